@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.distributed.decomposition import CellBox
-from warp_lcp.grid.particles import Particles
+from warp_lcp.grid.particles import MOST_A_CELL, Particles
 from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.memory import Scalar, Slot
 from warp_lcp.rows.program import LaunchGraph
@@ -23,8 +24,8 @@ ENDLESS = 1e30  # a coordinate beyond all
 COLUMNS = ("position", "velocity", "affine_0", "affine_1", "affine_2", "kept")
 PLACE_WORDS, COLUMN_WORDS = 2, 3  # of 4 bytes, of a particle in a message
 KERNELS = KernelFile(Path(__file__).parent / "headers/distributed.h")
-FIND_BORDER, PACK, UNPACK, SETTLE = (
-    KERNELS[f"warp_lcp.distributed.particles.{name}"] for name in ("find_border", "pack", "unpack", "settle")
+FIND_BORDER, PACK, UNPACK, SETTLE, GIVE_PLACES = (
+    KERNELS[f"warp_lcp.distributed.particles.{name}"] for name in ("find_border", "pack", "unpack", "settle", "give_places")
 )
 
 
@@ -82,9 +83,9 @@ class ParticleMessages:
         self._ends = self._take_boxes()
         self._copies: dict[str, wp.array[Any]] = {}
         copied = particles.grid.device.is_cuda  # others in each run
-        launches = self._launch_packing, self._launch_unpacking, self._launch_settling, self._launch_search
+        launches = self._launch_packing, self._launch_unpacking, self._launch_settling, self._launch_search, self._launch_places
         graphs = (LaunchGraph(self._device, launch, at_once=copied) for launch in launches)
-        self._packing, self._unpacking, self._settling, self._search = graphs
+        self._packing, self._unpacking, self._settling, self._search, self._giving = graphs
 
     def _take_boxes(self) -> list[int]:
         """Set the boxes that are searched, and return how many each neighbor has, this rank behind them.
@@ -120,11 +121,11 @@ class ParticleMessages:
         self._cells.reserve(3 * count)
         self._count.value = count
         self._search.run()
-        inside = self._found.host[1 : 1 + sum(self._ends)]
-        self._outgoing.reserve(words * int(inside.sum()))
+        inside, ends = self._found.host[1 : 1 + sum(self._ends)].tolist(), [0, *np.cumsum(self._ends).tolist()]
+        to = [words * sum(inside[:end]) for end in ends]
+        self._outgoing.reserve(to[-1])
         self._packing.run(positions_only, variant=positions_only)
-        sizes: Any = words * np.add.reduceat(inside, np.cumsum([0, *self._ends[:-1]])) if len(inside) else []
-        messages = np.split(self._outgoing.host[: sum(sizes)], np.cumsum(sizes)[:-1]) if len(inside) else []
+        messages = [self._outgoing.host[begin:end] for begin, end in pairwise(to)]
         incoming = self.part.mailbox.swap(dict(zip(self._neighbors, messages, strict=False)))
         incoming += messages[len(self._neighbors) :]
         come = sum(map(len, incoming)) // words
@@ -156,6 +157,12 @@ class ParticleMessages:
         self._send()
         own, end, free = found[:3].tolist()
         return own, end, self._others.host[:free].astype(np.int64)
+
+    def give_places(self) -> None:
+        """Give particles places that lie in the order of their cells, and have been numbered by these."""
+        self._count.value = self._particles.count
+        self._place.reserve(self._particles.count)
+        self._giving.run()
 
     def _take_in(self, incoming: Sequence[np.ndarray], come: int, words: int) -> None:
         self._incoming.reserve(come * words)
@@ -198,6 +205,14 @@ class ParticleMessages:
         given = {"message": self._moved.array, "others": self._others.array, "ghosts": self._ghosts.array, "flags": self._flags.array}
         given |= {"place": self._place.array, "count": self._count, "come": self._come}
         self._bind(SETTLE, self._placed | self._bounds | self._border_found | given | self._columns())
+
+    def _launch_places(self) -> None:
+        grid, key = self.part.grid, self._particles.key
+        key = wp.array(key.numpy(), dtype=wp.int32, device="cpu") if key.device.is_cuda else key
+        numbers = dict(zip(("all_x", "all_y", "all_z"), self.part.decomposition.counts, strict=True)) | {"most_a_cell": MOST_A_CELL}
+        numbers |= dict(zip(("before_x", "before_y", "before_z", "nx", "ny"), (*grid.origin, *grid.counts[:2]), strict=True))
+        given = {"key": key, "place": self._place.array, "found": self._found.array, "count": self._count}
+        self._bind(GIVE_PLACES, given | numbers)
 
     @property
     def _border_found(self) -> dict[str, wp.array[Any]]:

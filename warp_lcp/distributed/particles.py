@@ -20,7 +20,7 @@ from warp_lcp.distributed.particle_messages import KERNELS, REACH, Buffer, Parti
 from warp_lcp.distributed.place_order import PlaceOrder
 from warp_lcp.grid.part import ParticleExchange
 from warp_lcp.grid.particle_loops import launch
-from warp_lcp.grid.particles import MOST_A_CELL, NEW, Particles, ParticleTotals
+from warp_lcp.grid.particles import NEW, Particles, ParticleTotals
 
 if TYPE_CHECKING:
     from warp_lcp.distributed.subdomain import Subdomain
@@ -52,9 +52,9 @@ class ParticleMigration(ParticleExchange):
         self._own: np.ndarray | int | None = None  # which particles are this rank's, or how many of the first; None: all
         self._lying: PlaceOrder | None = None  # of those of this rank; None: not known
         self._neighbors = [r for r, box in enumerate(decomposition.boxes) if r != part.ranks.rank and decomposition.meet(box, around)]
+        self._messages = ParticleMessages(part, self.particles, self._places, self._neighbors)
         if self._neighbors:
             self.room = ROOM
-            self._messages = ParticleMessages(part, self.particles, self._places, self._neighbors)
 
     @property
     def place(self) -> np.ndarray:
@@ -153,17 +153,10 @@ class ParticleMigration(ParticleExchange):
 
     def end_sort(self) -> None:
         """Give the particles, which lie in the order of their cells, new places."""
-        count = self.particles.count
         if self._own is not None:
             self._own = self._where() != OUTSIDE
-        nx, ny, _ = self.part.decomposition.counts
-        key, begins = self.particles.key.numpy()[:count], np.ones(count, dtype=bool)
-        begins[1:] = key[1:] != key[:-1]
-        starts = np.flatnonzero(begins)
-        i, j, k = self._cells(starts).astype(np.int64) % np.array(self.part.decomposition.counts)[:, None]
-        first = ((k * ny + j) * nx + i) * MOST_A_CELL
-        self.place = np.repeat(first - starts, np.diff(starts, append=count))
-        self.place += np.arange(count)
+        self._messages.give_places()
+        self._placed = self.particles.count
 
     def next_place(self) -> int:
         """Return a place behind those of all ranks' particles, when this rank's own are there alone, numbered; collective."""
@@ -242,10 +235,3 @@ class ParticleMigration(ParticleExchange):
         if count:
             launch(WHERE, count, grid, position=self.particles.position, where=found, **bounds_of(self.part))
         return np.asarray(found.numpy())
-
-    def _cells(self, which: np.ndarray) -> np.ndarray:
-        """Return the cell (x, y, z) of the whole domain that some particles were last numbered in, shape (3, n)."""
-        nx, ny, _ = (n + 2 for n in self.part.grid.counts)
-        rows, i = np.divmod(self.particles.key.numpy()[: self.particles.count][which], nx)
-        k, j = np.divmod(rows, ny)
-        return np.stack([i, j, k]) + (np.array(self.part.grid.origin, dtype=np.int32) - 1)[:, None]

@@ -105,10 +105,10 @@ class DensityMonitor:
         The density at rest is 1.
         """
         if self._known is None:
-            above, held, densest = self._crowd.read()  # what is beyond what cells may hold, what there is, the largest density
-            ranks = self.grid.part.ranks
-            above, held = ranks.sum(np.array([above, held])).tolist()
-            self._known = above / held if held > 0.0 else 0.0, float(ranks.max(densest))
+            # what is beyond what cells may hold, what there is, the largest density
+            everyone = self.grid.part.ranks.gather(self._crowd.read())
+            above, held = everyone[:, :2].sum(axis=0).tolist()
+            self._known = above / held if held > 0.0 else 0.0, float(everyone[:, 2].max())
         return self._known
 
 
@@ -311,8 +311,8 @@ class DensityCorrection:
         if self._inside is not None:
             (lacking,) = self._lacking.read()
         full, densest = self._over.read()
-        ranks = self.grid.part.ranks
-        return int(ranks.sum(full + lacking)), float(ranks.max(densest))
+        everyone = self.grid.part.ranks.gather(np.array([full + lacking, densest]))
+        return int(everyone[:, 0].sum()), float(everyone[:, 1].max())
 
     def _solve(self, over_full: int) -> wl.SolveResult:
         if self._problem is None:

@@ -31,15 +31,23 @@ auto side_of_box = [&](const T* at) -> int {
     return 2 - in - away;
 };
 
+// snippet copy_bytes: Copies few bytes between types
+#ifdef __CUDA_ARCH__
+#define COPY_BYTES memcpy
+#else
+#define COPY_BYTES __builtin_memcpy
+#endif
+
 // snippet columns: Columns of particles that are there
+#include "copy_bytes"
 float* const columns[] = {(float*)given.position.data, (float*)given.velocity.data, (float*)given.affine_0.data,
                           (float*)given.affine_1.data, (float*)given.affine_2.data, (float*)given.kept.data};
 auto to_words = [&](int* to, long long p) {  // of a message: place, then what columns hold
-    memcpy(to, place + p, 8); to += 2;
-    for (const float* column : columns) if (column) { memcpy(to, column + 3*p, 12); to += 3; } };
+    COPY_BYTES(to, place + p, 8); to += 2;
+    for (const float* column : columns) if (column) { COPY_BYTES(to, column + 3*p, 12); to += 3; } };
 auto from_words = [&](const int* from, long long p) {
-    memcpy(place + p, from, 8); from += 2;
-    for (float* column : columns) if (column) { memcpy(column + 3*p, from, 12); from += 3; } };
+    COPY_BYTES(place + p, from, 8); from += 2;
+    for (float* column : columns) if (column) { COPY_BYTES(column + 3*p, from, 12); from += 3; } };
 int words = 2;
 for (const float* column : columns) words += column ? 3 : 0;
 
@@ -68,6 +76,7 @@ SIMD for (int p = first; p < last; ++p) where[p] = (unsigned char)side_of_box(po
 //              low_y, low_z, high_x, high_y, high_z, reach; int count, ends
 #include "side_of_box"
 #include "in_cells"
+#include "copy_bytes"
 constexpr int BLOCK = 1024;
 const T* at = (const T*)given.position.data;
 unsigned char side[BLOCK];
@@ -78,7 +87,7 @@ for (int from = 0; from < count; from += BLOCK) {
     SIMD for (int e = 0; e < n; ++e) side[e] = (unsigned char)side_of_box(at + 3*(long long)(from + e));
     for (int e = n; e < (n + 7)/8*8; ++e) side[e] = 0;
     for (int e = 0; e < n; e += 8) {
-        unsigned long long eight; memcpy(&eight, side + e, 8);
+        unsigned long long eight; COPY_BYTES(&eight, side + e, 8);
         if (!eight) continue;
         for (int p = e; p < e + 8; ++p) {
             if (!side[p]) continue;
@@ -110,11 +119,26 @@ for (int b = 0; b < ends; ++b)
         to_words(to, border[e]);
         for (int d = 0; around && d < 3; ++d) {
             const double offset = offsets[3*b + d];
-            float x; memcpy(&x, to + 2 + d, 4);
+            float x; COPY_BYTES(&x, to + 2 + d, 4);
             x = (float)((double)x + offset);
             x = offset > 0 && x < end[d] ? end[d] : x;
-            memcpy(to + 2 + d, &x, 4); }
+            COPY_BYTES(to + 2 + d, &x, 4); }
         to += words; }
+
+// kernel warp_lcp.distributed.particles.give_places: Give particles in the order of their cells
+// places: `most_a_cell` times the number of the cell among all ranks', and the number in the cell
+//   compute    float32
+//   whole      int32 key; int64 place
+//   box        int32 found
+//   numbers    int count, most_a_cell, before_x, before_y, before_z, nx, ny, all_x, all_y, all_z
+auto around = [](int i, int n) -> long long { return (i % n + n) % n; };  // where axes have no end
+long long next = 0;
+for (int p = 0; p < count; ++p) {
+    if (p == 0 || key[p] != key[p - 1]) {
+        const int row = key[p]/(nx + 2), i = key[p] - row*(nx + 2), k = row/(ny + 2), j = row - k*(ny + 2);
+        const long long x = around(i + before_x - 1, all_x), y = around(j + before_y - 1, all_y), z = around(k + before_z - 1, all_z);
+        next = ((z*all_y + y)*all_x + x)*most_a_cell; }
+    place[p] = next++; }
 
 // kernel warp_lcp.distributed.particles.unpack: Put the particles of messages behind the others
 //   compute    float32
