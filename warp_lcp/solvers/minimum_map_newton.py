@@ -45,7 +45,8 @@ HUGE = 1 << 16
 # growth of the residual by which a projected cycle on an operator that is not symmetric is undone, on a grid over the last one's, on a
 # matrix over the start's: torsion with wind on 250^2 nodes takes it to 11 times that, and the more nodes the more, to good effect
 RISEN, RISEN_ON_MATRIX = 10.0, 1000.0
-PROGRESS = 0.999  # equations whose residual is above this part of the smallest so far may have no solution
+PROGRESS = 0.999  # a residual above this part of the smallest so far is no progress
+STALLED = 10  # steps without progress after which damped steps end
 REGULARIZATIONS = (1e-8, 1e-4, 1e-2, 0.1, 1.0, 10.0, 100.0)  # of J'J, times its mean diagonal
 
 
@@ -62,9 +63,9 @@ class MinimumMapNewton(Settings):
     bounds if the residual would exceed the largest of the last `memory` ones (Grippo, Lampariello, Lucidi 1986). On a large sparse matrix,
     an active set that creeps all the same is moved by a problem on coarse points (Brandt and Cryer 1983) if A is nearly a diagonally
     dominant M-matrix. Converges on a grid in a few steps; on other matrices A should be a P-matrix. Where it is not, free blocks may be
-    singular and steps fail: dense problems try Levenberg-Marquardt steps of the minimum map, others end with NON_DESCENT, or with
-    STAGNATED where steps repeat themselves; INFEASIBLE if equations have no solution. `wl.solve` without a method goes on by other
-    methods (`wl.default_chain`).
+    singular and steps fail: dense problems try Levenberg-Marquardt steps of the minimum map and end with STAGNATED after 10 steps
+    without progress, others end with NON_DESCENT, or STAGNATED where steps repeat themselves; INFEASIBLE if equations have no solution.
+    `wl.solve` without a method goes on by other methods (`wl.default_chain`).
 
     Args:
         precision: "mixed": iterate float64, corrections float32; "double"; or "single": the iterate rounded to float32 as well.
@@ -161,7 +162,7 @@ class NewtonWorkspace(IterateMemory):
         self.target = tolerance
         # dense equations, of which it is not known yet whether they have a solution; a damped step has reduced the residual
         self._equations, self._damped = isinstance(self.system, DenseSystem) and not self.bounded, False
-        self._least, self._shrinks, self._active = math.inf, False, math.inf
+        self._least, self._waited, self._shrinks, self._active = math.inf, 0, False, math.inf
         # with an M-matrix each active set of whole steps is part of the one before, whatever the residual does
         self._monotone = isinstance(self.system, SparseSystem) and self.system.cycled and not self.problem.A.symmetric
         self.system.refresh()
@@ -205,7 +206,7 @@ class NewtonWorkspace(IterateMemory):
             self._equations = False
             if incompatible(p):
                 return Step("newton", 0, 0, SolveStatus.INFEASIBLE)
-        self._least = min(residual.norm, self._least)
+        self._least, self._waited = min(residual.norm, self._least), 0 if falls else self._waited + 1
         self.norms = [*self.norms, residual.norm][-(self.settings.memory if self.settings.safeguard else 1) :]
         size = residual.norm
         moved, active, shifted, square = self._sums.of(
@@ -234,7 +235,7 @@ class NewtonWorkspace(IterateMemory):
         residual.affine(x)
         self.trial.assign(self.coarse.correction(p, x.numpy(), residual.y.numpy()))
         self._correct(x, self.trial, 1.0, x)
-        self.norms, self.stale, self._least = [], True, math.inf
+        self.norms, self.stale, self._least, self._waited = [], True, math.inf, 0
         return Step("coarse problem", 1, active, interim=True)
 
     def _solve(self, norm: float, size: float, *, settled: bool) -> int:
@@ -277,7 +278,8 @@ class NewtonWorkspace(IterateMemory):
         wp.copy(x, self.trial)
         descended = isinstance(self.system, DenseSystem) and self._regularized(x, limit)
         residual.evaluate(x)
-        return Step("regularized", iterations, active, None if descended else SolveStatus.NON_DESCENT)
+        failure = SolveStatus.STAGNATED if self._waited >= STALLED else None
+        return Step("regularized", iterations, active, failure if descended else SolveStatus.NON_DESCENT)
 
     def _regularized(self, x: wp.array[Any], limit: float) -> bool:
         """Take the shortest of some Levenberg-Marquardt steps of the minimum map that reduces its norm; return whether one does.
