@@ -25,8 +25,8 @@ from warp_lcp.reduced.nonsmooth_map import FiniteDifferenceSystem, HostMap, Kink
 from warp_lcp.reduced.principal_system import GridSystem, principal_system
 from warp_lcp.reduced.settings import NewtonSettings
 from warp_lcp.settings import Count, CountOrZero, ShareOrAll, renamed
-from warp_lcp.solvers.cold_start import ColdStart
 from warp_lcp.solvers.gradient_descent import DescentWorkspace, GradientDescent
+from warp_lcp.solvers.projected_multigrid import ColdStart
 
 SHARE = 0.95  # lambda of the penalized map for dense problems: measured on frictional contacts
 FIRST_STEPS = 30  # of the regularized stage: those that succeed need 5 to 27

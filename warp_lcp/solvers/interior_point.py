@@ -28,7 +28,7 @@ from warp_lcp.rows import KernelFile, Known, Wave
 from warp_lcp.rows.fields import zeros_like
 from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, Positive, Share
-from warp_lcp.solvers.cold_start import ColdStart
+from warp_lcp.solvers.projected_multigrid import ColdStart
 
 LARGEST_START = 1e6  # of the residual's norm: ||b|| up to which it gives the start's size
 

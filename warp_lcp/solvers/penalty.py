@@ -19,7 +19,7 @@ from warp_lcp.reduced.settings import NewtonSettings
 from warp_lcp.rows import KernelFile
 from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Positive, Share
-from warp_lcp.solvers.cold_start import ColdStart
+from warp_lcp.solvers.projected_multigrid import ColdStart
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/penalty.h")
 MOVE = KERNELS["penalty.move"]
