@@ -340,9 +340,13 @@ def _workspaces_of(method: type) -> tuple[type, ...]:
     return tuple(kind for kind in get_args(hint) or (hint,) if isinstance(kind, type) and kind is not type(None))
 
 
+def takes_floating(workspace: Any) -> bool:
+    """Return whether `start` of a workspace takes the operator's floating components."""
+    return _takes_floating(type(workspace))
+
+
 @cache
-def takes_floating(workspace: type) -> bool:
-    """Return whether `start` of a kind of workspace takes the operator's floating components."""
+def _takes_floating(workspace: type) -> bool:
     return "floating" in inspect.signature(workspace.start).parameters  # type: ignore[attr-defined]
 
 
@@ -371,7 +375,7 @@ class _Loop:
             return self._finish(ended, 0)
         try:
             with self.deadline:
-                given = {"floating": self.floating} if takes_floating(type(self.work)) else {}
+                given = {"floating": self.floating} if takes_floating(self.work) else {}
                 wanted = self.work.start(warm=self.warm, tolerance=self.tolerance, **given) and self.stopping.max_iterations > 0
                 return self._iterate(None if wanted and not self.stopped else self._status(0, None))
         except TimeIsUp:  # within a step, of which nothing is left

@@ -276,7 +276,7 @@ class FallbackWorkspace:
             self._left_first = False
             self._first.keep()
         self._progress = Progress(self.problem, tolerance)
-        given = {"floating": floating} if takes_floating(type(self._first)) else {}
+        given = {"floating": floating} if takes_floating(self._first) else {}
         return self._first.start(warm=warm, tolerance=tolerance, **given)
 
     def keep(self) -> None:
@@ -350,7 +350,7 @@ class FallbackWorkspace:
         if place not in self._works:
             self._works[place] = self._made(self._entries[place].method)
         work = self._works[place]
-        return None if work is None or (self._floating is not None and not takes_floating(type(work))) else work
+        return None if work is None or (self._floating is not None and not takes_floating(work)) else work
 
     def _made(self, method: Solver) -> Any:
         same = next((k for k, work in self._works.items() if work is not None and self._entries[k].method == method), None)
@@ -405,7 +405,7 @@ class FallbackWorkspace:
         work.round_iterate()
         residual.evaluate(work.x)
         work.keep()
-        given = {"floating": self._floating} if takes_floating(type(work)) else {}
+        given = {"floating": self._floating} if takes_floating(work) else {}
         work.start(warm=not restart, tolerance=self._progress.tolerance, **given)
         if work is not self._first:
             self._take(work)
