@@ -98,6 +98,7 @@ def weak_preconditioner(progress: Progress) -> bool:
     return stalls(progress) or slow_linear_solves(progress) or getattr(progress.problem.A, "near_null_space", None) is not None
 
 
+@cache
 def _of_multigrid(method: ProjectedMultigrid) -> Solver:
     newton = MinimumMapNewton(precision=method.precision, cycle=method.cycle)
     entries = [FallbackEntry(method)]
@@ -114,12 +115,18 @@ def _of_newton(method: MinimumMapNewton, problem: LCP | None) -> Solver:
         return method if takes_points(A) else Fallback(method, (_on_assembled(), stalls_or_crawls))
     if not (has(A, HasRows) and has(A, HasScale)):
         return method
-    first, *between = [FallbackEntry(method)]
-    if _minimizes(problem):
-        first = FallbackEntry(replace(method, max_linear_iterations=min(WEAK, method.max_linear_iterations)))
-        between = [FallbackEntry(MPRGP(precision=method.precision), weak_preconditioner, batch=BATCH), FallbackEntry(method, fails)]
     narrow = isinstance(A, SparseOperator) and A.bandwidth <= NARROW
-    return Fallback(first, *between, *_last(StoppingCriteria.patience if narrow else PATH_IDLE))
+    return _on_matrix(method, _minimizes(problem), StoppingCriteria.patience if narrow else PATH_IDLE)
+
+
+@cache
+def _on_matrix(method: MinimumMapNewton, minimizes: bool, steps: int) -> Fallback:
+    """Return the chain of Newton's method on a matrix; with MPRGP if that has an energy."""
+    if not minimizes:
+        return Fallback(method, *_last(steps))
+    first = replace(method, max_linear_iterations=min(WEAK, method.max_linear_iterations))
+    gradients = FallbackEntry(MPRGP(precision=method.precision), weak_preconditioner, batch=BATCH)
+    return Fallback(first, gradients, (method, fails), *_last(steps))
 
 
 def _of_active_set(method: PrimalDualActiveSet, problem: LCP | None) -> Solver:
@@ -133,6 +140,7 @@ def _of_active_set(method: PrimalDualActiveSet, problem: LCP | None) -> Solver:
     return Fallback(method, (newton, fails), *_last())
 
 
+@cache
 def _last(steps: int = PATH_IDLE) -> tuple[FallbackEntry, FallbackEntry]:
     """Return what follows Newton's steps on matrices.
 

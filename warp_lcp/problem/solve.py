@@ -340,14 +340,14 @@ def _workspaces_of(method: type) -> tuple[type, ...]:
     return tuple(kind for kind in get_args(hint) or (hint,) if isinstance(kind, type) and kind is not type(None))
 
 
-def takes_floating(work: Workspace) -> bool:
+def takes_floating(workspace: Any) -> bool:
     """Return whether `start` of a workspace takes the operator's floating components."""
-    return _kind_takes_floating(type(work))
+    return _takes_floating(type(workspace))
 
 
 @cache
-def _kind_takes_floating(kind: type) -> bool:
-    return "floating" in inspect.signature(kind.start).parameters  # type: ignore[attr-defined]
+def _takes_floating(workspace: type) -> bool:
+    return "floating" in inspect.signature(workspace.start).parameters  # type: ignore[attr-defined]
 
 
 class _Loop:
