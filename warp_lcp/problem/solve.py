@@ -340,7 +340,7 @@ def _workspaces_of(method: type) -> tuple[type, ...]:
     return tuple(kind for kind in get_args(hint) or (hint,) if isinstance(kind, type) and kind is not type(None))
 
 
-def takes_floating(workspace: Any) -> bool:
+def takes_floating(workspace: Workspace) -> bool:
     """Return whether `start` of a workspace takes the operator's floating components."""
     return _takes_floating(type(workspace))
 
