@@ -47,7 +47,7 @@ def test_contacts_get_a_method_that_takes_them(family):
         if lcp.bounds.affine is not None:
             assert advice.method.affine_bounds
             assert all(wl.METHODS[name].affine_bounds for name in advice.alternatives)
-        assert wl.solve(lcp, advice.method, stopping=advice.stopping).relative_residual < 1
+        assert wl.solve(lcp, advice.chain, stopping=advice.stopping).relative_residual < 1
 
 
 def test_the_answer_is_one_by_another_codes_residual():

@@ -41,7 +41,9 @@ class Figure:
 
     @staticmethod
     def of(samples: Sequence[float], unit: str = "") -> Figure:
-        """Return the median with its range."""
+        """Return the median with its range, which one sample has not."""
+        if len(samples) == 1:
+            return Figure(samples[0], unit)
         return Figure(statistics.median(samples), unit, min(samples), max(samples), len(samples))
 
     @staticmethod

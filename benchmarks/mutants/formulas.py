@@ -99,7 +99,12 @@ FORMULAS = [
         ),
         ("return slope < 0 and self", "return slope < 1e300 and self"),
         ("slope = size * self.map.slope(x, self.system.e)", "slope = -2 * self._merit"),
-        ("settings.memory if settings.safeguard else 1", "settings.memory"),
+        (
+            "self._fusable = grid and settings.safeguard and self.precision is not Precision.SINGLE\n"
+            "        self._search = NonmonotoneSearch(memory=settings.memory if settings.safeguard else 1)",
+            "self._fusable = grid and settings.safeguard and self.precision is not Precision.SINGLE\n"
+            "        self._search = NonmonotoneSearch(memory=settings.memory)",
+        ),
         ("SolveStatus.LOCAL_MINIMUM if stationary", "SolveStatus.LOCAL_MINIMUM if not stationary"),
         ("SolveStatus.LOCAL_MINIMUM if stationary", "SolveStatus.NON_DESCENT if stationary"),
     ),
@@ -225,7 +230,6 @@ FORMULAS = [
         ("self.settings.memory if self.settings.safeguard else 1", "self.settings.memory"),
         ("            scale *= 0.5", "            scale *= 0.25"),
         ("        if not s.safeguard:\n", "        if s.safeguard and not s.safeguard:\n"),
-        ("        if not self.settings.safeguard:\n            return False\n", ""),
         ("if self.safeguard and takes_points", "if takes_points"),
         ("helped = self.bounded and settings.safeguard", "helped = self.bounded"),
         ("limit, scale, best, best_scale = max(self.norms)", "limit, scale, best, best_scale = min(self.norms)"),

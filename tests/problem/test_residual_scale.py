@@ -69,7 +69,8 @@ def unscaled(M, b, x):
 def test_a_tiny_diagonal_hides_nothing(method, kind):
     M, b = TINY
     try:
-        result = wl.solve(wl.LCP(operator(M, kind), b), wl.METHODS[method]())
+        problem = wl.LCP(operator(M, kind), b)
+        result = wl.solve(problem, wl.default_chain(wl.METHODS[method](), problem))
     except ValueError:
         assert method not in SOLVE_IT
         return
@@ -83,7 +84,8 @@ def test_a_tiny_diagonal_hides_nothing(method, kind):
 def test_linear_programs_have_their_optimum_or_are_not_solved(method, kind):
     for seed in range(4):
         M, b, c, G, h = program(seed)
-        result = wl.solve(wl.LCP(operator(M, kind), b), wl.METHODS[method]())
+        problem = wl.LCP(operator(M, kind), b)
+        result = wl.solve(problem, wl.default_chain(wl.METHODS[method](), problem))
         assert result or (method, kind) in {("fischer-newton", "dense"), ("fischer-newton", "sparse"), ("primal-dual-active-set", kind)}
         if result:
             best = linprog(c, A_ub=-G, b_ub=-h).fun
@@ -97,7 +99,8 @@ def test_units_of_rows_and_columns_are_the_users(method):
         M, b, *_ = program(seed)
         rng = np.random.default_rng(seed)
         R, C = 10.0 ** rng.uniform(-4, 4, 40) if seed % 2 else np.ones(40), 10.0 ** rng.uniform(-8, 8, 40)
-        result = wl.solve(wl.LCP(operator(R[:, None] * M * C, "dense"), R * b), wl.METHODS[method]())
+        problem = wl.LCP(operator(R[:, None] * M * C, "dense"), R * b)
+        result = wl.solve(problem, wl.default_chain(wl.METHODS[method](), problem))
         assert result, (seed, result.status)
         assert unscaled(M, b, C * result.x.numpy()) < 1e-4
 
@@ -171,9 +174,10 @@ def test_entries_that_change_change_the_scale():
     M, b = TINY
     A = wl.SparseOperator(scipy.sparse.csr_array(M + np.diag([3.0, 3.0])), device="cpu")
     problem = wl.LCP(A, b)
-    work = wl.MinimumMapNewton().init(problem)
+    chain = wl.default_chain(wl.MinimumMapNewton(), problem)
+    work = chain.init(problem)
     np.testing.assert_array_equal(work.residual.diagonal.numpy(), 3.0 + 1e-8)
     A.update(scipy.sparse.csr_array(M))
-    result = wl.solve(problem, wl.MinimumMapNewton(), workspace=work)
+    result = wl.solve(problem, chain, workspace=work)
     np.testing.assert_array_equal(work.residual.diagonal.numpy(), 1.0)
     np.testing.assert_allclose(result.x.numpy(), lemke(M, b), atol=1e-6)

@@ -41,7 +41,7 @@ def test_extreme_rows(kind, method):
         rng = np.random.default_rng(seed)
         A, b, D = matrix(kind, rng), rng.standard_normal(N), 10 ** rng.uniform(-8, 8, N)
         scaled = problem(D[:, None] * A * D, D * b, kind)
-        result = wl.solve(scaled, method)
+        result = wl.solve(scaled, wl.default_chain(method, scaled))
         assert result, (seed, result.status)
         largest = D.max() / 100 < D  # the criterion is in units of y: it tells these rows from 0
         np.testing.assert_array_equal((result.x.numpy() * D)[largest] < 1e-3, lemke(A, b)[largest] < 1e-3)

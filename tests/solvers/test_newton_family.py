@@ -226,7 +226,7 @@ def test_semidefinite_matrices(zeros):
             result = wl.solve(dense(problem.A, problem.b), method)
             assert result, (type(method).__name__, seed, result.status)
         newton = wl.solve(dense(problem.A, problem.b), wl.MinimumMapNewton())
-        assert newton or newton.status is wl.SolveStatus.NON_DESCENT
+        assert newton or newton.status in (wl.SolveStatus.NON_DESCENT, wl.SolveStatus.STAGNATED)
 
 
 def test_minimum_map_newton_leaves_the_cycle_of_period_three():

@@ -13,6 +13,7 @@ import warp as wp
 from warp_lcp.problem.lcp import LCP, as_operator
 from warp_lcp.problem.protocol import HasRows, HasScale, check_taken, has
 from warp_lcp.problem.result import SolveStatus
+from warp_lcp.problem.scale import scale_of_matrix
 from warp_lcp.problem.solve import EPS, FLOOR_MARGIN, IterateMemory, Solver, Step
 from warp_lcp.reduced.dense_problem import proved_infeasible
 from warp_lcp.settings import Settings
@@ -66,11 +67,9 @@ class ProximalPoint(Settings):
         """Return a workspace.
 
         Raises:
-            ValueError: A gives no access to rows, or has no scale.
+            ValueError: A gives no access to rows.
         """
         check_taken(self, problem.A)
-        if not has(problem.A, HasScale):
-            raise ValueError(f"{type(problem.A).__name__} has no scale: ProximalPoint needs wl.DenseOperator or wl.SparseOperator")
         return ProximalWorkspace(problem, self.inner)
 
     def step(self, problem: LCP, work: ProximalWorkspace, x: wp.array[Any]) -> Step:
@@ -89,7 +88,8 @@ class ProximalWorkspace(IterateMemory):
         """Take A, b and the bounds as they are now."""
         p, self._tolerance, self._eps = self.problem, tolerance, CENTER
         A: Any = p.A
-        self._matrix, self._D, self._b = A.rows().matrix(), A.scale(), p.b.numpy().copy()
+        self._matrix, self._b = A.rows().matrix(), p.b.numpy().copy()
+        self._D = A.scale() if has(A, HasScale) else scale_of_matrix(self._matrix)
         if scipy.sparse.issparse(self._matrix) and len(self._D) <= SMALL:
             self._matrix = self._matrix.toarray()
         self._operator: Any = as_operator(self._regularized(), p.device)

@@ -35,7 +35,7 @@ const bool exact = true;
 const R c0 = c > 0 ? c : (R)0, w0 = -w > 0 ? -w : (R)0;
 #if UPPER
 const R e = root(SMOOTHED(w*w + c*c)), es = e > tiny ? e : (R)1, n = c - w;
-const R below = n > 0 ? LOWERED(-2*w*c)/(n + es) : n - e, h = high ? -below : w;
+const R below = n > 0 ? LOWERED(-2*w*c)/(n + e) : n - e, h = high ? -below : w;
 const bool kink2 = high & (e <= tiny);
 const R p2 = high ? (kink2 ? kp : ((exact & (c > 0)) ? w*w/(es*(es + c0)) : 1 - c/es)) : (R)0;
 const R q2 = high ? (kink2 ? kq : ((exact & (w < 0)) ? c*c/(es*(es + w0)) : 1 + w/es)) : (R)1;
@@ -45,7 +45,7 @@ const R h = w, p2 = 0, q2 = 1; const bool kink2 = false;
 const R rho = root(SMOOTHED(a*a + h*h)), rs = rho > tiny ? rho : (R)1, t = a + h;
 const R a0 = a > 0 ? a : (R)0, h0 = h > 0 ? h : (R)0;
 const bool kink1 = low & (rho <= tiny), flat1 = exact & (a > 0), flat2 = exact & (h > 0);
-const R f1 = low ? (t > 0 ? LOWERED(2*a*h) : t - rho)/(t > 0 ? t + rs : (R)1) : h;
+const R f1 = low ? (t > 0 ? LOWERED(2*a*h) : t - rho)/(t > 0 ? t + rho : (R)1) : h;
 const R p1 = low ? (kink1 ? kp : (flat1 ? h*h : rs - a)/(rs*(flat1 ? rs + a0 : (R)1))) : (R)0;
 const R q1 = low ? (kink1 ? kq : (flat2 ? a*a : rs - h)/(rs*(flat2 ? rs + h0 : (R)1))) : (R)1;
 const bool kink = inside & (kink1 | kink2);
