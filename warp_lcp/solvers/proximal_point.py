@@ -89,7 +89,8 @@ class ProximalWorkspace(IterateMemory):
         p, self._tolerance, self._eps = self.problem, tolerance, CENTER
         A: Any = p.A
         self._matrix, self._b = A.rows().matrix(), p.b.numpy().copy()
-        self._D = A.scale() if has(A, HasScale) else scale_of_matrix(self._matrix)
+        known = A.scale() if has(A, HasScale) else None
+        self._D: np.ndarray = scale_of_matrix(self._matrix) if known is None else known
         if scipy.sparse.issparse(self._matrix) and len(self._D) <= SMALL:
             self._matrix = self._matrix.toarray()
         self._operator: Any = as_operator(self._regularized(), p.device)
