@@ -269,6 +269,12 @@ class KeepsWorkspace(Protocol):
         """Return a workspace for the problem, None if `init` has to make one."""
 
 
+def spare_of(solver: Solver, problem: Any) -> Spare | None:
+    """Return the workspace of an earlier solve that a method has kept, with a problem's data; None if there is none."""
+    lend = getattr(solver, "spare", None)  # of `KeepsWorkspace`; to look a protocol up takes a twentieth of a small solve
+    return None if lend is None else lend(problem)
+
+
 def solve(
     problem: LCP | VariationalInequality, solver: Solver, *, stopping: StoppingCriteria | MeanCriteria | None = None,
     x0: Array | None = None, workspace: Workspace | None = None, callback: Callable[[Record], None] | None = None,
@@ -286,7 +292,7 @@ def solve(
     across, loop = (problem.layout.across, _LoopInBox) if isinstance(problem, LCP) else (None, _Loop)
     stopping = stopping or StoppingCriteria()
     deadline = Deadline(stopping.max_seconds if isinstance(stopping, StoppingCriteria) else math.inf, across)
-    if workspace is None and isinstance(solver, KeepsWorkspace) and (spare := solver.spare(problem)) is not None:
+    if workspace is None and (spare := spare_of(solver, problem)) is not None:
         result = loop(problem, solver, stopping, deadline, spare.work, callback).run(x0)
         spare.give_back(result)
         return result

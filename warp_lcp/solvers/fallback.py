@@ -14,7 +14,7 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import takes
 from warp_lcp.problem.residual import EPS
 from warp_lcp.problem.result import SolveResult, SolveStatus
-from warp_lcp.problem.solve import FLOOR_MARGIN, KeepsWorkspace, Precision, Solver, Spare, Step, method_name, refusal, takes_floating
+from warp_lcp.problem.solve import FLOOR_MARGIN, Precision, Solver, Spare, Step, method_name, refusal, spare_of, takes_floating
 from warp_lcp.problem.stopping import StoppingCriteria
 
 WINDOW = 10  # steps over which the fall of the residual is measured
@@ -201,7 +201,7 @@ class Fallback:
     def spare(self, problem: Any) -> SpareChain | None:
         """Return the workspace of an earlier solve, if the first method keeps one."""
         first = self.entries[0].method
-        lent = first.spare(problem) if isinstance(first, KeepsWorkspace) else None
+        lent = spare_of(first, problem)
         return None if lent is None else SpareChain(lent, FallbackWorkspace(problem, self.entries, lent.work))
 
     def step(self, problem: Any, work: FallbackWorkspace, x: wp.array[Any]) -> Step:
@@ -320,6 +320,8 @@ class FallbackWorkspace:
         """Return the place of the method that takes over now, None if none does."""
         if self._place + 1 == len(self._entries) or getattr(self._first, "is_ahead", False):
             return None
+        if not any(entry.when(self._progress) for entry in self._entries[self._place + 1 :]):
+            return None  # conditions cost less than what follows
         for place in range(self._place + 1, len(self._entries)):
             entry = self._entries[place]
             if entry.method == self._entries[self._place].method or not self._may_take(place):
