@@ -98,7 +98,11 @@ class Packing:
         self._found.changed()
 
     def find_ghosts(self, layers: int) -> None:
-        """Find the ghost cells with sand that `join` fills; collective."""
+        """Find the ghost cells with sand, which `join` fills; collective.
+
+        Args:
+            layers: of a field of stresses.
+        """
         if self.grid.part.across is not None:
             sand = self.flags.numpy() != 0
             self._forest = self.grid.part.forest(layers, REACH, which=sand, into=self._forest)
@@ -166,9 +170,9 @@ class Packing:
         return window.common(self.nodes) or self.nodes
 
     def join(self, stress: wp.array, *, launch: Launch = launch) -> None:
-        """Fill ghost cells of a field of stresses, after `find_ghosts`; collective.
+        """Fill `REACH` layers of ghost cells of a field of stresses; collective.
 
-        Also the cells beyond periodic sides. Cells without sand have stresses of 0 on all ranks.
+        After `find_ghosts`. Also the cells beyond periodic sides. Cells without sand have stresses of 0 on all ranks.
         """
         if self._forest is not None:
             self.grid.part.filling(stress, forest=self._forest).launch(launch)
