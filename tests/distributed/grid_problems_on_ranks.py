@@ -85,10 +85,10 @@ def compare(
     own = (part(field, boxes.box, shape) for field in (b, lower, upper))
     problem = wl.LCP(joined(A, columns, boxes.box), *own)
     stopping = wl.StoppingCriteria(rtol=rtol)
-    found = wl.solve(problem, method, stopping=stopping)
+    found = wl.solve(problem, wl.default_chain(method, problem), stopping=stopping)
     whole = CellBox((0, 0, 0), counts)
     alone = wl.LCP(joined(wl.GridPoisson(cells, device="cpu", **faces), columns, whole), b, lower, upper)
-    expected = wl.solve(alone, method, stopping=stopping)
+    expected = wl.solve(alone, wl.default_chain(method, alone), stopping=stopping)
     assert found.status is expected.status, (name, found.status, expected.status)
     assert abs(found.iterations - expected.iterations) <= counts_differ, (name, found.iterations, expected.iterations)
     # both start from the same residual, and take the same steps on their way: lengths and directions are from sums over all ranks
