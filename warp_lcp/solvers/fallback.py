@@ -231,6 +231,11 @@ class FallbackWorkspace:
 
     Attributes that are not its own are those of the first method's workspace.
 
+    Attributes:
+        x: the iterate, a stored field.
+        residual: judges all iterates.
+        precision: of the iterate.
+
     Args:
         problem: the problem.
         entries: the chain.
@@ -239,6 +244,7 @@ class FallbackWorkspace:
 
     def __init__(self, problem: Any, entries: tuple[FallbackEntry, ...], first: Any) -> None:
         self.problem, self._entries, self._first = problem, entries, first
+        self.x, self.residual, self.precision = first.x, first.residual, Precision(first.precision)
         self._works: dict[int, Any] = {0: first}  # by place in the chain; None: the method does not take the problem
         self._suited: dict[int, bool] = {}  # by place: whether a method takes such a problem, before it has a workspace
         self._best: wp.array[Any] | None = None
@@ -253,21 +259,6 @@ class FallbackWorkspace:
         if name in ("_first", "__setstate__"):
             raise AttributeError(name)
         return getattr(self._first, name)
-
-    @property
-    def x(self) -> wp.array[Any]:
-        """The iterate, a stored field."""
-        return self._first.x
-
-    @property
-    def residual(self) -> Any:
-        """The residual that judges all iterates."""
-        return self._first.residual
-
-    @property
-    def precision(self) -> Precision:
-        """Of the iterate."""
-        return self._first.precision
 
     def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> bool | None:
         """Begin with the first method, at an iterate that `keep` has been told of; the operator may have changed."""
@@ -298,7 +289,12 @@ class FallbackWorkspace:
 
     def step(self) -> Step:
         """Hand over if that is due, then take a step."""
-        self._progress.record(self.residual.norm)
+        progress = self._progress
+        progress.record(self.residual.norm)
+        if self._place == 0 and getattr(self._first, "is_ahead", False):  # nothing is handed over: the device has taken the step
+            self._at_best = False
+            progress.step = self._entries[0].method.step(self.problem, self._first, self.x)
+            return progress.step
         place = self._due()
         if place is not None:
             self._hand_over(place)
@@ -318,7 +314,7 @@ class FallbackWorkspace:
 
     def _due(self) -> int | None:
         """Return the place of the method that takes over now, None if none does."""
-        if self._place + 1 == len(self._entries) or getattr(self._first, "is_ahead", False):
+        if self._place + 1 == len(self._entries):
             return None
         if not any(entry.when(self._progress) for entry in self._entries[self._place + 1 :]):
             return None  # conditions cost less than what follows
