@@ -167,7 +167,7 @@ def contact_kernel(
     k, j, first, end, s: UnilateralSetting, rate: wp.float64, settling: float, kind: I8, touch: U8, x: F64, contact: U8, sums: F64,
     found: wp.array(dtype=wp.float64),
 ):  # fmt: skip
-    """Find the wall cells that hold liquid and those that let go, [0] their number in a row, and [1] the largest |y| of full cells.
+    """Set the contact of wall cells; sum up those of a row that release liquid, and find its largest |y| of full cells.
 
     `found`, if there is one, has the sum of the first and the largest of the second of all rows.
     """

@@ -102,7 +102,7 @@ class ViscosityMultigrid:
             self._inner[number].move_to(inner)
 
     def set_up(self) -> None:
-        """Make the coarse levels from the finest, in the cells of `move_to`; on ranks all of them anew."""
+        """Make the coarse levels from the finest, in the cells of `move_to`; on ranks, in all cells."""
         fine = self.levels[0]
         fine.share(fine.equations)
         fine.find_spans(self._inner[0])

@@ -232,7 +232,7 @@ def test_bodies_that_weigh_next_to_nothing_where_walls_let_go(weight, precision)
 
 @pytest.mark.parametrize("cycles", [1, 2, 3])
 def test_the_correction_is_of_the_free_set_after_the_projected_cycles(cycles, device, monkeypatch):
-    """In projected cycles every unknown is free, and no correction is made; the first one begins anew."""
+    """Projected cycles keep every unknown free and make no correction. The first correction comes after them."""
     taken, made = [], []
     renew = LowRankCorrection.renew
 

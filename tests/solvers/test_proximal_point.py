@@ -131,3 +131,12 @@ def test_a_workspace_begins_anew():
         assert result, result.status
         assert "proximal point" not in {r.step for r in result.history}
         np.testing.assert_allclose(np.minimum(result.x.numpy(), y), 0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["dense", "sparse"])
+def test_the_solution_nearest_to_the_start_is_found(kind):
+    """A = [[1, -1], [-1, 1]] fixes x_1 - x_2 = 1 alone; D (x - c) lies in A's range, so that x_1 + x_2 stays 8."""
+    p = problem(np.array([[1.0, -1.0], [-1.0, 1.0]]), np.array([-1.0, 1.0]), kind)
+    result = wl.solve(p, wl.ProximalPoint(), x0=np.array([5.0, 3.0]), stopping=wl.StoppingCriteria(rtol=1e-9))
+    assert result, result.status
+    np.testing.assert_allclose(result.x.numpy(), [4.5, 3.5], atol=1e-4)

@@ -70,7 +70,7 @@ class Flights:
         self._boarding, self._lifting, self._flying, self._landing = (LaunchGraph(grid.device, launch) for launch in launches)
 
     def find(self, window: Window, weights: Sequence[wp.array], kind: wp.array) -> None:
-        """Look for bodies, without waiting for their number; arguments as of `begin`, which does it where nobody has.
+        """Find bodies in flight, without waiting for their number; arguments as of `begin`.
 
         Grow the trees of the window's cells and of those below it whose faces they are: of a part of the grid beside its own cells.
         """

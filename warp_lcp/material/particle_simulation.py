@@ -393,7 +393,7 @@ class ParticleSimulation(ParticleCheckpoints):
             dt: time step [s].
             window: of the step.
             density: of the particles before they move, in units of that at rest; None: no step has found it yet.
-            contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED where walls held the material in the step or let go of it; None: not known.
+            contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED: the contact with walls in the step; None: not known.
 
         Returns:
             What the log says of it and of the particles.

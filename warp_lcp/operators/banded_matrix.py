@@ -104,7 +104,7 @@ class BandedFactors:
         self._d = d
 
     def factor(self, by_z: np.ndarray, p: int) -> bool:
-        """Take -M_i where `by_z` says so; return whether T is regular."""
+        """Factor T, whose columns i with `by_z[i]` are -M_i; return whether it is regular."""
         self._p = p
         chosen = by_z.copy()
         chosen[p] = False

@@ -168,7 +168,7 @@ class LowRankCorrection:
 
     @property
     def is_calm(self) -> bool:
-        """Whether no column is corrected for, which a GPU may go on without while `calm` says so."""
+        """Whether no column is corrected for; a GPU then continues without the host while `calm` is 1."""
         return self.calm is not None and self.slots == 0
 
     @property

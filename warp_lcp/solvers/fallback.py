@@ -361,7 +361,7 @@ class FallbackWorkspace:
             return None
 
     def _hand_over(self, place: int) -> None:
-        """Let the method at a place begin where the one before has ended, or anew."""
+        """Start the method at a place of the chain, from the iterate or from clip(0, l, u)."""
         entry, before, work = self._entries[place], self._entries[self._place], self._workspace(place)
         failed = fails(self._progress) or before.restart
         if not self._left_first:

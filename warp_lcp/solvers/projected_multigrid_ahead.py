@@ -287,7 +287,7 @@ class RunAhead:
         self._take_rows()
         if isinstance(criteria, MeanCriteria) and criteria.count() == 0:  # no unknown counts: there is nothing to solve
             self.rows.clear()
-            work.distrust_hierarchy()  # of the free set nobody knows
+            work.distrust_hierarchy()  # the free set is unknown
             r.norm = 0.0
             return 0.0
         reference, first = (math.sqrt(row[int(NORM)]) for row in (self.rows[0], self.rows[1]))
