@@ -11,7 +11,8 @@ from warp_lcp.benchmarks.choose_problems import FAMILIES, KINDS, draw, make
 from warp_lcp.gallery.contact_models import BoxedModel
 from warp_lcp.gallery.contact_scenes import SCENES, SETTLING
 from warp_lcp.gallery.contact_stepper import ContactStepper
-from warp_lcp.recommend import LEAN, RULES, memory_of
+from warp_lcp.recommend import LEAN, memory_of
+from warp_lcp.rules import RULES
 from warp_lcp.traits import traits_of
 
 SEEDS = range(700, 703)  # neither those of the rules nor those of the published check

@@ -9,14 +9,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.default import solve, solve_by_alternatives
+from warp_lcp.default import solve, solve_by_attempts
+from warp_lcp.operators.restated import RestatedProblem
 from warp_lcp.problem.affine_bounds import AffineBounds
 from warp_lcp.problem.bounds import huge_as_infinite
 from warp_lcp.problem.lcp import LCP, as_operator
+from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import Record, SolveResult, SolveStatus
 from warp_lcp.problem.solve import Solver, Workspace
 from warp_lcp.problem.stopping import StoppingCriteria
-from warp_lcp.recommend import recommend
 from warp_lcp.rows.fields import Array, real_array
 from warp_lcp.settings import CountOrZero, NonNegative, ShareOrZero, checked
 from warp_lcp.solvers.registry import method_of
@@ -99,27 +100,30 @@ def linear_complementarity(
     lower, upper = _sides_of(bounds, fields.given)
     lower, upper = _bound(fields.load(lower, "bounds, lo"), "lo", np.inf), _bound(fields.load(upper, "bounds, hi"), "hi", -np.inf)
     problem = LCP(operator, fields.load(b, "b"), lower, upper, preconditioner=preconditioner)
-    solver = recommend(problem).chain if method is None else _method(method)
     stopping = StoppingCriteria(rtol=rtol, atol=least, max_iterations=most, patience=max(30, most // 10))
-    works = list[Workspace]()  # the last one has the iterate
+    guess = None if x0 is None else fields.load(x0, "x0")
+    at_work = list[tuple[RestatedProblem, Workspace]]()  # the last one has the iterate
 
     def told(record: Record) -> None:
         if tell is not None and not record.step.startswith("start"):
-            x = fields.unload(problem.layout.unload(works[-1].x))
+            restated, work = at_work[-1]
+            x = fields.unload(restated.field(restated.problem.layout.unload(work.x)))
             tell(OptimizeResult(x=x, nit=record.iteration, residual=record.residual))
 
-    def run(form: LCP, solver: Solver, stopping: Any, x0: Any, callback: Any) -> SolveResult:
-        works.append(solver.init(form))
-        return solve(form, solver, stopping=stopping, x0=x0, workspace=works[-1], callback=callback)
+    def run(restated: RestatedProblem, solver: Solver, stopping: Any, x0: Any, callback: Any) -> SolveResult:
+        work = solver.init(restated.problem)
+        at_work.append((restated, work))
+        found = solve(restated.problem, solver, stopping=stopping, x0=restated.start(x0), workspace=work, callback=callback)
+        return restated.result(found)
 
-    guess = None if x0 is None else fields.load(x0, "x0")
-    result = run(problem, solver, stopping, guess, told)
     if method is None:
-        result = solve_by_alternatives(problem, result, stopping, guess, run, told)
+        result = solve_by_attempts(problem, stopping, guess, told, run=run, reserve=False)
+    else:
+        result = run(RestatedProblem(problem, problem), _method(method), stopping, guess, told)
     message = f"{result.status.name}: {result.status.value}"
     for word, here in WORDS.items():
         message = message.replace(word, here)
-    slack, active = _sides(problem, works[0].residual, result.x)
+    slack, active = _sides(problem, result.x)
     return OptimizeResult(
         x=fields.unload(result.x), success=bool(result), status=STATUSES[result.status], message=message, nit=result.iterations,
         residual=result.residual, relative_residual=result.relative_residual, slack=fields.unload(slack),
@@ -241,13 +245,14 @@ def _told(callback: Any) -> Callable[[OptimizeResult], Any] | None:
     return lambda found: callback(found.x)
 
 
-def _sides(problem: LCP, residual: Any, x: wp.array[Any]) -> tuple[wp.array[Any], wp.array[Any]]:
+def _sides(problem: LCP, x: wp.array[Any]) -> tuple[wp.array[Any], wp.array[Any]]:
     """Return y at x and on which side of its bounds each unknown is held, fields of the operator's shape; 0 where there is no unknown."""
     layout = problem.layout
     stored, y = layout.load(x, wp.float64), layout.zeros(wp.float64)
     problem.bounds.follow(stored)
     problem.apply_plus(stored, problem.b, y)
     at, slack, unknown = stored.numpy(), y.numpy(), problem.unknown.numpy() == 1
+    residual = NaturalResidual(problem)
     d = np.maximum(np.abs(residual.diagonal.numpy().astype(np.float64)) * residual.unit, np.finfo(np.float64).tiny)
     low = (d * (at - problem.lower.numpy()) <= slack) & unknown
     high = (d * (at - problem.upper.numpy()) >= slack) & unknown & ~low

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from warp_lcp.benchmarks.choose import DEFAULT, NEGLIGIBLE, RULE_COLUMNS, SLOWER, is_right, over_best, rule_row
 from warp_lcp.benchmarks.harness.record import MACHINE, Record, read_json
-from warp_lcp.recommend import RULES
+from warp_lcp.rules import RULES
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "choosing-a-method.md"

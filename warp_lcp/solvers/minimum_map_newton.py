@@ -87,6 +87,7 @@ class MinimumMapNewton(Settings):
     definite: ClassVar[bool] = True
     distributed: ClassVar[bool] = True
     preconditioned: ClassVar[bool] = True
+    any_numbering: ClassVar[bool] = True
 
     precision: PrecisionName = "mixed"
     monotone_cycles: CountOrZero = 2
