@@ -305,6 +305,17 @@ def negative_diagonal(rng: np.random.Generator, seed: int, *, boxed: bool) -> Pr
     return planted(A, np.random.default_rng(seed), Plant(active=0.4, boxed=boxed), name="negative diagonal", facts=frozenset())
 
 
+def sparse_negative_diagonal(rng: np.random.Generator) -> wl.LCP:
+    """Return a random symmetric sparse matrix with a negative diagonal entry in one row of twenty, in a box."""
+    n = between(rng, 300, 4000)
+    R = scipy.sparse.random_array((n, n), density=4 / n, rng=rng, data_sampler=rng.standard_normal)
+    d = rng.uniform(0.5, 3.0, n)
+    d[rng.choice(n, n // 20, replace=False)] -= 4.0
+    return wl.LCP(
+        scipy.sparse.csr_array((R + R.T) / 2 + scipy.sparse.diags_array(d)), rng.standard_normal(n), 0.0, 10.0 ** float(rng.uniform(-1, 1))
+    )
+
+
 def wind(rng: np.random.Generator) -> wl.LCP:
     """Return upwind convection and diffusion on a grid above an obstacle: an unsymmetric stencil."""
     m, peclet = between(rng, 16, 128), 10.0 ** float(rng.uniform(-1, 2))
@@ -338,6 +349,7 @@ RARE: dict[str, Make] = {  # for rules that no kind above meets; sign errors may
     "wind": lambda r, s: wind(r),
     "large game": lambda r, s: large_game(r),
     "dominant": dominant,
+    "sparse negative diagonal, boxed": lambda r, s: sparse_negative_diagonal(r),
 }
 
 

@@ -18,6 +18,7 @@ from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.settings import Count, Settings
 from warp_lcp.solvers.assembled_matrix import AssembledMatrix
 from warp_lcp.solvers.fallback import WEAK, Fallback, FallbackEntry, Progress, crawls, fails, slow_linear_solves, stalls
+from warp_lcp.solvers.fischer_newton import FischerNewton
 from warp_lcp.solvers.interior_point import InteriorPoint
 from warp_lcp.solvers.minimum_map_newton import LARGE, MinimumMapNewton
 from warp_lcp.solvers.mprgp import MPRGP
@@ -39,8 +40,8 @@ def default_chain(method: Solver, problem: LCP | None = None) -> Solver:
     - `ProjectedMultigrid`: where cycles crawl, `MinimumMapNewton` on the assembled matrix, unless in single precision, on ranks or
       with floating components; beside rigid bodies `MinimumMapNewton`, where cycles crawl or the free set goes round in circles.
     - `MinimumMapNewton` on matrices: `MPRGP` where linear solves of a large symmetric matrix that is no M-matrix are slow, or its
-      near null space is known; `InteriorPoint` where steps stall or fail; then `ProximalPoint`. On grids that need line relaxation
-      or are not symmetric: on the assembled matrix.
+      near null space is known; `InteriorPoint` where steps stall or fail; then `ProximalPoint`. With negative diagonal entries
+      `FischerNewton` instead of these two. On grids that need line relaxation or are not symmetric: on the assembled matrix.
     - `PrimalDualActiveSet`: `MinimumMapNewton` (not on dense matrices), then as above.
 
     Args:
@@ -115,6 +116,8 @@ def _of_newton(method: MinimumMapNewton, problem: LCP | None) -> Solver:
         return method if takes_points(A) else Fallback(method, (_on_assembled(), stalls_or_crawls))
     if not (has(A, HasRows) and has(A, HasScale)):
         return method
+    if _has_negative_diagonal(problem):
+        return _without_path(method)
     narrow = isinstance(A, SparseOperator) and A.bandwidth <= NARROW
     return _on_matrix(method, _minimizes(problem), StoppingCriteria.patience if narrow else PATH_IDLE)
 
@@ -149,6 +152,18 @@ def _last(steps: int = PATH_IDLE) -> tuple[FallbackEntry, FallbackEntry]:
     layer of unknowns a step. The central path exists for every positive semi-definite A, and needs no free blocks.
     """
     return FallbackEntry(InteriorPoint(precision="double"), stalls, restart=True), FallbackEntry(ProximalPoint(), PathCreeps(steps=steps))
+
+
+@cache
+def _without_path(method: MinimumMapNewton) -> Fallback:
+    """Return the chain of Newton's method on a matrix with negative diagonal entries, of which there need be no central path."""
+    return Fallback(method, FallbackEntry(FischerNewton(), stalls, restart=True))
+
+
+def _has_negative_diagonal(problem: LCP) -> bool:
+    A = problem.A
+    diagonal = A.matrix.numpy().diagonal() if isinstance(A, DenseOperator) else A.diagonal().numpy()
+    return bool((diagonal < 0).any())
 
 
 def _minimizes(problem: LCP) -> bool:
