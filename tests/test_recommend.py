@@ -300,3 +300,19 @@ def test_friction_is_solved_by_default(name):
     result = wl.solve(lcp)
     assert result
     assert result.iterations <= 18
+
+
+def test_a_recommendation_prints_the_chain_its_reasons_and_what_comes_else():
+    advice = wl.recommend(gallery.definite(300, seed=81).lcp(device="cpu"))
+    first, *rest = str(advice).splitlines()
+    assert first == "minimum-map-newton, then interior-point (stalls), then proximal-point (PathCreeps(steps=10))"
+    assert first == str(advice.chain)
+    assert rest[: len(advice.reasons)] == list(advice.reasons)
+    assert rest[-2:] == [f"Expected: {advice.expected}.", f"Else, from the same start: {', '.join(advice.alternatives)}."]
+
+
+def test_few_negative_diagonal_entries_are_newtons_then_fischers():
+    rng = np.random.default_rng(5)
+    A = rng.standard_normal((12, 12)) + np.diag(np.where(np.arange(12) < 3, -1.0, 3.0) * 12**0.5)
+    advice = wl.recommend(wl.LCP(A, rng.standard_normal(12)))
+    assert advice.chain.names == ("minimum-map-newton", "fischer-newton")

@@ -14,6 +14,7 @@ from warp_lcp.problem.solve import Solver, solve
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.rules import LONGEST, Attempt, Rule, method_for, rules_for, steps_allowed
 from warp_lcp.settings import Count, Positive, Settings, Share, checked
+from warp_lcp.solvers.fallback import Fallback
 from warp_lcp.solvers.registry import METHODS
 from warp_lcp.traits import TRIAL, Traits
 
@@ -73,6 +74,16 @@ class Recommendation:
     expected: str | None
     attempts: tuple[Attempt, ...]
     traits: Traits
+
+    def __str__(self) -> str:
+        """Return the methods in order, and the reasons."""
+        chain = self.chain
+        lines = [str(chain) if isinstance(chain, Fallback) else self.name, *self.reasons]
+        if self.expected is not None:
+            lines.append(f"Expected: {self.expected}.")
+        if self.alternatives:
+            lines.append(f"Else, from the same start: {', '.join(self.alternatives)}.")
+        return "\n".join(lines)
 
     @property
     def alternatives(self) -> tuple[str, ...]:

@@ -205,7 +205,15 @@ def test_schema_is_json(dots):
 def test_info_names_versions_and_devices(dots):
     result = call("info")
     assert result.exit_code == 0
-    for expected in ("warp-lcp", "warp-lang", "device cpu", "kernel cache", "simulator dots", "dots that fall"):
+    for expected in (
+        "warp-lcp",
+        "warp-lang",
+        "device cpu",
+        "kernel cache",
+        "simulator dots",
+        "dots that fall",
+        "projected-multigrid, then ",
+    ):
         assert expected in result.stdout
 
 

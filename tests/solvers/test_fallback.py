@@ -275,6 +275,7 @@ def test_without_fallback_the_first_method_ends_the_solve():
     advice = wl.recommend(problem)
     assert advice.chain.names[:2] == ("projected-multigrid", "minimum-map-newton")
     assert advice.chain == wl.default_chain(advice.method, problem)
+    assert str(advice.chain).startswith("projected-multigrid, then minimum-map-newton on the assembled matrix (crawls)")
 
 
 def test_a_chain_costs_easy_grids_nothing():

@@ -18,6 +18,7 @@ from warp_lcp.cli.shown import export, looked_on, render, serve, view
 from warp_lcp.cli.solve_file import Outcome, solve_files
 from warp_lcp.cli.solve_recorded import SUFFIX, check_recorded, file_digest, solve_recorded
 from warp_lcp.cli.suites import benchmarks, suite_names
+from warp_lcp.default_chain import default_chain
 from warp_lcp.distributed.watchdog import LIMIT
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.problem.protocol import families
@@ -41,6 +42,7 @@ from warp_lcp.scene.presets import PresetName
 from warp_lcp.scene.scene_file import built_in_scenes, fix_file, installed_simulators, load_scene
 from warp_lcp.settings import nearest
 from warp_lcp.simulation import InputError, SimulationFailed, StepFailed
+from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
 from warp_lcp.solvers.registry import METHODS
 
 RANKED_SUITE = "scaling"  # what `bench --engine petsc` measures
@@ -386,13 +388,14 @@ def bench(
 
 @app.command()
 def info() -> None:
-    """Print versions, devices and simulators."""
+    """Print versions, devices, simulators and the default method on grids."""
     lines = list(versions().items())
     lines += [(f"device {alias}", text) for alias, text in devices().items()]
     with wrong_input():
         _use_threads(None)
         lines.append(("CPU threads", f"{get_threads()}; set by --threads or WARP_LCP_THREADS"))
     lines += [("CUDA driver", cuda_driver()), ("kernel cache", str(wp.config.kernel_cache_dir))]
+    lines.append(("default on grids", str(default_chain(ProjectedMultigrid()))))
     _print_pairs(lines)
     with wrong_input():
         _print_pairs([(f"simulator {name}", simulator.summary) for name, simulator in installed_simulators().items()])

@@ -32,6 +32,7 @@ class AssembledMatrix(Settings):
 
     supports: ClassVar = (HasStencil,)
     needs: ClassVar[str] = "as the inner method"
+    form: ClassVar[str] = " on the assembled matrix"
 
     inner: Solver
 

@@ -171,6 +171,11 @@ class Fallback:
     def __repr__(self) -> str:
         return f"Fallback({', '.join(_described(entry, first=k == 0) for k, entry in enumerate(self.entries))})"
 
+    def __str__(self) -> str:
+        """Return the methods in order, each with its condition."""
+        first, *others = self.entries
+        return ", then ".join([_named(first.method), *(f"{_named(entry.method)} ({_condition(entry)})" for entry in others)])
+
     def __reduce__(self) -> tuple[Any, ...]:
         return Fallback, self.entries
 
@@ -472,5 +477,13 @@ def _entry(given: Any, *, first: bool) -> FallbackEntry:
 
 def _described(entry: FallbackEntry, *, first: bool) -> str:
     """Return an entry in words."""
-    when = getattr(entry.when, "__name__", repr(entry.when))
-    return method_name(entry.method) if first else f"({method_name(entry.method)}, {when})"
+    return method_name(entry.method) if first else f"({method_name(entry.method)}, {_condition(entry)})"
+
+
+def _named(method: Any) -> str:
+    """Return a method's name, and the form of A that it works on, if that is another one."""
+    return method_name(method) + getattr(method, "form", "")
+
+
+def _condition(entry: FallbackEntry) -> str:
+    return getattr(entry.when, "__name__", repr(entry.when))
