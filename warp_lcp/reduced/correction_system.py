@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from typing import Any
 
 import numpy as np
@@ -162,7 +163,7 @@ class CorrectionSystem:
         """Return the step; on an M-matrix the residual need not fall while the active set shrinks."""
         return Step("newton", iterations, self.active, interim=self._shrinks)
 
-    def fall_back(self, iterations: int, norms: list[float], best: float, length: float) -> Step:
+    def fall_back(self, iterations: int, norms: deque[float], best: float, length: float) -> Step:
         """Take the best length, and on a grid a projected cycle from there; on dense problems a damped step; or fail."""
         x, residual = self.iterate.x, self.iterate.residual
         if not self._settings.safeguard:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from typing import Any
 
 import warp as wp
@@ -147,7 +148,7 @@ class FusedGridSystem:
             self._sinks = self.iterate.descent.sinks
         return Step("newton", iterations, self._active, interim=self._sinks)
 
-    def fall_back(self, iterations: int, norms: list[float], best: float, length: float) -> Step:
+    def fall_back(self, iterations: int, norms: deque[float], best: float, length: float) -> Step:
         """Take projected cycles from where the search has ended."""
         passes = self.iterate
         self._prepare_shortening()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from functools import cached_property
 from typing import Any
 
@@ -168,8 +169,9 @@ class HostIterate(IterateMemory):
     """
 
     def __init__(self, problem: LCP, precision: str, matrix: SmallMatrix | NarrowMatrix) -> None:
-        on_host = problem.device.is_cpu and problem.bounds.affine is None
-        super().__init__(problem, precision, residual=HostResidual(problem, matrix) if on_host else None)
+        self._on_cpu = problem.device.is_cpu
+        by_numpy = self._on_cpu and problem.bounds.affine is None
+        super().__init__(problem, precision, residual=HostResidual(problem, matrix) if by_numpy else None)
 
     def keep(self) -> None:
         """Remember x, on the host."""
@@ -186,7 +188,7 @@ class HostIterate(IterateMemory):
 
     def write(self, values: np.ndarray) -> None:
         """Set x."""
-        if self.problem.device.is_cpu:
+        if self._on_cpu:
             self.read()[...] = values
         else:
             self.x.assign(values)
@@ -220,6 +222,7 @@ class HostSystem:
         self._matrix: SmallMatrix | NarrowMatrix = NarrowMatrix(A, width) if width <= NARROW else SmallMatrix(A)
         self._problem, self._settings = problem, settings
         self.iterate = HostIterate(problem, settings.precision, self._matrix)
+        self._rounds = self.iterate.precision is Precision.SINGLE
 
     def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
         """Forget the sets, and read the bounds as they are now."""
@@ -255,7 +258,8 @@ class HostSystem:
                 return Step("nested iteration", 1, None, interim=True)
         if self._begun:  # the start's residual says nothing of the steps to come
             self._least, self._idle = (residual.norm, 0) if residual.norm < self._least else (self._least, self._idle + 1)
-        target = self.iterate.read() - self.iterate.y() / self._d
+        self._x = self.iterate.read()
+        target = self._x - self.iterate.y() / self._d
         self._below, self._above = target < self._lower, target > self._upper
         self._left -= 1
         return None
@@ -270,16 +274,16 @@ class HostSystem:
         if self._left < 0 or self._idle >= IDLE or self._comes_again(below, above):
             return None
         self._held = below | above
-        self._from = np.where(below, self._lower, np.where(above, self._upper, self.iterate.read()))
-        e = self._matrix.solve(~self._held, -(self._matrix.product(self._from) + self._b))
+        start = np.where(below, self._lower, np.where(above, self._upper, self._x))
+        e = self._matrix.solve(~self._held, -(self._matrix.product(start) + self._b))
         if e is None or not np.isfinite(e).all():
             return None
-        self._e = e
+        self._end = start + e
         return 1
 
     def move(self, length: float) -> float:
         """Take the whole step."""
-        self._go(self._from + self._e)
+        self._go(self._end)
         return self.iterate.residual.norm
 
     def _go(self, values: np.ndarray) -> None:
@@ -289,14 +293,15 @@ class HostSystem:
         if residual.evaluate(iterate.x) <= self._target:  # x may miss its bounds by what the criteria allow
             iterate.write(np.clip(values, self._lower, self._upper))
             residual.current = False
-        iterate.round_iterate()
-        residual.current = residual.current and iterate.precision is not Precision.SINGLE
+        if self._rounds:
+            iterate.round_iterate()
+            residual.current = False
 
     def accept(self, iterations: int) -> Step:
         """Return the step; whole steps may first take the residual up."""
         return Step("active set", iterations, int(np.count_nonzero(self._held)), interim=True)
 
-    def fall_back(self, iterations: int, norms: list[float], best: float, length: float) -> CorrectionSystem:
+    def fall_back(self, iterations: int, norms: deque[float], best: float, length: float) -> CorrectionSystem:
         """Return the system of searched steps, at the best iterate."""
         iterate, residual = self.iterate, self.iterate.residual
         iterate.restore()

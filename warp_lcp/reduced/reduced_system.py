@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from typing import Any, Protocol
 
 from warp_lcp.multigrid.line_hierarchy import takes_points
@@ -49,7 +50,7 @@ class ReducedSystem(Protocol):
     def accept(self, iterations: int) -> Step:
         """Return the step that ends at x, with the linear iterations that it took."""
 
-    def fall_back(self, iterations: int, norms: list[float], best: float, length: float) -> Step | ReducedSystem:
+    def fall_back(self, iterations: int, norms: deque[float], best: float, length: float) -> Step | ReducedSystem:
         """Go on where `solve` finds no step, or the search no length; return the step taken, or a system that takes over.
 
         Args:

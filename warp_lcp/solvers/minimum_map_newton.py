@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -104,12 +105,12 @@ class NewtonWorkspace:
         )
         self.keep, self.restore = iterate.keep, iterate.restore
         self.round_iterate, self.solution = iterate.round_iterate, iterate.solution
-        self.norms: list[float] = []
-        self._memory = settings.memory if settings.safeguard else 1  # 1 is Armijo's monotone search
+        self.norms = deque[float](maxlen=settings.memory if settings.safeguard else 1)  # 1 is Armijo's monotone search
 
     def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
         """Forget the last solve; the operator may have changed."""
-        self.system, self.norms = self._first, []
+        self.system = self._first
+        self.norms.clear()
         self.system.start(warm=warm, tolerance=tolerance, floating=floating)
 
     def step(self) -> Step:
@@ -120,10 +121,10 @@ class NewtonWorkspace:
     def newton_step(self) -> Step:
         """Classify, restrict, solve on the free set, move with a safeguard."""
         system = self.system
-        self.norms = [*self.norms, self.residual.norm][-self._memory :]
+        self.norms.append(self.residual.norm)
         other = system.classify()
         if other is not None:
-            self.norms = []
+            self.norms.clear()
             return other
         if not system.restrict():
             return system.accept(0)
@@ -148,5 +149,6 @@ class NewtonWorkspace:
         found = self.system.fall_back(iterations, self.norms, best, best_length)
         if isinstance(found, Step):
             return found
-        self.system, self.norms = found, []
+        self.system = found
+        self.norms.clear()
         return self.step()
