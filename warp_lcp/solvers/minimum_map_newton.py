@@ -81,28 +81,24 @@ class MinimumMapNewton(NewtonSettings):
 
 
 class NewtonWorkspace:
-    """Memory of the method for one problem.
+    """Memory of the method for one problem: the reduced system, and residuals of the last steps.
 
     Args:
         problem: the problem.
         settings: the method.
-        system: the equations on the free unknowns.
+        system: Newton's equations on the free unknowns.
 
     Attributes:
-        system: those at work; others take over where they lead nowhere.
-        iterate: x, its residual, and the best x so far, of all of them.
+        system: the reduced system at work; another one takes over where it leads nowhere.
+        iterate: x, its residual, and the best x so far, for all of them.
         norms: residual norms where the last steps began; no step may exceed the largest.
     """
 
     def __init__(self, problem: LCP, settings: MinimumMapNewton, system: ReducedSystem) -> None:
         self.problem, self.settings, self._first, self.system = problem, settings, system, system
         self.iterate = iterate = system.iterate
-        self.x, self.residual, self.precision, self.scratch = (
-            iterate.x,
-            iterate.residual,
-            iterate.precision,
-            getattr(iterate, "scratch", None),
-        )
+        self.x, self.residual, self.precision = iterate.x, iterate.residual, iterate.precision
+        self.scratch = getattr(iterate, "scratch", None)
         self.keep, self.restore = iterate.keep, iterate.restore
         self.round_iterate, self.solution = iterate.round_iterate, iterate.solution
         self.norms = deque[float](maxlen=settings.memory if settings.safeguard else 1)  # 1 is Armijo's monotone search
@@ -122,17 +118,17 @@ class NewtonWorkspace:
         """Classify, restrict, solve on the free set, move with a safeguard."""
         system = self.system
         self.norms.append(self.residual.norm)
-        other = system.classify()
+        other = system.classify()  # unknown i is held where x_i - y_i / d_i is outside [l_i, u_i]; F are the others
         if other is not None:
             self.norms.clear()
             return other
-        if not system.restrict():
+        if not system.restrict():  # held unknowns on their bounds; A_FF e_F = -y_F
             return system.accept(0)
         iterations = system.solve()
         return self.fall_back(0, math.inf, 1.0) if iterations is None else self.move(iterations)
 
     def move(self, iterations: int) -> Step:
-        """Halve the step until the residual is less than the largest of the last ones."""
+        """Go x + t e, projected, with t = 1, 1/2, ... until the residual is less than the largest of the last ones."""
         system, limit = self.system, max(self.norms)
         length, best, best_length = 1.0, math.inf, 1.0
         for _ in range(self.settings.backtracks + 1):
