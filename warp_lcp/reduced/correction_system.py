@@ -6,7 +6,6 @@ import math
 from collections import deque
 from typing import Any
 
-import numpy as np
 import warp as wp
 
 from warp_lcp.deadline import check_time
@@ -76,7 +75,7 @@ class CorrectionSystem:
         self._stale = True  # whether the principal system has another free set
         # with an M-matrix each active set of whole steps is part of the one before, whatever the residual does
         self._monotone = isinstance(self.principal, SparseSystem) and self.principal.cycled and not self._problem.A.symmetric
-        self._shrinks, self._last_active = False, math.inf
+        self._shrinks, self._last_active = False, math.inf  # whether the active set has become smaller; unknowns in the last one
         self.principal.refresh()
 
     def monotone_cycle(self) -> Step | None:
@@ -107,12 +106,12 @@ class CorrectionSystem:
         if self.damped is not None and self.damped.proves_infeasible(residual.norm, self._target):
             return Step("newton", 0, 0, SolveStatus.INFEASIBLE)
         self.size = residual.norm
-        moved, active, shifted, self._square = self.sums.of(
+        moved, active, shifted, square = self.sums.of(
             CLASSIFY, stencil=residual.known, bounds=p.bounds.operands, x=self.iterate.x, unknown=p.unknown, free=self.free,
             g=self.principal.r, scale=1 / self.size,
         )  # fmt: skip
-        self.moved, self.active, self._shifted = float(moved), int(active), bool(shifted)
-        self._shrinks, self._last_active = self._monotone and active < self._last_active, float(active)
+        self.moved, self.active, self._shifted, self._square = float(moved), int(active), bool(shifted), float(square)
+        self._shrinks, self._last_active = self._monotone and self.active < self._last_active, self.active
         return self._coarse_step() if self.coarse is not None and self.coarse.is_due(self.moved) else None
 
     def _coarse_step(self) -> Step:
@@ -133,7 +132,7 @@ class CorrectionSystem:
             self._stale = False
         if self._shifted:
             residual.affine(self.iterate.x)
-            self._square = self.sums.of(ON_FREE, y=residual.y, free=self.free, g=self.principal.r, scale=1 / self.size)[0]
+            self._square = float(self.sums.of(ON_FREE, y=residual.y, free=self.free, g=self.principal.r, scale=1 / self.size)[0])
         self._shrinks = self._shrinks and self._square != 0
         return self._square != 0
 
@@ -142,7 +141,7 @@ class CorrectionSystem:
         s, r = self._settings, self.principal.r
         if self.floating is not None:
             self.floating.project(r, self.free)
-        norm, target = float(np.sqrt(self._square)) / self.size, 0.3 * self._target / self.size
+        norm, target = math.sqrt(self._square) / self.size, 0.3 * self._target / self.size
         return self.principal.solve(max((s.eta if self.moved else s.eta**2) * norm, target), s.max_linear_iterations)[0]
 
     def move(self, length: float) -> float:

@@ -84,6 +84,7 @@ class FusedGridSystem:
         # Where x is rounded to float32 the energy says little of a step, and Newton's own safeguard decides.
         passes.cycles_against_creeping = self._exact
         self._target, self._active, self._length, self._step = 0.0, 0, 1.0, 0.0
+        self._sinks = False  # whether the energy has fallen to a new least
 
     def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
         """Forget the search direction; the operator may have changed."""
@@ -120,7 +121,7 @@ class FusedGridSystem:
             least, idle = (residual.norm, 0) if residual.norm < least else (least, idle + 1)
             if idle >= IDLE and not self._exact:  # what rounding x to float32 leaves
                 break
-        self._sinks = passes.descent.sinks and self._exact  # then the residual may rise
+        self._sinks = passes.descent.sinks and self._exact
         self.whole = self._sinks or not math.isfinite(residual.norm) or not passes.bounded
         return iterations
 
