@@ -36,8 +36,8 @@ from warp_lcp.benchmarks.harness.record import Table
 from warp_lcp.benchmarks.harness.report import markdown
 from warp_lcp.benchmarks.harness.timing import Options
 from warp_lcp.benchmarks.problems import natural, splash
+from warp_lcp.reduced.multigrid_ahead import RunAhead
 from warp_lcp.rows.program import LaunchGraph, Program, loops_on_device
-from warp_lcp.solvers.projected_multigrid_ahead import RunAhead
 
 CLOSE, ALIKE = 1e-5, 2e-2  # relative: solutions to 1e-8, and where particles are after many steps
 WRONG = 3  # what `benchmarks.gpu_kernels` ends with where kernels differ

@@ -22,7 +22,7 @@ from warp_lcp.benchmarks.harness.record import Record, Results, Table, shown, sp
 from warp_lcp.benchmarks.harness.timing import Options, ratios
 from warp_lcp.benchmarks.problems import BOUNDS, Splash, plane, splash
 from warp_lcp.problem.protocol import HasStencil, has
-from warp_lcp.solvers.projected_multigrid_workspace import MultigridWorkspace
+from warp_lcp.reduced.multigrid_workspace import MultigridWorkspace
 
 TITLE = "Published methods for the pressure LCP"
 SIZES = (64, 128)
@@ -70,7 +70,7 @@ class TruncatedMultigrid(wl.ProjectedMultigrid):
     def init(self, problem: wl.LCP) -> TruncatedWorkspace:
         """Return a workspace."""
         assert has(problem.A, HasStencil)
-        return TruncatedWorkspace(problem, problem.A, self)
+        return TruncatedWorkspace(problem, problem.A, self, ahead=False)
 
 
 class TruncatedWorkspace(MultigridWorkspace):
@@ -78,11 +78,11 @@ class TruncatedWorkspace(MultigridWorkspace):
 
     def wants_monotone_cycle(self) -> bool:
         """Return False, and forget the direction, so that the next one is the cycle's correction."""
-        self._forget()
+        self.forget_direction()
         return False
 
     def _creeps(self) -> bool:
-        self._judge()
+        self.judge()
         return False
 
 

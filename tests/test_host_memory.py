@@ -12,8 +12,8 @@ WRITES = {  # function: why it may
     "rows/fields.py:unload": "sparse fields are the CPU's",
     "rows/vectors.py:_add_across": "on the CPU only; assigned on CUDA",
     "solvers/staggering.py:accept": "assigned afterwards",
-    "solvers/projected_multigrid_ahead.py:run": "on the CPU only, where the beginning is recorded",
-    "solvers/projected_multigrid_workspace.py:set": "on the CPU only; filled on CUDA",
+    "reduced/multigrid_ahead.py:run": "on the CPU only, where the beginning is recorded",
+    "reduced/multigrid_residual.py:set": "on the CPU only; filled on CUDA",
 }
 
 

@@ -15,12 +15,13 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasColumns, HasRows, HasScale, HasStencil, has
 from warp_lcp.problem.solve import Solver
 from warp_lcp.problem.stopping import StoppingCriteria
+from warp_lcp.reduced.cold_cycles import LARGE
 from warp_lcp.settings import Count, Settings
 from warp_lcp.solvers.assembled_matrix import AssembledMatrix
 from warp_lcp.solvers.fallback import WEAK, Fallback, FallbackEntry, Progress, crawls, fails, slow_linear_solves, stalls
 from warp_lcp.solvers.fischer_newton import FischerNewton
 from warp_lcp.solvers.interior_point import InteriorPoint
-from warp_lcp.solvers.minimum_map_newton import LARGE, MinimumMapNewton
+from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.mprgp import MPRGP
 from warp_lcp.solvers.primal_dual_active_set import PrimalDualActiveSet
 from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid

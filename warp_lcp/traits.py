@@ -20,7 +20,7 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasRows, HasStencil, has, layout_of, takes
 from warp_lcp.problem.solve import solve
 from warp_lcp.problem.stopping import StoppingCriteria
-from warp_lcp.solvers.minimum_map_newton_direct import suits
+from warp_lcp.reduced.host_system import suits
 from warp_lcp.solvers.psor import ProjectedSOR, grid_omega, has_advised_omega
 from warp_lcp.solvers.registry import METHODS
 

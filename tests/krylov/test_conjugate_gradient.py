@@ -9,7 +9,7 @@ from oracle import assemble
 from warp_lcp.krylov import ConjugateGradient
 from warp_lcp.krylov.conjugate_gradient import BEST, ITERATIONS, LIMIT, RR, RZ, RZ_OLD, SLOTS, TOLERANCE, end_kernel
 from warp_lcp.operators.grid_poisson import GridPoisson
-from warp_lcp.reduced.principal_system import DIVIDE
+from warp_lcp.reduced.active_set_kernels import DIVIDE
 from warp_lcp.rows import program, team
 from warp_lcp.rows.vectors import rows_of
 

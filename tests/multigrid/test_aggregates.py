@@ -112,7 +112,7 @@ def test_newton_does_not_creep(wind, method, device):
     assert counts[1] <= 12
     plain = method(monotone_cycles=0)
     work = plain.init(problem)
-    work.coarse = None
+    work.system.coarse = None
     cold = wl.solve(problem, plain, stopping=wl.StoppingCriteria(max_iterations=200), workspace=work)
     assert cold, cold.status
     assert cold.iterations >= 20

@@ -138,7 +138,7 @@ def test_projected_sweeps_lower_the_energy_from_anywhere():
     work.residual.settle_isolated(work.x)
     work.residual.evaluate(work.x)
     work.start(warm=False, tolerance=0.0)
-    work._begin_cycles(300)
+    work.begin_cycles(300)
     energies, norms = [work.residual.energy], [work.residual.norm]
     for _ in range(300):
         work.descent.safe = True

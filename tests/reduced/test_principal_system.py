@@ -7,7 +7,9 @@ import warp as wp
 
 import warp_lcp as wl
 from oracle import assemble
-from warp_lcp.reduced.principal_system import CoupledGridSystem, DiagonalSystem, principal_system
+from warp_lcp.reduced.diagonal_system import DiagonalSystem
+from warp_lcp.reduced.low_rank_system import CoupledGridSystem
+from warp_lcp.reduced.principal_system import principal_system
 from warp_lcp.reduced.sparse_system import IncompleteFactors, suits_multigrid
 
 

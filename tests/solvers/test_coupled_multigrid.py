@@ -7,7 +7,7 @@ import warp as wp
 import warp_lcp as wl
 from oracle import assemble, lemke, natural_residual
 from warp_lcp.reduced.low_rank_correction import LowRankCorrection
-from warp_lcp.solvers.projected_multigrid_coupled import CoupledWorkspace
+from warp_lcp.reduced.multigrid_coupled import CoupledWorkspace
 
 TIGHT = wl.StoppingCriteria(rtol=1e-9, max_iterations=400)
 

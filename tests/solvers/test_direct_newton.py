@@ -176,7 +176,7 @@ def test_kernels_may_evaluate_the_residual_as_they_do_on_cuda():
     for p in (FAMILIES["dense"](5533), option(5533, n=300)):
         problem = lcp(p)
         work = DIRECT.init(problem)
-        work.residual = NaturalResidual(problem)
+        work.residual = work.iterate.residual = NaturalResidual(problem)
         result = wl.solve(problem, DIRECT, workspace=work, x0=p.start, stopping=TIGHT)
         assert result
         np.testing.assert_allclose(result.x.numpy(), wl.solve(problem, x0=p.start, stopping=TIGHT).x.numpy(), atol=1e-12)

@@ -11,8 +11,8 @@ from oracle import assemble, natural_residual
 from warp_lcp.krylov import ConjugateGradient
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.reduced.grid_step_kernels import BETA, CARRY, NORM, SIZE, SLOTS, STEP, plan_whole_step_kernel
+from warp_lcp.reduced.grid_system import GridSystem
 from warp_lcp.reduced.nonsmooth_map import Kink, MapForm, NonsmoothMap
-from warp_lcp.reduced.principal_system import GridSystem
 from warp_lcp.solvers.interior_point import InteriorPoint
 
 SHAPE = (6, 7, 21)

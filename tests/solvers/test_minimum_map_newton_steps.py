@@ -150,7 +150,7 @@ def test_index_sets_on_a_grid(bounds):
     below, above = index_sets(d, x, y, lower, upper)
     assert not (below | above)[tied].any()
     assert (below | above).sum() > 10
-    place, finest = problem.layout.places()[fluid], work.hierarchy.finest
+    place, finest = problem.layout.places()[fluid], work.iterate.hierarchy.finest
     free = finest.stencil.d.numpy().ravel()[place] != 0
     np.testing.assert_array_equal(free, ~(below | above))
     assert residual.active == (below | above).sum()

@@ -12,8 +12,8 @@ import warp_lcp as wl
 from warp_lcp.benchmarks.problems import splash
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
 from warp_lcp.problem.stopping import MeanCriteria
+from warp_lcp.reduced.multigrid_ahead import RunAhead
 from warp_lcp.rows.readings import BYTES, LINE, Reading
-from warp_lcp.solvers.projected_multigrid_ahead import RunAhead
 
 emulated = pytest.mark.skipif("emulated_cuda" not in sys.modules, reason="the plugin emulated_cuda is not there")
 SOLVER = wl.ProjectedMultigrid()

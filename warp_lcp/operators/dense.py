@@ -98,7 +98,11 @@ class DenseOperator(Pickled):
 
     def diagonal(self) -> wp.array[Any]:
         """Return the diagonal of A, shape (n,)."""
-        return wp.array(np.diag(self.matrix.numpy()).copy(), dtype=self.dtype, device=self.device)
+        return wp.array(self.host_diagonal().copy(), dtype=self.dtype, device=self.device)
+
+    def host_diagonal(self) -> np.ndarray:
+        """Return the diagonal of A on the host, shape (n,)."""
+        return self.matrix.numpy().diagonal()
 
     def rows(self) -> CompressedRows:
         """Return the rows, the operator's own memory."""

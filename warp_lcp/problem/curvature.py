@@ -22,12 +22,17 @@ def has_negative_curvature(problem: LCP) -> bool:
     A = problem.A
     if has(A, HasStencil) or has(A, HasColumns):  # which have positive diagonals
         return False
+    by_rows = has(A, HasRows)
+    if by_rows:
+        diagonal = A.host_diagonal() if hasattr(A, "host_diagonal") else A.diagonal().numpy().ravel()
+        if not (diagonal < 0).any():  # as a rule, and quickly seen
+            return False
     lower, upper = problem.bounds.host(0), problem.bounds.host(1)
     free = (np.isinf(lower) | np.isinf(upper)) & (problem.unknown.numpy() == 1)
     if not free.any():
         return False
-    if has(A, HasRows):
-        entries = A.diagonal().numpy().ravel()[free]
+    if by_rows:
+        entries = diagonal[free]
         return bool((entries < 0).any() and (entries <= 0).all())
     away = np.where(np.isinf(upper), 1.0, -1.0)
     sizes = np.random.default_rng(19620701).uniform(0.5, 1.5, len(free)) if A.symmetric else 1.0

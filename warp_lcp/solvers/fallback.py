@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Protocol, runtime_checkable
 
 import warp as wp
@@ -46,17 +47,19 @@ class Progress:
 
     def begin(self) -> None:
         """Forget the method before."""
-        self.least, self.norms = list[float](), list[float]()
+        self.least: list[float] = []
+        self.norms: list[float] = []
         self.step: Step | None = None
         self.waited, self._smallest = 0, math.inf
 
     def record(self, norm: float) -> None:
         """Take note of the residual at the start of a step."""
+        least, interim = self.least, self.step is not None and self.step.interim
         self.norms.append(norm)
-        self.least.append(min(self.least[-1], norm) if self.least else norm)
-        interim = self.step is not None and self.step.interim
+        least.append(norm if not least or norm < least[-1] else least[-1])
         self.waited = 0 if interim or norm <= PROGRESS * self._smallest else self.waited + 1
-        self._smallest = norm if interim else min(self._smallest, norm)
+        if interim or norm < self._smallest:
+            self._smallest = norm
 
     @property
     def taken(self) -> int:
@@ -74,7 +77,7 @@ def fails(progress: Progress) -> bool:
 
 def stalls(progress: Progress) -> bool:
     """Return whether the last step has failed, or 10 steps brought no progress."""
-    return fails(progress) or progress.waited >= STALLED
+    return progress.waited >= STALLED or (progress.step is not None and progress.step.failure is not None)
 
 
 def crawls(progress: Progress) -> bool:
@@ -185,7 +188,7 @@ class Fallback:
             raise AttributeError(name)
         return getattr(self.entries[0].method, name)
 
-    @property
+    @cached_property
     def name(self) -> str:
         """Name of the first method."""
         return method_name(self.entries[0].method)
@@ -234,7 +237,8 @@ class SpareChain:
 class FallbackWorkspace:
     """Memory of a chain for one problem.
 
-    Attributes that are not its own are those of the first method's workspace.
+    Attributes that are not its own are those of the first method's workspace. As long as that method is at work, a step costs little more
+    than its own: residuals are noted, and conditions asked.
 
     Attributes:
         x: the iterate, a stored field.
@@ -249,13 +253,15 @@ class FallbackWorkspace:
 
     def __init__(self, problem: Any, entries: tuple[FallbackEntry, ...], first: Any) -> None:
         self.problem, self._entries, self._first = problem, entries, first
-        self.x, self.residual, self.precision = first.x, first.residual, Precision(first.precision)
+        self.x, self.residual, self.round_iterate = first.x, first.residual, first.round_iterate
+        self.precision = first.precision if isinstance(first.precision, Precision) else Precision(first.precision)
+        self._may_be_ahead = hasattr(first, "is_ahead")  # whether its device may take steps without the host
+        if hasattr(first, "begin_ahead"):
+            self.begin_ahead = first.begin_ahead
         self._works: dict[int, Any] = {0: first}  # by place in the chain; None: the method does not take the problem
         self._suited: dict[int, bool] = {}  # by place: whether a method takes such a problem, before it has a workspace
         self._best: wp.array[Any] | None = None
-        self._progress = Progress(problem, 0.0)
-        self._place, self._since = 0, 0
-        self._floating: FloatingComponents | None = None
+        self._place = 0
         self._left_first = False  # whether the best iterate is kept here and no longer by the first workspace
         self._at_best, self._best_norm = False, math.inf
 
@@ -278,10 +284,12 @@ class FallbackWorkspace:
     def keep(self) -> None:
         """Remember x as the best iterate."""
         self._at_best, self._best_norm = True, self.residual.norm
+        if not self._left_first:
+            self._first.keep()
+            return
+        self._store_best()
         work = self._works[self._place]
-        if self._left_first:
-            self._store_best()
-        if work is not self._first or not self._left_first:
+        if work is not self._first:
             work.keep()
 
     def restore(self) -> None:
@@ -294,19 +302,19 @@ class FallbackWorkspace:
 
     def step(self) -> Step:
         """Hand over if that is due, then take a step."""
-        progress = self._progress
+        progress, first, at_first = self._progress, self._first, self._place == 0
         progress.record(self.residual.norm)
-        if self._place == 0 and getattr(self._first, "is_ahead", False):  # nothing is handed over: the device has taken the step
-            self._at_best = False
-            progress.step = self._entries[0].method.step(self.problem, self._first, self.x)
-            return progress.step
-        place = self._due()
-        if place is not None:
+        ahead = at_first and self._may_be_ahead and first.is_ahead  # nothing is handed over: the device has taken the step
+        if not ahead and (place := self._due()) is not None:
             self._hand_over(place)
+            at_first = False
         self._at_best = False
-        done = self._advance()
-        self._progress.step = done
-        if self._place > 0:
+        if at_first:
+            done = progress.step = self._entries[0].method.step(self.problem, first, first.x)
+            if ahead:
+                return done
+        else:
+            done = progress.step = self._advance()
             patient = self._since <= GRACE or self._place + 1 < len(self._entries)
             name = done.method or method_name(self._entries[self._place].method)
             done = replace(done, interim=done.interim or patient, method=name)
@@ -319,9 +327,10 @@ class FallbackWorkspace:
 
     def _due(self) -> int | None:
         """Return the place of the method that takes over now, None if none does."""
-        if self._place + 1 == len(self._entries):
-            return None
-        if not any(entry.when(self._progress) for entry in self._entries[self._place + 1 :]):
+        for entry in self._entries[self._place + 1 :]:
+            if entry.when(self._progress):
+                break
+        else:
             return None  # conditions cost less than what follows
         for place in range(self._place + 1, len(self._entries)):
             entry = self._entries[place]
@@ -416,10 +425,8 @@ class FallbackWorkspace:
         self._progress.record(self.residual.norm)
 
     def _advance(self) -> Step:
-        """Take a step, or a batch of steps, of the method at work; write the iterate to x."""
+        """Take a step, or a batch of steps, of a later method; write the iterate to x."""
         entry, work, first = self._entries[self._place], self._works[self._place], self._first
-        if self._place == 0:
-            return entry.method.step(self.problem, first, first.x)
         self._since += 1
         done = self._one_step(entry.method, work) if entry.batch == 1 else self._batch(entry, work)
         if work is not first:

@@ -21,12 +21,13 @@ from warp_lcp.problem.scale import NoTranspose
 from warp_lcp.problem.solve import IterateMemory, Precision, Step
 from warp_lcp.reduced.dense_problem import DenseWorkspace
 from warp_lcp.reduced.descent import DECREASE, NonmonotoneSearch
+from warp_lcp.reduced.grid_system import GridSystem
+from warp_lcp.reduced.multigrid_workspace import ColdStart
 from warp_lcp.reduced.nonsmooth_map import FiniteDifferenceSystem, HostMap, Kink, KinkName, MapForm, NonsmoothMap
-from warp_lcp.reduced.principal_system import GridSystem, principal_system
+from warp_lcp.reduced.principal_system import principal_system
 from warp_lcp.reduced.settings import NewtonSettings
 from warp_lcp.settings import Count, CountOrZero, ShareOrAll, renamed
 from warp_lcp.solvers.gradient_descent import DescentWorkspace, GradientDescent
-from warp_lcp.solvers.projected_multigrid import ColdStart
 
 SHARE = 0.95  # lambda of the penalized map for dense problems: measured on frictional contacts
 FIRST_STEPS = 30  # of the regularized stage: those that succeed need 5 to 27

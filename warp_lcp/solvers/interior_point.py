@@ -22,13 +22,14 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.solve import IterateMemory, Step
 from warp_lcp.reduced.equilibrated import EquilibratedWorkspace
-from warp_lcp.reduced.principal_system import GridSystem, principal_system
+from warp_lcp.reduced.grid_system import GridSystem
+from warp_lcp.reduced.multigrid_workspace import ColdStart
+from warp_lcp.reduced.principal_system import principal_system
 from warp_lcp.reduced.settings import NewtonSettings
 from warp_lcp.rows import KernelFile, Known, Wave
 from warp_lcp.rows.fields import zeros_like
 from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, Positive, Share
-from warp_lcp.solvers.projected_multigrid import ColdStart
 
 LARGEST_START = 1e6  # of the residual's norm: ||b|| up to which it gives the start's size
 

@@ -14,12 +14,13 @@ from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.solve import IterateMemory, Step
-from warp_lcp.reduced.principal_system import ON_FREE, principal_system
+from warp_lcp.reduced.active_set_kernels import ON_FREE
+from warp_lcp.reduced.multigrid_workspace import ColdStart
+from warp_lcp.reduced.principal_system import principal_system
 from warp_lcp.reduced.settings import NewtonSettings
 from warp_lcp.rows import KernelFile
 from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Positive, Share
-from warp_lcp.solvers.projected_multigrid import ColdStart
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/penalty.h")
 MOVE = KERNELS["penalty.move"]

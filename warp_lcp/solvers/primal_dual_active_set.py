@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.deadline import time_is_up
-from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.problem.bounds import INFINITE, Bounds
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasRows, HasScale, has
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve import PrecisionName, Step
+from warp_lcp.problem.solve import Step
+from warp_lcp.reduced.active_set_kernels import projected_move
+from warp_lcp.reduced.correction_system import CorrectionSystem
 from warp_lcp.reduced.dense_problem import DenseProblem, pivots_of
-from warp_lcp.reduced.principal_system import projected_move
-from warp_lcp.settings import Count, CountOrZero, Settings, Share
+from warp_lcp.reduced.settings import NewtonSettings
+from warp_lcp.settings import Share
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
 
 LOWER, FREE, UPPER = -1, 0, 1  # where least-index pivoting has an unknown
@@ -31,7 +32,7 @@ SLACK = 1e-12  # of the largest magnitudes of x and y: violations below it are r
 
 
 @dataclass(frozen=True, kw_only=True)
-class PrimalDualActiveSet(Settings):
+class PrimalDualActiveSet(NewtonSettings):
     """Primal-dual active set method (Hintermueller, Ito, Kunisch 2003).
 
     It guesses the active set from x and y, solves for the rest, and repeats until the guess stays.
@@ -61,11 +62,7 @@ class PrimalDualActiveSet(Settings):
     definite: ClassVar[bool] = True
     preconditioned: ClassVar[bool] = True
 
-    precision: PrecisionName = "mixed"
-    monotone_cycles: CountOrZero = 2
     eta: Share = 0.01
-    max_linear_iterations: Count = 200
-    cycle: CycleSettings = field(default_factory=CycleSettings)
     stop_if_singular: bool = True
 
     def as_newton(self) -> MinimumMapNewton:
@@ -85,7 +82,7 @@ class PrimalDualActiveSet(Settings):
 
         Least-index pivots after a recurring set.
         """
-        return work.step(x)
+        return work.step()
 
 
 class ActiveSetWorkspace(NewtonWorkspace):
@@ -97,54 +94,57 @@ class ActiveSetWorkspace(NewtonWorkspace):
         first: the residual's norm before the first step.
     """
 
+    system: CorrectionSystem
     places: np.ndarray | None = None
 
     def __init__(self, problem: LCP, settings: MinimumMapNewton, *, stop_if_singular: bool) -> None:
+        super().__init__(problem, settings, CorrectionSystem(problem, settings))
         self._stops, self._watched = stop_if_singular, stop_if_singular and has(problem.A, HasRows) and has(problem.A, HasScale)
-        super().__init__(problem, settings)
 
     def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
         """Forget the sets; the operator may have changed."""
         super().start(warm=warm, tolerance=tolerance, floating=floating)
+        self._target = tolerance
         self._seen: dict[bytes, float] = {}  # residuals at the sets met
         self._last, self._moved, self._stuck, self._pivots = b"", True, 0, 0
         self.cycled, self.places, self.first = False, None, 0.0
         self._unbounded = Bounds(self.problem.layout, *INFINITE).operands
 
-    def newton_step(self, x: wp.array[Any]) -> Step:
+    def newton_step(self) -> Step:
         """Classify, solve on the free set, take the whole step; a least-index one after a cycle."""
         if self.places is not None:
-            return self.least_index_step(x)
-        step = super().newton_step(x)
+            return self.least_index_step(self.x)
+        step = super().newton_step()
         held = step.linear_iterations == 0 and step.failure is None  # every unknown is
-        if held and self._cycles(x) and isinstance(self.problem.A, DenseOperator):
-            return self.least_index_step(x)
+        if held and self._cycles(self.x) and isinstance(self.problem.A, DenseOperator):
+            return self.least_index_step(self.x)
         return step
 
-    def _move(self, x: wp.array[Any], size: float, iterations: int, active: int) -> Step:
+    def move(self, iterations: int) -> Step:
         """Take the whole step, without a search: the base class has classified, and solved on the free set."""
-        p = self.problem
-        cycles = self._cycles(x)
+        p, x, system = self.problem, self.x, self.system
+        cycles, step = self._cycles(x), replace(system.accept(iterations), name="active set")
         if self._stops and self._stuck >= STUCK:
-            return Step("active set", iterations, active, SolveStatus.STAGNATED)
+            return replace(step, failure=SolveStatus.STAGNATED)
         if cycles and isinstance(p.A, DenseOperator):
             return self.least_index_step(x)
         if cycles:
-            return Step("active set", iterations, active, SolveStatus.STAGNATED)
+            return replace(step, failure=SolveStatus.STAGNATED)
         if self._watched:
-            wp.copy(self.trial, x)
+            wp.copy(system.start_of_step, x)
         bounds = self._unbounded if self._moved else p.bounds.operands  # within rounding of the bounds at the end
-        projected_move(self._sums.rows, bounds, x, self.system.e, size, x)
-        self._finish_move(x)
+        projected_move(system.sums.rows, bounds, x, system.principal.e, system.size, x)
+        system.settle()
+        self.round_iterate()
         norm = self.residual.evaluate(x)
         if self._watched and not norm <= BLOWN * self.first:  # the free block is all but singular
-            wp.copy(x, self.trial)
+            wp.copy(x, system.start_of_step)
             self.residual.evaluate(x)
-            return Step("active set", iterations, active, SolveStatus.STAGNATED)
-        if norm <= self.target:  # x may miss its bounds by what the criteria allow
+            return replace(step, failure=SolveStatus.STAGNATED)
+        if norm <= self._target:  # x may miss its bounds by what the criteria allow
             self.residual.start(x, keep=True)
-            self._round(x)
-        return Step("active set", iterations, active, interim=self._watched and self._moved)  # whole steps may first take the residual up
+            self.round_iterate()
+        return replace(step, interim=step.interim or (self._watched and self._moved))  # whole steps may first take the residual up
 
     def _cycles(self, x: wp.array[Any]) -> bool:
         """Return whether the set has come again, now or before, without a residual much smaller than then."""
@@ -158,7 +158,7 @@ class ActiveSetWorkspace(NewtonWorkspace):
 
     def _fingerprint(self, x: wp.array[Any]) -> bytes:
         """Return what tells a set, with its bounds, from others."""
-        free = self.free.numpy() != 0
+        free = self.system.free.numpy() != 0
         at_upper = ~free & (x.numpy() == self.problem.upper.numpy())
         return hashlib.blake2b(np.packbits(free).tobytes() + np.packbits(at_upper).tobytes(), digest_size=16).digest()
 
@@ -167,7 +167,7 @@ class ActiveSetWorkspace(NewtonWorkspace):
         own = DenseProblem.read(self.problem)
         data, units = own.scaled()
         if self.places is None:
-            free, at = self.free.numpy()[own.rows] != 0, x.numpy()[own.rows]
+            free, at = self.system.free.numpy()[own.rows] != 0, x.numpy()[own.rows]
             self.places = np.where(free, FREE, np.where(at == own.upper, UPPER, LOWER))
         pivots, most = 0, pivots_of(None, len(data.b)) * 8
         values, violated, singular = _basic_solution(data, self.places)
@@ -182,7 +182,7 @@ class ActiveSetWorkspace(NewtonWorkspace):
         stored = x.numpy().copy()
         stored[own.rows] = units * np.clip(values, data.lower, data.upper)
         x.assign(stored)
-        self._round(x)
+        self.round_iterate()
         failure = None if violated.size else SolveStatus.STAGNATED  # counts only if the criteria are not met by rounding
         return Step("least index", pivots, int(np.count_nonzero(self.places != FREE)), failure, interim=bool(violated.size))
 

@@ -8,16 +8,15 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_lcp.multigrid.cycle_settings import CycleSettings
-from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.operators.sum import grid_and_low_rank
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasColumns, HasStencil, check_taken, has
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import PrecisionName, Step
 from warp_lcp.problem.spare_workspace import SpareWorkspace, lend
+from warp_lcp.reduced.multigrid_coupled import CoupledWorkspace
+from warp_lcp.reduced.multigrid_workspace import MultigridWorkspace
 from warp_lcp.settings import Count, CountOrZero, Settings
-from warp_lcp.solvers.projected_multigrid_coupled import CoupledWorkspace
-from warp_lcp.solvers.projected_multigrid_workspace import MultigridWorkspace
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,25 +89,3 @@ class ProjectedMultigrid(Settings):
         if work.wants_monotone_cycle():
             return work.monotone_step()
         return work.truncated_step()
-
-
-class ColdStart(MultigridWorkspace):
-    """Memory of the cycles, whose iterate, residual and hierarchy the method shares.
-
-    The finest diagonal of the hierarchy takes the method's shifts, and the method keeps the best iterate.
-
-    Args:
-        problem: the problem.
-        A: its operator.
-        settings: of the method, with `precision`, `monotone_cycles` and `cycle`.
-    """
-
-    def __init__(self, problem: LCP, A: HasStencil, settings: Any) -> None:
-        super().__init__(problem, A, settings, shifted=True)
-        self._stored = True  # elsewhere
-
-    def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
-        """Begin; the method may have written the finest diagonal since it was coarsened."""
-        self.hierarchy.finest.changed.fill_(1)
-        self.distrust_hierarchy()
-        super().start(warm=warm, tolerance=tolerance, floating=floating)

@@ -15,7 +15,8 @@ from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasRows, Relaxes, check_taken
 from warp_lcp.problem.solve import PrecisionName, Step
-from warp_lcp.reduced.principal_system import ON_FREE, principal_system, projected_move
+from warp_lcp.reduced.active_set_kernels import ON_FREE, projected_move
+from warp_lcp.reduced.principal_system import principal_system
 from warp_lcp.rows import KernelFile
 from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, Ge, Relaxation, Settings, Share

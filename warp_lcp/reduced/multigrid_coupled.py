@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import warp as wp
@@ -15,11 +16,12 @@ from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
 from warp_lcp.reduced import grid_step_kernels as kernels
 from warp_lcp.reduced import low_rank_correction as coupling
 from warp_lcp.reduced.low_rank_correction import LowRankCorrection
+from warp_lcp.reduced.multigrid_ahead import RunAhead
+from warp_lcp.reduced.multigrid_residual import AssessedResidual
+from warp_lcp.reduced.multigrid_workspace import MultigridWorkspace
 from warp_lcp.rows.program import Launch, LaunchGraph, Program, launch_now
 from warp_lcp.rows.program import launch as launch_recorded
 from warp_lcp.rows.vectors import CONVERT, rows_of
-from warp_lcp.solvers.projected_multigrid_ahead import RunAhead
-from warp_lcp.solvers.projected_multigrid_workspace import AssessedResidual, MultigridWorkspace
 
 if TYPE_CHECKING:
     from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
@@ -31,7 +33,7 @@ class CoupledResidual(AssessedResidual):
     Its d_i are the diagonal of A alone, which is no larger.
     """
 
-    def __init__(self, problem: LCP, A: HasStencil, low: LowRankOperator, hierarchy: Hierarchy, *, rounded: bool) -> None:
+    def __init__(self, problem: LCP, A: HasStencil, hierarchy: Hierarchy, *, low: LowRankOperator, rounded: bool) -> None:
         super().__init__(problem, A, hierarchy, rounded=rounded)
         self.diagonal, self.unit, self._diagonal_of = A.stencil.d, float(A.stencil.unit), None
         self._low, self._b = low, wp.zeros_like(problem.b)  # in the place of the problem's
@@ -77,8 +79,8 @@ class CoupledWorkspace(MultigridWorkspace):
     most_runs = 3
 
     def __init__(self, problem: LCP, A: HasStencil, low: LowRankOperator, settings: ProjectedMultigrid) -> None:
+        super().__init__(problem, A, settings, residual=partial(CoupledResidual, low=low), ahead=False)
         self._low = low
-        super().__init__(problem, A, settings)
         self.correction = LowRankCorrection(low, self.hierarchy)
         self._ahead = RunAhead(self, rebuilds=False) if RunAhead.suits(self) else None
         self._evaluation = LaunchGraph(problem.device, self._launch_evaluation, at_once=problem.layout.across is not None)
@@ -88,9 +90,6 @@ class CoupledWorkspace(MultigridWorkspace):
         self.readings = (low.products, *self.correction.readings)
         self._prepared = False  # whether potentials have been made as the solve began
         low.products_of = self.x if problem.layout.across is None else None
-
-    def _residual(self, problem: LCP, rounded: bool) -> CoupledResidual:
-        return CoupledResidual(problem, self.A, self._low, self.hierarchy, rounded=rounded)
 
     def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
         """Forget the search direction; operator and bodies may have changed."""
@@ -105,9 +104,10 @@ class CoupledWorkspace(MultigridWorkspace):
         self._prepared = reference is not None and self.correction.is_made_ahead
         return reference
 
-    def _begin_cycles(self, count: int) -> None:
-        self._cycles_left = count
-        self._forget()
+    def begin_cycles(self, count: int) -> None:
+        """Let projected cycles come next: all unknowns are in their right-hand side."""
+        self.cycles_left = count
+        self.forget_direction()
         self.free_set_noted = False
         self._evaluation.run(self.x, False, variant=self.problem_key())
         self.residual.read(classified=False)
@@ -130,7 +130,7 @@ class CoupledWorkspace(MultigridWorkspace):
         """Follow the free set, with the correction too."""
         stale = self.stale
         super().rebuild(classify=classify)
-        if not (stale or self._fresh) or self._cycles_left > 0:
+        if not (stale or self._fresh) or self.cycles_left > 0:
             return
         begins, self._fresh = self._fresh, False
         noted, self.free_set_noted = self.free_set_noted, False

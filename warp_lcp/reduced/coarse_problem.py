@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -19,10 +19,7 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import AIR, FLUID, HasStencil
 from warp_lcp.problem.solve import solve
 from warp_lcp.problem.stopping import StoppingCriteria
-from warp_lcp.reduced.principal_system import LineSystem
-
-if TYPE_CHECKING:
-    from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
+from warp_lcp.reduced.line_system import LineSystem
 
 ROUGH = partial(StoppingCriteria, rtol=1e-2, max_iterations=30)  # of a correction that interpolation blurs by a layer or two anyway
 # a set creeps while more than this share of what the last step moved moves again: at that rate a dozen steps or more are still to
@@ -40,10 +37,11 @@ class CoarseProblem:
 
     Args:
         A: the matrix.
+        settings: of Newton's method, a `MinimumMapNewton`.
         coarse: whether A is a coarse problem's.
     """
 
-    def __init__(self, A: Any, settings: MinimumMapNewton, *, coarse: bool = False) -> None:
+    def __init__(self, A: Any, settings: Any, *, coarse: bool = False) -> None:
         self._A, self._coarse, self._version = A, coarse, -1
         self._settings = replace(settings, monotone_cycles=0, direct=False)
         self._work: Any = None
@@ -86,8 +84,8 @@ class CoarseProblem:
             A = SparseOperator(matrix, device=self._A.device, dtype=wp.float64)
             b, lower, upper = (A.layout.zeros(wp.float64) for _ in range(3))
             self._work = self._settings.init(LCP(A, b, lower, upper))
-            if self._work.coarse is not None:
-                self._work.coarse = CoarseProblem(A, self._settings, coarse=True)
+            if self._work.system.coarse is not None:
+                self._work.system.coarse = CoarseProblem(A, self._settings, coarse=True)
         return self._work is not None
 
 
@@ -103,7 +101,7 @@ class CoarseStencilProblem(CoarseProblem):
         settings: of Newton's method.
     """
 
-    def __init__(self, A: HasStencil, system: LineSystem, settings: MinimumMapNewton) -> None:
+    def __init__(self, A: HasStencil, system: LineSystem, settings: Any) -> None:
         self._system, self._hierarchy = system, system.hierarchy
         super().__init__(A, settings)
 

@@ -1,201 +1,68 @@
-"""What projected multigrid remembers of a problem: the residual with its free set, the iterate and its direction."""
+"""Projected and truncated multigrid cycles at work on a grid problem: the iterate, its residual with a free set, and a direction."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable
 from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import warp as wp
 
 from warp_lcp.multigrid.cycle_passes import CLEAR
 from warp_lcp.multigrid.halo_levels import beside_cuts
-from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.multigrid.turning import make_hierarchy
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasStencil
-from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.solve import IterateMemory, Precision, Step
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
 from warp_lcp.reduced import grid_step_kernels as kernels
 from warp_lcp.reduced.descent import Descent
-from warp_lcp.rows import Bound, Rows
+from warp_lcp.reduced.multigrid_ahead import RunAhead
+from warp_lcp.reduced.multigrid_residual import AssessedResidual
+from warp_lcp.rows import Rows
 from warp_lcp.rows.fields import nothing
 from warp_lcp.rows.program import Launch, Program, as_one_table, launch_now
 from warp_lcp.rows.program import launch as launch_recorded
 from warp_lcp.rows.readings import Reading
-from warp_lcp.rows.vectors import Reduction
-from warp_lcp.solvers.projected_multigrid_ahead import RunAhead
 
 if TYPE_CHECKING:
     from warp_lcp.reduced.low_rank_correction import LowRankCorrection
-    from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
 
 AHEAD = 20  # steps that the device may take without the host: then their pace is looked at
 
 
-class AssessedResidual(NaturalResidual):
-    """The natural residual, evaluated together with the free set and the right-hand side on it.
-
-    Attributes:
-        classified: whether the last evaluation let unknowns at a bound leave the free set; after `start`, whether the next one will.
-        free_set: version of the free set and of the operator: it grows when one of them changes.
-        active: unknowns held.
-        energy: x'Ax/2 + b'x.
-    """
-
-    _minimum_map = False
-
-    def __init__(self, problem: LCP, A: HasStencil, hierarchy: Hierarchy, *, rounded: bool) -> None:
-        super().__init__(problem)
-        self._A, self._finest, self._hierarchy, self._version = A, hierarchy.finest, hierarchy, A.version
-        self._rounded, self._b = rounded, problem.b
-        self._away: wp.array[Any] | None = None
-        self._reading = Reading(A.device, kernels.SLOTS)
-        self.scalars = self._reading.array
-        places = A.stencil.rows.places
-        self.sums = Reduction(problem.layout.size, A.device, self.scalars, columns=4, threads=places, across=problem.layout.across)
-        self.classified, self.free_set, self.active, self.energy, self._norm_of_b = False, 1, 0, 0.0, 0.0
-        self.size = 1.0  # what the right-hand side is divided by
-
-    def start(self, x: wp.array[Any], *, keep: bool) -> None:
-        """Set x to clip(x, l, u) or clip(0, l, u); a guess is classified, a cold start is not."""
-        self.renew()
-        with as_one_table(x.device, self.problem.layout.across):
-            super().start(x, keep=keep)
-            if not keep:
-                self.launch_square_of_b()
-        self.classified = keep
-        if not keep:
-            self.share_bounds()
-            self._norm_of_b = float(np.sqrt(self.square_of_b.numpy()[0]))
-            self.set(kernels.SIZE, self._norm_of_b or 1.0)
-            self.set(kernels.STEP, 0.0)
-
-    def share_bounds(self, launch: Launch = launch_now) -> None:
-        """Fill the bounds' ghost cells: x's will move as the cells do that they stand for."""
-        ghosts, (lower, _, upper, _, code) = self._A.stencil.ghosts, self.problem.bounds.operands
-        for bound in (lower, upper, code):
-            if ghosts is not None and bound.size:
-                ghosts.filling(bound).launch(launch)
-
-    def renew(self) -> None:
-        """Take the operator again if it has changed."""
-        if self.has_new_operator():
-            self._hierarchy.refresh()
-
-    def has_new_operator(self) -> bool:
-        """Return whether the operator has changed; the caller then refreshes the hierarchy."""
-        if self._version == self._A.version:
-            return False
-        self._version, self.free_set = self._A.version, self.free_set + 1
-        return True
-
-    def norm_of_b(self) -> float:
-        """Return ||b|| over the unknowns."""
-        return self._norm_of_b
-
-    def evaluate(self, x: wp.array[Any], classify: bool | None = None) -> float:
-        """Compute the norm of the natural residual at x, the free set and the right-hand side.
-
-        Args:
-            x: stored field.
-            classify: whether unknowns at a bound leave the free set; None: as in the last evaluation.
-        """
-        classify = self.classified if classify is None else classify
-        plain = type(self).assess is AssessedResidual.assess  # others may launch by Warp alone
-        with as_one_table(x.device, self.problem.layout.across) if plain else nullcontext():
-            self.assess(x, classify=classify)
-        return self.read(classified=classify)
-
-    def assess(self, x: wp.array[Any], *, classify: bool, launch: Launch = launch_now) -> None:
-        """Launch the evaluation at x; `read` has what it finds."""
-        self._A.stencil.wrap(x, launch=launch)
-        kernels.ADVANCE.launch(None, self._assessing(x, classify), launch=launch)
-        self.sums.add_up(int(kernels.NORM), columns=4, launch=launch)
-
-    def update(self, x: wp.array[Any], direction: wp.array[Any], *, launch: Launch = launch_now) -> None:
-        """Launch the step from x along the direction that the cycle's correction gives."""
-        self._updating(self._A.stencil.rows, x, direction).launch(launch)
-
-    def advance(self, x: wp.array[Any], direction: wp.array[Any], *, classify: bool, launch: Launch = launch_now) -> None:
-        """Launch the step and the evaluation where it ends: one launch on the CPU, unless periodic ghost cells must be filled between.
-
-        Ghost cells that stand for cells of others take the step by themselves; x's and the correction's are filled.
-        """
-        p, s = self.problem, self._A.stencil
-        if p.device.is_cuda or any(s.periodic):
-            self.update(x, direction, launch=launch)
-            self.assess(x, classify=classify, launch=launch)
-            return
-        for axis, end in s.ghosts.cuts if s.ghosts is not None else ():
-            self._updating(Rows.beyond(s.padding, p.device, axis, end), x, direction).launch(launch)
-        kernels.ADVANCE.launch(self._updating(s.rows, x, direction), self._assessing(x, classify), launch=launch)
-        self.sums.add_up(int(kernels.NORM), columns=4, launch=launch)
-
-    def _updating(self, rows: Rows, x: wp.array[Any], direction: wp.array[Any]) -> Bound:
-        bounds = self.problem.bounds.operands
-        return kernels.UPDATE.bind(rows, bounds=bounds, x=x, z=self._finest.x, q=direction, scalars=self.scalars)
-
-    def _assessing(self, x: wp.array[Any], classify: bool) -> Bound:
-        p, finest = self.problem, self._finest
-        return kernels.ASSESS.bind(
-            self._A.stencil.rows, stencil=self._A.stencil, bounds=p.bounds.operands, x=x, b=self._b, unknown=p.unknown,
-            free=finest.stencil.d, g=finest.b, changed=finest.changed.flatten(), away=self._away, scalars=self.scalars,
-            classify=classify, out=self.sums.partials, MINIMUM_MAP=self._minimum_map, ROUNDED=self._rounded,
-        )  # fmt: skip
-
-    def read(self, *, classified: bool) -> float:
-        """Read what the evaluation found; a step that is not finite was not taken, and its residual is no number.
-
-        Args:
-            classified: the evaluation's `classify`.
-        """
-        self._reading.changed()
-        scalars = self._reading.numpy()
-        return self.take([*scalars[:4], scalars[int(kernels.STEP)], scalars[int(kernels.SIZE)]], classified=classified)
-
-    def take(self, row: Iterable[float], norm_of_b: float | None = None, *, classified: bool) -> float:
-        """Take what an evaluation has found, see `projected_multigrid_ahead.keep_row`; return the norm."""
-        self.classified = classified
-        square, moved, active, twice, step, size = map(float, row)
-        self.energy, self.size = 0.5 * twice, size
-        self.norm, self.current, self.active = float(np.sqrt(square)), True, int(active)
-        if not math.isfinite(step):
-            self.norm = math.nan
-        if moved > 0:
-            self.free_set += 1
-        if norm_of_b is not None:
-            self._norm_of_b = norm_of_b
-        return self.norm
-
-    def set(self, slot: int, value: float) -> None:
-        """Write a scalar to its slot on the device."""
-        if self.scalars.device.is_cpu:
-            self.scalars.numpy()[int(slot)] = value
-        else:
-            self.scalars[int(slot) : int(slot) + 1].fill_(value)
-        if slot == kernels.SIZE:
-            self.set(kernels.PER_SIZE, 1.0 / value if value else math.inf)
-
-
 class MultigridWorkspace(IterateMemory):
-    """Memory of the method for one problem.
+    """Memory of `ProjectedMultigrid` for one problem; its cycles also serve other methods on grids.
 
     x is moved in place. The best iterate is not stored while it is x, nor when x is one step past it, for a step can be taken back; it
     is when the residual has risen and goes on from there.
+
+    Args:
+        problem: the problem.
+        A: its operator.
+        settings: of the method, with `precision`, `monotone_cycles` and `cycle`.
+        residual: makes the residual of the problem, the operator and the hierarchy.
+        shifted: whether the finest diagonal takes shifts.
+        ahead: whether the device may take steps without the host.
+
+    Attributes:
+        cycles_left: projected cycles that come next.
+        cycles_against_creeping: whether a projected cycle follows a step in which the free set creeps.
     """
 
     residual: AssessedResidual
     readings: tuple[Reading, ...] = ()  # that evaluations leave besides the residual's
     correction: LowRankCorrection | None = None  # of the cycle, for bodies
     most_runs: float = math.inf  # of projected cycles that were due: after those, the free set goes round in circles
+    cycles_against_creeping = True
     free_set_noted = False  # whether `LowRankCorrection.note` has been launched for the free set as it is
 
-    def __init__(self, problem: LCP, A: HasStencil, settings: ProjectedMultigrid, *, shifted: bool = False) -> None:
+    def __init__(
+        self, problem: LCP, A: HasStencil, settings: Any, *, residual: Callable[..., AssessedResidual] = AssessedResidual,
+        shifted: bool = False, ahead: bool = True,
+    ) -> None:  # fmt: skip
         precision = Precision(settings.precision)
         real, self.A, self.settings, self.bounded = precision.correction, A, settings, problem.bounded
         self._p = problem.layout.zeros(real)
@@ -203,15 +70,16 @@ class MultigridWorkspace(IterateMemory):
         upper = problem.layout.zeros(real) if problem.bounds.may_bind[1] else nothing(real, A.device)
         options: dict[str, Any] = {"bounded": self.bounded, "settings": settings.cycle, "bounds": (self._p, upper), "shifted": shifted}
         self.hierarchy = make_hierarchy(A.stencil, real, **options)
-        super().__init__(problem, precision, residual=self._residual(problem, precision is Precision.SINGLE))
+        super().__init__(problem, precision, residual=residual(problem, A, self.hierarchy, rounded=precision is Precision.SINGLE))
         self.flat = Rows.of_fields(problem.layout)
         self._programs: dict[tuple[Any, ...], Program] = {}  # truncated cycles
         self._mask: wp.array[Any] | None = None
         self.scratch = self._scratch() if real is wp.float32 else None
         self._past, self._stored = 0, False  # steps since the best iterate; whether it is in memory of its own
-        self._cycles_left, self.descent = 0, Descent(self.precision.epsilon)
+        self.cycles_left, self.descent = 0, Descent(self.precision.epsilon)
         self._tolerance, self._taken = 0.0, 0  # steps of this solve
-        self._ahead = RunAhead(self) if type(self) is MultigridWorkspace and RunAhead.suits(self) else None
+        self._ahead = RunAhead(self) if ahead and RunAhead.suits(self) else None
+        self._one_table = self._ahead is not None  # whether nothing is read on the way of a step
         self._built = 0  # the version of the free set that the hierarchy has
         self._budget, self._begun = 0, False  # steps that the device may take without the host; whether it has begun the solve
 
@@ -257,9 +125,6 @@ class MultigridWorkspace(IterateMemory):
         """Whether x is no more than a step from where it was before one."""
         return self.floating is None and self._rounded is None
 
-    def _residual(self, problem: LCP, rounded: bool) -> AssessedResidual:
-        return AssessedResidual(problem, self.A, self.hierarchy, rounded=rounded)
-
     def _scratch(self) -> tuple[wp.array[Any], wp.array[Any]]:
         """Return what is free between cycles, as fields of four bytes and of one byte a cell."""
         x, t = self.hierarchy.finest.x, self.hierarchy.finest.t
@@ -287,7 +152,7 @@ class MultigridWorkspace(IterateMemory):
                 self._keep_stored(by_undoing=self.exact)
         self._past += 1
 
-    def _store(self) -> None:
+    def store_best(self) -> None:
         """Keep the best iterate in memory of its own: x is about to change by more than can be taken back."""
         if not self._stored and self._past <= (1 if self.exact else 0):
             self._keep_stored(by_undoing=self._past == 1)
@@ -313,23 +178,36 @@ class MultigridWorkspace(IterateMemory):
             wp.launch
         )
 
+    def shorten_step(self, before: float, now: float, whole: float) -> None:
+        """Change how far x has moved along the last direction.
+
+        Args:
+            before: part of the whole step that x has moved.
+            now: part that it is to have moved.
+            whole: the step, in units of the direction.
+        """
+        self.residual.set(kernels.STEP, (before - now) * whole)
+        self._undo(self.x)
+        self._round(self.x)
+        self.residual.set(kernels.STEP, now * whole)
+
     def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
         """Forget the search direction; the operator may have changed."""
         self.floating = floating
-        self._cycles_left = self.settings.monotone_cycles if self.bounded and not warm else 0
+        self.cycles_left = self.settings.monotone_cycles if self.bounded and not warm else 0
         self.descent.start(self.residual.energy, self.residual.norm)
         self._tolerance, self._taken = tolerance, 0
         if self._begun:
             self._begun = False
             return
-        self._forget()
+        self.forget_direction()
         if self.scratch is not None:
             CLEAR.bind(self.flat, x=self.scratch[1]).launch()
         rescale = not 1e-6 < self.residual.norm / self.residual.size < 1e6  # corrections in float32 would overflow, or vanish
         if rescale:
             self.residual.set(kernels.SIZE, self.residual.norm)
         # unknowns at their bounds leave the free set unless a projected cycle comes next
-        classify = self._cycles_left == 0
+        classify = self.cycles_left == 0
         if self.floating is not None:
             self.residual.evaluate(self.x, classify)
             self._project()
@@ -348,16 +226,16 @@ class MultigridWorkspace(IterateMemory):
 
     def wants_monotone_cycle(self) -> bool:
         """Return whether the next step is a projected cycle."""
-        if self._cycles_left == 0 and self.bounded:
+        if self.cycles_left == 0 and self.bounded:
             due = self.descent.due(self.settings.patience)  # an active set can go round in a circle
             if due:
-                self._begin_cycles(due)
-        return self._cycles_left > 0
+                self.begin_cycles(due)
+        return self.cycles_left > 0
 
-    def _begin_cycles(self, count: int) -> None:
+    def begin_cycles(self, count: int) -> None:
         """Let projected cycles come next: all unknowns are in their right-hand side."""
-        self._cycles_left = count
-        self._forget()
+        self.cycles_left = count
+        self.forget_direction()
         self.residual.evaluate(self.x, classify=False)
 
     def monotone_step(self) -> Step:
@@ -366,16 +244,15 @@ class MultigridWorkspace(IterateMemory):
         self._leave()
         self._budget -= 1
         self._taken += 1
-        classify = self._cycles_left == 1  # truncated cycles come next
-        plain = type(self) is MultigridWorkspace and self._ahead is not None  # others read on the way
-        with as_one_table(self.problem.device, self.problem.layout.across) if plain else nullcontext():
+        classify = self.cycles_left == 1  # truncated cycles come next
+        with as_one_table(self.problem.device, self.problem.layout.across) if self._one_table else nullcontext():
             self.rebuild(classify=self.residual.classified)
-            self._cycles_left -= 1
+            self.cycles_left -= 1
             self._move_monotonely(descent.safe, classify, launch_recorded)
         self.residual.read(classified=classify)
-        if self.floating is not None and self._cycles_left == 0:
+        if self.floating is not None and self.cycles_left == 0:
             self._project()
-        descent.weigh(self._judge())
+        descent.weigh(self.judge())
         return Step("monotone cycle", 1, None, interim=descent.sinks)
 
     def _move_monotonely(self, safe: bool, classify: bool, launch: Launch) -> None:
@@ -412,8 +289,8 @@ class MultigridWorkspace(IterateMemory):
             self.residual.read(classified=True)
         if self.floating is not None:
             self._project()
-        if self._creeps():
-            self._begin_cycles(1)
+        if self._creeps() and self.cycles_against_creeping:
+            self.begin_cycles(1)
         return Step("truncated cycle", 1, active, interim=self.descent.sinks)
 
     def _has_run_ahead(self) -> bool:
@@ -430,9 +307,9 @@ class MultigridWorkspace(IterateMemory):
 
     def _creeps(self) -> bool:
         """Judge a truncated step; return whether a projected cycle should follow."""
-        return self.descent.creeps(self._judge(), moved=self.bounded and self.stale)
+        return self.descent.creeps(self.judge(), moved=self.bounded and self.stale)
 
-    def _judge(self) -> float:
+    def judge(self) -> float:
         """Let the energy judge the step that has been evaluated; return by how much it has lowered it."""
         return self.descent.record(self.residual.energy, self.residual.norm)
 
@@ -516,7 +393,7 @@ class MultigridWorkspace(IterateMemory):
             self.hierarchy.rebuild_changed()
             self._built = self.residual.free_set
 
-    def _forget(self) -> None:
+    def forget_direction(self) -> None:
         """Let the next step begin without a search direction."""
         self.residual.set(kernels.CARRY, 0.0)
 
@@ -527,3 +404,25 @@ class MultigridWorkspace(IterateMemory):
             self._mask = self.problem.layout.zeros(wp.uint8)
         kernels.MASK.bind(self.flat, free=free, mask=self._mask).launch()
         self.floating.project(self.hierarchy.finest.b, self._mask)
+
+
+class ColdStart(MultigridWorkspace):
+    """Memory of the cycles, whose iterate, residual and hierarchy the method shares.
+
+    The finest diagonal of the hierarchy takes the method's shifts, and the method keeps the best iterate.
+
+    Args:
+        problem: the problem.
+        A: its operator.
+        settings: of the method, with `precision`, `monotone_cycles` and `cycle`.
+    """
+
+    def __init__(self, problem: LCP, A: HasStencil, settings: Any) -> None:
+        super().__init__(problem, A, settings, shifted=True, ahead=False)
+        self._stored = True  # elsewhere
+
+    def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
+        """Begin; the method may have written the finest diagonal since it was coarsened."""
+        self.hierarchy.finest.changed.fill_(1)
+        self.distrust_hierarchy()
+        super().start(warm=warm, tolerance=tolerance, floating=floating)

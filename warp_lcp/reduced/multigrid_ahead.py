@@ -26,7 +26,7 @@ from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import CONVERT, add_across
 
 if TYPE_CHECKING:
-    from warp_lcp.solvers.projected_multigrid_workspace import MultigridWorkspace
+    from warp_lcp.reduced.multigrid_workspace import MultigridWorkspace
 
 EPS = float(np.finfo(np.float64).eps)
 ORDINARY = 1e-100  # the least residual that is taken for one: the squares of smaller ones vanish, which the loop looks into

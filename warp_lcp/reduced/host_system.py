@@ -1,10 +1,11 @@
-"""Newton's method on the minimum map where the host solves directly: small and narrow problems, whole steps, no kernel launches."""
+"""Reduced system of a small or narrow matrix on the host: whole Newton steps by LAPACK, no kernel launches."""
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -15,12 +16,10 @@ from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
-from warp_lcp.problem.solve import IterateMemory, Step
+from warp_lcp.problem.solve import IterateMemory, Precision, Step
+from warp_lcp.reduced.correction_system import CorrectionSystem
 from warp_lcp.reduced.dense_problem import factored
 from warp_lcp.reduced.nested_iteration import nested_iteration
-
-if TYPE_CHECKING:
-    from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
 
 MOST = 200  # unknowns up to which LAPACK on the host costs less than launches of kernels, whatever the bandwidth
 FEW = 30  # unknowns up to which dense factors cost no more than banded ones, whatever the bandwidth
@@ -160,46 +159,79 @@ class HostResidual(NaturalResidual):
         return math.sqrt(self.b @ self.b)
 
 
-class DirectNewtonWorkspace(IterateMemory):
-    """Whole Newton steps solved by LAPACK on the host, then the safeguarded ones where these lead nowhere.
+class HostIterate(IterateMemory):
+    """An iterate whose residual is evaluated, and whose best values are kept, on the host.
 
-    On an M-matrix whole steps end at the solution, but an end of a contact set may move by one unknown a step. A narrow problem
-    therefore takes nested iteration after `PLAIN` steps, which finds the ends to within a few unknowns. A set that comes again, a
-    singular block, or `IDLE` steps without gain: MinimumMapNewton's own steps go on from the best iterate.
-
-    Attributes:
-        rest: their memory, once they do.
+    Args:
+        problem: the problem.
+        precision: of the iterate.
+        matrix: A on the host.
     """
 
-    rest: NewtonWorkspace | None = None
-
-    def __init__(self, problem: LCP, settings: MinimumMapNewton) -> None:
-        A: Any = problem.A
-        if not suits(A):
-            raise ValueError(f"A: direct = True is for dense and sparse matrices of at most {MOST} unknowns or a bandwidth up to {NARROW}")
-        self.settings = settings
-        width = bandwidth(A) if A.unknowns > FEW else NARROW + 1
-        self.matrix: SmallMatrix | NarrowMatrix = NarrowMatrix(A, width) if width <= NARROW else SmallMatrix(A)
-        on_host = problem.device.is_cpu and problem.bounds.affine is None
-        super().__init__(problem, settings.precision, residual=HostResidual(problem, self.matrix) if on_host else None)
+    def __init__(self, problem: LCP, precision: str, matrix: SmallMatrix | NarrowMatrix) -> None:
+        self._on_cpu = problem.device.is_cpu
+        by_numpy = self._on_cpu and problem.bounds.affine is None
+        super().__init__(problem, precision, residual=HostResidual(problem, matrix) if by_numpy else None)
 
     def keep(self) -> None:
         """Remember x, on the host."""
-        self._kept = self._read(self.x).copy()
+        self._kept = self.read().copy()
 
     def restore(self) -> None:
         """Make x the best iterate again."""
-        self._write(self.x, self._kept)
+        self.write(self._kept)
+
+    def read(self) -> np.ndarray:
+        """Return x on the host, shape (n,): its own memory on the CPU."""
+        residual = self.residual
+        return residual.values(self.x) if isinstance(residual, HostResidual) else self.x.numpy()
+
+    def write(self, values: np.ndarray) -> None:
+        """Set x."""
+        if self._on_cpu:
+            self.read()[...] = values
+        else:
+            self.x.assign(values)
+
+    def y(self) -> np.ndarray:
+        """Return y = A x + b as last evaluated, shape (n,)."""
+        residual = self.residual
+        return residual.host_y() if isinstance(residual, HostResidual) else residual.y.numpy()
+
+
+class HostSystem:
+    """Whole Newton steps solved by LAPACK on the host, see `ReducedSystem`; a `CorrectionSystem` takes over where these lead nowhere.
+
+    On an M-matrix whole steps end at the solution, but an end of a contact set may move by one unknown a step. A narrow problem
+    therefore takes nested iteration after `PLAIN` steps, which finds the ends to within a few unknowns. A set that comes again, a
+    singular block, or `IDLE` steps without gain: searched steps go on from the best iterate.
+
+    Args:
+        problem: with a small or a narrow matrix.
+        settings: of Newton's method.
+    """
+
+    iterate: HostIterate
+    whole = True
+
+    def __init__(self, problem: LCP, settings: Any) -> None:
+        A: Any = problem.A
+        if not suits(A):
+            raise ValueError(f"A: direct = True is for dense and sparse matrices of at most {MOST} unknowns or a bandwidth up to {NARROW}")
+        width = bandwidth(A) if A.unknowns > FEW else NARROW + 1
+        self._matrix: SmallMatrix | NarrowMatrix = NarrowMatrix(A, width) if width <= NARROW else SmallMatrix(A)
+        self._problem, self._settings = problem, settings
+        self.iterate = HostIterate(problem, settings.precision, self._matrix)
+        self._rounds = self.iterate.precision is Precision.SINGLE
 
     def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
         """Forget the sets, and read the bounds as they are now."""
-        self.floating = floating
-        self._warm, self._target, self.rest = warm, tolerance, None
-        residual, bounds, self._b = self.residual, self.problem.bounds, self.problem.b.numpy()
+        self._warm, self._target, self._floating = warm, tolerance, floating
+        residual, bounds, self._b = self.iterate.residual, self._problem.bounds, self._problem.b.numpy()
         if isinstance(residual, HostResidual):
             self._d, self._lower, self._upper = residual.scale, residual.lower, residual.upper
         else:
-            self.matrix.refresh()
+            self._matrix.refresh()
             self._lower, self._upper = bounds.host(0), bounds.host(1)
             self._d = residual.diagonal.numpy().astype(np.float64)
         self._seen: set[bytes] = set()
@@ -208,73 +240,76 @@ class DirectNewtonWorkspace(IterateMemory):
         self._left: float = math.inf
         self._least, self._idle = math.inf, 0
 
-    def step(self, x: wp.array[Any]) -> Step:
-        """Take a whole step, or one of the safeguarded ones."""
-        if self.rest is None:
-            taken = self._whole_step(x)
-            if taken is not None:
-                return taken
-            self._hand_over(x)
-        return self.settings.step(self.problem, self.rest, x)
+    def monotone_cycle(self) -> Step | None:
+        """Return None: whole steps need no cold start."""
+        return None
 
-    def _hand_over(self, x: wp.array[Any]) -> None:
-        """Let safeguarded steps go on from the best iterate."""
-        self.restore()
-        self.residual.evaluate(x)
-        self.residual.current = False
-        self.rest = self.settings.safeguarded(self.problem)
-        self.rest.x, self.rest.residual = self.x, self.residual
-        self.rest.start(warm=self._warm, tolerance=self._target, floating=self.floating)
-
-    def _whole_step(self, x: wp.array[Any]) -> Step | None:
-        """Classify, solve on the free set, take the whole step; None where that leads nowhere."""
-        residual, start = self.residual, self._read(x)
+    def classify(self) -> Step | None:
+        """Find which unknowns are held at l and which at u; take nested iteration instead where it is due."""
+        residual = self.iterate.residual
         self._wait -= 1
-        if self._wait < 0 and isinstance(self.matrix, NarrowMatrix) and not self._nested:
+        if self._wait < 0 and isinstance(self._matrix, NarrowMatrix) and not self._nested:
             self._nested = True
-            coarse = nested_iteration(self.matrix.banded, self._b, self._lower, self._upper)
+            coarse = nested_iteration(self._matrix.banded, self._b, self._lower, self._upper)
             if coarse is not None:
                 self._seen.clear()
                 self._left = NARROW_STEPS
-                return self._move(x, coarse, "nested iteration", None)
+                self._go(coarse)
+                return Step("nested iteration", 1, None, interim=True)
         if self._begun:  # the start's residual says nothing of the steps to come
             self._least, self._idle = (residual.norm, 0) if residual.norm < self._least else (self._least, self._idle + 1)
-        below, above = self._classify(start, residual.host_y() if isinstance(residual, HostResidual) else residual.y.numpy())
+        self._x = self.iterate.read()
+        target = self._x - self.iterate.y() / self._d
+        self._below, self._above = target < self._lower, target > self._upper
         self._left -= 1
+        return None
+
+    def restrict(self) -> bool:
+        """Do nothing: `solve` takes the rows of the free unknowns."""
+        return True
+
+    def solve(self) -> int | None:
+        """Factor A_FF and solve; None where steps lead nowhere."""
+        below, above = self._below, self._above
         if self._left < 0 or self._idle >= IDLE or self._comes_again(below, above):
             return None
-        held = below | above
-        moved = np.where(below, self._lower, np.where(above, self._upper, start))
-        e = self.matrix.solve(~held, -(self.matrix.product(moved) + self._b))
+        self._held = below | above
+        start = np.where(below, self._lower, np.where(above, self._upper, self._x))
+        e = self._matrix.solve(~self._held, -(self._matrix.product(start) + self._b))
         if e is None or not np.isfinite(e).all():
             return None
-        return self._move(x, moved + e, "active set", int(np.count_nonzero(held)))
+        self._end = start + e
+        return 1
 
-    def _move(self, x: wp.array[Any], moved: np.ndarray, name: str, active: int | None) -> Step:
+    def move(self, length: float) -> float:
+        """Take the whole step."""
+        self._go(self._end)
+        return self.iterate.residual.norm
+
+    def _go(self, values: np.ndarray) -> None:
         """Set x, within its bounds once the residual meets the tolerance."""
-        residual, self._begun = self.residual, True
-        self._write(x, moved)
-        if residual.evaluate(x) <= self._target:  # x may miss its bounds by what the criteria allow
-            self._write(x, np.clip(moved, self._lower, self._upper))
+        iterate, residual, self._begun = self.iterate, self.iterate.residual, True
+        iterate.write(values)
+        if residual.evaluate(iterate.x) <= self._target:  # x may miss its bounds by what the criteria allow
+            iterate.write(np.clip(values, self._lower, self._upper))
             residual.current = False
-        self._round(x)
-        residual.current = residual.current and self._rounded is None
-        return Step(name, 1, active, interim=True)
+        if self._rounds:
+            iterate.round_iterate()
+            residual.current = False
 
-    def _read(self, x: wp.array[Any]) -> np.ndarray:
-        residual = self.residual
-        return residual.values(x) if isinstance(residual, HostResidual) else x.numpy()
+    def accept(self, iterations: int) -> Step:
+        """Return the step; whole steps may first take the residual up."""
+        return Step("active set", iterations, int(np.count_nonzero(self._held)), interim=True)
 
-    def _write(self, x: wp.array[Any], values: np.ndarray) -> None:
-        if self.problem.device.is_cpu:
-            self._read(x)[...] = values
-        else:
-            x.assign(values)
-
-    def _classify(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return which unknowns are held at l and which at u."""
-        target = x - y / self._d
-        return target < self._lower, target > self._upper
+    def fall_back(self, iterations: int, norms: deque[float], best: float, length: float) -> CorrectionSystem:
+        """Return the system of searched steps, at the best iterate."""
+        iterate, residual = self.iterate, self.iterate.residual
+        iterate.restore()
+        residual.evaluate(iterate.x)
+        residual.current = False
+        searched = CorrectionSystem(self._problem, self._settings, iterate)
+        searched.start(warm=self._warm, tolerance=self._target, floating=self._floating)
+        return searched
 
     def _comes_again(self, below: np.ndarray, above: np.ndarray) -> bool:
         """Return whether an active set has come again: whole steps would repeat themselves."""

@@ -1,0 +1,124 @@
+"""Reduced systems of Newton's method: which operator gets which, a step by the protocol against NumPy, the change of system."""
+
+import numpy as np
+import pytest
+import scipy.sparse
+import warp as wp
+
+import warp_lcp as wl
+from warp_lcp.reduced.correction_system import CorrectionSystem
+from warp_lcp.reduced.fused_grid_system import FusedGridSystem
+from warp_lcp.reduced.host_system import HostSystem
+
+SETTINGS = {"precision": "double", "eta": 1e-14}
+PERIOD_THREE = np.array([[1.0, 0.0, 4.0], [4.0, 1.0, 0.0], [0.0, 4.0, 1.0]])
+FORMS = {
+    "dense": lambda A: wl.DenseOperator(A, device="cpu"),
+    "sparse": lambda A: wl.SparseOperator(scipy.sparse.csr_array(A), device="cpu"),
+    "products": lambda A: wl.LinearOperator(scipy.sparse.linalg.aslinearoperator(A), symmetric=True, device="cpu"),
+}
+
+
+def matrix(rng, n=12, width=None):
+    """A symmetric positive definite matrix, of few diagonals if a width is given."""
+    B = rng.standard_normal((n, n))
+    A = B @ B.T / n + np.eye(n)
+    return A if width is None else np.where(np.abs(np.subtract.outer(np.arange(n), np.arange(n))) <= width, 0.1 * A, 0.0) + np.eye(n)
+
+
+def begun(problem, method, x0):
+    """A workspace at x0, whose solve has begun."""
+    work = method.init(problem)
+    work.residual.start(work.x, keep=False)
+    work.x.assign(x0)
+    work.residual.evaluate(work.x)
+    work.start(warm=True, tolerance=0.0)
+    return work
+
+
+@pytest.mark.parametrize("lengths", [(1.0,), (1.0, 0.5, 0.25)])
+@pytest.mark.parametrize(
+    ("form", "direct", "width"),
+    [("dense", True, None), ("sparse", True, None), ("sparse", True, 2), ("dense", False, None), ("sparse", False, None),
+     ("sparse", False, 2), ("products", False, None)],
+)  # fmt: skip
+def test_a_step_by_the_protocol(form, direct, width, lengths):
+    """Held unknowns onto their bounds, y = 0 on the others, and parts of the step from there."""
+    rng = np.random.default_rng(7101)
+    for _ in range(5):
+        n = 12 if width is None else 40
+        A, b, lower, upper = matrix(rng, n, width), rng.standard_normal(n), -1.5 * rng.random(n), 1.5 * rng.random(n)
+        x0 = np.clip(rng.standard_normal(n), lower, upper)
+        work = begun(wl.LCP(FORMS[form](A), b, lower, upper), wl.MinimumMapNewton(direct=direct, **SETTINGS), x0)
+        system, d = work.system, work.residual.scale if direct else work.residual.diagonal.numpy()
+        target = x0 - (A @ x0 + b) / d
+        held, start = (target < lower) | (target > upper), np.where(target < lower, lower, np.where(target > upper, upper, x0))
+        free, e = np.flatnonzero(~held), np.zeros(n)
+        e[free] = np.linalg.solve(A[np.ix_(free, free)], -(A @ start + b)[free])
+        assert system.monotone_cycle() is None
+        assert system.classify() is None
+        assert system.restrict()
+        assert system.solve() >= 1
+        for length in lengths[:1] if system.whole else lengths:  # whole steps are not shortened, nor projected
+            norm = system.move(length)
+            end = start + length * e
+            np.testing.assert_allclose(work.x.numpy(), end if system.whole else np.clip(end, lower, upper), atol=1e-9)
+            assert norm == work.residual.norm
+        assert system.accept(3).active == np.count_nonzero(held)
+
+
+def test_which_operator_gets_which():
+    grid, rows = wl.GridPoisson(np.ones((6, 7), dtype=int), shift=1.0, device="cpu"), wl.DenseOperator(np.eye(5), device="cpu")
+    wind = wl.Stencil(np.ones((9, 9), dtype=int), {(0, 0): 4.0, (0, 1): -0.5, (0, -1): -1.5, (1, 0): -1.0}, outside=wl.AIR, device="cpu")
+    for A, settings, kind in (
+        (grid, {}, FusedGridSystem),
+        (grid, {"safeguard": False}, CorrectionSystem),
+        (wind, {}, CorrectionSystem),
+        (rows, {}, CorrectionSystem),
+        (rows, {"direct": True}, HostSystem),
+    ):
+        problem, method = wl.LCP(A, np.ones(A.shape)), wl.MinimumMapNewton(**settings)
+        work = method.init(problem)
+        assert type(work.system) is kind
+        assert work.x is work.system.iterate.x
+    assert type(wl.PrimalDualActiveSet().init(wl.LCP(grid, np.ones(grid.shape))).system) is CorrectionSystem
+
+
+def test_the_change_of_system_keeps_the_iterate():
+    """Whole steps go round in a circle of three: searched steps go on, and the next solve begins with whole ones again."""
+    problem, method = wl.LCP(wl.DenseOperator(PERIOD_THREE, device="cpu"), -np.ones(3)), wl.MinimumMapNewton(direct=True)
+    work = method.init(problem)
+    for _ in range(2):
+        result = wl.solve(problem, method, workspace=work, x0=np.array([1.0, 0.0, 0.0]), stopping=wl.StoppingCriteria(rtol=1e-10))
+        assert result
+        assert type(work.system) is CorrectionSystem
+        assert work.system.iterate is work.iterate
+        assert {record.step for record in result.history[1:]} >= {"active set", "newton"}
+        np.testing.assert_allclose(PERIOD_THREE @ result.x.numpy(), np.ones(3), atol=1e-8)
+        work.start(warm=True, tolerance=1e-10)
+        assert type(work.system) is HostSystem
+
+
+def test_a_grid_moves_its_iterate_as_it_solves():
+    """The linear solve ends at the accuracy asked for, and half of its last iteration's step can be taken back."""
+    rng = np.random.default_rng(7103)
+    cells = np.ones((9, 11), dtype=int)
+    A, b = wl.GridPoisson(cells, shift=0.5, device="cpu"), rng.standard_normal(cells.shape)
+    problem = wl.LCP(A, b, -np.inf, np.inf)
+    work = begun(problem, wl.MinimumMapNewton(precision="double", eta=1e-2), np.zeros(problem.layout.size))
+    first, system = work.residual.norm, work.system
+    assert system.classify() is None
+    assert system.restrict()
+    iterations = system.solve()
+    assert iterations > 1
+    assert work.residual.norm <= 1e-2 * first
+    end, norm = work.x.numpy().copy(), system.move(1.0)
+    assert norm == work.residual.norm
+    np.testing.assert_array_equal(work.x.numpy(), end)
+    system.move(0.5)
+    half = work.x.numpy().copy()
+    system.move(0.25)
+    np.testing.assert_allclose(half - work.x.numpy(), 0.5 * (end - half), atol=1e-12)
+    assert np.abs(end - half).max() > 1e-6
+    exact = wl.solve(problem, stopping=wl.StoppingCriteria(rtol=1e-12)).x.numpy()
+    np.testing.assert_allclose(problem.layout.unload(wp.array(end, dtype=wp.float64, device="cpu")).numpy(), exact, atol=1e-2)

@@ -1,0 +1,25 @@
+"""Kernels that find free sets, make right-hand sides on them, and move along projected steps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from warp_lcp.rows import KernelFile, Rows
+
+KERNELS = KernelFile(Path(__file__).parent / "headers/active_set.h")
+CLASSIFY = KERNELS["active_set.classify"]
+ALL_FREE = KERNELS["active_set.all_free"]
+ON_FREE = KERNELS["active_set.on_free"]
+STEP = KERNELS["active_set.step"]
+SHIFT = KERNELS["principal_system.shift"]
+MASK = KERNELS["principal_system.mask"]
+DIVIDE = KERNELS["principal_system.divide"]
+
+
+def projected_move(
+    rows: Rows, bounds: list[Any], x: Any, along: Any, length: float, to: Any, *, z: Any = None, beta: float = 0.0, kept: Any = None,
+    guarded: bool = True,
+) -> None:  # fmt: skip
+    """Set `to` = clip(x + length along, l, u) where the direction is not 0; see `active_set.h`."""
+    STEP.bind(rows, bounds=bounds, x=x, z=z, along=along, to=to, kept=kept, beta=beta, step=length, guarded=guarded).launch()

@@ -1,0 +1,128 @@
+"""Principal system of a dense matrix: factors of the free block, on the host; and damped steps where Newton's lead nowhere."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+import warp as wp
+
+from warp_lcp.deadline import check_time
+from warp_lcp.operators.dense import DenseOperator
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.residual import NaturalResidual
+from warp_lcp.problem.result import SolveStatus
+from warp_lcp.reduced.dense_problem import equilibration, factored, incompatible
+
+PROGRESS = 0.999  # a residual above this part of the smallest so far is no progress
+STALLED = 10  # steps without progress after which damped steps end
+REGULARIZATIONS = (1e-8, 1e-4, 1e-2, 0.1, 1.0, 10.0, 100.0)  # of J'J, times its mean diagonal
+
+
+class DenseSystem:
+    """LU factors of the free block, on the host; the minimum-norm least-squares step where the block is singular."""
+
+    def __init__(self, A: DenseOperator) -> None:
+        self._A = A
+        self.r, self.e = A.layout.zeros(wp.float64), A.layout.zeros(wp.float64)
+        self._shift: np.ndarray | None = None
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Copy the matrix to the host."""
+        self._matrix = self._A.matrix.numpy().astype(np.float64)
+
+    def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
+        """Remember the free set and the shift."""
+        self._free = np.flatnonzero(free.numpy())
+        self._shift = None if shift is None else shift.numpy()[self._free].astype(np.float64)
+
+    def norm(self) -> float:
+        """Return ||r||, plain for matrices solved directly."""
+        return float(np.linalg.norm(self.r.numpy()))
+
+    def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
+        """Factor the free block and solve, whatever the tolerance."""
+        free, r, e = self._free, self.r.numpy(), np.zeros(self.e.size)
+        norm = 0.0
+        if free.size:
+            block, scale = self._matrix[np.ix_(free, free)], np.ones(free.size)
+            if self._shift is not None:
+                block = block + np.diag(self._shift)
+                scale = 1 / np.sqrt(1 + self._shift)  # rows with a large shift make no others look singular
+            e[free] = scale * _solve_or_least_squares(block * np.outer(scale, scale), scale * r[free])
+            norm = float(np.linalg.norm(block @ e[free] - r[free]))
+        self.e.assign(e)
+        return 1, norm
+
+
+def _solve_or_least_squares(block: np.ndarray, r: np.ndarray) -> np.ndarray:
+    """Return block^-1 r; where the block looks singular even in units in which its rows are alike, the least-squares solution there."""
+    solution = factored(block, r)
+    if solution is None:
+        S = equilibration(block)
+        block, r = S[:, None] * block * S, S * r
+        solution = factored(block, r)
+        solution = S * (scipy.linalg.lstsq(block, r, cond=1e-12, lapack_driver="gelsy")[0] if solution is None else solution)
+    return solution
+
+
+class DampedSteps:
+    """Levenberg-Marquardt steps of the minimum map of a dense problem, and when it is time to ask whether there is a solution.
+
+    Where Newton's steps cycle, and where the free block is singular, (J'J + nu I)^-1 J'r is still a descent direction.
+
+    Args:
+        problem: with a dense matrix.
+    """
+
+    def __init__(self, problem: LCP) -> None:
+        self._problem = problem
+        self.start()
+
+    def start(self) -> None:
+        """Forget the last solve."""
+        self._least, self._waited = math.inf, 0  # smallest residual; steps without progress
+        # equations, of which it is not known yet whether they have a solution; whether a damped step has reduced the residual
+        self._asks, self._damped = not self._problem.bounded, False
+
+    @property
+    def status(self) -> SolveStatus | None:
+        """How the solve ends after a damped step: STAGNATED after ten steps without progress, None as long as it goes on."""
+        return SolveStatus.STAGNATED if self._waited >= STALLED else None
+
+    def proves_infeasible(self, norm: float, target: float) -> bool:
+        """Note the residual norm where a step begins; return whether it is proved that there is no solution.
+
+        It is asked of equations alone, once, when a step has not reduced the residual.
+        """
+        falls = norm <= PROGRESS * self._least
+        if self._asks and (self._damped or not falls) and norm > target:
+            self._asks = False
+            if incompatible(self._problem):
+                return True
+        self._least, self._waited = min(norm, self._least), 0 if falls else self._waited + 1
+        return False
+
+    def take(self, x: wp.array[Any], residual: NaturalResidual) -> bool:
+        """Take the shortest of some steps that reduces the residual's norm; return whether one does."""
+        p, start = self._problem, x.numpy().copy()
+        norm, y = residual.evaluate(x), residual.y.numpy()
+        d = residual.diagonal.numpy().astype(np.float64)
+        lower, upper, A = p.lower.numpy(), p.upper.numpy(), p.A.matrix.numpy().astype(np.float64)  # type: ignore[attr-defined]
+        r = d * (start - np.clip(start - y / d, lower, upper))
+        held = (start - y / d < lower) | (start - y / d > upper)
+        J = np.where(held[:, None], np.diag(d), A)
+        gradient, normal = J.T @ r, J.T @ J
+        size = float(np.trace(normal)) / len(r)
+        for nu in REGULARIZATIONS:
+            check_time()
+            dx = np.linalg.solve(normal + nu * size * np.eye(len(r)), -gradient)
+            x.assign(np.clip(start + dx, lower, upper))
+            if residual.evaluate(x) <= (1 - 1e-6) * norm:
+                self._damped = True
+                return True
+        x.assign(start)
+        return False

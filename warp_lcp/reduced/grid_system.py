@@ -1,0 +1,113 @@
+"""Principal system of a grid: conjugate gradients, or GMRES if A is not symmetric, with a multigrid cycle."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import warp as wp
+
+from warp_lcp.krylov.conjugate_gradient import ConjugateGradient
+from warp_lcp.krylov.gmres import GMRES
+from warp_lcp.multigrid.cycle_settings import CycleSettings
+from warp_lcp.multigrid.hierarchy import Hierarchy
+from warp_lcp.multigrid.turning import make_hierarchy
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasStencil
+from warp_lcp.reduced.active_set_kernels import ALL_FREE, ON_FREE, SHIFT
+from warp_lcp.reduced.fused_conjugate_gradient import FusedConjugateGradient
+from warp_lcp.reduced.grid_step_kernels import GAPS, SIZE
+from warp_lcp.reduced.sparse_system import GuardedSystem, MatrixSystem
+from warp_lcp.rows import Rows
+from warp_lcp.rows.fields import zeros_like
+from warp_lcp.rows.program import Program
+from warp_lcp.rows.vectors import Reduction, rows_of
+
+
+class GridSystem(GuardedSystem):
+    """Conjugate gradients on a grid, preconditioned by a linear multigrid cycle on the free set; of `hierarchy` where there is one."""
+
+    def __init__(
+        self, A: HasStencil, real: Any, *, bounded: bool, settings: CycleSettings | None = None, shifted: bool = False,
+        hierarchy: Hierarchy | None = None,
+    ) -> None:  # fmt: skip
+        self._A = A
+        self._version = A.version
+        self.hierarchy = hierarchy or make_hierarchy(A.stencil, real, bounded=bounded, settings=settings, shifted=shifted)
+        self.r, self.z = self.hierarchy.finest.b, self.hierarchy.finest.x
+        self._weight = zeros_like(self.r) if shifted else None
+        # one CPU thread, no ghost cells to fill
+        self.fused = self.hierarchy.ends_in_wave and A.symmetric and A.stencil.ghosts is None
+        if self.fused:
+            method: Any = FusedConjugateGradient(A.stencil, self.hierarchy, weighted=shifted)
+        else:
+            method = (ConjugateGradient if A.symmetric else GMRES)(self.hierarchy.finest.stencil.product, self, weight=self._weight)
+        self._iterate_by(method, self._weight)
+        if not A.symmetric and A.stencil.ghosts is None:
+            self._guard(partial(MatrixSystem, A, shifted=shifted))
+
+    def refresh(self) -> None:
+        """Take the rows and the weights again if the operator has changed."""
+        if self._version != self._A.version:
+            self._version, self._substitute = self._A.version, None
+            self.hierarchy.refresh()
+            if isinstance(self._krylov, FusedConjugateGradient):
+                self._krylov.clear()
+
+    def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
+        """Mask and shift the finest diagonal and coarsen.
+
+        Raises:
+            ValueError: a shift, but the system was not made for one.
+        """
+        self._note(free, shift)
+        source, target = self._A.stencil, self.hierarchy.finest.stencil.d
+        if self._weight is None:
+            if shift is not None:
+                raise ValueError("shift: construct the system with shifted=True")
+            self.hierarchy.hold(source.d, free)
+            self.hierarchy.rebuild_changed()
+        else:
+            rows, weight = rows_of(target), self._weight
+            SHIFT.bind(rows, free=free, shift=shift, d=source.d, unit=source.unit, diagonal=target, weight=weight).launch()
+            self.hierarchy.rebuild()
+
+    @property
+    def program(self) -> Program:
+        """Precondition: z = one cycle on r."""
+        return self.hierarchy.cycle
+
+    def apply(self) -> None:
+        """Precondition: run `program`."""
+        self.program.run()
+
+    def monotone_cycle(self) -> None:
+        """One projected cycle on r within the finest level's bounds; the correction is `z`."""
+        self.hierarchy.monotone_cycle.run()
+
+
+def projected_cycle(
+    problem: LCP, system: GridSystem, x: wp.array[Any], y: wp.array[Any], size: float, free: wp.array[Any], sums: Reduction, *,
+    restrict: bool = True,
+) -> None:  # fmt: skip
+    """Run one from x: the correction is `system.z` times `size`.
+
+    Args:
+        problem: a grid's.
+        system: of its corrections.
+        x: where to begin, a stored field like y and free.
+        y: A x + b.
+        size: what the right-hand side is divided by.
+        free: every unknown's, when this is done.
+        sums: memory; `SIZE` of its scalars is written.
+        restrict: whether the system does not have all unknowns yet.
+    """
+    rows, finest = Rows.flat(problem.layout.size, problem.device), system.hierarchy.finest
+    ALL_FREE.bind(rows, unknown=problem.unknown, free=free).launch()
+    if restrict:
+        system.restrict(free)
+    ON_FREE.bind(rows, y=y, free=free, g=system.r, scale=1 / size, out=sums.partials).launch()
+    sums.scalars[int(SIZE) : int(SIZE) + 1].fill_(size)
+    bounds, lo, hi = problem.bounds.operands, finest.lower, finest.upper
+    GAPS.bind(rows, bounds=bounds, x=x, unknown=problem.unknown, lo=lo, hi=hi, scalars=sums.scalars).launch()
+    system.monotone_cycle()
