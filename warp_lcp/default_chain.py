@@ -163,7 +163,7 @@ def _without_path(method: MinimumMapNewton) -> Fallback:
 
 def _has_negative_diagonal(problem: LCP) -> bool:
     A = problem.A
-    diagonal = A.matrix.numpy().diagonal() if isinstance(A, DenseOperator) else A.diagonal().numpy()
+    diagonal = A.host_diagonal() if isinstance(A, DenseOperator) else A.diagonal().numpy()
     return bool((diagonal < 0).any())
 
 
