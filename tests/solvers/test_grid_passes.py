@@ -197,7 +197,7 @@ def test_what_the_minimum_map_holds_goes_to_its_bound(precision, periodic):
     np.testing.assert_allclose(inner(work.x), x, rtol=0, atol=0)
     free = fluid & ~low & ~high
     expected = np.where(free, -(A @ x + b), 0.0) / residual.norm_of_b()
-    np.testing.assert_allclose(inner(work.hierarchy.finest.b), expected, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(inner(work.iterate.hierarchy.finest.b), expected, rtol=1e-5, atol=1e-6)
     assert not residual.away
 
 

@@ -26,6 +26,7 @@ PROGRESS = 0.999  # a residual above this part of the smallest so far is no prog
 WEAK = 30  # iterations of a linear solve that tell of a weak preconditioner
 GRACE = StoppingCriteria.patience  # steps after a hand-over in which the residual need not fall
 BATCH = 0.1  # factor by which a batch of steps reduces the residual
+LASTING = ("begin_ahead", "scratch", "solution")  # attributes of a workspace that stay, and that the outer loop asks for
 PROVED = (SolveStatus.INFEASIBLE, SolveStatus.NEGATIVE_CURVATURE)  # failures that no other method mends
 
 
@@ -256,8 +257,6 @@ class FallbackWorkspace:
         self.x, self.residual, self.round_iterate = first.x, first.residual, first.round_iterate
         self.precision = first.precision if isinstance(first.precision, Precision) else Precision(first.precision)
         self._may_be_ahead = hasattr(first, "is_ahead")  # whether its device may take steps without the host
-        if hasattr(first, "begin_ahead"):
-            self.begin_ahead = first.begin_ahead
         self._works: dict[int, Any] = {0: first}  # by place in the chain; None: the method does not take the problem
         self._suited: dict[int, bool] = {}  # by place: whether a method takes such a problem, before it has a workspace
         self._best: wp.array[Any] | None = None
@@ -269,7 +268,10 @@ class FallbackWorkspace:
         """Return an attribute of the first method's workspace."""
         if name in ("_first", "__setstate__"):
             raise AttributeError(name)
-        return getattr(self._first, name)
+        found = getattr(self._first, name)
+        if name in LASTING:
+            self.__dict__[name] = found  # for later look-ups
+        return found
 
     def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> bool | None:
         """Begin with the first method, at an iterate that `keep` has been told of; the operator may have changed."""
