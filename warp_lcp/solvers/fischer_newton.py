@@ -308,6 +308,7 @@ class FischerDenseWorkspace(DenseWorkspace):
         super().__init__(problem, settings.precision)
         self.settings, self._descent = settings, settings.descent(problem)
         self.cycles_left, self.descents_left, self.stage, self.steps = 0, settings.warm_start, 0, 0
+        self.units: np.ndarray = np.ones(0)
         self.cold_start: Any = None
         self._search = NonmonotoneSearch(memory=settings.memory if settings.safeguard else 1)
         self._gradient: DescentWorkspace | None = None
@@ -316,7 +317,9 @@ class FischerDenseWorkspace(DenseWorkspace):
         """Read the problem, and begin the first stage."""
         super().start(warm=warm, tolerance=tolerance)
         s = self.settings
-        data, self.units = self.data.scaled() if s.scaled else (self.data, np.ones(len(self.data.b)))
+        data, self.units = self.data, np.ones(len(self.data.b), dtype=np.float64)
+        if s.scaled:
+            data, self.units = self.data.scaled()
         lower, upper = without_far(data.lower, data.upper, INFINITY)  # squares of what is larger overflow
         data = replace(data, lower=lower, upper=upper)
         self.map = HostMap(data, self._descent.fischer_weight, Kink(s.kink), np.random.default_rng(2015), scaled=s.scaled)
