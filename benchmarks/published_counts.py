@@ -17,19 +17,23 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.benchmarks.book import appendix_c
+from warp_lcp.benchmarks.book import problems as book
 from warp_lcp.benchmarks.book.outcome import outcome
-from warp_lcp.benchmarks.book.problems import Scale, kinds
 from warp_lcp.gallery import Problem, ball_obstacle, journal_bearing
 from warp_lcp.gallery.obstacle import membrane_height
 
 WITHIN = 2  # iterations by which a count may differ
-P4PDES, DEALII, PERMON, BOOK = "p4pdes", "deal.II step-41", "PERMON", "[Book] table C.2"
+P4PDES, DEALII, PERMON, TAO, BOOK = "p4pdes", "deal.II step-41", "PERMON", "PETSc/TAO", "[Book] table C.2"
+MURTY, YOUNG = "Murty 1988", "theory"
 LEVELS = (17, 33, 65, 129, 257)  # nodes a side
 NEWTON: dict[str, Any] = {"monotone_cycles": 0, "eta": 1e-5, "precision": "double"}  # PETSc's tolerance of linear systems
 REDUCED = wl.MinimumMapNewton(safeguard=False, **NEWTON)
-SEMISMOOTH = wl.FischerNewton(safeguard=False, fischer_weight=1.0, **NEWTON)
+SEMISMOOTH = wl.FischerNewton(safeguard=False, scaled=False, fischer_weight=1.0, **NEWTON)
 SOLVED = 1e-8  # PETSc's relative tolerance
 AT_BOUND = 1e-8  # from the bound, where PETSc's active set ends
+KINK = 1e-12  # of x - l and y, below which TAO moves the point
+# as TAO's bqpip: 0.95 of the way to a bound, a start whose products w s have its mean, 2000
+PREDICTOR_CORRECTOR = wl.InteriorPoint(precision="double", monotone_cycles=0, backoff=0.95, start=120.0, predictor_eta=1e-8, eta=1e-8)
 
 
 @dataclass(frozen=True)
@@ -210,31 +214,144 @@ def bearings(*sizes: tuple[int, int]) -> tuple[float, ...]:
     return tuple(gradient_steps(*bearing_problem(*size)) for size in sizes)
 
 
+def put_problem() -> tuple[np.ndarray, np.ndarray, Callable[[np.ndarray], np.ndarray]]:
+    """Return A, the payoff and b(V) of PETSc's blackscholes.c: a time step of an American put by Crank and Nicolson's scheme.
+
+    Values 10 at S = 0 and 0 at S = 100 are known, so that A has 149 unknowns; V has 151 values, those of the step before.
+    """
+    strike, rate, dividend, volatility, step = 10.0, 0.04, 0.01, 0.4, 0.1
+    S = np.linspace(0, 100, 151)
+    inner, spacing = slice(1, -1), S[1]
+    drift, diffusion = (dividend - rate) * S[inner] / (4 * spacing), -((volatility * S[inner] / spacing) ** 2) / 4
+    left, right = diffusion - drift, diffusion + drift
+    A = np.diag(1 / step + rate - 2 * diffusion) + np.diag(left[1:], -1) + np.diag(right[:-1], 1)
+
+    def right_side(V: np.ndarray) -> np.ndarray:
+        b = -V[inner] / step + left * V[:-2] - 2 * diffusion * V[inner] + right * V[2:]
+        b[0] += left[0] * strike
+        return np.asarray(b)
+
+    return A, np.maximum(strike - S, 0.0), right_side
+
+
+def fischer_gradient(A: np.ndarray, lower: np.ndarray, x: np.ndarray, y: np.ndarray) -> float:
+    """Return the norm of the gradient J'f of the Fischer-Burmeister map's merit (TAO's semismooth methods).
+
+    J = diag(p) + diag(q) A; at kinks p and q are those of a point moved along z, 1 at kinks and 0 elsewhere.
+    """
+    a = x - lower
+    rho = np.hypot(a, y)
+    kink = rho <= KINK
+    z = np.where(kink, 1.0, 0.0)
+    u, v = (np.where(kink, moved, value) for moved, value in ((z, a), (A @ z, y)))
+    length, f = np.hypot(u, v), a + y - rho
+    p, q = 1 - u / length, 1 - v / length
+    return float(np.linalg.norm(p * f + A.T @ (q * f)))
+
+
+def put() -> tuple[float, ...]:
+    """Return the Newton steps of the nine time steps of the put, each from the values of the step before."""
+    A, payoff, right_side = put_problem()
+    lower, V, counts = payoff[1:-1], payoff, list[float]()
+    method = wl.FischerNewton(safeguard=False, scaled=False, fischer_weight=1.0, precision="double")
+    for _ in range(9):
+        problem = wl.LCP(wl.DenseOperator(A, device="cpu"), right_side(V), lower)
+        result = steps_until(problem, method, partial(fischer_gradient, A, lower), 1e-5, x0=V[1:-1])
+        counts.append(result.iterations)
+        V = np.r_[payoff[0], result.x.numpy(), payoff[-1]]
+    return tuple(counts)
+
+
+def gap_norm(x: np.ndarray, y: np.ndarray) -> float:
+    """Return the root of the complementarity gap plus the dual infeasibility (TAO's bqpip), for x >= 0."""
+    return float(np.sqrt(np.maximum(x, 0.0) @ np.maximum(y, 0.0) + np.abs(np.minimum(y, 0.0)).sum()))
+
+
+def interior_bearing() -> tuple[float, ...]:
+    """Return the interior-point steps on the journal bearing of eccentricity 0.9."""
+    problem = journal_bearing(10, 16, 0.9, device="cpu").dense()
+    return (steps_until(wl.LCP(problem.A, problem.b, 0.0), PREDICTOR_CORRECTOR, gap_norm, 1e-4, relative=False).iterations,)
+
+
+def murty_problem(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return A and b of Murty's problem: 1 on the diagonal, 2 below, b_i = -(2^(n+1) - 2^(n-i)), i = 0, ... n - 1."""
+    return np.eye(n) + 2 * np.tril(np.ones((n, n)), -1), 2.0 ** (n - np.arange(n)) - 2.0 ** (n + 1)
+
+
+def pivots(*sizes: int) -> tuple[float, ...]:
+    """Return Lemke's pivots on Murty's problems."""
+    stopping = wl.StoppingCriteria(rtol=1e-12, max_iterations=2000)
+    solved = [wl.solve(wl.LCP(*murty_problem(n)), wl.Lemke(), stopping=stopping) for n in sizes]
+    return tuple(result.linear_iterations for result in solved if result)
+
+
+def slowest_mode(n: int, *, by_rows: bool) -> tuple[np.ndarray, float]:
+    """Return the error that sweeps on the 5-point operator of n^2 nodes reduce least, shape (n, n), and the factor.
+
+    Jacobi's is cos(pi h) with h = 1 / (n + 1); Gauss and Seidel's, row by row, its square (Young 1971).
+    """
+    k, factor = np.arange(1, n + 1), float(np.cos(np.pi / (n + 1)))
+    wave = np.sin(np.pi * k / (n + 1)) * (factor**k if by_rows else 1.0)
+    return np.outer(wave, wave), factor**2 if by_rows else factor
+
+
+def sweeps(n: int, method: Any, *, by_rows: bool) -> float:
+    """Return the sweeps that divide the slowest error by 1e6 where no bound is met: A x = A 1, x >= 0 from 1 plus that error."""
+    line = 2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
+    A = np.kron(line, np.eye(n)) + np.kron(np.eye(n), line)
+    error = slowest_mode(n, by_rows=by_rows)[0].ravel()
+
+    def largest(x: np.ndarray, y: np.ndarray) -> float:
+        return float(np.abs(x - 1).max())
+
+    return steps_until(wl.LCP(A, -A.sum(axis=1), 0.0), method, largest, 1e-6, x0=1 + error / 2).iterations
+
+
+def theory(n: int, *, by_rows: bool) -> float:
+    """Return the sweeps that the factor of the slowest error says."""
+    return float(np.ceil(np.log(1e-6) / np.log(slowest_mode(n, by_rows=by_rows)[1])))
+
+
 def recipe(kind: str, method: str, problems: int) -> tuple[float, ...]:
     """Return the mean iterations by the book's tests on its random problems."""
+    make = book.kinds(book.Scale(problems, 10, 30, 100, (16,), (2,), 40))[kind]
+    return _mean(method, [make(k) for k in range(problems)])
+
+
+def contact_problem(k: int, tangents: int = 3) -> Problem:
+    """Return a problem of 30 contacts by the recipe of Num4LCP, whose Python code fills three of four tangents."""
+    rng = np.random.default_rng([book.SEED + 1, k])
+    return book.recipe(book.contact_matrix(30, rng, tangents), rng, f"contact {k}")
+
+
+def contacts(problems: int) -> tuple[float, ...]:
+    """Return Fischer-Newton's mean iterations by the book's tests on random contacts."""
+    return _mean("Fischer-Newton", [contact_problem(k) for k in range(problems)])
+
+
+def _mean(method: str, problems: Sequence[Problem]) -> tuple[float, ...]:
     solver, merit = appendix_c.METHODS[method]
-    make = kinds(Scale(problems, 10, 30, 100, (16,), (2,), 40))[kind]
-    found = outcome(method, [make(k) for k in range(problems)], solver, merit, "cpu")
-    return (statistics.fmean(found.accepted),)
+    return (statistics.fmean(outcome(method, problems, solver, merit, "cpu").accepted),)
 
 
 NEWTON_NAME, FISCHER_NAME, FLUID = "minimum-map-newton", "fischer-newton", "fluid, recipe"
-SCALED = "the map is scaled by A_ii here; unscaled, NumPy takes 11 steps on the first"
 JACOBI = "preconditioned by the diagonal here, which varies; without, NumPy takes 119"
-HALF_STEP = "the whole step is projected here; with a half step and a fixed step NumPy takes 184, or 181 if that is 0.5 % longer"
-GMRES = "the map is scaled by an equilibration of A here, random numbers and linear solver differ; not explained in full"
+HALF_STEP = "the whole step is projected here; with PERMON's half step and fixed step NumPy takes 181"
+MURTYS, SIDE = (2, 3, 4, 5, 6, 7, 8), 15
 COUNTS: tuple[Count, ...] = (
     Count(NEWTON_NAME, "hemisphere, 17^2 to 257^2", (3, 6, 7, 12, 21), P4PDES, partial(cold_membrane, REDUCED, reduced_norm)),
     Count(NEWTON_NAME, "the same, from the coarser grid", (3, 4, 2, 2, 3), P4PDES, partial(sequenced_membrane, REDUCED, reduced_norm)),
-    Count(FISCHER_NAME, "hemisphere, 17^2, 33^2", (7, 11), P4PDES, partial(cold_membrane, SEMISMOOTH, fischer_norm, (17, 33))),
     Count(
-        FISCHER_NAME, "hemisphere, 65^2 to 257^2", (11, 16, 25), P4PDES,
-        partial(cold_membrane, SEMISMOOTH, fischer_norm, (65, 129, 257)), SCALED,
+        FISCHER_NAME, "hemisphere, 17^2 to 257^2", (7, 11, 11, 16, 25), P4PDES,
+        partial(cold_membrane, SEMISMOOTH, fischer_norm),
     ),
     Count(
         FISCHER_NAME, "hemisphere, 17^2 to 257^2, from the coarser grid", (5, 8, 6, 6, 7), P4PDES,
         partial(sequenced_membrane, SEMISMOOTH, fischer_norm),
     ),
+    Count(FISCHER_NAME, "American put, 9 time steps", (5, 5, 4, 4, 4, 4, 4, 4, 4), TAO, put),
+    Count("interior-point", "journal bearing, 10 x 16, e = 0.9", (14,), TAO, interior_bearing),
+    Count("lemke", "Murty's problems, 2 to 8 unknowns", (4, 8, 16, 32, 64, 128, 256), MURTY, partial(pivots, *MURTYS)),
     Count("primal-dual-active-set", "stairs, 129^2", (19,), DEALII, stairs),
     Count("mprgp", "string, 100, projected expansion", (160,), PERMON, string),
     Count("mprgp", "string, 100, half step and fixed step", (181,), PERMON, string, HALF_STEP),
@@ -244,7 +361,15 @@ COUNTS: tuple[Count, ...] = (
     Count(NEWTON_NAME, "random fluid, 1000", (4.07,), BOOK, partial(recipe, FLUID, "minimum map", 20)),
     Count("psor", "random fluid, 1000, omega = 1.4", (25.29,), BOOK, partial(recipe, FLUID, "PSOR 1.4", 100), slow=True),
     Count("psor", "random fluid, 1000, omega = 1", (49.38,), BOOK, partial(recipe, FLUID, "PGS", 100), slow=True),
-    Count(FISCHER_NAME, "random contacts, 180", (14.54,), BOOK, partial(recipe, "contact, recipe", "Fischer-Newton", 20), GMRES),
+    Count(FISCHER_NAME, "random contacts, 180", (14.54,), BOOK, partial(contacts, 100), slow=True),
+    Count(
+        "projected-jacobi", "5-point, 15^2, no bound met", (theory(SIDE, by_rows=False),), YOUNG,
+        lambda: (sweeps(SIDE, wl.ProjectedJacobi(omega=1.0), by_rows=False),),
+    ),
+    Count(
+        "psor", "5-point, 15^2, no bound met, omega = 1", (theory(SIDE, by_rows=True),), YOUNG,
+        lambda: (sweeps(SIDE, wl.ProjectedSOR(omega=1.0), by_rows=True),),
+    ),
 )  # fmt: skip
 
 

@@ -18,8 +18,6 @@ from warp_lcp.gallery import Problem
 
 RTOL = 1e-6  # of the natural residual: what this library calls solved
 DEEP = 1e-12  # tolerance of the solves: far enough to see how fast a method is at its end
-# steps by which MinimumMapNewton goes on where the book's method has ended
-FALLBACKS = frozenset({"regularized", "interior point", "predictor-corrector", "least index", "proximal point"})
 
 
 class Merit(Enum):
@@ -53,13 +51,11 @@ class Trace:
     Args:
         merits: the merit of each iterate, the start's first.
         residuals: the natural residual of each over the first one's.
-        steps: the method's word for what led to each.
         status: how the solve ended.
     """
 
     merits: Sequence[float]
     residuals: Sequence[float]
-    steps: Sequence[str]
     status: wl.SolveStatus
 
     @property
@@ -70,15 +66,12 @@ class Trace:
     def verdict(self, merit: Merit, limits: Limits) -> tuple[str, int, float]:
         """Return state, iterations and relative residual where Num4LCP's tests would have ended the solve.
 
-        Sweeps are tested after each one; Newton methods before each step, whose first test is iteration 1. A fallback of this library
-        counts as the end of the book's method, which has none.
+        Sweeps are tested after each one; Newton methods before each step, whose first test is iteration 1.
         """
         first = 1 if merit is Merit.PRODUCT else 0
         before = np.inf
         for k in range(first, len(self.merits)):
             iteration, now, relative = k + 1 - first, self.merits[k], self.residuals[k]
-            if self.steps[k] in FALLBACKS and self.steps[1] == "newton":
-                return "non-descent", iteration, relative
             if np.isfinite(before) and abs(now - before) < limits.rtol * abs(before):
                 return "relative", iteration, relative
             if now < limits.atol:
@@ -104,7 +97,7 @@ def follow(problem: Problem, solver: Any, merit: Merit, device: str, *, most: in
     stopping = wl.StoppingCriteria(rtol=DEEP, max_iterations=most, patience=max(1, most), divergence=1e30)
     result = wl.solve(lcp, solver, stopping=stopping, workspace=work, callback=look, x0=x0)
     first = result.history[0].residual or 1.0
-    return Trace(merits, [r.residual / first for r in result.history], [r.step for r in result.history], result.status)
+    return Trace(merits, [r.residual / first for r in result.history], result.status)
 
 
 @dataclass(frozen=True)

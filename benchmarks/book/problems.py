@@ -70,11 +70,16 @@ def complementary(A: Any, rng: np.random.Generator, name: str) -> Problem:
 RULES: dict[str, Callable[[Any, np.random.Generator, str], Problem]] = {"recipe": recipe, "planted": complementary}
 
 
-def contact_matrix(contacts: int, rng: np.random.Generator) -> np.ndarray:
+def contact_matrix(contacts: int, rng: np.random.Generator, tangents: int = 4) -> np.ndarray:
     """Return Num4LCP's contact matrix, which no contact of bodies has.
 
     Random symmetric 6 x 6 blocks, half of them zero, shifted to positive definite, with the pattern of Stewart and Trinkle written over
     those that are left.
+
+    Args:
+        contacts: number of contacts, six unknowns each.
+        rng: random numbers.
+        tangents: how many of a contact's tangents have the pattern: all 4 in Num4LCP's Matlab code, 3 in its Python code.
     """
     n = BLOCK * contacts
     R = rng.random((n, n))
@@ -86,11 +91,11 @@ def contact_matrix(contacts: int, rng: np.random.Generator) -> np.ndarray:
         A += (0.5 - lowest) * np.eye(n)
     blocks = A.reshape(contacts, BLOCK, contacts, BLOCK)
     i, j = np.nonzero(blocks[:, 0, :, 0])
-    last, tangents = BLOCK - 1, slice(1, BLOCK - 1)
+    last, among = BLOCK - 1, slice(1, 1 + tangents)
     blocks[i, last, j, 0] = 0.5  # mu
     blocks[i, last, j, last] = blocks[i, 0, j, last] = 0.0
-    blocks[i, last, j, tangents] = -1.0
-    blocks[i, tangents, j, last] = 1.0
+    blocks[i, last, j, among] = -1.0
+    blocks[i, among, j, last] = 1.0
     return A
 
 

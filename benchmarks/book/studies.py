@@ -37,7 +37,7 @@ SWEPT = 10  # sweeps of PGS before a warm start
 ZEROS = (0.0, 0.2, 0.4, 0.6, 0.8)
 SEMIDEFINITE: dict[str, Method] = {
     "Fischer-Newton, approximation": (APPROXIMATION, Merit.FISCHER),
-    **{name: METHODS[name] for name in ("minimum map", "PGS", "PSOR 1.4", "FischerNewton()")},
+    **{name: METHODS[name] for name in ("minimum map", "PGS", "PSOR 1.4", "FischerNewton()", "MinimumMapNewton()")},
 }
 
 

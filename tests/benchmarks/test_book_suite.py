@@ -98,12 +98,12 @@ def test_the_recipe_with_many_zero_eigenvalues_has_no_solution(zeros):
 
 
 def test_verdicts_are_num4lcp_s():
-    def trace(merits, steps=None):
-        return Trace(merits, [1.0] * len(merits), steps or ["start"] + ["newton"] * (len(merits) - 1), wl.SolveStatus.MAX_ITERATIONS)
+    def trace(merits, status=wl.SolveStatus.MAX_ITERATIONS):
+        return Trace(merits, [1.0] * len(merits), status)
 
     assert trace([9.0, 1.0, 1e-4]).verdict(Merit.FISCHER, Limits())[:2] == ("absolute", 3)
     assert trace([9.0, 1.0, 1.0]).verdict(Merit.FISCHER, Limits())[:2] == ("relative", 3)
     assert trace([9.0, 1.0, 1e-4]).verdict(Merit.PRODUCT, Limits())[:2] == ("absolute", 2)  # tested after a sweep
-    assert trace([9.0, 1.0, 0.5], ["start", "newton", "interior point"]).verdict(Merit.MINIMUM, Limits())[:2] == ("non-descent", 3)
     assert trace([9.0, 8.0, 7.0]).verdict(Merit.FISCHER, Limits(most=2))[:2] == ("max iterations", 2)
+    assert trace([9.0, 1.0], wl.SolveStatus.NON_DESCENT).verdict(Merit.MINIMUM, Limits())[:2] == ("non-descent", 2)
     assert outcome.spread([1, 2, 3]) == "2.00 (1 to 3, 0.82)"

@@ -116,6 +116,52 @@ def test_matrix_free_steps_are_those_of_the_algorithm(kink, share, safeguard, de
 
 
 @pytest.mark.parametrize("kink", ["perturbation", "zero"])
+@pytest.mark.parametrize("share", [1.0, 0.6])
+def test_unscaled_steps_are_those_of_the_algorithm(kink, share, device):
+    """d = 1 whatever A's diagonal is, on the host and matrix-free; those of the scaled map are others."""
+    method = FischerNewton(kink=kink, fischer_weight=share, safeguard=False, scaled=False, precision="double", eta=1e-14)
+    for seed in (4205, 4207, 4213):
+        A, b, lower, upper, x0 = unlike_rows(seed)
+        b, A = b - np.arange(9) / 2 * x0, A + np.diag(np.arange(9) / 2)  # y as before
+        plain = PlainMap("fischer" if share == 1 else "penalized", A, b, lower, upper, share=share)
+        scaled = plain_newton(plain, x0, 4, shifted_direction, drops=kink == "zero")
+        plain.d = np.ones(9)
+        assert plain.rows(x0)[3].sum() >= 3
+        expected = plain_newton(plain, x0, 4, shifted_direction, drops=kink == "zero")
+        assert np.abs(scaled[0][0] - expected[0][0]).max() > 1e-5
+        for operator in operators(A, device):
+            for x, (y, _) in zip(steps_of(wl.LCP(operator, b, lower, upper), method, x0, 4), expected, strict=True):
+                np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-9)
+        problem = wl.LCP(wl.DenseOperator(A, device=device), b, lower, upper)
+        expected = plain_newton(plain, x0, 4, jacobian_direction, drops=kink == "zero")
+        for x, (y, _) in zip(steps_of(problem, method, x0, 4), expected, strict=True):
+            np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-9)
+
+
+def test_unscaled_gradients_are_those_of_the_map():
+    """The projected gradient J'f itself, by which gradient descent goes and minima are told."""
+    A, b, lower, upper, x0 = unlike_rows(4207)
+    A = A + np.diag(np.arange(9) / 2)
+    plain = PlainMap("fischer", A, b, lower, upper)
+    plain.d = np.ones(9)
+    operator = wl.SparseOperator(scipy.sparse.csr_array(A), device="cpu")
+    problem, x0 = wl.LCP(operator, b, lower, upper), x0 + 0.125
+    work = FischerNewton(safeguard=False, scaled=False, fischer_weight=1.0).init(problem)
+    work.x.assign(x0)
+    work.residual.evaluate(work.x)
+    work.start(warm=True, tolerance=0.0)
+    work.map.descend(work.x)
+    np.testing.assert_allclose(work.map.direction.numpy(), plain.jacobian(x0).T @ plain.rows(x0)[0], rtol=1e-12, atol=1e-12)
+    method = FischerNewton(safeguard=False, scaled=False, fischer_weight=1.0)
+    assert method.descent(problem) == GradientDescent(map="fischer", fischer_weight=1.0, scaled=False)
+
+
+def test_unscaled_maps_have_no_safeguards():
+    with pytest.raises(ValueError, match=r"scaled = False: needs safeguard = False"):
+        FischerNewton(scaled=False)
+
+
+@pytest.mark.parametrize("kink", ["perturbation", "zero"])
 def test_plain_steps_on_the_host_are_those_of_the_algorithm(kink):
     """In units in which A is equilibrated, here 1: the diagonal is 1 and no entry larger."""
     lengths = []
@@ -244,8 +290,8 @@ def unit_rows(seed, share, n=7):
 
 @pytest.mark.parametrize("kink", ["perturbation", "zero"])
 @pytest.mark.parametrize("share", [1.0, 0.6])
-@pytest.mark.parametrize("safeguard", [False, True])
-def test_steps_on_a_grid_are_those_of_the_algorithm(kink, share, safeguard):
+@pytest.mark.parametrize(("safeguard", "scaled"), [(False, True), (True, True), (False, False)])
+def test_steps_on_a_grid_are_those_of_the_algorithm(kink, share, safeguard, scaled):
     """The passes over rows: from x = 0 on walls, half of them with y = 0."""
     rng = np.random.default_rng(4221)
     cells = rng.choice(3, (4, 5, 4), p=[0.1, 0.8, 0.1])
@@ -255,13 +301,16 @@ def test_steps_on_a_grid_are_those_of_the_algorithm(kink, share, safeguard):
     x0 = np.where(rng.random(n) < 0.6, 0.0, rng.integers(1, 5, n))
     b = np.where(rng.random(n) < 0.4, 0.0, rng.integers(-6, 7, n)) - A @ x0
     plain = PlainMap("fischer" if share == 1 else "penalized", A, b, np.zeros(n), np.full(n, np.inf), share=share)
+    plain.d = plain.d if scaled else np.ones(n)
     assert plain.rows(x0)[3].sum() > 5
     expected = plain_newton(plain, x0, 5, shifted_direction, drops=kink == "zero", memory=8 if safeguard else 1)
     fields = [np.zeros(cells.size) for _ in range(2)]
     for field, values in zip(fields, (b, x0), strict=True):
         field[fluid] = values
     problem = wl.LCP(wl.GridPoisson(cells, device="cpu"), fields[0].reshape(cells.shape))
-    method = FischerNewton(kink=kink, fischer_weight=share, safeguard=safeguard, precision="double", eta=1e-14, monotone_cycles=0)
+    method = FischerNewton(
+        kink=kink, fischer_weight=share, safeguard=safeguard, scaled=scaled, precision="double", eta=1e-14, monotone_cycles=0
+    )
     place = problem.layout.places()[fluid]
     for x, (y, _) in zip(steps_of(problem, method, fields[1].reshape(cells.shape), 5), expected, strict=True):
         np.testing.assert_allclose(x[place], y, rtol=1e-6, atol=1e-6)

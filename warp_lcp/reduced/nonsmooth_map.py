@@ -86,7 +86,7 @@ class MapFields:
     Attributes:
         x: iterate.
         y: A x + b.
-        d: diagonal of A in units of `unit`.
+        d: the natural residual's d, or 1, in units of `unit`.
         unknown: 1 where there is an unknown.
         unit: of d.
     """
@@ -163,13 +163,20 @@ class NonsmoothMap:
         map: which of the three.
         share: lambda of the penalized map.
         kink: what stands for the derivative at a kink.
+        scaled: False: d = 1.
 
     Attributes:
         norm: of the right-hand side that `step` wrote, as its system measures it.
     """
 
-    def __init__(self, problem: LCP, residual: NaturalResidual, map: MapForm, share: float, kink: Kink = Kink.PERTURBATION) -> None:
+    def __init__(
+        self, problem: LCP, residual: NaturalResidual, map: MapForm, share: float, kink: Kink = Kink.PERTURBATION, *,
+        scaled: bool = True,
+    ) -> None:  # fmt: skip
         self.problem, self.residual, self.map = problem, residual, map
+        self._d, self._unit = residual.diagonal, residual.unit
+        if not scaled:
+            self._d, self._unit = wp.full(self._d.shape, 1, dtype=self._d.dtype, device=problem.device), 1.0
         layout, self._share = problem.layout, share if map is MapForm.PENALIZED else 1.0
         natural, self._random = map is MapForm.NATURAL, kink is Kink.RANDOM
         self._natural, self._upper, self._penalized = natural, problem.bounds.may_bind[1], self._share < 1
@@ -258,8 +265,7 @@ class NonsmoothMap:
         self._half_sum(WEIGHTED, x, MapWeights(new, weights))
         shape = (p.layout.size,) if isinstance(p.layout, PaddedLayout) else p.layout.stored_shape  # grids take stored fields flat
         p.A.apply_transpose(weights.reshape(shape), product.reshape(shape))
-        r = self.residual
-        square, inner = self._sums.of(GRADIENT, gradient=new, product=product, last=last, unknown=p.unknown, d=r.diagonal, unit=r.unit)
+        square, inner = self._sums.of(GRADIENT, gradient=new, product=product, last=last, unknown=p.unknown, d=self._d, unit=self._unit)
         return float(square), float(inner)
 
     @property
@@ -291,7 +297,7 @@ class NonsmoothMap:
         merit = self.merit(x)
         self.descend(x)
         at, step, lower, upper = (v.numpy()[inside] for v in (x, self.direction, *(p.bounds.as_field(k) for k in (0, 1))))
-        d = np.abs(self.residual.diagonal.numpy()[inside].astype(np.float64) * self.residual.unit)
+        d = np.abs(self._d.numpy()[inside].astype(np.float64) * self._unit)
         projected = np.where(d == 0, 1.0, d) * (at - np.clip(at - step, lower, upper))
         return float(np.linalg.norm(projected)) <= share * math.sqrt(2 * merit)
 
@@ -309,8 +315,7 @@ class NonsmoothMap:
         return 0.5 * float(sums[0])
 
     def _fields(self, x: wp.array[Any]) -> MapFields:
-        r = self.residual
-        return MapFields(x, r.y, r.diagonal, self.problem.unknown, r.unit)
+        return MapFields(x, self.residual.y, self._d, self.problem.unknown, self._unit)
 
 
 class FiniteDifferenceSystem(KrylovSystem):
@@ -323,12 +328,13 @@ class FiniteDifferenceSystem(KrylovSystem):
         residual: evaluated at x when a step begins; its memory is used for the differences.
         map: the reformulation.
         share: lambda of the penalized map.
+        scaled: False: d = 1 in the map.
     """
 
-    def __init__(self, problem: LCP, residual: NaturalResidual, map: MapForm, share: float) -> None:
+    def __init__(self, problem: LCP, residual: NaturalResidual, map: MapForm, share: float, *, scaled: bool = True) -> None:
         layout, self._problem, self._residual = problem.layout, problem, residual
         self.r, self.z, self._f, self._moved = (layout.zeros(wp.float64) for _ in range(4))
-        self._map = NonsmoothMap(problem, residual, map, share, Kink.APPROXIMATION)
+        self._map = NonsmoothMap(problem, residual, map, share, Kink.APPROXIMATION, scaled=scaled)
         self._iterate_by(GMRES(self._product, self), None)
         self.refresh()
 
@@ -370,12 +376,13 @@ class HostMap:
         share: lambda.
         kink: what stands at kinks.
         rng: of random elements.
+        scaled: False: d = 1.
     """
 
-    def __init__(self, data: DenseProblem, share: float, kink: Kink, rng: np.random.Generator) -> None:
+    def __init__(self, data: DenseProblem, share: float, kink: Kink, rng: np.random.Generator, *, scaled: bool = True) -> None:
         self.data, self.share, self.kink, self._rng = data, share, kink, rng
         d = np.abs(np.diag(data.A))
-        self.d = np.where(d == 0, 1.0, d)
+        self.d = np.where(d == 0, 1.0, d) if scaled else np.ones_like(d)
         self.scale = float(np.sqrt(np.mean(data.b**2))) or 1.0
         n = len(data.b)
         self._element = np.zeros(n), np.ones(n)

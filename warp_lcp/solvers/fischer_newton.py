@@ -18,7 +18,7 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.scale import NoTranspose
-from warp_lcp.problem.solve import IterateMemory, Precision, Step
+from warp_lcp.problem.solve import IterateMemory, Precision, PrecisionName, Step
 from warp_lcp.reduced.dense_problem import DenseWorkspace
 from warp_lcp.reduced.descent import DECREASE, NonmonotoneSearch
 from warp_lcp.reduced.grid_system import GridSystem
@@ -66,6 +66,8 @@ class FischerNewton(NewtonSettings):
             grow with the grid (ball obstacle, 65^2 to 1025^2: 6 to 11 steps with 0.95, 6 to 7 with 1).
         safeguard: False: monotone Armijo search along the projected path, and an end with NON_DESCENT or LOCAL_MINIMUM where that
             fails: the book's method. True: as described above.
+        scaled: False: d = 1 in the map, and no equilibration of dense problems, as in the book; needs safeguard = False. Steps
+            then depend on the units of x.
         precision: "mixed": iterate float64, corrections float32 on grids; "double"; or "single": the iterate rounded to float32 too.
         warm_start: steps of gradient descent on the same map before the first Newton step.
         monotone_cycles: projected multigrid cycles of a cold start on a grid.
@@ -87,8 +89,14 @@ class FischerNewton(NewtonSettings):
     kink: KinkName = "perturbation"
     fischer_weight: ShareOrAll | None = None
     safeguard: bool = True
+    scaled: bool = True
     warm_start: CountOrZero = 0
     memory: Count = 8
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.safeguard and not self.scaled:
+            raise ValueError("scaled = False: needs safeguard = False: the safeguards have thresholds for scaled maps")
 
     def descent(self, problem: LCP) -> GradientDescent:
         """Return the gradient descent on this method's map for a problem.
@@ -97,7 +105,8 @@ class FischerNewton(NewtonSettings):
         """
         weight = self.fischer_weight if self.fischer_weight is not None else SHARE if isinstance(problem.A, DenseOperator) else 1.0
         map_ = MapForm.FISCHER if weight == 1 else MapForm.PENALIZED
-        return GradientDescent(map=map_.value, fischer_weight=weight, precision="single" if self.precision == "single" else "double")
+        precision: PrecisionName = "single" if self.precision == "single" else "double"
+        return GradientDescent(map=map_.value, fischer_weight=weight, precision=precision, scaled=self.scaled)
 
     def init(self, problem: LCP) -> FischerWorkspace | FischerDenseWorkspace:
         """Return a workspace, on the host for dense matrices.
@@ -138,14 +147,14 @@ class FischerWorkspace(IterateMemory):
         self._descent = settings.descent(problem)
         map_, share = MapForm(self._descent.map), self._descent.fischer_weight
         self.system: Any = (
-            FiniteDifferenceSystem(problem, self.residual, map_, share)
+            FiniteDifferenceSystem(problem, self.residual, map_, share, scaled=settings.scaled)
             if self.kink is Kink.APPROXIMATION
             else principal_system(
                 problem, self.precision.correction, bounded=False, settings=settings.cycle, shifted=True,
                 hierarchy=self.cold_start.hierarchy if self.cold_start else None,
             )
         )  # fmt: skip
-        self.map = NonsmoothMap(problem, self.residual, map_, share, self.kink)
+        self.map = NonsmoothMap(problem, self.residual, map_, share, self.kink, scaled=settings.scaled)
         grid = isinstance(self.system, GridSystem) and self.system.fused
         self._fusable = grid and settings.safeguard and self.precision is not Precision.SINGLE
         self._search = NonmonotoneSearch(memory=settings.memory if settings.safeguard else 1)
@@ -300,6 +309,7 @@ class FischerDenseWorkspace(DenseWorkspace):
         super().__init__(problem, settings.precision)
         self.settings, self._descent = settings, settings.descent(problem)
         self.cycles_left, self.descents_left, self.stage, self.steps = 0, settings.warm_start, 0, 0
+        self.units: np.ndarray = np.ones(0)
         self.cold_start: Any = None
         self._search = NonmonotoneSearch(memory=settings.memory if settings.safeguard else 1)
         self._gradient: DescentWorkspace | None = None
@@ -308,10 +318,12 @@ class FischerDenseWorkspace(DenseWorkspace):
         """Read the problem, and begin the first stage."""
         super().start(warm=warm, tolerance=tolerance)
         s = self.settings
-        data, self.units = self.data.scaled()
+        data, self.units = self.data, np.ones(len(self.data.b), dtype=np.float64)
+        if s.scaled:
+            data, self.units = self.data.scaled()
         lower, upper = without_far(data.lower, data.upper, INFINITY)  # squares of what is larger overflow
         data = replace(data, lower=lower, upper=upper)
-        self.map = HostMap(data, self._descent.fischer_weight, Kink(s.kink), np.random.default_rng(2015))
+        self.map = HostMap(data, self._descent.fischer_weight, Kink(s.kink), np.random.default_rng(2015), scaled=s.scaled)
         self._identity = np.eye(len(data.b))
         self._search.forget()
         self.descents_left, self.stage, self.steps, self.target = s.warm_start, 0, 0, tolerance

@@ -45,6 +45,7 @@ class GradientDescent(Settings):
         gradient: of the test for a local minimum, >= 0.
         memory: merits that the search remembers, >= 1; 1 is the book's monotone search.
         precision: "mixed" and "double" are the same here; "single" rounds x to float32.
+        scaled: False: d = 1 in the map and in the step, as in the book.
     """
 
     needs: ClassVar[str] = "products with A'"
@@ -56,6 +57,7 @@ class GradientDescent(Settings):
     gradient: NonNegative = 1e-10
     memory: Count = 10
     precision: PrecisionName = "double"
+    scaled: bool = True
 
     def init(self, problem: LCP) -> DescentWorkspace:
         """Return a workspace, for any operator."""
@@ -80,7 +82,7 @@ class DescentWorkspace(IterateMemory):
         super().__init__(problem, settings.precision, x=x, residual=residual)
         self.settings = settings
         self._from = problem.layout.zeros(wp.float64)
-        self._map = NonsmoothMap(problem, self.residual, MapForm(settings.map), settings.fischer_weight)
+        self._map = NonsmoothMap(problem, self.residual, MapForm(settings.map), settings.fischer_weight, scaled=settings.scaled)
         self._search = NonmonotoneSearch(memory=settings.memory, least=1e-18)
         self.length, self._square = 1.0, 0.0
 
