@@ -17,7 +17,7 @@ from warp_lcp.solvers.registry import METHODS
 from warp_lcp.solvers.subspace_minimization import SubspaceMinimization
 from warp_lcp.traits import Traits
 
-FEW_SWEEPS = {"grid": 25, "sparse": 30}  # fewer are faster than a multigrid hierarchy's set-up and some cycles, or than systems
+FEW_SWEEPS = {"grid": 25, "sparse": 60}  # fewer are faster than a multigrid hierarchy's set-up and some cycles, or than systems
 PIVOTED = 1000  # unknowns up to which a method that fails is followed by Lemke's: it takes seconds there
 SURE, LONG_PATHS = 100, 2000  # unknowns up to which Lemke's paths may take so many steps: ten seconds
 LONGEST = 5000  # steps of a method that sweeps: a prediction may be too low
