@@ -26,6 +26,7 @@ from warp_lcp.solvers.mprgp import MPRGP
 from warp_lcp.solvers.primal_dual_active_set import PrimalDualActiveSet
 from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
 from warp_lcp.solvers.proximal_point import ProximalPoint
+from warp_lcp.solvers.staggering import Staggering
 
 FALL = 0.9  # a residual above this part of the smallest so far is no progress of a path
 PATH_IDLE = 10  # steps without progress before the proximal-point method: a path is joined far from the start
@@ -44,6 +45,7 @@ def default_chain(method: Solver, problem: LCP | None = None) -> Solver:
       near null space is known; `InteriorPoint` where steps stall or fail; then `ProximalPoint`. With negative diagonal entries
       `FischerNewton` instead of these two. On grids that need line relaxation or are not symmetric: on the assembled matrix.
     - `PrimalDualActiveSet`: `MinimumMapNewton` (not on dense matrices), then as above.
+    - `Staggering` without methods for its blocks: `MinimumMapNewton` in each block, then `InteriorPoint` and `ProximalPoint` as above.
 
     Args:
         method: the first method.
@@ -55,6 +57,8 @@ def default_chain(method: Solver, problem: LCP | None = None) -> Solver:
         return _of_newton(method, problem)
     if isinstance(method, PrimalDualActiveSet):
         return _of_active_set(method, problem)
+    if isinstance(method, Staggering) and not method.solvers:
+        return replace(method, solvers=(Fallback(MinimumMapNewton(), *_last()),))
     return method
 
 

@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+import scipy.linalg
 import scipy.sparse
 import warp as wp
 
@@ -120,8 +121,10 @@ def test_the_last_iterate_is_handed_on_otherwise():
     np.testing.assert_allclose(second.works[0].begun, 1 - 0.5**4)
 
 
-def test_a_restarted_method_begins_cold_and_hands_on_the_best_iterate():
-    restarted, last = Shrink(0.9, "b", fails_after=2), Shrink(0.1, "c")
+@pytest.mark.parametrize("rate", [0.9, 0.1])
+def test_a_restarted_method_begins_cold_and_hands_on_what_it_was_given(rate):
+    """Whether its own iterates are better or not: the best one is kept for the end."""
+    restarted, last = Shrink(rate, "b", fails_after=2), Shrink(0.1, "c")
     chain = wl.Fallback(Shrink(0.5, "a"), wl.FallbackEntry(restarted, after(3), restart=True), (last, wl.fails))
     assert wl.solve(lines(), chain, stopping=LINES)
     np.testing.assert_array_equal(restarted.works[0].begun, np.zeros(3))
@@ -153,6 +156,36 @@ def test_a_failure_without_a_successor_is_the_status():
 def test_nothing_is_handed_over_at_the_rounding_floor():
     result = wl.solve(lines(), wl.Fallback(Shrink(0.1, "a"), (Shrink(0.1, "b"), wl.stalls)), stopping=wl.StoppingCriteria(rtol=0.0))
     assert {record.method for record in result.history} == {"a"}
+
+
+@dataclass(frozen=True)
+class AtFloor:
+    """Set x next to the solution 1, where the residual is what rounding leaves but not 0, and stay there."""
+
+    name: str = "floor"
+
+    def init(self, problem):
+        return Memory(problem)
+
+    def step(self, problem, work, x):
+        x.fill_(1 + 4 * np.finfo(float).eps)
+        return Step("step of floor", 1)
+
+
+def test_a_restarted_method_hands_over_at_the_rounding_floor():
+    """A path that leads nowhere ends, and the solve with FLOOR, not with MAX_ITERATIONS."""
+    entries = [wl.FallbackEntry(AtFloor(), after(3), restart=True), (Shrink(1.0, "c", fails_after=2), wl.stalls)]
+    result = wl.solve(lines(), wl.Fallback(Shrink(0.5, "a"), *entries), stopping=wl.StoppingCriteria(rtol=0.0))
+    assert result.status is wl.SolveStatus.FLOOR
+    assert result.method == "floor"
+    assert [record.method for record in result.history[-2:]] == ["c", "c"]
+
+
+def test_a_method_that_may_not_hand_over_at_the_rounding_floor_is_not_waited_for():
+    entries = [(AtFloor(), after(3)), (Shrink(1.0, "c"), wl.stalls)]
+    result = wl.solve(lines(), wl.Fallback(Shrink(0.5, "a"), *entries), stopping=wl.StoppingCriteria(rtol=0.0))
+    assert result.status is wl.SolveStatus.FLOOR
+    assert {record.method for record in result.history} == {"a", "floor"}
 
 
 def test_slow_linear_solves():
@@ -257,6 +290,22 @@ def maze(n=61):
     cells[0, 0] = wl.AIR
     b = np.where(cells == wl.FLUID, np.random.default_rng(5).standard_normal(cells.shape) - 0.2, 0.0)
     return wl.LCP(wl.GridPoisson(cells, device="cpu", dtype=wp.float64), b)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_blocks_of_staggering_have_a_chain_of_their_own(seed):
+    """Two linear programs with their duals: free blocks are singular, where Newton's method alone ends with NON_DESCENT."""
+    rng = np.random.default_rng(seed)
+    G, z = rng.standard_normal((9, 9)), np.maximum(rng.standard_normal(18), 0)
+    S = np.block([[np.zeros((9, 9)), -G.T], [G, np.zeros((9, 9))]])
+    b = np.where(z > 0, 0, rng.random(18)) - S @ z
+    problem = wl.LCP(scipy.linalg.block_diag(S, S), np.tile(b, 2))
+    assert wl.solve(problem, wl.Staggering()).status is wl.SolveStatus.NON_DESCENT
+    result = wl.solve(problem, wl.default_chain(wl.Staggering(), problem))
+    assert result
+    assert result.method == "staggering"
+    given = wl.Staggering(solvers=wl.Lemke())
+    assert wl.default_chain(given, problem) is given
 
 
 def test_without_fallback_the_first_method_ends_the_solve():

@@ -135,11 +135,11 @@ class Fallback:
     """Chain of methods, each of which takes over as soon as its condition holds.
 
     Before each step the condition of the next method that takes the problem is asked; others, and one equal to the method at work,
-    are skipped. If it holds, the next method gets the iterate (the best one if the last step has failed or the method at work had
-    been restarted), the tolerance, floating components, and what its `init_after` takes from the workspace before. Nothing is handed
-    over where the residual is what rounding leaves (FLOOR), or where the
-    last step has proved that there is no solution. The residual of the first workspace judges all iterates. Each `Record` names
-    the method that made it.
+    are skipped. If it holds, the next method gets the iterate (the best one if the last step has failed; the one that a restarted
+    method was given, after that method), the tolerance, floating components, and what its `init_after` takes from the workspace
+    before. Nothing is handed over where the residual is what rounding leaves (FLOOR), but by a restarted method, or where the last
+    step has proved that there is no solution. The residual of the first workspace judges all iterates. Each `Record` names the
+    method that made it.
 
     Args:
         entries: a method, then pairs (method, condition) or `FallbackEntry` objects. Conditions: `fails`, `stalls`, `crawls`,
@@ -261,6 +261,8 @@ class FallbackWorkspace:
         self._suited: dict[int, bool] = {}  # by place: whether a method takes such a problem, before it has a workspace
         self._best: wp.array[Any] | None = None
         self._place = 0
+        self._begun: wp.array[Any] | None = None  # the iterate that the restarted method at work was given
+        self._floored = False  # whether only the rounding floor keeps the method at work from handing over
         self._left_first = False  # whether the best iterate is kept here and no longer by the first workspace
         self._at_best, self._best_norm = False, math.inf
 
@@ -317,7 +319,7 @@ class FallbackWorkspace:
                 return done
         else:
             done = progress.step = self._advance()
-            patient = self._since <= GRACE or self._place + 1 < len(self._entries)
+            patient = self._since <= GRACE or (self._place + 1 < len(self._entries) and not self._floored)
             name = done.method or method_name(self._entries[self._place].method)
             done = replace(done, interim=done.interim or patient, method=name)
         if done.failure is not None and done.failure not in PROVED:
@@ -329,6 +331,7 @@ class FallbackWorkspace:
 
     def _due(self) -> int | None:
         """Return the place of the method that takes over now, None if none does."""
+        self._floored = False
         for entry in self._entries[self._place + 1 :]:
             if entry.when(self._progress):
                 break
@@ -338,7 +341,11 @@ class FallbackWorkspace:
             entry = self._entries[place]
             if entry.method == self._entries[self._place].method or not self._may_take(place):
                 continue
-            if not entry.when(self._progress) or self._at_floor():
+            if not entry.when(self._progress):
+                return None
+            # a path joined far from the start reaches large x, where rounding leaves much: the method before it was not at its floor
+            if not self._entries[self._place].restart and self._at_floor():
+                self._floored = True
                 return None
             if self._workspace(place) is not None:
                 return place
@@ -379,11 +386,15 @@ class FallbackWorkspace:
     def _hand_over(self, place: int) -> None:
         """Start the method at a place of the chain, from the iterate or from clip(0, l, u)."""
         entry, before, work = self._entries[place], self._entries[self._place], self._workspace(place)
-        failed = fails(self._progress) or before.restart
+        failed = fails(self._progress)
         if not self._left_first:
             self._leave_first()
-        if failed and not self._at_best:
+        if before.restart and self._begun is not None:
+            wp.copy(self.x, self._begun)
+        elif failed and not self._at_best:
             wp.copy(self.x, self._best)
+        if entry.restart:
+            self._begun = wp.clone(self.x)
         self._place, self._since = place, 0
         self._progress.begin()
         self._begin(work, restart=entry.restart)
