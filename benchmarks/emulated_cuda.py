@@ -6,8 +6,9 @@ threads and blocks run in an order that is not the usual one (ORDER = forward, r
 is written to it is lost, as it is there, and recorded programs launch what a graph would hold.
 
 With COMPARE=1 every launch runs in all three orders from equal memory; `differs` counts the kernels whose results depend on it and that are
-not in `ORDER_MATTERS`. `meter` counts launches, readbacks and allocations, and calls: of Python, to launch, copy or clear, one for a
-whole graph.
+not in `ORDER_MATTERS`. With CELLS=1 every pass by quads of cells (`warp_lcp/rows/headers/quad.h`) also runs by cells, from equal memory:
+`launched_by_cells` counts such launches, `otherwise` those whose fields differ in a bit, or whose sums differ by more than rounding.
+`meter` counts launches, readbacks and allocations, and calls: of Python, to launch, copy or clear, one for a whole graph.
 
 What it cannot show: torn interleavings and the memory model (threads run one after another), graphs' own rules, the order of streams.
 """
@@ -15,20 +16,23 @@ What it cannot show: torn interleavings and the memory model (threads run one af
 import collections
 import ctypes
 import fnmatch
+import gc
 import importlib.abc
 import importlib.machinery
+import math
 import os
 import re
 import sys
 from pathlib import Path
 
+import numpy as np
 import warp as wp
 from warp._src import codegen, context
 from warp._src.types import array_t
 
 ORDERS = ("forward", "reversed", "permuted")
 ORDER = ORDERS.index(os.environ.get("ORDER", "permuted"))
-COMPARE = os.environ.get("COMPARE") == "1"
+COMPARE, CELLS = os.environ.get("COMPARE") == "1", os.environ.get("CELLS") == "1"
 PACKAGE = "warp_lcp"
 REAL = ("warp_lcp.distributed.", "warp_lcp.run.devices", "warp_lcp.benchmarks.")  # these ask CUDA itself, or another process
 ADDRESS = 0x6F0000000000  # of the order, where compiled kernels look it up
@@ -222,6 +226,84 @@ def compared(invoke):
     return launch
 
 
+PIECES = ("moved",)  # sums that count pieces of rows: that they are 0 is what counts
+
+
+def checked_by_cells(invoke):
+    """Return what launches passes by quads also by cells, from equal memory, and notes what differs."""
+    from warp_lcp.rows import layout
+    from warp_lcp.rows.pass_form import Form
+
+    forms = {}  # of kernels; None of those that are no pass by quads
+
+    def form_of(kernel):
+        if kernel not in forms:
+            made = (o for o in gc.get_objects() if type(o) is Form and o.quads and vars(o).get("kernel") is kernel)
+            forms[kernel] = next(made, None)
+        return forms[kernel]
+
+    def launch(kernel, hooks, params, adjoint):
+        form = form_of(kernel)
+        if form is None:
+            invoke(kernel, hooks, params, adjoint)
+            return
+        counts = meter.copy()
+        found, (_, rows, given), columns, twin = {}, params, form.declared.found, form.by_cells
+        arrays_of(given, kernel.adj.args[1].type, found)
+        for address in {given.out.data} if columns else ():
+            found.pop(address, None)  # places of sums are others
+        native, cells = twin.native.from_buffer_copy(bytes(given)), type(rows).from_buffer_copy(rows)
+        cells.grain, cells.chunks = 1, cells.nx
+        dims = layout.threads(cells)
+        out = wp.zeros(len(columns) * math.prod(dims), dtype=wp.float64, device="cpu")
+        if columns:
+            native.out = out.__ctype__()
+        by_cells, arguments = layout.copy_of(layout.BLANK), object.__new__(twin._struct)
+        vars(by_cells)["_ctype"], vars(arguments)["_ctype"] = cells, native
+        before = {address: ctypes.string_at(address, size) for address, (size, _) in found.items()}
+        wp.launch(twin.kernel, dims, [by_cells, arguments], device="cpu", block_dim=1)
+        expected = {address: ctypes.string_at(address, size) for address, (size, _) in found.items()}
+        for address, data in before.items():
+            ctypes.memmove(address, data, len(data))
+        meter.clear()
+        meter.update(counts)
+        invoke(kernel, hooks, params, adjoint)
+        counts = meter.copy()
+        name = " ".join([form.declared.name, *form.words])
+        launched_by_cells[name] += 1
+        otherwise[name] += not all(equal_bits(ctypes.string_at(a, len(data)), data, found[a][1]) for a, data in expected.items())
+        if columns:
+            count = len(columns) * math.prod(layout.threads(rows))
+            sums = np.frombuffer(ctypes.string_at(given.out.data, 8 * count)).reshape(len(columns), -1)
+            for column, one, other in zip(columns, sums, out.numpy().reshape(len(columns), -1), strict=True):
+                otherwise[f"{name}: {column}"] += not equal_sums(one, other, column, largest=column in form.declared.largest)
+        meter.clear()
+        meter.update(counts)
+
+    return launch
+
+
+def equal_bits(one, other, kind):
+    """Return whether two arrays of a type have the same bits; every NaN counts as the same."""
+    if one == other or kind not in (wp.float32, wp.float64):
+        return one == other
+    a, b = (np.frombuffer(data, dtype=wp.types.warp_type_to_np_dtype[kind]) for data in (one, other))
+    either = np.isnan(a) | np.isnan(b)
+    return np.array_equal(np.isnan(a), np.isnan(b)) and a[~either].tobytes() == b[~either].tobytes()
+
+
+def equal_sums(one, other, column, *, largest):
+    """Return whether two sets of partial results come to the same, sums but for rounding."""
+    if largest:
+        return np.array_equal(one.max(), other.max(), equal_nan=True)
+    a, b, size = one.sum(), other.sum(), np.abs(other).sum()
+    if column in PIECES:
+        return (a == 0) == (b == 0)
+    return not (np.isfinite([a, b]).all() and size < 1e300) or bool(abs(a - b) <= 1e-6 * size)
+
+
+launched_by_cells: collections.Counter[str] = collections.Counter()
+otherwise: collections.Counter[str] = collections.Counter()
 differs: collections.Counter[str] = collections.Counter()
 if COMPARE:
     context.invoke, context.invoke_cpu_blocks = compared(context.invoke), compared(context.invoke_cpu_blocks)
@@ -231,6 +313,9 @@ def replayed():
     """Keep what a graph would record, to launch it; once the package can be imported. Loops of graphs read their conditions in place."""
     from warp_lcp.rows import device_graph, host_kernel, joined
     from warp_lcp.rows.program import LaunchGraph, Loop, Program
+
+    if CELLS:
+        context.invoke = checked_by_cells(context.invoke)
 
     class HostGraph(LaunchGraph):
         """Kernels on the host's memory, which run at once on every machine: what waits for the device waits on."""

@@ -4,9 +4,11 @@ Every launch of CUDA's form is heard on the CPU (`benchmarks/emulated_cuda.py`),
 counted once. A launch takes as long as its bytes at `SHARE` of the memory's bandwidth, and no less than its latency; small levels take a
 barrier a stage; the host waits for each readback. The two passes that compute most in float64 take as long as that takes, if it is longer.
 What is heard stands for larger grids, each of which has launches for another level. Nothing here has been measured on a GPU.
+
+With --sass, the passes' machine code is counted instead: see `benchmarks/gpu_counts.py`.
 """
 
-from benchmarks import emulated_cuda  # before the package
+from benchmarks import emulated_cuda, gpu_counts  # before the package
 
 # ruff: isort: split
 
@@ -205,7 +207,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cells", type=int, default=128, help="cells along an axis of the recorded solve")
     parser.add_argument("--step-cells", type=int, help="cells along an axis of the recorded steps")
+    parser.add_argument("--sass", action="store_true", help="count what a warp of each pass issues, and which limit holds it; extra ptxas")
+    parser.add_argument("--size", type=int, default=256, help="of --sass: times are of passes over so many cells along each axis")
     given = parser.parse_args()
+    if given.sass:
+        print(f"Passes over {given.size}^3 cells, a cell each: counted for sm_90, times as predicted\n")
+        for line in gpu_counts.table(given.size):
+            print(line, flush=True)
+        return
     n, cells = given.cells, given.step_cells or given.cells
     (small, _), (large, iterations) = solve(n // 2), solve(n)
     print(f"A cold solve to 1e-6 [ms]: {iterations} iterations, {large.readbacks} readbacks, {large.stages} stages of small levels\n")

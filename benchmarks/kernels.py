@@ -181,7 +181,8 @@ def _hear(scene: Splash, device: str) -> tuple[dict[str, Heard], Heard]:
         alone = not declared.name.startswith(
             "components."
         )  # those follow each other's trees in borrowed memory: `search` times them together
-        if alone and one.bound.rows.size == A.layout.size and not declared.box and not declared.listed:
+        there = one.bound.rows.device is A.device  # bounds of the host are coded there: a byte of a cell is sent then, not eight
+        if alone and there and one.bound.rows.size == A.layout.size and not declared.box and not declared.listed:
             kinds.setdefault(one.name, one)
     return kinds, kinds[heard[-1].name]
 

@@ -3,12 +3,12 @@
     PYTHONPATH=tests:. ORDER=permuted python -m pytest -p emulated_cuda tests/solvers
 
 Tests of the CPU's own ways (`cpu_form`) are left out. With COMPARE=1 a kernel whose results depend on the order of threads, and that is not
-known to, fails the test that launched it.
+known to, fails the test that launched it. With CELLS=1 so does a pass by quads of cells that finds something else than it does by cells.
 """
 
 import pytest
 
-from benchmarks.emulated_cuda import differs
+from benchmarks.emulated_cuda import differs, otherwise
 
 
 def pytest_collection_modifyitems(items):
@@ -20,9 +20,12 @@ def pytest_collection_modifyitems(items):
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item):
-    """Fail a test that launched a kernel whose results depend on the order of threads."""
+    """Fail a test that launched a kernel whose results depend on the order of threads, or on how many cells a thread takes."""
     differs.clear()
+    otherwise.clear()
     result = yield
     if differs:
         pytest.fail(f"results depend on the order of threads: {', '.join(sorted(differs))}")
+    if wrong := sorted(+otherwise):
+        pytest.fail(f"otherwise by cells: {', '.join(wrong)}")
     return result

@@ -266,6 +266,8 @@ def modules_of_every_kernel(reals):
     use_contact_kernels()
     for form in [made for made in gc.get_objects() if isinstance(made, Form)]:
         assert form.kernel  # of the pass alone, which the CPU launches in waves
+        if form.by_quads:
+            assert form.by_quads.kernel  # in place of it on CUDA
     from warp._src.context import user_modules
 
     return sorted(name for name, module in user_modules.items() if name.startswith(("warp_lcp", "fluids", "granular")) and module.kernels)

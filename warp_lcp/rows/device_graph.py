@@ -22,6 +22,7 @@ from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.joined import settle, waits
 from warp_lcp.rows.layout import RowLayout, make_struct, threads
 from warp_lcp.rows.memory import ARRAY_BYTES, LAYOUT_BYTES, Scalar, value_of
+from warp_lcp.rows.pass_form import task_of
 from warp_lcp.rows.program import Conditional, DeviceCopy, Loop, NotRecordable, Program, Task
 
 ALIGNED = 16  # bytes
@@ -54,11 +55,19 @@ def pass_from_memory(form: Any) -> Any:
     Piece = make_struct(f"Piece_{Fields.key}", {"L": RowLayout, "F": Fields})
     pieces = wp.array(dtype=Piece)
 
-    def from_memory(given: pieces):
-        i, j, c = wp.tid()
-        P = given[0]
-        if i < (P.L.planes + P.L.slab - 1) // P.L.slab and j < P.L.rows and c < P.L.chunks:
-            run(P.L, P.F, i, j, c, 1)
+    if form.quads:
+
+        def from_memory(given: pieces):
+            P = given[0]
+            q = task_of(P.L, wp.tid())
+            run(P.L, P.F, q[0], q[1], q[2], 1)
+    else:
+
+        def from_memory(given: pieces):
+            i, j, c = wp.tid()
+            P = given[0]
+            if i < (P.L.planes + P.L.slab - 1) // P.L.slab and j < P.L.rows and c < P.L.chunks:
+                run(P.L, P.F, i, j, c, 1)
 
     name = form.declared.name.rpartition(".")[2]
     from_memory.__name__ = from_memory.__qualname__ = name
@@ -155,10 +164,10 @@ class DeviceProgram(Program):
         patches, layout = bound.patches(), bound.layout
         if not patches:
             if 0 not in threads(layout):
-                super().launch(bound.form.kernel, threads(layout), [layout, bound.fields], device=self.device)
+                super().launch(bound.form.kernel, bound.form.dim(layout), [layout, bound.fields], device=self.device)
             return
         struct, kernel = pass_from_memory(bound.form)
-        room = threads(layout) if bound.rows.memory is None else self._hold(bound.rows.memory)
+        room = bound.form.dim(layout) if bound.rows.memory is None else self._hold(bound.rows.memory)
         memory = bytes(layout.__ctype__()).ljust(LAYOUT_BYTES, b"\0") + bound.arguments
         self._add(kernel, struct, room, memory, patches, bound)
 

@@ -34,7 +34,7 @@ TYPES = {kind.__name__: kind for kind in (*_INTEGERS, wp.float32, wp.float64, in
 }  # fmt: skip
 VECTORS = {wp.float32: wp.vec3, wp.float64: wp.vec3d}
 FIELDS = ("reads", "writes", "other", "by_row", "whole", "box", "numbers")
-NAMES, FLAGS = ("ring", "sums", "largest"), ("bounds", "finer", "ordered")
+NAMES, FLAGS = ("ring", "sums", "largest"), ("bounds", "finer", "ordered", "by_cell")
 ROLES = ("compute", "stencil", *FIELDS, *NAMES, *FLAGS, "listed", "constants", "module")
 NONE: Mapping[str, float] = {}
 

@@ -16,6 +16,7 @@ import warp as wp
 
 from warp_lcp.rows.fields import CPU_CHUNK, Layout, Padding
 
+QUAD = 4  # cells of a row that a thread takes at a time on CUDA
 CUDA_THREADS = 1 << 16  # threads of a flat reduction, several waves of a large GPU
 # planes that a thread sums over: on CUDA, a place for the sums of every cell would cost more memory than the rest of a method
 PLANES_A_THREAD = {"cpu": 1, "cuda": 16}
@@ -249,6 +250,8 @@ class Rows:
         ends: one past the last stored cell (k, j, i) of a box.
         weight: cells of a usual pass that one costs as much as.
         memory: a `warp_lcp.rows.memory.RowsMemory` that recorded launches read in each run; None: rows are always these.
+        quads: their layout for a pass on CUDA that does not sum and whose threads take quads of cells; threads that sum take as many there.
+            None: threads take cells.
     """
 
     summed: Any
@@ -260,12 +263,13 @@ class Rows:
     ends: tuple[int, ...] = ()
     weight: int = 1
     memory: Any = None
+    quads: Any = None
 
     @staticmethod
     def of(padding: Padding, device: wp.Device, spans: Any = None, *, whole: bool = False, more: int = 0) -> "Rows":
         """Return the rows of a padded grid and `more` beyond, or what their spans have of them; a thread takes a `whole` one."""
         steps, counts = (padding.plane + padding.row + 1, padding.plane, padding.row), tuple(n + more for n in padding.counts)
-        return Rows.strided(padding.size, device, steps, counts, spans, cells=counts[2] if whole else None)
+        return Rows.strided(padding.size, device, steps, counts, spans, cells=counts[2] if whole else None, quads=not whole)
 
     @staticmethod
     def part(padding: Padding, device: wp.Device, low: Sequence[int], high: Sequence[int]) -> "Rows":
@@ -284,7 +288,8 @@ class Rows:
     @staticmethod
     def stored(padding: Padding, device: wp.Device) -> "Rows":
         """Return all stored cells of a padded grid, ghosts too."""
-        made = Rows.strided(padding.size, device, (0, padding.plane, padding.row), tuple(n + 2 for n in padding.counts))
+        counts = tuple(n + 2 for n in padding.counts)
+        made = Rows.strided(padding.size, device, (0, padding.plane, padding.row), counts, quads=True)
         return made._changed(lift=1)
 
     def after_ghosts(self) -> "Rows":
@@ -298,8 +303,10 @@ class Rows:
         return self._changed(turn=1)
 
     def _changed(self, **members: int) -> "Rows":
-        single = put(copy_of(self.single), members)
-        return replace(self, single=single, summed=single if self.summed is self.single else put(copy_of(self.summed), members))
+        change = lambda layout: None if layout is None else put(copy_of(layout), members)  # noqa: E731
+        single = change(self.single)
+        summed = single if self.summed is self.single else change(self.summed)
+        return replace(self, single=single, summed=summed, quads=change(self.quads))
 
     @staticmethod
     def edge(padding: Padding, device: wp.Device, axis: int) -> "Rows":
@@ -362,17 +369,29 @@ class Rows:
         return replace(Rows.strided(0, device, (0, 0, 0), (1, 1, count), cells=cells), weight=weight)
 
     @staticmethod
-    def by_turns(size: int, device: wp.Device, width: int) -> "Rows":
+    def by_turns(size: int, device: wp.Device, width: int, *, quads: bool = False) -> "Rows":
         """Return a flat field as rows of a width: a thread of a pass that sums takes the same place of each, its neighbor the next."""
         planes = -(-size // width)
         ends = np.full((planes, 1, 2), (0, width))
         ends[-1:, 0, 1] -= planes * width - size
         spans = wp.array(ends, dtype=wp.vec2i, device=device)
-        return Rows.strided(size, device, (0, width, 0), (planes, 1, width), spans, cells=1, slab=planes)
+        return Rows.strided(size, device, (0, width, 0), (planes, 1, width), spans, cells=1, slab=planes, quads=quads)
 
     @staticmethod
-    def strided(size: int, device: wp.Device, first: Any, counts: Any, spans: Any = None, cells: Any = None, slab: Any = None) -> "Rows":
+    def strided(
+        size: int,
+        device: wp.Device,
+        first: Any,
+        counts: Any,
+        spans: Any = None,
+        cells: Any = None,
+        slab: Any = None,
+        *,
+        quads: bool = False,
+    ) -> "Rows":
         """Return rows by the first cell's element and the steps from plane to plane and row to row, and counts of planes, rows, cells.
+
+        Threads on CUDA take some `cells` each, or four where `quads` and a pass has it so.
 
         Raises:
             TypeError: spans are of another type.
@@ -387,7 +406,10 @@ class Rows:
         names = ("base", "s1", "s2", "planes", "rows", "nx")
         shared = dict(zip(names, (*first, *counts), strict=True)) | {"grain": cells, "chunks": -(-counts[2] // cells), "spans": spans}
         single = put(copy_of(BLANK), shared | {"slab": alone})
-        return Rows(single if slab == alone else put(copy_of(single), {"slab": slab}), single, size, 0, device)
+        if not (quads and device.is_cuda and size < 1 << 31):
+            return Rows(single if slab == alone else put(copy_of(single), {"slab": slab}), single, size, 0, device)
+        by_quads = put(copy_of(single), {"grain": QUAD, "chunks": -(-counts[2] // QUAD)})
+        return Rows(put(copy_of(by_quads), {"slab": slab}), single, size, 0, device, quads=by_quads)
 
     def beside(self, other: "Rows", factors: tuple[int, int, int]) -> "Rows":
         """Return the same rows with another level's beside them.
@@ -410,11 +432,12 @@ class Rows:
         L, theirs = self.single, other.single
         members = {"o0": theirs.base, "o1": theirs.s1, "o2": theirs.s2, "n1": theirs.planes, "n2": theirs.rows}
         members |= dict(zip(("fx", "fy", "fz"), factors, strict=True))
+        quads = None if self.quads is None or not {*factors} <= {-2, -1, 1, 2} else put(copy_of(self.quads), members)
+        summed = None if self.summed is L else put(copy_of(self.summed), members)
         if not self.device.is_cpu and factors[0] < 0:  # a thread takes the cells of one of the other level's
             members |= {"grain": -factors[0], "chunks": -(L.nx // factors[0])}
         single = put(copy_of(L), members)
-        summed = single if self.summed is L else put(copy_of(self.summed), members)
-        return Rows(summed, single, self.size, other.size, self.device)
+        return Rows(summed or single, single, self.size, other.size, self.device, quads=quads)
 
     @functools.cached_property
     def count(self) -> int:
@@ -433,7 +456,7 @@ def _flat(size: int, name: str, serial: bool) -> Rows:
     device = wp.get_device(name)
     if serial or not device.is_cuda or not size:
         return Rows.strided(size, device, (0, 0, 0), (1, 1, size), cells=max(size, 1) if serial else CPU_CHUNK)
-    return Rows.by_turns(size, device, min(size, CUDA_THREADS))
+    return Rows.by_turns(size, device, min(size, QUAD * CUDA_THREADS), quads=True)
 
 
 def threads(layout: Any) -> tuple[int, int, int]:

@@ -3,6 +3,7 @@
 
 import ctypes
 import functools
+import math
 import struct
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import warp as wp
 
 from warp_lcp.rows.compiler import forward_kernel
-from warp_lcp.rows.layout import BoundFields, Pattern, RowLayout, make_struct, packed, stencil_struct
+from warp_lcp.rows.layout import BoundFields, Pattern, RowLayout, make_struct, packed, stencil_struct, threads
 from warp_lcp.rows.memory import value_of
 from warp_lcp.rows.native import HEADERS, shared, text
 from warp_lcp.rows.team import Entry
@@ -20,6 +21,9 @@ if TYPE_CHECKING:
 
 C_TYPES = {wp.uint8: "unsigned char", wp.float32: "float", wp.float64: "double"}
 C = {**C_TYPES, wp.int8: "signed char", wp.int32: "int", wp.bool: "bool"}
+LOADED = (wp.uint8, wp.int8, wp.int32, wp.float32, wp.float64)  # types of fields that quads keep in registers
+POINTERS = "const auto in_ = [](auto* q, auto first) { return q + first; };"
+QUADS = "quads"
 PLACE = ("k0", "j0", "i0")  # first stored cell of a box
 INTEGERS = {wp.int32: "i", int: "i", wp.int64: "q", wp.bool: "?", bool: "?"}
 PACKED = {wp.float32: "f", wp.float64: "d", **INTEGERS}  # numbers, as `struct` calls them
@@ -29,9 +33,9 @@ UNIFORM, VARIABLE, KNOWN = "uniform", "variable", "known"  # stencils: with a we
 
 
 @functools.cache
-def form_of(declared: "RowPass", letters: Any, constants: Any, shape: str | Pattern, bounds: str) -> "Form":
-    """Return the form of a pass with these types, constants, stencil and bounds."""
-    return Form(declared, dict(letters), dict(constants), shape, bounds)
+def form_of(declared: "RowPass", letters: Any, constants: Any, shape: str | Pattern, bounds: str, *, quads: bool = False) -> "Form":
+    """Return the form of a pass with these types, constants, stencil and bounds, by `quads` of cells if told."""
+    return Form(declared, dict(letters), dict(constants), shape, bounds, quads=quads)
 
 
 TOGETHER: dict[str, list["RowPass"]] = {}  # passes by the Warp module in which they are compiled
@@ -42,8 +46,9 @@ def make_kernels_of_module(form: "Form", letters: Any, shape: str | Pattern, bou
     if not form.declared.module or form.pattern is not None:
         return
     for other in TOGETHER[form.declared.module]:
-        if other.letters == form.declared.letters and other.words(dict(letters), other.constants, shape, bounds) == form.words:
-            assert form_of(other, letters, tuple(other.constants.items()), shape, bounds).kernel
+        words = other.words(dict(letters), other.constants, shape, bounds) + [QUADS] * form.quads
+        if other.letters == form.declared.letters and words == form.words and (other.quads or not form.quads):
+            assert form_of(other, letters, tuple(other.constants.items()), shape, bounds, quads=form.quads).kernel
 
 
 class Form:
@@ -52,19 +57,30 @@ class Form:
     Attributes:
         words: what tells it from other forms.
         joins: whether it is compiled with other passes.
+        quads: whether a thread takes four cells of a row at a time, on CUDA only; see `headers/quad.h`.
         name: of its kernel.
         fields: struct of its arguments.
         native: that struct in C.
         run: native function (layout, fields, slab, row, chunk of the first task, number of tasks).
     """
 
-    def __init__(self, declared: "RowPass", letters: dict[str, Any], constants: dict[str, int], shape: str | Pattern, bounds: str) -> None:
-        self.declared, self.letters, self.bounds, d = declared, letters, bounds, declared
+    def __init__(
+        self,
+        declared: "RowPass",
+        letters: dict[str, Any],
+        constants: dict[str, int],
+        shape: str | Pattern,
+        bounds: str,
+        *,
+        quads: bool = False,
+    ) -> None:
+        self.declared, self.letters, self.bounds, self.quads, d = declared, letters, bounds, quads, declared
+        self._chosen = tuple(sorted(letters.items())), tuple(constants.items()), shape, bounds
         self.pattern = pattern = shape if isinstance(shape, Pattern) else None
         self.joins = bool(d.module) and pattern is None  # the module of other passes
         shape = pattern.word if pattern else shape
         of = lambda kind: letters[kind] if isinstance(kind, str) else kind  # noqa: E731
-        self.words = d.words(letters, constants, shape, bounds)
+        self.words = d.words(letters, constants, shape, bounds) + [QUADS] * quads
         weights = of(d.stencil[1]) if d.stencil and (shape == VARIABLE or (pattern and pattern.names)) else wp.float32
         parts = {"stencil": stencil_struct(of(d.stencil[0]), weights, pattern)} if d.stencil else {}
         parts |= {"bounds": BoundFields} if d.bounds else {}
@@ -88,6 +104,7 @@ class Form:
     def _source(self, letters: dict[str, Any], constants: dict[str, int], stencil: int, of: Any) -> str:
         """Return the body: a loop over pieces, in it pointers by name, the shared functions, the row function, the sums."""
         d, pattern = self.declared, self.pattern
+        assert not (self.quads and (pattern or not d.quads)), d.label
         into = not {*d.ring}.isdisjoint(d.writes)
         levels = d.finer or bool(d.other)
         switches = {"RINGS": bool(d.ring), "INTO_RING": into, "LEVELS": levels, "BOX": bool(d.box)}
@@ -96,6 +113,8 @@ class Form:
         head = [f"typedef {C[t]} {n};" for n, t in letters.items()] + [f"typedef {C[of(d.compute)]} T;"] * ("T" not in letters)
         head += [f"constexpr int {n} = {int(v)};" for n, v in switches.items()] + [f"#define {n} {int(v)}" for n, v in macros.items()]
         head += [f"constexpr double {n} = {float(v)!r};" for n, v in constants.items() if n not in macros]
+        if self.quads:
+            return self._source_of_quads(head, macros, of)
         at = {n: " + p + P.ring" if n in d.ring else " + p" for n in (*d.reads, *d.writes)} | dict.fromkeys(d.other, " + P.q")
         each = ["const Piece P = piece(k_i, j_i, c_, ring_); const int n = P.n; const long long p = P.p;"]
         each += [f"const long long yp = {'L.o2' if d.finer else 'P.yp'}, zp = {'L.o1' if d.finer else 'P.zp'};"]
@@ -131,12 +150,50 @@ class Form:
         sums = [f"#define EACH_FOUND(DO) {' '.join(f'DO({s}, {name})' for s, name in enumerate(d.found))}", text(HEADERS / "sums.h")]
         sums += ["#undef EACH_FOUND"]
         common = [shared(h) for h, used in (("stencil.h", d.stencil), ("bounds.h", d.bounds)) if used]
-        before = [shared("native.h"), '#line 1 "types"', *head, shared("piece.h"), shared("tasks.h"), '#line 1 "fields"', *each]
+        before = [shared("native.h"), '#line 1 "types"', *head, shared("piece.h"), shared("tasks.h"), '#line 1 "fields"', POINTERS, *each]
         body = ["{", text(d.header, d.declared), "}"] if d.box else [text(d.header, d.declared)]  # there names may be those of the pass
         closed = ["}"] * bool(d.listed)
         macros |= {"EACH_WEIGHT": 0} if pattern and d.stencil else {}
         tail = ['#line 1 "end"', "}}}", *(f"#undef {n}" for n in macros), ""]
         return "\n".join(["", *before, *common, *body, *closed, '#line 1 "sums"', *(sums if d.found else []), *tail])
+
+    def _source_of_quads(self, head: list[str], macros: dict[str, Any], of: Any) -> str:
+        """Return the body for quads: a loop over planes, in it the row function twice, for four cells and for fewer."""
+        d = self.declared
+        found = " ".join(f"DO({s}, {name})" for s, name in enumerate(d.found))
+        sums = [f"#define EACH_FOUND(DO) {found}", text(HEADERS / "sums.h"), "#undef EACH_FOUND"] if d.found else []
+        common = [shared(h) for h, used in (("stencil.h", d.stencil), ("bounds.h", d.bounds)) if used]
+        function = [*common, text(d.header, d.declared), '#line 1 "sums"', *sums]
+        head = [*head, f"constexpr bool FINER = {str(d.finer).lower()};"]
+        before = ["#define QUADS", shared("native.h"), '#line 1 "types"', *head, shared("quad.h"), '#line 1 "fields"']
+        whole = ["if (P.n == 4) {", "constexpr int n = 4;", *self._fields_of_quad(of, kept=True), *function, "}"]
+        rest = ["else if (FOUND || P.n > 0) {", "const int n = P.n;", POINTERS, *self._fields_of_quad(of, kept=False), *function, "}"]
+        once = ["#undef VECTORS", '#define VECTORS(WIDTH) _Pragma("unroll 1")']  # cells fewer than four: their loops are not unrolled
+        after = ['#line 1 "end"', "}", "#undef QUADS", "#undef METHOD", *(f"#undef {n}" for n in macros), ""]
+        return "\n".join(["", *before, *whole, *once, *rest, *after])
+
+    def _fields_of_quad(self, of: Any, *, kept: bool) -> list[str]:
+        """Return C++ that declares the fields at a quad's first cell, by name; `kept`: in registers, as `quad.h` does."""
+        d = self.declared
+        made = []
+        for n in (n for n in d.arrays if not (d.found and n == "out")):
+            if kept and self.types[n] in LOADED and (n in d.reads or n in d.writes or (d.finer and n in d.other)):
+                way = (
+                    "auto {n} = out_({data}, p);" if n in d.writes else f"const auto {{n}} = in_({{data}}, {'q' if n in d.other else 'p'});"
+                )
+                made.append(way.format(n=n, data=f"given.{n}.data"))
+                continue
+            pointer = f"given.{n}.data" + (" + p" if n in d.reads or n in d.writes else " + q" * (n in d.other))
+            pointer = f"given.{n}.data ? {pointer} : nullptr" if n in d.optional else pointer
+            made.append(f"{'const ' * (n in d.reads)}auto* {n} = {pointer};")
+        made += ["const bool pairs = L.fx > 1 || L.fx < -1;"] if d.other or d.finer else []
+        made += ["const int deep = L.fz == 1 || 2*P.k + 2 > L.n1 ? 1 : 2, wide = L.fy == 1 || 2*P.j + 2 > L.n2 ? 1 : 2;"] if d.finer else []
+        made += [f"const auto {n} = given.{n};" for n in d.numbers]
+        if d.stencil:
+            fields, numbers = ("d", "wx", "wy", "wz", "known"), ("unit", "cx", "cy", "cz")
+            made += [f"const auto {n} = in_(given.stencil.{n}.data, {'q' if d.finer else 'p'});" for n in fields]
+            made += [f"const T {n} = (T)given.stencil.{n};" for n in numbers]
+        return made
 
     def fill(self, stencil: Any, bounds: Any, given: dict[str, Any]) -> bytes:
         """Return the struct of arguments as C has it: structs and arrays, which fill whole eight bytes, side by side, then numbers."""
@@ -169,7 +226,12 @@ class Form:
     def kernel(self) -> Any:
         """The kernel of the pass alone."""
         run, Fields, touch = self.run, self.fields, self.pattern.touch if self.pattern else None
-        if touch is not None:
+        if self.quads:
+
+            def alone(L: RowLayout, F: Fields):
+                q = task_of(L, wp.tid())
+                run(L, F, q[0], q[1], q[2], 1)
+        elif touch is not None:
 
             def alone(L: RowLayout, F: Fields):
                 i, j, c = wp.tid()
@@ -189,6 +251,20 @@ class Form:
             return wp.kernel(enable_backward=False, module=run.module.name)(alone)
         return forward_kernel(module=run.module.name)(alone)
 
+    @property
+    def by_cells(self) -> "Form":
+        """The same of single cells."""
+        return form_of(self.declared, *self._chosen)
+
+    @property
+    def by_quads(self) -> "Form | None":
+        """The same of quads, as CUDA launches it on grids; None where there is none."""
+        return form_of(self.declared, *self._chosen, quads=True) if self.declared.quads and self.pattern is None else None
+
+    def dim(self, layout: Any) -> tuple[int, ...]:
+        """Return the dimensions of a launch of the kernel: by quads one, for three would be divided in 64 bits."""
+        return (math.prod(threads(layout)),) if self.quads else threads(layout)
+
     def entry(self, bound: "Bound") -> Entry:
         """Return the kernel as the team calls it."""
         if self._entry is None:
@@ -205,3 +281,11 @@ return wp::vec3i(L.begin / (L.rows*L.chunks), L.begin / L.chunks % L.rows, L.beg
 """)
 def first_task(L: RowLayout) -> wp.vec3i:
     """Slab, row and chunk of a range's first task; 0 on CUDA, where a thread has one of its own."""
+
+
+@wp.func_native("""
+const unsigned t = (unsigned)thread, row = t / (unsigned)L.chunks, slab = row / (unsigned)L.rows;
+return wp::vec3i((int)slab, (int)(row - slab*L.rows), (int)(t - row*L.chunks));
+""")
+def task_of(L: RowLayout, thread: int) -> wp.vec3i:
+    """Slab, row and chunk of a thread of a launch with one dimension."""

@@ -20,6 +20,7 @@ from warp_lcp.rows.pass_form import KNOWN, NUMBERS, PACKED, PLACE, TOGETHER, UNI
 from warp_lcp.rows.program import Launch, device_program, is_recording, perform
 from warp_lcp.rows.team import Operation, Patch, Stage, ranges, team
 
+FLAGGED = ("changed", "away")  # fields of one element a row that row functions only set, or find it set
 # names of the layer's own
 OWN = frozenset(("self", "rows", "stencil", "bounds", "given", "P", "n", "p", "ym", "yp", "zm", "zp", "down", "up", "c_", "_ctype"))
 
@@ -54,6 +55,7 @@ class RowPass:
         sums: variables of the row function that are summed over the cells. Those of a pass over a box are doubles, and 0 before a piece.
         largest: likewise, of which the largest counts; after the sums.
         ordered: whether tasks write what others read or write: on the CPU one thread takes them, in order.
+        by_cell: whether a thread takes one cell on CUDA, not four of a row: what it does of one is long, or reaches what others write.
         constants: numbers that are known when the kernel is made, with their usual values; those that are given are integers, and macros.
         declared: the kernel's name in the header, see `kernel_file.py`; empty: the header is the row function alone.
         module: Warp module of passes that are used together. They are compiled at once for each set of types: a module of its own costs
@@ -84,6 +86,7 @@ class RowPass:
     box: Mapping[str, Any] = field(default_factory=dict)
     listed: str = ""
     ordered: bool = False
+    by_cell: bool = False
     declared: str = ""
     module: str = ""
 
@@ -132,6 +135,12 @@ class RowPass:
     def found(self) -> tuple[str, ...]:
         """What is summed, and what the largest is taken of."""
         return (*self.sums, *self.largest)
+
+    @functools.cached_property
+    def quads(self) -> bool:
+        """Whether a thread can take four cells of a row at a time on CUDA: of passes over the rows of grids."""
+        elsewhere = self.box or self.ring or {*self.by_row} - {*FLAGGED}
+        return not (elsewhere or self.ordered or self.by_cell)
 
     @functools.cached_property
     def arrays(self) -> dict[str, Any]:
@@ -189,13 +198,14 @@ class RowPass:
             stored = (type(stencil), pattern, d.dtype, weights[0].dtype if weights else None)
             if d.size != (rows.other_size if self.finer else rows.size):
                 raise ValueError(f"{self.label}: the stencil has {d.size} elements, not {rows.other_size if self.finer else rows.size}")
-        key = (constants, kind, *stored, *types)
+        quads = self.quads and rows.quads is not None and rows.memory is None and not (stored and stored[1])
+        key = (constants, kind, quads, *stored, *types)
         made = self._forms.get(key)
         if made is None:
             letters = tuple(sorted(self._letters(stencil, given).items()))
             numbers = tuple(zip(self.constants, constants, strict=True))
             shape = KNOWN if isinstance(stencil, Known) else stored[1] if stencil and stored[1] else VARIABLE if weights else UNIFORM
-            made = self._forms[key] = form_of(self, letters, numbers, shape, kind)
+            made = self._forms[key] = form_of(self, letters, numbers, shape, kind, quads=quads)
             make_kernels_of_module(made, letters, shape, kind)
         self._check_memory(rows, given)
         return Bound(made, rows, made.fill(stencil, bounds, given), given, (stencil, bounds))
@@ -329,14 +339,14 @@ class Bound(NamedTuple):
     @property
     def layout(self) -> Any:
         """Where the rows are, for a pass that sums or one that does not."""
-        return self.rows.summed if self.form.declared.found else self.rows.single
+        return self.rows.summed if self.form.declared.found else self.rows.quads if self.form.quads else self.rows.single
 
     def launch(self, launch: Launch | None = None) -> None:
         """Launch the pass, or record it."""
         if self.rows.device.is_cuda and (program := device_program(launch)) is not None:
             program.record_pass(self)
         elif self.rows.device.is_cuda or team() is None:
-            (launch or wp.launch)(self.form.kernel, threads(self.layout), [self.layout, self.fields], device=self.rows.device)
+            (launch or wp.launch)(self.form.kernel, self.form.dim(self.layout), [self.layout, self.fields], device=self.rows.device)
         elif (made := self.operation()) is not None:
             perform(made, launch)
 

@@ -53,6 +53,7 @@ else { SIMD for (int k = 0; k < n; ++k) q[k] *= sqrt(w[k]); }
 //   whole      S basis
 //   numbers    int64 size; int count
 //   sums       first
+//   by_cell
 double first = 0;
 for (int j = 0; j < count; ++j) {
     const auto* v = basis + j*size + p; double vx = 0, *sum = given.out.data + j*places + P.t;
@@ -65,6 +66,7 @@ for (int j = 0; j < count; ++j) {
 //   whole      S basis; float64 factors
 //   numbers    int64 size; int count; float64 sign
 //   sums       xx
+//   by_cell
 for (int j = 0; j < count; ++j) {
     const auto* v = basis + j*size + p; const T c = (T)(sign*factors[j]);
     SIMD for (int k = 0; k < n; ++k) x[k] += c*v[k]; }
@@ -76,5 +78,6 @@ SIMD for (int k = 0; k < n; ++k) xx += (double)x[k]*x[k];
 //   reads      S x
 //   whole      S basis; float64 sums
 //   numbers    int64 size, place; int last
+//   by_cell
 auto* v = basis + place*size + p; const double xx = sums[last], scale = xx > 0 ? 1.0/sqrt(xx) : 0.0;
 SIMD for (int k = 0; k < n; ++k) v[k] = scale*x[k];

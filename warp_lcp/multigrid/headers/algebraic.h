@@ -6,6 +6,7 @@
 //   reads      A d; float64 shift?
 //   writes     S inverse, scale, weight
 //   whole      int32 ptr, col; A a; int32 order?; uint8 free; S m
+//   by_cell
 #include "snippets.h:entries"
 ROWS {
     const bool own = free[i]; const double extra = own && shift ? shift[k] : 0.0; double sum = 0, mid = 0;
@@ -23,6 +24,7 @@ ROWS {
 //   compute    S
 //   reads      S scale
 //   whole      int32 ptr; S a, scaled
+//   by_cell
 #include "snippets.h:entries"
 ROWS { const T f = scale[k]; ENTRIES scaled[e] = f*a[e]; }
 
@@ -31,6 +33,7 @@ ROWS { const T f = scale[k]; ENTRIES scaled[e] = f*a[e]; }
 //   compute    S
 //   reads      int64 begins
 //   whole      int32 ptr, col; S a; int32 right; S b; int32 starts; uint16 place; S result
+//   by_cell
 #include "snippets.h:entries"
 ROWS {
     T* o = result + starts[i]; const int entries = starts[i + 1] - starts[i]; long long c = begins[k];
@@ -44,6 +47,7 @@ ROWS {
 //   compute    S
 //   writes     S inverse
 //   whole      int32 ptr; S a
+//   by_cell
 #include "snippets.h:entries"
 ROWS { T s = 0; ENTRIES s += a[e] < 0 ? -a[e] : a[e]; inverse[k] = s > 0 ? (T)1/s : (T)0; }
 
@@ -54,6 +58,7 @@ ROWS { T s = 0; ENTRIES s += a[e] < 0 ? -a[e] : a[e]; inverse[k] = s > 0 ? (T)1/
 //   writes     S y
 //   whole      int32 ptr, col; S a, x
 //   numbers    S omega; bool from_zero
+//   by_cell
 #include "snippets.h:entries"
 if (from_zero) { for (int k = 0; k < n; ++k) y[k] = omega*inverse[k]*b[k]; }
 else { ROWS { T s = b[k]; ENTRIES s -= a[e]*x[col[e]]; y[k] = x[i] + omega*inverse[k]*s; } }
@@ -63,5 +68,6 @@ else { ROWS { T s = b[k]; ENTRIES s -= a[e]*x[col[e]]; y[k] = x[i] + omega*inver
 //   reads      S b
 //   writes     S y
 //   whole      int32 ptr, col; S a, x
+//   by_cell
 #include "snippets.h:entries"
 ROWS { T s = b[k]; ENTRIES s -= a[e]*x[col[e]]; y[k] = s; }

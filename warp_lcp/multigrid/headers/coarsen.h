@@ -209,6 +209,7 @@ if (moved) changed[P.row] = 1;
 //   stencil    F, W
 //   whole      float64 matrix
 //   numbers    int cells, lines, planes; bool periodic_x, periodic_y, periodic_z
+//   by_cell
 const int m = planes*lines*cells;
 for (int k = 0; k < n; ++k) {
     const int at[3] = {P.first + k, P.j, P.k}, counts[3] = {cells, lines, planes}, r = (at[2]*lines + at[1])*cells + at[0];
@@ -240,6 +241,7 @@ for (int k = 0; k < n; ++k) {
 //   compute    float64
 //   whole      float64 matrix, inverse, own
 //   numbers    int m; float64 least
+//   by_cell
 for (int r = 0; r < m; ++r) { own[r] = matrix[r*m + r]; for (int c = 0; c < m; ++c) inverse[c*m + r] = r == c; }
 for (int c = 0; c < m; ++c) {
     const double pivot = matrix[c*m + c], f = own[c] > 0 && pivot > least*own[c] ? 1/pivot : 0.0;
@@ -254,6 +256,7 @@ for (int c = 0; c < m; ++c) {
 //   whole      uint8 changed; float64 matrix, inverse
 //   numbers    int m, flags
 //   module     grid
+//   by_cell
 const auto due = [&]() { for (int r = 0; r < flags; ++r) if (changed[r]) return true; return false; };
 if (due()) {
     const int first = (int)p, end = first + n; const double* factors = matrix; double* X = inverse;
@@ -271,6 +274,7 @@ if (due()) {
 //   compute    float64
 //   whole      float64 inverse; S b, x
 //   numbers    int nx, ny, nz
+//   by_cell
 const long long s2 = nx + 2, s1 = (ny + 2)*s2; const int m = nz*ny*nx;
 enum { R = BUFFERED == 1 ? 1 : 64 };
 double v[R];

@@ -2,11 +2,11 @@
 
 // snippet relax: x + weight (b - A x) / diagonal at cell k, of what x is there, and what it is
 // around.
-const auto relaxed = [&](T x, T sum_around, T weight, int k, T e) -> T { return x + weight*((b[k] + sum_around) / e - x); };
+const auto relaxed = [&](T x, T sum_around, T weight, int k, T e) -> T { return x + weight*(quotient(b[k] + sum_around, e) - x); };
 
 // snippet sweep: y = a value clipped to the bounds if projected, 0 where there is no unknown
 #include "relax"
-const auto from_b = [&](int k, T e) -> T { return omega*b[k] / e; };
+const auto from_b = [&](int k, T e) -> T { return quotient(omega*b[k], e); };
 const auto from_x = [&](int k, T e) -> T { return relaxed(x[k], around(x, k, down, up), omega, k, e); };
 const auto sweep = [&](auto value, auto clip) {
     SIMD for (int k = 0; k < n; ++k) { const T e = diagonal(k), u = value(k, e != 0 ? e : (T)1), v = e != 0 ? u : (T)0; y[k] = clip(k, v); } };
@@ -63,7 +63,8 @@ if (L.spans.data) {
 //   other      S x, b
 //   finer
 //   module     multigrid
-T r[2*M]; const int fx = pairs ? 2 : 1;
+T r[2*M];
+with_pairs(pairs, [&](auto fx) {
 for (int begin = 0; begin < n; begin += M) {
     const int m = n - begin < M ? n - begin : (int)M;
     SIMD for (int k = 0; k < fx*m; ++k) r[k] = 0;
@@ -71,8 +72,8 @@ for (int begin = 0; begin < n; begin += M) {
         const long long at = z*zp + y*yp + fx*begin;
         SIMD for (int k = 0; k < fx*m; ++k) {
             const int i = (int)at + k; const T e = diagonal(i), v = b[i] - e*x[i] + neighbors(x, i); r[k] += e != 0 ? v : (T)0; } }
-    if (pairs) { SIMD for (int k = 0; k < m; ++k) coarse[begin + k] = r[2*k] + r[2*k+1]; }
-    else { SIMD for (int k = 0; k < m; ++k) coarse[begin + k] = r[k]; } }
+    if (fx == 2) { SIMD for (int k = 0; k < m; ++k) coarse[begin + k] = r[2*k] + r[2*k+1]; }
+    else { SIMD for (int k = 0; k < m; ++k) coarse[begin + k] = r[k]; } } });
 
 // kernel cycle.correct: x += scale times the correction of its aggregate, clipped to the bounds if
 // projected
@@ -91,9 +92,9 @@ if (projected) {
         else {
             SIMD for (int k = 0; k < m / 2; ++k) { const T v = scale*c[k]; e[2*k] = v; e[2*k+1] = v; }
             if (m % 2) e[m-1] = scale*c[m/2]; }
-        const auto* at = d + begin; T* to = x + begin; const T *lo = lower + begin, *hi = upper + begin;
-        if (upper) SIMD for (int k = 0; k < m; ++k) { const T v = at[k] != 0 ? to[k] + e[k] : (T)0; to[k] = clipped(v, lo[k], hi[k]); }
-        else SIMD for (int k = 0; k < m; ++k) { const T v = at[k] != 0 ? to[k] + e[k] : (T)0; to[k] = v < lo[k] ? lo[k] : v; } }
+        const auto moved = [&](int k) { return d[begin + k] != 0 ? x[begin + k] + e[k] : (T)0; };
+        if (upper) SIMD for (int k = 0; k < m; ++k) x[begin + k] = clipped(moved(k), lower[begin + k], upper[begin + k]);
+        else SIMD for (int k = 0; k < m; ++k) { const T v = moved(k), l = lower[begin + k]; x[begin + k] = v < l ? l : v; } }
 } else if (!pairs) {
     SIMD for (int k = 0; k < n; ++k) x[k] += d[k] != 0 ? scale*coarse[k] : (T)0;
 } else {
@@ -111,22 +112,23 @@ if (projected) {
 //   finer
 //   numbers    S scale
 //   module     multigrid
-T low[2*M], high[2*M]; const T big = (T)1e30, inverse = reciprocal(scale); const int fx = pairs ? 2 : 1;
+T low[2*M], high[2*M]; const T big = (T)1e30, inverse = reciprocal(scale);
+with_pairs(pairs, [&](auto fx) {
 for (int begin = 0; begin < n; begin += M) {
     const int m = n - begin < M ? n - begin : (int)M;
     SIMD for (int k = 0; k < fx*m; ++k) { low[k] = -big; high[k] = big; }
     for (int z = 0; z < deep; ++z) for (int y = 0; y < wide; ++y) {
         const long long at = z*zp + y*yp + fx*begin;
-        const auto* e = d + at; const T *to = x + at, *l = lower + at, *u = upper ? upper + at : l;
+        const auto e = d + at; const auto to = x + at, l = lower + at, u = upper ? upper + at : l;
         SIMD for (int k = 0; k < fx*m; ++k) {
             const T a0 = (l[k] - to[k])*inverse, b0 = (u[k] - to[k])*inverse, a1 = a0 > 0 ? (T)0 : a0, b1 = b0 < 0 ? (T)0 : b0;
             const T a = e[k] != 0 ? a1 : -big, b = e[k] != 0 ? b1 : big;
             low[k] = a > low[k] ? a : low[k]; high[k] = b < high[k] ? b : high[k]; } }
-    const auto tightest = [&](auto* coarse, const T* v, auto better) {
-        if (pairs) { SIMD for (int k = 0; k < m; ++k) coarse[begin + k] = better(v[2*k], v[2*k+1]); }
+    const auto tightest = [&](auto& coarse, const T* v, auto better) {
+        if (fx == 2) { SIMD for (int k = 0; k < m; ++k) coarse[begin + k] = better(v[2*k], v[2*k+1]); }
         else { SIMD for (int k = 0; k < m; ++k) coarse[begin + k] = v[k]; } };
     tightest(coarse_lower, low, [](T a, T b) { return a > b ? a : b; });
-    if (coarse_upper) tightest(coarse_upper, high, [](T a, T b) { return a < b ? a : b; }); }
+    if (coarse_upper) tightest(coarse_upper, high, [](T a, T b) { return a < b ? a : b; }); } });
 
 // kernel cycle.clear: x = 0
 //   compute    S

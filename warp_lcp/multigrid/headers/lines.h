@@ -8,6 +8,7 @@
 //   writes     S made, weight?
 //   whole      S weights
 //   numbers    int64 size
+//   by_cell
 for (int k = 0; k < n; ++k) {
     const T e = free[k] ? diagonal(k) + (shift ? (T)shift[k] : (T)0) : (T)0;
     T v[9] = {0, 0, 0, 0, 0, 0, 0, 0, 0};
@@ -36,6 +37,7 @@ const auto v = [&](int x, int y, long long k) -> T {
 //   whole      S weights, shares
 //   numbers    int64 size; int fx, fy
 //   constants  SAME = 0, RESTRICTION = 0
+//   by_cell
 #include "transfer"
 const bool odd_y = fy == 2 && P.j % 2;
 for (int k = 0; k < n; ++k) {
@@ -60,6 +62,7 @@ for (int k = 0; k < n; ++k) {
 //   whole      S weights, shares
 //   numbers    int64 size; int fx, fy
 //   constants  SAME = 0, RESTRICTION = 0
+//   by_cell
 #include "transfer"
 if (fx == 2 && fy == 2 && P.j % 2) for (int k = 1 - P.first % 2; k < n; k += 2) {
     const long long at = p + k; const T e = d[k];
@@ -79,6 +82,7 @@ if (fx == 2 && fy == 2 && P.j % 2) for (int k = 1 - P.first % 2; k < n; k += 2) 
 //   whole      S weights, diagonals, shares, restricts, coarse_weights
 //   numbers    int64 size, coarse_size; int cells
 //   constants  FX = 2, FY = 2
+//   by_cell
 const int j0 = FY*P.j, below = FY == 2 && j0 > 0 ? -1 : 0, above = FY == 2 && j0 + 1 < L.n2 ? 1 : 0;
 for (int k = 0; k < n; ++k) {
     const int i0 = FX*(P.first + k), left = FX == 2 && i0 > 0 ? -1 : 0, right = FX == 2 && i0 + 1 < cells ? 1 : 0;
@@ -106,6 +110,7 @@ for (int k = 0; k < n; ++k) {
 //   reads      S unused
 //   whole      S weights, diagonals, pivots, multiples
 //   numbers    int64 size, step; int count
+//   by_cell
 const int before = step == 1 ? 3 : 1, after = step == 1 ? 4 : 6, side = step == 1 ? 1 : n;  // lines that go side by side
 const T *e = diagonals + p, *w = weights + before*size + p, *v = weights + after*size + p; T *f = pivots + p, *q = multiples + p;
 for (int i = 0; i < count; ++i, e += step, w += step, v += step, f += step, q += step)
@@ -120,6 +125,7 @@ for (int i = 0; i < count; ++i, e += step, w += step, v += step, f += step, q +=
 //   writes     S x, t
 //   whole      S weights
 //   numbers    int64 size; int color
+//   by_cell
 if (P.j % 2 == color) {
     const T *before = weights + 3*size + p;
     SIMD for (int k = 0; k < n; ++k) { const T e = diagonal(k); t[k] = e != 0 ? b[k] - e*x[k] + neighbors(x, k) : (T)0; }
@@ -137,6 +143,7 @@ if (P.j % 2 == color) {
 //   writes     S x, t
 //   whole      S weights
 //   numbers    int64 size, step; int count, color
+//   by_cell
 const T *before = weights + size + p; const long long end = (long long)count*step; const int even = (P.first + color) % 2;
 for (long long at = 0; at < end; at += step) {
     const T *e = d + at, *w = before + at, *f = pivots + at, *v = b + at, *u = x + at, *below = t + at - (at ? step : 0); T* to = t + at;
@@ -161,6 +168,7 @@ SIMD for (int k = 0; k < n; ++k) { const T e = diagonal(k), v = b[k] - e*x[k] + 
 //   other      S t, shares
 //   finer
 //   numbers    int64 size; int cells, fx, fy
+//   by_cell
 const int j0 = fy*P.j; const bool below = fy == 2 && j0 > 0, above = fy == 2 && j0 + 1 < L.n2;
 for (int k = 0; k < n; ++k) {
     const int i0 = fx*(P.first + k); const long long at = fx*k; const bool left = fx == 2 && i0 > 0, right = fx == 2 && i0 + 1 < cells;
@@ -181,6 +189,7 @@ for (int k = 0; k < n; ++k) {
 //   other      S coarse
 //   whole      S shares
 //   numbers    int64 size; bool add
+//   by_cell
 const long long up_ = L.o2;
 for (int k = 0; k < n; ++k) {
     const long long at = p + k; const T* c = coarse + (L.fx < -1 ? k / 2 : k);

@@ -12,6 +12,7 @@ const bool uniform = !fx && !fy && !fz;
 //   compute    float32
 //   writes     int32 parent; uint8 grounded
 //   module     grid
+//   by_cell
 for (int k = 0; k < n; ++k) { parent[k] = (int)(p + k); grounded[k] = 0; }
 
 // kernel components.unite: Join cells to their lower neighbors. Parents have smaller numbers, so
@@ -73,6 +74,7 @@ for (int begin = 0; begin < n; begin += M) {
 //   whole      int32 parent; uint8 grounded
 //   numbers    float64 nx, ny, nz
 //   module     components
+//   by_cell
 #include "joined"
 if (uniform && !shift) {
     const unsigned char ax = nx > 0, ay = ny > 0, az = nz > 0; unsigned char hit[M];
@@ -96,6 +98,7 @@ for (int k = 0; k < n; ++k) {
 //   reads      int8 cells; int32 parent; uint8 grounded
 //   whole      int32 count
 //   module     grid
+//   by_cell
 const int q = (int)p; int floating = 0;
 SIMD for (int k = 0; k < n; ++k) floating += (cells[k] == 1) & (parent[k] == q + k) & (grounded[k] == 0);
 if (floating) count_up(count, floating);

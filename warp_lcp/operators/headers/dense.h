@@ -5,6 +5,7 @@
 //   writes     S y
 //   whole      A a; S x
 //   numbers    int64 size; bool transposed
+//   by_cell
 for (int k = 0; k < n; ++k) {
     EXACT_MATH const auto* row = a + (transposed ? p + k : (p + k)*size); const long long step = transposed ? size : 1; T s = 0;
     for (long long j = 0; j < size; ++j) s += (T)row[j*step]*x[j];
@@ -17,6 +18,7 @@ for (int k = 0; k < n; ++k) {
 //   writes     S x
 //   whole      A a
 //   numbers    float64 omega; bool forward
+//   by_cell
 for (int k = 0; k < n; ++k) {
     EXACT_MATH const long long i = forward ? k : n - 1 - k; const auto* row = a + i*n; T s = b[i];
     if (row[i] == 0) continue;
@@ -33,6 +35,7 @@ const auto times = [](double u, double f) { if constexpr (FUSED) return u*f; els
 //   numbers    int width, rank
 //   sums       first
 //   constants  FUSED = 1
+//   by_cell
 #include "times"
 double* sums = given.out.data + P.t; const int last = count[0];
 if (!P.more) for (int q = 0; q < rank; ++q) sums[q*places] = 0;
@@ -48,6 +51,7 @@ const double first = P.more ? 0 : sums[0];
 //              result
 //   numbers    int width; float64 sign
 //   constants  FUSED = 1
+//   by_cell
 #include "times"
 const int last = count[0];
 for (int k = 0; k < n && p + k < last; ++k) {
@@ -62,6 +66,7 @@ for (int k = 0; k < n && p + k < last; ++k) {
 //   compute    float64
 //   whole      int32 entry_rows, blocks; V values; int32 count; float64 weights, result
 //   numbers    int width, rank
+//   by_cell
 const int last = count[0];
 for (int k = 0; k < n && p + k < last; ++k) {
     EXACT_MATH const long long e = p + k; const int row = entry_rows[e]; double s = 0;

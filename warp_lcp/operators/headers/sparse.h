@@ -6,6 +6,7 @@
 //   reads      S plus?
 //   writes     S y
 //   whole      int32 ptr, col; A a; S x
+//   by_cell
 #include "snippets.h:entries"
 ROWS { T s = plus ? plus[k] : (T)0; ENTRIES s += (T)a[e]*x[col[e]]; y[k] = s; }
 
@@ -14,6 +15,7 @@ ROWS { T s = plus ? plus[k] : (T)0; ENTRIES s += (T)a[e]*x[col[e]]; y[k] = s; }
 //   compute    S
 //   whole      int32 ptr, col; A a, d; int32 list?; S b, lower, upper, x
 //   numbers    float64 omega; bool forward; int first
+//   by_cell
 #include "snippets.h:entries"
 const auto relax = [&](long long i) {
     if (d[i] == 0) return;
@@ -28,6 +30,7 @@ for (int k = 0; k < n; ++k) relax(list ? (long long)list[first + p + k] : forwar
 //   writes     float64 largest, diagonal
 //   whole      int32 ptr, col; float64 a
 //   sums       differ, more
+//   by_cell
 #include "snippets.h:entries"
 const auto across = [&](int i, int j) {  // a_ij, of row i, whose columns ascend; beyond the last one, where there is none
     int first = ptr[i], last = ptr[i + 1];
@@ -48,4 +51,5 @@ ROWS {
 //   reads      int32 order
 //   writes     S taken
 //   whole      S source
+//   by_cell
 for (int k = 0; k < n; ++k) taken[k] = order[k] >= 0 ? source[order[k]] : 0;

@@ -14,6 +14,7 @@ else SIMD for (int k = 0; k < n; ++k) y[k] = product(x, k);
 //   stencil    D, W
 //   reads      S x
 //   writes     S y
+//   by_cell
 #define ADD(W, X, Y, Z) + W(k - (X) + beside(-(Y), -(Z), zm, zp))*x[k - (X) + beside(-(Y), -(Z), zm, zp)]
 for (int k = 0; k < n; ++k) { const T e = diagonal(k); y[k] = e != 0 ? e*x[k] - ((T)0 EACH_WEIGHT(ADD)) : (T)0; }
 #undef ADD
@@ -25,6 +26,7 @@ for (int k = 0; k < n; ++k) { const T e = diagonal(k); y[k] = e != 0 ? e*x[k] - 
 //   reads      S b, lower, upper
 //   writes     S x
 //   numbers    S omega; int color
+//   by_cell
 const bool compact = STENCIL == 'c'; const int bits = compact ? color : 0;
 const int start = compact ? (P.first + bits) % 2 : (P.k + P.j + P.first + color) % 2;
 const bool ours = !compact || (P.j % 2 == bits / 2 % 2 && P.k % 2 == bits / 4);
@@ -65,6 +67,7 @@ for (int k = 0; k < n; ++k) {
 //   compute    S
 //   writes     S x
 //   numbers    int cells; int64 step
+//   by_cell
 for (int k = 0; k < n; ++k) { x[k] = x[k + cells*step]; x[k + (cells + 1)*step] = x[k + step]; }
 
 // kernel matrix_stencil.recognize: Rows of a sparse matrix as those of a compact stencil on a box
@@ -74,6 +77,7 @@ for (int k = 0; k < n; ++k) { x[k] = x[k + cells*step]; x[k + (cells + 1)*step] 
 //   whole      int32 ptr, col; float64 a, middle, weights?
 //   numbers    int nx, ny, nz, full, kept; int64 size
 //   sums       wrong, centers, differ, positive
+//   by_cell
 int wrong = 0, centers = 0, differ = 0, positive = 0, count = 0, reached = 0; const int plane = nx*ny; double row[27], usual[27];
 int places[27], columns[27], steps[27];  // neighbors that there are, and their fields; what the middle row's entries would be
 bool rises = false, within = true;

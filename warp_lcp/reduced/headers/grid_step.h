@@ -91,6 +91,7 @@ SIMD for (int k = 0; k < n; ++k) {
 //   reads      S z, q, g
 //   whole      float64 sums
 //   numbers    int place, lines, places
+//   by_cell
 #include "projected_multigrid.measure"
 double* sum = sums + place + P.k*lines + P.j;
 sum[0] = (double)zaz; sum[places] = (double)zap; sum[2*places] = (double)gz; sum[3*places] = (double)gp;

@@ -5,6 +5,7 @@
 //   compute    float64
 //   whole      int32 entry_rows, blocks; V values; int32 count; D d; float64 squares
 //   numbers    int width, rank
+//   by_cell
 for (int q = 0; q < rank + rank/width; ++q) squares[q] = 0;
 for (int e = 0; e < count[0]; ++e) {
     if (d[entry_rows[e]] == 0) continue;
@@ -16,6 +17,7 @@ for (int e = 0; e < count[0]; ++e) {
 //   whole      int32 entry_rows, blocks; V values; int32 count; D d
 //   numbers    int width, rank
 //   sums       first
+//   by_cell
 double* sums = given.out.data + P.t; const int last = count[0], all = rank + rank/width;
 if (!P.more) for (int q = 0; q < all; ++q) sums[q*places] = 0;
 for (int k = 0; k < n && p + k < last; ++k) {
@@ -30,6 +32,7 @@ const double first = P.more ? 0 : sums[0];
 //   whole      S Z
 //   numbers    int slots; int64 size
 //   sums       first
+//   by_cell
 T first = 0;
 for (int s = 0; s < slots; ++s) {
     const T* v = Z + s*size + p; double* column = given.out.data + s*places + P.t; T sum = 0;
@@ -42,6 +45,7 @@ for (int s = 0; s < slots; ++s) {
 //   writes     S z
 //   whole      S Z; float64 factors
 //   numbers    int slots; int64 size
+//   by_cell
 for (int begin = 0; begin < n; begin += M) {
     const int end = n - begin < M ? n : begin + (int)M; T sum[M];
     SIMD for (int k = begin; k < end; ++k) sum[k - begin] = 0;

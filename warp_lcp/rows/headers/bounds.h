@@ -1,7 +1,7 @@
 // Bounds of x. body(lower, upper) is called with functions of the cell, so that a loop over them tests none: numbers, a code of two bits, or
 // fields and numbers, see `warp_lcp.problem.bounds`. What there is, BOUNDS, is known when the kernel is made: the rest is not compiled.
 const auto with_bounds = [&](auto body) {
-    const double *l = given.bounds.lower.data + p, *u = given.bounds.upper.data + p; const auto* code = given.bounds.code.data + p;
+    const auto l = in_(given.bounds.lower.data, p), u = in_(given.bounds.upper.data, p); const auto code = in_(given.bounds.code.data, p);
     const double l_value = given.bounds.least, u_value = given.bounds.most;
     const auto low = [&](int k) { return l[k]; }; const auto high = [&](int k) { return u[k]; };
     const auto least = [&](int) { return l_value; }; const auto most = [&](int) { return u_value; };

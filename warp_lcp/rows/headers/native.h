@@ -3,9 +3,14 @@
 #ifdef __CUDA_ARCH__
 #define FAST_MATH
 #define EXACT_MATH
+#ifdef QUADS
+#define VECTORS(WIDTH) _Pragma("unroll")
+#define BUFFERED 4
+#else
 #define VECTORS(WIDTH)
-#define UNROLLED _Pragma("unroll 4")  // so that several loads are under way at a time
 #define BUFFERED 1
+#endif
+#define UNROLLED _Pragma("unroll 4")  // so that several loads are under way at a time
 #else
 #define PRAGMA(TEXT) _Pragma(#TEXT)
 #define FAST_MATH PRAGMA(clang fp reassociate(on) contract(fast))
@@ -27,12 +32,14 @@ FAST_MATH  // comes before the first declaration
 enum { M = BUFFERED };  // cells that a row function buffers at a time
 // Ask for the cache lines that cells begin ... end of fields will need 512 elements later: the processor's own prefetching does not keep up
 // with a pass over seven fields or more whose rows are short. So far ahead made such passes 20 to 25 % faster at 128^3 and 256^3.
+#ifdef __CUDA_ARCH__
+const auto fetch = [](int begin, int end, const auto&... fields) {};
+#else
 const auto fetch = [](int begin, int end, const auto*... fields) {
-#ifndef __CUDA_ARCH__
     const auto one = [&](const auto* q) { for (int i = begin; i < end; i += 64 / (int)sizeof(*q)) __builtin_prefetch(q + i + 512); };
     (one(fields), ...);
-#endif
 };
+#endif
 // What other threads, too, add to or make larger; the order changes nothing.
 const auto count_up = [](int* to, int v) {
 #ifdef __CUDA_ARCH__
@@ -57,3 +64,30 @@ const auto fused = [](auto a, auto b, auto c) { return __builtin_elementwise_fma
 #endif
 const auto clipped = [](auto v, auto l, auto u) { const auto w = v < l ? l : v; return w > u ? u : w; };
 const auto reciprocal = [](auto v) { EXACT_MATH return 1/v; };  // else clang may divide each cell by v where it is used once
+// body(2) if `pairs`, else body(1): a loop over so many cells is unrolled in quads
+#ifdef QUADS
+#ifdef __CUDACC__
+#define METHOD __device__
+#else
+#define METHOD
+#endif
+typedef int Whole;  // Warp has a macro of the name of a conversion to int
+struct One { METHOD constexpr operator Whole() const { return 1; } };
+struct Two { METHOD constexpr operator Whole() const { return 2; } };
+const auto with_pairs = [](bool pairs, auto body) { if (pairs) body(Two()); else body(One()); };
+#else
+const auto with_pairs = [](bool pairs, auto body) { body(pairs ? 2 : 1); };
+#endif
+// a / e. In quads a division of float32 has no branch, for loads do not merge across branches: it is rounded as IEEE division is, but
+// where e or the quotient is not a normal number.
+#if defined(QUADS) && defined(__CUDACC__)
+const auto quotient = [](auto a, auto e) {
+    if constexpr (sizeof(a) == 4 && sizeof(e) == 4) {
+        float r; asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(e));
+        r = fmaf(fmaf(-e, r, 1.0f), r, r);
+        const float q = a*r;
+        return fmaf(fmaf(-e, q, a), r, q);
+    } else return a / e; };
+#else
+const auto quotient = [](auto a, auto e) { return a / e; };
+#endif

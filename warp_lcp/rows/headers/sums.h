@@ -3,7 +3,9 @@
 double* sums_ = given.out.data + P.t;
 const auto joined_ = [](int s, auto a, auto b) { return s < SUMS ? a + b : b > a ? b : a; };
 #ifdef __CUDA_ARCH__
+#ifndef QUADS
 const bool last_ = (k_i + 1) % L.slab == 0 || k_i + 1 == L.planes;
+#endif
 const auto keep_ = [&](int s, auto v) {
     if constexpr ((decltype(v))0.5 == 0) {
         whole_[s] = P.more ? joined_(s, v, (decltype(v))whole_[s]) : v; if (last_) sums_[s*places_] = (double)whole_[s];

@@ -24,6 +24,7 @@ return s;
 //   whole      float64 partials, scalars
 //   numbers    int count, slot
 //   module     problem
+//   by_cell
 for (int k = 0; k < n; ++k) {
     const double* v = partials + (P.first + k)*(long long)count; double s = 0;
     SIMD8 for (int i = 0; i < count; ++i) s += v[i];

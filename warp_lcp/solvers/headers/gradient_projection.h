@@ -91,6 +91,7 @@ SIMD for (int k = 0; k < n; ++k) { const T v = unknown[k] == 1 ? g[k] - x[k] : (
 //   reads      float64 g; int8 unknown
 //   writes     float64 x, along
 //   whole      float64 squares
+//   by_cell
 const double fresh = squares[0], old = squares[1];
 #include "snippets.h:fletcher_reeves"
 with_bounds([&](auto lower, auto upper) {
@@ -150,6 +151,7 @@ with_bounds([&](auto lower, auto upper) {
 //   reads      float64 x, less?; uint8 member
 //   writes     float64 target
 //   numbers    bool kept
+//   by_cell
 const auto select = [&](auto value) {
     SIMD for (int k = 0; k < n; ++k) { const double v = value(k), rest = kept ? target[k] : 0.0; target[k] = member[k] ? v : rest; } };
 if (less) select([&](int k) { return x[k] - less[k]; }); else select([&](int k) { return x[k]; });

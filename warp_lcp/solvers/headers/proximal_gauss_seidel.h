@@ -85,6 +85,7 @@ for (int t = first; t < last; ++t) {
 //   writes     float64 r, way
 //   whole      float64 state
 //   numbers    int now
+//   by_cell
 const double fresh = state[now], old = state[1 - now];
 #include "snippets.h:fletcher_reeves"
 SIMD8 for (int k = 0; k < n; ++k) {
@@ -99,6 +100,7 @@ SIMD8 for (int k = 0; k < n; ++k) {
 //   writes     float64 w, before, way
 //   whole      float64 state
 //   numbers    int now
+//   by_cell
 const double fresh = state[now], old = state[1 - now];
 #include "snippets.h:fletcher_reeves"
 SIMD8 for (int k = 0; k < n; ++k) {

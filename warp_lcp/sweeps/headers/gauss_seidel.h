@@ -20,6 +20,7 @@ make_at_least(out_of, s);
 //   writes     float64 x, c, q, z; uint8 s
 //   numbers    int64 s1, s2; int cells, most, color; float64 omega
 //   constants  AXIS = 0
+//   by_cell
 #ifdef EACH_WEIGHT
 #define STEP(X, Y, Z) ((X) + (Y)*s2 + (Z)*s1)
 #define BEFORE(W, X, Y, Z) visit(STEP(X, Y, Z), W(k));

@@ -1,0 +1,201 @@
+"""What the passes of a solve cost a GPU, counted on the host: instructions, registers, and the limit that holds each of them.
+
+The passes over the finest grid are heard in CUDA's form (`benchmarks/emulated_cuda.py`), compiled for sm_90, and one warp of each is
+executed on the memory that the solve has left (`benchmarks/sass.py`). A pass takes as long as the slowest of: its instructions at one a
+clock and scheduler; those in float64 at their rate; wavefronts of the L1 cache at one a clock; the bytes of its fields at `SHARE` of the
+bandwidth; and a latency of memory for each plane of a thread, as often as the multiprocessors are filled.
+"""
+
+from benchmarks import emulated_cuda  # before the package
+
+# ruff: isort: split
+
+import math
+import struct
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import numpy as np
+import warp as wp
+
+import warp_lcp as wl
+from benchmarks.sass import Issued, Kernel, Memory, assemble, constants_of, issued, tools_missing
+from warp_lcp.benchmarks.kernels import Heard
+from warp_lcp.rows import RowPass, layout
+from warp_lcp.rows.row_pass import Bound
+
+assert emulated_cuda
+
+SHAPE = (36, 12, 128)  # planes, rows, cells of a row: a warp's quads fill one
+BLOCK, SCHEDULERS, WARP = 256, 4, 32
+SHARE, LATENCY = 0.8, 800  # of the bandwidth that streaming kernels reach; clocks of a load from memory
+AREAS = ("cycle.", "projected_multigrid.", "stencil.product", "residual.", "vectors.", "active_set.", "grid_conjugate_gradient.")
+
+
+@dataclass(frozen=True)
+class Gpu:
+    """A GPU: multiprocessors, clock [GHz], bandwidth [GB/s], float64 instructions of a warp a clock, warps, of each multiprocessor."""
+
+    processors: int
+    clock: float
+    bandwidth: float
+    float64: float
+    warps: int
+
+
+GPUS = {"H200": Gpu(132, 1.98, 4800.0, 2.0, 64), "RTX 4090": Gpu(128, 2.52, 1008.0, 1 / 16, 48)}
+
+
+@dataclass(frozen=True)
+class Count:
+    """What a warp of a pass issues, and what the pass needs.
+
+    Attributes:
+        name: of the pass, with types.
+        issued: of a warp.
+        cells: that a thread takes, of the finer level of a transfer.
+        planes: one after another, of these.
+        registers: of a thread.
+        bytes: of the fields of a cell.
+    """
+
+    name: str
+    issued: Issued
+    cells: int
+    planes: int
+    registers: int
+    bytes: float
+
+    @property
+    def a_cell(self) -> float:
+        """Issued instructions a cell."""
+        return self.issued.instructions / self.cells
+
+    def resident(self, gpu: Gpu) -> int:
+        """Return the warps that a multiprocessor holds."""
+        taken = max(-(-self.registers // 8) * 8, 16) * BLOCK
+        return min(65536 // taken * BLOCK // WARP, gpu.warps // (BLOCK // WARP) * (BLOCK // WARP))
+
+    def limits(self, gpu: Gpu, cells: int) -> dict[str, float]:
+        """Return the least time [ms] of a pass over so many cells by each limit."""
+        warps, clocks = cells / WARP / self.cells, gpu.processors * gpu.clock * 1e6  # of all multiprocessors in 1 ms
+        turns = math.ceil(warps / (gpu.processors * self.resident(gpu)))
+        return {
+            "issue": self.issued.instructions * warps / SCHEDULERS / clocks,
+            "float64": self.issued.float64 * warps / gpu.float64 / clocks,
+            "L1": self.issued.wavefronts * warps / clocks,
+            "bytes": self.bytes * cells / (SHARE * gpu.bandwidth * 1e6),
+            "latency": turns * self.planes * LATENCY / (gpu.clock * 1e6),
+        }
+
+
+def passes() -> dict[str, tuple[Heard, dict[str, Any]]]:
+    """Return the passes over the finest grid that solves of a full basin bind, as CUDA launches them on large grids, by name."""
+    cells = np.full(SHAPE, wl.FLUID, dtype=np.int8)
+    cells[-1] = wl.AIR
+    wall = np.zeros(SHAPE, dtype=bool)
+    for side in (0, -1):
+        wall[side] = wall[:, side] = wall[:, :, side] = True
+    b = np.where(cells == wl.FLUID, np.random.default_rng(2015).standard_normal(SHAPE), 0.0)
+    heard: list[tuple[Heard, dict[str, Any]]] = []
+    bind = RowPass.bind_arguments
+
+    def listening(declared: RowPass, rows: Any, structs: Any, given: dict[str, Any], stencil: Any = None, bounds: Any = None) -> Bound:
+        bound = bind(declared, rows, structs, given, stencil, bounds)
+        fields = {name: bound.given[name] for name in declared.arrays if isinstance(bound.given[name], wp.array)}
+        if stencil is not None:
+            fields |= {"d": stencil.d} | {f"w{axis}": w for axis, w in zip("xyz", stencil.weights or (), strict=False)}
+        fields |= {name: value for name, value in zip(("lower", "", "upper", "", "code"), bounds or (), strict=False) if name}
+        heard.append((Heard(bound, fields), bound.given))
+        return bound
+
+    many = mock.patch.object(layout, "MANY_CELLS", 1)
+    with many, mock.patch.object(RowPass, "bind_arguments", listening):
+        stopping = wl.StoppingCriteria(rtol=0, max_iterations=3)
+        for method, lower in ((wl.ProjectedMultigrid(), np.where(wall, 0.0, -np.inf)), (wl.ProjectedMultigrid(), -np.inf)):
+            wl.solve(wl.LCP(wl.GridPoisson(cells, device="cpu"), b, lower), method, stopping=stopping)
+        lower = np.where(wall, 0.0, -np.inf)
+        wl.solve(wl.LCP(wl.GridPoisson(cells, device="cpu"), b, lower), wl.MinimumMapNewton(), stopping=stopping)
+        A = wl.GridPoisson(cells, device="cpu")
+        x = wp.array(np.random.default_rng(7).random(A.layout.size, np.float32), device="cpu")
+        A.stencil.product(x, wp.zeros_like(x))
+    found: dict[str, tuple[Heard, dict[str, Any]]] = {}
+    for one, given in heard:
+        rows, declared = one.bound.rows, one.bound.form.declared
+        kinds = "".join(f" {word}" for word in ("from_zero", "projected") if given.get(word))
+        if max(rows.size, rows.other_size) == A.layout.size and not (declared.box or declared.listed):
+            found.setdefault(one.name + kinds, (one, given))
+    return found
+
+
+def count(name: str, one: Heard, given: dict[str, Any], folder: Path) -> Count:
+    """Compile a pass for CUDA, execute a warp in the middle of the grid, and return what it takes.
+
+    Raises:
+        NotImplementedError: it has an instruction that `benchmarks.sass` does not know.
+        KeyError: it reads what is not among its fields.
+    """
+    form, rows = one.bound.form, one.bound.layout
+    kernel = _compiled(form, folder)
+    slabs, lines, chunks = layout.threads(rows)
+    dim = (slabs * lines * chunks,) if form.quads else (slabs, lines, chunks)
+    bounds = struct.pack(f"<{len(dim)}I4xQQ", *dim, math.prod(dim), 1)
+    parameters = bounds + bytes(rows.__ctype__()) + one.bound.arguments
+    first = (min(1, slabs - 1) * lines + lines // 2) * chunks  # of the threads of a row within the second slab
+    taken = range(first + chunks // 2 // WARP * WARP if chunks > 1024 else first, math.prod(dim))[: min(WARP, chunks)]
+    arrays = [a for a in (*one.fields.values(), *given.values(), rows.spans) if isinstance(a, wp.array) and a.size]
+    memory = Memory((int(a.ptr), a.numpy().copy()) for a in arrays)
+    blocks = -(-math.prod(dim) // BLOCK)
+    found = issued(kernel.code, constants_of(parameters, BLOCK, blocks), memory, [(t % BLOCK, t // BLOCK) for t in taken])
+    planes, size = min(rows.slab, rows.planes), one.bound.rows.size
+    ratio = max(one.bound.rows.other_size // size, 1) if size else 1
+    finer = 8 if ratio > 4 else 1  # a thread takes an aggregate of the finer level
+    cells = planes * (max(rows.grain, 1)) * finer
+    whole = max(size, one.bound.rows.other_size)
+    apart = {*form.declared.by_row, *form.declared.whole, "out"}
+    moved = sum(a.size * wp.types.type_size_in_bytes(a.dtype) for n, a in one.fields.items() if n not in apart) / whole
+    return Count(name, found, cells, planes, kernel.registers, moved)
+
+
+def _compiled(form: Any, folder: Path) -> Kernel:
+    """Return the kernel of a pass, compiled for sm_90."""
+    kernel, place = form.kernel, folder / form.kernel.module.name
+    if not place.exists():
+        kernel.module.options["block_dim"] = BLOCK
+        wp.compile_aot_module(kernel.module.name, device=None, arch=[90], module_dir=place, use_ptx=True)
+    (ptx,) = place.glob("*.ptx")
+    made = assemble(ptx.read_text(), place / "module.cubin")
+    return next(one for one in made if one.name.startswith(f"{form.name}_") and one.name.endswith("kernel_forward"))
+
+
+def counts(words: tuple[str, ...] = AREAS) -> Iterator[Count]:
+    """Count the passes whose names begin with one of some words."""
+    if missing := tools_missing():
+        raise SystemExit(f"{', '.join(missing)}: not installed: pip install 'warp-lcp[ptxas]'")
+    with tempfile.TemporaryDirectory() as folder:
+        for name, (one, given) in passes().items():
+            if name.startswith(words):
+                try:
+                    yield count(name, one, given, Path(folder))
+                except (NotImplementedError, KeyError) as error:
+                    print(f"{name}: {error!r}")
+
+
+def table(n: int) -> Iterator[str]:
+    """Yield the lines of a table of all passes, with times over n^3 cells."""
+    times = " | ".join(f"{name} ms | limit" for name in GPUS)
+    yield f"| pass | issued a cell | loads | stores | L1 wavefronts | bytes | registers | warps | {times} |"
+    yield "|---" * (8 + 2 * len(GPUS)) + "|"
+    for one in counts():
+        i, c = one.issued, one.cells
+        cells = [f"{v / c:.1f}" for v in (i.instructions, i.loads, i.stores, i.wavefronts)]
+        cells += [f"{one.bytes:.1f}", str(one.registers), str(one.resident(GPUS["H200"]))]
+        for gpu in GPUS.values():
+            limits = one.limits(gpu, n**3)
+            limit = max(limits, key=lambda name: limits[name])
+            cells += [f"{limits[limit]:.3f}", limit]
+        yield f"| `{one.name}` | {' | '.join(cells)} |"

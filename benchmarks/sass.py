@@ -1,0 +1,696 @@
+"""Executes machine code of NVIDIA GPUs (SASS of sm_90) on the host, to count what a warp issues; no GPU is needed.
+
+A cubin is made by `ptxas` and printed by `cuobjdump` with the help of `nvdisasm`, which are in the extra `ptxas`. The lanes of a warp run
+one after another on copies of memory. An instruction of the warp is issued as often as by the lane that executes it most often, as
+branches join again. Shuffles, votes and atomics, which need other lanes, do nothing.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import itertools
+import math
+import os
+import re
+import struct
+import subprocess
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+PARAMETERS = 0x210  # offset of a kernel's parameters in constant memory
+LOW, ALL = 0xFFFFFFFF, (1 << 64) - 1
+MOST = 200_000  # instructions of a lane
+LINE = re.compile(r"^\s+/\*([0-9a-f]{4,})\*/\s+(.*?)\s*;")
+GUARD = re.compile(r"@(!?)(U?P\w+)\s+(.*)")
+PREDICATE = re.compile(r"U?P(\d|T)$")
+FLOAT64 = frozenset(("DADD", "DMUL", "DFMA", "DSETP", "DMNMX"))
+IGNORED = frozenset(
+    "NOP BSSY BSYNC WARPSYNC BREAK BMOV YIELD DEPBAR BAR MEMBAR ERRBAR CCTL RED ATOMG ATOM".split()  # noqa: SIM905
+)
+COMPARED: dict[str, Callable[[float, float], bool]] = {  # the second letter U: true of NaN
+    "LT": lambda a, b: a < b, "EQ": lambda a, b: a == b, "LE": lambda a, b: a <= b, "GT": lambda a, b: a > b,
+    "NE": lambda a, b: a != b and a == a and b == b, "GE": lambda a, b: a >= b, "NUM": lambda a, b: a == a and b == b,
+    "NAN": lambda a, b: a != a or b != b, "LTU": lambda a, b: not a >= b, "EQU": lambda a, b: a == b or a != a or b != b,
+    "LEU": lambda a, b: not a > b, "GTU": lambda a, b: not a <= b, "NEU": lambda a, b: a != b, "GEU": lambda a, b: not a < b,
+}  # fmt: skip
+
+
+def tool(name: str) -> Path | None:
+    """Return where a tool of the extra `ptxas` is; None if it is not installed."""
+    spec = importlib.util.find_spec("nvidia")
+    places = [Path(p) for p in (spec.submodule_search_locations or [])] if spec else []
+    return next((found for place in places for found in place.glob(f"*/bin/{name}")), None)
+
+
+def tools_missing() -> list[str]:
+    """Return the names of the tools that are not installed."""
+    return [name for name in ("ptxas", "cuobjdump", "nvdisasm") if tool(name) is None]
+
+
+@dataclass(frozen=True)
+class Instruction:
+    """An instruction: its guard (predicate, whether it is negated), its operation with modifiers, its operands."""
+
+    guard: tuple[str, bool] | None
+    name: str
+    modifiers: tuple[str, ...]
+    operands: tuple[str, ...]
+    text: str
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """A kernel of a cubin: instructions by address, and registers of a thread."""
+
+    name: str
+    code: dict[int, Instruction]
+    registers: int
+    spilled: int
+
+
+def assemble(ptx: str, cubin: Path, arch: str = "sm_90") -> list[Kernel]:
+    """Assemble PTX to a cubin and return its kernels."""
+    ptxas, cuobjdump, nvdisasm = (tool(name) for name in ("ptxas", "cuobjdump", "nvdisasm"))
+    assert ptxas and cuobjdump and nvdisasm, tools_missing()
+    text = ptx.rstrip("\0 \n") + "\n"  # Warp ends it with a NUL, which ptxas refuses
+    made = subprocess.run([ptxas, "-v", f"-arch={arch}", "/dev/stdin", "-o", cubin], input=text, capture_output=True, text=True, check=True)
+    environment = {
+        **os.environ,
+        "NVDISASM_PATH": str(nvdisasm.parent),
+        "PATH": f"{nvdisasm.parent}{os.pathsep}{os.environ.get('PATH', '')}",
+    }
+    printed = subprocess.run([cuobjdump, "-sass", cubin], capture_output=True, text=True, check=True, env=environment).stdout
+    codes: dict[str, dict[int, Instruction]] = {}
+    name = ""
+    for line in printed.splitlines():
+        if "Function :" in line:
+            name = line.split("Function :")[1].strip()
+            codes[name] = {}
+        elif name and (found := LINE.match(line)):
+            codes[name][int(found[1], 16)] = parsed(found[2])
+    kernels = []
+    for part in re.split(r"Compiling entry function '", made.stderr)[1:]:
+        name = part.partition("'")[0]
+        registers, spilled = re.search(r"Used (\d+) registers", part), re.search(r"(\d+) bytes spill stores", part)
+        assert registers, part
+        kernels.append(Kernel(name, codes[name], int(registers[1]), int(spilled[1]) if spilled else 0))
+    return kernels
+
+
+def parsed(text: str) -> Instruction:
+    """Return an instruction from its text."""
+    guard, rest = None, text
+    if found := GUARD.match(text):
+        guard, rest = (found[2], bool(found[1])), found[3]
+    operation, _, operands = rest.partition(" ")
+    name, *modifiers = operation.split(".")
+    split = re.split(r",\s*(?![^\[]*\])", operands) if operands.strip() else []
+    return Instruction(guard, name, tuple(modifiers), tuple(part.strip() for part in split), text)
+
+
+class Memory:
+    """Copies of arrays at their addresses; what is written lies on top of them."""
+
+    def __init__(self, arrays: Iterable[tuple[int, np.ndarray]]) -> None:
+        self._spans = sorted(((at, np.ascontiguousarray(a).view(np.uint8).reshape(-1)) for at, a in arrays), key=lambda span: span[0])
+        self.written: dict[int, int] = {}
+        self.shared: dict[int, int] = {}
+
+    def read(self, at: int, count: int) -> bytes:
+        """Return bytes; those up to 64 KiB outside of an array, which guarded loads do not use, are 0.
+
+        Raises:
+            KeyError: there is no array near the address.
+        """
+        for begin, data in self._spans:
+            if begin <= at and at + count <= begin + len(data):
+                found = bytearray(data[at - begin : at - begin + count].tobytes())
+                break
+        else:
+            if not any(begin - 65536 <= at < begin + len(data) + 65536 for begin, data in self._spans):
+                raise KeyError(f"no memory at {at:#x}")
+            found = bytearray(count)
+        for k in range(count):
+            if at + k in self.written:
+                found[k] = self.written[at + k]
+        return bytes(found)
+
+    def write(self, at: int, data: bytes) -> None:
+        """Write bytes."""
+        self.written.update((at + k, byte) for k, byte in enumerate(data))
+
+
+@dataclass
+class Issued:
+    """What a warp issues.
+
+    Attributes:
+        instructions: how many.
+        float64: of these, in float64.
+        loads: from global memory.
+        stores: to global memory.
+        wavefronts: passes through the L1 cache, of at most 128 bytes and one line each.
+    """
+
+    instructions: int = 0
+    float64: int = 0
+    loads: int = 0
+    stores: int = 0
+    wavefronts: int = 0
+
+
+def issued(code: dict[int, Instruction], constants: bytes, memory: Memory, threads: Sequence[tuple[int, int]]) -> Issued:
+    """Return what a warp issues whose threads have these (place in the block, block).
+
+    Raises:
+        NotImplementedError: the kernel has an instruction that is not known here.
+    """
+    most: Counter[int] = Counter()
+    groups: dict[tuple[int, int, bool], list[tuple[int, int]]] = defaultdict(list)
+    for thread, block in threads:
+        lane = Lane(code, constants, memory, thread, block)
+        lane.run()
+        for at, count in lane.count.items():
+            most[at] = max(most[at], count)
+        for at, turn, address, size, is_load in lane.accesses:
+            groups[at, turn, is_load].append((address, size))
+    found = Issued(sum(most.values()), sum(n for at, n in most.items() if code[at].name in FLOAT64))
+    for (_, _, is_load), accesses in groups.items():
+        lines = {byte // 128 for address, size in accesses for byte in (address, address + size - 1)}
+        found.loads += is_load
+        found.stores += not is_load
+        found.wavefronts += max(len(lines), -(-sum(size for _, size in accesses) // 128))
+    return found
+
+
+def _signed(value: int, bits: int = 32) -> int:
+    return value - (1 << bits) if value >> (bits - 1) & 1 else value
+
+
+def _float(bits: int) -> float:
+    return float(struct.unpack("<f", struct.pack("<I", bits & LOW))[0])
+
+
+def _double(bits: int) -> float:
+    return float(struct.unpack("<d", struct.pack("<Q", bits & ALL))[0])
+
+
+def _bits(value: float) -> int:
+    with np.errstate(all="ignore"):
+        return int(np.float32(value).view(np.uint32))
+
+
+def _long_bits(value: float) -> int:
+    return int(struct.unpack("<Q", struct.pack("<d", float(value)))[0])
+
+
+def _half_bits(value: float) -> int:
+    return int(np.float16(value).view(np.uint16))
+
+
+@dataclass
+class Lane:
+    """A thread that executes a kernel."""
+
+    code: dict[int, Instruction]
+    constants: bytes
+    memory: Memory
+    thread: int
+    block: int
+    registers: dict[str, int] = field(default_factory=lambda: defaultdict(int))
+    predicates: dict[str, bool] = field(default_factory=lambda: defaultdict(bool, PT=True, UPT=True))
+    count: Counter[int] = field(default_factory=Counter)  # of instructions by address
+    accesses: list[tuple[int, int, int, int, bool]] = field(default_factory=list)  # instruction, its turn, address, bytes, is a load
+    local: dict[int, int] = field(default_factory=dict)  # memory of its own, by address
+    at: int = 0
+
+    def run(self) -> None:
+        """Execute until the end."""
+        order = sorted(self.code)
+        following = dict(itertools.pairwise(order))
+        at = order[0]
+        for _ in range(MOST):
+            instruction = self.code[at]
+            self.count[at] += 1
+            target: int | None = None
+            if instruction.guard is None or self._predicate(instruction.guard[0]) != instruction.guard[1]:
+                if instruction.name == "EXIT":
+                    return
+                self.at = at
+                target = self._step(instruction)
+            at = following[at] if target is None else target
+        raise RuntimeError(f"a lane executes more than {MOST} instructions")
+
+    def _step(self, instruction: Instruction) -> int | None:
+        """Execute an instruction; return where it jumps to."""
+        name, operands = instruction.name, list(instruction.operands)
+        if name in IGNORED:
+            return None
+        if name == "BRA":
+            return int(operands[-1], 16) if len(operands) == 1 or self._predicate(operands[0]) else None
+        if name == "CALL":
+            return int(operands[-1], 16)
+        if name == "RET":
+            register, offset = operands[0].split()
+            return (self._long(register) + int(offset, 16)) & LOW
+        plain = name[1:] if name[0] == "U" else name  # the uniform datapath has the same operations
+        execute = getattr(self, f"_do_{ALIASES.get(plain, plain).lower()}", None)
+        if execute is None:
+            raise NotImplementedError(instruction.text)
+        with np.errstate(all="ignore"):
+            execute(set(instruction.modifiers), operands, instruction)
+        return None
+
+    # operands
+
+    def _register(self, name: str) -> int:
+        plain = name.split(".", maxsplit=1)[0]
+        return 0 if plain in ("RZ", "URZ", "SRZ") else self.registers[plain]
+
+    def _constant(self, operand: str, size: int) -> int:
+        found = re.match(r"c\[0x[0-9a-f]+\]\s*\[(.+?)\]$", operand)
+        assert found, operand
+        parts = [part.strip() for part in found[1].split("+")]
+        offset = sum(int(part, 16) if part.startswith("0x") else self._register(part) for part in parts)
+        return int.from_bytes(self.constants[offset : offset + size], "little")
+
+    @staticmethod
+    def _signs(operand: str) -> tuple[bool, bool, bool, str]:
+        """Return whether an operand is negated, inverted, absolute, and what it is without."""
+        negative = operand.startswith("-") and not re.match(r"-0x|-[\d.]|-INF|-QNAN", operand)
+        operand = operand[1:] if negative else operand
+        inverted = operand.startswith("~")
+        operand = operand[1:] if inverted else operand
+        return negative, inverted, operand.startswith("|"), operand.strip("|")
+
+    def _int(self, operand: str) -> int:
+        negative, inverted, _, plain = self._signs(operand)
+        if plain.startswith("c["):
+            value = self._constant(plain, 4)
+        elif re.match(r"-?0x", plain):
+            value = int(plain, 16) & LOW
+        elif re.match(r"-?\d", plain):
+            value = int(float(plain)) & LOW
+        else:
+            value = self._register(plain) >> (16 if ".H1" in plain else 0)
+        value = ~value & LOW if inverted else value
+        return -value & LOW if negative else value
+
+    def _long(self, operand: str) -> int:
+        negative, _, _, plain = self._signs(operand)
+        if plain.startswith("c["):
+            value = self._constant(plain, 8)
+        elif plain.startswith(("RZ", "URZ")):
+            value = 0
+        elif plain.startswith("0x"):
+            value = int(plain, 16)
+        else:
+            found = re.match(r"(U?R)(\d+)", plain)
+            assert found, operand
+            value = self.registers[f"{found[1]}{found[2]}"] | self.registers[f"{found[1]}{int(found[2]) + 1}"] << 32
+        return -value & ALL if negative else value
+
+    def _real(self, operand: str, *, double: bool = False) -> float:
+        negative, _, absolute, plain = self._signs(operand)
+        if plain.startswith("c["):
+            value = _double(self._constant(plain, 8)) if double else _float(self._constant(plain, 4))
+        elif re.match(r"[+-]?(INF|QNAN)", plain):
+            value = (-math.inf if plain.startswith("-") else math.inf) if "INF" in plain else math.nan
+        elif re.match(r"-?0x", plain):
+            value = _float(int(plain, 16))
+        elif re.match(r"[+-]?\d", plain):
+            value = float(plain)
+        else:
+            value = _double(self._long(plain)) if double else _float(self._register(plain))
+        value = abs(value) if absolute else value
+        return -value if negative else value
+
+    def _double_real(self, operand: str) -> float:
+        return self._real(operand, double=True)
+
+    def _predicate(self, operand: str) -> bool:
+        return not self._predicate(operand[1:]) if operand.startswith("!") else self.predicates[operand]
+
+    def _put(self, register: str, value: int) -> None:
+        plain = register.split(".", maxsplit=1)[0]
+        if plain not in ("RZ", "URZ"):
+            self.registers[plain] = value & LOW
+
+    def _put_long(self, register: str, value: int) -> None:
+        plain = register.split(".", maxsplit=1)[0]
+        if plain not in ("RZ", "URZ"):
+            kind, number = re.fullmatch(r"(U?R)(\d+)", plain).groups()  # type: ignore[union-attr]
+            self.registers[plain], self.registers[f"{kind}{int(number) + 1}"] = value & LOW, value >> 32 & LOW
+
+    def _set(self, predicate: str, value: object) -> None:
+        if predicate not in ("PT", "UPT"):
+            self.predicates[predicate] = bool(value)
+
+    def _address(self, operand: str) -> int:
+        found = re.search(r"\[([^\[\]]*)\]$", operand)
+        assert found, operand
+        address = 0
+        for part in (p.strip() for p in found[1].split("+")):
+            if re.match(r"-?0x", part):
+                address += int(part, 16)
+            elif part.endswith(".64") or (part.startswith("UR") and "desc" in operand):
+                address += self._long(part.replace(".64", ""))
+            elif scaled := re.search(r"\.X(\d+)$", part):
+                address += self._register(part) * int(scaled[1])
+            else:
+                address += _signed(self._register(part))
+        return address & ALL
+
+    @staticmethod
+    def _predicate_first(operands: list[str]) -> str | None:
+        """Take a predicate that stands before the operands away from them; None if there is none."""
+        return operands.pop(0) if PREDICATE.match(operands[0]) else None
+
+    # moves
+
+    def _do_s2r(self, m: set[str], o: list[str], i: Instruction) -> None:
+        which = {"SR_TID.X": self.thread, "SR_CTAID.X": self.block, "SR_LANEID": self.thread % 32}
+        self._put(o[0], which.get(o[1], 0))
+
+    def _do_cs2r(self, m: set[str], o: list[str], i: Instruction) -> None:
+        (self._put if "32" in m else self._put_long)(o[0], 0)
+
+    def _do_ldc(self, m: set[str], o: list[str], i: Instruction) -> None:
+        size = 8 if "64" in m else 1 if m & {"U8", "S8"} else 2 if m & {"U16", "S16"} else 4
+        (self._put_long if size == 8 else self._put)(o[0], self._constant(o[1], size))
+
+    def _do_mov(self, m: set[str], o: list[str], i: Instruction) -> None:
+        self._put(o[0], self._int(o[-1]))
+
+    def _do_r2ur(self, m: set[str], o: list[str], i: Instruction) -> None:
+        self._put(o[0], self._int(o[1]))
+
+    def _do_sel(self, m: set[str], o: list[str], i: Instruction) -> None:
+        self._put(o[0], self._int(o[1] if self._predicate(o[3]) else o[2]))
+
+    def _do_fsel(self, m: set[str], o: list[str], i: Instruction) -> None:
+        chosen = o[1] if self._predicate(o[3]) else o[2]
+        halves = {"+QNAN": 0x7FF00000, "-QNAN": 0xFFF00000, "QNAN": 0x7FF00000}  # upper halves of infinite doubles are shown so
+        negative, _, absolute, plain = self._signs(chosen)
+        if chosen in halves:
+            bits = halves[chosen]
+        elif plain.startswith("R"):
+            bits = self._register(plain) & (0x7FFFFFFF if absolute else LOW) ^ (0x80000000 if negative else 0)
+        else:
+            bits = _bits(self._real(chosen))
+        self._put(o[0], bits)
+
+    def _do_prmt(self, m: set[str], o: list[str], i: Instruction) -> None:
+        both, chosen, value = self._int(o[3]) << 32 | self._int(o[1]), self._int(o[2]), 0
+        for k in range(4):
+            which = chosen >> 4 * k & 15
+            byte = both >> 8 * (which & 7) & 255
+            value |= ((255 if byte & 128 else 0) if which & 8 else byte) << 8 * k
+        self._put(o[0], value)
+
+    def _do_p2r(self, m: set[str], o: list[str], i: Instruction) -> None:
+        mask = self._int(o[3])
+        value = sum(self.predicates[f"P{n}"] << n for n in range(7))
+        self._put(o[0], self._int(o[2]) & ~mask | value & mask)
+
+    def _do_r2p(self, m: set[str], o: list[str], i: Instruction) -> None:
+        value, mask = self._int(o[1]) >> (8 * int(o[1][-1]) if ".B" in o[1] else 0), self._int(o[2])
+        for n in range(7):
+            if mask >> n & 1:
+                self.predicates[f"P{n}"] = bool(value >> n & 1)
+
+    def _do_shfl(self, m: set[str], o: list[str], i: Instruction) -> None:
+        self._set(o[0], True)
+        self._put(o[1], self._int(o[2]))
+
+    def _do_redux(self, m: set[str], o: list[str], i: Instruction) -> None:
+        self._put(o[0], self._int(o[1]))
+
+    def _do_vote(self, m: set[str], o: list[str], i: Instruction) -> None:
+        for operand in o:
+            if re.match(r"U?R\d", operand):
+                self._put(operand, 1)
+
+    # whole numbers
+
+    def _do_iadd3(self, m: set[str], o: list[str], i: Instruction) -> None:
+        carries, rest = [], o[1:]
+        while PREDICATE.match(rest[0]):
+            carries.append(rest.pop(0))
+        total = sum(self._predicate(p) for p in rest[3:]) if "X" in m else 0
+        for operand in rest[:3]:  # a negated one is inverted and one more, so that the carry is that of the sum
+            negated = operand.startswith("-") and not operand.startswith("-0x")
+            total += (~self._int(operand[1:]) & LOW) + 1 if negated else self._int(operand)
+        for n, predicate in enumerate(carries[:2], 1):
+            self._set(predicate, total >> 32 >= n)
+        self._put(o[0], total)
+
+    def _do_viadd(self, m: set[str], o: list[str], i: Instruction) -> None:
+        self._put(o[0], self._int(o[1]) + self._int(o[2]))
+
+    def _do_imad(self, m: set[str], o: list[str], i: Instruction) -> None:
+        rest = o[1:]
+        carry_out = self._predicate_first(rest)
+        if "MOV" in m:
+            self._put(o[0], self._int(rest[2]))
+            return
+        if "SHL" in m or "IADD" in m or not m & {"WIDE", "HI"}:
+            carry = self._predicate(rest[3]) if "X" in m and len(rest) > 3 else 0
+            self._put(o[0], self._int(rest[0]) * self._int(rest[1]) + self._int(rest[2]) + carry)
+            return
+        a, b = self._int(rest[0]), self._int(rest[1])
+        a, b = (a, b) if "U32" in m else (_signed(a), _signed(b))
+        value = (a * b & ALL) + self._long(rest[2]) + (self._predicate(rest[3]) if "X" in m and len(rest) > 3 else 0)
+        if carry_out:
+            self._set(carry_out, value >> 64)
+        if "WIDE" in m:
+            self._put_long(o[0], value)
+        else:
+            self._put(o[0], value >> 32)
+
+    def _do_lea(self, m: set[str], o: list[str], i: Instruction) -> None:
+        rest = o[1:]
+        carry_out = self._predicate_first(rest)
+        if "HI" in m:
+            low, added = self._int(rest[0]), self._int(rest[1])
+            if "SX32" in m:
+                high, shift, carry = (LOW if low >> 31 else 0), self._int(rest[2]), rest[3:]
+            else:
+                high, shift, carry = self._int(rest[2]), self._int(rest[3]), rest[4:]
+            value = (((high << 32 | low) << shift) >> 32 & LOW) + added + (self._predicate(carry[0]) if "X" in m and carry else 0)
+        else:
+            value = (self._int(rest[0]) << self._int(rest[2]) & LOW) + self._int(rest[1])
+        if carry_out:
+            self._set(carry_out, value >> 32)
+        self._put(o[0], value)
+
+    def _do_shf(self, m: set[str], o: list[str], i: Instruction) -> None:
+        low, shift, high = self._int(o[1]), self._int(o[2]), self._int(o[3])
+        shift = shift & 63 if m & {"U64", "S64"} else shift & 31 if "W" in m else min(shift, 32)
+        both = high << 32 | low
+        if "L" in m:
+            value = (both << shift) >> 32 if "HI" in m else low << shift
+        elif "HI" in m and m & {"S32", "U32"}:
+            value = (_signed(high) if "S32" in m else high) >> shift
+        else:
+            value = (_signed(both, 64) if "S64" in m else both) >> shift
+            value = value >> 32 if "HI" in m else value
+        self._put(o[0], value)
+
+    def _do_shl(self, m: set[str], o: list[str], i: Instruction) -> None:
+        self._put(o[0], self._int(o[1]) << self._int(o[2]))
+
+    def _do_lop3(self, m: set[str], o: list[str], i: Instruction) -> None:
+        rest = o[:]
+        predicate = self._predicate_first(rest)
+        a, b, c, table = (self._int(operand) for operand in rest[1:5])
+        value = 0
+        for bit in range(8):
+            if table >> bit & 1:
+                value |= (a if bit & 4 else ~a) & (b if bit & 2 else ~b) & (c if bit & 1 else ~c)
+        if predicate:
+            self._set(predicate, value & LOW)
+        self._put(rest[0], value)
+
+    def _do_plop3(self, m: set[str], o: list[str], i: Instruction) -> None:
+        place = self._predicate(o[2]) << 2 | self._predicate(o[3]) << 1 | self._predicate(o[4])
+        self._set(o[0], self._int(o[5]) >> place & 1)
+        self._set(o[1], self._int(o[6]) >> place & 1 if len(o) > 6 else 0)
+
+    def _do_isetp(self, m: set[str], o: list[str], i: Instruction) -> None:
+        kind = i.modifiers[0]
+        a, b = self._int(o[2]), self._int(o[3])
+        a, b = (a, b) if "U32" in m else (_signed(a), _signed(b))
+        result = COMPARED[kind](a, b)
+        if "EX" in m:  # the upper halves of two numbers; the predicate is of the lower ones
+            low = self._predicate(o[5])
+            result = low if a == b and kind != "NE" else (result or low) if kind == "NE" else result
+        self._set_both(m, o, result)
+
+    def _set_both(self, m: set[str], o: list[str], result: bool) -> None:
+        other = self._predicate(o[4])
+        for predicate, value in ((o[0], result), (o[1], not result)):
+            self._set(predicate, (value and other) if "AND" in m else (value or other) if "OR" in m else value != other)
+
+    def _do_vimnmx(self, m: set[str], o: list[str], i: Instruction) -> None:
+        self._least_or_most(m, self._int(o[1]), self._int(o[2]), o)
+
+    def _do_viaddmnmx(self, m: set[str], o: list[str], i: Instruction) -> None:
+        self._least_or_most(m, (self._int(o[1]) + self._int(o[2])) & LOW, self._int(o[3]), o)
+
+    def _least_or_most(self, m: set[str], a: int, b: int, o: list[str]) -> None:
+        a, b = (a, b) if "U32" in m else (_signed(a), _signed(b))
+        value = min(a, b) if self._predicate(o[-1]) else max(a, b)
+        self._put(o[0], max(value, 0) if "RELU" in m else value)
+
+    def _do_iabs(self, m: set[str], o: list[str], i: Instruction) -> None:
+        self._put(o[0], abs(_signed(self._int(o[1]))))
+
+    def _do_popc(self, m: set[str], o: list[str], i: Instruction) -> None:
+        self._put(o[0], self._int(o[1]).bit_count())
+
+    # real numbers
+
+    def _do_hfma2(self, m: set[str], o: list[str], i: Instruction) -> None:  # used to load two halves
+        if o[1] != "-RZ":
+            raise NotImplementedError(i.text)
+        self._put(o[0], _half_bits(self._real(o[3])) << 16 | _half_bits(self._real(o[4])))
+
+    def _do_fadd(self, m: set[str], o: list[str], i: Instruction) -> None:
+        self._put(o[0], _bits(self._real(o[1]) + self._real(o[2])))
+
+    def _do_fmul(self, m: set[str], o: list[str], i: Instruction) -> None:
+        self._put(o[0], _bits(self._real(o[1]) * self._real(o[2])))
+
+    def _do_ffma(self, m: set[str], o: list[str], i: Instruction) -> None:
+        self._put(o[0], _bits(self._real(o[1]) * self._real(o[2]) + self._real(o[3])))
+
+    def _do_fmnmx(self, m: set[str], o: list[str], i: Instruction) -> None:
+        a, b = self._real(o[1]), self._real(o[2])
+        self._put(o[0], _bits(min(a, b) if self._predicate(o[3]) else max(a, b)))
+
+    def _do_dadd(self, m: set[str], o: list[str], i: Instruction) -> None:
+        self._put_long(o[0], _long_bits(self._double_real(o[1]) + self._double_real(o[2])))
+
+    def _do_dmul(self, m: set[str], o: list[str], i: Instruction) -> None:
+        self._put_long(o[0], _long_bits(np.float64(self._double_real(o[1])) * self._double_real(o[2])))
+
+    def _do_dfma(self, m: set[str], o: list[str], i: Instruction) -> None:  # rounded twice
+        self._put_long(o[0], _long_bits(np.float64(self._double_real(o[1])) * self._double_real(o[2]) + self._double_real(o[3])))
+
+    def _do_dmnmx(self, m: set[str], o: list[str], i: Instruction) -> None:
+        a, b = self._double_real(o[1]), self._double_real(o[2])
+        self._put_long(o[0], _long_bits(min(a, b) if self._predicate(o[3]) else max(a, b)))
+
+    def _do_fsetp(self, m: set[str], o: list[str], i: Instruction) -> None:
+        self._set_both(m, o, COMPARED[i.modifiers[0]](self._real(o[2]), self._real(o[3])))
+
+    def _do_dsetp(self, m: set[str], o: list[str], i: Instruction) -> None:
+        self._set_both(m, o, COMPARED[i.modifiers[0]](self._double_real(o[2]), self._double_real(o[3])))
+
+    def _do_fchk(self, m: set[str], o: list[str], i: Instruction) -> None:
+        """Set a predicate where a quotient needs more than the usual instructions."""
+        a, b = (_bits(self._real(operand)) >> 23 & 255 for operand in o[1:3])
+        usual = self._real(o[1]) == 0 or (1 < b < 252 and 24 < a < 255 and -126 < a - b < 127)
+        self._set(o[0], not usual)
+
+    def _do_mufu(self, m: set[str], o: list[str], i: Instruction) -> None:
+        if "RCP64H" in m:
+            high = self._int(o[1])
+            self._put(o[0], _long_bits(1 / _double(high << 32) if high & 0x7FFFFFFF else math.inf) >> 32)
+            return
+        value = np.float64(self._real(o[1]))
+        of: dict[str, Callable[[Any], Any]] = {
+            "RCP": lambda v: 1 / v,
+            "RSQ": lambda v: 1 / np.sqrt(v),
+            "SQRT": np.sqrt,
+            "EX2": np.exp2,
+            "LG2": np.log2,
+        }
+        self._put(o[0], _bits(of[i.modifiers[0]](value)))
+
+    def _do_f2f(self, m: set[str], o: list[str], i: Instruction) -> None:
+        if i.modifiers[-2:] == ("F32", "F64"):
+            self._put(o[0], _bits(self._double_real(o[1])))
+        elif i.modifiers[-2:] == ("F64", "F32"):
+            self._put_long(o[0], _long_bits(self._real(o[1])))
+        else:
+            raise NotImplementedError(i.text)
+
+    def _do_i2fp(self, m: set[str], o: list[str], i: Instruction) -> None:
+        value = self._int(o[1])
+        self._put(o[0], _bits(value if "U32" in m else _signed(value)))
+
+    def _do_i2f(self, m: set[str], o: list[str], i: Instruction) -> None:
+        part = o[1].split(".")[1] if "." in o[1] and o[1].startswith("R") else ""
+        if m & {"U64", "S64"}:
+            value = self._long(o[1]) if "U64" in m else _signed(self._long(o[1]), 64)
+        else:
+            value = self._int(o[1].split(".")[0] if part else o[1])
+            value = value >> 8 * int(part[1]) & 255 if part.startswith("B") else value
+            value = value & 255 if "U8" in m else value & 65535 if "U16" in m else value if "U32" in m else _signed(value)
+        if "F64" in m:
+            self._put_long(o[0], _long_bits(value))
+            return
+        rounded = np.float32(value)
+        if "RP" in m and float(rounded) < value:
+            rounded = np.nextafter(rounded, np.float32(np.inf))
+        self._put(o[0], _bits(float(rounded)))
+
+    def _do_f2i(self, m: set[str], o: list[str], i: Instruction) -> None:
+        real = self._double_real(o[1]) if "F64" in m else self._real(o[1])
+        value = 0 if real != real else int(max(min(real, 2.0**64), -(2.0**63)))
+        if m & {"U64", "S64"}:
+            self._put_long(o[0], max(0, min(value, ALL)) if "U64" in m else value & ALL)
+        else:
+            self._put(o[0], min(max(value, 0), LOW) if "U32" in m else max(min(value, (1 << 31) - 1), -(1 << 31)))
+
+    def _do_f2fp(self, m: set[str], o: list[str], i: Instruction) -> None:
+        self._put(o[0], _half_bits(self._real(o[1])) << 16 | _half_bits(self._real(o[2])))
+
+    # memory
+
+    @staticmethod
+    def _size(m: set[str]) -> int:
+        return 16 if "128" in m else 8 if "64" in m else 1 if m & {"U8", "S8"} else 2 if m & {"U16", "S16"} else 4
+
+    def _do_load(self, m: set[str], o: list[str], i: Instruction) -> None:
+        address, size = self._address(next(operand for operand in o[1:] if "[" in operand)), self._size(m)
+        if i.name in ("LDS", "LDL"):
+            own = self.memory.shared if i.name == "LDS" else self.local
+            data = bytes(own.get(address + k, 0) for k in range(size))
+        else:
+            data = self.memory.read(address, size)
+            self.accesses.append((self.at, self.count[self.at], address, size, True))
+        value = int.from_bytes(data, "little")
+        if size < 4:
+            self._put(o[0], _signed(value, 8 * size) if m & {"S8", "S16"} else value)
+        elif (register := o[0].split(".")[0]) != "RZ":
+            for k in range(0, size, 4):
+                self.registers[f"R{int(register[1:]) + k // 4}"] = value >> 8 * k & LOW
+
+    def _do_store(self, m: set[str], o: list[str], i: Instruction) -> None:
+        address, size, register = self._address(next(operand for operand in o if "[" in operand)), self._size(m), o[-1].split(".")[0]
+        words = [0 if register == "RZ" else self.registers[f"R{int(register[1:]) + k}"] for k in range(max(size // 4, 1))]
+        data = b"".join(word.to_bytes(4, "little") for word in words)[:size]
+        if i.name in ("STS", "STL"):
+            (self.memory.shared if i.name == "STS" else self.local).update((address + k, byte) for k, byte in enumerate(data))
+        else:
+            self.memory.write(address, data)
+            self.accesses.append((self.at, self.count[self.at], address, size, False))
+
+
+ALIASES = {
+    "S2UR": "S2R", "LDG": "load", "LD": "load", "LDS": "load", "LDL": "load", "STG": "store", "ST": "store", "STS": "store",
+    "STL": "store", "IMNMX": "VIMNMX", "IMOV": "MOV",
+}  # fmt: skip
+
+
+def constants_of(parameters: bytes, block: int, blocks: int) -> bytes:
+    """Return a kernel's constant memory: the size of a block, the number of blocks, and the parameters."""
+    return struct.pack("<6I", block, 1, 1, blocks, 1, 1).ljust(PARAMETERS, b"\0") + parameters
