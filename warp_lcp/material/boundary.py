@@ -19,6 +19,7 @@ from warp_lcp.grid.motion import Motions, boxes_of, kinks
 from warp_lcp.grid.sides import PeriodicSides, continue_beyond, with_periodic
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.grid.thin_walls import ThinWalls
 from warp_lcp.grid.voxelize import VoxelSolids
 from warp_lcp.material import boundary_kernels as kernels
 from warp_lcp.material.wall import Join, extend_velocity, extend_velocity_cut
@@ -42,9 +43,11 @@ class Boundary(Protocol):
         capacity: float32 share of a cell's quadratic kernel that is open.
         distance: float32 distance to the solids at the cells' low corners [cells]; None: whole cells, no distance.
         kinks: times [s] at which the velocity of a solid jumps.
+        thin: solids that particles meet as exact shapes; None: none is thin.
     """
 
     moves: bool  # whether a solid moves
+    thin: ThinWalls | None
     sides: PeriodicSides | None
     open_sides: int
     base: wp.array
@@ -126,6 +129,7 @@ class WholeCells:
     distance: wp.array | None = None
     kinks: tuple[float, ...] = ()
     moves = False
+    thin: ThinWalls | None = None
 
     def __init__(
         self, grid: StaggeredGrid, solids: VoxelSolids, wall_velocity: np.ndarray | None = None, *, open_sides: int,
@@ -226,13 +230,16 @@ class CutBoundary:
         grid: the grid.
         cut: the solids, with their capacity.
         sides: of axes without an end, if there are any; `cut` has walls there.
+        thin: those of the solids that particles meet as exact shapes; None: none is thin.
 
     Raises:
         ValueError: solids differ at the two sides of an axis without an end.
     """
 
-    def __init__(self, grid: StaggeredGrid, cut: CutCells, *, sides: PeriodicSides | None = None) -> None:
-        self.grid, self.cut, self.moves, self.sides = grid, cut, cut.moves, sides
+    def __init__(
+        self, grid: StaggeredGrid, cut: CutCells, *, sides: PeriodicSides | None = None, thin: ThinWalls | None = None
+    ) -> None:  # fmt: skip
+        self.grid, self.cut, self.moves, self.sides, self.thin = grid, cut, cut.moves, sides, thin
         self.open_sides, self._endless = with_periodic(cut.open_sides, sides), sides.bits if sides is not None else 0
         self._time = 0.0
         self.base, self.open, self.capacity, self.distance = cut.base, cut.open, cut.capacity, cut.distance
@@ -286,7 +293,11 @@ class CutBoundary:
         self._dt.value = dt
         if self.moves:
             self.place(time)
+        if self.thin is not None:
+            self.thin.remember(position)
         self._advection.run(fields, position)
+        if self.thin is not None:
+            self.thin.stop(position, still=not self.moves)
         self._counts.changed()
 
     def _advect(self, fields: Faces, position: wp.array) -> None:
@@ -307,7 +318,11 @@ class CutBoundary:
 
     def displace(self, fields: Faces, position: wp.array) -> None:
         """Move particles by a displacement [m] among the solids at rest."""
+        if self.thin is not None:
+            self.thin.remember(position)
         self._displacement.run(fields, position)
+        if self.thin is not None:
+            self.thin.stop(position, still=True)
 
     def _displace(self, fields: Faces, position: wp.array) -> None:
         ways = {"open_sides": self.open_sides, "endless": self._endless}
@@ -318,6 +333,8 @@ class CutBoundary:
         if self.moves:
             self._time = time
             self.cut.place(time)
+            if self.thin is not None:
+                self.thin.place(time)
             self._join_sides()
             self.grid.part.fill(*self.placed())
 
@@ -346,7 +363,8 @@ class CutBoundary:
         between = planes[0] if self.grid.dimension == 2 else (1 - z) * planes[0] + z * planes[1]
         axes = slice(self.grid.dimension)
         side = np.minimum(coordinates - 1.0, np.array(self.grid.domain_counts) + 1.0 - coordinates)[:, axes].min(axis=1)
-        return np.asarray(np.minimum(between, side) >= MARGIN)
+        result = np.asarray(np.minimum(between, side) >= MARGIN)
+        return result if self.thin is None else result & self.thin.admits(points)
 
     def _join_sides(self) -> None:
         """Add to the capacity of cells what their kernels reach beyond sides that are the same; refuse solids that differ there."""

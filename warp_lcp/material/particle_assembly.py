@@ -11,12 +11,13 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.grid.cut_cells import CutCells
+from warp_lcp.grid.cut_cells import DEEP, CutCells
 from warp_lcp.grid.particles import Particles, seed
 from warp_lcp.grid.sides import PeriodicSides, open_sides_of, periodic_sides, side_bits
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.surface_mesh import Obstacles, SurfaceMesh
+from warp_lcp.grid.thin_walls import STRIDE_ROOM, THIN, ThinWalls, fills_cells, is_thin
 from warp_lcp.grid.voxelize import PlacedSolid, inside, placement_notes, voxelize
 from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
 from warp_lcp.material.coverage import Coverage
@@ -113,14 +114,35 @@ def make_boundary(
         if wall_velocity is not None:
             raise ValueError('wall_velocity: only for solids = "voxel"; with cut cells, give the solid a motion')
         cut = CutCells(grid, placed, wall_separating=separating, open_sides=sides, remarks=not covered)
-        if not cut.whole_cells or (covered and placed):  # solids may cut cells elsewhere
-            return CutBoundary(grid, cut, sides=around), cut.notes
+        thin = make_thin_walls(scene, grid, placed, sides)
+        if not cut.whole_cells or (covered and placed) or thin is not None:  # solids may cut cells elsewhere
+            return CutBoundary(grid, cut, sides=around, thin=thin), cut.notes
         shapes = [solid.geometry for solid in placed]
     ends = side_bits(periodic_sides(scene.endless))
     voxels = voxelize(grid, placed, wall_separating=separating, open_sides=sides | ends, remarks=not covered)
     if wall_velocity is None and scene.source:
         wall_velocity = np.zeros((1 + len(placed), 3))  # what a source's faces are given goes there
     return WholeCells(grid, voxels, wall_velocity, open_sides=sides, sides=around, shapes=shapes), voxels.notes
+
+
+def make_thin_walls(scene: ParticleScene, grid: StaggeredGrid, placed: Sequence[PlacedSolid], open_sides: int) -> ThinWalls | None:
+    """Return the solids that are too thin for the grid, which particles meet as exact shapes; None: there are none.
+
+    One that moves must be thicker than what it may go in a step.
+
+    Args:
+        scene: the scene.
+        grid: its grid.
+        placed: its solids.
+        open_sides: of `warp_lcp.grid.sides.side_bits`.
+    """
+    least = {False: THIN * grid.spacing, True: max(THIN, scene.time.cfl + STRIDE_ROOM) * grid.spacing}
+    thin = [
+        is_thin(solid.geometry, least[solid.motion is not None], grid.device)
+        and not (solid.motion is None and fills_cells(solid.geometry, grid, DEEP))
+        for solid in placed
+    ]
+    return ThinWalls(grid, placed, thin, open_sides) if any(thin) else None
 
 
 @dataclass(frozen=True)

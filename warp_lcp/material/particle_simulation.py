@@ -467,6 +467,8 @@ class ParticleSimulation(ParticleCheckpoints):
         if self.flights is not None:
             with self.watch.stage("bodies in flight", self.particles.position):
                 self.flights.end(self.particles, self.velocity)
+            if self.boundary.thin is not None:
+                self.boundary.thin.stop(self.particles.position, still=not self.boundary.moves)
 
     def met(self) -> tuple[int, int, int]:
         """Return how many of all particles met a wall, were pushed by a solid, and are stuck inside one when `carry` moved them."""
