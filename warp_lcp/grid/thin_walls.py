@@ -25,6 +25,7 @@ from warp_lcp.rows.program import copy
 
 THIN = 2.5  # cells: what is thinner is met as its exact shape
 STRIDE_ROOM = 0.5  # cells that a moving solid must be thicker than what it may go in a step
+SKIN = 1e-4  # cells by which shapes are larger than they are, so that there is no crack between those that touch
 THIN_SHARE = 1e-3  # of a mesh's surface that must be thin for that
 COST = 32  # of a particle, in cells of a usual pass
 Simple = Box | Sphere | Capsule | TriangleMesh
@@ -91,7 +92,7 @@ class ThinWalls:
             of += [(number, part) for part in parts_of(solid.geometry)]
         self._motions = Motions([motion for motion, _ in groups if motion is not None])
         self._moving = [place for place, (motion, _) in enumerate(groups) if motion is not None]
-        shapes = [_shape(number, part, grid.device) for _, of in groups for number, part in of]
+        shapes = [_shape(number, part, grid.device, SKIN * grid.spacing) for _, of in groups for number, part in of]
         self._geometries = [part for _, of in groups for _, part in of]  # whose meshes are on the device
         ends = np.cumsum([0, *(len(of) for _, of in groups)])
         self._groups = []
@@ -123,11 +124,29 @@ class ThinWalls:
             group.turn, group.shift = wp.mat33d(rotation), wp.vec3d(*translation)
         self.groups.assign(self._groups)
 
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the low and the high corner of a box around the solids where they are [m], shape (3,) each."""
+        lows, highs = [], []
+        for group in self._groups:
+            turn, shift = np.array(group.turn).reshape(3, 3), np.array(group.shift)
+            for geometry in self._geometries[group.first : group.end]:
+                box = geometry.bounds()
+                assert box is not None, "thin solids are bounded"
+                low, high = np.clip(box, -kernels.ENDLESS, kernels.ENDLESS)
+                middle, reach = 0.5 * (low + high), np.abs(turn) @ (0.5 * (high - low))
+                lows.append(turn @ middle + shift - reach)
+                highs.append(turn @ middle + shift + reach)
+        return np.min(lows, axis=0), np.max(highs, axis=0)
+
     def remember(self, position: wp.array) -> None:
         """Keep the places of particles [m], shape (n,), from which they are about to be moved."""
         if len(self._start) < len(position):
             self._start = wp.empty(len(position) + len(position) // 4, dtype=wp.vec3, device=self.grid.device)
         copy(self._start[: len(position)], position)
+
+    def start_of(self, position: wp.array) -> wp.array:
+        """Return where particles were when they were remembered [m], shape (n,)."""
+        return self._start[: len(position)]
 
     def stop(self, position: wp.array, *, still: bool) -> None:
         """Put particles that have passed a thin solid since `remember` back to its surface, and on along it.
@@ -136,7 +155,7 @@ class ThinWalls:
             position: [m], shape (n,) (updated).
             still: whether the solids have not moved since then.
         """
-        given = [self._start[: len(position)], position, self.shapes, self.groups, int(still), self._margin, self.grid.planes]
+        given = [self.start_of(position), position, self.shapes, self.groups, int(still), self._margin, self.grid.planes]
         launch_list(kernels.stop_kernel, len(position), [*given, self._low, self._high], device=self.grid.device, cost=COST)
 
     def admits(self, points: np.ndarray) -> np.ndarray:
@@ -167,22 +186,23 @@ def _alike(one: Motion | None, other: Motion | None) -> bool:
         return False
 
 
-def _shape(number: int, geometry: Geometry, device: wp.Device) -> Any:
-    """Return a shape as kernels take it."""
+def _shape(number: int, geometry: Geometry, device: wp.Device, skin: float) -> Any:
+    """Return a shape as kernels take it, larger by a `skin` [m]; a mesh as it is."""
     assert isinstance(geometry, Simple), "half spaces are not thin"
     result, place, bounds = kernels.ThinShape(), geometry.placement, geometry.bounds()
     assert bounds is not None, "an inverted shape is not thin"
     result.solid = number
     result.turn = wp.mat33d(place.rotation.T)
     result.shift = wp.vec3d(*(place.translation + place.scale * place.rotation @ geometry.origin()))
-    result.low, result.high = (wp.vec3d(*np.clip(corner, -kernels.ENDLESS, kernels.ENDLESS)) for corner in bounds)
+    low, high = np.clip([bounds[0] - skin, bounds[1] + skin], -kernels.ENDLESS, kernels.ENDLESS)
+    result.low, result.high = wp.vec3d(*low), wp.vec3d(*high)
     if isinstance(geometry, Box):
-        half = np.minimum(place.scale * geometry.half_extents(), kernels.ENDLESS)
+        half = np.minimum(place.scale * geometry.half_extents() + skin, kernels.ENDLESS)
         result.kind, result.half = kernels.BOX, wp.vec3d(*half)
     elif isinstance(geometry, Sphere):
-        result.kind, result.radius = kernels.SPHERE, place.scale * geometry.radius
+        result.kind, result.radius = kernels.SPHERE, place.scale * geometry.radius + skin
     elif isinstance(geometry, Capsule):
-        result.kind, result.radius = kernels.CAPSULE, place.scale * geometry.radius
+        result.kind, result.radius = kernels.CAPSULE, place.scale * geometry.radius + skin
         result.half = wp.vec3d(*(place.scale * geometry.axis()))
     else:
         result.kind, result.radius = kernels.MESH, place.scale * geometry.unit_length()

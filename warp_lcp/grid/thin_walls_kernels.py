@@ -13,6 +13,8 @@ MODULE = "warp_lcp.grid.thin_walls"
 BOX, SPHERE, CAPSULE, MESH = 0, 1, 2, 3
 SLIDES = 12  # walls that a particle slides along in a step, one after another
 ROUNDS = 8  # how often a path is looked at again among solids of different motions
+ROOM = 0.25  # of the distance that particles keep, that they have in corners at least
+HALVINGS = 6  # of a way into a corner, until there is that room
 MISS = 2.0  # a parameter of a path beyond its end
 ENDLESS = 1.0e30  # half extent [m] of a box without ends
 
@@ -241,6 +243,17 @@ def clear_of(shapes: SHAPES, first: int, end: int, p: wp.vec3d, margin: wp.float
 
 
 @wp.func
+def has_room(shapes: SHAPES, first: int, end: int, p: wp.vec3d, room: wp.float64):
+    """Return whether a point keeps a distance from some shapes."""
+    result = bool(True)
+    for s in range(first, end):
+        d, _n = away(shapes[s], p, room)
+        if d < room:
+            result = False
+    return result
+
+
+@wp.func
 def free_way(shapes: SHAPES, first: int, end: int, start: wp.vec3d, aim: wp.vec3d, margin: wp.float64, planes: int):
     """Return where a particle ends that goes from `start` towards `aim` among shapes that rest, and whether one was in its way.
 
@@ -261,9 +274,14 @@ def free_way(shapes: SHAPES, first: int, end: int, start: wp.vec3d, aim: wp.vec3
                 met = True
                 p = x + t * way + margin * n
                 blocked, _n, _which = first_hit(shapes, first, end, x + t * way, p, which)
-                if blocked <= _ONE or wp.dot(n, n) < wp.float64(0.5):  # the corner of two walls that nearly meet
-                    length = wp.length(way)
-                    x = x + wp.max(t - margin / wp.max(length, _TINY), _ZERO) * way
+                room = wp.float64(ROOM) * margin
+                if blocked <= _ONE or not has_room(shapes, first, end, p, room) or wp.dot(n, n) < wp.float64(0.5):
+                    # the corner of two walls: as far as a place that rounding does not take into one of them
+                    s = wp.max(t - margin / wp.max(wp.length(way), _TINY), _ZERO)
+                    for _half in range(HALVINGS):
+                        if not has_room(shapes, first, end, x + s * way, room):
+                            s = wp.where(_half == HALVINGS - 1, _ZERO, wp.float64(0.5) * s)
+                    x = x + s * way
                     going = False
                 else:
                     rest = (_ONE - t) * way

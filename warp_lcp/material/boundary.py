@@ -13,6 +13,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.grid.advection import MARGIN, advect, advect_with_distance, clearance, push_out
+from warp_lcp.grid.barriers import Barriers
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.level_set import whole_cell_capacity
 from warp_lcp.grid.motion import Motions, boxes_of, kinks
@@ -231,15 +232,17 @@ class CutBoundary:
         cut: the solids, with their capacity.
         sides: of axes without an end, if there are any; `cut` has walls there.
         thin: those of the solids that particles meet as exact shapes; None: none is thin.
+        barriers: those of them that do not cut cells but hold apart what is on their two sides; None: there are none.
 
     Raises:
         ValueError: solids differ at the two sides of an axis without an end.
     """
 
     def __init__(
-        self, grid: StaggeredGrid, cut: CutCells, *, sides: PeriodicSides | None = None, thin: ThinWalls | None = None
+        self, grid: StaggeredGrid, cut: CutCells, *, sides: PeriodicSides | None = None, thin: ThinWalls | None = None,
+        barriers: Barriers | None = None,
     ) -> None:  # fmt: skip
-        self.grid, self.cut, self.moves, self.sides, self.thin = grid, cut, cut.moves, sides, thin
+        self.grid, self.cut, self.moves, self.sides, self.thin, self.barriers = grid, cut, cut.moves, sides, thin, barriers
         self.open_sides, self._endless = with_periodic(cut.open_sides, sides), sides.bits if sides is not None else 0
         self._time = 0.0
         self.base, self.open, self.capacity, self.distance = cut.base, cut.open, cut.capacity, cut.distance
@@ -261,6 +264,7 @@ class CutBoundary:
             cut.accompany(self._keep_distance, self._find_walls)
         self._find_walls()
         self._join_sides()
+        self._cross()
         grid.part.fill(*self.placed())
 
     def top_speed(self, time: float, span: float) -> float:
@@ -275,6 +279,8 @@ class CutBoundary:
         """Compute the velocity of the solids from `time` on [s]."""
         if self.moves:
             self.cut.set_velocity(time, dt)
+            if self.barriers is not None:
+                self.barriers.set_velocity()
 
     def extrapolate_velocity(
         self, window: Window, velocity: Faces, weights: Faces, known: Faces, kind: wp.array, contact: wp.array, layers: int,
@@ -297,6 +303,8 @@ class CutBoundary:
             self.thin.remember(position)
         self._advection.run(fields, position)
         if self.thin is not None:
+            if self.barriers is not None and not self._endless:
+                self.barriers.carry(fields, dt, self.thin.start_of(position), position)
             self.thin.stop(position, still=not self.moves)
         self._counts.changed()
 
@@ -322,6 +330,8 @@ class CutBoundary:
             self.thin.remember(position)
         self._displacement.run(fields, position)
         if self.thin is not None:
+            if self.barriers is not None and not self._endless:
+                self.barriers.carry(fields, 1.0, self.thin.start_of(position), position)
             self.thin.stop(position, still=True)
 
     def _displace(self, fields: Faces, position: wp.array) -> None:
@@ -336,6 +346,9 @@ class CutBoundary:
             if self.thin is not None:
                 self.thin.place(time)
             self._join_sides()
+            if self.barriers is not None:
+                self.barriers.place(time)
+            self._cross()
             self.grid.part.fill(*self.placed())
 
     def shapes(self) -> Sequence[Geometry]:
@@ -381,6 +394,12 @@ class CutBoundary:
     def _keep_distance(self) -> None:
         """Launch the copy of the distance before the solids move: particles may go where it is open before or after."""
         copy(self._reachable, self.cut.distance)
+
+    def _cross(self) -> None:
+        """Close the faces that barriers cross."""
+        if self.barriers is not None:
+            self.barriers.cross()
+            self._find_walls()
 
     def _find_walls(self) -> None:
         walls = (*self.cut.wall, *self.cut.wall[1:2])[:3]  # in 2-D nothing is asked of the third
