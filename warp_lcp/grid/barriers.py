@@ -9,28 +9,37 @@ it sees.
 Far from these solids everything is as without them, and costs a byte a cell.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
+from typing import no_type_check
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.grid import barriers_kernels as kernels
 from warp_lcp.grid.barriers_kernels import CENTERS
-from warp_lcp.grid.cell_kernel import launch_list
+from warp_lcp.grid.cell_kernel import POINTS, launch_list, list_kernel
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.particle_loops import MARGIN
 from warp_lcp.grid.staggered import StaggeredGrid, Window, three_components
 from warp_lcp.grid.thin_walls import ThinWalls
 from warp_lcp.operators.grid_poisson import FLUID
-from warp_lcp.rows.memory import Scalar
+from warp_lcp.rows.program import copy
 
 BARRIER = {2: 1.5, 3: 1.75}  # cells: corners of cells lie close enough in what is thicker, at any angle, to close its faces
 PARTS = {2: 6, 3: 3}  # points of a cell an axis, for the share of its kernel that its center sees
 PARTS_MOVING = {2: 4, 3: 2}  # the same, at each step
 COST = 256  # of a particle, in cells of a usual pass
 Faces = Sequence[wp.array]
+
+
+@list_kernel("warp_lcp.grid.barriers_bring")
+@no_type_check
+def bring_kernel(i, start: POINTS, aim: POINTS, position: POINTS):
+    """Bring a particle to its aim, if it has one that is not its start."""
+    a = aim[i]
+    s = start[i]
+    if a[0] != s[0] or a[1] != s[1] or a[2] != s[2]:
+        position[i] = a
 
 
 class Barriers:
@@ -65,7 +74,7 @@ class Barriers:
         self._low, self._high = wp.vec3(margin, margin, margin), wp.vec3(*(grid.extent - margin))
         self.calm = grid.field(wp.int8)
         self._window: Window | None = None
-        self._dt = Scalar()
+        self._aim = wp.empty(0, dtype=wp.vec3, device=grid.device)
         self._place()
 
     def place(self, time: float) -> None:
@@ -164,17 +173,29 @@ class Barriers:
         """Add up particles again in cells near the solids, `each` of them."""
         window.launch(kernels.density_kernel, [self._barrier, each, offsets, position, density])
 
-    def carry(self, velocity: Faces, dt: float, start: wp.array, position: wp.array) -> None:
-        """Move particles near the solids by what they see of the velocity.
+    def carry(self, velocity: Faces, dt: float, start: wp.array) -> None:
+        """Find where particles near the solids go by what they see of the velocity, before the solids move.
 
         Args:
             velocity: of each component on the faces [m/s].
             dt: time step [s].
-            start: where they were [m].
-            position: where they come to [m] (updated).
+            start: where they are [m], shape (n,).
         """
-        given = [self._barrier, self.cut.distance, *three_components(velocity), dt, self._low, self._high, start, position]
-        launch_list(kernels.carry_kernel, len(position), given, device=self.grid.device, cost=COST)
+        if len(self._aim) < len(start):
+            self._aim = wp.empty(len(start) + len(start) // 4, dtype=wp.vec3, device=self.grid.device)
+        aim = self._aim[: len(start)]
+        copy(aim, start)
+        given = [self._barrier, self.cut.distance, *three_components(velocity), dt, self._low, self._high, start, aim]
+        launch_list(kernels.carry_kernel, len(start), given, device=self.grid.device, cost=COST)
+
+    def bring(self, start: wp.array, position: wp.array) -> None:
+        """Bring particles to where `carry` has found.
+
+        Args:
+            start: as there.
+            position: where others come to [m], shape (n,) (updated).
+        """
+        launch_list(bring_kernel, len(position), [start, self._aim[: len(position)], position], device=self.grid.device)
 
     def constrain(self, window: Window, velocity: Faces, known: Faces, kind: wp.array, contact: wp.array, released: int) -> None:
         """Let crossed faces keep what of a velocity does not go through the wall that they are beside.

@@ -297,16 +297,26 @@ class CutBoundary:
     def advect(self, fields: Faces, dt: float, time: float, position: wp.array) -> None:
         """Advect particles, then move the solids to `time`."""
         self._dt.value = dt
+        self._look_around(fields, dt, position)
         if self.moves:
             self.place(time)
+        self._advection.run(fields, position)
+        self._stop_at_thin_walls(position, still=not self.moves)
+        self._counts.changed()
+
+    def _look_around(self, fields: Faces, dt: float, position: wp.array) -> None:
+        """Find where particles go by what they see of the velocity among thin solids, before those move."""
         if self.thin is not None:
             self.thin.remember(position)
-        self._advection.run(fields, position)
+            if self.barriers is not None and not self._endless:
+                self.barriers.carry(fields, dt, self.thin.start_of(position))
+
+    def _stop_at_thin_walls(self, position: wp.array, *, still: bool) -> None:
+        """Have particles go where that was, and stop them at thin solids, which have moved unless `still`."""
         if self.thin is not None:
             if self.barriers is not None and not self._endless:
-                self.barriers.carry(fields, dt, self.thin.start_of(position), position)
-            self.thin.stop(position, still=not self.moves)
-        self._counts.changed()
+                self.barriers.bring(self.thin.start_of(position), position)
+            self.thin.stop(position, still=still)
 
     def _advect(self, fields: Faces, position: wp.array) -> None:
         """Move the particles where the solids are or have been, then out of the solids."""
@@ -326,13 +336,9 @@ class CutBoundary:
 
     def displace(self, fields: Faces, position: wp.array) -> None:
         """Move particles by a displacement [m] among the solids at rest."""
-        if self.thin is not None:
-            self.thin.remember(position)
+        self._look_around(fields, 1.0, position)
         self._displacement.run(fields, position)
-        if self.thin is not None:
-            if self.barriers is not None and not self._endless:
-                self.barriers.carry(fields, 1.0, self.thin.start_of(position), position)
-            self.thin.stop(position, still=True)
+        self._stop_at_thin_walls(position, still=True)
 
     def _displace(self, fields: Faces, position: wp.array) -> None:
         ways = {"open_sides": self.open_sides, "endless": self._endless}
