@@ -38,6 +38,11 @@ def walls_of(grid: StaggeredGrid, boundary: Boundary) -> Any:
         S.distance = cut.distance
         if cut.moves:
             S.moving = cut.moving
+        if (barriers := boundary.barriers) is not None:
+            for axis, number, below, above in zip("xyz", barriers.number, barriers.below, barriers.above, strict=False):
+                setattr(S, f"number_{axis}", number)
+                setattr(S, f"below_{axis}", below)
+                setattr(S, f"above_{axis}", above)
     else:
         assert isinstance(boundary, WholeCells)
         S.index = boundary.solids.index

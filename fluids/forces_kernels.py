@@ -3,7 +3,7 @@
 
 import warp as wp
 
-from warp_lcp.fluids.wall_kernels import Walls, closed_on, face_center, put, standing_of, wall_way
+from warp_lcp.fluids.wall_kernels import Walls, closed_on, crossing_on, face_center, put, reach_across, standing_of, wall_way
 from warp_lcp.grid.cell_kernel import F32, F64, INTS, U8, cell_kernel
 
 
@@ -51,6 +51,12 @@ def pressure_kernel(
                             more = wp.where(bodies[solid] != wp.uint8(0), 0.0, rise)
                             if S.index or solid == 0:
                                 more = 0.5 * float(side) * stopped
+                            if S.number_x:
+                                share *= reach_across(S, axis, k, j, i)
+                                crossed, below, above = crossing_on(S, axis, c, b, a)
+                                if crossed > 0:  # at rest's gradient to where the solid is
+                                    gap = wp.where(high == 1, below, above)
+                                    more = float(side) * gap * wp.vec3(kick_x, kick_y, kick_z)[axis]
                             force = wp.vec3d()
                             force[axis] = scale * (x[k, j, i] + wp.float64(more)) * wp.float64(share) * wp.float64(side)
                             put(e, solid, force, face_center(S, axis, c, b, a) - references[solid], owners, values)

@@ -113,7 +113,7 @@ class WholeCellSurface:
     def complete(self, window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], known: Sequence[wp.array]) -> None:
         """Set u* on faces of sliver cells that hold no particle."""
         if self._level_set is not None:
-            complete(window, velocity, weights, known)
+            complete(window, velocity, weights, known, barriers=self.grid.barriers)
 
     def measure(self) -> None:
         """Do nothing: the volume is the number of cells."""
@@ -132,6 +132,7 @@ class NoSurface:
         """Find the cells, and the volume of this process's."""
         kind = boundary.base.numpy().copy()
         kind[kind == wl.AIR] = wl.FLUID
+        self.grid = grid
         self._kind = wp.array(kind, dtype=wp.int8, device=grid.device)
         owned = grid.part.owned
         cells = tuple(slice(low - 1, high - 1) for low, high in zip(owned.low, owned.high, strict=True))
@@ -147,7 +148,7 @@ class NoSurface:
 
     def complete(self, window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], known: Sequence[wp.array]) -> None:
         """Set u* on faces between particles."""
-        complete(window, velocity, weights, known)
+        complete(window, velocity, weights, known, barriers=self.grid.barriers)
 
     def measure(self) -> None:
         """Do nothing: the volume is constant."""
@@ -190,7 +191,7 @@ class GhostFluidSurface:
 
     def complete(self, window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], known: Sequence[wp.array]) -> None:
         """Set u* on FLUID faces between particles."""
-        complete(window, velocity, weights, known)
+        complete(window, velocity, weights, known, barriers=self.grid.barriers)
 
     def measure(self) -> None:
         """Compute the volume inside the surface."""

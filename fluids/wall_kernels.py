@@ -23,6 +23,15 @@ class Walls:
     wall_x: I16
     wall_y: I16
     wall_z: I16
+    number_x: I16  # of thin solids that cross faces, with barriers, see `warp_lcp.grid.barriers`
+    number_y: I16
+    number_z: I16
+    below_x: F32  # and how far they are from the centers of the cells below and above a face [cells]
+    below_y: F32
+    below_z: F32
+    above_x: F32
+    above_y: F32
+    above_z: F32
 
 
 @wp.func
@@ -37,6 +46,36 @@ def fields_on(S: Walls, axis: int, k: int, j: int, i: int):
         free = S.open_z[k, j, i]
         wall = S.wall_z[k, j, i]
     return free, int(wall)
+
+
+@wp.func
+def crossing_on(S: Walls, axis: int, k: int, j: int, i: int):
+    """Return the thin solid that crosses a face, 0 if none does, and its distance from the cells below and above [cells]."""
+    number = S.number_x[k, j, i]
+    below = S.below_x[k, j, i]
+    above = S.above_x[k, j, i]
+    if axis == 1:
+        number = S.number_y[k, j, i]
+        below = S.below_y[k, j, i]
+        above = S.above_y[k, j, i]
+    if axis == 2:
+        number = S.number_z[k, j, i]
+        below = S.below_z[k, j, i]
+        above = S.above_z[k, j, i]
+    return int(number), below, above
+
+
+@wp.func
+def reach_across(S: Walls, axis: int, k: int, j: int, i: int):
+    """Return the area of a cell's side of thin solids, across an axis, in faces: what they cut off another cell is its."""
+    area = float(1.0)
+    for d in range(S.planes + 1):
+        if d != axis:
+            crossed, _below, above = crossing_on(S, d, k, j, i)
+            length = wp.where(crossed > 0, above, 0.5)
+            crossed, below, _above = crossing_on(S, d, k + wp.where(d == 2, 1, 0), j + wp.where(d == 1, 1, 0), i + wp.where(d == 0, 1, 0))
+            area *= length + wp.where(crossed > 0, below, 0.5)
+    return area
 
 
 @wp.func

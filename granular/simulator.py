@@ -140,7 +140,8 @@ class SandSimulation(ParticleSimulation):
     def _launch_completion(self, window: Window) -> None:
         if self.sides is not None:
             self.sides.average(self.velocity, self.weights, self._saved or ())
-        complete(window, self.velocity, self.weights, self.outcome.known, self._layer_filled())  # faces have mass farther out than weight
+        # faces have mass farther out than weight
+        complete(window, self.velocity, self.weights, self.outcome.known, self._layer_filled(), barriers=self.grid.barriers)
 
     def carry(self, dt: float) -> None:
         """Move particles and solids by dt [s]."""

@@ -183,6 +183,8 @@ class SandSolids:
         if starts:
             self._covered = found.covered
         wp.copy(self.index, found.index)
+        if grid.barriers is not None:
+            grid.barriers.enter(self.index)
         if self._boundary.sides is not None:
             self._boundary.sides.wrap(self.index)
         grid.part.fill(self.index)
@@ -199,10 +201,11 @@ class SandSolids:
     def _thin_notes(self) -> tuple[str, ...]:
         """Return a warning for each solid that stands still and that no stress feels."""
         covered = self.grid.part.ranks.sum(np.array([*self._covered, 0]))[:-1]  # cells' centers that each solid holds
+        held = self.grid.barriers.walls.numbers if self.grid.barriers is not None else ()
         return tuple(
             f"{solid.name} contains no center of a cell of {self.grid.spacing:.4g} m: it supports no sand, and particles may pass through"
-            for solid, cells in zip(self._placed, covered.tolist(), strict=True)
-            if self.cut is None and not cells and solid.motion is None
+            for number, (solid, cells) in enumerate(zip(self._placed, covered.tolist(), strict=True), start=1)
+            if self.cut is None and not cells and solid.motion is None and number not in held
         )
 
     def _whole_note(self, cuts: bool) -> str:

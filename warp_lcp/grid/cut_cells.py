@@ -6,7 +6,7 @@ second order for smooth walls; at a solid's edges, and where it or a gap is thin
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from itertools import groupby
 from operator import le, lt
 
@@ -45,6 +45,7 @@ class CutCells:
         wall_separating: whether liquid may leave the domain's wall.
         capacity: whether to keep the capacity.
         remarks: make notes of faces and refuse a grid without open cells; False: the grid is a part of a larger one.
+        left_out: numbers of solids that cut no cells; their velocities are kept.
         open_sides: of `warp_lcp.grid.sides.side_bits`: there the faces are open as far as no solid closes them, and the ring is air.
 
     Attributes:
@@ -72,9 +73,9 @@ class CutCells:
 
     def __init__(
         self, grid: StaggeredGrid, solids: Sequence[PlacedSolid], *, wall_separating: bool, capacity: bool = True, open_sides: int = 0,
-        remarks: bool = True,
+        remarks: bool = True, left_out: Collection[int] = (),
     ) -> None:  # fmt: skip
-        self.grid, self.solids, self.open_sides = grid, tuple(solids), open_sides
+        self.grid, self.solids, self.open_sides, self._left_out = grid, tuple(solids), open_sides, frozenset(left_out)
         self.moves = any(solid.motion is not None for solid in solids)
         self._differences: dict[int, float] = {}  # between the sides of each periodic axis that is cut [cells]
         self.names = ("domain", *(solid.name for solid in solids))
@@ -88,11 +89,11 @@ class CutCells:
         self._counts = wp.zeros(2, dtype=wp.int32, device=grid.device)
         self._turn, self._shift = (HostArray(1 + len(solids), of, grid.device) for of in (wp.mat33, wp.vec3))
         self.turn, self.shift = self._turn.array, self._shift.array
-        notes = start_notes(self.solids, grid)
+        notes = start_notes(self.solids, grid, self._left_out)
         self._sampler, self._nodes = NodeSampler(grid), NodeDistances(grid, second=len(solids) > 1)
         self.distance = self._nodes.near
         self.nearest = self._nodes.arrays[1:] if self.moves else []
-        standing = [(number, solid.geometry) for number, solid in enumerate(solids, start=1) if solid.motion is None]
+        standing = [(number, solid.geometry) for number, solid in self._cutting() if solid.motion is None]
         for number, geometry in standing:
             self._sampler.enter(self._nodes, number, geometry)
         self._marks = wp.array(_ring(grid, open_sides), dtype=wp.int8, device=grid.device)
@@ -108,7 +109,7 @@ class CutCells:
         next_to_each_other = len(moving) and self._moving[-1] - self._moving[0] == len(moving) - 1
         self._moves = slice(self._moving[0], self._moving[-1] + 1) if next_to_each_other else self._moving
         if self.moves:
-            self._runs = list(_runs(grid, [(number, solid.geometry) for number, solid in moving]))
+            self._runs = list(_runs(grid, [(number, solid.geometry) for number, solid in moving], self._left_out))
             self._standing = NodeDistances(grid, second=len(solids) > 1)
             self._standing.copy_from(self._nodes)
             self._flat = self._flat_cells(standing)
@@ -131,6 +132,10 @@ class CutCells:
         self.notes = (*notes, *(self._result_notes(dropped) if remarks else ()))
         if not self.moves:  # needed by `place` only
             del self._sampler, self._nodes, self._marks
+
+    def _cutting(self) -> Iterator[tuple[int, PlacedSolid]]:
+        """Yield the solids that cut cells, and their numbers."""
+        return ((number, solid) for number, solid in enumerate(self.solids, start=1) if number not in self._left_out)
 
     @property
     def dropped(self) -> int:
@@ -262,8 +267,8 @@ class CutCells:
 
     def _all_placed(self) -> list[Geometry]:
         """Return all solids where they are."""
-        standing = [solid.geometry for solid in self.solids if solid.motion is None]
-        return [*standing, *(self._placed(place) for place in range(len(self._moving)))]
+        standing = [solid.geometry for _, solid in self._cutting() if solid.motion is None]
+        return [*standing, *(self._placed(place) for place, number in enumerate(self._moving) if number not in self._left_out)]
 
     def _enter(self) -> None:
         """Enter the distances of the solids that move where they are.
@@ -362,7 +367,7 @@ class CutCells:
         closed = np.sum(counts, axis=0)[1:]
         notes = [
             f"{solid.name} closes no part of a face: it is too small for cells of {grid.spacing:.4g} m, or lies in other solids"
-            for number, solid in enumerate(self.solids, start=1)
+            for number, solid in self._cutting()
             if not closed[number] and solid.motion is None
         ]
         if dropped:
@@ -384,9 +389,12 @@ def _around(boxes: Sequence[NodeBox]) -> NodeBox | None:
     return (tuple(map(min, zip(*lows, strict=True))), tuple(map(max, zip(*highs, strict=True)))) if boxes else None
 
 
-def _runs(grid: StaggeredGrid, solids: Sequence[tuple[int, Geometry]]) -> Iterator[ShapeTable | PlacedMesh | int]:
+def _runs(
+    grid: StaggeredGrid, solids: Sequence[tuple[int, Geometry]], left_out: Collection[int]
+) -> Iterator[ShapeTable | PlacedMesh | int]:
     """Cut solids, in order, into tables of those next to each other that tables hold, on a GPU meshes, and the places of others."""
-    for held, of in groupby(range(len(solids)), key=lambda place: ShapeTable.holds(solids[place][1])):
+    cutting = [place for place, (number, _) in enumerate(solids) if number not in left_out]
+    for held, of in groupby(cutting, key=lambda place: ShapeTable.holds(solids[place][1])):
         if held:
             places = list(of)
             yield ShapeTable(grid, [solids[place] for place in places], places)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import warp as wp
 
+from warp_lcp.grid.barriers_kernels import fill_layer_kernel
 from warp_lcp.grid.cell_kernel import F32, I8, cell_kernel
 from warp_lcp.grid.staggered import Window
 from warp_lcp.grid.transfer import TINY_WEIGHT
@@ -28,7 +29,7 @@ def weighted_kernel(k, j, i, least: float, weight: F32, known: I8):
 
 def complete(
     window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], known: Sequence[wp.array],
-    join: Callable[[wp.array, wp.array], None] | None = None,
+    join: Callable[[wp.array, wp.array], None] | None = None, barriers: typing.Any = None,
 ) -> None:  # fmt: skip
     """Extrapolate the particles' velocity to nearby faces without weight.
 
@@ -40,18 +41,19 @@ def complete(
         weights: of the particles on each component's faces.
         known: scratch memory, int8, one field a component.
         join: as of `extrapolate`.
+        barriers: solids thinner than cells; None: there are none.
     """
-    for field, weight, marks in zip(velocity, weights, known, strict=True):
+    for axis, (field, weight, marks) in enumerate(zip(velocity, weights, known, strict=True)):
         window.clear(marks)
         window.launch(weighted_kernel, [TINY_WEIGHT, weight, marks])
         if join is not None:  # weights are 0 in the ring
             join(marks, field)
-        extrapolate(window, marks, field, REACH, join=join)
+        extrapolate(window, marks, field, REACH, join=join, apart=None if barriers is None else barriers.apart[axis])
 
 
 def extrapolate(
     window: Window, known: wp.array, field: wp.array, layers: int, *, start: int = 1, fill: int = UNKNOWN,
-    join: Callable[[wp.array, wp.array], None] | None = None,
+    join: Callable[[wp.array, wp.array], None] | None = None, apart: wp.array | None = None,
 ) -> None:  # fmt: skip
     """Extrapolate a field: unknown faces get the mean of their known neighbors.
 
@@ -65,6 +67,7 @@ def extrapolate(
         start: faces marked 1..start are sources of the first layer.
         fill: the mark of the faces to fill, `UNKNOWN` or `BLOCKED`.
         join: called with known and field after each layer, where faces at two sides of the domain are the same.
+        apart: uint8, which neighbors thin solids hold apart, see `warp_lcp.grid.barriers`; None: none.
 
     Raises:
         ValueError: the marks would not fit in int8.
@@ -72,6 +75,9 @@ def extrapolate(
     if start + layers > 127:
         raise ValueError(f"layers = {layers} after layer {start}: at most 127 layers fit in int8")
     for layer in range(start, start + layers):
-        window.run(LAYER, known=known, field=field, layer=layer, fill=fill)
+        if apart is None:
+            window.run(LAYER, known=known, field=field, layer=layer, fill=fill)
+        else:
+            window.launch(fill_layer_kernel, [layer, fill, apart, known, field])
         if join is not None:
             join(known, field)

@@ -111,7 +111,8 @@ class LevelSet:
             shifted = next(field for field in self._scratch if field is not smooth)
             window.launch(kernels.wall_shift_kernel, [self._spread**2, self.limit, smooth, self.phi, self._known, shifted])
             window.run(COPY, source=shifted, field=self.phi)
-        extrapolate(window, self._known, self.phi, kernels.EXTENDED)
+        apart = grid.barriers.apart[-1] if grid.barriers is not None else None
+        extrapolate(window, self._known, self.phi, kernels.EXTENDED, apart=apart)
 
     def volume(self, distance: wp.array | None, window: Window) -> float:
         """Return the volume of phi < 0 outside the solids [m^3; m^2 in 2-D].
@@ -175,6 +176,8 @@ def particle_density(grid: StaggeredGrid, particles: Particles, window: Window, 
     clear(density)
     if particles.offsets is not None:
         window.run(kernels.GATHER, grid.placement, position=position, offsets=particles.offsets, density=density, each=each)
+        if grid.barriers is not None:
+            grid.barriers.density(window, particles.offsets, position, density, each)
     else:
         touched = touched_planes(grid, position)
         scatter(kernels.SCATTER, grid, position, touched, runs=particles.runs, density=density, each=each)

@@ -239,13 +239,17 @@ class Box(_Shape):
         """Return the point, in the shape's own coordinates, from which its kernel counts."""
         return 0.5 * (in_space(self.lower) + in_space(self.upper))
 
-    def _half(self) -> np.ndarray:
+    def half_extents(self) -> np.ndarray:
+        """Return half the sides, shape (3,).
+
+        In the shape's coordinates; infinite along z if the corners have two.
+        """
         half = 0.5 * (np.asarray(self.upper) - np.asarray(self.lower))
         return np.array([*half, np.inf][:3])
 
     def parameters(self, device: wp.Device) -> list[Any]:
         """Return the kernel's arguments after the placement."""
-        return [wp.vec3(*self._half())]
+        return [wp.vec3(*self.half_extents())]
 
     def bounds(self) -> np.ndarray | None:
         """Return the bounding box [m], shape (2, 3); None if inverted.
@@ -259,7 +263,7 @@ class Box(_Shape):
 
     def hull(self) -> tuple[np.ndarray, float]:
         """Return points, shape (m, 3), and a margin around them that cover the shape."""
-        half = np.where(np.isfinite(self._half()), self._half(), 0.0)
+        half = np.where(np.isfinite(self.half_extents()), self.half_extents(), 0.0)
         signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), axis=-1).reshape(-1, 3)
         return self.origin() + signs * half, 0.0
 
@@ -337,9 +341,16 @@ class Capsule(_Shape):
         """Return the point, in the shape's own coordinates, from which its kernel counts."""
         return in_space(self.start)
 
+    def axis(self) -> np.ndarray:
+        """Return the vector from one end of the segment to the other, shape (3,).
+
+        In the shape's coordinates.
+        """
+        return np.asarray(in_space(self.end) - in_space(self.start))
+
     def parameters(self, device: wp.Device) -> list[Any]:
         """Return the kernel's arguments after the placement."""
-        return [wp.vec3(*(in_space(self.end) - in_space(self.start))), self.radius]
+        return [wp.vec3(*self.axis()), self.radius]
 
     def hull(self) -> tuple[np.ndarray, float]:
         """Return points, shape (m, 3), and a margin around them that cover the shape."""

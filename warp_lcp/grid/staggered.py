@@ -464,6 +464,9 @@ class StaggeredGrid:
         sparse: whether only a small part of its fields will be written, for which memory is taken in small pages.
         part: what this process has of it; all if None.
 
+    Attributes:
+        barriers: solids thinner than its cells, `warp_lcp.grid.barriers.Barriers`, set by who places them; None: there are none.
+
     Raises:
         ValueError: a count is not positive, nz is not 1 in 2-D, or the spacing is not positive.
     """
@@ -476,6 +479,7 @@ class StaggeredGrid:
     whole: tuple[int, int, int] | None = None
     sparse: bool = field(default=False, compare=False)
     part: GridPart = field(default=None, compare=False, repr=False)  # type: ignore[assignment]  # set below
+    barriers: typing.Any = field(default=None, init=False, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         """Check the arguments and resolve the device."""
@@ -487,6 +491,10 @@ class StaggeredGrid:
             raise ValueError(f"spacing = {self.spacing}: must be a positive length [m]")
         object.__setattr__(self, "device", checked_device(self.device))
         object.__setattr__(self, "part", self.part or GridPart(self))
+
+    def divide(self, barriers: typing.Any) -> None:
+        """Have barriers hold apart what lies on their two sides."""
+        object.__setattr__(self, "barriers", barriers)
 
     @property
     def shape(self) -> tuple[int, int, int]:

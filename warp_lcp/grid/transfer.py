@@ -90,6 +90,8 @@ def particles_to_faces(
                 passes.gather_weights, grid.placement, position=position, velocity=velocity, gradient=gradient, axis=axis,
                 offsets=offsets, field=field, weight=weight,
             )  # fmt: skip
+            if grid.barriers is not None:
+                grid.barriers.particles_to_faces(window, axis, offsets, position, velocity, gradient, field, weight)
             continue
         scatter(
             passes.scatter, grid, position, touched, runs=runs, velocity=velocity, gradient=gradient, axis=axis, momentum=field,
@@ -114,6 +116,7 @@ def faces_to_particles(
         flip: share of FLIP, 0 (PIC) to 1; needs `saved`.
     """
     passes = transfer_passes(fields[0].dtype)
+    before = wp.clone(velocity) if grid.barriers is not None and saved and flip > 0.0 else velocity
     for axis, field in enumerate(fields):
         gradient = affine[axis] if affine else None
         old = saved[axis] if saved and flip > 0.0 else None
@@ -121,6 +124,8 @@ def faces_to_particles(
             passes.interpolate, len(position), grid, position=position, velocity=velocity, gradient=gradient, axis=axis, flip=flip,
             field=field, saved=old,
         )  # fmt: skip
+        if grid.barriers is not None:
+            grid.barriers.faces_to_particles(axis, field, old, flip if old else 0.0, before, position, velocity, gradient)
 
 
 @cell_kernel("warp_lcp.grid.gravity")

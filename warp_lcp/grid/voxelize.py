@@ -5,7 +5,7 @@ Warnings are of meshes that needed repair, that reach out of the domain or are t
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -139,19 +139,19 @@ def inside(geometries: Sequence[Geometry], points: np.ndarray, *, device: wp.Dev
     return result
 
 
-def start_notes(solids: Sequence[PlacedSolid], grid: StaggeredGrid) -> list[str]:
+def start_notes(solids: Sequence[PlacedSolid], grid: StaggeredGrid, held: Collection[int] = ()) -> list[str]:
     """Return warnings about solids at the start of a run.
 
-    Solids that move may enter later and are checked less.
+    Solids that move may enter later and are checked less. Those with the numbers `held`, from 1 on, may be thinner than cells.
 
     Raises:
         ValueError: a solid that stands still lies wholly outside the domain, or a part of a mesh is turned inside out.
     """
     notes = []
-    for solid in solids:
+    for number, solid in enumerate(solids, start=1):
         still = solid.motion is None
         notes += placement_notes(solid.geometry, solid.name, grid) if still else repair_notes(solid.geometry, solid.name)
-        notes += _thin_notes(solid, grid)
+        notes += [] if number in held else _thin_notes(solid, grid)
     return notes
 
 

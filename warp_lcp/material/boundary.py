@@ -13,12 +13,14 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.grid.advection import MARGIN, advect, advect_with_distance, clearance, push_out
+from warp_lcp.grid.barriers import Barriers
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.level_set import whole_cell_capacity
 from warp_lcp.grid.motion import Motions, boxes_of, kinks
 from warp_lcp.grid.sides import PeriodicSides, continue_beyond, with_periodic
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.grid.thin_walls import ThinWalls
 from warp_lcp.grid.voxelize import VoxelSolids
 from warp_lcp.material import boundary_kernels as kernels
 from warp_lcp.material.wall import Join, extend_velocity, extend_velocity_cut
@@ -42,9 +44,11 @@ class Boundary(Protocol):
         capacity: float32 share of a cell's quadratic kernel that is open.
         distance: float32 distance to the solids at the cells' low corners [cells]; None: whole cells, no distance.
         kinks: times [s] at which the velocity of a solid jumps.
+        thin: solids that particles meet as exact shapes; None: none is thin.
     """
 
     moves: bool  # whether a solid moves
+    thin: ThinWalls | None
     sides: PeriodicSides | None
     open_sides: int
     base: wp.array
@@ -126,6 +130,7 @@ class WholeCells:
     distance: wp.array | None = None
     kinks: tuple[float, ...] = ()
     moves = False
+    thin: ThinWalls | None = None
 
     def __init__(
         self, grid: StaggeredGrid, solids: VoxelSolids, wall_velocity: np.ndarray | None = None, *, open_sides: int,
@@ -226,13 +231,18 @@ class CutBoundary:
         grid: the grid.
         cut: the solids, with their capacity.
         sides: of axes without an end, if there are any; `cut` has walls there.
+        thin: those of the solids that particles meet as exact shapes; None: none is thin.
+        barriers: those of them that do not cut cells but hold apart what is on their two sides; None: there are none.
 
     Raises:
         ValueError: solids differ at the two sides of an axis without an end.
     """
 
-    def __init__(self, grid: StaggeredGrid, cut: CutCells, *, sides: PeriodicSides | None = None) -> None:
-        self.grid, self.cut, self.moves, self.sides = grid, cut, cut.moves, sides
+    def __init__(
+        self, grid: StaggeredGrid, cut: CutCells, *, sides: PeriodicSides | None = None, thin: ThinWalls | None = None,
+        barriers: Barriers | None = None,
+    ) -> None:  # fmt: skip
+        self.grid, self.cut, self.moves, self.sides, self.thin, self.barriers = grid, cut, cut.moves, sides, thin, barriers
         self.open_sides, self._endless = with_periodic(cut.open_sides, sides), sides.bits if sides is not None else 0
         self._time = 0.0
         self.base, self.open, self.capacity, self.distance = cut.base, cut.open, cut.capacity, cut.distance
@@ -254,6 +264,7 @@ class CutBoundary:
             cut.accompany(self._keep_distance, self._find_walls)
         self._find_walls()
         self._join_sides()
+        self._cross()
         grid.part.fill(*self.placed())
 
     def top_speed(self, time: float, span: float) -> float:
@@ -268,6 +279,8 @@ class CutBoundary:
         """Compute the velocity of the solids from `time` on [s]."""
         if self.moves:
             self.cut.set_velocity(time, dt)
+            if self.barriers is not None:
+                self.barriers.set_velocity()
 
     def extrapolate_velocity(
         self, window: Window, velocity: Faces, weights: Faces, known: Faces, kind: wp.array, contact: wp.array, layers: int,
@@ -284,10 +297,26 @@ class CutBoundary:
     def advect(self, fields: Faces, dt: float, time: float, position: wp.array) -> None:
         """Advect particles, then move the solids to `time`."""
         self._dt.value = dt
+        self._look_around(fields, dt, position)
         if self.moves:
             self.place(time)
         self._advection.run(fields, position)
+        self._stop_at_thin_walls(position, still=not self.moves)
         self._counts.changed()
+
+    def _look_around(self, fields: Faces, dt: float, position: wp.array) -> None:
+        """Find where particles go by what they see of the velocity among thin solids, before those move."""
+        if self.thin is not None:
+            self.thin.remember(position)
+            if self.barriers is not None and not self._endless:
+                self.barriers.carry(fields, dt, self.thin.start_of(position))
+
+    def _stop_at_thin_walls(self, position: wp.array, *, still: bool) -> None:
+        """Have particles go where that was, and stop them at thin solids, which have moved unless `still`."""
+        if self.thin is not None:
+            if self.barriers is not None and not self._endless:
+                self.barriers.bring(self.thin.start_of(position), position)
+            self.thin.stop(position, still=still)
 
     def _advect(self, fields: Faces, position: wp.array) -> None:
         """Move the particles where the solids are or have been, then out of the solids."""
@@ -307,7 +336,9 @@ class CutBoundary:
 
     def displace(self, fields: Faces, position: wp.array) -> None:
         """Move particles by a displacement [m] among the solids at rest."""
+        self._look_around(fields, 1.0, position)
         self._displacement.run(fields, position)
+        self._stop_at_thin_walls(position, still=True)
 
     def _displace(self, fields: Faces, position: wp.array) -> None:
         ways = {"open_sides": self.open_sides, "endless": self._endless}
@@ -318,7 +349,12 @@ class CutBoundary:
         if self.moves:
             self._time = time
             self.cut.place(time)
+            if self.thin is not None:
+                self.thin.place(time)
             self._join_sides()
+            if self.barriers is not None:
+                self.barriers.place(time)
+            self._cross()
             self.grid.part.fill(*self.placed())
 
     def shapes(self) -> Sequence[Geometry]:
@@ -346,7 +382,8 @@ class CutBoundary:
         between = planes[0] if self.grid.dimension == 2 else (1 - z) * planes[0] + z * planes[1]
         axes = slice(self.grid.dimension)
         side = np.minimum(coordinates - 1.0, np.array(self.grid.domain_counts) + 1.0 - coordinates)[:, axes].min(axis=1)
-        return np.asarray(np.minimum(between, side) >= MARGIN)
+        result = np.asarray(np.minimum(between, side) >= MARGIN)
+        return result if self.thin is None else result & self.thin.admits(points)
 
     def _join_sides(self) -> None:
         """Add to the capacity of cells what their kernels reach beyond sides that are the same; refuse solids that differ there."""
@@ -363,6 +400,12 @@ class CutBoundary:
     def _keep_distance(self) -> None:
         """Launch the copy of the distance before the solids move: particles may go where it is open before or after."""
         copy(self._reachable, self.cut.distance)
+
+    def _cross(self) -> None:
+        """Close the faces that barriers cross."""
+        if self.barriers is not None:
+            self.barriers.cross()
+            self._find_walls()
 
     def _find_walls(self) -> None:
         walls = (*self.cut.wall, *self.cut.wall[1:2])[:3]  # in 2-D nothing is asked of the third

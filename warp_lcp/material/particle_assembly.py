@@ -11,12 +11,14 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.grid.cut_cells import CutCells
+from warp_lcp.grid.barriers import BARRIER, Barriers
+from warp_lcp.grid.cut_cells import DEEP, CutCells
 from warp_lcp.grid.particles import Particles, seed
 from warp_lcp.grid.sides import PeriodicSides, open_sides_of, periodic_sides, side_bits
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.surface_mesh import Obstacles, SurfaceMesh
+from warp_lcp.grid.thin_walls import STRIDE_ROOM, THIN, ThinWalls, fills_cells, is_thin
 from warp_lcp.grid.voxelize import PlacedSolid, inside, placement_notes, voxelize
 from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
 from warp_lcp.material.coverage import Coverage
@@ -112,15 +114,46 @@ def make_boundary(
     if scene.domain.solids == "cut-cell":
         if wall_velocity is not None:
             raise ValueError('wall_velocity: only for solids = "voxel"; with cut cells, give the solid a motion')
-        cut = CutCells(grid, placed, wall_separating=separating, open_sides=sides, remarks=not covered)
-        if not cut.whole_cells or (covered and placed):  # solids may cut cells elsewhere
-            return CutBoundary(grid, cut, sides=around), cut.notes
+        thin, crossing = (make_thin_walls(scene, grid, placed, sides, crossing=c) for c in (False, True))
+        numbers = crossing.numbers if crossing is not None else ()
+        cut = CutCells(grid, placed, wall_separating=separating, open_sides=sides, remarks=not covered, left_out=numbers)
+        if not cut.whole_cells or (covered and placed) or thin is not None:  # solids may cut cells elsewhere
+            barriers = Barriers(grid, crossing, cut) if crossing is not None else None
+            grid.divide(barriers)
+            boundary = CutBoundary(grid, cut, sides=around, thin=thin, barriers=barriers)
+            return boundary, (*cut.notes, *(barriers.notes() if barriers is not None else ()))
         shapes = [solid.geometry for solid in placed]
     ends = side_bits(periodic_sides(scene.endless))
     voxels = voxelize(grid, placed, wall_separating=separating, open_sides=sides | ends, remarks=not covered)
     if wall_velocity is None and scene.source:
         wall_velocity = np.zeros((1 + len(placed), 3))  # what a source's faces are given goes there
     return WholeCells(grid, voxels, wall_velocity, open_sides=sides, sides=around, shapes=shapes), voxels.notes
+
+
+def make_thin_walls(
+    scene: ParticleScene, grid: StaggeredGrid, placed: Sequence[PlacedSolid], open_sides: int, *, crossing: bool
+) -> ThinWalls | None:  # fmt: skip
+    """Return the solids that are too thin for the grid, which particles meet as exact shapes; None: there are none.
+
+    One that moves must be thicker than what it may go in a step.
+
+    Args:
+        scene: the scene.
+        grid: its grid.
+        placed: its solids.
+        open_sides: of `warp_lcp.grid.sides.side_bits`.
+        crossing: only those that are too thin to cut cells, but for rigid bodies, which the pressure pushes by the cells that they cut.
+    """
+    least = dict.fromkeys((False, True), THIN) | {True: max(THIN, scene.time.cfl + STRIDE_ROOM)}
+    if crossing:
+        least = dict.fromkeys(least, BARRIER[grid.dimension])
+    thin = [
+        is_thin(solid.geometry, least[solid.motion is not None] * grid.spacing, grid.device)
+        and not (solid.motion is None and fills_cells(solid.geometry, grid, DEEP))
+        and not (crossing and isinstance(solid.motion, BodyMotion))
+        for solid in placed
+    ]
+    return ThinWalls(grid, placed, thin, open_sides) if any(thin) else None
 
 
 @dataclass(frozen=True)
@@ -196,6 +229,8 @@ def seed_materials(
         notes += placement_notes(geometry, name, grid)
     settings = scene.particles
     open_cells = grid.interior(boundary.base.numpy()) != wl.SOLID
+    if grid.barriers is not None:  # a cell whose center lies in a thin solid may have room beside it
+        open_cells |= grid.interior(grid.barriers.near.numpy()) > 0
     if without is not None:
         open_cells &= ~without
     grid.part.keep_own(open_cells)
@@ -222,7 +257,9 @@ def make_particles(
     """
     position, owner, notes = seed_materials(scene, grid, boundary, folder, without)
     velocity = start_velocities(scene).astype(np.float32)[owner]
-    return Particles(grid, position, velocity, affine=scene.particles.transfer == "apic", kept=kept_by(scene, owner)), notes
+    indexed = True if grid.barriers is not None else None  # what is near those gathers
+    affine, kept = scene.particles.transfer == "apic", kept_by(scene, owner)
+    return Particles(grid, position, velocity, affine=affine, kept=kept, indexed=indexed), notes
 
 
 def kept_by(scene: ParticleScene, owner: np.ndarray) -> np.ndarray | None:

@@ -137,6 +137,7 @@ class ParticleSimulation(ParticleCheckpoints):
         self.sides, at_once = parts.boundary.sides, grid.part.at_once
         self._transfer_to_grid = LaunchGraph(grid.device, self._launch_particles_to_grid, at_once=at_once)
         self._extrapolation = LaunchGraph(grid.device, self._launch_extrapolation, at_once=at_once)
+        at_once |= grid.barriers is not None  # beside those FLIP copies velocities, as many as there are
         self._transfer_to_particles = LaunchGraph(grid.device, self._launch_grid_to_particles, at_once=at_once)
         self.velocity, self.weights = grid.faces(), grid.faces()
         self._saved = grid.faces() if scene.particles.transfer == "flip" else None
@@ -467,6 +468,8 @@ class ParticleSimulation(ParticleCheckpoints):
         if self.flights is not None:
             with self.watch.stage("bodies in flight", self.particles.position):
                 self.flights.end(self.particles, self.velocity)
+            if self.boundary.thin is not None:
+                self.boundary.thin.stop(self.particles.position, still=not self.boundary.moves)
 
     def met(self) -> tuple[int, int, int]:
         """Return how many of all particles met a wall, were pushed by a solid, and are stuck inside one when `carry` moved them."""
@@ -549,4 +552,7 @@ class ParticleSimulation(ParticleCheckpoints):
     def admits(self, points: np.ndarray) -> np.ndarray:
         """Tell which points [m], shape (n, 3), a particle may be at."""
         i, j, k = np.clip(self.particles.cells_of(points), -1, self.grid.counts).T + 1
-        return (self.boundary.base.numpy()[k, j, i] != wl.SOLID) & self.boundary.admits(points)
+        free = self.boundary.base.numpy()[k, j, i] != wl.SOLID
+        if self.grid.barriers is not None:
+            free |= self.grid.barriers.near.numpy()[k, j, i] > 0
+        return free & self.boundary.admits(points)

@@ -113,7 +113,8 @@ class Reseeding:
         window.launch(kernels.count_kernel, [offsets, self._count])
         self.grid.part.fill(self._count)
         if not nothing:
-            inputs = [self._setting, self._count, b.capacity, b.base, b.touch, self._takers, self._numbers]
+            base = b.base if self.grid.barriers is None else self.grid.barriers.calm
+            inputs = [self._setting, self._count, b.capacity, base, b.touch, self._takers, self._numbers]
             self._inside.launch(kernels.find_kernel, inputs)
 
     def _exchange(self, particles: Particles) -> None:

@@ -197,11 +197,15 @@ def extend_velocity_cut(
         scratch: a float32 field for each component (written).
         layers: how far into air and walls, in faces.
     """
+    barriers = cut.grid.barriers
     for axis, (field, weight, marks, fraction) in enumerate(zip(velocity, weights, known, cut.open, strict=True)):
         window.launch(keep_released_kernel, [axis, kind, contact, weight, field, marks])
-        extrapolate(window, marks, field, 1, join=join)
+        apart = barriers.apart[axis] if barriers is not None else None
+        extrapolate(window, marks, field, 1, join=join, apart=apart)
         window.run(KEEP_SPRAY, axis=axis, known=marks, weight=weight, kind=kind, open=fraction)
-        extrapolate(window, marks, field, layers, join=join)
+        extrapolate(window, marks, field, layers, join=join, apart=apart)
+    if barriers is not None:
+        barriers.constrain(window, velocity, known, kind, contact, RELEASED)
     faces, placement = FaceVelocity.of(velocity), cut.grid.placement
     walls = WallFields.of(cut, known)
     for axis, (marks, open_, result) in enumerate(zip(known, cut.open, scratch, strict=True)):

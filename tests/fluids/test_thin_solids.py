@@ -1,0 +1,128 @@
+"""Solids thinner than cells: nothing passes them, both sides are apart, and they bear what stands on them."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from small_liquids import GRAVITY, advance, box, create, scene
+from warp_lcp.fluids import LiquidSimulation
+from warp_lcp.scene.scene_file import built_in_scenes, load_scene
+from warp_lcp.scene.simulator import simulators
+
+CELLS = 16
+CELL = 1.0 / CELLS
+SHAKEN = {"kind": "sinusoid", "period": 0.4, "amplitude": [0.12, 0.03]}
+TURNED = {"kind": "rotation", "rate": 360.0, "center": [0.5, 0.5]}
+
+
+def bottle(dimension: int, thickness: float, motion: dict[str, Any] | None = None, **place: Any) -> tuple[list[dict[str, Any]], np.ndarray]:
+    """Return the walls of a closed box, some cells thick and off the grid, and the ends of its inside along each axis."""
+    ends = np.array([[0.5 - 0.3 + 0.3 * CELL, 0.5 + 0.3 + 0.1 * CELL]] * dimension)
+    solids = []
+    for axis in range(dimension):
+        for side in range(2):
+            low, high = ends[:, 0] - thickness * CELL, ends[:, 1] + thickness * CELL
+            (low if side else high)[axis] = ends[axis, side]
+            solids.append(box(low.tolist(), high.tolist(), **place, **({"motion": motion} if motion else {})))
+    return solids, ends
+
+
+def filled(ends: np.ndarray, share: float = 0.6) -> list[dict[str, Any]]:
+    high = ends[:, 1].copy()
+    high[1] = ends[1, 0] + share * (ends[1, 1] - ends[1, 0])
+    return [box(ends[:, 0].tolist(), high.tolist())]
+
+
+def inside(simulation: LiquidSimulation, ends: np.ndarray) -> bool:
+    """Return whether all particles are between the ends, in the frame of the first solid."""
+    motion = simulation.boundary.cut.solids[0].motion
+    x = simulation.particles.position.numpy().astype(np.float64)
+    if motion is not None:
+        pose = motion.pose(simulation.time)
+        x = (x - pose.translation) @ pose.rotation
+    x = x[:, : len(ends)]
+    return bool(((x > ends[:, 0] - 1e-3 * CELL) & (x < ends[:, 1] + 1e-3 * CELL)).all())
+
+
+@pytest.mark.parametrize("motion", [None, SHAKEN, TURNED])
+@pytest.mark.parametrize("thickness", [0.05, 0.5, 1.28])
+def test_a_closed_bottle_keeps_all(thickness: float, motion: dict[str, Any] | None) -> None:
+    solids, ends = bottle(2, thickness, motion)
+    simulation = create(scene(size=[1.0, 1.0], resolution=CELLS, liquid=filled(ends), solid=solids, cfl=4.0))
+    rows = advance(simulation, 0.4)
+    assert inside(simulation, ends)
+    assert all(row["solve_status"] in (None, "CONVERGED") for row in rows)
+    if motion is None:
+        assert rows[-1]["max_density"] < 1.2 and rows[-1]["max_speed"] < 0.1
+
+
+def test_a_closed_bottle_in_space_keeps_all() -> None:
+    solids, ends = bottle(3, 0.4, SHAKEN | {"amplitude": [0.1, 0.0, 0.05]})
+    simulation = create(scene(size=[1.0] * 3, resolution=CELLS, liquid=filled(ends, 0.3), solid=solids))
+    advance(simulation, 0.15)
+    assert inside(simulation, ends)
+
+
+@pytest.mark.parametrize("thickness", [0.1, 0.5, 0.9])
+@pytest.mark.parametrize("offset", [0.0, 0.3125, 0.5, 0.8125])
+def test_a_plate_bears_the_pool_on_it(thickness: float, offset: float) -> None:
+    n = 24
+    top = (8.0 + offset) / n
+    plate, pool = box([-0.1, top - thickness / n], [1.1, top]), box([0.0, top], [1.0, top + 10.0 / n])
+    simulation = create(scene(size=[1.0, 1.0], resolution=n, liquid=[pool], solid=[plate], output={"forces": True}))
+    loads = []
+    for _ in range(8):
+        advance(simulation, simulation.time + 0.05)
+        loads.append(-simulation.measured["forces"]["solid0_fy"])
+    assert simulation.particles.position.numpy()[:, 1].min() > top
+    assert np.mean(loads[4:]) == pytest.approx(1000.0 * GRAVITY * 10.0 / n, rel=0.02)
+    assert np.abs(simulation.particles.velocity.numpy()).max() < 0.05
+
+
+@pytest.mark.parametrize("thickness", [0.05, 0.7])
+def test_pools_on_two_sides_of_a_plate_stay_apart(thickness: float) -> None:
+    at, other = 0.52, 0.52 + thickness / 24
+    plate = box([at, -0.1], [other, 1.1])
+    pools = [box([0.0, 0.0], [at, 0.5]), box([other, 0.0], [1.0, 0.2])]
+    simulation = create(scene(size=[1.0, 1.0], resolution=24, liquid=pools, solid=[plate]))
+    left = np.count_nonzero(simulation.particles.position.numpy()[:, 0] < at)
+    advance(simulation, 0.5)
+    x, y, _ = simulation.particles.position.numpy().T
+    assert np.count_nonzero(x < at) == left and not ((x > at) & (x < other)).any()
+    assert np.percentile(y[x < at], 99) == pytest.approx(0.5, abs=0.03) and np.percentile(y[x > at], 99) == pytest.approx(0.2, abs=0.03)
+    assert np.abs(simulation.particles.velocity.numpy()).max() < 0.05
+
+
+def test_a_thin_piston_takes_all_along() -> None:
+    """At 1 m/s and CFL 8 it goes several cells a step, each many times its thickness."""
+    piston = box([0.1, -0.2], [0.1 + 0.2 * CELL, 1.2], motion={"kind": "translation", "velocity": [1.0, 0.0], "stop": 0.3})
+    pool = box([0.1 + 0.2 * CELL, 0.0], [1.0, 0.3])
+    simulation = create(scene(size=[1.0, 1.0], resolution=CELLS, liquid=[pool], solid=[piston], cfl=8.0))
+    advance(simulation, 0.4, dt_max=0.1)
+    assert simulation.particles.position.numpy()[:, 0].min() > 0.4
+
+
+def test_gaps_narrower_than_a_cell_are_told() -> None:
+    def notes(gap: float) -> list[str]:
+        plates = [box([-0.1, 0.42], [0.5, 0.43]), box([0.5 + gap, 0.42], [1.1, 0.43])]
+        simulation = create(scene(size=[1.0, 1.0], resolution=CELLS, liquid=[box([0.0, 0.5], [1.0, 0.7])], solid=plates))
+        return [note for note in simulation.notes() if "gap" in note]
+
+    assert notes(0.0) == [] and notes(3.0 * CELL) == []
+    assert len(notes(0.4 * CELL)) == 1 and "lets nothing through" in notes(0.4 * CELL)[0]
+
+
+def test_built_in_scenes_have_no_thin_solids() -> None:
+    """They are as before, in all bits: whatever thin solids change is not there."""
+    for name in built_in_scenes():
+        loaded = load_scene(name)
+        if loaded.scene.simulator != "contacts" and loaded.solid and loaded.dimension == 2:
+            simulation = loaded_simulation(loaded)
+            assert simulation.boundary.thin is None and simulation.grid.barriers is None, name
+
+
+def loaded_simulation(loaded: Any) -> Any:
+    """Return the simulation of a scene."""
+    return simulators()[loaded.scene.simulator].create(loaded, device="cpu", folder=Path())

@@ -1,0 +1,65 @@
+"""Solids thinner than cells among sand: no grain passes, and sand rests on them."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from warp_lcp.granular import SIMULATOR
+from warp_lcp.granular.scene import SandScene
+
+CELLS = 24
+CELL = 1.0 / CELLS
+
+
+def simulate(until: float, sand: list[dict[str, Any]], solid: list[dict[str, Any]], **tables: Any) -> tuple[Any, list[dict[str, Any]]]:
+    """Return a simulation of sand after some time, and the rows of its log."""
+    data = {"scene": {"simulator": "granular"}, "time": {"duration": 10.0}, "domain": {"size": [1.0, 1.0], "resolution": CELLS}}
+    model = SandScene.model_validate(data | {"sand": sand, "solid": solid} | tables)
+    simulation, rows = SIMULATOR.create(model, device="cpu", folder=Path()), []
+    while simulation.time < until - 1e-9:
+        rows.append(simulation.step(min(simulation.stable_dt(), 0.005, until - simulation.time)))
+    return simulation, rows
+
+
+def box(low: list[float], high: list[float], **more: Any) -> dict[str, Any]:
+    return {"shape": "box", "min": low, "max": high, **more}
+
+
+@pytest.mark.parametrize("thickness", [0.1, 0.5])
+@pytest.mark.parametrize("offset", [0.0, 0.3, 0.7])
+def test_sand_rests_on_a_plate(thickness: float, offset: float) -> None:
+    top = (8.0 + offset) / CELLS
+    simulation, rows = simulate(0.3, [box([0.0, top], [1.0, top + 6.0 * CELL])], [box([-0.1, top - thickness * CELL], [1.1, top])])
+    y = simulation.particles.position.numpy()[:, 1]
+    assert y.min() > top and np.percentile(y, 99) == pytest.approx(top + 6.0 * CELL, abs=0.6 * CELL)
+    assert rows[-1]["max_speed"] < 0.2 and rows[-1]["max_fraction"] < 1.15
+
+
+def test_no_grain_passes_the_sides_of_a_funnel() -> None:
+    """Sides of 0.6 cells, steep, with a neck of 5 cells: what is below the funnel is below its neck."""
+    sides = [
+        {"shape": "capsule", "from": [-0.05, 0.85], "to": [0.4, 0.4], "radius": 0.3 * CELL, "friction": 0.3},
+        {"shape": "capsule", "from": [1.05, 0.85], "to": [0.6, 0.4], "radius": 0.3 * CELL, "friction": 0.3},
+    ]
+    simulation, _ = simulate(0.25, [box([0.36, 0.45], [0.64, 0.9])], sides)
+    x, y, _ = simulation.particles.position.numpy().T
+    assert (y < 0.35).any(), "some has fallen through the neck"
+    assert not ((y > 0.4) & ((x + y < 0.8) | (x - y > 0.2))).any()
+
+
+@pytest.mark.parametrize("thickness", [0.25, 1.28])
+def test_a_shaken_box_keeps_its_sand(thickness: float) -> None:
+    low, high = 0.23, 0.77
+    motion = {"kind": "sinusoid", "period": 0.5, "amplitude": [0.1, 0.03]}
+    w, solids = thickness * CELL, []
+    for axis in range(2):
+        for side in range(2):
+            start, end = [low - w] * 2, [high + w] * 2
+            (start if side else end)[axis] = high if side else low
+            solids.append(box(start, end, motion=motion))
+    simulation, _ = simulate(0.3, [box([low, low], [high, 0.5])], solids)
+    pose = simulation.boundary.cut.solids[0].motion.pose(simulation.time)
+    own = (simulation.particles.position.numpy() - pose.translation)[:, :2]
+    assert own.min() > low - 1e-3 * CELL and own.max() < high + 1e-3 * CELL

@@ -1,0 +1,210 @@
+"""Thin solids: those that a grid's cells cannot hold apart, met by particles as the exact shapes that they are.
+
+Distances at the nodes of a grid do not see a wall that lies between them, and a particle that a step takes to the other side of one finds
+itself in the open. So the path of each particle within a step is looked at in the frame of each solid, from where that was to where it
+is: what crosses the surface stops there and slides on, at the true surface and on its own side.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.grid import thin_walls_kernels as kernels
+from warp_lcp.grid.cell_kernel import launch_list
+from warp_lcp.grid.motion import Motion, Motions
+from warp_lcp.grid.particle_loops import MARGIN
+from warp_lcp.grid.solids import Box, Capsule, Geometry, Sphere, TriangleMesh, Union
+from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.grid.voxelize import PlacedSolid
+from warp_lcp.rows.program import copy
+
+THIN = 2.5  # cells: what is thinner is met as its exact shape
+STRIDE_ROOM = 0.5  # cells that a moving solid must be thicker than what it may go in a step
+SKIN = 1e-4  # cells by which shapes are larger than they are, so that there is no crack between those that touch
+THIN_SHARE = 1e-3  # of a mesh's surface that must be thin for that
+COST = 32  # of a particle, in cells of a usual pass
+Simple = Box | Sphere | Capsule | TriangleMesh
+
+
+def parts_of(geometry: Geometry) -> list[Geometry]:
+    """Return the shapes that a region is the union of."""
+    return [part for of in geometry.parts for part in parts_of(of)] if isinstance(geometry, Union) else [geometry]
+
+
+def is_thin(geometry: Geometry, thickness: float, device: wp.Device) -> bool:
+    """Return whether a part of a solid is thinner than `thickness` [m]; half spaces and inverted shapes are not."""
+    return any(_is_thin(part, thickness, device) for part in parts_of(geometry))
+
+
+def _is_thin(shape: Geometry, thickness: float, device: wp.Device) -> bool:
+    if not isinstance(shape, Simple) or shape.invert:
+        return False
+    if isinstance(shape, TriangleMesh):
+        return shape.thin_fraction(thickness, device) > THIN_SHARE
+    least = shape.half_extents().min() if isinstance(shape, Box) else shape.radius
+    return bool(2.0 * least * shape.placement.scale < thickness)
+
+
+def fills_cells(geometry: Geometry, grid: StaggeredGrid, error: float) -> bool:
+    """Return whether a solid is made of boxes whose sides lie on those of cells, but for an `error` [cells]."""
+    return all(_fills_cells(part, grid, error) for part in parts_of(geometry))
+
+
+def _fills_cells(shape: Geometry, grid: StaggeredGrid, error: float) -> bool:
+    if not isinstance(shape, Box) or not np.allclose(np.abs(shape.placement.rotation).max(axis=0), 1.0, rtol=0.0, atol=1e-12):
+        return False
+    bounds = shape.bounds()
+    assert bounds is not None, "the box is not inverted"
+    ends = bounds[:, : grid.dimension] / grid.spacing
+    return bool((np.abs(ends - np.round(ends)) <= error).all())
+
+
+class ThinWalls:
+    """Thin solids of a scene as exact shapes, and their motion within a step.
+
+    Args:
+        grid: the grid; any part of the domain's.
+        solids: of the scene; numbers of walls are 1 + s.
+        thin: which of them these are.
+        open_sides: of `warp_lcp.grid.sides.side_bits`: particles may leave the domain there.
+
+    Attributes:
+        numbers: of these solids.
+        moves: whether one of them moves.
+    """
+
+    def __init__(self, grid: StaggeredGrid, solids: Sequence[PlacedSolid], thin: Sequence[bool], open_sides: int) -> None:
+        self.grid = grid
+        self.numbers = [number for number, is_one in enumerate(thin, start=1) if is_one]
+        self.moves = any(solids[number - 1].motion is not None for number in self.numbers)
+        groups: list[tuple[Motion | None, list[tuple[int, Geometry]]]] = []
+        for number in self.numbers:
+            solid = solids[number - 1]
+            of = next((shapes for motion, shapes in groups if _alike(motion, solid.motion)), None)
+            if of is None:
+                of = []
+                groups.append((solid.motion, of))
+            of += [(number, part) for part in parts_of(solid.geometry)]
+        self._motions = Motions([motion for motion, _ in groups if motion is not None])
+        self._moving = [place for place, (motion, _) in enumerate(groups) if motion is not None]
+        shapes = [_shape(number, part, grid.device, SKIN * grid.spacing) for _, of in groups for number, part in of]
+        self._geometries = [part for _, of in groups for _, part in of]  # whose meshes are on the device
+        ends = np.cumsum([0, *(len(of) for _, of in groups)])
+        self._groups = []
+        for first, end in pairwise(ends):
+            group = kernels.ThinGroup()
+            group.first, group.end = int(first), int(end)
+            group.turn = group.turn_before = wp.mat33d(np.eye(3))
+            self._groups.append(group)
+        self.shapes = wp.array(shapes, dtype=kernels.ThinShape, device=grid.device)
+        self.groups = wp.array(self._groups, dtype=kernels.ThinGroup, device=grid.device)
+        margin = MARGIN * grid.spacing
+        low, high = np.full(3, margin), grid.extent - margin
+        for axis in range(3):
+            low[axis] = low[axis] if axis < grid.dimension and not open_sides >> (2 * axis) & 1 else -np.inf
+            high[axis] = high[axis] if axis < grid.dimension and not open_sides >> (2 * axis + 1) & 1 else np.inf
+        self._margin, self._low, self._high = wp.float64(margin), wp.vec3d(*low), wp.vec3d(*high)
+        self._start = wp.empty(0, dtype=wp.vec3, device=grid.device)
+        self.place(0.0)
+        self.place(0.0)
+
+    def place(self, time: float) -> None:
+        """Move the solids to a time [s]; where they were until now is where a step's particles start among them."""
+        if not self._moving:
+            return
+        rotations, translations = self._motions.poses([time])
+        for place, rotation, translation in zip(self._moving, rotations[0], translations[0], strict=True):
+            group = self._groups[place]
+            group.turn_before, group.shift_before = group.turn, group.shift
+            group.turn, group.shift = wp.mat33d(rotation), wp.vec3d(*translation)
+        self.groups.assign(self._groups)
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the low and the high corner of a box around the solids where they are [m], shape (3,) each."""
+        lows, highs = [], []
+        for group in self._groups:
+            turn, shift = np.array(group.turn).reshape(3, 3), np.array(group.shift)
+            for geometry in self._geometries[group.first : group.end]:
+                box = geometry.bounds()
+                assert box is not None, "thin solids are bounded"
+                low, high = np.clip(box, -kernels.ENDLESS, kernels.ENDLESS)
+                middle, reach = 0.5 * (low + high), np.abs(turn) @ (0.5 * (high - low))
+                lows.append(turn @ middle + shift - reach)
+                highs.append(turn @ middle + shift + reach)
+        return np.min(lows, axis=0), np.max(highs, axis=0)
+
+    def remember(self, position: wp.array) -> None:
+        """Keep the places of particles [m], shape (n,), from which they are about to be moved."""
+        if len(self._start) < len(position):
+            self._start = wp.empty(len(position) + len(position) // 4, dtype=wp.vec3, device=self.grid.device)
+        copy(self._start[: len(position)], position)
+
+    def start_of(self, position: wp.array) -> wp.array:
+        """Return where particles were when they were remembered [m], shape (n,)."""
+        return self._start[: len(position)]
+
+    def stop(self, position: wp.array, *, still: bool) -> None:
+        """Put particles that have passed a thin solid since `remember` back to its surface, and on along it.
+
+        Args:
+            position: [m], shape (n,) (updated).
+            still: whether the solids have not moved since then.
+        """
+        given = [self.start_of(position), position, self.shapes, self.groups, int(still), self._margin, self.grid.planes]
+        launch_list(kernels.stop_kernel, len(position), [*given, self._low, self._high], device=self.grid.device, cost=COST)
+
+    def admits(self, points: np.ndarray) -> np.ndarray:
+        """Return which points [m], shape (n, 3), keep the distance from these solids; a particle may start there."""
+        at = wp.array(np.asarray(points, dtype=np.float32), dtype=wp.vec3, device=self.grid.device)
+        room = wp.empty(len(points), dtype=wp.float64, device=self.grid.device)
+        reach = wp.float64(2.0 * float(self._margin))
+        launch_list(kernels.room_kernel, len(points), [at, self.shapes, self.groups, reach, room], device=self.grid.device, cost=COST)
+        result = room.numpy() >= float(self._margin)
+        meshes = [place for place, geometry in enumerate(self._geometries) if isinstance(geometry, TriangleMesh)]
+        for place in meshes:
+            group = next(g for g in self._groups if g.first <= place < g.end)
+            turn, shift = np.array(group.turn).reshape(3, 3), np.array(group.shift)
+            own = wp.array(((np.asarray(points) - shift) @ turn).astype(np.float32), dtype=wp.vec3, device=self.grid.device)
+            distance = wp.empty(len(points), dtype=wp.float32, device=self.grid.device)
+            self._geometries[place].signed_distance(own, distance)
+            result &= distance.numpy() > 0.0
+        return np.asarray(result)
+
+
+def _alike(one: Motion | None, other: Motion | None) -> bool:
+    """Return whether two motions are the same: those of rigid bodies never are."""
+    if one is other or one is None or other is None:
+        return one is other
+    try:
+        return type(one) is type(other) and bool(one == other)
+    except ValueError:  # arrays among their members
+        return False
+
+
+def _shape(number: int, geometry: Geometry, device: wp.Device, skin: float) -> Any:
+    """Return a shape as kernels take it, larger by a `skin` [m]; a mesh as it is."""
+    assert isinstance(geometry, Simple), "half spaces are not thin"
+    result, place, bounds = kernels.ThinShape(), geometry.placement, geometry.bounds()
+    assert bounds is not None, "an inverted shape is not thin"
+    result.solid = number
+    result.turn = wp.mat33d(place.rotation.T)
+    result.shift = wp.vec3d(*(place.translation + place.scale * place.rotation @ geometry.origin()))
+    low, high = np.clip([bounds[0] - skin, bounds[1] + skin], -kernels.ENDLESS, kernels.ENDLESS)
+    result.low, result.high = wp.vec3d(*low), wp.vec3d(*high)
+    if isinstance(geometry, Box):
+        half = np.minimum(place.scale * geometry.half_extents() + skin, kernels.ENDLESS)
+        result.kind, result.half = kernels.BOX, wp.vec3d(*half)
+    elif isinstance(geometry, Sphere):
+        result.kind, result.radius = kernels.SPHERE, place.scale * geometry.radius + skin
+    elif isinstance(geometry, Capsule):
+        result.kind, result.radius = kernels.CAPSULE, place.scale * geometry.radius + skin
+        result.half = wp.vec3d(*(place.scale * geometry.axis()))
+    else:
+        result.kind, result.radius = kernels.MESH, place.scale * geometry.unit_length()
+        result.mesh = geometry.surface.on_device(device).id
+    return result

@@ -1,0 +1,358 @@
+# mypy: ignore-errors
+"""Exact geometry of thin solids: where a straight path meets them, and kernels that stop particles there.
+
+All of it is float64: a particle keeps a distance of a thousandth of a cell from a wall, and that must survive the way from the domain's
+coordinates into those of a shape and back.
+"""
+
+import warp as wp
+
+from warp_lcp.grid.cell_kernel import POINTS, list_kernel
+
+MODULE = "warp_lcp.grid.thin_walls"
+BOX, SPHERE, CAPSULE, MESH = 0, 1, 2, 3
+SLIDES = 12  # walls that a particle slides along in a step, one after another
+ROUNDS = 8  # how often a path is looked at again among solids of different motions
+ROOM = 0.25  # of the distance that particles keep, that they have in corners at least
+HALVINGS = 6  # of a way into a corner, until there is that room
+MISS = 2.0  # a parameter of a path beyond its end
+ENDLESS = 1.0e30  # half extent [m] of a box without ends
+
+_ONE, _ZERO, _MISS = wp.constant(wp.float64(1.0)), wp.constant(wp.float64(0.0)), wp.constant(wp.float64(MISS))
+_TINY = wp.constant(wp.float64(1.0e-300))
+
+
+@wp.struct
+class ThinShape:
+    """A shape in the frame of its group: q = turn (p - shift) are its own coordinates [m] of a point p."""
+
+    kind: int
+    solid: int  # its solid's number
+    turn: wp.mat33d
+    shift: wp.vec3d
+    half: wp.vec3d  # half extents of a box, axis of a capsule from its start [m]
+    radius: wp.float64  # of a sphere or capsule; of a mesh: its unit of length [m]
+    mesh: wp.uint64
+    low: wp.vec3d  # corners of a box around it, in the group's frame [m]
+    high: wp.vec3d
+
+
+@wp.struct
+class ThinGroup:
+    """Shapes with one motion: x = turn p + shift of a point p of the group, before and after a step."""
+
+    first: int  # of its shapes
+    end: int
+    turn_before: wp.mat33d
+    shift_before: wp.vec3d
+    turn: wp.mat33d
+    shift: wp.vec3d
+
+
+SHAPES, GROUPS = wp.array(dtype=ThinShape), wp.array(dtype=ThinGroup)
+
+
+@wp.func
+def hit_box(a: wp.vec3d, d: wp.vec3d, half: wp.vec3d):
+    """Return where a path a + t d enters a box, and the normal there."""
+    enter = -_MISS
+    leave = _MISS
+    axis = int(0)
+    for k in range(3):
+        size = wp.abs(d[k])
+        if size < _TINY:
+            if wp.abs(a[k]) > half[k]:
+                leave = -_MISS * _MISS
+        else:
+            middle = -a[k] / d[k]
+            reach = half[k] / size
+            if middle - reach > enter:
+                enter = middle - reach
+                axis = k
+            leave = wp.min(leave, middle + reach)
+    n = wp.vec3d()
+    n[axis] = -wp.sign(d[axis])
+    t = enter
+    if enter < _ZERO or enter > leave:
+        t = _MISS
+    return t, n
+
+
+@wp.func
+def hit_ball(a: wp.vec3d, d: wp.vec3d, radius: wp.float64):
+    """Return where a path enters a ball about the origin."""
+    t = _MISS
+    dd = wp.dot(d, d)
+    ad = wp.dot(a, d)
+    rest = ad * ad - dd * (wp.dot(a, a) - radius * radius)
+    if rest > _ZERO and dd > _TINY:
+        s = (-ad - wp.sqrt(rest)) / dd
+        if s >= _ZERO:
+            t = s
+    return t
+
+
+@wp.func
+def hit_capsule(a: wp.vec3d, d: wp.vec3d, axis: wp.vec3d, radius: wp.float64):
+    """Return where a path enters a capsule from the origin along an axis, and the normal there."""
+    t = hit_ball(a, d, radius)
+    t = wp.min(t, hit_ball(a - axis, d, radius))
+    size = wp.dot(axis, axis)
+    # the cylinder between: the parts of path and start across the axis
+    across = d - (wp.dot(d, axis) / size) * axis
+    start = a - (wp.dot(a, axis) / size) * axis
+    s = hit_ball(start, across, radius)
+    if s < t:
+        along = wp.dot(a + s * d, axis) / size
+        if along >= _ZERO and along <= _ONE:
+            t = s
+    at = a + t * d
+    n = at - wp.clamp(wp.dot(at, axis) / size, _ZERO, _ONE) * axis
+    return t, wp.normalize(n)
+
+
+@wp.func
+def hit_mesh(a: wp.vec3d, d: wp.vec3d, unit: wp.float64, mesh: wp.uint64):
+    """Return where a path meets a mesh from either side, and the normal there, against the path."""
+    t = _MISS
+    n = wp.vec3d()
+    length = wp.length(d)
+    if length > _ZERO:
+        way = wp.vec3(d / length)
+        query = wp.mesh_query_ray(mesh, wp.vec3(a / unit), way, float(length / unit))
+        if query.result:
+            t = wp.float64(query.t) * unit / length
+            n = wp.normalize(wp.vec3d(query.normal))
+            if wp.dot(n, d) > _ZERO:
+                n = -n
+    return t, n
+
+
+@wp.func
+def hit(shape: ThinShape, a: wp.vec3d, b: wp.vec3d):
+    """Return where the path from a to b enters a shape, from 0 to 1, `MISS` if it does not, and the normal there; of a group's frame."""
+    t = _MISS
+    n = wp.vec3d()
+    near = bool(True)
+    for k in range(3):
+        if wp.max(a[k], b[k]) < shape.low[k] or wp.min(a[k], b[k]) > shape.high[k]:
+            near = False
+    if near:
+        q = shape.turn * (a - shape.shift)
+        d = shape.turn * (b - a)
+        if shape.kind == BOX:
+            t, n = hit_box(q, d, shape.half)
+        elif shape.kind == SPHERE:
+            t = hit_ball(q, d, shape.radius)
+            n = wp.normalize(q + t * d)
+        elif shape.kind == CAPSULE:
+            t, n = hit_capsule(q, d, shape.half, shape.radius)
+        else:
+            t, n = hit_mesh(q, d, shape.radius, shape.mesh)
+        n = wp.transpose(shape.turn) * n
+    if t > _ONE:
+        t = _MISS
+    return t, n
+
+
+@wp.func
+def away(shape: ThinShape, p: wp.vec3d, reach: wp.float64):
+    """Return the distance of a point [m], and the direction away from the shape, if it is less than `reach`; else `reach`.
+
+    Of a mesh, which has no inside here, the distance is that to its surface.
+    """
+    n = wp.vec3d()
+    distance = reach
+    near = bool(True)
+    for k in range(3):
+        if p[k] < shape.low[k] - reach or p[k] > shape.high[k] + reach:
+            near = False
+    if near:
+        q = shape.turn * (p - shape.shift)
+        if shape.kind == BOX:
+            most = -wp.float64(ENDLESS)
+            axis = int(0)
+            beyond = wp.vec3d()
+            for k in range(3):
+                gap = wp.abs(q[k]) - shape.half[k]
+                if gap > most:
+                    most = gap
+                    axis = k
+                if gap > _ZERO:
+                    beyond[k] = gap * wp.sign(q[k])
+            distance = most
+            n[axis] = wp.sign(q[axis])
+            if most > _ZERO:
+                distance = wp.length(beyond)
+                n = beyond / distance
+        elif shape.kind == MESH:
+            query = wp.mesh_query_point_no_sign(shape.mesh, wp.vec3(q / shape.radius), float(reach / shape.radius))
+            if query.result:
+                n = q - wp.vec3d(wp.mesh_eval_position(shape.mesh, query.face, query.u, query.v)) * shape.radius
+                distance = wp.length(n)
+                n = wp.normalize(n)
+        else:
+            n = q
+            if shape.kind == CAPSULE:
+                n = q - wp.clamp(wp.dot(q, shape.half) / wp.dot(shape.half, shape.half), _ZERO, _ONE) * shape.half
+            distance = wp.length(n) - shape.radius
+            n = wp.normalize(n)
+        n = wp.transpose(shape.turn) * n
+    return distance, n
+
+
+@wp.func
+def in_plane(n: wp.vec3d, planes: int):
+    """Return a direction within the plane of a 2-D scene; 0 if it has none there."""
+    result = n
+    if planes == 1:
+        result = wp.normalize(wp.vec3d(n[0], n[1], _ZERO))
+    return result
+
+
+@wp.func
+def first_hit(shapes: SHAPES, first: int, end: int, a: wp.vec3d, b: wp.vec3d, but: int):
+    """Return where the path from a to b first enters one of some shapes, but for one of them, the normal there and the shape."""
+    t = _MISS
+    n = wp.vec3d()
+    which = int(-1)
+    for s in range(first, end):
+        if s != but:
+            at, normal = hit(shapes[s], a, b)
+            if at < t:
+                t = at
+                n = normal
+                which = s
+    return t, n, which
+
+
+@wp.func
+def clear_of(shapes: SHAPES, first: int, end: int, p: wp.vec3d, margin: wp.float64, planes: int, inside: bool):
+    """Return a point moved off the shapes that it is nearer to than `margin`, or only off those that it lies in; and whether it was."""
+    x = p
+    moved = bool(False)
+    for s in range(first, end):
+        d, n = away(shapes[s], x, margin)
+        limit = margin * wp.float64(0.999)
+        if inside:
+            limit = _ZERO
+        if d < limit:
+            x = x + (margin * wp.float64(1.001) - d) * in_plane(n, planes)
+            moved = True
+    return x, moved
+
+
+@wp.func
+def has_room(shapes: SHAPES, first: int, end: int, p: wp.vec3d, room: wp.float64):
+    """Return whether a point keeps a distance from some shapes."""
+    result = bool(True)
+    for s in range(first, end):
+        d, _n = away(shapes[s], p, room)
+        if d < room:
+            result = False
+    return result
+
+
+@wp.func
+def free_way(shapes: SHAPES, first: int, end: int, start: wp.vec3d, aim: wp.vec3d, margin: wp.float64, planes: int):
+    """Return where a particle ends that goes from `start` towards `aim` among shapes that rest, and whether one was in its way.
+
+    It slides on along the surface of what it meets, at a distance of `margin` [m]. Each piece of its way is looked at; where no more can
+    be done it stops at the end of the last one that was free.
+    """
+    x, met = clear_of(shapes, first, end, start, margin, planes, True)
+    for _again in range(3):
+        x, _more = clear_of(shapes, first, end, x, margin, planes, True)
+    target = aim
+    going = bool(True)
+    for _slide in range(SLIDES):
+        if going:
+            t, normal, which = first_hit(shapes, first, end, x, target, -1)
+            n = in_plane(normal, planes)
+            way = target - x
+            if which >= 0:
+                met = True
+                p = x + t * way + margin * n
+                blocked, _n, _which = first_hit(shapes, first, end, x + t * way, p, which)
+                room = wp.float64(ROOM) * margin
+                if blocked <= _ONE or not has_room(shapes, first, end, p, room) or wp.dot(n, n) < wp.float64(0.5):
+                    # the corner of two walls: as far as a place that rounding does not take into one of them
+                    s = wp.max(t - margin / wp.max(wp.length(way), _TINY), _ZERO)
+                    for _half in range(HALVINGS):
+                        if not has_room(shapes, first, end, x + s * way, room):
+                            s = wp.where(_half == HALVINGS - 1, _ZERO, wp.float64(0.5) * s)
+                    x = x + s * way
+                    going = False
+                else:
+                    rest = (_ONE - t) * way
+                    x = p
+                    target = x + rest - wp.min(wp.dot(rest, n), _ZERO) * n
+            else:
+                target, near = clear_of(shapes, first, end, target, margin, planes, False)
+                if near:
+                    met = True
+                else:
+                    x = target
+                    going = False
+    return x, met
+
+
+@wp.func
+def into_group(turn: wp.mat33d, shift: wp.vec3d, x: wp.vec3d):
+    """Return the place of a point in the frame of a group."""
+    return wp.transpose(turn) * (x - shift)
+
+
+@list_kernel(MODULE)
+def stop_kernel(
+    i, start: POINTS, position: POINTS, shapes: SHAPES, groups: GROUPS, still: int, margin: wp.float64, planes: int, low: wp.vec3d,
+    high: wp.vec3d,
+):  # fmt: skip
+    """Let no particle on its way from `start` to `position` pass a thin solid.
+
+    Within the frame of a group, from where its solids were to where they are, a straight way is looked at. It is exact for translations;
+    that of a particle beside a solid that turns differs by its bend from the true one, and its ends do not.
+    With `still` the solids have not moved. `low` and `high` are corners of what particles may not leave.
+    """
+    x = wp.vec3d(start[i])
+    y = wp.vec3d(position[i])
+    count = groups.shape[0]
+    agreed = int(0)  # groups that leave the end as it is, since it was last changed
+    changed = bool(False)
+    g = int(0)
+    for _look in range(ROUNDS * count):
+        if agreed < count:
+            group = groups[g]
+            turn = group.turn_before
+            shift = group.shift_before
+            if still != 0:
+                turn = group.turn
+                shift = group.shift
+            a = into_group(turn, shift, x)
+            b = into_group(group.turn, group.shift, y)
+            end, met = free_way(shapes, group.first, group.end, a, b, margin, planes)
+            agreed += 1
+            if met:
+                y = group.turn * end + group.shift
+                y = wp.vec3d(wp.clamp(y[0], low[0], high[0]), wp.clamp(y[1], low[1], high[1]), wp.clamp(y[2], low[2], high[2]))
+                changed = True
+                agreed = 1
+            g = (g + 1) % count
+    if changed:
+        if planes == 1:
+            y[2] = _ZERO
+        position[i] = wp.vec3(y)
+
+
+@list_kernel(MODULE)
+def room_kernel(i, points: POINTS, shapes: SHAPES, groups: GROUPS, reach: wp.float64, room: wp.array(dtype=wp.float64)):
+    """Measure the distance of points from the nearest thin solid [m], at most `reach`; from a mesh's surface on either side."""
+    x = wp.vec3d(points[i])
+    least = reach
+    for g in range(groups.shape[0]):
+        group = groups[g]
+        p = into_group(group.turn, group.shift, x)
+        for s in range(group.first, group.end):
+            d, _n = away(shapes[s], p, reach)
+            least = wp.min(least, d)
+    room[i] = least
