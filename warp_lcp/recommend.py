@@ -103,7 +103,7 @@ def recommend(problem: LCP, *, accuracy: float | str = "usual", budget: Budget |
     The rules depend on A and the bounds; `wl.solve` without a method uses them
     too. Sweeps are tried only on unsymmetric sparse matrices and if there is a budget; only
     symmetric matrices are factored, at most 2,048 rows of them. The rules come from timings of all
-    methods on one core of an AMD EPYC and hold for CPUs; docs "Choosing a method" gives the
+    methods on one core of an AMD EPYC and an Intel Xeon, and hold for CPUs; docs "Choosing a method" gives the
     decision list and its success rate.
 
     Args:

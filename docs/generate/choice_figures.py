@@ -12,7 +12,7 @@ from warp_lcp.rules import RULES
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "choosing-a-method.md"
-RESULTS = ROOT / "benchmarks" / "results" / "amd-epyc" / "choose.json"
+RESULTS = ROOT / "benchmarks" / "results" / "intel-xeon" / "choose.json"
 BEGIN = "<!-- figures: written by docs/generate/choice_figures.py -->\n"
 END = "<!-- end of figures -->"
 SHOWN = ("rule", "method", "problems", "solved", "x best (most)", "alternatives add")
