@@ -113,7 +113,7 @@ def passes() -> dict[str, tuple[Heard, dict[str, Any]]]:
         heard.append((Heard(bound, fields), bound.given))
         return bound
 
-    many = mock.patch.object(layout, "MANY_CELLS", 1)
+    many = mock.patch.multiple(layout, MANY_CELLS=1, SUMMED_CELLS=1)
     with many, mock.patch.object(RowPass, "bind_arguments", listening):
         stopping = wl.StoppingCriteria(rtol=0, max_iterations=3)
         for method, lower in ((wl.ProjectedMultigrid(), np.where(wall, 0.0, -np.inf)), (wl.ProjectedMultigrid(), -np.inf)):

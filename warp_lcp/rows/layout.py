@@ -22,6 +22,7 @@ CUDA_THREADS = 1 << 16  # threads of a flat reduction, several waves of a large 
 PLANES_A_THREAD = {"cpu": 1, "cuda": 16}
 # planes that a thread of a pass without sums takes on CUDA, where cells are more than enough for all threads: .8 of the time on an H200
 UNSUMMED_PLANES, MANY_CELLS = 4, 1 << 21
+SUMMED_CELLS = 1 << 24  # fewer cells: threads that take quads sum over as few planes, or they are too few to hide latencies; as computed
 
 
 @wp.struct
@@ -398,6 +399,7 @@ class Rows:
             ValueError: a count is negative or too large, or spans have another shape.
         """
         alone = UNSUMMED_PLANES if not slab and device.is_cuda and math.prod(counts) >= MANY_CELLS else 1
+        few = not slab and math.prod(counts) < SUMMED_CELLS
         slab, cells = slab or PLANES_A_THREAD["cuda" if device.is_cuda else "cpu"], cells or grain(counts[2], device) or 1
         if not 0 <= min(counts) <= max(counts) < 1 << 31:
             raise ValueError(f"rows: counts {tuple(counts)}: expected below 2^31")
@@ -409,6 +411,7 @@ class Rows:
         if not (quads and device.is_cuda and size < 1 << 31):
             return Rows(single if slab == alone else put(copy_of(single), {"slab": slab}), single, size, 0, device)
         by_quads = put(copy_of(single), {"grain": QUAD, "chunks": -(-counts[2] // QUAD)})
+        slab = UNSUMMED_PLANES if few else slab
         return Rows(put(copy_of(by_quads), {"slab": slab}), single, size, 0, device, quads=by_quads)
 
     def beside(self, other: "Rows", factors: tuple[int, int, int]) -> "Rows":
