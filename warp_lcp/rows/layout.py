@@ -7,6 +7,7 @@ conditionals are written as selections of values that are computed anyway.
 
 import functools
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, no_type_check
@@ -17,6 +18,7 @@ import warp as wp
 from warp_lcp.rows.fields import CPU_CHUNK, Layout, Padding
 
 QUAD = 4  # cells of a row that a thread takes at a time on CUDA
+BY_QUADS = os.environ.get("WARP_LCP_QUADS") != "0"  # else a cell: to compare the two on a GPU
 CUDA_THREADS = 1 << 16  # threads of a flat reduction, several waves of a large GPU
 # planes that a thread sums over: on CUDA, a place for the sums of every cell would cost more memory than the rest of a method
 PLANES_A_THREAD = {"cpu": 1, "cuda": 16}
@@ -408,7 +410,7 @@ class Rows:
         names = ("base", "s1", "s2", "planes", "rows", "nx")
         shared = dict(zip(names, (*first, *counts), strict=True)) | {"grain": cells, "chunks": -(-counts[2] // cells), "spans": spans}
         single = put(copy_of(BLANK), shared | {"slab": alone})
-        if not (quads and device.is_cuda and size < 1 << 31):
+        if not (quads and BY_QUADS and device.is_cuda and size < 1 << 31):
             return Rows(single if slab == alone else put(copy_of(single), {"slab": slab}), single, size, 0, device)
         by_quads = put(copy_of(single), {"grain": QUAD, "chunks": -(-counts[2] // QUAD)})
         slab = UNSUMMED_PLANES if few else slab
