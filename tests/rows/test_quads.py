@@ -16,7 +16,7 @@ from warp_lcp.rows.kernel_file import KernelFile
 from warp_lcp.rows.layout import copy_of, put
 
 EMULATED = pytest.mark.skipif("emulated_cuda" not in sys.modules, reason="the plugin emulated_cuda is not there")
-SEEDS = [1, 2, int(os.environ.get("SEED") or np.random.SeedSequence().generate_state(1)[0])]  # the last one is another each time
+SEEDS = [1, 2, int(os.environ.get("SEED", "3414447061"))]  # SEED=... draws other grids
 WIDTHS = (1, 2, 3, 4, 5, 7, 8, 11, 13, 18, 30)  # of rows: full quads alone, with some cells left, and none
 
 
