@@ -70,7 +70,7 @@ def test_fields_have_the_bits_of_a_thread_a_cell(seed, checked):
         wl.solve(problem, method, stopping=stopping)
     assert sorted(+otherwise) == [], f"SEED={seed}"
     names = {name.split()[0] for name in launched}
-    assert names >= {"cycle.sweep", "cycle.restrict", "projected_multigrid.assess", "residual.natural", "vectors.dot"}, f"SEED={seed}"
+    assert names >= {"cycle.sweep", "cycle.restrict", "projected_multigrid.assess", "residual.natural"}, f"SEED={seed}"
 
 
 HEADER = """// Kernels of a test.
@@ -108,7 +108,7 @@ def test_sums_of_whole_numbers_are_equal(seed, tmp_path):
         y = y if rng.random() < 0.5 else None
         cells = replace(rows, quads=None, summed=put(copy_of(rows.single), {"slab": 5}))
         assert rows.quads is not None
-        assert rows.places < cells.places or width == 1
+        assert rows.places < cells.places or width < 4
         found = []
         for there in (rows, cells):
             z, changed = wp.full_like(x, -7.0), wp.zeros(shape[:2], dtype=wp.uint8, device=device)
