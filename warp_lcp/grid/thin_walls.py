@@ -7,9 +7,10 @@ is: what crosses the surface stops there and slides on, at the true surface and 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import warp as wp
@@ -74,9 +75,12 @@ class ThinWalls:
         open_sides: of `warp_lcp.grid.sides.side_bits`: particles may leave the domain there.
 
     Attributes:
+        enabled: whether scenes have them: not yet on ranks, so they are asked for.
         numbers: of these solids.
         moves: whether one of them moves.
     """
+
+    enabled: ClassVar[bool] = os.environ.get("WARP_LCP_THIN_WALLS") == "1"
 
     def __init__(self, grid: StaggeredGrid, solids: Sequence[PlacedSolid], thin: Sequence[bool], open_sides: int) -> None:
         self.grid = grid

@@ -144,6 +144,8 @@ def make_thin_walls(
         open_sides: of `warp_lcp.grid.sides.side_bits`.
         crossing: only those that are too thin to cut cells, but for rigid bodies, which the pressure pushes by the cells that they cut.
     """
+    if not ThinWalls.enabled:
+        return None
     least = dict.fromkeys((False, True), THIN) | {True: max(THIN, scene.time.cfl + STRIDE_ROOM)}
     if crossing:
         least = dict.fromkeys(least, BARRIER[grid.dimension])
