@@ -40,13 +40,13 @@ def test_every_algorithm_and_figure_has_its_row():
 
 
 def test_the_page_shows_every_picture_of_the_suite():
-    kept = {path.name for path in (ROOT / "benchmarks" / "results" / "amd-epyc").glob("book-*.png")}
-    assert kept == set(re.findall(r"!\[[^]]*\]\(\.\./benchmarks/results/amd-epyc/(book-[\w-]+\.png)\)", TEXT))
+    kept = {path.name for path in (ROOT / "benchmarks" / "results" / "intel-xeon").glob("book-*.png")}
+    assert kept == set(re.findall(r"!\[[^]]*\]\(\.\./benchmarks/results/intel-xeon/(book-[\w-]+\.png)\)", TEXT))
     assert {path.name for path in PAGE.parent.glob("book-*.webp")} == set(re.findall(r"!\[[^]]*\]\((book-[\w-]+\.webp)\)", TEXT))
 
 
 def test_figures_are_those_of_the_results():
-    found = read_json(ROOT / "benchmarks" / "results" / "amd-epyc" / "book.json")
+    found = read_json(ROOT / "benchmarks" / "results" / "intel-xeon" / "book.json")
     table = TEXT.split("Final states by the book's tests")[1].split("This library's maps")[0]
     kind = ""
     for line in re.findall(r"^\| (?!---|problems)(.*) \|$", table, flags=re.M):
