@@ -139,7 +139,7 @@ def test_unscaled_steps_are_those_of_the_algorithm(kink, share, device):
 
 
 def test_unscaled_gradients_are_those_of_the_map():
-    """The projected gradient J'f itself, by which gradient descent goes and minima are told."""
+    """The projected gradient is J'f: the direction of gradient descent, and 0 at a minimum."""
     A, b, lower, upper, x0 = unlike_rows(4207)
     A = A + np.diag(np.arange(9) / 2)
     plain = PlainMap("fischer", A, b, lower, upper)

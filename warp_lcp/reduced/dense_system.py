@@ -59,7 +59,7 @@ class DenseSystem:
 
 
 def _solve_or_least_squares(block: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """Return block^-1 r; where the block looks singular even in units in which its rows are alike, the least-squares solution there."""
+    """Return block^-1 r, or the least-squares solution of the equilibrated block if that is singular."""
     solution = factored(block, r)
     if solution is None:
         S = equilibration(block)

@@ -1,0 +1,57 @@
+"""Problems in another form: their solutions, starts and bounds are those of the given one, by a residual from NumPy."""
+
+import numpy as np
+import pytest
+import scipy.sparse
+
+import warp_lcp as wl
+from oracle import natural_residual
+from warp_lcp.operators import renumbering
+from warp_lcp.operators.restated import as_dense, as_grid, as_sparse, renumbered
+
+
+def laplacian(m):
+    T = scipy.sparse.diags_array([-1.0, 2.1, -1.0], offsets=[-1, 0, 1], shape=(m, m))
+    eye = scipy.sparse.eye_array(m)
+    return scipy.sparse.csr_array(scipy.sparse.kron(eye, T) + scipy.sparse.kron(T, eye))
+
+
+def small(seed, *, sparse):
+    A = laplacian(6) + scipy.sparse.diags_array(np.random.default_rng(seed).uniform(0, 1, 36))
+    return scipy.sparse.csr_array(A) if sparse else A.toarray()
+
+
+def shuffled(seed):
+    A, order = laplacian(48), np.random.default_rng(seed).permutation(48 * 48)
+    return scipy.sparse.csr_array(A[order][:, order])
+
+
+FORMS = {
+    "dense": (as_dense, lambda seed: small(seed, sparse=True)),
+    "sparse": (as_sparse, lambda seed: small(seed, sparse=False)),
+    "grid": (as_grid, lambda seed: laplacian(48)),
+    "renumbered": (renumbered, shuffled),
+}
+
+
+@pytest.mark.parametrize("seed", [5101, 5102])
+@pytest.mark.parametrize("name", FORMS)
+def test_solutions_and_starts_are_those_of_the_given_problem(name, seed, monkeypatch):
+    monkeypatch.setattr(renumbering, "SMALLEST", 100)
+    form, make = FORMS[name]
+    A, rng = make(seed), np.random.default_rng(seed)
+    n, dense = A.shape[0], A.toarray() if scipy.sparse.issparse(A) else A
+    b, low = rng.standard_normal(n), -rng.random(n)
+    high = low + rng.uniform(0.1, 2, n)
+    given = wl.LCP(A, b, low, high)
+    restated = form(given)
+    assert restated is not None
+    stopping = wl.StoppingCriteria(rtol=1e-9, max_iterations=200)
+    found = restated.result(wl.solve(restated.problem, wl.MinimumMapNewton(precision="double"), stopping=stopping))
+    x = found.x.numpy()
+    assert found.problem is given
+    assert x.shape == (n,)
+    first = natural_residual(dense, b, low, high, np.clip(np.zeros(n), low, high))
+    assert natural_residual(dense, b, low, high, x) <= 1.01e-9 * first
+    again = wl.solve(restated.problem, "psor", x0=restated.start(x), stopping=wl.StoppingCriteria(rtol=1e-8))
+    assert again.iterations == 0
