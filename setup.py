@@ -11,10 +11,14 @@ LINKED = ["fluids", "granular", "benchmarks"]
 RESULTS = "benchmarks.results*"
 
 unlinked = [name for name in LINKED if not Path("warp_lcp", name).is_dir()]
-beside = find_namespace_packages(include=[pattern for name in unlinked for pattern in (name, f"{name}.*")], exclude=[RESULTS])
+beside = find_namespace_packages(
+    include=[pattern for name in unlinked for pattern in (name, f"{name}.*")], exclude=[RESULTS]
+)
 setup(
     packages=[
-        *find_namespace_packages(include=["warp_lcp", "warp_lcp.*"], exclude=[f"warp_lcp.{RESULTS}"]),
+        *find_namespace_packages(
+            include=["warp_lcp", "warp_lcp.*"], exclude=[f"warp_lcp.{RESULTS}"]
+        ),
         *(f"warp_lcp.{name}" for name in beside),
     ],
     package_dir={f"warp_lcp.{name}": name for name in unlinked},

@@ -1,7 +1,7 @@
 """Build the wheel from a checkout, from its source distribution and from a checkout without symbolic links, as git makes it on Windows.
 
-All three must hold the sources, headers and tables of `warp_lcp`, and nothing else. Run in the repository by a Python with setuptools:
-`python .ci/wheel_contents.py FOLDER`; the wheel goes there.
+All three must hold the sources, headers and tables of `warp_lcp`, and nothing else. Run in the
+repository by a Python with setuptools: `python .ci/wheel_contents.py FOLDER`; the wheel goes there.
 """
 
 import shutil
@@ -17,8 +17,12 @@ SHIPPED = (".py", ".h", ".toml", ".html", ".typed")
 
 def tracked() -> list[Path]:
     """Return the files that git knows and the working tree has."""
-    names = subprocess.run(["git", "ls-files", "-z"], check=True, capture_output=True, text=True).stdout.split("\0")
-    return [Path(name) for name in names if name and (Path(name).is_file() or Path(name).is_symlink())]
+    names = subprocess.run(
+        ["git", "ls-files", "-z"], check=True, capture_output=True, text=True
+    ).stdout.split("\0")
+    return [
+        Path(name) for name in names if name and (Path(name).is_file() or Path(name).is_symlink())
+    ]
 
 
 def copied(tree: Path, *, links: bool) -> Path:
@@ -36,7 +40,9 @@ def built(tree: Path, kind: str, folder: Path) -> Path:
     """Return the wheel or sdist of a tree, made in a new folder."""
     folder.mkdir()
     code = f"from setuptools import build_meta; build_meta.build_{kind}({str(folder.resolve())!r})"
-    done = subprocess.run([sys.executable, "-c", code], cwd=tree, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tree, capture_output=True, text=True, check=False
+    )
     if done.returncode:
         sys.exit(f"{kind} of {tree}: {done.stderr}")
     return next(folder.iterdir())
@@ -46,19 +52,33 @@ def main(folder: Path) -> None:
     """Compare what three wheels hold with what git tracks."""
     expected = set()
     for name in tracked():
-        if name.suffix in SHIPPED and name.parts[0] in ("warp_lcp", *LINKED) and name.parts[:2] != ("benchmarks", "results"):
+        if (
+            name.suffix in SHIPPED
+            and name.parts[0] in ("warp_lcp", *LINKED)
+            and name.parts[:2] != ("benchmarks", "results")
+        ):
             expected.add(str(name if name.parts[0] == "warp_lcp" else "warp_lcp" / name))
     checkout = copied(folder / "checkout", links=True)
     with tarfile.open(built(checkout, "sdist", folder / "sdist")) as archive:
         archive.extractall(folder / "unpacked", filter="data")
-    trees = {"checkout": checkout, "sdist": next((folder / "unpacked").iterdir()), "unlinked": copied(folder / "unlinked", links=False)}
+    trees = {
+        "checkout": checkout,
+        "sdist": next((folder / "unpacked").iterdir()),
+        "unlinked": copied(folder / "unlinked", links=False),
+    }
     for kind, tree in trees.items():
         wheel = built(tree, "wheel", folder / f"wheel-{kind}")
         with ZipFile(wheel) as archive:
             found = {name for name in archive.namelist() if ".dist-info/" not in name}
         if found != expected:
-            sys.exit(f"the wheel of the {kind} lacks {sorted(expected - found)} and has {sorted(found - expected)} besides")
-    print(f"{wheel.name}: {len(found)} files, all of warp_lcp; the same of a source distribution and without symbolic links")
+            sys.exit(
+                f"the wheel of the {kind} lacks {sorted(expected - found)} and has "
+                f"{sorted(found - expected)} besides"
+            )
+    print(
+        f"{wheel.name}: {len(found)} files, all of warp_lcp; the same of a source distribution and "
+        "without symbolic links"
+    )
 
 
 main(Path(sys.argv[1]))

@@ -1,4 +1,5 @@
 """Benchmarks: what is measured, and the results kept.
 
-`warp-lcp bench SUITE` finds the suites by the entry-point group `warp_lcp.benchmarks` and runs each in a process of its own.
+`warp-lcp bench SUITE` finds the suites by the entry-point group `warp_lcp.benchmarks` and runs each
+in a process of its own.
 """

@@ -11,10 +11,28 @@ from pathlib import Path
 from warp_lcp.benchmarks.harness.timing import Options
 
 SUITES = (
-    "kernels", "solvers", "choose", "published", "scaling", "tank", "threads", "devices",
-    "domains", "ranks", "peers", "sparse", "run", "host", "sand", "contacts", "book", "models",
-    "tradeoff", "validation", "extremes",
-)  # fmt: skip
+    "kernels",
+    "solvers",
+    "choose",
+    "published",
+    "scaling",
+    "tank",
+    "threads",
+    "devices",
+    "domains",
+    "ranks",
+    "peers",
+    "sparse",
+    "run",
+    "host",
+    "sand",
+    "contacts",
+    "book",
+    "models",
+    "tradeoff",
+    "validation",
+    "extremes",
+)
 
 
 def main() -> None:
@@ -32,10 +50,19 @@ def main() -> None:
         importlib.import_module(f"warp_lcp.benchmarks.{given.suite}"),
         importlib.import_module("warp_lcp.benchmarks.harness.report"),
     )
-    options = Options(given.device, tuple(given.size), given.repeat, lambda text: sys.stderr.write(f"{text}\n"), given.scene, given.seed)
+    options = Options(
+        given.device,
+        tuple(given.size),
+        given.repeat,
+        lambda text: sys.stderr.write(f"{text}\n"),
+        given.scene,
+        given.seed,
+    )
     given.out.mkdir(parents=True, exist_ok=True)
     gc.collect()
-    gc.freeze()  # searches for arrays (`machine.array_bytes`) pass over the hundreds of thousands of objects that imports have made
+    # searches for arrays (`machine.array_bytes`) pass over the hundreds of thousands of objects
+    # that imports have made
+    gc.freeze()
     try:
         results = suite.measure(options, given.out)
     except MemoryError as error:

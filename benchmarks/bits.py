@@ -1,6 +1,7 @@
 """Digests of what solvers compute on grids, to the last bit: `python -m warp_lcp.benchmarks.bits --out before.txt`, then `diff`.
 
-A line a solve: the problem, the method, its status, steps, a digest of x and one of the residuals of all iterates; or what it refuses.
+A line a solve: the problem, the method, its status, steps, a digest of x and one of the residuals
+of all iterates; or what it refuses.
 """
 
 from __future__ import annotations
@@ -52,7 +53,8 @@ OTHER_SETTINGS: dict[str, tuple[dict[str, Any], ...]] = {  # that take other pat
     "psor": ({"direction": "forward"}, {"direction": "symmetric", "omega": 1.5}),
     "subspace-minimization": ({"sweeps": 1},),
 }
-SCENES = {"dam-break": (24, 0.1), "floating-bodies": (20, 0.1), "column-collapse": (16, 0.02)}  # resolution, seconds
+# resolution, seconds
+SCENES = {"dam-break": (24, 0.1), "floating-bodies": (20, 0.1), "column-collapse": (16, 0.02)}
 
 
 SEED = 0  # added to those of all problems
@@ -84,13 +86,17 @@ def faces_of(shape: tuple[int, ...]) -> dict[str, dict[str, Any]]:
     """Return coefficients of each form: one, a number an axis, arrays."""
     rng, names = generator(31), "xyz"[: len(shape)]
     axes = enumerate(reversed(names))
-    arrays = {f"face_{a}": 0.2 + rng.random([n + (i == j) for j, n in enumerate(shape)]) for i, a in axes}
+    arrays = {
+        f"face_{a}": 0.2 + rng.random([n + (i == j) for j, n in enumerate(shape)]) for i, a in axes
+    }
     return {"unit": {}, "number": {"face_y": 3.0}, "arrays": arrays}
 
 
 def small_solves() -> Iterator[tuple[str, wl.LCP, Any, Any]]:
     """Yield name, problem, method and start on small random sets of cells: all forms of storage, sides and bounds."""
-    for (name, shape), form, real in itertools.product(SHAPES.items(), ("unit", "number", "arrays"), (wp.float32, wp.float64)):
+    for (name, shape), form, real in itertools.product(
+        SHAPES.items(), ("unit", "number", "arrays"), (wp.float32, wp.float64)
+    ):
         rng = generator(97)
         cells = rng.choice([wl.AIR, wl.FLUID, wl.SOLID], size=shape, p=[0.1, 0.8, 0.1])
         b, faces, bounds = rng.standard_normal(shape), faces_of(shape)[form], bounds_of(shape)
@@ -105,9 +111,24 @@ def small_solves() -> Iterator[tuple[str, wl.LCP, Any, Any]]:
                 if kind in ("coded", "fields"):
                     yield f"{what} warm", wl.LCP(A, b, *sides), method(precision=precision), start
         for periodic in ((True,) * len(shape), (True,) + (False,) * (len(shape) - 1)):
-            A = wl.GridPoisson(cells, device="cpu", dtype=real, periodic=periodic, **({} if form == "arrays" else faces))
-            for made in (wl.ProjectedMultigrid(), wl.MinimumMapNewton(), wl.MinimumMapNewton(precision="single")):
-                yield f"{name} {form} {real.__name__} periodic {periodic}", wl.LCP(A, b, *bounds["coded twice"]), made, None
+            A = wl.GridPoisson(
+                cells,
+                device="cpu",
+                dtype=real,
+                periodic=periodic,
+                **({} if form == "arrays" else faces),
+            )
+            for made in (
+                wl.ProjectedMultigrid(),
+                wl.MinimumMapNewton(),
+                wl.MinimumMapNewton(precision="single"),
+            ):
+                yield (
+                    f"{name} {form} {real.__name__} periodic {periodic}",
+                    wl.LCP(A, b, *bounds["coded twice"]),
+                    made,
+                    None,
+                )
 
 
 def other_solves() -> Iterator[tuple[str, wl.LCP, Any, Any]]:
@@ -117,15 +138,29 @@ def other_solves() -> Iterator[tuple[str, wl.LCP, Any, Any]]:
     columns = np.zeros((*shape, 2))
     columns[2, 2:5, 3:7] = generator(7).standard_normal((3, 4, 2))
     for precision in PRECISIONS[:2]:
-        for method in (wl.ProjectedMultigrid, wl.MinimumMapNewton, MPRGP, wl.InteriorPoint, wl.FischerNewton):
+        for method in (
+            wl.ProjectedMultigrid,
+            wl.MinimumMapNewton,
+            MPRGP,
+            wl.InteriorPoint,
+            wl.FischerNewton,
+        ):
             made = method(precision=precision)
             for kind in ("walls", "everywhere", "linear"):
                 yield f"splash 32 {kind}", splash(32).lcp(kind, device="cpu"), made, None
             yield "cut splash 32", cut_cells(splash(32)).lcp("walls", device="cpu"), made, None
-            yield "closed box", wl.LCP(wl.GridPoisson(box, device="cpu"), b - b.mean(), 0.0), made, None
+            yield (
+                "closed box",
+                wl.LCP(wl.GridPoisson(box, device="cpu"), b - b.mean(), 0.0),
+                made,
+                None,
+            )
         low = wl.LowRankOperator(columns, [100.0, 100.0], device="cpu")
         A = wl.SumOperator(wl.GridPoisson(np.where(b > 1.5, wl.AIR, wl.FLUID), device="cpu"), low)
-        for coupled in (wl.ProjectedMultigrid(precision=precision), wl.MinimumMapNewton(precision=precision)):
+        for coupled in (
+            wl.ProjectedMultigrid(precision=precision),
+            wl.MinimumMapNewton(precision=precision),
+        ):
             yield "low rank", wl.LCP(A, b, 0.0), coupled, None
     for sweeping in (wl.ProjectedSOR(), wl.NNCG()):
         yield "splash 32 walls", splash(32).lcp("walls", device="cpu"), sweeping, None
@@ -133,12 +168,16 @@ def other_solves() -> Iterator[tuple[str, wl.LCP, Any, Any]]:
 
 def method_solves() -> Iterator[tuple[str, wl.LCP, Any, Any]]:
     """Yield every method on grids, matrices and user-made operators that are small enough for it, with bounds of each kind."""
-    for (what, make, shape), kind in itertools.product(_operators(), ("none", "number", "coded", "fields")):
+    for (what, make, shape), kind in itertools.product(
+        _operators(), ("none", "number", "coded", "fields")
+    ):
         rng = generator(577)
         b, start = rng.standard_normal(shape), rng.standard_normal(shape)
         sides = bounds_of(shape)[kind]
         for name, method in METHODS.items():
-            if what.split()[0] not in families(method) or math.prod(shape) > getattr(method, "most_unknowns", math.inf):
+            if what.split()[0] not in families(method) or math.prod(shape) > getattr(
+                method, "most_unknowns", math.inf
+            ):
                 continue
             for number, made in enumerate(_variants(name, method)):
                 yield f"{what} {kind} {number}", wl.LCP(make(), b, *sides), made, None
@@ -151,13 +190,30 @@ def _operators() -> Iterator[tuple[str, Any, tuple[int, ...]]]:
     factor = rng.standard_normal((40, 40))
     matrix = factor @ factor.T + 4 * np.eye(40)
     cells = rng.choice([wl.AIR, wl.FLUID, wl.SOLID], size=(7, 9, 13), p=[0.1, 0.8, 0.1])
-    flat, arrays = rng.choice([wl.AIR, wl.FLUID], size=(15, 22), p=[0.1, 0.9]), faces_of((7, 9, 13))["arrays"]
-    laplacian = scipy.sparse.diags_array([-1.0, -1.0, 4.2, -1.0, -1.0], offsets=[-20, -1, 0, 1, 20], shape=(400, 400)).tocsr()
-    yield "grid 3-D", lambda: wl.GridPoisson(cells, device="cpu", dtype=wp.float64, **arrays), (7, 9, 13)
+    flat, arrays = (
+        rng.choice([wl.AIR, wl.FLUID], size=(15, 22), p=[0.1, 0.9]),
+        faces_of((7, 9, 13))["arrays"],
+    )
+    laplacian = scipy.sparse.diags_array(
+        [-1.0, -1.0, 4.2, -1.0, -1.0], offsets=[-20, -1, 0, 1, 20], shape=(400, 400)
+    ).tocsr()
+    yield (
+        "grid 3-D",
+        lambda: wl.GridPoisson(cells, device="cpu", dtype=wp.float64, **arrays),
+        (7, 9, 13),
+    )
     yield "grid 2-D", lambda: wl.GridPoisson(flat, device="cpu"), (15, 22)
-    yield "grid periodic", lambda: wl.GridPoisson(flat, device="cpu", periodic=(True, False)), (15, 22)
+    yield (
+        "grid periodic",
+        lambda: wl.GridPoisson(flat, device="cpu", periodic=(True, False)),
+        (15, 22),
+    )
     yield "sparse", lambda: wl.SparseOperator(laplacian, device="cpu"), (400,)
-    yield "sparse float64", lambda: wl.SparseOperator(laplacian, device="cpu", dtype=wp.float64), (400,)
+    yield (
+        "sparse float64",
+        lambda: wl.SparseOperator(laplacian, device="cpu", dtype=wp.float64),
+        (400,),
+    )
     yield "dense", lambda: wl.DenseOperator(matrix, device="cpu"), (40,)
     yield "dense float64", lambda: wl.DenseOperator(matrix, device="cpu", dtype=wp.float64), (40,)
     yield "dense tiny", lambda: wl.DenseOperator(matrix[:3, :3], device="cpu"), (3,)
@@ -179,14 +235,20 @@ def line(what: str, problem: wl.LCP, method: Any, start: Any) -> str:
         return f"{what}, {called}: {type(error).__name__}: {' '.join(str(error).split())}"
     steps = "".join(record.step[0] for record in result.history)
     norms = np.array([record.residual for record in result.history])
-    return f"{what}, {called}: {result.status.name} {steps} {_digest(result.x.numpy())} {_digest(norms)}"
+    return (
+        f"{what}, {called}: {result.status.name} {steps} {_digest(result.x.numpy())} "
+        f"{_digest(norms)}"
+    )
 
 
 def frames(name: str, resolution: int, duration: float) -> str:
     """Run a scene, and return a line with a digest of its frames."""
     with tempfile.TemporaryDirectory() as out:
         scene = load_scene(name, [f"domain.resolution={resolution}", f"time.duration={duration}"])
-        run_scene(RunRequest(scene=scene, out=Path(out) / "run", device="cpu"), observer=Lines(Console(quiet=True)))
+        run_scene(
+            RunRequest(scene=scene, out=Path(out) / "run", device="cpu"),
+            observer=Lines(Console(quiet=True)),
+        )
         found = sorted(p for p in Path(out, "run", "frames").rglob("*") if p.is_file())
         return f"{name}: {len(found)} files {_digest(*(p.read_bytes() for p in found))}"
 
@@ -203,11 +265,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m warp_lcp.benchmarks.bits", description=__doc__)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--part", choices=PARTS, action="append")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the random problems (scenes and splashes have none)")
+    parser.add_argument(
+        "--seed",
+        type=int,
+        default=0,
+        help="seed of the random problems (scenes and splashes have none)",
+    )
     args = parser.parse_args()
     globals()["SEED"] = args.seed
     parts, lines = args.part or PARTS, list[str]()
-    for part, solves in (("small", small_solves), ("other", other_solves), ("methods", method_solves)):
+    for part, solves in (
+        ("small", small_solves),
+        ("other", other_solves),
+        ("methods", method_solves),
+    ):
         if part in parts:
             lines += [line(*solve) for solve in solves()]
     if "frames" in parts:

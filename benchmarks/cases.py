@@ -18,7 +18,8 @@ from warp_lcp.benchmarks.harness.timing import Figure
 from warp_lcp.benchmarks.problems import Splash, warm_changes
 
 RTOL = 1e-6
-# a method alone may creep for hundreds of steps, and its residual rise for more than the usual patience
+# a method alone may creep for hundreds of steps, and its residual rise for more than the usual
+# patience
 STOPPING = wl.StoppingCriteria(rtol=RTOL, max_iterations=1000, patience=1000)
 TOLERANCES = (1e-4, 1e-6, 1e-8)
 MIDST = 3  # iterations after which a method has made all of its buffers
@@ -100,12 +101,21 @@ class Case:
     def _solves(self) -> Iterator[tuple[float, int]]:
         """Yield seconds and iterations of a cold solve, a warm solve, and so on, in place and with one workspace."""
         problem, b = self._in_place()
-        work, fields = self.solver.init(problem), [self._stored(v) for v in warm_changes(self.scene)]
+        work, fields = (
+            self.solver.init(problem),
+            [self._stored(v) for v in warm_changes(self.scene)],
+        )
         start, turn = wp.zeros_like(b), 0
         while True:
             for warm in (False, True):
                 begun = time.perf_counter()
-                result = wl.solve(problem, self.solver, stopping=STOPPING, x0=start if warm else None, workspace=work)
+                result = wl.solve(
+                    problem,
+                    self.solver,
+                    stopping=STOPPING,
+                    x0=start if warm else None,
+                    workspace=work,
+                )
                 wp.synchronize_device(self.device)
                 yield time.perf_counter() - begun, result.iterations
                 if not warm:
@@ -133,8 +143,13 @@ class Case:
         """Solve cold to the tightest tolerance and keep the history; set-up is added later."""
         problem = self.scene.lcp(self.bounds, device=self.device)
         work = self.solver.init(problem)
-        result = wl.solve(problem, self.solver, stopping=wl.StoppingCriteria(rtol=TOLERANCES[-1]), workspace=work)
-        self.history, reference = result.history, result.residual / result.relative_residual if result.relative_residual else 1.0
+        result = wl.solve(
+            problem, self.solver, stopping=wl.StoppingCriteria(rtol=TOLERANCES[-1]), workspace=work
+        )
+        self.history, reference = (
+            result.history,
+            result.residual / result.relative_residual if result.relative_residual else 1.0,
+        )
         for tolerance in TOLERANCES:
             reached = [r for r in self.history if r.residual <= tolerance * reference]
             if reached:
@@ -143,7 +158,10 @@ class Case:
     def figures(self) -> dict[str, Figure]:
         """Return what was measured."""
         figures = {name: Figure.of(times, "s") for name, times in self.samples.items()}
-        figures |= {name: Figure(value, "B" if "per_cell" in name else "") for name, value in self.counts.items()}
+        figures |= {
+            name: Figure(value, "B" if "per_cell" in name else "")
+            for name, value in self.counts.items()
+        }
         return figures
 
     def _in_place(self) -> tuple[wl.LCP, wp.array[Any]]:

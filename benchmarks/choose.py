@@ -1,8 +1,10 @@
 """Suite `choose`: rules of `wl.recommend` against every method that takes a problem, on random problems by kind and seed.
 
-Each method solves each problem cold, set-up included, to the same relative residual. The methods of a problem take turns. A rule is
-judged by the share of its problems that its method solves, by that method's time over the best method's, and by what its alternatives
-add. `docs/generate/choice_figures.py` writes the table of docs/choosing-a-method.md from the kept results.
+Each method solves each problem cold, set-up included, to the same relative residual. The methods of
+a problem take turns. A rule is judged by the share of its problems that its method solves, by that
+method's time over the best method's, and by what its alternatives add.
+`docs/generate/choice_figures.py` writes the table of docs/choosing-a-method.md from the kept
+results.
 """
 
 from __future__ import annotations
@@ -26,8 +28,10 @@ SEED = 860  # first one; tests draw other seeds
 RTOL = 1e-6
 LONGEST = 4.0  # [s] of one trial
 ROUNDS = 2  # samples of each method after its first trial, which loads kernels
-NEAR, BRIEF = 4.0, 5e-3  # a method slower than NEAR times the fastest and than BRIEF [s] keeps its first trial's time
-SLOWER, NEGLIGIBLE = 2.0, 5e-4  # a choice is right within this factor of the best method, or within so many seconds
+# a method slower than NEAR times the fastest and than BRIEF [s] keeps its first trial's time
+NEAR, BRIEF = 4.0, 5e-3
+# a choice is right within this factor of the best method, or within so many seconds
+SLOWER, NEGLIGIBLE = 2.0, 5e-4
 BUDGETS = (5, 20, 100)  # steps
 DEFAULT = "default"  # `wl.solve` without a method: the rule's method, then its alternatives
 
@@ -59,7 +63,9 @@ def measure(options: Options, out: Path) -> Results:
         for number in range(seed, seed + options.repeat):
             records.append(problem_record(f"{kind} {number}", draw(kind, number), options.device))
         options.say(f"choose, {kind}: {_summary(records[-options.repeat :])}")
-    return Results(records, [rule_table(records[1:]), kind_table(records[1:]), budget_table(records[1:])])
+    return Results(
+        records, [rule_table(records[1:]), kind_table(records[1:]), budget_table(records[1:])]
+    )
 
 
 def problem_record(name: str, problem: wl.LCP, device: str) -> Record:
@@ -68,7 +74,11 @@ def problem_record(name: str, problem: wl.LCP, device: str) -> Record:
     trials = try_methods(problem, advice, device)
     t = advice.traits
     figures = {"unknowns": Figure(t.unknowns)}
-    figures |= {method: Figure.least(trial.seconds, "s") for method, trial in trials.items() if trial.seconds}
+    figures |= {
+        method: Figure.least(trial.seconds, "s")
+        for method, trial in trials.items()
+        if trial.seconds
+    }
     facts = {
         "kind": name.rpartition(" ")[0],
         "rule": rule_number(advice),
@@ -95,8 +105,14 @@ def try_methods(problem: wl.LCP, advice: Recommendation, device: str) -> dict[st
     t = advice.traits
 
     def solver(name: str) -> Callable[[], wl.SolveResult]:
-        limit = advice.stopping.max_iterations if name == advice.name else steps_allowed(name, t.unknowns)
-        stopping = wl.StoppingCriteria(rtol=RTOL, max_iterations=limit, patience=max(30, limit // 10), max_seconds=LONGEST)
+        limit = (
+            advice.stopping.max_iterations
+            if name == advice.name
+            else steps_allowed(name, t.unknowns)
+        )
+        stopping = wl.StoppingCriteria(
+            rtol=RTOL, max_iterations=limit, patience=max(30, limit // 10), max_seconds=LONGEST
+        )
         return lambda: wl.solve(problem, method_for(name, t), stopping=stopping)
 
     solvers = {name: solver(name) for name in t.able}
@@ -107,7 +123,11 @@ def try_methods(problem: wl.LCP, advice: Recommendation, device: str) -> dict[st
     solved = [trial.best for trial in trials.values() if trial.solved]
     slowest = max(NEAR * min(solved, default=0.0), BRIEF)
     kept = {DEFAULT, advice.name}
-    again = [name for name, trial in trials.items() if trial.solved and (trial.best <= slowest or name in kept)]
+    again = [
+        name
+        for name, trial in trials.items()
+        if trial.solved and (trial.best <= slowest or name in kept)
+    ]
     for name in again:
         trials[name].seconds.clear()  # the first trial may have loaded kernels
     for _ in range(ROUNDS):
@@ -133,15 +153,27 @@ def budget_choices(problem: wl.LCP, advice: Recommendation) -> dict[str, str]:
     """Return the method for each budget of steps, and for the memory that sweeps take."""
     if advice.traits.affine:  # one method whatever the budget
         return {}
-    found = {f"{steps} steps": wl.recommend(problem, accuracy=RTOL, budget=wl.Budget(iterations=steps)).name for steps in BUDGETS}
+    found = {
+        f"{steps} steps": wl.recommend(
+            problem, accuracy=RTOL, budget=wl.Budget(iterations=steps)
+        ).name
+        for steps in BUDGETS
+    }
     lean = memory_of("psor", advice.traits)
-    return {**found, "memory of a sweep": wl.recommend(problem, accuracy=RTOL, budget=wl.Budget(bytes=lean)).name}
+    return {
+        **found,
+        "memory of a sweep": wl.recommend(
+            problem, accuracy=RTOL, budget=wl.Budget(bytes=lean)
+        ).name,
+    }
 
 
 def solved_by(record: Record) -> dict[str, float]:
     """Return the seconds of the methods that solved a problem, the default apart."""
     status: Mapping[str, str] = record.facts["status"]
-    names = (name for name, s in status.items() if s == wl.SolveStatus.CONVERGED.name and name != DEFAULT)
+    names = (
+        name for name, s in status.items() if s == wl.SolveStatus.CONVERGED.name and name != DEFAULT
+    )
     return {name: record.figures[name].value for name in names}
 
 
@@ -171,8 +203,12 @@ def rule_row(number: int, records: Sequence[Record]) -> list[str]:
         return [str(number), f"`{method}`", "0", *[""] * 5]
     ratios = [x for r in own if (x := over_best(r, method)) is not None]
     failed = [r for r in own if over_best(r, method) is None]
-    fastest = Counter(min(found, key=lambda name: found[name]) for r in own if (found := solved_by(r)))
-    added = Counter(next((a for a in r.facts["alternatives"] if a in solved_by(r)), "none") for r in failed)
+    fastest = Counter(
+        min(found, key=lambda name: found[name]) for r in own if (found := solved_by(r))
+    )
+    added = Counter(
+        next((a for a in r.facts["alternatives"] if a in solved_by(r)), "none") for r in failed
+    )
     default = sum(r.facts["status"][DEFAULT] == wl.SolveStatus.CONVERGED.name for r in own)
     return [
         str(number),
@@ -181,21 +217,35 @@ def rule_row(number: int, records: Sequence[Record]) -> list[str]:
         str(len(ratios)),
         f"{statistics.median(ratios):.2f} ({max(ratios):.1f})" if ratios else "",
         ", ".join(f"`{name}` {n}" for name, n in fastest.most_common(3)),
-        ", ".join(f"`{name}` {n}" if name != "none" else f"none {n}" for name, n in added.most_common()),
+        ", ".join(
+            f"`{name}` {n}" if name != "none" else f"none {n}" for name, n in added.most_common()
+        ),
         str(default),
     ]
 
 
-RULE_COLUMNS = ["rule", "method", "problems", "solved", "x best (most)", "best", "alternatives add", "solved by default"]
+RULE_COLUMNS = [
+    "rule",
+    "method",
+    "problems",
+    "solved",
+    "x best (most)",
+    "best",
+    "alternatives add",
+    "solved by default",
+]
 
 
 def rule_table(records: Sequence[Record]) -> Table:
     """Return a row for each rule."""
     rows = [rule_row(number, records) for number in range(1, len(RULES) + 1)]
     remark = (
-        f"To {RTOL:g}, cold, set-up included, at most {LONGEST:g} s a solve. x best: median time of the rule's method over the fastest "
-        "method's (worst). Best: how often each method was the fastest. Alternatives add: of problems that the rule's method left, the "
-        "first alternative that solves them. By default: rule's method and alternatives, no limit of time."
+        f"To {RTOL:g}, cold, set-up included, at most {LONGEST:g} s a solve. x best: median time "
+        "of the rule's method over the fastest "
+        "method's (worst). Best: how often each method was the fastest. Alternatives add: of "
+        "problems that the rule's method left, the "
+        "first alternative that solves them. By default: rule's method and alternatives, no limit "
+        "of time."
     )
     return Table("Rules", RULE_COLUMNS, rows, remark)
 
@@ -208,10 +258,21 @@ def kind_table(records: Sequence[Record]) -> Table:
         ratios = [x for r in own if (x := over_best(r, DEFAULT)) is not None]
         rules = Counter(r.facts["rule"] for r in own)
         right = sum(is_right(r, DEFAULT) for r in own)
-        cells = [kind, ", ".join(map(str, sorted(rules))), str(len(own)), str(len(ratios)), str(right)]
-        rows.append([*cells, f"{statistics.median(ratios):.2f} ({max(ratios):.1f})" if ratios else ""])
+        cells = [
+            kind,
+            ", ".join(map(str, sorted(rules))),
+            str(len(own)),
+            str(len(ratios)),
+            str(right),
+        ]
+        rows.append(
+            [*cells, f"{statistics.median(ratios):.2f} ({max(ratios):.1f})" if ratios else ""]
+        )
     columns = ["kind", "rules", "problems", "solved by default", "near the best", "x best (most)"]
-    remark = f"Near the best: within {SLOWER:g} times the fastest method's time or {1e3 * NEGLIGIBLE:g} ms, the choice included."
+    remark = (
+        f"Near the best: within {SLOWER:g} times the fastest method's time or "
+        f"{1e3 * NEGLIGIBLE:g} ms, the choice included."
+    )
     return Table("Kinds of problems", columns, rows, remark)
 
 
@@ -221,11 +282,24 @@ def budget_table(records: Sequence[Record]) -> Table:
     for budget in (*(f"{steps} steps" for steps in BUDGETS), "memory of a sweep"):
         own = [r for r in records if budget in r.facts["budgets"]]
         most = int(budget.split()[0]) if budget.endswith("steps") else None
-        within = [[n for n in solved_by(r) if most is None or r.facts["iterations"][n] <= most] for r in own]
-        hits = sum(r.facts["budgets"][budget] in names for r, names in zip(own, within, strict=True))
+        within = [
+            [n for n in solved_by(r) if most is None or r.facts["iterations"][n] <= most]
+            for r in own
+        ]
+        hits = sum(
+            r.facts["budgets"][budget] in names for r, names in zip(own, within, strict=True)
+        )
         rows.append([budget, str(len(own)), str(hits), str(sum(map(bool, within)))])
-    remark = "Solved: the method that `wl.recommend` names for the budget has solved the problem within its steps."
-    return Table("Budgets", ["budget", "problems", "solved", "solved by any method, in any memory"], rows, remark)
+    remark = (
+        "Solved: the method that `wl.recommend` names for the budget has solved the problem "
+        "within its steps."
+    )
+    return Table(
+        "Budgets",
+        ["budget", "problems", "solved", "solved by any method, in any memory"],
+        rows,
+        remark,
+    )
 
 
 def _summary(records: Sequence[Record]) -> str:

@@ -1,6 +1,7 @@
 """Random problems by kind and seed, on which rules of `wl.recommend` are measured and tested.
 
-Sizes are spread evenly in their logarithm. The seed chooses shares, conditions, bounds and the accuracy, too.
+Sizes are spread evenly in their logarithm. The seed chooses shares, conditions, bounds and the
+accuracy, too.
 """
 
 from __future__ import annotations
@@ -49,7 +50,14 @@ def grid(rng: np.random.Generator, seed: int, shape: tuple[int, ...]) -> Problem
     holes = float(rng.random() < 0.5)
     coefficients = "random" if rng.random() < 0.4 else "uniform"
     return gallery.poisson(
-        shape, plant=plant(rng), air=0.1 * holes, solid=0.15 * holes, coefficients=coefficients, seed=seed, device=DEVICE, dtype=wp.float64
+        shape,
+        plant=plant(rng),
+        air=0.1 * holes,
+        solid=0.15 * holes,
+        coefficients=coefficients,
+        seed=seed,
+        device=DEVICE,
+        dtype=wp.float64,
     )
 
 
@@ -62,7 +70,9 @@ def liquid(rng: np.random.Generator, most: int) -> Problem:
 def convection(m: int, wind: float, *, upwind: bool) -> scipy.sparse.csr_array:
     """Return diffusion and convection along both axes on m^2 cells: upwind differences make it an M-matrix, centered ones need not."""
     L = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(m, m))
-    C = scipy.sparse.diags_array([-2.0, 2.0, 0.0] if upwind else [-1.0, 0.0, 1.0], offsets=[-1, 0, 1], shape=(m, m))
+    C = scipy.sparse.diags_array(
+        [-2.0, 2.0, 0.0] if upwind else [-1.0, 0.0, 1.0], offsets=[-1, 0, 1], shape=(m, m)
+    )
     eye = scipy.sparse.eye_array(m)
     one = L + wind * C
     return scipy.sparse.csr_array(scipy.sparse.kron(eye, one) + scipy.sparse.kron(one, eye))
@@ -74,19 +84,31 @@ def flow(rng: np.random.Generator, seed: int) -> Problem:
     A = convection(m, float(rng.uniform(0.05, 0.9) * (3 if upwind else 1)), upwind=upwind)
     facts = frozenset({"p-matrix", "positive-definite", "positive-diagonal"})
     if rng.random() < 0.5:
-        return planted(A, np.random.default_rng(seed), plant(rng), name=f"convection {m}^2", facts=facts)
+        return planted(
+            A, np.random.default_rng(seed), plant(rng), name=f"convection {m}^2", facts=facts
+        )
     load = np.full(m * m, -8.0 / m**2) * (1 + 3 * rng.random(m * m))
     upper = np.full(m * m, float(rng.uniform(0.02, 0.3)))
-    return Problem(f"convection {m}^2 under an obstacle", A, load, np.zeros(m * m), upper, None, facts)
+    return Problem(
+        f"convection {m}^2 under an obstacle", A, load, np.zeros(m * m), upper, None, facts
+    )
 
 
 def sparse_squares(rng: np.random.Generator, seed: int) -> Problem:
     """Return J J' with sparse J of fewer columns than rows, or as many, plus a small multiple of I: semi-definite or badly conditioned."""
     n, filler = between(rng, 30, 2000), np.random.default_rng(seed)
-    J = scipy.sparse.random_array((n, max(2, int(n * rng.uniform(0.5, 1.2)))), density=min(1.0, 4 / n), rng=filler)
+    J = scipy.sparse.random_array(
+        (n, max(2, int(n * rng.uniform(0.5, 1.2)))), density=min(1.0, 4 / n), rng=filler
+    )
     shift = 10.0 ** float(rng.uniform(-4, -1)) * float(rng.random() < 0.7)
     A = scipy.sparse.csr_array(J @ J.T + (shift + 1e-3) * scipy.sparse.eye_array(n))
-    return planted(A, filler, plant(rng), name=f"sparse J J' {n}", facts=frozenset({"symmetric", "positive-diagonal"}))
+    return planted(
+        A,
+        filler,
+        plant(rng),
+        name=f"sparse J J' {n}",
+        facts=frozenset({"symmetric", "positive-diagonal"}),
+    )
 
 
 def sparse_unsymmetric(rng: np.random.Generator, seed: int) -> Problem:
@@ -95,14 +117,23 @@ def sparse_unsymmetric(rng: np.random.Generator, seed: int) -> Problem:
     R = scipy.sparse.random_array((n, n), density=min(0.5, 5 / n), rng=filler)
     R.data -= 0.5
     rows = np.abs(R).sum(axis=1)
-    A = scipy.sparse.csr_array(R + scipy.sparse.diags_array(rows * float(rng.uniform(1.02, 1.5)) + 0.05))
-    return planted(A, filler, plant(rng), name=f"sparse unsymmetric {n}", facts=frozenset({"p-matrix", "positive-diagonal"}))
+    A = scipy.sparse.csr_array(
+        R + scipy.sparse.diags_array(rows * float(rng.uniform(1.02, 1.5)) + 0.05)
+    )
+    return planted(
+        A,
+        filler,
+        plant(rng),
+        name=f"sparse unsymmetric {n}",
+        facts=frozenset({"p-matrix", "positive-diagonal"}),
+    )
 
 
 def scene(rng: np.random.Generator, seed: int, model: object) -> Problem:
     """Return a contact problem of a scene with bodies that rest or begin to move."""
     name = str(rng.choice([n for n in SCENES if n not in ("driven-gears",)]))
-    size = None if rng.random() < 0.4 else between(rng, 1, 3) * 2 + 1  # odd: an arch has a link on top
+    # odd: an arch has a link on top
+    size = None if rng.random() < 0.4 else between(rng, 1, 3) * 2 + 1
     return contact_scene(name, size, model=model, seed=seed)  # type: ignore[arg-type]
 
 
@@ -111,7 +142,9 @@ def frozen(rng: np.random.Generator, seed: int) -> Problem:
     p = scene(rng, seed, None)
     normal = np.abs(rng.standard_normal(len(p.b)))
     low, high = p.lower.at(normal), p.upper.at(normal)
-    return Problem(f"{p.name}, frozen", p.A, p.b, np.minimum(low, high), high, None, p.facts - {"affine"})
+    return Problem(
+        f"{p.name}, frozen", p.A, p.b, np.minimum(low, high), high, None, p.facts - {"affine"}
+    )
 
 
 def bodies_in_liquid(rng: np.random.Generator) -> wl.LCP:
@@ -122,7 +155,9 @@ def bodies_in_liquid(rng: np.random.Generator) -> wl.LCP:
     rows = np.argwhere(splash.wall)
     picked = rows[rng.choice(len(rows), min(40, len(rows)), replace=False)]
     columns[tuple(picked.T)] = rng.standard_normal((len(picked), 3))
-    both = wl.SumOperator(A, wl.LowRankOperator(columns, np.full(3, float(rng.uniform(0.1, 5))), device=DEVICE))
+    both = wl.SumOperator(
+        A, wl.LowRankOperator(columns, np.full(3, float(rng.uniform(0.1, 5))), device=DEVICE)
+    )
     return wl.LCP(both, splash.b, splash.lower("walls"))
 
 
@@ -130,27 +165,51 @@ def equations(rng: np.random.Generator, seed: int) -> Problem:
     """Return a problem without bounds on a grid, or on a sparse or dense matrix."""
     kind, all_free = rng.integers(3), Plant(mixed=1.0)
     if kind == 0:
-        return gallery.poisson((between(rng, 8, 100),) * 2, plant=all_free, seed=seed, device=DEVICE, dtype=wp.float64)
+        return gallery.poisson(
+            (between(rng, 8, 100),) * 2, plant=all_free, seed=seed, device=DEVICE, dtype=wp.float64
+        )
     if kind == 1:
         return gallery.banded(between(rng, 100, 10000), plant=all_free, seed=seed)
-    return gallery.definite(between(rng, 10, 300), condition=10.0 ** float(rng.uniform(0, 3)), plant=all_free, seed=seed)
+    return gallery.definite(
+        between(rng, 10, 300), condition=10.0 ** float(rng.uniform(0, 3)), plant=all_free, seed=seed
+    )
 
 
 Make = Callable[[np.random.Generator, int], Problem | wl.LCP]
 FAMILIES: dict[str, Make] = {
-    "tiny": lambda r, s: gallery.definite(int(r.integers(1, 5)), condition=10.0, plant=plant(r), seed=s),
-    "definite": lambda r, s: gallery.definite(between(r, 10, 500), condition=10.0 ** float(r.uniform(0, 4)), plant=plant(r), seed=s),
-    "semidefinite": lambda r, s: gallery.semidefinite(between(r, 10, 300), zeros=float(r.uniform(0.1, 0.8)), plant=plant(r), seed=s),
-    "skewed": lambda r, s: gallery.skewed(between(r, 10, 400), skew=float(r.uniform(0.2, 2)), plant=plant(r), seed=s),
+    "tiny": lambda r, s: gallery.definite(
+        int(r.integers(1, 5)), condition=10.0, plant=plant(r), seed=s
+    ),
+    "definite": lambda r, s: gallery.definite(
+        between(r, 10, 500), condition=10.0 ** float(r.uniform(0, 4)), plant=plant(r), seed=s
+    ),
+    "semidefinite": lambda r, s: gallery.semidefinite(
+        between(r, 10, 300), zeros=float(r.uniform(0.1, 0.8)), plant=plant(r), seed=s
+    ),
+    "skewed": lambda r, s: gallery.skewed(
+        between(r, 10, 400), skew=float(r.uniform(0.2, 2)), plant=plant(r), seed=s
+    ),
     "period-three": lambda r, s: gallery.period_three(between(r, 1, 20), plant=plant(r), seed=s),
-    "contact": lambda r, s: gallery.contact(between(r, 1, 30), directions=int(r.choice([4, 8])), seed=s),
-    "banded": lambda r, s: gallery.banded(between(r, 100, 30000), bands=int(r.integers(1, 7)), plant=plant(r), seed=s),
-    "banded-dense": lambda r, s: gallery.banded(between(r, 20, 400), bands=int(r.integers(1, 7)), plant=plant(r), seed=s).dense(),
+    "contact": lambda r, s: gallery.contact(
+        between(r, 1, 30), directions=int(r.choice([4, 8])), seed=s
+    ),
+    "banded": lambda r, s: gallery.banded(
+        between(r, 100, 30000), bands=int(r.integers(1, 7)), plant=plant(r), seed=s
+    ),
+    "banded-dense": lambda r, s: gallery.banded(
+        between(r, 20, 400), bands=int(r.integers(1, 7)), plant=plant(r), seed=s
+    ).dense(),
     "poisson-2d": lambda r, s: grid(r, s, (between(r, 8, 160), between(r, 8, 160))),
-    "poisson-3d": lambda r, s: grid(r, s, (between(r, 4, 32), between(r, 4, 32), between(r, 4, 32))),
+    "poisson-3d": lambda r, s: grid(
+        r, s, (between(r, 4, 32), between(r, 4, 32), between(r, 4, 32))
+    ),
     "poisson-sparse": lambda r, s: grid(r, s, (between(r, 8, 100), between(r, 8, 100))).sparse(),
-    "obstacle": lambda r, s: gallery.ball_obstacle(between(r, 9, 161), device=DEVICE, dtype=wp.float64),
-    "obstacle-sparse": lambda r, s: gallery.ball_obstacle(between(r, 9, 97), device=DEVICE, dtype=wp.float64).sparse(),
+    "obstacle": lambda r, s: gallery.ball_obstacle(
+        between(r, 9, 161), device=DEVICE, dtype=wp.float64
+    ),
+    "obstacle-sparse": lambda r, s: gallery.ball_obstacle(
+        between(r, 9, 97), device=DEVICE, dtype=wp.float64
+    ).sparse(),
     "splash": lambda r, s: liquid(r, 40),
     "splash-sparse": lambda r, s: liquid(r, 20).sparse(),
     "convection": flow,
@@ -189,7 +248,9 @@ def support_vectors(rng: np.random.Generator) -> wl.LCP:
     labels = np.where(points[:, 0] + 0.7 * rng.standard_normal(n) > 0, 1.0, -1.0)
     squares = ((points[:, None] - points) ** 2).sum(axis=2)
     kernel = points @ points.T if rng.random() < 0.6 else np.exp(-squares / (2 * d))
-    return wl.LCP(labels[:, None] * kernel * labels, -np.ones(n), 0.0, 10.0 ** float(rng.uniform(-1, 2)))
+    return wl.LCP(
+        labels[:, None] * kernel * labels, -np.ones(n), 0.0, 10.0 ** float(rng.uniform(-1, 2))
+    )
 
 
 def portfolio(rng: np.random.Generator) -> wl.LCP:
@@ -200,7 +261,9 @@ def portfolio(rng: np.random.Generator) -> wl.LCP:
     A[:n, :n] = F @ F.T / d + np.diag(rng.uniform(0.01, 0.5, n))
     A[:n, n], A[n, :n] = -1.0, 1.0
     most = np.append(np.full(n, max(0.2, 4 / n)), np.inf)
-    return wl.LCP(A, np.append(-0.3 * rng.standard_normal(n), -1.0), np.append(np.zeros(n), -np.inf), most)
+    return wl.LCP(
+        A, np.append(-0.3 * rng.standard_normal(n), -1.0), np.append(np.zeros(n), -np.inf), most
+    )
 
 
 def game(rng: np.random.Generator) -> wl.LCP:
@@ -226,8 +289,14 @@ def p_matrix(rng: np.random.Generator, seed: int) -> wl.LCP:
     """Return a dense P-matrix: definite plus large skew, rows and columns scaled."""
     n = between(rng, 10, 300)
     B, C = rng.standard_normal((2, n, n)) / n**0.5
-    A = (B @ B.T + 0.1 * np.eye(n) + 2 * (C - C.T)) * 10 ** rng.uniform(-1, 1, n) * 10 ** rng.uniform(-1, 1, (n, 1))
-    return planted(A, np.random.default_rng(seed), plant(rng), name="P", facts=frozenset({"p-matrix"})).lcp(device=DEVICE)
+    A = (
+        (B @ B.T + 0.1 * np.eye(n) + 2 * (C - C.T))
+        * 10 ** rng.uniform(-1, 1, n)
+        * 10 ** rng.uniform(-1, 1, (n, 1))
+    )
+    return planted(
+        A, np.random.default_rng(seed), plant(rng), name="P", facts=frozenset({"p-matrix"})
+    ).lcp(device=DEVICE)
 
 
 def laplacian(rng: np.random.Generator) -> wl.LCP:
@@ -235,7 +304,9 @@ def laplacian(rng: np.random.Generator) -> wl.LCP:
     n = between(rng, 50, 3000)
     ends = rng.integers(0, n, (2, 2 * n))
     ends = ends[:, ends[0] != ends[1]]
-    W = scipy.sparse.coo_array((rng.uniform(0.1, 1, ends.shape[1]), tuple(ends)), shape=(n, n)).tocsr()
+    W = scipy.sparse.coo_array(
+        (rng.uniform(0.1, 1, ends.shape[1]), tuple(ends)), shape=(n, n)
+    ).tocsr()
     L = scipy.sparse.csgraph.laplacian(W + W.T)
     boxed = rng.random() < 0.5
     b = rng.standard_normal(n) if boxed else 0.3 * rng.random(n)
@@ -255,9 +326,16 @@ def stack(rng: np.random.Generator, seed: int) -> wl.LCP:
 def products(rng: np.random.Generator, seed: int) -> wl.LCP:
     """Return a problem whose matrix shows its products only."""
     n = between(rng, 20, 400)
-    made = gallery.definite(n, condition=10.0 ** float(rng.uniform(0, 3)), plant=plant(rng), seed=seed)
+    made = gallery.definite(
+        n, condition=10.0 ** float(rng.uniform(0, 3)), plant=plant(rng), seed=seed
+    )
     A = np.asarray(made.A)
-    return wl.LCP(wl.LinearOperator(lambda x: A @ x, shape=(n,), symmetric=True), made.b, made.lower, made.upper)
+    return wl.LCP(
+        wl.LinearOperator(lambda x: A @ x, shape=(n,), symmetric=True),
+        made.b,
+        made.lower,
+        made.upper,
+    )
 
 
 def membrane(rng: np.random.Generator) -> wl.LCP:
@@ -265,7 +343,9 @@ def membrane(rng: np.random.Generator) -> wl.LCP:
     m = between(rng, 8, 90)
     T = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(m, m))
     weights = scipy.sparse.diags_array(rng.uniform(0.5, 2, m * m))
-    L = scipy.sparse.kron(scipy.sparse.eye_array(m), T) + scipy.sparse.kron(T, scipy.sparse.eye_array(m))
+    L = scipy.sparse.kron(scipy.sparse.eye_array(m), T) + scipy.sparse.kron(
+        T, scipy.sparse.eye_array(m)
+    )
     A = scipy.sparse.csr_array(L + float(rng.uniform(0, 0.1)) * weights)
     b = rng.uniform(-10, 2, m * m) / m**2
     return wl.LCP(A, b, 0.0, float(rng.uniform(0.05, 0.3)) if rng.random() < 0.5 else np.inf)
@@ -302,7 +382,13 @@ def negative_diagonal(rng: np.random.Generator, seed: int, *, boxed: bool) -> Pr
     n = between(rng, 5, 40)
     A = rng.standard_normal((n, n)) + np.diag(np.where(rng.random(n) < 0.2, -1.0, 3.0) * n**0.5)
     A[0, 0] = -1.0
-    return planted(A, np.random.default_rng(seed), Plant(active=0.4, boxed=boxed), name="negative diagonal", facts=frozenset())
+    return planted(
+        A,
+        np.random.default_rng(seed),
+        Plant(active=0.4, boxed=boxed),
+        name="negative diagonal",
+        facts=frozenset(),
+    )
 
 
 def sparse_negative_diagonal(rng: np.random.Generator) -> wl.LCP:
@@ -312,15 +398,22 @@ def sparse_negative_diagonal(rng: np.random.Generator) -> wl.LCP:
     d = rng.uniform(0.5, 3.0, n)
     d[rng.choice(n, n // 20, replace=False)] -= 4.0
     return wl.LCP(
-        scipy.sparse.csr_array((R + R.T) / 2 + scipy.sparse.diags_array(d)), rng.standard_normal(n), 0.0, 10.0 ** float(rng.uniform(-1, 1))
+        scipy.sparse.csr_array((R + R.T) / 2 + scipy.sparse.diags_array(d)),
+        rng.standard_normal(n),
+        0.0,
+        10.0 ** float(rng.uniform(-1, 1)),
     )
 
 
 def wind(rng: np.random.Generator) -> wl.LCP:
     """Return upwind convection and diffusion on a grid above an obstacle: an unsymmetric stencil."""
     m, peclet = between(rng, 16, 128), 10.0 ** float(rng.uniform(-1, 2))
-    stencil = np.array([[0.0, -1.0, 0.0], [-1.0 - peclet, 4.0 + 2 * peclet, -1.0], [0.0, -1.0 - peclet, 0.0]])
-    A = wl.Stencil(np.full((m, m), wl.FLUID), stencil, outside=wl.AIR, device=DEVICE, dtype=wp.float64)
+    stencil = np.array(
+        [[0.0, -1.0, 0.0], [-1.0 - peclet, 4.0 + 2 * peclet, -1.0], [0.0, -1.0 - peclet, 0.0]]
+    )
+    A = wl.Stencil(
+        np.full((m, m), wl.FLUID), stencil, outside=wl.AIR, device=DEVICE, dtype=wp.float64
+    )
     return wl.LCP(A, (1.0 + peclet) / m * rng.uniform(-2, 1, (m, m)))
 
 
@@ -329,8 +422,16 @@ def dominant(rng: np.random.Generator, seed: int) -> Problem:
     n, filler = between(rng, 300, 20000), np.random.default_rng(seed)
     R = scipy.sparse.random_array((n, n), density=5 / n, rng=filler)
     R.data -= 0.5
-    A = scipy.sparse.csr_array(R + scipy.sparse.diags_array(np.abs(R).sum(axis=1) * float(rng.uniform(2, 4)) + 0.05))
-    return planted(A, filler, plant(rng), name=f"dominant {n}", facts=frozenset({"p-matrix", "positive-diagonal"}))
+    A = scipy.sparse.csr_array(
+        R + scipy.sparse.diags_array(np.abs(R).sum(axis=1) * float(rng.uniform(2, 4)) + 0.05)
+    )
+    return planted(
+        A,
+        filler,
+        plant(rng),
+        name=f"dominant {n}",
+        facts=frozenset({"p-matrix", "positive-diagonal"}),
+    )
 
 
 def large_game(rng: np.random.Generator) -> wl.LCP:

@@ -18,9 +18,11 @@ from warp_lcp.rigid.contact_problem import ContactImpulses, ContactProblem
 from warp_lcp.scene.scene_file import load_scene
 
 SPHERES, SIDE = 1000, 10  # and how many lie along a side of the box
-SETTLING, STEPS, DT = 40, 5, 0.005  # steps until they have fallen onto each other, steps measured, and their length [s]
+# steps until they have fallen onto each other, steps measured, and their length [s]
+SETTLING, STEPS, DT = 40, 5, 0.005
 RADIUS, APART = 0.05, 0.115  # [m]: the largest, and from center to center at first
-TOLERANCE, MOST = 1e-5, 3000  # of the solves; boxes of friction may take as many iterations as they need
+# of the solves; boxes of friction may take as many iterations as they need
+TOLERANCE, MOST = 1e-5, 3000
 METHODS = ("psor", "nncg", "proximal-gauss-seidel")
 SHARE = 0.15  # of the time of PSOR's steps
 
@@ -30,8 +32,17 @@ def spheres(method: str) -> dict[str, Any]:
     rng, solids = np.random.default_rng(0), []
     for number in range(SPHERES):
         layer, place = divmod(number, SIDE * SIDE)
-        center = (np.array([place // SIDE, layer, place % SIDE]) + 0.5) * APART + rng.uniform(-0.006, 0.006, 3)
-        solids.append({"shape": "sphere", "center": center.tolist(), "radius": RADIUS * rng.uniform(0.9, 1.0), "density": 1000.0})
+        center = (np.array([place // SIDE, layer, place % SIDE]) + 0.5) * APART + rng.uniform(
+            -0.006, 0.006, 3
+        )
+        solids.append(
+            {
+                "shape": "sphere",
+                "center": center.tolist(),
+                "radius": RADIUS * rng.uniform(0.9, 1.0),
+                "density": 1000.0,
+            }
+        )
     layers = -(-SPHERES // SIDE**2)
     return {
         "scene": {"simulator": "contacts"},
@@ -68,7 +79,9 @@ def steps_of_spheres(options: Options) -> tuple[list[Record], Table]:
     made, timed = {}, {}
     for method in METHODS:
         options.say(f"{SPHERES} spheres in a box: {method}")
-        made[method] = SIMULATOR.create(load_scene(spheres(method)), device=options.device, folder=Path())
+        made[method] = SIMULATOR.create(
+            load_scene(spheres(method)), device=options.device, folder=Path()
+        )
         solve = made[method].bodies._solve
         solve._solver = timed[method] = _Timed(solve._solver)
     last = made[METHODS[-1]]
@@ -83,8 +96,15 @@ def steps_of_spheres(options: Options) -> tuple[list[Record], Table]:
             begun = time.perf_counter()
             row = simulation.step(DT)
             seconds = time.perf_counter() - begun
-            figures = {"seconds": seconds, "solve_seconds": timed[method].seconds, "overlap": overlap(simulation.bodies)}
-            figures |= {"iterations": float(row["solve_iterations"] or 0), "residual": float(row["solve_residual"] or 0)}
+            figures = {
+                "seconds": seconds,
+                "solve_seconds": timed[method].seconds,
+                "overlap": overlap(simulation.bodies),
+            }
+            figures |= {
+                "iterations": float(row["solve_iterations"] or 0),
+                "residual": float(row["solve_residual"] or 0),
+            }
             figures |= {"contacts": float(row["contacts"] or 0)}
             for name, value in figures.items() if number >= 0 else ():
                 found[method][name].append(value)
@@ -96,17 +116,36 @@ def _reported(found: dict[str, dict[str, list[float]]]) -> tuple[list[Record], T
     records, rows = [], []
     for method, figures in found.items():
         record = Record(
-            f"{SPHERES} spheres in a box: {method}", {n: Figure.of(v, units.get(n, "")) for n, v in figures.items()}, {"method": method}
+            f"{SPHERES} spheres in a box: {method}",
+            {n: Figure.of(v, units.get(n, "")) for n, v in figures.items()},
+            {"method": method},
         )
         records.append(record)
         shares = [np.divide(figures[n], found[METHODS[0]][n]) for n in ("seconds", "solve_seconds")]
         names = ("contacts", "seconds", "solve_seconds", "iterations", "residual", "overlap")
-        ranges = [f"{np.median(share):.3g} ({share.min():.3g} to {share.max():.3g})" for share in shares]
+        ranges = [
+            f"{np.median(share):.3g} ({share.min():.3g} to {share.max():.3g})" for share in shares
+        ]
         rows.append([method, *(f"{record.value(name):.3g}" for name in names), *ranges])
-    columns = ["method", "contacts", "seconds a step", "of these in solves", "iterations", "residual", "overlap [m]"]
+    columns = [
+        "method",
+        "contacts",
+        "seconds a step",
+        "of these in solves",
+        "iterations",
+        "residual",
+        "overlap [m]",
+    ]
     remark = (
-        f"The same {STEPS} steps by all, in turns, medians; the last columns are shares of {METHODS[0]}'s and their range, of which "
-        f"{SHARE:g} of a step is aimed at. Residuals are relative to no impulses, asked for {TOLERANCE:g}, in "
+        f"The same {STEPS} steps by all, in turns, medians; the last columns are shares of "
+        f"{METHODS[0]}'s and their range, of which "
+        f"{SHARE:g} of a step is aimed at. Residuals are relative to no impulses, asked for "
+        f"{TOLERANCE:g}, in "
         "boxes of friction or the circular cone."
     )
-    return records, Table(f"{SPHERES} spheres in a box", [*columns, "share of a step", "share of a solve"], rows, remark)
+    return records, Table(
+        f"{SPHERES} spheres in a box",
+        [*columns, "share of a step", "share of a solve"],
+        rows,
+        remark,
+    )

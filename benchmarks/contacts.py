@@ -11,21 +11,28 @@ from warp_lcp.benchmarks.contact_steps import steps_of_spheres
 from warp_lcp.benchmarks.harness.machine import machine
 from warp_lcp.benchmarks.harness.record import Chart, Lines, Record, Results, Table
 from warp_lcp.benchmarks.harness.timing import Figure, Options
-from warp_lcp.gallery.contact_models import BoxedModel, ContactModel, ContactSystem, StewartTrinkleModel
+from warp_lcp.gallery.contact_models import (
+    BoxedModel,
+    ContactModel,
+    ContactSystem,
+    StewartTrinkleModel,
+)
 from warp_lcp.gallery.contact_scenes import SCENES, SETTLING, heavy_on_light
 from warp_lcp.gallery.contact_stepper import ContactStepper
 from warp_lcp.gallery.rigid_world import Assembly, World
 
 TITLE = "Rigid contacts: the scenes of figures 2.9 and 2.11"
 DT = 0.01  # [s]
-SWEEPS = 5000  # of PGS and NNCG, as in figure 2.12; other sweeping methods get as many, or what costs as much
+# of PGS and NNCG, as in figure 2.12; other sweeping methods get as many, or what costs as much
+SWEEPS = 5000
 TOLERANCE = 1e-13  # of the residual at x = 0: curves end there
 RATIOS = (1.0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6)
 EQUAL = (200, 1000, 5000)  # sweeps at which NNCG and PGS are compared
 TARGET = 10.0  # how many times smaller the residual of NNCG should be than that of PGS
 DRAWN = ("box-stack", "wall", "heavy-on-light", "hanging-snake")  # scenes whose residuals are drawn
 STACKS = ("box-stack", "sphere-stack", "wall", "leaning-wall", "heavy-on-light")
-LARGEST_LCP = 1500  # unknowns of a Stewart-Trinkle problem up to which Lemke's method and Newton's are waited for
+# unknowns of a Stewart-Trinkle problem up to which Lemke's method and Newton's are waited for
+LARGEST_LCP = 1500
 
 BOXED: dict[str, Callable[[ContactSystem], tuple[Any, int]]] = {
     "PGS": lambda s: (wl.ProjectedSOR(omega=1.0), SWEEPS),
@@ -34,7 +41,10 @@ BOXED: dict[str, Callable[[ContactSystem], tuple[Any, int]]] = {
     "blocked Gauss-Seidel": lambda s: (wl.BlockedGaussSeidel(blocks=s.blocks()), SWEEPS),
     "PGS-SM": lambda s: (wl.SubspaceMinimization(precision="double", backtracks=-1), 200),
     "PGS-SM, safeguarded": lambda s: (wl.SubspaceMinimization(precision="double"), 200),
-    "staggering, pivoting": lambda s: (wl.Staggering(blocks=s.staggered(), solvers=wl.IncrementalPivoting(), eta=1e-8), 50),
+    "staggering, pivoting": lambda s: (
+        wl.Staggering(blocks=s.staggered(), solvers=wl.IncrementalPivoting(), eta=1e-8),
+        50,
+    ),
 }
 LCP: dict[str, Callable[[ContactSystem], tuple[Any, int]]] = {
     "Lemke": lambda s: (wl.Lemke(), 1000),
@@ -52,11 +62,18 @@ def measure(options: Options, out: Path) -> Results:
         system = next_step(name, options.device).system
         options.say(f"{name}: {system.contacts} contacts, {len(system.lower)} joint rows")
         curves = _scene(name, system, options, solves)
-        steps, unit = "sweeps, linear iterations, pivots or factorizations", "residual / residual at x = 0"
+        steps, unit = (
+            "sweeps, linear iterations, pivots or factorizations",
+            "residual / residual at x = 0",
+        )
         charts += [Lines(name, system.name, steps, unit, curves)] if name in DRAWN else []
     equal = _equal(options)
     piles, pile = steps_of_spheres(options)
-    return Results([*records, *solves, *equal, *piles], [_finding(equal), _equal_table(equal), *_tables(solves), pile], charts)
+    return Results(
+        [*records, *solves, *equal, *piles],
+        [_finding(equal), _equal_table(equal), *_tables(solves), pile],
+        charts,
+    )
 
 
 def next_step(name: str, device: str) -> Assembly:
@@ -76,10 +93,15 @@ def unhindered(most: int, tolerance: float = TOLERANCE) -> wl.StoppingCriteria:
 Curve = tuple[list[float], list[float]]
 
 
-def _scene(name: str, system: ContactSystem, options: Options, solves: list[Record]) -> dict[str, Curve]:
+def _scene(
+    name: str, system: ContactSystem, options: Options, solves: list[Record]
+) -> dict[str, Curve]:
     """Solve a scene by all methods; return linear iterations, relative residuals and seconds of each."""
     curves: dict[str, Curve] = {}
-    models: list[tuple[ContactModel, str, dict[str, Any]]] = [(BoxedModel(), "boxed", BOXED), (StewartTrinkleModel(4), "LCP", LCP)]
+    models: list[tuple[ContactModel, str, dict[str, Any]]] = [
+        (BoxedModel(), "boxed", BOXED),
+        (StewartTrinkleModel(4), "LCP", LCP),
+    ]
     for model, kind, methods in models:
         given = model.problem(system)
         if kind == "LCP" and len(given.b) > LARGEST_LCP:
@@ -92,7 +114,9 @@ def _scene(name: str, system: ContactSystem, options: Options, solves: list[Reco
                 wl.solve(problem, method, stopping=unhindered(1))  # loads kernels
                 result = wl.solve(problem, method, stopping=unhindered(most))
             except ValueError as error:
-                solves.append(Record(f"{name}: {label}", {}, facts | {"status": f"refused: {error}"}))
+                solves.append(
+                    Record(f"{name}: {label}", {}, facts | {"status": f"refused: {error}"})
+                )
                 continue
             first = result.history[0].residual
             history = [(h.linear_iterations, h.residual / first, h.seconds) for h in result.history]
@@ -110,15 +134,25 @@ def _scene(name: str, system: ContactSystem, options: Options, solves: list[Reco
             for level in (1e-3, 1e-6, 1e-10):
                 reached = next(((n, t) for n, r, t in history if r <= level), None)
                 if reached is not None:
-                    figures |= {f"sweeps_to_{level:.0e}": Figure(reached[0]), f"seconds_to_{level:.0e}": Figure(reached[1], "s")}
-            solves.append(Record(f"{name}: {label}", figures, facts | {"status": result.status.name}))
+                    figures |= {
+                        f"sweeps_to_{level:.0e}": Figure(reached[0]),
+                        f"seconds_to_{level:.0e}": Figure(reached[1], "s"),
+                    }
+            solves.append(
+                Record(f"{name}: {label}", figures, facts | {"status": result.status.name})
+            )
     return curves
 
 
 def _equal(options: Options) -> list[Record]:
     """Return PGS and NNCG after equal sweeps, on the stacks and the heavy box at all mass ratios."""
-    systems = {name: next_step(name, options.device).system for name in STACKS if name != "heavy-on-light"}
-    systems |= {f"heavy-on-light, ratio {ratio:g}": heavy_on_light(ratio=ratio).assemble(DT).system for ratio in RATIOS}
+    systems = {
+        name: next_step(name, options.device).system for name in STACKS if name != "heavy-on-light"
+    }
+    systems |= {
+        f"heavy-on-light, ratio {ratio:g}": heavy_on_light(ratio=ratio).assemble(DT).system
+        for ratio in RATIOS
+    }
     frictionless = heavy_on_light(ratio=1000.0)
     frictionless.friction = 0.0
     systems["heavy-on-light, ratio 1000, no friction"] = frictionless.assemble(DT).system
@@ -129,11 +163,17 @@ def _equal(options: Options) -> list[Record]:
         residuals = {}
         for label, method in (("PGS", wl.ProjectedSOR(omega=1.0)), ("NNCG", wl.NNCG())):
             history = wl.solve(problem, method, stopping=unhindered(max(EQUAL))).history
-            residuals[label] = [history[min(n, len(history) - 1)].residual / history[0].residual for n in EQUAL]
+            residuals[label] = [
+                history[min(n, len(history) - 1)].residual / history[0].residual for n in EQUAL
+            ]
         figures: dict[str, Figure] = {}
         for i, n in enumerate(EQUAL):
             pgs, nncg = residuals["PGS"][i], residuals["NNCG"][i]
-            figures |= {f"PGS_{n}": Figure(pgs), f"NNCG_{n}": Figure(nncg), f"ratio_{n}": Figure(pgs / nncg if nncg > 0 else 1.0)}
+            figures |= {
+                f"PGS_{n}": Figure(pgs),
+                f"NNCG_{n}": Figure(nncg),
+                f"ratio_{n}": Figure(pgs / nncg if nncg > 0 else 1.0),
+            }
         records.append(Record(f"equal sweeps: {name}", figures, {"case": name}))
     return records
 
@@ -144,34 +184,68 @@ def _finding(records: list[Record]) -> Table:
     for n in EQUAL:
         open_ones = [r for r in records if (r.value(f"PGS_{n}") or 0.0) > 10 * TOLERANCE]
         good = [r for r in open_ones if (r.value(f"ratio_{n}") or 0.0) >= TARGET]
-        missed = "; ".join(f"{r.facts['case']} ({r.value(f'ratio_{n}'):.2g} x)" for r in open_ones if r not in good)
+        missed = "; ".join(
+            f"{r.facts['case']} ({r.value(f'ratio_{n}'):.2g} x)" for r in open_ones if r not in good
+        )
         rows.append([str(n), f"{len(good)} of {len(open_ones)}", missed or "none"])
-    remark = "Cases in which PGS has not converged to rounding itself by then. Residuals of the boxed model, relative to that at x = 0."
-    return Table(f"NNCG at least {TARGET:g} x below PGS at equal sweeps", ["sweeps", "cases", "missed by"], rows, remark)
+    remark = (
+        "Cases in which PGS has not converged to rounding itself by then. Residuals of the "
+        "boxed model, relative to that at x = 0."
+    )
+    return Table(
+        f"NNCG at least {TARGET:g} x below PGS at equal sweeps",
+        ["sweeps", "cases", "missed by"],
+        rows,
+        remark,
+    )
 
 
 def _equal_table(records: list[Record]) -> Table:
     names = [f"{label}_{n}" for n in EQUAL for label in ("PGS", "NNCG", "ratio")]
     rows = [[r.facts["case"], *(f"{r.value(name):.2g}" for name in names)] for r in records]
-    return Table("PGS and NNCG at equal sweeps", ["case", *(name.replace("_", " ") for name in names)], rows)
+    return Table(
+        "PGS and NNCG at equal sweeps", ["case", *(name.replace("_", " ") for name in names)], rows
+    )
 
 
 def _tables(solves: list[Record]) -> list[Table]:
     """Return a table of each scene."""
-    columns = ["method", "model", "status", "unknowns", "least residual", "steps", "sweeps, pivots ...", "seconds"]
+    columns = [
+        "method",
+        "model",
+        "status",
+        "unknowns",
+        "least residual",
+        "steps",
+        "sweeps, pivots ...",
+        "seconds",
+    ]
     columns += ["sweeps to 1e-3", "to 1e-6", "to 1e-10", "seconds to 1e-6", "cone residual [m/s]"]
     keys = ["unknowns", "residual", "iterations", "linear_iterations", "seconds"]
-    keys += ["sweeps_to_1e-03", "sweeps_to_1e-06", "sweeps_to_1e-10", "seconds_to_1e-06", "cone_residual"]
+    keys += [
+        "sweeps_to_1e-03",
+        "sweeps_to_1e-06",
+        "sweeps_to_1e-10",
+        "seconds_to_1e-06",
+        "cone_residual",
+    ]
     tables = []
     for name in SCENES:
         here = [r for r in solves if r.facts["scene"] == name]
         rows = [
-            [r.facts["method"], r.facts["model"], r.facts["status"], *("" if (v := r.value(k)) is None else f"{v:.3g}" for k in keys)]
+            [
+                r.facts["method"],
+                r.facts["model"],
+                r.facts["status"],
+                *("" if (v := r.value(k)) is None else f"{v:.3g}" for k in keys),
+            ]
             for r in here
         ]
         remark = (
-            "Residuals are relative to that at x = 0 in each model's own problem; the cone residual is that of Coulomb's law with the "
-            "circular cone, which the boxed model and the polyhedral one only approximate. Sweeps are products with A: of Lemke pivots, of "
+            "Residuals are relative to that at x = 0 in each model's own problem; the cone "
+            "residual is that of Coulomb's law with the "
+            "circular cone, which the boxed model and the polyhedral one only approximate. Sweeps "
+            "are products with A: of Lemke pivots, of "
             "Newton factorizations, of staggering pivots."
         )
         tables.append(Table(name, columns, rows, remark if name == next(iter(SCENES)) else ""))

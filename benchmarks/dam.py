@@ -1,7 +1,8 @@
 """Seepage through a dam against PETSc's SNESVI, in turns on one core: `python -m benchmarks.dam`, in the source tree.
 
-Both are cold: problem, operator and multigrid are made on the way. PETSc iterates from grid to grid, each with doubled spaces between
-nodes, takes Newton's steps on the free set (`vinewtonrsls`) and solves them by conjugate gradients and its geometric multigrid.
+Both are cold: problem, operator and multigrid are made on the way. PETSc iterates from grid to
+grid, each with doubled spaces between nodes, takes Newton's steps on the free set (`vinewtonrsls`)
+and solves them by conjugate gradients and its geometric multigrid.
 """
 
 import argparse
@@ -26,7 +27,9 @@ OPTIONS = ("-ksp_type", "cg", "-pc_type", "mg")
 def ours(nx: int, ny: int) -> tuple[float, str, int, float]:
     """Return seconds, status, steps and the norm of the solution."""
     begun = time.perf_counter()
-    result = wl.solve(dam(nx, ny, **SIZES, device="cpu").lcp(), stopping=wl.StoppingCriteria(rtol=RTOL))
+    result = wl.solve(
+        dam(nx, ny, **SIZES, device="cpu").lcp(), stopping=wl.StoppingCriteria(rtol=RTOL)
+    )
     seconds, w = time.perf_counter() - begun, result.x.numpy()
     return seconds, result.status.name, result.iterations, float(np.linalg.norm(w))
 
@@ -34,25 +37,47 @@ def ours(nx: int, ny: int) -> tuple[float, str, int, float]:
 def theirs(python: str, levels: int) -> dict[str, object]:
     """Return PETSc's answer on its finest grid; the norm is that of the inner nodes."""
     request = {"coarsest": COARSEST, "levels": levels, "rtol": RTOL, "sizes": SIZES}
-    command = [python, str(Path(__file__).parent / "peers" / "dam_petsc.py"), json.dumps(request), *OPTIONS]
-    return dict(json.loads(subprocess.run(command, env=environment(), check=True, capture_output=True, text=True).stdout))
+    command = [
+        python,
+        str(Path(__file__).parent / "peers" / "dam_petsc.py"),
+        json.dumps(request),
+        *OPTIONS,
+    ]
+    return dict(
+        json.loads(
+            subprocess.run(
+                command, env=environment(), check=True, capture_output=True, text=True
+            ).stdout
+        )
+    )
 
 
 def main() -> None:
     """Print a line a turn."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--levels", type=int, default=11, help="grids of PETSc, 5 x 7 nodes the coarsest: 11 are 4097 x 6145")
+    parser.add_argument(
+        "--levels",
+        type=int,
+        default=11,
+        help="grids of PETSc, 5 x 7 nodes the coarsest: 11 are 4097 x 6145",
+    )
     parser.add_argument("--repeat", type=int, default=REPEAT)
     given, python = parser.parse_args(), interpreter()
     nx, ny = ((n - 1) * 2 ** (given.levels - 1) + 1 for n in COARSEST)
     ours(65, 97)  # loads kernels
     for _ in range(given.repeat):
         seconds, status, steps, norm = ours(nx, ny)
-        line = f"{nx} x {ny} nodes to {RTOL:g}: ours {seconds:.2f} s, {status}, {steps} steps, |w| {norm:.9g}"
+        line = (
+            f"{nx} x {ny} nodes to {RTOL:g}: ours {seconds:.2f} s, {status}, {steps} steps, |w| "
+            f"{norm:.9g}"
+        )
         if python is None:
             sys.exit(f"{line}; {missing()}")
         peer = theirs(python, given.levels)
-        line += f"; PETSc {peer['version']} {peer['seconds']:.2f} s, {peer['steps'][-1][2:4]}, |w| {peer['norm']:.9g}"  # type: ignore[index]
+        line += (
+            f"; PETSc {peer['version']} {peer['seconds']:.2f} s, {peer['steps'][-1][2:4]}, |w| "
+            f"{peer['norm']:.9g}"
+        )  # type: ignore[index]
         sys.stdout.write(f"{line}; ratio {peer['seconds'] / seconds:.1f}\n")  # type: ignore[operator]
         sys.stdout.flush()
 

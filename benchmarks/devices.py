@@ -48,10 +48,20 @@ def measure(options: Options, out: Path) -> Results:
         records += [_step(name, n, options) for name in STEPS if n <= LARGEST_STEP]
     options.say("contacts")
     records.append(_contacts(options))
-    rows = [[r.name, *shown(r, ["seconds"], factor=1e3), *shown(r, ["iterations"], ".0f")] for r in records[1:]]
-    remark = "Least of the samples, warm: kernels loaded, workspaces made. Iterations: to 1e-6 of the residual at the start."
+    rows = [
+        [r.name, *shown(r, ["seconds"], factor=1e3), *shown(r, ["iterations"], ".0f")]
+        for r in records[1:]
+    ]
+    remark = (
+        "Least of the samples, warm: kernels loaded, workspaces made. Iterations: to 1e-6 of "
+        "the residual at the start."
+    )
     chart = Bars(
-        "seconds", "Time of each piece of work", "ms", {r.name: 1e3 * (r.value("seconds") or 0) for r in records[1:]}, logarithmic=True
+        "seconds",
+        "Time of each piece of work",
+        "ms",
+        {r.name: 1e3 * (r.value("seconds") or 0) for r in records[1:]},
+        logarithmic=True,
     )
     return Results(records, [Table("Work", ["work", "ms", "iterations"], rows, remark)], [chart])
 
@@ -74,9 +84,17 @@ def _solves(n: int, options: Options) -> list[Record]:
     records = []
     for name, taken in in_turns(work, options.repeat).items():
         if name == "PGS":
-            records.append(Record(f"{n}^3: a sweep of PGS", {"seconds": Figure.least([t / SWEEPS for t in taken], "s")}))
+            records.append(
+                Record(
+                    f"{n}^3: a sweep of PGS",
+                    {"seconds": Figure.least([t / SWEEPS for t in taken], "s")},
+                )
+            )
             continue
-        figures = {"seconds": Figure.least(taken, "s"), "iterations": Figure(found[name].iterations)}
+        figures = {
+            "seconds": Figure.least(taken, "s"),
+            "iterations": Figure(found[name].iterations),
+        }
         records.append(Record(f"{n}^3: {name}", figures, {"status": found[name].status.name}))
     return records
 
@@ -98,13 +116,18 @@ def _kernels(n: int, options: Options) -> list[Record]:
         wp.synchronize_device(options.device)
 
     taken = in_turns({"product": product, "multigrid cycle": cycle}, options.repeat)
-    return [Record(f"{n}^3: {name}", {"seconds": Figure.least(times, "s")}) for name, times in taken.items()]
+    return [
+        Record(f"{n}^3: {name}", {"seconds": Figure.least(times, "s")})
+        for name, times in taken.items()
+    ]
 
 
 def _step(name: str, cells: int, options: Options) -> Record:
     """Time the steps of a built-in scene."""
     scene = load_scene(name, [f"domain.resolution={cells}"])
-    simulation = simulators()[scene.scene.simulator].create(scene, device=options.device, folder=Path.cwd())
+    simulation = simulators()[scene.scene.simulator].create(
+        scene, device=options.device, folder=Path.cwd()
+    )
     taken = []
     for step in range(BEFORE + TIMED):
         begun = time.perf_counter()
@@ -116,7 +139,9 @@ def _step(name: str, cells: int, options: Options) -> Record:
 
 def _contacts(options: Options) -> Record:
     """Time sweeps of PGS over the contacts of a wall of boxes."""
-    problem = BoxedModel().problem(next_step(CONTACTS, options.device).system).lcp(device=options.device)
+    problem = (
+        BoxedModel().problem(next_step(CONTACTS, options.device).system).lcp(device=options.device)
+    )
     method = wl.ProjectedSOR(omega=1.0)
     kept, sweeps = method.init(problem), unhindered(CONTACT_SWEEPS)
 
@@ -125,4 +150,7 @@ def _contacts(options: Options) -> Record:
         wp.synchronize_device(options.device)
 
     taken = in_turns({"sweep": sweep}, options.repeat)["sweep"]
-    return Record(f"contacts of {CONTACTS}: a sweep of PGS", {"seconds": Figure.least([t / CONTACT_SWEEPS for t in taken], "s")})
+    return Record(
+        f"contacts of {CONTACTS}: a sweep of PGS",
+        {"seconds": Figure.least([t / CONTACT_SWEEPS for t in taken], "s")},
+    )

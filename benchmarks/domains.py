@@ -24,7 +24,8 @@ SIDE = 48  # cells of the cube of liquid, and of the smallest domain
 LARGER = (48, 96, 192, 384, 768)
 STEPS, LONGEST = 4, 0.005  # before a step is measured; the longest one [s]
 FLIGHT = 0.8  # [s] that a ball flies through a domain without far ends, and falls onto a floor
-TIME_LIMITS, GROWTH_LIMIT, MEMORY_LIMIT, LAYING_LIMIT = {192: 1.2, 768: 1.5}, 1.15, 200.0, 8.0  # MB; % of a step
+# MB; % of a step
+TIME_LIMITS, GROWTH_LIMIT, MEMORY_LIMIT, LAYING_LIMIT = {192: 1.2, 768: 1.5}, 1.15, 200.0, 8.0
 
 
 def measure(options: Options, out: Path) -> Results:
@@ -52,13 +53,22 @@ def measure(options: Options, out: Path) -> Results:
     options.say("a flight")
     flight = _flight()
     records.append(flight)
-    rows = [[r.name, *(str(f) for f in r.figures.values()), str(r.facts["covered"])] for r in records[1:-1]]
+    rows = [
+        [r.name, *(str(f) for f in r.figures.values()), str(r.facts["covered"])]
+        for r in records[1:-1]
+    ]
     remark = (
-        f"{(SIDE // 2) ** 3 * 8:,} particles in free fall in the middle of a closed cube. Steps: medians of {options.repeat} in turns, and "
-        "their range. Memory: what a process of its own has grown by after some steps. Checkpoint: a state's arrays."
+        f"{(SIDE // 2) ** 3 * 8:,} particles in free fall in the middle of a closed cube. Steps: "
+        f"medians of {options.repeat} in turns, and "
+        "their range. Memory: what a process of its own has grown by after some steps. Checkpoint: "
+        "a state's arrays."
     )
     heads = ["domain", "a step", "over the first", "memory", "checkpoint", "cells covered"]
-    tables = [Table("A step and its memory", heads, rows, remark), _flight_table(flight), _targets(records)]
+    tables = [
+        Table("A step and its memory", heads, rows, remark),
+        _flight_table(flight),
+        _targets(records),
+    ]
     return Results(records, tables)
 
 
@@ -66,12 +76,14 @@ def falling(n: int) -> LiquidScene:
     """Return the scene of a cube of liquid in a domain of n^3 cells."""
     dx = 1.0 / SIDE
     low, high = 0.5 * (n - SIDE) * dx + 0.25, 0.5 * (n - SIDE) * dx + 0.75
-    return LiquidScene.model_validate({
-        "scene": {"simulator": "fluids"},
-        "time": {"duration": 1.0},
-        "domain": {"size": [n * dx] * 3, "resolution": n},
-        "liquid": [{"shape": "box", "min": [low] * 3, "max": [high] * 3}],
-    })  # fmt: skip
+    return LiquidScene.model_validate(
+        {
+            "scene": {"simulator": "fluids"},
+            "time": {"duration": 1.0},
+            "domain": {"size": [n * dx] * 3, "resolution": n},
+            "liquid": [{"shape": "box", "min": [low] * 3, "max": [high] * 3}],
+        }
+    )
 
 
 def _stepping(n: int) -> Any:
@@ -100,7 +112,11 @@ def memory_of(n: int) -> tuple[int, float, float]:
     for _ in range(STEPS):
         simulation.step(min(simulation.stable_dt(), LONGEST))
     grown = resident_bytes() - before
-    return simulation.grid.size, grown / 2**20, sum(array.nbytes for array in simulation.state().values()) / 2**20
+    return (
+        simulation.grid.size,
+        grown / 2**20,
+        sum(array.nbytes for array in simulation.state().values()) / 2**20,
+    )
 
 
 class Shares(NoStopwatch):
@@ -119,13 +135,22 @@ class Shares(NoStopwatch):
 
 def _flight() -> Record:
     """Return what laying grids takes of a ball's flight over a solid, in a domain without far ends."""
-    scene = LiquidScene.model_validate({
-        "scene": {"simulator": "fluids"},
-        "time": {"duration": FLIGHT},
-        "domain": {"spacing": 0.02, "open": ["left", "back"]},
-        "liquid": [{"shape": "sphere", "center": [2.0, 2.0, 2.0], "radius": 0.4, "velocity": [6.0, 2.0, 0.0]}],
-        "solid": [{"shape": "box", "min": [1.0, 0.0, 1.0], "max": [5.0, 0.5, 3.0]}],
-    })  # fmt: skip
+    scene = LiquidScene.model_validate(
+        {
+            "scene": {"simulator": "fluids"},
+            "time": {"duration": FLIGHT},
+            "domain": {"spacing": 0.02, "open": ["left", "back"]},
+            "liquid": [
+                {
+                    "shape": "sphere",
+                    "center": [2.0, 2.0, 2.0],
+                    "radius": 0.4,
+                    "velocity": [6.0, 2.0, 0.0],
+                }
+            ],
+            "solid": [{"shape": "box", "min": [1.0, 0.0, 1.0], "max": [5.0, 0.5, 3.0]}],
+        }
+    )
     simulation = SIMULATOR.create(scene, device="cpu", folder=Path())
     for _ in range(STEPS):
         simulation.step(min(simulation.stable_dt(), LONGEST))
@@ -137,7 +162,9 @@ def _flight() -> Record:
             grids.append(simulation.grid)
     whole = time.perf_counter() - begun
     figures = {
-        "laying": Figure(100.0 * (watch.seconds["regridding"] + watch.seconds["spray"]) / whole, "%"),
+        "laying": Figure(
+            100.0 * (watch.seconds["regridding"] + watch.seconds["spray"]) / whole, "%"
+        ),
         "grids": Figure(len(grids)),
         "steps": Figure(simulation.step_count - STEPS),
         "step": Figure(1e3 * whole / (simulation.step_count - STEPS), "ms"),
@@ -146,19 +173,36 @@ def _flight() -> Record:
 
 
 def _flight_table(record: Record) -> Table:
-    remark = "A ball of .4 m flies 4 m and falls onto a solid and the floor, cells of 2 cm, a domain without far ends."
+    remark = (
+        "A ball of .4 m flies 4 m and falls onto a solid and the floor, cells of 2 cm, a "
+        "domain without far ends."
+    )
     heads = ["", "laying grids, share of a step", "grids", "steps", "a step", "most cells covered"]
-    return Table("Laying grids", heads, [[record.name, *(str(f) for f in record.figures.values()), str(record.facts["covered"])]], remark)
+    return Table(
+        "Laying grids",
+        heads,
+        [[record.name, *(str(f) for f in record.figures.values()), str(record.facts["covered"])]],
+        remark,
+    )
 
 
 def _targets(records: list[Record]) -> Table:
     by_name = {record.name: record for record in records}
     times = {n: by_name[f"{n}^3"].figures["ratio"] for n in TIME_LIMITS if f"{n}^3" in by_name}
-    found = [Target(f"{n}^3 over {SIDE}^3, a step", TIME_LIMITS[n], ratio, " x") for n, ratio in times.items()]
+    found = [
+        Target(f"{n}^3 over {SIDE}^3, a step", TIME_LIMITS[n], ratio, " x")
+        for n, ratio in times.items()
+    ]
     if "192^3" in by_name:
-        growth = by_name["192^3"].figures["memory"].value / by_name[f"{SIDE}^3"].figures["memory"].value
+        growth = (
+            by_name["192^3"].figures["memory"].value / by_name[f"{SIDE}^3"].figures["memory"].value
+        )
         found.append(Target(f"192^3 over {SIDE}^3, memory", GROWTH_LIMIT, Figure(growth), " x"))
     if "768^3" in by_name:
-        found.append(Target("768^3, memory", MEMORY_LIMIT, by_name["768^3"].figures["memory"], " MB"))
-    found.append(Target("laying grids, share of a step", LAYING_LIMIT, records[-1].figures["laying"], " %"))
+        found.append(
+            Target("768^3, memory", MEMORY_LIMIT, by_name["768^3"].figures["memory"], " MB")
+        )
+    found.append(
+        Target("laying grids, share of a step", LAYING_LIMIT, records[-1].figures["laying"], " %")
+    )
     return table_of_targets("of large domains", found)

@@ -1,8 +1,10 @@
 """What a run costs that Python drives: `python -m benchmarks.driven [SCENE ...]`, in the source tree; in turns, by threes.
 
-The same run by `run_scene`, as the command line calls it, by `for frame in wl.Run(...)` with a callback in each step and a look at the
-particles in each frame, and by `run_scene` again, which says what the clock cannot tell apart. All write log, frames and checkpoints.
-Seconds of the processor, so that neighbors on the machine count less; ratios to the first of the three, their medians and quartiles.
+The same run by `run_scene`, as the command line calls it, by `for frame in wl.Run(...)` with a
+callback in each step and a look at the particles in each frame, and by `run_scene` again, which
+says what the clock cannot tell apart. All write log, frames and checkpoints. Seconds of the
+processor, so that neighbors on the machine count less; ratios to the first of the three, their
+medians and quartiles.
 """
 
 import sys
@@ -25,13 +27,22 @@ TURNS = 15
 def by_command(scene: str, folder: Path, duration: float) -> None:
     """Run a scene as the command line does."""
     given = given_scene(scene, [f"time.duration={duration}"])
-    run_scene(RunRequest(scene=given.scene, out=folder, overrides=given.overrides), observer=Lines(Console(quiet=True)))
+    run_scene(
+        RunRequest(scene=given.scene, out=folder, overrides=given.overrides),
+        observer=Lines(Console(quiet=True)),
+    )
 
 
 def by_program(scene: str, folder: Path, duration: float) -> None:
     """Run it from Python, and look at every frame."""
     steps: list[float] = []
-    run = wl.Run(scene, folder=folder, device="cpu", duration=duration, on_step=lambda run: steps.append(run.time))
+    run = wl.Run(
+        scene,
+        folder=folder,
+        device="cpu",
+        duration=duration,
+        on_step=lambda run: steps.append(run.time),
+    )
     for frame in run:
         assert frame.particles.position.numpy()[0, 0] >= 0.0
     assert len(steps) == run.simulation.step_count
@@ -49,11 +60,16 @@ def measure(scene: str, duration: float) -> None:
                 taken.append(time.process_time() - begun)
         seconds.append(taken)
     first, driven, again = np.transpose(seconds[1:])  # the first turn loads kernels
-    sys.stdout.write(f"{scene}, {duration:g} s, {first.mean():.2f} s of the processor, {TURNS} turns:\n")
+    sys.stdout.write(
+        f"{scene}, {duration:g} s, {first.mean():.2f} s of the processor, {TURNS} turns:\n"
+    )
     for name, times in (("driven from Python", driven), ("the same again", again)):
         low, middle, high = np.percentile(times / first, [25, 50, 75])
         total = times.sum() / first.sum()
-        sys.stdout.write(f"  {name} / command line: median {middle:.3f}, quartiles {low:.3f} to {high:.3f}, all together {total:.3f}\n")
+        sys.stdout.write(
+            f"  {name} / command line: median {middle:.3f}, quartiles {low:.3f} to {high:.3f}, all "
+            f"together {total:.3f}\n"
+        )
 
 
 if __name__ == "__main__":

@@ -1,16 +1,20 @@
 # mypy: ignore-errors
 """What is done on CUDA, on the CPU: to be imported before the package. The plugin `tests/emulated_cuda.py` has tests run so.
 
-The package decides as on CUDA (`device.is_cuda`, `__CUDA_ARCH__`), blocks of threads run as cooperative fibers that meet at barriers,
-threads and blocks run in an order that is not the usual one (ORDER = forward, reversed, permuted), `.numpy()` gives a copy, so that what
-is written to it is lost, as it is there, and recorded programs launch what a graph would hold.
+The package decides as on CUDA (`device.is_cuda`, `__CUDA_ARCH__`), blocks of threads run as
+cooperative fibers that meet at barriers, threads and blocks run in an order that is not the usual
+one (ORDER = forward, reversed, permuted), `.numpy()` gives a copy, so that what is written to it is
+lost, as it is there, and recorded programs launch what a graph would hold.
 
-With COMPARE=1 every launch runs in all three orders from equal memory; `differs` counts the kernels whose results depend on it and that are
-not in `ORDER_MATTERS`. With CELLS=1 every pass by quads of cells (`warp_lcp/rows/headers/quad.h`) also runs by cells, from equal memory:
-`launched_by_cells` counts such launches, `otherwise` those whose fields differ in a bit, or whose sums differ by more than rounding.
-`meter` counts launches, readbacks and allocations, and calls: of Python, to launch, copy or clear, one for a whole graph.
+With COMPARE=1 every launch runs in all three orders from equal memory; `differs` counts the kernels
+whose results depend on it and that are not in `ORDER_MATTERS`. With CELLS=1 every pass by quads of
+cells (`warp_lcp/rows/headers/quad.h`) also runs by cells, from equal memory: `launched_by_cells`
+counts such launches, `otherwise` those whose fields differ in a bit, or whose sums differ by more
+than rounding. `meter` counts launches, readbacks and allocations, and calls: of Python, to launch,
+copy or clear, one for a whole graph.
 
-What it cannot show: torn interleavings and the memory model (threads run one after another), graphs' own rules, the order of streams.
+What it cannot show: torn interleavings and the memory model (threads run one after another),
+graphs' own rules, the order of streams.
 """
 
 import collections
@@ -34,21 +38,33 @@ ORDERS = ("forward", "reversed", "permuted")
 ORDER = ORDERS.index(os.environ.get("ORDER", "permuted"))
 COMPARE, CELLS = os.environ.get("COMPARE") == "1", os.environ.get("CELLS") == "1"
 PACKAGE = "warp_lcp"
-REAL = ("warp_lcp.distributed.", "warp_lcp.run.devices", "warp_lcp.benchmarks.")  # these ask CUDA itself, or another process
+# these ask CUDA itself, or another process
+REAL = ("warp_lcp.distributed.", "warp_lcp.run.devices", "warp_lcp.benchmarks.")
 ADDRESS = 0x6F0000000000  # of the order, where compiled kernels look it up
 # Kernels (module:name) whose results depend on the order of threads, and why they may.
 ORDER_MATTERS = {
     "warp_lcp.components.unite.*:unite": "trees differ, their roots do not",
     "warp_lcp.material.flight:unite": "trees differ, their roots do not",
-    "warp_lcp.material.flight:board_kernel": "a list in the order in which threads come; sums over it are rounded in that order",
-    "warp_lcp.grid.node_distance:claim_groups": "lists of nodes in the order in which threads come; each node is measured for itself",
-    "warp_lcp.grid.transfer_*.scatter.*:scatter": "sums of atomic additions are rounded in their order",
-    "warp_lcp.vectors:add_up_kernel": "a tile adds up by place in the block, and the emulation deals places out anew",
+    "warp_lcp.material.flight:board_kernel": "a list in the order in which threads come; sums over "
+    "it are rounded in that order",
+    "warp_lcp.grid.node_distance:claim_groups": "lists of nodes in the order in which threads "
+    "come; each node is measured for itself",
+    "warp_lcp.grid.transfer_*.scatter.*:scatter": "sums of atomic additions are rounded in their "
+    "order",
+    "warp_lcp.vectors:add_up_kernel": "a tile adds up by place in the block, and the emulation "
+    "deals places out anew",
 }
 
 libc = ctypes.CDLL(None)
 libc.mmap.restype = ctypes.c_void_p
-libc.mmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int, ctypes.c_int, ctypes.c_int, ctypes.c_long]
+libc.mmap.argtypes = [
+    ctypes.c_void_p,
+    ctypes.c_size_t,
+    ctypes.c_int,
+    ctypes.c_int,
+    ctypes.c_int,
+    ctypes.c_long,
+]
 READ_WRITE, PRIVATE_FIXED_ANONYMOUS = 3, 0x02 | 0x10 | 0x20
 if libc.mmap(ADDRESS, 4096, READ_WRITE, PRIVATE_FIXED_ANONYMOUS, -1, 0) != ADDRESS:
     raise RuntimeError(f"no memory at {ADDRESS:#x}, where kernels look up the order of threads")
@@ -99,20 +115,39 @@ def emulate_kernels():
     added = CUDA + rounded + PERMUTED.replace("ADDRESS", hex(ADDRESS))
     codegen.cpu_module_header += added.replace("{", "{{").replace("}", "}}")
     loop = "    for (size_t task_index = 0; task_index < dim->size; ++task_index)\n    {{\n"
-    permuted = "    const emulated_order of(dim->size);\n    for (size_t task = 0; task < dim->size; ++task)\n    {{\n"
-    swap("cpu_module_template_forward", (loop, permuted + "        const size_t task_index = of(task);\n"))
+    permuted = (
+        "    const emulated_order of(dim->size);\n    for (size_t task = 0; task < "
+        "dim->size; ++task)\n    {{\n"
+    )
+    swap(
+        "cpu_module_template_forward",
+        (loop, permuted + "        const size_t task_index = of(task);\n"),
+    )
     lane = "const size_t task_index = payload->block_first + (size_t)lane;"
-    rest = "const size_t rest = dim->size - payload->block_first, active = rest < WP_TILE_BLOCK_DIM ? rest : WP_TILE_BLOCK_DIM;\n"
-    swap("cpu_block_module_template_forward", (lane, f"{rest}    {lane.replace('(size_t)lane', 'emulated_order(active)((size_t)lane)')}"))
-    blocks = "    const size_t blocks = (total + block_dim - 1) / block_dim; const emulated_order of(blocks);\n"
+    rest = (
+        "const size_t rest = dim->size - payload->block_first, active = rest < "
+        "WP_TILE_BLOCK_DIM ? rest : WP_TILE_BLOCK_DIM;\n"
+    )
+    swap(
+        "cpu_block_module_template_forward",
+        (lane, f"{rest}    {lane.replace('(size_t)lane', 'emulated_order(active)((size_t)lane)')}"),
+    )
+    blocks = (
+        "    const size_t blocks = (total + block_dim - 1) / block_dim; const emulated_order "
+        "of(blocks);\n"
+    )
     swap(
         "cpu_block_entry_body_forward",
         ("    while (block_first < total)\n", f"{blocks}    while (block_id < blocks)\n"),
-        ("        const size_t remaining", "        block_first = of(block_id)*block_dim;\n        const size_t remaining"),
+        (
+            "        const size_t remaining",
+            "        block_first = of(block_id)*block_dim;\n        const size_t remaining",
+        ),
         ("        block_first += (size_t)active_count;\n", ""),
     )
     wp.config.enable_cpu_blocks = True
-    wp.config.kernel_cache_dir = str(Path(__file__).parents[1] / "build" / "emulated-cuda")  # of its own: Warp does not hash templates
+    # of its own: Warp does not hash templates
+    wp.config.kernel_cache_dir = str(Path(__file__).parents[1] / "build" / "emulated-cuda")
 
 
 class Loader(importlib.machinery.SourceFileLoader):
@@ -124,7 +159,8 @@ class Loader(importlib.machinery.SourceFileLoader):
         source = self.get_data(path).decode()
         if not fullname.startswith(REAL):
             source = re.sub(r"\.(is_cuda|is_cpu)\b", r".\1_like", source)
-        source = source.replace("block_dim: int = 256", "block_dim: int = 1")  # fibers only where threads meet
+        # fibers only where threads meet
+        source = source.replace("block_dim: int = 256", "block_dim: int = 1")
         return compile(source, path, "exec", dont_inherit=True)
 
 
@@ -133,13 +169,18 @@ class Finder(importlib.abc.MetaPathFinder):
 
     def find_spec(self, name, path, target=None):
         """Find a module of the package."""
-        spec = importlib.machinery.PathFinder.find_spec(name, path, target) if name.partition(".")[0] == PACKAGE else None
+        spec = (
+            importlib.machinery.PathFinder.find_spec(name, path, target)
+            if name.partition(".")[0] == PACKAGE
+            else None
+        )
         if spec and spec.origin and spec.origin.endswith(".py"):
             spec.loader = Loader(name, spec.origin)
         return spec
 
 
-meter = collections.Counter[str]()  # of launches, readbacks and allocations, to be cleared by whoever looks
+# of launches, readbacks and allocations, to be cleared by whoever looks
+meter = collections.Counter[str]()
 
 
 def counted(what, result):
@@ -168,7 +209,9 @@ def emulate_decisions():
 
     wp.launch = launch
     wp.array.numpy = lambda self: counted("readbacks", numpy(self).copy())
-    context.CpuDefaultAllocator.allocate = counting("allocations", context.CpuDefaultAllocator.allocate)
+    context.CpuDefaultAllocator.allocate = counting(
+        "allocations", context.CpuDefaultAllocator.allocate
+    )
     for name in ("invoke", "invoke_cpu_blocks"):
         setattr(context, name, counting("launches", getattr(context, name)))
     replay = wp.capture_launch
@@ -192,8 +235,16 @@ def arrays_of(value, kind, found):
     """Collect the addresses of arrays in a parameter, in structs and in tables of structs, with their bytes and element types."""
     if isinstance(value, array_t):
         dtype, shape = getattr(kind, "dtype", None), [value.shape[i] for i in range(value.ndim)]
-        item = ctypes.sizeof(dtype.ctype) if isinstance(dtype, codegen.Struct) else wp.types.type_size_in_bytes(dtype)
-        size = sum((n - 1) * abs(value.strides[i]) for i, n in enumerate(shape)) + item if value.data and all(shape) else 0
+        item = (
+            ctypes.sizeof(dtype.ctype)
+            if isinstance(dtype, codegen.Struct)
+            else wp.types.type_size_in_bytes(dtype)
+        )
+        size = (
+            sum((n - 1) * abs(value.strides[i]) for i, n in enumerate(shape)) + item
+            if value.data and all(shape)
+            else 0
+        )
         if size > found.get(value.data, (0, None))[0]:
             found[value.data] = size, dtype
         if size and isinstance(dtype, codegen.Struct) and value.ndim == 1:
@@ -217,8 +268,11 @@ def compared(invoke):
             for address, data in before.items():
                 ctypes.memmove(address, data, len(data))
             invoke(kernel, hooks, params, adjoint)
-            after.append({address: ctypes.string_at(address, size) for address, (size, _) in found.items()})
-        name = f"{kernel.module.name.partition('.memory.')[0]}:{kernel.key}"  # arguments from memory change nothing
+            after.append(
+                {address: ctypes.string_at(address, size) for address, (size, _) in found.items()}
+            )
+        # arguments from memory change nothing
+        name = f"{kernel.module.name.partition('.memory.')[0]}:{kernel.key}"
         if after[0] != after[2] or after[1] != after[2]:
             if not any(fnmatch.fnmatchcase(name, known) for known in ORDER_MATTERS):
                 differs[name] += 1
@@ -238,7 +292,11 @@ def checked_by_cells(invoke):
 
     def form_of(kernel):
         if kernel not in forms:
-            made = (o for o in gc.get_objects() if type(o) is Form and o.quads and vars(o).get("kernel") is kernel)
+            made = (
+                o
+                for o in gc.get_objects()
+                if type(o) is Form and o.quads and vars(o).get("kernel") is kernel
+            )
             forms[kernel] = next(made, None)
         return forms[kernel]
 
@@ -252,7 +310,10 @@ def checked_by_cells(invoke):
         arrays_of(given, kernel.adj.args[1].type, found)
         for address in {given.out.data} if columns else ():
             found.pop(address, None)  # places of sums are others
-        native, cells = twin.native.from_buffer_copy(bytes(given)), type(rows).from_buffer_copy(rows)
+        native, cells = (
+            twin.native.from_buffer_copy(bytes(given)),
+            type(rows).from_buffer_copy(rows),
+        )
         cells.grain, cells.chunks = 1, cells.nx
         dims = layout.threads(cells)
         out = wp.zeros(len(columns) * math.prod(dims), dtype=wp.float64, device="cpu")
@@ -262,7 +323,9 @@ def checked_by_cells(invoke):
         vars(by_cells)["_ctype"], vars(arguments)["_ctype"] = cells, native
         before = {address: ctypes.string_at(address, size) for address, (size, _) in found.items()}
         wp.launch(twin.kernel, dims, [by_cells, arguments], device="cpu", block_dim=1)
-        expected = {address: ctypes.string_at(address, size) for address, (size, _) in found.items()}
+        expected = {
+            address: ctypes.string_at(address, size) for address, (size, _) in found.items()
+        }
         for address, data in before.items():
             ctypes.memmove(address, data, len(data))
         meter.clear()
@@ -271,12 +334,21 @@ def checked_by_cells(invoke):
         counts = meter.copy()
         name = " ".join([form.declared.name, *form.words])
         launched_by_cells[name] += 1
-        otherwise[name] += not all(equal_bits(ctypes.string_at(a, len(data)), data, found[a][1]) for a, data in expected.items())
+        otherwise[name] += not all(
+            equal_bits(ctypes.string_at(a, len(data)), data, found[a][1])
+            for a, data in expected.items()
+        )
         if columns:
             count = len(columns) * math.prod(layout.threads(rows))
-            sums = np.frombuffer(ctypes.string_at(given.out.data, 8 * count)).reshape(len(columns), -1)
-            for column, one, other in zip(columns, sums, out.numpy().reshape(len(columns), -1), strict=True):
-                otherwise[f"{name}: {column}"] += not equal_sums(one, other, column, largest=column in form.declared.largest)
+            sums = np.frombuffer(ctypes.string_at(given.out.data, 8 * count)).reshape(
+                len(columns), -1
+            )
+            for column, one, other in zip(
+                columns, sums, out.numpy().reshape(len(columns), -1), strict=True
+            ):
+                otherwise[f"{name}: {column}"] += not equal_sums(
+                    one, other, column, largest=column in form.declared.largest
+                )
         meter.clear()
         meter.update(counts)
 
@@ -287,7 +359,9 @@ def equal_bits(one, other, kind):
     """Return whether two arrays of a type have the same bits; every NaN counts as the same."""
     if one == other or kind not in (wp.float32, wp.float64):
         return one == other
-    a, b = (np.frombuffer(data, dtype=wp.types.warp_type_to_np_dtype[kind]) for data in (one, other))
+    a, b = (
+        np.frombuffer(data, dtype=wp.types.warp_type_to_np_dtype[kind]) for data in (one, other)
+    )
     either = np.isnan(a) | np.isnan(b)
     return np.array_equal(np.isnan(a), np.isnan(b)) and a[~either].tobytes() == b[~either].tobytes()
 
@@ -306,7 +380,10 @@ launched_by_cells: collections.Counter[str] = collections.Counter()
 otherwise: collections.Counter[str] = collections.Counter()
 differs: collections.Counter[str] = collections.Counter()
 if COMPARE:
-    context.invoke, context.invoke_cpu_blocks = compared(context.invoke), compared(context.invoke_cpu_blocks)
+    context.invoke, context.invoke_cpu_blocks = (
+        compared(context.invoke),
+        compared(context.invoke_cpu_blocks),
+    )
 
 
 def replayed():
@@ -335,7 +412,9 @@ def replayed():
     device_graph.noted = lambda device, event: None
     wp.is_conditional_graph_supported = lambda: True
     Program._captured = lambda self, commands: list(commands)
-    Program._captured_loop = lambda self, condition: lambda: wp.capture_launch([Loop(condition, self)])
+    Program._captured_loop = lambda self, condition: (
+        lambda: wp.capture_launch([Loop(condition, self)])
+    )
 
 
 emulate_kernels()

@@ -1,9 +1,10 @@
 """A verdict on a GPU from one command, in the source tree: `python -m benchmarks.gpu`; one page is left in out/gpu.
 
-What holds on the CPU must hold on the device: equal answers, of each kernel too, the same bits in every run, graphs as launches, odd grids,
-hundreds of steps, memory that stays. Then times, beside what `benchmarks/gpu_model.py` foretold, and which share of the bandwidth kernels
-reach. A claim that fails is written down like one that holds. `--rehearse` does all of it on the CPU in CUDA's form
-(`benchmarks/emulated_cuda.py`).
+What holds on the CPU must hold on the device: equal answers, of each kernel too, the same bits in
+every run, graphs as launches, odd grids, hundreds of steps, memory that stays. Then times, beside
+what `benchmarks/gpu_model.py` foretold, and which share of the bandwidth kernels reach. A claim
+that fails is written down like one that holds. `--rehearse` does all of it on the CPU in CUDA's
+form (`benchmarks/emulated_cuda.py`).
 """
 
 import importlib
@@ -77,10 +78,18 @@ class Verdict:
         except AssertionError as error:
             text, holds = str(error), False
         except Exception as error:  # whatever a strange machine does is what this is to find
-            text, holds = f"{type(error).__name__}: {error} ({traceback.extract_tb(error.__traceback__)[-1].name})", False
+            text, holds = (
+                f"{type(error).__name__}: {error} "
+                f"({traceback.extract_tb(error.__traceback__)[-1].name})",
+                False,
+            )
         if text is not None:
             self.claims.append(Claim(name, holds, text))
-            print(f"{'PASS' if holds else 'FAIL'}  {name}: {text} ({time.perf_counter() - start:.0f} s)", flush=True)
+            print(
+                f"{'PASS' if holds else 'FAIL'}  {name}: {text} ({time.perf_counter() - start:.0f} "
+                "s)",
+                flush=True,
+            )
 
     def all(self) -> None:
         """Try everything."""
@@ -121,10 +130,22 @@ class Verdict:
 
     def each_kernel(self) -> str:
         """Launch each kernel here and there on equal arrays, in a process of its own: what crashes there leaves this page."""
-        command = [sys.executable, "-m", "benchmarks.gpu_kernels", self.device, *["--rehearse"] * self.rehearsal]
-        done = subprocess.run(command, cwd=ROOT, check=False, capture_output=True, text=True, timeout=900)
+        command = [
+            sys.executable,
+            "-m",
+            "benchmarks.gpu_kernels",
+            self.device,
+            *["--rehearse"] * self.rehearsal,
+        ]
+        done = subprocess.run(
+            command, cwd=ROOT, check=False, capture_output=True, text=True, timeout=900
+        )
         said = (done.stdout.splitlines() or [""])[-1]
-        assert done.returncode == 0, said if done.returncode == WRONG else f"ended with {done.returncode}: {done.stderr[-500:]}"
+        assert done.returncode == 0, (
+            said
+            if done.returncode == WRONG
+            else f"ended with {done.returncode}: {done.stderr[-500:]}"
+        )
         return said
 
     def residuals(self) -> str:
@@ -133,8 +154,13 @@ class Verdict:
         problem = scene.lcp("walls", device=self.device)
         result = wl.solve(problem, wl.ProjectedMultigrid(), stopping=wl.StoppingCriteria(rtol=1e-7))
         lower = np.where(scene.wall, 0.0, -np.inf)
-        start, end = (np.linalg.norm(natural(scene.cells, scene.b, lower, x)) for x in (np.zeros(scene.cells.shape), result.x.numpy()))
-        assert end <= 1.1e-7 * start, f"{end / start:.1e} at {n}^3, where the solver says {result.relative_residual:.1e}"
+        start, end = (
+            np.linalg.norm(natural(scene.cells, scene.b, lower, x))
+            for x in (np.zeros(scene.cells.shape), result.x.numpy())
+        )
+        assert end <= 1.1e-7 * start, (
+            f"{end / start:.1e} at {n}^3, where the solver says {result.relative_residual:.1e}"
+        )
         return f"{end / start:.1e} of the start's at {n}^3 in {result.iterations} iterations"
 
     def repeats(self) -> str:
@@ -142,7 +168,12 @@ class Verdict:
         first, second = (gpu_cases.large(self.device, 32) for _ in range(2))
         other = [name for name, x in first.items() if not np.array_equal(x, second[name])]
         for name in ("dam-break", "column-collapse-2d"):
-            for step, (a, b) in enumerate(zip(*(gpu_cases.states(name, self.device, self.steps) for _ in range(2)), strict=True)):
+            for step, (a, b) in enumerate(
+                zip(
+                    *(gpu_cases.states(name, self.device, self.steps) for _ in range(2)),
+                    strict=True,
+                )
+            ):
                 if not all(np.array_equal(a[key], b[key]) for key in a):
                     other.append(f"{name} from step {step} on")
                     break
@@ -152,7 +183,10 @@ class Verdict:
     def graphs(self) -> str:
         """Solve with launches one by one."""
         recorded = gpu_cases.large(self.device, 32)
-        with mock.patch.object(Program, "_captured", lambda _, commands: list(commands)), mock.patch.object(wp, "capture_launch", launched):
+        with (
+            mock.patch.object(Program, "_captured", lambda _, commands: list(commands)),
+            mock.patch.object(wp, "capture_launch", launched),
+        ):
             alone = gpu_cases.large(self.device, 32)
         other = [name for name, x in recorded.items() if not np.array_equal(x, alone[name])]
         assert not other, f"differ: {', '.join(other)}"
@@ -194,12 +228,15 @@ class Verdict:
         if not loops_on_device(wp.get_device(self.device)):
             return None
         simulation, counts = gpu_cases.simulation("dam-break", self.device), []
-        with mock.patch.object(wp.array, "numpy", autospec=True, side_effect=wp.array.numpy) as read:
+        with mock.patch.object(
+            wp.array, "numpy", autospec=True, side_effect=wp.array.numpy
+        ) as read:
             for _ in range(self.steps):
                 read.reset_mock()
                 row = simulation.step(min(simulation.stable_dt(), gpu_cases.DT))
                 counts += [] if row.get("density_status") else [read.call_count]
-        assert max(counts[2:]) <= 2, f"up to {max(counts[2:])} times"  # the first steps load kernels
+        # the first steps load kernels
+        assert max(counts[2:]) <= 2, f"up to {max(counts[2:])} times"
         return f"{len(counts) - 2} steps"
 
     def empty(self) -> str:
@@ -220,7 +257,10 @@ class Verdict:
         for step, _ in enumerate(gpu_cases.states("dam-break", self.device, 2 * self.steps)):
             if step % self.steps == self.steps - 1:
                 used.append(wp.get_mempool_used_mem_current(self.device))
-        assert used[1] <= 1.05 * used[0], f"{used[0] / 1e6:.0f} MB after {self.steps} steps, {used[1] / 1e6:.0f} after {2 * self.steps}"
+        assert used[1] <= 1.05 * used[0], (
+            f"{used[0] / 1e6:.0f} MB after {self.steps} steps, {used[1] / 1e6:.0f} after "
+            f"{2 * self.steps}"
+        )
         return f"{used[1] / 1e6:.0f} MB after {2 * self.steps} steps"
 
     def sanitized(self) -> str | None:
@@ -228,8 +268,22 @@ class Verdict:
         tool = shutil.which("compute-sanitizer")
         if tool is None or self.rehearsal:
             return None
-        cases = [sys.executable, "-m", "benchmarks.gpu_cases", str(self.out / "sanitized.npz"), self.device, "2"]
-        done = subprocess.run([tool, "--error-exitcode", "9", *cases], cwd=ROOT, capture_output=True, text=True, timeout=600, check=False)
+        cases = [
+            sys.executable,
+            "-m",
+            "benchmarks.gpu_cases",
+            str(self.out / "sanitized.npz"),
+            self.device,
+            "2",
+        ]
+        done = subprocess.run(
+            [tool, "--error-exitcode", "9", *cases],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            timeout=600,
+            check=False,
+        )
         assert done.returncode == 0, done.stdout[-500:]
         return "memcheck"
 
@@ -242,23 +296,53 @@ class Verdict:
             for _ in range(4):  # the first loads kernels and captures graphs
                 wp.synchronize()
                 start = time.perf_counter()
-                result = wl.solve(problem, method, stopping=wl.StoppingCriteria(rtol=1e-6), workspace=workspace)
+                result = wl.solve(
+                    problem, method, stopping=wl.StoppingCriteria(rtol=1e-6), workspace=workspace
+                )
                 wp.synchronize()
                 taken.append(time.perf_counter() - start)
-            rows.append([f"{n}^3", f"{1e3 * min(taken[1:]):.1f}", str(result.iterations), result.status.name])
-        self.tables.append(Table("Cold solves of a splash to 1e-6", ["cells", "ms", "iterations", "status"], rows))
+            rows.append(
+                [
+                    f"{n}^3",
+                    f"{1e3 * min(taken[1:]):.1f}",
+                    str(result.iterations),
+                    result.status.name,
+                ]
+            )
+        self.tables.append(
+            Table("Cold solves of a splash to 1e-6", ["cells", "ms", "iterations", "status"], rows)
+        )
         assert all(row[-1] == "CONVERGED" for row in rows), rows
         for n in (16,) if self.rehearsal else (64, 128):
-            steps.append([f"{n}", *(f"{1e3 * self._step_time(n, on_device=on):.1f}" for on in (False, True))])
-        self.tables.append(Table("Steps of the dam break", ["cells along x", "ms", "ms, step graphs"], steps))
+            steps.append(
+                [f"{n}", *(f"{1e3 * self._step_time(n, on_device=on):.1f}" for on in (False, True))]
+            )
+        self.tables.append(
+            Table("Steps of the dam break", ["cells along x", "ms", "ms, step graphs"], steps)
+        )
         cells = ("16", "16") if self.rehearsal else ("128", "64")
         said = subprocess.run(
-            [sys.executable, "-m", "benchmarks.gpu_model", "--cells", cells[0], "--step-cells", cells[1]],
-            cwd=ROOT, check=True, capture_output=True, text=True, timeout=600,
-        ).stdout  # fmt: skip
+            [
+                sys.executable,
+                "-m",
+                "benchmarks.gpu_model",
+                "--cells",
+                cells[0],
+                "--step-cells",
+                cells[1],
+            ],
+            cwd=ROOT,
+            check=True,
+            capture_output=True,
+            text=True,
+            timeout=600,
+        ).stdout
         (self.out / "model.md").write_text(said)
         return ", ".join(
-            [*(f"{cells} {ms} ms" for cells, ms, *_ in rows), *(f"a step at {n} {ms} ms, from graphs {graphs}" for n, ms, graphs in steps)]
+            [
+                *(f"{cells} {ms} ms" for cells, ms, *_ in rows),
+                *(f"a step at {n} {ms} ms, from graphs {graphs}" for n, ms, graphs in steps),
+            ]
         )
 
     def _step_time(self, n: int, *, on_device: bool) -> float:
@@ -276,7 +360,9 @@ class Verdict:
     def bandwidth(self) -> str:
         """Measure the kernels on the finest grid against copying."""
         n = 16 if self.rehearsal else 256
-        found = kernels.measure(Options(self.device, (n,), 1 if self.rehearsal else 5, lambda _: None), self.out)
+        found = kernels.measure(
+            Options(self.device, (n,), 1 if self.rehearsal else 5, lambda _: None), self.out
+        )
         self.tables += found.tables
         return f"{sum(len(t.rows) for t in found.tables[1:])} kernels at {n}^3"
 
@@ -296,7 +382,11 @@ class Verdict:
         if (model := self.out / "model.md").exists():
             lines += ["", "## What was foretold", "", model.read_text()]
         (self.out / "verdict.md").write_text("\n".join(lines) + "\n")
-        kept = {"device": record.facts, "claims": [asdict(c) for c in self.claims], "tables": [asdict(t) for t in self.tables]}
+        kept = {
+            "device": record.facts,
+            "claims": [asdict(c) for c in self.claims],
+            "tables": [asdict(t) for t in self.tables],
+        }
         (self.out / "verdict.json").write_text(json.dumps(kept, indent=1))
 
 
@@ -311,8 +401,14 @@ def launched(graph: Any) -> None:
 
 def main() -> int:
     """Try everything; return 1 if a claim fails, 2 if there is no device."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rehearse", action="store_true", help="small rehearsal on the CPU, with the CUDA code paths")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--rehearse",
+        action="store_true",
+        help="small rehearsal on the CPU, with the CUDA code paths",
+    )
     parser.add_argument("--device", default="cuda:0")
     parser.add_argument("--out", type=Path, default=Path("out/gpu"))
     given = parser.parse_args()
@@ -320,7 +416,9 @@ def main() -> int:
         print("no CUDA device: use `--rehearse` for a rehearsal on the CPU", file=sys.stderr)
         return 2
     given.out.mkdir(parents=True, exist_ok=True)
-    verdict = Verdict("cpu" if given.rehearse else given.device, rehearsal=given.rehearse, out=given.out.resolve())
+    verdict = Verdict(
+        "cpu" if given.rehearse else given.device, rehearsal=given.rehearse, out=given.out.resolve()
+    )
     verdict.all()
     verdict.write()
     print(f"{given.out}/verdict.md and verdict.json")

@@ -32,7 +32,12 @@ def obstacle(shape: tuple[int, ...], device: str, *, periodic: bool = False) -> 
     cells.flat[0] = wl.FLUID
     flags = tuple(n > 2 for n in reversed(shape)) if periodic else (False,) * len(shape)
     A = wl.GridPoisson(cells, shift=0.1, periodic=(*flags, False)[:3], device=device)
-    return wl.LCP(A, np.where(cells == wl.FLUID, rng.standard_normal(shape), 0.0), 0.0, np.where(rng.random(shape) < 0.3, 0.5, np.inf))
+    return wl.LCP(
+        A,
+        np.where(cells == wl.FLUID, rng.standard_normal(shape), 0.0),
+        0.0,
+        np.where(rng.random(shape) < 0.3, 0.5, np.inf),
+    )
 
 
 def methods(device: str) -> Arrays:
@@ -41,7 +46,9 @@ def methods(device: str) -> Arrays:
     found = {}
     B = rng.standard_normal((30, 30))
     dense = B @ B.T + np.eye(30)
-    banded = scipy.sparse.diags_array([-1.0, -1.0, 4.1, -1.0, -1.0], offsets=[-5, -1, 0, 1, 5], shape=(30, 30)).tocsr()
+    banded = scipy.sparse.diags_array(
+        [-1.0, -1.0, 4.1, -1.0, -1.0], offsets=[-5, -1, 0, 1, 5], shape=(30, 30)
+    ).tocsr()
     right, cells = rng.standard_normal(30), np.ones((6, 7), dtype=int)
     cells[0, 0], cells[2, 3] = wl.AIR, wl.SOLID
     field = np.where(cells == wl.FLUID, rng.standard_normal(cells.shape), 0.0)
@@ -68,7 +75,11 @@ def shapes(device: str) -> Arrays:
     found = {}
     for periodic in (False, True):
         for shape in SHAPES:
-            result = wl.solve(obstacle(shape, device, periodic=periodic), wl.ProjectedMultigrid(), stopping=STOPPING)
+            result = wl.solve(
+                obstacle(shape, device, periodic=periodic),
+                wl.ProjectedMultigrid(),
+                stopping=STOPPING,
+            )
             kind = "periodic " if periodic else ""
             found[f"{kind}{' x '.join(map(str, shape))}: {result.status.name}"] = result.x.numpy()
     return found
@@ -78,7 +89,9 @@ def large(device: str, n: int = 48) -> Arrays:
     """Return x of a splash, large enough for all paths of a device."""
     found = {}
     for method in (wl.ProjectedMultigrid(), wl.MinimumMapNewton(), wl.InteriorPoint(), wl.MPRGP()):
-        result = wl.solve(splash(n).lcp("walls", device=device), method, stopping=wl.StoppingCriteria(rtol=1e-7))
+        result = wl.solve(
+            splash(n).lcp("walls", device=device), method, stopping=wl.StoppingCriteria(rtol=1e-7)
+        )
         found[f"{type(method).__name__}, {n}^3: {result.status.name}"] = result.x.numpy()
     return found
 
@@ -103,7 +116,9 @@ def moments(device: str, steps: int = STEPS) -> Arrays:
     for name in SCENES:
         *_, last = states(name, device, steps)
         x, v = last["position"].astype(np.float64), last["velocity"].astype(np.float64)
-        found[f"{name}, {steps} steps"] = np.array([len(x), *x.mean(axis=0), *x.std(axis=0), np.linalg.norm(v, axis=1).mean()])
+        found[f"{name}, {steps} steps"] = np.array(
+            [len(x), *x.mean(axis=0), *x.std(axis=0), np.linalg.norm(v, axis=1).mean()]
+        )
     return found
 
 

@@ -1,9 +1,11 @@
 """What the passes of a solve cost a GPU, counted on the host: instructions, registers, and the limit that holds each of them.
 
-The passes over the finest grid are heard in CUDA's form (`benchmarks/emulated_cuda.py`), compiled for sm_90, and one warp of each is
-executed on the memory that the solve has left (`benchmarks/sass.py`). A pass takes as long as the slowest of: its instructions at one a
-clock and scheduler; those in float64 at their rate; wavefronts of the L1 cache at one a clock; the bytes of its fields at `SHARE` of the
-bandwidth; and a latency of memory for each plane of a thread, as often as the multiprocessors are filled.
+The passes over the finest grid are heard in CUDA's form (`benchmarks/emulated_cuda.py`), compiled
+for sm_90, and one warp of each is executed on the memory that the solve has left
+(`benchmarks/sass.py`). A pass takes as long as the slowest of: its instructions at one a clock and
+scheduler; those in float64 at their rate; wavefronts of the L1 cache at one a clock; the bytes of
+its fields at `SHARE` of the bandwidth; and a latency of memory for each plane of a thread, as often
+as the multiprocessors are filled.
 """
 
 from benchmarks import emulated_cuda  # before the package
@@ -32,8 +34,17 @@ assert emulated_cuda
 
 SHAPE = (36, 12, 128)  # planes, rows, cells of a row: a warp's quads fill one
 BLOCK, SCHEDULERS, WARP = 256, 4, 32
-SHARE, LATENCY = 0.8, 800  # of the bandwidth that streaming kernels reach; clocks of a load from memory
-AREAS = ("cycle.", "projected_multigrid.", "stencil.product", "residual.", "vectors.", "active_set.", "grid_conjugate_gradient.")
+# of the bandwidth that streaming kernels reach; clocks of a load from memory
+SHARE, LATENCY = 0.8, 800
+AREAS = (
+    "cycle.",
+    "projected_multigrid.",
+    "stencil.product",
+    "residual.",
+    "vectors.",
+    "active_set.",
+    "grid_conjugate_gradient.",
+)
 
 
 @dataclass(frozen=True)
@@ -82,7 +93,8 @@ class Count:
 
     def limits(self, gpu: Gpu, cells: int) -> dict[str, float]:
         """Return the least time [ms] of a pass over so many cells by each limit."""
-        warps, clocks = cells / WARP / self.cells, gpu.processors * gpu.clock * 1e6  # of all multiprocessors in 1 ms
+        # of all multiprocessors in 1 ms
+        warps, clocks = cells / WARP / self.cells, gpu.processors * gpu.clock * 1e6
         turns = math.ceil(warps / (gpu.processors * self.resident(gpu)))
         return {
             "issue": self.issued.instructions * warps / SCHEDULERS / clocks,
@@ -104,22 +116,48 @@ def passes() -> dict[str, tuple[Heard, dict[str, Any]]]:
     heard: list[tuple[Heard, dict[str, Any]]] = []
     bind = RowPass.bind_arguments
 
-    def listening(declared: RowPass, rows: Any, structs: Any, given: dict[str, Any], stencil: Any = None, bounds: Any = None) -> Bound:
+    def listening(
+        declared: RowPass,
+        rows: Any,
+        structs: Any,
+        given: dict[str, Any],
+        stencil: Any = None,
+        bounds: Any = None,
+    ) -> Bound:
         bound = bind(declared, rows, structs, given, stencil, bounds)
-        fields = {name: bound.given[name] for name in declared.arrays if isinstance(bound.given[name], wp.array)}
+        fields = {
+            name: bound.given[name]
+            for name in declared.arrays
+            if isinstance(bound.given[name], wp.array)
+        }
         if stencil is not None:
-            fields |= {"d": stencil.d} | {f"w{axis}": w for axis, w in zip("xyz", stencil.weights or (), strict=False)}
-        fields |= {name: value for name, value in zip(("lower", "", "upper", "", "code"), bounds or (), strict=False) if name}
+            fields |= {"d": stencil.d} | {
+                f"w{axis}": w for axis, w in zip("xyz", stencil.weights or (), strict=False)
+            }
+        fields |= {
+            name: value
+            for name, value in zip(("lower", "", "upper", "", "code"), bounds or (), strict=False)
+            if name
+        }
         heard.append((Heard(bound, fields), bound.given))
         return bound
 
     many = mock.patch.multiple(layout, MANY_CELLS=1, SUMMED_CELLS=1)
     with many, mock.patch.object(RowPass, "bind_arguments", listening):
         stopping = wl.StoppingCriteria(rtol=0, max_iterations=3)
-        for method, lower in ((wl.ProjectedMultigrid(), np.where(wall, 0.0, -np.inf)), (wl.ProjectedMultigrid(), -np.inf)):
-            wl.solve(wl.LCP(wl.GridPoisson(cells, device="cpu"), b, lower), method, stopping=stopping)
+        for method, lower in (
+            (wl.ProjectedMultigrid(), np.where(wall, 0.0, -np.inf)),
+            (wl.ProjectedMultigrid(), -np.inf),
+        ):
+            wl.solve(
+                wl.LCP(wl.GridPoisson(cells, device="cpu"), b, lower), method, stopping=stopping
+            )
         lower = np.where(wall, 0.0, -np.inf)
-        wl.solve(wl.LCP(wl.GridPoisson(cells, device="cpu"), b, lower), wl.MinimumMapNewton(), stopping=stopping)
+        wl.solve(
+            wl.LCP(wl.GridPoisson(cells, device="cpu"), b, lower),
+            wl.MinimumMapNewton(),
+            stopping=stopping,
+        )
         A = wl.GridPoisson(cells, device="cpu")
         x = wp.array(np.random.default_rng(7).random(A.layout.size, np.float32), device="cpu")
         A.stencil.product(x, wp.zeros_like(x))
@@ -127,7 +165,9 @@ def passes() -> dict[str, tuple[Heard, dict[str, Any]]]:
     for one, given in heard:
         rows, declared = one.bound.rows, one.bound.form.declared
         kinds = "".join(f" {word}" for word in ("from_zero", "projected") if given.get(word))
-        if max(rows.size, rows.other_size) == A.layout.size and not (declared.box or declared.listed):
+        if max(rows.size, rows.other_size) == A.layout.size and not (
+            declared.box or declared.listed
+        ):
             found.setdefault(one.name + kinds, (one, given))
     return found
 
@@ -145,19 +185,38 @@ def count(name: str, one: Heard, given: dict[str, Any], folder: Path) -> Count:
     dim = (slabs * lines * chunks,) if form.quads else (slabs, lines, chunks)
     bounds = struct.pack(f"<{len(dim)}I4xQQ", *dim, math.prod(dim), 1)
     parameters = bounds + bytes(rows.__ctype__()) + one.bound.arguments
-    first = (min(1, slabs - 1) * lines + lines // 2) * chunks  # of the threads of a row within the second slab
-    taken = range(first + chunks // 2 // WARP * WARP if chunks > 1024 else first, math.prod(dim))[: min(WARP, chunks)]
-    arrays = [a for a in (*one.fields.values(), *given.values(), rows.spans) if isinstance(a, wp.array) and a.size]
+    # of the threads of a row within the second slab
+    first = (min(1, slabs - 1) * lines + lines // 2) * chunks
+    taken = range(first + chunks // 2 // WARP * WARP if chunks > 1024 else first, math.prod(dim))[
+        : min(WARP, chunks)
+    ]
+    arrays = [
+        a
+        for a in (*one.fields.values(), *given.values(), rows.spans)
+        if isinstance(a, wp.array) and a.size
+    ]
     memory = Memory((int(a.ptr), a.numpy().copy()) for a in arrays)
     blocks = -(-math.prod(dim) // BLOCK)
-    found = issued(kernel.code, constants_of(parameters, BLOCK, blocks), memory, [(t % BLOCK, t // BLOCK) for t in taken])
+    found = issued(
+        kernel.code,
+        constants_of(parameters, BLOCK, blocks),
+        memory,
+        [(t % BLOCK, t // BLOCK) for t in taken],
+    )
     planes, size = min(rows.slab, rows.planes), one.bound.rows.size
     ratio = max(one.bound.rows.other_size // size, 1) if size else 1
     finer = 8 if ratio > 4 else 1  # a thread takes an aggregate of the finer level
     cells = planes * (max(rows.grain, 1)) * finer
     whole = max(size, one.bound.rows.other_size)
     apart = {*form.declared.by_row, *form.declared.whole, "out"}
-    moved = sum(a.size * wp.types.type_size_in_bytes(a.dtype) for n, a in one.fields.items() if n not in apart) / whole
+    moved = (
+        sum(
+            a.size * wp.types.type_size_in_bytes(a.dtype)
+            for n, a in one.fields.items()
+            if n not in apart
+        )
+        / whole
+    )
     return Count(name, found, cells, planes, kernel.registers, moved)
 
 
@@ -166,10 +225,16 @@ def _compiled(form: Any, folder: Path) -> Kernel:
     kernel, place = form.kernel, folder / form.kernel.module.name
     if not place.exists():
         kernel.module.options["block_dim"] = BLOCK
-        wp.compile_aot_module(kernel.module.name, device=None, arch=[90], module_dir=place, use_ptx=True)
+        wp.compile_aot_module(
+            kernel.module.name, device=None, arch=[90], module_dir=place, use_ptx=True
+        )
     (ptx,) = place.glob("*.ptx")
     made = assemble(ptx.read_text(), place / "module.cubin")
-    return next(one for one in made if one.name.startswith(f"{form.name}_") and one.name.endswith("kernel_forward"))
+    return next(
+        one
+        for one in made
+        if one.name.startswith(f"{form.name}_") and one.name.endswith("kernel_forward")
+    )
 
 
 def counts(words: tuple[str, ...] = AREAS) -> Iterator[Count]:
@@ -188,7 +253,10 @@ def counts(words: tuple[str, ...] = AREAS) -> Iterator[Count]:
 def table(n: int) -> Iterator[str]:
     """Yield the lines of a table of all passes, with times over n^3 cells."""
     times = " | ".join(f"{name} ms | limit" for name in GPUS)
-    yield f"| pass | issued a cell | loads | stores | L1 wavefronts | bytes | registers | warps | {times} |"
+    yield (
+        "| pass | issued a cell | loads | stores | L1 wavefronts | bytes | registers | warps | "
+        f"{times} |"
+    )
     yield "|---" * (8 + 2 * len(GPUS)) + "|"
     for one in counts():
         i, c = one.issued, one.cells

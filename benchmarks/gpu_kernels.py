@@ -1,8 +1,9 @@
 # mypy: ignore-errors
 """Kernels of a device against the same on the CPU, one by one: `python -m benchmarks.gpu_kernels [DEVICE]`, in the source tree.
 
-While solves and steps run, each kernel is launched once more on the CPU, with copies of all arrays as they were before, and what both have
-written is compared. With `--rehearse` the device is the CPU in CUDA's form and another order of threads, against the CPU's own form.
+While solves and steps run, each kernel is launched once more on the CPU, with copies of all arrays
+as they were before, and what both have written is compared. With `--rehearse` the device is the CPU
+in CUDA's form and another order of threads, against the CPU's own form.
 """
 
 import importlib
@@ -30,19 +31,27 @@ from warp._src.types import array_t, launch_bounds_t
 from warp_lcp.benchmarks import gpu_cases
 from warp_lcp.rows.program import Program
 
-SIZES, TRIES = 2, 16  # of each form of a kernel: two sizes, and of each the first launch of sixteen that writes something
+# of each form of a kernel: two sizes, and of each the first launch of sixteen that writes something
+SIZES, TRIES = 2, 16
 STEPS = 3  # of each scene
 ALLOWED = {"float32": 1e-5, "float64": 1e-12}  # of the largest number that is written, or was there
 ENDLESS = 1e20  # numbers from here on stand for infinity, and are compared each for itself
 ROOM, LINE = 4096, 64  # bytes around a copy, for what is read beyond arrays, and those of alignment
-TEMPLATES = ("cpu_module_header", "cpu_module_template_forward", "cpu_block_module_template_forward", "cpu_block_entry_body_forward")
+TEMPLATES = (
+    "cpu_module_header",
+    "cpu_module_template_forward",
+    "cpu_block_module_template_forward",
+    "cpu_block_entry_body_forward",
+)
 EMULATED, INVOKE = sys.modules.get("benchmarks.emulated_cuda"), context.invoke
 
 
 def roots(parents, _):
     """Return the root of each cell's tree."""
     inside, found = (parents >= 0) & (parents < len(parents)), parents
-    while not np.array_equal(further := np.where(inside, parents[np.where(inside, found, 0)], found), found):
+    while not np.array_equal(
+        further := np.where(inside, parents[np.where(inside, found, 0)], found), found
+    ):
         found = further
     return found
 
@@ -58,7 +67,8 @@ def totals(numbers, threads):
     return np.concatenate([columns[:9].sum(axis=1), columns[9:].max(axis=1)])
 
 
-# Kernels (module:name) of which integers (i) or floats (f) depend on the order of threads, or on how many there are, and what does not
+# Kernels (module:name) of which integers (i) or floats (f) depend on the order of threads, or on
+# how many there are, and what does not
 UNORDERED = {
     "warp_lcp.components.unite.*:unite": ("i", roots),
     "warp_lcp.material.flight:unite": ("i", roots),
@@ -68,13 +78,22 @@ UNORDERED = {
 }
 # those whose numbers in float64 come of what is rounded to float32
 SINGLE = (
-    "warp_lcp.projected_multigrid.measure.*_float32:*", "*conjugate_gradient.update.float32:*", "*conjugate_gradient.step.*float32*",
-    "warp_lcp.grid.particles:total", "warp_lcp.grid.volume:*", "warp_lcp.material.crowding:*", "warp_lcp.material.density_correction*",
-    "granular.stress_*", "granular.report*",
-)  # fmt: skip
-MANY_STAGES = ("warp_lcp.small_levels.*",)  # a hundred times as much is allowed: what one stage rounds, others compute with
-CANCEL = ("warp_lcp.projected_multigrid.undo.*",)  # x less its last step, from 0 nothing but rounding: what counts is how large x is
-ONE_THREAD = ("warp_lcp.grid.transfer_*.scatter.*", "warp_lcp.grid.density.scatter_density.*")  # on a CPU one adds all, see `particles.h`
+    "warp_lcp.projected_multigrid.measure.*_float32:*",
+    "*conjugate_gradient.update.float32:*",
+    "*conjugate_gradient.step.*float32*",
+    "warp_lcp.grid.particles:total",
+    "warp_lcp.grid.volume:*",
+    "warp_lcp.material.crowding:*",
+    "warp_lcp.material.density_correction*",
+    "granular.stress_*",
+    "granular.report*",
+)
+# a hundred times as much is allowed: what one stage rounds, others compute with
+MANY_STAGES = ("warp_lcp.small_levels.*",)
+# x less its last step, from 0 nothing but rounding: what counts is how large x is
+CANCEL = ("warp_lcp.projected_multigrid.undo.*",)
+# on a CPU one adds all, see `particles.h`
+ONE_THREAD = ("warp_lcp.grid.transfer_*.scatter.*", "warp_lcp.grid.density.scatter_density.*")
 
 
 def among(name, patterns):
@@ -87,10 +106,14 @@ def arrays_in(given):
     for value, kind in given:
         if isinstance(value, array_t):
             shape, strides = value.shape[: value.ndim], value.strides[: value.ndim]
-            size = wp.types.type_size_in_bytes(kind.dtype) + sum((n - 1) * step for n, step in zip(shape, strides, strict=True))
+            size = wp.types.type_size_in_bytes(kind.dtype) + sum(
+                (n - 1) * step for n, step in zip(shape, strides, strict=True)
+            )
             yield value, kind.dtype, size if value.data and all(shape) else 0
         elif isinstance(kind, codegen.Struct):
-            yield from arrays_in((getattr(value, name), var.type) for name, var in kind.vars.items())
+            yield from arrays_in(
+                (getattr(value, name), var.type) for name, var in kind.vars.items()
+            )
 
 
 def members(memory, table, dtype):
@@ -98,19 +121,30 @@ def members(memory, table, dtype):
     if not isinstance(dtype, codegen.Struct):
         return []
     assert table.ndim == 1, "tables of structs are lists"
-    return [(dtype.ctype.from_buffer(memory, i * table.strides[0]), dtype) for i in range(table.shape[0])]
+    return [
+        (dtype.ctype.from_buffer(memory, i * table.strides[0]), dtype)
+        for i in range(table.shape[0])
+    ]
 
 
 def has_handle(kind):
     """Return whether a parameter has a number such as Warp's meshes have."""
-    return kind is wp.uint64 or (isinstance(kind, codegen.Struct) and any(has_handle(var.type) for var in kind.vars.values()))
+    return kind is wp.uint64 or (
+        isinstance(kind, codegen.Struct) and any(has_handle(var.type) for var in kind.vars.values())
+    )
 
 
 def native(kind):
     """Return the type that C has of a parameter."""
     if isinstance(kind, codegen.Struct):
         return kind.ctype
-    return array_t if wp.types.is_array(kind) else kind if issubclass(kind, ctypes.Array) else kind._type_
+    return (
+        array_t
+        if wp.types.is_array(kind)
+        else kind
+        if issubclass(kind, ctypes.Array)
+        else kind._type_
+    )
 
 
 class Copies:
@@ -141,9 +175,15 @@ class Copies:
         found = []
         for address, size, dtype in self.arrays:
             if not isinstance(dtype, codegen.Struct):
-                at, begin = max((i, begin) for i, (begin, _) in enumerate(self.blocks) if begin <= address)
+                at, begin = max(
+                    (i, begin) for i, (begin, _) in enumerate(self.blocks) if begin <= address
+                )
                 kind = np.dtype(wp.dtype_to_numpy(getattr(dtype, "_wp_scalar_type_", dtype)))
-                found.append(blocks[at][address - begin : address - begin + size].view(np.uint8 if kind.kind == "b" else kind))
+                found.append(
+                    blocks[at][address - begin : address - begin + size].view(
+                        np.uint8 if kind.kind == "b" else kind
+                    )
+                )
         return found
 
     def _read(self, address, size):
@@ -163,7 +203,14 @@ class Copies:
 
     def _move(self, given):
         for a, dtype, size in arrays_in(given):
-            at = next(((begin, copy) for begin, copy in self.blocks if size and begin <= a.data < begin + len(copy)), None)
+            at = next(
+                (
+                    (begin, copy)
+                    for begin, copy in self.blocks
+                    if size and begin <= a.data < begin + len(copy)
+                ),
+                None,
+            )
             if at:
                 offset = a.data - at[0]
                 a.data = at[1].ctypes.data + offset
@@ -179,14 +226,23 @@ class Check:
 
     def __init__(self, device):
         self.device, self.tried, self.compared = wp.get_device(device), Counter(), Counter()
-        self.left_out, self.differs, self.unnoticed, self.arrays, self.worst = set(), {}, set(), 0, (0.0, "")
+        self.left_out, self.differs, self.unnoticed, self.arrays, self.worst = (
+            set(),
+            {},
+            set(),
+            0,
+            (0.0, ""),
+        )
         self._here, self.busy = {}, False
 
     def launch(self, kernel, addresses, run):
         """Launch a kernel, whose bounds and arguments are at addresses, by `run`, and compare where that is still to be done."""
         name, kinds = f"{kernel.module.name}:{kernel.key}", [arg.type for arg in kernel.adj.args]
         types = [type(launch_bounds_t((1,) * kernel.adj.kernel_dim)), *map(native, kinds)]
-        bounds, *values = (t.from_buffer_copy(ctypes.string_at(at, ctypes.sizeof(t))) for t, at in zip(types, addresses, strict=False))
+        bounds, *values = (
+            t.from_buffer_copy(ctypes.string_at(at, ctypes.sizeof(t)))
+            for t, at in zip(types, addresses, strict=False)
+        )
         given = list(zip(values, kinds, strict=True))
         form = name, tuple(bool(a.data) for a, *_ in arrays_in(given))
         sized = (*form, tuple(bounds.shape))
@@ -223,13 +279,20 @@ class Check:
 
     def _compare(self, name, threads, copies):
         """Compare what was written, and return whether anything was."""
-        arrays, blocks = self.arrays, (copies.before, [copy for _, copy in copies.blocks], copies.there())
-        of_kind, stays = next((what for known, what in UNORDERED.items() if fnmatchcase(name, known)), ("", None))
+        arrays, blocks = (
+            self.arrays,
+            (copies.before, [copy for _, copy in copies.blocks], copies.there()),
+        )
+        of_kind, stays = next(
+            (what for known, what in UNORDERED.items() if fnmatchcase(name, known)), ("", None)
+        )
         for before, here, there in zip(*map(copies.views, blocks), strict=True):
             written, kind = (bits(before) != bits(here)) | (bits(before) != bits(there)), here.dtype
             if not written.any():
                 continue
-            allowed = ALLOWED.get("float32" if kind.kind == "f" and among(name, SINGLE) else kind.name, 0.0)
+            allowed = ALLOWED.get(
+                "float32" if kind.kind == "f" and among(name, SINGLE) else kind.name, 0.0
+            )
             allowed *= 100 if among(name, MANY_STAGES) else 1
             size = max(largest(here[written]), largest(before[written]))
             if among(name, CANCEL):
@@ -242,7 +305,9 @@ class Check:
             self.worst = max(self.worst, (off / (allowed or 1.0), name))
             if off > allowed:
                 count = np.count_nonzero(bits(here) != bits(there))
-                self.differs[name] = f"{name} is off by {off:.0e} in {count} of {written.sum()} {kind}"
+                self.differs[name] = (
+                    f"{name} is off by {off:.0e} in {count} of {written.sum()} {kind}"
+                )
             if not difference(here, spoiled(there, written, allowed * size), size) > allowed:
                 self.unnoticed.add(name)
         return self.arrays > arrays
@@ -252,10 +317,22 @@ class Check:
         launches = [key for key in self.compared if len(key) == 3]
         kernels = {name for name, *_ in launches}
         idle = {name for name, *_ in self.tried} - kernels
-        text = f"{len(launches)} launches of {len(kernels)} kernels, at most {self.worst[0]:.1g} of what is allowed ({self.worst[1]})"
-        text += f"; a wrong number is noticed in all {self.arrays} arrays; {len(idle)} more kernels wrote nothing"
-        wrong = [*self.differs.values(), *(f"{name}: a wrong number is not noticed" for name in self.unnoticed)]
-        return f"{text}; left out: {len(self.left_out)} (they ask meshes, which stay on the device)", wrong or ["nothing"] * (not launches)
+        text = (
+            f"{len(launches)} launches of {len(kernels)} kernels, at most {self.worst[0]:.1g} "
+            f"of what is allowed ({self.worst[1]})"
+        )
+        text += (
+            f"; a wrong number is noticed in all {self.arrays} arrays; {len(idle)} more "
+            "kernels wrote nothing"
+        )
+        wrong = [
+            *self.differs.values(),
+            *(f"{name}: a wrong number is not noticed" for name in self.unnoticed),
+        ]
+        return (
+            f"{text}; left out: {len(self.left_out)} (they ask meshes, which stay on the device)",
+            wrong or ["nothing"] * (not launches),
+        )
 
 
 def bits(a):
@@ -277,7 +354,9 @@ def difference(here, there, size):
         return float(other.any())
     with np.errstate(invalid="ignore", divide="ignore"):
         a, b = here[other].astype(np.float64), there[other].astype(np.float64)
-        off = np.where((a == b) | (np.isnan(a) & np.isnan(b)), 0.0, np.abs(a - b) / np.maximum(np.abs(a), size))
+        off = np.where(
+            (a == b) | (np.isnan(a) & np.isnan(b)), 0.0, np.abs(a - b) / np.maximum(np.abs(a), size)
+        )
     return float(np.nan_to_num(off, nan=np.inf).max(initial=0.0))
 
 
@@ -285,7 +364,9 @@ def spoiled(a, written, allowed):
     """Return numbers of which one that was written is wrong: by three times what is allowed, if there is one that is no infinity."""
     wrong, finite = a.copy(), written & (np.abs(a) < ENDLESS)
     at = int(np.argmax(finite if finite.any() else written))
-    wrong[at] = ~a[at] if a.dtype.kind != "f" else a[at] + (3 * allowed or 1.0) if finite.any() else 0.0
+    wrong[at] = (
+        ~a[at] if a.dtype.kind != "f" else a[at] + (3 * allowed or 1.0) if finite.any() else 0.0
+    )
     return wrong
 
 
@@ -293,7 +374,11 @@ def spoiled(a, written, allowed):
 def templates():
     """Return what Warp makes kernels of on the CPU, whatever the emulation has changed."""
     body = ast.parse(Path(codegen.__file__).read_text()).body
-    made = {node.targets[0].id: node.value for node in body if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name)}
+    made = {
+        node.targets[0].id: node.value
+        for node in body
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name)
+    }
     return {name: ast.literal_eval(made[name]) for name in TEMPLATES}
 
 
@@ -331,18 +416,24 @@ def heard(check):
         kernels[ctypes.cast(hooks.forward, ctypes.c_void_p).value] = kernel
         return hooks
 
-    def launch(*args):  # context, function, threads, most blocks, threads of a block, strides, clusters, shared bytes, parameters, ...
+    # context, function, threads, most blocks, threads of a block, strides, clusters, shared bytes,
+    # parameters, ...
+    def launch(*args):
         kernel, run = kernels.get(args[1]), lambda: on_cuda(*args)
         return check.launch(kernel, args[8], run) if kernel else run()
 
     def emulated(invoke):
-        return lambda kernel, *rest: check.launch(kernel, [ctypes.addressof(p) for p in rest[1]], lambda: invoke(kernel, *rest))
+        return lambda kernel, *rest: check.launch(
+            kernel, [ctypes.addressof(p) for p in rest[1]], lambda: invoke(kernel, *rest)
+        )
 
     with contextlib.ExitStack() as stack:
         stack.enter_context(mock.patch.multiple(Program, run=one_by_one, run_while=looked_after))
         if EMULATED:
             for name in ("invoke", "invoke_cpu_blocks"):
-                stack.enter_context(mock.patch.object(context, name, emulated(getattr(context, name))))
+                stack.enter_context(
+                    mock.patch.object(context, name, emulated(getattr(context, name)))
+                )
         else:
             stack.enter_context(mock.patch.object(context.ModuleExec, "get_kernel_hooks", known))
             stack.enter_context(mock.patch.object(core, "wp_cuda_launch_kernel", launch))
@@ -361,7 +452,12 @@ def main():
     check = Check(*(given or ["cpu" if EMULATED else "cuda:0"]))
     steps = [functools.partial(stepped, scene) for scene in gpu_cases.SCENES]
     with heard(check):
-        for work in (functools.partial(gpu_cases.large, n=32), *steps, gpu_cases.shapes, gpu_cases.methods):
+        for work in (
+            functools.partial(gpu_cases.large, n=32),
+            *steps,
+            gpu_cases.shapes,
+            gpu_cases.methods,
+        ):
             try:
                 work(check.device.alias)
             except Exception as error:  # what wrong kernels lead to

@@ -1,9 +1,11 @@
 """What solves and steps should take on GPUs, from what they launch: `python -m benchmarks.gpu_model`, in the source tree.
 
-Every launch of CUDA's form is heard on the CPU (`benchmarks/emulated_cuda.py`), with the bytes of the fields that its pass declares, each
-counted once. A launch takes as long as its bytes at `SHARE` of the memory's bandwidth, and no less than its latency; small levels take a
-barrier a stage; the host waits for each readback. The two passes that compute most in float64 take as long as that takes, if it is longer.
-What is heard stands for larger grids, each of which has launches for another level. Nothing here has been measured on a GPU.
+Every launch of CUDA's form is heard on the CPU (`benchmarks/emulated_cuda.py`), with the bytes of
+the fields that its pass declares, each counted once. A launch takes as long as its bytes at `SHARE`
+of the memory's bandwidth, and no less than its latency; small levels take a barrier a stage; the
+host waits for each readback. The two passes that compute most in float64 take as long as that
+takes, if it is longer. What is heard stands for larger grids, each of which has launches for
+another level. Nothing here has been measured on a GPU.
 
 With --sass, the passes' machine code is counted instead: see `benchmarks/gpu_counts.py`.
 """
@@ -36,9 +38,13 @@ SHARE = 0.8  # of the bandwidth of data sheets that streaming kernels reach
 RECORDED, LAUNCHED = 2.0, 12.0  # [us] a launch in a graph, and one from Python
 BARRIER, READBACK = 1.5, 15.0  # [us]
 GPUS = {  # bandwidth [GB/s], and float64 instructions [10^9 a second]
-    "H100 SXM": (3350.0, 16_700.0), "H200": (4800.0, 16_700.0), "RTX 4090": (1008.0, 645.0), "RTX 4070 laptop": (256.0, 158.0),
-}  # fmt: skip
-FLOAT64 = {"assess": 32 / 25, "update": 17 / 29}  # such instructions a byte of the passes that have many, see `benchmarks.two_floats`
+    "H100 SXM": (3350.0, 16_700.0),
+    "H200": (4800.0, 16_700.0),
+    "RTX 4090": (1008.0, 645.0),
+    "RTX 4070 laptop": (256.0, 158.0),
+}
+# such instructions a byte of the passes that have many, see `benchmarks.two_floats`
+FLOAT64 = {"assess": 32 / 25, "update": 17 / 29}
 STEPS, HEARD = 10, 5  # of the dam break: until it moves, and those that are heard
 SIZES = (128, 256, 512, 1024)
 
@@ -64,9 +70,16 @@ class Work:
     def ms(self, bandwidth: float, float64: float) -> float:
         """Return the time [ms] at a bandwidth [GB/s] and a rate of instructions in float64 [10^9/s]."""
         least = np.where(self.graph, RECORDED, LAUNCHED)
-        slow = np.array([FLOAT64.get(name.rpartition(":")[2], 0.0) for name in self.names]) / float64
+        slow = (
+            np.array([FLOAT64.get(name.rpartition(":")[2], 0.0) for name in self.names]) / float64
+        )
         moved = np.array(self.bytes) * np.maximum(1 / (SHARE * bandwidth), slow) / 1e3
-        return float(np.maximum(least, moved).sum() + BARRIER * self.stages + READBACK * self.readbacks) / 1e3
+        return (
+            float(
+                np.maximum(least, moved).sum() + BARRIER * self.stages + READBACK * self.readbacks
+            )
+            / 1e3
+        )
 
     def grown(self, before: "Work", levels: int) -> "Work":
         """Return the work on a grid 2^levels times as fine; `before`: on one half as fine. Launches and stages grow by as many a level."""
@@ -103,19 +116,34 @@ def heard(make: Callable[[], Callable[[], object]]) -> Work:
     current: list[tuple[float, int]] = []
     found = Work()
 
-    def binding(declared: RowPass, rows: Any, *structs: Any, stencil: Any = None, bounds: Any = None, **arguments: Any) -> Bound:
+    def binding(
+        declared: RowPass,
+        rows: Any,
+        *structs: Any,
+        stencil: Any = None,
+        bounds: Any = None,
+        **arguments: Any,
+    ) -> Bound:
         bound = bind(declared, rows, *structs, stencil=stencil, bounds=bounds, **arguments)
         taken = {name: bound.given[name] for name in declared.arrays}
         fields = {name: value for name, value in taken.items() if isinstance(value, wp.array)}
         if stencil is not None:
-            fields |= {"d": stencil.d} | {f"w{axis}": w for axis, w in zip("xyz", stencil.weights or (), strict=False)}
-        fields |= {name: value for name, value in zip(("lower", "", "upper", "", "code"), bounds or (), strict=False) if name}
+            fields |= {"d": stencil.d} | {
+                f"w{axis}": w for axis, w in zip("xyz", stencil.weights or (), strict=False)
+            }
+        fields |= {
+            name: value
+            for name, value in zip(("lower", "", "upper", "", "code"), bounds or (), strict=False)
+            if name
+        }
         given[id(bound)] = bound, Heard(bound, fields)
         return bound
 
     def launching(bound: Bound, *args: Any) -> None:
         known = given.get(id(bound))
-        current.append((sum(known[1].reads.values()) + sum(known[1].writes.values()) if known else 0.0, 0))
+        current.append(
+            (sum(known[1].reads.values()) + sum(known[1].writes.values()) if known else 0.0, 0)
+        )
         launch_bound(bound, *args)
         current.pop()
 
@@ -124,9 +152,20 @@ def heard(make: Callable[[], Callable[[], object]]) -> Work:
         launch_sequence(sequence, *args)
         current.pop()
 
-    def launch(kernel: Any, dim: Any, inputs: Any = (), *args: Any, record_cmd: bool = False, **options: Any) -> Any:
+    def launch(
+        kernel: Any,
+        dim: Any,
+        inputs: Any = (),
+        *args: Any,
+        record_cmd: bool = False,
+        **options: Any,
+    ) -> Any:
         arrays = [a for a in inputs if isinstance(a, wp.array)]  # of a kernel that is no pass
-        cost = current[-1] if current else (float(sum(a.size * wp.types.type_size_in_bytes(a.dtype) for a in arrays)), 0)
+        cost = (
+            current[-1]
+            if current
+            else (float(sum(a.size * wp.types.type_size_in_bytes(a.dtype) for a in arrays)), 0)
+        )
         made = plain(kernel, dim, inputs, *args, record_cmd=record_cmd, **options)
         if record_cmd:
             tags[id(made)] = made, *cost, name_of(kernel)
@@ -146,10 +185,12 @@ def heard(make: Callable[[], Callable[[], object]]) -> Work:
         found.stages += stages
 
     patches = (
-        mock.patch.object(RowPass, "bind", binding), mock.patch.object(Bound, "launch", launching),
-        mock.patch.object(Sequence, "launch", sequencing), mock.patch.object(wp, "launch", launch),
+        mock.patch.object(RowPass, "bind", binding),
+        mock.patch.object(Bound, "launch", launching),
+        mock.patch.object(Sequence, "launch", sequencing),
+        mock.patch.object(wp, "launch", launch),
         mock.patch.object(wp.Launch, "launch", replaying),
-    )  # fmt: skip
+    )
     for patch in patches:
         patch.start()
     work = make()
@@ -167,11 +208,17 @@ def heard(make: Callable[[], Callable[[], object]]) -> Work:
 
 def solve(n: int) -> tuple[Work, int]:
     """Return the work of a cold solve of a splash with separating walls to 1e-6, and its iterations."""
-    problem, method, found = splash(n).lcp("walls", device="cpu"), wl.ProjectedMultigrid(), list[wl.SolveResult]()
+    problem, method, found = (
+        splash(n).lcp("walls", device="cpu"),
+        wl.ProjectedMultigrid(),
+        list[wl.SolveResult](),
+    )
 
     def make() -> Callable[[], object]:
         workspace = method.init(problem)
-        return lambda: found.append(wl.solve(problem, method, stopping=wl.StoppingCriteria(rtol=1e-6), workspace=workspace))
+        return lambda: found.append(
+            wl.solve(problem, method, stopping=wl.StoppingCriteria(rtol=1e-6), workspace=workspace)
+        )
 
     work = heard(make)
     assert found[-1], found[-1].status
@@ -183,7 +230,9 @@ def step(n: int) -> Work:
     scene = load_scene("dam-break", [f"domain.resolution={n}"])
 
     def make() -> Callable[[], object]:
-        simulation = simulators()[scene.scene.simulator].create(scene, device="cpu", folder=Path.cwd())
+        simulation = simulators()[scene.scene.simulator].create(
+            scene, device="cpu", folder=Path.cwd()
+        )
         for _ in range(STEPS):
             simulation.step(simulation.stable_dt())
         return lambda: [simulation.step(simulation.stable_dt()) for _ in range(HEARD)]
@@ -193,9 +242,18 @@ def step(n: int) -> Work:
 
 def table(small: Work, large: Work, n: int, times: int = 1) -> str:
     """Return a table of sizes and devices for one of some `times`, from the work at n / 2 and at n."""
-    lines = [f"| cells | launches | GB | {' | '.join(GPUS)} |", "|---|---|---|" + "---|" * len(GPUS)]
+    lines = [
+        f"| cells | launches | GB | {' | '.join(GPUS)} |",
+        "|---|---|---|" + "---|" * len(GPUS),
+    ]
     for size in (s for s in SIZES if s >= n // 2):
-        work = large.grown(small, int(np.log2(size / n))) if size > n else large if size == n else small
+        work = (
+            large.grown(small, int(np.log2(size / n)))
+            if size > n
+            else large
+            if size == n
+            else small
+        )
         columns = [f"{len(work.bytes) / times:.0f}", f"{sum(work.bytes) / times / 1e9:.2f}"]
         columns += [f"{work.ms(*rates) / times:.1f}" for rates in GPUS.values()]
         lines.append(f"| {size}^3 | {' | '.join(columns)} |")
@@ -204,23 +262,45 @@ def table(small: Work, large: Work, n: int, times: int = 1) -> str:
 
 def main() -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cells", type=int, default=128, help="cells along an axis of the recorded solve")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--cells", type=int, default=128, help="cells along an axis of the recorded solve"
+    )
     parser.add_argument("--step-cells", type=int, help="cells along an axis of the recorded steps")
-    parser.add_argument("--sass", action="store_true", help="count what a warp of each pass issues, and which limit holds it; extra ptxas")
-    parser.add_argument("--size", type=int, default=256, help="of --sass: times are of passes over so many cells along each axis")
+    parser.add_argument(
+        "--sass",
+        action="store_true",
+        help="count what a warp of each pass issues, and which limit holds it; extra ptxas",
+    )
+    parser.add_argument(
+        "--size",
+        type=int,
+        default=256,
+        help="of --sass: times are of passes over so many cells along each axis",
+    )
     given = parser.parse_args()
     if given.sass:
-        print(f"Passes over {given.size}^3 cells, a cell each: counted for sm_90, times as predicted\n")
+        print(
+            f"Passes over {given.size}^3 cells, a cell each: counted for sm_90, times as "
+            "predicted\n"
+        )
         for line in gpu_counts.table(given.size):
             print(line, flush=True)
         return
     n, cells = given.cells, given.step_cells or given.cells
     (small, _), (large, iterations) = solve(n // 2), solve(n)
-    print(f"A cold solve to 1e-6 [ms]: {iterations} iterations, {large.readbacks} readbacks, {large.stages} stages of small levels\n")
+    print(
+        f"A cold solve to 1e-6 [ms]: {iterations} iterations, {large.readbacks} readbacks, "
+        f"{large.stages} stages of small levels\n"
+    )
     print(table(small, large, n))
     before, after = step(cells // 2), step(cells)
-    print(f"\nA step of the dam break [ms]: {after.readbacks / HEARD:.0f} readbacks, {after.stages / HEARD:.0f} stages\n")
+    print(
+        f"\nA step of the dam break [ms]: {after.readbacks / HEARD:.0f} readbacks, "
+        f"{after.stages / HEARD:.0f} stages\n"
+    )
     print(table(before, after, cells, HEARD))
     print("\nLargest memory traffic of a solve\n")
     print(large.passes())

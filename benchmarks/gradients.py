@@ -1,7 +1,8 @@
 """What gradients through a solution cost: `python -m benchmarks.gradients`, in the source tree; seconds of the processor, in turns.
 
-`wl.vjp` beside the solve itself and the linear solve that it consists of, on a membrane over a ball: held unknowns are AIR, the tolerance
-is the same, its operator is made each time. Peaks of memory beyond what there was, after solves of few and of many steps.
+`wl.vjp` beside the solve itself and the linear solve that it consists of, on a membrane over a
+ball: held unknowns are AIR, the tolerance is the same, its operator is made each time. Peaks of
+memory beyond what there was, after solves of few and of many steps.
 """
 
 import sys
@@ -17,35 +18,59 @@ SHAPES, REPEAT, SEED = ((1024, 1024), (128, 128, 128)), 9, 2027
 TOLERANCES = (1e-6, 1e-10)
 
 
-def membrane(shape: tuple[int, ...], faces: bool) -> tuple[wl.GridPoisson, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+def membrane(
+    shape: tuple[int, ...], faces: bool
+) -> tuple[wl.GridPoisson, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
     """Return operator, cells, load, obstacle and coefficients of a membrane between fixed edges."""
     cells, rng = np.full(shape, wl.AIR), np.random.default_rng(SEED)
     cells[(slice(1, -1),) * len(shape)] = wl.FLUID
-    square = sum(((q - n / 2) / (0.3 * n)) ** 2 for q, n in zip(np.indices(shape), shape, strict=True))
+    square = sum(
+        ((q - n / 2) / (0.3 * n)) ** 2 for q, n in zip(np.indices(shape), shape, strict=True)
+    )
     given: dict[str, Any] = {}
     for axis in range(len(shape) if faces else 0):
         face = list(shape)
         face[-1 - axis] += 1
         given[f"face_{'xyz'[axis]}"] = rng.uniform(0.5, 2.0, face)
     obstacle = np.where(square < 1, 0.5 * np.sqrt(np.maximum(1 - square, 0.0)), -1.0)
-    return wl.GridPoisson(cells, device="cpu", **given), cells, np.full(shape, 20.0 / shape[0] ** 2), obstacle, given
+    return (
+        wl.GridPoisson(cells, device="cpu", **given),
+        cells,
+        np.full(shape, 20.0 / shape[0] ** 2),
+        obstacle,
+        given,
+    )
 
 
 def measure(shape: tuple[int, ...], faces: bool, rtol: float) -> None:
     """Print medians of a linear solve and of a vector-Jacobian product, and the median of their ratios."""
     A, cells, load, obstacle, given = membrane(shape, faces)
-    problem, tight, stopping = wl.LCP(A, load, lower=obstacle), wl.StoppingCriteria(rtol=1e-10), wl.StoppingCriteria(rtol=rtol)
+    problem, tight, stopping = (
+        wl.LCP(A, load, lower=obstacle),
+        wl.StoppingCriteria(rtol=1e-10),
+        wl.StoppingCriteria(rtol=rtol),
+    )
     result = wl.solve(problem, stopping=tight)
     held = (result.x.numpy() <= obstacle) & (cells == wl.FLUID)
-    open_cells, g = np.where(held, wl.AIR, cells), np.random.default_rng(SEED).standard_normal(shape)
+    open_cells, g = (
+        np.where(held, wl.AIR, cells),
+        np.random.default_rng(SEED).standard_normal(shape),
+    )
     right = np.where(open_cells == wl.FLUID, g, 0.0)
 
     def linear() -> np.ndarray:
         block = wl.GridPoisson(open_cells, device="cpu", **given)
         return wl.solve(wl.LCP(block, right, -np.inf), stopping=stopping).x.numpy()
 
-    work = {"solve": lambda: wl.solve(problem, stopping=stopping), "linear": linear, "vjp": lambda: wl.vjp(result, g, stopping=stopping)}
-    assert np.abs(linear() - wl.vjp(result, g, stopping=stopping).b.numpy()).max() < 1e-4 * np.abs(linear()).max()
+    work = {
+        "solve": lambda: wl.solve(problem, stopping=stopping),
+        "linear": linear,
+        "vjp": lambda: wl.vjp(result, g, stopping=stopping),
+    }
+    assert (
+        np.abs(linear() - wl.vjp(result, g, stopping=stopping).b.numpy()).max()
+        < 1e-4 * np.abs(linear()).max()
+    )
     seconds: dict[str, list[float]] = {name: [] for name in work}
     for _ in range(REPEAT):
         for name, run in work.items():
@@ -56,7 +81,8 @@ def measure(shape: tuple[int, ...], faces: bool, rtol: float) -> None:
     medians = " ".join(f"{name} {1e3 * np.median(times):.0f}" for name, times in seconds.items())
     kind = "fields" if faces else "numbers"
     sys.stdout.write(
-        f"{shape} {kind} {rtol:.0e}: [ms] {medians}; vjp / linear {np.median(ratio):.2f} ({ratio.min():.2f}-{ratio.max():.2f})\n"
+        f"{shape} {kind} {rtol:.0e}: [ms] {medians}; vjp / linear {np.median(ratio):.2f} "
+        f"({ratio.min():.2f}-{ratio.max():.2f})\n"
     )
 
 
@@ -65,13 +91,19 @@ def remember(shape: tuple[int, ...]) -> None:
     A, _, load, obstacle, _ = membrane(shape, False)
     problem = wl.LCP(A, load, lower=obstacle)
     for method in (wl.ProjectedMultigrid(), wl.ProjectedSOR(omega=1.95)):
-        result = wl.solve(problem, method, stopping=wl.StoppingCriteria(rtol=1e-8, max_iterations=20_000, patience=5_000))
+        result = wl.solve(
+            problem,
+            method,
+            stopping=wl.StoppingCriteria(rtol=1e-8, max_iterations=20_000, patience=5_000),
+        )
         wl.vjp(result, load)
         tracemalloc.start()
         wl.vjp(result, load)
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
-        sys.stdout.write(f"{shape} after {result.iterations} steps: {peak / load.size:.1f} bytes a cell\n")
+        sys.stdout.write(
+            f"{shape} after {result.iterations} steps: {peak / load.size:.1f} bytes a cell\n"
+        )
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
 """Host time of a simulation step by stage, beside the native work in it: `python -m warp_lcp.benchmarks.host`.
 
-A step is Python that prepares operations, and native calls that execute tables of them (`warp_lcp.rows.team.Team.run`). The *floor* of a
-stage is the time of its native calls alone: each is repeated from the same memory, without Python in between, and the fastest one counts.
+A step is Python that prepares operations, and native calls that execute tables of them
+(`warp_lcp.rows.team.Team.run`). The *floor* of a stage is the time of its native calls alone: each
+is repeated from the same memory, without Python in between, and the fastest one counts.
 """
 
 from __future__ import annotations
@@ -33,17 +34,37 @@ from warp_lcp.scene.simulator import simulators
 TITLE = "Host time of a step by stage"
 SCENES = ("dam-break-2d", "column-collapse-2d", "floating-bodies-2d", "dam-break")
 RESOLUTION = 32  # cells along the longest side: so few that a step is mostly host time
-SKIPPED, STEPS = 30, 20  # steps before the measured ones, in which the material begins to move; steps of a round
+# steps before the measured ones, in which the material begins to move; steps of a round
+SKIPPED, STEPS = 30, 20
 REPLAYS = 5  # of a native call
 OUTSIDE = "outside stages"
 CALLS, OPERATIONS = "native calls", "operations"
-LAUNCHES, COPIES, READS, ALLOCATIONS = "Warp launches", "copies and fills", "host reads", "allocations"
-# Calls by kind, and where callers look them up. Each launch by Warp loads its module first, whatever name `wp.launch` was called by.
+LAUNCHES, COPIES, READS, ALLOCATIONS = (
+    "Warp launches",
+    "copies and fills",
+    "host reads",
+    "allocations",
+)
+# Calls by kind, and where callers look them up. Each launch by Warp loads its module first,
+# whatever name `wp.launch` was called by.
 COUNTED: dict[str, tuple[tuple[Any, str], ...]] = {
     LAUNCHES: ((wp.Module, "load"), (wp.Launch, "launch")),
     COPIES: ((wp, "copy"), (wp.array, "assign"), (wp.array, "zero_"), (wp.array, "fill_")),
     READS: ((wp.array, "numpy"),),
-    ALLOCATIONS: tuple((wp, n) for n in ("zeros", "zeros_like", "ones", "ones_like", "full", "full_like", "empty", "empty_like", "clone")),
+    ALLOCATIONS: tuple(
+        (wp, n)
+        for n in (
+            "zeros",
+            "zeros_like",
+            "ones",
+            "ones_like",
+            "full",
+            "full_like",
+            "empty",
+            "empty_like",
+            "clone",
+        )
+    ),
 }
 COUNTS = (CALLS, OPERATIONS, *COUNTED)
 
@@ -167,7 +188,9 @@ class StepRecorder:
         def do(team: Team, asked: Any) -> None:
             if asked.mode != RUN:
                 return plain(team, asked)
-            before = [(begin, ctypes.string_at(begin, end - begin)) for begin, end in self._memory()]
+            before = [
+                (begin, ctypes.string_at(begin, end - begin)) for begin, end in self._memory()
+            ]
             seconds = [self._timed(plain, team, asked)]
             for _ in range(self._replays if not self._table.words[UNFINISHED] else 0):
                 for begin, content in before:
@@ -186,7 +209,14 @@ class StepRecorder:
 
     def _memory(self) -> list[tuple[int, int]]:
         """Return where the memory of all arrays begins and ends; views own none."""
-        owners = [a for a in self._arrays if a.ptr and a.capacity and a.device.is_cpu and (a.deleter or isinstance(a._ref, np.ndarray))]
+        owners = [
+            a
+            for a in self._arrays
+            if a.ptr
+            and a.capacity
+            and a.device.is_cpu
+            and (a.deleter or isinstance(a._ref, np.ndarray))
+        ]
         return sorted({(a.ptr, a.ptr + a.capacity) for a in owners if a.is_contiguous})
 
 
@@ -197,7 +227,9 @@ def measure(options: Options, out: Path) -> Results:
     for name in scenes:
         for size in options.sizes or (RESOLUTION,):
             options.say(f"{name}, {size} cells")
-            found[f"{name}, {size} cells"] = scene_records(name, size, options.device, STEPS, options.repeat)
+            found[f"{name}, {size} cells"] = scene_records(
+                name, size, options.device, STEPS, options.repeat
+            )
     return results(found, machine(options.device, elements=1 << 22, repeat=options.repeat))
 
 
@@ -212,7 +244,8 @@ def scene_records(name: str, resolution: int, device: str, steps: int, rounds: i
         rounds: samples.
 
     Raises:
-        ValueError: the device is not the CPU, a number is not positive, or the simulation has no stages.
+        ValueError: the device is not the CPU, a number is not positive, or the simulation has no
+            stages.
     """
     if not wp.get_device(device).is_cpu:
         raise ValueError(f"--device {device}: the suite host measures the CPU")
@@ -220,7 +253,9 @@ def scene_records(name: str, resolution: int, device: str, steps: int, rounds: i
         if number < 1:
             raise ValueError(f"{what} = {number}: must be >= 1")
     scene = load_scene(name, [f"domain.resolution={resolution}"])
-    simulation: Any = simulators()[scene.scene.simulator].create(scene, device=device, folder=Path.cwd())
+    simulation: Any = simulators()[scene.scene.simulator].create(
+        scene, device=device, folder=Path.cwd()
+    )
     if not hasattr(simulation, "watch"):  # a `warp_lcp.simulation.Profiled`
         raise ValueError(f"{name}: its simulation has no stages")
 
@@ -232,7 +267,8 @@ def scene_records(name: str, resolution: int, device: str, steps: int, rounds: i
     samples: dict[str, list[float]] = defaultdict(lambda: [0.0] * rounds)
     whole, unwatched = list[float](), simulation.watch
     for turn in range(rounds):
-        simulation.watch, since = unwatched, time.process_time()  # a stopwatch reads a clock at both ends of each stage
+        # a stopwatch reads a clock at both ends of each stage
+        simulation.watch, since = unwatched, time.process_time()
         for _ in range(steps):
             step()
         whole.append(1e3 * (time.process_time() - since) / steps)
@@ -249,11 +285,18 @@ def scene_records(name: str, resolution: int, device: str, steps: int, rounds: i
     simulation.watch = timer = StageTimer()
     with StepRecorder(timer) as replayed, timer.stage(OUTSIDE):
         step()
-    return _records(f"{name}, {resolution} cells", whole, samples, counted.counts, replayed.native, steps)
+    return _records(
+        f"{name}, {resolution} cells", whole, samples, counted.counts, replayed.native, steps
+    )
 
 
 def _records(
-    label: str, whole: list[float], samples: dict[str, list[float]], counts: dict[str, Counter[str]], native: dict[str, float], steps: int
+    label: str,
+    whole: list[float],
+    samples: dict[str, list[float]],
+    counts: dict[str, Counter[str]],
+    native: dict[str, float],
+    steps: int,
 ) -> list[Record]:
     """Return a record of the step and one of each stage, the longest first."""
     for stage in counts.keys() | native.keys():
@@ -275,13 +318,23 @@ def _records(
 def results(found: dict[str, list[Record]], *machines: Record) -> Results:
     """Return records, a table and a chart of each scene."""
     remark = (
-        f"Processor's milliseconds of a step, {wl.get_threads()} thread(s): least of the rounds. Stages do not overlap; a stopwatch "
-        "measures them in rounds of their own, and takes some of their time. Shares are of the sum of the stages. "
-        f"Native: the native calls of one step alone, least of {REPLAYS + 1} each. The rest: means of a step."
+        f"Processor's milliseconds of a step, {wl.get_threads()} thread(s): least of the rounds. "
+        "Stages do not overlap; a stopwatch "
+        "measures them in rounds of their own, and takes some of their time. Shares are of the sum "
+        "of the stages. "
+        f"Native: the native calls of one step alone, least of {REPLAYS + 1} each. The rest: means "
+        "of a step."
     )
     records = [*machines, *(record for of_scene in found.values() for record in of_scene)]
-    tables = [Table(label, ["stage", "host [ms]", "share [%]", "native [ms]", *COUNTS], _rows(own), remark) for label, own in found.items()]
-    bars = {own.name: own.figures["host"].value for of_scene in found.values() for own in of_scene[1:]}
+    tables = [
+        Table(
+            label, ["stage", "host [ms]", "share [%]", "native [ms]", *COUNTS], _rows(own), remark
+        )
+        for label, own in found.items()
+    ]
+    bars = {
+        own.name: own.figures["host"].value for of_scene in found.values() for own in of_scene[1:]
+    }
     return Results(records, tables, [Bars("stages", "Host time of a step by stage", "ms", bars)])
 
 
@@ -298,9 +351,17 @@ def _rows(records: Sequence[Record]) -> list[list[str]]:
 
 def main() -> None:
     """Print a table of each scene, and write files if asked."""
-    parser = argparse.ArgumentParser(prog="python -m warp_lcp.benchmarks.host", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--scene", action="append", help=f"name or file; may be repeated; default: {', '.join(SCENES)}")
-    parser.add_argument("--resolution", type=int, default=RESOLUTION, help="cells along the longest side")
+    parser = argparse.ArgumentParser(
+        prog="python -m warp_lcp.benchmarks.host", description=(__doc__ or "").splitlines()[0]
+    )
+    parser.add_argument(
+        "--scene",
+        action="append",
+        help=f"name or file; may be repeated; default: {', '.join(SCENES)}",
+    )
+    parser.add_argument(
+        "--resolution", type=int, default=RESOLUTION, help="cells along the longest side"
+    )
     parser.add_argument("--steps", type=int, default=STEPS, help="of a round")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--threads", type=int, default=1)
@@ -313,14 +374,21 @@ def main() -> None:
         for name in given.scene or SCENES:
             label = f"{name}, {given.resolution} cells"
             found[label] = scene_records(name, given.resolution, "cpu", given.steps, given.rounds)
-            for line in [f"## {label}", "", *markdown(results({label: found[label]}).tables[0]), ""]:
+            for line in [
+                f"## {label}",
+                "",
+                *markdown(results({label: found[label]}).tables[0]),
+                "",
+            ]:
                 sys.stdout.write(f"{line}\n")
             sys.stdout.flush()
     except ValueError as error:
         parser.error(str(error))
     if given.out:
         given.out.mkdir(parents=True, exist_ok=True)
-        for line in write("host", TITLE, results(found, machine("cpu", elements=1 << 22)), given.out):
+        for line in write(
+            "host", TITLE, results(found, machine("cpu", elements=1 << 22)), given.out
+        ):
             sys.stdout.write(f"{line}\n")
 
 

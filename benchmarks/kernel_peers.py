@@ -22,7 +22,14 @@ def plain_kernel(d: u8_3d, x: f32_3d, y: f32_3d):
     v = float(0.0)
     if d[i, j, k] != wp.uint8(0):
         v = float(d[i, j, k]) * x[i, j, k]
-        v -= x[i - 1, j, k] + x[i + 1, j, k] + x[i, j - 1, k] + x[i, j + 1, k] + x[i, j, k - 1] + x[i, j, k + 1]
+        v -= (
+            x[i - 1, j, k]
+            + x[i + 1, j, k]
+            + x[i, j - 1, k]
+            + x[i, j + 1, k]
+            + x[i, j, k - 1]
+            + x[i, j, k + 1]
+        )
     y[i, j, k] = v
 
 
@@ -50,7 +57,12 @@ def numba_products(d: np.ndarray, x: np.ndarray, y: np.ndarray) -> dict[str, Cal
                 for k in range(1, x.shape[2] - 1):
                     e = np.float32(d[i, j, k])
                     v = e * x[i, j, k] - (
-                        x[i - 1, j, k] + x[i + 1, j, k] + x[i, j - 1, k] + x[i, j + 1, k] + x[i, j, k - 1] + x[i, j, k + 1]
+                        x[i - 1, j, k]
+                        + x[i + 1, j, k]
+                        + x[i, j - 1, k]
+                        + x[i, j + 1, k]
+                        + x[i, j, k - 1]
+                        + x[i, j, k + 1]
                     )
                     y[i, j, k] = v if e != 0 else np.float32(0)
 
@@ -60,7 +72,15 @@ def numba_products(d: np.ndarray, x: np.ndarray, y: np.ndarray) -> dict[str, Cal
             for j in range(1, x.shape[1] - 1):
                 for k in range(1, x.shape[2] - 1):
                     y[i, j, k] = np.float32(6) * x[i, j, k] - (
-                        x[i - 1, j, k] + x[i + 1, j, k] + x[i, j - 1, k] + x[i, j + 1, k] + x[i, j, k - 1] + x[i, j, k + 1]
+                        x[i - 1, j, k]
+                        + x[i + 1, j, k]
+                        + x[i, j - 1, k]
+                        + x[i, j + 1, k]
+                        + x[i, j, k - 1]
+                        + x[i, j, k + 1]
                     )
 
-    return {"Numba product": lambda: masked(d, x, y), "Numba product, constant diagonal": lambda: constant(x, y)}
+    return {
+        "Numba product": lambda: masked(d, x, y),
+        "Numba product, constant diagonal": lambda: constant(x, y),
+    }

@@ -1,7 +1,7 @@
 """Every pass that a solve makes over the finest grid, by itself: cells and bytes a second against what copying memory reaches.
 
-The passes are those that solves of a full basin bind, so that the list follows the code. The bytes are those of the fields that a pass
-declares to read and to write, each counted once.
+The passes are those that solves of a full basin bind, so that the list follows the code. The bytes
+are those of the fields that a pass declares to read and to write, each counted once.
 """
 
 from __future__ import annotations
@@ -30,9 +30,15 @@ SIZES = (128, 256)
 PRODUCT = "stencil.product, float32"
 # kernels that run once in a while: for a new operator, problem or set of cells
 SET_UP = (
-    "grid_poisson.copy_cells", "grid_poisson.count_faces", "grid_poisson.diagonal", "grid_poisson.weights", "problem",
-    "residual.within", "residual.unknown_square", "residual.settle",
-)  # fmt: skip
+    "grid_poisson.copy_cells",
+    "grid_poisson.count_faces",
+    "grid_poisson.diagonal",
+    "grid_poisson.weights",
+    "problem",
+    "residual.within",
+    "residual.unknown_square",
+    "residual.settle",
+)
 SERIAL = ("stencil.relax",)  # in place and in two colors: bound by store forwarding, not by memory
 FORMS = ("unit", "faces")
 COPIES = 3
@@ -49,18 +55,28 @@ class Heard:
     @property
     def name(self) -> str:
         """Area, name, types and what is absent: `cycle.sweep uniform float32 uint8 -b`."""
-        absent = [f"-{name}" for name in self.bound.form.declared.optional if name not in self.fields]
+        absent = [
+            f"-{name}" for name in self.bound.form.declared.optional if name not in self.fields
+        ]
         return " ".join((self.bound.form.declared.name, *self.bound.form.words, *absent))
 
     @property
     def writes(self) -> dict[str, int]:
         """Bytes that are written."""
-        return {name: size for name, size in self._sizes().items() if name in self.bound.form.declared.writes}
+        return {
+            name: size
+            for name, size in self._sizes().items()
+            if name in self.bound.form.declared.writes
+        }
 
     @property
     def reads(self) -> dict[str, int]:
         """Bytes that are read."""
-        return {name: size for name, size in self._sizes().items() if name not in self.bound.form.declared.writes}
+        return {
+            name: size
+            for name, size in self._sizes().items()
+            if name not in self.bound.form.declared.writes
+        }
 
     @property
     def bytes(self) -> float:
@@ -72,7 +88,11 @@ class Heard:
         """Return the bytes of the fields of this grid and of the next coarser one; other arrays are small."""
         declared = self.bound.form.declared
         small = {*declared.by_row, *declared.whole, "out"}
-        return {name: a.size * wp.types.type_size_in_bytes(a.dtype) for name, a in self.fields.items() if a.size and name not in small}
+        return {
+            name: a.size * wp.types.type_size_in_bytes(a.dtype)
+            for name, a in self.fields.items()
+            if a.size and name not in small
+        }
 
 
 def measure(options: Options, out: Path) -> Results:
@@ -80,16 +100,30 @@ def measure(options: Options, out: Path) -> Results:
     sizes = options.sizes or SIZES
     if not present("numba"):
         options.say("Numba is missing: pip install 'warp-lcp[peers]'")
-    records = [machine(options.device, elements=min(COPIED, 64 * max(sizes) ** 3), repeat=options.repeat)]
+    records = [
+        machine(options.device, elements=min(COPIED, 64 * max(sizes) ** 3), repeat=options.repeat)
+    ]
     for n in sizes:
         for form in FORMS:
             options.say(f"kernels at {n}^3, {form}")
             records += _measure_form(n, form, options)
     shown = [r for r in records if r.value("cells")]
     tables = [_table(n, [r for r in shown if r.value("cells") == n**3]) for n in sizes]
-    largest = [r for r in shown if r.value("cells") == max(sizes) ** 3 and r.facts["role"] != "set-up"]
-    percent = {r.name.partition("^3 ")[2]: 100 * v for r in largest if (v := r.value("of_copy")) is not None}
-    chart = Bars("copy", f"Bytes a second at {max(sizes)}^3, float32, of measured copying", "% of copy bandwidth", percent, limit=50)
+    largest = [
+        r for r in shown if r.value("cells") == max(sizes) ** 3 and r.facts["role"] != "set-up"
+    ]
+    percent = {
+        r.name.partition("^3 ")[2]: 100 * v
+        for r in largest
+        if (v := r.value("of_copy")) is not None
+    }
+    chart = Bars(
+        "copy",
+        f"Bytes a second at {max(sizes)}^3, float32, of measured copying",
+        "% of copy bandwidth",
+        percent,
+        limit=50,
+    )
     return Results(records, [_weakest(largest), *tables], [chart])
 
 
@@ -105,12 +139,21 @@ def _measure_form(n: int, form: str, options: Options) -> list[Record]:
         work[f"copy {third}"] = _synchronized(lambda: wp.copy(b, a), device)
         work |= dict(kernels[third::COPIES])
     times = in_turns(work, options.repeat)
-    if peers:  # apart, for then all are done within milliseconds: other users of the machine slow them alike
+    # apart, for then all are done within milliseconds: other users of the machine slow them alike
+    if peers:
         apart = in_turns(
-            {"product": _synchronized(product.bound.launch, device), "copy": work["copy 0"], **peers}, PEER_ROUNDS * options.repeat
+            {
+                "product": _synchronized(product.bound.launch, device),
+                "copy": work["copy 0"],
+                **peers,
+            },
+            PEER_ROUNDS * options.repeat,
         )
         own = [8 * a.size / t for t in apart["copy"]]
-    copying = [8 * a.size / median(taken) for taken in zip(*(times[f"copy {third}"] for third in range(COPIES)), strict=True)]
+    copying = [
+        8 * a.size / median(taken)
+        for taken in zip(*(times[f"copy {third}"] for third in range(COPIES)), strict=True)
+    ]
     records = []
     for key, one in heard.items():
         role = "set-up" if key.startswith(SET_UP) else "serial" if key.startswith(SERIAL) else "hot"
@@ -119,15 +162,24 @@ def _measure_form(n: int, form: str, options: Options) -> list[Record]:
         figures = _figures(taken, n, one.bytes / n**3, copied)
         if with_peers:
             figures |= {f"over {peer}": ratios(apart[peer], apart["product"]) for peer in peers}
-        facts = {"form": form, "role": role, "reads": sorted(one.reads), "writes": sorted(one.writes)}
-        records.append(Record(f"{n}^3 {form}: {PRODUCT if one is product else key}", figures, facts))
+        facts = {
+            "form": form,
+            "role": role,
+            "reads": sorted(one.reads),
+            "writes": sorted(one.writes),
+        }
+        records.append(
+            Record(f"{n}^3 {form}: {PRODUCT if one is product else key}", figures, facts)
+        )
     for peer in peers:
         figures = _figures(apart[peer], n, 8 if "constant" in peer else 9, own)
         records.append(Record(f"{n}^3 {form}: {peer}", figures, {"form": form, "role": "peer"}))
     finder = wl.GridPoisson(_basin(n, form).cells, device=device, **_basin(n, form).faces)
     search = in_turns({"search": finder.floating_components}, options.repeat)["search"]
     name = f"{n}^3 {form}: search for floating components, all kernels"
-    records.append(Record(name, _figures(search, n, 0.0, copying), {"form": form, "role": "set-up"}))
+    records.append(
+        Record(name, _figures(search, n, 0.0, copying), {"form": form, "role": "set-up"})
+    )
     return sorted(records, key=lambda r: -(r.value("seconds") or 0))
 
 
@@ -157,21 +209,42 @@ def _hear(scene: Splash, device: str) -> tuple[dict[str, Heard], Heard]:
     bind = RowPass.bind
 
     def listening(
-        declared: RowPass, rows: Rows, *structs: Any, stencil: Any = None, bounds: list[Any] | None = None, **given: Any
+        declared: RowPass,
+        rows: Rows,
+        *structs: Any,
+        stencil: Any = None,
+        bounds: list[Any] | None = None,
+        **given: Any,
     ) -> Bound:
         bound = bind(declared, rows, *structs, stencil=stencil, bounds=bounds, **given)
         taken = {name: bound.given[name] for name in declared.arrays}
         fields = {name: value for name, value in taken.items() if isinstance(value, wp.array)}
         if stencil is not None:
-            fields |= {"d": stencil.d} | {f"w{axis}": w for axis, w in zip("xyz", stencil.weights or (), strict=False)}
-        fields |= {name: value for name, value in zip(("lower", "", "upper", "", "code"), bounds or (), strict=False) if name}
+            fields |= {"d": stencil.d} | {
+                f"w{axis}": w for axis, w in zip("xyz", stencil.weights or (), strict=False)
+            }
+        fields |= {
+            name: value
+            for name, value in zip(("lower", "", "upper", "", "code"), bounds or (), strict=False)
+            if name
+        }
         heard.append(Heard(bound, fields))
         return bound
 
     with mock.patch.object(RowPass, "bind", listening):
-        for solver, most in ((wl.ProjectedMultigrid(), 5), (wl.MinimumMapNewton(), 4), (wl.ProjectedSOR(), 1)):
-            for bounds in ("walls", "linear") if isinstance(solver, wl.ProjectedMultigrid) else ("walls",):
-                wl.solve(scene.lcp(bounds, device=device), solver, stopping=wl.StoppingCriteria(rtol=0, max_iterations=most))
+        for solver, most in (
+            (wl.ProjectedMultigrid(), 5),
+            (wl.MinimumMapNewton(), 4),
+            (wl.ProjectedSOR(), 1),
+        ):
+            for bounds in (
+                ("walls", "linear") if isinstance(solver, wl.ProjectedMultigrid) else ("walls",)
+            ):
+                wl.solve(
+                    scene.lcp(bounds, device=device),
+                    solver,
+                    stopping=wl.StoppingCriteria(rtol=0, max_iterations=most),
+                )
         A = wl.GridPoisson(scene.cells, device=device, **scene.faces)
         x = wp.array(np.random.default_rng(7).random(A.layout.size, np.float32), device=device)
         A.stencil.product(x, wp.zeros_like(x))
@@ -181,8 +254,15 @@ def _hear(scene: Splash, device: str) -> tuple[dict[str, Heard], Heard]:
         alone = not declared.name.startswith(
             "components."
         )  # those follow each other's trees in borrowed memory: `search` times them together
-        there = one.bound.rows.device is A.device  # bounds of the host are coded there: a byte of a cell is sent then, not eight
-        if alone and there and one.bound.rows.size == A.layout.size and not declared.box and not declared.listed:
+        # bounds of the host are coded there: a byte of a cell is sent then, not eight
+        there = one.bound.rows.device is A.device
+        if (
+            alone
+            and there
+            and one.bound.rows.size == A.layout.size
+            and not declared.box
+            and not declared.listed
+        ):
             kinds.setdefault(one.name, one)
     return kinds, kinds[heard[-1].name]
 
@@ -190,12 +270,21 @@ def _hear(scene: Splash, device: str) -> tuple[dict[str, Heard], Heard]:
 def _peers(product: Heard, n: int, device: str) -> dict[str, Callable[[], None]]:
     """Return the peers of the product on the same memory: where a field lies in the caches' sets is worth 30 % at 128^3."""
     d, x, y = (product.fields[name].reshape((n + 2,) * 3) for name in ("d", "x", "y"))
-    return {"Warp, one thread a cell": plain_product(d, x, y, device), **numba_products(d.numpy(), x.numpy(), y.numpy())}
+    return {
+        "Warp, one thread a cell": plain_product(d, x, y, device),
+        **numba_products(d.numpy(), x.numpy(), y.numpy()),
+    }
 
 
-def _figures(times: list[float], n: int, per_cell: float, copying: list[float]) -> dict[str, Figure]:
+def _figures(
+    times: list[float], n: int, per_cell: float, copying: list[float]
+) -> dict[str, Figure]:
     """Return rates of a kernel that moves `per_cell` bytes, and their share of what copying moved a second in the same rounds."""
-    figures = {"cells": Figure(n**3), "seconds": Figure.of(times, "s"), "rate": Figure.of([n**3 / t / 1e6 for t in times], "Mcell/s")}
+    figures = {
+        "cells": Figure(n**3),
+        "seconds": Figure.of(times, "s"),
+        "rate": Figure.of([n**3 / t / 1e6 for t in times], "Mcell/s"),
+    }
     if per_cell:
         moved = per_cell * n**3
         figures["bytes_per_cell"] = Figure(per_cell, "B")
@@ -205,19 +294,50 @@ def _figures(times: list[float], n: int, per_cell: float, copying: list[float]) 
 
 
 def _table(n: int, records: list[Record]) -> Table:
-    columns = ["kernel", "coefficients", "role", "ms", "Mcell/s", "B/cell", "GB/s", "% of copy", "range"]
+    columns = [
+        "kernel",
+        "coefficients",
+        "role",
+        "ms",
+        "Mcell/s",
+        "B/cell",
+        "GB/s",
+        "% of copy",
+        "range",
+    ]
     rows = []
     for r in records:
         of = r.figures.get("of_copy")
-        share = ["", ""] if of is None else [f"{100 * of.value:.0f}", f"{100 * (of.low or 0):.0f} to {100 * (of.high or 0):.0f}"]
-        numbers = [1e3 * (r.value("seconds") or 0), r.value("rate"), r.value("bytes_per_cell"), r.value("bandwidth")]
-        cells = [("" if v is None else f"{v:.{d}f}") for v, d in zip(numbers, (2, 0, 1, 1), strict=True)]
+        share = (
+            ["", ""]
+            if of is None
+            else [
+                f"{100 * of.value:.0f}",
+                f"{100 * (of.low or 0):.0f} to {100 * (of.high or 0):.0f}",
+            ]
+        )
+        numbers = [
+            1e3 * (r.value("seconds") or 0),
+            r.value("rate"),
+            r.value("bytes_per_cell"),
+            r.value("bandwidth"),
+        ]
+        cells = [
+            ("" if v is None else f"{v:.{d}f}") for v, d in zip(numbers, (2, 0, 1, 1), strict=True)
+        ]
         rows.append([r.name.partition(": ")[2], r.facts["form"], r.facts["role"], *cells, *share])
-    return Table(f"{n}^3", columns, rows, "Roles: hot kernels run in every iteration, set-up ones once a problem or set of cells.")
+    return Table(
+        f"{n}^3",
+        columns,
+        rows,
+        "Roles: hot kernels run in every iteration, set-up ones once a problem or set of cells.",
+    )
 
 
 def _weakest(records: list[Record]) -> Table:
     """Return the hot kernels below half of the copy bandwidth."""
     below = [r for r in records if r.facts["role"] == "hot" and (r.value("of_copy") or 1) < 0.5]
     rows = [[r.name, f"{100 * (r.value('of_copy') or 0):.0f} %"] for r in below] or [["none", ""]]
-    return Table("Hot kernels below 50 % of copy bandwidth at the largest size", ["kernel", "of copy"], rows)
+    return Table(
+        "Hot kernels below 50 % of copy bandwidth at the largest size", ["kernel", "of copy"], rows
+    )

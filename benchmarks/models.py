@@ -33,10 +33,16 @@ from warp_lcp.scene.table import validate
 TITLE = "What models cost"
 RESOLUTION = {2: 128, 3: 48}  # cells along the longest side of the reference scenes
 FRAMES = 15  # that are timed, half a second: columns collapse, and reach the other wall
-THIN = 0.12  # [m]: a column of less material, of the same height, tells what goes with the material from what goes with the domain
+# [m]: a column of less material, of the same height, tells what goes with the material from what
+# goes with the domain
+THIN = 0.12
 QUIET = {"diagnostics": False}
 REFERENCE = "{}"  # the tables of the reference scene, as text
-BEGIN, END = "<!-- Written by `python -m warp_lcp.benchmarks.models` down to the next mark; do not edit. -->", "<!-- end -->"
+BEGIN, END = (
+    "<!-- Written by `python -m warp_lcp.benchmarks.models` down to the next mark; do not edit. "
+    "-->",
+    "<!-- end -->",
+)
 Tables = dict[str, Any]
 
 
@@ -54,12 +60,18 @@ class Offer:
 def offers(simulator: str, dimension: int) -> dict[str, Offer]:
     """Return the models of a simulator by name."""
     ball = {"shape": "sphere", "center": [0.72, 0.16, 0.25][:dimension], "radius": 0.1}
-    swaying = ball | {"motion": {"kind": "sinusoid", "amplitude": [0.02, 0.0, 0.0][:dimension], "period": 1.0}}
-    bodies = [{"shape": "sphere", "center": [x, 0.1, 0.25][:dimension], "radius": 0.06, "density": 700.0} for x in (0.64, 0.78, 0.92)]
+    swaying = ball | {
+        "motion": {"kind": "sinusoid", "amplitude": [0.02, 0.0, 0.0][:dimension], "period": 1.0}
+    }
+    bodies = [
+        {"shape": "sphere", "center": [x, 0.1, 0.25][:dimension], "radius": 0.06, "density": 700.0}
+        for x in (0.64, 0.78, 0.92)
+    ]
     both = {
         "cut cells": Offer({"solid": [ball]}, {"solid": [ball], "domain": {"solids": "voxel"}}),
         "moving solids": Offer({"solid": [swaying]}, {"solid": [ball]}),
-        "rigid bodies": Offer({"solid": bodies}, {"solid": [swaying]}, count=len(bodies)),  # which move too
+        # which move too
+        "rigid bodies": Offer({"solid": bodies}, {"solid": [swaying]}, count=len(bodies)),
         "density correction": Offer({"density_correction": {}}),
         "automatic density correction": Offer({"density_correction": None}),
         "reseeding": Offer({"particles": {"reseed": {"every": 1}}}, unit="particle"),
@@ -70,25 +82,36 @@ def offers(simulator: str, dimension: int) -> dict[str, Offer]:
         return both
     level_set: Tables = {"pressure": {}}
     middle = [0.5, 0.1, 0.25][:dimension]
-    probes = [{"name": name, "position": middle, "quantity": name} for name in ("pressure", "velocity", "level")]
+    probes = [
+        {"name": name, "position": middle, "quantity": name}
+        for name in ("pressure", "velocity", "level")
+    ]
     liquid = {
         "separating walls": Offer({"domain": {"wall": "separating"}}),
         "ghost-fluid surface": Offer(level_set),
         "smoothing": Offer({"pressure": {"smoothing": 2}}, level_set),
         "unilateral pressure": Offer({"pressure": {"model": "unilateral"}}, level_set),
         "viscosity": Offer({"viscosity": {"value": 10.0}}),
-        "surface tension": Offer(level_set | {"surface_tension": {"coefficient": 0.072}}, level_set),
+        "surface tension": Offer(
+            level_set | {"surface_tension": {"coefficient": 0.072}}, level_set
+        ),
         "drag along walls": Offer({"wall_drag": {"coefficient": 5e-3}}),
-        "forces on solids": Offer({"solid": [ball], "output": QUIET | {"forces": True}}, {"solid": [ball]}),
+        "forces on solids": Offer(
+            {"solid": [ball], "output": QUIET | {"forces": True}}, {"solid": [ball]}
+        ),
         "probes": Offer({"probe": probes}),
         "automatic tolerance": Offer({"solver": {"tolerance": "auto"}}),
         "narrow band": Offer(level_set | {"particles": {"narrow_band": {"width": 4.0}}}, level_set),
-        "FLIP": Offer({"particles": {"transfer": "flip"}}, {"particles": {"transfer": "pic"}}, unit="particle"),
+        "FLIP": Offer(
+            {"particles": {"transfer": "flip"}}, {"particles": {"transfer": "pic"}}, unit="particle"
+        ),
     }
     return liquid | both
 
 
-def reference(simulator: str, dimension: int, tables: Tables, size: int, *, width: float = 0.55) -> Scene:
+def reference(
+    simulator: str, dimension: int, tables: Tables, size: int, *, width: float = 0.55
+) -> Scene:
     """Return the reference scene, a column in a box twice as long as high, with some tables changed, or taken out by None."""
     scene: Tables = {
         "scene": {"simulator": simulator, "name": "reference"},
@@ -103,7 +126,10 @@ def reference(simulator: str, dimension: int, tables: Tables, size: int, *, widt
     scene["liquid" if simulator == "fluids" else "sand"] = [
         {"shape": "box", "min": [0.0] * dimension, "max": [width, 0.4, 0.5][:dimension]}
     ]
-    merged = scene | {name: scene["domain"] | value if name == "domain" else value for name, value in tables.items()}
+    merged = scene | {
+        name: scene["domain"] | value if name == "domain" else value
+        for name, value in tables.items()
+    }
     given = {name: value for name, value in merged.items() if value is not None}
     return validate(simulators()[simulator].scene_model, given, "reference")
 
@@ -118,7 +144,12 @@ def run_seconds(simulation: Any, time: Time) -> np.ndarray:
     spent = []
     for frame in range(1, FRAMES + 1):
         while time.frame_time(frame) - simulation.time > 1e-9:
-            spent.append(step_seconds_of(simulation, plan_dt(simulation.stable_dt(), time.frame_time(frame) - simulation.time, time))[0])
+            spent.append(
+                step_seconds_of(
+                    simulation,
+                    plan_dt(simulation.stable_dt(), time.frame_time(frame) - simulation.time, time),
+                )[0]
+            )
     return np.array(spent)
 
 
@@ -189,7 +220,9 @@ def split(seconds: float, half: float, dimension: int) -> tuple[float, float]:
 def split_base(base: Sample, half: Sample, thin: Sample) -> tuple[float, float, float]:
     """Return the seconds of a step that are fixed, and those a cell and a particle, of three scenes of other sizes and amounts."""
     scenes = [(base, counts(base.scene)), (half, counts(half.scene)), (thin, counts(thin.scene))]
-    rows = np.array([[1.0, *count] for _, count in scenes]) / np.array([[sample.seconds] for sample, _ in scenes])
+    rows = np.array([[1.0, *count] for _, count in scenes]) / np.array(
+        [[sample.seconds] for sample, _ in scenes]
+    )
     scale = np.abs(rows).max(axis=0)
     found = nnls(rows / scale, np.ones(3))[0] / scale
     return float(found[0]), float(found[1]), float(found[2])
@@ -222,16 +255,22 @@ def records_of(simulator: str, dimension: int, options: Options) -> list[Record]
     found = [Record(f"{simulator} {dimension}d: base", figures, facts)]
     for name, offer in offers(simulator, dimension).items():
         on, off, many = str(offer.on), str(offer.off), {"cell": cells, "particle": particles}
-        added, added_half = ((s[on].seconds - s[off].seconds) / offer.count for s in (samples, halves))
+        added, added_half = (
+            (s[on].seconds - s[off].seconds) / offer.count for s in (samples, halves)
+        )
         fixed, growing = (0.0, 0.0) if offer.frames else split(added, added_half, dimension)
         figures = {
             "step": Figure(added, "s"),
             "fixed_seconds": Figure(fixed, "s"),
             "cell_seconds": Figure((1.0 - share) * growing / cells, "s"),
             "particle_seconds": Figure(share * growing / particles, "s"),
-            f"{offer.unit}_bytes": Figure((samples[on].bytes - samples[off].bytes) / many[offer.unit] / offer.count, "B"),
+            f"{offer.unit}_bytes": Figure(
+                (samples[on].bytes - samples[off].bytes) / many[offer.unit] / offer.count, "B"
+            ),
         }
-        found.append(Record(f"{simulator} {dimension}d: {name}", figures, facts | {"frames": offer.frames}))
+        found.append(
+            Record(f"{simulator} {dimension}d: {name}", figures, facts | {"frames": offer.frames})
+        )
     return found
 
 
@@ -260,11 +299,18 @@ def table_of(simulator: str, dimension: int, records: list[Record]) -> Table:
         rows.append([name, added, part, f"{record.figures[f'{unit}_bytes'].value:.1f} a {unit}"])
     what = "liquid" if simulator == "fluids" else "sand"
     remark = (
-        f"A column of {what}, {base.facts['cells']:,} cells and {base.facts['particles']:,} particles. `base` is the scene without any "
-        "model, particles and all; the others say what they add to it, to some percent of it: differences of short times. Each rigid body "
+        f"A column of {what}, {base.facts['cells']:,} cells and {base.facts['particles']:,} "
+        "particles. `base` is the scene without any "
+        "model, particles and all; the others say what they add to it, to some percent of it: "
+        "differences of short times. Each rigid body "
         "adds its own, beside what moving solids add once."
     )
-    return Table(f"{what.capitalize()}, {dimension}-D", ["model", "ms a step", "of base", "bytes"], rows, remark)
+    return Table(
+        f"{what.capitalize()}, {dimension}-D",
+        ["model", "ms a step", "of base", "bytes"],
+        rows,
+        remark,
+    )
 
 
 def price_list(records: list[Record]) -> Mapping[str, Any]:
@@ -275,7 +321,11 @@ def price_list(records: list[Record]) -> Mapping[str, Any]:
         if not separator:
             continue
         simulator, dimension = where.split()
-        price = {key: float(f"{figure.value:.3g}") for key, figure in record.figures.items() if key.endswith(("_seconds", "_bytes"))}
+        price = {
+            key: float(f"{figure.value:.3g}")
+            for key, figure in record.figures.items()
+            if key.endswith(("_seconds", "_bytes"))
+        }
         listed.setdefault(simulator, {}).setdefault(dimension, {})[name] = price
     return listed
 
@@ -297,11 +347,21 @@ def overview(records: Sequence[Record]) -> Table:
 
 def _price(record: Record, base: Record) -> str:
     """Return what a model adds to a step and to memory, or what `base` takes."""
-    step, unit = record.figures["step"].value, "particle" if "particle_bytes" in record.figures else "cell"
-    memory = f"{record.figures[f'{unit}_bytes'].value:.0f} B{' a particle' if unit == 'particle' else ''}"
+    step, unit = (
+        record.figures["step"].value,
+        "particle" if "particle_bytes" in record.figures else "cell",
+    )
+    memory = (
+        f"{record.figures[f'{unit}_bytes'].value:.0f} "
+        f"B{' a particle' if unit == 'particle' else ''}"
+    )
     if record is base:
         return f"{1e3 * step:.1f} ms, {memory}"
-    return f"frames only, {memory}" if record.facts.get("frames") else f"{100.0 * step / base.figures['step'].value:.0f} %, {memory}"
+    return (
+        f"frames only, {memory}"
+        if record.facts.get("frames")
+        else f"{100.0 * step / base.figures['step'].value:.0f} %, {memory}"
+    )
 
 
 def write_page(page: Path, results: Results) -> None:
@@ -321,8 +381,13 @@ def main() -> None:
     given = parser.parse_args()
     options = Options(given.device, (), given.repeat, lambda text: sys.stderr.write(f"{text}\n"))
     results = measure(options, Path())
-    head = "# What models add to a step and to memory, by simulator and dimension; written by `python -m warp_lcp.benchmarks.models`.\n\n"
-    Path(str(files("warp_lcp.scene") / TABLE)).write_text(head + tomli_w.dumps(price_list(results.records)), "utf-8")
+    head = (
+        "# What models add to a step and to memory, by simulator and dimension; written by "
+        "`python -m warp_lcp.benchmarks.models`.\n\n"
+    )
+    Path(str(files("warp_lcp.scene") / TABLE)).write_text(
+        head + tomli_w.dumps(price_list(results.records)), "utf-8"
+    )
     write_page(given.page, results)
 
 

@@ -5,11 +5,30 @@ from __future__ import annotations
 import numpy as np
 
 import warp_lcp as wl
-from warp_lcp.gallery.fluid import BOUNDS, SOLID_CENTER, SOLID_RADIUS, Splash, SplashPart, basin, splash, splash_part
+from warp_lcp.gallery.fluid import (
+    BOUNDS,
+    SOLID_CENTER,
+    SOLID_RADIUS,
+    Splash,
+    SplashPart,
+    basin,
+    splash,
+    splash_part,
+)
 
 __all__ = [
-    "BOUNDS", "Splash", "SplashPart", "anisotropic", "basin", "cut_cells", "natural", "plane", "splash", "splash_part", "warm_changes",
-]  # fmt: skip
+    "BOUNDS",
+    "Splash",
+    "SplashPart",
+    "anisotropic",
+    "basin",
+    "cut_cells",
+    "natural",
+    "plane",
+    "splash",
+    "splash_part",
+    "warm_changes",
+]
 
 
 def plane(n: int) -> Splash:
@@ -26,7 +45,10 @@ def cut_cells(scene: Splash) -> Splash:
     faces = {}
     for axis, name in enumerate(("face_z", "face_y", "face_x")):
         points = np.meshgrid(*(f if a == axis else c for a in range(3)), indexing="ij", sparse=True)
-        distance = np.sqrt(sum((a - m) ** 2 for a, m in zip(points, SOLID_CENTER, strict=True))) - SOLID_RADIUS
+        distance = (
+            np.sqrt(sum((a - m) ** 2 for a, m in zip(points, SOLID_CENTER, strict=True)))
+            - SOLID_RADIUS
+        )
         faces[name] = np.clip(distance * n + 0.5, 0.1, 1.0)
     return Splash(n, scene.cells, scene.b, scene.wall, faces)
 
@@ -42,7 +64,9 @@ def warm_changes(scene: Splash, size: float = 0.01) -> tuple[np.ndarray, np.ndar
     return scene.b, scene.b + size * np.linalg.norm(scene.b) / np.linalg.norm(other) * other
 
 
-def natural(cells: np.ndarray, b: np.ndarray, lower: float | np.ndarray, x: np.ndarray) -> np.ndarray:
+def natural(
+    cells: np.ndarray, b: np.ndarray, lower: float | np.ndarray, x: np.ndarray
+) -> np.ndarray:
     """Return min(x - l, A x + b) on FLUID cells and 0 elsewhere, with coefficients of 1, by no code of the solvers; all of one shape."""
     fluid, air = cells == wl.FLUID, cells == wl.AIR
     p, y = np.where(fluid, x, 0.0), b.copy()
@@ -50,7 +74,8 @@ def natural(cells: np.ndarray, b: np.ndarray, lower: float | np.ndarray, x: np.n
         below, above = ([slice(None)] * 3 for _ in range(2))
         below[axis], above[axis] = slice(None, -1), slice(1, None)
         i, j = tuple(below), tuple(above)
-        open_ = (fluid[i] & (fluid[j] | air[j])) | (fluid[j] & air[i])  # SOLID cells, and the box around all, let nothing through
+        # SOLID cells, and the box around all, let nothing through
+        open_ = (fluid[i] & (fluid[j] | air[j])) | (fluid[j] & air[i])
         flux = np.where(open_, p[i] - p[j], 0.0)
         y[i] += flux
         y[j] -= flux

@@ -1,8 +1,9 @@
 """Methods published for the pressure LCP from 2011 to 2023 on the splash: iterations and seconds to the same residual.
 
-Each runs as published as far as that is known (`docs/published-methods.md` says what was read and what is reconstructed),
-cold from p = 0, and then with what this library adds. All share kernels, precision, multigrid cycles and stopping criteria,
-so that methods are compared and not implementations. `docs/generate/published_figures.py` puts the figures into that page.
+Each runs as published as far as that is known (`docs/published-methods.md` says what was read and
+what is reconstructed), cold from p = 0, and then with what this library adds. All share kernels,
+precision, multigrid cycles and stopping criteria, so that methods are compared and not
+implementations. `docs/generate/published_figures.py` puts the figures into that page.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ FLAT = 4  # cells along a side in 2-D, in units of those in 3-D
 REPEATED = 3.0  # [s] of one solve, above which one sample is taken
 PATIENCE = 20.0  # [s] of one solve, above which a method is not run at larger sizes
 ENGINE = "multigrid, default"
-FIGURES = ("total", "iterations", "linear_iterations", "residual", "converged")  # that are kept of a case
+# that are kept of a case
+FIGURES = ("total", "iterations", "linear_iterations", "residual", "converged")
 
 
 class ProductsOnly(wl.Operator):
@@ -62,9 +64,9 @@ class ProductsOnly(wl.Operator):
 class TruncatedMultigrid(wl.ProjectedMultigrid):
     """Multigrid iterations whose coarse levels leave out the active set: neither conjugate directions nor projected cycles.
 
-    From x, unknowns at a bound with y = A x + b of the right sign are held; a linear cycle on the others, whose Galerkin
-    coarse levels and interpolation leave the held ones out, gives a correction z; x + t z is projected onto the bounds, t the
-    minimizer of the energy along z.
+    From x, unknowns at a bound with y = A x + b of the right sign are held; a linear cycle on the
+    others, whose Galerkin coarse levels and interpolation leave the held ones out, gives a
+    correction z; x + t z is projected onto the bounds, t the minimizer of the energy along z.
     """
 
     def init(self, problem: wl.LCP) -> TruncatedWorkspace:
@@ -97,17 +99,27 @@ class Entry:
 
 
 ENTRIES = (
-    Entry("Chentanez and Mueller 2011", "projected multigrid cycles", wl.ProjectedMultigrid(monotone_cycles=10_000)),
+    Entry(
+        "Chentanez and Mueller 2011",
+        "projected multigrid cycles",
+        wl.ProjectedMultigrid(monotone_cycles=10_000),
+    ),
     Entry(
         "Andersen et al. 2017",
         "minimum map, CG by products",
         wl.MinimumMapNewton(safeguard=False, max_linear_iterations=2000),
         ProductsOnly,
     ),
-    Entry("Macklin et al. 2019", "Fischer-Burmeister, r = A_ii", wl.FischerNewton(monotone_cycles=0)),
+    Entry(
+        "Macklin et al. 2019", "Fischer-Burmeister, r = A_ii", wl.FischerNewton(monotone_cycles=0)
+    ),
     Entry("Lai et al. 2020", "policy iteration", wl.PrimalDualActiveSet(monotone_cycles=0)),
     Entry("Lai et al. 2020", "penalty", wl.Penalty(monotone_cycles=0)),
-    Entry("Lai et al. 2020", "multigrid, active set off coarse levels", TruncatedMultigrid(monotone_cycles=0)),
+    Entry(
+        "Lai et al. 2020",
+        "multigrid, active set off coarse levels",
+        TruncatedMultigrid(monotone_cycles=0),
+    ),
     Entry("Takahashi and Batty 2023", "MPRGP, multilevel", wl.MPRGP(monotone_cycles=0)),
     Entry("here", "minimum map, default", wl.MinimumMapNewton()),
     Entry("here", "Fischer-Burmeister, default", wl.FischerNewton()),
@@ -121,7 +133,9 @@ ENTRIES = (
 def measure(options: Options, out: Path) -> Results:
     """Measure every method at every size in 3-D and 2-D, with bounds at walls and everywhere."""
     sizes = options.sizes or SIZES
-    where = machine(options.device, elements=min(COPIED, 64 * max(sizes) ** 3), repeat=options.repeat)
+    where = machine(
+        options.device, elements=min(COPIED, 64 * max(sizes) ** 3), repeat=options.repeat
+    )
     records, tables = list[Record](), list[Table]()
     for make, scale in ((splash, 1), (plane, FLAT)):
         slow = set[tuple[str, str]]()
@@ -135,7 +149,9 @@ def measure(options: Options, out: Path) -> Results:
     return Results([where, *records], tables, [], failures)
 
 
-def _measure_scene(scene: Splash, options: Options, slow: set[tuple[str, str]], *, load: bool) -> list[Record]:
+def _measure_scene(
+    scene: Splash, options: Options, slow: set[tuple[str, str]], *, load: bool
+) -> list[Record]:
     """Measure one sample of every method in each round.
 
     Args:
@@ -144,9 +160,29 @@ def _measure_scene(scene: Splash, options: Options, slow: set[tuple[str, str]], 
         slow: methods with their bounds that are left out; those above PATIENCE are added.
         load: whether a first round without samples loads the kernels.
     """
-    linear = Case("unit", scene, BOUNDS[0], wl.ProjectedMultigrid(), options.device, full=False, label="linear solve")
+    linear = Case(
+        "unit",
+        scene,
+        BOUNDS[0],
+        wl.ProjectedMultigrid(),
+        options.device,
+        full=False,
+        label="linear solve",
+    )
     cases = [
-        (entry, Case("unit", scene, bounds, entry.solver, options.device, full=False, label=entry.label, operator=entry.operator))
+        (
+            entry,
+            Case(
+                "unit",
+                scene,
+                bounds,
+                entry.solver,
+                options.device,
+                full=False,
+                label=entry.label,
+                operator=entry.operator,
+            ),
+        )
         for bounds in BOUNDS[1:]
         for entry in ENTRIES
         if (entry.label, bounds) not in slow
@@ -158,7 +194,10 @@ def _measure_scene(scene: Splash, options: Options, slow: set[tuple[str, str]], 
             if all(seconds <= REPEATED for seconds in case.samples["total"]):
                 case.cold(keep=turn > 0)
     slow |= {(c.label, c.bounds) for _, c in cases if max(c.samples["total"]) > PATIENCE}
-    return [_record(linear, "here"), *(_record(case, entry.source, linear) for entry, case in cases)]
+    return [
+        _record(linear, "here"),
+        *(_record(case, entry.source, linear) for entry, case in cases),
+    ]
 
 
 def _record(case: Case, source: str, linear: Case | None = None) -> Record:
@@ -172,12 +211,32 @@ def _record(case: Case, source: str, linear: Case | None = None) -> Record:
 
 
 def _table(records: Sequence[Record], bounds: str) -> Table:
-    columns = ["published", "method", "iterations", "linear iterations", "relative residual", "total [ms]", "range", "x linear solve"]
+    columns = [
+        "published",
+        "method",
+        "iterations",
+        "linear iterations",
+        "relative residual",
+        "total [ms]",
+        "range",
+        "x linear solve",
+    ]
     rows = []
     for r in records:
         counts = shown(r, ["iterations", "linear_iterations"], ".0f") + shown(r, ["residual"])
-        rows.append([r.facts["source"], r.facts["method"], *counts, *shown(r, ["total"], ".1f", 1e3), spread(r.figures["total"], 1e3)])
+        rows.append(
+            [
+                r.facts["source"],
+                r.facts["method"],
+                *counts,
+                *shown(r, ["total"], ".1f", 1e3),
+                spread(r.figures["total"], 1e3),
+            ]
+        )
         rows[-1] += shown(r, ["over_linear"], ".2f")
-    remark = f"Cold solves to {RTOL:g}, set-up included; x linear solve: the default multigrid without bounds, same rounds."
+    remark = (
+        f"Cold solves to {RTOL:g}, set-up included; x linear solve: the default multigrid "
+        "without bounds, same rounds."
+    )
     where = "at the walls" if bounds == "walls" else bounds
     return Table(f"p >= 0 {where}, {records[0].facts['size']}", columns, rows, remark)

@@ -1,6 +1,7 @@
 """Published iteration counts of named methods on problems that can be rebuilt exactly, and the counts of the methods here.
 
-Each runs with the settings, the start and the stopping rule of its source, in double precision; see `docs/published-methods.md`.
+Each runs with the settings, the start and the stopping rule of its source, in double precision; see
+`docs/published-methods.md`.
 """
 
 from __future__ import annotations
@@ -23,17 +24,26 @@ from warp_lcp.gallery import Problem, ball_obstacle, journal_bearing
 from warp_lcp.gallery.obstacle import membrane_height
 
 WITHIN = 2  # iterations by which a count may differ
-P4PDES, DEALII, PERMON, TAO, BOOK = "p4pdes", "deal.II step-41", "PERMON", "PETSc/TAO", "[Book] table C.2"
+P4PDES, DEALII, PERMON, TAO, BOOK = (
+    "p4pdes",
+    "deal.II step-41",
+    "PERMON",
+    "PETSc/TAO",
+    "[Book] table C.2",
+)
 MURTY, YOUNG = "Murty 1988", "theory"
 LEVELS = (17, 33, 65, 129, 257)  # nodes a side
-NEWTON: dict[str, Any] = {"monotone_cycles": 0, "eta": 1e-5, "precision": "double"}  # PETSc's tolerance of linear systems
+# PETSc's tolerance of linear systems
+NEWTON: dict[str, Any] = {"monotone_cycles": 0, "eta": 1e-5, "precision": "double"}
 REDUCED = wl.MinimumMapNewton(safeguard=False, **NEWTON)
 SEMISMOOTH = wl.FischerNewton(safeguard=False, scaled=False, fischer_weight=1.0, **NEWTON)
 SOLVED = 1e-8  # PETSc's relative tolerance
 AT_BOUND = 1e-8  # from the bound, where PETSc's active set ends
 KINK = 1e-12  # of x - l and y, below which TAO moves the point
 # as TAO's bqpip: 0.95 of the way to a bound, a start whose products w s have its mean, 2000
-PREDICTOR_CORRECTOR = wl.InteriorPoint(precision="double", monotone_cycles=0, backoff=0.95, start=120.0, predictor_eta=1e-8, eta=1e-8)
+PREDICTOR_CORRECTOR = wl.InteriorPoint(
+    precision="double", monotone_cycles=0, backoff=0.95, start=120.0, predictor_eta=1e-8, eta=1e-8
+)
 
 
 @dataclass(frozen=True)
@@ -60,15 +70,24 @@ class Count:
 
     def row(self, here: Sequence[float]) -> str:
         """Return the row of docs/published-methods.md with the counts found here."""
-        printed, found = (", ".join(f"{n:.4g}" for n in numbers) for numbers in (self.printed, here))
+        printed, found = (
+            ", ".join(f"{n:.4g}" for n in numbers) for numbers in (self.printed, here)
+        )
         return f"| `{self.method}` | {self.problem} | {printed} | {found} | {self.source} |"
 
 
-Small = Callable[[np.ndarray, np.ndarray], float]  # a norm of x and y, fields of the problem's shape
+# a norm of x and y, fields of the problem's shape
+Small = Callable[[np.ndarray, np.ndarray], float]
 
 
 def steps_until(
-    problem: wl.LCP, method: Any, norm: Small, tolerance: float, *, relative: bool = True, x0: np.ndarray | None = None
+    problem: wl.LCP,
+    method: Any,
+    norm: Small,
+    tolerance: float,
+    *,
+    relative: bool = True,
+    x0: np.ndarray | None = None,
 ) -> wl.SolveResult:
     """Solve until a norm of (x, y) is at most `tolerance`, or that times its first value.
 
@@ -114,13 +133,19 @@ def hemisphere(n: int) -> Problem:
     s = np.linspace(-2, 2, n)
     square = s[:, None] ** 2 + s**2
     edge, height = 0.9, (1 - 0.9**2) ** 0.5
-    psi = np.where(square <= edge, np.sqrt(np.maximum(1 - square, 0)), height - edge / height * (square - edge))
-    return replace(ball_obstacle(n, device="cpu", dtype=wp.float64), lower=np.pad(psi[1:-1, 1:-1], 1))
+    psi = np.where(
+        square <= edge, np.sqrt(np.maximum(1 - square, 0)), height - edge / height * (square - edge)
+    )
+    return replace(
+        ball_obstacle(n, device="cpu", dtype=wp.float64), lower=np.pad(psi[1:-1, 1:-1], 1)
+    )
 
 
 def _membrane(n: int, method: Any, norm: Any, x0: np.ndarray | None = None) -> wl.SolveResult:
     problem = hemisphere(n)
-    return steps_until(problem.lcp(), method, partial(norm, np.asarray(problem.lower)), SOLVED, x0=x0)
+    return steps_until(
+        problem.lcp(), method, partial(norm, np.asarray(problem.lower)), SOLVED, x0=x0
+    )
 
 
 def cold_membrane(method: Any, norm: Any, levels: Sequence[int] = LEVELS) -> tuple[float, ...]:
@@ -155,13 +180,17 @@ def stairs_problem() -> tuple[wl.LCP, np.ndarray]:
     """Return deal.II's step-41 and its obstacle: bilinear elements on 128^2 cells of [-1, 1]^2, load -10, u >= a stair of four steps."""
     n = 129
     x = np.linspace(-1, 1, n)
-    stair = np.broadcast_to(np.select([x < -0.5, x < 0.0, x < 0.5], [-0.2, -0.4, -0.6], -0.8), (n, n))
+    stair = np.broadcast_to(
+        np.select([x < -0.5, x < 0.0, x < 0.5], [-0.2, -0.4, -0.6], -0.8), (n, n)
+    )
     cells = np.pad(np.full((n - 2, n - 2), wl.FLUID), 1, constant_values=wl.AIR)
     element = np.full((3, 3), -1 / 3)
     element[1, 1] = 8 / 3
     A = wl.Stencil(cells, element, outside=wl.AIR, device="cpu", dtype=wp.float64)
     load = 10 * (2 / (n - 1)) ** 2
-    return wl.LCP(A, np.where(cells == wl.FLUID, load, 0.0), np.where(cells == wl.FLUID, stair, 0.0)), stair
+    return wl.LCP(
+        A, np.where(cells == wl.FLUID, load, 0.0), np.where(cells == wl.FLUID, stair, 0.0)
+    ), stair
 
 
 ACTIVE_SET = wl.PrimalDualActiveSet(monotone_cycles=0, eta=1e-3, precision="double")
@@ -178,7 +207,8 @@ def stairs() -> tuple[float, ...]:
 
     def change(u: np.ndarray, y: np.ndarray) -> float:
         sets.append(np.pad((y > weight * (u - stair))[1:-1, 1:-1], 1))
-        return 1.0 if len(sets) == 2 else float(np.count_nonzero(sets[-1] ^ sets[-2]))  # the start is no iterate
+        # the start is no iterate
+        return 1.0 if len(sets) == 2 else float(np.count_nonzero(sets[-1] ^ sets[-2]))
 
     return (steps_until(problem, ACTIVE_SET, change, 0.0, relative=False).iterations,)
 
@@ -201,7 +231,9 @@ def gradient_steps(A: Any, b: np.ndarray, lower: np.ndarray, tolerance: float) -
     """Return MPRGP's steps to a projected gradient of `tolerance` times b; proportioning steps count apart, as in PERMON."""
     norm = partial(projected_gradient_norm, lower)
     method = wl.MPRGP(precision="double", monotone_cycles=0)
-    return steps_until(wl.LCP(A, b, lower), method, norm, tolerance * float(np.linalg.norm(b)), relative=False).linear_iterations
+    return steps_until(
+        wl.LCP(A, b, lower), method, norm, tolerance * float(np.linalg.norm(b)), relative=False
+    ).linear_iterations
 
 
 def string() -> tuple[float, ...]:
@@ -217,12 +249,16 @@ def bearings(*sizes: tuple[int, int]) -> tuple[float, ...]:
 def put_problem() -> tuple[np.ndarray, np.ndarray, Callable[[np.ndarray], np.ndarray]]:
     """Return A, the payoff and b(V) of PETSc's blackscholes.c: a time step of an American put by Crank and Nicolson's scheme.
 
-    Values 10 at S = 0 and 0 at S = 100 are known, so that A has 149 unknowns; V has 151 values, those of the step before.
+    Values 10 at S = 0 and 0 at S = 100 are known, so that A has 149 unknowns; V has 151 values,
+    those of the step before.
     """
     strike, rate, dividend, volatility, step = 10.0, 0.04, 0.01, 0.4, 0.1
     S = np.linspace(0, 100, 151)
     inner, spacing = slice(1, -1), S[1]
-    drift, diffusion = (dividend - rate) * S[inner] / (4 * spacing), -((volatility * S[inner] / spacing) ** 2) / 4
+    drift, diffusion = (
+        (dividend - rate) * S[inner] / (4 * spacing),
+        -((volatility * S[inner] / spacing) ** 2) / 4,
+    )
     left, right = diffusion - drift, diffusion + drift
     A = np.diag(1 / step + rate - 2 * diffusion) + np.diag(left[1:], -1) + np.diag(right[:-1], 1)
 
@@ -237,7 +273,8 @@ def put_problem() -> tuple[np.ndarray, np.ndarray, Callable[[np.ndarray], np.nda
 def fischer_gradient(A: np.ndarray, lower: np.ndarray, x: np.ndarray, y: np.ndarray) -> float:
     """Return the norm of the gradient J'f of the Fischer-Burmeister map's merit (TAO's semismooth methods).
 
-    J = diag(p) + diag(q) A; at kinks p and q are those of a point moved along z, 1 at kinks and 0 elsewhere.
+    J = diag(p) + diag(q) A; at kinks p and q are those of a point moved along z, 1 at kinks and 0
+    elsewhere.
     """
     a = x - lower
     rho = np.hypot(a, y)
@@ -264,13 +301,19 @@ def put() -> tuple[float, ...]:
 
 def gap_norm(x: np.ndarray, y: np.ndarray) -> float:
     """Return the root of the complementarity gap plus the dual infeasibility (TAO's bqpip), for x >= 0."""
-    return float(np.sqrt(np.maximum(x, 0.0) @ np.maximum(y, 0.0) + np.abs(np.minimum(y, 0.0)).sum()))
+    return float(
+        np.sqrt(np.maximum(x, 0.0) @ np.maximum(y, 0.0) + np.abs(np.minimum(y, 0.0)).sum())
+    )
 
 
 def interior_bearing() -> tuple[float, ...]:
     """Return the interior-point steps on the journal bearing of eccentricity 0.9."""
     problem = journal_bearing(10, 16, 0.9, device="cpu").dense()
-    return (steps_until(wl.LCP(problem.A, problem.b, 0.0), PREDICTOR_CORRECTOR, gap_norm, 1e-4, relative=False).iterations,)
+    return (
+        steps_until(
+            wl.LCP(problem.A, problem.b, 0.0), PREDICTOR_CORRECTOR, gap_norm, 1e-4, relative=False
+        ).iterations,
+    )
 
 
 def murty_problem(n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -288,7 +331,8 @@ def pivots(*sizes: int) -> tuple[float, ...]:
 def slowest_mode(n: int, *, by_rows: bool) -> tuple[np.ndarray, float]:
     """Return the error that sweeps on the 5-point operator of n^2 nodes reduce least, shape (n, n), and the factor.
 
-    Jacobi's is cos(pi h) with h = 1 / (n + 1); Gauss and Seidel's, row by row, its square (Young 1971).
+    Jacobi's is cos(pi h) with h = 1 / (n + 1); Gauss and Seidel's, row by row, its square (Young
+    1971).
     """
     k, factor = np.arange(1, n + 1), float(np.cos(np.pi / (n + 1)))
     wave = np.sin(np.pi * k / (n + 1)) * (factor**k if by_rows else 1.0)
@@ -304,7 +348,9 @@ def sweeps(n: int, method: Any, *, by_rows: bool) -> float:
     def largest(x: np.ndarray, y: np.ndarray) -> float:
         return float(np.abs(x - 1).max())
 
-    return steps_until(wl.LCP(A, -A.sum(axis=1), 0.0), method, largest, 1e-6, x0=1 + error / 2).iterations
+    return steps_until(
+        wl.LCP(A, -A.sum(axis=1), 0.0), method, largest, 1e-6, x0=1 + error / 2
+    ).iterations
 
 
 def theory(n: int, *, by_rows: bool) -> float:
@@ -336,41 +382,101 @@ def _mean(method: str, problems: Sequence[Problem]) -> tuple[float, ...]:
 
 NEWTON_NAME, FISCHER_NAME, FLUID = "minimum-map-newton", "fischer-newton", "fluid, recipe"
 JACOBI = "preconditioned by the diagonal here, which varies; without, NumPy takes 119"
-HALF_STEP = "the whole step is projected here; with PERMON's half step and fixed step NumPy takes 181"
+HALF_STEP = (
+    "the whole step is projected here; with PERMON's half step and fixed step NumPy takes 181"
+)
 MURTYS, SIDE = (2, 3, 4, 5, 6, 7, 8), 15
 COUNTS: tuple[Count, ...] = (
-    Count(NEWTON_NAME, "hemisphere, 17^2 to 257^2", (3, 6, 7, 12, 21), P4PDES, partial(cold_membrane, REDUCED, reduced_norm)),
-    Count(NEWTON_NAME, "the same, from the coarser grid", (3, 4, 2, 2, 3), P4PDES, partial(sequenced_membrane, REDUCED, reduced_norm)),
     Count(
-        FISCHER_NAME, "hemisphere, 17^2 to 257^2", (7, 11, 11, 16, 25), P4PDES,
+        NEWTON_NAME,
+        "hemisphere, 17^2 to 257^2",
+        (3, 6, 7, 12, 21),
+        P4PDES,
+        partial(cold_membrane, REDUCED, reduced_norm),
+    ),
+    Count(
+        NEWTON_NAME,
+        "the same, from the coarser grid",
+        (3, 4, 2, 2, 3),
+        P4PDES,
+        partial(sequenced_membrane, REDUCED, reduced_norm),
+    ),
+    Count(
+        FISCHER_NAME,
+        "hemisphere, 17^2 to 257^2",
+        (7, 11, 11, 16, 25),
+        P4PDES,
         partial(cold_membrane, SEMISMOOTH, fischer_norm),
     ),
     Count(
-        FISCHER_NAME, "hemisphere, 17^2 to 257^2, from the coarser grid", (5, 8, 6, 6, 7), P4PDES,
+        FISCHER_NAME,
+        "hemisphere, 17^2 to 257^2, from the coarser grid",
+        (5, 8, 6, 6, 7),
+        P4PDES,
         partial(sequenced_membrane, SEMISMOOTH, fischer_norm),
     ),
     Count(FISCHER_NAME, "American put, 9 time steps", (5, 5, 4, 4, 4, 4, 4, 4, 4), TAO, put),
     Count("interior-point", "journal bearing, 10 x 16, e = 0.9", (14,), TAO, interior_bearing),
-    Count("lemke", "Murty's problems, 2 to 8 unknowns", (4, 8, 16, 32, 64, 128, 256), MURTY, partial(pivots, *MURTYS)),
+    Count(
+        "lemke",
+        "Murty's problems, 2 to 8 unknowns",
+        (4, 8, 16, 32, 64, 128, 256),
+        MURTY,
+        partial(pivots, *MURTYS),
+    ),
     Count("primal-dual-active-set", "stairs, 129^2", (19,), DEALII, stairs),
     Count("mprgp", "string, 100, projected expansion", (160,), PERMON, string),
     Count("mprgp", "string, 100, half step and fixed step", (181,), PERMON, string, HALF_STEP),
-    Count("mprgp", "journal bearing, 8 x 12, 10 x 16", (23, 34), PERMON, partial(bearings, (8, 12), (10, 16))),
+    Count(
+        "mprgp",
+        "journal bearing, 8 x 12, 10 x 16",
+        (23, 34),
+        PERMON,
+        partial(bearings, (8, 12), (10, 16)),
+    ),
     Count("mprgp", "journal bearing, 30 x 30", (119,), PERMON, partial(bearings, (30, 30)), JACOBI),
-    Count(FISCHER_NAME, "random fluid, 1000", (5.0,), BOOK, partial(recipe, FLUID, "Fischer-Newton", 20)),
-    Count(NEWTON_NAME, "random fluid, 1000", (4.07,), BOOK, partial(recipe, FLUID, "minimum map", 20)),
-    Count("psor", "random fluid, 1000, omega = 1.4", (25.29,), BOOK, partial(recipe, FLUID, "PSOR 1.4", 100), slow=True),
-    Count("psor", "random fluid, 1000, omega = 1", (49.38,), BOOK, partial(recipe, FLUID, "PGS", 100), slow=True),
+    Count(
+        FISCHER_NAME,
+        "random fluid, 1000",
+        (5.0,),
+        BOOK,
+        partial(recipe, FLUID, "Fischer-Newton", 20),
+    ),
+    Count(
+        NEWTON_NAME, "random fluid, 1000", (4.07,), BOOK, partial(recipe, FLUID, "minimum map", 20)
+    ),
+    Count(
+        "psor",
+        "random fluid, 1000, omega = 1.4",
+        (25.29,),
+        BOOK,
+        partial(recipe, FLUID, "PSOR 1.4", 100),
+        slow=True,
+    ),
+    Count(
+        "psor",
+        "random fluid, 1000, omega = 1",
+        (49.38,),
+        BOOK,
+        partial(recipe, FLUID, "PGS", 100),
+        slow=True,
+    ),
     Count(FISCHER_NAME, "random contacts, 180", (14.54,), BOOK, partial(contacts, 100), slow=True),
     Count(
-        "projected-jacobi", "5-point, 15^2, no bound met", (theory(SIDE, by_rows=False),), YOUNG,
+        "projected-jacobi",
+        "5-point, 15^2, no bound met",
+        (theory(SIDE, by_rows=False),),
+        YOUNG,
         lambda: (sweeps(SIDE, wl.ProjectedJacobi(omega=1.0), by_rows=False),),
     ),
     Count(
-        "psor", "5-point, 15^2, no bound met, omega = 1", (theory(SIDE, by_rows=True),), YOUNG,
+        "psor",
+        "5-point, 15^2, no bound met, omega = 1",
+        (theory(SIDE, by_rows=True),),
+        YOUNG,
         lambda: (sweeps(SIDE, wl.ProjectedSOR(omega=1.0), by_rows=True),),
     ),
-)  # fmt: skip
+)
 
 
 if __name__ == "__main__":  # the table of docs/published-methods.md

@@ -1,8 +1,9 @@
 """What a liquid costs a rank: `mpiexec -n N python -m warp_lcp.benchmarks.rank_costs SCENE [KEY=VALUE...]`, for docs/planning.md.
 
-Prints the figures of the rank that has most of each. Seconds are the processor's, so that neighbors on the machine count less; a rank that
-waits for others in MPI takes them, too. Memory is the most that the process held, less what it held with Python, libraries and kernels.
-Bytes are those that a rank receives, by who sends them and why.
+Prints the figures of the rank that has most of each. Seconds are the processor's, so that neighbors
+on the machine count less; a rank that waits for others in MPI takes them, too. Memory is the most
+that the process held, less what it held with Python, libraries and kernels. Bytes are those that a
+rank receives, by who sends them and why.
 """
 
 from __future__ import annotations
@@ -39,12 +40,31 @@ class Traffic:
         """Count from here on, in this process."""
         self.bytes, self.times = Counter[str](), Counter[str]()
         self._recorded: list[tuple[str, int]] | None = None  # by the program that is being recorded
-        self._listen(Subdomain, "fill", lambda part, *fields, width=None: _ghosts(part, width) * sum(map(_item, fields)))
-        self._listen(Subdomain, "collect", lambda part, mine, whole: (whole[0].size - mine[0].size) * sum(map(_item, whole)))
+        self._listen(
+            Subdomain,
+            "fill",
+            lambda part, *fields, width=None: _ghosts(part, width) * sum(map(_item, fields)),
+        )
+        self._listen(
+            Subdomain,
+            "collect",
+            lambda part, mine, whole: (whole[0].size - mine[0].size) * sum(map(_item, whole)),
+        )
         self._listen(Halo, "fill", lambda halo, field: _ghosts(halo) * _item(field))
-        self._listen(Gathering, "collect", lambda gathering, mine, whole: (whole.size - mine.size) * _item(whole))
-        self._listen(Ranks, "gather", lambda ranks, values: (ranks.size - 1) * np.asarray(values).nbytes)
-        self._listen(MpiMailbox, "swap", lambda post, outgoing: sum(array.nbytes for array in outgoing.values()))  # sent; as much comes
+        self._listen(
+            Gathering,
+            "collect",
+            lambda gathering, mine, whole: (whole.size - mine.size) * _item(whole),
+        )
+        self._listen(
+            Ranks, "gather", lambda ranks, values: (ranks.size - 1) * np.asarray(values).nbytes
+        )
+        # sent; as much comes
+        self._listen(
+            MpiMailbox,
+            "swap",
+            lambda post, outgoing: sum(array.nbytes for array in outgoing.values()),
+        )
         self._listen_to_programs()
 
     def _listen(self, kind: type, name: str, size: Callable[..., int]) -> None:
@@ -58,7 +78,11 @@ class Traffic:
 
     def _listen_to_programs(self) -> None:
         """Count what is recorded when it runs, not when it is recorded."""
-        record, run, recorded = LaunchGraph._recorded, Program.run, dict[int, tuple[Program, list[tuple[str, int]]]]()
+        record, run, recorded = (
+            LaunchGraph._recorded,
+            Program.run,
+            dict[int, tuple[Program, list[tuple[str, int]]]](),
+        )
 
         def recording(graph: LaunchGraph, arguments: tuple[Any, ...]) -> Any:
             outer, self._recorded = self._recorded, []
@@ -85,7 +109,13 @@ class Traffic:
 @cache
 def _ghosts(owner: Subdomain | Halo, width: int | None = None) -> int:
     """Return how many ghost cells are filled."""
-    forest = owner._forest if isinstance(owner, Halo) else owner.forest(width=width) if owner.ranks.size > 1 else None
+    forest = (
+        owner._forest
+        if isinstance(owner, Halo)
+        else owner.forest(width=width)
+        if owner.ranks.size > 1
+        else None
+    )
     return 0 if forest is None else len(forest.made.getGraph()[2])
 
 
@@ -97,7 +127,10 @@ def main() -> None:
     """Measure on the ranks there are."""
     wp.config.log_level = wp.LOG_ERROR
     ranks, (name, *overrides) = Ranks.world(), sys.argv[1:]
-    traffic, make = Traffic(), partial(FluidsSimulator().create, ranks=ranks, device="cpu", folder=Path())
+    traffic, make = (
+        Traffic(),
+        partial(FluidsSimulator().create, ranks=ranks, device="cpu", folder=Path()),
+    )
     warm = make(load_scene(name, [*overrides, SMALL]))
     for _ in range(2):
         warm.step(warm.stable_dt())
@@ -113,20 +146,32 @@ def main() -> None:
     rows = [simulation.step(simulation.stable_dt()) for _ in range(STEPS)]
     part: Any = simulation.grid.part
     box = part.box.counts
-    cut = sum(box[0] * box[1] * box[2] // box[axis] for axis in range(3) for side in range(2) if part.cuts >> 2 * axis + side & 1)
+    cut = sum(
+        box[0] * box[1] * box[2] // box[axis]
+        for axis in range(3)
+        for side in range(2)
+        if part.cuts >> 2 * axis + side & 1
+    )
     seconds = (time.process_time() - begun) / STEPS
     found = {
-        "cells of the box": part.box.cells, "cells stored": part.grid.size, "particles": simulation.particles.count, "cells at cuts": cut,
-        "MiB beyond the libraries'": (resident_bytes(peak=True) - before) / MEGA, "MiB of the libraries": before / MEGA,
+        "cells of the box": part.box.cells,
+        "cells stored": part.grid.size,
+        "particles": simulation.particles.count,
+        "cells at cuts": cut,
+        "MiB beyond the libraries'": (resident_bytes(peak=True) - before) / MEGA,
+        "MiB of the libraries": before / MEGA,
         "processor's ms a step": 1e3 * seconds,
         **{f"{kind}: bytes a step": size / STEPS for kind, size in sorted(traffic.bytes.items())},
         **{f"{kind}: times a step": count / STEPS for kind, count in sorted(traffic.times.items())},
-    }  # fmt: skip
+    }
     most = ranks.max(np.array([*found.values()], dtype=float))
     if ranks.is_root:
         counts = [key for key in ("solve_iterations", "density_iterations") if key in rows[0]]
         solves = [f"{np.mean([row[key] or 0 for row in rows]):.1f} {key}" for key in counts]
-        print(f"{name} {' '.join(overrides)}, {ranks.size} ranks, {cpu_model()}; a step: {', '.join(solves)}")
+        print(
+            f"{name} {' '.join(overrides)}, {ranks.size} ranks, {cpu_model()}; a step: "
+            f"{', '.join(solves)}"
+        )
         for key, value in zip(found, most, strict=True):
             print(f"{value:14,.1f}  {key}")
 

@@ -1,7 +1,7 @@
 """The solves of the suite `scaling` on several ranks of PETSc: strong scaling, memory of a rank, and the price of being shared.
 
-Started by `mpiexec`, it measures on the ranks there are, each of which makes its own box of the grid only. Otherwise it starts 1, 2 and 4
-ranks itself, one after the other.
+Started by `mpiexec`, it measures on the ranks there are, each of which makes its own box of the
+grid only. Otherwise it starts 1, 2 and 4 ranks itself, one after the other.
 """
 
 from __future__ import annotations
@@ -24,7 +24,17 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.benchmarks.cases import MIDST, TOLERANCES
 from warp_lcp.benchmarks.harness.machine import array_bytes, forget_peak, machine, resident_bytes
-from warp_lcp.benchmarks.harness.record import Lines, Record, Results, Table, Target, read_json, shown, spread, table_of_targets
+from warp_lcp.benchmarks.harness.record import (
+    Lines,
+    Record,
+    Results,
+    Table,
+    Target,
+    read_json,
+    shown,
+    spread,
+    table_of_targets,
+)
 from warp_lcp.benchmarks.harness.timing import Figure, Options, ratios
 from warp_lcp.benchmarks.problems import BOUNDS, SplashPart, natural, splash, splash_part
 from warp_lcp.benchmarks.scaling import FIGURES, SCENE_BYTES, SOLVE_BYTES, Growing
@@ -39,9 +49,12 @@ from warp_lcp.run.devices import devices, free_memory
 TITLE = "Solves on several ranks"
 SIZES = (64, 128)
 RANKS = (1, 2, 4)
-ROUNDED = 1e-3  # relative difference that is left between the residual that a solve tells and the one that is computed here
+# relative difference that is left between the residual that a solve tells and the one that is
+# computed here
+ROUNDED = 1e-3
 TOLD = "to_1e-06"
-PAUSE = 0.002  # [s] between two looks of a rank that waits: it leaves its core to the one that computes
+# [s] between two looks of a rank that waits: it leaves its core to the one that computes
+PAUSE = 0.002
 PLANNED = (ValueError, MemoryError, OSError)  # whose messages say enough
 FAILED, WRONG_INPUT = 1, 2  # exit codes
 MEGA = 1 << 20
@@ -76,8 +89,15 @@ class Shared:
 
     def build(self) -> tuple[wl.LCP, wl.ProjectedMultigrid, Any]:
         """Return the problem, the method and its workspace."""
-        cells, solver = np.ascontiguousarray(self.part.cells[1:-1, 1:-1, 1:-1]), wl.ProjectedMultigrid()
-        problem = wl.LCP(wl.GridPoisson(cells, decomposition=self.decomposition, device=self.device), self.part.b, self.lower)
+        cells, solver = (
+            np.ascontiguousarray(self.part.cells[1:-1, 1:-1, 1:-1]),
+            wl.ProjectedMultigrid(),
+        )
+        problem = wl.LCP(
+            wl.GridPoisson(cells, decomposition=self.decomposition, device=self.device),
+            self.part.b,
+            self.lower,
+        )
         return problem, solver, solver.init(problem)
 
     def sample(self, *, keep: bool) -> None:
@@ -87,10 +107,15 @@ class Shared:
         problem, solver, work = self.build()
         wp.synchronize_device(self.device)
         setup = self.ranks.max(time.perf_counter() - begun)
-        result = wl.solve(problem, solver, stopping=wl.StoppingCriteria(rtol=TOLERANCES[-1]), workspace=work)
+        result = wl.solve(
+            problem, solver, stopping=wl.StoppingCriteria(rtol=TOLERANCES[-1]), workspace=work
+        )
         reference = result.residual / result.relative_residual if result.relative_residual else 1.0
         if not keep:
-            self.counts |= {"told": result.relative_residual, "residual": self.residual(result.x.numpy())}
+            self.counts |= {
+                "told": result.relative_residual,
+                "residual": self.residual(result.x.numpy()),
+            }
             self.counts |= {"converged": float(bool(result)), "unknowns": problem.A.unknowns}  # type: ignore[attr-defined]
             return
         self.samples["setup"].append(setup)
@@ -107,7 +132,10 @@ class Shared:
         lower = np.pad(self.lower, 1) if isinstance(self.lower, np.ndarray) else self.lower
         around = np.pad(x.astype(np.float64).reshape(self.part.b.shape), 1)
         Halo(self.decomposition, 1).fill(around)
-        squares = [float((natural(cells, b, lower, p)[inner] ** 2).sum()) for p in (around, np.zeros_like(around))]
+        squares = [
+            float((natural(cells, b, lower, p)[inner] ** 2).sum())
+            for p in (around, np.zeros_like(around))
+        ]
         return math.sqrt(self.ranks.sum(squares[0]) / self.ranks.sum(squares[1]))
 
     def memory(self, before: int) -> None:
@@ -124,10 +152,18 @@ class Shared:
             if record.iteration == MIDST:
                 most.append(array_bytes())
 
-        wl.solve(problem, solver, stopping=wl.StoppingCriteria(rtol=TOLERANCES[-1]), workspace=work, callback=look)
+        wl.solve(
+            problem,
+            solver,
+            stopping=wl.StoppingCriteria(rtol=TOLERANCES[-1]),
+            workspace=work,
+            callback=look,
+        )
         most.append(array_bytes())
         peak = resident_bytes(peak=True)
-        self.counts["bytes_per_cell"] = self.ranks.sum(max(most) - arrays) / self.decomposition.counts[0] ** 3
+        self.counts["bytes_per_cell"] = (
+            self.ranks.sum(max(most) - arrays) / self.decomposition.counts[0] ** 3
+        )
         self.counts["resident"] = self.ranks.max(peak) / MEGA
         self.counts["resident_more"] = self.ranks.max(peak - before) / MEGA
 
@@ -140,7 +176,10 @@ class Shared:
             for name in ("setup", *FIGURES):
                 ours, theirs = self.samples[name], plain.samples[name]
                 if theirs and len(ours) == len(theirs):
-                    figures |= {f"single_{name}": Figure.of(theirs, "s"), f"{name}_over_single": ratios(ours, theirs)}
+                    figures |= {
+                        f"single_{name}": Figure.of(theirs, "s"),
+                        f"{name}_over_single": ratios(ours, theirs),
+                    }
             figures["single_iterations"] = Figure(plain.counts["iterations_to_1e-06"])
         if team is not None and len(team.samples[TOLD]) == len(self.samples[TOLD]):
             figures |= {
@@ -156,7 +195,8 @@ def measure(options: Options, out: Path) -> Results:
     """Measure on the ranks there are, or on each number of ranks in a run of its own.
 
     Raises:
-        SystemExit: on all ranks but the first, and on all with an exit code that is not 0 where one has failed.
+        SystemExit: on all ranks but the first, and on all with an exit code that is not 0 where one
+            has failed.
     """
     sizes = sorted(options.sizes or SIZES)
     if launch.rank_here() is not None:
@@ -166,16 +206,32 @@ def measure(options: Options, out: Path) -> Results:
         raise SystemExit(WRONG_INPUT)
     else:
         records = [record for count in RANKS for record in _started(count, sizes, options)]
-    found = {(r.facts["n"], r.facts["bounds"], r.facts["ranks"]): r for r in records if "boxes" in r.facts}
-    where = machine("cpu" if options.device == "cpu" else wp.get_preferred_device().alias, elements=1 << 22, repeat=options.repeat)
+    found = {
+        (r.facts["n"], r.facts["bounds"], r.facts["ranks"]): r
+        for r in records
+        if "boxes" in r.facts
+    }
+    where = machine(
+        "cpu" if options.device == "cpu" else wp.get_preferred_device().alias,
+        elements=1 << 22,
+        repeat=options.repeat,
+    )
     charts = [] if launch.rank_here() is not None else [_chart(found, sizes)]
-    return Results([where, *records], [targets(found, sizes), _table(found)], list(charts), _failures(records))
+    return Results(
+        [where, *records], [targets(found, sizes), _table(found)], list(charts), _failures(records)
+    )
 
 
 def _started(count: int, sizes: Sequence[int], options: Options) -> list[Record]:
     """Measure on so many ranks, started here."""
     with tempfile.TemporaryDirectory() as folder:
-        asked = [*(part for n in sizes for part in ("--size", str(n))), "--repeat", str(options.repeat), "--device", options.device]
+        asked = [
+            *(part for n in sizes for part in ("--size", str(n))),
+            "--repeat",
+            str(options.repeat),
+            "--device",
+            options.device,
+        ]
         arguments = [
             "-m",
             "warp_lcp.benchmarks",
@@ -190,7 +246,9 @@ def _started(count: int, sizes: Sequence[int], options: Options) -> list[Record]
         ]
         idle = str(int(count > (os.cpu_count() or 1)))  # to give cores away costs microseconds
         waiting = {VARIABLE: "1", "OMPI_MCA_mpi_yield_when_idle": idle}
-        process = subprocess.run(launch.command(count, *arguments), env=launch.environment() | waiting, check=False)
+        process = subprocess.run(
+            launch.command(count, *arguments), env=launch.environment() | waiting, check=False
+        )
         if process.returncode != 0:
             options.say(f"ranks: {count}: ended with exit code {process.returncode}")
             raise SystemExit(process.returncode)
@@ -203,7 +261,9 @@ def _together(sizes: Sequence[int], options: Options) -> list[Record]:
     ranks = Ranks.world()
     try:
         with Collective(ranks, PLANNED, options.say).together():
-            records = on_ranks(ranks, sizes, device=options.device, repeat=options.repeat, say=options.say)
+            records = on_ranks(
+                ranks, sizes, device=options.device, repeat=options.repeat, say=options.say
+            )
     except (RankFailed, *PLANNED) as error:
         if ranks.is_root:
             options.say(str(error))
@@ -213,11 +273,13 @@ def _together(sizes: Sequence[int], options: Options) -> list[Record]:
     return records
 
 
-def on_ranks(ranks: Ranks, sizes: Sequence[int], *, device: str, repeat: int, say: Callable[[str], object]) -> list[Record]:
+def on_ranks(
+    ranks: Ranks, sizes: Sequence[int], *, device: str, repeat: int, say: Callable[[str], object]
+) -> list[Record]:
     """Measure the sizes that fit on all ranks, one sample of each in every round; collective.
 
-    The first rank also solves each problem alone, on one thread and on as many as there are ranks, in the same rounds, as far as it fits on
-    its machine.
+    The first rank also solves each problem alone, on one thread and on as many as there are ranks,
+    in the same rounds, as far as it fits on its machine.
 
     Raises:
         MemoryError: no size fits.
@@ -229,11 +291,17 @@ def on_ranks(ranks: Ranks, sizes: Sequence[int], *, device: str, repeat: int, sa
     here = device_of_rank(ranks, device)
     for case in shared_cases(min(sizes), ranks, here):
         case.sample(keep=False)  # loads kernels
-    records, cases, threads = list[Record](), list[tuple[Shared, Growing | None, Growing | None]](), wl.get_threads()
+    records, cases, threads = (
+        list[Record](),
+        list[tuple[Shared, Growing | None, Growing | None]](),
+        wl.get_threads(),
+    )
     for n in sizes:
         if ranks.any(not _fits(Decomposition((n, n, n), ranks).box.cells, here)):
             say(f"rank {ranks.rank}: {n}^3 does not fit into memory")
-            records.append(Record(f"{n}^3, ranks: {ranks.size}", {}, {"left out": "does not fit into memory"}))
+            records.append(
+                Record(f"{n}^3, ranks: {ranks.size}", {}, {"left out": "does not fit into memory"})
+            )
             continue
         forget_peak()
         before = resident_bytes()  # with the arrays of smaller grids
@@ -243,8 +311,17 @@ def on_ranks(ranks: Ranks, sizes: Sequence[int], *, device: str, repeat: int, sa
             case.sample(keep=False)
             case.counts |= {name: shared[WALLS].counts[name] for name in MEMORY}
         scene = splash(n) if ranks.is_root and _fits(n**3, here) else None
-        alone = [None if scene is None else Growing(scene, bounds, here) for bounds in BOUNDS for _ in range(2)]
-        cases += zip(shared, alone[::2], alone[1::2] if here == "cpu" and ranks.size > 1 else [None] * len(shared), strict=True)
+        alone = [
+            None if scene is None else Growing(scene, bounds, here)
+            for bounds in BOUNDS
+            for _ in range(2)
+        ]
+        cases += zip(
+            shared,
+            alone[::2],
+            alone[1::2] if here == "cpu" and ranks.size > 1 else [None] * len(shared),
+            strict=True,
+        )
     if not cases:
         raise MemoryError(f"none of the sizes {', '.join(map(str, sizes))} fits")
     for turn in range(repeat + 1):
@@ -274,8 +351,13 @@ def shared_cases(n: int, ranks: Ranks, device: str) -> list[Shared]:
 def _fits(cells: int, device: str) -> bool:
     """Return whether a scene and its solve fit on this rank's machine."""
     free, host = free_memory(device), free_memory("cpu")
-    need = {device: SOLVE_BYTES * cells, "cpu": (SCENE_BYTES + (SOLVE_BYTES if device == "cpu" else 0)) * cells}
-    return all(space is None or need[name] <= space for name, space in ((device, free), ("cpu", host)))
+    need = {
+        device: SOLVE_BYTES * cells,
+        "cpu": (SCENE_BYTES + (SOLVE_BYTES if device == "cpu" else 0)) * cells,
+    }
+    return all(
+        space is None or need[name] <= space for name, space in ((device, free), ("cpu", host))
+    )
 
 
 def _ratio(a: Record | None, b: Record | None, figure: str) -> Figure | None:
@@ -288,39 +370,91 @@ def targets(found: Found, sizes: Sequence[int]) -> Table:
     """Return the figures to reach, at the sizes from 128^3 on."""
     rows = []
     for n in (size for size in sizes if size >= 128):
-        counts = [v for count in RANKS if (n, "walls", count) in found and (v := found[n, "walls", count].value(f"iterations_{TOLD}"))]
+        counts = [
+            v
+            for count in RANKS
+            if (n, "walls", count) in found
+            and (v := found[n, "walls", count].value(f"iterations_{TOLD}"))
+        ]
         one, two = found.get((n, "walls", 1)), found.get((n, "walls", 2))
         spread_ = Figure(max(counts) - min(counts)) if len(counts) == len(RANKS) else None
         single = one.figures.get(f"{TOLD}_over_single") if one else None
         team = two.figures.get(f"{TOLD}_over_team") if two else None
-        gain = _ratio(one, two, TOLD) if (os.cpu_count() or 1) >= 2 else None  # without a core for each rank it tells nothing
+        # without a core for each rank it tells nothing
+        gain = _ratio(one, two, TOLD) if (os.cpu_count() or 1) >= 2 else None
         rows += [
-            Target(f"{n}^3 walls: iterations to 1e-6, the most of any number of ranks less the least", 1, spread_),
-            Target(f"{n}^3 walls: seconds to 1e-6 on 1 rank over those on 2", 1.6, gain, at_least=True),
+            Target(
+                f"{n}^3 walls: iterations to 1e-6, the most of any number of ranks less the least",
+                1,
+                spread_,
+            ),
+            Target(
+                f"{n}^3 walls: seconds to 1e-6 on 1 rank over those on 2", 1.6, gain, at_least=True
+            ),
             Target(f"{n}^3 walls: seconds to 1e-6 on 1 rank over one process's", 1.5, single),
-            Target(f"{n}^3 walls: seconds to 1e-6 on 2 ranks over one process's on 2 threads", 1, team, at_least=True),
-            Target(f"{n}^3 walls: memory of a rank of 2 over that of 1", 0.6, _ratio(two, one, "resident_more")),
+            Target(
+                f"{n}^3 walls: seconds to 1e-6 on 2 ranks over one process's on 2 threads",
+                1,
+                team,
+                at_least=True,
+            ),
+            Target(
+                f"{n}^3 walls: memory of a rank of 2 over that of 1",
+                0.6,
+                _ratio(two, one, "resident_more"),
+            ),
         ]
     return table_of_targets("figure", rows)
 
 
 def _table(found: Found) -> Table:
-    columns = ["cells", "problem", "ranks", "boxes", "set-up [ms]", *(f"to {t:g} [ms]" for t in TOLERANCES), "range of 1e-6", "gain"]
-    columns += ["over one process", "over its threads", "iterations", "residual", "bytes a cell", "MiB a rank", "of them for the problem"]
+    columns = [
+        "cells",
+        "problem",
+        "ranks",
+        "boxes",
+        "set-up [ms]",
+        *(f"to {t:g} [ms]" for t in TOLERANCES),
+        "range of 1e-6",
+        "gain",
+    ]
+    columns += [
+        "over one process",
+        "over its threads",
+        "iterations",
+        "residual",
+        "bytes a cell",
+        "MiB a rank",
+        "of them for the problem",
+    ]
     rows = []
-    for (n, bounds, count), r in sorted(found.items(), key=lambda item: (item[0][0], BOUNDS.index(item[0][1]), item[0][2])):
+    for (n, bounds, count), r in sorted(
+        found.items(), key=lambda item: (item[0][0], BOUNDS.index(item[0][1]), item[0][2])
+    ):
         gain = _ratio(found.get((n, bounds, 1)), r, TOLD)
-        row = [f"{n}^3", bounds, str(count), r.facts["boxes"], *shown(r, ("setup", *FIGURES), ".1f", 1e3)]
-        row += [spread(r.figures.get(TOLD, Figure(0.0)), 1e3), "" if gain is None else f"{gain.value:.2f}"]
+        row = [
+            f"{n}^3",
+            bounds,
+            str(count),
+            r.facts["boxes"],
+            *shown(r, ("setup", *FIGURES), ".1f", 1e3),
+        ]
+        row += [
+            spread(r.figures.get(TOLD, Figure(0.0)), 1e3),
+            "" if gain is None else f"{gain.value:.2f}",
+        ]
         row += [
             *shown(r, [f"{TOLD}_over_single", f"{TOLD}_over_team"], ".2f"),
             " / ".join(shown(r, [f"iterations_{name}" for name in FIGURES], ".0f")),
         ]
         rows.append([*row, *shown(r, ["residual"], ".1e"), *shown(r, MEMORY, ".0f")])
     remark = (
-        f"On {os.cpu_count()} cores: more ranks than cores tell of counts, not of time. Cold, from each rank's arrays, seconds "
-        "of the slowest rank. Gain: seconds of 1 rank over those of these; over one process: seconds over those of one process that solves "
-        "alone, without MPI, on one thread, in the same rounds; over its threads: on as many as there are ranks. The residual is "
+        f"On {os.cpu_count()} cores: more ranks than cores tell of counts, not of time. Cold, from "
+        "each rank's arrays, seconds "
+        "of the slowest rank. Gain: seconds of 1 rank over those of these; over one process: "
+        "seconds over those of one process that solves "
+        "alone, without MPI, on one thread, in the same rounds; over its threads: on as many as "
+        "there are ranks. The residual is "
         "computed from x by NumPy in float64. Bytes: of all arrays. MiB: the "
         "most that a rank's process holds in a solve with walls, the scene included."
     )
@@ -341,9 +475,13 @@ def _failures(records: Sequence[Record]) -> list[str]:
 
 def _chart(found: Found, sizes: Sequence[int]) -> Lines:
     """Return what ranks gain on a grid."""
-    gains: dict[str, tuple[list[float], list[float]]] = {"as many times as ranks": (list(RANKS), list(RANKS))}
+    gains: dict[str, tuple[list[float], list[float]]] = {
+        "as many times as ranks": (list(RANKS), list(RANKS))
+    }
     for n in sizes:
-        strong = [(r, _ratio(found.get((n, "walls", 1)), found.get((n, "walls", r)), TOLD)) for r in RANKS]
+        strong = [
+            (r, _ratio(found.get((n, "walls", 1)), found.get((n, "walls", r)), TOLD)) for r in RANKS
+        ]
         gains[f"{n}^3"] = [r for r, f in strong if f], [f.value for _, f in strong if f]
     title = f"One grid on more ranks: walls, to 1e-6, {os.cpu_count()} cores"
     return Lines("strong", title, "ranks", "times as fast as 1 rank", gains, log="")

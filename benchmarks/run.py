@@ -27,8 +27,11 @@ TITLE = "Runs of built-in scenes"
 SCENES = {"dam-break-2d": 0.3, "dam-break": 0.2}  # [s] simulated
 PARTICLES = 128  # cells along the longest side of the scene whose particles are timed
 PARTICLE_STEPS = 12
-WALL_TIME = 0.6  # [s] simulated of the scene in which solves with and without walls are compared: the splash lies in it
-WHOLE = "domain.solids=voxel"  # solids fill whole cells, as they do by themselves at the suite's own resolutions
+# [s] simulated of the scene in which solves with and without walls are compared: the splash lies in
+# it
+WALL_TIME = 0.6
+# solids fill whole cells, as they do by themselves at the suite's own resolutions
+WHOLE = "domain.solids=voxel"
 STAGES: dict[str, tuple[ModuleType | type, str]] = {
     "to grid": (ParticleSimulation, "particles_to_grid"),
     "to particles": (ParticleSimulation, "grid_to_particles"),
@@ -75,8 +78,17 @@ def measure(options: Options, out: Path) -> Results:
     options.say("particles")
     particles = _particles(size or PARTICLES, options)
     records += [*scenes, walls, particles]
-    shares = {f"{r.name}: {k[6:]}": 100 * f.value for r in scenes for k, f in r.figures.items() if k[:6] == "share "}
-    return Results(records, [_table(scenes), _figures_table([walls, particles])], [Bars("stages", "Share of a step", "%", shares)])
+    shares = {
+        f"{r.name}: {k[6:]}": 100 * f.value
+        for r in scenes
+        for k, f in r.figures.items()
+        if k[:6] == "share "
+    }
+    return Results(
+        records,
+        [_table(scenes), _figures_table([walls, particles])],
+        [Bars("stages", "Share of a step", "%", shares)],
+    )
 
 
 def _overrides(duration: float, size: int) -> list[str]:
@@ -88,7 +100,10 @@ def _run(name: str, duration: float, size: int, device: str) -> dict[str, float]
     scene, watch = load_scene(name, _overrides(duration, size)), Watch()
     with tempfile.TemporaryDirectory() as folder, timed(device, STAGES) as seconds:
         begun = time.perf_counter()
-        record = run_scene(RunRequest(scene=scene, out=Path(folder) / "run", device=device, force=True), observer=watch)
+        record = run_scene(
+            RunRequest(scene=scene, out=Path(folder) / "run", device=device, force=True),
+            observer=watch,
+        )
         total = time.perf_counter() - begun
     if record.status != "finished":
         raise RuntimeError(f"{name}: {record.status}: {record.reason}")
@@ -108,7 +123,9 @@ def _scene_record(name: str, samples: Sequence[dict[str, float]]) -> Record:
         "seconds_per_step": Figure.of([s["in steps"] / s["steps"] for s in samples], "s"),
     }
     stages = [*STAGES, "rest of steps", "output"]
-    figures |= {f"share {stage}": Figure.of([s[stage] / s["total"] for s in samples]) for stage in stages}
+    figures |= {
+        f"share {stage}": Figure.of([s[stage] / s["total"] for s in samples]) for stage in stages
+    }
     return Record(name, figures)
 
 
@@ -127,16 +144,25 @@ class BothSolves:
     def __call__(self, problem: wl.LCP, solver: Any, **options: Any) -> wl.SolveResult:
         """Solve both and keep the seconds."""
         if self._problem is None:
-            self._problem = wl.LCP(problem.A, problem.b.reshape(problem.layout.stored_shape), -np.inf, np.inf)
+            self._problem = wl.LCP(
+                problem.A, problem.b.reshape(problem.layout.stored_shape), -np.inf, np.inf
+            )
             self._work = solver.init(self._problem)
         start = self._start(options["x0"])
         result = self._timed(self.bounded, problem, solver, options)
-        free = self._timed(self.linear, self._problem, solver, options | {"x0": start, "workspace": self._work})
-        self.iterations = [self.iterations[0] + result.linear_iterations, self.iterations[1] + free.linear_iterations]
+        free = self._timed(
+            self.linear, self._problem, solver, options | {"x0": start, "workspace": self._work}
+        )
+        self.iterations = [
+            self.iterations[0] + result.linear_iterations,
+            self.iterations[1] + free.linear_iterations,
+        ]
         self._last = result.x.numpy().copy(), free.x.numpy().copy()
         return result
 
-    def _timed(self, seconds: list[float], problem: wl.LCP, solver: Any, options: dict[str, Any]) -> wl.SolveResult:
+    def _timed(
+        self, seconds: list[float], problem: wl.LCP, solver: Any, options: dict[str, Any]
+    ) -> wl.SolveResult:
         begun = time.perf_counter()
         result: wl.SolveResult = self.plain(problem, solver, **options)
         wp.synchronize_device(self.device)
@@ -149,19 +175,39 @@ class BothSolves:
             return wp.clone(x0)
         guess, (bounded, free) = x0.numpy(), self._last
         both = (guess != 0) & (bounded.reshape(guess.shape) != 0)
-        ratio = float(np.median(guess[both] / bounded.reshape(guess.shape)[both])) if both.any() else 0.0
-        return wp.array(ratio * free.reshape(guess.shape) * (guess != 0), dtype=wp.float64, device=x0.device)
+        ratio = (
+            float(np.median(guess[both] / bounded.reshape(guess.shape)[both]))
+            if both.any()
+            else 0.0
+        )
+        return wp.array(
+            ratio * free.reshape(guess.shape) * (guess != 0), dtype=wp.float64, device=x0.device
+        )
 
 
 def _walls(size: int, options: Options) -> Record:
     """Solve every step of the running dam break with separating walls and without bounds."""
-    scene = load_scene("dam-break", [*_overrides(WALL_TIME, size), "solver.method=projected-multigrid", "solver.tolerance=1e-6"])
+    scene = load_scene(
+        "dam-break",
+        [
+            *_overrides(WALL_TIME, size),
+            "solver.method=projected-multigrid",
+            "solver.tolerance=1e-6",
+        ],
+    )
     watch = Watch()
     both = BothSolves(wl.solve, options.device)
     with tempfile.TemporaryDirectory() as folder, mock.patch.object(wl, "solve", both):
-        run_scene(RunRequest(scene=scene, out=Path(folder) / "run", device=options.device, force=True), observer=watch)
+        run_scene(
+            RunRequest(scene=scene, out=Path(folder) / "run", device=options.device, force=True),
+            observer=watch,
+        )
     parts = np.array_split(np.arange(1, len(both.linear)), options.repeat)  # the first step is cold
-    ratio = [sum(both.bounded[i] for i in part) / sum(both.linear[i] for i in part) for part in parts if len(part)]
+    ratio = [
+        sum(both.bounded[i] for i in part) / sum(both.linear[i] for i in part)
+        for part in parts
+        if len(part)
+    ]
     steps = len(both.linear)
     figures = {
         "solve_over_linear": Figure.of(ratio),
@@ -176,31 +222,58 @@ def _walls(size: int, options: Options) -> Record:
 def _particles(size: int, options: Options) -> Record:
     """Step a dam break and time what its particles cost."""
     scene = load_scene("dam-break", [WHOLE, f"domain.resolution={size}"])
-    simulation: Any = simulators()[scene.scene.simulator].create(scene, device=options.device, folder=Path.cwd())
+    simulation: Any = simulators()[scene.scene.simulator].create(
+        scene, device=options.device, folder=Path.cwd()
+    )
     count = simulation.particles.count
     with timed(options.device, STAGES) as seconds:
         for _ in range(PARTICLE_STEPS + 1):
             simulation.step(min(simulation.stable_dt(), scene.time.dt_max))
     there, back = seconds["to grid"][1:], seconds["to particles"][1:]
     figures = {"particles": Figure(count)}
-    figures |= {label: Figure.of([1e9 * t / count for t in times], "ns") for label, times in (("to_grid", there), ("to_particles", back))}
-    figures["round_trip"] = Figure.of([1e9 * (a + b) / count for a, b in zip(there, back, strict=True)], "ns")
+    figures |= {
+        label: Figure.of([1e9 * t / count for t in times], "ns")
+        for label, times in (("to_grid", there), ("to_particles", back))
+    }
+    figures["round_trip"] = Figure.of(
+        [1e9 * (a + b) / count for a, b in zip(there, back, strict=True)], "ns"
+    )
     figures["advection"] = Figure.of([1e9 * t / count for t in seconds["advection"][1:]], "ns")
     return Record("particles, 3-D", figures)
 
 
 def _table(scenes: Sequence[Record]) -> Table:
     shares = [*STAGES, "rest of steps", "output"]
-    columns = ["scene", "steps", "steps/s", "ms a step", "linear iterations a step", *(f"{s} [%]" for s in shares)]
+    columns = [
+        "scene",
+        "steps",
+        "steps/s",
+        "ms a step",
+        "linear iterations a step",
+        *(f"{s} [%]" for s in shares),
+    ]
     rows = []
     for r in scenes:
-        numbers = [f"{r.value('steps'):.0f}", str(r.figures["steps_per_second"]), f"{1e3 * (r.value('seconds_per_step') or 0):.2f}"]
+        numbers = [
+            f"{r.value('steps'):.0f}",
+            str(r.figures["steps_per_second"]),
+            f"{1e3 * (r.value('seconds_per_step') or 0):.2f}",
+        ]
         percent = [f"{100 * (r.value(f'share {s}') or 0):.1f}" for s in shares]
         rows.append([r.name, *numbers, f"{r.value('linear_iterations_per_step'):.1f}", *percent])
     remark = "steps/s: of the whole run, frames, checkpoints and start included. Simulated: "
-    return Table("Scenes", columns, rows, remark + ", ".join(f"{t} s of {name}" for name, t in SCENES.items()) + ".")
+    return Table(
+        "Scenes",
+        columns,
+        rows,
+        remark + ", ".join(f"{t} s of {name}" for name, t in SCENES.items()) + ".",
+    )
 
 
 def _figures_table(records: Sequence[Record]) -> Table:
-    rows = [[r.name, name.replace("_", " "), str(figure)] for r in records for name, figure in r.figures.items()]
+    rows = [
+        [r.name, name.replace("_", " "), str(figure)]
+        for r in records
+        for name, figure in r.figures.items()
+    ]
     return Table("Walls and particles", ["what", "figure", "measured"], rows)

@@ -19,15 +19,20 @@ from warp_lcp.granular.scene import SandScene
 from warp_lcp.granular.simulator import SandSimulation
 
 TITLE = "Sand: pressure and friction together"
-STATES = {"falling": 0.1, "mid-flow": 0.25, "spreading": 0.4, "coming to rest": 0.8}  # [s] into the collapse
+# [s] into the collapse
+STATES = {"falling": 0.1, "mid-flow": 0.25, "spreading": 0.4, "coming to rest": 0.8}
 TOLERANCE = 1e-3  # of the stresses, in units of rho g dx
 MOST = 4000  # iterations that a method may take here
 COLLAPSE_END = 1.2  # [s]
 STEPS = 20  # of the large scenes that are timed
 COLLAPSE = {
-    "a step": "seconds_per_step", "iterations": "iterations", f"steps at {TOLERANCE:g}": "share_converged", "runout / width": "runout",
-    "last top speed": "max_speed", "last energy, of the most": "kinetic_energy",
-}  # fmt: skip
+    "a step": "seconds_per_step",
+    "iterations": "iterations",
+    f"steps at {TOLERANCE:g}": "share_converged",
+    "runout / width": "runout",
+    "last top speed": "max_speed",
+    "last energy, of the most": "kinetic_energy",
+}
 ROUNDS = (10, 20, 40, 80, 160, 320, 640, 1280)  # iterations at which the curves are taken
 
 
@@ -41,9 +46,20 @@ def measure(options: Options, out: Path) -> Results:
     tables = [
         _method_table(states),
         _table("The whole collapse", "yield set", COLLAPSE, models),
-        _table("Steps of large scenes", "scene", {"particles": "particles", "a step": "seconds", "iterations": "iterations"}, steps),
+        _table(
+            "Steps of large scenes",
+            "scene",
+            {"particles": "particles", "a step": "seconds", "iterations": "iterations"},
+            steps,
+        ),
     ]
-    chart = Lines("convergence", "Residual against seconds, mid-flow", "seconds", "residual [rho g dx]", curves)
+    chart = Lines(
+        "convergence",
+        "Residual against seconds, mid-flow",
+        "seconds",
+        "residual [rho g dx]",
+        curves,
+    )
     return Results([*records, *states, *models, *steps], tables, [chart])
 
 
@@ -52,7 +68,11 @@ def collapse(size: int, **tables: Any) -> SandScene:
     scene: dict[str, Any] = {
         "scene": {"simulator": "granular"},
         "time": {"duration": COLLAPSE_END},
-        "domain": {"size": [1.2, 0.6], "resolution": size, "friction": math.tan(math.radians(30.0))},
+        "domain": {
+            "size": [1.2, 0.6],
+            "resolution": size,
+            "friction": math.tan(math.radians(30.0)),
+        },
         "material": {"friction_angle": 30.0},
         "sand": [{"shape": "box", "min": [0.0, 0.0], "max": [0.25, 0.5]}],
     }
@@ -67,7 +87,9 @@ def _large() -> dict[str, SandScene]:
     block = [{"shape": "box", "min": [0.0, 0.0, 0.0], "max": [0.32, 0.48, 0.41]}]
     gravity = {"gravity": [0.0, -9.81, 0.0]}
     return {
-        "128^2, 65,000 particles": collapse(128, domain=flat, particles={"per_axis": 4}, sand=column),
+        "128^2, 65,000 particles": collapse(
+            128, domain=flat, particles={"per_axis": 4}, sand=column
+        ),
         "64^3, 500,000 particles": collapse(64, domain=deep, physics=gravity, sand=block),
     }
 
@@ -84,20 +106,29 @@ class _Taken:
     """In the place of a simulation's solve: one by another method, its residual [rho g dx] and its seconds kept."""
 
     def __init__(self, stress: Any, name: str, tolerance: float, most: int) -> None:
-        self.stress, self.method, self.tolerance, self.most = stress, METHODS[name](), tolerance, most
+        self.stress, self.method, self.tolerance, self.most = (
+            stress,
+            METHODS[name](),
+            tolerance,
+            most,
+        )
         self.seconds = self.residual = 0.0
         self.outcome: wl.SolveResult | None = None
 
     def __call__(self, scale: float) -> wl.SolveResult:
         """Solve, and look at the clock."""
         begun = time.perf_counter()
-        stopping = wl.StoppingCriteria(rtol=0.0, atol=self.tolerance * scale, max_iterations=self.most)
+        stopping = wl.StoppingCriteria(
+            rtol=0.0, atol=self.tolerance * scale, max_iterations=self.most
+        )
         self.outcome = wl.solve(self.stress, self.method, stopping=stopping)
         self.seconds, self.residual = time.perf_counter() - begun, self.outcome.residual / scale
         return self.outcome
 
 
-def _solve(simulation: SandSimulation, state: dict[str, np.ndarray], name: str, tolerance: float, most: int) -> _Taken:
+def _solve(
+    simulation: SandSimulation, state: dict[str, np.ndarray], name: str, tolerance: float, most: int
+) -> _Taken:
     """Solve the step that follows a state."""
     simulation.restore(state)
     taken, usual = _Taken(simulation.stress, name, tolerance, most), simulation.solve_stress
@@ -107,7 +138,9 @@ def _solve(simulation: SandSimulation, state: dict[str, np.ndarray], name: str, 
     return taken
 
 
-def _methods(size: int, options: Options) -> tuple[list[Record], dict[str, tuple[list[float], list[float]]]]:
+def _methods(
+    size: int, options: Options
+) -> tuple[list[Record], dict[str, tuple[list[float], list[float]]]]:
     """Return each method's iterations and seconds from each state, and their curves from the one mid-flow."""
     records, curves = [], dict[str, tuple[list[float], list[float]]]()
     simulation = _simulation(collapse(size), options.device)
@@ -134,14 +167,18 @@ def _methods(size: int, options: Options) -> tuple[list[Record], dict[str, tuple
                 "iterations": Figure(taken.outcome.iterations),
                 "residual": Figure(taken.residual),
             }
-            records.append(Record(f"{label}: {name}", figures, {"status": taken.outcome.status.name}))
+            records.append(
+                Record(f"{label}: {name}", figures, {"status": taken.outcome.status.name})
+            )
             if label == "mid-flow":
                 curves[name] = _curve(simulation, state, name)
         simulation.restore(state)
     return records, curves
 
 
-def _curve(simulation: SandSimulation, state: dict[str, np.ndarray], name: str) -> tuple[list[float], list[float]]:
+def _curve(
+    simulation: SandSimulation, state: dict[str, np.ndarray], name: str
+) -> tuple[list[float], list[float]]:
     """Return seconds and residuals of solves that stop after some iterations."""
     taken = [_solve(simulation, state, name, 1e-12, most) for most in ROUNDS]
     return [t.seconds for t in taken], [t.residual for t in taken]
@@ -162,7 +199,9 @@ def _collapse(size: int, model: str, options: Options) -> Record:
         "share_converged": Figure(float(np.mean(good))),
         "runout": Figure(rows[-1]["runout"] / 0.25),
         "max_speed": Figure(rows[-1]["max_speed"], "m/s"),
-        "kinetic_energy": Figure(rows[-1]["kinetic_energy"] / max(row["kinetic_energy"] for row in rows)),
+        "kinetic_energy": Figure(
+            rows[-1]["kinetic_energy"] / max(row["kinetic_energy"] for row in rows)
+        ),
     }
     return Record(f"collapse: {model}", figures)
 
@@ -178,17 +217,34 @@ def _steps(name: str, scene: SandScene, options: Options) -> Record:
         if number > 0:
             seconds.append(time.perf_counter() - begun)
             iterations.append(float(row["staggering_iterations"]))
-    figures = {"seconds": Figure.of(seconds, "s"), "iterations": Figure.of(iterations), "particles": Figure(simulation.particles.count)}
+    figures = {
+        "seconds": Figure.of(seconds, "s"),
+        "iterations": Figure.of(iterations),
+        "particles": Figure(simulation.particles.count),
+    }
     return Record(f"steps: {name}", figures)
 
 
 def _method_table(records: list[Record]) -> Table:
     keys = ("iterations", "residual", "seconds", "ratio")
     rows = [[r.name, r.facts["status"], *(str(r.figures[k]) for k in keys)] for r in records]
-    columns = ["state: method", "status", "iterations", "residual", "seconds", "of interleaved sweeps"]
-    return Table(f"The step after a state of the collapse, to {TOLERANCE:g} rho g dx", columns, rows)
+    columns = [
+        "state: method",
+        "status",
+        "iterations",
+        "residual",
+        "seconds",
+        "of interleaved sweeps",
+    ]
+    return Table(
+        f"The step after a state of the collapse, to {TOLERANCE:g} rho g dx", columns, rows
+    )
 
 
 def _table(title: str, what: str, columns: dict[str, str], records: list[Record]) -> Table:
     """Return a table of figures by their columns' names."""
-    return Table(title, [what, *columns], [[r.name, *(str(r.figures[k]) for k in columns.values())] for r in records])
+    return Table(
+        title,
+        [what, *columns],
+        [[r.name, *(str(r.figures[k]) for k in columns.values())] for r in records],
+    )

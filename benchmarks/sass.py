@@ -1,8 +1,9 @@
 """Executes machine code of NVIDIA GPUs (SASS of sm_90) on the host, to count what a warp issues; no GPU is needed.
 
-A cubin is made by `ptxas` and printed by `cuobjdump` with the help of `nvdisasm`, which are in the extra `ptxas`. The lanes of a warp run
-one after another on copies of memory. An instruction of the warp is issued as often as by the lane that executes it most often, as
-branches join again. Shuffles, votes and atomics, which need other lanes, do nothing.
+A cubin is made by `ptxas` and printed by `cuobjdump` with the help of `nvdisasm`, which are in the
+extra `ptxas`. The lanes of a warp run one after another on copies of memory. An instruction of the
+warp is issued as often as by the lane that executes it most often, as branches join again.
+Shuffles, votes and atomics, which need other lanes, do nothing.
 """
 
 from __future__ import annotations
@@ -33,11 +34,21 @@ IGNORED = frozenset(
     "NOP BSSY BSYNC WARPSYNC BREAK BMOV YIELD DEPBAR BAR MEMBAR ERRBAR CCTL RED ATOMG ATOM".split()  # noqa: SIM905
 )
 COMPARED: dict[str, Callable[[float, float], bool]] = {  # the second letter U: true of NaN
-    "LT": lambda a, b: a < b, "EQ": lambda a, b: a == b, "LE": lambda a, b: a <= b, "GT": lambda a, b: a > b,
-    "NE": lambda a, b: a != b and a == a and b == b, "GE": lambda a, b: a >= b, "NUM": lambda a, b: a == a and b == b,
-    "NAN": lambda a, b: a != a or b != b, "LTU": lambda a, b: not a >= b, "EQU": lambda a, b: a == b or a != a or b != b,
-    "LEU": lambda a, b: not a > b, "GTU": lambda a, b: not a <= b, "NEU": lambda a, b: a != b, "GEU": lambda a, b: not a < b,
-}  # fmt: skip
+    "LT": lambda a, b: a < b,
+    "EQ": lambda a, b: a == b,
+    "LE": lambda a, b: a <= b,
+    "GT": lambda a, b: a > b,
+    "NE": lambda a, b: a != b and a == a and b == b,
+    "GE": lambda a, b: a >= b,
+    "NUM": lambda a, b: a == a and b == b,
+    "NAN": lambda a, b: a != a or b != b,
+    "LTU": lambda a, b: not a >= b,
+    "EQU": lambda a, b: a == b or a != a or b != b,
+    "LEU": lambda a, b: not a > b,
+    "GTU": lambda a, b: not a <= b,
+    "NEU": lambda a, b: a != b,
+    "GEU": lambda a, b: not a < b,
+}
 
 
 def tool(name: str) -> Path | None:
@@ -78,13 +89,21 @@ def assemble(ptx: str, cubin: Path, arch: str = "sm_90") -> list[Kernel]:
     ptxas, cuobjdump, nvdisasm = (tool(name) for name in ("ptxas", "cuobjdump", "nvdisasm"))
     assert ptxas and cuobjdump and nvdisasm, tools_missing()
     text = ptx.rstrip("\0 \n") + "\n"  # Warp ends it with a NUL, which ptxas refuses
-    made = subprocess.run([ptxas, "-v", f"-arch={arch}", "/dev/stdin", "-o", cubin], input=text, capture_output=True, text=True, check=True)
+    made = subprocess.run(
+        [ptxas, "-v", f"-arch={arch}", "/dev/stdin", "-o", cubin],
+        input=text,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     environment = {
         **os.environ,
         "NVDISASM_PATH": str(nvdisasm.parent),
         "PATH": f"{nvdisasm.parent}{os.pathsep}{os.environ.get('PATH', '')}",
     }
-    printed = subprocess.run([cuobjdump, "-sass", cubin], capture_output=True, text=True, check=True, env=environment).stdout
+    printed = subprocess.run(
+        [cuobjdump, "-sass", cubin], capture_output=True, text=True, check=True, env=environment
+    ).stdout
     codes: dict[str, dict[int, Instruction]] = {}
     name = ""
     for line in printed.splitlines():
@@ -96,9 +115,14 @@ def assemble(ptx: str, cubin: Path, arch: str = "sm_90") -> list[Kernel]:
     kernels = []
     for part in re.split(r"Compiling entry function '", made.stderr)[1:]:
         name = part.partition("'")[0]
-        registers, spilled = re.search(r"Used (\d+) registers", part), re.search(r"(\d+) bytes spill stores", part)
+        registers, spilled = (
+            re.search(r"Used (\d+) registers", part),
+            re.search(r"(\d+) bytes spill stores", part),
+        )
         assert registers, part
-        kernels.append(Kernel(name, codes[name], int(registers[1]), int(spilled[1]) if spilled else 0))
+        kernels.append(
+            Kernel(name, codes[name], int(registers[1]), int(spilled[1]) if spilled else 0)
+        )
     return kernels
 
 
@@ -117,7 +141,10 @@ class Memory:
     """Copies of arrays at their addresses; what is written lies on top of them."""
 
     def __init__(self, arrays: Iterable[tuple[int, np.ndarray]]) -> None:
-        self._spans = sorted(((at, np.ascontiguousarray(a).view(np.uint8).reshape(-1)) for at, a in arrays), key=lambda span: span[0])
+        self._spans = sorted(
+            ((at, np.ascontiguousarray(a).view(np.uint8).reshape(-1)) for at, a in arrays),
+            key=lambda span: span[0],
+        )
         self.written: dict[int, int] = {}
         self.shared: dict[int, int] = {}
 
@@ -132,7 +159,9 @@ class Memory:
                 found = bytearray(data[at - begin : at - begin + count].tobytes())
                 break
         else:
-            if not any(begin - 65536 <= at < begin + len(data) + 65536 for begin, data in self._spans):
+            if not any(
+                begin - 65536 <= at < begin + len(data) + 65536 for begin, data in self._spans
+            ):
                 raise KeyError(f"no memory at {at:#x}")
             found = bytearray(count)
         for k in range(count):
@@ -164,7 +193,12 @@ class Issued:
     wavefronts: int = 0
 
 
-def issued(code: dict[int, Instruction], constants: bytes, memory: Memory, threads: Sequence[tuple[int, int]]) -> Issued:
+def issued(
+    code: dict[int, Instruction],
+    constants: bytes,
+    memory: Memory,
+    threads: Sequence[tuple[int, int]],
+) -> Issued:
     """Return what a warp issues whose threads have these (place in the block, block).
 
     Raises:
@@ -181,7 +215,9 @@ def issued(code: dict[int, Instruction], constants: bytes, memory: Memory, threa
             groups[at, turn, is_load].append((address, size))
     found = Issued(sum(most.values()), sum(n for at, n in most.items() if code[at].name in FLOAT64))
     for (_, _, is_load), accesses in groups.items():
-        lines = {byte // 128 for address, size in accesses for byte in (address, address + size - 1)}
+        lines = {
+            byte // 128 for address, size in accesses for byte in (address, address + size - 1)
+        }
         found.loads += is_load
         found.stores += not is_load
         found.wavefronts += max(len(lines), -(-sum(size for _, size in accesses) // 128))
@@ -223,9 +259,12 @@ class Lane:
     thread: int
     block: int
     registers: dict[str, int] = field(default_factory=lambda: defaultdict(int))
-    predicates: dict[str, bool] = field(default_factory=lambda: defaultdict(bool, PT=True, UPT=True))
+    predicates: dict[str, bool] = field(
+        default_factory=lambda: defaultdict(bool, PT=True, UPT=True)
+    )
     count: Counter[int] = field(default_factory=Counter)  # of instructions by address
-    accesses: list[tuple[int, int, int, int, bool]] = field(default_factory=list)  # instruction, its turn, address, bytes, is a load
+    # instruction, its turn, address, bytes, is a load
+    accesses: list[tuple[int, int, int, int, bool]] = field(default_factory=list)
     local: dict[int, int] = field(default_factory=dict)  # memory of its own, by address
     at: int = 0
 
@@ -238,7 +277,10 @@ class Lane:
             instruction = self.code[at]
             self.count[at] += 1
             target: int | None = None
-            if instruction.guard is None or self._predicate(instruction.guard[0]) != instruction.guard[1]:
+            if (
+                instruction.guard is None
+                or self._predicate(instruction.guard[0]) != instruction.guard[1]
+            ):
                 if instruction.name == "EXIT":
                     return
                 self.at = at
@@ -252,7 +294,11 @@ class Lane:
         if name in IGNORED:
             return None
         if name == "BRA":
-            return int(operands[-1], 16) if len(operands) == 1 or self._predicate(operands[0]) else None
+            return (
+                int(operands[-1], 16)
+                if len(operands) == 1 or self._predicate(operands[0])
+                else None
+            )
         if name == "CALL":
             return int(operands[-1], 16)
         if name == "RET":
@@ -276,7 +322,9 @@ class Lane:
         found = re.match(r"c\[0x[0-9a-f]+\]\s*\[(.+?)\]$", operand)
         assert found, operand
         parts = [part.strip() for part in found[1].split("+")]
-        offset = sum(int(part, 16) if part.startswith("0x") else self._register(part) for part in parts)
+        offset = sum(
+            int(part, 16) if part.startswith("0x") else self._register(part) for part in parts
+        )
         return int.from_bytes(self.constants[offset : offset + size], "little")
 
     @staticmethod
@@ -312,15 +360,22 @@ class Lane:
         else:
             found = re.match(r"(U?R)(\d+)", plain)
             assert found, operand
-            value = self.registers[f"{found[1]}{found[2]}"] | self.registers[f"{found[1]}{int(found[2]) + 1}"] << 32
+            value = (
+                self.registers[f"{found[1]}{found[2]}"]
+                | self.registers[f"{found[1]}{int(found[2]) + 1}"] << 32
+            )
         return -value & ALL if negative else value
 
     def _real(self, operand: str, *, double: bool = False) -> float:
         negative, _, absolute, plain = self._signs(operand)
         if plain.startswith("c["):
-            value = _double(self._constant(plain, 8)) if double else _float(self._constant(plain, 4))
+            value = (
+                _double(self._constant(plain, 8)) if double else _float(self._constant(plain, 4))
+            )
         elif re.match(r"[+-]?(INF|QNAN)", plain):
-            value = (-math.inf if plain.startswith("-") else math.inf) if "INF" in plain else math.nan
+            value = (
+                (-math.inf if plain.startswith("-") else math.inf) if "INF" in plain else math.nan
+            )
         elif re.match(r"-?0x", plain):
             value = _float(int(plain, 16))
         elif re.match(r"[+-]?\d", plain):
@@ -334,7 +389,11 @@ class Lane:
         return self._real(operand, double=True)
 
     def _predicate(self, operand: str) -> bool:
-        return not self._predicate(operand[1:]) if operand.startswith("!") else self.predicates[operand]
+        return (
+            not self._predicate(operand[1:])
+            if operand.startswith("!")
+            else self.predicates[operand]
+        )
 
     def _put(self, register: str, value: int) -> None:
         plain = register.split(".", maxsplit=1)[0]
@@ -345,7 +404,10 @@ class Lane:
         plain = register.split(".", maxsplit=1)[0]
         if plain not in ("RZ", "URZ"):
             kind, number = re.fullmatch(r"(U?R)(\d+)", plain).groups()  # type: ignore[union-attr]
-            self.registers[plain], self.registers[f"{kind}{int(number) + 1}"] = value & LOW, value >> 32 & LOW
+            self.registers[plain], self.registers[f"{kind}{int(number) + 1}"] = (
+                value & LOW,
+                value >> 32 & LOW,
+            )
 
     def _set(self, predicate: str, value: object) -> None:
         if predicate not in ("PT", "UPT"):
@@ -395,12 +457,15 @@ class Lane:
 
     def _do_fsel(self, m: set[str], o: list[str], i: Instruction) -> None:
         chosen = o[1] if self._predicate(o[3]) else o[2]
-        halves = {"+QNAN": 0x7FF00000, "-QNAN": 0xFFF00000, "QNAN": 0x7FF00000}  # upper halves of infinite doubles are shown so
+        # upper halves of infinite doubles are shown so
+        halves = {"+QNAN": 0x7FF00000, "-QNAN": 0xFFF00000, "QNAN": 0x7FF00000}
         negative, _, absolute, plain = self._signs(chosen)
         if chosen in halves:
             bits = halves[chosen]
         elif plain.startswith("R"):
-            bits = self._register(plain) & (0x7FFFFFFF if absolute else LOW) ^ (0x80000000 if negative else 0)
+            bits = self._register(plain) & (0x7FFFFFFF if absolute else LOW) ^ (
+                0x80000000 if negative else 0
+            )
         else:
             bits = _bits(self._real(chosen))
         self._put(o[0], bits)
@@ -443,7 +508,8 @@ class Lane:
         while PREDICATE.match(rest[0]):
             carries.append(rest.pop(0))
         total = sum(self._predicate(p) for p in rest[3:]) if "X" in m else 0
-        for operand in rest[:3]:  # a negated one is inverted and one more, so that the carry is that of the sum
+        # a negated one is inverted and one more, so that the carry is that of the sum
+        for operand in rest[:3]:
             negated = operand.startswith("-") and not operand.startswith("-0x")
             total += (~self._int(operand[1:]) & LOW) + 1 if negated else self._int(operand)
         for n, predicate in enumerate(carries[:2], 1):
@@ -465,7 +531,11 @@ class Lane:
             return
         a, b = self._int(rest[0]), self._int(rest[1])
         a, b = (a, b) if "U32" in m else (_signed(a), _signed(b))
-        value = (a * b & ALL) + self._long(rest[2]) + (self._predicate(rest[3]) if "X" in m and len(rest) > 3 else 0)
+        value = (
+            (a * b & ALL)
+            + self._long(rest[2])
+            + (self._predicate(rest[3]) if "X" in m and len(rest) > 3 else 0)
+        )
         if carry_out:
             self._set(carry_out, value >> 64)
         if "WIDE" in m:
@@ -482,7 +552,11 @@ class Lane:
                 high, shift, carry = (LOW if low >> 31 else 0), self._int(rest[2]), rest[3:]
             else:
                 high, shift, carry = self._int(rest[2]), self._int(rest[3]), rest[4:]
-            value = (((high << 32 | low) << shift) >> 32 & LOW) + added + (self._predicate(carry[0]) if "X" in m and carry else 0)
+            value = (
+                (((high << 32 | low) << shift) >> 32 & LOW)
+                + added
+                + (self._predicate(carry[0]) if "X" in m and carry else 0)
+            )
         else:
             value = (self._int(rest[0]) << self._int(rest[2]) & LOW) + self._int(rest[1])
         if carry_out:
@@ -535,7 +609,14 @@ class Lane:
     def _set_both(self, m: set[str], o: list[str], result: bool) -> None:
         other = self._predicate(o[4])
         for predicate, value in ((o[0], result), (o[1], not result)):
-            self._set(predicate, (value and other) if "AND" in m else (value or other) if "OR" in m else value != other)
+            self._set(
+                predicate,
+                (value and other)
+                if "AND" in m
+                else (value or other)
+                if "OR" in m
+                else value != other,
+            )
 
     def _do_vimnmx(self, m: set[str], o: list[str], i: Instruction) -> None:
         self._least_or_most(m, self._int(o[1]), self._int(o[2]), o)
@@ -556,7 +637,8 @@ class Lane:
 
     # real numbers
 
-    def _do_hfma2(self, m: set[str], o: list[str], i: Instruction) -> None:  # used to load two halves
+    # used to load two halves
+    def _do_hfma2(self, m: set[str], o: list[str], i: Instruction) -> None:
         if o[1] != "-RZ":
             raise NotImplementedError(i.text)
         self._put(o[0], _half_bits(self._real(o[3])) << 16 | _half_bits(self._real(o[4])))
@@ -578,10 +660,18 @@ class Lane:
         self._put_long(o[0], _long_bits(self._double_real(o[1]) + self._double_real(o[2])))
 
     def _do_dmul(self, m: set[str], o: list[str], i: Instruction) -> None:
-        self._put_long(o[0], _long_bits(np.float64(self._double_real(o[1])) * self._double_real(o[2])))
+        self._put_long(
+            o[0], _long_bits(np.float64(self._double_real(o[1])) * self._double_real(o[2]))
+        )
 
     def _do_dfma(self, m: set[str], o: list[str], i: Instruction) -> None:  # rounded twice
-        self._put_long(o[0], _long_bits(np.float64(self._double_real(o[1])) * self._double_real(o[2]) + self._double_real(o[3])))
+        self._put_long(
+            o[0],
+            _long_bits(
+                np.float64(self._double_real(o[1])) * self._double_real(o[2])
+                + self._double_real(o[3])
+            ),
+        )
 
     def _do_dmnmx(self, m: set[str], o: list[str], i: Instruction) -> None:
         a, b = self._double_real(o[1]), self._double_real(o[2])
@@ -591,7 +681,9 @@ class Lane:
         self._set_both(m, o, COMPARED[i.modifiers[0]](self._real(o[2]), self._real(o[3])))
 
     def _do_dsetp(self, m: set[str], o: list[str], i: Instruction) -> None:
-        self._set_both(m, o, COMPARED[i.modifiers[0]](self._double_real(o[2]), self._double_real(o[3])))
+        self._set_both(
+            m, o, COMPARED[i.modifiers[0]](self._double_real(o[2]), self._double_real(o[3]))
+        )
 
     def _do_fchk(self, m: set[str], o: list[str], i: Instruction) -> None:
         """Set a predicate where a quotient needs more than the usual instructions."""
@@ -602,7 +694,9 @@ class Lane:
     def _do_mufu(self, m: set[str], o: list[str], i: Instruction) -> None:
         if "RCP64H" in m:
             high = self._int(o[1])
-            self._put(o[0], _long_bits(1 / _double(high << 32) if high & 0x7FFFFFFF else math.inf) >> 32)
+            self._put(
+                o[0], _long_bits(1 / _double(high << 32) if high & 0x7FFFFFFF else math.inf) >> 32
+            )
             return
         value = np.float64(self._real(o[1]))
         of: dict[str, Callable[[Any], Any]] = {
@@ -633,7 +727,15 @@ class Lane:
         else:
             value = self._int(o[1].split(".")[0] if part else o[1])
             value = value >> 8 * int(part[1]) & 255 if part.startswith("B") else value
-            value = value & 255 if "U8" in m else value & 65535 if "U16" in m else value if "U32" in m else _signed(value)
+            value = (
+                value & 255
+                if "U8" in m
+                else value & 65535
+                if "U16" in m
+                else value
+                if "U32" in m
+                else _signed(value)
+            )
         if "F64" in m:
             self._put_long(o[0], _long_bits(value))
             return
@@ -648,7 +750,12 @@ class Lane:
         if m & {"U64", "S64"}:
             self._put_long(o[0], max(0, min(value, ALL)) if "U64" in m else value & ALL)
         else:
-            self._put(o[0], min(max(value, 0), LOW) if "U32" in m else max(min(value, (1 << 31) - 1), -(1 << 31)))
+            self._put(
+                o[0],
+                min(max(value, 0), LOW)
+                if "U32" in m
+                else max(min(value, (1 << 31) - 1), -(1 << 31)),
+            )
 
     def _do_f2fp(self, m: set[str], o: list[str], i: Instruction) -> None:
         self._put(o[0], _half_bits(self._real(o[1])) << 16 | _half_bits(self._real(o[2])))
@@ -657,10 +764,23 @@ class Lane:
 
     @staticmethod
     def _size(m: set[str]) -> int:
-        return 16 if "128" in m else 8 if "64" in m else 1 if m & {"U8", "S8"} else 2 if m & {"U16", "S16"} else 4
+        return (
+            16
+            if "128" in m
+            else 8
+            if "64" in m
+            else 1
+            if m & {"U8", "S8"}
+            else 2
+            if m & {"U16", "S16"}
+            else 4
+        )
 
     def _do_load(self, m: set[str], o: list[str], i: Instruction) -> None:
-        address, size = self._address(next(operand for operand in o[1:] if "[" in operand)), self._size(m)
+        address, size = (
+            self._address(next(operand for operand in o[1:] if "[" in operand)),
+            self._size(m),
+        )
         if i.name in ("LDS", "LDL"):
             own = self.memory.shared if i.name == "LDS" else self.local
             data = bytes(own.get(address + k, 0) for k in range(size))
@@ -675,20 +795,38 @@ class Lane:
                 self.registers[f"R{int(register[1:]) + k // 4}"] = value >> 8 * k & LOW
 
     def _do_store(self, m: set[str], o: list[str], i: Instruction) -> None:
-        address, size, register = self._address(next(operand for operand in o if "[" in operand)), self._size(m), o[-1].split(".")[0]
-        words = [0 if register == "RZ" else self.registers[f"R{int(register[1:]) + k}"] for k in range(max(size // 4, 1))]
+        address, size, register = (
+            self._address(next(operand for operand in o if "[" in operand)),
+            self._size(m),
+            o[-1].split(".")[0],
+        )
+        words = [
+            0 if register == "RZ" else self.registers[f"R{int(register[1:]) + k}"]
+            for k in range(max(size // 4, 1))
+        ]
         data = b"".join(word.to_bytes(4, "little") for word in words)[:size]
         if i.name in ("STS", "STL"):
-            (self.memory.shared if i.name == "STS" else self.local).update((address + k, byte) for k, byte in enumerate(data))
+            (self.memory.shared if i.name == "STS" else self.local).update(
+                (address + k, byte) for k, byte in enumerate(data)
+            )
         else:
             self.memory.write(address, data)
             self.accesses.append((self.at, self.count[self.at], address, size, False))
 
 
 ALIASES = {
-    "S2UR": "S2R", "LDG": "load", "LD": "load", "LDS": "load", "LDL": "load", "STG": "store", "ST": "store", "STS": "store",
-    "STL": "store", "IMNMX": "VIMNMX", "IMOV": "MOV",
-}  # fmt: skip
+    "S2UR": "S2R",
+    "LDG": "load",
+    "LD": "load",
+    "LDS": "load",
+    "LDL": "load",
+    "STG": "store",
+    "ST": "store",
+    "STS": "store",
+    "STL": "store",
+    "IMNMX": "VIMNMX",
+    "IMOV": "MOV",
+}
 
 
 def constants_of(parameters: bytes, block: int, blocks: int) -> bytes:

@@ -1,6 +1,7 @@
 """What a solve costs as the grid grows: set-up, iterations, seconds to three tolerances, bytes a cell, and the exponent of the growth.
 
-And how far it can get: solves in each precision that are asked for a residual of 0 end at their floor.
+And how far it can get: solves in each precision that are asked for a residual of 0 end at their
+floor.
 """
 
 from __future__ import annotations
@@ -19,16 +20,31 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.benchmarks.cases import TOLERANCES, Case
 from warp_lcp.benchmarks.harness.machine import COPIED, machine
-from warp_lcp.benchmarks.harness.record import Chart, Lines, Record, Results, Table, Target, shown, spread, table_of_targets
+from warp_lcp.benchmarks.harness.record import (
+    Chart,
+    Lines,
+    Record,
+    Results,
+    Table,
+    Target,
+    shown,
+    spread,
+    table_of_targets,
+)
 from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.benchmarks.problems import BOUNDS, Splash, natural, splash
 from warp_lcp.run.devices import free_memory
 
 TITLE = "Cost of a solve against the size of the grid"
 CPU_SIZES, CUDA_SIZES = (32, 64, 128, 256), (32, 64, 128, 256, 512, 1024)
-SOLVE_BYTES = 60  # a cell: operator, problem, workspace, b, bounds, the result and what making them takes; 59 at 128^3
-SCENE_BYTES = 60  # a cell, in the memory of the host: the scene, the fields that it is made with (41 at 128^3) and the bounds
-ASYMPTOTIC = 64  # cells a side from which on the growth is fitted: below, launches cost more than cells
+# a cell: operator, problem, workspace, b, bounds, the result and what making them takes; 59 at
+# 128^3
+SOLVE_BYTES = 60
+# a cell, in the memory of the host: the scene, the fields that it is made with (41 at 128^3) and
+# the bounds
+SCENE_BYTES = 60
+# cells a side from which on the growth is fitted: below, launches cost more than cells
+ASYMPTOTIC = 64
 FIGURES = tuple(f"to_{t:.0e}" for t in TOLERANCES)
 PRECISIONS = ("single", "mixed", "double")
 REACHED = 1e-8  # relative residual that mixed precision must reach on every grid
@@ -54,7 +70,8 @@ class Growing:
     def sample(self, *, keep: bool) -> None:
         """Solve from the arrays of cells and b to the tightest tolerance; the history tells when the others were met.
 
-        The method has no tolerance within, so that a solve that is asked for less takes the same steps.
+        The method has no tolerance within, so that a solve that is asked for less takes the same
+        steps.
         """
         lower, solver = self.scene.lower(self.bounds), wl.ProjectedMultigrid()
         begun = time.perf_counter()
@@ -62,7 +79,9 @@ class Growing:
         work: Any = solver.init(problem)
         wp.synchronize_device(self.device)
         setup = time.perf_counter() - begun
-        result = wl.solve(problem, solver, stopping=wl.StoppingCriteria(rtol=TOLERANCES[-1]), workspace=work)
+        result = wl.solve(
+            problem, solver, stopping=wl.StoppingCriteria(rtol=TOLERANCES[-1]), workspace=work
+        )
         reference = result.residual / result.relative_residual if result.relative_residual else 1.0
         self.counts |= {"residual": result.relative_residual, "converged": float(bool(result))}
         if keep:
@@ -81,22 +100,33 @@ class Growing:
         case.memory()
         figures = {name: Figure.of(taken, "s") for name, taken in self.samples.items() if taken}
         figures |= {name: Figure(value) for name, value in self.counts.items()}
-        figures |= {"unknowns": Figure(self.unknowns), "bytes_per_cell": Figure(case.counts["bytes_per_cell"], "B")}
+        figures |= {
+            "unknowns": Figure(self.unknowns),
+            "bytes_per_cell": Figure(case.counts["bytes_per_cell"], "B"),
+        }
         taken = self.samples["to_1e-06"]
         if taken:
             figures["per_cell"] = Figure.of([1e9 * t / n**3 for t in taken], "ns")
-            figures["in_copies"] = Figure.of([t * copying * 1e9 / (FIELD_BYTES * n**3) for t in taken])
+            figures["in_copies"] = Figure.of(
+                [t * copying * 1e9 / (FIELD_BYTES * n**3) for t in taken]
+            )
         return Record(f"{n}^3 {self.bounds}", figures, {"n": n, "bounds": self.bounds})
 
 
 def measure(options: Options, out: Path) -> Results:
     """Measure the sizes that fit, one sample of each in every round."""
-    asked = sorted(options.sizes or (CUDA_SIZES if wp.get_device(options.device).is_cuda else CPU_SIZES))
+    asked = sorted(
+        options.sizes or (CUDA_SIZES if wp.get_device(options.device).is_cuda else CPU_SIZES)
+    )
     sizes, left_out = fitting(asked, options.device)
     if not sizes:
         raise MemoryError(f"no size fits: {next(iter(left_out.values()))}")
-    where = machine(options.device, elements=min(COPIED, 64 * max(sizes) ** 3), repeat=options.repeat)
-    cases = [Growing(scene, bounds, options.device) for scene in map(splash, sizes) for bounds in BOUNDS]
+    where = machine(
+        options.device, elements=min(COPIED, 64 * max(sizes) ** 3), repeat=options.repeat
+    )
+    cases = [
+        Growing(scene, bounds, options.device) for scene in map(splash, sizes) for bounds in BOUNDS
+    ]
     for turn in range(options.repeat + 1):  # the first one loads kernels
         options.say(f"scaling to {max(sizes)}^3, round {turn} of {options.repeat}")
         for case in cases:
@@ -104,22 +134,53 @@ def measure(options: Options, out: Path) -> Results:
     copying = where.value("copy") or 0.0
     records = [case.record(copying) for case in cases]
     growth = [_growth(bounds, [c for c in cases if c.bounds == bounds]) for bounds in BOUNDS]
-    floors = [floor(scene, bounds, p, options.device) for scene in map(splash, sizes) for bounds in BOUNDS[:2] for p in PRECISIONS]
+    floors = [
+        floor(scene, bounds, p, options.device)
+        for scene in map(splash, sizes)
+        for bounds in BOUNDS[:2]
+        for p in PRECISIONS
+    ]
     skipped = [Record(f"{n}^3", {}, {"left out": why}) for n, why in left_out.items()]
-    tables = [_targets(growth, floors), _growth_table(growth), _table(records), _floor_table(floors)]
+    tables = [
+        _targets(growth, floors),
+        _growth_table(growth),
+        _table(records),
+        _floor_table(floors),
+    ]
     if left_out:
         rows = [[f"{n}^3", why] for n, why in left_out.items()]
         tables.append(Table("Sizes that were not measured", ["cells", "why"], rows))
-    return Results([where, *records, *growth, *floors, *skipped], tables, _charts(records, growth, floors), _failures(floors))
+    return Results(
+        [where, *records, *growth, *floors, *skipped],
+        tables,
+        _charts(records, growth, floors),
+        _failures(floors),
+    )
 
 
 def floor(scene: Splash, bounds: str, precision: str, device: str) -> Record:
     """Solve until no step makes the residual smaller; return that over the residual at 0, computed here and as the solve tells it."""
-    result = wl.solve(scene.lcp(bounds, device=device), wl.ProjectedMultigrid(precision=precision), stopping=ENDLESS)
+    result = wl.solve(
+        scene.lcp(bounds, device=device),
+        wl.ProjectedMultigrid(precision=precision),
+        stopping=ENDLESS,
+    )
     x = result.x.numpy().astype(np.float64).reshape(scene.b.shape)
-    norms = [float(np.linalg.norm(natural(scene.cells, scene.b, scene.lower(bounds), p))) for p in (x, np.zeros_like(x))]
-    figures = {"floor": Figure(norms[0] / norms[1]), "told": Figure(result.relative_residual), "iterations": Figure(result.iterations)}
-    facts = {"n": scene.n, "floor of": f"{precision}, {bounds}", "precision": precision, "status": result.status.name}
+    norms = [
+        float(np.linalg.norm(natural(scene.cells, scene.b, scene.lower(bounds), p)))
+        for p in (x, np.zeros_like(x))
+    ]
+    figures = {
+        "floor": Figure(norms[0] / norms[1]),
+        "told": Figure(result.relative_residual),
+        "iterations": Figure(result.iterations),
+    }
+    facts = {
+        "n": scene.n,
+        "floor of": f"{precision}, {bounds}",
+        "precision": precision,
+        "status": result.status.name,
+    }
     return Record(f"floor {scene.n}^3 {bounds} {precision}", figures, facts)
 
 
@@ -129,13 +190,24 @@ def fitting(asked: Sequence[int], device: str) -> tuple[list[int], dict[int, str
     sizes, left_out = list[int](), dict[int, str]()
     for n in asked:
         solve, scene = SOLVE_BYTES * n**3, SCENE_BYTES * n**3
-        needs = {device: (solve, on_device), "cpu": (scene, on_host)} if device != "cpu" else {"cpu": (solve + scene, on_host)}
-        lacking = [(name, need, free) for name, (need, free) in needs.items() if free is not None and need > free]
+        needs = (
+            {device: (solve, on_device), "cpu": (scene, on_host)}
+            if device != "cpu"
+            else {"cpu": (solve + scene, on_host)}
+        )
+        lacking = [
+            (name, need, free)
+            for name, (need, free) in needs.items()
+            if free is not None and need > free
+        ]
         if not lacking:
             sizes.append(n)
             continue
         name, need, free = lacking[0]
-        left_out[n] = f"{n}^3 needs about {need / 2**30:.1f} GiB on {name}, where {free / 2**30:.1f} GiB are free"
+        left_out[n] = (
+            f"{n}^3 needs about {need / 2**30:.1f} GiB on {name}, where {free / 2**30:.1f} GiB are "
+            "free"
+        )
     return sizes, left_out
 
 
@@ -146,46 +218,85 @@ def exponent(unknowns: Sequence[float], seconds: Sequence[float]) -> float:
 
 def _growth(bounds: str, cases: Sequence[Growing]) -> Record:
     """Return the exponents of each round."""
-    large = [c for c in cases if c.scene.n >= ASYMPTOTIC] if sum(c.scene.n >= ASYMPTOTIC for c in cases) > 1 else list(cases)
+    large = (
+        [c for c in cases if c.scene.n >= ASYMPTOTIC]
+        if sum(c.scene.n >= ASYMPTOTIC for c in cases) > 1
+        else list(cases)
+    )
     figures = {}
     for name in ("setup", *FIGURES):
         rounds = list(zip(*(c.samples[name] for c in large), strict=False))
         if len(large) > 1 and rounds:
-            figures[f"exponent_{name}"] = Figure.of([exponent([c.unknowns for c in large], taken) for taken in rounds])
-    return Record(f"growth {bounds}", figures, {"bounds": bounds, "from": large[0].scene.n, "to": large[-1].scene.n})
+            figures[f"exponent_{name}"] = Figure.of(
+                [exponent([c.unknowns for c in large], taken) for taken in rounds]
+            )
+    return Record(
+        f"growth {bounds}",
+        figures,
+        {"bounds": bounds, "from": large[0].scene.n, "to": large[-1].scene.n},
+    )
 
 
 def _targets(growth: Sequence[Record], floors: Sequence[Record]) -> Table:
     targets = []
     for g in growth:
         figure = g.figures.get("exponent_to_1e-06") if g.facts["from"] >= ASYMPTOTIC else None
-        what = f"exponent of the seconds to 1e-6, {g.facts['bounds']}, {g.facts['from']}^3 to {g.facts['to']}^3"
+        what = (
+            f"exponent of the seconds to 1e-6, {g.facts['bounds']}, {g.facts['from']}^3 to "
+            f"{g.facts['to']}^3"
+        )
         targets.append(Target(what, 1.05, figure))
     worst = max(r.figures["floor"].value for r in floors if r.facts["precision"] == "mixed")
-    return table_of_targets("figure", [*targets, Target("mixed precision: largest floor of any grid", REACHED, Figure(worst))])
+    return table_of_targets(
+        "figure",
+        [*targets, Target("mixed precision: largest floor of any grid", REACHED, Figure(worst))],
+    )
 
 
 def _growth_table(growth: Sequence[Record]) -> Table:
     names = [f"exponent_{name}" for name in ("setup", *FIGURES)]
-    rows = [[g.facts["bounds"], *("" if (f := g.figures.get(name)) is None else str(f) for name in names)] for g in growth]
-    remark = "Exponents of the number of unknowns, fitted in each round; seconds include the set-up."
+    rows = [
+        [
+            g.facts["bounds"],
+            *("" if (f := g.figures.get(name)) is None else str(f) for name in names),
+        ]
+        for g in growth
+    ]
+    remark = (
+        "Exponents of the number of unknowns, fitted in each round; seconds include the set-up."
+    )
     return Table("Growth", ["problem", "set-up", *(f"to {t:g}" for t in TOLERANCES)], rows, remark)
 
 
 def _table(records: Sequence[Record]) -> Table:
-    columns = ["cells", "problem", "unknowns", "set-up [ms]", *(f"to {t:g} [ms]" for t in TOLERANCES), "range of 1e-6", "iterations"]
+    columns = [
+        "cells",
+        "problem",
+        "unknowns",
+        "set-up [ms]",
+        *(f"to {t:g} [ms]" for t in TOLERANCES),
+        "range of 1e-6",
+        "iterations",
+    ]
     columns += ["ns a cell", "in copies of a field", "bytes a cell"]
     rows = []
     for r in records:
-        row = [f"{r.facts['n']}^3", r.facts["bounds"], *shown(r, ["unknowns"], ".0f"), *shown(r, ("setup", *FIGURES), ".1f", 1e3)]
+        row = [
+            f"{r.facts['n']}^3",
+            r.facts["bounds"],
+            *shown(r, ["unknowns"], ".0f"),
+            *shown(r, ("setup", *FIGURES), ".1f", 1e3),
+        ]
         row += [
             spread(r.figures.get("to_1e-06", Figure(0.0)), 1e3),
             " / ".join(shown(r, [f"iterations_{name}" for name in FIGURES], ".0f")),
         ]
         rows.append([*row, *shown(r, ("per_cell", "in_copies", "bytes_per_cell"), ".1f")])
     remark = (
-        "Seconds from the arrays of cells and b to each tolerance, cold, set-up included. In copies of a field: the seconds to 1e-6 over "
-        "those that this machine takes to copy one float32 field of the grid. Bytes: of operator, problem and workspace, b and the bounds "
+        "Seconds from the arrays of cells and b to each tolerance, cold, set-up included. In "
+        "copies of a field: the seconds to 1e-6 over "
+        "those that this machine takes to copy one float32 field of the grid. Bytes: of operator, "
+        "problem and workspace, b and the bounds "
         "included."
     )
     return Table("Sizes", columns, rows, remark)
@@ -194,11 +305,18 @@ def _table(records: Sequence[Record]) -> Table:
 def _floor_table(floors: Sequence[Record]) -> Table:
     columns = ["cells", "precision, problem", "floor", "as the solve tells it", "steps", "status"]
     rows = [
-        [f"{r.facts['n']}^3", r.facts["floor of"], *shown(r, ("floor", "told"), ".2e"), *shown(r, ["iterations"]), r.facts["status"]]
+        [
+            f"{r.facts['n']}^3",
+            r.facts["floor of"],
+            *shown(r, ("floor", "told"), ".2e"),
+            *shown(r, ["iterations"]),
+            r.facts["status"],
+        ]
         for r in floors
     ]
     remark = (
-        "Solves that are asked for a residual of 0. The floor is the norm of min(x - l, A x + b) over that at x = 0, computed in float64 "
+        "Solves that are asked for a residual of 0. The floor is the norm of min(x - l, A x + b) "
+        "over that at x = 0, computed in float64 "
         "with NumPy from cells, b and the x that came back; single precision returns x in float32."
     )
     return Table("Floors", columns, rows, remark)
@@ -211,27 +329,43 @@ def _failures(floors: Sequence[Record]) -> list[str]:
         own, told = r.figures["floor"].value, r.figures["told"].value
         if r.facts["precision"] == "mixed" and own > REACHED:
             lines.append(f"{r.name}: ends at {own:.2e}")
-        # at the floor x has few digits that count: rounding in two orders of summation differs by a share of the floor itself
+        # at the floor x has few digits that count: rounding in two orders of summation differs by a
+        # share of the floor itself
         if not math.isclose(own, told, rel_tol=0.5):
             lines.append(f"{r.name}: the solve tells {told:.2e}, x has {own:.2e}")
     return lines
 
 
-def _charts(records: Sequence[Record], growth: Sequence[Record], floors: Sequence[Record]) -> list[Chart]:
+def _charts(
+    records: Sequence[Record], growth: Sequence[Record], floors: Sequence[Record]
+) -> list[Chart]:
     """Return the seconds to 1e-6 over the unknowns, and the floors over the cells a side."""
     curves: dict[str, tuple[list[float], list[float]]] = {}
     for g in growth:
-        here = [r for r in records if r.facts["bounds"] == g.facts["bounds"] and "to_1e-06" in r.figures]
+        here = [
+            r for r in records if r.facts["bounds"] == g.facts["bounds"] and "to_1e-06" in r.figures
+        ]
         fitted = g.value("exponent_to_1e-06")
         label = g.facts["bounds"] + ("" if fitted is None else f", exponent {fitted:.2f}")
-        curves[label] = [r.value("unknowns") or 0.0 for r in here], [r.value("to_1e-06") or 0.0 for r in here]
+        curves[label] = (
+            [r.value("unknowns") or 0.0 for r in here],
+            [r.value("to_1e-06") or 0.0 for r in here],
+        )
     ends: dict[str, tuple[list[float], list[float]]] = {}
     for r in floors:
         x, y = ends.setdefault(r.facts["floor of"], ([], []))
         x.append(r.facts["n"])
         y.append(r.figures["floor"].value)
-    double = frozenset(label for label in ends if label.startswith("double"))  # it would hide the others
+    # it would hide the others
+    double = frozenset(label for label in ends if label.startswith("double"))
     return [
         Lines("seconds", "Cold solves to 1e-6, set-up included", "unknowns", "s", curves),
-        Lines("floors", "Smallest relative residual", "cells a side", "residual / residual at 0", ends, marked=double),
+        Lines(
+            "floors",
+            "Smallest relative residual",
+            "cells a side",
+            "residual / residual at 0",
+            ends,
+            marked=double,
+        ),
     ]

@@ -1,6 +1,7 @@
 """Linear and LCP solves of the splash: set-up, iterations, seconds, memory; against PyAMG and SciPy in the same process, in turns.
 
-Every method of the library then solves a problem of each kind that [Book] appendix C compares methods on, made small.
+Every method of the library then solves a problem of each kind that [Book] appendix C compares
+methods on, made small.
 """
 
 from __future__ import annotations
@@ -24,8 +25,11 @@ from warp_lcp.solvers.fallback import Progress
 
 TITLE = "Linear and LCP pressure solves"
 SIZES = (64, 128)
-PEER_SECONDS = 60.0  # [s] after which a peer is not asked again: at 256^3 PyAMG needs that for one solve
-LARGE = 192  # cells a side beyond which only the engine on unit coefficients is measured: the rest takes minutes a round
+# [s] after which a peer is not asked again: at 256^3 PyAMG needs that for one solve
+PEER_SECONDS = 60.0
+# cells a side beyond which only the engine on unit coefficients is measured: the rest takes minutes
+# a round
+LARGE = 192
 SCIPY_CELLS = 64  # cells a side up to which plain CG is waited for
 ENGINE = "ProjectedMultigrid"
 
@@ -41,7 +45,8 @@ OTHERS = {
     "InteriorPoint": wl.InteriorPoint(),
     "InteriorPoint, crossover": wl.Fallback(wl.InteriorPoint(), (wl.MinimumMapNewton(), is_near)),
 }
-BOOK: dict[str, Callable[[], gallery.Problem]] = {  # of [Book] appendix C: fluids, contacts, and matrices made at random
+# of [Book] appendix C: fluids, contacts, and matrices made at random
+BOOK: dict[str, Callable[[], gallery.Problem]] = {
     "fluid 12^3": lambda: gallery.splash(12).named("walls", device="cpu"),
     "contacts of 12 bodies": lambda: gallery.contact(12, seed=2015),
     "definite 100": lambda: gallery.definite(100, condition=100.0, seed=2015),
@@ -52,7 +57,9 @@ BOOK_STOPPING = wl.StoppingCriteria(rtol=1e-8, max_iterations=1000, patience=100
 def measure(options: Options, out: Path) -> Results:
     """Measure all cases at the sizes asked for, then every method on small problems."""
     sizes = options.sizes or SIZES
-    where = machine(options.device, elements=min(COPIED, 64 * max(sizes) ** 3), repeat=options.repeat)
+    where = machine(
+        options.device, elements=min(COPIED, 64 * max(sizes) ** 3), repeat=options.repeat
+    )
     records, tables = list[Record](), list[Table]()
     for n in sizes:
         cases, answers, question = _measure_size(n, options)
@@ -61,15 +68,29 @@ def measure(options: Options, out: Path) -> Results:
         tables += [_times(n, found), _quality(n, found)]
     curves = _curves(cases)
     book, residuals = _book(options)
-    charts: list[Chart] = [Lines("convergence", f"Cold solves at {sizes[-1]}^3", "s", "relative residual", curves, log="y")]
-    charts += [Lines(f"book-{name.split()[0]}", name, "iterations", "relative residual", c) for name, c in residuals.items()]
+    charts: list[Chart] = [
+        Lines(
+            "convergence",
+            f"Cold solves at {sizes[-1]}^3",
+            "s",
+            "relative residual",
+            curves,
+            log="y",
+        )
+    ]
+    charts += [
+        Lines(f"book-{name.split()[0]}", name, "iterations", "relative residual", c)
+        for name, c in residuals.items()
+    ]
     return Results([where, *records, *book], [*tables, _book_table(book)], charts)
 
 
 def _measure_size(n: int, options: Options) -> tuple[list[Case], dict[str, list[Answer]], Question]:
     """Measure one sample of every case and peer in each round."""
     cases, question = _cases(n, options.device), Question(splash(n), "linear")
-    solves: dict[str, Callable[[Question, float], Answer]] = {"PyAMG SA-CG": pyamg} if present("pyamg") else {}
+    solves: dict[str, Callable[[Question, float], Answer]] = (
+        {"PyAMG SA-CG": pyamg} if present("pyamg") else {}
+    )
     solves |= {"SciPy CG": scipy_cg} if n <= SCIPY_CELLS else {}
     answers: dict[str, list[Answer]] = {name: [] for name in solves}
     for turn in range(options.repeat + 1):  # the first one loads kernels
@@ -94,15 +115,35 @@ def _cases(n: int, device: str) -> list[Case]:
     if n > LARGE:
         return [Case("unit", scene, bounds, engine, device) for bounds in BOUNDS]
     flat = anisotropic(scene)
-    arrays = {f"face_{a}": np.full([n + (i == j) for j in range(3)], flat.faces.get(f"face_{a}", 1.0)) for i, a in enumerate("zyx")}
-    cases = [Case("unit", scene, bounds, solver, device) for bounds in BOUNDS for solver in (engine, wl.MinimumMapNewton())]
-    cases += [Case("unit", scene, b, solver, device, full=False, label=label) for label, solver in OTHERS.items() for b in BOUNDS[1:]]
+    arrays = {
+        f"face_{a}": np.full([n + (i == j) for j in range(3)], flat.faces.get(f"face_{a}", 1.0))
+        for i, a in enumerate("zyx")
+    }
+    cases = [
+        Case("unit", scene, bounds, solver, device)
+        for bounds in BOUNDS
+        for solver in (engine, wl.MinimumMapNewton())
+    ]
+    cases += [
+        Case("unit", scene, b, solver, device, full=False, label=label)
+        for label, solver in OTHERS.items()
+        for b in BOUNDS[1:]
+    ]
     cases += [Case("faces", cut_cells(scene), bounds, engine, device) for bounds in BOUNDS]
-    harder = {"cells 1:100": flat, "arrays 1:100": type(scene)(n, scene.cells, scene.b, scene.wall, arrays)}
-    return cases + [Case(form, s, bounds, engine, device, full=False) for form, s in harder.items() for bounds in BOUNDS[:2]]
+    harder = {
+        "cells 1:100": flat,
+        "arrays 1:100": type(scene)(n, scene.cells, scene.b, scene.wall, arrays),
+    }
+    return cases + [
+        Case(form, s, bounds, engine, device, full=False)
+        for form, s in harder.items()
+        for bounds in BOUNDS[:2]
+    ]
 
 
-def _records(n: int, cases: list[Case], answers: dict[str, list[Answer]], question: Question) -> list[Record]:
+def _records(
+    n: int, cases: list[Case], answers: dict[str, list[Answer]], question: Question
+) -> list[Record]:
     """Return the records of a size, with ratios of samples that were taken in the same round."""
     by_name = {case.name: case for case in cases}
     pyamg = [a.total for a in answers.get("PyAMG SA-CG", [])]
@@ -111,18 +152,42 @@ def _records(n: int, cases: list[Case], answers: dict[str, list[Answer]], questi
         figures, method = case.figures(), case.method
         linear = by_name.get(f"{n}^3 {case.form} linear {method}", case)
         unit = by_name.get(f"{n}^3 unit {case.bounds} {method}", case)
-        for label, other, sample in (("over_linear", linear, "total"), ("over_unit", unit, "total"), ("warm_over_linear", linear, "warm")):
+        for label, other, sample in (
+            ("over_linear", linear, "total"),
+            ("over_unit", unit, "total"),
+            ("warm_over_linear", linear, "warm"),
+        ):
             if other is not case and case.samples[sample]:
                 figures[label] = ratios(case.samples[sample], other.samples[sample])
         if unit is not case:
-            figures["iterations_over_unit"] = Figure(case.counts["iterations"] / unit.counts["iterations"])
+            figures["iterations_over_unit"] = Figure(
+                case.counts["iterations"] / unit.counts["iterations"]
+            )
         if pyamg and case.form == "unit":
             figures["pyamg_over_this"] = ratios(pyamg, case.samples["total"][: len(pyamg)])
-        records.append(Record(case.name, figures, {"form": case.form, "bounds": case.bounds, "method": method, "n": n}))
+        records.append(
+            Record(
+                case.name,
+                figures,
+                {"form": case.form, "bounds": case.bounds, "method": method, "n": n},
+            )
+        )
     for name, given in answers.items():
-        figures = {part: Figure.of([getattr(a, part) for a in given], "s") for part in ("setup", "solve", "total")}
-        figures |= {"iterations": Figure(given[-1].iterations), "residual": Figure(question.residual(given[-1].x))}
-        records.append(Record(f"{n}^3 unit linear {name}", figures, {"form": "unit", "bounds": "linear", "method": name, "n": n}))
+        figures = {
+            part: Figure.of([getattr(a, part) for a in given], "s")
+            for part in ("setup", "solve", "total")
+        }
+        figures |= {
+            "iterations": Figure(given[-1].iterations),
+            "residual": Figure(question.residual(given[-1].x)),
+        }
+        records.append(
+            Record(
+                f"{n}^3 unit linear {name}",
+                figures,
+                {"form": "unit", "bounds": "linear", "method": name, "n": n},
+            )
+        )
     return records
 
 
@@ -131,38 +196,73 @@ def _curves(cases: list[Case]) -> dict[str, tuple[list[float], list[float]]]:
     curves = {}
     for case in cases:
         if case.history and case.form == "unit":
-            points = [(r.seconds, r.residual / case.history[0].residual) for r in case.history if r.residual > 0]
-            curves[f"{case.bounds}, {case.method}"] = ([t for t, _ in points], [r for _, r in points])
+            points = [
+                (r.seconds, r.residual / case.history[0].residual)
+                for r in case.history
+                if r.residual > 0
+            ]
+            curves[f"{case.bounds}, {case.method}"] = (
+                [t for t, _ in points],
+                [r for _, r in points],
+            )
     return curves
 
 
 def _times(n: int, records: Sequence[Record]) -> Table:
     """Seconds, as medians with the range of the cold total."""
     parts = ("setup", "solve", "total", "reuse", "warm", "to_1e-04", "to_1e-06", "to_1e-08")
-    columns = ["case", *(f"{p.replace('_', ' ')} [ms]" for p in parts), "range of total", "x faster than PyAMG"]
+    columns = [
+        "case",
+        *(f"{p.replace('_', ' ')} [ms]" for p in parts),
+        "range of total",
+        "x faster than PyAMG",
+    ]
     rows = []
     for r in records:
-        rows.append([r.name.partition(" ")[2], *shown(r, parts, ".1f", 1e3), spread(r.figures["total"], 1e3)])
+        rows.append(
+            [
+                r.name.partition(" ")[2],
+                *shown(r, parts, ".1f", 1e3),
+                spread(r.figures["total"], 1e3),
+            ]
+        )
         rows[-1] += shown(r, ["pyamg_over_this"], ".1f")
     remark = (
-        "setup: GridPoisson, LCP and init from host arrays; solve: the first one; total: both. reuse: again with the workspace, cold; "
-        "warm: from the last solution after b changed by 1 %. to 1e-4 ...: seconds of one solve to 1e-8, set-up not included."
+        "setup: GridPoisson, LCP and init from host arrays; solve: the first one; total: both. "
+        "reuse: again with the workspace, cold; "
+        "warm: from the last solution after b changed by 1 %. to 1e-4 ...: seconds of one solve to "
+        "1e-8, set-up not included."
     )
     return Table(f"Seconds at {n}^3", columns, rows, remark)
 
 
 def _quality(n: int, records: Sequence[Record]) -> Table:
-    names = ["iterations", "linear_iterations", "warm_iterations", "residual", "bytes_per_cell", "resident_per_cell"]
+    names = [
+        "iterations",
+        "linear_iterations",
+        "warm_iterations",
+        "residual",
+        "bytes_per_cell",
+        "resident_per_cell",
+    ]
     names += ["over_linear", "warm_over_linear", "over_unit", "iterations_over_unit"]
     rows = [[r.name.partition(" ")[2], *shown(r, names)] for r in records]
     remark = (
-        "bytes per cell: Warp arrays of operator, problem, workspace, b and bounds; resident: growth of the process's peak memory. "
+        "bytes per cell: Warp arrays of operator, problem, workspace, b and bounds; resident: "
+        "growth of the process's peak memory. "
         "over linear: to the same method's linear solve, set-up included."
     )
-    return Table(f"Iterations, memory and ratios at {n}^3", ["case", *(f.replace("_", " ") for f in names)], rows, remark)
+    return Table(
+        f"Iterations, memory and ratios at {n}^3",
+        ["case", *(f.replace("_", " ") for f in names)],
+        rows,
+        remark,
+    )
 
 
-def _book(options: Options) -> tuple[list[Record], dict[str, dict[str, tuple[list[float], list[float]]]]]:
+def _book(
+    options: Options,
+) -> tuple[list[Record], dict[str, dict[str, tuple[list[float], list[float]]]]]:
     """Solve each small problem by every method that takes it; return records, and residuals over iterations by problem and method."""
     records, curves = list[Record](), dict[str, dict[str, tuple[list[float], list[float]]]]()
     for what, make in BOOK.items():
@@ -170,16 +270,30 @@ def _book(options: Options) -> tuple[list[Record], dict[str, dict[str, tuple[lis
         for name, method in wl.METHODS.items():
             problem = make().lcp(device=options.device)
             try:
-                wl.solve(problem, method(), stopping=wl.StoppingCriteria(max_iterations=1))  # loads kernels
+                # loads kernels
+                wl.solve(problem, method(), stopping=wl.StoppingCriteria(max_iterations=1))
                 begun = time.perf_counter()
                 result = wl.solve(problem, method(), stopping=BOOK_STOPPING)
             except ValueError:  # the method says that the problem is none for it
                 continue
-            figures = {"seconds": Figure(time.perf_counter() - begun, "s"), "iterations": Figure(result.iterations)}
+            figures = {
+                "seconds": Figure(time.perf_counter() - begun, "s"),
+                "iterations": Figure(result.iterations),
+            }
             figures["residual"] = Figure(result.relative_residual)
-            records.append(Record(f"{what}: {name}", figures, {"problem": what, "method": name, "status": result.status.name}))
+            records.append(
+                Record(
+                    f"{what}: {name}",
+                    figures,
+                    {"problem": what, "method": name, "status": result.status.name},
+                )
+            )
             first = result.history[0].residual
-            points = [(r.iteration, r.residual / first) for r in result.history if r.iteration > 0 and r.residual > 0]
+            points = [
+                (r.iteration, r.residual / first)
+                for r in result.history
+                if r.iteration > 0 and r.residual > 0
+            ]
             curves[what][name] = [float(n) for n, _ in points], [r for _, r in points]
     return records, curves
 
@@ -196,5 +310,10 @@ def _book_table(records: Sequence[Record]) -> Table:
         ]
         for r in records
     ]
-    remark = f"To {BOOK_STOPPING.rtol:g} in {BOOK_STOPPING.max_iterations} steps at most, set-up included; who is not listed refuses."
-    return Table("Every method on small problems of [Book] appendix C's kinds", columns, rows, remark)
+    remark = (
+        f"To {BOOK_STOPPING.rtol:g} in {BOOK_STOPPING.max_iterations} steps at most, set-up "
+        "included; who is not listed refuses."
+    )
+    return Table(
+        "Every method on small problems of [Book] appendix C's kinds", columns, rows, remark
+    )

@@ -21,7 +21,9 @@ from warp_lcp.benchmarks.harness.timing import Figure, Options, ratios
 from warp_lcp.benchmarks.sparse_family import FAMILY, SparseProblem, numbered_at_random
 
 TITLE = "Sparse matrices numbered at random: with bounds, against PyAMG without"
-SIZES, SEED = (316, 1000), 30001  # roots of the numbers of unknowns; problems of the first seed that nothing was tuned on are asked for
+# roots of the numbers of unknowns; problems of the first seed that nothing was tuned on are asked
+# for
+SIZES, SEED = (316, 1000), 30001
 RTOL, TARGET = 1e-6, 1.5  # of the residual; of our seconds over PyAMG's
 ITERATIONS = 100  # after which PyAMG's solve counts as failed
 BUILDS = ("smoothed_aggregation_solver", "ruge_stuben_solver", "rootnode_solver")
@@ -29,12 +31,17 @@ BUILDS = ("smoothed_aggregation_solver", "ruge_stuben_solver", "rootnode_solver"
 
 def measure(options: Options, out: Path) -> Results:
     """Solve a problem of each kind and size, cold, `repeat` times; PyAMG's solvers that are not near its best are asked once."""
-    records, seed = [machine(options.device, repeat=options.repeat)], SEED if options.seed is None else options.seed
+    records, seed = (
+        [machine(options.device, repeat=options.repeat)],
+        SEED if options.seed is None else options.seed,
+    )
     for number, kind in enumerate(FAMILY):
         ours(numbered_at_random(kind, 4000, seed), options.device)  # loads kernels
         for side in sorted(options.sizes or SIZES):
             record = _contest(kind, side * side, seed + number, options)
-            options.say(f"{record.name}: {record.figures['ratio']} x PyAMG's {record.facts['pyamg']}")
+            options.say(
+                f"{record.name}: {record.figures['ratio']} x PyAMG's {record.facts['pyamg']}"
+            )
             records.append(record)
     return Results(records, [_table(records[1:])], [])
 
@@ -43,7 +50,10 @@ def ours(problem: SparseProblem, device: str) -> tuple[float, wl.SolveResult]:
     """Return the seconds of a cold solve, operator and LCP made on the way, and its result."""
     begun = time.perf_counter()
     A = wl.SparseOperator(problem.A, device=device, near_null_space=problem.near_null_space)
-    result = wl.solve(wl.LCP(A, problem.b, problem.lower), stopping=wl.StoppingCriteria(rtol=RTOL, max_iterations=300))
+    result = wl.solve(
+        wl.LCP(A, problem.b, problem.lower),
+        stopping=wl.StoppingCriteria(rtol=RTOL, max_iterations=300),
+    )
     return time.perf_counter() - begun, result
 
 
@@ -52,8 +62,11 @@ def pyamg_solvers(problem: SparseProblem) -> dict[str, Callable[[], float]]:
     found: dict[str, Callable[[], float]] = {}
     for build in BUILDS:
         for accel in ("cg",) if problem.symmetric else ("gmres", "bicgstab"):
-            if problem.near_null_space is None or build != "ruge_stuben_solver":  # which divides by zero on elastic blocks
-                found[f"{build.removesuffix('_solver')} {accel}"] = partial(_pyamg, problem, build, accel)
+            # which divides by zero on elastic blocks
+            if problem.near_null_space is None or build != "ruge_stuben_solver":
+                found[f"{build.removesuffix('_solver')} {accel}"] = partial(
+                    _pyamg, problem, build, accel
+                )
     return found
 
 
@@ -61,7 +74,9 @@ def _pyamg(problem: SparseProblem, build: str, accel: str) -> float:
     import pyamg
 
     A: Any = sp.csr_matrix(problem.A)
-    settings: dict[str, Any] = {} if problem.symmetric or build.startswith("ruge") else {"symmetry": "nonsymmetric"}
+    settings: dict[str, Any] = (
+        {} if problem.symmetric or build.startswith("ruge") else {"symmetry": "nonsymmetric"}
+    )
     if problem.near_null_space is not None:
         A, settings = A.tobsr((2, 2)), {"B": problem.near_null_space}
     begun = time.perf_counter()
@@ -71,7 +86,11 @@ def _pyamg(problem: SparseProblem, build: str, accel: str) -> float:
         # GMRES measures the preconditioned residual, which ends it early: to PyAMG's advantage
         x = solver.solve(-problem.b, tol=RTOL, accel=accel, maxiter=ITERATIONS)
     seconds = time.perf_counter() - begun
-    return seconds if np.linalg.norm(A @ x + problem.b) <= 1e3 * RTOL * np.linalg.norm(problem.b) else float("inf")
+    return (
+        seconds
+        if np.linalg.norm(A @ x + problem.b) <= 1e3 * RTOL * np.linalg.norm(problem.b)
+        else float("inf")
+    )
 
 
 def _contest(kind: str, n: int, seed: int, options: Options) -> Record:
@@ -85,19 +104,63 @@ def _contest(kind: str, n: int, seed: int, options: Options) -> Record:
         mine.append(seconds)
         theirs.append(solvers[best]())
     held = float(np.mean(result.x.numpy() <= problem.lower))
-    figures = {"ours": Figure.of(mine, "s"), "pyamg": Figure.of(theirs, "s"), "ratio": ratios(mine, theirs)}
-    figures |= {"iterations": Figure(result.iterations), "linear_iterations": Figure(result.linear_iterations), "held": Figure(held)}
-    facts = {"kind": kind, "unknowns": len(problem.b), "seed": seed, "pyamg": best, "status": result.status.name}
+    figures = {
+        "ours": Figure.of(mine, "s"),
+        "pyamg": Figure.of(theirs, "s"),
+        "ratio": ratios(mine, theirs),
+    }
+    figures |= {
+        "iterations": Figure(result.iterations),
+        "linear_iterations": Figure(result.linear_iterations),
+        "held": Figure(held),
+    }
+    facts = {
+        "kind": kind,
+        "unknowns": len(problem.b),
+        "seed": seed,
+        "pyamg": best,
+        "status": result.status.name,
+    }
     return Record(f"{kind}, {n}", figures, facts)
 
 
 def _table(records: list[Record]) -> Table:
-    columns = ["problem", "unknowns", "at a bound", "status", "steps", "linear iterations", "ours [s]", "PyAMG [s]", "its best", "ratio"]
+    columns = [
+        "problem",
+        "unknowns",
+        "at a bound",
+        "status",
+        "steps",
+        "linear iterations",
+        "ours [s]",
+        "PyAMG [s]",
+        "its best",
+        "ratio",
+    ]
     rows = []
     for r in records:
-        row = [r.facts["kind"], str(r.facts["unknowns"]), f"{r.value('held'):.1%}", r.facts["status"]]
+        row = [
+            r.facts["kind"],
+            str(r.facts["unknowns"]),
+            f"{r.value('held'):.1%}",
+            r.facts["status"],
+        ]
         row += [f"{r.value(name):.0f}" for name in ("iterations", "linear_iterations")]
-        rows.append([*row, *(f"{r.value(name):.2f}" for name in ("ours", "pyamg")), r.facts["pyamg"], str(r.figures["ratio"])])
-    missed = [r.name for r in records if (r.value("ratio") or 0.0) > TARGET or r.facts["status"] != "CONVERGED"]
-    remark = f"Set-up included, to {RTOL:g}. At most {TARGET:g} is asked for; missed: {'; '.join(missed) or 'none'}."
+        rows.append(
+            [
+                *row,
+                *(f"{r.value(name):.2f}" for name in ("ours", "pyamg")),
+                r.facts["pyamg"],
+                str(r.figures["ratio"]),
+            ]
+        )
+    missed = [
+        r.name
+        for r in records
+        if (r.value("ratio") or 0.0) > TARGET or r.facts["status"] != "CONVERGED"
+    ]
+    remark = (
+        f"Set-up included, to {RTOL:g}. At most {TARGET:g} is asked for; missed: "
+        f"{'; '.join(missed) or 'none'}."
+    )
     return Table("A cold solve with bounds over PyAMG's best linear one", columns, rows, remark)

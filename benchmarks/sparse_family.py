@@ -62,7 +62,10 @@ def triangles(n: int, rng: np.random.Generator) -> SparseProblem:
     sound = area > 1e-4 / n  # slivers at the hull
     corners, side, area = corners[sound], side[sound], area[sound]
     entries = np.einsum("tik,tjk->tij", side, side) / (4 * area)[:, None, None]
-    A = sp.coo_array((entries.ravel(), (np.repeat(corners, 3, axis=1).ravel(), np.tile(corners, 3).ravel())), shape=(n, n)).tocsr()
+    A = sp.coo_array(
+        (entries.ravel(), (np.repeat(corners, 3, axis=1).ravel(), np.tile(corners, 3).ravel())),
+        shape=(n, n),
+    ).tocsr()
     load = 8 * np.bincount(corners.ravel(), np.repeat(area / 3, 3), n)
     inner = np.flatnonzero(((points > 0.01) & (points < 0.99)).all(axis=1) & (A.diagonal() > 0))
     x, y = (2 * points[inner] - 1).T
@@ -97,7 +100,9 @@ def elastic(n: int, rng: np.random.Generator) -> SparseProblem:
         B[1, 1::2] = B[2, 0::2] = slope[1]
         K += 0.25 * B.T @ C @ B
     node = np.arange(m * m).reshape(m, m)
-    corners = np.stack([node[:-1, :-1], node[:-1, 1:], node[1:, 1:], node[1:, :-1]], axis=-1).reshape(-1, 4)
+    corners = np.stack(
+        [node[:-1, :-1], node[:-1, 1:], node[1:, 1:], node[1:, :-1]], axis=-1
+    ).reshape(-1, 4)
     unknowns = np.stack([2 * corners, 2 * corners + 1], axis=-1).reshape(-1, 8)
     places = (np.repeat(unknowns, 8, axis=1).ravel(), np.tile(unknowns, 8).ravel())
     A = sp.coo_array((np.tile(K.ravel(), len(corners)), places), shape=(2 * m * m,) * 2).tocsr()
@@ -113,15 +118,27 @@ def elastic(n: int, rng: np.random.Generator) -> SparseProblem:
 
 def graph(n: int, rng: np.random.Generator) -> SparseProblem:
     """The Laplacian of a random graph with short and long edges, shifted."""
-    first, far = rng.integers(0, n, 3 * n), np.minimum(20 * rng.pareto(1.0, 3 * n) + 1, n - 1).astype(np.int64)
-    A = sp.coo_array((-rng.uniform(0.1, 1, 3 * n), (first, (first + far) % n)), shape=(n, n)).tocsr()
+    first, far = (
+        rng.integers(0, n, 3 * n),
+        np.minimum(20 * rng.pareto(1.0, 3 * n) + 1, n - 1).astype(np.int64),
+    )
+    A = sp.coo_array(
+        (-rng.uniform(0.1, 1, 3 * n), (first, (first + far) % n)), shape=(n, n)
+    ).tocsr()
     A = A + A.T
-    return SparseProblem((A + sp.diags_array(1e-3 - A.sum(axis=1))).tocsr(), rng.standard_normal(n), np.zeros(n))
+    return SparseProblem(
+        (A + sp.diags_array(1e-3 - A.sum(axis=1))).tocsr(), rng.standard_normal(n), np.zeros(n)
+    )
 
 
 FAMILY: dict[str, Callable[[int, np.random.Generator], SparseProblem]] = {
-    "5 points": five_points, "9 points": nine_points, "triangles": triangles, "convection": convection, "elastic": elastic, "graph": graph,
-}  # fmt: skip
+    "5 points": five_points,
+    "9 points": nine_points,
+    "triangles": triangles,
+    "convection": convection,
+    "elastic": elastic,
+    "graph": graph,
+}
 
 
 def numbered_at_random(kind: str, n: int, seed: int) -> SparseProblem:
@@ -131,6 +148,7 @@ def numbered_at_random(kind: str, n: int, seed: int) -> SparseProblem:
     order = (block * rng.permutation(len(made.b) // block)[:, None] + np.arange(block)).ravel()
     A = made.A[order][:, order].tocsr()
     A.sort_indices()
-    A.indptr, A.indices = A.indptr.astype(np.int32), A.indices.astype(np.int32)  # PyAMG does not take others with its own
+    # PyAMG does not take others with its own
+    A.indptr, A.indices = A.indptr.astype(np.int32), A.indices.astype(np.int32)
     B = None if made.near_null_space is None else made.near_null_space[order]
     return SparseProblem(A, made.b[order], made.lower[order], B, made.symmetric)

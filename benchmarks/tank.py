@@ -16,7 +16,15 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.benchmarks.harness.machine import forget_peak, machine, resident_bytes
-from warp_lcp.benchmarks.harness.record import Record, Results, Table, Target, shown, spread, table_of_targets
+from warp_lcp.benchmarks.harness.record import (
+    Record,
+    Results,
+    Table,
+    Target,
+    shown,
+    spread,
+    table_of_targets,
+)
 from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.benchmarks.problems import natural
 from warp_lcp.rows.team import available_threads
@@ -32,8 +40,10 @@ PARTS = ("operator", "problem", "workspace", "solve")
 STOPPING = wl.StoppingCriteria(rtol=1e-6)
 PEAK, STEPS = 18.0, 12  # what 768^3 may take [GB]; iterations
 MCADAMS = (
-    "Beside it: McAdams, Sifakis and Teran (2010), *A parallel multigrid Poisson solver for fluids simulation on large grids*: linear "
-    "solves, without bounds, take 6.1 s an iteration at 768^3 on 16 cores and two iterations for an order of magnitude, and hold "
+    "Beside it: McAdams, Sifakis and Teran (2010), *A parallel multigrid Poisson solver for fluids "
+    "simulation on large grids*: linear "
+    "solves, without bounds, take 6.1 s an iteration at 768^3 on 16 cores and two iterations for "
+    "an order of magnitude, and hold "
     "768 x 768 x 1152 voxels in less than 16 GB (its abstract)."
 )
 
@@ -55,19 +65,36 @@ class Tank:
 
     def solid(self, k: int) -> np.ndarray:
         """Return which of those cells of plane k are SOLID, with one layer around: shape (rows + 2, n + 2)."""
-        x, y = (np.arange(-1, self.n + 1) + 0.5) / self.n, (np.arange(-1, self.rows + 1)[:, None] + 0.5) / self.n
+        x, y = (
+            (np.arange(-1, self.n + 1) + 0.5) / self.n,
+            (np.arange(-1, self.rows + 1)[:, None] + 0.5) / self.n,
+        )
         z = (k + 0.5) / self.n
-        found = ((x - 0.55) ** 2 + (y - 0.15) ** 2 + (z - 0.4) ** 2 < 0.1**2) | ((abs(x - 0.2) < 0.03) & (abs(z - 0.7) < 0.05) & (y > 0))
+        found = ((x - 0.55) ** 2 + (y - 0.15) ** 2 + (z - 0.4) ** 2 < 0.1**2) | (
+            (abs(x - 0.2) < 0.03) & (abs(z - 0.7) < 0.05) & (y > 0)
+        )
         return found | (x < 0) | (x > 1) | (y < 0) | (z < 0) | (z > 1)
 
     def plane(self, k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return cell types, b and lower bounds of those cells of plane k, shape (rows, n): 0 on cells that touch a solid, else -inf."""
-        x, y, z = (np.arange(self.n) + 0.5) / self.n, (np.arange(self.rows)[:, None] + 0.5) / self.n, (k + 0.5) / self.n
+        x, y, z = (
+            (np.arange(self.n) + 0.5) / self.n,
+            (np.arange(self.rows)[:, None] + 0.5) / self.n,
+            (k + 0.5) / self.n,
+        )
         solid = self.solid(k)
         height = 0.3 + 0.04 * np.sin(2 * np.pi * (2 * x + 0.3)) * np.cos(3 * np.pi * z)
-        cells = np.where(solid[1:-1, 1:-1], wl.SOLID, np.where(y < height, wl.FLUID, wl.AIR)).astype(np.int8)
-        b = np.sin(2 * np.pi * (1.5 * x + 0.1)) * np.cos(2 * np.pi * (1.3 * y + 0.2)) * np.sin(2 * np.pi * (1.7 * z - 0.1))
-        b = (b + 0.4 * np.sin(9 * np.pi * x) * np.sin(7 * np.pi * y) * np.cos(8 * np.pi * z)) / self.n
+        cells = np.where(
+            solid[1:-1, 1:-1], wl.SOLID, np.where(y < height, wl.FLUID, wl.AIR)
+        ).astype(np.int8)
+        b = (
+            np.sin(2 * np.pi * (1.5 * x + 0.1))
+            * np.cos(2 * np.pi * (1.3 * y + 0.2))
+            * np.sin(2 * np.pi * (1.7 * z - 0.1))
+        )
+        b = (
+            b + 0.4 * np.sin(9 * np.pi * x) * np.sin(7 * np.pi * y) * np.cos(8 * np.pi * z)
+        ) / self.n
         beside = self.solid(k - 1)[1:-1, 1:-1] | self.solid(k + 1)[1:-1, 1:-1]
         wall = beside | solid[:-2, 1:-1] | solid[2:, 1:-1] | solid[1:-1, :-2] | solid[1:-1, 2:]
         fluid = cells == wl.FLUID
@@ -75,7 +102,9 @@ class Tank:
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return cell types, b and lower bounds, shape (n, n, n), of which only the lowest rows are written."""
-        made = tuple(np.zeros((self.n,) * 3, dtype=kind) for kind in (np.int8, np.float64, np.float64))
+        made = tuple(
+            np.zeros((self.n,) * 3, dtype=kind) for kind in (np.int8, np.float64, np.float64)
+        )
         for k in range(self.n):
             for whole, part in zip(made, self.plane(k), strict=True):
                 whole[k, : self.rows] = part
@@ -86,9 +115,14 @@ class Tank:
         squares = np.zeros(2)
         for first, last, parts in self._slabs():
             cells, b, lower = (np.stack(field) for field in zip(*parts, strict=True))
-            low, inner = max(first - 1, 0), slice(first - max(first - 1, 0), last - max(first - 1, 0))
+            low, inner = (
+                max(first - 1, 0),
+                slice(first - max(first - 1, 0), last - max(first - 1, 0)),
+            )
             here = x[low : low + len(cells), : self.rows]
-            squares += [np.sum(natural(cells, b, lower, p)[inner] ** 2) for p in (here, np.zeros_like(here))]
+            squares += [
+                np.sum(natural(cells, b, lower, p)[inner] ** 2) for p in (here, np.zeros_like(here))
+            ]
         norm, reference = np.sqrt(squares)
         return float(norm), float(reference)
 
@@ -96,7 +130,11 @@ class Tank:
         """Yield planes to check, with one more on each side."""
         for first in range(0, self.n, PLANES):
             last = min(first + PLANES, self.n)
-            yield first, last, [self.plane(k) for k in range(max(first - 1, 0), min(last + 1, self.n))]
+            yield (
+                first,
+                last,
+                [self.plane(k) for k in range(max(first - 1, 0), min(last + 1, self.n))],
+            )
 
 
 def measure(options: Options, out: Path) -> Results:
@@ -114,7 +152,9 @@ def measure(options: Options, out: Path) -> Results:
     finally:
         wl.set_threads(before)
     del records[1]
-    return Results(records, [_targets(records[1:]), _table(records[1:])], failures=_failures(records[1:]))
+    return Results(
+        records, [_targets(records[1:]), _table(records[1:])], failures=_failures(records[1:])
+    )
 
 
 def record(tank: Tank, repeat: int) -> Record:
@@ -123,13 +163,30 @@ def record(tank: Tank, repeat: int) -> Record:
     for _ in range(repeat):
         result = _solve(tank, samples, counts)
     norm, reference = tank.residuals(result.x.numpy())
-    figures = {name: Figure.of(taken, "s" if name in (*PARTS, "total") else "GB") for name, taken in samples.items()}
+    figures = {
+        name: Figure.of(taken, "s" if name in (*PARTS, "total") else "GB")
+        for name, taken in samples.items()
+    }
     unknowns = counts["unknowns"]
-    figures |= {"per_cell": Figure(1e9 * figures["peak"].value / tank.n**3, "B"), "unknowns": Figure(unknowns)}
-    figures |= {f"{name}_per_unknown": Figure(1e9 * figures[name].value / unknowns, "B") for name in ("peak", "kept")}
-    figures |= {"iterations": Figure(result.iterations), "told": Figure(result.relative_residual), "residual": Figure(norm / reference)}
+    figures |= {
+        "per_cell": Figure(1e9 * figures["peak"].value / tank.n**3, "B"),
+        "unknowns": Figure(unknowns),
+    }
+    figures |= {
+        f"{name}_per_unknown": Figure(1e9 * figures[name].value / unknowns, "B")
+        for name in ("peak", "kept")
+    }
+    figures |= {
+        "iterations": Figure(result.iterations),
+        "told": Figure(result.relative_residual),
+        "residual": Figure(norm / reference),
+    }
     figures |= {"per_iteration": Figure(figures["solve"].value / max(result.iterations, 1), "s")}
-    return Record(f"tank {tank.n}^3", figures, {"n": tank.n, "status": result.status.name, "threads": wl.get_threads()})
+    return Record(
+        f"tank {tank.n}^3",
+        figures,
+        {"n": tank.n, "status": result.status.name, "threads": wl.get_threads()},
+    )
 
 
 def _solve(tank: Tank, samples: dict[str, list[float]], counts: dict[str, float]) -> wl.SolveResult:
@@ -148,9 +205,15 @@ def _solve(tank: Tank, samples: dict[str, list[float]], counts: dict[str, float]
     times.append(time.perf_counter())
     result = wl.solve(problem, wl.ProjectedMultigrid(), stopping=STOPPING, workspace=work)
     times.append(time.perf_counter())
-    for name, size in (("given", given), ("peak", resident_bytes(peak=True) - begun), ("kept", resident_bytes() - begun)):
+    for name, size in (
+        ("given", given),
+        ("peak", resident_bytes(peak=True) - begun),
+        ("kept", resident_bytes() - begun),
+    ):
         samples[name].append(1e-9 * size)
-    for part, (start, end) in zip((*PARTS, "total"), [*pairwise(times), (times[0], times[-1])], strict=True):
+    for part, (start, end) in zip(
+        (*PARTS, "total"), [*pairwise(times), (times[0], times[-1])], strict=True
+    ):
         samples[part].append(end - start)
     counts["unknowns"] = A.unknowns
     return result
@@ -160,22 +223,49 @@ def _targets(records: Sequence[Record]) -> Table:
     targets = []
     for r in records:
         targets += [Target(f"{r.name}: iterations", STEPS, r.figures["iterations"])]
-        targets += [Target(f"{r.name}: peak memory", PEAK, r.figures["peak"], " GB")] * (r.facts["n"] == max(SIZES))
+        targets += [Target(f"{r.name}: peak memory", PEAK, r.figures["peak"], " GB")] * (
+            r.facts["n"] == max(SIZES)
+        )
     return table_of_targets("figure", targets)
 
 
 def _table(records: Sequence[Record]) -> Table:
-    columns = ["cells", "unknowns [10^6]", *(f"{part} [s]" for part in PARTS), "total [s]", "range", "iterations", "s an iteration"]
-    columns += ["residual, by NumPy", "arrays given [GB]", "peak [GB]", "peak: B a cell", "B an unknown", "after the solve: B an unknown"]
+    columns = [
+        "cells",
+        "unknowns [10^6]",
+        *(f"{part} [s]" for part in PARTS),
+        "total [s]",
+        "range",
+        "iterations",
+        "s an iteration",
+    ]
+    columns += [
+        "residual, by NumPy",
+        "arrays given [GB]",
+        "peak [GB]",
+        "peak: B a cell",
+        "B an unknown",
+        "after the solve: B an unknown",
+    ]
     rows = []
     for r in records:
-        row = [f"{r.facts['n']}^3", *shown(r, ["unknowns"], ".1f", 1e-6), *shown(r, (*PARTS, "total"), ".2f")]
-        row += [spread(r.figures["total"], digits=".2f"), *shown(r, ["iterations"], ".0f"), *shown(r, ["per_iteration"])]
+        row = [
+            f"{r.facts['n']}^3",
+            *shown(r, ["unknowns"], ".1f", 1e-6),
+            *shown(r, (*PARTS, "total"), ".2f"),
+        ]
+        row += [
+            spread(r.figures["total"], digits=".2f"),
+            *shown(r, ["iterations"], ".0f"),
+            *shown(r, ["per_iteration"]),
+        ]
         row += [*shown(r, ["residual"], ".1e"), *shown(r, ("given", "peak"), ".2f")]
         rows.append([*row, *shown(r, ("per_cell", "peak_per_unknown", "kept_per_unknown"), ".0f")])
     remark = (
-        f"Pressures >= 0 at walls, cold, to a relative residual of 1e-6, on {records[0].facts['threads']} threads. Peak: of the process, "
-        "from before the arrays of cells, b and bounds are made until the result is there; the arrays are let go when the problem is made. "
+        "Pressures >= 0 at walls, cold, to a relative residual of 1e-6, on "
+        f"{records[0].facts['threads']} threads. Peak: of the process, "
+        "from before the arrays of cells, b and bounds are made until the result is there; the "
+        "arrays are let go when the problem is made. "
         f"After the solve: what is resident when the result is there. {MCADAMS}"
     )
     return Table("Tanks", columns, rows, remark)

@@ -26,13 +26,23 @@ from warp_lcp.scene.simulator import simulators
 
 TITLE = "All cores in one process"
 SIZES = (128, 256)
-SCENES = {"dam-break": (96, 1.7), "floating-bodies": (96, 1.6), "column-collapse": (64, 1.7)}  # cells along the longest side; target
+# cells along the longest side; target
+SCENES = {"dam-break": (96, 1.7), "floating-bodies": (96, 1.6), "column-collapse": (64, 1.7)}
 STEPS, LONGEST = 8, 0.005  # of a scene before it is measured; the longest one [s]
 STEP = "whole step"
-# of what is done at once by as many copies as there are cores, each on one thread: how often each copy does it
-TURNS = dict.fromkeys(("x += z (what memory allows)", "product", "sweep", "restriction", "cycle"), 20) | {STEP: 3}
+# of what is done at once by as many copies as there are cores, each on one thread: how often each
+# copy does it
+TURNS = dict.fromkeys(
+    ("x += z (what memory allows)", "product", "sweep", "restriction", "cycle"), 20
+) | {STEP: 3}
 STOPPING = wl.StoppingCriteria(rtol=1e-6)
-TARGETS = {"product": 1.85, "sweep": 1.85, "restriction": 1.85, "steps of a solve": 1.85, "solve, cold": 1.7}
+TARGETS = {
+    "product": 1.85,
+    "sweep": 1.85,
+    "restriction": 1.85,
+    "steps of a solve": 1.85,
+    "solve, cold": 1.7,
+}
 Work = dict[str, Callable[[], object]]
 
 
@@ -41,7 +51,10 @@ def measure(options: Options, out: Path) -> Results:
     if wp.get_device(options.device).is_cuda:
         raise ValueError(f"--device {options.device}: the suite threads measures the CPU")
     counts = [1 << k for k in range(available_threads().bit_length())]
-    before, records = wl.get_threads(), [machine(options.device, elements=1 << 22, repeat=options.repeat)]
+    before, records = (
+        wl.get_threads(),
+        [machine(options.device, elements=1 << 22, repeat=options.repeat)],
+    )
     try:
         for label, group in _groups(options.sizes or SIZES):
             options.say(label)
@@ -50,26 +63,50 @@ def measure(options: Options, out: Path) -> Results:
             for name in made[1]:
                 work = {str(count): _on(count, made[count][name]) for count in counts}
                 if name in TURNS:
-                    work["apart"] = _on(1, partial(_at_once, [other[name] for other in others], TURNS[name]))
+                    work["apart"] = _on(
+                        1, partial(_at_once, [other[name] for other in others], TURNS[name])
+                    )
                 times = in_turns(work, options.repeat)
-                figures = {f"speed_{count}": ratios(times["1"], times[str(count)]) for count in counts[1:]}
+                figures = {
+                    f"speed_{count}": ratios(times["1"], times[str(count)]) for count in counts[1:]
+                }
                 if "apart" in times:
-                    figures["apart"] = ratios([len(others) * TURNS[name] * t for t in times["1"]], times["apart"])
-                records.append(Record(f"{label}: {name}", figures, {"what": name, "group": label, "seconds": min(times["1"])}))
+                    figures["apart"] = ratios(
+                        [len(others) * TURNS[name] * t for t in times["1"]], times["apart"]
+                    )
+                records.append(
+                    Record(
+                        f"{label}: {name}",
+                        figures,
+                        {"what": name, "group": label, "seconds": min(times["1"])},
+                    )
+                )
     finally:
         wl.set_threads(before)
     rows = [
-        [r.name, f"{1e3 * float(r.facts['seconds']):.3g}", *(f"{f.value:.2f} ({f.low:.2f} to {f.high:.2f})" for f in r.figures.values())]
+        [
+            r.name,
+            f"{1e3 * float(r.facts['seconds']):.3g}",
+            *(f"{f.value:.2f} ({f.low:.2f} to {f.high:.2f})" for f in r.figures.values()),
+        ]
         for r in records[1:]
     ]
     rows = [row + [""] * (len(counts) + 2 - len(row)) for row in rows]
     remark = (
-        f"Medians of {options.repeat} ratios of samples taken in turns, and their range. Cores: {os.cpu_count()}. Apart: as many copies of "
-        "the work as there are cores, each on one thread that waits for no other: what they get done together over what one gets done, "
+        f"Medians of {options.repeat} ratios of samples taken in turns, and their range. Cores: "
+        f"{os.cpu_count()}. Apart: as many copies of "
+        "the work as there are cores, each on one thread that waits for no other: what they get "
+        "done together over what one gets done, "
         "which is what this machine had to give."
     )
     heads = ["what", "1 thread [ms]", *(f"{count} threads" for count in counts[1:]), "apart"]
-    return Results(records, [Table("Speed against one thread", heads, rows, remark), table_of_targets("on 2 threads", _targets(records))])
+    return Results(
+        records,
+        [
+            Table("Speed against one thread", heads, rows, remark),
+            table_of_targets("on 2 threads", _targets(records)),
+        ],
+    )
 
 
 def _on(count: int, work: Callable[[], object]) -> Callable[[], object]:
@@ -104,8 +141,12 @@ class _Grid:
     def __init__(self, n: int) -> None:
         scene = splash(n)
         self.box = wl.GridPoisson(np.full((n,) * 3, wl.FLUID, np.int8), device="cpu")
-        self.problem = wl.LCP(wl.GridPoisson(scene.cells, device="cpu"), scene.b, scene.lower("everywhere"))
-        self.x, self.y = (wp.ones(self.box.layout.size, dtype=wp.float32, device="cpu") for _ in range(2))
+        self.problem = wl.LCP(
+            wl.GridPoisson(scene.cells, device="cpu"), scene.b, scene.lower("everywhere")
+        )
+        self.x, self.y = (
+            wp.ones(self.box.layout.size, dtype=wp.float32, device="cpu") for _ in range(2)
+        )
 
     def work(self, count: int) -> Work:
         """Return what is measured."""
@@ -116,13 +157,21 @@ class _Grid:
         fine, coarse = hierarchy.levels[:2]
         sweep = fine.sweeping(fine.t, fine.x, 0.5, projected=False)
         return {
-            "x += z (what memory allows)": _program(ADD.bind(rows_of(self.x), z=self.x, x=self.y).launch),
-            "product": _program(lambda launch: self.box.stencil.product(self.x, self.y, launch=launch)),
+            "x += z (what memory allows)": _program(
+                ADD.bind(rows_of(self.x), z=self.x, x=self.y).launch
+            ),
+            "product": _program(
+                lambda launch: self.box.stencil.product(self.x, self.y, launch=launch)
+            ),
             "sweep": _program(sweep.launch),
             "restriction": _program(fine.restricting(coarse).launch),
             "cycle": hierarchy.cycle.run,
-            "steps of a solve": lambda: wl.solve(self.problem, wl.ProjectedMultigrid(), stopping=STOPPING, workspace=kept),
-            "solve, cold": lambda: wl.solve(self.problem, wl.ProjectedMultigrid(), stopping=STOPPING),
+            "steps of a solve": lambda: wl.solve(
+                self.problem, wl.ProjectedMultigrid(), stopping=STOPPING, workspace=kept
+            ),
+            "solve, cold": lambda: wl.solve(
+                self.problem, wl.ProjectedMultigrid(), stopping=STOPPING
+            ),
         }
 
 
@@ -147,6 +196,12 @@ def _scene(name: str, resolution: int, count: int) -> Work:
 
 
 def _targets(records: list[Record]) -> list[Target]:
-    limits = {f"{name}, {resolution} cells: {STEP}": limit for name, (resolution, limit) in SCENES.items()}
+    limits = {
+        f"{name}, {resolution} cells: {STEP}": limit for name, (resolution, limit) in SCENES.items()
+    }
     found = [(r, limits.get(r.name, TARGETS.get(str(r.facts.get("what"))))) for r in records[1:]]
-    return [Target(r.name, limit, r.figures.get("speed_2"), " x", at_least=True) for r, limit in found if limit is not None]
+    return [
+        Target(r.name, limit, r.figures.get("speed_2"), " x", at_least=True)
+        for r, limit in found
+        if limit is not None
+    ]

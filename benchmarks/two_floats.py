@@ -1,10 +1,12 @@
 # mypy: ignore-errors
 """What pairs of float32 would do to residuals, and to their time on an RTX 4090: `python -m benchmarks.two_floats`, in the source tree.
 
-GPUs for games compute in float64 at 1/64 of float32's rate. Here the natural residual of a splash at solutions by projected multigrid is
-evaluated on the CPU in genuine float32: x and b are sums of two float32 (48 bits), all arithmetic is on such pairs, on differences of them,
-or on their first halves alone; `longdouble` is NumPy's, by no code of these kernels. A floor is what an evaluation gets wrong. Instructions
-of a cell are counted in PTX, compiled without a GPU; times follow from data sheets. Nothing here has been measured on a GPU.
+GPUs for games compute in float64 at 1/64 of float32's rate. Here the natural residual of a splash
+at solutions by projected multigrid is evaluated on the CPU in genuine float32: x and b are sums of
+two float32 (48 bits), all arithmetic is on such pairs, on differences of them, or on their first
+halves alone; `longdouble` is NumPy's, by no code of these kernels. A floor is what an evaluation
+gets wrong. Instructions of a cell are counted in PTX, compiled without a GPU; times follow from
+data sheets. Nothing here has been measured on a GPU.
 """
 
 import re
@@ -23,11 +25,20 @@ from warp_lcp.rows.layout import make_struct, put
 from warp_lcp.rows.pass_form import C
 from warp_lcp.rows.vectors import CUDA_BLOCK
 
-ARCH, MULTIPROCESSORS, CLOCK, BANDWIDTH = 89, 128, 2.52e9, 0.8 * 1008e9  # of an RTX 4090: [Hz], [byte/s] that streaming kernels reach
-RATE = {"f64": 2, "f32": 128}  # instructions a multiprocessor and cycle; conversions of float64 take as long
+# of an RTX 4090: [Hz], [byte/s] that streaming kernels reach
+ARCH, MULTIPROCESSORS, CLOCK, BANDWIDTH = 89, 128, 2.52e9, 0.8 * 1008e9
+# instructions a multiprocessor and cycle; conversions of float64 take as long
+RATE = {"f64": 2, "f32": 128}
 RECIPROCAL = 5  # such instructions that ptxas makes of `rcp.rn.f64`
-BYTES = {"assess": 8 + 8 + 1 + 1 + 1 + 4 + 1, "update": 16 + 4 + 8 + 1}  # a cell: x b unknown d free g code; x z q code
-KINDS = {"add, mul, fma": "add sub mul fma", "compare": "min max setp", "convert": "cvt", "1/x": "rcp", "others": "div sqrt"}
+# a cell: x b unknown d free g code; x z q code
+BYTES = {"assess": 8 + 8 + 1 + 1 + 1 + 4 + 1, "update": 16 + 4 + 8 + 1}
+KINDS = {
+    "add, mul, fma": "add sub mul fma",
+    "compare": "min max setp",
+    "convert": "cvt",
+    "1/x": "rcp",
+    "others": "div sqrt",
+}
 SIZES, TOLERANCES, CELLS = (32, 64, 128), (1e-6, 1e-8, 1e-10, 1e-12, 1e-15), 256
 
 PAIRS = """
@@ -69,11 +80,24 @@ const F below = f*gap(l), above = f*gap(u), low = below < y ? below : y;
 g.r.data[c] = g.unknown.data[c] == 1 ? (above > low ? above : low) : (F)0;
 """
 F32, F64 = wp.float32, wp.float64
-WAYS = {"float64": (PLAIN, F64), "two floats": (TWO, F32), "differences": (DIFFERENCES, F32), "float32": (PLAIN, F32)}
-NUMBERS, CODES, FIELDS = ("unit", "cx", "cy", "cz", "least", "most"), ("d", "code"), ("hi", "lo", "b_hi", "b_lo")
+WAYS = {
+    "float64": (PLAIN, F64),
+    "two floats": (TWO, F32),
+    "differences": (DIFFERENCES, F32),
+    "float32": (PLAIN, F32),
+}
+NUMBERS, CODES, FIELDS = (
+    ("unit", "cx", "cy", "cz", "least", "most"),
+    ("d", "code"),
+    ("hi", "lo", "b_hi", "b_lo"),
+)
 
 
-@wp.func_native(PAIRS + "const Two s = sum(a, b), p = product(a, b); out.data[at] = wp::vec4f(s.hi, s.lo, p.hi, p.lo);")
+@wp.func_native(
+    PAIRS
+    + "const Two s = sum(a, b), p = product(a, b); out.data[at] = wp::vec4f(s.hi, s.lo, p.hi, "
+    "p.lo);"
+)
 def pairs_of(at: int, a: float, b: float, out: wp.array(dtype=wp.vec4f)): ...  # noqa: D103
 
 
@@ -86,23 +110,47 @@ def pairs_kernel(a: wp.array(dtype=float), b: wp.array(dtype=float), out: wp.arr
 def check_pairs() -> None:
     """Check them against float64, in which these numbers' sums and products are exact."""
     random, size = np.random.default_rng(1), 1 << 20
-    a, b = ((random.uniform(-1, 1, size) * 2.0 ** random.integers(-13, 14, size)).astype(np.float32) for _ in range(2))
+    a, b = (
+        (random.uniform(-1, 1, size) * 2.0 ** random.integers(-13, 14, size)).astype(np.float32)
+        for _ in range(2)
+    )
     out = wp.empty(size, dtype=wp.vec4f, device="cpu")
-    wp.launch(pairs_kernel, size, [wp.array(a, device="cpu"), wp.array(b, device="cpu"), out], device="cpu")
+    wp.launch(
+        pairs_kernel,
+        size,
+        [wp.array(a, device="cpu"), wp.array(b, device="cpu"), out],
+        device="cpu",
+    )
     found = out.numpy().astype(np.float64)
     for at, exact in ((0, a.astype(np.float64) + b), (2, a.astype(np.float64) * b)):
-        assert np.array_equal(found[:, at], exact.astype(np.float32)) and np.array_equal(found[:, at] + found[:, at + 1], exact)
+        assert np.array_equal(found[:, at], exact.astype(np.float32)) and np.array_equal(
+            found[:, at] + found[:, at + 1], exact
+        )
 
 
 @cache
 def evaluation(way: str) -> tuple[wp.Kernel, type]:
     """Return a kernel that evaluates the natural residual, a thread a cell, and the struct that it takes."""
     how, real = WAYS[way]
-    types = dict.fromkeys(CODES, wp.uint8) | dict.fromkeys((*FIELDS, "r"), real) | {"unknown": wp.int8}
-    members = dict.fromkeys(("row", "plane"), int) | dict.fromkeys(NUMBERS, real) | {n: wp.array(dtype=t) for n, t in types.items()}
+    types = (
+        dict.fromkeys(CODES, wp.uint8) | dict.fromkeys((*FIELDS, "r"), real) | {"unknown": wp.int8}
+    )
+    members = (
+        dict.fromkeys(("row", "plane"), int)
+        | dict.fromkeys(NUMBERS, real)
+        | {n: wp.array(dtype=t) for n, t in types.items()}
+    )
     Given = make_struct(f"TwoFloats_{real.__name__}", members)
-    head = " ".join([f"typedef {C[real]} F;", *(f"const auto* {name} = g.{name}.data;" for name in (*CODES, *FIELDS))])
-    head += " const int row = g.row, plane = g.plane; const F e = g.unit*(F)d[c], cx = g.cx, cy = g.cy, cz = g.cz;\n"
+    head = " ".join(
+        [
+            f"typedef {C[real]} F;",
+            *(f"const auto* {name} = g.{name}.data;" for name in (*CODES, *FIELDS)),
+        ]
+    )
+    head += (
+        " const int row = g.row, plane = g.plane; const F e = g.unit*(F)d[c], cx = g.cx, cy = "
+        "g.cy, cz = g.cz;\n"
+    )
 
     def residual(c: int, g: Given): ...
 
@@ -124,11 +172,30 @@ def split(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def evaluated(problem: wl.LCP, way: str, x: np.ndarray) -> np.ndarray:
     """Return the natural residual at x by a kernel."""
-    layout, stencil, real, (kernel, Given) = problem.layout, problem.A.stencil, WAYS[way][1], evaluation(way)
-    pairs = [split(v) if real is F32 else (v, v) for v in (layout.load(x, F64).numpy(), problem.b.numpy())]
+    layout, stencil, real, (kernel, Given) = (
+        problem.layout,
+        problem.A.stencil,
+        WAYS[way][1],
+        evaluation(way),
+    )
+    pairs = [
+        split(v) if real is F32 else (v, v)
+        for v in (layout.load(x, F64).numpy(), problem.b.numpy())
+    ]
     parts = [wp.array(part, dtype=real, device="cpu") for pair in pairs for part in pair]
-    given = {"row": stencil.padding.row, "plane": stencil.padding.plane, "d": stencil.d, "code": problem.bounds.code}
-    given |= dict(zip((*FIELDS, *NUMBERS), (*parts, stencil.unit, *stencil.coefficients, *problem.bounds.values), strict=True))
+    given = {
+        "row": stencil.padding.row,
+        "plane": stencil.padding.plane,
+        "d": stencil.d,
+        "code": problem.bounds.code,
+    }
+    given |= dict(
+        zip(
+            (*FIELDS, *NUMBERS),
+            (*parts, stencil.unit, *stencil.coefficients, *problem.bounds.values),
+            strict=True,
+        )
+    )
     given |= {"unknown": problem.unknown, "r": wp.zeros_like(parts[0])}
     wp.launch(kernel, x.shape, [put(Given(), given)], device="cpu")
     return given["r"].numpy().reshape(layout.stored_shape)[1:-1, 1:-1, 1:-1].astype(np.longdouble)
@@ -137,14 +204,24 @@ def evaluated(problem: wl.LCP, way: str, x: np.ndarray) -> np.ndarray:
 def exact_residual(scene: Splash, x: np.ndarray) -> np.ndarray:
     """Return the natural residual in longdouble."""
     open_ = np.pad(scene.cells, 1, constant_values=wl.SOLID) != wl.SOLID
-    d = sum(np.roll(open_, step, axis)[1:-1, 1:-1, 1:-1].astype(np.longdouble) for axis in range(3) for step in (1, -1))
+    d = sum(
+        np.roll(open_, step, axis)[1:-1, 1:-1, 1:-1].astype(np.longdouble)
+        for axis in range(3)
+        for step in (1, -1)
+    )
     y = natural(scene.cells, scene.b.astype(np.longdouble), -np.inf, x)
-    return np.where(scene.cells == wl.FLUID, np.minimum(np.maximum(d, 1) * (x - scene.lower("walls")), y), 0)
+    return np.where(
+        scene.cells == wl.FLUID, np.minimum(np.maximum(d, 1) * (x - scene.lower("walls")), y), 0
+    )
 
 
 def table(title: str, columns: list[str], rows: list[list[object]]) -> None:
     """Print a table."""
-    lines = [columns, ["---"] * len(columns), *([f"{e:.3g}" if isinstance(e, float) else str(e) for e in row] for row in rows)]
+    lines = [
+        columns,
+        ["---"] * len(columns),
+        *([f"{e:.3g}" if isinstance(e, float) else str(e) for e in row] for row in rows),
+    ]
     print("\n".join([f"\n{title}\n", *(f"| {' | '.join(line)} |" for line in lines)]), flush=True)
 
 
@@ -155,14 +232,35 @@ def compare() -> None:
         scene = splash(n)
         problem = scene.lcp("walls", device="cpu")
         for rtol in TOLERANCES:
-            found = wl.solve(problem, wl.ProjectedMultigrid(), stopping=wl.StoppingCriteria(rtol=rtol))
-            x, norm = found.x.numpy(), lambda r, unit=found.history[0].residual: float(np.linalg.norm(r.ravel()) / unit)
-            residuals, exact = [evaluated(problem, way, x) for way in WAYS], exact_residual(scene, x.astype(np.longdouble))
-            rows.append([f"{n}^3", f"{rtol:.0e}", found.status.name, found.iterations, *map(norm, residuals), norm(exact)])
+            found = wl.solve(
+                problem, wl.ProjectedMultigrid(), stopping=wl.StoppingCriteria(rtol=rtol)
+            )
+            x, norm = (
+                found.x.numpy(),
+                lambda r, unit=found.history[0].residual: float(np.linalg.norm(r.ravel()) / unit),
+            )
+            residuals, exact = (
+                [evaluated(problem, way, x) for way in WAYS],
+                exact_residual(scene, x.astype(np.longdouble)),
+            )
+            rows.append(
+                [
+                    f"{n}^3",
+                    f"{rtol:.0e}",
+                    found.status.name,
+                    found.iterations,
+                    *map(norm, residuals),
+                    norm(exact),
+                ]
+            )
         rounded = exact_residual(scene, sum(part.astype(np.longdouble) for part in split(x)))
         floors.append([f"{n}^3", *(norm(r - exact) for r in (*residuals, rounded))])
     table("Relative residual", ["cells", "rtol", "status", "iterations", *WAYS, "longdouble"], rows)
-    table("Floor: relative error of the residual at the last x", ["cells", *WAYS, "longdouble, x of 48 bits"], floors)
+    table(
+        "Floor: relative error of the residual at the last x",
+        ["cells", *WAYS, "longdouble, x of 48 bits"],
+        floors,
+    )
 
 
 def count(module: str, kind: str, stored: str) -> list[int]:
@@ -173,17 +271,24 @@ def count(module: str, kind: str, stored: str) -> list[int]:
         text = next(Path(folder).glob("*.ptx")).read_text()
     copies = len(re.findall(rf"\bst\.global\.{stored}\b", text))
     found = Counter(re.findall(rf"^\s*(?:@!?%p\d+ )?(\w+)\.[\w.]*\b{kind}\b", text, re.MULTILINE))
-    kinds = [sum(sum(divmod(found[name], copies)) for name in names.split()) for names in KINDS.values()]
+    kinds = [
+        sum(sum(divmod(found[name], copies)) for name in names.split()) for names in KINDS.values()
+    ]
     return [*kinds, sum(kinds) + (RECIPROCAL - 1) * kinds[3]]
 
 
 def instructions() -> None:
     """Print counts and times of the solver's passes as they are, and of the evaluations."""
-    made = {name: next(m for m in user_modules if m.startswith(f"warp_lcp.projected_multigrid.{name}.")) for name in BYTES}
+    made = {
+        name: next(m for m in user_modules if m.startswith(f"warp_lcp.projected_multigrid.{name}."))
+        for name in BYTES
+    }
     passes = [(f"`{name}`", module, "f64", "f32", BYTES[name]) for name, module in made.items()]
     for way, (_, real) in WAYS.items():
         kind = "f64" if real is F64 else "f32"
-        passes.append((f"residual alone, {way}", evaluation(way)[0].module.name, kind, kind, BYTES["assess"]))
+        passes.append(
+            (f"residual alone, {way}", evaluation(way)[0].module.name, kind, kind, BYTES["assess"])
+        )
     rows = []
     for what, module, kind, stored, moved in passes:
         counts = count(module, kind, stored)

@@ -1,7 +1,8 @@
 """What a viscous solve costs beside a pressure solve of the same cells: `python -m benchmarks.viscosity [CELLS ...]`, in the source tree.
 
-A tank of three fifths liquid with a wavy surface, whose velocity is a few smooth waves: the viscous step at several viscosities, and the
-pressure of that velocity, cold, with walls as equations and with walls that let go, all to 1e-4, in turns; medians of processor times.
+A tank of three fifths liquid with a wavy surface, whose velocity is a few smooth waves: the viscous
+step at several viscosities, and the pressure of that velocity, cold, with walls as equations and
+with walls that let go, all to 1e-4, in turns; medians of processor times.
 """
 
 import sys
@@ -20,12 +21,18 @@ TURNS, DT = 5, 1e-2
 
 def tank(cells: int, viscosity: float, wall: str) -> LiquidSimulation:
     """Return the tank with its velocity, before a step."""
-    blocks: list[dict[str, Any]] = [{"shape": "box", "min": [0.0, 0.0, 0.0], "max": [1.0, 0.5, 1.0]}]
+    blocks: list[dict[str, Any]] = [
+        {"shape": "box", "min": [0.0, 0.0, 0.0], "max": [1.0, 0.5, 1.0]}
+    ]
     blocks += [{"shape": "sphere", "center": [x, 0.5, 0.5], "radius": 0.2} for x in (0.25, 0.75)]
     data: dict[str, Any] = {
-        "scene": {"simulator": "fluids"}, "time": {"duration": 1.0}, "domain": {"size": [1.0] * 3, "resolution": cells, "wall": wall},
-        "viscosity": {"value": viscosity}, "liquid": blocks, "solver": {"tolerance": 1e-4},
-    }  # fmt: skip
+        "scene": {"simulator": "fluids"},
+        "time": {"duration": 1.0},
+        "domain": {"size": [1.0] * 3, "resolution": cells, "wall": wall},
+        "viscosity": {"value": viscosity},
+        "liquid": blocks,
+        "solver": {"tolerance": 1e-4},
+    }
     simulation = SIMULATOR.create(LiquidScene.model_validate(data), device="cpu", folder=Path())
     wave(simulation)
     return simulation
@@ -35,7 +42,12 @@ def wave(simulation: LiquidSimulation) -> None:
     """Give the faces their velocity [m/s]."""
     index = np.indices(simulation.grid.shape)[::-1] / max(simulation.grid.counts) * 2.0 * np.pi
     for axis, field in enumerate(simulation.velocity):
-        field.assign((np.sin(index[(axis + 1) % 3]) * np.cos(2.0 * index[axis]) + 0.3 * np.sin(3.0 * index[axis - 1])).astype(np.float32))
+        field.assign(
+            (
+                np.sin(index[(axis + 1) % 3]) * np.cos(2.0 * index[axis])
+                + 0.3 * np.sin(3.0 * index[axis - 1])
+            ).astype(np.float32)
+        )
 
 
 def viscous(simulation: LiquidSimulation) -> tuple[float, int]:
@@ -45,7 +57,14 @@ def viscous(simulation: LiquidSimulation) -> tuple[float, int]:
     projection.contact.fill_(1)
     begun = time.process_time()
     assert simulation.viscosity is not None
-    found = simulation.viscosity.solve(simulation.velocity, simulation.grid.everywhere, projection.kind, projection.contact, DT, 1.0)
+    found = simulation.viscosity.solve(
+        simulation.velocity,
+        simulation.grid.everywhere,
+        projection.kind,
+        projection.contact,
+        DT,
+        1.0,
+    )
     assert found.converged, "the viscous solve must reach its tolerance"
     return time.process_time() - begun, found.iterations
 
@@ -71,19 +90,27 @@ def measure(cells: int) -> None:
         done: dict[object, tuple[float, int]] = {"held": pressure(held), "free": pressure(free)}
         done |= {viscosity: viscous(simulation) for viscosity, simulation in thick.items()}
         for name, found in done.items():
-            rows.setdefault(name, []).extend([found] if turn else [])  # the first turn loads kernels
+            # the first turn loads kernels
+            rows.setdefault(name, []).extend([found] if turn else [])
     seconds = {name: float(np.median([s for s, _ in found])) for name, found in rows.items()}
-    pairs = {v: [a / b for (a, _), (b, _) in zip(rows[v], rows["held"], strict=True)] for v in VISCOSITIES}
+    pairs = {
+        v: [a / b for (a, _), (b, _) in zip(rows[v], rows["held"], strict=True)]
+        for v in VISCOSITIES
+    }
     for viscosity in VISCOSITIES:
         ratio, iterations = float(np.median(pairs[viscosity])), rows[viscosity][0][1]
         beside = f"{1e3 * seconds['held']:.1f} | {1e3 * seconds['free']:.1f}"
-        sys.stdout.write(f"| {cells}^3 | {viscosity:g} | {iterations} | {1e3 * seconds[viscosity]:.1f} | {beside} | {ratio:.2f} |\n")
+        sys.stdout.write(
+            f"| {cells}^3 | {viscosity:g} | {iterations} | {1e3 * seconds[viscosity]:.1f} | "
+            f"{beside} | {ratio:.2f} |\n"
+        )
     sys.stdout.flush()
 
 
 if __name__ == "__main__":
     sys.stdout.write(
-        "| cells | Pa s | iterations | viscous [ms] | pressure, equations [ms] | pressure, bounds [ms] | viscous / equations |\n"
+        "| cells | Pa s | iterations | viscous [ms] | pressure, equations [ms] | pressure, bounds "
+        "[ms] | viscous / equations |\n"
     )
     sys.stdout.write("|---|---|---|---|---|---|---|\n")
     for cells in map(int, sys.argv[1:] or (32, 64, 128)):

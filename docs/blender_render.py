@@ -1,8 +1,8 @@
 """Render a run with Blender's Cycles, from the USD file of `warp-lcp export`.
 
-    pip install bpy "numpy<2"  # Blender as a module, 5.0.1 for Python 3.11; in an environment of its own
-    warp-lcp export out/floating-bodies --out bodies.usdc
-    python docs/blender_render.py bodies.usdc bodies.png --frame 40 --position 2.4 1.6 2.8 --look-at 0.8 0.15 0.4
+    pip install bpy "numpy<2" # Blender as a module, 5.0.1 for Python 3.11; in an environment of its
+    own warp-lcp export out/floating-bodies --out bodies.usdc python docs/blender_render.py
+    bodies.usdc bodies.png --frame 40 --position 2.4 1.6 2.8 --look-at 0.8 0.15 0.4
 
 Positions are those of the scene [m], y up.
 """
@@ -17,8 +17,10 @@ from typing import Any
 import bpy
 import mathutils
 
-ABSORPTION = (1.6, 0.47, 0.26)  # of water, 1/m for red, green and blue; the real one is hardly visible in a tank
-SHADOW = (0.82, 0.92, 0.95, 1.0)  # of water: shadow rays go straight on, so that what lies below it needs no caustics
+# of water, 1/m for red, green and blue; the real one is hardly visible in a tank
+ABSORPTION = (1.6, 0.47, 0.26)
+# of water: shadow rays go straight on, so that what lies below it needs no caustics
+SHADOW = (0.82, 0.92, 0.95, 1.0)
 FLOOR, BODIES = (0.6, 0.6, 0.6), [(0.75, 0.24, 0.06), (0.85, 0.62, 0.08), (0.10, 0.35, 0.12)]
 GLASS_BOUNCES = 16
 
@@ -40,7 +42,10 @@ def water() -> Any:
     straight = tree.nodes.new("ShaderNodeBsdfTransparent")
     straight.inputs["Color"].default_value = SHADOW
     path, mix = tree.nodes.new("ShaderNodeLightPath"), tree.nodes.new("ShaderNodeMixShader")
-    absorption, output = tree.nodes.new("ShaderNodeVolumeAbsorption"), tree.nodes.new("ShaderNodeOutputMaterial")
+    absorption, output = (
+        tree.nodes.new("ShaderNodeVolumeAbsorption"),
+        tree.nodes.new("ShaderNodeOutputMaterial"),
+    )
     most = max(ABSORPTION)  # Cycles absorbs density * (1 - color)
     absorption.inputs["Density"].default_value = most
     absorption.inputs["Color"].default_value = (*(1.0 - value / most for value in ABSORPTION), 1.0)
@@ -62,11 +67,17 @@ def matte(name: str, color: tuple[float, float, float]) -> Any:
 
 def studio(scene: Any, size: float) -> None:
     """Add a floor, a sky and a soft key light."""
-    bpy.ops.mesh.primitive_plane_add(size=60.0 * size, location=(0.0, 0.0, -1e-3 * size))  # below the surface's own floor
+    # below the surface's own floor
+    bpy.ops.mesh.primitive_plane_add(size=60.0 * size, location=(0.0, 0.0, -1e-3 * size))
     bpy.context.object.data.materials.append(matte("floor", FLOOR))
     scene.world = bpy.data.worlds.new("sky")
     scene.world.use_nodes = True
-    scene.world.node_tree.nodes["Background"].inputs["Color"].default_value = (0.55, 0.65, 0.80, 1.0)
+    scene.world.node_tree.nodes["Background"].inputs["Color"].default_value = (
+        0.55,
+        0.65,
+        0.80,
+        1.0,
+    )
     light = bpy.data.lights.new("key", "SUN")
     light.energy, light.angle = 2.0, math.radians(15.0)
     key = bpy.data.objects.new("key", light)
@@ -87,18 +98,27 @@ def camera(scene: Any, asked: argparse.Namespace) -> None:
 def settings(scene: Any, asked: argparse.Namespace) -> None:
     """Choose Cycles, its denoiser, AgX and motion blur."""
     scene.render.engine = "CYCLES"
-    scene.cycles.samples, scene.cycles.use_denoising, scene.cycles.denoiser = asked.samples, True, "OPENIMAGEDENOISE"
+    scene.cycles.samples, scene.cycles.use_denoising, scene.cycles.denoiser = (
+        asked.samples,
+        True,
+        "OPENIMAGEDENOISE",
+    )
     scene.cycles.max_bounces = scene.cycles.transmission_bounces = GLASS_BOUNCES
     scene.cycles.sample_clamp_indirect = 10.0
     scene.render.resolution_x, scene.render.resolution_y = asked.size
     scene.render.use_motion_blur, scene.render.motion_blur_shutter = True, 0.25
-    scene.view_settings.view_transform, scene.view_settings.look = "AgX", "AgX - Medium High Contrast"
+    scene.view_settings.view_transform, scene.view_settings.look = (
+        "AgX",
+        "AgX - Medium High Contrast",
+    )
     scene.render.image_settings.file_format = "PNG"
 
 
 def main() -> None:
     """Import, light and render one frame."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("usd", type=Path)
     parser.add_argument("picture", type=Path)
     parser.add_argument("--frame", type=int, default=0)
@@ -115,7 +135,9 @@ def main() -> None:
     for number, item in enumerate(item for item in scene.objects if item.type == "MESH"):
         item.data.materials.clear()
         color = BODIES[number % len(BODIES)]
-        item.data.materials.append(water() if item.name.startswith("surface") else matte(item.name, color))
+        item.data.materials.append(
+            water() if item.name.startswith("surface") else matte(item.name, color)
+        )
     studio(scene, max(max(item.dimensions) for item in scene.objects))
     camera(scene, asked)
     settings(scene, asked)

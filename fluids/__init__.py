@@ -6,4 +6,11 @@ from warp_lcp.fluids.simulator import FluidsSimulator, LiquidSimulation
 
 SIMULATOR = FluidsSimulator()
 
-__all__ = ["SIMULATOR", "FluidsSimulator", "LiquidScene", "LiquidSimulation", "PressureProjection", "Projection"]
+__all__ = [
+    "SIMULATOR",
+    "FluidsSimulator",
+    "LiquidScene",
+    "LiquidSimulation",
+    "PressureProjection",
+    "Projection",
+]

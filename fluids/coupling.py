@@ -27,29 +27,46 @@ class BodyCoupling:
 
     After [Batty, Bertails & Bridson 2007].
 
-    A body's velocity is V* + M^-1 I after the pressure's impulse I = rho dx^d U'x of its x [m/s], and the outflow of a cell gains
-    U V: U_iq is the sum over the faces of cell i of s_f (1 - a_f) times the velocity of unit motion q at the face's center, s_f = +-1
-    outward. So with b from V* the outflow is
+    A body's velocity is V* + M^-1 I after the pressure's impulse I = rho dx^d U'x of its x [m/s],
+    and the outflow of a cell gains U V: U_iq is the sum over the faces of cell i of s_f (1 - a_f)
+    times the velocity of unit motion q at the face's center, s_f = +-1 outward. So with b from V*
+    the outflow is
 
         y = b + (A + rho dx^d U M^-1 U') x,
 
-    symmetric and positive semi-definite like A. Liquid and body exchange opposite impulses on the same faces: momentum is conserved
-    exactly, and energy up to the residual y.
+    symmetric and positive semi-definite like A. Liquid and body exchange opposite impulses on the
+    same faces: momentum is conserved exactly, and energy up to the residual y.
 
     Args:
         grid: the grid.
         boundary: its solids, with the bodies among them.
         bodies: the bodies.
         density: of the liquid [kg/m^3].
-        share: factor on U V in the outflow, where the problem is one of masses, see `fluids.unilateral`.
+        share: factor on U V in the outflow, where the problem is one of masses, see
+            `fluids.unilateral`.
     """
 
-    def __init__(self, grid: StaggeredGrid, boundary: CutBoundary, bodies: RigidBodies, density: float, *, share: float = 1.0) -> None:
-        self.grid, self.boundary, self.bodies, self._solved = grid, boundary, bodies, grid.part.owned
+    def __init__(
+        self,
+        grid: StaggeredGrid,
+        boundary: CutBoundary,
+        bodies: RigidBodies,
+        density: float,
+        *,
+        share: float = 1.0,
+    ) -> None:
+        self.grid, self.boundary, self.bodies, self._solved = (
+            grid,
+            boundary,
+            bodies,
+            grid.part.owned,
+        )
         self._scale, self._share = density * grid.cell_volume, share
         self.width = 3 if grid.dimension == 2 else 6
         low, high = np.array(self._solved.low) - 1, np.array(self._solved.high) + 1
-        self.columns = BlockColumns(int(np.prod(high - low)), len(bodies.bodies), self.width, wp.float64, grid.device)
+        self.columns = BlockColumns(
+            int(np.prod(high - low)), len(bodies.bodies), self.width, wp.float64, grid.device
+        )
         if grid.device.is_cuda:
             self.columns.reserve(LEAST)
         body = np.full(1 + len(boundary.cut.solids), -1, dtype=np.int32)
@@ -62,10 +79,13 @@ class BodyCoupling:
         S.center = self._center.array
         self._solids = S
         rows = grid.shape[0] * grid.shape[1]
-        self._counts, self._offsets = (wp.zeros(rows, dtype=wp.int32, device=grid.device) for _ in range(2))
+        self._counts, self._offsets = (
+            wp.zeros(rows, dtype=wp.int32, device=grid.device) for _ in range(2)
+        )
         self._low: wl.LowRankOperator | None = None
         self._flat: wp.array | None = None  # of the last solution
-        self._pending: wp.array | None = None  # cells of a `take` whose entries have not been counted by the host
+        # cells of a `take` whose entries have not been counted by the host
+        self._pending: wp.array | None = None
         self._beside, self._enclosing = ActiveWindow(grid.domain), ActiveWindow(grid.domain)
         self._counting = LaunchGraph(grid.device, self._launch_count)
         self._entering = LaunchGraph(grid.device, self._launch_entries)
@@ -136,16 +156,25 @@ class BodyCoupling:
     def _launch_count(self, kind: wp.array) -> None:
         """Count the entries of each row of cells, and add them up."""
         clear(self._counts)
-        self._beside.launch_rows(kernels.enter_kernel, [self._solids, kind, self._counts, None, None, None, None])
+        self._beside.launch_rows(
+            kernels.enter_kernel, [self._solids, kind, self._counts, None, None, None, None]
+        )
         first, device = 0, self.grid.device  # whose offset is 0
         if device.is_cuda:
             call(partial(wp.utils.array_scan, self._counts, self._offsets, inclusive=False))
             first = len(self._counts) - 1
-        launch(kernels.offsets_kernel, 1, [first, self._counts, self._offsets, self.columns.capacity, self.columns.count], device=device)
+        launch(
+            kernels.offsets_kernel,
+            1,
+            [first, self._counts, self._offsets, self.columns.capacity, self.columns.count],
+            device=device,
+        )
 
     def _launch_entries(self, kind: wp.array) -> None:
         entries = [self.columns.rows, self.columns.blocks, self.columns.values]
-        self._beside.launch_rows(kernels.enter_kernel, [self._solids, kind, self._counts, self._offsets, *entries])
+        self._beside.launch_rows(
+            kernels.enter_kernel, [self._solids, kind, self._counts, self._offsets, *entries]
+        )
 
     def push(self, x: wp.array) -> None:
         """Apply to the bodies the impulses of x = kick_dt p / (rho dx) [m/s]."""

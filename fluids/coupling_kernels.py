@@ -40,7 +40,10 @@ def body_on_face(S: Solids, axis: int, k: int, j: int, i: int):
 @wp.func
 def beside_a_wall(S: Solids, k: int, j: int, i: int):
     """Return whether a face of a cell is not open."""
-    a = wp.min(wp.min(S.walls.open_x[k, j, i], S.walls.open_x[k, j, i + 1]), wp.min(S.walls.open_y[k, j, i], S.walls.open_y[k, j + 1, i]))
+    a = wp.min(
+        wp.min(S.walls.open_x[k, j, i], S.walls.open_x[k, j, i + 1]),
+        wp.min(S.walls.open_y[k, j, i], S.walls.open_y[k, j + 1, i]),
+    )
     if S.walls.planes == 2:
         a = wp.min(a, wp.min(S.walls.open_z[k, j, i], S.walls.open_z[k + 1, j, i]))
     return a < 1.0
@@ -51,7 +54,13 @@ def side(S: Solids, n: int, k: int, j: int, i: int):
     """Return body and share on side n = 2 axis + (0: low, 1: high) of a cell."""
     axis = n >> 1
     high = n & 1
-    return body_on_face(S, axis, k + wp.where(axis == 2, high, 0), j + wp.where(axis == 1, high, 0), i + wp.where(axis == 0, high, 0))
+    return body_on_face(
+        S,
+        axis,
+        k + wp.where(axis == 2, high, 0),
+        j + wp.where(axis == 1, high, 0),
+        i + wp.where(axis == 0, high, 0),
+    )
 
 
 @wp.func
@@ -66,10 +75,23 @@ def next_body(S: Solids, last: int, k: int, j: int, i: int):
 
 
 @cell_kernel("fluids.coupling")
-def enter_kernel(k, j, first, end, S: Solids, kind: I8, counts: _I32, offsets: _I32, index: _I32, block: _I32, values: _F64):
+def enter_kernel(
+    k,
+    j,
+    first,
+    end,
+    S: Solids,
+    kind: I8,
+    counts: _I32,
+    offsets: _I32,
+    index: _I32,
+    block: _I32,
+    values: _F64,
+):
     """Count the pairs of a FLUID cell and a body beside it in a row, or with `values` write their entries.
 
-    An entry is what a cell's outflow gains by unit motions of a body, (vx, vy, wz) or (vx, vy, vz, wx, wy, wz).
+    An entry is what a cell's outflow gains by unit motions of a body, (vx, vy, wz) or (vx, vy, vz,
+    wx, wy, wz).
     """
     row = k * kind.shape[1] + j
     begin = int(0)

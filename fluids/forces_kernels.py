@@ -3,20 +3,46 @@
 
 import warp as wp
 
-from warp_lcp.fluids.wall_kernels import Walls, closed_on, crossing_on, face_center, put, reach_across, standing_of, wall_way
+from warp_lcp.fluids.wall_kernels import (
+    Walls,
+    closed_on,
+    crossing_on,
+    face_center,
+    put,
+    reach_across,
+    standing_of,
+    wall_way,
+)
 from warp_lcp.grid.cell_kernel import F32, F64, INTS, U8, cell_kernel
 
 
 @cell_kernel("fluids.forces")
 def pressure_kernel(
-    k, j, first, end, S: Walls, references: wp.array(dtype=wp.vec3d), counts: INTS, offsets: INTS, owners: INTS,
-    values: wp.array2d(dtype=wp.float64), bodies: wp.array(dtype=wp.uint8), touch: U8, x: F64,
-    u: F32, v: F32, w: F32, kick_x: float, kick_y: float, kick_z: float, scale: wp.float64,
-):  # fmt: skip
+    k,
+    j,
+    first,
+    end,
+    S: Walls,
+    references: wp.array(dtype=wp.vec3d),
+    counts: INTS,
+    offsets: INTS,
+    owners: INTS,
+    values: wp.array2d(dtype=wp.float64),
+    bodies: wp.array(dtype=wp.uint8),
+    touch: U8,
+    x: F64,
+    u: F32,
+    v: F32,
+    w: F32,
+    kick_x: float,
+    kick_y: float,
+    kick_z: float,
+    scale: wp.float64,
+):
     """Count the closed parts of faces that pressure acts on in a row, or with `values` write its impulses on them: `scale` x a share.
 
-    x is continued from a cell's center to the wall, see `warp_lcp.fluids.forces`; the kick [m/s] is what gravity adds to
-    velocities.
+    x is continued from a cell's center to the wall, see `warp_lcp.fluids.forces`; the kick [m/s] is
+    what gravity adds to velocities.
     """
     row = k * x.shape[1] + j
     begin = int(0)
@@ -58,7 +84,19 @@ def pressure_kernel(
                                     gap = wp.where(high == 1, below, above)
                                     more = float(side) * gap * wp.vec3(kick_x, kick_y, kick_z)[axis]
                             force = wp.vec3d()
-                            force[axis] = scale * (x[k, j, i] + wp.float64(more)) * wp.float64(share) * wp.float64(side)
-                            put(e, solid, force, face_center(S, axis, c, b, a) - references[solid], owners, values)
+                            force[axis] = (
+                                scale
+                                * (x[k, j, i] + wp.float64(more))
+                                * wp.float64(share)
+                                * wp.float64(side)
+                            )
+                            put(
+                                e,
+                                solid,
+                                force,
+                                face_center(S, axis, c, b, a) - references[solid],
+                                owners,
+                                values,
+                            )
                         e += 1
     counts[row] = e - begin

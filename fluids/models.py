@@ -30,10 +30,11 @@ class LiquidModel(Protocol):
 
     `LiquidSimulation` takes it among its `models`.
 
-    It acts on all of the liquid: with such models the corrections of bodies in flight, which know of gravity alone, are off.
+    It acts on all of the liquid: with such models the corrections of bodies in flight, which know
+    of gravity alone, are off.
 
-    Written once, it runs in one process and on ranks: `liquid.grid.part` says which cells are this process's, fills ghost cells and adds
-    up over all. Every rank enters `act` in every step.
+    Written once, it runs in one process and on ranks: `liquid.grid.part` says which cells are this
+    process's, fills ghost cells and adds up over all. Every rank enters `act` in every step.
 
     Attributes:
         columns: of the log, that `act` fills.
@@ -48,7 +49,8 @@ class LiquidModel(Protocol):
         """Change `liquid.velocity`, after gravity, before viscosity; collective.
 
         Args:
-            liquid: whose faces in liquid are known, `liquid.projection.known`; forces act for `liquid.kick_dt` [s].
+            liquid: whose faces in liquid are known, `liquid.projection.known`; forces act for
+                `liquid.kick_dt` [s].
             window: cells that the liquid can touch in the step.
             dt: time step [s].
 
@@ -63,7 +65,9 @@ class LiquidModel(Protocol):
 VISCOUS_TOLERANCE = 1e-4  # where the pressure's comes from the time step
 
 
-def make_surface(scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, fill: Fill | None = None) -> FreeSurface:
+def make_surface(
+    scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, fill: Fill | None = None
+) -> FreeSurface:
     """Return the free surface of a scene.
 
     Args:
@@ -77,21 +81,37 @@ def make_surface(scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, fi
     count = scene.particles.per_axis**grid.dimension
     if scene.pressure.surface == "ghost-fluid":
         smoothing = scene.pressure.smoothing
-        return GhostFluidSurface(grid, boundary, particles_a_cell=count, smoothing=smoothing, fill=fill)
+        return GhostFluidSurface(
+            grid, boundary, particles_a_cell=count, smoothing=smoothing, fill=fill
+        )
     return WholeCellSurface(grid, boundary, particles_a_cell=count, fill=fill)
 
 
-def make_tension(scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, surface: FreeSurface) -> SurfaceTension | None:
+def make_tension(
+    scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, surface: FreeSurface
+) -> SurfaceTension | None:
     """Return the surface tension of a scene, or None without tension or surface."""
     given = scene.surface_tension
     if given is None or surface.phi is None:
         return None
     angle, density = given.contact_angle, scene.physics.density
-    return SurfaceTension(grid, boundary, surface.phi, coefficient=given.coefficient, contact_angle=angle, density=density)
+    return SurfaceTension(
+        grid,
+        boundary,
+        surface.phi,
+        coefficient=given.coefficient,
+        contact_angle=angle,
+        density=density,
+    )
 
 
 def make_pressure(
-    scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, surface: FreeSurface, weights: list[wp.array], bodies: RigidBodies | None
+    scene: LiquidScene,
+    grid: StaggeredGrid,
+    boundary: Boundary,
+    surface: FreeSurface,
+    weights: list[wp.array],
+    bodies: RigidBodies | None,
 ) -> PressureProjection:
     """Return the pressure solver of a scene, for the liquid and its rigid bodies.
 
@@ -103,7 +123,10 @@ def make_pressure(
         weights: of the particles on the faces of each component.
         bodies: rigid bodies among the solids; None: there are none.
     """
-    solver, coupling = wl.default_chain(wl.METHODS[scene.solver.method](precision=scene.solver.precision)), None
+    solver, coupling = (
+        wl.default_chain(wl.METHODS[scene.solver.method](precision=scene.solver.precision)),
+        None,
+    )
     tolerance, most = scene.solver.tolerance, scene.solver.max_iterations
     gravity = float(np.linalg.norm(scene.physics.gravity))
     if bodies is not None:
@@ -111,17 +134,36 @@ def make_pressure(
         coupling = BodyCoupling(grid, boundary, bodies, scene.physics.density)
     if scene.pressure.model == "unilateral" and isinstance(surface, GhostFluidSurface):
         return UnilateralPressure(
-            grid, boundary, solver, tolerance=tolerance, max_iterations=most, gravity=gravity, coupling=coupling,
-            level_set=surface.level_set, weights=weights,
-        )  # fmt: skip
+            grid,
+            boundary,
+            solver,
+            tolerance=tolerance,
+            max_iterations=most,
+            gravity=gravity,
+            coupling=coupling,
+            level_set=surface.level_set,
+            weights=weights,
+        )
     return PressureProjection(
-        grid, boundary, solver, tolerance=tolerance, max_iterations=most, gravity=gravity, coupling=coupling, phi=surface.phi,
-        lets_go=scene.lets_go, weights=weights if scene.short_steps else None,
-    )  # fmt: skip
+        grid,
+        boundary,
+        solver,
+        tolerance=tolerance,
+        max_iterations=most,
+        gravity=gravity,
+        coupling=coupling,
+        phi=surface.phi,
+        lets_go=scene.lets_go,
+        weights=weights if scene.short_steps else None,
+    )
 
 
 def make_viscosity(
-    scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, surface: FreeSurface, bodies: RigidBodies | None
+    scene: LiquidScene,
+    grid: StaggeredGrid,
+    boundary: Boundary,
+    surface: FreeSurface,
+    bodies: RigidBodies | None,
 ) -> Viscosity | None:
     """Return the viscosity of a scene, or None."""
     if scene.viscosity is None:
@@ -129,6 +171,14 @@ def make_viscosity(
     tolerance = scene.solver.tolerance if scene.solver.tolerance != "auto" else VISCOUS_TOLERANCE
     kept = scene.kept([*scene.liquid, *scene.source])
     return Viscosity(
-        grid, boundary, viscosity=scene.viscosity.value, density=scene.physics.density, slip_lengths=scene.slip_lengths,
-        thickest=None if kept is None else max(*kept, 1.0), phi=surface.phi, tolerance=tolerance, sources=bool(scene.source), bodies=bodies,
-    )  # fmt: skip
+        grid,
+        boundary,
+        viscosity=scene.viscosity.value,
+        density=scene.physics.density,
+        slip_lengths=scene.slip_lengths,
+        thickest=None if kept is None else max(*kept, 1.0),
+        phi=surface.phi,
+        tolerance=tolerance,
+        sources=bool(scene.source),
+        bodies=bodies,
+    )

@@ -17,7 +17,13 @@ from warp_lcp.fluids.coupling import BodyCoupling
 from warp_lcp.fluids.tolerance import TimeErrorTolerance
 from warp_lcp.gallery import recorded
 from warp_lcp.grid.advection import FaceVelocity
-from warp_lcp.grid.staggered import ActiveWindow, DirtyRegion, StaggeredGrid, Window, three_components
+from warp_lcp.grid.staggered import (
+    ActiveWindow,
+    DirtyRegion,
+    StaggeredGrid,
+    Window,
+    three_components,
+)
 from warp_lcp.grid.tally import WindowTally
 from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.material.boundary import Boundary
@@ -28,7 +34,15 @@ from warp_lcp.rows import KernelFile
 from warp_lcp.rows.memory import Scalar
 from warp_lcp.rows.program import LaunchGraph, copy
 
-CONSTANTS = {"FLUID": FLUID, "SOLID": SOLID, "AIR": AIR, "TOUCHES": TOUCHES, "LETS_GO": LETS_GO, "RELEASED": RELEASED, "HELD": HELD}
+CONSTANTS = {
+    "FLUID": FLUID,
+    "SOLID": SOLID,
+    "AIR": AIR,
+    "TOUCHES": TOUCHES,
+    "LETS_GO": LETS_GO,
+    "RELEASED": RELEASED,
+    "HELD": HELD,
+}
 THETA_MIN = 1e-3  # the nearest that air comes to a FLUID cell's center, in cells
 KERNELS = KernelFile(Path(__file__).parent / "headers/pressure.h", CONSTANTS)
 COUNT = KERNELS["fluids.pressure.count_fluid"]
@@ -44,15 +58,36 @@ def pressure_passes(cut: bool, moving: bool, ghost: bool, bounded: bool = True) 
         ghost: whether the free surface lies between cells.
         bounded: whether a wall is separating; else there is no lower bound.
     """
-    module = "fluids.pressure" + "_cut" * cut + "_moving" * moving + "_ghost" * ghost + "_equations" * (not bounded)
-    flags = {"CUT": cut, "MOVING": moving, "GHOST": ghost, "BOUNDED": bounded, "THETA_MIN": THETA_MIN, "TINY_WEIGHT": TINY_WEIGHT}
+    module = (
+        "fluids.pressure"
+        + "_cut" * cut
+        + "_moving" * moving
+        + "_ghost" * ghost
+        + "_equations" * (not bounded)
+    )
+    flags = {
+        "CUT": cut,
+        "MOVING": moving,
+        "GHOST": ghost,
+        "BOUNDED": bounded,
+        "THETA_MIN": THETA_MIN,
+        "TINY_WEIGHT": TINY_WEIGHT,
+    }
     names = ("prepare", "subtract_gradient", "support", "contact")
-    return SimpleNamespace(**{name: KERNELS.kernel(f"fluids.pressure.{name}", module=module, constants=flags) for name in names})
+    return SimpleNamespace(
+        **{
+            name: KERNELS.kernel(f"fluids.pressure.{name}", module=module, constants=flags)
+            for name in names
+        }
+    )
 
 
 FACES = "face_x", "face_y", "face_z"  # of an operator
-ROUNDING = 4 * float(np.finfo(np.float32).eps)  # of an outflow, relative to the speeds it is the difference of (float32 faces)
-RELEASE_FACTOR = 10.0  # a wall cell lets go if its outflow exceeds this multiple of the accepted residual: resting ceilings are degenerate
+# of an outflow, relative to the speeds it is the difference of (float32 faces)
+ROUNDING = 4 * float(np.finfo(np.float32).eps)
+# a wall cell lets go if its outflow exceeds this multiple of the accepted residual: resting
+# ceilings are degenerate
+RELEASE_FACTOR = 10.0
 
 
 @dataclass(frozen=True)
@@ -93,7 +128,8 @@ class LiquidBoundary:
 
     Attributes:
         kind: int8 of AIR, FLUID, SOLID.
-        phi: level set of the surface [cells], float32; None: the surface lies at the faces of FLUID cells.
+        phi: level set of the surface [cells], float32; None: the surface lies at the faces of FLUID
+            cells.
         planes: nodes along z that a tent function spans: 1 in 2-D, 2 in 3-D.
         open_x: open fractions of the faces along x, float32; None: walls are whole cells.
         open_y: likewise along y.
@@ -117,22 +153,27 @@ class LiquidBoundary:
 class PressureProjection:
     """Pressure solve and projection of the velocity.
 
-    With x = kick_dt p / (rho dx) [m/s] on FLUID cells, s_f = +-1 outward, a_f the open fraction of a face, u_s the solid's velocity and
-    theta_f the distance to the free surface in cells where air is beyond the face, else 1 [Batty, Bertails & Bridson 2007],
+    With x = kick_dt p / (rho dx) [m/s] on FLUID cells, s_f = +-1 outward, a_f the open fraction of
+    a face, u_s the solid's velocity and theta_f the distance to the free surface in cells where air
+    is beyond the face, else 1 [Batty, Bertails & Bridson 2007],
 
         y_i = b_i + sum over faces of (a_f / theta_f) (x_i - x_neighbor),   b_i = sum of s_f [a_f u*_f + (1 - a_f) u_s,f],   x = 0 in AIR,
 
-    is the net outflow after u = u* - (x_right - x_left) / theta. FLUID cells with a face that is not open on a separating wall have
-    0 <= x complementary to y >= 0, the others y = 0. Liquid that wets the wall has -kick_dt `adhesion` in the place of 0, and its `jump`
-    beside a surface with a stronger pull: air then cannot enter between liquid and wall. Whole cells have a = 0 or 1, a surface on the
-    cells' faces theta = 1: without solids that cut cells the matrix keeps unit weights, and the surface adds a_f (1 / theta_f - 1) to the
-    diagonal. Beyond an open side of the domain lies AIR outside of the operator: its faces add a_f / theta_f.
+    is the net outflow after u = u* - (x_right - x_left) / theta. FLUID cells with a face that is
+    not open on a separating wall have 0 <= x complementary to y >= 0, the others y = 0. Liquid that
+    wets the wall has -kick_dt `adhesion` in the place of 0, and its `jump` beside a surface with a
+    stronger pull: air then cannot enter between liquid and wall. Whole cells have a = 0 or 1, a
+    surface on the cells' faces theta = 1: without solids that cut cells the matrix keeps unit
+    weights, and the surface adds a_f (1 / theta_f - 1) to the diagonal. Beyond an open side of the
+    domain lies AIR outside of the operator: its faces add a_f / theta_f.
 
-    Material in AIR cells has no pressure; where the velocity is continued into air, it takes that of liquid beside it. With `weights`, for
-    short steps, it rests on the surface instead: a face there that particles gave weight takes the mean change of the projected faces
-    around it, but no more than gravity gave it, nor than brings it to their mean velocity. To take that velocity itself, in every step
-    however short, would drag spray along with whatever passes it: at CFL 1/8 that raised the energy of liquid poured over a mesh without
-    bound, and so did changes beyond gravity's at CFL 1/16.
+    Material in AIR cells has no pressure; where the velocity is continued into air, it takes that
+    of liquid beside it. With `weights`, for short steps, it rests on the surface instead: a face
+    there that particles gave weight takes the mean change of the projected faces around it, but no
+    more than gravity gave it, nor than brings it to their mean velocity. To take that velocity
+    itself, in every step however short, would drag spray along with whatever passes it: at CFL 1/8
+    that raised the energy of liquid poured over a mesh without bound, and so did changes beyond
+    gravity's at CFL 1/16.
 
     Args:
         grid: the grid.
@@ -140,65 +181,111 @@ class PressureProjection:
         solver: settings of the method, for example `wl.MinimumMapNewton()`.
         tolerance: relative residual at which a solve is done; "auto": see `fluids.tolerance`.
         max_iterations: of the method a solve may take.
-        phi: float32 distance to the free surface at cell centers [cells], < 0 exactly in FLUID cells; None: it lies on the cells' faces.
+        phi: float32 distance to the free surface at cell centers [cells], < 0 exactly in FLUID
+            cells; None: it lies on the cells' faces.
         coupling: coupling with rigid bodies, whose term is added to A; None: there are none.
         lets_go: whether a wall is separating; else y = 0 on all cells, and no bounds are stored.
-        weights: of the particles on the faces of each component; None: no support of spray by the surface.
+        weights: of the particles on the faces of each component; None: no support of spray by the
+            surface.
         gravity: magnitude of gravity [m/s^2], the limit of that support.
 
     Attributes:
         kind: int8 of AIR, FLUID, SOLID, which the caller marks.
-        cells: `kind` of the last projection, which pressure and contact belong to; as first marked before it.
+        cells: `kind` of the last projection, which pressure and contact belong to; as first marked
+            before it.
         pressure: last accepted x [m/s], float64.
         contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED.
-        known: int8, one field per component: faces that the last projection made valid, see `warp_lcp.grid.extrapolate`.
-        jump: of the pressure across the surface [m/s] in cells beside it, float32, set by the surface tension; None: there is none.
-        adhesion: pressure below that of the air at which liquid detaches from a wall, over rho dx [m/s^2].
+        known: int8, one field per component: faces that the last projection made valid, see
+            `warp_lcp.grid.extrapolate`.
+        jump: of the pressure across the surface [m/s] in cells beside it, float32, set by the
+            surface tension; None: there is none.
+        adhesion: pressure below that of the air at which liquid detaches from a wall, over rho dx
+            [m/s^2].
         automatic: automatic tolerance, or None.
     """
 
     def __init__(
-        self, grid: StaggeredGrid, boundary: Boundary, solver: Any, *, tolerance: float | Literal["auto"], max_iterations: int,
-        phi: wp.array | None = None, coupling: BodyCoupling | None = None, lets_go: bool = True, weights: Sequence[wp.array] | None = None,
+        self,
+        grid: StaggeredGrid,
+        boundary: Boundary,
+        solver: Any,
+        *,
+        tolerance: float | Literal["auto"],
+        max_iterations: int,
+        phi: wp.array | None = None,
+        coupling: BodyCoupling | None = None,
+        lets_go: bool = True,
+        weights: Sequence[wp.array] | None = None,
         gravity: float = 0.0,
-    ) -> None:  # fmt: skip
-        self.grid, self.boundary, self.solver, self._phi, self.coupling = grid, boundary, solver, phi, coupling
+    ) -> None:
+        self.grid, self.boundary, self.solver, self._phi, self.coupling = (
+            grid,
+            boundary,
+            solver,
+            phi,
+            coupling,
+        )
         self._weights, self._gravity = list(weights or ()), gravity
         self.tolerance, self.max_iterations = tolerance, max_iterations
         self.jump: wp.array | None = None
         self.adhesion = 0.0
-        self._passes = pressure_passes(bool(boundary.open), bool(boundary.velocity), phi is not None, lets_go)
-        self.kind, self.cells, self.contact = grid.field(wp.int8), grid.field(wp.int8), grid.field(wp.uint8)
+        self._passes = pressure_passes(
+            bool(boundary.open), bool(boundary.velocity), phi is not None, lets_go
+        )
+        self.kind, self.cells, self.contact = (
+            grid.field(wp.int8),
+            grid.field(wp.int8),
+            grid.field(wp.uint8),
+        )
         self.pressure, self.known = grid.field(wp.float64), grid.faces(wp.int8)
         wp.copy(self.kind, boundary.base)
         self.show()
         self._unknown = self.kind  # FLUID where there is an unknown
         self._b, self._start = (grid.field(wp.float64) for _ in range(2))
-        self._lower = wp.full(grid.shape, -np.inf, dtype=wp.float64, device=grid.device) if lets_go else None
+        self._lower = (
+            wp.full(grid.shape, -np.inf, dtype=wp.float64, device=grid.device) if lets_go else None
+        )
         self._least: Any = -np.inf if self._lower is None else self._lower
         part = grid.part
         opens = part.ranks.any(bool(boundary.open_sides & ~part.cuts))
         self._shift = grid.field() if phi is not None or opens else None
-        self._count, self._contacts = WindowTally(COUNT, grid), WindowTally(self._passes.contact, grid)
-        self._trail, self._cells = DirtyRegion(grid.domain), ActiveWindow(grid.domain)  # those that are solved for
+        self._count, self._contacts = (
+            WindowTally(COUNT, grid),
+            WindowTally(self._passes.contact, grid),
+        )
+        # those that are solved for
+        self._trail, self._cells = DirtyRegion(grid.domain), ActiveWindow(grid.domain)
         self._cells.move_to(part.owned)
         self._rhs, self._guess = part.box_like(self._b), part.box_like(self._start).flatten()
-        self.automatic = TimeErrorTolerance(self._rhs.size, grid.device, part.across) if tolerance == "auto" else None
-        self._ratio_cell, self._adhesion, self._threshold, self._limit = (Scalar() for _ in range(4))
-        self._counting = LaunchGraph(grid.device, lambda: self._count.take(self._cells, kind=self._unknown))
+        self.automatic = (
+            TimeErrorTolerance(self._rhs.size, grid.device, part.across)
+            if tolerance == "auto"
+            else None
+        )
+        self._ratio_cell, self._adhesion, self._threshold, self._limit = (
+            Scalar() for _ in range(4)
+        )
+        self._counting = LaunchGraph(
+            grid.device, lambda: self._count.take(self._cells, kind=self._unknown)
+        )
         self._preparation = LaunchGraph(grid.device, self._launch_preparation)
         launches = self._launch_projection, self._copy_cells, self._copy_faces
         graphs = (LaunchGraph(grid.device, f, at_once=part.at_once) for f in launches)
         self._projection, self._copying, self._copying_faces = graphs
-        self._everyone: int | None = None  # unknowns of all processes in this step, once they are asked for
-        self._problem: wl.LCP | None = None  # built when there is liquid: an empty problem is refused
-        self._last = self._kick = self._ratio = 0.0  # how long forces acted in the last projection and act in this one [s]; by that
+        # unknowns of all processes in this step, once they are asked for
+        self._everyone: int | None = None
+        # built when there is liquid: an empty problem is refused
+        self._problem: wl.LCP | None = None
+        # how long forces acted in the last projection and act in this one [s]; by that
+        self._last = self._kick = self._ratio = 0.0
 
     def show(self) -> None:
         """Set the cell kinds shown in frames before the first projection."""
         wp.copy(self.cells, self.kind)
 
-    def prepare(self, velocity: Sequence[wp.array], dt: float, kick_dt: float, window: Window | None = None) -> bool:
+    def prepare(
+        self, velocity: Sequence[wp.array], dt: float, kick_dt: float, window: Window | None = None
+    ) -> bool:
         """Set up the problem of the marked cells; return whether there is one.
 
         The first guess is the last pressure.
@@ -228,10 +315,19 @@ class PressureProjection:
     def _launch_preparation(self, velocity: Sequence[wp.array]) -> None:
         """Launch the set-up of b, the lower bound, the first guess and the shift of the diagonal."""
         self._cells.run(
-            self._passes.prepare, self._faces, FaceVelocity.of(velocity), touch=self.boundary.touch, previous=self.pressure,
-            b=self._b, lower=self._lower, start=self._start, shift=self._shift, ratio=self._ratio_cell, adhesion=self._adhesion,
+            self._passes.prepare,
+            self._faces,
+            FaceVelocity.of(velocity),
+            touch=self.boundary.touch,
+            previous=self.pressure,
+            b=self._b,
+            lower=self._lower,
+            start=self._start,
+            shift=self._shift,
+            ratio=self._ratio_cell,
+            adhesion=self._adhesion,
             jump=self.jump,
-        )  # fmt: skip
+        )
 
     def _look(self, window: Window | None) -> None:
         """Solve for the cells of a window, and undo what is left of the last one; ranks solve for all of their cells."""
@@ -253,15 +349,25 @@ class PressureProjection:
     def _make_problem(self) -> None:
         part, least, opened = self.grid.part, self._least, self.boundary.open
         fields = [self._unknown, least if isinstance(least, wp.array) else None, self._shift]
-        kind, lower, shift = boxes = [None if field is None else part.box_like(field) for field in fields]
+        kind, lower, shift = boxes = [
+            None if field is None else part.box_like(field) for field in fields
+        ]
         faces = [part.box_like(field) for field in opened]
-        pairs = [*zip(fields, boxes, strict=True), (self._b, self._rhs), (self._start, self._guess.reshape(self._rhs.shape))]
+        pairs = [
+            *zip(fields, boxes, strict=True),
+            (self._b, self._rhs),
+            (self._start, self._guess.reshape(self._rhs.shape)),
+        ]
         self._copied = [(field, box) for field, box in pairs if field is not None and part.shared]
-        self._copied_faces = [(field, box) for field, box in zip(opened, faces, strict=True) if part.shared]
+        self._copied_faces = [
+            (field, box) for field, box in zip(opened, faces, strict=True) if part.shared
+        ]
         self._copy_cells()
         self._copy_faces()
         assert kind is not None
-        self._operator = part.poisson(self.grid.interior(kind.numpy()), shift=shift, **dict(zip(FACES, faces, strict=False)))
+        self._operator = part.poisson(
+            self.grid.interior(kind.numpy()), shift=shift, **dict(zip(FACES, faces, strict=False))
+        )
         self._kinds = kind
         self._problem = wl.LCP(self._joined(), self._rhs, least if lower is None else lower, np.inf)
         self._work = self.solver.init(self._problem)
@@ -282,7 +388,13 @@ class PressureProjection:
     @property
     def _faces(self) -> LiquidBoundary:
         b = self.boundary
-        return LiquidBoundary(self.kind, self._phi, self.grid.planes, *three_components(b.open), *three_components(b.velocity))
+        return LiquidBoundary(
+            self.kind,
+            self._phi,
+            self.grid.planes,
+            *three_components(b.open),
+            *three_components(b.velocity),
+        )
 
     def _copy_cells(self) -> None:
         """Give a rank's problem what the fields of its part hold."""
@@ -305,12 +417,18 @@ class PressureProjection:
         """
         mean = self._criteria(speed)
         assert self._problem is not None, "prepare comes first"
-        result = wl.solve(self._problem, self.solver, stopping=mean, x0=self._guess, workspace=self._work)
+        result = wl.solve(
+            self._problem, self.solver, stopping=mean, x0=self._guess, workspace=self._work
+        )
         if self.coupling is not None and self.coupling.grow_entries():
-            result = wl.solve(self._problem, self.solver, stopping=mean, x0=self._guess, workspace=self._work)
+            result = wl.solve(
+                self._problem, self.solver, stopping=mean, x0=self._guess, workspace=self._work
+            )
         criteria = mean.known()
         if self.automatic is not None and result:
-            self.automatic.measure(self._problem.A, result, criteria, [self._guess, self._rhs], self.counted())
+            self.automatic.measure(
+                self._problem.A, result, criteria, [self._guess, self._rhs], self.counted()
+            )
         return result, criteria
 
     def push_bodies(self, result: wl.SolveResult) -> None:
@@ -321,14 +439,24 @@ class PressureProjection:
     def _criteria(self, speed: float) -> MeanCriteria:
         """Return when a solve is done.
 
-        The absolute tolerance is the rounding noise of b, so that a liquid at rest or in free fall is not iterated on it.
+        The absolute tolerance is the rounding noise of b, so that a liquid at rest or in free fall
+        is not iterated on it.
 
         Args:
             speed: scale of u* [m/s].
         """
         atol = ROUNDING * speed
-        tolerances = {"rtol": self.tolerance, "atol": atol} if self.automatic is None else self.automatic.criteria(self._ratio, atol)
-        return MeanCriteria(**tolerances, max_iterations=self.max_iterations, count=self.counted, counted=self._count.on_device())
+        tolerances = (
+            {"rtol": self.tolerance, "atol": atol}
+            if self.automatic is None
+            else self.automatic.criteria(self._ratio, atol)
+        )
+        return MeanCriteria(
+            **tolerances,
+            max_iterations=self.max_iterations,
+            count=self.counted,
+            counted=self._count.on_device(),
+        )
 
     def recorded(self, speed: float) -> dict[str, np.ndarray]:
         """Return the prepared problem in the format of `warp_lcp.gallery.recorded`.
@@ -340,24 +468,39 @@ class PressureProjection:
         """
         assert self._problem is not None, "prepare comes first"
         criteria = self._criteria(speed).known()
-        numbers = {"tolerance": criteria.rtol, "absolute_tolerance": criteria.atol, "spacing": self.grid.spacing}
-        return recorded.arrays(self._problem, self._start) | {name: np.array(value) for name, value in numbers.items()}
+        numbers = {
+            "tolerance": criteria.rtol,
+            "absolute_tolerance": criteria.atol,
+            "spacing": self.grid.spacing,
+        }
+        return recorded.arrays(self._problem, self._start) | {
+            name: np.array(value) for name, value in numbers.items()
+        }
 
     def fields(self) -> list[wp.array]:
         """Return the problem's fields: cells, right-hand side, lower bound, first guess."""
         return [self.kind, self._b, *([] if self._lower is None else [self._lower]), self._start]
 
-    def project(self, velocity: Sequence[wp.array], window: Window, result: wl.SolveResult, criteria: wl.StoppingCriteria) -> Projection:
+    def project(
+        self,
+        velocity: Sequence[wp.array],
+        window: Window,
+        result: wl.SolveResult,
+        criteria: wl.StoppingCriteria,
+    ) -> Projection:
         """Apply a solution: subtract the gradient, mark valid faces and released cells.
 
         Args:
-            velocity: u* of each component [m/s] (updated on open faces that touch FLUID, and on those with weight beside them).
+            velocity: u* of each component [m/s] (updated on open faces that touch FLUID, and on
+                those with weight beside them).
             window: cells that hold all FLUID cells, with one to spare on each side.
             result: of `solve`.
             criteria: of `solve`.
         """
         unknowns = self.counted()
-        reference = result.residual / result.relative_residual if result.relative_residual > 0.0 else 0.0
+        reference = (
+            result.residual / result.relative_residual if result.relative_residual > 0.0 else 0.0
+        )
         # the criteria bound a 2-norm; what a cell may carry of it is the root mean square
         threshold = RELEASE_FACTOR * criteria.tolerance(reference) / max(unknowns, 1) ** 0.5
         self._threshold.value = threshold
@@ -374,12 +517,24 @@ class PressureProjection:
         for axis, field in enumerate(velocity):
             window.clear(self.known[axis])
             known = self.known[axis]
-            window.run(self._passes.subtract_gradient, self._faces, x=self.pressure, field=field, known=known, axis=axis)
+            window.run(
+                self._passes.subtract_gradient,
+                self._faces,
+                x=self.pressure,
+                field=field,
+                known=known,
+                axis=axis,
+            )
         self._support(velocity, window)
         self._contacts.take(
-            self._cells, self._faces, FaceVelocity.of(velocity), touch=self.boundary.touch, x=self.pressure, contact=self.contact,
+            self._cells,
+            self._faces,
+            FaceVelocity.of(velocity),
+            touch=self.boundary.touch,
+            x=self.pressure,
+            contact=self.contact,
             threshold=self._threshold,
-        )  # fmt: skip
+        )
         self.grid.part.fill(*velocity, *self.known, self.contact)
 
     def counted(self) -> int:
@@ -394,7 +549,9 @@ class PressureProjection:
         Indices (x, y, z) from 0 in the whole domain.
         """
         part = self.grid.part
-        mine = np.argwhere(~np.isfinite(part.box_of(self._b.numpy())))[:, ::-1] + np.array(part.first)
+        mine = np.argwhere(~np.isfinite(part.box_of(self._b.numpy())))[:, ::-1] + np.array(
+            part.first
+        )
         return np.concatenate(part.ranks.collect(mine))
 
     def fluid_cells(self) -> np.ndarray:
@@ -412,7 +569,9 @@ class PressureProjection:
             "pressure_dt": np.array(self._last),
             "cells": self.cells.numpy().copy(),
             "contact": self.contact.numpy().copy(),
-            "time_error": np.array([-1.0, 0.0]) if self.automatic is None else self.automatic.state(),
+            "time_error": np.array([-1.0, 0.0])
+            if self.automatic is None
+            else self.automatic.state(),
         }
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
@@ -436,11 +595,20 @@ class PressureProjection:
     def _support(self, velocity: Sequence[wp.array], window: Window) -> None:
         """Let the pressure act on what rests on the surface; its faces become known after the projected ones, also those of others."""
         self.grid.part.fill(*velocity, *self.known)
-        for axis, (field, weight, known) in enumerate(zip(velocity, self._weights, self.known, strict=False)):
+        for axis, (field, weight, known) in enumerate(
+            zip(velocity, self._weights, self.known, strict=False)
+        ):
             window.run(
-                self._passes.support, self._faces, x=self.pressure, field=field, known=known, weight=weight, jump=self.jump,
-                axis=axis, limit=self._limit,
-            )  # fmt: skip
+                self._passes.support,
+                self._faces,
+                x=self.pressure,
+                field=field,
+                known=known,
+                weight=weight,
+                jump=self.jump,
+                axis=axis,
+                limit=self._limit,
+            )
 
     def _accept(self, x: wp.array) -> None:
         """Take the solution of the problem, and show its cells."""

@@ -21,7 +21,9 @@ if typing.TYPE_CHECKING:
 
 _FLUID, _SOLID = wp.constant(wp.int8(FLUID)), wp.constant(wp.int8(SOLID))
 STEP = wp.constant(0.25)  # cells between two looks for the surface
-VALUES = 6  # of a probe: pressure over density, velocity, level, and whether that is where the search ended, in liquid
+# of a probe: pressure over density, velocity, level, and whether that is where the search ended, in
+# liquid
+VALUES = 6
 FAR = 1e9  # cells: farther than any grid
 
 options: dict[str, typing.Any] = {"module": "fluids.probes"}
@@ -63,13 +65,27 @@ def depth_of(x: wp.vec3, planes: int, shape: wp.vec3i, kind: I8, phi: F32):
 @forward_kernel(**options)
 @typing.no_type_check
 def probe_kernel(
-    points: wp.array(dtype=wp.vec3), counts: wp.vec3i, planes: int, kind: I8, x: F64, phi: F32, u: F32, v: F32, w: F32,
-    kick_x: float, kick_y: float, kick_z: float, up: wp.vec3, reach: wp.array(dtype=wp.vec2), values: wp.array2d(dtype=wp.float64),
-):  # fmt: skip
+    points: wp.array(dtype=wp.vec3),
+    counts: wp.vec3i,
+    planes: int,
+    kind: I8,
+    x: F64,
+    phi: F32,
+    u: F32,
+    v: F32,
+    w: F32,
+    kick_x: float,
+    kick_y: float,
+    kick_z: float,
+    up: wp.vec3,
+    reach: wp.array(dtype=wp.vec2),
+    values: wp.array2d(dtype=wp.float64),
+):
     """Find x [m/s], velocity [m/s] and level [cells] at points in array coordinates, in which cell i reaches from i to i + 1.
 
-    The kick [m/s] is what gravity adds to x from a cell to the next along each axis, `up` points against it and has
-    length 1. The surface is looked for between two distances from the point, `reach` [cells].
+    The kick [m/s] is what gravity adds to x from a cell to the next along each axis, `up` points
+    against it and has length 1. The surface is looked for between two distances from the point,
+    `reach` [cells].
     """
     t = wp.tid()
     kick = wp.vec3(kick_x, kick_y, kick_z)
@@ -135,10 +151,12 @@ def probe_kernel(
 class Probes:
     """Measure at points that stay where they are; `row` is collective.
 
-    Pressure is interpolated trilinearly from the liquid's cells; air and solids among the eight around a point are left out, and what the
-    others have is continued to the point by the pressure at rest's gradient rho g. Velocity is trilinear on each component's faces. Where
-    the point's cell holds no liquid pressure is 0 and velocity has no value. The level is the way from the point against gravity to the
-    first surface above it, or to the solid or the domain's end that comes before; 0 if the point is not in liquid.
+    Pressure is interpolated trilinearly from the liquid's cells; air and solids among the eight
+    around a point are left out, and what the others have is continued to the point by the pressure
+    at rest's gradient rho g. Velocity is trilinear on each component's faces. Where the point's
+    cell holds no liquid pressure is 0 and velocity has no value. The level is the way from the
+    point against gravity to the first surface above it, or to the solid or the domain's end that
+    comes before; 0 if the point is not in liquid.
 
     Args:
         probes: of the scene.
@@ -160,21 +178,35 @@ class Probes:
 
     def row(self, simulation: "LiquidSimulation") -> Row:
         """Return what a step has found, before anything moves."""
-        found, scale = self._measure(simulation), simulation.scene.physics.density * simulation.grid.spacing / simulation.kick_dt
+        found, scale = (
+            self._measure(simulation),
+            simulation.scene.physics.density * simulation.grid.spacing / simulation.kick_dt,
+        )
         row: Row = {}
         for probe, values in zip(self.probes, found, strict=True):
-            shown = {"pressure": values[:1] * scale, "velocity": values[1:4], "level": values[4:5] * simulation.grid.spacing}
-            row |= dict(zip(probe.columns(self.dimension), shown[probe.quantity].tolist(), strict=False))
+            shown = {
+                "pressure": values[:1] * scale,
+                "velocity": values[1:4],
+                "level": values[4:5] * simulation.grid.spacing,
+            }
+            row |= dict(
+                zip(probe.columns(self.dimension), shown[probe.quantity].tolist(), strict=False)
+            )
         return row
 
     def _reach(self, grid: StaggeredGrid) -> np.ndarray:
         """Return between which distances from each probe the surface is looked for [cells], shape (probes, 2); 0 and 0: nowhere."""
-        if not self._up.any():  # no direction is up, and no probe asks for a level: nothing would end the search
+        # no direction is up, and no probe asks for a level: nothing would end the search
+        if not self._up.any():
             return np.zeros((len(self.probes), 2))
         if grid.part.shared:
             return self._ways_through(grid)
         cells = grid.to_grid(self._points)[:, : grid.dimension] - grid.origin[: grid.dimension]
-        inside = np.all((cells >= 1.0) & (cells <= np.array(grid.counts[: grid.dimension]) + 1.0), axis=1, keepdims=True)
+        inside = np.all(
+            (cells >= 1.0) & (cells <= np.array(grid.counts[: grid.dimension]) + 1.0),
+            axis=1,
+            keepdims=True,
+        )
         return np.where(inside, [0.0, FAR], 0.0)
 
     def _ways_through(self, grid: StaggeredGrid) -> np.ndarray:
@@ -191,7 +223,9 @@ class Probes:
         last = np.where(up == 0.0, np.where(inside, np.inf, -np.inf), ways.max(axis=0)).min(axis=1)
         begin, end = STEP * np.floor(np.maximum(first, 0.0) / STEP), STEP * np.ceil(last / STEP)
         meets = (last >= 0.0) & (last >= first) & np.isfinite(begin)
-        return np.where(meets[:, None], np.stack([begin, np.maximum(end, begin + STEP)], axis=1), 0.0)
+        return np.where(
+            meets[:, None], np.stack([begin, np.maximum(end, begin + STEP)], axis=1), 0.0
+        )
 
     def _joined(self, mine: np.ndarray, reach: np.ndarray, grid: StaggeredGrid) -> np.ndarray:
         """Return what all ranks have found: at a point the one whose box has it, of a level those over whose boxes the way up leads."""
@@ -209,17 +243,27 @@ class Probes:
 
     def _measure(self, simulation: "LiquidSimulation") -> np.ndarray:
         """Return x [m/s], velocity [m/s] and level [cells] of each probe."""
-        grid, projection, velocity = simulation.grid, simulation.projection, three_components(simulation.velocity)
+        grid, projection, velocity = (
+            simulation.grid,
+            simulation.projection,
+            three_components(simulation.velocity),
+        )
         if self._grid is not grid:
             self._grid, self._measuring = grid, LaunchGraph(grid.device, self._launch)
             points = (grid.to_grid(self._points) - grid.origin).astype(np.float32)
             self._at = wp.array(points, dtype=wp.vec3, device=grid.device)
             self._reached = self._reach(grid)
-            self._ways = wp.array(self._reached.astype(np.float32), dtype=wp.vec2, device=grid.device)
-            self._values = wp.zeros((len(self.probes), VALUES), dtype=wp.float64, device=grid.device)
+            self._ways = wp.array(
+                self._reached.astype(np.float32), dtype=wp.vec2, device=grid.device
+            )
+            self._values = wp.zeros(
+                (len(self.probes), VALUES), dtype=wp.float64, device=grid.device
+            )
         for number, change in zip(self._kick, self.gravity * simulation.kick_dt, strict=True):
             number.value = float(change)
-        self._measuring.run([projection.kind, projection.pressure, simulation.surface.phi, *velocity])
+        self._measuring.run(
+            [projection.kind, projection.pressure, simulation.surface.phi, *velocity]
+        )
         mine = np.array(self._values.numpy())
         return self._joined(mine, self._reached, grid) if grid.part.shared else mine
 
@@ -227,5 +271,14 @@ class Probes:
         """Launch the search at all points."""
         assert self._grid is not None, "the grid is known"
         counts, up = wp.vec3i(*self._grid.counts), wp.vec3(*self._up)
-        inputs = [self._at, counts, self._grid.planes, *fields, *self._kick, up, self._ways, self._values]
+        inputs = [
+            self._at,
+            counts,
+            self._grid.planes,
+            *fields,
+            *self._kick,
+            up,
+            self._ways,
+            self._values,
+        ]
         launch(probe_kernel, len(self.probes), inputs, device=self._grid.device)

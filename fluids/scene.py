@@ -23,40 +23,67 @@ LEVEL_SET_BYTES = 19  # more for a surface between cells, or slivers
 SMOOTHING_BYTES = 12
 TENSION_BYTES = 21
 UNILATERAL_BYTES = 1
-VISCOUS_BYTES = {2: 140, 3: 220}  # its fields, those of coarse levels, and the velocity before the pressure
-SHORT_STEPS = 0.5  # Courant numbers below it: liquid over a mesh gained energy without bound at 1/4 on 40 cells, at 1/8 on 20
-BODY_BYTES, POTENTIAL_BYTES = 8, 4  # of a right-hand side that bodies change, and a motion of a body, if it is light
-VISCOSITY = Usual(1e-4, 1e7, "Pa s", "0.001 (water), 10 (honey), 10,000 (tar)", "m^2/s of a liquid as heavy as water", 1e3)
+# its fields, those of coarse levels, and the velocity before the pressure
+VISCOUS_BYTES = {2: 140, 3: 220}
+# Courant numbers below it: liquid over a mesh gained energy without bound at 1/4 on 40 cells, at
+# 1/8 on 20
+SHORT_STEPS = 0.5
+# of a right-hand side that bodies change, and a motion of a body, if it is light
+BODY_BYTES, POTENTIAL_BYTES = 8, 4
+VISCOSITY = Usual(
+    1e-4,
+    1e7,
+    "Pa s",
+    "0.001 (water), 10 (honey), 10,000 (tar)",
+    "m^2/s of a liquid as heavy as water",
+    1e3,
+)
 TENSION = Usual(1e-4, 3.0, "N/m", "0.02 to 0.5, 0.072 for water,", "mN/m", 1e-3)
 DRAG = Usual(0.0, 1.0, "", "about 0.005")
 LIQUID_CFL = Usual(0.0, 10.0, "", "1 to 4")
-COUPLED_METHODS = ("projected-multigrid", "minimum-map-newton", "primal-dual-active-set")  # for A + U W U', see `fluids.coupling`
+# for A + U W U', see `fluids.coupling`
+COUPLED_METHODS = ("projected-multigrid", "minimum-map-newton", "primal-dual-active-set")
 
 
 class Pressure(Table):
     """[pressure]: pressure model and free surface."""
 
     model: Literal["incompressible", "unilateral"] = Field(
-        default="incompressible", description="incompressible, or unilateral: no suction, liquid separates freely"
+        default="incompressible",
+        description="incompressible, or unilateral: no suction, liquid separates freely",
     )
     surface: Literal["ghost-fluid", "voxel"] = Field(
         default="ghost-fluid", description="ghost-fluid: between cell centers; voxel: on cell faces"
     )
-    smoothing: int = Field(default=0, ge=0, le=8, description="filter passes over a ghost-fluid surface")
+    smoothing: int = Field(
+        default=0, ge=0, le=8, description="filter passes over a ghost-fluid surface"
+    )
 
 
 class Viscosity(Table):
     """[viscosity]: viscous liquid; off without the table."""
 
-    value: float = Field(gt=0, le=1e9, allow_inf_nan=False, description="dynamic viscosity [Pa s]: water 0.001, honey 10")
-    slip_length: float = Field(default=0.0, ge=0, allow_inf_nan=True, description='slip length of "separating" and "sticky" walls [m]')
+    value: float = Field(
+        gt=0,
+        le=1e9,
+        allow_inf_nan=False,
+        description="dynamic viscosity [Pa s]: water 0.001, honey 10",
+    )
+    slip_length: float = Field(
+        default=0.0,
+        ge=0,
+        allow_inf_nan=True,
+        description='slip length of "separating" and "sticky" walls [m]',
+    )
 
 
 class SurfaceTensionSettings(Table):
     """[surface_tension]: tension of the free surface; off without the table."""
 
     coefficient: Positive = Field(description="surface tension [N/m]; water 0.072")
-    contact_angle: float = Field(default=90.0, ge=0, le=180, description="in the liquid [degrees]; above 90 walls repel it")
+    contact_angle: float = Field(
+        default=90.0, ge=0, le=180, description="in the liquid [degrees]; above 90 walls repel it"
+    )
 
 
 class LiquidScene(ParticleScene):
@@ -67,7 +94,8 @@ class LiquidScene(ParticleScene):
 
     solve_bytes: ClassVar[int] = PRESSURE_BYTES
     carried_by_grid: ClassVar[bool] = True
-    stirred: ClassVar[float] = 1.2  # splashed liquid lies in more cells, and solves take more iterations
+    # splashed liquid lies in more cells, and solves take more iterations
+    stirred: ClassVar[float] = 1.2
 
     pressure: Pressure = Field(default_factory=Pressure)
     viscosity: Viscosity | None = Field(default=None)
@@ -84,16 +112,25 @@ class LiquidScene(ParticleScene):
         """Return errors that involve several keys."""
         found = super().complaints()
         if self.solver.method not in COUPLED_METHODS and any(solid.is_body for solid in self.solid):
-            message = f"cannot be combined with rigid bodies (their part of the matrix has only products); use {', '.join(COUPLED_METHODS)}"
+            message = (
+                "cannot be combined with rigid bodies (their part of the matrix has only "
+                f"products); use {', '.join(COUPLED_METHODS)}"
+            )
             found.append(Complaint(("solver", "method"), self.solver.method, message))
         if self.pressure.model == "unilateral" and self.pressure.surface == "voxel":
             found.append(
                 Complaint(
-                    ("pressure", "surface"), "voxel", 'cannot be combined with pressure.model = "unilateral", which has no free surface'
+                    ("pressure", "surface"),
+                    "voxel",
+                    'cannot be combined with pressure.model = "unilateral", which has no free '
+                    "surface",
                 )
             )
         if self.pressure.model == "unilateral" and self.particles.narrow_band is not None:
-            message = 'cannot be combined with pressure.model = "unilateral", whose liquid may separate anywhere inside'
+            message = (
+                'cannot be combined with pressure.model = "unilateral", whose liquid may '
+                "separate anywhere inside"
+            )
             found.append(Complaint(("particles", "narrow_band"), None, message))
         elif self.pressure.surface == "voxel" and self.particles.narrow_band is not None:
             message = 'needs pressure.surface = "ghost-fluid", which computes how full cells are'
@@ -102,15 +139,28 @@ class LiquidScene(ParticleScene):
             message = 'needs pressure.surface = "ghost-fluid", whose surface has a curvature'
             found.append(Complaint(("surface_tension",), None, message))
         if self.surface_tension is not None and self.pressure.model == "unilateral":
-            message = 'needs pressure.model = "incompressible": surface tension needs a pressure that may be negative'
+            message = (
+                'needs pressure.model = "incompressible": surface tension needs a pressure '
+                "that may be negative"
+            )
             found.append(Complaint(("surface_tension",), None, message))
-        return [*found, *self._viscosity_complaints(), *probe_complaints(self.probe, self.domain.size, self.physics.gravity)]
+        return [
+            *found,
+            *self._viscosity_complaints(),
+            *probe_complaints(self.probe, self.domain.size, self.physics.gravity),
+        ]
 
     def notes(self) -> list[str]:
         """Return suspicious settings."""
-        found, tension = [*super().notes(), *LIQUID_DENSITY.notes("physics.density", self.physics.density)], self.surface_tension
+        found, tension = (
+            [*super().notes(), *LIQUID_DENSITY.notes("physics.density", self.physics.density)],
+            self.surface_tension,
+        )
         given = [("viscosity.value", self.viscosity.value if self.viscosity else None)]
-        given += [(f"{place}.viscosity", getattr(shape, "viscosity", None)) for place, shape in self.shapes()]
+        given += [
+            (f"{place}.viscosity", getattr(shape, "viscosity", None))
+            for place, shape in self.shapes()
+        ]
         for place, value in given:
             found += VISCOSITY.notes(place, value)
         found += LIQUID_CFL.notes("time.cfl", self.time.cfl)
@@ -119,12 +169,21 @@ class LiquidScene(ParticleScene):
             if 0.0 < tension.contact_angle <= math.pi + 0.01:
                 degrees = math.degrees(tension.contact_angle)
                 found.append(
-                    f"surface_tension.contact_angle = {tension.contact_angle:g} is in degrees; if radians were meant, it is {degrees:.3g}"
+                    f"surface_tension.contact_angle = {tension.contact_angle:g} is in degrees; if "
+                    f"radians were meant, it is {degrees:.3g}"
                 )
         drags = (
-            [("wall_drag.coefficient", self.wall_drag.coefficient), ("wall_drag.domain", self.wall_drag.domain)] if self.wall_drag else []
+            [
+                ("wall_drag.coefficient", self.wall_drag.coefficient),
+                ("wall_drag.domain", self.wall_drag.domain),
+            ]
+            if self.wall_drag
+            else []
         )
-        for place, value in [*drags, *((f"solid[{n}].drag", solid.drag) for n, solid in enumerate(self.solid))]:
+        for place, value in [
+            *drags,
+            *((f"solid[{n}].drag", solid.drag) for n, solid in enumerate(self.solid)),
+        ]:
             found += DRAG.notes(place, value)
         return found
 
@@ -140,26 +199,58 @@ class LiquidScene(ParticleScene):
         own = [given for given in own if given[-1] is not None]
         if self.viscosity is not None:
             message = "cannot be combined with liquids of different viscosities"
-            return [Complaint(("particles", "narrow_band"), None, message)] if own and self.particles.narrow_band is not None else []
+            return (
+                [Complaint(("particles", "narrow_band"), None, message)]
+                if own and self.particles.narrow_band is not None
+                else []
+            )
         message = 'needs the table [viscosity]; without viscosity use "free-slip"'
-        walls = [(("domain", "wall"), self.domain.wall), *((("solid", n, "wall"), solid.wall) for n, solid in enumerate(self.solid))]
+        walls = [
+            (("domain", "wall"), self.domain.wall),
+            *((("solid", n, "wall"), solid.wall) for n, solid in enumerate(self.solid)),
+        ]
         found = [Complaint(place, wall, message) for place, wall in walls if wall == "sticky"]
-        slips = [(n, solid.slip_length) for n, solid in enumerate(self.solid) if solid.slip_length is not None]
-        found += [Complaint((key, n, "viscosity"), value, "needs the table [viscosity]") for key, n, value in own]
-        return found + [Complaint(("solid", n, "slip_length"), slip, "needs the table [viscosity]") for n, slip in slips]
+        slips = [
+            (n, solid.slip_length)
+            for n, solid in enumerate(self.solid)
+            if solid.slip_length is not None
+        ]
+        found += [
+            Complaint((key, n, "viscosity"), value, "needs the table [viscosity]")
+            for key, n, value in own
+        ]
+        return found + [
+            Complaint(("solid", n, "slip_length"), slip, "needs the table [viscosity]")
+            for n, slip in slips
+        ]
 
-    def kept(self, materials: Sequence[MaterialProperties | SourceProperties]) -> list[float] | None:
+    def kept(
+        self, materials: Sequence[MaterialProperties | SourceProperties]
+    ) -> list[float] | None:
         """Return viscosities relative to `viscosity.value`; None: one viscosity."""
-        if self.viscosity is None or all(shape.viscosity is None for shape in (*self.liquid, *self.source)):
+        if self.viscosity is None or all(
+            shape.viscosity is None for shape in (*self.liquid, *self.source)
+        ):
             return None
-        return [(getattr(shape, "viscosity", None) or self.viscosity.value) / self.viscosity.value for shape in materials]
+        return [
+            (getattr(shape, "viscosity", None) or self.viscosity.value) / self.viscosity.value
+            for shape in materials
+        ]
 
     @property
     def slip_lengths(self) -> list[float]:
         """Return the slip lengths of the domain's wall and of each solid [m]."""
         assert self.viscosity is not None
-        own = [(self.domain.wall, None), *((solid.wall or self.domain.wall, solid.slip_length) for solid in self.solid)]
-        return [math.inf if wall == "free-slip" else (self.viscosity.slip_length if slip is None else slip) for wall, slip in own]
+        own = [
+            (self.domain.wall, None),
+            *((solid.wall or self.domain.wall, solid.slip_length) for solid in self.solid),
+        ]
+        return [
+            math.inf
+            if wall == "free-slip"
+            else (self.viscosity.slip_length if slip is None else slip)
+            for wall, slip in own
+        ]
 
     def models(self) -> list[Model]:
         """Return the models that the scene turns on, and those that have no effect."""
@@ -169,17 +260,38 @@ class LiquidScene(ParticleScene):
         if self.pressure.model == "unilateral":
             found.append(Model("unilateral pressure", 'pressure.model = "unilateral"'))
         elif self.lets_go:
-            found.append(Model("separating walls", "liquid may separate from domain.wall or a solid: bounds on the pressure"))
+            found.append(
+                Model(
+                    "separating walls",
+                    "liquid may separate from domain.wall or a solid: bounds on the pressure",
+                )
+            )
         elif self.domain.wall == "separating":
-            found.append(Model("separating walls", "the domain has no wall: equations without bounds", built=False))
+            found.append(
+                Model(
+                    "separating walls",
+                    "the domain has no wall: equations without bounds",
+                    built=False,
+                )
+            )
         if ghost:
-            found.append(Model("ghost-fluid surface", closed if full else 'pressure.surface = "ghost-fluid"', built=not full))
+            found.append(
+                Model(
+                    "ghost-fluid surface",
+                    closed if full else 'pressure.surface = "ghost-fluid"',
+                    built=not full,
+                )
+            )
         if self.pressure.smoothing and ghost:
-            found.append(Model("smoothing", closed if full else "pressure.smoothing", built=not full))
+            found.append(
+                Model("smoothing", closed if full else "pressure.smoothing", built=not full)
+            )
         if self.viscosity is not None:
             found.append(Model("viscosity", "viscosity.value"))
         if self.surface_tension is not None:
-            found.append(Model("surface tension", closed if full else "[surface_tension]", built=not full))
+            found.append(
+                Model("surface tension", closed if full else "[surface_tension]", built=not full)
+            )
         if self.short_steps:
             found.append(Model("support of spray", f"time.cfl is below {SHORT_STEPS}"))
         if self.solver.tolerance == "auto":
@@ -189,7 +301,12 @@ class LiquidScene(ParticleScene):
         if self.output.forces:
             found.append(Model("forces on solids", "output.forces"))
         if self.drags is not None:
-            found.append(Model("drag along walls", "[wall_drag]" if self.wall_drag is not None else "drag of a solid"))
+            found.append(
+                Model(
+                    "drag along walls",
+                    "[wall_drag]" if self.wall_drag is not None else "drag of a solid",
+                )
+            )
         return [*found, *super().models()]
 
     @property
@@ -231,14 +348,31 @@ class LiquidScene(ParticleScene):
 
         True if only solids at rest take space besides the liquid.
         """
-        openings = self.domain.open or self.source or self.drain or any(solid.moves for solid in self.solid)
-        return not openings and self.particles.narrow_band is None and self.pressure.model == "incompressible" and self._filled()
+        openings = (
+            self.domain.open
+            or self.source
+            or self.drain
+            or any(solid.moves for solid in self.solid)
+        )
+        return (
+            not openings
+            and self.particles.narrow_band is None
+            and self.pressure.model == "incompressible"
+            and self._filled()
+        )
 
     def _filled(self) -> bool:
         """Return whether a box of liquid holds the whole domain."""
         for liquid in self.liquid:
-            bounds = liquid.bounds(self.dimension) if liquid.shape == "box" and liquid.rotate is None and not liquid.invert else None
-            if bounds is not None and all(bounds[0][a] <= 0.0 and bounds[1][a] >= side for a, side in enumerate(self.domain.size)):
+            bounds = (
+                liquid.bounds(self.dimension)
+                if liquid.shape == "box" and liquid.rotate is None and not liquid.invert
+                else None
+            )
+            if bounds is not None and all(
+                bounds[0][a] <= 0.0 and bounds[1][a] >= side
+                for a, side in enumerate(self.domain.size)
+            ):
                 return True
         return False
 
@@ -246,7 +380,9 @@ class LiquidScene(ParticleScene):
     def lets_go(self) -> bool:
         """Return whether a wall of the scene is separating."""
         walls = self.domain.wall == "separating" and len(self.domain.open) < 2 * self.dimension
-        return walls or any((solid.wall or self.domain.wall) == "separating" for solid in self.solid)
+        return walls or any(
+            (solid.wall or self.domain.wall) == "separating" for solid in self.solid
+        )
 
     @property
     def coheres(self) -> bool:
@@ -267,7 +403,12 @@ class LiquidScene(ParticleScene):
         bounded = self.lets_go or self.pressure.model == "unilateral"
         motions = sum(solid.is_body for solid in self.solid) * (3 if self.dimension == 2 else 6)
         return {
-            "pressure": cells * (PRESSURE_BYTES - BOUND_BYTES * (not bounded) + UNILATERAL_BYTES * (self.pressure.model == "unilateral")),
+            "pressure": cells
+            * (
+                PRESSURE_BYTES
+                - BOUND_BYTES * (not bounded)
+                + UNILATERAL_BYTES * (self.pressure.model == "unilateral")
+            ),
             "viscosity": cells
             * (self.viscosity is not None)
             * (VISCOUS_BYTES[self.dimension] + 4 * self.dimension * (self.kept(()) is not None)),
@@ -275,6 +416,11 @@ class LiquidScene(ParticleScene):
             "drag along walls": cells * 4 * self.dimension * (self.drags is not None),
             "surface": cells
             * (not self.stays_full)
-            * (LEVEL_SET_BYTES * (level_set or self.cuts_cells) + SMOOTHING_BYTES * (level_set and self.pressure.smoothing > 0)),
-            "surface tension": cells * TENSION_BYTES * (self.surface_tension is not None and not self.stays_full),
+            * (
+                LEVEL_SET_BYTES * (level_set or self.cuts_cells)
+                + SMOOTHING_BYTES * (level_set and self.pressure.smoothing > 0)
+            ),
+            "surface tension": cells
+            * TENSION_BYTES
+            * (self.surface_tension is not None and not self.stays_full),
         }

@@ -11,7 +11,13 @@ import numpy as np
 
 import warp_lcp as wl
 from warp_lcp.fluids.forces import SolidForces, WallSums
-from warp_lcp.fluids.models import LiquidModel, make_pressure, make_surface, make_tension, make_viscosity
+from warp_lcp.fluids.models import (
+    LiquidModel,
+    make_pressure,
+    make_surface,
+    make_tension,
+    make_viscosity,
+)
 from warp_lcp.fluids.pressure import Projection
 from warp_lcp.fluids.probes import Probes
 from warp_lcp.fluids.scene import LiquidScene
@@ -49,7 +55,8 @@ if TYPE_CHECKING:
     from warp_lcp.distributed.ranks import Ranks
 
 
-METHODS_ON_RANKS = ("projected-multigrid", "minimum-map-newton")  # that solve problems of several ranks
+# that solve problems of several ranks
+METHODS_ON_RANKS = ("projected-multigrid", "minimum-map-newton")
 MOST_PARTS = 8  # of the viscous solve in a step that is much shorter than the last one
 
 
@@ -91,42 +98,67 @@ class LiquidSimulation(ParticleSimulation):
         self.forces = SolidForces(solids, grid.dimension) if tell else None
         super().__init__(scene, grid, parts, particles, **more)
         self.record: Callable[[Mapping[str, np.ndarray]], object] | None = None
-        self.reach = max(self.layers, 2 * scene.pressure.smoothing, 0 if self.tension is None else REACH)
+        self.reach = max(
+            self.layers, 2 * scene.pressure.smoothing, 0 if self.tension is None else REACH
+        )
         self.measured: dict[str, Row] = {}
         if self.tension is not None:
             longest = self.tension.longest_step()
             self._notes.append(f"surface tension: steps of at most {longest:.3g} s")
             if scene.time.dt_min > longest:
-                self._notes.append(f"time.dt_min = {scene.time.dt_min:g} s is longer, and steps would be unstable: use {0.1 * longest:.1g}")
+                self._notes.append(
+                    f"time.dt_min = {scene.time.dt_min:g} s is longer, and steps would be "
+                    f"unstable: use {0.1 * longest:.1g}"
+                )
         self.mark()
 
     def allocate(self, grid: StaggeredGrid, parts: Parts) -> None:
         """Allocate the fields of a grid."""
         super().allocate(grid, parts)
         self.surface = make_surface(self.scene, grid, self.boundary, self._fill_density())
-        self._surface_graph = LaunchGraph(grid.device, self._launch_surface, at_once=grid.part.at_once)
+        self._surface_graph = LaunchGraph(
+            grid.device, self._launch_surface, at_once=grid.part.at_once
+        )
         self.tension = make_tension(self.scene, grid, self.boundary, self.surface)
-        self.projection = make_pressure(self.scene, grid, self.boundary, self.surface, self.weights, self.bodies)
+        self.projection = make_pressure(
+            self.scene, grid, self.boundary, self.surface, self.weights, self.bodies
+        )
         self.probes = Probes(self.scene.probe, self.gravity, grid) if self.scene.probe else None
         drags, physics = self.scene.drags, self.scene.physics
         asked = self.forces is not None or drags is not None
         self.wall_sums = WallSums(grid, self.boundary, 1 + len(self.scene.solid)) if asked else None
-        self.wall_drag = WallDrag(grid, self.boundary, drags, physics.density) if drags is not None else None
+        self.wall_drag = (
+            WallDrag(grid, self.boundary, drags, physics.density) if drags is not None else None
+        )
         self.viscosity = make_viscosity(self.scene, grid, self.boundary, self.surface, self.bodies)
         if self.models:  # flights and spray know of gravity alone
             self.flights = None
         for model in self.models:
             model.allocate(self)
         if self.tension is not None:
-            self.projection.jump, self.projection.adhesion = self.tension.jump, self.tension.adhesion
+            self.projection.jump, self.projection.adhesion = (
+                self.tension.jump,
+                self.tension.adhesion,
+            )
 
     def particles_to_grid(self, window: Window) -> None:
         """Transfer velocity (and viscosity) of particles to the faces; apply gravity."""
         super().particles_to_grid(window)
         if self.viscosity is not None and self.viscosity.relative:
-            p, fields = self.particles, (self.viscosity.relative, self.weights)  # which stay what they are
-            particles_to_faces(self.grid, p.position, p.kept, [], *fields, window=window, offsets=p.offsets, runs=p.runs)
-            self.grid.part.fill(*self.viscosity.relative, *self.weights)  # ghost particles' own ghosts would have a share
+            # which stay what they are
+            p, fields = self.particles, (self.viscosity.relative, self.weights)
+            particles_to_faces(
+                self.grid,
+                p.position,
+                p.kept,
+                [],
+                *fields,
+                window=window,
+                offsets=p.offsets,
+                runs=p.runs,
+            )
+            # ghost particles' own ghosts would have a share
+            self.grid.part.fill(*self.viscosity.relative, *self.weights)
 
     def stable_dt(self) -> float:
         """Return the longest stable time step for advection and surface tension [s]."""
@@ -143,11 +175,13 @@ class LiquidSimulation(ParticleSimulation):
     def step(self, dt: float) -> Row:
         """Advance by dt [s].
 
-        The pressure is solved before any particle moves, so that a failed solve changes at most the particles' order.
+        The pressure is solved before any particle moves, so that a failed solve changes at most the
+        particles' order.
 
         Raises:
             StepFailed: a solve missed its criteria; a smaller dt may be tried.
-            SimulationFailed: something is not finite, a particle has left the domain, or enclosed liquid would have to change its volume.
+            SimulationFailed: something is not finite, a particle has left the domain, or enclosed
+                liquid would have to change its volume.
             ValueError: dt is not positive.
         """
         with self.attempt(), joined(self.grid.device):
@@ -174,7 +208,9 @@ class LiquidSimulation(ParticleSimulation):
                     self.tension.measure(window, self.projection.kind)
         walls = self._meet_walls(window, dt)
         self.solve_contacts()
-        self.extrapolate_velocity(window, self.projection.known, self.projection.kind, self.projection.contact, dt)
+        self.extrapolate_velocity(
+            window, self.projection.known, self.projection.kind, self.projection.contact, dt
+        )
         if self.projection.coupling is not None:
             self.projection.coupling.hold(self.velocity, self.projection.known)
         self._measure()
@@ -183,10 +219,17 @@ class LiquidSimulation(ParticleSimulation):
         if self.tension is not None:
             self.tension.calm(self.particles, dt)
         row = (
-            self.move(dt, window, self.surface.density, self.projection.contact) | self.solve_row(projected.result) | viscous | walls | own
+            self.move(dt, window, self.surface.density, self.projection.contact)
+            | self.solve_row(projected.result)
+            | viscous
+            | walls
+            | own
         )
         if self.scene.output.diagnostics:
-            row |= {"max_divergence": projected.max_outflow / self.grid.spacing, "volume": self.surface.volume(projected.unknowns)}
+            row |= {
+                "max_divergence": projected.max_outflow / self.grid.spacing,
+                "volume": self.surface.volume(projected.unknowns),
+            }
             if self.tension is not None:
                 row |= {"surface_energy": self.tension.energy()}
         automatic = self.projection.automatic
@@ -199,10 +242,18 @@ class LiquidSimulation(ParticleSimulation):
 
         `measured` has the last row of each.
 
-        `time` is that of pressures, levels and forces: the step's beginning; velocities are those of its middle.
+        `time` is that of pressures, levels and forces: the step's beginning; velocities are those
+        of its middle.
         """
-        measured = {"probes": self.probes, "forces": self.forces if self.scene.output.forces else None}
-        return {name: ("step", "time", *found.columns()) for name, found in measured.items() if found is not None}
+        measured = {
+            "probes": self.probes,
+            "forces": self.forces if self.scene.output.forces else None,
+        }
+        return {
+            name: ("step", "time", *found.columns())
+            for name, found in measured.items()
+            if found is not None
+        }
 
     def _measure(self) -> None:
         """Fill the rows of the tables, if there are any."""
@@ -224,13 +275,17 @@ class LiquidSimulation(ParticleSimulation):
         window, row = part.faces(window), Row()
         if sums is None:
             return row
-        with self.watch.stage("walls", *self.velocity, self.projection.pressure, self.boundary.touch):
+        with self.watch.stage(
+            "walls", *self.velocity, self.projection.pressure, self.boundary.touch
+        ):
             if forces is not None and self.scene.output.forces:
                 forces.add_pressure(sums, window, self)
             if self.wall_drag is not None:
                 fields = self.velocity, self.projection, self.surface.phi
                 points = forces.references if forces is not None else None
-                row["drag_work"], dragged = self.wall_drag.act(sums, window, *fields, self.kick_dt, points)
+                row["drag_work"], dragged = self.wall_drag.act(
+                    sums, window, *fields, self.kick_dt, points
+                )
                 if forces is not None and dragged is not None:
                     forces.add(dragged)
                 if self.bodies is not None and dragged is not None:
@@ -242,15 +297,21 @@ class LiquidSimulation(ParticleSimulation):
     def own_columns(self) -> tuple[str, ...]:
         """Return the log columns of pressure and volume.
 
-        active: wall cells that let go; max_divergence [1/s]: of the other FLUID cells after the projection; volume [m^3; m^2 in 2-D]:
-        counts FLUID cells, or lies inside the surface where that is finer than cells. With an automatic tolerance: tolerance, the relative
-        residual that the step was held to, and time_error [m/s], the error in the velocity that its length makes. With viscosity what its
-        solve took and reached, the energy that became heat in the step, and the work of moving walls on it [J; J/m in 2-D]. With drag along
-        walls: drag_work [J; J/m in 2-D], the energy that it takes from the liquid in the step.
+        active: wall cells that let go; max_divergence [1/s]: of the other FLUID cells after the
+        projection; volume [m^3; m^2 in 2-D]: counts FLUID cells, or lies inside the surface where
+        that is finer than cells. With an automatic tolerance: tolerance, the relative residual that
+        the step was held to, and time_error [m/s], the error in the velocity that its length makes.
+        With viscosity what its solve took and reached, the energy that became heat in the step, and
+        the work of moving walls on it [J; J/m in 2-D]. With drag along walls: drag_work [J; J/m in
+        2-D], the energy that it takes from the liquid in the step.
         """
         own = tuple(name for model in self.models for name in model.columns)
         drags = ("drag_work",) if self.scene.drags is not None else ()
-        columns = ("active", "max_divergence", "volume", *drags) if self.scene.output.diagnostics else ("active", *drags)
+        columns = (
+            ("active", "max_divergence", "volume", *drags)
+            if self.scene.output.diagnostics
+            else ("active", *drags)
+        )
         if self.tension is not None and self.scene.output.diagnostics:
             columns = (*columns, "surface_energy")
         columns = columns if self.viscosity is None else (*columns, *VISCOUS_COLUMNS)
@@ -262,7 +323,8 @@ class LiquidSimulation(ParticleSimulation):
 
         Cells are those of the last solve; surface and volume are optional.
 
-        Particles have velocity, speed and, where it differs, viscosity [Pa s]; cells pressure [Pa], wall and released flags.
+        Particles have velocity, speed and, where it differs, viscosity [Pa s]; cells pressure [Pa],
+        wall and released flags.
         """
         cells, grid = self.projection.fluid_cells(), self.grid
         at = tuple(cells.T)
@@ -274,10 +336,20 @@ class LiquidSimulation(ParticleSimulation):
         }
         points = self.points()
         if self.scene.viscosity is not None and self.particles.kept is not None:
-            points.fields["viscosity"] = self.scene.viscosity.value * self._particle_arrays()["kept"][:, 0]
+            points.fields["viscosity"] = (
+                self.scene.viscosity.value * self._particle_arrays()["kept"][:, 0]
+            )
         return [
             points,
-            Cells("grid", cells[:, ::-1] - 1 + grid.origin, grid.spacing, grid.dimension, fields, self.image_counts, grid.part.corners),
+            Cells(
+                "grid",
+                cells[:, ::-1] - 1 + grid.origin,
+                grid.spacing,
+                grid.dimension,
+                fields,
+                self.image_counts,
+                grid.part.corners,
+            ),
             *self.surfaces(),
             *self.volumes(),
             *self.body_surfaces(),
@@ -296,7 +368,9 @@ class LiquidSimulation(ParticleSimulation):
         projection = self.projection
         with self.watch.stage("surface", self.particles.key, projection.kind):
             self.surface.begin(window)
-            self._surface_graph.run(window, variant=(window.near is None, self.particles.runs is None))
+            self._surface_graph.run(
+                window, variant=(window.near is None, self.particles.runs is None)
+            )
         if self.tension is not None:
             with self.watch.stage("surface tension", *self.velocity, self.tension.jump):
                 self.tension.act(self.velocity, window, projection.kind, self.kick_dt)
@@ -312,7 +386,9 @@ class LiquidSimulation(ParticleSimulation):
     def _mark_cells(self, window: Window) -> None:
         """Mark the liquid's cells, ghost cells as other processes do."""
         self.surface.mark(self.particles, window, self.projection.kind)
-        self.grid.part.fill(self.projection.kind, *([] if self.surface.phi is None else [self.surface.phi]))
+        self.grid.part.fill(
+            self.projection.kind, *([] if self.surface.phi is None else [self.surface.phi])
+        )
 
     def _launch_surface(self, window: Window) -> None:
         """Launch the marking of the liquid's cells, and the velocity of their faces."""
@@ -322,8 +398,9 @@ class LiquidSimulation(ParticleSimulation):
     def _rub(self, viscosity: Viscosity, window: Window, dt: float, speed: float) -> Row:
         """Change the velocity before the pressure by what viscosity does to that after it; return what the log says of it.
 
-        The pressure first finds which walls hold: viscosity acts on the velocity that it leaves. Then all of it acts anew, together with
-        what viscosity has changed, so that it balances viscous stresses too and the walls that let go do so by the sum of both.
+        The pressure first finds which walls hold: viscosity acts on the velocity that it leaves.
+        Then all of it acts anew, together with what viscosity has changed, so that it balances
+        viscous stresses too and the walls that let go do so by the sum of both.
         """
         projection = self.projection
         viscosity.keep(self.velocity)
@@ -331,30 +408,54 @@ class LiquidSimulation(ParticleSimulation):
         if self._project(window, dt, speed).result is None:
             return {}
         self.extrapolate_velocity(window, projection.known, projection.kind, projection.contact)
-        # A step much shorter than the last one, as a retry is, still has half of that to make up for: equations no stiffer than its own
-        # length asks for are solved several times.
+        # A step much shorter than the last one, as a retry is, still has half of that to make up
+        # for: equations no stiffer than its own length asks for are solved several times.
         parts, total = min(max(1, int(self.kick_dt / dt)), MOST_PARTS), None
         for part in range(parts):
             if part:
                 viscosity.keep_change()
                 momenta = self._move_on(viscosity, momenta, dt)
             with self.watch.stage("viscosity", *self.velocity, projection.kind, projection.contact):
-                given = self.velocity, window, projection.kind, projection.contact, self.kick_dt / parts, speed
+                given = (
+                    self.velocity,
+                    window,
+                    projection.kind,
+                    projection.contact,
+                    self.kick_dt / parts,
+                    speed,
+                )
                 found = viscosity.solve(*given, last=part + 1 == parts)
             if not found.converged:
-                residual = f"relative residual of {found.relative_residual:.2e} (tolerance {viscosity.tolerance})"
-                raise missed_by_far("viscous", found.status, found.iterations, residual, "a shorter step is less stiff")
+                residual = (
+                    f"relative residual of {found.relative_residual:.2e} (tolerance "
+                    f"{viscosity.tolerance})"
+                )
+                raise missed_by_far(
+                    "viscous",
+                    found.status,
+                    found.iterations,
+                    residual,
+                    "a shorter step is less stiff",
+                )
             if self.forces is not None and self.scene.output.forces:
-                self.forces.add(viscosity.impulses(self.velocity, projection.kind, projection.contact, self.forces.references))
+                self.forces.add(
+                    viscosity.impulses(
+                        self.velocity, projection.kind, projection.contact, self.forces.references
+                    )
+                )
             total = found if total is None else found.after(total)
         assert total is not None
         viscosity.undo(self.velocity)
-        for body, values in zip(self.bodies.bodies if self.bodies is not None else (), momenta, strict=True):
+        for body, values in zip(
+            self.bodies.bodies if self.bodies is not None else (), momenta, strict=True
+        ):
             body.restore_momenta(values)
         viscosity.push_bodies()
         return dict(zip(VISCOUS_COLUMNS, total.row(), strict=True))
 
-    def _move_on(self, viscosity: Viscosity, momenta: Sequence[tuple[np.ndarray, ...]], dt: float) -> list[tuple[np.ndarray, ...]]:
+    def _move_on(
+        self, viscosity: Viscosity, momenta: Sequence[tuple[np.ndarray, ...]], dt: float
+    ) -> list[tuple[np.ndarray, ...]]:
         """Give the bodies the impulses of one of several viscous solves of a step; return their momenta before all, with these added."""
         if self.bodies is None:
             return []
@@ -363,7 +464,9 @@ class LiquidSimulation(ParticleSimulation):
         viscosity.push_bodies()
         self.boundary.begin_step(self.time, dt)  # their velocities are others now
         changes = zip(momenta, before, (body.momenta() for body in bodies), strict=True)
-        return [tuple(kept + now - then for kept, then, now in zip(*of, strict=True)) for of in changes]
+        return [
+            tuple(kept + now - then for kept, then, now in zip(*of, strict=True)) for of in changes
+        ]
 
     def _project(self, window: Window, dt: float, speed: float) -> Projection:
         """Solve for the pressure and project the velocity."""
@@ -380,7 +483,11 @@ class LiquidSimulation(ParticleSimulation):
                 self.flights.find(window, self.weights, projection.kind)
         if self.record is not None:
             with watch.stage("recording", *projection.fields()):
-                clock = {"step": np.array(self.step_count), "time": np.array(self.time), "dt": np.array(float(dt))}
+                clock = {
+                    "step": np.array(self.step_count),
+                    "time": np.array(self.time),
+                    "dt": np.array(float(dt)),
+                }
                 self.record(projection.recorded(speed) | clock)
         with watch.stage("pressure solve", *projection.fields()):
             result, criteria = projection.solve(speed)
@@ -392,7 +499,14 @@ class LiquidSimulation(ParticleSimulation):
             with watch.stage("bodies"):
                 projection.push_bodies(result)
                 self.boundary.begin_step(self.time, dt)  # their velocities are others now
-        with watch.stage("projection", *self.velocity, *projection.known, projection.pressure, projection.kind, projection.contact):
+        with watch.stage(
+            "projection",
+            *self.velocity,
+            *projection.known,
+            projection.pressure,
+            projection.kind,
+            projection.contact,
+        ):
             return self._held(projection.project(self.velocity, window, result, criteria))
 
     def _held(self, projected: Projection) -> Projection:
@@ -408,19 +522,31 @@ class LiquidSimulation(ParticleSimulation):
             StepFailed: a smaller dt may be tried.
             SimulationFailed: no dt helps.
         """
-        cells = self.projection.not_finite() if result.status is wl.SolveStatus.NON_FINITE else np.zeros((0, 3))
+        cells = (
+            self.projection.not_finite()
+            if result.status is wl.SolveStatus.NON_FINITE
+            else np.zeros((0, 3))
+        )
         if len(cells):
             where = tuple(int(c) for c in cells[0])
             raise SimulationFailed(
-                f"step {self.step_count}: the velocity on the faces of cell (x, y, z) = {where} is not finite ({len(cells)} cells)"
+                f"step {self.step_count}: the velocity on the faces of cell (x, y, z) = {where} is "
+                f"not finite ({len(cells)} cells)"
             )
-        if result.status is wl.SolveStatus.INFEASIBLE and (self.boundary.velocity or self.sources):  # no dt helps
+        # no dt helps
+        if result.status is wl.SolveStatus.INFEASIBLE and (self.boundary.velocity or self.sources):
             raise SimulationFailed(
-                f"step {self.step_count}: liquid fills a closed space whose volume changes, by moving walls or sources; "
+                f"step {self.step_count}: liquid fills a closed space whose volume changes, by "
+                "moving walls or sources; "
                 'leave air in it, or set wall = "separating" for a wall that moves away'
             )
-        residual = f"relative residual of {result.relative_residual:.2e} (tolerance {self.projection.tolerance})"
-        raise missed_by_far("pressure", result.status, result.iterations, residual, result.status.value)
+        residual = (
+            f"relative residual of {result.relative_residual:.2e} (tolerance "
+            f"{self.projection.tolerance})"
+        )
+        raise missed_by_far(
+            "pressure", result.status, result.iterations, residual, result.status.value
+        )
 
 
 class FluidsSimulator:
@@ -431,9 +557,15 @@ class FluidsSimulator:
     scene_model = LiquidScene
 
     def create(
-        self, scene: Scene, *, device: str, folder: Path, ranks: Ranks | None = None, wall_velocity: np.ndarray | None = None,
+        self,
+        scene: Scene,
+        *,
+        device: str,
+        folder: Path,
+        ranks: Ranks | None = None,
+        wall_velocity: np.ndarray | None = None,
         models: Sequence[LiquidModel] = (),
-    ) -> LiquidSimulation:  # fmt: skip
+    ) -> LiquidSimulation:
         """Build the simulation of a scene; on ranks, this rank's part (collective).
 
         Args:
@@ -441,12 +573,13 @@ class FluidsSimulator:
             device: a Warp device's name.
             folder: folder of the files that the scene names.
             ranks: that share it, for which the scene is the same; None: one process.
-            wall_velocity: velocity [m/s] of the domain's wall and of each solid, shape (1 + solids, 3), constant; the solids' cells stay
-                fixed. None: all are at rest.
+            wall_velocity: velocity [m/s] of the domain's wall and of each solid, shape (1 + solids,
+                3), constant; the solids' cells stay fixed. None: all are at rest.
             models: of your own, see `warp_lcp.fluids.models.LiquidModel`.
 
         Raises:
-            ValueError: the scene cannot be simulated, or not on ranks; the message names the key and what is allowed. On all ranks.
+            ValueError: the scene cannot be simulated, or not on ranks; the message names the key
+                and what is allowed. On all ranks.
         """
         if not isinstance(scene, LiquidScene):
             raise ValueError("scene.simulator: fluids needs a scene of liquid")
@@ -456,9 +589,17 @@ class FluidsSimulator:
         return self.assemble(scene, solids, bodies, device=device, folder=folder, **more)
 
     def assemble(
-        self, scene: LiquidScene, solids: Sequence[PlacedSolid], bodies: RigidBodies | None, *, device: str, folder: Path,
-        ranks: Ranks | None = None, wall_velocity: np.ndarray | None = None, models: Sequence[LiquidModel] = (),
-    ) -> LiquidSimulation:  # fmt: skip
+        self,
+        scene: LiquidScene,
+        solids: Sequence[PlacedSolid],
+        bodies: RigidBodies | None,
+        *,
+        device: str,
+        folder: Path,
+        ranks: Ranks | None = None,
+        wall_velocity: np.ndarray | None = None,
+        models: Sequence[LiquidModel] = (),
+    ) -> LiquidSimulation:
         """Build the simulation of a scene from placed solids and bodies.
 
         `bodies` are those that the liquid moves; other arguments as in `create`.
@@ -469,19 +610,45 @@ class FluidsSimulator:
 
         def make_parts(grid: StaggeredGrid) -> Parts:
             boundary, warnings[:] = make_boundary(scene, grid, folder, wall_velocity, solids=solids)
-            return Parts(boundary, make_sources(scene, grid, boundary, folder), make_narrow_band(scene, grid, boundary, folder))
+            return Parts(
+                boundary,
+                make_sources(scene, grid, boundary, folder),
+                make_narrow_band(scene, grid, boundary, folder),
+            )
 
         if ranks is None:
             coverage, grid = start_of(scene, device)
         else:
             from warp_lcp.distributed.particle_assembly import part_of  # what it needs is an extra
 
-            coverage, grid = None, part_of(scene, ranks, device, methods=METHODS_ON_RANKS, smoothing=scene.pressure.smoothing).grid
+            coverage, grid = (
+                None,
+                part_of(
+                    scene,
+                    ranks,
+                    device,
+                    methods=METHODS_ON_RANKS,
+                    smoothing=scene.pressure.smoothing,
+                ).grid,
+            )
         parts = make_parts(grid)
         without = start_band(scene, grid, parts.boundary, folder, parts.band)
         particles, notes = make_particles(scene, grid, parts.boundary, folder, without)
-        outlets, spray = make_outlets(scene, grid, folder), None if models else make_spray(scene, coverage, solids)
+        outlets, spray = (
+            make_outlets(scene, grid, folder),
+            None if models else make_spray(scene, coverage, solids),
+        )
         return LiquidSimulation(
-            scene, grid, parts, particles, make_parts=make_parts, solids=solids, outlets=outlets, bodies=bodies, coverage=coverage,
-            spray=spray, models=models, notes=[*warnings, *notes],
-        )  # fmt: skip
+            scene,
+            grid,
+            parts,
+            particles,
+            make_parts=make_parts,
+            solids=solids,
+            outlets=outlets,
+            bodies=bodies,
+            coverage=coverage,
+            spray=spray,
+            models=models,
+            notes=[*warnings, *notes],
+        )

@@ -35,12 +35,20 @@ def mark_particles_kernel(i, key: wp.array(dtype=wp.int32), kind: wp.array(dtype
 def mark_inside_kernel(k, j, first, end, phi: F32, capacity: F32, most: float, kind: I8):
     """An open cell of the domain below the free surface is FLUID, if the share of its kernel that is open is no more than `most`."""
     for i in range(wp.max(first, 1), wp.min(end, kind.shape[2] - 1)):
-        if kind[k, j, i] == _AIR and k > 0 and j > 0 and k + 1 < kind.shape[0] and j + 1 < kind.shape[1]:
+        if (
+            kind[k, j, i] == _AIR
+            and k > 0
+            and j > 0
+            and k + 1 < kind.shape[0]
+            and j + 1 < kind.shape[1]
+        ):
             if phi[k, j, i] < 0.0 and capacity[k, j, i] <= most:
                 kind[k, j, i] = _FLUID
 
 
-SLIVER = 0.35  # a cell whose open share is smaller may hold no particle though liquid fills it: the level set decides
+# a cell whose open share is smaller may hold no particle though liquid fills it: the level set
+# decides
+SLIVER = 0.35
 SAMPLES = 8  # points along the edge of a cut cell, of a volume that is found once
 
 
@@ -48,8 +56,10 @@ class FreeSurface(Protocol):
     """Free surface of a liquid.
 
     Attributes:
-        phi: float32 distance to the surface at cell centers [cells], < 0 in liquid; None: the surface lies on the cells' faces.
-        density: of the particles when it was last marked, in units of that at rest, float32; None: nothing needed it.
+        phi: float32 distance to the surface at cell centers [cells], < 0 in liquid; None: the
+            surface lies on the cells' faces.
+        density: of the particles when it was last marked, in units of that at rest, float32; None:
+            nothing needed it.
     """
 
     phi: wp.array | None
@@ -67,7 +77,13 @@ class FreeSurface(Protocol):
             kind: int8 of AIR, FLUID, SOLID (written).
         """
 
-    def complete(self, window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], known: Sequence[wp.array]) -> None:
+    def complete(
+        self,
+        window: Window,
+        velocity: Sequence[wp.array],
+        weights: Sequence[wp.array],
+        known: Sequence[wp.array],
+    ) -> None:
         """Set u* on faces of FLUID cells without particle weight.
 
         `known` is scratch memory.
@@ -86,15 +102,25 @@ class FreeSurface(Protocol):
 class WholeCellSurface:
     """Free surface on cell faces: cells that hold a particle are liquid.
 
-    In cells that a solid cuts down to a sliver there may be no particle though the liquid fills them; a level set decides there.
+    In cells that a solid cuts down to a sliver there may be no particle though the liquid fills
+    them; a level set decides there.
     """
 
     phi = None
 
-    def __init__(self, grid: StaggeredGrid, boundary: Boundary, *, particles_a_cell: int, fill: Fill | None = None) -> None:
+    def __init__(
+        self,
+        grid: StaggeredGrid,
+        boundary: Boundary,
+        *,
+        particles_a_cell: int,
+        fill: Fill | None = None,
+    ) -> None:
         """Make a level set if cells are cut; `fill` adds to its density what no particle stands for."""
         self.grid, self.boundary, self._fill = grid, boundary, fill
-        self._level_set = LevelSet(grid, particles_a_cell=particles_a_cell) if boundary.open else None
+        self._level_set = (
+            LevelSet(grid, particles_a_cell=particles_a_cell) if boundary.open else None
+        )
         self.density = self._level_set.density if self._level_set is not None else None
 
     def begin(self, window: Window) -> None:
@@ -105,12 +131,28 @@ class WholeCellSurface:
     def mark(self, particles: Particles, window: Window, kind: wp.array) -> None:
         """Mark cells that hold a particle as FLUID."""
         copy(kind, self.boundary.base)
-        launch_list(mark_particles_kernel, particles.count, [particles.key, kind.flatten()], device=self.grid.device, ordered=True)
+        launch_list(
+            mark_particles_kernel,
+            particles.count,
+            [particles.key, kind.flatten()],
+            device=self.grid.device,
+            ordered=True,
+        )
         if self._level_set is not None:
-            self._level_set.compute(particles, window, self.boundary.capacity, self.boundary.base, fill=self._fill)
-            window.launch(mark_inside_kernel, [self._level_set.phi, self.boundary.capacity, SLIVER, kind])
+            self._level_set.compute(
+                particles, window, self.boundary.capacity, self.boundary.base, fill=self._fill
+            )
+            window.launch(
+                mark_inside_kernel, [self._level_set.phi, self.boundary.capacity, SLIVER, kind]
+            )
 
-    def complete(self, window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], known: Sequence[wp.array]) -> None:
+    def complete(
+        self,
+        window: Window,
+        velocity: Sequence[wp.array],
+        weights: Sequence[wp.array],
+        known: Sequence[wp.array],
+    ) -> None:
         """Set u* on faces of sliver cells that hold no particle."""
         if self._level_set is not None:
             complete(window, velocity, weights, known, barriers=self.grid.barriers)
@@ -135,9 +177,14 @@ class NoSurface:
         self.grid = grid
         self._kind = wp.array(kind, dtype=wp.int8, device=grid.device)
         owned = grid.part.owned
-        cells = tuple(slice(low - 1, high - 1) for low, high in zip(owned.low, owned.high, strict=True))
+        cells = tuple(
+            slice(low - 1, high - 1) for low, high in zip(owned.low, owned.high, strict=True)
+        )
         filled = (grid.interior(kind) == wl.FLUID)[cells]
-        self._volume, self._ranks = float(_open_shares(grid, boundary)[cells][filled].sum()) * grid.cell_volume, grid.part.ranks
+        self._volume, self._ranks = (
+            float(_open_shares(grid, boundary)[cells][filled].sum()) * grid.cell_volume,
+            grid.part.ranks,
+        )
 
     def begin(self, window: Window) -> None:
         """Do nothing: all cells are marked in each step."""
@@ -146,7 +193,13 @@ class NoSurface:
         """Mark all open cells as FLUID."""
         copy(kind, self._kind)
 
-    def complete(self, window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], known: Sequence[wp.array]) -> None:
+    def complete(
+        self,
+        window: Window,
+        velocity: Sequence[wp.array],
+        weights: Sequence[wp.array],
+        known: Sequence[wp.array],
+    ) -> None:
         """Set u* on faces between particles."""
         complete(window, velocity, weights, known, barriers=self.grid.barriers)
 
@@ -171,7 +224,15 @@ class GhostFluidSurface:
         fill: adds the density of liquid without particles.
     """
 
-    def __init__(self, grid: StaggeredGrid, boundary: Boundary, *, particles_a_cell: int, smoothing: int, fill: Fill | None = None) -> None:
+    def __init__(
+        self,
+        grid: StaggeredGrid,
+        boundary: Boundary,
+        *,
+        particles_a_cell: int,
+        smoothing: int,
+        fill: Fill | None = None,
+    ) -> None:
         self.grid, self.boundary, self._fill = grid, boundary, fill
         self.level_set = LevelSet(grid, particles_a_cell=particles_a_cell, smoothing=smoothing)
         self.phi: wp.array | None = self.level_set.phi
@@ -185,11 +246,19 @@ class GhostFluidSurface:
 
     def mark(self, particles: Particles, window: Window, kind: wp.array) -> None:
         """Mark cells below the surface as FLUID."""
-        self.level_set.compute(particles, window, self.boundary.capacity, self.boundary.base, fill=self._fill)
+        self.level_set.compute(
+            particles, window, self.boundary.capacity, self.boundary.base, fill=self._fill
+        )
         copy(kind, self.boundary.base)
         window.launch(mark_inside_kernel, [self.level_set.phi, self.boundary.capacity, 2.0, kind])
 
-    def complete(self, window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], known: Sequence[wp.array]) -> None:
+    def complete(
+        self,
+        window: Window,
+        velocity: Sequence[wp.array],
+        weights: Sequence[wp.array],
+        known: Sequence[wp.array],
+    ) -> None:
         """Set u* on FLUID faces between particles."""
         complete(window, velocity, weights, known, barriers=self.grid.barriers)
 
@@ -218,7 +287,8 @@ def _open_shares(grid: StaggeredGrid, boundary: Boundary) -> np.ndarray:
     cut = (corners.min(axis=0) < 0.0) & (corners.max(axis=0) > 0.0)
     values = corners[:, cut].reshape(*(2 for _ in axes), -1)
     low = (np.arange(SAMPLES) + 0.5) / SAMPLES
-    for _ in axes:  # from corners to points inside, one axis after the other; the one in turn goes last
+    # from corners to points inside, one axis after the other; the one in turn goes last
+    for _ in axes:
         values = np.moveaxis(np.tensordot(np.stack([1.0 - low, low]), values, axes=(0, 0)), 0, -2)
     shares[cut] = (values > 0.0).mean(axis=tuple(range(values.ndim - 1)))
     return shares

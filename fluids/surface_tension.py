@@ -22,11 +22,20 @@ from warp_lcp.operators.grid_poisson import SOLID
 from warp_lcp.rows.memory import Scalar
 from warp_lcp.rows.program import LaunchGraph, clear
 
-PASSES, MOST_PASSES = 8, 16  # binomial passes of a filter: particles' noise asks for the fewest, the cost and thin liquid for the most
-CALM = 0.2  # of the grid's capillary rate, at which gradients of the velocity near the surface decay
-STIFFEST = 2.08  # the largest z^3 (2 exp(-z^2/2) - exp(-z^2)): of a filtered capillary wave, omega^2 s^3 rho dx^3 / sigma
-FARTHER = 9  # quarters of a cell from the mirror of a cell in a solid to where all cells around are open, at most
-REACH = 6  # cells around particles that are smoothed: two of the widest filter's spreads, with what `window` spares
+# binomial passes of a filter: particles' noise asks for the fewest, the cost and thin liquid for
+# the most
+PASSES, MOST_PASSES = 8, 16
+# of the grid's capillary rate, at which gradients of the velocity near the surface decay
+CALM = 0.2
+# the largest z^3 (2 exp(-z^2/2) - exp(-z^2)): of a filtered capillary wave, omega^2 s^3 rho dx^3 /
+# sigma
+STIFFEST = 2.08
+# quarters of a cell from the mirror of a cell in a solid to where all cells around are open, at
+# most
+FARTHER = 9
+# cells around particles that are smoothed: two of the widest filter's spreads, with what `window`
+# spares
+REACH = 6
 SAFETY = 3.0  # in the square of the longest step: particles add noise
 
 
@@ -50,21 +59,26 @@ class SurfaceShares:
 class SurfaceTension:
     """Push liquid by the pressure p = sigma kappa that its surface asks for.
 
-    The jump of a ghost-fluid surface [Gibou et al. 2002] between a FLUID cell i and an AIR cell n at theta, with X = kick_dt sigma kappa /
-    (rho dx) there, changes u = u* - (x_right - x_left) / theta by X / theta alone. It is added to u* before the projection, so that the
-    pressure's problem stays as it is: x is the liquid's whole pressure over that of the air, and 0 <= x on separating walls means what it
-    meant.
+    The jump of a ghost-fluid surface [Gibou et al. 2002] between a FLUID cell i and an AIR cell n
+    at theta, with X = kick_dt sigma kappa / (rho dx) there, changes u = u* - (x_right - x_left) /
+    theta by X / theta alone. It is added to u* before the projection, so that the pressure's
+    problem stays as it is: x is the liquid's whole pressure over that of the air, and 0 <= x on
+    separating walls means what it meant.
 
-    The curvature kappa = div n, n = -grad f / |grad f|, is that of f = (2 S - S^2) f0, where f0 is the share of a cell's kernel that lies
-    below the surface, and S are m binomial passes (1, 2, 1)/4 along each axis, nearly a Gaussian of the variance s^2 = m/2. Of a ripple of
-    wavenumber q on a plane f keeps 2 e^-a - e^-2a, a = (q s)^2 / 2, so that capillary waves are slower by (q s)^4 / 8. For m >= `PASSES`;
-    more where the step asks for it: explicit leapfrog steps are stable while omega dt < 2, and no ripple then has
-    omega^2 > STIFFEST sigma / (rho (s dx)^3). So waves that a step cannot follow are pushed less instead of making it shorter.
+    The curvature kappa = div n, n = -grad f / |grad f|, is that of f = (2 S - S^2) f0, where f0 is
+    the share of a cell's kernel that lies below the surface, and S are m binomial passes (1, 2,
+    1)/4 along each axis, nearly a Gaussian of the variance s^2 = m/2. Of a ripple of wavenumber q
+    on a plane f keeps 2 e^-a - e^-2a, a = (q s)^2 / 2, so that capillary waves are slower by (q
+    s)^4 / 8. For m >= `PASSES`; more where the step asks for it: explicit leapfrog steps are stable
+    while omega dt < 2, and no ripple then has omega^2 > STIFFEST sigma / (rho (s dx)^3). So waves
+    that a step cannot follow are pushed less instead of making it shorter.
 
-    In cells of walls, f goes on so that the surface meets the wall at the contact angle: the distance to it falls along the wall's normal
-    by the angle's cosine there, and by (1 - kappa d) of that on the wall at a distance d from it, where parallel surfaces meet the wall.
-    With the cosine alone the curvature beside the wall would be 0.6 of what it is at an angle of 30 degrees, on any grid. So kappa is found
-    twice in a step, first without itself. Beside walls particles tell of the open part of a cell's kernel alone, see `whole_share`.
+    In cells of walls, f goes on so that the surface meets the wall at the contact angle: the
+    distance to it falls along the wall's normal by the angle's cosine there, and by (1 - kappa d)
+    of that on the wall at a distance d from it, where parallel surfaces meet the wall. With the
+    cosine alone the curvature beside the wall would be 0.6 of what it is at an angle of 30 degrees,
+    on any grid. So kappa is found twice in a step, first without itself. Beside walls particles
+    tell of the open part of a cell's kernel alone, see `whole_share`.
 
     Args:
         grid: the grid.
@@ -76,29 +90,45 @@ class SurfaceTension:
 
     Attributes:
         jump: kick_dt sigma kappa / (rho dx) [m/s] in cells beside the surface, float32.
-        adhesion: sigma cos(angle) kappa / (rho dx) [m/s^2] of the most curved surface, by which liquid that wets a wall keeps air from it.
+        adhesion: sigma cos(angle) kappa / (rho dx) [m/s^2] of the most curved surface, by which
+            liquid that wets a wall keeps air from it.
     """
 
     def __init__(
-        self, grid: StaggeredGrid, boundary: Boundary, phi: wp.array, *, coefficient: float, contact_angle: float, density: float
-    ) -> None:  # fmt: skip
+        self,
+        grid: StaggeredGrid,
+        boundary: Boundary,
+        phi: wp.array,
+        *,
+        coefficient: float,
+        contact_angle: float,
+        density: float,
+    ) -> None:
         self.grid, self.boundary, self._phi = grid, boundary, phi
         self.coefficient, self.density = coefficient, density
         self._cosine = math.cos(math.radians(contact_angle)) if contact_angle != 90.0 else 0.0
         self._most = float(grid.dimension - 1)  # curvature, of a radius of one cell [1/dx]
-        self.adhesion = max(self._cosine, 0.0) * self._most * coefficient / (density * grid.spacing**2)
+        self.adhesion = (
+            max(self._cosine, 0.0) * self._most * coefficient / (density * grid.spacing**2)
+        )
         self.jump, self._fields = grid.field(), [grid.field() for _ in range(3)]
         self._passes = kernels.push_pass(bool(boundary.open))
         self._energy = WindowTally(self._passes.energy, grid)
         self._blocked = grid.field(wp.int8)
         self._capacity, self._lean = boundary.capacity, grid.field()
-        self._scale, self._factor = Scalar(), Scalar()  # kick_dt sigma / (rho dx^2); by which gradients are multiplied
-        self._measured: ActiveWindow | None = None  # cells whose energy has been measured; None: none have liquid
+        # kick_dt sigma / (rho dx^2); by which gradients are multiplied
+        self._scale, self._factor = Scalar(), Scalar()
+        # cells whose energy has been measured; None: none have liquid
+        self._measured: ActiveWindow | None = None
         self._cells = ActiveWindow(grid.domain)
         shared = grid.part.shared  # then ranks exchange halos, and their particles are others
-        self._pushing = LaunchGraph(grid.device, self._push, at_once=shared or boundary.moves)  # the lists of wall cells are rebuilt
+        # the lists of wall cells are rebuilt
+        self._pushing = LaunchGraph(grid.device, self._push, at_once=shared or boundary.moves)
         self._calming = LaunchGraph(grid.device, self._calm, at_once=shared)
-        self._measuring = LaunchGraph(grid.device, lambda kind: self._energy.take(self._cells, self._faces(kind), self._shares))
+        self._measuring = LaunchGraph(
+            grid.device,
+            lambda kind: self._energy.take(self._cells, self._faces(kind), self._shares),
+        )
         self._find_walls()
 
     def longest_step(self) -> float:
@@ -111,9 +141,13 @@ class SurfaceTension:
 
     def _passes_for(self, kick_dt: float) -> int:
         """Return how many passes a step takes."""
-        return next((m for m in range(PASSES, MOST_PASSES) if self._step_of(m) >= kick_dt), MOST_PASSES)
+        return next(
+            (m for m in range(PASSES, MOST_PASSES) if self._step_of(m) >= kick_dt), MOST_PASSES
+        )
 
-    def act(self, velocity: Sequence[wp.array], window: Window, kind: wp.array, kick_dt: float) -> None:
+    def act(
+        self, velocity: Sequence[wp.array], window: Window, kind: wp.array, kick_dt: float
+    ) -> None:
         """Push the faces that the surface crosses.
 
         Args:
@@ -139,18 +173,37 @@ class SurfaceTension:
         (bend,) = (field for field in self._fields if field is not once and field is not twice)
         return once, twice, bend
 
-    def _push(self, velocity: Sequence[wp.array], window: Window, kind: wp.array, passes: int) -> None:
+    def _push(
+        self, velocity: Sequence[wp.array], window: Window, kind: wp.array, passes: int
+    ) -> None:
         """Launch what `act` does."""
         grid, planes, bend = self.grid, self.grid.planes, self._bend
         self._find_curvature(window, passes)
         if self._cosine != 0.0:  # how the surface goes on into walls depends on its curvature
             s, bending = self._shares, 1.0 / (grid.dimension - 1)
             shares = [s.linear, s.cubic, s.once, s.twice]
-            inputs = [*self._walls, self._raised, planes, bending, self._cosine, *shares, bend, self._lean.flatten()]
+            inputs = [
+                *self._walls,
+                self._raised,
+                planes,
+                bending,
+                self._cosine,
+                *shares,
+                bend,
+                self._lean.flatten(),
+            ]
             launch_list(kernels.lean_kernel, len(self._walls[0]), inputs, device=grid.device)
             self.grid.part.fill(self._lean)
             self._find_curvature(window, passes)
-        window.run(kernels.JUMP, self._shares, planes=planes, bend=bend, jump=self.jump, kind=kind, scale=self._scale)
+        window.run(
+            kernels.JUMP,
+            self._shares,
+            planes=planes,
+            bend=bend,
+            jump=self.jump,
+            kind=kind,
+            scale=self._scale,
+        )
         self.grid.part.fill(self.jump)
         for axis, field in enumerate(velocity):
             window.run(self._passes.push, self._faces(kind), jump=self.jump, field=field, axis=axis)
@@ -158,32 +211,53 @@ class SurfaceTension:
     def _find_curvature(self, window: Window, passes: int) -> None:
         """Find the curvature [1/cells] in cells near the surface, and continued into walls: its nearest point may lie in one."""
         first, *free = self._fields
-        clear(*self._fields)  # passes look beyond the window, where an earlier step may have left something
+        # passes look beyond the window, where an earlier step may have left something
+        clear(*self._fields)
         capacity = self._capacity if self._cosine != 0.0 else None
-        window.launch(kernels.share_kernel, [self._phi, self._blocked, capacity, self._cosine, first])
+        window.launch(
+            kernels.share_kernel, [self._phi, self._blocked, capacity, self._cosine, first]
+        )
         once = self._smoothed(window, first, free, passes, 0)
-        self._smoothed(window, once, [field for field in self._fields if field is not once], passes, passes)
-        window.run(kernels.CURVATURE, self._shares, planes=self.grid.planes, bend=self._bend, limit=self._most)
+        self._smoothed(
+            window, once, [field for field in self._fields if field is not once], passes, passes
+        )
+        window.run(
+            kernels.CURVATURE,
+            self._shares,
+            planes=self.grid.planes,
+            bend=self._bend,
+            limit=self._most,
+        )
         self.grid.part.fill(self._bend)
         self._continue(self._bend, 0, 0.0)
 
     def calm(self, particles: Particles, dt: float) -> None:
         """Take from particles near the surface what ripples shorter than the filter leave in their gradients: nothing pulls these back.
 
-        Without it they grow from the particles' noise, for APIC damps next to nothing, and take the surface apart.
+        Without it they grow from the particles' noise, for APIC damps next to nothing, and take the
+        surface apart.
 
         Args:
-            particles: the liquid (updated: gradients, and their numbers, as a narrow band may have added and taken some).
+            particles: the liquid (updated: gradients, and their numbers, as a narrow band may have
+                added and taken some).
             dt: time step [s].
         """
-        self._factor.value = math.exp(-CALM * dt * math.sqrt(self.coefficient / (self.density * self.grid.spacing**3)))
+        self._factor.value = math.exp(
+            -CALM * dt * math.sqrt(self.coefficient / (self.density * self.grid.spacing**3))
+        )
         self._calming.run(particles)
 
     def _calm(self, particles: Particles) -> None:
         """Launch what `calm` does."""
         particles.number()
         for gradient in particles.affine:
-            listed = [self._factor, -0.99 * REACH_OF_PHI, particles.key, self._phi.flatten(), gradient]
+            listed = [
+                self._factor,
+                -0.99 * REACH_OF_PHI,
+                particles.key,
+                self._phi.flatten(),
+                gradient,
+            ]
             launch_list(kernels.calm_kernel, particles.count, listed, device=self.grid.device)
 
     def measure(self, window: Window, kind: wp.array) -> None:
@@ -199,21 +273,35 @@ class SurfaceTension:
         """Return the energy of surface and wet walls when it was last measured [J; J/m in 2-D]: sigma (area - cos(angle) wet area)."""
         mine = self._energy.read() if self._measured is not None else [0.0, 0.0]
         area, wetted = self.grid.part.ranks.sum(np.array(mine)).tolist()
-        return self.coefficient * (area - self._cosine * wetted) * self.grid.spacing ** (self.grid.dimension - 1)
+        return (
+            self.coefficient
+            * (area - self._cosine * wetted)
+            * self.grid.spacing ** (self.grid.dimension - 1)
+        )
 
     def _faces(self, kind: wp.array) -> LiquidBoundary:
         """Return the cells, the surface and the walls, which rest."""
-        return LiquidBoundary(kind, self._phi, self.grid.planes, *three_components(self.boundary.open), *three_components(()))
+        return LiquidBoundary(
+            kind,
+            self._phi,
+            self.grid.planes,
+            *three_components(self.boundary.open),
+            *three_components(()),
+        )
 
-    def _smoothed(self, window: Window, source: wp.array, free: Sequence[wp.array], passes: int, before: int) -> wp.array:
+    def _smoothed(
+        self, window: Window, source: wp.array, free: Sequence[wp.array], passes: int, before: int
+    ) -> wp.array:
         """Return the source after binomial passes, in one of two free fields; so many passes are `before` them."""
         self._continue(source, before, self._cosine)
-        if before == 0 and self._cosine != 0.0:  # `begin_kernel` looks farther than others' cells are known
+        # `begin_kernel` looks farther than others' cells are known
+        if before == 0 and self._cosine != 0.0:
             self.grid.part.fill(source)
         for done in range(1, passes + 1):
             out = free[done % 2]
             window.run(BINOMIAL, planes=self.grid.planes, source=source, out=out)
-            if done % 2 == 0 or done == passes:  # a pass looks a cell far, and what goes on into walls three
+            # a pass looks a cell far, and what goes on into walls three
+            if done % 2 == 0 or done == passes:
                 self.grid.part.fill(out)
             self._continue(out, before + done, self._cosine)
             source = out
@@ -221,19 +309,28 @@ class SurfaceTension:
 
     def _continue(self, field: wp.array, passes: int, cosine: float) -> None:
         """Continue a share into walls, after so many passes; with a cosine of 0 whatever a field has."""
-        walls, fields = [*self._walls, self._lean.flatten(), cosine], [self.grid.planes, self._blocked, field, field.flatten()]
+        walls, fields = (
+            [*self._walls, self._lean.flatten(), cosine],
+            [self.grid.planes, self._blocked, field, field.flatten()],
+        )
         kernel, spread = kernels.continue_kernel, [math.sqrt(0.25 + 0.5 * passes)]
         if passes == 0 and cosine != 0.0:  # a cell's kernel has no tails
             kernel, spread = kernels.begin_kernel, []
-        launch_list(kernel, len(self._walls[0]), [*walls, *spread, *fields], device=self.grid.device)
+        launch_list(
+            kernel, len(self._walls[0]), [*walls, *spread, *fields], device=self.grid.device
+        )
 
     def _find_walls(self) -> None:
         """Find the cells of walls that passes read, and where what they get comes from."""
         distance, device = self.boundary.distance, self.grid.device
-        blocked, *lists = wall_cells(self.grid, self.boundary.base.numpy(), None if distance is None else distance.numpy())
+        blocked, *lists = wall_cells(
+            self.grid, self.boundary.base.numpy(), None if distance is None else distance.numpy()
+        )
         self._blocked.assign(blocked)
         kinds = (wp.int32, wp.vec3, wp.float32, wp.float32)
-        *self._walls, self._raised = (wp.array(v, dtype=kind, device=device) for v, kind in zip(lists, kinds, strict=True))
+        *self._walls, self._raised = (
+            wp.array(v, dtype=kind, device=device) for v, kind in zip(lists, kinds, strict=True)
+        )
 
 
 def _profile(passes: int) -> tuple[float, float]:
@@ -245,11 +342,11 @@ def _profile(passes: int) -> tuple[float, float]:
 
 def wall_cells(
     grid: StaggeredGrid, base: np.ndarray, distance: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return which cells are walls, and of those beside open ones: flat index, the point before the wall that each reads, and how far.
 
-    A cell whose center lies in a solid is a wall, mirrored along the solid's normal; so is each of the ring or, without a distance, of a
-    solid's whole cells, mirrored along the axes.
+    A cell whose center lies in a solid is a wall, mirrored along the solid's normal; so is each of
+    the ring or, without a distance, of a solid's whole cells, mirrored along the axes.
 
     Args:
         grid: the grid.
@@ -257,30 +354,43 @@ def wall_cells(
         distance: to solids at the cells' low corners [cells]; None: solids are whole cells.
 
     Returns:
-        `blocked`, int8 in the stored shape; the cells, int32, shape (n,); the points (i, j, k) in cells' numbers, shape (n, 3); the ways
-        [cells], and how far in the open the middle of each lies, 0 of a mirror, shape (n,); float32.
+        `blocked`, int8 in the stored shape; the cells, int32, shape (n,); the points (i, j, k) in
+        cells' numbers, shape (n, 3); the ways [cells], and how far in the open the middle of each
+        lies, 0 of a mirror, shape (n,); float32.
     """
     flat, ends = grid.dimension == 2, np.array(base.shape) - 1
     inner = np.zeros(base.shape, dtype=bool)
     inner[1:-1, 1:-1, 1:-1] = True
-    center, normal = _at_centers(distance, flat) if distance is not None else (np.ones(base.shape), np.zeros((3, *base.shape)))
+    center, normal = (
+        _at_centers(distance, flat)
+        if distance is not None
+        else (np.ones(base.shape), np.zeros((3, *base.shape)))
+    )
     blocked = (base == SOLID) | ~inner | (center < 0.0)
     padded = np.pad(~blocked, 1)
-    steps = [np.array(s) - 1 for s in np.ndindex(3, 3, 3) if s != (1, 1, 1) and not (flat and s[0] != 1)]
-    near = _beside(~blocked, steps)  # and cells that have part of their face open ask for one layer more
+    steps = [
+        np.array(s) - 1 for s in np.ndindex(3, 3, 3) if s != (1, 1, 1) and not (flat and s[0] != 1)
+    ]
+    # and cells that have part of their face open ask for one layer more
+    near = _beside(~blocked, steps)
     cells = np.argwhere(blocked & (near | (_beside(near, steps) & (center < 0.0) & inner)))
     first, sides, least = np.zeros_like(cells), np.zeros_like(cells), np.full(len(cells), 4)
-    for step in sorted(steps, key=lambda s: int(np.abs(s).sum())):  # faces, then edges, then corners
+    # faces, then edges, then corners
+    for step in sorted(steps, key=lambda s: int(np.abs(s).sum())):
         there, size = padded[tuple((cells + 1 + step).T)], int(np.abs(step).sum())
         first[there & (least == 4)] = step
         least[there & (least == 4)] = size
         sides[there & (least == size)] += step
-    sides = np.sign(sides)  # between two open neighbors lies the cell that mirrors both walls, if it is open
+    # between two open neighbors lies the cell that mirrors both walls, if it is open
+    sides = np.sign(sides)
     both = padded[tuple((cells + 1 + sides).T)]
     toward = np.where(both[:, None], sides, first)
     points, way = (cells + toward).astype(np.float32), np.abs(toward).sum(axis=1).astype(np.float32)
     raised = np.zeros_like(way)
-    at, flat_index = tuple(cells.T), np.asarray(np.ravel_multi_index(tuple(cells.T), base.shape), dtype=np.int32)
+    at, flat_index = (
+        tuple(cells.T),
+        np.asarray(np.ravel_multi_index(tuple(cells.T), base.shape), dtype=np.int32),
+    )
     solid = np.flatnonzero((center[at] < 0.0) & inner[at])
     depth, along = -2.0 * center[at][solid], normal.reshape(3, -1)[:, flat_index[solid]].T
     corners = [np.array(corner) for corner in np.ndindex(1 if flat else 2, 2, 2)]
@@ -295,7 +405,12 @@ def wall_cells(
 def _beside(marked: np.ndarray, steps: list[np.ndarray]) -> np.ndarray:
     """Return which cells have a marked one at one of the steps from them."""
     padded = np.pad(marked, 1)
-    return np.logical_or.reduce([padded[tuple(slice(1 + d, 1 + d + n) for d, n in zip(s, marked.shape, strict=True))] for s in steps])
+    return np.logical_or.reduce(
+        [
+            padded[tuple(slice(1 + d, 1 + d + n) for d, n in zip(s, marked.shape, strict=True))]
+            for s in steps
+        ]
+    )
 
 
 def _at_centers(nodes: np.ndarray, flat: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -313,4 +428,6 @@ def _at_centers(nodes: np.ndarray, flat: bool) -> tuple[np.ndarray, np.ndarray]:
 
 def _next(field: np.ndarray, axis: int) -> np.ndarray:
     """Return each element's successor along an axis, the last one's own."""
-    return np.concatenate([field.take(range(1, field.shape[axis]), axis), field.take([-1], axis)], axis)
+    return np.concatenate(
+        [field.take(range(1, field.shape[axis]), axis), field.take([-1], axis)], axis
+    )

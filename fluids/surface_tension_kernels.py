@@ -16,9 +16,12 @@ from warp_lcp.rows import KernelFile
 MODULE = "fluids.surface_tension"
 FLOATS = wp.array(dtype=wp.float32)
 TAIL = wp.constant(1e-6)  # shares nearer to 0 or 1 have no place on the profile
-FARAWAY = wp.constant(4.0)  # cells; no kernel within reach of a wall's cell is cut by a surface that is farther from it
-FURTHER, MOST = wp.constant(2.0), wp.constant(3.0)  # cells, from beside a wall and along it, to where the surface's curvature is asked for
-NEAR = wp.constant(2.0)  # cells from the surface, beyond which parallel surfaces meet a wall as they do there
+# cells; no kernel within reach of a wall's cell is cut by a surface that is farther from it
+FARAWAY = wp.constant(4.0)
+# cells, from beside a wall and along it, to where the surface's curvature is asked for
+FURTHER, MOST = wp.constant(2.0), wp.constant(3.0)
+# cells from the surface, beyond which parallel surfaces meet a wall as they do there
+NEAR = wp.constant(2.0)
 BAND = 0.02  # cells whose share is nearer to 0 or 1 are too far from the surface to matter
 HALF = 0.3  # the part of the shares on either side of the surface that its area is found from
 FARTHEST = 1.5  # cells from one beside the surface to the smooth surface
@@ -33,8 +36,15 @@ JUMP = KERNELS["fluids.surface_tension.jump"]
 @functools.cache
 def push_pass(cut: bool) -> SimpleNamespace:
     """Return `push`, which acts on the velocity, and `energy`, which sums the surface up; `cut`: whether faces have open fractions."""
-    made = functools.partial(KERNELS.kernel, module=MODULE + "_cut" * cut, constants={"CUT": cut, "MOVING": False, "GHOST": True})
-    return SimpleNamespace(push=made("fluids.surface_tension.push"), energy=made("fluids.surface_tension.surface_energy"))
+    made = functools.partial(
+        KERNELS.kernel,
+        module=MODULE + "_cut" * cut,
+        constants={"CUT": cut, "MOVING": False, "GHOST": True},
+    )
+    return SimpleNamespace(
+        push=made("fluids.surface_tension.push"),
+        energy=made("fluids.surface_tension.surface_energy"),
+    )
 
 
 @wp.func
@@ -52,7 +62,8 @@ def filled(s: float):
 def walled(part: float):
     """Return how far into a wall the mean place of a part of a cell's kernel lies [cells], and its variance, of the part that a wall takes.
 
-    It is what lies c or more from the center: the kernel is (3/2 - t)^2 / 2 there, and 3/4 - t^2 up to t = 1/2.
+    It is what lies c or more from the center: the kernel is (3/2 - t)^2 / 2 there, and 3/4 - t^2 up
+    to t = 1/2.
     """
     u = wp.pow(wp.min(6.0 * part, 1.0), 1.0 / 3.0)  # 3/2 - c
     place = 1.5 - 0.75 * u
@@ -63,7 +74,9 @@ def walled(part: float):
             c -= (0.5 - 0.75 * c + c * c * c / 3.0 - part) / (c * c - 0.75)
         c = wp.max(c, 0.0)
         place = (0.203125 - 0.375 * c * c + 0.25 * c * c * c * c) / part
-        variance = wp.max((0.125 - 0.25 * c * c * c + 0.2 * c * c * c * c * c) / part - place * place, 0.0)
+        variance = wp.max(
+            (0.125 - 0.25 * c * c * c + 0.2 * c * c * c * c * c) / part - place * place, 0.0
+        )
     return wp.vec2(place, variance)
 
 
@@ -71,9 +84,11 @@ def walled(part: float):
 def whole_share(open_share: float, capacity: float, cosine: float):
     """Return the share of a whole kernel of which a wall takes a part, of what liquid fills of the open part.
 
-    Particles know of the open part alone, whose mean place lies off the center: a surface that is inclined to the wall seems to lie lower
-    there, by 0.15 cells times the cosine beside a whole cell's wall. In the wall the surface goes on as in `continue_kernel`. With d its
-    distance from the center the whole share is G(-d), the wall's part of it a normal distribution's, and the difference what is open.
+    Particles know of the open part alone, whose mean place lies off the center: a surface that is
+    inclined to the wall seems to lie lower there, by 0.15 cells times the cosine beside a whole
+    cell's wall. In the wall the surface goes on as in `continue_kernel`. With d its distance from
+    the center the whole share is G(-d), the wall's part of it a normal distribution's, and the
+    difference what is open.
     """
     part = wp.min(1.0 - capacity, 0.5)
     beyond = walled(part)
@@ -120,17 +135,32 @@ def away_from(cell: int, ny: int, nx: int, p: wp.vec3):
 
 @list_kernel(MODULE)
 def lean_kernel(
-    i, cells: INTS, points: POINTS, way: FLOATS, raised: FLOATS, planes: int, part: float, cosine: float, linear: float, cubic: float,
-    once: FIELD, twice: FIELD, bend: FIELD, lean: FLOATS,
-):  # fmt: skip
+    i,
+    cells: INTS,
+    points: POINTS,
+    way: FLOATS,
+    raised: FLOATS,
+    planes: int,
+    part: float,
+    cosine: float,
+    linear: float,
+    cubic: float,
+    once: FIELD,
+    twice: FIELD,
+    bend: FIELD,
+    lean: FLOATS,
+):
     """Find by how much the distance d to the surface falls into a wall's cell, each cell of the way, so that the two meet at their angle.
 
-    Where the surface meets the wall that is the cosine. At d from there, on the wall, parallel surfaces meet it at other angles, of
-    cosine (1 - kappa d), kappa the surface's curvature [1/cells] across the line where they meet: `part` of the whole one. It is taken
-    where the surface is nearest, two cells further from the wall, beside which it is not right before this is known.
+    Where the surface meets the wall that is the cosine. At d from there, on the wall, parallel
+    surfaces meet it at other angles, of cosine (1 - kappa d), kappa the surface's curvature
+    [1/cells] across the line where they meet: `part` of the whole one. It is taken where the
+    surface is nearest, two cells further from the wall, beside which it is not right before this is
+    known.
 
-    The way's middle lies `raised` cells before a wall that cuts cells, where its ends were moved into the open. Of a circle of radius
-    1/kappa whose center is cosine / kappa behind the wall, that is raised + cosine / kappa from the middle, which takes the cosine's place.
+    The way's middle lies `raised` cells before a wall that cuts cells, where its ends were moved
+    into the open. Of a circle of radius 1/kappa whose center is cosine / kappa behind the wall,
+    that is raised + cosine / kappa from the middle, which takes the cosine's place.
     """
     p = points[i]
     away = away_from(cells[i], bend.shape[1], bend.shape[2], p)
@@ -138,16 +168,26 @@ def lean_kernel(
     b = wp.clamp(int(wp.floor(p[1] + 0.5)), 1, bend.shape[1] - 2)
     c = wp.clamp(int(wp.floor(p[2] + 0.5)), 1, bend.shape[0] - 2)
     d = distance_of(c, b, a, once, twice, linear, cubic)
-    x = 0.5 * (distance_of(c, b, a + 1, once, twice, linear, cubic) - distance_of(c, b, a - 1, once, twice, linear, cubic))
-    y = 0.5 * (distance_of(c, b + 1, a, once, twice, linear, cubic) - distance_of(c, b - 1, a, once, twice, linear, cubic))
+    x = 0.5 * (
+        distance_of(c, b, a + 1, once, twice, linear, cubic)
+        - distance_of(c, b, a - 1, once, twice, linear, cubic)
+    )
+    y = 0.5 * (
+        distance_of(c, b + 1, a, once, twice, linear, cubic)
+        - distance_of(c, b - 1, a, once, twice, linear, cubic)
+    )
     z = float(0.0)
     if planes == 2:
-        z = 0.5 * (distance_of(c + 1, b, a, once, twice, linear, cubic) - distance_of(c - 1, b, a, once, twice, linear, cubic))
+        z = 0.5 * (
+            distance_of(c + 1, b, a, once, twice, linear, cubic)
+            - distance_of(c - 1, b, a, once, twice, linear, cubic)
+        )
     slope = wp.vec3(x, y, z)
     steep = wp.max(wp.dot(slope, slope), 0.1)
     q = FURTHER * away - slope * (d / steep)
     cell = wp.vec3(float(a), float(b), float(c))
-    d += wp.dot(slope, p - cell)  # at the point itself, which lies between cells where the wall's cell is cut
+    # at the point itself, which lies between cells where the wall's cell is cut
+    d += wp.dot(slope, p - cell)
     q = cell + q * wp.min(MOST / wp.max(wp.length(q), 1e-6), 1.0)
     a = wp.clamp(int(wp.floor(q[0])), 1, bend.shape[2] - 2)
     b = wp.clamp(int(wp.floor(q[1])), 1, bend.shape[1] - 2)
@@ -168,7 +208,9 @@ def lean_kernel(
     fall = cosine
     if weight > 0.25:
         kappa = part * total / weight
-        fall = (cosine + kappa * raised[i]) * (1.0 - kappa * wp.clamp(d - 0.5 * way[i] * cosine, -NEAR, NEAR))
+        fall = (cosine + kappa * raised[i]) * (
+            1.0 - kappa * wp.clamp(d - 0.5 * way[i] * cosine, -NEAR, NEAR)
+        )
     lean[cells[i]] = fall
 
 
@@ -212,13 +254,23 @@ def open_mean(p: wp.vec3, planes: int, blocked: MARKS, share: FIELD):
 
 @list_kernel(MODULE)
 def begin_kernel(
-    i, cells: INTS, points: POINTS, way: FLOATS, lean: FLOATS, cosine: float, planes: int, blocked: MARKS, share: FIELD, flat: FLOATS
-):  # fmt: skip
+    i,
+    cells: INTS,
+    points: POINTS,
+    way: FLOATS,
+    lean: FLOATS,
+    cosine: float,
+    planes: int,
+    blocked: MARKS,
+    share: FIELD,
+    flat: FLOATS,
+):
     """Continue the share of cells' kernels into a wall's cell, as `continue_kernel` does with smoothed shares.
 
-    A kernel is 3 cells wide. Before a wetted wall it may hold no liquid where that of the wall's cell, which the surface reaches first,
-    does. There the distance to the surface follows from cells around: it grows by the angle's cosine away from the wall and by its sine
-    along it. The same holds for air at a wall that liquid does not wet.
+    A kernel is 3 cells wide. Before a wetted wall it may hold no liquid where that of the wall's
+    cell, which the surface reaches first, does. There the distance to the surface follows from
+    cells around: it grows by the angle's cosine away from the wall and by its sine along it. The
+    same holds for air at a wall that liquid does not wet.
     """
     p = points[i]
     away = away_from(cells[i], share.shape[1], share.shape[2], p)
@@ -231,11 +283,15 @@ def begin_kernel(
         if value > TAIL and value < 1.0 - TAIL:
             value = filled(fall - distance_for(value))
         else:
-            if (value - 0.5) * cosine < 0.0:  # empty before a wall that liquid wets, or full before one that it does not
+            # empty before a wall that liquid wets, or full before one that it does not
+            if (value - 0.5) * cosine < 0.0:
                 sign = wp.where(cosine > 0.0, 1.0, -1.0)
                 sine = wp.sqrt(wp.max(1.0 - cosine * cosine, 0.0))
                 least = float(4.0)
-                for z in range(wp.where(planes == 2, wp.max(c - 2, 0), c), wp.where(planes == 2, wp.min(c + 4, share.shape[0]), c + 1)):
+                for z in range(
+                    wp.where(planes == 2, wp.max(c - 2, 0), c),
+                    wp.where(planes == 2, wp.min(c + 4, share.shape[0]), c + 1),
+                ):
                     for y in range(wp.max(b - 2, 0), wp.min(b + 4, share.shape[1])):
                         for x in range(wp.max(a - 2, 0), wp.min(a + 4, share.shape[2])):
                             near = share[z, y, x]
@@ -243,7 +299,9 @@ def begin_kernel(
                                 e = p - wp.vec3(float(x), float(y), float(z))
                                 n = wp.dot(e, away)
                                 along = wp.length(e - n * away)
-                                least = wp.min(least, sign * (distance_for(near) + n * cosine) + along * sine)
+                                least = wp.min(
+                                    least, sign * (distance_for(near) + n * cosine) + along * sine
+                                )
                 if least < FARAWAY:
                     value = filled(fall - sign * wp.max(least, 1.5))
         flat[cells[i]] = value
@@ -251,13 +309,23 @@ def begin_kernel(
 
 @list_kernel(MODULE)
 def continue_kernel(
-    i, cells: INTS, points: POINTS, way: FLOATS, lean: FLOATS, cosine: float, spread: float, planes: int, blocked: MARKS, share: FIELD,
+    i,
+    cells: INTS,
+    points: POINTS,
+    way: FLOATS,
+    lean: FLOATS,
+    cosine: float,
+    spread: float,
+    planes: int,
+    blocked: MARKS,
+    share: FIELD,
     flat: FLOATS,
-):  # fmt: skip
+):
     """Continue the share into a wall's cell from the open cells around a point before the wall, `way` cells nearer to the open.
 
-    Along it the distance to the surface falls by `lean`, if the cosine is not 0; a profile of the normal distribution with the spread
-    [cells] turns shares into distances and back. A cell reads open cells and writes none.
+    Along it the distance to the surface falls by `lean`, if the cosine is not 0; a profile of the
+    normal distribution with the spread [cells] turns shares into distances and back. A cell reads
+    open cells and writes none.
     """
     p = points[i]
     value, weight = open_mean(p, planes, blocked, share)

@@ -15,21 +15,30 @@ from warp_lcp.settings import NonNegative
 class WallDragSettings(Table):
     """[wall_drag]: drag of walls with an unresolved boundary layer; off without the table and `drag` of a solid."""
 
-    coefficient: NonNegative = Field(default=0.0, description="c_f of walls and solids, about 0.005: shear stress c_f / 2 rho u^2")
-    domain: NonNegative | None = Field(default=None, description="c_f of the domain's walls; default: coefficient")
+    coefficient: NonNegative = Field(
+        default=0.0,
+        description="c_f of walls and solids, about 0.005: shear stress c_f / 2 rho u^2",
+    )
+    domain: NonNegative | None = Field(
+        default=None, description="c_f of the domain's walls; default: coefficient"
+    )
 
 
 def _column_name(text: str) -> str:
     """Return a name that columns may begin with."""
     if not (text.isascii() and text.isidentifier()):
-        raise PydanticCustomError("name", 'must consist of letters, digits and "_", and not begin with a digit')
+        raise PydanticCustomError(
+            "name", 'must consist of letters, digits and "_", and not begin with a digit'
+        )
     return text
 
 
 class Probe(Table):
     """[[probe]]: measurement at a point in each step, in probes.csv."""
 
-    name: Annotated[str, AfterValidator(_column_name)] = Field(description="prefix of its columns, as in NAME_pressure")
+    name: Annotated[str, AfterValidator(_column_name)] = Field(
+        description="prefix of its columns, as in NAME_pressure"
+    )
     position: Vector = Field(description="point in the domain [m]")
     quantity: Literal["pressure", "velocity", "level"] = Field(
         description="level: height of the surface above the point, against gravity [m]"
@@ -41,18 +50,41 @@ class Probe(Table):
         return tuple(f"{self.name}_{part}" for part in parts)
 
 
-def probe_complaints(probes: Sequence[Probe], size: Sequence[float], gravity: Sequence[float]) -> list[Complaint]:
+def probe_complaints(
+    probes: Sequence[Probe], size: Sequence[float], gravity: Sequence[float]
+) -> list[Complaint]:
     """Return what is wrong with the probes of a domain of these sides [m], in such a gravity [m/s^2]."""
     found = []
     for index, probe in enumerate(probes):
         place = ("probe", index, "position")
         if len(probe.position) != len(size):
-            found.append(Complaint(place, probe.position, f"must have {len(size)} entries, as domain.size has"))
+            found.append(
+                Complaint(
+                    place, probe.position, f"must have {len(size)} entries, as domain.size has"
+                )
+            )
         elif not all(0.0 <= x <= side for x, side in zip(probe.position, size, strict=True)):
-            found.append(Complaint(place, probe.position, f"lies outside the domain, which extends from the origin to {list(size)} m"))
-        if any((probe.name, probe.quantity) == (other.name, other.quantity) for other in probes[:index]):
-            message = f"is also the name of another probe of the {probe.quantity}: log columns must differ"
+            found.append(
+                Complaint(
+                    place,
+                    probe.position,
+                    f"lies outside the domain, which extends from the origin to {list(size)} m",
+                )
+            )
+        if any(
+            (probe.name, probe.quantity) == (other.name, other.quantity) for other in probes[:index]
+        ):
+            message = (
+                f"is also the name of another probe of the {probe.quantity}: log columns "
+                "must differ"
+            )
             found.append(Complaint(("probe", index, "name"), probe.name, message))
         if probe.quantity == "level" and not any(gravity):
-            found.append(Complaint(("probe", index, "quantity"), "level", "needs gravity, along which it is measured"))
+            found.append(
+                Complaint(
+                    ("probe", index, "quantity"),
+                    "level",
+                    "needs gravity, along which it is measured",
+                )
+            )
     return found

@@ -16,27 +16,36 @@ from warp_lcp.rows.vectors import Across, Reduction, convert, rows_of
 KERNELS = KernelFile(Path(__file__).parent / "headers/pressure.h")
 CHANGE = KERNELS["tolerance.change"]
 FRACTION = 0.1  # of the time step's error that the solve may leave
-FIRST = 1e-4  # relative residual of the first steps, before which there is no change to measure: a liquid that is at rest shall stay so
-LEAST = 1e-6  # relative residual than which none is asked to be smaller: rounding on the faces is what is left then
-MOST = 0.1  # relative residual that is always asked for: what follows a collision must not be taken as it is
+# relative residual of the first steps, before which there is no change to measure: a liquid that is
+# at rest shall stay so
+FIRST = 1e-4
+# relative residual than which none is asked to be smaller: rounding on the faces is what is left
+# then
+LEAST = 1e-6
+# relative residual that is always asked for: what follows a collision must not be taken as it is
+MOST = 0.1
 
 
 class TimeErrorTolerance:
     """Automatic tolerance: a fraction of the time discretization error.
 
-    A step assumes a constant acceleration by the pressure. To first order its velocity error is half of the change of this acceleration
-    from one step to the next. The first guess of a solve is just the last step's pressure, x0 = x_last kick_dt / kick_dt_last:
+    A step assumes a constant acceleration by the pressure. To first order its velocity error is
+    half of the change of this acceleration from one step to the next. The first guess of a solve is
+    just the last step's pressure, x0 = x_last kick_dt / kick_dt_last:
 
         time error = 1/2 ||G (x - x0)||,   ||G e||^2 = e'A e,
 
-    with G the gradient: in the energy norm of A an error in x is one in the velocity. It is measured once x is known, and used for the
-    next step, times (kick_dt / kick_dt_last)^2 where that is shorter.
+    with G the gradient: in the energy norm of A an error in x is one in the velocity. It is
+    measured once x is known, and used for the next step, times (kick_dt / kick_dt_last)^2 where
+    that is shorter.
 
-    What a solve leaves is e with residual r = A e. Multigrid cycles leave errors that are as short as the cells, on which A is of order
-    one: looked at in forty steps of dam-break-2d, splash-in-circle, mesh-obstacle and wave-maker, ||G e|| = 0.12 to 1.0 ||r|| after one to
-    six cycles. So a solve is done when ||r|| <= FRACTION time error, which costs nothing to test.
+    What a solve leaves is e with residual r = A e. Multigrid cycles leave errors that are as short
+    as the cells, on which A is of order one: looked at in forty steps of dam-break-2d,
+    splash-in-circle, mesh-obstacle and wave-maker, ||G e|| = 0.12 to 1.0 ||r|| after one to six
+    cycles. So a solve is done when ||r|| <= FRACTION time error, which costs nothing to test.
 
-    Liquid at rest and in free fall has residuals of rounding noise, which the absolute tolerance covers.
+    Liquid at rest and in free fall has residuals of rounding noise, which the absolute tolerance
+    covers.
 
     Args:
         size: elements of a stored field.
@@ -50,7 +59,8 @@ class TimeErrorTolerance:
     def __init__(self, size: int, device: wp.Device, across: Across | None = None) -> None:
         self.used = FIRST
         self._error: float | None = None
-        self._warm = self._change = False  # whether a step came before; whether `_sum` has an error that has not been asked for
+        # whether a step came before; whether `_sum` has an error that has not been asked for
+        self._warm = self._change = False
         self._unknowns = 1
         self._reference = 0.0  # residual of the last step at x = 0, root mean square [m/s]
         self._sum = Reading(device)
@@ -70,7 +80,14 @@ class TimeErrorTolerance:
         allowed = min(FRACTION * self.time_error * shorter**2, MOST * self._reference * shorter)
         return {"rtol": LEAST, "atol": max(atol, allowed)}
 
-    def measure(self, A: Any, result: wl.SolveResult, criteria: wl.StoppingCriteria, fields: list[wp.array], unknowns: int) -> None:
+    def measure(
+        self,
+        A: Any,
+        result: wl.SolveResult,
+        criteria: wl.StoppingCriteria,
+        fields: list[wp.array],
+        unknowns: int,
+    ) -> None:
         """Estimate the time discretization error from a solution.
 
         Args:
@@ -80,7 +97,9 @@ class TimeErrorTolerance:
             fields: its first guess and another stored float64 field (both overwritten).
             unknowns: of the problem.
         """
-        reference = result.residual / result.relative_residual if result.relative_residual > 0.0 else 0.0
+        reference = (
+            result.residual / result.relative_residual if result.relative_residual > 0.0 else 0.0
+        )
         self.used = criteria.tolerance(reference) / reference if reference > 0.0 else 0.0
         self._reference = reference / max(unknowns, 1) ** 0.5
         self._unknowns, self._change = max(unknowns, 1), self._warm
@@ -104,7 +123,10 @@ class TimeErrorTolerance:
         None before the first step.
         """
         if self._change:
-            self._change, self._error = False, 0.5 * float(np.sqrt(max(float(self._sum.numpy()[0]), 0.0) / self._unknowns))
+            self._change, self._error = (
+                False,
+                0.5 * float(np.sqrt(max(float(self._sum.numpy()[0]), 0.0) / self._unknowns)),
+            )
         return self._error
 
     def state(self) -> np.ndarray:
@@ -113,4 +135,8 @@ class TimeErrorTolerance:
 
     def restore(self, state: np.ndarray) -> None:
         """Restore the result of `state`."""
-        self._error, self._reference, self._change = float(state[0]) if state[0] >= 0.0 else None, float(state[1]), False
+        self._error, self._reference, self._change = (
+            float(state[0]) if state[0] >= 0.0 else None,
+            float(state[1]),
+            False,
+        )

@@ -28,36 +28,45 @@ class UnilateralPressure(PressureProjection):
 
     The problem has all cells that are not SOLID.
 
-    After Narain et al. (2010) and Gerszewski and Bargteil (2013), as reported in [Book] 1.3; the discrete law is derived here.
+    After Narain et al. (2010) and Gerszewski and Bargteil (2013), as reported in [Book] 1.3; the
+    discrete law is derived here.
 
-    rho_i is the density of the particles in units of that at rest, capacity_i what fits beside walls, a_f the open fraction of a face,
-    s_f = +-1 outward. A cell is filled to f_i = min(rho_i / (FULL capacity_i), 1), f_f is that of a face. The pressure accelerates it:
+    rho_i is the density of the particles in units of that at rest, capacity_i what fits beside
+    walls, a_f the open fraction of a face, s_f = +-1 outward. A cell is filled to f_i = min(rho_i /
+    (FULL capacity_i), 1), f_f is that of a face. The pressure accelerates it:
 
         f_f u_f = f_f u*_f - (x_right - x_left),   x = kick_dt p / (rho_0 dx) [m/s].
 
-    With what passes a face, q_f = a_f f_f u*_f + (1 - a_f) u_s,f (a solid that comes in takes room: the second term),
+    With what passes a face, q_f = a_f f_f u*_f + (1 - a_f) u_s,f (a solid that comes in takes room:
+    the second term),
 
         y_i = room_i + settling_i + sum of s_f q_f + sum of a_f (x_i - x_neighbor),   0 <= x complementary to y >= 0,
         room_i = max(dx / dt, what flows in) max(capacity_i - rho_i / FULL, 0),
         settling_i = c (capacity_i - rho_i), within +-(1 - FULL) c,
 
-    whose matrix is symmetric and has no density in it, since it is the momentum f_f u_f and not the velocity that the pressure's
-    gradient changes. Where a cell has room for what flows in, x = 0: nothing holds liquid together, and walls let go as air does.
+    whose matrix is symmetric and has no density in it, since it is the momentum f_f u_f and not the
+    velocity that the pressure's gradient changes. Where a cell has room for what flows in, x = 0:
+    nothing holds liquid together, and walls let go as air does.
 
-    A full cell has no room, whatever it holds and however long the step is, so that its pressure acts in the shortest one. That it comes
-    to the density at rest takes a time of its own: c = sqrt(g dx), the speed of waves on a layer of cells, or dx / dt if that is less. At
-    dx / dt, as room is taken, a short step would throw out what is too much at any speed, and lose the pressure where a little is missing.
-    Too much and too little count alike: where the one acts slowly and the other at once, the uppermost cells fall into the room that was
-    made by pushing, and a pool boils.
+    A full cell has no room, whatever it holds and however long the step is, so that its pressure
+    acts in the shortest one. That it comes to the density at rest takes a time of its own: c =
+    sqrt(g dx), the speed of waves on a layer of cells, or dx / dt if that is less. At dx / dt, as
+    room is taken, a short step would throw out what is too much at any speed, and lose the pressure
+    where a little is missing. Too much and too little count alike: where the one acts slowly and
+    the other at once, the uppermost cells fall into the room that was made by pushing, and a pool
+    boils.
 
-    In q the share f_f is that of the cell that the flow comes from, and room grows with what flows in, which in a step of many cells is
-    more than fits: a cell that is filled and empties at once has room for all of it. With f_f the mean of both cells, or without that, the
-    front of a block in free flight seems to over-fill the cells ahead and is blown off. What the gradient accelerates is the mean of both.
+    In q the share f_f is that of the cell that the flow comes from, and room grows with what flows
+    in, which in a step of many cells is more than fits: a cell that is filled and empties at once
+    has room for all of it. With f_f the mean of both cells, or without that, the front of a block
+    in free flight seems to over-fill the cells ahead and is blown off. What the gradient
+    accelerates is the mean of both.
 
-    Cells that are open to less than a quarter hold too few particles to tell a density: they take what fits, and do not settle.
+    Cells that are open to less than a quarter hold too few particles to tell a density: they take
+    what fits, and do not settle.
 
-    The density is that of a kernel three cells wide, so that the two layers of cells beneath a surface are not full and carry no pressure
-    until they have been compressed a little.
+    The density is that of a kernel three cells wide, so that the two layers of cells beneath a
+    surface are not full and carry no pressure until they have been compressed a little.
 
     Args:
         grid: the grid.
@@ -74,10 +83,27 @@ class UnilateralPressure(PressureProjection):
     """
 
     def __init__(
-        self, grid: StaggeredGrid, boundary: Boundary, solver: Any, *, level_set: LevelSet, weights: Sequence[wp.array],
-        tolerance: float | Literal["auto"], max_iterations: int, coupling: BodyCoupling | None = None, gravity: float = 0.0,
-    ) -> None:  # fmt: skip
-        super().__init__(grid, boundary, solver, tolerance=tolerance, max_iterations=max_iterations, coupling=coupling, gravity=gravity)
+        self,
+        grid: StaggeredGrid,
+        boundary: Boundary,
+        solver: Any,
+        *,
+        level_set: LevelSet,
+        weights: Sequence[wp.array],
+        tolerance: float | Literal["auto"],
+        max_iterations: int,
+        coupling: BodyCoupling | None = None,
+        gravity: float = 0.0,
+    ) -> None:
+        super().__init__(
+            grid,
+            boundary,
+            solver,
+            tolerance=tolerance,
+            max_iterations=max_iterations,
+            coupling=coupling,
+            gravity=gravity,
+        )
         self._weights = list(weights)
         self._sums = wp.zeros((*grid.shape[:2], 2), dtype=wp.float64, device=grid.device)
         self._totals = Reading(grid.device, 2) if grid.device.is_cuda else None  # of `_sums`
@@ -91,14 +117,18 @@ class UnilateralPressure(PressureProjection):
         setting.cells, setting.base = self._unknown, boundary.base
         self._setting, self._rate, self._settling = setting, Scalar(), Scalar()
 
-    def prepare(self, velocity: Sequence[wp.array], dt: float, kick_dt: float, window: Window | None = None) -> bool:
+    def prepare(
+        self, velocity: Sequence[wp.array], dt: float, kick_dt: float, window: Window | None = None
+    ) -> bool:
         """Set up the problem of all cells that are not SOLID; return if there are any.
 
         Arguments as in the base class.
         """
         self._begin(kick_dt)
         self._rate.value, self._ratio_cell.value = self.grid.spacing / dt, self._ratio
-        self._settling.value = min(math.sqrt(self._gravity * self.grid.spacing), self.grid.spacing / dt)
+        self._settling.value = min(
+            math.sqrt(self._gravity * self.grid.spacing), self.grid.spacing / dt
+        )
         self._everyone = None
         self._preparation.run(velocity)
         self._count.changed()
@@ -113,16 +143,26 @@ class UnilateralPressure(PressureProjection):
         """Launch the set-up of the problem, and count its unknowns."""
         least, numbers = SHIFT if self.boundary.open else 0.0, [self._rate, self._settling]
         fields = [self.pressure, self._ratio_cell, least, self._b, self._start, self._shift]
-        self.grid.domain.launch(kernels.prepare_kernel, [self._at(velocity), *numbers, self.kind, *fields])
+        self.grid.domain.launch(
+            kernels.prepare_kernel, [self._at(velocity), *numbers, self.kind, *fields]
+        )
         self._count.take(self._cells, kind=self._unknown)
 
-    def project(self, velocity: Sequence[wp.array], window: Window, result: wl.SolveResult, criteria: wl.StoppingCriteria) -> Projection:
+    def project(
+        self,
+        velocity: Sequence[wp.array],
+        window: Window,
+        result: wl.SolveResult,
+        criteria: wl.StoppingCriteria,
+    ) -> Projection:
         """Apply a solution: update velocities, mark valid faces and wall contact.
 
         Arguments as in the base class.
         """
         self._last = self._kick
-        self._projection.run(velocity, window, result.x, variant=(result.x.ptr, window.near is None))
+        self._projection.run(
+            velocity, window, result.x, variant=(result.x.ptr, window.near is None)
+        )
         if self._totals is not None:
             self._totals.changed()
         return Projection(result, self.counted(), self._found)
@@ -133,9 +173,26 @@ class UnilateralPressure(PressureProjection):
         for axis, field in enumerate(velocity):
             clear(self.known[axis])
             open_ = self.boundary.open[axis] if self.boundary.open else None
-            inputs = [self._setting, axis, self.pressure, open_, self._weights[axis], field, self.known[axis]]
+            inputs = [
+                self._setting,
+                axis,
+                self.pressure,
+                open_,
+                self._weights[axis],
+                field,
+                self.known[axis],
+            ]
             window.launch(kernels.push_kernel, inputs)
-        inputs = [self._at(velocity), self._rate, self._settling, self.kind, self.boundary.touch, self.pressure, self.contact, self._sums]
+        inputs = [
+            self._at(velocity),
+            self._rate,
+            self._settling,
+            self.kind,
+            self.boundary.touch,
+            self.pressure,
+            self.contact,
+            self._sums,
+        ]
         inputs.append(None if self._totals is None else self._totals.array)
         if self._totals is not None:
             clear(self._totals.array)

@@ -8,9 +8,14 @@ from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.material.boundary_kernels import HELD, LETS_GO, RELEASED, TOUCHES
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
 
-FULL = 0.8  # density, of that at rest, from which a cell counts as full: less than 1 by more than what the sampling makes of it
-LEAST_SHARE = 0.25  # of a cell's kernel: where less is open, as in `warp_lcp.grid.level_set`, a particle more or less is not to tell
-LEAST_DENSITY = 0.1  # of a face: less mass would be thrown about by the pressure of a full cell beside it
+# density, of that at rest, from which a cell counts as full: less than 1 by more than what the
+# sampling makes of it
+FULL = 0.8
+# of a cell's kernel: where less is open, as in `warp_lcp.grid.level_set`, a particle more or less
+# is not to tell
+LEAST_SHARE = 0.25
+# of a face: less mass would be thrown about by the pressure of a full cell beside it
+LEAST_DENSITY = 0.1
 
 _AIR = wp.constant(wp.int8(AIR))
 _FLUID = wp.constant(wp.int8(FLUID))
@@ -69,7 +74,18 @@ def face_density(s: UnilateralSetting, k: int, j: int, i: int, c: int, b: int, a
 
 
 @wp.func
-def passing(s: UnilateralSetting, u: F32, open: F32, solid: F32, k: int, j: int, i: int, c: int, b: int, a: int):
+def passing(
+    s: UnilateralSetting,
+    u: F32,
+    open: F32,
+    solid: F32,
+    k: int,
+    j: int,
+    i: int,
+    c: int,
+    b: int,
+    a: int,
+):
     """Return what passes the lower face of cell (k, j, i) [m/s], in units of what full cells let pass; solids take their place."""
     part = open_part(s, open, k, j, i, c, b, a)
     flow = part * u[k, j, i]
@@ -86,7 +102,8 @@ def passing(s: UnilateralSetting, u: F32, open: F32, solid: F32, k: int, j: int,
 def slack(s: UnilateralSetting, rate: wp.float64, settling: float, k: int, j: int, i: int):
     """Return y of a cell: what it may still take, what it is off the density at rest, and what flows out of it [m/s].
 
-    The rate is dx / dt [m/s], and settling the speed at which a full cell comes to the density at rest [m/s], of what it is off by.
+    The rate is dx / dt [m/s], and settling the speed at which a full cell comes to the density at
+    rest [m/s], of what it is off by.
     """
     left = passing(s, s.u, s.open_x, s.solid_x, k, j, i, k, j, i - 1)
     right = passing(s, s.u, s.open_x, s.solid_x, k, j, i + 1, k, j, i)
@@ -109,9 +126,20 @@ def slack(s: UnilateralSetting, rate: wp.float64, settling: float, k: int, j: in
 
 @cell_kernel("fluids.unilateral")
 def prepare_kernel(
-    k, j, i, s: UnilateralSetting, rate: wp.float64, settling: float, kind: I8, last: F64, ratio: wp.float64, least: float, b: F64,
-    start: F64, shift: F32,
-):  # fmt: skip
+    k,
+    j,
+    i,
+    s: UnilateralSetting,
+    rate: wp.float64,
+    settling: float,
+    kind: I8,
+    last: F64,
+    ratio: wp.float64,
+    least: float,
+    b: F64,
+    start: F64,
+    shift: F32,
+):
     """Mark the unknowns; fill right-hand side, first guess and what the open sides add to the diagonal."""
     unknown = s.base[k, j, i] != _SOLID and kind[k, j, i] != _SOLID
     value = wp.float64(0.0)
@@ -141,7 +169,9 @@ def prepare_kernel(
 
 
 @cell_kernel("fluids.unilateral")
-def push_kernel(k, j, i, s: UnilateralSetting, axis: int, x: F64, open: F32, weight: F32, field: F32, known: I8):
+def push_kernel(
+    k, j, i, s: UnilateralSetting, axis: int, x: F64, open: F32, weight: F32, field: F32, known: I8
+):
     """Let the pressure act on the open faces that particles gave weight, and mark them 1; others 0, or -1 inside solids of whole cells."""
     c = k - wp.where(axis == 2, 1, 0)
     b = j - wp.where(axis == 1, 1, 0)
@@ -164,9 +194,20 @@ def push_kernel(k, j, i, s: UnilateralSetting, axis: int, x: F64, open: F32, wei
 
 @cell_kernel("fluids.unilateral")
 def contact_kernel(
-    k, j, first, end, s: UnilateralSetting, rate: wp.float64, settling: float, kind: I8, touch: U8, x: F64, contact: U8, sums: F64,
+    k,
+    j,
+    first,
+    end,
+    s: UnilateralSetting,
+    rate: wp.float64,
+    settling: float,
+    kind: I8,
+    touch: U8,
+    x: F64,
+    contact: U8,
+    sums: F64,
     found: wp.array(dtype=wp.float64),
-):  # fmt: skip
+):
     """Set the contact of wall cells; sum up those of a row that release liquid, and find its largest |y| of full cells.
 
     `found`, if there is one, has the sum of the first and the largest of the second of all rows.

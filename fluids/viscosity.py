@@ -4,23 +4,26 @@ With the rate of strain e of a velocity u, the step from u1 makes [Batty & Brids
 
     1/2 sum_f V_f |u_f - u1_f|^2 + tau sum_s V_s e_s : e_s,   tau = nu dt / dx^2,
 
-least: u on faces, e_aa at cells, e_ab on edges, differences in units of 1/dx, V the shares of their cubes that liquid fills, but 0 of faces
-between two cells of air: their u1 is the neighbors', and with a mass it would hold the surface back by a shear of mu d_t u_n, u_n the
-normal velocity and t along the surface, in steps of nu dt / dx^2 < 1. So faces have
+least: u on faces, e_aa at cells, e_ab on edges, differences in units of 1/dx, V the shares of their
+cubes that liquid fills, but 0 of faces between two cells of air: their u1 is the neighbors', and
+with a mass it would hold the surface back by a shear of mu d_t u_n, u_n the normal velocity and t
+along the surface, in steps of nu dt / dx^2 < 1. So faces have
 
     V u + tau K u = V u1,   K symmetric and positive semi-definite,
 
-with K u = 0 for all rigid motions of what floats freely: linear and angular momentum stay. Faces in air that touch a filled cell or edge
-are unknowns too, so that the surface bears no traction.
+with K u = 0 for all rigid motions of what floats freely: linear and angular momentum stay. Faces in
+air that touch a filled cell or edge are unknowns too, so that the surface bears no traction.
 
 In terms of gradients, with the determinants of pairs of axes apart,
 
     e : e = |grad u|^2 / 2 + (div u)^2 / 2 + sum_{a<b} (d_b u_a d_a u_b - d_a u_a d_b u_b),
 
-and in the discrete sums too the last term adds up to nothing in the middle of the liquid. Beside a wall where the liquid sticks it is left
-out with div u, which the pressure has made 0: what remains is |grad u|^2 / 2, whose links that cross the wall end at it, at theta of their
-length, with the wall's velocity there [Gibou et al. 2002], second order on walls that cut cells. A slip length puts the end that far behind
-the wall (Navier). Links to walls that the pressure's complementarity has let go of are cut: there is no traction.
+and in the discrete sums too the last term adds up to nothing in the middle of the liquid. Beside a
+wall where the liquid sticks it is left out with div u, which the pressure has made 0: what remains
+is |grad u|^2 / 2, whose links that cross the wall end at it, at theta of their length, with the
+wall's velocity there [Gibou et al. 2002], second order on walls that cut cells. A slip length puts
+the end that far behind the wall (Navier). Links to walls that the pressure's complementarity has
+let go of are cut: there is no traction.
 """
 
 from __future__ import annotations
@@ -37,7 +40,13 @@ from warp_lcp.fluids.viscosity_bodies import BodyDrag, ViscousWalls, WallPull
 from warp_lcp.fluids.viscosity_multigrid import ViscosityMultigrid
 from warp_lcp.fluids.viscosity_passes import viscous_passes
 from warp_lcp.grid.sides import open_sides_of
-from warp_lcp.grid.staggered import ActiveWindow, DirtyRegion, StaggeredGrid, Window, three_components
+from warp_lcp.grid.staggered import (
+    ActiveWindow,
+    DirtyRegion,
+    StaggeredGrid,
+    Window,
+    three_components,
+)
 from warp_lcp.grid.tally import WindowTally
 from warp_lcp.krylov.conjugate_gradient import ConjugateGradient
 from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
@@ -48,8 +57,11 @@ from warp_lcp.rows.fields import zeros
 from warp_lcp.rows.memory import Scalar
 from warp_lcp.rows.program import Launch, LaunchGraph, clear, copy, launch_now
 
-ROUNDING = 4 * float(np.finfo(np.float32).eps)  # of a force, relative to the diagonal times the speed
-STIFF = 1.0  # of nu dt / dx^2: where it is less, faces without mass, which nobody reads, would decide by their error when a solve ends
+# of a force, relative to the diagonal times the speed
+ROUNDING = 4 * float(np.finfo(np.float32).eps)
+# of nu dt / dx^2: where it is less, faces without mass, which nobody reads, would decide by their
+# error when a solve ends
+STIFF = 1.0
 
 VISCOUS_COLUMNS = ("viscous_iterations", "viscous_residual", "dissipated", "wall_work")
 
@@ -95,8 +107,8 @@ class ViscousResult:
 class Viscosity:
     """Take implicit steps of viscosity; `solve` and `push_bodies` are collective.
 
-    Velocity, kinds of cells, contacts, surface and the liquid's own viscosities must be right in ghost cells; velocity and change then are.
-    `impulses` are those of this process's faces.
+    Velocity, kinds of cells, contacts, surface and the liquid's own viscosities must be right in
+    ghost cells; velocity and change then are. `impulses` are those of this process's faces.
 
     Args:
         grid: the grid.
@@ -104,24 +116,37 @@ class Viscosity:
         viscosity: mu [Pa s].
         density: [kg/m^3].
         slip_lengths: of the domain's wall and each solid [m], shape (1 + solids,); inf: free slip.
-        phi: float32 distance to the free surface at cell centers [cells], < 0 in liquid; None: it lies on the cells' faces.
+        phi: float32 distance to the free surface at cell centers [cells], < 0 in liquid; None: it
+            lies on the cells' faces.
         tolerance: relative residual at which a solve is done.
         thickest: the largest viscosity, in units of `viscosity`; None: there is only one.
-        max_iterations: of conjugate gradients in a step; 200 unless given, 1000 where viscosities differ.
+        max_iterations: of conjugate gradients in a step; 200 unless given, 1000 where viscosities
+            differ.
         bodies: those that the liquid moves, among the solids; None: there are none.
         sources: whether cells may turn SOLID, as those of sources do.
 
     Attributes:
         change: what the last step changed of each component [m/s].
         before: of a velocity that a caller keeps, see `undo`.
-        relative: viscosity on the faces of each component, in units of `viscosity`, 0 where there is no liquid; empty: there is only one.
+        relative: viscosity on the faces of each component, in units of `viscosity`, 0 where there
+            is no liquid; empty: there is only one.
     """
 
     def __init__(
-        self, grid: StaggeredGrid, boundary: Boundary, *, viscosity: float, density: float, slip_lengths: Sequence[float],
-        phi: wp.array | None, tolerance: float, thickest: float | None = None, max_iterations: int | None = None, sources: bool = False,
+        self,
+        grid: StaggeredGrid,
+        boundary: Boundary,
+        *,
+        viscosity: float,
+        density: float,
+        slip_lengths: Sequence[float],
+        phi: wp.array | None,
+        tolerance: float,
+        thickest: float | None = None,
+        max_iterations: int | None = None,
+        sources: bool = False,
         bodies: RigidBodies | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.grid, self.boundary, self.tolerance, self.max_iterations = (
             grid,
             boundary,
@@ -130,7 +155,13 @@ class Viscosity:
         )
         self._viscosity, self._density, self._phi = viscosity, density, phi
         self._inner, self._across = grid.part.owned, grid.part.across
-        self._passes = viscous_passes(grid.dimension, bool(boundary.open), phi is not None, bool(boundary.velocity), thickest is not None)
+        self._passes = viscous_passes(
+            grid.dimension,
+            bool(boundary.open),
+            phi is not None,
+            bool(boundary.velocity),
+            thickest is not None,
+        )
         self._thickest = thickest or 1.0
         slips = np.asarray(slip_lengths, dtype=np.float32) / np.float32(grid.spacing)
         self._slips = wp.array(slips, dtype=wp.float32, device=grid.device)
@@ -147,7 +178,9 @@ class Viscosity:
         self._bodies: BodyDrag | None = None
         if bodies is not None:
             assert isinstance(boundary, CutBoundary), "a scene with bodies has cut cells"
-            self._bodies = BodyDrag(grid, boundary, bodies, density, self._passes, self._inner, self._across)
+            self._bodies = BodyDrag(
+                grid, boundary, bodies, density, self._passes, self._inner, self._across
+            )
         self._solver = self._krylov()
         self._trail, self._sums = (
             DirtyRegion(grid.everywhere),
@@ -155,12 +188,31 @@ class Viscosity:
         )
         self._box, self._above = ActiveWindow(grid.everywhere), ActiveWindow(grid.everywhere)
         self._unknowns, self._tau = ActiveWindow(self._inner), Scalar()
-        launches = (self._keep, self._set_up, self._residual, self._take_solution, self._cover, self._keep_change, self._undo)
+        launches = (
+            self._keep,
+            self._set_up,
+            self._residual,
+            self._take_solution,
+            self._cover,
+            self._keep_change,
+            self._undo,
+        )
         shared = grid.part.shared  # then ranks exchange halos in some
-        self._graphs = {function.__name__: LaunchGraph(grid.device, function, at_once=shared) for function in launches}
+        self._graphs = {
+            function.__name__: LaunchGraph(grid.device, function, at_once=shared)
+            for function in launches
+        }
 
     def solve(
-        self, velocity: Sequence[wp.array], window: Window, kind: wp.array, contact: wp.array, dt: float, speed: float, *, last: bool = True
+        self,
+        velocity: Sequence[wp.array],
+        window: Window,
+        kind: wp.array,
+        contact: wp.array,
+        dt: float,
+        speed: float,
+        *,
+        last: bool = True,
     ) -> ViscousResult:
         """Find the change of a velocity in a step; the velocity itself becomes what it was changed to.
 
@@ -171,7 +223,8 @@ class Viscosity:
             contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED.
             dt: how long viscosity acts [s].
             speed: scale of the velocities [m/s].
-            last: whether no other solve of the step follows; faces in walls take their velocity in the last one.
+            last: whether no other solve of the step follows; faces in walls take their velocity in
+                the last one.
         """
         box, inner = self._boxes(window)
         if inner is None:
@@ -183,7 +236,9 @@ class Viscosity:
         self._placed = True
         given = {"u": velocity, "kind": kind, "contact": contact}
         if self._bodies is not None:
-            self._bodies.take(self._fine, ViscousWalls(self._distance, self._slip, kind, contact), velocity)
+            self._bodies.take(
+                self._fine, ViscousWalls(self._distance, self._slip, kind, contact), velocity
+            )
             if self._bodies.moved:  # a recorded iteration knows where they lay
                 self._solver = self._krylov()
         first, lost, driven, stiff = self._force(given, changed=False)
@@ -211,14 +266,21 @@ class Viscosity:
         elif not math.isfinite(norm):
             status = SolveStatus.NON_FINITE
         else:
-            status = SolveStatus.MAX_ITERATIONS if iterations >= self.max_iterations else SolveStatus.STAGNATED
-        return ViscousResult(iterations, residual, status, energy * (lost + driven), energy * driven)
+            status = (
+                SolveStatus.MAX_ITERATIONS
+                if iterations >= self.max_iterations
+                else SolveStatus.STAGNATED
+            )
+        return ViscousResult(
+            iterations, residual, status, energy * (lost + driven), energy * driven
+        )
 
     def _begin(self, box: Window, inner: Window, tau: float) -> None:
         """Have launches work in a box, and on the unknowns of its `inner` cells."""
         self._tau.value = tau
         self._box.move_to(box)
-        # edges and faces on the upper ends of the domain, too; below the first cell there is nothing
+        # edges and faces on the upper ends of the domain, too; below the first cell there is
+        # nothing
         self._above.move_to(Window.of([max(low, 1) for low in box.low], box.high, box.device))
         self._unknowns.move_to(inner)
         self.multigrid.move_to(box)
@@ -231,7 +293,9 @@ class Viscosity:
 
     def _cover(self, velocity: Sequence[wp.array], kind: wp.array) -> None:
         """Give faces in walls their velocity."""
-        for axis, (total, u, own) in enumerate(zip(self.change, velocity, self._solids, strict=True)):
+        for axis, (total, u, own) in enumerate(
+            zip(self.change, velocity, self._solids, strict=True)
+        ):
             self._unknowns.run(
                 self._passes.cover,
                 total=total,
@@ -253,7 +317,9 @@ class Viscosity:
         box = part.whole(replace(self._trail.through(window), near=None))
         return box, box.common(part.owned)
 
-    def impulses(self, velocity: Sequence[wp.array], kind: wp.array, contact: wp.array, points: np.ndarray) -> np.ndarray:
+    def impulses(
+        self, velocity: Sequence[wp.array], kind: wp.array, contact: wp.array, points: np.ndarray
+    ) -> np.ndarray:
         """Return what viscous stresses of the last step give the domain and each solid, shape (1 + solids, 6): N s, N m s.
 
         Args:
@@ -263,8 +329,12 @@ class Viscosity:
             points: about which moments are taken [m], shape (1 + solids, 3).
         """
         if self._pull is None:
-            self._pull = WallPull(self.grid, self.boundary, range(len(points)), len(points), self._passes)
-        self._pull.take(self._inner, self._fine, ViscousWalls(self._distance, self._slip, kind, contact), points)
+            self._pull = WallPull(
+                self.grid, self.boundary, range(len(points)), len(points), self._passes
+            )
+        self._pull.take(
+            self._inner, self._fine, ViscousWalls(self._distance, self._slip, kind, contact), points
+        )
         pulled, drags = self._pull.pulled(velocity, points)
         if isinstance(self.boundary, CutBoundary) and self.boundary.moves:
             turn, shift = self.boundary.cut.turn.numpy(), self.boundary.cut.shift.numpy()
@@ -275,7 +345,9 @@ class Viscosity:
                 motions[self._bodies.bodies.numbers] = self._bodies.velocities()
             pulled -= np.einsum("sij,sj->si", drags, motions)
         impulses = np.zeros((len(points), 6))
-        impulses[:, slice(None) if self.grid.dimension == 3 else PLANAR] = self._density * self.grid.cell_volume * pulled
+        impulses[:, slice(None) if self.grid.dimension == 3 else PLANAR] = (
+            self._density * self.grid.cell_volume * pulled
+        )
         return impulses
 
     def push_bodies(self) -> None:
@@ -404,12 +476,21 @@ class Viscosity:
             found[0] = float(np.square(self.multigrid.r.numpy(), dtype=np.float64).sum())
         if self._across is not None:
             found = self._across.sum(found)
-        return [float(np.sqrt(found[0])), float(found[1]), float(found[2]), float(np.sqrt(found[3]))]
+        return [
+            float(np.sqrt(found[0])),
+            float(found[1]),
+            float(found[2]),
+            float(np.sqrt(found[3])),
+        ]
 
     def _residual(self, given: dict[str, Any], changed: bool) -> None:
         """Launch the passes that write the residual, and what they sum."""
         fine, solids = self._fine, self._solids
-        residual, velocity, distance = self.multigrid.components(self.multigrid.r), given["u"], self._distance
+        residual, velocity, distance = (
+            self.multigrid.components(self.multigrid.r),
+            given["u"],
+            self._distance,
+        )
         for axis in range(self.grid.dimension):
             others = (fine.of_others(axis, fields) for fields in (velocity, distance, solids))
             (ub, uc), (db, dc), (solid_b, solid_c) = others
@@ -442,4 +523,6 @@ class Viscosity:
 def _numbers(array: wp.array) -> wp.array:
     """Return vectors or matrices as the numbers that they lie in memory as."""
     size = array.size * array.strides[0] // 4
-    return wp.array(ptr=array.ptr, dtype=wp.float32, shape=(size,), device=array.device, capacity=4 * size)
+    return wp.array(
+        ptr=array.ptr, dtype=wp.float32, shape=(size,), device=array.device, capacity=4 * size
+    )

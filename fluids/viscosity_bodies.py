@@ -42,10 +42,11 @@ class ViscousWalls:
 class WallPull:
     """Find what pulls the liquid's faces towards some solids.
 
-    What pulls a face towards a solid's velocity V, of its motions (vx, vy, wz) or (vx, vy, vz, wx, wy, wz) about a point, does so by c'V:
-    of a link that meets its wall, the weight times the velocities of the unit motions there; of a product with a face in the solid, those
-    at that face. The solid is pulled back by C'u - D V, C of rows c. All this is an energy's, which rigid motions of liquid and solid
-    together leave 0, so D is what makes C'u = D V for those.
+    What pulls a face towards a solid's velocity V, of its motions (vx, vy, wz) or (vx, vy, vz, wx,
+    wy, wz) about a point, does so by c'V: of a link that meets its wall, the weight times the
+    velocities of the unit motions there; of a product with a face in the solid, those at that face.
+    The solid is pulled back by C'u - D V, C of rows c. All this is an energy's, which rigid motions
+    of liquid and solid together leave 0, so D is what makes C'u = D V for those.
 
     Args:
         grid: the grid.
@@ -59,7 +60,14 @@ class WallPull:
         values: c, shape (n, 3) or (n, 6).
     """
 
-    def __init__(self, grid: StaggeredGrid, boundary: Boundary, numbers: Sequence[int], solids: int, passes: Any) -> None:
+    def __init__(
+        self,
+        grid: StaggeredGrid,
+        boundary: Boundary,
+        numbers: Sequence[int],
+        solids: int,
+        passes: Any,
+    ) -> None:
         self.grid, self.boundary, self._passes = grid, boundary, passes
         self.width, self.count = 3 if grid.dimension == 2 else 6, len(numbers)
         owners = np.full(solids, -1, dtype=np.int32)
@@ -67,7 +75,9 @@ class WallPull:
         self._owners = wp.array(owners, dtype=wp.int32, device=grid.device)
         self._counts = wp.zeros(grid.shape[0] * grid.shape[1], dtype=wp.int32, device=grid.device)
 
-    def take(self, window: Window | None, level: ViscosityLevel, walls: ViscousWalls, points: np.ndarray) -> None:
+    def take(
+        self, window: Window | None, level: ViscosityLevel, walls: ViscousWalls, points: np.ndarray
+    ) -> None:
         """Find `rows`, `blocks` and `values`.
 
         Args:
@@ -77,13 +87,22 @@ class WallPull:
             points: about which the solids turn [m], shape (solids, 3).
         """
         grid, distance = self.grid, walls.distance
-        owners: list[Any] = [*self.boundary.cut.wall] if isinstance(self.boundary, CutBoundary) else [None] * grid.dimension
+        owners: list[Any] = (
+            [*self.boundary.cut.wall]
+            if isinstance(self.boundary, CutBoundary)
+            else [None] * grid.dimension
+        )
         index = self.boundary.solids.index if isinstance(self.boundary, WholeCells) else None
         center = wp.array(points.ravel(), dtype=wp.float64, device=grid.device)
-        found = [(np.zeros(0, dtype=np.int32), np.zeros(0, dtype=np.int32), np.zeros((0, self.width)))]
+        found = [
+            (np.zeros(0, dtype=np.int32), np.zeros(0, dtype=np.int32), np.zeros((0, self.width)))
+        ]
         for axis in range(grid.dimension if window is not None else 0):
             assert window is not None
-            (db, dc), (wall_b, wall_c) = level.of_others(axis, distance), level.of_others(axis, owners)
+            (db, dc), (wall_b, wall_c) = (
+                level.of_others(axis, distance),
+                level.of_others(axis, owners),
+            )
             links = partial(
                 window.run,
                 self._passes.links,
@@ -107,9 +126,13 @@ class WallPull:
                 from_=axis * grid.size,
             )
             found.append(self._entries(links))
-        self.rows, self.blocks, self.values = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        self.rows, self.blocks, self.values = (
+            np.concatenate(parts) for parts in zip(*found, strict=True)
+        )
 
-    def pulled(self, velocity: Sequence[wp.array], points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def pulled(
+        self, velocity: Sequence[wp.array], points: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return C'u and D of each solid, shapes (solids, width) and (solids, width, width).
 
         Args:
@@ -119,16 +142,25 @@ class WallPull:
         grid, dimension = self.grid, self.grid.dimension
         axes, cells = np.divmod(self.rows, grid.size)
         k, j, i = np.unravel_index(cells, grid.shape)
-        places = (np.stack((i, j, k), axis=-1) + np.array(grid.origin) - 0.5 - 0.5 * np.eye(3)[axes]) * grid.spacing
+        places = (
+            np.stack((i, j, k), axis=-1) + np.array(grid.origin) - 0.5 - 0.5 * np.eye(3)[axes]
+        ) * grid.spacing
         at = [field.numpy().ravel() for field in velocity]
         speeds = np.array([at[axis][cell] for axis, cell in zip(axes, cells, strict=True)])
-        sums, drags = np.zeros((self.count, self.width)), np.zeros((self.count, self.width, self.width))
+        sums, drags = (
+            np.zeros((self.count, self.width)),
+            np.zeros((self.count, self.width, self.width)),
+        )
         for n in range(self.count):
             own = self.blocks == n
             arms = places[own] - points[n]
             arms[:, dimension:] = 0.0
-            turns = np.cross(np.eye(3)[None], arms[:, None])[np.arange(len(arms)), :, axes[own]]  # by the axis of the turn
-            motions = np.concatenate((np.eye(3)[axes[own]][:, :dimension], turns[:, 2:] if dimension == 2 else turns), axis=1)
+            # by the axis of the turn
+            turns = np.cross(np.eye(3)[None], arms[:, None])[np.arange(len(arms)), :, axes[own]]
+            motions = np.concatenate(
+                (np.eye(3)[axes[own]][:, :dimension], turns[:, 2:] if dimension == 2 else turns),
+                axis=1,
+            )
             drag = self.values[own].T @ motions
             drags[n], sums[n] = 0.5 * (drag + drag.T), speeds[own] @ self.values[own]
         return sums, drags
@@ -151,7 +183,8 @@ class WallPull:
 class BodyDrag:
     """Solve for liquid and bodies together, see `WallPull`.
 
-    With m = rho dx^d M^-1 a body's velocity is V = V1 + m (C'u - D V), so that a change of the liquid's velocity changes it by
+    With m = rho dx^d M^-1 a body's velocity is V = V1 + m (C'u - D V), so that a change of the
+    liquid's velocity changes it by
 
         dV = W C'du,   W = (1 + m D)^-1 m,
 
@@ -172,21 +205,35 @@ class BodyDrag:
     """
 
     def __init__(
-        self, grid: StaggeredGrid, boundary: CutBoundary, bodies: RigidBodies, density: float, passes: Any, solved: Window,
+        self,
+        grid: StaggeredGrid,
+        boundary: CutBoundary,
+        bodies: RigidBodies,
+        density: float,
+        passes: Any,
+        solved: Window,
         across: Across | None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.grid, self.boundary, self.bodies, self._solved = grid, boundary, bodies, solved
         self._pull = WallPull(grid, boundary, bodies.numbers, 1 + len(boundary.cut.solids), passes)
         self._scale, self._width = density * grid.cell_volume, self._pull.width
-        self.columns = BlockColumns(grid.dimension * grid.size, len(bodies.bodies), self._width, wp.float64, grid.device)
+        self.columns = BlockColumns(
+            grid.dimension * grid.size, len(bodies.bodies), self._width, wp.float64, grid.device
+        )
         self.columns.across = across
         rank = self.columns.rank
         self._response = wp.zeros((rank, rank), dtype=wp.float64, device=grid.device)
         self._factors = wp.zeros(rank, dtype=wp.float64, device=grid.device)
 
-    def take(self, level: ViscosityLevel, walls: ViscousWalls, velocity: Sequence[wp.array]) -> None:
+    def take(
+        self, level: ViscosityLevel, walls: ViscousWalls, velocity: Sequence[wp.array]
+    ) -> None:
         """Find what pulls the bodies in a step, and how they answer to the liquid's velocity as it is; arguments as of `WallPull`."""
-        block, bodies, dimension = self.boundary.cut.moving_block(), self.bodies.bodies, self.grid.dimension
+        block, bodies, dimension = (
+            self.boundary.cut.moving_block(),
+            self.bodies.bodies,
+            self.grid.dimension,
+        )
         window = None if block is None else self.grid.window(*block, grow=1).common(self._solved)
         points = np.array([body.position for body in bodies])
         self._pull.take(window, level, walls, points)
@@ -201,7 +248,10 @@ class BodyDrag:
             self.columns.reserve(round(SPARE * count))
         self.columns.assign(self._pull.rows, self._pull.blocks, self._pull.values)
         m = [self._scale * body.inverse_mass(dimension) for body in bodies]
-        answers = [np.linalg.solve(np.eye(self._width) + a @ drag, a) for a, drag in zip(m, self._drag, strict=True)]
+        answers = [
+            np.linalg.solve(np.eye(self._width) + a @ drag, a)
+            for a, drag in zip(m, self._drag, strict=True)
+        ]
         before = np.array([body.velocities(dimension) for body in bodies])
         self._pulled = pulled - np.einsum("bij,bj->bi", self._drag, before)
         W = scipy.linalg.block_diag(*answers)
@@ -217,7 +267,12 @@ class BodyDrag:
     def subtract(self, p: wp.array, q: wp.array, launch: Launch) -> None:
         """q -= C W C'p."""
         self.columns.gather(p, launch=launch)
-        launch(weigh_kernel, self.columns.rank, [self._response, self.columns.sums, self._factors], device=self.grid.device)
+        launch(
+            weigh_kernel,
+            self.columns.rank,
+            [self._response, self.columns.sums, self._factors],
+            device=self.grid.device,
+        )
         self.columns.scatter(self._factors, q, q, sign=-1.0, launch=launch)
 
     def velocities(self) -> np.ndarray:
@@ -228,6 +283,10 @@ class BodyDrag:
     def push(self, change: wp.array) -> None:
         """Give the bodies the impulses of a step that changed the liquid's velocity by so much."""
         moved = self.change.reshape(self._pulled.shape)
-        pulled = self._pulled + self.columns.gather(change).numpy().reshape(moved.shape) - np.einsum("bij,bj->bi", self._drag, moved)
+        pulled = (
+            self._pulled
+            + self.columns.gather(change).numpy().reshape(moved.shape)
+            - np.einsum("bij,bj->bi", self._drag, moved)
+        )
         for body, impulse in zip(self.bodies.bodies, self._scale * pulled, strict=True):
             body.apply_impulse(impulse)

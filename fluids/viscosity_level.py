@@ -1,12 +1,14 @@
 """Levels of the viscous equations on faces: sweeps, transfers, and what ranks exchange between them.
 
-Coarse levels have equations of the same form with the means of what the finer one weighs; unknowns are carried linearly, beside air by
-those there are. A coarse level is a sum of squares, too: an unknown is drawn to faces in walls by no less than its links to them weigh.
-Gauss-Seidel takes one component after the other, two colors of rows each, and back.
+Coarse levels have equations of the same form with the means of what the finer one weighs; unknowns
+are carried linearly, beside air by those there are. A coarse level is a sum of squares, too: an
+unknown is drawn to faces in walls by no less than its links to them weigh. Gauss-Seidel takes one
+component after the other, two colors of rows each, and back.
 
-On ranks each face belongs to the one whose box has the cell above it. A sweep takes the faces of one process in its order: ghost cells in
-so many layers as the second color needs are computed twice; then the component's ghost cells come from their ranks. So the cycle is that
-of one process, on any number of ranks; where rows are not cut it has its bits.
+On ranks each face belongs to the one whose box has the cell above it. A sweep takes the faces of
+one process in its order: ghost cells in so many layers as the second color needs are computed
+twice; then the component's ghost cells come from their ranks. So the cycle is that of one process,
+on any number of ranks; where rows are not cut it has its bits.
 """
 
 from __future__ import annotations
@@ -24,10 +26,16 @@ from warp_lcp.grid.staggered import CLEAR, StaggeredGrid, Window, three_componen
 from warp_lcp.multigrid.cycle import CycleStage, Launches
 from warp_lcp.rows.program import Launch, perform
 
-KNOWN = 3  # layers of ghost cells that sweeps need: rows of the second color look at those of the first, where odd cells look at even ones
+# layers of ghost cells that sweeps need: rows of the second color look at those of the first, where
+# odd cells look at even ones
+KNOWN = 3
 SWEEPS = 4  # of the coarsest level, each forth and back
-MIXED = 0.5  # of the finer level's: twice that is at most `cell`, so that cells' squares outweigh their products in 3-D, too
-WALL = 0.5  # of the finer level's drag by walls, in units of its own links: half of what is near one lies in its row
+# of the finer level's: twice that is at most `cell`, so that cells' squares outweigh their products
+# in 3-D, too
+MIXED = 0.5
+# of the finer level's drag by walls, in units of its own links: half of what is near one lies in
+# its row
+WALL = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,29 +85,53 @@ class ViscosityLevel:
 
     Attributes:
         cell: weights of links along a component's own axis.
-        mixed: of those, what is left out of the products of different components where walls are, see `fluids.viscosity`.
+        mixed: of those, what is left out of the products of different components where walls are,
+            see `fluids.viscosity`.
         edges: weights of links across, by pairs of axes.
-        volume, drag, diagonal, hold, norm, there: of the faces of each component: what weighs, what walls add, the sum; whether a wall
-            holds it; the interpolation's normalization; and what that is to find.
+        volume, drag, diagonal, hold, norm, there: of the faces of each component: what weighs, what
+            walls add, the sum; whether a wall holds it; the interpolation's normalization; and what
+            that is to find.
         r: the residual, and what a sweep keeps.
-        span: where a row's unknowns begin and end, and its core, a run of cells with the equations of those around them.
+        span: where a row's unknowns begin and end, and its core, a run of cells with the equations
+            of those around them.
         shift: from the finer level's cells to this one's.
-        odd_row, odd_cell: whether row and cell 0 have the colors of row and cell 1 of the whole grid.
+        odd_row, odd_cell: whether row and cell 0 have the colors of row and cell 1 of the whole
+            grid.
     """
 
     visits = 1  # V-cycles
 
-    def __init__(self, grid: StaggeredGrid, x: list[wp.array], b: list[wp.array], finer: StaggeredGrid | None = None) -> None:
+    def __init__(
+        self,
+        grid: StaggeredGrid,
+        x: list[wp.array],
+        b: list[wp.array],
+        finer: StaggeredGrid | None = None,
+    ) -> None:
         shared = grid.part.across is not None
         ox, oy, oz = origin = grid.origin if shared else (0, 0, 0)
         self.odd_row, self.odd_cell, self.shift = (oy + oz) % 2, ox % 2, LevelShift()
         if shared and finer is not None:
-            self.shift = LevelShift(*[2 * own - fine for own, fine in zip(origin, finer.origin, strict=True)])
-        self._windows = [self._grown(grid, width) if shared else grid.domain for width in range(KNOWN + 1)]
-        self.shared, self.grid, self.dimension, self.passes = shared, grid, grid.dimension, viscous_passes(grid.dimension)
+            self.shift = LevelShift(
+                *[2 * own - fine for own, fine in zip(origin, finer.origin, strict=True)]
+            )
+        self._windows = [
+            self._grown(grid, width) if shared else grid.domain for width in range(KNOWN + 1)
+        ]
+        self.shared, self.grid, self.dimension, self.passes = (
+            shared,
+            grid,
+            grid.dimension,
+            viscous_passes(grid.dimension),
+        )
         self.cell, self.mixed = grid.field(), grid.field()
-        self.edges = {pair: grid.field() for pair in [(0, 1), (0, 2), (1, 2)][: 1 if grid.dimension == 2 else 3]}
-        self.volume, self.drag, self.diagonal, self.hold, self.norm, self.r, self.there = (grid.faces() for _ in range(7))
+        self.edges = {
+            pair: grid.field()
+            for pair in [(0, 1), (0, 2), (1, 2)][: 1 if grid.dimension == 2 else 3]
+        }
+        self.volume, self.drag, self.diagonal, self.hold, self.norm, self.r, self.there = (
+            grid.faces() for _ in range(7)
+        )
         self.x, self.b = x, b
         self.span = wp.zeros(4 * grid.shape[0] * grid.shape[1], dtype=wp.int32, device=grid.device)
 
@@ -113,7 +145,10 @@ class ViscosityLevel:
 
     def rows(self, axis: int) -> ViscousRows:
         """Return the equations of a component's faces."""
-        xb, xc = (None if other is None else self.edges[min(axis, other), max(axis, other)] for other in self.others(axis))
+        xb, xc = (
+            None if other is None else self.edges[min(axis, other), max(axis, other)]
+            for other in self.others(axis)
+        )
         on_faces = (self.volume[axis], self.drag[axis], self.diagonal[axis])
         return ViscousRows(axis, self.cell, self.mixed, xb, xc, *on_faces, self.span)
 
@@ -131,7 +166,11 @@ class ViscosityLevel:
     def _grown(grid: StaggeredGrid, width: int) -> Window:
         owned, domain = grid.part.owned, grid.domain
         low = [max(n - width, least) for n, least in zip(owned.low, domain.low, strict=True)]
-        return Window.of(low, [min(n + width, most) for n, most in zip(owned.high, domain.high, strict=True)], grid.device)
+        return Window.of(
+            low,
+            [min(n + width, most) for n, most in zip(owned.high, domain.high, strict=True)],
+            grid.device,
+        )
 
     def share(self, fields: Sequence[wp.array], launch: Launch | None = None) -> None:
         """Fill ghost cells from other ranks: all of them, of equations; while a cycle is launched or recorded, `KNOWN` layers."""
@@ -159,7 +198,9 @@ class ViscosityLevel:
         if self.shared:
             join_cores(self)
 
-    def descend(self, coarse: ViscosityLevel, *, projected: bool, from_zero: bool) -> Iterator[CycleStage]:
+    def descend(
+        self, coarse: ViscosityLevel, *, projected: bool, from_zero: bool
+    ) -> Iterator[CycleStage]:
         """Yield steps 1 and 2 of a cycle: sweeps, and the residual on the next level."""
         assert from_zero and not projected, "a V-cycle without bounds"
         yield from self._beginning()
@@ -221,14 +262,30 @@ class ViscosityLevel:
         for axis in range(self.dimension):
             y, z = self.of_others(axis, self.x)
             self.around(1).run(
-                self.passes.residual, self.rows(axis), launch=launch, x=self.x[axis], y=y, z=z, right=self.b[axis], out=self.r[axis]
+                self.passes.residual,
+                self.rows(axis),
+                launch=launch,
+                x=self.x[axis],
+                y=y,
+                z=z,
+                right=self.b[axis],
+                out=self.r[axis],
             )
 
     def product(self, x: list[wp.array], out: list[wp.array], launch: Launch) -> None:
         """Find A x."""
         for axis in range(self.dimension):
             y, z = self.of_others(axis, x)
-            self.around(0).run(self.passes.product, self.rows(axis), launch=launch, x=x[axis], y=y, z=z, right=None, out=out[axis])
+            self.around(0).run(
+                self.passes.product,
+                self.rows(axis),
+                launch=launch,
+                x=x[axis],
+                y=y,
+                z=z,
+                right=None,
+                out=out[axis],
+            )
 
     def clear(self, launch: Launch) -> None:
         """Set x to 0."""
@@ -246,7 +303,15 @@ class ViscosityLevel:
         planes, axes = self.grid.planes, range(self.dimension)
 
         def mean(out: wp.array, of: wp.array, faces: int, scale: float) -> None:
-            window.run(self.passes.average, self.shift, out=out, fine=of, planes=planes, faces=faces, scale=scale)
+            window.run(
+                self.passes.average,
+                self.shift,
+                out=out,
+                fine=of,
+                planes=planes,
+                faces=faces,
+                scale=scale,
+            )
 
         mean(self.cell, fine.cell, 0, 0.25)
         mean(self.mixed, fine.mixed, 0, MIXED * 0.25)
@@ -255,10 +320,23 @@ class ViscosityLevel:
         for axis in axes:
             mean(self.volume[axis], fine.volume[axis], 1 << axis, 1.0)
             mean(self.drag[axis], fine.drag[axis], 1 << axis, WALL)
-            window.run(self.passes.close, self.shift, out=self.hold[axis], fine=fine.hold[axis], axis=axis, planes=planes)
+            window.run(
+                self.passes.close,
+                self.shift,
+                out=self.hold[axis],
+                fine=fine.hold[axis],
+                axis=axis,
+                planes=planes,
+            )
         self.share(self.equations)
         for axis in axes:
-            window.run(self.passes.coarse_diagonal, self.rows(axis), h=self.hold[axis], there=self.there[axis], planes=planes)
+            window.run(
+                self.passes.coarse_diagonal,
+                self.rows(axis),
+                h=self.hold[axis],
+                there=self.there[axis],
+                planes=planes,
+            )
         self.share([*self.diagonal, *self.there])
         self.find_spans(inner)
 
@@ -313,11 +391,15 @@ def join_cores(level: ViscosityLevel) -> None:
         return
     domain, device = grid.domain, grid.device
     mine = Window.of([*domain.low[:2], owned.low[2]], [*domain.high[:2], owned.high[2]], device)
-    span, ends = (wp.zeros(n * grid.shape[0] * grid.shape[1], dtype=wp.int32, device=device) for n in (4, 2))
+    span, ends = (
+        wp.zeros(n * grid.shape[0] * grid.shape[1], dtype=wp.int32, device=device) for n in (4, 2)
+    )
     dx, dy, dz = three_components(level.diagonal)
     mine.run(level.passes.span, whole=True, dx=dx, dy=dy, dz=dz, span=span, ends=ends)
     begin, end, offset = owned.low[2], owned.high[2], grid.origin[0]
-    row = np.column_stack([span.numpy().reshape(-1, 4)[:, 2:], ends.numpy().reshape(-1, 2)]).astype(np.int32)
+    row = np.column_stack([span.numpy().reshape(-1, 4)[:, 2:], ends.numpy().reshape(-1, 2)]).astype(
+        np.int32
+    )
     none = row[:, 0] >= row[:, 1]
     row[none] = 0
     row[:, :2] += np.int32(offset) * ~none[:, None]
@@ -325,7 +407,10 @@ def join_cores(level: ViscosityLevel) -> None:
     low, length, run = (np.zeros(len(row), dtype=np.int32) for _ in range(3))
     for found, (start, stop, _, _) in zip(every[:, :-1], every[:, -1], strict=True):
         first, last, head, tail = found.T
-        for begins, size in ((start - run, np.where(head > 0, run + head, 0)), (first, last - first)):
+        for begins, size in (
+            (start - run, np.where(head > 0, run + head, 0)),
+            (first, last - first),
+        ):
             longer = size > length
             low, length = np.where(longer, begins, low), np.where(longer, size, length)
         run = np.where(tail == stop - start, run + tail, tail)

@@ -21,8 +21,8 @@ LEAST = 8  # cells of the longest side at which there is no coarser level
 class ViscosityMultigrid:
     """Approximate the inverse of the viscous equations on faces: z = M r, symmetric and positive definite.
 
-    On ranks `set_up` and `apply` are collective: r is read, and z written, of this rank's own faces; of the others within `KNOWN` layers
-    z is what their ranks find.
+    On ranks `set_up` and `apply` are collective: r is read, and z written, of this rank's own
+    faces; of the others within `KNOWN` layers z is what their ranks find.
 
     Args:
         grid: the finest grid.
@@ -34,13 +34,22 @@ class ViscosityMultigrid:
     """
 
     def __init__(self, grid: StaggeredGrid) -> None:
-        self.grid, size, self._shared = grid, grid.dimension * grid.size, grid.part.across is not None
-        self.r, self.z = (zeros(size, wp.float32, grid.device, small_pages=grid.sparse) for _ in range(2))
-        self._b = zeros(size, wp.float32, grid.device) if self._shared else self.r  # its ghost cells are filled
+        self.grid, size, self._shared = (
+            grid,
+            grid.dimension * grid.size,
+            grid.part.across is not None,
+        )
+        self.r, self.z = (
+            zeros(size, wp.float32, grid.device, small_pages=grid.sparse) for _ in range(2)
+        )
+        # its ghost cells are filled
+        self._b = zeros(size, wp.float32, grid.device) if self._shared else self.r
         self.levels = self._levels()
         self._gathered = self._whole() if self._shared else None
-        self._boxes = [ActiveWindow(level.grid.everywhere) for level in self.levels]  # of the cells whose equations are made
-        self._inner = [ActiveWindow(level.grid.domain) for level in self.levels]  # those of the domain among them
+        # of the cells whose equations are made
+        self._boxes = [ActiveWindow(level.grid.everywhere) for level in self.levels]
+        # those of the domain among them
+        self._inner = [ActiveWindow(level.grid.domain) for level in self.levels]
         self._window: Window | None = None  # of the last `move_to`
         begin = [Launches(partial(perform, self._take_right_side))] if self._shared else []
         self.program = recorded(grid.device, [*begin, *self.cycle.stages()])
@@ -51,18 +60,25 @@ class ViscosityMultigrid:
     def _levels(self) -> list[ViscosityLevel]:
         grid: StaggeredGrid | None = self.grid
         levels = [ViscosityLevel(self.grid, self.components(self.z), self.components(self._b))]
-        while not self._is_coarsest(levels[-1].grid) and (grid := levels[-1].grid.part.coarser(KNOWN + 1)) is not None:
+        while (
+            not self._is_coarsest(levels[-1].grid)
+            and (grid := levels[-1].grid.part.coarser(KNOWN + 1)) is not None
+        ):
             levels.append(ViscosityLevel(grid, grid.faces(), grid.faces(), levels[-1].grid))
         return levels
 
     def _is_coarsest(self, grid: StaggeredGrid) -> bool:
         """Whether sweeps solve on a grid; on ranks, whether it is gathered."""
-        return max(grid.domain_counts) <= LEAST or (self._shared and math.prod(grid.domain_counts) <= GATHERED)
+        return max(grid.domain_counts) <= LEAST or (
+            self._shared and math.prod(grid.domain_counts) <= GATHERED
+        )
 
     def _whole(self) -> ViscosityMultigrid:
         """Return the multigrid of the last level's whole grid."""
         last = self.levels[-1].grid
-        return ViscosityMultigrid(StaggeredGrid(last.domain_counts, last.spacing, last.dimension, last.device))
+        return ViscosityMultigrid(
+            StaggeredGrid(last.domain_counts, last.spacing, last.dimension, last.device)
+        )
 
     @property
     def cycle(self) -> Cycle:
@@ -74,12 +90,20 @@ class ViscosityMultigrid:
         whole, first = self._gathered.cycle, self._gathered.levels[0]
         gather = Launches(partial(perform, partial(part.collect, last.b, first.b)))
         take = Launches(partial(perform, partial(_take_part, last, first)))
-        return Cycle(self.levels, GatheredLevel(whole=lambda projected: whole, gather=[gather], gather_bounds=[], take=take).solve)
+        return Cycle(
+            self.levels,
+            GatheredLevel(
+                whole=lambda projected: whole, gather=[gather], gather_bounds=[], take=take
+            ).solve,
+        )
 
     def components(self, field: wp.array) -> list[wp.array]:
         """Return a flat field as one field a component."""
         n = self.grid.size
-        return [field[axis * n : (axis + 1) * n].reshape(self.grid.shape) for axis in range(self.grid.dimension)]
+        return [
+            field[axis * n : (axis + 1) * n].reshape(self.grid.shape)
+            for axis in range(self.grid.dimension)
+        ]
 
     def apply(self) -> None:
         """Write z = M r."""

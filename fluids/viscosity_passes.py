@@ -14,7 +14,8 @@ CLOSE = 1e-3  # cells: a face within it of a wall, or behind it, has the wall's 
 THETA = 0.02  # cells: the shortest link to a wall
 ALIKE = 1.001  # viscosities at most as far apart are one
 CORE = 1e-3  # diagonals that differ by less of theirs are alike
-ALONG = 0.95  # of a cell that the distance changes by from face to face: the wall lies across the axis
+# of a cell that the distance changes by from face to face: the wall lies across the axis
+ALONG = 0.95
 KINDS = {"AIR": AIR, "FLUID": FLUID, "SOLID": SOLID, "RELEASED": RELEASED}
 LIMITS = {"CLOSE": CLOSE, "THETA": THETA, "ALONG": ALONG, "ALIKE": ALIKE}
 KERNELS = KernelFile(Path(__file__).parent / "headers/viscosity.h", KINDS | LIMITS)
@@ -22,7 +23,13 @@ LEVELS = KernelFile(Path(__file__).parent / "headers/viscosity_multigrid.h", {"A
 
 
 @functools.cache
-def viscous_passes(dimension: int, cut: bool = False, ghost: bool = False, moving: bool = False, varies: bool = False) -> SimpleNamespace:
+def viscous_passes(
+    dimension: int,
+    cut: bool = False,
+    ghost: bool = False,
+    moving: bool = False,
+    varies: bool = False,
+) -> SimpleNamespace:
     """Return the passes of a dimension; those that look at walls differ by these.
 
     Args:
@@ -33,10 +40,15 @@ def viscous_passes(dimension: int, cut: bool = False, ghost: bool = False, movin
         varies: whether viscosities differ.
     """
     area, deep = f"fluids.viscosity_{dimension}d", dimension == 3
-    walls, flags = "_cut" * cut + "_ghost" * ghost + "_moving" * moving, {"CUT": cut, "GHOST": ghost, "MOVING": moving}
+    walls, flags = (
+        "_cut" * cut + "_ghost" * ghost + "_moving" * moving,
+        {"CUT": cut, "GHOST": ghost, "MOVING": moving},
+    )
 
     def near(name: str, apart: str = "", **more: bool) -> RowPass:
-        return KERNELS.kernel(f"fluids.viscosity.{name}", module=area + walls + apart, constants=flags | more)
+        return KERNELS.kernel(
+            f"fluids.viscosity.{name}", module=area + walls + apart, constants=flags | more
+        )
 
     def plain(name: str) -> RowPass:
         return KERNELS.kernel(f"fluids.viscosity.{name}", module=area)
@@ -46,9 +58,21 @@ def viscous_passes(dimension: int, cut: bool = False, ghost: bool = False, movin
 
     return SimpleNamespace(
         distance=near("distance"),
-        weights=near("weights", "_varies" * varies, VARIES=varies), diagonal=near("diagonal"), force=near("force"),
-        links=near("links"), cover=near("cover"), add=plain("add"), sum=plain("sum"), span=level("span"), sweep=level("sweep", DEPTH=deep),
-        product=level("apply", RESIDUAL=False, DEPTH=deep), residual=level("apply", "_residual", RESIDUAL=True, DEPTH=deep),
-        average=level("average"), close=level("close"), coarse_diagonal=level("coarse_diagonal"),
-        normalize=level("prolong", "_norm", NORM=True), prolong=level("prolong", NORM=False), restrict=level("restrict"),
-    )  # fmt: skip
+        weights=near("weights", "_varies" * varies, VARIES=varies),
+        diagonal=near("diagonal"),
+        force=near("force"),
+        links=near("links"),
+        cover=near("cover"),
+        add=plain("add"),
+        sum=plain("sum"),
+        span=level("span"),
+        sweep=level("sweep", DEPTH=deep),
+        product=level("apply", RESIDUAL=False, DEPTH=deep),
+        residual=level("apply", "_residual", RESIDUAL=True, DEPTH=deep),
+        average=level("average"),
+        close=level("close"),
+        coarse_diagonal=level("coarse_diagonal"),
+        normalize=level("prolong", "_norm", NORM=True),
+        prolong=level("prolong", NORM=False),
+        restrict=level("restrict"),
+    )

@@ -19,14 +19,16 @@ class Drag:
     walls: Walls
     kind: I8
     contact: U8
-    phi: F32  # distance to the free surface at cell centers [cells]; null: it lies on the cells' faces
+    # distance to the free surface at cell centers [cells]; null: it lies on the cells' faces
+    phi: F32
     u: F32
     v: F32
     w: F32
     known_u: I8
     known_v: I8
     known_w: I8
-    coefficient: wp.array(dtype=wp.float32)  # of the domain and each solid: shear stress over rho u^2
+    # of the domain and each solid: shear stress over rho u^2
+    coefficient: wp.array(dtype=wp.float32)
     turn: wp.array(dtype=wp.mat33)  # a wall's point x moves at turn x + shift
     shift: wp.array(dtype=wp.vec3)
 
@@ -94,8 +96,9 @@ def velocity_on(D: Drag, axis: int, k: int, j: int, i: int):
 def piece_of(S: Walls, n: int, along: int, k: int, j: int, i: int):
     """Return the area of a piece of wall in a cell [faces] that drags along an axis, its normal, and whose it is.
 
-    The first 2 d pieces are what whole cells, or the domain, close of each face; the last one is what solids that cut the cell close: a
-    plane with the vector area of all their parts, which cancel in a gap of one cell.
+    The first 2 d pieces are what whole cells, or the domain, close of each face; the last one is
+    what solids that cut the cell close: a plane with the vector area of all their parts, which
+    cancel in a gap of one cell.
     """
     faces = 2 * (S.planes + 1)
     area = float(0.0)
@@ -106,7 +109,11 @@ def piece_of(S: Walls, n: int, along: int, k: int, j: int, i: int):
         high = n & 1
         if axis != along:
             owner, own, _covered, _mover, _moved = closed_on(
-                S, axis, k + wp.where(axis == 2, high, 0), j + wp.where(axis == 1, high, 0), i + wp.where(axis == 0, high, 0)
+                S,
+                axis,
+                k + wp.where(axis == 2, high, 0),
+                j + wp.where(axis == 1, high, 0),
+                i + wp.where(axis == 0, high, 0),
             )
             if S.index or owner == 0:
                 area = own
@@ -118,7 +125,11 @@ def piece_of(S: Walls, n: int, along: int, k: int, j: int, i: int):
             axis = m >> 1
             high = m & 1
             owner, own, covered, mover, moved = closed_on(
-                S, axis, k + wp.where(axis == 2, high, 0), j + wp.where(axis == 1, high, 0), i + wp.where(axis == 0, high, 0)
+                S,
+                axis,
+                k + wp.where(axis == 2, high, 0),
+                j + wp.where(axis == 1, high, 0),
+                i + wp.where(axis == 0, high, 0),
             )
             if owner == 0:
                 own = float(0.0)
@@ -143,19 +154,36 @@ def pull(D: Drag, axis: int, q: wp.vec3, x: wp.vec3, area: float, normal: wp.vec
     relative = q - (D.turn[solid] * x + D.shift[solid])
     along = relative - wp.dot(relative, normal) * normal
     own = relative[axis]
-    lost = wp.clamp(along[axis], wp.min(own, 0.0), wp.max(own, 0.0))  # no more than all of it, nor a gain
+    # no more than all of it, nor a gain
+    lost = wp.clamp(along[axis], wp.min(own, 0.0), wp.max(own, 0.0))
     return wp.where(lost == 0.0, 0.0, area * D.coefficient[solid] * wp.length(along)), lost
 
 
 @cell_kernel("fluids.wall_drag")
 def drag_kernel(
-    k, j, first, end, S: Walls, references: wp.array(dtype=wp.vec3d), counts: INTS, offsets: INTS, owners: INTS,
-    values: wp.array2d(dtype=wp.float64), D: Drag, axis: int, dt: float, mass: wp.float64, apply: int, field: F32, known: I8,
+    k,
+    j,
+    first,
+    end,
+    S: Walls,
+    references: wp.array(dtype=wp.vec3d),
+    counts: INTS,
+    offsets: INTS,
+    owners: INTS,
+    values: wp.array2d(dtype=wp.float64),
+    D: Drag,
+    axis: int,
+    dt: float,
+    mass: wp.float64,
+    apply: int,
+    field: F32,
+    known: I8,
     losses: wp.array(dtype=wp.float64),
-):  # fmt: skip
+):
     """Slow down the projected faces of a row beside walls that hold the liquid; count pieces of wall, or with `values` write impulses.
 
-    Nothing changes unless `apply` or `values` is given. `mass` is that of a full cell [kg]; `losses` gains the energy of each row [J].
+    Nothing changes unless `apply` or `values` is given. `mass` is that of a full cell [kg];
+    `losses` gains the energy of each row [J].
     """
     row = k * field.shape[1] + j
     begin = int(0)
@@ -181,17 +209,25 @@ def drag_kernel(
             pulls = float(0.0)
             now = float(0.0)
             last = int(e)
-            for turn in range(wp.where(values, 2, 1)):  # what all pieces do, and then what of it is each one's
+            # what all pieces do, and then what of it is each one's
+            for turn in range(wp.where(values, 2, 1)):
                 for side in range(2):
                     z = wp.where(side == 0, k, c)
                     y = wp.where(side == 0, j, b)
                     s = wp.where(side == 0, i, a)
                     if (side == 0 and here) or (side == 1 and below):
-                        o = wp.where(side == 0, 1, 0)  # the cell's other face: its upper or its lower one
+                        # the cell's other face: its upper or its lower one
+                        o = wp.where(side == 0, 1, 0)
                         other = open_share(
-                            S, axis, z + wp.where(axis == 2, o, 0), y + wp.where(axis == 1, o, 0), s + wp.where(axis == 0, o, 0)
+                            S,
+                            axis,
+                            z + wp.where(axis == 2, o, 0),
+                            y + wp.where(axis == 1, o, 0),
+                            s + wp.where(axis == 0, o, 0),
                         )
-                        weight = dt / float(S.spacing) / wp.max(part, 1.0e-6) * free / (free + other)
+                        weight = (
+                            dt / float(S.spacing) / wp.max(part, 1.0e-6) * free / (free + other)
+                        )
                         for n in range(2 * (S.planes + 1) + 1):
                             area, normal, solid = piece_of(S, n, axis, z, y, s)
                             if area > 0.0 and D.coefficient[solid] > 0.0:
@@ -203,13 +239,17 @@ def drag_kernel(
                                 else:
                                     e -= 1  # from the last one
                                     force = wp.vec3d()
-                                    force[axis] = mass * wp.float64(part * rate * (now - q[axis] + lost))
+                                    force[axis] = mass * wp.float64(
+                                        part * rate * (now - q[axis] + lost)
+                                    )
                                     put(e, solid, force, center - references[solid], owners, values)
                 if turn == 0:
                     last = e
                 now = q[axis] - pulls / (1.0 + rates)
             e = last
             if apply == 1 or values:
-                losses[row] = losses[row] + wp.float64(0.5) * mass * wp.float64(part) * wp.float64((q[axis] - now) * (q[axis] + now))
+                losses[row] = losses[row] + wp.float64(0.5) * mass * wp.float64(part) * wp.float64(
+                    (q[axis] - now) * (q[axis] + now)
+                )
                 field[k, j, i] = now
     counts[row] = e - begin

@@ -26,7 +26,8 @@ class Walls:
     number_x: I16  # of thin solids that cross faces, with barriers, see `warp_lcp.grid.barriers`
     number_y: I16
     number_z: I16
-    below_x: F32  # and how far they are from the centers of the cells below and above a face [cells]
+    # and how far they are from the centers of the cells below and above a face [cells]
+    below_x: F32
     below_y: F32
     below_z: F32
     above_x: F32
@@ -73,7 +74,13 @@ def reach_across(S: Walls, axis: int, k: int, j: int, i: int):
         if d != axis:
             crossed, _below, above = crossing_on(S, d, k, j, i)
             length = wp.where(crossed > 0, above, 0.5)
-            crossed, below, _above = crossing_on(S, d, k + wp.where(d == 2, 1, 0), j + wp.where(d == 1, 1, 0), i + wp.where(d == 0, 1, 0))
+            crossed, below, _above = crossing_on(
+                S,
+                d,
+                k + wp.where(d == 2, 1, 0),
+                j + wp.where(d == 1, 1, 0),
+                i + wp.where(d == 0, 1, 0),
+            )
             area *= length + wp.where(crossed > 0, below, 0.5)
     return area
 
@@ -114,7 +121,11 @@ def standing_of(S: Walls, k: int, j: int, i: int):
         axis = n >> 1
         high = n & 1
         free, wall = fields_on(
-            S, axis, k + wp.where(axis == 2, high, 0), j + wp.where(axis == 1, high, 0), i + wp.where(axis == 0, high, 0)
+            S,
+            axis,
+            k + wp.where(axis == 2, high, 0),
+            j + wp.where(axis == 1, high, 0),
+            i + wp.where(axis == 0, high, 0),
         )
         if wall > 0 and 1.0 - free > most and not moves(S, wall):
             most = 1.0 - free
@@ -149,7 +160,9 @@ def closed_on(S: Walls, axis: int, k: int, j: int, i: int):
                     moved = own * part
                     own = own - moved
             if owner == 0:
-                covered = wp.clamp(1.0 - open_face(S.distance, axis, S.planes, k, j, i) - moved, 0.0, own)
+                covered = wp.clamp(
+                    1.0 - open_face(S.distance, axis, S.planes, k, j, i) - moved, 0.0, own
+                )
                 own = own - covered
             elif owner == mover:
                 covered = own
@@ -166,7 +179,11 @@ def wall_way(S: Walls, k: int, j: int, i: int):
     for n in range(corners):
         d = S.distance[k + (n >> 2), j + ((n >> 1) & 1), i + (n & 1)]
         mean += d / float(corners)
-        slope += d * wp.vec3(float(2 * (n & 1) - 1), float(2 * ((n >> 1) & 1) - 1), wp.where(S.planes == 2, float(2 * (n >> 2) - 1), 0.0))
+        slope += d * wp.vec3(
+            float(2 * (n & 1) - 1),
+            float(2 * ((n >> 1) & 1) - 1),
+            wp.where(S.planes == 2, float(2 * (n >> 2) - 1), 0.0),
+        )
     return -mean * wp.normalize(slope)
 
 
@@ -175,7 +192,9 @@ def face_center(S: Walls, axis: int, k: int, j: int, i: int):
     """Return the center of a lower face [m], z = 0 in 2-D."""
     o = S.origin
     half = wp.float64(0.5)
-    x = wp.vec3d(wp.float64(i + o[0]) - half, wp.float64(j + o[1]) - half, wp.float64(k + o[2]) - half)
+    x = wp.vec3d(
+        wp.float64(i + o[0]) - half, wp.float64(j + o[1]) - half, wp.float64(k + o[2]) - half
+    )
     x[axis] = x[axis] - half
     x = x * S.spacing
     if S.planes == 1:
@@ -184,7 +203,14 @@ def face_center(S: Walls, axis: int, k: int, j: int, i: int):
 
 
 @wp.func
-def put(e: int, solid: int, force: wp.vec3d, lever: wp.vec3d, owners: wp.array(dtype=wp.int32), values: wp.array2d(dtype=wp.float64)):
+def put(
+    e: int,
+    solid: int,
+    force: wp.vec3d,
+    lever: wp.vec3d,
+    owners: wp.array(dtype=wp.int32),
+    values: wp.array2d(dtype=wp.float64),
+):
     """Write entry e: an impulse on a solid, and its moment with a lever."""
     turn = wp.cross(lever, force)
     owners[e] = solid

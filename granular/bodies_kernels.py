@@ -13,8 +13,16 @@ from warp_lcp.granular.yield_set import HOLDS, NEARLY, SHEARS_HERE, STEP_OF_CELL
 from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.layout import make_struct, put
 
-_INTS, _BYTES, _REALS = wp.array(dtype=wp.int32), wp.array(dtype=wp.uint8), wp.array(dtype=wp.float64)
-_ROW, _SINGLE, _PAIRS = wp.array2d(dtype=wp.float64), wp.array(dtype=wp.float32), wp.array(dtype=wp.vec2d)
+_INTS, _BYTES, _REALS = (
+    wp.array(dtype=wp.int32),
+    wp.array(dtype=wp.uint8),
+    wp.array(dtype=wp.float64),
+)
+_ROW, _SINGLE, _PAIRS = (
+    wp.array2d(dtype=wp.float64),
+    wp.array(dtype=wp.float32),
+    wp.array(dtype=wp.vec2d),
+)
 _MATS, _SPANS = wp.array3d(dtype=wp.float64), wp.array2d(dtype=wp.int32)
 options = {"module": "granular.bodies"}
 
@@ -27,7 +35,10 @@ def vector_struct(real: Any) -> Any:
 
 def flat_vector(fields: Sequence[wp.array]) -> Any:
     """Return the components of a vector as kernels take them: flat, none where there are fewer."""
-    return put(vector_struct(fields[0].dtype)(), dict(zip("xyz", [field.flatten() for field in fields], strict=False)))
+    return put(
+        vector_struct(fields[0].dtype)(),
+        dict(zip("xyz", [field.flatten() for field in fields], strict=False)),
+    )
 
 
 Vector = vector_struct(wp.float32)
@@ -106,7 +117,15 @@ def forget_kernel(slot: _INTS, now: _SINGLE, before: _SINGLE, point: _SINGLE):
 
 
 @forward_kernel(**options)
-def force_kernel(grid: FieldShape, spans: _SPANS, stress: _SINGLE, cells: Places, edges: Places, share: Vector, out: _ROW):
+def force_kernel(
+    grid: FieldShape,
+    spans: _SPANS,
+    stress: _SINGLE,
+    cells: Places,
+    edges: Places,
+    share: Vector,
+    out: _ROW,
+):
     """What a part of the cells and edges beside a body does to it: minus their rows times their stresses."""
     part = wp.tid()
     freedoms = out.shape[1]
@@ -128,7 +147,9 @@ def force_kernel(grid: FieldShape, spans: _SPANS, stress: _SINGLE, cells: Places
             base = (first + 4 * d) * grid.layer + at
             c = int(edges.copies[n])
             low = copy_of(stress, base, c, 0) + copy_of(stress, base + grid.layer - alpha, c, 1)
-            high = copy_of(stress, base + 2 * grid.layer - beta, c, 2) + copy_of(stress, base + 3 * grid.layer - alpha - beta, c, 3)
+            high = copy_of(stress, base + 2 * grid.layer - beta, c, 2) + copy_of(
+                stress, base + 3 * grid.layer - alpha - beta, c, 3
+            )
             shear = wp.float64(wp.abs(weight)) * (low + high)
             for q in range(freedoms):
                 out[part, q] = out[part, q] - edges.row[n, 0, q] * shear
@@ -147,7 +168,15 @@ def add_runs_kernel(parts: _SPANS, partial: _ROW, met: _INTS, total: _ROW):
 
 @forward_kernel(**options)
 def respond_kernel(
-    implicit: int, parts: _SPANS, partial: _ROW, start: _ROW, response: _MATS, correction: _MATS, force: _ROW, error: _ROW, velocity: _ROW
+    implicit: int,
+    parts: _SPANS,
+    partial: _ROW,
+    start: _ROW,
+    response: _MATS,
+    correction: _MATS,
+    force: _ROW,
+    error: _ROW,
+    velocity: _ROW,
 ):
     """The force on a body and the velocity that it leaves; implicit: a step towards the velocity whose stresses leave it."""
     body = wp.tid()
@@ -179,7 +208,9 @@ def layer_kernel(faces: Places, mass: Vector, u: Vector, weight: Vector, out: _P
     at = faces.at[n]
     out[n] = wp.vec2d()
     if entry(weight, a, at) > 0.0:
-        out[n] = wp.vec2d(wp.float64(0.5) * wp.float64(entry(mass, a, at)), wp.float64(entry(u, a, at)))
+        out[n] = wp.vec2d(
+            wp.float64(0.5) * wp.float64(entry(mass, a, at)), wp.float64(entry(u, a, at))
+        )
 
 
 @forward_kernel(**options)
@@ -221,7 +252,10 @@ def lightness_kernel(grid: FieldShape, edges: Places, share: Vector, inverse: Ve
     d = int(edges.axis[n])
     a, b = axes_of(d)
     around = (
-        entry(inverse, a, at) + entry(inverse, a, at - grid.strides[b]) + entry(inverse, b, at) + entry(inverse, b, at - grid.strides[a])
+        entry(inverse, a, at)
+        + entry(inverse, a, at - grid.strides[b])
+        + entry(inverse, b, at)
+        + entry(inverse, b, at - grid.strides[a])
     )
     out[n] = wp.float64(0.0)
     if entry(share, d, at) != 0.0 and around > 0.0:
@@ -251,10 +285,15 @@ def body_kernels(dimension: int, real: Any, box: bool, rate: bool = False) -> Si
         i = edges.at[n]
         d = int(edges.axis[n])
         a, b = axes_of(d)
-        along, across = entry(u, a, i) - entry(u, a, i - grid.strides[b]), entry(u, b, i) - entry(u, b, i - grid.strides[a])
+        along, across = (
+            entry(u, a, i) - entry(u, a, i - grid.strides[b]),
+            entry(u, b, i) - entry(u, b, i - grid.strides[a]),
+        )
         set_entry(rates, d, i, along + across)
 
     words = {"DIM": dimension, "BOX": box, "RATE": rate, "RESIDUAL": 0, "TRIAL": 1}
-    made = functools.partial(KERNELS.kernel, module=f"granular.{name}", compute=real, constants=words)
+    made = functools.partial(
+        KERNELS.kernel, module=f"granular.{name}", compute=real, constants=words
+    )
     trial, trial_wall = made("granular.bodies.step"), made("granular.bodies.wall_step")
     return SimpleNamespace(move=move, strain=strain, trial=trial, trial_wall=trial_wall)

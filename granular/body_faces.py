@@ -1,10 +1,12 @@
 """Faces between bodies and sand, and the strain rates that bodies cause.
 
-A body of k degrees of freedom V (2-D: vx, vy, wz; 3-D: vx, vy, vz, wx, wy, wz; about its center of mass) has the velocity J_f V on face f,
-J_f the velocity of unit motions at the face's center along its axis. It changes the differences of velocity across an open cell, and the
-rates of shear of an edge, by rows times V; what the stresses do to the body is minus the same rows times the stresses. So sand and bodies
-exchange momentum and angular momentum without loss: the sum of the forces on all faces of sand and of a body is zero, and so is that of
-their torques, since the rates of strain of a rigid motion are.
+A body of k degrees of freedom V (2-D: vx, vy, wz; 3-D: vx, vy, vz, wx, wy, wz; about its center of
+mass) has the velocity J_f V on face f, J_f the velocity of unit motions at the face's center along
+its axis. It changes the differences of velocity across an open cell, and the rates of shear of an
+edge, by rows times V; what the stresses do to the body is minus the same rows times the stresses.
+So sand and bodies exchange momentum and angular momentum without loss: the sum of the forces on all
+faces of sand and of a body is zero, and so is that of their torques, since the rates of strain of a
+rigid motion are.
 """
 
 from __future__ import annotations
@@ -26,8 +28,9 @@ class Incidence:
     Attributes:
         at: flat index of the place, shape (n,).
         body: of each, shape (n,).
-        row: what a unit of V makes there, shape (n, m, k): the face's velocity, [1] and [m], the differences of velocity along each axis
-            across the cell, high less low, or the rate of shear of the edge.
+        row: what a unit of V makes there, shape (n, m, k): the face's velocity, [1] and [m], the
+            differences of velocity along each axis across the cell, high less low, or the rate of
+            shear of the edge.
         axis: the axis of a face, the shear of an edge, 0 of a cell.
         share: bodies beside the place.
     """
@@ -53,7 +56,11 @@ class BodyFaces:
 
 
 def find_body_faces(
-    grid: StaggeredGrid, index: np.ndarray, numbers: Sequence[int], centers: np.ndarray, counted: Window | None = None
+    grid: StaggeredGrid,
+    index: np.ndarray,
+    numbers: Sequence[int],
+    centers: np.ndarray,
+    counted: Window | None = None,
 ) -> BodyFaces:
     """Return the faces between bodies and open cells.
 
@@ -64,21 +71,38 @@ def find_body_faces(
         index: int, -1 in open cells, the wall's number elsewhere; shape of the grid's fields.
         numbers: the wall's number of each body.
         centers: of mass of each body [m], shape (bodies, 3).
-        counted: cells that are asked for, with their edges and all faces that strain these; None: all.
+        counted: cells that are asked for, with their edges and all faces that strain these; None:
+            all.
     """
-    faces = [_faces(grid, index, axis, np.asarray(numbers, dtype=int)) for axis in range(grid.dimension)]
-    rows = [_face_rows(grid, flat, axis, np.asarray(centers, dtype=float)[body]) for axis, (flat, body) in enumerate(faces)]
+    faces = [
+        _faces(grid, index, axis, np.asarray(numbers, dtype=int)) for axis in range(grid.dimension)
+    ]
+    rows = [
+        _face_rows(grid, flat, axis, np.asarray(centers, dtype=float)[body])
+        for axis, (flat, body) in enumerate(faces)
+    ]
     axis_of = np.repeat(np.arange(grid.dimension), [len(flat) for flat, _ in faces])
-    at, body, row = (np.concatenate(parts) for parts in zip(*((f, b, r) for (f, b), r in zip(faces, rows, strict=True)), strict=True))
+    at, body, row = (
+        np.concatenate(parts)
+        for parts in zip(*((f, b, r) for (f, b), r in zip(faces, rows, strict=True)), strict=True)
+    )
     here = within(grid, at, counted, below=1, above=1)
     at, body, row, axis_of = at[here], body[here], row[here], axis_of[here]
     order = np.lexsort((at, axis_of, body))
-    face = Incidence(at[order], body[order], row[order][:, None], axis_of[order], np.ones(len(at), dtype=int))
+    face = Incidence(
+        at[order], body[order], row[order][:, None], axis_of[order], np.ones(len(at), dtype=int)
+    )
     cell, edge = _cells(grid, index, face), _edges(grid, face)
-    return BodyFaces(face, cell.where(within(grid, cell.at, counted)), edge.where(within(grid, edge.at, counted, above=1)))
+    return BodyFaces(
+        face,
+        cell.where(within(grid, cell.at, counted)),
+        edge.where(within(grid, edge.at, counted, above=1)),
+    )
 
 
-def entries_near(grid: StaggeredGrid, faces: BodyFaces, cells: np.ndarray, sides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def entries_near(
+    grid: StaggeredGrid, faces: BodyFaces, cells: np.ndarray, sides: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return wall faces and cells that a body's velocity reaches.
 
     Wall faces with an edge beside a body, and all cells whose stresses it changes.
@@ -101,12 +125,15 @@ def entries_near(grid: StaggeredGrid, faces: BodyFaces, cells: np.ndarray, sides
     return entries, np.unique(np.concatenate([faces.cell.at, cells[entries]]))
 
 
-def unowned_copies(grid: StaggeredGrid, index: np.ndarray, faces: BodyFaces) -> tuple[np.ndarray, np.ndarray]:
+def unowned_copies(
+    grid: StaggeredGrid, index: np.ndarray, faces: BodyFaces
+) -> tuple[np.ndarray, np.ndarray]:
     """Return shear copies on edges beside bodies that belong to no wall face.
 
     As (shear, 4) in one number, and the cell.
 
-    A cell that touches a solid with its edge alone may have left a stress there before a body came that near. Nothing bounds it now.
+    A cell that touches a solid with its edge alone may have left a stress there before a body came
+    that near. Nothing bounds it now.
     """
     strides, solid = _strides(grid), index.ravel() >= 0
     copies, cells = [], []
@@ -128,11 +155,15 @@ def own_copies(grid: StaggeredGrid, edge: Incidence, counted: Window | None) -> 
     One bit each, uint8, shape (n,); `counted` None: all.
     """
     strides, axes = np.array(_strides(grid)), np.array(SHEARS[grid.dimension])[edge.axis]
-    cells = [edge.at - (q & 1) * strides[axes[:, 0]] - (q >> 1) * strides[axes[:, 1]] for q in range(4)]
+    cells = [
+        edge.at - (q & 1) * strides[axes[:, 0]] - (q >> 1) * strides[axes[:, 1]] for q in range(4)
+    ]
     return np.packbits([within(grid, at, counted) for at in cells], axis=0, bitorder="little")[0]
 
 
-def within(grid: StaggeredGrid, flat: np.ndarray, window: Window | None, *, below: int = 0, above: int = 0) -> np.ndarray:
+def within(
+    grid: StaggeredGrid, flat: np.ndarray, window: Window | None, *, below: int = 0, above: int = 0
+) -> np.ndarray:
     """Return which flat indices lie in a window grown by some layers.
 
     None: all.
@@ -140,7 +171,9 @@ def within(grid: StaggeredGrid, flat: np.ndarray, window: Window | None, *, belo
     if window is None:
         return np.ones(len(flat), dtype=bool)
     at = np.stack(np.unravel_index(flat, grid.shape), axis=-1)
-    return np.asarray(((at >= np.array(window.low) - below) & (at < np.array(window.high) + above)).all(axis=-1))
+    return np.asarray(
+        ((at >= np.array(window.low) - below) & (at < np.array(window.high) + above)).all(axis=-1)
+    )
 
 
 def _strides(grid: StaggeredGrid) -> tuple[int, int, int]:
@@ -148,15 +181,21 @@ def _strides(grid: StaggeredGrid) -> tuple[int, int, int]:
     return 1, columns, columns * rows
 
 
-def _faces(grid: StaggeredGrid, index: np.ndarray, axis: int, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _faces(
+    grid: StaggeredGrid, index: np.ndarray, axis: int, numbers: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the flat indices of the bodies' faces of one axis that an open cell is near, and their bodies."""
     owner = np.full(int(max(index.max(initial=0), numbers.max(initial=0))) + 2, -1)
     owner[numbers + 1] = np.arange(len(numbers))
     held = owner[index + 1] >= 0
     if not held.any():
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
-    found = ndimage.find_objects(held.astype(np.int8))[0]  # the box around all bodies, so that the rest of the grid costs nothing
-    box = [slice(max(along.start - 2, 0), min(along.stop + 3, size)) for along, size in zip(found, index.shape, strict=True)]
+    # the box around all bodies, so that the rest of the grid costs nothing
+    found = ndimage.find_objects(held.astype(np.int8))[0]
+    box = [
+        slice(max(along.start - 2, 0), min(along.stop + 3, size))
+        for along, size in zip(found, index.shape, strict=True)
+    ]
     if grid.dimension == 2:
         box[0] = slice(1, 2)
     part, place = index[tuple(box)], 2 - axis
@@ -189,7 +228,8 @@ def _cells(grid: StaggeredGrid, index: np.ndarray, face: Incidence) -> Incidence
     inner[1:-1, 1:-1, 1:-1] = index[1:-1, 1:-1, 1:-1] < 0
     open_, step = inner.ravel(), np.array(_strides(grid))[face.axis]
     parts = []
-    for cell, sign in ((face.at, -1.0), (face.at - step, 1.0)):  # a face is the low one of a cell and the high one of that before
+    # a face is the low one of a cell and the high one of that before
+    for cell, sign in ((face.at, -1.0), (face.at - step, 1.0)):
         at = np.flatnonzero(open_[cell])
         rows = np.zeros((len(at), grid.dimension, face.row.shape[2]))
         rows[np.arange(len(at)), face.axis[at]] = sign * face.row[at, 0]
@@ -200,20 +240,31 @@ def _cells(grid: StaggeredGrid, index: np.ndarray, face: Incidence) -> Incidence
 def _edges(grid: StaggeredGrid, face: Incidence) -> Incidence:
     """Return the edges beside bodies.
 
-    The rate of shear of an edge is u_a - u_a(one cell back along b) + u_b - u_b(one cell back along a).
+    The rate of shear of an edge is u_a - u_a(one cell back along b) + u_b - u_b(one cell back along
+    a).
     """
     strides, found = _strides(grid), []
     for d, (alpha, beta) in enumerate(SHEARS[grid.dimension]):
         parts = []
         for axis, other in ((alpha, beta), (beta, alpha)):
             own = np.flatnonzero(face.axis == axis)
-            parts += [(face.at[own], face.body[own], face.row[own]), (face.at[own] + strides[other], face.body[own], -face.row[own])]
+            parts += [
+                (face.at[own], face.body[own], face.row[own]),
+                (face.at[own] + strides[other], face.body[own], -face.row[own]),
+            ]
         found.append(_summed(grid, parts, d))
     order = np.argsort(np.concatenate([part.body for part in found]), kind="stable")
-    return Incidence(*(np.concatenate([getattr(part, name) for part in found])[order] for name in Incidence.__dataclass_fields__))
+    return Incidence(
+        *(
+            np.concatenate([getattr(part, name) for part in found])[order]
+            for name in Incidence.__dataclass_fields__
+        )
+    )
 
 
-def _summed(grid: StaggeredGrid, parts: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], axis: int) -> Incidence:
+def _summed(
+    grid: StaggeredGrid, parts: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], axis: int
+) -> Incidence:
     """Return the places that parts name, by body, each once, with the sums of their rows."""
     place, body, rows = (np.concatenate(part) for part in zip(*parts, strict=True))
     pairs, which = np.unique(body * grid.size + place, return_inverse=True)

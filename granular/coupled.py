@@ -16,22 +16,44 @@ import warp_lcp as wl
 from warp_lcp.granular import stress_kernels as kernels
 from warp_lcp.granular.stress import Stress
 from warp_lcp.granular.stress_ahead import StressAhead
-from warp_lcp.granular.stress_kernels import BETTER, NEAR_BEST, NOTHING, PERIOD, STILL_SHARE, TIGHTER
+from warp_lcp.granular.stress_kernels import (
+    BETTER,
+    NEAR_BEST,
+    NOTHING,
+    PERIOD,
+    STILL_SHARE,
+    TIGHTER,
+)
 from warp_lcp.granular.yield_set import CONSTANTS
 from warp_lcp.rows import KernelFile, RowPass, Rows
-from warp_lcp.settings import Count, CountOrZero, NonNegative, Positive, Relaxation, Settings, ShareOrZero, renamed_names
+from warp_lcp.settings import (
+    Count,
+    CountOrZero,
+    NonNegative,
+    Positive,
+    Relaxation,
+    Settings,
+    ShareOrZero,
+    renamed_names,
+)
 
-SWING = 1.9  # 1 - momentum, times the cells of a side, of cold solves: with less than 2 sqrt(pressure_step / 4) pi / 2 = 1.4 the longest
-# wave, a quarter of which fits into a column's depth, swings back, and walls hold down what they have let rise; friction asks for more
-APART = 3  # cells along an axis, so that two threads change no velocity in common: what a cell changes reaches two cells far
+# 1 - momentum, times the cells of a side, of cold solves: with less than 2 sqrt(pressure_step / 4)
+# pi / 2 = 1.4 the longest
+SWING = 1.9
+# wave, a quarter of which fits into a column's depth, swings back, and walls hold down what they
+# have let rise; friction asks for more
+# cells along an axis, so that two threads change no velocity in common: what a cell changes reaches
+# two cells far
+APART = 3
 KERNELS = KernelFile(Path(__file__).parent / "headers/sweeps.h", CONSTANTS)
 
 
 class StressWorkspace:
     """Workspace of a stress solve; the iterate is the problem's field, in place.
 
-    The last stresses are the result, even if the solve fails; `HeavyBallProjectedGradient.least` explains why.
-    Earlier stresses and the momentum are memory of the problem, whose `begin` uses it between solves.
+    The last stresses are the result, even if the solve fails; `HeavyBallProjectedGradient.least`
+    explains why. Earlier stresses and the momentum are memory of the problem, whose `begin` uses it
+    between solves.
     """
 
     precision = wl.Precision.SINGLE
@@ -62,31 +84,40 @@ class StressWorkspace:
 class HeavyBallProjectedGradient(Settings):
     """Heavy-ball projected gradient method for pressure and friction together.
 
-    Each step moves all stresses against their gradient, scaled by the problem's diagonal, and projects: x onto x >= 0, the friction onto
-    the yield set of the new x. Pressure and friction have momenta of their own, which grow where steps go on in one direction and fall
-    where they flutter: the friction's bound depends on the pressure but not the other way round, so that the problem has no energy to
-    descend and too much momentum makes it oscillate where sand is nearly rigid. Where the residual no longer falls, the momentum is
-    limited further. No theorem promises convergence, and in deep sand that yields there is a floor, see docs/methods.md: the residual
+    Each step moves all stresses against their gradient, scaled by the problem's diagonal, and
+    projects: x onto x >= 0, the friction onto the yield set of the new x. Pressure and friction
+    have momenta of their own, which grow where steps go on in one direction and fall where they
+    flutter: the friction's bound depends on the pressure but not the other way round, so that the
+    problem has no energy to descend and too much momentum makes it oscillate where sand is nearly
+    rigid. Where the residual no longer falls, the momentum is limited further. No theorem promises
+    convergence, and in deep sand that yields there is a floor, see docs/methods.md: the residual
     that is reported is that of the stresses, recomputed in float64.
 
-    With diagonals D_x and D_s of a full packing, steps are stable while c_x a_x + c_s a_s < 2 (1 + beta) / (1 + 2 lookahead beta), where
-    a are the steps and c = 2, 2 in 2-D, 2, 4 in 3-D (the largest eigenvalue on a periodic grid); the defaults take four fifths of that.
+    With diagonals D_x and D_s of a full packing, steps are stable while c_x a_x + c_s a_s < 2 (1 +
+    beta) / (1 + 2 lookahead beta), where a are the steps and c = 2, 2 in 2-D, 2, 4 in 3-D (the
+    largest eigenvalue on a periodic grid); the defaults take four fifths of that.
 
     Args:
         pressure_step: relative to the diagonal.
         shear_step: relative to the diagonal; in 3-D it is halved.
-        lookahead: the gradient is taken at x + lookahead beta (x - x_before), steps start from x + beta (x - x_before).
+        lookahead: the gradient is taken at x + lookahead beta (x - x_before), steps start from x +
+            beta (x - x_before).
         momentum: beta at the start of a solve.
         check_every: periods of steps between two looks at the estimate of the residual.
-        patience: steps without a better estimate, after which the next estimate near the best is accepted.
-        wait: steps without a better estimate after which the momentum is limited, unless the estimate is within the tolerance.
-        calm: limits of the momentum, one after the other: beyond .87 deep sand that yields flutters, which doubles its residual; waves
-            of pressure as long as the sand is deep want .95 and more, so that solves start without a limit.
-        least: steps that a solve takes, whatever its residual, unless that is next to nothing. Smooth errors hardly show in the residual
-            and add up from one time step to the next: without these steps, packed sand at rest creeps two to four times as far.
-        cold: the same of a solve that starts from much less than its forces make, unless the residual is next to nothing before. What it
-            leaves is the distance that sand initially at rest falls, with a rebound at walls: in a silo 126 cells deep it is 2e-4 of
-            the height, and friction points down in the uppermost rows.
+        patience: steps without a better estimate, after which the next estimate near the best is
+            accepted.
+        wait: steps without a better estimate after which the momentum is limited, unless the
+            estimate is within the tolerance.
+        calm: limits of the momentum, one after the other: beyond .87 deep sand that yields
+            flutters, which doubles its residual; waves of pressure as long as the sand is deep want
+            .95 and more, so that solves start without a limit.
+        least: steps that a solve takes, whatever its residual, unless that is next to nothing.
+            Smooth errors hardly show in the residual and add up from one time step to the next:
+            without these steps, packed sand at rest creeps two to four times as far.
+        cold: the same of a solve that starts from much less than its forces make, unless the
+            residual is next to nothing before. What it leaves is the distance that sand initially
+            at rest falls, with a rebound at walls: in a silo 126 cells deep it is 2e-4 of the
+            height, and friction points down in the uppermost rows.
     """
 
     problems: ClassVar = Stress
@@ -113,7 +144,15 @@ class HeavyBallProjectedGradient(Settings):
         """
         taken, due, stagnates = work.take_steps()
         failure = wl.SolveStatus.STAGNATED if stagnates else None
-        return wl.Step("projection", taken, failure=failure, interim=True, iterations=taken, due=due, final=True)
+        return wl.Step(
+            "projection",
+            taken,
+            failure=failure,
+            interim=True,
+            iterations=taken,
+            due=due,
+            final=True,
+        )
 
     def steps(self, stress: Stress) -> tuple[float, float, float]:
         """Return the steps of pressure and friction, and the lookahead."""
@@ -138,7 +177,8 @@ class MomentumWorkspace(StressWorkspace):
         self.method = method
         self._ahead = StressAhead(stress, method) if StressAhead.suits(stress) else None
         self._leads = False  # whether the device has begun the solve, and takes its steps
-        self._news: int | None = None  # where the decisions have the residual of the stresses as they are; None: it is not known
+        # where the decisions have the residual of the stresses as they are; None: it is not known
+        self._news: int | None = None
         self._taken = 0  # of the steps done, those that the outer loop knows of
 
     def begin_ahead(self, guess: None, criteria: wl.StoppingCriteria, steps: int) -> float | None:
@@ -151,7 +191,10 @@ class MomentumWorkspace(StressWorkspace):
             criteria: when steps are done; the device leads where the tolerance is absolute.
             steps: of this solve that may be taken without the host.
         """
-        self._leads, self._news = self._ahead is not None and steps > 0 and criteria.rtol == 0.0, None
+        self._leads, self._news = (
+            self._ahead is not None and steps > 0 and criteria.rtol == 0.0,
+            None,
+        )
         if self._ahead is None or not self._leads:
             return None
         self._ahead.begin(criteria.atol, steps)
@@ -194,9 +237,15 @@ class MomentumWorkspace(StressWorkspace):
             return bool(self._ahead.decisions()[kernels.LEAST] > 0.0)
         stress, method = self.problem, self.method
         pressure_step, shear_step, lookahead = method.steps(stress)
-        stress.restart(pressure_step=pressure_step, shear_step=shear_step, lookahead=lookahead, momentum=method.momentum)
+        stress.restart(
+            pressure_step=pressure_step,
+            shear_step=shear_step,
+            lookahead=lookahead,
+            momentum=method.momentum,
+        )
         self._aim, self._best, self._limits = tolerance, math.inf, list(method.calm)
-        self._done, self._best_at, self._moved = 0, 0, 0  # steps: taken, when the estimate was best, when it or the momentum last changed
+        # steps: taken, when the estimate was best, when it or the momentum last changed
+        self._done, self._best_at, self._moved = 0, 0, 0
         self._least, self._still = method.least, 0.0
         if stress.cold:
             self._least, self._still = method.cold, STILL_SHARE * tolerance
@@ -213,14 +262,18 @@ class MomentumWorkspace(StressWorkspace):
         method, stagnates = self.method, False
         self._done += taken
         if not estimate < BETTER * self._best:
-            late = self._done - self._best_at >= method.patience and estimate < NEAR_BEST * self._best
+            late = (
+                self._done - self._best_at >= method.patience and estimate < NEAR_BEST * self._best
+            )
             stagnates = not math.isfinite(estimate) or late
             if self._limits and self._done - self._moved >= method.wait and estimate > self._aim:
                 self.problem.limit_momentum(self._limits.pop(0))
                 self._moved = self._done
         else:
             self._best, self._best_at, self._moved = estimate, self._done, self._done
-        due = stagnates or not (estimate > self._aim or (self._done < self._least and estimate > self._still))
+        due = stagnates or not (
+            estimate > self._aim or (self._done < self._least and estimate > self._still)
+        )
         if due:
             self._aim *= TIGHTER
         return due, stagnates
@@ -232,7 +285,8 @@ class InterleavedSweeps(Settings):
 
     [Book] 2.2.4: staggering with one sweep per block.
 
-    Solving either to the end before the other converges far slower: both carry the same load, and each sweep must be able to hand it over.
+    Solving either to the end before the other converges far slower: both carry the same load, and
+    each sweep must be able to hand it over.
 
     Args:
         pressure_relaxation: of the sweeps for the pressure.
@@ -254,17 +308,26 @@ class InterleavedSweeps(Settings):
         """Sweep `check_every` times over pressure and friction."""
         for _ in range(self.check_every):
             self._round(problem)
-        return wl.Step("round", self.check_every, interim=True, iterations=self.check_every, final=True)
+        return wl.Step(
+            "round", self.check_every, interim=True, iterations=self.check_every, final=True
+        )
 
     def _round(self, stress: Stress) -> None:
         p, walls, device = stress.packing, stress.walls, stress.packing.grid.device
         passes = interleaved_passes(p.grid.dimension, stress.box, stress.rate, device.is_cuda)
-        structs, now, numbers, omega = (p.fields, stress.velocity.fields), stress.now, stress.numbers, self.friction_relaxation
+        structs, now, numbers, omega = (
+            (p.fields, stress.velocity.fields),
+            stress.now,
+            stress.numbers,
+            self.friction_relaxation,
+        )
         _sweep(stress, passes.pressure, self.pressure_relaxation)
         _sweep(stress, passes.friction, omega)
         if walls.count:
             rows = Rows.entries(walls.count, device, walls.count)
-            passes.wall.bind(rows, *structs, walls.faces, omega=omega, now=now, numbers=numbers).launch()
+            passes.wall.bind(
+                rows, *structs, walls.faces, omega=omega, now=now, numbers=numbers
+            ).launch()
 
 
 class StressSweepWorkspace(StressWorkspace):
@@ -288,25 +351,36 @@ def _sweep(stress: Stress, passed: RowPass, omega: float) -> None:
 
 
 @functools.cache
-def interleaved_passes(dimension: int, box: bool = False, rate: bool = False, listed: bool = False) -> SimpleNamespace:
+def interleaved_passes(
+    dimension: int, box: bool = False, rate: bool = False, listed: bool = False
+) -> SimpleNamespace:
     """Return the sweep kernels in 2-D or 3-D; `listed`: over a list of cells."""
     module = f"granular.interleaved_{dimension}d{'_box' * box}{'_rate' * rate}{'_listed' * listed}"
-    made = functools.partial(KERNELS.kernel, module=module, constants={"DIM": dimension, "BOX": box, "RATE": rate})
+    made = functools.partial(
+        KERNELS.kernel, module=module, constants={"DIM": dimension, "BOX": box, "RATE": rate}
+    )
     area = "granular.interleaved" + "_listed" * listed
     return SimpleNamespace(
-        pressure=made(f"{area}.sweep_pressure"), friction=made(f"{area}.sweep_friction"), wall=made("granular.interleaved.sweep_walls")
+        pressure=made(f"{area}.sweep_pressure"),
+        friction=made(f"{area}.sweep_friction"),
+        wall=made("granular.interleaved.sweep_walls"),
     )
 
 
 @functools.lru_cache(maxsize=2)
-def colors(shape: tuple[int, int, int], low: tuple[int, int, int], high: tuple[int, int, int], device: str) -> list[wp.array]:
+def colors(
+    shape: tuple[int, int, int], low: tuple[int, int, int], high: tuple[int, int, int], device: str
+) -> list[wp.array]:
     """Return the flat indices of a box's cells by color.
 
     Cells low <= (k, j, i) < high; cells of a color are `APART` along each axis.
     """
     cells = np.arange(np.prod(shape), dtype=np.int32).reshape(shape)[tuple(map(slice, low, high))]
     starts = np.ndindex(*(min(APART, n) for n in cells.shape))
-    return [wp.array(cells[k::APART, j::APART, i::APART].ravel(), dtype=wp.int32, device=device) for k, j, i in starts]
+    return [
+        wp.array(cells[k::APART, j::APART, i::APART].ravel(), dtype=wp.int32, device=device)
+        for k, j, i in starts
+    ]
 
 
 METHODS: dict[str, type[HeavyBallProjectedGradient | InterleavedSweeps]] = {

@@ -1,9 +1,10 @@
 """Solids that cut cells as the stresses of sand meet them: what they leave open, and friction on their true surface.
 
-The discrete power of the stresses is that of what is open: pressure on the open part of a face, a deviator on the open part of its cell
-or edge. Rates of strain are differences between faces that can move, so that sliding along a wall strains nothing, and forces are their
-adjoint, so that stresses exchange momentum without loss. No deviator acts on a wall: in the cells that it cuts the pressure is the whole
-load, and its friction is a traction of its own.
+The discrete power of the stresses is that of what is open: pressure on the open part of a face, a
+deviator on the open part of its cell or edge. Rates of strain are differences between faces that
+can move, so that sliding along a wall strains nothing, and forces are their adjoint, so that
+stresses exchange momentum without loss. No deviator acts on a wall: in the cells that it cuts the
+pressure is the whole load, and its friction is a traction of its own.
 """
 
 from __future__ import annotations
@@ -42,8 +43,9 @@ class CutWalls:
         solved: the cells whose walls are asked for; None: all.
 
     Attributes:
-        openings: float32: what solids leave open of the lower faces of each axis, then what of each cell the differences of velocity
-            along each axis stand for: its volume where solids leave both faces open in part, else 0; shape (2 dimension, *grid.shape).
+        openings: float32: what solids leave open of the lower faces of each axis, then what of each
+            cell the differences of velocity along each axis stand for: its volume where solids
+            leave both faces open in part, else 0; shape (2 dimension, *grid.shape).
         volume: float32 open part of each cell.
         around: float32 open part of what surrounds the edges of each shear.
         count: cells with a wall.
@@ -52,7 +54,13 @@ class CutWalls:
         area: of each, in units of a cell's face, on the host.
     """
 
-    def __init__(self, grid: StaggeredGrid, cut: CutCells, friction: Sequence[float], solved: Window | None = None) -> None:
+    def __init__(
+        self,
+        grid: StaggeredGrid,
+        cut: CutCells,
+        friction: Sequence[float],
+        solved: Window | None = None,
+    ) -> None:
         """Find volumes, areas and normals."""
         self.grid, device, dimension = grid, grid.device, grid.dimension
         distance, solid = cut.distance.numpy().astype(np.float64), cut.base.numpy() == SOLID
@@ -62,13 +70,19 @@ class CutWalls:
         inner[1:-1, 1:-1, 1:-1] = True
         volume[~inner] = 1.0
         volume[inner & solid] = 0.0
-        faces = _open_faces(grid, [field.numpy().astype(np.float64) for field in cut.open], distance)
+        faces = _open_faces(
+            grid, [field.numpy().astype(np.float64) for field in cut.open], distance
+        )
         high = [np.roll(face, -1, axis=2 - axis) for axis, face in enumerate(faces)]
-        counted = [np.where((a > 0.0) & (b > 0.0), volume, 0.0) for a, b in zip(faces, high, strict=True)]
+        counted = [
+            np.where((a > 0.0) & (b > 0.0), volume, 0.0) for a, b in zip(faces, high, strict=True)
+        ]
         self.openings = wp.array(np.array([*faces, *counted]), dtype=wp.float32, device=device)
         self.volume = wp.array(volume, dtype=wp.float32, device=device)
         self.around = [
-            wp.array(_around(octants, inner, inner & solid, alpha, beta), dtype=wp.float32, device=device)
+            wp.array(
+                _around(octants, inner, inner & solid, alpha, beta), dtype=wp.float32, device=device
+            )
             for alpha, beta in SHEARS[dimension]
         ]
         asked, window = np.zeros(grid.shape, dtype=bool), solved or grid.domain
@@ -76,7 +90,14 @@ class CutWalls:
         self._find_walls(cut, asked & ~solid, faces, high, volume)
         self._friction = wp.array(np.minimum(friction, 1e6), dtype=wp.float32, device=device)
 
-    def _find_walls(self, cut: CutCells, open_: np.ndarray, faces: list[np.ndarray], high: list[np.ndarray], volume: np.ndarray) -> None:
+    def _find_walls(
+        self,
+        cut: CutCells,
+        open_: np.ndarray,
+        faces: list[np.ndarray],
+        high: list[np.ndarray],
+        volume: np.ndarray,
+    ) -> None:
         """Find the cells with a wall, and what their kernel reads."""
         walls = np.array([a - b for a, b in zip(faces, high, strict=True)])
         size = np.sqrt((walls**2).sum(axis=0))
@@ -92,13 +113,23 @@ class CutWalls:
             for part, who in ((a, number), (b, np.roll(number, -1, axis=2 - axis))):
                 more = (1.0 - part.ravel()[at] > closed) & (who.ravel()[at] > 0)
                 numbers[more], closed[more] = who.ravel()[at][more], 1.0 - part.ravel()[at][more]
-        entries = np.concatenate([self.normal, self.area[:, None], missing, volume.ravel()[at][:, None]], axis=1)
+        entries = np.concatenate(
+            [self.normal, self.area[:, None], missing, volume.ravel()[at][:, None]], axis=1
+        )
         device = self.grid.device
         self.cells = wp.array(at, dtype=wp.int32, device=device)
         self._numbers = wp.array(numbers, dtype=wp.int32, device=device)
         self._entries = wp.array(entries.ravel(), dtype=wp.float32, device=device)
 
-    def project(self, packing: Packing, velocity: Velocity, stress: StressFields, partials: wp.array, grain: int, launch: Launch) -> None:
+    def project(
+        self,
+        packing: Packing,
+        velocity: Velocity,
+        stress: StressFields,
+        partials: wp.array,
+        grain: int,
+        launch: Launch,
+    ) -> None:
         """Take a projected step of the tractions, or find what the natural residual would move.
 
         Args:
@@ -134,7 +165,9 @@ def _corners(distance: np.ndarray, axes: Sequence[int]) -> np.ndarray:
     return found
 
 
-def _open_part(corners: np.ndarray, low: Sequence[float], high: Sequence[float], samples: int) -> np.ndarray:
+def _open_part(
+    corners: np.ndarray, low: Sequence[float], high: Sequence[float], samples: int
+) -> np.ndarray:
     """Return the part of boxes where the distance, linear between its values at the corners of a unit cube, is positive.
 
     Args:
@@ -144,7 +177,9 @@ def _open_part(corners: np.ndarray, low: Sequence[float], high: Sequence[float],
         samples: along each axis of the box.
     """
     total = np.zeros(corners.shape[-1])
-    places = [a + (b - a) * (np.arange(samples) + 0.5) / samples for a, b in zip(low, high, strict=True)]
+    places = [
+        a + (b - a) * (np.arange(samples) + 0.5) / samples for a, b in zip(low, high, strict=True)
+    ]
     step = max(b - a for a, b in zip(low, high, strict=True)) / samples
     for point in itertools.product(*places):
         value = corners
@@ -164,11 +199,15 @@ def _octants(distance: np.ndarray, dimension: int) -> np.ndarray:
     found[..., least >= 0.0] = 1.0
     for halves in itertools.product((0, 1), repeat=dimension):  # of the last axis first
         low = [0.5 * half for half in reversed(halves)]
-        found[halves][mixed] = _open_part(flat[..., mixed], low, [a + 0.5 for a in low], SAMPLES[dimension])
+        found[halves][mixed] = _open_part(
+            flat[..., mixed], low, [a + 0.5 for a in low], SAMPLES[dimension]
+        )
     return found.reshape((2,) * dimension + distance.shape)
 
 
-def _open_faces(grid: StaggeredGrid, faces: list[np.ndarray], distance: np.ndarray) -> list[np.ndarray]:
+def _open_faces(
+    grid: StaggeredGrid, faces: list[np.ndarray], distance: np.ndarray
+) -> list[np.ndarray]:
     """Return what solids leave open of faces, those of the domain's sides too, which its walls close."""
     for axis, face in enumerate(faces):
         others = [other for other in range(grid.dimension) if other != axis]
@@ -178,15 +217,23 @@ def _open_faces(grid: StaggeredGrid, faces: list[np.ndarray], distance: np.ndarr
             at[2 - axis] = slice(layer, layer + 1)
             part = corners[:, :, *at] if len(others) == 2 else corners[:, *at]
             flat = part.reshape(*(2,) * len(others), -1)
-            found = _open_part(flat, [0.0] * len(others), [1.0] * len(others), 2 * SAMPLES[grid.dimension])
+            found = _open_part(
+                flat, [0.0] * len(others), [1.0] * len(others), 2 * SAMPLES[grid.dimension]
+            )
             face[tuple(at)] = found.reshape(part.shape[len(others) :])
     return faces
 
 
-def _around(octants: np.ndarray, inner: np.ndarray, solid: np.ndarray, alpha: int, beta: int) -> np.ndarray:
+def _around(
+    octants: np.ndarray, inner: np.ndarray, solid: np.ndarray, alpha: int, beta: int
+) -> np.ndarray:
     """Return the open part of what surrounds the edges of a shear; 0 beside cells that solids fill but on the domain's walls."""
     dimension = octants.ndim - 3
-    total, count, filled = np.zeros(inner.shape), np.zeros(inner.shape), np.zeros(inner.shape, dtype=bool)
+    total, count, filled = (
+        np.zeros(inner.shape),
+        np.zeros(inner.shape),
+        np.zeros(inner.shape, dtype=bool),
+    )
     for a, b in itertools.product((0, 1), repeat=2):  # the cells one back along alpha, along beta
         at: list[slice | int] = [slice(None)] * dimension
         at[dimension - 1 - alpha], at[dimension - 1 - beta] = 1 if a else 0, 1 if b else 0

@@ -1,8 +1,9 @@
 # mypy: ignore-errors
 """Percentile of the particles' x and y, selected on the device: runout and height of the sand without a readback of its own.
 
-The n-th smallest of float32 numbers is found digit by digit (radix selection): of the numbers that begin with the digits found, count
-those with each next digit; the one in which n falls is found. Counts are integers, so that the result is exact.
+The n-th smallest of float32 numbers is found digit by digit (radix selection): of the numbers that
+begin with the digits found, count those with each next digit; the one in which n falls is found.
+Counts are integers, so that the result is exact.
 """
 
 from typing import no_type_check
@@ -30,7 +31,9 @@ def ordered_bits(x: float):
 
 @list_kernel("granular.front")
 @no_type_check
-def count_kernel(i, position: POINTS, found: WORDS, counts: INTS, mask: wp.uint32, shift: wp.uint32):
+def count_kernel(
+    i, position: POINTS, found: WORDS, counts: INTS, mask: wp.uint32, shift: wp.uint32
+):
     """Count the digits behind `mask` of the coordinates that begin with what is found."""
     for axis in range(AXES):
         bits = ordered_bits(position[i][axis])
@@ -40,7 +43,15 @@ def count_kernel(i, position: POINTS, found: WORDS, counts: INTS, mask: wp.uint3
 
 
 @forward_kernel(module="granular.front")
-def select_kernel(counts: INTS, found: WORDS, rank: INTS, place: int, mask: wp.uint32, shift: wp.uint32, out: wp.array(dtype=wp.float32)):
+def select_kernel(
+    counts: INTS,
+    found: WORDS,
+    rank: INTS,
+    place: int,
+    mask: wp.uint32,
+    shift: wp.uint32,
+    out: wp.array(dtype=wp.float32),
+):
     """Find the digit in which the number at a rank falls, and its rank among those; a thread an axis."""
     axis = wp.tid()
     left = rank[axis]
@@ -96,7 +107,14 @@ class Front:
             digits = [wp.uint32(mask), wp.uint32(shift)]
             inputs = [particles.position, self._found, self._counts, *digits]
             launch_list(count_kernel, particles.count, inputs, device=self._device, ordered=True)
-            inputs = [self._counts, self._found, self._rank, self._place, *digits, self._reading.array]
+            inputs = [
+                self._counts,
+                self._found,
+                self._rank,
+                self._place,
+                *digits,
+                self._reading.array,
+            ]
             launch(select_kernel, AXES, inputs, device=self._device)
             mask |= (DIGITS - 1) << shift
 

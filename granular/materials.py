@@ -1,10 +1,11 @@
 """Named granular materials, with the sources of their parameters.
 
-The angles are between loose and dense packing as soil mechanics measures them, near the loose one, which is that of a heap: uniform sand
-of round grains 27.5 to 34 degrees, sandy gravel 35 to 50 [Terzaghi & Peck 1967, table 17.1]; the densities are between both too, dry
-uniform sand 1430 to 1750 kg/m^3 [table 6.3]. Sugar: angle
-of repose and bulk density of dry granulated sugar [Beakawi Al-Hashemi & Al-Amoudi 2018, a review]. Friction against walls is that of
-smooth solid walls, about two thirds of the angle's tangent. Every number may be set in a scene instead.
+The angles are between loose and dense packing as soil mechanics measures them, near the loose one,
+which is that of a heap: uniform sand of round grains 27.5 to 34 degrees, sandy gravel 35 to 50
+[Terzaghi & Peck 1967, table 17.1]; the densities are between both too, dry uniform sand 1430 to
+1750 kg/m^3 [table 6.3]. Sugar: angle of repose and bulk density of dry granulated sugar [Beakawi
+Al-Hashemi & Al-Amoudi 2018, a review]. Friction against walls is that of smooth solid walls, about
+two thirds of the angle's tangent. Every number may be set in a scene instead.
 """
 
 from __future__ import annotations
@@ -45,13 +46,15 @@ def slope(angle: float, test: FrictionAngleTest, dimension: int) -> float:
 
     The angle [degrees] is that of the given test.
 
-    Repose: layers stop at it, k = tan. What slides along a slope shears alone, under equal normal stresses: its shear stress over its
-    pressure is the slope's tangent. Sand that rests and has pushed against itself along the slope holds up to asin(k), 35.3 degrees where
-    k = tan(30 degrees): heaps that are poured slowly lie between both.
+    Repose: layers stop at it, k = tan. What slides along a slope shears alone, under equal normal
+    stresses: its shear stress over its pressure is the slope's tangent. Sand that rests and has
+    pushed against itself along the slope holds up to asin(k), 35.3 degrees where k = tan(30
+    degrees): heaps that are poured slowly lie between both.
 
-    Plane strain: Mohr and Coulomb's, k = sin. In 3-D that cone is flatter where a sample is compressed along one axis: 30 degrees become
-    22.2. So triaxial compression has k = 2 sqrt(3) sin / (3 - sin), from |s|_F = sqrt(2/3) q and q = 6 sin / (3 - sin) p, where q is the
-    difference of the principal stresses. In 2-D there is no other compression than plane strain's.
+    Plane strain: Mohr and Coulomb's, k = sin. In 3-D that cone is flatter where a sample is
+    compressed along one axis: 30 degrees become 22.2. So triaxial compression has k = 2 sqrt(3) sin
+    / (3 - sin), from |s|_F = sqrt(2/3) q and q = 6 sin / (3 - sin) p, where q is the difference of
+    the principal stresses. In 2-D there is no other compression than plane strain's.
 
     >>> alike = (26.565, "repose"), (30.0, "plane-strain"), (22.23, "triaxial-compression")
     >>> print(*(f"{slope(angle, test, 3):.3f}" for angle, test in alike))
@@ -60,4 +63,8 @@ def slope(angle: float, test: FrictionAngleTest, dimension: int) -> float:
     if test == "repose":
         return math.tan(math.radians(angle))
     sine = math.sin(math.radians(angle))
-    return 2.0 * math.sqrt(3.0) * sine / (3.0 - sine) if test == "triaxial-compression" and dimension == 3 else sine
+    return (
+        2.0 * math.sqrt(3.0) * sine / (3.0 - sine)
+        if test == "triaxial-compression" and dimension == 3
+        else sine
+    )

@@ -28,31 +28,39 @@ SHEARS = {2: ((0, 1),), 3: ((0, 1), (0, 2), (1, 2))}  # the axes of each shear
 class Packing:
     """Packing of sand in a step, and where stresses act.
 
-    phi is the share of a cell that grains fill, in units of the densest packing. Sand may be denser than 1 by what the particles'
-    sampling makes of it, which the stresses leave as it is; from FULL on a cell is full. A face has the mean of its cells as mass; those
-    with less than 0.02 are empty, those with less than 0.1 count as 0.1. A cell with phi > 0.3 beside air counts as full in the pressure's
-    problem, so that a surface of partly filled cells carries a pressure, and thus friction; its mass is its own.
+    phi is the share of a cell that grains fill, in units of the densest packing. Sand may be denser
+    than 1 by what the particles' sampling makes of it, which the stresses leave as it is; from FULL
+    on a cell is full. A face has the mean of its cells as mass; those with less than 0.02 are
+    empty, those with less than 0.1 count as 0.1. A cell with phi > 0.3 beside air counts as full in
+    the pressure's problem, so that a surface of partly filled cells carries a pressure, and thus
+    friction; its mass is its own.
 
-    On ranks it is right in the box and `REACH` layers around it where the density is in all ghost layers.
+    On ranks it is right in the box and `REACH` layers around it where the density is in all ghost
+    layers.
 
     Args:
         grid: the grid.
         base: int8, SOLID or AIR.
         capacity: float32, share of a cell's kernel that is open.
         sides: of axes without an end, if there are any.
-        cut: solids that cut cells, if there are any; `base` has those cells alone that they leave nothing of.
+        cut: solids that cut cells, if there are any; `base` has those cells alone that they leave
+            nothing of.
 
     Attributes:
         base: that of the arguments.
         fraction: phi, float32.
         kind: int8 FLUID where a cell holds sand (phi > 0.02), AIR, SOLID.
         flags: uint8 bits of a cell, see `granular.yield_set`.
-        drive: what of a cell is free, at most FULL - phi and what is free around it, times dx / dt [m/s], float32.
-        mass, inverse: of each component's faces, in units of a full face's, float32; inverse is 0 where nothing can be moved.
+        drive: what of a cell is free, at most FULL - phi and what is free around it, times dx / dt
+            [m/s], float32.
+        mass, inverse: of each component's faces, in units of a full face's, float32; inverse is 0
+            where nothing can be moved.
         start: velocity of each component that the stresses act on [m/s], float32.
-        share: weight of a cell's copy on the edges of each shear, float32, see `granular.yield_set`.
+        share: weight of a cell's copy on the edges of each shear, float32, see
+            `granular.yield_set`.
         stiff: bound of the friction's diagonal in a cell, float32.
-        spans: int32, first and one past the last cell of each row that stresses reach, shape (*grid.shape[:2], 2).
+        spans: int32, first and one past the last cell of each row that stresses reach, shape
+            (*grid.shape[:2], 2).
         nodes: the window of lower faces and edges of all cells and the domain's upper side.
         strained: of it, edges whose rates of strain counted cells take.
         moved: faces whose velocities these and counted cells take.
@@ -60,10 +68,27 @@ class Packing:
     """
 
     def __init__(
-        self, grid: StaggeredGrid, base: wp.array, capacity: wp.array, *, sides: PeriodicSides | None = None, cut: CutWalls | None = None
+        self,
+        grid: StaggeredGrid,
+        base: wp.array,
+        capacity: wp.array,
+        *,
+        sides: PeriodicSides | None = None,
+        cut: CutWalls | None = None,
     ) -> None:
-        self.grid, self.base, self._capacity, self.sides, self.cut = grid, base, capacity, sides, cut
-        self.fraction, self.kind, self.flags, self.drive = grid.field(), grid.field(wp.int8), grid.field(wp.uint8), grid.field()
+        self.grid, self.base, self._capacity, self.sides, self.cut = (
+            grid,
+            base,
+            capacity,
+            sides,
+            cut,
+        )
+        self.fraction, self.kind, self.flags, self.drive = (
+            grid.field(),
+            grid.field(wp.int8),
+            grid.field(wp.uint8),
+            grid.field(),
+        )
         wp.copy(self.kind, base)
         self.mass, self.inverse, self.start = grid.faces(), grid.faces(), grid.faces()
         self.share = [grid.field() for _ in SHEARS[grid.dimension]]
@@ -74,17 +99,29 @@ class Packing:
         more = 1 if grid.dimension == 3 else 0
         self.nodes = Window(low, (high[0] + more, high[1] + 1, high[2] + 1), grid.device)
         self.counted = grid.part.owned
-        self._forest: Any = None  # of this step's sand, on ranks; the same object in all steps, which recorded exchanges read
-        self.strained, self.moved, self.stressed = self._around(0, 1), self._around(1, 1), self._around(1, 2)
+        # of this step's sand, on ranks; the same object in all steps, which recorded exchanges read
+        self._forest: Any = None
+        self.strained, self.moved, self.stressed = (
+            self._around(0, 1),
+            self._around(1, 1),
+            self._around(1, 2),
+        )
         self._known = grid.part.stored
-        self._rows = wp.zeros((2, *grid.shape[:2]), dtype=wp.float64, device=grid.device)  # count, largest fraction of each row
+        # count, largest fraction of each row
+        self._rows = wp.zeros((2, *grid.shape[:2]), dtype=wp.float64, device=grid.device)
         self._found = Reading(grid.device, 2)
         self._rate = Scalar()  # dx / dt [m/s]
         self._update = LaunchGraph(grid.device, self._launch)
         if sides is not None:  # what a row's neighbors hold may lie at the other end of it
             self.spans.assign(np.full((*grid.shape[:2], 2), (low[2], high[2] + 1), dtype=np.int32))
 
-    def update(self, density: wp.array, velocity: Sequence[wp.array], dt: float, solid: Sequence[wp.array] = ()) -> None:
+    def update(
+        self,
+        density: wp.array,
+        velocity: Sequence[wp.array],
+        dt: float,
+        solid: Sequence[wp.array] = (),
+    ) -> None:
         """Update the packing from the particles' density and velocity.
 
         Args:
@@ -94,7 +131,12 @@ class Packing:
             solid: velocity of the solids on each component's faces [m/s]; empty: they stand still.
         """
         self._rate.value = self.grid.spacing / dt
-        self._update.run(density, velocity, solid, variant=tuple(field.ptr for field in (density, *velocity, *solid)))
+        self._update.run(
+            density,
+            velocity,
+            solid,
+            variant=tuple(field.ptr for field in (density, *velocity, *solid)),
+        )
         self._found.changed()
 
     def find_ghosts(self, layers: int) -> None:
@@ -125,30 +167,68 @@ class Packing:
         """
         return float(self._found.numpy()[1])
 
-    def _launch(self, density: wp.array, velocity: Sequence[wp.array], solid: Sequence[wp.array]) -> None:
+    def _launch(
+        self, density: wp.array, velocity: Sequence[wp.array], solid: Sequence[wp.array]
+    ) -> None:
         """Launch an update."""
         grid, dimension = self.grid, self.grid.dimension
         domain, nodes = grid.domain, self.nodes
         domain.launch(kernels.fraction_kernel, [self.base, self._capacity, density, self.fraction])
         if self.sides is not None:
             self.sides.wrap(self.fraction)
-        openings, volume, around = (None, None, [None] * 3) if self.cut is None else (self.cut.openings, self.cut.volume, self.cut.around)
-        inputs = [self.base, self._capacity, self.fraction, grid.planes, self._rate, volume, self.kind, self.flags, self.drive]
+        openings, volume, around = (
+            (None, None, [None] * 3)
+            if self.cut is None
+            else (self.cut.openings, self.cut.volume, self.cut.around)
+        )
+        inputs = [
+            self.base,
+            self._capacity,
+            self.fraction,
+            grid.planes,
+            self._rate,
+            volume,
+            self.kind,
+            self.flags,
+            self.drive,
+        ]
         domain.launch(kernels.contents_kernel, inputs)
         if self.sides is not None:
             self.sides.wrap(self.flags, self.kind)
         for axis in range(dimension):
             moving = solid[axis] if solid else None
-            fields = [velocity[axis], moving, openings, self.start[axis], self.mass[axis], self.inverse[axis]]
+            fields = [
+                velocity[axis],
+                moving,
+                openings,
+                self.start[axis],
+                self.mass[axis],
+                self.inverse[axis],
+            ]
             nodes.launch(kernels.face_kernel, [axis, self.base, self.fraction, *fields])
             if self.sides is not None:
                 self.sides.wrap(self.start[axis], self.mass[axis], self.inverse[axis])
         for (alpha, beta), part, share in zip(SHEARS[dimension], around, self.share, strict=False):
             nodes.launch(
-                kernels.edge_kernel, [alpha, beta, self.base, self.flags, self.inverse[alpha], self.inverse[beta], part, share]
-            )  # fmt: skip
-        inverse, share = (put(kernels.Faces(), dict(zip("xyz", fields, strict=False))) for fields in (self.inverse, self.share))
-        domain.launch(kernels.stiffness_kernel, [dimension, self.flags, inverse, share, openings, self.stiff])
+                kernels.edge_kernel,
+                [
+                    alpha,
+                    beta,
+                    self.base,
+                    self.flags,
+                    self.inverse[alpha],
+                    self.inverse[beta],
+                    part,
+                    share,
+                ],
+            )
+        inverse, share = (
+            put(kernels.Faces(), dict(zip("xyz", fields, strict=False)))
+            for fields in (self.inverse, self.share)
+        )
+        domain.launch(
+            kernels.stiffness_kernel, [dimension, self.flags, inverse, share, openings, self.stiff]
+        )
         self._launch_counts(density)
         if self.sides is not None:
             return  # the spans are whole rows
@@ -158,10 +238,18 @@ class Packing:
     def _launch_counts(self, density: wp.array) -> None:
         """Launch what finds `sand_cells` and `densest`."""
         self.counted.launch_rows(kernels.count_kernel, [self.flags, self._rows])
-        self._known.launch_rows(kernels.most_kernel, [self.base, self._capacity, density, self._rows])
+        self._known.launch_rows(
+            kernels.most_kernel, [self.base, self._capacity, density, self._rows]
+        )
         clear(self._found.array)
         rows = self._rows.shape[1] * self._rows.shape[2]
-        launch_list(kernels.fold_kernel, rows, [self._rows, self._found.array], device=self.grid.device, ordered=True)
+        launch_list(
+            kernels.fold_kernel,
+            rows,
+            [self._rows, self._found.array],
+            device=self.grid.device,
+            ordered=True,
+        )
 
     def _around(self, below: int, above: int) -> Window:
         """Return the counted cells and so many layers of nodes on their lower and upper sides, as far as there are nodes."""
@@ -172,7 +260,8 @@ class Packing:
     def join(self, stress: wp.array, *, launch: Launch = launch) -> None:
         """Fill `REACH` layers of ghost cells of a field of stresses; collective.
 
-        After `find_ghosts`. Also the cells beyond periodic sides. Cells without sand have stresses of 0 on all ranks.
+        After `find_ghosts`. Also the cells beyond periodic sides. Cells without sand have stresses
+        of 0 on all ranks.
         """
         if self._forest is not None:
             self.grid.part.filling(stress, forest=self._forest).launch(launch)
@@ -182,5 +271,11 @@ class Packing:
     @property
     def fields(self) -> SandFields:
         """Return the fields as kernels take them."""
-        components = [c for f in (self.share, self.mass, self.inverse, self.start) for c in three_components(f)]
-        return SandFields(*[self.flags, self.drive, self.stiff, self.fraction, self.spans, *components])
+        components = [
+            c
+            for f in (self.share, self.mass, self.inverse, self.start)
+            for c in three_components(f)
+        ]
+        return SandFields(
+            *[self.flags, self.drive, self.stiff, self.fraction, self.spans, *components]
+        )

@@ -15,11 +15,18 @@ _SOLID = wp.constant(wp.int8(SOLID))
 LEAST_FRACTION = 0.02  # of a cell or face, below which it is empty
 LEAST_MASS = 0.1  # of a face, in units of a full one: lighter ones would make the problem stiff
 DENSE = 0.5  # the fraction from which a cell carries shear
-SURFACE = 0.3  # the fraction from which a cell beside air counts as full: a partly filled one has no pressure, and so no friction
-FULL = 0.95  # the fraction from which a cell counts as full: less than 1 by the sampling's noise, whose gaps would close as falls
-WALL_NOISE = 0.25  # by which it is less where a wall takes nearly all of a cell: half the distance of two particles
+# the fraction from which a cell beside air counts as full: a partly filled one has no pressure, and
+# so no friction
+SURFACE = 0.3
+# the fraction from which a cell counts as full: less than 1 by the sampling's noise, whose gaps
+# would close as falls
+FULL = 0.95
+# by which it is less where a wall takes nearly all of a cell: half the distance of two particles
+WALL_NOISE = 0.25
 FIRM_FRACTION = 0.9  # from which cohesion holds a cell together
-LEAST_OPEN = 5e-4  # of a cell, below which it bears nothing: its faces are slits, through which only huge pressures would move sand
+# of a cell, below which it bears nothing: its faces are slits, through which only huge pressures
+# would move sand
+LEAST_OPEN = 5e-4
 LANES = 16  # cells of a vector
 ROUNDING = 1e-6  # by which a fraction may differ from 1 and count as 1
 
@@ -40,15 +47,28 @@ def fraction_kernel(k, j, i, base: I8, capacity: F32, splatted: F32, fraction: F
 
 @cell_kernel("granular.packing")
 def contents_kernel(
-    k, j, i, base: I8, capacity: F32, fraction: F32, planes: int, rate: float, volume: F32, kind: I8, flags: U8, drive: F32
+    k,
+    j,
+    i,
+    base: I8,
+    capacity: F32,
+    fraction: F32,
+    planes: int,
+    rate: float,
+    volume: F32,
+    kind: I8,
+    flags: U8,
+    drive: F32,
 ):
     """Which cells hold sand, and what of them is still free: drive = max(FULL - saturation, 0) dx / dt [m/s].
 
-    What is free in a cell must be free around it as well: a gap that its neighbors' surplus fills is the particles' sampling, no room.
+    What is free in a cell must be free around it as well: a gap that its neighbors' surplus fills
+    is the particles' sampling, no room.
 
-    Never negative: what is too dense is a matter of positions, which the density correction moves apart. Pushed out by the stresses it
-    would be a velocity, which friction works against (a silo's walls would pull its sand down), and the larger the shorter the step. Where
-    solids cut cells, `volume` is what they leave open of each.
+    Never negative: what is too dense is a matter of positions, which the density correction moves
+    apart. Pushed out by the stresses it would be a velocity, which friction works against (a silo's
+    walls would pull its sand down), and the larger the shorter the step. Where solids cut cells,
+    `volume` is what they leave open of each.
     """
     solid = base[k, j, i] == _SOLID
     phi = fraction[k, j, i]
@@ -107,22 +127,37 @@ def _free_around(base: I8, capacity: F32, fraction: F32, planes: int, k: int, j:
         for b in range(-1, 2):
             for a in range(-1, 2):
                 if base[k + c, j + b, i + a] != _SOLID:
-                    weight = wp.max(capacity[k + c, j + b, i + a], 0.1) / float((1 + wp.abs(a)) * (1 + wp.abs(b)) * (1 + wp.abs(c)))
+                    weight = wp.max(capacity[k + c, j + b, i + a], 0.1) / float(
+                        (1 + wp.abs(a)) * (1 + wp.abs(b)) * (1 + wp.abs(c))
+                    )
                     free += weight * (FULL - fraction[k + c, j + b, i + a])
     return free / wp.max(capacity[k, j, i], 0.1)
 
 
 @cell_kernel("granular.packing")
 def face_kernel(
-    k, j, i, axis: int, base: I8, fraction: F32, velocity: F32, solid: F32, openings: _F32X, start: F32, mass: F32, inverse: F32
+    k,
+    j,
+    i,
+    axis: int,
+    base: I8,
+    fraction: F32,
+    velocity: F32,
+    solid: F32,
+    openings: _F32X,
+    start: F32,
+    mass: F32,
+    inverse: F32,
 ):
     """Mass of a face in units of a full one, its inverse, and the velocity that the stress acts on.
 
-    A face beside a solid cannot be moved: inverse 0. Its mass is the fraction of the open cell where the solid moves (it sweeps sand
-    along), and its velocity the solid's. A face of no mass stays out of it: 0 in all three. A cell that is filled less than the surface
-    has no pressure: a face between it and one that has bears all of it, not half. Else half of it would weigh on nothing, the pressure
-    and thus the friction below would be too small by what lies in it, and the uppermost row would slide off slopes that it should rest
-    on. Of a face that a solid cuts the open part has mass, at least a least one.
+    A face beside a solid cannot be moved: inverse 0. Its mass is the fraction of the open cell
+    where the solid moves (it sweeps sand along), and its velocity the solid's. A face of no mass
+    stays out of it: 0 in all three. A cell that is filled less than the surface has no pressure: a
+    face between it and one that has bears all of it, not half. Else half of it would weigh on
+    nothing, the pressure and thus the friction below would be too small by what lies in it, and the
+    uppermost row would slide off slopes that it should rest on. Of a face that a solid cuts the
+    open part has mass, at least a least one.
     """
     c, b, a = cell_below(axis, k, j, i)
     m = float(0.0)
@@ -155,7 +190,18 @@ def face_kernel(
 
 @cell_kernel("granular.packing")
 def edge_kernel(
-    k, j, first, end, alpha: int, beta: int, base: I8, flags: U8, inverse_alpha: F32, inverse_beta: F32, around: F32, share: F32
+    k,
+    j,
+    first,
+    end,
+    alpha: int,
+    beta: int,
+    base: I8,
+    flags: U8,
+    inverse_alpha: F32,
+    inverse_beta: F32,
+    around: F32,
+    share: F32,
 ):
     """The weight of a copy on an edge: 1 / dense cells around it, or -1 / cells with a wall face that ends there, or 0.
 
@@ -182,8 +228,13 @@ def edge_kernel(
             if base[k - a * ka - b * kb, j - a * ja - b * jb, i - a * ia] == _SOLID:
                 solids += 1
             else:
-                across_alpha = base[k - (1 - a) * ka - b * kb, j - (1 - a) * ja - b * jb, i - (1 - a) * ia] == _SOLID
-                across_beta = base[k - a * ka - (1 - b) * kb, j - a * ja - (1 - b) * jb, i - a * ia] == _SOLID
+                across_alpha = (
+                    base[k - (1 - a) * ka - b * kb, j - (1 - a) * ja - b * jb, i - (1 - a) * ia]
+                    == _SOLID
+                )
+                across_beta = (
+                    base[k - a * ka - (1 - b) * kb, j - a * ja - (1 - b) * jb, i - a * ia] == _SOLID
+                )
                 if across_alpha != across_beta:
                     held += flag & HOLDS
         weight = float(0.0)
@@ -198,7 +249,9 @@ def edge_kernel(
 
 
 @cell_kernel("granular.packing")
-def stiffness_kernel(k, j, i, dimension: int, flags: U8, inverse: Faces, share: Faces, openings: _F32X, stiff: F32):
+def stiffness_kernel(
+    k, j, i, dimension: int, flags: U8, inverse: Faces, share: Faces, openings: _F32X, stiff: F32
+):
     """What bounds the friction's part of a step in a cell: the largest diagonal in the metric of its yield set. 0: it carries no shear."""
     most = float(0.0)
     if int(flags[k, j, i]) & SHEARS_HERE:
@@ -217,19 +270,45 @@ def stiffness_kernel(k, j, i, dimension: int, flags: U8, inverse: Faces, share: 
             most = wp.max(most, 2.0 * z)
         for b in range(2):
             for a in range(2):
-                most = wp.max(most, _edge(share.x, inverse.x, inverse.y, k, j + b, i + a, 0, 1, 0, 0, 0, 1))
+                most = wp.max(
+                    most, _edge(share.x, inverse.x, inverse.y, k, j + b, i + a, 0, 1, 0, 0, 0, 1)
+                )
                 if dimension == 3:
-                    most = wp.max(most, _edge(share.y, inverse.x, inverse.z, k + b, j, i + a, 1, 0, 0, 0, 0, 1))
-                    most = wp.max(most, _edge(share.z, inverse.y, inverse.z, k + b, j + a, i, 1, 0, 0, 0, 1, 0))
+                    most = wp.max(
+                        most,
+                        _edge(share.y, inverse.x, inverse.z, k + b, j, i + a, 1, 0, 0, 0, 0, 1),
+                    )
+                    most = wp.max(
+                        most,
+                        _edge(share.z, inverse.y, inverse.z, k + b, j + a, i, 1, 0, 0, 0, 1, 0),
+                    )
         if not can:
             most = 0.0
     stiff[k, j, i] = most
 
 
 @wp.func
-def _edge(share: F32, first: F32, second: F32, k: int, j: int, i: int, bk: int, bj: int, bi: int, ak: int, aj: int, ai: int):
+def _edge(
+    share: F32,
+    first: F32,
+    second: F32,
+    k: int,
+    j: int,
+    i: int,
+    bk: int,
+    bj: int,
+    bi: int,
+    ak: int,
+    aj: int,
+    ai: int,
+):
     """4 share times the sum of the inverse masses around an edge between cells; 0 on walls."""
-    around = first[k, j, i] + first[k - bk, j - bj, i - bi] + second[k, j, i] + second[k - ak, j - aj, i - ai]
+    around = (
+        first[k, j, i]
+        + first[k - bk, j - bj, i - bi]
+        + second[k, j, i]
+        + second[k - ak, j - aj, i - ai]
+    )
     return 4.0 * wp.max(share[k, j, i], 0.0) * around
 
 
@@ -291,7 +370,8 @@ def widen_kernel(k, j, first, end, own: I32, wide: I32):
     else:
         low = wp.max(low - 1, first)
         high = wp.min(high + 1, end)
-        # whole vectors of cells, which may lie on either side; what is left of a row takes as long as a vector
+        # whole vectors of cells, which may lie on either side; what is left of a row takes as long
+        # as a vector
         more = (high - low + LANES - 1) / LANES * LANES - (high - low)
         right = wp.min(more, wp.max(end - 1 - high, 0))
         wide[k, j, 0] = wp.max(low - (more - right), first)

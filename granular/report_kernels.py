@@ -13,14 +13,20 @@ from warp_lcp.operators.grid_poisson import SOLID
 from warp_lcp.rows import KernelFile, RowPass
 
 RATIO_YIELDS = 0.99  # of the bound, from which a cell counts as yielded
-KERNELS = KernelFile(Path(__file__).parent / "headers/stress.h", CONSTANTS | {"RATIO_YIELDS": RATIO_YIELDS})
+KERNELS = KernelFile(
+    Path(__file__).parent / "headers/stress.h", CONSTANTS | {"RATIO_YIELDS": RATIO_YIELDS}
+)
 
 
 @functools.cache
 def report_pass(dimension: int, rate: bool = False, cut: bool = False) -> RowPass:
     """Return the pass for 2 or 3 dimensions; friction grows with the rate of shear; solids cut cells."""
     module = f"granular.report_{dimension}d{'_rate' * rate}{'_cut' * cut}"
-    return KERNELS.kernel("granular.report.report", module=module, constants={"DIM": dimension, "RATE": rate, "CUT": cut})
+    return KERNELS.kernel(
+        "granular.report.report",
+        module=module,
+        constants={"DIM": dimension, "RATE": rate, "CUT": cut},
+    )
 
 
 @cell_kernel("granular.report")
@@ -37,7 +43,16 @@ def take_kernel(k, j, i, axis: int, base: I8, inverse: F32, found: F64, velocity
 
 
 @cell_kernel("granular.report")
-def contact_kernel(k, j, i, held: wp.uint8, released: wp.uint8, flags: U8, now: wp.array4d(dtype=wp.float32), out: U8):
+def contact_kernel(
+    k,
+    j,
+    i,
+    held: wp.uint8,
+    released: wp.uint8,
+    flags: U8,
+    now: wp.array4d(dtype=wp.float32),
+    out: U8,
+):
     """Mark a cell of sand by whether it has pressure."""
     mark = wp.uint8(0)
     if flags[k, j, i] != wp.uint8(0):

@@ -34,12 +34,15 @@ from warp_lcp.settings import NonNegative, Positive, Share
 
 STRESS_BYTES = {2: 160, 3: 330}  # a cell: the coupled solve's fields
 CUT_STRESS_BYTES = {2: 48, 3: 76}  # and where solids cut cells
-STEEPEST = {2: 1.0, 3: math.sqrt(0.75)}  # slope of a cone from which on it holds stresses with tension
+# slope of a cone from which on it holds stresses with tension
+STEEPEST = {2: 1.0, 3: math.sqrt(0.75)}
 STEEPEST_ANGLE = {"repose": {2: 45.0, 3: 40.8}, "triaxial-compression": {3: 36.8}}  # degrees
 FRICTION_ANGLE = Usual(6.0, 60.0, "degrees", "25 to 45", "radians", math.degrees(1.0))
 COHESION = Usual(0.0, 1e6, "Pa", "100 to 5,000 (damp sand), 1e4 to 1e5 (clay)")
 SAND_CFL = Usual(0.0, 4.0, "", "0.5 to 1")
-GLASS = 0.279  # inertial number at which half of the growth of glass beads' friction is there [Jop, Forterre & Pouliquen 2006]
+# inertial number at which half of the growth of glass beads' friction is there
+# [Jop, Forterre & Pouliquen 2006]
+GLASS = 0.279
 
 Angle = Annotated[float, Field(gt=0, lt=60)]
 
@@ -59,54 +62,82 @@ class SandDomain(Domain):
 
     later: ClassVar = {}
     friction: WallFriction | None = Field(
-        default=None, description=f"friction coefficient of the domain's walls: {FRICTIONS}; default: material.wall_friction"
+        default=None,
+        description=f"friction coefficient of the domain's walls: {FRICTIONS}; default: "
+        "material.wall_friction",
     )
     solids: Literal["cut-cell", "voxel"] = Field(
         default="cut-cell",
         description="cut-cell: surfaces cut cells; voxel: solids fill whole cells and cannot move; "
-        'stresses treat solids as whole cells if one moves, an axis is periodic or solver.method = "interleaved-sweeps"',
+        "stresses treat solids as whole cells if one moves, an axis is periodic or solver.method = "
+        '"interleaved-sweeps"',
     )
-    periodic: list[bool] | None = Field(default=None, description="periodic axes, [x, y] or [x, y, z]; not y")  # type: ignore[assignment]
+    periodic: list[bool] | None = Field(
+        default=None, description="periodic axes, [x, y] or [x, y, z]; not y"
+    )  # type: ignore[assignment]
 
 
 class MaterialTable(Table):
     """[material]: properties of the grains."""
 
     renamed: ClassVar = {"angle_of": "friction_angle_test"}
-    name: Literal["dry-sand", "gravel", "sugar"] = Field(default="dry-sand", description="material that gives the defaults")
-    friction_angle: Angle | None = Field(
-        default=None, description="slope at which running sand stops [degrees], see friction_angle_test; default: by name"
+    name: Literal["dry-sand", "gravel", "sugar"] = Field(
+        default="dry-sand", description="material that gives the defaults"
     )
-    density: Positive | None = Field(default=None, description="density at the densest packing, air included [kg/m^3]; default: by name")
-    max_fraction: Share | None = Field(default=None, description="volume fraction of grains at the densest packing; default: by name")
+    friction_angle: Angle | None = Field(
+        default=None,
+        description="slope at which running sand stops [degrees], see friction_angle_test; "
+        "default: by name",
+    )
+    density: Positive | None = Field(
+        default=None,
+        description="density at the densest packing, air included [kg/m^3]; default: by name",
+    )
+    max_fraction: Share | None = Field(
+        default=None,
+        description="volume fraction of grains at the densest packing; default: by name",
+    )
     wall_friction: WallFriction | None = Field(
-        default=None, description=f"friction coefficient of walls and solids: {FRICTIONS}; default: by name"
+        default=None,
+        description=f"friction coefficient of walls and solids: {FRICTIONS}; default: by name",
     )
     cohesion: NonNegative = Field(
         default=0.0,
-        description="cohesion [Pa]: shear strength at zero pressure; with other tests than repose, divided by cos(friction_angle)",
+        description="cohesion [Pa]: shear strength at zero pressure; with other tests than repose, "
+        "divided by cos(friction_angle)",
     )
-    tensile_strength: NonNegative = Field(default=0.0, description="tensile strength at dense packing [Pa]")
+    tensile_strength: NonNegative = Field(
+        default=0.0, description="tensile strength at dense packing [Pa]"
+    )
     friction_angle_test: FrictionAngleTest = Field(
         default="repose",
-        description="test that measured friction_angle: repose (slope where layers stop), plane-strain or triaxial-compression (soils)",
+        description="test that measured friction_angle: repose (slope where layers stop), "
+        "plane-strain or triaxial-compression (soils)",
     )
 
 
 class Friction(Table):
     """[friction]: shear strength of sand.
 
-    With `dynamic_angle`, friction grows with the shear rate: mu(I) [Jop, Forterre & Pouliquen 2006]. Glass beads of
-    0.53 mm have 20.9 and 32.76 degrees. An iteration of the solve takes up to 1.4 times as long.
+    With `dynamic_angle`, friction grows with the shear rate: mu(I)
+    [Jop, Forterre & Pouliquen 2006]. Glass beads of 0.53 mm have 20.9 and 32.76 degrees. An
+    iteration of the solve takes up to 1.4 times as long.
     """
 
     model: Literal["cone", "box"] = Field(
-        default="cone", description="cone: isotropic; box: Narain et al. 2010, layers flow where they should rest"
+        default="cone",
+        description="cone: isotropic; box: Narain et al. 2010, layers flow where they should rest",
     )
-    dynamic_angle: Angle | None = Field(default=None, description="friction angle at high shear rates [degrees]")
-    grain_size: Positive | None = Field(default=None, description="grain diameter [m], with dynamic_angle")
+    dynamic_angle: Angle | None = Field(
+        default=None, description="friction angle at high shear rates [degrees]"
+    )
+    grain_size: Positive | None = Field(
+        default=None, description="grain diameter [m], with dynamic_angle"
+    )
     inertial_number: float | None = Field(
-        default=None, ge=1e-9, description=f"I_0 of mu(I), with dynamic_angle; default: {GLASS:g} (glass beads)"
+        default=None,
+        ge=1e-9,
+        description=f"I_0 of mu(I), with dynamic_angle; default: {GLASS:g} (glass beads)",
     )
 
 
@@ -119,7 +150,10 @@ class Gauge(Table):
 def _not_automatic(value: Any) -> Any:
     """Refuse "auto", which liquids have."""
     if value == "auto":
-        message = "is for liquids only: the tolerance of sand is relative to rho g dx, the weight of a cell; default: 1e-3"
+        message = (
+            "is for liquids only: the tolerance of sand is relative to rho g dx, the weight "
+            "of a cell; default: 1e-3"
+        )
         raise PydanticCustomError("cross_check", "{message}", {"message": message})
     return value
 
@@ -129,18 +163,29 @@ class SandSolver(Table):
 
     preset: PresetName | None = Field(default=None, description=PRESET_KEY)
     method: Literal["accelerated-projection", "interleaved-sweeps"] = Field(
-        default="accelerated-projection", description="accelerated-projection, or interleaved-sweeps: several times slower"
+        default="accelerated-projection",
+        description="accelerated-projection, or interleaved-sweeps: several times slower",
     )
-    tolerance: Annotated[Share, BeforeValidator(_not_automatic)] = Field(default=1e-3, description="root mean square residual [rho g dx]")
-    max_iterations: int = Field(default=600, ge=10, description="after these the step accepts the stresses")
-    precision: Literal["single"] = Field(default="single", description="of the stresses; residuals are double")
+    tolerance: Annotated[Share, BeforeValidator(_not_automatic)] = Field(
+        default=1e-3, description="root mean square residual [rho g dx]"
+    )
+    max_iterations: int = Field(
+        default=600, ge=10, description="after these the step accepts the stresses"
+    )
+    precision: Literal["single"] = Field(
+        default="single", description="of the stresses; residuals are double"
+    )
 
 
 class SandProperties(MaterialProperties):
     """Properties of a body of sand besides its shape."""
 
-    friction_angle: Angle | None = Field(default=None, description="friction angle [degrees]; default: material.friction_angle")
-    cohesion: NonNegative | None = Field(default=None, description="cohesion [Pa]; default: material.cohesion")
+    friction_angle: Angle | None = Field(
+        default=None, description="friction angle [degrees]; default: material.friction_angle"
+    )
+    cohesion: NonNegative | None = Field(
+        default=None, description="cohesion [Pa]; default: material.cohesion"
+    )
 
 
 class SandBox(SandProperties, BoxTable):
@@ -189,13 +234,21 @@ class RoughMesh(RoughSolid, SolidMesh):
     """Solid inside a triangle mesh, with friction."""
 
 
-Sand = Annotated[SandBox | SandSphere | SandCapsule | SandPlane | SandMesh, Field(discriminator="shape")]
-Solid = Annotated[RoughBox | RoughSphere | RoughCapsule | RoughPlane | RoughMesh, Field(discriminator="shape")]
+Sand = Annotated[
+    SandBox | SandSphere | SandCapsule | SandPlane | SandMesh, Field(discriminator="shape")
+]
+Solid = Annotated[
+    RoughBox | RoughSphere | RoughCapsule | RoughPlane | RoughMesh, Field(discriminator="shape")
+]
 
 
 def _found(rules: Iterable[tuple[object, str, object, str]]) -> list[Complaint]:
     """Return the complaints whose case there is: each a case, the key that it is about, its value and the message."""
-    return [Complaint(tuple(key.split(".")), value, message) for case, key, value, message in rules if case]
+    return [
+        Complaint(tuple(key.split(".")), value, message)
+        for case, key, value, message in rules
+        if case
+    ]
 
 
 class SandScene(ParticleScene):
@@ -204,9 +257,12 @@ class SandScene(ParticleScene):
     elsewhere: ClassVar = {"liquid": "fluids", "pressure": "fluids"}
     palette: ClassVar = "sand"
     solve_bytes: ClassVar[int] = STRESS_BYTES[3]
-    crowded: ClassVar[float] = 4e-4  # sand at rest has 1e-5, and what crowds is not pushed apart by its pressure
-    correction_gain: ClassVar[float] = 4.0  # leaves at most 1.1 of the densest nearly everywhere; 1 leaves 1.27
-    fall_speed: ClassVar[float] = 0.5  # friction holds back: .25 of columns, .4 to .8 of what runs and pours
+    # sand at rest has 1e-5, and what crowds is not pushed apart by its pressure
+    crowded: ClassVar[float] = 4e-4
+    # leaves at most 1.1 of the densest nearly everywhere; 1 leaves 1.27
+    correction_gain: ClassVar[float] = 4.0
+    # friction holds back: .25 of columns, .4 to .8 of what runs and pours
+    fall_speed: ClassVar[float] = 0.5
 
     time: SandTime
     domain: SandDomain
@@ -226,7 +282,11 @@ class SandScene(ParticleScene):
         material, physics = data.get("material", {}), data.get("physics", {})
         if not isinstance(material, dict) or not isinstance(physics, dict):
             return data
-        named = MATERIALS.get(material.get("name", "dry-sand")) if isinstance(material.get("name", ""), str) else None
+        named = (
+            MATERIALS.get(material.get("name", "dry-sand"))
+            if isinstance(material.get("name", ""), str)
+            else None
+        )
         density = material.get("density", named.density if named else None)
         return data if density is None else {**data, "physics": {"density": density, **physics}}
 
@@ -247,7 +307,9 @@ class SandScene(ParticleScene):
     @property
     def friction_angle(self) -> float:
         """Return the internal friction angle [degrees]."""
-        own = next((sand.friction_angle for sand in self.sand if sand.friction_angle is not None), None)
+        own = next(
+            (sand.friction_angle for sand in self.sand if sand.friction_angle is not None), None
+        )
         return own or self.material.friction_angle or self.preset.friction_angle
 
     @property
@@ -272,7 +334,8 @@ class SandScene(ParticleScene):
     def growth(self, spacing: float, kick_dt: float) -> dict[str, float]:
         """Return `gain` and `halfway` of the yield set; empty without mu(I).
 
-        I = |rate of shear| d sqrt(rho_s / p) [Jop, Forterre & Pouliquen 2006], rho_s = rho / max_fraction that of a grain.
+        I = |rate of shear| d sqrt(rho_s / p) [Jop, Forterre & Pouliquen 2006], rho_s = rho /
+        max_fraction that of a grain.
 
         Args:
             spacing: of the cells [m].
@@ -281,7 +344,12 @@ class SandScene(ParticleScene):
         dynamic, grain = self.friction.dynamic_angle, self.friction.grain_size
         if dynamic is None or grain is None:
             return {}
-        halfway = (self.friction.inertial_number or GLASS) * spacing / grain * math.sqrt(self.max_fraction * spacing / kick_dt)
+        halfway = (
+            (self.friction.inertial_number or GLASS)
+            * spacing
+            / grain
+            * math.sqrt(self.max_fraction * spacing / kick_dt)
+        )
         return {"gain": self._slope_of(dynamic) - self.slope, "halfway": halfway}
 
     @property
@@ -291,7 +359,11 @@ class SandScene(ParticleScene):
 
     def wall_frictions(self) -> list[float]:
         """Return the friction coefficient of the domain's walls and of each solid."""
-        general = self.preset.wall_friction if self.material.wall_friction is None else self.material.wall_friction
+        general = (
+            self.preset.wall_friction
+            if self.material.wall_friction is None
+            else self.material.wall_friction
+        )
         domain = general if self.domain.friction is None else self.domain.friction
         given = [domain, *(domain if s.friction is None else s.friction for s in self.solid)]
         return [STICKS if friction == "stick" else float(friction) for friction in given]
@@ -307,9 +379,16 @@ class SandScene(ParticleScene):
             for number, sand in enumerate(self.sand):
                 value = getattr(sand, key)
                 if value is not None and value != first:
-                    message = f"must be {first:g} as in the other [[sand]]: a scene has one material"
+                    message = (
+                        f"must be {first:g} as in the other [[sand]]: a scene has one material"
+                    )
                     found.append(Complaint(("sand", number, key), value, message))
-        return found + self._strength_complaints() + self._rate_complaints() + self._domain_complaints()
+        return (
+            found
+            + self._strength_complaints()
+            + self._rate_complaints()
+            + self._domain_complaints()
+        )
 
     def notes(self) -> list[str]:
         """Return suspicious settings."""
@@ -318,25 +397,38 @@ class SandScene(ParticleScene):
             *GRAIN_DENSITY.notes("physics.density", self.physics.density),
             *SAND_CFL.notes("time.cfl", self.time.cfl),
         ]
-        angles = [("material.friction_angle", self.material.friction_angle), ("friction.dynamic_angle", self.friction.dynamic_angle)]
-        angles += [(f"sand[{number}].friction_angle", sand.friction_angle) for number, sand in enumerate(self.sand)]
+        angles = [
+            ("material.friction_angle", self.material.friction_angle),
+            ("friction.dynamic_angle", self.friction.dynamic_angle),
+        ]
+        angles += [
+            (f"sand[{number}].friction_angle", sand.friction_angle)
+            for number, sand in enumerate(self.sand)
+        ]
         for place, angle in angles:
             found += FRICTION_ANGLE.notes(place, angle)
         cohesions = [("material.cohesion", self.material.cohesion)]
-        cohesions += [(f"sand[{number}].cohesion", sand.cohesion) for number, sand in enumerate(self.sand) if sand.cohesion is not None]
+        cohesions += [
+            (f"sand[{number}].cohesion", sand.cohesion)
+            for number, sand in enumerate(self.sand)
+            if sand.cohesion is not None
+        ]
         for place, cohesion in cohesions:
             found += COHESION.notes(place, cohesion)
         grains = self.friction.grain_size
         if grains is not None and grains > self.spacing:
             found.append(
-                f"friction.grain_size = {grains:g} m is larger than a cell, {self.spacing:.4g} m; if mm were meant, it is {1e-3 * grains:g}"
+                f"friction.grain_size = {grains:g} m is larger than a cell, {self.spacing:.4g} m; "
+                f"if mm were meant, it is {1e-3 * grains:g}"
             )
         return found
 
     def _strength_complaints(self) -> list[Complaint]:
         material, most = self.material, self.cohesion / math.tan(math.radians(self.friction_angle))
         if material.tensile_strength > most:
-            message = f"must be at most {most:.4g}, the cohesion over the tangent of the friction angle"
+            message = (
+                f"must be at most {most:.4g}, the cohesion over the tangent of the friction angle"
+            )
             return [Complaint(("material", "tensile_strength"), material.tensile_strength, message)]
         if self._slope_of(self.friction_angle) > STEEPEST[self.dimension]:
             return [self._too_steep()]
@@ -348,15 +440,34 @@ class SandScene(ParticleScene):
     def _too_steep(self) -> Complaint:
         """Return the complaint about a friction angle, at the key that gives it."""
         angle, message = self.friction_angle, self._at_most()
-        number = next((number for number, sand in enumerate(self.sand) if sand.friction_angle is not None), None)
+        number = next(
+            (number for number, sand in enumerate(self.sand) if sand.friction_angle is not None),
+            None,
+        )
         if number is None and self.material.friction_angle is None:
-            return Complaint(("material", "name"), self.material.name, f"has a friction angle of {angle:g} degrees, which {message}")
-        return Complaint(("material", "friction_angle") if number is None else ("sand", number, "friction_angle"), angle, message)
+            return Complaint(
+                ("material", "name"),
+                self.material.name,
+                f"has a friction angle of {angle:g} degrees, which {message}",
+            )
+        return Complaint(
+            ("material", "friction_angle")
+            if number is None
+            else ("sand", number, "friction_angle"),
+            angle,
+            message,
+        )
 
     def _at_most(self) -> str:
         """Return what is said of an angle that is too steep."""
-        test, most = self.material.friction_angle_test, STEEPEST_ANGLE[self.material.friction_angle_test][self.dimension]
-        return f'must be at most {most:g} where material.friction_angle_test = "{test}": a steeper cone would bear tension'
+        test, most = (
+            self.material.friction_angle_test,
+            STEEPEST_ANGLE[self.material.friction_angle_test][self.dimension],
+        )
+        return (
+            f'must be at most {most:g} where material.friction_angle_test = "{test}": a steeper '
+            "cone would bear tension"
+        )
 
     def _rate_complaints(self) -> list[Complaint]:
         """Return what is wrong with friction that grows with the rate of shear."""
@@ -364,38 +475,103 @@ class SandScene(ParticleScene):
         if dynamic is None:
             given = {"grain_size": table.grain_size, "inertial_number": table.inertial_number}
             message = "needs friction.dynamic_angle, which is missing"
-            return _found((value is not None, f"friction.{key}", value, message) for key, value in given.items())
-        above = f"must be above the friction angle, {self.friction_angle:g} degrees: friction grows with the rate of shear"
-        small, steep = dynamic <= self.friction_angle, self._slope_of(dynamic) > STEEPEST[self.dimension]
+            return _found(
+                (value is not None, f"friction.{key}", value, message)
+                for key, value in given.items()
+            )
+        above = (
+            f"must be above the friction angle, {self.friction_angle:g} degrees: friction "
+            "grows with the rate of shear"
+        )
+        small, steep = (
+            dynamic <= self.friction_angle,
+            self._slope_of(dynamic) > STEEPEST[self.dimension],
+        )
         missing = "must be given with friction.dynamic_angle: a length > 0 [m]"
         return _found(
             [
                 (small, "friction.dynamic_angle", dynamic, above),
-                (steep and not small, "friction.dynamic_angle", dynamic, self._at_most() if steep else ""),
+                (
+                    steep and not small,
+                    "friction.dynamic_angle",
+                    dynamic,
+                    self._at_most() if steep else "",
+                ),
                 (table.grain_size is None, "friction.grain_size", None, missing),
-                (table.model == "box", "friction.model", table.model, 'must be "cone" with friction.dynamic_angle'),
+                (
+                    table.model == "box",
+                    "friction.model",
+                    table.model,
+                    'must be "cone" with friction.dynamic_angle',
+                ),
             ]
         )
 
     def _domain_complaints(self) -> list[Complaint]:
         """Return what does not go with an axis without an end, with rigid bodies, or with sand at all."""
-        domain, method, closed, periodic = self.domain, self.solver.method, self.endless, self.domain.periodic or []
-        opened = any(side in domain.open for axis in closed for side in (("left", "right"), (), ("back", "front"))[axis])
-        ends = closed and (self.density_correction or self.particles.reseed or self.source or self.drain)
+        domain, method, closed, periodic = (
+            self.domain,
+            self.solver.method,
+            self.endless,
+            self.domain.periodic or [],
+        )
+        opened = any(
+            side in domain.open
+            for axis in closed
+            for side in (("left", "right"), (), ("back", "front"))[axis]
+        )
+        ends = closed and (
+            self.density_correction or self.particles.reseed or self.source or self.drain
+        )
         sweeps, bodies = method == "interleaved-sweeps", any(solid.is_body for solid in self.solid)
-        holds = domain.wall != "separating" or any(solid.wall == "free-slip" for solid in self.solid)
-        pulls = 'must be "separating", for solids too: walls cannot pull sand; for free slip set friction = 0'
+        holds = domain.wall != "separating" or any(
+            solid.wall == "free-slip" for solid in self.solid
+        )
+        pulls = (
+            'must be "separating", for solids too: walls cannot pull sand; for free slip set '
+            "friction = 0"
+        )
         height, top = None if self.gauge is None else self.gauge.height, domain.size[1]
         return _found(
             [
-                (1 in closed, "domain.periodic", periodic, "may be true along x and z only: sand falls along y"),
+                (
+                    1 in closed,
+                    "domain.periodic",
+                    periodic,
+                    "may be true along x and z only: sand falls along y",
+                ),
                 (opened, "domain.open", domain.open, "names a side of a periodic axis"),
-                (ends, "domain.periodic", periodic, "cannot be combined with density_correction, reseed, source or drain"),
-                (closed and sweeps, "solver.method", method, "cannot be combined with periodic axes: choose accelerated-projection"),
-                (bodies and sweeps, "solver.method", method, "cannot be combined with rigid bodies: choose accelerated-projection"),
-                (bodies and closed, "domain.periodic", domain.periodic, "cannot be combined with rigid bodies"),
+                (
+                    ends,
+                    "domain.periodic",
+                    periodic,
+                    "cannot be combined with density_correction, reseed, source or drain",
+                ),
+                (
+                    closed and sweeps,
+                    "solver.method",
+                    method,
+                    "cannot be combined with periodic axes: choose accelerated-projection",
+                ),
+                (
+                    bodies and sweeps,
+                    "solver.method",
+                    method,
+                    "cannot be combined with rigid bodies: choose accelerated-projection",
+                ),
+                (
+                    bodies and closed,
+                    "domain.periodic",
+                    domain.periodic,
+                    "cannot be combined with rigid bodies",
+                ),
                 (holds, "domain.wall", domain.wall, pulls),
-                (height is not None and not 0.0 < height < top, "gauge.height", height, f"must lie in the domain, between 0 and {top:g} m"),
+                (
+                    height is not None and not 0.0 < height < top,
+                    "gauge.height",
+                    height,
+                    f"must lie in the domain, between 0 and {top:g} m",
+                ),
             ]
         )
 
@@ -404,9 +580,20 @@ class SandScene(ParticleScene):
         frictions = ", ".join("stick" if f == STICKS else f"{f:g}" for f in self.wall_frictions())
         cohesion = f", cohesion {self.cohesion:g} Pa" if self.cohesion else ""
         dynamic, grain = self.friction.dynamic_angle, self.friction.grain_size
-        growing = f", growing to {dynamic:g} degrees with the rate of shear of grains of {grain:g} m" if dynamic else ""
-        material = f"{self.material.name}, friction angle {self.friction_angle:g} degrees{cohesion}, {self.physics.density:g} kg/m^3"
-        return [*super().plan(), ("material", material), ("friction", f"{self.friction.model}{growing}, on walls {frictions}")]
+        growing = (
+            f", growing to {dynamic:g} degrees with the rate of shear of grains of {grain:g} m"
+            if dynamic
+            else ""
+        )
+        material = (
+            f"{self.material.name}, friction angle {self.friction_angle:g} "
+            f"degrees{cohesion}, {self.physics.density:g} kg/m^3"
+        )
+        return [
+            *super().plan(),
+            ("material", material),
+            ("friction", f"{self.friction.model}{growing}, on walls {frictions}"),
+        ]
 
     def own_memory_parts(self) -> dict[str, int]:
         """Return the most memory of the stresses on the device [bytes]."""

@@ -51,20 +51,32 @@ if TYPE_CHECKING:
     from warp_lcp.distributed.ranks import Ranks
 
 METHODS_ON_RANKS = ("accelerated-projection",)  # that solve problems of several ranks
-STEP_WORK = 1 << 9  # cells full of sand whose work is that which a step takes however little there is of it
+# cells full of sand whose work is that which a step takes however little there is of it
+STEP_WORK = 1 << 9
 FRONT = 99.0  # percentile of the particles that runout and height are of
-FAR = 1.0  # rho g dx: cells are left with a velocity that is off by as much as gravity makes in the step
-JAMMED = "solids or a source may enclose sand: move them less or slower; deep sand may need more solver.max_iterations"
+# rho g dx: cells are left with a velocity that is off by as much as gravity makes in the step
+FAR = 1.0
+JAMMED = (
+    "solids or a source may enclose sand: move them less or slower; deep sand may need more "
+    "solver.max_iterations"
+)
 STANDING = 0.05  # of sqrt(g dx): a scale for the residual where there is no gravity
 DIAGNOSTICS = ("yielded", "dissipation", "predicted_excess")  # columns that nothing else needs
-COLUMNS = ("coupled_residual", "staggering_iterations", *DIAGNOSTICS, "max_fraction", "runout", "height")
+COLUMNS = (
+    "coupled_residual",
+    "staggering_iterations",
+    *DIAGNOSTICS,
+    "max_fraction",
+    "runout",
+    "height",
+)
 
 
 class SandSimulation(ParticleSimulation):
     """Simulation of sand; implements `warp_lcp.simulation.Simulation`.
 
-    A step transfers mass and velocity of the particles to the grid, solves for pressure and friction together, transfers the resulting
-    velocity back to the particles and moves them.
+    A step transfers mass and velocity of the particles to the grid, solves for pressure and
+    friction together, transfers the resulting velocity back to the particles and moves them.
 
     Args:
         scene: the scene.
@@ -82,11 +94,15 @@ class SandSimulation(ParticleSimulation):
 
     scene: SandScene
 
-    def __init__(self, scene: SandScene, grid: StaggeredGrid, parts: Parts, particles: Particles, **more: Any) -> None:
+    def __init__(
+        self, scene: SandScene, grid: StaggeredGrid, parts: Parts, particles: Particles, **more: Any
+    ) -> None:
         """Allocate the fields and find the sand's cells."""
         self.method = METHODS[scene.solver.method]()
         self._at_rest = scene.particles.per_axis**grid.dimension
-        self._percentiles = Front(grid.device) if grid.device.is_cuda and not grid.part.shared else None
+        self._percentiles = (
+            Front(grid.device) if grid.device.is_cuda and not grid.part.shared else None
+        )
         super().__init__(scene, grid, parts, particles, **more)
         if self._percentiles is not None:
             self.diagnostics.append(self._measure_front)
@@ -100,12 +116,17 @@ class SandSimulation(ParticleSimulation):
         scene, self.solids = self.scene, parts.solids
         self._base, self.density = grid.field(wp.int8), grid.field()
         self._completion, self._density_to_grid = (
-            LaunchGraph(grid.device, record, at_once=grid.part.at_once) for record in (self._launch_completion, self._launch_density)
+            LaunchGraph(grid.device, record, at_once=grid.part.at_once)
+            for record in (self._launch_completion, self._launch_density)
         )
-        self.packing = Packing(grid, self._base, self.boundary.capacity, sides=self.sides, cut=self.solids.cut)
+        self.packing = Packing(
+            grid, self._base, self.boundary.capacity, sides=self.sides, cut=self.solids.cut
+        )
         self.carried = None if self.bodies is None else SandBodies(grid, self.bodies.numbers)
         box, rate = scene.friction.model == "box", scene.friction.dynamic_angle is not None
-        self.stress = Stress(self.packing, self.solids.walls, box=box, rate=rate, bodies=self.carried)
+        self.stress = Stress(
+            self.packing, self.solids.walls, box=box, rate=rate, bodies=self.carried
+        )
         self.outcome = SandReport(self.stress)
         self._work: Any = None  # of the method that made it
         self._made_by: Any = None
@@ -141,7 +162,14 @@ class SandSimulation(ParticleSimulation):
         if self.sides is not None:
             self.sides.average(self.velocity, self.weights, self._saved or ())
         # faces have mass farther out than weight
-        complete(window, self.velocity, self.weights, self.outcome.known, self._layer_filled(), barriers=self.grid.barriers)
+        complete(
+            window,
+            self.velocity,
+            self.weights,
+            self.outcome.known,
+            self._layer_filled(),
+            barriers=self.grid.barriers,
+        )
 
     def carry(self, dt: float) -> None:
         """Move particles and solids by dt [s]."""
@@ -152,9 +180,10 @@ class SandSimulation(ParticleSimulation):
     def step(self, dt: float) -> Row:
         """Advance by dt [s].
 
-        Stresses that miss their tolerance are accepted (the log's coupled_residual has their residual), unless the
-        residual exceeds `FAR` and they would add energy to the sand. They are solved for before any particle moves, so that a
-        failed solve leaves the state unchanged, except for the particles' order.
+        Stresses that miss their tolerance are accepted (the log's coupled_residual has their
+        residual), unless the residual exceeds `FAR` and they would add energy to the sand. They are
+        solved for before any particle moves, so that a failed solve leaves the state unchanged,
+        except for the particles' order.
 
         Raises:
             StepFailed: the stresses are far from balance; a smaller dt may be tried.
@@ -172,7 +201,9 @@ class SandSimulation(ParticleSimulation):
         solved = self._solve(window, dt)
         self._measure_stresses()
         try:
-            self.extrapolate_velocity(window, self.outcome.known, self.packing.kind, self.outcome.contact, dt)
+            self.extrapolate_velocity(
+                window, self.outcome.known, self.packing.kind, self.outcome.contact, dt
+            )
         except StepFailed:
             self.stress.roll_back()
             raise
@@ -184,7 +215,16 @@ class SandSimulation(ParticleSimulation):
         self._place_solids()
         runout, height = self._front()
         rate = self._flow_rate(below, row, dt)
-        return self.logged(row | solved | {"max_fraction": most, "runout": runout - self._start, "height": height, "flow_rate": rate})
+        return self.logged(
+            row
+            | solved
+            | {
+                "max_fraction": most,
+                "runout": runout - self._start,
+                "height": height,
+                "flow_rate": rate,
+            }
+        )
 
     def _measure_stresses(self) -> None:
         """Launch what the log alone wants to know of the stresses."""
@@ -206,14 +246,22 @@ class SandSimulation(ParticleSimulation):
     def own_columns(self) -> tuple[str, ...]:
         """Return the log columns of stresses and shape of the sand.
 
-        coupled_residual: natural residual of pressure and friction together, root mean square over the cells with sand, in units of
-        rho g dx; solve_residual: relative to that at the start of the solve; staggering_iterations: of the coupled method; yielded,
-        dissipation, predicted_excess: see `SandReport.report`; max_fraction: of a cell at the start of the step, in units of
-        the densest packing; runout [m]: 99th percentile of x less that at the start; height [m]: 99th percentile of y; flow_rate [kg/s;
-        kg/(s m) in 2-D]: mass below the gauge, or without a gauge the mass that left through drains and open sides.
+        coupled_residual: natural residual of pressure and friction together, root mean square over
+        the cells with sand, in units of rho g dx; solve_residual: relative to that at the start of
+        the solve; staggering_iterations: of the coupled method; yielded, dissipation,
+        predicted_excess: see `SandReport.report`; max_fraction: of a cell at the start of the step,
+        in units of the densest packing; runout [m]: 99th percentile of x less that at the start;
+        height [m]: 99th percentile of y; flow_rate [kg/s; kg/(s m) in 2-D]: mass below the gauge,
+        or without a gauge the mass that left through drains and open sides.
         """
-        columns = tuple(name for name in COLUMNS if self.scene.output.diagnostics or name not in DIAGNOSTICS)
-        return (*columns, "flow_rate") if self.scene.gauge or self.scene.drain or self.scene.domain.open else columns
+        columns = tuple(
+            name for name in COLUMNS if self.scene.output.diagnostics or name not in DIAGNOSTICS
+        )
+        return (
+            (*columns, "flow_rate")
+            if self.scene.gauge or self.scene.drain or self.scene.domain.open
+            else columns
+        )
 
     def frame(self) -> list[Part]:
         """Return the parts of a frame: particles and cells, surface and volume.
@@ -235,7 +283,15 @@ class SandSimulation(ParticleSimulation):
         shown = {name: field[at] for name, field in fields.items()}
         return [
             points,
-            Cells("grid", cells[:, ::-1] - 1 + grid.origin, grid.spacing, grid.dimension, shown, self.image_counts, grid.part.corners),
+            Cells(
+                "grid",
+                cells[:, ::-1] - 1 + grid.origin,
+                grid.spacing,
+                grid.dimension,
+                shown,
+                self.image_counts,
+                grid.part.corners,
+            ),
             *self.surfaces(),
             *self.volumes(),
             *self.body_surfaces(),
@@ -244,14 +300,20 @@ class SandSimulation(ParticleSimulation):
     def _sand_cells(self) -> np.ndarray:
         """Return where this process's sand is that a frame shows, as (k, j, i) in the stored shape, shape (n, 3)."""
         part = self.grid.part
-        return np.argwhere(part.box_of(self.packing.kind.numpy()) == FLUID) + np.array(part.owned.low)
+        return np.argwhere(part.box_of(self.packing.kind.numpy()) == FLUID) + np.array(
+            part.owned.low
+        )
 
     def pressures(self) -> np.ndarray:
         """Return the pressure p = rho dx x / dt [Pa] of the last solve.
 
         Stored shape; zero before the first step.
         """
-        scale = self.scene.physics.density * self.grid.spacing / self.stress.kick_dt if self.stress.kick_dt > 0.0 else 0.0
+        scale = (
+            self.scene.physics.density * self.grid.spacing / self.stress.kick_dt
+            if self.stress.kick_dt > 0.0
+            else 0.0
+        )
         return np.asarray(self.stress.now.numpy()[0] * scale)
 
     def own_state(self) -> dict[str, np.ndarray]:
@@ -295,16 +357,21 @@ class SandSimulation(ParticleSimulation):
     def _gains(self, scale: float) -> bool:
         """Return whether the stresses leave sand faster than it, solids, sources and bodies were and gravity makes it (`scale`, m/s).
 
-        Walls turn velocities: a component may become as large as the magnitude of the velocity was, here that of the
-        largest components before the step.
+        Walls turn velocities: a component may become as large as the magnitude of the velocity was,
+        here that of the largest components before the step.
         """
         packing, own = self.packing, self._own
         moving = [own(inverse) > 0.0 for inverse in packing.inverse]
         after, before = (
-            [float(np.abs(own(u)[at]).max(initial=0.0)) for u, at in zip(velocity, moving, strict=True)]
+            [
+                float(np.abs(own(u)[at]).max(initial=0.0))
+                for u, at in zip(velocity, moving, strict=True)
+            ]
             for velocity in (self.stress.checked.u, packing.start)
         )
-        others = max((float(np.abs(own(component)).max()) for component in self.solids.velocity), default=0.0)
+        others = max(
+            (float(np.abs(own(component)).max()) for component in self.solids.velocity), default=0.0
+        )
         fastest, others, *before = self._largest([max(after), others, *before])
         bodies = self.bodies.top_speed(0.0) if self.bodies is not None else 0.0
         return fastest > math.hypot(*before) + scale + others + bodies
@@ -315,8 +382,11 @@ class SandSimulation(ParticleSimulation):
         In units of `scale` [m/s]: g dt is a pressure of rho g dx.
         """
         solver = self.scene.solver
-        stopping = wl.StoppingCriteria(rtol=0.0, atol=solver.tolerance * scale, max_iterations=solver.max_iterations)
-        if self._made_by is not self.method:  # the first solve on a grid, or another method since the last one
+        stopping = wl.StoppingCriteria(
+            rtol=0.0, atol=solver.tolerance * scale, max_iterations=solver.max_iterations
+        )
+        # the first solve on a grid, or another method since the last one
+        if self._made_by is not self.method:
             self._work, self._made_by = self.method.init(self.stress), self.method
         return wl.solve(self.stress, self.method, stopping=stopping, workspace=self._work)
 
@@ -324,30 +394,54 @@ class SandSimulation(ParticleSimulation):
         """Solve for the stresses and take over the velocity that they leave; return what the log wants to know of the solve."""
         packing, stress, solids, scene = self.packing, self.stress, self.solids, self.scene
         with self.watch.stage("packing", self.density, packing.fraction, *self.velocity):
-            self._density_to_grid.run(window, variant=(window.near is None, self.particles.runs is None))
+            self._density_to_grid.run(
+                window, variant=(window.near is None, self.particles.runs is None)
+            )
             solids.begin_step(self.time, dt)
             if self.sources is not None:
                 self.sources.supply(self.time + 0.5 * dt, self.velocity, self._base)
                 self.sources.hold(solids.velocity, [])
             packing.update(self.density, self.velocity, dt, solids.velocity)
             self._begin_bodies()
-        if self.grid.device.is_cuda and self.flights is not None and self.sources is None and not self.grid.part.shared:
-            with self.watch.stage("bodies in flight", packing.kind):  # whose number comes with what the solve has to tell
+        if (
+            self.grid.device.is_cuda
+            and self.flights is not None
+            and self.sources is None
+            and not self.grid.part.shared
+        ):
+            # whose number comes with what the solve has to tell
+            with self.watch.stage("bodies in flight", packing.kind):
                 self.flights.find(window, self.weights, packing.kind)
         impulse = self.kick_dt / (scene.physics.density * self.grid.spacing)  # of a stress of 1 Pa
         growth = scene.growth(self.grid.spacing, self.kick_dt)
-        bound = YieldSet(scene.slope, scene.intercept * impulse, scene.material.tensile_strength * impulse, **growth)
+        bound = YieldSet(
+            scene.slope,
+            scene.intercept * impulse,
+            scene.material.tensile_strength * impulse,
+            **growth,
+        )
         g = float(np.linalg.norm(self.gravity))
         scale = g * self.kick_dt if g > 0.0 else STANDING * math.sqrt(self.grid.spacing)
-        with self.watch.stage("stress", stress.now, *packing.mass, *packing.inverse, *packing.start):
+        with self.watch.stage(
+            "stress", stress.now, *packing.mass, *packing.inverse, *packing.start
+        ):
             stress.begin(bound, self.gravity, dt, self.kick_dt)
             solved = self.solve_stress(scale)
-        residual, first = math.hypot(*(part / scale for part in stress.last_residual)), solved.history[0].residual / scale
+        residual, first = (
+            math.hypot(*(part / scale for part in stress.last_residual)),
+            solved.history[0].residual / scale,
+        )
         if solved.status is wl.SolveStatus.NON_FINITE:
-            raise SimulationFailed(f"step {self.step_count}: the stresses are not finite after {solved.iterations} iterations")
+            raise SimulationFailed(
+                f"step {self.step_count}: the stresses are not finite after {solved.iterations} "
+                "iterations"
+            )
         if solved.status is not wl.SolveStatus.CONVERGED and residual > FAR and self._gains(scale):
             stress.roll_back()
-            left = f"residual of {residual:.2e} rho g dx (tolerance {scene.solver.tolerance}) and would add energy to the sand"
+            left = (
+                f"residual of {residual:.2e} rho g dx (tolerance {scene.solver.tolerance}) and "
+                "would add energy to the sand"
+            )
             raise missed_by_far("stress", solved.status, solved.iterations, left, JAMMED)
         with self.watch.stage("projection", *self.velocity):
             self.outcome.take(self.velocity)
@@ -372,10 +466,13 @@ class SandSimulation(ParticleSimulation):
             return
         dimension, bodies = self.grid.dimension, self.bodies.bodies
         self.carried.begin(
-            self.packing, self.velocity, self.weights, density=self.scene.physics.density,
+            self.packing,
+            self.velocity,
+            self.weights,
+            density=self.scene.physics.density,
             velocity=bodies.velocities() if dimension == 3 else bodies.velocities()[:, PLANAR],
             inverse_mass=bodies.inverse_masses(dimension),
-        )  # fmt: skip
+        )
 
     def _push_bodies(self, dt: float) -> None:
         """Give the bodies what the sand has done to them, and the faces beside them the velocity that this leaves."""
@@ -397,14 +494,31 @@ class SandSimulation(ParticleSimulation):
             self.sides.add(self.density)
         self.grid.part.fill(self.density)
 
-    def _continue(self, window: Window, known: list[wp.array], kind: wp.array, contact: wp.array, join: Join | None) -> None:
+    def _continue(
+        self,
+        window: Window,
+        known: list[wp.array],
+        kind: wp.array,
+        contact: wp.array,
+        join: Join | None,
+    ) -> None:
         """Continue the velocity among walls as the stresses meet them."""
         s = self.solids
         if s.cut is not None:
             super()._continue(window, known, kind, contact, join)
         else:
             walls = s.index, s.separating, s.velocity
-            extend_velocity(window, self.velocity, self.weights, known, kind, contact, *walls, self.layers, join=join)
+            extend_velocity(
+                window,
+                self.velocity,
+                self.weights,
+                known,
+                kind,
+                contact,
+                *walls,
+                self.layers,
+                join=join,
+            )
 
     def _front(self) -> tuple[float, float]:
         """Return the 99th percentile of x and of y [m]."""
@@ -416,7 +530,9 @@ class SandSimulation(ParticleSimulation):
         if not len(position):
             return 0.0, 0.0
         nth = percentile_place(len(position))
-        return float(np.partition(position[:, 0], nth)[nth]), float(np.partition(position[:, 1], nth)[nth])
+        return float(np.partition(position[:, 0], nth)[nth]), float(
+            np.partition(position[:, 1], nth)[nth]
+        )
 
     def _front_of_all(self) -> tuple[float, float]:
         """Return the same of all ranks' particles, of which each tells those that may lie beyond it."""
@@ -467,7 +583,9 @@ class GranularSimulator:
     summary = "sand that flows, piles up and comes to rest"
     scene_model = SandScene
 
-    def create(self, scene: Scene, *, device: str, folder: Path, ranks: Ranks | None = None) -> SandSimulation:
+    def create(
+        self, scene: Scene, *, device: str, folder: Path, ranks: Ranks | None = None
+    ) -> SandSimulation:
         """Build the simulation of a scene; on ranks, this rank's part (collective).
 
         Args:
@@ -477,7 +595,8 @@ class GranularSimulator:
             ranks: that share it, for which the scene is the same; None: one process.
 
         Raises:
-            ValueError: the scene cannot be simulated, or not on ranks; the message names the key and what is allowed. On all ranks.
+            ValueError: the scene cannot be simulated, or not on ranks; the message names the key
+                and what is allowed. On all ranks.
         """
         if not isinstance(scene, SandScene):
             raise ValueError("scene.simulator: granular needs a scene of sand")
@@ -488,7 +607,14 @@ class GranularSimulator:
 
         def make_parts(grid: StaggeredGrid) -> Parts:
             boundary, notes = make_boundary(scene, grid, folder, solids=placed)
-            solids = SandSolids(grid, placed, boundary, scene.wall_frictions(), prescribed=bool(scene.source), cuts=cuts)
+            solids = SandSolids(
+                grid,
+                placed,
+                boundary,
+                scene.wall_frictions(),
+                prescribed=bool(scene.source),
+                cuts=cuts,
+            )
             warnings[:] = [*notes, *solids.notes]
             return Parts(boundary, make_sources(scene, grid, boundary, folder), solids=solids)
 
@@ -498,14 +624,30 @@ class GranularSimulator:
             from warp_lcp.distributed.balance import Balance  # what it needs is an extra
             from warp_lcp.distributed.particle_assembly import part_of
 
-            shown = [key for key in ("surface", "volume") if scene.endless and getattr(scene.output, key)]
-            refused = [f"output.{key} where an axis is periodic" for key in shown]  # they end at sides that ranks do not have
+            shown = [
+                key for key in ("surface", "volume") if scene.endless and getattr(scene.output, key)
+            ]
+            # they end at sides that ranks do not have
+            refused = [f"output.{key} where an axis is periodic" for key in shown]
             balance = Balance(fixed=STEP_WORK)
-            coverage, grid = None, part_of(scene, ranks, device, methods=METHODS_ON_RANKS, refused=refused, balance=balance).grid
+            coverage, grid = (
+                None,
+                part_of(
+                    scene, ranks, device, methods=METHODS_ON_RANKS, refused=refused, balance=balance
+                ).grid,
+            )
         parts = make_parts(grid)
         particles, notes = make_particles(scene, grid, parts.boundary, folder)
         outlets, spray = make_outlets(scene, grid, folder), make_spray(scene, coverage, placed)
         return SandSimulation(
-            scene, grid, parts, particles, make_parts=make_parts, outlets=outlets, bodies=bodies, coverage=coverage, spray=spray,
+            scene,
+            grid,
+            parts,
+            particles,
+            make_parts=make_parts,
+            outlets=outlets,
+            bodies=bodies,
+            coverage=coverage,
+            spray=spray,
             notes=(*warnings, *notes),
-        )  # fmt: skip
+        )

@@ -35,8 +35,9 @@ class Walls:
         grid: the grid.
         index: int, -1 in open cells, the wall's number elsewhere, shape of the grid's fields.
         friction: Coulomb's coefficient of each wall, >= 0; inf sticks.
-        rubbing_only: leave out the faces of walls without friction. Their stresses are 0 from the start as long as no wall moves; what
-            moves may come where other cells of sand had theirs, which its faces then take away.
+        rubbing_only: leave out the faces of walls without friction. Their stresses are 0 from the
+            start as long as no wall moves; what moves may come where other cells of sand had
+            theirs, which its faces then take away.
         counted: cells whose faces these are; None: all.
 
     Attributes:
@@ -49,9 +50,14 @@ class Walls:
     """
 
     def __init__(
-        self, grid: StaggeredGrid, index: np.ndarray, friction: Sequence[float], *, rubbing_only: bool = False,
+        self,
+        grid: StaggeredGrid,
+        index: np.ndarray,
+        friction: Sequence[float],
+        *,
+        rubbing_only: bool = False,
         counted: Window | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         device = grid.device
         self.friction = wp.array(np.minimum(friction, 1e6), dtype=wp.float32, device=device)
         cells, sides, walls = wall_faces(index, grid.dimension, counted)
@@ -121,7 +127,8 @@ def list_active_kernel(cells: INTS, flags: BYTES, active: INTS, counts: INTS):
 class SandSolids:
     """Solids and the domain's walls, as whole cells with friction. Making it, `place` and `begin_step` are collective.
 
-    A cell belongs to a solid if its center lies inside. Particles move among the surfaces of `boundary`, which may cut cells.
+    A cell belongs to a solid if its center lies inside. Particles move among the surfaces of
+    `boundary`, which may cut cells.
 
     Args:
         grid: the grid.
@@ -142,18 +149,39 @@ class SandSolids:
     """
 
     def __init__(
-        self, grid: StaggeredGrid, placed: Sequence[PlacedSolid], boundary: Boundary, friction: Sequence[float], *,
-        prescribed: bool = False, cuts: bool = False,
-    ) -> None:  # fmt: skip
-        self._counted = grid.part.owned if grid.part.shared else None  # cells whose walls these are; None: all
-        self.grid, self._placed, self._boundary, self._friction = grid, tuple(placed), boundary, list(friction)
+        self,
+        grid: StaggeredGrid,
+        placed: Sequence[PlacedSolid],
+        boundary: Boundary,
+        friction: Sequence[float],
+        *,
+        prescribed: bool = False,
+        cuts: bool = False,
+    ) -> None:
+        # cells whose walls these are; None: all
+        self._counted = grid.part.owned if grid.part.shared else None
+        self.grid, self._placed, self._boundary, self._friction = (
+            grid,
+            tuple(placed),
+            boundary,
+            list(friction),
+        )
         self.base, self.index = grid.field(wp.int8), grid.field(wp.int32)
         self.separating = wp.full(1 + len(placed), 1, dtype=wp.uint8, device=grid.device)
         self.velocity: Faces = grid.faces() if boundary.moves or prescribed else []
         self._setting = LaunchGraph(grid.device, self._launch_velocity)
         self._cells: np.ndarray | None = None  # `index` as `walls` know it
-        fits = cuts and isinstance(boundary, CutBoundary) and not boundary.moves and boundary.sides is None
-        self.cut = CutWalls(grid, boundary.cut, friction, self._counted) if fits and isinstance(boundary, CutBoundary) else None
+        fits = (
+            cuts
+            and isinstance(boundary, CutBoundary)
+            and not boundary.moves
+            and boundary.sides is None
+        )
+        self.cut = (
+            CutWalls(grid, boundary.cut, friction, self._counted)
+            if fits and isinstance(boundary, CutBoundary)
+            else None
+        )
         self.place(0.0)
         whole = isinstance(boundary, CutBoundary) and self.cut is None
         self.notes = (*self._thin_notes(), *((self._whole_note(cuts),) if whole else ()))
@@ -173,13 +201,24 @@ class SandSolids:
         """Put the solids where they are at `time` [s]."""
         grid = self.grid
         now = [
-            solid if solid.motion is None else PlacedSolid(
-                geometry=solid.geometry.moved(solid.motion.pose(time)), separating=True, name=solid.name
+            solid
+            if solid.motion is None
+            else PlacedSolid(
+                geometry=solid.geometry.moved(solid.motion.pose(time)),
+                separating=True,
+                name=solid.name,
             )
             for solid in self._placed
-        ]  # fmt: skip
+        ]
         starts = self._cells is None
-        found = voxelize(grid, now, wall_separating=True, open_sides=self._boundary.open_sides, remarks=False, counts=starts)
+        found = voxelize(
+            grid,
+            now,
+            wall_separating=True,
+            open_sides=self._boundary.open_sides,
+            remarks=False,
+            counts=starts,
+        )
         if starts:
             self._covered = found.covered
         wp.copy(self.index, found.index)
@@ -194,25 +233,40 @@ class SandSolids:
             wp.copy(self.base, self._boundary.base)
             cells = cells.copy()
             grid.interior(cells)[...] = -1
-        if self._cells is None or not np.array_equal(cells, self._cells):  # else what is recorded for these walls stays valid
+        # else what is recorded for these walls stays valid
+        if self._cells is None or not np.array_equal(cells, self._cells):
             rubbing = not self.moves
-            self._cells, self.walls = cells.copy(), Walls(grid, cells, self._friction, rubbing_only=rubbing, counted=self._counted)
+            self._cells, self.walls = (
+                cells.copy(),
+                Walls(grid, cells, self._friction, rubbing_only=rubbing, counted=self._counted),
+            )
 
     def _thin_notes(self) -> tuple[str, ...]:
         """Return a warning for each solid that stands still and that no stress feels."""
-        covered = self.grid.part.ranks.sum(np.array([*self._covered, 0]))[:-1]  # cells' centers that each solid holds
+        # cells' centers that each solid holds
+        covered = self.grid.part.ranks.sum(np.array([*self._covered, 0]))[:-1]
         held = self.grid.barriers.walls.numbers if self.grid.barriers is not None else ()
         return tuple(
-            f"{solid.name} contains no center of a cell of {self.grid.spacing:.4g} m: it supports no sand, and particles may pass through"
-            for number, (solid, cells) in enumerate(zip(self._placed, covered.tolist(), strict=True), start=1)
+            f"{solid.name} contains no center of a cell of {self.grid.spacing:.4g} m: it supports "
+            "no sand, and particles may pass through"
+            for number, (solid, cells) in enumerate(
+                zip(self._placed, covered.tolist(), strict=True), start=1
+            )
             if self.cut is None and not cells and solid.motion is None and number not in held
         )
 
     def _whole_note(self, cuts: bool) -> str:
         """Return why solids that cut cells do not do so for the stresses."""
-        reason = "some solids move" if self.moves else "an axis is periodic" if cuts else 'solver.method is "interleaved-sweeps"'
+        reason = (
+            "some solids move"
+            if self.moves
+            else "an axis is periodic"
+            if cuts
+            else 'solver.method is "interleaved-sweeps"'
+        )
         return (
-            f'the stress solve uses whole cells for solids, as with domain.solids = "voxel", because {reason}: sand may rest up to half '
+            'the stress solve uses whole cells for solids, as with domain.solids = "voxel", '
+            f"because {reason}: sand may rest up to half "
             "a cell off their surfaces; particles collide with the surfaces"
         )
 
@@ -222,7 +276,8 @@ class SandSolids:
         if self.velocity:
             self._setting.run()
             if self.moves and self.grid.part.joined:
-                self.grid.part.fill(*self.velocity)  # where an axis without an end has led them around
+                # where an axis without an end has led them around
+                self.grid.part.fill(*self.velocity)
 
     def _launch_velocity(self) -> None:
         """Launch what sets the velocity of the solids' faces."""
@@ -230,13 +285,24 @@ class SandSolids:
         if self.moves and isinstance(boundary, CutBoundary):
             cut = boundary.cut
             for axis, field in enumerate(self.velocity):
-                inputs = [axis, grid.planes, grid.spacing, wp.vec3i(*grid.origin), self.index, cut.turn, cut.shift, field]
+                inputs = [
+                    axis,
+                    grid.planes,
+                    grid.spacing,
+                    wp.vec3i(*grid.origin),
+                    self.index,
+                    cut.turn,
+                    cut.shift,
+                    field,
+                ]
                 grid.everywhere.launch(kernels.wall_velocity_kernel, inputs)
         else:
             clear(*self.velocity)  # a source that has stopped has left its own
 
 
-def wall_faces(index: np.ndarray, dimension: int, counted: Window | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def wall_faces(
+    index: np.ndarray, dimension: int, counted: Window | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the faces between open cells and solids, by cell.
 
     Args:
@@ -245,13 +311,18 @@ def wall_faces(index: np.ndarray, dimension: int, counted: Window | None = None)
         counted: cells whose faces are asked for; None: all.
 
     Returns:
-        For each face its open cell's flat index (int32), 2 axis + side (uint8) and its wall's number (int32).
+        For each face its open cell's flat index (int32), 2 axis + side (uint8) and its wall's
+        number (int32).
     """
     found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     inner = np.zeros(index.shape, dtype=bool)
-    inner[(slice(1, -1),) * 3 if counted is None else tuple(map(slice, counted.low, counted.high))] = True
+    inner[
+        (slice(1, -1),) * 3 if counted is None else tuple(map(slice, counted.low, counted.high))
+    ] = True
     flat, open_ = index.ravel(), np.flatnonzero((index.ravel() < 0) & inner.ravel())
-    for axis, stride in zip(range(dimension), (1, index.shape[2], index.shape[1] * index.shape[2]), strict=False):
+    for axis, stride in zip(
+        range(dimension), (1, index.shape[2], index.shape[1] * index.shape[2]), strict=False
+    ):
         for side in range(2):
             beyond = open_ + (stride if side else -stride)
             wall = flat[beyond]
@@ -259,4 +330,8 @@ def wall_faces(index: np.ndarray, dimension: int, counted: Window | None = None)
             found.append((open_[at], np.full(int(at.sum()), 2 * axis + side), wall[at]))
     cells, sides, walls = (np.concatenate(parts) for parts in zip(*found, strict=True))
     order = np.argsort(cells, kind="stable")
-    return cells[order].astype(np.int32), sides[order].astype(np.uint8), walls[order].astype(np.int32)
+    return (
+        cells[order].astype(np.int32),
+        sides[order].astype(np.uint8),
+        walls[order].astype(np.int32),
+    )

@@ -47,8 +47,8 @@ class YieldSet:
 
     Stresses are impulses over rho dx [m/s].
 
-    With `gain` friction grows with the rate of shear: k becomes k + gain e / (e + halfway sqrt(x)), e = |rate of shear| dx [m/s], which is
-    mu(I) [Jop, Forterre & Pouliquen 2006].
+    With `gain` friction grows with the rate of shear: k becomes k + gain e / (e + halfway sqrt(x)),
+    e = |rate of shear| dx [m/s], which is mu(I) [Jop, Forterre & Pouliquen 2006].
 
     Attributes:
         k: tangent of the angle of repose.
@@ -70,7 +70,8 @@ class Velocity:
 
     Attributes:
         u: of each component [m/s].
-        edge: of each shear: first the shear stress of the edges, then twice their rate of shear times dx [m/s].
+        edge: of each shear: first the shear stress of the edges, then twice their rate of shear
+            times dx [m/s].
     """
 
     def __init__(self, packing: Packing, real: type, *, box: bool, rate: bool) -> None:
@@ -79,14 +80,25 @@ class Velocity:
         self.u = grid.faces(real)
         self.edge = [grid.field(real) for _ in SHEARS[grid.dimension]]
         self.openings = None if packing.cut is None else packing.cut.openings
-        self.passes = stress_passes(grid.dimension, real, box=box, rate=rate, cut=packing.cut is not None)
+        self.passes = stress_passes(
+            grid.dimension, real, box=box, rate=rate, cut=packing.cut is not None
+        )
 
     @property
     def fields(self) -> VelocityFields:
         """Return the fields as kernels take them."""
-        return VelocityFields(*[*three_components(self.u), *three_components(self.edge), self.openings])
+        return VelocityFields(
+            *[*three_components(self.u), *three_components(self.edge), self.openings]
+        )
 
-    def find(self, stress: wp.array, *, launch: Launch = launch_now, bodies: SandBodies | None = None, respond: bool = False) -> None:
+    def find(
+        self,
+        stress: wp.array,
+        *,
+        launch: Launch = launch_now,
+        bodies: SandBodies | None = None,
+        respond: bool = False,
+    ) -> None:
         """Compute velocity and rates of strain under a field of stresses.
 
         Args:
@@ -111,21 +123,27 @@ class Velocity:
 class Stress(wl.VariationalInequality):
     """Variational inequality of pressure and friction of sand for a given packing.
 
-    With x = kick_dt p / (rho dx) and s alike, u = u* + (1/m) (-grad x + div s) on faces of mass m, the stress is the solution of
+    With x = kick_dt p / (rho dx) and s alike, u = u* + (1/m) (-grad x + div s) on faces of mass m,
+    the stress is the solution of
 
         0 <= x  complementary to  w = drive + div(m' u) >= 0, drive of `granular.packing.Packing`,
         s = the nearest point of the yield set of x to s + r E u,
 
-    for any r > 0, m' = m in loose cells and 1 in full ones [Narain, Golas & Lin 2010; Daviet & Bertails-Descoubes 2016]: sand is never
-    denser than 1, and friction takes as much energy as it can. In a cell |n|^2 / 2 + sum over shears of max_q b_q^2 <= (k x + cohesion)^2.
-    On a face of a solid the shear stress is within mu times the normal load (Coulomb), and within what the sand beside it bears there: a
-    rougher wall makes the sand fail (snippet `wall_bound` of `headers/sand.h`).
+    for any r > 0, m' = m in loose cells and 1 in full ones [Narain, Golas & Lin 2010; Daviet &
+    Bertails-Descoubes 2016]: sand is never denser than 1, and friction takes as much energy as it
+    can. In a cell |n|^2 / 2 + sum over shears of max_q b_q^2 <= (k x + cohesion)^2. On a face of a
+    solid the shear stress is within mu times the normal load (Coulomb), and within what the sand
+    beside it bears there: a rougher wall makes the sand fail (snippet `wall_bound` of
+    `headers/sand.h`).
 
-    So it is a quasi-variational inequality, over the product of x >= 0 and of the slices of the cones that hold each cell's s at its x; its
-    natural residual is how far (x, s) - P((x, s) - y/d) lies from 0, y = (w, -E u), P onto x >= 0 first and then onto the slice at that x.
-    It is not the projection onto the cones themselves, which would let sand push itself apart as it shears (an associated flow rule, whose
-    normal velocity is k times the slip). `wl.solve` solves it, by the methods of `granular.coupled`. Gradient, projection and momentum of
-    a cell are one pass over memory (`granular.stress.step` in `headers/stress.h`): that is why neither y nor P stand here alone.
+    So it is a quasi-variational inequality, over the product of x >= 0 and of the slices of the
+    cones that hold each cell's s at its x; its natural residual is how far (x, s) - P((x, s) - y/d)
+    lies from 0, y = (w, -E u), P onto x >= 0 first and then onto the slice at that x. It is not the
+    projection onto the cones themselves, which would let sand push itself apart as it shears (an
+    associated flow rule, whose normal velocity is k times the slip). `wl.solve` solves it, by the
+    methods of `granular.coupled`. Gradient, projection and momentum of a cell are one pass over
+    memory (`granular.stress.step` in `headers/stress.h`): that is why neither y nor P stand here
+    alone.
 
     Args:
         packing: where sand is.
@@ -137,30 +155,58 @@ class Stress(wl.VariationalInequality):
     Attributes:
         now: the stresses, see `granular.yield_set`, float32.
         kick_dt: how long forces acted in the step that they belong to [s]; 0 before the first.
-        cold: whether forces act for much longer in the step that has begun than in the last, as in the first two steps.
+        cold: whether forces act for much longer in the step that has begun than in the last, as in
+            the first two steps.
         checked: the velocity that they leave, in float64, since the last `residual`.
         last_residual: that of pressure and friction [m/s].
     """
 
-    def __init__(self, packing: Packing, walls: Walls, *, box: bool = False, rate: bool = False, bodies: SandBodies | None = None) -> None:
-        grid, self.packing, self.walls, self.box, self.rate, self.bodies = packing.grid, packing, walls, box, rate, bodies
+    def __init__(
+        self,
+        packing: Packing,
+        walls: Walls,
+        *,
+        box: bool = False,
+        rate: bool = False,
+        bodies: SandBodies | None = None,
+    ) -> None:
+        grid, self.packing, self.walls, self.box, self.rate, self.bodies = (
+            packing.grid,
+            packing,
+            walls,
+            box,
+            rate,
+            bodies,
+        )
         self.shared, self._across = grid.part.shared, grid.part.across
         normals, shears = (3, 3) if grid.dimension == 3 else (1, 1)
         tractions = 0 if packing.cut is None else grid.dimension
         shape = (1 + normals + 4 * shears + tractions, *grid.shape)
-        self.now, self._before, self._point = (wp.zeros(shape, dtype=wp.float32, device=grid.device) for _ in range(3))
-        self.velocity, self.checked = (Velocity(packing, real, box=box, rate=rate) for real in (wp.float32, wp.float64))
+        self.now, self._before, self._point = (
+            wp.zeros(shape, dtype=wp.float32, device=grid.device) for _ in range(3)
+        )
+        self.velocity, self.checked = (
+            Velocity(packing, real, box=box, rate=rate) for real in (wp.float32, wp.float64)
+        )
         self.numbers = wp.zeros(NUMBERS, dtype=wp.float32, device=grid.device)
         self.momentum = wp.zeros(STATE, dtype=wp.float64, device=grid.device)
         self._sums = wp.zeros(2 * COLUMNS, dtype=wp.float64, device=grid.device)
-        self.total = self._sums if self._across is None else wp.zeros_like(self._sums)  # of all processes
-        self.counts = wp.zeros(1, dtype=wp.float64, device=grid.device) if self.shared else packing.counts  # `cells`, for kernels
+        # of all processes
+        self.total = self._sums if self._across is None else wp.zeros_like(self._sums)
+        # `cells`, for kernels
+        self.counts = (
+            wp.zeros(1, dtype=wp.float64, device=grid.device) if self.shared else packing.counts
+        )
         self._nothing = wp.zeros_like(self._sums)
-        self._found = wp.zeros((PERIOD, 2 * COLUMNS), dtype=wp.float64, device=grid.device)  # by the steps of a period
+        # by the steps of a period
+        self._found = wp.zeros((PERIOD, 2 * COLUMNS), dtype=wp.float64, device=grid.device)
         threads = int(np.prod(packing.grid.shape[:2])) * packing.counted.cells.chunks
-        self._cell_sums = Reduction(grid.size, grid.device, self._sums, columns=COLUMNS, threads=threads)
+        self._cell_sums = Reduction(
+            grid.size, grid.device, self._sums, columns=COLUMNS, threads=threads
+        )
         self._wall_sums: Reduction | None = None
-        self._host, self._host_momentum = self.numbers.numpy(), self.momentum.numpy()  # on the CPU the memory of both
+        # on the CPU the memory of both
+        self._host, self._host_momentum = self.numbers.numpy(), self.momentum.numpy()
         self._program: Program | None = None  # of an accelerated step
         self._check: Program | None = None  # of the residual
         self._cells: int | None = 1  # None: nobody has asked since `begin`
@@ -170,7 +216,8 @@ class Stress(wl.VariationalInequality):
         self._last, self._last_kick = wp.zeros_like(self.now), 0.0  # as before `begin`
         self._ratio = Scalar()  # of the time for which forces act to that in the last step
         self._admitting, self._restarting = (
-            LaunchGraph(grid.device, record, at_once=grid.part.at_once) for record in (self._launch_admission, self.start_from_now)
+            LaunchGraph(grid.device, record, at_once=grid.part.at_once)
+            for record in (self._launch_admission, self.start_from_now)
         )
         self.set_walls(walls)
 
@@ -182,8 +229,14 @@ class Stress(wl.VariationalInequality):
         self._sums.zero_()
         self._grain = 1 if device.is_cuda else WALL_GRAIN
         cut = self.packing.cut
-        threads = sum(-(-count // self._grain) for count in (walls.count, cut.count if cut is not None else 0))
-        self._wall_sums = Reduction(max(threads, 1), device, self._sums, columns=COLUMNS, threads=threads) if threads else None
+        threads = sum(
+            -(-count // self._grain) for count in (walls.count, cut.count if cut is not None else 0)
+        )
+        self._wall_sums = (
+            Reduction(max(threads, 1), device, self._sums, columns=COLUMNS, threads=threads)
+            if threads
+            else None
+        )
 
     def begin(self, bound: YieldSet, gravity: np.ndarray, dt: float, kick_dt: float) -> None:
         """Start from the last stresses, where they exist in the new packing.
@@ -192,7 +245,8 @@ class Stress(wl.VariationalInequality):
             bound: yield set of the sand.
             gravity: [m/s^2], three entries.
             dt: time step [s].
-            kick_dt: time for which forces act in it [s]; stresses are impulses and are rescaled from the last step's pressure.
+            kick_dt: time for which forces act in it [s]; stresses are impulses and are rescaled
+                from the last step's pressure.
         """
         self._last_kick = self.kick_dt
         before = bound.k, bound.cohesion, bound.tension, *map(float, gravity * kick_dt)
@@ -209,7 +263,8 @@ class Stress(wl.VariationalInequality):
         self._ratio.value = kick_dt / self.kick_dt if self.kick_dt > 0.0 else 1.0
         self._admitting.run()
         self.kick_dt = kick_dt
-        self.packing.grid.part.fill(self.now, width=REACH)  # of which cells without sand have lost theirs in ghost layers, too
+        # of which cells without sand have lost theirs in ghost layers, too
+        self.packing.grid.part.fill(self.now, width=REACH)
 
     def _launch_admission(self) -> None:
         """Launch what makes the last stresses those of the new packing: rescaled, 0 where it admits none, without the checkerboard."""
@@ -245,7 +300,9 @@ class Stress(wl.VariationalInequality):
         wp.copy(self.now, self._last)
         self.kick_dt = self._last_kick
 
-    def restart(self, *, pressure_step: float, shear_step: float, lookahead: float, momentum: float) -> None:
+    def restart(
+        self, *, pressure_step: float, shear_step: float, lookahead: float, momentum: float
+    ) -> None:
         """Restart the steps with momentum.
 
         Args:
@@ -271,7 +328,9 @@ class Stress(wl.VariationalInequality):
         """
         self._host[[PRESSURE_STEP, SHEAR_STEP, LOOKAHEAD]] = pressure_step, shear_step, lookahead
         if self.bodies is not None:
-            self.bodies.prepare(self.packing, self.numbers, pressure_step=pressure_step, shear_step=shear_step)
+            self.bodies.prepare(
+                self.packing, self.numbers, pressure_step=pressure_step, shear_step=shear_step
+            )
 
     def start_from_now(self) -> None:
         """Start the momentum from the present stresses; launches or records."""
@@ -298,8 +357,13 @@ class Stress(wl.VariationalInequality):
         for _ in range(periods):
             program.run()
         pressure, friction = self.momentum.numpy()[[RESIDUAL_X, RESIDUAL_X + 1]]
-        pressure, friction = pressure / self._host[PRESSURE_STEP], SHARE * friction / self._host[SHEAR_STEP]
-        return float(1.0 / math.sqrt(self.cells) * math.sqrt(pressure * pressure + friction * friction))
+        pressure, friction = (
+            pressure / self._host[PRESSURE_STEP],
+            SHARE * friction / self._host[SHEAR_STEP],
+        )
+        return float(
+            1.0 / math.sqrt(self.cells) * math.sqrt(pressure * pressure + friction * friction)
+        )
 
     def period(self) -> Program:
         """Return the program of `PERIOD` steps with momentum, of the walls as they are."""
@@ -366,7 +430,9 @@ class Stress(wl.VariationalInequality):
             partials = self._wall_sums.partials
             if walls.count:
                 rows = Rows.entries(walls.count, p.grid.device, self._grain, weight=WALL_FACE)
-                passes.wall.bind(rows, *structs, walls.faces, active=walls.active, behind=0, partials=partials).launch(launch)
+                passes.wall.bind(
+                    rows, *structs, walls.faces, active=walls.active, behind=0, partials=partials
+                ).launch(launch)
             if p.cut is not None:
                 p.cut.project(p, velocity, self._fields, partials, self._grain, launch)
 
@@ -378,7 +444,12 @@ class Stress(wl.VariationalInequality):
         """Launch the sums over cells and walls of all processes."""
         self._add_up_here(launch)
         if self._across is not None:
-            launch(keep_step_kernel, 2 * COLUMNS, [self._sums, self.total.reshape((1, -1)), 0], device=self.packing.grid.device)
+            launch(
+                keep_step_kernel,
+                2 * COLUMNS,
+                [self._sums, self.total.reshape((1, -1)), 0],
+                device=self.packing.grid.device,
+            )
             add_across(self._across, self.total, slice(None), launch)
 
     def _add_up_here(self, launch: Launch) -> None:

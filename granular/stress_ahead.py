@@ -21,8 +21,9 @@ if TYPE_CHECKING:
 class StressAhead:
     """Steps of a solve that the device takes and judges, as `coupled.MomentumWorkspace` would on the host.
 
-    On CUDA a solve is one graph: the residual at the start, a loop of periods of steps until the residual is due, that residual; the host
-    reads once. On the CPU a thread team works through the loop as one table.
+    On CUDA a solve is one graph: the residual at the start, a loop of periods of steps until the
+    residual is due, that residual; the host reads once. On the CPU a thread team works through the
+    loop as one table.
 
     Args:
         stress: the problem; on ranks, which decide alike by sums over all, on the CPU.
@@ -35,7 +36,10 @@ class StressAhead:
         self._going = wp.zeros(1, dtype=wp.int32, device=device)
         self._limits = wp.array(method.calm, dtype=wp.float64, device=device)
         self._given = [Scalar() for _ in range(5)]  # of `begin_steps_kernel`, from `limit_` on
-        self._beginning, self._resuming = (LaunchGraph(device, record) for record in (self._launch_beginning, self._launch_resumption))
+        self._beginning, self._resuming = (
+            LaunchGraph(device, record)
+            for record in (self._launch_beginning, self._launch_resumption)
+        )
         self._period: Program | None = None  # that the loop is made of
         self._loop = Program(device)
 
@@ -90,7 +94,10 @@ class StressAhead:
         self._period, self._loop = period, Program(device)
         self._loop.extend(period)
         s, method = self._stress, self._method
-        check, fields = method.check_every * kernels.PERIOD, [s.momentum, self._decisions.array, self._limits, self._going]
+        check, fields = (
+            method.check_every * kernels.PERIOD,
+            [s.momentum, self._decisions.array, self._limits, self._going],
+        )
         inputs = [s.counts, s.numbers, *fields, check, method.patience, method.wait]
         self._loop.launch(kernels.decide_kernel, 1, inputs, device=device)
         self._beginning.forget()
@@ -102,7 +109,14 @@ class StressAhead:
         pressure_step, shear_step, lookahead = self._method.steps(s)
         s.check().run()
         fields = [s.total, s.counts, s.numbers, s.momentum, self._decisions.array, self._going]
-        given = [pressure_step, shear_step, lookahead, self._method.momentum, MOST_MOMENTUM, *self._given]
+        given = [
+            pressure_step,
+            shear_step,
+            lookahead,
+            self._method.momentum,
+            MOST_MOMENTUM,
+            *self._given,
+        ]
         launch(kernels.begin_steps_kernel, 1, [*fields, *given], device=device)
         s.start_from_now()
         if device.is_cuda:
@@ -120,4 +134,9 @@ class StressAhead:
         s = self._stress
         self._loop.run_while(self._going)
         s.check().run()
-        launch(kernels.keep_sums_kernel, 1, [s.total, self._decisions.array, kernels.LAST], device=s.packing.grid.device)
+        launch(
+            kernels.keep_sums_kernel,
+            1,
+            [s.total, self._decisions.array, kernels.LAST],
+            device=s.packing.grid.device,
+        )

@@ -1,13 +1,16 @@
 # mypy: ignore-errors
 """Passes of the coupled pressure and friction of sand: projected steps on the stresses of `granular.yield_set`, 2-D and 3-D.
 
-And the momentum of these steps, and the decisions by which a device takes them without its host, see `granular.stress_ahead`.
+And the momentum of these steps, and the decisions by which a device takes them without its host,
+see `granular.stress_ahead`.
 
-And what damps the pattern that exerts no force: a checkerboard in the pressure and one in the shear balance each other on every face. Noise
-in the fraction feeds it and no equation takes it away. Where p = (-1)^(i + j), the shear stress with -p at a cell's low-low corner, +p at
-the two mixed ones and -p at high-high cancels grad p; in 3-D half of that on the edges of each shear does. So a part of what alternates of
-the pressure in all directions, (-1, 2, -1)/4 along each axis, can be taken from p and added to the copies with those signs, and no velocity
-changes. Only cells deep in dense sand take part, away from solids that cut cells.
+And what damps the pattern that exerts no force: a checkerboard in the pressure and one in the shear
+balance each other on every face. Noise in the fraction feeds it and no equation takes it away.
+Where p = (-1)^(i + j), the shear stress with -p at a cell's low-low corner, +p at the two mixed
+ones and -p at high-high cancels grad p; in 3-D half of that on the edges of each shear does. So a
+part of what alternates of the pressure in all directions, (-1, 2, -1)/4 along each axis, can be
+taken from p and added to the copies with those signs, and no velocity changes. Only cells deep in
+dense sand take part, away from solids that cut cells.
 """
 
 import functools
@@ -35,26 +38,54 @@ from warp_lcp.granular.yield_set import (
 from warp_lcp.rows import KernelFile
 from warp_lcp.rows.compiler import forward_kernel
 
-# The momentum's state: steps done; the most of it for pressure and friction; that of this step; that of the next; estimates of the natural
-# residuals over the last PERIOD steps; sums over these; 1 less the most that the momentum may grow to.
-COUNT, BETA_X, NOW_X, NOW_S, NEXT_X, NEXT_S, RESIDUAL_X, SUMS, REST, STATE = 0, 1, 3, 4, 5, 6, 7, 9, 17, 18
+# The momentum's state: steps done; the most of it for pressure and friction; that of this step;
+# that of the next; estimates of the natural residuals over the last PERIOD steps; sums over these;
+# 1 less the most that the momentum may grow to.
+COUNT, BETA_X, NOW_X, NOW_S, NEXT_X, NEXT_S, RESIDUAL_X, SUMS, REST, STATE = (
+    0,
+    1,
+    3,
+    4,
+    5,
+    6,
+    7,
+    9,
+    17,
+    18,
+)
 PERIOD = 5
 DAMPED = 0.15  # of the checkerboard, in a step
 HIGH, LOW = 0.85, 0.5  # cosines above and below which the momentum grows and falls
 
 MOMENTUM: dict[str, Any] = {"NOW_X": NOW_X, "NOW_S": NOW_S, "NEXT_X": NEXT_X, "NEXT_S": NEXT_S}
-KERNELS = KernelFile(Path(__file__).parent / "headers/stress.h", CONSTANTS | MOMENTUM | {"DAMPED": DAMPED})
+KERNELS = KernelFile(
+    Path(__file__).parent / "headers/stress.h", CONSTANTS | MOMENTUM | {"DAMPED": DAMPED}
+)
 
 
 @functools.cache
-def stress_passes(dimension: int, real: Any, *, box: bool = False, rate: bool = False, cut: bool = False) -> SimpleNamespace:
+def stress_passes(
+    dimension: int, real: Any, *, box: bool = False, rate: bool = False, cut: bool = False
+) -> SimpleNamespace:
     """Return the passes for 2 or 3 dimensions: with velocities of float32 of a step, of float64 of what the natural residual would move."""
     residual = real is F64
     kind = ("residual" if residual else "step") + "_box" * box + "_rate" * rate + "_cut" * cut
     module = f"granular.stress_{dimension}d_{real.__name__}_{kind}"
-    words = {"DIM": dimension, "BOX": box, "RATE": rate, "CUT": cut, "RESIDUAL": residual, "TRIAL": 0}
+    words = {
+        "DIM": dimension,
+        "BOX": box,
+        "RATE": rate,
+        "CUT": cut,
+        "RESIDUAL": residual,
+        "TRIAL": 0,
+    }
     names = ("edge_stress", "face_velocity", "edge_strain", "step", "traction", "admit", "damp")
-    made = {name: KERNELS.kernel(f"granular.stress.{name}", module=module, compute=real, constants=words) for name in names}
+    made = {
+        name: KERNELS.kernel(
+            f"granular.stress.{name}", module=module, compute=real, constants=words
+        )
+        for name in names
+    }
     wall = KERNELS.kernel("granular.stress.wall_step", module=module, compute=real, constants=words)
     return SimpleNamespace(**made, wall=wall)
 
@@ -63,7 +94,8 @@ def stress_passes(dimension: int, real: Any, *, box: bool = False, rate: bool = 
 def momentum_kernel(sums: wp.array(dtype=wp.float64), state: wp.array(dtype=wp.float64)):
     """Momentum of the next step but one; every few steps more or less of it, by the angle between the projection's error and the step.
 
-    cos = <e, s> / sqrt(<e, e> <s, s>) is near 1 where more momentum would help and small where the iterates flutter.
+    cos = <e, s> / sqrt(<e, e> <s, s>) is near 1 where more momentum would help and small where the
+    iterates flutter.
     """
     for c in range(COLUMNS):
         value = sums[c] + sums[COLUMNS + c]
@@ -90,11 +122,15 @@ def momentum_kernel(sums: wp.array(dtype=wp.float64), state: wp.array(dtype=wp.f
             state[SUMS + c] = wp.float64(0.0)
     for block in range(2):
         state[NOW_X + block] = state[NEXT_X + block]
-        state[NEXT_X + block] = wp.min(state[BETA_X + block], (count + wp.float64(1.0)) / (count + wp.float64(4.0)))
+        state[NEXT_X + block] = wp.min(
+            state[BETA_X + block], (count + wp.float64(1.0)) / (count + wp.float64(4.0))
+        )
 
 
 @forward_kernel(module="granular.momentum")
-def keep_step_kernel(sums: wp.array(dtype=wp.float64), found: wp.array2d(dtype=wp.float64), step: int):
+def keep_step_kernel(
+    sums: wp.array(dtype=wp.float64), found: wp.array2d(dtype=wp.float64), step: int
+):
     """Keep the sums of a step of a period on this rank; a thread a column."""
     c = wp.tid()
     found[step, c] = sums[c]
@@ -119,23 +155,38 @@ def period_kernel(found: wp.array2d(dtype=wp.float64), total: wp.array(dtype=wp.
     total[COLUMNS + c] = wp.float64(0.0)
 
 
-# Decisions of a solve. Steps: taken, when the estimate was best, when it or the momentum last changed, to be taken at least, at most.
+# Decisions of a solve. Steps: taken, when the estimate was best, when it or the momentum last
+# changed, to be taken at least, at most.
 DONE, BEST_AT, CHANGED, LEAST, MOST = 0, 1, 2, 3, 4
-BEST, AIM, STILL = 5, 6, 7  # [m/s]: least estimate, what it is to fall below, below which `LEAST` does not count
-LIMITS, DUE, STAGNATES = 8, 9, 10  # limits of the momentum used; whether the residual is due; whether progress has ended
-FIRST, LAST, DECISIONS = 11, 13, 15  # sums of squares of pressure's and friction's residual: at the start, after the last steps
-BETTER, NEAR_BEST = 0.95, 1.2  # of the best estimate: progress, and where a solve that stagnates may end
+# [m/s]: least estimate, what it is to fall below, below which `LEAST` does not count
+BEST, AIM, STILL = 5, 6, 7
+# limits of the momentum used; whether the residual is due; whether progress has ended
+LIMITS, DUE, STAGNATES = 8, 9, 10
+# sums of squares of pressure's and friction's residual: at the start, after the last steps
+FIRST, LAST, DECISIONS = 11, 13, 15
+# of the best estimate: progress, and where a solve that stagnates may end
+BETTER, NEAR_BEST = 0.95, 1.2
 NOTHING = 1e-3  # of the tolerance: nothing to solve, as in free fall
 STILL_SHARE = 1e-2  # of the tolerance, which leaves sand at rest
 TIGHTER = 0.8  # the aim after a residual was due, should the estimate have been too good
-SHARE = 0.7**0.5  # by which a step of the friction, over its length, exceeds the natural residual: measured
+# by which a step of the friction, over its length, exceeds the natural residual: measured
+SHARE = 0.7**0.5
 SAFELY = 1.0 + 1e-9  # the host computes the norm again
 f32s, f64s, i32s = wp.array(dtype=wp.float32), wp.array(dtype=wp.float64), wp.array(dtype=wp.int32)
 
 
 @forward_kernel(module="granular.momentum")
 def numbers_kernel(
-    numbers: f32s, k: float, cohesion: float, tension: float, x: float, y: float, z: float, step: float, gain: float, halfway: float
+    numbers: f32s,
+    k: float,
+    cohesion: float,
+    tension: float,
+    x: float,
+    y: float,
+    z: float,
+    step: float,
+    gain: float,
+    halfway: float,
 ):
     """Write what the kernels of a time step read, before a method sets its steps; see `granular.yield_set`."""
     numbers[FRICTION] = k
@@ -169,10 +220,23 @@ def keep_sums_kernel(sums: f64s, decisions: f64s, place: int):
 
 @forward_kernel(module="granular.momentum")
 def begin_steps_kernel(
-    sums: f64s, counted: f64s, numbers: f32s, state: f64s, decisions: f64s, going: i32s, pressure_step: float, shear_step: float,
-    lookahead: float, momentum: wp.float64, most_momentum: wp.float64, limit_: wp.float64, tolerance: wp.float64, least: wp.float64,
-    still: wp.float64, most: wp.float64,
-):  # fmt: skip
+    sums: f64s,
+    counted: f64s,
+    numbers: f32s,
+    state: f64s,
+    decisions: f64s,
+    going: i32s,
+    pressure_step: float,
+    shear_step: float,
+    lookahead: float,
+    momentum: wp.float64,
+    most_momentum: wp.float64,
+    limit_: wp.float64,
+    tolerance: wp.float64,
+    least: wp.float64,
+    still: wp.float64,
+    most: wp.float64,
+):
     """Begin the steps of a solve whose residual at the start is known, as `coupled.MomentumWorkspace.start` does."""
     numbers[PRESSURE_STEP] = pressure_step
     numbers[SHEAR_STEP] = shear_step
@@ -216,7 +280,15 @@ def resume_steps_kernel(decisions: f64s, going: i32s):
 
 @forward_kernel(module="granular.momentum")
 def decide_kernel(
-    counted: f64s, numbers: f32s, state: f64s, decisions: f64s, limits: f64s, going: i32s, check: int, patience: int, wait: int
+    counted: f64s,
+    numbers: f32s,
+    state: f64s,
+    decisions: f64s,
+    limits: f64s,
+    going: i32s,
+    check: int,
+    patience: int,
+    wait: int,
 ):
     """Decide after a period of steps whether the host is to look at the residual, as `coupled.MomentumWorkspace.judge` does."""
     done = decisions[DONE] + wp.float64(PERIOD)
@@ -233,10 +305,17 @@ def decide_kernel(
         decisions[BEST_AT] = done
         decisions[CHANGED] = done
     else:
-        late = done - decisions[BEST_AT] >= wp.float64(patience) and estimate < wp.float64(NEAR_BEST) * decisions[BEST]
+        late = (
+            done - decisions[BEST_AT] >= wp.float64(patience)
+            and estimate < wp.float64(NEAR_BEST) * decisions[BEST]
+        )
         stagnates = late or not wp.isfinite(estimate)
         used = int(decisions[LIMITS])
-        if used < limits.shape[0] and done - decisions[CHANGED] >= wp.float64(wait) and estimate > decisions[AIM]:
+        if (
+            used < limits.shape[0]
+            and done - decisions[CHANGED] >= wp.float64(wait)
+            and estimate > decisions[AIM]
+        ):
             limit(state, limits[used])
             decisions[LIMITS] = wp.float64(used + 1)
             decisions[CHANGED] = done

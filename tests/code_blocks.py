@@ -37,4 +37,8 @@ def anchors(page: Path) -> set[str]:
         text = unicodedata.normalize("NFKD", plain).encode("ascii", "ignore").decode()
         slug = re.sub(r"[-\s]+", "-", re.sub(r"[^\w\s-]", "", text).strip().lower())
         found[slug] = found.get(slug, 0) + 1
-    return {slug if count == 0 else f"{slug}_{count}" for slug, many in found.items() for count in range(many)}
+    return {
+        slug if count == 0 else f"{slug}_{count}"
+        for slug, many in found.items()
+        for count in range(many)
+    }

@@ -13,20 +13,29 @@ from warp_lcp.rows.kernel_messages import start_warp
 
 collect_ignore = ["emulated_cuda.py"]  # a plugin, which changes all that is imported after it
 wp.config.log_level = wp.LOG_ERROR
-if workers := os.environ.get("PYTEST_XDIST_WORKER_COUNT"):  # processes that test beside each other share the cores, as ranks do
+# processes that test beside each other share the cores, as ranks do
+if workers := os.environ.get("PYTEST_XDIST_WORKER_COUNT"):
     os.environ.setdefault("WARP_LCP_THREADS", str(max((os.cpu_count() or 1) // int(workers), 1)))
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as shells have both for what they start in the background; tests send them
+# as shells have both for what they start in the background; tests send them
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGQUIT, signal.SIG_DFL)
 
-UNHURRIED = {"deadline": None, "database": None, "suppress_health_check": [HealthCheck.too_slow, HealthCheck.data_too_large]}
+UNHURRIED = {
+    "deadline": None,
+    "database": None,
+    "suppress_health_check": [HealthCheck.too_slow, HealthCheck.data_too_large],
+}
 settings.register_profile("few", max_examples=100, derandomize=True, **UNHURRIED)
-settings.register_profile("fuzz", max_examples=int(os.environ.get("FUZZ_EXAMPLES", "10000")), **UNHURRIED)
+settings.register_profile(
+    "fuzz", max_examples=int(os.environ.get("FUZZ_EXAMPLES", "10000")), **UNHURRIED
+)
 settings.load_profile("few")
 
 
 def pytest_collection_modifyitems(items):
-    items.sort(key=lambda item: item.name.startswith("test_kernels_compile_for_cuda"), reverse=True)  # the longest: others run beside it
+    # the longest: others run beside it
+    items.sort(key=lambda item: item.name.startswith("test_kernels_compile_for_cuda"), reverse=True)
     start_warp()
     if not wp.is_cuda_available():
         skip = pytest.mark.skip(reason="no CUDA device on this machine")

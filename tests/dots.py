@@ -26,7 +26,11 @@ class Dots:
         self.step_count = 0
 
     def stable_dt(self) -> float:
-        return self.owner.stable_dt if self.owner.stable_dt is not None else 0.02 / (1.0 + np.abs(self.velocity).max(initial=0.0))
+        return (
+            self.owner.stable_dt
+            if self.owner.stable_dt is not None
+            else 0.02 / (1.0 + np.abs(self.velocity).max(initial=0.0))
+        )
 
     def step(self, dt: float) -> dict[str, float | int | str | None]:
         self.owner.before_step(self, dt)
@@ -37,7 +41,11 @@ class Dots:
         self.position[below, 1] *= -1
         self.time += dt
         self.step_count += 1
-        return {"max_speed": float(np.abs(self.velocity).max(initial=0.0)), "solve_status": self.owner.status, "volume": None}
+        return {
+            "max_speed": float(np.abs(self.velocity).max(initial=0.0)),
+            "solve_status": self.owner.status,
+            "volume": None,
+        }
 
     def columns(self) -> tuple[str, ...]:
         return ("max_speed", "solve_status", "volume")

@@ -32,7 +32,12 @@ def falling_in_space(k: int, j: int, i: int):
 
 FUNCTIONS = {  # as Warp has them, and as NumPy does: of the center, of a neighbor
     2: (rising, lambda j, i: 40 + 0.5 * i + j, falling, lambda j, i: -1 - 0.25 * j),
-    3: (rising_in_space, lambda k, j, i: 80 + 0.5 * i + k, falling_in_space, lambda k, j, i: -1 - 0.25 * j - k),
+    3: (
+        rising_in_space,
+        lambda k, j, i: 80 + 0.5 * i + k,
+        falling_in_space,
+        lambda k, j, i: -1 - 0.25 * j - k,
+    ),
 }
 KINDS = ("numbers", "arrays", "mirrored", "half mirrored", "functions")
 
@@ -50,7 +55,13 @@ class DrawnStencil:
 
     def operator(self, device="cpu", dtype=wp.float64):
         return wl.Stencil(
-            self.cells, self.given, shift=self.shift, periodic=self.periodic, outside=self.outside, device=device, dtype=dtype
+            self.cells,
+            self.given,
+            shift=self.shift,
+            periodic=self.periodic,
+            outside=self.outside,
+            device=device,
+            dtype=dtype,
         )
 
     def matrix(self):
@@ -74,7 +85,9 @@ def neighbor(cells, cell, offset, periodic, outside):
 
 def value_at(coefficient, cell, shape):
     """A coefficient of a cell."""
-    return coefficient(*cell) if callable(coefficient) else np.broadcast_to(coefficient, shape)[cell]
+    return (
+        coefficient(*cell) if callable(coefficient) else np.broadcast_to(coefficient, shape)[cell]
+    )
 
 
 def assembled(cells, coefficients, shift, periodic, outside):
@@ -116,7 +129,9 @@ def mirrored(given, shape, cells, rng, *, broken):
     if broken:
         for offset, a in made.items():
             if any(offset):
-                toward = np.roll(cells, tuple(-s for s in offset), tuple(range(len(shape)))) != wl.FLUID
+                toward = (
+                    np.roll(cells, tuple(-s for s in offset), tuple(range(len(shape)))) != wl.FLUID
+                )
                 for axis, s in enumerate(offset):  # beyond the array, too
                     if s:
                         np.moveaxis(toward, axis, 0)[-1 if s > 0 else 0] = True
@@ -138,16 +153,22 @@ def drawn(seed, kind=None, *, thin=True):
     cells = rng.choice([wl.AIR, wl.FLUID, wl.FLUID, wl.FLUID, wl.SOLID], shape)
     cells.flat[0] = wl.FLUID
     periodic = tuple(bool(p) for p in rng.random(3) < 0.3)
-    if kind in ("mirrored", "half mirrored"):  # on a torus the sides beyond the array are other cells'
+    # on a torus the sides beyond the array are other cells'
+    if kind in ("mirrored", "half mirrored"):
         periodic = tuple(p and shape[n - 1 - a] > 2 if a < n else p for a, p in enumerate(periodic))
     given = {(0,) * n: 60.0}
-    chosen = int(rng.integers(3))  # few, or the kernels of each would have to be compiled: faces alone, all neighbors, some
+    # few, or the kernels of each would have to be compiled: faces alone, all neighbors, some
+    chosen = int(rng.integers(3))
     for offset in itertools.product((-1, 0, 1), repeat=n):
         places = abs(np.array(offset)).sum(), sum((s + 1) * 3**a for a, s in enumerate(offset))
         if offset != (0,) * n and (places[0] == 1, True, places[1] % 3 != 1)[chosen]:
-            given[offset] = -rng.random() if kind in ("numbers", "functions") else -rng.random(shape)
+            given[offset] = (
+                -rng.random() if kind in ("numbers", "functions") else -rng.random(shape)
+            )
     if kind in ("mirrored", "half mirrored"):
-        given = mirrored(given, shape, cells, rng, broken=kind == "half mirrored" and not any(periodic))
+        given = mirrored(
+            given, shape, cells, rng, broken=kind == "half mirrored" and not any(periodic)
+        )
     elif kind == "numbers" and rng.random() < 0.5:
         given = {o: given.get(max(o, tuple(-s for s in o)), 0.0) for o in given}
     plain = dict(given)
@@ -174,7 +195,8 @@ def drawn_offsets(dimension, rng):
     return offsets if rng.random() < 0.5 else [o for o in offsets if sum(map(abs, o)) == 1]
 
 
-SINGULAR = ("symmetric", "numbers", "rows", "columns", "circulant")  # what sums to 0; of the last one both, without symmetry
+# what sums to 0; of the last one both, without symmetry
+SINGULAR = ("symmetric", "numbers", "rows", "columns", "circulant")
 
 
 def drawn_singular(seed, kind):
@@ -182,24 +204,35 @@ def drawn_singular(seed, kind):
     rng = np.random.default_rng([seed, 21])
     shape = (16 + seed % 3, 16) if rng.random() < 0.7 else (6, 7, 6)
     n, decades = len(shape), int(rng.integers(3))
-    periodic = [(False,) * 3, (True, False, False), (False, True, False), (True,) * 3][int(rng.integers(4))]
+    periodic = [(False,) * 3, (True, False, False), (False, True, False), (True,) * 3][
+        int(rng.integers(4))
+    ]
     periodic = (True,) * 3 if kind == "circulant" else periodic
     offsets, cells = drawn_offsets(n, rng), np.ones(shape, dtype=int)
     if rng.random() < 0.5 and kind in ("symmetric", "numbers", "rows"):
         fluid = rng.random(shape) > 0.15
-        cells = np.where(fluid & (sum(beside(fluid.astype(int), o, periodic) for o in offsets) > 0), wl.FLUID, wl.SOLID)
+        cells = np.where(
+            fluid & (sum(beside(fluid.astype(int), o, periodic) for o in offsets) > 0),
+            wl.FLUID,
+            wl.SOLID,
+        )
     given: dict[tuple[int, ...], Any] = {}
     for o in offsets:
         opposite = tuple(-s for s in o)
         if kind in ("numbers", "circulant"):
-            given[o] = given[opposite] if kind == "numbers" and opposite in given else -rng.uniform(0.2, 1)
+            given[o] = (
+                given[opposite] if kind == "numbers" and opposite in given else -rng.uniform(0.2, 1)
+            )
         else:
             given[o] = -(10 ** rng.uniform(-decades, 0, shape))
             if kind == "symmetric" and opposite in given:
                 given[o] = beside(given[opposite], o, periodic)
             elif kind == "columns":
                 given[o] = given[o] * beside(np.ones(shape), o, periodic)
-    across = [beside(given[tuple(-s for s in o)], o, periodic) if kind == "columns" else given[o] for o in offsets]
+    across = [
+        beside(given[tuple(-s for s in o)], o, periodic) if kind == "columns" else given[o]
+        for o in offsets
+    ]
     given[(0,) * n] = -sum(across)
     return DrawnStencil(cells, given, given, None, periodic, wl.SOLID)
 
@@ -208,25 +241,49 @@ def drawn_dominant(seed, side=40, side_in_space=10):
     """An M-matrix that need not be symmetric: random coefficients, winds or anisotropy over up to four decades; and its data."""
     rng = np.random.default_rng([seed, 31])
     shape = (side_in_space, side_in_space, side_in_space + 3) if seed % 3 == 2 else (side, side + 7)
-    n, decades, form = len(shape), int(rng.integers(0, 5)), rng.choice(["random", "wind", "anisotropic"])
+    n, decades, form = (
+        len(shape),
+        int(rng.integers(0, 5)),
+        rng.choice(["random", "wind", "anisotropic"]),
+    )
     periodic = [(False,) * 3, (False,) * 3, (True, False, False), (True,) * 3][int(rng.integers(4))]
     offsets = drawn_offsets(n, rng)
-    cells = np.ones(shape, dtype=int) if rng.random() < 0.6 else rng.choice([wl.AIR, *[wl.FLUID] * 4, wl.SOLID], shape)
-    wind, strength = rng.standard_normal(n) * 10 ** rng.uniform(0, decades), 10 ** rng.uniform(-decades, 0, n)
+    cells = (
+        np.ones(shape, dtype=int)
+        if rng.random() < 0.6
+        else rng.choice([wl.AIR, *[wl.FLUID] * 4, wl.SOLID], shape)
+    )
+    wind, strength = (
+        rng.standard_normal(n) * 10 ** rng.uniform(0, decades),
+        10 ** rng.uniform(-decades, 0, n),
+    )
     turning = np.sin(3 * (np.indices(shape) / max(shape)).sum(0) + rng.uniform(0, 6))
     given: dict[tuple[int, ...], Any] = {}
     for o in offsets:
         if form == "random":
             given[o] = -(10 ** rng.uniform(-decades, 0, shape))
         elif form == "wind":
-            given[o] = -(1 + np.maximum(0, -sum(o[a] * wind[a] * (turning if a % 2 else np.ones(shape)) for a in range(n))))
+            given[o] = -(
+                1
+                + np.maximum(
+                    0,
+                    -sum(o[a] * wind[a] * (turning if a % 2 else np.ones(shape)) for a in range(n)),
+                )
+            )
         else:
-            given[o] = -np.prod([strength[a] for a in range(n) if o[a]]) * rng.uniform(0.5, 1, shape)
+            given[o] = -np.prod([strength[a] for a in range(n) if o[a]]) * rng.uniform(
+                0.5, 1, shape
+            )
     given[(0,) * n] = -(1 + 10.0 ** rng.integers(-5, 0)) * sum(given.values())
     bounded = rng.random() < 0.5
     upper = float(10 ** rng.uniform(-2, 0)) if bounded and rng.random() < 0.3 else np.inf
     b = rng.standard_normal(shape) * (cells == wl.FLUID)
-    return DrawnStencil(cells, given, given, None, periodic, int(rng.choice([wl.AIR, wl.SOLID]))), b, 0.0 if bounded else -np.inf, upper
+    return (
+        DrawnStencil(cells, given, given, None, periodic, int(rng.choice([wl.AIR, wl.SOLID]))),
+        b,
+        0.0 if bounded else -np.inf,
+        upper,
+    )
 
 
 def natural_residual(matrix, diagonal, x, b, lower, upper):

@@ -2,8 +2,9 @@
 
     PYTHONPATH=tests:. ORDER=permuted python -m pytest -p emulated_cuda tests/solvers
 
-Tests of the CPU's own ways (`cpu_form`) are left out. With COMPARE=1 a kernel whose results depend on the order of threads, and that is not
-known to, fails the test that launched it. With CELLS=1 so does a pass by quads of cells that finds something else than it does by cells.
+Tests of the CPU's own ways (`cpu_form`) are left out. With COMPARE=1 a kernel whose results depend
+on the order of threads, and that is not known to, fails the test that launched it. With CELLS=1 so
+does a pass by quads of cells that finds something else than it does by cells.
 """
 
 import pytest

@@ -24,7 +24,10 @@ def told(simulation: Simulation, scene: Scene, index: int) -> Told:
     interval = 1.0 / scene.time.frames_per_second
     end = (int(simulation.time / interval * (1.0 + 1e-9)) + 1) * interval
     dt, retries, row = take_step(simulation, simulation.stable_dt(), end, scene.time)
-    found: Told = {"row": {"dt": dt, "retries": retries, **row}, **{f"state {name}": value for name, value in simulation.state().items()}}
+    found: Told = {
+        "row": {"dt": dt, "retries": retries, **row},
+        **{f"state {name}": value for name, value in simulation.state().items()},
+    }
     if index % 3 == 0:  # frames follow from the state, and take longer than a step
         found |= shown(simulation.frame())
     return found
@@ -42,16 +45,28 @@ def shown(frame: list[Part]) -> Told:
 
 def differing(first: Told, second: Told) -> list[str]:
     """Return the names of what is not the same bit for bit."""
-    names = [name for name in sorted(first.keys() | second.keys()) if not same(first.get(name), second.get(name))]
+    names = [
+        name
+        for name in sorted(first.keys() | second.keys())
+        if not same(first.get(name), second.get(name))
+    ]
     if "row" in names and first.keys() == second.keys():
-        names += [f"row {name}" for name, value in first["row"].items() if repr(second["row"].get(name)) != repr(value)]
+        names += [
+            f"row {name}"
+            for name, value in first["row"].items()
+            if repr(second["row"].get(name)) != repr(value)
+        ]
     return names
 
 
 def same(first: Any, second: Any) -> bool:
     """Tell whether two values are the same bit for bit."""
     if isinstance(first, np.ndarray) and isinstance(second, np.ndarray):
-        return (first.dtype, first.shape, first.tobytes()) == (second.dtype, second.shape, second.tobytes())
+        return (first.dtype, first.shape, first.tobytes()) == (
+            second.dtype,
+            second.shape,
+            second.tobytes(),
+        )
     if isinstance(first, Mapping):
         return repr(first) == repr(second)
     return first is second
@@ -73,8 +88,12 @@ def differences_by_step(scene: Scene, steps: int, every: int = 1) -> dict[int, l
             continue
         resumed = made(scene)
         resumed.restore({name: array.copy() for name, array in state.items()})
-        kept = {name: array for name, array in resumed.state().items() if not same(array, state[name])}
+        kept = {
+            name: array for name, array in resumed.state().items() if not same(array, state[name])
+        }
         resumed.frame()  # as a run does that goes on, to see what it will take on the disk
-        if names := [f"restored {name}" for name in kept] + differing(expected, told(resumed, scene, step)):
+        if names := [f"restored {name}" for name in kept] + differing(
+            expected, told(resumed, scene, step)
+        ):
             found[step] = names
     return found

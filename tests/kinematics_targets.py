@@ -9,12 +9,20 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.optimize
 
-from warp_lcp.gallery.articulated_figure import ArticulatedFigure, branching_figure, planar_chain, spatial_chain
+from warp_lcp.gallery.articulated_figure import (
+    ArticulatedFigure,
+    branching_figure,
+    planar_chain,
+    spatial_chain,
+)
 from warp_lcp.gallery.inverse_kinematics import InverseKinematics, ReachedPose
 
 SAME = 1e-6  # of reach^2: objectives that differ by less are one optimum
 OUTSIDE = 1e-9  # [rad] beyond the limits
-MODELS = {"Gauss-Newton": InverseKinematics(device="cpu"), "with curvature": InverseKinematics(device="cpu", curvature=True)}
+MODELS = {
+    "Gauss-Newton": InverseKinematics(device="cpu"),
+    "with curvature": InverseKinematics(device="cpu", curvature=True),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,10 +62,21 @@ def targets(count: int, *, seed: int = 134) -> Iterator[Target]:
     for k in range(count):
         name, figure = list(figures(rng).items())[k % 3]
         width = figure.upper - figure.lower
-        goals, reachable = figure.positions(figure.lower + rng.random(figure.hinges) * width), k // 3 % 2 == 0
+        goals, reachable = (
+            figure.positions(figure.lower + rng.random(figure.hinges) * width),
+            k // 3 % 2 == 0,
+        )
         if not reachable:
-            goals = goals * (rng.uniform(1.1, 1.5) * figure.reach / np.linalg.norm(goals, axis=1, keepdims=True))
-        yield Target(name, figure, goals, figure.lower + rng.uniform(0.25, 0.75, figure.hinges) * width, reachable)
+            goals = goals * (
+                rng.uniform(1.1, 1.5) * figure.reach / np.linalg.norm(goals, axis=1, keepdims=True)
+            )
+        yield Target(
+            name,
+            figure,
+            goals,
+            figure.lower + rng.uniform(0.25, 0.75, figure.hinges) * width,
+            reachable,
+        )
 
 
 def peer(target: Target, start: np.ndarray | None = None) -> scipy.optimize.OptimizeResult:
@@ -65,7 +84,9 @@ def peer(target: Target, start: np.ndarray | None = None) -> scipy.optimize.Opti
     figure, inside = target.figure, 1e-10 * (target.figure.upper - target.figure.lower)
     return scipy.optimize.least_squares(
         lambda theta: (figure.positions(theta) - target.goals).ravel(),
-        np.clip(target.start if start is None else start, figure.lower + inside, figure.upper - inside),
+        np.clip(
+            target.start if start is None else start, figure.lower + inside, figure.upper - inside
+        ),
         figure.jacobian,
         bounds=(figure.lower, figure.upper),
         ftol=1e-11,
@@ -85,9 +106,11 @@ class Comparison:
         same: how many objectives agree to SAME.
         better: how many other optima of ours are lower than SciPy's.
         worse: how many are higher.
-        both_stay: of the other optima, how many each code keeps when it starts from the other's answer and ours from ours.
+        both_stay: of the other optima, how many each code keeps when it starts from the other's
+            answer and ours from ours.
         outside: the most by which a limit was passed [rad].
-        overshoot: the most by which a solution of an LCP left its bounds before it was clipped [rad].
+        overshoot: the most by which a solution of an LCP left its bounds before it was clipped
+            [rad].
         grew: steps after which the objective was higher.
         iterations: of all our runs.
         evaluations: of all of SciPy's.
@@ -107,12 +130,21 @@ class Comparison:
     evaluations: int = 0
     worst: float = 0.0
 
-    def add(self, target: Target, pose: ReachedPose, other: scipy.optimize.OptimizeResult, solver: InverseKinematics) -> None:
+    def add(
+        self,
+        target: Target,
+        pose: ReachedPose,
+        other: scipy.optimize.OptimizeResult,
+        solver: InverseKinematics,
+    ) -> None:
         """Count a target."""
         figure, scale = target.figure, target.figure.reach**2
         self.targets += 1
         self.converged += bool(pose)
-        self.outside = max(self.outside, float(np.maximum(figure.lower - pose.theta, pose.theta - figure.upper).max()))
+        self.outside = max(
+            self.outside,
+            float(np.maximum(figure.lower - pose.theta, pose.theta - figure.upper).max()),
+        )
         self.overshoot = max(self.overshoot, pose.overshoot)
         self.grew += int((np.diff(pose.history) > 0).sum())
         self.iterations += pose.iterations
@@ -125,15 +157,23 @@ class Comparison:
         self.worse += difference > 0
         self.worst = max(self.worst, difference)
         kept = abs(float(peer(target, pose.theta).cost) - pose.objective) <= SAME * scale
-        held = abs(solver.solve(figure, target.goals, other.x).objective - float(other.cost)) <= SAME * scale
+        held = (
+            abs(solver.solve(figure, target.goals, other.x).objective - float(other.cost))
+            <= SAME * scale
+        )
         self.both_stay += kept and held
 
 
-def compare(count: int, solvers: dict[str, InverseKinematics], *, seed: int = 134) -> dict[str, dict[str, Comparison]]:
+def compare(
+    count: int, solvers: dict[str, InverseKinematics], *, seed: int = 134
+) -> dict[str, dict[str, Comparison]]:
     """Return, for each of the solvers, counts by figure and whether the goal is in reach."""
     counts: dict[str, dict[str, Comparison]] = {name: {} for name in solvers}
     for target in targets(count, seed=seed):
-        key, other = f"{target.name}, {'in reach' if target.reachable else 'out of reach'}", peer(target)
+        key, other = (
+            f"{target.name}, {'in reach' if target.reachable else 'out of reach'}",
+            peer(target),
+        )
         for name, solver in solvers.items():
             pose = solver.solve(target.figure, target.goals, target.start)
             counts[name].setdefault(key, Comparison()).add(target, pose, other, solver)

@@ -5,7 +5,17 @@ import scipy.sparse
 
 from small_problems import SmallProblem
 
-KINDS = ("chain", "rough chain", "pinched chain", "convection", "wide band", "dominant band", "supported beam", "beam", "frame")
+KINDS = (
+    "chain",
+    "rough chain",
+    "pinched chain",
+    "convection",
+    "wide band",
+    "dominant band",
+    "supported beam",
+    "beam",
+    "frame",
+)
 M_MATRICES = KINDS[:5]
 
 
@@ -13,12 +23,17 @@ def narrow_problem(kind, seed, n):
     """Return a problem of about n unknowns; loads and coefficients are smooth in the index unless the kind says otherwise."""
     rng = np.random.default_rng([seed, n, KINDS.index(kind)])
     A, b = _frame(rng, n) if kind == "frame" else _matrix(kind, rng, n)
-    return SmallProblem(f"{kind} {seed} {n}", A, b, *_bounds(rng, len(b), deflections=kind == "frame"))
+    return SmallProblem(
+        f"{kind} {seed} {n}", A, b, *_bounds(rng, len(b), deflections=kind == "frame")
+    )
 
 
 def _smooth(rng, x):
     parts = range(1, 6)
-    return sum(rng.normal() / j * np.sin(2 * np.pi * j * x * rng.uniform(0.3, 1) + rng.uniform(0, 6)) for j in parts)
+    return sum(
+        rng.normal() / j * np.sin(2 * np.pi * j * x * rng.uniform(0.3, 1) + rng.uniform(0, 6))
+        for j in parts
+    )
 
 
 def _matrix(kind, rng, n):
@@ -30,14 +45,22 @@ def _matrix(kind, rng, n):
             c = 10 ** rng.uniform(-2, 2, n + 1)
         elif kind == "pinched chain":
             c[rng.random(n + 1) < 0.01] = 1e-4
-        wind = rng.uniform(-5, 5) * h if kind == "convection" else 0.0  # upwind differences: the cell Peclet number is small
+        # upwind differences: the cell Peclet number is small
+        wind = rng.uniform(-5, 5) * h if kind == "convection" else 0.0
         lower, upper = c[1:-1] + max(wind, 0), c[1:-1] + max(-wind, 0)
-        A = scipy.sparse.diags_array([-lower, c[:-1] + c[1:] + abs(wind), -upper], offsets=[-1, 0, 1])
+        A = scipy.sparse.diags_array(
+            [-lower, c[:-1] + c[1:] + abs(wind), -upper], offsets=[-1, 0, 1]
+        )
         return A.tocsr(), load * h**2 * (10 if kind == "rough chain" else 1)
     if kind == "dominant band":
-        parts = [scipy.sparse.diags_array(rng.uniform(-1, 1, n - abs(o)), offsets=o, shape=(n, n)) for o in (-3, -2, -1, 1, 2, 3)]
+        parts = [
+            scipy.sparse.diags_array(rng.uniform(-1, 1, n - abs(o)), offsets=o, shape=(n, n))
+            for o in (-3, -2, -1, 1, 2, 3)
+        ]
         A = sum(parts[1:], parts[0])
-        return (A + scipy.sparse.diags_array(abs(A).sum(axis=1) * rng.uniform(1, 1.5, n) + 0.01)).tocsr(), rng.standard_normal(n)
+        return (
+            A + scipy.sparse.diags_array(abs(A).sum(axis=1) * rng.uniform(1, 1.5, n) + 0.01)
+        ).tocsr(), rng.standard_normal(n)
     if kind == "wide band":
         A, sums = scipy.sparse.csr_array((n, n)), np.zeros(n)
         for o in (1, 2, 3):
@@ -48,7 +71,9 @@ def _matrix(kind, rng, n):
         sums[[0, -1]] += 1.0
         return (A + scipy.sparse.diags_array(sums)).tocsr(), 3 * load * h**2
     K = scipy.sparse.diags_array([1.0, -2.0, 1.0], offsets=[-1, 0, 1], shape=(n, n))
-    A = K @ K + (scipy.sparse.diags_array(np.full(n, (30 * h) ** 4)) if kind == "supported beam" else 0 * K)
+    A = K @ K + (
+        scipy.sparse.diags_array(np.full(n, (30 * h) ** 4)) if kind == "supported beam" else 0 * K
+    )
     return A.tocsr(), 150 * load * h**4
 
 
@@ -66,7 +91,11 @@ def _frame(rng, n):
     )
     first = 2 * np.arange(nodes + 1)[:, None]
     rows, columns = first + np.repeat(np.arange(4), 4), first + np.tile(np.arange(4), 4)
-    A = scipy.sparse.coo_array((np.tile(K.ravel(), nodes + 1), (rows.ravel(), columns.ravel()))).tocsr()[2:-2, 2:-2].tocsr()
+    A = (
+        scipy.sparse.coo_array((np.tile(K.ravel(), nodes + 1), (rows.ravel(), columns.ravel())))
+        .tocsr()[2:-2, 2:-2]
+        .tocsr()
+    )
     b = np.zeros(2 * nodes)
     b[::2] = (3000 * _smooth(rng, np.arange(1, nodes + 1) * h) + 600 * rng.normal()) * h**4
     return A, b

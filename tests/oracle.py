@@ -19,7 +19,12 @@ def assemble(cells, faces=(1.0, 1.0, 1.0), shift=None, periodic=(False, False, F
             a, b = index.take(i % count, ax).ravel(), index.take((i + 1) % count, ax).ravel()
             face = faces[axis]
             if np.ndim(face):
-                face = np.asarray(face).reshape([s + (q == ax) for q, s in enumerate(grid.shape)]).take(i + 1, ax).ravel()
+                face = (
+                    np.asarray(face)
+                    .reshape([s + (q == ax) for q, s in enumerate(grid.shape)])
+                    .take(i + 1, ax)
+                    .ravel()
+                )
             for p, q, c in zip(a, b, np.broadcast_to(face, a.shape), strict=True):
                 if 2 not in (grid.ravel()[p], grid.ravel()[q]):
                     A[p, p] += c
@@ -58,7 +63,12 @@ def lemke(M, q, limit=10_000):
             return None
         keys = [np.r_[T[i, -1], T[i, :n]] / T[i, entering] for i in rows]
         row = int(rows[min(range(len(rows)), key=lambda k: tuple(np.round(keys[k], 12)))])
-        ties = [i for i in rows if basis[i] == 2 * n and T[i, -1] / T[i, entering] <= T[row, -1] / T[row, entering] + 1e-12]
+        ties = [
+            i
+            for i in rows
+            if basis[i] == 2 * n
+            and T[i, -1] / T[i, entering] <= T[row, -1] / T[row, entering] + 1e-12
+        ]
         row = ties[0] if ties else row
     return None
 
@@ -93,8 +103,11 @@ def natural_scale(A):
         cost = -np.log(inner)
     allowed = np.isfinite(cost)
     if np.diag(allowed).all():
-        far = 4.0 * len(cost) * (np.abs(cost[allowed]).max(initial=0.0) + 1.0)  # as good as forbidden
-        best = np.where(allowed, cost, far)[linear_sum_assignment(np.where(allowed, cost, far))].sum()
+        # as good as forbidden
+        far = 4.0 * len(cost) * (np.abs(cost[allowed]).max(initial=0.0) + 1.0)
+        best = np.where(allowed, cost, far)[
+            linear_sum_assignment(np.where(allowed, cost, far))
+        ].sum()
         if np.trace(cost) <= best + 1e-6 * max(1, len(cost)):
             d[full] = np.diag(inner)
             return d

@@ -23,8 +23,9 @@ def slopes_of_psi(a, b, kink, scale):
 def plain_row(form, d, x, y, lower, upper, *, share, scale, kink):
     """f of one row, p and q of the element p d + q A_i of its generalized Jacobian, and whether it is at a kink.
 
-    With a = d (x - l) and c = d (u - x): h = -psi(-y, c) takes the place of y where there is an upper bound, and f = psi(a, h) where there
-    is a lower one. Penalized: share f + (1 - share) (a+ y+ - c+ (-y)+) / scale. The minimum map is max(min(y, a), -c).
+    With a = d (x - l) and c = d (u - x): h = -psi(-y, c) takes the place of y where there is an
+    upper bound, and f = psi(a, h) where there is a lower one. Penalized: share f + (1 - share) (a+
+    y+ - c+ (-y)+) / scale. The minimum map is max(min(y, a), -c).
     """
     low, high = math.isfinite(lower), math.isfinite(upper)
     a, c = d * (x - lower) if low else 0.0, d * (upper - x) if high else 0.0
@@ -68,7 +69,10 @@ class PlainMap:
         """f, p, q and the kinks, each an array."""
         y = self.A @ x + self.b
         given = {"share": self.share, "scale": self.scale, "kink": self.kink}
-        rows = [plain_row(self.form, *row, **given) for row in zip(self.d, x, y, self.lower, self.upper, strict=True)]
+        rows = [
+            plain_row(self.form, *row, **given)
+            for row in zip(self.d, x, y, self.lower, self.upper, strict=True)
+        ]
         return tuple(np.array(column) for column in zip(*rows, strict=True))
 
     def merit(self, x):

@@ -13,7 +13,8 @@ import scipy.sparse
 
 INFINITIES = (1e20, 1e30, np.inf)
 VERDICTS = ("solvable",) * 7 + ("infeasible",) * 2 + ("unbounded",)
-DISTINCT = 1e-3  # singular value of the active rows and P, relative, from which a minimizer counts as unique
+# singular value of the active rows and P, relative, from which a minimizer counts as unique
+DISTINCT = 1e-3
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,10 @@ def draw(seed, *, widest=8.0, columns=0.0, most=14):
     """
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, most + 1))
-    kind, verdict = rng.choice(["definite", "semidefinite", "linear"], p=[0.4, 0.35, 0.25]), str(rng.choice(VERDICTS))
+    kind, verdict = (
+        rng.choice(["definite", "semidefinite", "linear"], p=[0.4, 0.35, 0.25]),
+        str(rng.choice(VERDICTS)),
+    )
     rank = {"definite": n, "semidefinite": int(rng.integers(0, n)), "linear": 0}[kind]
     if verdict == "unbounded":
         rank = min(rank, n - 1)
@@ -58,20 +62,29 @@ def draw(seed, *, widest=8.0, columns=0.0, most=14):
     root = rng.standard_normal((n, rank)) * (rng.random((n, rank)) < density)
     P = root @ root.T + (0.1 * np.eye(n) if rank == n else 0.0)
     x = rng.standard_normal(n) * (rng.random(n) < 0.8)
-    m, k = int(rng.integers(0, 2 * n + 1)) * (rng.random() < 0.8), int(rng.integers(0, n // 2 + 1)) * (rng.random() < 0.6)
+    m, k = (
+        int(rng.integers(0, 2 * n + 1)) * (rng.random() < 0.8),
+        int(rng.integers(0, n // 2 + 1)) * (rng.random() < 0.6),
+    )
     G, A = (rng.standard_normal((rows, n)) * (rng.random((rows, n)) < density) for rows in (m, k))
     if m > 1 and rng.random() < 0.3:  # a duplicate, and a sum of two
         G[-1] = G[0] if rng.random() < 0.5 else G[0] + G[m // 2]
     if k > 1 and rng.random() < 0.4:
         A[-1] = A[0] if rng.random() < 0.5 else A[0] - A[k // 2]
     # active rows: their slack is 0, and their multiplier mostly not
-    tight, sides = rng.random(m) < 0.3, rng.choice([-1, 0, 1], n, p=[0.2, 0.6, 0.2]) * (rng.random() < 0.7)
+    tight, sides = (
+        rng.random(m) < 0.3,
+        rng.choice([-1, 0, 1], n, p=[0.2, 0.6, 0.2]) * (rng.random() < 0.7),
+    )
     z = np.where(tight, rng.uniform(0.3, 2.0, m) * (rng.random(m) < 0.9), 0.0)
     z_box = sides * rng.uniform(0.3, 2.0, n) * (rng.random(n) < 0.9)
     h = G @ x + np.where(tight, 0.0, rng.uniform(0.1, 2.0, m))
     lower, upper = x - rng.uniform(0.1, 2.0, n), x + rng.uniform(0.1, 2.0, n)
     lower, upper = np.where(sides < 0, x, lower), np.where(sides > 0, x, upper)
-    lower[(rng.random(n) < 0.4) & (sides >= 0)], upper[(rng.random(n) < 0.4) & (sides <= 0)] = -np.inf, np.inf
+    lower[(rng.random(n) < 0.4) & (sides >= 0)], upper[(rng.random(n) < 0.4) & (sides <= 0)] = (
+        -np.inf,
+        np.inf,
+    )
     h[(rng.random(m) < 0.15) & ~tight] = np.inf
     b, y = A @ x, rng.standard_normal(k)
     q = -(P @ x + G.T @ z + A.T @ y + z_box)
@@ -80,13 +93,25 @@ def draw(seed, *, widest=8.0, columns=0.0, most=14):
     if verdict == "unbounded":
         P, q, G, A, lower, upper = _opened(rng, P, q, G, A, lower, upper)
         h, b = np.where(np.isinf(h), h, G @ x + (h > G @ x)), A @ x
-    active = np.vstack([P, A, G[: len(z)][z > 0], np.eye(n)[z_box != 0]]) if verdict == "solvable" else np.zeros((1, n))
+    active = (
+        np.vstack([P, A, G[: len(z)][z > 0], np.eye(n)[z_box != 0]])
+        if verdict == "solvable"
+        else np.zeros((1, n))
+    )
     values = np.linalg.svd(active, compute_uv=False)
     unique = bool(len(active) >= n and values[n - 1] > DISTINCT * max(values[0], 1.0))
     plain = {"P": P, "q": q, "G": G, "h": h, "A": A, "b": b, "lb": lower, "ub": upper}
     units = 10.0 ** rng.uniform(-columns, columns, n)
     cost = 10.0 ** rng.uniform(-widest, widest)
-    return Drawn(plain, _scaled(rng, plain, cost, units, widest, density < 1), verdict, x, unique, cost, units)
+    return Drawn(
+        plain,
+        _scaled(rng, plain, cost, units, widest, density < 1),
+        verdict,
+        x,
+        unique,
+        cost,
+        units,
+    )
 
 
 def _contradicted(rng, x, G, h, A, b, lower, upper):
@@ -101,9 +126,23 @@ def _contradicted(rng, x, G, h, A, b, lower, upper):
         lower = np.where(np.arange(n) == j, np.where(np.isfinite(lower), lower, x - 1.0), lower)
         return np.vstack([G, np.eye(n)[j]]), np.r_[h, lower[j] - gap], A, b, lower, upper
     if way == "equations":
-        return G, h, np.vstack([A, row, row * 2.0]), np.r_[b, row @ x, 2.0 * (row @ x + gap)], lower, upper
+        return (
+            G,
+            h,
+            np.vstack([A, row, row * 2.0]),
+            np.r_[b, row @ x, 2.0 * (row @ x + gap)],
+            lower,
+            upper,
+        )
     other = rng.standard_normal(n)
-    return np.vstack([G, row, other, -row - other]), np.r_[h, row @ x, other @ x, -(row + other) @ x - gap], A, b, lower, upper
+    return (
+        np.vstack([G, row, other, -row - other]),
+        np.r_[h, row @ x, other @ x, -(row + other) @ x - gap],
+        A,
+        b,
+        lower,
+        upper,
+    )
 
 
 def _opened(rng, P, q, G, A, lower, upper):
@@ -127,11 +166,15 @@ def _scaled(rng, plain, cost, units, widest, sparse):
         return np.where(np.isinf(values), sign * rng.choice(INFINITIES, len(values)), values)
 
     found = {
-        "P": made(cost * units[:, None] * p["P"] * units), "q": cost * units * p["q"],
-        "G": made(rows[:, None] * p["G"] * units), "h": infinite(rows * p["h"], 1.0),
-        "A": made(equations[:, None] * p["A"] * units), "b": equations * p["b"],
-        "lb": infinite(p["lb"] / units, -1.0), "ub": infinite(p["ub"] / units, 1.0),
-    }  # fmt: skip
+        "P": made(cost * units[:, None] * p["P"] * units),
+        "q": cost * units * p["q"],
+        "G": made(rows[:, None] * p["G"] * units),
+        "h": infinite(rows * p["h"], 1.0),
+        "A": made(equations[:, None] * p["A"] * units),
+        "b": equations * p["b"],
+        "lb": infinite(p["lb"] / units, -1.0),
+        "ub": infinite(p["ub"] / units, 1.0),
+    }
     for matrix, right in (("G", "h"), ("A", "b")):
         if not len(found[right]) and rng.random() < 0.7:  # else a matrix without rows
             found[matrix] = found[right] = None

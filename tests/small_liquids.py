@@ -11,7 +11,9 @@ GRAVITY = 9.81
 STEPS = 2000
 
 
-def scene(*, size: list[float], resolution: int, liquid: list[dict[str, Any]], **tables: Any) -> LiquidScene:
+def scene(
+    *, size: list[float], resolution: int, liquid: list[dict[str, Any]], **tables: Any
+) -> LiquidScene:
     """Return a scene; `wall`, `solids` and `cfl` are short for domain.wall, domain.solids and time.cfl, the rest are tables."""
     data: dict[str, Any] = {
         "scene": {"simulator": "fluids"},
@@ -32,7 +34,9 @@ def box(low: list[float], high: list[float], **more: Any) -> dict[str, Any]:
     return {"shape": "box", "min": low, "max": high, **more}
 
 
-def create(model: LiquidScene, wall_velocity: np.ndarray | None = None, device: str = "cpu") -> LiquidSimulation:
+def create(
+    model: LiquidScene, wall_velocity: np.ndarray | None = None, device: str = "cpu"
+) -> LiquidSimulation:
     """Return a simulation."""
     return SIMULATOR.create(model, device=device, folder=Path(), wall_velocity=wall_velocity)
 
@@ -41,10 +45,14 @@ def dam(dimension: int = 2, device: str = "cpu", **tables: Any) -> LiquidSimulat
     """Return a small dam break."""
     size, low, high = [1.0, 0.5, 0.25], [0.0, 0.0, 0.0], [0.375, 0.375, 0.25]
     liquid = [box(low[:dimension], high[:dimension])]
-    return create(scene(size=size[:dimension], resolution=16, liquid=liquid, **tables), device=device)
+    return create(
+        scene(size=size[:dimension], resolution=16, liquid=liquid, **tables), device=device
+    )
 
 
-def advance(simulation: LiquidSimulation, until: float, dt_max: float = 0.02) -> list[dict[str, Any]]:
+def advance(
+    simulation: LiquidSimulation, until: float, dt_max: float = 0.02
+) -> list[dict[str, Any]]:
     """Step to a time and return the rows of the log."""
     rows: list[dict[str, Any]] = []
     while simulation.time < until - 1e-9:
@@ -64,7 +72,21 @@ def random_tank(seed: int) -> dict[str, Any]:
         solids.append({"shape": "sphere", "center": center.tolist(), "radius": size})
         if rng.random() < 0.5:
             turn = rng.uniform(0.0, 180.0, 1 if dimension == 2 else 3).tolist()
-            solids[-1] = box((center - size).tolist(), (center + size).tolist(), rotate=turn, about=center.tolist())
+            solids[-1] = box(
+                (center - size).tolist(),
+                (center + size).tolist(),
+                rotate=turn,
+                about=center.tolist(),
+            )
     top = [0.8, float(rng.uniform(0.35, 0.65)), 0.8][:dimension]
-    tables = {"solids": str(rng.choice(["voxel", "cut-cell"])), "particles": {"seed": seed}, "solid": solids}
-    return {"size": [0.8] * dimension, "resolution": 20, "liquid": [box([0.0] * dimension, top)], **tables}
+    tables = {
+        "solids": str(rng.choice(["voxel", "cut-cell"])),
+        "particles": {"seed": seed},
+        "solid": solids,
+    }
+    return {
+        "size": [0.8] * dimension,
+        "resolution": 20,
+        "liquid": [box([0.0] * dimension, top)],
+        **tables,
+    }

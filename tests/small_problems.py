@@ -42,15 +42,24 @@ def option(seed: int, *, n: int | None = None, kind: str | None = None) -> Small
     rng = np.random.default_rng(seed)
     n = n or int(rng.integers(3, 400))
     kind = kind or ("put", "call")[int(rng.integers(2))]
-    rate, volatility, dividend, share = rng.uniform(0.0, 0.1), rng.uniform(0.05, 0.6), rng.uniform(0.0, 0.08), rng.choice([0.5, 1.0])
+    rate, volatility, dividend, share = (
+        rng.uniform(0.0, 0.1),
+        rng.uniform(0.05, 0.6),
+        rng.uniform(0.0, 0.08),
+        rng.choice([0.5, 1.0]),
+    )
     price = np.linspace(0.0, rng.uniform(2.0, 4.0), n + 2)[1:-1]
     h, dt = price[0], 1.0 / int(rng.integers(20, 200))
     second, first = 0.5 * (volatility * price / h) ** 2, (rate - dividend) * price / (2 * h)
-    L = scipy.sparse.diags_array([(second - first)[1:], -2 * second - rate, (second + first)[:-1]], offsets=[-1, 0, 1])
+    L = scipy.sparse.diags_array(
+        [(second - first)[1:], -2 * second - rate, (second + first)[:-1]], offsets=[-1, 0, 1]
+    )
     payoff = np.maximum(1.0 - price if kind == "put" else price - 1.0, 0.0)
     edge = np.zeros(n)
     at = 0 if kind == "put" else -1
-    edge[at] = -dt * ((second - first)[0] if kind == "put" else (second + first)[-1] * (payoff[-1] + h))
+    edge[at] = -dt * (
+        (second - first)[0] if kind == "put" else (second + first)[-1] * (payoff[-1] + h)
+    )
     b = edge - payoff - (1 - share) * dt * (L @ payoff)
     A = (scipy.sparse.eye_array(n) - share * dt * L).tocsr()
     return SmallProblem(f"{kind} {n}", A, b, payoff, np.full(n, np.inf), payoff)
@@ -61,8 +70,15 @@ def string(seed: int, *, n: int | None = None, between: bool = True) -> SmallPro
     rng = np.random.default_rng(seed)
     n = n or int(rng.integers(1, 400))
     s = np.linspace(0.0, 1.0, n + 2)[1:-1]
-    A = scipy.sparse.diags_array([-np.ones(n - 1), np.full(n, 2.0), -np.ones(n - 1)], offsets=[-1, 0, 1]).tocsr() * (n + 1) ** 2
-    load = rng.uniform(1.0, 40.0) * np.sin(rng.integers(1, 7) * np.pi * s + rng.uniform(0, 2 * np.pi))
+    A = (
+        scipy.sparse.diags_array(
+            [-np.ones(n - 1), np.full(n, 2.0), -np.ones(n - 1)], offsets=[-1, 0, 1]
+        ).tocsr()
+        * (n + 1) ** 2
+    )
+    load = rng.uniform(1.0, 40.0) * np.sin(
+        rng.integers(1, 7) * np.pi * s + rng.uniform(0, 2 * np.pi)
+    )
     bump = rng.uniform(-0.1, 0.3) - rng.uniform(1.0, 12.0) * (s - rng.uniform(0.2, 0.8)) ** 2
     upper = bump + rng.uniform(0.0, 0.3, n) if between else np.full(n, np.inf)
     return SmallProblem(f"{'strings' if between else 'obstacle'} {n}", A, load, bump, upper)
@@ -77,7 +93,11 @@ def banded(seed: int, *, kind: str = "m-matrix") -> SmallProblem:
     A = scipy.sparse.diags_array(entries, offsets=offsets, shape=(n, n)).tocsr()
     if kind == "definite":
         A = A - 0.9 * A.T  # nearly skew: far from dominant
-    reach = abs(A).sum(axis=1) if kind != "definite" else np.full(n, -np.linalg.eigvalsh((A + A.T).toarray() / 2)[0])
+    reach = (
+        abs(A).sum(axis=1)
+        if kind != "definite"
+        else np.full(n, -np.linalg.eigvalsh((A + A.T).toarray() / 2)[0])
+    )
     A = (A + scipy.sparse.diags_array(reach + rng.uniform(0.01, 1.0, n))).tocsr()
     return _random_rows(f"{kind}, {width} bands, {n}", A, rng)
 
@@ -118,7 +138,9 @@ def stepped(problem: SmallProblem, x: np.ndarray) -> SmallProblem:
     return replace(problem, b=problem.b + problem.first - x, start=x)
 
 
-def plain_active_set(problem: SmallProblem, bands: np.ndarray | None = None, limit: int = 1000) -> tuple[np.ndarray, int]:
+def plain_active_set(
+    problem: SmallProblem, bands: np.ndarray | None = None, limit: int = 1000
+) -> tuple[np.ndarray, int]:
     """Return x and steps of the active-set method as one writes it in NumPy: solve on the free set until the set stays.
 
     Args:

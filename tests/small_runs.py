@@ -30,18 +30,31 @@ checkpoint_every = 4
 """
 
 
-def run_into(scene: Scene, out: Path, *, observer: Observer | None = None, **options: Any) -> RunRecord:
+def run_into(
+    scene: Scene, out: Path, *, observer: Observer | None = None, **options: Any
+) -> RunRecord:
     """Run a scene into a folder on the CPU; options are those of a RunRequest or of `run_scene`."""
-    asked = {name: options.pop(name) for name in ("last_frame", "resume", "force", "force_memory", "record_problems") if name in options}
-    return run_scene(RunRequest(scene=scene, out=out, **asked), observer=observer or Lines(Console(quiet=True)), **options)
+    asked = {
+        name: options.pop(name)
+        for name in ("last_frame", "resume", "force", "force_memory", "record_problems")
+        if name in options
+    }
+    return run_scene(
+        RunRequest(scene=scene, out=out, **asked),
+        observer=observer or Lines(Console(quiet=True)),
+        **options,
+    )
 
 
-def write_run(folder: Path, frames: Sequence[list[Part]], text: str = "", size: Sequence[float] = (1.0, 1.0)) -> Path:
+def write_run(
+    folder: Path, frames: Sequence[list[Part]], text: str = "", size: Sequence[float] = (1.0, 1.0)
+) -> Path:
     """Write a run of the simulator `dots`: 10 cells along a side of 1 m, 20 frames a second."""
     folder.mkdir()
     source = folder / "source.toml"
     source.write_text(
-        '[scene]\nsimulator = "dots"\nname = "drops"\n[time]\nduration = 1.0\nframes_per_second = 20\n'
+        '[scene]\nsimulator = "dots"\nname = "drops"\n[time]\nduration = 1.0\nframes_per_second = '
+        "20\n"
         f'[domain]\nsize = {list(size)}\nresolution = 10\nsolids = "cut-cell"\n{text}'
     )
     (folder / "scene.toml").write_text(dump_scene(load_scene(source)))
@@ -51,11 +64,16 @@ def write_run(folder: Path, frames: Sequence[list[Part]], text: str = "", size: 
     return folder
 
 
-def ball(center: Sequence[float], radius: float, name: str = "surface", body: int | None = None) -> Surface:
+def ball(
+    center: Sequence[float], radius: float, name: str = "surface", body: int | None = None
+) -> Surface:
     """Return a sphere of triangles, counterclockwise seen from outside; in 2-D (two coordinates) a circle, its inside on the left."""
     if len(center) == 2:
         angle = np.linspace(0.0, 2.0 * np.pi, 97)[:-1]
-        points = np.stack([center[0] + radius * np.cos(angle), center[1] + radius * np.sin(angle), np.zeros(96)], axis=-1)
+        points = np.stack(
+            [center[0] + radius * np.cos(angle), center[1] + radius * np.sin(angle), np.zeros(96)],
+            axis=-1,
+        )
         corners = np.stack([np.arange(96), np.roll(np.arange(96), -1)], axis=-1)
     else:
         points, corners = sphere()
@@ -79,13 +97,24 @@ def box(low: Sequence[float], high: Sequence[float], name: str = "surface") -> S
             order = np.array([[0, 1, 2], [0, 2, 3]]) if side else np.array([[0, 2, 1], [0, 3, 2]])
             corners.append(order + len(points))
             points.extend(quad)
-    return Surface(name, np.array(points, dtype=np.float32), np.concatenate(corners).astype(np.int32))
+    return Surface(
+        name, np.array(points, dtype=np.float32), np.concatenate(corners).astype(np.int32)
+    )
 
 
 def sphere() -> tuple[np.ndarray, np.ndarray]:
     """Return a unit sphere: an octahedron whose triangles were divided four times."""
     points = [tuple(row) for sign in (1.0, -1.0) for row in sign * np.eye(3)]
-    corners = [(0, 1, 2), (1, 3, 2), (3, 4, 2), (4, 0, 2), (1, 0, 5), (3, 1, 5), (4, 3, 5), (0, 4, 5)]
+    corners = [
+        (0, 1, 2),
+        (1, 3, 2),
+        (3, 4, 2),
+        (4, 0, 2),
+        (1, 0, 5),
+        (3, 1, 5),
+        (4, 3, 5),
+        (0, 4, 5),
+    ]
     for _ in range(4):
         number = {point: index for index, point in enumerate(points)}
         divided = []

@@ -16,10 +16,16 @@ def box(low: list[float], high: list[float], **more: Any) -> dict[str, Any]:
     return {"shape": "box", "min": low, "max": high, **more}
 
 
-def scene(*, size: list[float], resolution: int, sand: list[dict[str, Any]], **tables: Any) -> SandScene:
+def scene(
+    *, size: list[float], resolution: int, sand: list[dict[str, Any]], **tables: Any
+) -> SandScene:
     """Return a scene; `friction` (not a table), `solids`, `open`, `periodic` are of the domain, `cfl` is time.cfl, the rest are tables."""
     of_domain = ("friction", "solids", "open", "periodic")
-    domain = {key: tables.pop(key) for key in of_domain if key in tables and not isinstance(tables[key], dict)}
+    domain = {
+        key: tables.pop(key)
+        for key in of_domain
+        if key in tables and not isinstance(tables[key], dict)
+    }
     data: dict[str, Any] = {
         "scene": {"simulator": "granular"},
         "time": {"duration": 10.0, "cfl": tables.pop("cfl", 0.8)},

@@ -16,7 +16,15 @@ from warp_lcp.rows.program import LaunchGraph
 from warp_lcp.scene.scene_file import built_in_scenes, load_scene
 from warp_lcp.scene.simulator import simulators
 
-CELLS = {"jet": 128, "river": 256, "mesh-obstacle": 30, "retracting-wall": 50, "stirred-tank": 24, "water-labyrinth": 48, "wave-maker": 60}
+CELLS = {
+    "jet": 128,
+    "river": 256,
+    "mesh-obstacle": 30,
+    "retracting-wall": 50,
+    "stirred-tank": 24,
+    "water-labyrinth": 48,
+    "wave-maker": 60,
+}
 STEPS, DT = 3, 0.004
 PLAIN = """
 import json, sys
@@ -41,7 +49,11 @@ def stepped(name: str) -> dict[str, list[float]]:
     for key, value in simulation.state().items():
         rows = np.asarray(value)
         if rows.ndim == 2 and rows.dtype.kind == "f" and len(rows):
-            found[key] = [float(len(rows)), *rows.mean(axis=0, dtype=np.float64), *rows.std(axis=0, dtype=np.float64)]
+            found[key] = [
+                float(len(rows)),
+                *rows.mean(axis=0, dtype=np.float64),
+                *rows.std(axis=0, dtype=np.float64),
+            ]
     return {key: [float(v) for v in values] for key, values in found.items()}
 
 
@@ -51,7 +63,13 @@ def on_the_cpu() -> Iterator[Callable[[str], dict[str, list[float]]]]:
     keep = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
     paths = os.pathsep.join([str(Path(__file__).parent), str(Path(__file__).parents[1])])
     command = [sys.executable, "-c", PLAIN]
-    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env={**keep, "PYTHONPATH": paths})
+    process = subprocess.Popen(
+        command,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**keep, "PYTHONPATH": paths},
+    )
     asked, said = process.stdin, process.stdout
     assert asked is not None
     assert said is not None
@@ -66,19 +84,37 @@ def on_the_cpu() -> Iterator[Callable[[str], dict[str, list[float]]]]:
         yield ask
 
 
-SMALL = 1e-2  # of velocities [m/s] and their gradients [1/s], which stresses solved to 1e-3 leave uncertain in sand that begins to move
+# of velocities [m/s] and their gradients [1/s], which stresses solved to 1e-3 leave uncertain in
+# sand that begins to move
+SMALL = 1e-2
 LONG = ("balls-on-sand-2d", "pouring-pile")  # a minute each
-EMULATED = pytest.mark.skipif("emulated_cuda" not in sys.modules, reason="the plugin emulated_cuda is not there")
+EMULATED = pytest.mark.skipif(
+    "emulated_cuda" not in sys.modules, reason="the plugin emulated_cuda is not there"
+)
 
 
 @EMULATED
-@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name in LONG else ()) for name in built_in_scenes()])
-def test_a_scene_goes_as_on_the_cpu(name: str, on_the_cpu: Callable[[str], dict[str, list[float]]]) -> None:
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow if name in LONG else ())
+        for name in built_in_scenes()
+    ],
+)
+def test_a_scene_goes_as_on_the_cpu(
+    name: str, on_the_cpu: Callable[[str], dict[str, list[float]]]
+) -> None:
     found, expected = stepped(name), on_the_cpu(name)
     assert found.keys() == expected.keys()
     for key, values in found.items():
         assert values[0] == expected[key][0], key
-        np.testing.assert_allclose(values, expected[key], rtol=1e-3, atol=1e-3 * max(np.abs(expected[key][1:]).max(), SMALL), err_msg=key)
+        np.testing.assert_allclose(
+            values,
+            expected[key],
+            rtol=1e-3,
+            atol=1e-3 * max(np.abs(expected[key][1:]).max(), SMALL),
+            err_msg=key,
+        )
 
 
 @EMULATED
@@ -91,13 +127,16 @@ def test_a_step_of_a_liquid_hardly_stops_the_device() -> None:
         meter.clear()
         simulation.step(min(simulation.stable_dt(), DT))
         counts.append([meter["readbacks"], meter["launches"], meter["allocations"]])
-    readbacks, launches, allocations = np.array(counts[2:]).max(axis=0)  # of steps after the kernels have been loaded
+    # of steps after the kernels have been loaded
+    readbacks, launches, allocations = np.array(counts[2:]).max(axis=0)
     assert allocations == 0
     assert readbacks <= 2  # what the solve has come to, and what the step has
-    assert launches <= 200  # most of them in graphs: levels of 16^3 cells are quicker so than in one block
+    # most of them in graphs: levels of 16^3 cells are quicker so than in one block
+    assert launches <= 200
 
 
-CROWDED = "density_correction.max_density=0.9"  # less than there is: the correction moves particles in each step
+# less than there is: the correction moves particles in each step
+CROWDED = "density_correction.max_density=0.9"
 
 
 @EMULATED
@@ -106,28 +145,49 @@ CROWDED = "density_correction.max_density=0.9"  # less than there is: the correc
     [
         ("dam-break", {"calls": 4, "readbacks": 2, "launches": 230}),
         ("dam-break-2d " + CROWDED, {"calls": 6, "readbacks": 3, "launches": 260}),
-        ("floating-bodies-2d", {"calls": 8, "readbacks": 4, "launches": 450}),  # of which a correction takes one
-        pytest.param("column-collapse", {"calls": 7, "readbacks": 3, "launches": 900}, marks=pytest.mark.slow),
-        pytest.param("floating-bodies", {"calls": 6, "readbacks": 3, "launches": 450}, marks=pytest.mark.slow),
-        pytest.param("splash-unilateral", {"calls": 4, "readbacks": 2, "launches": 200}, marks=pytest.mark.slow),
-        pytest.param("honey-coil", {"calls": 32, "readbacks": 8, "launches": 4000}, marks=pytest.mark.slow),
+        # of which a correction takes one
+        ("floating-bodies-2d", {"calls": 8, "readbacks": 4, "launches": 450}),
+        pytest.param(
+            "column-collapse", {"calls": 7, "readbacks": 3, "launches": 900}, marks=pytest.mark.slow
+        ),
+        pytest.param(
+            "floating-bodies", {"calls": 6, "readbacks": 3, "launches": 450}, marks=pytest.mark.slow
+        ),
+        pytest.param(
+            "splash-unilateral",
+            {"calls": 4, "readbacks": 2, "launches": 200},
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            "honey-coil", {"calls": 32, "readbacks": 8, "launches": 4000}, marks=pytest.mark.slow
+        ),
     ],
 )
-def test_graphs_of_a_step_give_the_same_bits_with_few_calls(name: str, most: dict[str, int], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_graphs_of_a_step_give_the_same_bits_with_few_calls(
+    name: str, most: dict[str, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The host waits for the device at each readback, and graphs hold no allocations."""
     from benchmarks.emulated_cuda import meter
 
     states, counts = [], []
     for on_device in (False, True):
         monkeypatch.setattr(LaunchGraph, "on_device", on_device)
-        simulation = made(name.split(maxsplit=1)[0], 16 if name == "column-collapse" else 32, *name.split()[1:])
+        simulation = made(
+            name.split(maxsplit=1)[0], 16 if name == "column-collapse" else 32, *name.split()[1:]
+        )
         for _ in range(4):
             meter.clear()
             row = simulation.step(min(simulation.stable_dt(), DT))
-            counts.append({what: meter[what] for what in ("calls", "readbacks", "launches", "allocations")})
-        states.append({key: np.asarray(value).tobytes() for key, value in simulation.state().items()} | {"row": repr(row)})
+            counts.append(
+                {what: meter[what] for what in ("calls", "readbacks", "launches", "allocations")}
+            )
+        states.append(
+            {key: np.asarray(value).tobytes() for key, value in simulation.state().items()}
+            | {"row": repr(row)}
+        )
     assert [key for key in states[0] if states[0][key] != states[1][key]] == []
-    for what, number in most.items():  # of the last step: the first ones load kernels and capture graphs
+    # of the last step: the first ones load kernels and capture graphs
+    for what, number in most.items():
         assert counts[-1][what] <= number, what
         assert counts[-1][what] > number // 2, f"{what}: lower the bound"
     assert counts[-1]["calls"] < counts[3]["calls"] // 2  # graphs, in place of launches
@@ -135,7 +195,9 @@ def test_graphs_of_a_step_give_the_same_bits_with_few_calls(name: str, most: dic
 
 
 @EMULATED
-def test_bodies_with_more_entries_than_there_is_room_for_are_solved_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bodies_with_more_entries_than_there_is_room_for_are_solved_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """A GPU learns how many cells touch bodies with the solve; one that left some out must not count."""
     states = []
     for least in (coupling.LEAST, 2):
@@ -146,15 +208,27 @@ def test_bodies_with_more_entries_than_there_is_room_for_are_solved_again(monkey
         states.append(simulation.state())
         assert simulation.projection.coupling.columns.capacity > 2
     one, other = (state["bodies"] for state in states)
-    np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6)  # sums over entries are rounded otherwise
+    # sums over entries are rounded otherwise
+    np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6)
     assert np.abs(one[:, 3:]).max() > 0.01  # they move
 
 
 @EMULATED
 def test_the_model_of_gpus_hears_what_is_launched() -> None:
     command = [sys.executable, "-m", "benchmarks.gpu_model", "--cells", "16"]
-    done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=300, cwd=Path(__file__).parents[1])
-    rows = [[float(cell) for cell in line.split("|")[2:-1]] for line in done.stdout.splitlines() if "^3 |" in line]
+    done = subprocess.run(
+        command,
+        check=True,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        cwd=Path(__file__).parents[1],
+    )
+    rows = [
+        [float(cell) for cell in line.split("|")[2:-1]]
+        for line in done.stdout.splitlines()
+        if "^3 |" in line
+    ]
     assert len(rows) == 8
     for table in (np.array(rows[:4]), np.array(rows[4:])):
         launches, gigabytes, *times = table.T
@@ -168,7 +242,14 @@ def test_the_model_of_gpus_hears_what_is_launched() -> None:
 @pytest.mark.slow
 def test_the_verdict_on_a_gpu_is_rehearsed(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "benchmarks.gpu", "--rehearse", "--out", str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=600, cwd=Path(__file__).parents[1], check=False)
+    done = subprocess.run(
+        command,
+        capture_output=True,
+        text=True,
+        timeout=600,
+        cwd=Path(__file__).parents[1],
+        check=False,
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     verdict = json.loads((tmp_path / "verdict.json").read_text())
     assert len(verdict["claims"]) >= 7

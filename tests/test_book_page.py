@@ -11,7 +11,11 @@ ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "book.md"
 TEXT = PAGE.read_text()
 TABLE = ROOT / "docs" / "api" / "book.md"
-ROWS = [[cell.strip() for cell in line.strip("|").split("|")] for line in TABLE.read_text().splitlines() if "::" in line]
+ROWS = [
+    [cell.strip() for cell in line.strip("|").split("|")]
+    for line in TABLE.read_text().splitlines()
+    if "::" in line
+]
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row[0])
@@ -20,7 +24,9 @@ def test_a_row_leads_to_its_source_test_and_picture(row):
     assert what
     assert (ROOT / source.strip("`")).is_file()
     file, _, function = test.strip("`").partition("::")
-    assert re.search(rf"^def {function}\(", (ROOT / file).read_text(), flags=re.M), f"{file} has no test {function}"
+    assert re.search(rf"^def {function}\(", (ROOT / file).read_text(), flags=re.M), (
+        f"{file} has no test {function}"
+    )
     links = re.findall(r"\]\(([^)]+)\)", pages)
     assert links
     assert all((TABLE.parent / link).is_file() for link in links)
@@ -29,20 +35,30 @@ def test_a_row_leads_to_its_source_test_and_picture(row):
 def test_every_algorithm_and_figure_has_its_row():
     named = {"Algorithm": set(), "Figure": set()}
     for first, *_ in ROWS:
-        for kind, text in re.findall(r"(Algorithm|Figure)s? ([\dC][\d.]*(?:(?: to |, )[\d.C]+)*)", first):
+        for kind, text in re.findall(
+            r"(Algorithm|Figure)s? ([\dC][\d.]*(?:(?: to |, )[\d.C]+)*)", first
+        ):
             prefix = text.partition(".")[0]
             for begin, end in re.findall(r"([\dC][\d.]*)(?: to ([\dC][\d.]*))?", text):
                 numbers = [int(part.rpartition(".")[2]) for part in (begin, end or begin)]
                 names = range(numbers[0], numbers[1] + 1)
                 named[kind] |= {str(n) if kind == "Algorithm" else f"{prefix}.{n}" for n in names}
     assert named["Algorithm"] == {str(n) for n in range(1, 14)}
-    assert named["Figure"] == {f"{part}.{n}" for part, most in (("1", 18), ("2", 13), ("C", 6)) for n in range(1, most + 1)}
+    assert named["Figure"] == {
+        f"{part}.{n}" for part, most in (("1", 18), ("2", 13), ("C", 6)) for n in range(1, most + 1)
+    }
 
 
 def test_the_page_shows_every_picture_of_the_suite():
-    kept = {path.name for path in (ROOT / "benchmarks" / "results" / "intel-xeon").glob("book-*.png")}
-    assert kept == set(re.findall(r"!\[[^]]*\]\(\.\./benchmarks/results/intel-xeon/(book-[\w-]+\.png)\)", TEXT))
-    assert {path.name for path in PAGE.parent.glob("book-*.webp")} == set(re.findall(r"!\[[^]]*\]\((book-[\w-]+\.webp)\)", TEXT))
+    kept = {
+        path.name for path in (ROOT / "benchmarks" / "results" / "intel-xeon").glob("book-*.png")
+    }
+    assert kept == set(
+        re.findall(r"!\[[^]]*\]\(\.\./benchmarks/results/intel-xeon/(book-[\w-]+\.png)\)", TEXT)
+    )
+    assert {path.name for path in PAGE.parent.glob("book-*.webp")} == set(
+        re.findall(r"!\[[^]]*\]\((book-[\w-]+\.webp)\)", TEXT)
+    )
 
 
 def test_figures_are_those_of_the_results():

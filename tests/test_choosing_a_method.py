@@ -24,7 +24,13 @@ def indefinite(n=60, seed=71):
     """Return a planted problem with a symmetric matrix of which a tenth of the eigenvalues is negative."""
     rng = np.random.default_rng(seed)
     values = np.where(np.arange(n) < n // 10, -0.3, np.geomspace(0.1, 1, n))
-    return planted(spectrum_matrix(values, rng), rng, Plant(), name="indefinite", facts=frozenset({"symmetric"}))
+    return planted(
+        spectrum_matrix(values, rng),
+        rng,
+        Plant(),
+        name="indefinite",
+        facts=frozenset({"symmetric"}),
+    )
 
 
 MATRICES = {
@@ -40,7 +46,9 @@ def outcome(name, problem):
     """Return how a method ends on a problem: "solved", "refuses" or a status."""
     method = wl.METHODS[name]
     try:
-        result = wl.solve(problem.lcp(device="cpu"), method(), stopping=wl.StoppingCriteria(rtol=1e-6, **LIMITS))
+        result = wl.solve(
+            problem.lcp(device="cpu"), method(), stopping=wl.StoppingCriteria(rtol=1e-6, **LIMITS)
+        )
     except ValueError:
         return "refuses"
     return "solved" if result else result.status.name
@@ -48,12 +56,18 @@ def outcome(name, problem):
 
 def section(title, text=TEXT):
     """The text under a heading."""
-    return re.search(rf"^## {re.escape(title)}.*?\n(.*?)(?=^## |\Z)", text, flags=re.M | re.S).group(1)
+    return re.search(
+        rf"^## {re.escape(title)}.*?\n(.*?)(?=^## |\Z)", text, flags=re.M | re.S
+    ).group(1)
 
 
 def table(title, text=TEXT):
     """First cells, without quotes, and the other cells of a section's table."""
-    rows = [[cell.strip() for cell in line.strip("| ").split("|")] for line in section(title, text).splitlines() if line.startswith("| ")]
+    rows = [
+        [cell.strip() for cell in line.strip("| ").split("|")]
+        for line in section(title, text).splitlines()
+        if line.startswith("| ")
+    ]
     return rows[0], {row[0].strip("`"): row[1:] for row in rows[1:]}
 
 
@@ -72,7 +86,10 @@ def test_costs_are_of_methods():
     not_measured = {"direct-enumeration", "proximal-gauss-seidel", "proximal-point"}
     assert set(rows) == set(wl.METHODS) - not_measured
     for dense, grid in rows.values():
-        assert all(cell == "-" or re.fullmatch(r"-?\d\.\d, -?\d\.\d \(\d+ steps, \d+ ms\)", cell) for cell in (dense, grid))
+        assert all(
+            cell == "-" or re.fullmatch(r"-?\d\.\d, -?\d\.\d \(\d+ steps, \d+ ms\)", cell)
+            for cell in (dense, grid)
+        )
 
 
 HEADER, CLAIMS = table("What A must be")
@@ -87,12 +104,20 @@ def test_claims_about_matrices_hold(name):
 
 
 def test_all_dense_methods_have_claims():
-    assert set(CLAIMS) == set(wl.METHODS) - {"direct-enumeration", "projected-multigrid", "proximal-gauss-seidel"}
+    assert set(CLAIMS) == set(wl.METHODS) - {
+        "direct-enumeration",
+        "projected-multigrid",
+        "proximal-gauss-seidel",
+    }
 
 
 def test_reformulations_live_where_it_says():
     named = set(re.findall(r"`reformulate\.(\w+)`", section("Reformulations")))
-    public = {name for name in vars(reformulate) if re.fullmatch(r"\w+_to_\w+", name) and not name.startswith("_")}
+    public = {
+        name
+        for name in vars(reformulate)
+        if re.fullmatch(r"\w+_to_\w+", name) and not name.startswith("_")
+    }
     assert named == public
 
 

@@ -24,18 +24,23 @@ ARCHS = ("sm_80", "sm_90", "sm_100")
 REGISTERS = 65536  # of a multiprocessor, on all of them
 # Kernels that may spill, and why.
 SPILLS = {
-    "warp_lcp.blocked_gauss_seidel.*_[56]:*": "a thread enumerates the sets of a block of 5 or 6 unknowns with its matrix at hand",
+    "warp_lcp.blocked_gauss_seidel.*_[56]:*": "a thread enumerates the sets of a block of 5 or 6 "
+    "unknowns with its matrix at hand",
     "warp_lcp.small_levels.coarsen.*": "a few hundred bytes once a solve, in one block",
-    "warp_lcp.small_levels.cycle.solve.*": "84 bytes of a level that is solved directly, all there is of it",
+    "warp_lcp.small_levels.cycle.solve.*": "84 bytes of a level that is solved directly, all there "
+    "is of it",
     "warp_lcp.coarsest.invert_*": "20 bytes once a solve, in one block",
 }
-# Kernels that take more than 128 registers, so that fewer than 512 threads fit on a multiprocessor, and why that is how it is.
+# Kernels that take more than 128 registers, so that fewer than 512 threads fit on a multiprocessor,
+# and why that is how it is.
 LARGE = {
     "warp_lcp.blocked_gauss_seidel.*_[23456]:*": "as above",
-    "granular.stress_3d_float64_residual_rate*": "the residual's step with friction that grows with the rate, in float64",
+    "granular.stress_3d_float64_residual_rate*": "the residual's step with friction that grows "
+    "with the rate, in float64",
     "granular.bodies_3d_float64*": "the same at cells that a body touches",
     "granular.report_3d*": "130 on sm_80: what the log tells, once a step",
-    "warp_lcp.mprgp.split.variable_float64_float64_float64:split": "an operator in float64 throughout",
+    "warp_lcp.mprgp.split.variable_float64_float64_float64:split": "an operator in float64 "
+    "throughout",
     "granular.packing:contents_kernel": "once a run",
     "warp_lcp.grid.mesh_crossings:find_crossings": "once a mesh",
     "fluids.coupling:*": "bodies' cells only",
@@ -43,9 +48,14 @@ LARGE = {
 
 # Instructions that passes may issue a cell, of the finer grid of a transfer, on sm_90.
 ISSUED = {
-    "stencil.product": 45, "cycle.sweep": 55, "cycle.restrict": 30, "cycle.correct": 40, "projected_multigrid.update": 60,
-    "projected_multigrid.assess": 115, "projected_multigrid.measure": 55,
-}  # fmt: skip
+    "stencil.product": 45,
+    "cycle.sweep": 55,
+    "cycle.restrict": 30,
+    "cycle.correct": 40,
+    "projected_multigrid.update": 60,
+    "projected_multigrid.assess": 115,
+    "projected_multigrid.measure": 55,
+}
 
 
 def known(kernel: str, among: dict[str, str]) -> bool:
@@ -73,16 +83,30 @@ def costs(ptx: Path, arch: str) -> list[Cost]:
     text = ptx.read_text().rstrip("\0 \n") + "\n"  # Warp ends it with a NUL, which ptxas refuses
     blocks = dict(re.findall(r"\.entry (\w+)\([^{]*?\)\s*(?:\.maxntid (\d+))?", text))
     done = subprocess.run(
-        [ptxas, "-v", f"-arch={arch}", "/dev/stdin", "-o", "/dev/null"], input=text, capture_output=True, text=True, check=True
+        [ptxas, "-v", f"-arch={arch}", "/dev/stdin", "-o", "/dev/null"],
+        input=text,
+        capture_output=True,
+        text=True,
+        check=True,
     )
     found = []
     for part in re.split(r"Compiling entry function '", done.stderr)[1:]:
         entry = part.partition("'")[0]
-        frame = re.search(r"(\d+) bytes stack frame, (\d+) bytes spill stores, (\d+) bytes spill loads", part)
-        registers, shared = re.search(r"Used (\d+) registers", part), re.search(r"(\d+) bytes smem", part)
+        frame = re.search(
+            r"(\d+) bytes stack frame, (\d+) bytes spill stores, (\d+) bytes spill loads", part
+        )
+        registers, shared = (
+            re.search(r"Used (\d+) registers", part),
+            re.search(r"(\d+) bytes smem", part),
+        )
         assert frame and registers, part
         name = re.sub(r"_[0-9a-f]{8}_cuda_kernel_forward", "", entry)
-        numbers = (int(registers[1]), *map(int, frame.groups()), int(shared[1]) if shared else 0, int(blocks.get(entry) or 256))
+        numbers = (
+            int(registers[1]),
+            *map(int, frame.groups()),
+            int(shared[1]) if shared else 0,
+            int(blocks.get(entry) or 256),
+        )
         found.append(Cost(f"{ptx.parent.name}:{name}", arch, *numbers))
     return found
 
@@ -93,12 +117,16 @@ def table(rows: list[Cost]) -> str:
     for kernel, group in itertools.groupby(sorted(rows), key=lambda row: row.kernel):
         by_arch = {row.arch: row for row in group}
         most = (max(values) for values in zip(*(row[3:] for row in by_arch.values()), strict=True))
-        lines.append("\t".join(map(str, [kernel, *(by_arch[arch].registers for arch in ARCHS), *most])))
+        lines.append(
+            "\t".join(map(str, [kernel, *(by_arch[arch].registers for arch in ARCHS), *most]))
+        )
     return "\n".join(lines) + "\n"
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(tool("ptxas") is None, reason="nvidia-cuda-nvcc, which has ptxas, is not installed")
+@pytest.mark.skipif(
+    tool("ptxas") is None, reason="nvidia-cuda-nvcc, which has ptxas, is not installed"
+)
 def test_kernels_stay_within_their_budgets(tmp_path: Path) -> None:
     folder = Path(os.environ.get("PTX", tmp_path))
     for name in modules_of_every_kernel((wp.float32, wp.float64)):
@@ -106,24 +134,47 @@ def test_kernels_stay_within_their_budgets(tmp_path: Path) -> None:
             compile_for_cuda(name, [80], folder / name)
     modules = sorted(folder.glob("*/*.ptx"))
     with ThreadPoolExecutor() as pool:
-        rows = [row for part in pool.map(lambda job: costs(*job), [(m, arch) for m in modules for arch in ARCHS]) for row in part]
+        rows = [
+            row
+            for part in pool.map(
+                lambda job: costs(*job), [(m, arch) for m in modules for arch in ARCHS]
+            )
+            for row in part
+        ]
     if "TABLE" in os.environ:
         Path(os.environ["TABLE"]).write_text(table(rows))
     for row in rows:
         assert row.registers * row.block <= REGISTERS, row
-    spilling, large = {row.kernel for row in rows if row.spilled}, {row.kernel for row in rows if row.registers > 128}
+    spilling, large = (
+        {row.kernel for row in rows if row.spilled},
+        {row.kernel for row in rows if row.registers > 128},
+    )
     assert {kernel for kernel in spilling if not known(kernel, SPILLS)} == set()
     assert {kernel for kernel in large if not known(kernel, LARGE)} == set()
     for among, found in ((SPILLS, spilling), (LARGE, large)):
-        assert [pattern for pattern in among if not fnmatch.filter(found, pattern)] == []  # nobody is excused for nothing
+        # nobody is excused for nothing
+        assert [pattern for pattern in among if not fnmatch.filter(found, pattern)] == []
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(bool(tools_missing()), reason="the extra ptxas, which has the tools, is not installed")
+@pytest.mark.skipif(
+    bool(tools_missing()), reason="the extra ptxas, which has the tools, is not installed"
+)
 def test_passes_issue_few_instructions() -> None:
     command = [sys.executable, "-m", "benchmarks.gpu_model", "--sass"]
-    done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=1200, cwd=Path(__file__).parents[1])
+    done = subprocess.run(
+        command,
+        check=True,
+        capture_output=True,
+        text=True,
+        timeout=1200,
+        cwd=Path(__file__).parents[1],
+    )
     found = defaultdict[str, float](float)
-    for name, issued in re.findall(r"^\| `([\w.]+)[^`]*` \| ([\d.]+) \|", done.stdout, re.MULTILINE):
+    for name, issued in re.findall(
+        r"^\| `([\w.]+)[^`]*` \| ([\d.]+) \|", done.stdout, re.MULTILINE
+    ):
         found[name] = max(found[name], float(issued))
-    assert [(name, found[name], most) for name, most in ISSUED.items() if not 0 < found[name] <= most] == []
+    assert [
+        (name, found[name], most) for name, most in ISSUED.items() if not 0 < found[name] <= most
+    ] == []

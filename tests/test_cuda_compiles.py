@@ -37,10 +37,14 @@ from warp_lcp.rows.row_pass import RowPass
 from warp_lcp.rows.vectors import CUDA_BLOCK
 from warp_lcp.solvers.mprgp import MPRGP
 
-# Modules that have compiled for CUDA, with the hash of their sources. `python tests/test_cuda_compiles.py` compiles the
-# others and writes it.
+# Modules that have compiled for CUDA, with the hash of their sources.
+# `python tests/test_cuda_compiles.py` compiles the others and writes it.
 COMPILED = Path(__file__).with_name("compiled_for_cuda.txt")
-ONE_LAUNCH = [CycleSettings(one_launch_cpu=4096), CycleSettings(one_launch_cpu=4096, coarsest_cpu=8)]  # as GPUs cycle
+# as GPUs cycle
+ONE_LAUNCH = [
+    CycleSettings(one_launch_cpu=4096),
+    CycleSettings(one_launch_cpu=4096, coarsest_cpu=8),
+]
 METHODS = [
     wl.MinimumMapNewton(),
     wl.MinimumMapNewton(precision="double"),
@@ -58,18 +62,27 @@ def use_every_kernel(reals):
     face = np.full((4, 4, 5), 0.5)
     for dtype in reals:
         for faces in ({}, {"face_x": 2.0}, {"face_x": face}):
-            problem = wl.LCP(wl.GridPoisson(cells, device="cpu", dtype=dtype, **faces), -np.ones(cells.shape))
+            problem = wl.LCP(
+                wl.GridPoisson(cells, device="cpu", dtype=dtype, **faces), -np.ones(cells.shape)
+            )
             for solver in METHODS:
                 assert wl.solve(problem, solver, stopping=wl.StoppingCriteria(rtol=1e-4))
             fused = mock.patch.object(StencilLevel, "fuses", False)
             with fused:  # as on CUDA, with small levels apart and together
-                for precision, cycle in itertools.product(("mixed", "double"), (CycleSettings(coarsest_cpu=8), *ONE_LAUNCH)):
+                for precision, cycle in itertools.product(
+                    ("mixed", "double"), (CycleSettings(coarsest_cpu=8), *ONE_LAUNCH)
+                ):
                     method = wl.ProjectedMultigrid(precision=precision, cycle=cycle)
                     assert wl.solve(problem, method, stopping=wl.StoppingCriteria(rtol=1e-4))
-        assert Hierarchy(problem.A.stencil, dtype, bounded=False, settings=ONE_LAUNCH[1])._small.coarsening.kernel
+        assert Hierarchy(
+            problem.A.stencil, dtype, bounded=False, settings=ONE_LAUNCH[1]
+        )._small.coarsening.kernel
     for real in (wp.float32, wp.float64):
         transfer_passes(real)
-    wl.solve(wl.LCP(wl.DenseOperator(np.eye(3), device="cpu"), -np.ones(3)), wl.MinimumMapNewton(precision="single"))
+    wl.solve(
+        wl.LCP(wl.DenseOperator(np.eye(3), device="cpu"), -np.ones(3)),
+        wl.MinimumMapNewton(precision="single"),
+    )
 
 
 def use_sparse_kernels(reals):
@@ -79,18 +92,34 @@ def use_sparse_kernels(reals):
     for dtype in reals:
         low = wl.LowRankOperator(np.full((4, 4, 1), 0.1), [1.0], device="cpu", dtype=dtype)
         grid = wl.GridPoisson(cells, device="cpu", dtype=dtype, shift=1.0)
-        operators = [wl.SparseOperator(m, device="cpu", dtype=dtype) for m in (T, (T + T.T).tocsr())]
-        operators += [wl.SumOperator(grid, low), wl.SumOperator(low, wl.GridPoisson(cells, device="cpu", dtype=dtype)), grid]
+        operators = [
+            wl.SparseOperator(m, device="cpu", dtype=dtype) for m in (T, (T + T.T).tocsr())
+        ]
+        operators += [
+            wl.SumOperator(grid, low),
+            wl.SumOperator(low, wl.GridPoisson(cells, device="cpu", dtype=dtype)),
+            grid,
+        ]
         for A in operators:
-            problem, x = wl.LCP(A, -np.ones(A.shape)), wp.ones(A.shape, dtype=wp.float64, device="cpu")
+            problem, x = (
+                wl.LCP(A, -np.ones(A.shape)),
+                wp.ones(A.shape, dtype=wp.float64, device="cpu"),
+            )
             A.apply_transpose(x)
             for real in (wp.float32, wp.float64):
                 system = principal_system(problem, real, bounded=True, shifted=True)
-                system.restrict(problem.layout.load(np.ones(A.shape), wp.uint8), problem.layout.load(np.ones(A.shape), wp.float64))
+                system.restrict(
+                    problem.layout.load(np.ones(A.shape), wp.uint8),
+                    problem.layout.load(np.ones(A.shape), wp.float64),
+                )
                 system.r.assign(problem.layout.load(np.ones(A.shape), system.r.dtype))
-                assert system.solve(1e-3 * system.norm(), 50)[1] < 1e-3 * np.sqrt(problem.layout.size)
+                assert system.solve(1e-3 * system.norm(), 50)[1] < 1e-3 * np.sqrt(
+                    problem.layout.size
+                )
         for A in operators[:2]:
-            A.relax(*(wp.ones(100, dtype=wp.float64, device="cpu") for _ in range(4)), 1.0, colored=True)
+            A.relax(
+                *(wp.ones(100, dtype=wp.float64, device="cpu") for _ in range(4)), 1.0, colored=True
+            )
 
 
 def use_sweeping_kernels(reals):
@@ -100,10 +129,18 @@ def use_sweeping_kernels(reals):
     for dtype in reals:
         dense = wl.LCP(wl.DenseOperator(T.toarray(), device="cpu", dtype=dtype), -np.ones(30))
         sparse = wl.LCP(wl.SparseOperator(T, device="cpu", dtype=dtype), -np.ones(30))
-        grid = wl.LCP(wl.GridPoisson(np.array([[0, 1, 1, 1]]), device="cpu", dtype=dtype), -np.ones((1, 4)))
+        grid = wl.LCP(
+            wl.GridPoisson(np.array([[0, 1, 1, 1]]), device="cpu", dtype=dtype), -np.ones((1, 4))
+        )
         blocks = [wl.BlockedGaussSeidel(blocks=size) for size in range(1, 7)]
         orders = [wl.ProjectedSOR(order="magnitude"), wl.ProjectedSOR(order="greedy")]
-        first = [wl.ProjectedJacobi(), wl.NNCG(), wl.AcceleratedProjectedGradient(), wl.Staggering(), wl.SubspaceMinimization()]
+        first = [
+            wl.ProjectedJacobi(),
+            wl.NNCG(),
+            wl.AcceleratedProjectedGradient(),
+            wl.Staggering(),
+            wl.SubspaceMinimization(),
+        ]
         for solver in [*blocks, *orders, *first, wl.SubspaceMinimization(precision="double")]:
             assert wl.solve(dense, solver)
         for problem in (sparse, grid):
@@ -123,13 +160,21 @@ def use_gradient_projection_kernels(reals):
     T = scipy.sparse.diags_array([-1.0, 3.0, -1.0], offsets=[-1, 0, 1], shape=(100, 100)).tocsr()
     cells = np.array([[0, 1, 1, 1]])
     for dtype in reals:
-        operators = [wl.DenseOperator(T.toarray(), device="cpu", dtype=dtype), wl.SparseOperator(T, device="cpu", dtype=dtype)]
+        operators = [
+            wl.DenseOperator(T.toarray(), device="cpu", dtype=dtype),
+            wl.SparseOperator(T, device="cpu", dtype=dtype),
+        ]
         for faces in ({}, {"face_x": 2.0}, {"face_x": np.ones((1, 5))}):
             operators.append(wl.GridPoisson(cells, device="cpu", dtype=dtype, **faces))
         for A in operators:
             for precision in ("mixed", "double"):
                 assert wl.solve(wl.LCP(A, -np.ones(A.shape)), MPRGP(precision=precision))
-                assert wl.solve(wl.LCP(A, -np.ones(A.shape), 0.0), MPRGP(precision=precision), x0=np.zeros(A.shape))  # releases all
+                # releases all
+                assert wl.solve(
+                    wl.LCP(A, -np.ones(A.shape), 0.0),
+                    MPRGP(precision=precision),
+                    x0=np.zeros(A.shape),
+                )
 
 
 def use_newton_kernels(reals):
@@ -142,10 +187,16 @@ def use_newton_kernels(reals):
         for faces in ({}, {"face_x": 2.0}, {"face_x": np.full((4, 4, 5), 0.5)}):
             operators.append(wl.GridPoisson(cells, device="cpu", dtype=dtype, **faces))
         for A in operators:
-            problem = wl.LCP(A, np.where(np.arange(np.prod(A.shape)).reshape(A.shape) % 2, -1.0, 1.0))
+            problem = wl.LCP(
+                A, np.where(np.arange(np.prod(A.shape)).reshape(A.shape) % 2, -1.0, 1.0)
+            )
             for precision in ("mixed", "double"):
                 for method in (wl.MinimumMapNewton, wl.FischerNewton, wl.InteriorPoint, wl.Penalty):
-                    assert wl.solve(problem, method(precision=precision), stopping=wl.StoppingCriteria(rtol=1e-4)), (A, method, precision)
+                    assert wl.solve(
+                        problem,
+                        method(precision=precision),
+                        stopping=wl.StoppingCriteria(rtol=1e-4),
+                    ), (A, method, precision)
 
 
 @wp.func
@@ -156,29 +207,62 @@ def drift(j: int, i: int):
 def use_stencil_kernels(reals):
     """Instantiate the kernels of compact stencils: of numbers, arrays and functions, of lines and aggregates, and of matrices."""
     nine = np.array([[-1.0, -1.0, -1.0], [-1.0, 9.0, -1.0], [-1.0, -1.0, -1.0]])
-    cells, wind = np.ones((12, 12), dtype=int), {(0, 0): 5.0, (0, 1): -0.5, (1, 0): -1.0, (-1, 0): -1.0}
+    cells, wind = (
+        np.ones((12, 12), dtype=int),
+        {(0, 0): 5.0, (0, 1): -0.5, (1, 0): -1.0, (-1, 0): -1.0},
+    )
     for dtype in reals:
-        given = [nine, {**wind, (0, -1): np.full(cells.shape, -2.0)}, {**wind, (0, -1): drift, (0, 0): 9.0}]
+        given = [
+            nine,
+            {**wind, (0, -1): np.full(cells.shape, -2.0)},
+            {**wind, (0, -1): drift, (0, 0): 9.0},
+        ]
         for coefficients in given:
             A = wl.Stencil(cells, coefficients, outside=wl.AIR, device="cpu", dtype=dtype)
             A.apply_transpose(wp.ones(A.shape, dtype=wp.float64, device="cpu"))
-            for method in (None, wl.BlockedGaussSeidel(), wl.ProjectedSOR(), wl.MinimumMapNewton(precision="double")):
-                assert wl.solve(wl.LCP(A, np.where(np.arange(144).reshape(12, 12) % 2, -1.0, 0.5)), method)
+            for method in (
+                None,
+                wl.BlockedGaussSeidel(),
+                wl.ProjectedSOR(),
+                wl.MinimumMapNewton(precision="double"),
+            ):
+                assert wl.solve(
+                    wl.LCP(A, np.where(np.arange(144).reshape(12, 12) % 2, -1.0, 0.5)), method
+                )
     T = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(50, 50))
-    matrix = scipy.sparse.kron(scipy.sparse.eye_array(50), T) + scipy.sparse.kron(T, scipy.sparse.eye_array(50))
-    assert wl.solve(wl.LCP(wl.SparseOperator(matrix, device="cpu"), -np.ones(2500))).grid == (50, 50)
+    matrix = scipy.sparse.kron(scipy.sparse.eye_array(50), T) + scipy.sparse.kron(
+        T, scipy.sparse.eye_array(50)
+    )
+    assert wl.solve(wl.LCP(wl.SparseOperator(matrix, device="cpu"), -np.ones(2500))).grid == (
+        50,
+        50,
+    )
 
 
 def use_kernels_of_gradients(reals):
     """Instantiate those of vector-Jacobian products on every kind of bounds and diagonal."""
-    cells, T = np.array([[0, 1, 1, 1]]), scipy.sparse.diags_array([-1.0, 3.0, -1.0], offsets=[-1, 0, 1], shape=(30, 30)).tocsr()
+    cells, T = (
+        np.array([[0, 1, 1, 1]]),
+        scipy.sparse.diags_array([-1.0, 3.0, -1.0], offsets=[-1, 0, 1], shape=(30, 30)).tocsr(),
+    )
     for dtype in reals:
-        operators = [wl.SparseOperator(T, device="cpu", dtype=dtype), wl.GridPoisson(cells, device="cpu", dtype=dtype)]
-        operators.append(wl.GridPoisson(cells, device="cpu", dtype=dtype, face_x=np.ones((1, 5)), shift=0.1))
+        operators = [
+            wl.SparseOperator(T, device="cpu", dtype=dtype),
+            wl.GridPoisson(cells, device="cpu", dtype=dtype),
+        ]
+        operators.append(
+            wl.GridPoisson(cells, device="cpu", dtype=dtype, face_x=np.ones((1, 5)), shift=0.1)
+        )
         for A in operators:
-            for lower in (0.0, np.zeros(A.shape), np.linspace(-1.0, 0.0, A.shape[-1]) * np.ones(A.shape)):
+            for lower in (
+                0.0,
+                np.zeros(A.shape),
+                np.linspace(-1.0, 0.0, A.shape[-1]) * np.ones(A.shape),
+            ):
                 assert wl.vjp(wl.solve(wl.LCP(A, -np.ones(A.shape), lower)), np.ones(A.shape))
-        A = wl.Stencil(np.ones((12, 12), dtype=int), {(0, 0): 3.0, (0, 1): -1.0}, device="cpu", dtype=dtype)
+        A = wl.Stencil(
+            np.ones((12, 12), dtype=int), {(0, 0): 3.0, (0, 1): -1.0}, device="cpu", dtype=dtype
+        )
         assert wl.vjp(wl.solve(wl.LCP(A, -np.ones(A.shape))), np.ones(A.shape))
 
 
@@ -195,7 +279,11 @@ def use_coupled_kernels(reals):
             for precision in ("mixed", "double"):
                 for method in (wl.ProjectedMultigrid, wl.MinimumMapNewton):
                     problem = wl.LCP(A, np.linspace(-1.0, 0.5, 64).reshape(cells.shape))
-                    assert wl.solve(problem, method(precision=precision), stopping=wl.StoppingCriteria(rtol=1e-4))
+                    assert wl.solve(
+                        problem,
+                        method(precision=precision),
+                        stopping=wl.StoppingCriteria(rtol=1e-4),
+                    )
 
 
 def use_sand_kernels():
@@ -213,7 +301,9 @@ def use_sand_kernels():
 
 def use_contact_kernels():
     down, none = np.eye(3)[None], np.zeros((1, 3, 3))
-    ball = wl.FrictionalContact([0], [1], down, none, b=[[-1.0, 3.0, 4.0]], friction=[0.5], bodies=1, device="cpu")
+    ball = wl.FrictionalContact(
+        [0], [1], down, none, b=[[-1.0, 3.0, 4.0]], friction=[0.5], bodies=1, device="cpu"
+    )
     assert wl.solve(ball, wl.ProximalGaussSeidel())
 
 
@@ -222,11 +312,19 @@ def family(name):
     from warp._src.context import user_modules
 
     package, module, *variant = name.split(".")
-    if package == "granular":  # its switches are in the module's name; the longest variant has walls that cut and a rate, or a box
+    # its switches are in the module's name; the longest variant has walls that cut and a rate, or a
+    # box
+    if package == "granular":
         module = re.sub("_(2d|3d|float32|float64|rate|cut)(?=_|$)", "", module)
-    if package == "fluids" and module.startswith(("pressure", "viscosity")):  # the longest variant has all switches
+    # the longest variant has all switches
+    if package == "fluids" and module.startswith(("pressure", "viscosity")):
         module = re.sub("_(2d|cut|ghost|moving)(?=_|$)", "", module)
-    return package, module, len(user_modules[name].kernels), *(re.match("[a-z]*", word)[0] for word in variant)
+    return (
+        package,
+        module,
+        len(user_modules[name].kernels),
+        *(re.match("[a-z]*", word)[0] for word in variant),
+    )
 
 
 def modules_of_every_kernel(reals):
@@ -249,10 +347,20 @@ def modules_of_every_kernel(reals):
         carry_pass(axis)
     for dtype in (wp.int8, wp.uint8, wp.int32, wp.float32, wp.float64):
         wrap_kernel(dtype)
-    for d_type, real in itertools.product((wp.uint8, wp.float32, wp.float64), (wp.float32, wp.float64)):
-        field, vector = wp.zeros(8, dtype=real, device="cpu"), wp.zeros(8, dtype=wp.float64, device="cpu")
+    for d_type, real in itertools.product(
+        (wp.uint8, wp.float32, wp.float64), (wp.float32, wp.float64)
+    ):
+        field, vector = (
+            wp.zeros(8, dtype=real, device="cpu"),
+            wp.zeros(8, dtype=wp.float64, device="cpu"),
+        )
         rows = Rows.flat(8, field.device).beside(Rows.flat(8, field.device), (1, 1, 1))
-        given = {"d": wp.zeros(8, dtype=d_type, device="cpu"), "x": field, "v": vector, "scale": 1.0}
+        given = {
+            "d": wp.zeros(8, dtype=d_type, device="cpu"),
+            "x": field,
+            "v": vector,
+            "scale": 1.0,
+        }
         ENTER.bind(rows, **given)
         LEAVE.bind(rows, **given, others=None)
     use_sparse_kernels(reals)
@@ -270,15 +378,27 @@ def modules_of_every_kernel(reals):
             assert form.by_quads.kernel  # in place of it on CUDA
     from warp._src.context import user_modules
 
-    return sorted(name for name, module in user_modules.items() if name.startswith(("warp_lcp", "fluids", "granular")) and module.kernels)
+    return sorted(
+        name
+        for name, module in user_modules.items()
+        if name.startswith(("warp_lcp", "fluids", "granular")) and module.kernels
+    )
 
 
 def kernels_not_taken():
     """Return the kernels of headers that nothing of the above has made a pass of."""
     interleaved_passes(2)  # which a CPU alone runs
-    taken = {(made.header.resolve(), made.declared) for made in gc.get_objects() if isinstance(made, RowPass) and made.declared}
-    return [f"{path}:{section.line}" for path in {header for header, _ in taken} for section in sections(path).values()
-            if section.kind == "kernel" and (path, section.name) not in taken]  # fmt: skip
+    taken = {
+        (made.header.resolve(), made.declared)
+        for made in gc.get_objects()
+        if isinstance(made, RowPass) and made.declared
+    }
+    return [
+        f"{path}:{section.line}"
+        for path in {header for header, _ in taken}
+        for section in sections(path).values()
+        if section.kind == "kernel" and (path, section.name) not in taken
+    ]
 
 
 def one_a_family(names):
@@ -291,7 +411,9 @@ def source_hash(name):
     from warp._src.context import user_modules
 
     module = user_modules[name]
-    for_cpus = {key: module.options.get(key) for key in ("cpu_compiler_flags", "extra_build_options")}
+    for_cpus = {
+        key: module.options.get(key) for key in ("cpu_compiler_flags", "extra_build_options")
+    }
     module.options.update(dict.fromkeys(for_cpus))
     found = module.hash_module().hex()
     wp.set_module_options(for_cpus, module=name)
@@ -317,7 +439,10 @@ def compile_for_cuda(name, archs, folder):
 
 @pytest.mark.parametrize(
     ("reals", "archs"),
-    [((wp.float64,), [80]), pytest.param((wp.float32, wp.float64), [80, 90], marks=pytest.mark.slow)],
+    [
+        ((wp.float64,), [80]),
+        pytest.param((wp.float32, wp.float64), [80, 90], marks=pytest.mark.slow),
+    ],
     ids=["one", "all"],
 )
 def test_kernels_compile_for_cuda(reals, archs, tmp_path):
@@ -328,7 +453,8 @@ def test_kernels_compile_for_cuda(reals, archs, tmp_path):
     if len(archs) == 1:
         compiled = set(COMPILED.read_text().splitlines())
         names = [line.split()[0] for line in lines_of(one_a_family(names)) if line not in compiled]
-    known = Path(wp.config.kernel_cache_dir) / "compiled-for-cuda"  # minutes for all modules, so each once while it stays as it is
+    # minutes for all modules, so each once while it stays as it is
+    known = Path(wp.config.kernel_cache_dir) / "compiled-for-cuda"
     known.mkdir(exist_ok=True)
     for name in names:
         mark = known / f"{name}-{source_hash(name)}-{'-'.join(map(str, archs))}"

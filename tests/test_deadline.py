@@ -18,7 +18,15 @@ S = wl.SolveStatus
 CRITERIA = wl.StoppingCriteria(rtol=1e-8, max_iterations=25, patience=25)
 LIMITS = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89, 144)
 MORE = 2  # looks at a clock that has run out before: of the solve of a block, and of the outer loop
-LONG = ("fischer-newton", "gradient-descent", "incremental-pivoting", "lemke", "minimum-map-newton", "staggering", "subspace-minimization")
+LONG = (
+    "fischer-newton",
+    "gradient-descent",
+    "incremental-pivoting",
+    "lemke",
+    "minimum-map-newton",
+    "staggering",
+    "subspace-minimization",
+)
 
 
 def chain(n):
@@ -35,13 +43,20 @@ def case(family, name):
         ny, nx = cells.shape[0] - 1, cells.shape[1]
         across, upward = chain(nx).toarray(), chain(ny).toarray()
         across[0, 0] = across[-1, -1] = upward[0, 0] = 1.0  # walls at the sides and below
-        A, b = np.kron(np.eye(ny), across) + np.kron(upward, np.eye(nx)), rng.standard_normal(cells.shape)
+        A, b = (
+            np.kron(np.eye(ny), across) + np.kron(upward, np.eye(nx)),
+            rng.standard_normal(cells.shape),
+        )
         b = -np.abs(b) if few else b
         return wl.LCP(wl.GridPoisson(cells, device="cpu"), b), A, b[:-1].ravel()
     matrix = chain(3 if few else 60)
     b = rng.standard_normal(matrix.shape[0])
     b = -np.abs(b) if few else b
-    made = wl.SparseOperator(matrix, device="cpu") if family == "sparse" else wl.DenseOperator(matrix.toarray(), device="cpu")
+    made = (
+        wl.SparseOperator(matrix, device="cpu")
+        if family == "sparse"
+        else wl.DenseOperator(matrix.toarray(), device="cpu")
+    )
     return wl.LCP(made, b), matrix.toarray(), b
 
 
@@ -53,13 +68,18 @@ def solve(monkeypatch):
         ticks = itertools.count()
         with monkeypatch.context() as patched:
             patched.setattr(deadline, "now", lambda: float(next(ticks)))
-            result = wl.solve(problem, method, stopping=replace(CRITERIA, max_seconds=seconds), **options)
+            result = wl.solve(
+                problem, method, stopping=replace(CRITERIA, max_seconds=seconds), **options
+            )
         return result, next(ticks) - 1  # the first look is when the time begins to run
 
     return by_counting
 
 
-@pytest.mark.parametrize(("name", "family"), [(name, family) for name, cls in wl.METHODS.items() for family in sorted(families(cls))])
+@pytest.mark.parametrize(
+    ("name", "family"),
+    [(name, family) for name, cls in wl.METHODS.items() for family in sorted(families(cls))],
+)
 def test_each_method_ends_in_time_with_its_best_iterate(name, family, solve):
     if name == "quadratic-program":
         pytest.importorskip("piqp")
@@ -68,7 +88,8 @@ def test_each_method_ends_in_time_with_its_best_iterate(name, family, solve):
     for seconds in LIMITS:
         result, looks = solve(problem, method, seconds, workspace=work)
         again = wl.solve(problem, method, workspace=work, stopping=CRITERIA)
-        np.testing.assert_array_equal(again.x.numpy(), whole.x.numpy())  # what was cut short leaves nothing behind
+        # what was cut short leaves nothing behind
+        np.testing.assert_array_equal(again.x.numpy(), whole.x.numpy())
         if result.status is not S.TIME_LIMIT:
             assert (result.status, result.iterations) == (whole.status, whole.iterations)
             break
@@ -76,10 +97,14 @@ def test_each_method_ends_in_time_with_its_best_iterate(name, family, solve):
         assert not result
         assert looks <= seconds + MORE
         assert result.iterations == result.history[-1].iteration < whole.iterations
-        assert [r.residual for r in result.history[:-1]] == [r.residual for r in whole.history[: result.iterations]]
+        assert [r.residual for r in result.history[:-1]] == [
+            r.residual for r in whole.history[: result.iterations]
+        ]
         assert result.residual == pytest.approx(min(r.residual for r in result.history), rel=1e-12)
         x = result.x.numpy().ravel()[: len(b)]
-        assert result.residual == pytest.approx(natural_residual(A, b, np.zeros(len(b)), np.full(len(b), np.inf), x), rel=1e-9)
+        assert result.residual == pytest.approx(
+            natural_residual(A, b, np.zeros(len(b)), np.full(len(b), np.inf), x), rel=1e-9
+        )
     assert ended
     assert ended[0].iterations == 0
 
@@ -93,13 +118,19 @@ def test_long_steps_look_at_the_clock_inside(name, solve):
 
 def test_inner_iterations_look_at_the_clock(solve):
     """Those of conjugate gradients and GMRES, on grids and on matrices that are not narrow, whose systems would be factored."""
-    skew, b = scipy.sparse.diags_array([-1.2, 2.5, -0.8], offsets=[-1, 0, 1], shape=(60, 60)).tocsr(), case("dense", "")[2]
+    skew, b = (
+        scipy.sparse.diags_array([-1.2, 2.5, -0.8], offsets=[-1, 0, 1], shape=(60, 60)).tocsr(),
+        case("dense", "")[2],
+    )
     order = np.random.default_rng(8).permutation(60)
-    numbered = [wl.SparseOperator(matrix[order][:, order], device="cpu") for matrix in (chain(60), skew)]
+    numbered = [
+        wl.SparseOperator(matrix[order][:, order], device="cpu") for matrix in (chain(60), skew)
+    ]
     for problem in (case("grid", "")[0], *(wl.LCP(A, b) for A in numbered)):
         result, looks = solve(problem, wl.InteriorPoint(), 1e6)
         assert result.linear_iterations > result.iterations
-        native = isinstance(problem.A, wl.GridPoisson)  # whose inner loop ends by itself when its time is over
+        # whose inner loop ends by itself when its time is over
+        native = isinstance(problem.A, wl.GridPoisson)
         assert looks > (result.iterations if native else result.linear_iterations - 1)
         assert solve(problem, wl.InteriorPoint(), looks - 2)[0].status is S.TIME_LIMIT
 
@@ -128,7 +159,12 @@ def test_set_up_counts(monkeypatch):
     result = wl.solve(problem, Slow(), stopping=wl.StoppingCriteria(max_seconds=10))
     assert (result.status, result.iterations) == (S.TIME_LIMIT, 0)
     assert not result.x.numpy().any()
-    assert wl.solve(problem, Slow(), stopping=wl.StoppingCriteria(max_seconds=11, max_iterations=1)).status is S.MAX_ITERATIONS
+    assert (
+        wl.solve(
+            problem, Slow(), stopping=wl.StoppingCriteria(max_seconds=11, max_iterations=1)
+        ).status
+        is S.MAX_ITERATIONS
+    )
 
 
 def test_a_solve_that_is_done_is_converged_however_late(solve):
@@ -187,8 +223,12 @@ def test_lemke_on_an_american_put_ends_in_time():
     begun = time.perf_counter()
     wl.solve(problem, method, workspace=work)
     whole = time.perf_counter() - begun
-    result = wl.solve(problem, method, workspace=work, stopping=wl.StoppingCriteria(max_seconds=0.3 * whole))
+    result = wl.solve(
+        problem, method, workspace=work, stopping=wl.StoppingCriteria(max_seconds=0.3 * whole)
+    )
     assert result.status is S.TIME_LIMIT
     assert result.linear_iterations > 0
-    assert result.residual <= natural_residual(A.toarray(), b, payoff, np.full(n, np.inf), payoff) * (1 + 1e-12)
+    assert result.residual <= natural_residual(
+        A.toarray(), b, payoff, np.full(n, np.inf), payoff
+    ) * (1 + 1e-12)
     assert wl.solve(wl.LCP(A, b, lower=payoff), stopping=wl.StoppingCriteria(max_seconds=600))

@@ -14,7 +14,9 @@ from warp_lcp.solvers.registry import grid_methods
 DOCS = Path(__file__).parents[1] / "docs"
 TEXT = (DOCS / "methods.md").read_text()
 COLUMNS = ("class", "name", "scene", "book", "needs", "step", "when")
-ROW = re.compile(r"^\| `(\w+)`<br>`([a-z-]+)`(\\\*)?(?:<br>Book (.*?))? \| (.*) \| (.*) \| (.*) \|$", flags=re.M)
+ROW = re.compile(
+    r"^\| `(\w+)`<br>`([a-z-]+)`(\\\*)?(?:<br>Book (.*?))? \| (.*) \| (.*) \| (.*) \|$", flags=re.M
+)
 ROWS = [dict(zip(COLUMNS, row, strict=True)) for row in ROW.findall(TEXT)]
 
 
@@ -46,35 +48,58 @@ def test_rows_say_what_the_classes_say(row):
 def test_what_the_text_says_of_all_methods_holds():
     """Boxed bounds by all, affine ones by those of one table, every kind of A by all but three."""
     assert all(getattr(method, "boxed", True) for method in wl.METHODS.values())
-    assert {name for name, method in wl.METHODS.items() if families(method) != {"dense", "sparse", "grid"}} == set(OWN)
+    assert {
+        name
+        for name, method in wl.METHODS.items()
+        if families(method) != {"dense", "sparse", "grid"}
+    } == set(OWN)
     assert {name: families(wl.METHODS[name]) for name in OWN} == OWN
     sweeps = TEXT.split("### Sweeps and splittings")[1].split("###")[0]
-    affine = {name for name, method in wl.METHODS.items() if getattr(method, "affine_bounds", False)}
+    affine = {
+        name for name, method in wl.METHODS.items() if getattr(method, "affine_bounds", False)
+    }
     assert {row[1] for row in ROW.findall(sweeps)} == affine
 
 
 def test_capabilities_have_their_rows():
     """The table of operators is what protocols and methods say, in their order."""
-    rows = re.findall(r"^\| `(\w+)` \| (.*) \| (.*) \| (.*) \|$", (DOCS / "operators.md").read_text(), flags=re.M)
+    rows = re.findall(
+        r"^\| `(\w+)` \| (.*) \| (.*) \| (.*) \|$", (DOCS / "operators.md").read_text(), flags=re.M
+    )
     expected = []
     for capability, (_, having) in CAPABILITIES.items():
-        asking = sorted(name for name, method in wl.METHODS.items() if capability in getattr(method, "supports", ()))
-        names, asked = (", ".join(f"`{name}`" for name in listed) for listed in (members(capability), asking))
+        asking = sorted(
+            name
+            for name, method in wl.METHODS.items()
+            if capability in getattr(method, "supports", ())
+        )
+        names, asked = (
+            ", ".join(f"`{name}`" for name in listed) for listed in (members(capability), asking)
+        )
         expected.append((capability.__name__, names, ", ".join(having) or "-", asked or "-"))
     assert rows == expected
 
 
 def test_prices_name_methods():
-    named = re.findall(r"^\| `([a-z-]+)`(?:, omega.*?)? \| (?:\d|refused|[A-Z_]{5})", TEXT, flags=re.M)
+    named = re.findall(
+        r"^\| `([a-z-]+)`(?:, omega.*?)? \| (?:\d|refused|[A-Z_]{5})", TEXT, flags=re.M
+    )
     assert "projected-multigrid" in named
     assert set(named) <= set(wl.METHODS)
 
 
 # The tutorial has a test of its own.
-EXAMPLES = [(page, code) for page in sorted(DOCS.rglob("*.md")) if page.name != "tutorial.md" for code in blocks(page, "python")]
+EXAMPLES = [
+    (page, code)
+    for page in sorted(DOCS.rglob("*.md"))
+    if page.name != "tutorial.md"
+    for code in blocks(page, "python")
+]
 
 
-@pytest.mark.parametrize(("page", "code"), EXAMPLES, ids=lambda value: value.stem if isinstance(value, Path) else "")
+@pytest.mark.parametrize(
+    ("page", "code"), EXAMPLES, ids=lambda value: value.stem if isinstance(value, Path) else ""
+)
 def test_python_examples_run(page, code, capsys):
     if "warp_lcp.distributed" in code:
         pytest.importorskip("petsc4py", reason="PETSc is missing")
@@ -86,7 +111,12 @@ def test_python_examples_run(page, code, capsys):
     assert capsys.readouterr().out.startswith("CONVERGED")
 
 
-TABLES = [(page, text) for page in sorted(DOCS.glob("*.md")) if page.name != "tutorial.md" for text in blocks(page, "toml")]
+TABLES = [
+    (page, text)
+    for page in sorted(DOCS.glob("*.md"))
+    if page.name != "tutorial.md"
+    for text in blocks(page, "toml")
+]
 SCENE = """
 [scene]
 simulator = "fluids"
@@ -102,7 +132,9 @@ max = [1.0, 0.5, 1.0]
 """
 
 
-@pytest.mark.parametrize(("page", "text"), TABLES, ids=lambda value: value.stem if isinstance(value, Path) else "")
+@pytest.mark.parametrize(
+    ("page", "text"), TABLES, ids=lambda value: value.stem if isinstance(value, Path) else ""
+)
 def test_tables_of_scenes_are_valid(page, text, tmp_path):
     """What pages show is a table of a scene, or a scene."""
     file = tmp_path / "scene.toml"

@@ -17,9 +17,18 @@ from warp_lcp.scene.scene_file import built_in_scenes, load_scene
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-PAGES = [*sorted(DOCS.rglob("*.md")), ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md"]
+PAGES = [
+    *sorted(DOCS.rglob("*.md")),
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    ROOT / "CHANGELOG.md",
+]
 SITE = (ROOT / "mkdocs.yml").read_text()
-NAMED = re.findall(r"^::: ([\w.]+)$", "\n".join(page.read_text() for page in (DOCS / "api").glob("*.md")), flags=re.M)
+NAMED = re.findall(
+    r"^::: ([\w.]+)$",
+    "\n".join(page.read_text() for page in (DOCS / "api").glob("*.md")),
+    flags=re.M,
+)
 
 
 def relative(page):
@@ -43,7 +52,10 @@ def test_links_and_anchors_lead_somewhere(page):
 def test_the_link_test_sees_what_is_wrong(tmp_path):
     """Headings in code are none, links in code are none, and repeated headings are counted."""
     page = tmp_path / "page.md"
-    page.write_text("# A `b` c: d\n\n```sh\n# no heading\n[x](y)\n```\n\n## Same\n\n## Same\n\n[in](other.md#a) and `[not](this)`\n")
+    page.write_text(
+        "# A `b` c: d\n\n```sh\n# no heading\n[x](y)\n```\n\n## Same\n\n## "
+        "Same\n\n[in](other.md#a) and `[not](this)`\n"
+    )
     assert anchors(page) == {"a-b-c-d", "same", "same_1"}
     assert links(page) == ["other.md#a"]
 
@@ -59,12 +71,16 @@ def test_the_page_of_the_command_line_has_every_command():
     from warp_lcp.cli.commands import app
 
     cells = re.findall(r"^\| (`.*?`) \| ", (DOCS / "command-line.md").read_text(), flags=re.M)
-    assert {name for cell in cells for name in re.findall(r"`(\w+)", cell)} == set(typer.main.get_command(app).commands)
+    assert {name for cell in cells for name in re.findall(r"`(\w+)", cell)} == set(
+        typer.main.get_command(app).commands
+    )
 
 
 def test_a_value_passes_through_five_files_at_most_from_its_key_to_its_kernel():
     """Each file of a walk is there, and has the names that the page says."""
-    page = (DOCS / "architecture.md").read_text().partition("## Four walks\n")[2].partition("\n## ")[0]
+    page = (
+        (DOCS / "architecture.md").read_text().partition("## Four walks\n")[2].partition("\n## ")[0]
+    )
     walks = re.split(r"^\*\*", page, flags=re.M)[1:]
     assert len(walks) == 4
     for walk in walks:
@@ -85,9 +101,17 @@ def test_the_page_of_the_architecture_has_every_room_in_the_contract_s_order():
     assert {path.parent.name for path in (ROOT / "warp_lcp").glob("*/__init__.py")} <= table.keys()
     for room, first in table.items():
         for file in re.findall(r"`(\w+\.py)`", first):
-            assert (ROOT / "warp_lcp" / room / file).is_file() or (ROOT / "warp_lcp" / file).is_file(), (room, file)
-    contract = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"][0]["layers"]
-    layer = {name.strip().removeprefix("warp_lcp."): place for place, names in enumerate(contract) for name in names.split("|")}
+            assert (ROOT / "warp_lcp" / room / file).is_file() or (
+                ROOT / "warp_lcp" / file
+            ).is_file(), (room, file)
+    contract = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"][
+        "contracts"
+    ][0]["layers"]
+    layer = {
+        name.strip().removeprefix("warp_lcp."): place
+        for place, names in enumerate(contract)
+        for name in names.split("|")
+    }
     places = [layer[room] for room in table if room in layer]
     assert places == sorted(places)
 
@@ -100,7 +124,10 @@ def test_the_search_works_from_the_disk():
     spec.loader.exec_module(pages)
     page = f'<script src="{pages.SHIM}"></script>'
     assert pages.own_shim(page, "index.html") == '<script src="iframe-worker.js"></script>'
-    assert pages.own_shim(page, "benchmarks/results/peers.html") == '<script src="../../iframe-worker.js"></script>'
+    assert (
+        pages.own_shim(page, "benchmarks/results/peers.html")
+        == '<script src="../../iframe-worker.js"></script>'
+    )
     shim = (DOCS / pages.OWN_SHIM).read_text()
     assert "Permission is hereby granted" in shim
     assert 'location.protocol==="file:"&&(window.Worker=' in shim
@@ -110,16 +137,29 @@ def test_commands_of_pages_take_their_scenes_with_what_they_set():
     """A resolution that does not divide a domain's sides was refused."""
     tried = 0
     for page in PAGES:
-        for line in re.findall(r"^(?:\.venv/bin/)?warp-lcp (?:run|check|tune) (.*)", page.read_text(), flags=re.M):
+        for line in re.findall(
+            r"^(?:\.venv/bin/)?warp-lcp (?:run|check|tune) (.*)", page.read_text(), flags=re.M
+        ):
             words = line.partition("#")[0].split()
             if words[0] in built_in_scenes():
-                load_scene(words[0], [word.strip("'\"") for flag, word in itertools.pairwise(words) if flag == "--set"])
+                load_scene(
+                    words[0],
+                    [
+                        word.strip("'\"")
+                        for flag, word in itertools.pairwise(words)
+                        if flag == "--set"
+                    ],
+                )
                 tried += 1
     assert tried > 10
 
 
 def test_pages_name_no_place_of_a_machine():
-    texts = [*(page.read_text() for page in PAGES), SITE, *(notebook.read_text() for notebook in DOCS.glob("*.ipynb"))]
+    texts = [
+        *(page.read_text() for page in PAGES),
+        SITE,
+        *(notebook.read_text() for notebook in DOCS.glob("*.ipynb")),
+    ]
     for text in texts:
         assert not re.search(r"(?<![\w.])/(home|root|work|tmp|Users)/", text)
 
@@ -142,10 +182,15 @@ def test_the_reference_has_every_public_name():
     constants = {"AIR", "FLUID", "SOLID", "METHODS", "Precision", "Step"}
     assert set(wl.__all__) - constants <= short
     assert set(distributed.__all__) <= short
-    assert {f"warp_lcp.gallery.{path.stem}" for path in Path(gallery.__file__).parent.glob("[a-z]*.py")} <= set(NAMED)
+    assert {
+        f"warp_lcp.gallery.{path.stem}" for path in Path(gallery.__file__).parent.glob("[a-z]*.py")
+    } <= set(NAMED)
 
 
-@pytest.mark.parametrize("name", ["scene_keys", "method_settings", "device_figures", "published_figures", "choice_figures"])
+@pytest.mark.parametrize(
+    "name",
+    ["scene_keys", "method_settings", "device_figures", "published_figures", "choice_figures"],
+)
 def test_generated_pages_are_up_to_date(name):
     spec = importlib.util.spec_from_file_location(name, DOCS / "generate" / f"{name}.py")
     generator = importlib.util.module_from_spec(spec)
@@ -160,12 +205,9 @@ def test_the_page_of_scene_files_has_every_key():
     text = (DOCS / "scenes.md").read_text()
     for simulator in installed_simulators().values():
         schema = simulator.scene_model.model_json_schema(by_alias=True)
-        keys = {key for definition in schema["$defs"].values() for key in definition["properties"]} - {
-            "kind",
-            "shape",
-            "reseed",
-            "narrow_band",
-        }
+        keys = {
+            key for definition in schema["$defs"].values() for key in definition["properties"]
+        } - {"kind", "shape", "reseed", "narrow_band"}
         assert {key for key in keys if f"| `{key}` |" not in text} == set()
         assert all(f"[{table}]" in text for table in schema["properties"])
 
@@ -176,9 +218,17 @@ NOT_NAMES = {"Since", "In", "From", "November", "Claypool"}
 
 def test_what_is_cited_is_in_the_bibliography():
     entries = re.split(r"\n\n|\n- ", prose(DOCS / "bibliography.md"))
-    sources = [path for package in ("warp_lcp", "fluids", "granular", "benchmarks") for path in (ROOT / package).rglob("*.py")]
+    sources = [
+        path
+        for package in ("warp_lcp", "fluids", "granular", "benchmarks")
+        for path in (ROOT / package).rglob("*.py")
+    ]
     cited = {match for path in [*sources, *PAGES] for match in CITATION.findall(path.read_text())}
     cited = {(name, year) for name, year in cited if name not in NOT_NAMES and int(year) < 2026}
     assert ("Rockafellar", "1976") in cited
-    missing = {(name, year) for name, year in cited if not any(name in entry and f"{year}" in entry for entry in entries)}
+    missing = {
+        (name, year)
+        for name, year in cited
+        if not any(name in entry and f"{year}" in entry for entry in entries)
+    }
     assert missing == set()

@@ -20,8 +20,12 @@ FILE = re.compile(r"[./\\]|^[<$\"'*]")
 
 def shown(page):
     """Return what a page shows as typed: lines of blocks, continued ones as one, and what stands between backticks."""
-    lines = [line for block in blocks(page, "sh") for line in block.replace("\\\n", " ").splitlines()]
-    return [re.sub(r"\s#.*", "", line) for line in lines] + re.findall(r"`([^`\n]+)`", page.read_text())
+    lines = [
+        line for block in blocks(page, "sh") for line in block.replace("\\\n", " ").splitlines()
+    ]
+    return [re.sub(r"\s#.*", "", line) for line in lines] + re.findall(
+        r"`([^`\n]+)`", page.read_text()
+    )
 
 
 def options(words):
@@ -31,9 +35,13 @@ def options(words):
 def module_of(name):
     """Return the file that `python -m` runs."""
     path = ROOT / name.replace(".", "/")
-    found = next((file for file in (path.with_suffix(".py"), path / "__main__.py") if file.is_file()), None)
+    found = next(
+        (file for file in (path.with_suffix(".py"), path / "__main__.py") if file.is_file()), None
+    )
     assert found, f"python -m {name}: there is no such module"
-    assert found.name == "__main__.py" or '__name__ == "__main__"' in found.read_text(), f"python -m {name}: does nothing"
+    assert found.name == "__main__.py" or '__name__ == "__main__"' in found.read_text(), (
+        f"python -m {name}: does nothing"
+    )
     return found
 
 
@@ -41,7 +49,9 @@ def check_module(line):
     for name, rest in re.findall(r"python3? -m ((?:warp_lcp|benchmarks)[\w.]*)([^&|;]*)", line):
         text = module_of(name).read_text()
         words = rest.split()
-        assert {o for o in options(words) - {"--help"} if f'"{o}"' not in text} == set(), f"{line}: no such option"
+        assert {o for o in options(words) - {"--help"} if f'"{o}"' not in text} == set(), (
+            f"{line}: no such option"
+        )
         if name == "warp_lcp.benchmarks":
             assert words[0] in (*SUITES, "SUITE"), f"{line}: no such suite"
 
@@ -51,7 +61,11 @@ def check_command(line):
         name, *words = call.split()
         assert name in COMMANDS, f"{line}: there is no command {name}"
         command = COMMANDS[name]
-        known = {option for parameter in command.params for option in (*parameter.opts, *parameter.secondary_opts)} | {"--help"}
+        known = {
+            option
+            for parameter in command.params
+            for option in (*parameter.opts, *parameter.secondary_opts)
+        } | {"--help"}
         assert options(words) <= known, f"{line}: no such option"
         first = words[0] if words and not words[0].startswith("-") else ""
         if not first or PLACEHOLDER.fullmatch(first) or FILE.search(first):
@@ -78,7 +92,10 @@ def test_enough_is_found():
 @pytest.mark.parametrize(
     ("line", "expected"),
     [
-        ("python -m warp_lcp.benchmarks.inverse_kinematics compare 1000", "there is no such module"),
+        (
+            "python -m warp_lcp.benchmarks.inverse_kinematics compare 1000",
+            "there is no such module",
+        ),
         ("python -m warp_lcp.benchmarks.problems", "does nothing"),
         ("python -m warp_lcp.benchmarks spheres --out out", "no such suite"),
         ("python -m warp_lcp.benchmarks.hostile --sed 5", "no such option"),

@@ -28,11 +28,20 @@ def is_empty(method: ast.FunctionDef) -> bool:
         if isinstance(value, ast.Tuple | ast.List):
             return all(map(plain, value.elts))
         empty = isinstance(value, ast.Dict) and not value.keys
-        return value is None or empty or isinstance(value, ast.Constant) or (isinstance(value, ast.Name) and value.id in arguments)
+        return (
+            value is None
+            or empty
+            or isinstance(value, ast.Constant)
+            or (isinstance(value, ast.Name) and value.id in arguments)
+        )
 
     def nothing(statement: ast.stmt) -> bool:
         said = isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
-        return said or isinstance(statement, ast.Pass) or (isinstance(statement, ast.Return) and plain(statement.value))
+        return (
+            said
+            or isinstance(statement, ast.Pass)
+            or (isinstance(statement, ast.Return) and plain(statement.value))
+        )
 
     return all(map(nothing, method.body))
 
@@ -46,7 +55,9 @@ def overridden(sources: list[str]) -> Iterator[str]:
         for node in ast.walk(ast.parse(source)):
             if isinstance(node, ast.ClassDef):
                 bases = [ast.unparse(base).split("[")[0].split(".")[-1] for base in node.bases]
-                methods[node.name] |= {m.name: m for m in node.body if isinstance(m, ast.FunctionDef)}
+                methods[node.name] |= {
+                    m.name: m for m in node.body if isinstance(m, ast.FunctionDef)
+                }
                 protocols |= {node.name} & ({node.name} if "Protocol" in bases else set())
                 for base in bases:
                     below[base].add(node.name)
@@ -56,17 +67,29 @@ def overridden(sources: list[str]) -> Iterator[str]:
 
     for name in list(methods):
         for method in methods[name].values() if name not in protocols else ():
-            abstract = any("abstractmethod" in ast.unparse(decorator) for decorator in method.decorator_list)
-            if not abstract and is_empty(method) and any(method.name in methods[other] for other in descendants(name)):
+            abstract = any(
+                "abstractmethod" in ast.unparse(decorator) for decorator in method.decorator_list
+            )
+            if (
+                not abstract
+                and is_empty(method)
+                and any(method.name in methods[other] for other in descendants(name))
+            ):
                 yield f"{name}.{method.name}"
 
 
 def test_no_method_waits_for_a_subclass_without_a_reason():
-    files = [path for folder in ("warp_lcp", "fluids", "granular") for path in sorted((ROOT / folder).rglob("*.py"))]
+    files = [
+        path
+        for folder in ("warp_lcp", "fluids", "granular")
+        for path in sorted((ROOT / folder).rglob("*.py"))
+    ]
     found = set(overridden([path.read_text() for path in files if "benchmarks" not in path.parts]))
     assert "GridPart.fill" in found
     assert set(ALLOWED) <= found | {method.split(".")[0] for method in found}
-    assert not {method for method in found if method not in ALLOWED and method.split(".")[0] not in ALLOWED}
+    assert not {
+        method for method in found if method not in ALLOWED and method.split(".")[0] not in ALLOWED
+    }
 
 
 def test_what_counts():

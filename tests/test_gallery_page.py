@@ -9,10 +9,18 @@ DOCS = Path(__file__).parents[1] / "docs"
 
 
 def test_every_built_in_scene_has_a_picture_and_figures():
-    scenes = {entry.name.removesuffix(".toml") for entry in files("warp_lcp.scene.scenes").iterdir() if entry.name.endswith(".toml")}
+    scenes = {
+        entry.name.removesuffix(".toml")
+        for entry in files("warp_lcp.scene.scenes").iterdir()
+        if entry.name.endswith(".toml")
+    }
     page = (DOCS / "gallery.md").read_text()
     assert set(re.findall(r"^## (\S+)$", page, flags=re.M)) == scenes
-    assert set(re.findall(r"\]\(gallery/(\S+)\.webp\)", page)) == scenes == {path.stem for path in (DOCS / "gallery").glob("*.webp")}
+    assert (
+        set(re.findall(r"\]\(gallery/(\S+)\.webp\)", page))
+        == scenes
+        == {path.stem for path in (DOCS / "gallery").glob("*.webp")}
+    )
     assert set(re.findall(r"^warp-lcp run (\S+)", page, flags=re.M)) < scenes
     figures = json.loads((DOCS / "gallery" / "figures.json").read_text())["scenes"]
     assert scenes == figures.keys()

@@ -24,7 +24,9 @@ def is_view(node: ast.expr) -> bool:
         inner = node.func if isinstance(node, ast.Call) else node
         if call and isinstance(inner, ast.Attribute) and inner.attr == "numpy":
             return True
-        if not isinstance(inner, ast.Subscript) and not (isinstance(inner, ast.Attribute) and inner.attr in VIEWS):
+        if not isinstance(inner, ast.Subscript) and not (
+            isinstance(inner, ast.Attribute) and inner.attr in VIEWS
+        ):
             return False
         node = inner.value
 
@@ -46,14 +48,22 @@ def pairs(node: ast.AST) -> list[tuple[ast.expr, ast.expr]]:
 
 def writes(function: ast.FunctionDef) -> bool:
     """Return whether a function writes to what `.numpy()` gave it."""
-    assigned = [(node, target, value) for node in ast.walk(function) for target, value in pairs(node)]
-    views = {t.id for node, t, value in assigned if isinstance(node, ast.Assign) and isinstance(t, ast.Name) and is_view(value)}
+    assigned = [
+        (node, target, value) for node in ast.walk(function) for target, value in pairs(node)
+    ]
+    views = {
+        t.id
+        for node, t, value in assigned
+        if isinstance(node, ast.Assign) and isinstance(t, ast.Name) and is_view(value)
+    }
     for node, target, _ in assigned:
         base = target
         while isinstance(base, ast.Subscript):
             base = base.value
         named = isinstance(base, ast.Name) and base.id in views
-        if (isinstance(target, ast.Subscript) and (named or is_view(target))) or (isinstance(node, ast.AugAssign) and named):
+        if (isinstance(target, ast.Subscript) and (named or is_view(target))) or (
+            isinstance(node, ast.AugAssign) and named
+        ):
             return True
     return False
 
@@ -62,7 +72,9 @@ def test_nobody_writes_to_what_is_a_copy_on_cuda() -> None:
     found = set()
     for path in ROOT.rglob("*.py"):
         if "benchmarks" not in path.parts:
-            functions = [f for f in ast.walk(ast.parse(path.read_text())) if isinstance(f, ast.FunctionDef)]
+            functions = [
+                f for f in ast.walk(ast.parse(path.read_text())) if isinstance(f, ast.FunctionDef)
+            ]
             found |= {f"{path.relative_to(ROOT)}:{f.name}" for f in functions if writes(f)}
     assert found == set(WRITES)
 
@@ -77,6 +89,9 @@ def test_the_guard_sees_writes() -> None:
         function = ast.parse(f"def f(x, y):\n    {line}").body[0]
         assert isinstance(function, ast.FunctionDef)
         assert writes(function), line
-    harmless = ast.parse("def f(x):\n    a = x.numpy().copy(); a[0] = 1; b = x.numpy() + 1; b += 1; c = x.numpy(); c = c + 1").body[0]
+    harmless = ast.parse(
+        "def f(x):\n    a = x.numpy().copy(); a[0] = 1; b = x.numpy() + 1; b += 1; c = x.numpy(); "
+        "c = c + 1"
+    ).body[0]
     assert isinstance(harmless, ast.FunctionDef)
     assert not writes(harmless)

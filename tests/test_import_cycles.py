@@ -7,7 +7,12 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-PACKAGES = {"warp_lcp": "warp_lcp", "warp_lcp.fluids": "fluids", "warp_lcp.granular": "granular", "warp_lcp.benchmarks": "benchmarks"}
+PACKAGES = {
+    "warp_lcp": "warp_lcp",
+    "warp_lcp.fluids": "fluids",
+    "warp_lcp.granular": "granular",
+    "warp_lcp.benchmarks": "benchmarks",
+}
 
 
 def modules() -> dict[str, Path]:
@@ -68,9 +73,19 @@ def edges_of_all() -> dict[str, set[str]]:
     """Return which modules of the project each one imports, packages that those lie in included."""
     names, found = modules(), {}
     for name, path in names.items():
-        direct = {other for other in imported(ast.parse(path.read_text()), names) if other in names and other != name}
-        around = {other.rsplit(".", depth)[0] for other in direct for depth in range(1, other.count(".") + 1)}
-        found[name] = direct | {package for package in around if package != name and not name.startswith(f"{package}.")}
+        direct = {
+            other
+            for other in imported(ast.parse(path.read_text()), names)
+            if other in names and other != name
+        }
+        around = {
+            other.rsplit(".", depth)[0]
+            for other in direct
+            for depth in range(1, other.count(".") + 1)
+        }
+        found[name] = direct | {
+            package for package in around if package != name and not name.startswith(f"{package}.")
+        }
     return found
 
 
@@ -78,7 +93,12 @@ def test_no_circle_of_imports():
     edges = edges_of_all()
     assert len(edges) > 400
     found = circles(edges)
-    assert not found, "\n".join(f"{m} imports {o}" for circle in found for m in circle for o in sorted(edges[m] & set(circle)))
+    assert not found, "\n".join(
+        f"{m} imports {o}"
+        for circle in found
+        for m in circle
+        for o in sorted(edges[m] & set(circle))
+    )
 
 
 @pytest.mark.parametrize(
@@ -96,5 +116,8 @@ def test_circles_are_found(edges, expected):
 
 def test_imports_within_functions_count_and_those_of_types_do_not():
     names = {"a": Path(), "a.b": Path(), "a.c": Path()}
-    source = "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import a.c\ndef f():\n    from a import b\n"
+    source = (
+        "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import a.c\ndef f():\n    "
+        "from a import b\n"
+    )
     assert set(imported(ast.parse(source), names)) == {"typing", "a.b"}

@@ -17,7 +17,10 @@ KINDS = {
     "dense": np.asarray,
     "operator": aslinearoperator,
     "warp": lambda A: wl.DenseOperator(A, device="cpu"),
-    **{kind: lambda A, kind=kind: scipy.sparse.csr_array(A).asformat(kind) for kind in ("csr", "csc", "coo", "bsr", "dia", "lil", "dok")},
+    **{
+        kind: lambda A, kind=kind: scipy.sparse.csr_array(A).asformat(kind)
+        for kind in ("csr", "csc", "coo", "bsr", "dia", "lil", "dok")
+    },
     "matrix": scipy.sparse.csc_matrix,
     "float32": lambda A: A.astype(np.float32),
 }
@@ -39,8 +42,12 @@ def check(found, A, b, lower, upper, x):
     np.testing.assert_allclose(found.x.ravel(), x, atol=1e-6)
     np.testing.assert_allclose(found.slack.ravel(), A @ found.x.ravel() + b.ravel(), atol=1e-10)
     low, high = found.active_mask.ravel() == -1, found.active_mask.ravel() == 1
-    np.testing.assert_allclose(found.x.ravel()[low], np.broadcast_to(lower, b.shape).ravel()[low], atol=1e-9)
-    np.testing.assert_allclose(found.x.ravel()[high], np.broadcast_to(upper, b.shape).ravel()[high], atol=1e-9)
+    np.testing.assert_allclose(
+        found.x.ravel()[low], np.broadcast_to(lower, b.shape).ravel()[low], atol=1e-9
+    )
+    np.testing.assert_allclose(
+        found.x.ravel()[high], np.broadcast_to(upper, b.shape).ravel()[high], atol=1e-9
+    )
     assert (found.slack.ravel()[low] >= 0).all()
     assert (found.slack.ravel()[high] <= 0).all()
     np.testing.assert_allclose(found.slack.ravel()[~(low | high)], 0.0, atol=1e-5)
@@ -70,13 +77,17 @@ def test_least_squares_in_boxes(given, seed):
     np.testing.assert_array_equal(found.active_mask, expected.active_mask)
 
 
-@pytest.mark.parametrize("name", ["lemke", "interior-point", "fischer-newton", "minimum-map-newton"])
+@pytest.mark.parametrize(
+    "name", ["lemke", "interior-point", "fischer-newton", "minimum-map-newton"]
+)
 def test_unsymmetric_matrices_and_names(name):
     rng = np.random.default_rng(19)
     A = np.eye(N) + 0.4 * rng.standard_normal((N, N))
     A += 1.5 * np.eye(N) * abs(A).max()
     b, lower, upper = rng.standard_normal(N), np.full(N, -0.1), np.full(N, 0.15)
-    found = wl.linear_complementarity(A, b, bounds=(lower, upper), tol=1e-9, method=name, x0=np.full(N, 0.05))
+    found = wl.linear_complementarity(
+        A, b, bounds=(lower, upper), tol=1e-9, method=name, x0=np.full(N, 0.05)
+    )
     check(found, A, b, lower, upper, boxed(A, b, lower, upper))
 
 
@@ -94,7 +105,10 @@ def test_grids():
     cells = np.full((5, 6), wl.FLUID)
     cells[:, 0] = wl.AIR
     cells[2, 3] = wl.SOLID
-    A, b = wl.GridPoisson(cells, device="cpu", dtype=wp.float64), np.random.default_rng(2).standard_normal((5, 6))
+    A, b = (
+        wl.GridPoisson(cells, device="cpu", dtype=wp.float64),
+        np.random.default_rng(2).standard_normal((5, 6)),
+    )
     seen = []
     found = wl.linear_complementarity(A, b, tol=1e-8, callback=seen.append)
     assert found.success
@@ -115,17 +129,40 @@ def sweeps(**options):
 
 
 @pytest.mark.parametrize("infinity", [1e20, 1e30, np.inf])
-@pytest.mark.parametrize("name", ["lemke", "interior-point", "fischer-newton", "minimum-map-newton", None])
+@pytest.mark.parametrize(
+    "name", ["lemke", "interior-point", "fischer-newton", "minimum-map-newton", None]
+)
 def test_1e20_is_infinite(name, infinity):
     rng = np.random.default_rng(23)
     C, b = rng.standard_normal((N, N)), rng.standard_normal(N)
     A = C @ C.T + np.eye(N)
-    lower, upper = np.where(np.arange(N) % 2, -0.1, -infinity), np.where(np.arange(N) % 3, infinity, 0.15)
-    expected = boxed(A, b, np.where(np.arange(N) % 2, -0.1, -np.inf), np.where(np.arange(N) % 3, np.inf, 0.15))
-    for given in ((lower, upper), list(zip(lower, upper, strict=True)), Bounds(lower, upper), (wp.array(lower, device="cpu"), upper)):
-        check(wl.linear_complementarity(A, b, bounds=given, tol=1e-10, method=name), A, b, lower, upper, expected)
+    lower, upper = (
+        np.where(np.arange(N) % 2, -0.1, -infinity),
+        np.where(np.arange(N) % 3, infinity, 0.15),
+    )
+    expected = boxed(
+        A, b, np.where(np.arange(N) % 2, -0.1, -np.inf), np.where(np.arange(N) % 3, np.inf, 0.15)
+    )
+    for given in (
+        (lower, upper),
+        list(zip(lower, upper, strict=True)),
+        Bounds(lower, upper),
+        (wp.array(lower, device="cpu"), upper),
+    ):
+        check(
+            wl.linear_complementarity(A, b, bounds=given, tol=1e-10, method=name),
+            A,
+            b,
+            lower,
+            upper,
+            expected,
+        )
     for given in ((-infinity, infinity), (None, None)):
-        np.testing.assert_allclose(wl.linear_complementarity(A, b, bounds=given, tol=1e-10).x, np.linalg.solve(A, -b), atol=1e-8)
+        np.testing.assert_allclose(
+            wl.linear_complementarity(A, b, bounds=given, tol=1e-10).x,
+            np.linalg.solve(A, -b),
+            atol=1e-8,
+        )
 
 
 ARRAYS = (np.zeros(2), np.array([0.4, 3.0]))
@@ -150,12 +187,31 @@ ARRAYS = (np.zeros(2), np.array([0.4, 3.0]))
 def test_pairs_of_two_unknowns(bounds, expected):
     A, b = np.array([[2.0, -1.0], [-1.0, 2.0]]), np.array([0.5, -2.5])
     found = wl.linear_complementarity(A, b, bounds=bounds, tol=1e-10, method="lemke")
-    check(found, A, b, *map(np.array, expected), boxed(A, b, *(np.array(side, dtype=float) for side in expected)))
+    check(
+        found,
+        A,
+        b,
+        *map(np.array, expected),
+        boxed(A, b, *(np.array(side, dtype=float) for side in expected)),
+    )
 
 
-@pytest.mark.parametrize("bounds", [[[0, 0], [1, 1]], list(ARRAYS), ((0, 0), (1, 1)), np.array([[0, 0], [1, 1]]), [(0, 1), [0, 1]]])
+@pytest.mark.parametrize(
+    "bounds",
+    [
+        [[0, 0], [1, 1]],
+        list(ARRAYS),
+        ((0, 0), (1, 1)),
+        np.array([[0, 0], [1, 1]]),
+        [(0, 1), [0, 1]],
+    ],
+)
 def test_what_could_be_pairs_or_a_pair_is_refused(bounds):
-    with pytest.raises(ValueError, match=r"bounds is a .* of two .*, which could be \(lo, hi\) or a pair for each of two unknowns: write"):
+    with pytest.raises(
+        ValueError,
+        match=r"bounds is a .* of two .*, which could be \(lo, hi\) or a pair for each of two "
+        r"unknowns: write",
+    ):
         wl.linear_complementarity(np.eye(2), np.ones(2), bounds=bounds)
 
 
@@ -163,13 +219,19 @@ def test_what_could_be_pairs_or_a_pair_is_refused(bounds):
 def test_pairs_of_other_numbers_of_unknowns(kind):
     rng = np.random.default_rng(29)
     C, b = rng.standard_normal((4, 4)), rng.standard_normal(4)
-    A, lower, upper = C @ C.T + np.eye(4), np.array([-0.1, 0.0, -0.3, -np.inf]), np.array([0.0, 0.2, np.inf, 0.1])
+    A, lower, upper = (
+        C @ C.T + np.eye(4),
+        np.array([-0.1, 0.0, -0.3, -np.inf]),
+        np.array([0.0, 0.2, np.inf, 0.1]),
+    )
     pairs = kind([tuple(pair) for pair in zip(lower, upper, strict=True)])
     found = wl.linear_complementarity(A, b, bounds=pairs, tol=1e-10, method="lemke")
     check(found, A, b, lower, upper, boxed(A, b, lower, upper))
     square = wl.linear_complementarity(A, b.reshape(2, 2), bounds=pairs, tol=1e-10, method="lemke")
     np.testing.assert_array_equal(square.x.ravel(), found.x)
-    one = wl.linear_complementarity(A[:1, :1], b[:1], bounds=kind([(lower[0], upper[0])]), method="lemke")
+    one = wl.linear_complementarity(
+        A[:1, :1], b[:1], bounds=kind([(lower[0], upper[0])]), method="lemke"
+    )
     np.testing.assert_allclose(one.x, np.clip(-b[0] / A[0, 0], lower[0], upper[0]), atol=1e-12)
 
 
@@ -181,9 +243,13 @@ def test_callbacks_see_each_iterate():
 
     found = sweeps(maxiter=6, callback=see)
     assert found.status == 1
-    assert found.message.startswith("MAX_ITERATIONS: the iteration limit was reached: raise maxiter")
+    assert found.message.startswith(
+        "MAX_ITERATIONS: the iteration limit was reached: raise maxiter"
+    )
     assert [one.nit for one in seen] == [1, 2, 3, 4, 5, 6] == list(range(1, found.nit + 1))
-    assert [one.residual for one in seen] == [record.residual for record in found.result.history[1:]]
+    assert [one.residual for one in seen] == [
+        record.residual for record in found.result.history[1:]
+    ]
     norms = [np.linalg.norm(one.x - seen[-1].x) for one in seen]
     assert norms[0] > norms[2] > norms[-1] == 0.0  # copies
     np.testing.assert_array_equal(seen[-1].x, found.x)
@@ -245,9 +311,21 @@ A, B = np.array([[2.0, -1.0], [-1.0, 2.0]]), np.array([0.5, -2.5])
         ((A, np.ones(3)), {}, r"b has shape \(3,\): expected \(2,\)"),
         ((A, B), {"bounds": (0.5, -0.5)}, "lower > upper in 2 unknowns"),
         ((A, B), {"bounds": (0.0, 1.0, 2.0)}, r"bounds is a tuple: expected a pair \(lo, hi\)"),
-        ((A, B), {"bounds": [(0.0, 1.0)] * 3}, "bounds is a list: expected a pair .* a list of 2 pairs, .*; it has 3 entries"),
-        ((A, B), {"bounds": np.zeros((3, 2))}, r"bounds is a ndarray: expected a pair .*; it has shape \(3, 2\)"),
-        ((A, B), {"bounds": (1e20, None)}, "bounds, lo holds 1 values of 1e20 or beyond, which is infinite: no x could meet it"),
+        (
+            (A, B),
+            {"bounds": [(0.0, 1.0)] * 3},
+            "bounds is a list: expected a pair .* a list of 2 pairs, .*; it has 3 entries",
+        ),
+        (
+            (A, B),
+            {"bounds": np.zeros((3, 2))},
+            r"bounds is a ndarray: expected a pair .*; it has shape \(3, 2\)",
+        ),
+        (
+            (A, B),
+            {"bounds": (1e20, None)},
+            "bounds, lo holds 1 values of 1e20 or beyond, which is infinite: no x could meet it",
+        ),
         ((A, B), {"bounds": [(0, 1), (0, -1e30)]}, "bounds, hi holds 1 values of -1e20 or beyond"),
         ((A, B), {"bounds": 3}, "bounds is a int: expected a pair"),
         ((A, B), {"bounds": (np.zeros(3), 1.0)}, r"bounds, lo has shape \(3,\): expected \(2,\)"),
@@ -257,13 +335,26 @@ A, B = np.array([[2.0, -1.0], [-1.0, 2.0]]), np.array([0.5, -2.5])
         ((A, B), {"tol": 2}, r"tol = 2: must be in \[0, 1\)"),
         ((A, B), {"atol": -1}, "atol = -1: must be a finite number >= 0"),
         ((A, B), {"maxiter": 1.5}, "maxiter = 1.5: must be an integer >= 0"),
-        ((A, B), {"method": "lemk"}, "method = 'lemk': must be one of accelerated-projected-gradient, .*, lemke, .*, a method with"),
+        (
+            (A, B),
+            {"method": "lemk"},
+            "method = 'lemk': must be one of accelerated-projected-gradient, .*, lemke, .*, a "
+            "method with",
+        ),
         ((A, B), {"method": wl.Lemke}, "method is the class Lemke: expected a name in wl.METHODS"),
         ((A, B), {"method": 3}, "method is a int: expected a name"),
-        ((A, B), {"method": "projected-multigrid"}, "ProjectedMultigrid needs an operator with a stencil"),
+        (
+            (A, B),
+            {"method": "projected-multigrid"},
+            "ProjectedMultigrid needs an operator with a stencil",
+        ),
         ((A, B), {"callback": 3}, "callback is a int: expected a function of one argument"),
         ((A, B), {"preconditioner": np.eye(3)}, r"preconditioner has shape \(3, 3\)"),
-        ((A, B), {"preconditioner": np.eye(2), "method": "lemke"}, "preconditioner: Lemke does not use one"),
+        (
+            (A, B),
+            {"preconditioner": np.eye(2), "method": "lemke"},
+            "preconditioner: Lemke does not use one",
+        ),
     ],
 )
 def test_what_is_refused(arguments, options, message):
@@ -285,7 +376,9 @@ def test_callbacks_see_the_iterates_of_alternatives_and_stop_them():
     names = [record.step for record in found.result.history]
     assert any(name == f"start of {found.result.method}" for name in names)
     told = [record for record in found.result.history if not record.step.startswith("start")]
-    assert [(one.nit, one.residual) for one in seen] == [(record.iteration, record.residual) for record in told]
+    assert [(one.nit, one.residual) for one in seen] == [
+        (record.iteration, record.residual) for record in told
+    ]
     np.testing.assert_array_equal(seen[-1].x, found.x)
     first = names.index(f"start of {found.result.method}")
     after = told[first - 1].iteration + 1  # within the alternative

@@ -1,8 +1,10 @@
 """Random problems: families x methods x precisions x seeds. Nothing that is no solution is called one; failures say the right thing.
 
-`test_sweep` runs two seeds of each combination with the other tests, about 800 problems; `test_full_sweep` (slow) ten, over 4,000. What a
-result says is checked against NumPy: the natural residual from its definition, the error bound of strongly monotone problems, and which
-statuses a problem's facts leave possible. Every problem has a solution, so INFEASIBLE and NON_FINITE are always wrong.
+`test_sweep` runs two seeds of each combination with the other tests, about 800 problems;
+`test_full_sweep` (slow) ten, over 4,000. What a result says is checked against NumPy: the natural
+residual from its definition, the error bound of strongly monotone problems, and which statuses a
+problem's facts leave possible. Every problem has a solution, so INFEASIBLE and NON_FINITE are
+always wrong.
 """
 
 import dataclasses
@@ -24,18 +26,39 @@ S = wl.SolveStatus
 NEVER = {S.INFEASIBLE, S.NON_FINITE}
 GAVE_UP = {S.MAX_ITERATIONS, S.STAGNATED, S.FLOOR}
 # sure of a solution wherever the matrix is a symmetric positive definite M-matrix
-SURE = {"incremental-pivoting", "lemke", "minimum-map-newton", "mprgp", "primal-dual-active-set", "projected-multigrid"}
-MAY_DIVERGE = {"projected-jacobi", "blocked-gauss-seidel", "staggering", "accelerated-projected-gradient", "gradient-descent"}
+SURE = {
+    "incremental-pivoting",
+    "lemke",
+    "minimum-map-newton",
+    "mprgp",
+    "primal-dual-active-set",
+    "projected-multigrid",
+}
+MAY_DIVERGE = {
+    "projected-jacobi",
+    "blocked-gauss-seidel",
+    "staggering",
+    "accelerated-projected-gradient",
+    "gradient-descent",
+}
 
 
 def precisions(cls):
     if cls is wl.GradientDescent:  # "mixed" and "double" are the same there, and it is slow
         return ("double", "single")
-    return ("mixed", "double", "single") if "precision" in {f.name for f in dataclasses.fields(cls)} else ("double",)
+    return (
+        ("mixed", "double", "single")
+        if "precision" in {f.name for f in dataclasses.fields(cls)}
+        else ("double",)
+    )
 
 
 def solver(cls, precision):
-    return cls(precision=precision) if "precision" in {f.name for f in dataclasses.fields(cls)} else cls()
+    return (
+        cls(precision=precision)
+        if "precision" in {f.name for f in dataclasses.fields(cls)}
+        else cls()
+    )
 
 
 def as_kind(problem, seed):
@@ -45,7 +68,11 @@ def as_kind(problem, seed):
 
 def takes(cls, problem, n):
     boxes = {"boxed", "mixed"} & problem.facts
-    return problem.kind in families(cls) and n <= getattr(cls, "most_unknowns", n) and (getattr(cls, "boxed", True) or not boxes)
+    return (
+        problem.kind in families(cls)
+        and n <= getattr(cls, "most_unknowns", n)
+        and (getattr(cls, "boxed", True) or not boxes)
+    )
 
 
 def allowed(name, facts):
@@ -75,20 +102,39 @@ def residual_vector(p, x):
 def faults(name, method, problem, precision):
     """Solve; return how it ended and what is wrong with that."""
     p = problem.dense()
-    fluid = problem.A.cells.numpy()[1:-1, 1:-1, 1:-1].reshape(problem.b.shape) == wl.FLUID if problem.kind == "grid" else ...
+    fluid = (
+        problem.A.cells.numpy()[1:-1, 1:-1, 1:-1].reshape(problem.b.shape) == wl.FLUID
+        if problem.kind == "grid"
+        else ...
+    )
     try:
-        result = wl.solve(problem.lcp(device="cpu"), method, stopping=wl.StoppingCriteria(rtol=RTOL[precision], **LIMITS))
+        result = wl.solve(
+            problem.lcp(device="cpu"),
+            method,
+            stopping=wl.StoppingCriteria(rtol=RTOL[precision], **LIMITS),
+        )
     except ValueError as refusal:
-        suits = {"symmetric", "positive-diagonal"} <= p.facts and {"positive-definite", "semidefinite"} & p.facts
+        suits = {"symmetric", "positive-diagonal"} <= p.facts and {
+            "positive-definite",
+            "semidefinite",
+        } & p.facts
         return "refused", [f"refused a matrix that it takes: {refusal}"] if suits else []
     x = result.x.numpy().astype(np.float64)[fluid].ravel()
     own = natural_residual(p.A, p.b, p.lower, p.upper, x)
-    reference = natural_residual(p.A, p.b, p.lower, p.upper, np.clip(np.zeros(len(x)), p.lower, p.upper))
+    reference = natural_residual(
+        p.A, p.b, p.lower, p.upper, np.clip(np.zeros(len(x)), p.lower, p.upper)
+    )
     rounding = 1e-12 * (np.linalg.norm(np.abs(p.A) @ np.abs(x)) + np.linalg.norm(p.b))
     wrong = []
-    if result.status is S.CONVERGED and not own <= RTOL[precision] * reference * (1 + 1e-6) + rounding:
-        wrong.append(f"false CONVERGED: residual {own:.1e}, asked for {RTOL[precision] * reference:.1e}")
-    low, high = (v.astype(np.float32) if precision == "single" else v for v in (p.lower, p.upper))  # bounds are rounded as x is
+    if (
+        result.status is S.CONVERGED
+        and not own <= RTOL[precision] * reference * (1 + 1e-6) + rounding
+    ):
+        wrong.append(
+            f"false CONVERGED: residual {own:.1e}, asked for {RTOL[precision] * reference:.1e}"
+        )
+    # bounds are rounded as x is
+    low, high = (v.astype(np.float32) if precision == "single" else v for v in (p.lower, p.upper))
     if result and not ((x >= low) & (x <= high)).all():
         wrong.append(f"CONVERGED {max((low - x).max(), (x - high).max()):.1e} outside the bounds")
     if result.status is not S.CONVERGED and own < 0.99 * RTOL[precision] * reference - rounding:
@@ -97,15 +143,17 @@ def faults(name, method, problem, precision):
         wrong.append(f"says the residual is {result.residual:.3e}, it is {own:.3e}")
     if result.status in NEVER or result.status not in allowed(name, p.facts):
         wrong.append(f"{result.status.name} is not how this may end")
-    if result.status is S.FLOOR and own > 1e5 * np.finfo(np.float32 if precision == "single" else np.float64).eps * max(
-        reference, rounding
-    ):
+    if result.status is S.FLOOR and own > 1e5 * np.finfo(
+        np.float32 if precision == "single" else np.float64
+    ).eps * max(reference, rounding):
         wrong.append(f"FLOOR at {own / reference:.1e}")
     if name in SURE and "m-matrix" in p.facts and precision != "single" and not result:
         wrong.append(f"{result.status.name} on a positive definite M-matrix")
     if result and {"symmetric", "positive-definite"} <= p.facts and p.solution is not None:
         error = np.linalg.norm(np.sqrt(np.diag(p.A)) * (x - p.solution))
-        if error > 1.01 * error_bound(p, residual_vector(p, x)) + 1e-9 * np.linalg.norm(np.sqrt(np.diag(p.A)) * p.solution):
+        if error > 1.01 * error_bound(p, residual_vector(p, x)) + 1e-9 * np.linalg.norm(
+            np.sqrt(np.diag(p.A)) * p.solution
+        ):
             wrong.append(f"error {error:.1e} beyond the bound")
     return result.status.name, wrong
 
@@ -133,7 +181,8 @@ def some(name):
 
 @pytest.mark.parametrize("name", [name for name, cls in METHODS.items() if families(cls)])
 def test_sweep(name, monkeypatch):
-    monkeypatch.setitem(LIMITS, "max_iterations", 150)  # many that end there would go on to the full sweep's limit
+    # many that end there would go on to the full sweep's limit
+    monkeypatch.setitem(LIMITS, "max_iterations", 150)
     cls = some(name)
     outcomes, found = sweep(name, cls, [1000 + sum(map(ord, name)), 2000 + sum(map(ord, name))])
     assert not found, "\n".join(found)
@@ -169,12 +218,18 @@ class FlippedStep(wl.ProjectedSOR):
     def step(self, problem, work, x):
         wp.copy(before := wp.clone(x), x)
         step = super().step(problem, work, x)
-        x.assign(np.clip(2 * before.numpy() - x.numpy(), problem.lower.numpy(), problem.upper.numpy()))
+        x.assign(
+            np.clip(2 * before.numpy() - x.numpy(), problem.lower.numpy(), problem.upper.numpy())
+        )
         return step
 
 
 @pytest.mark.parametrize(
-    ("name", "cls", "word"), [("minimum-map-newton", FlippedRightSide, "false CONVERGED"), ("psor", FlippedStep, "DIVERGED is not")]
+    ("name", "cls", "word"),
+    [
+        ("minimum-map-newton", FlippedRightSide, "false CONVERGED"),
+        ("psor", FlippedStep, "DIVERGED is not"),
+    ],
 )
 def test_a_broken_method_is_caught(name, cls, word):
     found = sweep(name, cls, [77])[1]

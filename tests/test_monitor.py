@@ -17,7 +17,9 @@ def test_progress_has_a_line_for_each_record(capsys):
     assert result and len(lines) == len(result.history)
     for line, record in zip(lines, result.history, strict=True):
         residual = re.escape(f"{record.residual:.6e}")
-        assert re.fullmatch(rf" *{record.iteration}  residual {residual} +[0-9.]+ s  {record.step}", line)
+        assert re.fullmatch(
+            rf" *{record.iteration}  residual {residual} +[0-9.]+ s  {record.step}", line
+        )
 
 
 def test_a_name_is_the_method_with_its_default_settings():
@@ -38,8 +40,14 @@ def test_plots_have_the_relative_residuals_of_each_solve():
         np.testing.assert_allclose(drawn[expected > 0.0], expected[expected > 0.0], rtol=1e-6)
         assert np.isnan(drawn[expected == 0.0]).all()
     assert axes.get_yscale() == "log"
-    given = wl.plot_convergence(list(results.values()), x="seconds", relative=False, axes=pyplot.figure().add_subplot())
-    assert (given.get_xlabel(), given.get_ylabel(), len(given.get_lines())) == ("wall time [s]", "residual", 2)
+    given = wl.plot_convergence(
+        list(results.values()), x="seconds", relative=False, axes=pyplot.figure().add_subplot()
+    )
+    assert (given.get_xlabel(), given.get_ylabel(), len(given.get_lines())) == (
+        "wall time [s]",
+        "residual",
+        2,
+    )
     pyplot.close("all")
 
 
@@ -47,5 +55,7 @@ def test_plots_have_the_relative_residuals_of_each_solve():
 def test_what_is_no_result_is_refused(results):
     with pytest.raises(ValueError, match=r"expected a result of wl\.solve"):
         wl.plot_convergence(results)
-    with pytest.raises(ValueError, match="x = 'steps': must be one of iterations, seconds, linear_iterations"):
+    with pytest.raises(
+        ValueError, match="x = 'steps': must be one of iterations, seconds, linear_iterations"
+    ):
         wl.plot_convergence(results, x="steps")

@@ -39,7 +39,9 @@ MIDDLE = (-0.5, -0.5, 0.0)
 
 
 def together(model, scene, **more):
-    return SolverLiquid.coupled(model, lambda view: SolverXPBD(view, iterations=10), scene, origin=MIDDLE, **more)
+    return SolverLiquid.coupled(
+        model, lambda view: SolverXPBD(view, iterations=10), scene, origin=MIDDLE, **more
+    )
 
 
 def steps(solver, count, dt):
@@ -69,7 +71,10 @@ def under(z, half, liquid):
 @pytest.mark.parametrize("alone", [True, False])
 def test_a_box_of_half_the_density_floats_half_under(alone):
     half, start = 0.15, 0.53
-    model, scene = world(((0.0, 0.0, start), 0.5 * WATER, "box", {"hx": half, "hy": half, "hz": half})), pool()
+    model, scene = (
+        world(((0.0, 0.0, start), 0.5 * WATER, "box", {"hx": half, "hy": half, "hz": half})),
+        pool(),
+    )
     solver = SolverLiquid(model, scene, origin=MIDDLE) if alone else together(model, scene)
     liquid = solver if alone else solver.solver("liquid")
     volume = liquid.simulation.particles.count * liquid.simulation.particle_mass / WATER
@@ -81,7 +86,10 @@ def test_a_box_of_half_the_density_floats_half_under(alone):
 
 
 def test_dense_bodies_sink_onto_the_world_s_floor_and_light_ones_rise():
-    boxes = [((x, 0.0, 0.3), density * WATER, "box", {"hx": 0.12, "hy": 0.12, "hz": 0.12}) for x, density in ((-0.25, 2.5), (0.25, 0.2))]
+    boxes = [
+        ((x, 0.0, 0.3), density * WATER, "box", {"hx": 0.12, "hy": 0.12, "hz": 0.12})
+        for x, density in ((-0.25, 2.5), (0.25, 0.2))
+    ]
     *_, state = steps(together(world(*boxes), pool()), 60, 0.02)
     assert heights(state)[0] == pytest.approx(0.12, abs=2e-3)
     assert abs(state.body_qd.numpy()[0]).max() < 0.05
@@ -105,7 +113,12 @@ def test_a_sphere_sets_off_with_its_added_mass(ratio, alone):
 @pytest.mark.parametrize("iterations", [1, 2])
 def test_momentum_is_handed_over(iterations):
     """A dumbbell of light balls flies into a drop: it gets what the liquid gave, with one iteration the last impulse a step later."""
-    balls = ["sphere", {"radius": 0.08, "xform": wp.transform(wp.vec3(0.0, 0.0, 0.1), wp.quat_identity())}, "sphere", {"radius": 0.1}]
+    balls = [
+        "sphere",
+        {"radius": 0.08, "xform": wp.transform(wp.vec3(0.0, 0.0, 0.1), wp.quat_identity())},
+        "sphere",
+        {"radius": 0.1},
+    ]
     model = world(((0.0, 0.02, 0.78), 0.5 * WATER, *balls), ground=False, gravity=0.0)
     model.body_qd.assign(np.array([[0.0, 0.0, -2.0, 1.0, 0.0, 0.0]]))
     drop = {"liquid": [{"shape": "sphere", "center": [0.5, 0.5, 0.45], "radius": 0.2}]}
@@ -119,19 +132,36 @@ def test_momentum_is_handed_over(iterations):
     assert given[-1][2] > 0.1 * mass * 2.0
     late = given[:-1] if iterations == 1 else given[1:]
     assert np.abs(np.array(taken) - late).max() < (1e-5 if iterations == 1 else 5e-3) * given[-1][2]
-    flowing = liquid.simulation.particles.velocity.numpy().astype(float).sum(axis=0) * liquid.simulation.particle_mass
-    assert flowing[2] == pytest.approx(-given[-1][2], rel=0.15)  # particles near a body have velocities of faces inside it
+    flowing = (
+        liquid.simulation.particles.velocity.numpy().astype(float).sum(axis=0)
+        * liquid.simulation.particle_mass
+    )
+    # particles near a body have velocities of faces inside it
+    assert flowing[2] == pytest.approx(-given[-1][2], rel=0.15)
 
 
 @pytest.mark.parametrize("name", ["XPBD", "Featherstone"])
 def test_a_float_on_a_hinge_swings_up(name):
     builder = newton.ModelBuilder()
     link = builder.add_link(xform=wp.transform(wp.vec3(0.25, 0.0, 0.3), wp.quat_identity()))
-    builder.add_shape_sphere(link, radius=0.1, cfg=newton.ModelBuilder.ShapeConfig(density=0.2 * WATER))
-    at, arm = (wp.transform(wp.vec3(*place), wp.quat_identity()) for place in ((0.0, 0.0, 0.3), (-0.25, 0.0, 0.0)))
-    builder.add_articulation([builder.add_joint_revolute(-1, link, parent_xform=at, child_xform=arm, axis=(0.0, 1.0, 0.0))])
+    builder.add_shape_sphere(
+        link, radius=0.1, cfg=newton.ModelBuilder.ShapeConfig(density=0.2 * WATER)
+    )
+    at, arm = (
+        wp.transform(wp.vec3(*place), wp.quat_identity())
+        for place in ((0.0, 0.0, 0.3), (-0.25, 0.0, 0.0))
+    )
+    builder.add_articulation(
+        [
+            builder.add_joint_revolute(
+                -1, link, parent_xform=at, child_xform=arm, axis=(0.0, 1.0, 0.0)
+            )
+        ]
+    )
     model = builder.finalize(device="cpu")
-    solver = SolverLiquid.coupled(model, getattr(newton.solvers, f"Solver{name}"), pool(20, 0.8), origin=MIDDLE)
+    solver = SolverLiquid.coupled(
+        model, getattr(newton.solvers, f"Solver{name}"), pool(20, 0.8), origin=MIDDLE
+    )
     places = np.array([state.body_q.numpy()[0, :3] for state in steps(solver, 80, 5e-3)])
     assert np.abs(np.linalg.norm(places - [0.0, 0.0, 0.3], axis=1) - 0.25).max() < 2e-3
     assert places[:, 2].max() > 0.54
@@ -141,7 +171,9 @@ def test_a_float_on_a_hinge_swings_up(name):
 @pytest.mark.parametrize("alone", [True, False])
 def test_kinematic_bodies_push_liquid_and_take_nothing(alone):
     builder = newton.ModelBuilder()
-    body = builder.add_body(xform=wp.transform(wp.vec3(-0.4, 0.0, 0.25), wp.quat_identity()), is_kinematic=True)
+    body = builder.add_body(
+        xform=wp.transform(wp.vec3(-0.4, 0.0, 0.25), wp.quat_identity()), is_kinematic=True
+    )
     builder.add_shape_box(body, hx=0.06, hy=0.5, hz=0.5)
     model = builder.finalize(device="cpu")
     solver = SolverLiquid(model, pool(), origin=MIDDLE) if alone else together(model, pool())
@@ -174,7 +206,12 @@ def test_reset_puts_the_liquid_back_and_other_masses_are_taken():
 
 
 def test_a_frame_shows_liquid_and_bodies():
-    balls = ["sphere", {"radius": 0.08, "xform": wp.transform(wp.vec3(0.0, 0.0, 0.1), wp.quat_identity())}, "sphere", {"radius": 0.1}]
+    balls = [
+        "sphere",
+        {"radius": 0.08, "xform": wp.transform(wp.vec3(0.0, 0.0, 0.1), wp.quat_identity())},
+        "sphere",
+        {"radius": 0.1},
+    ]
     liquid = SolverLiquid(world(((0.0, 0.0, 0.4), 500.0, *balls)), pool(), origin=MIDDLE)
     parts = {part.name: part for part in liquid.simulation.frame()}
     top = parts["bodies"].points[:, 2].max()
@@ -184,24 +221,38 @@ def test_a_frame_shows_liquid_and_bodies():
 def test_graphs_are_not_for_it():
     model = world(((0.0, 0.0, 0.5), 500.0, "sphere", {"radius": 0.1}))
     liquid, state = SolverLiquid(model, pool(), origin=MIDDLE), model.state()
-    with wp.ScopedDevice("cpu"), pytest.raises(RuntimeError, match="inside a captured graph"), wp.ScopedCapture():
+    with (
+        wp.ScopedDevice("cpu"),
+        pytest.raises(RuntimeError, match="inside a captured graph"),
+        wp.ScopedCapture(),
+    ):
         liquid.step(state, state, None, None, 0.01)
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"solid": [{"shape": "sphere", "center": [0.5] * 3, "radius": 0.1, "mass": 1.0}]}, "rigid bodies come from the model"),
+        (
+            {"solid": [{"shape": "sphere", "center": [0.5] * 3, "radius": 0.1, "mass": 1.0}]},
+            "rigid bodies come from the model",
+        ),
         ({"solver": {"method": "psor"}}, "solver.method"),
         (
-            {"domain": {"size": [1.0, 1.0], "resolution": 16}, "liquid": [{"shape": "box", "min": [0, 0], "max": [1, 0.5]}]},
+            {
+                "domain": {"size": [1.0, 1.0], "resolution": 16},
+                "liquid": [{"shape": "box", "min": [0, 0], "max": [1, 0.5]}],
+            },
             "must have 2 entries",
         ),
     ],
 )
 def test_what_it_cannot_do_is_refused(change, message):
     with pytest.raises(ValueError, match=message):
-        SolverLiquid(world(((0.0, 0.0, 0.5), 500.0, "sphere", {"radius": 0.1})), pool() | change, origin=MIDDLE)
+        SolverLiquid(
+            world(((0.0, 0.0, 0.5), 500.0, "sphere", {"radius": 0.1})),
+            pool() | change,
+            origin=MIDDLE,
+        )
 
 
 def test_worlds_that_it_cannot_hold_are_refused():
@@ -228,12 +279,20 @@ def test_newton_s_basic_shapes_fall_into_liquid():
     from newton.viewer import ViewerNull
 
     size, states = [2.0, 14.0, 3.0], {}
-    scene = {"domain": {"size": size, "resolution": 70}, "liquid": [{"shape": "box", "min": [0.0] * 3, "max": [2.0, 14.0, 1.4]}]}
+    scene = {
+        "domain": {"size": size, "resolution": 70},
+        "liquid": [{"shape": "box", "min": [0.0] * 3, "max": [2.0, 14.0, 1.4]}],
+    }
     with wp.ScopedDevice("cpu"):
         for wet in (False, True):
             example = Example(ViewerNull(), SimpleNamespace(solver="xpbd"))
             if wet:
-                example.solver = SolverLiquid.coupled(example.model, lambda view: SolverXPBD(view, iterations=5), scene, origin=(-1, -7, 0))
+                example.solver = SolverLiquid.coupled(
+                    example.model,
+                    lambda view: SolverXPBD(view, iterations=5),
+                    scene,
+                    origin=(-1, -7, 0),
+                )
             example.sim_substeps, example.sim_dt = 1, 0.02
             for _ in range(40):
                 example.simulate()

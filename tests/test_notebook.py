@@ -55,9 +55,15 @@ def test_the_notebook_is_clean(notebook):
     """No counts of execution, no errors, no paths."""
     for cell in notebook["cells"]:
         assert cell.get("execution_count") is None
-        texts = [output for output in cell.get("outputs", ()) if output["output_type"] != "display_data"]
-        assert all(output["output_type"] == "stream" and output["name"] == "stdout" for output in texts)
-        assert not re.search(r"(^|[\s'\"])(/\w+/|[A-Z]:\\|~/)", "".join("".join(output["text"]) for output in texts))
+        texts = [
+            output for output in cell.get("outputs", ()) if output["output_type"] != "display_data"
+        ]
+        assert all(
+            output["output_type"] == "stream" and output["name"] == "stdout" for output in texts
+        )
+        assert not re.search(
+            r"(^|[\s'\"])(/\w+/|[A-Z]:\\|~/)", "".join("".join(output["text"]) for output in texts)
+        )
     assert notebook["nbformat"] == 4
     assert set(notebook["metadata"]["language_info"]) == {"name"}
 
@@ -66,15 +72,27 @@ def test_the_page_shows_code_and_what_it_prints(notebook, name):
     page, pictures = load("site_pages").page_of_notebook(json.dumps(notebook), name)
     title, printing, drawn = TITLES[name]
     assert page.startswith(f"# {title}\n")
-    assert page.count("```python\n") == sum(cell["cell_type"] == "code" for cell in notebook["cells"])
+    assert page.count("```python\n") == sum(
+        cell["cell_type"] == "code" for cell in notebook["cells"]
+    )
     assert page.count("```text\n") == printing
-    assert re.findall(r"^!\[.+\]\((.*)\)$", page, flags=re.M) == list(pictures) == [f"{name}-{k + 1}.png" for k in range(drawn)]
-    assert all(picture.startswith(b"\x89PNG") and len(picture) < LARGEST for picture in pictures.values())
+    assert (
+        re.findall(r"^!\[.+\]\((.*)\)$", page, flags=re.M)
+        == list(pictures)
+        == [f"{name}-{k + 1}.png" for k in range(drawn)]
+    )
+    assert all(
+        picture.startswith(b"\x89PNG") and len(picture) < LARGEST for picture in pictures.values()
+    )
 
 
 def test_powers_and_comparisons_are_set_but_for_code():
-    page = '<p title="a^2">64^3 &lt;= n^(3/2), D^-1/2, m^2/s, <code>a^2 &gt;= 1</code> and <a href="#x^2">x^n</a></p><pre>\n2^n</pre>'
+    page = (
+        '<p title="a^2">64^3 &lt;= n^(3/2), D^-1/2, m^2/s, <code>a^2 &gt;= 1</code> and <a '
+        'href="#x^2">x^n</a></p><pre>\n2^n</pre>'
+    )
     assert load("site_pages").on_page_content(page) == (
-        '<p title="a^2">64<sup>3</sup> ≤ n<sup>3/2</sup>, D<sup>-1/2</sup>, m<sup>2</sup>/s, <code>a^2 &gt;= 1</code> and <a href="#x^2">'
+        '<p title="a^2">64<sup>3</sup> ≤ n<sup>3/2</sup>, D<sup>-1/2</sup>, m<sup>2</sup>/s, '
+        '<code>a^2 &gt;= 1</code> and <a href="#x^2">'
         "x<sup>n</sup></a></p><pre>\n2^n</pre>"
     )

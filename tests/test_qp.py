@@ -11,7 +11,15 @@ from scipy.optimize import lsq_linear
 from warp_lcp import qp
 
 qpsolvers = pytest.importorskip("qpsolvers")
-USES = {"box": "", "inequalities": "G", "equations": "A", "both": "GA", "no box": "GA-", "nothing": "-", "rows that bound nothing": "Gh"}
+USES = {
+    "box": "",
+    "inequalities": "G",
+    "equations": "A",
+    "both": "GA",
+    "no box": "GA-",
+    "nothing": "-",
+    "rows that bound nothing": "Gh",
+}
 
 
 @pytest.fixture(autouse=True)
@@ -30,9 +38,14 @@ def program(use, rank, seed, sparse):
     if "h" in use:
         h[2] = np.inf
     made = scipy.sparse.csc_matrix if sparse else np.asarray
-    q = root @ rng.standard_normal(rank) if "-" in use or rank < n else rng.standard_normal(n)  # in P's range: there is a minimizer
-    rows = ((made(G), h) if "G" in use else (None, None)) + ((made(A), A @ x) if "A" in use else (None, None))
-    return qpsolvers.Problem(made(root @ root.T), q, *rows, *((None, None) if "-" in use else (lower, upper)))
+    # in P's range: there is a minimizer
+    q = root @ rng.standard_normal(rank) if "-" in use or rank < n else rng.standard_normal(n)
+    rows = ((made(G), h) if "G" in use else (None, None)) + (
+        (made(A), A @ x) if "A" in use else (None, None)
+    )
+    return qpsolvers.Problem(
+        made(root @ root.T), q, *rows, *((None, None) if "-" in use else (lower, upper))
+    )
 
 
 def satisfied(problem, found, accuracy=1e-6):
@@ -79,7 +92,9 @@ def test_least_squares_of_qpsolvers():
     rng = np.random.default_rng(13)
     R, s = rng.standard_normal((15, 6)), rng.standard_normal(15)
     x = qpsolvers.solve_ls(R, s, lb=np.full(6, -0.1), ub=np.full(6, 0.2), solver="warp_lcp")
-    np.testing.assert_allclose(x, lsq_linear(R, s, (-0.1, 0.2), method="bvls", tol=1e-14).x, atol=1e-7)
+    np.testing.assert_allclose(
+        x, lsq_linear(R, s, (-0.1, 0.2), method="bvls", tol=1e-14).x, atol=1e-7
+    )
 
 
 def test_linear_programs():
@@ -98,7 +113,9 @@ def test_linear_programs():
 @pytest.mark.parametrize("why", ["infeasible", "unbounded"])
 def test_programs_without_a_solution_are_not_found(why, capsys):
     made = {
-        "infeasible": qpsolvers.Problem(np.eye(2), np.ones(2), np.array([[1.0, 0.0], [-1.0, 0.0]]), np.array([-1.0, -1.0])),
+        "infeasible": qpsolvers.Problem(
+            np.eye(2), np.ones(2), np.array([[1.0, 0.0], [-1.0, 0.0]]), np.array([-1.0, -1.0])
+        ),
         "unbounded": qpsolvers.Problem(np.diag([1.0, 0.0]), -np.ones(2), lb=np.zeros(2)),
     }
     found = qpsolvers.solve_problem(made[why], "warp_lcp", verbose=True)

@@ -27,7 +27,9 @@ def check(seed, **options):
     p, x = drawn.plain, found.x * drawn.units
     size = max(np.abs(drawn.x).max(), np.abs(x).max() if not drawn.x.any() else 0.0)
     if drawn.unique:
-        np.testing.assert_allclose(x, drawn.x, atol=1e-6 * size if drawn.x.any() else 1e-9, rtol=0, err_msg=str(message))
+        np.testing.assert_allclose(
+            x, drawn.x, atol=1e-6 * size if drawn.x.any() else 1e-9, rtol=0, err_msg=str(message)
+        )
     costs, least = (0.5 * v @ p["P"] @ v + p["q"] @ v for v in (x, drawn.x))
     assert abs(costs - least) <= 1e-7 * (1 + np.abs(p["q"] * drawn.x).sum()), message
     optimal(drawn.scaled, found, message)
@@ -36,19 +38,37 @@ def check(seed, **options):
 
 def optimal(given, found, message, accuracy=2e-8):
     """Test the first-order conditions row by row, relative to the terms of each row."""
-    dense = {name: v.toarray() if hasattr(v, "toarray") else v for name, v in given.items() if v is not None}
+    dense = {
+        name: v.toarray() if hasattr(v, "toarray") else v
+        for name, v in given.items()
+        if v is not None
+    }
     n, x = len(given["q"]), found.x
-    gradient, terms = dense["P"] @ x + dense["q"], np.abs(dense["P"]) @ np.abs(x) + np.abs(dense["q"])
-    for matrix, right, multiplier, inequality in (("G", "h", found.z, True), ("A", "b", found.y, False)):
+    gradient, terms = (
+        dense["P"] @ x + dense["q"],
+        np.abs(dense["P"]) @ np.abs(x) + np.abs(dense["q"]),
+    )
+    for matrix, right, multiplier, inequality in (
+        ("G", "h", found.z, True),
+        ("A", "b", found.y, False),
+    ):
         if matrix not in dense:
             assert multiplier is None
             continue
         M, r = dense[matrix], dense[right]
-        rest, sizes = M @ x - r, np.abs(M) @ np.abs(x) + np.abs(r) + 1e-5 * np.abs(M).max(1, initial=0.0) * np.abs(x).max()
-        assert ((np.maximum(rest, 0) if inequality else np.abs(rest)) <= accuracy * sizes).all(), message
+        rest, sizes = (
+            M @ x - r,
+            np.abs(M) @ np.abs(x)
+            + np.abs(r)
+            + 1e-5 * np.abs(M).max(1, initial=0.0) * np.abs(x).max(),
+        )
+        assert ((np.maximum(rest, 0) if inequality else np.abs(rest)) <= accuracy * sizes).all(), (
+            message
+        )
         if inequality:
             assert (multiplier >= 0).all()
-            assert ((multiplier == 0) | (np.abs(rest) <= accuracy * sizes)).all(), message  # complementary, exactly
+            # complementary, exactly
+            assert ((multiplier == 0) | (np.abs(rest) <= accuracy * sizes)).all(), message
         gradient, terms = gradient + M.T @ multiplier, terms + np.abs(M).T @ np.abs(multiplier)
     lower, upper = dense.get("lb", np.full(n, -np.inf)), dense.get("ub", np.full(n, np.inf))
     assert ((lower <= x) & (x <= upper)).all(), message
@@ -56,7 +76,9 @@ def optimal(given, found, message, accuracy=2e-8):
         assert (x[found.z_box < 0] == lower[found.z_box < 0]).all(), message
         assert (x[found.z_box > 0] == upper[found.z_box > 0]).all(), message
         gradient = gradient + found.z_box
-    assert (np.abs(gradient) <= accuracy * (terms + 1e-5 * np.abs(dense["P"]).max(1) * np.abs(x).max())).all(), message
+    assert (
+        np.abs(gradient) <= accuracy * (terms + 1e-5 * np.abs(dense["P"]).max(1) * np.abs(x).max())
+    ).all(), message
 
 
 @pytest.mark.parametrize("seed", range(40, 72))
@@ -64,7 +86,8 @@ def test_drawn_programs(seed):
     check(seed)
 
 
-@pytest.mark.parametrize("seed", [*range(900, 906), 620237])  # the last: multipliers of an equation and a bound that cancel
+# the last: multipliers of an equation and a bound that cancel
+@pytest.mark.parametrize("seed", [*range(900, 906), 620237])
 def test_drawn_programs_whose_unknowns_are_scaled(seed):
     check(seed, columns=3.0, most=30)
 
@@ -74,14 +97,21 @@ def test_drawn_programs_whose_unknowns_are_scaled(seed):
 def test_as_clarabel_and_piqp_say(seed):
     """On the program in plain units, for in the others they fail themselves."""
     drawn, found = check(seed)
-    sparse = {name: scipy.sparse.csc_matrix(v) if v.ndim == 2 else v for name, v in drawn.plain.items() if v.shape[0]}
+    sparse = {
+        name: scipy.sparse.csc_matrix(v) if v.ndim == 2 else v
+        for name, v in drawn.plain.items()
+        if v.shape[0]
+    }
     agreed = []
     for name in OTHERS:
         options = (
-            {"tol_gap_abs": 1e-10, "tol_gap_rel": 1e-10, "tol_feas": 1e-10} if name == "clarabel" else {"eps_abs": 1e-10, "eps_rel": 1e-10}
+            {"tol_gap_abs": 1e-10, "tol_gap_rel": 1e-10, "tol_feas": 1e-10}
+            if name == "clarabel"
+            else {"eps_abs": 1e-10, "eps_rel": 1e-10}
         )
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # Clarabel's statuses of programs without a solution
+            # Clarabel's statuses of programs without a solution
+            warnings.simplefilter("ignore", UserWarning)
             other = qpsolvers.solve_problem(qpsolvers.Problem(**sparse), name, **options)
         if bool(other.found) != found.found:
             continue  # PIQP gives up on 3 of 500
@@ -100,7 +130,9 @@ def test_as_clarabel_and_piqp_say(seed):
 @pytest.mark.parametrize("scale", [1e-12, 1e-9, 1.0, 1e6, 1e9, 1e12, 1e100])
 def test_costs_in_any_unit(scale):
     """x + y <= 1, costs (x^2 + y^2) / 2 - x - y: at (.5, .5), with a multiplier of .5 units."""
-    found = qp.solve_problem(qpsolvers.Problem(scale * np.eye(2), -scale * np.ones(2), G=np.ones((1, 2)), h=np.ones(1)))
+    found = qp.solve_problem(
+        qpsolvers.Problem(scale * np.eye(2), -scale * np.ones(2), G=np.ones((1, 2)), h=np.ones(1))
+    )
     assert found.found
     np.testing.assert_allclose(found.x, 0.5, rtol=1e-9)
     np.testing.assert_allclose(found.z, 0.5 * scale, rtol=1e-9)
@@ -110,14 +142,26 @@ def test_costs_in_any_unit(scale):
 def test_infinity_as_a_number(infinity):
     eye, one = np.eye(2), np.ones(2)
     for bounds in ({}, {"lb": np.array([-infinity, 0.0]), "ub": infinity * one}):
-        found = qp.solve_problem(qpsolvers.Problem(eye, -one, G=np.array([[1.0, 0.0], [0.0, 1.0]]), h=np.array([infinity, 0.25]), **bounds))
+        found = qp.solve_problem(
+            qpsolvers.Problem(
+                eye,
+                -one,
+                G=np.array([[1.0, 0.0], [0.0, 1.0]]),
+                h=np.array([infinity, 0.25]),
+                **bounds,
+            )
+        )
         assert found.found
         np.testing.assert_allclose(found.x, [1.0, 0.25], rtol=1e-9)
         np.testing.assert_allclose(found.z, [0.0, 0.75], rtol=1e-9)
-    box = qp.solve_problem(qpsolvers.Problem(eye, -one, lb=-infinity * one, ub=np.array([infinity, 0.5])))
+    box = qp.solve_problem(
+        qpsolvers.Problem(eye, -one, lb=-infinity * one, ub=np.array([infinity, 0.5]))
+    )
     np.testing.assert_allclose(box.x, [1.0, 0.5])
     np.testing.assert_allclose(box.z_box, [0.0, 0.5])
-    none = qp.solve_problem(qpsolvers.Problem(eye, -one, G=np.ones((1, 2)), h=np.array([-infinity])))
+    none = qp.solve_problem(
+        qpsolvers.Problem(eye, -one, G=np.ones((1, 2)), h=np.array([-infinity]))
+    )
     assert none.found is False
     assert none.extras["result"].message == "INFEASIBLE: h[0] is -infinity, which no x meets"
     falls = qp.solve_problem(qpsolvers.Problem(0 * eye, one, lb=-infinity * one))
@@ -138,16 +182,22 @@ def test_a_large_row_hides_no_other():
         found = qp.solve_problem(qpsolvers.Problem(P, q, **given))
         assert found.found
         np.testing.assert_allclose(found.x, [0.5, 0.0], atol=1e-9)
-    far = qp.solve_problem(qpsolvers.Problem(P, np.array([-1.0, -1.0]), G=np.eye(2), h=np.array([0.25, 1e16])))
+    far = qp.solve_problem(
+        qpsolvers.Problem(P, np.array([-1.0, -1.0]), G=np.eye(2), h=np.array([0.25, 1e16]))
+    )
     np.testing.assert_allclose(far.x, [0.25, 0.375], atol=1e-9)
 
 
 def test_programs_without_rows_and_rows_without_entries():
     eye, one, none, row = np.eye(2), np.ones(2), np.zeros((0, 2)), np.zeros((1, 2))
-    found = qp.solve_problem(qpsolvers.Problem(eye, -one, G=none, h=np.zeros(0), A=none, b=np.zeros(0)))
+    found = qp.solve_problem(
+        qpsolvers.Problem(eye, -one, G=none, h=np.zeros(0), A=none, b=np.zeros(0))
+    )
     assert (found.found, found.y.shape, found.z.shape) == (True, (0,), (0,))
     np.testing.assert_allclose(found.x, 1.0)
-    assert qp.solve_problem(qpsolvers.Problem(eye, -one, G=row, h=one[:1], A=row, b=0 * one[:1])).found
+    assert qp.solve_problem(
+        qpsolvers.Problem(eye, -one, G=row, h=one[:1], A=row, b=0 * one[:1])
+    ).found
     assert not qp.solve_problem(qpsolvers.Problem(eye, -one, G=row, h=-one[:1])).found
     assert not qp.solve_problem(qpsolvers.Problem(eye, -one, A=row, b=one[:1])).found
 
@@ -155,7 +205,12 @@ def test_programs_without_rows_and_rows_without_entries():
 @pytest.mark.parametrize("gap", [1.0, 1e-3, 1e-6])
 def test_rows_that_contradict_each_other_by_little(gap):
     found = qp.solve_problem(
-        qpsolvers.Problem(np.eye(2), np.zeros(2), G=np.array([[1.0, 1.0], [-1.0, -1.0]]), h=np.array([1.0, -1.0 - gap]))
+        qpsolvers.Problem(
+            np.eye(2),
+            np.zeros(2),
+            G=np.array([[1.0, 1.0], [-1.0, -1.0]]),
+            h=np.array([1.0, -1.0 - gap]),
+        )
     )
     assert found.found is False
     assert found.extras["result"].message == "INFEASIBLE: no x meets the constraints"
@@ -164,9 +219,19 @@ def test_rows_that_contradict_each_other_by_little(gap):
 def test_figures_are_those_of_qpsolvers():
     """x_0 + x_1 = 1, x_0 - x_2 <= .2, -1 <= x <= .7: all kinds of multipliers, and qpsolvers' own three figures."""
     P, q = np.diag([1.0, 2.0, 0.0]), np.array([-2.0, 0.5, 1.0])
-    rows = {"G": np.array([[1.0, 0.0, -1.0]]), "h": np.array([0.2]), "A": np.array([[1.0, 1.0, 0.0]]), "b": np.ones(1)}
+    rows = {
+        "G": np.array([[1.0, 0.0, -1.0]]),
+        "h": np.array([0.2]),
+        "A": np.array([[1.0, 1.0, 0.0]]),
+        "b": np.ones(1),
+    }
     found = qp.solve_problem(qpsolvers.Problem(P, q, **rows, lb=-np.ones(3), ub=np.full(3, 0.7)))
     assert found.is_optimal(1e-9)
-    assert max(found.extras[name] for name in ("primal_residual", "dual_residual", "duality_gap")) <= 1e-9
-    moved = qpsolvers.Solution(found.problem, found=True, x=found.x + 1e-3, z=found.z, y=found.y, z_box=found.z_box)
+    assert (
+        max(found.extras[name] for name in ("primal_residual", "dual_residual", "duality_gap"))
+        <= 1e-9
+    )
+    moved = qpsolvers.Solution(
+        found.problem, found=True, x=found.x + 1e-3, z=found.z, y=found.y, z_box=found.z_box
+    )
     assert not moved.is_optimal(1e-4)

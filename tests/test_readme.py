@@ -17,7 +17,10 @@ def test_it_is_short_and_counts_the_methods():
     text = README.read_text()
     assert text.count("\n") <= 110
     assert f"[{len(wl.METHODS)} methods]" in text
-    assert f">{len(wl.METHODS)} methods: init, step<" in (README.parent / "docs" / "architecture.svg").read_text()
+    assert (
+        f">{len(wl.METHODS)} methods: init, step<"
+        in (README.parent / "docs" / "architecture.svg").read_text()
+    )
 
 
 @pytest.mark.parametrize("code", blocks(README, "python"))

@@ -16,7 +16,8 @@ from warp_lcp.rules import RULES
 from warp_lcp.traits import traits_of
 
 SEEDS = range(700, 703)  # neither those of the rules nor those of the published check
-COUNTED = [family for family in FAMILIES if not family.startswith("scene")]  # contacts at rest are tried below
+# contacts at rest are tried below
+COUNTED = [family for family in FAMILIES if not family.startswith("scene")]
 NO_INDEFINITE = np.diag([1.0, 1.0, 1.0, 1.0, 1.0])
 
 
@@ -27,7 +28,9 @@ def test_recommended_methods_converge(family):
         name, lcp, accuracy = make(family, seed)
         advice = wl.recommend(lcp, accuracy=accuracy)
         result = wl.solve(lcp, advice.chain, stopping=advice.stopping)
-        assert result, f"{name}: {advice.name} ends {result.status.name} at {result.relative_residual:.1e}"
+        assert result, (
+            f"{name}: {advice.name} ends {result.status.name} at {result.relative_residual:.1e}"
+        )
         assert result.relative_residual <= accuracy
         assert set(advice.alternatives) <= set(wl.METHODS) - {advice.name}
         assert len(advice.reasons) >= 2
@@ -58,8 +61,16 @@ def test_the_answer_is_one_by_another_codes_residual():
     advice = wl.recommend(lcp, accuracy=1e-8)
     assert np.array_equal(lcp.b.numpy(), before)
     x = wl.solve(lcp, advice.chain, stopping=advice.stopping).x.numpy()
-    start = natural_residual(problem.A, problem.b, problem.lower, problem.upper, np.clip(np.zeros(40), problem.lower, problem.upper))
-    assert natural_residual(problem.A, problem.b, problem.lower, problem.upper, x) <= 1e-8 * start * (1 + 1e-6)
+    start = natural_residual(
+        problem.A,
+        problem.b,
+        problem.lower,
+        problem.upper,
+        np.clip(np.zeros(40), problem.lower, problem.upper),
+    )
+    assert natural_residual(
+        problem.A, problem.b, problem.lower, problem.upper, x
+    ) <= 1e-8 * start * (1 + 1e-6)
 
 
 def eigenvalue_verdict(A):
@@ -115,7 +126,9 @@ def test_the_trial_foresees_how_many_sweeps():
     """To a factor of 2, where the rate has settled; a rate taken over another number of sweeps would be far off."""
     for problem in (gallery.banded(400, seed=77), gallery.poisson((12, 12), seed=77, device="cpu")):
         lcp = problem.lcp(device="cpu")
-        sweeps = wl.solve(lcp, wl.ProjectedSOR(), stopping=wl.StoppingCriteria(rtol=1e-8, max_iterations=1000)).iterations
+        sweeps = wl.solve(
+            lcp, wl.ProjectedSOR(), stopping=wl.StoppingCriteria(rtol=1e-8, max_iterations=1000)
+        ).iterations
         assert sweeps > 10
         assert sweeps / 2 <= traits_of(lcp, 1e-8).sweeps <= 2 * sweeps
 
@@ -123,7 +136,10 @@ def test_the_trial_foresees_how_many_sweeps():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"accuracy": "perfect"}, r"accuracy = 'perfect': must be in \(0, 1\) or 'rough', 'usual' or 'exact'"),
+        (
+            {"accuracy": "perfect"},
+            r"accuracy = 'perfect': must be in \(0, 1\) or 'rough', 'usual' or 'exact'",
+        ),
         ({"accuracy": 1}, "accuracy = .*: must be in"),
         ({"accuracy": True}, "accuracy = .*: must be in"),
         ({"accuracy": float("nan")}, "accuracy = .*: must be in"),
@@ -161,7 +177,9 @@ def test_wrong_budgets_are_named(wrong, message):
 @pytest.mark.parametrize("n", [120, 3000])
 def test_small_and_narrow_matrices_get_the_default(n):
     """Directly on the host: NumPy's sweeps would do, the dense one's eigenvalues are positive."""
-    lcp = (gallery.definite(n, seed=76) if n == 120 else gallery.banded(n, seed=76)).lcp(device="cpu")
+    lcp = (gallery.definite(n, seed=76) if n == 120 else gallery.banded(n, seed=76)).lcp(
+        device="cpu"
+    )
     advice = wl.recommend(lcp, accuracy=1e-8)
     assert advice.method == wl.default_method(lcp) == wl.MinimumMapNewton(direct=True)
     assert wl.solve(lcp, advice.method, stopping=advice.stopping)
@@ -195,7 +213,8 @@ def test_a_budget_of_seconds_is_tried():
     assert hurried.name == "psor"
     assert hurried.stopping.max_iterations == 1
     assert wl.recommend(lcp, budget=wl.Budget(seconds=1e4)).name == "minimum-map-newton"
-    slow = gallery.contact(3, seed=80).lcp(device="cpu")  # beta rows: no sweep helps, but one can start
+    # beta rows: no sweep helps, but one can start
+    slow = gallery.contact(3, seed=80).lcp(device="cpu")
     assert wl.recommend(slow, budget=wl.Budget(seconds=1e4)).name == "lemke"
 
 
@@ -215,7 +234,10 @@ def check_default(kind, seed):
     """The default solves a problem to 1e-6, and takes first what is recommended."""
     lcp = draw(kind, seed)
     result = wl.solve(lcp)
-    assert result, f"{kind} {seed}: {result.method} ends {result.status.name} at {result.relative_residual:.1e}"
+    assert result, (
+        f"{kind} {seed}: {result.method} ends {result.status.name} at "
+        f"{result.relative_residual:.1e}"
+    )
     if kind in BOXES:
         A, b, low, high = lcp.A.matrix.numpy(), lcp.b.numpy(), lcp.lower.numpy(), lcp.upper.numpy()
         start = natural_residual(A, b, low, high, np.clip(0 * b, low, high))
@@ -252,18 +274,34 @@ def misled():
 
 
 def test_a_method_that_fails_is_followed_by_its_alternatives(misled):
-    told, alone = [], wl.solve(misled, wl.default_method(misled), stopping=wl.StoppingCriteria(max_iterations=75))
+    told, alone = (
+        [],
+        wl.solve(
+            misled, wl.default_method(misled), stopping=wl.StoppingCriteria(max_iterations=75)
+        ),
+    )
     assert not alone
-    result = wl.solve(misled, stopping=wl.StoppingCriteria(max_iterations=100), callback=told.append)
+    result = wl.solve(
+        misled, stopping=wl.StoppingCriteria(max_iterations=100), callback=told.append
+    )
     assert result
     assert result.method in wl.recommend(misled).alternatives
     assert result.iterations == told[-1].iteration == result.history[-1].iteration
     assert alone.iterations < result.iterations <= 100
-    assert result.linear_iterations == result.history[-1].linear_iterations >= alone.linear_iterations
+    assert (
+        result.linear_iterations == result.history[-1].linear_iterations >= alone.linear_iterations
+    )
     assert [r.iteration for r in told] == [r.iteration for r in result.history]
-    for numbers in ([r.iteration for r in told], [r.linear_iterations for r in told], [r.seconds for r in told]):
+    for numbers in (
+        [r.iteration for r in told],
+        [r.linear_iterations for r in told],
+        [r.seconds for r in told],
+    ):
         assert numbers == sorted(numbers)
-    assert [r.step for r in told if r.step.startswith("start")] == ["start", f"start of {result.method}"]
+    assert [r.step for r in told if r.step.startswith("start")] == [
+        "start",
+        f"start of {result.method}",
+    ]
     x = misled.A.matrix.numpy(), misled.b.numpy(), 0.0, 1.0, result.x.numpy()
     assert natural_residual(*x) <= 1e-6 * natural_residual(*x[:4], np.zeros(12))
 
@@ -281,7 +319,10 @@ def test_alternatives_keep_the_limits(misled):
             raise StopIteration
 
     assert wl.solve(misled, callback=stop).status is wl.SolveStatus.STOPPED
-    timed = wl.solve(misled, stopping=wl.StoppingCriteria(max_iterations=100_000, patience=100_000, max_seconds=0.02))
+    timed = wl.solve(
+        misled,
+        stopping=wl.StoppingCriteria(max_iterations=100_000, patience=100_000, max_seconds=0.02),
+    )
     assert timed.status is wl.SolveStatus.TIME_LIMIT
     assert len([r for r in timed.history if r.step.startswith("start")]) == 1
 
@@ -290,7 +331,9 @@ def test_scipy_s_manner_goes_on_too(misled):
     assert wl.linear_complementarity(misled.A, misled.b.numpy(), bounds=(0.0, 1.0)).success
 
 
-@pytest.mark.parametrize("name", ["box-stack", "arched-snake", pytest.param("wall", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", ["box-stack", "arched-snake", pytest.param("wall", marks=pytest.mark.slow)]
+)
 def test_friction_is_solved_by_default(name):
     world = SCENES[name]()
     stepper = ContactStepper(world, wl.NNCG(), dt=0.01, device="cpu")
@@ -305,10 +348,16 @@ def test_friction_is_solved_by_default(name):
 def test_a_recommendation_prints_the_chain_its_reasons_and_what_comes_else():
     advice = wl.recommend(gallery.definite(300, seed=81).lcp(device="cpu"))
     first, *rest = str(advice).splitlines()
-    assert first == "minimum-map-newton, then interior-point (stalls), then proximal-point (PathCreeps(steps=10))"
+    assert (
+        first == "minimum-map-newton, then interior-point (stalls), then proximal-point "
+        "(PathCreeps(steps=10))"
+    )
     assert first == str(advice.chain)
     assert rest[: len(advice.reasons)] == list(advice.reasons)
-    assert rest[-2:] == [f"Expected: {advice.expected}.", f"Else, from the same start: {', '.join(advice.alternatives)}."]
+    assert rest[-2:] == [
+        f"Expected: {advice.expected}.",
+        f"Else, from the same start: {', '.join(advice.alternatives)}.",
+    ]
 
 
 def test_few_negative_diagonal_entries_are_newtons_then_fischers():

@@ -39,20 +39,36 @@ def test_the_recipe_wants_what_the_package_wants():
 
 def test_the_container_has_what_ranks_need():
     """The packages of the tests on ranks, which are those of the extra, and a Python and PETSc that are new enough."""
-    packages = re.search(r"^packages=\((.*)\)$", (ROOT / ".ci" / "mpi-environment").read_text(), flags=re.M)[1]
+    packages = re.search(
+        r"^packages=\((.*)\)$", (ROOT / ".ci" / "mpi-environment").read_text(), flags=re.M
+    )[1]
     assert f" {packages} " in CONTAINER
-    least = dict(requirement.split(">=") for requirement in PROJECT["optional-dependencies"]["distributed"])
+    least = dict(
+        requirement.split(">=") for requirement in PROJECT["optional-dependencies"]["distributed"]
+    )
     assert {f"python3-{name}" for name in least} <= set(packages.split())
     has = re.search(r"Python ([\d.]+), PETSc ([\d.]+) ", CONTAINER).groups()
-    for version, needed in zip(has, (PROJECT["requires-python"].removeprefix(">="), least["petsc4py"]), strict=True):
-        assert [int(part) for part in version.split(".")] >= [int(part) for part in needed.split(".")]
+    for version, needed in zip(
+        has, (PROJECT["requires-python"].removeprefix(">="), least["petsc4py"]), strict=True
+    ):
+        assert [int(part) for part in version.split(".")] >= [
+            int(part) for part in needed.split(".")
+        ]
     assert f"{PROJECT['name'].replace('-', '_')}-*.whl" in CONTAINER
 
 
 def test_the_batch_script_runs_this_command_line():
     run = re.search(r'"\$\{program\[@\]\}" (run .*)$', BATCH, flags=re.M)[1]
-    options = {name for parameter in typer.main.get_command(app).commands["run"].params for name in parameter.opts}
-    assert set(re.findall(r"--\w+", run + re.search(r"set -- (.*);", BATCH)[1])) == {"--engine", "--out", "--resume"} <= options
+    options = {
+        name
+        for parameter in typer.main.get_command(app).commands["run"].params
+        for name in parameter.opts
+    }
+    assert (
+        set(re.findall(r"--\w+", run + re.search(r"set -- (.*);", BATCH)[1]))
+        == {"--engine", "--out", "--resume"}
+        <= options
+    )
     assert f"WARP_LCP:-{next(iter(PROJECT['scripts']))}}}" in BATCH
 
 

@@ -15,9 +15,13 @@ from warp_lcp.cli.commands import app
 TUTORIAL = Path(__file__).parents[1] / "docs" / "tutorial.md"
 SCENES = blocks(TUTORIAL, "toml")
 COMMANDS = [
-    shlex.split(line, comments=True)[1:] for block in blocks(TUTORIAL, "sh") for line in block.splitlines() if re.match(r"warp-lcp ", line)
+    shlex.split(line, comments=True)[1:]
+    for block in blocks(TUTORIAL, "sh")
+    for line in block.splitlines()
+    if re.match(r"warp-lcp ", line)
 ]
-SHORTER = ["--set", "time.duration=0.05", "--set", "domain.resolution=24"]  # the text's films take longer
+# the text's films take longer
+SHORTER = ["--set", "time.duration=0.05", "--set", "domain.resolution=24"]
 
 
 def invoke(*words):
@@ -61,12 +65,29 @@ def test_commands_work(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("crate.toml").write_text(SCENES[0])
     Path("sand.toml").write_text(SCENES[1])
-    assert [words[0] for words in COMMANDS] == ["run", "render", "check", "run", "render", "render", "run", "render"]
+    assert [words[0] for words in COMMANDS] == [
+        "run",
+        "render",
+        "check",
+        "run",
+        "render",
+        "render",
+        "run",
+        "render",
+    ]
     for words in COMMANDS:
         if words[0] == "render":
             pytest.importorskip("pyvista")
         invoke(*words, *(SHORTER if words[0] == "run" else []))
-    assert {path.name for path in tmp_path.iterdir()} == {"dam", "crate", "sand", "crate.toml", "sand.toml", "dam.gif", "crate.gif"}
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "dam",
+        "crate",
+        "sand",
+        "crate.toml",
+        "sand.toml",
+        "dam.gif",
+        "crate.gif",
+    }
     assert (tmp_path / "crate" / "images" / "sheet.png").is_file()
 
 

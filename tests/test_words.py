@@ -17,7 +17,8 @@ from warp_lcp.cli.commands import app
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*(ROOT / "docs").glob("*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md"])
 LONGEST = 80  # characters of a summary line
-RIDDLES = {"what", "which", "how", "who", "that", "in", "of", "where", "when"}  # a summary line begins with a noun or a verb
+# a summary line begins with a noun or a verb
+RIDDLES = {"what", "which", "how", "who", "that", "in", "of", "where", "when"}
 
 # Old names and phrases, each with the plain one that replaces it.
 REPLACED = {
@@ -49,7 +50,8 @@ NOT_IN_MESSAGES = {
     r"\banew\b": "again",
     r"\bunless given\b": "Default:",
 }
-for old_name in (r"\bcrowding\b", r"\bangle_of\b", r"\bConvexSetProblem\b"):  # a module of kernels; names with a deprecation
+# a module of kernels; names with a deprecation
+for old_name in (r"\bcrowding\b", r"\bangle_of\b", r"\bConvexSetProblem\b"):
     del NOT_IN_MESSAGES[old_name]
 
 
@@ -61,21 +63,37 @@ def parsed(file: Path) -> ast.Module:
 def documented() -> dict[str, str]:
     """Return the summary line of everything that docs/api shows or that `run` and `scene` have: modules, classes, functions."""
     found: dict[str, str] = {}
-    for reference in re.findall(r"^::: (\S+)", "\n".join(page.read_text() for page in (ROOT / "docs" / "api").glob("*.md")), re.MULTILINE):
+    for reference in re.findall(
+        r"^::: (\S+)",
+        "\n".join(page.read_text() for page in (ROOT / "docs" / "api").glob("*.md")),
+        re.MULTILINE,
+    ):
         parts = reference.split(".")
         places = [ROOT.joinpath(*parts[:n]) for n in range(len(parts), 0, -1)]
-        file = next(file for place in places for file in (place.with_suffix(".py"), place / "__init__.py") if file.is_file())
+        file = next(
+            file
+            for place in places
+            for file in (place.with_suffix(".py"), place / "__init__.py")
+            if file.is_file()
+        )
         node: ast.AST = parsed(file)
         for part in parts[len(file.relative_to(ROOT).with_suffix("").parts) :]:
-            node = next(inner for inner in ast.iter_child_nodes(node) if getattr(inner, "name", "") == part)
+            node = next(
+                inner for inner in ast.iter_child_nodes(node) if getattr(inner, "name", "") == part
+            )
         _add_summaries(found, reference, node)
-    for file in (file for package in ("run", "scene") for file in (ROOT / "warp_lcp" / package).glob("*.py")):
+    for file in (
+        file for package in ("run", "scene") for file in (ROOT / "warp_lcp" / package).glob("*.py")
+    ):
         _add_summaries(found, f"{file.parent.name}.{file.stem}", parsed(file))
     return found
 
 
 def _add_summaries(found: dict[str, str], name: str, node: ast.AST) -> None:
-    if name not in found and not any("kernel" in word or "wp." in word for word in map(ast.unparse, getattr(node, "decorator_list", []))):
+    if name not in found and not any(
+        "kernel" in word or "wp." in word
+        for word in map(ast.unparse, getattr(node, "decorator_list", []))
+    ):
         # a setter comes second; the text of a kernel is part of its module's hash
         found[name] = (ast.get_docstring(node, clean=False) or "").split("\n")[0]  # type: ignore[arg-type]
     if isinstance(node, ast.ClassDef | ast.Module):
@@ -86,12 +104,22 @@ def _add_summaries(found: dict[str, str], name: str, node: ast.AST) -> None:
 
 def messages(phrases: re.Pattern[str]) -> Iterator[str]:
     """Yield the place and the text of each string of the packages that has one of the phrases, except docstrings."""
-    for file in (file for package in ("warp_lcp", "fluids", "granular") for file in (ROOT / package).rglob("*.py")):
+    for file in (
+        file
+        for package in ("warp_lcp", "fluids", "granular")
+        for file in (ROOT / package).rglob("*.py")
+    ):
         if not phrases.search(file.read_text()):
             continue  # most files need not be parsed
-        docstrings = {id(node.value) for node in ast.walk(parsed(file)) if isinstance(node, ast.Expr)}
+        docstrings = {
+            id(node.value) for node in ast.walk(parsed(file)) if isinstance(node, ast.Expr)
+        }
         for node in ast.walk(parsed(file)):
-            if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docstrings:
+            if (
+                isinstance(node, ast.Constant)
+                and isinstance(node.value, str)
+                and id(node) not in docstrings
+            ):
                 if " " in node.value and phrases.search(node.value):
                     yield f"{file.relative_to(ROOT)}:{node.lineno}: {node.value}"
 
@@ -102,10 +130,16 @@ def public_summaries():
     for module in (wl, gallery):
         for name in module.__all__:
             member = getattr(module, name)
-            if (inspect.isclass(member) or inspect.isfunction(member)) and member.__module__.startswith("warp_lcp"):
+            if (
+                inspect.isclass(member) or inspect.isfunction(member)
+            ) and member.__module__.startswith("warp_lcp"):
                 found[name] = inspect.getdoc(member)
                 for key, value in vars(member).items() if inspect.isclass(member) else ():
-                    function = value.fget if isinstance(value, property) else getattr(value, "__func__", value)
+                    function = (
+                        value.fget
+                        if isinstance(value, property)
+                        else getattr(value, "__func__", value)
+                    )
                     if not key.startswith("_") and inspect.isfunction(function):
                         found[f"{name}.{key}"] = function.__doc__
     return {name: (text or "").strip().split("\n")[0] for name, text in found.items()}
@@ -114,7 +148,12 @@ def public_summaries():
 def is_plain(summary: str) -> bool:
     """Return whether a summary line is short and begins with a noun or a verb."""
     words = summary.lower().split(" ")
-    return 0 < len(summary) <= LONGEST and words[0] not in RIDDLES and words[:2] != ["return", "what"] and words[:2] != ["return", "how"]
+    return (
+        0 < len(summary) <= LONGEST
+        and words[0] not in RIDDLES
+        and words[:2] != ["return", "what"]
+        and words[:2] != ["return", "how"]
+    )
 
 
 def test_summary_lines_name_the_thing():
@@ -128,10 +167,18 @@ def test_summary_lines_name_the_thing():
 def test_help_texts_are_short_and_name_the_thing():
     command = typer.main.get_command(app)
     found = {"": command.help} | {name: inner.help for name, inner in command.commands.items()}
-    found |= {f"{name} {option.name}": option.help for name, inner in command.commands.items() for option in inner.params}
+    found |= {
+        f"{name} {option.name}": option.help
+        for name, inner in command.commands.items()
+        for option in inner.params
+    }
     found = {name: (text or "").strip() for name, text in found.items() if name != "bench suite"}
     assert len(found) > 60
-    assert not [name for name, text in found.items() if not 0 < len(text) <= 115 or text.split(" ")[0].lower() in RIDDLES]
+    assert not [
+        name
+        for name, text in found.items()
+        if not 0 < len(text) <= 115 or text.split(" ")[0].lower() in RIDDLES
+    ]
 
 
 def test_messages_have_no_replaced_phrases():
@@ -142,12 +189,20 @@ def test_messages_have_no_replaced_phrases():
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_pages_have_no_replaced_phrases(page):
     text = re.sub(r"\s+", " ", page.read_text())
-    found = {match.group(): plain for phrase, plain in REPLACED.items() for match in re.finditer(phrase, text, re.IGNORECASE)}
+    found = {
+        match.group(): plain
+        for phrase, plain in REPLACED.items()
+        for match in re.finditer(phrase, text, re.IGNORECASE)
+    }
     assert not found, f"write instead: {found}"
 
 
 def test_the_glossary_is_in_order_and_its_files_are_there():
-    rows = re.findall(r"^\| ([^|]+) \| ([^|]+) \| `([^`]+)` \|$", (ROOT / "docs" / "glossary.md").read_text(), re.MULTILINE)
+    rows = re.findall(
+        r"^\| ([^|]+) \| ([^|]+) \| `([^`]+)` \|$",
+        (ROOT / "docs" / "glossary.md").read_text(),
+        re.MULTILINE,
+    )
     assert len(rows) > 40
     assert [term.lower() for term, _, _ in rows] == sorted(term.lower() for term, _, _ in rows)
     assert not [file for _, _, file in rows if not (ROOT / file).is_file()]

@@ -56,7 +56,11 @@ def test_operators():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"solver": "lemk"}, "solver = 'lemk': must be one of accelerated-projected-gradient, .*did you mean 'lemke'"),
+        (
+            {"solver": "lemk"},
+            "solver = 'lemk': must be one of accelerated-projected-gradient, .*did you mean "
+            "'lemke'",
+        ),
         ({"solver": wl.Lemke}, "solver is the class Lemke"),
         ({"stopping": 1e-6}, "stopping is a float"),
         ({"x0": 0.0}, r"x0 has shape \(\)"),
@@ -78,7 +82,9 @@ def test_a_matrix_is_no_problem():
 OPERATORS = {
     "dense": lambda device: wl.LCP(wl.DenseOperator(A, device=device), B),
     "sparse": lambda device: wl.LCP(wl.SparseOperator(scipy.sparse.csr_array(A), device=device), B),
-    "grid": lambda device: wl.LCP(wl.GridPoisson(np.array([[1, 1, 0]]), device=device), np.array([[0.5, -2.5, 0.0]])),
+    "grid": lambda device: wl.LCP(
+        wl.GridPoisson(np.array([[1, 1, 0]]), device=device), np.array([[0.5, -2.5, 0.0]])
+    ),
 }
 
 
@@ -90,28 +96,40 @@ def test_workspaces_of_another_method_problem_or_kind_are_refused(name, device):
         pytest.importorskip("piqp")
     for family in families(wl.METHODS[name]):
         problem, twin = (OPERATORS[family](device) for _ in range(2))
-        assert wl.solve(problem, method, workspace=method.init(problem), stopping=wl.StoppingCriteria(rtol=0.5))
+        assert wl.solve(
+            problem, method, workspace=method.init(problem), stopping=wl.StoppingCriteria(rtol=0.5)
+        )
         with pytest.raises(ValueError, match="workspace was made for another problem"):
             wl.solve(problem, method, workspace=method.init(twin))
         for other, cls in wl.METHODS.items():
-            shared = (name, other) == ("blocked-gauss-seidel", "staggering")  # two blocks are staggered
+            # two blocks are staggered
+            shared = (name, other) == ("blocked-gauss-seidel", "staggering")
             if other not in (name, "quadratic-program") and family in families(cls) and not shared:
-                with pytest.raises(ValueError, match=f"workspace is a .*: expected what {type(method).__name__}"):
+                with pytest.raises(
+                    ValueError, match=f"workspace is a .*: expected what {type(method).__name__}"
+                ):
                     wl.solve(problem, method, workspace=cls().init(problem))
     for wrong in ({}, 3, "work", type(method.init(problem)), problem, np.zeros(2)):
         with pytest.raises(ValueError, match="workspace is "):
             wl.solve(problem, method, workspace=wrong)
 
 
-@pytest.mark.parametrize("setting", [{"max_iterations": 1.5}, {"max_iterations": -1}, {"patience": 0}, {"patience": float("nan")}])
+@pytest.mark.parametrize(
+    "setting",
+    [{"max_iterations": 1.5}, {"max_iterations": -1}, {"patience": 0}, {"patience": float("nan")}],
+)
 def test_limits_are_integers(setting):
     with pytest.raises(ValueError, match=f"{next(iter(setting))} = .*: must be an integer >= "):
         wl.StoppingCriteria(**setting)
 
 
-@pytest.mark.parametrize("name", [name for name, cls in wl.METHODS.items() if "precision" in cls.__dataclass_fields__])
+@pytest.mark.parametrize(
+    "name", [name for name, cls in wl.METHODS.items() if "precision" in cls.__dataclass_fields__]
+)
 def test_precision_is_named(name):
-    with pytest.raises(ValueError, match=r"precision = 'half': must be 'mixed', 'single' or 'double'"):
+    with pytest.raises(
+        ValueError, match=r"precision = 'half': must be 'mixed', 'single' or 'double'"
+    ):
         wl.METHODS[name](precision="half")
 
 
@@ -122,8 +140,14 @@ def test_precision_is_named(name):
         lambda device: (A.astype(np.float32), B),
         lambda device: (np.asfortranarray(A), np.repeat(B, 2)[::2]),
         lambda device: ((2 * A).astype(int), [1, -5]),
-        lambda device: (wp.array(A, dtype=wp.float32, device=device), wp.array(B, dtype=wp.float64, device=device)),
-        lambda device: (wp.array(A, dtype=wp.float64, device=device), wp.array(B, dtype=wp.float32, device=device)),
+        lambda device: (
+            wp.array(A, dtype=wp.float32, device=device),
+            wp.array(B, dtype=wp.float64, device=device),
+        ),
+        lambda device: (
+            wp.array(A, dtype=wp.float64, device=device),
+            wp.array(B, dtype=wp.float32, device=device),
+        ),
         lambda device: (A, wp.array(np.repeat(B, 2), dtype=wp.float64, device=device)[::2]),
         lambda device: (scipy.sparse.coo_array(A), B),
         lambda device: (scipy.sparse.csc_matrix(A), B.astype(np.float32)),
@@ -162,11 +186,22 @@ class Table:
 @pytest.mark.parametrize("kind", [Frame, Table])
 def test_what_converts_to_an_array_is_taken_as_one(kind):
     given = [kind(values) for values in (A, B, np.full(2, -1.0), np.full(2, 9.0))]
-    np.testing.assert_allclose(wl.solve(wl.LCP(*given), x0=kind(np.ones(2))).x.numpy(), X, atol=1e-5)
-    assert (
-        wl.GridPoisson(kind([[1, 0]]), face_x=kind([[1.0, 2.0, 3.0]]), shift=kind([[4.0, 0.0]]), device="cpu").diagonal().numpy()[0, 0] == 6
+    np.testing.assert_allclose(
+        wl.solve(wl.LCP(*given), x0=kind(np.ones(2))).x.numpy(), X, atol=1e-5
     )
-    for wrong, message in (([["a", "b"]], "A is a .* of type"), ([1.0, 2.0], r"matrix has shape \(2,\)"), (A * 1j, "of type complex128")):
+    assert (
+        wl.GridPoisson(
+            kind([[1, 0]]), face_x=kind([[1.0, 2.0, 3.0]]), shift=kind([[4.0, 0.0]]), device="cpu"
+        )
+        .diagonal()
+        .numpy()[0, 0]
+        == 6
+    )
+    for wrong, message in (
+        ([["a", "b"]], "A is a .* of type"),
+        ([1.0, 2.0], r"matrix has shape \(2,\)"),
+        (A * 1j, "of type complex128"),
+    ):
         with pytest.raises(ValueError, match=message):
             wl.LCP(kind(wrong), B)
 
@@ -186,29 +221,50 @@ def masked(values, *where):
         (lambda: wl.LCP(A, B, -9.0, masked(np.ones(2), 0, 1)), "upper", 2),
         (lambda: wl.solve(wl.LCP(A, B), x0=masked(B, 1)), "x0", 1),
         (lambda: wl.GridPoisson(masked(np.ones((2, 2), dtype=int), 3)), "cells", 1),
-        (lambda: wl.GridPoisson(np.ones((1, 2), dtype=int), face_x=masked(np.ones((1, 3)), 1)), "face_x", 1),
-        (lambda: wl.GridPoisson(np.ones((1, 2), dtype=int), shift=masked(np.ones((1, 2)), 1)), "shift", 1),
+        (
+            lambda: wl.GridPoisson(np.ones((1, 2), dtype=int), face_x=masked(np.ones((1, 3)), 1)),
+            "face_x",
+            1,
+        ),
+        (
+            lambda: wl.GridPoisson(np.ones((1, 2), dtype=int), shift=masked(np.ones((1, 2)), 1)),
+            "shift",
+            1,
+        ),
         (lambda: wl.LowRankOperator(masked(np.ones((3, 1)), 1), np.ones(1)), "columns", 1),
         (lambda: wl.AffineBounds(masked(B, 1), np.full(2, -1), 0.0), "constant", 1),
     ],
 )
 def test_masked_entries_are_no_values(make, name, count):
-    with pytest.raises(ValueError, match=rf"{name} is a masked array with {count} masked entries: .*{name}.filled"):
+    with pytest.raises(
+        ValueError, match=rf"{name} is a masked array with {count} masked entries: .*{name}.filled"
+    ):
         make()
 
 
 def test_masked_arrays_without_masked_entries_are_taken():
-    np.testing.assert_allclose(wl.solve(wl.LCP(masked(A), masked(B), masked(np.zeros(2)))).x.numpy(), X, atol=1e-5)
+    np.testing.assert_allclose(
+        wl.solve(wl.LCP(masked(A), masked(B), masked(np.zeros(2)))).x.numpy(), X, atol=1e-5
+    )
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"face_x": 1e39}, r"face_x holds values up to 1.0e\+39, too large for float32: pass dtype=wp.float64"),
+        (
+            {"face_x": 1e39},
+            r"face_x holds values up to 1.0e\+39, too large for float32: pass dtype=wp.float64",
+        ),
         ({"face_y": np.full((2, 2), 1e39)}, r"face_y holds values up to 1.0e\+39"),
         ({"shift": 1e100}, r"shift holds values up to 1.0e\+100"),
-        ({"face_x": np.full((1, 3), 1e38), "shift": 2e38}, r"face_x, face_y, face_z and shift add up to 4.0e\+38, too large for float32"),
-        ({"face_x": 1e-60}, "face_x: 1 are not 0, but float32 takes them for it: pass dtype=wp.float64"),
+        (
+            {"face_x": np.full((1, 3), 1e38), "shift": 2e38},
+            r"face_x, face_y, face_z and shift add up to 4.0e\+38, too large for float32",
+        ),
+        (
+            {"face_x": 1e-60},
+            "face_x: 1 are not 0, but float32 takes them for it: pass dtype=wp.float64",
+        ),
         ({"shift": np.array([[1e-60, 1.0]])}, "shift: 1 are not 0"),
     ],
 )
@@ -223,8 +279,14 @@ def test_coefficients_beyond_their_type(options, message):
 
 
 def test_matrices_beyond_float32():
-    for make in (wl.DenseOperator, lambda M, **options: wl.SparseOperator(scipy.sparse.csr_array(M), **options)):
-        for scale, message in ((1e39, "matrix holds values up to"), (1e-60, "matrix, the largest entries of its rows: 2 are not 0")):
+    for make in (
+        wl.DenseOperator,
+        lambda M, **options: wl.SparseOperator(scipy.sparse.csr_array(M), **options),
+    ):
+        for scale, message in (
+            (1e39, "matrix holds values up to"),
+            (1e-60, "matrix, the largest entries of its rows: 2 are not 0"),
+        ):
             with pytest.raises(ValueError, match=message):
                 make(scale * A, dtype=wp.float32, device="cpu")
             assert wl.solve(wl.LCP(make(scale * A, device="cpu"), scale * B), wl.Lemke())
@@ -233,18 +295,27 @@ def test_matrices_beyond_float32():
 
 
 @pytest.mark.parametrize(
-    ("bounds", "message"), [((1e39, np.inf), r"lower: x must be 1.0e\+39"), ((-np.inf, -1e39), r"upper: x must be -1.0e\+39")]
+    ("bounds", "message"),
+    [
+        ((1e39, np.inf), r"lower: x must be 1.0e\+39"),
+        ((-np.inf, -1e39), r"upper: x must be -1.0e\+39"),
+    ],
 )
 def test_bounds_beyond_single_precision(bounds, message):
     problem = wl.LCP(A, B, *bounds)
-    with pytest.raises(ValueError, match=message + ", too large for precision='single': use 'mixed'"):
+    with pytest.raises(
+        ValueError, match=message + ", too large for precision='single': use 'mixed'"
+    ):
         wl.solve(problem, wl.ProjectedSOR(precision="single"))
     assert wl.solve(problem, wl.ProjectedSOR(precision="mixed"))
-    assert wl.solve(wl.LCP(A, B, 0.0, 1e39), wl.ProjectedSOR(precision="single"))  # a bound beyond all x is none
+    # a bound beyond all x is none
+    assert wl.solve(wl.LCP(A, B, 0.0, 1e39), wl.ProjectedSOR(precision="single"))
 
 
 def test_operators_that_lack_members():
-    members = {name for name in vars(wl.Operator) if not name.startswith("_")} | set(wl.Operator.__annotations__)
+    members = {name for name in vars(wl.Operator) if not name.startswith("_")} | set(
+        wl.Operator.__annotations__
+    )
     assert set(names_of(wl.Operator)) == members
 
     class Half:
@@ -253,7 +324,11 @@ def test_operators_that_lack_members():
         def apply(self, x, out=None):
             raise AssertionError
 
-    with pytest.raises(ValueError, match=r"A is a Half without device, apply_transpose, diagonal: an operator needs them; a subclass of"):
+    with pytest.raises(
+        ValueError,
+        match=r"A is a Half without device, apply_transpose, diagonal: an operator needs them; a "
+        r"subclass of",
+    ):
         wl.LCP(Half(), B)
 
 
@@ -262,11 +337,19 @@ def test_methods_by_name():
         wl.METHODS["lemk"]
     with pytest.raises(KeyError, match=r"no such method: 'foo'; choose from .*, lemke, .*, psor"):
         wl.METHODS["foo"]
-    meant = {"ipm": "interior-point", "PGS": "psor", "qp": "quadratic-program", "InteriorPoint": "interior-point", "apg": "accelerated.*"}
+    meant = {
+        "ipm": "interior-point",
+        "PGS": "psor",
+        "qp": "quadratic-program",
+        "InteriorPoint": "interior-point",
+        "apg": "accelerated.*",
+    }
     for name, method in meant.items():
         with pytest.raises(KeyError, match=f"no such method: '{name}'; did you mean '{method}'"):
             wl.METHODS[name]
-    with pytest.raises(ValueError, match=r"method = 'ipm': must be one of .*; did you mean 'interior-point'"):
+    with pytest.raises(
+        ValueError, match=r"method = 'ipm': must be one of .*; did you mean 'interior-point'"
+    ):
         wl.linear_complementarity(np.eye(2), np.ones(2), method="ipm")
     assert wl.METHODS.get("foo") is None
     assert "foo" not in wl.METHODS
@@ -275,7 +358,11 @@ def test_methods_by_name():
 @pytest.mark.parametrize(
     ("option", "message"),
     [
-        ({"rtol": 1e-8}, r"solve takes no rtol: it is a stopping criterion, pass stopping=wl.StoppingCriteria\(rtol=...\)"),
+        (
+            {"rtol": 1e-8},
+            r"solve takes no rtol: it is a stopping criterion, pass "
+            r"stopping=wl.StoppingCriteria\(rtol=...\)",
+        ),
         ({"max_seconds": 1.0}, r"pass stopping=wl.StoppingCriteria\(max_seconds=...\)"),
         ({"omega": 1.5}, "solve takes no omega: it is a setting of a method"),
     ],

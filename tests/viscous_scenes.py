@@ -31,13 +31,25 @@ def viscous_scene(seed: int) -> LiquidScene:
         if kind == "sphere":
             found |= {"center": middle.tolist(), "radius": size}
         elif kind == "box":
-            found |= {"min": (middle - corner(0.05, 0.25)).tolist(), "max": (middle + corner(0.05, 0.25)).tolist()}
+            found |= {
+                "min": (middle - corner(0.05, 0.25)).tolist(),
+                "max": (middle + corner(0.05, 0.25)).tolist(),
+            }
         elif kind == "capsule":
-            found |= {"from": middle.tolist(), "to": (middle + corner(-0.2, 0.2)).tolist(), "radius": 0.4 * size}
+            found |= {
+                "from": middle.tolist(),
+                "to": (middle + corner(-0.2, 0.2)).tolist(),
+                "radius": 0.4 * size,
+            }
         else:
             angles = rng.uniform(-180.0, 180.0, 3).tolist()
             name = "builtin:" + str(rng.choice(["torus", "knot"]))
-            found |= {"file": name, "scale": 3.0 * size, "rotate": angles, "translate": middle.tolist()}
+            found |= {
+                "file": name,
+                "scale": 3.0 * size,
+                "rotate": angles,
+                "translate": middle.tolist(),
+            }
         if found["wall"] == "sticky" and some(0.4):
             found["slip_length"] = float(10.0 ** rng.uniform(-3.0, 0.0))
         return found
@@ -46,7 +58,10 @@ def viscous_scene(seed: int) -> LiquidScene:
     for _ in range(int(rng.integers(1, 3))):
         low = corner(0.0, 0.5)
         blocks.append(box(low.tolist(), np.minimum(low + corner(0.2, 0.6), 1.0).tolist()))
-    tables: dict[str, Any] = {"viscosity": {"value": float(10.0 ** rng.uniform(-3.0, 5.0))}, "wall": str(rng.choice(walls))}
+    tables: dict[str, Any] = {
+        "viscosity": {"value": float(10.0 ** rng.uniform(-3.0, 5.0))},
+        "wall": str(rng.choice(walls)),
+    }
     if some(0.4):
         tables["viscosity"]["slip_length"] = float(10.0 ** rng.uniform(-3.0, 0.0))
     if some(0.5):
@@ -57,7 +72,13 @@ def viscous_scene(seed: int) -> LiquidScene:
         velocity = [0.0, -float(rng.uniform(0.3, 2.0)), 0.0][:dimension]
         tables["source"] = [box(low.tolist(), high.tolist(), velocity=velocity)]
     tables["solid"] = [solid() for _ in range(int(rng.integers(0, 4)))]
-    return scene(size=[1.0] * dimension, resolution=resolution, liquid=blocks, cfl=float(rng.uniform(0.5, 4.0)), **tables)
+    return scene(
+        size=[1.0] * dimension,
+        resolution=resolution,
+        liquid=blocks,
+        cfl=float(rng.uniform(0.5, 4.0)),
+        **tables,
+    )
 
 
 def stirred_scene(seed: int) -> LiquidScene:
@@ -80,13 +101,24 @@ def stirred_scene(seed: int) -> LiquidScene:
         middle[0] = (1 + number) / (1 + count)  # apart from each other, however they turn
         round_one = {"shape": "sphere", "center": middle.tolist(), "radius": size}
         half = size * corner(0.3, 0.6)
-        found: dict[str, Any] = round_one if some(0.4) else box((middle - half).tolist(), (middle + half).tolist())
+        found: dict[str, Any] = (
+            round_one if some(0.4) else box((middle - half).tolist(), (middle + half).tolist())
+        )
         kind = str(rng.choice(["rotation", "sinusoid", "body", "body"]))
         if kind == "rotation":
             axis = {"axis": rng.standard_normal(3).tolist()} if dimension == 3 else {}
-            found["motion"] = {"kind": kind, "center": middle.tolist(), "rate": float(rng.uniform(-600.0, 600.0)), **axis}
+            found["motion"] = {
+                "kind": kind,
+                "center": middle.tolist(),
+                "rate": float(rng.uniform(-600.0, 600.0)),
+                **axis,
+            }
         elif kind == "sinusoid":
-            found["motion"] = {"kind": kind, "period": float(rng.uniform(0.1, 0.5)), "amplitude": (0.05 * corner(-1.0, 1.0)).tolist()}
+            found["motion"] = {
+                "kind": kind,
+                "period": float(rng.uniform(0.1, 0.5)),
+                "amplitude": (0.05 * corner(-1.0, 1.0)).tolist(),
+            }
         else:
             turning = float(rng.uniform(-600.0, 600.0))
             found |= {"density": float(10.0 ** rng.uniform(1.5, 4.0))}
@@ -108,4 +140,10 @@ def stirred_scene(seed: int) -> LiquidScene:
         tables["source"] = [box(low.tolist(), high.tolist(), velocity=velocity)]
     count = int(rng.integers(1, 4))
     tables["solid"] = [solid(number, count) for number in range(count)]
-    return scene(size=[1.0] * dimension, resolution=resolution, liquid=blocks, cfl=float(rng.uniform(0.5, 4.0)), **tables)
+    return scene(
+        size=[1.0] * dimension,
+        resolution=resolution,
+        liquid=blocks,
+        cfl=float(rng.uniform(0.5, 4.0)),
+        **tables,
+    )

@@ -38,7 +38,14 @@ from warp_lcp.rows.team import get_threads, set_threads
 from warp_lcp.solvers.accelerated_projected_gradient import AcceleratedProjectedGradient
 from warp_lcp.solvers.blocked_gauss_seidel import BlockedGaussSeidel, GridLines
 from warp_lcp.solvers.direct_enumeration import BatchResult, DirectEnumeration, enumerate_batch
-from warp_lcp.solvers.fallback import Fallback, FallbackEntry, crawls, fails, slow_linear_solves, stalls
+from warp_lcp.solvers.fallback import (
+    Fallback,
+    FallbackEntry,
+    crawls,
+    fails,
+    slow_linear_solves,
+    stalls,
+)
 from warp_lcp.solvers.fischer_newton import FischerNewton
 from warp_lcp.solvers.gradient_descent import GradientDescent
 from warp_lcp.solvers.incremental_pivoting import IncrementalPivoting
@@ -78,7 +85,9 @@ def __getattr__(name: str) -> Any:
     if name == "Run":
         return import_module("warp_lcp.run.driven").Run
     if name == "ConvexSetProblem":
-        warnings.warn("wl.ConvexSetProblem is now wl.VariationalInequality", DeprecationWarning, stacklevel=2)
+        warnings.warn(
+            "wl.ConvexSetProblem is now wl.VariationalInequality", DeprecationWarning, stacklevel=2
+        )
         return VariationalInequality
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 

@@ -1,8 +1,9 @@
 """How long solves may take: the deadline of the solve under way, which everything inside it may ask about.
 
-The outer loop (`warp_lcp.problem.solve`) sets it; a method's inner loops call `check_time`, or end early by `time_is_up`. It reaches them
-by a context variable, not as an argument: Krylov methods, principal systems and the solves of blocks know nothing of the loop they are
-in, and a solve within a solve must end with the outer one.
+The outer loop (`warp_lcp.problem.solve`) sets it; a method's inner loops call `check_time`, or end
+early by `time_is_up`. It reaches them by a context variable, not as an argument: Krylov methods,
+principal systems and the solves of blocks know nothing of the loop they are in, and a solve within
+a solve must end with the outer one.
 """
 
 from __future__ import annotations
@@ -23,8 +24,10 @@ class Deadline:
     """When a solve must end; a context within which `check_time` and `time_is_up` ask it.
 
     Args:
-        seconds: from now; inf: no limit of its own. It never ends later than the solve that it is part of.
-        across: who solves together, see `warp_lcp.rows.vectors.Across`: time is up for all as soon as it is for one. None: nobody else.
+        seconds: from now; inf: no limit of its own. It never ends later than the solve that it is
+            part of.
+        across: who solves together, see `warp_lcp.rows.vectors.Across`: time is up for all as soon
+            as it is for one. None: nobody else.
     """
 
     def __init__(self, seconds: float = math.inf, across: Any = None) -> None:

@@ -22,7 +22,9 @@ from warp_lcp.rules import Attempt, method_for, steps_allowed
 from warp_lcp.solvers.registry import method_of
 
 LEAST = 1e-9  # seconds that are left to a solve whose set-up has taken them all
-RESERVED, FEW = 4, 40  # one step of four is kept for the alternatives of a method for matrices, of limits from FEW steps on
+# one step of four is kept for the alternatives of a method for matrices, of limits from FEW steps
+# on
+RESERVED, FEW = 4, 40
 ENDED = (
     SolveStatus.CONVERGED,
     SolveStatus.INFEASIBLE,
@@ -43,46 +45,65 @@ def default_method(problem: LCP) -> Solver:
 
 
 def solve(
-    problem: LCP | VariationalInequality, solver: Solver | str | None = None, *, stopping: StoppingCriteria | MeanCriteria | None = None,
-    x0: Array | None = None, workspace: Workspace | None = None, callback: Callable[[Record], None] | None = None, fallback: bool = True,
+    problem: LCP | VariationalInequality,
+    solver: Solver | str | None = None,
+    *,
+    stopping: StoppingCriteria | MeanCriteria | None = None,
+    x0: Array | None = None,
+    workspace: Workspace | None = None,
+    callback: Callable[[Record], None] | None = None,
+    fallback: bool = True,
     **misplaced: Never,
-) -> SolveResult:  # fmt: skip
+) -> SolveResult:
     """Solve a problem by a method.
 
     Args:
         problem: the LCP, or a problem over another convex set than a box.
-        solver: the method, such as `wl.MinimumMapNewton()`, or its name in `wl.METHODS` for its default
-            settings, such as "psor": it alone is used. None: the method of `wl.recommend`; where it stops, the methods of its
-            chain (`wl.default_chain`) go on from its iterate, and if these fail, its alternatives begin from the same start.
-            `stopping` limits the sum of their steps; the history has all of them, each record names its method, and the result's
-            `method` names the one that found x. Sparse matrices that are a compact stencil on a box of cells in its natural
-            order, x first, are then solved as a grid problem; the result's `grid` has its shape.
-        stopping: the criteria; `StoppingCriteria()` if None, with the limit of steps that `wl.recommend` gives if there is no solver.
-        x0: a guess, field of the problem's shape, projected onto the bounds; clip(0, l, u) if None (over other sets: x as it is).
-        workspace: result of `solver.init(problem)`, to reuse its memory. Without it, one of a grid may be kept for later solves, see
-            `wl.release_workspace`.
+        solver: the method, such as `wl.MinimumMapNewton()`, or its name in `wl.METHODS` for its
+            default settings, such as "psor": it alone is used. None: the method of `wl.recommend`;
+            where it stops, the methods of its chain (`wl.default_chain`) go on from its iterate,
+            and if these fail, its alternatives begin from the same start. `stopping` limits the sum
+            of their steps; the history has all of them, each record names its method, and the
+            result's `method` names the one that found x. Sparse matrices that are a compact stencil
+            on a box of cells in its natural order, x first, are then solved as a grid problem; the
+            result's `grid` has its shape.
+        stopping: the criteria; `StoppingCriteria()` if None, with the limit of steps that
+            `wl.recommend` gives if there is no solver.
+        x0: a guess, field of the problem's shape, projected onto the bounds; clip(0, l, u) if None
+            (over other sets: x as it is).
+        workspace: result of `solver.init(problem)`, to reuse its memory. Without it, one of a grid
+            may be kept for later solves, see `wl.release_workspace`.
         callback: called with each Record, such as `wl.print_progress`; if it raises StopIteration,
             the solve ends with STOPPED.
         fallback: False: without a method, the solve ends with the recommended one, however it ends.
         misplaced: other options are refused, with a hint where they belong.
 
     Returns:
-        The best iterate, its status and recomputed residual, the history. The result's x is the caller's to keep, unless the problem
-        works in place or is over another set: then it is the workspace's own iterate, overwritten by the next solve with that workspace.
+        The best iterate, its status and recomputed residual, the history. The result's x is the
+        caller's to keep, unless the problem works in place or is over another set: then it is the
+        workspace's own iterate, overwritten by the next solve with that workspace.
 
     Raises:
-        ValueError: an argument is of another kind, x0 has a wrong shape or is not finite, a workspace comes without its solver, or the
-            method cannot take this A.
+        ValueError: an argument is of another kind, x0 has a wrong shape or is not finite, a
+            workspace comes without its solver, or the method cannot take this A.
         TypeError: an option of another name; the message says where it belongs.
     """
     for name in misplaced:
         if name in StoppingCriteria.__dataclass_fields__:
-            raise TypeError(f"solve takes no {name}: it is a stopping criterion, pass stopping=wl.StoppingCriteria({name}=...)")
-        raise TypeError(f"solve takes no {name}: it is a setting of a method, pass for example wl.ProjectedSOR(omega=1.5)")
+            raise TypeError(
+                f"solve takes no {name}: it is a stopping criterion, pass "
+                f"stopping=wl.StoppingCriteria({name}=...)"
+            )
+        raise TypeError(
+            f"solve takes no {name}: it is a setting of a method, pass for example "
+            "wl.ProjectedSOR(omega=1.5)"
+        )
     if solver is None and workspace is not None:
         raise ValueError("workspace: pass the solver that made it, too")
     if solver is None and isinstance(problem, VariationalInequality):
-        raise ValueError(f"solver: a {type(problem).__name__} needs one of its own methods, pass one")
+        raise ValueError(
+            f"solver: a {type(problem).__name__} needs one of its own methods, pass one"
+        )
     check_criteria(stopping)
     method: Any = method_of(solver, "solver")
     if method is None and isinstance(problem, LCP):
@@ -91,47 +112,82 @@ def solve(
         begun = time.perf_counter()
         restated = renumbered(problem)
         if restated is not None:
-            return solve_restated(restated, method, left(stopping or StoppingCriteria(), begun), x0, callback)
-    return solve_by(problem, method, stopping=stopping, x0=x0, workspace=workspace, callback=callback)
+            return solve_restated(
+                restated, method, left(stopping or StoppingCriteria(), begun), x0, callback
+            )
+    return solve_by(
+        problem, method, stopping=stopping, x0=x0, workspace=workspace, callback=callback
+    )
 
 
 def solve_restated(
-    restated: RestatedProblem, method: Solver, stopping: Criteria | None, x0: Array | None, callback: Watch | None
+    restated: RestatedProblem,
+    method: Solver,
+    stopping: Criteria | None,
+    x0: Array | None,
+    callback: Watch | None,
 ) -> SolveResult:
     """Solve a problem in another form; return the result for the given one."""
-    found = solve_by(restated.problem, method, stopping=stopping, x0=restated.start(x0), callback=callback)
+    found = solve_by(
+        restated.problem, method, stopping=stopping, x0=restated.start(x0), callback=callback
+    )
     return restated.result(found)
 
 
 def solve_by_attempts(
-    problem: LCP, stopping: Criteria | None, x0: Array | None, callback: Watch | None, *, fallback: bool = True, run: Run = solve_restated,
+    problem: LCP,
+    stopping: Criteria | None,
+    x0: Array | None,
+    callback: Watch | None,
+    *,
+    fallback: bool = True,
+    run: Run = solve_restated,
     reserve: bool = True,
-) -> SolveResult:  # fmt: skip
+) -> SolveResult:
     """Solve by the attempts of `recommend`, until one ends the solve; return the best x.
 
     Args:
         problem: the problem.
-        stopping: the criteria, whose limits are for the sum of all attempts; None: each attempt has its own limit of steps.
+        stopping: the criteria, whose limits are for the sum of all attempts; None: each attempt has
+            its own limit of steps.
         x0: a guess, with which each attempt begins; None: clip(0, l, u).
         callback: called with each record.
         fallback: False: only the first method, without those that take over.
         run: solves a problem by a method.
-        reserve: keep a quarter of the steps that are given for the alternatives of a method for matrices.
+        reserve: keep a quarter of the steps that are given for the alternatives of a method for
+            matrices.
     """
     begun, accuracy = time.perf_counter(), min(max((stopping or StoppingCriteria()).rtol, EPS), 0.5)
     advice, results = recommend(problem, accuracy=accuracy), list[SolveResult]()
-    reserve = reserve and fallback and stopping is not None and advice.traits.kind in ("dense", "sparse")
+    reserve = (
+        reserve and fallback and stopping is not None and advice.traits.kind in ("dense", "sparse")
+    )
     for attempt in advice.attempts:
         planned = _planned(attempt, problem, advice, accuracy, given=stopping is not None)
         if planned is None or (planned.alternative and isinstance(stopping, MeanCriteria)):
             continue
-        kept = reserve and not planned.alternative and (attempt.method is None or bool(advice.alternatives))
-        criteria = left(stopping or planned.stopping, begun, results if stopping is not None else [], reserve=kept)
+        kept = (
+            reserve
+            and not planned.alternative
+            and (attempt.method is None or bool(advice.alternatives))
+        )
+        criteria = left(
+            stopping or planned.stopping,
+            begun,
+            results if stopping is not None else [],
+            reserve=kept,
+        )
         if results and criteria.max_iterations == 0:
             break
         method = default_chain(planned.method, planned.chained) if fallback else planned.method
         try:
-            result = _recorded(partial(run, planned.restated, method, criteria, x0), planned.name, results, callback, begun)
+            result = _recorded(
+                partial(run, planned.restated, method, criteria, x0),
+                planned.name,
+                results,
+                callback,
+                begun,
+            )
         except ValueError:
             if not results:
                 raise
@@ -163,7 +219,9 @@ class _Planned:
     alternative: bool
 
 
-def _planned(attempt: Attempt, problem: LCP, advice: Recommendation, accuracy: float, *, given: bool) -> _Planned | None:
+def _planned(
+    attempt: Attempt, problem: LCP, advice: Recommendation, accuracy: float, *, given: bool
+) -> _Planned | None:
     """Return the solve that an attempt asks for, None if the problem does not suit it.
 
     Args:
@@ -181,7 +239,9 @@ def _planned(attempt: Attempt, problem: LCP, advice: Recommendation, accuracy: f
         if restated is None:
             return None
         there = recommend(restated.problem, accuracy=accuracy)
-        return _Planned(there.name, there.method, restated, restated.problem, there.stopping, alternative=False)
+        return _Planned(
+            there.name, there.method, restated, restated.problem, there.stopping, alternative=False
+        )
     if attempt.again and given and restated is None:
         return None
     name, first = attempt.method, attempt.method == advice.name and not attempt.again
@@ -191,16 +251,31 @@ def _planned(attempt: Attempt, problem: LCP, advice: Recommendation, accuracy: f
         restated = renumbered(problem)
     steps = attempt.steps or steps_allowed(name, t.unknowns)
     stopping = advice.stopping if first else criteria(accuracy, steps)
-    return _Planned(name, method, restated or RestatedProblem(problem, problem), chained, stopping, alternative=not first)
+    return _Planned(
+        name,
+        method,
+        restated or RestatedProblem(problem, problem),
+        chained,
+        stopping,
+        alternative=not first,
+    )
 
 
 def _recorded(
-    solve: Callable[[Watch | None], SolveResult], name: str, results: list[SolveResult], callback: Watch | None, begun: float
+    solve: Callable[[Watch | None], SolveResult],
+    name: str,
+    results: list[SolveResult],
+    callback: Watch | None,
+    begun: float,
 ) -> SolveResult:
     """Solve, with the steps and seconds of earlier results added to the records."""
-    shifted = partial(_after, results[-1].history[-1] if results else None, name, time.perf_counter() - begun)
+    shifted = partial(
+        _after, results[-1].history[-1] if results else None, name, time.perf_counter() - begun
+    )
     result = solve(None if callback is None else lambda record: callback(shifted(record)))
-    return replace(result, method=result.method or name, history=[shifted(record) for record in result.history])
+    return replace(
+        result, method=result.method or name, history=[shifted(record) for record in result.history]
+    )
 
 
 def _best(results: list[SolveResult]) -> SolveResult:
@@ -208,13 +283,25 @@ def _best(results: list[SolveResult]) -> SolveResult:
     last = results[-1]
     if len(results) == 1:
         return last
-    best = last if last.status is SolveStatus.INFEASIBLE else min(results, key=lambda result: result.residual)
+    best = (
+        last
+        if last.status is SolveStatus.INFEASIBLE
+        else min(results, key=lambda result: result.residual)
+    )
     status = last.status if last.status in ENDED else best.status
     end, history = last.history[-1], [record for result in results for record in result.history]
-    return replace(best, status=status, iterations=end.iteration, linear_iterations=end.linear_iterations, history=history)
+    return replace(
+        best,
+        status=status,
+        iterations=end.iteration,
+        linear_iterations=end.linear_iterations,
+        history=history,
+    )
 
 
-def left(stopping: Criteria, begun: float, results: Sequence[SolveResult] = (), *, reserve: bool = False) -> Criteria:
+def left(
+    stopping: Criteria, begun: float, results: Sequence[SolveResult] = (), *, reserve: bool = False
+) -> Criteria:
     """Return criteria with the steps and the time that are left.
 
     Args:
@@ -225,9 +312,15 @@ def left(stopping: Criteria, begun: float, results: Sequence[SolveResult] = (), 
     """
     most = stopping.max_iterations - (results[-1].history[-1].iteration if results else 0)
     most -= most // RESERVED if reserve and most >= FEW else 0
-    changed = stopping if most == stopping.max_iterations else replace(stopping, max_iterations=max(most, 0))
+    changed = (
+        stopping
+        if most == stopping.max_iterations
+        else replace(stopping, max_iterations=max(most, 0))
+    )
     if isinstance(changed, StoppingCriteria) and changed.max_seconds < math.inf:
-        changed = replace(changed, max_seconds=max(LEAST, changed.max_seconds - (time.perf_counter() - begun)))
+        changed = replace(
+            changed, max_seconds=max(LEAST, changed.max_seconds - (time.perf_counter() - begun))
+        )
     return changed
 
 
@@ -236,6 +329,9 @@ def _after(last: Record | None, name: str, seconds: float, record: Record) -> Re
     if last is None:
         return record
     return replace(
-        record, iteration=last.iteration + record.iteration, linear_iterations=last.linear_iterations + record.linear_iterations,
-        step=f"start of {name}" if record.iteration == 0 else record.step, seconds=seconds + record.seconds,
-    )  # fmt: skip
+        record,
+        iteration=last.iteration + record.iteration,
+        linear_iterations=last.linear_iterations + record.linear_iterations,
+        step=f"start of {name}" if record.iteration == 0 else record.step,
+        seconds=seconds + record.seconds,
+    )

@@ -18,7 +18,16 @@ from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.reduced.cold_cycles import LARGE
 from warp_lcp.settings import Count, Settings
 from warp_lcp.solvers.assembled_matrix import AssembledMatrix
-from warp_lcp.solvers.fallback import WEAK, Fallback, FallbackEntry, Progress, crawls, fails, slow_linear_solves, stalls
+from warp_lcp.solvers.fallback import (
+    WEAK,
+    Fallback,
+    FallbackEntry,
+    Progress,
+    crawls,
+    fails,
+    slow_linear_solves,
+    stalls,
+)
 from warp_lcp.solvers.fischer_newton import FischerNewton
 from warp_lcp.solvers.interior_point import InteriorPoint
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
@@ -29,8 +38,11 @@ from warp_lcp.solvers.proximal_point import ProximalPoint
 from warp_lcp.solvers.staggering import Staggering
 
 FALL = 0.9  # a residual above this part of the smallest so far is no progress of a path
-PATH_IDLE = 10  # steps without progress before the proximal-point method: a path is joined far from the start
-CREEPS = 0.97  # of the residual PATH_IDLE steps ago: above it, a path that was joined far from the start leads nowhere
+# steps without progress before the proximal-point method: a path is joined far from the start
+PATH_IDLE = 10
+# of the residual PATH_IDLE steps ago: above it, a path that was joined far from the start leads
+# nowhere
+CREEPS = 0.97
 BATCH = 200  # steps of MPRGP that count as one: together they cost about as much as a linear solve
 
 
@@ -39,13 +51,16 @@ def default_chain(method: Solver, problem: LCP | None = None) -> Solver:
 
     The method itself if none does.
 
-    - `ProjectedMultigrid`: where cycles crawl, `MinimumMapNewton` on the assembled matrix, unless in single precision, on ranks or
-      with floating components; beside rigid bodies `MinimumMapNewton`, where cycles crawl or the free set goes round in circles.
-    - `MinimumMapNewton` on matrices: `MPRGP` where linear solves of a large symmetric matrix that is no M-matrix are slow, or its
-      near null space is known; `InteriorPoint` where steps stall or fail; then `ProximalPoint`. With negative diagonal entries
-      `FischerNewton` instead of these two. On grids that need line relaxation or are not symmetric: on the assembled matrix.
+    - `ProjectedMultigrid`: where cycles crawl, `MinimumMapNewton` on the assembled matrix, unless
+      in single precision, on ranks or with floating components; beside rigid bodies
+      `MinimumMapNewton`, where cycles crawl or the free set goes round in circles.
+    - `MinimumMapNewton` on matrices: `MPRGP` where linear solves of a large symmetric matrix that
+      is no M-matrix are slow, or its near null space is known; `InteriorPoint` where steps stall or
+      fail; then `ProximalPoint`. With negative diagonal entries `FischerNewton` instead of these
+      two. On grids that need line relaxation or are not symmetric: on the assembled matrix.
     - `PrimalDualActiveSet`: `MinimumMapNewton` (not on dense matrices), then as above.
-    - `Staggering` without methods for its blocks: `MinimumMapNewton` in each block, then `InteriorPoint` and `ProximalPoint` as above.
+    - `Staggering` without methods for its blocks: `MinimumMapNewton` in each block, then
+      `InteriorPoint` and `ProximalPoint` as above.
 
     Args:
         method: the first method.
@@ -99,9 +114,14 @@ def stalls_or_crawls(progress: Progress) -> bool:
 def weak_preconditioner(progress: Progress) -> bool:
     """Return whether steps stall, linear solves are slow, or a near null space is known.
 
-    With that, cycles are so good that MPRGP as a whole takes about as many iterations as a linear solve.
+    With that, cycles are so good that MPRGP as a whole takes about as many iterations as a linear
+    solve.
     """
-    return stalls(progress) or slow_linear_solves(progress) or getattr(progress.problem.A, "near_null_space", None) is not None
+    return (
+        stalls(progress)
+        or slow_linear_solves(progress)
+        or getattr(progress.problem.A, "near_null_space", None) is not None
+    )
 
 
 @cache
@@ -124,7 +144,9 @@ def _of_newton(method: MinimumMapNewton, problem: LCP | None) -> Solver:
     if _has_negative_diagonal(problem):
         return _without_path(method)
     narrow = isinstance(A, SparseOperator) and A.bandwidth <= NARROW
-    return _on_matrix(method, _minimizes(problem), StoppingCriteria.patience if narrow else PATH_IDLE)
+    return _on_matrix(
+        method, _minimizes(problem), StoppingCriteria.patience if narrow else PATH_IDLE
+    )
 
 
 @cache
@@ -152,11 +174,14 @@ def _of_active_set(method: PrimalDualActiveSet, problem: LCP | None) -> Solver:
 def _last(steps: int = PATH_IDLE) -> tuple[FallbackEntry, FallbackEntry]:
     """Return what follows Newton's steps on matrices.
 
-    Linear programs and other saddle points, A skew but for a block or a small shift, have free blocks that are singular or nearly so
-    on the way to the solution's own; so have matrices of low rank, and Laplacians that nothing holds, whose active set creeps by a
-    layer of unknowns a step. The central path exists for every positive semi-definite A, and needs no free blocks.
+    Linear programs and other saddle points, A skew but for a block or a small shift, have free
+    blocks that are singular or nearly so on the way to the solution's own; so have matrices of low
+    rank, and Laplacians that nothing holds, whose active set creeps by a layer of unknowns a step.
+    The central path exists for every positive semi-definite A, and needs no free blocks.
     """
-    return FallbackEntry(InteriorPoint(precision="double"), stalls, restart=True), FallbackEntry(ProximalPoint(), PathCreeps(steps=steps))
+    return FallbackEntry(InteriorPoint(precision="double"), stalls, restart=True), FallbackEntry(
+        ProximalPoint(), PathCreeps(steps=steps)
+    )
 
 
 @cache
@@ -174,7 +199,12 @@ def _has_negative_diagonal(problem: LCP) -> bool:
 def _minimizes(problem: LCP) -> bool:
     """Return whether A has an energy, and is no matrix for problems on coarse points."""
     A = problem.A
-    if not isinstance(A, SparseOperator) or not A.symmetric or A.unknowns < LARGE or A.bandwidth <= NARROW:
+    if (
+        not isinstance(A, SparseOperator)
+        or not A.symmetric
+        or A.unknowns < LARGE
+        or A.bandwidth <= NARROW
+    ):
         return False
     if not problem.bounded or problem.preconditioner is not None:
         return False

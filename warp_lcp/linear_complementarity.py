@@ -43,20 +43,31 @@ WORDS = {"max_iterations": "maxiter", "rtol": "tol"}  # what criteria are called
 
 
 def linear_complementarity(
-    A: Any, b: Array, *, bounds: Any = None, x0: Array | None = None, tol: float = 1e-6, atol: float = 0.0,
-    method: str | Solver | None = None, maxiter: int = 1000, preconditioner: Any = None, callback: Callable[..., Any] | None = None,
-) -> OptimizeResult:  # fmt: skip
+    A: Any,
+    b: Array,
+    *,
+    bounds: Any = None,
+    x0: Array | None = None,
+    tol: float = 1e-6,
+    atol: float = 0.0,
+    method: str | Solver | None = None,
+    maxiter: int = 1000,
+    preconditioner: Any = None,
+    callback: Callable[..., Any] | None = None,
+) -> OptimizeResult:
     """Solve a complementarity problem with SciPy's conventions.
 
     Find x with lo <= x <= hi and y = A x + b: y_i >= 0 where x_i = lo_i, y_i <= 0 where x_i = hi_i,
     and y_i = 0 in between.
 
-    For bounds 0 and inf that is the linear complementarity problem, 0 <= x, y >= 0, x'y = 0 ([Book] 1.2); if A is symmetric positive
-    semi-definite, x minimizes x'Ax / 2 + b'x within its bounds. This is `wl.solve` with SciPy's conventions, for host arrays. Problems
-    that are solved again and again, or live on a device, are better made once as a `wl.LCP`.
+    For bounds 0 and inf that is the linear complementarity problem, 0 <= x, y >= 0, x'y = 0 ([Book]
+    1.2); if A is symmetric positive semi-definite, x minimizes x'Ax / 2 + b'x within its bounds.
+    This is `wl.solve` with SciPy's conventions, for host arrays. Problems that are solved again and
+    again, or live on a device, are better made once as a `wl.LCP`.
 
     Args:
-        A: matrix (n, n), a numpy array or scipy.sparse one in any format, a scipy.sparse.linalg.LinearOperator, or an operator of warp_lcp.
+        A: matrix (n, n), a numpy array or scipy.sparse one in any format, a
+            scipy.sparse.linalg.LinearOperator, or an operator of warp_lcp.
         b: n numbers in any shape, or a field of the operator's shape.
         bounds: a tuple (lo, hi) or a scipy.optimize.Bounds, of numbers or arrays like b, or None
             where there is none; or SciPy's list of pairs (lo, hi), one for each unknown, of numbers
@@ -64,25 +75,30 @@ def linear_complementarity(
             lists or arrays is (lo, hi), and ambiguous forms are refused. Magnitudes of 1e20 and
             more are infinite.
         x0: a guess, of b's shape.
-        tol: relative tolerance, in [0, 1): of the natural residual's norm, relative to that at the projection of 0 onto the bounds.
+        tol: relative tolerance, in [0, 1): of the natural residual's norm, relative to that at the
+            projection of 0 onto the bounds.
         atol: absolute tolerance of that norm, >= 0, in the units of b.
-        method: a method with its settings, such as `wl.InteriorPoint()`, or a name in `wl.METHODS`, for the method with its
-            default settings; None: `wl.default_method`, and its alternatives where it fails.
+        method: a method with its settings, such as `wl.InteriorPoint()`, or a name in `wl.METHODS`,
+            for the method with its default settings; None: `wl.default_method`, and its
+            alternatives where it fails.
         maxiter: maximum number of iterations of the method, >= 0.
         preconditioner: of `wl.LCP`.
-        callback: called after each iteration, of alternatives too: `callback(intermediate_result)`, an
-            OptimizeResult with x, nit and residual, if its parameter has this name, else
-            `callback(x)`. If it raises StopIteration, the best x so far is returned, with status 99.
+        callback: called after each iteration, of alternatives too: `callback(intermediate_result)`,
+            an OptimizeResult with x, nit and residual, if its parameter has this name, else
+            `callback(x)`. If it raises StopIteration, the best x so far is returned, with status
+            99.
 
     Returns:
-        `x`, a float64 array of b's shape; `success`, whether the residual, recomputed in float64, meets a tolerance; `status`, 0 for
-        success, 1 where maxiter was reached, 2 where there is no solution, others as `STATUSES` of this module has them; `message`,
-        which says what to try next; `nit`; `residual`, the norm of the natural residual, and `relative_residual`; `slack`, y;
-        `active_mask`, as scipy.optimize.lsq_linear has it, -1 where x is held at lo, 1 at hi, 0 where y = 0 is asked for; `result`,
-        what `wl.solve` returned.
+        `x`, a float64 array of b's shape; `success`, whether the residual, recomputed in float64,
+        meets a tolerance; `status`, 0 for success, 1 where maxiter was reached, 2 where there is no
+        solution, others as `STATUSES` of this module has them; `message`, which says what to try
+        next; `nit`; `residual`, the norm of the natural residual, and `relative_residual`; `slack`,
+        y; `active_mask`, as scipy.optimize.lsq_linear has it, -1 where x is held at lo, 1 at hi, 0
+        where y = 0 is asked for; `result`, what `wl.solve` returned.
 
     Raises:
-        ValueError: an argument is of another kind, shape or range, or the method cannot take this A; the message names it.
+        ValueError: an argument is of another kind, shape or range, or the method cannot take this
+            A; the message names it.
 
     Example:
         >>> import numpy as np, warp_lcp as wl
@@ -93,14 +109,22 @@ def linear_complementarity(
     from scipy.optimize import OptimizeResult  # a quarter of a second to import
 
     criteria = {"tol": ShareOrZero, "atol": NonNegative, "maxiter": CountOrZero}
-    rtol, least, most = (checked(name, given, criteria[name]) for name, given in (("tol", tol), ("atol", atol), ("maxiter", maxiter)))
+    rtol, least, most = (
+        checked(name, given, criteria[name])
+        for name, given in (("tol", tol), ("atol", atol), ("maxiter", maxiter))
+    )
     tell = _told(callback)
     operator = as_operator(A, b.device if isinstance(b, wp.array) else None)
     fields = _Fields(real_array(b, "b"), tuple(operator.shape))
     lower, upper = _sides_of(bounds, fields.given)
-    lower, upper = _bound(fields.load(lower, "bounds, lo"), "lo", np.inf), _bound(fields.load(upper, "bounds, hi"), "hi", -np.inf)
+    lower, upper = (
+        _bound(fields.load(lower, "bounds, lo"), "lo", np.inf),
+        _bound(fields.load(upper, "bounds, hi"), "hi", -np.inf),
+    )
     problem = LCP(operator, fields.load(b, "b"), lower, upper, preconditioner=preconditioner)
-    stopping = StoppingCriteria(rtol=rtol, atol=least, max_iterations=most, patience=max(30, most // 10))
+    stopping = StoppingCriteria(
+        rtol=rtol, atol=least, max_iterations=most, patience=max(30, most // 10)
+    )
     guess = None if x0 is None else fields.load(x0, "x0")
     at_work = list[tuple[RestatedProblem, Workspace]]()  # the last one has the iterate
 
@@ -110,10 +134,19 @@ def linear_complementarity(
             x = fields.unload(restated.field(restated.problem.layout.unload(work.x)))
             tell(OptimizeResult(x=x, nit=record.iteration, residual=record.residual))
 
-    def run(restated: RestatedProblem, solver: Solver, stopping: Any, x0: Any, callback: Any) -> SolveResult:
+    def run(
+        restated: RestatedProblem, solver: Solver, stopping: Any, x0: Any, callback: Any
+    ) -> SolveResult:
         work = solver.init(restated.problem)
         at_work.append((restated, work))
-        found = solve(restated.problem, solver, stopping=stopping, x0=restated.start(x0), workspace=work, callback=callback)
+        found = solve(
+            restated.problem,
+            solver,
+            stopping=stopping,
+            x0=restated.start(x0),
+            workspace=work,
+            callback=callback,
+        )
         return restated.result(found)
 
     if method is None:
@@ -125,10 +158,17 @@ def linear_complementarity(
         message = message.replace(word, here)
     slack, active = _sides(problem, result.x)
     return OptimizeResult(
-        x=fields.unload(result.x), success=bool(result), status=STATUSES[result.status], message=message, nit=result.iterations,
-        residual=result.residual, relative_residual=result.relative_residual, slack=fields.unload(slack),
-        active_mask=fields.unload(active, np.int8), result=result,
-    )  # fmt: skip
+        x=fields.unload(result.x),
+        success=bool(result),
+        status=STATUSES[result.status],
+        message=message,
+        nit=result.iterations,
+        residual=result.residual,
+        relative_residual=result.relative_residual,
+        slack=fields.unload(slack),
+        active_mask=fields.unload(active, np.int8),
+        result=result,
+    )
 
 
 class _Fields:
@@ -160,16 +200,24 @@ def _sides_of(bounds: Any, shape: tuple[int, ...]) -> tuple[Any, Any]:
         return 0.0, np.inf
     if hasattr(bounds, "lb") and hasattr(bounds, "ub"):
         return bounds.lb, bounds.ub
-    expected = f"expected a pair (lo, hi), a list of {int(np.prod(shape))} pairs, a scipy.optimize.Bounds or None"
+    expected = (
+        f"expected a pair (lo, hi), a list of {int(np.prod(shape))} pairs, a "
+        "scipy.optimize.Bounds or None"
+    )
     if not isinstance(bounds, (tuple, list, np.ndarray)):
         raise ValueError(f"bounds is a {type(bounds).__name__}: {expected}")
     if _is_pairs(bounds, int(np.prod(shape))):
         infinite = (-np.inf, np.inf)
-        pairs = [[infinite[k] if side is None else float(side) for k, side in enumerate(pair)] for pair in bounds]
+        pairs = [
+            [infinite[k] if side is None else float(side) for k, side in enumerate(pair)]
+            for pair in bounds
+        ]
         lower, upper = np.array(pairs, dtype=np.float64).T
         return lower.reshape(shape), upper.reshape(shape)
     if isinstance(bounds, np.ndarray) or len(bounds) != 2:
-        size = f"shape {bounds.shape}" if isinstance(bounds, np.ndarray) else f"{len(bounds)} entries"
+        size = (
+            f"shape {bounds.shape}" if isinstance(bounds, np.ndarray) else f"{len(bounds)} entries"
+        )
         raise ValueError(f"bounds is a {type(bounds).__name__}: {expected}; it has {size}")
     lower, upper = bounds
     return -np.inf if lower is None else lower, np.inf if upper is None else upper
@@ -192,7 +240,8 @@ def _is_pairs(bounds: Any, n: int) -> bool:
     kinds = f"{type(bounds).__name__} of two {type(bounds[0]).__name__}s"
     raise ValueError(
         f"bounds is a {kinds}, which could be (lo, hi) or a pair for each of two unknowns: "
-        "write a tuple of two lists or arrays, ([lo, lo], [hi, hi]), or a list of two tuples, [(lo, hi), (lo, hi)]"
+        "write a tuple of two lists or arrays, ([lo, lo], [hi, hi]), or a list of two tuples, "
+        "[(lo, hi), (lo, hi)]"
     )
 
 
@@ -200,7 +249,11 @@ def _is_pair(one: Any) -> bool:
     """Return whether this is a sequence of two numbers or None."""
     if isinstance(one, np.ndarray):
         return one.shape == (2,)
-    return isinstance(one, (tuple, list)) and len(one) == 2 and all(side is None or np.ndim(side) == 0 for side in one)
+    return (
+        isinstance(one, (tuple, list))
+        and len(one) == 2
+        and all(side is None or np.ndim(side) == 0 for side in one)
+    )
 
 
 def _bound(values: Any, name: str, wrong: float) -> Any:
@@ -215,18 +268,32 @@ def _bound(values: Any, name: str, wrong: float) -> Any:
     found = huge_as_infinite(host)
     if (found == wrong).any():
         count, sign = np.count_nonzero(found == wrong), "-" if wrong < 0 else ""
-        raise ValueError(f"bounds, {name} holds {count} values of {sign}1e20 or beyond, which is infinite: no x could meet it")
+        raise ValueError(
+            f"bounds, {name} holds {count} values of {sign}1e20 or beyond, which is infinite: no x "
+            "could meet it"
+        )
     if found is host:
         return values
-    return wp.array(found, dtype=values.dtype, device=values.device) if isinstance(values, wp.array) else found
+    return (
+        wp.array(found, dtype=values.dtype, device=values.device)
+        if isinstance(values, wp.array)
+        else found
+    )
 
 
 def _method(method: Any) -> Solver:
     """Return the method that a name stands for, or the one given."""
     method = method_of(method)
     if isinstance(method, type) or not isinstance(method, Solver):
-        kind = f"the class {method.__name__}" if isinstance(method, type) else f"a {type(method).__name__}"
-        raise ValueError(f"method is {kind}: expected a name in wl.METHODS, a method like wl.MinimumMapNewton(), or None")
+        kind = (
+            f"the class {method.__name__}"
+            if isinstance(method, type)
+            else f"a {type(method).__name__}"
+        )
+        raise ValueError(
+            f"method is {kind}: expected a name in wl.METHODS, a method like "
+            "wl.MinimumMapNewton(), or None"
+        )
     return method
 
 
@@ -235,7 +302,9 @@ def _told(callback: Any) -> Callable[[OptimizeResult], Any] | None:
     if callback is None:
         return None
     if not callable(callback):
-        raise ValueError(f"callback is a {type(callback).__name__}: expected a function of one argument")
+        raise ValueError(
+            f"callback is a {type(callback).__name__}: expected a function of one argument"
+        )
     try:
         names = set(inspect.signature(callback).parameters)
     except ValueError:  # of a function written in C
@@ -253,8 +322,13 @@ def _sides(problem: LCP, x: wp.array[Any]) -> tuple[wp.array[Any], wp.array[Any]
     problem.apply_plus(stored, problem.b, y)
     at, slack, unknown = stored.numpy(), y.numpy(), problem.unknown.numpy() == 1
     residual = NaturalResidual(problem)
-    d = np.maximum(np.abs(residual.diagonal.numpy().astype(np.float64)) * residual.unit, np.finfo(np.float64).tiny)
+    d = np.maximum(
+        np.abs(residual.diagonal.numpy().astype(np.float64)) * residual.unit,
+        np.finfo(np.float64).tiny,
+    )
     low = (d * (at - problem.lower.numpy()) <= slack) & unknown
     high = (d * (at - problem.upper.numpy()) >= slack) & unknown & ~low
     mask = high.astype(np.float64) - low
-    return layout.unload(wp.array(np.where(unknown, slack, 0.0), device=y.device)), layout.unload(wp.array(mask, device=y.device))
+    return layout.unload(wp.array(np.where(unknown, slack, 0.0), device=y.device)), layout.unload(
+        wp.array(mask, device=y.device)
+    )

@@ -30,7 +30,11 @@ def print_progress(record: Record) -> None:
     Args:
         record: argument that `wl.solve` passes to its callback.
     """
-    print(f"{record.iteration:5d}  residual {record.residual:.6e}  {record.seconds:9.3f} s  {record.step}", flush=True)
+    print(
+        f"{record.iteration:5d}  residual {record.residual:.6e}  {record.seconds:9.3f} s  "
+        f"{record.step}",
+        flush=True,
+    )
 
 
 def plot_convergence(
@@ -45,10 +49,11 @@ def plot_convergence(
     There is one line for each solve.
 
     Args:
-        results: one result of `wl.solve`, a sequence of results, or a mapping from labels to results.
+        results: one result of `wl.solve`, a sequence of results, or a mapping from labels to
+            results.
         x: the horizontal axis: "iterations", "seconds" or "linear_iterations".
-        relative: divide each residual by the one at clip(0, l, u), as `StoppingCriteria(rtol=...)` does.
-            Without it residuals have the units of y.
+        relative: divide each residual by the one at clip(0, l, u), as `StoppingCriteria(rtol=...)`
+            does. Without it residuals have the units of y.
         axes: Matplotlib axes to draw into; new ones if None.
 
     Returns:
@@ -65,7 +70,9 @@ def plot_convergence(
         try:
             from matplotlib import pyplot  # an optional dependency, half a second to import
         except ImportError as error:
-            raise ImportError("plot_convergence needs Matplotlib: pip install matplotlib") from error
+            raise ImportError(
+                "plot_convergence needs Matplotlib: pip install matplotlib"
+            ) from error
         axes = pyplot.figure().add_subplot()
     attribute, axis_label = X_AXES[x]
     for label, result in lines:
@@ -73,7 +80,8 @@ def plot_convergence(
         residual = np.array([record.residual for record in result.history])
         if relative:
             residual = residual / _reference(result)
-        axes.semilogy(position, np.where(residual > 0.0, residual, np.nan), marker=".", label=label)  # log(0) has no place
+        # log(0) has no place
+        axes.semilogy(position, np.where(residual > 0.0, residual, np.nan), marker=".", label=label)
     axes.set_xlabel(axis_label)
     axes.set_ylabel("relative residual" if relative else "residual")
     axes.legend()
@@ -87,14 +95,24 @@ def _labeled(results: Any) -> list[tuple[str, SolveResult]]:
     if isinstance(results, Mapping):
         lines = [(str(label), result) for label, result in results.items()]
     elif isinstance(results, Sequence):
-        lines = [(getattr(result, "method", None) or f"solve {number}", result) for number, result in enumerate(results, 1)]
+        lines = [
+            (getattr(result, "method", None) or f"solve {number}", result)
+            for number, result in enumerate(results, 1)
+        ]
     else:
         lines = []
     if not lines or not all(isinstance(result, SolveResult) for _, result in lines):
-        raise ValueError("results: expected a result of wl.solve, a sequence of them, or a mapping from labels to results; at least one")
+        raise ValueError(
+            "results: expected a result of wl.solve, a sequence of them, or a mapping from labels "
+            "to results; at least one"
+        )
     return lines
 
 
 def _reference(result: SolveResult) -> float:
     """Return the norm of the natural residual at clip(0, l, u), which relative residuals are divided by."""
-    return result.residual / result.relative_residual if result.relative_residual > 0.0 else max(result.history[0].residual, 1e-300)
+    return (
+        result.residual / result.relative_residual
+        if result.relative_residual > 0.0
+        else max(result.history[0].residual, 1e-300)
+    )

@@ -35,7 +35,10 @@ if TYPE_CHECKING:
 NAME = "warp_lcp"
 LOOSER = 10.0  # times tol: residuals row by row, where a method has met tol in the norm of all rows
 LEAST = 1e-12  # the least tolerance of rows, which rounding leaves
-WORDS = {"infeasible": "no x meets the constraints", "unbounded": "the objective is unbounded below"}
+WORDS = {
+    "infeasible": "no x meets the constraints",
+    "unbounded": "the objective is unbounded below",
+}
 
 
 def register() -> None:
@@ -49,7 +52,10 @@ def register() -> None:
     try:
         import qpsolvers.solvers as there
     except ImportError as missing:
-        raise ImportError("warp_lcp.qp needs qpsolvers: pip install 'warp-lcp[qpsolvers]' (or pip install qpsolvers)") from missing
+        raise ImportError(
+            "warp_lcp.qp needs qpsolvers: pip install 'warp-lcp[qpsolvers]' (or pip install "
+            "qpsolvers)"
+        ) from missing
     there.solve_function[NAME] = solve_problem
     for names in (there.available_solvers, there.dense_solvers, there.sparse_solvers):
         if NAME not in names:
@@ -57,7 +63,13 @@ def register() -> None:
 
 
 def solve_problem(
-    problem: Problem, initvals: Any = None, verbose: bool = False, *, method: Any = None, tol: float = 1e-9, maxiter: int = 500
+    problem: Problem,
+    initvals: Any = None,
+    verbose: bool = False,
+    *,
+    method: Any = None,
+    tol: float = 1e-9,
+    maxiter: int = 500,
 ) -> Solution:
     """Minimize x'Px / 2 + q'x subject to G x <= h, A x = b, lb <= x <= ub.
 
@@ -104,8 +116,12 @@ def solve_problem(
     result = solve.result
     if verbose:
         print(f"{NAME}: {result.message} ({result.nit} iterations)")
-    figures = dict(zip(("primal_residual", "dual_residual", "duality_gap"), solve.figures, strict=True))
-    solution = Solution(problem, extras={"result": result, **figures}, found=solve.point is not None)
+    figures = dict(
+        zip(("primal_residual", "dual_residual", "duality_gap"), solve.figures, strict=True)
+    )
+    solution = Solution(
+        problem, extras={"result": result, **figures}, found=solve.point is not None
+    )
     if solve.point is not None:
         _write(solution, program, solve.point, bounding)
     return solution
@@ -120,8 +136,21 @@ class _Solve:
         figures: relative primal residual, dual residual and gap of the last point.
     """
 
-    def __init__(self, program: QuadraticProgramData, method: Any, tol: float, maxiter: int, x0: np.ndarray | None) -> None:
-        self.program, self.method, self.tol, self.maxiter, self.x0 = program, method, tol, maxiter, x0
+    def __init__(
+        self,
+        program: QuadraticProgramData,
+        method: Any,
+        tol: float,
+        maxiter: int,
+        x0: np.ndarray | None,
+    ) -> None:
+        self.program, self.method, self.tol, self.maxiter, self.x0 = (
+            program,
+            method,
+            tol,
+            maxiter,
+            x0,
+        )
         self.point: ProgramPoint | None = None
         self.figures = (np.inf, np.inf, np.inf)
         self.result: Any = None
@@ -138,12 +167,18 @@ class _Solve:
         self._by(InteriorPoint() if self.method is None else self.method)
         if self.point is not None or self.method is not None:
             return
-        if sum(map(_entries, (self._scaled.Q, self._scaled.G, self._scaled.C))) <= PROVABLE and (why := has_no_solution(self._scaled)):
+        if sum(map(_entries, (self._scaled.Q, self._scaled.G, self._scaled.C))) <= PROVABLE and (
+            why := has_no_solution(self._scaled)
+        ):
             self.end(SolveStatus.INFEASIBLE, WORDS[why])
         elif len(self._conditions.b) <= Lemke.most_unknowns:
             self._by(Lemke())
-            if self.point is None and self.result.status == STATUSES[SolveStatus.INFEASIBLE]:  # a ray is no certificate
-                self.end(SolveStatus.STAGNATED, "no method solves the conditions, and no certificate shows that none could")
+            # a ray is no certificate
+            if self.point is None and self.result.status == STATUSES[SolveStatus.INFEASIBLE]:
+                self.end(
+                    SolveStatus.STAGNATED,
+                    "no method solves the conditions, and no certificate shows that none could",
+                )
 
     def end(self, status: SolveStatus, message: str) -> None:
         """Say how the program ended."""
@@ -152,14 +187,20 @@ class _Solve:
             from scipy.optimize import OptimizeResult
 
             self.result = OptimizeResult(nit=0)
-        self.result.update(success=status is SolveStatus.CONVERGED, status=STATUSES[status], message=message)
+        self.result.update(
+            success=status is SolveStatus.CONVERGED, status=STATUSES[status], message=message
+        )
 
     def _box(self) -> None:
         """Solve the boxed LCP of P and q in the caller's units."""
         p = self.program
         sides = {"bounds": (p.lower, p.upper), "x0": self.x0, "method": self.method}
-        self.result = found = linear_complementarity(p.Q, p.c, tol=self.tol, maxiter=self.maxiter, **sides)
-        x = np.where(found.active_mask < 0, p.lower, np.where(found.active_mask > 0, p.upper, found.x))
+        self.result = found = linear_complementarity(
+            p.Q, p.c, tol=self.tol, maxiter=self.maxiter, **sides
+        )
+        x = np.where(
+            found.active_mask < 0, p.lower, np.where(found.active_mask > 0, p.upper, found.x)
+        )
         self._judge(with_rows(p), ProgramPoint(x, np.zeros(0), np.zeros(0)), None)
 
     def _by(self, method: Any) -> None:
@@ -168,11 +209,17 @@ class _Solve:
         n, m = len(p.c), len(p.h)
         x0 = None if self.x0 is None else np.r_[self.x0 / units.x, np.zeros(len(made.b) - n)]
         sides = {"bounds": (made.lower, made.upper), "x0": x0, "method": method}
-        self.result = found = linear_complementarity(made.A, made.b, tol=self.tol, maxiter=self.maxiter, **sides)
+        self.result = found = linear_complementarity(
+            made.A, made.b, tol=self.tol, maxiter=self.maxiter, **sides
+        )
         point = ProgramPoint(found.x[:n], found.x[n : n + m], found.x[n + m :])
         if not np.isfinite(found.x).all():
             return
-        self._judge(p, polished(p, point) if found.success or self.method is None else settled(p, point), units)
+        self._judge(
+            p,
+            polished(p, point) if found.success or self.method is None else settled(p, point),
+            units,
+        )
 
     def _judge(self, p: ProgramWithRows, point: ProgramPoint, units: ProgramUnits | None) -> None:
         """Take a point that is optimal, or say that it is not."""
@@ -182,14 +229,20 @@ class _Solve:
             self.point = found
             self.end(SolveStatus.CONVERGED, f"{SolveStatus.CONVERGED.value}")
         elif self.result.success:
-            worst = ", ".join(f"{name} {value:.1e}" for name, value in zip(("primal", "dual", "gap"), self.figures, strict=True))
+            worst = ", ".join(
+                f"{name} {value:.1e}"
+                for name, value in zip(("primal", "dual", "gap"), self.figures, strict=True)
+            )
             self.end(
                 SolveStatus.FLOOR,
-                f"the conditions are solved, but a constraint is violated by more than 10 tol: relative residuals {worst}",
+                "the conditions are solved, but a constraint is violated by more than 10 tol: "
+                f"relative residuals {worst}",
             )
 
 
-def _write(solution: Solution, program: QuadraticProgramData, point: ProgramPoint, bounding: np.ndarray) -> None:
+def _write(
+    solution: Solution, program: QuadraticProgramData, point: ProgramPoint, bounding: np.ndarray
+) -> None:
     """Write x, its objective and the multipliers."""
     problem, x, p = solution.problem, point.x, program
     slope = p.Q @ x + p.c
@@ -204,7 +257,9 @@ def _write(solution: Solution, program: QuadraticProgramData, point: ProgramPoin
         slope = slope if p.C is None else slope - p.C.T @ point.y
     if problem.lb is not None or problem.ub is not None:
         at_lower, at_upper = (x <= p.lower) & ((slope > 0) | (x < p.upper)), x >= p.upper
-        solution.z_box = np.where(at_lower, np.minimum(-slope, 0.0), np.where(at_upper, np.maximum(-slope, 0.0), 0.0))
+        solution.z_box = np.where(
+            at_lower, np.minimum(-slope, 0.0), np.where(at_upper, np.maximum(-slope, 0.0), 0.0)
+        )
 
 
 def _read(problem: Problem) -> tuple[QuadraticProgramData, np.ndarray]:
@@ -218,7 +273,10 @@ def _read(problem: Problem) -> tuple[QuadraticProgramData, np.ndarray]:
     if h is not None:
         G, h = (-G[np.flatnonzero(bounding)], -h[bounding]) if bounding.any() else (None, None)
     if d is not None and not np.isfinite(d).all():
-        raise ValueError(f"b holds {np.count_nonzero(~np.isfinite(d))} values that are not finite: equations need numbers")
+        raise ValueError(
+            f"b holds {np.count_nonzero(~np.isfinite(d))} values that are not finite: equations "
+            "need numbers"
+        )
     if d is not None and not len(d):
         C, d = None, None
     return QuadraticProgramData(P, q, lower, upper, G, h, C, d), bounding
@@ -238,17 +296,31 @@ def _objective(problem: Problem) -> tuple[Any, np.ndarray, np.ndarray, np.ndarra
         raise ValueError(f"P has shape {P.shape}: expected {(n, n)}, after q")
     if not np.isfinite(q).all():
         raise ValueError(f"q holds {np.count_nonzero(~np.isfinite(q))} values that are not finite")
-    lower = np.full(n, -np.inf) if problem.lb is None else huge_as_infinite(_vector(problem.lb, "lb", n))
-    upper = np.full(n, np.inf) if problem.ub is None else huge_as_infinite(_vector(problem.ub, "ub", n))
+    lower = (
+        np.full(n, -np.inf)
+        if problem.lb is None
+        else huge_as_infinite(_vector(problem.lb, "lb", n))
+    )
+    upper = (
+        np.full(n, np.inf) if problem.ub is None else huge_as_infinite(_vector(problem.ub, "ub", n))
+    )
     for name, side, wrong in (("lb", lower, np.inf), ("ub", upper, -np.inf)):
         if (side == wrong).any():
-            raise ValueError(f"{name}[{np.flatnonzero(side == wrong)[0]}] is {wrong} (1e20 and more are infinite): no x could meet it")
+            raise ValueError(
+                f"{name}[{np.flatnonzero(side == wrong)[0]}] is {wrong} (1e20 and more are "
+                "infinite): no x could meet it"
+            )
     if (lower > upper).any():
-        raise ValueError(f"lb > ub in {np.count_nonzero(lower > upper)} unknowns, {np.flatnonzero(lower > upper)[0]} the first")
+        raise ValueError(
+            f"lb > ub in {np.count_nonzero(lower > upper)} unknowns, "
+            f"{np.flatnonzero(lower > upper)[0]} the first"
+        )
     return (P + P.T) * 0.5, q, lower, upper
 
 
-def _rows(matrix: Any, right: Any, name: str, name_of_right: str, n: int) -> tuple[Any, np.ndarray | None]:
+def _rows(
+    matrix: Any, right: Any, name: str, name_of_right: str, n: int
+) -> tuple[Any, np.ndarray | None]:
     """Return a constraint's matrix and right-hand side, None where there is none."""
     if matrix is None or right is None:
         if matrix is not None or right is not None:
@@ -273,7 +345,10 @@ def _matrix(values: Any, name: str) -> Any:
 def _vector(values: Any, name: str, n: int) -> np.ndarray:
     host = real_array(values, name).astype(np.float64).ravel()
     if host.shape != (n,) or np.isnan(host).any():
-        raise ValueError(f"{name} has shape {host.shape} and {np.count_nonzero(np.isnan(host))} NaN: expected {(n,)} and none")
+        raise ValueError(
+            f"{name} has shape {host.shape} and {np.count_nonzero(np.isnan(host))} NaN: expected "
+            f"{(n,)} and none"
+        )
     return host
 
 

@@ -19,9 +19,11 @@ from warp_lcp.solvers.registry import METHODS
 from warp_lcp.traits import TRIAL, Traits
 
 ACCURACIES = {"rough": 1e-2, "usual": 1e-6, "exact": 1e-10}
-# numbers of 8 bytes besides A that methods hold for an entry of a matrix and for an unknown, rounded up from measured workspaces
+# numbers of 8 bytes besides A that methods hold for an entry of a matrix and for an unknown,
+# rounded up from measured workspaces
 FIELDS_ONLY, SYSTEMS = (0, 18), (4, 40)
-LEAN = ("psor", "accelerated-projected-gradient", "projected-jacobi")  # hold fields only and take matrices
+# hold fields only and take matrices
+LEAN = ("psor", "accelerated-projected-gradient", "projected-jacobi")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +65,8 @@ class Recommendation:
         stopping: criteria for the requested accuracy, with a suitable limit of steps.
         reasons: one sentence for each reason.
         expected: expected cost of the solve, None if unknown.
-        attempts: solves that `wl.solve` makes without a method, in order; those that do not suit the problem are left out.
+        attempts: solves that `wl.solve` makes without a method, in order; those that do not suit
+            the problem are left out.
         traits: properties of the problem that decided.
     """
 
@@ -89,7 +92,9 @@ class Recommendation:
     def alternatives(self) -> tuple[str, ...]:
         """Names of methods to try if this one fails or is too slow, best first."""
         others = (attempt for attempt in self.attempts if attempt.method not in (None, self.name))
-        return tuple(dict.fromkeys(str(attempt.method) for attempt in others if attempt.suits(self.traits)))
+        return tuple(
+            dict.fromkeys(str(attempt.method) for attempt in others if attempt.suits(self.traits))
+        )
 
     @property
     def chain(self) -> Solver:
@@ -97,18 +102,21 @@ class Recommendation:
         return default_chain(self.method, self.traits.problem)
 
 
-def recommend(problem: LCP, *, accuracy: float | str = "usual", budget: Budget | None = None) -> Recommendation:
+def recommend(
+    problem: LCP, *, accuracy: float | str = "usual", budget: Budget | None = None
+) -> Recommendation:
     """Return the recommended method for a problem, with reasons.
 
-    The rules depend on A and the bounds; `wl.solve` without a method uses them
-    too. Sweeps are tried only on unsymmetric sparse matrices and if there is a budget; only
-    symmetric matrices are factored, at most 2,048 rows of them. The rules come from timings of all
-    methods on one core of an AMD EPYC and an Intel Xeon, and hold for CPUs; docs "Choosing a method" gives the
-    decision list and its success rate.
+    The rules depend on A and the bounds; `wl.solve` without a method uses them too. Sweeps are
+    tried only on unsymmetric sparse matrices and if there is a budget; only symmetric matrices are
+    factored, at most 2,048 rows of them. The rules come from timings of all methods on one core of
+    an AMD EPYC and an Intel Xeon, and hold for CPUs; docs "Choosing a method" gives the decision
+    list and its success rate.
 
     Args:
         problem: the LCP; it is not changed.
-        accuracy: relative residual wanted, in (0, 1), or "rough" (1e-2), "usual" (1e-6) or "exact" (1e-10).
+        accuracy: relative residual wanted, in (0, 1), or "rough" (1e-2), "usual" (1e-6) or "exact"
+            (1e-10).
         budget: limits of the solve; None: no limits.
 
     Raises:
@@ -124,7 +132,10 @@ def recommend(problem: LCP, *, accuracy: float | str = "usual", budget: Budget |
     if not isinstance(problem, LCP):
         raise ValueError(f"problem is a {type(problem).__name__}: expected an LCP")
     if not (budget is None or isinstance(budget, Budget)):
-        raise ValueError(f"budget = {budget!r}: expected Budget(seconds=...), Budget(iterations=...) or Budget(bytes=...)")
+        raise ValueError(
+            f"budget = {budget!r}: expected Budget(seconds=...), Budget(iterations=...) or "
+            "Budget(bytes=...)"
+        )
     given = checked("accuracy", accuracy, Share | Literal[tuple(ACCURACIES)])
     rtol = ACCURACIES.get(given, given)
     traits = Traits(problem, rtol, trial=budget is not None)
@@ -145,9 +156,23 @@ def _from_rule(rule: Rule, t: Traits, rtol: float) -> Recommendation:
         expected = f"{rule.steps} steps or fewer"
     elif rule.method == "psor" and math.isfinite(t.sweeps):
         expected = f"about {math.ceil(t.sweeps)} sweeps, by the rate of the first {TRIAL}"
-    reasons = (f"{rule.reason}.", f"The problem: {t.kind}, {t.unknowns} unknowns, {'symmetric' if t.symmetric else 'unsymmetric'}.")
-    limit = steps_allowed(rule.method, t.unknowns) if rule.steps is None else max(100, 10 * rule.steps)
-    return Recommendation(rule.method, method_for(rule.method, t), criteria(rtol, limit), reasons, expected, rule.attempts, t)
+    reasons = (
+        f"{rule.reason}.",
+        f"The problem: {t.kind}, {t.unknowns} unknowns, "
+        f"{'symmetric' if t.symmetric else 'unsymmetric'}.",
+    )
+    limit = (
+        steps_allowed(rule.method, t.unknowns) if rule.steps is None else max(100, 10 * rule.steps)
+    )
+    return Recommendation(
+        rule.method,
+        method_for(rule.method, t),
+        criteria(rtol, limit),
+        reasons,
+        expected,
+        rule.attempts,
+        t,
+    )
 
 
 @lru_cache(maxsize=64)
@@ -160,18 +185,40 @@ def _within(found: Recommendation, budget: Budget, problem: LCP) -> Recommendati
     """Return a recommendation that respects a budget, or says that it cannot."""
     t = found.traits
     if budget.bytes is not None and (needs := memory_of(found.name, t)) > budget.bytes:
-        lean = next((n for n in LEAN if t.takes(n) and memory_of(n, t) <= budget.bytes and _takes(n, problem)), None)
+        lean = next(
+            (
+                n
+                for n in LEAN
+                if t.takes(n) and memory_of(n, t) <= budget.bytes and _takes(n, problem)
+            ),
+            None,
+        )
         if lean is None:
-            found = _said(found, f"No method fits into {budget.bytes} bytes; this one takes about {needs}.")
+            found = _said(
+                found, f"No method fits into {budget.bytes} bytes; this one takes about {needs}."
+            )
         else:
             found = _instead(
-                found, lean, f"{found.name} takes about {needs} bytes of the {budget.bytes} allowed; {lean} holds fields only."
+                found,
+                lean,
+                f"{found.name} takes about {needs} bytes of the {budget.bytes} allowed; {lean} "
+                "holds fields only.",
             )
     if budget.iterations is not None:
         if budget.bytes is None and found.name in ("psor", "nncg") and t.sweeps > budget.iterations:
-            fewer = next((rule for rule in rules_for(t) if rule.steps is not None and rule.steps <= 2 * budget.iterations), None)
+            fewer = next(
+                (
+                    rule
+                    for rule in rules_for(t)
+                    if rule.steps is not None and rule.steps <= 2 * budget.iterations
+                ),
+                None,
+            )
             if fewer is not None:
-                why = f"{found.name} would take {t.sweeps:.0f} of the {budget.iterations} steps allowed, {fewer.method} some {fewer.steps}."
+                why = (
+                    f"{found.name} would take {t.sweeps:.0f} of the {budget.iterations} steps "
+                    f"allowed, {fewer.method} some {fewer.steps}."
+                )
                 found = _said(_from_rule(fewer, t, found.stopping.rtol), why)
         found = replace(found, stopping=replace(found.stopping, max_iterations=budget.iterations))
     return found if budget.seconds is None else _in_time(found, budget.seconds, problem)
@@ -183,14 +230,28 @@ def _in_time(found: Recommendation, seconds: float, problem: LCP) -> Recommendat
     taken = _takes(found.name, problem, steps=1)
     took = time.perf_counter() - begun
     if taken and took <= seconds:
-        return _said(found, f"Its set-up and first step took {took:.2g} s of the {seconds:g} s allowed.")
+        return _said(
+            found, f"Its set-up and first step took {took:.2g} s of the {seconds:g} s allowed."
+        )
     begun = time.perf_counter()
     if not found.traits.takes("psor") or not _takes("psor", problem, steps=TRIAL):
-        return _said(found, f"Its set-up and first step took {took:.2g} s, more than the {seconds:g} s allowed; no sweep is possible here.")
+        return _said(
+            found,
+            f"Its set-up and first step took {took:.2g} s, more than the {seconds:g} s allowed; no "
+            "sweep is possible here.",
+        )
     many = max(1, int(seconds / ((time.perf_counter() - begun) / TRIAL)))
-    why = f"{found.name} took {took:.2g} s for its first step, more than the {seconds:g} s allowed: {many} sweeps fit, and each helps."
+    why = (
+        f"{found.name} took {took:.2g} s for its first step, more than the {seconds:g} s "
+        f"allowed: {many} sweeps fit, and each helps."
+    )
     cheaper = _instead(found, "psor", why)
-    return replace(cheaper, stopping=replace(cheaper.stopping, max_iterations=min(many, cheaper.stopping.max_iterations)))
+    return replace(
+        cheaper,
+        stopping=replace(
+            cheaper.stopping, max_iterations=min(many, cheaper.stopping.max_iterations)
+        ),
+    )
 
 
 def _takes(name: str, problem: LCP, *, steps: int = 0) -> bool:
@@ -210,5 +271,12 @@ def _instead(found: Recommendation, name: str, reason: str) -> Recommendation:
     """Return another method for the same criteria, with the limit of steps of a method that sweeps."""
     stopping = replace(found.stopping, max_iterations=LONGEST, patience=LONGEST // 10)
     attempts = (Attempt(name), *(attempt for attempt in found.attempts if attempt.method != name))
-    changed = replace(found, name=name, method=METHODS[name](), stopping=stopping, expected=None, attempts=attempts)
+    changed = replace(
+        found,
+        name=name,
+        method=METHODS[name](),
+        stopping=stopping,
+        expected=None,
+        attempts=attempts,
+    )
     return _said(changed, reason)

@@ -1,7 +1,8 @@
 """The rules by which `wl.solve` and `wl.recommend` choose: a table whose rows are tried in order.
 
-A row says when it applies, and which solves are attempted then: each a method, the form of the matrix that it works on, and a limit of
-steps. `default_chain` lists the methods that take over within a solve. `warp_lcp.benchmarks.choose` measures every row against all methods.
+A row says when it applies, and which solves are attempted then: each a method, the form of the
+matrix that it works on, and a limit of steps. `default_chain` lists the methods that take over
+within a solve. `warp_lcp.benchmarks.choose` measures every row against all methods.
 """
 
 from __future__ import annotations
@@ -17,11 +18,20 @@ from warp_lcp.solvers.registry import METHODS
 from warp_lcp.solvers.subspace_minimization import SubspaceMinimization
 from warp_lcp.traits import Traits
 
-FEW_SWEEPS = {"grid": 25, "sparse": 60}  # fewer are faster than a multigrid hierarchy's set-up and some cycles, or than systems
-PIVOTED = 1000  # unknowns up to which a method that fails is followed by Lemke's: it takes seconds there
-SURE, LONG_PATHS = 100, 2000  # unknowns up to which Lemke's paths may take so many steps: ten seconds
+# fewer are faster than a multigrid hierarchy's set-up and some cycles, or than systems
+FEW_SWEEPS = {"grid": 25, "sparse": 60}
+# unknowns up to which a method that fails is followed by Lemke's: it takes seconds there
+PIVOTED = 1000
+# unknowns up to which Lemke's paths may take so many steps: ten seconds
+SURE, LONG_PATHS = 100, 2000
 LONGEST = 5000  # steps of a method that sweeps: a prediction may be too low
-SWEEPING = ("psor", "nncg", "blocked-gauss-seidel", "projected-jacobi", "accelerated-projected-gradient")
+SWEEPING = (
+    "psor",
+    "nncg",
+    "blocked-gauss-seidel",
+    "projected-jacobi",
+    "accelerated-projected-gradient",
+)
 OTHERS = 100  # steps of other methods
 
 
@@ -30,11 +40,13 @@ class Attempt:
     """One of the solves that `wl.solve` makes without a method, from the same start, until one succeeds.
 
     Args:
-        method: its name in METHODS; None: that of the rules for the problem in `form`, left out where the problem has no such form.
+        method: its name in METHODS; None: that of the rules for the problem in `form`, left out
+            where the problem has no such form.
         form: of the matrix; None, or where the problem has no such form: as it is given.
         when: condition under which the attempt is made; None: always.
         steps: limit of steps, where the caller gives none; None: `steps_allowed`.
-        again: the method has been tried before, with fewer steps: no attempt where the caller's own limits would make it the same.
+        again: the method has been tried before, with fewer steps: no attempt where the caller's own
+            limits would make it the same.
     """
 
     method: str | None
@@ -58,10 +70,17 @@ ON_GRID = Attempt(None, form=as_grid)
 LEMKE = Attempt("lemke", when=lambda t: t.unknowns <= PIVOTED)
 # Singular blocks are seen by LAPACK, which is faster there than GMRES, too.
 FISCHER = Attempt("fischer-newton", form=as_dense)
-# Free blocks of contacts are singular, and heavy bodies on light ones leave eigenvalues of 1 over the ratio of masses: on a free set that
-# is not the solution's the exact step of a dense matrix is as much too long, where conjugate gradients stop early. With ratios to 1e7 the
-# residual rises and falls over hundreds of steps.
-INEXACT = Attempt("subspace-minimization", form=as_sparse, when=lambda t: t.kind in ("dense", "sparse"), steps=1000, again=True)
+# Free blocks of contacts are singular, and heavy bodies on light ones leave eigenvalues of 1 over
+# the ratio of masses: on a free set that is not the solution's the exact step of a dense matrix is
+# as much too long, where conjugate gradients stop early. With ratios to 1e7 the residual rises and
+# falls over hundreds of steps.
+INEXACT = Attempt(
+    "subspace-minimization",
+    form=as_sparse,
+    when=lambda t: t.kind in ("dense", "sparse"),
+    steps=1000,
+    again=True,
+)
 
 
 def unless_concave(name: str) -> Attempt:
@@ -76,7 +95,8 @@ class Rule:
     Args:
         reason: a sentence without its full stop.
         applies: whether it does.
-        steps: which nine of ten such problems take no more of, whatever the accuracy; None: that is known by a trial, or not at all.
+        steps: which nine of ten such problems take no more of, whatever the accuracy; None: that is
+            known by a trial, or not at all.
         attempts: in order.
     """
 
@@ -93,7 +113,9 @@ class Rule:
     @property
     def alternatives(self) -> tuple[str, ...]:
         """Names of the other methods."""
-        names = dict.fromkeys(attempt.method for attempt in self.attempts if attempt.method is not None)
+        names = dict.fromkeys(
+            attempt.method for attempt in self.attempts if attempt.method is not None
+        )
         return tuple(name for name in names if name != self.method)
 
 
@@ -104,22 +126,26 @@ def attempts(*given: Attempt | str) -> tuple[Attempt, ...]:
 
 # fmt: off
 RULES: tuple[Rule, ...] = (
-    Rule("Affine bounds, as for friction, depend on x and need sweeps; solves on the free unknowns speed these up",
+    Rule("Affine bounds, as for friction, depend on x and need sweeps; solves on the free unknowns "
+         "speed these up",
          lambda t: t.affine, 18,
          attempts("subspace-minimization", INEXACT, "nncg", "blocked-gauss-seidel", "psor", "staggering")),
     Rule("Affine bounds without access to rows leave one method",
          lambda t: t.affine, None,
          attempts("projected-jacobi")),
-    Rule("Negative diagonal entries with infinite bounds are usually a sign error in A; pivoting still works",
+    Rule("Negative diagonal entries with infinite bounds are usually a sign error in A; pivoting "
+         "still works",
          lambda t: t.curved and t.unknowns <= PIVOTED, 5,
          attempts("lemke", unless_concave("minimum-map-newton"))),
     Rule("Larger problems with such entries end with NEGATIVE_CURVATURE: check the sign of A",
          lambda t: t.curved, None,
          attempts(ON_GRID, "minimum-map-newton")),
-    Rule("With a few negative diagonal entries Newton's method often converges; where it stalls, the Fischer-Burmeister function goes on",
+    Rule("With a few negative diagonal entries Newton's method often converges; where it stalls, "
+         "the Fischer-Burmeister function goes on",
          lambda t: t.diagonal == "negative" and t.kind in ("dense", "sparse") and t.unbounded, 20,
          attempts(ON_GRID, "minimum-map-newton", LEMKE, unless_concave("interior-point"))),
-    Rule("In a box, sweeps set an unknown with a negative diagonal entry to a bound; solves on the free unknowns speed up dense ones",
+    Rule("In a box, sweeps set an unknown with a negative diagonal entry to a bound; solves on the "
+         "free unknowns speed up dense ones",
          lambda t: t.diagonal == "negative" and t.kind == "dense", 40,
          attempts("subspace-minimization", "fischer-newton", LEMKE, "psor", unless_concave("minimum-map-newton"),
                   unless_concave("interior-point"))),
@@ -127,7 +153,8 @@ RULES: tuple[Rule, ...] = (
          lambda t: t.diagonal == "negative" and t.kind == "sparse", None,
          attempts("psor", LEMKE, Attempt("fischer-newton", as_dense, lambda t: not is_concave(t)), unless_concave("minimum-map-newton"),
                   unless_concave("interior-point"))),
-    Rule("Without access to rows there are no sweeps, and Newton's method needs the fewest products",
+    Rule("Without access to rows there are no sweeps, and Newton's method needs the fewest "
+         "products",
          lambda t: t.kind == "operator", 8,
          attempts("minimum-map-newton", "mprgp", "primal-dual-active-set", "interior-point", "fischer-newton")),
     Rule("If a few sweeps solve a grid or a sparse matrix, multigrid and linear systems cost more",
@@ -136,22 +163,27 @@ RULES: tuple[Rule, ...] = (
     Rule("On a grid the number of multigrid cycles hardly depends on the size",
          lambda t: t.kind == "grid" and t.points, 8,
          attempts("projected-multigrid", "minimum-map-newton", "mprgp")),
-    Rule("A stencil that is unsymmetric or needs line relaxation has a multigrid hierarchy for Newton's systems",
+    Rule("A stencil that is unsymmetric or needs line relaxation has a multigrid hierarchy for "
+         "Newton's systems",
          lambda t: t.kind == "grid", 9,
          attempts("minimum-map-newton", "primal-dual-active-set", "interior-point", "mprgp")),
-    Rule("With few unknowns, pivoting handles zeros on the diagonal (friction cones, linear programs, games)",
+    Rule("With few unknowns, pivoting handles zeros on the diagonal (friction cones, linear "
+         "programs, games)",
          lambda t: t.pivotable and t.unknowns <= 400, 5,
          attempts("lemke", "interior-point", FISCHER, "minimum-map-newton")),
     Rule("Interior-point systems are shifted, so that zeros on the diagonal do no harm",
          lambda t: t.pivotable, 14,
          attempts(ON_GRID, "interior-point", FISCHER, "minimum-map-newton", LEMKE)),
-    Rule("PIQP solves the convex quadratic program of a dense symmetric matrix of low rank or with a small ridge",
+    Rule("PIQP solves the convex quadratic program of a dense symmetric matrix of low rank or with "
+         "a small ridge",
          lambda t: t.low_rank, 1,
          attempts("quadratic-program", "interior-point", LEMKE, "minimum-map-newton", "mprgp")),
-    Rule("A symmetric matrix of low rank has singular free blocks, which interior-point systems shift",
+    Rule("A symmetric matrix of low rank has singular free blocks, which interior-point systems "
+         "shift",
          lambda t: t.low_rank, 14,
          attempts("interior-point", LEMKE, FISCHER, "minimum-map-newton", "mprgp")),
-    Rule("Any other matrix needs a few systems on the free unknowns, solved directly if small or narrow",
+    Rule("Any other matrix needs a few systems on the free unknowns, solved directly if small or "
+         "narrow",
          lambda t: True, 9,
          attempts(ON_GRID, "minimum-map-newton", "quadratic-program", "interior-point", LEMKE, FISCHER, "primal-dual-active-set", "mprgp")),
 )
@@ -179,6 +211,7 @@ def method_for(name: str, t: Traits) -> Solver:
 def _method(name: str, direct: bool, affine: bool) -> Solver:
     if name == "minimum-map-newton" and direct:
         return MinimumMapNewton(direct=True)
-    if name == "subspace-minimization" and affine:  # where the residual may not rise first, 4 of 11 scenes of contacts do not converge
+    # where the residual may not rise first, 4 of 11 scenes of contacts do not converge
+    if name == "subspace-minimization" and affine:
         return SubspaceMinimization(precision="double", backtracks=-1)
     return METHODS[name]()

@@ -38,7 +38,13 @@ Part = Annotated[float, Ge(0), Le(1)]
 Relaxation = Annotated[float, Gt(0), Lt(2)]
 
 Kind = TypeVar("Kind")
-KINDS = {int: "an integer", float: "a finite number", bool: "True or False", str: "text", NoneType: "None"}
+KINDS = {
+    int: "an integer",
+    float: "a finite number",
+    bool: "True or False",
+    str: "text",
+    NoneType: "None",
+}
 ENDS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
 
 
@@ -63,8 +69,9 @@ class SettingError(ValueError):
 class Settings:
     """Base of a frozen dataclass that checks its fields by their annotations, once it is made. Numbers are stored as Python's.
 
-    Whole floats are integers, NumPy's numbers are those of their values, members of a `StrEnum` their words; a bool or a text is no number.
-    Numbers are finite, unless the range says `OrInfinite`. What several fields must be together is checked in a `__post_init__` that calls
+    Whole floats are integers, NumPy's numbers are those of their values, members of a `StrEnum`
+    their words; a bool or a text is no number. Numbers are finite, unless the range says
+    `OrInfinite`. What several fields must be together is checked in a `__post_init__` that calls
     this one first.
 
     Example:
@@ -108,8 +115,15 @@ def renamed(**names: str) -> Callable[[type[Kind]], type[Kind]]:
             for old, new in names.items():
                 if old in settings:
                     if new in settings:
-                        raise TypeError(f"{kind.__name__} got both {old} and {new}: {old} is the old name of {new}, leave it out")
-                    warnings.warn(f"{kind.__name__}({old}=...) is now {kind.__name__}({new}=...)", DeprecationWarning, stacklevel=2)
+                        raise TypeError(
+                            f"{kind.__name__} got both {old} and {new}: {old} is the old name of "
+                            f"{new}, leave it out"
+                        )
+                    warnings.warn(
+                        f"{kind.__name__}({old}=...) is now {kind.__name__}({new}=...)",
+                        DeprecationWarning,
+                        stacklevel=2,
+                    )
                     settings[new] = settings.pop(old)
             init(self, *args, **settings)
 
@@ -130,7 +144,9 @@ def renamed_names(module: str, **names: str) -> Callable[[str], Any]:
     def find(name: str) -> Any:
         if name not in names:
             raise AttributeError(f"module {module!r} has no attribute {name!r}")
-        warnings.warn(f"{module}.{name} is now {module}.{names[name]}", DeprecationWarning, stacklevel=2)
+        warnings.warn(
+            f"{module}.{name} is now {module}.{names[name]}", DeprecationWarning, stacklevel=2
+        )
         return getattr(sys.modules[module], names[name])
 
     return find
@@ -147,7 +163,11 @@ def renamed_method(old: str, method: Callable[..., Any]) -> Callable[..., Any]:
 
     @wraps(method)
     def call(self: Any, *args: Any, **given: Any) -> Any:
-        warnings.warn(f"{type(self).__name__}.{old} is now {type(self).__name__}.{new}", DeprecationWarning, stacklevel=2)
+        warnings.warn(
+            f"{type(self).__name__}.{old} is now {type(self).__name__}.{new}",
+            DeprecationWarning,
+            stacklevel=2,
+        )
         return getattr(self, new)(*args, **given)
 
     return call
@@ -164,8 +184,18 @@ def checked(name: str, given: object, annotation: Any) -> Any:
     Raises:
         SettingError: it is not.
     """
-    value: Any = given.item() if isinstance(given, (np.generic, np.ndarray)) and np.ndim(given) == 0 else given
-    plain = str(value) if isinstance(value, StrEnum) else int(value) if isinstance(value, float) and value.is_integer() else value
+    value: Any = (
+        given.item()
+        if isinstance(given, (np.generic, np.ndarray)) and np.ndim(given) == 0
+        else given
+    )
+    plain = (
+        str(value)
+        if isinstance(value, StrEnum)
+        else int(value)
+        if isinstance(value, float) and value.is_integer()
+        else value
+    )
     try:
         return adapter(annotation).validate_python(plain)
     except ValueError:  # pydantic's words name one end of a range
@@ -203,7 +233,8 @@ def rule(annotation: Any) -> str:
         case None:
             return KINDS.get(annotation) or f"a {getattr(annotation, '__name__', annotation)}"
         case kind if kind is Annotated:
-            said = [part for part in parts if isinstance(part, str)]  # words of the annotation's own
+            # words of the annotation's own
+            said = [part for part in parts if isinstance(part, str)]
             return said[0] if said else _range(*parts)
         case kind if kind in (Literal, Union, UnionType):
             words = [repr(part) if kind is Literal else rule(part) for part in parts]
@@ -214,13 +245,21 @@ def rule(annotation: Any) -> str:
 
 def _range(kind: type, *limits: Any) -> str:
     """Return a range of numbers in words."""
-    found = {name: getattr(limit, name) for limit in limits for name in ENDS if hasattr(limit, name)}
+    found = {
+        name: getattr(limit, name) for limit in limits for name in ENDS if hasattr(limit, name)
+    }
     if len(found) == 2:
         (low, a), (high, b) = found.items()
         ends = f"in {'[' if low == 'ge' else '('}{a:g}, {b:g}{']' if high == 'le' else ')'}"
         return f"an integer {ends}" if kind is int else ends
     ends = " ".join(f"{ENDS[name]} {limit:g}" for name, limit in found.items())
-    return f"an integer {ends}" if kind is int else f"{ends} or inf" if OrInfinite in limits else f"a finite number {ends}"
+    return (
+        f"an integer {ends}"
+        if kind is int
+        else f"{ends} or inf"
+        if OrInfinite in limits
+        else f"a finite number {ends}"
+    )
 
 
 @cache
@@ -230,12 +269,19 @@ def adapter(annotation: Any) -> Any:
 
     if dataclasses.is_dataclass(annotation):
         return TypeAdapter(InstanceOf[annotation])
-    return TypeAdapter(annotation, config=ConfigDict(strict=True, allow_inf_nan=False, arbitrary_types_allowed=True))
+    return TypeAdapter(
+        annotation,
+        config=ConfigDict(strict=True, allow_inf_nan=False, arbitrary_types_allowed=True),
+    )
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
     """Return `did you mean ...?` for a word that is near a known one, or its initials, and the list of known ones otherwise."""
     known = sorted(known)
     initials = {"".join(part[:1] for part in re.split("[_-]", name)): name for name in known}
-    match = [initials[word]] if len(word) > 1 and word in initials else get_close_matches(word, known, n=1, cutoff=0.6)
+    match = (
+        [initials[word]]
+        if len(word) > 1 and word in initials
+        else get_close_matches(word, known, n=1, cutoff=0.6)
+    )
     return f"did you mean {match[0]!r}?" if match else f"choose from {', '.join(known)}"

@@ -57,7 +57,9 @@ class StepFailed(RuntimeError):
     """The step's solve missed its criteria. The state is as before the step, so a smaller dt may be tried."""
 
 
-def missed_by_far(solve: str, status: SolveStatus, iterations: int, residual: str, advice: str) -> StepFailed:
+def missed_by_far(
+    solve: str, status: SolveStatus, iterations: int, residual: str, advice: str
+) -> StepFailed:
     """Return what to raise where a solve has ended too far from its tolerance for the step to be taken.
 
     Args:
@@ -67,7 +69,10 @@ def missed_by_far(solve: str, status: SolveStatus, iterations: int, residual: st
         residual: what it left, with its unit and what was asked for, in words.
         advice: what may help.
     """
-    return StepFailed(f"the {solve} solve ended with {status.name} after {iterations} iterations at a {residual}: {advice}")
+    return StepFailed(
+        f"the {solve} solve ended with {status.name} after {iterations} iterations at a "
+        f"{residual}: {advice}"
+    )
 
 
 class SimulationFailed(RuntimeError):
@@ -101,9 +106,10 @@ class Points:
 class Cells:
     """A frame of equal axis-aligned cells. `index` (n, 3): integer x, y, z of each cell, whose low corner lies at index * spacing [m].
 
-    `dimension` 2 makes quadrilaterals in the plane z = 0, 3 makes voxels. `fields` have shape (n,) or (n, 3). `counts`: cells of the whole
-    grid along x, y and z, which an image of it has in every frame. `box`: the first cell, and the one behind the last, of the part of the
-    grid that these cells come from, if others have the rest; then an image is one of that part.
+    `dimension` 2 makes quadrilaterals in the plane z = 0, 3 makes voxels. `fields` have shape (n,)
+    or (n, 3). `counts`: cells of the whole grid along x, y and z, which an image of it has in every
+    frame. `box`: the first cell, and the one behind the last, of the part of the grid that these
+    cells come from, if others have the rest; then an image is one of that part.
     """
 
     name: str
@@ -119,8 +125,9 @@ class Cells:
 class Surface:
     """A frame of a surface: triangles, in 2-D the segments of an outline.
 
-    `points` [m], shape (n, 3); `corners` of the triangles among them, shape (m, 3), counterclockwise seen from outside, or of the segments,
-    shape (m, 2), with the inside on the left; `fields` at the points, of shape (n,) or (n, 3).
+    `points` [m], shape (n, 3); `corners` of the triangles among them, shape (m, 3),
+    counterclockwise seen from outside, or of the segments, shape (m, 2), with the inside on the
+    left; `fields` at the points, of shape (n,) or (n, 3).
     """
 
     name: str
@@ -133,8 +140,9 @@ class Surface:
 class Volume:
     """A frame of values at the centers of a 3-D grid's cells.
 
-    `values`: float32, shape (nz, ny, nx); `spacing` of the cells [m]; `band`: of a signed distance [m], < 0 inside, how far from the
-    surface it is known; None: a density, >= 0; `origin`: how many cells (x, y, z) lie between the first one and the domain's low corner.
+    `values`: float32, shape (nz, ny, nx); `spacing` of the cells [m]; `band`: of a signed distance
+    [m], < 0 inside, how far from the surface it is known; None: a density, >= 0; `origin`: how many
+    cells (x, y, z) lie between the first one and the domain's low corner.
     """
 
     name: str
@@ -191,8 +199,8 @@ class Simulation(Protocol):
 class Scheduled(Protocol):
     """What a Simulation may also be: one in which something starts or stops at times known before.
 
-    Steps end there where that takes no step that is much shorter than its neighbors. The others run across: the simulation must be right
-    then too.
+    Steps end there where that takes no step that is much shorter than its neighbors. The others run
+    across: the simulation must be right then too.
     """
 
     def events(self, until: float) -> list[float]:
@@ -203,8 +211,8 @@ class Scheduled(Protocol):
 class Profiled(Protocol):
     """What a Simulation may also be: one that says what its step spends its time on.
 
-    It wraps the stages of its step in `with self.watch.stage(name, *arrays)`. A run that is profiled sets `watch` before the first step;
-    until then it is a `NoStopwatch`.
+    It wraps the stages of its step in `with self.watch.stage(name, *arrays)`. A run that is
+    profiled sets `watch` before the first step; until then it is a `NoStopwatch`.
     """
 
     watch: Stopwatch
@@ -214,8 +222,9 @@ class Profiled(Protocol):
 class Recorded(Protocol):
     """What a Simulation may also be: one that shows the problems it solves.
 
-    Until a run sets `record`, it is None and costs nothing. Then each step calls it before its solve, once an attempt, with the arrays of a
-    file as `warp_lcp.gallery.recorded` describes them; problems that no method solves are recorded too.
+    Until a run sets `record`, it is None and costs nothing. Then each step calls it before its
+    solve, once an attempt, with the arrays of a file as `warp_lcp.gallery.recorded` describes them;
+    problems that no method solves are recorded too.
     """
 
     record: Callable[[Mapping[str, np.ndarray]], object] | None
@@ -229,7 +238,8 @@ class Resampled(Protocol):
         """Continue from the state of a simulation that differs in `domain.resolution` alone; return what the user should know of it.
 
         Raises:
-            ValueError: the state does not belong to this scene on any grid, or cannot be brought to this one.
+            ValueError: the state does not belong to this scene on any grid, or cannot be brought to
+                this one.
         """
 
 
@@ -237,10 +247,12 @@ class Resampled(Protocol):
 class Joined(Simulation, Protocol):
     """What a Simulation may also be: one that several MPI ranks share, or that can go on where several ended.
 
-    On several ranks it is a rank's part: `stable_dt`, `step`, `frame`, `restore` (the state of one process) and `restore_pieces` are
-    collective. Times, rows of the log and columns are those of the whole simulation, the same on all ranks, which also raise the same kind
-    of error. `frame` returns what this rank has, in coordinates of the whole domain; `state` returns this rank's piece of the state, whose
-    `box`, int (2, 3), is its part's first cell and the one behind the last.
+    On several ranks it is a rank's part: `stable_dt`, `step`, `frame`, `restore` (the state of one
+    process) and `restore_pieces` are collective. Times, rows of the log and columns are those of
+    the whole simulation, the same on all ranks, which also raise the same kind of error. `frame`
+    returns what this rank has, in coordinates of the whole domain; `state` returns this rank's
+    piece of the state, whose `box`, int (2, 3), is its part's first cell and the one behind the
+    last.
     """
 
     def restore_pieces(self, pieces: Sequence[Mapping[str, np.ndarray]]) -> None:

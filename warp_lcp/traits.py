@@ -27,8 +27,11 @@ from warp_lcp.solvers.registry import METHODS
 MOST_FACTORED = 500  # unknowns of a matrix whose Cholesky factorization is tried: 4 ms
 # of more unknowns of a dense matrix every second one, up to MOST_SAMPLED: 0.2 s
 SHARE_FACTORED, MOST_SAMPLED = 2, 2048
-TRIAL, TRIAL_RATE = 8, 4  # sweeps on trial, and how many of the last tell the rate: the first ones remove what is rough in the error
-PIVOT = 1e-11  # of the largest diagonal entry: semi-definite matrices in float64 leave squared pivots of that size
+# sweeps on trial, and how many of the last tell the rate: the first ones remove what is rough in
+# the error
+TRIAL, TRIAL_RATE = 8, 4
+# of the largest diagonal entry: semi-definite matrices in float64 leave squared pivots of that size
+PIVOT = 1e-11
 # of a diagonal entry: where most pivots are smaller, Newton's method cycles or PIQP is faster (17
 # kernels and 39 dense matrices tried); the second where systems are not solved on the host
 LOW_RANK, LOW_RANK_ITERATIVE = 0.1, 0.3
@@ -100,13 +103,20 @@ class Traits:
 
         Negative entries where a bound is infinite, and no positive entries there.
         """
-        return self.kind in ("dense", "sparse") and self.diagonal == "negative" and has_negative_curvature(self._problem)
+        return (
+            self.kind in ("dense", "sparse")
+            and self.diagonal == "negative"
+            and has_negative_curvature(self._problem)
+        )
 
     @cached_property
     def unbounded(self) -> bool:
         """Return whether a bound is infinite where a diagonal entry is negative."""
         below = self._entries_on_diagonal < 0
-        return any(np.isinf(side.numpy()[self._known][below]).any() for side in (self._problem.lower, self._problem.upper))
+        return any(
+            np.isinf(side.numpy()[self._known][below]).any()
+            for side in (self._problem.lower, self._problem.upper)
+        )
 
     @cached_property
     def definiteness(self) -> str:
@@ -120,7 +130,11 @@ class Traits:
             return "definite"  # closed components apart, which are settled before the first step
         if self.diagonal == "negative":
             return "indefinite"
-        return "unknown" if self.kind == "operator" else _definiteness(self._matrix, self.symmetric, self._entries_on_diagonal)
+        return (
+            "unknown"
+            if self.kind == "operator"
+            else _definiteness(self._matrix, self.symmetric, self._entries_on_diagonal)
+        )
 
     @cached_property
     def low_rank(self) -> bool:
@@ -152,15 +166,18 @@ class Traits:
         problem = self._problem
         if self.affine:
             return "affine"
-        sides = [bool(np.isfinite(side.numpy()[self._known]).any()) for side in (problem.lower, problem.upper)]
+        sides = [
+            bool(np.isfinite(side.numpy()[self._known]).any())
+            for side in (problem.lower, problem.upper)
+        ]
         return {0: "none", 1: "one-sided", 2: "box"}[sum(sides)]
 
     @cached_property
     def sweeps(self) -> float:
         """Return the expected number of `ProjectedSOR` sweeps for the accuracy.
 
-        On grids by the rate omega - 1 of the advised omega, else extrapolated from the rate of TRIAL
-        sweeps, which are made.
+        On grids by the rate omega - 1 of the advised omega, else extrapolated from the rate of
+        TRIAL sweeps, which are made.
 
         inf where they do not converge, are not possible or are not tried.
         """
@@ -190,9 +207,15 @@ class Traits:
         method, problem = METHODS[name], self._problem
         if name == "quadratic-program" and not (self.symmetric and has_piqp()):
             return False
-        if not takes(method, problem.A) or self.unknowns > getattr(method, "most_unknowns", self.unknowns):
+        if not takes(method, problem.A) or self.unknowns > getattr(
+            method, "most_unknowns", self.unknowns
+        ):
             return False
-        asked = {"preconditioned": problem.preconditioner is not None, "affine_bounds": self.affine, "distributed": self.ranks}
+        asked = {
+            "preconditioned": problem.preconditioner is not None,
+            "affine_bounds": self.affine,
+            "distributed": self.ranks,
+        }
         return all(getattr(method, ability, False) for ability, needed in asked.items() if needed)
 
     @property
@@ -247,7 +270,9 @@ def sweeps_to(problem: LCP, accuracy: float) -> float:
     if has_advised_omega(problem):
         return math.log(accuracy) / math.log(grid_omega(problem, singular=False) - 1)
     try:
-        trial = solve(problem, ProjectedSOR(), stopping=StoppingCriteria(rtol=accuracy, max_iterations=TRIAL))
+        trial = solve(
+            problem, ProjectedSOR(), stopping=StoppingCriteria(rtol=accuracy, max_iterations=TRIAL)
+        )
     except ValueError:
         return float("inf")
     residuals = [record.residual for record in trial.history]
@@ -278,7 +303,10 @@ def _definiteness(A: Any, symmetric: bool, d: np.ndarray) -> str:
     if len(d) > MOST_FACTORED:
         return "unknown"
     dense = _dense(A)
-    part, shift = dense if symmetric else 0.5 * (dense + dense.T), PIVOT * float(d.max(initial=0.0)) * np.eye(len(d))
+    part, shift = (
+        dense if symmetric else 0.5 * (dense + dense.T),
+        PIVOT * float(d.max(initial=0.0)) * np.eye(len(d)),
+    )
     for shifted, verdict in ((part - shift, "definite"), (part + shift, "semidefinite")):
         if _pivots(shifted) is not None:
             return verdict

@@ -16,9 +16,11 @@ from warp_lcp.benchmarks.harness.record import Lines, Panels, Record, Results, T
 from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.gallery import Problem, splash
 
-# the book's methods: monotone searches without fallbacks, no cycles first, linear systems solved. Num4LCP's default at kinks, "random",
-# leaves their rows of the Jacobian empty, as "zero" does
-FISCHER = wl.FischerNewton(fischer_weight=1.0, kink="zero", safeguard=False, scaled=False, monotone_cycles=0, eta=1e-8)
+# the book's methods: monotone searches without fallbacks, no cycles first, linear systems solved.
+# Num4LCP's default at kinks, "random", leaves their rows of the Jacobian empty, as "zero" does
+FISCHER = wl.FischerNewton(
+    fischer_weight=1.0, kink="zero", safeguard=False, scaled=False, monotone_cycles=0, eta=1e-8
+)
 APPROXIMATION = replace(FISCHER, kink="approximation", max_linear_iterations=50)
 MINIMUM_MAP = wl.MinimumMapNewton(safeguard=False, monotone_cycles=0, eta=1e-8)
 INTERIOR = wl.InteriorPoint(mehrotra=False, monotone_cycles=0, precision="double")
@@ -45,7 +47,10 @@ PUBLISHED = {
 }
 # as the book has them, and as they should be
 COMPARED = ("fluid, recipe", "fluid, 7-point, planted", "contact, recipe", "contact, rigid bodies")
-KINKS = {**{kink: replace(FISCHER, kink=kink) for kink in ("random", "zero", "perturbation")}, "approximation": APPROXIMATION}
+KINKS = {
+    **{kink: replace(FISCHER, kink=kink) for kink in ("random", "zero", "perturbation")},
+    "approximation": APPROXIMATION,
+}
 SHARES = (0.5, 0.7, 0.8, 0.9, 0.95, 0.99, 1.0)  # lambda
 FACTORS = (0.6, 0.8, 1.0, 1.2, 1.3, 1.4, 1.5, 1.6, 1.7, 1.8, 1.9)  # omega
 SWEEPS = 2000
@@ -56,13 +61,20 @@ UNIT = "residual / residual at x = 0"
 
 def measure(results: Results, scale: Scale, options: Options) -> None:
     """Run the experiments on random problems."""
-    problems = {kind: [make(k) for k in range(scale.problems)] for kind, make in kinds(scale).items()}
+    problems = {
+        kind: [make(k) for k in range(scale.problems)] for kind, make in kinds(scale).items()
+    }
     _patterns(results, problems)
     _states(results, problems, options)
     few = {kind: problems[kind][: max(2, scale.problems // 2)] for kind in COMPARED}
     _kinks(results, few, options)
     _lambda(results, few, options)
-    _omega(results, {kind: of_kind[0] for kind, of_kind in problems.items() if kind.startswith("fluid")}, scale, options)
+    _omega(
+        results,
+        {kind: of_kind[0] for kind, of_kind in problems.items() if kind.startswith("fluid")},
+        scale,
+        options,
+    )
 
 
 def _patterns(results: Results, problems: dict[str, list[Problem]]) -> None:
@@ -75,24 +87,53 @@ def _patterns(results: Results, problems: dict[str, list[Problem]]) -> None:
             infeasible += bool(y.min() < -1e-9)
             worst = max(worst, float(-y.min()))
         for p in of_kind[:10]:
-            result = wl.solve(p.lcp(device="cpu"), wl.FischerNewton(), stopping=wl.StoppingCriteria(rtol=1e-9))
+            result = wl.solve(
+                p.lcp(device="cpu"), wl.FischerNewton(), stopping=wl.StoppingCriteria(rtol=1e-9)
+            )
             x = result.x.numpy().ravel()
             held.append(float((x < p.A @ x + p.b).mean()))
-        figures = {"infeasible": infeasible, "problems": len(of_kind), "worst": worst, "held": statistics.fmean(held)}
-        results.records.append(Record(f"planted: {kind}", {name: Figure(value) for name, value in figures.items()}))
+        figures = {
+            "infeasible": infeasible,
+            "problems": len(of_kind),
+            "worst": worst,
+            "held": statistics.fmean(held),
+        }
+        results.records.append(
+            Record(f"planted: {kind}", {name: Figure(value) for name, value in figures.items()})
+        )
         planted = "none" if of_kind[0].solution is None else f"{infeasible} of {len(of_kind)}"
         rows.append([kind, planted, f"{worst:.2g}", f"{statistics.fmean(held):.1%}"])
         if kind in COMPARED:
-            i, j = np.nonzero(of_kind[0].A[:60, :60].toarray() if hasattr(of_kind[0].A, "toarray") else of_kind[0].A[:60, :60])
+            i, j = np.nonzero(
+                of_kind[0].A[:60, :60].toarray()
+                if hasattr(of_kind[0].A, "toarray")
+                else of_kind[0].A[:60, :60]
+            )
             panels.append(
                 Lines(
-                    kind, f"{kind}: {len(i)} entries", "column", "- row", {"": (j.tolist(), (-i).tolist())}, log="", marked=frozenset({""})
+                    kind,
+                    f"{kind}: {len(i)} entries",
+                    "column",
+                    "- row",
+                    {"": (j.tolist(), (-i).tolist())},
+                    log="",
+                    marked=frozenset({""}),
                 )
             )
-    remark = "Whether the x that a problem is made from breaks y >= 0, by how much at most, and how many unknowns the solution holds at 0."
-    columns = ["problems", "planted x infeasible", "most negative y", "held in the solution (mean of 10)"]
+    remark = (
+        "Whether the x that a problem is made from breaks y >= 0, by how much at most, and "
+        "how many unknowns the solution holds at 0."
+    )
+    columns = [
+        "problems",
+        "planted x infeasible",
+        "most negative y",
+        "held in the solution (mean of 10)",
+    ]
     results.tables.append(Table("Planted solutions", columns, rows, remark))
-    results.charts.append(Panels("c1-patterns", "Figure C.1: entries of the first 60 rows and columns", panels, 4))
+    results.charts.append(
+        Panels("c1-patterns", "Figure C.1: entries of the first 60 rows and columns", panels, 4)
+    )
 
 
 def _states(results: Results, problems: dict[str, list[Problem]], options: Options) -> None:
@@ -103,32 +144,68 @@ def _states(results: Results, problems: dict[str, list[Problem]], options: Optio
         for method, (solver, merit) in METHODS.items():
             options.say(f"book: {kind}, {method}")
             try:
-                outcomes[method] = outcome(f"{kind}: {method}", of_kind, solver, merit, options.device)
+                outcomes[method] = outcome(
+                    f"{kind}: {method}", of_kind, solver, merit, options.device
+                )
             except ValueError as error:
                 options.say(f"refused: {error}")
                 continue
             results.records.append(outcomes[method].record())
             results.records[-1].figures["rate"] = Figure(rate := _rate(outcomes[method]))
-            rows.append([kind, method, *outcomes[method].row(), f"{rate:.3g}", PUBLISHED.get(f"{kind}: {method}", "")])
+            rows.append(
+                [
+                    kind,
+                    method,
+                    *outcomes[method].row(),
+                    f"{rate:.3g}",
+                    PUBLISHED.get(f"{kind}: {method}", ""),
+                ]
+            )
         if kind in COMPARED:
-            curves = {name: _curve(o.traces[0].residuals[: SHOWN + 1]) for name, o in outcomes.items()}
+            curves = {
+                name: _curve(o.traces[0].residuals[: SHOWN + 1]) for name, o in outcomes.items()
+            }
             panels.append(Lines(kind, kind, "iterations", UNIT, curves, log="y"))
     remark = (
-        "Book's test: states and iterations by Num4LCP's rules (relative 1e-6, absolute 1e-3, at most 100) on the merit or, for sweeps, "
-        "on x'|y|. Residual there: the largest natural residual where that test ended a solve, over the one of x = 0. Solved: natural "
-        f"residual below {RTOL:g} of that within 100 steps. Rate: the factor by which the residual falls in the step that takes it below "
-        f"{NEAR:g}, or in the last one (median). Names with () are the library's methods as they come."
+        "Book's test: states and iterations by Num4LCP's rules (relative 1e-6, absolute 1e-3, at "
+        "most 100) on the merit or, for sweeps, "
+        "on x'|y|. Residual there: the largest natural residual where that test ended a solve, "
+        "over the one of x = 0. Solved: natural "
+        f"residual below {RTOL:g} of that within 100 steps. Rate: the factor by which the residual "
+        "falls in the step that takes it below "
+        f"{NEAR:g}, or in the last one (median). Names with () are the library's methods as they "
+        "come."
     )
-    columns = ["problems", "method", "book's test", "iterations", "residual there", "solved", "steps", "rate", "[Book] C.1, C.2"]
-    results.tables.append(Table("Tables C.1 and C.2: final states and iterations", columns, rows, remark))
-    results.charts.append(Panels("c2-convergence", "Figure C.2: convergence, the book's problems (left) and planted ones", panels))
+    columns = [
+        "problems",
+        "method",
+        "book's test",
+        "iterations",
+        "residual there",
+        "solved",
+        "steps",
+        "rate",
+        "[Book] C.1, C.2",
+    ]
+    results.tables.append(
+        Table("Tables C.1 and C.2: final states and iterations", columns, rows, remark)
+    )
+    results.charts.append(
+        Panels(
+            "c2-convergence",
+            "Figure C.2: convergence, the book's problems (left) and planted ones",
+            panels,
+        )
+    )
 
 
 def _rate(of_method: Outcome) -> float:
     """Return by which factor the residual falls in the step that takes it below NEAR, or in the last one: the median."""
     factors = []
     for trace in of_method.traces:
-        last = next((k for k, r in enumerate(trace.residuals) if r <= NEAR), len(trace.residuals) - 1)
+        last = next(
+            (k for k, r in enumerate(trace.residuals) if r <= NEAR), len(trace.residuals) - 1
+        )
         if last > 0:
             factors.append(trace.residuals[last - 1] / max(trace.residuals[last], 1e-16))
     return statistics.median(factors) if factors else 1.0
@@ -153,21 +230,42 @@ def _kinks(results: Results, problems: dict[str, list[Problem]], options: Option
             curves[kink] = _curve(found.traces[0].residuals[: SHOWN + 1])
         rows.append(row)
         panels.append(Lines(kind, kind, "iterations", UNIT, curves, log="y"))
-    remark = f"Problems solved to {RTOL:g} within 100 steps, and the mean of their steps, of the book's Fischer-Newton."
-    results.tables.append(Table("Figure C.3: strategies at kinks", ["problems", *KINKS], rows, remark))
-    results.charts.append(Panels("c3-kinks", "Figure C.3: strategies at kinks, the first problem of each kind", panels))
+    remark = (
+        f"Problems solved to {RTOL:g} within 100 steps, and the mean of their steps, of the "
+        "book's Fischer-Newton."
+    )
+    results.tables.append(
+        Table("Figure C.3: strategies at kinks", ["problems", *KINKS], rows, remark)
+    )
+    results.charts.append(
+        Panels(
+            "c3-kinks", "Figure C.3: strategies at kinks, the first problem of each kind", panels
+        )
+    )
 
 
 def _lambda(results: Results, problems: dict[str, list[Problem]], options: Options) -> None:
     """Vary lambda of the penalized Fischer map, in the book's loop and with this library's safeguards."""
     rows = list[list[str]]()
-    solved, steps = dict[str, tuple[Sequence[float], list[float]]](), dict[str, tuple[list[float], list[float]]]()
+    solved, steps = (
+        dict[str, tuple[Sequence[float], list[float]]](),
+        dict[str, tuple[list[float], list[float]]](),
+    )
     for kind, few in list(problems.items())[1:]:
-        for label, solver in (("book's loop", FISCHER), ("safeguarded", wl.FischerNewton(monotone_cycles=0))):
+        for label, solver in (
+            ("book's loop", FISCHER),
+            ("safeguarded", wl.FischerNewton(monotone_cycles=0)),
+        ):
             options.say(f"book: lambda, {kind}, {label}")
             row, name = [kind, label], f"{kind}, {label}"
             for share in SHARES:
-                found = outcome(f"lambda: {name}: {share:g}", few, replace(solver, fischer_weight=share), Merit.FISCHER, options.device)
+                found = outcome(
+                    f"lambda: {name}: {share:g}",
+                    few,
+                    replace(solver, fischer_weight=share),
+                    Merit.FISCHER,
+                    options.device,
+                )
                 results.records.append(found.record())
                 row.append(found.share)
                 solved.setdefault(name, (SHARES, []))[1].append(100 * len(found.solved) / len(few))
@@ -175,8 +273,14 @@ def _lambda(results: Results, problems: dict[str, list[Problem]], options: Optio
                     steps.setdefault(name, ([], []))[0].append(share)
                     steps[name][1].append(statistics.fmean(found.solved))
             rows.append(row)
-    remark = f"Problems solved to {RTOL:g} within 100 steps, and the mean of their steps. 1 is the plain Fischer map."
-    panels = [Lines("solved", "solved", "lambda", "%", solved, log=""), Lines("steps", "steps of those", "lambda", "steps", steps, log="")]
+    remark = (
+        f"Problems solved to {RTOL:g} within 100 steps, and the mean of their steps. 1 is the "
+        "plain Fischer map."
+    )
+    panels = [
+        Lines("solved", "solved", "lambda", "%", solved, log=""),
+        Lines("steps", "steps of those", "lambda", "steps", steps, log=""),
+    ]
     title = "Lambda of the penalized Fischer map"
     results.tables.append(Table(title, ["problems", "loop", *map(str, SHARES)], rows, remark))
     results.charts.append(Panels("lambda", title, panels))
@@ -185,7 +289,8 @@ def _lambda(results: Results, problems: dict[str, list[Problem]], options: Optio
 def _omega(results: Results, given: dict[str, Problem], scale: Scale, options: Options) -> None:
     """Vary the relaxation factor of PSOR (figure C.4)."""
     given = given | {
-        f"splash {n}^3, p >= 0": splash(n).named("everywhere", device=options.device) for n in (2 * scale.side, 4 * scale.side)
+        f"splash {n}^3, p >= 0": splash(n).named("everywhere", device=options.device)
+        for n in (2 * scale.side, 4 * scale.side)
     }
     stopping = wl.StoppingCriteria(rtol=RTOL, max_iterations=SWEEPS, patience=SWEEPS)
     rows, curves = list[list[str]](), dict[str, tuple[list[float], list[float]]]()
@@ -197,11 +302,17 @@ def _omega(results: Results, given: dict[str, Problem], scale: Scale, options: O
             if result:
                 done[omega] = result.iterations
         best = min(done, key=lambda omega: done[omega], default=0.0)
-        figures = {f"sweeps at {omega:g}": Figure(sweeps) for omega, sweeps in done.items()} | {"best": Figure(best)}
+        figures = {f"sweeps at {omega:g}": Figure(sweeps) for omega, sweeps in done.items()} | {
+            "best": Figure(best)
+        }
         results.records.append(Record(f"omega: {label}", figures))
-        rows.append([label, f"{best:g}", *(str(done.get(omega, f"> {SWEEPS}")) for omega in FACTORS)])
+        rows.append(
+            [label, f"{best:g}", *(str(done.get(omega, f"> {SWEEPS}")) for omega in FACTORS)]
+        )
         curves[label] = [*done], [float(sweeps) for sweeps in done.values()]
     remark = "Matrices are swept row by row, grids red-black."
     title = f"Figure C.4: relaxation factors of PSOR, sweeps to {RTOL:g}"
-    results.tables.append(Table(title, ["problem", "best", *(f"{w:g}" for w in FACTORS)], rows, remark))
+    results.tables.append(
+        Table(title, ["problem", "best", *(f"{w:g}" for w in FACTORS)], rows, remark)
+    )
     results.charts.append(Lines("c4-omega", title, "omega", "sweeps", curves, log="y"))

@@ -16,7 +16,8 @@ from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.gallery import contact_scenes
 from warp_lcp.gallery.contact_models import BoxedModel, ContactSystem
 
-ORDERED = ("wall", "box-stack", "leaning-wall", "gear-pyramid")  # scenes of figure 2.3, which has dense structured ones: brick walls
+# scenes of figure 2.3, which has dense structured ones: brick walls
+ORDERED = ("wall", "box-stack", "leaning-wall", "gear-pyramid")
 ROUNDS = 100  # of figure 2.3
 LEVELS = (1e-3, 1e-6, 1e-10)
 METHODS: dict[str, tuple[Any, int]] = {  # and how many sweeps a step of theirs takes at least
@@ -27,16 +28,27 @@ METHODS: dict[str, tuple[Any, int]] = {  # and how many sweeps a step of theirs 
 ORDERS: dict[str, Callable[[ContactSystem, np.ndarray], Any]] = {
     "PGS": lambda system, height: wl.ProjectedSOR(omega=1.0),
     "impulse": lambda system, height: wl.ProjectedSOR(omega=1.0, order="magnitude"),
-    "coordinate": lambda system, height: wl.ProjectedSOR(omega=1.0, permutation=tuple(np.argsort(height, kind="stable"))),
+    "coordinate": lambda system, height: wl.ProjectedSOR(
+        omega=1.0, permutation=tuple(np.argsort(height, kind="stable"))
+    ),
     "greedy": lambda system, height: wl.ProjectedSOR(omega=1.0, order="greedy"),
-    "staggered": lambda system, height: wl.ProjectedSOR(omega=1.0, permutation=tuple(np.concatenate(system.staggered()))),
-    "extreme staggered": lambda system, height: wl.Staggering(blocks=system.staggered(), solvers=wl.IncrementalPivoting(), eta=1e-8),
+    "staggered": lambda system, height: wl.ProjectedSOR(
+        omega=1.0, permutation=tuple(np.concatenate(system.staggered()))
+    ),
+    "extreme staggered": lambda system, height: wl.Staggering(
+        blocks=system.staggered(), solvers=wl.IncrementalPivoting(), eta=1e-8
+    ),
 }
 
 
 def measure(results: Results, scale: Scale, options: Options) -> None:
     """Solve the next step of every scene."""
-    rows, panels, order_rows, ordered = list[list[str]](), list[Lines](), list[list[str]](), list[Lines]()
+    rows, panels, order_rows, ordered = (
+        list[list[str]](),
+        list[Lines](),
+        list[list[str]](),
+        list[Lines](),
+    )
     for name in contact_scenes.SCENES:
         assembly = contacts.next_step(name, options.device)
         system = assembly.system
@@ -44,9 +56,14 @@ def measure(results: Results, scale: Scale, options: Options) -> None:
         curves, cells = dict[str, tuple[list[float], list[float]]](), [name, str(len(system.q))]
         for method, (solver, least) in METHODS.items():
             options.say(f"book: {name}, {method}")
-            history = wl.solve(problem, solver, stopping=contacts.unhindered(max(1, scale.sweeps // least))).history
+            history = wl.solve(
+                problem, solver, stopping=contacts.unhindered(max(1, scale.sweeps // least))
+            ).history
             curves[method] = _curve([(h.linear_iterations, h.residual) for h in history])
-            figures = {"residual": Figure(min(curves[method][1], default=0.0)), "sweeps": Figure(history[-1].linear_iterations)}
+            figures = {
+                "residual": Figure(min(curves[method][1], default=0.0)),
+                "sweeps": Figure(history[-1].linear_iterations),
+            }
             for level in LEVELS:
                 there = next((n for n, r in zip(*curves[method], strict=True) if r <= level), None)
                 figures |= {f"sweeps to {level:g}": Figure(there)} if there is not None else {}
@@ -56,18 +73,42 @@ def measure(results: Results, scale: Scale, options: Options) -> None:
         rows.append(cells)
         panels.append(Lines(name, system.name, "sweeps", UNIT, curves))
         if name in ORDERED:
-            height = np.concatenate([np.repeat(assembly.contacts.point[:, 2], 3), np.full(len(system.lower), np.inf)])
-            found = {label: _order(problem, make(system, height), options) for label, make in ORDERS.items()}
+            height = np.concatenate(
+                [np.repeat(assembly.contacts.point[:, 2], 3), np.full(len(system.lower), np.inf)]
+            )
+            found = {
+                label: _order(problem, make(system, height), options)
+                for label, make in ORDERS.items()
+            }
             ordered.append(Lines(name, system.name, "sweeps or rounds", UNIT, found, log="y"))
             order_rows.append([name, *(f"{min(r, default=0.0):.1e}" for _, r in found.values())])
             last = {label: Figure(min(r, default=0.0)) for label, (_, r) in found.items()}
             results.records.append(Record(f"orders: {name}", last))
-    remark = f"At most {scale.sweeps} sweeps; least: the smallest residual met. Boxed friction, residuals over that at x = 0."
-    columns = ["scene", "unknowns", *(f"{m} {part}" for m in METHODS for part in (*(f"to {x:g}" for x in LEVELS), "least"))]
-    results.tables.append(Table(f"Figure 2.3: least residual in {ROUNDS} sweeps or rounds", ["scene", *ORDERS], order_rows))
-    results.tables.append(Table("Figures 2.10 and 2.12: sweeps to residuals on contact scenes", columns, rows, remark))
-    results.charts.append(Panels("2-3-orders", "Figure 2.3: orders of the unknowns in sweeps", ordered))
-    results.charts.append(Panels("2-10-scenes", "Figures 2.10 and 2.12: contact scenes", panels, columns=4))
+    remark = (
+        f"At most {scale.sweeps} sweeps; least: the smallest residual met. Boxed friction, "
+        "residuals over that at x = 0."
+    )
+    columns = [
+        "scene",
+        "unknowns",
+        *(f"{m} {part}" for m in METHODS for part in (*(f"to {x:g}" for x in LEVELS), "least")),
+    ]
+    results.tables.append(
+        Table(
+            f"Figure 2.3: least residual in {ROUNDS} sweeps or rounds",
+            ["scene", *ORDERS],
+            order_rows,
+        )
+    )
+    results.tables.append(
+        Table("Figures 2.10 and 2.12: sweeps to residuals on contact scenes", columns, rows, remark)
+    )
+    results.charts.append(
+        Panels("2-3-orders", "Figure 2.3: orders of the unknowns in sweeps", ordered)
+    )
+    results.charts.append(
+        Panels("2-10-scenes", "Figures 2.10 and 2.12: contact scenes", panels, columns=4)
+    )
 
 
 def _order(problem: wl.LCP, solver: Any, options: Options) -> tuple[list[float], list[float]]:

@@ -66,7 +66,8 @@ class Trace:
     def verdict(self, merit: Merit, limits: Limits) -> tuple[str, int, float]:
         """Return state, iterations and relative residual where Num4LCP's tests would have ended the solve.
 
-        Sweeps are tested after each one; Newton methods before each step, whose first test is iteration 1.
+        Sweeps are tested after each one; Newton methods before each step, whose first test is
+        iteration 1.
         """
         first = 1 if merit is Merit.PRODUCT else 0
         before = np.inf
@@ -79,12 +80,21 @@ class Trace:
             if iteration >= limits.most:
                 return "max iterations", iteration, relative
             before = now
-        names = {"max iterations": "MAX_ITERATIONS", "stagnation": "STAGNATED FLOOR", "local minimum": "LOCAL_MINIMUM"}
-        state = next((name for name, statuses in names.items() if self.status.name in statuses.split()), "non-descent")
+        names = {
+            "max iterations": "MAX_ITERATIONS",
+            "stagnation": "STAGNATED FLOOR",
+            "local minimum": "LOCAL_MINIMUM",
+        }
+        state = next(
+            (name for name, statuses in names.items() if self.status.name in statuses.split()),
+            "non-descent",
+        )
         return state, max(1, len(self.merits) - first), self.residuals[-1]
 
 
-def follow(problem: Problem, solver: Any, merit: Merit, device: str, *, most: int = 100, x0: Any = None) -> Trace:
+def follow(
+    problem: Problem, solver: Any, merit: Merit, device: str, *, most: int = 100, x0: Any = None
+) -> Trace:
     """Solve a dense or sparse problem and keep the merit of each iterate."""
     lcp = problem.lcp(device=device)
     work = solver.init(lcp)
@@ -94,7 +104,9 @@ def follow(problem: Problem, solver: Any, merit: Merit, device: str, *, most: in
         x = lcp.layout.unload(work.x).numpy().ravel()
         merits.append(merit.of(x, problem.A @ x + problem.b))
 
-    stopping = wl.StoppingCriteria(rtol=DEEP, max_iterations=most, patience=max(1, most), divergence=1e30)
+    stopping = wl.StoppingCriteria(
+        rtol=DEEP, max_iterations=most, patience=max(1, most), divergence=1e30
+    )
     result = wl.solve(lcp, solver, stopping=stopping, workspace=work, callback=look, x0=x0)
     first = result.history[0].residual or 1.0
     return Trace(merits, [r.residual / first for r in result.history], result.status)
@@ -116,7 +128,11 @@ class Outcome:
     @property
     def accepted(self) -> list[int]:
         """Iterations of those that one of the book's two tests of convergence ended."""
-        return [iterations for state, iterations, _ in self.verdicts if state in ("relative", "absolute")]
+        return [
+            iterations
+            for state, iterations, _ in self.verdicts
+            if state in ("relative", "absolute")
+        ]
 
     @property
     def states(self) -> str:
@@ -126,11 +142,17 @@ class Outcome:
     @property
     def share(self) -> str:
         """How many were solved to RTOL, with the mean of their steps."""
-        return f"{len(self.solved)} of {len(self.traces)}" + (f", {statistics.fmean(self.solved):.2f}" if self.solved else "")
+        return f"{len(self.solved)} of {len(self.traces)}" + (
+            f", {statistics.fmean(self.solved):.2f}" if self.solved else ""
+        )
 
     def record(self) -> Record:
         """Return the figures."""
-        figures: dict[str, float] = {"solved": len(self.solved), "problems": len(self.traces), "accepted": len(self.accepted)}
+        figures: dict[str, float] = {
+            "solved": len(self.solved),
+            "problems": len(self.traces),
+            "accepted": len(self.accepted),
+        }
         figures["residual"] = max(residual for _, _, residual in self.verdicts)
         figures |= {"steps": statistics.fmean(self.solved)} if self.solved else {}
         figures |= {"iterations": statistics.fmean(self.accepted)} if self.accepted else {}
@@ -140,17 +162,32 @@ class Outcome:
     def row(self) -> list[str]:
         """Return states, iterations and largest residual by the book's tests, then problems solved to RTOL and their steps."""
         worst = max(residual for _, _, residual in self.verdicts)
-        return [self.states, spread(self.accepted), f"{worst:.1e}", f"{len(self.solved)} of {len(self.traces)}", spread(self.solved)]
+        return [
+            self.states,
+            spread(self.accepted),
+            f"{worst:.1e}",
+            f"{len(self.solved)} of {len(self.traces)}",
+            spread(self.solved),
+        ]
 
 
 def outcome(
-    name: str, problems: Sequence[Problem], solver: Any, merit: Merit, device: str, *, limits: Limits | None = None,
+    name: str,
+    problems: Sequence[Problem],
+    solver: Any,
+    merit: Merit,
+    device: str,
+    *,
+    limits: Limits | None = None,
     starts: Sequence[Any] | None = None,
-) -> Outcome:  # fmt: skip
+) -> Outcome:
     """Solve all problems by a method, from x = 0 or the starts."""
     limits = limits or Limits()
     given = starts or [None] * len(problems)
-    traces = [follow(p, solver, merit, device, most=limits.most, x0=x0) for p, x0 in zip(problems, given, strict=True)]
+    traces = [
+        follow(p, solver, merit, device, most=limits.most, x0=x0)
+        for p, x0 in zip(problems, given, strict=True)
+    ]
     return Outcome(name, traces, [t.verdict(merit, limits) for t in traces])
 
 
@@ -163,4 +200,7 @@ def spread(values: Sequence[float]) -> str:
     """Return mean (smallest to largest, standard deviation)."""
     if not values:
         return ""
-    return f"{statistics.fmean(values):.2f} ({min(values):g} to {max(values):g}, {statistics.pstdev(values):.2f})"
+    return (
+        f"{statistics.fmean(values):.2f} ({min(values):g} to {max(values):g}, "
+        f"{statistics.pstdev(values):.2f})"
+    )

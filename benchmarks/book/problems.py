@@ -53,8 +53,9 @@ class Scale:
 def recipe(A: Any, rng: np.random.Generator, name: str) -> Problem:
     """Return the problem that Num4LCP's `make_lcp` makes of a matrix.
 
-    Its `solution` is the x that it plants, uniform in (0, 1) with a quarter set to 0, b = -A x where x > 0 and 0 elsewhere. That x is no
-    solution where (A x)_i < 0 at a zero: with an M-matrix everywhere.
+    Its `solution` is the x that it plants, uniform in (0, 1) with a quarter set to 0, b = -A x
+    where x > 0 and 0 elsewhere. That x is no solution where (A x)_i < 0 at a zero: with an M-matrix
+    everywhere.
     """
     x = rng.random(A.shape[0])
     x[x < ZEROS] = 0
@@ -67,19 +68,23 @@ def complementary(A: Any, rng: np.random.Generator, name: str) -> Problem:
     return planted(A, rng, Plant(active=ZEROS), name=name, facts=frozenset())
 
 
-RULES: dict[str, Callable[[Any, np.random.Generator, str], Problem]] = {"recipe": recipe, "planted": complementary}
+RULES: dict[str, Callable[[Any, np.random.Generator, str], Problem]] = {
+    "recipe": recipe,
+    "planted": complementary,
+}
 
 
 def contact_matrix(contacts: int, rng: np.random.Generator, tangents: int = 4) -> np.ndarray:
     """Return Num4LCP's contact matrix, which no contact of bodies has.
 
-    Random symmetric 6 x 6 blocks, half of them zero, shifted to positive definite, with the pattern of Stewart and Trinkle written over
-    those that are left.
+    Random symmetric 6 x 6 blocks, half of them zero, shifted to positive definite, with the pattern
+    of Stewart and Trinkle written over those that are left.
 
     Args:
         contacts: number of contacts, six unknowns each.
         rng: random numbers.
-        tangents: how many of a contact's tangents have the pattern: all 4 in Num4LCP's Matlab code, 3 in its Python code.
+        tangents: how many of a contact's tangents have the pattern: all 4 in Num4LCP's Matlab code,
+            3 in its Python code.
     """
     n = BLOCK * contacts
     R = rng.random((n, n))
@@ -126,7 +131,13 @@ def kinds(scale: Scale) -> dict[str, Callable[[int], Problem]]:
         return make
 
     def seven_point(k: int) -> Problem:
-        return poisson((scale.side,) * 3, plant=Plant(active=ZEROS), seed=SEED + k, device="cpu", dtype=wp.float64).sparse()
+        return poisson(
+            (scale.side,) * 3,
+            plant=Plant(active=ZEROS),
+            seed=SEED + k,
+            device="cpu",
+            dtype=wp.float64,
+        ).sparse()
 
     return {
         "fluid, recipe": fluid("recipe"),

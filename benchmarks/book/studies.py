@@ -10,7 +10,14 @@ import numpy as np
 import scipy.optimize
 
 import warp_lcp as wl
-from warp_lcp.benchmarks.book.appendix_c import APPROXIMATION, FISCHER, METHODS, MINIMUM_MAP, PGS, Method
+from warp_lcp.benchmarks.book.appendix_c import (
+    APPROXIMATION,
+    FISCHER,
+    METHODS,
+    MINIMUM_MAP,
+    PGS,
+    Method,
+)
 from warp_lcp.benchmarks.book.outcome import RTOL, Limits, Merit, outcome, spread
 from warp_lcp.benchmarks.book.problems import RULES, SEED, Scale, dense
 from warp_lcp.benchmarks.harness.record import Lines, Panels, Record, Results, Table
@@ -18,7 +25,8 @@ from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.gallery import Problem, contact, splash
 
 STEPS = 10  # figure C.5 has the time of so many
-LEAST = 3000  # unknowns from which on exponents of grids are fitted: below, launches cost as much as the work
+# unknowns from which on exponents of grids are fitted: below, launches cost as much as the work
+LEAST = 3000
 GRID: dict[str, tuple[Any, int]] = {  # method, most steps
     "ProjectedMultigrid": (wl.ProjectedMultigrid(), 100),
     "FischerNewton": (wl.FischerNewton(), 100),
@@ -37,7 +45,10 @@ SWEPT = 10  # sweeps of PGS before a warm start
 ZEROS = (0.0, 0.2, 0.4, 0.6, 0.8)
 SEMIDEFINITE: dict[str, Method] = {
     "Fischer-Newton, approximation": (APPROXIMATION, Merit.FISCHER),
-    **{name: METHODS[name] for name in ("minimum map", "PGS", "PSOR 1.4", "FischerNewton()", "MinimumMapNewton()")},
+    **{
+        name: METHODS[name]
+        for name in ("minimum map", "PGS", "PSOR 1.4", "FischerNewton()", "MinimumMapNewton()")
+    },
 }
 
 
@@ -51,10 +62,20 @@ def measure(results: Results, scale: Scale, options: Options) -> None:
 def _cost(results: Results, scale: Scale, options: Options) -> None:
     """Time solves against the number of unknowns (figure C.5)."""
     panels = list[Lines]()
-    fluids = {int((splash(n).cells == wl.FLUID).sum()): splash(n).lcp("everywhere", device=options.device) for n in scale.grids}
+    fluids = {
+        int((splash(n).cells == wl.FLUID).sum()): splash(n).lcp("everywhere", device=options.device)
+        for n in scale.grids
+    }
     contacts = {6 * k: contact(k, seed=SEED).lcp(device=options.device) for k in scale.rows}
-    for what, problems, methods, least in (("splash, p >= 0", fluids, GRID, LEAST), ("contacts of rigid bodies", contacts, DENSE, 0)):
-        rows, curves, sizes = list[list[str]](), dict[str, tuple[Sequence[float], Sequence[float]]](), np.array(list(problems), dtype=float)
+    for what, problems, methods, least in (
+        ("splash, p >= 0", fluids, GRID, LEAST),
+        ("contacts of rigid bodies", contacts, DENSE, 0),
+    ):
+        rows, curves, sizes = (
+            list[list[str]](),
+            dict[str, tuple[Sequence[float], Sequence[float]]](),
+            np.array(list(problems), dtype=float),
+        )
         for method, (solver, most) in methods.items():
             cells, steps, solves = list[str](), list[float](), list[float]()
             for unknowns, problem in problems.items():
@@ -62,29 +83,56 @@ def _cost(results: Results, scale: Scale, options: Options) -> None:
                 result, seconds = _timed(problem, solver, most, options.repeat)
                 steps.append(seconds / max(1, result.iterations))
                 solves.append(seconds if result else math.nan)
-                figures = {"seconds of a step": Figure(steps[-1], "s"), "steps": Figure(result.iterations)}
+                figures = {
+                    "seconds of a step": Figure(steps[-1], "s"),
+                    "steps": Figure(result.iterations),
+                }
                 figures |= {f"seconds to {RTOL:g}": Figure(seconds, "s")} if result else {}
-                results.records.append(Record(f"cost: {what}: {method}: {unknowns}", figures, {"status": result.status.name}))
-                cells.append(f"{1e3 * seconds:.3g} in {result.iterations}" if result else f"{1e3 * steps[-1]:.3g} a step")
+                results.records.append(
+                    Record(
+                        f"cost: {what}: {method}: {unknowns}",
+                        figures,
+                        {"status": result.status.name},
+                    )
+                )
+                cells.append(
+                    f"{1e3 * seconds:.3g} in {result.iterations}"
+                    if result
+                    else f"{1e3 * steps[-1]:.3g} a step"
+                )
             exponents = [exponent(sizes, solves, least), exponent(sizes, steps, least)]
             rows.append([method, *cells, *("" if np.isnan(p) else f"{p:.2f}" for p in exponents)])
             unsolved = np.isnan(solves).any()
-            curves[f"{method}, {STEPS} steps" if unsolved else method] = list(sizes), [STEPS * t for t in steps] if unsolved else solves
+            curves[f"{method}, {STEPS} steps" if unsolved else method] = (
+                list(sizes),
+                [STEPS * t for t in steps] if unsolved else solves,
+            )
         panels.append(Lines(what, what, "unknowns", "s", curves))
         remark = (
-            f"ms to {RTOL:g} and steps, the least of the samples, with a workspace that has solved before; ms of a step where the limit of "
-            f"steps came first. Exponents are of the time to {RTOL:g} and of a step's, over unknowns{f' from {least} on' if least else ''}."
+            f"ms to {RTOL:g} and steps, the least of the samples, with a workspace that has solved "
+            "before; ms of a step where the limit of "
+            f"steps came first. Exponents are of the time to {RTOL:g} and of a step's, over "
+            f"unknowns{f' from {least} on' if least else ''}."
         )
         columns = ["method", *(f"{n} unknowns" for n in problems), "exponent", "of a step"]
-        results.tables.append(Table(f"Figure C.5: cost against size, {what}", columns, rows, remark))
-    results.charts.append(Panels("c5-cost", f"Figure C.5: time to {RTOL:g} against unknowns", panels))
+        results.tables.append(
+            Table(f"Figure C.5: cost against size, {what}", columns, rows, remark)
+        )
+    results.charts.append(
+        Panels("c5-cost", f"Figure C.5: time to {RTOL:g} against unknowns", panels)
+    )
 
 
 def _timed(problem: wl.LCP, solver: Any, most: int, repeat: int) -> tuple[wl.SolveResult, float]:
     """Return a solve and the least seconds of those made, after one that loads kernels."""
-    work, stopping = solver.init(problem), wl.StoppingCriteria(rtol=RTOL, max_iterations=most, patience=most)
+    work, stopping = (
+        solver.init(problem),
+        wl.StoppingCriteria(rtol=RTOL, max_iterations=most, patience=most),
+    )
     wl.solve(problem, solver, stopping=wl.StoppingCriteria(max_iterations=3), workspace=work)
-    results = [wl.solve(problem, solver, stopping=stopping, workspace=work) for _ in range(min(repeat, 3))]
+    results = [
+        wl.solve(problem, solver, stopping=stopping, workspace=work) for _ in range(min(repeat, 3))
+    ]
     return results[0], min(r.history[-1].seconds for r in results)
 
 
@@ -102,21 +150,45 @@ def _warm(results: Results, scale: Scale, options: Options) -> None:
     limits = Limits(rtol=1e-6, atol=1e-2, most=30)
     for rule in RULES:
         options.say(f"book: warm starts, {rule}")
-        problems, curves = [dense(rule, scale, k) for k in range(scale.problems)], dict[str, tuple[list[float], list[float]]]()
+        problems, curves = (
+            [dense(rule, scale, k) for k in range(scale.problems)],
+            dict[str, tuple[list[float], list[float]]](),
+        )
         stopping = wl.StoppingCriteria(rtol=0.0, max_iterations=SWEPT)
-        swept = [wl.solve(p.lcp(device=options.device), PGS, stopping=stopping).x.numpy() for p in problems]
-        for method, (solver, merit) in {"Fischer-Newton": (FISCHER, Merit.FISCHER), "minimum map": (MINIMUM_MAP, Merit.MINIMUM)}.items():
+        swept = [
+            wl.solve(p.lcp(device=options.device), PGS, stopping=stopping).x.numpy()
+            for p in problems
+        ]
+        for method, (solver, merit) in {
+            "Fischer-Newton": (FISCHER, Merit.FISCHER),
+            "minimum map": (MINIMUM_MAP, Merit.MINIMUM),
+        }.items():
             for start, starts in (("from 0", None), (f"from {SWEPT} sweeps", swept)):
                 name = f"{method} {start}"
-                found = outcome(f"warm: {rule}: {name}", problems, solver, merit, options.device, limits=limits, starts=starts)
+                found = outcome(
+                    f"warm: {rule}: {name}",
+                    problems,
+                    solver,
+                    merit,
+                    options.device,
+                    limits=limits,
+                    starts=starts,
+                )
                 results.records.append(found.record())
-                rows.append([rule, method, start, found.states, spread(found.accepted), found.share])
+                rows.append(
+                    [rule, method, start, found.states, spread(found.accepted), found.share]
+                )
                 shown = range(1, 8)
-                curves[name] = [float(k) for k in shown], [float(found.accepted.count(k)) for k in shown]
+                curves[name] = (
+                    [float(k) for k in shown],
+                    [float(found.accepted.count(k)) for k in shown],
+                )
         panels.append(Lines(rule, rule, "iterations", "problems", curves, log=""))
     remark = (
-        f"{scale.problems} dense positive definite problems of {scale.dense} unknowns, eigenvalues evenly spaced in (0, 1]. Iterations to "
-        "an absolute merit of 1e-2, counted as Num4LCP does: the first test is number 1, so that a start that is good enough counts 1. "
+        f"{scale.problems} dense positive definite problems of {scale.dense} unknowns, eigenvalues "
+        "evenly spaced in (0, 1]. Iterations to "
+        "an absolute merit of 1e-2, counted as Num4LCP does: the first test is number 1, so that a "
+        "start that is good enough counts 1. "
         f"Solved: to {RTOL:g} of the natural residual of the start, within 30 steps."
     )
     columns = ["problems", "method", "start", "book's test", "iterations", "solved, steps"]
@@ -127,7 +199,12 @@ def _warm(results: Results, scale: Scale, options: Options) -> None:
 def solvable(problem: Problem) -> bool:
     """Return whether some x >= 0 has A x + b >= 0, which for a positive semi-definite A makes the LCP solvable."""
     n = len(problem.b)
-    return bool(scipy.optimize.linprog(np.zeros(n), A_ub=-problem.A, b_ub=problem.b, bounds=(0, None), method="highs").status == 0)
+    return bool(
+        scipy.optimize.linprog(
+            np.zeros(n), A_ub=-problem.A, b_ub=problem.b, bounds=(0, None), method="highs"
+        ).status
+        == 0
+    )
 
 
 def _zeros(results: Results, scale: Scale, options: Options) -> None:
@@ -140,10 +217,22 @@ def _zeros(results: Results, scale: Scale, options: Options) -> None:
             options.say(f"book: zero eigenvalues, {rule}, {zeros:.0%}")
             problems = [dense(rule, scale, k, zeros) for k in range(few)]
             able = sum(map(solvable, problems))
-            results.records.append(Record(f"zeros: {rule}: {zeros:.0%}", {"solvable": Figure(able), "problems": Figure(few)}))
+            results.records.append(
+                Record(
+                    f"zeros: {rule}: {zeros:.0%}",
+                    {"solvable": Figure(able), "problems": Figure(few)},
+                )
+            )
             shares = {"solvable": able}
             for method, (solver, merit) in SEMIDEFINITE.items():
-                found = outcome(f"zeros: {rule}: {zeros:.0%}: {method}", problems, solver, merit, options.device, limits=limits)
+                found = outcome(
+                    f"zeros: {rule}: {zeros:.0%}: {method}",
+                    problems,
+                    solver,
+                    merit,
+                    options.device,
+                    limits=limits,
+                )
                 results.records.append(found.record())
                 ends = results.records[-1].facts["statuses"]
                 rows.append([rule, f"{zeros:.0%}", f"{able} of {few}", method, *found.row(), ends])
@@ -153,8 +242,10 @@ def _zeros(results: Results, scale: Scale, options: Options) -> None:
                 curves[name][1].append(100 * count / few)
         panels.append(Lines(rule, rule, "zero eigenvalues [%]", "solved [%]", curves, log=""))
     remark = (
-        f"{few} dense positive semi-definite problems of {scale.dense} unknowns for each share of zero eigenvalues. Book's test: relative "
-        "1e-4, absolute 1e-2, at most 100. Solvable: a linear program finds x >= 0 with A x + b >= 0."
+        f"{few} dense positive semi-definite problems of {scale.dense} unknowns for each share of "
+        "zero eigenvalues. Book's test: relative "
+        "1e-4, absolute 1e-2, at most 100. Solvable: a linear program finds x >= 0 with A x + b >= "
+        "0."
     )
     columns = [
         "problems",
@@ -169,4 +260,6 @@ def _zeros(results: Results, scale: Scale, options: Options) -> None:
         "the library says",
     ]
     results.tables.append(Table("Zero eigenvalues", columns, rows, remark))
-    results.charts.append(Panels("zeros", f"Zero eigenvalues: problems solved to {RTOL:g} in 100 steps", panels))
+    results.charts.append(
+        Panels("zeros", f"Zero eigenvalues: problems solved to {RTOL:g} in 100 steps", panels)
+    )

@@ -1,7 +1,8 @@
 """Hostile cases with an outcome that is fixed beforehand, judged by NumPy and SciPy in float64; `warp-lcp bench extremes` runs them all.
 
-A case is solved to its tolerance, refused before the start with a message that names the argument, or stopped with a status that says so.
-Solvers that are wrong on purpose are among the cases: the checks must catch each of them. Random problems come last, new ones each time.
+A case is solved to its tolerance, refused before the start with a message that names the argument,
+or stopped with a status that says so. Solvers that are wrong on purpose are among the cases: the
+checks must catch each of them. Random problems come last, new ones each time.
 """
 
 from __future__ import annotations
@@ -12,7 +13,15 @@ from itertools import chain
 from pathlib import Path
 from random import SystemRandom
 
-from warp_lcp.benchmarks.extremes import bounds, broken, coefficients, matrices, refused, shapes, simulations
+from warp_lcp.benchmarks.extremes import (
+    bounds,
+    broken,
+    coefficients,
+    matrices,
+    refused,
+    shapes,
+    simulations,
+)
 from warp_lcp.benchmarks.extremes.case import PRECISIONS, REFUSED, Case, Expected, Verdict, judge
 from warp_lcp.benchmarks.extremes.unseen import FRESH, judging
 from warp_lcp.benchmarks.harness.machine import machine
@@ -22,10 +31,23 @@ from warp_lcp.benchmarks.harness.timing import Figure, Options
 ORDINARY = ("CONVERGED", REFUSED, "done")  # statuses that the report does not list case by case
 TITLE = "Extremes: hostile problems and scenes, and what they come to"
 FAMILIES = (
-    shapes.sizes, shapes.masks, shapes.closed_pools, coefficients.slivers, coefficients.contrasts, coefficients.bodies, bounds.scales,
-    bounds.degenerate, bounds.tolerances, matrices.singular, matrices.cycling, refused.wrong_arguments, simulations.steps_and_forces,
-    simulations.solids_and_depth, simulations.particles_anywhere, broken.wrong_solvers,
-)  # fmt: skip
+    shapes.sizes,
+    shapes.masks,
+    shapes.closed_pools,
+    coefficients.slivers,
+    coefficients.contrasts,
+    coefficients.bodies,
+    bounds.scales,
+    bounds.degenerate,
+    bounds.tolerances,
+    matrices.singular,
+    matrices.cycling,
+    refused.wrong_arguments,
+    simulations.steps_and_forces,
+    simulations.solids_and_depth,
+    simulations.particles_anywhere,
+    broken.wrong_solvers,
+)
 
 
 def cases(seed: int) -> Iterator[Case]:
@@ -52,7 +74,9 @@ def measure(options: Options, out: Path) -> Results:
     for case in cases(seed):
         if case.family != family:
             family = case.family
-            options.say(f"{family} ..." + (f" seeds from {seed} on" if family in judging.FAMILIES else ""))
+            options.say(
+                f"{family} ..." + (f" seeds from {seed} on" if family in judging.FAMILIES else "")
+            )
         for precision in case.precisions:
             verdicts.append(judge(case, precision, options.device))
             if verdicts[-1].wrong:
@@ -60,7 +84,11 @@ def measure(options: Options, out: Path) -> Results:
     found = by_family(verdicts)
     unseen, beyond = judging.summary(verdicts, seed)
     wrong = [v for v in verdicts if v.wrong]
-    records = [machine(options.device, elements=1 << 22, repeat=options.repeat), *found, *map(record, wrong)]
+    records = [
+        machine(options.device, elements=1 << 22, repeat=options.repeat),
+        *found,
+        *map(record, wrong),
+    ]
     failures = [f"{v.name}: {v.outcome} (expected: {v.promise})" for v in wrong] + beyond
     return Results(records, [families(found), unseen, table(verdicts)], failures=failures)
 
@@ -68,8 +96,18 @@ def measure(options: Options, out: Path) -> Results:
 def record(verdict: Verdict) -> Record:
     """Return what the file keeps of a case that is not as it must be."""
     attempt, case = verdict.attempt, verdict.case
-    facts = {"family": case.family, "precision": verdict.precision, "expected": str(verdict.promise), "outcome": verdict.outcome}
-    more = {"status": attempt.status, "residual": attempt.residual, "message": attempt.message, **attempt.facts}
+    facts = {
+        "family": case.family,
+        "precision": verdict.precision,
+        "expected": str(verdict.promise),
+        "outcome": verdict.outcome,
+    }
+    more = {
+        "status": attempt.status,
+        "residual": attempt.residual,
+        "message": attempt.message,
+        **attempt.facts,
+    }
     return Record(verdict.name, {"seconds": Figure(attempt.seconds, "s")}, facts | more)
 
 
@@ -78,11 +116,25 @@ def by_family(verdicts: Sequence[Verdict]) -> list[Record]:
     records = []
     for family in dict.fromkeys(v.case.family for v in verdicts):
         own = [v for v in verdicts if v.case.family == family]
-        counts = {"cases": len({v.case.name for v in own}), "attempts": len(own), "wrong": sum(bool(v.wrong) for v in own)}
-        counts |= {kind.value: n for kind in Expected if (n := sum(v.promise.expected is kind for v in own))}
+        counts = {
+            "cases": len({v.case.name for v in own}),
+            "attempts": len(own),
+            "wrong": sum(bool(v.wrong) for v in own),
+        }
+        counts |= {
+            kind.value: n
+            for kind in Expected
+            if (n := sum(v.promise.expected is kind for v in own))
+        }
         seconds = [v.attempt.seconds for v in own]
         figures = {name: Figure(count) for name, count in counts.items()}
-        records.append(Record(family, figures | {"slowest": Figure(max(seconds), "s"), "seconds": Figure(sum(seconds), "s")}))
+        records.append(
+            Record(
+                family,
+                figures
+                | {"slowest": Figure(max(seconds), "s"), "seconds": Figure(sum(seconds), "s")},
+            )
+        )
     return records
 
 
@@ -90,32 +142,64 @@ def families(records: Sequence[Record]) -> Table:
     """Return the families' records as a table."""
     rows = []
     for r in records:
-        kinds = ", ".join(f"{figure.value:.0f} {kind.value}" for kind in Expected if (figure := r.figures.get(kind.value)))
-        rows.append([r.name, *shown(r, ("cases", "attempts"), ".0f"), kinds, *shown(r, ["wrong"], ".0f"), *shown(r, ["slowest"], ".2f")])
-    cases, attempts, wrong, seconds = (sum(r.value(f) or 0 for r in records) for f in ("cases", "attempts", "wrong", "seconds"))
-    remark = f"{cases:.0f} cases, {attempts:.0f} attempts in {seconds:.0f} s, {wrong:.0f} not as they must be."
-    return Table("Families", ("family", "cases", "attempts", "expected", "not as they must be", "slowest [s]"), rows, remark)
+        kinds = ", ".join(
+            f"{figure.value:.0f} {kind.value}"
+            for kind in Expected
+            if (figure := r.figures.get(kind.value))
+        )
+        rows.append(
+            [
+                r.name,
+                *shown(r, ("cases", "attempts"), ".0f"),
+                kinds,
+                *shown(r, ["wrong"], ".0f"),
+                *shown(r, ["slowest"], ".2f"),
+            ]
+        )
+    cases, attempts, wrong, seconds = (
+        sum(r.value(f) or 0 for r in records) for f in ("cases", "attempts", "wrong", "seconds")
+    )
+    remark = (
+        f"{cases:.0f} cases, {attempts:.0f} attempts in {seconds:.0f} s, {wrong:.0f} not as "
+        "they must be."
+    )
+    return Table(
+        "Families",
+        ("family", "cases", "attempts", "expected", "not as they must be", "slowest [s]"),
+        rows,
+        remark,
+    )
 
 
 def table(verdicts: Sequence[Verdict]) -> Table:
     """Return a row for each noteworthy case, with status, relative residual and seconds in each precision.
 
-    Noteworthy: a verdict is wrong, a solve stops before its tolerance, or it takes a second or more.
-    Random problems are listed only if a verdict is wrong.
+    Noteworthy: a verdict is wrong, a solve stops before its tolerance, or it takes a second or
+    more. Random problems are listed only if a verdict is wrong.
     """
     by_case = defaultdict[tuple[str, str], list[Verdict]](list)
     for v in (v for v in verdicts if v.wrong or v.case.family not in judging.FAMILIES):
         by_case[v.case.family, v.case.name].append(v)
     rows = []
     for name, own in by_case.items():
-        if all(v.attempt.status in ORDINARY and v.attempt.seconds < 1.0 and not v.wrong for v in own):
+        if all(
+            v.attempt.status in ORDINARY and v.attempt.seconds < 1.0 and not v.wrong for v in own
+        ):
             continue
-        cells = {v.precision: f"{v.attempt.status}{v.attempt.at}, {v.attempt.seconds:.2g} s" for v in own}
+        cells = {
+            v.precision: f"{v.attempt.status}{v.attempt.at}, {v.attempt.seconds:.2g} s" for v in own
+        }
         wrong = "; ".join(f"{v.precision}: {v.outcome}" for v in own if v.wrong)
         expected = "; ".join(dict.fromkeys(str(v.promise) for v in own))
         rows.append([*name, expected, *(cells.get(p, "-") for p in PRECISIONS), wrong or "yes"])
     remark = (
-        "Cases that are wrong, stop before their tolerance, or take a second or more: status, residual relative to that of "
+        "Cases that are wrong, stop before their tolerance, or take a second or more: status, "
+        "residual relative to that of "
         "clip(0, l, u) (computed by NumPy and SciPy from cells and faces), seconds."
     )
-    return Table("Noteworthy cases", ("family", "case", "expected", *PRECISIONS, "as it must be?"), rows, remark)
+    return Table(
+        "Noteworthy cases",
+        ("family", "case", "expected", *PRECISIONS, "as it must be?"),
+        rows,
+        remark,
+    )

@@ -8,7 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from warp_lcp.benchmarks.extremes.case import BELOW_ROUNDING, EITHER, Case, Expected, Promise, refusal, stopped
+from warp_lcp.benchmarks.extremes.case import (
+    BELOW_ROUNDING,
+    EITHER,
+    Case,
+    Expected,
+    Promise,
+    refusal,
+    stopped,
+)
 from warp_lcp.benchmarks.extremes.problem import GridProblem, with_solution
 from warp_lcp.benchmarks.extremes.shapes import AIR, FLUID, chance, given, noise, pool
 
@@ -31,18 +39,28 @@ def scales() -> Iterator[Case]:
     yield from case("b = -0.0", b=np.full(SHAPE, -0.0))
     for scale in (1e-30, 1e-15, 1e15, 1e30):
         yield from case(f"b of {scale:g}", b=scale * NOISE)
-        yield from case(f"b and bounds of {scale:g}", b=scale * NOISE, lower=-0.1 * scale, upper=0.2 * scale)
+        yield from case(
+            f"b and bounds of {scale:g}", b=scale * NOISE, lower=-0.1 * scale, upper=0.2 * scale
+        )
     for scale in (1e-160, 1e-310):
-        yield from case(f"b of {scale:g}", {"expected": refusal("b: largest value")}, b=scale * NOISE)
+        yield from case(
+            f"b of {scale:g}", {"expected": refusal("b: largest value")}, b=scale * NOISE
+        )
     yield from case("b of 1e160", {"expected": stopped("NON_FINITE")}, b=1e160 * NOISE)
     yield from case("one cell of b at 1e12", b=but((17, 19), -1e12, NOISE))
     yield from case("b over 30 decades", b=NOISE * 10 ** chance(11).uniform(-15, 15, SHAPE))
     yield from case("bounds at 1e30", lower=-1e30, upper=1e30)
     # far beyond what b can do, so that one cell pushes all others
-    yield from case("b of 1e-30 beside a bound of 1e10", b=1e-30 * NOISE, lower=but((20, 20), 1e10, np.full(SHAPE, -np.inf)))
+    yield from case(
+        "b of 1e-30 beside a bound of 1e10",
+        b=1e-30 * NOISE,
+        lower=but((20, 20), 1e10, np.full(SHAPE, -np.inf)),
+    )
 
 
-def given_pool(family: str, name: str, more: dict[str, Any] | None = None, **fields: Any) -> Iterator[Case]:
+def given_pool(
+    family: str, name: str, more: dict[str, Any] | None = None, **fields: Any
+) -> Iterator[Case]:
     """Yield a pool with these fields for both methods; `more` as of SolveCase."""
     return given(family, name, partial(pool, SHAPE, **fields), **(more or {}))
 
@@ -58,7 +76,11 @@ def degenerate() -> Iterator[Case]:
     yield from case("all active but one", b=but((11, 12), -2.0, np.ones(SHAPE)), lower=0.0)
     yield from case("none active", b=-np.abs(NOISE) - 0.01, lower=0.0)
     yield from case("l = u everywhere", lower=0.5, upper=0.5)
-    yield from case("l = u on half of the cells", lower=np.where(ODD, 0.3, -np.inf), upper=np.where(ODD, 0.3, np.inf))
+    yield from case(
+        "l = u on half of the cells",
+        lower=np.where(ODD, 0.3, -np.inf),
+        upper=np.where(ODD, 0.3, np.inf),
+    )
     yield from case("box of 1e-12", lower=-1e-12, upper=1e-12)
     yield from case("b = 0 on half of the cells", b=np.where(NOISE > 0, 0.0, noise(SHAPE, 12)))
     yield from case("equal b everywhere", b=np.full(SHAPE, -1.0), lower=0.0, upper=50.0)
@@ -76,7 +98,13 @@ def planted(share: float) -> GridProblem:
     inside = cells == FLUID
     x = np.where(inside & (draw.random(SHAPE) >= share), draw.uniform(0.1, 1.0, SHAPE), 0.0)
     x[5, 5] = 1.0
-    return with_solution(cells, x, np.where((x == 0) & (draw.random(SHAPE) > 0.9) & (share < 1), draw.uniform(0.1, 1.0, SHAPE), 0.0))
+    return with_solution(
+        cells,
+        x,
+        np.where(
+            (x == 0) & (draw.random(SHAPE) > 0.9) & (share < 1), draw.uniform(0.1, 1.0, SHAPE), 0.0
+        ),
+    )
 
 
 def ceiling() -> GridProblem:
@@ -92,12 +120,32 @@ def tolerances() -> Iterator[Case]:
     """Yield tolerances that no arithmetic reaches: FLOOR, not CONVERGED and not an endless loop."""
     case = partial(given, "tolerances")
     for rtol in (1e-15, 1e-17, 0.0):
-        expected, stopping = BELOW_ROUNDING if rtol < 1e-16 else EXACT_OR_FLOOR, {"rtol": rtol, "max_iterations": 500}
+        expected, stopping = (
+            BELOW_ROUNDING if rtol < 1e-16 else EXACT_OR_FLOOR,
+            {"rtol": rtol, "max_iterations": 500},
+        )
         for name, shape in (("2-D", (64, 66)), ("3-D", (17, 18, 19))):
-            yield from case(f"rtol = {rtol:g}, {name}", partial(pool, shape), expected=expected, stopping=stopping)
-    yield from case("rtol = 1e-12, single stops", lambda: pool((64, 66)), promises={"single": BELOW_ROUNDING}, stopping={"rtol": 1e-12})
+            yield from case(
+                f"rtol = {rtol:g}, {name}",
+                partial(pool, shape),
+                expected=expected,
+                stopping=stopping,
+            )
+    yield from case(
+        "rtol = 1e-12, single stops",
+        lambda: pool((64, 66)),
+        promises={"single": BELOW_ROUNDING},
+        stopping={"rtol": 1e-12},
+    )
     yield from case("atol = 1e30", lambda: pool(SHAPE), stopping={"atol": 1e30})
     for limit in (0, 1):
         promise = stopped("MAX_ITERATIONS")
-        yield from case(f"{limit} iterations", lambda: pool(SHAPE), expected=promise, stopping={"max_iterations": limit})
-    yield from case("256x256 to 1e-13", lambda: pool((256, 256)), expected=EITHER, stopping={"rtol": 1e-13})
+        yield from case(
+            f"{limit} iterations",
+            lambda: pool(SHAPE),
+            expected=promise,
+            stopping={"max_iterations": limit},
+        )
+    yield from case(
+        "256x256 to 1e-13", lambda: pool((256, 256)), expected=EITHER, stopping={"rtol": 1e-13}
+    )

@@ -48,7 +48,9 @@ def backwards(problem: wl.LCP, solver: Any, **options: Any) -> wl.SolveResult:
 def flipped_and_sure(problem: wl.LCP, solver: Any, **options: Any) -> wl.SolveResult:
     """Return -x of the right result x with its status and its residual: the result itself shows nothing."""
     result = wl.solve(problem, solver, **options)
-    return replace(result, x=wp.array(-result.x.numpy(), dtype=result.x.dtype, device=result.x.device))
+    return replace(
+        result, x=wp.array(-result.x.numpy(), dtype=result.x.dtype, device=result.x.device)
+    )
 
 
 def equations(problem: wl.LCP, solver: Any, *, sign: float, **options: Any) -> wl.SolveResult:
@@ -57,9 +59,13 @@ def equations(problem: wl.LCP, solver: Any, *, sign: float, **options: Any) -> w
     return wl.solve(wl.LCP(problem.A, problem.layout.unload(b), -np.inf, np.inf), solver, **options)
 
 
-def sooner(problem: wl.LCP, solver: Any, *, stopping: wl.StoppingCriteria, start: bool, **options: Any) -> wl.SolveResult:
+def sooner(
+    problem: wl.LCP, solver: Any, *, stopping: wl.StoppingCriteria, start: bool, **options: Any
+) -> wl.SolveResult:
     """Return the start without a step, or what a tenth of the tolerance's digits gives, and call it converged."""
-    weak = replace(stopping, max_iterations=0) if start else replace(stopping, rtol=stopping.rtol**0.1)
+    weak = (
+        replace(stopping, max_iterations=0) if start else replace(stopping, rtol=stopping.rtol**0.1)
+    )
     result = wl.solve(problem, solver, stopping=weak, **options)
     return replace(result, status=wl.SolveStatus.CONVERGED, residual=result.residual * 1e-9)
 
@@ -78,4 +84,11 @@ def wrong_solvers() -> Iterator[Case]:
     """Yield each wrong solver on two ordinary problems."""
     for name, solve in SOLVERS.items():
         for dimensions, make, method in RIGHT:
-            yield SolveCase("wrong on purpose", f"{name}, {dimensions}", make, method, expected=CAUGHT, solve=solve)
+            yield SolveCase(
+                "wrong on purpose",
+                f"{name}, {dimensions}",
+                make,
+                method,
+                expected=CAUGHT,
+                solve=solve,
+            )

@@ -26,10 +26,13 @@ BUDGET = 10.0  # seconds of a case; usual ones take milliseconds
 LAST_CALL = 6.0  # multiples of the budget after which a case is interrupted
 MAX_ITERATIONS = 200
 EPS = float(np.finfo(np.float32).eps)
-AGREES = 1e-3  # of a residual: how far what a result says may be from what is found, besides rounding
+# of a residual: how far what a result says may be from what is found, besides rounding
+AGREES = 1e-3
 REFUSED, OUT_OF_TIME = "refused", "out of time"
-BROKEN = (ArithmeticError, TypeError, LookupError, AttributeError, np.linalg.LinAlgError)  # what no method may end with
-HONEST = frozenset({"FLOOR", "STAGNATED", "MAX_ITERATIONS", "NON_DESCENT"})  # the precision does not go further, or not in this time
+# what no method may end with
+BROKEN = (ArithmeticError, TypeError, LookupError, AttributeError, np.linalg.LinAlgError)
+# the precision does not go further, or not in this time
+HONEST = frozenset({"FLOOR", "STAGNATED", "MAX_ITERATIONS", "NON_DESCENT"})
 
 
 class Expected(Enum):
@@ -84,7 +87,8 @@ class Attempt:
     faults: list[str] = field(default_factory=list)  # what is wrong whatever was expected
     met: bool = False  # whether the independent residual meets the tolerance
     facts: dict[str, Any] = field(default_factory=dict)  # what else a record keeps
-    processor: float = math.inf  # processor time [s] with what is judged; unknown where a GPU does the work
+    # processor time [s] with what is judged; unknown where a GPU does the work
+    processor: float = math.inf
 
     @property
     def spent(self) -> float:
@@ -105,7 +109,8 @@ class Case(ABC):
     name: str  # unique in its family
     _: KW_ONLY
     expected: Promise = SOLVED  # what it must come to,
-    promises: Mapping[str, Promise] = field(default_factory=dict)  # in these precisions something else
+    # in these precisions something else
+    promises: Mapping[str, Promise] = field(default_factory=dict)
     budget: float = BUDGET  # seconds that a precision may take
     precisions: tuple[str, ...] = PRECISIONS  # those in which it is tried
 
@@ -122,7 +127,11 @@ class Case(ABC):
             return attempt
         except (ValueError, *BROKEN) as error:
             broken = isinstance(error, BROKEN)
-            return Attempt(type(error).__name__ if broken else REFUSED, seconds=time.perf_counter() - begun, message=str(error))
+            return Attempt(
+                type(error).__name__ if broken else REFUSED,
+                seconds=time.perf_counter() - begun,
+                message=str(error),
+            )
 
     @abstractmethod
     def tried(self, precision: str, device: str) -> Attempt:
@@ -157,9 +166,11 @@ class SolveCase(Case):
     method: str = "projected-multigrid"  # of `wl.METHODS`
     _: KW_ONLY
     precisions: tuple[str, ...] = ()
-    stopping: Mapping[str, Any] = field(default_factory=dict)  # criteria besides rtol and max_iterations, or instead of them
+    # criteria besides rtol and max_iterations, or instead of them
+    stopping: Mapping[str, Any] = field(default_factory=dict)
     x0: np.ndarray | None = None  # a guess
-    solve: Callable[..., wl.SolveResult] = wl.solve  # stands in for `wl.solve`, where something wrong is to be caught
+    # stands in for `wl.solve`, where something wrong is to be caught
+    solve: Callable[..., wl.SolveResult] = wl.solve
     alone: bool = False  # whether the method's default chain is left out
 
     def __post_init__(self) -> None:
@@ -169,7 +180,11 @@ class SolveCase(Case):
 
     def tried(self, precision: str, device: str) -> Attempt:
         """Solve, and compare what the result says with the independent residual."""
-        criteria: dict[str, Any] = {"rtol": RTOL[precision], "max_iterations": MAX_ITERATIONS, **self.stopping}
+        criteria: dict[str, Any] = {
+            "rtol": RTOL[precision],
+            "max_iterations": MAX_ITERATIONS,
+            **self.stopping,
+        }
         problem, method = self.problem(), wl.METHODS[self.method]
         begun = time.perf_counter()
         solver = method(precision=precision) if self.precisions == PRECISIONS else method()
@@ -180,12 +195,23 @@ class SolveCase(Case):
         return checked(problem, result, criteria, time.perf_counter() - begun, precision)
 
 
-def checked(problem: Problem, result: wl.SolveResult, criteria: Mapping[str, Any], seconds: float, precision: str) -> Attempt:
+def checked(
+    problem: Problem,
+    result: wl.SolveResult,
+    criteria: Mapping[str, Any],
+    seconds: float,
+    precision: str,
+) -> Attempt:
     """Return the attempt that a result is, with all that NumPy finds wrong about it."""
     exact, x = problem.exact(), problem.unknowns(result.x.numpy())
     if not np.isfinite(x).all():
         return Attempt(result.status.name, None, seconds, faults=["x is not finite"])
-    own, reference, sizes, single = exact.residual(x), exact.residual(exact.start), exact.sizes(x), precision == "single"
+    own, reference, sizes, single = (
+        exact.residual(x),
+        exact.residual(exact.start),
+        exact.sizes(x),
+        precision == "single",
+    )
     rounding = 32 * np.finfo(np.float64).eps * sizes
     if problem.rounded(wp.float32 if single else wp.float64):
         rounding += 4 * EPS * sizes
@@ -194,19 +220,32 @@ def checked(problem: Problem, result: wl.SolveResult, criteria: Mapping[str, Any
     faults = []
     if result and not met:
         faults.append(f"CONVERGED at a residual of {own:.1e}, asked for {wanted:.1e}")
-    # a result in single precision is rounded once more where it sits at a bound that is no float32 number
+    # a result in single precision is rounded once more where it sits at a bound that is no float32
+    # number
     returned = 0.5 * EPS * sizes if single else 0.0
-    known = np.isfinite(own) and result.status is not wl.SolveStatus.NON_FINITE  # its norm may overflow where the scaled one does not
-    # projected multigrid scales by the diagonal without the bodies' term: any d > 0 has the same zeros
-    says = [abs(result.residual - of) <= AGREES * of + rounding + returned for of in (own, exact.residual(x, bodies=False))]
+    # its norm may overflow where the scaled one does not
+    known = np.isfinite(own) and result.status is not wl.SolveStatus.NON_FINITE
+    # projected multigrid scales by the diagonal without the bodies' term: any d > 0 has the same
+    # zeros
+    says = [
+        abs(result.residual - of) <= AGREES * of + rounding + returned
+        for of in (own, exact.residual(x, bodies=False))
+    ]
     if known and not any(says):
         faults.append(f"says the residual is {result.residual:.3e}, it is {own:.3e}")
-    beyond = np.maximum(exact.lower - x, x - exact.upper) - (EPS * np.abs(x) if single else 0.0)  # bounds are rounded as x is
+    # bounds are rounded as x is
+    beyond = np.maximum(exact.lower - x, x - exact.upper) - (EPS * np.abs(x) if single else 0.0)
     if result and (beyond > 0).any():
         faults.append(f"x is {beyond.max():.1e} outside its bounds")
     if not result and own < 0.99 * wanted - rounding:
         faults.append(f"{result.status.name} at a solution")
-    return Attempt(result.status.name, own / reference if reference > 0 else own, seconds, faults=faults, met=met)
+    return Attempt(
+        result.status.name,
+        own / reference if reference > 0 else own,
+        seconds,
+        faults=faults,
+        met=met,
+    )
 
 
 @dataclass(frozen=True)
@@ -287,6 +326,9 @@ def violations(promise: Promise, attempt: Attempt) -> list[str]:
         wrong.append(f"{status}{attempt.at}, not solved")
     elif expected is Expected.STOPPED and status not in promise.statuses:
         wrong.append(f"{status}{attempt.at}, not {'/'.join(sorted(promise.statuses))}")
-    elif expected in (Expected.EITHER, Expected.DONE) and status not in promise.statuses | {"CONVERGED", "done"}:
+    elif expected in (Expected.EITHER, Expected.DONE) and status not in promise.statuses | {
+        "CONVERGED",
+        "done",
+    }:
         wrong.append(f"{status}{attempt.at} {attempt.message}".rstrip())
     return wrong

@@ -18,9 +18,12 @@ Y, X = np.indices((48, 50))
 ROUGH = {"rtol": 1e-6}  # where the matrix's own rounding is felt: 12 decades beside each other
 SINGLE_MAY_STOP = {"single": EITHER}
 MIXED_MAY_STOP = {"single": EITHER, "mixed": EITHER}
-# Documented limits: corrections of float32 know a cell's diagonal to 6e-8 of it, and what holds a light region to less than the contrast
+# Documented limits: corrections of float32 know a cell's diagonal to 6e-8 of it, and what holds a
+# light region to less than the contrast
 LARGEST_CONTRAST = 1e4
-LIGHTEST = 1e6  # 1/mass beyond which float32 does not tell the force on a body from the pressures that it is the difference of
+# 1/mass beyond which float32 does not tell the force on a body from the pressures that it is the
+# difference of
+LIGHTEST = 1e6
 
 
 def may_stop(value: float, largest: float) -> dict[str, Any]:
@@ -33,7 +36,10 @@ def slivers() -> Iterator[Case]:
     case = partial(given, "cut fractions", promises=SINGLE_MAY_STOP)
     for shape in SHAPES:
         for smallest in (1e-3, 1e-6, 1e-12, 1e-30):
-            yield from case(f"one face in 20 open by {smallest:g}, {len(shape)}-D", partial(sprinkled, shape, smallest))
+            yield from case(
+                f"one face in 20 open by {smallest:g}, {len(shape)}-D",
+                partial(sprinkled, shape, smallest),
+            )
         yield from case(f"fractions 0 to 1, {len(shape)}-D", partial(uniform_fractions, shape))
     for fraction in (1e-3, 1e-6, 1e-12):
         yield from case(f"pool behind a face open by {fraction:g}", partial(behind_a_gap, fraction))
@@ -45,13 +51,21 @@ def slivers() -> Iterator[Case]:
 def sprinkled(shape: tuple[int, ...], smallest: float) -> GridProblem:
     """Return a pool with a few faces all but closed."""
     draw = chance(5)
-    return pool(shape, faces=faces_of(shape, lambda counts: np.where(draw.random(counts) < 0.05, smallest, 1.0)))
+    return pool(
+        shape,
+        faces=faces_of(shape, lambda counts: np.where(draw.random(counts) < 0.05, smallest, 1.0)),
+    )
 
 
 def uniform_fractions(shape: tuple[int, ...]) -> GridProblem:
     """Return a pool with random fractions, a tenth of them 0; p >= 0 everywhere, so that enclosed cells with outflow have a solution."""
     draw = chance(6)
-    return pool(shape, faces=faces_of(shape, lambda counts: np.maximum(draw.uniform(-0.1, 1, counts), 0)), lower=0.0, b=noise(shape) + 0.5)
+    return pool(
+        shape,
+        faces=faces_of(shape, lambda counts: np.maximum(draw.uniform(-0.1, 1, counts), 0)),
+        lower=0.0,
+        b=noise(shape) + 0.5,
+    )
 
 
 def behind_a_gap(fraction: float) -> GridProblem:
@@ -86,48 +100,86 @@ def contrasts() -> Iterator[Case]:
     """Yield coefficients over 12 decades, densities to 10^8 to 1, and cells a thousand times flatter than wide."""
     case = partial(given, "contrasts")
     for ratio in (1e2, 1e4, 1e6, 1e8):
-        for name, light in (("layers", (Y // 6) % 2 == 1), ("bubbles", np.hypot(Y % 16 - 7.5, X % 16 - 7.5) < 5)):
+        for name, light in (
+            ("layers", (Y // 6) % 2 == 1),
+            ("bubbles", np.hypot(Y % 16 - 7.5, X % 16 - 7.5) < 5),
+        ):
             made = partial(pool, Y.shape, faces=harmonic(np.where(light, 1.0, 1 / ratio)))
-            yield from case(f"{name} of density 1:{ratio:g}", made, **may_stop(ratio, LARGEST_CONTRAST))
+            yield from case(
+                f"{name} of density 1:{ratio:g}", made, **may_stop(ratio, LARGEST_CONTRAST)
+            )
     for shape in SHAPES:
         for decades, expected in ((4, SOLVED), (12, EITHER)):
-            name, make = f"coefficients over {decades} decades, {len(shape)}-D", partial(decades_of, shape, decades)
+            name, make = (
+                f"coefficients over {decades} decades, {len(shape)}-D",
+                partial(decades_of, shape, decades),
+            )
             yield from case(name, make, expected=expected, promises=SINGLE_MAY_STOP, stopping=ROUGH)
         for axis in "xyz"[: len(shape)]:
             for ratio in (1e3, 1e-3):
-                yield from case(f"anisotropy {ratio:g} along {axis}, {len(shape)}-D", partial(pool, shape, faces={f"face_{axis}": ratio}))
+                yield from case(
+                    f"anisotropy {ratio:g} along {axis}, {len(shape)}-D",
+                    partial(pool, shape, faces={f"face_{axis}": ratio}),
+                )
     for low, high in ((-6, 6), (0, 12), (-12, 0)):
         made = partial(full, (40, 44), shift=10 ** chance(10).uniform(low, high, (40, 44)))
-        yield from case(f"shift from 1e{low} to 1e{high}", made, promises=SINGLE_MAY_STOP, stopping=ROUGH)
+        yield from case(
+            f"shift from 1e{low} to 1e{high}", made, promises=SINGLE_MAY_STOP, stopping=ROUGH
+        )
     for scale in (1e-12, 1e12, 1e-30, 1e30):
-        yield from case(f"all coefficients {scale:g}", partial(pool, (40, 44), faces={"face_x": scale, "face_y": scale}))
+        yield from case(
+            f"all coefficients {scale:g}",
+            partial(pool, (40, 44), faces={"face_x": scale, "face_y": scale}),
+        )
 
 
 def harmonic(cell: np.ndarray) -> dict[str, np.ndarray]:
     """Return faces with the harmonic mean of the cells beside them."""
-    across = [np.concatenate([c[:1], 2 * c[1:] * c[:-1] / (c[1:] + c[:-1]), c[-1:]]) for c in (cell.T, cell)]
+    across = [
+        np.concatenate([c[:1], 2 * c[1:] * c[:-1] / (c[1:] + c[:-1]), c[-1:]])
+        for c in (cell.T, cell)
+    ]
     return {"face_x": across[0].T, "face_y": across[1]}
 
 
 def decades_of(shape: tuple[int, ...], decades: int) -> GridProblem:
     """Return a pool of coefficients that are random over so many decades, face by face."""
     draw = chance(9)
-    return pool(shape, faces=faces_of(shape, lambda counts: 10 ** draw.uniform(-decades / 2, decades / 2, counts)))
+    return pool(
+        shape,
+        faces=faces_of(shape, lambda counts: 10 ** draw.uniform(-decades / 2, decades / 2, counts)),
+    )
 
 
 def bodies() -> Iterator[Case]:
     """Yield rigid bodies in the liquid, as a term U W U' of masses from 10^-8 to 10^8 of the liquid's."""
     case = partial(given, "rigid bodies")
     for inverse in (1e-8, 1e-4, 1.0, 1e4, 1e8):
-        yield from case(f"one body, 1/mass = {inverse:g}", partial(swimming, [inverse]), **may_stop(inverse, LIGHTEST))
-    four, promises, but = partial(swimming, [1e-8, 1e8, 1.0, 1e4]), MIXED_MAY_STOP, {"minimum-map-newton": EITHER}
-    yield from case("four, 1/mass from 1e-8 to 1e8", four, promises=promises, but=but, stopping=ROUGH)
+        yield from case(
+            f"one body, 1/mass = {inverse:g}",
+            partial(swimming, [inverse]),
+            **may_stop(inverse, LIGHTEST),
+        )
+    four, promises, but = (
+        partial(swimming, [1e-8, 1e8, 1.0, 1e4]),
+        MIXED_MAY_STOP,
+        {"minimum-map-newton": EITHER},
+    )
+    yield from case(
+        "four, 1/mass from 1e-8 to 1e8", four, promises=promises, but=but, stopping=ROUGH
+    )
     yield from case("held: W = 0", lambda: swimming([0.0, 0.0]))
     for inverse in (1e2, 1e4, 1e6, 1e8):
-        yield from case(f"two, 1/mass = {inverse:g}, 3-D", partial(swimming_3d, [inverse, inverse]), **may_stop(inverse, LIGHTEST))
+        yield from case(
+            f"two, 1/mass = {inverse:g}, 3-D",
+            partial(swimming_3d, [inverse, inverse]),
+            **may_stop(inverse, LIGHTEST),
+        )
     yield from case("heavy bodies, 3-D", lambda: swimming_3d([1e-8, 1e-8]))
-    yield from case("a column that touches nothing", lambda: with_column(swimming([1.0]), 0.0, 1e8))  # of a body in air
-    yield from case("two equal columns", lambda: with_column(swimming([10.0]), 1.0, 3.0))  # of a body counted twice
+    # of a body in air
+    yield from case("a column that touches nothing", lambda: with_column(swimming([1.0]), 0.0, 1e8))
+    # of a body counted twice
+    yield from case("two equal columns", lambda: with_column(swimming([10.0]), 1.0, 3.0))
     yield from case("a piston closes a chamber", piston)
 
 
@@ -140,7 +192,12 @@ def swimming(inverse_masses: Sequence[float]) -> GridProblem:
         cells[j : j + n, i : i + n] = SOLID
         U[j : j + n, i - 1, number, 0], U[j : j + n, i + n, number, 0] = 1.0, -1.0
         U[j - 1, i : i + n, number, 1], U[j + n, i : i + n, number, 1] = 1.0, -1.0
-    return replace(problem, cells=cells, columns=U.reshape(*cells.shape, -1), weights=np.diag(np.repeat(np.array(inverse_masses), 2)))
+    return replace(
+        problem,
+        cells=cells,
+        columns=U.reshape(*cells.shape, -1),
+        weights=np.diag(np.repeat(np.array(inverse_masses), 2)),
+    )
 
 
 def swimming_3d(inverse_masses: Sequence[float]) -> GridProblem:
@@ -159,7 +216,11 @@ def with_column(made: GridProblem, factor: float, weight: float) -> GridProblem:
     assert made.columns is not None
     assert made.weights is not None
     weights = np.diag([*made.weights.diagonal(), weight])
-    return replace(made, columns=np.concatenate([made.columns, factor * made.columns[..., :1]], axis=-1), weights=weights)
+    return replace(
+        made,
+        columns=np.concatenate([made.columns, factor * made.columns[..., :1]], axis=-1),
+        weights=weights,
+    )
 
 
 def piston() -> GridProblem:
@@ -169,4 +230,10 @@ def piston() -> GridProblem:
     cells[-1, 20:] = AIR
     u = np.zeros(cells.shape)
     u[:, 18], u[:-1, 20] = 1.0, -1.0
-    return GridProblem(cells=cells, b=noise(cells.shape), lower=-np.inf, columns=u[..., None], weights=np.array([[0.05]]))
+    return GridProblem(
+        cells=cells,
+        b=noise(cells.shape),
+        lower=-np.inf,
+        columns=u[..., None],
+        weights=np.array([[0.05]]),
+    )

@@ -1,8 +1,9 @@
 """A x + b of hostile problems and its natural residual, assembled anew in float64: no code of the library takes part.
 
-r_i = d_i (x_i - clip(x_i - y_i / d_i, l_i, u_i)) with d_i = 1 / (r_i c_i), diag(r) A diag(c) equilibrated: |A_ii| where no transversal of A
-has a larger product than the diagonal, else that of columns scaled to 1, then rows; 1 for empty rows and columns. Norms are scaled by
-their largest entry, so that squares neither overflow nor vanish.
+r_i = d_i (x_i - clip(x_i - y_i / d_i, l_i, u_i)) with d_i = 1 / (r_i c_i), diag(r) A diag(c)
+equilibrated: |A_ii| where no transversal of A has a larger product than the diagonal, else that of
+columns scaled to 1, then rows; 1 for empty rows and columns. Norms are scaled by their largest
+entry, so that squares neither overflow nor vanish.
 """
 
 from __future__ import annotations
@@ -62,7 +63,9 @@ class Exact:
         """Return || (d + |A|) |x| + |b| ||: what rounding errors of a residual are in proportion to."""
         size = abs(self.matrix) @ np.abs(x) + self.diagonal() * np.abs(x) + np.abs(self.b)
         if self.columns is not None and self.weights is not None:
-            size = size + np.abs(self.columns) @ (np.abs(self.weights) @ (np.abs(self.columns).T @ np.abs(x)))
+            size = size + np.abs(self.columns) @ (
+                np.abs(self.weights) @ (np.abs(self.columns).T @ np.abs(x))
+            )
         return norm(size)
 
 
@@ -75,8 +78,11 @@ def equilibrated_scale(matrix: Any) -> np.ndarray:
     empty = (np.diff(A.indptr) == 0) & (np.bincount(column, minlength=len(d)) == 0)
     if (d[~empty] > 0).all():
         one = np.where(empty, 1.0, d)
-        cost = np.log(np.sqrt(one[row])) + np.log(np.sqrt(one[column])) - np.log(size)  # 0 on the diagonal
-        if (cost >= -1e-6).all() or _least_cost(cost, row, column, np.flatnonzero(empty), len(d)) >= -1e-6 * len(d):
+        # 0 on the diagonal
+        cost = np.log(np.sqrt(one[row])) + np.log(np.sqrt(one[column])) - np.log(size)
+        if (cost >= -1e-6).all() or _least_cost(
+            cost, row, column, np.flatnonzero(empty), len(d)
+        ) >= -1e-6 * len(d):
             return one
     q, t = np.zeros(len(d)), np.zeros(len(d))
     np.maximum.at(q, column, size)
@@ -86,7 +92,9 @@ def equilibrated_scale(matrix: Any) -> np.ndarray:
     return q * t
 
 
-def _least_cost(cost: np.ndarray, row: np.ndarray, column: np.ndarray, alone: np.ndarray, n: int) -> float:
+def _least_cost(
+    cost: np.ndarray, row: np.ndarray, column: np.ndarray, alone: np.ndarray, n: int
+) -> float:
     """Return the cost of the cheapest matching of rows and columns, `alone` with themselves at no cost; dense, O(n^3)."""
     table = np.full((n, n), 4.0 * n * (float(np.abs(cost).max()) + 1.0))  # as good as forbidden
     table[row, column], table[alone, alone] = cost, 0.0
@@ -102,22 +110,30 @@ def norm(values: np.ndarray) -> float:
 
 
 def stencil(
-    cells: np.ndarray, faces: Mapping[str, Any], shift: Any = None, periodic: tuple[bool, ...] = (False, False, False)
+    cells: np.ndarray,
+    faces: Mapping[str, Any],
+    shift: Any = None,
+    periodic: tuple[bool, ...] = (False, False, False),
 ) -> tuple[scipy.sparse.csr_array, np.ndarray]:
     """Return the matrix of the FLUID cells and which cells those are, flat, from the definition face by face.
 
-    A face has the coefficient c, adds c to the diagonal of each FLUID cell beside it and -c between two; SOLID on a side closes it, and so
-    does the array's end unless the axis is periodic.
+    A face has the coefficient c, adds c to the diagonal of each FLUID cell beside it and -c between
+    two; SOLID on a side closes it, and so does the array's end unless the axis is periodic.
 
     Args:
         cells: AIR, FLUID, SOLID, shape (nz, ny, nx) or (ny, nx).
-        faces: `face_x`, `face_y`, `face_z`: numbers or arrays with one face more along their axis; 1 where there is none.
+        faces: `face_x`, `face_y`, `face_z`: numbers or arrays with one face more along their axis;
+            1 where there is none.
         shift: added to the diagonal, a number or shape of `cells`.
         periodic: whether x, y, z wrap around.
     """
     grid = cells.reshape((1,) * (3 - cells.ndim) + cells.shape)
     index = np.arange(grid.size).reshape(grid.shape)
-    d = np.zeros(grid.size) if shift is None else np.broadcast_to(shift, cells.shape).astype(np.float64).ravel().copy()
+    d = (
+        np.zeros(grid.size)
+        if shift is None
+        else np.broadcast_to(shift, cells.shape).astype(np.float64).ravel().copy()
+    )
     rows, columns, values = [], [], []
     for axis in range(cells.ndim):
         ax, count = 2 - axis, grid.shape[2 - axis]
@@ -125,7 +141,11 @@ def stencil(
         below = np.arange(-1 if wraps else 0, count - 1)
         face = np.asarray(faces.get(f"face_{AXES[axis]}", 1.0), dtype=np.float64)
         shape = [n + (q == ax) for q, n in enumerate(grid.shape)]
-        c = np.broadcast_to(face.reshape(shape if face.ndim else ()), shape).take(below + 1, ax).ravel()
+        c = (
+            np.broadcast_to(face.reshape(shape if face.ndim else ()), shape)
+            .take(below + 1, ax)
+            .ravel()
+        )
         p, q = index.take(below % count, ax).ravel(), index.take(below + 1, ax).ravel()
         types = grid.ravel()
         is_open = (types[p] != SOLID) & (types[q] != SOLID)
@@ -138,5 +158,7 @@ def stencil(
         values += [-c[between], -c[between]]
     fluid = grid.ravel() == FLUID
     entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
-    coupling = scipy.sparse.coo_array(entries, shape=(grid.size, grid.size)).tocsr()[fluid][:, fluid]
+    coupling = scipy.sparse.coo_array(entries, shape=(grid.size, grid.size)).tocsr()[fluid][
+        :, fluid
+    ]
     return (coupling + scipy.sparse.diags_array(d[fluid])).tocsr(), fluid

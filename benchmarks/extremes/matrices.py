@@ -24,18 +24,50 @@ def singular() -> Iterator[Case]:
     case = partial(given, "zero eigenvalues")
     for rank in (1, N // 2, N - 1):
         made = partial(MatrixProblem.of, semidefinite(N, zeros=1 - rank / N))
-        methods, expected = (*NEWTON, "mprgp", "interior-point", *PIVOTING, *LEMKE), EITHER if rank == 1 else SOLVED
-        yield from case(f"dense of rank {rank}, b in its range", made, methods, expected=expected, promises=MAY_STOP)
-    yield from case("sparse, constants are a null space", ring, (*NEWTON, "mprgp", *PIVOTING), promises=MAY_STOP)
+        methods, expected = (
+            (*NEWTON, "mprgp", "interior-point", *PIVOTING, *LEMKE),
+            EITHER if rank == 1 else SOLVED,
+        )
+        yield from case(
+            f"dense of rank {rank}, b in its range",
+            made,
+            methods,
+            expected=expected,
+            promises=MAY_STOP,
+        )
+    yield from case(
+        "sparse, constants are a null space", ring, (*NEWTON, "mprgp", *PIVOTING), promises=MAY_STOP
+    )
     zero = partial(MatrixProblem, matrix=np.zeros((3, 3)))
-    yield from case("A = 0, b >= 0", partial(zero, b=np.array([0.0, 1.0, 2.0])), (*NEWTON, *LEMKE, "psor"))
-    yield from case("A = 0, b < 0", partial(zero, b=np.array([0.0, 1.0, -2.0])), NEWTON + LEMKE, expected=INFEASIBLE)
+    yield from case(
+        "A = 0, b >= 0", partial(zero, b=np.array([0.0, 1.0, 2.0])), (*NEWTON, *LEMKE, "psor")
+    )
+    yield from case(
+        "A = 0, b < 0",
+        partial(zero, b=np.array([0.0, 1.0, -2.0])),
+        NEWTON + LEMKE,
+        expected=INFEASIBLE,
+    )
     for b, expected in ((1.0, SOLVED), (-1.0, INFEASIBLE)):
-        yield from case(f"sparse with an empty row, b = {b:g} there", partial(empty_row, b), NEWTON, expected=expected)
+        yield from case(
+            f"sparse with an empty row, b = {b:g} there",
+            partial(empty_row, b),
+            NEWTON,
+            expected=expected,
+        )
     for small in (1e-8, 1e-14, 1e-300):
-        yield from case(f"smallest eigenvalue {small:g}", partial(nearly, small), NEWTON + PIVOTING, expected=EITHER)
+        yield from case(
+            f"smallest eigenvalue {small:g}",
+            partial(nearly, small),
+            NEWTON + PIVOTING,
+            expected=EITHER,
+        )
     for size in (1e-30, 1e30):
-        two = partial(MatrixProblem, matrix=np.array([[2.0, -1.0], [-1.0, 2.0]]) * size, b=np.array([0.5, -2.5]) * size)
+        two = partial(
+            MatrixProblem,
+            matrix=np.array([[2.0, -1.0], [-1.0, 2.0]]) * size,
+            b=np.array([0.5, -2.5]) * size,
+        )
         yield from case(f"entries of {size:g}", two, NEWTON + PIVOTING + LEMKE, promises=MAY_STOP)
 
 
@@ -43,7 +75,10 @@ def ring() -> MatrixProblem:
     """Return the Laplacian of a ring with b that adds up to more than 0."""
     n, one = 50, np.eye(50)
     b = chance(21).standard_normal(n)
-    return MatrixProblem(matrix=scipy.sparse.csr_array(2 * one - np.roll(one, 1, 0) - np.roll(one, -1, 0)), b=b - b.mean() + 0.05)
+    return MatrixProblem(
+        matrix=scipy.sparse.csr_array(2 * one - np.roll(one, 1, 0) - np.roll(one, -1, 0)),
+        b=b - b.mean() + 0.05,
+    )
 
 
 def empty_row(b: float) -> MatrixProblem:
@@ -69,17 +104,31 @@ def cycling() -> Iterator[Case]:
         yield from case(f"cyclic, {n} unknowns", partial(circulant, n), robust)
         for start, every in (("first", n), ("alternating", 2)):
             x0 = np.where(np.arange(n) % every == 0, 1.0, 0.0)
-            yield from case(f"cyclic, {n} unknowns, {start} start", partial(circulant, n), NEWTON, x0=x0)
+            yield from case(
+                f"cyclic, {n} unknowns, {start} start", partial(circulant, n), NEWTON, x0=x0
+            )
     for n in (8, 16):
-        yield from case(f"Murty's, {n} unknowns", partial(murty, n), NEWTON + LEMKE, but={"lemke": EITHER} if n > 8 else {})
-        yield from case(f"Fathi's, {n} unknowns", partial(murty, n, times_transposed=True), NEWTON + PIVOTING + LEMKE, promises=MAY_STOP)
+        yield from case(
+            f"Murty's, {n} unknowns",
+            partial(murty, n),
+            NEWTON + LEMKE,
+            but={"lemke": EITHER} if n > 8 else {},
+        )
+        yield from case(
+            f"Fathi's, {n} unknowns",
+            partial(murty, n, times_transposed=True),
+            NEWTON + PIVOTING + LEMKE,
+            promises=MAY_STOP,
+        )
     for seed in range(4):
         yield from case(f"unsymmetric, random {seed}", partial(unsymmetric, seed), robust)
 
 
 def circulant(n: int) -> MatrixProblem:
     """Return I plus a cyclic shift by 2 where n is odd, 0.9 where it is even: P-matrices [Ben Gharbia & Gilbert 2012], b < 0."""
-    return MatrixProblem(matrix=np.eye(n) + (2.0 if n % 2 else 0.9) * np.roll(np.eye(n), 1, axis=1), b=-np.ones(n))
+    return MatrixProblem(
+        matrix=np.eye(n) + (2.0 if n % 2 else 0.9) * np.roll(np.eye(n), 1, axis=1), b=-np.ones(n)
+    )
 
 
 def murty(n: int, *, times_transposed: bool = False) -> MatrixProblem:

@@ -16,7 +16,8 @@ from warp_lcp import gallery
 from warp_lcp.benchmarks.extremes.exact import Exact, stencil
 
 BALANCED = 1e-10  # of sum |b|: sums of b that are 0 but for rounding
-GENTLY = 0.01  # of the mean |b|: what a pool's b is raised by where its sum has the sign that no bound takes up
+# of the mean |b|: what a pool's b is raised by where its sum has the sign that no bound takes up
+GENTLY = 0.01
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +36,14 @@ class GridProblem:
 
     def lcp(self, device: str, storage: Any) -> wl.LCP:
         """Return it for the library; `storage` is the type of coefficients, wp.float32 or wp.float64."""
-        A: Any = wl.GridPoisson(self.cells, shift=self.shift, periodic=self.periodic, device=device, dtype=storage, **self.faces)
+        A: Any = wl.GridPoisson(
+            self.cells,
+            shift=self.shift,
+            periodic=self.periodic,
+            device=device,
+            dtype=storage,
+            **self.faces,
+        )
         if self.columns is not None:
             A = wl.SumOperator(A, wl.LowRankOperator(self.columns, self.weights, device=device))
         return wl.LCP(A, self.b, self.lower, self.upper)
@@ -43,8 +51,15 @@ class GridProblem:
     def exact(self) -> Exact:
         """Return it for the independent residual."""
         matrix, fluid = stencil(self.cells, self.faces, self.shift, self.periodic)
-        b, lower, upper = (np.broadcast_to(f, self.cells.shape).ravel()[fluid].astype(np.float64) for f in (self.b, self.lower, self.upper))
-        U = None if self.columns is None else self.columns.reshape(-1, self.columns.shape[-1])[fluid]
+        b, lower, upper = (
+            np.broadcast_to(f, self.cells.shape).ravel()[fluid].astype(np.float64)
+            for f in (self.b, self.lower, self.upper)
+        )
+        U = (
+            None
+            if self.columns is None
+            else self.columns.reshape(-1, self.columns.shape[-1])[fluid]
+        )
         return Exact(matrix, b, lower, upper, U, self.weights)
 
     def unknowns(self, x: np.ndarray) -> np.ndarray:
@@ -54,7 +69,11 @@ class GridProblem:
     def rounded(self, storage: Any) -> bool:
         """Return whether `storage` rounds the coefficients: arrays or unequal numbers."""
         faces = [self.faces.get(f"face_{axis}", 1.0) for axis in "xyz"[: self.cells.ndim]]
-        uneven = self.shift is not None or any(np.ndim(f) > 0 for f in faces) or len({float(f) for f in faces}) > 1
+        uneven = (
+            self.shift is not None
+            or any(np.ndim(f) > 0 for f in faces)
+            or len({float(f) for f in faces}) > 1
+        )
         return uneven and storage is not wp.float64
 
 
@@ -76,12 +95,21 @@ class MatrixProblem:
     def lcp(self, device: str, storage: Any) -> wl.LCP:
         """Return it for the library."""
         kind = wl.SparseOperator if scipy.sparse.issparse(self.matrix) else wl.DenseOperator
-        return wl.LCP(kind(self.matrix, device=device, dtype=storage), self.b, self.lower, self.upper)
+        return wl.LCP(
+            kind(self.matrix, device=device, dtype=storage), self.b, self.lower, self.upper
+        )
 
     def exact(self) -> Exact:
         """Return it for the independent residual."""
-        lower, upper = (np.broadcast_to(f, self.b.shape).astype(np.float64) for f in (self.lower, self.upper))
-        return Exact(scipy.sparse.csr_array(self.matrix, dtype=np.float64), self.b.astype(np.float64), lower, upper)
+        lower, upper = (
+            np.broadcast_to(f, self.b.shape).astype(np.float64) for f in (self.lower, self.upper)
+        )
+        return Exact(
+            scipy.sparse.csr_array(self.matrix, dtype=np.float64),
+            self.b.astype(np.float64),
+            lower,
+            upper,
+        )
 
     def unknowns(self, x: np.ndarray) -> np.ndarray:
         """Return x."""
@@ -98,7 +126,10 @@ Problem = GridProblem | MatrixProblem
 def faces_of(shape: tuple[int, ...], value: Callable[[tuple[int, ...]], Any]) -> dict[str, Any]:
     """Return arrays of coefficients; `value` takes an array's shape."""
     axes = list(zip("xyz", range(len(shape))[::-1], strict=False))
-    return {f"face_{name}": value(tuple(n + (q == axis) for q, n in enumerate(shape))) for name, axis in axes}
+    return {
+        f"face_{name}": value(tuple(n + (q == axis) for q, n in enumerate(shape)))
+        for name, axis in axes
+    }
 
 
 def with_solution(cells: np.ndarray, x: np.ndarray, y: np.ndarray) -> GridProblem:
@@ -125,7 +156,10 @@ class Pools:
         """Return the pools of a symmetric problem whose off-diagonal entries are <= 0."""
         count, label = scipy.sparse.csgraph.connected_components(exact.matrix != 0, directed=False)
         tied = np.asarray(exact.matrix.sum(axis=1)).ravel() > 1e-12 * exact.matrix.diagonal()
-        held, below, above = (np.bincount(label, v, count) > 0 for v in (tied, np.isfinite(exact.lower), np.isfinite(exact.upper)))
+        held, below, above = (
+            np.bincount(label, v, count) > 0
+            for v in (tied, np.isfinite(exact.lower), np.isfinite(exact.upper))
+        )
         net, size = (np.bincount(label, v, count) for v in (exact.b, np.abs(exact.b)))
         net = np.where(np.abs(net) <= BALANCED * size, 0.0, net)
         return Pools(label, ~held, net, size, np.bincount(label, minlength=count), below, above)
@@ -139,10 +173,13 @@ class Pools:
 def solvable(problem: GridProblem) -> GridProblem:
     """Return the problem with b moved, on the pools that have no solution, by the least that gives them one and a little more."""
     pools = Pools.of(problem.exact())
-    # a sum of 0 is on the verge of having none: where one bound can take up a sign, b gets some of that sign
+    # a sum of 0 is on the verge of having none: where one bound can take up a sign, b gets some of
+    # that sign
     moved = pools.lost | (pools.loose & (pools.net == 0) & (pools.below ^ pools.above))
     taken_up = pools.below.astype(float) - pools.above
-    shift = np.where(moved, (taken_up * GENTLY * (pools.size + (pools.size == 0)) - pools.net) / pools.cells, 0.0)
+    shift = np.where(
+        moved, (taken_up * GENTLY * (pools.size + (pools.size == 0)) - pools.net) / pools.cells, 0.0
+    )
     b = np.where(problem.cells == wl.FLUID, problem.b, 0.0)
     b[problem.cells == wl.FLUID] += shift[pools.label]
     return replace(problem, b=b)

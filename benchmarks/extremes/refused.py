@@ -22,7 +22,12 @@ def wrong_arguments() -> Iterator[Case]:
     for bad in (np.nan, np.inf, -np.inf):
         for name, call in NOT_FINITE.items():
             if not (name == "lower" and bad == -np.inf) and not (name == "upper" and bad == np.inf):
-                yield RefusalCase("not finite", f"{bad} in {name}", partial(call, v=bad), name.replace(",", "").split()[0])
+                yield RefusalCase(
+                    "not finite",
+                    f"{bad} in {name}",
+                    partial(call, v=bad),
+                    name.replace(",", "").split()[0],
+                )
     for name, (names, simple) in WRONG.items():
         yield RefusalCase("wrong arguments", name, simple, names)
 
@@ -62,7 +67,9 @@ NOT_FINITE: dict[str, Callable[..., object]] = {
     "shift": lambda device, p, v: grid(device, shift=spoiled(SHAPE, v)),
     "shift, a number": lambda device, p, v: grid(device, shift=v),
     "matrix (dense)": lambda device, p, v: wl.DenseOperator(spoiled((3, 3), v), device=device),
-    "matrix (sparse)": lambda device, p, v: wl.SparseOperator(scipy.sparse.csr_array(spoiled((3, 3), v)), device=device),
+    "matrix (sparse)": lambda device, p, v: wl.SparseOperator(
+        scipy.sparse.csr_array(spoiled((3, 3), v)), device=device
+    ),
     "columns": lambda device, p, v: low_rank(device, spoiled((*SHAPE, 2), v), np.ones(2)),
     "weights": lambda device, p, v: low_rank(device, np.ones((*SHAPE, 2)), spoiled((2,), v)),
     "rtol": lambda device, p, v: wl.StoppingCriteria(rtol=v),
@@ -77,19 +84,39 @@ WRONG: dict[str, tuple[str, Callable[[str, str], object]]] = {
     "b of another shape": ("b has shape", lambda device, p: run(device, p, b=np.ones((3, 3)))),
     "negative coefficients": ("face_x", lambda device, p: grid(device, face_x=-1.0)),
     "negative shift": ("shift", lambda device, p: grid(device, shift=-1e-30)),
-    "cell types of 3": ("cells", lambda device, p: wl.GridPoisson(np.full(SHAPE, 3), device=device)),
-    "no cells": ("cells", lambda device, p: wl.GridPoisson(np.ones((0, 3), dtype=int), device=device)),
+    "cell types of 3": (
+        "cells",
+        lambda device, p: wl.GridPoisson(np.full(SHAPE, 3), device=device),
+    ),
+    "no cells": (
+        "cells",
+        lambda device, p: wl.GridPoisson(np.ones((0, 3), dtype=int), device=device),
+    ),
     "no matrix": ("matrix", lambda device, p: wl.DenseOperator(np.ones((0, 0)), device=device)),
-    "matrix not square": ("matrix", lambda device, p: wl.DenseOperator(np.ones((2, 3)), device=device)),
+    "matrix not square": (
+        "matrix",
+        lambda device, p: wl.DenseOperator(np.ones((2, 3)), device=device),
+    ),
     "complex matrix": ("matrix", lambda device, p: wl.DenseOperator(np.eye(2) * 1j, device=device)),
     "no column": ("columns", lambda device, p: low_rank(device, np.ones((*SHAPE, 0)), np.ones(0))),
-    "weights of another size": ("weights", lambda device, p: low_rank(device, np.ones((*SHAPE, 2)), np.ones(3))),
+    "weights of another size": (
+        "weights",
+        lambda device, p: low_rank(device, np.ones((*SHAPE, 2)), np.ones(3)),
+    ),
     "rtol = 1": ("rtol", lambda device, p: wl.StoppingCriteria(rtol=1.0)),
-    "max_iterations = -1": ("max_iterations", lambda device, p: wl.StoppingCriteria(max_iterations=-1)),
+    "max_iterations = -1": (
+        "max_iterations",
+        lambda device, p: wl.StoppingCriteria(max_iterations=-1),
+    ),
     "patience = 0": ("patience", lambda device, p: wl.StoppingCriteria(patience=0)),
     "precision = half": (
         "precision",
-        lambda device, p: wl.solve(wl.LCP(grid(device), np.ones(SHAPE)), wl.ProjectedMultigrid(precision="half")),
+        lambda device, p: wl.solve(
+            wl.LCP(grid(device), np.ones(SHAPE)), wl.ProjectedMultigrid(precision="half")
+        ),
     ),
-    "entries beyond float32": ("matrix", lambda device, p: wl.DenseOperator(np.full((2, 2), 1e200), device=device, dtype=wp.float32)),
+    "entries beyond float32": (
+        "matrix",
+        lambda device, p: wl.DenseOperator(np.full((2, 2), 1e200), device=device, dtype=wp.float32),
+    ),
 }

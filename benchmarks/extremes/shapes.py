@@ -9,7 +9,14 @@ from typing import Any
 import numpy as np
 
 import warp_lcp as wl
-from warp_lcp.benchmarks.extremes.case import EITHER, INFEASIBLE, SOLVED, Case, RefusalCase, SolveCase
+from warp_lcp.benchmarks.extremes.case import (
+    EITHER,
+    INFEASIBLE,
+    SOLVED,
+    Case,
+    RefusalCase,
+    SolveCase,
+)
 from warp_lcp.benchmarks.extremes.problem import GridProblem, solvable
 
 AIR, FLUID, SOLID = wl.AIR, wl.FLUID, wl.SOLID
@@ -18,7 +25,9 @@ METHODS = ("projected-multigrid", "minimum-map-newton")  # which must take every
 LARGE_BUDGET = 60.0  # of 10^6 unknowns
 
 
-def given(family: str, name: str, make: Callable[[], Any], methods: tuple[str, ...] = METHODS, **more: Any) -> Iterator[Case]:
+def given(
+    family: str, name: str, make: Callable[[], Any], methods: tuple[str, ...] = METHODS, **more: Any
+) -> Iterator[Case]:
     """Yield the case for each method; `more` as of SolveCase, `but` holds what single methods come to instead."""
     but = more.pop("but", {})
     for method in methods:
@@ -60,15 +69,35 @@ def grounded(shape: tuple[int, ...]) -> GridProblem:
 def sizes() -> Iterator[Case]:
     """Yield grids of one cell, one layer, prime sizes, 10^6 cells and long ones."""
     case = partial(given, "sizes")
-    for shape in ((1, 1), (1, 1, 1), (1, 2), (2, 1), (1, 1, 7), (1, 7, 1), (7, 1, 1), (1, 1, 4096), (4096, 1, 1), (1, 13, 17)):
+    for shape in (
+        (1, 1),
+        (1, 1, 1),
+        (1, 2),
+        (2, 1),
+        (1, 1, 7),
+        (1, 7, 1),
+        (7, 1, 1),
+        (1, 1, 4096),
+        (4096, 1, 1),
+        (1, 13, 17),
+    ):
         yield from case("x".join(map(str, shape)), partial(grounded, shape))
     for shape in ((2, 2), (3, 1), (127, 131), (1, 127, 131), (31, 37, 41), (2, 3, 5)):
         yield from case("x".join(map(str, shape)) + " below air", partial(pool, shape))
     for shape in ((3, 3000), (3000, 3), (2, 2000), (2, 2, 2000), (2000, 2, 2), (3, 2000, 3)):
-        yield from case("1:1000, " + "x".join(map(str, shape)), partial(pool, shape), promises={"single": EITHER})
+        yield from case(
+            "1:1000, " + "x".join(map(str, shape)),
+            partial(pool, shape),
+            promises={"single": EITHER},
+        )
     yield from case("1024x1024", lambda: pool((1024, 1024)), budget=LARGE_BUDGET)
-    yield from case("1024x1024 with noise as mask", lambda: sponge((1024, 1024), 0.75), budget=LARGE_BUDGET)
-    yield from case("2-D like 3-D of one layer, periodic", lambda: pool((1, 61, 67), periodic=(True, False, False)))
+    yield from case(
+        "1024x1024 with noise as mask", lambda: sponge((1024, 1024), 0.75), budget=LARGE_BUDGET
+    )
+    yield from case(
+        "2-D like 3-D of one layer, periodic",
+        lambda: pool((1, 61, 67), periodic=(True, False, False)),
+    )
 
 
 def sponge(shape: tuple[int, ...], liquid: float) -> GridProblem:
@@ -87,12 +116,21 @@ def masks() -> Iterator[Case]:
         for shape in ((3, 3), (5, 5, 5)):
             for b in (-1.0, 1.0, 0.0):
                 if not (around == SOLID and b < 0):
-                    yield from case(f"one cell in {name}, {len(shape)}-D, b = {b:g}", partial(single, shape, around, b))
-    yield from case("one cell in solid, b = -1", lambda: single((3, 3), SOLID, -1.0), expected=INFEASIBLE)
+                    yield from case(
+                        f"one cell in {name}, {len(shape)}-D, b = {b:g}",
+                        partial(single, shape, around, b),
+                    )
+    yield from case(
+        "one cell in solid, b = -1", lambda: single((3, 3), SOLID, -1.0), expected=INFEASIBLE
+    )
     for shape in ((40, 41), (12, 13, 14)):
         for name, other in (("air", AIR), ("solid", SOLID)):
-            yield from case(f"checkerboard of liquid and {name}, {len(shape)}-D", partial(checkerboard, shape, other))
-    yield from case("labyrinth 65x65", lambda: labyrinth(65), but={"projected-multigrid": EITHER})  # LIMITS
+            yield from case(
+                f"checkerboard of liquid and {name}, {len(shape)}-D",
+                partial(checkerboard, shape, other),
+            )
+    # LIMITS
+    yield from case("labyrinth 65x65", lambda: labyrinth(65), but={"projected-multigrid": EITHER})
     yield from case("labyrinth 33x33 without bounds", lambda: labyrinth(33, lower=-np.inf))
     yield from case("two pools joined by a needle", lambda: needle(64))
     yield from case("chambers behind walls of one cell", lambda: chambers(59))
@@ -136,7 +174,11 @@ def needle(n: int) -> GridProblem:
     cells[:, n // 2 : n + n // 2] = SOLID
     cells[n // 3, n // 2 : n + n // 2] = FLUID
     cells[-1, n + n // 2 :] = AIR
-    return GridProblem(cells=cells, b=noise(cells.shape), lower=np.where(np.indices(cells.shape)[0] == 0, 0.0, -np.inf))
+    return GridProblem(
+        cells=cells,
+        b=noise(cells.shape),
+        lower=np.where(np.indices(cells.shape)[0] == 0, 0.0, -np.inf),
+    )
 
 
 def chambers(n: int) -> GridProblem:
@@ -145,7 +187,9 @@ def chambers(n: int) -> GridProblem:
     cells[5::6], cells[:, 5::6] = SOLID, SOLID
     cells[5::6, 2::6], cells[2::6, 5::6] = FLUID, FLUID
     cells[:5, :5] = AIR
-    return GridProblem(cells=cells, b=noise((n, n)), lower=np.where(noise((n, n), 3) > 0, 0.0, -np.inf))
+    return GridProblem(
+        cells=cells, b=noise((n, n)), lower=np.where(noise((n, n), 3) > 0, 0.0, -np.inf)
+    )
 
 
 def punctured(shape: tuple[int, ...]) -> GridProblem:
@@ -162,13 +206,27 @@ def closed_pools() -> Iterator[Case]:
         yield from case(f"compatible, {len(shape)}-D", partial(full, shape, lower=-np.inf))
         for flow, b in (("outflow", noise(shape) + 0.1), ("inflow", noise(shape) - 0.1)):
             off = f"{flow}, {len(shape)}-D"
-            yield from case(f"incompatible {off}", partial(full, shape, b=b, lower=-np.inf), expected=INFEASIBLE)
-            yield from case(f"p >= 0, {off}", partial(full, shape, b=b), expected=SOLVED if flow == "outflow" else INFEASIBLE)
+            yield from case(
+                f"incompatible {off}", partial(full, shape, b=b, lower=-np.inf), expected=INFEASIBLE
+            )
+            yield from case(
+                f"p >= 0, {off}",
+                partial(full, shape, b=b),
+                expected=SOLVED if flow == "outflow" else INFEASIBLE,
+            )
     yield from case("one of 40 is incompatible", lambda: many_pools(0.05), expected=INFEASIBLE)
     yield from case("40 compatible ones", lambda: many_pools(0.0))
-    yield from case("boxed, inflow", lambda: full((9, 9), b=noise((9, 9)) - 0.2, lower=-1.0, upper=1.0))
-    yield from case("incompatible by rounding only", lambda: full((64, 64), b=noise((64, 64)) * 1e6, lower=-np.inf))
-    yield from case("periodic in x and y, compatible", lambda: full((31, 32), lower=-np.inf, periodic=(True, True, False)))
+    yield from case(
+        "boxed, inflow", lambda: full((9, 9), b=noise((9, 9)) - 0.2, lower=-1.0, upper=1.0)
+    )
+    yield from case(
+        "incompatible by rounding only",
+        lambda: full((64, 64), b=noise((64, 64)) * 1e6, lower=-np.inf),
+    )
+    yield from case(
+        "periodic in x and y, compatible",
+        lambda: full((31, 32), lower=-np.inf, periodic=(True, True, False)),
+    )
 
 
 def many_pools(net: float) -> GridProblem:

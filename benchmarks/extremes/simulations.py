@@ -43,8 +43,10 @@ class RunCase(Case):
     _: KW_ONLY
     dt: float | None = None  # of every step [s]; what the CFL number allows if None
     steps: int = STEPS  # how many
-    prepare: Callable[[ParticleSimulation], object] = lambda simulation: None  # changes it before the first step
-    check: Callable[[ParticleSimulation], list[str]] = lambda simulation: []  # what is wrong with it, besides what is checked of all
+    # changes it before the first step
+    prepare: Callable[[ParticleSimulation], object] = lambda simulation: None
+    # what is wrong with it, besides what is checked of all
+    check: Callable[[ParticleSimulation], list[str]] = lambda simulation: []
     leaves: bool = False  # whether particles may leave
     expected: Promise = DONE
     budget: float = BUDGET
@@ -54,7 +56,8 @@ class RunCase(Case):
         simulation = self.make(precision, device)
         self.prepare(simulation)
         before, recorded = simulation.particles.count, list[Mapping[str, np.ndarray]]()
-        if isinstance(simulation, LiquidSimulation) and simulation.bodies is None:  # a record has no place for the bodies' term
+        # a record has no place for the bodies' term
+        if isinstance(simulation, LiquidSimulation) and simulation.bodies is None:
             simulation.record = recorded.append
         status, message, begun = "done", "", time.perf_counter()
         try:
@@ -62,11 +65,17 @@ class RunCase(Case):
                 simulation.step(usual_dt(simulation) if self.dt is None else self.dt)
         except (StepFailed, SimulationFailed, ValueError) as error:
             named = self.expected.names and self.expected.names in str(error)
-            status, message = f"failed: {self.expected.names if named else type(error).__name__}", str(error)
+            status, message = (
+                f"failed: {self.expected.names if named else type(error).__name__}",
+                str(error),
+            )
         wp.synchronize_device(device)
         attempt = Attempt(status, None, time.perf_counter() - begun, message)
         if status == "done":
-            attempt.faults += [*lost(simulation, before, leaves=self.leaves), *self.check(simulation)]
+            attempt.faults += [
+                *lost(simulation, before, leaves=self.leaves),
+                *self.check(simulation),
+            ]
             if recorded and isinstance(simulation, LiquidSimulation):
                 attempt.residual, fault = independent(recorded[-1], simulation)
                 attempt.faults += fault
@@ -81,7 +90,11 @@ def usual_dt(simulation: ParticleSimulation) -> float:
 
 def lost(simulation: ParticleSimulation, before: int, *, leaves: bool) -> list[str]:
     """Return what is wrong with the particles after a run."""
-    wrong, position, velocity = [], simulation.particles.position.numpy(), simulation.particles.velocity.numpy()
+    wrong, position, velocity = (
+        [],
+        simulation.particles.position.numpy(),
+        simulation.particles.velocity.numpy(),
+    )
     if not leaves and simulation.particles.count != before:
         wrong.append(f"{simulation.particles.count} particles of {before}")
     if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
@@ -92,18 +105,29 @@ def lost(simulation: ParticleSimulation, before: int, *, leaves: bool) -> list[s
     return wrong
 
 
-def independent(kept: Mapping[str, np.ndarray], simulation: LiquidSimulation) -> tuple[float | None, list[str]]:
+def independent(
+    kept: Mapping[str, np.ndarray], simulation: LiquidSimulation
+) -> tuple[float | None, list[str]]:
     """Return the relative residual of the last pressure, from the recorded arrays alone, and what is wrong with it."""
     faces = {name: kept[name] for name in ("face_x", "face_y", "face_z") if name in kept}
     problem = GridProblem(
-        cells=kept["cells"].astype(int), b=kept["b"], lower=kept["lower"], upper=kept["upper"], faces=faces, shift=kept.get("shift")
+        cells=kept["cells"].astype(int),
+        b=kept["b"],
+        lower=kept["lower"],
+        upper=kept["upper"],
+        faces=faces,
+        shift=kept.get("shift"),
     )
     exact = problem.exact()
     x = problem.unknowns(simulation.grid.interior(simulation.projection.pressure.numpy()))
     own, reference = exact.residual(x), exact.residual(exact.start)
     wanted = max(float(kept["absolute_tolerance"]), float(kept["tolerance"]) * reference)
     rounding = 4 * float(np.finfo(np.float32).eps) * exact.sizes(x)
-    fault = [] if own <= 1.01 * wanted + rounding else [f"the pressure's residual is {own:.1e}, asked for {wanted:.1e}"]
+    fault = (
+        []
+        if own <= 1.01 * wanted + rounding
+        else [f"the pressure's residual is {own:.1e}, asked for {wanted:.1e}"]
+    )
     return (own / reference if reference > 0 else own), fault
 
 
@@ -132,12 +156,20 @@ def made(kind: Material, **tables: Any) -> Callable[[str, str], ParticleSimulati
             "time": {"duration": 10.0, "dt_max": 10.0, "dt_min": 1e-12},
             "domain": {"size": [1.0, 0.5], "resolution": 16},
         }
-        data: dict[str, Any] = {name: values | tables.get(name, {}) for name, values in usual.items()}
+        data: dict[str, Any] = {
+            name: values | tables.get(name, {}) for name, values in usual.items()
+        }
         data["scene"] = {"simulator": kind.simulator.name}
-        data[kind.name] = [box([0.0, 0.0], [0.375, 0.375], velocity=tables.get("velocity", [0.0, 0.0]))]
+        data[kind.name] = [
+            box([0.0, 0.0], [0.375, 0.375], velocity=tables.get("velocity", [0.0, 0.0]))
+        ]
         data |= {"solver": {"precision": precision}} if kind is liquid else {}
-        data |= {name: values for name, values in tables.items() if name not in (*usual, "velocity")}
-        simulation = kind.simulator.create(kind.simulator.scene_model.model_validate(data), device=device, folder=Path())
+        data |= {
+            name: values for name, values in tables.items() if name not in (*usual, "velocity")
+        }
+        simulation = kind.simulator.create(
+            kind.simulator.scene_model.model_validate(data), device=device, folder=Path()
+        )
         assert isinstance(simulation, ParticleSimulation)
         return simulation
 
@@ -148,34 +180,57 @@ def steps_and_forces() -> Iterator[Case]:
     """Yield time steps from 1e-9 to 10 s, CFL numbers from 0.01 to 50, gravity from none to 1e6 m/s^2, speeds to 1e6 m/s."""
     for kind in (liquid, sand):
 
-        def case(name: str, kind: Material = kind, *, tables: Mapping[str, Any] | None = None, **more: Any) -> RunCase:
-            return RunCase(kind.name, name, made(kind, **(tables or {})), precisions=kind.precisions, **more)
+        def case(
+            name: str,
+            kind: Material = kind,
+            *,
+            tables: Mapping[str, Any] | None = None,
+            **more: Any,
+        ) -> RunCase:
+            return RunCase(
+                kind.name, name, made(kind, **(tables or {})), precisions=kind.precisions, **more
+            )
 
         for dt in (1e-9, 1e-6, 1e-3, 0.1, 1.0, 10.0):
             yield case(f"dt = {dt:g} s", dt=dt)
         for cfl in (0.01, 0.1, 1.0, 10.0, 50.0):
             yield case(f"CFL {cfl:g}", tables={"time": {"cfl": cfl}})
         for g in (0.0, 1e-9, 1e3, 1e6):
-            yield case(f"gravity of {g:g} m/s^2", tables=gravity(0.0, -g), dt=0.01 if g == 0 else None)
+            yield case(
+                f"gravity of {g:g} m/s^2", tables=gravity(0.0, -g), dt=0.01 if g == 0 else None
+            )
         yield case("gravity sideways and up", tables=gravity(300.0, 400.0))
         for speed in ([1e6, 0.0], [-1e6, 1e6], [1e-6, 0.0]):
             yield case(f"speed of {speed} m/s", tables={"velocity": speed})
-        # liquid must be incompressible alone; sand's stresses, which miss their tolerance, would raise its energy by a fifth
+        # liquid must be incompressible alone; sand's stresses, which miss their tolerance, would
+        # raise its energy by a fifth
         far = ended_with("would add energy to the sand") if kind is sand else DONE
         yield case("1e6 m/s for 1 s a step", tables={"velocity": [1e6, 0.0]}, dt=1.0, expected=far)
         for bad in (0.0, -1.0, np.nan, np.inf):
             yield case(f"dt = {bad}", dt=bad, expected=ended_with("dt ="))
         still = at_rest if kind is liquid else all_but_at_rest
         yield case("at rest without gravity", tables=gravity(0.0, 0.0), dt=0.1, check=still)
-    all_open = made(liquid, domain={"open": ["left", "right", "top", "bottom"]}, velocity=[9.0, 0.0])
+    all_open = made(
+        liquid, domain={"open": ["left", "right", "top", "bottom"]}, velocity=[9.0, 0.0]
+    )
     yield RunCase("liquid", "all sides open", all_open, leaves=True)
     whole = [box([0, 0], [1, 0.5], velocity=[3, 1])]
     yield RunCase("liquid", "full and closed", made(liquid, liquid=whole))
-    yield RunCase("liquid", "free-slip, full and closed", made(liquid, domain={"wall": "free-slip"}, liquid=whole))
-    flat = made(liquid, domain={"size": [2.0, 0.0625], "resolution": 64}, liquid=[box([0.0, 0.0], [0.5, 0.03])])
+    yield RunCase(
+        "liquid",
+        "free-slip, full and closed",
+        made(liquid, domain={"wall": "free-slip"}, liquid=whole),
+    )
+    flat = made(
+        liquid,
+        domain={"size": [2.0, 0.0625], "resolution": 64},
+        liquid=[box([0.0, 0.0], [0.5, 0.03])],
+    )
     yield RunCase("liquid", "flat domain, 2 x 0.0625 m", flat)
     for density in (1e-6, 1e9):
-        yield RunCase("liquid", f"density of {density:g} kg/m^3", made(liquid, physics={"density": density}))
+        yield RunCase(
+            "liquid", f"density of {density:g} kg/m^3", made(liquid, physics={"density": density})
+        )
 
 
 def gravity(*components: float) -> dict[str, Any]:
@@ -186,7 +241,10 @@ def gravity(*components: float) -> dict[str, Any]:
 def solids_and_depth() -> Iterator[Case]:
     """Yield 3-D liquid, and rigid bodies of 10^-8 to 10^8 of its density, solids that move too fast, and liquid between them."""
     case, pond = partial(RunCase, "liquid, 3-D and with bodies"), [box([0.0, 0.0], [1.0, 0.25])]
-    column, size = box([0.0, 0.0, 0.0], [0.25, 0.3, 0.25]), {"domain": {"size": [0.5, 0.5, 0.25], "resolution": 12}}
+    column, size = (
+        box([0.0, 0.0, 0.0], [0.25, 0.3, 0.25]),
+        {"domain": {"size": [0.5, 0.5, 0.25], "resolution": 12}},
+    )
     deep = partial(made, liquid, **size, liquid=[column])
     for dt in (1e-9, 0.1, 10.0):
         yield case(f"3-D, dt = {dt:g} s", deep(), dt=dt)
@@ -194,19 +252,31 @@ def solids_and_depth() -> Iterator[Case]:
     yield case("3-D, 1e6 m/s", deep(liquid=[column | {"velocity": [1e6, 1e5, -1e6]}]))
     for ratio in (1e-8, 1e-4, 1e-2, 1.0, 1e4, 1e8):
         body = box([0.2, 0.14], [0.4, 0.3], density=1000.0 * ratio)
-        yield case(f"a body of {ratio:g} of its density", made(liquid, solid=[body], liquid=pond), check=bodies_inside)
+        yield case(
+            f"a body of {ratio:g} of its density",
+            made(liquid, solid=[body], liquid=pond),
+            check=bodies_inside,
+        )
     for speed in (1e-6, 1.0, 1e3):
-        paddle = box([0.05, -0.1], [0.15, 0.6], motion={"kind": "translation", "velocity": [speed, 0.0]})
+        paddle = box(
+            [0.05, -0.1], [0.15, 0.6], motion={"kind": "translation", "velocity": [speed, 0.0]}
+        )
         yield case(f"a paddle of {speed:g} m/s", made(liquid, solid=[paddle], liquid=pond))
     gap = [box([0.1, -0.1], [0.4, 0.35]), box([0.402, -0.1], [0.9, 0.35])]
-    yield case("between solids 2 mm apart", made(liquid, solid=gap, liquid=[box([0.0, 0.0], [1.0, 0.45])]))
+    yield case(
+        "between solids 2 mm apart", made(liquid, solid=gap, liquid=[box([0.0, 0.0], [1.0, 0.45])])
+    )
 
 
 def bodies_inside(simulation: ParticleSimulation) -> list[str]:
     """Return which bodies have left the domain or are nowhere."""
     bodies = simulation.bodies.bodies if simulation.bodies is not None else []
     size = np.array([*simulation.scene.domain.size, 0.0][:3])
-    return [f"a body is at {body.position}" for body in bodies if not ((body.position >= 0) & (body.position <= size)).all()]
+    return [
+        f"a body is at {body.position}"
+        for body in bodies
+        if not ((body.position >= 0) & (body.position <= size)).all()
+    ]
 
 
 def at_rest(simulation: ParticleSimulation, most: float = 1e-6) -> list[str]:
@@ -223,20 +293,51 @@ def all_but_at_rest(simulation: ParticleSimulation) -> list[str]:
 def particles_anywhere() -> Iterator[Case]:
     """Yield particles on nodes, on walls, outside, all in one cell, and with values that are no numbers."""
     for kind in (liquid, sand):
-        name, case = kind.name, partial(RunCase, "particles", make=made(kind), precisions=kind.precisions)
+        name, case = (
+            kind.name,
+            partial(RunCase, "particles", make=made(kind), precisions=kind.precisions),
+        )
         yield case(f"{name} on nodes", prepare=on_nodes)
         yield case(f"{name} on walls and in corners", prepare=on_walls)
-        yield case(f"all {name} at one point", prepare=put("position", (slice(None), slice(0, 2)), [0.21, 0.11]))
-        for where, bad in (("outside", 7.0), ("far outside", 1e30), ("just outside", -1e-3), ("at the far end", 1.0)):
-            yield case(f"{name} {where}", prepare=put("position", (5, 0), bad), expected=ended_with("outside the domain"))
+        yield case(
+            f"all {name} at one point",
+            prepare=put("position", (slice(None), slice(0, 2)), [0.21, 0.11]),
+        )
+        for where, bad in (
+            ("outside", 7.0),
+            ("far outside", 1e30),
+            ("just outside", -1e-3),
+            ("at the far end", 1.0),
+        ):
+            yield case(
+                f"{name} {where}",
+                prepare=put("position", (5, 0), bad),
+                expected=ended_with("outside the domain"),
+            )
         for bad in (np.nan, np.inf):
-            yield case(f"{name} at {bad}", prepare=put("position", (5, 0), bad), expected=ended_with("position"))
-            yield case(f"{name} of speed {bad}", prepare=put("velocity", (5, 0), bad), expected=ended_with("velocity"))
+            yield case(
+                f"{name} at {bad}",
+                prepare=put("position", (5, 0), bad),
+                expected=ended_with("position"),
+            )
+            yield case(
+                f"{name} of speed {bad}",
+                prepare=put("velocity", (5, 0), bad),
+                expected=ended_with("velocity"),
+            )
         yield case(f"{CROWD:.0e} of {name} in one cell", prepare=crowd(CROWD), steps=2)
     more = {"prepare": crowd(CROWDED), "steps": 1, "budget": 90.0, "precisions": ("mixed",)}
     yield RunCase("particles", f"{CROWDED:.0e} of liquid in one cell", made(liquid), **more)  # type: ignore[arg-type]
     weightless = made(liquid, **gravity(0.0, 0.0))
-    yield RunCase("particles", "10^6 in a cell that flies", weightless, prepare=crowd(CROWD, 1.0), check=flies, dt=1e-3, steps=2)
+    yield RunCase(
+        "particles",
+        "10^6 in a cell that flies",
+        weightless,
+        prepare=crowd(CROWD, 1.0),
+        check=flies,
+        dt=1e-3,
+        steps=2,
+    )
 
 
 def put(field: str, at: Any, value: Any) -> Callable[[ParticleSimulation], None]:
@@ -262,15 +363,22 @@ def on_walls(simulation: ParticleSimulation) -> None:
     right, top = np.array(simulation.scene.domain.size) - MARGIN * simulation.grid.spacing
     put("position", (slice(0, None, 3), 1), 0.0)(simulation)
     put("position", (slice(1, None, 3), 0), 0.0)(simulation)
-    put("position", (slice(0, 4), slice(0, 2)), [[0.0, 0.0], [right, 0.0], [0.0, top], [right, top]])(simulation)
+    put(
+        "position", (slice(0, 4), slice(0, 2)), [[0.0, 0.0], [right, 0.0], [0.0, top], [right, top]]
+    )(simulation)
 
 
 def crowd(count: int, speed: float = 0.0) -> Callable[[ParticleSimulation], None]:
     """Return what adds particles in one cell of the air, with a speed [m/s] along x."""
 
     def add(simulation: ParticleSimulation) -> None:
-        chance, position, velocity = np.random.default_rng(6007), *(np.zeros((count, 3), dtype=np.float32) for _ in range(2))
-        position[:, :2] = (np.array([11, 5]) + chance.random((count, 2), dtype=np.float32)) * simulation.grid.spacing
+        chance, position, velocity = (
+            np.random.default_rng(6007),
+            *(np.zeros((count, 3), dtype=np.float32) for _ in range(2)),
+        )
+        position[:, :2] = (
+            np.array([11, 5]) + chance.random((count, 2), dtype=np.float32)
+        ) * simulation.grid.spacing
         velocity[:, 0] = speed
         simulation.particles.append(position, velocity)
 
@@ -282,4 +390,8 @@ def flies(simulation: ParticleSimulation) -> list[str]:
     speeds = simulation.particles.velocity.numpy()[:, 0]
     fast = speeds[speeds > 0.5]
     wrong = abs(float(fast.mean(dtype=np.float64)) - 1.0) if len(fast) else 1.0
-    return [] if wrong <= 1e-3 and len(fast) >= CROWD else [f"a crowd of {len(fast)} has become {wrong:.1e} slower"]
+    return (
+        []
+        if wrong <= 1e-3 and len(fast) >= CROWD
+        else [f"a crowd of {len(fast)} has become {wrong:.1e} slower"]
+    )

@@ -9,8 +9,15 @@ from warp_lcp.benchmarks.harness.record import MACHINE, Record, read_json
 from warp_lcp.benchmarks.harness.timing import Figure
 
 ALLOWED = 0.25  # share of a ratio to a peer that may be lost
-# ratios of a peer's time to ours, of the same rounds: what is compared across states of the code and across machines
-TO_PEERS = ("pyamg_over_this", "over_engine", "over_ours", "over Numba product", "over Numba product, constant diagonal")
+# ratios of a peer's time to ours, of the same rounds: what is compared across states of the code
+# and across machines
+TO_PEERS = (
+    "pyamg_over_this",
+    "over_engine",
+    "over_ours",
+    "over Numba product",
+    "over Numba product, constant diagonal",
+)
 
 
 def bounds(old: Figure, new: Figure) -> tuple[float, float]:
@@ -19,7 +26,9 @@ def bounds(old: Figure, new: Figure) -> tuple[float, float]:
     return new_low / old_high, new_high / old_low
 
 
-def losses(old: Mapping[str, Record], new: Mapping[str, Record], allowed: float = ALLOWED) -> list[str]:
+def losses(
+    old: Mapping[str, Record], new: Mapping[str, Record], allowed: float = ALLOWED
+) -> list[str]:
     """Return the ratios to peers that fell by more than `allowed`, whatever samples of the two are taken; a line each."""
     found = []
     for name in (n for n in old if n in new):
@@ -27,7 +36,9 @@ def losses(old: Mapping[str, Record], new: Mapping[str, Record], allowed: float 
             before, after = old[name].figures[label], new[name].figures[label]
             low, high = bounds(before, after)
             if high < 1 - allowed:
-                found.append(f"{name}: {label} {before} fell to {after}, to [{low:.2f}, {high:.2f}] of it")
+                found.append(
+                    f"{name}: {label} {before} fell to {after}, to [{low:.2f}, {high:.2f}] of it"
+                )
     return found
 
 
@@ -38,12 +49,20 @@ def comparison(old: Path, new: Path) -> str:
         ValueError: a file is no result of a suite, or they have no figure in common.
     """
     before, after = read_json(old), read_json(new)
-    lines = [f"{'record':<72} {'figure':<18} {'old':>11} {'new':>11} {'new/old':>8}  {'noise':<17} change"]
+    lines = [
+        f"{'record':<72} {'figure':<18} {'old':>11} {'new':>11} {'new/old':>8}  {'noise':<17} "
+        "change"
+    ]
     for name in (n for n in before if n in after):
         figures = after[name].figures
         for label, figure in before[name].figures.items():
             other = figures.get(label)
-            if other is None or figure.value <= 0 or other.value <= 0 or (figure.low or figure.value) <= 0:
+            if (
+                other is None
+                or figure.value <= 0
+                or other.value <= 0
+                or (figure.low or figure.value) <= 0
+            ):
                 continue
             low, high = bounds(figure, other)
             ratio, noise = other.value / figure.value, f"[{low:.3f}, {high:.3f}]"
@@ -58,7 +77,10 @@ def comparison(old: Path, new: Path) -> str:
         lines.append(f"no ratio to a peer fell by more than {100 * ALLOWED:.0f} % beyond noise")
     machines = [_hardware(r) for r in (before, after)]
     if machines[0] != machines[1]:
-        lines.append(f"not the same machine: {machines[0]} and {machines[1]}; compare ratios to peers, not seconds")
+        lines.append(
+            f"not the same machine: {machines[0]} and {machines[1]}; compare ratios to peers, not "
+            "seconds"
+        )
     return "\n".join(lines)
 
 

@@ -49,14 +49,18 @@ def machine(device: str, *, elements: int = COPIED, repeat: int = 5) -> Record:
 def copy_bandwidth(device: str, elements: int, repeat: int) -> dict[str, Figure]:
     """Return GB/s of `wp.copy` and of NumPy's copy."""
     a, b = (wp.full(elements, 1.0, dtype=wp.float32, device=device) for _ in range(2))
-    x, y = (np.ones(elements, np.float32) for _ in range(2))  # zeros nobody wrote are one page, read from the cache
+    # zeros nobody wrote are one page, read from the cache
+    x, y = (np.ones(elements, np.float32) for _ in range(2))
 
     def warp_copy() -> None:
         wp.copy(b, a)
         wp.synchronize_device(device)
 
     times = in_turns({"copy": warp_copy, "numpy_copy": lambda: np.copyto(y, x)}, repeat)
-    return {name: Figure.of([8e-9 * elements / t for t in taken], "GB/s") for name, taken in times.items()}
+    return {
+        name: Figure.of([8e-9 * elements / t for t in taken], "GB/s")
+        for name, taken in times.items()
+    }
 
 
 def source_digest() -> str:
@@ -72,7 +76,11 @@ def source_digest() -> str:
 def cpu_model() -> str:
     """Return the processor's name."""
     path = Path("/proc/cpuinfo")
-    names = re.findall(r"model name\s*:\s*(.+)", path.read_text(encoding="utf-8")) if path.exists() else []
+    names = (
+        re.findall(r"model name\s*:\s*(.+)", path.read_text(encoding="utf-8"))
+        if path.exists()
+        else []
+    )
     return names[0] if names else platform.processor() or platform.machine()
 
 
@@ -90,7 +98,11 @@ def _version(name: str) -> str:
 
 def array_bytes() -> int:
     """Return the bytes of all Warp arrays alive, views and shared memory counted once; a slow search."""
-    spans = sorted((a.ptr, a.ptr + a.capacity) for a in gc.get_objects() if type(a) is wp.array and a.ptr and a.capacity)
+    spans = sorted(
+        (a.ptr, a.ptr + a.capacity)
+        for a in gc.get_objects()
+        if type(a) is wp.array and a.ptr and a.capacity
+    )
     total, end = 0, 0
     for first, last in spans:
         total += max(0, last - max(first, end))
@@ -102,7 +114,9 @@ def resident_bytes(*, peak: bool = False) -> int:
     """Return the process's resident memory now, or the most since `forget_peak`; 0 where the system does not tell."""
     if not STATUS.exists():
         return 0
-    found = re.search(rf"{'VmHWM' if peak else 'VmRSS'}:\s+(\d+) kB", STATUS.read_text(encoding="ascii"))
+    found = re.search(
+        rf"{'VmHWM' if peak else 'VmRSS'}:\s+(\d+) kB", STATUS.read_text(encoding="ascii")
+    )
     return 1024 * int(found[1]) if found else 0
 
 
@@ -110,7 +124,8 @@ def forget_peak() -> None:
     """Give freed memory back and let the peak begin again, where the system can."""
     gc.collect()
     if sys.platform == "linux":
-        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc keeps freed fields for the next ones
+        # glibc keeps freed fields for the next ones
+        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
         if trim is not None:
             trim(0)
     if CLEAR.exists():

@@ -83,7 +83,8 @@ class Results:
     records: list[Record]  # for the file
     tables: list[Table]  # for the report
     charts: list[Chart] = field(default_factory=list)  # to draw
-    failures: list[str] = field(default_factory=list)  # what is not as it must be, a line each; the suite then ends with an error
+    # what is not as it must be, a line each; the suite then ends with an error
+    failures: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -116,12 +117,18 @@ class Target:
 
 def table_of_targets(what: str, targets: Sequence[Target], remark: str = "") -> Table:
     """Return the table of figures to reach."""
-    return Table("Figures to reach", [what, "target", "measured", "met?"], [t.row() for t in targets], remark)
+    return Table(
+        "Figures to reach", [what, "target", "measured", "met?"], [t.row() for t in targets], remark
+    )
 
 
-def shown(record: Record, figures: Sequence[str], digits: str = ".3g", factor: float = 1.0) -> list[str]:
+def shown(
+    record: Record, figures: Sequence[str], digits: str = ".3g", factor: float = 1.0
+) -> list[str]:
     """Return figures' values as a table shows them, empty where there is none."""
-    return ["" if (v := record.value(name)) is None else f"{factor * v:{digits}}" for name in figures]
+    return [
+        "" if (v := record.value(name)) is None else f"{factor * v:{digits}}" for name in figures
+    ]
 
 
 def spread(figure: Figure, factor: float = 1.0, digits: str = ".1f") -> str:
@@ -131,7 +138,10 @@ def spread(figure: Figure, factor: float = 1.0, digits: str = ".1f") -> str:
 
 def write_json(path: Path, records: Sequence[Record]) -> None:
     """Write records as a JSON list, one a line."""
-    kept = [{"name": r.name, "figures": {k: f.as_dict() for k, f in r.figures.items()}, **r.facts} for r in records]
+    kept = [
+        {"name": r.name, "figures": {k: f.as_dict() for k, f in r.figures.items()}, **r.facts}
+        for r in records
+    ]
     path.write_text("[\n" + ",\n".join(map(json.dumps, kept)) + "\n]\n", encoding="utf-8")
 
 
@@ -144,6 +154,17 @@ def read_json(path: Path) -> dict[str, Record]:
     try:
         kept = json.loads(path.read_text(encoding="utf-8"))
         figures = [{k: Figure.from_dict(f) for k, f in r.pop("figures").items()} for r in kept]
-        return {name: Record(name, own, r) for r, own in zip(kept, figures, strict=True) if (name := r.pop("name"))}
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
+        return {
+            name: Record(name, own, r)
+            for r, own in zip(kept, figures, strict=True)
+            if (name := r.pop("name"))
+        }
+    except (
+        OSError,
+        UnicodeDecodeError,
+        json.JSONDecodeError,
+        KeyError,
+        TypeError,
+        AttributeError,
+    ) as error:
         raise ValueError(f"{path}: no results of a benchmark: {error}") from error

@@ -8,7 +8,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from warp_lcp.benchmarks.harness.machine import present
-from warp_lcp.benchmarks.harness.record import MACHINE, Bars, Chart, Lines, Panels, Record, Results, Table, write_json
+from warp_lcp.benchmarks.harness.record import (
+    MACHINE,
+    Bars,
+    Chart,
+    Lines,
+    Panels,
+    Record,
+    Results,
+    Table,
+    write_json,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,12 +38,22 @@ def write(name: str, title: str, results: Results, out: Path) -> list[str]:
     write_json(out / f"{name}.json", results.records)
     images = draw(results.charts, out, name)
     write_markdown(out / f"{name}.md", title, machine, results.tables, images)
-    return [*([] if present("matplotlib") else [NO_PLOTS]), f"wrote {out / name}.json, {name}.md and {len(images)} plots"]
+    return [
+        *([] if present("matplotlib") else [NO_PLOTS]),
+        f"wrote {out / name}.json, {name}.md and {len(images)} plots",
+    ]
 
 
-def write_markdown(path: Path, title: str, machine: Record, tables: Sequence[Table], images: Sequence[Path]) -> None:
+def write_markdown(
+    path: Path, title: str, machine: Record, tables: Sequence[Table], images: Sequence[Path]
+) -> None:
     """Write a report."""
-    lines = [f"# {title}", "", *(f"- {name}: {_text(value)}" for name, value in machine.facts.items()), ""]
+    lines = [
+        f"# {title}",
+        "",
+        *(f"- {name}: {_text(value)}" for name, value in machine.facts.items()),
+        "",
+    ]
     for table in tables:
         lines += [f"## {table.title}", "", *markdown(table), ""]
     lines += [f"![{image.stem}]({image.name})\n" for image in images]
@@ -51,7 +71,11 @@ def _row(cells: Sequence[str]) -> str:
 
 
 def _text(value: Any) -> str:
-    return ", ".join(f"{k} {v}" for k, v in value.items()) if isinstance(value, Mapping) else str(value)
+    return (
+        ", ".join(f"{k} {v}" for k, v in value.items())
+        if isinstance(value, Mapping)
+        else str(value)
+    )
 
 
 def draw(charts: Sequence[Chart], out: Path, prefix: str) -> list[Path]:
@@ -73,15 +97,19 @@ def draw(charts: Sequence[Chart], out: Path, prefix: str) -> list[Path]:
             canvas.set_size_inches(8, 5.3)
             axes = canvas.add_subplot()
             _lines(axes, chart)
-            beside = {"loc": "upper left", "bbox_to_anchor": (1.01, 1.0)} if len(chart.curves) >= CROWDED else {}
+            beside = (
+                {"loc": "upper left", "bbox_to_anchor": (1.01, 1.0)}
+                if len(chart.curves) >= CROWDED
+                else {}
+            )
             axes.legend(fontsize=7, **beside)
         canvas.suptitle(chart.title, fontsize=10)
         images.append(out / f"{prefix}-{chart.name}.png")
         with io.BytesIO() as drawn:
             canvas.savefig(drawn)
-            Image.open(drawn).convert("RGB").quantize(2 * SHADES if isinstance(chart, Panels) else SHADES).save(
-                images[-1], optimize=True
-            )  # a third of the bytes
+            Image.open(drawn).convert("RGB").quantize(
+                2 * SHADES if isinstance(chart, Panels) else SHADES
+            ).save(images[-1], optimize=True)  # a third of the bytes
     return images
 
 
@@ -102,7 +130,9 @@ def _panels(canvas: Any, chart: Panels) -> None:
     canvas.set_size_inches(PANEL[0] * chart.columns, PANEL[1] * rows + 0.6)
     names = list(dict.fromkeys(label for panel in chart.panels for label in panel.curves))
     shown: dict[str, Any] = {}
-    for axes, panel in zip(canvas.subplots(rows, chart.columns, squeeze=False).ravel(), chart.panels, strict=False):
+    for axes, panel in zip(
+        canvas.subplots(rows, chart.columns, squeeze=False).ravel(), chart.panels, strict=False
+    ):
         _lines(axes, panel, names)
         axes.set_title(panel.title, fontsize=8)
         axes.tick_params(labelsize=7)
@@ -110,8 +140,15 @@ def _panels(canvas: Any, chart: Panels) -> None:
         axes.yaxis.label.set_size(7)
         shown |= {line.get_label(): line for line in axes.lines}
     if any(names):
-        beside = int(PANEL[0] * chart.columns / (0.055 * max(map(len, names)) + 0.55))  # names of this many letters of 7 points, and lines
-        canvas.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=max(1, min(beside, len(names))), fontsize=7)
+        # names of this many letters of 7 points, and lines
+        beside = int(PANEL[0] * chart.columns / (0.055 * max(map(len, names)) + 0.55))
+        canvas.legend(
+            shown.values(),
+            shown.keys(),
+            loc="outside lower center",
+            ncols=max(1, min(beside, len(names))),
+            fontsize=7,
+        )
 
 
 def _lines(axes: Axes, chart: Lines, names: Sequence[str] = ()) -> None:
@@ -119,11 +156,26 @@ def _lines(axes: Axes, chart: Lines, names: Sequence[str] = ()) -> None:
     for number, (label, (x, y)) in enumerate(chart.curves.items()):
         place = names.index(label) if names else number
         if label in chart.marked:
-            axes.plot(x, y, marker="o", markersize=2 if names else None, linestyle="none", fillstyle="none", color="black", label=label)
+            axes.plot(
+                x,
+                y,
+                marker="o",
+                markersize=2 if names else None,
+                linestyle="none",
+                fillstyle="none",
+                color="black",
+                label=label,
+            )
             continue
         # wider the earlier, so that curves that coincide are all seen
-        color: Any = {"color": f"C{place % 10}", "linewidth": 3 - 2 * place / len(names)} if names else {}
+        color: Any = (
+            {"color": f"C{place % 10}", "linewidth": 3 - 2 * place / len(names)} if names else {}
+        )
         marker = "." if len(x) < (2 if names else MARKERS) else ""
-        axes.plot(x, y, marker=marker, linestyle=STYLES[place // 10 % len(STYLES)], label=label, **color)
-    axes.set(**{f"{axis}scale": "log" for axis in chart.log}, xlabel=chart.x_label, ylabel=chart.y_label)
+        axes.plot(
+            x, y, marker=marker, linestyle=STYLES[place // 10 % len(STYLES)], label=label, **color
+        )
+    axes.set(
+        **{f"{axis}scale": "log" for axis in chart.log}, xlabel=chart.x_label, ylabel=chart.y_label
+    )
     axes.grid(alpha=0.3)

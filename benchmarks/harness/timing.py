@@ -14,7 +14,8 @@ from unittest.mock import patch
 
 import warp as wp
 
-SHORTEST_SAMPLE = 2e-3  # [s]: a sample repeats shorter work up to this, clock and launch would show otherwise
+# [s]: a sample repeats shorter work up to this, clock and launch would show otherwise
+SHORTEST_SAMPLE = 2e-3
 
 
 @dataclass(frozen=True)
@@ -54,29 +55,44 @@ class Figure:
     @property
     def range(self) -> tuple[float, float]:
         """The smallest and the largest sample."""
-        return (self.value, self.value) if self.low is None or self.high is None else (self.low, self.high)
+        return (
+            (self.value, self.value)
+            if self.low is None or self.high is None
+            else (self.low, self.high)
+        )
 
     def as_dict(self) -> dict[str, float | int | str]:
         """Return what a file keeps."""
-        more = {} if self.low is None or self.high is None else {"min": self.low, "max": self.high, "samples": self.samples}
+        more = (
+            {}
+            if self.low is None or self.high is None
+            else {"min": self.low, "max": self.high, "samples": self.samples}
+        )
         return {"value": self.value, "unit": self.unit, **more}
 
     @staticmethod
     def from_dict(kept: Mapping[str, float | int | str]) -> Figure:
         """Return what a file keeps as a figure."""
         low, high = (float(kept[name]) if name in kept else None for name in ("min", "max"))
-        return Figure(float(kept["value"]), str(kept.get("unit", "")), low, high, int(kept.get("samples", 1)))
+        return Figure(
+            float(kept["value"]), str(kept.get("unit", "")), low, high, int(kept.get("samples", 1))
+        )
 
     def __str__(self) -> str:
         """Return the number with its range."""
         text = f"{self.value:.4g}{f' {self.unit}' if self.unit else ''}"
-        return text if self.low is None or self.samples == 1 else f"{text} ({self.low:.4g} to {self.high:.4g})"
+        return (
+            text
+            if self.low is None or self.samples == 1
+            else f"{text} ({self.low:.4g} to {self.high:.4g})"
+        )
 
 
 def in_turns(work: Mapping[str, Callable[[], object]], repeat: int) -> dict[str, list[float]]:
     """Return the seconds of each piece of work, `repeat` samples each, one of each in every round.
 
-    An unmeasured run comes before each sample, so that what fits into the caches is there for all, whatever ran before.
+    An unmeasured run comes before each sample, so that what fits into the caches is there for all,
+    whatever ran before.
     """
     times: dict[str, list[float]] = {name: [] for name in work}
     runs = {}
@@ -111,7 +127,9 @@ def clock(device: str) -> Callable[[], float]:
 
 
 @contextmanager
-def timed(device: str, functions: dict[str, tuple[ModuleType | type, str]]) -> Iterator[dict[str, list[float]]]:
+def timed(
+    device: str, functions: dict[str, tuple[ModuleType | type, str]]
+) -> Iterator[dict[str, list[float]]]:
     """Time every call of functions that callers look up in a module or a class.
 
     Args:

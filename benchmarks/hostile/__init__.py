@@ -44,9 +44,17 @@ def attempt(case: Case) -> Answer:
         while trace is not None and trace.tb_next is not None:
             trace = trace.tb_next
         file = trace.tb_frame.f_code.co_filename if trace is not None else ""
-        where = f" (raised in {file.rsplit('/', 1)[-1]}:{trace.tb_lineno})" if trace is not None and "warp_lcp" not in file else ""
+        where = (
+            f" (raised in {file.rsplit('/', 1)[-1]}:{trace.tb_lineno})"
+            if trace is not None and "warp_lcp" not in file
+            else ""
+        )
         refused = isinstance(error, ValueError) and not isinstance(error, np.linalg.LinAlgError)
-        return Answer("REFUSED" if refused else "EXCEPTION", None, f"{type(error).__name__}: {str(error)[:150]}{where}")
+        return Answer(
+            "REFUSED" if refused else "EXCEPTION",
+            None,
+            f"{type(error).__name__}: {str(error)[:150]}{where}",
+        )
 
 
 def examine(case: Case) -> tuple[Answer, Verdicts]:

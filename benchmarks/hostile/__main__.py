@@ -40,9 +40,13 @@ class Outcome:
 
 def main() -> None:
     """Run the kinds asked for, print a table and the faults."""
-    parser = argparse.ArgumentParser(prog="python -m warp_lcp.benchmarks.hostile", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m warp_lcp.benchmarks.hostile", description=__doc__
+    )
     parser.add_argument("--seed", type=int, required=True)
-    parser.add_argument("--count", type=int, default=78, help="cases of each kind; 78 make 1,014 solves")
+    parser.add_argument(
+        "--count", type=int, default=78, help="cases of each kind; 78 make 1,014 solves"
+    )
     parser.add_argument("--kinds", nargs="+", default=[], help="default: all")
     parser.add_argument("--index", type=int, help="solve only this case, in this process")
     parser.add_argument("--out", type=Path, help="folder for hostile.json and hostile.md")
@@ -65,7 +69,9 @@ def main() -> None:
         if given.out:  # after each kind, as a run may be interrupted
             given.out.mkdir(parents=True, exist_ok=True)
             (given.out / "hostile.md").write_text(report(outcomes, given.seed))
-            (given.out / "hostile.json").write_text(json.dumps([asdict(o) for o in outcomes], indent=1))
+            (given.out / "hostile.json").write_text(
+                json.dumps([asdict(o) for o in outcomes], indent=1)
+            )
     sys.stdout.write(report(outcomes, given.seed))
     sys.exit(1 if any(c in FAULTS for o in outcomes for c, _ in o.verdicts) else 0)
 
@@ -96,7 +102,15 @@ def _work(kind: str, seed: int, indices: range) -> None:
         for timer in (signal.ITIMER_PROF, signal.ITIMER_REAL):
             signal.setitimer(timer, 0.0)
         verdicts = judge(case, answer)
-        _write({"end": index, "name": case.name, "status": answer.status, "seconds": seconds, "verdicts": verdicts})
+        _write(
+            {
+                "end": index,
+                "name": case.name,
+                "status": answer.status,
+                "seconds": seconds,
+                "verdicts": verdicts,
+            }
+        )
 
 
 def _write(record: dict[str, Any]) -> None:
@@ -106,15 +120,36 @@ def _write(record: dict[str, Any]) -> None:
 
 def supervise(kind: str, seed: int, count: int) -> list[Outcome]:
     """Run workers until all cases of a kind have an outcome."""
-    environment = {"WARP_LCP_THREADS": "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", **os.environ}
+    environment = {
+        "WARP_LCP_THREADS": "1",
+        "OMP_NUM_THREADS": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+        **os.environ,
+    }
     outcomes: list[Outcome] = []
     while len(outcomes) < count:
         first = len(outcomes)
-        command = [sys.executable, "-m", "warp_lcp.benchmarks.hostile", "--worker", str(first), "--seed", str(seed), "--count", str(count)]
+        command = [
+            sys.executable,
+            "-m",
+            "warp_lcp.benchmarks.hostile",
+            "--worker",
+            str(first),
+            "--seed",
+            str(seed),
+            "--count",
+            str(count),
+        ]
         begun = ""
         with (
             tempfile.TemporaryFile("w+") as messages,
-            subprocess.Popen([*command, "--kinds", kind], stdout=subprocess.PIPE, stderr=messages, text=True, env=environment) as worker,
+            subprocess.Popen(
+                [*command, "--kinds", kind],
+                stdout=subprocess.PIPE,
+                stderr=messages,
+                text=True,
+                env=environment,
+            ) as worker,
         ):
             assert worker.stdout is not None
             for line in worker.stdout:
@@ -124,20 +159,40 @@ def supervise(kind: str, seed: int, count: int) -> list[Outcome]:
                 if "begin" in record:
                     begun = record["name"]
                     continue
-                outcomes.append(Outcome(kind, record["end"], record["name"], _late(record), record["seconds"]))
+                outcomes.append(
+                    Outcome(kind, record["end"], record["name"], _late(record), record["seconds"])
+                )
                 _tell(outcomes[-1], seed)
             messages.seek(0)
             told = messages.read()
         if len(outcomes) < count:  # the worker has died
-            category = "TIMEOUT" if -worker.returncode in (signal.SIGPROF, signal.SIGALRM) else "CRASH"
-            why = f"more than {LIMIT + GRACE:g} s" if category == "TIMEOUT" else f"exit {worker.returncode}: {told.strip()[-150:]}"
-            outcomes.append(Outcome(kind, len(outcomes), begun, [[category, why]], LIMIT + GRACE if category == "TIMEOUT" else 0.0))
+            category = (
+                "TIMEOUT" if -worker.returncode in (signal.SIGPROF, signal.SIGALRM) else "CRASH"
+            )
+            why = (
+                f"more than {LIMIT + GRACE:g} s"
+                if category == "TIMEOUT"
+                else f"exit {worker.returncode}: {told.strip()[-150:]}"
+            )
+            outcomes.append(
+                Outcome(
+                    kind,
+                    len(outcomes),
+                    begun,
+                    [[category, why]],
+                    LIMIT + GRACE if category == "TIMEOUT" else 0.0,
+                )
+            )
             _tell(outcomes[-1], seed)
     return outcomes
 
 
 def _late(record: dict[str, Any]) -> list[list[str]]:
-    late = [["TIMEOUT", f"{record['seconds']:.0f} s, {record['status']}"]] if record["seconds"] > LIMIT else []
+    late = (
+        [["TIMEOUT", f"{record['seconds']:.0f} s, {record['status']}"]]
+        if record["seconds"] > LIMIT
+        else []
+    )
     return [*record["verdicts"], *late]
 
 
@@ -149,7 +204,8 @@ def _tell(outcome: Outcome, seed: int) -> None:
 def fault_lines(outcomes: list[Outcome], seed: int, categories: tuple[str, ...]) -> list[str]:
     """Return a line for each verdict of the categories, with what repeats it."""
     return [
-        f"{category}: --kinds {o.kind} --seed {seed} --index {o.index}: {o.name} ({o.seconds:.1f} s): {' '.join(why.split())}"
+        f"{category}: --kinds {o.kind} --seed {seed} --index {o.index}: {o.name} ({o.seconds:.1f} "
+        f"s): {' '.join(why.split())}"
         for o in outcomes
         for category, why in o.verdicts
         if category in categories
@@ -159,13 +215,19 @@ def fault_lines(outcomes: list[Outcome], seed: int, categories: tuple[str, ...])
 def report(outcomes: list[Outcome], seed: int) -> str:
     """Return a page: a row a kind, then the faults and remarks."""
     kinds = list(dict.fromkeys(o.kind for o in outcomes))
-    lines = [f"# Hostile inputs, seed {seed}", "", f"| kind | {' | '.join(COLUMNS)} | slowest [s] |"]
+    lines = [
+        f"# Hostile inputs, seed {seed}",
+        "",
+        f"| kind | {' | '.join(COLUMNS)} | slowest [s] |",
+    ]
     lines.append("|---" * (len(COLUMNS) + 2) + "|")
     for kind in [*kinds, "all"]:
         chosen = [o for o in outcomes if kind in (o.kind, "all")]
         count = Counter(category for o in chosen for category, _ in o.verdicts)
         cells = [str(len(chosen)), *(str(count[column] or "") for column in COLUMNS[1:])]
-        lines.append(f"| {kind} | " + " | ".join(cells) + f" | {max(o.seconds for o in chosen):.1f} |")
+        lines.append(
+            f"| {kind} | " + " | ".join(cells) + f" | {max(o.seconds for o in chosen):.1f} |"
+        )
     for title, categories in (("Faults", FAULTS), ("Remarks", REMARKS)):
         found = fault_lines(outcomes, seed, categories)
         lines += ["", f"## {title}: {len(found)}", "", *(f"- {line}" for line in found)]

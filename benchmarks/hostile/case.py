@@ -20,7 +20,13 @@ from warp_lcp.problem.protocol import families
 Bounds = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 CONVERGED, INFEASIBLE, REFUSED, EXCEPTION = "CONVERGED", "INFEASIBLE", "REFUSED", "EXCEPTION"
 # Methods that take any matrix, or refuse it in a ValueError, which is no fault.
-NAMED = tuple(sorted(name for name, cls in wl.METHODS.items() if "dense" in families(cls) and name != "direct-enumeration"))
+NAMED = tuple(
+    sorted(
+        name
+        for name, cls in wl.METHODS.items()
+        if "dense" in families(cls) and name != "direct-enumeration"
+    )
+)
 GRID_METHODS = ("projected-multigrid", "minimum-map-newton", "mprgp", "psor", "interior-point")
 
 
@@ -163,7 +169,9 @@ def box_case(
     method = str(rng.choice(named)) if rng.random() < share else None
     entry = "solve"
     if entries and operator is None and x0 is None and box.affine is None:
-        entry = str(rng.choice(["solve", "linear_complementarity", "command line"], p=[0.86, 0.125, 0.015]))
+        entry = str(
+            rng.choice(["solve", "linear_complementarity", "command line"], p=[0.86, 0.125, 0.015])
+        )
 
     def field_of(values: Any) -> Any:
         if shape is None or unknowns is None or np.ndim(values) == 0:
@@ -176,42 +184,81 @@ def box_case(
         A = box.A if operator is None else operator()
         low, high = (box.lower, box.upper) if bounds is None else bounds
         if entry == "linear_complementarity":
-            found = wl.linear_complementarity(A, box.b, bounds=(low, high), tol=box.rtol, method=method)
+            found = wl.linear_complementarity(
+                A, box.b, bounds=(low, high), tol=box.rtol, method=method
+            )
             return Answer(found.result.status.name, np.asarray(found.x).ravel(), found.message)
         if entry == "command line":
             return command_line(A, box.b, low, high, box.rtol, method)
         problem = wl.LCP(A, field_of(box.b), field_of(low), field_of(high))
         stopping = wl.StoppingCriteria(rtol=box.rtol, max_iterations=1000 if method else 100)
         solver = wl.METHODS[method]() if method else None
-        result = wl.solve(problem, solver, stopping=stopping, x0=None if x0 is None else field_of(x0))
+        result = wl.solve(
+            problem, solver, stopping=stopping, x0=None if x0 is None else field_of(x0)
+        )
         x = result.x.numpy().astype(np.float64).ravel()
         note = f"{result.iterations} steps, relative residual {result.relative_residual:.1e}"
         return Answer(result.status.name, x if unknowns is None else x[unknowns], note)
 
     via = "" if entry == "solve" else f", by {entry}"
-    return Case(f"{name}, n={len(box.b)}, rtol {box.rtol:g}, {method or 'default'}{via}", solve, box, method)
+    return Case(
+        f"{name}, n={len(box.b)}, rtol {box.rtol:g}, {method or 'default'}{via}", solve, box, method
+    )
 
 
-def command_line(A: Any, b: np.ndarray, lower: Any, upper: Any, rtol: float, method: str | None) -> Answer:
+def command_line(
+    A: Any, b: np.ndarray, lower: Any, upper: Any, rtol: float, method: str | None
+) -> Answer:
     """Solve by `warp-lcp solve` from Matrix Market files."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for label, array in (("A", A), ("b", b), ("l", lower), ("u", upper)):
             column = np.broadcast_to(array, np.shape(b)).reshape(-1, 1) if label != "A" else array
-            text = scipy.sparse.coo_array(column) if scipy.sparse.issparse(column) else np.asarray(column)
+            text = (
+                scipy.sparse.coo_array(column)
+                if scipy.sparse.issparse(column)
+                else np.asarray(column)
+            )
             scipy.io.mmwrite(folder / f"{label}.mtx", text, precision=17)
-        command = [sys.executable, "-m", "warp_lcp.cli.commands", "solve", "A.mtx", "b.mtx", "--lower", "l.mtx", "--upper", "u.mtx"]
-        command += ["--tolerance", f"{rtol:g}", "--out", "x.mtx", "--device", "cpu"] + (["--method", method] if method else [])
-        code = f"import sys; sys.argv = {['warp-lcp', *command[3:]]!r}; from warp_lcp.cli.commands import main; main()"
-        run = subprocess.run([sys.executable, "-c", code], cwd=folder, env=_environment(), capture_output=True, text=True, check=False)
+        command = [
+            sys.executable,
+            "-m",
+            "warp_lcp.cli.commands",
+            "solve",
+            "A.mtx",
+            "b.mtx",
+            "--lower",
+            "l.mtx",
+            "--upper",
+            "u.mtx",
+        ]
+        command += ["--tolerance", f"{rtol:g}", "--out", "x.mtx", "--device", "cpu"] + (
+            ["--method", method] if method else []
+        )
+        code = (
+            f"import sys; sys.argv = {['warp-lcp', *command[3:]]!r}; from warp_lcp.cli.commands "
+            "import main; main()"
+        )
+        run = subprocess.run(
+            [sys.executable, "-c", code],
+            cwd=folder,
+            env=_environment(),
+            capture_output=True,
+            text=True,
+            check=False,
+        )
         told = f"{run.stdout}\n{run.stderr}".strip()
         if run.returncode == 0 and (folder / "x.mtx").exists():
-            return Answer(CONVERGED, np.asarray(scipy.io.mmread(folder / "x.mtx")).ravel(), told[-200:])
+            return Answer(
+                CONVERGED, np.asarray(scipy.io.mmread(folder / "x.mtx")).ravel(), told[-200:]
+            )
         if run.returncode == 2:
             return Answer(REFUSED, None, told[-200:])
         if run.returncode != 1 or "Traceback" in told:
             return Answer(EXCEPTION, None, f"exit code {run.returncode}: {told[-200:]}")
-        status = next((s.name for s in wl.SolveStatus if s.name in told and s.name != CONVERGED), "FAILED")
+        status = next(
+            (s.name for s in wl.SolveStatus if s.name in told and s.name != CONVERGED), "FAILED"
+        )
         return Answer(status, None, told[-200:])
 
 

@@ -17,18 +17,28 @@ Rng = np.random.Generator
 
 def _cells(rng: Rng, most: int = 14, solid: float = 0.2) -> np.ndarray:
     """Return cells in 2-D or 3-D with AIR and SOLID in random places, at least one FLUID."""
-    shape = tuple(int(k) for k in rng.integers(1, most if rng.random() < 0.7 else max(2, most // 2), rng.integers(2, 4)))
+    shape = tuple(
+        int(k)
+        for k in rng.integers(
+            1, most if rng.random() < 0.7 else max(2, most // 2), rng.integers(2, 4)
+        )
+    )
     shape = shape if len(shape) == 2 else tuple(max(1, k // 2) for k in shape)
     air = rng.choice([0.0, 0.1, 0.3])
-    cells = rng.choice([draw.AIR, draw.FLUID, draw.SOLID], size=shape, p=[air, 1 - air - solid, solid])
+    cells = rng.choice(
+        [draw.AIR, draw.FLUID, draw.SOLID], size=shape, p=[air, 1 - air - solid, solid]
+    )
     cells.flat[rng.integers(cells.size)] = draw.FLUID
     return cells
 
 
-def _coefficients(rng: Rng, cells: np.ndarray, *, symmetric: bool, spread: float, margin: float, periodic: Any) -> dict[Any, Any]:
+def _coefficients(
+    rng: Rng, cells: np.ndarray, *, symmetric: bool, spread: float, margin: float, periodic: Any
+) -> dict[Any, Any]:
     """Return a_o <= 0 by offset, arrays; the center makes every row dominant by `margin`, whatever its neighbors are.
 
-    Symmetric: a_o(i) = a_-o(i + o) between cells, while a coefficient that belongs to a closed or outer side is its own.
+    Symmetric: a_o(i) = a_-o(i + o) between cells, while a coefficient that belongs to a closed or
+    outer side is its own.
     """
     names = draw.offsets(cells.ndim, axes=bool(rng.random() < 0.4))
     a: dict[Any, Any] = {o: -(10 ** rng.uniform(-spread, 0, cells.shape)) for o in names}
@@ -40,7 +50,8 @@ def _coefficients(rng: Rng, cells: np.ndarray, *, symmetric: bool, spread: float
                     if there is not None and cells[cell] == cells[there] == draw.FLUID:
                         a[tuple(-k for k in o)][there] = a[o][cell]
     center = sum(-values for values in a.values()) if a else np.ones(cells.shape)
-    # A closed side adds a_o < 0 to the diagonal, so the row's sum is that of the center and all sides.
+    # A closed side adds a_o < 0 to the diagonal, so the row's sum is that of the center and all
+    # sides.
     a[(0,) * cells.ndim] = center * (1 + margin)
     return a
 
@@ -50,20 +61,44 @@ def solid(rng: Rng) -> Case:
     cells, symmetric = _cells(rng), bool(rng.random() < 0.6)
     periodic = tuple(bool(p) for p in rng.random(3) < 0.15)
     periodic = (periodic[0], periodic[1], periodic[2] and cells.ndim == 3)
-    # Periodic axes of one or two cells couple a pair twice, which the symmetric drawing does not know.
-    symmetric &= not any(p and cells.shape[cells.ndim - 1 - axis] < 3 for axis, p in enumerate(periodic))
+    # Periodic axes of one or two cells couple a pair twice, which the symmetric drawing does not
+    # know.
+    symmetric &= not any(
+        p and cells.shape[cells.ndim - 1 - axis] < 3 for axis, p in enumerate(periodic)
+    )
     outside = int(rng.choice([draw.SOLID, draw.AIR]))
-    a = _coefficients(rng, cells, symmetric=symmetric, spread=rng.choice([0.5, 2.0]), margin=rng.choice([0.01, 0.3]), periodic=periodic)
+    a = _coefficients(
+        rng,
+        cells,
+        symmetric=symmetric,
+        spread=rng.choice([0.5, 2.0]),
+        margin=rng.choice([0.01, 0.3]),
+        periodic=periodic,
+    )
     shift = rng.uniform(0, 2, cells.shape) if rng.random() < 0.5 else None
-    name = f"stencil {'x'.join(map(str, cells.shape))}, {'' if symmetric else 'un'}symmetric, outside {outside}, periodic {periodic}"
+    name = (
+        f"stencil {'x'.join(map(str, cells.shape))}, {'' if symmetric else 'un'}symmetric, "
+        f"outside {outside}, periodic {periodic}"
+    )
     matrix = draw.stencil_matrix(cells, a, shift, periodic, outside)
 
     def operator() -> Any:
-        return wl.Stencil(cells, a, shift=shift, periodic=periodic, outside=outside, device="cpu", dtype=wp.float64)
+        return wl.Stencil(
+            cells,
+            a,
+            shift=shift,
+            periodic=periodic,
+            outside=outside,
+            device="cpu",
+            dtype=wp.float64,
+        )
 
     F = np.flatnonzero(cells.ravel() == draw.FLUID)
     if rng.random() < 0.4:
-        x, border = rng.standard_normal(cells.shape), rng.standard_normal([k + 2 for k in cells.shape])
+        x, border = (
+            rng.standard_normal(cells.shape),
+            rng.standard_normal([k + 2 for k in cells.shape]),
+        )
         inside = tuple(slice(1, -1) for _ in cells.shape)
         fluid = (cells == draw.FLUID).astype(float)
         expected = {
@@ -74,17 +109,44 @@ def solid(rng: Rng) -> Case:
 
         def parts() -> Answer:
             A = operator()
-            found = {"A x": A.apply(wp.array(x * fluid, dtype=wp.float64, device="cpu")), "diagonal": A.diagonal()}
+            found = {
+                "A x": A.apply(wp.array(x * fluid, dtype=wp.float64, device="cpu")),
+                "diagonal": A.diagonal(),
+            }
             found["boundary term"] = A.boundary_term(border)
             assert border[inside].shape == cells.shape
-            return Answer("CONVERGED", None, "", {k: v.numpy().ravel()[F].astype(float) for k, v in found.items()})
+            return Answer(
+                "CONVERGED",
+                None,
+                "",
+                {k: v.numpy().ravel()[F].astype(float) for k, v in found.items()},
+            )
 
         return Case(f"{name}, its parts", parts, Values(expected, 1e-12))
     A = matrix[F][:, F].tocsr()
     kind, low, high = draw.bounds(rng, len(F))
     x, b = draw.plant(rng, A, low, high)
-    box = Box(A=A, b=b, lower=low, upper=high, rtol=draw.tolerance(rng), solution=x, unique=True, solvable=True, grid=True)
-    return box_case(rng, f"{name}, {kind} bounds", box, operator=operator, shape=cells.shape, unknowns=F, named=GRID_METHODS, share=0.3)
+    box = Box(
+        A=A,
+        b=b,
+        lower=low,
+        upper=high,
+        rtol=draw.tolerance(rng),
+        solution=x,
+        unique=True,
+        solvable=True,
+        grid=True,
+    )
+    return box_case(
+        rng,
+        f"{name}, {kind} bounds",
+        box,
+        operator=operator,
+        shape=cells.shape,
+        unknowns=F,
+        named=GRID_METHODS,
+        share=0.3,
+    )
 
 
 def periodic(rng: Rng) -> Case:
@@ -93,20 +155,48 @@ def periodic(rng: Rng) -> Case:
     if kind == "faces":
         return _faces(rng)
     if kind == "dominant":
-        shape = (draw.size(rng, 3, 70), draw.size(rng, 3, 70)) if rng.random() < 0.8 else tuple(draw.size(rng, 2, 12) for _ in range(3))
+        shape = (
+            (draw.size(rng, 3, 70), draw.size(rng, 3, 70))
+            if rng.random() < 0.8
+            else tuple(draw.size(rng, 2, 12) for _ in range(3))
+        )
         cells, sides = np.ones(shape, int), (False, False, False)
         spread = rng.uniform(1, 6)
-        a = _coefficients(rng, cells, symmetric=False, spread=spread, margin=10 ** rng.uniform(-4, -1), periodic=sides)
+        a = _coefficients(
+            rng,
+            cells,
+            symmetric=False,
+            spread=spread,
+            margin=10 ** rng.uniform(-4, -1),
+            periodic=sides,
+        )
         A = draw.stencil_matrix(cells, a, None, sides, draw.AIR)
         bound, low, high = draw.bounds(rng, cells.size, str(rng.choice(["none", "lower", "box"])))
         x, b = draw.plant(rng, A, low, high)
-        box = Box(A=A, b=b, lower=low, upper=high, rtol=float(rng.choice([1e-6, 1e-8])), solution=x, unique=True, solvable=True, grid=True)
-        name = f"dominant stencil {'x'.join(map(str, shape))} over {spread:.1f} decades, {bound} bounds"
+        box = Box(
+            A=A,
+            b=b,
+            lower=low,
+            upper=high,
+            rtol=float(rng.choice([1e-6, 1e-8])),
+            solution=x,
+            unique=True,
+            solvable=True,
+            grid=True,
+        )
+        name = (
+            f"dominant stencil {'x'.join(map(str, shape))} over {spread:.1f} decades, {bound} "
+            "bounds"
+        )
         return _stencil_case(rng, name, box, cells, a, sides, draw.AIR)
     three = rng.random() < 0.2
     shape = tuple(draw.size(rng, 3, 9 if three else 48) for _ in range(3 if three else 2))
     cells, sides = np.ones(shape, int), (True, True, three)
-    a = {o: -float(rng.integers(1, 4)) for o in draw.offsets(len(shape), axes=bool(rng.random() < 0.5)) if o > (0,) * len(shape)}
+    a = {
+        o: -float(rng.integers(1, 4))
+        for o in draw.offsets(len(shape), axes=bool(rng.random() < 0.5))
+        if o > (0,) * len(shape)
+    }
     a |= {tuple(-k for k in o): value for o, value in list(a.items())}
     a[(0,) * len(shape)] = -sum(a.values())
     A = draw.stencil_matrix(cells, a, None, sides, draw.SOLID)
@@ -117,19 +207,43 @@ def periodic(rng: Rng) -> Case:
     if not solvable:
         b = b - b.mean() - 10 ** rng.uniform(-3, 0)
     solution = x if solvable else None
-    box = Box(A=A, b=b, lower=low, upper=high, rtol=1e-6, solution=solution, solvable=solvable, definite=True, grid=True)
-    name = f"periodic stencil {'x'.join(map(str, shape))}, {bound} bounds, {'planted' if solvable else 'incompatible'}"
+    box = Box(
+        A=A,
+        b=b,
+        lower=low,
+        upper=high,
+        rtol=1e-6,
+        solution=solution,
+        solvable=solvable,
+        definite=True,
+        grid=True,
+    )
+    name = (
+        f"periodic stencil {'x'.join(map(str, shape))}, {bound} bounds, "
+        f"{'planted' if solvable else 'incompatible'}"
+    )
     return _stencil_case(rng, name, box, cells, a, sides, draw.SOLID)
 
 
-def _stencil_case(rng: Rng, name: str, box: Box, cells: np.ndarray, a: Any, sides: Any, outside: int) -> Case:
+def _stencil_case(
+    rng: Rng, name: str, box: Box, cells: np.ndarray, a: Any, sides: Any, outside: int
+) -> Case:
     """Return a case whose cells are all FLUID."""
 
     def operator() -> Any:
         return _stencil(cells, a, sides, outside)
 
     every = np.arange(cells.size)
-    return box_case(rng, name, box, operator=operator, shape=cells.shape, unknowns=every, named=GRID_METHODS, share=0.2)
+    return box_case(
+        rng,
+        name,
+        box,
+        operator=operator,
+        shape=cells.shape,
+        unknowns=every,
+        named=GRID_METHODS,
+        share=0.2,
+    )
 
 
 def _stencil(cells: Any, a: Any, sides: Any, outside: int) -> Any:
@@ -142,12 +256,19 @@ def _faces(rng: Rng) -> Case:
     cells = rng.choice([draw.AIR, draw.FLUID, draw.SOLID], size=shape, p=[0.05, 0.9, 0.05])
     cells[0] = draw.AIR
     cells[1, 0] = draw.FLUID
-    fx, fy = 10 ** rng.uniform(-2, 0, (shape[0], shape[1] + 1)), 10 ** rng.uniform(-2, 0, (shape[0] + 1, shape[1]))
+    fx, fy = (
+        10 ** rng.uniform(-2, 0, (shape[0], shape[1] + 1)),
+        10 ** rng.uniform(-2, 0, (shape[0] + 1, shape[1])),
+    )
     double = bool(rng.random() < 0.5)
     pairs = []
     for j, i in np.ndindex(shape):
         for dj, di, c in ((0, 1, fx[j, i + 1]), (1, 0, fy[j + 1, i])):
-            if j + dj < shape[0] and i + di < shape[1] and draw.SOLID not in (cells[j, i], cells[j + dj, i + di]):
+            if (
+                j + dj < shape[0]
+                and i + di < shape[1]
+                and draw.SOLID not in (cells[j, i], cells[j + dj, i + di])
+            ):
                 pairs.append((j * shape[1] + i, (j + dj) * shape[1] + i + di, c))
     tails, heads, weights = (np.array(column) for column in zip(*pairs, strict=True))
     F = np.flatnonzero(cells.ravel() == draw.FLUID)
@@ -159,13 +280,30 @@ def _faces(rng: Rng) -> Case:
     x, b = draw.plant(rng, A, low, high)
     rtol = float(rng.choice([1e-6, 1e-8, 1e-10]))
     storage = 0.0 if double else 1.2e-7
-    box = Box(A=A, b=b, lower=low, upper=high, rtol=rtol, solution=x, solvable=True, definite=True, grid=True, storage=storage)
+    box = Box(
+        A=A,
+        b=b,
+        lower=low,
+        upper=high,
+        rtol=rtol,
+        solution=x,
+        solvable=True,
+        definite=True,
+        grid=True,
+        storage=storage,
+    )
 
     def operator() -> Any:
-        return wl.GridPoisson(cells, face_x=fx, face_y=fy, device="cpu", **({"dtype": wp.float64} if double else {}))
+        return wl.GridPoisson(
+            cells, face_x=fx, face_y=fy, device="cpu", **({"dtype": wp.float64} if double else {})
+        )
 
-    name = f"grid {shape[0]}x{shape[1]}, {kind} bounds, {'float64' if double else 'default storage'}"
-    return box_case(rng, name, box, operator=operator, shape=shape, unknowns=F, named=GRID_METHODS, share=0.2)
+    name = (
+        f"grid {shape[0]}x{shape[1]}, {kind} bounds, {'float64' if double else 'default storage'}"
+    )
+    return box_case(
+        rng, name, box, operator=operator, shape=shape, unknowns=F, named=GRID_METHODS, share=0.2
+    )
 
 
 def gradients(rng: Rng) -> Case:
@@ -174,12 +312,20 @@ def gradients(rng: Rng) -> Case:
     if kind == "stencil":
         cells, sides = _cells(rng, 9, solid=0.25), (False, False, False)
         outside = int(rng.choice([draw.SOLID, draw.AIR]))
-        a = _coefficients(rng, cells, symmetric=bool(rng.random() < 0.4), spread=1.0, margin=0.3, periodic=sides)
+        a = _coefficients(
+            rng, cells, symmetric=bool(rng.random() < 0.4), spread=1.0, margin=0.3, periodic=sides
+        )
         F = np.flatnonzero(cells.ravel() == draw.FLUID)
         A: Any = draw.stencil_matrix(cells, a, None, sides, outside)[F][:, F].tocsr()
     else:
         A = draw.positive(rng, draw.size(rng, 1, 60))[1]
-        A = A.toarray() if kind == "dense" and sp.issparse(A) else sp.csr_array(A) if kind == "sparse" else A
+        A = (
+            A.toarray()
+            if kind == "dense" and sp.issparse(A)
+            else sp.csr_array(A)
+            if kind == "sparse"
+            else A
+        )
         F, cells = np.arange(A.shape[0]), np.ones(A.shape[0], int)
     n = len(F)
     bound, low, high = draw.bounds(rng, n)
@@ -188,12 +334,19 @@ def gradients(rng: Rng) -> Case:
     free = (x > low) & (x < high)
     y = A @ x + b
     held_low, held_high = (x == low) & (low < high), (x == high) & (low < high)
-    b += np.where(held_low & (np.abs(y) < 1e-9), 0.5, 0.0) - np.where(held_high & (np.abs(y) < 1e-9), 0.5, 0.0)  # no degenerate rows
+    # no degenerate rows
+    b += np.where(held_low & (np.abs(y) < 1e-9), 0.5, 0.0) - np.where(
+        held_high & (np.abs(y) < 1e-9), 0.5, 0.0
+    )
     g = rng.standard_normal(n)
     D, mu = (A.toarray() if sp.issparse(A) else A), np.zeros(n)
     mu[free] = -np.linalg.solve(D[np.ix_(free, free)].T, g[free])  # A_FF' mu_F = -g_F
     slope = g + D.T @ mu
-    expected = {"b": mu, "lower": np.where(held_low, slope, 0.0), "upper": np.where(held_high, slope, 0.0)}
+    expected = {
+        "b": mu,
+        "lower": np.where(held_low, slope, 0.0),
+        "upper": np.where(held_high, slope, 0.0),
+    }
     if kind == "dense":
         expected["matrix"] = np.outer(mu, x).ravel()
     if kind == "stencil":
@@ -211,7 +364,10 @@ def gradients(rng: Rng) -> Case:
             operator = _stencil(cells, a, sides, outside)
         elif kind == "operator":
             operator = wl.LinearOperator(lambda v: D @ v, (n,), transpose=lambda v: D.T @ v)
-        result = wl.solve(wl.LCP(operator, field_of(b), field_of(low), field_of(high)), stopping=wl.StoppingCriteria(rtol=1e-11))
+        result = wl.solve(
+            wl.LCP(operator, field_of(b), field_of(low), field_of(high)),
+            stopping=wl.StoppingCriteria(rtol=1e-11),
+        )
         if not result:
             return Answer(result.status.name, None, "the problem's own solve")
         try:
@@ -222,14 +378,19 @@ def gradients(rng: Rng) -> Case:
         if kind == "dense":
             values["matrix"] = found.coefficients["matrix"].numpy().ravel()
         if kind == "stencil":
-            values |= {f"coefficient {o}": v.numpy().ravel()[F] for o, v in found.coefficients["coefficients"].items()}
+            values |= {
+                f"coefficient {o}": v.numpy().ravel()[F]
+                for o, v in found.coefficients["coefficients"].items()
+            }
         return Answer("CONVERGED", result.x.numpy().ravel()[F], "", values)
 
     name = f"gradients of a {kind} problem, n={n}, {free.sum()} free, {bound} bounds"
     return Case(name, solve, Values(expected, max(1e-6, 1e-8 * condition)))
 
 
-def _by_offset(cells: np.ndarray, a: Any, F: np.ndarray, mu: np.ndarray, x: np.ndarray, outside: int) -> dict[str, np.ndarray]:
+def _by_offset(
+    cells: np.ndarray, a: Any, F: np.ndarray, mu: np.ndarray, x: np.ndarray, outside: int
+) -> dict[str, np.ndarray]:
     """Return mu_i x_(i + o), or mu_i x_i where that neighbor is SOLID."""
     fields = np.zeros((2, cells.size))
     fields[:, F] = mu, x
@@ -240,6 +401,8 @@ def _by_offset(cells: np.ndarray, a: Any, F: np.ndarray, mu: np.ndarray, x: np.n
         for cell in zip(*np.nonzero(cells == draw.FLUID), strict=True):
             there = draw.neighbor(cell, o, cells.shape, (False, False, False))
             kind = outside if there is None else cells[there]
-            part[cell] = m[cell] * (v[cell] if kind == draw.SOLID else v[there] if kind == draw.FLUID else 0.0)
+            part[cell] = m[cell] * (
+                v[cell] if kind == draw.SOLID else v[there] if kind == draw.FLUID else 0.0
+            )
         found[f"coefficient {o}"] = part.ravel()[F]
     return found

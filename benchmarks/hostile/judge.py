@@ -10,7 +10,18 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.optimize import linprog
 
-from warp_lcp.benchmarks.hostile.case import CONVERGED, EXCEPTION, INFEASIBLE, REFUSED, Answer, Box, Case, Program, Refusal, Values
+from warp_lcp.benchmarks.hostile.case import (
+    CONVERGED,
+    EXCEPTION,
+    INFEASIBLE,
+    REFUSED,
+    Answer,
+    Box,
+    Case,
+    Program,
+    Refusal,
+    Values,
+)
 
 EPS = np.finfo(np.float64).eps
 HIDDEN = 1e-3  # a row violated by more than this share of its own terms is hidden by others
@@ -41,14 +52,19 @@ def _refusal(truth: Refusal, answer: Answer) -> Verdicts:
 def _values(truth: Values, answer: Answer) -> Verdicts:
     if answer.status != CONVERGED:
         return [("not solved", f"{answer.status}: {answer.note}")]
-    magnitude = max((float(np.abs(e).max(initial=0.0)) for e in truth.expected.values()), default=0.0)
+    magnitude = max(
+        (float(np.abs(e).max(initial=0.0)) for e in truth.expected.values()), default=0.0
+    )
     for name, expected in truth.expected.items():
         if name not in answer.values:
             return [("FALSE CONVERGED", f"{name} is missing")]
         error = float(np.abs(answer.values[name] - expected).max(initial=0.0))
-        largest = max(float(np.abs(expected).max(initial=0.0)), 1e-3 * magnitude, 1e-9)  # some may be 0
+        # some may be 0
+        largest = max(float(np.abs(expected).max(initial=0.0)), 1e-3 * magnitude, 1e-9)
         if not error <= truth.tolerance * largest:
-            return [("FALSE CONVERGED", f"{name} is off by {error / largest:.1e} of its largest entry")]
+            return [
+                ("FALSE CONVERGED", f"{name} is off by {error / largest:.1e} of its largest entry")
+            ]
     return [("converged", "")]
 
 
@@ -103,18 +119,44 @@ def _converged(box: Box, x: np.ndarray, note: str) -> Verdicts:
     r, first = residual(box, x, d), float(np.linalg.norm(residual(box, start, d)))
     size, (low, high) = terms(box, x), box.bounds(x)
     # What rounding may leave: of y_i, or of d_i (x_i - l_i) where the bound holds x_i.
-    at_bound = d * (np.abs(x) + np.where(np.isfinite(low), np.abs(low), 0) + np.where(np.isfinite(high), np.abs(high), 0))
-    rounding = 8 * EPS * np.where(np.abs(r) == np.abs(box.A @ x + box.b), size, at_bound) + box.storage * size
+    at_bound = d * (
+        np.abs(x)
+        + np.where(np.isfinite(low), np.abs(low), 0)
+        + np.where(np.isfinite(high), np.abs(high), 0)
+    )
+    rounding = (
+        8 * EPS * np.where(np.abs(r) == np.abs(box.A @ x + box.b), size, at_bound)
+        + box.storage * size
+    )
     # A_ii is unique; Ruiz's limit depends on the order of its updates, by factors up to about 4.
     slack = 1.05 if box.grid or box.definite else 10.0
-    norm, allowed = float(np.linalg.norm(r)), slack * box.rtol * first + float(np.linalg.norm(rounding))
+    norm, allowed = (
+        float(np.linalg.norm(r)),
+        slack * box.rtol * first + float(np.linalg.norm(rounding)),
+    )
     if not norm <= allowed:
-        return [("FALSE CONVERGED", f"residual {norm:.1e}, allowed {allowed:.1e} (rtol times {first:.1e}); {note}")]
+        return [
+            (
+                "FALSE CONVERGED",
+                f"residual {norm:.1e}, allowed {allowed:.1e} (rtol times {first:.1e}); {note}",
+            )
+        ]
     verdicts = [("converged", "")]
     share = np.abs(r) / np.where(size > 0, size, 1.0)
     worst = int(np.argmax(np.where((box.b != 0) & (np.abs(r) > rounding), share, 0.0)))
-    if box.rtol <= 1e-6 and box.b[worst] != 0 and share[worst] > HIDDEN and abs(r[worst]) > rounding[worst]:
-        verdicts.append(("row hidden", f"row {worst}: {share[worst]:.1e} of its terms {size[worst]:.1e}, start {first:.1e}"))
+    if (
+        box.rtol <= 1e-6
+        and box.b[worst] != 0
+        and share[worst] > HIDDEN
+        and abs(r[worst]) > rounding[worst]
+    ):
+        verdicts.append(
+            (
+                "row hidden",
+                f"row {worst}: {share[worst]:.1e} of its terms {size[worst]:.1e}, start "
+                f"{first:.1e}",
+            )
+        )
     far = _far(box, x, d)
     return [*verdicts, ("suspicious", far)] if far else verdicts
 
@@ -128,9 +170,15 @@ def _far(box: Box, x: np.ndarray, d: np.ndarray) -> str:
     A = box.A.toarray() if sp.issparse(box.A) else box.A
     root = np.sqrt(d)
     condition = float(np.linalg.cond(A / root[:, None] / root))
-    error = float(np.linalg.norm(root * (x - box.solution))) / max(float(np.linalg.norm(root * box.solution)), 1e-300)
+    error = float(np.linalg.norm(root * (x - box.solution))) / max(
+        float(np.linalg.norm(root * box.solution)), 1e-300
+    )
     allowed = 100 * condition * max(box.rtol, EPS, box.storage)
-    return f"{error:.1e} from the solution, condition {condition:.1e}" if allowed < 0.5 and error > allowed else ""
+    return (
+        f"{error:.1e} from the solution, condition {condition:.1e}"
+        if allowed < 0.5 and error > allowed
+        else ""
+    )
 
 
 def _infeasible(box: Box) -> Verdicts:
@@ -141,14 +189,18 @@ def _infeasible(box: Box) -> Verdicts:
     found = exists(box)
     if found is None:
         return [("infeasible unproved", "neither proved nor disproved")]
-    return [("FALSE INFEASIBLE", "an oracle finds a solution")] if found else [("infeasible right", "")]
+    return (
+        [("FALSE INFEASIBLE", "an oracle finds a solution")]
+        if found
+        else [("infeasible right", "")]
+    )
 
 
 def exists(box: Box) -> bool | None:
     """Return whether a solution exists; None where no oracle knows.
 
-    A solution has l <= x <= u, y_i >= 0 where u_i is infinite and y_i <= 0 where l_i is. If A is monotone, an x that
-    meets these inequalities is enough. Small problems are enumerated.
+    A solution has l <= x <= u, y_i >= 0 where u_i is infinite and y_i <= 0 where l_i is. If A is
+    monotone, an x that meets these inequalities is enough. Small problems are enumerated.
     """
     if box.affine is not None:
         return None
@@ -166,14 +218,25 @@ def exists(box: Box) -> bool | None:
 def _linear_program(box: Box) -> bool | None:
     A, n = sp.csr_array(box.A), len(box.b)
     rows = np.maximum(abs(A).max(axis=1).toarray().ravel(), np.abs(box.b))
-    A, b = sp.diags_array(1 / np.where(rows > 0, rows, 1.0)) @ A, box.b / np.where(rows > 0, rows, 1.0)
+    A, b = (
+        sp.diags_array(1 / np.where(rows > 0, rows, 1.0)) @ A,
+        box.b / np.where(rows > 0, rows, 1.0),
+    )
     above, below = ~np.isfinite(box.upper), ~np.isfinite(box.lower)
     limits = np.column_stack((box.lower, box.upper))
     rows_of = sp.vstack([-A[above], A[below]]) if above.any() or below.any() else None
     sides = np.r_[b[above], -b[below]]
-    found = linprog(np.zeros(n), A_ub=rows_of, b_ub=sides if rows_of is not None else None, bounds=limits, options={"time_limit": 20.0})
+    found = linprog(
+        np.zeros(n),
+        A_ub=rows_of,
+        b_ub=sides if rows_of is not None else None,
+        bounds=limits,
+        options={"time_limit": 20.0},
+    )
     if found.status == 0 and rows_of is not None:
-        excess = (rows_of @ found.x - sides) / (np.abs(sides) + abs(rows_of) @ np.abs(found.x) + 1e-300)
+        excess = (rows_of @ found.x - sides) / (
+            np.abs(sides) + abs(rows_of) @ np.abs(found.x) + 1e-300
+        )
         return True if excess.max(initial=0.0) < 1e-9 else None
     return {0: True, 2: False}.get(found.status)
 
@@ -210,7 +273,11 @@ def reference(program: Program) -> np.ndarray | None:
         if solution.found and solution.x is not None:
             first = solution.x if first is None else first
             values.append(_cost(program.plain, solution.x)[0])
-    return first if len(values) == 2 and abs(values[0] - values[1]) <= 1e-5 * (1 + abs(values[0])) else None
+    return (
+        first
+        if len(values) == 2 and abs(values[0] - values[1]) <= 1e-5 * (1 + abs(values[0]))
+        else None
+    )
 
 
 def _cost(p: Any, x: np.ndarray) -> tuple[float, float]:
@@ -226,12 +293,24 @@ def violation(p: Any, x: np.ndarray) -> float:
         if M is not None:
             M = sp.csr_array(np.atleast_2d(M)) if not sp.issparse(M) else sp.csr_array(M)
             excess, size = M @ x - side, np.abs(side) + abs(M) @ np.abs(x)
-            excess, size = (np.abs(excess) if equal else excess)[np.isfinite(side)], size[np.isfinite(side)]
+            excess, size = (
+                (np.abs(excess) if equal else excess)[np.isfinite(side)],
+                size[np.isfinite(side)],
+            )
             worst = max(worst, float((excess / np.where(size > 0, size, 1.0)).max(initial=0.0)))
     for side, sign in ((p.lb, 1.0), (p.ub, -1.0)):
         if side is not None:
             finite = np.isfinite(side)
-            worst = max(worst, float((sign * (side - x)[finite] / (1e-3 + np.abs(side[finite]) + np.abs(x[finite]))).max(initial=0.0)))
+            worst = max(
+                worst,
+                float(
+                    (
+                        sign
+                        * (side - x)[finite]
+                        / (1e-3 + np.abs(side[finite]) + np.abs(x[finite]))
+                    ).max(initial=0.0)
+                ),
+            )
     return worst
 
 
@@ -255,8 +334,16 @@ def _program(truth: Program, answer: Answer) -> Verdicts:
             return [("FALSE CONVERGED", f"cost {cost:.6g}, least {least:.6g}")]
         error = float(np.abs(x - best).max() / max(np.abs(best).max(), 1e-3))
         if truth.unique and error > 1e-5:
-            return [("FALSE CONVERGED" if error > 1e-2 else "converged", ""), ("suspicious", f"x is off by {error:.1e}")]
+            return [
+                ("FALSE CONVERGED" if error > 1e-2 else "converged", ""),
+                ("suspicious", f"x is off by {error:.1e}"),
+            ]
         return [("converged", "")]
     if truth.expected == "solvable":
-        return [("FALSE INFEASIBLE" if answer.status == INFEASIBLE else "not solved", f"{answer.status}: {answer.note}")]
+        return [
+            (
+                "FALSE INFEASIBLE" if answer.status == INFEASIBLE else "not solved",
+                f"{answer.status}: {answer.note}",
+            )
+        ]
     return [("infeasible right" if answer.status == INFEASIBLE else "honest", answer.status)]

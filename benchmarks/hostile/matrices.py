@@ -23,7 +23,8 @@ def rows(rng: Rng) -> Case:
     n, definite = A.shape[0], what not in ("definite plus skew", "M-matrix")
     kind, low, high = draw.bounds(rng, n, str(rng.choice(["lower", "box", "mixed"])))
     x, b = draw.plant(rng, A, low, high)
-    large = 10 ** (rng.uniform(8, 16) if rng.random() < 0.5 else rng.uniform(15, 18))  # 1 / eps and beyond hides rows
+    # 1 / eps and beyond hides rows
+    large = 10 ** (rng.uniform(8, 16) if rng.random() < 0.5 else rng.uniform(15, 18))
     way = str(rng.choice(["inactive", "inactive", "units", "symmetric units", "start"]))
     some = np.flatnonzero((x == low) | (x == high))
     x0 = None
@@ -39,27 +40,67 @@ def rows(rng: Rng) -> Case:
         s = 10 ** rng.uniform(-np.log10(large) / 4, np.log10(large) / 4, n)
         A, b, x, low, high = draw.scaled(A, s, s), s * b, x / s, low / s, high / s
     elif way == "start":
-        x0 = np.clip(x + rng.standard_normal(n) * 10 ** rng.uniform(-6, 6, n), np.maximum(low, -1e12), np.minimum(high, 1e12))
+        x0 = np.clip(
+            x + rng.standard_normal(n) * 10 ** rng.uniform(-6, 6, n),
+            np.maximum(low, -1e12),
+            np.minimum(high, 1e12),
+        )
         if len(some):
-            b[some[0]] += large if x[some[0]] == low[some[0]] and low[some[0]] < high[some[0]] else 0.0
-    box = Box(A=A, b=b, lower=low, upper=high, rtol=draw.tolerance(rng), solution=x, unique=True, solvable=True, definite=definite)
+            b[some[0]] += (
+                large if x[some[0]] == low[some[0]] and low[some[0]] < high[some[0]] else 0.0
+            )
+    box = Box(
+        A=A,
+        b=b,
+        lower=low,
+        upper=high,
+        rtol=draw.tolerance(rng),
+        solution=x,
+        unique=True,
+        solvable=True,
+        definite=definite,
+    )
     return box_case(rng, f"{what}, {kind} bounds, {way} {large:.0e}", box, x0=x0)
 
 
 def singular(rng: Rng) -> Case:
     """Draw a singular system or LCP: compatible up to rounding, or incompatible by a margin."""
     n = draw.size(rng, 2, 800)
-    kind = str(rng.choice(["path", "cycle", "plane", "periodic plane", "graph", "Reynolds", "low rank", "chain of states"]))
+    kind = str(
+        rng.choice(
+            [
+                "path",
+                "cycle",
+                "plane",
+                "periodic plane",
+                "graph",
+                "Reynolds",
+                "low rank",
+                "chain of states",
+            ]
+        )
+    )
     if kind == "Reynolds":
         return _reynolds(rng)
     if kind in ("path", "cycle"):
         A: Any = draw.laplacian(rng, max(n, 3), weighted=rng.random() < 0.5, cycle=kind == "cycle")
     elif kind in ("plane", "periodic plane"):
         side = max(3, int(n**0.5))
-        A = draw.plane_laplacian((side, side + int(rng.integers(0, 4))), rng, periodic=kind != "plane", spread=rng.choice([0.0, 1.0]))
+        A = draw.plane_laplacian(
+            (side, side + int(rng.integers(0, 4))),
+            rng,
+            periodic=kind != "plane",
+            spread=rng.choice([0.0, 1.0]),
+        )
     elif kind == "graph":
-        tails, heads = rng.integers(0, n, 2 * n), rng.integers(0, n, 2 * n)  # often of several components, or with empty rows
-        A = draw.graph_laplacian(n, tails[tails != heads], heads[tails != heads], rng.uniform(0.1, 10, (tails != heads).sum()))
+        # often of several components, or with empty rows
+        tails, heads = rng.integers(0, n, 2 * n), rng.integers(0, n, 2 * n)
+        A = draw.graph_laplacian(
+            n,
+            tails[tails != heads],
+            heads[tails != heads],
+            rng.uniform(0.1, 10, (tails != heads).sum()),
+        )
     elif kind == "chain of states":  # A = I - P' of a Markov chain: unsymmetric, singular, 1'A = 0
         n = min(n, 200)
         P = rng.random((n, n)) * (rng.random((n, n)) < 0.2) + np.eye(n, k=1) + np.eye(n, k=1 - n)
@@ -75,12 +116,24 @@ def singular(rng: Rng) -> Case:
     _, low, high = draw.bounds(rng, n, bound)
     x, b = draw.plant(rng, A, low, high)
     solvable: bool | None = True
-    if kind not in ("low rank", "graph") and rng.random() < 0.4:  # 1'y = 1'b: for equations 1'b = 0, for x >= 0 1'b >= 0
+    # 1'y = 1'b: for equations 1'b = 0, for x >= 0 1'b >= 0
+    if kind not in ("low rank", "graph") and rng.random() < 0.4:
         b = b - b.mean() - 10 ** rng.uniform(-3, 1) * np.abs(b).mean() - 1e-3
         solvable = False if bound in ("none", "lower") else None
     solution = x if solvable else None
-    box = Box(A=A, b=b, lower=low, upper=high, rtol=draw.tolerance(rng), solution=solution, solvable=solvable, definite=definite)
-    return box_case(rng, f"{kind}, {bound} bounds, {'planted' if solvable else 'incompatible'}", box, share=0.3)
+    box = Box(
+        A=A,
+        b=b,
+        lower=low,
+        upper=high,
+        rtol=draw.tolerance(rng),
+        solution=solution,
+        solvable=solvable,
+        definite=definite,
+    )
+    return box_case(
+        rng, f"{kind}, {bound} bounds, {'planted' if solvable else 'incompatible'}", box, share=0.3
+    )
 
 
 def _reynolds(rng: Rng) -> Case:
@@ -92,7 +145,15 @@ def _reynolds(rng: Rng) -> Case:
     b = np.roll(h, -1) - np.roll(h, 1)
     b -= b.mean() if rng.random() < 0.7 else 0.0
     low = np.full(n, rng.choice([0.0, -np.inf], p=[0.8, 0.2]))
-    box = Box(A=A, b=b, lower=low, upper=np.full(n, np.inf), rtol=draw.tolerance(rng), solvable=True, definite=True)
+    box = Box(
+        A=A,
+        b=b,
+        lower=low,
+        upper=np.full(n, np.inf),
+        rtol=draw.tolerance(rng),
+        solvable=True,
+        definite=True,
+    )
     return box_case(rng, f"Reynolds, eccentricity {e}", box, share=0.3)
 
 
@@ -113,15 +174,27 @@ def narrow(rng: Rng) -> Case:
         A = D @ D + rng.choice([0.0, 1.0]) * D if bandwidth == 2 else D @ D @ D
         A = A + foundation * sp.eye_array(n) if n > 2000 else A
     symmetric = bandwidth > 1 or not np.any(wind)
-    load = rng.uniform(5, 60) * np.sin(rng.uniform(1, 30) * t + rng.uniform(0, 6)) - rng.uniform(-10, 15)
+    load = rng.uniform(5, 60) * np.sin(rng.uniform(1, 30) * t + rng.uniform(0, 6)) - rng.uniform(
+        -10, 15
+    )
     b = load / (n + 1) ** (2 * bandwidth) if n <= 2000 or bandwidth == 1 else load * foundation
     low = np.full(n, -np.inf) if rng.random() < 0.1 else np.zeros(n)
     high = np.full(n, np.inf)
     for _ in range(int(rng.integers(0, 4))):
         high[np.abs(t - rng.random()) < rng.uniform(0.01, 0.3)] = 10 ** rng.uniform(-2.5, 0)
-    box = Box(A=A.tocsr(), b=b, lower=low, upper=high, rtol=float(rng.choice([1e-6, 1e-8])), solvable=True, definite=symmetric)
+    box = Box(
+        A=A.tocsr(),
+        b=b,
+        lower=low,
+        upper=high,
+        rtol=float(rng.choice([1e-6, 1e-8])),
+        solvable=True,
+        definite=symmetric,
+    )
     named = ("minimum-map-newton", "interior-point", "primal-dual-active-set", "mprgp", "lemke")
-    name = f"bandwidth {bandwidth}{'' if symmetric else ' with wind'}, {np.isfinite(high).sum()} upper"
+    name = (
+        f"bandwidth {bandwidth}{'' if symmetric else ' with wind'}, {np.isfinite(high).sum()} upper"
+    )
     return box_case(rng, name, box, named=named, share=0.15)
 
 
@@ -129,7 +202,15 @@ def sign(rng: Rng) -> Case:
     """Draw a matrix with its sign flipped, wholly or in a few rows or entries."""
     n = draw.size(rng, 1, 600)
     what, A = draw.definite(rng, n) if rng.random() < 0.8 else draw.positive(rng, n)
-    n, way = A.shape[0], str(rng.choice(["-M", "negative diagonal", "flipped rows", "a wrong entry"], p=[0.6, 0.15, 0.15, 0.1]))
+    n, way = (
+        A.shape[0],
+        str(
+            rng.choice(
+                ["-M", "negative diagonal", "flipped rows", "a wrong entry"],
+                p=[0.6, 0.15, 0.15, 0.1],
+            )
+        ),
+    )
     kind, low, high = draw.bounds(rng, n)
     b = rng.choice([-np.ones(n), rng.standard_normal(n), np.ones(n)])
     some = rng.choice(n, size=max(1, n // 20), replace=False)
@@ -155,7 +236,14 @@ def friction(rng: Rng) -> Case:
     from warp_lcp.gallery.contact_models import BoxedModel, StewartTrinkleModel
     from warp_lcp.gallery.contact_scenes import SCENES
 
-    named = ("psor", "nncg", "subspace-minimization", "blocked-gauss-seidel", "projected-jacobi", "staggering")
+    named = (
+        "psor",
+        "nncg",
+        "subspace-minimization",
+        "blocked-gauss-seidel",
+        "projected-jacobi",
+        "staggering",
+    )
     rtol = float(rng.choice([1e-6, 1e-4]))
     if rng.random() < 0.25:
         k = draw.size(rng, 1, 40)
@@ -168,25 +256,60 @@ def friction(rng: Rng) -> Case:
         low, high = wl.AffineBounds.friction(normal, mu)
     else:
         scene = str(rng.choice(sorted(SCENES)))
-        count = int(rng.integers(2, {"wall": 5, "leaning-wall": 4, "gear-pyramid": 4, "heavy-on-light": 4}.get(scene, 9)))
+        count = int(
+            rng.integers(
+                2,
+                {"wall": 5, "leaning-wall": 4, "gear-pyramid": 4, "heavy-on-light": 4}.get(
+                    scene, 9
+                ),
+            )
+        )
         count = 2 * (count // 2) + 3 if "snake" in scene else count  # an odd number of links
         ratio = {"ratio": float(10 ** rng.uniform(0, 6))} if scene == "heavy-on-light" else {}
-        system = SCENES[scene](count, seed=int(rng.integers(1, 10_000)), **ratio).assemble(10 ** rng.uniform(-3, -1.5)).system
+        system = (
+            SCENES[scene](count, seed=int(rng.integers(1, 10_000)), **ratio)
+            .assemble(10 ** rng.uniform(-3, -1.5))
+            .system
+        )
         if len(system.q) == 0:
             return friction(rng)
-        model = BoxedModel() if rng.random() < 0.75 or len(system.q) > 300 else StewartTrinkleModel(4)
+        model = (
+            BoxedModel() if rng.random() < 0.75 or len(system.q) > 300 else StewartTrinkleModel(4)
+        )
         given = model.problem(system)
-        name, system_A, system_b, low, high = f"{given.name}", given.A, np.asarray(given.b), given.lower, given.upper
+        name, system_A, system_b, low, high = (
+            f"{given.name}",
+            given.A,
+            np.asarray(given.b),
+            given.lower,
+            given.upper,
+        )
     n = len(system_b)
     if not isinstance(low, wl.AffineBounds) and not isinstance(high, wl.AffineBounds):
         plain = [np.broadcast_to(np.asarray(side, dtype=float), n).copy() for side in (low, high)]
-        box = Box(A=system_A, b=system_b, lower=plain[0], upper=plain[1], rtol=rtol, solvable=True)  # (Anitescu, Potra)
-        return box_case(rng, name, box, named=("lemke", "fischer-newton", "interior-point", "minimum-map-newton"), share=0.4)
+        # (Anitescu, Potra)
+        box = Box(A=system_A, b=system_b, lower=plain[0], upper=plain[1], rtol=rtol, solvable=True)
+        return box_case(
+            rng,
+            name,
+            box,
+            named=("lemke", "fischer-newton", "interior-point", "minimum-map-newton"),
+            share=0.4,
+        )
 
     def sides(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return _side(low, x), _side(high, x)
 
-    box = Box(A=system_A, b=system_b, lower=np.zeros(n), upper=np.zeros(n), rtol=rtol, solvable=True, definite=True, affine=sides)
+    box = Box(
+        A=system_A,
+        b=system_b,
+        lower=np.zeros(n),
+        upper=np.zeros(n),
+        rtol=rtol,
+        solvable=True,
+        definite=True,
+        affine=sides,
+    )
     return box_case(rng, name, box, named=named, bounds=(low, high), share=0.3)
 
 
@@ -195,7 +318,10 @@ def _side(side: Any, x: np.ndarray) -> np.ndarray:
     if not isinstance(side, wl.AffineBounds):
         return np.broadcast_to(np.asarray(side, dtype=float), x.shape)
     index = np.broadcast_to(np.asarray(side.index), x.shape).astype(int)
-    constant, slope = np.broadcast_to(side.constant, x.shape), np.broadcast_to(side.coefficient, x.shape)
+    constant, slope = (
+        np.broadcast_to(side.constant, x.shape),
+        np.broadcast_to(side.coefficient, x.shape),
+    )
     return constant + np.where(index < 0, 0.0, slope * x[np.maximum(index, 0)])
 
 
@@ -203,15 +329,44 @@ def malformed(rng: Rng) -> Case:
     """Draw sparse matrices whose arrays contradict each other, singular blocks, or unusual but valid types."""
     n = draw.size(rng, 3, 600)
     M = (sp.random_array((n, n), density=min(1.0, 5 / n), rng=rng) + 10 * sp.eye_array(n)).tocsr()
-    way = str(rng.choice(["indices", "negative", "indptr", "lengths", "values", "type", "block", "block", "block", "valid", "valid"]))
+    way = str(
+        rng.choice(
+            [
+                "indices",
+                "negative",
+                "indptr",
+                "lengths",
+                "values",
+                "type",
+                "block",
+                "block",
+                "block",
+                "valid",
+                "valid",
+            ]
+        )
+    )
     if way == "block":
         return _singular_block(rng, n)
     if way == "valid":
         low, high = np.zeros(n), np.full(n, np.inf)
         x, b = draw.plant(rng, M, low, high)
-        form = str(rng.choice(["coo", "csc", "duplicates", "int64", "float32", "dia", "unsorted", "bsr"]))
-        box = Box(A=M, b=b, lower=low, upper=high, solution=x, unique=True, solvable=True, storage=6e-8 if form == "float32" else 0.0)
-        return box_case(rng, f"valid matrix as {form}", box, operator=lambda: _form(M, form), share=0.3)
+        form = str(
+            rng.choice(["coo", "csc", "duplicates", "int64", "float32", "dia", "unsorted", "bsr"])
+        )
+        box = Box(
+            A=M,
+            b=b,
+            lower=low,
+            upper=high,
+            solution=x,
+            unique=True,
+            solvable=True,
+            storage=6e-8 if form == "float32" else 0.0,
+        )
+        return box_case(
+            rng, f"valid matrix as {form}", box, operator=lambda: _form(M, form), share=0.3
+        )
     k = int(rng.integers(0, M.nnz))
     if way == "indices":
         M.indices[k] = int(rng.choice([n, 2 * n, 2_000_000, 2**31 - 1]))
@@ -226,7 +381,11 @@ def malformed(rng: Rng) -> Case:
     else:
         M = M.astype(complex)
     if rng.random() < 0.3:  # a COO array has no indptr and no lengths to contradict
-        M = _as_coo(M) if way in ("indices", "negative", "values") and rng.random() < 0.5 else _as_csc(M)
+        M = (
+            _as_coo(M)
+            if way in ("indices", "negative", "values") and rng.random() < 0.5
+            else _as_csc(M)
+        )
     method = None if rng.random() < 0.6 else str(rng.choice(NAMED))
     wrapped = rng.random() < 0.5
 
@@ -235,7 +394,12 @@ def malformed(rng: Rng) -> Case:
         result = wl.solve(wl.LCP(A, -np.ones(n)), wl.METHODS[method]() if method else None)
         return Answer(result.status.name, result.x.numpy())
 
-    return Case(f"malformed {M.format} matrix, n={n}: {way}, {method or 'default'}", solve, Refusal(f"{way} of a malformed matrix"), None)
+    return Case(
+        f"malformed {M.format} matrix, n={n}: {way}, {method or 'default'}",
+        solve,
+        Refusal(f"{way} of a malformed matrix"),
+        None,
+    )
 
 
 def _as_coo(M: Any) -> Any:
@@ -261,7 +425,9 @@ def _form(M: Any, form: str) -> Any:
     N = M.copy()
     if form == "duplicates":  # every entry in two halves
         C = M.tocoo()
-        return sp.coo_array((np.r_[C.data, C.data] / 2, (np.r_[C.row, C.row], np.r_[C.col, C.col])), shape=M.shape)
+        return sp.coo_array(
+            (np.r_[C.data, C.data] / 2, (np.r_[C.row, C.row], np.r_[C.col, C.col])), shape=M.shape
+        )
     if form == "int64":
         N.indices, N.indptr = N.indices.astype(np.int64), N.indptr.astype(np.int64)
     elif form == "float32":
@@ -291,12 +457,19 @@ def _singular_block(rng: Rng, n: int) -> Case:
     kind, low, high = draw.bounds(rng, n)
     x, b = draw.plant(rng, A, low, high)
     box = Box(A=A, b=b, lower=low, upper=high, solution=x, solvable=True, definite=symmetric)
-    return box_case(rng, f"{'symmetric' if symmetric else 'unsymmetric'} singular blocks, {kind} bounds", box, share=0.4)
+    return box_case(
+        rng,
+        f"{'symmetric' if symmetric else 'unsymmetric'} singular blocks, {kind} bounds",
+        box,
+        share=0.4,
+    )
 
 
 def odd(rng: Rng) -> Case:
     """Draw what else users bring: buffers, functions, empty rows, stacks of masses, cycles, SciPy's lists of pairs."""
-    way = str(rng.choice(["buffer", "operator", "empty row", "stack", "cycle", "pairs", "read-only"]))
+    way = str(
+        rng.choice(["buffer", "operator", "empty row", "stack", "cycle", "pairs", "read-only"])
+    )
     n = draw.size(rng, 2, 120)
     what, A = draw.definite(rng, n)
     n, definite = A.shape[0], True
@@ -306,12 +479,21 @@ def odd(rng: Rng) -> Case:
         if rng.random() < 0.5:  # one heavy body on top of light ones
             mass = np.r_[np.ones(n), 10 ** rng.uniform(2, 8)]
         J = np.eye(n, n + 1) - np.eye(n, n + 1, k=1)
-        A, low, high, kind, what = (J / mass) @ J.T, np.zeros(n), np.full(n, np.inf), "lower", "stack of masses"
+        A, low, high, kind, what = (
+            (J / mass) @ J.T,
+            np.zeros(n),
+            np.full(n, np.inf),
+            "lower",
+            "stack of masses",
+        )
         A = sp.csr_array(A) if rng.random() < 0.4 else A
     elif way == "cycle":
         n = draw.size(rng, 3, 3000)
         delta = 10 ** rng.uniform(-7, -1)
-        A = sp.csr_array((np.r_[np.ones(n), np.full(n, delta - 1)], (np.r_[:n, :n], np.r_[:n, np.r_[1:n, 0]])), shape=(n, n))
+        A = sp.csr_array(
+            (np.r_[np.ones(n), np.full(n, delta - 1)], (np.r_[:n, :n], np.r_[:n, np.r_[1:n, 0]])),
+            shape=(n, n),
+        )
         (kind, low, high), what, definite = draw.bounds(rng, n), f"I - (1 - {delta:.0e}) S", False
     x, b = draw.plant(rng, A, low, high)
     if way == "empty row":
@@ -322,8 +504,22 @@ def odd(rng: Rng) -> Case:
         x, b = draw.plant(rng, A, low, high)
         b[free] = 0.0
     unique = way != "empty row"
-    box = Box(A=A, b=b, lower=low, upper=high, rtol=draw.tolerance(rng), solution=x, unique=unique, solvable=True, definite=definite)
-    box = replace(box, monotone=True, largest=1e6 * max(1.0, np.abs(x).max()) if way == "empty row" else np.inf)
+    box = Box(
+        A=A,
+        b=b,
+        lower=low,
+        upper=high,
+        rtol=draw.tolerance(rng),
+        solution=x,
+        unique=unique,
+        solvable=True,
+        definite=definite,
+    )
+    box = replace(
+        box,
+        monotone=True,
+        largest=1e6 * max(1.0, np.abs(x).max()) if way == "empty row" else np.inf,
+    )
     name = f"{way}, {what}, {kind} bounds"
     if way in ("buffer", "operator"):
         return box_case(rng, name, box, operator=lambda: _operator(A, way == "buffer"), share=0.3)
@@ -342,7 +538,11 @@ def _operator(A: Any, buffer: bool) -> Any:
         out[:] = A @ x
         return out
 
-    return wl.LinearOperator(multiply, (A.shape[0],), symmetric=True) if buffer else aslinearoperator(A)
+    return (
+        wl.LinearOperator(multiply, (A.shape[0],), symmetric=True)
+        if buffer
+        else aslinearoperator(A)
+    )
 
 
 def _frozen(A: Any) -> Any:

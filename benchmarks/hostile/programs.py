@@ -24,11 +24,39 @@ def infinity(rng: Rng) -> Case:
     kind, low, high = draw.bounds(rng, n)
     x, b = draw.plant(rng, A, low, high)
     written = rng.choice(INFINITIES, size=2, p=[0.35, 0.35, 0.1, 0.1, 0.1])
-    given = np.where(np.isfinite(low), low, -written[0]), np.where(np.isfinite(high), high, written[1])
+    given = (
+        np.where(np.isfinite(low), low, -written[0]),
+        np.where(np.isfinite(high), high, written[1]),
+    )
     definite = what not in ("definite plus skew", "M-matrix")
-    box = Box(A=A, b=b, lower=low, upper=high, rtol=draw.tolerance(rng), solution=x, unique=True, solvable=True, definite=definite)
-    named = ("lemke", "fischer-newton", "interior-point", "quadratic-program", "minimum-map-newton", "psor", "mprgp")
-    return box_case(rng, f"{what}, {kind} bounds, infinity {written[0]:g}, {written[1]:g}", box, bounds=given, named=named, share=0.5)
+    box = Box(
+        A=A,
+        b=b,
+        lower=low,
+        upper=high,
+        rtol=draw.tolerance(rng),
+        solution=x,
+        unique=True,
+        solvable=True,
+        definite=definite,
+    )
+    named = (
+        "lemke",
+        "fischer-newton",
+        "interior-point",
+        "quadratic-program",
+        "minimum-map-newton",
+        "psor",
+        "mprgp",
+    )
+    return box_case(
+        rng,
+        f"{what}, {kind} bounds, infinity {written[0]:g}, {written[1]:g}",
+        box,
+        bounds=given,
+        named=named,
+        share=0.5,
+    )
 
 
 def programs(rng: Rng) -> Case:
@@ -45,20 +73,37 @@ def program(rng: Rng, scale: float) -> Case:
     F = rng.standard_normal((n, max(rank, 1))) / n**0.5 * (rank > 0)
     P = F @ F.T + (0.1 * np.eye(n) if rank == n else 0.0)
     inside = rng.standard_normal(n)
-    rows, equations = (int(rng.integers(0, 2 * n + 1)), int(rng.integers(0, n // 2 + 1))) if rng.random() < 0.85 else (0, 0)
+    rows, equations = (
+        (int(rng.integers(0, 2 * n + 1)), int(rng.integers(0, n // 2 + 1)))
+        if rng.random() < 0.85
+        else (0, 0)
+    )
     G, A = rng.standard_normal((rows, n)), rng.standard_normal((equations, n))
     h = G @ inside + rng.uniform(0, 1, rows) * (rng.random(rows) < 0.8)
-    q = P @ rng.standard_normal(n) + (rng.random(rows) < 0.2) @ -G  # bounded below: q in range(P) - cone(G')
-    lb, ub = (inside - rng.uniform(0, 2, n), inside + rng.uniform(0, 2, n)) if rng.random() < 0.5 else (None, None)
+    # bounded below: q in range(P) - cone(G')
+    q = P @ rng.standard_normal(n) + (rng.random(rows) < 0.2) @ -G
+    lb, ub = (
+        (inside - rng.uniform(0, 2, n), inside + rng.uniform(0, 2, n))
+        if rng.random() < 0.5
+        else (None, None)
+    )
     expected = "solvable"
     draw_of = rng.random()
     if draw_of < 0.12 and rows:
         G, h = np.vstack([G, -G[:1]]), np.r_[h, -h[:1] - rng.choice([1e-3, 1.0])]
         expected, rows = "infeasible", rows + 1
     elif draw_of < 0.2 and rank < n and rows and lb is None:
-        ray = np.linalg.svd(np.vstack([F.T, A]))[2][-1] if np.linalg.matrix_rank(np.vstack([F.T, A])) < n else None
+        ray = (
+            np.linalg.svd(np.vstack([F.T, A]))[2][-1]
+            if np.linalg.matrix_rank(np.vstack([F.T, A])) < n
+            else None
+        )
         if ray is not None:  # P ray = 0, A ray = 0, G ray <= 0 and q'ray < 0
-            G, q, expected = G - np.outer(np.maximum(G @ ray, 0), ray), q - (q @ ray + 1.0) * ray, "unbounded"
+            G, q, expected = (
+                G - np.outer(np.maximum(G @ ray, 0), ray),
+                q - (q @ ray + 1.0) * ray,
+                "unbounded",
+            )
             h = G @ inside + rng.uniform(0, 1, rows)
     open_rows = rng.random(rows) < (0.3 if rng.random() < 0.5 else 0.0)
     open_rows[-1:] &= expected != "infeasible"
@@ -74,7 +119,11 @@ def program(rng: Rng, scale: float) -> Case:
     keep = ~open_rows
 
     def problem(cost: float, r: Any, e: Any, loosely: bool) -> Any:
-        g_rows, sides = (G * r[:, None], np.where(open_rows, loose, h * r)) if loosely else (G[keep], plain_h[keep])
+        g_rows, sides = (
+            (G * r[:, None], np.where(open_rows, loose, h * r))
+            if loosely
+            else (G[keep], plain_h[keep])
+        )
         sparse = loosely and as_sparse
         form = sp.csc_matrix if sparse else np.asarray
         low, high = (None, None) if lb is None else (lb, ub)
@@ -94,10 +143,20 @@ def program(rng: Rng, scale: float) -> Case:
     as_sparse, rng_bounds = bool(rng.random() < 0.4), bool(rng.random() < 0.4)
     scaled = problem(big, by_row[:rows], by_equation[:equations], True)
     plain = problem(1.0, np.ones(rows), np.ones(equations), False)
-    name = f"{expected} program, n={n}, rank {rank}, {rows} rows, {equations} equations, {'box' if lb is not None else 'no box'}"
-    name += f", costs {big:.0e}{', sparse' if as_sparse else ''}, infinity {loose:g} in {open_rows.sum()} rows"
+    name = (
+        f"{expected} program, n={n}, rank {rank}, {rows} rows, {equations} equations, "
+        f"{'box' if lb is not None else 'no box'}"
+    )
+    name += (
+        f", costs {big:.0e}{', sparse' if as_sparse else ''}, infinity {loose:g} in "
+        f"{open_rows.sum()} rows"
+    )
     name += " and bounds" if rng_bounds and lb is None else ""
-    return Case(name, lambda: solve_program(scaled), Program(scaled=scaled, plain=plain, expected=expected, unique=rank == n))
+    return Case(
+        name,
+        lambda: solve_program(scaled),
+        Program(scaled=scaled, plain=plain, expected=expected, unique=rank == n),
+    )
 
 
 def solve_program(problem: Any) -> Answer:
@@ -111,12 +170,29 @@ def solve_program(problem: Any) -> Answer:
     if solution.found:
         return Answer(CONVERGED, solution.x)
     result = solution.extras.get("result")
-    return Answer(getattr(getattr(getattr(result, "result", None), "status", None), "name", "NOT FOUND"), None, "not found")
+    return Answer(
+        getattr(getattr(getattr(result, "result", None), "status", None), "name", "NOT FOUND"),
+        None,
+        "not found",
+    )
 
 
 def low_rank(rng: Rng) -> Case:
     """Draw a box of low rank, a support vector machine, a ridge, a portfolio, a game or a linear program."""
-    kind = str(rng.choice(["box", "svm", "svm with bias", "ridge", "portfolio", "game", "linear program", "planted"]))
+    kind = str(
+        rng.choice(
+            [
+                "box",
+                "svm",
+                "svm with bias",
+                "ridge",
+                "portfolio",
+                "game",
+                "linear program",
+                "planted",
+            ]
+        )
+    )
     n = draw.size(rng, 10, 300)
     d = int(rng.integers(1, max(2, n // 3)))
     F = rng.standard_normal((n, d)) * np.sign(rng.standard_normal((n, 1)))
@@ -128,31 +204,63 @@ def low_rank(rng: Rng) -> Case:
         truth = Box(A=Q, b=b, lower=-one * rng.integers(0, 2), upper=one, definite=True, **box)
     elif kind == "ridge":
         ridge = 10 ** rng.uniform(-8, -1)
-        truth = Box(A=Q + ridge * np.eye(n), b=rng.standard_normal(n), lower=-np.ones(n), upper=np.ones(n), definite=True, **box)
+        truth = Box(
+            A=Q + ridge * np.eye(n),
+            b=rng.standard_normal(n),
+            lower=-np.ones(n),
+            upper=np.ones(n),
+            definite=True,
+            **box,
+        )
     elif kind == "planted":
         _, low, high = draw.bounds(rng, n)
         x, b = draw.plant(rng, Q, low, high)
         truth = Box(A=Q, b=b, lower=low, upper=high, definite=True, solution=x, **box)
     elif kind == "svm":
         C = 10 ** rng.uniform(-2, 3)
-        truth = Box(A=Q, b=-np.ones(n), lower=np.zeros(n), upper=np.full(n, C), definite=True, **box)
+        truth = Box(
+            A=Q, b=-np.ones(n), lower=np.zeros(n), upper=np.full(n, C), definite=True, **box
+        )
     elif kind == "svm with bias":  # sum_i label_i x_i = 0 with a free multiplier: [Q, -t; t', 0]
         t = np.sign(rng.standard_normal((n, 1)))
         A = np.block([[Q, -t], [t.T, np.zeros((1, 1))]])
         C = 10 ** rng.uniform(-2, 2)
-        truth = Box(A=A, b=np.r_[-np.ones(n), 0], lower=np.r_[np.zeros(n), -np.inf], upper=np.r_[np.full(n, C), np.inf], **box)
+        truth = Box(
+            A=A,
+            b=np.r_[-np.ones(n), 0],
+            lower=np.r_[np.zeros(n), -np.inf],
+            upper=np.r_[np.full(n, C), np.inf],
+            **box,
+        )
     elif kind == "portfolio":  # least variance, sum x = 1, mean >= what half of the assets have
         mean = rng.uniform(0, 0.1, n)
         rows = np.vstack([np.ones(n), mean])
-        A = np.block([[Q / n + np.diag(10 ** rng.uniform(-4, -1, n)), -rows.T], [rows, np.zeros((2, 2))]])
+        A = np.block(
+            [[Q / n + np.diag(10 ** rng.uniform(-4, -1, n)), -rows.T], [rows, np.zeros((2, 2))]]
+        )
         truth = Box(
-            A=A, b=np.r_[np.zeros(n), -1.0, -np.median(mean)], lower=np.r_[np.zeros(n), -np.inf, 0.0], upper=np.full(n + 2, np.inf), **box
+            A=A,
+            b=np.r_[np.zeros(n), -1.0, -np.median(mean)],
+            lower=np.r_[np.zeros(n), -np.inf, 0.0],
+            upper=np.full(n + 2, np.inf),
+            **box,
         )
     elif kind == "game":  # an equilibrium always exists; A is not monotone
         m = max(2, n // 3)
-        first, second = rng.uniform(0.5, 2, (2, m, m)) if rng.random() < 0.7 else rng.integers(1, 4, (2, m, m)).astype(float)
+        first, second = (
+            rng.uniform(0.5, 2, (2, m, m))
+            if rng.random() < 0.7
+            else rng.integers(1, 4, (2, m, m)).astype(float)
+        )
         A = np.block([[np.zeros((m, m)), first], [second.T, np.zeros((m, m))]])
-        truth = Box(A=A, b=-np.ones(2 * m), lower=np.zeros(2 * m), upper=np.full(2 * m, np.inf), rtol=box["rtol"], solvable=True)
+        truth = Box(
+            A=A,
+            b=-np.ones(2 * m),
+            lower=np.zeros(2 * m),
+            upper=np.full(2 * m, np.inf),
+            rtol=box["rtol"],
+            solvable=True,
+        )
     else:  # min c'x, A x >= g, x >= 0: [0, -A'; A, 0] with a planted pair of solutions
         m = max(1, n // 2)
         M = rng.standard_normal((m, n)) * (rng.random((m, n)) < rng.choice([0.1, 1.0]))

@@ -28,8 +28,11 @@ from warp_lcp.benchmarks.mutants.tests_of import tests_of
 ROOT = Path(__file__).resolve().parents[2]
 HANGS = 40  # seconds of processor time that no single test takes
 PYTEST = ["-x", "-q", "--no-header", "-p", "no:cacheprovider", "--hypothesis-seed=7"]
-FILES = (1, 4)  # of tests: these first, with one of its parameters for each function, then these with all where a mutant survives
-PRELOADED = ("pyamg", "pydantic", "pytest", "rich", "scipy.sparse.linalg", "typer", "warp")  # Warp not initialized: no threads, no device
+# of tests: these first, with one of its parameters for each function, then these with all where a
+# mutant survives
+FILES = (1, 4)
+# Warp not initialized: no threads, no device
+PRELOADED = ("pyamg", "pydantic", "pytest", "rich", "scipy.sparse.linalg", "typer", "warp")
 TREE: Path
 SECONDS = 5.0
 SOUND: set[str] = set()  # tests that pass where nothing is changed, and those that do not
@@ -40,7 +43,9 @@ def prepare(folder: str, files: tuple[int, int] = FILES, seconds: float = 60.0) 
     """Copy the tree for one worker and import what a mutant cannot change, so that forks start with it."""
     global TREE, FILES, SECONDS  # a worker's own
     TREE, FILES, SECONDS = Path(tempfile.mkdtemp(dir=folder)), files, seconds
-    ignore = shutil.ignore_patterns(".git", ".venv*", "out", "build", "results", ".*_cache", ".hypothesis")
+    ignore = shutil.ignore_patterns(
+        ".git", ".venv*", "out", "build", "results", ".*_cache", ".hypothesis"
+    )
     shutil.copytree(ROOT, TREE, ignore=ignore, dirs_exist_ok=True)
     for name in PRELOADED:
         importlib.import_module(name)
@@ -83,7 +88,8 @@ def tests(arguments: list[str], *, brief: bool = False) -> tuple[str, str, float
         brief: whether to run each test with one of its parameters.
 
     Returns:
-        "passed", "failed", "crashed" or "timeout", the end of what it printed, and its processor time [s].
+        "passed", "failed", "crashed" or "timeout", the end of what it printed, and its processor
+        time [s].
     """
     log, limit = TREE / "mutant.log", int(SECONDS * len(arguments) + HANGS)
     child = os.fork()
@@ -96,8 +102,14 @@ def tests(arguments: list[str], *, brief: bool = False) -> tuple[str, str, float
         time.sleep(0.05)
     _, status, usage = found
     ended_by = os.WTERMSIG(status) if os.WIFSIGNALED(status) else 0
-    verdict = {0: "failed", signal.SIGKILL: "timeout", signal.SIGXCPU: "timeout"}.get(ended_by, "crashed")
-    return verdict if status else "passed", log.read_text(errors="replace")[-20000:], usage.ru_utime + usage.ru_stime
+    verdict = {0: "failed", signal.SIGKILL: "timeout", signal.SIGXCPU: "timeout"}.get(
+        ended_by, "crashed"
+    )
+    return (
+        verdict if status else "passed",
+        log.read_text(errors="replace")[-20000:],
+        usage.ru_utime + usage.ru_stime,
+    )
 
 
 def _become_pytest(arguments: list[str], budget: Budget, limit: int, log: Path) -> NoReturn:
@@ -110,7 +122,8 @@ def _become_pytest(arguments: list[str], budget: Budget, limit: int, log: Path) 
     resource.setrlimit(resource.RLIMIT_AS, (12 << 30, 12 << 30))
     os.environ["PYTHONPATH"] = str(TREE)
     sys.path[:] = [str(TREE), *(p for p in sys.path if Path(p or ".").resolve() != ROOT)]
-    for name in [name for name in sys.modules if name.split(".")[0] == "warp_lcp"]:  # which this program is a part of
+    # which this program is a part of
+    for name in [name for name in sys.modules if name.split(".")[0] == "warp_lcp"]:
         del sys.modules[name]
     gc.collect()  # their kernels, which Warp knows as long as they live
     import pytest
@@ -129,12 +142,19 @@ def judge(mutant: Mutant) -> dict[str, object]:
     """Apply a mutant, run its tests and take it back; tests that fail without it too are left out from then on."""
     path = TREE / mutant.module
     whole, stat = path.read_text(), path.stat()
-    chosen = [FORMULAS[mutant.occurrence].tests] if mutant.operator == FORMULA else tests_of(TREE, mutant.module)
+    chosen = (
+        [FORMULAS[mutant.occurrence].tests]
+        if mutant.operator == FORMULA
+        else tests_of(TREE, mutant.module)
+    )
     spent, verdict, by = 0.0, "alive", ""
     rounds = list(FILES)
     while rounds and verdict == "alive":
         path.write_text(mutated(whole, mutant.operator, mutant.occurrence))
-        outcome, text, took = tests([*chosen[: rounds[0]], *(f"--deselect={name}" for name in BROKEN)], brief=rounds[0] == FILES[0])
+        outcome, text, took = tests(
+            [*chosen[: rounds[0]], *(f"--deselect={name}" for name in BROKEN)],
+            brief=rounds[0] == FILES[0],
+        )
         path.write_text(whole)
         os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
         spent += took
@@ -144,10 +164,22 @@ def judge(mutant: Mutant) -> dict[str, object]:
         if names and names[0] in BROKEN:
             continue
         if outcome != "passed":
-            verdict = outcome if outcome == "timeout" else "killed" if names or outcome == "crashed" else "broken test"
+            verdict = (
+                outcome
+                if outcome == "timeout"
+                else "killed"
+                if names or outcome == "crashed"
+                else "broken test"
+            )
             by = names[0] if names else text[-300:]
         number = rounds.pop(0)
-    return {**mutant._asdict(), "verdict": verdict, "by": by, "tests": chosen[:number], "seconds": round(spent, 1)}
+    return {
+        **mutant._asdict(),
+        "verdict": verdict,
+        "by": by,
+        "tests": chosen[:number],
+        "seconds": round(spent, 1),
+    }
 
 
 def report(results: list[dict[str, object]], out: Path, seed: int) -> None:
@@ -155,28 +187,61 @@ def report(results: list[dict[str, object]], out: Path, seed: int) -> None:
     (out / "mutants.json").write_text(json.dumps(results, indent=1))
     counts = Counter(str(r["verdict"]) for r in results)
     seconds = sum(float(str(r["seconds"])) for r in results)
-    lines = [f"# {len(results)} mutants of seed {seed}: {', '.join(f'{n} {verdict}' for verdict, n in sorted(counts.items()))}"]
-    lines += [f"{seconds:.0f} s of processor time", "", "| where | before | after | verdict |", "|---|---|---|---|"]
+    lines = [
+        f"# {len(results)} mutants of seed {seed}: "
+        f"{', '.join(f'{n} {verdict}' for verdict, n in sorted(counts.items()))}"
+    ]
+    lines += [
+        f"{seconds:.0f} s of processor time",
+        "",
+        "| where | before | after | verdict |",
+        "|---|---|---|---|",
+    ]
     left = [r for r in results if r["verdict"] != "killed"]
-    lines += [f"| `{r['module']}:{r['line']}` | `{r['before']}` | `{r['after']}` | {r['verdict']} |" for r in left]
+    lines += [
+        f"| `{r['module']}:{r['line']}` | `{r['before']}` | `{r['after']}` | {r['verdict']} |"
+        for r in left
+    ]
     (out / "mutants.md").write_text("\n".join(lines) + "\n")
     print("\n".join(lines))
 
 
 def options() -> argparse.Namespace:
     """Read the command line."""
-    parser = argparse.ArgumentParser(prog="python -m warp_lcp.benchmarks.mutants", description=__doc__)
-    parser.add_argument("--count", type=int, help="number of mutants; default: 50 over all modules, or all formulas")
-    parser.add_argument("--seed", type=int, default=7, help="seed of the random choice")
-    parser.add_argument("--jobs", type=int, default=2, help="processes")
-    parser.add_argument("--out", type=Path, default=ROOT / "out/mutants", help="folder of the report; of a run that was stopped: go on")
-    parser.add_argument("--formulas", action="store_true", help="use the changes and tests of formulas.py instead of random ones")
-    parser.add_argument("--again", type=Path, help="try the survivors of a mutants.json instead of new mutants")
-    parser.add_argument(
-        "--files", type=int, nargs=2, default=FILES, help="numbers of test files: first try, and again if a mutant survives"
+    parser = argparse.ArgumentParser(
+        prog="python -m warp_lcp.benchmarks.mutants", description=__doc__
     )
     parser.add_argument(
-        "--seconds", type=float, default=5.0, help="processor time per test file [s]; tests that would start later are skipped"
+        "--count", type=int, help="number of mutants; default: 50 over all modules, or all formulas"
+    )
+    parser.add_argument("--seed", type=int, default=7, help="seed of the random choice")
+    parser.add_argument("--jobs", type=int, default=2, help="processes")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=ROOT / "out/mutants",
+        help="folder of the report; of a run that was stopped: go on",
+    )
+    parser.add_argument(
+        "--formulas",
+        action="store_true",
+        help="use the changes and tests of formulas.py instead of random ones",
+    )
+    parser.add_argument(
+        "--again", type=Path, help="try the survivors of a mutants.json instead of new mutants"
+    )
+    parser.add_argument(
+        "--files",
+        type=int,
+        nargs=2,
+        default=FILES,
+        help="numbers of test files: first try, and again if a mutant survives",
+    )
+    parser.add_argument(
+        "--seconds",
+        type=float,
+        default=5.0,
+        help="processor time per test file [s]; tests that would start later are skipped",
     )
     return parser.parse_args()
 
@@ -186,19 +251,31 @@ def _drawn(formulas: bool, count: int | None, seed: int) -> list[Mutant]:
     if not formulas:
         return draw(ROOT, 50 if count is None else count, seed)
     everyone = of_formulas(ROOT)
-    return everyone if count is None else random.Random(seed).sample(everyone, min(count, len(everyone)))
+    return (
+        everyone
+        if count is None
+        else random.Random(seed).sample(everyone, min(count, len(everyone)))
+    )
 
 
 def main() -> None:
     """Run the command line."""
     given = options()
     given.out.mkdir(parents=True, exist_ok=True)
-    kernels, usual, kept = given.out.parent / "kernels-of-mutants", Path("~/.cache/warp").expanduser(), given.out / "mutants.json"
+    kernels, usual, kept = (
+        given.out.parent / "kernels-of-mutants",
+        Path("~/.cache/warp").expanduser(),
+        given.out / "mutants.json",
+    )
     if usual.exists() and not kernels.exists():
         shutil.copytree(usual, kernels)
     os.environ["WARP_CACHE_PATH"] = str(kernels)
     if given.again:
-        drawn = [Mutant(*(r[name] for name in Mutant._fields)) for r in json.loads(given.again.read_text()) if r["verdict"] != "killed"]
+        drawn = [
+            Mutant(*(r[name] for name in Mutant._fields))
+            for r in json.loads(given.again.read_text())
+            if r["verdict"] != "killed"
+        ]
     else:
         drawn = _drawn(given.formulas, given.count, given.seed)
     results = json.loads(kept.read_text()) if kept.exists() else []

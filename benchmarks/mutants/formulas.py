@@ -23,12 +23,22 @@ class Formula(NamedTuple):
 
 def _changes(module: str, tests: str, *pairs: tuple[str, str]) -> list[Formula]:
     """Return changes of one file."""
-    return [Formula(f"warp_lcp/{module}", before, after, f"tests/{tests}") for before, after in pairs]
+    return [
+        Formula(f"warp_lcp/{module}", before, after, f"tests/{tests}") for before, after in pairs
+    ]
 
 
-MAP, NEWTON, PATH = "reduced/test_nonsmooth_map.py", "solvers/test_fischer_newton_steps.py", "solvers/test_interior_point_steps.py"
+MAP, NEWTON, PATH = (
+    "reduced/test_nonsmooth_map.py",
+    "solvers/test_fischer_newton_steps.py",
+    "solvers/test_interior_point_steps.py",
+)
 ACTIVE, GRADIENTS = "solvers/test_minimum_map_newton_steps.py", "solvers/test_mprgp_steps.py"
-SUBSPACE, BLOCKS, PIVOTS = "solvers/test_subspace_minimization_steps.py", "solvers/test_block_steps.py", "solvers/test_lemke_steps.py"
+SUBSPACE, BLOCKS, PIVOTS = (
+    "solvers/test_subspace_minimization_steps.py",
+    "solvers/test_block_steps.py",
+    "solvers/test_lemke_steps.py",
+)
 
 FORMULAS = [
     *_changes(
@@ -65,8 +75,14 @@ FORMULAS = [
         ("-scale*f/qs", "-scale*f"),
         ("(S)size*p*inverse", "(S)p*inverse"),
         ("solved ? -f*inverse", "solved ? f*inverse"),
-        ("inverse = (S)1/qs; const bool solved = inside & !(drop & kink)", "inverse = (S)1/qs; const bool solved = inside"),
-        ("least_q; const bool solved = inside & !(drop & kink)", "least_q; const bool solved = inside"),
+        (
+            "inverse = (S)1/qs; const bool solved = inside & !(drop & kink)",
+            "inverse = (S)1/qs; const bool solved = inside",
+        ),
+        (
+            "least_q; const bool solved = inside & !(drop & kink)",
+            "least_q; const bool solved = inside",
+        ),
     ),
     *_changes(
         "reduced/headers/nonsmooth_map.h",
@@ -100,9 +116,12 @@ FORMULAS = [
         ("return slope < 0 and self", "return slope < 1e300 and self"),
         ("slope = size * self.map.slope(x, self.system.e)", "slope = -2 * self._merit"),
         (
-            "self._fusable = grid and settings.safeguard and self.precision is not Precision.SINGLE\n"
-            "        self._search = NonmonotoneSearch(memory=settings.memory if settings.safeguard else 1)",
-            "self._fusable = grid and settings.safeguard and self.precision is not Precision.SINGLE\n"
+            "self._fusable = grid and settings.safeguard and self.precision is not "
+            "Precision.SINGLE\n"
+            "        self._search = NonmonotoneSearch(memory=settings.memory if settings.safeguard "
+            "else 1)",
+            "self._fusable = grid and settings.safeguard and self.precision is not "
+            "Precision.SINGLE\n"
             "        self._search = NonmonotoneSearch(memory=settings.memory)",
         ),
         ("SolveStatus.LOCAL_MINIMUM if stationary", "SolveStatus.LOCAL_MINIMUM if not stationary"),
@@ -142,7 +161,12 @@ FORMULAS = [
         ("over=1 / self.scale", "over=1.0"),
         ("share=1.0 if smoothing", "share=0.5 if smoothing"),
     ),
-    *_changes("reduced/nonsmooth_map.py", MAP, ("1 - np.sqrt(0.5) * self._rng", "1 - self._rng"), ("kinks=KINK * self.scale", "kinks=0.0")),
+    *_changes(
+        "reduced/nonsmooth_map.py",
+        MAP,
+        ("1 - np.sqrt(0.5) * self._rng", "1 - self._rng"),
+        ("kinks=KINK * self.scale", "kinks=0.0"),
+    ),
     *_changes(
         "reduced/headers/nonsmooth_map.h",
         MAP,
@@ -161,10 +185,16 @@ FORMULAS = [
         ("min(s.backoff, self.steps", "max(s.backoff, self.steps"),
         ("after / self.mu)) ** 3", "after / self.mu)) ** 2"),
         ("length**2 * products / self.count", "length * products / self.count"),
-        ("tau, second = self._center(longest, products), 1.0", "tau, second = self._center(longest, products), 0.0"),
+        (
+            "tau, second = self._center(longest, products), 1.0",
+            "tau, second = self._center(longest, products), 0.0",
+        ),
         ("length = min(1.0, share / longest)", "length = min(1.0, 1 / longest)"),
         ("min(1.0, s.backoff / longest)", "min(1.0, 1 / longest)"),
-        ("LARGEST_START * self.residual.norm), self.residual.norm)", "LARGEST_START * self.residual.norm), 0.0)"),
+        (
+            "LARGEST_START * self.residual.norm), self.residual.norm)",
+            "LARGEST_START * self.residual.norm), 0.0)",
+        ),
         ("self.settings.start * size / math.sqrt(unknowns)", "self.settings.start * size"),
     ),
     *_changes(
@@ -197,9 +227,19 @@ FORMULAS = [
         ("products += dx*ds - dx*dt", "products += dx*ds + dx*dt"),
         ("third = dx*iv", "third = -dx*iv"),
     ),
-    *_changes("solvers/headers/interior_point.h", PATH, ("k0 = c < 0.5*span ? c : 0.5*span", "k0 = c < 0.25*span ? c : 0.25*span")),
-    *_changes("solvers/headers/interior_point.h", PATH, ("c = -y[i] > least ? -y[i] : least", "c = y[i] > least ? y[i] : least")),
-    *_changes("solvers/headers/interior_point.h", PATH, ("vn = v[i] - length*dx", "vn = v[i] + length*dx")),
+    *_changes(
+        "solvers/headers/interior_point.h",
+        PATH,
+        ("k0 = c < 0.5*span ? c : 0.5*span", "k0 = c < 0.25*span ? c : 0.25*span"),
+    ),
+    *_changes(
+        "solvers/headers/interior_point.h",
+        PATH,
+        ("c = -y[i] > least ? -y[i] : least", "c = y[i] > least ? y[i] : least"),
+    ),
+    *_changes(
+        "solvers/headers/interior_point.h", PATH, ("vn = v[i] - length*dx", "vn = v[i] + length*dx")
+    ),
     *_changes(
         "reduced/headers/active_set.h",
         ACTIVE,
@@ -234,38 +274,66 @@ FORMULAS = [
     *_changes(
         "reduced/correction_system.py",
         ACTIVE,
-        ("        if not self._settings.safeguard:\n", "        if self._settings.safeguard and not self._settings.safeguard:\n"),
+        (
+            "        if not self._settings.safeguard:\n",
+            "        if self._settings.safeguard and not self._settings.safeguard:\n",
+        ),
         ("helped = problem.bounded and settings.safeguard", "helped = problem.bounded"),
     ),
-    *_changes("reduced/reduced_system.py", ACTIVE, ("if settings.safeguard and takes_points", "if takes_points")),
+    *_changes(
+        "reduced/reduced_system.py",
+        ACTIVE,
+        ("if settings.safeguard and takes_points", "if takes_points"),
+    ),
     *_changes(
         "solvers/headers/gradient_projection.h",
         SUBSPACE,
         ("(x[k] > lower(k))", "(x[k] >= lower(k))"),
         ("(x[k] < upper(k))", "(x[k] <= upper(k))"),
     ),
-    *_changes("solvers/headers/gradient_projection.h", SUBSPACE, ("(v <= was_l)", "(v < was_l)"), ("(v >= was_u)", "(v > was_u)")),
+    *_changes(
+        "solvers/headers/gradient_projection.h",
+        SUBSPACE,
+        ("(v <= was_l)", "(v < was_l)"),
+        ("(v >= was_u)", "(v > was_u)"),
+    ),
     *_changes(
         "solvers/subspace_minimization.py",
         SUBSPACE,
         ("size * 0.5**halving", "size * 0.25**halving"),
         ("residual.evaluate(x) < norm or", "residual.evaluate(x) < norm and"),
         ("if solve > 0 and not moved", "if not moved"),
-        ("for halving in range(max(s.backtracks, 0) + 1)", "for halving in range(max(s.backtracks, 0) + 2)"),
+        (
+            "for halving in range(max(s.backtracks, 0) + 1)",
+            "for halving in range(max(s.backtracks, 0) + 2)",
+        ),
         ("(self.residual.y, self.problem.b)", "(self.residual.y, self.residual.y)"),
-        ("        wp.copy(x, self._before)\n        residual.current = False", "        residual.current = False"),
-        ("            work.sweep.run(x, forward=True)", "            work.sweep.run(x, forward=False)"),
+        (
+            "        wp.copy(x, self._before)\n        residual.current = False",
+            "        residual.current = False",
+        ),
+        (
+            "            work.sweep.run(x, forward=True)",
+            "            work.sweep.run(x, forward=False)",
+        ),
     ),
     *_changes(
         "solvers/staggering.py",
         BLOCKS,
         ("[rows] + self._outer @", "[rows] - self._outer @"),
         ("            slab[:, rows] = 0.0\n", ""),
-        ("        whole.bounds.follow(self._x)\n        problem.b.assign", "        problem.b.assign"),
+        (
+            "        whole.bounds.follow(self._x)\n        problem.b.assign",
+            "        problem.b.assign",
+        ),
         ("others[rows] = 0.0", "others[rows] = 1.0"),
         ("x=self._y, less=self._z, target=self._b", "x=self._y, less=None, target=self._b"),
     ),
-    *_changes("solvers/staggering.py", BLOCKS, ("range(count) if forward else reversed(range(count))", "range(count)")),
+    *_changes(
+        "solvers/staggering.py",
+        BLOCKS,
+        ("range(count) if forward else reversed(range(count))", "range(count)"),
+    ),
     *_changes(
         "sweeps/block_kernels.py",
         BLOCKS,
@@ -284,16 +352,31 @@ FORMULAS = [
         ("self.gamma**2 * work.residual.reduced", "self.gamma * work.residual.reduced"),
         ("beta = -residual.dot(M.z, self._q)", "beta = residual.dot(M.z, self._q)"),
         ("            length *= 0.5\n", "            length *= 0.25\n"),
-        ("self._projected_step(self._p, residual.release, curvature)", "self._projected_step(direction, residual.release, curvature)"),
-        ("residual.moved, self._carry = False, False", "residual.moved, self._carry = False, self._carry"),
-        ("factor, target, p = residual.release / curvature", "factor, target, p = 2 * residual.release / curvature"),
-        ("length = gain / curvature * residual.size\n        else", "length = 0.5 * gain / curvature * residual.size\n        else"),
+        (
+            "self._projected_step(self._p, residual.release, curvature)",
+            "self._projected_step(direction, residual.release, curvature)",
+        ),
+        (
+            "residual.moved, self._carry = False, False",
+            "residual.moved, self._carry = False, self._carry",
+        ),
+        (
+            "factor, target, p = residual.release / curvature",
+            "factor, target, p = 2 * residual.release / curvature",
+        ),
+        (
+            "length = gain / curvature * residual.size\n        else",
+            "length = 0.5 * gain / curvature * residual.size\n        else",
+        ),
     ),
     *_changes(
         "solvers/headers/gradient_projection.h",
         GRADIENTS,
         ("(held ? v : (T)0)*h/e", "h*h/e"),
-        ("(x[k] >= u - reach(u)));\n        const T r0 = natural_residual(v, e", "false);\n        const T r0 = natural_residual(v, e"),
+        (
+            "(x[k] >= u - reach(u)));\n        const T r0 = natural_residual(v, e",
+            "false);\n        const T r0 = natural_residual(v, e",
+        ),
         ("r*v; release += (held", "r*r; release += (held"),
     ),
     *_changes(
@@ -309,17 +392,33 @@ FORMULAS = [
         ("before = s != 0 ? own : g[k]", "before = g[k]"),
     ),
     *_changes(
-        "reduced/grid_step_kernels.py", GRADIENTS, ("ratio = -zap / pap", "ratio = zap / pap"), ("gz + ratio * gp", "gz - ratio * gp")
+        "reduced/grid_step_kernels.py",
+        GRADIENTS,
+        ("ratio = -zap / pap", "ratio = zap / pap"),
+        ("gz + ratio * gp", "gz - ratio * gp"),
     ),
-    *_changes("operators/banded_matrix.py", PIVOTS, ("t[:-1] - np.multiply.outer", "t[:-1] + np.multiply.outer")),
+    *_changes(
+        "operators/banded_matrix.py",
+        PIVOTS,
+        ("t[:-1] - np.multiply.outer", "t[:-1] + np.multiply.outer"),
+    ),
     *_changes(
         "solvers/lemke.py",
         PIVOTS,
-        ("ratios <= ratios.min() + TIE * abs(ratios.min()))[-1])", "ratios <= ratios.min() + TIE * abs(ratios.min()))[0])"),
+        (
+            "ratios <= ratios.min() + TIE * abs(ratios.min()))[-1])",
+            "ratios <= ratios.min() + TIE * abs(ratios.min()))[0])",
+        ),
         ("        if ends.any():\n            return int(rows[ends][0])\n", ""),
-        ("least = ratios <= ratios.min() + TIE * np.abs(ratios).max()", "least = ratios >= ratios.max() - TIE * np.abs(ratios).max()"),
+        (
+            "least = ratios <= ratios.min() + TIE * np.abs(ratios).max()",
+            "least = ratios >= ratios.max() - TIE * np.abs(ratios).max()",
+        ),
         ("ratios = inverse[:, column] / direction[rows]", "ratios = inverse[:, column]"),
-        ("for column in range(self.m):\n            if inverse", "for column in range(1):\n            if inverse"),
+        (
+            "for column in range(self.m):\n            if inverse",
+            "for column in range(1):\n            if inverse",
+        ),
         ("ratios = np.divide(q, d, out", "ratios = np.divide(q, np.ones(m), out"),
     ),
     *_changes(
@@ -329,8 +428,14 @@ FORMULAS = [
         ("old < 0) | (spring & equal)", "old < 0)"),
         ("is & (y[i] < 0) &", "is & (y[i] > 0) &"),
     ),
-    *_changes("solvers/headers/penalty.h", "solvers/test_penalty.py", ("& (side[i] == 0)", "& true")),
-    *_changes("solvers/penalty.py", "solvers/test_penalty.py", ("self._excess / allowed)", "allowed / self._excess)")),
+    *_changes(
+        "solvers/headers/penalty.h", "solvers/test_penalty.py", ("& (side[i] == 0)", "& true")
+    ),
+    *_changes(
+        "solvers/penalty.py",
+        "solvers/test_penalty.py",
+        ("self._excess / allowed)", "allowed / self._excess)"),
+    ),
     *_changes(
         "problem/merits.py",
         "problem/test_merits.py",

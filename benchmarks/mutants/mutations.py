@@ -19,11 +19,20 @@ from warp_lcp.benchmarks.mutants.formulas import FORMULAS
 PACKAGES = ("warp_lcp", "fluids", "granular")
 # lines that only a type checker, the time of a compiler or an eye can tell
 UNSEEN = re.compile(r"TYPE_CHECKING|enable_backward|\(\d+, \d+, \d+\)|\[\d+, \d+, \d+\]")
-APART = re.compile(r"/distributed|/__init__\.py$|/rank_|_table\.py$")  # needs ranks of MPI; names; tables of numbers
+# needs ranks of MPI; names; tables of numbers
+APART = re.compile(r"/distributed|/__init__\.py$|/rank_|_table\.py$")
 
-BINARY = "Add_Sub Sub_Add Mul_Div Div_Mul FloorDiv_Mul Mod_FloorDiv Pow_Mul BitAnd_BitOr BitOr_BitAnd LShift_RShift"
-COMPARISON = "Lt_LtE Lt_GtE LtE_Lt LtE_Gt Gt_GtE Gt_LtE GtE_Gt GtE_Lt Eq_NotEq NotEq_Eq Is_IsNot IsNot_Is"
-PLAIN = "AddNot NumberReplacer ReplaceAndWithOr ReplaceOrWithAnd ReplaceTrueWithFalse ReplaceFalseWithTrue ReplaceBreakWithContinue"
+BINARY = (
+    "Add_Sub Sub_Add Mul_Div Div_Mul FloorDiv_Mul Mod_FloorDiv Pow_Mul BitAnd_BitOr "
+    "BitOr_BitAnd LShift_RShift"
+)
+COMPARISON = (
+    "Lt_LtE Lt_GtE LtE_Lt LtE_Gt Gt_GtE Gt_LtE GtE_Gt GtE_Lt Eq_NotEq NotEq_Eq Is_IsNot IsNot_Is"
+)
+PLAIN = (
+    "AddNot NumberReplacer ReplaceAndWithOr ReplaceOrWithAnd ReplaceTrueWithFalse "
+    "ReplaceFalseWithTrue ReplaceBreakWithContinue"
+)
 NAMES = (
     *(f"core/ReplaceBinaryOperator_{name}" for name in BINARY.split()),
     *(f"core/ReplaceComparisonOperator_{name}" for name in COMPARISON.split()),
@@ -31,11 +40,26 @@ NAMES = (
     "core/ReplaceUnaryOperator_Delete_Not",
     "core/ReplaceUnaryOperator_USub_UAdd",
 )
-SWAPS = {"+": "-", "-": "+", "*": "/", "/": "*", "<": "<=", "<=": "<", ">": ">=", ">=": ">", "==": "!=", "!=": "==", "&&": "||", "||": "&&"}
+SWAPS = {
+    "+": "-",
+    "-": "+",
+    "*": "/",
+    "/": "*",
+    "<": "<=",
+    "<=": "<",
+    ">": ">=",
+    ">=": ">",
+    "==": "!=",
+    "!=": "==",
+    "&&": "||",
+    "||": "&&",
+}
 SWAPS |= {"&": "|", "|": "&"}
 NATIVE_SWAP = "NativeSwap"  # one of them for its neighbor
 FORMULA = "Formula"  # one of FORMULAS
-NATIVE = re.compile(r"(?<=[\w\])] )(?:[<>=!]=|&&|\|\||[-+*/<>&|])(?= [\w(!-])|(?<=[\w\])])[*/](?=[\w(])")
+NATIVE = re.compile(
+    r"(?<=[\w\])] )(?:[<>=!]=|&&|\|\||[-+*/<>&|])(?= [\w(!-])|(?<=[\w\])])[*/](?=[\w(])"
+)
 
 
 class LeaveOut(Operator):
@@ -45,7 +69,9 @@ class LeaveOut(Operator):
         """Yield where such a statement starts and ends."""
         statement = node.parent is not None and node.parent.type == "simple_stmt"
         call = node.type == "atom_expr" and getattr(node.children[-1], "children", [""])[0] == "("
-        inplace = node.type == "expr_stmt" and getattr(node.children[1], "value", node.children[1].type) not in ("=", "annassign")
+        inplace = node.type == "expr_stmt" and getattr(
+            node.children[1], "value", node.children[1].type
+        ) not in ("=", "annassign")
         if statement and (call or inplace):
             yield node.start_pos, node.end_pos
 
@@ -77,7 +103,11 @@ def operator(name: str) -> Operator:
 
 def native_places(source: str) -> list[re.Match[str]]:
     """Return the operators of a header outside of comments and of the preprocessor's lines."""
-    return [m for m in NATIVE.finditer(source) if not re.search(r"//|^\s*#", source[source.rfind("\n", 0, m.start()) + 1 : m.start()])]
+    return [
+        m
+        for m in NATIVE.finditer(source)
+        if not re.search(r"//|^\s*#", source[source.rfind("\n", 0, m.start()) + 1 : m.start()])
+    ]
 
 
 def mutated(source: str, name: str, occurrence: int) -> str:
@@ -95,7 +125,16 @@ def of_formulas(root: Path) -> list[Mutant]:
     found = []
     for number, (module, before, after, _) in enumerate(FORMULAS):
         source = (root / module).read_text()
-        found.append(Mutant(module, source.count("\n", 0, source.index(before)) + 1, FORMULA, number, before.strip(), after.strip()))
+        found.append(
+            Mutant(
+                module,
+                source.count("\n", 0, source.index(before)) + 1,
+                FORMULA,
+                number,
+                before.strip(),
+                after.strip(),
+            )
+        )
     return found
 
 
@@ -108,8 +147,19 @@ def draw(root: Path, count: int, seed: int) -> list[Mutant]:
         seed: of the first line and of the operators.
     """
     rng = random.Random(seed)
-    files = sorted(str(f.relative_to(root)) for package in PACKAGES for f in (root / package).rglob("*") if f.suffix in (".py", ".h"))
-    lines = [(f, n + 1) for f in files if not APART.search(f) for n, text in enumerate((root / f).read_text().splitlines()) if text.strip()]
+    files = sorted(
+        str(f.relative_to(root))
+        for package in PACKAGES
+        for f in (root / package).rglob("*")
+        if f.suffix in (".py", ".h")
+    )
+    lines = [
+        (f, n + 1)
+        for f in files
+        if not APART.search(f)
+        for n, text in enumerate((root / f).read_text().splitlines())
+        if text.strip()
+    ]
     start = rng.random()
     wanted = [lines[int((start + i) * len(lines) / count)] for i in range(count)]
     sources = {module: (root / module).read_text() for module in {module for module, _ in wanted}}
@@ -118,16 +168,26 @@ def draw(root: Path, count: int, seed: int) -> list[Mutant]:
     for module, line in wanted:
         if places[module]:
             nearest = min(abs(at - line) for at, *_ in places[module])
-            at, name, occurrence = rng.choice([place for place in places[module] if abs(place[0] - line) == nearest])
-            old, new = (text.splitlines() for text in (sources[module], mutated(sources[module], name, occurrence)))
-            found.append(Mutant(module, at, name, occurrence, old[at - 1].strip(), new[at - 1].strip()))
+            at, name, occurrence = rng.choice(
+                [place for place in places[module] if abs(place[0] - line) == nearest]
+            )
+            old, new = (
+                text.splitlines()
+                for text in (sources[module], mutated(sources[module], name, occurrence))
+            )
+            found.append(
+                Mutant(module, at, name, occurrence, old[at - 1].strip(), new[at - 1].strip())
+            )
     return found
 
 
 def _places(module: str, source: str) -> list[tuple[int, str, int]]:
     """Return line, operator's name and occurrence of a file's changes but those in annotations, in what is raised and on UNSEEN lines."""
     if module.endswith(".h"):
-        return [(source.count("\n", 0, match.start()) + 1, NATIVE_SWAP, n) for n, match in enumerate(native_places(source))]
+        return [
+            (source.count("\n", 0, match.start()) + 1, NATIVE_SWAP, n)
+            for n, match in enumerate(native_places(source))
+        ]
     nodes = [(node, _inert(node)) for node in ast_nodes(parso.parse(source))]
     places, lines = [], source.splitlines()
     for name in (*NAMES, "LeaveOut"):

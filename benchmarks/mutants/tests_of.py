@@ -7,7 +7,8 @@ from collections import defaultdict
 from functools import cache
 from pathlib import Path
 
-# minutes each, or about other things: compilation for CUDA, pages and notebooks, ranks, runs that are killed
+# minutes each, or about other things: compilation for CUDA, pages and notebooks, ranks, runs that
+# are killed
 NEVER = re.compile(
     r"_slow|cuda_compiles|test_docs|notebook|readme|tutorial|gallery_page|on_ranks|tests/(distributed|benchmarks|fuzz)|killed_run|crash_points"
 )
@@ -30,11 +31,17 @@ def _users(root: Path) -> dict[str, set[str]]:
             if file.suffix in (".py", ".h"):
                 places = [file.parent, file.parent / "headers", root / "warp_lcp/rows/headers"]
                 for header in re.findall(r"[\"/](\w+)\.h(?::[\w.]+)?\"", file.read_text()):
-                    found = [place / f"{header}.h" for place in places if (place / f"{header}.h").exists()]
+                    found = [
+                        place / f"{header}.h"
+                        for place in places
+                        if (place / f"{header}.h").exists()
+                    ]
                     if found and found[0] != file:
                         users[str(found[0].relative_to(root))].add(str(file.relative_to(root)))
         for file in (root / package).rglob("*.py"):
-            for whole, names in re.findall(r"^\s*from ([\w.]+) import (.+)$", file.read_text(), re.MULTILINE):
+            for whole, names in re.findall(
+                r"^\s*from ([\w.]+) import (.+)$", file.read_text(), re.MULTILINE
+            ):
                 for name in [whole, *(f"{whole}.{word}" for word in WORD.findall(names))]:
                     if file.name != "__init__.py":
                         users[name.replace(".", "/") + ".py"].add(str(file.relative_to(root)))
@@ -46,18 +53,36 @@ def tests_of(root: Path, module: str) -> list[str]:
     score: dict[str, float] = defaultdict(float)
     front, weight, seen = {module}, 1.0, set[str]()
     for _ in range(3):  # headers in headers
-        front = {user for file in front for user in (_users(root).get(file, ()) if file.endswith(".h") else (file,))}
+        front = {
+            user
+            for file in front
+            for user in (_users(root).get(file, ()) if file.endswith(".h") else (file,))
+        }
     if not front:  # its name is put together
-        front = {str(file.relative_to(root)) for file in (root / module).parents[1].glob("*_kernels.py")}
+        front = {
+            str(file.relative_to(root)) for file in (root / module).parents[1].glob("*_kernels.py")
+        }
     for _ in range(3):
         for file in front:
             name = Path(file).stem.removesuffix("_kernels")
-            defined = set(re.findall(r"^(?:def|class) ([A-Za-z]\w{4,})|^([A-Z_]{5,}) =", (root / file).read_text(), re.MULTILINE))
-            words = {word for pair in defined for word in pair if word} | ({name} if len(name) > 4 else set())
+            defined = set(
+                re.findall(
+                    r"^(?:def|class) ([A-Za-z]\w{4,})|^([A-Z_]{5,}) =",
+                    (root / file).read_text(),
+                    re.MULTILINE,
+                )
+            )
+            words = {word for pair in defined for word in pair if word} | (
+                {name} if len(name) > 4 else set()
+            )
             for test, there in _tests(root).items():
                 same = name in test.rsplit("/", 1)[1]
                 place = Path(test).parent.name in file
-                score[test] += weight * (8 * same + len(words & there) ** 0.5 * (2 if place else 1)) / len(front) ** 0.5
+                score[test] += (
+                    weight
+                    * (8 * same + len(words & there) ** 0.5 * (2 if place else 1))
+                    / len(front) ** 0.5
+                )
         seen |= front
         front = {user for file in front for user in _users(root).get(file, ())} - seen
         weight /= 4

@@ -10,7 +10,17 @@ from pathlib import Path
 import warp_lcp as wl
 from warp_lcp.benchmarks.cases import RTOL, Case
 from warp_lcp.benchmarks.harness.machine import COPIED, machine
-from warp_lcp.benchmarks.harness.record import MACHINE, Bars, Record, Results, Table, Target, shown, spread, table_of_targets
+from warp_lcp.benchmarks.harness.record import (
+    MACHINE,
+    Bars,
+    Record,
+    Results,
+    Table,
+    Target,
+    shown,
+    spread,
+    table_of_targets,
+)
 from warp_lcp.benchmarks.harness.timing import Figure, Options, ratios
 from warp_lcp.benchmarks.peers.peer import Answer, Peer, PeerFailed, Question
 from warp_lcp.benchmarks.peers.roster import Roster, roster
@@ -21,7 +31,8 @@ SIZES = (32, 64, 128)
 ENGINE = "ProjectedMultigrid"
 BUDGET = 60.0  # [s] after which a peer is not asked again at a size
 LONGEST = 300.0  # [s] that a solve may be expected to take, from that at the size before
-TIGHTER = (1.0, 0.3, 0.1, 0.03, 0.01, 1e-3, 1e-4, 1e-5, 1e-6)  # of the tolerance, until the residual is that asked for
+# of the tolerance, until the residual is that asked for
+TIGHTER = (1.0, 0.3, 0.1, 0.03, 0.01, 1e-3, 1e-4, 1e-5, 1e-6)
 SLACK = 1.01  # of the residual: sums are in another order
 GROWTH = 4 / 3  # least exponent of the time of solves whose iterations grow, for what is expected
 
@@ -67,13 +78,26 @@ class Contest:
     def record(self, ours: Case) -> Record:
         """Return what was measured, with the ratio to ours in the same rounds."""
         peer, scene = self.peer, self.question.scene
-        facts = {"n": scene.n, "bounds": self.question.bounds, "method": peer.name, "precision": peer.precision, "settings": peer.settings}
+        facts = {
+            "n": scene.n,
+            "bounds": self.question.bounds,
+            "method": peer.name,
+            "precision": peer.precision,
+            "settings": peer.settings,
+        }
         name = f"{scene.n}^3 {self.question.bounds} {peer.name}"
         if not self.answers or self.remark:
             return Record(name, {}, facts | {"remark": self.remark})
-        figures = {part: Figure.of([getattr(a, part) for a in self.answers], "s") for part in ("setup", "solve", "total")}
+        figures = {
+            part: Figure.of([getattr(a, part) for a in self.answers], "s")
+            for part in ("setup", "solve", "total")
+        }
         last = self.answers[-1]
-        figures |= {"iterations": Figure(last.iterations), "residual": Figure(self.residual), "asked": Figure(self.tolerance)}
+        figures |= {
+            "iterations": Figure(last.iterations),
+            "residual": Figure(self.residual),
+            "asked": Figure(self.tolerance),
+        }
         if last.linear_iterations is not None:
             figures["linear_iterations"] = Figure(last.linear_iterations)
         totals = [a.total for a in self.answers]
@@ -84,7 +108,9 @@ class Contest:
 def measure(options: Options, out: Path) -> Results:
     """Ask everybody at the sizes asked for."""
     sizes = sorted(options.sizes or SIZES)
-    where = machine(options.device, elements=min(COPIED, 64 * max(sizes) ** 3), repeat=options.repeat)
+    where = machine(
+        options.device, elements=min(COPIED, 64 * max(sizes) ** 3), repeat=options.repeat
+    )
     records, seconds = [where], dict[tuple[str, str], tuple[int, float]]()
     with roster(options.device) as there:
         where.facts["peers"] = there.versions
@@ -94,17 +120,30 @@ def measure(options: Options, out: Path) -> Results:
         for n in sizes:
             found = _measure_size(n, there, seconds, options)
             records += found
-            seconds |= {(r.facts["method"], r.facts["bounds"]): (n, t) for r in found if (t := r.value("total"))}
+            seconds |= {
+                (r.facts["method"], r.facts["bounds"]): (n, t)
+                for r in found
+                if (t := r.value("total"))
+            }
     n = max(sizes)
-    asked = Table("Who was asked", ["library", "version"], [[name, text] for name, text in there.versions.items()])
+    asked = Table(
+        "Who was asked",
+        ["library", "version"],
+        [[name, text] for name, text in there.versions.items()],
+    )
     tables = [_targets(records, n), asked, *(_table(m, records) for m in sizes)]
     return Results(records, tables, [_bars(bounds, records) for bounds in BOUNDS])
 
 
-def _measure_size(n: int, there: Roster, seconds: dict[tuple[str, str], tuple[int, float]], options: Options) -> list[Record]:
+def _measure_size(
+    n: int, there: Roster, seconds: dict[tuple[str, str], tuple[int, float]], options: Options
+) -> list[Record]:
     """Measure one sample of everybody in each round."""
     scene = splash(n)
-    cases = {bounds: Case("unit", scene, bounds, wl.ProjectedMultigrid(), options.device) for bounds in BOUNDS}
+    cases = {
+        bounds: Case("unit", scene, bounds, wl.ProjectedMultigrid(), options.device)
+        for bounds in BOUNDS
+    }
     questions = {bounds: Question(scene, bounds) for bounds in BOUNDS}
     contests = [Contest(peer, questions[bounds]) for peer in there.peers for bounds in peer.bounds]
     for contest in contests:
@@ -130,29 +169,65 @@ def _measure_size(n: int, there: Roster, seconds: dict[tuple[str, str], tuple[in
 
 
 def _engine(case: Case) -> Record:
-    facts = {"n": case.scene.n, "bounds": case.bounds, "method": case.method, "precision": "float64, corrections float32"}
-    return Record(f"{case.scene.n}^3 {case.bounds} {case.method}", case.figures(), facts | {"settings": "defaults"})
+    facts = {
+        "n": case.scene.n,
+        "bounds": case.bounds,
+        "method": case.method,
+        "precision": "float64, corrections float32",
+    }
+    return Record(
+        f"{case.scene.n}^3 {case.bounds} {case.method}",
+        case.figures(),
+        facts | {"settings": "defaults"},
+    )
 
 
 def _targets(records: Sequence[Record], n: int) -> Table:
     """Return the figures to reach at the largest size."""
 
     def least(bounds: str, *names: str) -> Figure | None:
-        here = [r for r in records if r.facts.get("n") == n and r.facts["bounds"] == bounds and r.facts["method"].startswith(names)]
-        return min((r.figures["over_engine"] for r in here if "over_engine" in r.figures), key=lambda f: f.value, default=None)
+        here = [
+            r
+            for r in records
+            if r.facts.get("n") == n
+            and r.facts["bounds"] == bounds
+            and r.facts["method"].startswith(names)
+        ]
+        return min(
+            (r.figures["over_engine"] for r in here if "over_engine" in r.figures),
+            key=lambda f: f.value,
+            default=None,
+        )
 
     targets = [
         Target("linear: PyAMG's best", 20, least("linear", "PyAMG"), " x", True),
         Target("linear: PETSc's CG+MG", 3, least("linear", "PETSc CG+MG"), " x", True),
         Target("linear: PETSc's best", 3, least("linear", "PETSc"), " x", True),
-        *(Target(f"{bounds}: PETSc's best SNESVI", 10, least(bounds, "PETSc SNESVI"), " x", True) for bounds in BOUNDS[1:]),
+        *(
+            Target(f"{bounds}: PETSc's best SNESVI", 10, least(bounds, "PETSc SNESVI"), " x", True)
+            for bounds in BOUNDS[1:]
+        ),
     ]
-    remark = f"Times the engine's seconds in the same rounds, set-up included, at {n}^3, both to a relative natural residual of {RTOL:g}."
+    remark = (
+        f"Times the engine's seconds in the same rounds, set-up included, at {n}^3, both to a "
+        f"relative natural residual of {RTOL:g}."
+    )
     return table_of_targets("peer over engine", targets, remark)
 
 
 def _table(n: int, records: Sequence[Record]) -> Table:
-    columns = ["problem", "solver", "settings", "set-up [ms]", "solve [ms]", "total [ms]", "range", "iterations", "linear", "residual"]
+    columns = [
+        "problem",
+        "solver",
+        "settings",
+        "set-up [ms]",
+        "solve [ms]",
+        "total [ms]",
+        "range",
+        "iterations",
+        "linear",
+        "residual",
+    ]
     rows = []
     here = [r for r in records if r.facts.get("n") == n]
     for r in sorted(here, key=lambda r: (BOUNDS.index(r.facts["bounds"]), r.value("total") or 1e9)):
@@ -160,20 +235,35 @@ def _table(n: int, records: Sequence[Record]) -> Table:
         if "total" not in r.figures:
             rows[-1] += [*[""] * 7, r.facts["remark"]]
             continue
-        rows[-1] += [*shown(r, ("setup", "solve", "total"), ".1f", 1e3), spread(r.figures["total"], 1e3)]
-        rows[-1] += [*shown(r, ("iterations", "linear_iterations"), ".0f"), *shown(r, ["residual"], ".1e")]
+        rows[-1] += [
+            *shown(r, ("setup", "solve", "total"), ".1f", 1e3),
+            spread(r.figures["total"], 1e3),
+        ]
+        rows[-1] += [
+            *shown(r, ("iterations", "linear_iterations"), ".0f"),
+            *shown(r, ["residual"], ".1e"),
+        ]
         rows[-1].append(str(r.figures.get("over_engine", 1)))
     remark = (
-        "Peers get the assembled matrix, whose assembly is not counted; the engine's set-up starts from the arrays of cells and b. "
-        "residual: natural, relative, in float64 from the x that came back; a peer's own tolerance is tightened until it is as asked."
+        "Peers get the assembled matrix, whose assembly is not counted; the engine's set-up starts "
+        "from the arrays of cells and b. "
+        "residual: natural, relative, in float64 from the x that came back; a peer's own tolerance "
+        "is tightened until it is as asked."
     )
     return Table(f"{n}^3 cells", [*columns, "x the engine's time"], rows, remark)
 
 
 def _bars(bounds: str, records: Sequence[Record]) -> Bars:
     """Return seconds by solver at the largest size where there are any."""
-    here = [r for r in records if r.name != MACHINE and r.facts["bounds"] == bounds and "total" in r.figures]
-    n = max((r.facts["n"] for r in here if r.facts["method"] != ENGINE), default=max((r.facts["n"] for r in here), default=0))
+    here = [
+        r
+        for r in records
+        if r.name != MACHINE and r.facts["bounds"] == bounds and "total" in r.figures
+    ]
+    n = max(
+        (r.facts["n"] for r in here if r.facts["method"] != ENGINE),
+        default=max((r.facts["n"] for r in here), default=0),
+    )
     values = {r.facts["method"]: r.value("total") or 0.0 for r in here if r.facts["n"] == n}
     ordered = dict(sorted(values.items(), key=lambda item: item[1]))
     return Bars(bounds, f"{bounds}, {n}^3, cold, to {RTOL:g}", "s", ordered, logarithmic=True)

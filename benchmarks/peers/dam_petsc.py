@@ -84,7 +84,15 @@ def main():
             gc.collect()
             dm, nx, ny = finer, 2 * nx - 1, 2 * ny - 1
         snes, x = solve(dm, nx, ny, guess, rtol, sizes)
-        steps.append((nx, ny, snes.getIterationNumber(), snes.getLinearSolveIterations(), snes.getConvergedReason()))
+        steps.append(
+            (
+                nx,
+                ny,
+                snes.getIterationNumber(),
+                snes.getLinearSolveIterations(),
+                snes.getConvergedReason(),
+            )
+        )
     w = x.getArray().reshape(ny, nx)
     answer = {
         "seconds": time.perf_counter() - begun,
@@ -92,7 +100,9 @@ def main():
         "wet": int((w > 0).sum()),
         "norm": float(np.linalg.norm(w[1:-1, 1:-1])),
     }
-    sys.stdout.write(json.dumps({**answer, "version": ".".join(map(str, PETSc.Sys.getVersion()))}) + "\n")
+    sys.stdout.write(
+        json.dumps({**answer, "version": ".".join(map(str, PETSc.Sys.getVersion()))}) + "\n"
+    )
 
 
 main()

@@ -14,7 +14,9 @@ from warp_lcp.benchmarks.peers.peer import Answer, Question
 CG_PATIENCE, OSQP_PATIENCE = 20_000, 100_000  # iterations
 
 
-def pyamg(question: Question, tolerance: float, *, build: str = "smoothed_aggregation_solver") -> Answer:
+def pyamg(
+    question: Question, tolerance: float, *, build: str = "smoothed_aggregation_solver"
+) -> Answer:
     """One of PyAMG's hierarchies before CG, all defaults."""
     import pyamg as library
 
@@ -32,7 +34,9 @@ def scipy_cg(question: Question, tolerance: float) -> Answer:
     """Plain conjugate gradients."""
     A, b, count = question.matrix, -question.b, list[int]()
     begun = time.perf_counter()
-    x, _ = scipy.sparse.linalg.cg(A, b, rtol=tolerance, atol=0.0, callback=lambda _: count.append(1))
+    x, _ = scipy.sparse.linalg.cg(
+        A, b, rtol=tolerance, atol=0.0, callback=lambda _: count.append(1)
+    )
     return Answer(x, 0.0, time.perf_counter() - begun, len(count))
 
 
@@ -42,7 +46,9 @@ def amgcl(question: Question, tolerance: float) -> Answer:
 
     A, b = sp.csr_matrix(question.matrix), -question.b
     begun = time.perf_counter()
-    preconditioner = pyamgcl.amg(A, {"coarsening.type": "smoothed_aggregation", "relax.type": "ilu0"})
+    preconditioner = pyamgcl.amg(
+        A, {"coarsening.type": "smoothed_aggregation", "relax.type": "ilu0"}
+    )
     solver = pyamgcl.solver(preconditioner, {"type": "cg", "tol": tolerance, "maxiter": 1000})
     middle = time.perf_counter()
     x = solver(b)
@@ -57,8 +63,13 @@ def warp_cg(question: Question, tolerance: float, *, device: str) -> Answer:
 
     coo, n = question.matrix.tocoo(), len(question.b)
     rows, columns = (wp.array(i, dtype=wp.int32, device=device) for i in coo.coords)
-    A = warp.sparse.bsr_from_triplets(n, n, rows, columns, wp.array(coo.data, dtype=wp.float64, device=device))
-    b, x = wp.array(-question.b, dtype=wp.float64, device=device), wp.zeros(n, dtype=wp.float64, device=device)
+    A = warp.sparse.bsr_from_triplets(
+        n, n, rows, columns, wp.array(coo.data, dtype=wp.float64, device=device)
+    )
+    b, x = (
+        wp.array(-question.b, dtype=wp.float64, device=device),
+        wp.zeros(n, dtype=wp.float64, device=device),
+    )
     wp.synchronize_device(device)
     begun = time.perf_counter()
     M = warp.optim.linear.preconditioner(A, "diag")
@@ -74,10 +85,16 @@ def cupy_cg(question: Question, tolerance: float) -> Answer:
     import cupyx.scipy.sparse
     import cupyx.scipy.sparse.linalg
 
-    A, b, count = cupyx.scipy.sparse.csr_matrix(sp.csr_matrix(question.matrix)), cupy.asarray(-question.b), list[int]()
+    A, b, count = (
+        cupyx.scipy.sparse.csr_matrix(sp.csr_matrix(question.matrix)),
+        cupy.asarray(-question.b),
+        list[int](),
+    )
     cupy.cuda.Device().synchronize()
     begun = time.perf_counter()
-    x, _ = cupyx.scipy.sparse.linalg.cg(A, b, tol=tolerance, maxiter=CG_PATIENCE, callback=lambda _: count.append(1))
+    x, _ = cupyx.scipy.sparse.linalg.cg(
+        A, b, tol=tolerance, maxiter=CG_PATIENCE, callback=lambda _: count.append(1)
+    )
     cupy.cuda.Device().synchronize()
     return Answer(cupy.asnumpy(x), 0.0, time.perf_counter() - begun, len(count))
 
@@ -91,12 +108,22 @@ def osqp(question: Question, tolerance: float) -> Answer:
     begun = time.perf_counter()
     solver = library.OSQP()
     solver.setup(
-        sp.csc_matrix(P), question.b, sp.csc_matrix(A), question.lower, np.full(len(question.b), np.inf),
-        verbose=False, eps_abs=scale, eps_rel=0.0, max_iter=OSQP_PATIENCE, polishing=False,
-    )  # fmt: skip
+        sp.csc_matrix(P),
+        question.b,
+        sp.csc_matrix(A),
+        question.lower,
+        np.full(len(question.b), np.inf),
+        verbose=False,
+        eps_abs=scale,
+        eps_rel=0.0,
+        max_iter=OSQP_PATIENCE,
+        polishing=False,
+    )
     middle = time.perf_counter()
     result = solver.solve(raise_error=False)
-    return Answer(np.array(result.x), middle - begun, time.perf_counter() - middle, int(result.info.iter))
+    return Answer(
+        np.array(result.x), middle - begun, time.perf_counter() - middle, int(result.info.iter)
+    )
 
 
 def piqp(question: Question, tolerance: float) -> Answer:
@@ -112,7 +139,12 @@ def piqp(question: Question, tolerance: float) -> Answer:
     solver.setup(P, question.b, x_l=question.lower)
     middle = time.perf_counter()
     solver.solve()
-    return Answer(np.array(solver.result.x), middle - begun, time.perf_counter() - middle, int(solver.result.info.iter))
+    return Answer(
+        np.array(solver.result.x),
+        middle - begun,
+        time.perf_counter() - middle,
+        int(solver.result.info.iter),
+    )
 
 
 def clarabel(question: Question, tolerance: float) -> Answer:
@@ -121,12 +153,24 @@ def clarabel(question: Question, tolerance: float) -> Answer:
 
     P = sp.csc_matrix(sp.triu(question.matrix, format="csc"))
     bounded = np.flatnonzero(np.isfinite(question.lower))
-    rows = sp.csc_matrix((-np.ones(len(bounded)), (np.arange(len(bounded)), bounded)), shape=(len(bounded), len(question.b)))
+    rows = sp.csc_matrix(
+        (-np.ones(len(bounded)), (np.arange(len(bounded)), bounded)),
+        shape=(len(bounded), len(question.b)),
+    )
     settings = library.DefaultSettings()
     settings.verbose, settings.max_threads = False, 1
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
     begun = time.perf_counter()
-    solver = library.DefaultSolver(P, question.b, rows, -question.lower[bounded], [library.NonnegativeConeT(len(bounded))], settings)
+    solver = library.DefaultSolver(
+        P,
+        question.b,
+        rows,
+        -question.lower[bounded],
+        [library.NonnegativeConeT(len(bounded))],
+        settings,
+    )
     middle = time.perf_counter()
     solution = solver.solve()
-    return Answer(np.array(solution.x), middle - begun, time.perf_counter() - middle, int(solution.iterations))
+    return Answer(
+        np.array(solution.x), middle - begun, time.perf_counter() - middle, int(solution.iterations)
+    )

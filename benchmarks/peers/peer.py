@@ -47,7 +47,9 @@ class Question:
     @cached_property
     def lower(self) -> np.ndarray:
         """Shape (unknowns,); -inf where there is no bound."""
-        return np.broadcast_to(self.scene.lower(self.bounds), self.scene.b.shape).ravel()[self.where]
+        return np.broadcast_to(self.scene.lower(self.bounds), self.scene.b.shape).ravel()[
+            self.where
+        ]
 
     @cached_property
     def exact(self) -> Exact:
@@ -82,7 +84,8 @@ class Peer:
     Args:
         name: what tables call it.
         library: distribution it is of.
-        solve: solves to its own idea of a tolerance; the harness tightens that until `Question.residual` agrees.
+        solve: solves to its own idea of a tolerance; the harness tightens that until
+            `Question.residual` agrees.
         bounds: which problems it solves.
         most: cells a side beyond which it is not asked.
         settings: what was set.

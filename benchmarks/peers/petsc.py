@@ -20,17 +20,29 @@ from warp_lcp.benchmarks.problems import BOUNDS
 
 VARIABLE = "WARP_LCP_PETSC_PYTHON"  # environment variable that names the interpreter
 PROBE_SECONDS = 120.0
-DEBIAN_PETSC = "/usr/lib/petscdir/petsc*/*-real"  # where Debian keeps the builds that petsc4py chooses from by PETSC_DIR
+# where Debian keeps the builds that petsc4py chooses from by PETSC_DIR
+DEBIAN_PETSC = "/usr/lib/petscdir/petsc*/*-real"
 CYCLE = "V-cycle, Galerkin, SSOR"
 ICC, HYPRE = {"pc_type": "icc"}, {"pc_type": "hypre", "pc_hypre_type": "boomeramg"}
-METHODS: dict[str, tuple[dict[str, str], tuple[str, ...], int, str]] = {  # options, problems, cells a side beyond which it is not asked
+# options, problems, cells a side beyond which it is not asked
+METHODS: dict[str, tuple[dict[str, str], tuple[str, ...], int, str]] = {
     "PETSc CG+MG": ({}, BOUNDS[:1], 256, f"geometric 2x2x2 aggregates, {CYCLE}"),
     "PETSc CG+GAMG": ({"pc_type": "gamg"}, BOUNDS[:1], 256, "-pc_type gamg"),
     "PETSc CG+BoomerAMG": (HYPRE, BOUNDS[:1], 256, "-pc_type hypre"),
     "PETSc CG+ICC": (ICC, BOUNDS[:1], 128, "-pc_type icc"),
-    "PETSc SNESVI+MG": ({}, INEQUALITIES, 128, f"vinewtonrsls, -ksp_rtol 1e-2, aggregates of the free set, {CYCLE}"),
+    "PETSc SNESVI+MG": (
+        {},
+        INEQUALITIES,
+        128,
+        f"vinewtonrsls, -ksp_rtol 1e-2, aggregates of the free set, {CYCLE}",
+    ),
     "PETSc SNESVI+ICC": (ICC, INEQUALITIES, 128, "vinewtonrsls, -ksp_rtol 1e-2 -pc_type icc"),
-    "PETSc SNESVI+BoomerAMG": (HYPRE, INEQUALITIES, 64, "vinewtonrsls, -ksp_rtol 1e-2 -pc_type hypre"),
+    "PETSc SNESVI+BoomerAMG": (
+        HYPRE,
+        INEQUALITIES,
+        64,
+        "vinewtonrsls, -ksp_rtol 1e-2 -pc_type hypre",
+    ),
 }
 
 
@@ -40,7 +52,9 @@ def interpreter(module: str = "petsc4py", variable: str = VARIABLE) -> str | Non
     for python in [named] if named else [sys.executable, "/usr/bin/python3"]:
         command = [python, "-c", f"import {module}"]
         try:
-            done = subprocess.run(command, env=environment(), capture_output=True, check=False, timeout=PROBE_SECONDS)
+            done = subprocess.run(
+                command, env=environment(), capture_output=True, check=False, timeout=PROBE_SECONDS
+            )
         except (OSError, subprocess.TimeoutExpired):
             continue
         if done.returncode == 0:
@@ -51,14 +65,23 @@ def interpreter(module: str = "petsc4py", variable: str = VARIABLE) -> str | Non
 def missing() -> str:
     """Return what to tell where there is none."""
     named = os.environ.get(VARIABLE)
-    where = f"{named}, which {VARIABLE} names, does not import petsc4py" if named else "no interpreter imports petsc4py"
+    where = (
+        f"{named}, which {VARIABLE} names, does not import petsc4py"
+        if named
+        else "no interpreter imports petsc4py"
+    )
     return f"missing: {where}; apt-get install python3-petsc4py, or name an interpreter that has it"
 
 
 def environment() -> dict[str, str]:
     """Return the environment of its interpreter: one thread, and Debian's PETSc where none is named."""
     found = sorted(glob.glob(DEBIAN_PETSC))
-    return {**({"PETSC_DIR": found[-1]} if found else {}), **os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    return {
+        **({"PETSC_DIR": found[-1]} if found else {}),
+        **os.environ,
+        "OMP_NUM_THREADS": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+    }
 
 
 @contextmanager
@@ -76,7 +99,13 @@ def peers(folder: Path) -> Iterator[tuple[list[Peer], str]]:
     ask = partial(asked, worker=worker, folder=folder)
     try:
         found = METHODS.items()
-        yield [Peer(name, "petsc", partial(ask, options=o), bounds, most, text) for name, (o, bounds, most, text) in found], worker.version
+        yield (
+            [
+                Peer(name, "petsc", partial(ask, options=o), bounds, most, text)
+                for name, (o, bounds, most, text) in found
+            ],
+            worker.version,
+        )
     finally:
         worker.close()
 
@@ -97,7 +126,12 @@ class Worker:
 
     def __init__(self, name: str, command: Sequence[str]) -> None:
         self.name = name
-        pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "encoding": "utf-8"}
+        pipes: dict[str, Any] = {
+            "stdin": subprocess.PIPE,
+            "stdout": subprocess.PIPE,
+            "text": True,
+            "encoding": "utf-8",
+        }
         self.process = subprocess.Popen(command, env=environment(), **pipes)
         self.version = str(self._read()["version"])
 
@@ -112,7 +146,9 @@ class Worker:
             self.process.stdin.write(json.dumps(request) + "\n")
             self.process.stdin.flush()
         except BrokenPipeError:
-            raise PeerFailed(f"{self.name} has ended with exit code {self.process.wait()}") from None
+            raise PeerFailed(
+                f"{self.name} has ended with exit code {self.process.wait()}"
+            ) from None
         reply = self._read()
         if "error" in reply:
             raise PeerFailed(f"{self.name}: {reply['error']}")
@@ -131,7 +167,14 @@ class Worker:
         return reply
 
 
-def asked(question: Question, tolerance: float, *, worker: Worker, folder: Path, options: Mapping[str, str]) -> Answer:
+def asked(
+    question: Question,
+    tolerance: float,
+    *,
+    worker: Worker,
+    folder: Path,
+    options: Mapping[str, str],
+) -> Answer:
     """Ask a worker through files: one for each scene, written when it is first asked about.
 
     Raises:
@@ -141,12 +184,33 @@ def asked(question: Question, tolerance: float, *, worker: Worker, folder: Path,
     if not path.exists():
         for old in folder.glob("*.npz"):
             old.unlink()
-        fields: dict[str, Any] = {f"lower_{name}": Question(question.scene, name).lower for name in INEQUALITIES}
-        fields |= {"data": A.data, "indices": A.indices, "indptr": A.indptr, "shape": np.array(question.scene.cells.shape)}
+        fields: dict[str, Any] = {
+            f"lower_{name}": Question(question.scene, name).lower for name in INEQUALITIES
+        }
+        fields |= {
+            "data": A.data,
+            "indices": A.indices,
+            "indptr": A.indptr,
+            "shape": np.array(question.scene.cells.shape),
+        }
         np.savez(path, b=question.b, where=question.where, **fields)
     method = "inequality" if question.bounds in INEQUALITIES else "linear"
-    request = {"method": method, "options": dict(options), "tolerance": tolerance, "bounds": question.bounds}
+    request = {
+        "method": method,
+        "options": dict(options),
+        "tolerance": tolerance,
+        "bounds": question.bounds,
+    }
     reply = worker.ask(request | {"problem": str(path), "answer": str(answer)})
     if reply["reason"] <= 0:
-        raise PeerFailed(f"PETSc did not converge: reason {reply['reason']} after {reply['iterations']} iterations")
-    return Answer(np.load(answer), reply["setup"], reply["solve"], reply["iterations"], reply["linear_iterations"])
+        raise PeerFailed(
+            f"PETSc did not converge: reason {reply['reason']} after {reply['iterations']} "
+            "iterations"
+        )
+    return Answer(
+        np.load(answer),
+        reply["setup"],
+        reply["solve"],
+        reply["iterations"],
+        reply["linear_iterations"],
+    )

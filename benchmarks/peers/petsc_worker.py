@@ -1,7 +1,8 @@
 """PETSc's conjugate gradients with its multigrids, and its active-set solver of inequalities: a program for an interpreter that has it.
 
-The matrix is converted and the transfers of the geometric hierarchy are built before the clock starts: neither is PETSc's work.
-A line of JSON asks, a line of JSON answers; arrays travel in .npz files. It imports nothing of this project.
+The matrix is converted and the transfers of the geometric hierarchy are built before the clock
+starts: neither is PETSc's work. A line of JSON asks, a line of JSON answers; arrays travel in .npz
+files. It imports nothing of this project.
 """
 
 from __future__ import annotations
@@ -23,8 +24,14 @@ Reply = dict[str, Any]
 COARSEST = 500  # unknowns that are left to a direct solver
 NEWTON_STEPS = 200
 LINEAR_ITERATIONS = 10_000
-# two sweeps of symmetric SOR per level or PETSc's own choices; of what was tried these take the least time on the splash
-MULTIGRID = {"pc_mg_galerkin": "both", "mg_levels_ksp_type": "richardson", "mg_levels_ksp_max_it": 1, "mg_levels_pc_type": "sor"}
+# two sweeps of symmetric SOR per level or PETSc's own choices; of what was tried these take the
+# least time on the splash
+MULTIGRID = {
+    "pc_mg_galerkin": "both",
+    "mg_levels_ksp_type": "richardson",
+    "mg_levels_ksp_max_it": 1,
+    "mg_levels_pc_type": "sor",
+}
 LOOSE = {"ksp_rtol": 1e-2}  # of a Newton step; tighter ones take fewer steps and more time
 
 
@@ -40,8 +47,16 @@ class Problem:
 
     def __init__(self, path: str) -> None:
         with np.load(path) as kept:
-            self.b, self.where, self.shape = kept["b"], kept["where"], tuple(int(s) for s in kept["shape"])
-            rows, columns, values = kept["indptr"].astype(np.int32), kept["indices"].astype(np.int32), kept["data"]
+            self.b, self.where, self.shape = (
+                kept["b"],
+                kept["where"],
+                tuple(int(s) for s in kept["shape"]),
+            )
+            rows, columns, values = (
+                kept["indptr"].astype(np.int32),
+                kept["indices"].astype(np.int32),
+                kept["data"],
+            )
             self.lower = {name[6:]: kept[name] for name in kept.files if name.startswith("lower_")}
         self.A = PETSc.Mat().createAIJWithArrays((len(self.b),) * 2, (rows, columns, values))
         self.A.setOption(PETSc.Mat.Option.SPD, True)
@@ -65,18 +80,25 @@ def options(values: dict[str, Any]) -> Iterator[None]:
 def aggregates(where: np.ndarray, shape: tuple[int, ...]) -> list[Any]:
     """Return prolongations by 2 x 2 x 2 aggregates of cells, finest first, constant on each.
 
-    Trilinear ones take fewer iterations and three times as long, for their Galerkin products are of 27 points.
+    Trilinear ones take fewer iterations and three times as long, for their Galerkin products are of
+    27 points.
     """
     found = []
     while len(where) > COARSEST and min(shape) > 2:
         coarse = tuple((s + 1) // 2 for s in shape)
-        parents = np.ravel_multi_index(tuple(i // 2 for i in np.unravel_index(where, shape)), coarse)
+        parents = np.ravel_multi_index(
+            tuple(i // 2 for i in np.unravel_index(where, shape)), coarse
+        )
         kept = np.zeros(int(np.prod(coarse)), dtype=bool)
         kept[parents] = True
         columns = (np.cumsum(kept) - 1)[parents].astype(np.int32)
         rows = np.arange(len(where) + 1, dtype=np.int32)
         where, shape = np.flatnonzero(kept), coarse
-        found.append(PETSc.Mat().createAIJWithArrays((len(rows) - 1, len(where)), (rows, columns, np.ones(len(columns)))))
+        found.append(
+            PETSc.Mat().createAIJWithArrays(
+                (len(rows) - 1, len(where)), (rows, columns, np.ones(len(columns)))
+            )
+        )
     return found
 
 
@@ -108,7 +130,15 @@ def linear(request: Request) -> Reply:
         middle = time.perf_counter()
         ksp.solve(right, x)
         end = time.perf_counter()
-    return _answer(request, x, middle - begun, end - middle, ksp.getIterationNumber(), ksp.getConvergedReason(), ksp)
+    return _answer(
+        request,
+        x,
+        middle - begun,
+        end - middle,
+        ksp.getIterationNumber(),
+        ksp.getConvergedReason(),
+        ksp,
+    )
 
 
 class ReducedMultigrid:
@@ -172,27 +202,51 @@ def inequality(request: Request) -> Reply:
         snes.solve(None, x)
         end = time.perf_counter()
     seconds = end - middle - (0.0 if own is None else own.building)
-    return _answer(request, x, middle - begun, seconds, snes.getIterationNumber(), snes.getConvergedReason(), snes)
+    return _answer(
+        request,
+        x,
+        middle - begun,
+        seconds,
+        snes.getIterationNumber(),
+        snes.getConvergedReason(),
+        snes,
+    )
 
 
-def _answer(request: Request, x: Any, setup: float, solve: float, iterations: int, reason: int, solver: Any) -> Reply:
+def _answer(
+    request: Request, x: Any, setup: float, solve: float, iterations: int, reason: int, solver: Any
+) -> Reply:
     """Write x and return the rest."""
     np.save(request["answer"], x.array_r)
-    linear_iterations = solver.getLinearSolveIterations() if isinstance(solver, PETSc.SNES) else iterations
+    linear_iterations = (
+        solver.getLinearSolveIterations() if isinstance(solver, PETSc.SNES) else iterations
+    )
     solver.destroy()
-    return {"setup": setup, "solve": solve, "iterations": iterations, "linear_iterations": linear_iterations, "reason": int(reason)}
+    return {
+        "setup": setup,
+        "solve": solve,
+        "iterations": iterations,
+        "linear_iterations": linear_iterations,
+        "reason": int(reason),
+    }
 
 
-def serve(version: str, methods: Mapping[str, Callable[[Request], Reply]], failures: tuple[type[Exception], ...] = ()) -> None:
+def serve(
+    version: str,
+    methods: Mapping[str, Callable[[Request], Reply]],
+    failures: tuple[type[Exception], ...] = (),
+) -> None:
     """Answer requests until the input ends; the first line that is sent tells the peer's version.
 
     Args:
         version: of the peer.
         methods: what can be asked for, by the request's `method`.
-        failures: what methods raise where they fail; the answer is then {"error": text}. Anything else ends the program.
+        failures: what methods raise where they fail; the answer is then {"error": text}. Anything
+            else ends the program.
     """
     replies = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # what the peer prints must not get between the answers
+    # what the peer prints must not get between the answers
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
 
     def send(reply: Reply) -> None:
         replies.write(json.dumps(reply) + "\n")
@@ -208,4 +262,8 @@ def serve(version: str, methods: Mapping[str, Callable[[Request], Reply]], failu
 
 
 if __name__ == "__main__":
-    serve(".".join(map(str, PETSc.Sys.getVersion())), {"linear": linear, "inequality": inequality}, (PETSc.Error,))
+    serve(
+        ".".join(map(str, PETSc.Sys.getVersion())),
+        {"linear": linear, "inequality": inequality},
+        (PETSc.Error,),
+    )

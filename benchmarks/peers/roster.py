@@ -14,7 +14,9 @@ from pathlib import Path
 from warp_lcp.benchmarks.peers import libraries, petsc
 from warp_lcp.benchmarks.peers.peer import INEQUALITIES, Peer
 
-FACTORS = 32  # cells a side up to which matrices are factorized: fill grows with the fourth power, work with the sixth
+# cells a side up to which matrices are factorized: fill grows with the fourth power, work with the
+# sixth
+FACTORS = 32
 EXTRA = "pip install 'warp-lcp[peers]'"
 HINTS = {
     "pyamgcl": "pip install pyamgcl (needs a C++ compiler and Boost's headers)",
@@ -29,19 +31,36 @@ class Roster:
     """Who is there."""
 
     peers: tuple[Peer, ...]  # who can be asked
-    versions: dict[str, str]  # of all libraries that were looked for; of missing ones, how to get them
+    # of all libraries that were looked for; of missing ones, how to get them
+    versions: dict[str, str]
 
 
 def _linear(device: str) -> list[Peer]:
     """Return the peers of the linear solve in this process."""
-    warp, classical = partial(libraries.warp_cg, device=device), partial(libraries.pyamg, build="ruge_stuben_solver")
-    most = 256 if device.startswith("cuda") else 32  # Warp's CG takes 15 ms an iteration at 24^3 on the CPU
+    warp, classical = (
+        partial(libraries.warp_cg, device=device),
+        partial(libraries.pyamg, build="ruge_stuben_solver"),
+    )
+    # Warp's CG takes 15 ms an iteration at 24^3 on the CPU
+    most = 256 if device.startswith("cuda") else 32
     return [
         Peer("PyAMG SA-CG", "pyamg", libraries.pyamg, most=256),
         Peer("PyAMG RS-CG", "pyamg", classical, most=256),
-        Peer("AMGCL SA-CG", "pyamgcl", libraries.amgcl, most=256, settings="smoothed aggregation, ILU(0), one thread"),
+        Peer(
+            "AMGCL SA-CG",
+            "pyamgcl",
+            libraries.amgcl,
+            most=256,
+            settings="smoothed aggregation, ILU(0), one thread",
+        ),
         Peer("SciPy CG", "scipy", libraries.scipy_cg, most=128, settings="no preconditioner"),
-        Peer("Warp CG", "warp.optim.linear", warp, most=most, settings="diagonal, BSR, one thread a row"),
+        Peer(
+            "Warp CG",
+            "warp.optim.linear",
+            warp,
+            most=most,
+            settings="diagonal, BSR, one thread a row",
+        ),
         Peer("CuPy CG", "cupy", libraries.cupy_cg, settings="no preconditioner"),
     ]
 
@@ -56,12 +75,35 @@ QUADRATIC = (
 @contextmanager
 def roster(device: str) -> Iterator[Roster]:
     """Find the peers; those in interpreters of their own run until the end of the block."""
-    with tempfile.TemporaryDirectory(prefix="peers-") as folder, petsc.peers(Path(folder)) as (others, petsc_version):
-        libraries = ["scipy", "pyamg", "pyamgcl", "osqp", "piqp", "clarabel", "numba", "cupy", "siconos"]
-        versions = {name: _version(name) for name in libraries} | {"petsc": petsc_version, "warp.optim.linear": version("warp-lang")}
+    with (
+        tempfile.TemporaryDirectory(prefix="peers-") as folder,
+        petsc.peers(Path(folder)) as (others, petsc_version),
+    ):
+        libraries = [
+            "scipy",
+            "pyamg",
+            "pyamgcl",
+            "osqp",
+            "piqp",
+            "clarabel",
+            "numba",
+            "cupy",
+            "siconos",
+        ]
+        versions = {name: _version(name) for name in libraries} | {
+            "petsc": petsc_version,
+            "warp.optim.linear": version("warp-lang"),
+        }
         if not device.startswith("cuda"):
             versions["cupy"] = f"not asked: {device} is no CUDA device"
-        yield Roster(tuple(p for p in (*_linear(device), *QUADRATIC, *others) if versions[p.library][:1].isdigit()), versions)
+        yield Roster(
+            tuple(
+                p
+                for p in (*_linear(device), *QUADRATIC, *others)
+                if versions[p.library][:1].isdigit()
+            ),
+            versions,
+        )
 
 
 def _version(name: str) -> str:

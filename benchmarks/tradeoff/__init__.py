@@ -7,7 +7,13 @@ from pathlib import Path
 from warp_lcp.benchmarks.harness.machine import machine
 from warp_lcp.benchmarks.harness.record import Results
 from warp_lcp.benchmarks.harness.timing import Options
-from warp_lcp.benchmarks.tradeoff.charts import preset_table, run_chart, run_table, solve_chart, solve_table
+from warp_lcp.benchmarks.tradeoff.charts import (
+    preset_table,
+    run_chart,
+    run_table,
+    solve_chart,
+    solve_table,
+)
 from warp_lcp.benchmarks.tradeoff.runs import FRAMES, Runs
 from warp_lcp.benchmarks.tradeoff.settings import Setting, settings_of
 from warp_lcp.benchmarks.tradeoff.solves import measure_solves
@@ -26,29 +32,41 @@ def measure(options: Options, out: Path) -> Results:
     records = [machine(options.device, elements=1 << 22, repeat=options.repeat)]
     results = Results(records, [])
     for name in [options.scene] if options.scene else SCENES:
-        resolution = max(options.sizes, default=SCENES.get(name) or load_scene(name).domain.resolution)
+        resolution = max(
+            options.sizes, default=SCENES.get(name) or load_scene(name).domain.resolution
+        )
         frames = FRAMES if resolution > QUICK else QUICK_FRAMES
         _measure_scene(name, resolution, frames, options, results)
     return results
 
 
-def _measure_scene(name: str, resolution: int, frames: int, options: Options, results: Results) -> None:
+def _measure_scene(
+    name: str, resolution: int, frames: int, options: Options, results: Results
+) -> None:
     """Add what a scene shows to the results."""
     runs = Runs(name, resolution, frames, options)
     scene = runs.scene()
     settings = settings_of(scene.scene.simulator)
-    presets = [Setting(f"preset {preset}", _overrides(scene.scene.simulator, preset)) for preset in PRESETS]
+    presets = [
+        Setting(f"preset {preset}", _overrides(scene.scene.simulator, preset)) for preset in PRESETS
+    ]
     measured = runs.measure([*presets, *settings])
     own = [runs.record(run) for run in measured]
     if not any(run.trial for run in measured):
         raise StepFailed(f"{name}: no setting ran: {measured[0].failed}")
     solves, title = measure_solves(scene, options, frames), scene.scene.name
     results.records.extend([*own, *solves])
-    results.tables.extend([preset_table(title, own), run_table(title, own), solve_table(title, solves)])
+    results.tables.extend(
+        [preset_table(title, own), run_table(title, own), solve_table(title, solves)]
+    )
     results.charts.extend([*run_chart(title, own), *solve_chart(title, solves)])
 
 
 def _overrides(simulator: str, preset: str) -> tuple[str, ...]:
     """Return a preset's settings but for those of models that a scene may not have."""
     settings = price_table()[simulator].presets[preset].settings
-    return tuple(f"{key}={value:g}" for key, value in settings.items() if not key.startswith("density_correction"))
+    return tuple(
+        f"{key}={value:g}"
+        for key, value in settings.items()
+        if not key.startswith("density_correction")
+    )

@@ -12,10 +12,14 @@ PARETO = "Pareto front"
 FINEST = "distance_to_finest"
 SMALLEST = 1e-16  # that a logarithmic axis shows
 RUN_REMARK = (
-    "seconds: the least of all rounds, of the steps alone. distance: share of the mass that is elsewhere than in a run of the same "
-    "resolution with the smallest steps and tolerance, in boxes of two cells of the scene, the mean over the frames compared; to the "
-    "finest: than in such a run of twice the resolution. Pareto: no other setting of this resolution is faster and nearer to its "
-    "reference; Pareto, all: no other one at all is faster and nearer to the finest. energy, front: largest relative and last "
+    "seconds: the least of all rounds, of the steps alone. distance: share of the mass that is "
+    "elsewhere than in a run of the same "
+    "resolution with the smallest steps and tolerance, in boxes of two cells of the scene, the "
+    "mean over the frames compared; to the "
+    "finest: than in such a run of twice the resolution. Pareto: no other setting of this "
+    "resolution is faster and nearer to its "
+    "reference; Pareto, all: no other one at all is faster and nearer to the finest. energy, "
+    "front: largest relative and last "
     "difference from the reference. volume: its growth. packing: of the densest cell of sand."
 )
 
@@ -28,11 +32,17 @@ def run_chart(scene: str, records: Sequence[Record]) -> list[Chart]:
 
 def solve_chart(scene: str, records: Sequence[Record]) -> list[Chart]:
     """Return the error over the seconds of the solves, the Pareto front marked."""
-    solves = [(f"{r.facts['method']}, {r.facts['precision']}", r) for r in records if r.facts["kind"] == "solve"]
+    solves = [
+        (f"{r.facts['method']}, {r.facts['precision']}", r)
+        for r in records
+        if r.facts["kind"] == "solve"
+    ]
     return _chart(scene, "error", "error against a converged float64 solution", "solve", solves)
 
 
-def _chart(scene: str, figure: str, label: str, kind: str, records: Sequence[tuple[str, Record]]) -> list[Chart]:
+def _chart(
+    scene: str, figure: str, label: str, kind: str, records: Sequence[tuple[str, Record]]
+) -> list[Chart]:
     """Return the chart of a figure over seconds, none where no record has it."""
     points = defaultdict[str, list[tuple[float, float]]](list)
     for curve, r in records:
@@ -44,19 +54,46 @@ def _chart(scene: str, figure: str, label: str, kind: str, records: Sequence[tup
     points[PARETO] = [every[i] for i in front_of(every)]
     curves = {curve: ([x for x, _ in own], [y for _, y in own]) for curve, own in points.items()}
     name = f"{scene}-{kind}-{figure.replace('_', '-')}"
-    return [Lines(name, f"{scene}: {label}", f"seconds of a {kind}", label, curves, marked=frozenset({PARETO}))]
+    return [
+        Lines(
+            name,
+            f"{scene}: {label}",
+            f"seconds of a {kind}",
+            label,
+            curves,
+            marked=frozenset({PARETO}),
+        )
+    ]
 
 
 def _front(records: Sequence[Record], figure: str) -> set[str]:
     """Return the names of the records on the Pareto front of seconds and a figure."""
-    return {records[i].name for i in front_of([(r.figures["seconds"].value, r.figures[figure].value) for r in records])}
+    return {
+        records[i].name
+        for i in front_of([(r.figures["seconds"].value, r.figures[figure].value) for r in records])
+    }
 
 
 def run_table(scene: str, records: Sequence[Record]) -> Table:
     """Return the runs, the Pareto front of seconds and distance marked."""
     ran = [r for r in records if r.figures]
-    best, best_of_all = _front([r for r in ran if r.facts["scale"] == 1.0], "distance"), _front(ran, FINEST)
-    columns = ["settings", "", "seconds", "steps", "iterations", "MB", "distance", "to the finest", "energy", "front [m]", "volume"]
+    best, best_of_all = (
+        _front([r for r in ran if r.facts["scale"] == 1.0], "distance"),
+        _front(ran, FINEST),
+    )
+    columns = [
+        "settings",
+        "",
+        "seconds",
+        "steps",
+        "iterations",
+        "MB",
+        "distance",
+        "to the finest",
+        "energy",
+        "front [m]",
+        "volume",
+    ]
     rows = []
     for r in records:
         curve, settings = str(r.facts["curve"]), str(r.facts["settings"])
@@ -65,8 +102,14 @@ def run_table(scene: str, records: Sequence[Record]) -> Table:
             rows.append([name, "failed", *[""] * (len(columns) - 2), str(r.facts["failed"])[:120]])
             continue
         mark = ", ".join(["Pareto"] * (r.name in best) + ["Pareto, all"] * (r.name in best_of_all))
-        cost = [*shown(r, ["seconds"], ".3f"), *shown(r, ["steps", "iterations"], ".0f"), *shown(r, ["bytes"], ".1f", 1e-6)]
-        seen = shown(r, ["distance", FINEST, "energy_error"], ".4f") + shown(r, ["front_error", "volume_drift", "packing"], "+.4f")
+        cost = [
+            *shown(r, ["seconds"], ".3f"),
+            *shown(r, ["steps", "iterations"], ".0f"),
+            *shown(r, ["bytes"], ".1f", 1e-6),
+        ]
+        seen = shown(r, ["distance", FINEST, "energy_error"], ".4f") + shown(
+            r, ["front_error", "volume_drift", "packing"], "+.4f"
+        )
         rows.append([name, mark, *cost, *seen])
     return Table(f"{scene}: runs", [*columns, "packing"], rows, RUN_REMARK)
 
@@ -77,16 +120,40 @@ def solve_table(scene: str, records: Sequence[Record]) -> Table:
     best = _front(solved, "error")
     rows = []
     for r in solved:
-        named = [str(r.facts["method"]), str(r.facts["precision"]), f"{r.facts['tolerance']:g}", "Pareto" if r.name in best else ""]
-        cost = [*shown(r, ["seconds"], ".4f"), *shown(r, ["iterations"], ".0f"), *shown(r, ["bytes"], ".1f", 1e-6)]
-        rows.append([*named, *cost, *shown(r, ["residual", "error"], ".2e"), str(r.facts.get("status", ""))])
+        named = [
+            str(r.facts["method"]),
+            str(r.facts["precision"]),
+            f"{r.facts['tolerance']:g}",
+            "Pareto" if r.name in best else "",
+        ]
+        cost = [
+            *shown(r, ["seconds"], ".4f"),
+            *shown(r, ["iterations"], ".0f"),
+            *shown(r, ["bytes"], ".1f", 1e-6),
+        ]
+        rows.append(
+            [*named, *cost, *shown(r, ["residual", "error"], ".2e"), str(r.facts.get("status", ""))]
+        )
     reference = next(r for r in records if r.facts["kind"] == "reference")
     remark = (
-        "Liquid: problems recorded in a run, from its own first guess; error: relative, in the energy norm, against a float64 solution of "
-        f"relative residual {reference.value('residual'):.1e}. Sand: whole steps from states of a run; error: root mean square of the "
+        "Liquid: problems recorded in a run, from its own first guess; error: relative, in the "
+        "energy norm, against a float64 solution of "
+        f"relative residual {reference.value('residual'):.1e}. Sand: whole steps from states of a "
+        "run; error: root mean square of the "
         "particles' velocity difference over g dt, residual in units of rho g dx."
     )
-    columns = ["method", "precision", "tolerance", "", "seconds", "iterations", "MB", "residual", "error", "status"]
+    columns = [
+        "method",
+        "precision",
+        "tolerance",
+        "",
+        "seconds",
+        "iterations",
+        "MB",
+        "residual",
+        "error",
+        "status",
+    ]
     return Table(f"{scene}: solves", columns, rows, remark)
 
 
@@ -97,8 +164,22 @@ def preset_table(scene: str, records: Sequence[Record]) -> Table:
     rows = []
     for r in presets:
         last = [figure for figure in ("volume_drift", "packing") if figure in r.figures][:1]
-        seen = shown(r, ["distance", "energy_error"], ".4f") + [*shown(r, ["front_error", *last], "+.4f"), "+0.0000"][:2]
+        seen = (
+            shown(r, ["distance", "energy_error"], ".4f")
+            + [*shown(r, ["front_error", *last], "+.4f"), "+0.0000"][:2]
+        )
         times = [*shown(r, ["seconds"], ".3f"), f"{slowest / r.figures['seconds'].value:.1f}"]
-        rows.append([str(r.facts["curve"]).removeprefix("preset "), str(r.facts["settings"]), *times, *seen])
-    columns = ["preset", "settings", "seconds", "times faster", "distance", "energy", "front [m]", "volume or packing"]
+        rows.append(
+            [str(r.facts["curve"]).removeprefix("preset "), str(r.facts["settings"]), *times, *seen]
+        )
+    columns = [
+        "preset",
+        "settings",
+        "seconds",
+        "times faster",
+        "distance",
+        "energy",
+        "front [m]",
+        "volume or packing",
+    ]
     return Table(f"{scene}: presets", columns, rows, "At the same resolution; columns as below.")

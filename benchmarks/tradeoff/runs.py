@@ -50,7 +50,9 @@ class Runs:
 
     def scene(self, overrides: Sequence[str] = (), scale: float = 1.0) -> Scene:
         """Return the scene with other values, at a scaled resolution."""
-        return load_scene(self.name, [f"domain.resolution={round(scale * self.resolution)}", *overrides])
+        return load_scene(
+            self.name, [f"domain.resolution={round(scale * self.resolution)}", *overrides]
+        )
 
     def measure(self, settings: Sequence[Setting]) -> list[Run]:
         """Run all settings, in turns."""
@@ -60,7 +62,10 @@ class Runs:
                 if run.failed:
                     continue
                 if number % 20 == 0:
-                    self.options.say(f"{self.name}, round {turn + 1} of {self.options.repeat}: setting {number + 1} of {len(runs)}")
+                    self.options.say(
+                        f"{self.name}, round {turn + 1} of {self.options.repeat}: setting "
+                        f"{number + 1} of {len(runs)}"
+                    )
                 self._add(run)
         return runs
 
@@ -79,14 +84,33 @@ class Runs:
             "front": Figure(ran.looks[-1].front - ran.looks[0].front, "m"),
             "front_error": Figure(ran.front_error(own), "m"),
         }
-        names = ("steps", "iterations", "linear_iterations", "residual", "volume_drift", "packing", "penetration")
-        return found | {name: Figure(value) for name in names if (value := getattr(ran, name)) is not None}
+        names = (
+            "steps",
+            "iterations",
+            "linear_iterations",
+            "residual",
+            "volume_drift",
+            "packing",
+            "penetration",
+        )
+        return found | {
+            name: Figure(value) for name in names if (value := getattr(ran, name)) is not None
+        }
 
     def record(self, run: Run) -> Record:
         """Return what a run took and showed."""
         setting, scene = run.setting, self.scene().scene.name
-        facts: dict[str, Any] = {"scene": scene, "kind": "run", "curve": setting.curve, "settings": setting.name}
-        facts |= {"device": self.options.device, "frames": self.frames, "resolution": round(setting.scale * self.resolution)}
+        facts: dict[str, Any] = {
+            "scene": scene,
+            "kind": "run",
+            "curve": setting.curve,
+            "settings": setting.name,
+        }
+        facts |= {
+            "device": self.options.device,
+            "frames": self.frames,
+            "resolution": round(setting.scale * self.resolution),
+        }
         facts |= {"scale": setting.scale} | ({"failed": run.failed} if run.failed else {})
         return Record(f"{scene} {setting.curve}: {setting.name}", self.figures(run), facts)
 
@@ -105,7 +129,13 @@ class Runs:
             scene = self.scene(run.setting.overrides, run.setting.scale)
             if not run.seconds:  # loads kernels
                 trial(scene, device=self.options.device, frames=1, box=self.box)
-            ran = trial(scene, device=self.options.device, frames=self.frames, box=self.box, inspect=lambda _: after.append(array_bytes()))
+            ran = trial(
+                scene,
+                device=self.options.device,
+                frames=self.frames,
+                box=self.box,
+                inspect=lambda _: after.append(array_bytes()),
+            )
         except (SceneError, StepFailed, SimulationFailed) as error:
             run.failed = str(error).replace("\n", " ")
             return

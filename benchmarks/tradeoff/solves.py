@@ -29,7 +29,11 @@ from warp_lcp.solvers.registry import grid_methods
 
 PROBLEMS, STATES = 4, 3  # of a run of liquid or sand, at equal distances
 EXACT = wl.StoppingCriteria(rtol=1e-13, max_iterations=500)
-EXACT_STEP = {"solver.tolerance": 1e-7, "solver.max_iterations": 30000, "solver.method": "accelerated-projection"}
+EXACT_STEP = {
+    "solver.tolerance": 1e-7,
+    "solver.max_iterations": 30000,
+    "solver.method": "accelerated-projection",
+}
 MOST_LIQUID, MOST_SAND = 1000, 3000  # iterations
 
 
@@ -59,7 +63,9 @@ class Probe(ABC):
         self.scene, self.device, self.read = scene, device, clock(device)
 
     @abstractmethod
-    def solves(self, method: str, precision: str, tolerance: float) -> Iterator[Callable[[], Found]]:
+    def solves(
+        self, method: str, precision: str, tolerance: float
+    ) -> Iterator[Callable[[], Found]]:
         """Yield what solves each problem."""
 
 
@@ -67,37 +73,65 @@ def measure_solves(scene: Scene, options: Options, frames: int) -> list[Record]:
     """Solve problems of a run by all methods to all tolerances; return a record of each setting, that of the reference first."""
     options.say(f"{scene.scene.name}: problems of a run")
     probe: Probe = PROBES[scene.scene.simulator](scene, options.device, frames)
-    known, figures = {"scene": scene.scene.name}, {"residual": Figure(probe.residual), "problems": Figure(len(probe.problems))}
-    records = [Record(f"{scene.scene.name} {probe.kind} reference", figures, known | {"kind": "reference"})]
+    known, figures = (
+        {"scene": scene.scene.name},
+        {"residual": Figure(probe.residual), "problems": Figure(len(probe.problems))},
+    )
+    records = [
+        Record(f"{scene.scene.name} {probe.kind} reference", figures, known | {"kind": "reference"})
+    ]
     for name, (method, precision) in probe.methods.items():
         options.say(f"{scene.scene.name}: {name}")
         for tolerance in probe.tolerances:
-            facts = known | {"kind": "solve", "method": method, "precision": precision, "tolerance": tolerance}
-            figures, status = _measured(probe.solves(method, precision, tolerance), probe.warm, options.repeat)
+            facts = known | {
+                "kind": "solve",
+                "method": method,
+                "precision": precision,
+                "tolerance": tolerance,
+            }
+            figures, status = _measured(
+                probe.solves(method, precision, tolerance), probe.warm, options.repeat
+            )
             more = {"status": status} if status else {}
-            records.append(Record(f"{scene.scene.name} {probe.kind} {name} {tolerance:g}", figures, facts | more))
+            records.append(
+                Record(
+                    f"{scene.scene.name} {probe.kind} {name} {tolerance:g}", figures, facts | more
+                )
+            )
     return records
 
 
-def _measured(solves: Iterator[Callable[[], Found]], warm: int, repeat: int) -> tuple[dict[str, Figure], str]:
+def _measured(
+    solves: Iterator[Callable[[], Found]], warm: int, repeat: int
+) -> tuple[dict[str, Figure], str]:
     """Solve all problems as often as asked for; return the figures of all together and how they ended."""
     samples = [[solve() for _ in range(warm + repeat)][warm:] for solve in solves]
     last = [found[-1] for found in samples]
     figures = {
-        "seconds": Figure.least([sum(f.seconds for f in turn) for turn in zip(*samples, strict=True)], "s"),
+        "seconds": Figure.least(
+            [sum(f.seconds for f in turn) for turn in zip(*samples, strict=True)], "s"
+        ),
         "iterations": Figure(sum(f.iterations for f in last)),
         "residual": Figure(max(f.residual for f in last)),
         "error": Figure(max(f.error for f in last)),
     }
     held = [f.bytes for f in last if f.bytes is not None]
-    return figures | ({"bytes": Figure(max(held), "B")} if held else {}), ", ".join(sorted({f.status for f in last}))
+    return figures | ({"bytes": Figure(max(held), "B")} if held else {}), ", ".join(
+        sorted({f.status for f in last})
+    )
 
 
 def _run(scene: Scene, simulation: Simulation, frames: int) -> Iterator[int]:
     """Step through frames; yield the number of each."""
     for frame in range(1, frames + 1):
         while scene.time.frame_time(frame) - simulation.time > 1e-9:
-            simulation.step(plan_dt(simulation.stable_dt(), scene.time.frame_time(frame) - simulation.time, scene.time))
+            simulation.step(
+                plan_dt(
+                    simulation.stable_dt(),
+                    scene.time.frame_time(frame) - simulation.time,
+                    scene.time,
+                )
+            )
         yield frame
 
 
@@ -108,12 +142,15 @@ def _simulation(scene: Scene, device: str) -> Simulation:
 class Reference:
     """A problem's solution by a solve in float64 that converged as far as rounding allows, to measure errors from.
 
-    Residuals are recomputed in float64 from the assembled matrix, whatever a solver says, relative to that of clip(0, lower, upper).
+    Residuals are recomputed in float64 from the assembled matrix, whatever a solver says, relative
+    to that of clip(0, lower, upper).
     """
 
     def __init__(self, path: Path, device: str) -> None:
         problem = load(path, device=device, dtype=wp.float64)
-        result = wl.solve(problem.lcp(), wl.MinimumMapNewton(precision="double"), stopping=EXACT, x0=problem.x0)
+        result = wl.solve(
+            problem.lcp(), wl.MinimumMapNewton(precision="double"), stopping=EXACT, x0=problem.x0
+        )
         sparse = problem.sparse()
         self._exact = Exact(sparse.A, sparse.b, sparse.lower, sparse.upper)
         self._fluid = problem.A.cells.numpy()[1:-1, 1:-1, 1:-1].ravel() == wl.FLUID
@@ -149,19 +186,37 @@ class Pressures(Probe):
         with tempfile.TemporaryDirectory() as folder:
             simulation.record = ProblemFolder(Path(folder) / "problems").write
             found = [files(Path(folder) / "problems") for _ in _run(scene, simulation, frames)][-1]
-            paths = [found[i] for i in np.unique(np.linspace(1, len(found) - 1, PROBLEMS).astype(int))]  # the first is free fall
+            # the first is free fall
+            paths = [
+                found[i] for i in np.unique(np.linspace(1, len(found) - 1, PROBLEMS).astype(int))
+            ]
             self.problems = [(load(path, device=device), Reference(path, device)) for path in paths]
         self.residual = max(reference.residual_of_solution for _, reference in self.problems)
-        tried = [(m, p) for m in grid_methods() for p in (("mixed", "single", "double") if m in self.thorough else ("mixed",))]
+        tried = [
+            (m, p)
+            for m in grid_methods()
+            for p in (("mixed", "single", "double") if m in self.thorough else ("mixed",))
+        ]
         self.methods = {f"{method} {precision}": (method, precision) for method, precision in tried}
 
-    def solves(self, method: str, precision: str, tolerance: float) -> Iterator[Callable[[], Found]]:
+    def solves(
+        self, method: str, precision: str, tolerance: float
+    ) -> Iterator[Callable[[], Found]]:
         """Yield what solves each problem."""
-        solver, stopping = wl.METHODS[method](precision=precision), wl.StoppingCriteria(rtol=tolerance, max_iterations=MOST_LIQUID)
+        solver, stopping = (
+            wl.METHODS[method](precision=precision),
+            wl.StoppingCriteria(rtol=tolerance, max_iterations=MOST_LIQUID),
+        )
         for problem, reference in self.problems:
             yield self._solve(problem, reference, solver, stopping)
 
-    def _solve(self, problem: RecordedProblem, reference: Reference, solver: Any, stopping: wl.StoppingCriteria) -> Callable[[], Found]:
+    def _solve(
+        self,
+        problem: RecordedProblem,
+        reference: Reference,
+        solver: Any,
+        stopping: wl.StoppingCriteria,
+    ) -> Callable[[], Found]:
         lcp, before = problem.lcp(), array_bytes()
         work = solver.init(lcp)
         held = array_bytes() - before
@@ -172,7 +227,14 @@ class Pressures(Probe):
             wp.synchronize_device(self.device)
             taken, x = self.read() - begun, result.x.numpy()
             iterations = result.linear_iterations or result.iterations
-            return Found(taken, iterations, reference.residual(x), reference.error(x), result.status.name, held)
+            return Found(
+                taken,
+                iterations,
+                reference.residual(x),
+                reference.error(x),
+                result.status.name,
+                held,
+            )
 
         return solve
 
@@ -189,7 +251,8 @@ class Steps(Probe):
         self.gravity = float(np.linalg.norm(scene.physics.gravity)) or 1.0
         wanted = {round(frames * (n + 1) / (STATES + 1)) for n in range(STATES)}
         simulation, usual = _simulation(scene, device), 1.0 / scene.time.frames_per_second
-        self.problems, self.residual = [], 0.0  # a state, the length of its next step [s], the velocities after it
+        # a state, the length of its next step [s], the velocities after it
+        self.problems, self.residual = [], 0.0
         for frame in _run(scene, simulation, max(wanted)):
             if frame in wanted:
                 state, dt = simulation.state(), plan_dt(simulation.stable_dt(), usual, scene.time)
@@ -197,18 +260,28 @@ class Steps(Probe):
                 self.problems.append((state, dt, velocity))
                 self.residual = max(self.residual, row["coupled_residual"])
 
-    def solves(self, method: str, precision: str, tolerance: float) -> Iterator[Callable[[], Found]]:
+    def solves(
+        self, method: str, precision: str, tolerance: float
+    ) -> Iterator[Callable[[], Found]]:
         """Yield what takes the step from each state."""
-        keys = {"solver.method": method, "solver.tolerance": tolerance, "solver.max_iterations": MOST_SAND}
+        keys = {
+            "solver.method": method,
+            "solver.tolerance": tolerance,
+            "solver.max_iterations": MOST_SAND,
+        }
         for problem in self.problems:
             yield partial(self._solve, changed(self.scene, keys), *problem)
 
     def _solve(self, scene: Scene, state: Any, dt: float, exact: np.ndarray) -> Found:
         velocity, row, taken = self._step(scene, state, dt)
-        error = float(np.sqrt(np.mean(np.sum((velocity - exact) ** 2, axis=1)))) / (self.gravity * dt)
+        error = float(np.sqrt(np.mean(np.sum((velocity - exact) ** 2, axis=1)))) / (
+            self.gravity * dt
+        )
         return Found(taken, row["solve_iterations"], row["coupled_residual"], error)
 
-    def _step(self, scene: Scene, state: Any, dt: float) -> tuple[np.ndarray, dict[str, Any], float]:
+    def _step(
+        self, scene: Scene, state: Any, dt: float
+    ) -> tuple[np.ndarray, dict[str, Any], float]:
         """Take a step from a state, and return the particles' velocities [m/s], the log's row and the seconds."""
         simulation = _simulation(scene, self.device)
         simulation.restore(state)

@@ -1,6 +1,7 @@
 """Physical checks of liquids, sand and bodies with known answers, each with set-ups that are wrong on purpose and must fail it.
 
-`warp-lcp bench validation` runs them all. A check is a file: what must hold, at two resolutions, with its negative controls.
+`warp-lcp bench validation` runs them all. A check is a file: what must hold, at two resolutions,
+with its negative controls.
 """
 
 from __future__ import annotations
@@ -61,33 +62,68 @@ def measure(options: Options, out: Path) -> Results:
         options.say(f"{name} ...")
         trials[name], drawn = check.run(options.device)
         passed = sum(t.passed for t in trials[name])
-        options.say(f"{name}: {passed} of {len(trials[name])} as they must be, {sum(t.seconds for t in trials[name]):.0f} s")
+        options.say(
+            f"{name}: {passed} of {len(trials[name])} as they must be, "
+            f"{sum(t.seconds for t in trials[name]):.0f} s"
+        )
         charts += [chart for chart in drawn if chart.curves]
     found = [t for own in trials.values() for t in own]
     where = machine(options.device, elements=1 << 22, repeat=options.repeat)
-    tables = [summary(trials), misses(trials), *(table(name, CHECKS[name].about.strip(), own) for name, own in trials.items())]
-    return Results([where, *(t.record() for t in found)], tables, charts, [line for t in found for line in t.failures()])
+    tables = [
+        summary(trials),
+        misses(trials),
+        *(table(name, CHECKS[name].about.strip(), own) for name, own in trials.items()),
+    ]
+    return Results(
+        [where, *(t.record() for t in found)],
+        tables,
+        charts,
+        [line for t in found for line in t.failures()],
+    )
 
 
 def summary(trials: Mapping[str, Sequence[Trial]]) -> Table:
     """Return a row a check: how many figures keep their bounds, and how many controls fail theirs."""
     rows, sums = list[list[str]](), np.zeros(4, dtype=int)
     for name, own in trials.items():
-        kinds = [[f.passed for t in own for f in t.findings if f.control is control] for control in (False, True)]
+        kinds = [
+            [f.passed for t in own for f in t.findings if f.control is control]
+            for control in (False, True)
+        ]
         counts = [n for kind in kinds for n in (sum(kind), len(kind))]
         sums += counts
         verdict = "as it must be" if all(t.passed for t in own) else "not all as it must be"
         seconds = sum(t.seconds for t in own)
-        rows.append([name, f"{counts[0]} of {counts[1]}", f"{counts[2]} of {counts[3]}", f"{seconds:.1f}", verdict])
+        rows.append(
+            [
+                name,
+                f"{counts[0]} of {counts[1]}",
+                f"{counts[2]} of {counts[3]}",
+                f"{seconds:.1f}",
+                verdict,
+            ]
+        )
     remark = (
-        f"{sums[0]} of {sums[1]} figures keep their tolerance, and {sums[2]} of {sums[3]} negative controls fail theirs, as they must; "
-        f"{sum(t.seconds for own in trials.values() for t in own):.0f} s in all. A negative control is a set-up that is wrong on "
+        f"{sums[0]} of {sums[1]} figures keep their tolerance, and {sums[2]} of {sums[3]} negative "
+        "controls fail theirs, as they must; "
+        f"{sum(t.seconds for own in trials.values() for t in own):.0f} s in all. A negative "
+        "control is a set-up that is wrong on "
         "purpose: a check that it passes would prove nothing."
     )
-    return Table("Checks", ["check", "within tolerance", "controls that fail", "seconds", "verdict"], rows, remark)
+    return Table(
+        "Checks",
+        ["check", "within tolerance", "controls that fail", "seconds", "verdict"],
+        rows,
+        remark,
+    )
 
 
 def misses(trials: Mapping[str, Sequence[Trial]]) -> Table:
     """Return what is not as it must be, and why that is known."""
-    rows = [[line, CHECKS[name].known] for name, own in trials.items() for t in own for line in t.failures()]
+    rows = [
+        [line, CHECKS[name].known]
+        for name, own in trials.items()
+        for t in own
+        for line in t.failures()
+    ]
     return Table("Not as it must be", ["figure", "known"], rows)

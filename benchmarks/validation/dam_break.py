@@ -9,8 +9,26 @@ import numpy as np
 
 from warp_lcp.benchmarks.validation import signals
 from warp_lcp.benchmarks.validation.finding import Check, Findings, check_at, plot
-from warp_lcp.benchmarks.validation.scenes import GRAVITY, SUB_CELL, Numerics, Row, box, create_liquid, fill, particles_in_cells, steps
-from warp_lcp.benchmarks.validation.signals import best_shift, enclosed_cells, filled_fraction, front, relative_rms, stays, surface_height
+from warp_lcp.benchmarks.validation.scenes import (
+    GRAVITY,
+    SUB_CELL,
+    Numerics,
+    Row,
+    box,
+    create_liquid,
+    fill,
+    particles_in_cells,
+    steps,
+)
+from warp_lcp.benchmarks.validation.signals import (
+    best_shift,
+    enclosed_cells,
+    filled_fraction,
+    front,
+    relative_rms,
+    stays,
+    surface_height,
+)
 from warp_lcp.fluids import LiquidSimulation
 
 RESOLUTIONS = (12, 24)  # cells of a
@@ -26,17 +44,28 @@ TAU_LAST = 2.45
 
 SIZE, COLUMN = [1.6, 0.8], 0.4  # [m]: of a domain with two columns, and the side of each
 DURATION, AVERAGED = 30.0, 2.0  # [s], and the end over which their volume is averaged
-DAM_DURATION, DAM_AVERAGED = 3.0, 0.3  # [s]: the column of the dam break fills a pool four cells deep
+# [s]: the column of the dam break fills a pool four cells deep
+DAM_DURATION, DAM_AVERAGED = 3.0, 0.3
 UNCORRECTED: Row = {"density_correction": {"every": 0}}
-DATA, FRONT, HIGH = "Martin & Moyce", "Front of a collapsing column", "Height at the wall"  # in charts
+# in charts
+DATA, FRONT, HIGH = "Martin & Moyce", "Front of a collapsing column", "Height at the wall"
 
 # [MartinMoyce1952], front and height of the column of square section, n^2 = 2
-T = np.array([0.41, 0.84, 1.19, 1.43, 1.63, 1.83, 1.98, 2.20, 2.32, 2.51, 2.65, 2.83, 2.98, 3.11, 3.33])
-Z = np.array([1.11, 1.22, 1.44, 1.67, 1.89, 2.11, 2.33, 2.56, 2.78, 3.00, 3.22, 3.44, 3.67, 3.89, 4.11])
-TAU = np.array([0.56, 0.77, 0.93, 1.08, 1.28, 1.46, 1.66, 1.84, 2.00, 2.21, 2.45, 2.70, 3.06, 3.44, 4.20, 5.25])
-H = np.array([0.94, 0.89, 0.83, 0.78, 0.72, 0.67, 0.61, 0.56, 0.50, 0.44, 0.39, 0.33, 0.28, 0.22, 0.17, 0.11])
+T = np.array(
+    [0.41, 0.84, 1.19, 1.43, 1.63, 1.83, 1.98, 2.20, 2.32, 2.51, 2.65, 2.83, 2.98, 3.11, 3.33]
+)
+Z = np.array(
+    [1.11, 1.22, 1.44, 1.67, 1.89, 2.11, 2.33, 2.56, 2.78, 3.00, 3.22, 3.44, 3.67, 3.89, 4.11]
+)
+TAU = np.array(
+    [0.56, 0.77, 0.93, 1.08, 1.28, 1.46, 1.66, 1.84, 2.00, 2.21, 2.45, 2.70, 3.06, 3.44, 4.20, 5.25]
+)
+H = np.array(
+    [0.94, 0.89, 0.83, 0.78, 0.72, 0.67, 0.61, 0.56, 0.50, 0.44, 0.39, 0.33, 0.28, 0.22, 0.17, 0.11]
+)
 
-# the same experiment farther out, as read off its figure 3 (PySPH's `db_exp_data`), and what its slope is compared over
+# the same experiment farther out, as read off its figure 3 (PySPH's `db_exp_data`), and what its
+# slope is compared over
 FAR_T = np.array([3.345, 4.034, 4.418, 5.091, 5.685, 6.306, 6.822, 7.439, 8.031, 8.633, 9.237])
 FAR_Z = np.array([4.134, 4.944, 5.881, 6.980, 7.945, 8.966, 9.986, 10.963, 11.977, 13.005, 13.970])
 FAR, FAR_LENGTH, FAR_END = (4.0, 14.0), 16.0, 11.0  # Z; of the tank, in units of a; T
@@ -65,23 +94,34 @@ def front_and_height(found: Findings, cells: int, numerics: Numerics = SUB_CELL)
     found.add("the best shift of T", shift, low=-MAX_SHIFT, high=MAX_SHIFT)
     found.add("gravity that the front shows", shown_gravity(c), low=0.9, high=1.1, unit="g")
     early = TAU <= TAU_LAST
-    found.add("largest |dH|", float(np.abs(np.interp(TAU[early], c.tau, c.H) - H[early]).max()), high=0.05)
+    found.add(
+        "largest |dH|", float(np.abs(np.interp(TAU[early], c.tau, c.H) - H[early]).max()), high=0.05
+    )
     found.curve("front", c.T, c.Z)
     found.curve("height", c.tau, c.H)
     found.curve(f"front, shifted by {-shift:.2f}", c.T - shift, c.Z)
     for factor in WRONG_GRAVITY:
         wrong = collapse(cells, numerics, gravity=factor * GRAVITY)
-        found.must_break(f"{factor:g} g: gravity that the front shows", shown_gravity(wrong), low=0.9, high=1.1, unit="g")
+        found.must_break(
+            f"{factor:g} g: gravity that the front shows",
+            shown_gravity(wrong),
+            low=0.9,
+            high=1.1,
+            unit="g",
+        )
         if factor == min(WRONG_GRAVITY):  # nearer ones a shift can hide
             rms = 100.0 * best_shift(wrong.T, wrong.Z, at, expected, MAX_SHIFT)[1]
-            found.must_break(f"{factor:g} g: RMS error of Z after the best shift", rms, high=limit, unit="%")
+            found.must_break(
+                f"{factor:g} g: RMS error of Z after the best shift", rms, high=limit, unit="%"
+            )
 
 
 def shown_gravity(c: Collapse) -> float:
     """Return the gravity with which the experiment's front would go as fast as a collapse's, over the real one.
 
-    Times go with 1 / sqrt(g), and where the experiment's begins is open. The speed of the even part alone would not tell: it goes with
-    sqrt(g) too, and data and simulation leave it a range as wide as that from .8 g to 1.25 g.
+    Times go with 1 / sqrt(g), and where the experiment's begins is open. The speed of the even part
+    alone would not tell: it goes with sqrt(g) too, and data and simulation leave it a range as wide
+    as that from .8 g to 1.25 g.
     """
     compared = (T >= FIRST) & (T <= LAST)
     return signals.best_pace(c.T, c.Z, T[compared], Z[compared], MAX_SHIFT) ** 2
@@ -103,20 +143,35 @@ def plate_friction() -> float:
 def far_front(found: Findings, cells: int, numerics: Numerics = SUB_CELL) -> None:
     """Compare the speed of the front far out, where a floor without drag lets it run too fast; the control has none."""
     expected = slope(FAR_T, FAR_Z)
-    for label, tables in (("c_f of a smooth plate", {"wall_drag": {"coefficient": plate_friction()}}), ("no drag", {})):
+    for label, tables in (
+        ("c_f of a smooth plate", {"wall_drag": {"coefficient": plate_friction()}}),
+        ("no drag", {}),
+    ):
         simulation = create(cells, numerics, FAR_LENGTH, **tables)
         unit = math.sqrt(N2 * GRAVITY / A)
-        run = [(unit * row["time"], front(fill(simulation)) / cells) for row in steps(simulation, FAR_END / unit)]
+        run = [
+            (unit * row["time"], front(fill(simulation)) / cells)
+            for row in steps(simulation, FAR_END / unit)
+        ]
         time, place = stays(*np.array(run).T)
         judge = found.add if tables else found.must_break
-        judge(f"{label}: dZ/dT over the experiment's, Z from 4 to 14", slope(time, place) / expected, low=0.95, high=1.05)
+        judge(
+            f"{label}: dZ/dT over the experiment's, Z from 4 to 14",
+            slope(time, place) / expected,
+            low=0.95,
+            high=1.05,
+        )
         found.curve(label, time, place)
 
 
-def create(cells: int, numerics: Numerics, length: float = LENGTH, **tables: Any) -> LiquidSimulation:
+def create(
+    cells: int, numerics: Numerics, length: float = LENGTH, **tables: Any
+) -> LiquidSimulation:
     """Return a column on a floor that it can slip on, its base so many cells wide, in a tank of a `length` in units of it."""
     column = box([0.0, 0.0], [A, N2 * A])
-    return create_liquid(numerics, [length * A, HEIGHT * A], round(length * cells), [column], **tables)
+    return create_liquid(
+        numerics, [length * A, HEIGHT * A], round(length * cells), [column], **tables
+    )
 
 
 def collapse(cells: int, numerics: Numerics, *, gravity: float = GRAVITY) -> Collapse:
@@ -129,16 +184,27 @@ def collapse(cells: int, numerics: Numerics, *, gravity: float = GRAVITY) -> Col
         return time, front(fill(simulation)), surface_height(wall)
 
     unit = math.sqrt(GRAVITY / A)
-    time, place, height = np.array([now(0.0), *(now(row["time"]) for row in steps(simulation, END / (math.sqrt(N2) * unit)))]).T
+    time, place, height = np.array(
+        [now(0.0), *(now(row["time"]) for row in steps(simulation, END / (math.sqrt(N2) * unit)))]
+    ).T
     tau = unit * time
     return Collapse(*stays(math.sqrt(N2) * tau, place / cells), tau, height / (N2 * cells))
 
 
 DAM_BREAK = Check(
-    about="A dam break against the experiments of Martin & Moyce 1952: a column of base a and height n^2 a, n^2 = 2.",
+    about="A dam break against the experiments of Martin & Moyce 1952: a column of base a and "
+    "height n^2 a, n^2 = 2.",
     trials=[(front_and_height, RESOLUTIONS), (far_front, RESOLUTIONS)],
     charts=[
-        plot("dam-break-front", FRONT, "T = n t sqrt(g / a)", "Z = x / a", "front", exact={DATA: (T, Z)}, marked=[DATA]),
+        plot(
+            "dam-break-front",
+            FRONT,
+            "T = n t sqrt(g / a)",
+            "Z = x / a",
+            "front",
+            exact={DATA: (T, Z)},
+            marked=[DATA],
+        ),
         plot(
             "dam-break-drag",
             FRONT,
@@ -148,7 +214,15 @@ DAM_BREAK = Check(
             exact={DATA: (FAR_T, FAR_Z)},
             marked=[DATA],
         ),
-        plot("dam-break-height", HIGH, "tau = t sqrt(g / a)", "H = y / (n^2 a)", "height", exact={DATA: (TAU, H)}, marked=[DATA]),
+        plot(
+            "dam-break-height",
+            HIGH,
+            "tau = t sqrt(g / a)",
+            "H = y / (n^2 a)",
+            "height",
+            exact={DATA: (TAU, H)},
+            marked=[DATA],
+        ),
     ],
 )
 
@@ -159,15 +233,20 @@ def columns(found: Findings, resolution: int, numerics: Numerics = SUB_CELL) -> 
     right = box([SIZE[0] - COLUMN, 0.0], [SIZE[0], COLUMN])
     late = []
     for label, tables in (("as it comes", {}), ("no correction", UNCORRECTED)):
-        simulation = create_liquid(numerics, SIZE, resolution, [box([0.0, 0.0], [COLUMN, COLUMN]), right], **tables)
+        simulation = create_liquid(
+            numerics, SIZE, resolution, [box([0.0, 0.0], [COLUMN, COLUMN]), right], **tables
+        )
         time, volume, density = watch(simulation, DURATION)
         late.append(volume[time > DURATION - AVERAGED].mean())
         found.curve(label, time, volume)
         if not tables:
             found.add("volume of the last 2 s over that at the start", late[0], low=0.98, high=1.02)
-            # of single cells, which a correction that acts where a thousandth of the liquid crowds leaves to themselves
+            # of single cells, which a correction that acts where a thousandth of the liquid crowds
+            # leaves to themselves
             found.add("mean of the largest densities", density.mean(), high=1.5)
-    found.must_break("no correction: volume of the last 2 s over that at the start", late[1], low=0.8)
+    found.must_break(
+        "no correction: volume of the last 2 s over that at the start", late[1], low=0.8
+    )
 
 
 @check_at("volume of the dam break", "{cells} cells of a, {numerics.name}")
@@ -180,7 +259,9 @@ def dam(found: Findings, cells: int, numerics: Numerics = SUB_CELL) -> None:
         judge(f"{name}volume of the last .3 s over that at the start", late, low=0.98, high=1.02)
 
 
-def watch(simulation: LiquidSimulation, duration: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def watch(
+    simulation: LiquidSimulation, duration: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the ends of the steps [s], the volume inside the surface over that at the start, and the largest densities, if known.
 
     The surface is measured apart from the simulation: a count of particles could not show a loss.
@@ -190,13 +271,17 @@ def watch(simulation: LiquidSimulation, duration: float) -> tuple[np.ndarray, np
         return enclosed_cells(*particles_in_cells(simulation))
 
     before = volume()
-    rows = [(row["time"], volume() / before, row.get("max_density", np.nan)) for row in steps(simulation, duration)]
+    rows = [
+        (row["time"], volume() / before, row.get("max_density", np.nan))
+        for row in steps(simulation, duration)
+    ]
     time, volumes, density = np.array(rows).T
     return time, volumes, density
 
 
 VOLUME = Check(
-    about="Columns that collapse keep their volume: two into each other for half a minute, those of the experiments for three seconds.",
+    about="Columns that collapse keep their volume: two into each other for half a minute, those "
+    "of the experiments for three seconds.",
     trials=[(columns, (64, 96)), (dam, RESOLUTIONS)],
     charts=[plot("volume", "Volume of two columns that collapse", "t [s]", "volume / start")],
 )

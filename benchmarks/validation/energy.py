@@ -18,8 +18,9 @@ class Step:
     Attributes:
         before: kinetic and potential energy at its start, bodies included.
         after: at its end.
-        given: what came in from outside: with particles that sources add and outlets remove, by walls that the scene moves, and where an
-            endless axis takes particles back to its beginning.
+        given: what came in from outside: with particles that sources add and outlets remove, by
+            walls that the scene moves, and where an endless axis takes particles back to its
+            beginning.
         displaced: what the density correction's displacements lifted; part of `after`.
     """
 
@@ -37,9 +38,10 @@ class Step:
 class Ledger:
     """Steps a simulation and keeps account of its energy, in float64 from its particles and bodies.
 
-    A particle's velocity is that of the middle of its step. Its energy of motion at the end has what gravity does in half a step more: a
-    power that is that of the mean velocity V, and that changes as V has in the step, as far as that is free fall. Walls that move do the
-    work of the pressure's impulses at their faces; what they do to spray that they hit is not in `given`.
+    A particle's velocity is that of the middle of its step. Its energy of motion at the end has
+    what gravity does in half a step more: a power that is that of the mean velocity V, and that
+    changes as V has in the step, as far as that is free fall. Walls that move do the work of the
+    pressure's impulses at their faces; what they do to spray that they hit is not in `given`.
 
     Args:
         simulation: of particles; a ledger stays with it, as it watches its parts.
@@ -47,15 +49,25 @@ class Ledger:
 
     def __init__(self, simulation: Any) -> None:
         self.simulation = simulation
-        self._dt, self._given, self._displaced, self._carried = simulation.last_dt, 0.0, 0.0, np.zeros(3)
+        self._dt, self._given, self._displaced, self._carried = (
+            simulation.last_dt,
+            0.0,
+            0.0,
+            np.zeros(3),
+        )
         self._watch("carry", simulation, None, self._note_momentum)
         exchange = self._exchange("_given")
-        for part, names in ((simulation.sources, ("emit",)), (simulation.outlets, ("apply", "remove_departed"))):
+        for part, names in (
+            (simulation.sources, ("emit",)),
+            (simulation.outlets, ("apply", "remove_departed")),
+        ):
             for name in names if part is not None else ():
                 self._watch(name, part, *exchange)
         if simulation.boundary.sides is not None:
             self._watch("carry", simulation.boundary.sides, *exchange)
-        apart = getattr(simulation, "rearrangement", None) or getattr(simulation, "correction", None)
+        apart = getattr(simulation, "rearrangement", None) or getattr(
+            simulation, "correction", None
+        )
         if apart is not None:
             self._watch("apply", apart, *self._exchange("_displaced"))
         projection = getattr(simulation, "projection", None)
@@ -75,12 +87,18 @@ class Ledger:
         lowest = float(np.minimum(-gravity * size, 0.0).sum())
         mass, moment = self._moments()
         own = -float(gravity @ moment) - mass * lowest
-        return own + sum(-b.properties.mass * (float(gravity @ b.position) + lowest) for b in self._bodies())
+        return own + sum(
+            -b.properties.mass * (float(gravity @ b.position) + lowest) for b in self._bodies()
+        )
 
     def total(self) -> float:
         """Return the energy of motion and that of height over the domain's lowest corner [J; J/m]."""
         bodies = self.simulation.bodies
-        motion = self.now - self._potential() - (bodies.potential_energy(self.simulation.gravity) if bodies is not None else 0.0)
+        motion = (
+            self.now
+            - self._potential()
+            - (bodies.potential_energy(self.simulation.gravity) if bodies is not None else 0.0)
+        )
         return max(motion, 0.0) + self.height()
 
     def set_back(self, state: dict[str, np.ndarray], energy: float) -> None:
@@ -104,7 +122,9 @@ class Ledger:
         s.step(dt)
         gained = self._free_fall(s.particle_mass * s.particles.count, self._carried - momentum)
         for body, old in zip(bodies, moving, strict=True):
-            gained += self._free_fall(body.properties.mass, body.properties.mass * (body.velocity - old))
+            gained += self._free_fall(
+                body.properties.mass, body.properties.mass * (body.velocity - old)
+            )
         self.now = self.energy() + gained
         return Step(before, self.now, self._given, self._displaced)
 
@@ -127,8 +147,14 @@ class Ledger:
         s = self.simulation
         if s.bodies is None:
             return 0.0
-        power = sum(body.properties.mass * float(s.gravity @ body.velocity) for body in s.bodies.bodies)
-        return s.bodies.kinetic_energy() + 0.5 * self._dt * power + s.bodies.potential_energy(s.gravity)
+        power = sum(
+            body.properties.mass * float(s.gravity @ body.velocity) for body in s.bodies.bodies
+        )
+        return (
+            s.bodies.kinetic_energy()
+            + 0.5 * self._dt * power
+            + s.bodies.potential_energy(s.gravity)
+        )
 
     def _potential(self) -> float:
         return -float(self.simulation.gravity @ self._moments()[1])
@@ -146,7 +172,9 @@ class Ledger:
 
     def _momentum(self) -> np.ndarray:
         s = self.simulation
-        return np.asarray(s.particle_mass * s.particles.velocity.numpy().astype(np.float64).sum(axis=0))
+        return np.asarray(
+            s.particle_mass * s.particles.velocity.numpy().astype(np.float64).sum(axis=0)
+        )
 
     def _note_momentum(self) -> None:
         self._carried = self._momentum()
@@ -174,7 +202,13 @@ class Ledger:
 
         return before, after
 
-    def _watch(self, name: str, part: Any, before: Callable[[], None] | None, after: Callable[[], None] | None) -> None:
+    def _watch(
+        self,
+        name: str,
+        part: Any,
+        before: Callable[[], None] | None,
+        after: Callable[[], None] | None,
+    ) -> None:
         """Call something before and after a method of a part."""
         method = getattr(part, name)
 
@@ -192,7 +226,8 @@ class Ledger:
 def wall_outflow(simulation: Any) -> np.ndarray:
     """Return what walls that the scene moves, and sources, take up of each cell's outflow [m/s], in the stored shape; bodies do not count.
 
-    On a face of the open fraction a_f it is s_f (1 - a_f) u_s,f, s_f = +-1 outward; a source's cells are SOLID and their faces closed.
+    On a face of the open fraction a_f it is s_f (1 - a_f) u_s,f, s_f = +-1 outward; a source's
+    cells are SOLID and their faces closed.
     """
     boundary, kind = simulation.boundary, simulation.projection.kind.numpy()
     bodies = simulation.bodies.numbers if simulation.bodies is not None else []
@@ -203,6 +238,8 @@ def wall_outflow(simulation: Any) -> np.ndarray:
             wall = np.where(np.isin(boundary.cut.wall[axis].numpy(), bodies), 0.0, field.numpy())
             passes = (1.0 - boundary.open[axis].numpy()) * wall
         else:
-            passes = np.where((kind == SOLID) | (np.roll(kind, 1, along) == SOLID), field.numpy(), 0.0).astype(np.float64)
+            passes = np.where(
+                (kind == SOLID) | (np.roll(kind, 1, along) == SOLID), field.numpy(), 0.0
+            ).astype(np.float64)
         result += np.roll(passes, -1, along) - passes
     return result

@@ -32,7 +32,8 @@ class Finding:
     low: float = -math.inf  # the bound from below
     high: float = math.inf  # the bound from above
     unit: str = ""  # of value and bounds
-    control: bool = False  # a negative control: it belongs to a set-up that is wrong on purpose, and must break the bound
+    # a negative control: it belongs to a set-up that is wrong on purpose, and must break the bound
+    control: bool = False
 
     @property
     def passed(self) -> bool:
@@ -46,7 +47,11 @@ class Finding:
         unit = f" {self.unit}" if self.unit else ""
         if math.isinf(self.low):
             return f"<= {self.high:g}{unit}"
-        return f">= {self.low:g}{unit}" if math.isinf(self.high) else f"{self.low:g} to {self.high:g}{unit}"
+        return (
+            f">= {self.low:g}{unit}"
+            if math.isinf(self.high)
+            else f"{self.low:g} to {self.high:g}{unit}"
+        )
 
     def row(self) -> list[str]:
         """Return what a table says of it."""
@@ -87,7 +92,9 @@ class Trial:
 
     def record(self) -> Record:
         """Return what the file keeps."""
-        figures = {f.what: Figure(f.value, f.unit) for f in self.findings if not math.isnan(f.value)}
+        figures = {
+            f.what: Figure(f.value, f.unit) for f in self.findings if not math.isnan(f.value)
+        }
         own, controls = ([f for f in self.findings if f.control is kind] for kind in (False, True))
         facts = {
             "check": self.check,
@@ -104,7 +111,9 @@ class Trial:
         lines = [f"{self.name}: {self.error}"] if self.error else []
         for f in self.findings:
             if not f.passed:
-                lines.append(f"{self.name}: {f.what} = {f.value:.4g} {f.unit}".rstrip() + f" ({f.row()[2]})")
+                lines.append(
+                    f"{self.name}: {f.what} = {f.value:.4g} {f.unit}".rstrip() + f" ({f.row()[2]})"
+                )
         return lines
 
 
@@ -113,8 +122,10 @@ class Check:
     """What must hold, and by what it is tried and shown."""
 
     about: str  # what must hold
-    trials: Sequence[tuple[Callable[..., Trial], Sequence[Any]]]  # with their cases: arguments, in a tuple where there are several
-    across: tuple[str, Callable[[Findings, Sequence[Trial]], None]] | None = None  # what compares trials, after what it does in words
+    # with their cases: arguments, in a tuple where there are several
+    trials: Sequence[tuple[Callable[..., Trial], Sequence[Any]]]
+    # what compares trials, after what it does in words
+    across: tuple[str, Callable[[Findings, Sequence[Trial]], None]] | None = None
     charts: Sequence[Drawing] = ()
     known: str = ""  # why it is known not to hold everywhere; the report says so where it does not
 
@@ -122,7 +133,11 @@ class Check:
         """Run all trials on a device, and draw them."""
         before = DEVICE.set(device)
         try:
-            trials = [run(*(case if isinstance(case, tuple) else (case,))) for run, cases in self.trials for case in cases]
+            trials = [
+                run(*(case if isinstance(case, tuple) else (case,)))
+                for run, cases in self.trials
+                for case in cases
+            ]
             if self.across:
                 words, compare = self.across
                 trials.append(attempt(trials[0].check, words, lambda found: compare(found, trials)))
@@ -144,7 +159,11 @@ def check_at(check: str, resolution: str) -> Callable[[Callable[..., None]], Cal
         def trial(*given: Any, **named: Any) -> Trial:
             arguments = signature(run).bind(None, *given, **named)
             arguments.apply_defaults()
-            return attempt(check, resolution.format(**arguments.arguments), lambda found: run(found, *given, **named))
+            return attempt(
+                check,
+                resolution.format(**arguments.arguments),
+                lambda found: run(found, *given, **named),
+            )
 
         return trial
 
@@ -164,7 +183,9 @@ def attempt(check: str, resolution: str, run: Callable[[Findings], None]) -> Tri
         run(found)
     except (StepFailed, SimulationFailed, ValueError) as reason:
         error = str(reason)
-    return Trial(check, resolution, found.findings, time.perf_counter() - begun, error, found.curves)
+    return Trial(
+        check, resolution, found.findings, time.perf_counter() - begun, error, found.curves
+    )
 
 
 @dataclass
@@ -174,20 +195,40 @@ class Findings:
     findings: list[Finding] = field(default_factory=list)
     curves: dict[str, Curve] = field(default_factory=dict)
 
-    def add(self, what: str, value: float, *, low: float = -math.inf, high: float = math.inf, unit: str = "") -> None:
+    def add(
+        self,
+        what: str,
+        value: float,
+        *,
+        low: float = -math.inf,
+        high: float = math.inf,
+        unit: str = "",
+    ) -> None:
         """Note a figure that must keep its bound."""
         self.findings.append(Finding(what, float(value), low, high, unit))
 
-    def curve(self, label: str, x: Sequence[float] | np.ndarray, y: Sequence[float] | np.ndarray) -> None:
+    def curve(
+        self, label: str, x: Sequence[float] | np.ndarray, y: Sequence[float] | np.ndarray
+    ) -> None:
         """Note a line to draw."""
         self.curves[label] = (np.asarray(x).tolist(), np.asarray(y).tolist())
 
-    def must_break(self, what: str, value: float, *, low: float = -math.inf, high: float = math.inf, unit: str = "") -> None:
+    def must_break(
+        self,
+        what: str,
+        value: float,
+        *,
+        low: float = -math.inf,
+        high: float = math.inf,
+        unit: str = "",
+    ) -> None:
         """Note a figure of a negative control, which must break the bound."""
         self.findings.append(control(Finding(what, float(value), low, high, unit)))
 
 
-def curves_of(trials: Sequence[Trial], *labels: str, check: str = "", but: str = "") -> dict[str, Curve]:
+def curves_of(
+    trials: Sequence[Trial], *labels: str, check: str = "", but: str = ""
+) -> dict[str, Curve]:
     """Return the curves of trials by resolution and label.
 
     Args:
@@ -197,18 +238,41 @@ def curves_of(trials: Sequence[Trial], *labels: str, check: str = "", but: str =
         but: the label that is left out.
     """
     chosen = [t for t in trials if check in ("", t.check)]
-    return {f"{t.resolution}: {k}": c for t in chosen for k, c in t.curves.items() if k != but and k.startswith(labels or "")}
+    return {
+        f"{t.resolution}: {k}": c
+        for t in chosen
+        for k, c in t.curves.items()
+        if k != but and k.startswith(labels or "")
+    }
 
 
 def plot(
-    name: str, title: str, x: str, y: str, *labels: str, log: str = "", exact: Mapping[str, ArrayCurve] | None = None,
-    marked: Collection[str] = (), **chosen: str,
-) -> Drawing:  # fmt: skip
+    name: str,
+    title: str,
+    x: str,
+    y: str,
+    *labels: str,
+    log: str = "",
+    exact: Mapping[str, ArrayCurve] | None = None,
+    marked: Collection[str] = (),
+    **chosen: str,
+) -> Drawing:
     """Return what draws exact curves and those of trials that `curves_of` chooses; those in `marked` are points."""
-    given = {label: (np.asarray(a).tolist(), np.asarray(b).tolist()) for label, (a, b) in (exact or {}).items()}
+    given = {
+        label: (np.asarray(a).tolist(), np.asarray(b).tolist())
+        for label, (a, b) in (exact or {}).items()
+    }
 
     def draw(trials: Sequence[Trial]) -> Lines:
-        return Lines(name, title, x, y, given | curves_of(trials, *labels, **chosen), log=log, marked=frozenset(marked))
+        return Lines(
+            name,
+            title,
+            x,
+            y,
+            given | curves_of(trials, *labels, **chosen),
+            log=log,
+            marked=frozenset(marked),
+        )
 
     return draw
 

@@ -11,7 +11,18 @@ import numpy as np
 from warp_lcp.benchmarks.harness.record import Lines
 from warp_lcp.benchmarks.validation import scenes
 from warp_lcp.benchmarks.validation.finding import Check, Findings, check_at
-from warp_lcp.benchmarks.validation.scenes import GRAVITY, SHORTEST, SUB_CELL, VOXEL, Row, box, create_liquid, create_sand, positions, steps
+from warp_lcp.benchmarks.validation.scenes import (
+    GRAVITY,
+    SHORTEST,
+    SUB_CELL,
+    VOXEL,
+    Row,
+    box,
+    create_liquid,
+    create_sand,
+    positions,
+    steps,
+)
 from warp_lcp.benchmarks.validation.transfers import angular_momentum
 from warp_lcp.fluids import LiquidSimulation
 
@@ -28,7 +39,8 @@ BLOCK = box(LOW, HIGH, velocity=VELOCITY)
 CRATE: Row = BLOCK | {"density": 500.0, "angular_velocity": 4.0}
 
 KEPT = {32: 0.95, 64: 0.98}  # of the angular momentum
-RADIUS, SPIN, FLIGHT = 0.25, 3.0 * np.pi, 0.4  # [m], [rad/s], [s]: .6 of a turn, at 2.4 m/s of the rim
+# [m], [rad/s], [s]: .6 of a turn, at 2.4 m/s of the rim
+RADIUS, SPIN, FLIGHT = 0.25, 3.0 * np.pi, 0.4
 LAUNCH = np.array([1.0, 2.0])  # [m/s]
 TRANSFERS = ("apic", "flip", "pic")
 
@@ -39,8 +51,18 @@ def thrown(found: Findings, cells: int) -> None:
     for what in THROWN:
         for cfl in CFL:
             old = off_its_parabola(what, cells, cfl, whole_kicks=True)
-            found.add(f"{what}, CFL {cfl:g}: off its parabola", off_its_parabola(what, cells, cfl), high=MOST, unit="of the way")
-            found.must_break(f"{what}, CFL {cfl:g}, old gravity: off its parabola", old, high=MOST, unit="of the way")
+            found.add(
+                f"{what}, CFL {cfl:g}: off its parabola",
+                off_its_parabola(what, cells, cfl),
+                high=MOST,
+                unit="of the way",
+            )
+            found.must_break(
+                f"{what}, CFL {cfl:g}, old gravity: off its parabola",
+                old,
+                high=MOST,
+                unit="of the way",
+            )
 
 
 def off_its_parabola(what: str, cells: int, cfl: float, *, whole_kicks: bool = False) -> float:
@@ -50,14 +72,17 @@ def off_its_parabola(what: str, cells: int, cfl: float, *, whole_kicks: bool = F
         what: a key of `THROWN`.
         cells: along the domain.
         cfl: the Courant number.
-        whole_kicks: let gravity act for the whole step that it moves things by, as symplectic Euler does.
+        whole_kicks: let gravity act for the whole step that it moves things by, as symplectic Euler
+            does.
     """
     simulation = THROWN[what](cells, time={"duration": 100.0, "cfl": cfl, "dt_max": 1.0})
 
     def center() -> np.ndarray:
         if simulation.bodies is not None:
             return np.array(simulation.bodies.bodies[0].position[:2])
-        return np.asarray(simulation.particles.position.numpy()[:, :2].mean(axis=0, dtype=np.float64))
+        return np.asarray(
+            simulation.particles.position.numpy()[:, :2].mean(axis=0, dtype=np.float64)
+        )
 
     start = center()
     while simulation.time < DURATION - SHORTEST:
@@ -91,12 +116,15 @@ THROWN: dict[str, Callable[..., Any]] = {
     "body over sand": partial(_sand, sand=POOL, solid=[CRATE]),
 }
 THROWING = Check(
-    about="What is thrown flies along its parabola: liquid, sand and a rigid body, at any CFL number, as long as nothing touches it.",
+    about="What is thrown flies along its parabola: liquid, sand and a rigid body, at any CFL "
+    "number, as long as nothing touches it.",
     trials=[(thrown, RESOLUTIONS)],
 )
 
 
-def drop(n: int, *, transfer: str = "apic", thrown: bool = False, cfl: float = 2.0, keeps: bool = True) -> LiquidSimulation:
+def drop(
+    n: int, *, transfer: str = "apic", thrown: bool = False, cfl: float = 2.0, keeps: bool = True
+) -> LiquidSimulation:
     """Return a drop that spins in a room of two meters, far from its walls.
 
     Args:
@@ -106,7 +134,11 @@ def drop(n: int, *, transfer: str = "apic", thrown: bool = False, cfl: float = 2
         cfl: Courant number.
         keeps: whether bodies in flight keep their momenta; False: the control.
     """
-    tables: Row = {"particles": {"transfer": transfer}, "physics": {"gravity": [0.0, -GRAVITY if thrown else 0.0]}, "cfl": cfl}
+    tables: Row = {
+        "particles": {"transfer": transfer},
+        "physics": {"gravity": [0.0, -GRAVITY if thrown else 0.0]},
+        "cfl": cfl,
+    }
     ball = {"shape": "sphere", "center": [0.8 if thrown else 1.0, 1.0], "radius": RADIUS}
     simulation = create_liquid(SUB_CELL, SIZE, 2 * n, [ball], **tables)
     particles, arm = simulation.particles, positions(simulation)
@@ -136,7 +168,10 @@ def spinning(found: Findings, n: int) -> None:
 
     def spun(label: str, simulation: LiquidSimulation) -> tuple[float, np.ndarray]:
         start = turning(simulation)
-        rows = [(row["time"], turning(simulation) / start, row["kinetic_energy"]) for row in steps(simulation, FLIGHT)]
+        rows = [
+            (row["time"], turning(simulation) / start, row["kinetic_energy"])
+            for row in steps(simulation, FLIGHT)
+        ]
         times, kept, energies = np.array(rows).T
         found.curve(label, times, kept)
         return float(kept[-1]), energies
@@ -146,9 +181,18 @@ def spinning(found: Findings, n: int) -> None:
         middle = positions(simulation).mean(axis=0)
         kept, energies = spun(f"{name}, {n} cells a meter", simulation)
         way = float(np.linalg.norm(positions(simulation).mean(axis=0) - middle))
-        found.add(f"{name}: angular momentum after {FLIGHT} s, of that at the start", kept, low=KEPT[n], high=2.0 - KEPT[n])
+        found.add(
+            f"{name}: angular momentum after {FLIGHT} s, of that at the start",
+            kept,
+            low=KEPT[n],
+            high=2.0 - KEPT[n],
+        )
         found.add(f"{name}: way of the center of mass", way, high=1e-5, unit="m")
-        found.add(f"{name}: largest rise of the kinetic energy in a step", np.diff(energies).max() / energies[0], high=1e-3)
+        found.add(
+            f"{name}: largest rise of the kinetic energy in a step",
+            np.diff(energies).max() / energies[0],
+            high=1e-3,
+        )
     kept, _ = spun("APIC, control", drop(n, keeps=False))
     found.must_break("APIC: angular momentum, bodies in flight left alone", kept, low=KEPT[n])
 
@@ -165,12 +209,25 @@ def parabolas(found: Findings, n: int) -> None:
         return off(positions(simulation).mean(axis=0) - start, LAUNCH, FLIGHT)
 
     for cfl in CFL:
-        found.add(f"CFL {cfl:g}: center of mass off its parabola, of its way", missed(cfl), high=MOST)
-    found.must_break("CFL 2: the same, bodies in flight left alone", missed(2.0, keeps=False), high=MOST)
+        found.add(
+            f"CFL {cfl:g}: center of mass off its parabola, of its way", missed(cfl), high=MOST
+        )
+    found.must_break(
+        "CFL 2: the same, bodies in flight left alone", missed(2.0, keeps=False), high=MOST
+    )
 
 
 SPINNING = Check(
-    about="Liquid in flight: a spinning drop keeps its angular momentum, and what flies goes along its parabola.",
+    about="Liquid in flight: a spinning drop keeps its angular momentum, and what flies goes along "
+    "its parabola.",
     trials=[(spinning, RESOLUTIONS), (parabolas, RESOLUTIONS[:1])],
-    charts=[lambda trials: Lines("spin", "Angular momentum of a spinning drop", "time [s]", "of that at the start", trials[0].curves)],
+    charts=[
+        lambda trials: Lines(
+            "spin",
+            "Angular momentum of a spinning drop",
+            "time [s]",
+            "of that at the start",
+            trials[0].curves,
+        )
+    ],
 )

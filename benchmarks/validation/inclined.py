@@ -2,15 +2,18 @@
 
 A layer rests, or runs with the acceleration that friction leaves of gravity's.
 
-On a rough floor the friction is the sand's own, k = tan(friction angle) of the normal load; stiff sand slides on a smooth one with the
-wall's. Above the friction angle sand that runs goes on running; sand that has settled holds up to the angle whose sine is k, because it
-has pushed against itself along the slope. So the checks of running sand start it moving. A rough floor bears what sand beside it bears
-in simple shear, k times the load: a layer that runs slides on it, the lowest row as fast as the others.
+On a rough floor the friction is the sand's own, k = tan(friction angle) of the normal load; stiff
+sand slides on a smooth one with the wall's. Above the friction angle sand that runs goes on
+running; sand that has settled holds up to the angle whose sine is k, because it has pushed against
+itself along the slope. So the checks of running sand start it moving. A rough floor bears what sand
+beside it bears in simple shear, k times the load: a layer that runs slides on it, the lowest row as
+fast as the others.
 
-Where friction grows with the rate of shear, mu(I) [Jop, Forterre & Pouliquen 2006], a layer runs at a steady speed. Pressure and shear
-stress grow with the depth alike, so that I is the same everywhere, mu(I) = tan(slope). |Rate of shear| = I sqrt(p / rho_s) / d with
-p = rho g (H - y) cos(slope), rho = max_fraction rho_s, then integrates to Bagnold's profile,
-u = 2/3 I / d sqrt(max_fraction g cos(slope)) (H^1.5 - (H - y)^1.5).
+Where friction grows with the rate of shear, mu(I) [Jop, Forterre & Pouliquen 2006], a layer runs at
+a steady speed. Pressure and shear stress grow with the depth alike, so that I is the same
+everywhere, mu(I) = tan(slope). |Rate of shear| = I sqrt(p / rho_s) / d with p = rho g (H - y)
+cos(slope), rho = max_fraction rho_s, then integrates to Bagnold's profile, u = 2/3 I / d
+sqrt(max_fraction g cos(slope)) (H^1.5 - (H - y)^1.5).
 """
 
 from __future__ import annotations
@@ -21,7 +24,15 @@ from typing import Any
 import numpy as np
 
 from warp_lcp.benchmarks.validation.finding import Check, Findings, check_at, plot
-from warp_lcp.benchmarks.validation.scenes import CORRECTED, GRAVITY, Row, box, create_sand, steps, tilted
+from warp_lcp.benchmarks.validation.scenes import (
+    CORRECTED,
+    GRAVITY,
+    Row,
+    box,
+    create_sand,
+    steps,
+    tilted,
+)
 from warp_lcp.granular.materials import MATERIALS
 from warp_lcp.granular.simulator import SandSimulation
 from warp_lcp.granular.solids import SandSolids
@@ -30,7 +41,8 @@ from warp_lcp.material.particle_assembly import Parts
 DEPTH, LENGTH = 0.32, 0.16  # [m]: of the layer, and of the domain
 RESOLUTIONS = (16, 32)  # cells of depth
 DT = 2e-3  # [s], at 16 cells
-RUNS, SETTLES, RESTS = 0.2, 0.12, 0.4  # [s]: how long sand runs, settles, and is watched as it rests
+# [s]: how long sand runs, settles, and is watched as it rests
+RUNS, SETTLES, RESTS = 0.2, 0.12, 0.4
 START = 0.5  # [m/s] of sand that runs
 ROUGH, SMOOTH = "stick", 0.5
 BAGNOLD = "Bagnold's layer"
@@ -38,18 +50,24 @@ COEFFICIENT = 0.5  # of both
 FRICTION_ANGLE, STIFF = math.degrees(math.atan(COEFFICIENT)), 37.5  # degrees
 ANGLES, SLIDES = (27.5, 29.0, 31.0, 35.0), (26.8, 30.0, 35.0)
 REST, SLAB_REST, BOX_FLOWS = 26.0, 26.3, 26.0  # degrees
-STATIC, DYNAMIC, INERTIAL = 20.9, 32.76, 0.279  # degrees, degrees and I0: glass beads [Jop, Forterre & Pouliquen 2006]
-GRAIN = 0.3  # [m]: Bagnold's profile knows no other length than the depth, and with so large a grain it is steady in a second
-STEADY, BELOW, STOPPED = (24.0, 28.0), 19.0, 0.6  # degrees; degrees at which it rests after this time [s],
+# degrees, degrees and I0: glass beads [Jop, Forterre & Pouliquen 2006]
+STATIC, DYNAMIC, INERTIAL = 20.9, 32.76, 0.279
+# [m]: Bagnold's profile knows no other length than the depth, and with so large a grain it is
+# steady in a second
+GRAIN = 0.3
+# degrees; degrees at which it rests after this time [s],
+STEADY, BELOW, STOPPED = (24.0, 28.0), 19.0, 0.6
 CREEPS = 0.1  # from this speed [m/s]
 SETS_IN, OFF = 0.9, 0.8  # [s] until it is steady; what of the profile it starts with
 
-PLANES = ((10.0, 0.1), (20.0, 0.2), (30.0, 0.3), (45.0, 0.5))  # degrees, friction of planes that the block slides on
+# degrees, friction of planes that the block slides on
+PLANES = ((10.0, 0.1), (20.0, 0.2), (30.0, 0.3), (45.0, 0.5))
 BLOCK_HEIGHT, BLOCK_LENGTH = 0.1, 0.4  # [m]
 BLOCK = {"friction_angle": 40.0, "cohesion": 5e3}
 AFTER, UNTIL = 0.03, 0.12  # [s], when the block's acceleration is measured
 HOPPER = 40  # cells of its width
-WIDTH, SLOT, STEEP, LIP, SLICK = 0.4, 0.1, 60.0, 0.025, 0.2  # of the hopper [m, degrees], and its friction
+# of the hopper [m, degrees], and its friction
+WIDTH, SLOT, STEEP, LIP, SLICK = 0.4, 0.1, 60.0, 0.025, 0.2
 SHIFTS = (0.0, 0.25, 0.5)  # of the grid [cells]
 FROM, TO, PARTS = 0.25, 0.6, 3  # [s], when the hopper's rate is measured
 
@@ -63,11 +81,15 @@ def layer(found: Findings, cells: int, angles: tuple[float, ...] = ANGLES) -> No
     ratios = []
     for angle in angles:
         ratio = runs(cells, angle) / accelerates(angle)
-        found.add(f"{angle:g} degrees, running: acceleration over expected", ratio, low=0.94, high=1.06)
+        found.add(
+            f"{angle:g} degrees, running: acceleration over expected", ratio, low=0.94, high=1.06
+        )
         ratios.append(ratio * accelerates(angle) / GRAVITY)
     found.curve("layer", angles, ratios)
     _, flows = rests(cells, BOX_FLOWS, friction={"model": "box"})
-    found.must_break(f"box, {BOX_FLOWS:g} degrees, settled: mean acceleration", flows, high=0.01, unit="g")
+    found.must_break(
+        f"box, {BOX_FLOWS:g} degrees, settled: mean acceleration", flows, high=0.01, unit="g"
+    )
 
 
 @check_at("sliding slab", "{cells} cells of depth")
@@ -87,19 +109,42 @@ def slab(found: Findings, cells: int, angles: tuple[float, ...] = SLIDES) -> Non
 def bagnold(found: Findings, cells: int, angles: tuple[float, ...] = STEADY) -> None:
     """Let sand whose friction grows with the rate of shear run to its steady speed; the control is friction that does not grow."""
     beads: dict[str, Any] = {"material": {"friction_angle": STATIC}}
-    growing = beads | {"friction": {"dynamic_angle": DYNAMIC, "grain_size": GRAIN, "inertial_number": INERTIAL}}
+    growing = beads | {
+        "friction": {"dynamic_angle": DYNAMIC, "grain_size": GRAIN, "inertial_number": INERTIAL}
+    }
     for angle in angles:
         y, u = steady(cells, angle, **growing)
-        expected, most = bagnold_profile(y, angle), float(bagnold_profile(np.array([DEPTH]), angle)[0])
-        found.add(f"{angle:g} degrees: mean speed over Bagnold's", u.mean() / expected.mean(), low=0.95, high=1.05)
+        expected, most = (
+            bagnold_profile(y, angle),
+            float(bagnold_profile(np.array([DEPTH]), angle)[0]),
+        )
+        found.add(
+            f"{angle:g} degrees: mean speed over Bagnold's",
+            u.mean() / expected.mean(),
+            low=0.95,
+            high=1.05,
+        )
         off = np.abs(u - expected).max() / most
-        found.add(f"{angle:g} degrees: farthest from Bagnold's profile, over its surface's speed", off, high=0.05)
+        found.add(
+            f"{angle:g} degrees: farthest from Bagnold's profile, over its surface's speed",
+            off,
+            high=0.05,
+        )
         found.curve(f"{angle:g} degrees", y / DEPTH, u)
     _, mean = _watch(_create(cells, BELOW, CREEPS, **growing), cells, STOPPED)
-    found.add(f"{BELOW:g} degrees: speed in the end over that at the start", abs(mean[-1]) / CREEPS, high=0.01)
+    found.add(
+        f"{BELOW:g} degrees: speed in the end over that at the start",
+        abs(mean[-1]) / CREEPS,
+        high=0.01,
+    )
     y, u = steady(cells, angles[0], **beads)
     ratio = u.mean() / bagnold_profile(y, angles[0]).mean()
-    found.must_break(f"friction that does not grow, {angles[0]:g} degrees: mean speed over Bagnold's", ratio, low=0.95, high=1.05)
+    found.must_break(
+        f"friction that does not grow, {angles[0]:g} degrees: mean speed over Bagnold's",
+        ratio,
+        low=0.95,
+        high=1.05,
+    )
 
 
 def bagnold_profile(y: np.ndarray, angle: float) -> np.ndarray:
@@ -107,7 +152,9 @@ def bagnold_profile(y: np.ndarray, angle: float) -> np.ndarray:
     static, slope, dynamic = (math.tan(math.radians(a)) for a in (STATIC, angle, DYNAMIC))
     inertial = INERTIAL * (slope - static) / (dynamic - slope)
     fall = math.sqrt(MATERIALS["dry-sand"].max_fraction * GRAVITY * math.cos(math.radians(angle)))
-    return np.asarray(2.0 / 3.0 * inertial / GRAIN * fall * (DEPTH**1.5 - np.maximum(DEPTH - y, 0.0) ** 1.5))
+    return np.asarray(
+        2.0 / 3.0 * inertial / GRAIN * fall * (DEPTH**1.5 - np.maximum(DEPTH - y, 0.0) ** 1.5)
+    )
 
 
 def steady(cells: int, angle: float, **tables: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -150,18 +197,32 @@ def rests(cells: int, angle: float, **tables: Any) -> tuple[float, float]:
     return float(whole / GRAVITY), float(late / GRAVITY)
 
 
-def _create(cells: int, angle: float, speed: float, floor: float | str = ROUGH, **tables: Any) -> SandSimulation:
+def _create(
+    cells: int, angle: float, speed: float, floor: float | str = ROUGH, **tables: Any
+) -> SandSimulation:
     size, resolution = [LENGTH, 1.5 * DEPTH], 3 * cells // 2
     layer: Row = {
-        "domain": {"size": size, "resolution": resolution, "periodic": [True, False], "friction": floor},
+        "domain": {
+            "size": size,
+            "resolution": resolution,
+            "periodic": [True, False],
+            "friction": floor,
+        },
         "physics": tilted(angle),
         "material": {"friction_angle": FRICTION_ANGLE},
         "particles": {"jitter": 0.0},
     }
-    return create_sand(size, resolution, [box([0.0, 0.0], [LENGTH, DEPTH], velocity=[speed, 0.0])], **(layer | tables))
+    return create_sand(
+        size,
+        resolution,
+        [box([0.0, 0.0], [LENGTH, DEPTH], velocity=[speed, 0.0])],
+        **(layer | tables),
+    )
 
 
-def _watch(simulation: SandSimulation, cells: int, duration: float) -> tuple[np.ndarray, np.ndarray]:
+def _watch(
+    simulation: SandSimulation, cells: int, duration: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Step for a time [s]; return the time since [s] and the mean velocity along the slope [m/s] after each step."""
     dt = DT * RESOLUTIONS[0] / cells
     mean = []
@@ -174,16 +235,26 @@ def _watch(simulation: SandSimulation, cells: int, duration: float) -> tuple[np.
 STEEPER = np.degrees(np.linspace(math.atan(COEFFICIENT), math.radians(36.0), 20))
 HEIGHTS = np.linspace(0.0, DEPTH, 40)
 EXACT = {"sin - cos / 2": (STEEPER, [accelerates(angle) / GRAVITY for angle in STEEPER])}
-STEADY_LAYERS = {f"Bagnold, {a:g} degrees": (HEIGHTS / DEPTH, bagnold_profile(HEIGHTS, a)) for a in STEADY}
+STEADY_LAYERS = {
+    f"Bagnold, {a:g} degrees": (HEIGHTS / DEPTH, bagnold_profile(HEIGHTS, a)) for a in STEADY
+}
 RUNNING = "inclined-layer", "Acceleration of a layer that runs", "slope [degrees]", "a / g"
 LAYERS = Check(
     about=__doc__ or "",
     trials=[(run, RESOLUTIONS) for run in (layer, slab, bagnold)],
     charts=[
         plot(*RUNNING, check="inclined layer", exact=EXACT),
-        plot("bagnold-layer", f"{BAGNOLD}: speed", "y / depth", "u [m/s]", check=BAGNOLD, exact=STEADY_LAYERS),
+        plot(
+            "bagnold-layer",
+            f"{BAGNOLD}: speed",
+            "y / depth",
+            "u [m/s]",
+            check=BAGNOLD,
+            exact=STEADY_LAYERS,
+        ),
     ],
-    known="half a degree below the angle from which it runs a settled layer of 32 cells still moves, at .7 % of g t",
+    known="half a degree below the angle from which it runs a settled layer of 32 cells still "
+    "moves, at .7 % of g t",
 )
 
 
@@ -195,20 +266,38 @@ def planes(found: Findings, cells: int, cases: tuple[tuple[float, float], ...] =
         drive = GRAVITY * math.sin(t)
         measured = acceleration(angle, friction, cells)
         off = 100.0 * (measured - drive + friction * GRAVITY * math.cos(t)) / drive
-        found.add(f"{angle:g} degrees, friction {friction:g}: acceleration off Coulomb's, of g sin", abs(off), high=2.0, unit="%")
+        found.add(
+            f"{angle:g} degrees, friction {friction:g}: acceleration off Coulomb's, of g sin",
+            abs(off),
+            high=2.0,
+            unit="%",
+        )
         held = acceleration(angle, 1.2 * math.tan(t), cells)
-        found.add(f"{angle:g} degrees, friction 1.2 tan: acceleration of g sin", 100.0 * abs(held) / drive, high=0.5, unit="%")
+        found.add(
+            f"{angle:g} degrees, friction 1.2 tan: acceleration of g sin",
+            100.0 * abs(held) / drive,
+            high=0.5,
+            unit="%",
+        )
     angle, friction = cases[len(cases) // 2]
     drive = GRAVITY * math.sin(math.radians(angle))
     exact = drive - friction * GRAVITY * math.cos(math.radians(angle))
     stairs = acceleration(angle, friction, cells, whole=True)
-    found.must_break("whole cells: acceleration off Coulomb's, of g sin", 100.0 * abs(stairs - exact) / drive, high=2.0, unit="%")
+    found.must_break(
+        "whole cells: acceleration off Coulomb's, of g sin",
+        100.0 * abs(stairs - exact) / drive,
+        high=2.0,
+        unit="%",
+    )
 
 
 @check_at("sand oblique", "hopper of {cells} cells")
 def hopper(found: Findings, cells: int = HOPPER, shifts: tuple[float, ...] = SHIFTS) -> None:
     """Let sand run from a hopper whose place in the grid differs."""
-    cut, stairs = (np.array([discharge(shift, cells, whole=whole) for shift in shifts]) for whole in (False, True))
+    cut, stairs = (
+        np.array([discharge(shift, cells, whole=whole) for shift in shifts])
+        for whole in (False, True)
+    )
 
     def spread(rates: np.ndarray) -> float:
         return 100.0 * float(np.ptp(rates.mean(axis=1)) / rates.mean())
@@ -217,10 +306,17 @@ def hopper(found: Findings, cells: int = HOPPER, shifts: tuple[float, ...] = SHI
     growth = 100.0 * float(np.abs(cut[:, -1] / cut[:, 0] - 1.0).max())
     found.add("growth of the rate as the hopper empties", growth, high=10.0, unit="%")
     found.add("rate / sqrt(g D^3)", float(cut.mean()), low=0.7, high=2.0)
-    found.must_break("whole cells: spread of the rate over places in the grid", spread(stairs), high=6.0, unit="%")
+    found.must_break(
+        "whole cells: spread of the rate over places in the grid",
+        spread(stairs),
+        high=6.0,
+        unit="%",
+    )
 
 
-def acceleration(angle: float, friction: float, cells: int, *, whole: bool = False, shift: float = 0.0) -> float:
+def acceleration(
+    angle: float, friction: float, cells: int, *, whole: bool = False, shift: float = 0.0
+) -> float:
     """Return the acceleration of a stiff block down a plane [m/s^2].
 
     Args:
@@ -261,16 +357,25 @@ def discharge(shift: float, cells: int, *, whole: bool = False) -> list[float]:
     for side in (-1.0, 1.0):
         x = middle + side * (0.5 * SLOT + LIP)
         end = [x + side * 0.6 * math.cos(t), foot + 0.6 * math.sin(t)]
-        walls.append({"shape": "capsule", "from": [x, foot], "to": end, "radius": LIP, "friction": SLICK})
+        walls.append(
+            {"shape": "capsule", "from": [x, foot], "to": end, "radius": LIP, "friction": SLICK}
+        )
     fill = box([0.0, foot + 0.01], [WIDTH, foot + 0.4])
     drain = box([-1.0, -1.0], [WIDTH + 1.0, 0.08])
-    simulation = create_sand([WIDTH, 2.0 * WIDTH], 2 * cells, [fill], walls, drain=[drain], **CORRECTED)
+    simulation = create_sand(
+        [WIDTH, 2.0 * WIDTH], 2 * cells, [fill], walls, drain=[drain], **CORRECTED
+    )
     simulation = with_stairs(simulation) if whole else simulation
     left = []
     for time in parts:
         for _ in steps(simulation, time):
             pass
-        left.append(np.count_nonzero(simulation.particles.position.numpy()[:, 1] > foot) * dx * dx / simulation.scene.particles.per_axis**2)
+        left.append(
+            np.count_nonzero(simulation.particles.position.numpy()[:, 1] > foot)
+            * dx
+            * dx
+            / simulation.scene.particles.per_axis**2
+        )
     return [float(rate) / math.sqrt(GRAVITY * SLOT**3) for rate in -np.diff(left) / np.diff(parts)]
 
 
@@ -278,7 +383,13 @@ def with_stairs(simulation: SandSimulation) -> SandSimulation:
     """Return a simulation of the same, not yet begun, whose solids are whole cells for the stresses."""
     scene, boundary = simulation.scene, simulation.boundary
     solids = SandSolids(simulation.grid, boundary.cut.solids, boundary, scene.wall_frictions())  # type: ignore[attr-defined]
-    return SandSimulation(scene, simulation.grid, Parts(boundary, solids=solids), simulation.particles, outlets=simulation.outlets)
+    return SandSimulation(
+        scene,
+        simulation.grid,
+        Parts(boundary, solids=solids),
+        simulation.particles,
+        outlets=simulation.outlets,
+    )
 
 
 OBLIQUE = Check(

@@ -13,7 +13,17 @@ import numpy as np
 from warp_lcp.benchmarks.harness.record import Lines
 from warp_lcp.benchmarks.validation import scenes
 from warp_lcp.benchmarks.validation.finding import Check, Curve, Findings, Trial, check_at, plot
-from warp_lcp.benchmarks.validation.scenes import DENSITY, GRAVITY, SUB_CELL, VOXEL, Numerics, box, pressures, steps, tilted
+from warp_lcp.benchmarks.validation.scenes import (
+    DENSITY,
+    GRAVITY,
+    SUB_CELL,
+    VOXEL,
+    Numerics,
+    box,
+    pressures,
+    steps,
+    tilted,
+)
 from warp_lcp.benchmarks.validation.signals import enclosed_cells, mode, period
 
 RESOLUTIONS = (20, 40)  # cells a side
@@ -24,7 +34,11 @@ SLOPE, TILT = 30.0, 20.0  # degrees: of the planes of a V, and of gravity
 
 POOL = [box([0.0, 0.0], [SIDE, LEVEL])]
 V = [
-    {"shape": "plane", "point": [0.5 * SIDE, 0.0], "normal": [side * math.sin(math.radians(SLOPE)), math.cos(math.radians(SLOPE))]}
+    {
+        "shape": "plane",
+        "point": [0.5 * SIDE, 0.0],
+        "normal": [side * math.sin(math.radians(SLOPE)), math.cos(math.radians(SLOPE))],
+    }
     for side in (-1, 1)
 ]
 FULL = [box([0.0, 0.0], [SIDE, SIDE])]
@@ -41,7 +55,9 @@ AMPLITUDE = 0.05 * DEPTH
 WAVENUMBER = math.pi / LENGTH
 PERIOD = 2.0 * math.pi / math.sqrt(GRAVITY * WAVENUMBER * math.tanh(WAVENUMBER * DEPTH))
 PERIODS = 5
-SEEDS = (2015, 1, 2)  # of the particles: with whole cells the period is a matter of chance too, once the wave is lower than a cell
+# of the particles: with whole cells the period is a matter of chance too, once the wave is lower
+# than a cell
+SEEDS = (2015, 1, 2)
 POINTS = 257  # of the surface at the start
 SPEED = "t [s]", "largest speed / sqrt(g dx)"
 STAIRS = "whole cells: error of the period"  # a control
@@ -52,8 +68,10 @@ class Rest(NamedTuple):
 
     time: np.ndarray  # ends of the steps [s]
     speed: np.ndarray  # largest of the particles, in units of sqrt(g dx)
-    bias: float  # of the pressure below the surface at the end, in units of rho g dx, if it is level
-    profile: tuple[np.ndarray, np.ndarray]  # heights of rows of cells [m] and their mean pressure [Pa]
+    # of the pressure below the surface at the end, in units of rho g dx, if it is level
+    bias: float
+    # heights of rows of cells [m] and their mean pressure [Pa]
+    profile: tuple[np.ndarray, np.ndarray]
     volume: float  # inside the sub-cell surface at the end over that at the start
 
     def largest(self, begin: float, end: float) -> float:
@@ -68,13 +86,19 @@ def whole_cells(found: Findings, resolution: int, numerics: Numerics = VOXEL) ->
         rest = settle(resolution, VOXEL, DURATION, **tables)
         found.add(f"{case}: largest speed", rest.largest(0.0, DURATION), high=1e-3)
         if case.startswith("pool"):
-            found.add(f"{case}: bias of the pressure", rest.bias, low=0.48, high=0.52, unit="rho g dx")
+            found.add(
+                f"{case}: bias of the pressure", rest.bias, low=0.48, high=0.52, unit="rho g dx"
+            )
         if case == "pool":
             _draw_profile(found, rest)
     tilts = settle(resolution, VOXEL, AVERAGED, liquid=POOL, physics=tilted(TILT))
-    found.must_break("level pool under tilted gravity: largest speed", tilts.largest(0.0, AVERAGED), high=1e-3)
+    found.must_break(
+        "level pool under tilted gravity: largest speed", tilts.largest(0.0, AVERAGED), high=1e-3
+    )
     within = settle(resolution, SUB_CELL, 2 * AVERAGED, **CASES["pool"])
-    found.must_break("sub-cell pool: bias of the pressure", within.bias, low=0.48, high=0.52, unit="rho g dx")
+    found.must_break(
+        "sub-cell pool: bias of the pressure", within.bias, low=0.48, high=0.52, unit="rho g dx"
+    )
 
 
 @check_at("rest", "{resolution} cells, {numerics.name}")
@@ -91,29 +115,47 @@ def sub_cell(found: Findings, resolution: int, numerics: Numerics = SUB_CELL) ->
             _draw_profile(found, rest)
     level = LEVEL + 0.5 * SIDE / resolution  # its surface goes through the cells' centers
     rest = settle(resolution, numerics, DURATION, level, liquid=[box([0.0, 0.0], [SIDE, level])])
-    found.add("pool half a cell higher: |bias of the pressure|", abs(rest.bias), high=0.02, unit="rho g dx")
+    found.add(
+        "pool half a cell higher: |bias of the pressure|",
+        abs(rest.bias),
+        high=0.02,
+        unit="rho g dx",
+    )
     found.curve("pool half a cell higher", rest.time, rest.speed)
     whole = settle(resolution, VOXEL, 2 * AVERAGED, **CASES["pool"])
-    found.must_break("whole cells: |bias of the pressure|", abs(whole.bias), high=0.02, unit="rho g dx")
+    found.must_break(
+        "whole cells: |bias of the pressure|", abs(whole.bias), high=0.02, unit="rho g dx"
+    )
 
 
 @check_at("tilted rest", "{resolution} cells, {numerics.name}")
 def tilted_surface(found: Findings, resolution: int, numerics: Numerics = scenes.SMOOTHED) -> None:
     """Rest of a free surface that gravity tilts; the control is a surface of whole cells, whose stairs run."""
     normal = [-math.sin(math.radians(TILT)), math.cos(math.radians(TILT))]
-    tables: scenes.Row = {"liquid": [{"shape": "plane", "point": [0.5 * SIDE, 0.5 * SIDE], "normal": normal}], "physics": tilted(TILT)}
-    rest, stairs = (settle(resolution, each, TILTED_DURATION, **tables) for each in (numerics, VOXEL))
+    tables: scenes.Row = {
+        "liquid": [{"shape": "plane", "point": [0.5 * SIDE, 0.5 * SIDE], "normal": normal}],
+        "physics": tilted(TILT),
+    }
+    rest, stairs = (
+        settle(resolution, each, TILTED_DURATION, **tables) for each in (numerics, VOXEL)
+    )
     late = rest.time > 0.5 * TILTED_DURATION
     found.add("largest speed", rest.largest(0.0, TILTED_DURATION), high=0.1)
     found.add("largest speed after the first second", rest.largest(1.0, TILTED_DURATION), high=0.1)
-    found.add("mean of the largest speeds, second half over first", rest.speed[late].mean() / rest.speed[~late].mean(), high=1.0)
+    found.add(
+        "mean of the largest speeds, second half over first",
+        rest.speed[late].mean() / rest.speed[~late].mean(),
+        high=1.0,
+    )
     found.add("change of volume", 100.0 * abs(rest.volume - 1.0), high=0.5, unit="%")
     found.must_break("whole cells: largest speed", stairs.largest(0.0, TILTED_DURATION), high=0.3)
     found.curve("surface", rest.time, rest.speed)
     found.curve("whole cells", stairs.time, stairs.speed)
 
 
-def settle(resolution: int, numerics: Numerics, duration: float, level: float = LEVEL, **tables: Any) -> Rest:
+def settle(
+    resolution: int, numerics: Numerics, duration: float, level: float = LEVEL, **tables: Any
+) -> Rest:
     """Let a liquid rest for a time [s]; `level` is how high it stands if it stands level [m]."""
     simulation = scenes.create_liquid(numerics, [SIDE, SIDE], resolution, **tables)
     dx = simulation.grid.spacing
@@ -125,10 +167,18 @@ def settle(resolution: int, numerics: Numerics, duration: float, level: float = 
         if row["time"] > duration - AVERAGED:
             fields.append(pressures(simulation))
     bias, profile = _bias(np.mean(fields, axis=0), dx, level)
-    return Rest(np.array(time), np.array(speed), bias, profile, enclosed_cells(*scenes.particles_in_cells(simulation)) / before)
+    return Rest(
+        np.array(time),
+        np.array(speed),
+        bias,
+        profile,
+        enclosed_cells(*scenes.particles_in_cells(simulation)) / before,
+    )
 
 
-def _bias(pressure: np.ndarray, dx: float, level: float = LEVEL) -> tuple[float, tuple[np.ndarray, np.ndarray]]:
+def _bias(
+    pressure: np.ndarray, dx: float, level: float = LEVEL
+) -> tuple[float, tuple[np.ndarray, np.ndarray]]:
     """Return the mean of p - rho g (h - y) in the cells that lie a cell or more below the surface, and the rows' mean pressures."""
     y = (np.arange(len(pressure)) + 0.5) * dx
     wet = pressure > 0.0
@@ -155,10 +205,17 @@ RESTING = Check(
     trials=[(run, RESOLUTIONS) for run in (whole_cells, sub_cell, tilted_surface)],
     charts=[
         plot("rest", "Largest speed at rest", *SPEED, log="y", check="rest", but="profile"),
-        plot("tilted-rest", "Largest speed of a tilted surface at rest", *SPEED, log="y", check="tilted rest"),
+        plot(
+            "tilted-rest",
+            "Largest speed of a tilted surface at rest",
+            *SPEED,
+            log="y",
+            check="tilted rest",
+        ),
         _profiles,
     ],
-    known="single particles that leave a tilted free surface run down above it, beyond 10 % of sqrt(g dx)",
+    known="single particles that leave a tilted free surface run down above it, beyond 10 % of "
+    "sqrt(g dx)",
 )
 
 
@@ -171,7 +228,9 @@ def sloshing(found: Findings, cells: int, numerics: Numerics = SUB_CELL) -> None
         worst = int(np.argmax(np.abs(np.array(periods) - PERIOD)))
         error = 100.0 * abs(periods[worst] / PERIOD - 1.0)
         time, elevation = waves[worst]
-        found.curve(f"{cells} cells, {each.name}, {periods[worst]:.4f} s", time, elevation / AMPLITUDE)
+        found.curve(
+            f"{cells} cells, {each.name}, {periods[worst]:.4f} s", time, elevation / AMPLITUDE
+        )
         if each is numerics:
             found.add("error of the period", error, high=3.0, unit="%")
         else:
@@ -184,13 +243,23 @@ def slosh(cells: int, numerics: Numerics, seed: int = SEEDS[0]) -> tuple[np.ndar
         folder, size = Path(name), [LENGTH, HEIGHT]
         write_wave(folder / "wave.obj")
         wave = {"shape": "mesh", "file": "wave.obj"}
-        simulation = scenes.create_liquid(numerics, size, round(cells * LENGTH / DEPTH), [wave], particles={"seed": seed}, folder=folder)
+        simulation = scenes.create_liquid(
+            numerics,
+            size,
+            round(cells * LENGTH / DEPTH),
+            [wave],
+            particles={"seed": seed},
+            folder=folder,
+        )
     area = (simulation.grid.spacing / scenes.PER_AXIS) ** 2
 
     def amplitude() -> float:
         return mode(scenes.positions(simulation)[:, 0], WAVENUMBER, area, LENGTH)
 
-    curve = [(0.0, amplitude()), *((row["time"], amplitude()) for row in steps(simulation, PERIODS * PERIOD))]
+    curve = [
+        (0.0, amplitude()),
+        *((row["time"], amplitude()) for row in steps(simulation, PERIODS * PERIOD)),
+    ]
     time, elevation = np.array(curve).T
     return time, elevation
 
@@ -199,7 +268,11 @@ def write_wave(path: Path) -> None:
     """Write the liquid at the start as a closed surface, extruded along z: its cut by z = 0 lies below y = h + a cos(k x)."""
     margin = 0.1 * LENGTH  # beyond the walls, so that none of the liquid's sides lies on them
     x = np.linspace(-margin, LENGTH + margin, POINTS)
-    outline = [*zip(x, DEPTH + AMPLITUDE * np.cos(WAVENUMBER * x), strict=True), (x[-1], -margin), (x[0], -margin)]
+    outline = [
+        *zip(x, DEPTH + AMPLITUDE * np.cos(WAVENUMBER * x), strict=True),
+        (x[-1], -margin),
+        (x[0], -margin),
+    ]
     n = len(outline)
     vertices = [f"v {a:.9g} {b:.9g} {z:g}" for z in (-1.0, 1.0) for a, b in outline]
     sides = []
@@ -215,7 +288,9 @@ def write_wave(path: Path) -> None:
 
 def finer(found: Findings, trials: Sequence[Trial]) -> None:
     """Compare the errors of the period at both resolutions."""
-    (coarse, _), (fine, stairs) = ([t.value(what) for what in ("error of the period", f"control: {STAIRS}")] for t in trials)
+    (coarse, _), (fine, stairs) = (
+        [t.value(what) for what in ("error of the period", f"control: {STAIRS}")] for t in trials
+    )
     found.add("error of the period", fine, high=max(coarse, 0.5), unit="%")
     found.must_break(STAIRS, stairs, high=max(coarse, 0.5), unit="%")
 
@@ -225,11 +300,14 @@ def _modes(trials: Sequence[Trial]) -> Lines:
     curves = {"linear theory": (time.tolist(), np.cos(2.0 * math.pi * time / PERIOD).tolist())}
     for t in trials:
         curves |= t.curves
-    return Lines("sloshing", "First mode of the elevation", "t [s]", "amplitude / start", curves, log="")
+    return Lines(
+        "sloshing", "First mode of the elevation", "t [s]", "amplitude / start", curves, log=""
+    )
 
 
 SLOSHING = Check(
-    about="Sloshing of a small amplitude: omega^2 = g k tanh(k h), linear theory of waves on water of depth h.",
+    about="Sloshing of a small amplitude: omega^2 = g k tanh(k h), linear theory of waves on water "
+    "of depth h.",
     trials=[(sloshing, WAVE_RESOLUTIONS)],
     across=(f"{WAVE_RESOLUTIONS[1]} against {WAVE_RESOLUTIONS[0]} cells", finer),
     charts=[_modes],

@@ -12,21 +12,36 @@ import numpy as np
 from warp_lcp.benchmarks.harness.record import Lines
 from warp_lcp.benchmarks.validation import scenes
 from warp_lcp.benchmarks.validation.finding import Check, Findings, Trial, check_at, plot
-from warp_lcp.benchmarks.validation.scenes import FRICTION_ANGLE, GRAVITY, TOLERANCE, WALL_FRICTION, WIDTH, Row, column, share_solved, steps
+from warp_lcp.benchmarks.validation.scenes import (
+    FRICTION_ANGLE,
+    GRAVITY,
+    TOLERANCE,
+    WALL_FRICTION,
+    WIDTH,
+    Row,
+    column,
+    share_solved,
+    steps,
+)
 from warp_lcp.granular.simulator import SandSimulation
 
-CASES = {20: (0.5, 1.0, 2.0, 4.0, 8.0), 40: (0.5, 1.0, 2.0, 4.0)}  # aspects at each number of cells of a column's width
+# aspects at each number of cells of a column's width
+CASES = {20: (0.5, 1.0, 2.0, 4.0, 8.0), 40: (0.5, 1.0, 2.0, 4.0)}
 CONTROLLED = 2.0  # the aspect of the negative controls
 WIDENED = 0.2  # of the experiments' range
 HEIGHT = 0.1  # of the experiments' heights
 STEEPEST = 45.0  # degrees of a control: no cone is steeper
-GROWTH = 20, (1.0, 2.0, 4.0)  # cells and aspects of columns whose friction grows with the rate of shear,
-GAIN = math.tan(math.radians(32.76)) - math.tan(math.radians(20.9))  # by as much as that of glass beads
+# cells and aspects of columns whose friction grows with the rate of shear,
+GROWTH = 20, (1.0, 2.0, 4.0)
+# by as much as that of glass beads
+GAIN = math.tan(math.radians(32.76)) - math.tan(math.radians(20.9))
 DYNAMIC = math.degrees(math.atan(WALL_FRICTION + GAIN))
 GRAIN = 5.3e-4  # [m], and of their size [Jop, Forterre & Pouliquen 2006]
 TALL = 4.0  # the aspect from which that must bring the runout into the experiments' range
 STOPS, STAYS = 3.5, 0.5  # [sqrt(height / g)]: when a pile has stopped; [s] that it is watched then
-HIGH, MOST = 80, 1500  # cells of height from which columns need more iterations a step than a scene allows by itself; how many
+# cells of height from which columns need more iterations a step than a scene allows by itself; how
+# many
+HIGH, MOST = 80, 1500
 STEEP = 40.0  # degrees of the control in 3-D, where no cone is steeper than 40.8
 CUBE = 48  # cells of the domain in 3-D
 CUBE_DOMAIN, CUBE_WIDTH = 0.96, 0.28  # [m]: of the domain, and of the cube that collapses there
@@ -77,7 +92,9 @@ def envelope(aspect: float) -> tuple[float, float]:
 
 
 @check_at("sand collapse", "{cells} cells of width")
-def runouts(found: Findings, cells: int, aspects: tuple[float, ...] = (), *, controls: bool = True) -> None:
+def runouts(
+    found: Findings, cells: int, aspects: tuple[float, ...] = (), *, controls: bool = True
+) -> None:
     """Compare runouts and heights with the experiments; the controls have half of their friction, and the most that a cone may have.
 
     Args:
@@ -91,17 +108,32 @@ def runouts(found: Findings, cells: int, aspects: tuple[float, ...] = (), *, con
         c, label = collapse(aspect, cells), f"a = {aspect:g}"
         ways.append(c.runout)
         _compare(found, label, c, envelope(aspect))
-        found.add(f"{label}: way of the front in the last {STAYS:g} s", abs(c.moved), high=0.02, unit="widths")
+        found.add(
+            f"{label}: way of the front in the last {STAYS:g} s",
+            abs(c.moved),
+            high=0.02,
+            unit="widths",
+        )
         found.add(f"{label}: kinetic energy in the end over the largest", c.energy, high=1e-3)
         found.add(f"{label}: steps with stresses to 1e-3", c.solved, low=95.0, unit="%")
         found.curve(label, *c.outline)
     found.curve("runout", chosen, ways)
-    for angle in (math.degrees(math.atan(0.5 * math.tan(math.radians(FRICTION_ANGLE)))), STEEPEST) if controls else ():
-        c = collapse(CONTROLLED, cells, length=12.0, angle=angle, floor=math.tan(math.radians(angle)))
-        _compare(found, f"{angle:.0f} degrees, a = {CONTROLLED:g}", c, envelope(CONTROLLED), control=True)
+    for angle in (
+        (math.degrees(math.atan(0.5 * math.tan(math.radians(FRICTION_ANGLE)))), STEEPEST)
+        if controls
+        else ()
+    ):
+        c = collapse(
+            CONTROLLED, cells, length=12.0, angle=angle, floor=math.tan(math.radians(angle))
+        )
+        _compare(
+            found, f"{angle:.0f} degrees, a = {CONTROLLED:g}", c, envelope(CONTROLLED), control=True
+        )
 
 
-def _compare(found: Findings, label: str, c: Collapse, bounds: tuple[float, float], *, control: bool = False) -> None:
+def _compare(
+    found: Findings, label: str, c: Collapse, bounds: tuple[float, float], *, control: bool = False
+) -> None:
     """Judge a runout by its bounds and a height by that of Lube et al."""
     judge = found.must_break if control else found.add
     judge(f"{label}: runout", c.runout, low=bounds[0], high=bounds[1], unit="widths")
@@ -118,7 +150,9 @@ def collapse(aspect: float, cells: int, *, length: float = 0.0, **tables: Any) -
         tables: of the scene.
     """
     more = {"solver": {"max_iterations": MOST}} if aspect * cells >= HIGH else {}
-    simulation = column(aspect, cells, length=length or 2.5 + 1.2 * envelope(aspect)[1], **(more | tables))
+    simulation = column(
+        aspect, cells, length=length or 2.5 + 1.2 * envelope(aspect)[1], **(more | tables)
+    )
     stops = STOPS * math.sqrt(aspect * WIDTH / GRAVITY) + 0.2
     rows = list(steps(simulation, stops))
     before = scenes.runout(simulation)
@@ -126,7 +160,9 @@ def collapse(aspect: float, cells: int, *, length: float = 0.0, **tables: Any) -
     outline = (scenes.profile(simulation)[1:-1] - scenes.FLOOR) / cells
     pile, x = outline > 0.0, (np.arange(len(outline)) + 0.5) / cells
     way, high = scenes.runout(simulation), scenes.height(simulation) / lube_height(aspect)
-    return Collapse(way, high, way - before, _energy(rows), share_solved(rows), (x[pile], outline[pile]))
+    return Collapse(
+        way, high, way - before, _energy(rows), share_solved(rows), (x[pile], outline[pile])
+    )
 
 
 def _energy(rows: Sequence[Row]) -> float:
@@ -136,12 +172,19 @@ def _energy(rows: Sequence[Row]) -> float:
 
 
 @check_at("sand collapse", "mu(I), {cells} cells of width")
-def growing(found: Findings, cells: int = GROWTH[0], aspects: tuple[float, ...] = GROWTH[1]) -> None:
+def growing(
+    found: Findings, cells: int = GROWTH[0], aspects: tuple[float, ...] = GROWTH[1]
+) -> None:
     """Compare columns whose friction grows with the rate of shear by as much as that of glass beads."""
     ways = []
     for aspect in aspects:
         c = collapse(aspect, cells, friction={"dynamic_angle": DYNAMIC, "grain_size": GRAIN})
-        _compare(found, f"a = {aspect:g}", c, envelope(aspect) if aspect < TALL else (lube(aspect), lajeunesse(aspect)))
+        _compare(
+            found,
+            f"a = {aspect:g}",
+            c,
+            envelope(aspect) if aspect < TALL else (lube(aspect), lajeunesse(aspect)),
+        )
         ways.append(c.runout)
     found.curve("runout", aspects, ways)
 
@@ -150,7 +193,8 @@ def growing(found: Findings, cells: int = GROWTH[0], aspects: tuple[float, ...] 
 def cube(found: Findings, cells: int = CUBE) -> None:
     """Let a square column collapse in 3-D: it must stop, as a round pile that reaches as far as those of round columns do.
 
-    The controls are the cube itself, and sand of nearly the steepest cone. Sand with half of the friction would meet the walls.
+    The controls are the cube itself, and sand of nearly the steepest cone. Sand with half of the
+    friction would meet the walls.
     """
     start, x, rows = _falling_cube({"friction_angle": FRICTION_ANGLE}, WALL_FRICTION, cells)
     found.add("kinetic energy in the end over the largest", _energy(rows), high=1e-3)
@@ -159,18 +203,36 @@ def cube(found: Findings, cells: int = CUBE) -> None:
     found.must_break("before it falls: |mean of exp(4 i angle)|", _squareness(start), high=0.5)
     radius = CUBE_WIDTH / math.sqrt(math.pi)  # of a round column of the same area
     aspect = CUBE_WIDTH / radius
-    low, high = (1.0 - WIDENED) * 1.6 * math.sqrt(aspect), (1.0 + WIDENED) * 2.0 * math.sqrt(aspect)  # [Lube2004], [Lajeunesse2004]
-    found.add(f"a = {aspect:.2f}: runout", _reach(x) / radius - 1.0, low=low, high=high, unit="radii")
-    found.add("least dissipation of a step", min(row["dissipation"] for row in rows), low=0.0, unit="J")
+    # [Lube2004], [Lajeunesse2004]
+    low, high = (1.0 - WIDENED) * 1.6 * math.sqrt(aspect), (1.0 + WIDENED) * 2.0 * math.sqrt(aspect)
+    found.add(
+        f"a = {aspect:.2f}: runout", _reach(x) / radius - 1.0, low=low, high=high, unit="radii"
+    )
+    found.add(
+        "least dissipation of a step", min(row["dissipation"] for row in rows), low=0.0, unit="J"
+    )
     _, x, _ = _falling_cube({"friction_angle": STEEP}, math.tan(math.radians(STEEP)), cells)
-    found.must_break(f"{STEEP:g} degrees, a = {aspect:.2f}: runout", _reach(x) / radius - 1.0, low=low, high=high, unit="radii")
+    found.must_break(
+        f"{STEEP:g} degrees, a = {aspect:.2f}: runout",
+        _reach(x) / radius - 1.0,
+        low=low,
+        high=high,
+        unit="radii",
+    )
 
 
-def _falling_cube(material: Row, walls: float, cells: int) -> tuple[np.ndarray, np.ndarray, list[Row]]:
+def _falling_cube(
+    material: Row, walls: float, cells: int
+) -> tuple[np.ndarray, np.ndarray, list[Row]]:
     """Return where the particles of a cube of sand are at the start and in the end, from its axis, shape (n, 2) [m], and the log's rows."""
     near, end = 0.5 * (CUBE_DOMAIN - CUBE_WIDTH), 0.5 * (CUBE_DOMAIN + CUBE_WIDTH)
-    sand, size = scenes.box([near, 0.0, near], [end, CUBE_WIDTH, end]), [CUBE_DOMAIN, 0.5 * CUBE_DOMAIN, CUBE_DOMAIN]
-    simulation = scenes.create_sand(size, cells, [sand], walls=walls, material=material, **scenes.CORRECTED)
+    sand, size = (
+        scenes.box([near, 0.0, near], [end, CUBE_WIDTH, end]),
+        [CUBE_DOMAIN, 0.5 * CUBE_DOMAIN, CUBE_DOMAIN],
+    )
+    simulation = scenes.create_sand(
+        size, cells, [sand], walls=walls, material=material, **scenes.CORRECTED
+    )
     start = simulation.particles.position.numpy()[:, [0, 2]] - 0.5 * CUBE_DOMAIN
     rows = list(steps(simulation, STOPS * math.sqrt(CUBE_WIDTH / GRAVITY) + 0.2))
     return start, simulation.particles.position.numpy()[:, [0, 2]] - 0.5 * CUBE_DOMAIN, rows
@@ -195,14 +257,18 @@ def _laws(trials: Sequence[Trial]) -> Lines:
         curves[label] = (a, [envelope(x)[side] for x in a])
     curves |= {t.resolution: t.curves.get("runout", ([], [])) for t in trials[:-1]}
     marked, title = frozenset(t.resolution for t in trials), "Runout of collapsing columns"
-    return Lines("sand-runout", title, "a = height / width", "runout / width", curves, marked=marked)
+    return Lines(
+        "sand-runout", title, "a = height / width", "runout / width", curves, marked=marked
+    )
 
 
 COLLAPSES = Check(
-    about="Collapsing columns of sand against the runouts and heights that experiments found: Lube et al. 2005 and Lajeunesse et al. 2005.",
+    about="Collapsing columns of sand against the runouts and heights that experiments found: Lube "
+    "et al. 2005 and Lajeunesse et al. 2005.",
     trials=[(runouts, tuple(CASES)), (growing, [()]), (cube, [()])],
     charts=[_laws, plot("sand-piles", "Piles", "x / width", "y / width", "a = ")],
-    known="a = 0.5 with 20 cells, ten of height, runs 0.40 widths, with 40 cells 0.52; 10 to 30 % of tall ones' steps miss 1e-3",
+    known="a = 0.5 with 20 cells, ten of height, runs 0.40 widths, with 40 cells 0.52; 10 to 30 % "
+    "of tall ones' steps miss 1e-3",
 )
 
 
@@ -214,27 +280,62 @@ def invariants(found: Findings, cells: int, duration: float = DURATION) -> None:
     rows, least, off = watch(simulation, duration)
     densest = np.array([row["max_fraction"] for row in rows])
     found.add("change of the mass", _change(rows, mass), high=1e-12)
-    found.add("mass off rho a b", abs(mass / (simulation.scene.physics.density * ASPECT * WIDTH**2) - 1.0), high=1e-9)
+    found.add(
+        "mass off rho a b",
+        abs(mass / (simulation.scene.physics.density * ASPECT * WIDTH**2) - 1.0),
+        high=1e-9,
+    )
     found.add("least pressure", least, low=0.0, unit="rho g dx")
-    found.add("99th percentile over steps: complementarity of the pressure", np.percentile(off, 99.0), high=2.0 * TOLERANCE)
-    found.add("steps with complementarity to 1e-3", 100.0 * (off <= TOLERANCE).mean(), low=95.0, unit="%")
-    found.add("largest predicted excess of a cell", max(row["predicted_excess"] for row in rows), high=EXCESS)
-    found.add("least dissipation of a step", min(row["dissipation"] for row in rows), low=0.0, unit="J/m")
+    found.add(
+        "99th percentile over steps: complementarity of the pressure",
+        np.percentile(off, 99.0),
+        high=2.0 * TOLERANCE,
+    )
+    found.add(
+        "steps with complementarity to 1e-3", 100.0 * (off <= TOLERANCE).mean(), low=95.0, unit="%"
+    )
+    found.add(
+        "largest predicted excess of a cell",
+        max(row["predicted_excess"] for row in rows),
+        high=EXCESS,
+    )
+    found.add(
+        "least dissipation of a step", min(row["dissipation"] for row in rows), low=0.0, unit="J/m"
+    )
     found.add("densest cell of any step, corrected", densest.max(), high=DENSEST)
-    found.add("95th percentile over steps: densest cell, corrected", np.percentile(densest, 95.0), high=DENSEST)
+    found.add(
+        "95th percentile over steps: densest cell, corrected",
+        np.percentile(densest, 95.0),
+        high=DENSEST,
+    )
     found.curve("with density correction", [row["time"] for row in rows], densest)
 
-    rows = list(steps(column(ASPECT, cells, length=LENGTH, density_correction={"every": 0}), duration))
+    rows = list(
+        steps(column(ASPECT, cells, length=LENGTH, density_correction={"every": 0}), duration)
+    )
     densest = np.array([row["max_fraction"] for row in rows])
     found.must_break("no correction: densest cell of any step", densest.max(), high=DENSEST)
     found.curve("without", [row["time"] for row in rows], densest)
-    rows, _, off = watch(column(ASPECT, cells, length=LENGTH, solver={"max_iterations": FEW}), duration)
+    rows, _, off = watch(
+        column(ASPECT, cells, length=LENGTH, solver={"max_iterations": FEW}), duration
+    )
     early = f"{FEW} iterations"
-    found.must_break(f"{early}: steps with complementarity to 1e-3", 100.0 * (off <= TOLERANCE).mean(), low=95.0, unit="%")
-    found.must_break(f"{early}: largest predicted excess of a cell", max(row["predicted_excess"] for row in rows), high=EXCESS)
+    found.must_break(
+        f"{early}: steps with complementarity to 1e-3",
+        100.0 * (off <= TOLERANCE).mean(),
+        low=95.0,
+        unit="%",
+    )
+    found.must_break(
+        f"{early}: largest predicted excess of a cell",
+        max(row["predicted_excess"] for row in rows),
+        high=EXCESS,
+    )
     drain = scenes.box([WIDTH, 0.0], [LENGTH * WIDTH, WIDTH])
     rows = list(steps(column(ASPECT, cells, length=LENGTH, drain=[drain]), duration))
-    found.must_break("a drain beside the column: change of the mass", _change(rows, mass), high=1e-12)
+    found.must_break(
+        "a drain beside the column: change of the mass", _change(rows, mass), high=1e-12
+    )
 
 
 def _change(rows: Sequence[Row], mass: float) -> float:
@@ -245,8 +346,8 @@ def watch(simulation: SandSimulation, duration: float) -> tuple[list[Row], float
     """Step for a time [s].
 
     Returns:
-        The log's rows, the least pressure of any cell [rho g dx], and the complementarity of the pressure of each step: the root mean
-        square of min(x, w / diagonal) in units of g dt.
+        The log's rows, the least pressure of any cell [rho g dx], and the complementarity of the
+        pressure of each step: the root mean square of min(x, w / diagonal) in units of g dt.
     """
     rows, least, off = [], 0.0, []
     for row in steps(simulation, duration):
@@ -258,10 +359,12 @@ def watch(simulation: SandSimulation, duration: float) -> tuple[list[Row], float
 
 
 INVARIANTS = Check(
-    about="What every step of sand must keep: its mass, pressures that push, what fits into a cell, and friction that takes energy.",
+    about="What every step of sand must keep: its mass, pressures that push, what fits into a "
+    "cell, and friction that takes energy.",
     trials=[(invariants, RESOLUTIONS)],
     charts=[plot("sand-density", "Densest cell of a collapsing column", "t [s]", "fraction")],
-    known="of the steps at 40 cells 94.9 % reach 1e-3, one packs a cell to 1.11, one gains 1e-4 J/m",
+    known="of the steps at 40 cells 94.9 % reach 1e-3, one packs a cell to 1.11, one gains 1e-4 "
+    "J/m",
 )
 
 
@@ -269,16 +372,31 @@ INVARIANTS = Check(
 def resting(found: Findings, cells: int, watches: int = WATCHES) -> None:
     """Watch a pile at rest; the control is of sand that hardly rubs."""
     whole, deep = np.array(rest(cells, watches)).T
-    found.add(f"{AFTER:g} s after the stop: drift four cells below the surface", deep[0], high=DEEP, unit="heights/s")
+    found.add(
+        f"{AFTER:g} s after the stop: drift four cells below the surface",
+        deep[0],
+        high=DEEP,
+        unit="heights/s",
+    )
     found.add(f"{AFTER:g} s after the stop: drift of all", whole[0], high=ALL, unit="heights/s")
     if watches > 1:
-        found.add("later: largest drift four cells below the surface", deep[1:].max(), high=DEEP, unit="heights/s")
+        found.add(
+            "later: largest drift four cells below the surface",
+            deep[1:].max(),
+            high=DEEP,
+            unit="heights/s",
+        )
         found.add("drift of all, in the end over that", whole[-1] / whole[0], high=1.0)
     at = STOPPED * FALL + AFTER + WATCHED * (np.arange(watches) + 0.5)
     found.curve("all", at, whole)
     found.curve("deep", at, deep)
     ((_, slides),) = rest(cells, 1, material={"friction_angle": SLIPPERY})
-    found.must_break(f"{SLIPPERY:g} degrees: drift four cells below the surface", slides, high=DEEP, unit="heights/s")
+    found.must_break(
+        f"{SLIPPERY:g} degrees: drift four cells below the surface",
+        slides,
+        high=DEEP,
+        unit="heights/s",
+    )
 
 
 def rest(cells: int, watches: int, **tables: Any) -> list[tuple[float, float]]:
@@ -300,14 +418,20 @@ def models(found: Findings, cells: int) -> None:
         seconds = (time.perf_counter() - begun) / len(rows)
         found.add(f"{model}: runout", scenes.runout(simulation), low=low, high=high, unit="widths")
         found.add(f"{model}: time of a step", 1e3 * seconds, high=200.0, unit="ms")
-        found.add(f"{model}: iterations of a step", np.mean([row["solve_iterations"] for row in rows]), high=600.0)
+        found.add(
+            f"{model}: iterations of a step",
+            np.mean([row["solve_iterations"] for row in rows]),
+            high=600.0,
+        )
         found.add(f"{model}: steps with stresses to 1e-3", share_solved(rows), low=least, unit="%")
         whole, deep = scenes.drift(simulation, WATCHED, ASPECT * WIDTH)
         found.add(f"{model}: drift of all", whole, high=1e-2, unit="heights/s")
         found.add(f"{model}: drift four cells below the surface", deep, high=1e-2, unit="heights/s")
     hasty = column(ASPECT, cells, length=LENGTH, solver={"max_iterations": FEW})
     solved = share_solved(list(steps(hasty, STOPPED * FALL)))
-    found.must_break(f"cone, {FEW} iterations: steps with stresses to 1e-3", solved, low=95.0, unit="%")
+    found.must_break(
+        f"cone, {FEW} iterations: steps with stresses to 1e-3", solved, low=95.0, unit="%"
+    )
 
 
 RESTING = Check(
@@ -317,5 +441,6 @@ The box of Narain et al. is compared with the cone on the same column.
 """,
     trials=[(resting, RESOLUTIONS), (models, RESOLUTIONS[:1])],
     charts=[plot("sand-rest", "Drift of a pile", "t [s]", "heights / s", log="y")],
-    known="columns of the box of Narain et al. run 2.25 widths, 7 % less than the experiments allow",
+    known="columns of the box of Narain et al. run 2.25 widths, 7 % less than the experiments "
+    "allow",
 )

@@ -1,8 +1,9 @@
 """Heaps of sand that is poured slowly: how steep they are, that they are wedges and stay; and that wedges which are flatter stay too.
 
-In sand whose yield set has the slope k a layer that runs stops at atan k: what slides along a slope shears alone, under equal normal
-stresses. Sand that rests has pushed against itself along the slope, and so holds up to asin k: by 1, 5
-and 17 degrees more at 20, 30 and 40. A heap lies between, and the check says by how much it is off the angle at which layers stop.
+In sand whose yield set has the slope k a layer that runs stops at atan k: what slides along a slope
+shears alone, under equal normal stresses. Sand that rests has pushed against itself along the
+slope, and so holds up to asin k: by 1, 5 and 17 degrees more at 20, 30 and 40. A heap lies between,
+and the check says by how much it is off the angle at which layers stop.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ AREA = 0.04  # [m^2]: what it pours
 SEED_WIDTH, SEED_HEIGHT = 0.1, 0.025  # [m]: of the sand that is there at the start
 SETTLES, LASTS = 1.0, 5.0  # [s] from the end of the pouring to the first look, and to the last
 NEAR, ALIKE, CREEP = 2.0, 1.5, 0.2  # degrees; degrees between two resolutions; degrees a second
-BELOW, BASE, STANDS, SHRINKS = 3.0, 0.9, 5.0, 0.01  # of a wedge: degrees below the angle; [m]; [s]; share of its height
+# of a wedge: degrees below the angle; [m]; [s]; share of its height
+BELOW, BASE, STANDS, SHRINKS = 3.0, 0.9, 5.0, 0.01
 CONTROLLED = 30.0  # degrees: of the negative control
 HIGHEST = 3  # columns that the height is the mean of
 Outline = tuple[np.ndarray, np.ndarray]  # x and y [m]
@@ -50,8 +52,12 @@ def heaps(found: Findings, cells: int, angles: Sequence[float] = ANGLES) -> None
         low, high = angle - NEAR, angle + NEAR
         found.add(f"{angle:g} degrees: heap", heap.angle, low=low, high=high, unit="degrees")
         found.add(f"{angle:g} degrees: creep", abs(heap.creep), high=CREEP, unit="degrees/s")
-        found.add(f"{angle:g} degrees: distance from a wedge, over the height", heap.wedge, high=0.08)
-        found.add(f"{angle:g} degrees: steps with stresses to 1e-3", heap.solved, low=95.0, unit="%")
+        found.add(
+            f"{angle:g} degrees: distance from a wedge, over the height", heap.wedge, high=0.08
+        )
+        found.add(
+            f"{angle:g} degrees: steps with stresses to 1e-3", heap.solved, low=95.0, unit="%"
+        )
         found.curve(f"{angle:g} degrees", *heap.outline)
     if cells == RESOLUTIONS[0]:
         low, high = CONTROLLED - NEAR, CONTROLLED + NEAR
@@ -63,9 +69,15 @@ def heaps(found: Findings, cells: int, angles: Sequence[float] = ANGLES) -> None
 def wedges(found: Findings, cells: int, angles: Sequence[float] = ANGLES) -> None:
     """Let wedges stand that are flatter than a layer that stops; the control has half the friction."""
     for angle in angles:
-        found.add(f"{angle - BELOW:g} of {angle:g} degrees: height lost", lost(cells, angle), high=SHRINKS)
-    flows = lost(cells, CONTROLLED, duration=SETTLES, material={"friction_angle": half_as_steep(CONTROLLED)})
-    found.must_break(f"half the friction, {CONTROLLED - BELOW:g} degrees: height lost", flows, high=SHRINKS)
+        found.add(
+            f"{angle - BELOW:g} of {angle:g} degrees: height lost", lost(cells, angle), high=SHRINKS
+        )
+    flows = lost(
+        cells, CONTROLLED, duration=SETTLES, material={"friction_angle": half_as_steep(CONTROLLED)}
+    )
+    found.must_break(
+        f"half the friction, {CONTROLLED - BELOW:g} degrees: height lost", flows, high=SHRINKS
+    )
 
 
 def half_as_steep(angle: float) -> float:
@@ -99,7 +111,9 @@ def pour(cells: int, angle: float, *, lasts: float = LASTS, **tables: Any) -> He
 
 def lost(cells: int, angle: float, *, duration: float = STANDS, **tables: Any) -> float:
     """Return the share of its height that a wedge, `BELOW` flatter than an angle [degrees], loses in a time [s]."""
-    simulation = cut_wedge(cells, angle - BELOW, **({"material": {"friction_angle": angle}} | tables))
+    simulation = cut_wedge(
+        cells, angle - BELOW, **({"material": {"friction_angle": angle}} | tables)
+    )
     before = height(simulation)
     for _ in steps(simulation, duration):
         pass
@@ -115,7 +129,9 @@ def cut_wedge(cells: int, slope: float, **tables: Any) -> SandSimulation:
     simulation = create_sand(size, cells, [sand], **({"walls": "stick"} | tables))
     x, y = positions(simulation).T
     keep = y < top - np.abs(x - middle) * tangent
-    simulation.particles.assign({name: array.numpy()[keep] for name, array in simulation.particles.arrays().items()})
+    simulation.particles.assign(
+        {name: array.numpy()[keep] for name, array in simulation.particles.arrays().items()}
+    )
     simulation.particles.sort()
     simulation.mark()
     return simulation
@@ -147,25 +163,45 @@ def dome(across: np.ndarray) -> np.ndarray:
 def fit(line: Outline, shape: Callable[[np.ndarray], np.ndarray]) -> tuple[float, float, float]:
     """Return the angle of a shape that is fitted to an outline by least squares [degrees], how far it is off [m], and its height [m].
 
-    All columns take part, so that single ones, which may be denser or looser than others, matter little.
+    All columns take part, so that single ones, which may be denser or looser than others, matter
+    little.
     """
     x, y = line
     middle = float(np.average(x, weights=y))
-    start = [float(y.max()), math.sqrt(6.0 * float(np.average((x - middle) ** 2, weights=y))), middle]  # a wedge's half width
+    # a wedge's half width
+    start = [
+        float(y.max()),
+        math.sqrt(6.0 * float(np.average((x - middle) ** 2, weights=y))),
+        middle,
+    ]
 
     def distance(p: np.ndarray) -> float:
         return float(np.sum((p[0] * shape((x - p[2]) / p[1]) - y) ** 2))
 
-    best = minimize(distance, start, method="Nelder-Mead", options={"xatol": 1e-6, "fatol": 1e-12, "maxiter": 2000})
+    best = minimize(
+        distance,
+        start,
+        method="Nelder-Mead",
+        options={"xatol": 1e-6, "fatol": 1e-12, "maxiter": 2000},
+    )
     top, half, _ = best.x
-    return math.degrees(math.atan(top / half)), math.sqrt(best.fun / np.count_nonzero(y)), float(top)
+    return (
+        math.degrees(math.atan(top / half)),
+        math.sqrt(best.fun / np.count_nonzero(y)),
+        float(top),
+    )
 
 
 def alike(found: Findings, trials: Sequence[Trial]) -> None:
     """Compare the heaps of both resolutions."""
     for angle in ANGLES:
         coarse, fine = (t.value(f"{angle:g} degrees: heap") for t in trials[:2])
-        found.add(f"{angle:g} degrees: |difference of the heaps|", abs(fine - coarse), high=ALIKE, unit="degrees")
+        found.add(
+            f"{angle:g} degrees: |difference of the heaps|",
+            abs(fine - coarse),
+            high=ALIKE,
+            unit="degrees",
+        )
 
 
 CHECK = Check(
@@ -173,5 +209,6 @@ CHECK = Check(
     trials=[(heaps, RESOLUTIONS), (wedges, RESOLUTIONS)],
     across=("both", alike),
     charts=[plot("sand-heaps", "Heaps and wedges", "x [m]", "y [m]")],
-    known="sand at rest holds up to asin k: heaps lie at 33 to 36 degrees where layers stop at 30, at 41 to 43 where at 40",
+    known="sand at rest holds up to asin k: heaps lie at 33 to 36 degrees where layers stop at 30, "
+    "at 41 to 43 where at 40",
 )

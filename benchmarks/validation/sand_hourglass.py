@@ -1,6 +1,7 @@
 """Sand runs out of a bin as fast however full it is, and as (D - delta)^(3/2) of its slot; a liquid slows down as its height's root.
 
-The bin's floor is rough: its friction is the sand's own. delta is a property of grains, which a continuum has not: it is near 0.
+The bin's floor is rough: its friction is the sand's own. delta is a property of grains, which a
+continuum has not: it is near 0.
 """
 
 from __future__ import annotations
@@ -14,13 +15,25 @@ import numpy as np
 from warp_lcp.benchmarks.harness.record import Lines
 from warp_lcp.benchmarks.validation import scenes
 from warp_lcp.benchmarks.validation.finding import Check, Findings, Trial, attempt, plot
-from warp_lcp.benchmarks.validation.scenes import CORRECTED, GRAVITY, Row, box, create_liquid, create_sand, positions, share_solved, steps
+from warp_lcp.benchmarks.validation.scenes import (
+    CORRECTED,
+    GRAVITY,
+    Row,
+    box,
+    create_liquid,
+    create_sand,
+    positions,
+    share_solved,
+    steps,
+)
 
 OPENINGS = {1: (8, 12, 16), 2: (16,)}  # cells, by refinement
-WIDTH, DEPTH, BELOW = 0.24, 0.44, 0.12  # [m]: of the bin, the sand in it at the start, and the room below
+# [m]: of the bin, the sand in it at the start, and the room below
+WIDTH, DEPTH, BELOW = 0.24, 0.44, 0.12
 SPACING = 0.005  # [m], before refinement
 PLATE = 2  # cells of the bin's floor, before refinement
-FIRST, LEAST = 1.65, 1.2  # the fill between which the discharge is measured [widths]: at first it grows
+# the fill between which the discharge is measured [widths]: at first it grows
+FIRST, LEAST = 1.65, 1.2
 LOW = 0.3  # the fill down to which the liquid is followed
 PARTS = 5  # the fill's range is cut in
 WALLS = 0.4  # friction of the sides
@@ -47,20 +60,51 @@ def trial(refinement: int, openings: tuple[int, ...] = ()) -> Trial:
         for cells in chosen:
             d, label = sand(cells, refinement), f"D = {cells} cells"
             rates.append(float(d.rate.mean()))
-            found.add(f"{label}: spread of the rate while fill > {LEAST:g} widths", d.spread, high=8.0, unit="%")
-            found.add(f"{label}: rate / sqrt(g D^3)", rates[-1] / math.sqrt(GRAVITY * (cells * dx) ** 3), low=0.7, high=1.3)
+            found.add(
+                f"{label}: spread of the rate while fill > {LEAST:g} widths",
+                d.spread,
+                high=8.0,
+                unit="%",
+            )
+            found.add(
+                f"{label}: rate / sqrt(g D^3)",
+                rates[-1] / math.sqrt(GRAVITY * (cells * dx) ** 3),
+                low=0.7,
+                high=1.3,
+            )
             found.add(f"{label}: steps with stresses to 1e-3", d.solved, low=95.0, unit="%")
             found.curve(label, d.fill, d.rate / d.rate[0])
         if len(chosen) > 2:
             root = np.array(rates) ** (2.0 / 3.0)
             slope, offset = np.polyfit(np.array(chosen), root, 1)
             fitted = slope * np.array(chosen) + offset
-            found.add("delta of rate ~ (D - delta)^(3/2)", -offset / slope, low=-0.5, high=0.5, unit="cells")
-            found.add("worst rate off that law", 100.0 * np.abs((root / fitted) ** 1.5 - 1.0).max(), high=4.0, unit="%")
+            found.add(
+                "delta of rate ~ (D - delta)^(3/2)",
+                -offset / slope,
+                low=-0.5,
+                high=0.5,
+                unit="cells",
+            )
+            found.add(
+                "worst rate off that law",
+                100.0 * np.abs((root / fitted) ** 1.5 - 1.0).max(),
+                high=4.0,
+                unit="%",
+            )
             found.curve("law", dx * np.array(chosen), root)
         high, w = liquid(8)
-        found.must_break(f"liquid: spread of the rate while fill > {LEAST:g} widths", high.spread, high=8.0, unit="%")
-        found.add("liquid: exponent of the rate over height", np.polyfit(np.log(w.fill), np.log(w.rate), 1)[0], low=0.4, high=0.6)
+        found.must_break(
+            f"liquid: spread of the rate while fill > {LEAST:g} widths",
+            high.spread,
+            high=8.0,
+            unit="%",
+        )
+        found.add(
+            "liquid: exponent of the rate over height",
+            np.polyfit(np.log(w.fill), np.log(w.rate), 1)[0],
+            low=0.4,
+            high=0.6,
+        )
         found.curve("liquid", w.fill, w.rate / w.rate[0])
 
     return attempt("sand hourglass", f"cells of {1000.0 * SPACING / refinement:g} mm", run)
@@ -71,7 +115,15 @@ def sand(cells: int, refinement: int, floor: float | str = "stick", **tables: An
     dx = SPACING / refinement
     size, solids, fill, drain = _bin(cells * dx, DEPTH)
     solids = [solid | {"friction": floor} for solid in solids]
-    simulation = create_sand(size, round(max(size) / dx), [fill], solids, walls=WALLS, drain=[drain], **(CORRECTED | tables))
+    simulation = create_sand(
+        size,
+        round(max(size) / dx),
+        [fill],
+        solids,
+        walls=WALLS,
+        drain=[drain],
+        **(CORRECTED | tables),
+    )
     area = simulation.particle_mass / simulation.scene.physics.density
     rows: list[Row] = []
     curve = _empty(simulation, area, LEAST, rows)
@@ -81,31 +133,54 @@ def sand(cells: int, refinement: int, floor: float | str = "stick", **tables: An
 def liquid(cells: int) -> tuple[Discharge, Discharge]:
     """Let a liquid run through a slot of so many cells; return what sand is measured on, and what leaves down to LOW."""
     size, solids, fill, drain = _bin(cells * SPACING, DEPTH)
-    simulation = create_liquid(scenes.VOXEL, size, round(max(size) / SPACING), [fill], solid=solids, drain=[drain], **CORRECTED)
+    simulation = create_liquid(
+        scenes.VOXEL,
+        size,
+        round(max(size) / SPACING),
+        [fill],
+        solid=solids,
+        drain=[drain],
+        **CORRECTED,
+    )
     curve = _empty(simulation, SPACING**2 / scenes.PER_AXIS**2, LOW, [])
-    return Discharge(*_rates(*curve, FIRST, LEAST, PARTS)), Discharge(*_rates(*curve, FIRST, LOW, 2 * PARTS))
+    return Discharge(*_rates(*curve, FIRST, LEAST, PARTS)), Discharge(
+        *_rates(*curve, FIRST, LOW, 2 * PARTS)
+    )
 
 
-def _empty(simulation: scenes.Simulation, area: float, low: float, rows: list[Row]) -> tuple[np.ndarray, np.ndarray]:
+def _empty(
+    simulation: scenes.Simulation, area: float, low: float, rows: list[Row]
+) -> tuple[np.ndarray, np.ndarray]:
     """Step until a bin is as low [widths], note the log's rows; return the times [s] and how much is in the bin [m^2]."""
     time, left = [0.0], [simulation.particles.count]
     while left[-1] * area > low * WIDTH**2:
-        rows += steps(simulation, simulation.time + min(simulation.stable_dt(), simulation.scene.time.dt_max))
+        rows += steps(
+            simulation, simulation.time + min(simulation.stable_dt(), simulation.scene.time.dt_max)
+        )
         time.append(simulation.time)
         left.append(int(np.count_nonzero(positions(simulation)[:, 1] > BELOW + PLATE * SPACING)))
     return np.array(time), np.array(left) * area
 
 
-def _bin(slot: float, depth: float) -> tuple[list[float], list[dict[str, Any]], dict[str, Any], dict[str, Any]]:
+def _bin(
+    slot: float, depth: float
+) -> tuple[list[float], list[dict[str, Any]], dict[str, Any], dict[str, Any]]:
     """Return the size of the domain, the halves of a bin's floor, what fills the bin, and a drain below."""
     top = BELOW + PLATE * SPACING
     size = [WIDTH, top + depth + 4.0 * SPACING]
     left, right = 0.5 * (WIDTH - slot), 0.5 * (WIDTH + slot)
     solids = [box([-1.0, BELOW], [left, top]), box([right, BELOW], [WIDTH + 1.0, top])]
-    return size, solids, box([0.0, top], [WIDTH, top + depth]), box([-1.0, -1.0], [WIDTH + 1.0, 2.0 / 3.0 * BELOW])
+    return (
+        size,
+        solids,
+        box([0.0, top], [WIDTH, top + depth]),
+        box([-1.0, -1.0], [WIDTH + 1.0, 2.0 / 3.0 * BELOW]),
+    )
 
 
-def _rates(time: np.ndarray, area: np.ndarray, first: float, last: float, parts: int) -> tuple[np.ndarray, np.ndarray]:
+def _rates(
+    time: np.ndarray, area: np.ndarray, first: float, last: float, parts: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the middle of each part of a range of fills [widths] and the rate in it [m^2/s]."""
     ends = np.linspace(first, last, parts + 1)
     at = np.interp(-ends * WIDTH**2, -area, time)
@@ -122,6 +197,16 @@ def _law(trials: Sequence[Trial]) -> Lines:
 CHECK = Check(
     about=__doc__ or "",
     trials=[(trial, tuple(OPENINGS))],
-    charts=[plot("sand-discharge", "Discharge of a bin over its fill", "fill / width", "rate / first rate", "D = ", "liquid"), _law],
+    charts=[
+        plot(
+            "sand-discharge",
+            "Discharge of a bin over its fill",
+            "fill / width",
+            "rate / first rate",
+            "D = ",
+            "liquid",
+        ),
+        _law,
+    ],
     known="deep sand that yields everywhere is solved to 2 to 5e-3 rho g dx, not 1e-3",
 )

@@ -2,9 +2,11 @@
 
     sigma(z) / (rho g W) = (1 - exp(-c mu K z / W)) / (c mu K),
 
-c = 2 between two walls, 4 in a square of four [Janssen 1895]. K, how much of the vertical stress presses on the walls, lies between 1/3,
-where sand of a sine of 1/2 gives way sideways, and 1: bounds are a tenth beyond either. The vertical stress is the pressure less the
-deviator's part, averaged over a cross-section; depth is the mass above it over rho W, which holds wherever the surface may be.
+c = 2 between two walls, 4 in a square of four [Janssen 1895]. K, how much of the vertical stress
+presses on the walls, lies between 1/3, where sand of a sine of 1/2 gives way sideways, and 1:
+bounds are a tenth beyond either. The vertical stress is the pressure less the deviator's part,
+averaged over a cross-section; depth is the mass above it over rho W, which holds wherever the
+surface may be.
 """
 
 from __future__ import annotations
@@ -33,7 +35,8 @@ RESTS = 0.3  # [s]
 TINY, PERIOD = 1e-5, 20  # [s] of a short step, and how many steps there are from one to the next
 LOAD, LID = 2.0, 0.25  # [rho g W] of a lid; its height [widths]
 CLEAR = 1e-3  # of a cell between a lid and the walls
-NEAR = 0.25  # [widths]: rows nearer to the surface have no walls beside them in part of their cells' kernels
+# [widths]: rows nearer to the surface have no walls beside them in part of their cells' kernels
+NEAR = 0.25
 RISE = 0.01  # [m/s] of a floor
 Step = Callable[[SandSimulation, float], None]
 
@@ -41,7 +44,8 @@ Step = Callable[[SandSimulation, float], None]
 class Silo(NamedTuple):
     """What a silo bears."""
 
-    depth: np.ndarray  # of each row of cells, the uppermost first: the mass above its centers [widths], shape (rows,)
+    # of each row of cells, the uppermost first: the mass above its centers [widths], shape (rows,)
+    depth: np.ndarray
     load: np.ndarray  # the vertical stress there [rho g W], shape (rows,)
     shear: np.ndarray  # what walls bear, upward, over the load, shape (rows,)
     fell: float  # how far the center of mass has gone at most, over the height
@@ -58,27 +62,58 @@ def janssen(depth: float, friction: float, ratio: float, walls: int = 2) -> floa
 
 
 @check_at("sand silo", "{cells} cells of width, {dimension}-D")
-def trial(found: Findings, cells: int, dimension: int = 2, frictions: tuple[float, ...] = FRICTIONS, deep: float = 0.0) -> None:
+def trial(
+    found: Findings,
+    cells: int,
+    dimension: int = 2,
+    frictions: tuple[float, ...] = FRICTIONS,
+    deep: float = 0.0,
+) -> None:
     """Compare what a silo bears with Janssen's law: as it is, with short steps, under a lid, and between walls without friction."""
     more: dict[str, Any] = {"deep": deep or DEEP[dimension], "square": dimension == 3}
     depths = range(1, math.ceil(more["deep"]))
     for friction in frictions:
-        bears(found, f"mu = {friction:g}", rest(fill(cells, friction, **more)), friction, depths, walls=2 * dimension - 2)
+        bears(
+            found,
+            f"mu = {friction:g}",
+            rest(fill(cells, friction, **more)),
+            friction,
+            depths,
+            walls=2 * dimension - 2,
+        )
     friction = frictions[len(frictions) // 2]
     plain, short = (rest(fill(cells, friction, **more), tiny=tiny) for tiny in (0.0, TINY))
-    found.add(f"a step of {TINY:g} s every {PERIOD}: largest change of a load", change(plain, short, depths), high=0.02)
+    found.add(
+        f"a step of {TINY:g} s every {PERIOD}: largest change of a load",
+        change(plain, short, depths),
+        high=0.02,
+    )
     lid = rest(fill(cells, friction, lid=LOAD, **more))
     left = np.array([lid.at(z) - plain.at(z) for z in depths])
-    found.add("a lid: what a width leaves of its load, at most", float((left[1:] / left[:-1]).max()), high=1.0)
+    found.add(
+        "a lid: what a width leaves of its load, at most",
+        float((left[1:] / left[:-1]).max()),
+        high=1.0,
+    )
     found.add("a lid: what is left of its load one width down", left[0] / LOAD, low=0.0, high=1.0)
     level = rest(fill(cells, 0.0, **more))
-    found.add("mu = 0: largest load off the weight above", max(abs(level.at(z) / z - 1.0) for z in depths), high=0.02)
+    found.add(
+        "mu = 0: largest load off the weight above",
+        max(abs(level.at(z) / z - 1.0) for z in depths),
+        high=0.02,
+    )
 
 
 @check_at("sand silo", "{cells} cells between two walls, 3-D")
 def slot(found: Findings, cells: int) -> None:
     """Compare a silo of two walls in 3-D with Janssen's law."""
-    bears(found, "mu = 0.5", rest(fill(cells, 0.5, deep=DEEP[3], deeper=SLOT)), 0.5, range(1, math.ceil(DEEP[3])))
+    bears(
+        found,
+        "mu = 0.5",
+        rest(fill(cells, 0.5, deep=DEEP[3], deeper=SLOT)),
+        0.5,
+        range(1, math.ceil(DEEP[3])),
+    )
 
 
 @check_at("sand silo, wrong", "{cells} cells of width, 2-D")
@@ -92,25 +127,57 @@ def controls(found: Findings, cells: int) -> None:
     ):
         most = max(silo.at(z) / janssen(z, 0.5, RATIOS[0]) for z in depths)
         found.must_break(f"{label}: largest load over that of K = 1/3", most, high=1.0 + BEYOND)
-        found.must_break(f"{label}: least shear of the walls, upward", float(silo.shear[silo.depth > NEAR].min()), low=0.0)
+        found.must_break(
+            f"{label}: least shear of the walls, upward",
+            float(silo.shear[silo.depth > NEAR].min()),
+            low=0.0,
+        )
         found.curve(label, silo.depth, silo.load)
     gaps = rest(fill(cells, 0.5), each=_close_all_gaps)
-    found.must_break("gaps of the sampling close: way of the center of mass over the height", gaps.fell, high=2e-4)
+    found.must_break(
+        "gaps of the sampling close: way of the center of mass over the height",
+        gaps.fell,
+        high=2e-4,
+    )
     short = rest(fill(cells, 0.5), tiny=TINY, each=_keep_impulses)
-    found.must_break("impulses of steps of other lengths: largest change of a load", change(plain, short, depths), high=0.02)
+    found.must_break(
+        "impulses of steps of other lengths: largest change of a load",
+        change(plain, short, depths),
+        high=0.02,
+    )
 
 
-def bears(found: Findings, label: str, silo: Silo, friction: float, depths: range, walls: int = 2) -> None:
+def bears(
+    found: Findings, label: str, silo: Silo, friction: float, depths: range, walls: int = 2
+) -> None:
     """Add what a silo bears at whole widths of depth."""
     loads = np.array([silo.at(z) for z in depths])
-    least, most = (np.array([janssen(z, friction, ratio, walls) for z in depths]) for ratio in reversed(RATIOS))
+    least, most = (
+        np.array([janssen(z, friction, ratio, walls) for z in depths]) for ratio in reversed(RATIOS)
+    )
     rises = np.diff(np.append(0.0, loads))
-    found.add(f"{label}: least load over that of K = 1", float((loads / least).min()), low=1.0 - BEYOND)
-    found.add(f"{label}: largest load over that of K = 1/3", float((loads / most).max()), high=1.0 + BEYOND)
-    found.add(f"{label}: least rise of the load in a width", float(rises.min()), low=0.0, unit="rho g W")
-    found.add(f"{label}: largest ratio of a rise to that before", float((rises[1:] / rises[:-1]).max()), high=1.0)
+    found.add(
+        f"{label}: least load over that of K = 1", float((loads / least).min()), low=1.0 - BEYOND
+    )
+    found.add(
+        f"{label}: largest load over that of K = 1/3",
+        float((loads / most).max()),
+        high=1.0 + BEYOND,
+    )
+    found.add(
+        f"{label}: least rise of the load in a width", float(rises.min()), low=0.0, unit="rho g W"
+    )
+    found.add(
+        f"{label}: largest ratio of a rise to that before",
+        float((rises[1:] / rises[:-1]).max()),
+        high=1.0,
+    )
     below = (silo.depth > NEAR) & (silo.depth < depths[-1])
-    found.add(f"{label}: least shear of the walls over the load, upward", float(silo.shear[below].min()), low=0.0)
+    found.add(
+        f"{label}: least shear of the walls over the load, upward",
+        float(silo.shear[below].min()),
+        low=0.0,
+    )
     found.add(f"{label}: way of the center of mass over the height", silo.fell, high=2e-4)
     found.curve(label, silo.depth, silo.load)
 
@@ -121,9 +188,16 @@ def change(one: Silo, other: Silo, depths: range) -> float:
 
 
 def fill(
-    cells: int, friction: float | str, *, deep: float = DEEP[2], deeper: int = 1, lid: float = 0.0, square: bool = False,
-    rise: float = 0.0, **tables: Any,
-) -> SandSimulation:  # fmt: skip
+    cells: int,
+    friction: float | str,
+    *,
+    deep: float = DEEP[2],
+    deeper: int = 1,
+    lid: float = 0.0,
+    square: bool = False,
+    rise: float = 0.0,
+    **tables: Any,
+) -> SandSimulation:
     """Return a silo filled at rest.
 
     Args:
@@ -146,8 +220,16 @@ def fill(
         ends = ([gap, low, gap], [WIDTH - gap, top, WIDTH - gap])
         solids = [box(*(end[: 2 + len(more)] for end in ends), mass=mass, friction=0.0)]
     if more and not square:
-        tables["domain"] = {"size": [WIDTH, ny * dx, *more], "resolution": ny, "friction": friction, "periodic": [False, False, True]}
-    tables = {"physics": {"gravity": [0.0, -GRAVITY, 0.0][: 2 + len(more)], "density": DENSITY}, "walls": friction} | tables
+        tables["domain"] = {
+            "size": [WIDTH, ny * dx, *more],
+            "resolution": ny,
+            "friction": friction,
+            "periodic": [False, False, True],
+        }
+    tables = {
+        "physics": {"gravity": [0.0, -GRAVITY, 0.0][: 2 + len(more)], "density": DENSITY},
+        "walls": friction,
+    } | tables
     floor = dx if rise else 0.0
     if rise:
         motion, ny = {"kind": "translation", "velocity": [0.0, rise]}, ny + 2
@@ -156,7 +238,9 @@ def fill(
     return create_sand([WIDTH, ny * dx, *more], ny, [sand], solids, **tables)
 
 
-def rest(simulation: SandSimulation, duration: float = RESTS, tiny: float = 0.0, each: Step | None = None) -> Silo:
+def rest(
+    simulation: SandSimulation, duration: float = RESTS, tiny: float = 0.0, each: Step | None = None
+) -> Silo:
     """Let sand rest and measure what it bears.
 
     Args:
@@ -174,12 +258,15 @@ def rest(simulation: SandSimulation, duration: float = RESTS, tiny: float = 0.0,
             each(simulation, dt)
         heights.append(simulation.step(dt)["center_of_mass_y"])
     grid, packing = simulation.grid, simulation.packing
-    inner = tuple(slice(low, high) for low, high in zip(grid.domain.low, grid.domain.high, strict=True))
+    inner = tuple(
+        slice(low, high) for low, high in zip(grid.domain.low, grid.domain.high, strict=True)
+    )
     x = simulation.stress.now.numpy()[(slice(None), *inner)].astype(np.float64)
     flat, across, cells = grid.dimension == 2, (0, 2), x.shape[3]
     unit = GRAVITY * simulation.stress.kick_dt * cells  # of rho g W
     load = (x[0] + x[1] if flat else x[0] - x[2]).mean(axis=across) / unit
-    xy = x[2:6] if flat else x[4:8]  # what walls bear of a row is the mean of its copies, see `granular.yield_set`
+    # what walls bear of a row is the mean of its copies, see `granular.yield_set`
+    xy = x[2:6] if flat else x[4:8]
     sides = [xy[1::2, :, :, -1].mean(axis=(0, 1)), -xy[::2, :, :, 0].mean(axis=(0, 1))]
     if not flat and not simulation.scene.endless:
         sides += [x[14:16, -1].mean(axis=(0, 2)), -x[12:14, 0].mean(axis=(0, 2))]
@@ -189,11 +276,15 @@ def rest(simulation: SandSimulation, duration: float = RESTS, tiny: float = 0.0,
     return Silo(depth, load[::-1], shear[::-1], float(np.ptp(heights) / (2.0 * heights[0])))
 
 
-def _drive(simulation: SandSimulation, dt: float, rule: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> None:
+def _drive(
+    simulation: SandSimulation, dt: float, rule: Callable[[np.ndarray, np.ndarray], np.ndarray]
+) -> None:
     """Have the packing's drive follow a rule of fractions and what it was [cells a step]."""
     packing, rate = simulation.packing, simulation.grid.spacing / dt
 
-    def update(density: wp.array, velocity: Sequence[wp.array], dt: float, solid: Sequence[wp.array] = ()) -> None:
+    def update(
+        density: wp.array, velocity: Sequence[wp.array], dt: float, solid: Sequence[wp.array] = ()
+    ) -> None:
         type(packing).update(packing, density, velocity, dt, solid)
         new = rule(packing.fraction.numpy(), packing.drive.numpy() / rate)
         packing.drive.assign((new * rate).astype(np.float32))
@@ -201,10 +292,13 @@ def _drive(simulation: SandSimulation, dt: float, rule: Callable[[np.ndarray, np
     packing.update = update  # type: ignore[method-assign]
 
 
-# let what is too dense expand through the stresses: drive = (1 - phi) dx / dt of either sign below the surface
+# let what is too dense expand through the stresses: drive = (1 - phi) dx / dt of either sign below
+# the surface
 _pack_as_before = partial(_drive, rule=lambda phi, drive: np.where(phi >= 0.9, 1.0 - phi, drive))
 # count a cell as full at the nominal density, and no sooner
-_close_all_gaps = partial(_drive, rule=lambda phi, drive: np.where(phi >= 0.9, np.maximum(1.0 - phi, 0.0), drive))
+_close_all_gaps = partial(
+    _drive, rule=lambda phi, drive: np.where(phi >= 0.9, np.maximum(1.0 - phi, 0.0), drive)
+)
 
 
 def _keep_impulses(simulation: SandSimulation, dt: float) -> None:
@@ -213,7 +307,10 @@ def _keep_impulses(simulation: SandSimulation, dt: float) -> None:
 
 
 DEPTHS = np.linspace(0.0, DEEP[2], 40)
-LAWS = {f"Janssen, mu = 0.5, K = {ratio:.2g}": (DEPTHS, [janssen(z, 0.5, ratio) for z in DEPTHS]) for ratio in RATIOS}
+LAWS = {
+    f"Janssen, mu = 0.5, K = {ratio:.2g}": (DEPTHS, [janssen(z, 0.5, ratio) for z in DEPTHS])
+    for ratio in RATIOS
+}
 CHECK = Check(
     about=__doc__ or "",
     trials=[
@@ -221,5 +318,7 @@ CHECK = Check(
         (slot, RESOLUTIONS[2]),
         (controls, RESOLUTIONS[2][:1]),
     ],
-    charts=[plot("sand-silo", "Vertical stress in a silo", "z / W", "sigma / (rho g W)", exact=LAWS)],
+    charts=[
+        plot("sand-silo", "Vertical stress in a silo", "z / W", "sigma / (rho g W)", exact=LAWS)
+    ],
 )

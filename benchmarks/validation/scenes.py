@@ -53,7 +53,13 @@ SMOOTHED = Numerics("sub-cell, 2 smoothing passes", "cut-cell", "ghost-fluid", 2
 
 
 def create_liquid(
-    numerics: Numerics, size: list[float], resolution: int, liquid: list[Row], *, folder: Path | None = None, **tables: Any
+    numerics: Numerics,
+    size: list[float],
+    resolution: int,
+    liquid: list[Row],
+    *,
+    folder: Path | None = None,
+    **tables: Any,
 ) -> LiquidSimulation:
     """Return a simulation.
 
@@ -68,14 +74,23 @@ def create_liquid(
     data: Row = {
         "scene": {"simulator": "fluids"},
         "time": {"duration": 100.0, "cfl": tables.pop("cfl", 2.0), "dt_max": DT_MAX},
-        "domain": {"size": size, "resolution": resolution, "wall": tables.pop("wall", "separating"), "solids": numerics.solids},
+        "domain": {
+            "size": size,
+            "resolution": resolution,
+            "wall": tables.pop("wall", "separating"),
+            "solids": numerics.solids,
+        },
         "pressure": {"surface": numerics.surface, "smoothing": numerics.smoothing},
         "liquid": liquid,
     }
-    return FluidsSimulator().create(LiquidScene.model_validate(data | tables), device=DEVICE.get(), folder=folder or Path())
+    return FluidsSimulator().create(
+        LiquidScene.model_validate(data | tables), device=DEVICE.get(), folder=folder or Path()
+    )
 
 
-def create_sand(size: list[float], resolution: int, sand: list[Row], solids: Sequence[Row] = (), **tables: Any) -> SandSimulation:
+def create_sand(
+    size: list[float], resolution: int, sand: list[Row], solids: Sequence[Row] = (), **tables: Any
+) -> SandSimulation:
     """Return a simulation; arguments as of a liquid's, `walls` is short for domain.friction."""
     data: Row = {
         "scene": {"simulator": "granular"},
@@ -85,11 +100,19 @@ def create_sand(size: list[float], resolution: int, sand: list[Row], solids: Seq
         "sand": sand,
         "solid": list(solids),
     }
-    return GranularSimulator().create(SandScene.model_validate(data | tables), device=DEVICE.get(), folder=Path())
+    return GranularSimulator().create(
+        SandScene.model_validate(data | tables), device=DEVICE.get(), folder=Path()
+    )
 
 
 def column(
-    aspect: float, cells: int, *, length: float, angle: float = FRICTION_ANGLE, floor: float = WALL_FRICTION, **tables: Any
+    aspect: float,
+    cells: int,
+    *,
+    length: float,
+    angle: float = FRICTION_ANGLE,
+    floor: float = WALL_FRICTION,
+    **tables: Any,
 ) -> SandSimulation:
     """Return a column of sand on a rough floor, at a wall without friction.
 
@@ -177,7 +200,11 @@ def profile(simulation: SandSimulation) -> np.ndarray:
 
 def height(simulation: SandSimulation) -> float:
     """Return how high the sand in three columns of cells is, were it packed densely, where it is most [widths]."""
-    sand = simulation.packing.fraction.numpy()[1, 1 + FLOOR : -1, 1:-1].sum(axis=0) * simulation.grid.spacing / WIDTH
+    sand = (
+        simulation.packing.fraction.numpy()[1, 1 + FLOOR : -1, 1:-1].sum(axis=0)
+        * simulation.grid.spacing
+        / WIDTH
+    )
     return float(np.convolve(sand, np.full(3, 1.0 / 3.0), "valid").max())
 
 
@@ -187,10 +214,13 @@ def depth(simulation: SandSimulation) -> np.ndarray:
     return np.asarray(profile(simulation)[cells[:, 0]] - cells[:, 1])
 
 
-def drift(simulation: SandSimulation, duration: float, height: float, deep: int = 4) -> tuple[float, float]:
+def drift(
+    simulation: SandSimulation, duration: float, height: float, deep: int = 4
+) -> tuple[float, float]:
     """Step for a time [s] and return how fast particles went from where they were to where they are [heights / s].
 
-    Particles, which are sorted now and then, are followed through steps in which they move less than their distance.
+    Particles, which are sorted now and then, are followed through steps in which they move less
+    than their distance.
 
     Args:
         simulation: to step.

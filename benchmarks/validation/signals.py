@@ -1,8 +1,9 @@
 """Numbers from curves and particles, all of it plain NumPy: periods, curves compared after a shift in time, fronts, heights, volumes.
 
-What liquid a sub-cell surface encloses is found from the particles alone, by a formula of its own: an oracle for the simulator's level set.
-The density of particles under the quadratic B-spline of a cell, over the same kernel's integral over the domain, is the filled fraction of
-a half space at the distance s from the cell's center when that fraction is F(-s): s is the signed distance.
+What liquid a sub-cell surface encloses is found from the particles alone, by a formula of its own:
+an oracle for the simulator's level set. The density of particles under the quadratic B-spline of a
+cell, over the same kernel's integral over the domain, is the filled fraction of a half space at the
+distance s from the cell's center when that fraction is F(-s): s is the signed distance.
 """
 
 from __future__ import annotations
@@ -24,7 +25,10 @@ def crossings(time: np.ndarray, signal: np.ndarray) -> tuple[np.ndarray, np.ndar
     time, signal = np.asarray(time, dtype=float), np.asarray(signal, dtype=float)
     below, above = signal[:-1], signal[1:]
     found = []
-    for at in (np.flatnonzero((below < 0) & (above >= 0)), np.flatnonzero((below > 0) & (above <= 0))):
+    for at in (
+        np.flatnonzero((below < 0) & (above >= 0)),
+        np.flatnonzero((below > 0) & (above <= 0)),
+    ):
         found.append(time[at] + (time[at + 1] - time[at]) * below[at] / (below[at] - above[at]))
     return found[0], found[1]
 
@@ -45,7 +49,8 @@ def period(time: np.ndarray, signal: np.ndarray) -> float:
 def mode(x: np.ndarray, wavenumber: float, area: float, length: float) -> float:
     """Return the amplitude [m] of cos(k x) in a liquid's elevation, from equal particles that fill it.
 
-    The integral of cos(k x) over a liquid of depth h + eta(x) is that of eta cos(k x), where k is a multiple of pi / length.
+    The integral of cos(k x) over a liquid of depth h + eta(x) is that of eta cos(k x), where k is a
+    multiple of pi / length.
 
     Args:
         x: of the particles [m], shape (n,).
@@ -56,13 +61,17 @@ def mode(x: np.ndarray, wavenumber: float, area: float, length: float) -> float:
     return float(2.0 / length * area * np.cos(wavenumber * np.asarray(x)).sum())
 
 
-def relative_rms(time: np.ndarray, values: np.ndarray, at: np.ndarray, expected: np.ndarray, shift: float = 0.0) -> float:
+def relative_rms(
+    time: np.ndarray, values: np.ndarray, at: np.ndarray, expected: np.ndarray, shift: float = 0.0
+) -> float:
     """Return the root mean square of values(at + shift) / expected - 1, linear between samples."""
     found = np.interp(np.asarray(at) + shift, time, values)
     return float(np.sqrt(np.mean((found / np.asarray(expected) - 1.0) ** 2)))
 
 
-def best_shift(time: np.ndarray, values: np.ndarray, at: np.ndarray, expected: np.ndarray, limit: float) -> tuple[float, float]:
+def best_shift(
+    time: np.ndarray, values: np.ndarray, at: np.ndarray, expected: np.ndarray, limit: float
+) -> tuple[float, float]:
     """Return the shift within +-limit that makes `relative_rms` smallest, and that error."""
     count = round(limit / SHIFT_STEP)
     shifts = np.linspace(-limit, limit, 2 * count + 1)
@@ -71,10 +80,21 @@ def best_shift(time: np.ndarray, values: np.ndarray, at: np.ndarray, expected: n
     return float(shifts[best]), errors[best]
 
 
-def best_pace(time: np.ndarray, values: np.ndarray, at: np.ndarray, expected: np.ndarray, limit: float) -> float:
+def best_pace(
+    time: np.ndarray, values: np.ndarray, at: np.ndarray, expected: np.ndarray, limit: float
+) -> float:
     """Return how many times as fast as expected a curve runs: the factor on its time, .5 to 2, with which `best_shift` errs least."""
     paces = np.geomspace(0.5, 2.0, PACES)
-    return float(paces[np.argmin([best_shift(np.asarray(time) * pace, values, at, expected, limit)[1] for pace in paces])])
+    return float(
+        paces[
+            np.argmin(
+                [
+                    best_shift(np.asarray(time) * pace, values, at, expected, limit)[1]
+                    for pace in paces
+                ]
+            )
+        ]
+    )
 
 
 def front(fill: np.ndarray) -> int:
@@ -90,7 +110,8 @@ def front(fill: np.ndarray) -> int:
 def stays(time: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the middle of the time that an advancing front stayed at each place, and these places; the last stay has no end.
 
-    A front that is known to a cell is on average where the stair of its places says, and best known in the middle of a tread.
+    A front that is known to a cell is on average where the stair of its places says, and best known
+    in the middle of a tread.
     """
     time, place = np.asarray(time, dtype=float), np.asarray(place, dtype=float)
     farthest = np.maximum.accumulate(place)
@@ -102,7 +123,8 @@ def surface_height(column: np.ndarray) -> float:
     """Return the height, in cells, where the liquid's fraction in a column of cells falls below a half for the last time.
 
     Args:
-        column: fraction of each cell that is liquid, the floor first; linear between the cells' centers.
+        column: fraction of each cell that is liquid, the floor first; linear between the cells'
+            centers.
     """
     column = np.append(np.asarray(column, dtype=float), 0.0)
     wet = np.flatnonzero(column >= HALF_FULL)
@@ -144,7 +166,9 @@ def filled_fraction(cells: np.ndarray, counts: tuple[int, int], volume: float) -
     for b, wy in enumerate(weights(f[:, 1])):
         for a, wx in enumerate(weights(f[:, 0])):
             np.add.at(rho, (corner[:, 1] + b, corner[:, 0] + a), volume * wx * wy)
-    inside = [cumulative(n - np.arange(n) - 0.5) - cumulative(-np.arange(n) - 0.5) for n in (ny, nx)]
+    inside = [
+        cumulative(n - np.arange(n) - 0.5) - cumulative(-np.arange(n) - 0.5) for n in (ny, nx)
+    ]
     return rho[1:-1, 1:-1] / np.outer(inside[0], inside[1])
 
 
@@ -155,5 +179,6 @@ def enclosed_cells(cells: np.ndarray, counts: tuple[int, int], volume: float) ->
     distance = np.pad(-np.interp(fraction, cumulative(KNOTS), KNOTS), 1, mode="edge")
     y, x = ((np.arange(n * SAMPLES) + 0.5) / SAMPLES + 0.5 for n in (ny, nx))
     sampled = map_coordinates(distance, np.meshgrid(y, x, indexing="ij"), order=1)
-    covered = np.clip(0.5 - SAMPLES * sampled, 0.0, 1.0)  # of the little square around a sample, by a surface at this distance
+    # of the little square around a sample, by a surface at this distance
+    covered = np.clip(0.5 - SAMPLES * sampled, 0.0, 1.0)
     return float(covered.sum()) / SAMPLES**2

@@ -10,14 +10,28 @@ import numpy as np
 
 from warp_lcp.benchmarks.validation.energy import Ledger
 from warp_lcp.benchmarks.validation.finding import Check, Findings, check_at, plot
-from warp_lcp.benchmarks.validation.scenes import SHORTEST, SUB_CELL, VOXEL, box, create_liquid, create_sand
+from warp_lcp.benchmarks.validation.scenes import (
+    SHORTEST,
+    SUB_CELL,
+    VOXEL,
+    box,
+    create_liquid,
+    create_sand,
+)
 from warp_lcp.operators.grid_poisson import FLUID
 
 RESOLUTIONS = (24, 48)  # cells along the domain
 SIZE, COLUMN = [0.8, 0.4], box([0.0, 0.0], [0.2, 0.3])  # [m]
-LONGEST = {"liquid, whole cells": 0.02, "liquid, sub-cell": 0.02, "liquid, unilateral": 0.02, "sand": 0.01}  # [s]: steps of the first run
+# [s]: steps of the first run
+LONGEST = {
+    "liquid, whole cells": 0.02,
+    "liquid, sub-cell": 0.02,
+    "liquid, unilateral": 0.02,
+    "sand": 0.01,
+}
 HALVINGS = 4
-MOMENTS = np.array([0.04, 0.08, 0.12, 0.16, 0.2])  # [s] at which runs are compared: the front meets no wall
+# [s] at which runs are compared: the front meets no wall
+MOMENTS = np.array([0.04, 0.08, 0.12, 0.16, 0.2])
 MOST = 1e-3  # of the total, that a step may add
 CHANGE = 5e-3  # of the total, that the last halving may change
 Watched = Callable[[Any], None]
@@ -29,18 +43,35 @@ def trial(found: Findings, cells: int, what: str) -> None:
     lengths = LONGEST[what] * 0.5 ** np.arange(HALVINGS + 1)
     runs = [collapse(what, cells, dt) for dt in lengths]
     changes = [float(np.abs(a - b).max()) for (a, _), (b, _) in pairwise(runs)]
-    found.add("most that a step adds", max(gained for _, gained in runs), high=MOST, unit="of the total")
-    found.add("highest energy over that at the start", max(float(E.max()) for E, _ in runs), high=1.0 + MOST)
+    found.add(
+        "most that a step adds", max(gained for _, gained in runs), high=MOST, unit="of the total"
+    )
+    found.add(
+        "highest energy over that at the start",
+        max(float(E.max()) for E, _ in runs),
+        high=1.0 + MOST,
+    )
     found.add("change by the last halving", changes[-1], high=CHANGE, unit="of the total")
-    found.add("change by the last halving over that by the first", changes[-1] / changes[0], high=1.0)
+    found.add(
+        "change by the last halving over that by the first", changes[-1] / changes[0], high=1.0
+    )
     for dt, (energy, _) in zip(lengths, runs, strict=True):
         found.curve(f"{what}, {1e3 * dt:g} ms", MOMENTS, energy)
     if what in PUSHED_APART:
         _, gained = collapse(what, cells, lengths[-1], change=PUSHED_APART[what])
-        found.must_break("old relaxation: most that a step adds", gained, high=MOST, unit="of the total")
+        found.must_break(
+            "old relaxation: most that a step adds", gained, high=MOST, unit="of the total"
+        )
 
 
-def collapse(what: str, cells: int, dt: float, *, change: Watched | None = None, moments: np.ndarray = MOMENTS) -> tuple[np.ndarray, float]:
+def collapse(
+    what: str,
+    cells: int,
+    dt: float,
+    *,
+    change: Watched | None = None,
+    moments: np.ndarray = MOMENTS,
+) -> tuple[np.ndarray, float]:
     """Let a column collapse from rest.
 
     Args:
@@ -51,14 +82,17 @@ def collapse(what: str, cells: int, dt: float, *, change: Watched | None = None,
         moments: at which the energy is wanted [s].
 
     Returns:
-        The energy at the moments over that at the start, and the most that a step added to it, over it.
+        The energy at the moments over that at the start, and the most that a step added to it, over
+        it.
     """
     simulation: Any
     if what == "sand":
         simulation = create_sand(SIZE, cells, [COLUMN], walls=0.5)
     else:
         numerics = SUB_CELL if what == "liquid, sub-cell" else VOXEL
-        tables: dict[str, Any] = {"pressure": {"model": "unilateral"}} if what == "liquid, unilateral" else {}
+        tables: dict[str, Any] = (
+            {"pressure": {"model": "unilateral"}} if what == "liquid, unilateral" else {}
+        )
         simulation = create_liquid(numerics, SIZE, cells, [COLUMN], **tables)
     if change is not None:
         change(simulation)
@@ -80,7 +114,9 @@ def _push_sand_apart(simulation: Any) -> None:
         update(density, velocity, dt, *more)
         phi = density.numpy() / np.maximum(simulation.boundary.capacity.numpy(), 0.1)
         excess = np.where(packing.flags.numpy() != 0, np.maximum(phi - 1.0, 0.0), 0.0)
-        packing.drive.assign((packing.drive.numpy() - 0.2 * excess * simulation.grid.spacing / dt).astype(np.float32))
+        packing.drive.assign(
+            (packing.drive.numpy() - 0.2 * excess * simulation.grid.spacing / dt).astype(np.float32)
+        )
 
     packing.update = pushed
 
@@ -92,18 +128,28 @@ def _push_liquid_apart(simulation: Any) -> None:
 
     def pushed(velocity: Any, dt: float, *given: Any) -> bool:
         there: bool = prepare(velocity, dt, *given)
-        excess = np.maximum(simulation.surface.level_set.density.numpy() - simulation.boundary.capacity.numpy(), 0.0)
+        excess = np.maximum(
+            simulation.surface.level_set.density.numpy() - simulation.boundary.capacity.numpy(), 0.0
+        )
         inside = projection._unknown.numpy() == FLUID
-        projection._b.assign(projection._b.numpy() - np.where(inside, excess, 0.0) * simulation.grid.spacing / dt)
+        projection._b.assign(
+            projection._b.numpy() - np.where(inside, excess, 0.0) * simulation.grid.spacing / dt
+        )
         return there
 
     projection.prepare = pushed
 
 
-PUSHED_APART: dict[str, Watched] = {"sand": _push_sand_apart, "liquid, unilateral": _push_liquid_apart}
+PUSHED_APART: dict[str, Watched] = {
+    "sand": _push_sand_apart,
+    "liquid, unilateral": _push_liquid_apart,
+}
 
 CHECK = Check(
-    about="The energy of a collapse converges as its steps get shorter, and no step makes any, the first one from rest included.",
+    about="The energy of a collapse converges as its steps get shorter, and no step makes any, the "
+    "first one from rest included.",
     trials=[(trial, [(n, what) for n in RESOLUTIONS for what in LONGEST])],
-    charts=[plot("time-steps", "Energy of a collapse by the length of steps", "t [s]", "energy / start")],
+    charts=[
+        plot("time-steps", "Energy of a collapse by the length of steps", "t [s]", "energy / start")
+    ],
 )

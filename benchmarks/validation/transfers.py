@@ -28,7 +28,8 @@ REALS: dict[str, tuple[Any, Any, Any, float]] = {
 CENTER = np.array([0.5, 0.5, 0.0])
 TURN_STEPS = (20, 40, 80)  # of one turn of Zalesak's disk
 VORTEX_GRIDS = (16, 32, 64)
-VORTEX_SIZE, VORTEX_TIME, VORTEX_STEPS = 0.15, 3.0, 96  # [m], [s] at 1 rad/s in the middle; steps enough for the grid's error to show
+# [m], [s] at 1 rad/s in the middle; steps enough for the grid's error to show
+VORTEX_SIZE, VORTEX_TIME, VORTEX_STEPS = 0.15, 3.0, 96
 
 
 @dataclass
@@ -44,7 +45,9 @@ class Cloud:
 
     def round_trip(self) -> None:
         """Transfer to the faces and back."""
-        particles_to_faces(self.grid, self.position, self.velocity, self.affine, self.fields, self.weights)
+        particles_to_faces(
+            self.grid, self.position, self.velocity, self.affine, self.fields, self.weights
+        )
         faces_to_particles(self.grid, self.fields, self.position, self.velocity, self.affine)
 
     def momentum(self) -> np.ndarray:
@@ -54,10 +57,14 @@ class Cloud:
     def angular_momentum(self) -> float:
         """Return it about the origin, with what the affine part carries in the tents around a particle: f (1 - f) dx^2 dv/dx."""
         gradients = [g.numpy() for g in self.affine]
-        return angular_momentum(self.position.numpy(), self.velocity.numpy(), gradients, self.grid.spacing)
+        return angular_momentum(
+            self.position.numpy(), self.velocity.numpy(), gradients, self.grid.spacing
+        )
 
 
-def angular_momentum(position: np.ndarray, velocity: np.ndarray, gradients: list[np.ndarray], dx: float) -> float:
+def angular_momentum(
+    position: np.ndarray, velocity: np.ndarray, gradients: list[np.ndarray], dx: float
+) -> float:
     """Return the angular momentum of equal particles of unit mass about the origin, the affine part included.
 
     Args:
@@ -72,7 +79,9 @@ def angular_momentum(position: np.ndarray, velocity: np.ndarray, gradients: list
         along = 1 - component  # the arm: x for v, y for u
         f = x[:, along] / dx + 0.5  # from the nodes, which are centers of cells along that axis
         f -= np.floor(f)
-        share = float((f * (1.0 - f) * dx**2 * np.asarray(gradient, dtype=np.float64)[:, along]).sum())
+        share = float(
+            (f * (1.0 - f) * dx**2 * np.asarray(gradient, dtype=np.float64)[:, along]).sum()
+        )
         total += share if component == 1 else -share
     return total
 
@@ -89,9 +98,14 @@ def cloud(n: int, real: str, *, affine: bool) -> Cloud:
     noise[..., 2] = 0.0
     arm = position - CENTER
     velocity = np.stack([-arm[:, 1], arm[:, 0], 0.0 * arm[:, 0]], axis=1) + noise[0]
-    gradients = [np.array(row) + noise[1 + c] for c, row in enumerate(([0.0, -1.0, 0.0], [1.0, 0.0, 0.0]))] if affine else []
+    gradients = (
+        [np.array(row) + noise[1 + c] for c, row in enumerate(([0.0, -1.0, 0.0], [1.0, 0.0, 0.0]))]
+        if affine
+        else []
+    )
     position, velocity, *gradients = (
-        wp.array(values.astype(numpy_type), dtype=vector, device=DEVICE.get()) for values in (position, velocity, *gradients)
+        wp.array(values.astype(numpy_type), dtype=vector, device=DEVICE.get())
+        for values in (position, velocity, *gradients)
     )
     return Cloud(grid, position, velocity, gradients, grid.faces(scalar), grid.faces(scalar))
 
@@ -114,18 +128,32 @@ def changes(c: Cloud) -> tuple[float, float]:
     linear, angular = c.momentum(), c.angular_momentum()
     c.round_trip()
     lost = np.linalg.norm(c.momentum() - linear)
-    return float(lost / speed.sum()), abs(c.angular_momentum() - angular) / float((arm * speed).sum())
+    return float(lost / speed.sum()), abs(c.angular_momentum() - angular) / float(
+        (arm * speed).sum()
+    )
 
 
-@check_at("advection", f"{TURN_STEPS[0]} to {TURN_STEPS[-1]} steps, {VORTEX_GRIDS[0]} to {VORTEX_GRIDS[-1]} cells")
+@check_at(
+    "advection",
+    f"{TURN_STEPS[0]} to {TURN_STEPS[-1]} steps, {VORTEX_GRIDS[0]} to {VORTEX_GRIDS[-1]} cells",
+)
 def orders(found: Findings) -> None:
     """Find the order of the advection in time on Zalesak's disk, and in space in a vortex."""
     turns = [zalesak_error(steps) for steps in TURN_STEPS]
     found.add("Zalesak's disk, one turn: order in time", order(turns), low=2.7, high=3.3)
-    found.add(f"Zalesak's disk, {TURN_STEPS[-1]} steps: largest error over the slot's width", turns[-1] / 0.05, high=0.01)
+    found.add(
+        f"Zalesak's disk, {TURN_STEPS[-1]} steps: largest error over the slot's width",
+        turns[-1] / 0.05,
+        high=0.01,
+    )
     errors = [vortex_error(n) for n in VORTEX_GRIDS]
     found.add("rotating blob in a vortex: order in space", order(errors), low=1.8, high=2.4)
-    found.must_break("Euler's steps, one turn: order in time", order([euler_error(steps) for steps in TURN_STEPS]), low=2.7, high=3.3)
+    found.must_break(
+        "Euler's steps, one turn: order in time",
+        order([euler_error(steps) for steps in TURN_STEPS]),
+        low=2.7,
+        high=3.3,
+    )
     collocated = [vortex_error(n, off=0.5) for n in VORTEX_GRIDS]
     found.must_break("fields half a cell off: order in space", order(collocated), low=1.8, high=2.4)
     found.curves["Zalesak's disk, steps a turn"] = (TURN_STEPS, turns)
@@ -163,11 +191,15 @@ def vortex_error(n: int, *, off: float = 0.0) -> float:
 
     moved = carried(start, n, VORTEX_TIME / VORTEX_STEPS, VORTEX_STEPS, rate, off)
     turn = VORTEX_TIME * float(rate(np.array(0.15)))
-    exact = CENTER + np.stack([0.15 * np.cos(angle + turn), 0.15 * np.sin(angle + turn), 0.0 * angle], axis=1)
+    exact = CENTER + np.stack(
+        [0.15 * np.cos(angle + turn), 0.15 * np.sin(angle + turn), 0.0 * angle], axis=1
+    )
     return float(np.linalg.norm(moved - exact, axis=1).max())
 
 
-def carried(start: np.ndarray, n: int, dt: float, count: int, rate: Any, off: float = 0.0) -> np.ndarray:
+def carried(
+    start: np.ndarray, n: int, dt: float, count: int, rate: Any, off: float = 0.0
+) -> np.ndarray:
     """Return where particles are [m] after `count` steps in a steady field that turns about the center with rate(r) [rad/s].
 
     The field is sampled `off` cells beside its faces.
@@ -176,7 +208,10 @@ def carried(start: np.ndarray, n: int, dt: float, count: int, rate: Any, off: fl
     j, i = np.meshgrid(np.arange(n + 2), np.arange(n + 2), indexing="ij")
     fields = grid.faces()
     for axis, field in enumerate(fields):
-        x, y = (i + off - (0.5 if axis else 1.0)) / n - 0.5, (j + off - (1.0 if axis else 0.5)) / n - 0.5
+        x, y = (
+            (i + off - (0.5 if axis else 1.0)) / n - 0.5,
+            (j + off - (1.0 if axis else 0.5)) / n - 0.5,
+        )
         turning = rate(np.hypot(x, y)) * (x if axis else -y)
         field.assign(np.broadcast_to(turning, grid.shape).astype(np.float32))
     cells = np.full(grid.shape, wl.SOLID, np.int8)
@@ -192,5 +227,13 @@ def carried(start: np.ndarray, n: int, dt: float, count: int, rate: Any, off: fl
 CHECK = Check(
     about="Particles and grid: what the transfers conserve, and the order of the advection.",
     trials=[(round_trip, RESOLUTIONS), (orders, [()])],
-    charts=[lambda ran: Lines("advection", "Error of the advection", "steps a turn, or cells a side", "largest error [m]", ran[-1].curves)],
+    charts=[
+        lambda ran: Lines(
+            "advection",
+            "Error of the advection",
+            "steps a turn, or cells a side",
+            "largest error [m]",
+            ran[-1].curves,
+        )
+    ],
 )

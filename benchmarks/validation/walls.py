@@ -10,7 +10,17 @@ import warp as wp
 
 from warp_lcp.benchmarks.validation import scenes
 from warp_lcp.benchmarks.validation.finding import Check, Findings, check_at
-from warp_lcp.benchmarks.validation.scenes import GRAVITY, SUB_CELL, VOXEL, Numerics, box, create_liquid, positions, steps, velocities
+from warp_lcp.benchmarks.validation.scenes import (
+    GRAVITY,
+    SUB_CELL,
+    VOXEL,
+    Numerics,
+    box,
+    create_liquid,
+    positions,
+    steps,
+    velocities,
+)
 from warp_lcp.fluids import LiquidSimulation
 
 DURATION = 0.25  # [s]
@@ -18,9 +28,13 @@ SIZE, LOW = [0.4, 0.8], 0.55  # [m]: of the domain with a ceiling, and where the
 SLANTED = math.radians(5.0)
 CEILINGS: dict[str, list[scenes.Row]] = {
     "flat": [],
-    "slanted": [{"shape": "plane", "point": [0.2, 0.76], "normal": [math.sin(SLANTED), -math.cos(SLANTED)]}],  # cuts cells
+    # cuts cells
+    "slanted": [
+        {"shape": "plane", "point": [0.2, 0.76], "normal": [math.sin(SLANTED), -math.cos(SLANTED)]}
+    ],
 }
-WEIGHT = scenes.DENSITY * GRAVITY * (SIZE[1] - LOW)  # [Pa] that the block's height would have below it at rest
+# [Pa] that the block's height would have below it at rest
+WEIGHT = scenes.DENSITY * GRAVITY * (SIZE[1] - LOW)
 
 WAY_IN_DEPTHS, LENGTH_IN_DEPTHS = 10.0, 4.0  # the way, and the sliding layer's length
 ANGLE = 30.0  # degrees
@@ -54,14 +68,27 @@ def falling(found: Findings, resolution: int, numerics: Numerics, ceiling: str =
     found.must_break("free-slip: mean way", float(hanging.fallen.mean()), low=0.5, unit="cells")
     found.must_break("free-slip: lowest p over rho g H", hanging.lowest / WEIGHT, low=-0.1)
     stuck = drop(resolution, numerics, ceiling, release=False)
-    found.add("wall's velocity kept: mean behind", stuck.expected - float(stuck.fallen.mean()), high=1.0, unit="cells")
+    found.add(
+        "wall's velocity kept: mean behind",
+        stuck.expected - float(stuck.fallen.mean()),
+        high=1.0,
+        unit="cells",
+    )
     found.must_break("wall's velocity kept: worst particle", stuck.worst, high=0.5, unit="cells")
 
 
-def drop(resolution: int, numerics: Numerics, ceiling: str = "flat", *, wall: str = "separating", release: bool = True) -> Fall:
+def drop(
+    resolution: int,
+    numerics: Numerics,
+    ceiling: str = "flat",
+    *,
+    wall: str = "separating",
+    release: bool = True,
+) -> Fall:
     """Let a block fall.
 
-    Particles are told apart by their order from the floor up, which a rigid fall keeps and a straggler can only lose places in.
+    Particles are told apart by their order from the floor up, which a rigid fall keeps and a
+    straggler can only lose places in.
 
     Args:
         resolution: cells of the domain's height.
@@ -70,7 +97,9 @@ def drop(resolution: int, numerics: Numerics, ceiling: str = "flat", *, wall: st
         wall: separating or free-slip.
         release: whether faces of cells that let go may take the liquid's velocity.
     """
-    simulation = create_liquid(numerics, SIZE, resolution, [box([0.0, LOW], SIZE)], solid=CEILINGS[ceiling], wall=wall)
+    simulation = create_liquid(
+        numerics, SIZE, resolution, [box([0.0, LOW], SIZE)], solid=CEILINGS[ceiling], wall=wall
+    )
     start, lowest, highest = np.sort(positions(simulation)[:, 1]), 0.0, 0.0
     if not release:
         _hold(simulation)
@@ -78,7 +107,9 @@ def drop(resolution: int, numerics: Numerics, ceiling: str = "flat", *, wall: st
         pressure = scenes.pressures(simulation)
         lowest, highest = min(lowest, pressure.min()), max(highest, pressure.max())
     dx, way = simulation.grid.spacing, 0.5 * GRAVITY * DURATION**2
-    return Fall((start - np.sort(positions(simulation)[:, 1])) / dx, way / dx, float(lowest), float(highest))
+    return Fall(
+        (start - np.sort(positions(simulation)[:, 1])) / dx, way / dx, float(lowest), float(highest)
+    )
 
 
 def _hold(simulation: LiquidSimulation) -> None:
@@ -93,8 +124,18 @@ def _hold(simulation: LiquidSimulation) -> None:
 
 
 CEILING = Check(
-    about="Letting go of the ceiling: a block that spans it from wall to wall falls freely, every particle of it.",
-    trials=[(falling, [(n, *case) for n in (32, 64) for case in ((VOXEL, "flat"), (SUB_CELL, "flat"), (SUB_CELL, "slanted"))])],
+    about="Letting go of the ceiling: a block that spans it from wall to wall falls freely, every "
+    "particle of it.",
+    trials=[
+        (
+            falling,
+            [
+                (n, *case)
+                for n in (32, 64)
+                for case in ((VOXEL, "flat"), (SUB_CELL, "flat"), (SUB_CELL, "slanted"))
+            ],
+        )
+    ],
 )
 
 
@@ -106,29 +147,54 @@ def sliding(found: Findings, cells: int, numerics: Numerics = SUB_CELL) -> None:
         found.add(f"{wall}: way", way, low=0.98 * WAY_IN_DEPTHS * cells, unit="cells")
         found.add(f"{wall}: loss of momentum", 100.0 * loss, high=0.1, unit="%")
         found.add(f"{wall}: lift", abs(lift), high=0.05, unit="cells")
-    found.must_break("whole cells, free-slip: loss of momentum", 100.0 * slide(cells, VOXEL, "free-slip")[0], high=0.1, unit="%")
+    found.must_break(
+        "whole cells, free-slip: loss of momentum",
+        100.0 * slide(cells, VOXEL, "free-slip")[0],
+        high=0.1,
+        unit="%",
+    )
 
 
 def slide(cells: int, numerics: Numerics, wall: str) -> tuple[float, float, float]:
     """Let a layer of so many cells of depth slide up a slope for its way; `wall` is separating or free-slip.
 
     Returns:
-        The loss of momentum along the wall over that at the start, and the mean ways off the wall and along it [cells].
+        The loss of momentum along the wall over that at the start, and the mean ways off the wall
+        and along it [cells].
     """
     angle = math.radians(ANGLE)
-    tangent, normal = np.array([math.cos(angle), math.sin(angle)]), np.array([-math.sin(angle), math.cos(angle)])
-    layer = box([0.0, 0.0], [LENGTH_IN_DEPTHS * DEPTH, DEPTH], rotate=ANGLE, translate=POINT.tolist(), velocity=(SPEED * tangent).tolist())
+    tangent, normal = (
+        np.array([math.cos(angle), math.sin(angle)]),
+        np.array([-math.sin(angle), math.cos(angle)]),
+    )
+    layer = box(
+        [0.0, 0.0],
+        [LENGTH_IN_DEPTHS * DEPTH, DEPTH],
+        rotate=ANGLE,
+        translate=POINT.tolist(),
+        velocity=(SPEED * tangent).tolist(),
+    )
     plane = {"shape": "plane", "point": POINT.tolist(), "normal": normal.tolist(), "wall": wall}
     resolution, still = round(max(SLOPE_SIZE) * cells / DEPTH), {"gravity": [0.0, 0.0]}
-    simulation = create_liquid(numerics, SLOPE_SIZE, resolution, [layer], solid=[plane], physics=still)
-    start, momentum = positions(simulation).mean(axis=0), velocities(simulation).mean(axis=0) @ tangent
+    simulation = create_liquid(
+        numerics, SLOPE_SIZE, resolution, [layer], solid=[plane], physics=still
+    )
+    start, momentum = (
+        positions(simulation).mean(axis=0),
+        velocities(simulation).mean(axis=0) @ tangent,
+    )
     for _ in steps(simulation, WAY_IN_DEPTHS * DEPTH / SPEED):
         pass
     moved = (positions(simulation).mean(axis=0) - start) / simulation.grid.spacing
-    return float(1.0 - velocities(simulation).mean(axis=0) @ tangent / momentum), float(moved @ normal), float(moved @ tangent)
+    return (
+        float(1.0 - velocities(simulation).mean(axis=0) @ tangent / momentum),
+        float(moved @ normal),
+        float(moved @ tangent),
+    )
 
 
 SLOPE = Check(
-    about="Flow along a slanted wall: without gravity nothing may slow a layer that slides along it, and nothing may lift it.",
+    about="Flow along a slanted wall: without gravity nothing may slow a layer that slides along "
+    "it, and nothing may lift it.",
     trials=[(sliding, (10, 20))],
 )

@@ -17,7 +17,13 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 import warp_lcp as wl
-from warp_lcp.gallery.contact_models import BoxedModel, ContactModel, ContactSystem, StewartTrinkleModel, proximal_sweeps
+from warp_lcp.gallery.contact_models import (
+    BoxedModel,
+    ContactModel,
+    ContactSystem,
+    StewartTrinkleModel,
+    proximal_sweeps,
+)
 from warp_lcp.gallery.contact_scenes import contact_scene, incline
 from warp_lcp.krylov import GMRES
 from warp_lcp.reduced.descent import DECREASE, NonmonotoneSearch
@@ -30,7 +36,13 @@ FAST = 300.0  # slip [m/s] that friction hardly turns
 def residuals(problem: wl.LCP, method: Any, workspace: Any = None) -> np.ndarray:
     """Return the norm of the natural residual after each iteration."""
     norms = list[float]()
-    wl.solve(problem, method, stopping=TIGHT, workspace=workspace, callback=lambda progress: norms.append(progress.residual))
+    wl.solve(
+        problem,
+        method,
+        stopping=TIGHT,
+        workspace=workspace,
+        callback=lambda progress: norms.append(progress.residual),
+    )
     return np.array(norms)
 
 
@@ -48,11 +60,16 @@ def friction_panel(axes: Any) -> None:
         for angle in np.linspace(0, 2 * np.pi, 48, endpoint=False) + 0.03:
             slip = FAST * np.array([np.cos(angle), np.sin(angle)])
             motion = np.array([-1.0 / mass, *slip])
-            system = ContactSystem("particle", scipy.sparse.csr_array(np.eye(3) / mass), motion, np.array([mu]))
+            system = ContactSystem(
+                "particle", scipy.sparse.csr_array(np.eye(3) / mass), motion, np.array([mu])
+            )
             if model is None:
                 r = proximal_sweeps(system)[0]
             else:
-                result = wl.solve(model.problem(system).dense().lcp(device="cpu"), "psor" if isinstance(model, BoxedModel) else "lemke")
+                result = wl.solve(
+                    model.problem(system).dense().lcp(device="cpu"),
+                    "psor" if isinstance(model, BoxedModel) else "lemke",
+                )
                 r = model.impulses(system, result.x.numpy())
             ends.append(r[1:] / r[0])
         x, y = np.array(ends).T
@@ -68,13 +85,19 @@ def frame_panel(axes: Any) -> None:
     contacts = world.contacts()
     low, high = contacts.point.min(axis=0), contacts.point.max(axis=0)
     length = 0.4 * float((high - low).max())
-    view = np.array([[1.0, 0.4, 0.0], [0.0, 0.3, 1.0]])  # oblique: x to the right, z up, y to the back
+    # oblique: x to the right, z up, y to the back
+    view = np.array([[1.0, 0.4, 0.0], [0.0, 0.3, 1.0]])
     order = np.argsort(np.arctan2(*(contacts.point - 0.5 * (low + high))[:, [1, 0]].T))
     face = contacts.point[np.append(order, order[0])] @ view.T
     axes.plot(face[:, 0], face[:, 1], "0.6")
     for point, frame in zip(contacts.point, contacts.frames, strict=True):
         for way, color in zip(frame, ("C0", "C1", "C2"), strict=True):
-            axes.annotate("", view @ (point + length * way), view @ point, arrowprops={"arrowstyle": "->", "color": color})
+            axes.annotate(
+                "",
+                view @ (point + length * way),
+                view @ point,
+                arrowprops={"arrowstyle": "->", "color": color},
+            )
     axes.set_aspect("equal")
     axes.margins(0.3)
     axes.set_title("1.16: frames of contacts, box on an incline")
@@ -94,7 +117,9 @@ def pivots(method: str, n: int, seed: int) -> int:
     """Return the pivots of a random positive definite problem."""
     rng = np.random.default_rng([n, seed])
     F = rng.standard_normal((n, n))
-    return wl.solve(wl.LCP(F @ F.T + 0.1 * np.eye(n), rng.standard_normal(n), 0.0), method).linear_iterations
+    return wl.solve(
+        wl.LCP(F @ F.T + 0.1 * np.eye(n), rng.standard_normal(n), 0.0), method
+    ).linear_iterations
 
 
 def sweep_panel(axes: Any) -> None:
@@ -106,8 +131,12 @@ def sweep_panel(axes: Any) -> None:
     problem, path = wl.LCP(A, b, 0.0), [np.array([1.0, 1.1])]
     for _ in range(12):
         once = wl.StoppingCriteria(rtol=1e-14, max_iterations=1)
-        path.append(wl.solve(problem, wl.ProjectedSOR(omega=1.0), x0=path[-1], stopping=once).x.numpy())
-    steps = [point for start, end in pairwise(path) for point in (start, np.array([end[0], start[1]]))]
+        path.append(
+            wl.solve(problem, wl.ProjectedSOR(omega=1.0), x0=path[-1], stopping=once).x.numpy()
+        )
+    steps = [
+        point for start, end in pairwise(path) for point in (start, np.array([end[0], start[1]]))
+    ]
     axes.plot(*np.array([*steps, path[-1]]).T, "o-", ms=3)
     axes.fill_between([-0.4, 0], -0.8, 1.2, color="0.9")
     axes.fill_between([0, 1.2], -0.8, 0, color="0.9")
@@ -117,7 +146,10 @@ def sweep_panel(axes: Any) -> None:
 def contraction_panel(axes: Any) -> None:
     """Draw residuals of Jacobi and Gauss-Seidel beside the factor of the contraction test."""
     problem = wl.LCP(np.array([[1.0, 0.6], [0.6, 1.0]]), np.array([-1.0, -2.0]), -np.inf)
-    for label, method in (("Jacobi", wl.ProjectedJacobi(omega=1.0)), ("Gauss-Seidel", wl.ProjectedSOR(omega=1.0))):
+    for label, method in (
+        ("Jacobi", wl.ProjectedJacobi(omega=1.0)),
+        ("Gauss-Seidel", wl.ProjectedSOR(omega=1.0)),
+    ):
         work = method.init(problem)
         norms = residuals(problem, method, work)
         k = np.arange(len(norms))
@@ -134,7 +166,11 @@ def diagonal_panel(axes: Any) -> None:
         b = -0.8 if a >= 0 else 0.7
         problem = wl.LCP(np.array([[a]]), np.array([b]), 0.0, 1.0)
         once = wl.StoppingCriteria(rtol=1e-14, max_iterations=1)
-        end = float(wl.solve(problem, wl.ProjectedSOR(omega=1.0), x0=np.array([0.2]), stopping=once).x.numpy()[0])
+        end = float(
+            wl.solve(
+                problem, wl.ProjectedSOR(omega=1.0), x0=np.array([0.2]), stopping=once
+            ).x.numpy()[0]
+        )
         (line,) = axes.plot(x, 0.5 * a * x * x + b * x, label=f"a = {a:g}")
         axes.plot(end, 0.5 * a * end * end + b * end, "o", color=line.get_color())
     axes.set_title("2.4: energy in [0, 1], a sweep's end")
@@ -190,9 +226,14 @@ def search_panel(axes: Any) -> None:
 def descent_panel(axes: Any) -> None:
     """Draw residuals of gradient descent beside Fischer-Newton."""
     n = 40
-    A = scipy.sparse.diags_array([-np.ones(n - 1), 2.1 * np.ones(n), -np.ones(n - 1)], offsets=[-1, 0, 1]).tocsr()
+    A = scipy.sparse.diags_array(
+        [-np.ones(n - 1), 2.1 * np.ones(n), -np.ones(n - 1)], offsets=[-1, 0, 1]
+    ).tocsr()
     problem = wl.LCP(A, np.random.default_rng(4).standard_normal(n), 0.0)
-    for label, method in (("gradient descent", "gradient-descent"), ("Fischer-Newton", "fischer-newton")):
+    for label, method in (
+        ("gradient descent", "gradient-descent"),
+        ("Fischer-Newton", "fischer-newton"),
+    ):
         axes.semilogy(residuals(problem, method), label=label)
     axes.set_title("algorithm 13: residual over steps")
     axes.legend(fontsize=6)
@@ -201,14 +242,25 @@ def descent_panel(axes: Any) -> None:
 def gmres_panel(axes: Any) -> None:
     """Draw residuals of GMRES with and without restarts; SciPy's as circles."""
     n, wind = 12, 0.6
-    one = scipy.sparse.diags_array([-(1 + wind) * np.ones(n - 1), 2 * np.ones(n), -(1 - wind) * np.ones(n - 1)], offsets=[-1, 0, 1])
+    one = scipy.sparse.diags_array(
+        [-(1 + wind) * np.ones(n - 1), 2 * np.ones(n), -(1 - wind) * np.ones(n - 1)],
+        offsets=[-1, 0, 1],
+    )
     eye = scipy.sparse.eye_array(n)
     matrix = (scipy.sparse.kron(one, eye) + scipy.sparse.kron(eye, one)).tocsr()
     b = np.random.default_rng(3).standard_normal(n * n)
     operator = wl.SparseOperator(matrix)
     for restart in (8, 144):
         norms = list[float]()
-        scipy.sparse.linalg.gmres(matrix, b, rtol=1e-10, restart=restart, maxiter=400, callback=norms.append, callback_type="pr_norm")
+        scipy.sparse.linalg.gmres(
+            matrix,
+            b,
+            rtol=1e-10,
+            restart=restart,
+            maxiter=400,
+            callback=norms.append,
+            callback_type="pr_norm",
+        )
         axes.semilogy(norms, lw=0.8, label=f"SciPy, restart {restart}")
         counts, ends = [], []
         for tolerance in (1e-2, 1e-4, 1e-6, 1e-8):

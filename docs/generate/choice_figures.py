@@ -6,7 +6,15 @@ from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 
-from warp_lcp.benchmarks.choose import DEFAULT, NEGLIGIBLE, RULE_COLUMNS, SLOWER, is_right, over_best, rule_row
+from warp_lcp.benchmarks.choose import (
+    DEFAULT,
+    NEGLIGIBLE,
+    RULE_COLUMNS,
+    SLOWER,
+    is_right,
+    over_best,
+    rule_row,
+)
 from warp_lcp.benchmarks.harness.record import MACHINE, Record, read_json
 from warp_lcp.rules import RULES
 
@@ -28,17 +36,24 @@ def section() -> str:
     solved = [r for r in records if over_best(r, DEFAULT) is not None]
     right = sum(is_right(r, DEFAULT) for r in records)
     slow = _counted(r.facts["kind"] for r in records if _is_slow(r))
-    unsolved = _counted(f"{r.facts['kind']} {r.facts['status'][DEFAULT]}" for r in records if over_best(r, DEFAULT) is None)
+    unsolved = _counted(
+        f"{r.facts['kind']} {r.facts['status'][DEFAULT]}"
+        for r in records
+        if over_best(r, DEFAULT) is None
+    )
     lines = [
-        f"The default solves {len(solved)} of {len(records)} random problems of {len(kinds)} kinds to 1e-6. On {right} it takes at most",
-        f"{SLOWER:g} times the time of the fastest method, or {1e3 * NEGLIGIBLE:g} ms more, the choice included.",
+        f"The default solves {len(solved)} of {len(records)} random problems of {len(kinds)} kinds "
+        f"to 1e-6. On {right} it takes at most",
+        f"{SLOWER:g} times the time of the fastest method, or {1e3 * NEGLIGIBLE:g} ms more, the "
+        "choice included.",
         "",
         f"- Slower: {slow or 'none'}.",
         f"- Not solved: {unsolved or 'none'}.",
         "",
         *table(records),
         "",
-        f"CPU time, measured {machine.facts['date']} on {hardware['cpu']}, load {hardware['load']}. CUDA was not measured.",
+        f"CPU time, measured {machine.facts['date']} on {hardware['cpu']}, load "
+        f"{hardware['load']}. CUDA was not measured.",
     ]
     return "\n".join(lines) + "\n"
 

@@ -10,7 +10,10 @@ from typing import Any
 
 ROOT = Path(__file__).parents[2]
 PAGE, RESULTS = ROOT / "docs" / "gpu.md", ROOT / "benchmarks" / "results"
-BEGIN, END = "<!-- devices: written by docs/generate/device_figures.py -->\n", "<!-- end of devices -->"
+BEGIN, END = (
+    "<!-- devices: written by docs/generate/device_figures.py -->\n",
+    "<!-- end of devices -->",
+)
 
 
 def files() -> dict[str, Path]:
@@ -26,8 +29,14 @@ def table() -> str:
     count = Counter(work for records in machines.values() for work in records if work != "machine")
     rows = [work for work, times in count.items() if times > 1]
     lines = [f"| ms | {' | '.join(machines)} |", f"|---|{'---|' * len(machines)}"]
-    lines += [f"| {work} | {' | '.join(_cell(records.get(work)) for records in machines.values())} |" for work in sorted(rows, key=_order)]
-    dates = [f"{name}: {records['machine']['hardware']['device']}, {records['machine']['date']}" for name, records in machines.items()]
+    lines += [
+        f"| {work} | {' | '.join(_cell(records.get(work)) for records in machines.values())} |"
+        for work in sorted(rows, key=_order)
+    ]
+    dates = [
+        f"{name}: {records['machine']['hardware']['device']}, {records['machine']['date']}"
+        for name, records in machines.items()
+    ]
     return "\n".join([*lines, "", "Measured on " + "; ".join(dates) + "."]) + "\n"
 
 

@@ -14,4 +14,6 @@ class ExampleSections(Extension):
     def on_instance(self, *, obj: Object, **_: Any) -> None:
         """Rename the section of one object's docstring."""
         if obj.docstring is not None:
-            obj.docstring.value = re.sub(r"^Example:$", "Examples:", obj.docstring.value, flags=re.M)
+            obj.docstring.value = re.sub(
+                r"^Example:$", "Examples:", obj.docstring.value, flags=re.M
+            )

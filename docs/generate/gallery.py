@@ -1,6 +1,7 @@
 """Runs the built-in scenes, draws each and writes docs/gallery.md: `python docs/generate/gallery.py [--scene NAME]... [--work DIR]`.
 
-Scenes that were not asked for keep their picture and their figures, which docs/gallery/figures.json holds.
+Scenes that were not asked for keep their picture and their figures, which docs/gallery/figures.json
+holds.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ PAGE, FOLDER = DOCS / "gallery.md", DOCS / "gallery"
 FIGURES = FOLDER / "figures.json"
 PICTURES = 3  # of a sheet: early, in the middle, late
 SIZE = "1500x480"  # pixels: one row
-SETTINGS = {"fluids": ("output.surface=true",), "granular": (), "contacts": ()}  # of 3-D scenes, besides their own
+# of 3-D scenes, besides their own
+SETTINGS = {"fluids": ("output.surface=true",), "granular": (), "contacts": ()}
 SURFACE = ("--show", "surface")
 PHOTOS = {  # frames of which `render --look photo` makes the picture
     "column-collapse": 9,
@@ -65,8 +67,18 @@ def scene_text(name: str) -> str:
 
 def scene_names() -> list[str]:
     """Return the built-in scenes: liquids, sand, bodies alone."""
-    names = [Path(entry.name).stem for entry in files("warp_lcp.scene.scenes").iterdir() if entry.name.endswith(".toml")]
-    return sorted(names, key=lambda name: ([*SETTINGS].index(tomllib.loads(scene_text(name))["scene"]["simulator"]), name))
+    names = [
+        Path(entry.name).stem
+        for entry in files("warp_lcp.scene.scenes").iterdir()
+        if entry.name.endswith(".toml")
+    ]
+    return sorted(
+        names,
+        key=lambda name: (
+            [*SETTINGS].index(tomllib.loads(scene_text(name))["scene"]["simulator"]),
+            name,
+        ),
+    )
 
 
 def commands(name: str) -> tuple[list[str], list[str]]:
@@ -98,7 +110,18 @@ def show(name: str, work: Path) -> dict[str, Any]:
     end = json.loads((out / "run.json").read_text())
     last = end["frames"]
     if name in PHOTOS:
-        shot = ["--look", "photo", "--frame", str(PHOTOS[name]), "--shutter", "0", "--size", PHOTO_SIZE, "--samples", PHOTO_SAMPLES]
+        shot = [
+            "--look",
+            "photo",
+            "--frame",
+            str(PHOTOS[name]),
+            "--shutter",
+            "0",
+            "--size",
+            PHOTO_SIZE,
+            "--samples",
+            PHOTO_SAMPLES,
+        ]
         measured([str(program), "render", str(out), *shot])
         picture = Image.open(out / "photo" / f"photo_{PHOTOS[name]:06d}.png")
     else:
@@ -116,7 +139,11 @@ def show(name: str, work: Path) -> dict[str, Any]:
 
 def _sheet(program: Path, out: Path, options: list[str], last: int) -> Image.Image:
     """Return three frames of a run side by side."""
-    chosen = [word for part in range(1, PICTURES + 1) for word in ("--frame", str(round(last * part / (PICTURES + 1) * 4 / 3)))]
+    chosen = [
+        word
+        for part in range(1, PICTURES + 1)
+        for word in ("--frame", str(round(last * part / (PICTURES + 1) * 4 / 3)))
+    ]
     measured([str(program), "render", str(out), *options, *chosen, "--size", SIZE])
     return Image.open(out / "images" / "sheet.png")
 
@@ -125,7 +152,10 @@ def entry(name: str, figures: dict[str, Any]) -> str:
     """Return what the page says of a scene."""
     about = tomllib.loads(scene_text(name))["scene"]
     description = about["description"][0].upper() + about["description"][1:].partition(" (")[0]
-    return f"## {name}\n\n![{name}](gallery/{name}.webp)\n\n{description}. {figures['seconds']:.0f} s.\n"
+    return (
+        f"## {name}\n\n![{name}](gallery/{name}.webp)\n\n{description}. "
+        f"{figures['seconds']:.0f} s.\n"
+    )
 
 
 def page(figures: dict[str, Any]) -> str:

@@ -26,9 +26,17 @@ def rows(kind: type[Any]) -> dict[str, str]:
     """Return the settings of a class as items of a list, by name."""
     allowed, default, found = ranges(kind), kind(), {}
     for name in (field.name for field in dataclasses.fields(kind)):
-        words = rule(allowed[name]).replace("an integer", "integer").replace("a finite number", "finite")
+        words = (
+            rule(allowed[name])
+            .replace("an integer", "integer")
+            .replace("a finite number", "finite")
+        )
         found[name] = f"- `{name}` = `{getattr(default, name)!r}`, {words}"
-    return found | {"cycle": "- `cycle`: [CycleSettings](#cyclesettings)"} if "cycle" in found else found
+    return (
+        found | {"cycle": "- `cycle`: [CycleSettings](#cyclesettings)"}
+        if "cycle" in found
+        else found
+    )
 
 
 def section(title: str, lines: list[str], also: list[str]) -> str:
@@ -44,8 +52,12 @@ def page() -> str:
     count = Counter(line for found in methods.values() for line in found.values())
     common = [line for line, times in count.items() if times >= COMMON]
     names = Counter(line.split("`")[1] for line in common)
-    common = [line for line in common if names[line.split("`")[1]] == 1]  # a name has one default here
-    parts = [section(kind.__name__, list(rows(kind).values()), []) for kind in (wl.StoppingCriteria, wl.CycleSettings)]
+    # a name has one default here
+    common = [line for line in common if names[line.split("`")[1]] == 1]
+    parts = [
+        section(kind.__name__, list(rows(kind).values()), [])
+        for kind in (wl.StoppingCriteria, wl.CycleSettings)
+    ]
     parts.append(section("Common settings", common, []))
     for title, found in methods.items():
         own = [line for line in found.values() if line not in common]

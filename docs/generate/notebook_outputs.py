@@ -43,7 +43,9 @@ def drawn(plt: Any) -> list[bytes]:
     found = []
     for figure in map(plt.figure, plt.get_fignums()):
         file = io.BytesIO()
-        figure.savefig(file, format="png", dpi=DOTS, bbox_inches="tight", metadata={"Software": None})
+        figure.savefig(
+            file, format="png", dpi=DOTS, bbox_inches="tight", metadata={"Software": None}
+        )
         found.append(file.getvalue())
     plt.close("all")
     return found
@@ -51,13 +53,19 @@ def drawn(plt: Any) -> list[bytes]:
 
 def kept(notebook: dict[str, Any]) -> list[str]:
     """Return the printed text that each code cell holds."""
-    return ["".join("".join(output.get("text", "")) for output in cell["outputs"]) for cell in code_cells(notebook)]
+    return [
+        "".join("".join(output.get("text", "")) for output in cell["outputs"])
+        for cell in code_cells(notebook)
+    ]
 
 
 def outputs(text: str, pictures: list[bytes], alt: str) -> list[dict[str, Any]]:
     """Return the outputs of a cell as a notebook holds them."""
     lines = text.splitlines(keepends=True)
-    shown = [{"image/png": base64.b64encode(picture).decode(), "text/plain": [alt]} for picture in pictures]
+    shown = [
+        {"image/png": base64.b64encode(picture).decode(), "text/plain": [alt]}
+        for picture in pictures
+    ]
     return [
         *([{"name": "stdout", "output_type": "stream", "text": lines}] if lines else []),
         *({"data": data, "metadata": {}, "output_type": "display_data"} for data in shown),
@@ -72,6 +80,8 @@ if __name__ == "__main__":
         if not sys.argv[1:] or path.stem in sys.argv[1:]:
             content = json.loads(path.read_text())
             images: list[list[bytes]] = []
-            for cell, text, found in zip(code_cells(content), printed(content, images), images, strict=True):
+            for cell, text, found in zip(
+                code_cells(content), printed(content, images), images, strict=True
+            ):
                 cell["outputs"] = outputs(text, found, cell["metadata"].get("alt", ""))
             path.write_text(json.dumps(content, indent=1) + "\n")

@@ -16,7 +16,16 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
 
-from warp_lcp.gallery import PUBLISHED, Heston, IceDome, ball_obstacle, dam, journal_bearing, sine_obstacle, torsion
+from warp_lcp.gallery import (
+    PUBLISHED,
+    Heston,
+    IceDome,
+    ball_obstacle,
+    dam,
+    journal_bearing,
+    sine_obstacle,
+    torsion,
+)
 from warp_lcp.gallery.published import solution
 
 PAGE = Path(__file__).parents[2] / "benchmarks" / "results" / "amd-epyc" / "problems.md"
@@ -31,7 +40,9 @@ def table(problem: str) -> str:
     for p in PUBLISHED:
         if p.problem == problem:
             digits = len(re.sub(r"^-?0?\.?0*|[.-]|e.*$", "", p.printed))
-            rows.append(f"| {p.case} | `{p.printed}` | {p.source} | `{p.measure():.{digits + 2}g}` |")
+            rows.append(
+                f"| {p.case} | `{p.printed}` | {p.source} | `{p.measure():.{digits + 2}g}` |"
+            )
     return "\n".join(rows)
 
 
@@ -46,7 +57,14 @@ def panels(count: int, width: float = 8.0, height: float = 3.0) -> tuple[Figure,
     return figure, list(np.atleast_1d(axes))
 
 
-def shade(axes: Axes, x: np.ndarray, y: np.ndarray, field: np.ndarray, title: str, held: np.ndarray | None = None) -> None:
+def shade(
+    axes: Axes,
+    x: np.ndarray,
+    y: np.ndarray,
+    field: np.ndarray,
+    title: str,
+    held: np.ndarray | None = None,
+) -> None:
     """Draw a field in colors, and hatch where it is held by a bound."""
     picture = axes.pcolormesh(x, y, field, cmap="viridis", shading="gouraud", rasterized=True)
     axes.figure.colorbar(picture, ax=axes)
@@ -74,7 +92,14 @@ def bars() -> Figure:
     for panel, load in zip(axes, (5.0, 10.0, 20.0), strict=True):
         p = torsion(148, load, device=DEVICE)
         u = solution(p)
-        shade(panel, s, s, u, f"load {load:g}: yielded where hatched", (np.abs(u - p.upper) < 1e-9) & (p.upper > 0))
+        shade(
+            panel,
+            s,
+            s,
+            u,
+            f"load {load:g}: yielded where hatched",
+            (np.abs(u - p.upper) < 1e-9) & (p.upper > 0),
+        )
         panel.set_aspect("equal")
     return figure
 
@@ -88,7 +113,14 @@ def sines() -> Figure:
         u = solution(p)
         inner = p.b != 0
         title = "between two obstacles" if between else "above one"
-        shade(panel, s, s, u, f"{title}: touching where hatched", inner & ((u <= p.lower + 1e-9) | (u >= p.upper - 1e-9)))
+        shade(
+            panel,
+            s,
+            s,
+            u,
+            f"{title}: touching where hatched",
+            inner & ((u <= p.lower + 1e-9) | (u >= p.upper - 1e-9)),
+        )
         panel.set_aspect("equal")
     return figure
 
@@ -133,14 +165,25 @@ def put() -> Figure:
     shown = (S > 5) & (S < 14)
     exercised = (prices.u == payoff) & (S < 10)
     shade(
-        axes[0], S[shown], prices.v, (prices.u - payoff)[:, shown], "price above the payoff, exercised where hatched", exercised[:, shown]
+        axes[0],
+        S[shown],
+        prices.v,
+        (prices.u - payoff)[:, shown],
+        "price above the payoff, exercised where hatched",
+        exercised[:, shown],
     )
     axes[0].set(xlabel="stock", ylabel="variance", ylim=(0, 0.6))
     spots = np.linspace(6, 13, 300)
     axes[1].plot(spots, prices.at(spots, 0.0625), label="American")
     axes[1].plot(spots, held.at(spots, 0.0625), label="European")
     axes[1].plot(spots, np.maximum(10 - spots, 0), "k:", label="payoff")
-    axes[1].plot(np.arange(8, 13), [2.0, 1.1076, 0.52, 0.2137, 0.082], "o", color="tab:red", label="published")
+    axes[1].plot(
+        np.arange(8, 13),
+        [2.0, 1.1076, 0.52, 0.2137, 0.082],
+        "o",
+        color="tab:red",
+        label="published",
+    )
     axes[1].set(xlabel="stock", title="variance 0.0625")
     axes[1].legend()
     return figure
@@ -164,9 +207,14 @@ def ice() -> Figure:
 
 
 PICTURES: dict[str, Callable[[], Figure]] = {
-    "bearing": bearing, "torsion": bars, "sines": sines, "ball": ball, "dam": seepage,
-    "put": put, "ice": ice,
-}  # fmt: skip
+    "bearing": bearing,
+    "torsion": bars,
+    "sines": sines,
+    "ball": ball,
+    "dam": seepage,
+    "put": put,
+    "ice": ice,
+}
 
 
 def main() -> None:

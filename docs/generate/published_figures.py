@@ -25,10 +25,17 @@ def table() -> str:
     sources = {r["method"]: r["source"] for r in records}
     lines = [f"| published | method | {' | '.join(COLUMNS)} |", f"|---|---|{'---|' * len(COLUMNS)}"]
     for method, source in sources.items():
-        own = [kept.get((method, "linear" if method == LINEAR else bounds, size)) for bounds, size in COLUMNS.values()]
+        own = [
+            kept.get((method, "linear" if method == LINEAR else bounds, size))
+            for bounds, size in COLUMNS.values()
+        ]
         lines.append(f"| {source} | {method} | {' | '.join(map(_cell, own))} |")
     hardware, date = machine["hardware"], machine["date"]
-    lines += ["", f"Measured {date} on {hardware['cpu']}, {hardware['cores']} cores, load {hardware['load']}."]
+    lines += [
+        "",
+        f"Measured {date} on {hardware['cpu']}, {hardware['cores']} cores, load "
+        f"{hardware['load']}.",
+    ]
     return "\n".join(lines) + "\n"
 
 

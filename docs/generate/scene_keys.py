@@ -14,7 +14,18 @@ PAGE = Path(__file__).parents[1] / "scenes.md"
 SHAPES = ("box", "sphere", "capsule", "plane", "mesh")
 SHARED = ("scene", "time", "domain", "physics", "output", "camera")
 SAMPLED = ("particles", "particles.reseed", "particles.narrow_band", "density_correction")
-SELF_EVIDENT = ("scene", "time", "physics", "output", "particles", "solver", "pressure", "material", "friction")  # by their headings
+# by their headings
+SELF_EVIDENT = (
+    "scene",
+    "time",
+    "physics",
+    "output",
+    "particles",
+    "solver",
+    "pressure",
+    "material",
+    "friction",
+)
 ELSEWHERE = "unused with bodies alone"  # begins the description of a key that bodies alone inherit
 LONG_LISTS = {  # by a key's default
     "vtu": "[formats](frames-and-films.md#other-formats)",
@@ -165,14 +176,25 @@ def default_of(name: str, prop: Definition, required: bool) -> str:
         return f"`{toml(prop['default'])}`"
     if default == "by name":
         first, *rest = MATERIALS
-        return "; ".join([f"`{getattr(MATERIALS[first], name):g}`", *(f"{other} `{getattr(MATERIALS[other], name):g}`" for other in rest)])
-    return f"`{default}`" if re.fullmatch(r"[a-z_]+\.[a-z_]+|\d+", default) else default or "required" * required
+        return "; ".join(
+            [
+                f"`{getattr(MATERIALS[first], name):g}`",
+                *(f"{other} `{getattr(MATERIALS[other], name):g}`" for other in rest),
+            ]
+        )
+    return (
+        f"`{default}`"
+        if re.fullmatch(r"[a-z_]+\.[a-z_]+|\d+", default)
+        else default or "required" * required
+    )
 
 
 def beyond(text: str, base: str) -> str:
     """Return a text without the words that it begins with as `base` does."""
     own, other = text.split(), base.split()
-    alike = itertools.takewhile(lambda pair: pair[0].strip(";") == pair[1].strip(";"), zip(own, other, strict=False))
+    alike = itertools.takewhile(
+        lambda pair: pair[0].strip(";") == pair[1].strip(";"), zip(own, other, strict=False)
+    )
     same = len(list(alike))
     return " ".join(own[same:])
 
@@ -192,7 +214,9 @@ def meaning_of(prop: Definition) -> str:
     return ", ".join(part for part in (meaning, bounds(prop)) if part)
 
 
-def row(name: str, prop: Definition, required: bool, others: dict[str, Definition] | None = None) -> str:
+def row(
+    name: str, prop: Definition, required: bool, others: dict[str, Definition] | None = None
+) -> str:
     """Return a key's line of a table.
 
     Args:
@@ -204,13 +228,22 @@ def row(name: str, prop: Definition, required: bool, others: dict[str, Definitio
     meaning, default = meaning_of(prop), default_of(name, prop, required)
     for material, other in (others or {}).items():
         if not other["description"].startswith(ELSEWHERE):
-            own, value = beyond(described(other), described(prop)), default_of(name, other, required)
+            own, value = (
+                beyond(described(other), described(prop)),
+                default_of(name, other, required),
+            )
             meaning += f"; {material}: {own}" if own else ""
-            default += f"{', ' * bool(default)}{material} {value}" if value and value != default else ""
+            default += (
+                f"{', ' * bool(default)}{material} {value}" if value and value != default else ""
+            )
     return f"| `{name}` | {meaning} | {default} |"
 
 
-def table(definition: Definition, leave_out: frozenset[str] = frozenset(), others: dict[str, Definition] | None = None) -> str:
+def table(
+    definition: Definition,
+    leave_out: frozenset[str] = frozenset(),
+    others: dict[str, Definition] | None = None,
+) -> str:
     """Return the keys of a definition as a Markdown table, empty if it has none.
 
     Args:
@@ -221,16 +254,27 @@ def table(definition: Definition, leave_out: frozenset[str] = frozenset(), other
     required, rows = definition.get("required", ()), []
     properties = {material: other["properties"] for material, other in (others or {}).items()}
     for name, prop in definition["properties"].items():
-        if name not in leave_out and reference(prop) is None and not prop["description"].startswith(ELSEWHERE):
-            differing = {material: keys[name] for material, keys in properties.items() if keys[name] != prop}
+        if (
+            name not in leave_out
+            and reference(prop) is None
+            and not prop["description"].startswith(ELSEWHERE)
+        ):
+            differing = {
+                material: keys[name] for material, keys in properties.items() if keys[name] != prop
+            }
             rows.append(row(name, prop, name in required, differing))
     for material, keys in properties.items():
         own = {name: prop for name, prop in keys.items() if name not in definition["properties"]}
-        rows += [row(name, {**prop, "description": f"{material}: {prop['description']}"}, False) for name, prop in own.items()]
+        rows += [
+            row(name, {**prop, "description": f"{material}: {prop['description']}"}, False)
+            for name, prop in own.items()
+        ]
     return "\n".join(["| key | meaning | default |", "|---|---|---|", *rows]) + "\n" if rows else ""
 
 
-def variant_table(kinds: dict[str, Definition], column: str, leave_out: frozenset[str], *, defaults: bool = True) -> str:
+def variant_table(
+    kinds: dict[str, Definition], column: str, leave_out: frozenset[str], *, defaults: bool = True
+) -> str:
     """Return the keys of tables that come in several kinds as one Markdown table.
 
     Args:
@@ -243,11 +287,20 @@ def variant_table(kinds: dict[str, Definition], column: str, leave_out: frozense
     for kind, definition in kinds.items():
         for name, prop in definition["properties"].items():
             if name not in leave_out:
-                cells = (name, meaning_of(prop), default_of(name, prop, name in definition.get("required", ())))
+                cells = (
+                    name,
+                    meaning_of(prop),
+                    default_of(name, prop, name in definition.get("required", ())),
+                )
                 rows.setdefault(cells, []).append(kind)
     last = [f" {default} |" * defaults for _, _, default in rows]
-    lines = [f"| `{name}` | {', '.join(of)} | {meaning} |" for (name, meaning, _), of in rows.items()]
-    head = [f"| key | {column} | meaning |" + " default |" * defaults, "|---|---|---|" + "---|" * defaults]
+    lines = [
+        f"| `{name}` | {', '.join(of)} | {meaning} |" for (name, meaning, _), of in rows.items()
+    ]
+    head = [
+        f"| key | {column} | meaning |" + " default |" * defaults,
+        "|---|---|---|" + "---|" * defaults,
+    ]
     return "\n".join([*head, *(line + cell for line, cell in zip(lines, last, strict=True))]) + "\n"
 
 
@@ -285,23 +338,49 @@ def shapes_of(schema: Definition, name: str) -> dict[str, Definition]:
 
 def lists_of(schema: Definition) -> dict[str, Definition]:
     """Return the arrays of tables of a simulator's scenes, but for shapes, by name."""
-    entries = {name: reference(prop.get("items", {})) for name, prop in schema["properties"].items()}
+    entries = {
+        name: reference(prop.get("items", {})) for name, prop in schema["properties"].items()
+    }
     return {name: schema["$defs"][target] for name, target in entries.items() if target is not None}
 
 
 def shape_section(schema: Definition) -> str:
     """Return the keys that place a shape."""
     drains = shapes_of(schema, "drain")
-    common = {key for key in drains["box"]["properties"] if all(key in other["properties"] for other in drains.values())}
+    common = {
+        key
+        for key in drains["box"]["properties"]
+        if all(key in other["properties"] for other in drains.values())
+    }
     placing = common - {"start", "stop", "shape"}
-    placed = {**drains["box"], "properties": {key: prop for key, prop in drains["box"]["properties"].items() if key in placing}}
-    return "\n".join([SHAPED, variant_table(drains, "`shape`", frozenset(common), defaults=False), MESHES, PLACED, table(placed)])
+    placed = {
+        **drains["box"],
+        "properties": {
+            key: prop for key, prop in drains["box"]["properties"].items() if key in placing
+        },
+    }
+    return "\n".join(
+        [
+            SHAPED,
+            variant_table(drains, "`shape`", frozenset(common), defaults=False),
+            MESHES,
+            PLACED,
+            table(placed),
+        ]
+    )
 
 
 def motion_section(schema: Definition) -> str:
     """Return the kinds of motion."""
-    kinds = {part["properties"]["kind"]["const"]: part for name, part in schema["$defs"].items() if name.endswith("Motion")}
-    lines = [f"- `{kind}`: {summary(definition)[0].lower()}{summary(definition)[1:]}" for kind, definition in kinds.items()]
+    kinds = {
+        part["properties"]["kind"]["const"]: part
+        for name, part in schema["$defs"].items()
+        if name.endswith("Motion")
+    }
+    lines = [
+        f"- `{kind}`: {summary(definition)[0].lower()}{summary(definition)[1:]}"
+        for kind, definition in kinds.items()
+    ]
     return "\n".join([MOVING, *lines, "", variant_table(kinds, "`kind`", frozenset({"kind"}))])
 
 
@@ -316,7 +395,10 @@ def material_section(liquid: Definition, sand: Definition) -> str:
 def page() -> str:
     """Return the page."""
     installed = installed_simulators()
-    liquid, sand, alone = (installed[name].scene_model.model_json_schema(by_alias=True) for name in ("fluids", "granular", "contacts"))
+    liquid, sand, alone = (
+        installed[name].scene_model.model_json_schema(by_alias=True)
+        for name in ("fluids", "granular", "contacts")
+    )
     tables, of_sand, of_bodies = tables_of(liquid), tables_of(sand), tables_of(alone)
     notes = {"time": [STEPS], "domain": [DOMAIN]}
     parts = [HEAD, "## Every scene\n"]
@@ -324,14 +406,38 @@ def page() -> str:
         others = {"sand": of_sand[name], "bodies alone": of_bodies[name]}
         parts += [section(name, tables[name], others), *notes.get(name, [])]
     of_shape = frozenset(shapes_of(liquid, "drain")["box"]["properties"])
-    parts += [shape_section(liquid), material_section(liquid, sand), "## Solids\n\nA `[[solid]]` has a [shape](#shapes) and:\n"]
+    parts += [
+        shape_section(liquid),
+        material_section(liquid, sand),
+        "## Solids\n\nA `[[solid]]` has a [shape](#shapes) and:\n",
+    ]
     parts += [table(shapes_of(liquid, "solid")["box"], of_shape), motion_section(liquid), BODIES]
-    parts += ["## Particles\n", "Of liquids and sand.\n", *(section(name, tables[name]) for name in SAMPLED), LIQUID]
-    parts += [section(name, definition) for name, definition in tables.items() if name not in (*SHARED, *SAMPLED)]
-    parts += [*(section(f"[{name}]", definition) for name, definition in lists_of(liquid).items()), SAND]
-    own = {key: prop for key, prop in of_sand["solver"]["properties"].items() if tables["solver"]["properties"].get(key) != prop}
+    parts += [
+        "## Particles\n",
+        "Of liquids and sand.\n",
+        *(section(name, tables[name]) for name in SAMPLED),
+        LIQUID,
+    ]
+    parts += [
+        section(name, definition)
+        for name, definition in tables.items()
+        if name not in (*SHARED, *SAMPLED)
+    ]
+    parts += [
+        *(section(f"[{name}]", definition) for name, definition in lists_of(liquid).items()),
+        SAND,
+    ]
+    own = {
+        key: prop
+        for key, prop in of_sand["solver"]["properties"].items()
+        if tables["solver"]["properties"].get(key) != prop
+    }
     of_sand["solver"] = {**of_sand["solver"], "properties": own}
-    parts += [section(name, definition) for name, definition in of_sand.items() if name not in (*SHARED, *SAMPLED)]
+    parts += [
+        section(name, definition)
+        for name, definition in of_sand.items()
+        if name not in (*SHARED, *SAMPLED)
+    ]
     parts += [CONTACTS, section("solver", of_bodies["solver"])]
     parts += [section(f"[{name}]", definition) for name, definition in lists_of(alone).items()]
     return "\n".join([*parts, LIMITS]).rstrip() + "\n"

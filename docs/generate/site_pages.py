@@ -1,7 +1,7 @@
 """What the site shows besides Markdown files under docs: a hook of MkDocs.
 
-Notebooks become pages, and so do the files of the repository that pages link to. Formulas become MathML, which browsers draw
-themselves, without a script, with the font that comes along.
+Notebooks become pages, and so do the files of the repository that pages link to. Formulas become
+MathML, which browsers draw themselves, without a script, with the font that comes along.
 """
 
 from __future__ import annotations
@@ -16,8 +16,10 @@ from typing import Any
 
 NOTEBOOK = re.compile(r"\]\(((?:\.\./)?[\w-]+)\.ipynb\)")  # a link to one
 FONT = "STIXTwoMath-Regular.ttf"  # of ziamath; docs/site.css names it
-SHIM, OWN_SHIM = "https://unpkg.com/iframe-worker/shim", "iframe-worker.js"  # what the plug-in `offline` loads for the search, and our copy
-OUTSIDE = re.compile(r"\]\(\.\./([^)#\s]+)(#[^)]*)?\)")  # a link from a page right under docs to a file of the repository
+# what the plug-in `offline` loads for the search, and our copy
+SHIM, OWN_SHIM = "https://unpkg.com/iframe-worker/shim", "iframe-worker.js"
+# a link from a page right under docs to a file of the repository
+OUTSIDE = re.compile(r"\]\(\.\./([^)#\s]+)(#[^)]*)?\)")
 # What pymdownx.arithmatex makes of $...$ and $$...$$.
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[([](.*?)\\[])]</\1>', flags=re.S)
 
@@ -62,7 +64,13 @@ def on_files(files: Any, config: Any) -> Any:
         files.append(File.generated(config, f"{notebook.stem}.md", content=page))
         for picture, content in pictures.items():
             files.append(File.generated(config, picture, content=content))
-    files.append(File.generated(config, FONT, abs_src_path=str(distribution("ziamath").locate_file(f"ziamath/fonts/{FONT}"))))
+    files.append(
+        File.generated(
+            config,
+            FONT,
+            abs_src_path=str(distribution("ziamath").locate_file(f"ziamath/fonts/{FONT}")),
+        )
+    )
     wanted = set().union(*(outside_links(page.read_text()) for page in docs.glob("*.md")))
     wanted |= set(re.findall(r"(benchmarks/\S+\.md|[A-Z]+\.md)", json.dumps(config.nav)))
     for name in sorted(wanted):
@@ -73,7 +81,11 @@ def on_files(files: Any, config: Any) -> Any:
         text = path.read_text()
         for shown in re.findall(r"\]\(([^):#\s]+)\)", text):
             source = PurePosixPath(name).parent / shown
-            if (root / source).is_file() and not shown.endswith(".md") and files.get_file_from_path(str(source)) is None:
+            if (
+                (root / source).is_file()
+                and not shown.endswith(".md")
+                and files.get_file_from_path(str(source)) is None
+            ):
                 files.append(File.generated(config, str(source), abs_src_path=str(root / source)))
         files.append(File.generated(config, name, content=text.replace("](docs/", "](")))
     return files
@@ -91,13 +103,19 @@ def formula(found: re.Match[str]) -> str:
     made = convert(html.unescape(found[2]), display="block" if found[1] == "div" else "inline")
     if "\\" in made:
         raise ValueError(f"not all of this is TeX that can be drawn: {found[2]}")
-    made = made.replace("<mo>&#x0221E;</mo>", "<mi>&#x0221E;</mi>").replace("<mi>&#x027C2;</mi>", "<mo>&#x027C2;</mo>")
+    made = made.replace("<mo>&#x0221E;</mo>", "<mi>&#x0221E;</mi>").replace(
+        "<mi>&#x027C2;</mi>", "<mo>&#x027C2;</mo>"
+    )
     return f'<div class="formula">{made}</div>' if found[1] == "div" else made
 
 
 def typeset(text: str) -> str:
     """Return words with powers raised and signs of comparison as they are written by hand."""
-    return POWER.sub(lambda found: f"<sup>{found[1] or found[2]}</sup>", text).replace("&lt;=", "≤").replace("&gt;=", "≥")
+    return (
+        POWER.sub(lambda found: f"<sup>{found[1] or found[2]}</sup>", text)
+        .replace("&lt;=", "≤")
+        .replace("&gt;=", "≥")
+    )
 
 
 def on_page_content(content: str, **_: Any) -> str:

@@ -19,10 +19,26 @@ def test_the_suite_runs_every_experiment(monkeypatch, tmp_path):
     kept = {name: gallery.SCENES[name] for name in ("sphere-stack", "incline")}
     monkeypatch.setattr(gallery, "SCENES", kept)
     monkeypatch.setattr(contact_scenes.contacts, "SCENES", kept)
-    few = [(contact_scenes, "ORDERED", ("sphere-stack",)), (contact_scenes, "ROUNDS", 20), (studies, "ZEROS", (0.0, 0.8))]
-    few += [(appendix_c, "FACTORS", (1.0, 1.4)), (appendix_c, "SHARES", (0.95, 1.0)), (appendix_c, "SWEEPS", 200)]
-    few += [(appendix_c, "KINKS", {name: appendix_c.KINKS[name] for name in ("zero", "perturbation")})]
-    few += [(studies, "SEMIDEFINITE", {name: appendix_c.METHODS[name] for name in ("PGS", "FischerNewton()")})]
+    few = [
+        (contact_scenes, "ORDERED", ("sphere-stack",)),
+        (contact_scenes, "ROUNDS", 20),
+        (studies, "ZEROS", (0.0, 0.8)),
+    ]
+    few += [
+        (appendix_c, "FACTORS", (1.0, 1.4)),
+        (appendix_c, "SHARES", (0.95, 1.0)),
+        (appendix_c, "SWEEPS", 200),
+    ]
+    few += [
+        (appendix_c, "KINKS", {name: appendix_c.KINKS[name] for name in ("zero", "perturbation")})
+    ]
+    few += [
+        (
+            studies,
+            "SEMIDEFINITE",
+            {name: appendix_c.METHODS[name] for name in ("PGS", "FischerNewton()")},
+        )
+    ]
     for module, name, value in few:
         monkeypatch.setattr(module, name, value)
     results = book.measure(Options("cpu", (8,), 1, lambda text: None), tmp_path)
@@ -31,16 +47,32 @@ def test_the_suite_runs_every_experiment(monkeypatch, tmp_path):
     for kind in kinds(SMALL):
         assert records[f"{kind}: FischerNewton()"].value("solved") == SMALL.problems
     assert records["kinks: fluid, 7-point, planted: perturbation"].value("solved") == SMALL.problems
-    assert records["lambda: contact, rigid bodies, safeguarded: 0.95"].value("solved") == SMALL.problems
+    assert (
+        records["lambda: contact, rigid bodies, safeguarded: 0.95"].value("solved")
+        == SMALL.problems
+    )
     assert records["omega: splash 8^3, p >= 0"].value("best") > 1
     assert records["cost: contacts of rigid bodies: Lemke: 24"].value("steps") >= 1
     assert records["warm: planted: minimum map from 0"].value("accepted") == SMALL.problems
     assert records["zeros: planted: 80%"].value("solvable") == 2
     assert records["scenes: incline: PGS-SM"].value("residual") < 1e-10
-    assert records["orders: sphere-stack"].value("extreme staggered") < 1e-6 < records["orders: sphere-stack"].value("PGS")
+    assert (
+        records["orders: sphere-stack"].value("extreme staggered")
+        < 1e-6
+        < records["orders: sphere-stack"].value("PGS")
+    )
     assert {chart.name for chart in results.charts} == {
-        "c1-patterns", "c2-convergence", "c3-kinks", "c4-omega", "c5-cost", "c6-warm", "lambda", "zeros", "2-3-orders", "2-10-scenes"
-    }  # fmt: skip
+        "c1-patterns",
+        "c2-convergence",
+        "c3-kinks",
+        "c4-omega",
+        "c5-cost",
+        "c6-warm",
+        "lambda",
+        "zeros",
+        "2-3-orders",
+        "2-10-scenes",
+    }
     assert all(len(row) == len(table.columns) for table in results.tables for row in table.rows)
 
 
@@ -54,7 +86,8 @@ def test_planted_solutions_are_solutions_and_those_of_the_recipes_are_not(kind):
         assert (p.solution >= 0).all()
         assert_allclose(p.solution * y, 0, atol=1e-12)
         infeasible = y.min() < -1e-3
-        assert infeasible == (kind == "fluid, recipe") or kind == "contact, recipe"  # of contacts most
+        # of contacts most
+        assert infeasible == (kind == "fluid, recipe") or kind == "contact, recipe"
 
 
 def test_the_fluid_recipe_has_nothing_complementary():
@@ -62,7 +95,11 @@ def test_the_fluid_recipe_has_nothing_complementary():
     p = kinds(SMALL)["fluid, recipe"](3)
     x = np.linalg.solve(p.A.toarray(), -p.b)
     assert x.min() > 0
-    solved = wl.solve(p.lcp(device="cpu"), wl.Lemke(), stopping=wl.StoppingCriteria(rtol=1e-10)).x.numpy().ravel()
+    solved = (
+        wl.solve(p.lcp(device="cpu"), wl.Lemke(), stopping=wl.StoppingCriteria(rtol=1e-10))
+        .x.numpy()
+        .ravel()
+    )
     assert_allclose(solved, x, rtol=1e-8)
 
 
@@ -91,7 +128,9 @@ def test_the_recipe_with_many_zero_eigenvalues_has_no_solution(zeros):
         assert studies.solvable(dense("recipe", scale, k, zeros)) == (zeros == 0)
         planted = dense("planted", scale, k, zeros)
         assert studies.solvable(planted)
-        result = wl.solve(planted.lcp(device="cpu"), wl.FischerNewton(), stopping=wl.StoppingCriteria(rtol=1e-8))
+        result = wl.solve(
+            planted.lcp(device="cpu"), wl.FischerNewton(), stopping=wl.StoppingCriteria(rtol=1e-8)
+        )
         assert result
         x = result.x.numpy().ravel()
         assert np.abs(np.minimum(x, planted.A @ x + planted.b)).max() < 1e-5
@@ -103,7 +142,14 @@ def test_verdicts_are_num4lcp_s():
 
     assert trace([9.0, 1.0, 1e-4]).verdict(Merit.FISCHER, Limits())[:2] == ("absolute", 3)
     assert trace([9.0, 1.0, 1.0]).verdict(Merit.FISCHER, Limits())[:2] == ("relative", 3)
-    assert trace([9.0, 1.0, 1e-4]).verdict(Merit.PRODUCT, Limits())[:2] == ("absolute", 2)  # tested after a sweep
-    assert trace([9.0, 8.0, 7.0]).verdict(Merit.FISCHER, Limits(most=2))[:2] == ("max iterations", 2)
-    assert trace([9.0, 1.0], wl.SolveStatus.NON_DESCENT).verdict(Merit.MINIMUM, Limits())[:2] == ("non-descent", 2)
+    # tested after a sweep
+    assert trace([9.0, 1.0, 1e-4]).verdict(Merit.PRODUCT, Limits())[:2] == ("absolute", 2)
+    assert trace([9.0, 8.0, 7.0]).verdict(Merit.FISCHER, Limits(most=2))[:2] == (
+        "max iterations",
+        2,
+    )
+    assert trace([9.0, 1.0], wl.SolveStatus.NON_DESCENT).verdict(Merit.MINIMUM, Limits())[:2] == (
+        "non-descent",
+        2,
+    )
     assert outcome.spread([1, 2, 3]) == "2.00 (1 to 3, 0.82)"

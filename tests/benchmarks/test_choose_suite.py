@@ -12,10 +12,21 @@ from warp_lcp.rules import RULES
 
 UNMET = {2}  # affine bounds with products only: no kind of problems here has them
 MEETS = {
-    "boxed friction": 1, "sign error": 3, "large sign error": 4, "negative diagonal": 5, "negative diagonal, boxed": 6,
-    "sparse negative diagonal, boxed": 7, "products": 8,
-    "dominant": 9, "pressure": 10, "wind": 11, "game": 12, "large game": 13, "portfolio": 12, "P-matrix": 16,
-}  # fmt: skip
+    "boxed friction": 1,
+    "sign error": 3,
+    "large sign error": 4,
+    "negative diagonal": 5,
+    "negative diagonal, boxed": 6,
+    "sparse negative diagonal, boxed": 7,
+    "products": 8,
+    "dominant": 9,
+    "pressure": 10,
+    "wind": 11,
+    "game": 12,
+    "large game": 13,
+    "portfolio": 12,
+    "P-matrix": 16,
+}
 
 
 @pytest.mark.parametrize("kind", MEETS)
@@ -26,20 +37,44 @@ def test_a_kind_meets_its_rule(kind):
 def made(rule, name, status, seconds, alternatives=()):
     """Return a record of a problem that rule number `rule` applies to."""
     figures = {method: Figure(t, "s") for method, t in seconds.items()}
-    facts = {"kind": name, "rule": rule, "alternatives": list(alternatives), "status": status, "budgets": {"5 steps": "psor"}}
+    facts = {
+        "kind": name,
+        "rule": rule,
+        "alternatives": list(alternatives),
+        "status": status,
+        "budgets": {"5 steps": "psor"},
+    }
     return Record(name, figures, {**facts, "iterations": dict.fromkeys(status, 5)})
 
 
 SOLVED, FAILED = "CONVERGED", "STAGNATED"
-FIRST = made(10, "a", {"projected-multigrid": SOLVED, "mprgp": SOLVED, "default": SOLVED},
-             {"projected-multigrid": 3.0, "mprgp": 2.0, "default": 5.0})  # fmt: skip
-SECOND = made(10, "b", {"projected-multigrid": FAILED, "mprgp": SOLVED, "psor": SOLVED, "default": SOLVED},
-              {"projected-multigrid": 1.0, "mprgp": 2.0, "psor": 1.0, "default": 4.0}, ["minimum-map-newton", "mprgp"])  # fmt: skip
+FIRST = made(
+    10,
+    "a",
+    {"projected-multigrid": SOLVED, "mprgp": SOLVED, "default": SOLVED},
+    {"projected-multigrid": 3.0, "mprgp": 2.0, "default": 5.0},
+)
+SECOND = made(
+    10,
+    "b",
+    {"projected-multigrid": FAILED, "mprgp": SOLVED, "psor": SOLVED, "default": SOLVED},
+    {"projected-multigrid": 1.0, "mprgp": 2.0, "psor": 1.0, "default": 4.0},
+    ["minimum-map-newton", "mprgp"],
+)
 
 
 def test_a_rule_is_judged_by_its_method_and_its_alternatives():
     row = choose.rule_row(10, [FIRST, SECOND])
-    assert row == ["10", "`projected-multigrid`", "2", "1", "1.50 (1.5)", "`mprgp` 1, `psor` 1", "`mprgp` 1", "2"]
+    assert row == [
+        "10",
+        "`projected-multigrid`",
+        "2",
+        "1",
+        "1.50 (1.5)",
+        "`mprgp` 1, `psor` 1",
+        "`mprgp` 1",
+        "2",
+    ]
     assert choose.over_best(SECOND, "projected-multigrid") is None
     assert choose.over_best(SECOND, "default") == 4.0
     assert not choose.is_right(FIRST, "default")

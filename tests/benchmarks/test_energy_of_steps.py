@@ -17,7 +17,11 @@ STILL = {"gravity": [0.0, 0.0]}
 
 
 def test_free_fall_makes_no_energy_whatever_the_steps() -> None:
-    ledger = Ledger(scenes.create_liquid(VOXEL, [1.0, 1.0], 16, [box([0.3, 0.6], [0.6, 0.9], velocity=[0.5, 1.0])]))
+    ledger = Ledger(
+        scenes.create_liquid(
+            VOXEL, [1.0, 1.0], 16, [box([0.3, 0.6], [0.6, 0.9], velocity=[0.5, 1.0])]
+        )
+    )
     start = ledger.total()
     for dt in LENGTHS:
         assert abs(ledger.step(dt).gained) < 1e-6 * start
@@ -45,9 +49,15 @@ def test_the_work_of_a_wall_that_sets_a_plug_in_motion_is_its_momentum_times_its
     motion = {"kind": "translation", "velocity": [0.8, 0.0]}
     piston = box([-2.0, -1.0], [0.25, 2.0], motion=motion, wall="free-slip")
     simulation = scenes.create_liquid(
-        SUB_CELL, [1.0, 0.25], 32, [box([0.25, 0.0], [0.5, 0.25])], solid=[piston], physics=STILL, wall="free-slip",
+        SUB_CELL,
+        [1.0, 0.25],
+        32,
+        [box([0.25, 0.0], [0.5, 0.25])],
+        solid=[piston],
+        physics=STILL,
+        wall="free-slip",
         solver={"tolerance": 1e-8},
-    )  # fmt: skip
+    )
     done = Ledger(simulation).step(1e-4)
     assert done.given == pytest.approx(DENSITY * 0.25 * 0.25 * 0.8**2, rel=0.1)
     assert done.gained == pytest.approx(-0.5 * done.given, rel=0.1)
@@ -56,15 +66,40 @@ def test_the_work_of_a_wall_that_sets_a_plug_in_motion_is_its_momentum_times_its
 TAP = {"shape": "box", "min": [0.0, 0.5], "max": [0.125, 0.625], "velocity": [1.5, 0.0]}
 
 
-SCENES = {  # without surface tension, whose energy no account has: cells along the longest side, and the time [s] whose parts are moments
-    "balls-on-sand-2d": (48, 0.6), "carried-box-2d": (48, 0.7), "ceiling-drop": (32, 0.8), "column-collapse-2d": (48, 0.7),
-    "column-collapse": (24, 0.5), "dam-break-2d": (48, 1.2), "dam-break": (32, 0.8), "floating-bodies-2d": (64, 1.2),
-    "floating-bodies": (32, 0.8), "honey-coil": (32, 1.5), "hourglass-2d": (48, 0.6), "hourglass": (28, 0.4), "inclined-layer": (32, 0.8),
-    "jet": (128, 0.8), "mesh-obstacle": (30, 0.6), "paint-pour": (24, 1.0), "pouring-pile": (24, 1.2), "retracting-wall": (60, 1.8),
-    "river": (256, 1.6), "sand-on-mesh": (24, 0.4), "sliding-slab": (32, 0.8), "slumping-letter": (32, 1.5), "splash-in-circle": (40, 1.2),
-    "splash-in-square": (40, 1.0), "splash-unilateral": (80, 0.8), "stirred-tank": (24, 0.8), "tap-and-drain": (32, 1.6),
-    "water-labyrinth": (48, 1.6), "waterfall": (32, 1.2), "wave-maker": (120, 2.4),
-}  # fmt: skip
+# without surface tension, whose energy no account has: cells along the longest side, and the time
+# [s] whose parts are moments
+SCENES = {
+    "balls-on-sand-2d": (48, 0.6),
+    "carried-box-2d": (48, 0.7),
+    "ceiling-drop": (32, 0.8),
+    "column-collapse-2d": (48, 0.7),
+    "column-collapse": (24, 0.5),
+    "dam-break-2d": (48, 1.2),
+    "dam-break": (32, 0.8),
+    "floating-bodies-2d": (64, 1.2),
+    "floating-bodies": (32, 0.8),
+    "honey-coil": (32, 1.5),
+    "hourglass-2d": (48, 0.6),
+    "hourglass": (28, 0.4),
+    "inclined-layer": (32, 0.8),
+    "jet": (128, 0.8),
+    "mesh-obstacle": (30, 0.6),
+    "paint-pour": (24, 1.0),
+    "pouring-pile": (24, 1.2),
+    "retracting-wall": (60, 1.8),
+    "river": (256, 1.6),
+    "sand-on-mesh": (24, 0.4),
+    "sliding-slab": (32, 0.8),
+    "slumping-letter": (32, 1.5),
+    "splash-in-circle": (40, 1.2),
+    "splash-in-square": (40, 1.0),
+    "splash-unilateral": (80, 0.8),
+    "stirred-tank": (24, 0.8),
+    "tap-and-drain": (32, 1.6),
+    "water-labyrinth": (48, 1.6),
+    "waterfall": (32, 1.2),
+    "wave-maker": (120, 2.4),
+}
 SHORTER = (1e-6, 1e-5, 1e-4, 1e-3)  # [s], than the normal step
 MOST = 1e-3  # of the total that a step may add
 
@@ -85,7 +120,9 @@ def along(ledger: Ledger, moments: list[float], dt_max: float) -> list[Rise]:
             ledger.step(min(simulation.stable_dt(), dt_max))
         state, energy, total = simulation.state(), ledger.now, ledger.total()
         normal = min(simulation.stable_dt(), dt_max)
-        rows: list[tuple[float, ...]] = [(length,) for length in (*(t for t in SHORTER if t < normal), normal)]
+        rows: list[tuple[float, ...]] = [
+            (length,) for length in (*(t for t in SHORTER if t < normal), normal)
+        ]
         for row in [*rows, (0.0, 1e-6) * 2, (0.0, 1e-4) * 2]:
             for length in row:
                 done = ledger.step(length or min(simulation.stable_dt(), dt_max))
@@ -99,7 +136,9 @@ def along(ledger: Ledger, moments: list[float], dt_max: float) -> list[Rise]:
 def test_no_step_in_the_middle_of_a_scene_makes_energy(name: str) -> None:
     cells, time = SCENES[name]
     scene = load_scene(name, [f"domain.resolution={cells}"])
-    simulation: Any = simulators()[scene.scene.simulator].create(scene, device="cpu", folder=Path.cwd())
+    simulation: Any = simulators()[scene.scene.simulator].create(
+        scene, device="cpu", folder=Path.cwd()
+    )
     rises = along(Ledger(simulation), [0.05 * time, 0.5 * time, time], scene.time.dt_max)
     assert max(rise.gained for rise in rises) < MOST
 
@@ -111,18 +150,28 @@ def test_a_step_of_any_length_makes_no_energy(what: str) -> None:
     if what == "sand":
         simulation = scenes.create_sand([0.8, 0.4], 24, [box([0.0, 0.0], [0.2, 0.3])], walls=0.5)
     else:
-        of: dict[str, dict[str, Any]] = {"liquid and a tap": {"source": [TAP]}, "unilateral": {"pressure": {"model": "unilateral"}}}
+        of: dict[str, dict[str, Any]] = {
+            "liquid and a tap": {"source": [TAP]},
+            "unilateral": {"pressure": {"model": "unilateral"}},
+        }
         tables = of.get(what, {"viscosity": {"value": 3000.0}, "wall": "sticky"})
-        simulation = scenes.create_liquid(VOXEL, [1.0, 0.75], 16, [box([0.0, 0.0], [0.375, 0.5])], **tables)
+        simulation = scenes.create_liquid(
+            VOXEL, [1.0, 0.75], 16, [box([0.0, 0.0], [0.375, 0.5])], **tables
+        )
     found = along(Ledger(simulation), [0.02, 0.2], simulation.scene.time.dt_max)
     assert len(found) > 20
-    assert max(rise.gained - rise.displaced for rise in found) < (0.0 if what == "thick liquid" else MOST)  # what creeps loses
+    # what creeps loses
+    assert max(rise.gained - rise.displaced for rise in found) < (
+        0.0 if what == "thick liquid" else MOST
+    )
 
 
 @pytest.mark.parametrize("what", ["liquid, unilateral", "sand"])
 def test_the_old_relaxation_is_told(what: str) -> None:
     """Crowds that are pushed apart within a step get the faster the shorter it is."""
-    _, gained = time_steps.collapse(what, 24, 1e-3, change=time_steps.PUSHED_APART[what], moments=np.array([0.01]))
+    _, gained = time_steps.collapse(
+        what, 24, 1e-3, change=time_steps.PUSHED_APART[what], moments=np.array([0.01])
+    )
     assert gained > time_steps.MOST
 
 

@@ -14,12 +14,26 @@ import warp_lcp as wl
 from oracle import assemble, natural_residual
 from warp_lcp.benchmarks import extremes
 from warp_lcp.benchmarks.extremes import bounds, broken, case, matrices, refused, shapes
-from warp_lcp.benchmarks.extremes.case import Attempt, Expected, Promise, RefusalCase, SolveCase, judge, violations
+from warp_lcp.benchmarks.extremes.case import (
+    Attempt,
+    Expected,
+    Promise,
+    RefusalCase,
+    SolveCase,
+    judge,
+    violations,
+)
 from warp_lcp.benchmarks.extremes.exact import Exact, norm, stencil
 from warp_lcp.benchmarks.extremes.problem import GridProblem, MatrixProblem
 from warp_lcp.cli import commands as cli
 
-FAST = (shapes.masks, shapes.closed_pools, matrices.singular, matrices.cycling, refused.wrong_arguments)
+FAST = (
+    shapes.masks,
+    shapes.closed_pools,
+    matrices.singular,
+    matrices.cycling,
+    refused.wrong_arguments,
+)
 
 
 def wrong(cases):
@@ -45,7 +59,9 @@ def test_there_are_enough_cases_of_every_kind():
     kinds = Counter(c.promise(p).expected for c in cases for p in c.precisions)
     assert len(cases) >= 150
     assert set(kinds) == set(Expected)
-    assert kinds[Expected.EITHER] < 0.35 * sum(kinds.values()), "what may end either way tests little"
+    assert kinds[Expected.EITHER] < 0.35 * sum(kinds.values()), (
+        "what may end either way tests little"
+    )
 
 
 @pytest.mark.parametrize("name", broken.SOLVERS)
@@ -54,7 +70,9 @@ def test_a_wrong_solver_is_caught(name, precision):
     """Expected to solve the problem, as a right one is: the same case passes with wl.solve."""
     for _, make, method in broken.RIGHT:
         assert judge(SolveCase("right", "right", make, method), precision, "cpu").wrong == []
-        verdict = judge(SolveCase("wrong", name, make, method, solve=broken.SOLVERS[name]), precision, "cpu")
+        verdict = judge(
+            SolveCase("wrong", name, make, method, solve=broken.SOLVERS[name]), precision, "cpu"
+        )
         assert verdict.wrong
         if name == "steps backwards":
             assert verdict.attempt.status != "CONVERGED"
@@ -83,7 +101,11 @@ def test_a_wrong_solver_that_passes_fails_the_suite():
         (case.INFEASIBLE, Attempt("STAGNATED", 1.0), "not INFEASIBLE"),
         (case.EITHER, Attempt("FLOOR", 1e-7), ""),
         (case.EITHER, Attempt("DIVERGED", 1e7), "DIVERGED"),
-        (case.EITHER, Attempt("FLOOR", 1e-7, faults=["says the residual is 0"]), "says the residual is 0"),
+        (
+            case.EITHER,
+            Attempt("FLOOR", 1e-7, faults=["says the residual is 0"]),
+            "says the residual is 0",
+        ),
     ],
 )
 def test_judgment(promise, attempt, expected):
@@ -99,7 +121,9 @@ def test_a_case_beyond_its_budget_is_not_as_it_must_be(monkeypatch):
 
 def test_time_of_other_programs_is_not_in_a_budget(monkeypatch):
     monkeypatch.setattr(case, "LAST_CALL", 0.0)
-    waits = RefusalCase("waits", "waits", lambda device, precision: time.sleep(0.2), "x", budget=0.1)
+    waits = RefusalCase(
+        "waits", "waits", lambda device, precision: time.sleep(0.2), "x", budget=0.1
+    )
     assert not any("budget" in line for line in judge(waits, "mixed", "cpu").wrong)
 
 
@@ -135,7 +159,9 @@ def test_the_matrix_is_that_of_the_oracle(seed):
     n = int(fluid.sum())
     b, x, lower = rng.standard_normal((3, n))
     own = Exact(matrix, b, lower, lower + 1.5)
-    assert own.residual(x) == pytest.approx(natural_residual(expected, b, lower, lower + 1.5, x), rel=1e-12)
+    assert own.residual(x) == pytest.approx(
+        natural_residual(expected, b, lower, lower + 1.5, x), rel=1e-12
+    )
 
 
 def test_bodies_are_in_the_residual():
@@ -145,9 +171,14 @@ def test_bodies_are_in_the_residual():
     W = np.array([[2.0, 0.5], [0.5, 3.0]])
     problem = GridProblem(cells=cells, b=rng.standard_normal((3, 4)), columns=U, weights=W)
     inside = cells.ravel() == wl.FLUID
-    A = assemble(cells)[np.ix_(inside, inside)] + U.reshape(12, 2)[inside] @ W @ U.reshape(12, 2)[inside].T
+    A = (
+        assemble(cells)[np.ix_(inside, inside)]
+        + U.reshape(12, 2)[inside] @ W @ U.reshape(12, 2)[inside].T
+    )
     x, b = rng.standard_normal(11), problem.b.ravel()[inside]
-    assert problem.exact().residual(x) == pytest.approx(natural_residual(A, b, np.zeros(11), np.full(11, np.inf), x), rel=1e-12)
+    assert problem.exact().residual(x) == pytest.approx(
+        natural_residual(A, b, np.zeros(11), np.full(11, np.inf), x), rel=1e-12
+    )
 
 
 @pytest.mark.parametrize("scale", [1e-300, 1e-160, 1.0, 1e160, 1e300])
@@ -163,7 +194,9 @@ def test_values_whose_squares_vanish_are_refused():
             wl.solve(wl.LCP(A, np.array([tiny, -abs(tiny)])))
         with pytest.raises(ValueError, match="lower, upper: largest value"):
             wl.solve(wl.LCP(A, np.zeros(2), lower=abs(tiny)))
-        assert wl.solve(wl.LCP(A, np.array([tiny, -abs(tiny)])), stopping=wl.StoppingCriteria(atol=1e-30))
+        assert wl.solve(
+            wl.LCP(A, np.array([tiny, -abs(tiny)])), stopping=wl.StoppingCriteria(atol=1e-30)
+        )
     assert wl.solve(wl.LCP(A, np.zeros(2)))
     assert wl.solve(wl.LCP(A, np.array([-1e-100, 1e-130])))
 
@@ -171,7 +204,9 @@ def test_values_whose_squares_vanish_are_refused():
 def test_a_tolerance_below_what_float32_holds_costs_few_iterations():
     """Linear solves that no longer lower the residual end: 3,236 iterations where each runs to its limit."""
     problem = bounds.pool((96, 96)).lcp("cpu", wp.float32)
-    result = wl.solve(problem, wl.MinimumMapNewton(precision="single"), stopping=wl.StoppingCriteria(rtol=1e-13))
+    result = wl.solve(
+        problem, wl.MinimumMapNewton(precision="single"), stopping=wl.StoppingCriteria(rtol=1e-13)
+    )
     assert result.status is wl.SolveStatus.FLOOR
     assert result.relative_residual < 1e-5
     assert result.linear_iterations < 1500
@@ -182,14 +217,22 @@ def test_precisions_are_those_that_a_method_has():
         return MatrixProblem(matrix=scipy.sparse.eye_array(3).tocsr(), b=-np.ones(3))
 
     assert SolveCase("a", "b", problem, "lemke").precisions == ("double",)
-    assert SolveCase("a", "b", problem, "minimum-map-newton").precisions == ("single", "mixed", "double")
+    assert SolveCase("a", "b", problem, "minimum-map-newton").precisions == (
+        "single",
+        "mixed",
+        "double",
+    )
 
 
 @pytest.mark.slow
 def test_the_whole_suite(tmp_path):
-    result = CliRunner().invoke(cli.app, ["bench", "extremes", "--device", "cpu", "--out", str(tmp_path), "--repeat", "1"])
+    result = CliRunner().invoke(
+        cli.app, ["bench", "extremes", "--device", "cpu", "--out", str(tmp_path), "--repeat", "1"]
+    )
     assert result.exit_code == 0, result.stderr
-    records = [r for r in json.loads((tmp_path / "extremes.json").read_text()) if r["name"] != "machine"]
+    records = [
+        r for r in json.loads((tmp_path / "extremes.json").read_text()) if r["name"] != "machine"
+    ]
     assert sum(r["figures"]["cases"]["value"] for r in records) >= 900
     assert all(r["figures"]["wrong"]["value"] == 0 for r in records)
     report = (tmp_path / "extremes.md").read_text()

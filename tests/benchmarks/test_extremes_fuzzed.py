@@ -30,7 +30,9 @@ def grid_problems(draw):
         counts = list(shape)
         counts[-1 - axis] += 1
         if decades:
-            faces[name] = np.where(rng.random(counts) < 0.1, 0.0, 10.0 ** rng.uniform(-decades, 0, counts))
+            faces[name] = np.where(
+                rng.random(counts) < 0.1, 0.0, 10.0 ** rng.uniform(-decades, 0, counts)
+            )
     scale = 10.0 ** draw(st.sampled_from([-30, -3, 0, 0, 3, 30]))
     b = scale * rng.standard_normal(shape) + scale * draw(st.sampled_from([-1.0, 0.0, 1.0]))
     kind = draw(st.sampled_from(["lcp", "equations", "box", "mixed", "upper"]))
@@ -42,9 +44,14 @@ def grid_problems(draw):
     elif kind != "lcp":
         lower, upper = -scale * rng.random(shape), scale * rng.random(shape)
         if kind == "mixed":
-            lower, upper = np.where(rng.random(shape) < 0.5, lower, -np.inf), np.where(rng.random(shape) < 0.5, upper, np.inf)
+            lower, upper = (
+                np.where(rng.random(shape) < 0.5, lower, -np.inf),
+                np.where(rng.random(shape) < 0.5, upper, np.inf),
+            )
     shift = 10.0 ** rng.uniform(-3, 0, shape) if draw(st.booleans()) else None
-    return GridProblem(cells=cells, b=b, lower=lower, upper=upper, faces=faces, shift=shift), decades
+    return GridProblem(
+        cells=cells, b=b, lower=lower, upper=upper, faces=faces, shift=shift
+    ), decades
 
 
 def solvable(problem):
@@ -55,7 +62,9 @@ def solvable(problem):
     size = np.asarray(abs(exact.matrix).sum(axis=1)).ravel()
     held = np.bincount(label, sums > 1e-14 * size, count) > 0
     net, scale = (np.bincount(label, v, count) for v in (exact.b, np.abs(exact.b)))
-    below, above = (np.bincount(label, np.isfinite(v), count) > 0 for v in (exact.lower, exact.upper))
+    below, above = (
+        np.bincount(label, np.isfinite(v), count) > 0 for v in (exact.lower, exact.upper)
+    )
     unsure = ~held & (np.abs(net) <= 1e-10 * scale) & (scale > 0)
     lost = ~held & (((net > 0) & ~below) | ((net < 0) & ~above))
     return None if (unsure & lost).any() else not lost.any()
@@ -66,14 +75,22 @@ def solvable(problem):
 @given(grid_problems(), st.sampled_from(METHODS), st.sampled_from(PRECISIONS))
 def test_fuzzed_grid_problems(drawn, method, precision):
     problem, decades = drawn
-    case = SolveCase("fuzzed", "grid", lambda: problem, method, stopping={"rtol": 1e-6 if precision != "single" else 1e-3})
+    case = SolveCase(
+        "fuzzed",
+        "grid",
+        lambda: problem,
+        method,
+        stopping={"rtol": 1e-6 if precision != "single" else 1e-3},
+    )
     attempt = case.attempt(precision, "cpu")
     assert attempt.faults == []
     possible = solvable(problem)
     if possible is False:
-        assert attempt.status == "INFEASIBLE" or (attempt.status == "CONVERGED" and attempt.met)  # what is lost is small
+        # what is lost is small
+        assert attempt.status == "INFEASIBLE" or (attempt.status == "CONVERGED" and attempt.met)
     elif possible:
-        beyond = precision == "single" and decades > TAME and np.abs(problem.b).max() > 1e25  # x may be no float32 number
+        # x may be no float32 number
+        beyond = precision == "single" and decades > TAME and np.abs(problem.b).max() > 1e25
         assert attempt.status in HONEST | {"CONVERGED"} | ({"NON_FINITE"} if beyond else set())
         if precision != "single" and decades <= TAME:
             assert attempt.status == "CONVERGED"
@@ -95,10 +112,17 @@ def matrix_problems(draw):
 
 @pytest.mark.slow
 @settings(max_examples=400, deadline=None, derandomize=True)
-@given(matrix_problems(), st.sampled_from(["minimum-map-newton", "lemke", "incremental-pivoting", "interior-point", "mprgp"]))
+@given(
+    matrix_problems(),
+    st.sampled_from(
+        ["minimum-map-newton", "lemke", "incremental-pivoting", "interior-point", "mprgp"]
+    ),
+)
 def test_fuzzed_matrix_problems(drawn, method):
     problem, shift = drawn
-    attempt = SolveCase("fuzzed", "matrix", lambda: problem, method, stopping={"rtol": 1e-6}).attempt("double", "cpu")
+    attempt = SolveCase(
+        "fuzzed", "matrix", lambda: problem, method, stopping={"rtol": 1e-6}
+    ).attempt("double", "cpu")
     assert attempt.faults == []
     ends = HONEST | {"CONVERGED", "LOCAL_MINIMUM"}
     assert attempt.status in (ends if shift > 0 else ends | {"INFEASIBLE", "DIVERGED"})
@@ -119,12 +143,16 @@ def test_fuzzed_matrix_problems(drawn, method):
     transfer=st.sampled_from(["apic", "flip", "pic"]),
     precision=st.sampled_from(PRECISIONS),
 )
-def test_fuzzed_simulations(kind, dt, gravity, sideways, speed, direction, cfl, transfer, precision):
+def test_fuzzed_simulations(
+    kind, dt, gravity, sideways, speed, direction, cfl, transfer, precision
+):
     tables = {
         "time": {"cfl": cfl},
         "physics": {"gravity": [sideways * gravity, -gravity]},
         "velocity": [speed * d for d in direction],
         "particles": {"transfer": transfer},
     }
-    verdict = judge(RunCase("fuzzed", "run", made(kind, **tables), dt=dt, steps=3), precision, "cpu")
+    verdict = judge(
+        RunCase("fuzzed", "run", made(kind, **tables), dt=dt, steps=3), precision, "cpu"
+    )
     assert verdict.wrong == []

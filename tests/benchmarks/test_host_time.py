@@ -49,11 +49,16 @@ def test_calls_are_counted_in_the_stage_that_makes_them(addition):
             bound.launch()
             program.run()
             with timer.stage("within"):
-                made = wp.zeros(4, dtype=wp.float32, device="cpu")  # its own fill is no call of ours
+                # its own fill is no call of ours
+                made = wp.zeros(4, dtype=wp.float32, device="cpu")
             made.numpy()
         wp.copy(made, made)
     made.numpy()
-    assert recorder.counts == {OUTSIDE: {COPIES: 2}, "pressure": {CALLS: 2, OPERATIONS: 3, READS: 1}, "within": {ALLOCATIONS: 1}}
+    assert recorder.counts == {
+        OUTSIDE: {COPIES: 2},
+        "pressure": {CALLS: 2, OPERATIONS: 3, READS: 1},
+        "within": {ALLOCATIONS: 1},
+    }
     assert x.numpy().tolist() == [5.0] * 8  # 2, and one for each operation
 
 
@@ -62,7 +67,9 @@ def test_launches_by_warp_are_counted_by_whatever_name(addition):
         launch(bound.form.kernel, (1, 1, 1), [bound.layout, bound.fields], device="cpu")
 
     bound = addition[1]
-    recorded = wp.launch(bound.form.kernel, (1, 1, 1), [bound.layout, bound.fields], device="cpu", record_cmd=True)
+    recorded = wp.launch(
+        bound.form.kernel, (1, 1, 1), [bound.layout, bound.fields], device="cpu", record_cmd=True
+    )
     with StepRecorder(StageTimer(), 0) as recorder:
         launched()
         recorded.launch()
@@ -94,7 +101,9 @@ def test_stages_exclude_those_within_them():
 
 def test_a_measured_step_is_the_step():
     scene = load_scene("dam-break-2d", ["domain.resolution=12"])
-    plain, measured = (simulators()["fluids"].create(scene, device="cpu", folder=Path()) for _ in range(2))
+    plain, measured = (
+        simulators()["fluids"].create(scene, device="cpu", folder=Path()) for _ in range(2)
+    )
     measured.watch = timer = StageTimer()
     for _ in range(2):
         plain.step(0.01)
@@ -109,10 +118,14 @@ def test_records_of_a_scene():
     step, *stages = scene_records("dam-break-2d", 12, "cpu", steps=2, rounds=2)
     solve = next(record for record in stages if record.facts["stage"] == "pressure solve")
     assert solve.name == "dam-break-2d, 12 cells: pressure solve"
-    assert 0 < solve.figures["native"].value < solve.figures["host"].value < step.figures["host"].value
+    assert (
+        0 < solve.figures["native"].value < solve.figures["host"].value < step.figures["host"].value
+    )
     assert solve.figures[OPERATIONS].value >= solve.figures[CALLS].value > 0
     for kind in COUNTS:
-        assert step.figures[kind].value == pytest.approx(sum(record.figures[kind].value for record in stages))
+        assert step.figures[kind].value == pytest.approx(
+            sum(record.figures[kind].value for record in stages)
+        )
     for wrong in ({"steps": 0, "rounds": 1}, {"steps": 1, "rounds": 0}):
         with pytest.raises(ValueError, match="= 0: must be >= 1"):
             scene_records("dam-break-2d", 12, "cpu", **wrong)

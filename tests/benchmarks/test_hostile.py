@@ -37,14 +37,26 @@ def test_a_wrong_x_is_a_false_convergence(large):
 
 def test_signs_at_upper_bounds_and_in_equations():
     truth = box([-9.0, 0.0], lower=np.array([0.0, -np.inf]), upper=np.array([1.0, np.inf]))
-    assert categories(truth, Answer("CONVERGED", np.array([1.0, -0.5]))) == ["converged"]  # y = (-7.5, 0)
-    assert categories(replace(truth, b=np.array([9.0, 0.0])), Answer("CONVERGED", np.array([1.0, -0.5]))) == ["FALSE CONVERGED"]
+    # y = (-7.5, 0)
+    assert categories(truth, Answer("CONVERGED", np.array([1.0, -0.5]))) == ["converged"]
+    assert categories(
+        replace(truth, b=np.array([9.0, 0.0])), Answer("CONVERGED", np.array([1.0, -0.5]))
+    ) == ["FALSE CONVERGED"]
 
 
 def test_a_row_that_others_hide_is_told():
     """x_1 = 0 is wrong in its own row, but 1e-12 of the norm that the tolerance is relative to."""
-    truth = Box(A=np.eye(2), b=np.array([-1.0, -1e12]), lower=np.zeros(2), upper=np.full(2, np.inf), definite=True)
-    assert categories(truth, Answer("CONVERGED", np.array([0.0, 1e12]))) == ["converged", "row hidden"]
+    truth = Box(
+        A=np.eye(2),
+        b=np.array([-1.0, -1e12]),
+        lower=np.zeros(2),
+        upper=np.full(2, np.inf),
+        definite=True,
+    )
+    assert categories(truth, Answer("CONVERGED", np.array([0.0, 1e12]))) == [
+        "converged",
+        "row hidden",
+    ]
     assert categories(truth, Answer("CONVERGED", np.array([1.0, 1e12]))) == ["converged"]
 
 
@@ -54,7 +66,8 @@ def test_a_false_infeasible_is_seen():
     assert categories(box([-1.0, 1.0], solvable=True), claim) == ["FALSE INFEASIBLE"]
     assert categories(box([-1.0, 1.0]), claim) == ["FALSE INFEASIBLE"]
     assert categories(box([-1.0, 1.0], definite=False), claim) == ["FALSE INFEASIBLE"]
-    assert categories(box([-1.0, 0.0], A=-A, definite=False), claim) == ["infeasible right"]  # -2 x_1 - x_2 - 1 >= 0
+    # -2 x_1 - x_2 - 1 >= 0
+    assert categories(box([-1.0, 0.0], A=-A, definite=False), claim) == ["infeasible right"]
     assert categories(box([-1.0, 0.0], A=np.zeros((2, 2))), claim) == ["infeasible right"]
     assert exists(box([-1.0, 0.0], A=-A, definite=False, upper=np.ones(2)))
 
@@ -63,7 +76,9 @@ def test_what_ends_honestly():
     known = box([-1.0, 1.0], solvable=True)
     assert categories(known, Answer("STAGNATED", np.zeros(2))) == ["not solved"]
     assert categories(known, Answer("STAGNATED", np.zeros(2)), "psor") == ["other method"]
-    assert categories(replace(known, solvable=False), Answer("STAGNATED", np.zeros(2))) == ["honest"]
+    assert categories(replace(known, solvable=False), Answer("STAGNATED", np.zeros(2))) == [
+        "honest"
+    ]
     assert categories(known, Answer("REFUSED", None)) == ["refused"]
     assert categories(Refusal("no matrix"), Answer("REFUSED", None)) == ["honest"]
     assert categories(Refusal("no matrix"), Answer("CONVERGED", np.zeros(2))) == ["FALSE CONVERGED"]
@@ -76,7 +91,10 @@ def test_scales_hardly_depend_on_units():
     plain = Box(A=M, b=b, lower=np.zeros(5), upper=np.full(5, np.inf))
     other = replace(plain, A=draw.scaled(M, s, np.ones(5)), b=s * b)
     x = np.abs(rng.standard_normal(5))
-    for one, two in ((scales(other), s * scales(plain)), (residual(other, x, scales(other)), s * residual(plain, x, scales(plain)))):
+    for one, two in (
+        (scales(other), s * scales(plain)),
+        (residual(other, x, scales(other)), s * residual(plain, x, scales(plain))),
+    ):
         assert np.all((one / two > 0.1) & (one / two < 10))
 
 
@@ -90,13 +108,19 @@ def test_programs_are_judged_in_plain_units():
     for wrong in (0.4, 0.6, 0.0, 1.0):
         assert categories(truth, Answer("CONVERGED", np.array([wrong]))) == ["FALSE CONVERGED"]
     assert categories(truth, Answer("INFEASIBLE", None)) == ["FALSE INFEASIBLE"]
-    assert categories(replace(truth, expected="unbounded"), Answer("CONVERGED", np.array([0.5]))) == ["FALSE CONVERGED"]
+    assert categories(
+        replace(truth, expected="unbounded"), Answer("CONVERGED", np.array([0.5]))
+    ) == ["FALSE CONVERGED"]
 
 
 def test_values_and_exceptions():
     truth = Values({"b": np.array([1.0, -2.0])}, 1e-6)
-    assert categories(truth, Answer("CONVERGED", None, "", {"b": np.array([1.0, -2.0])})) == ["converged"]
-    assert categories(truth, Answer("CONVERGED", None, "", {"b": np.array([1.0, 2.0])})) == ["FALSE CONVERGED"]
+    assert categories(truth, Answer("CONVERGED", None, "", {"b": np.array([1.0, -2.0])})) == [
+        "converged"
+    ]
+    assert categories(truth, Answer("CONVERGED", None, "", {"b": np.array([1.0, 2.0])})) == [
+        "FALSE CONVERGED"
+    ]
 
     def fail():
         raise np.linalg.LinAlgError("from inside")
@@ -108,7 +132,11 @@ def test_values_and_exceptions():
 
 def test_the_stencil_oracle_follows_the_definition():
     """A closed side adds its coefficient to the diagonal; AIR adds nothing there."""
-    coefficients = {(0, 0): np.full((1, 2), 20.0), (0, 1): np.array([[-1.0, -5.0]]), (0, -1): np.array([[-3.0, -1.0]])}
+    coefficients = {
+        (0, 0): np.full((1, 2), 20.0),
+        (0, 1): np.array([[-1.0, -5.0]]),
+        (0, -1): np.array([[-3.0, -1.0]]),
+    }
     cells = np.ones((1, 2), int)
     closed = draw.stencil_matrix(cells, coefficients, None, (False,) * 3, draw.SOLID).toarray()
     assert np.array_equal(closed, [[17.0, -1.0], [-1.0, 15.0]])
@@ -116,8 +144,12 @@ def test_the_stencil_oracle_follows_the_definition():
     assert np.array_equal(open_, [[20.0, -1.0], [-1.0, 20.0]])
     values = np.zeros((3, 4))
     values[1, 0], values[1, 3] = 1.0, 10.0
-    assert np.array_equal(draw.boundary_term(cells, coefficients, values, (False,) * 3, draw.AIR), [[-3.0, -50.0]])
-    around = draw.stencil_matrix(np.ones((1, 3), int), {(0, 0): 5.0, (0, 1): -2.0}, 1.0, (True, False, False), draw.SOLID).toarray()
+    assert np.array_equal(
+        draw.boundary_term(cells, coefficients, values, (False,) * 3, draw.AIR), [[-3.0, -50.0]]
+    )
+    around = draw.stencil_matrix(
+        np.ones((1, 3), int), {(0, 0): 5.0, (0, 1): -2.0}, 1.0, (True, False, False), draw.SOLID
+    ).toarray()
     assert np.array_equal(around, [[6.0, -2.0, 0.0], [0.0, 6.0, -2.0], [-2.0, 0.0, 6.0]])
 
 
@@ -135,15 +167,29 @@ def test_planted_solutions_solve():
         for _ in range(8):
             case = KINDS[kind](rng)
             if isinstance(case.truth, Box) and case.truth.solution is not None:
-                assert categories(case.truth, Answer("CONVERGED", case.truth.solution))[0] == "converged", case.name
+                assert (
+                    categories(case.truth, Answer("CONVERGED", case.truth.solution))[0]
+                    == "converged"
+                ), case.name
                 planted += 1
     assert planted > 30
 
 
 SOLVED = {
-    "rows": (1, 3), "infinity": (0, 2), "program": (0, 1), "solid": (0, 1), "gradients": (1, 2), "singular": (0, 2), "narrow": (1, 4),
-    "sign": (1, 4), "low-rank": (0, 5), "friction": (0, 4), "malformed": (1, 2), "periodic": (3, 4), "odd": (1, 2),
-}  # fmt: skip
+    "rows": (1, 3),
+    "infinity": (0, 2),
+    "program": (0, 1),
+    "solid": (0, 1),
+    "gradients": (1, 2),
+    "singular": (0, 2),
+    "narrow": (1, 4),
+    "sign": (1, 4),
+    "low-rank": (0, 5),
+    "friction": (0, 4),
+    "malformed": (1, 2),
+    "periodic": (3, 4),
+    "odd": (1, 2),
+}
 
 
 @pytest.mark.parametrize(("kind", "index"), [(kind, i) for kind in KINDS for i in SOLVED[kind]])

@@ -12,8 +12,14 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_tests_that_bear_a_modules_name_come_first():
-    assert chosen_for(ROOT, "warp_lcp/multigrid/hierarchy.py")[0] == "tests/multigrid/test_hierarchy.py"
-    assert chosen_for(ROOT, "warp_lcp/material/sources_kernels.py")[0] == "tests/material/test_sources.py"
+    assert (
+        chosen_for(ROOT, "warp_lcp/multigrid/hierarchy.py")[0]
+        == "tests/multigrid/test_hierarchy.py"
+    )
+    assert (
+        chosen_for(ROOT, "warp_lcp/material/sources_kernels.py")[0]
+        == "tests/material/test_sources.py"
+    )
 
 
 def test_a_mutant_is_one_change_that_still_is_python():
@@ -47,18 +53,30 @@ def test_mutants_of_formulas_are_one_change():
     for mutant, formula in zip(of_formulas(ROOT), FORMULAS, strict=True):
         source = (ROOT / mutant.module).read_text()
         assert formula.before.split("\n")[0].strip() in source.splitlines()[mutant.line - 1]
-        assert mutated(source, mutant.operator, mutant.occurrence) == source.replace(formula.before, formula.after) != source
+        assert (
+            mutated(source, mutant.operator, mutant.occurrence)
+            == source.replace(formula.before, formula.after)
+            != source
+        )
 
 
 def test_headers_are_changed_between_operands_only():
     pytest.importorskip("cosmic_ray")
     from warp_lcp.benchmarks.mutants.mutations import mutated, native_places
 
-    source = "#if A && B\nconst float* x = (const float*)y + row;  // a < b\nif (*x < -1) { z = a*b; }\n"
+    source = (
+        "#if A && B\nconst float* x = (const float*)y + row;  // a < b\nif (*x < -1) { z = a*b; }\n"
+    )
     swapped = {mutated(source, "NativeSwap", n) for n in range(len(native_places(source)))}
-    assert swapped == {source.replace(*pair) for pair in [("y + row", "y - row"), ("x < -1", "x <= -1"), ("a*b", "a/b")]}
+    assert swapped == {
+        source.replace(*pair)
+        for pair in [("y + row", "y - row"), ("x < -1", "x <= -1"), ("a*b", "a/b")]
+    }
 
 
 def test_headers_have_the_tests_of_who_names_them():
-    assert "tests/multigrid/test_hierarchy.py" in chosen_for(ROOT, "warp_lcp/multigrid/headers/coarsen.h")[:4]
+    assert (
+        "tests/multigrid/test_hierarchy.py"
+        in chosen_for(ROOT, "warp_lcp/multigrid/headers/coarsen.h")[:4]
+    )
     assert "tests/rows/test_row_pass.py" in chosen_for(ROOT, "warp_lcp/rows/headers/piece.h")[:2]

@@ -76,7 +76,12 @@ def test_peers_of_the_linear_solve_find_its_solution():
     question = Question(splash(12), "linear")
     x = np.linalg.solve(question.matrix.toarray(), -question.b)
     classical = partial(libraries.pyamg, build="ruge_stuben_solver")
-    for solve in (libraries.pyamg, classical, libraries.scipy_cg, partial(libraries.warp_cg, device="cpu")):
+    for solve in (
+        libraries.pyamg,
+        classical,
+        libraries.scipy_cg,
+        partial(libraries.warp_cg, device="cpu"),
+    ):
         answer = solve(question, 1e-9)
         assert np.allclose(answer.x, x, atol=1e-7 * np.abs(x).max())
         assert answer.iterations > 0
@@ -111,13 +116,17 @@ def test_petsc_finds_the_solutions(question):
                 assert asked.residual(answer.x) < 1e-6, peer.name
                 assert answer.linear_iterations >= answer.iterations > 0
                 if bounds == "walls":
-                    assert np.allclose(answer.x, dense_solution(question), atol=1e-5 * np.abs(answer.x).max())
+                    assert np.allclose(
+                        answer.x, dense_solution(question), atol=1e-5 * np.abs(answer.x).max()
+                    )
 
 
 @pytest.fixture
 def stub(tmp_path):
     (tmp_path / "stub.py").write_text(STUB)
-    worker = Worker("json", [sys.executable, str(tmp_path / "stub.py"), str(Path(petsc.__file__).parent)])
+    worker = Worker(
+        "json", [sys.executable, str(tmp_path / "stub.py"), str(Path(petsc.__file__).parent)]
+    )
     yield worker
     worker.close()
 
@@ -140,7 +149,10 @@ def test_a_missing_peer_tells_how_to_get_it(monkeypatch):
     assert petsc.missing().startswith("missing: no interpreter imports petsc4py; apt-get install")
     monkeypatch.setenv(petsc.VARIABLE, "/no/such/python")
     assert petsc.interpreter("json") is None
-    assert "/no/such/python, which WARP_LCP_PETSC_PYTHON names, does not import petsc4py" in petsc.missing()
+    assert (
+        "/no/such/python, which WARP_LCP_PETSC_PYTHON names, does not import petsc4py"
+        in petsc.missing()
+    )
     assert petsc.interpreter("json", "WARP_LCP_TEST_OTHER") == sys.executable
 
 
@@ -159,7 +171,9 @@ def contest(question, errors):
 def test_tolerances_are_tightened_until_the_residual_is_as_asked(question):
     x = dense_solution(question)
     size = question.residual(2 * x)  # the residual that an error as large as x has
-    exact, loose, hopeless, broken = (contest(question, e) for e in (0.5 / size, 20 / size, 1e9 / size, None))
+    exact, loose, hopeless, broken = (
+        contest(question, e) for e in (0.5 / size, 20 / size, 1e9 / size, None)
+    )
     for one in (exact, loose, hopeless, broken):
         one.calibrate()
         one.again()

@@ -5,23 +5,37 @@ import pytest
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.benchmarks.problems import BOUNDS, anisotropic, basin, cut_cells, splash, splash_part, warm_changes
+from warp_lcp.benchmarks.problems import (
+    BOUNDS,
+    anisotropic,
+    basin,
+    cut_cells,
+    splash,
+    splash_part,
+    warm_changes,
+)
 
 
 def test_splash_has_liquid_on_walls_and_no_outflow_elsewhere():
     scene = splash(20)
     fluid, around = scene.cells == wl.FLUID, np.pad(scene.cells, 1, constant_values=wl.SOLID)
-    neighbors = [np.roll(around, step, axis)[1:-1, 1:-1, 1:-1] for axis in range(3) for step in (-1, 1)]
+    neighbors = [
+        np.roll(around, step, axis)[1:-1, 1:-1, 1:-1] for axis in range(3) for step in (-1, 1)
+    ]
     assert np.array_equal(scene.wall, fluid & np.any([n == wl.SOLID for n in neighbors], axis=0))
     assert 0.3 < fluid.mean() < 0.7
     assert (scene.b[~fluid] == 0).all()
     assert np.count_nonzero(scene.b) == fluid.sum()
 
 
-@pytest.mark.parametrize("part", [(slice(0, 5), slice(3, 20), slice(11, 20)), (slice(6, 9), slice(0, 20), slice(4, 5))])
+@pytest.mark.parametrize(
+    "part", [(slice(0, 5), slice(3, 20), slice(11, 20)), (slice(6, 9), slice(0, 20), slice(4, 5))]
+)
 def test_a_part_is_that_of_the_whole(part):
     whole, found = splash(20, phase=0.23), splash_part(20, part, phase=0.23)
-    around = np.pad(whole.cells, 1, constant_values=wl.SOLID)[tuple(slice(s.start, s.stop + 2) for s in part)]
+    around = np.pad(whole.cells, 1, constant_values=wl.SOLID)[
+        tuple(slice(s.start, s.stop + 2) for s in part)
+    ]
     assert np.array_equal(found.cells, around)
     assert np.array_equal(found.wall, whole.wall[part])
     assert np.array_equal(found.b, whole.b[part])

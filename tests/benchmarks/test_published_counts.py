@@ -17,7 +17,10 @@ from warp_lcp.benchmarks.book.outcome import outcome
 
 PAGE = (Path(__file__).parents[2] / "docs" / "published-methods.md").read_text()
 SLOW = pytest.mark.slow
-ROWS = [pytest.param(c, marks=SLOW if c.slow else (), id=f"{c.method}, {c.problem}, {c.printed[0]:g}") for c in counts.COUNTS]
+ROWS = [
+    pytest.param(c, marks=SLOW if c.slow else (), id=f"{c.method}, {c.problem}, {c.printed[0]:g}")
+    for c in counts.COUNTS
+]
 
 
 def documented(count):
@@ -48,7 +51,8 @@ def test_active_sets_have_the_printed_sizes():
     sizes = [record.active for record in result.history[2:]]
     assert [*sizes[:2], *sizes[17:19]] == [13164, 12363, 5399, 5399]
     assert result.history[0].residual == pytest.approx(0.310059, abs=5e-7)
-    assert result.history[2].residual == pytest.approx(3.9373, rel=1e-3)  # the linear solves are inexact
+    # the linear solves are inexact
+    assert result.history[2].residual == pytest.approx(3.9373, rel=1e-3)
 
 
 def fischer_newton(A, b, lower, scale, tolerance):
@@ -84,7 +88,14 @@ def test_fischer_newton_takes_more_steps_as_its_map_is_scaled():
         args = sparse.A.tocsr(), sparse.b, np.asarray(sparse.lower)
         unscaled.append(fischer_newton(*args, 1.0, counts.SOLVED))
         scaled.append(fischer_newton(*args, 4.0, counts.SOLVED))
-    assert np.abs(np.subtract(unscaled, counts.cold_membrane(counts.SEMISMOOTH, counts.fischer_norm, sizes))).max() <= 1
+    assert (
+        np.abs(
+            np.subtract(
+                unscaled, counts.cold_membrane(counts.SEMISMOOTH, counts.fischer_norm, sizes)
+            )
+        ).max()
+        <= 1
+    )
     method = dataclasses.replace(counts.SEMISMOOTH, scaled=True)
     assert scaled == list(counts.cold_membrane(method, counts.fischer_norm, sizes)) == [9, 13, 14]
 
@@ -97,7 +108,10 @@ def semismooth(A, b, lower, x, tolerance):
         kink = np.hypot(a, y) < 1e-12
         z = np.where(kink, 1.0, 0.0)
         u, v = np.where(kink, z, a), np.where(kink, A @ z, y)
-        f, J = a + y - np.hypot(a, y), np.diag(1 - u / np.hypot(u, v)) + (1 - v / np.hypot(u, v))[:, None] * A
+        f, J = (
+            a + y - np.hypot(a, y),
+            np.diag(1 - u / np.hypot(u, v)) + (1 - v / np.hypot(u, v))[:, None] * A,
+        )
         norms.append(np.linalg.norm(f))
         size = np.linalg.norm(J.T @ f)
         first = first or size
@@ -115,7 +129,9 @@ def test_semismooth_steps_on_the_put_are_those_printed():
         V = np.r_[payoff[0], x, payoff[-1]]
         steps.append(len(norms) - 1)
         if k == 0:
-            np.testing.assert_allclose(norms, [23.7, 10.1049, 1.44247, 0.0299771, 0.00273847, 8.69442e-5], rtol=1e-5)
+            np.testing.assert_allclose(
+                norms, [23.7, 10.1049, 1.44247, 0.0299771, 0.00273847, 8.69442e-5], rtol=1e-5
+            )
     assert steps == [5, 5, 4, 4, 4, 4, 4, 4, 4] == list(counts.put())
 
 
@@ -139,7 +155,10 @@ def num4lcp(A, b):
         dx = np.zeros(len(b))
         dx[moves] = np.linalg.solve(J[np.ix_(moves, moves)], -f[moves])
         slope, length = float(f @ (J @ dx)), 1.0
-        while 0.5 * np.sum(evaluate(np.maximum(x + length * dx, 0.0))[1] ** 2) > merit + 1e-3 * length * slope:
+        while (
+            0.5 * np.sum(evaluate(np.maximum(x + length * dx, 0.0))[1] ** 2)
+            > merit + 1e-3 * length * slope
+        ):
             length /= 2
         x, before = np.maximum(x + length * dx, 0.0), merit
     return 100
@@ -150,7 +169,9 @@ def test_steps_on_random_contacts_are_num4lcps(tangents):
     problems = [counts.contact_problem(k, tangents) for k in range(8)]
     solver, merit = appendix_c.METHODS["Fischer-Newton"]
     here = outcome("contacts", problems, solver, merit, "cpu")
-    assert [iterations for _, iterations, _ in here.verdicts] == [num4lcp(p.A, p.b) for p in problems]
+    assert [iterations for _, iterations, _ in here.verdicts] == [
+        num4lcp(p.A, p.b) for p in problems
+    ]
 
 
 @pytest.mark.slow
@@ -176,9 +197,9 @@ def largest_eigenvalue(A):
 def projected_gradients(A, b, lower, tolerance, *, diagonal=False, half_step=False):
     """MPRGP after Dostal and Schoeberl with Gamma = 1, as in PERMON; returns steps of conjugate gradients, expansions, proportionings.
 
-    diagonal: preconditioned by A's diagonal D on the free unknowns, with the reduced free gradient min(phi, D (x - l)) in the test for
-    proportioning. half_step: expansions go to the first bound and then a step of 2 / ||A|| along the free gradient; without, the whole
-    step is projected.
+    diagonal: preconditioned by A's diagonal D on the free unknowns, with the reduced free gradient
+    min(phi, D (x - l)) in the test for proportioning. half_step: expansions go to the first bound
+    and then a step of 2 / ||A|| along the free gradient; without, the whole step is projected.
     """
     x, taken = np.maximum(0.0, lower), [0, 0, 0]
     M = A.diagonal() if diagonal else np.ones(len(b))
@@ -239,4 +260,6 @@ def test_plain_projected_gradients_take_the_printed_steps(problem, settings, pri
 def test_the_diagonal_explains_mprgp_on_bearings(size):
     A, b, lower, tolerance = counts.bearing_problem(*size)
     here = counts.gradient_steps(A, b, lower, tolerance)
-    assert abs(sum(projected_gradients(A, b, lower, tolerance, diagonal=True)) - here) <= counts.WITHIN
+    assert (
+        abs(sum(projected_gradients(A, b, lower, tolerance, diagonal=True)) - here) <= counts.WITHIN
+    )

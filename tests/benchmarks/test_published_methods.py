@@ -29,7 +29,9 @@ def test_cycles_without_coarse_levels_on_the_active_set_need_no_other_steps():
     scene = plane(128)
     counts = {}
     for method in (published.TruncatedMultigrid(monotone_cycles=0), wl.ProjectedMultigrid()):
-        result = wl.solve(scene.lcp("everywhere", device="cpu"), method, stopping=wl.StoppingCriteria(rtol=1e-6))
+        result = wl.solve(
+            scene.lcp("everywhere", device="cpu"), method, stopping=wl.StoppingCriteria(rtol=1e-6)
+        )
         counts[type(method).__name__] = result.iterations
         assert result
         assert result.linear_iterations == result.iterations

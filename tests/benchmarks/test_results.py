@@ -10,7 +10,16 @@ from warp_lcp import benchmarks
 from warp_lcp.benchmarks.harness import machine, report
 from warp_lcp.benchmarks.harness.compare import bounds, comparison
 from warp_lcp.benchmarks.harness.machine import array_bytes, resident_bytes
-from warp_lcp.benchmarks.harness.record import Bars, Lines, Record, Results, Table, Target, read_json, write_json
+from warp_lcp.benchmarks.harness.record import (
+    Bars,
+    Lines,
+    Record,
+    Results,
+    Table,
+    Target,
+    read_json,
+    write_json,
+)
 from warp_lcp.benchmarks.harness.timing import Figure, in_turns, ratios, timed
 
 
@@ -50,11 +59,19 @@ def test_files_keep_records(tmp_path):
     write_json(path, [record("one", 1.0, 2.0, n=64), record("two", 3.0)])
     kept = json.loads(path.read_text())
     assert [r["name"] for r in kept] == ["one", "two"]
-    assert kept[0]["figures"]["total"] == {"value": 1.5, "unit": "s", "min": 1.0, "max": 2.0, "samples": 2}
+    assert kept[0]["figures"]["total"] == {
+        "value": 1.5,
+        "unit": "s",
+        "min": 1.0,
+        "max": 2.0,
+        "samples": 2,
+    }
     assert read_json(path)["one"].facts == {"n": 64}
 
 
-@pytest.mark.parametrize("content", ["", "{}", "[1]", '[{"name": "x"}]', '[{"name": "x", "figures": {"a": {}}}]'])
+@pytest.mark.parametrize(
+    "content", ["", "{}", "[1]", '[{"name": "x"}]', '[{"name": "x", "figures": {"a": {}}}]']
+)
 def test_other_files_are_refused(tmp_path, content):
     path = tmp_path / "x.json"
     path.write_text(content)
@@ -67,8 +84,24 @@ def test_other_files_are_refused(tmp_path, content):
 
 def test_comparison_tells_change_from_noise(tmp_path):
     old, new = tmp_path / "old.json", tmp_path / "new.json"
-    write_json(old, [record("same", 1.0, 1.1, 1.2), record("slower", 1.0, 1.1, 1.2), record("faster", 1.0, 1.1, 1.2), record("gone", 1.0)])
-    write_json(new, [record("same", 1.1, 1.15, 1.3), record("slower", 2.0, 2.2, 2.4), record("faster", 0.5, 0.6, 0.7), record("new", 1.0)])
+    write_json(
+        old,
+        [
+            record("same", 1.0, 1.1, 1.2),
+            record("slower", 1.0, 1.1, 1.2),
+            record("faster", 1.0, 1.1, 1.2),
+            record("gone", 1.0),
+        ],
+    )
+    write_json(
+        new,
+        [
+            record("same", 1.1, 1.15, 1.3),
+            record("slower", 2.0, 2.2, 2.4),
+            record("faster", 0.5, 0.6, 0.7),
+            record("new", 1.0),
+        ],
+    )
     lines = {line.split()[0]: line for line in comparison(old, new).splitlines()}
     assert lines["same"].endswith("within noise")
     assert lines["slower"].endswith("more")
@@ -90,7 +123,13 @@ def test_report_and_charts(tmp_path):
     assert [image.name for image in images] == ["x-b.png", "x-l.png"]
     assert all(image.read_bytes().startswith(b"\x89PNG") for image in images)
     where = Record("machine", {}, {"date": "today", "hardware": {"cpu": "Z80"}})
-    report.write_markdown(tmp_path / "x.md", "Title", where, [Table("T", ["a", "b"], [["1", "2|3"]], "Remark.")], images)
+    report.write_markdown(
+        tmp_path / "x.md",
+        "Title",
+        where,
+        [Table("T", ["a", "b"], [["1", "2|3"]], "Remark.")],
+        images,
+    )
     text = (tmp_path / "x.md").read_text()
     assert "# Title\n" in text
     assert "- hardware: cpu Z80" in text
@@ -103,7 +142,9 @@ def test_no_charts_without_matplotlib(tmp_path, monkeypatch):
     assert report.draw([Bars("b", "bars", "s", {"one": 1.0})], tmp_path, "x") == []
     assert not machine.present("no-such-distribution")
     where = Record("machine", {}, {"date": "today"})
-    said = report.write("x", "Title", Results([where], [], [Bars("b", "bars", "s", {"one": 1.0})]), tmp_path)
+    said = report.write(
+        "x", "Title", Results([where], [], [Bars("b", "bars", "s", {"one": 1.0})]), tmp_path
+    )
     assert said[0].startswith("no plots: Matplotlib is missing (pip install")
     assert {path.name for path in tmp_path.iterdir()} == {"x.json", "x.md"}
 
@@ -112,7 +153,12 @@ def test_targets():
     assert Target("x", 2, Figure(1.5)).met
     assert not Target("x", 2, Figure(1.5), at_least=True).met
     assert Target("x", 2, None).row() == ["x", "<= 2", "not measured here", ""]
-    assert Target("x", 40, Figure.of([30.0, 41.0, 43.0]), " x", True).row() == ["x", ">= 40 x", "41 x (30 to 43)", "yes"]
+    assert Target("x", 40, Figure.of([30.0, 41.0, 43.0]), " x", True).row() == [
+        "x",
+        ">= 40 x",
+        "41 x (30 to 43)",
+        "yes",
+    ]
 
 
 def test_array_bytes_count_memory_once():
@@ -143,5 +189,6 @@ def test_kept_results_can_be_read():
 def test_kept_results_are_small():
     kept = Path(benchmarks.__file__).parent / "results"
     sizes = {path: path.stat().st_size for path in kept.rglob("*") if path.is_file()}
-    assert sum(sizes.values()) < 2.45e6  # `validation` has 492 figures and 21 plots, `host` 80 kB, `choose` every method on 69 problems
+    # `validation` has 492 figures and 21 plots, `host` 80 kB, `choose` every method on 69 problems
+    assert sum(sizes.values()) < 2.45e6
     assert {path.suffix for path in sizes} == {".json", ".md", ".png", ".tsv"}

@@ -17,7 +17,8 @@ def test_sand_runs_out_alike_on_a_finer_grid() -> None:
     """A slot of 8 cells and one of 16 half as large: the law's delta, of a cell or so, is all that is between them."""
     coarse, fine = (sand_hourglass.sand(8 * n, n) for n in (1, 2))
     root = [float(d.rate.mean()) ** (2.0 / 3.0) for d in (coarse, fine)]
-    assert 1.0 < root[1] / root[0] < (16.0 - 2.0) / (16.0 - 4.0)  # (16 - delta) / (16 - 2 delta) for delta from 0 to 2 cells
+    # (16 - delta) / (16 - 2 delta) for delta from 0 to 2 cells
+    assert 1.0 < root[1] / root[0] < (16.0 - 2.0) / (16.0 - 4.0)
 
 
 @pytest.mark.slow

@@ -29,7 +29,8 @@ def test_sizes_stop_where_memory_ends(monkeypatch):
     assert sizes == [32, 64]
     assert left_out == {128: "128^3 needs about 0.1 GiB on cuda:0, where 0.0 GiB are free"}
     free |= {"cuda:0": 1 << 50, "cpu": 100 * 64**3}
-    assert scaling.fitting([32, 64, 128], "cuda:0")[0] == [32, 64]  # the scene is made in the host's memory
+    # the scene is made in the host's memory
+    assert scaling.fitting([32, 64, 128], "cuda:0")[0] == [32, 64]
     assert scaling.fitting([32, 64], "cpu")[0] == [32]  # which holds both, on the CPU
     monkeypatch.setattr(scaling, "free_memory", lambda device: None)
     assert scaling.fitting([1024], "cpu") == ([1024], {})
@@ -37,7 +38,11 @@ def test_sizes_stop_where_memory_ends(monkeypatch):
 
 def test_estimate_of_memory_bounds_what_a_solve_takes(tmp_path):
     records = measured(tmp_path, "--size", 48)
-    most = max(r["figures"]["bytes_per_cell"]["value"] for r in records.values() if "bytes_per_cell" in r["figures"])
+    most = max(
+        r["figures"]["bytes_per_cell"]["value"]
+        for r in records.values()
+        if "bytes_per_cell" in r["figures"]
+    )
     assert 30 < most < scaling.SOLVE_BYTES
 
 
@@ -46,7 +51,11 @@ def measured(tmp_path, *options):
     result = CliRunner().invoke(cli.app, [str(a) for a in arguments])
     assert result.exit_code == 0, result.stderr
     assert f"{tmp_path / 'scaling.json'}" in result.stdout
-    return {r["name"]: r for r in json.loads((tmp_path / "scaling.json").read_text()) if r["name"] != "machine"}
+    return {
+        r["name"]: r
+        for r in json.loads((tmp_path / "scaling.json").read_text())
+        if r["name"] != "machine"
+    }
 
 
 def test_scaling(tmp_path):
@@ -54,7 +63,12 @@ def test_scaling(tmp_path):
     for name in ("16^3 linear", "24^3 walls", "24^3 everywhere"):
         figures = {k: f["value"] for k, f in records[name]["figures"].items()}
         assert figures["setup"] < figures["to_1e-04"] <= figures["to_1e-06"] <= figures["to_1e-08"]
-        assert figures["iterations_to_1e-04"] < figures["iterations_to_1e-06"] < figures["iterations_to_1e-08"] <= 12
+        assert (
+            figures["iterations_to_1e-04"]
+            < figures["iterations_to_1e-06"]
+            < figures["iterations_to_1e-08"]
+            <= 12
+        )
         assert figures["converged"] == 1
         assert figures["residual"] <= 1e-8
         assert {"bytes_per_cell", "per_cell", "in_copies"} <= figures.keys()
@@ -62,13 +76,23 @@ def test_scaling(tmp_path):
     assert (growth["from"], growth["to"]) == (16, 24)
     assert growth["figures"]["exponent_to_1e-06"]["samples"] == 2
     text = (tmp_path / "scaling.md").read_text()
-    assert "| exponent of the seconds to 1e-6, linear, 16^3 to 24^3 | <= 1.05 | not measured here |  |" in text  # too small to be judged
+    # too small to be judged
+    assert (
+        "| exponent of the seconds to 1e-6, linear, 16^3 to 24^3 | <= 1.05 | not measured here |  |"
+        in text
+    )
     assert "| mixed precision: largest floor of any grid | <= 1e-08 |" in text
-    assert {path.name for path in tmp_path.glob("*.png")} == {"scaling-seconds.png", "scaling-floors.png"}
+    assert {path.name for path in tmp_path.glob("*.png")} == {
+        "scaling-seconds.png",
+        "scaling-floors.png",
+    }
 
 
 def floors(n):
-    return {r.facts["precision"]: r for r in (scaling.floor(splash(n), "walls", p, "cpu") for p in scaling.PRECISIONS)}
+    return {
+        r.facts["precision"]: r
+        for r in (scaling.floor(splash(n), "walls", p, "cpu") for p in scaling.PRECISIONS)
+    }
 
 
 def test_floors_grow_with_the_grid_and_shrink_with_the_precision():
@@ -84,8 +108,15 @@ def test_floors_grow_with_the_grid_and_shrink_with_the_precision():
 
 
 def test_a_solve_that_tells_another_residual_is_a_failure():
-    ended = Record("floor 16^3 walls mixed", {"floor": Figure(1e-7), "told": Figure(1e-15)}, {"precision": "mixed"})
-    lines = ["floor 16^3 walls mixed: ends at 1.00e-07", "floor 16^3 walls mixed: the solve tells 1.00e-15, x has 1.00e-07"]
+    ended = Record(
+        "floor 16^3 walls mixed",
+        {"floor": Figure(1e-7), "told": Figure(1e-15)},
+        {"precision": "mixed"},
+    )
+    lines = [
+        "floor 16^3 walls mixed: ends at 1.00e-07",
+        "floor 16^3 walls mixed: the solve tells 1.00e-15, x has 1.00e-07",
+    ]
     assert scaling._failures([ended]) == lines
 
 
@@ -100,7 +131,10 @@ def test_the_residual_is_that_of_the_matrix(bounds):
     x = np.random.default_rng(271).standard_normal(scene.cells.shape)
     lower = np.broadcast_to(scene.lower(bounds), x.shape)
     y = scene.matrix() @ x[fluid] + scene.b[fluid]
-    assert norm(x) == pytest.approx(np.linalg.norm(np.minimum(x[fluid] - lower[fluid], y)), rel=1e-12)
+    assert norm(x) == pytest.approx(
+        np.linalg.norm(np.minimum(x[fluid] - lower[fluid], y)), rel=1e-12
+    )
     solved = np.zeros(x.shape)
     solved[fluid] = scipy.sparse.linalg.spsolve(scene.matrix().tocsc(), -scene.b[fluid])
-    assert norm(solved, "linear") < 1e-12 * norm(0.0 * x, "linear") < norm(-solved, "linear")  # a wrong sign is seen
+    # a wrong sign is seen
+    assert norm(solved, "linear") < 1e-12 * norm(0.0 * x, "linear") < norm(-solved, "linear")

@@ -36,12 +36,18 @@ def measured(tmp_path, suite, *options):
 
 def test_suites_are_installed():
     assert {"kernels", "run", "sand", "solvers", "validation"} <= benchmarks().keys()
-    assert all(suite.name == name and suite.summary and "minutes" in suite.takes for name, suite in benchmarks().items())
+    assert all(
+        suite.name == name and suite.summary and "minutes" in suite.takes
+        for name, suite in benchmarks().items()
+    )
 
 
 def test_the_page_says_what_each_suite_takes():
     page = (Path(__file__).parents[2] / "docs" / "benchmarks.md").read_text()
-    assert all(re.search(rf"^\| `{name}` \| .* \| {suite.takes} \|$", page, flags=re.M) for name, suite in benchmarks().items())
+    assert all(
+        re.search(rf"^\| `{name}` \| .* \| {suite.takes} \|$", page, flags=re.M)
+        for name, suite in benchmarks().items()
+    )
 
 
 def test_kernels(tmp_path):
@@ -53,21 +59,39 @@ def test_kernels(tmp_path):
     assert product["figures"]["bytes_per_cell"]["value"] == 9
     faces = records["16^3 faces: stencil.product, float32"]
     assert faces["figures"]["bytes_per_cell"]["value"] == 24
-    assert {"rate", "bandwidth", "of_copy", "over Warp, one thread a cell"} <= product["figures"].keys()
+    assert {"rate", "bandwidth", "of_copy", "over Warp, one thread a cell"} <= product[
+        "figures"
+    ].keys()
 
 
 @pytest.mark.slow
 def test_solvers(tmp_path):
     records = measured(tmp_path, "solvers", "--size", 16)
     case = records["16^3 unit walls ProjectedMultigrid"]["figures"]
-    expected = {"setup", "solve", "total", "reuse", "warm", "iterations", "to_1e-04", "to_1e-06", "to_1e-08", "bytes_per_cell"}
+    expected = {
+        "setup",
+        "solve",
+        "total",
+        "reuse",
+        "warm",
+        "iterations",
+        "to_1e-04",
+        "to_1e-06",
+        "to_1e-08",
+        "bytes_per_cell",
+    }
     assert expected <= case.keys()
     assert case["converged"]["value"] == 1
     assert case["residual"]["value"] <= 1e-6
     assert records["16^3 unit linear PyAMG SA-CG"]["figures"]["residual"]["value"] <= 2e-6
     assert "16^3 arrays 1:100 walls ProjectedMultigrid" in records
-    assert records["definite 100: minimum-map-newton"]["status"] == records["fluid 12^3: psor"]["status"] == "CONVERGED"
-    assert "contacts of 12 bodies: incremental-pivoting" not in records  # which takes symmetric matrices only
+    assert (
+        records["definite 100: minimum-map-newton"]["status"]
+        == records["fluid 12^3: psor"]["status"]
+        == "CONVERGED"
+    )
+    # which takes symmetric matrices only
+    assert "contacts of 12 bodies: incremental-pivoting" not in records
     again = call("solvers", "--compare", tmp_path / "solvers.json", tmp_path / "solvers.json")
     assert again.exit_code == 0
     assert "[1.000, 1.000]    within noise" in again.stdout
@@ -77,7 +101,12 @@ def test_solvers(tmp_path):
 def test_devices(tmp_path):
     records = measured(tmp_path, "devices", "--size", 16)
     assert records["16^3: ProjectedMultigrid"]["status"] == "CONVERGED"
-    names = {"16^3: a sweep of PGS", "16^3: product", "a step of dam-break, 16 cells", "a step of column-collapse, 16 cells"}
+    names = {
+        "16^3: a sweep of PGS",
+        "16^3: product",
+        "a step of dam-break, 16 cells",
+        "a step of column-collapse, 16 cells",
+    }
     assert names <= records.keys()
     assert all(records[name]["figures"]["seconds"]["value"] > 0 for name in names)
 
@@ -94,7 +123,9 @@ def test_run(tmp_path):
     records = measured(tmp_path, "run", "--size", 16)
     scene = records["dam-break"]["figures"]
     assert scene["steps"]["value"] > 3
-    assert sum(figure["value"] for name, figure in scene.items() if name.startswith("share")) == pytest.approx(1)
+    assert sum(
+        figure["value"] for name, figure in scene.items() if name.startswith("share")
+    ) == pytest.approx(1)
     assert records["particles, 3-D"]["figures"]["round_trip"]["value"] > 0
     assert records["dam-break, 3-D: walls"]["figures"]["solve_over_linear"]["value"] > 0
 

@@ -20,14 +20,18 @@ pytestmark = pytest.mark.usefixtures("only_new_objects")
 
 
 def options(**changes: object) -> Options:
-    return Options(**({"device": "cpu", "sizes": (16,), "repeat": 1, "say": lambda text: None} | changes))  # type: ignore[arg-type]
+    return Options(
+        **({"device": "cpu", "sizes": (16,), "repeat": 1, "say": lambda text: None} | changes)
+    )  # type: ignore[arg-type]
 
 
 def test_the_pareto_front_against_all_pairs() -> None:
     rng = np.random.default_rng(8123)
     for _ in range(20):
         points = [(float(x), float(y)) for x, y in rng.integers(0, 12, (40, 2))]
-        best = {p for p in points if not any(q != p and q[0] <= p[0] and q[1] <= p[1] for q in points)}
+        best = {
+            p for p in points if not any(q != p and q[0] <= p[0] and q[1] <= p[1] for q in points)
+        }
         found = [points[i] for i in front_of(points)]
         assert set(found) == best
         assert found == sorted(best)
@@ -40,12 +44,25 @@ def test_there_are_sixty_settings_that_the_scene_takes(name: str) -> None:
     assert len({setting.name for setting in settings}) == len(settings)
     for setting in settings:
         resolution = round(setting.scale * tradeoff.SCENES[name])
-        assert load_scene(name, [f"domain.resolution={resolution}", *setting.overrides]).domain.resolution == resolution
+        assert (
+            load_scene(
+                name, [f"domain.resolution={resolution}", *setting.overrides]
+            ).domain.resolution
+            == resolution
+        )
 
 
 def test_axes_that_are_compared() -> None:
     words = " ".join(setting.name for setting in settings_of("fluids"))
-    for key in ("time.cfl", "solver.tolerance", "solver.precision", "solver.method", "pressure.model", "pressure.surface", "resolution x"):
+    for key in (
+        "time.cfl",
+        "solver.tolerance",
+        "solver.precision",
+        "solver.method",
+        "pressure.model",
+        "pressure.surface",
+        "resolution x",
+    ):
         assert key in words
     with pytest.raises(ValueError, match="simulator smoke: has no settings"):
         settings_of("smoke")
@@ -53,7 +70,12 @@ def test_axes_that_are_compared() -> None:
 
 def test_a_run_is_compared_with_its_own_reference_and_the_finest() -> None:
     runs = Runs("dam-break-2d", 16, 3, options())
-    long, short = runs.measure([Setting("a", ("time.dt_max=0.04", "time.cfl=8")), Setting("b", ("time.dt_max=0.004", "time.cfl=0.5"))])
+    long, short = runs.measure(
+        [
+            Setting("a", ("time.dt_max=0.04", "time.cfl=8")),
+            Setting("b", ("time.dt_max=0.004", "time.cfl=0.5")),
+        ]
+    )
     for run in (long, short):
         assert len(run.seconds) == 1
         assert run.bytes > 16 * 8 * 50  # fields of the grid alone
@@ -70,7 +92,10 @@ def test_a_run_is_compared_with_its_own_reference_and_the_finest() -> None:
 @pytest.fixture
 def few(monkeypatch: pytest.MonkeyPatch) -> None:
     """Make the suite small."""
-    kept = [Setting(f"cfl {cfl:g}", (f"time.cfl={cfl:g}", f"time.dt_max={0.005 * cfl:g}")) for cfl in (4.0, 1.0)]
+    kept = [
+        Setting(f"cfl {cfl:g}", (f"time.cfl={cfl:g}", f"time.dt_max={0.005 * cfl:g}"))
+        for cfl in (4.0, 1.0)
+    ]
     monkeypatch.setattr(tradeoff, "settings_of", lambda simulator: kept)
     monkeypatch.setattr(solves, "grid_methods", lambda: ("projected-multigrid", "psor"))
     monkeypatch.setattr(solves.Pressures, "tolerances", (1e-1, 1e-3, 1e-5))
@@ -90,14 +115,20 @@ def test_the_files_of_a_small_suite(scene: str, few: None, tmp_path: Path) -> No
     solved = [r for r in records.values() if r.get("kind") == "solve"]
     curves: dict[tuple[str, str], list[float]] = {}
     for r in solved:
-        assert r["figures"]["residual"]["value"] <= (1.1 * r["tolerance"] if scene.startswith("dam") else 0.1)
+        assert r["figures"]["residual"]["value"] <= (
+            1.1 * r["tolerance"] if scene.startswith("dam") else 0.1
+        )
         curves.setdefault((r["method"], r["precision"]), []).append(r["figures"]["error"]["value"])
     for errors in curves.values():
-        assert errors[-1] < (0.1 if scene.startswith("dam") else 0.5) * errors[0]  # sand is known to 2e-4 at once
+        # sand is known to 2e-4 at once
+        assert errors[-1] < (0.1 if scene.startswith("dam") else 0.5) * errors[0]
     if scene.startswith("dam"):
         assert records[f"{scene} solve reference"]["figures"]["residual"]["value"] < 1e-11
     pages = {path.name for path in tmp_path.glob(f"tradeoff-{scene}*")}
-    assert pages == {f"tradeoff-{scene}-run-distance-to-finest.png", f"tradeoff-{scene}-solve-error.png"}
+    assert pages == {
+        f"tradeoff-{scene}-run-distance-to-finest.png",
+        f"tradeoff-{scene}-solve-error.png",
+    }
     text = (tmp_path / "tradeoff.md").read_text()
     assert "| Pareto" in text
     assert f"## {scene}: presets" in text
@@ -115,7 +146,10 @@ def test_a_scene_is_for_suites_that_run_some() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("scene", tradeoff.SCENES)
 def test_the_whole_suite_at_a_small_size(scene: str, tmp_path: Path) -> None:
-    result = CliRunner().invoke(cli.app, ["bench", "tradeoff", scene, "--size", "16", "--repeat", "1", "--out", str(tmp_path)])
+    result = CliRunner().invoke(
+        cli.app,
+        ["bench", "tradeoff", scene, "--size", "16", "--repeat", "1", "--out", str(tmp_path)],
+    )
     assert result.exit_code == 0, result.stderr
     records = json.loads((tmp_path / "tradeoff.json").read_text())
     ran = [r for r in records if r.get("kind") == "run" and r["figures"]]

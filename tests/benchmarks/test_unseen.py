@@ -20,7 +20,8 @@ from warp_lcp.benchmarks.suite import EXTREMES, SOLVERS
 
 SEEDS = (4217, 4218)  # of the second b changes, too
 MORE = range(4300, 4315)
-FEW = ("handful", "rows", "cut-cells", "shifted", "linear-program", "skew")  # of which methods take little time
+# of which methods take little time
+FEW = ("handful", "rows", "cut-cells", "shifted", "linear-program", "skew")
 MUTATED = ("degenerate", "rough", "bearing", "shifted", "triangles", "elastic")
 
 
@@ -50,7 +51,9 @@ def test_every_method_on_every_kind(kind):
 
 @pytest.mark.slow
 def test_default_method_on_many():
-    verdicts = [judge(UnseenCase(kind, seed), "mixed", "cpu") for kind in unseen.KINDS for seed in MORE]
+    verdicts = [
+        judge(UnseenCase(kind, seed), "mixed", "cpu") for kind in unseen.KINDS for seed in MORE
+    ]
     assert len(verdicts) >= 300
     _, beyond = judging.summary(verdicts, MORE[0])
     assert [f"{v.name}: {v.outcome}" for v in verdicts if v.wrong] + beyond == []
@@ -89,7 +92,9 @@ def test_small_grids_have_a_solution_by_enumeration():
         if len(exact.b) <= 6:
             x = boxed(exact.matrix.toarray(), exact.b, exact.lower, exact.upper)
             found += 1
-            assert x is not None or np.linalg.matrix_rank(exact.matrix.toarray()) < len(exact.b), seed
+            assert x is not None or np.linalg.matrix_rank(exact.matrix.toarray()) < len(exact.b), (
+                seed
+            )
             if x is not None:
                 assert exact.residual(x) <= 1e-9 * max(1.0, np.abs(exact.b).max())
     assert found >= 20
@@ -99,7 +104,8 @@ def test_no_problem_is_lost_and_none_is_changed_without_need():
     cells = np.array([[FLUID, FLUID, SOLID, FLUID, FLUID, AIR]])
     made = GridProblem(cells=cells, b=np.array([[-1.0, -3.0, 9.0, -5.0, -7.0, 9.0]]))
     moved = solvable(made)
-    assert moved.b[0, :2].sum() == pytest.approx(0.01 * 4)  # inflow without an upper bound has no solution
+    # inflow without an upper bound has no solution
+    assert moved.b[0, :2].sum() == pytest.approx(0.01 * 4)
     np.testing.assert_array_equal(moved.b[0, 2:], [0, -5, -7, 0])
     outflow = replace(made, b=-made.b)
     np.testing.assert_array_equal(solvable(outflow).b[0, :2], [1, 3])  # x >= 0 takes it up
@@ -107,7 +113,12 @@ def test_no_problem_is_lost_and_none_is_changed_without_need():
     assert solvable(replace(made, lower=-np.inf, upper=2.0)).b[0, :2].sum() == -4
     assert equality(outflow) is None
     assert equality(replace(outflow, b=np.array([[1.0, -1.0, 0, 1, 1, 0]]))) is not None
-    assert equality(replace(made, cells=np.where(cells == SOLID, AIR, cells), b=np.zeros(cells.shape))).b.min() == -1
+    assert (
+        equality(
+            replace(made, cells=np.where(cells == SOLID, AIR, cells), b=np.zeros(cells.shape))
+        ).b.min()
+        == -1
+    )
 
 
 def test_the_change_is_one_percent():
@@ -147,28 +158,45 @@ def test_a_slow_solver_is_caught():
         calls.append(result)
         return result if len(calls) > 1 else replace(result, iterations=7 + 4 * result.iterations)
 
-    assert any("are allowed (equality" in line for line in judge(UnseenCase("rough", 4217, solve=slow), "mixed", "cpu").wrong)
+    assert any(
+        "are allowed (equality" in line
+        for line in judge(UnseenCase("rough", 4217, solve=slow), "mixed", "cpu").wrong
+    )
 
 
 def test_a_warm_start_that_loses_is_caught():
     def lost(problem, solver, **options):
         result = wl.solve(problem, solver, **options)
-        return replace(result, linear_iterations=result.linear_iterations + 40) if "x0" in options else result
+        return (
+            replace(result, linear_iterations=result.linear_iterations + 40)
+            if "x0" in options
+            else result
+        )
 
     assert judge(UnseenCase("rough", 4218), "mixed", "cpu").wrong == []
-    assert any("iterations warm," in line for line in judge(UnseenCase("rough", 4218, solve=lost), "mixed", "cpu").wrong)
+    assert any(
+        "iterations warm," in line
+        for line in judge(UnseenCase("rough", 4218, solve=lost), "mixed", "cpu").wrong
+    )
 
 
 def test_many_warm_starts_that_lose_a_little_are_caught():
     def loses(problem, solver, **options):
         result = wl.solve(problem, solver, **options)
-        return replace(result, linear_iterations=result.linear_iterations + 9) if "x0" in options else result
+        return (
+            replace(result, linear_iterations=result.linear_iterations + 9)
+            if "x0" in options
+            else result
+        )
 
     for solve, found in ((wl.solve, 0), (loses, 1)):
         verdicts = [judge(UnseenCase("rough", 4218, solve=solve), "mixed", "cpu")]
         assert [v.wrong for v in verdicts] == [[]]
         _, beyond = judging.summary(verdicts, 4218)
-        assert len([line for line in beyond if "warm starts take at most 1 iteration more" in line]) == found
+        assert (
+            len([line for line in beyond if "warm starts take at most 1 iteration more" in line])
+            == found
+        )
 
 
 def test_a_warm_start_is_judged_by_iterations_on_the_finest_grid():
@@ -181,7 +209,11 @@ def test_a_warm_start_is_judged_by_iterations_on_the_finest_grid():
 def test_equations_that_are_not_solved_are_a_fault():
     def gives_up(problem, solver, **options):
         result = wl.solve(problem, solver, **options)
-        return result if np.isfinite(problem.lower.numpy()).any() else replace(result, status=wl.SolveStatus.STAGNATED)
+        return (
+            result
+            if np.isfinite(problem.lower.numpy()).any()
+            else replace(result, status=wl.SolveStatus.STAGNATED)
+        )
 
     verdict = judge(UnseenCase("rough", 4217, solve=gives_up), "mixed", "cpu")
     assert verdict.wrong == ["the equations end with STAGNATED"]
@@ -201,12 +233,21 @@ def test_a_method_that_breaks_is_caught():
         raise ZeroDivisionError("b is 0")
 
     problem = unseen.problem("shifted", 4217, small=True).problem
-    assert judging.by_method("psor", problem, "cpu", breaks) == ("ZeroDivisionError", ["ZeroDivisionError: b is 0"])
+    assert judging.by_method("psor", problem, "cpu", breaks) == (
+        "ZeroDivisionError",
+        ["ZeroDivisionError: b is 0"],
+    )
 
 
 def verdict(kind, iterations, equations, *, status="CONVERGED"):
     """What the judge would say of a grid."""
-    facts = {"kind": kind, "seed": 5, "iterations": iterations, "equality": equations, "often": 2 * equations + 6}
+    facts = {
+        "kind": kind,
+        "seed": 5,
+        "iterations": iterations,
+        "equality": equations,
+        "often": 2 * equations + 6,
+    }
     case = UnseenCase(kind, 5)
     return Verdict(case, "mixed", case.promise("mixed"), Attempt(status, 1e-7, facts=facts), [])
 
@@ -215,12 +256,17 @@ def test_summary_counts_those_within_twice_the_equations():
     often = [verdict("strip", 26, 10) for _ in range(19)]
     table, beyond = judging.summary([*often, verdict("dam", 27, 10)], 5)
     assert beyond == []
-    assert [row[:5] for row in table.rows] == [["strip", "19", "0", "26.0", "26"], ["dam", "1", "0", "27.0", "27"]]
+    assert [row[:5] for row in table.rows] == [
+        ["strip", "19", "0", "26.0", "26"],
+        ["dam", "1", "0", "27.0", "27"],
+    ]
     assert [row[6] for row in table.rows] == ["2.6", "2.7"]
     assert "--seed 5" in table.remark
     for one in (verdict("dam", 27, 10), verdict("dam", 5, 10, status="STAGNATED")):
         _, beyond = judging.summary([*often[:18], one], 5)
-        assert beyond == ["unseen: only 94.7% of 19 grids take at most 2 times the equality's iterations and 6"]
+        assert beyond == [
+            "unseen: only 94.7% of 19 grids take at most 2 times the equality's iterations and 6"
+        ]
 
 
 def test_records_name_kind_and_seed(monkeypatch, tmp_path):
@@ -237,7 +283,8 @@ def test_records_name_kind_and_seed(monkeypatch, tmp_path):
     results = extremes.measure(Options("cpu", (), 1, said.append, seed=4217), tmp_path)
     assert [row[1] for row in results.tables[2].rows][:2] == ["handful 4217", "handful 4218"]
     monkeypatch.setattr(unseen, "KINDS", {})
-    extremes.measure(Options("cpu", (), 1, said.append), tmp_path)  # draws a seed where none is given
+    # draws a seed where none is given
+    extremes.measure(Options("cpu", (), 1, said.append), tmp_path)
 
 
 def test_fresh_seeds_are_neither_reserved_nor_those_of_tests():
@@ -250,7 +297,9 @@ def test_fresh_seeds_are_neither_reserved_nor_those_of_tests():
 
 
 def test_seeds_are_refused_where_nothing_is_drawn(tmp_path):
-    with pytest.raises(ValueError, match="--seed 3: the suite solvers has no random problems; use extremes"):
+    with pytest.raises(
+        ValueError, match="--seed 3: the suite solvers has no random problems; use extremes"
+    ):
         SOLVERS.run(device="cpu", out=tmp_path, seed=3)
     with pytest.raises(ValueError, match="--seed -1: must be >= 0"):
         EXTREMES.run(device="cpu", out=tmp_path, seed=-1)

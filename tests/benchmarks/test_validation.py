@@ -14,7 +14,15 @@ from warp_lcp.benchmarks import validation
 from warp_lcp.benchmarks.harness.record import Lines
 from warp_lcp.benchmarks.suite import VALIDATION
 from warp_lcp.benchmarks.validation import dam_break, rest, signals, transfers, walls
-from warp_lcp.benchmarks.validation.finding import Check, Finding, Findings, Trial, attempt, control, table
+from warp_lcp.benchmarks.validation.finding import (
+    Check,
+    Finding,
+    Findings,
+    Trial,
+    attempt,
+    control,
+    table,
+)
 from warp_lcp.benchmarks.validation.scenes import SUB_CELL, VOXEL, Numerics, create_liquid, fill
 from warp_lcp.benchmarks.validation.signals import cumulative, enclosed_cells, filled_fraction
 from warp_lcp.grid.triangle_mesh import load_surface
@@ -31,7 +39,12 @@ def test_a_finding_keeps_its_bound_and_a_control_breaks_it() -> None:
     for finding in (Finding("x", math.nan, high=1.0), control(Finding("x", math.nan, high=1.0))):
         assert not finding.passed
     assert Finding("x", 1.0, high=2.0, unit="m").row() == ["x", "1 m", "<= 2 m", "yes"]
-    assert control(Finding("x", 1.0, low=2.0)).row() == ["control: x", "1", "must break >= 2", "yes"]
+    assert control(Finding("x", 1.0, low=2.0)).row() == [
+        "control: x",
+        "1",
+        "must break >= 2",
+        "yes",
+    ]
     assert Finding("x", 9.0, low=1.0, high=2.0).row() == ["x", "9", "1 to 2", "NO"]
 
 
@@ -52,10 +65,15 @@ def test_records_say_what_held_and_which_controls_failed() -> None:
     assert record.figures["control: whole cells: error"].unit == "%"
     assert record.figures["seconds"].value >= 0
     assert (record.facts["passed"], record.facts["controls_failed_as_they_must"]) == (True, True)
-    assert (bad.record().facts["passed"], blind.record().facts["controls_failed_as_they_must"]) == (False, False)
+    assert (bad.record().facts["passed"], blind.record().facts["controls_failed_as_they_must"]) == (
+        False,
+        False,
+    )
     assert good.failures() == []
     assert bad.failures() == ["waves, 8 cells: error = 1.5 % (<= 1 %)"]
-    assert blind.failures() == ["waves, 8 cells: control: whole cells: error = 0.5 % (must break <= 1 %)"]
+    assert blind.failures() == [
+        "waves, 8 cells: control: whole cells: error = 0.5 % (must break <= 1 %)"
+    ]
 
 
 def test_a_simulation_that_ends_early_fails_its_check() -> None:
@@ -67,13 +85,21 @@ def test_a_simulation_that_ends_early_fails_its_check() -> None:
     assert not trial.passed
     assert trial.failures() == ["waves, 8 cells: no convergence"]
     assert trial.record().facts["error"] == "no convergence"
-    assert table("waves", "", [trial]).rows[-1] == ["waves, 8 cells", "error", "no convergence", "none", "NO"]
+    assert table("waves", "", [trial]).rows[-1] == [
+        "waves, 8 cells",
+        "error",
+        "no convergence",
+        "none",
+        "NO",
+    ]
 
 
 def test_the_period_of_a_fading_wave_with_a_drift() -> None:
     t = np.linspace(0.0, 9.0, 400)
     for offset in (0.0, 0.2, -0.2):
-        assert signals.period(t, np.exp(-0.02 * t) * np.cos(2 * np.pi * t / 1.7) + offset) == pytest.approx(1.7, rel=3e-3)
+        assert signals.period(
+            t, np.exp(-0.02 * t) * np.cos(2 * np.pi * t / 1.7) + offset
+        ) == pytest.approx(1.7, rel=3e-3)
     assert signals.period(t, np.cos(2 * np.pi * t / 1.7)) == pytest.approx(1.7, rel=1e-4)
     with pytest.raises(ValueError, match="no period"):
         signals.period(t, 1.0 + t)
@@ -95,7 +121,9 @@ def test_the_shift_that_fits_best() -> None:
     assert signals.best_shift(t, values, at, 1.0 + (at - 0.5) ** 2, 0.3)[0] == pytest.approx(-0.3)
     assert signals.relative_rms(t, 1.1 * values, at, 1.0 + at**2) == pytest.approx(0.1, rel=1e-3)
     for pace in (0.71, 1.0, 1.4):
-        assert signals.best_pace(t / pace, 1.0 + (t - 0.1) ** 2, at, 1.0 + at**2, 0.3) == pytest.approx(pace, rel=0.01)
+        assert signals.best_pace(
+            t / pace, 1.0 + (t - 0.1) ** 2, at, 1.0 + at**2, 0.3
+        ) == pytest.approx(pace, rel=0.01)
 
 
 def test_the_front_is_the_far_edge_of_the_last_floor_cell_half_full() -> None:
@@ -108,7 +136,8 @@ def test_an_even_front_is_found_between_the_cells() -> None:
     """The stair of an even advance lies half a cell ahead where it begins, half a cell behind where it ends: in the middle it is right."""
     t = np.linspace(0.0, 5.0, 501)
     places = np.floor(2.0 * t + 0.5)  # a front at 2 t, as known to the cell
-    middle, at = signals.stays(t, np.where(t > 4.0, 3.0, places))  # one that falls back is forgotten
+    # one that falls back is forgotten
+    middle, at = signals.stays(t, np.where(t > 4.0, 3.0, places))
     assert np.array_equal(at, np.arange(8))
     assert middle[1:] == pytest.approx(at[1:] / 2.0, abs=0.01)
 
@@ -138,7 +167,9 @@ def test_the_data_are_those_of_the_experiment() -> None:
 def test_the_kernel_of_the_density_is_a_quadratic_spline() -> None:
     s = np.linspace(-2.0, 2.0, 4001)
     density = np.gradient(cumulative(s), s)
-    exact = np.where(np.abs(s) < 0.5, 0.75 - s**2, np.where(np.abs(s) < 1.5, 0.5 * (1.5 - np.abs(s)) ** 2, 0.0))
+    exact = np.where(
+        np.abs(s) < 0.5, 0.75 - s**2, np.where(np.abs(s) < 1.5, 0.5 * (1.5 - np.abs(s)) ** 2, 0.0)
+    )
     assert density == pytest.approx(exact, abs=1e-3)
 
 
@@ -146,7 +177,9 @@ def test_the_kernel_of_the_density_is_a_quadratic_spline() -> None:
 def test_the_volume_inside_a_surface_is_that_of_the_half_space(degrees: float) -> None:
     """Nothing like particles x their volume: squeezed to 80 % of their distance, they enclose less."""
     n, m = 20, 8
-    x, y = (a.ravel() for a in np.meshgrid((np.arange(n * m) + 0.5) / m, (np.arange(n * m) + 0.5) / m))
+    x, y = (
+        a.ravel() for a in np.meshgrid((np.arange(n * m) + 0.5) / m, (np.arange(n * m) + 0.5) / m)
+    )
     angle = math.radians(degrees)
     wet = -(x - 10.0) * math.sin(angle) + (y - 8.3) * math.cos(angle) < 0.0
     points = np.stack([x[wet], y[wet]], axis=1)
@@ -182,13 +215,16 @@ def test_angular_momentum_is_that_of_the_grid_around_the_particles() -> None:
     j, i = np.meshgrid(np.arange(18), np.arange(18), indexing="ij")
     for axis, (field, weight) in enumerate(zip(c.fields, c.weights, strict=True)):
         momentum = (field.numpy() * weight.numpy())[1]
-        arm = (i - 0.5 if axis else j - 0.5) / 16  # the coordinate across the component: x for v, y for u
+        # the coordinate across the component: x for v, y for u
+        arm = (i - 0.5 if axis else j - 0.5) / 16
         total += (1 if axis else -1) * float((arm * momentum).sum())
     assert total == pytest.approx(expected, rel=1e-12)
 
 
 def test_cells_are_filled_by_their_particles() -> None:
-    simulation = create_liquid(VOXEL, [1.0, 0.5], 8, [{"shape": "box", "min": [0.0, 0.0], "max": [0.5, 0.25]}])
+    simulation = create_liquid(
+        VOXEL, [1.0, 0.5], 8, [{"shape": "box", "min": [0.0, 0.0], "max": [0.5, 0.25]}]
+    )
     expected = np.zeros((4, 8))
     expected[:2, :4] = 1.0
     assert np.array_equal(fill(simulation), expected)
@@ -207,11 +243,15 @@ def test_the_advection_has_its_orders_and_worse_ones_do_not() -> None:
         "control: Euler's steps, one turn: order in time",
         "control: fields half a cell off: order in space",
     ]
-    assert transfers.euler_error(1000) == pytest.approx(2.0 * np.pi**2 * np.hypot(0.15, 0.25) / 1000, rel=0.02)
+    assert transfers.euler_error(1000) == pytest.approx(
+        2.0 * np.pi**2 * np.hypot(0.15, 0.25) / 1000, rel=0.02
+    )
 
 
 @pytest.mark.parametrize(("numerics", "shape"), [(VOXEL, "flat"), (SUB_CELL, "slanted")])
-def test_a_block_lets_go_of_the_ceiling_and_its_controls_do_not(numerics: Numerics, shape: str) -> None:
+def test_a_block_lets_go_of_the_ceiling_and_its_controls_do_not(
+    numerics: Numerics, shape: str
+) -> None:
     trial = walls.falling(24, numerics, shape)
     assert trial.failures() == []
     assert len([f for f in trial.findings if f.control]) == 3
@@ -225,11 +265,20 @@ def test_a_layer_slides_along_a_slope_and_is_stopped_by_stairs() -> None:
 
 
 @pytest.mark.parametrize("error", [0.5, 2.0])
-def test_a_failed_check_ends_the_process_with_1_after_its_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: float) -> None:
+def test_a_failed_check_ends_the_process_with_1_after_its_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: float
+) -> None:
     chart = Lines("waves", "waves", "t", "y", {"c": ([0.0, 1.0], [-1.0, 1.0])}, log="")
-    check = Check(about="Waves.", trials=[(found, [(error, 3.0)])], charts=[lambda trials: chart], known="steep")
+    check = Check(
+        about="Waves.",
+        trials=[(found, [(error, 3.0)])],
+        charts=[lambda trials: chart],
+        known="steep",
+    )
     monkeypatch.setattr(validation, "CHECKS", {"waves": check})
-    monkeypatch.setattr(sys, "argv", ["benchmarks", "validation", "--out", str(tmp_path), "--repeat", "1"])
+    monkeypatch.setattr(
+        sys, "argv", ["benchmarks", "validation", "--out", str(tmp_path), "--repeat", "1"]
+    )
     if error > 1.0:
         with pytest.raises(SystemExit) as ended:
             process.main()
@@ -241,7 +290,10 @@ def test_a_failed_check_ends_the_process_with_1_after_its_files(tmp_path: Path, 
     assert (tmp_path / "validation-waves.png").is_file()
     page = (tmp_path / "validation.md").read_text(encoding="utf-8")
     assert "| waves, 8 cells | error |" in page
-    assert f"{int(error < 1.0)} of 1 figures keep their tolerance, and 1 of 1 negative controls fail theirs" in page
+    assert (
+        f"{int(error < 1.0)} of 1 figures keep their tolerance, and 1 of 1 negative controls fail "
+        "theirs" in page
+    )
     assert ("| waves, 8 cells: error = 2 % (<= 1 %) | steep |" in page) is (error > 1.0)
 
 

@@ -5,7 +5,11 @@ import pytest
 from warp_lcp.benchmarks.validation import CHECKS
 
 ALWAYS = {"rest", "sand hourglass"}  # the others come close enough to hold on some machines
-UNMET = {name: pytest.mark.xfail(strict=name in ALWAYS, reason=check.known) for name, check in CHECKS.items() if check.known}
+UNMET = {
+    name: pytest.mark.xfail(strict=name in ALWAYS, reason=check.known)
+    for name, check in CHECKS.items()
+    if check.known
+}
 
 
 @pytest.mark.slow

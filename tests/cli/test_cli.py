@@ -38,15 +38,38 @@ def test_a_profile_is_shown_and_written(scene_file, out):
     assert result.exit_code == 0
     shown = [line.split()[0] for line in result.stdout.splitlines()]
     assert shown[0] == "stage"
-    assert {"frames", "(frames,", "checkpoints", "(checkpoints,", "rest", "all", "finished:"} == set(shown[1:]) - {"kernels,"}
-    assert json.loads((out / "profile.json").read_text())["steps"] == json.loads((out / "run.json").read_text())["steps"]
-    assert call("run", scene_file, "--out", out, "--device", "cpu", "--frames", 2, "--force").exit_code == 0
+    assert {
+        "frames",
+        "(frames,",
+        "checkpoints",
+        "(checkpoints,",
+        "rest",
+        "all",
+        "finished:",
+    } == set(shown[1:]) - {"kernels,"}
+    assert (
+        json.loads((out / "profile.json").read_text())["steps"]
+        == json.loads((out / "run.json").read_text())["steps"]
+    )
+    assert (
+        call("run", scene_file, "--out", out, "--device", "cpu", "--frames", 2, "--force").exit_code
+        == 0
+    )
     assert not (out / "profile.json").exists()
 
 
 @pytest.mark.parametrize("name", ["x" * 5000, "x" * 300], ids=["path", "part"])
 @pytest.mark.parametrize(
-    "words", ["check {}", "run {}", "run dam-break-2d --out {}", "run --resume --out {}", "render {}", "solve {}", "tune {}"]
+    "words",
+    [
+        "check {}",
+        "run {}",
+        "run dam-break-2d --out {}",
+        "run --resume --out {}",
+        "render {}",
+        "solve {}",
+        "tune {}",
+    ],
 )
 def test_paths_that_no_file_can_have(words, name):
     result = call(*words.format(name).split())
@@ -66,11 +89,17 @@ def test_the_folder_is_named_after_the_scene(scene_file, tmp_path, monkeypatch):
     [
         (["run", "no-such-scene"], "no such built-in scene"),
         (["run", "{scene}", "--set", "time.cfl=0"], "time.cfl = 0: must be at least 0.001"),
-        (["run", "{scene}", "--device", "cuda:77"], "--device cuda:77: there is no such device; choose from"),
+        (
+            ["run", "{scene}", "--device", "cuda:77"],
+            "--device cuda:77: there is no such device; choose from",
+        ),
         (["run", "{scene}", "--resume"], "there is no run to resume"),
         (["run", "{scene}", "--resume", "--force"], "exclude each other"),
         (["run", "{scene}", "--frames", "-1"], "--frames"),
-        (["run", "{scene}", "--device", "cpu", "--record-problems", "problems"], "the simulator dots has no problems to record"),
+        (
+            ["run", "{scene}", "--device", "cpu", "--record-problems", "problems"],
+            "the simulator dots has no problems to record",
+        ),
         (["run"], "SCENE"),
         (["run", "{scene}", "--fast"], "--fast"),
         (["check", "{scene}", "--set", "domain.wal=x"], "did you mean 'wall'?"),
@@ -98,7 +127,9 @@ def test_existing_output_is_kept_without_force(scene_file, out):
 
 
 def test_a_finished_run_that_is_resumed_says_so(scene_file, out):
-    assert call("run", scene_file, "--out", out, "--device", "cpu").stdout.startswith("finished: frame ")
+    assert call("run", scene_file, "--out", out, "--device", "cpu").stdout.startswith(
+        "finished: frame "
+    )
     again = call("run", "--resume", "--out", out, "--device", "cpu")
     assert again.exit_code == 0
     assert again.stdout.startswith("finished earlier, nothing to do: frame 10 of 10 reached; ")
@@ -110,11 +141,19 @@ def test_files_nearby_are_named_where_one_is_not_there(scene_file, tmp_path, mon
     monkeypatch.chdir(tmp_path)
     for name in ("my-scene.toml", "other.toml"):
         (tmp_path / name).write_text(scene_file.read_text())
-    assert call("check", "my-scen.toml").stderr == "my-scen.toml: there is no such file; did you mean 'my-scene.toml'?\n"
+    assert (
+        call("check", "my-scen.toml").stderr
+        == "my-scen.toml: there is no such file; did you mean 'my-scene.toml'?\n"
+    )
     assert "did you mean 'my-scene.toml'?" in call("check", "my-scene").stderr
     assert "did you mean 'dam-break'?" in call("check", "dam-brek").stderr
-    assert call("check", "nothing-like-it.toml").stderr == "nothing-like-it.toml: there is no such file\n"
-    assert f"did you mean '{tmp_path / 'other.toml'}'?" in call("check", tmp_path / "othr.toml").stderr
+    assert (
+        call("check", "nothing-like-it.toml").stderr
+        == "nothing-like-it.toml: there is no such file\n"
+    )
+    assert (
+        f"did you mean '{tmp_path / 'other.toml'}'?" in call("check", tmp_path / "othr.toml").stderr
+    )
 
 
 def test_initials_of_a_key_are_understood(scene_file):
@@ -124,7 +163,9 @@ def test_initials_of_a_key_are_understood(scene_file):
 
 def test_the_help_of_bench_names_every_suite():
     shown = call("bench", "--help").stdout
-    assert {"domains", "tank", *benchmarks()} == {name for name in suite_names() if re.search(rf"\b{name}\b", shown)}
+    assert {"domains", "tank", *benchmarks()} == {
+        name for name in suite_names() if re.search(rf"\b{name}\b", shown)
+    }
 
 
 @pytest.mark.parametrize(
@@ -145,7 +186,11 @@ def test_the_shell_completes_scenes_suites_and_methods(words, expected, tmp_path
     (tmp_path / "my-notes.txt").write_text("")
     (tmp_path / "sub").mkdir()
     typed = f"warp-lcp {words}"
-    asked = {"_WARP_LCP_COMPLETE": "complete_bash", "COMP_WORDS": typed, "COMP_CWORD": str(len(typed.split()) - 1)}
+    asked = {
+        "_WARP_LCP_COMPLETE": "complete_bash",
+        "COMP_WORDS": typed,
+        "COMP_CWORD": str(len(typed.split()) - 1),
+    }
     result = CliRunner().invoke(cli.app, [], prog_name="warp-lcp", env=asked)
     assert result.stdout.split() == expected
 
@@ -178,7 +223,9 @@ def test_ctrl_c_ends_the_run_with_a_checkpoint(dots, scene_file, out):
     assert (out / "checkpoints" / "step_000007.npz").is_file()
     assert signal.getsignal(signal.SIGINT) is before
     dots.before_step = lambda simulation, dt: None
-    assert call("run", out / "scene.toml", "--out", out, "--device", "cpu", "--resume").exit_code == 0
+    assert (
+        call("run", out / "scene.toml", "--out", out, "--device", "cpu", "--resume").exit_code == 0
+    )
     assert json.loads((out / "run.json").read_text())["resumed_from_step"] == 7
 
 
@@ -198,7 +245,15 @@ def test_scenes_lists_what_can_be_run():
 
 def test_schema_is_json(dots):
     schema = json.loads(call("schema", "--simulator", "dots").stdout)
-    assert schema["properties"].keys() >= {"scene", "time", "domain", "physics", "solver", "solid", "output"}
+    assert schema["properties"].keys() >= {
+        "scene",
+        "time",
+        "domain",
+        "physics",
+        "solver",
+        "solid",
+        "output",
+    }
     assert "from" in json.dumps(schema)
 
 
@@ -222,4 +277,6 @@ def test_a_simulator_that_does_not_load(dots, scene_file, monkeypatch):
     monkeypatch.setattr(simulator, "entry_points", lambda group: [entry])
     result = call("check", scene_file)
     assert result.exit_code == 2
-    assert "a simulator cannot be loaded: module 'json' has no attribute 'SIMULATOR'" in result.stderr
+    assert (
+        "a simulator cannot be loaded: module 'json' has no attribute 'SIMULATOR'" in result.stderr
+    )

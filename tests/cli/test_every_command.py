@@ -28,7 +28,8 @@ CELLS = {
     "waterfall": 32,
     "wave-maker": 30,
 }  # along the longest side, where 24 and 12 do not fit
-FEW, MORE = range(20), range(20, 100)  # of ten seeds liquid and sand have each size once, of twenty in 2-D and in 3-D
+# of ten seeds liquid and sand have each size once, of twenty in 2-D and in 3-D
+FEW, MORE = range(20), range(20, 100)
 
 
 def done(*arguments: object) -> str:
@@ -53,21 +54,43 @@ def every_command(scene: object, tmp_path: Path, *overrides: str) -> None:
     assert told in done("check", scene, "--device", "cpu", *sets)
     assert "seconds a step" in done("check", scene, "--device", "cpu", "--calibrate", *sets)
     recorded = ["--record-problems", problems] if alone else []
-    assert "finished: frame 1 " in done("run", scene, "--device", "cpu", "--out", out, "--frames", 1, *recorded, *sets)
-    assert "finished: frame 2 " in done("run", "--resume", "--out", out, "--device", "cpu", "--frames", 2)
-    assert "finished earlier" in done("run", "--resume", "--out", out, "--device", "cpu", "--frames", 2)
-    assert told in done("check", out / "scene.toml", "--device", "cpu"), "the scene as it ran is one"
+    assert "finished: frame 1 " in done(
+        "run", scene, "--device", "cpu", "--out", out, "--frames", 1, *recorded, *sets
+    )
+    assert "finished: frame 2 " in done(
+        "run", "--resume", "--out", out, "--device", "cpu", "--frames", 2
+    )
+    assert "finished earlier" in done(
+        "run", "--resume", "--out", out, "--device", "cpu", "--frames", 2
+    )
+    assert told in done("check", out / "scene.toml", "--device", "cpu"), (
+        "the scene as it ran is one"
+    )
     assert "image" in done("render", out, "--slice", "--size", "320x240")
     assert "frame_000002.png" in done("render", out, "--frame", 2, "--size", "320x240")
     assert "3 frames" in done("export", out, "--out", tmp_path / "run.usda")
     done("serve", out, "--port", 0)
     if recorded:
-        for problem in sorted(problems.glob("problem_*.npz"))[-1:]:  # a thread thinner than a cell has none
+        # a thread thinner than a cell has none
+        for problem in sorted(problems.glob("problem_*.npz"))[-1:]:
             done("solve", problem)
-        done("run", scene, "--out", tmp_path / "profiled", "--device", "cpu", "--frames", 0, "--profile", *sets)
+        done(
+            "run",
+            scene,
+            "--out",
+            tmp_path / "profiled",
+            "--device",
+            "cpu",
+            "--frames",
+            0,
+            "--profile",
+            *sets,
+        )
     if (out / "probes.csv").exists():
         with open(out / "probes.csv", newline="") as table:
-            values = [float(value) for row in csv.DictReader(table) for value in row.values() if value]
+            values = [
+                float(value) for row in csv.DictReader(table) for value in row.values() if value
+            ]
         assert np.isfinite(values).all()
 
 
@@ -93,12 +116,16 @@ def test_every_built_in_scene_is_checked(name: str) -> None:
     assert told in done("check", name, "--device", "cpu", "--set", small(name))
 
 
-@pytest.mark.parametrize("seed", [*FEW, *(pytest.param(seed, marks=pytest.mark.slow) for seed in MORE)])
+@pytest.mark.parametrize(
+    "seed", [*FEW, *(pytest.param(seed, marks=pytest.mark.slow) for seed in MORE)]
+)
 def test_drawn_scenes_are_checked(seed: int, tmp_path: Path) -> None:
     assert "whole run" in done("check", written(seed, tmp_path), "--device", "cpu")
 
 
-@pytest.mark.parametrize("seed", [3, 7, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 4))])
+@pytest.mark.parametrize(
+    "seed", [3, 7, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 4))]
+)
 def test_every_command_on_drawn_scenes(seed: int, tmp_path: Path, nobody_waits: None) -> None:
     every_command(written(seed, tmp_path), tmp_path)
 
@@ -111,7 +138,9 @@ def test_every_command_on_more_drawn_scenes(seed: int, tmp_path: Path, nobody_wa
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", built_in_scenes())
-def test_every_command_on_every_built_in_scene(name: str, tmp_path: Path, nobody_waits: None) -> None:
+def test_every_command_on_every_built_in_scene(
+    name: str, tmp_path: Path, nobody_waits: None
+) -> None:
     every_command(name, tmp_path, small(name))
 
 
@@ -124,6 +153,10 @@ def test_drawn_scenes_have_every_table_shape_and_motion() -> None:
         assert set(model.model_fields) == set().union(*mine)
         for key in ("liquid" if simulator == "fluids" else "sand", "solid"):
             assert {shape["shape"] for data in mine for shape in data[key]} == set(SHAPES)
-        assert {solid["motion"]["kind"] for data in mine for solid in data["solid"] if "motion" in solid} == set(MOTIONS)
+        assert {
+            solid["motion"]["kind"] for data in mine for solid in data["solid"] if "motion" in solid
+        } == set(MOTIONS)
         sizes = [data["domain"]["size"] for data in mine]
-        assert {(max(size), len(size)) for size in sizes} == {(side, dimension) for side in SIDES for dimension in (2, 3)}
+        assert {(max(size), len(size)) for size in sizes} == {
+            (side, dimension) for side in SIDES for dimension in (2, 3)
+        }

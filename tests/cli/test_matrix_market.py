@@ -34,7 +34,10 @@ def written(matrix, **options) -> bytes:
 @pytest.mark.parametrize("sparse", [False, True])
 def test_what_scipy_writes_is_read(tmp_path, symmetry, sparse):
     matrix = OF[symmetry](THIN if sparse else FULL)
-    found = read(tmp_path / "a.mtx", written(scipy.sparse.coo_array(matrix) if sparse else matrix, symmetry=symmetry))
+    found = read(
+        tmp_path / "a.mtx",
+        written(scipy.sparse.coo_array(matrix) if sparse else matrix, symmetry=symmetry),
+    )
     assert scipy.sparse.issparse(found) == sparse
     np.testing.assert_array_equal(found.toarray() if sparse else found, matrix)
 
@@ -44,8 +47,13 @@ def test_other_fields_shapes_and_spellings(tmp_path):
     np.testing.assert_array_equal(read(tmp_path / "a.mtx", written(whole)), whole)
     pattern = read(tmp_path / "a.mtx", written(scipy.sparse.coo_array(whole), field="pattern"))
     np.testing.assert_array_equal(pattern.toarray(), whole != 0)
-    text = b"%%matrixmarket MATRIX Coordinate Real General\r\n% a\r\n\r\n 2  2 3 \r\n1 1 .5e1\r\n\r\n 2 2 -inf\r\n1 1 1"
-    np.testing.assert_array_equal(read(tmp_path / "a.mtx", text).toarray(), [[6.0, 0.0], [0.0, -np.inf]])
+    text = (
+        b"%%matrixmarket MATRIX Coordinate Real General\r\n% a\r\n\r\n 2  2 3 \r\n1 1 "
+        b".5e1\r\n\r\n 2 2 -inf\r\n1 1 1"
+    )
+    np.testing.assert_array_equal(
+        read(tmp_path / "a.mtx", text).toarray(), [[6.0, 0.0], [0.0, -np.inf]]
+    )
     assert read(tmp_path / "a.mtx", REAL + b"3 3 0\n").nnz == 0
 
 
@@ -65,19 +73,29 @@ def test_packed_files(tmp_path, suffix, pack):
         (REAL + b"\n" * 100_000, "must begin with %%MatrixMarket"),
         (REAL + b"2 2\n1 1\n", "the line with its size does not fit its form"),
         (REAL + b"1" + b"0" * 30 + b" 4 1\n1 1 1\n", "must begin"),
-        (REAL + b"2 2 1\n1 1 1.9[[[[[", "an entry that is not a number"),  # these end SciPy 1.17 with a segmentation fault
+        # these end SciPy 1.17 with a segmentation fault
+        (REAL + b"2 2 1\n1 1 1.9[[[[[", "an entry that is not a number"),
         (REAL + b"2 2 2\n1 1 1.5\n2 2 1\x00.5\n", "an entry that is not a number"),
         (REAL + b"2 2 2\n1 1 1.5\n2 ", "these take 11 bytes, and the file has 10"),
-        (REAL + b"2 2 2\n1 1 1.5\n222222 ", "it holds 4 numbers, expected 6 for 2 x 2 with 2 entries"),
+        (
+            REAL + b"2 2 2\n1 1 1.5\n222222 ",
+            "it holds 4 numbers, expected 6 for 2 x 2 with 2 entries",
+        ),
         (REAL + b"2 2 1\n1 3 1.5\n", "rows 1 to 2 and columns 1 to 2"),
         (REAL + b"2 2 1\n0 1 1.5\n", "rows 1 to 2 and columns 1 to 2"),
         (REAL + b"2 2 1\n1.5 1 1\n", "rows 1 to 2 and columns 1 to 2"),
         (REAL + b"2 2 1\nnan 1 1\n", "rows 1 to 2 and columns 1 to 2"),
-        (REAL.replace(b"general", b"symmetric") + b"2 3 1\n1 1 1\n", "symmetric matrices are square"),
+        (
+            REAL.replace(b"general", b"symmetric") + b"2 3 1\n1 1 1\n",
+            "symmetric matrices are square",
+        ),
         (REAL.replace(b"real", b"complex") + b"2 2 1\n1 1 1 0\n", "holds complex numbers"),
         (REAL + b"3 3 1000000000000\n1 1 1.0\n", "the file has 8 bytes"),
         (REAL + b"1000000000000 1000000000000 1\n1 1 1.0\n", "1000000000000 entries|GB of memory"),
-        (REAL.replace(b"coordinate", b"array") + b"4294967296 4294967296\n1.0\n", "the file has 4 bytes"),
+        (
+            REAL.replace(b"coordinate", b"array") + b"4294967296 4294967296\n1.0\n",
+            "the file has 4 bytes",
+        ),
     ],
 )
 def test_what_is_wrong_is_told(tmp_path, data, message):
@@ -88,20 +106,28 @@ def test_what_is_wrong_is_told(tmp_path, data, message):
 
 def test_a_shape_is_refused_before_its_matrix_is_read(tmp_path):
     with pytest.raises(ValueError, match="has shape 2 x 3: expected another"):
-        read(tmp_path / "a.mtx", REAL + b"2 3 1\nno numbers at all\n", lambda rows, columns: rows == columns)
+        read(
+            tmp_path / "a.mtx",
+            REAL + b"2 3 1\nno numbers at all\n",
+            lambda rows, columns: rows == columns,
+        )
 
 
 def test_the_shape_is_read_alone(tmp_path):
     path = tmp_path / "a.mtx"
     path.write_bytes(REAL + b"% " + b"long" * 40_000 + b"\n7 9 1\n" + b"no numbers")
     assert read_shape(path, lambda rows, columns: True, "") == (7, 9)
-    cut = REAL + b"%" + b"x" * (HEAD - len(REAL) - len("%\n70")) + b"\n70"  # the first bytes end in the size
+    # the first bytes end in the size
+    cut = REAL + b"%" + b"x" * (HEAD - len(REAL) - len("%\n70")) + b"\n70"
     path.write_bytes(cut + b"0 900 1\n1 1 1\n")
     assert len(cut) == HEAD
     assert read_shape(path, lambda rows, columns: True, "") == (700, 900)
     (tmp_path / "a.mtx.gz").write_bytes(gzip.compress(REAL + b"3 4 1\nno numbers"))
     assert read_shape(tmp_path / "a.mtx.gz", lambda rows, columns: True, "") == (3, 4)
-    for data, message in ((REAL + b"2 2 9\n1 1 1\n", "2 x 2 with 9 entries: these take 53 bytes, and the file has 6"), (b"", "must begin")):
+    for data, message in (
+        (REAL + b"2 2 9\n1 1 1\n", "2 x 2 with 9 entries: these take 53 bytes, and the file has 6"),
+        (b"", "must begin"),
+    ):
         path.write_bytes(data)
         with pytest.raises(ValueError, match=message):
             read_shape(path, lambda rows, columns: True, "")

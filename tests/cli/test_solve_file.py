@@ -24,7 +24,10 @@ def call(*arguments: object) -> Result:
 def problem(tmp_path):
     """A 5-point stencil and a wave."""
     T = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(6, 6))
-    A = (scipy.sparse.kron(T, scipy.sparse.eye_array(6)) + scipy.sparse.kron(scipy.sparse.eye_array(6), T)).tocsr()
+    A = (
+        scipy.sparse.kron(T, scipy.sparse.eye_array(6))
+        + scipy.sparse.kron(scipy.sparse.eye_array(6), T)
+    ).tocsr()
     b = np.sin(np.arange(36.0))
     write(tmp_path / "A.mtx", A)
     write(tmp_path / "b.mtx", b)
@@ -33,7 +36,13 @@ def problem(tmp_path):
 
 def write(path: Path, array) -> Path:
     """Write as Matrix Market; vectors as one column."""
-    scipy.io.mmwrite(path, array if scipy.sparse.issparse(array) or np.ndim(array) == 2 else np.reshape(array, (-1, 1)), precision=17)
+    scipy.io.mmwrite(
+        path,
+        array
+        if scipy.sparse.issparse(array) or np.ndim(array) == 2
+        else np.reshape(array, (-1, 1)),
+        precision=17,
+    )
     return path
 
 
@@ -77,33 +86,68 @@ def test_1e20_is_infinite_in_files(infinity, tmp_path):
     rng = np.random.default_rng(31)
     B = rng.standard_normal((5, 5))
     A, b = B @ B.T + np.eye(5), rng.standard_normal(5)
-    lower, upper = np.array([-infinity, -0.1, 0.0, -infinity, 0.0]), np.array([infinity, 0.1, 0.05, 0.0, infinity])
+    lower, upper = (
+        np.array([-infinity, -0.1, 0.0, -infinity, 0.0]),
+        np.array([infinity, 0.1, 0.05, 0.0, infinity]),
+    )
     for name, array in {"A": A, "b": b, "l": lower, "u": upper}.items():
         write(tmp_path / f"{name}.mtx", array)
     result = call(
-        *(tmp_path / "A.mtx", tmp_path / "b.mtx", "--lower", tmp_path / "l.mtx", "--upper", tmp_path / "u.mtx"),
+        *(
+            tmp_path / "A.mtx",
+            tmp_path / "b.mtx",
+            "--lower",
+            tmp_path / "l.mtx",
+            "--upper",
+            tmp_path / "u.mtx",
+        ),
         *("--method", "lemke", "--out", tmp_path / "x.mtx", "--tolerance", 1e-11),
     )
     assert result.exit_code == 0, result.stderr
-    expected = boxed(A, b, np.where(lower <= -1e20, -np.inf, lower), np.where(upper >= 1e20, np.inf, upper))
+    expected = boxed(
+        A, b, np.where(lower <= -1e20, -np.inf, lower), np.where(upper >= 1e20, np.inf, upper)
+    )
     np.testing.assert_allclose(scipy.io.mmread(tmp_path / "x.mtx").ravel(), expected, atol=1e-9)
-    free = call(tmp_path / "A.mtx", tmp_path / "b.mtx", "--lower", -infinity, "--out", tmp_path / "x.mtx", "--tolerance", 1e-11)
+    free = call(
+        tmp_path / "A.mtx",
+        tmp_path / "b.mtx",
+        "--lower",
+        -infinity,
+        "--out",
+        tmp_path / "x.mtx",
+        "--tolerance",
+        1e-11,
+    )
     assert free.exit_code == 0, free.stderr
-    np.testing.assert_allclose(scipy.io.mmread(tmp_path / "x.mtx").ravel(), np.linalg.solve(A, -b), atol=1e-9)
+    np.testing.assert_allclose(
+        scipy.io.mmread(tmp_path / "x.mtx").ravel(), np.linalg.solve(A, -b), atol=1e-9
+    )
 
 
 def test_the_files_symmetry_is_understood(problem, tmp_path):
     """A symmetric file holds one triangle only."""
     A, _ = problem
     scipy.io.mmwrite(tmp_path / "half.mtx", A, symmetry="symmetric")
-    whole, half = (call(tmp_path / name, tmp_path / "b.mtx").stdout.splitlines() for name in ("A.mtx", "half.mtx"))
+    whole, half = (
+        call(tmp_path / name, tmp_path / "b.mtx").stdout.splitlines()
+        for name in ("A.mtx", "half.mtx")
+    )
     assert half[0] == whole[0]
     assert half[-1] == whole[-1]
 
 
 def test_a_solve_that_fails_exits_with_1(problem, tmp_path):
     out = tmp_path / "x.mtx"
-    result = call(tmp_path / "A.mtx", tmp_path / "b.mtx", "--method", "psor", "--max-iterations", 3, "--out", out)
+    result = call(
+        tmp_path / "A.mtx",
+        tmp_path / "b.mtx",
+        "--method",
+        "psor",
+        "--max-iterations",
+        3,
+        "--out",
+        out,
+    )
     assert result.exit_code == 1
     assert result.stderr.startswith("MAX_ITERATIONS: ")
     assert "3 iterations, residual " in result.stderr
@@ -118,8 +162,21 @@ def test_a_solve_ends_in_time(problem, tmp_path):
 
 
 def test_a_long_history_is_shortened(problem, tmp_path):
-    result = call(tmp_path / "A.mtx", tmp_path / "b.mtx", "--method", "psor", "--max-iterations", 70, "--tolerance", 1e-15)
-    rows = [line.split()[0] for line in result.stdout.splitlines()[2:] if line.split()[0].isdigit() or line.split()[0] == "..."]
+    result = call(
+        tmp_path / "A.mtx",
+        tmp_path / "b.mtx",
+        "--method",
+        "psor",
+        "--max-iterations",
+        70,
+        "--tolerance",
+        1e-15,
+    )
+    rows = [
+        line.split()[0]
+        for line in result.stdout.splitlines()[2:]
+        if line.split()[0].isdigit() or line.split()[0] == "..."
+    ]
     assert len(rows) == MOST_ROWS + 1
     assert rows[MOST_ROWS // 2] == "..."
 
@@ -129,15 +186,30 @@ def test_a_long_history_is_shortened(problem, tmp_path):
     [
         (["nope.mtx", "b.mtx"], "nope.mtx: no such file"),
         (["text.mtx", "b.mtx"], "text.mtx: is not a Matrix Market file"),
-        (["short.mtx", "b.mtx"], "short.mtx: 2 x 2 with 3 entries: these take 17 bytes, and the file has 8"),
+        (
+            ["short.mtx", "b.mtx"],
+            "short.mtx: 2 x 2 with 3 entries: these take 17 bytes, and the file has 8",
+        ),
         (["wide.mtx", "b.mtx"], "wide.mtx: has shape 36 x 35: A must be square"),
         (["complex.mtx", "b.mtx"], "complex.mtx: holds complex numbers"),
         (["nan.mtx", "b.mtx"], "nan.mtx: holds 1 values that are not finite"),
         (["A.mtx", "A.mtx"], "A.mtx: has shape 36 x 36: expected 36 x 1"),
-        (["claims.mtx", "b.mtx"], "b.mtx: has shape 36 x 1: expected 2000000000 x 1, a number for each row of A"),
-        (["A.mtx", "b.mtx", "--upper", "long.mtx"], "long.mtx: has shape 2000000000 x 1: expected 36 x 1"),
-        (["A.mtx", "b.mtx", "--lower", "1e25"], "--lower 1e25: is inf (1e20 and more count as infinite): no x could meet it"),
-        (["A.mtx", "b.mtx", "--upper=-inf"], "--upper -inf: is -inf (1e20 and more count as infinite)"),
+        (
+            ["claims.mtx", "b.mtx"],
+            "b.mtx: has shape 36 x 1: expected 2000000000 x 1, a number for each row of A",
+        ),
+        (
+            ["A.mtx", "b.mtx", "--upper", "long.mtx"],
+            "long.mtx: has shape 2000000000 x 1: expected 36 x 1",
+        ),
+        (
+            ["A.mtx", "b.mtx", "--lower", "1e25"],
+            "--lower 1e25: is inf (1e20 and more count as infinite): no x could meet it",
+        ),
+        (
+            ["A.mtx", "b.mtx", "--upper=-inf"],
+            "--upper -inf: is -inf (1e20 and more count as infinite)",
+        ),
         (["A.mtx", "bnan.mtx"], "bnan.mtx: holds 2 values that are not finite"),
         (["A.mtx", "binf.mtx"], "binf.mtx: holds 1 values that are not finite"),
         (["A.mtx", "b.mtx", "--upper", "bnan.mtx"], "bnan.mtx: holds 2 values that are NaN"),
@@ -145,13 +217,25 @@ def test_a_long_history_is_shortened(problem, tmp_path):
         (["A.mtx", "b.mtx", "--lower", "none"], "--lower none: neither a number nor a file"),
         (["A.mtx", "b.mtx", "--lower", "2", "--upper", "1"], "lower > upper in 36"),
         (["A.mtx", "b.mtx", "--lower", "nan"], "lower holds 36 NaN"),
-        (["A.mtx", "b.mtx", "--method", "lemk"], "--method lemk: no such method; did you mean 'lemke'?"),
-        (["A.mtx", "b.mtx", "--method", "projected-multigrid"], "does not accept sparse matrices; choose from"),
+        (
+            ["A.mtx", "b.mtx", "--method", "lemk"],
+            "--method lemk: no such method; did you mean 'lemke'?",
+        ),
+        (
+            ["A.mtx", "b.mtx", "--method", "projected-multigrid"],
+            "does not accept sparse matrices; choose from",
+        ),
         (["A.mtx", "b.mtx", "--tolerance", "2"], "--tolerance 2.0: must be in [0, 1)"),
-        (["A.mtx", "b.mtx", "--max-iterations", "-1"], "--max-iterations -1: must be an integer >= 0"),
+        (
+            ["A.mtx", "b.mtx", "--max-iterations", "-1"],
+            "--max-iterations -1: must be an integer >= 0",
+        ),
         (["A.mtx", "b.mtx", "--max-seconds", "0"], "--max-seconds 0.0: must be > 0"),
         (["A.mtx", "b.mtx", "--max-seconds", "nan"], "--max-seconds nan: must be > 0"),
-        (["A.mtx", "b.mtx", "--out", "no/where/x.mtx"], "--out no/where/x.mtx: no such folder: no/where"),
+        (
+            ["A.mtx", "b.mtx", "--out", "no/where/x.mtx"],
+            "--out no/where/x.mtx: no such folder: no/where",
+        ),
         (["A.mtx"], "b.mtx"),
     ],
 )
@@ -159,7 +243,9 @@ def test_wrong_input_exits_with_2(problem, tmp_path, monkeypatch, arguments, exp
     A, b = problem
     monkeypatch.chdir(tmp_path)
     (tmp_path / "text.mtx").write_text("1 2 3\n")
-    (tmp_path / "short.mtx").write_text("%%MatrixMarket matrix coordinate real general\n2 2 3\n1 1 1.0\n")
+    (tmp_path / "short.mtx").write_text(
+        "%%MatrixMarket matrix coordinate real general\n2 2 3\n1 1 1.0\n"
+    )
     claims = "%%MatrixMarket matrix coordinate real general\n2000000000 {} 2\n1 1 1.0\n36 1 1.0\n"
     (tmp_path / "claims.mtx").write_text(claims.format(2000000000))
     (tmp_path / "long.mtx").write_text(claims.format(1))
@@ -183,15 +269,20 @@ def test_wrong_input_exits_with_2(problem, tmp_path, monkeypatch, arguments, exp
         "coordinate integer symmetric\n2 2 3\n1 1 2\n2 1 -1\n2 2 2\n",
         "array real symmetric\n2 2\n2.0\n-1.0\n2.0\n",
         "array integer general\n2 2\n2\n-1\n-1\n2\n",
-        "coordinate real general\n2 2 5\n1 1 1.5\n1 1 0.5\n1 2 -1\n2 1 -1\n2 2 2\n",  # entries given twice are summed
+        # entries given twice are summed
+        "coordinate real general\n2 2 5\n1 1 1.5\n1 1 0.5\n1 2 -1\n2 1 -1\n2 2 2\n",
     ],
 )
-@pytest.mark.parametrize("right_side", ["array integer general\n2 1\n1\n-5\n", "array real general\n1 2\n1.0\n-5.0\n"])
+@pytest.mark.parametrize(
+    "right_side", ["array integer general\n2 1\n1\n-5\n", "array real general\n1 2\n1.0\n-5.0\n"]
+)
 def test_all_forms_of_a_file_mean_the_same(text, right_side, tmp_path):
     """2 x1 - x2 + 1 and -x1 + 2 x2 - 5 vanish at x = (1, 3)."""
     for name, content in (("A.mtx", text), ("b.mtx", right_side)):
         (tmp_path / name).write_text(f"%%MatrixMarket matrix {content}")
-    result = call(tmp_path / "A.mtx", tmp_path / "b.mtx", "--out", tmp_path / "x.mtx", "--tolerance", 1e-12)
+    result = call(
+        tmp_path / "A.mtx", tmp_path / "b.mtx", "--out", tmp_path / "x.mtx", "--tolerance", 1e-12
+    )
     assert result.exit_code == 0, result.stderr
     np.testing.assert_allclose(scipy.io.mmread(tmp_path / "x.mtx").ravel(), [1.0, 3.0], atol=1e-10)
 
@@ -200,8 +291,20 @@ def test_all_forms_of_a_file_mean_the_same(text, right_side, tmp_path):
 def recorded_problem(tmp_path):
     """A splash as a run records it."""
     scene = cut_cells(splash(10))
-    fields = {"cells": scene.cells, "b": scene.b, "lower": scene.lower("walls"), "upper": np.inf, "x0": np.zeros(scene.b.shape)}
-    np.savez_compressed(tmp_path / "problem_000007.npz", format=1, **fields, **scene.faces, **dict.fromkeys(recorded.NUMBERS, 1.0))
+    fields = {
+        "cells": scene.cells,
+        "b": scene.b,
+        "lower": scene.lower("walls"),
+        "upper": np.inf,
+        "x0": np.zeros(scene.b.shape),
+    }
+    np.savez_compressed(
+        tmp_path / "problem_000007.npz",
+        format=1,
+        **fields,
+        **scene.faces,
+        **dict.fromkeys(recorded.NUMBERS, 1.0),
+    )
     return scene
 
 
@@ -210,11 +313,15 @@ def test_a_recorded_problem(recorded_problem, tmp_path):
     result = call(file, "--out", out, "--tolerance", 1e-10)
     assert result.exit_code == 0, result.stderr
     fluid = recorded_problem.cells == wl.FLUID
-    assert f"{fluid.sum()} unknowns, 10 x 10 x 10 cells, by projected-multigrid on cpu" in result.stdout
+    assert (
+        f"{fluid.sum()} unknowns, 10 x 10 x 10 cells, by projected-multigrid on cpu"
+        in result.stdout
+    )
     x, lower = np.load(out), np.where(recorded_problem.wall, 0.0, -np.inf)
     y = recorded_problem.matrix() @ x[fluid] + recorded_problem.b[fluid]
     assert np.abs(np.minimum(x[fluid] - lower[fluid], y)).max() < 1e-6
-    assert 0 < (x[fluid][np.isfinite(lower[fluid])] == 0.0).sum() < np.isfinite(lower).sum()  # some walls are let go of
+    # some walls are let go of
+    assert 0 < (x[fluid][np.isfinite(lower[fluid])] == 0.0).sum() < np.isfinite(lower).sum()
     assert (x[~fluid] == 0.0).all()
     by_psor = call(file, "--method", "psor", "--out", out, "--max-iterations", 5)
     assert by_psor.exit_code == 1
@@ -226,12 +333,17 @@ def test_a_recorded_problem(recorded_problem, tmp_path):
     [
         (["b.mtx"], "b.mtx: problem_000007.npz has a right-hand side of its own"),
         (["--lower", "0"], "--lower 0: problem_000007.npz has bounds of its own"),
-        (["--out", "x.mtx"], "--out x.mtx: x of a grid is written as a NumPy array: the name must end in .npy"),
+        (
+            ["--out", "x.mtx"],
+            "--out x.mtx: x of a grid is written as a NumPy array: the name must end in .npy",
+        ),
         (["--method", "psorr"], "--method psorr: no such method; did you mean 'psor'?"),
         (["--tolerance", "2"], "--tolerance 2.0: must be in [0, 1)"),
     ],
 )
-def test_wrong_options_of_a_recorded_problem(recorded_problem, tmp_path, monkeypatch, arguments, expected):
+def test_wrong_options_of_a_recorded_problem(
+    recorded_problem, tmp_path, monkeypatch, arguments, expected
+):
     monkeypatch.chdir(tmp_path)
     result = call("problem_000007.npz", *arguments)
     assert result.exit_code == 2
@@ -247,7 +359,9 @@ def test_a_damaged_recorded_problem(recorded_problem, tmp_path):
 
 
 def test_a_pattern_is_a_matrix_of_ones(tmp_path):
-    (tmp_path / "A.mtx").write_text("%%MatrixMarket matrix coordinate pattern symmetric\n2 2 2\n1 1\n2 2\n")
+    (tmp_path / "A.mtx").write_text(
+        "%%MatrixMarket matrix coordinate pattern symmetric\n2 2 2\n1 1\n2 2\n"
+    )
     write(tmp_path / "b.mtx", np.array([-2.0, 3.0]))
     assert call(tmp_path / "A.mtx", tmp_path / "b.mtx", "--out", tmp_path / "x.mtx").exit_code == 0
     np.testing.assert_allclose(scipy.io.mmread(tmp_path / "x.mtx").ravel(), [2.0, 0.0], atol=1e-6)

@@ -24,12 +24,24 @@ SCENES = ("box-stack", "heavy-on-light", "incline", "leaning-wall", "sphere-stac
 
 def box(x: float, y: float, **more: Any) -> dict[str, Any]:
     """Return a cube with its low corner at (x, y) in the middle of the room."""
-    return {"shape": "box", "min": [x, y, 1.0], "max": [x + SIDE, y + SIDE, 1.0 + SIDE], "density": 1000.0, **more}
+    return {
+        "shape": "box",
+        "min": [x, y, 1.0],
+        "max": [x + SIDE, y + SIDE, 1.0 + SIDE],
+        "density": 1000.0,
+        **more,
+    }
 
 
 def tables(*solids: dict[str, Any], **more: Any) -> dict[str, Any]:
     time = {"duration": 1.0, "frames_per_second": 10, "dt_max": 0.01}
-    return {"scene": {"simulator": "contacts"}, "time": time, "domain": {"size": [3.0, 3.0, 3.0]}, "solid": list(solids), **more}
+    return {
+        "scene": {"simulator": "contacts"},
+        "time": time,
+        "domain": {"size": [3.0, 3.0, 3.0]},
+        "solid": list(solids),
+        **more,
+    }
 
 
 def made(scene: ContactScene) -> ContactSimulation:
@@ -52,7 +64,9 @@ def places(simulation: ContactSimulation) -> np.ndarray:
     return np.array([body.position for body in simulation.bodies.bodies])
 
 
-@pytest.mark.parametrize("name", ["box-stack", "heavy-on-light", "leaning-wall", "sphere-stack", "wall"])
+@pytest.mark.parametrize(
+    "name", ["box-stack", "heavy-on-light", "leaning-wall", "sphere-stack", "wall"]
+)
 def test_what_stands_in_the_book_stands(name: str) -> None:
     """After a second no body has moved by a hundredth of a side, and the residual is that of the scene."""
     simulation = made(built_in(name))
@@ -73,14 +87,21 @@ def test_bodies_slide_down_a_slope_as_friction_lets_them() -> None:
         simulation.step(dt)
     gone = np.linalg.norm(places(simulation) - before, axis=1)
     friction = np.array([0.1, 0.25, 0.4, 0.8])
-    expected = 0.5 * 9.81 * np.maximum(np.sin(0.3) - friction * np.cos(0.3), 0.0) * (steps * dt) ** 2
+    expected = (
+        0.5 * 9.81 * np.maximum(np.sin(0.3) - friction * np.cos(0.3), 0.0) * (steps * dt) ** 2
+    )
     assert gone == pytest.approx(expected, rel=0.01, abs=1e-3)
 
 
 def test_a_body_falls_as_a_stone_does_and_hits_the_floor() -> None:
     simulation = made(loaded(box(1.0, 1.0)))
     row = simulation.step(0.01)
-    assert (row["solver"], row["solve_status"], row["solve_residual"], row["contacts"]) == (None, None, None, 0)
+    assert (row["solver"], row["solve_status"], row["solve_residual"], row["contacts"]) == (
+        None,
+        None,
+        None,
+        0,
+    )
     for _ in range(29):
         row = simulation.step(0.01)
     assert row["body0_y"] == pytest.approx(1.25 - 0.5 * 9.81 * 0.3**2, rel=1e-6)
@@ -94,7 +115,11 @@ def test_a_body_falls_as_a_stone_does_and_hits_the_floor() -> None:
 @pytest.mark.parametrize("method", [DEFAULT, "psor", "lemke", "proximal-gauss-seidel"])
 def test_energy_does_not_grow_without_restitution(method: str) -> None:
     """Bodies fall on each other, tilted and turning: kinetic and potential energy together never grow."""
-    turned = {"rotate": [20.0, 10.0, 30.0], "about": [1.4, 1.95, 1.25], "angular_velocity": [90.0, 0.0, -200.0]}
+    turned = {
+        "rotate": [20.0, 10.0, 30.0],
+        "about": [1.4, 1.95, 1.25],
+        "angular_velocity": [90.0, 0.0, -200.0],
+    }
     solids = [box(1.0, 0.0), box(1.15, 1.7, velocity=[0.5, -1.0, 0.0], **turned)]
     simulation = made(loaded(*solids, solver={"method": method, "tolerance": 1e-6}))
     energies = []
@@ -107,7 +132,13 @@ def test_energy_does_not_grow_without_restitution(method: str) -> None:
 
 def test_a_ball_bounces_as_its_restitution_says() -> None:
     """After a fall by h it comes up by e^2 h."""
-    ball = {"shape": "sphere", "center": [1.5, 1.25, 1.5], "radius": 0.25, "density": 1000.0, "restitution": 0.5}
+    ball = {
+        "shape": "sphere",
+        "center": [1.5, 1.25, 1.5],
+        "radius": 0.25,
+        "density": 1000.0,
+        "restitution": 0.5,
+    }
     simulation, heights = made(loaded(ball)), []
     for _ in range(75):
         heights.append(float(simulation.step(0.01)["body0_y"] or 0.0))  # type: ignore[arg-type]
@@ -118,7 +149,10 @@ def test_a_ball_bounces_as_its_restitution_says() -> None:
 @pytest.mark.parametrize("method", [DEFAULT, *BOXED, *STEWART_TRINKLE, *CONE])
 def test_every_method_says_what_it_left(method: str) -> None:
     """Three boxes rest by any method; the log has its name, status, iterations and residual."""
-    scene = loaded(*(box(1.0 + 0.01 * n, SIDE * n) for n in range(3)), solver={"method": method, "tolerance": 1e-3})
+    scene = loaded(
+        *(box(1.0 + 0.01 * n, SIDE * n) for n in range(3)),
+        solver={"method": method, "tolerance": 1e-3},
+    )
     simulation = made(scene)
     before = places(simulation)
     for _ in range(10):
@@ -131,7 +165,12 @@ def test_every_method_says_what_it_left(method: str) -> None:
 
 
 def test_the_log_says_when_a_method_falls_short() -> None:
-    simulation = made(loaded(*(box(1.0, SIDE * n) for n in range(3)), solver={"method": "projected-jacobi", "max_iterations": 3}))
+    simulation = made(
+        loaded(
+            *(box(1.0, SIDE * n) for n in range(3)),
+            solver={"method": "projected-jacobi", "max_iterations": 3},
+        )
+    )
     row = simulation.step(0.01)
     assert (row["solve_status"], row["solve_iterations"]) == ("MAX_ITERATIONS", 3)
     assert float(row["solve_residual"] or 0.0) > 1e-5  # type: ignore[arg-type]
@@ -142,7 +181,8 @@ def test_a_body_that_slides_along_a_diagonal_is_braked_by_mu_g() -> None:
     speed, mu, steps, dt = 1.0, 0.4, 15, 0.01
     way = np.array([np.cos(0.6), 0.0, np.sin(0.6)])
     scene = loaded(
-        box(1.0, 0.0, velocity=(speed * way).tolist(), friction=mu), solver={"method": "proximal-gauss-seidel", "tolerance": 1e-8}
+        box(1.0, 0.0, velocity=(speed * way).tolist(), friction=mu),
+        solver={"method": "proximal-gauss-seidel", "tolerance": 1e-8},
     )
     simulation = made(scene)
     for _ in range(steps):
@@ -153,18 +193,31 @@ def test_a_body_that_slides_along_a_diagonal_is_braked_by_mu_g() -> None:
 
 
 def test_in_a_plane() -> None:
-    solids = [{"shape": "box", "min": [1.0, 0.5 * n], "max": [1.5, 0.5 * n + 0.5], "density": 500.0} for n in range(3)]
+    solids = [
+        {"shape": "box", "min": [1.0, 0.5 * n], "max": [1.5, 0.5 * n + 0.5], "density": 500.0}
+        for n in range(3)
+    ]
     for method in (DEFAULT, "nncg", "minimum-map-newton", "proximal-gauss-seidel"):
-        simulation = made(loaded(*solids, domain={"size": [3.0, 3.0]}, solver={"method": method, "tolerance": 1e-6}))
+        simulation = made(
+            loaded(
+                *solids, domain={"size": [3.0, 3.0]}, solver={"method": method, "tolerance": 1e-6}
+            )
+        )
         for _ in range(20):
             row = simulation.step(0.01)
         assert row["body2_y"] == pytest.approx(1.25, abs=1e-5)
         assert row["max_speed"] < 1e-4  # type: ignore[operator]
 
 
-@pytest.mark.parametrize("method", [DEFAULT, "subspace-minimization", "fischer-newton", "proximal-gauss-seidel"])
+@pytest.mark.parametrize(
+    "method", [DEFAULT, "subspace-minimization", "fischer-newton", "proximal-gauss-seidel"]
+)
 def test_a_run_goes_on_bit_for_bit_after_every_step(method: str) -> None:
-    solids = [box(1.0, 0.0), box(1.1, SIDE), box(1.3, 1.2, velocity=[1.0, -2.0, 0.0], restitution=0.3)]
+    solids = [
+        box(1.0, 0.0),
+        box(1.1, SIDE),
+        box(1.3, 1.2, velocity=[1.0, -2.0, 0.0], restitution=0.3),
+    ]
     scene = loaded(*solids, solver={"method": method, "tolerance": 1e-5})
     assert differences_by_step(scene, 15, 2) == {}
 
@@ -206,7 +259,10 @@ def test_the_commands(tmp_path: Path) -> None:
         ({"solver": {"method": "lemke", "directions": 5}}, "solver.directions = 5"),
         ({"solver": {"precision": "mixed"}}, "solver.precision"),
         ({"solver": {"preset": "final"}}, "solver.preset"),
-        ({"output": {"particles": True}}, "output.particles = true: must be false: there is no material"),
+        (
+            {"output": {"particles": True}},
+            "output.particles = true: must be false: there is no material",
+        ),
         ({"physics": {"density": 900.0}}, "physics.density = 900.0: there is no material"),
         ({"liquid": [box(0.0, 0.0)]}, "fluids"),
         ({"domain": {"size": [3.0, 3.0, 3.0], "solids": "voxel"}}, "domain.solids"),
@@ -220,7 +276,9 @@ def test_what_is_wrong_is_refused(change: dict[str, Any], message: str) -> None:
 
 
 def test_bodies_that_overlap_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"solid\[1\] \(box\) overlaps solid\[0\] \(box\) by 0\.1 m at the start"):
+    with pytest.raises(
+        ValueError, match=r"solid\[1\] \(box\) overlaps solid\[0\] \(box\) by 0\.1 m at the start"
+    ):
         made(loaded(box(1.0, 0.0), box(1.0, 0.4)))
 
 

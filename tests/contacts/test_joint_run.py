@@ -24,7 +24,13 @@ Z = [0.0, 0.0, 1.0]
 
 def bar(x: float, y: float = 1.5, **more: Any) -> dict[str, Any]:
     """Return a bar of 0.4 m along x that begins at x."""
-    return {"shape": "box", "min": [x, y - 0.05, 0.95], "max": [x + 0.4, y + 0.05, 1.05], "density": 1000.0, **more}
+    return {
+        "shape": "box",
+        "min": [x, y - 0.05, 0.95],
+        "max": [x + 0.4, y + 0.05, 1.05],
+        "density": 1000.0,
+        **more,
+    }
 
 
 def hinge(*solids: int, at: float, **more: Any) -> dict[str, Any]:
@@ -35,12 +41,22 @@ def tables(joints: list[dict[str, Any]], **more: Any) -> dict[str, Any]:
     """Return a scene of two bars and a post that stands."""
     post = {"shape": "box", "min": [0.2, 0.0, 0.8], "max": [0.5, 2.0, 1.2]}
     time = {"duration": 1.0, "frames_per_second": 10, "dt_max": 0.01}
-    own = {"solid": [post, bar(0.6), bar(1.05)], "joint": joints, "domain": {"size": [3.0, 3.0, 2.0]}, "time": time}
+    own = {
+        "solid": [post, bar(0.6), bar(1.05)],
+        "joint": joints,
+        "domain": {"size": [3.0, 3.0, 2.0]},
+        "time": time,
+    }
     return {"scene": {"simulator": "contacts"}, **own, **more}
 
 
 JOINTS = [hinge(1, 0, at=0.55), hinge(2, 1, at=1.02, limits=[-20.0, 20.0])]
-REACH = {"solid": 2, "point": [1.45, 1.5, 1.0], "times": [0.0, 1.0], "places": [[1.45, 1.5, 1.0], [0.9, 2.1, 1.0]]}
+REACH = {
+    "solid": 2,
+    "point": [1.45, 1.5, 1.0],
+    "times": [0.0, 1.0],
+    "places": [[1.45, 1.5, 1.0], [0.9, 2.1, 1.0]],
+}
 
 
 def loaded(source: Any, *overrides: str) -> ContactScene:
@@ -73,7 +89,15 @@ def test_a_chain_falls_and_stays_together() -> None:
 
 def test_a_scene_in_the_plane() -> None:
     """Two bars on hinges fall as two that are fixed to each other where the second's limits are 0."""
-    solids = [{"shape": "box", "min": [0.6 + 0.45 * n, 1.45], "max": [1.0 + 0.45 * n, 1.55], "density": 1000.0} for n in (0, 1)]
+    solids = [
+        {
+            "shape": "box",
+            "min": [0.6 + 0.45 * n, 1.45],
+            "max": [1.0 + 0.45 * n, 1.55],
+            "density": 1000.0,
+        }
+        for n in (0, 1)
+    ]
     first = {"kind": "hinge", "solids": [0], "anchor": [0.55, 1.5]}
     seconds = [
         {"kind": "fixed", "solids": [1, 0], "anchor": [1.02, 1.5]},
@@ -93,7 +117,9 @@ def test_a_scene_in_the_plane() -> None:
     assert ends[0][0] < -30.0
 
 
-@pytest.mark.parametrize("more", [{}, {"target": [REACH]}, {"solver": {"method": "nncg", "tolerance": 1e-3}}])
+@pytest.mark.parametrize(
+    "more", [{}, {"target": [REACH]}, {"solver": {"method": "nncg", "tolerance": 1e-3}}]
+)
 def test_a_run_goes_on_bit_for_bit_after_every_step(more: dict[str, Any]) -> None:
     assert differences_by_step(loaded(tables(JOINTS, **more)), 6, 2) == {}
 
@@ -101,7 +127,9 @@ def test_a_run_goes_on_bit_for_bit_after_every_step(more: dict[str, Any]) -> Non
 @pytest.mark.parametrize("method", KINEMATIC)
 def test_an_arm_reaches_as_far_as_its_limits_let_it(method: str) -> None:
     """Within the limits and at the point that SciPy's bounded least squares finds; anchors stay together."""
-    simulation = made(loaded(tables(JOINTS, target=[REACH], solver={"method": method, "tolerance": 1e-6})))
+    simulation = made(
+        loaded(tables(JOINTS, target=[REACH], solver={"method": method, "tolerance": 1e-6}))
+    )
     assert isinstance(simulation, KinematicSimulation)
     for _ in range(10):
         row = simulation.step(0.1)
@@ -113,13 +141,21 @@ def test_an_arm_reaches_as_far_as_its_limits_let_it(method: str) -> None:
 
     def off(angles: np.ndarray) -> np.ndarray:
         a, b = angles[0], angles[0] + angles[1]
-        at = np.array([0.55, 1.5, 1.0]) + 0.47 * np.array([np.cos(a), np.sin(a), 0.0]) + 0.43 * np.array([np.cos(b), np.sin(b), 0.0])
+        at = (
+            np.array([0.55, 1.5, 1.0])
+            + 0.47 * np.array([np.cos(a), np.sin(a), 0.0])
+            + 0.43 * np.array([np.cos(b), np.sin(b), 0.0])
+        )
         return at - goal
 
     limit = np.radians(20.0)
     start = [1.0, 0.1 * np.sign(row["joint1_angle"])]  # the elbow bends either way
-    best = scipy.optimize.least_squares(off, start, bounds=([-np.inf, -limit], [np.inf, limit]), xtol=1e-14, ftol=1e-14, gtol=1e-14)
-    assert [row["joint0_angle"], row["joint1_angle"]] == pytest.approx(np.degrees(best.x).tolist(), abs=1e-3)
+    best = scipy.optimize.least_squares(
+        off, start, bounds=([-np.inf, -limit], [np.inf, limit]), xtol=1e-14, ftol=1e-14, gtol=1e-14
+    )
+    assert [row["joint0_angle"], row["joint1_angle"]] == pytest.approx(
+        np.degrees(best.x).tolist(), abs=1e-3
+    )
     assert row["target_error"] == pytest.approx(float(np.linalg.norm(best.fun)), abs=1e-5)
     tip = simulation.bodies.motions[1].pose(simulation.time).apply(np.array([REACH["point"]]))[0]
     assert tip - goal == pytest.approx(best.fun, abs=1e-5)
@@ -128,25 +164,64 @@ def test_an_arm_reaches_as_far_as_its_limits_let_it(method: str) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"joint": [hinge(1, 7, at=0.5)]}, "joint[0].solids = [1, 7]: must be numbers of [[solid]]s, from 0 to 2"),
+        (
+            {"joint": [hinge(1, 7, at=0.5)]},
+            "joint[0].solids = [1, 7]: must be numbers of [[solid]]s, from 0 to 2",
+        ),
         ({"joint": [hinge(0, 1, at=0.5)]}, "the first must be a rigid body"),
         ({"joint": [hinge(1, 1, at=0.5)]}, "must differ"),
-        ({"joint": [{"kind": "hinge", "solids": [1], "anchor": [0.5, 1.5, 1.0]}]}, "joint[0].axis: must be given for a hinge in 3-D"),
-        ({"joint": [hinge(1, at=0.5, motor_speed=1.0)]}, "joint[0].motor_torque: must be given together with motor_speed"),
-        ({"joint": [hinge(1, at=0.5, limits=[10.0, -10.0])]}, "joint[0].limits = [10.0, -10.0]: must be in order"),
         (
-            {"joint": [{"kind": "ball", "solids": [1], "anchor": [0.5, 1.5, 1.0], "limits": [-1.0, 1.0]}]},
+            {"joint": [{"kind": "hinge", "solids": [1], "anchor": [0.5, 1.5, 1.0]}]},
+            "joint[0].axis: must be given for a hinge in 3-D",
+        ),
+        (
+            {"joint": [hinge(1, at=0.5, motor_speed=1.0)]},
+            "joint[0].motor_torque: must be given together with motor_speed",
+        ),
+        (
+            {"joint": [hinge(1, at=0.5, limits=[10.0, -10.0])]},
+            "joint[0].limits = [10.0, -10.0]: must be in order",
+        ),
+        (
+            {
+                "joint": [
+                    {
+                        "kind": "ball",
+                        "solids": [1],
+                        "anchor": [0.5, 1.5, 1.0],
+                        "limits": [-1.0, 1.0],
+                    }
+                ]
+            },
             "is only for hinges: this joint is ball",
         ),
         ({"joint": [{"kind": "rope", "solids": [1], "anchor": [0.5, 1.5, 1.0]}]}, "joint[0].kind"),
-        ({"solver": {"method": "sweeps-and-newton"}}, "cannot solve joints, which are equations; choose from nncg"),
-        ({"solid": [bar(0.6, restitution=0.5), bar(1.05)], "joint": [hinge(1, 0, at=1.02)]}, "must be 0 where there are joints"),
+        (
+            {"solver": {"method": "sweeps-and-newton"}},
+            "cannot solve joints, which are equations; choose from nncg",
+        ),
+        (
+            {"solid": [bar(0.6, restitution=0.5), bar(1.05)], "joint": [hinge(1, 0, at=1.02)]},
+            "must be 0 where there are joints",
+        ),
         ({"domain": {"size": [3.0, 3.0, 2.0], "open": ["left"]}}, "domain.open"),
-        ({"target": [{**REACH, "solid": 0}]}, "target[0].solid = 0: must be the number of a rigid body"),
+        (
+            {"target": [{**REACH, "solid": 0}]},
+            "target[0].solid = 0: must be the number of a rigid body",
+        ),
         ({"target": [{**REACH, "times": [0.0]}]}, "target[0].places"),
-        ({"target": [REACH], "joint": JOINTS[:1]}, "target: every body must be the first body of exactly one hinge"),
-        ({"target": [REACH], "joint": [hinge(1, 2, at=1.02), hinge(2, 1, at=1.02)]}, "some form a loop"),
-        ({"target": [REACH], "solver": {"method": "staggering"}}, "cannot be used for inverse kinematics"),
+        (
+            {"target": [REACH], "joint": JOINTS[:1]},
+            "target: every body must be the first body of exactly one hinge",
+        ),
+        (
+            {"target": [REACH], "joint": [hinge(1, 2, at=1.02), hinge(2, 1, at=1.02)]},
+            "some form a loop",
+        ),
+        (
+            {"target": [REACH], "solver": {"method": "staggering"}},
+            "cannot be used for inverse kinematics",
+        ),
     ],
 )
 def test_what_is_wrong_is_refused(change: dict[str, Any], message: str) -> None:
@@ -169,7 +244,9 @@ def test_frames_of_built_in_scenes(tmp_path: Path, name: str) -> None:
     done("run", name, "--device", "cpu", "--out", tmp_path / "run", "--frames", 1)
     with open(tmp_path / "run" / "log.csv", newline="") as file:
         rows = list(csv.DictReader(file))
-    assert all(float(row["solve_residual"]) <= 1e-5 and int(row["solve_iterations"]) >= 0 for row in rows)
+    assert all(
+        float(row["solve_residual"]) <= 1e-5 and int(row["solve_iterations"]) >= 0 for row in rows
+    )
     mesh = meshio.read(tmp_path / "run" / "frames" / "bodies_000001.vtu")
     scene = loaded(name)
     shown = sum(solid.is_body for solid in scene.solid) + len(scene.target)
@@ -182,7 +259,13 @@ def test_frames_of_built_in_scenes(tmp_path: Path, name: str) -> None:
 def test_an_arch_is_held_up_by_the_limits_of_its_hinges(limit: float) -> None:
     """It sags until six of them have reached them, then stands. Loose hinges let it fall."""
     scene = loaded("arched-snake")
-    simulation = made(scene.model_copy(update={"joint": [j.model_copy(update={"limits": [-limit, limit]}) for j in scene.joint]}))
+    simulation = made(
+        scene.model_copy(
+            update={
+                "joint": [j.model_copy(update={"limits": [-limit, limit]}) for j in scene.joint]
+            }
+        )
+    )
     for _ in range(15):
         row = simulation.step(0.01)
     angles = np.array([value for key, value in row.items() if key.endswith("_angle")])
@@ -222,7 +305,10 @@ def test_a_gear_turns_one_with_twice_its_teeth_half_as_fast() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "apart"), [("arched-snake", 1e-6), ("gear-pyramid", 1e-6), ("motor-arm", 1e-6), ("snake", 1e-5)])
+@pytest.mark.parametrize(
+    ("name", "apart"),
+    [("arched-snake", 1e-6), ("gear-pyramid", 1e-6), ("motor-arm", 1e-6), ("snake", 1e-5)],
+)
 def test_built_in_scenes_run_to_their_ends(name: str, apart: float) -> None:
     scene = loaded(name)
     simulation = made(scene)

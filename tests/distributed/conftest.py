@@ -16,17 +16,20 @@ launch.find_petsc()
 def mpi(tmp_path):
     """Run this interpreter on n ranks: `mpi(2, "-m", "module", "--option")`, or `mpi(2, TEXT, *arguments)` with a program's text.
 
-    Text is what has a line break in it; it is written into a file in `tmp_path`, which is the working folder of all runs.
+    Text is what has a line break in it; it is written into a file in `tmp_path`, which is the
+    working folder of all runs.
 
     Args:
         n: ranks.
-        arguments: of the interpreter, any type that `str` turns into text; or a program and its arguments.
+        arguments: of the interpreter, any type that `str` turns into text; or a program and its
+            arguments.
         exit_code: what the run must end with; None for anything.
         seconds: time limit.
         environment: variables to add.
 
     Returns:
-        subprocess.CompletedProcess with the text of `stdout` (of all ranks, their lines in any order) and `stderr`.
+        subprocess.CompletedProcess with the text of `stdout` (of all ranks, their lines in any
+        order) and `stderr`.
     """
     why = launch.missing()
     if why:
@@ -39,9 +42,14 @@ def mpi(tmp_path):
             program.write_text(textwrap.dedent(words[0]))
             words[0] = str(program)
         process = subprocess.Popen(
-            launch.command(n, *words), env=launch.environment() | (environment or {}), cwd=tmp_path, text=True,
-            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-        )  # fmt: skip
+            launch.command(n, *words),
+            env=launch.environment() | (environment or {}),
+            cwd=tmp_path,
+            text=True,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        )
         try:
             out, errors = process.communicate(timeout=seconds)
         except subprocess.TimeoutExpired:
@@ -52,7 +60,9 @@ def mpi(tmp_path):
                 process.kill()
                 out, errors = process.communicate()
             pytest.fail(f"{n} ranks did not end within {seconds} s\n{out}\n{errors}")
-        assert exit_code is None or process.returncode == exit_code, f"exit code {process.returncode}\n{out}\n{errors}"
+        assert exit_code is None or process.returncode == exit_code, (
+            f"exit code {process.returncode}\n{out}\n{errors}"
+        )
         return subprocess.CompletedProcess(process.args, process.returncode, out, errors)
 
     return run

@@ -1,7 +1,8 @@
 """The command line with a simulator of falling dots that several ranks share, NumPy only, and willing to fail on request.
 
-Several commands may follow each other, with `then` between them; their exit codes go to the error stream, the last one's is the program's.
-A command may begin with DOTS_TROUBLE="step rank kind", what goes wrong, see `trouble`, and DOTS_REFUSE, why there is no simulation.
+Several commands may follow each other, with `then` between them; their exit codes go to the error
+stream, the last one's is the program's. A command may begin with DOTS_TROUBLE="step rank kind",
+what goes wrong, see `trouble`, and DOTS_REFUSE, why there is no simulation.
 """
 
 from __future__ import annotations
@@ -81,12 +82,21 @@ class Dots:
         points = np.pad(self.position, ((0, 0), (0, 1))).astype(np.float32)
         index = np.unique(np.clip(points * CELLS, 0, CELLS - 1).astype(np.int32), axis=0)
         fields = {"velocity": np.pad(self.velocity, ((0, 0), (0, 1))), "identity": self.identity}
-        return [Points("particles", points, fields), Cells("grid", index, 1.0 / CELLS, 2, {"wall": index[:, 1] == 0}, (CELLS, CELLS, 1))]
+        return [
+            Points("particles", points, fields),
+            Cells("grid", index, 1.0 / CELLS, 2, {"wall": index[:, 1] == 0}, (CELLS, CELLS, 1)),
+        ]
 
     def state(self) -> dict[str, np.ndarray]:
         box = np.array([[self.low, 0, 0], [self.high, CELLS, 1]])
         clock = {"time": np.array(self.time), "step_count": np.array(self.step_count)}
-        return {"box": box, "position": self.position, "velocity": self.velocity, "identity": self.identity, **clock}
+        return {
+            "box": box,
+            "position": self.position,
+            "velocity": self.velocity,
+            "identity": self.identity,
+            **clock,
+        }
 
     def restore_pieces(self, pieces: list[dict[str, np.ndarray]]) -> None:
         names = "position", "velocity", "identity"
@@ -103,7 +113,11 @@ class Dots:
         column = np.minimum((CELLS * position[:, 0]).astype(int), CELLS - 1)
         mine = np.flatnonzero((column >= self.low) & (column < self.high))
         mine = mine[np.argsort(identity[mine])]
-        self.position, self.velocity, self.identity = position[mine].copy(), velocity[mine].copy(), identity[mine].copy()
+        self.position, self.velocity, self.identity = (
+            position[mine].copy(),
+            velocity[mine].copy(),
+            identity[mine].copy(),
+        )
 
 
 class DotsSimulator:
@@ -113,7 +127,9 @@ class DotsSimulator:
     summary = "dots that fall, on ranks too"
     scene_model = Scene
 
-    def create(self, scene: Scene, *, device: str, folder: Path, ranks: Ranks | None = None) -> Dots:
+    def create(
+        self, scene: Scene, *, device: str, folder: Path, ranks: Ranks | None = None
+    ) -> Dots:
         if ranks is None:
             return Dots(scene, Ranks(SimpleNamespace(rank=0, size=1)))
         if os.environ.get("DOTS_REFUSE"):

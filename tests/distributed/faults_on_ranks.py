@@ -1,7 +1,8 @@
 """The command line on ranks, of which one meets a fault: FAULT="rank kind place number", the number-th time that it comes to the place.
 
-Places: `file`, an operation on a file in the folder `out`; `wait`, the start of an operation of all ranks; `wait-end`, its end; `step`.
-Then the program writes the time into the file `fault`. The scene of dots is simulated by `dots_on_ranks`, others as everywhere.
+Places: `file`, an operation on a file in the folder `out`; `wait`, the start of an operation of all
+ranks; `wait-end`, its end; `step`. Then the program writes the time into the file `fault`. The
+scene of dots is simulated by `dots_on_ranks`, others as everywhere.
 """
 
 from __future__ import annotations
@@ -23,9 +24,21 @@ from warp_lcp.distributed import launch
 from warp_lcp.distributed.waiting import Waiting
 from warp_lcp.run import loop
 
-OPERATIONS = {"open", "os.rename", "os.remove", "os.mkdir", "os.truncate"}  # audit events: raised before the system is asked
-SIGNALS = {"killed": signal.SIGKILL, "stopped": signal.SIGSTOP, "crashed": signal.SIGSEGV, "asked": signal.SIGTERM}
-TO_ALL = {"Ctrl-C": signal.SIGINT, "ended": signal.SIGTERM, "launcher-killed": signal.SIGKILL, "stop": signal.SIGUSR1}  # to mpiexec
+# audit events: raised before the system is asked
+OPERATIONS = {"open", "os.rename", "os.remove", "os.mkdir", "os.truncate"}
+SIGNALS = {
+    "killed": signal.SIGKILL,
+    "stopped": signal.SIGSTOP,
+    "crashed": signal.SIGSEGV,
+    "asked": signal.SIGTERM,
+}
+# to mpiexec
+TO_ALL = {
+    "Ctrl-C": signal.SIGINT,
+    "ended": signal.SIGTERM,
+    "launcher-killed": signal.SIGKILL,
+    "stop": signal.SIGUSR1,
+}
 KINDS = (*SIGNALS, *TO_ALL, "late", "bug", "disk", "disk-full", "small-files")
 PLACES = ("file", "wait", "wait-end", "step")
 HEARD = threading.Event()  # a signal that this process handles
@@ -84,12 +97,20 @@ def lay_in_wait(place: str, fault: Fault) -> None:
         out = str(Path("out").resolve())
 
         def audit(event: str, arguments: tuple[Any, ...]) -> None:
-            if event in OPERATIONS and isinstance(arguments[0], str | os.PathLike) and os.path.abspath(arguments[0]).startswith(out):
+            if (
+                event in OPERATIONS
+                and isinstance(arguments[0], str | os.PathLike)
+                and os.path.abspath(arguments[0]).startswith(out)
+            ):
                 fault()
 
         sys.addaudithook(audit)
         return
-    where, name = {"wait": (Waiting, "__enter__"), "wait-end": (Waiting, "__exit__"), "step": (loop, "take_step")}[place]
+    where, name = {
+        "wait": (Waiting, "__enter__"),
+        "wait-end": (Waiting, "__exit__"),
+        "step": (loop, "take_step"),
+    }[place]
     real = getattr(where, name)
 
     def meanwhile(*arguments: Any, **options: Any) -> Any:

@@ -47,7 +47,9 @@ def part(values, box, shape, axis=None):
     """This rank's part of a field, or of the faces along an axis, which include those at its upper sides."""
     if np.ndim(values) == 0:
         return values
-    slices = [slice(l, h + (a == axis)) for a, (l, h) in enumerate(zip(box.low, box.high, strict=True))][: len(shape)]
+    slices = [
+        slice(l, h + (a == axis)) for a, (l, h) in enumerate(zip(box.low, box.high, strict=True))
+    ][: len(shape)]
     return np.ascontiguousarray(values[tuple(reversed(slices))])
 
 
@@ -57,7 +59,9 @@ def columns(shape, count):
     for _ in range(count):
         center, radius = rng.random(len(shape)) * shape, rng.uniform(1.5, 0.3 * min(shape))
         near = np.sqrt(sum((w - c) ** 2 for w, c in zip(where, center, strict=True)))
-        found.append(np.where((near > 0.6 * radius) & (near < radius), rng.standard_normal(shape), 0.0))
+        found.append(
+            np.where((near > 0.6 * radius) & (near < radius), rng.standard_normal(shape), 0.0)
+        )
     root = rng.standard_normal((count, count))
     return np.stack(found, axis=-1), 10.0 ** rng.uniform(-1, 1) * root @ root.T
 
@@ -72,9 +76,22 @@ def joined(A, columns, box):
 
 
 def compare(
-    ranks, name, cells, b, lower, upper=np.inf, *, method, decomposition=None, rtol=1e-9, same=1e-7, columns=None, counts_differ=1,
-    others=(), **faces
-):  # fmt: skip
+    ranks,
+    name,
+    cells,
+    b,
+    lower,
+    upper=np.inf,
+    *,
+    method,
+    decomposition=None,
+    rtol=1e-9,
+    same=1e-7,
+    columns=None,
+    counts_differ=1,
+    others=(),
+    **faces,
+):
     """Solve on all ranks and on one; statuses are the same (CONVERGED, INFEASIBLE or `others`), counts to one, x but for rounding."""
     shape = cells.shape
     counts = (*reversed(shape), 1)[:3]
@@ -87,19 +104,33 @@ def compare(
     stopping = wl.StoppingCriteria(rtol=rtol)
     found = wl.solve(problem, wl.default_chain(method, problem), stopping=stopping)
     whole = CellBox((0, 0, 0), counts)
-    alone = wl.LCP(joined(wl.GridPoisson(cells, device="cpu", **faces), columns, whole), b, lower, upper)
+    alone = wl.LCP(
+        joined(wl.GridPoisson(cells, device="cpu", **faces), columns, whole), b, lower, upper
+    )
     expected = wl.solve(alone, wl.default_chain(method, alone), stopping=stopping)
     assert found.status is expected.status, (name, found.status, expected.status)
-    assert abs(found.iterations - expected.iterations) <= counts_differ, (name, found.iterations, expected.iterations)
-    # both start from the same residual, and take the same steps on their way: lengths and directions are from sums over all ranks
+    assert abs(found.iterations - expected.iterations) <= counts_differ, (
+        name,
+        found.iterations,
+        expected.iterations,
+    )
+    # both start from the same residual, and take the same steps on their way: lengths and
+    # directions are from sums over all ranks
     ours, theirs = (np.array([r.residual for r in result.history]) for result in (found, expected))
     assert np.isclose(ours[0], theirs[0], rtol=1e-12), name
     way = min(len(ours), len(theirs), 4)  # later, rounding may have moved cells between sets
-    assert np.allclose(ours[:way], theirs[:way], rtol=1e-3, atol=1e-300), (name, ours[:way], theirs[:way])
+    assert np.allclose(ours[:way], theirs[:way], rtol=1e-3, atol=1e-300), (
+        name,
+        ours[:way],
+        theirs[:way],
+    )
     own, whole = found.x.numpy(), expected.x.numpy()
     error = ranks.max(float(np.abs(own - part(whole, boxes.box, shape)).max(initial=0.0)))
     scale = max(float(np.abs(whole).max()), 1e-300)
-    assert expected.status in (wl.SolveStatus.CONVERGED, wl.SolveStatus.INFEASIBLE, *others), (name, expected.status)
+    assert expected.status in (wl.SolveStatus.CONVERGED, wl.SolveStatus.INFEASIBLE, *others), (
+        name,
+        expected.status,
+    )
     assert not expected or error <= same * scale, (name, error / scale)
     return found, problem.A
 
@@ -118,8 +149,18 @@ def shapes(ranks):
             compare(ranks, f"linear {shape}", cells, b, -np.inf, method=method)
             walls = np.where(rng.random(shape) < 0.3, 0.0, -np.inf)
             compare(ranks, f"walls {shape}", cells, b, walls, method=method, **coefficients(shape))
-            compare(ranks, f"number a face {shape}", cells, b, 0.0, method=method, face_x=1.0, face_y=3.0)
-            alike = np.where(np.indices(shape)[0] < shape[0] // 2, walls, -rng.random(shape))  # of one finite value on some ranks only
+            compare(
+                ranks,
+                f"number a face {shape}",
+                cells,
+                b,
+                0.0,
+                method=method,
+                face_x=1.0,
+                face_y=3.0,
+            )
+            # of one finite value on some ranks only
+            alike = np.where(np.indices(shape)[0] < shape[0] // 2, walls, -rng.random(shape))
             compare(ranks, f"bounds alike on some ranks {shape}", cells, b, alike, method=method)
 
 
@@ -130,9 +171,16 @@ def rounded_on_one_rank(ranks):
     face[3, 4, 5] = 0.3
     for method in (PM, NEWTON):
         found, _ = compare(
-            ranks, "rounded", scene(shape), rng.standard_normal(shape), 0.0, method=method, rtol=1e-10, face_x=face,
+            ranks,
+            "rounded",
+            scene(shape),
+            rng.standard_normal(shape),
+            0.0,
+            method=method,
+            rtol=1e-10,
+            face_x=face,
             others=(wl.SolveStatus.FLOOR,),
-        )  # fmt: skip
+        )
         assert found.status is wl.SolveStatus.FLOOR, found.status
 
 
@@ -143,8 +191,25 @@ def low_rank(ranks):
         b = rng.standard_normal(shape)
         walls = np.where(rng.random(shape) < 0.3, 0.0, -np.inf)
         for method in (PM, NEWTON):
-            compare(ranks, f"columns {shape}", cells, b, -np.inf, method=method, columns=columns(shape, 5))
-            compare(ranks, f"columns, walls {shape}", cells, b, walls, method=method, columns=columns(shape, 3), counts_differ=3)
+            compare(
+                ranks,
+                f"columns {shape}",
+                cells,
+                b,
+                -np.inf,
+                method=method,
+                columns=columns(shape, 5),
+            )
+            compare(
+                ranks,
+                f"columns, walls {shape}",
+                cells,
+                b,
+                walls,
+                method=method,
+                columns=columns(shape, 3),
+                counts_differ=3,
+            )
 
 
 def other_cuts(ranks):
@@ -157,14 +222,22 @@ def other_cuts(ranks):
                 (20, 20, 20),
                 ranks,
                 processes=processes,
-                cuts=[[20] if p == 1 else [7, *[5] * (p - 2), 20 - 7 - 5 * (p - 2)] for p in processes],
+                cuts=[
+                    [20] if p == 1 else [7, *[5] * (p - 2), 20 - 7 - 5 * (p - 2)] for p in processes
+                ],
             )
             compare(ranks, f"odd cuts {processes}", cells, b, 0.0, method=PM, decomposition=boxes)
         cells = scene((40, 40, 40))
         b = rng.standard_normal((40, 40, 40))
         for processes in ((ranks.size, 1, 1), (1, ranks.size, 1)):
             compare(
-                ranks, f"cuts {processes}", cells, b, 0.0, method=PM, decomposition=Decomposition((40, 40, 40), ranks, processes=processes)
+                ranks,
+                f"cuts {processes}",
+                cells,
+                b,
+                0.0,
+                method=PM,
+                decomposition=Decomposition((40, 40, 40), ranks, processes=processes),
             )
 
 
@@ -175,7 +248,10 @@ def closed_pools(ranks):
     cells[:, 7:, 6] = wl.SOLID
     cells[3, 9, 9] = wl.AIR
     b = rng.standard_normal(cells.shape)
-    for region in ((slice(None), slice(0, 6), slice(None)), (slice(None), slice(7, None), slice(0, 6))):
+    for region in (
+        (slice(None), slice(0, 6), slice(None)),
+        (slice(None), slice(7, None), slice(0, 6)),
+    ):
         b[region] -= b[region].mean()
     for method in (PM, NEWTON):
         found, A = compare(ranks, "closed pools", cells, b, -np.inf, method=method, same=1e-8)
@@ -183,7 +259,9 @@ def closed_pools(ranks):
         compare(ranks, "closed pools, bounded", cells, b + 0.1, 0.0, method=method, same=1e-8)
         piston = np.zeros((*cells.shape, 1))
         piston[:, 5, :] = 1.0 / 288.0  # what it feels of the pool beneath it is no null space
-        found, A = compare(ranks, "a piston", cells, b, -np.inf, method=method, columns=(piston, np.ones((1, 1))))
+        found, A = compare(
+            ranks, "a piston", cells, b, -np.inf, method=method, columns=(piston, np.ones((1, 1)))
+        )
         assert A.floating_components().count == 1
     found, A = compare(ranks, "no solution", cells, b + 1.0, -np.inf, method=PM)
     assert found.status is wl.SolveStatus.INFEASIBLE
@@ -207,19 +285,32 @@ def memory_in_place(ranks):
         stored.numpy()[1:-1, 1:-1, 1:-1] = part(b, boxes.box, shape)
         guess = None
         for _ in range(2):  # the second time warm
-            found = wl.solve(problem, PM, workspace=work, stopping=wl.StoppingCriteria(rtol=1e-9), x0=guess)
+            found = wl.solve(
+                problem, PM, workspace=work, stopping=wl.StoppingCriteria(rtol=1e-9), x0=guess
+            )
             guess = found.x
-        expected = wl.solve(wl.LCP(wl.GridPoisson(cells, device="cpu"), b, 0.0), PM, stopping=wl.StoppingCriteria(rtol=1e-9))
+        expected = wl.solve(
+            wl.LCP(wl.GridPoisson(cells, device="cpu"), b, 0.0),
+            PM,
+            stopping=wl.StoppingCriteria(rtol=1e-9),
+        )
         assert found and expected
         inner = found.x.numpy()[1:-1, 1:-1, 1:-1]
-        assert np.abs(inner - part(expected.x.numpy(), boxes.box, shape)).max() <= 1e-7 * np.abs(expected.x.numpy()).max()
+        assert (
+            np.abs(inner - part(expected.x.numpy(), boxes.box, shape)).max()
+            <= 1e-7 * np.abs(expected.x.numpy()).max()
+        )
 
 
 def as_on_devices(ranks):
     """Ghost cells that go through the host's memory, and no leg of a cycle in one pass."""
     fill, filling, fuses = Halo.fill, Halo.filling, StencilLevel.fuses
     Halo.filling = lambda self, field: Task(partial(self.fill, field))
-    Halo.fill = lambda self, field: self._fill_through_host(field.reshape(self.shape)) if isinstance(field, wp.array) else fill(self, field)
+    Halo.fill = lambda self, field: (
+        self._fill_through_host(field.reshape(self.shape))
+        if isinstance(field, wp.array)
+        else fill(self, field)
+    )
     StencilLevel.fuses = False
     cells = scene((34, 21, 40))
     b = rng.standard_normal(cells.shape)
@@ -234,7 +325,12 @@ def legs(ranks):
     cells, faces = scene(shape), coefficients(shape)
     free, b, gaps = rng.random(shape) < 0.9, rng.standard_normal(shape), rng.random((2, *shape))
     halo_levels.GATHERED = 64
-    cuts = {(1, 1, ranks.size), (1, ranks.size, 1), (ranks.size, 1, 1), Decomposition(shape[::-1], ranks).processes}
+    cuts = {
+        (1, 1, ranks.size),
+        (1, ranks.size, 1),
+        (ranks.size, 1, 1),
+        Decomposition(shape[::-1], ranks).processes,
+    }
     for processes, given in product(sorted(cuts), (faces, {})):
         boxes, found = Decomposition(shape[::-1], ranks, processes=processes), []
         axes = {"face_x": 0, "face_y": 1, "face_z": 2}
@@ -243,10 +339,21 @@ def legs(ranks):
         for streams, threads in ((True, 1), (False, 1), (True, 2)):
             wl.set_threads(threads)
             made = make_hierarchy(A.stencil, wp.float64, bounded=True)
-            made.hold(A.stencil.d, A.layout.load(part(free, boxes.box, shape).astype(np.uint8), wp.uint8))
+            made.hold(
+                A.stencil.d, A.layout.load(part(free, boxes.box, shape).astype(np.uint8), wp.uint8)
+            )
             made.rebuild_changed()
-            for field, values in ((made.finest.b, b), (made.finest.lower, -gaps[0]), (made.finest.upper, gaps[1])):
-                field.assign(A.layout.load(part(np.where(free & (cells == wl.FLUID), values, 0.0), boxes.box, shape), wp.float64))
+            for field, values in (
+                (made.finest.b, b),
+                (made.finest.lower, -gaps[0]),
+                (made.finest.upper, gaps[1]),
+            ):
+                field.assign(
+                    A.layout.load(
+                        part(np.where(free & (cells == wl.FLUID), values, 0.0), boxes.box, shape),
+                        wp.float64,
+                    )
+                )
             with mock.patch.object(StencilLevel, "fuses", StencilLevel.fuses if streams else False):
                 cycles = made.cycle, made.cycle, made.monotone_cycle, made.cycle
             for cycle in cycles:
@@ -255,7 +362,9 @@ def legs(ranks):
         wl.set_threads(1)
         for once, apart, together in zip(found[:4], found[4:8], found[8:], strict=True):
             assert once.tobytes() == together.tobytes(), processes
-            assert np.abs(once - apart).max() <= 1e-13 * ranks.max(np.abs(apart).max()) > 0, processes
+            assert np.abs(once - apart).max() <= 1e-13 * ranks.max(np.abs(apart).max()) > 0, (
+                processes
+            )
     halo_levels.GATHERED = gathered
 
 
@@ -263,9 +372,14 @@ def wrong_input(ranks):
     """What is wrong is refused on all ranks."""
     shape = (32, 18, 18)
     boxes = Decomposition((18, 18, 32), ranks)
-    cells, b = (part(field, boxes.box, shape) for field in (scene(shape), rng.standard_normal(shape)))
+    cells, b = (
+        part(field, boxes.box, shape) for field in (scene(shape), rng.standard_normal(shape))
+    )
     problem = wl.LCP(wl.GridPoisson(cells, decomposition=boxes, device="cpu"), b)
-    for arguments, word in (({"periodic": (True, False, False)}, "periodic"), ({"face_x": np.ones((3, 3, 3))}, "face_x")):
+    for arguments, word in (
+        ({"periodic": (True, False, False)}, "periodic"),
+        ({"face_x": np.ones((3, 3, 3))}, "face_x"),
+    ):
         try:
             wl.GridPoisson(cells, decomposition=boxes, device="cpu", **arguments)
             raise AssertionError(word)
@@ -273,7 +387,9 @@ def wrong_input(ranks):
             assert word in str(error), error
     if ranks.size > 1:
         try:  # on one rank alone
-            wl.GridPoisson(cells if ranks.rank else cells[:, :-1], decomposition=boxes, device="cpu")
+            wl.GridPoisson(
+                cells if ranks.rank else cells[:, :-1], decomposition=boxes, device="cpu"
+            )
             raise AssertionError("cells")
         except ValueError as error:
             assert "rank 0: cells has shape" in str(error), error
@@ -297,9 +413,19 @@ def halos(ranks):
             halo = Halo(boxes, width)
             for dtype in (np.int8, np.int16, np.float32, np.float64):
                 around = boxes.box.grown(width)
-                ranges = (np.arange(low, high) for low, high in zip(around.low[::-1], around.high[::-1], strict=True))
+                ranges = (
+                    np.arange(low, high)
+                    for low, high in zip(around.low[::-1], around.high[::-1], strict=True)
+                )
                 z, y, x = np.meshgrid(*ranges, indexing="ij")
-                inside = (x >= 0) & (x < counts[0]) & (y >= 0) & (y < counts[1]) & (z >= 0) & (z < counts[2])
+                inside = (
+                    (x >= 0)
+                    & (x < counts[0])
+                    & (y >= 0)
+                    & (y < counts[1])
+                    & (z >= 0)
+                    & (z < counts[2])
+                )
                 everyone = np.where(inside, ((z * 7 + y) * 5 + x) % 101, 0).astype(dtype)
                 field, inner = np.zeros(halo.shape, dtype), (slice(width, -width),) * 3
                 field[inner] = everyone[inner]
@@ -333,8 +459,17 @@ if __name__ == "__main__":
     wp.config.log_level = wp.LOG_ERROR
     everyone = Ranks.world()
     for check in (
-        halos, messages_in_tables, shapes, other_cuts, closed_pools, memory_in_place, as_on_devices, legs, rounded_on_one_rank, low_rank,
+        halos,
+        messages_in_tables,
+        shapes,
+        other_cuts,
+        closed_pools,
+        memory_in_place,
+        as_on_devices,
+        legs,
+        rounded_on_one_rank,
+        low_rank,
         wrong_input,
-    ):  # fmt: skip
+    ):
         check(everyone)
     sys.stdout.write(f"rank {everyone.rank} of {everyone.size} is done\n")

@@ -60,22 +60,31 @@ def small(name: str, bounds: str) -> Small:
     """Liquid below air with a solid ball in it, in a closed box.
 
     Args:
-        name: cube (16^3, unit coefficients), brick (17 x 13 x 11 cells, a coefficient a face, a shift) or plane (64^2, c_y = 1/2).
-        bounds: walls (x >= 0 beside solids), everywhere (x >= 0) or boxed (both bounds, other ones in each cell).
+        name: cube (16^3, unit coefficients), brick (17 x 13 x 11 cells, a coefficient a face, a
+            shift) or plane (64^2, c_y = 1/2).
+        bounds: walls (x >= 0 beside solids), everywhere (x >= 0) or boxed (both bounds, other ones
+            in each cell).
     """
     shape = {"cube": (16, 16, 16), "brick": (11, 13, 17), "plane": (64, 64)}[name]
     rng = np.random.default_rng(20261122 + len(name))
     at = np.meshgrid(*((np.arange(n) + 0.5) / n for n in shape), indexing="ij")
     cells = np.where(at[-2] < 0.75 + 0.1 * np.sin(7 * at[-1]), FLUID, AIR)
-    cells[sum((a - c) ** 2 for a, c in zip(at, (0.4, 0.35, 0.55)[-len(shape) :], strict=True)) < 0.15**2] = SOLID
+    cells[
+        sum((a - c) ** 2 for a, c in zip(at, (0.4, 0.35, 0.55)[-len(shape) :], strict=True))
+        < 0.15**2
+    ] = SOLID
     coefficients = {}
     if name == "brick":
         for axis, face in enumerate(("face_z", "face_y", "face_x")):
-            coefficients[face] = rng.uniform(0.2, 1.0, [n + (a == axis) for a, n in enumerate(shape)])
+            coefficients[face] = rng.uniform(
+                0.2, 1.0, [n + (a == axis) for a, n in enumerate(shape)]
+            )
         coefficients["shift"] = rng.uniform(0.0, 0.01, shape)
     elif name == "plane":
         coefficients["face_y"] = 0.5
-    waves = sum(np.cos(np.pi * k * a + k) for k in (1, 2, 3) for a in at) + 0.5 * rng.standard_normal(shape)
+    waves = sum(
+        np.cos(np.pi * k * a + k) for k in (1, 2, 3) for a in at
+    ) + 0.5 * rng.standard_normal(shape)
     b = np.where(cells == FLUID, waves - waves[cells == FLUID].mean(), 0.0) / max(shape) ** 2
     lower, upper = np.full(shape, -np.inf), np.full(shape, np.inf)
     if bounds == "walls":

@@ -37,14 +37,25 @@ def random_vector(grid, boxes, shape, seed):
 
 def products():
     """Products and diagonals on all unknowns and on a free set, with unit coefficients and others, in 3-D and 2-D."""
-    for name, dtype, accuracy in (("brick", wp.float64, 1e-14), ("brick", wp.float32, 1e-6), ("plane", wp.float64, 1e-14)):
+    for name, dtype, accuracy in (
+        ("brick", wp.float64, 1e-14),
+        ("brick", wp.float32, 1e-6),
+        ("plane", wp.float64, 1e-14),
+    ):
         problem = small(name, "walls")
         boxes, lcp = shared_problem(problem, Ranks.world(), dtype=dtype)
         grid, shape = PetscGrid(lcp.A, real=dtype), problem.cells.shape
         free = problem.fluid & (np.random.default_rng(517).random(shape) < 0.8)
         held = grid.vector()
-        grid.hold(lcp.A.layout.load(free.reshape(boxes.counts[::-1])[boxes.box.slices].reshape(lcp.A.shape), wp.uint8))
-        for matrix, expected in ((grid.operator, on_all_cells(problem, problem.fluid)), (grid.matrix, on_all_cells(problem, free))):
+        grid.hold(
+            lcp.A.layout.load(
+                free.reshape(boxes.counts[::-1])[boxes.box.slices].reshape(lcp.A.shape), wp.uint8
+            )
+        )
+        for matrix, expected in (
+            (grid.operator, on_all_cells(problem, problem.fluid)),
+            (grid.matrix, on_all_cells(problem, free)),
+        ):
             x, v = random_vector(grid, boxes, shape, 29)
             y = expected @ x.ravel()
             for product in (matrix.mult, matrix.multTranspose):
@@ -91,21 +102,30 @@ def linear_solves():
     boxes, lcp = shared_problem(problem, Ranks.world())
     grid, shape = PetscGrid(lcp.A, real=wp.float64), problem.cells.shape
     options = petsc().Options()
-    options["jacobi_pc_type"], options["jacobi_ksp_type"], options["jacobi_ksp_max_it"] = "jacobi", "minres", 500
+    options["jacobi_pc_type"], options["jacobi_ksp_type"], options["jacobi_ksp_max_it"] = (
+        "jacobi",
+        "minres",
+        500,
+    )
     kinds = [grid.solver(), grid.solver("jacobi_")]
     assert [ksp.getType() for ksp in kinds] == ["cg", "minres"]
     for share in (1.1, 0.7):
         free = problem.fluid & (np.random.default_rng(61).random(shape) < share)
         grid.hold(lcp.A.layout.load(free[boxes.box.slices], wp.uint8))
         x, b = random_vector(grid, boxes, shape, 41)
-        expected = scipy.sparse.linalg.spsolve(on_all_cells(problem, free), x.ravel()).reshape(shape)
+        expected = scipy.sparse.linalg.spsolve(on_all_cells(problem, free), x.ravel()).reshape(
+            shape
+        )
         for ksp, most in zip(kinds, (12, 500), strict=True):
             ksp.setTolerances(rtol=1e-10)
             found = grid.vector()
             ksp.solve(b, found)
             assert ksp.getConvergedReason() > 0
             assert ksp.getIterationNumber() <= most
-            assert np.abs(whole_field(grid.field(found), boxes, shape) - expected).max() < 1e-7 * np.abs(expected).max()
+            assert (
+                np.abs(whole_field(grid.field(found), boxes, shape) - expected).max()
+                < 1e-7 * np.abs(expected).max()
+            )
 
 
 def bounded_methods():
@@ -118,7 +138,11 @@ def bounded_methods():
     options = petsc().Options()
     options["pc_type"], options["snes_vi_zero_tolerance"] = "jacobi", 1e-13
     least, most = petsc().NINFINITY, petsc().INFINITY
-    fields = problem.b, np.where(fluid, np.maximum(problem.lower, least), 0.0), np.where(fluid, most, 0.0)
+    fields = (
+        problem.b,
+        np.where(fluid, np.maximum(problem.lower, least), 0.0),
+        np.where(fluid, most, 0.0),
+    )
     b, lower, upper = (grid.vector(field[boxes.box.slices]) for field in fields)
 
     def energy(tao, x, gradient):
@@ -169,13 +193,17 @@ class Sums:
     def mult(self, matrix, x, y):
         field = np.where(self.unknown[0], x.getArray(readonly=True).reshape(self.shapes[0]), 0.0)
         for axis in range(3):
-            field = np.add.reduceat(field, np.arange(0, field.shape[axis], self.by[axis]), axis=axis)
+            field = np.add.reduceat(
+                field, np.arange(0, field.shape[axis], self.by[axis]), axis=axis
+            )
         y.setArray(np.where(self.unknown[1], field, 0.0).ravel())
 
     def multTranspose(self, matrix, x, y):  # noqa: N802  # PETSc's name
         field = np.where(self.unknown[1], x.getArray(readonly=True).reshape(self.shapes[1]), 0.0)
         for axis in range(3):
-            field = np.repeat(field, self.by[axis], axis=axis).take(np.arange(self.shapes[0][axis]), axis=axis)
+            field = np.repeat(field, self.by[axis], axis=axis).take(
+                np.arange(self.shapes[0][axis]), axis=axis
+            )
         y.setArray(np.where(self.unknown[0], self.factor * field, 0.0).ravel())
 
 
@@ -218,7 +246,11 @@ def cycles_of_pcmg():
             pc.setMGRestriction(k, restriction)
             pc.setMGInterpolation(k, PETSc.Mat().createTranspose(restriction))
         pc.setUp()
-        r = grid.vector(np.where(problem.fluid, np.random.default_rng(43).standard_normal(problem.cells.shape), 0.0))
+        r = grid.vector(
+            np.where(
+                problem.fluid, np.random.default_rng(43).standard_normal(problem.cells.shape), 0.0
+            )
+        )
         z, expected = grid.vector(), grid.vector()
         ours.getPC().apply(r, z)
         pc.apply(r, expected)

@@ -1,6 +1,7 @@
 """A program for ranks: solve a small problem by PETSc's own methods on an assembled matrix and by ours; tell how they differ.
 
-Usage: petsc_oracles.py NAME with a name of `oracle_problems.small`. Rank 0 prints one JSON object: what each method tells, for all bounds.
+Usage: petsc_oracles.py NAME with a name of `oracle_problems.small`. Rank 0 prints one JSON object:
+what each method tells, for all bounds.
 """
 
 import json
@@ -60,13 +61,17 @@ def snes(problem, A, kind, prepare):
     """Solve by PETSc's SNES for variational inequalities, F(x) = A x + b."""
     matrix = shared_matrix(A)
     fluid = problem.fluid
-    b, lower, upper = (shared_vector(matrix, field[fluid]) for field in (problem.b, problem.lower, problem.upper))
+    b, lower, upper = (
+        shared_vector(matrix, field[fluid]) for field in (problem.b, problem.lower, problem.upper)
+    )
     options = petsc().Options()
-    options["snes_vi_zero_tolerance"] = 1e-13  # an absolute one, 1e-8 unless set: bounds would count as touched that are not
+    # an absolute one, 1e-8 unless set: bounds would count as touched that are not
+    options["snes_vi_zero_tolerance"] = 1e-13
     solver = petsc().SNES().create()
     solver.setType(kind)
     solver.setFunction(lambda snes, x, f: matrix.multAdd(x, b, f), b.duplicate())
-    solver.setJacobian(lambda snes, x, J, P: matrix.copy(P), matrix.duplicate(copy=True))  # vinewtonssls scales the rows in place
+    # vinewtonssls scales the rows in place
+    solver.setJacobian(lambda snes, x, J, P: matrix.copy(P), matrix.duplicate(copy=True))
     solver.setVariableBounds(lower, upper)
     solver.setTolerances(rtol=1e-11, atol=1e-11 * b.norm(), stol=0.0, max_it=100)
     prepare(solver.getKSP())
@@ -80,7 +85,9 @@ def tao(problem, A, kind):
     """Solve by PETSc's TAO, as the quadratic program of which the LCP is the condition of optimality."""
     matrix = shared_matrix(A)
     fluid = problem.fluid
-    b, lower, upper = (shared_vector(matrix, field[fluid]) for field in (problem.b, problem.lower, problem.upper))
+    b, lower, upper = (
+        shared_vector(matrix, field[fluid]) for field in (problem.b, problem.lower, problem.upper)
+    )
 
     def energy(tao, x, gradient):
         matrix.mult(x, gradient)
@@ -148,13 +155,19 @@ def solve_ours(problem, solver, ranks):
 
 def level_matrix(stencil):
     """Return a level's stencil of one rank as an assembled matrix on all cells, the identity on those that are no unknowns."""
-    counts, grid = stencil.padding.counts, np.arange(np.prod(stencil.padding.counts)).reshape(stencil.padding.counts)
+    counts, grid = (
+        stencil.padding.counts,
+        np.arange(np.prod(stencil.padding.counts)).reshape(stencil.padding.counts),
+    )
     inside = (slice(1, -1),) * 3
     d = stencil.d.numpy().reshape(stencil.padding.shape)[inside].astype(float) * stencil.unit
     matrix = scipy.sparse.diags_array(np.where(d == 0, 1.0, d).ravel()).tolil()
     for axis, w in zip((2, 1, 0), stencil.weights, strict=True):
         weight = w.numpy().reshape(stencil.padding.shape)[inside]
-        above, below = ((slice(None),) * axis + (cut,) for cut in (slice(1, None), slice(None, counts[axis] - 1)))
+        above, below = (
+            (slice(None),) * axis + (cut,)
+            for cut in (slice(1, None), slice(None, counts[axis] - 1))
+        )
         joined = (d[above] != 0) & (d[below] != 0)
         i, j = grid[above][joined], grid[below][joined]
         matrix[i, j] = matrix[j, i] = -weight[above][joined]
@@ -169,13 +182,20 @@ def compare(problem):
         places = problem.places(A, x)
         reference = reference or (x, places)
         told[name] = {
-            "converged": bool(result), "iterations": result.iterations, "linear_iterations": result.linear_iterations,
-            "residual": result.residual, "residual_by_scipy": float(np.linalg.norm(problem.natural_residual(A, x))),
+            "converged": bool(result),
+            "iterations": result.iterations,
+            "linear_iterations": result.linear_iterations,
+            "residual": result.residual,
+            "residual_by_scipy": float(np.linalg.norm(problem.natural_residual(A, x))),
             **differences(x, places, *reference),
-        }  # fmt: skip
+        }
     for name, solve in THEIRS.items():
         x, reason, iterations = solve(problem, A)
-        told[name] = {"converged": reason > 0, "iterations": iterations, **differences(x, problem.places(A, x), *reference)}
+        told[name] = {
+            "converged": reason > 0,
+            "iterations": iterations,
+            **differences(x, problem.places(A, x), *reference),
+        }
     return told
 
 
@@ -188,6 +208,10 @@ def differences(x, places, other_x, other_places):
 
 if __name__ == "__main__":
     wp.config.log_level = wp.LOG_ERROR
-    found = {f"{name}, {bounds}": compare(small(name, bounds)) for name in sys.argv[1:] for bounds in BOUNDS}
+    found = {
+        f"{name}, {bounds}": compare(small(name, bounds))
+        for name in sys.argv[1:]
+        for bounds in BOUNDS
+    }
     if Ranks.world().is_root:
         print(json.dumps(found))

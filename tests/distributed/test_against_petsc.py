@@ -27,4 +27,8 @@ def test_petscs_own_methods_find_the_same_solution_and_active_set(mpi, ranks):
             assert told["held_otherwise"] == 0, (bounds, method, told)
         for method in OURS:  # the residual that a result tells is that of its x
             told = methods[method]
-            assert told["residual_by_scipy"] == pytest.approx(told["residual"], rel=1e-3), (bounds, method, told)
+            assert told["residual_by_scipy"] == pytest.approx(told["residual"], rel=1e-3), (
+                bounds,
+                method,
+                told,
+            )

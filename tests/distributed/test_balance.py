@@ -22,8 +22,14 @@ def box(*high: float) -> tuple[np.ndarray, np.ndarray]:
 
 def test_a_column_is_cut_along_the_axis_that_it_stays_balanced_along():
     counts = (64, 32, 32)
-    assert balanced_processes(counts, 2, layers=5, states=[[box(16, 20, 32)], [box(64, 5, 32)]]) == (1, 1, 2)
-    assert balanced_processes(counts, 2, layers=5, states=[[box(64, 32, 4)], [box(64, 4, 32)]]) == (2, 1, 1)
+    assert balanced_processes(
+        counts, 2, layers=5, states=[[box(16, 20, 32)], [box(64, 5, 32)]]
+    ) == (1, 1, 2)
+    assert balanced_processes(counts, 2, layers=5, states=[[box(64, 32, 4)], [box(64, 4, 32)]]) == (
+        2,
+        1,
+        1,
+    )
 
 
 def test_material_everywhere_is_cut_where_least_is_seen_by_others():
@@ -79,7 +85,9 @@ def test_boxes_are_cut_anew_only_if_the_whole_step_gets_a_quarter_shorter(least,
     particles = SimpleNamespace(exchange=SimpleNamespace(counts=[1000, 100]))
     monkeypatch.setattr(balance, "seen_by", lambda counts, parts, layers: np.zeros((2, 1, 1)))
     monkeypatch.setattr(balance, "blocks", lambda part, particles, edge: np.zeros(1))
-    monkeypatch.setattr(balance, "Load", lambda *given: SimpleNamespace(best=lambda *asked, rank: (least, cuts)))
+    monkeypatch.setattr(
+        balance, "Load", lambda *given: SimpleNamespace(best=lambda *asked, rank: (least, cuts))
+    )
     found = balance.Balance(fixed=1000.0).rebalance(part, particles, 1)
     assert found == (cuts if pays else None)
 
@@ -103,7 +111,9 @@ def test_cuts_by_load_leave_the_busiest_rank_as_little_as_any_cuts_along_one_axi
     assert [sum(part) for part in cut] == list(counts)
     for axis, p in itertools.product(range(3), [ranks]):
         for part in every_cut(counts[axis], p, 3):
-            assert work <= busiest(load, [part if a == axis else [n] for a, n in enumerate(counts)]) * (1.0 + 1e-12)
+            assert work <= busiest(
+                load, [part if a == axis else [n] for a, n in enumerate(counts)]
+            ) * (1.0 + 1e-12)
 
 
 def test_cuts_by_load_lie_between_blocks_that_multigrid_gathers():

@@ -89,7 +89,9 @@ EXPECTED = {
 def test_blocks_end_alike(mpi):
     found = mpi(3, BLOCKS).stdout.splitlines()
     for name, expected in EXPECTED.items():
-        assert {line for line in found if f" {name}:" in line} == {f"{rank} {name}: {expected}" for rank in range(3)}
+        assert {line for line in found if f" {name}:" in line} == {
+            f"{rank} {name}: {expected}" for rank in range(3)
+        }
     bug = {line for line in found if " bug:" in line}
     others = {f"{rank} bug: RankFailed rank 1: KeyError: 'key'   [1]" for rank in (0, 2)}
     assert bug == others | {"1 bug: KeyError 'key'  ['on rank 1 of 3'] [1]"}

@@ -21,7 +21,10 @@ def test_devices_are_dealt_in_turns(name, number, found, expected):
 
 @pytest.mark.parametrize(("name", "choices"), [("cuda", "cpu"), ("cuda:0", "cpu"), ("tpu", "cpu")])
 def test_a_missing_device_is_named(name, choices):
-    with pytest.raises(ValueError, match=f"--device {name}: there is no such device on this machine; choose from {choices}"):
+    with pytest.raises(
+        ValueError,
+        match=f"--device {name}: there is no such device on this machine; choose from {choices}",
+    ):
         dealt(name, 0, [])
 
 
@@ -36,4 +39,8 @@ def test_ranks_of_one_machine_count_through_its_devices(mpi):
     print(f"{ranks.rank}: {devices.device_of_rank(ranks, 'cuda')}\\n", end="")
     """
     lines = mpi(3, text).stdout.split("\n")
-    assert sorted(line for line in lines if ": cuda" in line) == ["0: cuda 0", "1: cuda 1", "2: cuda 2"]
+    assert sorted(line for line in lines if ": cuda" in line) == [
+        "0: cuda 0",
+        "1: cuda 1",
+        "2: cuda 2",
+    ]

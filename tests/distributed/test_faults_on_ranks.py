@@ -24,8 +24,27 @@ def befall(mpi, tmp_path):
 
     def go(ranks, fault, *more):
         (tmp_path / "dots.toml").write_text(SCENE)
-        options = ("--engine", "petsc", "--device", "cpu", "--out", "out", "--rank-timeout", LIMIT, *more)
-        done = mpi(ranks, PROGRAM, "run", "dots.toml", *options, exit_code=None, seconds=90.0, environment={"FAULT": fault})
+        options = (
+            "--engine",
+            "petsc",
+            "--device",
+            "cpu",
+            "--out",
+            "out",
+            "--rank-timeout",
+            LIMIT,
+            *more,
+        )
+        done = mpi(
+            ranks,
+            PROGRAM,
+            "run",
+            "dots.toml",
+            *options,
+            exit_code=None,
+            seconds=90.0,
+            environment={"FAULT": fault},
+        )
         assert done.returncode != 0
         assert "finished" not in done.stdout
         return done.stdout + done.stderr, time.time() - float((tmp_path / "fault").read_text())
@@ -39,9 +58,16 @@ def wait_for_ranks(folder):
         fcntl.flock(lock, fcntl.LOCK_EX)
 
 
-FAULTS = {  # on two ranks, with how run.json says that it ended, what is said, and the step that others go on from
+# on two ranks, with how run.json says that it ended, what is said, and the step that others go on
+# from
+FAULTS = {
     "1 killed step 70": ("running", "", "noticed that process rank 1", 68),
-    "1 late wait 300": ("failed", "rank 1 of 2 keeps the others waiting: ", "rank 1 has been at __main__:", 12),
+    "1 late wait 300": (
+        "failed",
+        "rank 1 of 2 keeps the others waiting: ",
+        "rank 1 has been at __main__:",
+        12,
+    ),
     "0 Ctrl-C step 30": ("stopped", "interrupted by SIG", "", None),
     "1 bug step 30": ("failed", "rank 1", "KeyError: 'no such key'", 28),
     "1 small-files step 30": ("failed", "rank 1: [Errno 27] File too large", "File too large", 28),
@@ -54,7 +80,8 @@ def test_all_end_and_others_go_on(befall, run, tmp_path, fault):
     text, seconds = befall(2, fault)
     assert seconds < SOON + LIMIT * fault.count("late")
     found = record(tmp_path / "out")
-    killed = "Ctrl-C" in fault and found["status"] == "running"  # by mpiexec, a second later, before the step's end
+    # by mpiexec, a second later, before the step's end
+    killed = "Ctrl-C" in fault and found["status"] == "running"
     assert killed or (found["status"], found["reason"][: len(reason)]) == (status, reason)
     assert said in text
     ranks = 3 if "late" in fault else 0
@@ -90,7 +117,9 @@ def test_what_fails_after_a_step_leaves_it(mpi, run, tmp_path, rank):
     assert "LookupError: nothing to show" in done.stderr
     found = record(tmp_path / "out")
     assert (found["status"], found["steps"]) == ("failed", 30)
-    assert found["reason"] == ("LookupError: nothing to show" if rank == 0 else "rank 1: LookupError: nothing to show")
+    assert found["reason"] == (
+        "LookupError: nothing to show" if rank == 0 else "rank 1: LookupError: nothing to show"
+    )
     run(0, "run dots.toml --out out --resume")
     assert record(tmp_path / "out")["resumed_from_step"] == 30
 
@@ -102,10 +131,32 @@ MOST = {"file": 80, "wait": 900, "wait-end": 900, "step": 131}
 @pytest.mark.parametrize("seed", range(40))
 def test_any_fault_at_any_moment(mpi, run, tmp_path, seed):
     draw = random.Random(9173 * seed + 71)
-    ranks, kind, place = draw.choice([2, 2, 3, 4]), draw.choice(faults_on_ranks.KINDS), draw.choice(faults_on_ranks.PLACES)
+    ranks, kind, place = (
+        draw.choice([2, 2, 3, 4]),
+        draw.choice(faults_on_ranks.KINDS),
+        draw.choice(faults_on_ranks.PLACES),
+    )
     rank, number = draw.randrange(ranks), 1 + int(MOST[place] * draw.random() ** 1.5)
-    words = ("run", "dots.toml", "--engine", "petsc", "--device", "cpu", "--out", "out", "--rank-timeout", LIMIT)
-    done = mpi(ranks, PROGRAM, *words, exit_code=None, seconds=120.0, environment={"FAULT": f"{rank} {kind} {place} {number}"})
+    words = (
+        "run",
+        "dots.toml",
+        "--engine",
+        "petsc",
+        "--device",
+        "cpu",
+        "--out",
+        "out",
+        "--rank-timeout",
+        LIMIT,
+    )
+    done = mpi(
+        ranks,
+        PROGRAM,
+        *words,
+        exit_code=None,
+        seconds=120.0,
+        environment={"FAULT": f"{rank} {kind} {place} {number}"},
+    )
     if (tmp_path / "fault").exists() and done.returncode != 0:
         late = kind in ("late", "stopped")
         assert time.time() - float((tmp_path / "fault").read_text()) < SOON + 2 * LIMIT * late
@@ -113,8 +164,14 @@ def test_any_fault_at_any_moment(mpi, run, tmp_path, seed):
             assert f"rank {rank}" in done.stdout + done.stderr
     out = tmp_path / "out"
     wait_for_ranks(out)
-    if not (out / "run.json").is_file() or json.loads((out / "run.json").read_text())["status"] != "finished":
-        run(draw.choice([0, 1, 3]), f"run dots.toml --out out{' --resume' * (out / 'run.json').is_file()}")
+    if (
+        not (out / "run.json").is_file()
+        or json.loads((out / "run.json").read_text())["status"] != "finished"
+    ):
+        run(
+            draw.choice([0, 1, 3]),
+            f"run dots.toml --out out{' --resume' * (out / 'run.json').is_file()}",
+        )
     run(0, "run dots.toml --out one")
     assert len(log(out)) == 131
     assert_same_run(tmp_path / "one", out)

@@ -10,13 +10,20 @@ from warp_lcp.distributed.decomposition import CellBox, parts
 PROGRAMS = Path(__file__).parent
 
 
-@pytest.mark.parametrize("ranks", [*(pytest.param(n, marks=pytest.mark.slow) for n in (1, 3, 4)), 2])
+@pytest.mark.parametrize(
+    "ranks", [*(pytest.param(n, marks=pytest.mark.slow) for n in (1, 3, 4)), 2]
+)
 def test_problems_of_one_process_and_of_ranks(mpi, ranks):
     done = mpi(ranks, PROGRAMS / "grid_problems_on_ranks.py")
-    assert sorted(done.stdout.split("\n"))[1:] == [f"rank {rank} of {ranks} is done" for rank in range(ranks)]
+    assert sorted(done.stdout.split("\n"))[1:] == [
+        f"rank {rank} of {ranks} is done" for rank in range(ranks)
+    ]
 
 
-@pytest.mark.parametrize(("n", "p", "expected"), [(128, 2, [64, 64]), (129, 2, [64, 65]), (100, 3, [32, 32, 36]), (5, 5, [1] * 5)])
+@pytest.mark.parametrize(
+    ("n", "p", "expected"),
+    [(128, 2, [64, 64]), (129, 2, [64, 65]), (100, 3, [32, 32, 36]), (5, 5, [1] * 5)],
+)
 def test_cuts_lie_at_powers_of_two(n, p, expected):
     assert parts(n, p) == expected
 

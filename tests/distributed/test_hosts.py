@@ -12,7 +12,18 @@ from warp_lcp.distributed import launch
 
 HOSTS = Path(__file__).with_name("hosts")
 RUN = "from warp_lcp.cli.commands import main; main()"
-WORDS = ("run", "dam-break", "--engine", "petsc", "--device", "cpu", "--set", "domain.resolution=48", "--set", "time.duration=0.2")
+WORDS = (
+    "run",
+    "dam-break",
+    "--engine",
+    "petsc",
+    "--device",
+    "cpu",
+    "--set",
+    "domain.resolution=48",
+    "--set",
+    "time.duration=0.2",
+)
 WHERE = """
     import os, socket
     from mpi4py import MPI
@@ -26,12 +37,25 @@ def hosts(tmp_path):
     """Run this interpreter on ranks of which each has a host: `hosts(3, *arguments)`, in `tmp_path`; what it prints comes back."""
     if why := launch.missing():
         pytest.skip(why)
-    if shutil.which("ip") is None or subprocess.run(["unshare", "--net", "--uts", "true"], check=False, capture_output=True).returncode:
+    if (
+        shutil.which("ip") is None
+        or subprocess.run(
+            ["unshare", "--net", "--uts", "true"], check=False, capture_output=True
+        ).returncode
+    ):
         pytest.skip("this user makes no network namespaces")
 
     def run(n, *arguments):
         command = [str(HOSTS), str(n), sys.executable, *map(str, arguments)]
-        done = subprocess.run(command, env=launch.environment(), cwd=tmp_path, text=True, capture_output=True, timeout=300.0, check=False)
+        done = subprocess.run(
+            command,
+            env=launch.environment(),
+            cwd=tmp_path,
+            text=True,
+            capture_output=True,
+            timeout=300.0,
+            check=False,
+        )
         assert done.returncode == 0, done.stderr
         return done.stdout
 
@@ -50,10 +74,17 @@ def test_runs_have_the_same_bits(hosts, mpi, tmp_path):
     """In the log, but for seconds, and in all frames."""
     mpi(3, "-c", RUN, *WORDS, "--out", "one")
     hosts(3, "-c", RUN, *WORDS, "--out", "three")
-    logs = [[row.split(",")[:-1] for row in (tmp_path / out / "log.csv").read_text().splitlines()] for out in ("one", "three")]
+    logs = [
+        [row.split(",")[:-1] for row in (tmp_path / out / "log.csv").read_text().splitlines()]
+        for out in ("one", "three")
+    ]
     assert logs[0] == logs[1]
     assert len(logs[0]) > 10
-    files = sorted(path.relative_to(tmp_path / "one") for path in (tmp_path / "one" / "frames").rglob("*.*"))
+    files = sorted(
+        path.relative_to(tmp_path / "one") for path in (tmp_path / "one" / "frames").rglob("*.*")
+    )
     assert len(files) > 30
     for file in files:
-        assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "three" / file).read_bytes(), file
+        assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "three" / file).read_bytes(), (
+            file
+        )

@@ -13,11 +13,14 @@ HELLO = """
 
 def test_ranks_know_each_other(mpi):
     lines = mpi(3, HELLO, "argument").stdout.split("\n")
-    assert sorted(line for line in lines if line) == [f"rank {n} of 3, argument, 1" for n in range(3)]
+    assert sorted(line for line in lines if line) == [
+        f"rank {n} of 3, argument, 1" for n in range(3)
+    ]
 
 
 def test_modules_run_on_ranks(mpi):
-    text = "from warp_lcp.distributed import launch; print(f'{launch.rank_here()} ', end='')"  # ranks' lines may run into each other
+    # ranks' lines may run into each other
+    text = "from warp_lcp.distributed import launch; print(f'{launch.rank_here()} ', end='')"
     assert sorted(mpi(2, "-c", text).stdout.split()) == ["0", "1"]
 
 
@@ -48,7 +51,10 @@ def test_the_environment_has_the_last_word(monkeypatch):
     assert launch.command(2, "program.py")[:3] == ["mpiexec", "-n", "2"]
 
 
-@pytest.mark.parametrize(("there", "expected"), [(None, "no mpiexec: install"), ("/usr/bin/mpiexec", "no petsc4py and no mpi4py: install")])
+@pytest.mark.parametrize(
+    ("there", "expected"),
+    [(None, "no mpiexec: install"), ("/usr/bin/mpiexec", "no petsc4py and no mpi4py: install")],
+)
 def test_what_is_missing_is_named(monkeypatch, there, expected):
     monkeypatch.setattr(launch.shutil, "which", lambda name: there)
     monkeypatch.setattr(launch.importlib.util, "find_spec", lambda name: None)

@@ -38,19 +38,40 @@ from warp_lcp.scene.simulator import simulators
 
 PROGRAM = Path(__file__).with_name("liquids_on_ranks.py")
 TESTS = Path(__file__).parents[1]
-SANDS = ("bodies in sand", "ball on sand", "sand", "stirred sand", "voxel sand", "trickling sand", "endless sand", "endless sand, stirred")
-# What is left of the residual is as large as the rounding of the solve: it is compared with what it is a small part of.
+SANDS = (
+    "bodies in sand",
+    "ball on sand",
+    "sand",
+    "stirred sand",
+    "voxel sand",
+    "trickling sand",
+    "endless sand",
+    "endless sand, stirred",
+)
+# What is left of the residual is as large as the rounding of the solve: it is compared with what it
+# is a small part of.
 NOISE = {
-    **dict.fromkeys(("solve_residual", "viscous_residual", "coupled_residual", "predicted_excess"), lambda row: 1.0),
+    **dict.fromkeys(
+        ("solve_residual", "viscous_residual", "coupled_residual", "predicted_excess"),
+        lambda row: 1.0,
+    ),
     "max_divergence": lambda row: 32.0 * max(row["max_speed"], 0.1),
 }
 
 
-# With a solver in double precision the order of its sums differs alone; now and then that is the last bit of a velocity. What rests on
-# others makes more of it: the last bit of a thousandth of all velocities, changed in one process, turns the box on the floor by 4e-6 of 90
-# degrees a second. Beside a periodic side that is cut, particles are added up in another order, and seen from the other side with other
-# last bits: such bits, changed after each step in one process, make 4e-6 of the dissipation.
-CLOSE = {"cut": 1e-8, "floating": 1e-5, "ball on sand": 1e-5, "bodies in sand": 1e-5, "endless sand": 2e-5}
+# With a solver in double precision the order of its sums differs alone; now and then that is the
+# last bit of a velocity. What rests on others makes more of it: the last bit of a thousandth of all
+# velocities, changed in one process, turns the box on the floor by 4e-6 of 90 degrees a second.
+# Beside a periodic side that is cut, particles are added up in another order, and seen from the
+# other side with other last bits: such bits, changed after each step in one process, make 4e-6 of
+# the dissipation.
+CLOSE = {
+    "cut": 1e-8,
+    "floating": 1e-5,
+    "ball on sand": 1e-5,
+    "bodies in sand": 1e-5,
+    "endless sand": 2e-5,
+}
 
 
 def same(rows, expected, rel):
@@ -58,7 +79,8 @@ def same(rows, expected, rel):
     assert len(rows) == len(expected)
     for row, other in zip(rows, expected, strict=True):
         assert row.keys() == other.keys()
-        scales = {"forces ": 9.81 * other["mass"], "probes velocity": other["max_speed"]}  # components may be next to nothing
+        # components may be next to nothing
+        scales = {"forces ": 9.81 * other["mass"], "probes velocity": other["max_speed"]}
         scales |= {f"body{n}_{turn}": 90.0 for n in range(3) for turn in ("w", "spin", "angle")}
         scales |= {f"body{n}_v": other["max_speed"] for n in range(3)}
         for name, value in other.items():
@@ -83,7 +105,9 @@ def single(model_) -> ParticleSimulation:
 
 def alone(model_, **options):
     """Return a simulation on one rank, for which no MPI is needed."""
-    return simulators()[model_.scene.simulator].create(model_, device="cpu", folder=Path(), ranks=Ranks(Seat(0, 1)), **options)
+    return simulators()[model_.scene.simulator].create(
+        model_, device="cpu", folder=Path(), ranks=Ranks(Seat(0, 1)), **options
+    )
 
 
 ONE_RANK = (
@@ -116,7 +140,9 @@ def test_one_rank_is_one_process_bit_for_bit(name):
         np.testing.assert_array_equal(piece[array], field[..., 1:-1, 1:-1, 1:-1])
     assert shared.notes()[0] == one.notes()[0]
     for part, expected in zip(shared.frame(), one.frame(), strict=True):
-        np.testing.assert_array_equal(getattr(part, "index", None), getattr(expected, "index", None))
+        np.testing.assert_array_equal(
+            getattr(part, "index", None), getattr(expected, "index", None)
+        )
         for field, values in expected.fields.items():
             np.testing.assert_array_equal(part.fields[field], values)
 
@@ -136,9 +162,18 @@ def logs():
 
 @pytest.mark.parametrize("ranks", [2, pytest.param(4, marks=pytest.mark.slow)])
 def test_ranks_have_the_log_and_the_pressure_of_one_process(mpi, tmp_path, logs, ranks):
-    mpi(ranks, PROGRAM, "run", tmp_path, environment={"PYTHONPATH": f"{TESTS}:{TESTS.parent}"}, seconds=300.0)
+    mpi(
+        ranks,
+        PROGRAM,
+        "run",
+        tmp_path,
+        environment={"PYTHONPATH": f"{TESTS}:{TESTS.parent}"},
+        seconds=300.0,
+    )
     for name, (rows, cells, pressure) in logs.items():
-        same(json.loads((tmp_path / f"{name}_{ranks}.json").read_text()), rows, CLOSE.get(name, 1e-6))
+        same(
+            json.loads((tmp_path / f"{name}_{ranks}.json").read_text()), rows, CLOSE.get(name, 1e-6)
+        )
         saved = np.load(tmp_path / f"{name}_{ranks}.npz")
         np.testing.assert_array_equal(saved["cells"], cells)
         np.testing.assert_allclose(saved["pressure"], pressure, atol=1e-5 * np.abs(pressure).max())
@@ -146,12 +181,23 @@ def test_ranks_have_the_log_and_the_pressure_of_one_process(mpi, tmp_path, logs,
 
 @pytest.mark.parametrize("ranks", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_a_rank_without_material_takes_every_stage(mpi, tmp_path, ranks):
-    mpi(ranks, PROGRAM, "bare,own-model", tmp_path, environment={"PYTHONPATH": f"{TESTS}:{TESTS.parent}"})
+    mpi(
+        ranks,
+        PROGRAM,
+        "bare,own-model",
+        tmp_path,
+        environment={"PYTHONPATH": f"{TESTS}:{TESTS.parent}"},
+    )
     for name, tables in BARE.items():
         rows = advance(single(scene(**tables)), BARE_STEPS)
         same(json.loads((tmp_path / f"bare_{name}_{ranks}.json").read_text()), rows, 1e-5)
     for name, tables in {"corner": CORNER, "flat": FLAT}.items():  # the documentation's own model
-        rows = advance(SIMULATOR.create(scene(**tables), device="cpu", folder=Path(), models=[sponge()(20.0, 0.1)]), BARE_STEPS + 1)
+        rows = advance(
+            SIMULATOR.create(
+                scene(**tables), device="cpu", folder=Path(), models=[sponge()(20.0, 0.1)]
+            ),
+            BARE_STEPS + 1,
+        )
         assert rows[-1]["sponge_work"] > 0.0
         same(json.loads((tmp_path / f"own_{name}_{ranks}.json").read_text()), rows, 1e-5)
 
@@ -176,7 +222,12 @@ def test_ranks_have_the_surface_and_the_volumes_of_one_process(mpi, tmp_path, ra
                 places = [np.empty_like(numbers) for numbers in (order, other)]
                 for place, numbers in zip(places, (order, other), strict=True):
                     place[numbers] = np.arange(len(numbers))
-                corners = [rolled(place[part]) for place, part in zip(places, (found["corners"], expected.corners), strict=True)]
+                corners = [
+                    rolled(place[part])
+                    for place, part in zip(
+                        places, (found["corners"], expected.corners), strict=True
+                    )
+                ]
                 np.testing.assert_array_equal(*corners)
             assert found["points"].shape == expected.points.shape
             assert found["corners"].shape == expected.corners.shape
@@ -188,14 +239,26 @@ def test_ranks_have_the_surface_and_the_volumes_of_one_process(mpi, tmp_path, ra
 def rolled(corners):
     """Return triangles or segments in one order, each triangle from its lowest corner on."""
     turn = corners.argmin(axis=1) if corners.shape[1] == 3 else np.zeros(len(corners), dtype=int)
-    turned = np.take_along_axis(corners, (turn[:, None] + np.arange(corners.shape[1])) % corners.shape[1], axis=1)
+    turned = np.take_along_axis(
+        corners, (turn[:, None] + np.arange(corners.shape[1])) % corners.shape[1], axis=1
+    )
     return turned[np.lexsort(turned.T)]
 
 
 @pytest.mark.slow
 def test_a_dam_break_has_the_log_of_one_process(mpi, tmp_path):
     """The last bit of a thousandth of all velocities, changed once in one process, makes up to 1.7e-6 of a column in these steps."""
-    assert mpi(2, PROGRAM, "dam", tmp_path, environment={"PYTHONPATH": f"{TESTS}:{TESTS.parent}"}, seconds=300.0).returncode == 0
+    assert (
+        mpi(
+            2,
+            PROGRAM,
+            "dam",
+            tmp_path,
+            environment={"PYTHONPATH": f"{TESTS}:{TESTS.parent}"},
+            seconds=300.0,
+        ).returncode
+        == 0
+    )
     rows = advance(single(load_scene("dam-break")), DAM_STEPS)
     same(json.loads((tmp_path / "dam.json").read_text()), rows, 3e-6)
 
@@ -215,7 +278,9 @@ def test_a_run_goes_on_on_any_number_of_ranks(mpi, tmp_path):
 
 def test_failures_are_those_of_all_ranks_and_steps_of_stresses_need_no_python(mpi, tmp_path):
     environment = {"PYTHONPATH": f"{TESTS}:{TESTS.parent}"}
-    assert mpi(2, PROGRAM, "fail,differ,launches", tmp_path, environment=environment).returncode == 0
+    assert (
+        mpi(2, PROGRAM, "fail,differ,launches", tmp_path, environment=environment).returncode == 0
+    )
 
 
 def test_pieces_of_any_boxes_can_be_read():
@@ -224,8 +289,13 @@ def test_pieces_of_any_boxes_can_be_read():
     whole = simulation.state()
     pieces = []
     for low, high in ((0, 13), (13, 32)):
-        mine = (whole["position"][:, 0] < 0.55) if low == 0 else (whole["position"][:, 0] >= 0.55)  # some have not moved on yet
-        part = {name: values[mine] for name, values in whole.items() if name[:6] in ("positi", "veloci", "affine", "place")}
+        # some have not moved on yet
+        mine = (whole["position"][:, 0] < 0.55) if low == 0 else (whole["position"][:, 0] >= 0.55)
+        part = {
+            name: values[mine]
+            for name, values in whole.items()
+            if name[:6] in ("positi", "veloci", "affine", "place")
+        }
         fields = {name: whole[name][:, :, low:high] for name in ("pressure", "cells", "contact")}
         pieces.append(whole | part | fields | {"box": np.array([[low, 0, 0], [high, 16, 1]])})
     again = alone(model("flat"))
@@ -247,7 +317,13 @@ def test_a_source_keeps_its_cells_in_other_boxes_wherever_bodies_are():
 
 
 def test_velocities_that_ranks_cannot_follow_are_seen_near_cuts_and_along_them():
-    part = Subdomain(Decomposition((40, 8, 1), Ranks(Seat(0, 2))), spacing=0.1, dimension=2, device="cpu", layers=5)
+    part = Subdomain(
+        Decomposition((40, 8, 1), Ranks(Seat(0, 2))),
+        spacing=0.1,
+        dimension=2,
+        device="cpu",
+        layers=5,
+    )
     for axis, place, cells, expected in (
         (0, 21, 3.9, 0.0),  # as far as the layers go but for one
         (0, 21, -4.2, 4.2),
@@ -280,7 +356,12 @@ def damaged(name, change):
         (lambda p: p.update(box=np.array([[0, 0, 0], [31, 16, 1]])), "do not cover the domain"),
         (lambda p: p["velocity"].__setitem__((3, 0), np.nan), "not finite"),
         (lambda p: p["cells"].__setitem__((0, 3, 4), 2), "solids are not this scene's"),
-        (lambda p: p.update({n: p[n][1:] for n in ("position", "velocity", "affine_0", "affine_1", "place")}), "927 particles.*928"),
+        (
+            lambda p: p.update(
+                {n: p[n][1:] for n in ("position", "velocity", "affine_0", "affine_1", "place")}
+            ),
+            "927 particles.*928",
+        ),
     ],
 )
 def test_pieces_of_something_else_are_refused(change, message):
@@ -291,7 +372,12 @@ def test_pieces_of_something_else_are_refused(change, message):
 
 @pytest.mark.parametrize(
     ("tables", "key"),
-    [(COLUMN | {"periodic": [False, False, True], "output": {"surface": True}}, "output.surface where an axis is periodic")],
+    [
+        (
+            COLUMN | {"periodic": [False, False, True], "output": {"surface": True}},
+            "output.surface where an axis is periodic",
+        )
+    ],
 )
 def test_what_ranks_have_not_is_refused_by_name(tables, key):
     with pytest.raises(ValueError, match=f"{key} is not there on several processes"):
@@ -299,9 +385,17 @@ def test_what_ranks_have_not_is_refused_by_name(tables, key):
 
 
 def test_methods_of_one_process_are_refused_by_name():
-    with pytest.raises(ValueError, match=r"solver\.method = psor works on one process only.*: projected-multigrid or minimum-map-newton"):
+    with pytest.raises(
+        ValueError,
+        match=r"solver\.method = psor works on one process only.*: projected-multigrid or "
+        r"minimum-map-newton",
+    ):
         alone(scene(**(FLAT | {"solver": {"method": "psor"}})))
-    with pytest.raises(ValueError, match=r"solver\.method = interleaved-sweeps works on one process only.*: accelerated-projection"):
+    with pytest.raises(
+        ValueError,
+        match=r"solver\.method = interleaved-sweeps works on one process only.*: "
+        r"accelerated-projection",
+    ):
         alone(scene(**(HEAP | {"solver": {"method": "interleaved-sweeps"}})))
 
 

@@ -7,7 +7,8 @@ import pytest
 PROGRAM = Path(__file__).with_name("petsc_objects.py")
 
 
-# products and diagonals beside the definition's, and PETSc's solvers with them: starts cost more than most checks
+# products and diagonals beside the definition's, and PETSc's solvers with them: starts cost more
+# than most checks
 CHECKS = ("products", "preconditioner", "linear_solves", "bounded_methods")
 
 
@@ -17,4 +18,5 @@ def test_they_are_what_the_definition_says_and_petscs_solvers_work_with_them(mpi
 
 
 def test_a_cycle_is_that_of_pcmg(mpi):
-    assert mpi(1, PROGRAM, "cycles_of_pcmg").stdout == "cycles_of_pcmg "  # which asserts that they agree to 1e-12
+    # which asserts that they agree to 1e-12
+    assert mpi(1, PROGRAM, "cycles_of_pcmg").stdout == "cycles_of_pcmg "

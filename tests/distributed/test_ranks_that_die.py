@@ -36,12 +36,20 @@ def test_one_ends_all(mpi, what):
     done = mpi(2, FAIL, what, exit_code=None, seconds=60.0)
     assert done.returncode != 0
     assert "done" not in done.stdout
-    assert ("rank 1 of 2: " in done.stderr and "KeyboardInterrupt" in done.stderr) == (what == "interrupt")
+    assert ("rank 1 of 2: " in done.stderr and "KeyboardInterrupt" in done.stderr) == (
+        what == "interrupt"
+    )
 
 
 def test_different_things_are_refused_once(mpi):
     done = mpi(3, FAIL, "differ", exit_code=2)
-    assert done.stderr.count("the scene on rank 1 differs from rank 0: start all ranks with the same command and files") == 1
+    assert (
+        done.stderr.count(
+            "the scene on rank 1 differs from rank 0: start all ranks with the same command and "
+            "files"
+        )
+        == 1
+    )
     assert "done" not in done.stdout
 
 
@@ -52,5 +60,12 @@ SHORT = ("--engine", "petsc", "--device", "cpu", "--set", "domain.resolution=32"
 @pytest.mark.parametrize("turn", range(200))
 def test_short_runs_end(mpi, turn):
     """One after the other, as ranks that wait for each other for ever may do so now and then."""
-    done = mpi(2 + turn % 3, "-c", "from warp_lcp.cli.commands import main; main()", "run", "dam-break-2d", *SHORT)
+    done = mpi(
+        2 + turn % 3,
+        "-c",
+        "from warp_lcp.cli.commands import main; main()",
+        "run",
+        "dam-break-2d",
+        *SHORT,
+    )
     assert "finished: frame 1 of" in done.stdout

@@ -28,12 +28,15 @@ PROGRAM = Path(__file__).with_name("dots_on_ranks.py")
 def run(mpi, tmp_path, monkeypatch):
     """Run commands on the scene of dots, each a text, one after the other on the same ranks, or without MPI on 0 ranks.
 
-    A command's text is completed by the scene and `--device cpu`, its exit code by that of the last.
+    A command's text is completed by the scene and `--device cpu`, its exit code by that of the
+    last.
     """
     scene = tmp_path / "dots.toml"
     scene.write_text(SCENE)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(simulator, "entry_points", lambda group: [SimpleNamespace(name="dots", load=DotsSimulator)])
+    monkeypatch.setattr(
+        simulator, "entry_points", lambda group: [SimpleNamespace(name="dots", load=DotsSimulator)]
+    )
 
     def go(ranks, *commands, exit_code=0):
         words = [[*shlex.split(command), "--device", "cpu"] for command in commands]
@@ -49,7 +52,10 @@ def run(mpi, tmp_path, monkeypatch):
 
 def log(folder: Path) -> list[dict[str, float]]:
     with open(folder / "log.csv", newline="") as file:
-        return [{name: float(value) for name, value in row.items() if name != "seconds"} for row in csv.DictReader(file)]
+        return [
+            {name: float(value) for name, value in row.items() if name != "seconds"}
+            for row in csv.DictReader(file)
+        ]
 
 
 def record(folder: Path) -> dict[str, Any]:
@@ -62,7 +68,11 @@ def particles(folder: Path, index: int) -> dict[str, np.ndarray]:
     files = piece_files(whole) if whole.is_file() else [whole.with_suffix(".vtu")]
     mesh = one_mesh([read_vtu(file) for file in files])
     order = np.argsort(mesh.fields["identity"])
-    return {"points": mesh.points[order], "velocity": mesh.fields["velocity"][order], "identity": mesh.fields["identity"][order]}
+    return {
+        "points": mesh.points[order],
+        "velocity": mesh.fields["velocity"][order],
+        "identity": mesh.fields["identity"][order],
+    }
 
 
 def assert_same_run(a: Path, b: Path) -> None:
@@ -81,14 +91,28 @@ def assert_same_run(a: Path, b: Path) -> None:
 def test_ranks_write_the_run_of_one_process(run, tmp_path):
     run(0, "run dots.toml --out one")
     done = run(3, "run dots.toml --out three --profile")
-    assert done.stderr.count("frame 10/10") == done.stderr.count("on 3 ranks (cpu)") == done.stdout.count("finished: frame 10 of 10") == 1
+    assert (
+        done.stderr.count("frame 10/10")
+        == done.stderr.count("on 3 ranks (cpu)")
+        == done.stdout.count("finished: frame 10 of 10")
+        == 1
+    )
     assert done.stdout.count("rest ") == 1  # the profile
     assert_same_run(tmp_path / "one", tmp_path / "three")
     found = record(tmp_path / "three")
-    assert (found["status"], found["engine"], found["ranks"], found["frames"]) == ("finished", "petsc", 3, 10)
+    assert (found["status"], found["engine"], found["ranks"], found["frames"]) == (
+        "finished",
+        "petsc",
+        3,
+        10,
+    )
     assert (tmp_path / "three" / "particles.pvd").read_text().count(".pvtu") == 11
     assert (tmp_path / "three" / "grid.pvd").read_text().count(".pvtu") == 11
-    left = [path for path in (tmp_path / "three").rglob("*") if path.name.endswith(".part") or path.name == "run.lock"]
+    left = [
+        path
+        for path in (tmp_path / "three").rglob("*")
+        if path.name.endswith(".part") or path.name == "run.lock"
+    ]
     assert not left
 
 
@@ -111,11 +135,15 @@ def test_damaged_pieces_are_found(run, tmp_path):
     run(0, "run dots.toml --out one")
     run(2, "run dots.toml --out out --frames 3")
     checkpoints = tmp_path / "out" / "checkpoints"
-    newest, second, _ = sorted((int(path.stem[5:]) for path in checkpoints.glob("step_*.npz")), reverse=True)
+    newest, second, _ = sorted(
+        (int(path.stem[5:]) for path in checkpoints.glob("step_*.npz")), reverse=True
+    )
     file = checkpoints / "rank_0001" / f"step_{newest:06d}.npz"
     file.write_bytes(file.read_bytes()[:-200])
     resumed = run(3, "run dots.toml --out out --resume")
-    assert f"rank_0001/step_{newest:06d}.npz: cut short, damaged or not a checkpoint" in resumed.stderr
+    assert (
+        f"rank_0001/step_{newest:06d}.npz: cut short, damaged or not a checkpoint" in resumed.stderr
+    )
     assert record(tmp_path / "out")["resumed_from_step"] == second
     assert_same_run(tmp_path / "one", tmp_path / "out")
     pieces = {path.stem for path in checkpoints.glob("rank_*/step_*.npz")}
@@ -131,12 +159,19 @@ TROUBLES = {  # with how the run ends, and what it says
     "40 -1 failed": ("failed", "failed: step 40: velocity is not finite"),
     "40 -1 missed": ("failed", "retries 6: the solve missed its criteria"),
     "40 1 interrupted": ("stopped", "stopped: interrupted"),
-    "40 1 disk": ("failed", "failed: the disk is full: rank 1: [Errno 28] No space left on device; files written before are intact"),
+    "40 1 disk": (
+        "failed",
+        "failed: the disk is full: rank 1: [Errno 28] No space left on device; files written "
+        "before are intact",
+    ),
 }
 
 
 def test_troubles_end_the_run_with_a_message(run, tmp_path):
-    commands = [f"DOTS_TROUBLE='{trouble}' run dots.toml --out {number}" for number, trouble in enumerate(TROUBLES)]
+    commands = [
+        f"DOTS_TROUBLE='{trouble}' run dots.toml --out {number}"
+        for number, trouble in enumerate(TROUBLES)
+    ]
     done = run(2, *commands, exit_code=1)
     assert done.stderr.count("exit code 1") == 2 * len(TROUBLES)
     assert done.stderr.count("--resume --engine petsc") == len(TROUBLES)
@@ -145,11 +180,19 @@ def test_troubles_end_the_run_with_a_message(run, tmp_path):
         assert done.stderr.count(expected) == 1
         found = record(tmp_path / str(number))
         assert found["status"] == status
-        assert (tmp_path / str(number) / "particles.pvd").read_text().count(".pvtu") == found["frames"] + 1 == 4
+        assert (
+            (tmp_path / str(number) / "particles.pvd").read_text().count(".pvtu")
+            == found["frames"] + 1
+            == 4
+        )
 
 
 @pytest.mark.parametrize(
-    ("trouble", "expected"), [("40 0 missed", "rank 0 of 2: the solve missed its criteria"), ("40 1 bug", "KeyError: 'no such key'")]
+    ("trouble", "expected"),
+    [
+        ("40 0 missed", "rank 0 of 2: the solve missed its criteria"),
+        ("40 1 bug", "KeyError: 'no such key'"),
+    ],
 )
 def test_a_rank_that_fails_alone_ends_the_others(run, tmp_path, trouble, expected):
     """They wait for it inside MPI: it says what happened, writes that into run.json and ends them."""
@@ -166,9 +209,11 @@ WRONG = {  # commands, with what is said of each
     "run dots.toml --out out --resume --force": "exclude each other",
     "run dots.toml --out out --set time.cfl=0": "time.cfl = 0: must be at least 0.001",
     "run dots.toml --out out --force --set output.surface_ply=true": "output.surface_ply = true: ",
-    "run dots.toml --out out --force --record-problems problems": "--record-problems cannot be combined with --engine petsc",
+    "run dots.toml --out out --force --record-problems problems": "--record-problems cannot be "
+    "combined with --engine petsc",
     "DOTS_REFUSE=liquid[0] run dots.toml --out out --force": "dots: liquid[0]",
-    "DOTS_REFUSE=liquid[1{rank}] run dots.toml --out out --force": "rank 0: dots: liquid[10]; rank 1: dots: liquid[11]",
+    "DOTS_REFUSE=liquid[1{rank}] run dots.toml --out out --force": "rank 0: dots: liquid[10]; rank "
+    "1: dots: liquid[11]",
 }
 
 
@@ -207,7 +252,10 @@ def test_different_input_is_named(mpi, tmp_path):
     dots_on_ranks.main(["run", "dots.toml", "--engine", "petsc", "--device", "cpu", *own])
     """
     done = mpi(3, text, exit_code=2)
-    expected = "different scenes or options\n  --frames: 0 on rank 0, 1 on rank 1\n  time.cfl: 1.0 on rank 0, 2.0 on rank 2\n"
+    expected = (
+        "different scenes or options\n  --frames: 0 on rank 0, 1 on rank 1\n  time.cfl: 1.0 "
+        "on rank 0, 2.0 on rank 2\n"
+    )
     assert done.stderr.count(expected) == 1
     assert not (tmp_path / "out").exists()
 
@@ -218,24 +266,45 @@ def test_without_mpi_one_message_says_how_to_install(run, monkeypatch, variable)
     if variable:  # mpiexec has started several, of which this is not the first
         monkeypatch.setenv(variable, "1")
     said = run(0, "run dots.toml --engine petsc", exit_code=2).stderr
-    assert ("pip install 'warp-lcp[distributed]'" in said and "PETSC_DIR" in said) if not variable else said == ""
+    assert (
+        ("pip install 'warp-lcp[distributed]'" in said and "PETSC_DIR" in said)
+        if not variable
+        else said == ""
+    )
 
 
 def test_ranks_of_another_mpi_are_refused(mpi, tmp_path):
     """As srun starts them whose --mpi this MPI does not know; `mpi` skips where there is none."""
-    words = [sys.executable, "-c", "from warp_lcp.cli.commands import main; main()", "run", "dam-break", "--engine", "petsc"]
+    words = [
+        sys.executable,
+        "-c",
+        "from warp_lcp.cli.commands import main; main()",
+        "run",
+        "dam-break",
+        "--engine",
+        "petsc",
+    ]
     environment = launch.environment() | {"SLURM_STEP_NUM_TASKS": "3"}
-    done = subprocess.run(words, env=environment, cwd=tmp_path, text=True, capture_output=True, check=False)
+    done = subprocess.run(
+        words, env=environment, cwd=tmp_path, text=True, capture_output=True, check=False
+    )
     assert done.returncode == 2
     assert "3 processes were started, but mpi4py sees only one" in done.stderr
 
 
-SMALL = "--set domain.resolution=24 --set time.duration=0.3 --set output.checkpoint_every=4 --set output.grid_format=vti"
+SMALL = (
+    "--set domain.resolution=24 --set time.duration=0.3 --set output.checkpoint_every=4 --set "
+    "output.grid_format=vti"
+)
 COLUMNS = ("time", "dt", "particles", "mass", "kinetic_energy", "potential_energy", "max_speed")
 
 
 @pytest.mark.parametrize(
-    ("scene", "columns"), [("dam-break-2d", ("volume", "active")), ("column-collapse-2d", ("runout", "height", "yielded"))]
+    ("scene", "columns"),
+    [
+        ("dam-break-2d", ("volume", "active")),
+        ("column-collapse-2d", ("runout", "height", "yielded")),
+    ],
 )
 def test_a_material_goes_on_on_other_numbers_of_ranks(mpi, tmp_path, scene, columns):
     """From two ranks to three, and on in one process: one log, and frames with the particles and cells of a run in one process."""

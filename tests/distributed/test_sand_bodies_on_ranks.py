@@ -19,7 +19,9 @@ DX, DT, LAYERS = 0.1, 0.01, 3
 COUNTS = {2: (16, 16, 1), 3: (16, 16, 8)}
 
 
-def answers(bodies: SandBodies, packing: Packing, index: np.ndarray, centers: np.ndarray, fields: dict) -> list[np.ndarray]:
+def answers(
+    bodies: SandBodies, packing: Packing, index: np.ndarray, centers: np.ndarray, fields: dict
+) -> list[np.ndarray]:
     """Return what bodies of random numbers have to do with random stresses: sums of all kinds, the velocities that they leave."""
     grid, count, k = packing.grid, len(centers), bodies.freedoms
     walls = Walls(grid, index, [0.5] * (1 + count), counted=packing.counted)
@@ -27,9 +29,24 @@ def answers(bodies: SandBodies, packing: Packing, index: np.ndarray, centers: np
     speeds = [wp.array(fields["speed"][axis], dtype=wp.float32) for axis in range(grid.dimension)]
     packing.update(wp.array(fields["density"], dtype=wp.float32), speeds, DT, grid.faces())
     random = np.random.default_rng(907)
-    velocity, inverse = random.normal(size=(count, k)), np.tile(np.eye(k), (count, 1, 1)) * random.uniform(1.0, 2.0, (count, 1, 1))
-    bodies.begin(packing, speeds, speeds, velocity=velocity, inverse_mass=inverse, density=1.0 / grid.cell_volume)
-    bodies.prepare(packing, wp.array(np.full(NUMBERS, 0.5), dtype=wp.float32), pressure_step=0.8, shear_step=0.4)
+    velocity, inverse = (
+        random.normal(size=(count, k)),
+        np.tile(np.eye(k), (count, 1, 1)) * random.uniform(1.0, 2.0, (count, 1, 1)),
+    )
+    bodies.begin(
+        packing,
+        speeds,
+        speeds,
+        velocity=velocity,
+        inverse_mass=inverse,
+        density=1.0 / grid.cell_volume,
+    )
+    bodies.prepare(
+        packing,
+        wp.array(np.full(NUMBERS, 0.5), dtype=wp.float32),
+        pressure_step=0.8,
+        shear_step=0.4,
+    )
     stress = wp.array(fields["stress"], dtype=wp.float32)
     found = [bodies.velocity.numpy().copy(), bodies._correction.array.numpy().copy()]
     for implicit in (True, False):
@@ -46,13 +63,22 @@ def test_every_cell_and_edge_acts_on_a_body_once(dimension: int, size: int) -> N
     index = np.zeros(grid.shape, dtype=np.int32)
     index[1:-1, 1:-1, 1:-1] = -1
     deep = slice(3, 7) if dimension == 3 else slice(1, -1)
-    for number, (rows, columns) in enumerate(((slice(5, 9), slice(3, 11)), (slice(9, 12), slice(7, 9)), (slice(12, 14), slice(13, 15))), 1):
-        index[deep, rows, columns] = number  # across cuts, beside it and the cuts, and in one rank's box
+    for number, (rows, columns) in enumerate(
+        ((slice(5, 9), slice(3, 11)), (slice(9, 12), slice(7, 9)), (slice(12, 14), slice(13, 15))),
+        1,
+    ):
+        # across cuts, beside it and the cuts, and in one rank's box
+        index[deep, rows, columns] = number
     open_ = index < 0
     fields = {
-        "density": np.where(open_, random.choice([0.0, 0.6, 1.0], p=[0.1, 0.2, 0.7], size=grid.shape), 0.0),
+        "density": np.where(
+            open_, random.choice([0.0, 0.6, 1.0], p=[0.1, 0.2, 0.7], size=grid.shape), 0.0
+        ),
         "speed": random.uniform(0.1, 1.0, (3, *grid.shape)),
-        "stress": random.normal(size=((2 if dimension == 2 else 4) + 4 * (1 if dimension == 2 else 3), *grid.shape)) * open_,
+        "stress": random.normal(
+            size=((2 if dimension == 2 else 4) + 4 * (1 if dimension == 2 else 3), *grid.shape)
+        )
+        * open_,
     }
     centers, numbers = random.uniform(0.3, 1.3, (3, 3)), (1, 2, 3)
 
@@ -63,12 +89,19 @@ def test_every_cell_and_edge_acts_on_a_body_once(dimension: int, size: int) -> N
     def work(seat: Seat) -> list[np.ndarray]:
         boxes = Decomposition(grid.counts, Ranks(seat))
         part = Subdomain(boxes, spacing=DX, dimension=dimension, device="cpu", layers=LAYERS)
-        here = tuple(slice(low, low + n) for low, n in zip(part.grid.origin[::-1], part.grid.shape, strict=True))
+        here = tuple(
+            slice(low, low + n)
+            for low, n in zip(part.grid.origin[::-1], part.grid.shape, strict=True)
+        )
         mine = {name: np.ascontiguousarray(values[(..., *here)]) for name, values in fields.items()}
         cells = np.ascontiguousarray(index[here])
-        return answers(SandBodies(part.grid, numbers), packed(part.grid, cells), cells, centers, mine)
+        return answers(
+            SandBodies(part.grid, numbers), packed(part.grid, cells), cells, centers, mine
+        )
 
     expected = answers(SandBodies(grid, numbers), packed(grid, index), index, centers, fields)
     for found in on_ranks(size, work):
         for values, wanted in zip(found, expected, strict=True):
-            np.testing.assert_allclose(values, wanted, rtol=1e-10, atol=1e-12 * np.abs(wanted).max())
+            np.testing.assert_allclose(
+                values, wanted, rtol=1e-10, atol=1e-12 * np.abs(wanted).max()
+            )

@@ -15,11 +15,28 @@ MAIN = "import sys; from warp_lcp.cli.commands import main; main()"
 
 
 def records(file):
-    return {r["name"]: {**r, **{k: f["value"] for k, f in r["figures"].items()}} for r in json.loads(file.read_text())}
+    return {
+        r["name"]: {**r, **{k: f["value"] for k, f in r["figures"].items()}}
+        for r in json.loads(file.read_text())
+    }
 
 
 def test_ranks_measure_what_one_process_does(mpi, tmp_path):
-    done = mpi(2, "-c", MAIN, "bench", "scaling", "--engine", "petsc", "--size", 24, "--repeat", 1, "--out", tmp_path)
+    done = mpi(
+        2,
+        "-c",
+        MAIN,
+        "bench",
+        "scaling",
+        "--engine",
+        "petsc",
+        "--size",
+        24,
+        "--repeat",
+        1,
+        "--out",
+        tmp_path,
+    )
     assert done.stdout.split() == [str(tmp_path / "ranks.json"), str(tmp_path / "ranks.md")]
     found = records(tmp_path / "ranks.json")
     for bounds in ("linear", "walls", "everywhere"):
@@ -63,18 +80,28 @@ def test_it_starts_the_ranks_itself(mpi, tmp_path, monkeypatch):
     counts = [kept[f"16^3 walls, ranks: {count}"].value("iterations_to_1e-06") for count in (1, 2)]
     assert max(counts) - min(counts) <= 1
     assert [t.title for t in results.tables] == ["Figures to reach", "Ranks and sizes"]
-    assert [row[:3] for row in results.tables[1].rows if row[1] == "walls"] == [["16^3", "walls", "1"], ["16^3", "walls", "2"]]
+    assert [row[:3] for row in results.tables[1].rows if row[1] == "walls"] == [
+        ["16^3", "walls", "1"],
+        ["16^3", "walls", "2"],
+    ]
 
 
 @pytest.mark.parametrize("arguments", [["kernels"], ["solvers"]])
 def test_other_suites_have_one_process(arguments, tmp_path):
-    result = CliRunner().invoke(cli.app, ["bench", *arguments, "--engine", "petsc", "--out", str(tmp_path)])
+    result = CliRunner().invoke(
+        cli.app, ["bench", *arguments, "--engine", "petsc", "--out", str(tmp_path)]
+    )
     assert result.exit_code == 2
     assert "measures one process; use scaling" in result.stderr
 
 
 def measured(n, ranks, seconds, count, memory, over):
-    figures = {"to_1e-06": seconds, "iterations_to_1e-06": count, "resident_more": memory, "to_1e-06_over_single": over}
+    figures = {
+        "to_1e-06": seconds,
+        "iterations_to_1e-06": count,
+        "resident_more": memory,
+        "to_1e-06_over_single": over,
+    }
     facts = {"n": n, "bounds": "walls", "ranks": ranks, "boxes": "1 x 1 x 1"}
     return Record("", {name: Figure(value) for name, value in figures.items()}, facts)
 
@@ -85,9 +112,19 @@ def found(records):
 
 def test_figures_to_reach(monkeypatch):
     monkeypatch.setattr(ranks.os, "cpu_count", lambda: 2)
-    kept = [measured(128, 1, 0.2, 8, 100.0, 1.2), measured(128, 2, 0.1, 9, 55.0, 0.7), measured(128, 4, 0.3, 10, 30.0, 2.0)]
+    kept = [
+        measured(128, 1, 0.2, 8, 100.0, 1.2),
+        measured(128, 2, 0.1, 9, 55.0, 0.7),
+        measured(128, 4, 0.3, 10, 30.0, 2.0),
+    ]
     table = ranks.targets(found(kept), [64, 128])
-    assert [row[2:] for row in table.rows] == [["2", "no"], ["2", "yes"], ["1.2", "yes"], ["not measured here", ""], ["0.55", "yes"]]
+    assert [row[2:] for row in table.rows] == [
+        ["2", "no"],
+        ["2", "yes"],
+        ["1.2", "yes"],
+        ["not measured here", ""],
+        ["0.55", "yes"],
+    ]
     monkeypatch.setattr(ranks.os, "cpu_count", lambda: 1)
     assert ranks.targets(found(kept), [128]).rows[1][2:] == ["not measured here", ""]
 
@@ -95,13 +132,20 @@ def test_figures_to_reach(monkeypatch):
 def test_what_a_liquid_costs_a_rank_is_counted(mpi):
     """Ghost cells of 28 bytes and more of fields, in 5 layers at the one cut, are filled several times a step.
 
-    Solves begin, and multigrid is built again, without Python between exchanges: it fills no halo of an operator itself.
+    Solves begin, and multigrid is built again, without Python between exchanges: it fills no halo
+    of an operator itself.
     """
-    said = mpi(2, "-m", "warp_lcp.benchmarks.rank_costs", "dam-break-2d", "domain.resolution=32").stdout
-    found = {name: float(value.replace(",", "")) for value, name in re.findall(r"^ *([\d,.]+)  (.*)$", said, flags=re.M)}
+    said = mpi(
+        2, "-m", "warp_lcp.benchmarks.rank_costs", "dam-break-2d", "domain.resolution=32"
+    ).stdout
+    found = {
+        name: float(value.replace(",", ""))
+        for value, name in re.findall(r"^ *([\d,.]+)  (.*)$", said, flags=re.M)
+    }
     assert found["cells at cuts"] == 16
     assert found["cells of the box"] < found["cells stored"] < 32 * 16 * 3
     assert found["Subdomain.fill: bytes a step"] > 28 * 5 * found["cells at cuts"]
     assert 8 < found["Ranks.gather: times a step"] <= 12
-    assert found["MpiMailbox.swap: times a step"] <= 2  # particles that move on, and ghosts of a density correction
+    # particles that move on, and ghosts of a density correction
+    assert found["MpiMailbox.swap: times a step"] <= 2
     assert not {name for name in found if re.match(r"(Halo|Gathering)\.", name)}

@@ -19,8 +19,13 @@ SPACING = 0.03
 
 def part_of(seat: Seat, counts: tuple[int, int, int], periodic: tuple[int, ...] = ()) -> Subdomain:
     """Return a rank's part of a grid."""
-    dimension, boxes = 2 if counts[2] == 1 else 3, Decomposition(counts, Ranks(seat), periodic=periodic)
-    return Subdomain(boxes, spacing=SPACING, dimension=dimension, device="cpu", layers=LAYERS, mailbox=seat)
+    dimension, boxes = (
+        2 if counts[2] == 1 else 3,
+        Decomposition(counts, Ranks(seat), periodic=periodic),
+    )
+    return Subdomain(
+        boxes, spacing=SPACING, dimension=dimension, device="cpu", layers=LAYERS, mailbox=seat
+    )
 
 
 def cells_of(position: np.ndarray) -> np.ndarray:
@@ -34,7 +39,9 @@ def scattered(counts: tuple[int, int, int], n: int) -> tuple[np.ndarray, np.ndar
     axes = 2 if counts[2] == 1 else 3
     position = np.zeros((n, 3))
     for axis in range(axes):
-        position[:, axis] = (rng.integers(counts[axis], size=n) + rng.uniform(0.05, 0.95, n)) * SPACING
+        position[:, axis] = (
+            rng.integers(counts[axis], size=n) + rng.uniform(0.05, 0.95, n)
+        ) * SPACING
     return position.astype(np.float32), rng.normal(size=(n, 3)).astype(np.float32)
 
 
@@ -93,18 +100,25 @@ def test_particles_go_to_the_rank_of_their_cell_in_the_order_of_one_process(coun
         cells = cells_of(where)
         for rank, box in enumerate(boxes):
             own = ((cells >= box.low) & (cells < box.high)).all(axis=1)
-            near = ((cells >= np.array(box.low) - REACH) & (cells < np.array(box.high) + REACH)).all(axis=1)
+            near = (
+                (cells >= np.array(box.low) - REACH) & (cells < np.array(box.high) + REACH)
+            ).all(axis=1)
             expected = where[near], how[near], where[own], how[own]
             for array, wanted in zip(found[rank][step], expected, strict=True):
                 np.testing.assert_array_equal(array, wanted)
 
 
-@pytest.mark.parametrize(("counts", "size", "periodic"), [((24, 12, 1), 2, (0,)), ((13, 12, 14), 4, (0, 2)), ((13, 12, 14), 8, (0,))])
+@pytest.mark.parametrize(
+    ("counts", "size", "periodic"),
+    [((24, 12, 1), 2, (0,)), ((13, 12, 14), 4, (0, 2)), ((13, 12, 14), 8, (0,))],
+)
 def test_particles_go_around(counts, size, periodic):
     """What is near a box, also through sides that are one, is seen there once, where it continues the box."""
     position, velocity = scattered(counts, 900)
     position[:4, 0] = 0.0, 1e-9, (counts[0] - 1e-3) * SPACING, SPACING
-    domain = np.array([n * SPACING if axis in periodic else np.inf for axis, n in enumerate(counts)])
+    domain = np.array(
+        [n * SPACING if axis in periodic else np.inf for axis, n in enumerate(counts)]
+    )
 
     def work(seat: Seat) -> None:
         part = part_of(seat, counts, periodic)
@@ -118,22 +132,34 @@ def test_particles_go_around(counts, size, periodic):
             particles.arrange(step)
             found = particles.position.numpy().astype(float)
             assert len(np.unique(particles.exchange.place)) == len(found)
-            images = [x + np.array(shift) * SPACING for shift in part.decomposition.shifts for x in everyone]
+            images = [
+                x + np.array(shift) * SPACING
+                for shift in part.decomposition.shifts
+                for x in everyone
+            ]
             near = np.array([x for x in images if within(x, low, high)])
             seen = found[within(found, low, high)]
             assert len(seen) == len(near)
             np.testing.assert_allclose(np.sort(seen[:, 1]), np.sort(near[:, 1]))
             particles.drop_ghosts()
-            moves = particles.position.numpy() + np.float32(2.7 * SPACING) * np.sin(9137.0 * particles.velocity.numpy() + step)
-            inside = np.clip(moves, 0.01 * SPACING, (np.array(counts) - 0.01) * SPACING) * (np.array(counts) > 1)
-            particles.position.assign(np.where(np.isfinite(domain), np.mod(moves, domain), inside).astype(np.float32))
+            moves = particles.position.numpy() + np.float32(2.7 * SPACING) * np.sin(
+                9137.0 * particles.velocity.numpy() + step
+            )
+            inside = np.clip(moves, 0.01 * SPACING, (np.array(counts) - 0.01) * SPACING) * (
+                np.array(counts) > 1
+            )
+            particles.position.assign(
+                np.where(np.isfinite(domain), np.mod(moves, domain), inside).astype(np.float32)
+            )
 
     on_ranks(size, work)
 
 
 def within(x, low, high):
     """Tell which points lie in a box; in 2-D none has a z."""
-    return ((x >= low) & (x < high))[..., :2].all(axis=-1) & ((x[..., 2] == 0.0) | ((x[..., 2] >= low[2]) & (x[..., 2] < high[2])))
+    return ((x >= low) & (x < high))[..., :2].all(axis=-1) & (
+        (x[..., 2] == 0.0) | ((x[..., 2] >= low[2]) & (x[..., 2] < high[2]))
+    )
 
 
 def test_gradients_travel_with_their_particles():
@@ -150,7 +176,9 @@ def test_gradients_travel_with_their_particles():
                 gradient.assign((n + 1) * particles.velocity.numpy())
             particles.arrange(step)
             for n, gradient in enumerate(particles.affine):
-                np.testing.assert_array_equal(gradient.numpy(), (n + 1) * particles.velocity.numpy())
+                np.testing.assert_array_equal(
+                    gradient.numpy(), (n + 1) * particles.velocity.numpy()
+                )
             particles.drop_ghosts()
             particles.position.assign(moved(particles.position.numpy(), counts, step))
         return True
@@ -161,11 +189,17 @@ def test_gradients_travel_with_their_particles():
 def test_sums_are_of_all_ranks_and_count_each_particle_once():
     counts = (12, 12, 12)
     position, velocity = scattered(counts, 500)
-    alone = Particles(StaggeredGrid(counts, SPACING, 3, "cpu"), position, velocity, affine=False).totals()
+    alone = Particles(
+        StaggeredGrid(counts, SPACING, 3, "cpu"), position, velocity, affine=False
+    ).totals()
 
     def work(seat: Seat) -> Any:
         part = part_of(seat, counts)
-        mine = (part.owners(cells_of(position)) == seat.rank) if seat.rank else np.zeros(len(position), dtype=bool)
+        mine = (
+            (part.owners(cells_of(position)) == seat.rank)
+            if seat.rank
+            else np.zeros(len(position), dtype=bool)
+        )
         if seat.rank == 1:  # that of rank 0 has not moved on yet
             mine |= part.owners(cells_of(position)) == 0
         particles = Particles(part.grid, position[mine], velocity[mine], affine=False)
@@ -173,7 +207,8 @@ def test_sums_are_of_all_ranks_and_count_each_particle_once():
 
     for totals in on_ranks(8, work):
         assert (totals.count, totals.bad_positions, totals.bad_velocities) == (500, 0, 0)
-        assert totals.mean_square_speed == pytest.approx(alone.mean_square_speed, rel=1e-8)  # squares of float32, rounded in blocks
+        # squares of float32, rounded in blocks
+        assert totals.mean_square_speed == pytest.approx(alone.mean_square_speed, rel=1e-8)
         np.testing.assert_allclose(totals.center, alone.center, rtol=1e-13)
         np.testing.assert_array_equal([totals.low, totals.high], [alone.low, alone.high])
         assert totals.max_speed == alone.max_speed
@@ -190,7 +225,12 @@ def test_particles_that_are_not_finite_are_counted_on_all_ranks():
         return Particles(part.grid, position[half], velocity[half], affine=False).totals()
 
     for totals in on_ranks(2, work):
-        assert (totals.count, totals.bad_positions, totals.bad_velocities, totals.finite) == (40, 1, 1, False)
+        assert (totals.count, totals.bad_positions, totals.bad_velocities, totals.finite) == (
+            40,
+            1,
+            1,
+            False,
+        )
 
 
 def test_a_rank_may_have_no_particle():
@@ -200,7 +240,9 @@ def test_a_rank_may_have_no_particle():
     def work(seat: Seat) -> int:
         part = part_of(seat, counts)
         n = 1 - seat.rank
-        particles = Particles(part.grid, position[:n], np.ones((n, 3), dtype=np.float32), affine=True)
+        particles = Particles(
+            part.grid, position[:n], np.ones((n, 3), dtype=np.float32), affine=True
+        )
         particles.sort()
         for step in range(2):
             particles.arrange(step)
@@ -217,7 +259,8 @@ def test_boxes_thinner_than_the_ghost_layers_are_refused():
 
     with pytest.raises(
         ValueError,
-        match=r"4 ranks along x have boxes of 4 cells.*needs 5 layers around a box: start fewer ranks \(at most 3 along that axis\)",
+        match=r"4 ranks along x have boxes of 4 cells.*needs 5 layers around a box: start fewer "
+        r"ranks \(at most 3 along that axis\)",
     ):
         on_ranks(4, work)
 

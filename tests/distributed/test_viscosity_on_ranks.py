@@ -10,4 +10,6 @@ TESTS = Path(__file__).parents[1]
 
 @pytest.mark.parametrize("ranks", [2, pytest.param(4, marks=pytest.mark.slow)])
 def test_a_cycle_is_that_of_one_process(mpi, ranks):
-    assert mpi(ranks, PROGRAM, environment={"PYTHONPATH": f"{TESTS}:{TESTS.parent}"}).returncode == 0
+    assert (
+        mpi(ranks, PROGRAM, environment={"PYTHONPATH": f"{TESTS}:{TESTS.parent}"}).returncode == 0
+    )

@@ -10,20 +10,36 @@ import pytest
 from warp_lcp.distributed.waiting import Waiting, finish
 from warp_lcp.distributed.watchdog import Board, Post, place_of, verdict
 
-INSIDE, OUTSIDE = Post(9, 31, "a sum", 12.0, "solver:7"), Post(8, 30, "", 13.0, "build:3 from step:5")
+INSIDE, OUTSIDE = (
+    Post(9, 31, "a sum", 12.0, "solver:7"),
+    Post(8, 30, "", 13.0, "build:3 from step:5"),
+)
 LATE, SILENT = (
     "has been at build:3 from step:5 for 13 s",
     "sends no heartbeat: stopped, unreachable, or inside a library call that does not return",
 )
 VERDICTS = [
     ([OUTSIDE, OUTSIDE], ""),
-    ([INSIDE, OUTSIDE, INSIDE], f"rank 1 of 3 keeps the others waiting: rank 1 {LATE}; ranks 0, 2 in a sum (solver:7) for 12 s"),
-    ([INSIDE, None], f"rank 1 of 2 keeps the others waiting: rank 1 {SILENT}; rank 0 in a sum (solver:7) for 12 s"),
-    ([None, INSIDE, OUTSIDE, None], f"ranks 0, 2, 3 of 4 keep the others waiting: rank 2 {LATE}; ranks 0, 3 {SILENT}; rank 1 in a sum"),
+    (
+        [INSIDE, OUTSIDE, INSIDE],
+        f"rank 1 of 3 keeps the others waiting: rank 1 {LATE}; ranks 0, 2 in a sum (solver:7) for "
+        "12 s",
+    ),
+    (
+        [INSIDE, None],
+        f"rank 1 of 2 keeps the others waiting: rank 1 {SILENT}; rank 0 in a sum (solver:7) for 12 "
+        "s",
+    ),
+    (
+        [None, INSIDE, OUTSIDE, None],
+        f"ranks 0, 2, 3 of 4 keep the others waiting: rank 2 {LATE}; ranks 0, 3 {SILENT}; rank 1 "
+        "in a sum",
+    ),
     ([None, OUTSIDE], f"rank 1 {LATE}; rank 0 {SILENT}"),
     (
         [INSIDE, Post(9, 29, "a broadcast", 14.0, "solver:8")],
-        "all ranks wait for each other in different operations: rank 0 in a sum (solver:7); rank 1 in a broadcast (solver:8)",
+        "all ranks wait for each other in different operations: rank 0 in a sum (solver:7); rank 1 "
+        "in a broadcast (solver:8)",
     ),
 ]
 ROOT = Path(__file__).parents[2]
@@ -103,8 +119,10 @@ def test_operations_are_counted_in_order():
 
 
 ENDS = {
-    "late": r"rank 2 of 3 keeps the others waiting: rank 2 has been at __main__:\d+ for \d+ s; ranks 0, 1 in a gather \(__main__:\d+\)",
-    "other": r"all ranks wait for each other in different operations: ranks 0, 2 in a gather \(__main__:\d+\); rank 1 in a gather",
+    "late": r"rank 2 of 3 keeps the others waiting: rank 2 has been at __main__:\d+ for \d+ s; "
+    r"ranks 0, 1 in a gather \(__main__:\d+\)",
+    "other": r"all ranks wait for each other in different operations: ranks 0, 2 in a gather "
+    r"\(__main__:\d+\); rank 1 in a gather",
 }
 
 
@@ -120,11 +138,21 @@ def test_waiting_ends(mpi, what):
 
 def test_no_operation_goes_unwatched():
     """What waits for other ranks does so inside `waiting`, in the few places that call MPI."""
-    calls = re.compile(r"\.(I?([Aa]ll|[Bb]arrier|[Bb]cast|[Gg]ather|[Ss]catter|[Rr]educe|[Ss]can)\w*|[Ss]end|[Rr]ecv|Wait\w*|Split\w*)\(")
+    calls = re.compile(
+        r"\.(I?([Aa]ll|[Bb]arrier|[Bb]cast|[Gg]ather|[Ss]catter|[Rr]educe|[Ss]can)\w*|[Ss]end|[Rr]ecv|Wait\w*|Split\w*)\("
+    )
     unwatched = []
-    for file in (file for folder in ("warp_lcp", "fluids", "granular") for file in (ROOT / folder).rglob("*.py")):
+    for file in (
+        file
+        for folder in ("warp_lcp", "fluids", "granular")
+        for file in (ROOT / folder).rglob("*.py")
+    ):
         lines = file.read_text().splitlines()
         for number, line in enumerate(lines):
-            if ("comm." in line or "MPI." in line) and calls.search(line) and "with waiting(" not in lines[number - 1]:
+            if (
+                ("comm." in line or "MPI." in line)
+                and calls.search(line)
+                and "with waiting(" not in lines[number - 1]
+            ):
                 unwatched.append(f"{file.name}:{number + 1}: {line.strip()}")
     assert not unwatched

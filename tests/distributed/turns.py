@@ -50,7 +50,9 @@ class Seat:
 
     def swap(self, outgoing: Mapping[int, np.ndarray]) -> list[np.ndarray]:
         """Exchange messages."""
-        laid = self._table.exchange(self.rank, {rank: sent.copy() for rank, sent in outgoing.items()})
+        laid = self._table.exchange(
+            self.rank, {rank: sent.copy() for rank, sent in outgoing.items()}
+        )
         return [laid[rank][self.rank] for rank in sorted(outgoing)]
 
 

@@ -28,7 +28,13 @@ def path(request, tmp_path: Path) -> Path:
 
 
 def member(header: str, data: bytes = bytes(16), version: tuple[int, int] = (1, 0)) -> bytes:
-    return b"\x93NUMPY" + bytes(version) + len(header).to_bytes(2 if version == (1, 0) else 4, "little") + header.encode() + data
+    return (
+        b"\x93NUMPY"
+        + bytes(version)
+        + len(header).to_bytes(2 if version == (1, 0) else 4, "little")
+        + header.encode()
+        + data
+    )
 
 
 def zipped(path: Path, members: dict[str, bytes], packed: int = zipfile.ZIP_STORED) -> Path:
@@ -62,7 +68,9 @@ def test_a_box_is_part_of_the_array(path, name):
 
 def test_other_versions_of_the_format_are_read(tmp_path):
     for version in ((1, 0), (2, 0), (3, 0)):
-        np.testing.assert_array_equal(read(zipped(tmp_path / "a.npz", {"a.npy": member(DESCR, version=version)})), [0.0, 0.0])
+        np.testing.assert_array_equal(
+            read(zipped(tmp_path / "a.npz", {"a.npy": member(DESCR, version=version)})), [0.0, 0.0]
+        )
     indented = member(DESCR + "\r\n   ")  # which NumPy takes for one of Python 2 and warns of
     np.testing.assert_array_equal(read(zipped(tmp_path / "a.npz", {"a.npy": indented})), [0.0, 0.0])
 
@@ -70,10 +78,16 @@ def test_other_versions_of_the_format_are_read(tmp_path):
 @pytest.mark.parametrize(
     ("members", "message"),
     [
-        ({"a.npy": member(DESCR.replace("(2,)", "(1000000000000000000,)"))}, "take 8000000000000000000 bytes, and the file has 16"),
+        (
+            {"a.npy": member(DESCR.replace("(2,)", "(1000000000000000000,)"))},
+            "take 8000000000000000000 bytes, and the file has 16",
+        ),
         ({"a.npy": member(DESCR.replace("(2,)", "(3,)"))}, "take 24 bytes, and the file has 16"),
         ({"a.npy": member(DESCR.replace("<f8", "|O8"))}, "it holds objects"),
-        ({"a.npy": member(DESCR.replace("'<f8'", "[('x', '<f8')]"))}, "not a NumPy header, or it declares structured values"),
+        (
+            {"a.npy": member(DESCR.replace("'<f8'", "[('x', '<f8')]"))},
+            "not a NumPy header, or it declares structured values",
+        ),
         ({"a.npy": member(DESCR.replace("2", "2" * 5000))}, "not a NumPy header"),
         ({"a.npy": member("[" * 9000)}, "not a NumPy header"),
         ({"a.npy": member("{'descr': __import__('os').abort()}")}, "not a NumPy header"),
@@ -106,7 +120,11 @@ def test_two_arrays_of_one_name(tmp_path):
 
 def test_a_bomb_is_refused_before_it_is_read(tmp_path, monkeypatch):
     header = DESCR.replace("(2,)", "(4000000,)")
-    path = zipped(tmp_path / "a.npz", {"a.npy": member(header, bytes(32_000_000)), "b.npy": member(DESCR)}, zipfile.ZIP_DEFLATED)
+    path = zipped(
+        tmp_path / "a.npz",
+        {"a.npy": member(header, bytes(32_000_000)), "b.npy": member(DESCR)},
+        zipfile.ZIP_DEFLATED,
+    )
     assert path.stat().st_size < 40_000
     monkeypatch.setattr(claims, "free_host_memory", lambda: 10**7)
     with pytest.raises(ArchiveError, match=r"need 0[.]032 GB of memory, and 0[.]01 GB are free"):
@@ -118,16 +136,24 @@ def test_a_bomb_is_refused_before_it_is_read(tmp_path, monkeypatch):
 
 
 def test_a_size_that_deflate_cannot_reach(tmp_path):
-    path = zipped(tmp_path / "a.npz", {"a.npy": member(DESCR.replace("(2,)", "(40000000,)"))}, zipfile.ZIP_DEFLATED)
+    path = zipped(
+        tmp_path / "a.npz",
+        {"a.npy": member(DESCR.replace("(2,)", "(40000000,)"))},
+        zipfile.ZIP_DEFLATED,
+    )
     with zipfile.ZipFile(path) as file:
         size = file.infolist()[0].file_size
     wanted = size - 16 + 320_000_000
-    path.write_bytes(path.read_bytes().replace(size.to_bytes(4, "little"), wanted.to_bytes(4, "little")))
+    path.write_bytes(
+        path.read_bytes().replace(size.to_bytes(4, "little"), wanted.to_bytes(4, "little"))
+    )
     with pytest.raises(ArchiveError, match="and the file has"):
         read(path)
 
 
-@pytest.mark.parametrize("make", [lambda path: None, lambda path: path.mkdir(), lambda path: path.write_bytes(b"")])
+@pytest.mark.parametrize(
+    "make", [lambda path: None, lambda path: path.mkdir(), lambda path: path.write_bytes(b"")]
+)
 def test_no_file(tmp_path, make):
     make(tmp_path / "a.npz")
     with pytest.raises(ArchiveError):

@@ -12,7 +12,10 @@ def gigabyte(monkeypatch):
     monkeypatch.setattr(claims, "free_host_memory", lambda: 10**9)
 
 
-@pytest.mark.parametrize(("needed", "stored", "held"), [(0, None, None), (10**9, None, None), (50, 50, 50), (10**9, 3, 50)])
+@pytest.mark.parametrize(
+    ("needed", "stored", "held"),
+    [(0, None, None), (10**9, None, None), (50, 50, 50), (10**9, 3, 50)],
+)
 def test_what_fits_is_believed(needed, stored, held):
     check_claim("a", needed, stored=stored, held=held)
 

@@ -26,10 +26,18 @@ def velocity_errors(simulation: Any, steps: int, patch: pytest.MonkeyPatch) -> n
         start = wp.clone(options["x0"])
         result = solve(problem, solver, **options)
         left = result.x.numpy().ravel().copy()
-        exact = solve(problem, solver, stopping=wl.StoppingCriteria(rtol=1e-10), x0=start).x.numpy().ravel()
+        exact = (
+            solve(problem, solver, stopping=wl.StoppingCriteria(rtol=1e-10), x0=start)
+            .x.numpy()
+            .ravel()
+        )
         error = wp.array(left - exact, dtype=wp.float64)
         product = problem.A.apply(error)
-        errors.append(np.sqrt(max(error.numpy() @ product.numpy(), 0.0) / (problem.unknown.numpy() == 1).sum()))
+        errors.append(
+            np.sqrt(
+                max(error.numpy() @ product.numpy(), 0.0) / (problem.unknown.numpy() == 1).sum()
+            )
+        )
         return result
 
     with patch.context() as patched:
@@ -40,13 +48,17 @@ def velocity_errors(simulation: Any, steps: int, patch: pytest.MonkeyPatch) -> n
 
 
 @pytest.mark.parametrize("model", ["incompressible", "unilateral"])
-def test_a_solve_leaves_a_stated_part_of_the_time_steps_error(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_solve_leaves_a_stated_part_of_the_time_steps_error(
+    model: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     simulation = dam(solver=AUTO, pressure={"model": model})
     errors = velocity_errors(simulation, 30, monkeypatch)
     assert simulation.rows[0]["time_error"] is None, "no step came before"
     assert [row["tolerance"] for row in simulation.rows[:2]] == pytest.approx([FIRST, FIRST])
     time_errors = np.array([row["time_error"] for row in simulation.rows[1:]])
-    assert (errors[2:] <= 1.5 * FRACTION * time_errors[:-1] + 1e-6).all(), "each is held to the error of the step before it"
+    assert (errors[2:] <= 1.5 * FRACTION * time_errors[:-1] + 1e-6).all(), (
+        "each is held to the error of the step before it"
+    )
     used = np.array([row["tolerance"] for row in simulation.rows[2:]])
     assert (used >= LEAST).all()
     assert (used <= 1.5 * MOST).all()
@@ -55,8 +67,12 @@ def test_a_solve_leaves_a_stated_part_of_the_time_steps_error(model: str, monkey
 
 def test_the_time_error_is_what_halving_the_time_step_makes_less() -> None:
     coarse, fine = (advance(dam(solver=AUTO), 0.2, dt_max=dt) for dt in (4e-3, 2e-3))
-    ratio = np.median([row["time_error"] for row in coarse[5:]]) / np.median([row["time_error"] for row in fine[5:]])
-    assert 1.5 < ratio < 4.5, "second order a step, where the surface does not jump from cell to cell"
+    ratio = np.median([row["time_error"] for row in coarse[5:]]) / np.median(
+        [row["time_error"] for row in fine[5:]]
+    )
+    assert 1.5 < ratio < 4.5, (
+        "second order a step, where the surface does not jump from cell to cell"
+    )
 
 
 def test_liquid_at_rest_stays_at_rest() -> None:
@@ -76,13 +92,19 @@ def test_free_fall_is_not_iterated_on() -> None:
 def test_the_run_is_that_of_an_exact_solver_as_far_as_its_steps_allow() -> None:
     """Front and energy: nearer to the exact solver's run than that is to one of half the time step."""
     runs: dict[str, tuple[float, float]] = {}
-    for name, tolerance, dt in (("auto", "auto", 8e-3), ("exact", 1e-9, 8e-3), ("half", 1e-9, 4e-3)):
+    for name, tolerance, dt in (
+        ("auto", "auto", 8e-3),
+        ("exact", 1e-9, 8e-3),
+        ("half", 1e-9, 4e-3),
+    ):
         simulation = dam(solver={"tolerance": tolerance})
         row = advance(simulation, 0.3, dt_max=dt)[-1]
         front = float(np.percentile(simulation.particles.position.numpy()[:, 0], 99))
         runs[name] = front, row["kinetic_energy"] + row["potential_energy"]
     for seen in (0, 1):
-        assert abs(runs["auto"][seen] - runs["exact"][seen]) < 0.5 * abs(runs["half"][seen] - runs["exact"][seen])
+        assert abs(runs["auto"][seen] - runs["exact"][seen]) < 0.5 * abs(
+            runs["half"][seen] - runs["exact"][seen]
+        )
 
 
 def test_a_run_that_is_continued_takes_the_same_steps() -> None:
@@ -100,8 +122,13 @@ def test_a_run_that_is_continued_takes_the_same_steps() -> None:
 
 
 def test_precisions_measure_the_same_error() -> None:
-    mixed, single = (advance(dam(solver=AUTO | {"precision": precision}), 0.1) for precision in ("mixed", "single"))
-    assert [row["time_error"] for row in single[1:6]] == pytest.approx([row["time_error"] for row in mixed[1:6]], rel=0.05, abs=1e-5)
+    mixed, single = (
+        advance(dam(solver=AUTO | {"precision": precision}), 0.1)
+        for precision in ("mixed", "single")
+    )
+    assert [row["time_error"] for row in single[1:6]] == pytest.approx(
+        [row["time_error"] for row in mixed[1:6]], rel=0.05, abs=1e-5
+    )
 
 
 def test_bodies_count_in_the_error() -> None:
@@ -123,9 +150,12 @@ def test_bodies_count_in_the_error() -> None:
 )
 def test_other_values_are_refused(value: Any, expected: str) -> None:
     data = {
-        "scene": {"simulator": "fluids"}, "time": {"duration": 1.0}, "domain": {"size": [1.0, 1.0], "resolution": 8},
-        "liquid": [box([0.0, 0.0], [0.5, 0.5])], "solver": {"tolerance": value},
-    }  # fmt: skip
+        "scene": {"simulator": "fluids"},
+        "time": {"duration": 1.0},
+        "domain": {"size": [1.0, 1.0], "resolution": 8},
+        "liquid": [box([0.0, 0.0], [0.5, 0.5])],
+        "solver": {"tolerance": value},
+    }
     with pytest.raises(SceneError) as refused:
         validate(LiquidScene, data, "scene.toml")
     assert expected in str(refused.value)
@@ -133,4 +163,6 @@ def test_other_values_are_refused(value: Any, expected: str) -> None:
 
 def test_a_fixed_tolerance_has_no_columns_of_the_other() -> None:
     assert {"tolerance", "time_error"}.isdisjoint(dam().columns())
-    assert {"tolerance", "time_error"} <= set(SIMULATOR.create(dam(solver=AUTO).scene, device="cpu", folder=Path()).columns())
+    assert {"tolerance", "time_error"} <= set(
+        SIMULATOR.create(dam(solver=AUTO).scene, device="cpu", folder=Path()).columns()
+    )

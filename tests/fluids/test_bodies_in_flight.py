@@ -28,7 +28,9 @@ def in_order(simulation: LiquidSimulation) -> LiquidSimulation:
     return simulation
 
 
-def launch(simulation: LiquidSimulation, chosen: Chosen, velocity: list[float], spin: float) -> np.ndarray:
+def launch(
+    simulation: LiquidSimulation, chosen: Chosen, velocity: list[float], spin: float
+) -> np.ndarray:
     """Give the chosen particles a rigid motion, gradients included; return which they are."""
     particles = simulation.particles
     x = particles.position.numpy().astype(np.float64)
@@ -54,7 +56,11 @@ def turning(simulation: LiquidSimulation, which: np.ndarray, *, gradients: bool 
     square = (f - np.floor(f)) * (1.0 - f + np.floor(f)) * dx**2
     for component, sign in ((0, -1.0), (1, 1.0)):
         if gradients and simulation.particles.affine:
-            total += sign * square[:, 1 - component] * simulation.particles.affine[component].numpy()[which, 1 - component]
+            total += (
+                sign
+                * square[:, 1 - component]
+                * simulation.particles.affine[component].numpy()[which, 1 - component]
+            )
     return float(total.mean())
 
 
@@ -68,12 +74,22 @@ def everything(x: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("transfer", ["apic", "flip", "pic"])
 @pytest.mark.parametrize("cfl", [0.5, 2.0, 8.0])
-def test_a_spinning_drop_keeps_its_angular_momentum_and_its_energy(transfer: str, cfl: float) -> None:
+def test_a_spinning_drop_keeps_its_angular_momentum_and_its_energy(
+    transfer: str, cfl: float
+) -> None:
     """Without gravity; it lost 18 % at CFL 2 (APIC), 30 % (PIC). What APIC's gradients carry hangs on where in cells particles are."""
     weightless = {"physics": {"gravity": [0.0, 0.0]}, "particles": {"transfer": transfer}}
-    drop = create(scene(size=[1.0, 1.0], resolution=32, liquid=[ball([0.51, 0.49], 0.17)], cfl=cfl, **weightless))
+    drop = create(
+        scene(
+            size=[1.0, 1.0], resolution=32, liquid=[ball([0.51, 0.49], 0.17)], cfl=cfl, **weightless
+        )
+    )
     which = launch(drop, everything, [0.0, 0.0], RIM / 0.17)
-    before, whole, middle = turning(drop, which), turning(drop, which, gradients=True), center(drop, which)
+    before, whole, middle = (
+        turning(drop, which),
+        turning(drop, which, gradients=True),
+        center(drop, which),
+    )
     rows = advance(drop, FLIGHT)
     assert turning(drop, which) == pytest.approx(before, rel=1e-4)
     assert turning(drop, which, gradients=True) == pytest.approx(whole, rel=0.01)
@@ -83,25 +99,44 @@ def test_a_spinning_drop_keeps_its_angular_momentum_and_its_energy(transfer: str
     assert energy[-1] > 0.97 * energy[0]
 
 
-@pytest.mark.parametrize(("model", "cfl"), [("incompressible", 2.0), ("incompressible", 8.0), ("unilateral", 2.0)])
+@pytest.mark.parametrize(
+    ("model", "cfl"), [("incompressible", 2.0), ("incompressible", 8.0), ("unilateral", 2.0)]
+)
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_what_spins_in_flight_goes_along_its_parabola(model: str, cfl: float, dimension: int) -> None:
+def test_what_spins_in_flight_goes_along_its_parabola(
+    model: str, cfl: float, dimension: int
+) -> None:
     """A block that turns, where it is not round; it was 2 % of the way off."""
     low, high = np.array([0.6, 1.0, 0.9]), np.array([1.0, 1.3, 1.2])
     cells = 40 if dimension == 2 else 20
     liquid = [box(low[:dimension].tolist(), high[:dimension].tolist())]
-    block = create(scene(size=[2.0] * dimension, resolution=cells, liquid=liquid, cfl=cfl, pressure={"model": model}))
+    block = create(
+        scene(
+            size=[2.0] * dimension,
+            resolution=cells,
+            liquid=liquid,
+            cfl=cfl,
+            pressure={"model": model},
+        )
+    )
     which = launch(block, everything, [1.0, 1.5, 0.0], 6.0)
     before, turned = center(block, which), turning(block, which)
     advance(block, FLIGHT)
     expected = before + FLIGHT * np.array([1.0, 1.5 - 0.5 * GRAVITY * FLIGHT, 0.0])
-    np.testing.assert_allclose(center(block, which), expected, atol=1e-4 * float(np.linalg.norm(expected - before)))
-    if model == "incompressible":  # the other kind flies apart, into particles that turn about nothing but themselves
+    np.testing.assert_allclose(
+        center(block, which), expected, atol=1e-4 * float(np.linalg.norm(expected - before))
+    )
+    # the other kind flies apart, into particles that turn about nothing but themselves
+    if model == "incompressible":
         assert turning(block, which) == pytest.approx(turned, rel=1e-3)
 
 
 def test_drops_that_collide_in_flight_keep_their_common_parabola() -> None:
-    drops = create(scene(size=[4.0, 4.0], resolution=64, liquid=[ball([1.6, 2.5], 0.2), ball([2.3, 2.52], 0.25)]))
+    drops = create(
+        scene(
+            size=[4.0, 4.0], resolution=64, liquid=[ball([1.6, 2.5], 0.2), ball([2.3, 2.52], 0.25)]
+        )
+    )
     first = launch(drops, lambda x: x[:, 0] < 1.9, [2.0, 0.0], 4.0)
     launch(drops, lambda x: x[:, 0] > 1.9, [-1.0, 0.5], 0.0)
     share, whole = first.mean(), np.full(len(first), True)
@@ -109,7 +144,9 @@ def test_drops_that_collide_in_flight_keep_their_common_parabola() -> None:
     rows = advance(drops, FLIGHT)
     velocity = share * np.array([2.0, 0.0]) + (1.0 - share) * np.array([-1.0, 0.5])
     expected = FLIGHT * velocity - np.array([0.0, 0.5 * GRAVITY * FLIGHT**2])
-    np.testing.assert_allclose((center(drops, whole) - before)[:2], expected, atol=1e-4 * float(np.linalg.norm(expected)))
+    np.testing.assert_allclose(
+        (center(drops, whole) - before)[:2], expected, atol=1e-4 * float(np.linalg.norm(expected))
+    )
     energy = [row["kinetic_energy"] + row["potential_energy"] for row in rows]
     assert np.diff(energy).max() < 1e-5 * energy[0]
 
@@ -117,12 +154,22 @@ def test_drops_that_collide_in_flight_keep_their_common_parabola() -> None:
 @pytest.mark.cpu_form("particles are sorted in every step on CUDA")
 def test_a_drop_flies_over_a_pool_that_rests() -> None:
     """Each is a body of its own; the pool touches walls and is left alone."""
-    pool = in_order(create(scene(size=[2.0, 2.0], resolution=40, liquid=[ball([1.0, 1.5], 0.2), box([0.0, 0.0], [2.0, 0.3])])))
+    pool = in_order(
+        create(
+            scene(
+                size=[2.0, 2.0],
+                resolution=40,
+                liquid=[ball([1.0, 1.5], 0.2), box([0.0, 0.0], [2.0, 0.3])],
+            )
+        )
+    )
     drop = launch(pool, lambda x: x[:, 1] > 1.0, [0.5, 0.0], 8.0)
     before, turned = center(pool, drop), turning(pool, drop)
     advance(pool, 0.3)
     expected = before + np.array([0.15, -0.5 * GRAVITY * 0.3**2, 0.0])
-    np.testing.assert_allclose(center(pool, drop), expected, atol=1e-4 * float(np.linalg.norm(expected - before)))
+    np.testing.assert_allclose(
+        center(pool, drop), expected, atol=1e-4 * float(np.linalg.norm(expected - before))
+    )
     assert turning(pool, drop) == pytest.approx(turned, rel=1e-4)
     assert pool.flights is not None
     assert np.abs(pool.particles.velocity.numpy()[~drop]).max() < 0.1
@@ -136,9 +183,13 @@ def test_a_small_drop_does_not_fly_through_a_plate(key: str, materials: ModuleTy
     width = 1.0 / 32.0
     for offset in range(4):
         low = 0.1 + offset * width
-        small = {key: [box([low, 0.5], [low + 2.0 * width, 0.5 + 2.0 * width], velocity=[6.0, 2.0])]}
+        small = {
+            key: [box([low, 0.5], [low + 2.0 * width, 0.5 + 2.0 * width], velocity=[6.0, 2.0])]
+        }
         plate = box([0.6, 0.0], [0.6 + 1.2 * width, 1.0])
-        drop = materials.create(materials.scene(size=[1.0, 1.0], resolution=32, **small, solid=[plate], cfl=8.0))
+        drop = materials.create(
+            materials.scene(size=[1.0, 1.0], resolution=32, **small, solid=[plate], cfl=8.0)
+        )
         materials.advance(drop, 0.12, dt_max=1.0)
         assert drop.particles.position.numpy()[:, 0].max() < 0.6 + 1.2 * width
 

@@ -15,13 +15,18 @@ def block(dimension: int, **tables: Any) -> LiquidSimulation:
     """Return a block that spans the ceiling from wall to wall."""
     size = [0.4, 0.8, 0.2][:dimension]
     low = [0.0, 0.6, 0.0][:dimension]
-    return create(scene(size=size, resolution={2: 32, 3: 16}[dimension], liquid=[box(low, size)], **tables))
+    return create(
+        scene(size=size, resolution={2: 32, 3: 16}[dimension], liquid=[box(low, size)], **tables)
+    )
 
 
-def drop(simulation: LiquidSimulation, until: float) -> tuple[np.ndarray, float, list[dict[str, Any]]]:
+def drop(
+    simulation: LiquidSimulation, until: float
+) -> tuple[np.ndarray, float, list[dict[str, Any]]]:
     """Let it fall; return how far each particle did and should have [cells], and the log.
 
-    Particles are matched by their order from the floor up, which a rigid fall keeps and a straggler can only lose places in.
+    Particles are matched by their order from the floor up, which a rigid fall keeps and a straggler
+    can only lose places in.
     """
     start = np.sort(simulation.particles.position.numpy()[:, 1])
     rows = []
@@ -30,7 +35,11 @@ def drop(simulation: LiquidSimulation, until: float) -> tuple[np.ndarray, float,
         dt = min(simulation.stable_dt(), 0.02, until - simulation.time)
         rows.append(simulation.step(dt))
     end = np.sort(simulation.particles.position.numpy()[:, 1])
-    return (start - end) / simulation.grid.spacing, 0.5 * GRAVITY * simulation.time**2 / simulation.grid.spacing, rows
+    return (
+        (start - end) / simulation.grid.spacing,
+        0.5 * GRAVITY * simulation.time**2 / simulation.grid.spacing,
+        rows,
+    )
 
 
 @pytest.mark.parametrize("transfer", ["apic", "flip", "pic"])
@@ -54,15 +63,28 @@ def test_free_slip_walls_hold_it_by_suction(dimension: int) -> None:
     assert expected > {2: 8, 3: 4}[dimension]
     assert abs(fallen.mean()) < 0.1
     assert np.abs(fallen).max() < 1.0  # a few drops let go of the free surface
-    assert simulation.projection.pressures(1000.0).min() == pytest.approx(-1000.0 * GRAVITY * 0.2, rel=0.15)
+    assert simulation.projection.pressures(1000.0).min() == pytest.approx(
+        -1000.0 * GRAVITY * 0.2, rel=0.15
+    )
     assert all(row["active"] == 0 for row in rows)
 
 
-def test_a_wall_that_keeps_its_velocity_fails_the_last_particle_only(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_wall_that_keeps_its_velocity_fails_the_last_particle_only(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """The negative control of the release: the mean looks right, the last particle lags."""
     extend = boundary.extend_velocity
 
-    def hold(window: Any, velocity: Any, weights: Any, known: Any, kind: wp.array, contact: wp.array, *rest: Any, **more: Any) -> None:
+    def hold(
+        window: Any,
+        velocity: Any,
+        weights: Any,
+        known: Any,
+        kind: wp.array,
+        contact: wp.array,
+        *rest: Any,
+        **more: Any,
+    ) -> None:
         extend(window, velocity, weights, known, kind, wp.zeros_like(contact), *rest, **more)
 
     monkeypatch.setattr(boundary, "extend_velocity", hold)
@@ -74,6 +96,9 @@ def test_a_wall_that_keeps_its_velocity_fails_the_last_particle_only(monkeypatch
 @pytest.mark.parametrize(("wall", "falls"), [("separating", True), ("free-slip", False)])
 def test_a_solid_ceiling_decides_for_itself(wall: str, falls: bool) -> None:
     solid, liquid = [box([0.0, 0.7], [0.4, 0.8], wall=wall)], [box([0.0, 0.5], [0.4, 0.7])]
-    fallen, expected, _ = drop(create(scene(size=[0.4, 0.8], resolution=32, liquid=liquid, solid=solid, wall="free-slip")), 0.15)
+    fallen, expected, _ = drop(
+        create(scene(size=[0.4, 0.8], resolution=32, liquid=liquid, solid=solid, wall="free-slip")),
+        0.15,
+    )
     assert expected > 3
     assert np.abs(fallen - expected if falls else fallen).max() < (0.01 if falls else 0.5)

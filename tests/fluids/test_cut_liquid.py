@@ -11,12 +11,19 @@ from small_liquids import GRAVITY, advance, box, create, scene
 from warp_lcp.material.boundary import CutBoundary, WholeCells
 
 SLOPE = math.radians(30)
-V = [{"shape": "plane", "point": [0.5, 0.1], "normal": [side * math.sin(SLOPE), math.cos(SLOPE)]} for side in (-1, 1)]
+V = [
+    {"shape": "plane", "point": [0.5, 0.1], "normal": [side * math.sin(SLOPE), math.cos(SLOPE)]}
+    for side in (-1, 1)
+]
 
 
 def pool(resolution: int = 24, **tables: Any) -> Any:
     """Return a pool of depth 0.4 over two slopes that meet in the middle."""
-    return create(scene(size=[1.0, 1.0], resolution=resolution, liquid=[box([0.0, 0.0], [1.0, 0.5])], **tables))
+    return create(
+        scene(
+            size=[1.0, 1.0], resolution=resolution, liquid=[box([0.0, 0.0], [1.0, 0.5])], **tables
+        )
+    )
 
 
 @pytest.mark.parametrize(
@@ -28,7 +35,9 @@ def pool(resolution: int = 24, **tables: Any) -> Any:
         ([box([0.5, 0.0], [0.75, 0.25], rotate=45)], CutBoundary),
     ],
 )
-def test_only_solids_that_cut_cells_cost_face_coefficients(solid: list[dict[str, Any]], kind: type) -> None:
+def test_only_solids_that_cut_cells_cost_face_coefficients(
+    solid: list[dict[str, Any]], kind: type
+) -> None:
     simulation = pool(16, solid=solid)
     assert type(simulation.boundary) is kind
     simulation.step(0.01)
@@ -60,10 +69,16 @@ def test_the_pressure_over_slopes_is_that_of_the_depth(resolution: int) -> None:
 
 def test_no_particle_enters_a_solid() -> None:
     disc = {"shape": "sphere", "center": [0.55, 0.15], "radius": 0.17}
-    simulation = create(scene(size=[1.0, 0.6], resolution=30, liquid=[box([0.0, 0.0], [0.3, 0.5])], solid=[disc]))
+    simulation = create(
+        scene(size=[1.0, 0.6], resolution=30, liquid=[box([0.0, 0.0], [0.3, 0.5])], solid=[disc])
+    )
     rows = advance(simulation, 0.5)
     position = simulation.particles.position.numpy()
     far = np.hypot(position[:, 0] - 0.55, position[:, 1] - 0.15)
     assert max(row["stopped"] for row in rows) > 0
-    assert far.min() > 0.17 - 0.01 * simulation.grid.spacing - 0.125 * simulation.grid.spacing**2 / 0.17  # the chord of a cell
+    # the chord of a cell
+    assert (
+        far.min()
+        > 0.17 - 0.01 * simulation.grid.spacing - 0.125 * simulation.grid.spacing**2 / 0.17
+    )
     assert {row["solve_status"] for row in rows} == {"CONVERGED"}

@@ -19,13 +19,27 @@ def disc(center, radius, **more):
 def crowded(dimension, model="incompressible"):
     """Two bodies that share cells, one beside a standing solid and the wall, in a tank almost full of liquid."""
     if dimension == 2:
-        bodies = [disc([0.3, 0.41], 0.13, density=700.0), box([0.437, 0.33], [0.7, 0.52], density=2000.0)]
+        bodies = [
+            disc([0.3, 0.41], 0.13, density=700.0),
+            box([0.437, 0.33], [0.7, 0.52], density=2000.0),
+        ]
         standing = [box([0.72, 0.0], [1.0, 0.47])]
     else:
-        bodies = [disc([0.3, 0.41, 0.5], 0.13, density=700.0), box([0.437, 0.33, 0.3], [0.7, 0.52, 0.71], density=2000.0)]
+        bodies = [
+            disc([0.3, 0.41, 0.5], 0.13, density=700.0),
+            box([0.437, 0.33, 0.3], [0.7, 0.52, 0.71], density=2000.0),
+        ]
         standing = [box([0.74, 0.0, 0.0], [1.0, 0.47, 1.0])]
     liquid = [box([0.0] * dimension, [1.0, 0.8, 1.0][:dimension])]
-    return create(scene(size=[1.0] * dimension, resolution=24, liquid=liquid, solid=[*standing, *bodies], pressure={"model": model}))
+    return create(
+        scene(
+            size=[1.0] * dimension,
+            resolution=24,
+            liquid=liquid,
+            solid=[*standing, *bodies],
+            pressure={"model": model},
+        )
+    )
 
 
 def dense_columns(simulation):
@@ -50,7 +64,10 @@ def test_the_columns_are_what_velocities_add_to_the_right_hand_side(dimension, m
     def right_side(velocities):
         for body, v in zip(simulation.bodies.bodies, velocities, strict=True):
             six = np.array([v[0], v[1], 0.0, 0.0, 0.0, v[2]]) if dimension == 2 else v
-            body.momentum, body.angular_momentum = body.properties.mass * six[:3], body.inertia @ six[3:]
+            body.momentum, body.angular_momentum = (
+                body.properties.mass * six[:3],
+                body.inertia @ six[3:],
+            )
         simulation.boundary.begin_step(simulation.time, 1e-4)
         projection.prepare(still, 1e-4, 1e-4)
         return projection._b.numpy().ravel().copy()
@@ -75,22 +92,50 @@ def projected(simulation, dt):
 
     def watched(velocity, *steps):
         taken["u"] = [field.numpy().astype(np.float64) for field in velocity]
-        taken["V"] = np.array([np.r_[body.velocity, body.angular_velocity] for body in simulation.bodies.bodies])
+        taken["V"] = np.array(
+            [np.r_[body.velocity, body.angular_velocity] for body in simulation.bodies.bodies]
+        )
         return prepare(velocity, *steps)
 
     simulation.projection.prepare = watched
     simulation._project(window, dt, simulation.top_speed(before))
     after = [field.numpy().astype(np.float64) for field in simulation.velocity]
-    return taken["u"], after, taken["V"], np.array([np.r_[body.velocity, body.angular_velocity] for body in simulation.bodies.bodies])
+    return (
+        taken["u"],
+        after,
+        taken["V"],
+        np.array(
+            [np.r_[body.velocity, body.angular_velocity] for body in simulation.bodies.bodies]
+        ),
+    )
 
 
 def drop_that_meets_a_body(dimension, ratio, wall):
     """Liquid around most of a body flies against it, far from all walls."""
     weightless = {"physics": {"gravity": [0.0] * dimension}}
-    body = box([0.46, 0.4, 0.4][:dimension], [0.61, 0.57, 0.57][:dimension], density=1000.0 * ratio, wall=wall)
-    liquid = [box([0.25, 0.3, 0.3][:dimension], [0.55, 0.6, 0.6][:dimension], velocity=[1.0, 0.2, -0.3][:dimension])]
+    body = box(
+        [0.46, 0.4, 0.4][:dimension],
+        [0.61, 0.57, 0.57][:dimension],
+        density=1000.0 * ratio,
+        wall=wall,
+    )
+    liquid = [
+        box(
+            [0.25, 0.3, 0.3][:dimension],
+            [0.55, 0.6, 0.6][:dimension],
+            velocity=[1.0, 0.2, -0.3][:dimension],
+        )
+    ]
     return create(
-        scene(size=[1.0] * dimension, resolution=20, liquid=liquid, solid=[body], solver={"tolerance": 1e-6}, **weightless, **VOXEL)
+        scene(
+            size=[1.0] * dimension,
+            resolution=20,
+            liquid=liquid,
+            solid=[body],
+            solver={"tolerance": 1e-6},
+            **weightless,
+            **VOXEL,
+        )
     )
 
 
@@ -141,7 +186,9 @@ def test_a_tilted_raft_rights_itself(tilt):
     center = np.array([0.5, 0.5])
     back = center - np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) @ center
     raft = box([0.3, 0.45], [0.7, 0.55], density=500.0, rotate=[tilt], translate=back.tolist())
-    simulation = create(scene(size=[1.0, 1.0], resolution=32, liquid=[box([0.0, 0.0], [1.0, 0.5])], solid=[raft]))
+    simulation = create(
+        scene(size=[1.0, 1.0], resolution=32, liquid=[box([0.0, 0.0], [1.0, 0.5])], solid=[raft])
+    )
     rows = advance(simulation, 0.15)
     turned = rows[-1]["body0_angle"]
     assert np.sign(turned) == -np.sign(tilt)
@@ -153,7 +200,11 @@ def test_a_tilted_raft_rights_itself(tilt):
 def test_light_bodies_rise_and_heavy_ones_sink(density, sign, model):
     liquid = [box([0.0, 0.0], [1.0, 0.8])]
     ball = disc([0.5, 0.4], 0.12, density=density)
-    simulation = create(scene(size=[1.0, 1.0], resolution=32, liquid=liquid, solid=[ball], pressure={"model": model}))
+    simulation = create(
+        scene(
+            size=[1.0, 1.0], resolution=32, liquid=liquid, solid=[ball], pressure={"model": model}
+        )
+    )
     rows = advance(simulation, 0.1)
     assert sign * rows[-1]["body0_vy"] > 0.15
     assert abs(rows[-1]["body0_vx"]) < 0.05
@@ -165,7 +216,15 @@ def test_liquid_lets_go_of_a_body_that_leaves_it():
     speeds = {}
     for wall in ("separating", "free-slip"):
         body = box([0.4, 0.3], [0.6, 0.5], density=300.0, velocity=[0.0, 3.0], wall=wall)
-        simulation = create(scene(size=[1.0, 1.0], resolution=32, liquid=[box([0.0, 0.0], [1.0, 0.31])], solid=[body], **FLAT))
+        simulation = create(
+            scene(
+                size=[1.0, 1.0],
+                resolution=32,
+                liquid=[box([0.0, 0.0], [1.0, 0.31])],
+                solid=[body],
+                **FLAT,
+            )
+        )
         rows = advance(simulation, 0.02)
         speeds[wall] = rows[-1]["body0_vy"]
     assert speeds["separating"] == pytest.approx(3.0, rel=1e-3)
@@ -175,8 +234,12 @@ def test_liquid_lets_go_of_a_body_that_leaves_it():
 def test_bodies_of_all_weights_in_one_tank():
     """The columns of one problem reach from 1e-3 to 1e3 times the liquid's density."""
     densities = (1.0, 30.0, 1000.0, 3e4, 1e6)
-    bodies = [disc([0.2 + 0.3 * n, 0.3], 0.1, density=density) for n, density in enumerate(densities)]
-    simulation = create(scene(size=[1.6, 0.8], resolution=64, liquid=[box([0.0, 0.0], [1.6, 0.5])], solid=bodies))
+    bodies = [
+        disc([0.2 + 0.3 * n, 0.3], 0.1, density=density) for n, density in enumerate(densities)
+    ]
+    simulation = create(
+        scene(size=[1.6, 0.8], resolution=64, liquid=[box([0.0, 0.0], [1.6, 0.5])], solid=bodies)
+    )
     rows = advance(simulation, 0.06)
     assert all(row["solve_status"] == "CONVERGED" for row in rows)
     assert max(row["solve_iterations"] for row in rows) <= 30
@@ -188,8 +251,18 @@ def test_bodies_of_all_weights_in_one_tank():
 
 @pytest.mark.parametrize("body", [box([-0.1] * 3, [0.1] * 3), disc([0.0] * 3, 0.1)])
 def test_bodies_of_equal_moments_may_be_turned(body):
-    turned = body | {"density": 300.0, "rotate": [12.0, 34.0, 56.0], "translate": [0.4, 0.6, 0.4], "angular_velocity": [3.0, -2.0, 1.0]}
-    model = scene(size=[0.8] * 3, resolution=8, liquid=[box([0.0, 0.0, 0.0], [0.8, 0.65, 0.8])], solid=[turned])
+    turned = body | {
+        "density": 300.0,
+        "rotate": [12.0, 34.0, 56.0],
+        "translate": [0.4, 0.6, 0.4],
+        "angular_velocity": [3.0, -2.0, 1.0],
+    }
+    model = scene(
+        size=[0.8] * 3,
+        resolution=8,
+        liquid=[box([0.0, 0.0, 0.0], [0.8, 0.65, 0.8])],
+        solid=[turned],
+    )
     simulation = create(model)
     rows = advance(simulation, 0.03)
     assert {row["solve_status"] for row in rows} == {"CONVERGED"}
@@ -210,7 +283,9 @@ def test_a_failed_step_leaves_the_bodies_as_they_were():
 def light_raft():
     """A body that the preconditioner is corrected for."""
     raft = box([0.3, 0.42], [0.7, 0.55], density=20.0)
-    return create(scene(size=[1.0, 1.0], resolution=32, liquid=[box([0.0, 0.0], [1.0, 0.5])], solid=[raft]))
+    return create(
+        scene(size=[1.0, 1.0], resolution=32, liquid=[box([0.0, 0.0], [1.0, 0.5])], solid=[raft])
+    )
 
 
 def test_a_run_goes_on_bit_for_bit_from_a_state():
@@ -221,22 +296,44 @@ def test_a_run_goes_on_bit_for_bit_from_a_state():
     second.restore(state)
     for simulation in (first, second):
         rows.append(advance(simulation, 0.08))
-    assert [row["solve_iterations"] for row in rows[0]] == [row["solve_iterations"] for row in rows[1]]
-    np.testing.assert_array_equal(first.particles.position.numpy(), second.particles.position.numpy())
+    assert [row["solve_iterations"] for row in rows[0]] == [
+        row["solve_iterations"] for row in rows[1]
+    ]
+    np.testing.assert_array_equal(
+        first.particles.position.numpy(), second.particles.position.numpy()
+    )
     np.testing.assert_array_equal(first.bodies.state()["bodies"], second.bodies.state()["bodies"])
 
 
 def test_methods_that_sweep_are_refused_with_bodies():
     body = box([0.3, 0.3], [0.5, 0.5], density=500.0)
-    with pytest.raises(ValidationError, match=r"cannot be combined with rigid bodies.*use projected-multigrid"):
-        scene(size=[1.0, 1.0], resolution=16, liquid=[box([0.0, 0.0], [1.0, 0.4])], solid=[body], solver={"method": "psor"})
+    with pytest.raises(
+        ValidationError, match=r"cannot be combined with rigid bodies.*use projected-multigrid"
+    ):
+        scene(
+            size=[1.0, 1.0],
+            resolution=16,
+            liquid=[box([0.0, 0.0], [1.0, 0.4])],
+            solid=[body],
+            solver={"method": "psor"},
+        )
 
 
-@pytest.mark.parametrize("method", ["projected-multigrid", "minimum-map-newton", "primal-dual-active-set"])
+@pytest.mark.parametrize(
+    "method", ["projected-multigrid", "minimum-map-newton", "primal-dual-active-set"]
+)
 def test_methods_agree_on_where_bodies_go(method):
     liquid = [box([0.0, 0.0], [1.0, 0.45])]
     body = box([0.35, 0.4], [0.65, 0.6], density=200.0)
-    simulation = create(scene(size=[1.0, 1.0], resolution=24, liquid=liquid, solid=[body], solver={"method": method, "tolerance": 1e-7}))
+    simulation = create(
+        scene(
+            size=[1.0, 1.0],
+            resolution=24,
+            liquid=liquid,
+            solid=[body],
+            solver={"method": method, "tolerance": 1e-7},
+        )
+    )
     rows = advance(simulation, 0.2)
     assert rows[-1]["body0_y"] == pytest.approx(0.519893, abs=2e-6)
     assert all(row["solve_status"] == "CONVERGED" for row in rows)
@@ -245,7 +342,9 @@ def test_methods_agree_on_where_bodies_go(method):
 def test_what_a_body_buries_does_not_fall_for_ever():
     """Particles between a body and the floor it has sunk to have no open face near: gravity alone would act on them."""
     body = box([0.3, 0.05], [0.7, 0.2], density=4000.0)
-    simulation = create(scene(size=[1.0, 0.75], resolution=32, liquid=[box([0.0, 0.0], [1.0, 0.4])], solid=[body]))
+    simulation = create(
+        scene(size=[1.0, 0.75], resolution=32, liquid=[box([0.0, 0.0], [1.0, 0.4])], solid=[body])
+    )
     rows = advance(simulation, 1.2)
     assert rows[-1]["body0_y"] == pytest.approx(0.075, abs=0.005)
     assert rows[-1]["max_speed"] < 1.5

@@ -11,10 +11,21 @@ WIDE = 6  # diameters of the body that the tank has
 
 def first_acceleration(dimension, cells, ratio, wall="free-slip"):
     """The acceleration from rest of a disc or a sphere in a closed tank full of liquid."""
-    ball = {"shape": "sphere", "center": [0.5] * dimension, "radius": 0.5 / WIDE, "density": 1000.0 * ratio}
+    ball = {
+        "shape": "sphere",
+        "center": [0.5] * dimension,
+        "radius": 0.5 / WIDE,
+        "density": 1000.0 * ratio,
+    }
     down = {"physics": {"gravity": [0.0, -GRAVITY, 0.0][:dimension]}}
     liquid = [box([0.0] * dimension, [1.0] * dimension)]
-    tables = {"liquid": liquid, "solid": [ball], "wall": wall, "solver": {"tolerance": 1e-6}, **down}
+    tables = {
+        "liquid": liquid,
+        "solid": [ball],
+        "wall": wall,
+        "solver": {"tolerance": 1e-6},
+        **down,
+    }
     simulation = create(scene(size=[1.0] * dimension, resolution=cells * WIDE, **tables))
     row = simulation.step(STEP)
     assert row["solve_status"] == "CONVERGED"
@@ -27,11 +38,15 @@ def test_a_disc_sets_off_with_its_added_mass(ratio):
     """That of its own displacement, (1 + q^2) / (1 - q^2) times as much in a round tank of 1/q diameters; the square one is like it."""
     q = 1.0 / WIDE
     added = (1.0 + q**2) / (1.0 - q**2)
-    assert first_acceleration(2, 16, ratio) == pytest.approx((1.0 - ratio) * GRAVITY / (ratio + added), rel=0.04)
+    assert first_acceleration(2, 16, ratio) == pytest.approx(
+        (1.0 - ratio) * GRAVITY / (ratio + added), rel=0.04
+    )
 
 
 def test_walls_that_let_go_of_liquid_do_not_change_how_a_disc_sets_off():
-    assert first_acceleration(2, 16, 0.5, "separating") == pytest.approx(first_acceleration(2, 16, 0.5), rel=1e-3)
+    assert first_acceleration(2, 16, 0.5, "separating") == pytest.approx(
+        first_acceleration(2, 16, 0.5), rel=1e-3
+    )
 
 
 @pytest.mark.parametrize("ratio", [0.1, pytest.param(3.0, marks=pytest.mark.slow)])
@@ -39,7 +54,9 @@ def test_a_sphere_sets_off_with_its_added_mass(ratio):
     """Half of its displacement, (1 + 2 q^3) / (1 - q^3) times as much in a round tank of 1/q diameters."""
     q = 1.0 / WIDE
     added = 0.5 * (1.0 + 2.0 * q**3) / (1.0 - q**3)
-    assert first_acceleration(3, 10, ratio) == pytest.approx((1.0 - ratio) * GRAVITY / (ratio + added), rel=0.02)
+    assert first_acceleration(3, 10, ratio) == pytest.approx(
+        (1.0 - ratio) * GRAVITY / (ratio + added), rel=0.02
+    )
 
 
 @pytest.mark.slow

@@ -26,7 +26,9 @@ def run(out: Path, scene: str, *overrides: str) -> Path:
 def dense(path: Path, outside: float, shape: tuple[int, int, int]) -> np.ndarray:
     """Return the voxels of a file's leaves, x first, found by their size alone: they end the file."""
     data, tree = path.read_bytes(), 16 + 176 + len(path.stem.rpartition("_")[0]) + 1 + 672
-    leaves = np.frombuffer(data[-int(np.frombuffer(data, "<u4", 1, tree + 32)[0]) * LEAF_NODE.itemsize :], LEAF_NODE)
+    leaves = np.frombuffer(
+        data[-int(np.frombuffer(data, "<u4", 1, tree + 32)[0]) * LEAF_NODE.itemsize :], LEAF_NODE
+    )
     values = np.full([-(-count // LEAF) * LEAF for count in shape], outside, dtype=np.float32)
     for leaf in leaves:
         x, y, z = leaf["low"]
@@ -38,19 +40,25 @@ def dense(path: Path, outside: float, shape: tuple[int, int, int]) -> np.ndarray
 def test_volumes_lie_where_the_particles_are(tmp_path, scene):
     sizes = SMALL if scene == "dam-break" else ("domain.resolution=24", "time.duration=0.05")
     model = load_scene(scene, sizes)
-    plain, out = run(tmp_path / "plain", scene, *sizes), run(tmp_path / "volume", scene, *sizes, "output.volume=true")
+    plain, out = (
+        run(tmp_path / "plain", scene, *sizes),
+        run(tmp_path / "volume", scene, *sizes, "output.volume=true"),
+    )
     for index in (0, model.time.frame_count):
         particles = meshio.read(out / "frames" / f"particles_{index:06d}.vtu").points
         density = dense(out / "frames" / f"density_{index:06d}.nvdb", 0.0, model.cell_counts)
         distance = dense(out / "frames" / f"level_set_{index:06d}.nvdb", 9.0, model.cell_counts)
         at_rest = model.particles.per_axis**3
-        np.testing.assert_allclose(density.sum() * at_rest, len(particles), rtol=0.12)  # of kernels at walls a part lies outside
+        # of kernels at walls a part lies outside
+        np.testing.assert_allclose(density.sum() * at_rest, len(particles), rtol=0.12)
         cells = tuple(np.floor(particles / model.spacing).astype(int).T)
         assert (density[cells] > 0.1).all()
         assert np.median(distance[cells]) < 0.0
         assert (distance[cells] < model.spacing).all()
         inside = np.argwhere(distance < 0.0) + 0.5
-        np.testing.assert_allclose(inside.mean(axis=0) * model.spacing, particles.mean(axis=0), atol=0.3 * model.spacing)
+        np.testing.assert_allclose(
+            inside.mean(axis=0) * model.spacing, particles.mean(axis=0), atol=0.3 * model.spacing
+        )
         filled = np.zeros(model.cell_counts, dtype=bool)
         filled[cells] = True
         assert (distance[~filled] > -0.5 * model.spacing).all()
@@ -65,19 +73,26 @@ def test_volumes_lie_where_the_particles_are(tmp_path, scene):
 @pytest.mark.parametrize("scene", ["dam-break", "dam-break-2d"])
 def test_images_show_what_hexahedra_do(tmp_path, scene):
     sizes = SMALL if scene == "dam-break" else ("domain.resolution=32", "time.duration=0.1")
-    hexahedra, images = (run(tmp_path / kind, scene, *sizes, f"output.grid_format={kind}") for kind in ("vtu", "vti"))
+    hexahedra, images = (
+        run(tmp_path / kind, scene, *sizes, f"output.grid_format={kind}") for kind in ("vtu", "vti")
+    )
     last = load_scene(scene, sizes).time.frame_count
     assert len(list(images.glob("frames/grid_*.vti"))) == last + 1
     assert not list(images.glob("frames/grid_*.vtu"))
     for index in (0, last):
-        expected, found = (Recording(folder, Color.PRESSURE).read(index) for folder in (hexahedra, images))
+        expected, found = (
+            Recording(folder, Color.PRESSURE).read(index) for folder in (hexahedra, images)
+        )
         np.testing.assert_array_equal(found[0], expected[0])
         np.testing.assert_array_equal(found[1], expected[1])
     assert np.abs(expected[1]).max() > 100.0  # [Pa]
     pyvista = pytest.importorskip("pyvista", reason="VTK reads the files back")
     image = pyvista.read(images / "frames" / f"grid_{last:06d}.vti")
     grid = pyvista.read(hexahedra / "frames" / f"grid_{last:06d}.vtu")
-    counts = [count if axis < 2 or scene == "dam-break" else 0 for axis, count in enumerate(load_scene(scene, sizes).cell_counts)]
+    counts = [
+        count if axis < 2 or scene == "dam-break" else 0
+        for axis, count in enumerate(load_scene(scene, sizes).cell_counts)
+    ]
     assert list(image.extent[1::2]) == counts
     numbers = [image.find_containing_cell(center) for center in grid.cell_centers().points]
     for name in grid.cell_data:

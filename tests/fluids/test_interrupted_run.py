@@ -30,14 +30,24 @@ class Silent:
         assert index <= last
 
 
-MOVING = ["domain.resolution=60", "time.duration=0.4", "output.checkpoint_every=5", "pressure.smoothing=1", "particles.transfer=flip"]
+MOVING = [
+    "domain.resolution=60",
+    "time.duration=0.4",
+    "output.checkpoint_every=5",
+    "pressure.smoothing=1",
+    "particles.transfer=flip",
+]
 TANK = ["domain.resolution=24", "time.duration=0.12", "output.checkpoint_every=5"]
 OVERRIDES = ["domain.resolution=32", "time.duration=0.3", "output.checkpoint_every=5"]
 
 
 def written(folder: Path) -> dict[str, bytes]:
     """Return frames, collections and the last checkpoint by name."""
-    files = [*folder.glob("frames/*"), *folder.glob("*.pvd"), sorted(folder.glob("checkpoints/*.npz"))[-1]]
+    files = [
+        *folder.glob("frames/*"),
+        *folder.glob("*.pvd"),
+        sorted(folder.glob("checkpoints/*.npz"))[-1],
+    ]
     return {str(file.relative_to(folder)): file.read_bytes() for file in files}
 
 
@@ -77,12 +87,19 @@ BALL = {"shape": "sphere", "center": [0.7, 0.3, 0.5], "radius": 0.15}
     [
         (2, {}),
         (2, {"solid": [BALL | {"motion": {"kind": "translation", "velocity": [-0.8, 0.2, 0.0]}}]}),
-        (2, {"pressure": {"smoothing": 8}, "cfl": 0.5}),  # a level set that reaches farther than a step
+        # a level set that reaches farther than a step
+        (2, {"pressure": {"smoothing": 8}, "cfl": 0.5}),
         (2, {"particles": {"transfer": "flip"}, "pressure": {"surface": "voxel"}}),
         (3, {"pressure": {"smoothing": 1}}),
         (3, {"pressure": {"model": "unilateral"}, "solid": [BALL]}),
         (2, {"density_correction": {}, "particles": {"reseed": {"min": 4, "max": 4}}}),
-        (2, {"density_correction": {"every": 2}, "solid": [BALL | {"motion": {"kind": "translation", "velocity": [-0.8, 0.2, 0.0]}}]}),
+        (
+            2,
+            {
+                "density_correction": {"every": 2},
+                "solid": [BALL | {"motion": {"kind": "translation", "velocity": [-0.8, 0.2, 0.0]}}],
+            },
+        ),
         (3, {"density_correction": {}, "solids": "voxel"}),
         (3, {"solids": "voxel", "cfl": 4.0}),
     ],
@@ -98,7 +115,14 @@ def test_nothing_but_the_state_is_remembered(dimension: int, tables: dict[str, A
     solids = [cut_down(solid) for solid in tables.get("solid", [BALL])]
     drop = box([0.1] * dimension, [0.4] * dimension, velocity=[3.0, 2.0, 1.0][:dimension])
     resolution = 24 if dimension == 2 else 16
-    old = create(scene(size=[1.0] * dimension, resolution=resolution, liquid=[drop], **(tables | {"solid": solids})))
+    old = create(
+        scene(
+            size=[1.0] * dimension,
+            resolution=resolution,
+            liquid=[drop],
+            **(tables | {"solid": solids}),
+        )
+    )
     for number in range(12):
         if number == 8:  # the window jumps and shrinks
             position = old.particles.position.numpy().copy()

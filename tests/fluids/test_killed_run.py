@@ -62,7 +62,9 @@ class Fork:
 
     def __init__(self, scene: Path, out: Path, *more: str) -> None:
         self.printed = out.with_suffix(".txt")
-        self.process = multiprocessing.get_context("fork").Process(target=self.main, args=[arguments(scene, out, *more)])
+        self.process = multiprocessing.get_context("fork").Process(
+            target=self.main, args=[arguments(scene, out, *more)]
+        )
         self.process.start()
         self.pid = self.process.pid
 
@@ -118,7 +120,10 @@ def results(out: Path) -> dict[str, bytes]:
 
 
 def newest_step(out: Path) -> int:
-    return max((int(path.stem.removeprefix("step_")) for path in out.glob("checkpoints/step_*.npz")), default=0)
+    return max(
+        (int(path.stem.removeprefix("step_")) for path in out.glob("checkpoints/step_*.npz")),
+        default=0,
+    )
 
 
 class Before:
@@ -126,10 +131,20 @@ class Before:
 
     def __init__(self, out: Path) -> None:
         self.out, self.step = out, newest_step(out)
-        self.rows = (out / "log.csv").read_text().splitlines()[: self.step + 1] if (out / "log.csv").is_file() else []
+        self.rows = (
+            (out / "log.csv").read_text().splitlines()[: self.step + 1]
+            if (out / "log.csv").is_file()
+            else []
+        )
         checkpoint = out / "checkpoints" / f"step_{self.step:06d}.npz"
-        reached = float(np.load(checkpoint)["state/time"]) * 60 + 1e-6 if checkpoint.is_file() else -1.0
-        self.frames = {path: self.stamp(path) for path in out.glob("frames/*.vtu") if int(path.stem[-6:]) <= reached}
+        reached = (
+            float(np.load(checkpoint)["state/time"]) * 60 + 1e-6 if checkpoint.is_file() else -1.0
+        )
+        self.frames = {
+            path: self.stamp(path)
+            for path in out.glob("frames/*.vtu")
+            if int(path.stem[-6:]) <= reached
+        }
 
     @staticmethod
     def stamp(path: Path) -> tuple[int, int, int]:
@@ -145,12 +160,15 @@ class Before:
         return self.step
 
 
-def kill_and_resume(folder: Path, kills: int, seed: int, begin: Callable[..., Any], duration: float) -> list[int]:
+def kill_and_resume(
+    folder: Path, kills: int, seed: int, begin: Callable[..., Any], duration: float
+) -> list[int]:
     """Run, kill, resume and kill again, until `kills` processes died at random moments; return the steps resumed from."""
     scene = folder / "scene.toml"
     scene.write_text(SCENE.replace("duration = 1.5", f"duration = {duration}"))
     whole = folder / "whole"
-    for option in (["--set", "time.duration=0.1"], ["--force"]):  # the first loads, and compiles what is not compiled yet
+    # the first loads, and compiles what is not compiled yet
+    for option in (["--set", "time.duration=0.1"], ["--force"]):
         code, text = call(scene, whole, *option)
         assert code == 0, text
     expected, seconds = results(whole), 1.2 * record(whole)["seconds"]
@@ -165,7 +183,11 @@ def kill_and_resume(folder: Path, kills: int, seed: int, begin: Callable[..., An
                 time.sleep(rng.uniform(0.0, seconds))
                 process.send_signal(signal.SIGKILL)
             text, _ = process.communicate(timeout=LIMIT)
-            if before and begun and (process.returncode == 0 or record(out)["resumed_from_step"] == before.step):
+            if (
+                before
+                and begun
+                and (process.returncode == 0 or record(out)["resumed_from_step"] == before.step)
+            ):
                 steps.append(before.check())
             if process.returncode == 0:
                 break
@@ -190,7 +212,8 @@ def test_twenty_kills(tmp_path):
     steps = kill_and_resume(tmp_path, 20, 80317, start, 1.5)
     print(f"resumed from steps {steps}")
     assert len(steps) >= 15
-    assert len(set(steps)) >= 5  # killed all along the run: how far each got is the machine's business
+    # killed all along the run: how far each got is the machine's business
+    assert len(set(steps)) >= 5
 
 
 def test_a_second_process_is_refused_and_sigterm_leaves_a_checkpoint(tmp_path):
@@ -201,7 +224,8 @@ def test_a_second_process_is_refused_and_sigterm_leaves_a_checkpoint(tmp_path):
         wait_until_it_holds(process, out)
         for option in ("--resume", "--force"):
             code, text = call(scene, out, option)
-            if option == "--resume" and "no run to resume" in text:  # it held the folder, and had not written yet
+            # it held the folder, and had not written yet
+            if option == "--resume" and "no run to resume" in text:
                 continue
             assert code == 2, text
             assert re.search(rf"another run writes there \(process {process.pid} on ", text)

@@ -22,7 +22,12 @@ def test_defaults() -> None:
     assert issubclass(LiquidScene, Scene)
     assert model.pressure.model == "incompressible"
     particles = model.particles
-    assert (particles.per_axis, particles.transfer, particles.flip_ratio, particles.jitter) == (2, "apic", 0.95, 0.25)
+    assert (particles.per_axis, particles.transfer, particles.flip_ratio, particles.jitter) == (
+        2,
+        "apic",
+        0.95,
+        0.25,
+    )
     assert isinstance(particles.seed, int)
 
 
@@ -62,25 +67,47 @@ def test_the_plan_says_what_moves_particles_apart() -> None:
     assert not {"density", "reseeding"} & dict(small(density_correction={"every": 0}).plan()).keys()
     assert (
         dict(small().plan())["density"]
-        == "at most 1.05 times the density at rest, corrected every step if more than 0.1 % of the material exceeds it"
+        == "at most 1.05 times the density at rest, corrected every step if more than 0.1 % of the "
+        "material exceeds it"
     )
     rare = dict(small(particles={"per_axis": 4}, solver={"preset": "preview"}).plan())["density"]
-    assert rare == "at most 1.025 times the density at rest, corrected every 2 steps if more than 0.05 % of the material exceeds it"
-    plan = dict(small(density_correction={"every": 2}, particles={"per_axis": 3, "reseed": {"every": 1}}).plan())
+    assert (
+        rare
+        == "at most 1.025 times the density at rest, corrected every 2 steps if more than 0.05 % "
+        "of the material exceeds it"
+    )
+    plan = dict(
+        small(
+            density_correction={"every": 2}, particles={"per_axis": 3, "reseed": {"every": 1}}
+        ).plan()
+    )
     assert plan["density"] == "at most 1.033 times the density at rest, corrected every 2 steps"
     assert plan["reseeding"] == "4 to 18 particles a cell, every step"
 
 
-def test_the_estimate_of_memory_counts_what_the_options_add(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_estimate_of_memory_counts_what_the_options_add(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(coverage, "LEAST_CELLS", 1 << 30)  # of all of the domain
     ball = {"shape": "sphere", "center": [0.7, 0.2], "radius": 0.1}
     moving = ball | {"motion": {"kind": "translation", "velocity": [1.0, 0.0]}}
     voxel = {"solids": "voxel", "pressure": {"surface": "voxel"}}
-    options = [voxel, {"solids": "voxel"}, {"solids": "voxel", "pressure": {"smoothing": 1}}, {}, {"solid": [moving]}]
-    options += [{"solid": [moving], "density_correction": {}, "particles": more} for more in ({}, {"reseed": {}})]
+    options = [
+        voxel,
+        {"solids": "voxel"},
+        {"solids": "voxel", "pressure": {"smoothing": 1}},
+        {},
+        {"solid": [moving]},
+    ]
+    options += [
+        {"solid": [moving], "density_correction": {}, "particles": more}
+        for more in ({}, {"reseed": {}})
+    ]
     off = {"density_correction": {"every": 0}}
     size = {"size": [1.0, 0.5], "resolution": 1000, "liquid": [box([0.0, 0.0], [0.1, 0.1])]}
-    sizes = [scene(**size, **({"solid": [ball]} | off | tables)).memory_estimate() for tables in options]
+    sizes = [
+        scene(**size, **({"solid": [ball]} | off | tables)).memory_estimate() for tables in options
+    ]
     assert sizes == sorted(set(sizes))
     assert scene(**size, solid=[moving]).memory_estimate() == sizes[-2]  # it may act by itself
     assert 100 * 2**20 < sizes[0] < 400 * 2**20  # measured: about 160 MB
@@ -88,7 +115,9 @@ def test_the_estimate_of_memory_counts_what_the_options_add(monkeypatch: pytest.
 
 @pytest.mark.parametrize("per_axis", [1, 2, 3])
 def test_the_mass_does_not_depend_on_the_sampling(per_axis: int) -> None:
-    simulation = create(small(particles={"per_axis": per_axis}, physics={"density": 500.0, "gravity": [0.0, -9.81]}))
+    simulation = create(
+        small(particles={"per_axis": per_axis}, physics={"density": 500.0, "gravity": [0.0, -9.81]})
+    )
     row = simulation.step(0.001)
     assert row["particles"] == 8 * 4 * per_axis**2
     assert row["mass"] == pytest.approx(500.0 * 0.5 * 0.25)

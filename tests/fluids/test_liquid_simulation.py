@@ -36,7 +36,8 @@ def test_a_dam_breaks(dimension: int) -> None:
     assert all(tuple(row)[1:] == simulation.columns() for row in rows)
     assert first["mass"] == pytest.approx(1000.0 * 0.375**2 * (0.25 if dimension == 3 else 1.0))
     assert last["mass"] == first["mass"]
-    assert first["volume"] == pytest.approx(first["mass"] / 1000.0, rel=0.015)  # the level set rounds the corners
+    # the level set rounds the corners
+    assert first["volume"] == pytest.approx(first["mass"] / 1000.0, rel=0.015)
     assert last["center_of_mass_y"] < 0.75 * first["center_of_mass_y"]
     energies = [row["kinetic_energy"] + row["potential_energy"] for row in rows]
     assert max(energies) <= energies[0] * 1.01
@@ -54,12 +55,18 @@ def test_a_dam_breaks(dimension: int) -> None:
 def test_the_log_holds_what_the_particles_have() -> None:
     simulation = dam()
     row, before = advance(simulation, 0.1)[-1], simulation._velocity_before[1]
-    x, v = (a.numpy().astype(np.float64) for a in (simulation.particles.position, simulation.particles.velocity))
+    x, v = (
+        a.numpy().astype(np.float64)
+        for a in (simulation.particles.position, simulation.particles.velocity)
+    )
     mass = row["mass"] / len(x)
     assert row["particles"] == len(x) == 6 * 6 * 4
     dt, fall = row["dt"], -v[:, 1].mean()
-    work = 0.5 * dt * GRAVITY * (fall + 0.25 * dt * (fall + before) / simulation.kick_dt)  # of gravity in half a step
-    assert row["kinetic_energy"] == pytest.approx(mass * (0.5 * (v**2).sum() + len(v) * work), rel=1e-5)
+    # of gravity in half a step
+    work = 0.5 * dt * GRAVITY * (fall + 0.25 * dt * (fall + before) / simulation.kick_dt)
+    assert row["kinetic_energy"] == pytest.approx(
+        mass * (0.5 * (v**2).sum() + len(v) * work), rel=1e-5
+    )
     assert row["potential_energy"] == pytest.approx(mass * GRAVITY * x[:, 1].sum(), rel=1e-5)
     assert row["center_of_mass_y"] == pytest.approx(x[:, 1].mean(), rel=1e-6)
     assert row["max_speed"] == pytest.approx(np.linalg.norm(v, axis=1).max(), rel=1e-6)
@@ -73,7 +80,14 @@ def test_the_time_step_obeys_the_cfl_number() -> None:
     dx = 1.0 / 16
     still = dam(cfl=2.0)
     assert still.stable_dt() == pytest.approx(np.sqrt(2.0 * dx / GRAVITY))
-    moving = create(scene(size=[1.0, 0.5], resolution=16, cfl=1.0, liquid=[box([0.0, 0.0], [0.5, 0.25], velocity=[3.0, 4.0])]))
+    moving = create(
+        scene(
+            size=[1.0, 0.5],
+            resolution=16,
+            cfl=1.0,
+            liquid=[box([0.0, 0.0], [0.5, 0.25], velocity=[3.0, 4.0])],
+        )
+    )
     assert moving.stable_dt() == pytest.approx(dx / (5.0 + np.sqrt(GRAVITY * dx)))
     weightless = dam(physics={"gravity": [0.0, 0.0]})
     assert weightless.stable_dt() == np.inf
@@ -89,7 +103,9 @@ def test_frames_show_particles_and_cells(dimension: int) -> None:
         assert isinstance(cells, Cells)
         n = simulation.particles.count
         assert points.points.shape == points.fields["velocity"].shape == (n, 3)
-        assert points.fields["speed"] == pytest.approx(np.linalg.norm(points.fields["velocity"], axis=1))
+        assert points.fields["speed"] == pytest.approx(
+            np.linalg.norm(points.fields["velocity"], axis=1)
+        )
         assert cells.dimension == dimension
         assert cells.spacing == 1.0 / 16
         assert cells.index.min() >= 0
@@ -150,7 +166,10 @@ def test_states_of_other_scenes_are_refused() -> None:
     with pytest.raises(ValueError, match="affine_0"):
         simulation.restore({name: value for name, value in state.items() if name != "affine_0"})
     with pytest.raises(ValueError, match="grid"):
-        simulation.restore(dam(particles={"transfer": "flip"}).state() | {"affine_0": state["affine_0"], "affine_1": state["affine_1"]})
+        simulation.restore(
+            dam(particles={"transfer": "flip"}).state()
+            | {"affine_0": state["affine_0"], "affine_1": state["affine_1"]}
+        )
     assert same(simulation.state(), state)
 
 
@@ -191,7 +210,12 @@ def test_the_gpu_gives_the_same_liquid(dimension: int) -> None:
 
 
 def test_values_that_are_not_finite_end_the_run_with_step_field_and_cell() -> None:
-    for name, value in (("velocity", np.nan), ("velocity", np.inf), ("velocity", 1e30), ("position", np.nan)):
+    for name, value in (
+        ("velocity", np.nan),
+        ("velocity", np.inf),
+        ("velocity", 1e30),
+        ("position", np.nan),
+    ):
         simulation = dam()
         simulation.step(0.01)
         array = getattr(simulation.particles, name)
@@ -199,7 +223,10 @@ def test_values_that_are_not_finite_end_the_run_with_step_field_and_cell() -> No
         x, y, _ = simulation.particles.cells_of(simulation.particles.position.numpy()[7:8])[0]
         host[7, 1] = value
         array.assign(host)
-        with pytest.raises(SimulationFailed, match=rf"step 1: {name} is not finite in cell \(x, y, z\) = \({x}, {y}, 0\)"):
+        with pytest.raises(
+            SimulationFailed,
+            match=rf"step 1: {name} is not finite in cell \(x, y, z\) = \({x}, {y}, 0\)",
+        ):
             simulation.step(0.01)
 
 
@@ -230,15 +257,27 @@ def test_a_step_needs_a_positive_time(dt: float) -> None:
 
 def test_liquids_without_particles_are_refused() -> None:
     with pytest.raises(ValueError, match=r"liquid\[1\] \(box\) holds no particle"):
-        create(scene(size=[1.0, 0.5], resolution=16, liquid=[box([0.0, 0.0], [0.5, 0.25]), box([0.1, 0.1], [0.2, 0.2])]))
+        create(
+            scene(
+                size=[1.0, 0.5],
+                resolution=16,
+                liquid=[box([0.0, 0.0], [0.5, 0.25]), box([0.1, 0.1], [0.2, 0.2])],
+            )
+        )
     with pytest.raises(ValueError, match=r"liquid\[0\]"):
         solid = [box([0.4, 0.1], [0.8, 0.4])]
-        create(scene(size=[1.0, 0.5], resolution=16, liquid=[box([0.5, 0.2], [0.6, 0.3])], solid=solid))
+        create(
+            scene(size=[1.0, 0.5], resolution=16, liquid=[box([0.5, 0.2], [0.6, 0.3])], solid=solid)
+        )
 
 
 def test_liquids_start_with_their_own_velocity_and_outside_solids() -> None:
     liquid = [box([0.0, 0.0], [0.25, 0.25], velocity=[1.0, 2.0]), box([0.125, 0.0], [0.5, 0.25])]
-    simulation = create(scene(size=[1.0, 0.5], resolution=16, liquid=liquid, solid=[box([0.375, 0.0], [0.4375, 0.5])]))
+    simulation = create(
+        scene(
+            size=[1.0, 0.5], resolution=16, liquid=liquid, solid=[box([0.375, 0.0], [0.4375, 0.5])]
+        )
+    )
     x, v = simulation.particles.position.numpy(), simulation.particles.velocity.numpy()
     assert (v[x[:, 0] < 0.25] == [1.0, 2.0, 0.0]).all()
     assert (v[x[:, 0] > 0.25] == 0.0).all()
@@ -279,7 +318,9 @@ def test_gathering_transfers_give_the_same_liquid(dimension: int) -> None:
     """What a GPU does, on the CPU."""
     scattered, gathered = dam(dimension), dam(dimension)
     p = gathered.particles
-    gathered.particles = Particles(p.grid, p.position.numpy(), p.velocity.numpy(), affine=True, indexed=True)
+    gathered.particles = Particles(
+        p.grid, p.position.numpy(), p.velocity.numpy(), affine=True, indexed=True
+    )
     rows = [advance(simulation, 0.2, 0.01)[-1] for simulation in (scattered, gathered)]
     for name in ("kinetic_energy", "potential_energy", "center_of_mass_y", "volume"):
         assert rows[1][name] == pytest.approx(rows[0][name], rel=1e-3)
@@ -309,17 +350,39 @@ def test_a_step_marks_its_stages() -> None:
     watched.watch = Names()
     assert watched.step(0.01) == plain.step(0.01)
     assert watched.watch.found == [
-        "diagnostics", "sort", "particles-to-grid", "surface", "pressure set-up", "pressure solve", "projection", "diagnostics",
-        "extrapolation", "bodies in flight", "grid-to-particles", "density monitor", "advection", "bodies in flight",
         "diagnostics",
-    ]  # fmt: skip
+        "sort",
+        "particles-to-grid",
+        "surface",
+        "pressure set-up",
+        "pressure solve",
+        "projection",
+        "diagnostics",
+        "extrapolation",
+        "bodies in flight",
+        "grid-to-particles",
+        "density monitor",
+        "advection",
+        "bodies in flight",
+        "diagnostics",
+    ]
 
 
 def test_a_piston_drives_the_liquid_of_a_scene() -> None:
     """A solid with a velocity of its own, in the simulator: its cells stay, its face pushes."""
     solid = [box([0.0, 0.0], [0.0625, 0.5])]
-    tables = {"physics": {"gravity": [0.0, 0.0]}, "solids": "voxel", "pressure": {"surface": "voxel"}}
-    model = scene(size=[1.0, 0.5], resolution=16, liquid=[box([0.0625, 0.0], [1.0, 0.25])], solid=solid, **tables)
+    tables = {
+        "physics": {"gravity": [0.0, 0.0]},
+        "solids": "voxel",
+        "pressure": {"surface": "voxel"},
+    }
+    model = scene(
+        size=[1.0, 0.5],
+        resolution=16,
+        liquid=[box([0.0625, 0.0], [1.0, 0.25])],
+        solid=solid,
+        **tables,
+    )
     simulation = create(model, np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]]))
     row = simulation.step(0.01)
     v = simulation.velocity[1].numpy()[1]
@@ -332,6 +395,10 @@ def test_a_piston_drives_the_liquid_of_a_scene() -> None:
 def test_scenes_of_something_else_are_refused() -> None:
     from warp_lcp.scene.scene import Scene
 
-    data = {"scene": {"simulator": "fluids"}, "time": {"duration": 1.0}, "domain": {"size": [1.0, 1.0], "resolution": 4}}
+    data = {
+        "scene": {"simulator": "fluids"},
+        "time": {"duration": 1.0},
+        "domain": {"size": [1.0, 1.0], "resolution": 4},
+    }
     with pytest.raises(ValueError, match="liquid"):
         SIMULATOR.create(Scene.model_validate(data), device="cpu", folder=Path())

@@ -16,7 +16,17 @@ TABLES: dict[str, dict[str, Any]] = {
     "apic": {},
     "flip": {"particles": {"transfer": "flip"}},
     "diagnostics": {"output": {"diagnostics": True}},
-    "source": {"source": [{"shape": "box", "min": [1.5, 0.2], "max": [1.6, 0.3], "velocity": [1.0, 0.5], "stop": 0.05}]},
+    "source": {
+        "source": [
+            {
+                "shape": "box",
+                "min": [1.5, 0.2],
+                "max": [1.6, 0.3],
+                "velocity": [1.0, 0.5],
+                "stop": 0.05,
+            }
+        ]
+    },
     "voxel": {"pressure": {"surface": "voxel"}},
 }
 
@@ -31,7 +41,10 @@ def states(tables: dict[str, Any]) -> list[dict[str, bytes]]:
     simulation, found = thrown(tables), []
     for _ in range(25):
         row = simulation.step(0.01)
-        state = {name: np.ascontiguousarray(array).tobytes() for name, array in simulation.state().items()}
+        state = {
+            name: np.ascontiguousarray(array).tobytes()
+            for name, array in simulation.state().items()
+        }
         found.append(state | {"row": repr(sorted(row.items())).encode()})
     return found
 
@@ -49,10 +62,14 @@ def test_pressure_and_flight_cost_what_the_liquid_does(monkeypatch):
     visited = [Counter[str]()]
     run, take = Window.run, WindowTally.take
     # launches at once, of which each says what it visits
-    monkeypatch.setattr(LaunchGraph, "run", lambda graph, *arguments, variant=None: graph._record(*arguments))
+    monkeypatch.setattr(
+        LaunchGraph, "run", lambda graph, *arguments, variant=None: graph._record(*arguments)
+    )
 
     def count(passed: Any, window: Window) -> None:
-        visited[-1][passed.name.rpartition(".")[2]] += int(np.prod(np.subtract(window.high, window.low)))
+        visited[-1][passed.name.rpartition(".")[2]] += int(
+            np.prod(np.subtract(window.high, window.low))
+        )
 
     def counted(window: Window, passed: Any, *structs: Any, **given: Any) -> None:
         count(passed, window)
@@ -79,9 +96,14 @@ def test_pressure_and_flight_cost_what_the_liquid_does(monkeypatch):
 def test_a_trail_leads_through_the_last_window():
     grid = StaggeredGrid((20, 10, 1), 1.0, 2)
     trail = DirtyRegion(grid.domain)
-    boxes = [grid.window((2, 2, 1), (4, 4, 1)), grid.window((5, 3, 1), (7, 8, 1)), grid.window((5, 3, 1), (6, 5, 1))]
+    boxes = [
+        grid.window((2, 2, 1), (4, 4, 1)),
+        grid.window((5, 3, 1), (7, 8, 1)),
+        grid.window((5, 3, 1), (6, 5, 1)),
+    ]
     through = [trail.through(window) for window in boxes]
-    assert (through[0].low, through[0].high) == (grid.domain.low, grid.domain.high)  # nobody knows what was there
+    # nobody knows what was there
+    assert (through[0].low, through[0].high) == (grid.domain.low, grid.domain.high)
     assert (through[1].low, through[1].high) == ((1, 2, 2), (2, 9, 8))
     assert (through[2].low, through[2].high) == ((1, 3, 5), (2, 9, 8))
     trail.forget()

@@ -19,12 +19,16 @@ WIDTH = 4.0
 BAND = {"narrow_band": {"width": WIDTH}}
 
 
-def tank(dimension: int = 2, resolution: int = 32, height: float = 0.75, **tables: Any) -> LiquidSimulation:
+def tank(
+    dimension: int = 2, resolution: int = 32, height: float = 0.75, **tables: Any
+) -> LiquidSimulation:
     """Return a tank of liquid at rest, a cube or square whose upper part is air."""
     size = [1.0, 1.0, 0.5][:dimension]
     liquid = tables.pop("liquid", [box([0.0] * dimension, [1.0, height, 0.5][:dimension])])
     particles = tables.pop("particles", BAND)
-    return create(scene(size=size, resolution=resolution, liquid=liquid, particles=particles, **tables))
+    return create(
+        scene(size=size, resolution=resolution, liquid=liquid, particles=particles, **tables)
+    )
 
 
 def without(simulation: LiquidSimulation) -> NarrowBand:
@@ -37,7 +41,9 @@ def counts(simulation: LiquidSimulation) -> np.ndarray:
     """Return the particles of each cell, shape (nz, ny, nx)."""
     cells = simulation.particles.cells_of(simulation.particles.position.numpy())
     nx, ny, nz = simulation.grid.counts
-    return np.bincount((cells[:, 2] * ny + cells[:, 1]) * nx + cells[:, 0], minlength=nx * ny * nz).reshape(nz, ny, nx)
+    return np.bincount(
+        (cells[:, 2] * ny + cells[:, 1]) * nx + cells[:, 0], minlength=nx * ny * nz
+    ).reshape(nz, ny, nx)
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -58,7 +64,9 @@ def test_particles_are_near_the_surface_only(dimension):
 def test_particles_below_the_band_are_around_solids_inside_only(dimension):
     """And not along the domain's walls, whichever side they are on."""
     center, radius = np.array([0.5, 0.3, 0.25])[:dimension], 0.08
-    simulation = tank(dimension, solid=[{"shape": "sphere", "center": center.tolist(), "radius": radius}])
+    simulation = tank(
+        dimension, solid=[{"shape": "sphere", "center": center.tolist(), "radius": radius}]
+    )
     assert simulation.boundary.distance is not None
     held = (np.argwhere(counts(simulation)[:, :19] > 0)[:, ::-1][:, :dimension] + 0.5) / 32
     gap = 32 * (np.linalg.norm(held - center, axis=1) - radius)
@@ -76,7 +84,9 @@ def test_the_depth_is_a_distance():
     """Below a plane exactly; below a corner of air within 8 %; through solids as through liquid."""
     grid = StaggeredGrid((24, 24, 1), 1.0, 2, "cpu")
     simulation = tank(2, 24, 1.0, solid=[box([0.25, 0.25], [0.5, 0.5])], solids="voxel")
-    band = NarrowBand(grid, simulation.boundary, width=12.0, per_axis=2, jitter=0.25, random_seed=77)
+    band = NarrowBand(
+        grid, simulation.boundary, width=12.0, per_axis=2, jitter=0.25, random_seed=77
+    )
     kind = simulation.boundary.base.numpy()
     kind[1, 1:21, 1:25] = np.where(kind[1, 1:21, 1:25] == SOLID, SOLID, FLUID)
     band._measure(grid.everywhere, wp.array(kind, device="cpu"), None, grid.field(wp.uint8))
@@ -109,7 +119,11 @@ def test_a_block_in_free_flight_keeps_its_shape(dimension):
     """Uniform translation across cells: depth and velocity go along, the volume stays, no hole opens inside."""
     low, high = [0.08, 0.3, 0.05][:dimension], [0.58, 0.8, 0.45][:dimension]
     speed = [0.7, 0.9, 0.1][:dimension]
-    start = {"liquid": [box(low, high, velocity=speed)], "resolution": 48, "physics": {"gravity": [0.0] * dimension}}
+    start = {
+        "liquid": [box(low, high, velocity=speed)],
+        "resolution": 48,
+        "physics": {"gravity": [0.0] * dimension},
+    }
     simulation = tank(dimension, **start)
     band = without(simulation)
     cells, volume = band.interior.count, simulation.surface.volume(0)
@@ -122,9 +136,13 @@ def test_a_block_in_free_flight_keeps_its_shape(dimension):
     middle = 0.5 * np.array([*np.add(low, high), 0.0][:3]) + moved
     assert np.allclose(band.interior.center, middle, atol=0.5 / 48)  # of whole cells
     assert row["max_speed"] == pytest.approx(np.linalg.norm(speed), rel=2e-3)
-    assert row["kinetic_energy"] == pytest.approx(0.5 * row["mass"] * np.linalg.norm(speed) ** 2, rel=2e-3)
+    assert row["kinetic_energy"] == pytest.approx(
+        0.5 * row["mass"] * np.linalg.norm(speed) ** 2, rel=2e-3
+    )
     simulation.mark()
-    centers = (np.argwhere(simulation.projection.kind.numpy()[1:-1, 1:-1, 1:-1] == FLUID)[:, ::-1] + 0.5) / 48
+    centers = (
+        np.argwhere(simulation.projection.kind.numpy()[1:-1, 1:-1, 1:-1] == FLUID)[:, ::-1] + 0.5
+    ) / 48
     depth = np.linalg.norm((centers - middle)[:, :dimension], axis=1)
     filled = np.count_nonzero(depth < 0.15)
     ball = 48**dimension * 0.15**dimension * (math.pi if dimension == 2 else 4.0 / 3.0 * math.pi)
@@ -139,11 +157,18 @@ def test_a_ceiling_lets_go(dimension):
     volume = simulation.surface.volume(0)
     assert without(simulation).interior.count > 0
     rows = advance(simulation, 0.2)
-    assert rows[-1]["max_speed"] == pytest.approx(GRAVITY * (0.2 - 0.5 * simulation.last_dt), rel=1e-3)
-    assert rows[-1]["kinetic_energy"] == pytest.approx(0.5 * rows[-1]["mass"] * (GRAVITY * 0.2) ** 2, rel=1e-3)
+    assert rows[-1]["max_speed"] == pytest.approx(
+        GRAVITY * (0.2 - 0.5 * simulation.last_dt), rel=1e-3
+    )
+    assert rows[-1]["kinetic_energy"] == pytest.approx(
+        0.5 * rows[-1]["mass"] * (GRAVITY * 0.2) ** 2, rel=1e-3
+    )
     assert rows[-1]["volume"] == pytest.approx(volume, rel=0.01)
     reference = advance(tank(dimension, 40, liquid=[box(low, high)], particles={}), 0.2)
-    assert rows[-1]["center_of_mass_y"] == pytest.approx(reference[-1]["center_of_mass_y"], abs=0.25 / 40)  # of whole cells
+    # of whole cells
+    assert rows[-1]["center_of_mass_y"] == pytest.approx(
+        reference[-1]["center_of_mass_y"], abs=0.25 / 40
+    )
 
 
 def test_a_body_dives_into_the_interior():
@@ -151,31 +176,46 @@ def test_a_body_dives_into_the_interior():
     plunge = {"kind": "translation", "velocity": [0.0, -1.0]}
     particles = {"transfer": "apic", **BAND}
     disk = {"shape": "sphere", "center": [0.5, 0.92], "radius": 0.06, "motion": plunge}
-    simulation, other = (tank(2, 48, solid=[disk], particles=p, density_correction={}) for p in (particles, {}))
+    simulation, other = (
+        tank(2, 48, solid=[disk], particles=p, density_correction={}) for p in (particles, {})
+    )
     rows, reference = advance(simulation, 0.5), advance(other, 0.5)
     assert without(simulation).interior.count > 0
     assert rows[-1]["mass"] == reference[-1]["mass"]
     assert rows[-1]["volume"] == pytest.approx(reference[-1]["volume"], rel=0.01)
     near = np.hypot(*(simulation.particles.position.numpy()[:, :2] - [0.5, 0.42]).T)
     all_of_them = np.hypot(*(other.particles.position.numpy()[:, :2] - [0.5, 0.42]).T)
-    ring = [np.count_nonzero((distance > 0.06) & (distance < 0.06 + 2.0 / 48)) for distance in (near, all_of_them)]
+    ring = [
+        np.count_nonzero((distance > 0.06) & (distance < 0.06 + 2.0 / 48))
+        for distance in (near, all_of_them)
+    ]
     assert ring[0] == pytest.approx(ring[1], rel=0.15)
 
 
 def sloshing(particles: dict[str, Any], end: float) -> list[dict[str, Any]]:
     """Return the log of a standing wave, half a wavelength in a tank 1 m wide and 0.5 m deep."""
     n = 64
-    columns = [box([i / n, 0.0], [(i + 1) / n, 0.5 + 0.04 * math.cos(math.pi * (i + 0.5) / n)]) for i in range(n)]
-    simulation = create(scene(size=[1.0, 0.75], resolution=n, liquid=columns, wall="free-slip", particles=particles))
+    columns = [
+        box([i / n, 0.0], [(i + 1) / n, 0.5 + 0.04 * math.cos(math.pi * (i + 0.5) / n)])
+        for i in range(n)
+    ]
+    simulation = create(
+        scene(size=[1.0, 0.75], resolution=n, liquid=columns, wall="free-slip", particles=particles)
+    )
     return advance(simulation, end)
 
 
 def wave(rows: list[dict[str, Any]]) -> tuple[float, float]:
     """Return a standing wave's period [s] and decay [1/s], from the peaks of its kinetic energy."""
-    time, energy = np.cumsum([row["dt"] for row in rows]), np.array([row["kinetic_energy"] for row in rows])
+    time, energy = (
+        np.cumsum([row["dt"] for row in rows]),
+        np.array([row["kinetic_energy"] for row in rows]),
+    )
     peaks: list[tuple[float, float]] = []
     for i in range(1, len(time) - 1):
-        if energy[i] >= max(energy[i - 1], energy[i + 1], 0.5 * energy.max()) and (not peaks or time[i] - peaks[-1][0] > 0.3):
+        if energy[i] >= max(energy[i - 1], energy[i + 1], 0.5 * energy.max()) and (
+            not peaks or time[i] - peaks[-1][0] > 0.3
+        ):
             a, b, c = np.polyfit(time[i - 1 : i + 2] - time[i], energy[i - 1 : i + 2], 2)
             peaks.append((time[i] - 0.5 * b / a, c - 0.25 * b * b / a))
     times, heights = np.array(peaks).T
@@ -186,15 +226,26 @@ def test_a_wave_is_as_fast_and_damped_as_without():
     """The period is that of linear theory within 1 %, and that of particles everywhere within 0.2 %; no damping comes in."""
     period, decay = wave(sloshing(BAND, 3.5))
     reference, other = wave(sloshing({}, 3.5))
-    assert period == pytest.approx(2.0 * math.pi / math.sqrt(GRAVITY * math.pi * math.tanh(0.5 * math.pi)), rel=0.01)
+    assert period == pytest.approx(
+        2.0 * math.pi / math.sqrt(GRAVITY * math.pi * math.tanh(0.5 * math.pi)), rel=0.01
+    )
     assert period == pytest.approx(reference, rel=2e-3)
     assert -0.002 < decay < other + 0.005
 
 
-def dams(particles: dict[str, Any], end: float, resolution: int = 64, **tables: Any) -> tuple[LiquidSimulation, list[dict[str, Any]]]:
+def dams(
+    particles: dict[str, Any], end: float, resolution: int = 64, **tables: Any
+) -> tuple[LiquidSimulation, list[dict[str, Any]]]:
     """Return two dams that break against each other, and the log."""
     liquid = [box([0.0, 0.0], [0.3, 0.7]), box([0.7, 0.0], [1.0, 0.7])]
-    model = scene(size=[1.0, 1.0], resolution=resolution, liquid=liquid, particles=particles, density_correction={}, **tables)
+    model = scene(
+        size=[1.0, 1.0],
+        resolution=resolution,
+        liquid=liquid,
+        particles=particles,
+        density_correction={},
+        **tables,
+    )
     simulation = create(model)
     return simulation, advance(simulation, end)
 
@@ -243,7 +294,10 @@ MODELS: list[dict[str, Any]] = [
             }
         ]
     },
-    {"source": [box([0.4, 0.1], [0.45, 0.2], velocity=[1.0, 0.0])], "drain": [box([0.6, 0.0], [0.7, 0.05])]},
+    {
+        "source": [box([0.4, 0.1], [0.45, 0.2], velocity=[1.0, 0.0])],
+        "drain": [box([0.6, 0.0], [0.7, 0.05])],
+    },
 ]
 
 
@@ -282,7 +336,10 @@ def test_a_state_belongs_to_its_band():
 def test_another_resolution(resolution, particles):
     """The interior gets its particles back first, so that nothing is lost on the way, whatever the new grid wants of them."""
     start, _ = dams(BAND, 0.4)
-    mass, energy = start.checked_totals("at").count * start.particle_mass, start.checked_totals("at")
+    mass, energy = (
+        start.checked_totals("at").count * start.particle_mass,
+        start.checked_totals("at"),
+    )
     twin, _ = dams(particles, 0.0, resolution)
     twin.resample(start.state())
     totals = twin.checked_totals("at")

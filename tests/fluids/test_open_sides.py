@@ -23,8 +23,11 @@ def opened(model: LiquidScene, sides: list[str]) -> LiquidScene:
 @pytest.mark.parametrize("cut", [False, True])
 @pytest.mark.parametrize("surface", ["ghost-fluid", "voxel"])
 @pytest.mark.parametrize("side", SIDES)
-def test_the_pressure_is_that_of_the_depth_below_an_open_side(side: str, surface: str, cut: bool) -> None:
-    # gravity points away from the open side of a full box: a side taken for another, a face not open or p = 0 at the wrong place show
+def test_the_pressure_is_that_of_the_depth_below_an_open_side(
+    side: str, surface: str, cut: bool
+) -> None:
+    # gravity points away from the open side of a full box: a side taken for another, a face not
+    # open or p = 0 at the wrong place show
     dimension = 3 if side in ("front", "back") else 2
     axis, high = SIDES.index(side) >> 1, SIDES.index(side) & 1
     size = [1.0, 1.0, 1.0][:dimension]
@@ -33,12 +36,17 @@ def test_the_pressure_is_that_of_the_depth_below_an_open_side(side: str, surface
     ball = {**BALL, "center": [0.5, 0.5, 0.5][:dimension], "radius": 0.15}
     model = opened(
         scene(
-            size=size, resolution=10, liquid=[box([0.0] * dimension, size)], physics={"gravity": gravity.tolist()},
-            particles={"jitter": 0.0}, pressure={"surface": surface}, solver={"tolerance": 1e-8, "precision": "double"},
+            size=size,
+            resolution=10,
+            liquid=[box([0.0] * dimension, size)],
+            physics={"gravity": gravity.tolist()},
+            particles={"jitter": 0.0},
+            pressure={"surface": surface},
+            solver={"tolerance": 1e-8, "precision": "double"},
             **({"solid": [ball]} if cut else {}),
         ),
         [side],
-    )  # fmt: skip
+    )
     simulation = create(model)
     assert bool(simulation.boundary.open) == cut
     row = simulation.step(1e-3)
@@ -47,7 +55,8 @@ def test_the_pressure_is_that_of_the_depth_below_an_open_side(side: str, surface
     depth = (np.arange(10) + 0.5) * 0.1
     if high:
         depth = depth[::-1]
-    depth = depth + (0.05 if surface == "voxel" else 0.0)  # p = 0 at the centers of the cells beyond, or on the side itself
+    # p = 0 at the centers of the cells beyond, or on the side itself
+    depth = depth + (0.05 if surface == "voxel" else 0.0)
     shape = [1, 1, 1]
     shape[2 - axis] = 10
     expected = np.broadcast_to(1000.0 * GRAVITY * depth.reshape(shape), p.shape)
@@ -68,44 +77,66 @@ def test_a_block_leaves_as_if_there_were_no_side(side: str, solids: str, cut: bo
     low, high = [0.375, 0.375], [0.625, 0.625]
     low[axis], high[axis] = (0.625, 0.875) if sign > 0 else (0.125, 0.375)
     model = scene(
-        size=[1.0, 1.0], resolution=32, liquid=[box(low, high, velocity=velocity)], solids=solids, physics={"gravity": [0.0, 0.0]}, **solid
+        size=[1.0, 1.0],
+        resolution=32,
+        liquid=[box(low, high, velocity=velocity)],
+        solids=solids,
+        physics={"gravity": [0.0, 0.0]},
+        **solid,
     )
     simulation = create(opened(model, [side]))
     count = simulation.particles.count
     rows = advance(simulation, 0.25, 0.01)
-    assert simulation.particles.count == pytest.approx(0.5 * count, rel=0.1)  # the front has 0.125 to go, the rest is 0.25 long
+    # the front has 0.125 to go, the rest is 0.25 long
+    assert simulation.particles.count == pytest.approx(0.5 * count, rel=0.1)
     np.testing.assert_allclose(simulation.particles.velocity.numpy()[:, axis], sign, atol=1e-5)
     rows += advance(simulation, 0.45, 0.01)
     assert simulation.particles.count == 0
     assert sum(row["departed"] for row in rows) == count
     assert rows[-1]["stopped"] == 0
     simulation.step(0.01)  # an empty domain is no error
-    assert [frame.points.shape for frame in simulation.frame() if hasattr(frame, "points")] == [(0, 3)]
+    assert [frame.points.shape for frame in simulation.frame() if hasattr(frame, "points")] == [
+        (0, 3)
+    ]
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("cut", [False, True])
 def test_a_pool_drains_over_an_open_side_as_a_dam_breaks(dimension: int, cut: bool) -> None:
-    # Ritter's solution: the discharge through the place of a broken dam is 8/27 sqrt(g) h^(3/2) as long as the wave has not come back
+    # Ritter's solution: the discharge through the place of a broken dam is 8/27 sqrt(g) h^(3/2) as
+    # long as the wave has not come back
     size, top = [2.0, 0.5, 0.125][:dimension], [2.0, 0.25, 0.125][:dimension]
-    ball = {"solid": [{**BALL, "center": [0.1, 0.45, 0.06][:dimension], "radius": 0.04}]} if cut else {}
+    ball = (
+        {"solid": [{**BALL, "center": [0.1, 0.45, 0.06][:dimension], "radius": 0.04}]}
+        if cut
+        else {}
+    )
     model = scene(size=size, resolution=64, liquid=[box([0.0] * dimension, top)], **ball)
     simulation = create(opened(model, ["right"]))
     mass = simulation.particles.count
     advance(simulation, 0.6)
     lost = 0.5 * (1.0 - simulation.particles.count / mass)
     expected = 8.0 / 27.0 * GRAVITY**0.5 * 0.25**1.5 * 0.6
-    assert lost == pytest.approx(expected, rel=0.25)  # shallow water has no vertical motion at the start
+    # shallow water has no vertical motion at the start
+    assert lost == pytest.approx(expected, rel=0.25)
 
 
-@pytest.mark.parametrize(("sides", "message"), [(["top", "top"], "named twice"), (["front"], "3-D"), (["up"], "left"), ("top", "list")])
+@pytest.mark.parametrize(
+    ("sides", "message"),
+    [(["top", "top"], "named twice"), (["front"], "3-D"), (["up"], "left"), ("top", "list")],
+)
 def test_what_sides_may_not_be(sides: Any, message: str) -> None:
     with pytest.raises(ValidationError, match=message):
         opened(scene(size=[1.0, 1.0], resolution=8, liquid=[box([0.0, 0.0], [0.5, 0.5])]), sides)
 
 
 def test_what_the_density_correction_pushes_out_has_left() -> None:
-    model = scene(size=[1.0, 0.5], resolution=32, liquid=[box([0.0, 0.0], [0.5, 0.4])], density_correction={"every": 1})
+    model = scene(
+        size=[1.0, 0.5],
+        resolution=32,
+        liquid=[box([0.0, 0.0], [0.5, 0.4])],
+        density_correction={"every": 1},
+    )
     simulation = create(opened(model, ["left"]))
     count = simulation.particles.count
     rows = advance(simulation, 0.5)

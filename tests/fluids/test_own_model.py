@@ -23,15 +23,27 @@ def sponge() -> type:
 def test_a_sponge_slows_liquid_by_its_rate_and_tells_the_energy():
     """A block in flight without gravity, all of it in the sponge: u is divided by 1 + k dt in each step, and so is its momentum."""
     block = box([0.3, 0.2], [0.5, 0.4], velocity=[0.4, 0.1])
-    model = scene(size=[1.0, 0.5], resolution=32, liquid=[block], physics={"gravity": [0.0, 0.0]}, solver={"precision": "double"})
-    liquid, rate = SIMULATOR.create(model, device="cpu", folder=Path(), models=[sponge()(5.0, 0.5)]), 5.0
+    model = scene(
+        size=[1.0, 0.5],
+        resolution=32,
+        liquid=[block],
+        physics={"gravity": [0.0, 0.0]},
+        solver={"precision": "double"},
+    )
+    liquid, rate = (
+        SIMULATOR.create(model, device="cpu", folder=Path(), models=[sponge()(5.0, 0.5)]),
+        5.0,
+    )
     velocity, energy, last = np.array([0.4, 0.1, 0.0]), None, 0.0
     assert "sponge_work" in liquid.columns()
     for dt in (0.01, 0.02, 0.005):
         row = liquid.step(dt)
-        velocity /= 1.0 + rate * 0.5 * (last + dt)  # forces act for half of the last step and half of this one
+        # forces act for half of the last step and half of this one
+        velocity /= 1.0 + rate * 0.5 * (last + dt)
         last = dt
-        np.testing.assert_allclose(liquid.particles.velocity.numpy().mean(axis=0), velocity, rtol=2e-5, atol=1e-7)
+        np.testing.assert_allclose(
+            liquid.particles.velocity.numpy().mean(axis=0), velocity, rtol=2e-5, atol=1e-7
+        )
         if energy is not None:  # of particles that all have one velocity, as their faces have
             assert row["sponge_work"] == pytest.approx(energy - row["kinetic_energy"], rel=1e-3)
         energy = row["kinetic_energy"]

@@ -18,7 +18,12 @@ class Tank:
     """A 2-D tank with liquid in given cells; the column i = 0 can be a piston (solid 1)."""
 
     def __init__(
-        self, liquid: np.ndarray, *, separating: bool | tuple[bool, bool] = True, piston: float | None = None, tolerance: float = 1e-8
+        self,
+        liquid: np.ndarray,
+        *,
+        separating: bool | tuple[bool, bool] = True,
+        piston: float | None = None,
+        tolerance: float = 1e-8,
     ) -> None:
         self.grid = StaggeredGrid((NX, NY, 1), 0.1, 2, "cpu")
         index = np.zeros(self.grid.shape, np.int32)
@@ -29,9 +34,17 @@ class Tank:
             velocity = np.array([[0.0, 0.0, 0.0], [piston, 0.0, 0.0]])
         flags = wp.array(np.broadcast_to(separating, 2).astype(np.uint8), device="cpu")
         names = ("domain", "solid[0] (box)")
-        solids = VoxelSolids(index=wp.array(index, device="cpu"), separating=flags, names=names, covered=(0,), notes=())
+        solids = VoxelSolids(
+            index=wp.array(index, device="cpu"),
+            separating=flags,
+            names=names,
+            covered=(0,),
+            notes=(),
+        )
         self.boundary = WholeCells(self.grid, solids, velocity, open_sides=0)
-        self.projection = PressureProjection(self.grid, self.boundary, wl.MinimumMapNewton(), tolerance=tolerance, max_iterations=50)
+        self.projection = PressureProjection(
+            self.grid, self.boundary, wl.MinimumMapNewton(), tolerance=tolerance, max_iterations=50
+        )
         stored = np.zeros(self.grid.shape, bool)
         stored[1, 1:-1, 1:-1] = liquid
         kind = self.boundary.base.numpy()
@@ -61,7 +74,9 @@ def liquid(rows: slice, columns: slice = slice(None)) -> np.ndarray:
 
 
 @pytest.mark.parametrize("separating", [True, False])
-def test_a_pool_that_falls_onto_the_floor_is_stopped_by_a_positive_pressure(separating: bool) -> None:
+def test_a_pool_that_falls_onto_the_floor_is_stopped_by_a_positive_pressure(
+    separating: bool,
+) -> None:
     """The sign of b: flip it and x is negative with free-slip walls, zero with separating ones."""
     tank = Tank(liquid(slice(0, 4)), separating=separating)
     tank.velocity[1].fill_(-0.5)
@@ -131,7 +146,9 @@ def test_a_cell_under_pressure_is_held_whatever_flows_out_of_it() -> None:
     tank.projection.prepare(tank.velocity, 0.01, 0.01)
     result, criteria = tank.projection.solve(1.0)
     tank.velocity[1].fill_(0.5)
-    assert tank.projection.project(tank.velocity, tank.grid.everywhere, result, criteria).released == 0
+    assert (
+        tank.projection.project(tank.velocity, tank.grid.everywhere, result, criteria).released == 0
+    )
     assert (tank.contact[0] == HELD).all()
 
 
@@ -179,7 +196,9 @@ def test_a_solve_leaves_velocity_and_pressure_alone() -> None:
 def test_noise_of_a_uniform_fall_is_not_iterated_on() -> None:
     tank = Tank(liquid(slice(2, 5), slice(2, 4)))
     rng = np.random.default_rng(12)
-    tank.velocity[1].assign((-3.0 * (1 + 6e-8 * rng.normal(size=tank.grid.shape))).astype(np.float32))
+    tank.velocity[1].assign(
+        (-3.0 * (1 + 6e-8 * rng.normal(size=tank.grid.shape))).astype(np.float32)
+    )
     tank.projection.prepare(tank.velocity, 0.01, 0.01)
     result, _ = tank.projection.solve(3.0)
     assert result.status is wl.SolveStatus.CONVERGED

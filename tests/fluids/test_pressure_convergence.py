@@ -1,8 +1,9 @@
 """The sub-cell pressure problem is accurate to second order, on smooth solutions in discs and balls that cut the cells anywhere.
 
--lap p = f with p = 0 on a free surface that lies a share theta of the way from a FLUID cell to an AIR cell, and with the flux through
-walls given: sum over faces of a_f (p_i - p_neighbor) / theta_f = the source within the open part of the cell plus what enters through
-its wall. Unit weights or the open fractions a_f are the operator's faces, what theta adds to the diagonal is its shift.
+-lap p = f with p = 0 on a free surface that lies a share theta of the way from a FLUID cell to an
+AIR cell, and with the flux through walls given: sum over faces of a_f (p_i - p_neighbor) / theta_f
+= the source within the open part of the cell plus what enters through its wall. Unit weights or the
+open fractions a_f are the operator's faces, what theta adds to the diagonal is its shift.
 """
 
 from collections.abc import Callable
@@ -18,7 +19,8 @@ import warp_lcp as wl
 
 THETA_MIN, FRACTION_MIN = 1e-3, 1e-3  # as the liquid has them
 SECOND_ORDER = 1.8
-CENTER = np.array([0.513, 0.489, 0.507])  # of walls and surfaces, in a box [0, 1]: no cells are alike
+# of walls and surfaces, in a box [0, 1]: no cells are alike
+CENTER = np.array([0.513, 0.489, 0.507])
 
 
 @dataclass
@@ -33,7 +35,11 @@ class Field:
 
     def parts(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         d = x - self.center[: x.shape[-1]]
-        return d, self.sign * ((d**2).sum(axis=-1) - self.radius**2), np.exp(x @ self.slope[: x.shape[-1]])
+        return (
+            d,
+            self.sign * ((d**2).sum(axis=-1) - self.radius**2),
+            np.exp(x @ self.slope[: x.shape[-1]]),
+        )
 
     def value(self, x: np.ndarray) -> np.ndarray:
         _, q, e = self.parts(x)
@@ -68,7 +74,11 @@ def sides(dimension: int, axis: int) -> tuple[tuple[slice, ...], tuple[slice, ..
 
 
 def solve(
-    cells: np.ndarray, phi: np.ndarray, fractions: list[np.ndarray] | None, rhs: np.ndarray, theta_min: float
+    cells: np.ndarray,
+    phi: np.ndarray,
+    fractions: list[np.ndarray] | None,
+    rhs: np.ndarray,
+    theta_min: float,
 ) -> tuple[wl.GridPoisson, np.ndarray]:
     """Return the operator and the solution of sum a_f (p_i - p_neighbor) / theta = rhs."""
     dimension = cells.ndim
@@ -114,7 +124,9 @@ def dirichlet_error(n: int, dimension: int, theta_min: float = THETA_MIN) -> flo
 
 
 @pytest.mark.parametrize(("dimension", "sizes"), [(2, (16, 32, 64, 128)), (3, (16, 24, 32, 48))])
-def test_a_disc_or_a_ball_of_liquid_in_air_converges_with_second_order(dimension: int, sizes: tuple[int, ...]) -> None:
+def test_a_disc_or_a_ball_of_liquid_in_air_converges_with_second_order(
+    dimension: int, sizes: tuple[int, ...]
+) -> None:
     """In the largest error; with whole cells (theta = 1) the same solution converges with first order only."""
     assert order({n: dirichlet_error(n, dimension) for n in sizes}) >= SECOND_ORDER
     assert order({n: dirichlet_error(n, dimension, theta_min=1.0) for n in sizes}) < 1.4
@@ -133,11 +145,16 @@ class Disc:
     def exact(self, n: int, axis: int) -> Part:
         """Return where the open part of each lower face begins and ends along the face [0, 1], shape (n, n) each, empty ones equal."""
         cells = np.arange(n) / n
-        across, along = (cells[None, :], cells[:, None]) if axis == 0 else (cells[:, None], cells[None, :])
+        across, along = (
+            (cells[None, :], cells[:, None]) if axis == 0 else (cells[:, None], cells[None, :])
+        )
         along = np.broadcast_to(along, (n, n))
         half = np.sqrt(np.maximum(self.radius**2 - (across - self.center[axis]) ** 2, 0.0))
         middle = self.center[1 - axis]
-        begin, end = np.clip(middle - half, along, along + 1 / n), np.clip(middle + half, along, along + 1 / n)
+        begin, end = (
+            np.clip(middle - half, along, along + 1 / n),
+            np.clip(middle + half, along, along + 1 / n),
+        )
         return begin, np.maximum(begin, end)
 
     def from_nodes(self, n: int, axis: int) -> Part:
@@ -164,14 +181,18 @@ Opening = Callable[[Disc, int, int], Part]
 def outward_flux(field: Field, n: int, wall: Disc, opening: Opening) -> np.ndarray:
     """Return -integral of grad p . s over the open part of each cell's faces, s outward; shape (n, n).
 
-    By the divergence theorem that is the source in the open part of the cell plus what enters through the wall.
+    By the divergence theorem that is the source in the open part of the cell plus what enters
+    through the wall.
     """
     nodes, weights = np.polynomial.legendre.leggauss(6)
     through = []
     for axis in range(2):
         begin, end = opening(wall, n, axis)
         along = begin[..., None] + (end - begin)[..., None] * 0.5 * (nodes + 1)
-        place = np.broadcast_to((np.arange(n) / n)[None, :, None] if axis == 0 else (np.arange(n) / n)[:, None, None], along.shape)
+        place = np.broadcast_to(
+            (np.arange(n) / n)[None, :, None] if axis == 0 else (np.arange(n) / n)[:, None, None],
+            along.shape,
+        )
         x = np.stack([place, along] if axis == 0 else [along, place], axis=-1)
         flux = (field.gradient(x)[..., axis] * weights).sum(axis=-1) * 0.5 * (end - begin)
         through.append(np.pad(flux, ((0, 0), (0, 1)) if axis == 0 else ((0, 1), (0, 0))))
@@ -183,7 +204,9 @@ def test_the_flux_through_open_faces_is_the_source_and_what_enters_through_the_w
     n, m = 8, 300
     wall, field = Disc(CENTER[:2], 0.43), Field(np.array([0.62, 0.4]), 0.2, 1.0)
     x = cell_centers(n * m, 2)
-    f = np.where(np.hypot(*(x - wall.center).transpose(2, 0, 1)) < wall.radius, field.source(x), 0.0)
+    f = np.where(
+        np.hypot(*(x - wall.center).transpose(2, 0, 1)) < wall.radius, field.source(x), 0.0
+    )
     total = f.reshape(n, m, n, m).sum(axis=(1, 3)) / (n * m) ** 2
     angle = (np.arange(200_000) + 0.5) / 200_000 * 2 * np.pi
     normal = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
@@ -199,7 +222,8 @@ def test_the_flux_through_open_faces_is_the_source_and_what_enters_through_the_w
 class Tank:
     """A solved problem in a disc-shaped tank.
 
-    `opening` tells how faces are open, `source` the region whose source and wall flux the right-hand side holds.
+    `opening` tells how faces are open, `source` the region whose source and wall flux the
+    right-hand side holds.
     """
 
     n: int
@@ -215,11 +239,16 @@ class Tank:
         for axis, face in enumerate(self.fractions):
             face[face < FRACTION_MIN] = 0.0
             assert not face.take(0, 1 - axis).any()  # no open face lies on the box's own wall
-        upper = [np.pad(face, ((0, 0), (0, 1)) if axis == 0 else ((0, 1), (0, 0))) for axis, face in enumerate(self.fractions)]
+        upper = [
+            np.pad(face, ((0, 0), (0, 1)) if axis == 0 else ((0, 1), (0, 0)))
+            for axis, face in enumerate(self.fractions)
+        ]
         self.openness = upper[0][:, 1:] + upper[0][:, :-1] + upper[1][1:] + upper[1][:-1]
         x = cell_centers(n, 2)
         self.phi = self.field.distance(x)
-        self.cells = np.where(self.openness == 0, wl.SOLID, np.where(self.phi < 0.0, wl.FLUID, wl.AIR))
+        self.cells = np.where(
+            self.openness == 0, wl.SOLID, np.where(self.phi < 0.0, wl.FLUID, wl.AIR)
+        )
         self.rhs = outward_flux(self.field, n, wall, self.source)
         self.A, self.p = solve(self.cells, self.phi, self.fractions, self.rhs, self.theta_min)
         self.errors = np.where(self.cells == wl.FLUID, np.abs(self.p - self.field.value(x)), 0.0)
@@ -251,9 +280,13 @@ def test_liquid_in_a_round_tank_converges_with_second_order(field: Field, openin
 def test_what_nodes_miss_of_a_round_wall_costs_single_cells_only(field: Field) -> None:
     """The circle's own source with fractions from nodes: an edge that the circle cuts twice is closed, its cell has the wrong source.
 
-    The root mean square error is of second order all the same; the largest one, in cells of which a sliver is open, is not (1.2 to 1.3).
+    The root mean square error is of second order all the same; the largest one, in cells of which a
+    sliver is open, is not (1.2 to 1.3).
     """
-    assert order({n: Tank(n, field, Disc.from_nodes, Disc.exact).mean_error for n in SIZES}) >= SECOND_ORDER
+    assert (
+        order({n: Tank(n, field, Disc.from_nodes, Disc.exact).mean_error for n in SIZES})
+        >= SECOND_ORDER
+    )
 
 
 @pytest.mark.parametrize("field", [RING, POOL], ids=["ring", "pool"])
@@ -288,6 +321,8 @@ def test_the_operator_is_the_matrix_assembled_face_by_face() -> None:
     matrix = scipy.sparse.csr_matrix((values, (rows, columns)))
     x = np.random.default_rng(1729).normal(size=cells.shape) * (cells == wl.FLUID)
     product = A.apply(wp.array(x, dtype=wp.float64, device="cpu")).numpy()
-    assert product[cells == wl.FLUID] == pytest.approx(matrix @ x[cells == wl.FLUID], rel=1e-12, abs=1e-12)
+    assert product[cells == wl.FLUID] == pytest.approx(
+        matrix @ x[cells == wl.FLUID], rel=1e-12, abs=1e-12
+    )
     direct = scipy.sparse.linalg.spsolve(matrix.tocsc(), rhs[cells == wl.FLUID])
     assert p[cells == wl.FLUID] == pytest.approx(direct, abs=1e-9)

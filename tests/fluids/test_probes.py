@@ -26,7 +26,11 @@ def probe(name: str, position: list[float], quantity: str = "pressure") -> dict[
 def tank(dimension: int, probes: list[dict[str, Any]], **tables: Any) -> LiquidSimulation:
     """Return liquid of ten cells depth at rest, in a tank of 20 x 20 (x 5) cells."""
     size, top = [0.8, 0.8, 0.2][:dimension], [0.8, 0.4, 0.2][:dimension]
-    return create(scene(size=size, resolution=20, liquid=[box([0.0] * dimension, top)], probe=probes, **tables))
+    return create(
+        scene(
+            size=size, resolution=20, liquid=[box([0.0] * dimension, top)], probe=probes, **tables
+        )
+    )
 
 
 def last(simulation: LiquidSimulation, until: float) -> dict[str, Any]:
@@ -40,23 +44,35 @@ def last(simulation: LiquidSimulation, until: float) -> dict[str, Any]:
 
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize(("surface", "bias"), [("ghost-fluid", 0.0), ("voxel", 0.5)])
-def test_a_tank_at_rest_has_pressures_and_levels_of_its_depth(dimension: int, surface: str, bias: float) -> None:
+def test_a_tank_at_rest_has_pressures_and_levels_of_its_depth(
+    dimension: int, surface: str, bias: float
+) -> None:
     """At walls, in corners, at cell centers and anywhere between; whole cells put the surface half a cell too high (`test_rest`)."""
     rng = np.random.default_rng(71)
     points = rng.uniform([0.0, 0.0, 0.0], [0.8, 0.4 - DX, 0.2], (20, 3))
-    points = np.concatenate((points, [[0, 0, 0], [0.8, 0, 0.2], [0.4, 0, 0.1], [0.02, 0.02, 0.02], [0.4, 0.36, 0.1]]))[:, :dimension]
+    points = np.concatenate(
+        (points, [[0, 0, 0], [0.8, 0, 0.2], [0.4, 0, 0.1], [0.02, 0.02, 0.02], [0.4, 0.36, 0.1]])
+    )[:, :dimension]
     named = [(f"p{n}", point) for n, point in enumerate(points.tolist())]
-    probes = [probe(name, point, quantity) for name, point in named for quantity in ("pressure", "level")]
+    probes = [
+        probe(name, point, quantity) for name, point in named for quantity in ("pressure", "level")
+    ]
     row = last(tank(dimension, probes, pressure={"surface": surface}), 0.2)
     depths = 0.4 - points[:, 1]
-    pressures, levels = (np.array([row[f"{name}_{what}"] for name, _ in named]) for what in ("pressure", "level"))
+    pressures, levels = (
+        np.array([row[f"{name}_{what}"] for name, _ in named]) for what in ("pressure", "level")
+    )
     assert np.abs(pressures / (WATER * DX) - depths / DX - bias).max() < 0.06
     assert np.abs(levels / DX - depths / DX).max() < 0.1
 
 
 def test_air_and_solids_have_no_pressure_no_level_and_no_velocity() -> None:
     points = {"above": [0.4, 0.6], "inside": [0.3, 0.2], "under": [0.3, 0.05]}
-    probes = [probe(name, point, quantity) for name, point in points.items() for quantity in ("pressure", "velocity", "level")]
+    probes = [
+        probe(name, point, quantity)
+        for name, point in points.items()
+        for quantity in ("pressure", "velocity", "level")
+    ]
     row = last(tank(2, probes, solid=[box([0.2, 0.12], [0.4, 0.28])]), 0.1)
     for name in ("above", "inside"):
         assert row[f"{name}_pressure"] == row[f"{name}_level"] == 0.0
@@ -66,7 +82,14 @@ def test_air_and_solids_have_no_pressure_no_level_and_no_velocity() -> None:
 
 
 def test_a_full_box_ends_levels() -> None:
-    simulation = create(scene(size=[0.8, 0.8], resolution=20, liquid=[box([0, 0], [0.8, 0.8])], probe=[probe("a", [0.41, 0.31], "level")]))
+    simulation = create(
+        scene(
+            size=[0.8, 0.8],
+            resolution=20,
+            liquid=[box([0, 0], [0.8, 0.8])],
+            probe=[probe("a", [0.41, 0.31], "level")],
+        )
+    )
     assert last(simulation, 0.05)["a_level"] == pytest.approx(0.49, rel=1e-5)
 
 
@@ -77,23 +100,47 @@ def test_liquid_in_flight_has_its_velocity_and_no_pressure(dimension: int) -> No
     low, high = [0.2, 0.2, 0.1][:dimension], [0.6, 0.7, 0.3][:dimension]
     probes = [probe("a", middle, "velocity"), probe("a", middle)]
     liquid = [box(low, high, velocity=velocity)]
-    simulation = create(scene(size=[0.8, 0.8, 0.4][:dimension], resolution=20, liquid=liquid, probe=probes))
+    simulation = create(
+        scene(size=[0.8, 0.8, 0.4][:dimension], resolution=20, liquid=liquid, probe=probes)
+    )
     row = last(simulation, 0.05)
-    expected = np.array(velocity) - [0.0, GRAVITY * (row["time"] + 0.5 * simulation.last_dt), 0.0][:dimension]
+    expected = (
+        np.array(velocity)
+        - [0.0, GRAVITY * (row["time"] + 0.5 * simulation.last_dt), 0.0][:dimension]
+    )
     assert np.abs([row[f"a_{c}"] for c in ("vx", "vy", "vz")[:dimension]] - expected).max() < 1e-4
     assert abs(row["a_pressure"]) < 1e-3 * WATER * DX
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("gravity", [0.0, -1e-6, -1e-170])
-def test_without_gravity_liquid_keeps_its_velocity_and_has_no_pressure(dimension: int, gravity: float) -> None:
+def test_without_gravity_liquid_keeps_its_velocity_and_has_no_pressure(
+    dimension: int, gravity: float
+) -> None:
     """No direction is up, or hardly one, whose square is 0: the search for the surface ends all the same."""
     velocity, middle = [0.3, -0.2, 0.1][:dimension], [0.4, 0.45, 0.2][:dimension]
     liquid = [box([0.2, 0.2, 0.1][:dimension], [0.6, 0.7, 0.3][:dimension], velocity=velocity)]
-    probes = [probe("a", middle, quantity) for quantity in (("pressure", "velocity", "level") if gravity else ("pressure", "velocity"))]
+    probes = [
+        probe("a", middle, quantity)
+        for quantity in (("pressure", "velocity", "level") if gravity else ("pressure", "velocity"))
+    ]
     physics = {"gravity": [0.0, gravity, 0.0][:dimension]}
-    row = last(create(scene(size=[0.8, 0.8, 0.4][:dimension], resolution=20, liquid=liquid, probe=probes, physics=physics)), 0.05)
-    assert np.abs([row[f"a_{c}"] for c in ("vx", "vy", "vz")[:dimension]] - np.array(velocity)).max() < 1e-4
+    row = last(
+        create(
+            scene(
+                size=[0.8, 0.8, 0.4][:dimension],
+                resolution=20,
+                liquid=liquid,
+                probe=probes,
+                physics=physics,
+            )
+        ),
+        0.05,
+    )
+    assert (
+        np.abs([row[f"a_{c}"] for c in ("vx", "vy", "vz")[:dimension]] - np.array(velocity)).max()
+        < 1e-4
+    )
     assert abs(row["a_pressure"]) < 1e-3 * WATER * DX
     if gravity:
         assert row["a_level"] == pytest.approx(0.25, abs=0.5 * DX)
@@ -108,7 +155,9 @@ def test_a_container_that_moves() -> None:
     ]
     probes = [probe("a", [0.51, 0.2], quantity) for quantity in ("pressure", "velocity", "level")]
     liquid = [box([0.28, 0.1], [0.72, 0.4], velocity=[0.4, 0.0])]
-    row = last(create(scene(size=[1.2, 0.8], resolution=30, liquid=liquid, solid=walls, probe=probes)), 0.3)
+    row = last(
+        create(scene(size=[1.2, 0.8], resolution=30, liquid=liquid, solid=walls, probe=probes)), 0.3
+    )
     assert row["a_pressure"] == pytest.approx(0.2 * WATER, rel=0.05)
     assert row["a_level"] == pytest.approx(0.2, abs=0.4 * DX)
     assert row["a_vx"] == pytest.approx(0.4, rel=0.02)
@@ -120,8 +169,17 @@ def test_grids_that_follow_the_liquid_measure_the_same(dimension: int) -> None:
     """A box of liquid crosses a wide domain; whichever part of it the grid covers, the probe sees it come."""
     size = [64.0, 32.0] if dimension == 2 else [16.0, 16.0, 8.0]
     resolution, middle = (1024, 30.1) if dimension == 2 else (128, 8.1)
-    liquid = [box([middle - 1.0, 1.0, 1.0][:dimension], [middle, 2.0, 2.0][:dimension], velocity=[12.0, 4.0, 0.0][:dimension])]
-    probes = [probe("a", [middle + 0.4, 1.8, 1.5][:dimension], quantity) for quantity in ("pressure", "velocity", "level")]
+    liquid = [
+        box(
+            [middle - 1.0, 1.0, 1.0][:dimension],
+            [middle, 2.0, 2.0][:dimension],
+            velocity=[12.0, 4.0, 0.0][:dimension],
+        )
+    ]
+    probes = [
+        probe("a", [middle + 0.4, 1.8, 1.5][:dimension], quantity)
+        for quantity in ("pressure", "velocity", "level")
+    ]
     tables = {"liquid": liquid, "probe": probes, "size": size, "resolution": resolution}
     rows: dict[bool, list[dict[str, Any]]] = {True: [], False: []}
     for follow, found in rows.items():
@@ -185,13 +243,18 @@ def test_an_interrupted_run_writes_the_same_table(tmp_path: Path) -> None:
         file.write("8,0.2,1.0,0.0,0.0\n9,0.")  # a killed process got so far
     assert run_into(scene, parts, resume=True).status == "finished"
     assert (parts / "probes.csv").read_bytes() == (whole / "probes.csv").read_bytes()
-    with open(whole / "probes.csv", newline="") as table, open(whole / "log.csv", newline="") as log:
+    with (
+        open(whole / "probes.csv", newline="") as table,
+        open(whole / "log.csv", newline="") as log,
+    ):
         rows, steps = list(csv.DictReader(table)), list(csv.DictReader(log))
     assert list(rows[0]) == ["step", "time", "a_pressure", "b_vx", "b_vy"]
     assert [row["step"] for row in rows] == [row["step"] for row in steps]
     assert [row["time"] for row in rows[1:]] == [row["time"] for row in steps[:-1]]
     assert rows[0]["b_vx"] == "", "no velocity in air"
-    (whole / "probes.csv").write_text("\n".join((whole / "probes.csv").read_text().split("\n")[:3]) + "\n")
+    (whole / "probes.csv").write_text(
+        "\n".join((whole / "probes.csv").read_text().split("\n")[:3]) + "\n"
+    )
     again = run_into(dam(tmp_path, 0.5), whole, resume=True)
     assert any(warning.startswith("probes.csv: rows of steps") for warning in again.warnings)
 

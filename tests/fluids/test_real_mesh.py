@@ -15,10 +15,28 @@ pytestmark = pytest.mark.skipif(not SPOT.is_file(), reason="shared/data/spot.obj
 @pytest.mark.parametrize("wall", ["separating", "free-slip"])
 @pytest.mark.parametrize("solids", ["cut-cell", "voxel"])
 def test_a_dam_breaks_over_spot(solids: str, wall: str) -> None:
-    cow = {"shape": "mesh", "file": str(SPOT), "scale": 0.35, "rotate": [0, -90, 0], "translate": [0.9, 0.25, 0.5]}
+    cow = {
+        "shape": "mesh",
+        "file": str(SPOT),
+        "scale": 0.35,
+        "rotate": [0, -90, 0],
+        "translate": [0.9, 0.25, 0.5],
+    }
     liquid = [box([0.0, 0.0, 0.0], [0.5, 0.9, 1.0])]
-    simulation = create(scene(size=[1.5, 1.25, 1.0], resolution=24, liquid=liquid, solid=[cow], wall=wall, solids=solids))
-    volume = float((1.0 - simulation.boundary.capacity.numpy())[2:-2, 2:-2, 2:-2].sum()) * simulation.grid.cell_volume
+    simulation = create(
+        scene(
+            size=[1.5, 1.25, 1.0],
+            resolution=24,
+            liquid=liquid,
+            solid=[cow],
+            wall=wall,
+            solids=solids,
+        )
+    )
+    volume = (
+        float((1.0 - simulation.boundary.capacity.numpy())[2:-2, 2:-2, 2:-2].sum())
+        * simulation.grid.cell_volume
+    )
     assert volume == pytest.approx(0.718 * 0.35**3, rel=0.15 if solids == "cut-cell" else 0.2)
     rows = advance(simulation, 0.6)
     assert {row["solve_status"] for row in rows} == {"CONVERGED"}

@@ -22,7 +22,9 @@ CASES = {
     "cut": lambda: dam(solid=[RAMP]),
     "3-D": lambda: dam(3),
     "unilateral": lambda: dam(solid=[RAMP], pressure={"model": "unilateral"}),
-    "moving": lambda: dam(solid=[RAMP | {"motion": {"kind": "translation", "velocity": [0.5, 0.0]}}]),
+    "moving": lambda: dam(
+        solid=[RAMP | {"motion": {"kind": "translation", "velocity": [0.5, 0.0]}}]
+    ),
 }
 
 
@@ -42,26 +44,38 @@ def record(simulation, folder, steps=3):
 def test_the_recorded_problem_is_the_one_that_was_solved(tmp_path, name):
     simulation = CASES[name]()
     pressures = record(simulation, tmp_path)
-    assert [path.name for path in files(tmp_path)] == [f"problem_{step:06d}.npz" for step in range(3)]
+    assert [path.name for path in files(tmp_path)] == [
+        f"problem_{step:06d}.npz" for step in range(3)
+    ]
     for path, pressure in zip(files(tmp_path), pressures, strict=True):
         problem = load(path, device="cpu")
         kept = dict(np.load(path, allow_pickle=False))
-        # the oracle reads the file by its description alone: a face off by one, or a shift of another step, is not solved by the run's x
+        # the oracle reads the file by its description alone: a face off by one, or a shift of
+        # another step, is not solved by the run's x
         faces = [kept.get(f"face_{axis}", 1.0) for axis in "xyz"]
         A = assemble(kept["cells"], faces, kept.get("shift"))
         fluid = kept["cells"].ravel() == wl.FLUID
         A = A[np.ix_(fluid, fluid)]
         np.testing.assert_allclose(problem.dense().A, A, atol=2e-6 * np.abs(A).max())
-        b, lower, upper = (np.broadcast_to(kept[key], kept["cells"].shape).ravel()[fluid] for key in ("b", "lower", "upper"))
+        b, lower, upper = (
+            np.broadcast_to(kept[key], kept["cells"].shape).ravel()[fluid]
+            for key in ("b", "lower", "upper")
+        )
         x = pressure.ravel()[fluid]
         reference = natural_residual(A, b, lower, upper, np.clip(0.0 * b, lower, upper))
         allowed = max(float(kept["absolute_tolerance"]), float(kept["tolerance"]) * reference)
-        assert natural_residual(A, b, lower, upper, x) <= 1.5 * allowed + 1e-6 * np.abs(A).max() * np.linalg.norm(x)
+        assert natural_residual(A, b, lower, upper, x) <= 1.5 * allowed + 1e-6 * np.abs(
+            A
+        ).max() * np.linalg.norm(x)
         criteria = wl.StoppingCriteria(rtol=1e-9, atol=1e-12, max_iterations=300)
         for start in (None, problem.x0):
-            result = wl.solve(problem.lcp(), wl.MinimumMapNewton(precision="double"), stopping=criteria, x0=start)
+            result = wl.solve(
+                problem.lcp(), wl.MinimumMapNewton(precision="double"), stopping=criteria, x0=start
+            )
             assert result, result.status
-            np.testing.assert_allclose(result.x.numpy(), pressure, atol=2e-3 * np.abs(pressure).max())
+            np.testing.assert_allclose(
+                result.x.numpy(), pressure, atol=2e-3 * np.abs(pressure).max()
+            )
 
 
 def test_coefficients_are_there_only_where_they_vary(tmp_path):
@@ -80,12 +94,15 @@ def test_numbers_and_first_guess(tmp_path):
     first, *_ = record(simulation, tmp_path)
     problems = [load(path, device="cpu") for path in files(tmp_path)]
     assert [p.step for p in problems] == [0, 1, 2]
-    assert [p.time for p in problems] == pytest.approx([0.0, problems[0].dt, problems[0].dt + problems[1].dt])
+    assert [p.time for p in problems] == pytest.approx(
+        [0.0, problems[0].dt, problems[0].dt + problems[1].dt]
+    )
     assert problems[0].spacing == simulation.grid.spacing
     assert problems[0].tolerance == simulation.projection.tolerance
     assert not problems[0].x0.any()
     both = (first != 0) & (problems[1].x0 != 0)  # the last pressure, scaled with the step
-    ratio = (problems[0].dt + problems[1].dt) / problems[0].dt  # forces act for half of each of two steps
+    # forces act for half of each of two steps
+    ratio = (problems[0].dt + problems[1].dt) / problems[0].dt
     np.testing.assert_allclose(problems[1].x0[both], ratio * first[both], rtol=1e-12)
     assert both.sum() > 20
 
@@ -128,7 +145,8 @@ def test_damaged_files_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ("name", "array", "message"),
     [
-        ("b", np.array(1.0), r"b is float64 of shape \(\): must be numbers of shape \("),  # 8 bytes that became a field
+        # 8 bytes that became a field
+        ("b", np.array(1.0), r"b is float64 of shape \(\): must be numbers of shape \("),
         ("lower", np.zeros(3), "lower is float64 of shape"),
         ("face_x", np.ones((2, 2)), "face_x is float64 of shape"),
         ("dt", np.array("soon"), "dt is <U4 of shape"),
@@ -141,7 +159,9 @@ def test_arrays_must_fit_the_cells(tmp_path, name, array, message):
     (path,) = files(tmp_path)
     np.savez_compressed(path, **{**np.load(path), name: array})
     for read in (load, cell_counts):
-        with pytest.raises(ValueError, match=rf"problem_000000\.npz: is not a recorded problem: {message}"):
+        with pytest.raises(
+            ValueError, match=rf"problem_000000\.npz: is not a recorded problem: {message}"
+        ):
             read(path)
 
 
@@ -170,21 +190,40 @@ def call(*arguments):
 
 def test_record_and_replay_by_the_command_line(tmp_path):
     folder = tmp_path / "problems"
-    run = ["run", "dam-break", "--device", "cpu", "--set", "domain.resolution=16", "--set", "time.duration=0.1"]
+    run = [
+        "run",
+        "dam-break",
+        "--device",
+        "cpu",
+        "--set",
+        "domain.resolution=16",
+        "--set",
+        "time.duration=0.1",
+    ]
     done = call(*run, "--out", tmp_path / "run", "--frames", 1, "--record-problems", folder)
     assert done.exit_code == 0, done.stderr
     count = len(files(folder))
     assert count == json.loads((tmp_path / "run" / "run.json").read_text())["steps"]
-    again = call(*run, "--out", tmp_path / "run", "--frames", 1, "--force", "--record-problems", folder)
+    again = call(
+        *run, "--out", tmp_path / "run", "--frames", 1, "--force", "--record-problems", folder
+    )
     assert again.exit_code == 2
     assert "holds recorded problems already" in again.stderr
-    more = call(*run, "--out", tmp_path / "run", "--frames", 2, "--resume", "--record-problems", folder)
+    more = call(
+        *run, "--out", tmp_path / "run", "--frames", 2, "--resume", "--record-problems", folder
+    )
     assert more.exit_code == 0, more.stderr
-    assert len(files(folder)) == json.loads((tmp_path / "run" / "run.json").read_text())["steps"] > count
+    assert (
+        len(files(folder))
+        == json.loads((tmp_path / "run" / "run.json").read_text())["steps"]
+        > count
+    )
     count = len(files(folder))
     for path in files(folder):
         problem = load(path)
         for method in ("projected-multigrid", "minimum-map-newton", "mprgp"):
             for start in (None, problem.x0):
-                stopping = wl.StoppingCriteria(rtol=problem.tolerance, atol=problem.absolute_tolerance, max_iterations=1000)
+                stopping = wl.StoppingCriteria(
+                    rtol=problem.tolerance, atol=problem.absolute_tolerance, max_iterations=1000
+                )
                 assert wl.solve(problem.lcp(), wl.METHODS[method](), stopping=stopping, x0=start)

@@ -10,7 +10,10 @@ from small_liquids import GRAVITY, advance, box, create, scene
 from warp_lcp.fluids import LiquidSimulation
 
 SLOPE = math.radians(30)
-V = [{"shape": "plane", "point": [0.4, 0.0], "normal": [side * math.sin(SLOPE), math.cos(SLOPE)]} for side in (-1, 1)]
+V = [
+    {"shape": "plane", "point": [0.4, 0.0], "normal": [side * math.sin(SLOPE), math.cos(SLOPE)]}
+    for side in (-1, 1)
+]
 TILT = math.radians(20)
 TILTED = {"gravity": [GRAVITY * math.sin(TILT), -GRAVITY * math.cos(TILT)]}
 
@@ -24,7 +27,10 @@ CASES: dict[str, dict[str, Any]] = {
 }
 
 
-LONG = [pytest.param(case, 10.0, marks=[] if case == "pool in a V" else [pytest.mark.slow]) for case in CASES]
+LONG = [
+    pytest.param(case, 10.0, marks=[] if case == "pool in a V" else [pytest.mark.slow])
+    for case in CASES
+]
 VOXEL: dict[str, Any] = {"solids": "voxel", "pressure": {"surface": "voxel"}}
 
 
@@ -34,7 +40,9 @@ def tank(case: str, **tables: Any) -> LiquidSimulation:
 
 def largest_speed(simulation: LiquidSimulation, until: float) -> float:
     """Return the largest speed in units of sqrt(g dx)."""
-    return max(row["max_speed"] for row in advance(simulation, until)) / math.sqrt(GRAVITY * simulation.grid.spacing)
+    return max(row["max_speed"] for row in advance(simulation, until)) / math.sqrt(
+        GRAVITY * simulation.grid.spacing
+    )
 
 
 @pytest.mark.parametrize(("case", "until"), [*((case, 1.5) for case in CASES), *LONG])
@@ -54,7 +62,12 @@ def test_a_liquid_with_a_surface_between_cells_comes_to_rest(case: str, until: f
 @pytest.mark.parametrize(("tables", "bound"), [(VOXEL, 1e-3), ({}, 0.05)])
 def test_a_pool_at_rest_in_space(tables: dict[str, Any], bound: float) -> None:
     liquid = [box([0.0, 0.0, 0.0], [0.8, 0.4, 0.4])]
-    assert largest_speed(create(scene(size=[0.8, 0.8, 0.4], resolution=12, liquid=liquid, **tables)), 0.5) < bound
+    assert (
+        largest_speed(
+            create(scene(size=[0.8, 0.8, 0.4], resolution=12, liquid=liquid, **tables)), 0.5
+        )
+        < bound
+    )
 
 
 def test_the_pressure_of_a_pool_is_that_of_its_depth() -> None:
@@ -94,12 +107,19 @@ BALLS: dict[str, list[dict[str, Any]]] = {
 @pytest.mark.parametrize("wall", ["separating", "free-slip"])
 @pytest.mark.parametrize("surface", ["ghost-fluid", "voxel"])
 @pytest.mark.parametrize("ball", BALLS)
-def test_a_gap_of_less_than_a_cell_above_the_floor_is_no_sink(ball: str, surface: str, wall: str) -> None:
+def test_a_gap_of_less_than_a_cell_above_the_floor_is_no_sink(
+    ball: str, surface: str, wall: str
+) -> None:
     """Particles must be able to go where the faces are open: else the gap holds no liquid, what flows in is lost, and the pool spins up."""
     simulation = tank("full box", solid=BALLS[ball], pressure={"surface": surface}, wall=wall)
     volume = 0.64 - math.pi * 0.16**2
     rows = advance(simulation, 0.6)
-    assert max(row["max_speed"] for row in rows[len(rows) // 2 :]) < 0.05 * math.sqrt(GRAVITY * simulation.grid.spacing)
+    assert max(row["max_speed"] for row in rows[len(rows) // 2 :]) < 0.05 * math.sqrt(
+        GRAVITY * simulation.grid.spacing
+    )
     if surface == "ghost-fluid":
         assert rows[-1]["volume"] == pytest.approx(volume, rel=0.01)
-    assert simulation.projection.counted() == (simulation.boundary.base.numpy()[1:-1, 1:-1, 1:-1] == 0).sum()
+    assert (
+        simulation.projection.counted()
+        == (simulation.boundary.base.numpy()[1:-1, 1:-1, 1:-1] == 0).sum()
+    )

@@ -19,7 +19,11 @@ FRAMES = 30.0
 
 def busy(end: float = 0.2) -> Any:
     """Return a scene with a pool, a tap, a drain and a slide, whose times are next to frames and to each other."""
-    slide = {"kind": "keyframes", "times": [0.0666, 0.1251, 0.12513], "translate": [[0.0, 0.0], [0.1, 0.0], [0.1, 0.0]]}
+    slide = {
+        "kind": "keyframes",
+        "times": [0.0666, 0.1251, 0.12513],
+        "translate": [[0.0, 0.0], [0.1, 0.0], [0.1, 0.0]],
+    }
     return scene(
         size=[1.0, 1.0],
         resolution=16,
@@ -53,7 +57,12 @@ def test_a_busy_run_has_no_slivers_and_goes_on_with_the_same_steps(tmp_path: Pat
     assert np.abs(ends[:, None] - [0.03337, 0.0666, 0.10004]).min() > 1e-6  # too close to frames
 
     asked = count(1)
-    run_into(model, tmp_path / "again", observer=Lines(Console(quiet=True)), stop=lambda: next(asked) >= len(ends) // 2)
+    run_into(
+        model,
+        tmp_path / "again",
+        observer=Lines(Console(quiet=True)),
+        stop=lambda: next(asked) >= len(ends) // 2,
+    )
     run_into(model, tmp_path / "again", observer=Lines(Console(quiet=True)), resume=True)
     assert np.array_equal(steps(tmp_path / "again"), through)
 
@@ -63,7 +72,15 @@ def test_a_jet_flies_on_whenever_in_a_step_its_source_stops(phase: float) -> Non
     """A source that pushed with the share of its velocity that it runs in a step would hold back the jet before it."""
     dt, velocity = 0.01, 1.5
     source = box([0.0, 0.5], [0.125, 0.625], velocity=[velocity, 0.0], stop=(5 + phase) * dt)
-    simulation = create(scene(size=[1.0, 1.0], resolution=16, liquid=[], source=[source], physics={"gravity": [0.0, 0.0]}))
+    simulation = create(
+        scene(
+            size=[1.0, 1.0],
+            resolution=16,
+            liquid=[],
+            source=[source],
+            physics={"gravity": [0.0, 0.0]},
+        )
+    )
     for _ in range(10):
         simulation.step(dt)
     assert simulation.particles.count > 16

@@ -25,12 +25,16 @@ def test_a_drop_that_flies_past_spray_keeps_its_momentum(cfl: float) -> None:
     rng = np.random.default_rng(20261122)
     spray = np.zeros((400, 3))
     spray[:, 0] = rng.uniform(0.2, 1.8, 400)
-    spray[:, 1] = np.where(rng.random(400) < 0.5, rng.uniform(0.62, 0.7, 400), rng.uniform(0.3, 0.38, 400))
+    spray[:, 1] = np.where(
+        rng.random(400) < 0.5, rng.uniform(0.62, 0.7, 400), rng.uniform(0.3, 0.38, 400)
+    )
     simulation.particles.append(spray, np.zeros((400, 3)))
     simulation.particles.sort()
 
     def momentum() -> np.ndarray:
-        return simulation.particle_mass * simulation.particles.velocity.numpy().astype(np.float64).sum(axis=0)
+        return simulation.particle_mass * simulation.particles.velocity.numpy().astype(
+            np.float64
+        ).sum(axis=0)
 
     before = momentum()
     advance(simulation, 0.5)
@@ -43,7 +47,12 @@ def test_liquid_poured_over_a_mesh_gains_no_energy_in_short_steps(cfl: float) ->
     """Half of it is spray among drops; dragged along with them in every step it went off at 60 m/s."""
     model = load_scene("mesh-obstacle", ["domain.resolution=20", f"time.cfl={cfl}"])
     simulation = SIMULATOR.create(model, device="cpu", folder=Path())
-    energy = np.array([row["kinetic_energy"] + row["potential_energy"] for row in advance(simulation, 0.46, dt_max=0.0025)])
+    energy = np.array(
+        [
+            row["kinetic_energy"] + row["potential_energy"]
+            for row in advance(simulation, 0.46, dt_max=0.0025)
+        ]
+    )
     assert (energy - np.minimum.accumulate(energy)).max() < 0.05 * energy[0]
     assert energy[-1] < 0.4 * energy[0]
 
@@ -66,12 +75,18 @@ def test_one_drop_that_leaves_a_wall_throws_nothing_after_it(cut: bool) -> None:
     floor = 0.3 if cut else 0.0
     simulation = create(
         scene(
-            size=[1.0, 1.0], resolution=10, physics={"gravity": [0.0, 0.0]}, liquid=[box([0.5, 0.7], [0.6, 0.8])],
+            size=[1.0, 1.0],
+            resolution=10,
+            physics={"gravity": [0.0, 0.0]},
+            liquid=[box([0.5, 0.7], [0.6, 0.8])],
             solid=[box([-1.0, -1.0], [2.0, floor])] if cut else [],
         )
-    )  # fmt: skip
+    )
     position, velocity = np.zeros((2, 10, 3), dtype=np.float32)
-    position[:, 0], position[:, 1] = [*np.linspace(0.53, 0.57, 9), 0.55], floor + np.array([0.002] * 9 + [0.09])
+    position[:, 0], position[:, 1] = (
+        [*np.linspace(0.53, 0.57, 9), 0.55],
+        floor + np.array([0.002] * 9 + [0.09]),
+    )
     velocity[9, 1] = 4.0
     rows = {name: array.numpy()[:10] * 0 for name, array in simulation.particles.arrays().items()}
     simulation.particles.assign(rows | {"position": position, "velocity": velocity})

@@ -24,7 +24,11 @@ FORCES = {"forces": True}
 def tank(dimension: int, **tables: Any) -> LiquidSimulation:
     """Return a tank of 20 x 20 (x 20) cells, filled to 14."""
     size, top = [0.8] * dimension, [0.8, 0.56, 0.8][:dimension]
-    return create(scene(size=size, resolution=20, liquid=[box([0.0] * dimension, top)], output=FORCES, **tables))
+    return create(
+        scene(
+            size=size, resolution=20, liquid=[box([0.0] * dimension, top)], output=FORCES, **tables
+        )
+    )
 
 
 def forces(simulation: LiquidSimulation, until: float) -> dict[str, np.ndarray]:
@@ -47,18 +51,24 @@ def ball(dimension: int, **more: Any) -> dict[str, Any]:
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_archimedes_and_the_weight_on_the_floor(dimension: int, solids: str, surface: str) -> None:
     """The ball is pushed up by what it displaces, as cells are closed; the walls bear that and the weight of the liquid."""
-    simulation = tank(dimension, solids=solids, pressure={"surface": surface}, solid=[ball(dimension)])
+    simulation = tank(
+        dimension, solids=solids, pressure={"surface": surface}, solid=[ball(dimension)]
+    )
     found = forces(simulation, 0.3)
     volume = np.pi * 0.15**2 if dimension == 2 else 4.0 / 3.0 * np.pi * 0.15**3
     if solids == "voxel":
         volume = simulation.boundary.solids.covered[0] * simulation.grid.cell_volume
     up = found["solid0"][1] / (WATER * volume)
-    lost = {"voxel": 1e-3, "cut-cell": 0.015 if dimension == 2 else 0.042}[solids]  # of a ball of 3.75 cells, between the grid's nodes
+    # of a ball of 3.75 cells, between the grid's nodes
+    lost = {"voxel": 1e-3, "cut-cell": 0.015 if dimension == 2 else 0.042}[solids]
     assert up == pytest.approx(1.0, abs=lost)
-    assert np.abs(np.delete(found["solid0"], 1)).max() < 0.02 * WATER * volume, "no other force, no torque about its center"
+    assert np.abs(np.delete(found["solid0"], 1)).max() < 0.02 * WATER * volume, (
+        "no other force, no torque about its center"
+    )
     filled = 0.8 * 0.56 * (0.8 if dimension == 3 else 1.0)
     if surface == "voxel":
-        filled += 0.5 * simulation.grid.spacing * 0.8 ** (dimension - 1)  # whole cells put the surface half a cell too high
+        # whole cells put the surface half a cell too high
+        filled += 0.5 * simulation.grid.spacing * 0.8 ** (dimension - 1)
     assert found["domain"][1] / (WATER * filled) == pytest.approx(-1.0, abs=1e-3)
     assert abs(found["domain"][0]) < 0.01 * WATER * filled
 
@@ -76,11 +86,18 @@ def test_floor_and_walls_bear_the_depth(dimension: int, solids: str) -> None:
     both = found["solid0"] + found["solid1"]  # where they touch, either may have what is buried
     assert both[:2] == pytest.approx([push, -weight], rel=0.01)
     assert found["domain"][0] == pytest.approx(-push, rel=0.01), "the left wall"
-    assert found["domain"][1] == pytest.approx(0.0, abs=1e-3 * weight), "all of the floor is the solid's"
+    assert found["domain"][1] == pytest.approx(0.0, abs=1e-3 * weight), (
+        "all of the floor is the solid's"
+    )
     alone = forces(tank(dimension, solids=solids, solid=parts[:1]), 0.3)["solid0"]
-    assert alone[:2] == pytest.approx([0.0, -WATER * depth * 0.8 * width], rel=2e-3, abs=1e-3 * push)
-    aside = forces(tank(dimension, solids=solids, solid=[box([wall, -0.2, -0.2][:dimension], high)]), 0.3)["solid0"]
-    push, lever = 0.5 * WATER * 0.56**2 * width, 0.56 / 3.0 - 0.4  # of the center of pressure, above that of the box
+    assert alone[:2] == pytest.approx(
+        [0.0, -WATER * depth * 0.8 * width], rel=2e-3, abs=1e-3 * push
+    )
+    aside = forces(
+        tank(dimension, solids=solids, solid=[box([wall, -0.2, -0.2][:dimension], high)]), 0.3
+    )["solid0"]
+    # of the center of pressure, above that of the box
+    push, lever = 0.5 * WATER * 0.56**2 * width, 0.56 / 3.0 - 0.4
     assert aside[:2] == pytest.approx([push, 0.0], rel=0.01, abs=1e-3 * push)
     assert aside[-1] == pytest.approx(-push * lever, rel=0.02)
 
@@ -91,9 +108,18 @@ def crowded(dimension: int, solids: str, moves: str) -> LiquidSimulation:
     if moves == "moves":
         more = {"motion": {"kind": "translation", "velocity": [0.3, -0.2, 0.1][:dimension]}}
     standing = box([0.57, 0.0, 0.0][:dimension], [0.8, 0.31, 0.8][:dimension])
-    liquid = [box([0.0] * dimension, [0.4, 0.7, 0.8][:dimension]), box([0.4, 0.0, 0.0][:dimension], [0.8, 0.5, 0.8][:dimension])]
-    tables: dict[str, Any] = {"solids": solids, "solid": [standing, ball(dimension, **more)], "pressure": {"surface": "voxel"}}
-    return create(scene(size=[0.8] * dimension, resolution=20, liquid=liquid, output=FORCES, **tables))
+    liquid = [
+        box([0.0] * dimension, [0.4, 0.7, 0.8][:dimension]),
+        box([0.4, 0.0, 0.0][:dimension], [0.8, 0.5, 0.8][:dimension]),
+    ]
+    tables: dict[str, Any] = {
+        "solids": solids,
+        "solid": [standing, ball(dimension, **more)],
+        "pressure": {"surface": "voxel"},
+    }
+    return create(
+        scene(size=[0.8] * dimension, resolution=20, liquid=liquid, output=FORCES, **tables)
+    )
 
 
 CROWDED = [("voxel", "stands"), ("cut-cell", "stands"), ("cut-cell", "moves"), ("cut-cell", "body")]
@@ -101,10 +127,13 @@ CROWDED = [("voxel", "stands"), ("cut-cell", "stands"), ("cut-cell", "moves"), (
 
 @pytest.mark.parametrize(("solids", "moves"), CROWDED)
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_what_the_pressure_takes_from_the_liquid_solids_get(dimension: int, solids: str, moves: str, monkeypatch: Any) -> None:
+def test_what_the_pressure_takes_from_the_liquid_solids_get(
+    dimension: int, solids: str, moves: str, monkeypatch: Any
+) -> None:
     """On the grid to rounding: the faces' momentum, open fractions times change of velocity, against all solids' impulses.
 
-    Of whole cells with what stops the liquid in the half cells beside closed faces, else of the pressure alone.
+    Of whole cells with what stops the liquid in the half cells beside closed faces, else of the
+    pressure alone.
     """
     simulation = crowded(dimension, solids, moves)
     projection, mass, checked = simulation.projection, 1000.0 * simulation.grid.cell_volume, []
@@ -115,12 +144,18 @@ def test_what_the_pressure_takes_from_the_liquid_solids_get(dimension: int, soli
         done = project(velocity, window, *rest)
         x, boundary = projection.pressure, simulation.boundary
         gained = np.zeros(3)
-        for axis, (field, u, known) in enumerate(zip(velocity, before, projection.known, strict=True)):
+        for axis, (field, u, known) in enumerate(
+            zip(velocity, before, projection.known, strict=True)
+        ):
             open_ = boundary.open[axis].numpy() if boundary.open else 1.0
-            gained[axis] = mass * (np.where(known.numpy() == 1, field.numpy() - u, 0.0) * open_).sum()
+            gained[axis] = (
+                mass * (np.where(known.numpy() == 1, field.numpy() - u, 0.0) * open_).sum()
+            )
             if solids == "voxel":  # on closed faces of cells with pressure
                 index, filled = boundary.solids.index.numpy() >= 0, x.numpy() != 0.0
-                beside = (index & np.roll(filled, 1, 2 - axis)) | (np.roll(index, 1, 2 - axis) & filled)
+                beside = (index & np.roll(filled, 1, 2 - axis)) | (
+                    np.roll(index, 1, 2 - axis) & filled
+                )
                 gained[axis] -= 0.5 * mass * u[beside].sum()
         fields = velocity if solids == "voxel" else [wp.zeros_like(field) for field in velocity]
         bodies = wp.zeros(3, dtype=wp.uint8, device="cpu")
@@ -150,17 +185,24 @@ def test_a_body_is_told_what_it_got(dimension: int) -> None:
     simulation.projection.push_bodies = watched  # type: ignore[method-assign]
     for _ in range(4):
         simulation.step(0.004)
-        told = forces(simulation, 0.0)["solid1"][: 3 if dimension == 3 else None] * simulation.kick_dt
+        told = (
+            forces(simulation, 0.0)["solid1"][: 3 if dimension == 3 else None] * simulation.kick_dt
+        )
         assert told == pytest.approx(given[-1], rel=1e-6, abs=1e-9)
     assert np.abs(given).max() > 0.0
 
 
 @pytest.mark.parametrize("viscosity", [0.05, 20.0])
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_in_thick_liquid_forces_and_weight_are_what_moves_a_body(dimension: int, viscosity: float) -> None:
+def test_in_thick_liquid_forces_and_weight_are_what_moves_a_body(
+    dimension: int, viscosity: float
+) -> None:
     """Each step: pressure, viscous stresses and weight add up to the change of momentum, whatever the solves left."""
     rod = ball(
-        dimension, density=7800.0, velocity=[0.4, -1.0, 0.2][:dimension], angular_velocity=300.0 if dimension == 2 else [0.0, 90.0, 200.0]
+        dimension,
+        density=7800.0,
+        velocity=[0.4, -1.0, 0.2][:dimension],
+        angular_velocity=300.0 if dimension == 2 else [0.0, 90.0, 200.0],
     )
     simulation = tank(dimension, viscosity={"value": viscosity}, solid=[rod])
     assert simulation.bodies is not None
@@ -169,17 +211,27 @@ def test_in_thick_liquid_forces_and_weight_are_what_moves_a_body(dimension: int,
     for dt in (0.004, 0.01, 0.002, 0.007):
         before = np.concatenate([body.momentum, body.angular_momentum])
         simulation.step(dt)
-        gained = (np.concatenate([body.momentum, body.angular_momentum]) - before) / simulation.kick_dt
+        gained = (
+            np.concatenate([body.momentum, body.angular_momentum]) - before
+        ) / simulation.kick_dt
         gained[1] += weight
         told = forces(simulation, 0.0)["solid0"]
-        np.testing.assert_allclose(told, gained if dimension == 3 else gained[[0, 1, 5]], rtol=1e-4, atol=1e-5 * weight)
+        np.testing.assert_allclose(
+            told, gained if dimension == 3 else gained[[0, 1, 5]], rtol=1e-4, atol=1e-5 * weight
+        )
     assert np.abs(told[:2]).max() > 0.02 * weight
 
 
 def test_a_rod_that_sinks_through_honey_evenly_is_borne_by_it() -> None:
     """The mean force is the weight; at first there is none."""
     rod = {"shape": "sphere", "center": [0.02, 0.055], "radius": 0.005, "density": 7800.0}
-    tables = {"size": [0.04, 0.08], "resolution": 32, "output": FORCES, "viscosity": {"value": 10.0}, "solid": [rod]}
+    tables = {
+        "size": [0.04, 0.08],
+        "resolution": 32,
+        "output": FORCES,
+        "viscosity": {"value": 10.0},
+        "solid": [rod],
+    }
     simulation = create(scene(liquid=[box([0.0, 0.0], [0.04, 0.075])], **tables))
     assert simulation.bodies is not None
     weight, told = simulation.bodies.bodies[0].properties.mass * GRAVITY, []
@@ -192,12 +244,19 @@ def test_a_rod_that_sinks_through_honey_evenly_is_borne_by_it() -> None:
 @pytest.mark.parametrize("solids", ["voxel", "cut-cell"])
 def test_an_impact_takes_the_momentum(solids: str) -> None:
     """A block falls into a tilted tub: what particles lose of their momentum, gravity's apart, the walls have got, to a few percent."""
-    tables: dict[str, Any] = {"solids": solids, "solid": [{"shape": "plane", "point": [0.3, 0.1], "normal": [0.3, 1.0]}]}
+    tables: dict[str, Any] = {
+        "solids": solids,
+        "solid": [{"shape": "plane", "point": [0.3, 0.1], "normal": [0.3, 1.0]}],
+    }
     block = [box([0.2, 0.4], [0.52, 0.72], velocity=[0.6, -1.0])]
-    simulation = create(scene(size=[0.8, 0.8], resolution=40, liquid=block, output=FORCES, **tables))
+    simulation = create(
+        scene(size=[0.8, 0.8], resolution=40, liquid=block, output=FORCES, **tables)
+    )
 
     def momentum() -> np.ndarray:
-        return simulation.particle_mass * simulation.particles.velocity.numpy()[:, :2].sum(axis=0, dtype=np.float64)
+        return simulation.particle_mass * simulation.particles.velocity.numpy()[:, :2].sum(
+            axis=0, dtype=np.float64
+        )
 
     mass = simulation.particle_mass * simulation.particles.count
     start, given, elapsed = momentum(), np.zeros(2), 0.0
@@ -224,7 +283,15 @@ def test_all_solids_together_bear_the_liquid(seed: int) -> None:
 def test_forces_change_nothing() -> None:
     states = []
     for output in ({}, FORCES):
-        simulation = create(scene(size=[0.8, 0.8], resolution=20, liquid=[box([0, 0], [0.4, 0.5])], solid=[ball(2)], output=output))
+        simulation = create(
+            scene(
+                size=[0.8, 0.8],
+                resolution=20,
+                liquid=[box([0, 0], [0.4, 0.5])],
+                solid=[ball(2)],
+                output=output,
+            )
+        )
         assert bool(simulation.tables()) == bool(output)
         advance(simulation, 0.2)
         states.append(simulation.state())
@@ -234,18 +301,36 @@ def test_forces_change_nothing() -> None:
 def test_reference_points_move_along() -> None:
     """A rotating paddle: the point is the center of its box, which goes around; a plane has the origin."""
     motion = {"kind": "rotation", "center": [0.4, 0.4], "rate": 90.0}
-    solids = [box([0.5, 0.38], [0.7, 0.42], motion=motion), {"shape": "plane", "point": [0.0, 0.05], "normal": [0.0, 1.0]}]
-    simulation = create(scene(size=[0.8, 0.8], resolution=20, liquid=[box([0, 0], [0.8, 0.3])], solid=solids, output=FORCES))
+    solids = [
+        box([0.5, 0.38], [0.7, 0.42], motion=motion),
+        {"shape": "plane", "point": [0.0, 0.05], "normal": [0.0, 1.0]},
+    ]
+    simulation = create(
+        scene(
+            size=[0.8, 0.8],
+            resolution=20,
+            liquid=[box([0, 0], [0.8, 0.3])],
+            solid=solids,
+            output=FORCES,
+        )
+    )
     advance(simulation, 1.0)
     turned = np.radians(90.0 * (simulation.time - simulation.last_dt))
-    assert simulation.forces.references[1] == pytest.approx([0.4 + 0.2 * np.cos(turned), 0.4 + 0.2 * np.sin(turned), 0.0], abs=1e-9)
+    assert simulation.forces.references[1] == pytest.approx(
+        [0.4 + 0.2 * np.cos(turned), 0.4 + 0.2 * np.sin(turned), 0.0], abs=1e-9
+    )
     assert (simulation.forces.references[[0, 2]] == 0.0).all()
     assert set(simulation.tables()) == {"forces"}
     assert simulation.tables()["forces"][-1] == "solid1_torque"
 
 
 def test_an_interrupted_run_writes_the_same_table(tmp_path: Path) -> None:
-    overrides = ["domain.resolution=24", "time.duration=0.3", "output.checkpoint_every=5", "output.forces=true"]
+    overrides = [
+        "domain.resolution=24",
+        "time.duration=0.3",
+        "output.checkpoint_every=5",
+        "output.forces=true",
+    ]
     model, asked = load_scene("dam-break-2d", overrides), itertools.count(1)
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     assert run_into(model, whole).status == "finished"

@@ -25,7 +25,16 @@ def tank(dimension: int, cells: int, *, angle: float = 90.0, **tables: Any) -> L
     liquid = [box([0.0] * dimension, [side / 2] * dimension)]
     tension = {"coefficient": 1.0, "contact_angle": angle}
     physics = {"density": 1.0, "gravity": [0.0] * dimension}
-    return create(scene(size=[side] * dimension, resolution=cells, liquid=liquid, surface_tension=tension, physics=physics, **tables))
+    return create(
+        scene(
+            size=[side] * dimension,
+            resolution=cells,
+            liquid=liquid,
+            surface_tension=tension,
+            physics=physics,
+            **tables,
+        )
+    )
 
 
 def centers(simulation: LiquidSimulation) -> np.ndarray:
@@ -42,7 +51,9 @@ def take(simulation: LiquidSimulation, distance: np.ndarray) -> tuple[SurfaceTen
     kind[(kind == wl.AIR) & (distance < 0.0)] = wl.FLUID
     simulation.surface.phi.assign(np.clip(distance, -1.5, 1.5).astype(np.float32))
     simulation.projection.kind.assign(kind)
-    simulation.tension.act(simulation.velocity, simulation.grid.everywhere, simulation.projection.kind, 1e-3)
+    simulation.tension.act(
+        simulation.velocity, simulation.grid.everywhere, simulation.projection.kind, 1e-3
+    )
     return simulation.tension, kind
 
 
@@ -53,23 +64,41 @@ def curvatures(simulation: LiquidSimulation, distance: np.ndarray) -> np.ndarray
     return np.asarray(jump[jump != 0.0])
 
 
-def measured(simulation: LiquidSimulation, liquid: np.ndarray, open_: np.ndarray, points: int) -> np.ndarray:
+def measured(
+    simulation: LiquidSimulation, liquid: np.ndarray, open_: np.ndarray, points: int
+) -> np.ndarray:
     """Return the distance that evenly spread particles would say.
 
     Args:
         simulation: of unit cells.
-        liquid: whether it is at each of `points` an axis and cell, two cells beyond the domain, in the order of the stored cells.
+        liquid: whether it is at each of `points` an axis and cell, two cells beyond the domain, in
+            the order of the stored cells.
         open_: whether no solid is there.
         points: how many.
     """
     filled, room = (liquid & open_).astype(np.float64), open_.astype(np.float64)
     for axis, count in enumerate(simulation.grid.counts[::-1]):
         if filled.shape[axis] > 1:
-            t = np.abs((np.arange((count + 4) * points) + 0.5) / points - 2.0 - np.arange(count)[:, None] - 0.5)
-            kernel = np.where(t < 0.5, 0.75 - t * t, np.where(t < 1.5, 0.5 * (1.5 - t) ** 2, 0.0)) / points
-            filled, room = (np.moveaxis(np.tensordot(kernel, of, axes=(1, axis)), 0, axis) for of in (filled, room))
+            t = np.abs(
+                (np.arange((count + 4) * points) + 0.5) / points
+                - 2.0
+                - np.arange(count)[:, None]
+                - 0.5
+            )
+            kernel = (
+                np.where(t < 0.5, 0.75 - t * t, np.where(t < 1.5, 0.5 * (1.5 - t) ** 2, 0.0))
+                / points
+            )
+            filled, room = (
+                np.moveaxis(np.tensordot(kernel, of, axes=(1, axis)), 0, axis)
+                for of in (filled, room)
+            )
     places = np.linspace(-1.5, 1.5, 3001)
-    shares = np.where(np.abs(places) < 0.5, 0.5 - 0.75 * np.abs(places) + np.abs(places) ** 3 / 3.0, (1.5 - np.abs(places)) ** 3 / 6.0)
+    shares = np.where(
+        np.abs(places) < 0.5,
+        0.5 - 0.75 * np.abs(places) + np.abs(places) ** 3 / 3.0,
+        (1.5 - np.abs(places)) ** 3 / 6.0,
+    )
     shares = np.where(places > 0.0, 1.0 - shares, shares)
     distance = np.full(simulation.grid.shape, 1.5)
     distance[1:-1, 1:-1, 1:-1] = -np.interp(filled / np.maximum(room, 1e-9), shares, places)
@@ -78,7 +107,10 @@ def measured(simulation: LiquidSimulation, liquid: np.ndarray, open_: np.ndarray
 
 def samples(simulation: LiquidSimulation, points: int) -> np.ndarray:
     """Return the points (x, y, z) of `measured`, in cells."""
-    axes = [(np.arange((n + 4) * points) + 0.5) / points - 2.0 if n > 1 else np.zeros(1) for n in simulation.grid.counts[::-1]]
+    axes = [
+        (np.arange((n + 4) * points) + 0.5) / points - 2.0 if n > 1 else np.zeros(1)
+        for n in simulation.grid.counts[::-1]
+    ]
     return np.stack(np.meshgrid(*axes, indexing="ij")[::-1], axis=-1)
 
 
@@ -99,9 +131,17 @@ def test_the_curvature_of_a_sphere(dimension: int, radius: float, sign: float) -
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("at", [1, 5])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_the_surface_is_looked_for_nearby_and_inside_the_grid(dimension: int, at: int, sign: float) -> None:
+def test_the_surface_is_looked_for_nearby_and_inside_the_grid(
+    dimension: int, at: int, sign: float
+) -> None:
     """Where the distance hardly changes, its slope says 15 cells, of which 1.5 slopes are gone; ghost cells count for nothing."""
-    simulation = create(scene(size=[1.0] * dimension, resolution=10, liquid=[box([0.0] * dimension, [0.5] * dimension)]))
+    simulation = create(
+        scene(
+            size=[1.0] * dimension,
+            resolution=10,
+            liquid=[box([0.0] * dimension, [0.5] * dimension)],
+        )
+    )
     grid, field = simulation.grid, simulation.grid.field
     once, twice, bend, jump = (field() for _ in range(4))
     i = np.broadcast_to(np.arange(once.shape[2], dtype=np.float32), once.shape)
@@ -113,10 +153,14 @@ def test_the_surface_is_looked_for_nearby_and_inside_the_grid(dimension: int, at
     kind = grid.field(wp.int8)
     kind.assign(np.where(i <= at, wl.FLUID, wl.AIR).astype(np.int8))
     numbers = {"planes": grid.planes, "linear": 1.0, "cubic": 0.0, "scale": 2.0}
-    grid.everywhere.run(kernels.JUMP, once=once, twice=twice, bend=bend, jump=jump, kind=kind, **numbers)
+    grid.everywhere.run(
+        kernels.JUMP, once=once, twice=twice, bend=bend, jump=jump, kind=kind, **numbers
+    )
     found = jump.numpy()[1:-1, 1:-1, 1:-1] if dimension == 3 else jump.numpy()[1, 1:-1, 1:-1]
     expected = 2.0 * np.maximum(np.array([at, at + 1]) - 1.5 * 0.02, 1.0)
-    np.testing.assert_allclose(found[..., at - 1 : at + 1], np.broadcast_to(expected, (*found.shape[:-1], 2)), rtol=1e-4)
+    np.testing.assert_allclose(
+        found[..., at - 1 : at + 1], np.broadcast_to(expected, (*found.shape[:-1], 2)), rtol=1e-4
+    )
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -130,9 +174,15 @@ def test_the_push_is_a_jump_of_the_pressure(dimension: int) -> None:
     window, projection = simulation.grid.everywhere, simulation.projection
     for axis, field in enumerate(simulation.velocity):
         window.run(
-            tension._passes.push, kind=projection.kind, phi=simulation.surface.phi, planes=simulation.grid.planes, jump=tension.jump,
-            field=field, axis=axis, **{f"{what}_{a}": None for what in ("open", "solid") for a in "xyz"},
-        )  # fmt: skip
+            tension._passes.push,
+            kind=projection.kind,
+            phi=simulation.surface.phi,
+            planes=simulation.grid.planes,
+            jump=tension.jump,
+            field=field,
+            axis=axis,
+            **{f"{what}_{a}": None for what in ("open", "solid") for a in "xyz"},
+        )
     assert max(np.abs(field.numpy()).max() for field in simulation.velocity) > 0.25
     projection.tolerance = 1e-8
     assert projection.prepare(simulation.velocity, 1e-3, 1e-3)
@@ -140,15 +190,32 @@ def test_the_push_is_a_jump_of_the_pressure(dimension: int) -> None:
     assert result
     projection.project(simulation.velocity, window, result, criteria)
     np.testing.assert_allclose(projection.pressure.numpy()[kind == wl.FLUID], 0.25, rtol=1e-5)
-    assert max(np.abs(field.numpy()).max() for field in simulation.velocity) < 1e-4  # the push is up to 0.25 / theta
+    # the push is up to 0.25 / theta
+    assert max(np.abs(field.numpy()).max() for field in simulation.velocity) < 1e-4
 
 
 @pytest.mark.parametrize("angle", [50.0, 90.0, 130.0])
-@pytest.mark.parametrize(("dimension", "degrees"), [(2, 0.0), (2, 10.0), (2, 25.0), (3, 0.0), (3, 25.0)])
-def test_a_plane_at_the_contact_angle_is_straight(angle: float, dimension: int, degrees: float) -> None:
+@pytest.mark.parametrize(
+    ("dimension", "degrees"), [(2, 0.0), (2, 10.0), (2, 25.0), (3, 0.0), (3, 25.0)]
+)
+def test_a_plane_at_the_contact_angle_is_straight(
+    angle: float, dimension: int, degrees: float
+) -> None:
     cells, slope = 32 if dimension == 2 else 24, math.radians(degrees)
     normal = [math.sin(slope), math.cos(slope), 0.0]
-    wall = {"solid": [{"shape": "plane", "point": [cells / 2, 8.0, 0.0][:dimension], "normal": normal[:dimension]}]} if slope else {}
+    wall = (
+        {
+            "solid": [
+                {
+                    "shape": "plane",
+                    "point": [cells / 2, 8.0, 0.0][:dimension],
+                    "normal": normal[:dimension],
+                }
+            ]
+        }
+        if slope
+        else {}
+    )
     foot = np.array([cells / 2 + 0.3, 8.0 - 0.3 * math.tan(slope) if slope else 0.0, 0.0])
     tilt = math.radians(angle) - slope  # of the surface, whose liquid lies to its right
     found = {}
@@ -159,34 +226,65 @@ def test_a_plane_at_the_contact_angle_is_straight(angle: float, dimension: int, 
         if slope:
             open_ &= (at - [cells / 2, 8.0, 0.0]) @ normal > 0.0
         liquid = (at - foot) @ (-math.sin(tilt), math.cos(tilt), 0.0) < 0.0
-        tension, _ = take(simulation, measured(simulation, liquid, open_, 10 if dimension == 2 else 4))
+        tension, _ = take(
+            simulation, measured(simulation, liquid, open_, 10 if dimension == 2 else 4)
+        )
         away = (centers(simulation) - foot) * (1.0, 1.0, 0.0)
         near = np.linalg.norm(away, axis=-1) < 6.0
         if dimension == 3:
-            near &= np.abs(centers(simulation)[..., 2] - cells / 2) < 2.0  # the sides have the angle, too
+            # the sides have the angle, too
+            near &= np.abs(centers(simulation)[..., 2] - cells / 2) < 2.0
         found[given] = np.abs(tension.jump.numpy()[near]).max() / 1e-3
     assert found[angle] < 0.03
     assert found[angle - 30.0] > 0.06
 
 
-def meniscus(width: int, angle: float, offset: float, rng: np.random.Generator) -> tuple[LiquidSimulation, np.ndarray, float, float]:
+def meniscus(
+    width: int, angle: float, offset: float, rng: np.random.Generator
+) -> tuple[LiquidSimulation, np.ndarray, float, float]:
     """Return an arc between plates, the left one's end at `offset` of a cell or the domain's side: distance, radius, where it begins."""
-    radius, low, depth = 0.5 * width / math.cos(math.radians(angle)), 3.0 + offset if offset else 0.0, 9.0
+    radius, low, depth = (
+        0.5 * width / math.cos(math.radians(angle)),
+        3.0 + offset if offset else 0.0,
+        9.0,
+    )
     high = low + width
     size = [float(math.ceil(high + low)), width + 18.0]
-    plates: dict[str, Any] = {"solid": [box([-9.0, -9.0], [low, 99.0]), box([high, -9.0], [size[0] + 9.0, 99.0])]} if offset else {}
-    physics, tension = {"density": 1.0, "gravity": [0.0, 0.0]}, {"coefficient": 1.0, "contact_angle": angle}
-    plates |= {"liquid": [box([low, 0.0], [high, depth])], "physics": physics, "surface_tension": tension}
+    plates: dict[str, Any] = (
+        {"solid": [box([-9.0, -9.0], [low, 99.0]), box([high, -9.0], [size[0] + 9.0, 99.0])]}
+        if offset
+        else {}
+    )
+    physics, tension = (
+        {"density": 1.0, "gravity": [0.0, 0.0]},
+        {"coefficient": 1.0, "contact_angle": angle},
+    )
+    plates |= {
+        "liquid": [box([low, 0.0], [high, depth])],
+        "physics": physics,
+        "surface_tension": tension,
+    }
     simulation = create(scene(size=size, resolution=int(max(size)), **plates))
     middle = np.array([0.5 * (low + high), depth + rng.uniform(-0.5, 0.5) + radius, 0.0])
     at = samples(simulation, 12)
     inside = np.linalg.norm(at - middle, axis=-1) < abs(radius)
-    below = (at[..., 1] < middle[1]) & ~inside if radius > 0.0 else inside | (at[..., 1] < middle[1])
-    return simulation, measured(simulation, below, (at[..., 0] > low) & (at[..., 0] < high) & (at[..., 1] > 0.0), 12), radius, low
+    below = (
+        (at[..., 1] < middle[1]) & ~inside if radius > 0.0 else inside | (at[..., 1] < middle[1])
+    )
+    return (
+        simulation,
+        measured(
+            simulation, below, (at[..., 0] > low) & (at[..., 0] < high) & (at[..., 1] > 0.0), 12
+        ),
+        radius,
+        low,
+    )
 
 
 @pytest.mark.parametrize("angle", [30.0, 60.0, 120.0])
-@pytest.mark.parametrize(("width", "offset"), [(12, 0.0), (24, 0.0), (12, 0.25), (12, 1 / 3), (12, 0.5)])
+@pytest.mark.parametrize(
+    ("width", "offset"), [(12, 0.0), (24, 0.0), (12, 0.25), (12, 1 / 3), (12, 0.5)]
+)
 def test_a_meniscus_has_the_curvature_of_its_arc(width: int, offset: float, angle: float) -> None:
     """Between walls: 2 cos(angle) / width. The mean, what liquid rises by, was 8 % off where walls cut cells."""
     rng, found = np.random.default_rng(17), []
@@ -213,10 +311,15 @@ def test_the_widest_filter_bends_no_flat_surface_beside_a_wall(angle: float) -> 
     assert tension._passes_for(kick) == MOST_PASSES
     for _ in range(8):
         foot = 16.0 + 6.0 * cosine + rng.uniform(-0.5, 0.5)
-        liquid, open_ = at[..., 0] * cosine + (at[..., 1] - foot) * sine < 0.0, ((at > 0.0) & (at < 32.0))[..., :2].all(axis=-1)
+        liquid, open_ = (
+            at[..., 0] * cosine + (at[..., 1] - foot) * sine < 0.0,
+            ((at > 0.0) & (at < 32.0))[..., :2].all(axis=-1),
+        )
         distance = measured(simulation, liquid, open_, 10)
         _, kind = take(simulation, distance)
-        tension.act(simulation.velocity, simulation.grid.everywhere, simulation.projection.kind, kick)
+        tension.act(
+            simulation.velocity, simulation.grid.everywhere, simulation.projection.kind, kick
+        )
         turn = 0.0
         for i in range(1, 5):
             j = np.flatnonzero((kind[1, :-1, i] == wl.FLUID) & (kind[1, 1:, i] == wl.AIR))[-1]
@@ -232,7 +335,10 @@ def test_cells_of_walls_mirror_what_is_before_them() -> None:
     blocked, cells, points, way, raised = wall_cells(simulation.grid, base, None)
     assert (raised == 0.0).all()
     assert ((blocked != 0)[1, 1:-1, 1:-1] == (base == wl.SOLID)[1, 1:-1, 1:-1]).all()
-    found = {tuple(np.array(np.unravel_index(c, base.shape))[::-1]): (p, w) for c, p, w in zip(cells, points, way, strict=True)}
+    found = {
+        tuple(np.array(np.unravel_index(c, base.shape))[::-1]): (p, w)
+        for c, p, w in zip(cells, points, way, strict=True)
+    }
     for cell, (point, length) in {
         (0, 3, 1): ((1, 3, 1), 1.0),  # the domain's left wall
         (0, 0, 1): ((1, 1, 1), 2.0),  # its corner
@@ -249,9 +355,14 @@ def drop(across: int, dimension: int = 2, *, seed: int = 2015, **tables: Any) ->
     liquid = [{"shape": "sphere", "center": [side / 2] * dimension, "radius": RADIUS}]
     settings = {"particles": {"seed": seed}, "surface_tension": WATER} | tables
     return create(
-        scene(size=[side] * dimension, resolution=across * (4 if dimension == 2 else 3) // 2, liquid=liquid,
-              physics={"gravity": [0.0] * dimension}, **settings)
-    )  # fmt: skip
+        scene(
+            size=[side] * dimension,
+            resolution=across * (4 if dimension == 2 else 3) // 2,
+            liquid=liquid,
+            physics={"gravity": [0.0] * dimension},
+            **settings,
+        )
+    )
 
 
 def capillary_step(simulation: LiquidSimulation) -> float:
@@ -262,17 +373,27 @@ def capillary_step(simulation: LiquidSimulation) -> float:
 def laplace(simulation: LiquidSimulation, dimension: int) -> float:
     """Return the pressure deep inside over sigma kappa."""
     assert simulation.surface.phi is not None
-    deep = (simulation.projection.cells.numpy() == wl.FLUID) & (simulation.surface.phi.numpy() < -1.4)
-    return float(simulation.projection.pressures(RHO)[deep].mean()) * RADIUS / ((dimension - 1) * SIGMA)
+    deep = (simulation.projection.cells.numpy() == wl.FLUID) & (
+        simulation.surface.phi.numpy() < -1.4
+    )
+    return (
+        float(simulation.projection.pressures(RHO)[deep].mean())
+        * RADIUS
+        / ((dimension - 1) * SIGMA)
+    )
 
 
-@pytest.mark.parametrize(("across", "dimension", "error"), [(16, 2, 0.03), (32, 2, 0.02), (16, 3, 0.05), (32, 3, 0.02)])
+@pytest.mark.parametrize(
+    ("across", "dimension", "error"), [(16, 2, 0.03), (32, 2, 0.02), (16, 3, 0.05), (32, 3, 0.02)]
+)
 def test_the_pressure_in_a_drop(across: int, dimension: int, error: float) -> None:
     simulation = drop(across, dimension)
     rows = advance(simulation, 0.2 * TIME, capillary_step(simulation))
     assert laplace(simulation, dimension) == pytest.approx(1.0, abs=error)
     area = 2.0 * math.pi * RADIUS * (1.0 if dimension == 2 else 2.0 * RADIUS)
-    assert rows[-1]["surface_energy"] == pytest.approx(SIGMA * area, rel=0.08 if across == 16 else 0.03)
+    assert rows[-1]["surface_energy"] == pytest.approx(
+        SIGMA * area, rel=0.08 if across == 16 else 0.03
+    )
 
 
 @pytest.mark.parametrize(("times", "bound"), [(1.0, 1e-2), (10.0, 1e-2)])
@@ -300,18 +421,24 @@ def frequency(times: list[float], values: list[float], guess: float) -> tuple[fl
     def decaying(t: np.ndarray, a: float, b: float, w: float, c: float, d: float) -> np.ndarray:
         return np.exp(-c * t) * (a * np.cos(w * t) + b * np.sin(w * t)) + d
 
-    found, _ = curve_fit(decaying, np.array(times), np.array(values), p0=[values[0], 0.0, guess, 0.01 * guess, 0.0])
+    found, _ = curve_fit(
+        decaying, np.array(times), np.array(values), p0=[values[0], 0.0, guess, 0.01 * guess, 0.0]
+    )
     return float(found[2]) / guess, float(found[3]) / guess
 
 
-def oscillation(across: int, dimension: int, times: float, periods: float = 1.6) -> tuple[float, float]:
+def oscillation(
+    across: int, dimension: int, times: float, periods: float = 1.6
+) -> tuple[float, float]:
     """Return the frequency of an ellipsoid over Lamb's, and its damping."""
     guess = math.sqrt((6.0 if dimension == 2 else 8.0) / TIME**2)
     simulation, stretch = drop(across, dimension), 0.05
     middle = simulation.grid.extent[0] / 2
     position = simulation.particles.position.numpy()
     position[:, 0] = middle + (position[:, 0] - middle) * math.exp(stretch)
-    position[:, 1:dimension] = middle + (position[:, 1:dimension] - middle) * math.exp(-stretch / (dimension - 1))
+    position[:, 1:dimension] = middle + (position[:, 1:dimension] - middle) * math.exp(
+        -stretch / (dimension - 1)
+    )
     moved(simulation, position)
     at, shape = [], []
     while simulation.time < periods * 2.0 * math.pi / guess:
@@ -345,7 +472,12 @@ def wave(cells: int, times: float = 1.0) -> float:
     liquid = [box([0.0, 0.0], [length, depth])]
     simulation = create(
         scene(
-            size=[length, length], resolution=cells, liquid=liquid, wall="free-slip", physics={"gravity": [0.0, 0.0]}, surface_tension=WATER
+            size=[length, length],
+            resolution=cells,
+            liquid=liquid,
+            wall="free-slip",
+            physics={"gravity": [0.0, 0.0]},
+            surface_tension=WATER,
         )
     )
     position = simulation.particles.position.numpy()
@@ -369,7 +501,8 @@ def test_a_capillary_wave() -> None:
 @pytest.mark.slow
 def test_capillary_waves_converge() -> None:
     assert wave(64, 3.0) == pytest.approx(1.0, abs=0.012)
-    assert wave(32, 10.0) == pytest.approx(1.0, abs=0.05)  # the widest filter takes part of so short a wave
+    # the widest filter takes part of so short a wave
+    assert wave(32, 10.0) == pytest.approx(1.0, abs=0.05)
 
 
 def cap(angle: float, given: float) -> tuple[LiquidSimulation, float, float]:
@@ -417,7 +550,10 @@ def test_without_the_table_there_is_none() -> None:
     ("tables", "message"),
     [
         ({"surface_tension": {"coefficient": 0.0}}, "greater than 0"),
-        ({"surface_tension": {"coefficient": 0.1, "contact_angle": 181.0}}, "less than or equal to 180"),
+        (
+            {"surface_tension": {"coefficient": 0.1, "contact_angle": 181.0}},
+            "less than or equal to 180",
+        ),
         ({"surface_tension": WATER, "pressure": {"surface": "voxel"}}, "ghost-fluid"),
         ({"surface_tension": WATER, "pressure": {"model": "unilateral"}}, "incompressible"),
     ],
@@ -432,12 +568,29 @@ def test_what_cannot_be_is_refused(tables: dict[str, Any], message: str) -> None
 def test_a_splash_is_no_faster_where_walls_let_go(dimension: int, angle: float) -> None:
     """What the surface pulls with beside a wall that lets go is borne by the liquid there, however near to its center the surface lies."""
     low, high = [0.1, 0.2, 0.3][:dimension], [0.5, 0.4, 0.5][:dimension]
-    drop = [box([0.6, 0.3, 0.1][:dimension], [0.8, 0.45, 0.3][:dimension], velocity=[-1.0, 0.5, 0.7][:dimension])]
+    drop = [
+        box(
+            [0.6, 0.3, 0.1][:dimension],
+            [0.8, 0.45, 0.3][:dimension],
+            velocity=[-1.0, 0.5, 0.7][:dimension],
+        )
+    ]
     ball = [{"shape": "sphere", "center": [0.5, 0.15, 0.25][:dimension], "radius": 0.12}]
-    tables = {"surface_tension": {"coefficient": 5.0, "contact_angle": angle}, "solid": ball, "liquid": [box(low, high), *drop]}
+    tables = {
+        "surface_tension": {"coefficient": 5.0, "contact_angle": angle},
+        "solid": ball,
+        "liquid": [box(low, high), *drop],
+    }
     fastest = {}
     for wall in ("separating", "free-slip"):
-        simulation = create(scene(size=[1.0, 0.5, 0.5][:dimension], resolution={2: 40, 3: 24}[dimension], wall=wall, **tables))
+        simulation = create(
+            scene(
+                size=[1.0, 0.5, 0.5][:dimension],
+                resolution={2: 40, 3: 24}[dimension],
+                wall=wall,
+                **tables,
+            )
+        )
         fastest[wall] = max(row["max_speed"] for row in advance(simulation, 0.15, 0.01))
     assert fastest["separating"] < 1.2 * fastest["free-slip"]
 
@@ -447,20 +600,41 @@ def test_a_drop_hangs_from_a_ceiling_that_lets_go_if_it_wets_it(angle: float, ha
     """Of 7.8 mm of free fall: the air holds up what clings to the ceiling by its surface, and nothing holds up what does not."""
     drop = {"shape": "sphere", "center": [0.01, 0.01], "radius": 0.004}
     tension = {"coefficient": 0.072, "contact_angle": angle}
-    simulation = create(scene(size=[0.02, 0.01], resolution=40, liquid=[drop], surface_tension=tension, wall="separating"))
+    simulation = create(
+        scene(
+            size=[0.02, 0.01],
+            resolution=40,
+            liquid=[drop],
+            surface_tension=tension,
+            wall="separating",
+        )
+    )
     before = simulation.particles.position.numpy()[:, 1].mean()
     advance(simulation, 0.04, 1e-3)
     fallen = before - simulation.particles.position.numpy()[:, 1].mean()
     assert fallen < 0.001 if hangs else fallen > 0.005
 
 
-@pytest.mark.parametrize(("width", "angle"), [(0.004, 30.0), (0.004, 70.0), (0.008, 20.0), (0.008, 60.0)])
+@pytest.mark.parametrize(
+    ("width", "angle"), [(0.004, 30.0), (0.004, 70.0), (0.008, 20.0), (0.008, 60.0)]
+)
 def test_a_meniscus_rises_along_walls_that_let_go(width: float, angle: float) -> None:
     """The pressure in it is below that of the air, down to some cells below the surface too, and no air gets there."""
-    tension, liquid = {"coefficient": 0.072, "contact_angle": angle}, [box([0.0, 0.0], [width, 0.006])]
+    tension, liquid = (
+        {"coefficient": 0.072, "contact_angle": angle},
+        [box([0.0, 0.0], [width, 0.006])],
+    )
     fastest = {}
     for wall in ("separating", "free-slip"):
-        simulation = create(scene(size=[width, 0.012], resolution=36, liquid=liquid, surface_tension=tension, wall=wall))
+        simulation = create(
+            scene(
+                size=[width, 0.012],
+                resolution=36,
+                liquid=liquid,
+                surface_tension=tension,
+                wall=wall,
+            )
+        )
         fastest[wall] = max(row["max_speed"] for row in advance(simulation, 0.04, 1e-3))
     assert fastest["separating"] < 1.1 * fastest["free-slip"]
 
@@ -469,22 +643,40 @@ def test_a_meniscus_rises_along_walls_that_let_go(width: float, angle: float) ->
 def test_liquid_rises_between_plates(angle: float) -> None:
     """By 2 sigma cos(angle) / (rho g width) over its pressure's level, 12 cells apart and 30, the mean over the width."""
     plate, bath = box([0.004, 0.002], [0.006, 0.02]), [box([0.0, 0.0], [0.016, 0.006])]
-    tables = {"solid": [plate], "viscosity": {"value": 0.05, "slip_length": math.inf}, "particles": {"transfer": "pic"}}
+    tables = {
+        "solid": [plate],
+        "viscosity": {"value": 0.05, "slip_length": math.inf},
+        "particles": {"transfer": "pic"},
+    }
     tension = {"coefficient": SIGMA, "contact_angle": angle}
-    simulation = create(scene(size=[0.016, 0.014], resolution=48, liquid=bath, surface_tension=tension, **tables))
+    simulation = create(
+        scene(size=[0.016, 0.014], resolution=48, liquid=bath, surface_tension=tension, **tables)
+    )
     rises = []
     while simulation.time < 0.5:
         simulation.step(min(simulation.stable_dt(), 0.02))
         x, y = simulation.particles.position.numpy()[:, :2].T
         area = simulation.particle_mass / RHO
-        levels = [float(((x > low) & (x < high) & (y > 0.002)).sum()) * area / (high - low) for low, high in ((0.0, 0.004), (0.006, 0.016))]
+        levels = [
+            float(((x > low) & (x < high) & (y > 0.002)).sum()) * area / (high - low)
+            for low, high in ((0.0, 0.004), (0.006, 0.016))
+        ]
         rises += [levels[0] - levels[1]] if simulation.time > 0.3 else []
-    expected = 2.0 * SIGMA * math.cos(math.radians(angle)) / (RHO * 9.81) * (1.0 / 0.004 - 1.0 / 0.01)
+    expected = (
+        2.0 * SIGMA * math.cos(math.radians(angle)) / (RHO * 9.81) * (1.0 / 0.004 - 1.0 / 0.01)
+    )
     assert np.mean(rises) == pytest.approx(expected, rel=0.03)
 
 
 def test_a_full_box_has_no_surface() -> None:
-    simulation = create(scene(size=[1.0, 1.0], resolution=8, liquid=[box([0.0, 0.0], [1.0, 1.0])], surface_tension=WATER))
+    simulation = create(
+        scene(
+            size=[1.0, 1.0],
+            resolution=8,
+            liquid=[box([0.0, 0.0], [1.0, 1.0])],
+            surface_tension=WATER,
+        )
+    )
     assert simulation.tension is None
     assert simulation.step(1e-3)["max_speed"] < 1e-5
 
@@ -493,7 +685,18 @@ def test_a_moving_solid_and_short_steps_are_taken_along() -> None:
     motion = {"kind": "translation", "velocity": [0.1, 0.0]}
     solid = [{"shape": "sphere", "center": [0.02, 0.01], "radius": 0.004, "motion": motion}]
     liquid = [box([0.0, 0.0], [0.04, 0.01])]
-    simulation = create(scene(size=[0.04, 0.02], resolution=32, liquid=liquid, solid=solid, surface_tension=WATER, cfl=0.4))
+    simulation = create(
+        scene(
+            size=[0.04, 0.02],
+            resolution=32,
+            liquid=liquid,
+            solid=solid,
+            surface_tension=WATER,
+            cfl=0.4,
+        )
+    )
     rows = advance(simulation, 0.01)
-    assert simulation.projection.jump is not None and isinstance(simulation.projection.jump, wp.array)
+    assert simulation.projection.jump is not None and isinstance(
+        simulation.projection.jump, wp.array
+    )
     assert max(row["max_speed"] for row in rows) < 0.4

@@ -23,7 +23,9 @@ def thin_walls(monkeypatch):
     monkeypatch.setattr(ThinWalls, "enabled", True)
 
 
-def bottle(dimension: int, thickness: float, motion: dict[str, Any] | None = None, **place: Any) -> tuple[list[dict[str, Any]], np.ndarray]:
+def bottle(
+    dimension: int, thickness: float, motion: dict[str, Any] | None = None, **place: Any
+) -> tuple[list[dict[str, Any]], np.ndarray]:
     """Return the walls of a closed box, some cells thick and off the grid, and the ends of its inside along each axis."""
     ends = np.array([[0.5 - 0.3 + 0.3 * CELL, 0.5 + 0.3 + 0.1 * CELL]] * dimension)
     solids = []
@@ -31,7 +33,9 @@ def bottle(dimension: int, thickness: float, motion: dict[str, Any] | None = Non
         for side in range(2):
             low, high = ends[:, 0] - thickness * CELL, ends[:, 1] + thickness * CELL
             (low if side else high)[axis] = ends[axis, side]
-            solids.append(box(low.tolist(), high.tolist(), **place, **({"motion": motion} if motion else {})))
+            solids.append(
+                box(low.tolist(), high.tolist(), **place, **({"motion": motion} if motion else {}))
+            )
     return solids, ends
 
 
@@ -56,7 +60,9 @@ def inside(simulation: LiquidSimulation, ends: np.ndarray) -> bool:
 @pytest.mark.parametrize("thickness", [0.05, 0.5, 1.28])
 def test_a_closed_bottle_keeps_all(thickness: float, motion: dict[str, Any] | None) -> None:
     solids, ends = bottle(2, thickness, motion)
-    simulation = create(scene(size=[1.0, 1.0], resolution=CELLS, liquid=filled(ends), solid=solids, cfl=4.0))
+    simulation = create(
+        scene(size=[1.0, 1.0], resolution=CELLS, liquid=filled(ends), solid=solids, cfl=4.0)
+    )
     rows = advance(simulation, 0.4)
     assert inside(simulation, ends)
     assert all(row["solve_status"] in (None, "CONVERGED") for row in rows)
@@ -66,7 +72,9 @@ def test_a_closed_bottle_keeps_all(thickness: float, motion: dict[str, Any] | No
 
 def test_a_closed_bottle_in_space_keeps_all() -> None:
     solids, ends = bottle(3, 0.4, SHAKEN | {"amplitude": [0.1, 0.0, 0.05]})
-    simulation = create(scene(size=[1.0] * 3, resolution=CELLS, liquid=filled(ends, 0.3), solid=solids))
+    simulation = create(
+        scene(size=[1.0] * 3, resolution=CELLS, liquid=filled(ends, 0.3), solid=solids)
+    )
     advance(simulation, 0.15)
     assert inside(simulation, ends)
 
@@ -76,8 +84,13 @@ def test_a_closed_bottle_in_space_keeps_all() -> None:
 def test_a_plate_bears_the_pool_on_it(thickness: float, offset: float) -> None:
     n = 24
     top = (8.0 + offset) / n
-    plate, pool = box([-0.1, top - thickness / n], [1.1, top]), box([0.0, top], [1.0, top + 10.0 / n])
-    simulation = create(scene(size=[1.0, 1.0], resolution=n, liquid=[pool], solid=[plate], output={"forces": True}))
+    plate, pool = (
+        box([-0.1, top - thickness / n], [1.1, top]),
+        box([0.0, top], [1.0, top + 10.0 / n]),
+    )
+    simulation = create(
+        scene(size=[1.0, 1.0], resolution=n, liquid=[pool], solid=[plate], output={"forces": True})
+    )
     loads = []
     for _ in range(8):
         advance(simulation, simulation.time + 0.05)
@@ -97,15 +110,23 @@ def test_pools_on_two_sides_of_a_plate_stay_apart(thickness: float) -> None:
     advance(simulation, 0.5)
     x, y, _ = simulation.particles.position.numpy().T
     assert np.count_nonzero(x < at) == left and not ((x > at) & (x < other)).any()
-    assert np.percentile(y[x < at], 99) == pytest.approx(0.5, abs=0.03) and np.percentile(y[x > at], 99) == pytest.approx(0.2, abs=0.03)
+    assert np.percentile(y[x < at], 99) == pytest.approx(0.5, abs=0.03) and np.percentile(
+        y[x > at], 99
+    ) == pytest.approx(0.2, abs=0.03)
     assert np.abs(simulation.particles.velocity.numpy()).max() < 0.05
 
 
 def test_a_thin_piston_takes_all_along() -> None:
     """At 1 m/s and CFL 8 it goes several cells a step, each many times its thickness."""
-    piston = box([0.1, -0.2], [0.1 + 0.2 * CELL, 1.2], motion={"kind": "translation", "velocity": [1.0, 0.0], "stop": 0.3})
+    piston = box(
+        [0.1, -0.2],
+        [0.1 + 0.2 * CELL, 1.2],
+        motion={"kind": "translation", "velocity": [1.0, 0.0], "stop": 0.3},
+    )
     pool = box([0.1 + 0.2 * CELL, 0.0], [1.0, 0.3])
-    simulation = create(scene(size=[1.0, 1.0], resolution=CELLS, liquid=[pool], solid=[piston], cfl=8.0))
+    simulation = create(
+        scene(size=[1.0, 1.0], resolution=CELLS, liquid=[pool], solid=[piston], cfl=8.0)
+    )
     advance(simulation, 0.4, dt_max=0.1)
     assert simulation.particles.position.numpy()[:, 0].min() > 0.4
 
@@ -113,7 +134,14 @@ def test_a_thin_piston_takes_all_along() -> None:
 def test_gaps_narrower_than_a_cell_are_told() -> None:
     def notes(gap: float) -> list[str]:
         plates = [box([-0.1, 0.42], [0.5, 0.43]), box([0.5 + gap, 0.42], [1.1, 0.43])]
-        simulation = create(scene(size=[1.0, 1.0], resolution=CELLS, liquid=[box([0.0, 0.5], [1.0, 0.7])], solid=plates))
+        simulation = create(
+            scene(
+                size=[1.0, 1.0],
+                resolution=CELLS,
+                liquid=[box([0.0, 0.5], [1.0, 0.7])],
+                solid=plates,
+            )
+        )
         return [note for note in simulation.notes() if "gap" in note]
 
     assert notes(0.0) == [] and notes(3.0 * CELL) == []

@@ -11,9 +11,13 @@ from warp_lcp.fluids import LiquidSimulation
 UNILATERAL = {"pressure": {"model": "unilateral"}}
 
 
-def liquid(size: list[float], blocks: list[dict[str, Any]], resolution: int = 32, **tables: Any) -> LiquidSimulation:
+def liquid(
+    size: list[float], blocks: list[dict[str, Any]], resolution: int = 32, **tables: Any
+) -> LiquidSimulation:
     """Return a liquid with that pressure."""
-    return create(scene(size=size, resolution=resolution, liquid=blocks, **{**UNILATERAL, **tables}))
+    return create(
+        scene(size=size, resolution=resolution, liquid=blocks, **{**UNILATERAL, **tables})
+    )
 
 
 def splines(distance: np.ndarray) -> np.ndarray:
@@ -23,12 +27,20 @@ def splines(distance: np.ndarray) -> np.ndarray:
 
 
 def test_the_solution_satisfies_the_law_written_face_by_face() -> None:
-    # NumPy, cell by cell, from mass balance alone: y is what cells can still take after a step. A wrong sign or row shows.
+    # NumPy, cell by cell, from mass balance alone: y is what cells can still take after a step. A
+    # wrong sign or row shows.
     rng = np.random.default_rng(77)
-    blocks = [box([0.0, 0.0], [0.5, 0.5], velocity=[3.0, -1.0]), box([0.5, 0.0], [1.0, 0.25], velocity=[-3.0, 2.0])]
-    simulation = liquid([1.0, 1.0], blocks, 16, solver={"tolerance": 1e-8, "precision": "double"}, solids="voxel")
+    blocks = [
+        box([0.0, 0.0], [0.5, 0.5], velocity=[3.0, -1.0]),
+        box([0.5, 0.0], [1.0, 0.25], velocity=[-3.0, 2.0]),
+    ]
+    simulation = liquid(
+        [1.0, 1.0], blocks, 16, solver={"tolerance": 1e-8, "precision": "double"}, solids="voxel"
+    )
     x = simulation.particles.position.numpy()
-    simulation.particles.position.assign(np.clip(x + 0.02 * rng.standard_normal(x.shape), 0.01, 0.99) * [1, 1, 0])
+    simulation.particles.position.assign(
+        np.clip(x + 0.02 * rng.standard_normal(x.shape), 0.01, 0.99) * [1, 1, 0]
+    )
     dt, dx = 0.01, 1 / 16
     simulation.particles.sort()
     window = simulation.grid.everywhere
@@ -56,7 +68,12 @@ def test_the_solution_satisfies_the_law_written_face_by_face() -> None:
     flow_x, flow_y = np.zeros_like(u), np.zeros_like(v)
     flow_x[:, 1:-1] = np.where(u[:, 1:-1] > 0, full[:, :-1], full[:, 1:]) * u[:, 1:-1]
     flow_y[1:-1] = np.where(v[1:-1] > 0, full[:-1], full[1:]) * v[1:-1]
-    inward = np.maximum(flow_x[:, :-1], 0) - np.minimum(flow_x[:, 1:], 0) + np.maximum(flow_y[:-1], 0) - np.minimum(flow_y[1:], 0)
+    inward = (
+        np.maximum(flow_x[:, :-1], 0)
+        - np.minimum(flow_x[:, 1:], 0)
+        + np.maximum(flow_y[:-1], 0)
+        - np.minimum(flow_y[1:], 0)
+    )
     flow_x[:, 1:-1] -= p[:, 1:] - p[:, :-1]
     flow_y[1:-1] -= p[1:] - p[:-1]
     out = flow_x[:, 1:] - flow_x[:, :-1] + flow_y[1:] - flow_y[:-1]
@@ -75,12 +92,20 @@ def test_what_is_too_dense_flies_as_it_is_and_settles_slowly(dimension: int) -> 
     """Without gravity crowding is no velocity; with it a cell twice as full expands by at most a fifth of sqrt(g dx), whatever dt is."""
     low, high = [0.375] * dimension, [0.625] * dimension
     for g, dt in ((0.0, 0.01), (GRAVITY, 1e-5)):
-        simulation = liquid([1.0] * dimension, [box(low, high)], 8, physics={"gravity": [0.0, -g, 0.0][:dimension]})
-        simulation.particles.append(np.tile(simulation.particles.position.numpy(), (2, 1)), np.zeros((2 * simulation.particles.count, 3)))
+        simulation = liquid(
+            [1.0] * dimension, [box(low, high)], 8, physics={"gravity": [0.0, -g, 0.0][:dimension]}
+        )
+        simulation.particles.append(
+            np.tile(simulation.particles.position.numpy(), (2, 1)),
+            np.zeros((2 * simulation.particles.count, 3)),
+        )
         simulation.particles.sort()
         center = simulation.particles.position.numpy().mean(axis=0)
         simulation.step(dt)
-        outward, velocity = simulation.particles.position.numpy() - center, simulation.particles.velocity.numpy()
+        outward, velocity = (
+            simulation.particles.position.numpy() - center,
+            simulation.particles.velocity.numpy(),
+        )
         fastest = np.abs(velocity).max()
         if g == 0.0:
             assert fastest == 0.0
@@ -91,23 +116,33 @@ def test_what_is_too_dense_flies_as_it_is_and_settles_slowly(dimension: int) -> 
 
 
 def test_cells_with_room_have_no_pressure_and_spray_is_ballistic() -> None:
-    simulation = liquid([1.0, 1.0], [box([0.25, 0.25], [0.75, 0.75])], particles={"per_axis": 2, "jitter": 1.0})
+    simulation = liquid(
+        [1.0, 1.0], [box([0.25, 0.25], [0.75, 0.75])], particles={"per_axis": 2, "jitter": 1.0}
+    )
     thin = simulation.particles.marks
-    thin.assign((np.arange(simulation.particles.count) % 4 != 0).astype(np.int32))  # a quarter stays
+    # a quarter stays
+    thin.assign((np.arange(simulation.particles.count) % 4 != 0).astype(np.int32))
     simulation.particles.remove(thin)
-    velocity = np.random.default_rng(5).uniform(-0.2, 0.2, (simulation.particles.count, 3)).astype(np.float32) * [1, 1, 0]
+    velocity = np.random.default_rng(5).uniform(-0.2, 0.2, (simulation.particles.count, 3)).astype(
+        np.float32
+    ) * [1, 1, 0]
     simulation.particles.velocity.assign(velocity.astype(np.float32))
     mean = velocity.mean(axis=0)
     advance(simulation, 0.1, 0.005)
     assert not simulation.projection.pressure.numpy().any()
     middle = simulation.time - 0.5 * simulation.last_dt
-    np.testing.assert_allclose(simulation.particles.velocity.numpy().mean(axis=0), mean - [0.0, middle * GRAVITY, 0.0], atol=1e-4)
+    np.testing.assert_allclose(
+        simulation.particles.velocity.numpy().mean(axis=0),
+        mean - [0.0, middle * GRAVITY, 0.0],
+        atol=1e-4,
+    )
 
 
 @pytest.mark.parametrize("cfl", [0.7, 2.0])
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_falling_block_is_ballistic(dimension: int, cfl: float) -> None:
-    # with fluxes of the mean density its front seems to over-fill the cells ahead, and is blown off at some m/s
+    # with fluxes of the mean density its front seems to over-fill the cells ahead, and is blown off
+    # at some m/s
     low, high = [0.375, 0.6, 0.0][:dimension], [0.625, 0.9, 0.25][:dimension]
     block = box(low, high, velocity=[0.5, 0.0, 0.0][:dimension])
     simulation = liquid([1.0, 1.0, 0.25][:dimension], [block], cfl=cfl)
@@ -115,7 +150,8 @@ def test_a_falling_block_is_ballistic(dimension: int, cfl: float) -> None:
     velocity = simulation.particles.velocity.numpy().astype(np.float64)
     expected = [0.5, -(0.2 - 0.5 * simulation.last_dt) * GRAVITY, 0.0]
     np.testing.assert_allclose(velocity.mean(axis=0), expected, atol=2e-3)
-    assert np.abs(velocity - expected).max() < 0.06  # 3 % of the speed: the jitter's densest cells settle
+    # 3 % of the speed: the jitter's densest cells settle
+    assert np.abs(velocity - expected).max() < 0.06
     assert np.abs(velocity - expected).std() < 0.01
 
 
@@ -124,7 +160,11 @@ def test_a_falling_block_is_ballistic(dimension: int, cfl: float) -> None:
 def test_a_pool_holds_itself(dimension: int, cut: bool) -> None:
     ball = {"shape": "sphere", "center": [0.3, 0.1, 0.1][:dimension], "radius": 0.08}
     tables = {"solid": [ball]} if cut else {}
-    simulation = liquid([0.5, 1.0, 0.25][:dimension], [box([0.0] * dimension, [0.5, 0.5, 0.25][:dimension])], **tables)
+    simulation = liquid(
+        [0.5, 1.0, 0.25][:dimension],
+        [box([0.0] * dimension, [0.5, 0.5, 0.25][:dimension])],
+        **tables,
+    )
     height = simulation.particles.totals().center[1]
     rows = advance(simulation, 1.0, 0.01)
     assert rows[-1]["volume"] == pytest.approx(rows[0]["volume"], rel=0.02)
@@ -132,18 +172,25 @@ def test_a_pool_holds_itself(dimension: int, cut: bool) -> None:
     assert rows[-1]["kinetic_energy"] < 1e-3 * rows[-1]["potential_energy"]
     p = simulation.grid.interior(simulation.projection.pressures(1000.0))[..., 0].mean(axis=0)
     depth = 0.5 - (np.arange(32) + 0.5) / 32
-    np.testing.assert_allclose(p[:14] / (1000.0 * GRAVITY), depth[:14], atol=0.45 / 32)  # the surface is known to half a cell
+    # the surface is known to half a cell
+    np.testing.assert_allclose(p[:14] / (1000.0 * GRAVITY), depth[:14], atol=0.45 / 32)
     assert not p[17:].any()
 
 
 def test_blocks_that_part_are_not_held_together() -> None:
-    halves = [box([0.25, 0.25], [0.5, 0.75], velocity=[-1.0, 0.0]), box([0.5, 0.25], [0.75, 0.75], velocity=[1.0, 0.0])]
+    halves = [
+        box([0.25, 0.25], [0.5, 0.75], velocity=[-1.0, 0.0]),
+        box([0.5, 0.25], [0.75, 0.75], velocity=[1.0, 0.0]),
+    ]
     speeds = {}
     for model in ("unilateral", "incompressible"):
-        simulation = liquid([1.0, 1.0], halves, physics={"gravity": [0.0, 0.0]}, pressure={"model": model})
+        simulation = liquid(
+            [1.0, 1.0], halves, physics={"gravity": [0.0, 0.0]}, pressure={"model": model}
+        )
         advance(simulation, 0.1, 0.005)
         speeds[model] = np.abs(simulation.particles.velocity.numpy()[:, 0]).mean()
-    assert speeds["unilateral"] > 0.93  # particles within a cell of the seam share faces: they stay behind as spray
+    # particles within a cell of the seam share faces: they stay behind as spray
+    assert speeds["unilateral"] > 0.93
     assert speeds["incompressible"] < 0.8
 
 
@@ -160,7 +207,9 @@ def test_a_collision_conserves_volume_and_momentum() -> None:
         {"shape": "sphere", "center": [0.3, 0.5], "radius": 0.12, "velocity": [2.0, 0.0]},
         {"shape": "sphere", "center": [0.7, 0.5], "radius": 0.12, "velocity": [-2.0, 0.0]},
     ]
-    simulation = liquid([1.0, 1.0], drops, 48, physics={"gravity": [0.0, 0.0]}, cfl=1.0, density_correction={})
+    simulation = liquid(
+        [1.0, 1.0], drops, 48, physics={"gravity": [0.0, 0.0]}, cfl=1.0, density_correction={}
+    )
     rows = advance(simulation, 0.12)
     velocity = simulation.particles.velocity.numpy()
     assert np.abs(velocity[:, 0]).mean() < 1.2  # they have met

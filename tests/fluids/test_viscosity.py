@@ -18,12 +18,25 @@ from warp_lcp.simulation import StepFailed
 WEIGHTLESS = {"physics": {"gravity": [0.0, 0.0]}}
 
 
-def blob(dimension: int, viscosity: float = 100.0, resolution: int = 24, own: float | None = None, **tables):
+def blob(
+    dimension: int,
+    viscosity: float = 100.0,
+    resolution: int = 24,
+    own: float | None = None,
+    **tables,
+):
     """A box of liquid in free flight."""
     low, high = [0.3, 0.35, 0.4][:dimension], [0.7, 0.62, 0.65][:dimension]
     physics = {"physics": {"gravity": [0.0] * dimension}}
     given = {"viscosity": {"value": viscosity}, **physics, **tables}
-    return create(scene(size=[1.0] * dimension, resolution=resolution, liquid=[box(low, high, viscosity=own)], **given))
+    return create(
+        scene(
+            size=[1.0] * dimension,
+            resolution=resolution,
+            liquid=[box(low, high, viscosity=own)],
+            **given,
+        )
+    )
 
 
 def prepared(simulation, velocity, dt: float = 0.01):
@@ -33,7 +46,9 @@ def prepared(simulation, velocity, dt: float = 0.01):
     projection = simulation.projection
     projection.contact.fill_(1)
     everywhere = simulation.grid.everywhere
-    return simulation.viscosity.solve(simulation.velocity, everywhere, projection.kind, projection.contact, dt, 1.0)
+    return simulation.viscosity.solve(
+        simulation.velocity, everywhere, projection.kind, projection.contact, dt, 1.0
+    )
 
 
 def force_of_energy(simulation, u, tau: float, relative=None):
@@ -55,11 +70,17 @@ def force_of_energy(simulation, u, tau: float, relative=None):
             return 1.0
         if len(axes) == 2:
             a, b = axes
-            return 0.25 * (relative[a] + below(relative[a], b) + relative[b] + below(relative[b], a))
+            return 0.25 * (
+                relative[a] + below(relative[a], b) + relative[b] + below(relative[b], a)
+            )
         return sum(m + above(m, a) for a, m in enumerate(relative)) / (2 * d)
 
-    fluid = simulation.projection.kind.numpy() == FLUID  # between two cells of air velocities are continued: no mass
-    volume = [np.where(fluid | below(fluid, a), filled(0.5 * (phi + below(phi, a))), 0.0) for a in range(d)]
+    # between two cells of air velocities are continued: no mass
+    fluid = simulation.projection.kind.numpy() == FLUID
+    volume = [
+        np.where(fluid | below(fluid, a), filled(0.5 * (phi + below(phi, a))), 0.0)
+        for a in range(d)
+    ]
     result = [volume[a] * u[a] for a in range(d)]
     for a in range(d):
         stress = 2.0 * thick() * filled(phi) * (above(u[a], a) - u[a])
@@ -83,12 +104,17 @@ def test_the_equations_are_the_energys(dimension: int, varies: bool) -> None:
     prepared(simulation, [np.zeros(grid.shape)] * dimension)
     there = [field.numpy() > 0.0 for field in viscosity.multigrid.levels[0].diagonal]
     u = [np.where(mask, rng.standard_normal(grid.shape), 0.0) for mask in there]
-    expected, _ = force_of_energy(simulation, u, 100.0 / 1000.0 * 0.01 / grid.spacing**2, relative or None)
+    expected, _ = force_of_energy(
+        simulation, u, 100.0 / 1000.0 * 0.01 / grid.spacing**2, relative or None
+    )
     p, q = (wp.zeros(dimension * grid.size, dtype=wp.float32, device="cpu") for _ in range(2))
     p.assign(np.concatenate([field.ravel() for field in u]).astype(np.float32))
     viscosity.multigrid.product(p, q)
     for axis, found in enumerate(viscosity.multigrid.components(q)):
-        assert np.abs(np.where(there[axis], expected[axis], 0.0) - found.numpy()).max() < 1e-5 * np.abs(expected[axis]).max()
+        assert (
+            np.abs(np.where(there[axis], expected[axis], 0.0) - found.numpy()).max()
+            < 1e-5 * np.abs(expected[axis]).max()
+        )
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -108,11 +134,16 @@ def test_rigid_motions_stay_and_momenta_are_kept(dimension: int) -> None:
     assert result.converged and result.dissipated > 0.0
     after = [field.numpy() for field in simulation.velocity]
     kept = [sum((volume[a] * x[a]).sum() for a in (0,)) for x in (before, after)]
-    spin = [(volume[1] * at[1][0] * x[1]).sum() - (volume[0] * at[0][1] * x[0]).sum() for x in (before, after)]
+    spin = [
+        (volume[1] * at[1][0] * x[1]).sum() - (volume[0] * at[0][1] * x[0]).sum()
+        for x in (before, after)
+    ]
     size = sum(np.abs(volume[a] * before[a]).sum() for a in range(dimension))
     assert abs(kept[1] - kept[0]) < 1e-4 * size
     assert abs(spin[1] - spin[0]) < 1e-4 * size * grid.counts[0]
-    energy = [sum((volume[a] * np.square(x[a])).sum() for a in range(dimension)) for x in (before, after)]
+    energy = [
+        sum((volume[a] * np.square(x[a])).sum() for a in range(dimension)) for x in (before, after)
+    ]
     assert energy[1] < 0.1 * energy[0]
 
 
@@ -127,24 +158,44 @@ def test_the_surface_bears_no_shear_however_short_the_step(above: float) -> None
     for dt in (0.01, 0.1):  # nu dt / dx^2: .0026 and .026
         prepared(simulation, [np.zeros_like(x), speed * np.cos(math.pi * x)], dt)
         u, v = (field.numpy()[1, :, 3:15].astype(float) for field in simulation.velocity)
-        across = u[9, 1:] - u[8, 1:] + np.diff(v[9])  # at the edges beside the surface, the lower side of row 9
+        # at the edges beside the surface, the lower side of row 9
+        across = u[9, 1:] - u[8, 1:] + np.diff(v[9])
         inside = u[5, 1:] - u[4, 1:] + np.diff(v[5])
         shear[dt] = np.abs(across).max() / np.abs(inside).max()
-        assert np.abs(inside + speed * math.pi / 16.0 * np.sin(math.pi * (np.arange(4, 15) - 1.0) / 16.0)).max() < 0.02
+        assert (
+            np.abs(
+                inside + speed * math.pi / 16.0 * np.sin(math.pi * (np.arange(4, 15) - 1.0) / 16.0)
+            ).max()
+            < 0.02
+        )
     assert max(shear.values()) < 0.15
 
 
 @pytest.mark.parametrize("shape", ["tank", "drops"])
 @pytest.mark.parametrize("viscosity", [1e-3, 1.0, 1e3, 1e5])
 def test_iterations_do_not_grow_with_the_grid(viscosity: int, shape: str) -> None:
-    drops = [{"shape": "sphere", "center": [x, y], "radius": r} for x, y, r in ((0.3, 0.35, 0.23), (0.6, 0.6, 0.2), (0.8, 0.2, 0.1))]
+    drops = [
+        {"shape": "sphere", "center": [x, y], "radius": r}
+        for x, y, r in ((0.3, 0.35, 0.23), (0.6, 0.6, 0.2), (0.8, 0.2, 0.1))
+    ]
     liquid = drops if shape == "drops" else [box([0.0, 0.0], [1.0, 0.6])]
     counts = []
     for resolution in (32, 128):
-        simulation = create(scene(size=[1.0, 1.0], resolution=resolution, liquid=liquid, viscosity={"value": viscosity}))
+        simulation = create(
+            scene(
+                size=[1.0, 1.0],
+                resolution=resolution,
+                liquid=liquid,
+                viscosity={"value": viscosity},
+            )
+        )
         index = np.indices(simulation.grid.shape)[::-1] / resolution * 2.0 * np.pi
-        result = prepared(simulation, [np.sin(index[1]) * np.cos(2.0 * index[0]), np.sin(index[0]) * np.cos(2.0 * index[1])])
-        rounding = 3e-4 if viscosity < 1.0 else 0.0  # forces of 1e-5 of the momentum, which float32 velocities round to 1e-7 of it
+        result = prepared(
+            simulation,
+            [np.sin(index[1]) * np.cos(2.0 * index[0]), np.sin(index[0]) * np.cos(2.0 * index[1])],
+        )
+        # forces of 1e-5 of the momentum, which float32 velocities round to 1e-7 of it
+        rounding = 3e-4 if viscosity < 1.0 else 0.0
         assert result.converged and result.relative_residual <= max(1e-4, rounding)
         counts.append(result.iterations)
     assert counts[1] <= (counts[0] + 3 if shape == "tank" else 16) and min(counts) <= 13
@@ -176,7 +227,10 @@ def least_eigenvalue(level, steps: int = 60) -> float:
     return float(eigvalsh_tridiagonal(alphas, betas[1 : len(alphas)])[0])
 
 
-@pytest.mark.parametrize("seed", [4, 6, 28, 37, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(100, 160))])
+@pytest.mark.parametrize(
+    "seed",
+    [4, 6, 28, 37, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(100, 160))],
+)
 def test_any_liquid_among_any_solids_is_solved(seed: int) -> None:
     """Every step converges in a few dozen iterations, and no level's equations have a negative eigenvalue."""
     simulation, most = create(viscous_scene(seed)), 0
@@ -188,12 +242,16 @@ def test_any_liquid_among_any_solids_is_solved(seed: int) -> None:
             assert least_eigenvalue(level) > -1e-4
 
 
-@pytest.mark.parametrize("seed", [43, 74, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(100, 160))])
+@pytest.mark.parametrize(
+    "seed", [43, 74, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(100, 160))]
+)
 def test_any_liquid_stirred_by_any_solids_is_solved(seed: int) -> None:
     """Solids that turn, bodies, slip, sources and liquids of several viscosities: every step converges in a few iterations."""
     simulation, most = create(stirred_scene(seed)), 0
     for _ in range(12):
-        most = max(most, simulation.step(min(simulation.stable_dt(), 0.02))["viscous_iterations"] or 0)
+        most = max(
+            most, simulation.step(min(simulation.stable_dt(), 0.02))["viscous_iterations"] or 0
+        )
     assert most <= 40
 
 
@@ -202,21 +260,43 @@ def test_any_liquid_stirred_by_any_solids_is_solved(seed: int) -> None:
 def test_liquid_that_turns_with_its_wall_feels_no_force(dimension: int, slip: float) -> None:
     """Where liquid and solid move as one rigid body there is no rate of strain, at any slip length: nothing changes."""
     middle = [0.5, 0.5, 0.5][:dimension]
-    motion = {"kind": "rotation", "center": middle, "rate": 90.0, **({"axis": [1.0, 2.0, 3.0]} if dimension == 3 else {})}
-    ball = {"shape": "sphere", "center": middle, "radius": 0.15, "wall": "sticky", "slip_length": slip, "motion": motion}
+    motion = {
+        "kind": "rotation",
+        "center": middle,
+        "rate": 90.0,
+        **({"axis": [1.0, 2.0, 3.0]} if dimension == 3 else {}),
+    }
+    ball = {
+        "shape": "sphere",
+        "center": middle,
+        "radius": 0.15,
+        "wall": "sticky",
+        "slip_length": slip,
+        "motion": motion,
+    }
     liquid = box([0.27] * dimension, [0.73] * dimension)
-    tables = {"solid": [ball], "viscosity": {"value": 1e3}, "physics": {"gravity": [0.0] * dimension}}
+    tables = {
+        "solid": [ball],
+        "viscosity": {"value": 1e3},
+        "physics": {"gravity": [0.0] * dimension},
+    }
     simulation = create(scene(size=[1.0] * dimension, resolution=20, liquid=[liquid], **tables))
     simulation.boundary.begin_step(0.0, 1e-5)
-    axis = np.array([1.0, 2.0, 3.0]) / math.sqrt(14.0) if dimension == 3 else np.array([0.0, 0.0, 1.0])
+    axis = (
+        np.array([1.0, 2.0, 3.0]) / math.sqrt(14.0) if dimension == 3 else np.array([0.0, 0.0, 1.0])
+    )
     index = np.indices(simulation.grid.shape)[::-1].astype(float)
     turning = []
     for a in range(dimension):
-        x = [(index[b] - (1.0 if a == b else 0.5)) * simulation.grid.spacing - 0.5 for b in range(3)]
+        x = [
+            (index[b] - (1.0 if a == b else 0.5)) * simulation.grid.spacing - 0.5 for b in range(3)
+        ]
         b, c = (a + 1) % 3, (a + 2) % 3
         turning.append(0.5 * math.pi * (axis[b] * x[c] - axis[c] * x[b]))
     prepared(simulation, turning)
-    for change, diagonal in zip(simulation.viscosity.change, simulation.viscosity.multigrid.levels[0].diagonal, strict=True):
+    for change, diagonal in zip(
+        simulation.viscosity.change, simulation.viscosity.multigrid.levels[0].diagonal, strict=True
+    ):
         assert np.abs(change.numpy()[diagonal.numpy() > 0.0]).max() < 2e-5
 
 
@@ -224,7 +304,9 @@ def test_liquid_that_falls_as_fast_as_its_source_feels_no_force() -> None:
     """The source's own faces have its velocity in the products of components beside it too."""
     source = box([0.35, 0.7], [0.65, 0.8], velocity=[0.0, -1.0])
     tables = {"viscosity": {"value": 100.0}, "source": [source], **WEIGHTLESS}
-    simulation = create(scene(size=[1.0, 1.0], resolution=20, liquid=[box([0.25, 0.3], [0.75, 0.8])], **tables))
+    simulation = create(
+        scene(size=[1.0, 1.0], resolution=20, liquid=[box([0.25, 0.3], [0.75, 0.8])], **tables)
+    )
     simulation.sources.supply(0.0, simulation.velocity, simulation.projection.kind)
     shape = simulation.grid.shape
     assert prepared(simulation, [np.zeros(shape), np.full(shape, -1.0)]).iterations == 0
@@ -239,10 +321,16 @@ def test_a_block_leaves_a_ceiling_that_separates(dimension: int, viscosity: floa
     fallen = {}
     for wall in ("separating", "free-slip", "sticky"):
         tables = {"wall": wall, "viscosity": {"value": viscosity}, "cfl": 1.0}
-        simulation = create(scene(size=size, resolution={2: 32, 3: 16}[dimension], liquid=[box(low, high)], **tables))
+        simulation = create(
+            scene(
+                size=size, resolution={2: 32, 3: 16}[dimension], liquid=[box(low, high)], **tables
+            )
+        )
         start = np.sort(simulation.particles.position.numpy()[:, 1])
         advance(simulation, 0.15)
-        fallen[wall] = (start - np.sort(simulation.particles.position.numpy()[:, 1])) / simulation.grid.spacing
+        fallen[wall] = (
+            start - np.sort(simulation.particles.position.numpy()[:, 1])
+        ) / simulation.grid.spacing
     expected = 0.5 * GRAVITY * 0.15**2 / simulation.grid.spacing
     assert np.abs(fallen["separating"] - expected).max() < 0.01
     for wall in ("free-slip", "sticky"):
@@ -266,19 +354,33 @@ def test_couette_flow_between_cut_walls() -> None:
             },
         ]
         full = box([0.0, 0.0], [1.0, 1.0])
-        tables = {"wall": "sticky", "viscosity": {"value": 1.0}, "physics": {"gravity": [0.0, 0.0], "density": 1.0}}
-        simulation = create(scene(size=[1.0, 1.0], resolution=resolution, liquid=[full], solid=solids, **tables))
+        tables = {
+            "wall": "sticky",
+            "viscosity": {"value": 1.0},
+            "physics": {"gravity": [0.0, 0.0], "density": 1.0},
+        }
+        simulation = create(
+            scene(size=[1.0, 1.0], resolution=resolution, liquid=[full], solid=solids, **tables)
+        )
         simulation.boundary.begin_step(0.0, 1e-5)
         prepared(simulation, [np.zeros(simulation.grid.shape)] * 2, dt=1e3)
         B = rate * inner**2 * outer**2 / (outer**2 - inner**2)
         wrong, size = 0.0, 0.0
-        for axis, (field, diagonal) in enumerate(zip(simulation.velocity, simulation.viscosity.multigrid.levels[0].diagonal, strict=True)):
+        for axis, (field, diagonal) in enumerate(
+            zip(simulation.velocity, simulation.viscosity.multigrid.levels[0].diagonal, strict=True)
+        ):
             index = np.indices(simulation.grid.shape)[::-1]
-            x, y = ((index[a] - (1.0 if a == axis else 0.5)) / resolution - center for a, center in ((0, 0.5), (1, 0.51)))
+            x, y = (
+                (index[a] - (1.0 if a == axis else 0.5)) / resolution - center
+                for a, center in ((0, 0.5), (1, 0.51))
+            )
             r = np.maximum(np.hypot(x, y), 1e-9)
             exact = (-B / outer**2 * r + B / r) * (-y if axis == 0 else x) / r
             mask = diagonal.numpy() > 0.0
-            wrong, size = wrong + np.square(field.numpy() - exact)[mask].sum(), size + np.square(exact)[mask].sum()
+            wrong, size = (
+                wrong + np.square(field.numpy() - exact)[mask].sum(),
+                size + np.square(exact)[mask].sum(),
+            )
         errors.append(math.sqrt(wrong / size))
     assert errors[1] < 0.004
     assert errors[0] / errors[1] > 2.8
@@ -287,8 +389,13 @@ def test_couette_flow_between_cut_walls() -> None:
 @pytest.mark.parametrize("slip", [0.0, 0.1])
 def test_a_block_spreads_as_a_gravity_current(slip: float) -> None:
     """The front of a thin layer on a no-slip floor, Huppert 1982: 1.411 (g q^3 t / (3 nu))^(1/5), q the area on each side of the middle."""
-    given = {"viscosity": {"value": 1000.0, "slip_length": slip}, "physics": {"gravity": [0.0, -10.0], "density": 1000.0}}
-    simulation = create(scene(size=[4.0, 1.0], resolution=96, liquid=[box([1.75, 0.0], [2.25, 0.5])], **given))
+    given = {
+        "viscosity": {"value": 1000.0, "slip_length": slip},
+        "physics": {"gravity": [0.0, -10.0], "density": 1000.0},
+    }
+    simulation = create(
+        scene(size=[4.0, 1.0], resolution=96, liquid=[box([1.75, 0.0], [2.25, 0.5])], **given)
+    )
     fronts = []
     while simulation.time < 12.0:
         simulation.step(min(simulation.stable_dt(), 0.05))
@@ -296,7 +403,8 @@ def test_a_block_spreads_as_a_gravity_current(slip: float) -> None:
         fronts.append([simulation.time, 0.5 * float(x.max() - x.min())])
     t, front = np.array([row for row in fronts if row[0] > 6.0]).T
     expected = 1.411 * (10.0 * 0.125**3 / 3.0) ** 0.2
-    rate = np.polyfit(t, front**5, 1)[0] ** 0.2 / expected  # a block's start is no similarity solution's: the rate forgets it sooner
+    # a block's start is no similarity solution's: the rate forgets it sooner
+    rate = np.polyfit(t, front**5, 1)[0] ** 0.2 / expected
     if slip:
         assert rate > 1.1  # the floor is what slows it
     else:
@@ -308,13 +416,28 @@ def test_a_slip_length_moves_the_wall_away() -> None:
     """A layer over a floor that drags it: u - nu dt u'' = 1 with u(0) = slip u'(0), u'(H) = 0."""
     depth, length = 0.125, math.sqrt(0.02)
     for slip in (0.0, 0.05, math.inf):
-        tables = {"viscosity": {"value": 1.0, "slip_length": slip}, "physics": {"gravity": [0.0, 0.0], "density": 1.0}, "wall": "sticky"}
-        simulation = create(scene(size=[2.0, 0.25], resolution=128, liquid=[box([0.0, 0.0], [2.0, depth])], **tables))
-        prepared(simulation, [np.ones(simulation.grid.shape), np.zeros(simulation.grid.shape)], dt=0.02)
+        tables = {
+            "viscosity": {"value": 1.0, "slip_length": slip},
+            "physics": {"gravity": [0.0, 0.0], "density": 1.0},
+            "wall": "sticky",
+        }
+        simulation = create(
+            scene(
+                size=[2.0, 0.25], resolution=128, liquid=[box([0.0, 0.0], [2.0, depth])], **tables
+            )
+        )
+        prepared(
+            simulation, [np.ones(simulation.grid.shape), np.zeros(simulation.grid.shape)], dt=0.02
+        )
         y = (np.arange(8) + 0.5) / 64
-        part = 0.0 if slip == math.inf else 1.0 / (math.cosh(depth / length) + slip / length * math.sinh(depth / length))
+        part = (
+            0.0
+            if slip == math.inf
+            else 1.0 / (math.cosh(depth / length) + slip / length * math.sinh(depth / length))
+        )
         expected = 1.0 - part * np.cosh((depth - y) / length)
-        assert np.abs(simulation.velocity[0].numpy()[1, 1:9, 65] - expected).max() < 0.015  # the tank's ends reach here
+        # the tank's ends reach here
+        assert np.abs(simulation.velocity[0].numpy()[1, 1:9, 65] - expected).max() < 0.015
 
 
 def test_a_body_sinks_slowly_and_a_light_one_is_stable() -> None:
@@ -322,19 +445,45 @@ def test_a_body_sinks_slowly_and_a_light_one_is_stable() -> None:
     ball = {"shape": "sphere", "center": [0.2, 0.2, 0.2], "radius": 0.05}
     speeds = {}
     for density in (2000.0, 50.0):
-        tables = {"viscosity": {"value": 200.0}, "solid": [{**ball, "density": density}], "wall": "sticky"}
-        simulation = create(scene(size=[0.4] * 3, resolution=20, liquid=[box([0.0] * 3, [0.4, 0.38, 0.4])], **tables))
+        tables = {
+            "viscosity": {"value": 200.0},
+            "solid": [{**ball, "density": density}],
+            "wall": "sticky",
+        }
+        simulation = create(
+            scene(
+                size=[0.4] * 3, resolution=20, liquid=[box([0.0] * 3, [0.4, 0.38, 0.4])], **tables
+            )
+        )
         advance(simulation, 0.06, dt_max=0.01)
         speeds[density] = simulation.bodies.bodies[0].velocity[1]
         stokes = 2.0 / 9.0 * (1000.0 - density) * GRAVITY * 0.05**2 / 200.0
         assert 0.5 < speeds[density] / stokes < 0.9
     tables = {"viscosity": {"value": 50.0}, **WEIGHTLESS}
-    disc = {"shape": "sphere", "center": [0.5, 0.5], "radius": 0.1, "density": 500.0, "velocity": [1.0, 0.0], "angular_velocity": 90.0}
-    simulation = create(scene(size=[1.0, 1.0], resolution=32, liquid=[box([0.3, 0.3], [0.7, 0.7])], solid=[disc], **tables))
+    disc = {
+        "shape": "sphere",
+        "center": [0.5, 0.5],
+        "radius": 0.1,
+        "density": 500.0,
+        "velocity": [1.0, 0.0],
+        "angular_velocity": 90.0,
+    }
+    simulation = create(
+        scene(
+            size=[1.0, 1.0],
+            resolution=32,
+            liquid=[box([0.3, 0.3], [0.7, 0.7])],
+            solid=[disc],
+            **tables,
+        )
+    )
     body = simulation.bodies.bodies[0]
 
     def momentum() -> float:
-        return float(body.momentum[0] + simulation.particle_mass * simulation.particles.velocity.numpy()[:, 0].sum())
+        return float(
+            body.momentum[0]
+            + simulation.particle_mass * simulation.particles.velocity.numpy()[:, 0].sum()
+        )
 
     before = momentum()
     advance(simulation, 0.1)
@@ -349,17 +498,32 @@ def test_a_body_sinks_slowly_and_a_light_one_is_stable() -> None:
 def test_solids_bear_what_the_liquid_loses(dimension: int, solids: str) -> None:
     """Forces of pressure and stresses on all solids are the change of the liquid's momentum."""
     ball = {"shape": "sphere", "center": [0.5] * dimension, "radius": 0.15}
-    liquid = box([0.0] * dimension, [1.0, 0.9, 1.0][:dimension], velocity=[1.0, 0.3, 0.2][:dimension])
-    tables = {"viscosity": {"value": 100.0}, "wall": "sticky", "solids": solids, "output": {"forces": True}}
+    liquid = box(
+        [0.0] * dimension, [1.0, 0.9, 1.0][:dimension], velocity=[1.0, 0.3, 0.2][:dimension]
+    )
+    tables = {
+        "viscosity": {"value": 100.0},
+        "wall": "sticky",
+        "solids": solids,
+        "output": {"forces": True},
+    }
     tables |= {"physics": {"gravity": [0.0] * dimension}, "solid": [ball]}
-    simulation = create(scene(size=[1.0] * dimension, resolution={2: 32, 3: 16}[dimension], liquid=[liquid], **tables))
+    simulation = create(
+        scene(
+            size=[1.0] * dimension, resolution={2: 32, 3: 16}[dimension], liquid=[liquid], **tables
+        )
+    )
     start = simulation.particle_mass * simulation.particles.count  # of 1 m/s
     for _ in range(3):
         before = simulation.particles.velocity.numpy()[:, 0].astype(float).sum()
         simulation.step(0.005)
-        change = simulation.particle_mass * (simulation.particles.velocity.numpy()[:, 0].astype(float).sum() - before)
+        change = simulation.particle_mass * (
+            simulation.particles.velocity.numpy()[:, 0].astype(float).sum() - before
+        )
         forces = simulation.measured["forces"]
-        borne = simulation.kick_dt * sum(value for name, value in forces.items() if name.endswith("_fx"))
+        borne = simulation.kick_dt * sum(
+            value for name, value in forces.items() if name.endswith("_fx")
+        )
         assert borne == pytest.approx(-change, abs=3e-3 * start)
 
 
@@ -378,7 +542,14 @@ def test_a_resumed_run_goes_on_with_the_same_bits(own: float | None) -> None:
 
 
 def test_the_log_tells_heat_and_rows_are_finite() -> None:
-    simulation = create(scene(size=[1.0, 0.5], resolution=32, liquid=[box([0.0, 0.0], [0.4, 0.4])], viscosity={"value": 5.0}))
+    simulation = create(
+        scene(
+            size=[1.0, 0.5],
+            resolution=32,
+            liquid=[box([0.0, 0.0], [0.4, 0.4])],
+            viscosity={"value": 5.0},
+        )
+    )
     rows = advance(simulation, 0.2)
     assert {"viscous_iterations", "viscous_residual", "dissipated", "wall_work"} <= set(rows[0])
     assert all(row["dissipated"] >= -1e-9 and row["wall_work"] == 0.0 for row in rows)
@@ -387,9 +558,13 @@ def test_the_log_tells_heat_and_rows_are_finite() -> None:
 def test_a_step_that_cannot_be_solved_may_be_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
     simulation = blob(2, physics={"gravity": [0.0, -9.81]})
     advance(simulation, 0.05)
-    simulation.particles.velocity.assign(np.random.default_rng(0).standard_normal((simulation.particles.count, 3)).astype(np.float32))
+    simulation.particles.velocity.assign(
+        np.random.default_rng(0).standard_normal((simulation.particles.count, 3)).astype(np.float32)
+    )
     monkeypatch.setattr(simulation.viscosity, "max_iterations", 1)
-    with pytest.raises(StepFailed, match="viscous solve ended with MAX_ITERATIONS after 1 iterations"):
+    with pytest.raises(
+        StepFailed, match="viscous solve ended with MAX_ITERATIONS after 1 iterations"
+    ):
         simulation.step(0.01)
 
 
@@ -401,12 +576,21 @@ def test_a_solve_that_gets_no_nearer_is_said_to_stagnate() -> None:
         field.assign(speed.astype(np.float32))
     projection = simulation.projection
     where = simulation.grid.everywhere, projection.kind, projection.contact
-    assert simulation.viscosity.solve(simulation.velocity, *where, 0.01, 1e-12).status is SolveStatus.STAGNATED
+    assert (
+        simulation.viscosity.solve(simulation.velocity, *where, 0.01, 1e-12).status
+        is SolveStatus.STAGNATED
+    )
 
 
 def test_a_retry_solves_equations_that_are_less_stiff(monkeypatch: pytest.MonkeyPatch) -> None:
     """Forces act for half of the last step and half of the next: what is left of a long step is solved in parts, of the same sum."""
-    disc = {"shape": "sphere", "center": [0.5, 0.45], "radius": 0.08, "density": 500.0, "velocity": [1.0, 0.0]}
+    disc = {
+        "shape": "sphere",
+        "center": [0.5, 0.45],
+        "radius": 0.08,
+        "density": 500.0,
+        "velocity": [1.0, 0.0],
+    }
     spans: list[float] = []
     solve = Viscosity.solve
 
@@ -428,7 +612,8 @@ def test_a_retry_solves_equations_that_are_less_stiff(monkeypatch: pytest.Monkey
     assert len(spans) == 8
     assert max(spans) < 2.0 * 0.001
     assert sum(spans) == pytest.approx(0.5 * (0.016 + 0.001))
-    assert changes == pytest.approx(reference, rel=0.1)  # of one solve of the whole span: -0.43 N s of 4.8
+    # of one solve of the whole span: -0.43 N s of 4.8
+    assert changes == pytest.approx(reference, rel=0.1)
     assert row["viscous_iterations"] >= 8
 
 
@@ -436,7 +621,11 @@ def test_a_retry_solves_equations_that_are_less_stiff(monkeypatch: pytest.Monkey
 def test_one_viscosity_of_all_liquids_is_that_of_the_table(own: float) -> None:
     first, second = blob(2, viscosity=own), blob(2, own=own)
     for simulation in (first, second):
-        simulation.particles.velocity.assign(np.random.default_rng(0).standard_normal((simulation.particles.count, 3)).astype(np.float32))
+        simulation.particles.velocity.assign(
+            np.random.default_rng(0)
+            .standard_normal((simulation.particles.count, 3))
+            .astype(np.float32)
+        )
         for _ in range(4):
             simulation.step(0.004)
     assert np.abs(first.particles.position.numpy() - second.particles.position.numpy()).max() < 1e-5
@@ -444,12 +633,19 @@ def test_one_viscosity_of_all_liquids_is_that_of_the_table(own: float) -> None:
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_momenta_are_kept_where_thick_liquid_meets_thin(dimension: int) -> None:
-    low, middle, high = [0.3, 0.35, 0.4][:dimension], [0.5, 0.62, 0.65][:dimension], [0.7, 0.62, 0.65][:dimension]
+    low, middle, high = (
+        [0.3, 0.35, 0.4][:dimension],
+        [0.5, 0.62, 0.65][:dimension],
+        [0.7, 0.62, 0.65][:dimension],
+    )
     halves = [box(low, middle, viscosity=0.1), box([0.5, *low[1:]], high, viscosity=1e4)]
     tables = {"viscosity": {"value": 10.0}, "physics": {"gravity": [0.0] * dimension}}
     simulation = create(scene(size=[1.0] * dimension, resolution=24, liquid=halves, **tables))
     p = simulation.particles
-    p.velocity.assign(np.random.default_rng(1).standard_normal((p.count, 3)).astype(np.float32) * (np.arange(3) < dimension))
+    p.velocity.assign(
+        np.random.default_rng(1).standard_normal((p.count, 3)).astype(np.float32)
+        * (np.arange(3) < dimension)
+    )
     before = p.velocity.numpy().astype(float).mean(axis=0)
     for _ in range(5):
         row = simulation.step(0.004)
@@ -457,9 +653,14 @@ def test_momenta_are_kept_where_thick_liquid_meets_thin(dimension: int) -> None:
         assert row["dissipated"] > 0.0
     np.testing.assert_allclose(p.velocity.numpy().astype(float).mean(axis=0), before, atol=1e-5)
     x, v = p.position.numpy(), p.velocity.numpy()
-    thin, thick = (v[kept == value][:, :dimension] for kept in [p.kept.numpy()[:, 0]] for value in np.float32([0.01, 1e3]))
+    thin, thick = (
+        v[kept == value][:, :dimension]
+        for kept in [p.kept.numpy()[:, 0]]
+        for value in np.float32([0.01, 1e3])
+    )
     assert len(thin) + len(thick) == len(x)
-    assert thick.std(axis=0).max() < 0.5 * thin.std(axis=0).min()  # what is thick turns and flies as one
+    # what is thick turns and flies as one
+    assert thick.std(axis=0).max() < 0.5 * thin.std(axis=0).min()
 
 
 @pytest.mark.parametrize("spread", [1.0, 1.0005, 100.0])
@@ -474,8 +675,12 @@ def test_differing_viscosities_lose_energy_beside_walls(dimension: int, spread: 
     for field in viscosity.relative:
         field.assign(spread ** rng.uniform(0.0, 1.0, grid.shape).astype(np.float32))
     prepared(simulation, [np.zeros(grid.shape)] * dimension)
-    there = np.concatenate([(field.numpy() > 0.0).ravel() for field in viscosity.multigrid.levels[0].diagonal])
-    x, y = (np.where(there, rng.standard_normal(len(there)), 0.0).astype(np.float32) for _ in range(2))
+    there = np.concatenate(
+        [(field.numpy() > 0.0).ravel() for field in viscosity.multigrid.levels[0].diagonal]
+    )
+    x, y = (
+        np.where(there, rng.standard_normal(len(there)), 0.0).astype(np.float32) for _ in range(2)
+    )
 
     def product(x):
         p, q = (wp.zeros(len(there), dtype=wp.float32, device="cpu") for _ in range(2))
@@ -500,13 +705,20 @@ def test_differing_viscosities_lose_energy_beside_walls(dimension: int, spread: 
 
 
 def test_thick_liquid_from_a_source_stays_thick() -> None:
-    tables = {"viscosity": {"value": 1.0}, "source": [box([0.1, 0.7], [0.2, 0.8], velocity=[1.0, 0.0], viscosity=100.0)]}
-    simulation = create(scene(size=[1.0, 1.0], resolution=20, liquid=[box([0.0, 0.0], [1.0, 0.3])], **tables))
+    tables = {
+        "viscosity": {"value": 1.0},
+        "source": [box([0.1, 0.7], [0.2, 0.8], velocity=[1.0, 0.0], viscosity=100.0)],
+    }
+    simulation = create(
+        scene(size=[1.0, 1.0], resolution=20, liquid=[box([0.0, 0.0], [1.0, 0.3])], **tables)
+    )
     advance(simulation, 0.2)
     kept, y = simulation.particles.kept.numpy()[:, 0], simulation.particles.position.numpy()[:, 1]
     assert set(kept) == {np.float32(1.0), np.float32(100.0)}
     assert (kept[y < 0.2] == 1.0).all()
-    simulation.add(np.array([[0.5, 0.5, 0.0]], dtype=np.float32), np.zeros((1, 3), dtype=np.float32))
+    simulation.add(
+        np.array([[0.5, 0.5, 0.0]], dtype=np.float32), np.zeros((1, 3), dtype=np.float32)
+    )
     assert simulation.particles.kept.numpy().min() == 1.0
 
 
@@ -524,10 +736,19 @@ def test_without_the_table_there_is_nothing() -> None:
         ({"wall": "sticky"}, "needs the table"),
         ({"solid": [box([0.1, 0.1], [0.2, 0.2], slip_length=0.1)]}, "needs the table"),
         ({"liquid": [box([0.0, 0.0], [0.5, 0.5], viscosity=1.0)]}, "needs the table"),
-        ({"viscosity": {"value": 1.0}, "liquid": [box([0.0, 0.0], [0.5, 0.5], viscosity=0.0)]}, "greater than 0"),
+        (
+            {"viscosity": {"value": 1.0}, "liquid": [box([0.0, 0.0], [0.5, 0.5], viscosity=0.0)]},
+            "greater than 0",
+        ),
         ({"viscosity": {"value": -1.0}}, "greater than 0"),
         ({"viscosity": {"value": 1.0, "slip_length": -0.1}}, "greater than or equal to 0"),
-        ({"viscosity": {"value": 1.0}, "domain": {"size": [1.0, 1.0], "resolution": 8, "periodic": ["x"]}}, "periodic"),
+        (
+            {
+                "viscosity": {"value": 1.0},
+                "domain": {"size": [1.0, 1.0], "resolution": 8, "periodic": ["x"]},
+            },
+            "periodic",
+        ),
     ],
 )
 def test_what_is_wrong_is_said(tables, complaint: str) -> None:

@@ -25,7 +25,8 @@ class StandingWave:
 
         v_y = (sinh(k y) / sinh(k H) + b sinh(m y) / sinh(m H)) cos(k x),   d_x v_x + d_y v_y = 0,
 
-    a potential flow and a layer of vorticity; the surface bears neither shear, b = -2 k^2 / (k^2 + m^2), nor a normal stress,
+    a potential flow and a layer of vorticity; the surface bears neither shear, b = -2 k^2 / (k^2 +
+    m^2), nor a normal stress,
 
         n coth(k H) / k + g (1 + b) / n + 2 nu (k coth(k H) + b m coth(m H)) = 0.
 
@@ -40,7 +41,9 @@ class StandingWave:
         """The normal stress on the surface over density and velocity [m/s]."""
         m, b = self._layer(n)
         pressed = n / cmath.tanh(self.k * self.depth) / self.k + GRAVITY * (1.0 + b) / n
-        return pressed + 2.0 * self.nu * (self.k / cmath.tanh(self.k * self.depth) + b * m / cmath.tanh(m * self.depth))
+        return pressed + 2.0 * self.nu * (
+            self.k / cmath.tanh(self.k * self.depth) + b * m / cmath.tanh(m * self.depth)
+        )
 
     def _layer(self, n: complex) -> tuple[complex, complex]:
         m = cmath.sqrt(self.k**2 + n / self.nu)
@@ -49,8 +52,15 @@ class StandingWave:
     @cached_property
     def rate(self) -> complex:
         """n: -decay + i frequency [1/s]."""
-        start = [-2.0 * self.nu * self.k**2, math.sqrt(GRAVITY * self.k * math.tanh(self.k * self.depth))]
-        found = root(lambda z: [self.stress(complex(*z)).real, self.stress(complex(*z)).imag], start, tol=1e-13).x
+        start = [
+            -2.0 * self.nu * self.k**2,
+            math.sqrt(GRAVITY * self.k * math.tanh(self.k * self.depth)),
+        ]
+        found = root(
+            lambda z: [self.stress(complex(*z)).real, self.stress(complex(*z)).imag],
+            start,
+            tol=1e-13,
+        ).x
         assert abs(self.stress(complex(*found))) < 1e-9 * GRAVITY / abs(complex(*found))
         return complex(*found)
 
@@ -65,8 +75,15 @@ class StandingWave:
 def tank(wave: StandingWave, cells: int, viscosity: float, **tables: Any) -> LiquidSimulation:
     """Return a tank that is one wave long, whose particles lie and move as the wave's do at its greatest height."""
     liquid = [box([0.0, 0.0], [LONG, DEPTH])]
-    given = {"wall": "free-slip", "cfl": 20.0, "viscosity": {"value": viscosity}, "solver": {"tolerance": 1e-6}}
-    simulation = create(scene(size=[LONG, 0.625], resolution=cells, liquid=liquid, **given, **tables))
+    given = {
+        "wall": "free-slip",
+        "cfl": 20.0,
+        "viscosity": {"value": viscosity},
+        "solver": {"tolerance": 1e-6},
+    }
+    simulation = create(
+        scene(size=[LONG, 0.625], resolution=cells, liquid=liquid, **given, **tables)
+    )
     p = simulation.particles
     at = p.position.numpy().astype(np.float64)
     v_x, v_y = wave.velocity(at[:, 0], at[:, 1])
@@ -82,9 +99,13 @@ def decay(simulation: LiquidSimulation, wave: StandingWave, dt: float) -> comple
     seen, n = [], wave.rate
     while simulation.time < VIEWED * 2.0 * math.pi / n.imag:
         simulation.step(dt)
-        x, v = (of.numpy().astype(np.float64) for of in (simulation.particles.position, simulation.particles.velocity))
+        x, v = (
+            of.numpy().astype(np.float64)
+            for of in (simulation.particles.position, simulation.particles.velocity)
+        )
         share = np.cosh(wave.k * x[:, 1]) / np.cosh(wave.k * DEPTH) * np.cos(wave.k * x[:, 0])
-        seen.append((simulation.time - 0.5 * dt, float((share * v[:, 1]).mean())))  # velocities are of the middle of steps
+        # velocities are of the middle of steps
+        seen.append((simulation.time - 0.5 * dt, float((share * v[:, 1]).mean())))
     t, speed = np.array(seen).T
     speed /= np.abs(speed).max()
 
@@ -106,10 +127,14 @@ def test_the_root_is_known_where_viscosity_is_small() -> None:
     """2 nu k^2 (1 - sqrt(share / 2)) at first; and the mode moves without divergence or shear on the surface."""
     for share in (1e-4, 1e-3):
         wave = wave_of(share)
-        assert -wave.rate.real / (2.0 * wave.nu * wave.k**2) == pytest.approx(1.0 - math.sqrt(share / 2.0), abs=3.0 * share)
+        assert -wave.rate.real / (2.0 * wave.nu * wave.k**2) == pytest.approx(
+            1.0 - math.sqrt(share / 2.0), abs=3.0 * share
+        )
     wave, h = wave_of(0.04), 1e-5
     x, y = np.array([0.13]), np.array([DEPTH])
-    along, across = ([wave.velocity(x + s * a, y + s * b) for s in (h, -h)] for a, b in ((1.0, 0.0), (0.0, 1.0)))
+    along, across = (
+        [wave.velocity(x + s * a, y + s * b) for s in (h, -h)] for a, b in ((1.0, 0.0), (0.0, 1.0))
+    )
     slope = [[(many[0][c] - many[1][c])[0] / (2.0 * h) for c in (0, 1)] for many in (along, across)]
     assert abs(slope[0][0] + slope[1][1]) < 1e-6 * abs(slope[0][0])
     assert abs(slope[0][1] + slope[1][0]) < 1e-6 * abs(slope[0][1])
@@ -117,7 +142,11 @@ def test_the_root_is_known_where_viscosity_is_small() -> None:
 
 @pytest.mark.parametrize(
     ("cells", "dt", "expected"),
-    [(16, 0.02, 0.90), pytest.param(32, 0.02, 0.93, marks=pytest.mark.slow), pytest.param(64, 0.02, 0.95, marks=pytest.mark.slow)],
+    [
+        (16, 0.02, 0.90),
+        pytest.param(32, 0.02, 0.93, marks=pytest.mark.slow),
+        pytest.param(64, 0.02, 0.95, marks=pytest.mark.slow),
+    ],
 )
 def test_a_standing_wave_decays(cells: int, dt: float, expected: float) -> None:
     """nu k^2 is .04 of the frequency, where 2 nu k^2 is 16 % more than the root; what is expected has been measured."""

@@ -26,7 +26,13 @@ def some_points(count: int = 20) -> Points:
 
 def some_cells(dimension: int) -> Cells:
     index = np.array([[3, 2, 1], [4, 2, 1], [4, 3, 1], [9, 9, 1]]) * [1, 1, dimension == 3]
-    return Cells("grid", index, 0.25, dimension, {"pressure": np.arange(4.0), "wall": np.array([True, False, True, False])})
+    return Cells(
+        "grid",
+        index,
+        0.25,
+        dimension,
+        {"pressure": np.arange(4.0), "wall": np.array([True, False, True, False])},
+    )
 
 
 def test_points_round_trip(tmp_path):
@@ -36,7 +42,12 @@ def test_points_round_trip(tmp_path):
     assert mesh.points.dtype == np.float32
     np.testing.assert_array_equal(mesh.points, points.points)
     np.testing.assert_array_equal(mesh.cells_dict["vertex"].ravel(), np.arange(20))
-    for name, dtype in [("velocity", np.float32), ("flag", np.uint8), ("half", np.float32), ("kind", np.int8)]:
+    for name, dtype in [
+        ("velocity", np.float32),
+        ("flag", np.uint8),
+        ("half", np.float32),
+        ("kind", np.int8),
+    ]:
         assert mesh.point_data[name].dtype == dtype
         np.testing.assert_array_equal(mesh.point_data[name], points.fields[name])
 
@@ -46,18 +57,29 @@ def test_cells_share_corners(tmp_path, dimension, kind, corners):
     cells = some_cells(dimension)
     write_vtu(tmp_path / "a.vtu", cells)
     mesh = meshio.read(tmp_path / "a.vtu")
-    assert len(mesh.points) == corners  # three cells in an L: 8 corners a layer, and 4 of the one apart
+    # three cells in an L: 8 corners a layer, and 4 of the one apart
+    assert len(mesh.points) == corners
     np.testing.assert_allclose(mesh.points[mesh.cells_dict[kind][:, 0]], cells.index * 0.25)
     middle = np.array([0.5, 0.5, 0.5 if dimension == 3 else 0.0])
-    np.testing.assert_allclose(mesh.points[mesh.cells_dict[kind]].mean(axis=1), (cells.index + middle) * 0.25)
+    np.testing.assert_allclose(
+        mesh.points[mesh.cells_dict[kind]].mean(axis=1), (cells.index + middle) * 0.25
+    )
     np.testing.assert_array_equal(mesh.cell_data["pressure"][0], np.arange(4.0))
     np.testing.assert_array_equal(mesh.cell_data["wall"][0], [1, 0, 1, 0])
 
 
 def some_surface(dimension: int) -> Surface:
     """A tetrahedron, or a square in 2-D, seen from outside."""
-    points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]] if dimension == 3 else [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-    corners = [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]] if dimension == 3 else [[0, 1], [1, 2], [2, 3], [3, 0]]
+    points = np.array(
+        [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
+        if dimension == 3
+        else [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
+    )
+    corners = (
+        [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]
+        if dimension == 3
+        else [[0, 1], [1, 2], [2, 3], [3, 0]]
+    )
     fields = {"velocity": RNG.random((4, 3)).astype(np.float32), "body": np.arange(4)}
     return Surface("surface", points.astype(np.float32), np.array(corners, dtype=np.int32), fields)
 
@@ -78,8 +100,11 @@ def test_vtk_finds_the_volume_inside_a_surface(tmp_path):
     write_vtu(tmp_path / "a.vtu", some_surface(3))
     mesh = pyvista.read(tmp_path / "a.vtu").extract_surface(algorithm="dataset_surface")
     assert mesh.is_all_triangles
-    np.testing.assert_allclose(mesh.volume, 1 / 6)  # VTK's sign: triangles are counterclockwise from outside
-    outward = mesh.compute_normals(point_normals=False, consistent_normals=False, auto_orient_normals=False).cell_data["Normals"]
+    # VTK's sign: triangles are counterclockwise from outside
+    np.testing.assert_allclose(mesh.volume, 1 / 6)
+    outward = mesh.compute_normals(
+        point_normals=False, consistent_normals=False, auto_orient_normals=False
+    ).cell_data["Normals"]
     assert (np.einsum("ij,ij->i", outward, mesh.cell_centers().points - 0.25) > 0).all()
     write_vtu(tmp_path / "b.vtu", some_surface(2))
     outline = pyvista.read(tmp_path / "b.vtu")
@@ -102,7 +127,11 @@ def test_vtk_opens_a_collection(tmp_path):
 
 @pytest.mark.parametrize("count", [0, 1, 2, 65536, 65537, 65538, 200_000])
 def test_arrays_of_every_length_survive_their_pieces(tmp_path, count):
-    points = Points("particles", RNG.random((count, 3)).astype(np.float32), {"kind": np.arange(count, dtype=np.uint8)})
+    points = Points(
+        "particles",
+        RNG.random((count, 3)).astype(np.float32),
+        {"kind": np.arange(count, dtype=np.uint8)},
+    )
     write_vtu(tmp_path / "a.vtu", points)
     pyvista = pytest.importorskip("pyvista", reason="VTK reads the files back")
     cloud = pyvista.read(tmp_path / "a.vtu")
@@ -113,7 +142,14 @@ def test_arrays_of_every_length_survive_their_pieces(tmp_path, count):
 
 
 @pytest.mark.parametrize(
-    "part", [some_points(), some_points(0), some_cells(2), some_cells(3), Cells("grid", np.empty((0, 3), int), 1.0, 3)]
+    "part",
+    [
+        some_points(),
+        some_points(0),
+        some_cells(2),
+        some_cells(3),
+        Cells("grid", np.empty((0, 3), int), 1.0, 3),
+    ],
 )
 def test_vtk_opens_every_frame(tmp_path, part):
     pyvista = pytest.importorskip("pyvista")
@@ -125,7 +161,8 @@ def test_vtk_opens_every_frame(tmp_path, part):
     assert set(data.keys()) == part.fields.keys()
     if isinstance(part, Cells) and size:
         measure = "Area" if part.dimension == 2 else "Volume"
-        np.testing.assert_allclose(grid.compute_cell_sizes()[measure], 0.25**part.dimension)  # positive: VTK's corner order
+        # positive: VTK's corner order
+        np.testing.assert_allclose(grid.compute_cell_sizes()[measure], 0.25**part.dimension)
 
 
 def test_a_field_of_another_length_is_refused(tmp_path):
@@ -135,7 +172,10 @@ def test_a_field_of_another_length_is_refused(tmp_path):
 
 
 def test_estimate_is_near_the_files(tmp_path):
-    points, cells = some_points(5000), Cells("grid", np.argwhere(np.ones((12, 12, 12))), 0.1, 3, {"pressure": np.zeros(1728)})
+    points, cells = (
+        some_points(5000),
+        Cells("grid", np.argwhere(np.ones((12, 12, 12))), 0.1, 3, {"pressure": np.zeros(1728)}),
+    )
     for part in (points, cells):
         write_vtu(tmp_path / "a.vtu", part)
         size = (tmp_path / "a.vtu").stat().st_size
@@ -150,12 +190,18 @@ def test_collections_grow_and_resume(tmp_path):
     folder = FrameFolder(tmp_path)
     for index in range(4):
         folder.write(index, index / 3, [some_points(3)])
-    assert entries(tmp_path / "particles.pvd") == [(k / 3, f"frames/particles_{k:06d}.vtu") for k in range(4)]
+    assert entries(tmp_path / "particles.pvd") == [
+        (k / 3, f"frames/particles_{k:06d}.vtu") for k in range(4)
+    ]
     (tmp_path / "frames" / "notes.vtu").write_text("not a frame")
     resumed = FrameFolder(tmp_path)
     resumed.resume([0.0, 1 / 3])
     assert len(entries(tmp_path / "particles.pvd")) == 2
-    assert sorted(p.name for p in (tmp_path / "frames").iterdir()) == ["notes.vtu", "particles_000000.vtu", "particles_000001.vtu"]
+    assert sorted(p.name for p in (tmp_path / "frames").iterdir()) == [
+        "notes.vtu",
+        "particles_000000.vtu",
+        "particles_000001.vtu",
+    ]
     resumed.write(2, 2 / 3, [some_points(3)])
     assert [time for time, _ in entries(tmp_path / "particles.pvd")] == [0.0, 1 / 3, 2 / 3]
     assert all((tmp_path / file).is_file() for _, file in entries(tmp_path / "particles.pvd"))
@@ -195,7 +241,9 @@ def test_a_writer_s_frames_are_written_in_order_on_one_other_thread(tmp_path):
         folder.gate.release()
         writer.put(WAITING, float(WAITING), [some_points(3)])
     assert written(tmp_path) == list(range(WAITING + 1))  # leaving waits
-    assert [time for time, _ in entries(tmp_path / "particles.pvd")] == [float(k) for k in range(WAITING + 1)]
+    assert [time for time, _ in entries(tmp_path / "particles.pvd")] == [
+        float(k) for k in range(WAITING + 1)
+    ]
     assert len(folder.threads) == 1
     assert threading.get_ident() not in folder.threads
 
@@ -249,7 +297,12 @@ def test_another_error_is_not_hidden_by_the_writer_s(tmp_path):
     ],
 )
 def test_a_file_that_says_what_cannot_be_is_refused(tmp_path, old, new):
-    write_vtu(tmp_path / "a.vtu", Points("a", np.ones((4, 3), dtype=np.float32), {"velocity": np.ones((4, 3), dtype=np.float32)}))
+    write_vtu(
+        tmp_path / "a.vtu",
+        Points(
+            "a", np.ones((4, 3), dtype=np.float32), {"velocity": np.ones((4, 3), dtype=np.float32)}
+        ),
+    )
     assert read_vtu(tmp_path / "a.vtu").fields["velocity"].shape == (4, 3)
     whole = (tmp_path / "a.vtu").read_bytes()
     assert old in whole

@@ -55,8 +55,12 @@ POINTS = RNG.random((7, 3)).astype(np.float32)
 FLAT = POINTS * np.array([1, 1, 0], dtype=np.float32)
 PARTS = {
     "points": Points("particles", POINTS, fields(7)),
-    "triangles": Surface("surface", POINTS, np.array([[0, 1, 2], [1, 2, 3], [4, 5, 6], [3, 4, 6]]), fields(7)),
-    "segments": Surface("surface", FLAT, np.array([[0, 1], [1, 2], [2, 3], [4, 5], [5, 6]]), fields(7)),
+    "triangles": Surface(
+        "surface", POINTS, np.array([[0, 1, 2], [1, 2, 3], [4, 5, 6], [3, 4, 6]]), fields(7)
+    ),
+    "segments": Surface(
+        "surface", FLAT, np.array([[0, 1], [1, 2], [2, 3], [4, 5], [5, 6]]), fields(7)
+    ),
     "hexahedra": Cells("grid", np.array([[0, 0, 0], [1, 0, 0], [3, 4, 5]]), 0.1, 3, fields(3)),
     "squares": Cells("grid", np.array([[0, 0, 0], [1, 0, 0], [3, 4, 0]]), 0.1, 2, fields(3)),
 }
@@ -108,12 +112,16 @@ def test_what_a_format_holds_comes_back(tmp_path, name, part):
         with pytest.raises(ValueError, match="are written for other programs"):
             read_meshio(file, name)
     if name == "stl":  # which holds triangles one by one, and no points beside
-        np.testing.assert_allclose(found.points[found.corners], given.points[given.corners], rtol=1e-6, atol=1e-7)
+        np.testing.assert_allclose(
+            found.points[found.corners], given.points[given.corners], rtol=1e-6, atol=1e-7
+        )
     else:
         same(found, mesh_of(given), bare=bare)
     if held.empty:
         write_meshio(file, without(given), name)
-        assert len(from_meshio(getattr(meshio, MODULES.get(name, name)).read(str(file))).points) == 0
+        assert (
+            len(from_meshio(getattr(meshio, MODULES.get(name, name)).read(str(file))).points) == 0
+        )
 
 
 @pytest.mark.parametrize("name", ["xdmf", "vtk", "gmsh", "ply"])
@@ -150,7 +158,13 @@ def test_a_part_as_a_mesh(tmp_path, part):
     assert isinstance(mesh, meshio.Mesh)
     assert (
         mesh.cells[0].type
-        == {"points": "vertex", "triangles": "triangle", "segments": "line", "hexahedra": "hexahedron", "squares": "quad"}[part]
+        == {
+            "points": "vertex",
+            "triangles": "triangle",
+            "segments": "line",
+            "hexahedra": "hexahedron",
+            "squares": "quad",
+        }[part]
     )
     same(from_meshio(mesh), mesh_of(given), bare=False)
     assert bool(mesh.cell_data) == isinstance(given, Cells)
@@ -181,13 +195,17 @@ def test_an_empty_frame(tmp_path, part):
     write_vtu(file, none)
     mesh = wl.read_frame(file)
     assert (len(mesh.points), sum(len(block.data) for block in mesh.cells)) == (0, 0)
-    assert (mesh.cell_data if isinstance(none, Cells) else mesh.point_data).keys() == none.fields.keys()
+    assert (
+        mesh.cell_data if isinstance(none, Cells) else mesh.point_data
+    ).keys() == none.fields.keys()
     with pytest.raises(IndexError):  # once it does, this and the page on frames can go
         meshio.read(file)
     for name in ("xdmf", "vtk", "gmsh"):
         folder = FrameFolder(tmp_path / name, frame_format=name)
         (written,) = folder.write(0, 0.0, [none])
-        assert written.suffix == (".vtu" if not holds(name, *kind_of(none)).empty else f".{SUFFIXES[name]}")
+        assert written.suffix == (
+            ".vtu" if not holds(name, *kind_of(none)).empty else f".{SUFFIXES[name]}"
+        )
         assert len(wl.read_frame(written).points) == 0
         assert folder.missing(none.name, 1) == []
         assert not (tmp_path / name / f"{none.name}.pvd").exists()
@@ -196,7 +214,9 @@ def test_an_empty_frame(tmp_path, part):
 def test_frames_of_every_kind_are_read(tmp_path):
     write_vti(tmp_path / "grid_000003.vti", PARTS["hexahedra"])
     mesh = wl.read_frame(str(tmp_path / "grid_000003.vti"))
-    np.testing.assert_allclose(np.sort(mesh.cell_data["pressure"][0]), np.sort(PARTS["hexahedra"].fields["pressure"]))
+    np.testing.assert_allclose(
+        np.sort(mesh.cell_data["pressure"][0]), np.sort(PARTS["hexahedra"].fields["pressure"])
+    )
     write_pieces(tmp_path / "many", "vtu")
     for file in (tmp_path / "many" / "frames").glob("*.pvtu"):
         assert len(wl.read_frame(file).points) > 0
@@ -209,10 +229,16 @@ def test_frames_of_every_kind_are_read(tmp_path):
 
 @pytest.mark.parametrize("name", SUFFIXES)
 @pytest.mark.filterwarnings("ignore")  # of NumPy, on files without lines
-@pytest.mark.parametrize("content", [b"", b"\0" * 100, b"nonsense\n1 2 3\n", "half"], ids=["empty", "zeros", "text", "half"])
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"\0" * 100, b"nonsense\n1 2 3\n", "half"],
+    ids=["empty", "zeros", "text", "half"],
+)
 def test_damaged_files_are_named(tmp_path, name, content):
     """Neither does meshio end the process, as its own `read` does."""
-    part = next((part for part in PARTS.values() if holds(name, *kind_of(part)).dress is not None), None)
+    part = next(
+        (part for part in PARTS.values() if holds(name, *kind_of(part)).dress is not None), None
+    )
     if part is None:
         pytest.skip("needs another package")
     file = tmp_path / f"{part.name}_000001.{SUFFIXES[name]}"
@@ -237,7 +263,11 @@ def test_a_run_in_a_format_that_is_not_read_back_goes_on(scene_file, tmp_path):
 def test_the_bytes_of_a_frame_are_foretold(tmp_path, name):
     part = ball([0.0, 0.0, 0.0], 1.0)
     (file,) = FrameFolder(tmp_path, frame_format=name).write(0, 0.0, [part])
-    assert 0.6 * file.stat().st_size < frame_bytes([part], frame_format=name) < 1.7 * file.stat().st_size
+    assert (
+        0.6 * file.stat().st_size
+        < frame_bytes([part], frame_format=name)
+        < 1.7 * file.stat().st_size
+    )
 
 
 # ---- runs
@@ -258,12 +288,19 @@ def test_a_run_in_another_format_goes_on_and_is_drawn(scene_file, tmp_path, name
     assert record.status == "finished"
     assert not [warning for warning in record.warnings if "missing" in warning]
     files = sorted(path.name for path in (other / "frames").iterdir())
-    assert files == [f"{part}_{index:06d}.{SUFFIXES[name]}" for part in ("grid", "particles") for index in range(5)]
+    assert files == [
+        f"{part}_{index:06d}.{SUFFIXES[name]}"
+        for part in ("grid", "particles")
+        for index in range(5)
+    ]
     assert not list(other.glob("*.pvd"))
     for index in range(5):
         for part in ("particles", "grid"):
-            same(read_meshio(other / "frames" / f"{part}_{index:06d}.{SUFFIXES[name]}", name),
-                 read_vtu(plain / "frames" / f"{part}_{index:06d}.vtu"), bare=False)  # fmt: skip
+            same(
+                read_meshio(other / "frames" / f"{part}_{index:06d}.{SUFFIXES[name]}", name),
+                read_vtu(plain / "frames" / f"{part}_{index:06d}.vtu"),
+                bare=False,
+            )
     one, two = Recording(plain, Color.SPEED), Recording(other, Color.SPEED)
     assert one.numbers == two.numbers == list(range(5))
     for number in one.numbers:
@@ -272,24 +309,31 @@ def test_a_run_in_another_format_goes_on_and_is_drawn(scene_file, tmp_path, name
     assert len(list(render_run(other, looks=Looks(cut=True, color=Color.SPEED)))) == 5
     run_into(scene, other, force=True)  # whose files are the run's
     (other / "frames" / f"grid_000001.{SUFFIXES[name]}").unlink()
-    record = run_into(load_scene(scene_file, ["time.duration=0.25", f"output.format={name}"]), other, resume=True)
+    record = run_into(
+        load_scene(scene_file, ["time.duration=0.25", f"output.format={name}"]), other, resume=True
+    )
     assert [warning for warning in record.warnings if "grid 1 are missing" in warning]
 
 
 def test_the_format_may_change_when_a_run_goes_on(scene_file, tmp_path):
     out = tmp_path / "out"
     run_into(load_scene(scene_file, ["time.duration=0.2"]), out, last_frame=2)
-    record = run_into(load_scene(scene_file, ["time.duration=0.2", "output.format=vtk"]), out, resume=True)
+    record = run_into(
+        load_scene(scene_file, ["time.duration=0.2", "output.format=vtk"]), out, resume=True
+    )
     assert record.changed == ['output.format: "vtu" before, "vtk" now']
     assert not [warning for warning in record.warnings if "missing" in warning]
     assert Recording(out).numbers == list(range(5))
     run_into(load_scene(scene_file, ["time.duration=0.25"]), out, resume=True)
     assert Recording(out).numbers == list(range(6))
-    assert (out / "particles.pvd").read_text().count("DataSet ") == 4  # those that a collection can name
+    # those that a collection can name
+    assert (out / "particles.pvd").read_text().count("DataSet ") == 4
 
 
 def test_cells_as_images_beside_another_format(scene_file, tmp_path):
-    scene = load_scene(scene_file, ["time.duration=0.1", "output.format=ply", "output.grid_format=vti"])
+    scene = load_scene(
+        scene_file, ["time.duration=0.1", "output.format=ply", "output.grid_format=vti"]
+    )
     assert run_into(scene, tmp_path / "out").status == "finished"
     assert {path.suffix for path in (tmp_path / "out" / "frames").iterdir()} == {".ply", ".vti"}
     assert (tmp_path / "out" / "grid.pvd").is_file()
@@ -305,7 +349,9 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_a_format_that_does_not_hold_the_parts_is_refused_before_any_work(dots, scene_file, tmp_path, name):
+def test_a_format_that_does_not_hold_the_parts_is_refused_before_any_work(
+    dots, scene_file, tmp_path, name
+):
     dots.refuse = "work was done"
     for refused in (
         lambda: run_into(load_scene(scene_file, [f"output.format={name}"]), tmp_path / "out"),
@@ -321,7 +367,9 @@ def test_what_else_is_refused(scene_file, tmp_path):
     with pytest.raises(SceneError, match=r"output.format"):
         load_scene(scene_file, ["output.format=doc"])
     with pytest.raises(SceneError, match="surface_ply"):
-        check_scene(str(scene_file), ["output.format=ply", "output.surface_ply=true", "output.grid=false"])
+        check_scene(
+            str(scene_file), ["output.format=ply", "output.surface_ply=true", "output.grid=false"]
+        )
     with pytest.raises(SceneError, match=r"writes only .vtu pieces"):
         check_ranks(load_scene(scene_file, ["output.format=xdmf"]))
     if importlib.util.find_spec("netCDF4") is None:
@@ -332,9 +380,13 @@ def test_what_else_is_refused(scene_file, tmp_path):
 def test_fields_that_a_format_does_not_hold_are_told(scene_file, tmp_path):
     scene = load_scene(scene_file, ["time.duration=0.1", "output.format=permas"])
     record = run_into(scene, tmp_path / "out", observer=quiet())
-    assert record.warnings == ['output.format = "permas" writes the geometry of particles and grid, without fields']
+    assert record.warnings == [
+        'output.format = "permas" writes the geometry of particles and grid, without fields'
+    ]
     assert json.loads((tmp_path / "out" / "run.json").read_text())["warnings"] == record.warnings
-    with pytest.raises(RenderError, match="the frames have no velocity, which --color speed needs; choose plain"):
+    with pytest.raises(
+        RenderError, match="the frames have no velocity, which --color speed needs; choose plain"
+    ):
         list(render_run(tmp_path / "out", looks=Looks(cut=True, color=Color.SPEED)))
     assert list(render_run(tmp_path / "out", looks=Looks(cut=True, color=Color.PLAIN)))
 

@@ -11,15 +11,18 @@ from warp_lcp.frames.nvdb import name_key, write_nvdb
 from warp_lcp.simulation import Volume
 
 SPACING = 0.125
-CENTER, RADIUS, BAND = np.array([1.6, 1.3, 1.1]), 0.8, 0.3  # [m]; the ball is not in the middle: axes that are mixed up would show
+# [m]; the ball is not in the middle: axes that are mixed up would show
+CENTER, RADIUS, BAND = np.array([1.6, 1.3, 1.1]), 0.8, 0.3
 SHAPE = (19, 24, 31)  # planes, rows, columns
 
 
 def distance() -> np.ndarray:
     z, y, x = ((np.arange(count) + 0.5) * SPACING for count in SHAPE)
-    return np.sqrt((x[None, None, :] - CENTER[0]) ** 2 + (y[None, :, None] - CENTER[1]) ** 2 + (z[:, None, None] - CENTER[2]) ** 2).astype(
-        np.float32
-    ) - np.float32(RADIUS)
+    return np.sqrt(
+        (x[None, None, :] - CENTER[0]) ** 2
+        + (y[None, :, None] - CENTER[1]) ** 2
+        + (z[:, None, None] - CENTER[2]) ** 2
+    ).astype(np.float32) - np.float32(RADIUS)
 
 
 def level_set() -> Volume:
@@ -32,20 +35,29 @@ def density() -> Volume:
 
 @pytest.fixture
 def tinyvdb():
-    return pytest.importorskip("tinyvdb._tinyvdb_nanovdb", reason="an independent reader of NanoVDB files")
+    return pytest.importorskip(
+        "tinyvdb._tinyvdb_nanovdb", reason="an independent reader of NanoVDB files"
+    )
 
 
 def test_another_reader_finds_the_ball(tinyvdb, tmp_path):
     write_nvdb(tmp_path / "a.nvdb", level_set())
     file = tinyvdb.NanoVDBFile(str(tmp_path / "a.nvdb"))
-    assert (file.grid_count(), file.grid_name(0), file.grid_type(0), file.grid_class(0)) == (1, "level_set", "Float", "LevelSet")
+    assert (file.grid_count(), file.grid_name(0), file.grid_type(0), file.grid_class(0)) == (
+        1,
+        "level_set",
+        "Float",
+        "LevelSet",
+    )
     assert file.voxel_size(0) == SPACING
     near = np.argwhere(np.abs(distance()) < BAND)[:, ::-1]
     assert file.active_voxel_count(0) == len(near)
     low, high = file.bbox(0)
     np.testing.assert_array_equal([low, high], [near.min(axis=0), near.max(axis=0)])
     low, high = file.world_bbox(0)  # centers of the first voxels, and of those after the last
-    np.testing.assert_allclose([low, high], (np.array([near.min(axis=0), near.max(axis=0) + 1]) + 0.5) * SPACING)
+    np.testing.assert_allclose(
+        [low, high], (np.array([near.min(axis=0), near.max(axis=0) + 1]) + 0.5) * SPACING
+    )
     clamped = np.clip(distance(), -BAND, BAND)
     for x, y, z in np.ndindex(31, 24, 19):
         np.testing.assert_allclose(file.get(0, x, y, z), clamped[z, y, x], rtol=1e-6, atol=1e-7)
@@ -67,7 +79,9 @@ def test_another_reader_finds_the_density(tinyvdb, tmp_path):
 @wp.kernel
 def sample_kernel(volume: wp.uint64, points: wp.array[wp.vec3], values: wp.array[wp.float32]):
     p = wp.tid()
-    values[p] = wp.volume_sample_f(volume, wp.volume_world_to_index(volume, points[p]), wp.Volume.LINEAR)
+    values[p] = wp.volume_sample_f(
+        volume, wp.volume_world_to_index(volume, points[p]), wp.Volume.LINEAR
+    )
 
 
 def test_warp_samples_it_in_world_units(tmp_path):
@@ -76,11 +90,20 @@ def test_warp_samples_it_in_world_units(tmp_path):
         volume = wp.Volume.load_from_nvdb(file, device="cpu")
     rng = np.random.default_rng(6151)
     direction = rng.normal(size=(500, 3))
-    points = CENTER + direction / np.linalg.norm(direction, axis=1, keepdims=True) * rng.uniform(0.7, 0.9, (500, 1))  # [m]
+    # [m]
+    points = CENTER + direction / np.linalg.norm(direction, axis=1, keepdims=True) * rng.uniform(
+        0.7, 0.9, (500, 1)
+    )
     values = wp.zeros(500, dtype=wp.float32, device="cpu")
-    wp.launch(sample_kernel, 500, [volume.id, wp.array(points, dtype=wp.vec3, device="cpu"), values], device="cpu")
+    wp.launch(
+        sample_kernel,
+        500,
+        [volume.id, wp.array(points, dtype=wp.vec3, device="cpu"), values],
+        device="cpu",
+    )
     exact = np.linalg.norm(points - CENTER, axis=1) - RADIUS
-    np.testing.assert_allclose(values.numpy(), exact, atol=SPACING**2 / 2 / RADIUS)  # a sphere's curvature, between voxels
+    # a sphere's curvature, between voxels
+    np.testing.assert_allclose(values.numpy(), exact, atol=SPACING**2 / 2 / RADIUS)
     info = volume.get_grid_info()
     np.testing.assert_allclose(info.translation, SPACING / 2)
     np.testing.assert_allclose(np.reshape(info.transform_matrix, (3, 3)), np.eye(3) * SPACING)
@@ -102,21 +125,29 @@ def test_the_header_byte_by_byte(tmp_path):
     grid = data[begin:]
     assert grid[40:50] == b"level_set\0"
     assert struct.unpack_from("<Q", grid, 32)[0] == len(grid)
-    assert struct.unpack_from("<9d", grid, 384) == (SPACING, 0, 0, 0, SPACING, 0, 0, 0, SPACING)  # index to world
+    # index to world
+    assert struct.unpack_from("<9d", grid, 384) == (SPACING, 0, 0, 0, SPACING, 0, 0, 0, SPACING)
     assert struct.unpack_from("<9d", grid, 456) == (8, 0, 0, 0, 8, 0, 0, 0, 8)  # and back
     assert struct.unpack_from("<3d", grid, 528) == (SPACING / 2,) * 3
     assert struct.unpack_from("<I", grid, 632)[0] == 1
     leaves = struct.unpack_from("<I", grid, 672 + 32)[0]
-    tiles = np.pad(distance(), [(0, -count % 8) for count in SHAPE], constant_values=1.0).reshape(3, 8, 3, 8, 4, 8)
-    assert leaves == np.count_nonzero(tiles.min(axis=(1, 3, 5)) < BAND)  # what is far outside takes no room
+    tiles = np.pad(distance(), [(0, -count % 8) for count in SHAPE], constant_values=1.0).reshape(
+        3, 8, 3, 8, 4, 8
+    )
+    # what is far outside takes no room
+    assert leaves == np.count_nonzero(tiles.min(axis=(1, 3, 5)) < BAND)
 
 
 def test_what_is_far_inside_takes_no_room(tinyvdb, tmp_path):
     z, y, x = np.ogrid[:70, :80, :300]  # the ball fills two lower nodes along x
-    values = (np.sqrt((x - 160.0) ** 2 / 9 + (y - 40.0) ** 2 + (z - 35.0) ** 2) - 30.0).astype(np.float32)
+    values = (np.sqrt((x - 160.0) ** 2 / 9 + (y - 40.0) ** 2 + (z - 35.0) ** 2) - 30.0).astype(
+        np.float32
+    )
     write_nvdb(tmp_path / "a.nvdb", Volume("level_set", values, 1.0, 2.0))
     file = tinyvdb.NanoVDBFile(str(tmp_path / "a.nvdb"))
-    tiles = np.pad(np.clip(values, -2, 2), [(0, -count % 8) for count in values.shape], constant_values=2.0).reshape(9, 8, 10, 8, 38, 8)
+    tiles = np.pad(
+        np.clip(values, -2, 2), [(0, -count % 8) for count in values.shape], constant_values=2.0
+    ).reshape(9, 8, 10, 8, 38, 8)
     varied = (tiles.min(axis=(1, 3, 5)) < 2.0) & (tiles.max(axis=(1, 3, 5)) > -2.0)
     assert file.node_counts(0) == (np.count_nonzero(varied), 2, 1)
     rng = np.random.default_rng(4133)
@@ -126,7 +157,10 @@ def test_what_is_far_inside_takes_no_room(tinyvdb, tmp_path):
 
 
 def test_an_empty_volume_and_a_full_one(tinyvdb, tmp_path):
-    for values, count in [(np.zeros(SHAPE, np.float32), 0), (np.ones(SHAPE, np.float32), 19 * 24 * 31)]:
+    for values, count in [
+        (np.zeros(SHAPE, np.float32), 0),
+        (np.ones(SHAPE, np.float32), 19 * 24 * 31),
+    ]:
         write_nvdb(tmp_path / "a.nvdb", Volume("density", values, SPACING))
         file = tinyvdb.NanoVDBFile(str(tmp_path / "a.nvdb"))
         assert file.active_voxel_count(0) == count
@@ -150,4 +184,7 @@ def test_frames_of_volumes_have_no_collection(tmp_path):
     size = sum(path.stat().st_size for path in tmp_path.glob("frames/*_000001.nvdb"))
     assert size < frame_bytes([level_set(), density()]) < 4 * size
     FrameFolder(tmp_path).resume([0.0])
-    assert sorted(path.name for path in tmp_path.glob("frames/*")) == ["density_000000.nvdb", "level_set_000000.nvdb"]
+    assert sorted(path.name for path in tmp_path.glob("frames/*")) == [
+        "density_000000.nvdb",
+        "level_set_000000.nvdb",
+    ]

@@ -24,10 +24,18 @@ def whole() -> list[Part]:
     random = np.random.default_rng(411)
     points = (random.random((300, 3)) * COUNTS).astype(np.float32)
     cells = np.argwhere(np.ones(COUNTS, dtype=bool))[random.permutation(48)[:20]]
-    corners = np.array([[0.1, 0, 0], [1, 0, 0], [0, 1, 0], [5.1, 0, 0], [5.9, 0, 0], [5, 1, 0]], dtype=np.float32)
+    corners = np.array(
+        [[0.1, 0, 0], [1, 0, 0], [0, 1, 0], [5.1, 0, 0], [5.9, 0, 0], [5, 1, 0]], dtype=np.float32
+    )
     return [
-        Points("particles", points, {"velocity": random.standard_normal((300, 3)), "number": np.arange(300)}),
-        Cells("grid", cells, 1.0, 3, {"pressure": random.random(20), "wall": cells[:, 1] == 0}, COUNTS),
+        Points(
+            "particles",
+            points,
+            {"velocity": random.standard_normal((300, 3)), "number": np.arange(300)},
+        ),
+        Cells(
+            "grid", cells, 1.0, 3, {"pressure": random.random(20), "wall": cells[:, 1] == 0}, COUNTS
+        ),
         Surface("surface", corners, np.arange(6).reshape(2, 3), {"velocity": 2.0 * corners}),
     ]
 
@@ -41,9 +49,26 @@ def piece(box: tuple[tuple[int, int, int], tuple[int, int, int]]) -> list[Part]:
     c = (cells.index[:, 0] >= low) & (cells.index[:, 0] < high)
     s = (surface.points[:, 0] >= low) & (surface.points[:, 0] < high)
     return [
-        Points("particles", points.points[p], {name: values[p] for name, values in points.fields.items()}),
-        Cells("grid", cells.index[c], 1.0, 3, {name: values[c] for name, values in cells.fields.items()}, COUNTS, box),
-        Surface("surface", surface.points[s], np.arange(s.sum()).reshape(-1, 3), {"velocity": surface.fields["velocity"][s]}),
+        Points(
+            "particles",
+            points.points[p],
+            {name: values[p] for name, values in points.fields.items()},
+        ),
+        Cells(
+            "grid",
+            cells.index[c],
+            1.0,
+            3,
+            {name: values[c] for name, values in cells.fields.items()},
+            COUNTS,
+            box,
+        ),
+        Surface(
+            "surface",
+            surface.points[s],
+            np.arange(s.sum()).reshape(-1, 3),
+            {"velocity": surface.fields["velocity"][s]},
+        ),
     ]
 
 
@@ -72,12 +97,17 @@ def test_vtk_reads_the_frame_of_one_process(tmp_path, grid_format):
     for index in range(2):
         one.write(index, 0.5 * index, whole())
     for name in ("particles", "grid", "surface"):
-        readers = [pyvista.get_reader(tmp_path / folder / f"{name}.pvd") for folder in ("one", "many")]
+        readers = [
+            pyvista.get_reader(tmp_path / folder / f"{name}.pvd") for folder in ("one", "many")
+        ]
         assert readers[0].time_values == readers[1].time_values == [0.0, 0.5]
         readers[1].set_active_time_value(0.5)
         expected, found = readers[0].read()[0], readers[1].read()[0]
         assert type(found) is type(expected)
-        assert (found.n_points, found.n_cells) == (expected.n_points, expected.n_cells) or grid_format == "vtu"
+        assert (found.n_points, found.n_cells) == (
+            expected.n_points,
+            expected.n_cells,
+        ) or grid_format == "vtu"
         a, b = (ordered(mesh, name) for mesh in (expected, found))
         assert a.keys() == b.keys()
         for key in a:
@@ -98,7 +128,10 @@ def ordered(mesh, name):
 
 @pytest.mark.parametrize("grid_format", ["vtu", "vti"])
 def test_a_recording_of_pieces_is_that_of_one_process(dots, tmp_path, grid_format):
-    text = '[scene]\nsimulator = "dots"\n[time]\nduration = 1.0\nframes_per_second = 2\n[domain]\nsize = [6.0, 4.0, 2.0]\nresolution = 6\n'
+    text = (
+        '[scene]\nsimulator = "dots"\n[time]\nduration = 1.0\nframes_per_second = '
+        "2\n[domain]\nsize = [6.0, 4.0, 2.0]\nresolution = 6\n"
+    )
     (tmp_path / "scene.toml").write_text(text)
     scene = dump_scene(load_scene(tmp_path / "scene.toml"))
     for folder in ("one", "many"):
@@ -107,7 +140,9 @@ def test_a_recording_of_pieces_is_that_of_one_process(dots, tmp_path, grid_forma
     write(tmp_path / "many", grid_format, frames=2)
     for index in range(2):
         FrameFolder(tmp_path / "one", grid_format).write(index, 0.5 * index, whole())
-    one, many = (Recording(tmp_path / folder, Color.PRESSURE, cells=True) for folder in ("one", "many"))
+    one, many = (
+        Recording(tmp_path / folder, Color.PRESSURE, cells=True) for folder in ("one", "many")
+    )
     assert many.numbers == one.numbers == [0, 1]
     for a, b in zip(one.read(1), many.read(1), strict=True):
         np.testing.assert_array_equal(np.sort(a, axis=0), np.sort(b, axis=0))
@@ -116,39 +151,72 @@ def test_a_recording_of_pieces_is_that_of_one_process(dots, tmp_path, grid_forma
     assert cells is not None and len(cells.index) == 20
     surface = Recording(tmp_path / "many").frame(0).surface
     assert surface is not None
-    np.testing.assert_array_equal(surface.points[surface.corners], whole()[2].points.reshape(2, 3, 3))
+    np.testing.assert_array_equal(
+        surface.points[surface.corners], whole()[2].points.reshape(2, 3, 3)
+    )
     assert FrameFolder(tmp_path / "many").missing("particles", 2) == []
     (tmp_path / "many" / "frames" / "rank_0001" / "particles_000001.vtu").unlink()
-    assert FrameFolder(tmp_path / "many").missing("particles", 2) == [1]  # as if the rank had not written it
+    # as if the rank had not written it
+    assert FrameFolder(tmp_path / "many").missing("particles", 2) == [1]
     with pytest.raises(RenderError, match=r"rank_0001.particles_000001.vtu: cannot be read"):
         many.read(1)
 
 
 def test_pieces_without_points_count_only_if_all_are(tmp_path):
-    full, none = (describe(Points("particles", np.zeros((n, 3)), {"velocity": np.zeros((n, 3))}), "vtu") for n in (4, 0))
+    full, none = (
+        describe(Points("particles", np.zeros((n, 3)), {"velocity": np.zeros((n, 3))}), "vtu")
+        for n in (4, 0)
+    )
     write_whole(tmp_path / "a.pvtu", [("rank_0000/a.vtu", none), ("rank_0001/a.vtu", full)])
     assert piece_files(tmp_path / "a.pvtu") == [tmp_path / "rank_0001" / "a.vtu"]
     write_whole(tmp_path / "a.pvtu", [("rank_0000/a.vtu", none), ("rank_0001/a.vtu", none)])
     assert piece_files(tmp_path / "a.pvtu") == [tmp_path / "rank_0000" / "a.vtu"]
     other = describe(Points("particles", np.zeros((4, 3)), {"speed": np.zeros(4)}), "vtu")
-    with pytest.raises(ValueError, match=r"rank_0001/a\.vtu has other fields than rank_0000/a\.vtu"):
+    with pytest.raises(
+        ValueError, match=r"rank_0001/a\.vtu has other fields than rank_0000/a\.vtu"
+    ):
         write_whole(tmp_path / "c.pvtu", [("rank_0000/a.vtu", full), ("rank_0001/a.vtu", other)])
     assert not (tmp_path / "c.pvtu").exists()
 
 
 def test_images_of_ranks_without_cells_fill_the_whole(tmp_path):
-    empty = Cells("grid", np.zeros((0, 3), dtype=int), 0.5, 2, {"pressure": np.zeros(0)}, (8, 4, 1), ((0, 0, 0), (5, 4, 1)))
-    full = Cells("grid", np.array([[6, 1, 0]]), 0.5, 2, {"pressure": np.ones(1)}, (8, 4, 1), ((5, 0, 0), (8, 4, 1)))
-    write_whole(tmp_path / "grid.pvti", [("rank_0000/g.vti", describe(empty, "vti")), ("rank_0001/g.vti", describe(full, "vti"))])
+    empty = Cells(
+        "grid",
+        np.zeros((0, 3), dtype=int),
+        0.5,
+        2,
+        {"pressure": np.zeros(0)},
+        (8, 4, 1),
+        ((0, 0, 0), (5, 4, 1)),
+    )
+    full = Cells(
+        "grid",
+        np.array([[6, 1, 0]]),
+        0.5,
+        2,
+        {"pressure": np.ones(1)},
+        (8, 4, 1),
+        ((5, 0, 0), (8, 4, 1)),
+    )
+    write_whole(
+        tmp_path / "grid.pvti",
+        [("rank_0000/g.vti", describe(empty, "vti")), ("rank_0001/g.vti", describe(full, "vti"))],
+    )
     text = (tmp_path / "grid.pvti").read_text()
     assert 'WholeExtent="0 8 0 4 0 0"' in text
-    assert '<Piece Extent="0 5 0 4 0 0" Source="rank_0000/g.vti"/>\n<Piece Extent="5 8 0 4 0 0" Source="rank_0001/g.vti"/>' in text
+    assert (
+        '<Piece Extent="0 5 0 4 0 0" Source="rank_0000/g.vti"/>\n<Piece Extent="5 8 0 4 0 0" '
+        'Source="rank_0001/g.vti"/>' in text
+    )
     assert len(one_grid([empty, full]).index) == 1
 
 
 def test_pieces_are_files_of_the_run(dots, tmp_path):
     """A run that goes on deletes later pieces; --force deletes all, and nothing that is not a run's."""
-    text = '[scene]\nsimulator = "dots"\n[time]\nduration = 1.0\nframes_per_second = 2\n[domain]\nsize = [6.0, 4.0, 2.0]\nresolution = 6\n'
+    text = (
+        '[scene]\nsimulator = "dots"\n[time]\nduration = 1.0\nframes_per_second = '
+        "2\n[domain]\nsize = [6.0, 4.0, 2.0]\nresolution = 6\n"
+    )
     (tmp_path / "scene.toml").write_text(text)
     out = tmp_path / "out"
     write(out, "vtu", frames=3)
@@ -160,7 +228,9 @@ def test_pieces_are_files_of_the_run(dots, tmp_path):
     folder = RunFolder(out, load_scene(tmp_path / "scene.toml"))
     folder.check_new(force=True)
     (out / "frames" / "rank_0001" / "notes.txt").write_text("mine")
-    with pytest.raises(OutputError, match=r"holds files that do not belong to a run \(frames.rank_0001.notes.txt, "):
+    with pytest.raises(
+        OutputError, match=r"holds files that do not belong to a run \(frames.rank_0001.notes.txt, "
+    ):
         folder.check_new(force=True)
     (out / "frames" / "rank_0001" / "notes.txt").unlink()
     folder.start(RunRecord("dots", "dots", "cpu"))
@@ -171,7 +241,10 @@ def test_a_folder_that_ranks_do_not_share_is_refused(dots, scene_file, tmp_path)
     collective = Collective.of_one()
     collective.ranks.comm.rank = 1  # the first one writes elsewhere
     folder = RunFolder(tmp_path / "out", load_scene(scene_file), collective)
-    with pytest.raises(OutputError, match="is not the folder that rank 0 writes; choose one that all machines share"):
+    with pytest.raises(
+        OutputError,
+        match="is not the folder that rank 0 writes; choose one that all machines share",
+    ):
         folder.start(RunRecord("dots", "dots", "cpu"))
 
 
@@ -205,7 +278,11 @@ def test_a_frame_names_pieces_of_its_own_alone(tmp_path, source):
     (tmp_path / "frames" / "rank_0009").symlink_to(tmp_path / "elsewhere")
     whole = tmp_path / "frames" / "particles_000001.pvtu"
     write_whole(whole, [(source, describe(whole_points(), "vtu"))])
-    with pytest.raises(RenderError, match=r"particles_000001\.pvtu: is not a readable frame: names '.*': a piece is rank_0000/particles"):
+    with pytest.raises(
+        RenderError,
+        match=r"particles_000001\.pvtu: is not a readable frame: names '.*': a piece is "
+        r"rank_0000/particles",
+    ):
         recording._read(whole)
 
 
@@ -222,6 +299,8 @@ def test_a_piece_is_named_once(tmp_path):
 def test_entities_are_refused(tmp_path):
     """A few lines that would become 10^9 characters."""
     lines = "".join(f'<!ENTITY a{n + 1} "{f"&a{n};" * 10}">' for n in range(9))
-    (tmp_path / "a.pvtu").write_text(f'<!DOCTYPE x [<!ENTITY a0 "xxxxxxxxxx">{lines}]><VTKFile>&a9;</VTKFile>')
+    (tmp_path / "a.pvtu").write_text(
+        f'<!DOCTYPE x [<!ENTITY a0 "xxxxxxxxxx">{lines}]><VTKFile>&a9;</VTKFile>'
+    )
     with pytest.raises(ValueError, match="declares a document type"):
         piece_files(tmp_path / "a.pvtu")

@@ -30,7 +30,8 @@ def test_a_dam_has_its_surface_at_the_start_and_later(dimension):
     start = surface_of(simulation)
     assert start.corners.shape[1] == dimension
     assert_closed(start.corners)
-    assert enclosed(start.points, start.corners) == pytest.approx(SIZE[dimension], rel=0.04)  # six cells high: edges are round
+    # six cells high: edges are round
+    assert enclosed(start.points, start.corners) == pytest.approx(SIZE[dimension], rel=0.04)
     assert start.fields["velocity"] == pytest.approx(0.0, abs=1e-6)
     small_liquids.advance(simulation, 0.15)
     later = surface_of(simulation)
@@ -45,11 +46,21 @@ def test_a_dam_has_its_surface_at_the_start_and_later(dimension):
 
 @DIMENSIONS
 def test_a_falling_block_has_its_velocity_from_its_first_frame_on(dimension):
-    low, high, velocity = [0.3, 0.4, 0.1][:dimension], [0.6, 0.8, 0.4][:dimension], [1.0, -2.0, 0.0][:dimension]
+    low, high, velocity = (
+        [0.3, 0.4, 0.1][:dimension],
+        [0.6, 0.8, 0.4][:dimension],
+        [1.0, -2.0, 0.0][:dimension],
+    )
     block = small_liquids.box(low, high, velocity=velocity)
-    simulation = small_liquids.create(small_liquids.scene(size=[1.0, 1.0, 0.5][:dimension], resolution=20, liquid=[block], **SURFACE))
+    simulation = small_liquids.create(
+        small_liquids.scene(
+            size=[1.0, 1.0, 0.5][:dimension], resolution=20, liquid=[block], **SURFACE
+        )
+    )
     surface = surface_of(simulation)
-    assert surface.fields["velocity"][:, :dimension] == pytest.approx(np.tile(velocity, (len(surface.points), 1)), abs=1e-4)
+    assert surface.fields["velocity"][:, :dimension] == pytest.approx(
+        np.tile(velocity, (len(surface.points), 1)), abs=1e-4
+    )
     small_liquids.advance(simulation, 0.02, 0.005)
     moved = surface_of(simulation)
     assert moved.fields["velocity"][:, 1] == pytest.approx(-2.0 - 9.81 * 0.02, abs=0.05)
@@ -92,14 +103,19 @@ def test_off_is_nothing(monkeypatch):
 @pytest.mark.parametrize("solid", [False, True])
 @DIMENSIONS
 def test_the_memory_that_is_announced_is_taken(dimension, solid):
-    solids = {"solid": [{"shape": "sphere", "center": [0.7, 0.2, 0.1][:dimension], "radius": 0.1}]} if solid else {}
+    solids = (
+        {"solid": [{"shape": "sphere", "center": [0.7, 0.2, 0.1][:dimension], "radius": 0.1}]}
+        if solid
+        else {}
+    )
     simulation = small_liquids.dam(dimension, **SURFACE, **solids)
     mesh = simulation.surface_mesh
     fields = [value for value in vars(mesh).values() if isinstance(value, wp.array)]
     taken = sum(field.capacity for field in [*fields, *mesh._fields])
     announced = simulation.scene.memory_parts()["surface mesh"]
     points = 2 * (32 * 16 + 16 * 8 + 8 * 32) if dimension == 3 else 2 * (32 + 16)
-    ring = np.prod(mesh.lattice.shape) / (32 * 16 * (8 if dimension == 3 else 3))  # of a lattice this small it is a third
+    # of a lattice this small it is a third
+    ring = np.prod(mesh.lattice.shape) / (32 * 16 * (8 if dimension == 3 else 3))
     assert taken == pytest.approx(ring * (announced - 80 * points), rel=0.02)
 
 
@@ -109,7 +125,10 @@ def some_surface(dimension):
     if dimension == 2:
         points, tetrahedron = points[:3], np.array([[0, 1], [1, 2], [2, 0]], dtype=np.int32)
     rng = np.random.default_rng(6043)
-    fields = {"velocity": rng.random((len(points), 3)).astype(np.float32), "id": np.arange(len(points), dtype=np.int32)}
+    fields = {
+        "velocity": rng.random((len(points), 3)).astype(np.float32),
+        "id": np.arange(len(points), dtype=np.int32),
+    }
     return Surface("surface", points, tetrahedron, fields)
 
 
@@ -120,7 +139,9 @@ def test_ply_triangles_are_read_back(tmp_path):
     assert np.array_equal(read.points, surface.points)
     assert np.array_equal(read.cells_dict["triangle"], surface.corners)
     for number, axis in enumerate("xyz"):
-        assert np.array_equal(read.point_data[f"velocity_{axis}"], surface.fields["velocity"][:, number])
+        assert np.array_equal(
+            read.point_data[f"velocity_{axis}"], surface.fields["velocity"][:, number]
+        )
     assert np.array_equal(read.point_data["id"], surface.fields["id"])
     assert enclosed(read.points, read.cells_dict["triangle"]) == pytest.approx(1 / 6)
 
@@ -138,11 +159,18 @@ def test_ply_files_come_beside_the_series_and_go_with_it(tmp_path):
     folder = FrameFolder(tmp_path, surface_ply=True)
     for index in range(3):
         written = [file.name for file in folder.write(index, index / 5, frame)]
-        assert written == [f"particles_{index:06d}.vtu", f"surface_{index:06d}.vtu", f"surface_{index:06d}.ply"]
+        assert written == [
+            f"particles_{index:06d}.vtu",
+            f"surface_{index:06d}.vtu",
+            f"surface_{index:06d}.ply",
+        ]
     size = sum(file.stat().st_size for file in (tmp_path / "frames").glob("*_000001.*"))
-    assert 0.95 * size < frame_bytes(frame, surface_ply=True) < size + 6000  # of files that are mostly headers
+    # of files that are mostly headers
+    assert 0.95 * size < frame_bytes(frame, surface_ply=True) < size + 6000
     FrameFolder(tmp_path, surface_ply=True).resume([0.0])
     assert sorted(file.name for file in (tmp_path / "frames").iterdir()) == [
-        "particles_000000.vtu", "surface_000000.ply", "surface_000000.vtu",
-    ]  # fmt: skip
+        "particles_000000.vtu",
+        "surface_000000.ply",
+        "surface_000000.vtu",
+    ]
     assert (tmp_path / "surface.pvd").read_text().count("DataSet") == 1

@@ -61,12 +61,17 @@ def test_vtk_shows_exactly_the_cells(pyvista, tmp_path, dimension, whole):
 
 
 def test_every_frame_has_the_whole_grid(pyvista, tmp_path):
-    few, none = some_cells(3, (10, 8, 5)), Cells("grid", np.empty((0, 3), int), 0.25, 3, {"pressure": np.empty(0)}, (10, 8, 5))
+    few, none = (
+        some_cells(3, (10, 8, 5)),
+        Cells("grid", np.empty((0, 3), int), 0.25, 3, {"pressure": np.empty(0)}, (10, 8, 5)),
+    )
     for cells in (few, none):
         write_vti(tmp_path / "a.vti", cells)
         image = pyvista.read(tmp_path / "a.vti")
         assert image.extent == (0, 10, 0, 8, 0, 5)
-        assert sum(image.IsCellVisible(number) for number in range(image.n_cells)) == len(cells.index)
+        assert sum(image.IsCellVisible(number) for number in range(image.n_cells)) == len(
+            cells.index
+        )
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -127,16 +132,23 @@ def test_arrays_do_not_share_their_bytes(tmp_path):
     write_vti(tmp_path / "a.vti", some_cells(3))
     array = b'<DataArray type="Float64" Name="%d" format="appended" offset="0"/>'
     whole = (tmp_path / "a.vti").read_bytes()
-    (tmp_path / "a.vti").write_bytes(whole.replace(b"</CellData>", b"".join(array % n for n in range(9)) + b"</CellData>"))
+    (tmp_path / "a.vti").write_bytes(
+        whole.replace(b"</CellData>", b"".join(array % n for n in range(9)) + b"</CellData>")
+    )
     with pytest.raises(ValueError, match="its arrays do not match its"):
         read_vti(tmp_path / "a.vti")
 
 
 def test_cells_outside_the_grid_are_refused(tmp_path):
-    with pytest.raises(ValueError, match="the grid of 9 x 8 x 5 cells does not hold all cells of 'grid'"):
+    with pytest.raises(
+        ValueError, match="the grid of 9 x 8 x 5 cells does not hold all cells of 'grid'"
+    ):
         write_vti(tmp_path / "a.vti", some_cells(3, (9, 8, 5)))
     with pytest.raises(ValueError, match="'pressure' has 3 entries for 4"):
-        write_vti(tmp_path / "a.vti", Cells("grid", some_cells(3).index, 0.25, 3, {"pressure": np.zeros(3)}))
+        write_vti(
+            tmp_path / "a.vti",
+            Cells("grid", some_cells(3).index, 0.25, 3, {"pressure": np.zeros(3)}),
+        )
     assert list(tmp_path.iterdir()) == []
 
 
@@ -166,7 +178,13 @@ def test_a_run_that_goes_on_with_another_format_keeps_its_frames(tmp_path):
     second = FrameFolder(tmp_path, "vti")
     second.resume([0.0, 1.0])
     second.write(2, 2.0, [some_cells(3)])
-    assert sorted(path.name for path in (tmp_path / "frames").iterdir()) == ["grid_000000.vtu", "grid_000001.vtu", "grid_000002.vti"]
-    assert [line.split('"')[-2] for line in (tmp_path / "grid.pvd").read_text().splitlines() if "DataSet" in line] == [
-        f"frames/grid_{index:06d}.{kind}" for index, kind in enumerate(["vtu", "vtu", "vti"])
+    assert sorted(path.name for path in (tmp_path / "frames").iterdir()) == [
+        "grid_000000.vtu",
+        "grid_000001.vtu",
+        "grid_000002.vti",
     ]
+    assert [
+        line.split('"')[-2]
+        for line in (tmp_path / "grid.pvd").read_text().splitlines()
+        if "DataSet" in line
+    ] == [f"frames/grid_{index:06d}.{kind}" for index, kind in enumerate(["vtu", "vtu", "vti"])]

@@ -20,7 +20,21 @@ NUMBERS = [
     b"0x7f",
     b"",
 ]
-PIECES = [b"\x00", b"\xff" * 8, b"\x1b]0;x\x07", b"\n", b"[" * 200, b'"', b"{", b"../", b"\r\n", "\u202e\u00e9".encode(), b"%s", b"=", b" "]
+PIECES = [
+    b"\x00",
+    b"\xff" * 8,
+    b"\x1b]0;x\x07",
+    b"\n",
+    b"[" * 200,
+    b'"',
+    b"{",
+    b"../",
+    b"\r\n",
+    "\u202e\u00e9".encode(),
+    b"%s",
+    b"=",
+    b" ",
+]
 NUMBER = re.compile(rb"-?\d[\d.]*(?:[eE][-+]?\d+)?")
 
 
@@ -43,7 +57,11 @@ def _mutation(draw: st.DrawFn, data: bytes, other: bytes) -> bytes:
     """Draw a mutation of `data`."""
     at = draw(st.integers(0, max(len(data) - 1, 0)))
     end = min(len(data), at + draw(st.sampled_from([1, 2, 4, 16, 256, 4096])))
-    match draw(st.sampled_from(["bit", "byte", "number", "number", "cut", "drop", "double", "piece", "splice"])):
+    match draw(
+        st.sampled_from(
+            ["bit", "byte", "number", "number", "cut", "drop", "double", "piece", "splice"]
+        )
+    ):
         case "bit" if data:
             return data[:at] + bytes([data[at] ^ 1 << draw(st.integers(0, 7))]) + data[at + 1 :]
         case "byte":

@@ -19,7 +19,13 @@ WORDS = [
 
 @given(st.lists(mutated(WORDS), max_size=3))
 def test_overrides(words: list[bytes]) -> None:
-    told("check", "dam-break-2d", "--device", "cpu", *(option for word in words for option in ("--set", word.decode("utf-8", "replace"))))
+    told(
+        "check",
+        "dam-break-2d",
+        "--device",
+        "cpu",
+        *(option for word in words for option in ("--set", word.decode("utf-8", "replace"))),
+    )
 
 
 @given(mutated([b"dam-break-2d", b"scenes/missing.toml", b"builtin:bunny"]))

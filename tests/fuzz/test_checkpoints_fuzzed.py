@@ -48,7 +48,10 @@ def newest(folder: CheckpointFolder, path: Path, data: bytes) -> Checkpoint | No
         with limited():
             found, refused = folder.newest()
             if found and PIECES in found.state:
-                assert all(np.array_equal(piece["position"], STATE["position"]) for piece in folder.pieces(found))
+                assert all(
+                    np.array_equal(piece["position"], STATE["position"])
+                    for piece in folder.pieces(found)
+                )
         assert all(str(path) in reason for reason in refused), refused
         assert refused or found.step == 12
         return found
@@ -59,8 +62,12 @@ def newest(folder: CheckpointFolder, path: Path, data: bytes) -> Checkpoint | No
 @costly
 @given(st.data())
 def test_checkpoints_in_pieces(folder: CheckpointFolder, data: st.DataObject) -> None:
-    path = data.draw(st.sampled_from([folder.path(12), folder.of_rank(0).path(12), folder.of_rank(1).path(12)]))
-    found = newest(folder, path, data.draw(mutated([path.read_bytes(), folder.path(5).read_bytes()])))
+    path = data.draw(
+        st.sampled_from([folder.path(12), folder.of_rank(0).path(12), folder.of_rank(1).path(12)])
+    )
+    found = newest(
+        folder, path, data.draw(mutated([path.read_bytes(), folder.path(5).read_bytes()]))
+    )
     assert found is not None
 
 
@@ -79,14 +86,25 @@ def test_checkpoints_whose_zip_is_right(folder: CheckpointFolder, data: st.DataO
 
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
-    lambda inner: st.lists(inner, max_size=2) | st.dictionaries(st.sampled_from([*KEYS, "domain.resolution"]), inner, max_size=2),
+    lambda inner: (
+        st.lists(inner, max_size=2)
+        | st.dictionaries(st.sampled_from([*KEYS, "domain.resolution"]), inner, max_size=2)
+    ),
     max_leaves=4,
 )
 
 
 @costly
-@given(st.dictionaries(st.sampled_from(["format", "scene", "step", "time", "keys", "checksum", "more"]), JSON, max_size=2))
-def test_checkpoints_that_say_something_else(folder: CheckpointFolder, said: dict[str, Any]) -> None:
+@given(
+    st.dictionaries(
+        st.sampled_from(["format", "scene", "step", "time", "keys", "checksum", "more"]),
+        JSON,
+        max_size=2,
+    )
+)
+def test_checkpoints_that_say_something_else(
+    folder: CheckpointFolder, said: dict[str, Any]
+) -> None:
     with zipfile.ZipFile(folder.path(5)) as archive:
         members = {info.filename: archive.read(info) for info in archive.infolist()}
     meta = json.loads(str(np.load(io.BytesIO(members["meta.npy"]))))
@@ -128,7 +146,15 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def command(folder: Path) -> list[str]:
-    scene = ["ceiling-drop", "--set", "domain.resolution=8", "--set", "time.duration=0.05", "--set", "output.checkpoint_every=1"]
+    scene = [
+        "ceiling-drop",
+        "--set",
+        "domain.resolution=8",
+        "--set",
+        "time.duration=0.05",
+        "--set",
+        "output.checkpoint_every=1",
+    ]
     return ["run", *scene, "--device", "cpu", "--out", str(folder)]
 
 

@@ -34,7 +34,9 @@ POINTS = RANDOM.random((5, 3)).astype(np.float32)
 INDEX = np.array([[0, 1, 2], [3, 2, 1], [1, 1, 0]])
 PARTS: list[Part] = [
     Points("particles", POINTS, {"velocity": POINTS - 0.5}),
-    Cells("grid", INDEX, 0.25, 3, {"pressure": RANDOM.random(3), "wall": INDEX[:, 1] == 1}, (4, 4, 4)),
+    Cells(
+        "grid", INDEX, 0.25, 3, {"pressure": RANDOM.random(3), "wall": INDEX[:, 1] == 1}, (4, 4, 4)
+    ),
     Surface("surface", POINTS, np.array([[0, 1, 2], [1, 2, 3]]), {"velocity": POINTS}),
     Surface("bodies", POINTS, np.array([[2, 3, 4]]), {"body": np.arange(5.0)}),
 ]
@@ -51,7 +53,10 @@ def write_run(folder: Path) -> None:
         whole = folder / "frames" / f"{part.name}_000001.{kind}"
         for rank in range(2):
             whole.parent.joinpath(f"rank_000{rank}").mkdir(exist_ok=True)
-            shutil.copy(whole.with_name(whole.name.replace("000001", "000002")), whole.parent / f"rank_000{rank}" / whole.name)
+            shutil.copy(
+                whole.with_name(whole.name.replace("000001", "000002")),
+                whole.parent / f"rank_000{rank}" / whole.name,
+            )
         if part.name != "bodies":  # frame 1 has pieces of all but these
             (whole.parent / f"{part.name}_000001.vtu").unlink()
             pieces = [(f"rank_000{rank}/{whole.name}", describe(part, kind)) for rank in range(2)]
@@ -124,7 +129,18 @@ def test_scenes_of_runs(run: Path, scene: bytes) -> None:
 
 
 @costly
-@given(st.lists(mutated([b"camera.position=[1, 2, 3]", b"camera.look_at=[0.5, 0.5, 0]", b"camera.field_of_view=30"]), max_size=2))
+@given(
+    st.lists(
+        mutated(
+            [
+                b"camera.position=[1, 2, 3]",
+                b"camera.look_at=[0.5, 0.5, 0]",
+                b"camera.field_of_view=30",
+            ]
+        ),
+        max_size=2,
+    )
+)
 def test_cameras(run: Path, words: list[bytes]) -> None:
     try:
         with limited():

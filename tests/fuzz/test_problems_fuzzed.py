@@ -79,7 +79,17 @@ def solved(folder: Path, **files: bytes) -> int:
     for name, data in files.items():
         (folder / name.replace("_", ".")).write_bytes(data)
     arguments = [folder / name.replace("_", ".") for name in files]
-    return told("solve", *arguments, "--device", "cpu", "--method", "psor", "--max-iterations", "0", codes=(0, cli.FAILED, cli.WRONG_INPUT))
+    return told(
+        "solve",
+        *arguments,
+        "--device",
+        "cpu",
+        "--method",
+        "psor",
+        "--max-iterations",
+        "0",
+        codes=(0, cli.FAILED, cli.WRONG_INPUT),
+    )
 
 
 @costly
@@ -104,4 +114,7 @@ def test_recorded_problems(folder: Path, problem: bytes) -> None:
 @given(st.data())
 def test_recorded_problems_with_right_checksums(folder: Path, data: st.DataObject) -> None:
     name = data.draw(st.sampled_from(sorted(MEMBERS)))
-    solved(folder, problem_npz=archive(MEMBERS | {name: data.draw(mutated([MEMBERS[name], MEMBERS["b"]]))}))
+    solved(
+        folder,
+        problem_npz=archive(MEMBERS | {name: data.draw(mutated([MEMBERS[name], MEMBERS["b"]]))}),
+    )

@@ -26,14 +26,69 @@ from warp_lcp.scene.scene_file import built_in_scenes
 from warp_lcp.scene.table import SceneError
 
 ROOM = 8 << 20  # bytes of memory that a scene may take to be made: those of a few thousand cells
-NUMBERS = [0, -1, 1, 2, 3, 7, 4096, 10**9, 2**63 - 1, -(2**63), 2**64, 10**400, math.nan, math.inf, -math.inf]
+NUMBERS = [
+    0,
+    -1,
+    1,
+    2,
+    3,
+    7,
+    4096,
+    10**9,
+    2**63 - 1,
+    -(2**63),
+    2**64,
+    10**400,
+    math.nan,
+    math.inf,
+    -math.inf,
+]
 NUMBERS += [0.0, -0.0, 0.5, -2.5, 1e-320, 1e-30, 1e-9, 1e12, 1e30, 1e200, 1.7e308, -1e308]
 FACTORS = [2, 3, 10, 1000, 10**6, 10**15, 1e-3, 1e-15, 1e-200, 1e-320, 1e30, 1e200, -1]
-WORDS = ["", " ", "é\u200b漢🌊", "a\x00b", "/", ".", "..", "x" * 5000, "nan", "{}", "%s", "'", "builtin:", "builtin:torus", "builtin:x"]
+WORDS = [
+    "",
+    " ",
+    "é\u200b漢🌊",
+    "a\x00b",
+    "/",
+    ".",
+    "..",
+    "x" * 5000,
+    "nan",
+    "{}",
+    "%s",
+    "'",
+    "builtin:",
+    "builtin:torus",
+    "builtin:x",
+]
 WORDS += ["box", "sphere", "plane", "mesh", "translation", "rotation", "sinusoid", "keyframes"]
 WORDS += ["fluids", "granular", "flip", "unilateral", "voxel", "left", "front", "psor"]
-KEYS = [*WORDS, "scale", "rotate", "translate", "motion", "file", "invert", "smoothing", "open", "shape"]
-OTHERS = [True, False, [], [[]], {}, {"a": {"b": []}}, datetime.date(2026, 2, 28), datetime.time(1, 2), [1.0], [1.0] * 3, [0.1] * 1000]
+KEYS = [
+    *WORDS,
+    "scale",
+    "rotate",
+    "translate",
+    "motion",
+    "file",
+    "invert",
+    "smoothing",
+    "open",
+    "shape",
+]
+OTHERS = [
+    True,
+    False,
+    [],
+    [[]],
+    {},
+    {"a": {"b": []}},
+    datetime.date(2026, 2, 28),
+    datetime.time(1, 2),
+    [1.0],
+    [1.0] * 3,
+    [0.1] * 1000,
+]
 INSERTS = [
     b"[" * 3000,
     b"[[x]]\n",
@@ -48,7 +103,14 @@ INSERTS = [
 
 SMALL = [
     re.sub(rb"resolution = \d+", b"resolution = 20", built_in_scenes()[name].read_bytes())
-    for name in ("column-collapse-2d", "dam-break-2d", "floating-bodies-2d", "hourglass-2d", "retracting-wall", "tap-and-drain")
+    for name in (
+        "column-collapse-2d",
+        "dam-break-2d",
+        "floating-bodies-2d",
+        "hourglass-2d",
+        "retracting-wall",
+        "tap-and-drain",
+    )
 ]
 
 
@@ -67,7 +129,12 @@ def test_changed_scenes(data: bytes) -> None:
             assert dict(lines)["frames"]
 
 
-@given(mutated(SMALL) | st.sampled_from(SMALL).flatmap(lambda data: st.integers(0, 2**32).map(lambda s: fuzzed(random.Random(s), data))))
+@given(
+    mutated(SMALL)
+    | st.sampled_from(SMALL).flatmap(
+        lambda data: st.integers(0, 2**32).map(lambda s: fuzzed(random.Random(s), data))
+    )
+)
 def test_mutated_scenes(data: bytes) -> None:
     """Bytes and values: `check` makes what it takes, and ends with 0, or with 2 and a message."""
     with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
@@ -86,7 +153,10 @@ def test_mutated_scenes(data: bytes) -> None:
         ("time.duration = 0x" + "f" * 5000, "too many digits"),
         ("time.duration = 1e300", "time.duration = 1e+300: must not be beyond 1e+18"),
         ("domain.periodic = [{}]", "domain.periodic"),  # a value that is no key of a set
-        ('solver.preset = {a = 1}\nsolver.method = {a = 1}\n[scene]\nsimulator = "fluids"', "solver.method"),
+        (
+            'solver.preset = {a = 1}\nsolver.method = {a = 1}\n[scene]\nsimulator = "fluids"',
+            "solver.method",
+        ),
     ],
 )
 def test_what_once_ended_in_a_traceback_is_refused(text: str, message: str, tmp_path: Path) -> None:
@@ -119,7 +189,11 @@ def test_a_folder_is_no_scene_and_no_mesh(tmp_path: Path) -> None:
 
 def fuzzed(chance: random.Random, original: bytes | None = None) -> bytes:
     """Return a scene, a built-in one unless given, with a few random changes of its keys and values, and sometimes of its bytes."""
-    text = chance.choice(list(built_in_scenes().values())).read_bytes() if original is None else original
+    text = (
+        chance.choice(list(built_in_scenes().values())).read_bytes()
+        if original is None
+        else original
+    )
     data = tomllib.loads(text.decode())
     change = chance.choice([_change, _change_number])
     for _ in range(chance.choice([1, 1, 1, 2, 3, 5])):
@@ -142,7 +216,13 @@ def _value(chance: random.Random) -> Any:
 
 def _change_number(data: dict[str, Any], chance: random.Random) -> None:
     """Change a number to one that the scene may well allow, so that what comes after the first checks is reached."""
-    owner, key = chance.choice([(o, k) for o, k in _places(data) if isinstance(o[k], (int, float)) and not isinstance(o[k], bool)])
+    owner, key = chance.choice(
+        [
+            (o, k)
+            for o, k in _places(data)
+            if isinstance(o[k], (int, float)) and not isinstance(o[k], bool)
+        ]
+    )
     old = owner[key]
     owner[key] = chance.choice([old + 1, 1e18, *(old * factor for factor in FACTORS)])
 
@@ -154,20 +234,42 @@ def _change(data: dict[str, Any], chance: random.Random) -> None:
     owner, key = chance.choice(places)
     old = owner[key]
     numeric = isinstance(old, (int, float)) and not isinstance(old, bool)
-    kind = chance.choice(["value", "value", "number", "number", "drop", "rename", "swap", "nest", "repeat", "add", "text"])
+    kind = chance.choice(
+        [
+            "value",
+            "value",
+            "number",
+            "number",
+            "drop",
+            "rename",
+            "swap",
+            "nest",
+            "repeat",
+            "add",
+            "text",
+        ]
+    )
     if kind == "number" and numeric:
-        owner[key] = chance.choice([old * 10.0 ** chance.uniform(-6, 6), -old, old + 1, chance.choice(NUMBERS)])
+        owner[key] = chance.choice(
+            [old * 10.0 ** chance.uniform(-6, 6), -old, old + 1, chance.choice(NUMBERS)]
+        )
     elif kind == "drop":
         del owner[key]
     elif kind == "rename" and isinstance(owner, dict):
-        owner[chance.choice([f"{key}x", key.upper(), key[1:] or "q", chance.choice(WORDS)])] = owner.pop(key)
+        owner[chance.choice([f"{key}x", key.upper(), key[1:] or "q", chance.choice(WORDS)])] = (
+            owner.pop(key)
+        )
     elif kind == "swap":
         other, place = chance.choice(places)
         owner[key] = copy.deepcopy(other[place])
     elif kind == "nest":
-        owner[key] = chance.choice([[old], {"value": old}, [old] * 3, {key if isinstance(key, str) else "k": old}])
+        owner[key] = chance.choice(
+            [[old], {"value": old}, [old] * 3, {key if isinstance(key, str) else "k": old}]
+        )
     elif kind == "repeat" and isinstance(old, list) and old:
-        owner[key] = [copy.deepcopy(chance.choice(old)) for _ in range(chance.choice([2, 3, 10, 200]))]
+        owner[key] = [
+            copy.deepcopy(chance.choice(old)) for _ in range(chance.choice([2, 3, 10, 200]))
+        ]
     elif kind == "add" and isinstance(old, dict):
         old[chance.choice(KEYS)] = _value(chance)
     elif kind == "text" and isinstance(old, str):

@@ -21,20 +21,24 @@ except ImportError:  # not on Windows
     resource = None
 
 COUNT = settings().max_examples
-costly = settings(max_examples=COUNT if COUNT > 100 else COUNT // 4)  # a quarter in the short tests, all of them in `make fuzz`
+# a quarter in the short tests, all of them in `make fuzz`
+costly = settings(max_examples=COUNT if COUNT > 100 else COUNT // 4)
 MEMORY = 1 << 30  # bytes that reading one small file may take
 
 
 def told(*arguments: str | Path, codes: tuple[int, ...] = (0, cli.WRONG_INPUT)) -> int:
     """Run a command that reads files; return its exit code, one of `codes`, 0 or 2 unless given.
 
-    It ends without a traceback, takes no more than MEMORY, says why when it refuses, and prints nothing that a terminal obeys.
+    It ends without a traceback, takes no more than MEMORY, says why when it refuses, and prints
+    nothing that a terminal obeys.
     """
     if arguments[0] == "check":
         make_kernels()
     with limited():
         result = CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
-    assert result.exception is None or isinstance(result.exception, SystemExit), repr(result.exception)
+    assert result.exception is None or isinstance(result.exception, SystemExit), repr(
+        result.exception
+    )
     assert result.exit_code in codes, (result.exit_code, result.output)
     assert result.exit_code == 0 or result.stderr.strip(), "refused without a word"
     assert visible(result.output) == result.output
@@ -44,7 +48,13 @@ def told(*arguments: str | Path, codes: tuple[int, ...] = (0, cli.WRONG_INPUT)) 
 @cache
 def make_kernels() -> None:
     """Compile what checks of scenes launch, which takes more memory than they may."""
-    for scene in ("dam-break-2d", "column-collapse-2d", "floating-bodies-2d", "tap-and-drain", "mesh-obstacle"):
+    for scene in (
+        "dam-break-2d",
+        "column-collapse-2d",
+        "floating-bodies-2d",
+        "tap-and-drain",
+        "mesh-obstacle",
+    ):
         start(load_scene(scene, ["domain.resolution=20"]), "cpu")
 
 

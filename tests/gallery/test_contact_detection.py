@@ -39,42 +39,66 @@ def test_spheres():
 
 def test_a_sphere_and_a_tilted_plane():
     normal = np.array([0.6, 0.0, 0.8])
-    contacts = world_of(ball(0.55 * normal + np.array([0, 3, 0]), 0.5), obstacles=(plane(normal),)).contacts(margin=0.1)
+    contacts = world_of(
+        ball(0.55 * normal + np.array([0, 3, 0]), 0.5), obstacles=(plane(normal),)
+    ).contacts(margin=0.1)
     assert contacts.second[0] == 1  # no body
     assert contacts.gap[0] == pytest.approx(0.05)
     np.testing.assert_allclose(contacts.point[0], 0.025 * normal + [0, 3, 0], atol=1e-14)
 
 
 def test_a_box_stands_on_four_corners_or_on_one():
-    contacts = world_of(box([0, 0, 0.3], (0.1, 0.2, 0.3)), obstacles=(GROUND,)).contacts(margin=0.01)
-    assert sorted(map(tuple, contacts.point.round(12).tolist())) == [(-0.1, -0.2, 0), (-0.1, 0.2, 0), (0.1, -0.2, 0), (0.1, 0.2, 0)]
+    contacts = world_of(box([0, 0, 0.3], (0.1, 0.2, 0.3)), obstacles=(GROUND,)).contacts(
+        margin=0.01
+    )
+    assert sorted(map(tuple, contacts.point.round(12).tolist())) == [
+        (-0.1, -0.2, 0),
+        (-0.1, 0.2, 0),
+        (0.1, -0.2, 0),
+        (0.1, 0.2, 0),
+    ]
     leaning = turn(0.5, 0.3, 0.0)
     lowest = 0.3 - np.abs(leaning.as_matrix()[2]) @ [0.1, 0.2, 0.3]  # support function of a box
     low = plane([0.0, 0.0, 1.0], lowest - 0.001)
-    contacts = world_of(box([0, 0, 0.3], (0.1, 0.2, 0.3), leaning), obstacles=(low,)).contacts(margin=0.01)
+    contacts = world_of(box([0, 0, 0.3], (0.1, 0.2, 0.3), leaning), obstacles=(low,)).contacts(
+        margin=0.01
+    )
     assert len(contacts) == 1
     assert contacts.gap[0] == pytest.approx(0.001)
 
 
 def test_a_face_on_a_face_gives_the_corners_of_the_overlap():
-    contacts = world_of(box([0, 0, 0.5], (0.5,) * 3), box([0.4, 0.0, 1.19], (0.2,) * 3)).contacts(margin=0.02)
+    contacts = world_of(box([0, 0, 0.5], (0.5,) * 3), box([0.4, 0.0, 1.19], (0.2,) * 3)).contacts(
+        margin=0.02
+    )
     np.testing.assert_allclose(contacts.gap, -0.01)
     np.testing.assert_allclose(contacts.frames[:, 0], np.tile([0, 0, 1.0], (4, 1)), atol=1e-14)
-    expected = {(x, y, 0.995) for x in (0.2, 0.5) for y in (-0.2, 0.2)}  # x from 0.2 to 0.6, cut at 0.5
+    # x from 0.2 to 0.6, cut at 0.5
+    expected = {(x, y, 0.995) for x in (0.2, 0.5) for y in (-0.2, 0.2)}
     assert {tuple(p) for p in contacts.point.round(9).tolist()} == expected
 
 
 def test_a_turned_face_gives_an_octagon():
-    contacts = world_of(box([0, 0, 0.5], (0.5,) * 3), box([0, 0, 1.5], (0.5,) * 3, turn(0, 0, np.pi / 4))).contacts(margin=0.02)
+    contacts = world_of(
+        box([0, 0, 0.5], (0.5,) * 3), box([0, 0, 1.5], (0.5,) * 3, turn(0, 0, np.pi / 4))
+    ).contacts(margin=0.02)
     assert len(contacts) == 8
-    np.testing.assert_allclose(np.linalg.norm(contacts.point[:, :2], axis=1), 0.5 / np.cos(np.pi / 8), rtol=1e-12)
+    np.testing.assert_allclose(
+        np.linalg.norm(contacts.point[:, :2], axis=1), 0.5 / np.cos(np.pi / 8), rtol=1e-12
+    )
     np.testing.assert_allclose(contacts.gap, 0, atol=1e-12)
 
 
 def test_crossed_edges_meet_in_a_point():
     h = 0.5
-    a = OrientedBox(np.zeros(3), turn(np.pi / 4, 0, 0).as_matrix(), np.full(3, h))  # an edge along x on top, at height h sqrt 2
-    b = OrientedBox(np.array([0.1, 0.05, 2 * h * np.sqrt(2) + 0.01]), turn(0, np.pi / 4, 0).as_matrix(), np.full(3, h))  # along y, below
+    # an edge along x on top, at height h sqrt 2
+    a = OrientedBox(np.zeros(3), turn(np.pi / 4, 0, 0).as_matrix(), np.full(3, h))
+    # along y, below
+    b = OrientedBox(
+        np.array([0.1, 0.05, 2 * h * np.sqrt(2) + 0.01]),
+        turn(0, np.pi / 4, 0).as_matrix(),
+        np.full(3, h),
+    )
     points, normal, gaps = box_box(a, b, 0.02)
     np.testing.assert_allclose(normal, [0, 0, -1], atol=1e-12)
     np.testing.assert_allclose(points, [[0.1, 0.0, h * np.sqrt(2) + 0.005]], atol=1e-12)
@@ -97,13 +121,22 @@ def test_a_sphere_at_a_box_from_outside_and_inside():
 
 KINDS = {
     "spheres": lambda: world_of(ball([0, 0, 0], 0.5), ball([0.6, 0.5, 0.6], 0.5)),
-    "sphere and box": lambda: world_of(ball([0, 0, 0.8], 0.5), box([0.1, 0, 0], (0.3,) * 3, turn(0.1, 0.05, 0))),
-    "sphere and gear": lambda: world_of(ball([0, 0, 0.52], 0.2), gear([0.05, 0, 0], (0.3, 0.05, 0.1), 0.5)),
-    "corner on face": lambda: world_of(box([0, 0, 0], (0.5,) * 3), box([0.1, 0, 0.82], (0.2,) * 3, turn(0.7, 0.5, 0))),
-    "edges": lambda: world_of(
-        box([0, 0, 0], (0.5,) * 3, turn(np.pi / 4, 0.02, 0)), box([0.1, 0, np.sqrt(2)], (0.5,) * 3, turn(0.01, np.pi / 4, 0))
+    "sphere and box": lambda: world_of(
+        ball([0, 0, 0.8], 0.5), box([0.1, 0, 0], (0.3,) * 3, turn(0.1, 0.05, 0))
     ),
-    "box on plane": lambda: world_of(box([0, 0, 0.34], (0.1, 0.2, 0.3), turn(0.4, 0.3, 0.2)), obstacles=(GROUND,)),
+    "sphere and gear": lambda: world_of(
+        ball([0, 0, 0.52], 0.2), gear([0.05, 0, 0], (0.3, 0.05, 0.1), 0.5)
+    ),
+    "corner on face": lambda: world_of(
+        box([0, 0, 0], (0.5,) * 3), box([0.1, 0, 0.82], (0.2,) * 3, turn(0.7, 0.5, 0))
+    ),
+    "edges": lambda: world_of(
+        box([0, 0, 0], (0.5,) * 3, turn(np.pi / 4, 0.02, 0)),
+        box([0.1, 0, np.sqrt(2)], (0.5,) * 3, turn(0.01, np.pi / 4, 0)),
+    ),
+    "box on plane": lambda: world_of(
+        box([0, 0, 0.34], (0.1, 0.2, 0.3), turn(0.4, 0.3, 0.2)), obstacles=(GROUND,)
+    ),
 }
 
 

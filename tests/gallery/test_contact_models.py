@@ -5,20 +5,35 @@ import pytest
 import scipy.sparse
 
 import warp_lcp as wl
-from warp_lcp.gallery.contact_models import BoxedModel, ContactSystem, FrozenBoxModel, StewartTrinkleModel, proximal_sweeps
+from warp_lcp.gallery.contact_models import (
+    BoxedModel,
+    ContactSystem,
+    FrozenBoxModel,
+    StewartTrinkleModel,
+    proximal_sweeps,
+)
 from warp_lcp.gallery.contact_scenes import box_stack, contact_scene, incline, motor_arm
 
-FAST = 300.0  # [m/s]: friction turns the slip by a thousandth at most, so that two vectors share it next to nowhere
+# [m/s]: friction turns the slip by a thousandth at most, so that two vectors share it next to
+# nowhere
+FAST = 300.0
 TIGHT = wl.StoppingCriteria(rtol=1e-12, max_iterations=2000, patience=2000)
 
 
 def particle(slip, mu, weight=1.0, mass=2.0):
     """A particle on the ground that falls with the impulse `weight` and slides with `slip`."""
-    return ContactSystem("particle", scipy.sparse.csr_array(np.eye(3) / mass), np.array([-weight / mass, *slip]), np.array([mu]))
+    return ContactSystem(
+        "particle",
+        scipy.sparse.csr_array(np.eye(3) / mass),
+        np.array([-weight / mass, *slip]),
+        np.array([mu]),
+    )
 
 
 def solved(system, model, method=None):
-    result = wl.solve(model.problem(system).dense().lcp(device="cpu"), method or wl.Lemke(), stopping=TIGHT)
+    result = wl.solve(
+        model.problem(system).dense().lcp(device="cpu"), method or wl.Lemke(), stopping=TIGHT
+    )
     assert result, result.status
     return model.impulses(system, result.x.numpy())
 
@@ -33,8 +48,11 @@ def test_friction_dissipates_the_most_that_its_cone_allows(directions):
         r = solved(system, StewartTrinkleModel(directions))
         u = (system.B @ r + system.q)[1:]
         assert u @ r[1:] == pytest.approx(0.5 * r[0] * (vectors @ u).min(), abs=1e-9)
-        sides = np.stack([np.cos(angles + np.pi / directions), np.sin(angles + np.pi / directions)], axis=1)
-        assert (sides @ r[1:]).max() <= 0.5 * r[0] * np.cos(np.pi / directions) + 1e-9  # inside the polygon
+        sides = np.stack(
+            [np.cos(angles + np.pi / directions), np.sin(angles + np.pi / directions)], axis=1
+        )
+        # inside the polygon
+        assert (sides @ r[1:]).max() <= 0.5 * r[0] * np.cos(np.pi / directions) + 1e-9
 
 
 @pytest.mark.parametrize("directions", [4, 8, 16])
@@ -44,9 +62,12 @@ def test_a_sliding_particle_is_held_along_the_nearest_vector(directions):
         slip = FAST * np.array([np.cos(angle), np.sin(angle)])
         r = solved(particle(slip, mu, mass=mass), model)
         assert r[0] == pytest.approx(1.0)
-        assert np.linalg.norm(r[1:]) == pytest.approx(mu * r[0])  # it slides: friction is on the cone
+        # it slides: friction is on the cone
+        assert np.linalg.norm(r[1:]) == pytest.approx(mu * r[0])
         nearest = 2 * np.pi / directions * np.round((angle + np.pi) / (2 * np.pi / directions))
-        np.testing.assert_allclose(r[1:], mu * np.array([np.cos(nearest), np.sin(nearest)]), atol=1e-9)
+        np.testing.assert_allclose(
+            r[1:], mu * np.array([np.cos(nearest), np.sin(nearest)]), atol=1e-9
+        )
 
 
 def test_the_polyhedral_cone_converges_to_the_circular_one():
@@ -58,7 +79,8 @@ def test_the_polyhedral_cone_converges_to_the_circular_one():
             slip = FAST * np.array([np.cos(angle), np.sin(angle)])
             system = particle(slip, mu)
             exact, residual, _ = proximal_sweeps(system)
-            np.testing.assert_allclose(exact[1:], -mu * slip / FAST, atol=1e-9)  # opposite to the slip: Coulomb's law
+            # opposite to the slip: Coulomb's law
+            np.testing.assert_allclose(exact[1:], -mu * slip / FAST, atol=1e-9)
             assert residual < 1e-9
             errors.append(np.linalg.norm(solved(system, StewartTrinkleModel(K)) - exact) / mu)
         worst[K] = max(errors)
@@ -69,7 +91,9 @@ def test_the_polyhedral_cone_converges_to_the_circular_one():
 def test_in_a_stack_velocities_converge_to_those_of_the_circular_cone():
     """Impulses of face contacts are not unique; velocities of what slides are. Boxes thrown along the ground in odd directions."""
     world = incline(3, angle=0.0, friction=0.3)
-    for body, thrown in zip(world.bodies, ([2.0, 0.7, 0.0], [0.3, 1.1, 0.0], [-1.3, 0.4, 0.0]), strict=True):
+    for body, thrown in zip(
+        world.bodies, ([2.0, 0.7, 0.0], [0.3, 1.1, 0.0], [-1.3, 0.4, 0.0]), strict=True
+    ):
         body.momentum = body.properties.mass * np.array(thrown)
     assembly = world.assemble(0.01)
     system = assembly.system
@@ -77,7 +101,9 @@ def test_in_a_stack_velocities_converge_to_those_of_the_circular_cone():
     assert residual <= 1e-10 * system.residual(np.zeros_like(r))
     exact, errors = assembly.velocity(r), []
     for K in (4, 8, 16):
-        errors.append(np.abs(assembly.velocity(solved(system, StewartTrinkleModel(K))) - exact)[:, :2].max())
+        errors.append(
+            np.abs(assembly.velocity(solved(system, StewartTrinkleModel(K))) - exact)[:, :2].max()
+        )
     assert errors[2] < 0.5 * errors[0]
     assert errors[2] < 0.2 * 0.3 * 9.81 * 0.01  # of the change that friction makes in the step
 
@@ -103,7 +129,8 @@ def test_in_the_plane_both_models_are_coulombs_law():
 def test_the_boxed_model_is_tighter_than_nothing_and_wider_than_the_cone():
     system = particle(np.array([3.0, 3.0]), 0.5)
     r = solved(system, BoxedModel(), wl.ProjectedSOR(omega=1.0))
-    np.testing.assert_allclose(r, [1.0, -0.5, -0.5], atol=1e-9)  # sqrt(2) mu along a diagonal, as it is documented
+    # sqrt(2) mu along a diagonal, as it is documented
+    np.testing.assert_allclose(r, [1.0, -0.5, -0.5], atol=1e-9)
     frozen = solved(system, FrozenBoxModel(np.array([2.0])), wl.IncrementalPivoting())
     np.testing.assert_allclose(frozen, [1.0, -1.0, -1.0], atol=1e-9)
 
@@ -113,7 +140,9 @@ def test_a_guess_has_the_impulses_it_was_made_of(model):
     system, rng = box_stack(2).assemble(0.01).system, np.random.default_rng(8)
     r = rng.uniform(0.1, 1.0, len(system.q))
     r[system.tangents] *= 0.3 * rng.choice([-1, 1], system.tangents.shape)
-    r[system.tangents] = np.clip(r[system.tangents], -0.5 * r[system.normals][:, None], 0.5 * r[system.normals][:, None])
+    r[system.tangents] = np.clip(
+        r[system.tangents], -0.5 * r[system.normals][:, None], 0.5 * r[system.normals][:, None]
+    )
     np.testing.assert_allclose(model.impulses(system, model.guess(system, r)), r, atol=1e-13)
 
 
@@ -121,7 +150,9 @@ def test_equations_and_limits_of_motors_are_rows_of_every_model():
     system = motor_arm(2).assemble(0.01).system
     assert system.contacts == 0
     r = solved(system, StewartTrinkleModel())
-    np.testing.assert_allclose(solved(system, BoxedModel(), wl.ProjectedSOR(omega=1.0)), r, atol=1e-6 * abs(r).max())
+    np.testing.assert_allclose(
+        solved(system, BoxedModel(), wl.ProjectedSOR(omega=1.0)), r, atol=1e-6 * abs(r).max()
+    )
     u, free = system.B @ r + system.q, np.isinf(system.lower)
     np.testing.assert_allclose(u[free], 0, atol=1e-9)
     assert ((r >= system.lower - 1e-12) & (r <= system.upper + 1e-12)).all()

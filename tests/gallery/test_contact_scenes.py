@@ -21,7 +21,15 @@ from warp_lcp.gallery.rigid_world import World
 from warp_lcp.grid.solids import Sphere
 
 DT = 0.01
-SMALL = {"box-stack": 3, "wall": 2, "heavy-on-light": 1, "arched-snake": 5, "heavy-on-snake": 5, "leaning-wall": 2, "gear-pyramid": 2}
+SMALL = {
+    "box-stack": 3,
+    "wall": 2,
+    "heavy-on-light": 1,
+    "arched-snake": 5,
+    "heavy-on-snake": 5,
+    "leaning-wall": 2,
+    "gear-pyramid": 2,
+}
 TIGHT = wl.StoppingCriteria(rtol=1e-10, max_iterations=20_000, patience=20_000)
 
 
@@ -35,7 +43,9 @@ def test_scenes_are_problems_that_repeat(name):
     world = SCENES[name](SMALL.get(name, 2))
     assert world.deepest() < 0.01 * world.size  # nothing begins inside something else
     assert (
-        not np.array_equal(problem.A.toarray(), contact_scene(name, SMALL.get(name), seed=7).A.toarray())
+        not np.array_equal(
+            problem.A.toarray(), contact_scene(name, SMALL.get(name), seed=7).A.toarray()
+        )
         or not np.array_equal(problem.b, contact_scene(name, SMALL.get(name), seed=7).b)
         or name in ("arched-snake", "heavy-on-snake", "hanging-snake")
     )  # whose limits alone are drawn
@@ -49,7 +59,11 @@ def test_lemke_and_newton_find_the_same_velocities(name):
     system, model, found = assembly.system, StewartTrinkleModel(4), []
     problem = model.problem(system).dense()
     for method in (wl.Lemke(), wl.FischerNewton()):
-        result = wl.solve(problem.lcp(device="cpu"), method, stopping=wl.StoppingCriteria(rtol=1e-8, max_iterations=500, patience=500))
+        result = wl.solve(
+            problem.lcp(device="cpu"),
+            method,
+            stopping=wl.StoppingCriteria(rtol=1e-8, max_iterations=500, patience=500),
+        )
         assert result, (method, result.status)
         r = model.impulses(system, result.x.numpy())
         u = system.B @ r + system.q
@@ -60,7 +74,11 @@ def test_lemke_and_newton_find_the_same_velocities(name):
     np.testing.assert_allclose(found[0], found[1], atol=2e-6)
 
 
-@pytest.mark.parametrize("world", [sphere_stack(4), box_stack(3), wall(3, columns=2), heavy_on_light(1, ratio=100.0)], ids=lambda w: w.name)
+@pytest.mark.parametrize(
+    "world",
+    [sphere_stack(4), box_stack(3), wall(3, columns=2), heavy_on_light(1, ratio=100.0)],
+    ids=lambda w: w.name,
+)
 def test_the_ground_carries_the_weight(world):
     assembly = world.assemble(DT)
     system = assembly.system
@@ -69,7 +87,9 @@ def test_the_ground_carries_the_weight(world):
     assert result, result.status
     r = result.x.numpy()
     on_ground = assembly.contacts.second == len(world.bodies)
-    assert r[system.normals][on_ground].sum() == pytest.approx(sum(world.mass) * 9.81 * DT, rel=1e-7)
+    assert r[system.normals][on_ground].sum() == pytest.approx(
+        sum(world.mass) * 9.81 * DT, rel=1e-7
+    )
     np.testing.assert_allclose(assembly.velocity(r), 0, atol=1e-8)
 
 
@@ -77,7 +97,8 @@ def test_a_stack_by_its_name_is_of_boxes_of_water_about_to_fall_for_a_hundredth_
     world = box_stack(2)
     assert [body.properties.mass for body in world.bodies] == pytest.approx([1000.0 * 0.5**3] * 2)
     assert (world.assemble(DT).system.friction == 0.5).all()
-    assert contact_scene("box-stack", 2).b.min() == pytest.approx(-9.81 * 0.01)  # all contacts are closed and at rest
+    # all contacts are closed and at rest
+    assert contact_scene("box-stack", 2).b.min() == pytest.approx(-9.81 * 0.01)
 
 
 @pytest.mark.parametrize("mu", [0.2, 0.5])
@@ -86,12 +107,19 @@ def test_a_box_sticks_below_the_angle_of_friction_and_slides_above(mu, steeper):
     angle = float(np.arctan(mu)) * steeper
     world = incline(1, angle=angle, friction=mu)
     assembly = world.assemble(DT)
-    for model, method in ((BoxedModel(), wl.ProjectedSOR(omega=1.0)), (StewartTrinkleModel(4), wl.Lemke())):
-        result = wl.solve(model.problem(assembly.system).dense().lcp(device="cpu"), method, stopping=TIGHT)
+    for model, method in (
+        (BoxedModel(), wl.ProjectedSOR(omega=1.0)),
+        (StewartTrinkleModel(4), wl.Lemke()),
+    ):
+        result = wl.solve(
+            model.problem(assembly.system).dense().lcp(device="cpu"), method, stopping=TIGHT
+        )
         assert result, result.status
         v = assembly.velocity(model.impulses(assembly.system, result.x.numpy()))[0]
         speed = max(0.0, 9.81 * (np.sin(angle) - mu * np.cos(angle))) * DT
-        np.testing.assert_allclose(v[:3], speed * np.array([np.cos(angle), 0, -np.sin(angle)]), atol=1e-8)
+        np.testing.assert_allclose(
+            v[:3], speed * np.array([np.cos(angle), 0, -np.sin(angle)]), atol=1e-8
+        )
         np.testing.assert_allclose(v[3:], 0, atol=1e-7)
 
 
@@ -110,7 +138,11 @@ def test_motors_turn_at_their_speed_as_far_as_their_torque_reaches():
     for torque, reached in ((4000.0, True), (1.0, False)):
         world = motor_arm(2, torque=torque)
         assembly = world.assemble(DT)
-        result = wl.solve(BoxedModel().problem(assembly.system).lcp(device="cpu"), wl.ProjectedSOR(omega=1.0), stopping=TIGHT)
+        result = wl.solve(
+            BoxedModel().problem(assembly.system).lcp(device="cpu"),
+            wl.ProjectedSOR(omega=1.0),
+            stopping=TIGHT,
+        )
         v = assembly.velocity(result.x.numpy())
         rates = [v[1, 4], v[2, 4] - v[1, 4]]  # about y
         wanted = [hinge.motor_speed for hinge in world.hinges]
@@ -140,18 +172,25 @@ def test_wrong_scenes_are_named():
         World("", [Sphere(center=[0, 0, 1], radius=1.0)], [1.0], friction=-1)
 
 
-@pytest.mark.parametrize("world", [box_stack(10), heavy_on_light(2, ratio=1000.0)], ids=lambda w: w.name)
+@pytest.mark.parametrize(
+    "world", [box_stack(10), heavy_on_light(2, ratio=1000.0)], ids=lambda w: w.name
+)
 def test_nncg_beats_sweeps_on_stacks_and_mass_ratios(world):
     """[Book] fig. 2.12. Friction that is projected by bounds of before the move along p loses this: 2 x on the heavy box."""
     problem = BoxedModel().problem(world.assemble(DT).system).lcp(device="cpu")
     stopping = wl.StoppingCriteria(rtol=1e-13, max_iterations=1000, patience=1000)
-    sweeps, nncg = (wl.solve(problem, method, stopping=stopping).residual for method in (wl.ProjectedSOR(omega=1.0), wl.NNCG()))
+    sweeps, nncg = (
+        wl.solve(problem, method, stopping=stopping).residual
+        for method in (wl.ProjectedSOR(omega=1.0), wl.NNCG())
+    )
     assert nncg < sweeps / 100
 
 
 def test_subspace_minimization_with_affine_bounds_solves_stacks():
     """Held friction that stayed where it was while its normal impulse moved would end at the residual of sweeps, 1e-3."""
     problem = BoxedModel().problem(box_stack(10).assemble(DT).system).lcp(device="cpu")
-    result = wl.solve(problem, wl.SubspaceMinimization(precision="double", backtracks=-1), stopping=TIGHT)
+    result = wl.solve(
+        problem, wl.SubspaceMinimization(precision="double", backtracks=-1), stopping=TIGHT
+    )
     assert result, result.status
     assert result.linear_iterations < 1000

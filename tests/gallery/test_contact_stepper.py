@@ -5,7 +5,17 @@ import pytest
 
 import warp_lcp as wl
 from warp_lcp.gallery.contact_models import StewartTrinkleModel
-from warp_lcp.gallery.contact_scenes import SCENES, box, box_stack, driven_gears, hanging_snake, heavy_on_light, incline, sphere_stack, wall
+from warp_lcp.gallery.contact_scenes import (
+    SCENES,
+    box,
+    box_stack,
+    driven_gears,
+    hanging_snake,
+    heavy_on_light,
+    incline,
+    sphere_stack,
+    wall,
+)
 from warp_lcp.gallery.contact_stepper import ContactStepper
 from warp_lcp.gallery.rigid_world import World
 from warp_lcp.grid.solids import Sphere
@@ -27,8 +37,12 @@ def positions(world):
 
 def momentum(world):
     """Of all bodies, and angular about the origin."""
-    turns = [np.cross(body.position, body.momentum) + body.angular_momentum for body in world.bodies]
-    return np.concatenate([np.sum([body.momentum for body in world.bodies], axis=0), np.sum(turns, axis=0)])
+    turns = [
+        np.cross(body.position, body.momentum) + body.angular_momentum for body in world.bodies
+    ]
+    return np.concatenate(
+        [np.sum([body.momentum for body in world.bodies], axis=0), np.sum(turns, axis=0)]
+    )
 
 
 def test_a_ball_falls_then_rests_with_the_impulse_of_its_weight():
@@ -37,7 +51,8 @@ def test_a_ball_falls_then_rests_with_the_impulse_of_its_weight():
     for n in range(1, 11):
         stepper.step()
         assert world.bodies[0].velocity[2] == pytest.approx(-9.81 * DT * n)
-        assert world.bodies[0].position[2] == pytest.approx(1.5 - 9.81 * DT**2 * n * (n + 1) / 2)  # semi-implicit Euler, summed
+        # semi-implicit Euler, summed
+        assert world.bodies[0].position[2] == pytest.approx(1.5 - 9.81 * DT**2 * n * (n + 1) / 2)
     for _ in range(60):
         report = stepper.step()
         assert world.bodies[0].position[2] > 0.5 - 1e-6  # gaps are closed, never crossed
@@ -50,11 +65,24 @@ def collision():
     rng = np.random.default_rng(44)
     position = [[0, 0, 0], [1.05, 0.2, 0.1], [0.3, 1.1, -0.2], [-1.2, 0.1, 0.3]]
     halves = [(0.4, 0.4, 0.4), (0.5, 0.3, 0.4), None, (0.4, 0.5, 0.3)]
-    solids = [box(x, half) if half else Sphere(center=x, radius=0.5) for x, half in zip(position, halves, strict=True)]
+    solids = [
+        box(x, half) if half else Sphere(center=x, radius=0.5)
+        for x, half in zip(position, halves, strict=True)
+    ]
     hinge = Joint(0, 1, np.array([0.5, 0.1, 0.05]), AXIS)
-    world = World("collision", solids, [1.0, 2.0, 0.5, 3.0], obstacles=(), hinges=(hinge,), gravity=(0.0, 0.0, 0.0))
+    world = World(
+        "collision",
+        solids,
+        [1.0, 2.0, 0.5, 3.0],
+        obstacles=(),
+        hinges=(hinge,),
+        gravity=(0.0, 0.0, 0.0),
+    )
     for body, spin in zip(world.bodies, rng.standard_normal((4, 3)), strict=True):
-        body.momentum, body.angular_momentum = -2 * body.properties.mass * body.position, body.properties.inertia @ spin
+        body.momentum, body.angular_momentum = (
+            -2 * body.properties.mass * body.position,
+            body.properties.inertia @ spin,
+        )
     return world
 
 
@@ -66,7 +94,9 @@ def test_momentum_stays_without_gravity(stabilization):
     stepper = ContactStepper(world, dt=DT, stabilization=stabilization)
     for _ in range(60):
         report = stepper.step()
-        touched += report.contacts > 0 and bool((report.impulses[: 3 * report.contacts : 3] > 1e-3).any())
+        touched += report.contacts > 0 and bool(
+            (report.impulses[: 3 * report.contacts : 3] > 1e-3).any()
+        )
         np.testing.assert_allclose(momentum(world)[:3], before[:3], atol=1e-10)
         if stabilization != "split":  # which moves bodies without momentum
             np.testing.assert_allclose(momentum(world)[3:], before[3:], atol=1e-10)
@@ -82,10 +112,14 @@ def test_energy_does_not_grow():
         energies.append(world.energy())
     assert energies[-1] < 0.9 * energies[0]  # the collisions are plastic
     rise = np.diff(energies).max()
-    assert rise < 5e-3 * energies[0]  # of turning bodies with their angular momentum kept, first order in dt
+    # of turning bodies with their angular momentum kept, first order in dt
+    assert rise < 5e-3 * energies[0]
 
 
-@pytest.mark.parametrize(("method", "model"), [(None, None), (wl.NNCG(), None), (DIRECT, None), (wl.Lemke(), StewartTrinkleModel(4))])
+@pytest.mark.parametrize(
+    ("method", "model"),
+    [(None, None), (wl.NNCG(), None), (DIRECT, None), (wl.Lemke(), StewartTrinkleModel(4))],
+)
 def test_a_box_slides_down_a_slope_with_the_acceleration_of_coulombs_law(method, model):
     mu, angle = 0.3, 0.5
     world = incline(1, angle=angle, friction=mu)
@@ -95,7 +129,9 @@ def test_a_box_slides_down_a_slope_with_the_acceleration_of_coulombs_law(method,
         stepper.step()
     a = 9.81 * (np.sin(angle) - mu * np.cos(angle))
     assert np.linalg.norm(world.bodies[0].velocity) == pytest.approx(a * 50 * DT, rel=1e-5)
-    assert np.linalg.norm(world.bodies[0].position - start) == pytest.approx(a * DT**2 * 50 * 51 / 2, rel=1e-5)
+    assert np.linalg.norm(world.bodies[0].position - start) == pytest.approx(
+        a * DT**2 * 50 * 51 / 2, rel=1e-5
+    )
 
 
 def test_a_box_rests_on_a_gentle_slope():
@@ -114,14 +150,25 @@ def test_overlaps_are_removed_as_asked(stabilization):
     for _ in range(60):
         stepper.step()
         top = max(top, float(world.bodies[0].velocity[2]))
-    assert world.deepest() == pytest.approx(0.02, abs=1e-6) if stabilization == "none" else world.deepest() < 0.0015
-    assert (top > 0.1) == (stabilization == "baumgarte")  # which gives the body the velocity it is moved with
+    assert (
+        world.deepest() == pytest.approx(0.02, abs=1e-6)
+        if stabilization == "none"
+        else world.deepest() < 0.0015
+    )
+    # which gives the body the velocity it is moved with
+    assert (top > 0.1) == (stabilization == "baumgarte")
 
 
 def test_a_pendulum_keeps_its_length_and_its_period():
     bob = Sphere(center=[np.sin(0.1), 0, -np.cos(0.1)], radius=0.1)
-    world = World("pendulum", [bob], [1.0], obstacles=(), hinges=(Joint(0, WORLD, np.zeros(3), AXIS),))
-    stepper, crossings, last = ContactStepper(world, wl.Lemke(), model=StewartTrinkleModel(4), dt=DT), [], 1.0
+    world = World(
+        "pendulum", [bob], [1.0], obstacles=(), hinges=(Joint(0, WORLD, np.zeros(3), AXIS),)
+    )
+    stepper, crossings, last = (
+        ContactStepper(world, wl.Lemke(), model=StewartTrinkleModel(4), dt=DT),
+        [],
+        1.0,
+    )
     while stepper.time < 1.7:
         stepper.step()
         x = float(world.bodies[0].position[0])
@@ -158,10 +205,15 @@ def test_warm_starting_saves_iterations():
     assert counts[True] < 0.3 * counts[False]
 
 
-BLOCKED = {"blocked": lambda s: wl.BlockedGaussSeidel(blocks=s.blocks()), "staggering": lambda s: wl.Staggering(blocks=s.staggered())}
+BLOCKED = {
+    "blocked": lambda s: wl.BlockedGaussSeidel(blocks=s.blocks()),
+    "staggering": lambda s: wl.Staggering(blocks=s.staggered()),
+}
 
 
-@pytest.mark.parametrize("method", [None, wl.NNCG(), DIRECT, BLOCKED["blocked"], BLOCKED["staggering"]])
+@pytest.mark.parametrize(
+    "method", [None, wl.NNCG(), DIRECT, BLOCKED["blocked"], BLOCKED["staggering"]]
+)
 def test_a_stack_stands_with_every_method(method):
     world = box_stack(3)
     start = positions(world)
@@ -193,7 +245,13 @@ def test_methods_without_affine_bounds_refuse_the_boxed_model():
 @pytest.mark.slow
 @pytest.mark.parametrize("stabilization", ["baumgarte", "split"])
 @pytest.mark.parametrize(
-    "make", [lambda: box_stack(10), lambda: sphere_stack(6), lambda: wall(4, columns=4), lambda: heavy_on_light(2, ratio=1000.0)]
+    "make",
+    [
+        lambda: box_stack(10),
+        lambda: sphere_stack(6),
+        lambda: wall(4, columns=4),
+        lambda: heavy_on_light(2, ratio=1000.0),
+    ],
 )
 def test_stacks_stand_for_five_seconds(make, stabilization):
     world = make()

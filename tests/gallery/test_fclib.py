@@ -46,7 +46,9 @@ def test_local_problems_come_back(tmp_path, kind):
     system = box_stack(2).assemble(0.01).system
     method = wl.SubspaceMinimization(precision="double", backtracks=-1)
     expected = wl.solve(BoxedModel().problem(system).lcp(device="cpu"), method).x.numpy()
-    write_local(tmp_path / "stack.hdf5", system.B, system.q, system.friction, kind, solution=expected)
+    write_local(
+        tmp_path / "stack.hdf5", system.B, system.q, system.friction, kind, solution=expected
+    )
     read = read_fclib(tmp_path / "stack.hdf5")
     assert read.title == read.system.name == "a title"
     np.testing.assert_allclose(read.system.B.toarray(), system.B.toarray(), atol=1e-15)
@@ -63,7 +65,12 @@ def test_unsymmetric_blocks_are_read_the_right_way_round(tmp_path, kind):
     root = rng.standard_normal((8, 8))
     full = root @ root.T
     write_local(
-        tmp_path / "v.hdf5", full[:6, :6], np.arange(6.0), np.array([0.1, 0.2]), kind, joints=(full[:6, 6:], full[6:, 6:], [7.0, 8.0])
+        tmp_path / "v.hdf5",
+        full[:6, :6],
+        np.arange(6.0),
+        np.array([0.1, 0.2]),
+        kind,
+        joints=(full[:6, 6:], full[6:, 6:], [7.0, 8.0]),
     )
     system = read_fclib(tmp_path / "v.hdf5").system
     np.testing.assert_allclose(system.B.toarray(), full, atol=1e-14)
@@ -88,7 +95,9 @@ def test_a_global_problem_has_the_velocities_of_its_bodies(tmp_path):
     assert (system.dim, system.contacts, len(system.lower)) == (2, 2, 1)
     x = rng.standard_normal(5)
     v = np.linalg.solve(M, H @ x[:4] + G @ x[4:] + f)
-    np.testing.assert_allclose(system.B @ x + system.q, np.concatenate([H.T @ v + w, G.T @ v + b]), atol=1e-12)
+    np.testing.assert_allclose(
+        system.B @ x + system.q, np.concatenate([H.T @ v + w, G.T @ v + b]), atol=1e-12
+    )
 
 
 def test_wrong_files_are_named(tmp_path):
@@ -101,7 +110,11 @@ def test_wrong_files_are_named(tmp_path):
     with pytest.raises(ValueError, match="neither fclib_local nor fclib_global"):
         read_fclib(path)
     unsymmetric = np.eye(3) + np.eye(3, k=1)
-    cases = [(unsymmetric, [0.1], "not symmetric"), (np.eye(3), [0.1, 0.2], "mu has 2 values"), (np.eye(3), [-0.1], "friction holds")]
+    cases = [
+        (unsymmetric, [0.1], "not symmetric"),
+        (np.eye(3), [0.1, 0.2], "mu has 2 values"),
+        (np.eye(3), [-0.1], "friction holds"),
+    ]
     for W, mu, message in cases:
         write_local(path, W, np.zeros(3), np.array(mu))
         with pytest.raises(ValueError, match=f"{path}: .*{message}"):
@@ -132,7 +145,9 @@ def hostile(file, name):
         matrix.create_dataset("x", shape=(10**12,), dtype=np.float64)
     elif name == "packed":
         del matrix["x"]
-        matrix.create_dataset("x", shape=(10**12,), dtype=np.float64, chunks=(10**6,), compression="gzip")
+        matrix.create_dataset(
+            "x", shape=(10**12,), dtype=np.float64, chunks=(10**6,), compression="gzip"
+        )
     elif name == "link":
         del matrix["x"]
         matrix["x"] = h5py.ExternalLink("other.hdf5", "/x")

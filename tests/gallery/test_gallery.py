@@ -7,14 +7,35 @@ import warp as wp
 
 import warp_lcp as wl
 from oracle import assemble, lemke, natural_residual
-from warp_lcp.gallery import FAMILIES, Plant, Problem, contact, definite, period_three, planted, poisson, semidefinite, skewed, splash
+from warp_lcp.gallery import (
+    FAMILIES,
+    Plant,
+    Problem,
+    contact,
+    definite,
+    period_three,
+    planted,
+    poisson,
+    semidefinite,
+    skewed,
+    splash,
+)
 
-PLANTS = [Plant(), Plant(active=0.0), Plant(active=1.0), Plant(weak=0.5), Plant(boxed=True, mixed=0.3, active=0.6), Plant(size=1e-5)]
+PLANTS = [
+    Plant(),
+    Plant(active=0.0),
+    Plant(active=1.0),
+    Plant(weak=0.5),
+    Plant(boxed=True, mixed=0.3, active=0.6),
+    Plant(size=1e-5),
+]
 
 
 def solves(problem):
     p = problem.dense()
-    return natural_residual(p.A, p.b, p.lower, p.upper, p.solution) <= 1e-13 * max(np.linalg.norm(p.b), 1e-300)
+    return natural_residual(p.A, p.b, p.lower, p.upper, p.solution) <= 1e-13 * max(
+        np.linalg.norm(p.b), 1e-300
+    )
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -49,7 +70,15 @@ def test_facts_hold(family):
 @pytest.mark.parametrize("plant", PLANTS)
 @pytest.mark.parametrize("shape", [(9, 7), (4, 5, 3)])
 def test_planted_shares_and_signs(plant, shape):
-    p = poisson(shape, plant=plant, air=0.1, solid=0.15, coefficients="random", dtype=wp.float64, device="cpu")
+    p = poisson(
+        shape,
+        plant=plant,
+        air=0.1,
+        solid=0.15,
+        coefficients="random",
+        dtype=wp.float64,
+        device="cpu",
+    )
     assert solves(p)
     flat = p.dense()
     bounded = np.isfinite(flat.lower)
@@ -68,12 +97,21 @@ def test_planted_shares_and_signs(plant, shape):
 def test_grid_becomes_the_matrix_of_its_definition():
     rng = np.random.default_rng(7)
     cells = rng.choice(3, (4, 5, 3), p=[0.2, 0.6, 0.2])
-    faces = [rng.uniform(0.2, 1, [n + (k == 2 - a) for k, n in enumerate(cells.shape)]).astype(np.float32) for a in range(3)]
-    A = wl.GridPoisson(cells, face_x=faces[0], face_y=faces[1], face_z=faces[2], dtype=wp.float64, device="cpu")
+    faces = [
+        rng.uniform(0.2, 1, [n + (k == 2 - a) for k, n in enumerate(cells.shape)]).astype(
+            np.float32
+        )
+        for a in range(3)
+    ]
+    A = wl.GridPoisson(
+        cells, face_x=faces[0], face_y=faces[1], face_z=faces[2], dtype=wp.float64, device="cpu"
+    )
     b = np.where(cells == wl.FLUID, rng.standard_normal(cells.shape), 0)
     p = Problem("here", A, b, np.zeros(b.shape), np.full(b.shape, np.inf), None, frozenset())
     fluid = cells.ravel() == wl.FLUID
-    np.testing.assert_allclose(p.dense().A, assemble(cells, faces)[np.ix_(fluid, fluid)], rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(
+        p.dense().A, assemble(cells, faces)[np.ix_(fluid, fluid)], rtol=1e-12, atol=1e-15
+    )
     assert scipy.sparse.issparse(p.sparse().A)
     np.testing.assert_array_equal(p.dense().b, b.ravel()[fluid])
 
@@ -101,7 +139,8 @@ def test_contacts_have_the_block_pattern_and_a_solution(directions):
     assert np.linalg.eigvalsh(G)[0] > -1e-12
     tangents = p.A[1:last, 1:last].reshape(directions, directions)
     half = directions // 2
-    np.testing.assert_allclose(tangents[:half], -tangents[half:], atol=1e-12)  # tangents come in opposite pairs
+    # tangents come in opposite pairs
+    np.testing.assert_allclose(tangents[:half], -tangents[half:], atol=1e-12)
     x = lemke(p.A, p.b)
     assert x is not None
     assert natural_residual(p.A, p.b, p.lower, p.upper, x) < 1e-9
@@ -146,7 +185,12 @@ def test_arguments_out_of_range_are_named():
         (lambda: semidefinite(4, zeros=1.0), "zeros"),
         (lambda: definite(4, condition=0.5), "condition"),
         (lambda: poisson((3, 3), coefficients="odd"), "coefficients"),
-        (lambda: planted(np.eye(2), np.random.default_rng(5), Plant(), name="x", facts=frozenset({"lucky"})), "facts"),
+        (
+            lambda: planted(
+                np.eye(2), np.random.default_rng(5), Plant(), name="x", facts=frozenset({"lucky"})
+            ),
+            "facts",
+        ),
     ]:
         with pytest.raises(ValueError, match=name):
             wrong()

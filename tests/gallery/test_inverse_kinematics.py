@@ -9,11 +9,20 @@ from scipy.spatial.transform import Rotation
 
 import warp_lcp as wl
 from kinematics_targets import MODELS, OUTSIDE, compare, targets
-from warp_lcp.gallery.articulated_figure import ArticulatedFigure, branching_figure, planar_chain, spatial_chain
+from warp_lcp.gallery.articulated_figure import (
+    ArticulatedFigure,
+    branching_figure,
+    planar_chain,
+    spatial_chain,
+)
 from warp_lcp.gallery.inverse_kinematics import InverseKinematics, StepProblem
 from warp_lcp.problem.protocol import families
 
-FIGURES = {"planar": planar_chain([1.0, 0.8, 0.6, 0.4]), "spatial": spatial_chain([0.3] * 7), "branching": branching_figure()}
+FIGURES = {
+    "planar": planar_chain([1.0, 0.8, 0.6, 0.4]),
+    "spatial": spatial_chain([0.3] * 7),
+    "branching": branching_figure(),
+}
 TIGHT = wl.StoppingCriteria(rtol=1e-12, max_iterations=300)
 
 
@@ -46,7 +55,9 @@ def test_positions_are_those_of_another_walk(name):
 def test_a_planar_chain_is_a_sum_of_complex_numbers():
     lengths, theta = np.array([1.0, 0.8, 0.6]), np.array([0.3, -1.1, 2.0])
     end = (lengths * np.exp(1j * np.cumsum(theta))).sum()
-    np.testing.assert_allclose(planar_chain(lengths).positions(theta), [[end.real, end.imag]], atol=1e-15)
+    np.testing.assert_allclose(
+        planar_chain(lengths).positions(theta), [[end.real, end.imag]], atol=1e-15
+    )
 
 
 @pytest.mark.parametrize("name", FIGURES)
@@ -54,10 +65,22 @@ def test_derivatives_are_differences(name):
     """Central differences of the other walk: a wrong sign, order of cross products or ancestor is off by the arm's length."""
     figure, h = FIGURES[name], 1e-6
     theta, unit = some_pose(figure), np.eye(figure.hinges)
-    J = np.stack([(walked(figure, theta + h * e) - walked(figure, theta - h * e)).ravel() / (2 * h) for e in unit], axis=1)
+    J = np.stack(
+        [
+            (walked(figure, theta + h * e) - walked(figure, theta - h * e)).ravel() / (2 * h)
+            for e in unit
+        ],
+        axis=1,
+    )
     np.testing.assert_allclose(figure.jacobian(theta), J, atol=1e-8)
     w = np.random.default_rng(58).standard_normal(len(J))
-    second = np.stack([(figure.jacobian(theta + h * e) - figure.jacobian(theta - h * e)).T @ w / (2 * h) for e in unit], axis=1)
+    second = np.stack(
+        [
+            (figure.jacobian(theta + h * e) - figure.jacobian(theta - h * e)).T @ w / (2 * h)
+            for e in unit
+        ],
+        axis=1,
+    )
     np.testing.assert_allclose(figure.curvature(theta, w), second, atol=1e-8)
     assert np.abs(second).max() > 0.1
 
@@ -67,11 +90,23 @@ def test_the_two_forms_of_a_step_are_the_minimum_of_its_quadratic_program():
     rng = np.random.default_rng(59)
     for _ in range(10):
         R = rng.standard_normal((5, 5))
-        model = StepProblem(R @ R.T + 0.1 * np.eye(5), 3 * rng.standard_normal(5), -rng.uniform(0, 1, 5), rng.uniform(0, 1, 5))
+        model = StepProblem(
+            R @ R.T + 0.1 * np.eye(5),
+            3 * rng.standard_normal(5),
+            -rng.uniform(0, 1, 5),
+            rng.uniform(0, 1, 5),
+        )
         d = wl.solve(model.lcp(device="cpu"), wl.MinimumMapNewton(), stopping=TIGHT).x.numpy()
         lemke = wl.solve(model.multipliers(device="cpu"), wl.Lemke(), stopping=TIGHT)
-        root = np.linalg.cholesky(model.H).T  # |root d + root^-T c|^2 / 2 is the model but for a constant
-        oracle = scipy.optimize.lsq_linear(root, -np.linalg.solve(root.T, model.c), (model.lower, model.upper), method="bvls", tol=1e-14).x
+        # |root d + root^-T c|^2 / 2 is the model but for a constant
+        root = np.linalg.cholesky(model.H).T
+        oracle = scipy.optimize.lsq_linear(
+            root,
+            -np.linalg.solve(root.T, model.c),
+            (model.lower, model.upper),
+            method="bvls",
+            tol=1e-14,
+        ).x
         assert lemke
         np.testing.assert_allclose(d, oracle, atol=1e-8)
         np.testing.assert_allclose(model.step(lemke.x.numpy()), oracle, atol=1e-8)
@@ -83,12 +118,19 @@ def test_every_method_finds_the_pose():
     figure = planar_chain([1.0, 0.8, 0.6, 0.4], lower=-0.2, upper=np.array([2.0, 0.3, 0.7, 0.2]))
     goal, start = np.array([[-1.5, 1.5]]), np.full(4, 0.1)
     oracle = scipy.optimize.least_squares(
-        lambda t: (figure.positions(t) - goal).ravel(), start, bounds=(figure.lower, figure.upper), ftol=1e-15, xtol=1e-15, gtol=1e-13
+        lambda t: (figure.positions(t) - goal).ravel(),
+        start,
+        bounds=(figure.lower, figure.upper),
+        ftol=1e-15,
+        xtol=1e-15,
+        gtol=1e-13,
     )
     for name, method in wl.METHODS.items():
         if "dense" not in families(method):
             continue
-        pose = InverseKinematics(device="cpu", method=method(), curvature=True, tolerance=1e-6).solve(figure, goal, start)
+        pose = InverseKinematics(
+            device="cpu", method=method(), curvature=True, tolerance=1e-6
+        ).solve(figure, goal, start)
         assert pose, (name, pose)
         assert pose.objective == pytest.approx(oracle.cost, abs=1e-7), name
         np.testing.assert_allclose(pose.theta, oracle.x, atol=1e-4, err_msg=name)
@@ -100,7 +142,9 @@ def test_multipliers_take_the_same_steps(curvature):
     for target in targets(3):
         boxed = InverseKinematics(device="cpu", curvature=curvature)
         other = dataclasses.replace(boxed, multipliers=True, method=wl.Lemke())
-        a, b = (solver.solve(target.figure, target.goals, target.start) for solver in (boxed, other))
+        a, b = (
+            solver.solve(target.figure, target.goals, target.start) for solver in (boxed, other)
+        )
         assert b
         np.testing.assert_allclose(b.theta, a.theta, atol=1e-5)
 
@@ -118,7 +162,9 @@ def agree(counts, count, share=0.95):
 
 def test_random_targets_beside_scipy():
     """In reach and out of it, a planar, a spatial and a branching figure with random limits."""
-    counts = compare(12, {"Gauss-Newton": InverseKinematics(device="cpu", max_iterations=300)})["Gauss-Newton"]
+    counts = compare(12, {"Gauss-Newton": InverseKinematics(device="cpu", max_iterations=300)})[
+        "Gauss-Newton"
+    ]
     agree(counts, 12)  # each of the twelve: two of a kind
     assert {key.split(", ")[1] for key in counts} == {"in reach", "out of reach"}
 
@@ -135,7 +181,11 @@ def test_the_price_of_damping():
 
     def steps(reachable, **settings):
         solver = InverseKinematics(device="cpu", **settings)
-        return sum(solver.solve(t.figure, t.goals, t.start).iterations for t in targets(6) if t.reachable == reachable)
+        return sum(
+            solver.solve(t.figure, t.goals, t.start).iterations
+            for t in targets(6)
+            if t.reachable == reachable
+        )
 
     assert steps(True, damping=1e-1) > 3 * steps(True, damping=1e-4)
     assert steps(False, damping=1e-4, curvature=True) < 0.5 * steps(False, damping=1e-4)
@@ -143,13 +193,19 @@ def test_the_price_of_damping():
 
 def test_honest_ends():
     arm = planar_chain([1.0, 1.0])
-    few = InverseKinematics(device="cpu", max_iterations=1).solve(arm, np.array([[0.0, 1.5]]), np.array([0.2, 0.3]))
+    few = InverseKinematics(device="cpu", max_iterations=1).solve(
+        arm, np.array([[0.0, 1.5]]), np.array([0.2, 0.3])
+    )
     assert few.status is wl.SolveStatus.MAX_ITERATIONS
     assert not few
     assert few.iterations == 1 == len(few.history) - 1
-    there = InverseKinematics(device="cpu").solve(arm, arm.positions(np.array([0.2, 0.3])), np.array([0.2, 0.3]))
+    there = InverseKinematics(device="cpu").solve(
+        arm, arm.positions(np.array([0.2, 0.3])), np.array([0.2, 0.3])
+    )
     assert (bool(there), there.iterations, there.objective) == (True, 0, 0.0)
-    outside = InverseKinematics(device="cpu", max_iterations=0).solve(arm, np.array([[0.0, 1.5]]), np.array([9.0, -9.0]))
+    outside = InverseKinematics(device="cpu", max_iterations=0).solve(
+        arm, np.array([[0.0, 1.5]]), np.array([9.0, -9.0])
+    )
     np.testing.assert_array_equal(outside.theta, [2.0, -2.0])
 
 
@@ -170,7 +226,12 @@ def test_wrong_figures_are_refused(change, named):
 
 
 def test_wrong_settings_are_refused():
-    for name, value in (("damping", -1.0), ("radius", 0.0), ("tolerance", np.inf), ("max_iterations", -1)):
+    for name, value in (
+        ("damping", -1.0),
+        ("radius", 0.0),
+        ("tolerance", np.inf),
+        ("max_iterations", -1),
+    ):
         with pytest.raises(ValueError, match=name):
             InverseKinematics(**{name: value})
     arm = planar_chain([1.0])

@@ -16,8 +16,12 @@ from oracle import assemble, boxed, natural_residual
 from warp_lcp.gallery import PUBLISHED, Heston, IceDome, journal_bearing, sine_obstacle, torsion
 
 SLOW = pytest.mark.slow
-ROWS = [pytest.param(p, marks=SLOW if p.slow else (), id=f"{p.problem}, {p.case}, {p.source}") for p in PUBLISHED]
-TRIANGLES = (((0, 0), (1, 0), (0, 1)), ((1, 1), (0, 1), (1, 0)))  # of a cell, corners (x, y), the right angle first
+ROWS = [
+    pytest.param(p, marks=SLOW if p.slow else (), id=f"{p.problem}, {p.case}, {p.source}")
+    for p in PUBLISHED
+]
+# of a cell, corners (x, y), the right angle first
+TRIANGLES = (((0, 0), (1, 0), (0, 1)), ((1, 1), (0, 1), (1, 0)))
 
 
 @pytest.mark.parametrize("published", ROWS)
@@ -51,7 +55,9 @@ def test_bearing_is_the_integral_over_triangles():
 
 
 @pytest.mark.parametrize(
-    "p", [torsion(3, 20.0, border=0.5, device="cpu"), sine_obstacle(5, 4, between=True, device="cpu")], ids=lambda p: p.name
+    "p",
+    [torsion(3, 20.0, border=0.5, device="cpu"), sine_obstacle(5, 4, between=True, device="cpu")],
+    ids=lambda p: p.name,
 )
 def test_border_has_half_the_weight(p):
     """By the energy's definition: each inner node has a quarter of the squares of its differences to all four neighbors."""
@@ -61,7 +67,11 @@ def test_border_has_half_the_weight(p):
     squares = 0.0
     for j, i in itertools.product(range(1, ny - 1), range(1, nx - 1)):
         for dj, di in ((0, 1), (0, -1), (1, 0), (-1, 0)):
-            squares += (u[j + dj, i + di] - u[j, i]) ** 2 / 4 * ((nx - 1) / (ny - 1) if di else (ny - 1) / (nx - 1))
+            squares += (
+                (u[j + dj, i + di] - u[j, i]) ** 2
+                / 4
+                * ((nx - 1) / (ny - 1) if di else (ny - 1) / (nx - 1))
+            )
     assert p.energy(u) == pytest.approx(squares + (p.b * u).sum(), rel=1e-6)
 
 
@@ -74,7 +84,9 @@ def test_small_problem_by_trying_all_active_sets():
 
 def test_torsion_has_the_bits_it_had():
     p = torsion(4, device="cpu")
-    np.testing.assert_array_equal(p.dense().A, assemble(np.pad(np.ones((4, 4), int), 1))[np.ix_(*(np.flatnonzero(p.b),) * 2)])
+    np.testing.assert_array_equal(
+        p.dense().A, assemble(np.pad(np.ones((4, 4), int), 1))[np.ix_(*(np.flatnonzero(p.b),) * 2)]
+    )
     assert p.A.uniform == (1.0, 1.0, 1.0)
 
 
@@ -87,35 +99,56 @@ def european(m, spot, variance):
         d = np.sqrt(beta**2 + sigma**2 * (1j * z + z**2))
         g, decay = (beta - d) / (beta + d), np.exp(-d * T)
         C = kappa * m.mean / sigma**2 * ((beta - d) * T - 2 * np.log((1 - g * decay) / (1 - g)))
-        return np.exp(1j * z * (np.log(spot) + m.rate * T) + C + (beta - d) / sigma**2 * (1 - decay) / (1 - g * decay) * variance)
+        return np.exp(
+            1j * z * (np.log(spot) + m.rate * T)
+            + C
+            + (beta - d) / sigma**2 * (1 - decay) / (1 - g * decay) * variance
+        )
 
     def chance(shift, scale):
         def density(z):
-            return (np.exp(-1j * z * np.log(m.strike)) * characteristic(z - shift) / (1j * z * scale)).real
+            return (
+                np.exp(-1j * z * np.log(m.strike)) * characteristic(z - shift) / (1j * z * scale)
+            ).real
 
-        return 0.5 + scipy.integrate.quad(density, 1e-12, 400.0, limit=1000, epsabs=1e-12, epsrel=1e-12)[0] / np.pi
+        return (
+            0.5
+            + scipy.integrate.quad(density, 1e-12, 400.0, limit=1000, epsabs=1e-12, epsrel=1e-12)[0]
+            / np.pi
+        )
 
-    return m.strike * np.exp(-m.rate * T) * (1 - chance(0, 1.0)) - spot * (1 - chance(1j, spot * np.exp(m.rate * T)))
+    return m.strike * np.exp(-m.rate * T) * (1 - chance(0, 1.0)) - spot * (
+        1 - chance(1j, spot * np.exp(m.rate * T))
+    )
 
 
 def black_scholes(m, spot):
     s = np.sqrt(m.mean * m.expiry)
     d = (np.log(spot / m.strike) + m.rate * m.expiry) / s + s / 2
-    return m.strike * np.exp(-m.rate * m.expiry) * scipy.stats.norm.cdf(s - d) - spot * scipy.stats.norm.cdf(-d)
+    return m.strike * np.exp(-m.rate * m.expiry) * scipy.stats.norm.cdf(
+        s - d
+    ) - spot * scipy.stats.norm.cdf(-d)
 
 
 @pytest.mark.parametrize("correlation", [0.1, -0.7, 0.0])
 def test_european_puts_by_the_closed_form(correlation):
     m, spots = Heston(correlation=correlation), np.arange(8.0, 13.0)
     exact = np.array([european(m, s, 0.0625) for s in spots])
-    coarse, fine = (np.abs(m.put(32 * k, 16 * k, 16 * k, american=False, device="cpu").at(spots, 0.0625) - exact).max() for k in (1, 2))
+    coarse, fine = (
+        np.abs(
+            m.put(32 * k, 16 * k, 16 * k, american=False, device="cpu").at(spots, 0.0625) - exact
+        ).max()
+        for k in (1, 2)
+    )
     assert fine < 5e-4
     assert fine < coarse / 2.8  # the order is two
 
 
 def test_steady_variance_is_black_and_scholes():
     m = Heston(volatility=1e-3, mean=0.09)
-    assert m.put(96, 48, 32, american=False, device="cpu").at(10.0, 0.09) == pytest.approx(black_scholes(m, 10.0), abs=1e-3)
+    assert m.put(96, 48, 32, american=False, device="cpu").at(10.0, 0.09) == pytest.approx(
+        black_scholes(m, 10.0), abs=1e-3
+    )
     assert european(m, 10.0, 0.09) == pytest.approx(black_scholes(m, 10.0), abs=1e-5)
 
 
@@ -133,12 +166,23 @@ def test_american_put_is_worth_more_and_is_exercised_below():
 def test_american_puts_on_one_grid():
     """All four digits without extrapolation."""
     prices = Heston().put(384, 96, 128, device="cpu").at(np.arange(8.0, 13.0), 0.0625)
-    assert [f"{price:.4f}" for price in prices] == ["2.0000", "1.1076", "0.5200", "0.2137", "0.0820"]
+    assert [f"{price:.4f}" for price in prices] == [
+        "2.0000",
+        "1.1076",
+        "0.5200",
+        "0.2137",
+        "0.0820",
+    ]
 
 
 def test_money_grows_by_the_rate():
     model = Heston()
-    A = wl.Stencil(np.full((9, 13), wl.FLUID), model.coefficients(*model.nodes(12, 8)), device="cpu", dtype=wp.float64)
+    A = wl.Stencil(
+        np.full((9, 13), wl.FLUID),
+        model.coefficients(*model.nodes(12, 8)),
+        device="cpu",
+        dtype=wp.float64,
+    )
     growth = A.apply(wp.ones((9, 13), dtype=wp.float64, device="cpu")).numpy()
     np.testing.assert_allclose(growth, model.rate, atol=1e-10)  # what is the same everywhere
 
@@ -147,8 +191,14 @@ def test_ice_flows_by_its_derivative():
     dome, rng = IceDome(nodes=7), np.random.default_rng(29)
     H, v = rng.uniform(500, 3000, (7, 7)), rng.standard_normal((7, 7))
     ahead, behind = (dome.outflow(H + s * v, 0.01)[0] for s in (1e-2, -1e-2))
-    np.testing.assert_allclose(dome.outflow(H, 0.01)[1] @ v.ravel(), ((ahead - behind) / 2e-2).ravel(), rtol=1e-6, atol=1e-1)
-    assert abs(dome.outflow(H, 0.01)[0].sum()) < 1e-6 * np.abs(dome.outflow(H, 0.01)[0]).max()  # what leaves a volume enters another
+    np.testing.assert_allclose(
+        dome.outflow(H, 0.01)[1] @ v.ravel(),
+        ((ahead - behind) / 2e-2).ravel(),
+        rtol=1e-6,
+        atol=1e-1,
+    )
+    # what leaves a volume enters another
+    assert abs(dome.outflow(H, 0.01)[0].sum()) < 1e-6 * np.abs(dome.outflow(H, 0.01)[0]).max()
 
 
 def test_ice_balance_is_the_divergence_of_the_known_dome():
@@ -159,7 +209,12 @@ def test_ice_balance_is_the_divergence_of_the_known_dome():
     q = -dome.gamma * H**5 * np.hypot(gx, gy) ** 2
     divergence = np.gradient(q * gx, h, axis=1) + np.gradient(q * gy, h, axis=0)
     away = (r > 0.2) & (r < 0.8)
-    np.testing.assert_allclose(divergence[away], dome.balance()[away], rtol=2e-3, atol=1e-3 * np.abs(dome.balance()[away]).max())
+    np.testing.assert_allclose(
+        divergence[away],
+        dome.balance()[away],
+        rtol=2e-3,
+        atol=1e-3 * np.abs(dome.balance()[away]).max(),
+    )
     assert dome.thickness()[400, 400] == pytest.approx(3600)
     assert (dome.thickness()[r >= 1] == 0).all()
     assert (dome.balance()[r > 1] < 0).all()
@@ -204,7 +259,9 @@ def test_arguments_out_of_range_are_named():
 
 def test_the_page_has_the_table():
     """Each number with what came out here when the page was made."""
-    text = (Path(__file__).parents[2] / "benchmarks" / "results" / "amd-epyc" / "problems.md").read_text()
+    text = (
+        Path(__file__).parents[2] / "benchmarks" / "results" / "amd-epyc" / "problems.md"
+    ).read_text()
     rows = dict(re.findall(r"^(\| .* \| `.*` \| .* \|) `(.*)` \|$", text, flags=re.M))
     assert list(rows) == [f"| {p.case} | `{p.printed}` | {p.source} |" for p in PUBLISHED]
     for p, here in zip(PUBLISHED, rows.values(), strict=True):

@@ -14,7 +14,9 @@ def sampled_inertia(half, mass, n=60):
     """Midpoint sums of (|r|^2 1 - r r') over a box: no formula of the code."""
     axes = [(np.arange(n) + 0.5) / n * 2 * h - h for h in half]
     r = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    return mass * ((r * r).sum(axis=1)[:, None, None] * np.eye(3) - r[:, :, None] * r[:, None, :]).mean(axis=0)
+    return mass * (
+        (r * r).sum(axis=1)[:, None, None] * np.eye(3) - r[:, :, None] * r[:, None, :]
+    ).mean(axis=0)
 
 
 def test_a_gear_has_the_mass_and_inertia_of_its_bars():
@@ -32,8 +34,15 @@ def test_a_gear_has_the_mass_and_inertia_of_its_bars():
 def tumbling():
     """A box that turns, a ball, and a box that does not move whatever it is given."""
     turn = Rotation.random(random_state=np.random.default_rng(5))
-    solids = [box([0, 0, 1], (0.1, 0.2, 0.5), turn), Sphere(center=[1, 2, 3], radius=0.3), box([5, 5, 5], (0.1, 0.1, 0.1))]
-    world, rng = World("", solids, [1.0, 2.0, FIXED], obstacles=(), gravity=(0.0, 0.0, 0.0)), np.random.default_rng(6)
+    solids = [
+        box([0, 0, 1], (0.1, 0.2, 0.5), turn),
+        Sphere(center=[1, 2, 3], radius=0.3),
+        box([5, 5, 5], (0.1, 0.1, 0.1)),
+    ]
+    world, rng = (
+        World("", solids, [1.0, 2.0, FIXED], obstacles=(), gravity=(0.0, 0.0, 0.0)),
+        np.random.default_rng(6),
+    )
     for body in world.bodies[:2]:
         body.momentum, body.angular_momentum = rng.standard_normal(3), rng.standard_normal(3)
     return world
@@ -48,7 +57,9 @@ def test_what_is_fixed_stays_and_answers_to_no_impulse():
     np.testing.assert_array_equal(world.bodies[2].rotation, np.eye(3))
     assert np.linalg.norm(world.bodies[0].rotation - np.eye(3)) > 0.1
     assert world.energy() == pytest.approx(energy, rel=1e-2)
-    held = World("", [box([0, 0, 1], (0.1,) * 3), Sphere(center=[0, 0, 1.2], radius=0.1)], [FIXED, 1.0])
+    held = World(
+        "", [box([0, 0, 1], (0.1,) * 3), Sphere(center=[0, 0, 1.2], radius=0.1)], [FIXED, 1.0]
+    )
     assembly = held.assemble(0.01)
     assert len(assembly.contacts) == 1
     np.testing.assert_array_equal(assembly.velocity(np.ones(3))[0], 0.0)
@@ -57,7 +68,12 @@ def test_what_is_fixed_stays_and_answers_to_no_impulse():
 
 def test_the_inverse_mass_is_that_of_the_energy():
     """v'M v / 2 with M^-1 of the velocity problem, along what a contact does."""
-    world = World("", [box([0, 0, 0.5], (0.1, 0.2, 0.5), about((0.0, 0.0, 1.0), 0.4))], [3.0], gravity=(0.0, 0.0, 0.0))
+    world = World(
+        "",
+        [box([0, 0, 0.5], (0.1, 0.2, 0.5), about((0.0, 0.0, 1.0), 0.4))],
+        [3.0],
+        gravity=(0.0, 0.0, 0.0),
+    )
     assembly, body = world.assemble(0.01), world.bodies[0]
     r = np.random.default_rng(6).standard_normal(len(assembly.system.q))
     impulse = assembly.J.T @ r
@@ -69,9 +85,20 @@ def test_the_inverse_mass_is_that_of_the_energy():
     ("make", "message"),
     [
         (lambda: World("", [], []), "solids is empty"),
-        (lambda: World("", [box([0, 0, 0], (1.0, -1.0, 1.0))], [1.0]), "min must be less than its max"),
-        (lambda: World("", [Sphere(center=[0, 0, 0], radius=1.0)], [-1.0]), "mass = -1.0: must be positive"),
-        (lambda: World("", [Sphere(center=[0, 0, 0], radius=1.0)], [1.0], gravity=(0.0, 0.0, np.nan)), "gravity"),
+        (
+            lambda: World("", [box([0, 0, 0], (1.0, -1.0, 1.0))], [1.0]),
+            "min must be less than its max",
+        ),
+        (
+            lambda: World("", [Sphere(center=[0, 0, 0], radius=1.0)], [-1.0]),
+            "mass = -1.0: must be positive",
+        ),
+        (
+            lambda: World(
+                "", [Sphere(center=[0, 0, 0], radius=1.0)], [1.0], gravity=(0.0, 0.0, np.nan)
+            ),
+            "gravity",
+        ),
     ],
 )
 def test_wrong_worlds_are_named(make, message):

@@ -35,7 +35,10 @@ def differences(make, data, name, g):
     value, found = np.array(data[name], dtype=float), []
     for way in directions(value):
         moved = [value + sign * STEP * way for sign in (1, -1)]
-        ends = [g.ravel() @ solved(make, {**data, name: m if m.ndim else float(m)}).x.numpy().ravel() for m in moved]
+        ends = [
+            g.ravel() @ solved(make, {**data, name: m if m.ndim else float(m)}).x.numpy().ravel()
+            for m in moved
+        ]
         found.append((ends[0] - ends[1]) / (2 * STEP))
     return np.array(found)
 
@@ -75,12 +78,23 @@ def random_grid(shape, seed):
         face[-1 - axis] += 1
     coefficients = {f"face_{'xyz'[a]}": rng.uniform(0.3, 2.0, f) for a, f in enumerate(faces)}
     b, lower = 2 * rng.standard_normal(shape), -rng.uniform(0.05, 0.5, shape)
-    return cells, {"b": b, "lower": lower, "upper": rng.uniform(0.05, 0.5, shape), "shift": rng.uniform(0.05, 0.3, shape), **coefficients}
+    return cells, {
+        "b": b,
+        "lower": lower,
+        "upper": rng.uniform(0.05, 0.5, shape),
+        "shift": rng.uniform(0.05, 0.3, shape),
+        **coefficients,
+    }
 
 
 def grid_problem(cells, **options):
     def make(b, lower=0.0, upper=np.inf, **coefficients):
-        return wl.LCP(wl.GridPoisson(cells, device="cpu", dtype=wp.float64, **options, **coefficients), b, lower, upper)
+        return wl.LCP(
+            wl.GridPoisson(cells, device="cpu", dtype=wp.float64, **options, **coefficients),
+            b,
+            lower,
+            upper,
+        )
 
     return make
 
@@ -96,9 +110,20 @@ def test_grids_with_random_masks_and_coefficients(shape, seed):
 @pytest.mark.parametrize(("shape", "seed"), [((9, 8), 12), ((4, 4, 5), 29)])
 def test_numbers_have_derivatives_that_are_numbers(shape, seed):
     cells, data = random_grid(shape, seed)
-    numbers = {"lower": -0.2, "upper": 0.3, "shift": 0.1, "face_x": 0.7, "face_y": 1.1, **({"face_z": 0.9} if len(shape) == 3 else {})}
+    numbers = {
+        "lower": -0.2,
+        "upper": 0.3,
+        "shift": 0.1,
+        "face_x": 0.7,
+        "face_y": 1.1,
+        **({"face_z": 0.9} if len(shape) == 3 else {}),
+    }
     gradients = check(grid_problem(cells), {"b": data["b"], **numbers}, seed)
-    assert all(isinstance(v, float) for v in (gradients.lower, gradients.upper, *gradients.coefficients.values()) if v is not None)
+    assert all(
+        isinstance(v, float)
+        for v in (gradients.lower, gradients.upper, *gradients.coefficients.values())
+        if v is not None
+    )
     mixed = {**numbers, "face_y": data["face_y"], "lower": data["lower"]}
     check(grid_problem(cells), {"b": data["b"], **mixed}, seed)
     without = wl.vjp(wl.solve(grid_problem(cells)(data["b"])), np.ones(shape))
@@ -111,7 +136,9 @@ def test_periodic_axes_share_the_derivative_of_the_face_that_is_one():
     inner = data.pop("face_x")[:, :-1]
 
     def make(inner, **rest):
-        return grid_problem(cells, periodic=(True, False))(face_x=np.concatenate([inner, inner[:, :1]], axis=1), **rest)
+        return grid_problem(cells, periodic=(True, False))(
+            face_x=np.concatenate([inner, inner[:, :1]], axis=1), **rest
+        )
 
     result = solved(make, {**data, "inner": inner})
     g = np.random.default_rng(54).standard_normal(cells.shape)
@@ -125,10 +152,21 @@ def test_periodic_axes_share_the_derivative_of_the_face_that_is_one():
     check(grid_problem(cells, periodic=(True, True)), uniform, 55, skip=("b", "shift"))
 
 
-STENCILS = {  # offsets whose coefficients vary, offsets of numbers, a center above their sum, periodic axes
+# offsets whose coefficients vary, offsets of numbers, a center above their sum, periodic axes
+STENCILS = {
     "turned": (((0, 1), (0, -1), (1, 0), (-1, 1), (-1, -1)), {(1, 1): -0.5}, 6.0, (False, False)),
-    "periodic": (((0, 1), (1, 0)), {(0, -1): -0.4, (-1, 0): -0.3, (1, -1): -0.2}, 4.0, (True, False)),
-    "in space": (((0, 0, 1), (1, 0, 0)), {(0, -1, 1): -0.3, (1, 1, 1): -0.2, (0, 0, -1): 0.1}, 5.0, (False, False, True)),
+    "periodic": (
+        ((0, 1), (1, 0)),
+        {(0, -1): -0.4, (-1, 0): -0.3, (1, -1): -0.2},
+        4.0,
+        (True, False),
+    ),
+    "in space": (
+        ((0, 0, 1), (1, 0, 0)),
+        {(0, -1, 1): -0.3, (1, 1, 1): -0.2, (0, 0, -1): 0.1},
+        5.0,
+        (False, False, True),
+    ),
 }
 
 
@@ -139,23 +177,39 @@ def test_stencils_of_arrays_and_numbers(name, outside):
     shape = (6, 7) if len(center_of(numbers)) == 2 else (3, 4, 5)
     cells, data = random_grid(shape, 67)
     rng, given = np.random.default_rng(68), {n: data[n] for n in ("b", "lower", "upper", "shift")}
-    given |= {o: -rng.uniform(0.2, 1.0, shape) for o in varying} | numbers | {center_of(numbers): np.full(shape, center)}
+    given |= (
+        {o: -rng.uniform(0.2, 1.0, shape) for o in varying}
+        | numbers
+        | {center_of(numbers): np.full(shape, center)}
+    )
 
     def make(b, lower, upper, shift, coefficients):
-        return wl.LCP(wl.Stencil(cells, coefficients, shift=shift, outside=outside, periodic=periodic, **F64), b, lower, upper)
+        return wl.LCP(
+            wl.Stencil(cells, coefficients, shift=shift, outside=outside, periodic=periodic, **F64),
+            b,
+            lower,
+            upper,
+        )
 
     def of_offsets(**data):
-        return make(*(data.pop(n) for n in ("b", "lower", "upper", "shift")), {o: data[str(o)] for o in given if str(o) in data})
+        return make(
+            *(data.pop(n) for n in ("b", "lower", "upper", "shift")),
+            {o: data[str(o)] for o in given if str(o) in data},
+        )
 
     named = {str(o): v for o, v in given.items()}
     result, g = solved(of_offsets, named), rng.standard_normal(shape)
     found = wl.vjp(result, g, stopping=wl.StoppingCriteria(rtol=1e-12))
     assert not result.problem.A.symmetric
     fields = "b", "lower", "upper", "shift"
-    ours = {str(o): v for o, v in found.coefficients["coefficients"].items()} | {n: found.by_name[n] for n in fields}
+    ours = {str(o): v for o, v in found.coefficients["coefficients"].items()} | {
+        n: found.by_name[n] for n in fields
+    }
     for key in named:
         expected = differences(of_offsets, named, key, g)
-        assert np.linalg.norm(along(host(ours[key])) - expected) < 1e-5 * np.linalg.norm(expected), key
+        assert np.linalg.norm(along(host(ours[key])) - expected) < 1e-5 * np.linalg.norm(
+            expected
+        ), key
 
 
 def center_of(offsets):
@@ -174,21 +228,31 @@ def test_functions_have_the_gradients_of_their_values():
     for east in (eastward, values):
         center = 3.0 if east is eastward else np.full(cells.shape, 3.0)
         A = wl.Stencil(cells, {(0, 0): center, (0, 1): east, (1, 0): -0.5, (-1, 0): -0.6}, **F64)
-        found.append(wl.vjp(solved(lambda A=A: wl.LCP(A, data["b"]), {}), g).coefficients["coefficients"])
+        found.append(
+            wl.vjp(solved(lambda A=A: wl.LCP(A, data["b"]), {}), g).coefficients["coefficients"]
+        )
     np.testing.assert_allclose(found[0][0, 1].numpy(), found[1][0, 1].numpy(), rtol=1e-6, atol=1e-8)
     assert found[0][0, 0] == pytest.approx(found[1][0, 0].numpy().sum())
 
 
-@pytest.mark.parametrize(("drift", "center"), [(0.0, 2.1), (0.3, 2.0)])  # with drift and 2.1 a few sweeps are faster
+# with drift and 2.1 a few sweeps are faster
+@pytest.mark.parametrize(("drift", "center"), [(0.0, 2.1), (0.3, 2.0)])
 def test_matrices_solved_as_grids_have_gradients_of_their_own(drift, center):
     n, rng = 50, np.random.default_rng(4)
     T = scipy.sparse.diags_array(
-        [(-1.0 - drift) * np.ones(n - 1), center * np.ones(n), (-1.0 + drift) * np.ones(n - 1)], offsets=[-1, 0, 1]
+        [(-1.0 - drift) * np.ones(n - 1), center * np.ones(n), (-1.0 + drift) * np.ones(n - 1)],
+        offsets=[-1, 0, 1],
     )
-    matrix = (scipy.sparse.kron(scipy.sparse.eye_array(n), T) + scipy.sparse.kron(T, scipy.sparse.eye_array(n))).tocsr()
+    matrix = (
+        scipy.sparse.kron(scipy.sparse.eye_array(n), T)
+        + scipy.sparse.kron(T, scipy.sparse.eye_array(n))
+    ).tocsr()
     b, g = rng.standard_normal(n * n), rng.standard_normal(n * n)
     stopping = wl.StoppingCriteria(rtol=1e-11)
-    results = [wl.solve(wl.LCP(matrix, b), method, stopping=stopping) for method in (None, wl.MinimumMapNewton())]
+    results = [
+        wl.solve(wl.LCP(matrix, b), method, stopping=stopping)
+        for method in (None, wl.MinimumMapNewton())
+    ]
     assert [result.grid for result in results] == [(n, n), None]
     one, other = (wl.vjp(result, g, stopping=stopping) for result in results)
     np.testing.assert_allclose(one.b.numpy(), other.b.numpy(), atol=1e-8)
@@ -203,18 +267,29 @@ def test_padded_fields_in_place_have_gradients_of_their_own_shape():
         if name.startswith("face"):
             inner[2 - "xyz".index(name[-1])] = slice(1, None)
         field[tuple(inner)] = data[name]
-    fields = {name: wp.array(field, dtype=wp.float64, device="cpu") for name, field in padded.items()}
+    fields = {
+        name: wp.array(field, dtype=wp.float64, device="cpu") for name, field in padded.items()
+    }
     make = grid_problem(cells)
     g = np.random.default_rng(72).standard_normal(cells.shape)
     plain = wl.vjp(solved(make, data), g)
     found = wl.vjp(solved(make, fields), np.pad(g, 1))
-    for name, field in {"b": found.b, "lower": found.lower, "upper": found.upper, **found.coefficients}.items():
+    for name, field in {
+        "b": found.b,
+        "lower": found.lower,
+        "upper": found.upper,
+        **found.coefficients,
+    }.items():
         inner = [slice(1, -1)] * 3
         if name.startswith("face"):
             inner[2 - "xyz".index(name[-1])] = slice(1, None)
-        expected = {"b": plain.b, "lower": plain.lower, "upper": plain.upper, **plain.coefficients}[name].numpy()
+        expected = {"b": plain.b, "lower": plain.lower, "upper": plain.upper, **plain.coefficients}[
+            name
+        ].numpy()
         assert field.shape == padded[name].shape
-        assert np.allclose(field.numpy()[tuple(inner)], expected, rtol=1e-8, atol=1e-9 * abs(expected).max())
+        assert np.allclose(
+            field.numpy()[tuple(inner)], expected, rtol=1e-8, atol=1e-9 * abs(expected).max()
+        )
         outside = field.numpy().copy()
         outside[tuple(inner)] = 0.0
         assert not outside.any()
@@ -224,23 +299,37 @@ def random_matrix(n, seed, symmetric):
     rng = np.random.default_rng(seed)
     B = scipy.sparse.random_array((n, n), density=4 / n, rng=rng).tocsr()
     B = B + B.T if symmetric else B
-    return (scipy.sparse.diags_array(np.abs(B).sum(axis=1) + np.abs(B).sum(axis=0) + 0.2) - B).tocsr(), rng
+    return (
+        scipy.sparse.diags_array(np.abs(B).sum(axis=1) + np.abs(B).sum(axis=0) + 0.2) - B
+    ).tocsr(), rng
 
 
 @pytest.mark.parametrize("symmetric", [True, False])
 def test_matrices(symmetric):
     A, rng = random_matrix(25, 31, symmetric)
-    data = {"b": 4 * rng.standard_normal(25), "lower": -rng.random(25), "upper": rng.random(25) + 0.1}
+    data = {
+        "b": 4 * rng.standard_normal(25),
+        "lower": -rng.random(25),
+        "upper": rng.random(25) + 0.1,
+    }
 
     def sparse(b, lower, upper, matrix):
         return wl.LCP(
-            wl.SparseOperator(scipy.sparse.csr_array((matrix, A.indices, A.indptr), shape=A.shape), device="cpu"), b, lower, upper
+            wl.SparseOperator(
+                scipy.sparse.csr_array((matrix, A.indices, A.indptr), shape=A.shape), device="cpu"
+            ),
+            b,
+            lower,
+            upper,
         )
 
     def dense(b, lower, upper, matrix):
         return wl.LCP(wl.DenseOperator(matrix, device="cpu"), b, lower, upper)
 
-    one, other = check(sparse, {**data, "matrix": A.data}, 32), check(dense, {**data, "matrix": A.toarray()}, 32)
+    one, other = (
+        check(sparse, {**data, "matrix": A.data}, 32),
+        check(dense, {**data, "matrix": A.toarray()}, 32),
+    )
     assert np.allclose(one.b.numpy(), other.b.numpy())
     assert 0 < one.free < 25
 
@@ -250,7 +339,10 @@ def test_large_sparse_matrices_by_their_own_methods(symmetric):
     """Past the direct ones, against SciPy's solution on the same free set."""
     A, rng = random_matrix(3000, 41, symmetric)
     b, lower, g = rng.standard_normal(3000), -0.1 * rng.random(3000), rng.standard_normal(3000)
-    result = wl.solve(wl.LCP(wl.SparseOperator(A, device="cpu"), b, lower), stopping=wl.StoppingCriteria(rtol=1e-12))
+    result = wl.solve(
+        wl.LCP(wl.SparseOperator(A, device="cpu"), b, lower),
+        stopping=wl.StoppingCriteria(rtol=1e-12),
+    )
     found = wl.vjp(result, g, stopping=wl.StoppingCriteria(rtol=1e-11))
     free = np.flatnonzero(result.x.numpy() > lower + 1e-9)
     multiplier = np.zeros(3000)
@@ -266,7 +358,12 @@ class Products:
 
     def __init__(self, matrix, symmetric):
         self._A, self.symmetric = wl.DenseOperator(matrix, device="cpu"), symmetric
-        self.shape, self.dtype, self.device, self.diagonal = self._A.shape, self._A.dtype, self._A.device, self._A.diagonal
+        self.shape, self.dtype, self.device, self.diagonal = (
+            self._A.shape,
+            self._A.dtype,
+            self._A.device,
+            self._A.diagonal,
+        )
         self.apply, self.apply_transpose = self._A.apply, self._A.apply_transpose
 
     def masked(self, free, shift=None):
@@ -287,7 +384,9 @@ def test_sums_of_a_grid_and_columns():
 
     def make(b, lower, upper):
         grid = wl.GridPoisson(cells, device="cpu", dtype=wp.float64, shift=0.1)
-        return wl.LCP(wl.SumOperator(grid, wl.LowRankOperator(U, [0.5, 2.0], device="cpu")), b, lower, upper)
+        return wl.LCP(
+            wl.SumOperator(grid, wl.LowRankOperator(U, [0.5, 2.0], device="cpu")), b, lower, upper
+        )
 
     check(make, {name: data[name] for name in ("b", "lower", "upper")}, 85)
 
@@ -296,7 +395,9 @@ def test_sums_of_a_grid_and_columns():
 def test_iterates_in_float32_and_coefficients_in_float32(precision):
     cells, data = random_grid((8, 9), 91)
     problem = wl.LCP(wl.GridPoisson(cells, device="cpu", shift=0.25), data["b"], data["lower"])
-    result = wl.solve(problem, wl.MinimumMapNewton(precision=precision), stopping=wl.StoppingCriteria(rtol=1e-5))
+    result = wl.solve(
+        problem, wl.MinimumMapNewton(precision=precision), stopping=wl.StoppingCriteria(rtol=1e-5)
+    )
     g = np.random.default_rng(92).standard_normal(cells.shape)
     exact = wl.solve(problem, stopping=TIGHT)
     one, other = wl.vjp(result, g), wl.vjp(exact, g)
@@ -311,7 +412,13 @@ def test_bounds_that_are_equal_move_x_with_them():
     g = np.random.default_rng(44).standard_normal(12)
     found = wl.vjp(result, g, stopping=wl.StoppingCriteria(rtol=1e-12))
     along = STEP * (np.arange(12) == 3)
-    moved = [solved(lambda **d: wl.LCP(A, **d), {"b": b, "lower": lower + s * along, "upper": upper + s * along}) for s in (1, -1)]
+    moved = [
+        solved(
+            lambda **d: wl.LCP(A, **d),
+            {"b": b, "lower": lower + s * along, "upper": upper + s * along},
+        )
+        for s in (1, -1)
+    ]
     expected = float(g @ (moved[0].x.numpy() - moved[1].x.numpy())) / (2 * STEP)
     assert found.degenerate == 0
     assert found.lower.numpy()[3] + found.upper.numpy()[3] == pytest.approx(expected, rel=1e-6)
@@ -321,7 +428,10 @@ def test_of_two_bounds_that_are_equal_the_one_holds_that_y_pushes_against():
     """Nothing is free, so that the derivative of g.x by a bound is g's entry; at y = 0 it is the lower bound's."""
     A = np.array([[2.0, -1.0, 0.0], [-1.0, 2.0, -1.0], [0.0, -1.0, 2.0]])
     x = np.array([0.2, -0.1, 0.3])
-    result = solved(lambda **d: wl.LCP(A, **d), {"b": np.array([5.0, -7.0, 0.0]) - A @ x, "lower": x, "upper": x.copy()})
+    result = solved(
+        lambda **d: wl.LCP(A, **d),
+        {"b": np.array([5.0, -7.0, 0.0]) - A @ x, "lower": x, "upper": x.copy()},
+    )
     found = wl.vjp(result, np.array([1.0, 2.0, 4.0]))
     assert (found.free, found.degenerate) == (0, 0)
     assert found.lower.numpy().tolist() == [1.0, 0.0, 4.0]
@@ -360,14 +470,18 @@ def test_a_floating_component_is_defined_but_for_a_constant():
     cells[2, 3] = wl.SOLID
     inside = cells == wl.FLUID
     rng = np.random.default_rng(101)
-    b, g, along = (np.where(inside, v - v[inside].mean(), 0.0) for v in rng.standard_normal((3, 5, 6)))
+    b, g, along = (
+        np.where(inside, v - v[inside].mean(), 0.0) for v in rng.standard_normal((3, 5, 6))
+    )
 
     def make(b):
         return wl.LCP(wl.GridPoisson(cells, device="cpu", dtype=wp.float64), b, -np.inf, np.inf)
 
     found = wl.vjp(solved(make, {"b": b}), g + 7.0, stopping=wl.StoppingCriteria(rtol=1e-12))
     ends = [solved(make, {"b": b + s * STEP * along}).x.numpy() for s in (1, -1)]
-    assert float(np.vdot(found.b.numpy(), along)) == pytest.approx(float(np.vdot(g, ends[0] - ends[1])) / (2 * STEP), rel=1e-6)
+    assert float(np.vdot(found.b.numpy(), along)) == pytest.approx(
+        float(np.vdot(g, ends[0] - ends[1])) / (2 * STEP), rel=1e-6
+    )
     assert abs(found.b.numpy()[inside].mean()) < 1e-10
 
 
@@ -411,11 +525,16 @@ def test_changes_in_place_are_refused():
 def test_solves_that_do_not_converge_say_so():
     cells, data = random_grid((12, 12), 103)
     problem = grid_problem(cells)(data["b"], shift=data["shift"])
-    early = wl.solve(problem, wl.ProjectedSOR(), stopping=wl.StoppingCriteria(rtol=1e-12, max_iterations=3))
+    early = wl.solve(
+        problem, wl.ProjectedSOR(), stopping=wl.StoppingCriteria(rtol=1e-12, max_iterations=3)
+    )
     with pytest.raises(ValueError, match="did not converge"):
         wl.vjp(early, np.ones(cells.shape))
     assert wl.vjp(early, np.ones(cells.shape), allow_inexact=True)
-    result, short = wl.solve(problem, stopping=TIGHT), wl.StoppingCriteria(rtol=1e-14, max_iterations=1)
+    result, short = (
+        wl.solve(problem, stopping=TIGHT),
+        wl.StoppingCriteria(rtol=1e-14, max_iterations=1),
+    )
     with pytest.raises(ArithmeticError, match="MAX_ITERATIONS"):
         wl.vjp(result, np.ones(cells.shape), stopping=short)
     found = wl.vjp(result, np.ones(cells.shape), stopping=short, allow_inexact=True)
@@ -433,12 +552,19 @@ def test_a_singular_free_block_is_no_success():
 
 def test_the_residual_of_the_linear_solve_is_one_of_float64():
     cells, data = random_grid((14, 15), 107)
-    problem = grid_problem(cells)(data["b"], data["lower"], shift=data["shift"], face_x=data["face_x"])
-    result, g = wl.solve(problem, stopping=TIGHT), np.random.default_rng(108).standard_normal(cells.shape)
+    problem = grid_problem(cells)(
+        data["b"], data["lower"], shift=data["shift"], face_x=data["face_x"]
+    )
+    result, g = (
+        wl.solve(problem, stopping=TIGHT),
+        np.random.default_rng(108).standard_normal(cells.shape),
+    )
     found = wl.vjp(result, g, stopping=wl.StoppingCriteria(rtol=1e-11))
     multiplier = -found.b.numpy()
     free = (result.x.numpy() > data["lower"]) & (cells == wl.FLUID)
-    product = problem.A.apply_transpose(wp.array(multiplier, dtype=wp.float64, device="cpu")).numpy()
+    product = problem.A.apply_transpose(
+        wp.array(multiplier, dtype=wp.float64, device="cpu")
+    ).numpy()
     assert np.linalg.norm((product - g)[free]) < 1e-11 * np.linalg.norm(g[free])
     assert found.relative_residual < 1e-11
 
@@ -457,7 +583,9 @@ def test_memory_does_not_grow_with_the_iterations():
     cells, data = random_grid((60, 60), 131)
     problem, peaks, steps = grid_problem(cells)(data["b"], shift=data["shift"]), [], []
     for method in (wl.ProjectedMultigrid(), wl.ProjectedSOR(omega=1.0)):
-        result = wl.solve(problem, method, stopping=wl.StoppingCriteria(rtol=1e-10, max_iterations=5000))
+        result = wl.solve(
+            problem, method, stopping=wl.StoppingCriteria(rtol=1e-10, max_iterations=5000)
+        )
         wl.vjp(result, data["b"])
         tracemalloc.start()
         wl.vjp(result, data["b"])

@@ -14,10 +14,23 @@ def silo(cells: int, depth: int, slot: int, **tables: Any) -> SandSimulation:
     """Return a silo of some cells' width and depth, with a slot in its floor."""
     dx, left = 0.0125, (cells - slot) // 2
     low, floor, high = 4 * dx, 6 * dx, (6 + depth) * dx
-    solid = [box([-1.0, low], [left * dx, floor], friction="stick"), box([(left + slot) * dx, low], [1.0, floor], friction="stick")]
+    solid = [
+        box([-1.0, low], [left * dx, floor], friction="stick"),
+        box([(left + slot) * dx, low], [1.0, floor], friction="stick"),
+    ]
     sand, drain = [box([0.0, floor], [cells * dx, high])], [box([-1.0, -1.0], [1.0, 2 * dx])]
     size = [cells * dx, (depth + 10) * dx]
-    return create(scene(size=size, resolution=depth + 10, sand=sand, friction=0.5, solid=solid, drain=drain, **tables))
+    return create(
+        scene(
+            size=size,
+            resolution=depth + 10,
+            sand=sand,
+            friction=0.5,
+            solid=solid,
+            drain=drain,
+            **tables,
+        )
+    )
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.5])
@@ -29,7 +42,9 @@ def test_a_cold_start_takes_iterations_as_the_sand_is_deep(cells: int, friction:
     """
     dx = 0.02
     sand = [box([0.0, 0.0], [8 * dx, cells * dx])]
-    simulation = create(scene(size=[8 * dx, (cells + 4) * dx], resolution=cells + 4, sand=sand, friction=friction))
+    simulation = create(
+        scene(size=[8 * dx, (cells + 4) * dx], resolution=cells + 4, sand=sand, friction=friction)
+    )
     simulation.method = HeavyBallProjectedGradient(cold=HeavyBallProjectedGradient().least)
     row = simulation.step(0.5 * float(np.sqrt(dx / GRAVITY)))
     assert row["solve_status"] == "CONVERGED"

@@ -16,7 +16,10 @@ class Points:
     """Particles at some points, shape (n, 3)."""
 
     def __init__(self, points: np.ndarray) -> None:
-        self.count, self.position = len(points), wp.array(points.astype(np.float32), dtype=wp.vec3, device=DEVICE)
+        self.count, self.position = (
+            len(points),
+            wp.array(points.astype(np.float32), dtype=wp.vec3, device=DEVICE),
+        )
 
 
 def particles(points: np.ndarray) -> Any:
@@ -29,7 +32,9 @@ def test_the_number_at_a_place_is_that_of_the_sorted_ones(seed: int) -> None:
     rng, front = np.random.default_rng(7800 + seed), Front(DEVICE)
     for _ in range(4):
         n = int(rng.choice([1, 2, 99, 100, 101, 1500]))
-        points = (rng.standard_normal((n, 3)) * 10.0 ** rng.integers(-30, 30, (n, 3))).astype(np.float32)
+        points = (rng.standard_normal((n, 3)) * 10.0 ** rng.integers(-30, 30, (n, 3))).astype(
+            np.float32
+        )
         points[rng.random((n, 3)) < 0.3] = rng.choice([0.0, 1.0, -1.0, 1e-42])  # many alike
         for place in {percentile_place(n), 0, n - 1, int(rng.integers(0, n))}:
             front.find(particles(points), place)

@@ -14,7 +14,9 @@ from warp_lcp.rows import Rows
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_colors_hold_each_cell_once_and_none_near_another(dimension: int) -> None:
     grid = make(dimension, 3).packing.grid
-    found = [color.numpy() for color in colors(grid.shape, grid.domain.low, grid.domain.high, "cpu")]
+    found = [
+        color.numpy() for color in colors(grid.shape, grid.domain.low, grid.domain.high, "cpu")
+    ]
     inside = np.zeros(grid.size, dtype=int)
     np.add.at(inside, np.concatenate(found), 1)
     domain = np.zeros(grid.shape, dtype=int)
@@ -32,12 +34,23 @@ def test_a_sweep_over_a_list_of_all_cells_is_that_over_the_grid(dimension: int) 
     stress.velocity.find(stress.now)
     u = [field.numpy() for field in stress.velocity.u]
     every = colors(grid.shape, grid.domain.low, grid.domain.high, "cpu")
-    cells = wp.array(np.sort(np.concatenate([color.numpy() for color in every])), dtype=wp.int32, device=grid.device)
+    cells = wp.array(
+        np.sort(np.concatenate([color.numpy() for color in every])),
+        dtype=wp.int32,
+        device=grid.device,
+    )
     for listed in (False, True):
         passes, now = interleaved_passes(dimension, listed=listed), wp.clone(stress.now)
         moved = [wp.array(field, dtype=wp.float32, device=grid.device) for field in u]
-        structs = (p.fields, VelocityFields(*three_components(moved), *three_components(stress.velocity.edge), None))
-        rows = Rows.entries(cells.size, grid.device) if listed else Rows.box(grid.domain.low, grid.domain.high, grid.device)
+        structs = (
+            p.fields,
+            VelocityFields(*three_components(moved), *three_components(stress.velocity.edge), None),
+        )
+        rows = (
+            Rows.entries(cells.size, grid.device)
+            if listed
+            else Rows.box(grid.domain.low, grid.domain.high, grid.device)
+        )
         given = {"now": now, "numbers": stress.numbers} | ({"cells": cells} if listed else {})
         passes.pressure.bind(rows, *structs, omega=1.5, **given).launch()
         passes.friction.bind(rows, *structs, omega=1.0, **given).launch()

@@ -11,7 +11,8 @@ from warp_lcp.granular.solids import Walls
 from warp_lcp.granular.stress import Stress, YieldSet
 from warp_lcp.grid.staggered import StaggeredGrid
 
-CELLS, PRESSURE, SLOPE, RATE = 6, 1.0, 0.5, 300.0  # cells an edge; p and k of the yield set [m/s]; shear of the flow, times dx [m/s]
+# cells an edge; p and k of the yield set [m/s]; shear of the flow, times dx [m/s]
+CELLS, PRESSURE, SLOPE, RATE = 6, 1.0, 0.5, 300.0
 
 
 def linear_flow(grid: StaggeredGrid, gradient: np.ndarray) -> list[wp.array]:
@@ -22,7 +23,13 @@ def linear_flow(grid: StaggeredGrid, gradient: np.ndarray) -> list[wp.array]:
     for axis in range(grid.dimension):
         at = center + 0.5
         at[axis] -= 0.5
-        fields.append(wp.array(np.einsum("j,jkmn->kmn", gradient[axis], at).astype(np.float32), dtype=wp.float32, device=grid.device))
+        fields.append(
+            wp.array(
+                np.einsum("j,jkmn->kmn", gradient[axis], at).astype(np.float32),
+                dtype=wp.float32,
+                device=grid.device,
+            )
+        )
     return fields
 
 
@@ -36,7 +43,10 @@ def borne(degrees: float, plane: tuple[int, int], dimension: int, *, box: bool) 
     packing = Packing(grid, base, one)
     angle = math.radians(degrees)
     along, across = np.zeros(3), np.zeros(3)
-    along[list(plane)], across[list(plane)] = (math.cos(angle), math.sin(angle)), (-math.sin(angle), math.cos(angle))
+    along[list(plane)], across[list(plane)] = (
+        (math.cos(angle), math.sin(angle)),
+        (-math.sin(angle), math.cos(angle)),
+    )
     gradient = RATE * np.outer(along, across)
     packing.update(one, linear_flow(grid, gradient), 1.0)
     stress = Stress(packing, Walls(grid, np.full(grid.shape, -1, dtype=np.int32), [0.0]), box=box)
@@ -45,8 +55,10 @@ def borne(degrees: float, plane: tuple[int, int], dimension: int, *, box: bool) 
     stress.now.assign(start)
     stress.kick_dt = 1.0
     stress.begin(YieldSet(SLOPE), np.zeros(3), 1.0, 1.0)
-    stress.restart(pressure_step=1e-6, shear_step=0.2, lookahead=0.0, momentum=0.0)  # the pressure stays
-    stress.advance(1)  # so fast a flow takes the stress to the point of the yield set where friction takes most
+    # the pressure stays
+    stress.restart(pressure_step=1e-6, shear_step=0.2, lookahead=0.0, momentum=0.0)
+    # so fast a flow takes the stress to the point of the yield set where friction takes most
+    stress.advance(1)
     k = CELLS // 2 if dimension == 3 else 1
     cell = stress.now.numpy()[:, k, CELLS // 2, CELLS // 2].astype(float)
     assert cell[0] == pytest.approx(PRESSURE, rel=1e-3)
@@ -63,8 +75,12 @@ CASES = [(2, (0, 1)), (3, (0, 1)), (3, (0, 2)), (3, (1, 2))]
 
 
 @pytest.mark.parametrize(("dimension", "plane"), CASES)
-def test_the_cone_bears_the_same_shear_in_all_directions(dimension: int, plane: tuple[int, int]) -> None:
-    found = [borne(degrees, plane, dimension, box=False) for degrees in (0.0, 10.0, 22.5, 45.0, 100.0)]
+def test_the_cone_bears_the_same_shear_in_all_directions(
+    dimension: int, plane: tuple[int, int]
+) -> None:
+    found = [
+        borne(degrees, plane, dimension, box=False) for degrees in (0.0, 10.0, 22.5, 45.0, 100.0)
+    ]
     assert found == pytest.approx([1.0] * len(found), abs=0.03)
 
 

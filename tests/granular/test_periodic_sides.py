@@ -21,7 +21,12 @@ DX, DT = 0.02, 2e-3  # [m], [s]
 
 def scene(cells: tuple[int, ...], sand: list[dict[str, Any]], **tables: Any) -> dict[str, Any]:
     """Return a scene of cells of DX without an end along x and z."""
-    domain = {"size": [n * DX for n in cells], "resolution": max(cells), "periodic": [True, False, True][: len(cells)], "friction": 0.5}
+    domain = {
+        "size": [n * DX for n in cells],
+        "resolution": max(cells),
+        "periodic": [True, False, True][: len(cells)],
+        "friction": 0.5,
+    }
     return {
         "scene": {"simulator": "granular"},
         "time": {"duration": 1.0, "dt_max": DT},
@@ -34,16 +39,25 @@ def scene(cells: tuple[int, ...], sand: list[dict[str, Any]], **tables: Any) -> 
 
 def create(*args: Any, **tables: Any) -> SandSimulation:
     """Return the simulation of a `scene`."""
-    return GranularSimulator().create(SandScene.model_validate(scene(*args, **tables)), device="cpu", folder=Path())
+    return GranularSimulator().create(
+        SandScene.model_validate(scene(*args, **tables)), device="cpu", folder=Path()
+    )
 
 
-def block(low: list[float], high: list[float], count: int, shift: int, velocity: list[float]) -> list[dict[str, Any]]:
+def block(
+    low: list[float], high: list[float], count: int, shift: int, velocity: list[float]
+) -> list[dict[str, Any]]:
     """Return a box [cells], moved along x by whole cells around a domain of `count`; in two parts where it crosses the side."""
     x0 = (low[0] + shift) % count
     x1 = x0 + high[0] - low[0]
     parts = [(x0, min(x1, count))] + ([(0.0, x1 - count)] if x1 > count else [])
     return [
-        {"shape": "box", "min": [a * DX, *(n * DX for n in low[1:])], "max": [b * DX, *(n * DX for n in high[1:])], "velocity": velocity}
+        {
+            "shape": "box",
+            "min": [a * DX, *(n * DX for n in low[1:])],
+            "max": [b * DX, *(n * DX for n in high[1:])],
+            "velocity": velocity,
+        }
         for a, b in parts
     ]
 
@@ -56,8 +70,14 @@ def test_the_ring_repeats_the_other_side() -> None:
         field = wp.array(values, dtype=dtype)
         PeriodicSides(grid, axes).wrap(field)
         expected = values[1:-1] if 2 in axes else values
-        expected = np.pad(expected, ((1, 1), (0, 0), (0, 0)), mode="wrap") if 2 in axes else expected
-        expected = np.pad(expected[:, :, 1:-1], ((0, 0), (0, 0), (1, 1)), mode="wrap") if 0 in axes else expected
+        expected = (
+            np.pad(expected, ((1, 1), (0, 0), (0, 0)), mode="wrap") if 2 in axes else expected
+        )
+        expected = (
+            np.pad(expected[:, :, 1:-1], ((0, 0), (0, 0), (1, 1)), mode="wrap")
+            if 0 in axes
+            else expected
+        )
         assert np.array_equal(field.numpy(), expected.astype(field.numpy().dtype))
 
 
@@ -76,7 +96,10 @@ def folded(field: Any) -> np.ndarray:
 def test_velocities_go_on_through_a_side(at: int) -> None:
     """One face is known: what it gives to those around it does not depend on where the grid begins."""
     grid = StaggeredGrid((8, 4, 4), 1.0, 3)
-    window, join = Window.of((1, 1, 1), (5, 5, 9), wp.get_device("cpu")), PeriodicSides(grid, (0,)).wrap
+    window, join = (
+        Window.of((1, 1, 1), (5, 5, 9), wp.get_device("cpu")),
+        PeriodicSides(grid, (0,)).wrap,
+    )
 
     def around(i: int) -> np.ndarray:
         host = np.zeros(grid.shape, dtype=np.float32)
@@ -94,7 +117,9 @@ def test_sums_and_means_over_particles_come_back_from_the_ring() -> None:
     grid = StaggeredGrid((5, 3, 4), 1.0, 3)
     random = np.random.default_rng(3141)
     sides = PeriodicSides(grid, (0, 2))
-    density, velocity, weight, saved = (wp.array(random.random(grid.shape), dtype=wp.float32) for _ in range(4))
+    density, velocity, weight, saved = (
+        wp.array(random.random(grid.shape), dtype=wp.float32) for _ in range(4)
+    )
     expected = folded(density)
     sides.add(density)
     assert density.numpy()[1:-1, :, 1:-1] == pytest.approx(expected[1:-1, :, 1:-1], rel=1e-6)
@@ -110,7 +135,14 @@ def test_sums_and_means_over_particles_come_back_from_the_ring() -> None:
 def test_particles_come_in_again_and_keep_off_the_end() -> None:
     grid = StaggeredGrid((10, 5, 1), DX, 2)
     L = 10 * DX
-    x = [[-0.3 * DX, 0.05, 0], [L + 0.25 * DX, 0.05, 0], [L - 1e-8, 0.05, 0], [-1e-9, 0.05, 0], [0.1, -1e-4, 0], [L + 0.01, -1e-4, 0]]
+    x = [
+        [-0.3 * DX, 0.05, 0],
+        [L + 0.25 * DX, 0.05, 0],
+        [L - 1e-8, 0.05, 0],
+        [-1e-9, 0.05, 0],
+        [0.1, -1e-4, 0],
+        [L + 0.01, -1e-4, 0],
+    ]
     position = wp.array(np.array(x, dtype=np.float32), dtype=wp.vec3)
     PeriodicSides(grid, (0,)).carry(position)
     found = position.numpy()
@@ -163,7 +195,9 @@ def test_the_same_in_three_dimensions() -> None:
 
     at = run(0, turned=False)
     for shift, turned in ((4, False), (4, True)):
-        distance, partner = cKDTree(at, boxsize=[count * DX, 1.0, count * DX]).query(run(shift, turned=turned))
+        distance, partner = cKDTree(at, boxsize=[count * DX, 1.0, count * DX]).query(
+            run(shift, turned=turned)
+        )
         assert len(set(partner)) == len(at)
         assert distance.max() < 2e-3 * DX
 
@@ -171,7 +205,9 @@ def test_the_same_in_three_dimensions() -> None:
 def test_nothing_is_lost_on_the_way_round() -> None:
     """A layer that slides on a smooth floor keeps its mass, momentum and height for two rounds."""
     count = 8
-    simulation = create((count, 8), block([0, 0], [count, 4], count, 0, [1.0, 0.0]), domain={"friction": 0.0})
+    simulation = create(
+        (count, 8), block([0, 0], [count, 4], count, 0, [1.0, 0.0]), domain={"friction": 0.0}
+    )
     particles, row = simulation.particles.count, {}
     while simulation.time < 2 * count * DX / 1.0:
         row = simulation.step(DT)
@@ -193,15 +229,20 @@ def test_a_floor_goes_on_across_the_sides() -> None:
     assert simulation.particles.count == particles
     assert simulation.particles.velocity.numpy()[:, 0].mean() == pytest.approx(1.0, abs=1e-4)
     assert simulation.particles.position.numpy()[:, 1].min() > 2.5 * DX
-    points = np.zeros((21, 3), dtype=np.float32)  # that end on the side, or nearer to it than anything may come to a wall
+    # that end on the side, or nearer to it than anything may come to a wall
+    points = np.zeros((21, 3), dtype=np.float32)
     points[:, 0], points[:, 1] = (7.5 + np.linspace(-1e-3, 1e-3, 21)) * DX, 6.5 * DX
     position, wind = wp.array(points, dtype=wp.vec3), simulation.grid.faces()
     wind[0].fill_(1.0)
     simulation.boundary.advect(wind, 0.5 * DX, simulation.time, position)
     assert simulation.boundary.met() == (0, 0, 0)
-    assert np.unwrap(position.numpy()[:, 0], period=8 * DX) - points[:, 0] == pytest.approx(0.5 * DX, abs=1e-7)
+    assert np.unwrap(position.numpy()[:, 0], period=8 * DX) - points[:, 0] == pytest.approx(
+        0.5 * DX, abs=1e-7
+    )
     with pytest.raises(ValueError, match="sides of the periodic x axis"):
-        create((8, 10), sand, solid=[{"shape": "plane", "point": [0.08, 0.03], "normal": [0.3, 1.0]}])
+        create(
+            (8, 10), sand, solid=[{"shape": "plane", "point": [0.08, 0.03], "normal": [0.3, 1.0]}]
+        )
 
 
 @pytest.mark.parametrize(
@@ -215,11 +256,15 @@ def test_a_floor_goes_on_across_the_sides() -> None:
 )
 def test_what_does_not_go_together_is_refused(tables: dict[str, Any], message: str) -> None:
     with pytest.raises(SceneError, match=message):
-        validate(SandScene, scene((8, 8), block([0, 0], [8, 4], 8, 0, [0.0, 0.0]), **tables), "scene")
+        validate(
+            SandScene, scene((8, 8), block([0, 0], [8, 4], 8, 0, [0.0, 0.0]), **tables), "scene"
+        )
 
 
 def test_a_domain_with_sides_has_none_of_it() -> None:
-    simulation = create((8, 8), block([0, 0], [8, 4], 8, 0, [0.0, 0.0]), domain={"periodic": [False, False]})
+    simulation = create(
+        (8, 8), block([0, 0], [8, 4], 8, 0, [0.0, 0.0]), domain={"periodic": [False, False]}
+    )
     assert simulation.sides is None
     assert simulation.packing.sides is None
     assert simulation.boundary.open_sides == 0

@@ -11,14 +11,20 @@ from warp_lcp.granular.scene import SandScene
 from warp_lcp.scene.table import SceneError, validate
 
 GROWS = {"dynamic_angle": 40.0, "grain_size": 0.01}
-GLASS = {"dynamic_angle": inclined.DYNAMIC, "grain_size": inclined.GRAIN, "inertial_number": inclined.INERTIAL}
+GLASS = {
+    "dynamic_angle": inclined.DYNAMIC,
+    "grain_size": inclined.GRAIN,
+    "inertial_number": inclined.INERTIAL,
+}
 
 
 def sand(dimension: int = 2, **tables: object) -> SandScene:
     """Return a column whose friction grows with the rate."""
     size, high = [1.0, 0.5, 0.25], [0.375, 0.375, 0.25]
     column = [box([0.0] * dimension, high[:dimension])]
-    return scene(size=size[:dimension], resolution=16, sand=column, **({"friction": GROWS} | tables))
+    return scene(
+        size=size[:dimension], resolution=16, sand=column, **({"friction": GROWS} | tables)
+    )
 
 
 def test_a_layer_runs_as_fast_as_bagnold_says(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -38,16 +44,23 @@ def test_bagnolds_profile_keeps_the_balance_of_forces() -> None:
     """The shear stress mu(I) p of its rate of shear is rho g sin(angle) times the depth, at each depth."""
     angle, d, h = 28.0, inclined.GRAIN, inclined.DEPTH
     y = np.linspace(0.1, 0.8, 8) * h
-    rate = (inclined.bagnold_profile(y + 1e-6, angle) - inclined.bagnold_profile(y - 1e-6, angle)) / 2e-6
-    p = inclined.GRAVITY * math.cos(math.radians(angle)) * (h - y)  # over rho; a grain's density is rho over 0.6
+    rate = (
+        inclined.bagnold_profile(y + 1e-6, angle) - inclined.bagnold_profile(y - 1e-6, angle)
+    ) / 2e-6
+    # over rho; a grain's density is rho over 0.6
+    p = inclined.GRAVITY * math.cos(math.radians(angle)) * (h - y)
     number = rate * d / np.sqrt(0.6 * p)
     static, most = (math.tan(math.radians(a)) for a in (inclined.STATIC, inclined.DYNAMIC))
     stress = (static + (most - static) / (inclined.INERTIAL / number + 1.0)) * p
-    assert stress == pytest.approx(inclined.GRAVITY * math.sin(math.radians(angle)) * (h - y), rel=1e-6)
+    assert stress == pytest.approx(
+        inclined.GRAVITY * math.sin(math.radians(angle)) * (h - y), rel=1e-6
+    )
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_sand_that_falls_bears_more_than_at_rest_and_no_more_than_its_rate_allows(dimension: int) -> None:
+def test_sand_that_falls_bears_more_than_at_rest_and_no_more_than_its_rate_allows(
+    dimension: int,
+) -> None:
     """In cells that yield, stress over pressure lies between both slopes; reported is the ratio to the bound of their rate, 1."""
     simulation = create(sand(dimension, solver={"tolerance": 1e-4, "max_iterations": 3000}))
     for _ in range(12):
@@ -74,7 +87,9 @@ def test_sand_that_falls_bears_more_than_at_rest_and_no_more_than_its_rate_allow
 def test_both_methods_find_the_same_velocity() -> None:
     found = []
     for method, most in (("accelerated-projection", 4000), ("interleaved-sweeps", 3000)):
-        simulation = create(sand(solver={"method": method, "tolerance": 5e-5, "max_iterations": most}))
+        simulation = create(
+            sand(solver={"method": method, "tolerance": 5e-5, "max_iterations": most})
+        )
         for _ in range(2):
             row = simulation.step(5e-3)
         assert row["coupled_residual"] <= 5e-5
@@ -86,23 +101,47 @@ def test_both_methods_find_the_same_velocity() -> None:
     ("friction", "expected"),
     [
         ({"dynamic_angle": 40.0}, "friction.grain_size: must be given with friction.dynamic_angle"),
-        ({"grain_size": 1e-3}, "friction.grain_size = 0.001: needs friction.dynamic_angle, which is missing"),
-        ({"inertial_number": 0.3}, "friction.inertial_number = 0.3: needs friction.dynamic_angle, which is missing"),
-        (GROWS | {"dynamic_angle": 30.0}, "friction.dynamic_angle = 30.0: must be above the friction angle, 30 degrees"),
+        (
+            {"grain_size": 1e-3},
+            "friction.grain_size = 0.001: needs friction.dynamic_angle, which is missing",
+        ),
+        (
+            {"inertial_number": 0.3},
+            "friction.inertial_number = 0.3: needs friction.dynamic_angle, which is missing",
+        ),
+        (
+            GROWS | {"dynamic_angle": 30.0},
+            "friction.dynamic_angle = 30.0: must be above the friction angle, 30 degrees",
+        ),
         (
             GROWS | {"dynamic_angle": 50.0},
-            'friction.dynamic_angle = 50.0: must be at most 45 where material.friction_angle_test = "repose"',
+            "friction.dynamic_angle = 50.0: must be at most 45 where material.friction_angle_test "
+            '= "repose"',
         ),
-        (GROWS | {"model": "box"}, 'friction.model = "box": must be "cone" with friction.dynamic_angle'),
+        (
+            GROWS | {"model": "box"},
+            'friction.model = "box": must be "cone" with friction.dynamic_angle',
+        ),
         (GROWS | {"grain_size": 0.0}, "friction.grain_size = 0.0: must be greater than 0"),
     ],
 )
 def test_what_is_missing_or_too_much_is_named(friction: dict[str, object], expected: str) -> None:
-    tables = {"domain": {"size": [1.0, 0.5], "resolution": 16}, "time": {"duration": 1.0}, "sand": [box([0.0, 0.0], [0.5, 0.25])]}
+    tables = {
+        "domain": {"size": [1.0, 0.5], "resolution": 16},
+        "time": {"duration": 1.0},
+        "sand": [box([0.0, 0.0], [0.5, 0.25])],
+    }
     with pytest.raises(SceneError) as caught:
-        validate(SandScene, {"scene": {"simulator": "granular"}, **tables, "friction": friction}, "pile.toml")
+        validate(
+            SandScene,
+            {"scene": {"simulator": "granular"}, **tables, "friction": friction},
+            "pile.toml",
+        )
     assert expected in str(caught.value)
 
 
 def test_the_plan_says_that_friction_grows() -> None:
-    assert ("friction", "cone, growing to 40 degrees with the rate of shear of grains of 0.01 m, on walls 0.4") in sand().plan()
+    assert (
+        "friction",
+        "cone, growing to 40 degrees with the rate of shear of grains of 0.01 m, on walls 0.4",
+    ) in sand().plan()

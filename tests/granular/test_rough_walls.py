@@ -8,13 +8,27 @@ from small_sands import GRAVITY, box, create, scene
 DX, DT, SPEED = 0.05, 0.02, 0.2  # [m], [s], [m/s]
 
 
-def pushed(friction: float | str, *, depth: int, cohesion: float = 0.0, **more: float) -> tuple[str, float, float]:
+def pushed(
+    friction: float | str, *, depth: int, cohesion: float = 0.0, **more: float
+) -> tuple[str, float, float]:
     """Push a column six cells wide up between walls, twice; return the last status, its speed [m/s], the most pressure [rho g dx]."""
-    floor = box([-1.0, -1.0], [2.0, 2 * DX], motion={"kind": "translation", "velocity": [0.0, SPEED]})
+    floor = box(
+        [-1.0, -1.0], [2.0, 2 * DX], motion={"kind": "translation", "velocity": [0.0, SPEED]}
+    )
     sand = [box([0.0, 2 * DX], [6 * DX, (depth + 2) * DX])]
     material = {"friction_angle": 40.0, "cohesion": cohesion}
     size = [6 * DX, (depth + 8) * DX]
-    simulation = create(scene(size=size, resolution=depth + 8, friction=friction, solid=[floor], sand=sand, material=material, **more))
+    simulation = create(
+        scene(
+            size=size,
+            resolution=depth + 8,
+            friction=friction,
+            solid=[floor],
+            sand=sand,
+            material=material,
+            **more,
+        )
+    )
     status = [str(simulation.step(DT)["solve_status"]) for _ in range(2)][-1]
     speed = float(simulation.particles.velocity.numpy()[:, 1].mean())
     return status, speed, float(simulation.stress.now.numpy()[0].max()) / (GRAVITY * DT)
@@ -27,7 +41,8 @@ def test_a_piston_lifts_sand_between_walls_that_stick(cohesion: float) -> None:
     assert status == "CONVERGED"
     assert speed == pytest.approx(SPEED, rel=0.01)
     rough = pushed(2.0, depth=12, cohesion=cohesion)
-    assert pressure == pytest.approx(rough[2], rel=0.05)  # the pressure does not depend on mu above the sand's own friction
+    # the pressure does not depend on mu above the sand's own friction
+    assert pressure == pytest.approx(rough[2], rel=0.05)
 
 
 def test_smoother_walls_bear_what_coulomb_says() -> None:
@@ -39,8 +54,22 @@ def test_smoother_walls_bear_what_coulomb_says() -> None:
 def test_a_rough_floor_holds_sand_that_leans_on_it() -> None:
     """A wall as rough as sand is not slippery: on a slope below the angle of repose nothing slides."""
     tilt = np.radians(25.0)
-    tables = {"physics": {"gravity": [GRAVITY * np.sin(tilt), -GRAVITY * np.cos(tilt)]}, "periodic": [True, False], "friction": "stick"}
-    simulation = create(scene(size=[8 * DX, 12 * DX], resolution=12, sand=[box([0.0, 0.0], [8 * DX, 6 * DX])], **tables))
+    tables = {
+        "physics": {"gravity": [GRAVITY * np.sin(tilt), -GRAVITY * np.cos(tilt)]},
+        "periodic": [True, False],
+        "friction": "stick",
+    }
+    simulation = create(
+        scene(
+            size=[8 * DX, 12 * DX],
+            resolution=12,
+            sand=[box([0.0, 0.0], [8 * DX, 6 * DX])],
+            **tables,
+        )
+    )
     for _ in range(20):
         simulation.step(DT / 2)
-    assert abs(simulation.particles.velocity.numpy()[:, 0].mean()) < 0.01 * GRAVITY * np.sin(tilt) * 10 * DT
+    assert (
+        abs(simulation.particles.velocity.numpy()[:, 0].mean())
+        < 0.01 * GRAVITY * np.sin(tilt) * 10 * DT
+    )

@@ -17,7 +17,9 @@ from warp_lcp.simulation import SimulationFailed, StepFailed, Surface
 G, DENSITY = 9.81, 1500.0
 
 
-def start(solids: list[dict[str, Any]], *, size: list[float], depth: float, resolution: int, **tables: Any) -> SandSimulation:
+def start(
+    solids: list[dict[str, Any]], *, size: list[float], depth: float, resolution: int, **tables: Any
+) -> SandSimulation:
     """Return a simulation of bodies over a bed of sand.
 
     Args:
@@ -46,7 +48,11 @@ def run(simulation: SandSimulation, until: float) -> list[dict[str, Any]]:
     """Step to a time [s], return the log."""
     rows: list[dict[str, Any]] = []
     while simulation.time < until - 1e-9:
-        rows.append(simulation.step(min(simulation.stable_dt(), simulation.scene.time.dt_max, until - simulation.time)))
+        rows.append(
+            simulation.step(
+                min(simulation.stable_dt(), simulation.scene.time.dt_max, until - simulation.time)
+            )
+        )
     return rows
 
 
@@ -68,7 +74,13 @@ def test_a_light_ball_stays_on_top_and_a_heavy_one_digs_in_and_stops() -> None:
     depths, speeds = [], []
     for density in (0.2 * DENSITY, 5.0 * DENSITY):
         sand = {"friction_angle": 26.565}  # sand of 30 degrees bears twice as much
-        simulation = start([ball([0.3, 0.28], 0.06, density)], size=[0.6, 0.4], depth=0.2, resolution=48, material=sand)
+        simulation = start(
+            [ball([0.3, 0.28], 0.06, density)],
+            size=[0.6, 0.4],
+            depth=0.2,
+            resolution=48,
+            material=sand,
+        )
         run(simulation, 0.35)
         before = height(simulation)
         run(simulation, 0.4)
@@ -83,13 +95,21 @@ def test_sand_bears_a_block_and_the_floor_bears_both() -> None:
     """A block on smooth-walled sand stays where it is, and the floor's pressure is the weight of sand and block."""
     loads, forces, simulations = [], [], []
     for solids in ([box([0.2, 0.2], [0.4, 0.3], 2.0 * DENSITY, friction=0.5)], []):
-        simulation = start(solids, size=[0.6, 0.4], depth=0.2, resolution=48, domain={"friction": 0.0})
+        simulation = start(
+            solids, size=[0.6, 0.4], depth=0.2, resolution=48, domain={"friction": 0.0}
+        )
         run(simulation, 0.3)
         floor, given = [], []
         for _ in range(20):
             simulation.step(simulation.scene.time.dt_max)
-            pressure, deviator = simulation.stress.now.numpy()[:2, 1, 1, 1:-1]  # on the floor lies p - s_yy = p + a
-            floor.append((pressure + deviator).sum() * DENSITY * simulation.grid.spacing**2 / simulation.stress.kick_dt)
+            # on the floor lies p - s_yy = p + a
+            pressure, deviator = simulation.stress.now.numpy()[:2, 1, 1, 1:-1]
+            floor.append(
+                (pressure + deviator).sum()
+                * DENSITY
+                * simulation.grid.spacing**2
+                / simulation.stress.kick_dt
+            )
             if simulation.carried is not None:
                 given.append(simulation.carried.impulses()[0] / simulation.stress.kick_dt)
         loads.append(float(np.mean(floor)))
@@ -97,13 +117,17 @@ def test_sand_bears_a_block_and_the_floor_bears_both() -> None:
         simulations.append(simulation)
     weight = 2.0 * DENSITY * 0.2 * 0.1 * G
     assert loads[0] - loads[1] == pytest.approx(weight, rel=0.05)
-    assert loads[1] == pytest.approx(DENSITY * 0.6 * 0.2 * G, rel=0.05)  # but for the half cell below the stresses
+    # but for the half cell below the stresses
+    assert loads[1] == pytest.approx(DENSITY * 0.6 * 0.2 * G, rel=0.05)
     np.testing.assert_allclose(forces[0][:2], [0.0, weight], atol=0.01 * weight)
     assert abs(forces[0][2]) < 0.001 * weight * 0.2
     body = simulations[0].bodies
     assert body is not None
     assert np.abs(body.bodies[0].velocity).max() < 0.01
-    assert abs(body.bodies[0].position[0] - 0.3) < 1e-3 and 0.238 < body.bodies[0].position[1] <= 0.2505
+    assert (
+        abs(body.bodies[0].position[0] - 0.3) < 1e-3
+        and 0.238 < body.bodies[0].position[1] <= 0.2505
+    )
     assert abs(np.degrees(body.bodies[0].angle)) < 0.5
 
 
@@ -114,9 +138,13 @@ def test_a_block_on_a_slope_of_firm_sand_slides_as_coulomb_says(friction: float)
     gravity = [G * float(np.sin(slope)), -G * float(np.cos(slope))]
     block = box([0.1, 0.15], [0.4, 0.25], DENSITY, friction=friction)
     simulation = start(
-        [block], size=[0.9, 0.35], depth=0.15, resolution=54, physics={"gravity": gravity, "density": DENSITY},
+        [block],
+        size=[0.9, 0.35],
+        depth=0.15,
+        resolution=54,
+        physics={"gravity": gravity, "density": DENSITY},
         material={"friction_angle": 37.5},
-    )  # fmt: skip
+    )
     run(simulation, 0.06)  # it falls a part of a cell first
     assert simulation.bodies is not None
     before = simulation.bodies.bodies[0].velocity[0]
@@ -151,9 +179,13 @@ def test_momentum_of_sand_and_body_without_gravity() -> None:
     """A block of sand that flies into a body in the open gives it what it loses."""
     target = ball([0.42, 0.2], 0.06, DENSITY)
     simulation = start(
-        [target], size=[0.8, 0.4], depth=0.1, resolution=64, physics={"gravity": [0.0, 0.0], "density": DENSITY},
+        [target],
+        size=[0.8, 0.4],
+        depth=0.1,
+        resolution=64,
+        physics={"gravity": [0.0, 0.0], "density": DENSITY},
         sand=[{"shape": "box", "min": [0.1, 0.14], "max": [0.3, 0.24], "velocity": [1.0, 0.0]}],
-    )  # fmt: skip
+    )
     assert simulation.bodies is not None
 
     def momentum() -> tuple[float, float]:
@@ -171,7 +203,10 @@ def test_momentum_of_sand_and_body_without_gravity() -> None:
 def test_three_dimensions() -> None:
     """A light ball rests on sand in 3-D; one pushed sideways rolls forward."""
     simulation = start(
-        [ball([0.12, 0.128, 0.1], 0.05, 400.0, velocity=[0.5, 0.0, 0.0], friction=0.8)], size=[0.3, 0.2, 0.2], depth=0.08, resolution=24
+        [ball([0.12, 0.128, 0.1], 0.05, 400.0, velocity=[0.5, 0.0, 0.0], friction=0.8)],
+        size=[0.3, 0.2, 0.2],
+        depth=0.08,
+        resolution=24,
     )
     run(simulation, 0.1)
     assert simulation.bodies is not None
@@ -179,8 +214,12 @@ def test_three_dimensions() -> None:
     assert 0.115 < body.position[1] < 0.13
     assert body.position[0] > 0.14 and 0.0 < body.velocity[0] < 0.5
     assert body.angular_velocity[2] < -1.0  # forward over sand: about -z
-    assert abs(body.angular_velocity[0]) + abs(body.angular_velocity[1]) < 0.2 * abs(body.angular_velocity[2])
-    surfaces = [part for part in simulation.frame() if isinstance(part, Surface) and part.name == "bodies"]
+    assert abs(body.angular_velocity[0]) + abs(body.angular_velocity[1]) < 0.2 * abs(
+        body.angular_velocity[2]
+    )
+    surfaces = [
+        part for part in simulation.frame() if isinstance(part, Surface) and part.name == "bodies"
+    ]
     assert len(surfaces) == 1
 
 
@@ -226,17 +265,34 @@ class Misses:
         self.stress.residual()
         self.stress.last_residual = self.residual * scale, 0.0
         history = [wl.Record(0, 5.0 * scale, 0, None, "start", 0.0)]
-        return wl.SolveResult(self.stress.now, wl.SolveStatus.STAGNATED, 310, 310, self.residual * scale, self.residual / 5.0, history)
+        return wl.SolveResult(
+            self.stress.now,
+            wl.SolveStatus.STAGNATED,
+            310,
+            310,
+            self.residual * scale,
+            self.residual / 5.0,
+            history,
+        )
 
 
-def test_stresses_that_are_far_off_fail_a_step_that_can_be_taken_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stresses_that_are_far_off_fail_a_step_that_can_be_taken_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """The next try is that of a simulation that never failed, bit for bit; stresses that are a little off are taken."""
-    twins = [start([ball([0.3, 0.27], 0.05, 3000.0)], size=[0.6, 0.4], depth=0.2, resolution=30) for _ in range(2)]
+    twins = [
+        start([ball([0.3, 0.27], 0.05, 3000.0)], size=[0.6, 0.4], depth=0.2, resolution=30)
+        for _ in range(2)
+    ]
     for simulation in twins:
         simulation.step(0.004)
     with monkeypatch.context() as patch:
         patch.setattr(twins[0], "solve_stress", Misses(twins[0].stress, 1.5 * FAR))
-        with pytest.raises(StepFailed, match=r"STAGNATED after 310 iterations at a residual of 1.50e\+00 rho g dx .*may enclose sand"):
+        with pytest.raises(
+            StepFailed,
+            match=r"STAGNATED after 310 iterations at a residual of 1.50e\+00 rho g dx .*may "
+            r"enclose sand",
+        ):
             twins[0].step(0.004)
     for simulation in twins:
         simulation.step(0.002)
@@ -248,7 +304,11 @@ def test_stresses_that_are_far_off_fail_a_step_that_can_be_taken_again(monkeypat
 
 
 @pytest.mark.parametrize(
-    ("table", "key"), [({"solver": {"method": "interleaved-sweeps"}}, "method"), ({"domain": {"periodic": [True, False]}}, "periodic")]
+    ("table", "key"),
+    [
+        ({"solver": {"method": "interleaved-sweeps"}}, "method"),
+        ({"domain": {"periodic": [True, False]}}, "periodic"),
+    ],
 )
 def test_scenes_that_bodies_do_not_go_with(table: dict[str, Any], key: str) -> None:
     with pytest.raises(ValidationError, match=key):

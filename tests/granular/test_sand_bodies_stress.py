@@ -36,9 +36,19 @@ class Case:
     def begin(self, velocity: np.ndarray, inverse_mass: np.ndarray) -> None:
         """Start a step of the bodies in sand that falls."""
         assert self.bodies is not None
-        fields = [wp.full(self.packing.grid.shape, float(g * DT), dtype=wp.float32) for g in GRAVITY[: self.dimension]]
+        fields = [
+            wp.full(self.packing.grid.shape, float(g * DT), dtype=wp.float32)
+            for g in GRAVITY[: self.dimension]
+        ]
         weights = [wp.full(self.packing.grid.shape, 1.0, dtype=wp.float32) for _ in fields]
-        self.bodies.begin(self.packing, fields, weights, velocity=velocity, inverse_mass=inverse_mass, density=DENSITY)
+        self.bodies.begin(
+            self.packing,
+            fields,
+            weights,
+            velocity=velocity,
+            inverse_mass=inverse_mass,
+            density=DENSITY,
+        )
 
     def solve(self, tolerance: float = 1e-3):
         stopping = wl.StoppingCriteria(rtol=0.0, atol=tolerance * SCALE, max_iterations=2000)
@@ -71,12 +81,18 @@ def make(
     index[1:-1, 1:-1, 1:-1] = -1
     centers, masses, inertias = [], [], []
     for number, (low, high) in enumerate(blocks, start=1):
-        index[tuple(slice(a + 1, b + 1) for a, b in zip(low[::-1], high[::-1], strict=True))] = number
+        index[tuple(slice(a + 1, b + 1) for a, b in zip(low[::-1], high[::-1], strict=True))] = (
+            number
+        )
         size = (np.array(high) - low)[:dimension] * DX
         centers.append((np.add(low, high) / 2 * DX) * (np.arange(3) < dimension))
         masses.append((ratio or 1.0) * DENSITY * float(np.prod(size)))
         squares = size**2
-        inertias.append(masses[-1] / 12.0 * (np.array([squares.sum()]) if dimension == 2 else squares.sum() - squares))
+        inertias.append(
+            masses[-1]
+            / 12.0
+            * (np.array([squares.sum()]) if dimension == 2 else squares.sum() - squares)
+        )
     density = np.zeros(grid.shape, dtype=np.float32)
     columns = slice(1, -1) if sand is None else slice(1 + sand[0], 1 + sand[1])
     density[1:-1, 1 : 1 + depth, columns] = 1.0
@@ -90,9 +106,18 @@ def make(
     if bodies is not None:
         bodies.place(index, np.array(centers), walls)
         k = bodies.freedoms
-        start = np.tile(np.concatenate([GRAVITY[:dimension] * DT, np.zeros(k - dimension)]), (len(blocks), 1))
-        inverse = np.array([np.diag(1.0 / np.concatenate([[m] * dimension, i])) for m, i in zip(masses, inertias, strict=True)])
-    case = Case(Stress(packing, walls, bodies=bodies), packing, bodies, np.array(centers), np.array(masses))
+        start = np.tile(
+            np.concatenate([GRAVITY[:dimension] * DT, np.zeros(k - dimension)]), (len(blocks), 1)
+        )
+        inverse = np.array(
+            [
+                np.diag(1.0 / np.concatenate([[m] * dimension, i]))
+                for m, i in zip(masses, inertias, strict=True)
+            ]
+        )
+    case = Case(
+        Stress(packing, walls, bodies=bodies), packing, bodies, np.array(centers), np.array(masses)
+    )
     if bodies is not None:
         case.begin(start, inverse)
     case.stress.begin(YieldSet(0.5), GRAVITY, DT, DT)
@@ -122,8 +147,13 @@ def test_what_a_body_gets_is_what_sand_loses(dimension: int) -> None:
     """Momentum and angular momentum of sand and two bodies stay what they are under any stresses that reach no wall."""
     third = (10,) * (dimension - 2)
     low, high = ((3, 3, 4), (5, 6, 6)), ((5, 5, 3), (8, 7, 6))
-    flat = [tuple((*corner[:2], (0, 1)[end]) for end, corner in enumerate(block)) for block in (low, high)]
-    case = make(dimension, (11, 10, *third), [low, high] if dimension == 3 else flat, ratio=0.3, depth=10)
+    flat = [
+        tuple((*corner[:2], (0, 1)[end]) for end, corner in enumerate(block))
+        for block in (low, high)
+    ]
+    case = make(
+        dimension, (11, 10, *third), [low, high] if dimension == 3 else flat, ratio=0.3, depth=10
+    )
     grid, random, now = case.packing.grid, np.random.default_rng(811), case.stress.now.numpy()
     inner = tuple(slice(3, -3) if n > 3 else slice(None) for n in grid.shape)
     values = np.zeros_like(now)
@@ -132,21 +162,26 @@ def test_what_a_body_gets_is_what_sand_loses(dimension: int) -> None:
     case.stress.now.assign(values)
     case.stress.residual()
     assert case.bodies is not None
-    given = case.bodies.impulses() / (DENSITY * grid.cell_volume)  # as the grid's momenta, in units of a full face's mass
+    # as the grid's momenta, in units of a full face's mass
+    given = case.bodies.impulses() / (DENSITY * grid.cell_volume)
     assert (np.abs(given) > 1e-4).all()  # [m/s, m^2/s]: both bodies are pushed and turned
     push, turn = np.zeros(3), np.zeros(3)
     for axis, u in enumerate(case.stress.checked.u):
         free, mass = case.packing.inverse[axis].numpy() > 0.0, case.packing.mass[axis].numpy()
-        gained = (u.numpy() - GRAVITY[axis] * DT) * np.where(free, mass, 0.5 * mass)  # half a cell before a body moves with it
+        # half a cell before a body moves with it
+        gained = (u.numpy() - GRAVITY[axis] * DT) * np.where(free, mass, 0.5 * mass)
         gained[~(free | beside_bodies(case, axis))] = 0.0
         push[axis] = gained.sum()
-        turn += (np.cross(face_centers(grid, axis), np.eye(3)[axis]) * gained[..., None]).sum(axis=(0, 1, 2))
+        turn += (np.cross(face_centers(grid, axis), np.eye(3)[axis]) * gained[..., None]).sum(
+            axis=(0, 1, 2)
+        )
     for number, center in enumerate(case.centers):
         force, torque = np.zeros(3), np.zeros(3)
         force[:dimension] = given[number, :dimension]
         torque[(3 - (1 if dimension == 2 else 3)) :] = given[number, dimension:]
         push, turn = push + force, turn + torque + np.cross(center, force)
-    assert np.abs(push).max() < 2e-7 * np.abs(given).max() * grid.size**0.5  # sums of float32 masses
+    # sums of float32 masses
+    assert np.abs(push).max() < 2e-7 * np.abs(given).max() * grid.size**0.5
     assert np.abs(turn).max() < 2e-7 * np.abs(given).max() * grid.size**0.5
 
 
@@ -154,9 +189,16 @@ def test_what_a_body_gets_is_what_sand_loses(dimension: int) -> None:
 def test_pressure_pushes_away_and_off_center_pressure_turns(dimension: int) -> None:
     """A pressure below a block pushes it up; one to the right of its center turns it to the left."""
     third = (9,) * (dimension - 2)
-    case = make(dimension, (11, 9, *third), [((3, 4, 3 * (dimension - 2)), (8, 6, 1 if dimension == 2 else 6))], ratio=1.0, depth=9)
+    case = make(
+        dimension,
+        (11, 9, *third),
+        [((3, 4, 3 * (dimension - 2)), (8, 6, 1 if dimension == 2 else 6))],
+        ratio=1.0,
+        depth=9,
+    )
     now = np.zeros_like(case.stress.now.numpy())
-    now[0, 1 if dimension == 2 else 5, 4, 8] = 0.2  # the cell below the block's right end, one plane of three
+    # the cell below the block's right end, one plane of three
+    now[0, 1 if dimension == 2 else 5, 4, 8] = 0.2
     case.stress.now.assign(now)
     case.stress.residual()
     assert case.bodies is not None
@@ -184,7 +226,8 @@ def test_sand_that_slides_over_a_plate_takes_it_along() -> None:
     vx, vy, spin = case.bodies.velocity.numpy()[0]
     push, load, turn = case.bodies.impulses()[0] / (DENSITY * DX**2)
     assert vx > 0.05 * SCALE and vy == spin == 0.0
-    assert -load == pytest.approx(20 * 3 * SCALE, rel=0.1)  # the weight of the sand on it, in units of a cell's
+    # the weight of the sand on it, in units of a cell's
+    assert -load == pytest.approx(20 * 3 * SCALE, rel=0.1)
     assert FRICTION * -load * 0.95 < push < FRICTION * -load * 21 / 20  # 20 faces have 21 edges
     assert turn < 0.0
 
@@ -215,12 +258,20 @@ def test_velocity_is_what_the_impulse_leaves_and_sand_sees_it() -> None:
     assert velocity[1] == pytest.approx(-SCALE + impulse[1] / case.masses[0], rel=1e-12)
     assert -SCALE < velocity[1] < -0.2 * SCALE  # it sinks, but slower than in free fall
     below = case.stress.checked.u[1].numpy()[1, 7, 12:18]
-    np.testing.assert_allclose(below, velocity[1] + velocity[2] * (np.arange(-2.5, 3.0) * DX), rtol=1e-6)
+    np.testing.assert_allclose(
+        below, velocity[1] + velocity[2] * (np.arange(-2.5, 3.0) * DX), rtol=1e-6
+    )
 
 
 def test_two_light_bodies_in_touch_through_sand() -> None:
     """Light blocks one cell of sand apart, and under a heavier one: trial steps that ignored either would diverge."""
-    case = make(2, (30, 22), [((9, 4, 0), (14, 9, 1)), ((15, 4, 0), (20, 9, 1)), ((10, 10, 0), (19, 14, 1))], ratio=5e-3, depth=12)
+    case = make(
+        2,
+        (30, 22),
+        [((9, 4, 0), (14, 9, 1)), ((15, 4, 0), (20, 9, 1)), ((10, 10, 0), (19, 14, 1))],
+        ratio=5e-3,
+        depth=12,
+    )
     solved = case.solve()
     assert solved.residual <= 1e-3 * SCALE
     assert case.bodies is not None
@@ -253,12 +304,18 @@ def test_without_friction_it_is_the_linear_complementarity_problem_with_the_bodi
     cells = [tuple(c) for c in np.argwhere(flags > 0)]
     assert (packing.drive.numpy()[flags > 0] == 0.0).all()  # full cells: volumes count
     number = {c: n for n, c in enumerate(cells)}
-    mass, inverse, start = ([f.numpy().astype(float) for f in fields] for fields in (packing.mass, packing.inverse, packing.start))
+    mass, inverse, start = (
+        [f.numpy().astype(float) for f in fields]
+        for fields in (packing.mass, packing.inverse, packing.start)
+    )
     n, center = len(cells), case.centers[0]
     size = np.array([3.0, 2.0]) * DX
-    body = np.diag([case.masses[0], case.masses[0], case.masses[0] / 12.0 * (size**2).sum()]) / (DENSITY * DX**2)
+    body = np.diag([case.masses[0], case.masses[0], case.masses[0] / 12.0 * (size**2).sum()]) / (
+        DENSITY * DX**2
+    )
     momentum = body @ [0.0, -SCALE, 0.0]
-    div, b, rows = np.zeros((n, n)), np.zeros(n), np.zeros((n, 3))  # of the pressure's velocity, of the start's, of the body's
+    # of the pressure's velocity, of the start's, of the body's
+    div, b, rows = np.zeros((n, n)), np.zeros(n), np.zeros((n, 3))
     for c in cells:
         for axis in range(2):
             for side in range(2):
@@ -269,7 +326,11 @@ def test_without_friction_it_is_the_linear_complementarity_problem_with_the_bodi
                 face, other, out = tuple(face), tuple(other), 2 * side - 1
                 if base[other] == SOLID:
                     place = face_centers(packing.grid, axis)[face] - center
-                    unit = np.array([1.0, 0.0, -place[1]]) if axis == 0 else np.array([0.0, 1.0, place[0]])
+                    unit = (
+                        np.array([1.0, 0.0, -place[1]])
+                        if axis == 0
+                        else np.array([0.0, 1.0, place[0]])
+                    )
                     if 1 <= other[2] <= 7 and 1 <= other[1] <= 6:  # not the domain's wall
                         rows[number[c]] += out * unit
                         body += 0.5 * mass[axis][face] * np.outer(unit, unit)
@@ -286,8 +347,12 @@ def test_without_friction_it_is_the_linear_complementarity_problem_with_the_bodi
     x = wl.solve(lcp, wl.Lemke(), stopping=wl.StoppingCriteria(rtol=1e-10)).x.numpy()
     case.stress.begin(YieldSet(0.0), GRAVITY, DT, DT)
     assert case.solve(1e-6).residual <= 1e-6 * SCALE
-    np.testing.assert_allclose(case.stress.now.numpy()[0][tuple(np.array(cells).T)], x, atol=2e-4 * SCALE)
-    np.testing.assert_allclose(bodies.velocity.numpy()[0], inverse_body @ (momentum + rows.T @ x), atol=2e-4 * SCALE)
+    np.testing.assert_allclose(
+        case.stress.now.numpy()[0][tuple(np.array(cells).T)], x, atol=2e-4 * SCALE
+    )
+    np.testing.assert_allclose(
+        bodies.velocity.numpy()[0], inverse_body @ (momentum + rows.T @ x), atol=2e-4 * SCALE
+    )
     assert x.max() > 3.0 * SCALE
 
 
@@ -299,7 +364,9 @@ def test_a_step_is_implicit_in_the_bodies_velocity(monkeypatch: pytest.MonkeyPat
         case = make(2, (28, 20), [((11, 6, 0), (17, 12, 1))], ratio=0.02, depth=9)
         assert case.bodies is not None
         case.stress.residual()
-        case.stress.restart(pressure_step=1 / 1.2, shear_step=1 / 2.5, lookahead=0.15, momentum=0.85)
+        case.stress.restart(
+            pressure_step=1 / 1.2, shear_step=1 / 2.5, lookahead=0.15, momentum=0.85
+        )
         case.stress.advance(8)
         taken = case.bodies.velocity.numpy().copy()
         case.bodies.respond(case.packing, case.stress.now, wp.launch, implicit=False)

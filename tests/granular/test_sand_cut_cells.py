@@ -25,33 +25,64 @@ from warp_lcp.material.particle_assembly import Parts
 from warp_lcp.operators.grid_poisson import SOLID
 
 DT, DX, G = 0.01, 0.1, 9.81
-TILTS = {2: [(-0.37, 1.0, 0.0), (1.0, 1.0, 0.0), (0.8, -0.55, 0.0)], 3: [(-0.37, 1.0, 0.21), (0.6, 0.7, -0.9)]}
+TILTS = {
+    2: [(-0.37, 1.0, 0.0), (1.0, 1.0, 0.0), (0.8, -0.55, 0.0)],
+    3: [(-0.37, 1.0, 0.21), (0.6, 0.7, -0.9)],
+}
 CASES = [(dimension, number) for dimension, tilts in TILTS.items() for number in range(len(tilts))]
 
 
 class Case:
     """A grid full of sand on one side of a plane, gravity toward the plane."""
 
-    def __init__(self, dimension: int, tilt: tuple[float, ...], *, mu: float = 0.4, k: float = 0.5, cells: int = 7, seed: int = 1) -> None:
+    def __init__(
+        self,
+        dimension: int,
+        tilt: tuple[float, ...],
+        *,
+        mu: float = 0.4,
+        k: float = 0.5,
+        cells: int = 7,
+        seed: int = 1,
+    ) -> None:
         self.dimension, self.random = dimension, np.random.default_rng(seed)
         counts = (cells, cells - 1, cells - 2 if dimension == 3 else 1)
         self.grid = grid = StaggeredGrid(counts, DX, dimension)
         self.normal = np.array(tilt) / np.linalg.norm(tilt)
-        point = DX * np.array([0.52 * counts[0], 0.43 * counts[1], 0.47 * counts[2] if dimension == 3 else 0.0])
+        point = DX * np.array(
+            [0.52 * counts[0], 0.43 * counts[1], 0.47 * counts[2] if dimension == 3 else 0.0]
+        )
         half = Plane(point=point[:dimension].tolist(), normal=self.normal[:dimension].tolist())
-        cut = CutCells(grid, [PlacedSolid(geometry=half, separating=True, name="plane")], wall_separating=True)
+        cut = CutCells(
+            grid, [PlacedSolid(geometry=half, separating=True, name="plane")], wall_separating=True
+        )
         self.walls = CutWalls(grid, cut, [0.0, mu])
         self.point, self.k, self.mu = point, k, mu
-        self.packing = Packing(grid, cut.base, wp.full(grid.shape, 1.0, dtype=wp.float32, device=grid.device), cut=self.walls)
+        self.packing = Packing(
+            grid,
+            cut.base,
+            wp.full(grid.shape, 1.0, dtype=wp.float32, device=grid.device),
+            cut=self.walls,
+        )
         ring = np.zeros(grid.shape, dtype=np.int32)
         ring[1:-1, 1:-1, 1:-1] = -1
         self.stress = Stress(self.packing, Walls(grid, ring, [0.0, mu], rubbing_only=True))
         self.openings = self.walls.openings.numpy().astype(float)
 
-    def begin(self, velocity: list[np.ndarray], gravity: np.ndarray, *, cohesion: float = 0.0, filled: np.ndarray | None = None) -> None:
+    def begin(
+        self,
+        velocity: list[np.ndarray],
+        gravity: np.ndarray,
+        *,
+        cohesion: float = 0.0,
+        filled: np.ndarray | None = None,
+    ) -> None:
         density = np.ones(self.grid.shape) if filled is None else filled
         one = wp.array(density.astype(np.float32), dtype=wp.float32, device=self.grid.device)
-        fields = [wp.array(np.broadcast_to(u, self.grid.shape).astype(np.float32), dtype=wp.float32) for u in velocity]
+        fields = [
+            wp.array(np.broadcast_to(u, self.grid.shape).astype(np.float32), dtype=wp.float32)
+            for u in velocity
+        ]
         self.packing.update(one, fields, DT)
         self.stress.begin(YieldSet(self.k, cohesion), gravity, DT, DT)
         self.stress.kick_dt = DT
@@ -73,9 +104,13 @@ def test_openings_are_those_of_the_plane() -> None:
     for j in range(1, case.grid.counts[1] + 1):
         for i in range(1, case.grid.counts[0] + 1):
             x, y = np.meshgrid(DX * (i - 1 + points), DX * (j - 1 + points))
-            inside = (x - case.point[0]) * case.normal[0] + (y - case.point[1]) * case.normal[1] > 0.0
+            inside = (x - case.point[0]) * case.normal[0] + (y - case.point[1]) * case.normal[
+                1
+            ] > 0.0
             assert volume[j, i] == pytest.approx(inside.mean(), abs=5e-3)
-    assert case.walls.normal == pytest.approx(np.tile(-case.normal, (case.walls.count, 1)), abs=2e-3)
+    assert case.walls.normal == pytest.approx(
+        np.tile(-case.normal, (case.walls.count, 1)), abs=2e-3
+    )
     columns = case.walls.area * case.normal[1]  # what a wall covers of the ground
     assert columns.sum() == pytest.approx(case.grid.counts[0], abs=0.01)
 
@@ -97,15 +132,21 @@ def test_forces_are_the_adjoint_of_what_they_work_on(dimension: int, number: int
     work = 0.0
     for axis in range(dimension):
         change = stress.checked.u[axis].numpy() - p.start[axis].numpy()
-        work += float((v[axis][faces[axis]] * change[faces[axis]] / p.inverse[axis].numpy()[faces[axis]]).sum())
+        work += float(
+            (
+                v[axis][faces[axis]] * change[faces[axis]] / p.inverse[axis].numpy()[faces[axis]]
+            ).sum()
+        )
     power, normals = 0.0, 3 if dimension == 3 else 1
     for axis in range(dimension):
         low, high = case.openings[axis], along(case.openings[axis], axis, 1)
         ahead = along(v[axis], axis, 1)
-        power += float((now[0] * (high * ahead - low * v[axis])).sum())  # pressure: what flows out of the open part
+        # pressure: what flows out of the open part
+        power += float((now[0] * (high * ahead - low * v[axis])).sum())
         part = (now[1] if axis == 0 else -now[1]) if dimension == 2 else now[1 + axis]
         power -= float((part * case.openings[dimension + axis] * (ahead - v[axis])).sum())
-        power += float((now[len(now) - dimension + axis] * (low * v[axis] + high * ahead)).sum())  # traction: the slip along the wall
+        # traction: the slip along the wall
+        power += float((now[len(now) - dimension + axis] * (low * v[axis] + high * ahead)).sum())
     for d, (alpha, beta) in enumerate(SHEARS[dimension]):
         rate = v[alpha] - along(v[alpha], beta, -1) + v[beta] - along(v[beta], alpha, -1)
         weight = np.abs(p.share[d].numpy())
@@ -127,10 +168,17 @@ def test_sliding_along_the_wall_strains_nothing(dimension: int, number: int) -> 
     for axis in range(dimension):  # away from the domain's own walls
         ring &= along(ring, axis, 1) & along(ring, axis, -1)
     u = [f.numpy() for f in case.stress.checked.u]
-    out = sum(case.openings[a] * -u[a] + along(case.openings[a] * u[a], a, 1) for a in range(dimension))
+    out = sum(
+        case.openings[a] * -u[a] + along(case.openings[a] * u[a], a, 1) for a in range(dimension)
+    )
     assert np.abs(out[ring]).max() < 3e-3  # faces open by less than 1e-3 count as closed
     for axis in range(dimension):
-        assert np.abs((case.openings[dimension + axis] * (along(u[axis], axis, 1) - u[axis]))[ring]).max() < 1e-6
+        assert (
+            np.abs(
+                (case.openings[dimension + axis] * (along(u[axis], axis, 1) - u[axis]))[ring]
+            ).max()
+            < 1e-6
+        )
     for share, rate in zip(case.packing.share, case.stress.checked.edge, strict=True):
         assert np.abs((share.numpy() * rate.numpy())[ring & (share.numpy() > 0.0)]).max() < 1e-6
 
@@ -142,16 +190,30 @@ def test_the_wall_bears_what_the_sand_loses(dimension: int) -> None:
     gravity = np.array([0.0, -G, 0.0])
     filled = np.zeros(case.grid.shape)
     filled[(slice(1, -1) if dimension == 2 else slice(3, -3)), 1:-2, 3:-3] = 1.0
-    case.begin([np.full(case.grid.shape, g * DT) for g in gravity[:dimension]], gravity, cohesion=10.0, filled=filled)
+    case.begin(
+        [np.full(case.grid.shape, g * DT) for g in gravity[:dimension]],
+        gravity,
+        cohesion=10.0,
+        filled=filled,
+    )
     case.solve(1e-5)
     now, p, cells = case.stress.now.numpy().astype(float), case.packing, case.walls.cells.numpy()
-    traction, slip, lost = np.zeros((case.walls.count, 3)), np.zeros((case.walls.count, 3)), np.zeros(3)
+    traction, slip, lost = (
+        np.zeros((case.walls.count, 3)),
+        np.zeros((case.walls.count, 3)),
+        np.zeros(3),
+    )
     pressure, area, missing = now[0].ravel()[cells], case.walls.area, np.zeros(case.walls.count)
     for axis in range(dimension):
         low, high = case.openings[axis], along(case.openings[axis], axis, 1)
         total, u = (low + high).ravel()[cells], case.stress.checked.u[axis].numpy()
         traction[:, axis] = now[len(now) - dimension + axis].ravel()[cells] * total / area
-        slip[:, axis] = np.divide((low * u + high * along(u, axis, 1)).ravel()[cells], total, out=np.zeros(len(total)), where=total > 0.0)
+        slip[:, axis] = np.divide(
+            (low * u + high * along(u, axis, 1)).ravel()[cells],
+            total,
+            out=np.zeros(len(total)),
+            where=total > 0.0,
+        )
         volume = (case.walls.volume.numpy() - 0.5 * (low + high)).ravel()[cells]
         missing += case.walls.normal[:, axis] * gravity[axis] * DT * volume / area
         inverse = p.inverse[axis].numpy()
@@ -163,7 +225,9 @@ def test_the_wall_bears_what_the_sand_loses(dimension: int) -> None:
     assert sliding.sum() >= 3 ** (dimension - 1)
     size, speed = np.linalg.norm(traction[sliding], axis=1), np.linalg.norm(slip[sliding], axis=1)
     assert -(traction[sliding] * slip[sliding]).sum(axis=1) == pytest.approx(size * speed, rel=0.02)
-    assert size == pytest.approx(0.2 * np.maximum(pressure + missing, 0.0)[sliding], rel=0.02, abs=1e-6)
+    assert size == pytest.approx(
+        0.2 * np.maximum(pressure + missing, 0.0)[sliding], rel=0.02, abs=1e-6
+    )
 
 
 def test_a_liquid_at_rest_presses_by_its_depth() -> None:
@@ -180,7 +244,9 @@ def test_a_liquid_at_rest_presses_by_its_depth() -> None:
     assert depth[big] == pytest.approx(np.full(big.sum(), depth[big].mean()), abs=0.02)
 
 
-def on_plane(theta: float, mu: Any, *, cells: int, cuts: bool = True, shift: float = 0.0) -> tuple[SandSimulation, np.ndarray]:
+def on_plane(
+    theta: float, mu: Any, *, cells: int, cuts: bool = True, shift: float = 0.0
+) -> tuple[SandSimulation, np.ndarray]:
     """Return a block of stiff sand on a plane that falls by theta degrees, and the direction down."""
     depth, t = 0.1, math.radians(theta)
     dx = depth / cells
@@ -191,10 +257,22 @@ def on_plane(theta: float, mu: Any, *, cells: int, cuts: bool = True, shift: flo
         {
             "scene": {"simulator": "granular"},
             "time": {"duration": 1.0},
-            "domain": {"size": [6 * depth, high * depth], "resolution": max(6, high) * cells, "friction": 0.0},
+            "domain": {
+                "size": [6 * depth, high * depth],
+                "resolution": max(6, high) * cells,
+                "friction": 0.0,
+            },
             "material": {"friction_angle": 40.0, "cohesion": 5e3},
             "solid": [{"shape": "plane", "point": point, "normal": up.tolist(), "friction": mu}],
-            "sand": [{"shape": "box", "min": [0.0, 0.0], "max": [3 * depth, depth], "rotate": -theta, "translate": point}],
+            "sand": [
+                {
+                    "shape": "box",
+                    "min": [0.0, 0.0],
+                    "max": [3 * depth, depth],
+                    "rotate": -theta,
+                    "translate": point,
+                }
+            ],
         }
     )
     simulation = GranularSimulator().create(scene, device="cpu", folder=Path())
@@ -206,8 +284,12 @@ def on_plane(theta: float, mu: Any, *, cells: int, cuts: bool = True, shift: flo
 def whole(simulation: SandSimulation) -> SandSimulation:
     """Return it with solids that are whole cells for the stresses, as the control."""
     scene = simulation.scene
-    solids = SandSolids(simulation.grid, simulation.boundary.cut.solids, simulation.boundary, scene.wall_frictions())
-    return SandSimulation(scene, simulation.grid, Parts(simulation.boundary, solids=solids), simulation.particles)
+    solids = SandSolids(
+        simulation.grid, simulation.boundary.cut.solids, simulation.boundary, scene.wall_frictions()
+    )
+    return SandSimulation(
+        scene, simulation.grid, Parts(simulation.boundary, solids=solids), simulation.particles
+    )
 
 
 def acceleration(simulation: SandSimulation, down: np.ndarray) -> float:
@@ -219,8 +301,12 @@ def acceleration(simulation: SandSimulation, down: np.ndarray) -> float:
     return (speeds[-1] - speeds[9]) / (20 * 2e-3)
 
 
-@pytest.mark.parametrize(("theta", "mu", "shift"), [(20.0, 0.2, 0.0), (30.0, 0.0, 0.3), (35.0, 0.4, 0.7)])
-def test_a_block_slides_on_an_oblique_plane_as_coulomb_says(theta: float, mu: float, shift: float) -> None:
+@pytest.mark.parametrize(
+    ("theta", "mu", "shift"), [(20.0, 0.2, 0.0), (30.0, 0.0, 0.3), (35.0, 0.4, 0.7)]
+)
+def test_a_block_slides_on_an_oblique_plane_as_coulomb_says(
+    theta: float, mu: float, shift: float
+) -> None:
     t = math.radians(theta)
     assert acceleration(*on_plane(theta, mu, cells=6, shift=shift)) == pytest.approx(
         G * (math.sin(t) - mu * math.cos(t)), abs=0.02 * G * math.sin(t)
@@ -251,7 +337,9 @@ def test_solids_of_whole_cells_stay_so() -> None:
 
     def cut(normal: list[float], point: list[float]) -> CutCells:
         half = Plane(point=point, normal=normal)
-        return CutCells(grid, [PlacedSolid(geometry=half, separating=True, name="plane")], wall_separating=True)
+        return CutCells(
+            grid, [PlacedSolid(geometry=half, separating=True, name="plane")], wall_separating=True
+        )
 
     assert cut([0.0, 1.0], [0.0, 0.25]).whole_cells
     assert not cut([math.sqrt(0.5), math.sqrt(0.5)], [0.5, 0.5]).whole_cells

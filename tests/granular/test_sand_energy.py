@@ -54,7 +54,9 @@ def test_the_checkerboard_that_is_damped_moves_nothing(dimension: int) -> None:
     grid = StaggeredGrid((10, 10, 10 if dimension == 3 else 1), 0.1, dimension)
     index = np.zeros(grid.shape, dtype=np.int32)
     index[1:-1, 1:-1, 1:-1] = -1
-    base = wp.array(np.where(index >= 0, SOLID, 0).astype(np.int8), dtype=wp.int8, device=grid.device)
+    base = wp.array(
+        np.where(index >= 0, SOLID, 0).astype(np.int8), dtype=wp.int8, device=grid.device
+    )
     one = wp.full(grid.shape, 1.0, dtype=wp.float32, device=grid.device)
     packing = Packing(grid, base, one)
     packing.update(one, grid.faces(), 0.01)
@@ -67,13 +69,16 @@ def test_the_checkerboard_that_is_damped_moves_nothing(dimension: int) -> None:
     stress.now.assign(start)
     stress.residual()
     before = [field.numpy().copy() for field in stress.checked.u]
-    grid.domain.run(stress.velocity.passes.damp, packing.fields, source=wp.clone(stress.now), now=stress.now)
+    grid.domain.run(
+        stress.velocity.passes.damp, packing.fields, source=wp.clone(stress.now), now=stress.now
+    )
     stress.residual()
     deep = (slice(5, 7) if dimension == 3 else slice(1, 2), slice(5, 7), slice(5, 7))
     taken = start[0][deep] - stress.now.numpy()[0][deep]
     np.testing.assert_allclose(taken, DAMPED * 0.5 * checkers[deep], rtol=1e-4)
     for old, field in zip(before, stress.checked.u, strict=True):
-        assert np.abs(old[deep]).max() > 0.9  # the checkerboard pushes each face by twice its height
+        # the checkerboard pushes each face by twice its height
+        assert np.abs(old[deep]).max() > 0.9
         np.testing.assert_allclose(field.numpy()[deep], old[deep], atol=1e-5)
 
 
@@ -81,7 +86,9 @@ def test_the_checkerboard_that_is_damped_moves_nothing(dimension: int) -> None:
 def test_crowded_sand_gains_no_energy_in_a_step_of_any_length(until: float) -> None:
     """A falling block packs a jittered bed; what emptied its over-full cells within the step made 1e3 times the energy in 1e-6 s."""
     blocks = [box([0.0, 0.0], [1.0, 0.3]), box([0.3, 0.5], [0.6, 0.8], velocity=[0.0, -2.0])]
-    simulation = create(scene(size=[1.0, 1.0], resolution=24, sand=blocks, friction=0.5, particles={"jitter": 1.0}))
+    simulation = create(
+        scene(size=[1.0, 1.0], resolution=24, sand=blocks, friction=0.5, particles={"jitter": 1.0})
+    )
     rows = advance(simulation, until)[-1:]
     rows += [simulation.step(dt) for dt in (1e-6, 5e-3, 1e-5, 1e-6, 5e-3, 1e-4, 1e-3, 5e-3)]
     energy = np.array([row["kinetic_energy"] + row["potential_energy"] for row in rows])
@@ -90,11 +97,20 @@ def test_crowded_sand_gains_no_energy_in_a_step_of_any_length(until: float) -> N
 
 def test_walls_hold_sand_up() -> None:
     """A silo's walls bear some of what lies between them: sand that pushed itself apart hung on them, and weighed more than it has mass."""
-    simulation = create(scene(size=[0.2, 1.0], resolution=60, sand=[box([0.0, 0.0], [0.2, 0.9])], friction=0.5, particles={"jitter": 1.0}))
+    simulation = create(
+        scene(
+            size=[0.2, 1.0],
+            resolution=60,
+            sand=[box([0.0, 0.0], [0.2, 0.9])],
+            friction=0.5,
+            particles={"jitter": 1.0},
+        )
+    )
     advance(simulation, 0.15)
     depth = 0.9 - (np.arange(60) + 0.5) / 60
     vertical = simulation.stress.now.numpy()[:2, 1, 1:-1, 1:-1].sum(axis=0).mean(axis=1)  # x - s_yy
     load = vertical * simulation.grid.spacing / (simulation.stress.kick_dt * 9.81)
-    for below, most in ((0.4, 0.75), (0.8, 0.55)):  # Janssen (1895), K = 1/3 .. 1: 0.73 .. 0.49 and 0.55 .. 0.25 of the weight
+    # Janssen (1895), K = 1/3 .. 1: 0.73 .. 0.49 and 0.55 .. 0.25 of the weight
+    for below, most in ((0.4, 0.75), (0.8, 0.55)):
         row = int((0.9 - below) * 60)
         assert load[row - 2 : row + 3].mean() < most * depth[row]

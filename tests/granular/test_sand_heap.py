@@ -17,7 +17,9 @@ def sinks(friction_angle: float, duration: float = STANDS) -> tuple[float, float
     top, center = sand_heap.height(simulation), positions(simulation)[:, 1].mean()
     for _ in steps(simulation, duration):
         pass
-    return 1.0 - sand_heap.height(simulation) / top, 1.0 - float(positions(simulation)[:, 1].mean() / center)
+    return 1.0 - sand_heap.height(simulation) / top, 1.0 - float(
+        positions(simulation)[:, 1].mean() / center
+    )
 
 
 def test_a_wedge_flatter_than_a_layer_that_stops_stands() -> None:

@@ -12,15 +12,22 @@ FLIGHT = 0.3  # [s]
 BODY = {"density": 800.0}
 
 
-def thrown(dimension: int, cells: int, cfl: float, *, spin: float = 0.0, **tables: Any) -> SandSimulation:
+def thrown(
+    dimension: int, cells: int, cfl: float, *, spin: float = 0.0, **tables: Any
+) -> SandSimulation:
     """Return a block of sand in flight, which turns about z at `spin` [1/s]."""
     low, high, velocity = [0.6, 1.0, 0.9], [1.0, 1.3, 1.2], [1.0, 1.5, -0.5]
     sand = [box(low[:dimension], high[:dimension], velocity=velocity[:dimension])]
-    simulation = create(scene(size=[2.0] * dimension, resolution=cells, sand=sand, cfl=cfl, **tables))
+    simulation = create(
+        scene(size=[2.0] * dimension, resolution=cells, sand=sand, cfl=cfl, **tables)
+    )
     particles = simulation.particles
     arm = particles.position.numpy().astype(np.float64)
     arm -= arm.mean(axis=0)
-    particles.velocity.assign(particles.velocity.numpy() + spin * np.stack([-arm[:, 1], arm[:, 0], 0.0 * arm[:, 0]], axis=1))
+    particles.velocity.assign(
+        particles.velocity.numpy()
+        + spin * np.stack([-arm[:, 1], arm[:, 0], 0.0 * arm[:, 0]], axis=1)
+    )
     for gradient, row in zip(particles.affine, ([0.0, -spin, 0.0], [spin, 0.0, 0.0]), strict=False):
         gradient.assign(np.tile(np.array(row, dtype=np.float32), (len(arm), 1)))
     return simulation
@@ -28,14 +35,23 @@ def thrown(dimension: int, cells: int, cfl: float, *, spin: float = 0.0, **table
 
 @pytest.mark.parametrize(("dimension", "cells", "cfl"), [(2, 40, 2.0), (2, 40, 8.0), (3, 20, 8.0)])
 @pytest.mark.parametrize("spin", [0.0, 6.0])
-def test_thrown_sand_goes_along_its_parabola(dimension: int, cells: int, cfl: float, spin: float) -> None:
+def test_thrown_sand_goes_along_its_parabola(
+    dimension: int, cells: int, cfl: float, spin: float
+) -> None:
     """Its center to 1e-4 of its way (it was up to 8e-2 off), its turning likewise, and no grain is pushed by grains in flight with it."""
     simulation = thrown(dimension, cells, cfl, spin=spin)
 
     def measured() -> tuple[np.ndarray, np.ndarray, float]:
-        x, v = (field.numpy().astype(np.float64) for field in (simulation.particles.position, simulation.particles.velocity))
+        x, v = (
+            field.numpy().astype(np.float64)
+            for field in (simulation.particles.position, simulation.particles.velocity)
+        )
         arm, own = x - x.mean(axis=0), v - v.mean(axis=0)
-        return x.mean(axis=0), np.cross(arm, own).mean(axis=0), float(np.square(own).sum(axis=1).mean())
+        return (
+            x.mean(axis=0),
+            np.cross(arm, own).mean(axis=0),
+            float(np.square(own).sum(axis=1).mean()),
+        )
 
     start, turning, within = measured()
     advance(simulation, FLIGHT, dt_max=1.0)
@@ -60,8 +76,12 @@ def test_sand_that_touches_a_wall_or_a_body_is_not_in_flight() -> None:
         assert kept.flights is not None
         dt = 0.05 if "cfl" in case else 4e-3
         assert kept.step(dt) == left.step(dt)
-        np.testing.assert_array_equal(kept.particles.position.numpy(), left.particles.position.numpy())
-        np.testing.assert_array_equal(kept.particles.velocity.numpy(), left.particles.velocity.numpy())
+        np.testing.assert_array_equal(
+            kept.particles.position.numpy(), left.particles.position.numpy()
+        )
+        np.testing.assert_array_equal(
+            kept.particles.velocity.numpy(), left.particles.velocity.numpy()
+        )
 
 
 def test_only_the_sand_in_the_air_is_told_where_to_go() -> None:
@@ -76,8 +96,19 @@ def test_only_the_sand_in_the_air_is_told_where_to_go() -> None:
     low = x[:, 1] < 0.4
     np.testing.assert_array_equal(x[low], left.particles.position.numpy()[low])
     np.testing.assert_allclose(velocity[~low].mean(axis=0), [0.5, -0.025 * GRAVITY, 0.0], atol=1e-6)
-    assert np.abs(velocity[~low] - velocity[~low].mean(axis=0)).max() < 1e-3  # the root of what rounding makes of energies
+    # the root of what rounding makes of energies
+    assert np.abs(velocity[~low] - velocity[~low].mean(axis=0)).max() < 1e-3
 
 
 def test_sand_on_an_endless_axis_has_no_bodies_that_end() -> None:
-    assert create(scene(size=[1.0, 1.0], resolution=16, sand=[box([0.0, 0.5], [1.0, 0.8])], periodic=[True, False])).flights is None
+    assert (
+        create(
+            scene(
+                size=[1.0, 1.0],
+                resolution=16,
+                sand=[box([0.0, 0.5], [1.0, 0.8])],
+                periodic=[True, False],
+            )
+        ).flights
+        is None
+    )

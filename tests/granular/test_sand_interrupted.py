@@ -11,7 +11,10 @@ from small_sands import box, create, scene
 from warp_lcp.scene.scene_file import load_scene
 
 FAST = ["output.checkpoint_every=5", "solver.max_iterations=60"]
-SLIDER = {**box([0.55, -0.1], [0.65, 0.3]), "motion": {"kind": "translation", "velocity": [-0.6, 0.0]}}
+SLIDER = {
+    **box([0.55, -0.1], [0.65, 0.3]),
+    "motion": {"kind": "translation", "velocity": [-0.6, 0.0]},
+}
 DISC = {"shape": "sphere", "center": [0.7, 0.3, 0.5], "radius": 0.15}
 
 
@@ -36,14 +39,26 @@ class Silent:
 
 def written(folder: Path) -> dict[str, bytes]:
     """Return frames, collections and the last checkpoint by name."""
-    files = [*folder.glob("frames/*"), *folder.glob("*.pvd"), sorted(folder.glob("checkpoints/*.npz"))[-1]]
+    files = [
+        *folder.glob("frames/*"),
+        *folder.glob("*.pvd"),
+        sorted(folder.glob("checkpoints/*.npz"))[-1],
+    ]
     return {str(file.relative_to(folder)): file.read_bytes() for file in files}
 
 
 @pytest.mark.parametrize(
     ("name", "overrides"),
     [
-        ("column-collapse-2d", ["domain.resolution=32", "time.duration=0.1", "particles.transfer=flip", "particles.reseed.every=1"]),
+        (
+            "column-collapse-2d",
+            [
+                "domain.resolution=32",
+                "time.duration=0.1",
+                "particles.transfer=flip",
+                "particles.reseed.every=1",
+            ],
+        ),
         ("hourglass-2d", ["domain.resolution=48", "time.duration=0.1"]),
         ("pouring-pile", ["domain.resolution=16", "time.duration=0.12", "source.0.stop=0.08"]),
         ("sand-on-mesh", ["domain.resolution=16", "time.duration=0.12"]),
@@ -54,7 +69,9 @@ def test_resumed_sand_equals_uninterrupted(name: str, overrides: list[str], tmp_
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     assert run_into(model, whole, observer=Silent()).status == "finished"
     watch = Silent()
-    assert run_into(model, parts, observer=watch, stop=lambda: watch.steps >= 13).status == "stopped"
+    assert (
+        run_into(model, parts, observer=watch, stop=lambda: watch.steps >= 13).status == "stopped"
+    )
     second = run_into(model, parts, observer=Silent(), resume=True)
     assert (second.status, second.resumed_from_step) == ("finished", 13)
     assert written(whole) == written(parts)
@@ -65,15 +82,24 @@ def test_resumed_sand_equals_uninterrupted(name: str, overrides: list[str], tmp_
     [
         (2, {}),
         (2, {"friction_model": "box"}),
-        (2, {"solid": [SLIDER], "density_correction": {}}),  # a simulation that is made where the solid is not any more
+        # a simulation that is made where the solid is not any more
+        (2, {"solid": [SLIDER], "density_correction": {}}),
         (2, {"solver": {"method": "interleaved-sweeps", "max_iterations": 60}}),
-        (2, {"particles": {"transfer": "flip", "reseed": {"every": 1}}, "density_correction": {"every": 2}}),
+        (
+            2,
+            {
+                "particles": {"transfer": "flip", "reseed": {"every": 1}},
+                "density_correction": {"every": 2},
+            },
+        ),
         (2, {"solids": "voxel", "solid": [DISC]}),
         (3, {"solid": [DISC | {"motion": {"kind": "translation", "velocity": [-0.8, 0.2, 0.0]}}]}),
         (3, {"density_correction": {}}),
     ],
 )
-def test_nothing_but_the_state_of_sand_is_remembered(dimension: int, tables: dict[str, Any]) -> None:
+def test_nothing_but_the_state_of_sand_is_remembered(
+    dimension: int, tables: dict[str, Any]
+) -> None:
     """A fresh simulation takes the same step from any state: fields hold nothing of where the sand was before."""
     tables = dict(tables)
     if "friction_model" in tables:
@@ -82,9 +108,13 @@ def test_nothing_but_the_state_of_sand_is_remembered(dimension: int, tables: dic
         tables.pop("friction_model")
     tables.setdefault("solver", {"max_iterations": 60})
     if dimension == 2 and "solid" in tables:
-        tables["solid"] = [s | {"center": s["center"][:2]} if "center" in s else s for s in tables["solid"]]
+        tables["solid"] = [
+            s | {"center": s["center"][:2]} if "center" in s else s for s in tables["solid"]
+        ]
     sand = [box([0.1] * dimension, [0.4] * dimension, velocity=[1.0, -1.0, 0.5][:dimension])]
-    old = create(scene(size=[1.0] * dimension, resolution=24 if dimension == 2 else 12, sand=sand, **tables))
+    old = create(
+        scene(size=[1.0] * dimension, resolution=24 if dimension == 2 else 12, sand=sand, **tables)
+    )
     for number in range(12):
         if number == 8:  # the window jumps and shrinks
             position = old.particles.position.numpy().copy()

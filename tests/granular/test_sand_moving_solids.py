@@ -37,12 +37,27 @@ def depth_in_solids(simulation: SandSimulation) -> float:
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_paddle_pushes_sand_and_none_gets_behind_it(dimension: int) -> None:
     """Momentum goes in: without the solid's velocity in the pressure's problem the sand before it would stay at rest or pile up in it."""
-    blade = {**box([-0.5, -1.0, -1.0][:dimension], [0.2, 2.0, 2.0][:dimension]), "motion": push([SPEED, 0.0, 0.0][:dimension])}
+    blade = {
+        **box([-0.5, -1.0, -1.0][:dimension], [0.2, 2.0, 2.0][:dimension]),
+        "motion": push([SPEED, 0.0, 0.0][:dimension]),
+    }
     size, high = [1.0, 0.4, 0.2][:dimension], [0.5, 0.2, 0.2][:dimension]
     sand = [box([0.2, 0.0, 0.0][:dimension], high)]
-    simulation = create(scene(size=size, resolution=40 if dimension == 2 else 20, sand=sand, solid=[blade], friction=0.0, solver=FEW))
+    simulation = create(
+        scene(
+            size=size,
+            resolution=40 if dimension == 2 else 20,
+            sand=sand,
+            solid=[blade],
+            friction=0.0,
+            solver=FEW,
+        )
+    )
     rows = advance(simulation, 0.4)
-    position, velocity = simulation.particles.position.numpy(), simulation.particles.velocity.numpy()
+    position, velocity = (
+        simulation.particles.position.numpy(),
+        simulation.particles.velocity.numpy(),
+    )
     face = 0.2 + SPEED * simulation.time
     assert position[:, 0].min() > face - 0.05 * simulation.grid.spacing
     assert depth_in_solids(simulation) < 0.05
@@ -56,21 +71,44 @@ def test_a_paddle_pushes_sand_and_none_gets_behind_it(dimension: int) -> None:
 def test_a_plate_that_is_pulled_from_under_sand_lets_it_fall() -> None:
     """The layer falls by the plate's height onto the floor, and keeps its mass."""
     plate = {**box([-0.1, -0.1], [1.1, 0.2]), "motion": push([0.0, -4.0])}
-    simulation = create(scene(size=[1.0, 0.75], resolution=32, sand=[box([0.0, 0.2], [1.0, 0.4])], solid=[plate], friction=0.0, solver=FEW))
+    simulation = create(
+        scene(
+            size=[1.0, 0.75],
+            resolution=32,
+            sand=[box([0.0, 0.2], [1.0, 0.4])],
+            solid=[plate],
+            friction=0.0,
+            solver=FEW,
+        )
+    )
     before = simulation.particles.position.numpy()[:, 1].mean()
     advance(simulation, 0.1)
     fallen = before - simulation.particles.position.numpy()[:, 1].mean()
-    assert fallen == pytest.approx(0.5 * GRAVITY * 0.1**2, rel=0.1)  # the plate is gone faster than sand falls: it does not pull
+    # the plate is gone faster than sand falls: it does not pull
+    assert fallen == pytest.approx(0.5 * GRAVITY * 0.1**2, rel=0.1)
     advance(simulation, 0.45)
-    assert before - simulation.particles.position.numpy()[:, 1].mean() == pytest.approx(0.2, abs=0.02)
+    assert before - simulation.particles.position.numpy()[:, 1].mean() == pytest.approx(
+        0.2, abs=0.02
+    )
 
 
 def test_a_plate_that_rises_carries_its_load() -> None:
     lift = {**box([-0.1, -0.3], [1.1, 0.1]), "motion": push([0.0, 0.4])}
-    simulation = create(scene(size=[1.0, 0.75], resolution=32, sand=[box([0.0, 0.1], [1.0, 0.3])], solid=[lift], friction=0.0, solver=FEW))
+    simulation = create(
+        scene(
+            size=[1.0, 0.75],
+            resolution=32,
+            sand=[box([0.0, 0.1], [1.0, 0.3])],
+            solid=[lift],
+            friction=0.0,
+            solver=FEW,
+        )
+    )
     before = simulation.particles.position.numpy()[:, 1].mean()
     advance(simulation, 0.3)
-    assert simulation.particles.position.numpy()[:, 1].mean() - before == pytest.approx(0.12, abs=0.02)
+    assert simulation.particles.position.numpy()[:, 1].mean() - before == pytest.approx(
+        0.12, abs=0.02
+    )
     assert depth_in_solids(simulation) < 0.05
 
 
@@ -80,9 +118,21 @@ def test_a_belt_drags_sand_along_with_friction_and_not_without() -> None:
     for friction in (0.0, 0.3):
         belt = {**box([-3.0, -1.0], [4.0, 0.1]), "motion": push([0.6, 0.0]), "friction": friction}
         sand = [box([0.3, 0.1], [0.9, 0.2])]
-        simulation = create(scene(size=[2.0, 0.5], resolution=80, sand=sand, solid=[belt], friction=0.0, material={"friction_angle": 40.0}))
+        simulation = create(
+            scene(
+                size=[2.0, 0.5],
+                resolution=80,
+                sand=sand,
+                solid=[belt],
+                friction=0.0,
+                material={"friction_angle": 40.0},
+            )
+        )
         advance(simulation, 0.1)
-        position, velocity = simulation.particles.position.numpy(), simulation.particles.velocity.numpy()
+        position, velocity = (
+            simulation.particles.position.numpy(),
+            simulation.particles.velocity.numpy(),
+        )
         found.append(float(velocity[np.abs(position[:, 0] - 0.6) < 0.15, 0].mean()))
     assert found[0] == pytest.approx(0.0, abs=0.03)
     assert found[1] == pytest.approx(0.3 * GRAVITY * 0.1, rel=0.25)
@@ -90,11 +140,20 @@ def test_a_belt_drags_sand_along_with_friction_and_not_without() -> None:
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_solid_comes_in_from_outside_and_leaves(dimension: int) -> None:
-    ball = {"shape": "sphere", "center": [-0.5, 0.12, 0.15][:dimension], "radius": 0.09, "motion": push([3.0, 0.5, 0.0][:dimension])}
+    ball = {
+        "shape": "sphere",
+        "center": [-0.5, 0.12, 0.15][:dimension],
+        "radius": 0.09,
+        "motion": push([3.0, 0.5, 0.0][:dimension]),
+    }
     size = [1.0, 0.5, 0.3][:dimension]
     sand = [box([0.4, 0.0, 0.0][:dimension], [1.0, 0.2, 0.3][:dimension])]
     resolution = 20 if dimension == 2 else 10
-    simulation = create(scene(size=size, resolution=resolution, sand=sand, solid=[ball], solver={"max_iterations": 40}))
+    simulation = create(
+        scene(
+            size=size, resolution=resolution, sand=sand, solid=[ball], solver={"max_iterations": 40}
+        )
+    )
     rows = advance(simulation, 0.7)
     assert max(row["max_speed"] for row in rows) > 0.5
     assert (simulation.solids.base.numpy()[1, 1:-1, 1:-1] == 0).all()
@@ -103,7 +162,15 @@ def test_a_solid_comes_in_from_outside_and_leaves(dimension: int) -> None:
 
 def test_solids_that_close_the_domain_end_no_run() -> None:
     press = {**box([-0.1, 0.3], [0.6, 2.0]), "motion": push([0.0, -1.0])}
-    simulation = create(scene(size=[0.5, 0.5], resolution=16, sand=[box([0.0, 0.0], [0.5, 0.1])], solid=[press], solver=FEW))
+    simulation = create(
+        scene(
+            size=[0.5, 0.5],
+            resolution=16,
+            sand=[box([0.0, 0.0], [0.5, 0.1])],
+            solid=[press],
+            solver=FEW,
+        )
+    )
     rows = advance(simulation, 0.4)  # the press passes the floor at 0.3 s
     assert rows[-1]["stuck"] > 0
     assert math.isfinite(rows[-1]["kinetic_energy"])

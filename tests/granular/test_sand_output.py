@@ -72,7 +72,12 @@ def test_the_profile_has_the_stages_of_a_step(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("color", "label"), [(Color.FRACTION, "fraction of grains"), (Color.YIELD_RATIO, "yield ratio"), (Color.PRESSURE, "pressure [Pa]")]
+    ("color", "label"),
+    [
+        (Color.FRACTION, "fraction of grains"),
+        (Color.YIELD_RATIO, "yield ratio"),
+        (Color.PRESSURE, "pressure [Pa]"),
+    ],
 )
 def test_images_may_show_what_sand_bears(folder: Path, color: Color, label: str) -> None:
     recording = Recording(folder, color)
@@ -90,7 +95,14 @@ def test_sand_has_colors_of_its_own(folder: Path) -> None:
 
 def test_scenes_schema_and_check_know_sand() -> None:
     listed = call("scenes").stdout
-    for name in ("column-collapse-2d", "column-collapse", "hourglass-2d", "hourglass", "pouring-pile", "sand-on-mesh"):
+    for name in (
+        "column-collapse-2d",
+        "column-collapse",
+        "hourglass-2d",
+        "hourglass",
+        "pouring-pile",
+        "sand-on-mesh",
+    ):
         assert f"{name} " in listed
     schema = json.loads(call("schema", "--simulator", "granular").stdout)
     assert {"material", "friction", "gauge", "sand"} <= schema["properties"].keys()
@@ -102,7 +114,9 @@ def test_scenes_schema_and_check_know_sand() -> None:
 def test_a_solid_that_no_cell_feels_is_told() -> None:
     """Particles stop at it, but stresses know only whole cells."""
     plate = box([0.2, 0.19], [0.8, 0.21])
-    simulation = create(scene(size=[1.0, 0.5], resolution=16, sand=[box([0.0, 0.3], [1.0, 0.5])], solid=[plate]))
+    simulation = create(
+        scene(size=[1.0, 0.5], resolution=16, sand=[box([0.0, 0.3], [1.0, 0.5])], solid=[plate])
+    )
     assert any("solid[0] (box) contains no center of a cell" in note for note in simulation.notes())
 
 
@@ -113,6 +127,7 @@ def test_the_frame_before_the_first_step_shows_the_start() -> None:
     full = (cells.index[:, :2] < [8, 4]).all(axis=1)
     assert full.sum() == 8 * 4
     inner = (cells.index[:, :2] < [7, 3]).all(axis=1)
-    np.testing.assert_allclose(cells.fields["fraction"][inner], 0.6, rtol=0.1)  # as the particles' kernels see it
+    # as the particles' kernels see it
+    np.testing.assert_allclose(cells.fields["fraction"][inner], 0.6, rtol=0.1)
     assert (cells.fields["fraction"][~full] < 0.3).all()  # what reaches over its edge
     assert not points.fields["pressure"].any()

@@ -19,14 +19,19 @@ def packed(picture: list[str], **more: Any) -> Packing:
     """Return the packing of a picture, top row first: '#' solid, '.' empty, 'o' dense sand, ':' sand of 0.4, '+' of 1.5."""
     rows = picture[::-1]
     grid = StaggeredGrid((len(rows[0]), len(rows), 1), DX, 2)
-    density, base = np.zeros(grid.shape, dtype=np.float32), np.full(grid.shape, SOLID, dtype=np.int8)
+    density, base = (
+        np.zeros(grid.shape, dtype=np.float32),
+        np.full(grid.shape, SOLID, dtype=np.int8),
+    )
     for j, row in enumerate(rows, start=1):
         for i, mark in enumerate(row, start=1):
             base[1, j, i] = SOLID if mark == "#" else 0
             density[1, j, i] = {"#": 0.0, ".": 0.0, "o": 1.0, ":": 0.4, "+": 1.5}[mark]
     one = wp.full(grid.shape, 1.0, dtype=wp.float32, device=grid.device)
     packing = Packing(grid, wp.array(base, dtype=wp.int8, device=grid.device), one)
-    velocity = [wp.full(grid.shape, 2.0 + axis, dtype=wp.float32, device=grid.device) for axis in range(2)]
+    velocity = [
+        wp.full(grid.shape, 2.0 + axis, dtype=wp.float32, device=grid.device) for axis in range(2)
+    ]
     packing.update(wp.array(density, dtype=wp.float32, device=grid.device), velocity, DT, **more)
     return packing
 
@@ -40,12 +45,17 @@ def test_a_face_has_the_mean_of_its_cells_as_mass() -> None:
     packing = packed(["o.", "o:", "##"])
     u, v = plane(packing.mass[0]), plane(packing.mass[1])
     np.testing.assert_allclose(u[1:3], [[0.0, 0.7, 0.0], [0.0, 0.5, 0.0]], atol=1e-6)
-    np.testing.assert_allclose(v[1:4, :2], [[0.0, 0.0], [1.0, 0.2], [0.0, 0.0]], atol=1e-6)  # none on walls
-    for mass, inverse, start, given in zip(packing.mass, packing.inverse, packing.start, (2.0, 3.0), strict=True):
+    # none on walls
+    np.testing.assert_allclose(v[1:4, :2], [[0.0, 0.0], [1.0, 0.2], [0.0, 0.0]], atol=1e-6)
+    for mass, inverse, start, given in zip(
+        packing.mass, packing.inverse, packing.start, (2.0, 3.0), strict=True
+    ):
         m, light = mass.numpy(), inverse.numpy()
         np.testing.assert_allclose(light[m > 0.0], 1.0 / m[m > 0.0], rtol=1e-6)
         assert not light[m == 0.0].any()
-        np.testing.assert_array_equal(start.numpy(), np.where(m > 0.0, given, 0.0).astype(np.float32))
+        np.testing.assert_array_equal(
+            start.numpy(), np.where(m > 0.0, given, 0.0).astype(np.float32)
+        )
 
 
 def test_a_solid_that_moves_sweeps_the_fraction_before_it() -> None:
@@ -73,18 +83,25 @@ def test_surface_cells_count_as_full_and_loose_ones_do_not() -> None:
 def test_a_gap_that_its_neighbors_fill_is_no_room() -> None:
     """Free is what a cell and those around it, by halves along each axis, have free in all: 0.95 less the fractions of eight neighbors."""
     assert plane(packed(["+++", "+:+", "+++"]).drive)[1, 1] == 0.0
-    assert plane(packed(["ooo", "o:o", "ooo"]).drive)[1, 1] == pytest.approx((0.55 - 3 * 0.05) * DX / DT, rel=1e-5)
+    assert plane(packed(["ooo", "o:o", "ooo"]).drive)[1, 1] == pytest.approx(
+        (0.55 - 3 * 0.05) * DX / DT, rel=1e-5
+    )
 
 
 @pytest.mark.parametrize(
     ("picture", "expected"),
     [
-        (["oo", "oo"], [[0.0, -0.5, 0.0], [-0.5, 0.25, -0.5], [0.0, -0.5, 0.0]]),  # none in the corners of the domain
-        (["oo", ":o"], [[0.0, -0.5, 0.0], [-0.5, 1 / 3, -0.5], [0.0, -0.5, 0.0]]),  # a loose cell bears no shear, but leans on walls
-        (["..", "oo"], [[0.0, -0.5, 0.0], [-1.0, 0.0, -1.0], [0.0, 0.0, 0.0]]),  # the surface itself bears none: the face above is empty
+        # none in the corners of the domain
+        (["oo", "oo"], [[0.0, -0.5, 0.0], [-0.5, 0.25, -0.5], [0.0, -0.5, 0.0]]),
+        # a loose cell bears no shear, but leans on walls
+        (["oo", ":o"], [[0.0, -0.5, 0.0], [-0.5, 1 / 3, -0.5], [0.0, -0.5, 0.0]]),
+        # the surface itself bears none: the face above is empty
+        (["..", "oo"], [[0.0, -0.5, 0.0], [-1.0, 0.0, -1.0], [0.0, 0.0, 0.0]]),
     ],
 )
-def test_edges_share_shear_among_dense_cells(picture: list[str], expected: list[list[float]]) -> None:
+def test_edges_share_shear_among_dense_cells(
+    picture: list[str], expected: list[list[float]]
+) -> None:
     packing = packed(picture)
     np.testing.assert_allclose(plane(packing.share[0]), expected, atol=1e-6)
 
@@ -99,7 +116,11 @@ def test_copies_weigh_one_together() -> None:
     random = np.random.default_rng(77)
     rows = ["".join(random.choice(list("ooo:.#"), size=9)) for _ in range(8)]
     packing = packed(rows)
-    share, flags, base = packing.share[0].numpy()[1], packing.flags.numpy()[1], packing.base.numpy()[1]
+    share, flags, base = (
+        packing.share[0].numpy()[1],
+        packing.flags.numpy()[1],
+        packing.base.numpy()[1],
+    )
     for j in range(1, 10):
         for i in range(1, 11):
             cells = [(j, i), (j, i - 1), (j - 1, i), (j - 1, i - 1)]
@@ -110,7 +131,10 @@ def test_copies_weigh_one_together() -> None:
                 touching = [
                     flags[c] & 1
                     and base[c] != SOLID
-                    and ((base[c[0], 2 * i - 1 - c[1]] == SOLID) != (base[2 * j - 1 - c[0], c[1]] == SOLID))
+                    and (
+                        (base[c[0], 2 * i - 1 - c[1]] == SOLID)
+                        != (base[2 * j - 1 - c[0], c[1]] == SOLID)
+                    )
                     for c in cells
                 ]
                 assert -share[j, i] * sum(map(bool, touching)) == pytest.approx(1.0)
@@ -131,7 +155,13 @@ def test_wall_faces_lie_between_open_cells_and_solids(dimension: int) -> None:
                 beyond = cell.copy()
                 beyond[2 - axis] += 2 * side - 1
                 if index[tuple(beyond)] >= 0:
-                    expected.add((int(np.ravel_multi_index(tuple(cell), shape)), 2 * axis + side, int(index[tuple(beyond)])))
+                    expected.add(
+                        (
+                            int(np.ravel_multi_index(tuple(cell), shape)),
+                            2 * axis + side,
+                            int(index[tuple(beyond)]),
+                        )
+                    )
     assert set(zip(cells.tolist(), sides.tolist(), walls.tolist(), strict=True)) == expected
     assert len(cells) == len(expected)
     assert (np.diff(cells) >= 0).all()  # so that a cell's faces are one thread's, in one order
@@ -150,12 +180,17 @@ class SomeCells(GridPart):
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_cells_of_sand_and_the_densest_are_those_that_numpy_finds_in_every_step(dimension: int) -> None:
+def test_cells_of_sand_and_the_densest_are_those_that_numpy_finds_in_every_step(
+    dimension: int,
+) -> None:
     random = np.random.default_rng(dimension)
     grid = StaggeredGrid((7, 5, 4 if dimension == 3 else 1), DX, dimension)
     base = np.where(random.random(grid.shape) < 0.3, SOLID, 0).astype(np.int8)
     capacity = random.uniform(0.2, 1.0, grid.shape).astype(np.float32)
-    arrays = [wp.array(host, dtype=kind, device=grid.device) for host, kind in ((base, wp.int8), (capacity, wp.float32))]
+    arrays = [
+        wp.array(host, dtype=kind, device=grid.device)
+        for host, kind in ((base, wp.int8), (capacity, wp.float32))
+    ]
     counted = Window((1, 2, 2), (grid.shape[0] - 1, 5, 6), grid.device)
     object.__setattr__(grid, "part", SomeCells(grid, counted))
     packing = Packing(grid, *arrays)
@@ -164,14 +199,18 @@ def test_cells_of_sand_and_the_densest_are_those_that_numpy_finds_in_every_step(
     walls = Walls(grid, index, [0.5])
     density, velocity = grid.field(), grid.faces()
     for step in range(4):
-        host = random.uniform(0.0, 1.2, grid.shape) * (random.random(grid.shape) < 0.5) * (step != 2)
+        host = (
+            random.uniform(0.0, 1.2, grid.shape) * (random.random(grid.shape) < 0.5) * (step != 2)
+        )
         if step == 3:
             density = grid.field()  # another array than what is recorded knows
         density.assign(host.astype(np.float32))
         packing.update(density, velocity, DT)
         walls.activate(packing.flags)
         flags = packing.flags.numpy()
-        assert packing.sand_cells == np.count_nonzero(flags[tuple(map(slice, counted.low, counted.high))])
+        assert packing.sand_cells == np.count_nonzero(
+            flags[tuple(map(slice, counted.low, counted.high))]
+        )
         seen = (base != SOLID) & (capacity > 0.5)
         seen[: 1 if dimension == 2 else 0] = False
         seen[2 if dimension == 2 else grid.shape[0] :] = False  # in 2-D one plane is used

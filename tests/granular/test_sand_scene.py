@@ -51,18 +51,27 @@ def complaint(tmp_path: Any, *overrides: str) -> str:
         ("material.tensile_strength=100", "material.tensile_strength = 100.0: must be at most 0"),
         (
             "material.friction_angle_test=shear",
-            "material.friction_angle_test = \"shear\": must be 'repose', 'plane-strain' or 'triaxial-compression'",
+            "material.friction_angle_test = \"shear\": must be 'repose', 'plane-strain' or "
+            "'triaxial-compression'",
         ),
-        ("material.wall_friction=-0.1", 'material.wall_friction = -0.1: must be a number from 0 to 10, or "stick" (friction coefficient'),
+        (
+            "material.wall_friction=-0.1",
+            'material.wall_friction = -0.1: must be a number from 0 to 10, or "stick" (friction '
+            "coefficient",
+        ),
         ("material.colour=red", "material.colour: unknown key; choose from cohesion, density"),
         ("friction.model=sphere", "friction.model = \"sphere\": must be 'cone' or 'box'"),
         (
             "domain.friction=rough",
-            'domain.friction = "rough": must be a number from 0 to 10, or "stick" (friction coefficient of the domain\'s walls',
+            'domain.friction = "rough": must be a number from 0 to 10, or "stick" (friction '
+            "coefficient of the domain's walls",
         ),
         ("domain.friction=11", "domain.friction = 11: must be a number from 0 to 10"),
         ("domain.wall=free-slip", 'domain.wall = "free-slip": must be "separating"'),
-        ("domain.periodic=[false, true]", "domain.periodic = [false, true]: may be true along x and z only"),
+        (
+            "domain.periodic=[false, true]",
+            "domain.periodic = [false, true]: may be true along x and z only",
+        ),
         ("domain.periodic=[true]", "domain.periodic = [true]: must have 2 entries"),
         ("solid.0.friction=-1", "solid[0].friction"),
         ("solid.0.wall=free-slip", 'must be "separating"'),
@@ -70,7 +79,10 @@ def complaint(tmp_path: Any, *overrides: str) -> str:
         ("sand.0.cohesion=true", "sand[0].cohesion = true: must be a number"),
         ("gauge.height=0.5", "gauge.height = 0.5: must lie in the domain, between 0 and 0.5 m"),
         ("gauge.hight=0.2", "gauge.height: is missing"),
-        ("solver.method=psor", "solver.method = \"psor\": must be 'accelerated-projection' or 'interleaved-sweeps'"),
+        (
+            "solver.method=psor",
+            "solver.method = \"psor\": must be 'accelerated-projection' or 'interleaved-sweeps'",
+        ),
         ("solver.tolerance=1", "solver.tolerance = 1: must be less than 1"),
         ("solver.tolerance=auto", 'solver.tolerance = "auto": is for liquids only'),
         ("solver.max_iterations=0", "solver.max_iterations = 0: must be at least 10"),
@@ -91,20 +103,31 @@ def test_what_is_refused(tmp_path: Any, overrides: str, expected: str) -> None:
             ["material.density=1500", "physics.density=1600"],
             "material.density = 1500.0: differs from physics.density = 1600; give one of them",
         ),
-        (["domain.periodic=[true, false]", 'domain.open=["left"]'], "names a side of a periodic axis"),
-        (["domain.periodic=[true, false]", "density_correction.every=1"], "cannot be combined with density_correction"),
+        (
+            ["domain.periodic=[true, false]", 'domain.open=["left"]'],
+            "names a side of a periodic axis",
+        ),
+        (
+            ["domain.periodic=[true, false]", "density_correction.every=1"],
+            "cannot be combined with density_correction",
+        ),
         (
             ["material.cohesion=10", "material.tensile_strength=20"],
             "must be at most 17.32, the cohesion over the tangent of the friction angle",
         ),
     ],
 )
-def test_keys_that_contradict_each_other(tmp_path: Any, overrides: list[str], expected: str) -> None:
+def test_keys_that_contradict_each_other(
+    tmp_path: Any, overrides: list[str], expected: str
+) -> None:
     assert expected in complaint(tmp_path, *overrides)
 
 
 def test_sand_of_two_kinds_is_refused() -> None:
-    sand = [box([0.0, 0.0], [0.2, 0.2], friction_angle=30.0), box([0.5, 0.0], [0.7, 0.2], friction_angle=35.0)]
+    sand = [
+        box([0.0, 0.0], [0.2, 0.2], friction_angle=30.0),
+        box([0.5, 0.0], [0.7, 0.2], friction_angle=35.0),
+    ]
     with pytest.raises(ValueError, match="must be 30 as in the other"):
         scene(size=[1.0, 0.5], resolution=16, sand=sand)
 
@@ -116,16 +139,33 @@ def test_no_sand_at_all_is_refused() -> None:
 
 def test_a_material_gives_what_the_table_does_not() -> None:
     """Gravel's own density and angle, and a wall friction in place of its own."""
-    data = {"scene": {"simulator": "granular"}, "time": {"duration": 1.0}, "domain": {"size": [1.0, 0.5], "resolution": 16}}
-    given = data | {"material": {"name": "gravel", "wall_friction": 0.1}, "sand": [box([0.0, 0.0], [0.2, 0.2])]}
+    data = {
+        "scene": {"simulator": "granular"},
+        "time": {"duration": 1.0},
+        "domain": {"size": [1.0, 0.5], "resolution": 16},
+    }
+    given = data | {
+        "material": {"name": "gravel", "wall_friction": 0.1},
+        "sand": [box([0.0, 0.0], [0.2, 0.2])],
+    }
     model = validate(SandScene, given, "x")
     assert (model.physics.density, model.friction_angle, model.max_fraction) == (1800.0, 40.0, 0.65)
     assert model.wall_frictions() == [0.1]
 
 
 def test_walls_and_solids_have_their_own_friction() -> None:
-    solids = [box([0.5, 0.0], [0.6, 0.1], friction=0.0), box([0.7, 0.0], [0.8, 0.1], friction="stick"), box([0.9, 0.0], [1.0, 0.1])]
-    model = scene(size=[1.0, 0.5], resolution=16, sand=[box([0.0, 0.0], [0.2, 0.2])], solid=solids, friction=0.3)
+    solids = [
+        box([0.5, 0.0], [0.6, 0.1], friction=0.0),
+        box([0.7, 0.0], [0.8, 0.1], friction="stick"),
+        box([0.9, 0.0], [1.0, 0.1]),
+    ]
+    model = scene(
+        size=[1.0, 0.5],
+        resolution=16,
+        sand=[box([0.0, 0.0], [0.2, 0.2])],
+        solid=solids,
+        friction=0.3,
+    )
     assert model.wall_frictions() == [0.3, 0.0, STICKS, 0.3]
 
 
@@ -135,27 +175,42 @@ def test_the_slope_of_the_yield_set() -> None:
     Cohesion counts as such in the first, times cos 30 in the others.
     """
     sand = [box([0.0, 0.0], [0.2, 0.2])]
-    assert scene(size=[1.0, 0.5], resolution=16, sand=sand).slope == pytest.approx(math.tan(math.radians(30.0)))
+    assert scene(size=[1.0, 0.5], resolution=16, sand=sand).slope == pytest.approx(
+        math.tan(math.radians(30.0))
+    )
     for test, factor in (("repose", 1.0), ("plane-strain", math.sqrt(0.75))):
         material = {"friction_angle_test": test, "cohesion": 10.0}
-        assert scene(size=[1.0, 0.5], resolution=16, sand=sand, material=material).intercept == pytest.approx(10.0 * factor)
-    assert scene(size=[1.0, 0.5], resolution=16, sand=sand, material={"friction_angle_test": "plane-strain"}).slope == pytest.approx(0.5)
+        assert scene(
+            size=[1.0, 0.5], resolution=16, sand=sand, material=material
+        ).intercept == pytest.approx(10.0 * factor)
+    assert scene(
+        size=[1.0, 0.5], resolution=16, sand=sand, material={"friction_angle_test": "plane-strain"}
+    ).slope == pytest.approx(0.5)
     triaxial = {"material": {"friction_angle_test": "triaxial-compression"}}
     assert scene(size=[1.0, 0.5], resolution=16, sand=sand, **triaxial).slope == pytest.approx(0.5)
     deep = [box([0.0] * 3, [0.2] * 3)]
-    assert scene(size=[1.0, 0.5, 0.5], resolution=16, sand=deep, **triaxial).slope == pytest.approx(math.sqrt(3.0) / 2.5)
+    assert scene(size=[1.0, 0.5, 0.5], resolution=16, sand=deep, **triaxial).slope == pytest.approx(
+        math.sqrt(3.0) / 2.5
+    )
 
 
 def test_a_cone_that_would_bear_tension_is_refused() -> None:
     """The least principal stress is below 0 beyond |s|_F = sqrt(2) sqrt(3) / 2 p where a sample is pulled; in 2-D beyond sqrt(2) p."""
     flat = [box([0.0, 0.0], [0.2, 0.2])]
-    with pytest.raises(ValueError, match=r"must be at most 45 where material.friction_angle_test = \"repose\""):
+    with pytest.raises(
+        ValueError, match=r"must be at most 45 where material.friction_angle_test = \"repose\""
+    ):
         scene(size=[1.0, 0.5], resolution=16, sand=flat, material={"friction_angle": 46.0})
     sand = [box([0.0] * 3, [0.2] * 3)]
     steep = {"material": {"friction_angle_test": "triaxial-compression", "friction_angle": 37.0}}
     with pytest.raises(ValueError, match=r"must be at most 36\.8"):
         scene(size=[1.0, 0.5, 0.5], resolution=16, sand=sand, **steep)
-    k = scene(size=[1.0, 0.5, 0.5], resolution=16, sand=sand, material={**steep["material"], "friction_angle": 36.8}).slope
+    k = scene(
+        size=[1.0, 0.5, 0.5],
+        resolution=16,
+        sand=sand,
+        material={**steep["material"], "friction_angle": 36.8},
+    ).slope
     axial = math.sqrt(2.0) * k * math.sqrt(2.0 / 3.0)  # of the deviator, over p
     assert 0.0 < 1.0 - axial < 0.01
 

@@ -28,16 +28,38 @@ class Silent:
 
 def run(name: str, folder: Path, *overrides: str) -> dict[str, np.ndarray]:
     """Run a scene and return the columns of its log that are numbers."""
-    assert run_into(load_scene(name, list(overrides)), folder, observer=Silent()).status == "finished"
+    assert (
+        run_into(load_scene(name, list(overrides)), folder, observer=Silent()).status == "finished"
+    )
     with open(folder / "log.csv", newline="", encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
-    columns = ("dt", "mass", "coupled_residual", "dissipation", "predicted_excess", "max_fraction", "runout", "height", "max_speed")
+    columns = (
+        "dt",
+        "mass",
+        "coupled_residual",
+        "dissipation",
+        "predicted_excess",
+        "max_fraction",
+        "runout",
+        "height",
+        "max_speed",
+    )
     columns = (*columns, "kinetic_energy", *(["flow_rate"] if "flow_rate" in rows[0] else []))
     return {name: np.array([float(row[name]) for row in rows]) for name in columns}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["column-collapse-2d", "hourglass-2d", "column-collapse", "pouring-pile", "sand-on-mesh", "hourglass"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "column-collapse-2d",
+        "hourglass-2d",
+        "column-collapse",
+        "pouring-pile",
+        "sand-on-mesh",
+        "hourglass",
+    ],
+)
 def test_a_scene_from_beginning_to_end(name: str, tmp_path: Path) -> None:
     log = run(name, tmp_path / "run")
     assert np.mean(log["coupled_residual"] <= 1e-3) >= 0.9
@@ -55,7 +77,8 @@ def test_the_planar_column_runs_as_far_as_experiments_say_and_rests(tmp_path: Pa
     log = run("column-collapse-2d", tmp_path / "run", "time.duration=2.5")
     assert 0.8 * 2.4 <= log["runout"][-1] / 0.25 <= 1.2 * 3.6
     mass = log["mass"][-1]
-    assert np.sqrt(2.0 * log["kinetic_energy"][-1] / mass) < 0.01 * 0.5  # [m/s], of a pile from 0.5 m
+    # [m/s], of a pile from 0.5 m
+    assert np.sqrt(2.0 * log["kinetic_energy"][-1] / mass) < 0.01 * 0.5
     assert log["height"][-1] == pytest.approx(0.25, abs=0.05)
 
 

@@ -17,7 +17,12 @@ def vertical_load(simulation: SandSimulation) -> np.ndarray:
     now = simulation.stress.now.numpy().astype(float)
     deviator = -now[1] if simulation.grid.dimension == 2 else now[2]
     planes = slice(1, 2) if simulation.grid.dimension == 2 else slice(1, -1)
-    return np.asarray((now[0] - deviator)[planes, 1:-1, 1:-1] * DENSITY * simulation.grid.spacing / simulation.stress.kick_dt)
+    return np.asarray(
+        (now[0] - deviator)[planes, 1:-1, 1:-1]
+        * DENSITY
+        * simulation.grid.spacing
+        / simulation.stress.kick_dt
+    )
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -26,7 +31,13 @@ def test_a_grain_falls_freely(dimension: int) -> None:
     center = [8.25 / 32, 24.25 / 32, 8.25 / 32][:dimension]
     grain = {"shape": "sphere", "center": center, "radius": 0.004}
     simulation = create(
-        scene(size=[0.5, 1.0, 0.5][:dimension], resolution=32, sand=[grain], particles={"per_axis": 2, "jitter": 0.0}, friction=0.3)
+        scene(
+            size=[0.5, 1.0, 0.5][:dimension],
+            resolution=32,
+            sand=[grain],
+            particles={"per_axis": 2, "jitter": 0.0},
+            friction=0.3,
+        )
     )
     assert simulation.particles.count == 1
     sideways = np.array([0.7, 0.0, -0.3])[:dimension]
@@ -44,7 +55,11 @@ def test_a_grain_falls_freely(dimension: int) -> None:
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_block_falls_freely(dimension: int) -> None:
     """What moves through a partly filled cell as it is does not compress it: no pressure, no drag on the block's front."""
-    size, low, high = [0.5, 1.0, 0.5][:dimension], [0.15, 0.7, 0.15][:dimension], [0.35, 0.9, 0.35][:dimension]
+    size, low, high = (
+        [0.5, 1.0, 0.5][:dimension],
+        [0.15, 0.7, 0.15][:dimension],
+        [0.35, 0.9, 0.35][:dimension],
+    )
     simulation = create(scene(size=size, resolution=48, sand=[box(low, high)]))
     advance(simulation, 0.2)
     fallen = GRAVITY * (simulation.time - 0.5 * simulation.last_dt)
@@ -70,7 +85,11 @@ def settled(dimension: int, **tables: object) -> tuple[SandSimulation, list[dict
     """Return sand that fills a box without friction on its walls to 3/4 and has come to rest."""
     high = [0.5, 0.375, 0.5][:dimension]
     model = scene(
-        size=[0.5] * dimension, resolution=32 if dimension == 2 else 16, sand=[box([0.0] * dimension, high)], friction=0.0, **tables
+        size=[0.5] * dimension,
+        resolution=32 if dimension == 2 else 16,
+        sand=[box([0.0] * dimension, high)],
+        friction=0.0,
+        **tables,
     )
     simulation = create(model)
     return simulation, advance(simulation, 0.25)
@@ -80,7 +99,8 @@ def settled(dimension: int, **tables: object) -> tuple[SandSimulation, list[dict
 def test_each_layer_bears_what_lies_on_it(dimension: int) -> None:
     """Walls that do not rub take no weight, so the load of a row of cells is exactly the weight of what lies above their centers.
 
-    How a row shares it among its cells is undetermined in sand with friction, and varies: by a half and more.
+    How a row shares it among its cells is undetermined in sand with friction, and varies: by a half
+    and more.
     """
     simulation, rows = settled(dimension)
     assert rows[-1]["max_speed"] < 0.03
@@ -92,12 +112,15 @@ def test_each_layer_bears_what_lies_on_it(dimension: int) -> None:
     weight = DENSITY * GRAVITY * dx * above
     deep = slice(0, int(0.3 / dx))
     np.testing.assert_allclose(load[deep], weight[deep], rtol=0.05)
-    exact = DENSITY * GRAVITY * (0.375 - (np.arange(len(load)) + 0.5) * dx)  # rho g (h - y), if nothing had settled
+    # rho g (h - y), if nothing had settled
+    exact = DENSITY * GRAVITY * (0.375 - (np.arange(len(load)) + 0.5) * dx)
     np.testing.assert_allclose(load[deep], exact[deep], rtol=0.1)
     mean = simulation.pressures()[planes, 1:-1, 1:-1].mean(axis=(0, 2))
-    least = (1.0 + (dimension - 1) / 3.0) / dimension  # Rankine's active state of 30 degrees: a third of the load acts sideways
+    # Rankine's active state of 30 degrees: a third of the load acts sideways
+    least = (1.0 + (dimension - 1) / 3.0) / dimension
     assert (mean[deep] > 0.95 * least * load[deep]).all()
-    assert (mean[deep] < 1.05 * load[deep]).all()  # nor more than the load: sand that pushes itself apart would be passive
+    # nor more than the load: sand that pushes itself apart would be passive
+    assert (mean[deep] < 1.05 * load[deep]).all()
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -105,20 +128,36 @@ def test_the_floor_bears_the_weight(dimension: int) -> None:
     """The load of the lowest cells and the weight of the half cell below their centers, summed over the floor."""
     simulation, _ = settled(dimension)
     dx = simulation.grid.spacing
-    floor = (vertical_load(simulation)[:, 0] + 0.5 * DENSITY * GRAVITY * dx).sum() * dx ** (dimension - 1)
+    floor = (vertical_load(simulation)[:, 0] + 0.5 * DENSITY * GRAVITY * dx).sum() * dx ** (
+        dimension - 1
+    )
     weight = simulation.particles.count * simulation.particle_mass * GRAVITY
     assert floor == pytest.approx(weight, rel=0.02)
 
 
 @pytest.mark.parametrize(
-    ("model", "method"), [("cone", "accelerated-projection"), ("box", "accelerated-projection"), ("cone", "interleaved-sweeps")]
+    ("model", "method"),
+    [
+        ("cone", "accelerated-projection"),
+        ("box", "accelerated-projection"),
+        ("cone", "interleaved-sweeps"),
+    ],
 )
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_what_every_step_keeps(dimension: int, model: str, method: str) -> None:
     """Mass exactly; pressure only pushes; friction only takes energy; no cell is predicted to be too dense; energy falls."""
     solver = {"method": method, "tolerance": 1e-3, "max_iterations": 1000}
-    simulation = column(dimension, friction=0.4, solver=solver, density_correction={}) if model == "cone" else boxed(dimension, solver)
-    mass, energy, rows, total = simulation.particles.count * simulation.particle_mass, math.inf, [], []
+    simulation = (
+        column(dimension, friction=0.4, solver=solver, density_correction={})
+        if model == "cone"
+        else boxed(dimension, solver)
+    )
+    mass, energy, rows, total = (
+        simulation.particles.count * simulation.particle_mass,
+        math.inf,
+        [],
+        [],
+    )
     for _ in range(30):
         row = simulation.step(min(simulation.stable_dt(), 5e-3))
         assert row["mass"] == pytest.approx(mass, rel=1e-12)
@@ -133,9 +172,11 @@ def test_what_every_step_keeps(dimension: int, model: str, method: str) -> None:
         energy = after
         total.append(energy)
     taken = sum(row["dissipation"] for row in rows[1:]) / (total[0] - total[-1])
-    assert 0.8 < taken < 1.0  # friction has taken what is lost; the rest is the transfers' and the floor's
+    # friction has taken what is lost; the rest is the transfers' and the floor's
+    assert 0.8 < taken < 1.0
     reached = np.mean([row["coupled_residual"] <= 1e-3 for row in rows])
-    assert reached >= (0.4 if model == "box" else 0.9)  # the box's flow has steps that no method has been seen to solve
+    # the box's flow has steps that no method has been seen to solve
+    assert reached >= (0.4 if model == "box" else 0.9)
 
 
 def boxed(dimension: int, solver: dict[str, object]) -> SandSimulation:
@@ -155,13 +196,22 @@ def test_tilted_gravity_moves_a_slab_as_coulomb_says(degrees: float) -> None:
     mu, angle = 0.4, math.radians(degrees)
     gravity = [GRAVITY * math.sin(angle), -GRAVITY * math.cos(angle)]
     model = scene(
-        size=[2.0, 0.25], resolution=128, sand=[box([0.25, 0.0], [1.0, 0.09375])], friction=mu, physics={"gravity": gravity},
+        size=[2.0, 0.25],
+        resolution=128,
+        sand=[box([0.25, 0.0], [1.0, 0.09375])],
+        friction=mu,
+        physics={"gravity": gravity},
         material={"friction_angle": 37.5},
-    )  # fmt: skip
+    )
     simulation = create(model)
     advance(simulation, 0.15)
-    position, velocity = simulation.particles.position.numpy(), simulation.particles.velocity.numpy()
-    inner = (position[:, 0] > np.quantile(position[:, 0], 0.3)) & (position[:, 0] < np.quantile(position[:, 0], 0.7))
+    position, velocity = (
+        simulation.particles.position.numpy(),
+        simulation.particles.velocity.numpy(),
+    )
+    inner = (position[:, 0] > np.quantile(position[:, 0], 0.3)) & (
+        position[:, 0] < np.quantile(position[:, 0], 0.7)
+    )
     expected = max(0.0, GRAVITY * (math.sin(angle) - mu * math.cos(angle)) * simulation.time)
     assert velocity[inner, 0].mean() == pytest.approx(expected, rel=0.1, abs=0.03)
 
@@ -170,7 +220,15 @@ def test_a_mirrored_scene_stays_mirrored() -> None:
     """Nothing prefers a side, as far as the order of additions goes."""
     found = []
     for low, high in (([0.0, 0.0], [0.375, 0.375]), ([0.625, 0.0], [1.0, 0.375])):
-        simulation = create(scene(size=[1.0, 0.5], resolution=32, sand=[box(low, high)], friction=0.4, particles={"jitter": 0.0}))
+        simulation = create(
+            scene(
+                size=[1.0, 0.5],
+                resolution=32,
+                sand=[box(low, high)],
+                friction=0.4,
+                particles={"jitter": 0.0},
+            )
+        )
         advance(simulation, 0.3)
         found.append(simulation.particles.position.numpy()[:, 0])
     left, right = np.sort(found[0]), np.sort(1.0 - found[1])
@@ -183,7 +241,8 @@ def test_a_pile_comes_to_rest_and_stays() -> None:
     front, height = simulation._front()
     before = simulation.particles.position.numpy().copy()
     advance(simulation, 1.3)
-    drift = np.linalg.norm(simulation.particles.position.numpy() - before, axis=1).mean()  # the order may change: an upper bound only
+    # the order may change: an upper bound only
+    drift = np.linalg.norm(simulation.particles.position.numpy() - before, axis=1).mean()
     later = simulation._front()
     assert later[0] - front < 0.5 * simulation.grid.spacing
     assert height - later[1] < 0.5 * simulation.grid.spacing

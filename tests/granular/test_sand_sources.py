@@ -16,14 +16,28 @@ def total(rows: list[dict[str, Any]], name: str) -> int:
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_source_lets_in_area_times_velocity(dimension: int) -> None:
-    source = box([0.25, 0.875, 0.25][:dimension], [0.5, 1.0, 0.5][:dimension], velocity=[0.0, -0.5, 0.0][:dimension])
-    simulation = create(scene(size=[1.0] * dimension, resolution=16, sand=[], source=[source], solver={"max_iterations": 60}))
+    source = box(
+        [0.25, 0.875, 0.25][:dimension],
+        [0.5, 1.0, 0.5][:dimension],
+        velocity=[0.0, -0.5, 0.0][:dimension],
+    )
+    simulation = create(
+        scene(
+            size=[1.0] * dimension,
+            resolution=16,
+            sand=[],
+            source=[source],
+            solver={"max_iterations": 60},
+        )
+    )
     start = simulation.particles.count
     rows = advance(simulation, 0.5)
     let_in = 0.25 ** (dimension - 1) * 0.5 * 0.5 * 16**dimension * 2**dimension
     assert total(rows, "emitted") == pytest.approx(let_in, rel=0.02)
     assert simulation.particles.count == start + total(rows, "emitted")
-    assert rows[-1]["mass"] == pytest.approx(simulation.particles.count * simulation.particle_mass, rel=1e-12)
+    assert rows[-1]["mass"] == pytest.approx(
+        simulation.particles.count * simulation.particle_mass, rel=1e-12
+    )
 
 
 def test_a_source_that_has_stopped_leaves_no_velocity_behind() -> None:
@@ -36,14 +50,18 @@ def test_a_source_that_has_stopped_leaves_no_velocity_behind() -> None:
 
 def test_what_a_drain_swallows_and_what_leaves_is_the_flow() -> None:
     tables = {"drain": [box([0.0, 0.0], [0.25, 0.0625])], "open": ["right"], "friction": 0.1}
-    simulation = create(scene(size=[1.0, 0.5], resolution=16, sand=[box([0.0, 0.0], [1.0, 0.25])], **tables))
+    simulation = create(
+        scene(size=[1.0, 0.5], resolution=16, sand=[box([0.0, 0.0], [1.0, 0.25])], **tables)
+    )
     start = simulation.particles.count
     rows = advance(simulation, 0.5)
     gone = total(rows, "drained") + total(rows, "departed")
     assert total(rows, "drained") > 0
     assert total(rows, "departed") > 0
     assert start - simulation.particles.count == gone
-    assert sum(row["flow_rate"] * row["dt"] for row in rows) == pytest.approx(gone * simulation.particle_mass, rel=1e-9)
+    assert sum(row["flow_rate"] * row["dt"] for row in rows) == pytest.approx(
+        gone * simulation.particle_mass, rel=1e-9
+    )
 
 
 def test_the_gauge_counts_what_falls_through_it() -> None:
@@ -63,7 +81,9 @@ def test_the_gauge_counts_what_falls_through_it() -> None:
 def test_sand_that_fills_its_box_stops_no_run() -> None:
     """The source goes on; what has no place is packed too densely, and the log says how much."""
     source = box([0.25, 0.4375], [0.5, 0.5], velocity=[0.0, -0.5])
-    simulation = create(scene(size=[0.5, 0.5], resolution=8, sand=[box([0.0, 0.0], [0.5, 0.4375])], source=[source]))
+    simulation = create(
+        scene(size=[0.5, 0.5], resolution=8, sand=[box([0.0, 0.0], [0.5, 0.4375])], source=[source])
+    )
     rows = advance(simulation, 0.1)
     assert np.isfinite(rows[-1]["kinetic_energy"])
     assert rows[-1]["max_fraction"] >= 1.0
@@ -72,7 +92,16 @@ def test_sand_that_fills_its_box_stops_no_run() -> None:
 @pytest.mark.parametrize("tables", [{}, {"particles": {"transfer": "flip"}}])
 def test_an_interrupted_pour_goes_on_bit_for_bit(tables: dict[str, Any]) -> None:
     def made() -> Any:
-        return create(scene(size=[1.0, 1.0], resolution=16, sand=[], source=[TAP], drain=[box([0.25, 0.0], [0.5, 0.125])], **tables))
+        return create(
+            scene(
+                size=[1.0, 1.0],
+                resolution=16,
+                sand=[],
+                source=[TAP],
+                drain=[box([0.25, 0.0], [0.5, 0.125])],
+                **tables,
+            )
+        )
 
     through, resumed = made(), made()
     advance(through, 0.4)

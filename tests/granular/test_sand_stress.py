@@ -17,9 +17,11 @@ from warp_lcp.operators.grid_poisson import SOLID
 
 DT, GRAVITY = 0.01, np.array([0.0, -9.81, 0.0])
 AXES = {2: ((0, 1),), 3: ((0, 1), (0, 2), (1, 2))}  # of the shears xy, xz, yz
-OPENING = np.array([0, 1, 3])  # bits of a copy's place: q & 1 along the first axis, q >> 1 along the second
+# bits of a copy's place: q & 1 along the first axis, q >> 1 along the second
+OPENING = np.array([0, 1, 3])
 FRICTIONS = [0.3, 1e6]  # of the domain and of the solid, which is rougher than sand
-Growth = Callable[[float], float]  # of a yield set's radius, by the multiplier of the projection onto it
+# of a yield set's radius, by the multiplier of the projection onto it
+Growth = Callable[[float], float]
 
 
 def step_along(axis: int) -> np.ndarray:
@@ -49,7 +51,14 @@ class Case:
 
 
 def make(
-    dimension: int, seed: int, *, cohesion: float = 0.0, tension: float = 0.0, box: bool = False, gain: float = 0.0, halfway: float = 0.0
+    dimension: int,
+    seed: int,
+    *,
+    cohesion: float = 0.0,
+    tension: float = 0.0,
+    box: bool = False,
+    gain: float = 0.0,
+    halfway: float = 0.0,
 ) -> Case:
     """Return a case: cells that are empty, loose and dense, partly in touch with walls and a solid of two cells."""
     random = np.random.default_rng(seed)
@@ -59,12 +68,25 @@ def make(
     index[1:3, 2, 3] = index[1:3, 1, 3] = 1
     if dimension == 2:
         index[2] = 0
-    base = wp.array(np.where(index >= 0, SOLID, 0).astype(np.int8), dtype=wp.int8, device=grid.device)
+    base = wp.array(
+        np.where(index >= 0, SOLID, 0).astype(np.int8), dtype=wp.int8, device=grid.device
+    )
     one = wp.full(grid.shape, 1.0, dtype=wp.float32, device=grid.device)
     packing = Packing(grid, base, one)
-    density = np.where(random.random(grid.shape) < 0.75, random.uniform(0.55, 1.1, grid.shape), random.uniform(0.0, 0.3, grid.shape))
-    u = [wp.array(random.normal(size=grid.shape).astype(np.float32), dtype=wp.float32, device=grid.device) for _ in range(dimension)]
-    packing.update(wp.array(density.astype(np.float32), dtype=wp.float32, device=grid.device), u, DT)
+    density = np.where(
+        random.random(grid.shape) < 0.75,
+        random.uniform(0.55, 1.1, grid.shape),
+        random.uniform(0.0, 0.3, grid.shape),
+    )
+    u = [
+        wp.array(
+            random.normal(size=grid.shape).astype(np.float32), dtype=wp.float32, device=grid.device
+        )
+        for _ in range(dimension)
+    ]
+    packing.update(
+        wp.array(density.astype(np.float32), dtype=wp.float32, device=grid.device), u, DT
+    )
     stress = Stress(packing, Walls(grid, index, FRICTIONS), box=box, rate=gain > 0.0)
     start = random.normal(scale=0.4, size=stress.now.shape)
     start[0] = np.maximum(random.normal(0.4, 0.5, size=grid.shape), 0.0)
@@ -118,7 +140,11 @@ def velocity(case: Case) -> list[np.ndarray]:
     out = []
     shears = [edge_stress(case, d) for d in range(len(AXES[case.dimension]))]
     for axis in range(case.dimension):
-        start, inverse, normal = case.field("start")[axis], case.field("inverse")[axis], total_stress(case, axis)
+        start, inverse, normal = (
+            case.field("start")[axis],
+            case.field("inverse")[axis],
+            total_stress(case, axis),
+        )
         u = start.copy()
         for face in zip(*np.nonzero(inverse), strict=True):
             force = normal[face] - normal[at(face, -step_along(axis))]
@@ -134,22 +160,34 @@ def velocity(case: Case) -> list[np.ndarray]:
 def shear_rate(u: list[np.ndarray], shear: int, edge: tuple[int, ...]) -> float:
     """Return (du_a/dx_b + du_b/dx_a) dx on an edge."""
     alpha, beta = AXES[3][shear]
-    return float(u[alpha][edge] - u[alpha][at(edge, -step_along(beta))] + u[beta][edge] - u[beta][at(edge, -step_along(alpha))])
+    return float(
+        u[alpha][edge]
+        - u[alpha][at(edge, -step_along(beta))]
+        + u[beta][edge]
+        - u[beta][at(edge, -step_along(alpha))]
+    )
 
 
 def nearest(
-    point: np.ndarray, groups: list[np.ndarray], free: np.ndarray, metric: np.ndarray, radius: float, grown: Growth | None = None
+    point: np.ndarray,
+    groups: list[np.ndarray],
+    free: np.ndarray,
+    metric: np.ndarray,
+    radius: float,
+    grown: Growth | None = None,
 ) -> np.ndarray:
     """Return the point of { sum of free n^2 + sum over groups of max |z|^2 <= radius^2 } nearest in a metric.
 
-    With a multiplier mu of the set's bound, each group is cut to the size m that minimizes sum metric (|z| - m)_+^2 + mu m^2, and what
-    counts by itself shrinks; SciPy's root finder gives each m, and mu.
+    With a multiplier mu of the set's bound, each group is cut to the size m that minimizes sum
+    metric (|z| - m)_+^2 + mu m^2, and what counts by itself shrinks; SciPy's root finder gives each
+    m, and mu.
 
     Args:
         point: to project.
         groups: entries whose largest magnitude counts.
         free: weights of the squares of the entries that count by themselves; 0 for those in groups.
-        metric: weights of the squared distance; on the entries that count by themselves equal to `free`.
+        metric: weights of the squared distance; on the entries that count by themselves equal to
+            `free`.
         radius: of the set.
         grown: the radius by the multiplier instead.
     """
@@ -160,7 +198,14 @@ def nearest(
         sizes, weights = np.abs(point[group]), metric[group]
         if not sizes.any():
             return 0.0
-        return float(scipy.optimize.brentq(lambda m: mu * m - weights @ np.maximum(sizes - m, 0.0), 0.0, sizes.max(), xtol=1e-14))
+        return float(
+            scipy.optimize.brentq(
+                lambda m: mu * m - weights @ np.maximum(sizes - m, 0.0),
+                0.0,
+                sizes.max(),
+                xtol=1e-14,
+            )
+        )
 
     def shrunk(mu: float) -> np.ndarray:
         out = point / (1.0 + mu)
@@ -171,7 +216,11 @@ def nearest(
 
     def excess(mu: float) -> float:
         new, bound = shrunk(mu), grown(mu) if grown else radius
-        return float(free @ new**2 + sum(np.abs(new[group]).max(initial=0.0) ** 2 for group in groups) - bound**2)
+        return float(
+            free @ new**2
+            + sum(np.abs(new[group]).max(initial=0.0) ** 2 for group in groups)
+            - bound**2
+        )
 
     if excess(0.0) <= 0.0:
         return point
@@ -187,12 +236,21 @@ def growth(radius: float, gain: float, half: float, soft: float) -> Growth:
     def grown(mu: float) -> float:
         if mu == 0.0 or gain == 0.0:
             return radius
-        return float(scipy.optimize.brentq(lambda r: r - radius - gain / (1.0 + half * soft / (mu * r)), radius, radius + gain, xtol=1e-14))
+        return float(
+            scipy.optimize.brentq(
+                lambda r: r - radius - gain / (1.0 + half * soft / (mu * r)),
+                radius,
+                radius + gain,
+                xtol=1e-14,
+            )
+        )
 
     return grown
 
 
-def cell_move(case: Case, u: list[np.ndarray], cell: tuple[int, ...], *, box: bool = False) -> tuple[float, float]:
+def cell_move(
+    case: Case, u: list[np.ndarray], cell: tuple[int, ...], *, box: bool = False
+) -> tuple[float, float]:
     """Return the squared natural residual of pressure and friction of a cell."""
     dimension, now, p = case.dimension, case.now, case.packing
     flags, w, diagonal = int(p.flags.numpy()[cell]), float(p.drive.numpy()[cell]), 0.0
@@ -200,7 +258,8 @@ def cell_move(case: Case, u: list[np.ndarray], cell: tuple[int, ...], *, box: bo
         return 0.0, 0.0
     mass, inverse, share = case.field("mass"), case.field("inverse"), case.field("share")
     stretch = []
-    full = float(np.clip(1.0 - w * DT / p.grid.spacing / 0.05, 0.0, 1.0))  # a full cell counts volume, a loose one mass
+    # a full cell counts volume, a loose one mass
+    full = float(np.clip(1.0 - w * DT / p.grid.spacing / 0.05, 0.0, 1.0))
     for axis in range(dimension):
         low, high = cell, at(cell, step_along(axis))
         beyond, here = (mass[axis][face] + full * (1.0 - mass[axis][face]) for face in (high, low))
@@ -208,15 +267,26 @@ def cell_move(case: Case, u: list[np.ndarray], cell: tuple[int, ...], *, box: bo
         diagonal += beyond * inverse[axis][high] + here * inverse[axis][low]
         stretch.append(u[axis][high] - u[axis][low])
     dense, firm, stiff = bool(flags & 2), bool(flags & 4), float(p.stiff.numpy()[cell])
-    x = max(now[(0, *cell)] - w / diagonal, -case.bound.tension if firm else 0.0) if diagonal > 0.0 else 0.0
-    radius = max(case.bound.k * x + (case.bound.cohesion if dense else 0.0), 0.0) if dense and stiff > 0.0 else 0.0
-    # the deviator and the copies, moved against the gradient over `stiff` in the metric |n|^2 / 2 + sum b^2 / 4 (2-D: n = (a, -a))
+    x = (
+        max(now[(0, *cell)] - w / diagonal, -case.bound.tension if firm else 0.0)
+        if diagonal > 0.0
+        else 0.0
+    )
+    radius = (
+        max(case.bound.k * x + (case.bound.cohesion if dense else 0.0), 0.0)
+        if dense and stiff > 0.0
+        else 0.0
+    )
+    # the deviator and the copies, moved against the gradient over `stiff` in the metric |n|^2 / 2 +
+    # sum b^2 / 4 (2-D: n = (a, -a))
     normals = [now[(1, *cell)]] if dimension == 2 else [now[(1 + axis, *cell)] for axis in range(3)]
     soft = 1.0 / stiff if stiff > 0.0 else 0.0
     if dimension == 2:
         moved = [normals[0] + soft * (stretch[0] - stretch[1])]
     else:
-        moved = [n + 2.0 * soft * (e - np.mean(stretch)) for n, e in zip(normals, stretch, strict=True)]
+        moved = [
+            n + 2.0 * soft * (e - np.mean(stretch)) for n, e in zip(normals, stretch, strict=True)
+        ]
     old, groups = list(normals), []
     for shear in range(len(AXES[dimension])):
         group = []
@@ -235,19 +305,32 @@ def cell_move(case: Case, u: list[np.ndarray], cell: tuple[int, ...], *, box: bo
         size = np.sqrt(free @ point**2)
         new[:count] = point[:count] * min(1.0, radius / size) if size > 0.0 else 0.0
     else:
-        grown = growth(radius, case.bound.gain * max(x, 0.0), case.bound.halfway * np.sqrt(max(x, 0.0)), soft) if case.bound.gain else None
+        grown = (
+            growth(
+                radius,
+                case.bound.gain * max(x, 0.0),
+                case.bound.halfway * np.sqrt(max(x, 0.0)),
+                soft,
+            )
+            if case.bound.gain
+            else None
+        )
         new = nearest(point, groups, free, metric, radius, grown)
     return (x - now[(0, *cell)]) ** 2, float(metric @ (new - np.array(old)) ** 2)
 
 
-def wall_move(case: Case, u: list[np.ndarray], cell: tuple[int, ...], axis: int, side: int, friction: float) -> float:
+def wall_move(
+    case: Case, u: list[np.ndarray], cell: tuple[int, ...], axis: int, side: int, friction: float
+) -> float:
     """Return the squared natural residual of friction on a face of a cell with a solid: Coulomb's, or the sand's own strength."""
     dimension, now, p = case.dimension, case.now, case.packing
     if p.flags.numpy()[cell] == 0:
         return 0.0
     x = now[(0, *cell)]
     toward = (1.0 if side else -1.0) * DT * GRAVITY[axis]
-    load = -total_stress(case, axis)[cell] + (0.5 if x > 0.0 else 1.0) * toward * float(p.fraction.numpy()[cell])
+    load = -total_stress(case, axis)[cell] + (0.5 if x > 0.0 else 1.0) * toward * float(
+        p.fraction.numpy()[cell]
+    )
     inverse, share = case.field("inverse"), case.field("share")
     point, old, groups, pulls, stiffest = [], [], [], [], 0.0
     for shear, (alpha, beta) in enumerate(AXES[dimension]):
@@ -273,7 +356,13 @@ def wall_move(case: Case, u: list[np.ndarray], cell: tuple[int, ...], axis: int,
     point = np.array(old) + 2.0 / stiffest * np.array(pulls)
     metric = np.full(len(point), 0.5)
     most, bound = max(load, 0.0), case.bound
-    new = nearest(point, groups, np.zeros(len(point)), metric, min(friction * most, (bound.k + bound.gain) * most + bound.cohesion))
+    new = nearest(
+        point,
+        groups,
+        np.zeros(len(point)),
+        metric,
+        min(friction * most, (bound.k + bound.gain) * most + bound.cohesion),
+    )
     return float(metric @ (new - np.array(old)) ** 2)
 
 
@@ -288,7 +377,9 @@ def test_the_velocity_is_the_divergence_of_the_stress(dimension: int, seed: int)
     for axis, expected in enumerate(velocity(case)):
         moved = case.field("inverse")[axis] > 0.0
         assert moved.sum() > 8
-        np.testing.assert_allclose(case.stress.checked.u[axis].numpy()[moved], expected[moved], rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(
+            case.stress.checked.u[axis].numpy()[moved], expected[moved], rtol=1e-5, atol=1e-5
+        )
 
 
 @pytest.mark.parametrize(("dimension", "seed"), CASES)
@@ -300,7 +391,12 @@ def test_shear_rates_are_differences_around_edges(dimension: int, seed: int) -> 
         edges = list(zip(*np.nonzero(share), strict=True))
         assert len(edges) > 5
         expected = [shear_rate(u, shear, edge) for edge in edges]
-        np.testing.assert_allclose([case.stress.checked.edge[shear].numpy()[edge] for edge in edges], expected, rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(
+            [case.stress.checked.edge[shear].numpy()[edge] for edge in edges],
+            expected,
+            rtol=1e-4,
+            atol=1e-4,
+        )
 
 
 @pytest.mark.parametrize(("dimension", "seed"), CASES)
@@ -309,20 +405,34 @@ def test_stress_and_strain_are_adjoint(dimension: int, seed: int) -> None:
     case = make(dimension, seed)
     now = case.now
     case.stress.residual()
-    u = [np.where(inverse > 0.0, field.numpy(), 0.0) for field, inverse in zip(case.stress.checked.u, case.field("inverse"), strict=True)]
+    u = [
+        np.where(inverse > 0.0, field.numpy(), 0.0)
+        for field, inverse in zip(case.stress.checked.u, case.field("inverse"), strict=True)
+    ]
     gained = 0.0  # power of div(sigma) on the faces
     for axis, after in enumerate(velocity(case)):
         inverse = case.field("inverse")[axis]
-        force = np.divide(after - case.field("start")[axis], inverse, out=np.zeros_like(after), where=inverse > 0.0)
+        force = np.divide(
+            after - case.field("start")[axis],
+            inverse,
+            out=np.zeros_like(after),
+            where=inverse > 0.0,
+        )
         gained += float((force * u[axis]).sum())
     taken = 0.0
     for cell in interior(case):
         for axis in range(dimension):
-            taken += total_stress(case, axis)[cell] * (u[axis][at(cell, step_along(axis))] - u[axis][cell])
+            taken += total_stress(case, axis)[cell] * (
+                u[axis][at(cell, step_along(axis))] - u[axis][cell]
+            )
         for shear, share in enumerate(case.field("share")):
             for copy in range(4):
                 edge = edge_of(cell, shear, copy)
-                taken += abs(share[edge]) * now[(first_copy(dimension, shear) + copy, *cell)] * shear_rate(u, shear, edge)
+                taken += (
+                    abs(share[edge])
+                    * now[(first_copy(dimension, shear) + copy, *cell)]
+                    * shear_rate(u, shear, edge)
+                )
     assert gained == pytest.approx(-taken, rel=1e-4)
 
 
@@ -338,7 +448,9 @@ def test_stress_and_strain_are_adjoint(dimension: int, seed: int) -> None:
         (3, 47, {"gain": 0.8, "halfway": 4.0, "cohesion": 0.1}),
     ],
 )
-def test_the_residual_is_how_far_the_projection_moves_the_stress(dimension: int, seed: int, options: dict[str, float]) -> None:
+def test_the_residual_is_how_far_the_projection_moves_the_stress(
+    dimension: int, seed: int, options: dict[str, float]
+) -> None:
     """Projections by SciPy: another yield set, another metric, or a cell whose copies are others would change the sum."""
     case = make(dimension, seed, **options)
     pressure, friction = case.stress.residual()
@@ -347,7 +459,9 @@ def test_the_residual_is_how_far_the_projection_moves_the_stress(dimension: int,
     moves = np.array([cell_move(case, u, cell, box=bool(options.get("box"))) for cell in cells])
     walls = case.stress.walls
     rubs = 0.0
-    for flat, where, wall in zip(walls.cells.numpy(), walls.sides.numpy(), walls.walls.numpy(), strict=True):
+    for flat, where, wall in zip(
+        walls.cells.numpy(), walls.sides.numpy(), walls.walls.numpy(), strict=True
+    ):
         cell = tuple(int(n) for n in np.unravel_index(int(flat), case.index.shape))
         rubs += wall_move(case, u, cell, int(where) >> 1, int(where) & 1, FRICTIONS[wall])
     assert pressure == pytest.approx(np.sqrt(moves[:, 0].sum() / len(cells)), rel=1e-4)

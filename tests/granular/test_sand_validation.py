@@ -8,7 +8,13 @@ from warp_lcp.benchmarks.validation import sand_collapse, sand_hourglass, scenes
 
 def test_the_envelope_is_that_of_the_experiments() -> None:
     """Numbers from the papers' laws; were one read with the other's power, a = 8 would be off by a third."""
-    for aspect, low, high in ((0.5, 0.6, 0.9), (1.0, 1.2, 1.8), (2.0, 3.02, 3.6), (4.0, 4.79, 5.8), (8.0, 7.6, 9.2)):
+    for aspect, low, high in (
+        (0.5, 0.6, 0.9),
+        (1.0, 1.2, 1.8),
+        (2.0, 3.02, 3.6),
+        (4.0, 4.79, 5.8),
+        (8.0, 7.6, 9.2),
+    ):
         assert sand_collapse.lube(aspect) == pytest.approx(low, abs=0.01)
         assert sand_collapse.lajeunesse(aspect) == pytest.approx(high, abs=0.01)
         assert sand_collapse.envelope(aspect) == pytest.approx((0.8 * low, 1.2 * high), abs=0.02)
@@ -59,12 +65,17 @@ def test_a_collapse_keeps_its_invariants() -> None:
 def test_a_pile_at_rest_hardly_moves_inside() -> None:
     (_, deep), (whole, later) = sand_collapse.rest(10, 2)
     assert max(deep, later) < sand_collapse.DEEP
-    assert whole < sand_collapse.ALL  # few cells have a large share of them in the surface, where at first a grain still slides
+    # few cells have a large share of them in the surface, where at first a grain still slides
+    assert whole < sand_collapse.ALL
 
 
-def test_drift_is_the_way_of_each_particle_whatever_their_order(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_drift_is_the_way_of_each_particle_whatever_their_order(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Particles move by a rigid shift and are shuffled at every step: were they followed by number, they would seem to go far."""
-    simulation = scenes.create_sand([0.2, 0.1], 20, [{"shape": "box", "min": [0.0, 0.0], "max": [0.1, 0.08]}])
+    simulation = scenes.create_sand(
+        [0.2, 0.1], 20, [{"shape": "box", "min": [0.0, 0.0], "max": [0.1, 0.08]}]
+    )
     random = np.random.default_rng(1)
 
     def shift(s: scenes.SandSimulation, until: float):

@@ -18,7 +18,9 @@ from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.operators.grid_poisson import SOLID
 
 DT, SCALE = 0.01, 0.0981  # [s], g dt [m/s]
-emulated = pytest.mark.skipif("emulated_cuda" not in sys.modules, reason="the plugin emulated_cuda is not there")
+emulated = pytest.mark.skipif(
+    "emulated_cuda" not in sys.modules, reason="the plugin emulated_cuda is not there"
+)
 
 
 class Twin:
@@ -30,30 +32,57 @@ class Twin:
 
     def __init__(self, rng: np.random.Generator) -> None:
         dimension = int(rng.integers(2, 4))
-        counts = (int(rng.integers(3, 9)), int(rng.integers(3, 9)), int(rng.integers(2, 5)) if dimension == 3 else 1)
+        counts = (
+            int(rng.integers(3, 9)),
+            int(rng.integers(3, 9)),
+            int(rng.integers(2, 5)) if dimension == 3 else 1,
+        )
         grid = self.grid = StaggeredGrid(counts, 0.1, dimension)
         index = np.zeros(grid.shape, dtype=np.int32)
         index[1:-1, 1:-1, 1:-1] = np.where(rng.random(counts[::-1]) < 0.1, 1, -1)
-        base = wp.array(np.where(index >= 0, SOLID, 0).astype(np.int8), dtype=wp.int8, device=grid.device)
-        self.packing = Packing(grid, base, wp.full(grid.shape, 1.0, dtype=wp.float32, device=grid.device))
+        base = wp.array(
+            np.where(index >= 0, SOLID, 0).astype(np.int8), dtype=wp.int8, device=grid.device
+        )
+        self.packing = Packing(
+            grid, base, wp.full(grid.shape, 1.0, dtype=wp.float32, device=grid.device)
+        )
         self.rate = bool(rng.random() < 0.3)
-        self.stress = Stress(self.packing, Walls(grid, index, [0.3, 1e6]), box=bool(rng.random() < 0.2), rate=self.rate)
+        self.stress = Stress(
+            self.packing,
+            Walls(grid, index, [0.3, 1e6]),
+            box=bool(rng.random() < 0.2),
+            rate=self.rate,
+        )
         self.stress.now.assign(np.zeros(self.stress.now.shape, dtype=np.float32))
         self.change(rng)
 
     def change(self, rng: np.random.Generator) -> None:
         """Draw other sand, velocities and forces."""
         shape, full = self.grid.shape, rng.choice([0.2, 0.75, 1.0])
-        density = np.where(rng.random(shape) < full, rng.uniform(0.55, 1.1, shape), rng.uniform(0.0, 0.3, shape))
-        size = 10.0 ** rng.integers(-4, 1) * (rng.random() > 0.1)  # sometimes there is nothing to solve
-        u = [wp.array((size * rng.standard_normal(shape)).astype(np.float32), dtype=wp.float32) for _ in range(self.grid.dimension)]
+        density = np.where(
+            rng.random(shape) < full, rng.uniform(0.55, 1.1, shape), rng.uniform(0.0, 0.3, shape)
+        )
+        # sometimes there is nothing to solve
+        size = 10.0 ** rng.integers(-4, 1) * (rng.random() > 0.1)
+        u = [
+            wp.array((size * rng.standard_normal(shape)).astype(np.float32), dtype=wp.float32)
+            for _ in range(self.grid.dimension)
+        ]
         self.packing.update(wp.array(density.astype(np.float32), dtype=wp.float32), u, DT)
         gain = {"gain": 0.3, "halfway": 0.5} if self.rate else {}
-        self._given = YieldSet(0.5, 0.1 * SCALE * (rng.random() < 0.3), **gain), np.array([0.0, -9.81, 0.0]), DT, DT
+        self._given = (
+            YieldSet(0.5, 0.1 * SCALE * (rng.random() < 0.3), **gain),
+            np.array([0.0, -9.81, 0.0]),
+            DT,
+            DT,
+        )
         self._start = self.stress.now.numpy().copy() * rng.choice([0.0, 1.0, 1.0])
-        self._last = float(rng.choice([0.0, 0.3 * DT, DT]))  # the last step's time of forces: cold or warm
+        # the last step's time of forces: cold or warm
+        self._last = float(rng.choice([0.0, 0.3 * DT, DT]))
 
-    def solve(self, work: MomentumWorkspace, method: HeavyBallProjectedGradient, **options: Any) -> tuple[Any, ...]:
+    def solve(
+        self, work: MomentumWorkspace, method: HeavyBallProjectedGradient, **options: Any
+    ) -> tuple[Any, ...]:
         """Solve from the drawn start; return all that is known of it."""
         stress = self.stress
         stress.now.assign(self._start)
@@ -61,8 +90,19 @@ class Twin:
         stress.begin(*self._given)
         result = wl.solve(stress, method, workspace=work, **options)
         rows = [(r.iteration, r.residual, r.step) for r in result.history]
-        memory = [array.numpy().tobytes() for array in (stress.now, *stress.checked.u, stress.momentum, stress.numbers)]
-        return rows, result.status, result.iterations, result.residual, stress.last_residual, stress.cells, *memory
+        memory = [
+            array.numpy().tobytes()
+            for array in (stress.now, *stress.checked.u, stress.momentum, stress.numbers)
+        ]
+        return (
+            rows,
+            result.status,
+            result.iterations,
+            result.residual,
+            stress.last_residual,
+            stress.cells,
+            *memory,
+        )
 
 
 def workspaces(
@@ -84,15 +124,21 @@ def drawn_method(rng: np.random.Generator) -> HeavyBallProjectedGradient:
         return HeavyBallProjectedGradient()
     calm = tuple(float(v) for v in rng.uniform(0.0, 0.9, int(rng.integers(0, 4))))
     check = int(rng.integers(1, 4))
-    count = {name: 5 * check * int(rng.integers(1, 6)) for name in ("patience", "wait")} | {"check_every": check}
+    count = {name: 5 * check * int(rng.integers(1, 6)) for name in ("patience", "wait")} | {
+        "check_every": check
+    }
     least = {name: int(rng.choice([0, 10, 35, 80])) for name in ("least", "cold")}
-    return HeavyBallProjectedGradient(calm=calm, momentum=float(rng.uniform(0.0, 0.95)), **count, **least)
+    return HeavyBallProjectedGradient(
+        calm=calm, momentum=float(rng.uniform(0.0, 0.95)), **count, **least
+    )
 
 
 def drawn_criteria(rng: np.random.Generator) -> wl.StoppingCriteria:
     """Return an absolute tolerance, loose or beyond reach, and a limit of steps."""
     most = int(rng.choice([0, 1, 7, 10, 33, 150, 400]))
-    return wl.StoppingCriteria(rtol=0.0, atol=SCALE * 10.0 ** rng.integers(-9, 2), max_iterations=most)
+    return wl.StoppingCriteria(
+        rtol=0.0, atol=SCALE * 10.0 ** rng.integers(-9, 2), max_iterations=most
+    )
 
 
 @pytest.mark.parametrize("seed", range(18))
@@ -111,7 +157,9 @@ def test_solves_are_those_of_the_host(seed: int, monkeypatch: pytest.MonkeyPatch
 
 @pytest.mark.parametrize("wrong", [np.nan, np.inf])
 @pytest.mark.parametrize("where", ["stress", "velocity"])
-def test_what_is_not_finite_ends_both_alike(wrong: float, where: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_not_finite_ends_both_alike(
+    wrong: float, where: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     rng = np.random.default_rng(7400)
     twin, method = Twin(rng), HeavyBallProjectedGradient()
     host, device = workspaces(twin.stress, method, monkeypatch)
@@ -131,7 +179,9 @@ def test_what_is_not_finite_ends_both_alike(wrong: float, where: str, monkeypatc
     assert found[1] is wl.SolveStatus.NON_FINITE
 
 
-def test_a_deadline_and_a_callback_leave_each_step_to_the_host(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_deadline_and_a_callback_leave_each_step_to_the_host(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     rng = np.random.default_rng(7500)
     twin, method = Twin(rng), HeavyBallProjectedGradient(least=0, cold=0)
     host, device = workspaces(twin.stress, method, monkeypatch)

@@ -19,9 +19,15 @@ def thin_walls(monkeypatch):
     monkeypatch.setattr(ThinWalls, "enabled", True)
 
 
-def simulate(until: float, sand: list[dict[str, Any]], solid: list[dict[str, Any]], **tables: Any) -> tuple[Any, list[dict[str, Any]]]:
+def simulate(
+    until: float, sand: list[dict[str, Any]], solid: list[dict[str, Any]], **tables: Any
+) -> tuple[Any, list[dict[str, Any]]]:
     """Return a simulation of sand after some time, and the rows of its log."""
-    data = {"scene": {"simulator": "granular"}, "time": {"duration": 10.0}, "domain": {"size": [1.0, 1.0], "resolution": CELLS}}
+    data = {
+        "scene": {"simulator": "granular"},
+        "time": {"duration": 10.0},
+        "domain": {"size": [1.0, 1.0], "resolution": CELLS},
+    }
     model = SandScene.model_validate(data | {"sand": sand, "solid": solid} | tables)
     simulation, rows = SIMULATOR.create(model, device="cpu", folder=Path()), []
     while simulation.time < until - 1e-9:
@@ -37,7 +43,11 @@ def box(low: list[float], high: list[float], **more: Any) -> dict[str, Any]:
 @pytest.mark.parametrize("offset", [0.0, 0.3, 0.7])
 def test_sand_rests_on_a_plate(thickness: float, offset: float) -> None:
     top = (8.0 + offset) / CELLS
-    simulation, rows = simulate(0.3, [box([0.0, top], [1.0, top + 6.0 * CELL])], [box([-0.1, top - thickness * CELL], [1.1, top])])
+    simulation, rows = simulate(
+        0.3,
+        [box([0.0, top], [1.0, top + 6.0 * CELL])],
+        [box([-0.1, top - thickness * CELL], [1.1, top])],
+    )
     y = simulation.particles.position.numpy()[:, 1]
     assert y.min() > top and np.percentile(y, 99) == pytest.approx(top + 6.0 * CELL, abs=0.6 * CELL)
     assert rows[-1]["max_speed"] < 0.2 and rows[-1]["max_fraction"] < 1.15
@@ -46,8 +56,20 @@ def test_sand_rests_on_a_plate(thickness: float, offset: float) -> None:
 def test_no_grain_passes_the_sides_of_a_funnel() -> None:
     """Sides of 0.6 cells, steep, with a neck of 5 cells: what is below the funnel is below its neck."""
     sides = [
-        {"shape": "capsule", "from": [-0.05, 0.85], "to": [0.4, 0.4], "radius": 0.3 * CELL, "friction": 0.3},
-        {"shape": "capsule", "from": [1.05, 0.85], "to": [0.6, 0.4], "radius": 0.3 * CELL, "friction": 0.3},
+        {
+            "shape": "capsule",
+            "from": [-0.05, 0.85],
+            "to": [0.4, 0.4],
+            "radius": 0.3 * CELL,
+            "friction": 0.3,
+        },
+        {
+            "shape": "capsule",
+            "from": [1.05, 0.85],
+            "to": [0.6, 0.4],
+            "radius": 0.3 * CELL,
+            "friction": 0.3,
+        },
     ]
     simulation, _ = simulate(0.25, [box([0.36, 0.45], [0.64, 0.9])], sides)
     x, y, _ = simulation.particles.position.numpy().T

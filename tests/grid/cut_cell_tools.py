@@ -15,7 +15,14 @@ from warp_lcp.grid.voxelize import PlacedSolid
 SPACING = 0.1
 DIRECTIONS = {
     2: [(1.0, 0.0), (0.0, -1.0), (0.5, 3**0.5 / 2), (-0.8, 0.6), (1.0, 1.0), (0.02, -1.0)],
-    3: [(0.0, 0.0, 1.0), (0.5, 3**0.5 / 2, 0.0), (-1.0, 1.0, 1.0), (0.3, -0.9, 0.4), (1.0, 0.01, -0.02), (-0.4, -0.5, -0.7)],
+    3: [
+        (0.0, 0.0, 1.0),
+        (0.5, 3**0.5 / 2, 0.0),
+        (-1.0, 1.0, 1.0),
+        (0.3, -0.9, 0.4),
+        (1.0, 0.01, -0.02),
+        (-0.4, -0.5, -0.7),
+    ],
 }
 
 
@@ -45,7 +52,10 @@ def grid_of(dimension, counts=(8, 7, 6), spacing=SPACING):
 
 
 def cut_cells(grid, *geometries, **options):
-    solids = [g if isinstance(g, PlacedSolid) else placed(g, name=f"solid[{n}]") for n, g in enumerate(geometries)]
+    solids = [
+        g if isinstance(g, PlacedSolid) else placed(g, name=f"solid[{n}]")
+        for n, g in enumerate(geometries)
+    ]
     return CutCells(grid, solids, wall_separating=False, **options)
 
 
@@ -60,7 +70,9 @@ def clip(polygon, normal, offset):
     """Return the part of a polygon, shape (m, 3), where normal.x > offset (Sutherland & Hodgman)."""
     result = []
     side = polygon @ normal - offset
-    for a, b, da, db in zip(polygon, np.roll(polygon, -1, axis=0), side, np.roll(side, -1), strict=True):
+    for a, b, da, db in zip(
+        polygon, np.roll(polygon, -1, axis=0), side, np.roll(side, -1), strict=True
+    ):
         if da > 0.0:
             result.append(a)
         if (da > 0.0) != (db > 0.0):
@@ -88,18 +100,23 @@ def face_polygon(axis, i, j, k):
 
 def interior_faces(grid, axis):
     """Yield the (i, j, k) of the faces of a component that lie between two cells."""
-    yield from itertools.product(*(range(2 if a == axis else 1, count + 1) for a, count in enumerate(grid.counts)))
+    yield from itertools.product(
+        *(range(2 if a == axis else 1, count + 1) for a, count in enumerate(grid.counts))
+    )
 
 
 MOVING = {
     2: [
         (Sphere(center=[0.3, 0.3], radius=0.17), Translation(velocity=[0.4, 0.1])),
-        (Box(lower=[0.0, 0.2], upper=[0.2, 0.4]), Translation(velocity=[0.1, 0.0])),  # whole cells at times
+        # whole cells at times
+        (Box(lower=[0.0, 0.2], upper=[0.2, 0.4]), Translation(velocity=[0.1, 0.0])),
     ],
     3: [
         (Sphere(center=[0.3, 0.3, 0.3], radius=0.17), Translation(velocity=[0.4, 0.1, 0.0])),
         (
-            TriangleMesh.from_file("builtin:torus", placement=Placement(scale=0.5, translation=[0.4, 0.4, 0.3])),
+            TriangleMesh.from_file(
+                "builtin:torus", placement=Placement(scale=0.5, translation=[0.4, 0.4, 0.3])
+            ),
             Rotation(rate=40.0, center=[0.4, 0.4, 0.3], axis=[1.0, 0.0, 0.0]),
         ),
     ],

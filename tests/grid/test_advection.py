@@ -20,7 +20,9 @@ def cells_of(grid: StaggeredGrid, solid: np.ndarray | None = None) -> wp.array:
     return wp.array(host, dtype=wp.int8, device="cpu")
 
 
-def move(grid: StaggeredGrid, fields: list[wp.array], cells: wp.array, dt: float, points: np.ndarray) -> tuple[np.ndarray, int]:
+def move(
+    grid: StaggeredGrid, fields: list[wp.array], cells: wp.array, dt: float, points: np.ndarray
+) -> tuple[np.ndarray, int]:
     position = wp.array(np.asarray(points, dtype=np.float32), dtype=wp.vec3, device="cpu")
     stopped = wp.zeros(1, dtype=wp.int32, device="cpu")
     advect(grid, fields, clearance(grid, cells), dt, position, stopped)
@@ -60,14 +62,20 @@ def test_third_order_on_a_rotating_blob() -> None:
 @pytest.mark.parametrize("grid", [FLAT, SPACE], ids=["2d", "3d"])
 @settings(max_examples=200, deadline=None)
 @given(random_seed=st.integers(0, 10**6), speed=st.sampled_from([0.1, 1.0, 10.0, 1e4]))
-def test_no_velocity_carries_a_particle_into_a_solid(grid: StaggeredGrid, random_seed: int, speed: float) -> None:
+def test_no_velocity_carries_a_particle_into_a_solid(
+    grid: StaggeredGrid, random_seed: int, speed: float
+) -> None:
     rng = np.random.default_rng(random_seed)
     nx, ny, nz = grid.counts
     solid = rng.random((nz, ny, nx)) < rng.choice([0.1, 0.5, 0.8])
     solid[0, 0, 0] = False
     free = np.argwhere(~solid)[:, ::-1]
     cells = free[rng.integers(len(free), size=200)]
-    offset = rng.choice([MARGIN, 0.5, 1 - MARGIN], size=(200, 3)) if random_seed % 2 else rng.uniform(MARGIN, 1 - MARGIN, (200, 3))
+    offset = (
+        rng.choice([MARGIN, 0.5, 1 - MARGIN], size=(200, 3))
+        if random_seed % 2
+        else rng.uniform(MARGIN, 1 - MARGIN, (200, 3))
+    )
     points = (cells + offset) * grid.spacing
     points[:, grid.dimension :] = 0.0
     fields = grid.faces()
@@ -91,7 +99,9 @@ def test_no_velocity_carries_a_particle_into_a_solid(grid: StaggeredGrid, random
 
 
 def test_a_wall_stops_one_component_and_lets_the_other_slide() -> None:
-    points, stopped = move(FLAT, uniform(FLAT, (1.0, 0.3)), cells_of(FLAT), 0.2, [[0.65, 0.25, 0.0]])
+    points, stopped = move(
+        FLAT, uniform(FLAT, (1.0, 0.3)), cells_of(FLAT), 0.2, [[0.65, 0.25, 0.0]]
+    )
     assert stopped == 1
     assert points[0] == pytest.approx([0.8 - MARGIN * 0.1, 0.31, 0.0], abs=1e-6)
 
@@ -99,7 +109,9 @@ def test_a_wall_stops_one_component_and_lets_the_other_slide() -> None:
 def test_a_thin_wall_is_not_jumped() -> None:
     solid = np.zeros((1, 6, 8), bool)
     solid[0, :, 4] = True
-    points, stopped = move(FLAT, uniform(FLAT, (5.0, 0.0)), cells_of(FLAT, solid), 0.1, [[0.05, 0.25, 0.0]])
+    points, stopped = move(
+        FLAT, uniform(FLAT, (5.0, 0.0)), cells_of(FLAT, solid), 0.1, [[0.05, 0.25, 0.0]]
+    )
     assert stopped == 1
     assert points[0, 0] == pytest.approx(0.4 - MARGIN * 0.1, abs=1e-6)
 
@@ -123,7 +135,9 @@ def test_two_dimensions_ignore_z() -> None:
 
 def test_velocities_that_are_not_finite_do_not_crash() -> None:
     for bad in (np.nan, np.inf, -np.inf, 1e38):
-        points, _ = move(SPACE, uniform(SPACE, (bad, 0.1, bad)), cells_of(SPACE), 0.1, [[0.3, 0.3, 0.2]])
+        points, _ = move(
+            SPACE, uniform(SPACE, (bad, 0.1, bad)), cells_of(SPACE), 0.1, [[0.3, 0.3, 0.2]]
+        )
         assert points.shape == (1, 3)
         if not np.isfinite(bad):
             assert not np.isfinite(points).all()
@@ -135,7 +149,8 @@ def test_clearance_is_the_distance_to_the_nearest_solid(grid: StaggeredGrid) -> 
     solid = np.random.default_rng(88).random((nz, ny, nx)) < 0.01
     cells = cells_of(grid, solid)
     room = clearance(grid, cells).numpy()
-    planes = slice(1, 2) if grid.dimension == 2 else slice(None)  # in 2-D no cell beyond the plane counts
+    # in 2-D no cell beyond the plane counts
+    planes = slice(1, 2) if grid.dimension == 2 else slice(None)
     at = np.argwhere(cells.numpy()[planes] == SOLID)
     everywhere = np.argwhere(np.ones(cells.numpy()[planes].shape))
     distance = np.abs(everywhere[:, None] - at[None]).max(axis=2).min(axis=1)
@@ -152,7 +167,9 @@ def test_particles_far_from_solids_need_not_walk(grid: StaggeredGrid, reach: flo
     room = clearance(grid, cells)
     careful = wp.array(np.minimum(room.numpy(), 1), dtype=wp.int8, device="cpu")
     free = np.argwhere(grid.interior(cells.numpy()) != SOLID)[:, ::-1]
-    start = (free[rng.integers(len(free), size=3000)] + rng.uniform(MARGIN, 1 - MARGIN, (3000, 3))) * grid.spacing
+    start = (
+        free[rng.integers(len(free), size=3000)] + rng.uniform(MARGIN, 1 - MARGIN, (3000, 3))
+    ) * grid.spacing
     fields = grid.faces()
     for field in fields:
         field.assign(rng.normal(size=grid.shape).astype(np.float32))

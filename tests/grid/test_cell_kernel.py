@@ -58,7 +58,9 @@ def test_a_kernel_of_a_cell_visits_those_of_a_window_and_no_other() -> None:
 def test_a_kernel_of_a_piece_has_a_whole_row() -> None:
     field, out = wp.array(places(), dtype=wp.float32, device="cpu"), GRID.field()
     WINDOW.launch_rows(sum_kernel, [field, out])
-    np.testing.assert_array_equal(out.numpy()[2:4, 1:4, 0], inside(places()).sum(axis=2) + 1000 * np.arange(3))
+    np.testing.assert_array_equal(
+        out.numpy()[2:4, 1:4, 0], inside(places()).sum(axis=2) + 1000 * np.arange(3)
+    )
 
 
 @pytest.mark.parametrize("axis", range(3))
@@ -76,12 +78,21 @@ def box_pass(tmp_path_factory) -> RowPass:
     header = tmp_path_factory.mktemp("headers") / "box.h"
     header.write_text(
         "double total = 0; const int n = 7;\n"  # a name of the pass itself
-        "for (int i = first; i < last; ++i) { y[i] = (T)(SCALE*(x[i] + (z ? z[i - s1 - s2] : (T)n))); total += y[i]; }\n"
+        "for (int i = first; i < last; ++i) { y[i] = (T)(SCALE*(x[i] + (z ? z[i - s1 - s2] : "
+        "(T)n))); total += y[i]; }\n"
         "sums[P.row] = total;\n"
     )
     real = wp.float32
     fields, sums = {"x": real, "y": real, "z": real}, {"sums": wp.float64}
-    return RowPass("tests.boxes.scaled", header, real, box=fields, by_row=sums, optional=("z",), constants={"SCALE": 0.5})
+    return RowPass(
+        "tests.boxes.scaled",
+        header,
+        real,
+        box=fields,
+        by_row=sums,
+        optional=("z",),
+        constants={"SCALE": 0.5},
+    )
 
 
 @pytest.mark.cpu_form("threads take whole rows on the CPU")
@@ -99,8 +110,15 @@ def test_a_pass_over_a_box(box_pass: RowPass, whole: bool, given: bool) -> None:
 
 @pytest.mark.cpu_form("threads take whole rows on the CPU")
 def test_threads_share_a_row_of_a_box_unless_it_is_whole(box_pass: RowPass) -> None:
-    rows, fields = Rows.box(WINDOW.low, WINDOW.high, GRID.device), {"x": GRID.field(), "y": GRID.field(), "z": None}
-    assert Rows.box(WINDOW.low, WINDOW.high, GRID.device, cells=10**6).single.chunks == rows.single.chunks == 1
+    rows, fields = (
+        Rows.box(WINDOW.low, WINDOW.high, GRID.device),
+        {"x": GRID.field(), "y": GRID.field(), "z": None},
+    )
+    assert (
+        Rows.box(WINDOW.low, WINDOW.high, GRID.device, cells=10**6).single.chunks
+        == rows.single.chunks
+        == 1
+    )
     chunks = Rows.box(WINDOW.low, WINDOW.high, GRID.device, cells=2)
     fields["x"].fill_(1.0)
     box_pass.bind(chunks, **fields, sums=wp.zeros(6, dtype=wp.float64, device="cpu")).launch()
@@ -110,8 +128,12 @@ def test_threads_share_a_row_of_a_box_unless_it_is_whole(box_pass: RowPass) -> N
 
 def test_what_is_said_of_a_box_that_is_wrong(box_pass: RowPass) -> None:
     x, sums = GRID.field(), wp.zeros(6, dtype=wp.float64, device="cpu")
-    with pytest.raises(ValueError, match=r"tests.boxes.scaled: fields have the shapes \(5, 6, 6\), \(5, 6, 7\)"):
-        WINDOW.run(box_pass, x=x, y=wp.zeros((5, 6, 6), dtype=wp.float32, device="cpu"), z=None, sums=sums)
+    with pytest.raises(
+        ValueError, match=r"tests.boxes.scaled: fields have the shapes \(5, 6, 6\), \(5, 6, 7\)"
+    ):
+        WINDOW.run(
+            box_pass, x=x, y=wp.zeros((5, 6, 6), dtype=wp.float32, device="cpu"), z=None, sums=sums
+        )
     with pytest.raises(TypeError, match="y is NoneType, not an array of float32"):
         WINDOW.run(box_pass, x=x, y=None, z=None, sums=sums)
     with pytest.raises(TypeError, match=r"missing \['sums'\], unknown \['SCALE'\]"):
@@ -123,12 +145,34 @@ def test_what_is_said_of_a_box_that_is_wrong(box_pass: RowPass) -> None:
 def test_a_pass_over_listed_cells_sees_them_as_in_their_rows(tmp_path: Path) -> None:
     """Pointers are those of a box, into the first layer of a field that has several; cells that are not listed keep their value."""
     header = tmp_path / "mark.h"
-    header.write_text("for (int i = first; i < last; ++i) y[i + s1*given.x.shape[0]] = x[i] + (T)(10000*k + 1000*j);\n")
-    fields, layers = {"x": wp.float32, "y": wp.float32}, wp.zeros((2, *GRID.shape), dtype=wp.float32, device="cpu")
-    listed = RowPass("tests.lists.mark", header, wp.float32, box=fields, whole={"cells": wp.int32}, listed="cells")
+    header.write_text(
+        "for (int i = first; i < last; ++i) y[i + s1*given.x.shape[0]] = x[i] + (T)(10000*k + "
+        "1000*j);\n"
+    )
+    fields, layers = (
+        {"x": wp.float32, "y": wp.float32},
+        wp.zeros((2, *GRID.shape), dtype=wp.float32, device="cpu"),
+    )
+    listed = RowPass(
+        "tests.lists.mark",
+        header,
+        wp.float32,
+        box=fields,
+        whole={"cells": wp.int32},
+        listed="cells",
+    )
     cells = [(0, 0, 0), (1, 2, 3), (2, 3, 1)]
-    flat = wp.array([int(np.ravel_multi_index(cell, GRID.shape)) for cell in cells], dtype=wp.int32, device="cpu")
-    listed.bind(Rows.entries(len(cells), GRID.device), cells=flat, x=wp.array(places(), dtype=wp.float32, device="cpu"), y=layers).launch()
+    flat = wp.array(
+        [int(np.ravel_multi_index(cell, GRID.shape)) for cell in cells],
+        dtype=wp.int32,
+        device="cpu",
+    )
+    listed.bind(
+        Rows.entries(len(cells), GRID.device),
+        cells=flat,
+        x=wp.array(places(), dtype=wp.float32, device="cpu"),
+        y=layers,
+    ).launch()
     expected = np.zeros((2, *GRID.shape))
     for k, j, i in cells:
         expected[1, k, j, i] = places()[k, j, i] + 10000 * k + 1000 * j
@@ -140,7 +184,9 @@ def test_a_pass_over_listed_cells_sees_them_as_in_their_rows(tmp_path: Path) -> 
 def test_a_pass_over_entries(grain: int | None, tmp_path: Path) -> None:
     """A list is the row of a box; a thread takes some of it."""
     header = tmp_path / "double.h"
-    header.write_text("for (int n = first; n < last; ++n) { y[n] = 2*x[n]; z[n] = last - first; }\n")
+    header.write_text(
+        "for (int n = first; n < last; ++n) { y[n] = 2*x[n]; z[n] = last - first; }\n"
+    )
     passed = RowPass("tests.lists.double", header, wp.float32, box=dict.fromkeys("xyz", wp.float32))
     x, y, z = (wp.array(np.arange(10.0), dtype=wp.float32, device="cpu") for _ in range(3))
     passed.bind(Rows.entries(10, GRID.device, grain), x=x, y=y, z=z).launch()

@@ -26,7 +26,9 @@ from warp_lcp.grid.solids import Box, Placement, Plane, Sphere, TriangleMesh
 from warp_lcp.grid.voxelize import voxelize
 
 
-@pytest.mark.parametrize(("dimension", "direction"), [(d, n) for d in (2, 3) for n in DIRECTIONS[d]])
+@pytest.mark.parametrize(
+    ("dimension", "direction"), [(d, n) for d in (2, 3) for n in DIRECTIONS[d]]
+)
 def test_fractions_are_exact_for_planes(dimension, direction):
     grid = grid_of(dimension)
     plane, normal, offset = tilted(dimension, direction)
@@ -53,7 +55,9 @@ def test_fractions_are_exact_for_planes(dimension, direction):
     assert cut.dropped == 0
 
 
-@pytest.mark.parametrize(("dimension", "direction"), [(d, n) for d in (2, 3) for n in DIRECTIONS[d]])
+@pytest.mark.parametrize(
+    ("dimension", "direction"), [(d, n) for d in (2, 3) for n in DIRECTIONS[d]]
+)
 def test_open_faces_and_wall_close_every_cell(dimension, direction):
     """The area vectors of the open parts of a cell's faces and of the wall within it sum to zero."""
     grid = grid_of(dimension)
@@ -61,14 +65,17 @@ def test_open_faces_and_wall_close_every_cell(dimension, direction):
     cut = cut_cells(grid, plane)
     fields = [field.numpy() for field in cut.open]
     normal3 = np.array([*normal, 0.0][:3])
-    cells = itertools.product(*(range(2, count) for count in grid.counts[:dimension]), *([[1]] if dimension == 2 else []))
+    cells = itertools.product(
+        *(range(2, count) for count in grid.counts[:dimension]), *([[1]] if dimension == 2 else [])
+    )
     walls = 0
     for i, j, k in cells:
         upper = [fields[a][k + (a == 2), j + (a == 1), i + (a == 0)] for a in range(dimension)]
         open_area = np.array([upper[a] - fields[a][k, j, i] for a in range(dimension)])
         wall = wall_area(np.array([i, j, k], dtype=np.float64), normal3, offset, dimension)
         walls += wall > 0.0
-        np.testing.assert_allclose(open_area, wall * normal, atol=3e-3 if wall else 1e-6)  # a dropped face misses 1e-3
+        # a dropped face misses 1e-3
+        np.testing.assert_allclose(open_area, wall * normal, atol=3e-3 if wall else 1e-6)
     assert walls > 0
 
 
@@ -77,7 +84,14 @@ def wall_area(low, normal, offset, dimension):
     across = np.linalg.svd(normal[None])[2][1:]
     center = low + 0.5
     center = center - (normal @ center - offset) * normal
-    square = center + 10.0 * np.array([across[0] + across[1], across[1] - across[0], -across[0] - across[1], across[0] - across[1]])
+    square = center + 10.0 * np.array(
+        [
+            across[0] + across[1],
+            across[1] - across[0],
+            -across[0] - across[1],
+            across[0] - across[1],
+        ]
+    )
     if dimension == 2:
         square[:, 2] = np.clip(square[:, 2], low[2], low[2] + 1.0)
     for axis in range(3):
@@ -96,10 +110,12 @@ def test_slices_of_a_ball_converge_with_second_order(dimension):
         cut = cut_cells(grid, Sphere(center=center, radius=radius))
         worst = 0.0
         for axis in range(dimension):
-            open_area = grid.interior(cut.open[axis].numpy()).sum(axis=tuple(n for n in range(3) if n != 2 - axis)) / cells ** (
-                dimension - 1
+            open_area = grid.interior(cut.open[axis].numpy()).sum(
+                axis=tuple(n for n in range(3) if n != 2 - axis)
+            ) / cells ** (dimension - 1)
+            half = np.sqrt(
+                np.maximum(radius**2 - (np.arange(cells) / cells - center[axis]) ** 2, 0.0)
             )
-            half = np.sqrt(np.maximum(radius**2 - (np.arange(cells) / cells - center[axis]) ** 2, 0.0))
             exact = 1.0 - (2.0 * half if dimension == 2 else np.pi * half**2)
             worst = max(worst, float(np.abs(open_area - exact)[1:].mean()))
         errors.append(worst)
@@ -117,7 +133,9 @@ def test_the_mean_decides_saddles(dimension, value):
         saddle = Function(lambda p: (p[:, 0] - 1.5) * (p[:, 1] - 1.5) + value)
         cut = cut_cells(grid, saddle)
         # d at the corners of cell (2, 2): 1/4 + value and -1/4 + value; an edge is open on one side
-        np.testing.assert_allclose(cut.open[0].numpy()[1, 2, 2:4], 0.5 + 2.0 * value * np.ones(2), atol=1e-6)
+        np.testing.assert_allclose(
+            cut.open[0].numpy()[1, 2, 2:4], 0.5 + 2.0 * value * np.ones(2), atol=1e-6
+        )
         return
     cut = cut_cells(grid, Function(lambda p: (p[:, 0] - 1.5) * (p[:, 1] - 1.5) + value))
     part = 0.5 + 2.0 * abs(value)
@@ -127,7 +145,10 @@ def test_the_mean_decides_saddles(dimension, value):
 
 def test_mesh_agrees_with_samples_of_its_faces():
     grid = grid_of(3, (36, 36, 20), 0.03)
-    mesh = TriangleMesh.from_file("builtin:torus", placement=Placement.from_degrees(0.9, [20.0, 10.0, 0.0], [0.54, 0.53, 0.31], 3))
+    mesh = TriangleMesh.from_file(
+        "builtin:torus",
+        placement=Placement.from_degrees(0.9, [20.0, 10.0, 0.0], [0.54, 0.53, 0.31], 3),
+    )
     cut = cut_cells(grid, mesh)
     rng = np.random.default_rng(20)
     samples = (np.arange(24) + 0.5) / 24
@@ -136,7 +157,9 @@ def test_mesh_agrees_with_samples_of_its_faces():
         computed = cut.open[axis].numpy()
         inside = [slice(2 if a == axis else 1, -1) for a in range(3)]
         partial = np.argwhere((computed > 0.0) & (computed < 1.0))
-        whole = np.argwhere(np.pad(computed[inside[2], inside[1], inside[0]], 0) >= 0.0) + [s.start for s in inside[::-1]]
+        whole = np.argwhere(np.pad(computed[inside[2], inside[1], inside[0]], 0) >= 0.0) + [
+            s.start for s in inside[::-1]
+        ]
         for k, j, i in np.concatenate([rng.permutation(partial)[:60], rng.permutation(whole)[:60]]):
             p, q = (other for other in range(3) if other != axis)
             points = np.tile(np.array([i, j, k], dtype=np.float64), (len(samples) ** 2, 1))
@@ -144,7 +167,9 @@ def test_mesh_agrees_with_samples_of_its_faces():
             points[:, p] += a.ravel()
             points[:, q] += b.ravel()
             distance = wp.empty(len(points), dtype=wp.float32, device="cpu")
-            mesh.signed_distance(wp.array(grid.to_world(points), dtype=wp.vec3, device="cpu"), distance)
+            mesh.signed_distance(
+                wp.array(grid.to_world(points), dtype=wp.vec3, device="cpu"), distance
+            )
             errors.append(computed[k, j, i] - (distance.numpy() > 0.0).mean())
     # not the largest: a face that the surface grazes between its corners may be off by much
     assert np.quantile(np.abs(errors), 0.95) < 0.05
@@ -155,10 +180,22 @@ BOXES = {
     "box": [Box(lower=[0.2, 0.0], upper=[0.5, 0.3])],
     "slab of one cell": [Box(lower=[0.0, 0.0], upper=[0.8, 0.1])],
     "plate of one cell": [Box(lower=[0.0, 0.3], upper=[0.5, 0.4])],
-    "gap of one cell": [Box(lower=[0.0, 0.3], upper=[0.3, 0.7]), Box(lower=[0.4, 0.2], upper=[0.8, 0.7])],
-    "step on a floor": [Box(lower=[-1.0, -1.0], upper=[2.0, 0.2]), Box(lower=[0.3, 0.2], upper=[0.5, 0.5])],
+    "gap of one cell": [
+        Box(lower=[0.0, 0.3], upper=[0.3, 0.7]),
+        Box(lower=[0.4, 0.2], upper=[0.8, 0.7]),
+    ],
+    "step on a floor": [
+        Box(lower=[-1.0, -1.0], upper=[2.0, 0.2]),
+        Box(lower=[0.3, 0.2], upper=[0.5, 0.5]),
+    ],
     "container": [Box(lower=[0.1, 0.1], upper=[0.7, 0.6], invert=True)],
-    "turned": [Box(lower=[-0.1, -0.2], upper=[0.1, 0.2], placement=Placement.from_degrees(1.0, 90.0, [0.4, 0.3], 2))],
+    "turned": [
+        Box(
+            lower=[-0.1, -0.2],
+            upper=[0.1, 0.2],
+            placement=Placement.from_degrees(1.0, 90.0, [0.4, 0.3], 2),
+        )
+    ],
 }
 
 
@@ -166,7 +203,9 @@ def in_space(box):
     """The same box with a limited third direction."""
     lower, upper = (0.1, 0.4) if box.lower[0] > -1.0 else (-1.0, 2.0)
     placement = Placement(rotation=box.placement.rotation, translation=box.placement.translation)
-    return Box(lower=[*box.lower, lower], upper=[*box.upper, upper], invert=box.invert, placement=placement)
+    return Box(
+        lower=[*box.lower, lower], upper=[*box.upper, upper], invert=box.invert, placement=placement
+    )
 
 
 @pytest.mark.parametrize("name", BOXES)
@@ -176,14 +215,26 @@ def test_boxes_of_whole_cells_leave_whole_cells(name, dimension, size):
     """The cells and faces are those of `voxelize`: rounding of the nodes' places must not show."""
     solids = [box if dimension == 2 else in_space(box) for box in BOXES[name]]
     if size != 1.0:
-        scaled = [Placement(scale=size, rotation=b.placement.rotation, translation=size * b.placement.translation) for b in solids]
-        solids = [Box(lower=b.lower, upper=b.upper, invert=b.invert, placement=p) for b, p in zip(solids, scaled, strict=True)]
+        scaled = [
+            Placement(
+                scale=size,
+                rotation=b.placement.rotation,
+                translation=size * b.placement.translation,
+            )
+            for b in solids
+        ]
+        solids = [
+            Box(lower=b.lower, upper=b.upper, invert=b.invert, placement=p)
+            for b, p in zip(solids, scaled, strict=True)
+        ]
     grid = grid_of(dimension, (8, 7, 6), SPACING * size)
     cut = cut_cells(grid, *solids)
     index = voxelize(grid, [placed(box) for box in solids], wall_separating=False).index.numpy()
     assert cut.whole_cells
     assert cut.dropped == 0
-    np.testing.assert_array_equal(grid.interior(cut.base.numpy()), np.where(grid.interior(index) < 0, wl.AIR, wl.SOLID))
+    np.testing.assert_array_equal(
+        grid.interior(cut.base.numpy()), np.where(grid.interior(index) < 0, wl.AIR, wl.SOLID)
+    )
     assert (np.delete(cut.base.numpy(), range(1, grid.counts[0] + 1), axis=2) == wl.SOLID).all()
     for axis in range(dimension):
         below = np.roll(index, 1, axis=2 - axis)
@@ -192,11 +243,15 @@ def test_boxes_of_whole_cells_leave_whole_cells(name, dimension, size):
         computed, wall = cut.open[axis].numpy(), cut.wall[axis].numpy()
         np.testing.assert_array_equal(computed[inside], open_face[inside])
         # a face between an open cell and a solid one is that solid's
-        owner = np.where(index < 0, below, np.where(below < 0, index, np.where(index == below, index, -5)))
+        owner = np.where(
+            index < 0, below, np.where(below < 0, index, np.where(index == below, index, -5))
+        )
         known = (owner[inside] > -5) & (owner[inside] != 0)
         np.testing.assert_array_equal(wall[inside][known], owner[inside][known])
     expected = kernel_sums(index < 0, dimension)
-    np.testing.assert_allclose(grid.interior(cut.capacity.numpy()), grid.interior(expected), atol=1e-6)
+    np.testing.assert_allclose(
+        grid.interior(cut.capacity.numpy()), grid.interior(expected), atol=1e-6
+    )
 
 
 def kernel_sums(open_cells, dimension):
@@ -212,23 +267,41 @@ def line_distribution(normal, offset, points=240):
     dimension, main = len(normal), int(np.argmax(np.abs(normal)))
     at = (np.arange(points) + 0.5) * (3.0 / points) - 1.5
     across = np.meshgrid(*[at] * (dimension - 1), indexing="ij")
-    weight = np.prod([np.where(np.abs(x) < 0.5, 0.75 - x**2, 0.5 * (1.5 - np.abs(x)) ** 2) for x in across], axis=0)
+    weight = np.prod(
+        [np.where(np.abs(x) < 0.5, 0.75 - x**2, 0.5 * (1.5 - np.abs(x)) ** 2) for x in across],
+        axis=0,
+    )
     weight = weight * (3.0 / points) ** (dimension - 1)
     rest = offset - sum(n * x for n, x in zip(np.delete(normal, main), across, strict=True))
     x = np.clip(rest / normal[main], -1.5, 1.5)
-    below = np.where(x < -0.5, (x + 1.5) ** 3 / 6.0, np.where(x < 0.5, 0.5 + 0.75 * x - x**3 / 3.0, 1.0 - (1.5 - x) ** 3 / 6.0))
+    below = np.where(
+        x < -0.5,
+        (x + 1.5) ** 3 / 6.0,
+        np.where(x < 0.5, 0.5 + 0.75 * x - x**3 / 3.0, 1.0 - (1.5 - x) ** 3 / 6.0),
+    )
     return float((weight * (1.0 - below if normal[main] > 0.0 else below)).sum())
 
 
-@pytest.mark.parametrize(("dimension", "direction"), [(d, n) for d in (2, 3) for n in DIRECTIONS[d]])
+@pytest.mark.parametrize(
+    ("dimension", "direction"), [(d, n) for d in (2, 3) for n in DIRECTIONS[d]]
+)
 def test_capacity_of_planes(dimension, direction):
     grid = grid_of(dimension)
     plane, normal, offset = tilted(dimension, direction)
     capacity = cut_cells(grid, plane).capacity.numpy()
-    cells = list(itertools.product(*(range(2, count) for count in grid.counts[:dimension]), *([[1]] if dimension == 2 else [])))
+    cells = list(
+        itertools.product(
+            *(range(2, count) for count in grid.counts[:dimension]),
+            *([[1]] if dimension == 2 else []),
+        )
+    )
     errors = []
     for i, j, k in cells:
-        exact = line_distribution(normal, offset - float(normal @ (np.array([i, j, k])[:dimension] + 0.5)), 240 if dimension == 2 else 80)
+        exact = line_distribution(
+            normal,
+            offset - float(normal @ (np.array([i, j, k])[:dimension] + 0.5)),
+            240 if dimension == 2 else 80,
+        )
         errors.append(capacity[k, j, i] - exact)
     assert np.abs(errors).max() < 5e-4
 
@@ -240,7 +313,10 @@ def test_capacity_of_a_disc_and_the_walls_beside_it():
     fine = 20
     x, y = (0.05 * ((np.arange(n * fine) + 0.5) / fine) for n in (20, 16))
     open_part = np.hypot(x[None] - 0.12, y[:, None] - 0.31) > 0.22
-    kernels = [np.array([np.interp(np.abs(c - at), *table()) for c in 0.05 * (np.arange(n) + 0.5)]) / fine for n, at in ((20, x), (16, y))]
+    kernels = [
+        np.array([np.interp(np.abs(c - at), *table()) for c in 0.05 * (np.arange(n) + 0.5)]) / fine
+        for n, at in ((20, x), (16, y))
+    ]
     exact = kernels[1] @ open_part @ kernels[0].T
     # chords instead of arcs leave 1 / (12 radius) open too much along the wall
     assert np.abs(capacity - exact).max() < 0.02
@@ -258,7 +334,10 @@ def test_capacities_add_up_to_the_open_volume():
     errors = []
     for cells in (20, 40):
         grid = grid_of(3, (cells, cells, cells // 2), 1.2 / cells)
-        mesh = TriangleMesh.from_file("builtin:torus", placement=Placement.from_degrees(0.9, [20.0, 10.0, 0.0], [0.61, 0.58, 0.31], 3))
+        mesh = TriangleMesh.from_file(
+            "builtin:torus",
+            placement=Placement.from_degrees(0.9, [20.0, 10.0, 0.0], [0.61, 0.58, 0.31], 3),
+        )
         capacity = cut_cells(grid, mesh).capacity.numpy().astype(np.float64)
         solid = np.prod(grid.counts) - capacity.sum()
         errors.append(abs(solid * grid.cell_volume / mesh.volume - 1.0))
@@ -267,7 +346,9 @@ def test_capacities_add_up_to_the_open_volume():
 
 
 def test_a_mesh_is_cut_in_two_dimensions():
-    torus = TriangleMesh.from_file("builtin:torus", placement=Placement(translation=[0.6, 0.6, 0.0]))
+    torus = TriangleMesh.from_file(
+        "builtin:torus", placement=Placement(translation=[0.6, 0.6, 0.0])
+    )
     grid = grid_of(2, (60, 60), 0.02)
     solid = 3600.0 - cut_cells(grid, torus).capacity.numpy()[1].sum(dtype=np.float64)
     assert solid * grid.cell_volume == pytest.approx(np.pi * (0.5**2 - 0.2**2), rel=0.01)
@@ -286,7 +367,10 @@ def test_a_thread_a_cell_finds_the_same(dimension):
 
 
 def test_capacity_can_be_left_out():
-    assert cut_cells(grid_of(2), Sphere(center=[0.4, 0.3], radius=0.2), capacity=False).capacity is None
+    assert (
+        cut_cells(grid_of(2), Sphere(center=[0.4, 0.3], radius=0.2), capacity=False).capacity
+        is None
+    )
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -307,7 +391,9 @@ def test_distance_is_exact_near_walls_and_large_elsewhere(dimension):
 
 def test_groups_of_nodes_measure_a_mesh_as_single_nodes_do():
     grid = grid_of(3, (60, 54, 28), 0.02)
-    mesh = TriangleMesh.from_file("builtin:torus", placement=Placement(translation=[0.61, 0.55, 0.3]))
+    mesh = TriangleMesh.from_file(
+        "builtin:torus", placement=Placement(translation=[0.61, 0.55, 0.3])
+    )
     grouped = cut_cells(grid, mesh).distance.numpy()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(node_distance, "COARSE", 1)
@@ -325,14 +411,21 @@ def test_faces_belong_to_the_solid_nearest_to_their_centers():
     shapes = [
         Plane(point=[0.0, 0.33, 0.0], normal=[0.1, 1.0, 0.0]),
         Sphere(center=[0.7, 0.55, 0.6], radius=0.31),
-        Box(lower=[-0.2, -0.3, -0.2], upper=[0.2, 0.3, 0.2], placement=Placement.from_degrees(1.0, [10.0, 20.0, 30.0], [1.1, 0.5, 0.6], 3)),
+        Box(
+            lower=[-0.2, -0.3, -0.2],
+            upper=[0.2, 0.3, 0.2],
+            placement=Placement.from_degrees(1.0, [10.0, 20.0, 30.0], [1.1, 0.5, 0.6], 3),
+        ),
     ]
     cut = cut_cells(grid, *shapes)
     counts = np.zeros(4, dtype=int)
     for axis in range(3):
         inside = tuple(slice(2 if a == axis else 1, -1) for a in (2, 1, 0))
         wall = cut.wall[axis].numpy()[inside]
-        k, j, i = np.meshgrid(*(np.arange(s.start, n - 1) for s, n in zip(inside, grid.shape, strict=True)), indexing="ij")
+        k, j, i = np.meshgrid(
+            *(np.arange(s.start, n - 1) for s, n in zip(inside, grid.shape, strict=True)),
+            indexing="ij",
+        )
         center = np.stack([i, j, k], axis=-1) + 0.5 * (np.arange(3) != axis)
         points = wp.array(grid.to_world(center.reshape(-1, 3)), dtype=wp.vec3, device="cpu")
         distances = []
@@ -344,7 +437,8 @@ def test_faces_belong_to_the_solid_nearest_to_their_centers():
         assert ((wall >= 1) == (cut.open[axis].numpy()[inside] < 1.0)).all()
         chosen = np.take_along_axis(distances, np.maximum(wall - 1, 0)[None].astype(int), axis=0)[0]
         closed = wall >= 1
-        assert (chosen - distances.min(axis=0))[closed].max() < 0.03  # a third of a cell: those are equally near
+        # a third of a cell: those are equally near
+        assert (chosen - distances.min(axis=0))[closed].max() < 0.03
         counts += np.bincount(wall[closed], minlength=4)
     assert (counts[1:] > 20).all()
 
@@ -374,19 +468,29 @@ def test_slivers_are_dropped_and_counted():
 
 
 def test_solids_that_close_nothing_are_reported():
-    cut = cut_cells(grid_of(2), Sphere(center=[0.45, 0.35], radius=0.03), Sphere(center=[0.4, 0.3], radius=0.03))
-    assert cut.notes == ("solid[0] closes no part of a face: it is too small for cells of 0.1 m, or lies in other solids",)
+    cut = cut_cells(
+        grid_of(2), Sphere(center=[0.45, 0.35], radius=0.03), Sphere(center=[0.4, 0.3], radius=0.03)
+    )
+    assert cut.notes == (
+        "solid[0] closes no part of a face: it is too small for cells of 0.1 m, or lies in other "
+        "solids",
+    )
 
 
 def test_thin_meshes_are_reported():
-    torus = TriangleMesh.from_file("builtin:torus", placement=Placement(scale=0.5, translation=[0.4, 0.4, 0.3]))
+    torus = TriangleMesh.from_file(
+        "builtin:torus", placement=Placement(scale=0.5, translation=[0.4, 0.4, 0.3])
+    )
     notes = cut_cells(grid_of(3, (8, 8, 6), 0.2), torus).notes
     assert any("is thinner than a cell of 0.2 m" in note for note in notes)
 
 
 @pytest.mark.parametrize(
     ("geometry", "match"),
-    [(Sphere(center=[2.0, 0.5], radius=0.5), "wholly outside"), (Plane(point=[0.0, 2.0], normal=[0.0, 1.0]), "no open cell is left")],
+    [
+        (Sphere(center=[2.0, 0.5], radius=0.5), "wholly outside"),
+        (Plane(point=[0.0, 2.0], normal=[0.0, 1.0]), "no open cell is left"),
+    ],
 )
 def test_solids_outside_or_everywhere_are_refused(geometry, match):
     with pytest.raises(ValueError, match=match):

@@ -13,7 +13,8 @@ from warp_lcp.grid.staggered import StaggeredGrid
 
 FLAT = StaggeredGrid((24, 20, 1), 0.1, 2)
 SPACE = StaggeredGrid((18, 16, 14), 0.1, 3)
-Distance = Callable[[np.ndarray], np.ndarray]  # of points in cells from the domain's corner, shape (..., 3), in cells
+# of points in cells from the domain's corner, shape (..., 3), in cells
+Distance = Callable[[np.ndarray], np.ndarray]
 
 
 def box(grid: StaggeredGrid, x: np.ndarray) -> np.ndarray:
@@ -65,14 +66,26 @@ def velocities(grid: StaggeredGrid, velocity: tuple[float, ...]) -> list[wp.arra
     return fields
 
 
-def move(grid: StaggeredGrid, fields: list[wp.array], distance: wp.array, dt: float, points: npt.ArrayLike) -> tuple[np.ndarray, int]:
+def move(
+    grid: StaggeredGrid,
+    fields: list[wp.array],
+    distance: wp.array,
+    dt: float,
+    points: npt.ArrayLike,
+) -> tuple[np.ndarray, int]:
     position = wp.array(np.asarray(points, dtype=np.float32), dtype=wp.vec3, device="cpu")
     stopped = wp.zeros(1, dtype=wp.int32, device="cpu")
     advect_with_distance(grid, fields, distance, dt, position, stopped)
     return position.numpy().astype(np.float64), int(stopped.numpy()[0])
 
 
-def open_points(grid: StaggeredGrid, distance: wp.array, count: int, rng: np.random.Generator, least: float = MARGIN) -> np.ndarray:
+def open_points(
+    grid: StaggeredGrid,
+    distance: wp.array,
+    count: int,
+    rng: np.random.Generator,
+    least: float = MARGIN,
+) -> np.ndarray:
     """Return points [m] among walls, a third of them as near as may be."""
     x = rng.uniform(0, 1, (20 * count, 3)) * np.array(grid.counts) * grid.spacing
     x[:, 2] *= grid.dimension == 3
@@ -100,10 +113,14 @@ def test_away_from_walls_it_is_the_step_among_whole_cells(grid: StaggeredGrid) -
     fields = grid.faces()
     for field in fields:
         field.assign(rng.normal(size=grid.shape).astype(np.float32))
-    start = (rng.uniform(5, np.maximum(grid.counts, 11) - 5, (500, 3)) * grid.spacing).astype(np.float32)
+    start = (rng.uniform(5, np.maximum(grid.counts, 11) - 5, (500, 3)) * grid.spacing).astype(
+        np.float32
+    )
     found, stopped = move(grid, fields, at_nodes(grid), 0.8 * grid.spacing, start)
     expected = wp.array(start, dtype=wp.vec3, device="cpu")
-    advect(grid, fields, room, 0.8 * grid.spacing, expected, wp.zeros(1, dtype=wp.int32, device="cpu"))
+    advect(
+        grid, fields, room, 0.8 * grid.spacing, expected, wp.zeros(1, dtype=wp.int32, device="cpu")
+    )
     assert stopped == 0
     assert np.abs(found - start)[:, 0].max() > grid.spacing
     assert np.abs(found - expected.numpy()).max() < 1e-6
@@ -130,7 +147,9 @@ def test_third_order_on_a_rotation() -> None:
 
 @pytest.mark.parametrize("cells", [0.5, 2.0, 8.0])
 @pytest.mark.parametrize("normal", [(0.0, 1.0, 0.0), (-0.5, 0.75**0.5, 0.0), (-0.3, 0.8, 0.5)])
-def test_a_plane_stops_the_normal_part_and_lets_the_tangential_part_go(normal: tuple[float, float, float], cells: float) -> None:
+def test_a_plane_stops_the_normal_part_and_lets_the_tangential_part_go(
+    normal: tuple[float, float, float], cells: float
+) -> None:
     """What an inclined plane leaves of a straight way is known: start + way, less the normal part beyond the wall."""
     grid = FLAT if normal[2] == 0 else StaggeredGrid((24, 20, 24), 0.1, 3)
     n = np.array(normal) / np.linalg.norm(normal)
@@ -138,7 +157,13 @@ def test_a_plane_stops_the_normal_part_and_lets_the_tangential_part_go(normal: t
     at = np.array([12.0, 9.0, 12.0 * (grid.dimension == 3)])
     way = cells * (0.6 * tangent - 0.8 * n)
     start = at + np.outer([0.01, 0.1, 0.7], n) - 0.3 * cells * tangent
-    points, stopped = move(grid, velocities(grid, tuple(way)), at_nodes(grid, plane(tuple(at), normal)), grid.spacing, start * grid.spacing)
+    points, stopped = move(
+        grid,
+        velocities(grid, tuple(way)),
+        at_nodes(grid, plane(tuple(at), normal)),
+        grid.spacing,
+        start * grid.spacing,
+    )
     end = points / grid.spacing
     height = np.maximum((start + way - at) @ n, MARGIN)
     touching = (start + way - at) @ n < MARGIN
@@ -176,7 +201,9 @@ def test_nobody_ends_inside_a_wall(grid: StaggeredGrid, random_seed: int, cells:
 @pytest.mark.parametrize("thickness", [1.2, 2.5])
 @pytest.mark.parametrize("x0", [9.37, 9.0, 8.61, 9.5])
 @pytest.mark.parametrize("sine", [0.0, 0.4])
-def test_a_thin_plate_is_not_tunnelled(grid: StaggeredGrid, thickness: float, x0: float, sine: float) -> None:
+def test_a_thin_plate_is_not_tunnelled(
+    grid: StaggeredGrid, thickness: float, x0: float, sine: float
+) -> None:
     """At CFL 8 a particle would end far beyond."""
     rng = np.random.default_rng(616)
     distance = at_nodes(grid, plate(x0, thickness))
@@ -184,8 +211,11 @@ def test_a_thin_plate_is_not_tunnelled(grid: StaggeredGrid, thickness: float, x0
     start = start[start[:, 0] < x0 * grid.spacing]
     points, stopped = move(grid, velocities(grid, (8.0, 8.0 * sine)), distance, grid.spacing, start)
     assert stopped > 0.5 * len(start)
-    assert (points[:, 0] / grid.spacing < x0 - 0.5 * thickness + 0.05).all()  # a node behind the middle measures to the far side
-    free = (start[:, 0] / grid.spacing + 8.0 < x0 - thickness) & (start[:, 1] / grid.spacing + 8 * sine < grid.counts[1] - 1)
+    # a node behind the middle measures to the far side
+    assert (points[:, 0] / grid.spacing < x0 - 0.5 * thickness + 0.05).all()
+    free = (start[:, 0] / grid.spacing + 8.0 < x0 - thickness) & (
+        start[:, 1] / grid.spacing + 8 * sine < grid.counts[1] - 1
+    )
     assert points[free, 0] == pytest.approx(start[free, 0] + 0.8, abs=1e-5)
 
 
@@ -198,7 +228,9 @@ def test_a_sphere_is_flown_around(grid: StaggeredGrid) -> None:
     start = center + np.stack([np.full(5, -4.0), rows, np.zeros(5)], axis=1)
     points, met = start * grid.spacing, 0
     for _ in range(22):
-        points, stopped = move(grid, velocities(grid, (1.0, 0.0)), distance, 0.5 * grid.spacing, points)
+        points, stopped = move(
+            grid, velocities(grid, (1.0, 0.0)), distance, 0.5 * grid.spacing, points
+        )
         radius = np.linalg.norm(points / grid.spacing - center, axis=1)
         assert (radius > 2.9).all()  # between nodes a sphere is flatter
         met += stopped
@@ -217,7 +249,9 @@ def test_corners_of_the_domain_hold_particles() -> None:
         rng = np.random.default_rng(9)
         points = (corner - sign * rng.uniform(0.15, 3, (200, 3))) * grid.spacing
         for _ in range(5):
-            points, stopped = move(grid, velocities(grid, way), at_nodes(grid), grid.spacing, points)
+            points, stopped = move(
+                grid, velocities(grid, way), at_nodes(grid), grid.spacing, points
+            )
         assert stopped == 200
         apart = np.abs(points / grid.spacing - corner)
         assert apart.max() < (0.2 if grid is FLAT else 0.7)
@@ -235,7 +269,9 @@ def test_a_wall_ahead_of_a_floor_does_not_send_particles_up() -> None:
 
 def test_a_ramp_on_the_floor_is_climbed() -> None:
     ramp = plane((12.0, 0.0, 0.0), (-0.5, 0.75**0.5, 0.0))
-    points, stopped = move(FLAT, velocities(FLAT, (6.0, 0.0)), at_nodes(FLAT, ramp), FLAT.spacing, [[1.1, 0.02, 0.0]])
+    points, stopped = move(
+        FLAT, velocities(FLAT, (6.0, 0.0)), at_nodes(FLAT, ramp), FLAT.spacing, [[1.1, 0.02, 0.0]]
+    )
     assert stopped == 1
     x, y, _ = points[0] / FLAT.spacing
     assert x - 11.0 == pytest.approx(1.0 + 5.0 * 0.75, abs=0.2)  # the ramp keeps cos^2 of the way
@@ -250,7 +286,9 @@ def test_who_slid_over_a_ledge_goes_on_along_it() -> None:
         return np.linalg.norm(np.maximum(out, 0.0), axis=-1) + np.minimum(out.max(axis=-1), 0.0)
 
     start = np.array([[9.0, 8.3, 0.0]]) * FLAT.spacing
-    points, stopped = move(FLAT, velocities(FLAT, (6.0, -3.0)), at_nodes(FLAT, ledge), FLAT.spacing, start)
+    points, stopped = move(
+        FLAT, velocities(FLAT, (6.0, -3.0)), at_nodes(FLAT, ledge), FLAT.spacing, start
+    )
     assert stopped == 1
     assert points[0] / FLAT.spacing == pytest.approx([15.0, 8.0 + 1.1 * MARGIN, 0.0], abs=2e-3)
 
@@ -259,7 +297,10 @@ def test_a_wedge_stops_particles() -> None:
     """Between two walls there is nowhere to slide to: the particle ends in the wedge, in the open."""
 
     def wedge(x: np.ndarray) -> np.ndarray:
-        return np.minimum(plane((12.0, 5.0, 0.0), (-0.2, 1.0, 0.0))(x), plane((12.0, 5.0, 0.0), (-0.2, -1.0, 0.0))(x))
+        return np.minimum(
+            plane((12.0, 5.0, 0.0), (-0.2, 1.0, 0.0))(x),
+            plane((12.0, 5.0, 0.0), (-0.2, -1.0, 0.0))(x),
+        )
 
     distance = at_nodes(FLAT, wedge)
     start = np.array([[6.0, 5.1, 0.0], [6.0, 4.5, 0.0], [9.0, 5.3, 0.0]]) * FLAT.spacing
@@ -288,14 +329,22 @@ def test_where_there_is_no_way_out_a_particle_stays() -> None:
 
 
 def test_two_dimensions_ignore_z() -> None:
-    points, stopped = move(FLAT, velocities(FLAT, (0.5, 0.5)), at_nodes(FLAT), 0.1, [[0.3, 0.3, 5.0], [0.01, 0.01, -7.0]])
+    points, stopped = move(
+        FLAT,
+        velocities(FLAT, (0.5, 0.5)),
+        at_nodes(FLAT),
+        0.1,
+        [[0.3, 0.3, 5.0], [0.01, 0.01, -7.0]],
+    )
     assert stopped == 0
     assert points == pytest.approx(np.array([[0.35, 0.35, 0.0], [0.06, 0.06, 0.0]]), abs=1e-6)
 
 
 def test_velocities_that_are_not_finite_do_not_crash() -> None:
     for bad in (np.nan, np.inf, -np.inf, 1e38):
-        points, _ = move(SPACE, velocities(SPACE, (bad, 0.1, bad)), at_nodes(SPACE), 0.1, [[0.3, 0.3, 0.2]])
+        points, _ = move(
+            SPACE, velocities(SPACE, (bad, 0.1, bad)), at_nodes(SPACE), 0.1, [[0.3, 0.3, 0.2]]
+        )
         assert points.shape == (1, 3)
         if not np.isfinite(bad):
             assert not np.isfinite(points).all()
@@ -303,7 +352,9 @@ def test_velocities_that_are_not_finite_do_not_crash() -> None:
 
 @pytest.mark.parametrize("grid", [FLAT, SPACE], ids=["2d", "3d"])
 @pytest.mark.parametrize("normal", [(0.0, 1.0, 0.0), (-0.5, 0.75**0.5, 0.0)])
-def test_particles_are_pushed_out_along_the_normal(grid: StaggeredGrid, normal: tuple[float, float, float]) -> None:
+def test_particles_are_pushed_out_along_the_normal(
+    grid: StaggeredGrid, normal: tuple[float, float, float]
+) -> None:
     """Out of a plane the way is known; beyond PUSH cells nobody is moved."""
     n = np.array(normal)
     at = np.array([9.0, 8.0, 7.0 * (grid.dimension == 3)])
@@ -313,7 +364,8 @@ def test_particles_are_pushed_out_along_the_normal(grid: StaggeredGrid, normal: 
     moved, left = (wp.zeros(1, dtype=wp.int32, device="cpu") for _ in range(2))
     push_out(grid, at_nodes(grid, plane(tuple(at), normal)), position, moved, left)
     end = position.numpy() / grid.spacing
-    assert (int(moved.numpy()[0]), int(left.numpy()[0])) in ((4, 1), (5, 1))  # at MARGIN itself rounding decides
+    # at MARGIN itself rounding decides
+    assert (int(moved.numpy()[0]), int(left.numpy()[0])) in ((4, 1), (5, 1))
     assert end[[0, 6]] == pytest.approx(start[[0, 6]], abs=1e-5)
     assert end[1:6] == pytest.approx(np.broadcast_to(at + 1.1 * MARGIN * n, (5, 3)), abs=1.5e-4)
 
@@ -338,4 +390,5 @@ def test_a_sphere_that_moved_leaves_nobody_inside(random_seed: int) -> None:
     assert (between_nodes(SPACE, after, end) >= 0.99 * MARGIN).all()
     away = between_nodes(SPACE, after, start) > 1.01 * MARGIN
     assert end[away] == pytest.approx(start[away], abs=1e-6)
-    assert np.linalg.norm(end - start, axis=1).max() < (2.0 + 0.5) * SPACE.spacing  # near its middle a sphere's gradient is off
+    # near its middle a sphere's gradient is off
+    assert np.linalg.norm(end - start, axis=1).max() < (2.0 + 0.5) * SPACE.spacing

@@ -11,7 +11,9 @@ FLAT = StaggeredGrid((8, 6, 1), 0.1, 2)
 SOLID = StaggeredGrid((8, 6, 5), 0.1, 3)
 
 
-def reference(known: np.ndarray, field: np.ndarray, layers: int, start: int = 1, fill: int = UNKNOWN) -> tuple[np.ndarray, np.ndarray]:
+def reference(
+    known: np.ndarray, field: np.ndarray, layers: int, start: int = 1, fill: int = UNKNOWN
+) -> tuple[np.ndarray, np.ndarray]:
     """Extrapolate out of place with NumPy."""
     known, field = known.copy(), field.astype(np.float64)
     for layer in range(start, start + layers):
@@ -31,14 +33,23 @@ def reference(known: np.ndarray, field: np.ndarray, layers: int, start: int = 1,
 
 @pytest.mark.parametrize("grid", [FLAT, SOLID], ids=["2d", "3d"])
 @settings(max_examples=30, deadline=None)
-@given(random_seed=st.integers(0, 10**6), layers=st.integers(0, 6), fill=st.sampled_from([UNKNOWN, BLOCKED]))
-def test_layers_are_means_of_known_neighbors(grid: StaggeredGrid, random_seed: int, layers: int, fill: int) -> None:
+@given(
+    random_seed=st.integers(0, 10**6),
+    layers=st.integers(0, 6),
+    fill=st.sampled_from([UNKNOWN, BLOCKED]),
+)
+def test_layers_are_means_of_known_neighbors(
+    grid: StaggeredGrid, random_seed: int, layers: int, fill: int
+) -> None:
     rng = np.random.default_rng(random_seed)
     known = rng.choice([BLOCKED, UNKNOWN, 1], size=grid.shape, p=[0.3, 0.6, 0.1]).astype(np.int8)
     if grid.dimension == 2:
         known[[0, 2]] = BLOCKED + UNKNOWN - fill  # planes not in use are left alone
     field = rng.normal(size=grid.shape).astype(np.float32)
-    marks, values = wp.array(known, dtype=wp.int8, device="cpu"), wp.array(field, dtype=wp.float32, device="cpu")
+    marks, values = (
+        wp.array(known, dtype=wp.int8, device="cpu"),
+        wp.array(field, dtype=wp.float32, device="cpu"),
+    )
     extrapolate(grid.everywhere, marks, values, layers, fill=fill)
     expected_known, expected = reference(known, field, layers, fill=fill)
     assert (marks.numpy() == expected_known).all()
@@ -62,7 +73,10 @@ def test_later_layers_continue_from_a_mark() -> None:
     known[1, 2:4, 2] = 5, UNKNOWN
     field = np.zeros(FLAT.shape, np.float32)
     field[1, 2, 2] = 7.0
-    marks, values = wp.array(known, dtype=wp.int8, device="cpu"), wp.array(field, dtype=wp.float32, device="cpu")
+    marks, values = (
+        wp.array(known, dtype=wp.int8, device="cpu"),
+        wp.array(field, dtype=wp.float32, device="cpu"),
+    )
     extrapolate(FLAT.everywhere, marks, values, 1, start=4)
     assert marks.numpy()[1, 3, 2] == UNKNOWN
     extrapolate(FLAT.everywhere, marks, values, 1, start=5)

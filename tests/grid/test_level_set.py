@@ -31,7 +31,11 @@ def fill(grid: StaggeredGrid, low: list[float], high: list[float], per_cell: int
     axes = []
     for axis in range(3):
         n = round((high[axis] - low[axis]) * per_cell) if axis < grid.dimension else 1
-        axes.append(low[axis] + (np.arange(n) + 0.5) * (high[axis] - low[axis]) / n if axis < grid.dimension else np.zeros(1))
+        axes.append(
+            low[axis] + (np.arange(n) + 0.5) * (high[axis] - low[axis]) / n
+            if axis < grid.dimension
+            else np.zeros(1)
+        )
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
@@ -47,7 +51,9 @@ def level_set(
 ) -> LevelSet:
     """Return the level set of points in cells, `a_cell` of them at rest; without a capacity that of whole cells."""
     cells = on_device(box_of(grid) if base is None else base)
-    particles = Particles(grid, points * grid.spacing, np.zeros_like(points), affine=False, indexed=indexed)
+    particles = Particles(
+        grid, points * grid.spacing, np.zeros_like(points), affine=False, indexed=indexed
+    )
     if indexed:
         particles.sort()
     room = grid.field()
@@ -78,10 +84,13 @@ def share_below(s: np.ndarray) -> np.ndarray:
 @GRIDS
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize("side", [-1, 1])
-def test_phi_is_the_distance_to_a_plane_wherever_it_lies_in_a_cell(grid: StaggeredGrid, axis: int, side: int) -> None:
+def test_phi_is_the_distance_to_a_plane_wherever_it_lies_in_a_cell(
+    grid: StaggeredGrid, axis: int, side: int
+) -> None:
     """Sampled as densely as here (16 or 10 points an axis) a lattice is a continuum to 5e-3 cells; the domain's walls do not show.
 
-    A wrong sign, a center off by half a cell or a capacity without the walls are all errors of a tenth of a cell or more.
+    A wrong sign, a center off by half a cell or a capacity without the walls are all errors of a
+    tenth of a cell or more.
     """
     if axis >= grid.dimension:
         pytest.skip("no such axis")
@@ -93,14 +102,17 @@ def test_phi_is_the_distance_to_a_plane_wherever_it_lies_in_a_cell(grid: Stagger
             high[axis] = surface
         else:
             low[axis] = surface
-        # whole layers from the surface on, so that the density is right there; what is left over is at the far wall
+        # whole layers from the surface on, so that the density is right there; what is left over is
+        # at the far wall
         layers = int((high[axis] - low[axis]) * per_cell) / per_cell
         if side > 0:
             low[axis] = high[axis] - layers
         else:
             high[axis] = low[axis] + layers
         made = level_set(grid, fill(grid, low, high, per_cell), per_cell**grid.dimension)
-        expected = np.broadcast_to(side * (centers(grid, axis) - surface), grid.interior(made.phi.numpy()).shape)
+        expected = np.broadcast_to(
+            side * (centers(grid, axis) - surface), grid.interior(made.phi.numpy()).shape
+        )
         near = np.abs(expected) < 0.9
         assert near.any()
         assert grid.interior(made.phi.numpy())[near] == pytest.approx(expected[near], abs=1e-2)
@@ -108,12 +120,19 @@ def test_phi_is_the_distance_to_a_plane_wherever_it_lies_in_a_cell(grid: Stagger
 
 
 @GRIDS
-def test_particles_as_a_liquid_has_them_put_the_surface_within_a_tenth_of_a_cell(grid: StaggeredGrid) -> None:
+def test_particles_as_a_liquid_has_them_put_the_surface_within_a_tenth_of_a_cell(
+    grid: StaggeredGrid,
+) -> None:
     """The seeding of a scene: 2 an axis, moved by a quarter of their spacing. Mean and scatter of phi in cells beside the surface."""
-    points = np.concatenate([lattice(grid, 2, 0.25, 515, plane) for plane in range(grid.counts[2])]) / grid.spacing
+    points = (
+        np.concatenate([lattice(grid, 2, 0.25, 515, plane) for plane in range(grid.counts[2])])
+        / grid.spacing
+    )
     points = points[points[:, 1] < 7.0]
     made = level_set(grid, points, 2**grid.dimension)
-    errors = np.stack([grid.interior(made.phi.numpy())[:, row] - (row + 0.5 - 7.0) for row in (6, 7)])
+    errors = np.stack(
+        [grid.interior(made.phi.numpy())[:, row] - (row + 0.5 - 7.0) for row in (6, 7)]
+    )
     assert abs(errors.mean()) < 0.03
     assert errors.std() < 0.06
 
@@ -128,9 +147,13 @@ def test_a_surface_that_meets_cut_walls_at_right_angles_is_not_biased(grid: Stag
     volume = np.prod([top[0] - low_wall, *top[1 : grid.dimension]])
     x = np.arange(grid.shape[2]) - 0.5
     open_x = np.minimum(share_below(x - low_wall), share_below(high_wall - x))
-    along = [np.interp(np.arange(n + 2) - 0.5, [-0.5, 0.5, 1.5], [1 / 6, 5 / 6, 1]) for n in grid.counts]
+    along = [
+        np.interp(np.arange(n + 2) - 0.5, [-0.5, 0.5, 1.5], [1 / 6, 5 / 6, 1]) for n in grid.counts
+    ]
     along = [np.minimum(a, a[::-1]) for a in along]
-    capacity = open_x * along[1][:, None] * (along[2][:, None, None] if grid.dimension == 3 else 1.0)
+    capacity = (
+        open_x * along[1][:, None] * (along[2][:, None, None] if grid.dimension == 3 else 1.0)
+    )
     capacity = np.broadcast_to(capacity, grid.shape)
     base = box_of(grid)
     base[..., : int(low_wall) + 1] = SOLID
@@ -143,13 +166,17 @@ def test_a_surface_that_meets_cut_walls_at_right_angles_is_not_biased(grid: Stag
     columns = slice(int(low_wall), int(high_wall) + 1)
     expected = np.broadcast_to((y - surface)[None, rows, None], phi[:, rows, columns].shape)
     assert phi[:, rows, columns] == pytest.approx(expected, abs=1e-2)
-    plain = grid.interior(level_set(grid, points, round(weight), base=base).phi.numpy())[:, rows, columns]
+    plain = grid.interior(level_set(grid, points, round(weight), base=base).phi.numpy())[
+        :, rows, columns
+    ]
     assert np.abs(plain - expected).max() > 0.1  # with the capacity of whole cells it is biased
 
 
 @GRIDS
 @pytest.mark.parametrize("indexed", [False, True], ids=["scatter", "gather"])
-def test_the_density_is_the_sum_of_the_particles_kernels(grid: StaggeredGrid, indexed: bool) -> None:
+def test_the_density_is_the_sum_of_the_particles_kernels(
+    grid: StaggeredGrid, indexed: bool
+) -> None:
     """Against every pair of cell and particle in float64, each kernel evaluated from its distance."""
     rng = np.random.default_rng(31415)
     points = rng.random((400, 3)) * np.array(grid.counts)
@@ -161,8 +188,13 @@ def test_the_density_is_the_sum_of_the_particles_kernels(grid: StaggeredGrid, in
     for axis in range(grid.dimension):
         shape = [1, 1, 1, 1]
         shape[3 - axis] = -1
-        d = np.abs(points[:, axis].reshape(-1, 1, 1, 1) - (np.arange(grid.shape[2 - axis]) - 0.5).reshape(shape))
-        expected = expected * np.where(d < 0.5, 0.75 - d**2, np.where(d < 1.5, 0.5 * (1.5 - d) ** 2, 0.0))
+        d = np.abs(
+            points[:, axis].reshape(-1, 1, 1, 1)
+            - (np.arange(grid.shape[2 - axis]) - 0.5).reshape(shape)
+        )
+        expected = expected * np.where(
+            d < 0.5, 0.75 - d**2, np.where(d < 1.5, 0.5 * (1.5 - d) ** 2, 0.0)
+        )
     expected = expected.sum(axis=0) / 4
     if grid.dimension == 2:
         expected[[0, 2]] = 0.0
@@ -174,8 +206,12 @@ def test_gathered_and_scattered_surfaces_agree(grid: StaggeredGrid) -> None:
     rng = np.random.default_rng(2718)
     points = fill(grid, [0.0, 0.0, 0.0], [6.0, 5.0, float(grid.counts[2])], 2)
     points[:, : grid.dimension] += 0.2 * (rng.random((len(points), grid.dimension)) - 0.5)
-    fields = [level_set(grid, points, 2**grid.dimension, indexed=indexed).phi.numpy() for indexed in (False, True)]
-    assert fields[0] == pytest.approx(fields[1], abs=2e-2)  # the cube root near 1.5 magnifies rounding
+    fields = [
+        level_set(grid, points, 2**grid.dimension, indexed=indexed).phi.numpy()
+        for indexed in (False, True)
+    ]
+    # the cube root near 1.5 magnifies rounding
+    assert fields[0] == pytest.approx(fields[1], abs=2e-2)
     near = np.abs(fields[0]) < 1.0
     assert fields[0][near] == pytest.approx(fields[1][near], abs=1e-5)
 
@@ -215,7 +251,9 @@ def test_nothing_stays_behind_when_the_window_moves(grid: StaggeredGrid) -> None
 
 
 @GRIDS
-def test_solid_cells_take_the_mean_of_their_neighbors_a_layer_at_a_time(grid: StaggeredGrid) -> None:
+def test_solid_cells_take_the_mean_of_their_neighbors_a_layer_at_a_time(
+    grid: StaggeredGrid,
+) -> None:
     """An independent Jacobi sweep; what a sweep finds it does not use before the next."""
     rng = np.random.default_rng(1618)
     base = box_of(grid)
@@ -231,7 +269,9 @@ def test_solid_cells_take_the_mean_of_their_neighbors_a_layer_at_a_time(grid: St
         total, count = np.zeros(grid.shape), np.zeros(grid.shape)
         for axis, step in itertools.product(range(3 - grid.dimension, 3), (-1, 1)):
             source = np.roll(np.pad(known, 1), step, axis)[1:-1, 1:-1, 1:-1]
-            total += np.where(source, np.roll(np.pad(expected, 1), step, axis)[1:-1, 1:-1, 1:-1], 0.0)
+            total += np.where(
+                source, np.roll(np.pad(expected, 1), step, axis)[1:-1, 1:-1, 1:-1], 0.0
+            )
             count += source
         new = ~known & (count > 0)
         if grid.dimension == 2:
@@ -242,7 +282,9 @@ def test_solid_cells_take_the_mean_of_their_neighbors_a_layer_at_a_time(grid: St
 
 
 @GRIDS
-def test_the_capacity_of_whole_cells_is_what_a_continuum_in_the_open_ones_weighs(grid: StaggeredGrid) -> None:
+def test_the_capacity_of_whole_cells_is_what_a_continuum_in_the_open_ones_weighs(
+    grid: StaggeredGrid,
+) -> None:
     """Particles 12 an axis in every open cell: their density is the midpoint rule for the kernel's integral."""
     rng = np.random.default_rng(6283)
     base = box_of(grid)
@@ -258,9 +300,16 @@ def test_the_capacity_of_whole_cells_is_what_a_continuum_in_the_open_ones_weighs
     assert room.numpy()[used] == pytest.approx(density[used], abs=3e-3)
 
 
-def ball(grid: StaggeredGrid, center: list[float], radius: float, per_axis: int, random_seed: int) -> np.ndarray:
+def ball(
+    grid: StaggeredGrid, center: list[float], radius: float, per_axis: int, random_seed: int
+) -> np.ndarray:
     """Return the points of a jittered lattice in a disc or a ball [cells]."""
-    points = np.concatenate([lattice(grid, per_axis, 0.25, random_seed, plane) for plane in range(grid.counts[2])]) / grid.spacing
+    points = (
+        np.concatenate(
+            [lattice(grid, per_axis, 0.25, random_seed, plane) for plane in range(grid.counts[2])]
+        )
+        / grid.spacing
+    )
     middle = np.array([*center, 0.0][:3])
     return points[((points - middle) ** 2)[:, : grid.dimension].sum(axis=1) < radius**2]
 
@@ -272,7 +321,9 @@ def test_a_ball_of_twelve_cells_has_its_volume(dimension: int, smoothing: int) -
     grid = StaggeredGrid((36, 36, 1 if dimension == 2 else 36), 0.05, dimension)
     radius, center = 12.0, [18.2, 17.9, 18.1][:dimension]  # out of the walls' reach
     made = level_set(grid, ball(grid, center, radius, 2, 99), 2**dimension, smoothing=smoothing)
-    exact = (np.pi * radius**2 if dimension == 2 else 4 / 3 * np.pi * radius**3) * grid.spacing**dimension
+    exact = (
+        np.pi * radius**2 if dimension == 2 else 4 / 3 * np.pi * radius**3
+    ) * grid.spacing**dimension
     lost = dimension * (dimension - 1) * (0.25 + 0.5 * smoothing) / (2 * radius**2)
     assert made.volume(None, grid.everywhere) / exact == pytest.approx(1.0 - lost, abs=4e-3)
     assert smoothing or made.volume(None, grid.everywhere) / exact == pytest.approx(1.0, abs=1e-2)
@@ -294,10 +345,14 @@ def test_volume_ends_at_a_wall_that_cuts_cells(dimension: int) -> None:
     distance = on_device(np.minimum(walls, cut).astype(np.float32))
     whole = nx * ny * nz * grid.cell_volume
     assert made.volume(None, grid.everywhere) == pytest.approx(whole, rel=1e-6)
-    assert made.volume(on_device(walls.astype(np.float32)), grid.everywhere) == pytest.approx(whole, rel=1e-6)
-    # some is lost where the plane meets the domain's walls: there the distance is not linear between the nodes
+    assert made.volume(on_device(walls.astype(np.float32)), grid.everywhere) == pytest.approx(
+        whole, rel=1e-6
+    )
+    # some is lost where the plane meets the domain's walls: there the distance is not linear
+    # between the nodes
     assert made.volume(distance, grid.everywhere) == pytest.approx(whole / 2, rel=6e-3)
-    assert made.volume(distance, grid.window((1, 1, 1), (8, 20, 14))) < whole / 2  # only what the window holds
+    # only what the window holds
+    assert made.volume(distance, grid.window((1, 1, 1), (8, 20, 14))) < whole / 2
     assert made.volume(None, Window((0, 0, 0), (1, 1, 1), grid.device)) == 0.0
 
 
@@ -306,13 +361,17 @@ def test_smoothing_quiets_a_surface_and_keeps_its_place() -> None:
     rng = np.random.default_rng(77)
     surface = 7.4
     points = rng.random((round(16 * 14 * surface), 3)) * [14.0, surface, 0.0]
-    scatter = [FLAT.interior(level_set(FLAT, points, 16, smoothing=n).phi.numpy())[0, 6:8].std(axis=1) for n in (0, 2)]
+    scatter = [
+        FLAT.interior(level_set(FLAT, points, 16, smoothing=n).phi.numpy())[0, 6:8].std(axis=1)
+        for n in (0, 2)
+    ]
     assert (scatter[1] < 0.8 * scatter[0]).all()
     dense = fill(FLAT, [0.0, 0.0, 0.0], [14.0, surface, 1.0], 20)
     made = level_set(FLAT, dense, 400, smoothing=2)
     expected = np.arange(16) + 0.5 - surface
     near = np.abs(expected) < 1.0
-    assert FLAT.interior(made.phi.numpy())[0, near, 3] == pytest.approx(expected[near], abs=0.04)  # the kernel is not quite normal
+    # the kernel is not quite normal
+    assert FLAT.interior(made.phi.numpy())[0, near, 3] == pytest.approx(expected[near], abs=0.04)
 
 
 def test_impossible_settings_are_refused() -> None:

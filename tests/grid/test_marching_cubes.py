@@ -52,7 +52,8 @@ def test_a_ball_has_its_volume_and_faces_outward(grid):
     out = (points - center) / radius
     assert np.abs(np.linalg.norm(out, axis=1) - 1.0).max() < 0.03
     assert pieces(points, corners) == 1
-    assert len(points) - len(corners) / 2 == (2 if grid.dimension == 3 else len(points) / 2)  # Euler's number of a sphere; of a loop 0
+    # Euler's number of a sphere; of a loop 0
+    assert len(points) - len(corners) / 2 == (2 if grid.dimension == 3 else len(points) / 2)
 
 
 def test_a_plane_is_exact():
@@ -72,7 +73,9 @@ def test_what_fills_the_domain_is_cut_on_its_sides(grid):
     size = np.array(grid.counts) * grid.spacing
     assert_closed(corners)
     x = points[:, : grid.dimension]
-    assert (np.isclose(x, 0.0, atol=1e-6) | np.isclose(x, size[: grid.dimension])).sum(axis=1).min() == 1
+    assert (np.isclose(x, 0.0, atol=1e-6) | np.isclose(x, size[: grid.dimension])).sum(
+        axis=1
+    ).min() == 1
     assert enclosed(points, corners) == pytest.approx(size[: grid.dimension].prod(), rel=1e-4)
 
 
@@ -92,7 +95,8 @@ def test_a_layer_of_one_cell_is_a_cell_thick():
     grid = StaggeredGrid((6, 5, 1), 0.5, 3)
     points, corners = mesh_of(grid, np.full(grid.shape, -1.0))
     assert_closed(corners)
-    assert enclosed(points, corners) > 0.5 * 3.0 * 2.5 * 0.5  # its edges are cut off where the centers lie
+    # its edges are cut off where the centers lie
+    assert enclosed(points, corners) > 0.5 * 3.0 * 2.5 * 0.5
 
 
 @GRIDS

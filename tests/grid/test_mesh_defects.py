@@ -63,7 +63,9 @@ def test_what_can_be_healed_is_and_is_told(spoil, words: str, share: float) -> N
     surface = close_surface(*spoil(some), "ball")
     assert len(surface.triangles) == len(TRIANGLES)
     assert np.array_equal(inside(surface), inside(close_surface(VERTICES, TRIANGLES, "ball")))
-    assert any(warning.startswith("ball: ") and words in warning for warning in surface.warnings), surface.warnings
+    assert any(warning.startswith("ball: ") and words in warning for warning in surface.warnings), (
+        surface.warnings
+    )
     assert surface.crossings.place is None
 
 
@@ -72,24 +74,45 @@ def two(shift: list[float], size: float = 1.0) -> ClosedSurface:
     return close_surface(vertices, np.concatenate([CUBE_TRIANGLES, 8 + CUBE_TRIANGLES]), "cubes")
 
 
-@pytest.mark.parametrize("shift", [[0.5, 0.5, 0.5], [0.3, 0.2, 0.1], [0.5, 0.0, 0.0], [0.9, 0.1, 0.1]])
+@pytest.mark.parametrize(
+    "shift", [[0.5, 0.5, 0.5], [0.3, 0.2, 0.1], [0.5, 0.0, 0.0], [0.9, 0.1, 0.1]]
+)
 def test_parts_that_overlap_are_their_union_and_are_told(shift: list[float]) -> None:
     surface = two(shift)
     overlap = np.prod(1.0 - np.array(shift))
     assert surface.crossings.count > 0 and surface.crossings.inverted == 0.0
-    assert ((surface.crossings.place >= 0.0) & (surface.crossings.place <= 1.0 + np.array(shift))).all()
-    union = np.any([((corner < POINTS) & (corner + 1.0 > POINTS)).all(axis=1) for corner in (np.zeros(3), np.array(shift))], axis=0)
+    assert (
+        (surface.crossings.place >= 0.0) & (surface.crossings.place <= 1.0 + np.array(shift))
+    ).all()
+    union = np.any(
+        [
+            ((corner < POINTS) & (corner + 1.0 > POINTS)).all(axis=1)
+            for corner in (np.zeros(3), np.array(shift))
+        ],
+        axis=0,
+    )
     assert np.array_equal(inside(surface), union)
     assert surface.volume == pytest.approx(2.0), "what is there twice counts twice"
     (note,) = repair_notes(TriangleMesh(surface=surface), "solid[0] (mesh)")
-    assert note.startswith("solid[0] (mesh): cubes: ") and "triangles cross others, first at [" in note
+    assert (
+        note.startswith("solid[0] (mesh): cubes: ") and "triangles cross others, first at [" in note
+    )
     if overlap > 0.05:
-        with pytest.raises(ValueError, match=r"cubes: about \d+% of its surface lies inside itself and would count twice"):
+        with pytest.raises(
+            ValueError,
+            match=r"cubes: about \d+% of its surface lies inside itself and would count twice",
+        ):
             mass_properties(TriangleMesh(surface=surface), 3, density=1.0)
 
 
 @pytest.mark.parametrize(
-    ("shift", "size"), [([1.0, 0.0, 0.0], 1.0), ([1.0, 1.0, 0.0], 1.0), ([1.0, -0.5, -0.5], 2.0), ([1.0, 0.3, 0.2], 0.5)]
+    ("shift", "size"),
+    [
+        ([1.0, 0.0, 0.0], 1.0),
+        ([1.0, 1.0, 0.0], 1.0),
+        ([1.0, -0.5, -0.5], 2.0),
+        ([1.0, 0.3, 0.2], 0.5),
+    ],
 )
 def test_parts_that_touch_are_no_crossing(shift: list[float], size: float) -> None:
     assert two(shift, size).crossings.place is None
@@ -97,7 +120,9 @@ def test_parts_that_touch_are_no_crossing(shift: list[float], size: float) -> No
 
 def test_a_part_inside_another_is_told() -> None:
     surface = two([0.25, 0.25, 0.25], 0.5)
-    assert surface.crossings.count == 0 and surface.crossings.doubled == pytest.approx(0.2, abs=0.02)
+    assert surface.crossings.count == 0 and surface.crossings.doubled == pytest.approx(
+        0.2, abs=0.02
+    )
     (note,) = repair_notes(TriangleMesh(surface=surface), "x")
     assert "a part lies inside another, at [" in note
 
@@ -108,7 +133,11 @@ def test_a_part_that_is_turned_out_of_itself_is_refused() -> None:
     vertices[:, 0] *= vertices[:, 2] + 0.3
     surface = close_surface(vertices, TRIANGLES, "eight")
     assert surface.crossings.inverted > 0.2
-    with pytest.raises(ValueError, match=r"solid: eight: \d+ of its 320 triangles cross others, first at .* is inside out there"):
+    with pytest.raises(
+        ValueError,
+        match=r"solid: eight: \d+ of its 320 triangles cross others, first at .* is inside out "
+        r"there",
+    ):
         repair_notes(TriangleMesh(surface=surface), "solid")
 
 
@@ -120,7 +149,9 @@ def test_a_dent_is_fine_and_one_through_the_other_side_is_told() -> None:
 
 
 @pytest.mark.parametrize(
-    "surface", [builtin_mesh("torus"), builtin_mesh("knot"), close_surface(*icosphere(4), "ball")], ids=lambda s: s.name
+    "surface",
+    [builtin_mesh("torus"), builtin_mesh("knot"), close_surface(*icosphere(4), "ball")],
+    ids=lambda s: s.name,
 )
 def test_whole_meshes_have_no_crossing(surface: ClosedSurface) -> None:
     assert surface.crossings.place is None

@@ -36,7 +36,9 @@ def test_noise_goes_and_volume_stays(grid):
     assert np.array_equal(mesh.corners.numpy(), corners)
     assert enclosed(after, corners) == pytest.approx(enclosed(before, corners), rel=1.5e-3)
     axes = slice(grid.dimension)
-    rough = [(np.linalg.norm((x - center)[:, axes], axis=1) - radius).std() for x in (before, after)]
+    rough = [
+        (np.linalg.norm((x - center)[:, axes], axis=1) - radius).std() for x in (before, after)
+    ]
     assert rough[1] < 0.8 * rough[0]
     assert np.linalg.norm(after - before, axis=1).max() < MOST + 1e-4
 
@@ -59,7 +61,9 @@ def test_walls_and_solids_hold_their_points():
 def test_a_drop_of_six_points_stays_a_drop():
     phi = np.full(GRID.shape, 0.6, dtype=np.float32)
     phi[20, 21, 22] = -0.4
-    mesh = MarchingCubes(GRID).contour(wp.array(phi, device="cpu"), wp.empty(GRID.shape, dtype=wp.int32, device="cpu"))
+    mesh = MarchingCubes(GRID).contour(
+        wp.array(phi, device="cpu"), wp.empty(GRID.shape, dtype=wp.int32, device="cpu")
+    )
     before = enclosed(mesh.points.numpy(), mesh.corners.numpy())
     smooth(mesh, GRID, None, 3)
     assert_closed(mesh.corners.numpy())
@@ -67,6 +71,8 @@ def test_a_drop_of_six_points_stays_a_drop():
 
 
 def test_nothing_stays_nothing():
-    empty = DeviceMesh(wp.empty(0, dtype=wp.vec3, device="cpu"), wp.empty((0, 3), dtype=wp.int32, device="cpu"))
+    empty = DeviceMesh(
+        wp.empty(0, dtype=wp.vec3, device="cpu"), wp.empty((0, 3), dtype=wp.int32, device="cpu")
+    )
     smooth(empty, GRID, None, 3)
     assert len(empty.points) == 0

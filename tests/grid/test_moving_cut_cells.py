@@ -22,12 +22,17 @@ def test_a_moving_plane_sweeps_what_its_velocity_says():
     grid, velocity, dt = grid_of(2, (9, 7), 0.1), np.array([0.3, -0.2]), 1e-3
     direction = np.array([0.8, 0.6])
     plane = Plane(point=[0.33, 0.27], normal=direction)
-    cut = CutCells(grid, [placed(plane, motion=Translation(velocity=velocity))], wall_separating=True)
+    cut = CutCells(
+        grid, [placed(plane, motion=Translation(velocity=velocity))], wall_separating=True
+    )
     time = 0.2
     cut.move(time, dt)
     u, v = (field.numpy()[1] for field in cut.velocity)
     a, b = (field.numpy()[1] for field in cut.open)
-    offset = [direction @ ((np.array([0.33, 0.27]) + velocity * t) / 0.1 + 1.0) for t in (time - 0.5 * dt, time + 0.5 * dt)]
+    offset = [
+        direction @ ((np.array([0.33, 0.27]) + velocity * t) / 0.1 + 1.0)
+        for t in (time - 0.5 * dt, time + 0.5 * dt)
+    ]
     swept = np.zeros((7, 9))
     for j, i in itertools.product(range(1, 8), range(1, 10)):
         before, after = (open_volume(grid, direction, o, (i, j)) for o in offset)
@@ -62,13 +67,20 @@ def test_velocity_is_that_of_the_way_between_two_times():
         velocity, wall = cut.velocity[axis].numpy()[1], cut.wall[axis].numpy()[1]
         for j, i in itertools.product(range(1, 11), range(1, 11)):
             x = (np.array([i, j]) - 1.0 + 0.5 * (np.arange(2) != axis)) * 0.1 - 0.5
-            way = np.array([cosine * x[0] - cosine * x[1] - x[0], cosine * x[0] + cosine * x[1] - x[1]]) / 0.5
+            way = (
+                np.array(
+                    [cosine * x[0] - cosine * x[1] - x[0], cosine * x[0] + cosine * x[1] - x[1]]
+                )
+                / 0.5
+            )
             assert velocity[j, i] == pytest.approx(way[axis] if wall[j, i] == 2 else 0.0, abs=1e-5)
             faces += wall[j, i] == 2
     assert faces > 20
     cut.move(1.5, 0.5)  # the same two times, but at a face is now the point that the way ends at
     x = np.array([0.6, 0.55]) - 0.5
-    way = np.array([x[0] - cosine * x[0] - cosine * x[1], x[1] + cosine * x[0] - cosine * x[1]]) / 0.5
+    way = (
+        np.array([x[0] - cosine * x[0] - cosine * x[1], x[1] + cosine * x[0] - cosine * x[1]]) / 0.5
+    )
     assert cut.wall[0].numpy()[1, 6, 7] == 2
     assert cut.velocity[0].numpy()[1, 6, 7] == pytest.approx(way[0], abs=1e-5)
     with pytest.raises(ValueError, match="two different times"):
@@ -82,20 +94,35 @@ def test_moving_solids_are_as_if_placed_there(dimension, which):
     grid = grid_of(dimension, (12, 9, 7), 0.1)
     geometry, motion = MOVING[dimension][which]
     still = [
-        placed(Box(lower=[0.3, 0.0, 0.0][:dimension], upper=[1.3, 0.1, 0.7][:dimension]), name="slab of one cell"),
-        placed(Plane(point=[0.0, 0.21, 0.0][:dimension], normal=[0.2, 1.0, 0.0][:dimension]), name="slope"),
+        placed(
+            Box(lower=[0.3, 0.0, 0.0][:dimension], upper=[1.3, 0.1, 0.7][:dimension]),
+            name="slab of one cell",
+        ),
+        placed(
+            Plane(point=[0.0, 0.21, 0.0][:dimension], normal=[0.2, 1.0, 0.0][:dimension]),
+            name="slope",
+        ),
     ]
-    moving = CutCells(grid, [still[0], placed(geometry, motion=motion), still[1]], wall_separating=True)
+    moving = CutCells(
+        grid, [still[0], placed(geometry, motion=motion), still[1]], wall_separating=True
+    )
     alone = CutCells(grid, still, wall_separating=True)
     for time in (0.5, 2.2, 1.0):
         moving.move(time, 0.1)
-        there = CutCells(grid, [still[0], placed(geometry.moved(motion.pose(time))), still[1]], wall_separating=True)
+        there = CutCells(
+            grid,
+            [still[0], placed(geometry.moved(motion.pose(time))), still[1]],
+            wall_separating=True,
+        )
         for one, other in zip(fields_of(moving), fields_of(there), strict=True):
             np.testing.assert_array_equal(one, other)
         assert moving.dropped == there.dropped
-        for velocity, wall, open_, before in zip(moving.velocity, moving.wall, moving.open, alone.open, strict=True):
+        for velocity, wall, open_, before in zip(
+            moving.velocity, moving.wall, moving.open, alone.open, strict=True
+        ):
             as_before = (open_.numpy() == before.numpy()) & (wall.numpy() != 0)
-            assert (np.abs(velocity.numpy()[as_before]) < 2e-3).all()  # of a dropped fraction, at most
+            # of a dropped fraction, at most
+            assert (np.abs(velocity.numpy()[as_before]) < 2e-3).all()
 
 
 def test_solids_that_stand_still_ignore_moves():
@@ -123,7 +150,8 @@ def test_a_solid_may_come_in_later():
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_what_a_moving_solid_covers_of_a_resting_one_does_not_move(dimension):
     """A piston slides over a floor 0.37 cells above faces: 0.63 of its front's lowest faces displace liquid, nothing of what lies in the
-    floor. If the whole face moved, the liquid would be pushed at 1.6 times the piston's speed there."""
+    floor. If the whole face moved, the liquid would be pushed at 1.6 times the piston's speed
+    there."""
     grid = grid_of(dimension, (12, 9, 7), 0.1)
     piston = Box(lower=[-9.0] * dimension, upper=[0.44, 9.0, 9.0][:dimension])
     floor = Box(lower=[-9.0] * dimension, upper=[9.0, 0.237, 9.0][:dimension])
@@ -131,7 +159,9 @@ def test_what_a_moving_solid_covers_of_a_resting_one_does_not_move(dimension):
     for order in (solids, solids[::-1]):
         cut = CutCells(grid, order, wall_separating=True)
         cut.set_velocity(0.0, 0.01)
-        displaced = (cut.velocity[0].numpy() * (1.0 - cut.open[0].numpy()))[1 : 1 + (1 if dimension == 2 else 7), 1:-1]
+        displaced = (cut.velocity[0].numpy() * (1.0 - cut.open[0].numpy()))[
+            1 : 1 + (1 if dimension == 2 else 7), 1:-1
+        ]
         np.testing.assert_allclose(displaced[:, 2, 1:5], 1.26, atol=1e-4)
         np.testing.assert_allclose(displaced[:, 3:, 1:5], 2.0, atol=1e-4)
         np.testing.assert_allclose(displaced[:, :2], 0.0, atol=1e-4)
@@ -144,7 +174,9 @@ def test_a_solid_may_be_near_the_ring_alone(dimension):
     """A node outside the domain is near it, but no face inside: there is nothing to fill, and nothing to divide by."""
     grid = grid_of(dimension, (6, 5, 4), 0.1)
     for corner in ([-1.0, 0.2, 0.2], [0.3, 0.9 + 0.05, 0.2], [0.3, 0.2, -0.55]):
-        ball = placed(Sphere(center=corner[:dimension], radius=0.05), motion=Translation(velocity=[0.1, 0.0]))
+        ball = placed(
+            Sphere(center=corner[:dimension], radius=0.05), motion=Translation(velocity=[0.1, 0.0])
+        )
         cut = CutCells(grid, [ball], wall_separating=True)
         for time in np.linspace(0.0, 8.0, 33):
             cut.place(time)

@@ -24,19 +24,27 @@ PAIRS = [(WHOLE, PART), (FLAT, FLAT_PART)]
 
 def stored(part: StaggeredGrid) -> tuple[slice, ...]:
     """Return where a part's stored cells lie in the whole grid's stored cells."""
-    return tuple(slice(low, low + n) for low, n in zip(reversed(part.origin), part.shape, strict=True))
+    return tuple(
+        slice(low, low + n) for low, n in zip(reversed(part.origin), part.shape, strict=True)
+    )
 
 
 def away(part: StaggeredGrid, layers: int) -> tuple[slice, ...]:
     """Return the stored cells of a part that are some layers from its stored ends along the axes that are cut."""
     cut = [n != m for n, m in zip(reversed(part.counts), reversed(part.whole), strict=True)]
-    return tuple(slice(layers, n - layers) if c else slice(None) for c, n in zip(cut, part.shape, strict=True))
+    return tuple(
+        slice(layers, n - layers) if c else slice(None)
+        for c, n in zip(cut, part.shape, strict=True)
+    )
 
 
 def points(part: StaggeredGrid, margin: float, n: int = 4000) -> np.ndarray:
     """Return points in a part, some cells away from its sides at cuts."""
     rng = np.random.default_rng(271)
-    low, high = np.array(part.origin, dtype=float), np.array(part.origin) + np.array(part.counts, dtype=float)
+    low, high = (
+        np.array(part.origin, dtype=float),
+        np.array(part.origin) + np.array(part.counts, dtype=float),
+    )
     cut = np.array([a != b for a, b in zip(part.counts, part.whole, strict=True)])
     low, high = low + np.where(cut, margin, 0.01), high - np.where(cut, margin, 0.01)
     found = rng.uniform(low, high, (n, 3)) * part.spacing
@@ -49,7 +57,9 @@ def fields(whole: StaggeredGrid, part: StaggeredGrid) -> tuple[list[wp.array], l
     """Return velocities of both grids."""
     rng = np.random.default_rng(31)
     hosts = [rng.normal(size=whole.shape).astype(np.float32) for _ in range(whole.dimension)]
-    return [wp.array(h, device="cpu") for h in hosts], [wp.array(np.ascontiguousarray(h[stored(part)]), device="cpu") for h in hosts]
+    return [wp.array(h, device="cpu") for h in hosts], [
+        wp.array(np.ascontiguousarray(h[stored(part)]), device="cpu") for h in hosts
+    ]
 
 
 @pytest.mark.parametrize(("whole", "part"), PAIRS)
@@ -64,10 +74,26 @@ def test_particles_have_the_same_cells_and_give_faces_and_cells_the_same(whole, 
             gradient.assign(velocity)
         particles.sort()
         faces, weights, density = grid.faces(), grid.faces(), grid.field()
-        particles_to_faces(grid, particles.position, particles.velocity, particles.affine, faces, weights, offsets=particles.offsets)
+        particles_to_faces(
+            grid,
+            particles.position,
+            particles.velocity,
+            particles.affine,
+            faces,
+            weights,
+            offsets=particles.offsets,
+        )
         particle_density(grid, particles, grid.everywhere, 8, density)
-        key = np.stack(np.unravel_index(particles.key.numpy()[: particles.count], grid.shape), axis=1)
-        results.append((key + grid.origin[::-1], particles.position.numpy(), [f.numpy() for f in (*faces, *weights, density)]))
+        key = np.stack(
+            np.unravel_index(particles.key.numpy()[: particles.count], grid.shape), axis=1
+        )
+        results.append(
+            (
+                key + grid.origin[::-1],
+                particles.position.numpy(),
+                [f.numpy() for f in (*faces, *weights, density)],
+            )
+        )
     (keys, order, given), (part_keys, part_order, part_given) = results
     np.testing.assert_array_equal(part_keys, keys)
     np.testing.assert_array_equal(part_order, order)
@@ -82,7 +108,9 @@ def test_faces_give_particles_the_same(whole, part):
     for grid, faces in zip((whole, part), fields(whole, part), strict=True):
         particles = Particles(grid, position, np.zeros_like(position), affine=True)
         faces_to_particles(grid, faces, particles.position, particles.velocity, particles.affine)
-        results.append([particles.velocity.numpy(), *(gradient.numpy() for gradient in particles.affine)])
+        results.append(
+            [particles.velocity.numpy(), *(gradient.numpy() for gradient in particles.affine)]
+        )
     for a, b in zip(*results, strict=True):
         np.testing.assert_array_equal(a, b)
 
@@ -101,17 +129,35 @@ def test_particles_move_alike_among_walls(whole, part, walls):
     distance = (np.hypot(place[0] - 52.3, place[1] - 4.4) - 2.2).astype(np.float32)
     k, j, i = (np.floor(position / whole.spacing).astype(int) + 1).T[::-1]
     k[:] = k if whole.dimension == 3 else 1
-    position = position[cells[k, j, i] == 0] if walls == "cells" else position[distance[k, j, i] > 2.0]
+    position = (
+        position[cells[k, j, i] == 0] if walls == "cells" else position[distance[k, j, i] > 2.0]
+    )
     for grid, faces in zip((whole, part), fields(whole, part), strict=True):
-        where, stopped = wp.array(position, dtype=wp.vec3, device="cpu"), wp.zeros(1, dtype=wp.int32, device="cpu")
+        where, stopped = (
+            wp.array(position, dtype=wp.vec3, device="cpu"),
+            wp.zeros(1, dtype=wp.int32, device="cpu"),
+        )
         box = (slice(None),) * 3 if grid is whole else stored(part)
         if walls == "cells":
-            room = clearance(grid, wp.array(np.ascontiguousarray(cells[box]), dtype=wp.int8, device="cpu"))
+            room = clearance(
+                grid, wp.array(np.ascontiguousarray(cells[box]), dtype=wp.int8, device="cpu")
+            )
             advect(grid, faces, room, 0.6 * SPACING, where, stopped)
         else:
-            near, cuts = wp.array(np.ascontiguousarray(distance[box]), device="cpu"), side_bits(("left", "right", "back", "front"))
-            open_sides = 0 if grid is whole else cuts if grid.dimension == 3 else side_bits(("left", "right"))
-            advect_with_distance(grid, faces, near, 0.6 * SPACING, where, stopped, open_sides=open_sides)
+            near, cuts = (
+                wp.array(np.ascontiguousarray(distance[box]), device="cpu"),
+                side_bits(("left", "right", "back", "front")),
+            )
+            open_sides = (
+                0
+                if grid is whole
+                else cuts
+                if grid.dimension == 3
+                else side_bits(("left", "right"))
+            )
+            advect_with_distance(
+                grid, faces, near, 0.6 * SPACING, where, stopped, open_sides=open_sides
+            )
         results.append(where.numpy())
         stops.append(int(stopped.numpy()[0]))
     np.testing.assert_array_equal(*results)
@@ -125,7 +171,16 @@ def test_parts_are_seeded_as_the_whole_is(whole, part, jitter):
     regions = [lambda p: p[:, 0] + p[:, 1] < 0.8, lambda p: p[:, 0] > 0.75]
     results = []
     for grid in (whole, part):
-        results.append(seed(grid, regions, np.ones(grid.counts[::-1], dtype=bool), per_axis=2, jitter=jitter, random_seed=99))
+        results.append(
+            seed(
+                grid,
+                regions,
+                np.ones(grid.counts[::-1], dtype=bool),
+                per_axis=2,
+                jitter=jitter,
+                random_seed=99,
+            )
+        )
     (position, owner), (part_position, part_owner) = results
     cell = np.floor(position.astype(np.float64) / SPACING).astype(int) - part.origin
     cell[:, 2] = cell[:, 2] if whole.dimension == 3 else 0
@@ -138,23 +193,37 @@ def test_parts_are_seeded_as_the_whole_is(whole, part, jitter):
 def ball(grid: StaggeredGrid) -> PlacedSolid:
     """Return a solid in the middle of the part."""
     center = np.array([52.3, 4.7, 9.6][: grid.dimension]) * SPACING
-    return PlacedSolid(geometry=Sphere(center=center.tolist(), radius=2.4 * SPACING), separating=True, name="ball")
+    return PlacedSolid(
+        geometry=Sphere(center=center.tolist(), radius=2.4 * SPACING), separating=True, name="ball"
+    )
 
 
 @pytest.mark.parametrize(("whole", "part"), PAIRS)
 def test_solids_cut_the_same_cells(whole, part):
     solids = [ball(whole)]
-    cuts = side_bits(("left", "right", "back", "front") if whole.dimension == 3 else ("left", "right"))
+    cuts = side_bits(
+        ("left", "right", "back", "front") if whole.dimension == 3 else ("left", "right")
+    )
     of_whole = CutCells(whole, solids, wall_separating=True)
     of_part = CutCells(part, solids, wall_separating=True, open_sides=cuts, remarks=False)
     inner = away(part, 2)
-    pairs = [(of_whole.base, of_part.base), (of_whole.capacity, of_part.capacity), (of_whole.distance, of_part.distance)]
-    for a, b in [*pairs, *zip(of_whole.open, of_part.open, strict=True), *zip(of_whole.wall, of_part.wall, strict=True)]:
+    pairs = [
+        (of_whole.base, of_part.base),
+        (of_whole.capacity, of_part.capacity),
+        (of_whole.distance, of_part.distance),
+    ]
+    for a, b in [
+        *pairs,
+        *zip(of_whole.open, of_part.open, strict=True),
+        *zip(of_whole.wall, of_part.wall, strict=True),
+    ]:
         np.testing.assert_array_equal(b.numpy()[inner], a.numpy()[stored(part)][inner])
     assert not of_part.whole_cells
     voxels = [voxelize(g, solids, wall_separating=True, remarks=g is whole) for g in (whole, part)]
     inner = away(part, 1)
-    np.testing.assert_array_equal(voxels[1].index.numpy()[inner], voxels[0].index.numpy()[stored(part)][inner])
+    np.testing.assert_array_equal(
+        voxels[1].index.numpy()[inner], voxels[0].index.numpy()[stored(part)][inner]
+    )
     assert voxels[0].covered == voxels[1].covered > (10,)
 
 

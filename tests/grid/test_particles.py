@@ -5,14 +5,24 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import warp_lcp as wl
-from warp_lcp.grid.particles import MARGIN, SORT_EVERY, Particles, _rows_of_sort, lattice, seed, sort_keys
+from warp_lcp.grid.particles import (
+    MARGIN,
+    SORT_EVERY,
+    Particles,
+    _rows_of_sort,
+    lattice,
+    seed,
+    sort_keys,
+)
 from warp_lcp.grid.staggered import StaggeredGrid
 
 FLAT = StaggeredGrid((7, 5, 1), 0.2, 2)
 SOLID = StaggeredGrid((7, 5, 4), 0.2, 3)
 
 
-def random_particles(grid: StaggeredGrid, n: int, random_seed: int, *, affine: bool = True) -> Particles:
+def random_particles(
+    grid: StaggeredGrid, n: int, random_seed: int, *, affine: bool = True
+) -> Particles:
     rng = np.random.default_rng(random_seed)
     position = rng.random((n, 3)) * np.array(grid.counts) * grid.spacing
     position[:, grid.dimension :] = 0.0
@@ -25,12 +35,18 @@ def random_particles(grid: StaggeredGrid, n: int, random_seed: int, *, affine: b
 @pytest.mark.parametrize("grid", [FLAT, SOLID], ids=["2d", "3d"])
 @settings(max_examples=20, deadline=None)
 @given(n=st.integers(1, 3000), random_seed=st.integers(0, 10**6))
-def test_sort_orders_by_cell_and_keeps_particles_whole(grid: StaggeredGrid, n: int, random_seed: int) -> None:
+def test_sort_orders_by_cell_and_keeps_particles_whole(
+    grid: StaggeredGrid, n: int, random_seed: int
+) -> None:
     particles = random_particles(grid, n, random_seed)
     before = {name: array.numpy().copy() for name, array in particles.arrays().items()}
     particles.sort()
     cells = particles.cells_of(before["position"])
-    key = ((cells[:, 2] + 1) * (grid.counts[1] + 2) + cells[:, 1] + 1) * (grid.counts[0] + 2) + cells[:, 0] + 1
+    key = (
+        ((cells[:, 2] + 1) * (grid.counts[1] + 2) + cells[:, 1] + 1) * (grid.counts[0] + 2)
+        + cells[:, 0]
+        + 1
+    )
     order = np.argsort(key, kind="stable")
     assert (particles.key.numpy()[:n] == key[order]).all()
     assert set(before) == {"position", "velocity"} | {f"affine_{c}" for c in range(grid.dimension)}
@@ -38,8 +54,12 @@ def test_sort_orders_by_cell_and_keeps_particles_whole(grid: StaggeredGrid, n: i
         assert (array.numpy() == before[name][order]).all()
 
 
-@pytest.mark.parametrize(("count", "bits"), [(1, 4), (50, 1), (999, 9), (3000, 18), (1000, 22), (1000, 23), (500, 31)])
-def test_keys_are_sorted_as_numpy_sorts_them(count: int, bits: int, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("count", "bits"), [(1, 4), (50, 1), (999, 9), (3000, 18), (1000, 22), (1000, 23), (500, 31)]
+)
+def test_keys_are_sorted_as_numpy_sorts_them(
+    count: int, bits: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """In pieces of 100 keys, on any number of threads; what lies behind the keys is scratch memory."""
     monkeypatch.setattr("warp_lcp.grid.particles.CPU_GRAIN", 100)
     monkeypatch.setattr("warp_lcp.rows.team.CELLS", 1)
@@ -51,8 +71,18 @@ def test_keys_are_sorted_as_numpy_sorts_them(count: int, bits: int, monkeypatch:
             wl.set_threads(threads)
             key = wp.array(np.append(keys, rng.integers(0, 9, count)), dtype=wp.int32, device="cpu")
             order = wp.full(2 * count, -7, dtype=wp.int32, device="cpu")
-            rows, counts = _rows_of_sort(count, key.device), wp.zeros(32 * (2048 + 16), dtype=wp.int32, device="cpu")
-            sort_keys((key[:count], key[count:]), (order[:count], order[count:]), counts, rows, rows.places, bits)
+            rows, counts = (
+                _rows_of_sort(count, key.device),
+                wp.zeros(32 * (2048 + 16), dtype=wp.int32, device="cpu"),
+            )
+            sort_keys(
+                (key[:count], key[count:]),
+                (order[:count], order[count:]),
+                counts,
+                rows,
+                rows.places,
+                bits,
+            )
             np.testing.assert_array_equal(order.numpy()[:count], expected)
             np.testing.assert_array_equal(key.numpy()[:count], keys[expected])
     finally:
@@ -78,16 +108,29 @@ def test_numbers_are_the_cells_whatever_the_order(grid: StaggeredGrid) -> None:
     before = particles.position.numpy().copy()
     particles.number()
     cells = particles.cells_of(before)
-    assert (keys(particles) == ((cells[:, 2] + 1) * (grid.counts[1] + 2) + cells[:, 1] + 1) * (grid.counts[0] + 2) + cells[:, 0] + 1).all()
+    assert (
+        keys(particles)
+        == ((cells[:, 2] + 1) * (grid.counts[1] + 2) + cells[:, 1] + 1) * (grid.counts[0] + 2)
+        + cells[:, 0]
+        + 1
+    ).all()
     assert (particles.position.numpy() == before).all()
 
 
 def test_the_order_is_restored_every_few_steps_or_in_each() -> None:
     for indexed in (False, True):
         particles = random_particles(SOLID, 500, 41)
-        particles = Particles(SOLID, particles.position.numpy(), particles.velocity.numpy(), affine=False, indexed=indexed)
+        particles = Particles(
+            SOLID,
+            particles.position.numpy(),
+            particles.velocity.numpy(),
+            affine=False,
+            indexed=indexed,
+        )
         for step in range(2 * SORT_EVERY + 1):
-            particles.position.assign(np.random.default_rng(step).permutation(particles.position.numpy()))
+            particles.position.assign(
+                np.random.default_rng(step).permutation(particles.position.numpy())
+            )
             particles.arrange(step)
             in_order = (np.diff(keys(particles)) >= 0).all()
             assert in_order == (indexed or step % SORT_EVERY == 0)
@@ -110,7 +153,10 @@ def test_appended_particles_come_behind_and_storage_grows_geometrically() -> Non
     for _ in range(200):
         more = rng.random((7, 3)).astype(np.float32)
         particles.append(more, -more)
-        rest = {n: np.concatenate([a, {"position": more, "velocity": -more}.get(n, np.zeros((7, 3)))]) for n, a in rest.items()}
+        rest = {
+            n: np.concatenate([a, {"position": more, "velocity": -more}.get(n, np.zeros((7, 3)))])
+            for n, a in rest.items()
+        }
         capacities.append(particles.capacity)
     assert particles.count == 1500
     for name, array in particles.arrays().items():
@@ -130,7 +176,10 @@ def test_appended_particles_come_behind_and_storage_grows_geometrically() -> Non
 
 def test_totals_are_the_sums_and_repeatable() -> None:
     particles = random_particles(SOLID, 5000, 901, affine=False)
-    x, v = particles.position.numpy().astype(np.float64), particles.velocity.numpy().astype(np.float64)
+    x, v = (
+        particles.position.numpy().astype(np.float64),
+        particles.velocity.numpy().astype(np.float64),
+    )
     totals = particles.totals()
     assert totals.mean_square_speed == pytest.approx((v**2).sum(axis=1).mean(), rel=1e-6)
     assert totals.center == pytest.approx(x.mean(axis=0), rel=1e-6)
@@ -169,7 +218,14 @@ def test_removing_keeps_the_others_in_order_and_in_place(keep: float) -> None:
     particles = random_particles(FLAT, 500, 31)
     position, velocity = particles.position.numpy().copy(), particles.velocity.numpy().copy()
     gone = np.random.default_rng(12).random(500) >= keep
-    storage, memory = particles.capacity, {particles.key.ptr, *(a.ptr for a in particles.arrays().values()), particles._spare.store.ptr}
+    storage, memory = (
+        particles.capacity,
+        {
+            particles.key.ptr,
+            *(a.ptr for a in particles.arrays().values()),
+            particles._spare.store.ptr,
+        },
+    )
     marks = particles.marks
     marks.assign(gone.astype(np.int32))
     assert particles.remove(marks) == gone.sum()
@@ -177,7 +233,11 @@ def test_removing_keeps_the_others_in_order_and_in_place(keep: float) -> None:
     np.testing.assert_array_equal(particles.position.numpy(), position[~gone])
     np.testing.assert_array_equal(particles.velocity.numpy(), velocity[~gone])
     assert particles.capacity == storage
-    assert {particles.key.ptr, *(a.ptr for a in particles.arrays().values()), particles._spare.store.ptr} == memory
+    assert {
+        particles.key.ptr,
+        *(a.ptr for a in particles.arrays().values()),
+        particles._spare.store.ptr,
+    } == memory
     particles.arrange(0)
     assert particles.totals().count == (~gone).sum()
     particles.append(position[:3], velocity[:3])
@@ -189,7 +249,10 @@ def test_removed_particles_are_counted_by_their_marks(seed: int) -> None:
     draw = np.random.default_rng([99, seed])
     particles = random_particles(FLAT, 300, seed)
     for _ in range(3):
-        marks, position = draw.choice([0, 0, 0, 1, 2, 7], particles.count), particles.position.numpy().copy()
+        marks, position = (
+            draw.choice([0, 0, 0, 1, 2, 7], particles.count),
+            particles.position.numpy().copy(),
+        )
         particles.marks.assign(marks.astype(np.int32))
         particles.launch_removal(particles.marks)
         assert particles.finish_removal(particles.marks) == ((marks == 1).sum(), (marks > 1).sum())
@@ -249,7 +312,14 @@ def test_seeds_stay_out_of_solids_and_are_not_doubled(grid: StaggeredGrid) -> No
 
 
 def test_the_widest_jitter_leaves_no_particle_on_the_edge() -> None:
-    position, _ = seed(FLAT, [lambda p: p[:, 0] >= 0], np.ones((1, 5, 7), bool), per_axis=4, jitter=1.0, random_seed=5)
+    position, _ = seed(
+        FLAT,
+        [lambda p: p[:, 0] >= 0],
+        np.ones((1, 5, 7), bool),
+        per_axis=4,
+        jitter=1.0,
+        random_seed=5,
+    )
     size = np.array(FLAT.counts) * FLAT.spacing
     assert position[:, :2].min() > 0.5 * MARGIN * FLAT.spacing
     assert (position[:, :2].max(axis=0) < size[:2] - 0.5 * MARGIN * FLAT.spacing).all()

@@ -18,8 +18,13 @@ def compare_meshes(seed: int, dimension: int) -> None:
     rng = np.random.default_rng(seed)
     counts = (22, 17) if dimension == 2 else (15, 13, 11)
     grid = grid_of(dimension, counts, 1.0 / counts[0])
-    placement = Placement(scale=rng.uniform(0.2, 0.6), translation=np.append(rng.uniform(0.2, 0.6, dimension), 0.0)[:3])
-    mesh = TriangleMesh(surface=builtin_mesh("torus"), placement=placement, invert=bool(rng.random() < 0.2))
+    placement = Placement(
+        scale=rng.uniform(0.2, 0.6),
+        translation=np.append(rng.uniform(0.2, 0.6, dimension), 0.0)[:3],
+    )
+    mesh = TriangleMesh(
+        surface=builtin_mesh("torus"), placement=placement, invert=bool(rng.random() < 0.2)
+    )
     ball = Sphere(center=rng.uniform(0.2, 0.7, dimension), radius=0.15)
     table, sampler = PlacedMesh(grid, 2, mesh), NodeSampler(grid)
     fields = [NodeDistances(grid, second=True) for _ in range(2)]
@@ -46,7 +51,8 @@ def compare_gaps(seed: int, dimension: int) -> int:
     n = 12
     grid = grid_of(dimension, (n,) * dimension, 1.0 / n)
     solids = []
-    for number in range(1, 7):  # plates and blocks, some next to a gap of one cell, some one cell thick
+    # plates and blocks, some next to a gap of one cell, some one cell thick
+    for number in range(1, 7):
         low = rng.integers(1, n - 3, dimension)
         high = low + rng.integers(1, 4, dimension)
         solids.append((number, Box(lower=low / n, upper=high / n)))
@@ -72,12 +78,17 @@ def test_a_plate_that_a_mesh_fills_is_no_gap() -> None:
     """A cell between two plates is a gap until a mesh lies in it, whose surface leaves the corners at distance 0."""
     n = 12
     grid = grid_of(3, (n,) * 3, 1.0 / n)
-    plates = [(1, Box(lower=[4 / n] * 3, upper=[8 / n, 5 / n, 8 / n])), (2, Box(lower=[4 / n, 6 / n, 4 / n], upper=[8 / n, 7 / n, 8 / n]))]
+    plates = [
+        (1, Box(lower=[4 / n] * 3, upper=[8 / n, 5 / n, 8 / n])),
+        (2, Box(lower=[4 / n, 6 / n, 4 / n], upper=[8 / n, 7 / n, 8 / n])),
+    ]
     nodes, sampler = NodeDistances(grid, second=True), NodeSampler(grid)
     for number, geometry in plates:
         sampler.enter(nodes, number, geometry)
     found = []
-    torus = TriangleMesh(surface=builtin_mesh("torus"), placement=Placement(scale=0.01, translation=np.full(3, 2.5)))
+    torus = TriangleMesh(
+        surface=builtin_mesh("torus"), placement=Placement(scale=0.01, translation=np.full(3, 2.5))
+    )
     for inverted in (False, True):  # far away: outside of it, or inside what is not it
         mesh = TriangleMesh(surface=torus.surface, placement=torus.placement, invert=inverted)
         marks = wp.zeros(grid.shape, dtype=wp.int8, device=grid.device)
@@ -91,4 +102,10 @@ def test_a_plate_that_a_mesh_fills_is_no_gap() -> None:
 
 def test_unions_of_meshes_are_left_to_the_sampler() -> None:
     mesh = TriangleMesh(surface=builtin_mesh("torus"))
-    assert tables_of(grid_of(3, (6, 6, 6), 1 / 6), [(1, Union(parts=(mesh, Sphere(center=[0.5] * 3, radius=0.1))))]) is None
+    assert (
+        tables_of(
+            grid_of(3, (6, 6, 6), 1 / 6),
+            [(1, Union(parts=(mesh, Sphere(center=[0.5] * 3, radius=0.1))))],
+        )
+        is None
+    )

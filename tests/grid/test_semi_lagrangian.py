@@ -24,10 +24,19 @@ def uniform(grid: StaggeredGrid, velocity: tuple[float, ...]) -> list[wp.array]:
     return faces
 
 
-def carried(grid: StaggeredGrid, velocity: list[wp.array], dt: float, values: np.ndarray, axis: int, level: np.ndarray | None = None):
+def carried(
+    grid: StaggeredGrid,
+    velocity: list[wp.array],
+    dt: float,
+    values: np.ndarray,
+    axis: int,
+    level: np.ndarray | None = None,
+):
     """Return a field after a step."""
     levels = np.ones(grid.shape) if level is None else level
-    field, out = (wp.array(v.astype(np.float32), device="cpu") for v in (values, np.full(grid.shape, -7.0)))
+    field, out = (
+        wp.array(v.astype(np.float32), device="cpu") for v in (values, np.full(grid.shape, -7.0))
+    )
     carry_field(
         grid,
         grid.everywhere,
@@ -113,7 +122,8 @@ def test_places_without_the_level_are_left_alone():
     level[:, :, 5:] = 0.9
     x = coordinates(grid, 0)[0]
     out = carried(grid, uniform(grid, (0.5, 0.0)), 1.0, x, 0, level)
-    assert np.array_equal(out[1, 1:9, 1:6], x.astype(np.float32)[1, 1:9, 1:6])  # face 5 lies at the mean of 0 and 0.9
+    # face 5 lies at the mean of 0 and 0.9
+    assert np.array_equal(out[1, 1:9, 1:6], x.astype(np.float32)[1, 1:9, 1:6])
     assert np.allclose(out[1, 1:9, 6:9], x[1, 1:9, 6:9] - 0.5)
     out = carried(grid, uniform(grid, (0.5, 0.0)), 1.0, x, CENTERS, level)
     assert not out[1, 1:9, 1:5].any() and out[1, 1:9, 6:9].all()

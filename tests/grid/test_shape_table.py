@@ -20,17 +20,26 @@ def random_solid(rng, dimension, parts=True):
     """A shape of any kind, or a union: turned, scaled, now and then inverted."""
     kind = rng.integers(5 if parts else 4)
     if kind == 4:
-        return Union(parts=tuple(random_solid(rng, dimension, False) for _ in range(rng.integers(1, 4))))
+        return Union(
+            parts=tuple(random_solid(rng, dimension, False) for _ in range(rng.integers(1, 4)))
+        )
     low = rng.uniform(0.1, 0.7, dimension)
     shift = np.append(rng.uniform(-0.1, 0.1, dimension), [0.0])[:3]
-    placement = Placement(scale=rng.uniform(0.5, 1.5), rotation=turn(rng, dimension), translation=shift)
+    placement = Placement(
+        scale=rng.uniform(0.5, 1.5), rotation=turn(rng, dimension), translation=shift
+    )
     common = {"placement": placement, "invert": bool(rng.random() < 0.1)}
     if kind == 0:
         return Box(lower=low, upper=low + rng.uniform(0.05, 0.3, dimension), **common)
     if kind == 1:
         return Sphere(center=low, radius=rng.uniform(0.05, 0.2), **common)
     if kind == 2:
-        return Capsule(start=low, end=low + rng.uniform(0.05, 0.3, dimension), radius=rng.uniform(0.03, 0.1), **common)
+        return Capsule(
+            start=low,
+            end=low + rng.uniform(0.05, 0.3, dimension),
+            radius=rng.uniform(0.03, 0.1),
+            **common,
+        )
     return Plane(point=low, normal=rng.normal(size=dimension), **common)
 
 
@@ -41,9 +50,13 @@ def differences(rng, dimension):
     solids = [(number, random_solid(rng, dimension)) for number in range(1, rng.integers(2, 7))]
     table, sampler = ShapeTable(grid, solids, range(len(solids))), NodeSampler(grid)
     rotations = np.array([turn(rng, dimension) for _ in solids])
-    translations = rng.uniform(-0.2, 0.2, (len(solids), 3)) * ([1, 1, 0] if dimension == 2 else [1, 1, 1])
+    translations = rng.uniform(-0.2, 0.2, (len(solids), 3)) * (
+        [1, 1, 0] if dimension == 2 else [1, 1, 1]
+    )
     fields, boxes = [NodeDistances(grid, second=True) for _ in range(2)], []
-    for (number, geometry), rotation, translation in zip(solids, rotations, translations, strict=True):
+    for (number, geometry), rotation, translation in zip(
+        solids, rotations, translations, strict=True
+    ):
         moved = geometry.moved(Pose(rotation, translation))
         sampler.enter(fields[0], number, moved)
         boxes.append(nodes_near(grid, moved))

@@ -26,7 +26,9 @@ def test_shapes_in_2d_and_3d() -> None:
         ((3, 3, 3), 0.1, 4, "dimension"),
     ],
 )
-def test_bad_grids_are_refused(counts: tuple[int, int, int], spacing: float, dimension: int, word: str) -> None:
+def test_bad_grids_are_refused(
+    counts: tuple[int, int, int], spacing: float, dimension: int, word: str
+) -> None:
     with pytest.raises(ValueError, match=word):
         StaggeredGrid(counts, spacing, dimension)
 
@@ -56,5 +58,10 @@ def index_kernel(coordinates: wp.array(dtype=float), count: int, out: wp.array(d
 def test_cells_of_points_off_the_grid_are_on_it() -> None:
     coordinates = [-np.inf, -3.0, 1.0, 1.99, 2.0, 4.0, 4.5, 9.0, np.inf, np.nan]
     out = wp.zeros(len(coordinates), dtype=int, device="cpu")
-    wp.launch(index_kernel, len(coordinates), [wp.array(coordinates, dtype=float, device="cpu"), 4, out], device="cpu")
+    wp.launch(
+        index_kernel,
+        len(coordinates),
+        [wp.array(coordinates, dtype=float, device="cpu"), 4, out],
+        device="cpu",
+    )
     assert out.numpy().tolist() == [1, 1, 1, 1, 2, 4, 4, 4, 4, 1]

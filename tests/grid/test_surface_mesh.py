@@ -10,7 +10,13 @@ from mesh_checks import assert_closed, enclosed, pieces
 from warp_lcp.grid.level_set import LevelSet
 from warp_lcp.grid.particles import Particles, lattice
 from warp_lcp.grid.staggered import StaggeredGrid
-from warp_lcp.grid.surface_mesh import Interior, Obstacles, SurfaceMesh, faces_from_particles, sample
+from warp_lcp.grid.surface_mesh import (
+    Interior,
+    Obstacles,
+    SurfaceMesh,
+    faces_from_particles,
+    sample,
+)
 
 AIR, SOLID = 0, 2
 DX = 0.05
@@ -21,7 +27,10 @@ SEED = 8812
 
 def fill(grid, inside, *, per_axis=2, jitter=0.25):
     """Return particles on a jittered lattice where `inside` says so of points [cells]."""
-    planes = [lattice(grid, per_axis, jitter, SEED, plane) / grid.spacing for plane in range(grid.counts[2])]
+    planes = [
+        lattice(grid, per_axis, jitter, SEED, plane) / grid.spacing
+        for plane in range(grid.counts[2])
+    ]
     x = np.concatenate([points[inside(points)] for points in planes])
     return x * grid.spacing
 
@@ -81,7 +90,9 @@ def test_a_pool_is_flat_and_its_walls_too(grid, smoothing):
     assert top.std() < 0.02
     assert np.abs(top - 14.0).max() < 0.12  # the last row of points before a wall leans to it
     assert walls.sum() + len(top) == len(points)
-    assert enclosed(points, corners) == pytest.approx(14.0 * size[[0, 2][: grid.dimension - 1]].prod(), rel=2e-3)
+    assert enclosed(points, corners) == pytest.approx(
+        14.0 * size[[0, 2][: grid.dimension - 1]].prod(), rel=2e-3
+    )
     assert points[:, : grid.dimension].min() == 0.0
     assert (points <= size + 1e-4).all()
 
@@ -98,7 +109,8 @@ def test_a_box_in_a_corner_touches_its_walls(corner):
         side = points[np.abs(points[:, axis] - wall) < 1e-4]
         across = np.delete(side, axis, axis=1)
         span = across.max(axis=0) - across.min(axis=0)
-        assert span == pytest.approx(np.delete(extent, axis), abs=0.3)  # up to the free edges, which are round
+        # up to the free edges, which are round
+        assert span == pytest.approx(np.delete(extent, axis), abs=0.3)
 
 
 @GRIDS
@@ -106,7 +118,9 @@ def test_a_box_in_a_corner_touches_its_walls(corner):
 def test_a_particle_alone_is_a_drop_wherever_it_is(grid, per_axis):
     rng = np.random.default_rng(SEED)
     ranges = [range(3, n - 3, 5) if n > 1 else [0] for n in grid.counts]
-    x = np.array(list(itertools.product(*ranges))) + rng.random((np.prod([len(r) for r in ranges]), 3))
+    x = np.array(list(itertools.product(*ranges))) + rng.random(
+        (np.prod([len(r) for r in ranges]), 3)
+    )
     x[:, grid.dimension :] = 0.0
     points, corners = surface_of(grid, x * grid.spacing, per_axis=per_axis)
     assert pieces(points, corners) == len(x)
@@ -119,7 +133,9 @@ def test_a_particle_alone_is_a_drop_wherever_it_is(grid, per_axis):
 def test_a_sheet_of_one_layer_has_no_holes(smoothing):
     rng = np.random.default_rng(SEED)
     a, b = np.meshgrid(np.arange(8, 48) / 2.0, np.arange(8, 48) / 2.0)
-    x = np.stack([a.ravel(), np.full(a.size, 15.2), b.ravel()], axis=1) + 0.12 * (rng.random((a.size, 3)) - 0.5)
+    x = np.stack([a.ravel(), np.full(a.size, 15.2), b.ravel()], axis=1) + 0.12 * (
+        rng.random((a.size, 3)) - 0.5
+    )
     points, corners = surface_of(DEEP, x * DX, smoothing=smoothing)
     assert pieces(points, corners) == 1
     assert len(points) - len(corners) / 2 == 2  # Euler's number of a sphere: each hole would take 2
@@ -160,16 +176,22 @@ def test_a_pool_ends_at_whole_solid_cells():
     base = base_of(FLAT)
     base[1, 1:11, 9:17] = SOLID  # cells (8..15, 0..9)
     x = fill(FLAT, lambda p: (p[:, 1] < 20.0) & ~((p[:, 0] >= 8) & (p[:, 0] < 16) & (p[:, 1] < 10)))
-    points, corners = surface_of(FLAT, x, obstacles=Obstacles(wp.array(base, device="cpu"), None, False))
+    points, corners = surface_of(
+        FLAT, x, obstacles=Obstacles(wp.array(base, device="cpu"), None, False)
+    )
     assert enclosed(points, corners) == pytest.approx(32.0 * 20.0 - 80.0, rel=0.003)
-    beside = points[(points[:, 0] > 6.0) & (points[:, 0] < 12.0) & (points[:, 1] > 1.0) & (points[:, 1] < 9.0)]
+    beside = points[
+        (points[:, 0] > 6.0) & (points[:, 0] < 12.0) & (points[:, 1] > 1.0) & (points[:, 1] < 9.0)
+    ]
     assert beside[:, 0] == pytest.approx(8.0, abs=1e-4)
 
 
 def test_a_solid_in_air_changes_nothing():
     x = fill(FLAT, lambda p: p[:, 1] < 8.0)
     high = node_distances(FLAT, lambda p: np.hypot(p[..., 0] - 16.0, p[..., 1] - 25.0) - 4.0)
-    with_it = surface_of(FLAT, x, obstacles=Obstacles(wp.array(base_of(FLAT), device="cpu"), high, False))
+    with_it = surface_of(
+        FLAT, x, obstacles=Obstacles(wp.array(base_of(FLAT), device="cpu"), high, False)
+    )
     without = surface_of(FLAT, x)
     assert with_it[0] == pytest.approx(without[0], abs=2e-4)
     assert np.array_equal(with_it[1], without[1])
@@ -198,7 +220,9 @@ def test_resolution_refines_and_coarsens(grid):
         points, corners = surface_of(grid, x, resolution=resolution)
         assert enclosed(points, corners) == pytest.approx(12.0**grid.dimension, rel=accuracy)
         counts.append(len(corners))
-    assert [b / a for a, b in itertools.pairwise(counts)] == pytest.approx([2.0 ** (grid.dimension - 1)] * 2, rel=0.15)
+    assert [b / a for a, b in itertools.pairwise(counts)] == pytest.approx(
+        [2.0 ** (grid.dimension - 1)] * 2, rel=0.15
+    )
 
 
 def test_no_particles_have_no_surface():
@@ -237,7 +261,12 @@ def test_points_move_with_the_particles_around_them(grid):
 
 
 @pytest.mark.parametrize(
-    ("settings", "named"), [({"per_axis": 0}, "per_axis"), ({"resolution": 0}, "resolution"), ({"smoothing": 0.4}, "smoothing")]
+    ("settings", "named"),
+    [
+        ({"per_axis": 0}, "per_axis"),
+        ({"resolution": 0}, "resolution"),
+        ({"smoothing": 0.4}, "smoothing"),
+    ],
 )
 def test_wrong_arguments_are_named(settings, named):
     with pytest.raises(ValueError, match=named):

@@ -19,7 +19,11 @@ def test_windows_are_added_up(counts: tuple[int, int, int]) -> None:
     density, capacity = (rng.uniform(0.0, 2.0, grid.shape).astype(np.float32) for _ in range(2))
     fields = {"base": base, "density": density, "capacity": capacity}
     given = {name: wp.array(field, device=grid.device) for name, field in fields.items()}
-    crowd, all, count = WindowTally(CROWD, grid), WindowTally(CROWD, grid, grid.domain), WindowTally(COUNT, grid)
+    crowd, all, count = (
+        WindowTally(CROWD, grid),
+        WindowTally(CROWD, grid, grid.domain),
+        WindowTally(COUNT, grid),
+    )
     for _ in range(6):
         corners = np.sort(rng.integers(1, np.array(counts) + 1, (2, 3)), axis=0)
         window = grid.window(corners[0], corners[1], grow=1).common(grid.domain)
@@ -30,7 +34,11 @@ def test_windows_are_added_up(counts: tuple[int, int, int]) -> None:
         count.take(window, kind=given["base"])
         has = (base[box] != SOLID) & (density[box] > 0.0)
         over = np.where(has, density[box] - np.float32(1.2) * capacity[box], 0.0)
-        expected = [over[over > 0.0].sum(), density[box][has].sum(), 1.0 + np.where(has, density[box] - capacity[box], -1.0).max()]
+        expected = [
+            over[over > 0.0].sum(),
+            density[box][has].sum(),
+            1.0 + np.where(has, density[box] - capacity[box], -1.0).max(),
+        ]
         assert crowd.read() == pytest.approx(expected, rel=1e-6)
         assert all.read() == pytest.approx(expected, rel=1e-6)
         assert count.read() == [(base[box] == FLUID).sum()]

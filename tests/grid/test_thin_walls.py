@@ -22,7 +22,9 @@ def grid(dimension):
 def sheet(low, high):
     """Return a closed mesh of a box."""
     low, high = np.asarray(low), np.asarray(high)
-    vertices = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)]) * (high - low) + low
+    vertices = (
+        np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)]) * (high - low) + low
+    )
     quads = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
     triangles = [t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]
     return TriangleMesh(surface=close_surface(vertices, np.array(triangles), "sheet"))
@@ -43,7 +45,9 @@ def walls_around(dimension, thickness, kind=Box):
 
 
 def thin_walls(g, shapes, motion=None):
-    solids = [PlacedSolid(geometry=shape, separating=True, name="wall", motion=motion) for shape in shapes]
+    solids = [
+        PlacedSolid(geometry=shape, separating=True, name="wall", motion=motion) for shape in shapes
+    ]
     return ThinWalls(g, solids, [True] * len(solids), 0)
 
 
@@ -74,28 +78,40 @@ def test_nothing_leaves_a_closed_box(dimension, thickness, kind):
     points, ways = inside_points(dimension, 3000, rng)
     ends = flung(walls, points, ways)[:, :dimension]
     assert (ends > LOW).all() and (ends < HIGH).all()
-    free = ((points + ways)[:, :dimension] > LOW + CELL).all(axis=1) & ((points + ways)[:, :dimension] < HIGH - CELL).all(axis=1)
-    assert free.sum() > 100 and np.allclose(ends[free], (points + ways)[free, :dimension], atol=1e-6)  # nothing was in their way
+    free = ((points + ways)[:, :dimension] > LOW + CELL).all(axis=1) & (
+        (points + ways)[:, :dimension] < HIGH - CELL
+    ).all(axis=1)
+    # nothing was in their way
+    assert free.sum() > 100 and np.allclose(
+        ends[free], (points + ways)[free, :dimension], atol=1e-6
+    )
 
 
-@pytest.mark.parametrize("motion", [Sinusoid(period=0.4, amplitude=(0.2, 0.05)), Rotation(rate=700.0, center=(0.5, 0.5))])
+@pytest.mark.parametrize(
+    "motion", [Sinusoid(period=0.4, amplitude=(0.2, 0.05)), Rotation(rate=700.0, center=(0.5, 0.5))]
+)
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_nothing_leaves_a_closed_box_that_moves(dimension, motion):
     rng = np.random.default_rng(418)
     walls = thin_walls(grid(dimension), walls_around(dimension, 0.3 * CELL), motion)
     points, ways = inside_points(dimension, 2000, rng)
     for step in range(1, 9):  # of up to 5 cells; particles do not follow by themselves
-        points = flung(walls, points, 0.1 * ways, still=False, between=lambda at=step: walls.place(0.05 * at))
+        points = flung(
+            walls, points, 0.1 * ways, still=False, between=lambda at=step: walls.place(0.05 * at)
+        )
         pose = motion.pose(0.05 * step)
         own = ((points - pose.translation) @ pose.rotation)[:, :dimension]
         assert (own > LOW).all() and (own < HIGH).all()
 
 
-@pytest.mark.parametrize("shape", [
-    Box(lower=(0.2, 0.5), upper=(0.8, 0.505)),
-    Sphere(center=(0.5, 0.5), radius=0.02),
-    Capsule(start=(0.3, 0.4), end=(0.7, 0.6), radius=0.01),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "shape",
+    [
+        Box(lower=(0.2, 0.5), upper=(0.8, 0.505)),
+        Sphere(center=(0.5, 0.5), radius=0.02),
+        Capsule(start=(0.3, 0.4), end=(0.7, 0.6), radius=0.01),
+    ],
+)
 def test_particles_slide_along_the_true_surface(shape):
     """What meets a surface keeps the part of its way along it, and a thousandth of a cell from it."""
     rng = np.random.default_rng(52)
@@ -111,14 +127,25 @@ def test_particles_slide_along_the_true_surface(shape):
     assert distance.numpy().min() > 0.9e-3 * CELL
     stopped = np.abs(ends - points - ways).max(axis=1) > 1e-5
     assert 20 < stopped.sum() < len(ends) // 2
-    assert (np.linalg.norm(ends - points, axis=1) <= np.linalg.norm(ways, axis=1) + 3e-3 * CELL).all()
+    assert (
+        np.linalg.norm(ends - points, axis=1) <= np.linalg.norm(ways, axis=1) + 3e-3 * CELL
+    ).all()
     if isinstance(shape, Box):
-        above = stopped & (points[:, 1] > 0.51) & (np.abs(points[:, 0] - 0.5) < 0.2) & (np.abs((points + ways)[:, 0] - 0.5) < 0.2)
+        above = (
+            stopped
+            & (points[:, 1] > 0.51)
+            & (np.abs(points[:, 0] - 0.5) < 0.2)
+            & (np.abs((points + ways)[:, 0] - 0.5) < 0.2)
+        )
         assert above.any() and np.allclose(ends[above, 0], (points + ways)[above, 0], atol=1e-6)
 
 
 def test_a_wall_takes_along_what_it_meets():
-    walls = thin_walls(grid(2), [Box(lower=(0.2, 0.0), upper=(0.202, 1.0))], Sinusoid(period=4.0, amplitude=(0.4, 0.0)))
+    walls = thin_walls(
+        grid(2),
+        [Box(lower=(0.2, 0.0), upper=(0.202, 1.0))],
+        Sinusoid(period=4.0, amplitude=(0.4, 0.0)),
+    )
     points = np.array([[0.25, 0.4, 0.0], [0.19, 0.4, 0.0]])
     ends = flung(walls, points, np.zeros((2, 3)), still=False, between=lambda: walls.place(0.5))
     at = 0.4 * np.sin(np.pi / 4)
@@ -135,7 +162,12 @@ def test_what_starts_inside_is_put_outside():
 def test_points_near_thin_walls_are_not_admitted():
     shapes = [Box(lower=(0.2, 0.5), upper=(0.8, 0.51)), sheet([0.2, 0.7, -1.0], [0.8, 0.71, 1.0])]
     walls = thin_walls(grid(2), shapes)
-    points = np.array([[0.5, y, 0.0] for y in (0.505, 0.51 + 0.5e-3 * CELL, 0.51 + 2e-3 * CELL, 0.705, 0.71 + 2e-3 * CELL)])
+    points = np.array(
+        [
+            [0.5, y, 0.0]
+            for y in (0.505, 0.51 + 0.5e-3 * CELL, 0.51 + 2e-3 * CELL, 0.705, 0.71 + 2e-3 * CELL)
+        ]
+    )
     assert walls.admits(points).tolist() == [False, False, True, False, True]
 
 
@@ -149,6 +181,8 @@ def test_what_is_thin():
     assert not is_thin(Plane(point=(0, 0), normal=(0, 1)), 1.0, device)
     assert not is_thin(Sphere(center=(0, 0), radius=0.01, invert=True), 0.05, device)
     assert is_thin(Union(parts=(Sphere(center=(0, 0), radius=1), thin)), 0.05, device)
-    assert is_thin(sheet([0, 0, 0], [1, 1, 0.04]), 0.05, device) and not is_thin(sheet([0, 0, 0], [1, 1, 1]), 0.05, device)
+    assert is_thin(sheet([0, 0, 0], [1, 1, 0.04]), 0.05, device) and not is_thin(
+        sheet([0, 0, 0], [1, 1, 1]), 0.05, device
+    )
     assert fills_cells(Box(lower=(0.0, 2 * CELL), upper=(1.0, 3 * CELL)), grid(2), 1e-2)
     assert not fills_cells(thin, grid(2), 1e-2)

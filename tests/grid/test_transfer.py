@@ -12,7 +12,10 @@ from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.transfer import faces_to_particles, particles_to_faces
 
-REALS = {"float32": (wp.float32, wp.vec3, np.float32, 1e-5), "float64": (wp.float64, wp.vec3d, np.float64, 1e-12)}
+REALS = {
+    "float32": (wp.float32, wp.vec3, np.float32, 1e-5),
+    "float64": (wp.float64, wp.vec3d, np.float64, 1e-12),
+}
 GRIDS = {"2d": StaggeredGrid((9, 7, 1), 0.125, 2), "3d": StaggeredGrid((8, 7, 6), 0.125, 3)}
 
 
@@ -28,13 +31,19 @@ class Cloud:
     weights: list[wp.array]
 
     def to_faces(self) -> None:
-        particles_to_faces(self.grid, self.position, self.velocity, self.affine, self.fields, self.weights)
+        particles_to_faces(
+            self.grid, self.position, self.velocity, self.affine, self.fields, self.weights
+        )
 
     def to_particles(self, **options) -> None:
-        faces_to_particles(self.grid, self.fields, self.position, self.velocity, self.affine, **options)
+        faces_to_particles(
+            self.grid, self.fields, self.position, self.velocity, self.affine, **options
+        )
 
 
-def cloud(grid: StaggeredGrid, real: str, *, affine: bool, n: int = 300, random_seed: int = 4711) -> Cloud:
+def cloud(
+    grid: StaggeredGrid, real: str, *, affine: bool, n: int = 300, random_seed: int = 4711
+) -> Cloud:
     scalar, vector, numpy_type, _ = REALS[real]
     rng = np.random.default_rng(random_seed)
     size = np.array(grid.counts) * grid.spacing
@@ -48,8 +57,13 @@ def cloud(grid: StaggeredGrid, real: str, *, affine: bool, n: int = 300, random_
 
     gradients = [vectors(rng.normal(size=(n, 3))) for _ in range(grid.dimension)] if affine else []
     return Cloud(
-        grid, vectors(position), vectors(rng.normal(size=(n, 3)) + 0.4), gradients, grid.faces(scalar), grid.faces(scalar)
-    )  # fmt: skip
+        grid,
+        vectors(position),
+        vectors(rng.normal(size=(n, 3)) + 0.4),
+        gradients,
+        grid.faces(scalar),
+        grid.faces(scalar),
+    )
 
 
 def node_points(grid: StaggeredGrid, axis: int) -> np.ndarray:
@@ -88,7 +102,9 @@ def grid_momenta(c: Cloud) -> tuple[np.ndarray, np.ndarray]:
     for axis, (field, weight) in enumerate(zip(c.fields, c.weights, strict=True)):
         p = field.numpy().astype(np.float64) * weight.numpy().astype(np.float64)
         linear[axis] = p.sum()
-        angular += np.cross(node_points(c.grid, axis), np.eye(3)[axis] * p[..., None]).sum(axis=(0, 1, 2))
+        angular += np.cross(node_points(c.grid, axis), np.eye(3)[axis] * p[..., None]).sum(
+            axis=(0, 1, 2)
+        )
     return linear, angular
 
 
@@ -145,7 +161,9 @@ def test_apic_reproduces_a_linear_field(dimension: str) -> None:
     c.to_faces()
     for axis, (field, weight) in enumerate(zip(c.fields, c.weights, strict=True)):
         used = weight.numpy() > 1e-9
-        assert field.numpy()[used] == pytest.approx((node_points(grid, axis) @ slope[axis] + offset[axis])[used], abs=1e-8)
+        assert field.numpy()[used] == pytest.approx(
+            (node_points(grid, axis) @ slope[axis] + offset[axis])[used], abs=1e-8
+        )
 
 
 @pytest.mark.parametrize("dimension", GRIDS)
@@ -162,7 +180,9 @@ def test_scatter_is_the_adjoint_of_gather(dimension: str) -> None:
     c.to_particles()
     gathered = c.velocity.numpy()
     for axis in range(grid.dimension):
-        assert (momenta[axis] * tests[axis]).sum() == pytest.approx((v[:, axis] * gathered[:, axis]).sum(), rel=1e-12)
+        assert (momenta[axis] * tests[axis]).sum() == pytest.approx(
+            (v[:, axis] * gathered[:, axis]).sum(), rel=1e-12
+        )
 
 
 def test_the_weights_of_a_particle_sum_to_one() -> None:
@@ -195,7 +215,9 @@ def test_flip_keeps_what_the_grid_did_not_change() -> None:
     faces_to_particles(grid, c.fields, pic.position, pic.velocity, [])
     blend = cloud(grid, "float32", affine=False)
     faces_to_particles(grid, c.fields, blend.position, blend.velocity, [], saved=saved, flip=0.4)
-    assert blend.velocity.numpy() == pytest.approx(0.6 * pic.velocity.numpy() + 0.4 * c.velocity.numpy(), abs=1e-5)
+    assert blend.velocity.numpy() == pytest.approx(
+        0.6 * pic.velocity.numpy() + 0.4 * c.velocity.numpy(), abs=1e-5
+    )
 
 
 def test_a_particle_on_a_cell_boundary_gives_weight_to_both_faces_of_its_cell() -> None:
@@ -228,7 +250,9 @@ def sorted_cloud(grid: StaggeredGrid, *, affine: bool, n: int = 4000) -> Particl
     size = np.array(grid.counts) * grid.spacing
     position = np.clip(rng.random((n, 3)) * size, 1e-3 * grid.spacing, size - 1e-3 * grid.spacing)
     on_a_face = np.round(position[: n // 8] / grid.spacing) * grid.spacing
-    position[: n // 8] = np.where((on_a_face > 0) & (on_a_face < size), on_a_face, position[: n // 8])
+    position[: n // 8] = np.where(
+        (on_a_face > 0) & (on_a_face < size), on_a_face, position[: n // 8]
+    )
     velocity = rng.normal(size=(n, 3))
     for values in (position, velocity):
         values[:, grid.dimension :] = 0.0
@@ -241,7 +265,9 @@ def sorted_cloud(grid: StaggeredGrid, *, affine: bool, n: int = 4000) -> Particl
 
 def transfer(p: Particles, offsets: wp.array | None, **options) -> list[np.ndarray]:
     fields, weights = p.grid.faces(), p.grid.faces()
-    particles_to_faces(p.grid, p.position, p.velocity, p.affine, fields, weights, offsets=offsets, **options)
+    particles_to_faces(
+        p.grid, p.position, p.velocity, p.affine, fields, weights, offsets=offsets, **options
+    )
     return [array.numpy() for array in (*fields, *weights)]
 
 
@@ -278,14 +304,18 @@ PLACES = {
     "shuffled": lambda rng, n: rng.random(n),
     "in one plane": lambda rng, n: np.full(n, 0.4),
     "at both ends": lambda rng, n: np.where(rng.random(n) < 0.5, 0.002, 0.998),
-    "downward, then some more": lambda rng, n: np.append(np.sort(rng.random(n - n // 4))[::-1], rng.random(n // 4) ** 4),
+    "downward, then some more": lambda rng, n: np.append(
+        np.sort(rng.random(n - n // 4))[::-1], rng.random(n // 4) ** 4
+    ),
 }
 
 
 @pytest.mark.cpu_form("CUDA has no shares of planes")
 @pytest.mark.parametrize("places", PLACES)
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_threads_add_up_in_the_order_of_one(dimension: int, places: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_threads_add_up_in_the_order_of_one(
+    dimension: int, places: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """However particles lie, and however many share them: the bits of one thread, and the weights of a plain loop."""
     monkeypatch.setattr("warp_lcp.grid.particle_loops.CPU_GRAIN", 64)
     n, rng, before = 1500, np.random.default_rng([dimension, len(places)]), wl.get_threads()
@@ -299,7 +329,9 @@ def test_threads_add_up_in_the_order_of_one(dimension: int, places: str, monkeyp
     def added(threads: int) -> list[np.ndarray]:
         wl.set_threads(threads)
         fields, weights, density = grid.faces(), grid.faces(), grid.field()
-        particles_to_faces(grid, particles.position, particles.velocity, particles.affine, fields, weights)
+        particles_to_faces(
+            grid, particles.position, particles.velocity, particles.affine, fields, weights
+        )
         particle_density(grid, particles, grid.everywhere, 4, density)
         return [a.numpy() for a in (*fields, *weights, density)]
 
@@ -314,7 +346,17 @@ def test_threads_add_up_in_the_order_of_one(dimension: int, places: str, monkeyp
     corner = grid.to_grid(points) - [0.0, 0.5, 0.5]  # of the u faces
     cell, share = np.floor(corner).astype(int), corner - np.floor(corner)
     for offset in np.ndindex(2, 2, dimension - 1):
-        weight = np.prod([np.where(o, f, 1.0 - f) for o, f in list(zip(offset, share.T, strict=True))[:dimension]], axis=0)
+        weight = np.prod(
+            [
+                np.where(o, f, 1.0 - f)
+                for o, f in list(zip(offset, share.T, strict=True))[:dimension]
+            ],
+            axis=0,
+        )
         at = cell + offset
-        np.add.at(expected, (at[:, 2] if dimension == 3 else np.ones(n, dtype=int), at[:, 1], at[:, 0]), weight)
+        np.add.at(
+            expected,
+            (at[:, 2] if dimension == 3 else np.ones(n, dtype=int), at[:, 1], at[:, 0]),
+            weight,
+        )
     np.testing.assert_allclose(one[dimension], expected, atol=3e-5 * expected.max())

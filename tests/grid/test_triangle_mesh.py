@@ -6,13 +6,22 @@ import pytest
 import warp as wp
 
 from warp_lcp.grid.solids import Placement, TriangleMesh
-from warp_lcp.grid.triangle_mesh import ClosedSurface, builtin_mesh, close_surface, load_surface, read_mesh, winding_number
+from warp_lcp.grid.triangle_mesh import (
+    ClosedSurface,
+    builtin_mesh,
+    close_surface,
+    load_surface,
+    read_mesh,
+    winding_number,
+)
 
 SPOT = Path(__file__).resolve().parents[2] / "../shared/data/spot.obj"
 CPU = wp.get_device("cpu")
 
 CUBE = np.array([[x, y, z] for z in (0.0, 1.0) for y in (0.0, 1.0) for x in (0.0, 1.0)])
-QUADS = np.array([[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]])
+QUADS = np.array(
+    [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]]
+)
 CUBE_TRIANGLES = np.concatenate([QUADS[:, [0, 1, 2]], QUADS[:, [0, 2, 3]]])
 
 
@@ -38,12 +47,20 @@ def icosphere(levels):
     vertices /= np.linalg.norm(vertices, axis=1, keepdims=True)
     distance = np.linalg.norm(vertices[:, None] - vertices[None], axis=-1)
     near = np.isclose(distance, distance[distance > 0].min())
-    triangles = [(i, j, k) for i in range(12) for j in range(i) for k in range(j) if near[i, j] and near[j, k] and near[k, i]]
+    triangles = [
+        (i, j, k)
+        for i in range(12)
+        for j in range(i)
+        for k in range(j)
+        if near[i, j] and near[j, k] and near[k, i]
+    ]
     corners = vertices[np.array(triangles)]
     for _ in range(levels):
         a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
         ab, bc, ca = a + b, b + c, c + a
-        corners = np.concatenate([np.stack(t, axis=1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))])
+        corners = np.concatenate(
+            [np.stack(t, axis=1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
+        )
         corners /= np.linalg.norm(corners, axis=2, keepdims=True)
     outward = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) > 0
     corners[~outward] = corners[~outward][:, ::-1]
@@ -78,11 +95,16 @@ def test_sphere_of_triangles_is_nearly_a_sphere():
     assert surface.triangles.shape == (1280, 3)
     assert surface.warnings == ()
     assert 0.98 < surface.volume / (4.0 / 3.0 * np.pi) < 1.0
-    mesh = TriangleMesh(surface=surface, placement=Placement.from_degrees(0.5, [10.0, 20.0, 30.0], [1.0, 2.0, 3.0], 3))
+    mesh = TriangleMesh(
+        surface=surface,
+        placement=Placement.from_degrees(0.5, [10.0, 20.0, 30.0], [1.0, 2.0, 3.0], 3),
+    )
     assert mesh.volume == pytest.approx(surface.volume / 8.0)
     points = np.random.default_rng(4410).uniform(0.0, 4.0, (4000, 3))
     exact = np.linalg.norm(points - [1.0, 2.0, 3.0], axis=1) - 0.5
-    sagitta = 0.5 * (1.0 - np.linalg.norm(surface.vertices[surface.triangles].mean(axis=1), axis=1).min())
+    sagitta = 0.5 * (
+        1.0 - np.linalg.norm(surface.vertices[surface.triangles].mean(axis=1), axis=1).min()
+    )
     error = distances(mesh, points) - exact
     assert error.min() > -1e-5  # the faceted sphere lies within the sphere
     assert error.max() < sagitta + 1e-5
@@ -92,12 +114,16 @@ def test_sphere_of_triangles_is_nearly_a_sphere():
 def test_distance_to_a_cube_mesh_is_exact_far_from_the_origin(invert):
     offset = np.array([3.0e5, -2.0e5, 1.0e5])
     surface = close_surface(CUBE + offset, CUBE_TRIANGLES, "cube")
-    mesh = TriangleMesh(surface=surface, invert=invert, placement=Placement(scale=2.0, translation=-2.0 * offset))
+    mesh = TriangleMesh(
+        surface=surface, invert=invert, placement=Placement(scale=2.0, translation=-2.0 * offset)
+    )
     points = np.random.default_rng(4411).uniform(-1.0, 3.0, (1000, 3))
     inner = np.minimum(points, 2.0 - points).min(axis=1)
     outer = np.linalg.norm(points - np.clip(points, 0.0, 2.0), axis=1)
     expected = np.where(inner > 0, -inner, outer)
-    np.testing.assert_allclose(distances(mesh, points), -expected if invert else expected, atol=1e-5)
+    np.testing.assert_allclose(
+        distances(mesh, points), -expected if invert else expected, atol=1e-5
+    )
 
 
 def test_device_mesh_is_made_once():
@@ -119,11 +145,15 @@ def test_builtin_knot_is_a_tube_with_its_curve_inside():
     extent = np.ptp(surface.vertices, axis=0)
     assert extent.max() == pytest.approx(1.0)
     t = np.linspace(0.0, 2.0 * np.pi, 200)
-    curve = np.stack([np.sin(t) + 2 * np.sin(2 * t), np.cos(t) - 2 * np.cos(2 * t), -np.sin(3 * t)], axis=-1)
+    curve = np.stack(
+        [np.sin(t) + 2 * np.sin(2 * t), np.cos(t) - 2 * np.cos(2 * t), -np.sin(3 * t)], axis=-1
+    )
     scale = extent[2] / 3.0  # the curve spans z = [-1, 1], the tube half a unit more
     curve *= scale
     curve[:, 1] += surface.vertices[:, 1].max() - (curve[:, 1].max() + 0.5 * scale)
-    np.testing.assert_allclose(distances(TriangleMesh(surface=surface), curve), -0.5 * scale, rtol=0.03)
+    np.testing.assert_allclose(
+        distances(TriangleMesh(surface=surface), curve), -0.5 * scale, rtol=0.03
+    )
     length = np.linalg.norm(np.diff(curve, axis=0), axis=1).sum()
     assert surface.volume == pytest.approx(np.pi * (0.5 * scale) ** 2 * length, rel=0.02)
 
@@ -141,7 +171,8 @@ def test_winding_number_counts():
 
 def test_thickness():
     surface = close_surface(CUBE * [1.0, 0.05, 1.0], CUBE_TRIANGLES, "plate")
-    assert surface.thin_fraction(0.05002, CPU) == pytest.approx(2.0 / 2.2, abs=1e-3)  # all but the narrow sides
+    # all but the narrow sides
+    assert surface.thin_fraction(0.05002, CPU) == pytest.approx(2.0 / 2.2, abs=1e-3)
     assert surface.thin_fraction(0.04998, CPU) == 0.0
 
 
@@ -206,7 +237,9 @@ def test_reads_relative_indices(tmp_path):
 
 def test_reads_a_text_stl_with_capitals_and_blank_lines(tmp_path):
     facets = (
-        "FACET NORMAL 0 0 0\nOUTER LOOP\n" + "".join("VERTEX {} {} {}\n".format(*v) for v in CUBE[t]) + "ENDLOOP\nENDFACET\n\n"
+        "FACET NORMAL 0 0 0\nOUTER LOOP\n"
+        + "".join("VERTEX {} {} {}\n".format(*v) for v in CUBE[t])
+        + "ENDLOOP\nENDFACET\n\n"
         for t in CUBE_TRIANGLES
     )
     path = tmp_path / "cube.stl"
@@ -226,13 +259,16 @@ OBJ = obj_text(["f " + " ".join(str(v + 1) for v in quad) for quad in QUADS])
 TEXT_STL = (
     "solid cube\n"
     + "".join(
-        "facet normal 0 0 0\nouter loop\n" + "".join("vertex {} {} {}\n".format(*v) for v in CUBE[t]) + "endloop\nendfacet\n"
+        "facet normal 0 0 0\nouter loop\n"
+        + "".join("vertex {} {} {}\n".format(*v) for v in CUBE[t])
+        + "endloop\nendfacet\n"
         for t in CUBE_TRIANGLES
     )
     + "endsolid cube\n"
 )
 PLY = (
-    "ply\nformat ascii 1.0\ncomment a cube\nelement vertex 8\nproperty float x\nproperty float y\nproperty float z\nelement face 6\n"
+    "ply\nformat ascii 1.0\ncomment a cube\nelement vertex 8\nproperty float x\nproperty float "
+    "y\nproperty float z\nelement face 6\n"
     "property list uchar int vertex_indices\nend_header\n"
     + "".join("{} {} {}\n".format(*v) for v in CUBE)
     + "".join("4 {} {} {} {}\n".format(*quad) for quad in QUADS)
@@ -276,7 +312,12 @@ def test_binary_stl_with_bytes_behind_its_triangles(tmp_path, head, behind):
 
 @pytest.mark.parametrize("head", [b"", b"solid cube"])
 @pytest.mark.parametrize(
-    ("count", "message"), [(13, "it declares 13 triangles and holds 12"), (2**32 - 1, "holds 12"), (0, "it declares no triangles")]
+    ("count", "message"),
+    [
+        (13, "it declares 13 triangles and holds 12"),
+        (2**32 - 1, "holds 12"),
+        (0, "it declares no triangles"),
+    ],
 )
 def test_binary_stl_with_a_wrong_count(tmp_path, head, count, message):
     path = tmp_path / "cube.stl"
@@ -287,7 +328,10 @@ def test_binary_stl_with_a_wrong_count(tmp_path, head, count, message):
 
 
 @pytest.mark.parametrize("suffix", TEXTS)
-@pytest.mark.parametrize(("word", "message"), [("nan", "not finite"), ("-inf", "not finite"), ("1_0", "1_0"), ("0,5", "0,5")])
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [("nan", "not finite"), ("-inf", "not finite"), ("1_0", "1_0"), ("0,5", "0,5")],
+)
 def test_coordinates_that_are_no_numbers(tmp_path, suffix, word, message):
     path = tmp_path / f"cube.{suffix}"
     first = " ".join(map(str, CUBE[3]))
@@ -312,9 +356,17 @@ def test_coordinates_that_are_no_numbers(tmp_path, suffix, word, message):
         ("a.stl", "\x7fELF", "not a readable STL"),
         ("a.stl", "solid a\nendsolid a\n", "no triangles"),
         ("a.stl", "solid a\nfacet\nvertex 0 0 0\nendfacet\nendsolid a\n", "1 corners in 1 facets"),
-        ("a.stl", "solid a\nfacet\nvertex 0 0 x\nvertex 0 0 0\nvertex 0 0 0\nendfacet\nendsolid a\n", "not a readable STL"),
+        (
+            "a.stl",
+            "solid a\nfacet\nvertex 0 0 x\nvertex 0 0 0\nvertex 0 0 0\nendfacet\nendsolid a\n",
+            "not a readable STL",
+        ),
         ("a.ply", "", "not a readable PLY"),
-        ("a.ply", "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\n", "not a readable PLY"),
+        (
+            "a.ply",
+            "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\n",
+            "not a readable PLY",
+        ),
         ("a.ply", "ply\nformat ascii 1.0\nelement camera 3\nend_header\n", "no vertices"),
         (
             "a.ply",
@@ -353,14 +405,18 @@ def test_missing_file_is_named(tmp_path):
 def test_vertices_that_are_not_finite(tmp_path, bad):
     vertices = [[*CUBE[0][:2], bad], *CUBE[1:].tolist()]
     path = tmp_path / "cube.obj"
-    path.write_text(obj_text(["f " + " ".join(str(v + 1) for v in quad) for quad in QUADS], vertices))
+    path.write_text(
+        obj_text(["f " + " ".join(str(v + 1) for v in quad) for quad in QUADS], vertices)
+    )
     with pytest.raises(ValueError, match=r"cube\.obj: 1 of 8 vertices is not finite"):
         read_mesh(path)
 
 
 def test_open_surface_counts_its_open_edges():
     with pytest.raises(
-        ValueError, match=r"cube: the surface is not closed: 3 of its 18 edges are open, the first at .*would leak.*Fill the holes"
+        ValueError,
+        match=r"cube: the surface is not closed: 3 of its 18 edges are open, the first at .*would "
+        r"leak.*Fill the holes",
     ):
         close_surface(CUBE, CUBE_TRIANGLES[:-1], "cube")
 
@@ -369,21 +425,29 @@ def test_degenerate_triangles_are_dropped():
     vertices = np.concatenate([CUBE, [[0.5, 0.5, 0.0], [0.0, 0.0, 0.0]]])
     triangles = np.concatenate([CUBE_TRIANGLES, [[0, 0, 1], [2, 3, 2], [0, 9, 3]]])
     surface = close_surface(vertices, triangles, "cube")
-    assert surface.warnings == ("cube: dropped 3 degenerate triangles (without area), the first at [0.3333, 0, 0]",)
+    assert surface.warnings == (
+        "cube: dropped 3 degenerate triangles (without area), the first at [0.3333, 0, 0]",
+    )
     assert surface.triangles.shape == (12, 3)
     assert surface.volume == pytest.approx(1.0)
 
 
 def test_a_seam_may_be_closed_by_a_triangle_without_area():
-    a, c, b = QUADS[0][0], QUADS[0][2], 8  # the first face's diagonal, split on one of its sides only
+    # the first face's diagonal, split on one of its sides only
+    a, c, b = QUADS[0][0], QUADS[0][2], 8
     vertices = np.concatenate([CUBE, [[0.5, 0.5, 0.0]]])
     halves = [[a, QUADS[0][1], b], [b, QUADS[0][1], c]]
     triangles = np.concatenate([CUBE_TRIANGLES[1:], halves, [[a, b, c]]])
     surface = close_surface(vertices, triangles, "cube")
-    assert surface.warnings == ("cube: dropped 1 degenerate triangles (without area), the first at [0.5, 0.5, 0]",)
+    assert surface.warnings == (
+        "cube: dropped 1 degenerate triangles (without area), the first at [0.5, 0.5, 0]",
+    )
     assert surface.volume == pytest.approx(1.0)
     points = np.random.default_rng(4413).uniform(-0.5, 1.5, (500, 3))
-    assert ((distances(TriangleMesh(surface=surface), points) < 0) == ((points > 0) & (points < 1)).all(axis=1)).all()
+    assert (
+        (distances(TriangleMesh(surface=surface), points) < 0)
+        == ((points > 0) & (points < 1)).all(axis=1)
+    ).all()
 
 
 def test_only_degenerate_triangles():
@@ -399,8 +463,12 @@ def test_flat_surface_encloses_nothing():
 
 
 def test_repeated_triangles_are_dropped():
-    surface = close_surface(CUBE, np.concatenate([CUBE_TRIANGLES, CUBE_TRIANGLES[:3][:, [1, 2, 0]]]), "cube")
-    assert surface.warnings == ("cube: dropped 3 repeated triangles, the first at [0.3333, 0.6667, 0]",)
+    surface = close_surface(
+        CUBE, np.concatenate([CUBE_TRIANGLES, CUBE_TRIANGLES[:3][:, [1, 2, 0]]]), "cube"
+    )
+    assert surface.warnings == (
+        "cube: dropped 3 repeated triangles, the first at [0.3333, 0.6667, 0]",
+    )
     assert surface.volume == pytest.approx(1.0)
 
 
@@ -415,7 +483,11 @@ def test_disagreeing_triangles_are_turned():
     triangles[[2, 7, 9]] = triangles[[2, 7, 9]][:, ::-1]
     surface = close_surface(CUBE, triangles, "cube")
     (warning,) = surface.warnings
-    assert warning == "cube: turned 3 of 12 triangles that disagreed with their neighbors' orientation, the first at [0.6667, 0, 0.3333]"
+    assert (
+        warning
+        == "cube: turned 3 of 12 triangles that disagreed with their neighbors' orientation, the "
+        "first at [0.6667, 0, 0.3333]"
+    )
     assert surface.volume == pytest.approx(1.0)
 
 
@@ -429,7 +501,9 @@ def test_one_of_two_parts_inside_out_is_turned():
     vertices = np.concatenate([2.0 * CUBE, CUBE + 5.0])
     triangles = np.concatenate([CUBE_TRIANGLES, 8 + CUBE_TRIANGLES[:, ::-1]])
     surface = close_surface(vertices, triangles, "cubes")
-    assert surface.warnings == ("cubes: 1 of its 2 parts were inside out, the first at [5.333, 5.667, 5]; turned",)
+    assert surface.warnings == (
+        "cubes: 1 of its 2 parts were inside out, the first at [5.333, 5.667, 5]; turned",
+    )
     assert surface.volume == pytest.approx(9.0)
 
 
@@ -440,7 +514,9 @@ def test_a_hollow_stays_hollow(inside_out):
     surface = close_surface(vertices, triangles[:, ::-1] if inside_out else triangles, "shell")
     assert surface.volume == pytest.approx(26.0)
     np.testing.assert_allclose(
-        distances(TriangleMesh(surface=surface), np.array([[1.5, 1.5, 1.5], [0.5, 1.5, 1.5]])), [0.5, -0.5], atol=1e-6
+        distances(TriangleMesh(surface=surface), np.array([[1.5, 1.5, 1.5], [0.5, 1.5, 1.5]])),
+        [0.5, -0.5],
+        atol=1e-6,
     )
 
 
@@ -453,13 +529,19 @@ def test_parts_that_touch_along_an_edge_are_closed():
 
 def test_touching_part_inside_out_is_turned():
     vertices = np.concatenate([CUBE, CUBE + np.array([1.0, 1.0, 0.0])])
-    surface = close_surface(vertices, np.concatenate([CUBE_TRIANGLES, 8 + CUBE_TRIANGLES[:, ::-1]]), "cubes")
-    assert surface.warnings == ("cubes: 1 of its 2 parts were inside out, the first at [1.333, 1.667, 0]; turned",)
+    surface = close_surface(
+        vertices, np.concatenate([CUBE_TRIANGLES, 8 + CUBE_TRIANGLES[:, ::-1]]), "cubes"
+    )
+    assert surface.warnings == (
+        "cubes: 1 of its 2 parts were inside out, the first at [1.333, 1.667, 0]; turned",
+    )
     assert surface.volume == pytest.approx(2.0)
 
 
 def test_tangled_edges_are_refused():
-    n = 4  # every second cube of a block whose sides are joined: four squares meet at every edge; where the vertices are does not matter
+    # every second cube of a block whose sides are joined: four squares meet at every edge; where
+    # the vertices are does not matter
+    n = 4
     cells = [cell for cell in np.ndindex(n, n, n) if sum(cell) % 2 == 0]
     corners = np.array(cells)[:, None] + CUBE[None].astype(int)
     number = np.ravel_multi_index(tuple(np.moveaxis(corners % n, -1, 0)), (n, n, n))
@@ -472,14 +554,18 @@ def test_tangled_edges_are_refused():
 
 
 def test_one_sided_surface_is_refused():
-    n = 12  # a Klein bottle as an n x n grid whose last row is joined to the first one reversed; its shape does not matter
+    # a Klein bottle as an n x n grid whose last row is joined to the first one reversed; its shape
+    # does not matter
+    n = 12
     i, j = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
 
     def number(row, column):
         return np.where(row == n, (n - column) % n, row % n * n + column % n)
 
     a, b, c, d = number(i, j), number(i + 1, j), number(i + 1, j + 1), number(i, j + 1)
-    triangles = np.concatenate([np.stack([a, b, c], axis=-1).reshape(-1, 3), np.stack([a, c, d], axis=-1).reshape(-1, 3)])
+    triangles = np.concatenate(
+        [np.stack([a, b, c], axis=-1).reshape(-1, 3), np.stack([a, c, d], axis=-1).reshape(-1, 3)]
+    )
     vertices = np.random.default_rng(4415).random((n * n, 3))
     with pytest.raises(ValueError, match="one side only"):
         close_surface(vertices, triangles, "bottle")
@@ -495,5 +581,7 @@ def test_spot():
     points = np.random.default_rng(4416).uniform(low, high, (500, 3))
     inside = distances(TriangleMesh(surface=surface), points) < 0.0
     direction = np.array([0.3612, 0.8431, 0.3989])
-    np.testing.assert_array_equal(inside, parity_inside(points, surface, direction / np.linalg.norm(direction)))
+    np.testing.assert_array_equal(
+        inside, parity_inside(points, surface, direction / np.linalg.norm(direction))
+    )
     assert 100 < inside.sum() < 400

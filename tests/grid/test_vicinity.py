@@ -45,7 +45,9 @@ def marked(grid: StaggeredGrid, near: np.ndarray, box: Window) -> np.ndarray:
 
 
 def random_part(seed: int, share: float) -> Window:
-    near = np.random.default_rng(seed).random((*GRID.shape[:2], -(-GRID.shape[2] // SEGMENT))) < share
+    near = (
+        np.random.default_rng(seed).random((*GRID.shape[:2], -(-GRID.shape[2] // SEGMENT))) < share
+    )
     return Window((1, 3, 2), (12, 22, 37), GRID.device, near.astype(np.uint8))
 
 
@@ -58,14 +60,18 @@ def test_each_marked_cell_of_a_box_is_visited_once_and_no_other(share: float) ->
         expected = marked(GRID, part.near, part)
         np.testing.assert_array_equal(out.numpy(), expected)
         source, smooth, whole = (
-            wp.array(np.random.default_rng(seed).random(GRID.shape), dtype=wp.float32, device="cpu"),
+            wp.array(
+                np.random.default_rng(seed).random(GRID.shape), dtype=wp.float32, device="cpu"
+            ),
             GRID.field(),
             GRID.field(),
         )
         inner = Window((1, 3, 2), (12, 21, 37), GRID.device)
         inner.run(BINOMIAL, planes=2, source=source, out=whole)
         part.common(inner).run(BINOMIAL, planes=2, source=source, out=smooth)  # type: ignore[union-attr]
-        np.testing.assert_array_equal(smooth.numpy(), np.where(marked(GRID, part.near, inner), whole.numpy(), 0.0))
+        np.testing.assert_array_equal(
+            smooth.numpy(), np.where(marked(GRID, part.near, inner), whole.numpy(), 0.0)
+        )
         part.launch_rows(visit_rows_kernel, [rows])
         used = expected.any(axis=2)
         first, last = expected.argmax(axis=2), GRID.shape[2] - expected[..., ::-1].argmax(axis=2)
@@ -113,7 +119,10 @@ def test_all_cells_that_particles_reach_are_near(grid: StaggeredGrid, small: Non
 
 @pytest.mark.cpu_form("pieces of rows are the CPU's")
 def test_what_was_reached_goes_along_to_another_part_of_a_domain(small: None) -> None:
-    old, new = (StaggeredGrid((32, 20, 12), 0.1, 3, "cpu", origin=at, whole=(80, 60, 40)) for at in ((16, 8, 8), (24, 0, 16)))
+    old, new = (
+        StaggeredGrid((32, 20, 12), 0.1, 3, "cpu", origin=at, whole=(80, 60, 40))
+        for at in ((16, 8, 8), (24, 0, 16))
+    )
     particles = Particles(old, np.array([[2.75, 1.25, 1.85]]), np.zeros((1, 3)), affine=False)
     before = Vicinity(old)
     before.window(old.everywhere, particles, 2, 5)

@@ -81,7 +81,10 @@ def test_inverted_sphere_is_a_container(dimension):
     angles=st.tuples(*[st.floats(0.0, 360.0)] * 3),
     scale=st.floats(0.05, 3.0),
     shape=st.sampled_from(
-        [Box(lower=[-0.3, -0.1, -0.2], upper=[0.3, 0.1, 0.2]), Capsule(start=[0.0, -0.2, 0.1], end=[0.2, 0.3, 0.0], radius=0.1)]
+        [
+            Box(lower=[-0.3, -0.1, -0.2], upper=[0.3, 0.1, 0.2]),
+            Capsule(start=[0.0, -0.2, 0.1], end=[0.2, 0.3, 0.0], radius=0.1),
+        ]
     ),
     chunk=st.sampled_from([1, 100, 1 << 20]),
 )
@@ -93,8 +96,12 @@ def test_every_cell_is_claimed_by_its_center(center, angles, scale, shape, chunk
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(voxelize_module, "CHUNK", chunk)
         patch.setattr(node_distance, "CHUNK", chunk)
-        host = np.stack(np.meshgrid(*(spacing * (np.arange(n) + 0.5) for n in counts), indexing="ij"), axis=-1)
-        claimed = inside([geometry], np.asarray(host.reshape(-1, 3), dtype=np.float32), device="cpu").reshape(counts)
+        host = np.stack(
+            np.meshgrid(*(spacing * (np.arange(n) + 0.5) for n in counts), indexing="ij"), axis=-1
+        )
+        claimed = inside(
+            [geometry], np.asarray(host.reshape(-1, 3), dtype=np.float32), device="cpu"
+        ).reshape(counts)
         if claimed.all():
             return
         try:
@@ -103,14 +110,23 @@ def test_every_cell_is_claimed_by_its_center(center, angles, scale, shape, chunk
             assert "wholly outside" in str(error)
             assert not claimed.any()
             return
-    np.testing.assert_array_equal(voxels.index.numpy()[1:-1, 1:-1, 1:-1] == 1, claimed.transpose(2, 1, 0))
+    np.testing.assert_array_equal(
+        voxels.index.numpy()[1:-1, 1:-1, 1:-1] == 1, claimed.transpose(2, 1, 0)
+    )
     assert voxels.covered == (int(claimed.sum()),)
 
 
 def test_a_solid_between_cell_centers_is_reported():
-    voxels = cells((10, 10, 1), 0.1, 2, placed(Sphere(center=[0.5, 0.5], radius=0.04), name="solid[0] (sphere)"))
+    voxels = cells(
+        (10, 10, 1),
+        0.1,
+        2,
+        placed(Sphere(center=[0.5, 0.5], radius=0.04), name="solid[0] (sphere)"),
+    )
     assert voxels.covered == (0,)
-    assert voxels.notes == ("solid[0] (sphere) is too small for the grid: no center of a cell of 0.1 m lies inside it",)
+    assert voxels.notes == (
+        "solid[0] (sphere) is too small for the grid: no center of a cell of 0.1 m lies inside it",
+    )
 
 
 def test_solids_that_leave_no_cell_are_refused():
@@ -134,38 +150,61 @@ def test_a_solid_outside_the_domain_is_refused(geometry, dimension):
 
 def test_a_solid_that_has_moved_may_be_anywhere():
     """Outside the domain, or over all of it: without remarks neither is refused, and nothing is noted."""
-    outside = PlacedSolid(geometry=Sphere(center=[9.0, 9.0], radius=0.2), separating=True, name="ball")
-    found = voxelize(StaggeredGrid((4, 4, 1), 0.25, 2), [outside], wall_separating=True, remarks=False)
+    outside = PlacedSolid(
+        geometry=Sphere(center=[9.0, 9.0], radius=0.2), separating=True, name="ball"
+    )
+    found = voxelize(
+        StaggeredGrid((4, 4, 1), 0.25, 2), [outside], wall_separating=True, remarks=False
+    )
     assert (found.index.numpy()[1, 1:-1, 1:-1] == -1).all()
-    everywhere = PlacedSolid(geometry=Sphere(center=[0.5, 0.5], radius=9.0), separating=True, name="ball")
-    found = voxelize(StaggeredGrid((4, 4, 1), 0.25, 2), [everywhere], wall_separating=True, remarks=False)
+    everywhere = PlacedSolid(
+        geometry=Sphere(center=[0.5, 0.5], radius=9.0), separating=True, name="ball"
+    )
+    found = voxelize(
+        StaggeredGrid((4, 4, 1), 0.25, 2), [everywhere], wall_separating=True, remarks=False
+    )
     assert (found.index.numpy()[1, 1:-1, 1:-1] == 1).all()
     assert found.notes == ()
 
 
 def test_a_mesh_that_misses_the_plane_of_two_dimensions_is_refused():
-    mesh = TriangleMesh(surface=builtin_mesh("torus"), placement=Placement(translation=[0.5, 0.5, 0.2]))
+    mesh = TriangleMesh(
+        surface=builtin_mesh("torus"), placement=Placement(translation=[0.5, 0.5, 0.2])
+    )
     with pytest.raises(ValueError, match=r"misses z = 0"):
         cells((10, 10, 1), 0.1, 2, placed(mesh))
 
 
 def test_a_mesh_is_cut_in_two_dimensions():
-    mesh = TriangleMesh(surface=builtin_mesh("torus"), placement=Placement(translation=[0.6, 0.6, 0.0]))
+    mesh = TriangleMesh(
+        surface=builtin_mesh("torus"), placement=Placement(translation=[0.6, 0.6, 0.0])
+    )
     voxels = cells((120, 120, 1), 0.01, 2, placed(mesh))
     assert voxels.covered[0] * 0.01**2 == pytest.approx(np.pi * (0.5**2 - 0.2**2), rel=0.01)
     assert voxels.notes == ()
 
 
 def test_a_mesh_that_sticks_out_is_reported():
-    mesh = TriangleMesh(surface=builtin_mesh("torus"), placement=Placement(translation=[0.2, 0.5, 0.5]))
+    mesh = TriangleMesh(
+        surface=builtin_mesh("torus"), placement=Placement(translation=[0.2, 0.5, 0.5])
+    )
     assert placement_notes(mesh, "cow", StaggeredGrid((50, 50, 50), 0.02, 3)) == [
         "cow reaches 0.3 m out of the domain; the part outside has no effect"
     ]
-    assert placement_notes(Sphere(center=[0.0, 0.5, 0.5], radius=0.3), "sphere", StaggeredGrid((50, 50, 50), 0.02, 3)) == []
+    assert (
+        placement_notes(
+            Sphere(center=[0.0, 0.5, 0.5], radius=0.3),
+            "sphere",
+            StaggeredGrid((50, 50, 50), 0.02, 3),
+        )
+        == []
+    )
 
 
 def test_a_mesh_thinner_than_a_cell_is_reported():
-    thin = TriangleMesh(surface=builtin_mesh("knot"), placement=Placement(translation=[0.5, 0.5, 0.5]))
+    thin = TriangleMesh(
+        surface=builtin_mesh("knot"), placement=Placement(translation=[0.5, 0.5, 0.5])
+    )
     (note,) = cells((5, 5, 5), 0.2, 3, placed(thin, name="knot")).notes
     assert "knot is thinner than a cell of 0.2 m under 100% of its surface" in note
     assert cells((32, 32, 32), 1.0 / 32.0, 3, placed(thin)).notes == ()

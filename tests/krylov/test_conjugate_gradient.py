@@ -7,7 +7,17 @@ import warp as wp
 import warp_lcp as wl
 from oracle import assemble
 from warp_lcp.krylov import ConjugateGradient
-from warp_lcp.krylov.conjugate_gradient import BEST, ITERATIONS, LIMIT, RR, RZ, RZ_OLD, SLOTS, TOLERANCE, end_kernel
+from warp_lcp.krylov.conjugate_gradient import (
+    BEST,
+    ITERATIONS,
+    LIMIT,
+    RR,
+    RZ,
+    RZ_OLD,
+    SLOTS,
+    TOLERANCE,
+    end_kernel,
+)
 from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.reduced.active_set_kernels import DIVIDE
 from warp_lcp.rows import program, team
@@ -21,9 +31,13 @@ class Jacobi:
 
     def __init__(self, A, recorded):
         stencil = A.stencil
-        self.r, self.z = (wp.zeros(stencil.d.size, dtype=wp.float64, device=A.device) for _ in range(2))
+        self.r, self.z = (
+            wp.zeros(stencil.d.size, dtype=wp.float64, device=A.device) for _ in range(2)
+        )
         d = np.maximum(stencil.d.numpy().astype(float) * stencil.unit, 1.0)
-        self._divide = DIVIDE.bind(rows_of(self.r), r=self.r, d=wp.array(d, dtype=wp.float64, device=A.device), z=self.z)
+        self._divide = DIVIDE.bind(
+            rows_of(self.r), r=self.r, d=wp.array(d, dtype=wp.float64, device=A.device), z=self.z
+        )
         if recorded:
             self.program = program.Program(A.device)
             self._divide.launch(self.program.launch)
@@ -81,7 +95,9 @@ def test_iterations_are_those_of_the_textbook(krylov, cells):
         b = rng.standard_normal(SHAPE) * (cells == wl.FLUID)
         set_right_side(preconditioner, b)
         iterations, norm = krylov.solve(tolerance, most)
-        expected, expected_norm, x = numpy_iterations(A, b.ravel()[unknown], np.maximum(np.diag(A), 1), tolerance, most)
+        expected, expected_norm, x = numpy_iterations(
+            A, b.ravel()[unknown], np.maximum(np.diag(A), 1), tolerance, most
+        )
         assert iterations == expected
         assert norm == pytest.approx(expected_norm, rel=1e-6)
         found = krylov.x.numpy().reshape([n + 2 for n in SHAPE])[1:-1, 1:-1, 1:-1].ravel()
@@ -120,7 +136,13 @@ def test_a_right_side_that_is_no_number_stops_at_once(krylov, cells):
 )
 def test_every_reason_to_stop(norm, best, iterations, going, device):
     scalars = np.zeros(int(SLOTS))
-    scalars[[int(slot) for slot in (RR, BEST, ITERATIONS, TOLERANCE, LIMIT)]] = norm**2, best, iterations, 1.0, 10
+    scalars[[int(slot) for slot in (RR, BEST, ITERATIONS, TOLERANCE, LIMIT)]] = (
+        norm**2,
+        best,
+        iterations,
+        1.0,
+        10,
+    )
     scalars[int(RZ)] = 7.0
     on_device = wp.array(scalars, dtype=wp.float64, device=device)
     flag = wp.zeros(1, dtype=wp.int32, device=device)

@@ -23,7 +23,9 @@ class Scaling:
 
 def convection_diffusion(m, peclet):
     """Central differences with a wind of both axes."""
-    T = scipy.sparse.diags_array([-1.0 - peclet, 2.0, -1.0 + peclet], offsets=[-1, 0, 1], shape=(m, m))
+    T = scipy.sparse.diags_array(
+        [-1.0 - peclet, 2.0, -1.0 + peclet], offsets=[-1, 0, 1], shape=(m, m)
+    )
     I = scipy.sparse.eye_array(m)
     return (scipy.sparse.kron(T, I) + scipy.sparse.kron(I, T)).tocsr()
 
@@ -48,7 +50,15 @@ def test_iterations_are_scipys(restart, scaled, device):
     # from the right: A M u = b, x = M u
     seen = []
     right = scipy.sparse.linalg.LinearOperator((144, 144), matvec=lambda u: matrix @ (scale * u))
-    u, info = scipy.sparse.linalg.gmres(right, b, rtol=1e-8, restart=restart, maxiter=1000, callback=seen.append, callback_type="pr_norm")
+    u, info = scipy.sparse.linalg.gmres(
+        right,
+        b,
+        rtol=1e-8,
+        restart=restart,
+        maxiter=1000,
+        callback=seen.append,
+        callback_type="pr_norm",
+    )
     assert info == 0
     assert abs(count - len(seen)) <= 1
     x = krylov.x.numpy()
@@ -63,7 +73,9 @@ def test_a_weight_measures_the_residual(device):
     stiff = 10 ** rng.uniform(0, 8, 100)
     matrix = (convection_diffusion(10, 0.3) + scipy.sparse.diags_array(stiff)).tocsr()
     d, b = matrix.diagonal(), rng.standard_normal(100) * np.sqrt(stiff)
-    krylov, M = make(matrix, device, scale=1 / d, weight=wp.array(1 / d, dtype=wp.float64, device=device))
+    krylov, M = make(
+        matrix, device, scale=1 / d, weight=wp.array(1 / d, dtype=wp.float64, device=device)
+    )
     M.r.assign(b)
     size = np.linalg.norm(b / np.sqrt(d))
     count, norm = krylov.solve(1e-10 * float(size), 200)
@@ -80,7 +92,9 @@ def test_single_precision_reports_the_true_residual(device):
     M.r.assign(b)
     count, norm = krylov.solve(1e-12, 400)  # out of reach: restarts must end, not run on
     assert count < 400
-    assert norm == pytest.approx(np.linalg.norm(matrix @ krylov.x.numpy().astype(np.float64) - b), rel=0.5)
+    assert norm == pytest.approx(
+        np.linalg.norm(matrix @ krylov.x.numpy().astype(np.float64) - b), rel=0.5
+    )
     assert norm <= 1e-5
 
 

@@ -19,13 +19,17 @@ BLOCK = {"shape": "box", "min": [0.4, 0.6], "max": [0.6, 0.7], "density": 500.0}
 LOW = [0.0, 0.0]
 
 
-def make(*solids: dict[str, Any], simulator: str = "fluids", resolution: int = 16, **tables: Any) -> Any:
+def make(
+    *solids: dict[str, Any], simulator: str = "fluids", resolution: int = 16, **tables: Any
+) -> Any:
     data = {
         "scene": {"simulator": simulator},
         "time": {"duration": 1.0},
         "domain": {"size": [1.0, 1.0], "resolution": resolution},
         "physics": {},
-        ("liquid" if simulator == "fluids" else "sand"): [{"shape": "box", "min": LOW, "max": [0.25, 0.25]}],
+        ("liquid" if simulator == "fluids" else "sand"): [
+            {"shape": "box", "min": LOW, "max": [0.25, 0.25]}
+        ],
         "solid": list(solids),
     }
     model, plugin = (LiquidScene, FLUIDS) if simulator == "fluids" else (SandScene, GRANULAR)
@@ -34,17 +38,21 @@ def make(*solids: dict[str, Any], simulator: str = "fluids", resolution: int = 1
 
 @pytest.mark.parametrize("simulator", ["fluids", "granular"])
 def test_a_body_falls_and_turns_in_air_as_mechanics_says(simulator: str) -> None:
-    simulation = make({**BLOCK, "velocity": [0.5, 0.0], "angular_velocity": 90.0}, simulator=simulator)
+    simulation = make(
+        {**BLOCK, "velocity": [0.5, 0.0], "angular_velocity": 90.0}, simulator=simulator
+    )
     for dt in (0.004, 0.01, 1e-6, 0.006, 0.02):
         row = simulation.step(dt)
     time = simulation.time
     assert row["body0_x"] == pytest.approx(0.5 + 0.5 * time)
     assert row["body0_y"] == pytest.approx(0.65 - 0.5 * GRAVITY * time**2)
-    assert row["body0_vy"] == pytest.approx(-GRAVITY * (time - 0.5 * dt))  # in the middle of the step
+    # in the middle of the step
+    assert row["body0_vy"] == pytest.approx(-GRAVITY * (time - 0.5 * dt))
     assert row["body0_angle"] == pytest.approx(90.0 * time)
     assert row["body0_spin"] == pytest.approx(90.0)
     assert tuple(row) == simulation.columns()
-    distance = simulation.boundary.distance.numpy()[1] * simulation.grid.spacing  # its solid is where it is
+    # its solid is where it is
+    distance = simulation.boundary.distance.numpy()[1] * simulation.grid.spacing
     j, i = np.unravel_index(distance[1:-1, 1:-1].argmin(), (16, 16))
     assert np.hypot(i / 16 - row["body0_x"], j / 16 - row["body0_y"]) < 0.08
 
@@ -61,7 +69,10 @@ def test_what_no_scene_asks_for_is_not_there() -> None:
 @pytest.mark.parametrize("simulator", ["fluids", "granular"])
 def test_a_run_goes_on_from_a_state_bit_for_bit(simulator: str) -> None:
     """From the middle of an impact on the floor."""
-    solids = [{**BLOCK, "translate": [0.2, -0.55], "rotate": 3.0, "velocity": [0.0, -3.0]}, {**BLOCK, "translate": [0.0, 0.1]}]
+    solids = [
+        {**BLOCK, "translate": [0.2, -0.55], "rotate": 3.0, "velocity": [0.0, -3.0]},
+        {**BLOCK, "translate": [0.0, 0.1]},
+    ]
     through, later = (make(*solids, simulator=simulator) for _ in range(2))
     for _ in range(6):
         through.step(0.004)
@@ -96,8 +107,15 @@ def test_bodies_go_on_on_another_grid() -> None:
 
 
 def test_a_step_that_fails_leaves_the_bodies_as_they_were(monkeypatch: pytest.MonkeyPatch) -> None:
-    simulation = make({**BLOCK, "translate": [0.0, -0.6], "angular_velocity": 10.0}, solver={"max_iterations": 1, "tolerance": 1e-12})
-    before = {name: array for name, array in simulation.state().items() if name not in ("position", "velocity", "affine")}
+    simulation = make(
+        {**BLOCK, "translate": [0.0, -0.6], "angular_velocity": 10.0},
+        solver={"max_iterations": 1, "tolerance": 1e-12},
+    )
+    before = {
+        name: array
+        for name, array in simulation.state().items()
+        if name not in ("position", "velocity", "affine")
+    }
     with pytest.raises(StepFailed):
         simulation.step(0.01)
     for name, array in simulation.state().items():
@@ -107,9 +125,13 @@ def test_a_step_that_fails_leaves_the_bodies_as_they_were(monkeypatch: pytest.Mo
 
 @pytest.mark.parametrize("simulator", ["fluids", "granular"])
 @pytest.mark.parametrize("when", ["begin_step", "solve_contacts"])
-def test_contacts_that_are_not_solved_fail_the_step(simulator: str, when: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_contacts_that_are_not_solved_fail_the_step(
+    simulator: str, when: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Before or after the material's solve: the message has the residual, a shorter step may follow, and the state is as it was."""
-    simulation, twin = (make({**BLOCK, "translate": [0.0, -0.6]}, simulator=simulator) for _ in range(2))
+    simulation, twin = (
+        make({**BLOCK, "translate": [0.0, -0.6]}, simulator=simulator) for _ in range(2)
+    )
     simulation.step(0.004)
     twin.step(0.004)
     kept = getattr(RigidBodies, when)
@@ -130,7 +152,11 @@ def test_contacts_that_are_not_solved_fail_the_step(simulator: str, when: str, m
 
 @pytest.mark.parametrize("simulator", ["fluids", "granular"])
 def test_the_log_says_how_well_contacts_are_solved(simulator: str) -> None:
-    simulation = make({**BLOCK, "translate": [0.2, -0.6]}, {**BLOCK, "translate": [0.2, -0.5], "density": 4e4}, simulator=simulator)
+    simulation = make(
+        {**BLOCK, "translate": [0.2, -0.6]},
+        {**BLOCK, "translate": [0.2, -0.5], "density": 4e4},
+        simulator=simulator,
+    )
     assert "contact_residual" in simulation.columns()
     rows = [simulation.step(0.004) for _ in range(3)]
     assert all(0.0 < row["contact_residual"] <= 1e-5 for row in rows)
@@ -139,7 +165,10 @@ def test_the_log_says_how_well_contacts_are_solved(simulator: str) -> None:
 @pytest.mark.parametrize("simulator", ["fluids", "granular"])
 def test_a_body_leaves_by_an_open_side(simulator: str, tmp_path: Path) -> None:
     """It slides out over the floor, whose plane does not end outside; the other stays, and a run goes on from any state bit for bit."""
-    solids = [{**BLOCK, "translate": [0.2, -0.6], "velocity": [3.0, 0.0], "friction": 0.0}, {**BLOCK, "translate": [0.0, 0.1]}]
+    solids = [
+        {**BLOCK, "translate": [0.2, -0.6], "velocity": [3.0, 0.0], "friction": 0.0},
+        {**BLOCK, "translate": [0.0, 0.1]},
+    ]
     domain = {"size": [1.0, 1.0], "resolution": 16, "open": ["right"]}
     through, later = (make(*solids, simulator=simulator, domain=domain) for _ in range(2))
     rows = [through.step(0.01) for _ in range(8)]
@@ -174,7 +203,16 @@ def test_frames_without_a_body_left_are_written(tmp_path: Path) -> None:
 
 
 def test_frames_show_the_outlines(tmp_path: Path) -> None:
-    simulation = make(BLOCK, {"shape": "sphere", "center": [0.2, 0.6], "radius": 0.1, "mass": 1.0, "velocity": [0.3, 0.0]})
+    simulation = make(
+        BLOCK,
+        {
+            "shape": "sphere",
+            "center": [0.2, 0.6],
+            "radius": 0.1,
+            "mass": 1.0,
+            "velocity": [0.3, 0.0],
+        },
+    )
     simulation.step(0.01)
     part = simulation.frame()[-1]
     assert isinstance(part, Surface)
@@ -184,7 +222,9 @@ def test_frames_show_the_outlines(tmp_path: Path) -> None:
     row = simulation.bodies.row()
     ball = part.points[4:]
     np.testing.assert_allclose(ball.mean(axis=0)[:2], [row["body1_x"], row["body1_y"]], atol=1e-6)
-    np.testing.assert_allclose(part.fields["velocity"][4:], np.tile([0.3, -0.5 * 0.0981, 0.0], (48, 1)), rtol=1e-5)
+    np.testing.assert_allclose(
+        part.fields["velocity"][4:], np.tile([0.3, -0.5 * 0.0981, 0.0], (48, 1)), rtol=1e-5
+    )
     write_vtu(tmp_path / "bodies.vtu", part)
     assert (tmp_path / "bodies.vtu").stat().st_size > 1000
 

@@ -28,7 +28,10 @@ SOURCE = {"source": [small_liquids.box([0.9, 1.0], [1.0, 1.1], velocity=[2.0, 0.
 LIQUIDS: dict[str, dict[str, Any]] = {
     "apic": {},
     "flip": {"particles": {"transfer": "flip"}},
-    "band": {"particles": {"narrow_band": {"width": 3}}, "liquid": [{**small_liquids.box([0.2, 0.5], [1.0, 1.3]), "velocity": [3.0, 1.0]}]},
+    "band": {
+        "particles": {"narrow_band": {"width": 3}},
+        "liquid": [{**small_liquids.box([0.2, 0.5], [1.0, 1.3]), "velocity": [3.0, 1.0]}],
+    },
     "reseeding": {"particles": {"reseed": {"every": 3}}},
     "correction": {"density_correction": {"every": 2}},
     "unilateral": {"pressure": {"model": "unilateral"}},
@@ -44,7 +47,11 @@ LIQUIDS: dict[str, dict[str, Any]] = {
     "source": SOURCE,
     "drain": {"drain": [small_liquids.box([0.8, 0.5], [1.2, 1.0])]},
 }
-SANDS: dict[str, dict[str, Any]] = {"sand": {}, "solid in sand": {"solid": [BALL]}, "sand source": {"source": SOURCE["source"]}}
+SANDS: dict[str, dict[str, Any]] = {
+    "sand": {},
+    "solid in sand": {"solid": [BALL]},
+    "sand source": {"source": SOURCE["source"]},
+}
 CASES = [*LIQUIDS, *SANDS]
 
 
@@ -56,12 +63,18 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def made(name: str, *, follow: bool) -> ParticleSimulation:
-    tables: dict[str, Any] = {"liquid" if name in LIQUIDS else "sand": [THROWN]} | (LIQUIDS | SANDS)[name]
+    tables: dict[str, Any] = {"liquid" if name in LIQUIDS else "sand": [THROWN]} | (
+        LIQUIDS | SANDS
+    )[name]
     short = {key: tables.pop(key) for key in ("solids",) if key in tables}
-    domain = {"size": [3.0, 1.5], "resolution": 60, "follow": follow} | short | tables.pop("domain", {})
+    domain = (
+        {"size": [3.0, 1.5], "resolution": 60, "follow": follow} | short | tables.pop("domain", {})
+    )
     data = {"time": {"duration": 10.0}, "domain": domain} | tables
     if name in LIQUIDS:
-        return small_liquids.create(LiquidScene.model_validate({"scene": {"simulator": "fluids"}} | data))
+        return small_liquids.create(
+            LiquidScene.model_validate({"scene": {"simulator": "fluids"}} | data)
+        )
     return small_sands.create(SandScene.model_validate({"scene": {"simulator": "granular"}} | data))
 
 
@@ -89,27 +102,41 @@ def test_a_grid_that_follows_finds_what_one_of_the_domain_does(name: str, small:
 
 @pytest.mark.parametrize("name", CASES)
 def test_it_goes_on_from_a_state_bit_for_bit_and_on_the_other_grid(name: str, small: None) -> None:
-    through, later, whole = made(name, follow=True), made(name, follow=True), made(name, follow=False)
+    through, later, whole = (
+        made(name, follow=True),
+        made(name, follow=True),
+        made(name, follow=False),
+    )
     run(through, 9)
     state = {key: np.array(value) for key, value in through.state().items()}
-    assert state["box"].tolist() == [list(through.grid.origin), (np.array(through.grid.origin) + through.grid.counts).tolist()]
+    assert state["box"].tolist() == [
+        list(through.grid.origin),
+        (np.array(through.grid.origin) + through.grid.counts).tolist(),
+    ]
     later.restore(state)
     whole.restore(state)
     for simulation in (through, later, whole):
         run(simulation, 9)
     found = later.state()
-    assert [key for key, value in through.state().items() if not np.array_equal(value, found[key])] == []
+    assert [
+        key for key, value in through.state().items() if not np.array_equal(value, found[key])
+    ] == []
     assert "box" not in whole.state()
-    assert whole.particles.totals().center == pytest.approx(through.particles.totals().center, abs=1e-4)
+    assert whole.particles.totals().center == pytest.approx(
+        through.particles.totals().center, abs=1e-4
+    )
     later.restore(whole.state())
     assert later.grid == whole.grid
 
 
 @pytest.mark.cpu_form("pieces of rows are the CPU's")
 @pytest.mark.parametrize("name", CASES)
-def test_visiting_what_particles_reach_leaves_the_same_bits(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_visiting_what_particles_reach_leaves_the_same_bits(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     whole = made(name, follow=False)
-    for setting, value in {"LEAST_CELLS": 0, "MOST": 9.0}.items():  # segments end beyond a small box
+    # segments end beyond a small box
+    for setting, value in {"LEAST_CELLS": 0, "MOST": 9.0}.items():
         monkeypatch.setattr(vicinity, setting, value)
     part = made(name, follow=False)
     assert run(part, 18) == run(whole, 18)
@@ -124,7 +151,9 @@ def test_it_pays_for_what_there_is() -> None:
     sizes = []
     for n in (64, 512):
         drop = {"shape": "sphere", "center": [0.05 * n] * 3, "radius": 1.2}
-        simulation = small_liquids.create(small_liquids.scene(size=[0.1 * n] * 3, resolution=n, liquid=[drop]))
+        simulation = small_liquids.create(
+            small_liquids.scene(size=[0.1 * n] * 3, resolution=n, liquid=[drop])
+        )
         simulation.step(0.004)
         sizes.append(simulation.grid.size)
         state = simulation.state()
@@ -140,7 +169,9 @@ def test_grids_are_laid_where_the_material_leaves_them() -> None:
     assert moving.covers([40, 40, 20], [74, 68, 40])  # and some to spare, where it goes
     assert moving.origin == first.origin
     assert laid.around([41, 40, 20], [69, 60, 40], first) is first
-    assert laid.around([40, 40, 20], [first.origin[0] + first.counts[0], 60, 40], first) is not first
+    assert (
+        laid.around([40, 40, 20], [first.origin[0] + first.counts[0], 60, 40], first) is not first
+    )
     assert laid.around([50, 40, 20], [51, 41, 21], first).size < first.size / module.LOOSE
     assert laid.around([0, 0, 0], [150, 90, 60]) is DOMAIN  # more than half of it
     assert laid.around([-50, 200, 0], [-40, 300, 9]).domain_counts == DOMAIN.counts  # beyond it
@@ -159,17 +190,27 @@ def test_fields_go_along_where_both_grids_know_them() -> None:
     old = StaggeredGrid((32, 96, 64), 0.1, 3, "cpu", origin=(16, 0, 0), whole=DOMAIN.counts)
     new = StaggeredGrid((32, 96, 32), 0.1, 3, "cpu", origin=(32, 0, 16), whole=DOMAIN.counts)
     numbers = np.arange(np.prod(DOMAIN.shape)).reshape(DOMAIN.shape)
-    view = tuple(slice(o, o + n + 2) for o, n in zip(old.origin[::-1], old.counts[::-1], strict=True))
-    found = carry_over({"a": numbers[view], "b": np.array(7)}, old, new, {"a": np.full(new.shape, -1)})["a"]
+    view = tuple(
+        slice(o, o + n + 2) for o, n in zip(old.origin[::-1], old.counts[::-1], strict=True)
+    )
+    found = carry_over(
+        {"a": numbers[view], "b": np.array(7)}, old, new, {"a": np.full(new.shape, -1)}
+    )["a"]
     assert np.array_equal(found[1:-1, :, 1:17], numbers[17:49, :, 33:49])
     assert (found[:, :, 17:] == -1).all()
     assert (found[0] == -1).all()  # the new grid's own ring
 
 
 def test_a_domain_without_far_ends() -> None:
-    data = {"scene": {"simulator": "fluids"}, "time": {"duration": 1.0}, "liquid": [{**THROWN, "velocity": [40.0, 0.0]}]}
+    data = {
+        "scene": {"simulator": "fluids"},
+        "time": {"duration": 1.0},
+        "liquid": [{**THROWN, "velocity": [40.0, 0.0]}],
+    }
     model = LiquidScene
-    scene = model.model_validate(data | {"domain": {"spacing": 0.05, "dimension": 2, "open": ["left"]}})
+    scene = model.model_validate(
+        data | {"domain": {"spacing": 0.05, "dimension": 2, "open": ["left"]}}
+    )
     assert scene.cell_counts == (MOST_CELLS, MOST_CELLS, 1)
     assert scene.domain.open == ["left", "right", "top"]
     assert scene.seen[1][0] < 1.0
@@ -185,7 +226,10 @@ def test_a_domain_without_far_ends() -> None:
     with pytest.raises(SimulationFailed, match=rf"extends to {MOST_CELLS} cells along x"):
         simulation.step(0.001)
     for wrong, message in (
-        ({"spacing": 0.05, "size": [1.0, 1.0], "resolution": 16, "dimension": 2}, "replaces size and resolution"),
+        (
+            {"spacing": 0.05, "size": [1.0, 1.0], "resolution": 16, "dimension": 2},
+            "replaces size and resolution",
+        ),
         ({"size": [1.0, 1.0], "resolution": 16, "dimension": 2}, "otherwise size gives it"),
         ({"spacing": 0.05, "dimension": 2, "follow": False}, "no grid covers"),
     ):

@@ -22,7 +22,9 @@ JUNK = 1e3  # on faces that are neither projected nor carry weight
 def points(grid: StaggeredGrid, offset: Sequence[float]) -> np.ndarray:
     """Return the points (x, y, z) in cells from the domain's corner that lie at an offset from the cells' low corners."""
     k, j, i = np.meshgrid(*(np.arange(n) - 1.0 for n in grid.shape), indexing="ij")
-    return np.stack([i + offset[0], j + offset[1], (k + offset[2]) * (grid.dimension == 3)], axis=-1)
+    return np.stack(
+        [i + offset[0], j + offset[1], (k + offset[2]) * (grid.dimension == 3)], axis=-1
+    )
 
 
 def face_centers(grid: StaggeredGrid, axis: int) -> np.ndarray:
@@ -41,12 +43,20 @@ class Slope:
     """
 
     def __init__(
-        self, grid: StaggeredGrid, normal: tuple[float, float, float], kind: int = FLUID, contact: int = HELD, shift: float = 0.0
+        self,
+        grid: StaggeredGrid,
+        normal: tuple[float, float, float],
+        kind: int = FLUID,
+        contact: int = HELD,
+        shift: float = 0.0,
     ) -> None:
         self.grid, self.normal = grid, np.array(normal) / np.linalg.norm(normal)
         self.at = 0.5 * np.array(grid.counts) * [1, 1, grid.dimension == 3] + shift * self.normal
         nodes = self.signed(points(grid, (0, 0, 0)))
-        sides = [np.minimum(c, n - c) for c, n in zip(np.moveaxis(points(grid, (0, 0, 0)), -1, 0), grid.counts, strict=False)]
+        sides = [
+            np.minimum(c, n - c)
+            for c, n in zip(np.moveaxis(points(grid, (0, 0, 0)), -1, 0), grid.counts, strict=False)
+        ]
         distance = np.minimum(nodes, np.min(sides[: grid.dimension], axis=0))
         ring = np.ones(grid.shape, bool)
         ring[1:-1, 1:-1, 1:-1] = False
@@ -58,8 +68,11 @@ class Slope:
             outside[(slice(1, -1),) * (2 - axis) + (1,)] = True  # the domain's lower wall
             fraction[outside] = 0.0
             self.open.append(fraction)
-            inner = self.signed(face_centers(grid, axis)) < 0.5  # the plane is the nearest wall, or it would not matter
-            self.wall.append(np.where(fraction == 1.0, -1, np.where(inner & ~outside, 1, 0)).astype(np.int16))
+            # the plane is the nearest wall, or it would not matter
+            inner = self.signed(face_centers(grid, axis)) < 0.5
+            self.wall.append(
+                np.where(fraction == 1.0, -1, np.where(inner & ~outside, 1, 0)).astype(np.int16)
+            )
         cells = np.full(grid.shape, SOLID, np.int8)
         touches = np.full(grid.shape, TOUCHES_NOTHING, np.uint8)
         for axis, fraction in enumerate(self.open):
@@ -76,7 +89,8 @@ class Slope:
     def move(self, velocity: np.ndarray) -> None:
         """Let the plane move [m/s]."""
         self.speed = velocity
-        self.moving = [np.where(f < 1, velocity[axis], np.nan) for axis, f in enumerate(self.open)]  # open faces have no wall's velocity
+        # open faces have no wall's velocity
+        self.moving = [np.where(f < 1, velocity[axis], np.nan) for axis, f in enumerate(self.open)]
 
     def signed(self, x: np.ndarray) -> np.ndarray:
         return (x - self.at) @ self.normal
@@ -95,25 +109,48 @@ class Slope:
         return (total / n ** len(others)).astype(np.float32)
 
     def extend(
-        self, velocity: tuple[float, ...], layers: int = 4, *, closed: tuple[float, ...] = (JUNK,) * 3, weights: Faces = ()
+        self,
+        velocity: tuple[float, ...],
+        layers: int = 4,
+        *,
+        closed: tuple[float, ...] = (JUNK,) * 3,
+        weights: Faces = (),
     ) -> list[np.ndarray]:
         grid = self.grid
         given = [wp.array(w, dtype=wp.float32, device="cpu") for w in weights] or grid.faces()
         fields, known = [], []
         for axis, fraction in enumerate(self.open):
-            fields.append(wp.array(np.where(fraction > 0, velocity[axis], closed[axis]).astype(np.float32), device="cpu"))
+            fields.append(
+                wp.array(
+                    np.where(fraction > 0, velocity[axis], closed[axis]).astype(np.float32),
+                    device="cpu",
+                )
+            )
             is_open = fraction > 0
             if grid.dimension == 2:
                 is_open[[0, 2]] = False
             known.append(wp.array(is_open.astype(np.int8), device="cpu"))
         extend_velocity_cut(
-            grid.everywhere, fields, given, known, wp.array(self.kind, device="cpu"), wp.array(self.contact, device="cpu"),
-            self.cut(), grid.faces(), layers,
-        )  # fmt: skip
+            grid.everywhere,
+            fields,
+            given,
+            known,
+            wp.array(self.kind, device="cpu"),
+            wp.array(self.contact, device="cpu"),
+            self.cut(),
+            grid.faces(),
+            layers,
+        )
         return [field.numpy() for field in fields]
 
     def cut(self) -> Any:
-        moving = None if self.moving is None else [wp.array(m.astype(np.float32), dtype=wp.float32, device="cpu") for m in self.moving]
+        moving = (
+            None
+            if self.moving is None
+            else [
+                wp.array(m.astype(np.float32), dtype=wp.float32, device="cpu") for m in self.moving
+            ]
+        )
         return SimpleNamespace(
             distance=wp.array(self.distance.astype(np.float32), dtype=wp.float32, device="cpu"),
             open=[wp.array(f, dtype=wp.float32, device="cpu") for f in self.open],
@@ -129,7 +166,13 @@ class Slope:
     def judged(self, axis: int) -> np.ndarray:
         """Return the closed faces that a particle's tent can reach, away from the domain's walls."""
         x = face_centers(self.grid, axis)
-        away = np.all([(x[..., d] > 2.6) & (x[..., d] < self.grid.counts[d] - 2.6) for d in range(self.grid.dimension)], axis=0)
+        away = np.all(
+            [
+                (x[..., d] > 2.6) & (x[..., d] < self.grid.counts[d] - 2.6)
+                for d in range(self.grid.dimension)
+            ],
+            axis=0,
+        )
         if self.grid.dimension == 2:
             away[[0, 2]] = False
         return away & (self.open[axis] == 0) & (self.signed(x) > -1.5)
@@ -164,7 +207,13 @@ def expected(slope: Slope, velocity: tuple[float, ...], removes: bool) -> np.nda
     ],
 )
 def test_closed_faces_along_a_slope(
-    grid: StaggeredGrid, normal: tuple[float, float, float], towards: float, kind: int, contact: int, separating: int, holds: bool
+    grid: StaggeredGrid,
+    normal: tuple[float, float, float],
+    towards: float,
+    kind: int,
+    contact: int,
+    separating: int,
+    holds: bool,
 ) -> None:
     """Tangential flow stays whole; what leaves is held back only where the wall holds, what goes in is stopped everywhere."""
     slope = Slope(grid, normal, kind, contact)
@@ -204,7 +253,9 @@ def test_released_liquid_is_pushed_by_a_wall_that_overtakes_it() -> None:
 
 
 @pytest.mark.parametrize(("contact", "speed"), [(RELEASED, -1.0), (HELD, 0.0)])
-def test_a_sliver_that_lets_go_decides_and_not_the_cell_behind_it(contact: int, speed: float) -> None:
+def test_a_sliver_that_lets_go_decides_and_not_the_cell_behind_it(
+    contact: int, speed: float
+) -> None:
     """The wall cell under a ceiling is open for a fifth, the cell below it touches no wall: nothing may hang from that one."""
     slope = Slope(FLAT, (0.0, -1.0, 0.0), contact=contact, shift=-0.2)
     row = FLAT.counts[1] // 2 + 1  # of the wall cells
@@ -219,21 +270,34 @@ def test_a_sliver_that_lets_go_decides_and_not_the_cell_behind_it(contact: int, 
 @pytest.mark.parametrize("counts", [(7, 6, 1), (5, 6, 4)])
 @settings(max_examples=30, deadline=None)
 @given(random_seed=st.integers(0, 10**6))
-def test_a_box_is_treated_as_one_of_whole_cells(counts: tuple[int, int, int], random_seed: int) -> None:
+def test_a_box_is_treated_as_one_of_whole_cells(
+    counts: tuple[int, int, int], random_seed: int
+) -> None:
     """Without solids the walls are those of the domain, along the grid: what `warp_lcp.material.wall` does is an oracle."""
     grid = StaggeredGrid(counts, 0.1, 2 if counts[2] == 1 else 3)
     rng = np.random.default_rng(random_seed)
     inner = (slice(1, -1),) * 3
     kind = np.full(grid.shape, SOLID, np.int8)
     kind[inner] = rng.choice([AIR, FLUID], size=counts[::-1], p=[0.6, 0.4])
-    contact = np.where(kind == FLUID, rng.choice([HELD, RELEASED], size=grid.shape), TOUCHES_NOTHING).astype(np.uint8)
+    contact = np.where(
+        kind == FLUID, rng.choice([HELD, RELEASED], size=grid.shape), TOUCHES_NOTHING
+    ).astype(np.uint8)
     separating = wp.array([random_seed % 3 > 0], dtype=wp.uint8, device="cpu")
     x = points(grid, (0, 0, 0))
-    sides = np.min([np.minimum(x[..., d], grid.counts[d] - x[..., d]) for d in range(grid.dimension)], axis=0)
+    sides = np.min(
+        [np.minimum(x[..., d], grid.counts[d] - x[..., d]) for d in range(grid.dimension)], axis=0
+    )
     cut = SimpleNamespace(
-        distance=wp.array(sides.astype(np.float32), device="cpu"), open=[], wall=[], velocity=None, nearest=[], separating=separating,
-        grid=grid, turn=wp.zeros(1, dtype=wp.mat33, device="cpu"), shift=wp.zeros(1, dtype=wp.vec3, device="cpu"),
-    )  # fmt: skip
+        distance=wp.array(sides.astype(np.float32), device="cpu"),
+        open=[],
+        wall=[],
+        velocity=None,
+        nearest=[],
+        separating=separating,
+        grid=grid,
+        turn=wp.zeros(1, dtype=wp.mat33, device="cpu"),
+        shift=wp.zeros(1, dtype=wp.vec3, device="cpu"),
+    )
     results = []
     start, weights, marks = [], [], []
     for axis in range(grid.dimension):
@@ -242,26 +306,37 @@ def test_a_box_is_treated_as_one_of_whole_cells(counts: tuple[int, int, int], ra
         cut.open.append(wp.array(open_face.astype(np.float32), device="cpu"))
         cut.wall.append(wp.array(np.where(open_face, -1, 0).astype(np.int16), device="cpu"))
         projected = open_face & ((kind == FLUID) | (below == FLUID))
-        weights.append((rng.random(grid.shape) < 0.3).astype(np.float32) * ((kind != SOLID) | (below != SOLID)))
+        weights.append(
+            (rng.random(grid.shape) < 0.3).astype(np.float32) * ((kind != SOLID) | (below != SOLID))
+        )
         marks.append(np.where((kind == SOLID) & (below == SOLID), -1, projected).astype(np.int8))
-        start.append((rng.normal(size=grid.shape) * (projected | (weights[-1] > 0))).astype(np.float32))
+        start.append(
+            (rng.normal(size=grid.shape) * (projected | (weights[-1] > 0))).astype(np.float32)
+        )
     layers = 4
     for cuts in (False, True):
         fields = [wp.array(f, device="cpu") for f in start]
         weight = [wp.array(w, device="cpu") for w in weights]
-        known = [wp.array(np.maximum(m, 0) if cuts else m, dtype=wp.int8, device="cpu") for m in marks]
+        known = [
+            wp.array(np.maximum(m, 0) if cuts else m, dtype=wp.int8, device="cpu") for m in marks
+        ]
         liquid, touch = wp.array(kind, device="cpu"), wp.array(contact, device="cpu")
         if cuts:
-            extend_velocity_cut(grid.everywhere, fields, weight, known, liquid, touch, cut, grid.faces(), layers)
+            extend_velocity_cut(
+                grid.everywhere, fields, weight, known, liquid, touch, cut, grid.faces(), layers
+            )
         else:
             index = wp.array(np.where(kind == SOLID, 0, -1).astype(np.int32), device="cpu")
-            extend_velocity(grid.everywhere, fields, weight, known, liquid, touch, index, separating, [], layers)
+            extend_velocity(
+                grid.everywhere, fields, weight, known, liquid, touch, index, separating, [], layers
+            )
         results.append(([f.numpy() for f in fields], [m.numpy() for m in known]))
     for axis, (voxel, smooth) in enumerate(zip(results[0][0], results[1][0], strict=True)):
         reached = results[0][1][axis] > 0
         if grid.dimension == 2:
             reached[[0, 2]] = False
-        np.moveaxis(reached, 2 - axis, 0)[0] = False  # no tent reaches a face behind the domain's lower wall
+        # no tent reaches a face behind the domain's lower wall
+        np.moveaxis(reached, 2 - axis, 0)[0] = False
         assert smooth[reached] == pytest.approx(voxel[reached], abs=1e-6)
 
 
@@ -275,7 +350,9 @@ def test_spray_keeps_its_own_velocity_on_open_faces_only() -> None:
     fields[1][1, floor - 1, 15:16].fill_(7.0)
     weights[1][1, floor - 1, 15:16].fill_(1.0)
     kind, contact = wp.array(slope.kind, device="cpu"), wp.array(slope.contact, device="cpu")
-    extend_velocity_cut(FLAT.everywhere, fields, weights, marks, kind, contact, cut, FLAT.faces(), 2)
+    extend_velocity_cut(
+        FLAT.everywhere, fields, weights, marks, kind, contact, cut, FLAT.faces(), 2
+    )
     v, known = fields[1].numpy()[1], marks[1].numpy()[1]
     assert v[floor + 4, 9] == -2.0
     assert v[floor + 2, 9] == -2.0  # two layers from it
@@ -294,7 +371,9 @@ def test_what_rests_at_a_cut_wall_is_not_thrown_after_what_leaves_it(
     weights = [np.where(fraction == 0, 1.0, 0.0) for fraction in slope.open]
     fields = slope.extend(tuple(3.0 * away), closed=tuple(0.06 * away), weights=weights)
     for axis, field in enumerate(fields):
-        beside = slope.judged(axis) & ((slope.contact == contact) | (np.roll(slope.contact, 1, 2 - axis) == contact))
+        beside = slope.judged(axis) & (
+            (slope.contact == contact) | (np.roll(slope.contact, 1, 2 - axis) == contact)
+        )
         if abs(away[axis]) < 0.1:
             continue
         assert beside.sum() > 5

@@ -23,13 +23,23 @@ BALL = {"shape": "sphere", "center": [0.5, 0.5], "radius": 0.23}
 
 def tank(dimension: int = 2, resolution: int = 12, **tables: Any) -> tuple[Any, Boundary]:
     """Return grid and boundary of a unit box."""
-    simulation = create(scene(size=[1.0] * dimension, resolution=resolution, liquid=[box([0.0] * dimension, [1.0] * dimension)], **tables))
+    simulation = create(
+        scene(
+            size=[1.0] * dimension,
+            resolution=resolution,
+            liquid=[box([0.0] * dimension, [1.0] * dimension)],
+            **tables,
+        )
+    )
     return simulation.grid, simulation.boundary
 
 
 def lattice(grid: Any, boundary: Boundary, per_axis: int = 2) -> np.ndarray:
     """Return the points of a lattice that fills what is open [m], shape (n, 3)."""
-    axes = [(np.arange(n * per_axis) + 0.5) * grid.spacing / per_axis for n in grid.counts[: grid.dimension]]
+    axes = [
+        (np.arange(n * per_axis) + 0.5) * grid.spacing / per_axis
+        for n in grid.counts[: grid.dimension]
+    ]
     points = np.stack([c.ravel() for c in np.meshgrid(*axes, indexing="ij")], axis=1)
     points = np.pad(points, ((0, 0), (0, 3 - grid.dimension)))
     return points[boundary.admits(points)]
@@ -38,7 +48,11 @@ def lattice(grid: Any, boundary: Boundary, per_axis: int = 2) -> np.ndarray:
 def correction(grid: Any, boundary: Boundary, **settings: Any) -> DensityCorrection:
     """Return a correction of particles, 2 along each axis of a cell."""
     return DensityCorrection(
-        grid, boundary, wl.ProjectedMultigrid(precision="double"), particles_a_cell=2**grid.dimension, **({"max_density": 1.05} | settings)
+        grid,
+        boundary,
+        wl.ProjectedMultigrid(precision="double"),
+        particles_a_cell=2**grid.dimension,
+        **({"max_density": 1.05} | settings),
     )
 
 
@@ -65,10 +79,13 @@ def density_of(grid: Any, points: np.ndarray) -> np.ndarray:
     return result
 
 
-def dense_solution(boundary: Boundary, density: np.ndarray, most: float, sweeps: int = 20000) -> np.ndarray:
+def dense_solution(
+    boundary: Boundary, density: np.ndarray, most: float, sweeps: int = 20000
+) -> np.ndarray:
     """Return x >= 0 that is complementary to sum a_f (x_i - x_nb) + most capacity - density, in the stored shape, by projected sweeps.
 
-    A face of whole cells is open where no cell beside it is SOLID; x is 0 where there is no density.
+    A face of whole cells is open where no cell beside it is SOLID; x is 0 where there is no
+    density.
     """
     base, capacity = boundary.base.numpy(), boundary.capacity.numpy().astype(float)
     wet = (base != wl.SOLID) & (density > 0)
@@ -117,7 +134,9 @@ def test_the_solution_is_that_of_a_dense_problem(solid: list[dict[str, Any]]) ->
     assert expected.max() > 0.2
     np.testing.assert_allclose(corrected.x.numpy(), expected, atol=0.01 if boundary.open else 1e-4)
     open_cells = boundary.base.numpy() != wl.SOLID
-    assert done.max_density == pytest.approx(1 + (density - boundary.capacity.numpy())[open_cells & (density > 0)].max(), abs=1e-4)
+    assert done.max_density == pytest.approx(
+        1 + (density - boundary.capacity.numpy())[open_cells & (density > 0)].max(), abs=1e-4
+    )
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -145,7 +164,9 @@ def test_an_over_full_cell_pushes_its_neighbors_outward(dimension: int, indexed:
         if turn == 0 and not indexed:
             away = before - center
             distance = np.linalg.norm(away, axis=1)
-            outward = ((particles.position.numpy().copy() - before) * away).sum(axis=1) / np.maximum(distance, 1e-9)
+            outward = ((particles.position.numpy().copy() - before) * away).sum(
+                axis=1
+            ) / np.maximum(distance, 1e-9)
             ring = (distance > 0.6 * grid.spacing) & (distance < 1.6 * grid.spacing)
             assert (outward[ring] > 0.01 * grid.spacing).all()
             assert np.array_equal(particles.velocity.numpy().copy(), speeds)
@@ -191,8 +212,12 @@ def test_a_layer_squeezed_against_a_wall_counts_although_half_of_its_kernel_is_w
     points = lattice(grid, boundary)
     points = points[points[:, 1] < 1.0 / 8.0]
     lifted = points + np.array([0.0, 1.0 / 8.0, 0.0])
-    squeezed = np.concatenate([points, points * [1.0, 0.8, 1.0] + np.array([1e-3, 0.0, 0.0])])[: int(1.2 * len(points))]
-    done = correction(grid, boundary).apply(particles_of(grid, np.concatenate([squeezed, lifted])), grid.everywhere)
+    squeezed = np.concatenate([points, points * [1.0, 0.8, 1.0] + np.array([1e-3, 0.0, 0.0])])[
+        : int(1.2 * len(points))
+    ]
+    done = correction(grid, boundary).apply(
+        particles_of(grid, np.concatenate([squeezed, lifted])), grid.everywhere
+    )
     assert density_of(grid, np.concatenate([squeezed, lifted])).max() < 1.3
     assert done.over_full > 0
     assert done.result is not None
@@ -218,18 +243,25 @@ def test_a_closed_pocket_that_is_too_full_stops_nobody_else() -> None:
     random = np.random.default_rng(8)
     inside = np.pad(random.uniform(0.42, 0.58, (400, 2)), ((0, 0), (0, 1)))
     below = np.pad(random.uniform(0.01, 0.2, (400, 2)), ((0, 0), (0, 1)))
-    particles = particles_of(grid, np.concatenate([inside, below])[boundary.admits(np.concatenate([inside, below]))])
+    particles = particles_of(
+        grid, np.concatenate([inside, below])[boundary.admits(np.concatenate([inside, below]))]
+    )
     before = particles.position.numpy().copy()
     done = correction(grid, boundary).apply(particles, grid.everywhere)
     assert done.result is not None
     assert done.result.status is not wl.SolveStatus.INFEASIBLE
     outside = before[:, 1] < 0.25
-    assert np.linalg.norm(particles.position.numpy().copy() - before, axis=1)[outside].max() > 0.1 * grid.spacing
+    assert (
+        np.linalg.norm(particles.position.numpy().copy() - before, axis=1)[outside].max()
+        > 0.1 * grid.spacing
+    )
 
 
 def pool(**tables: Any) -> Any:
     """Return water at rest, 8 cells deep."""
-    return create(scene(size=[1.0, 0.5], resolution=24, liquid=[box([0.0, 0.0], [1.0, 1.0 / 3.0])], **tables))
+    return create(
+        scene(size=[1.0, 0.5], resolution=24, liquid=[box([0.0, 0.0], [1.0, 1.0 / 3.0])], **tables)
+    )
 
 
 def test_it_acts_by_itself_where_particles_crowd_and_nowhere_else() -> None:
@@ -276,7 +308,9 @@ def test_a_collapsed_column_has_the_volume_that_it_had(table: dict[str, Any]) ->
     counts = tuple(simulation.grid.counts[:2])
 
     def volume() -> float:
-        return enclosed_cells(simulation.particles.position.numpy()[:, :2] / simulation.grid.spacing, counts, 0.25)
+        return enclosed_cells(
+            simulation.particles.position.numpy()[:, :2] / simulation.grid.spacing, counts, 0.25
+        )
 
     before = volume()
     advance(simulation, 2.5)
@@ -301,7 +335,8 @@ def test_resuming_across_its_first_step_gives_the_same_bits() -> None:
     first = has.index(True)
     assert 0 < first < 25
     used = dam()
-    for start in (first - 1, first + 3, first - 2):  # the last one forgets what the simulation has made for itself
+    # the last one forgets what the simulation has made for itself
+    for start in (first - 1, first + 3, first - 2):
         used.restore(states[start])
         for _ in range(start, len(states)):
             used.step(min(used.stable_dt(), 0.02))
@@ -322,11 +357,15 @@ def test_voids_inside_close_where_the_material_keeps_its_volume(even: bool) -> N
     points = lattice(grid, boundary)
     particles = particles_of(grid, void(grid, points[points[:, 1] < 0.9]))
     middle = grid.counts[1] // 2 + 1
-    before = density_of(grid, particles.position.numpy())[1, middle - 1 : middle + 1, middle - 1 : middle + 1].mean()
+    before = density_of(grid, particles.position.numpy())[
+        1, middle - 1 : middle + 1, middle - 1 : middle + 1
+    ].mean()
     corrected = correction(grid, boundary, even=even)
     for _ in range(6):
         corrected.apply(particles, grid.everywhere)
-    after = density_of(grid, particles.position.numpy())[1, middle - 1 : middle + 1, middle - 1 : middle + 1].mean()
+    after = density_of(grid, particles.position.numpy())[
+        1, middle - 1 : middle + 1, middle - 1 : middle + 1
+    ].mean()
     assert before < 0.8
     assert after > 0.9 if even else after == pytest.approx(before, abs=0.01)
 
@@ -346,8 +385,13 @@ def test_liquid_that_lets_go_of_a_wall_is_not_drawn_back(lets_go: bool) -> None:
     assert risen < 0.01 if lets_go else risen > 0.05
 
 
-@pytest.mark.parametrize("tables", [{"density_correction": {"every": 0}}, {"density_correction": {}, "particles": {"reseed": {}}}])
-def test_a_scene_without_it_launches_none_of_its_kernels(tables: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "tables",
+    [{"density_correction": {"every": 0}}, {"density_correction": {}, "particles": {"reseed": {}}}],
+)
+def test_a_scene_without_it_launches_none_of_its_kernels(
+    tables: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Nor does it allocate: fields are made when the simulation is."""
     launched, launch, entry, prepared = set(), wp.launch, Form.entry, program.prepared
 
@@ -368,25 +412,46 @@ def test_a_scene_without_it_launches_none_of_its_kernels(tables: dict[str, Any],
     monkeypatch.setattr(program, "prepared", note_prepared)
     simulation = dam(**tables)
     advance(simulation, 0.2)
-    own = {name for name in launched if name.startswith(("warp_lcp.material.density_correction", "warp_lcp.material.reseeding"))}
+    own = {
+        name
+        for name in launched
+        if name.startswith(("warp_lcp.material.density_correction", "warp_lcp.material.reseeding"))
+    }
     assert any(name.startswith("warp_lcp.grid.density") for name in launched)
-    assert own == ({"warp_lcp.material.density_correction", "warp_lcp.material.reseeding"} if "particles" in tables else set())
+    assert own == (
+        {"warp_lcp.material.density_correction", "warp_lcp.material.reseeding"}
+        if "particles" in tables
+        else set()
+    )
 
 
 def test_every_third_step() -> None:
     simulation = dam(density_correction={"every": 3})
     rows = advance(simulation, 0.3)
-    assert [row["max_density"] is not None for row in rows] == [step % 3 == 0 for step in range(len(rows))]
+    assert [row["max_density"] is not None for row in rows] == [
+        step % 3 == 0 for step in range(len(rows))
+    ]
 
 
-@pytest.mark.parametrize("tables", [{}, {"solid": [box([0.5, 0.0], [0.7, 0.11], rotate=20)]}, {"dimension": 3}])
+@pytest.mark.parametrize(
+    "tables", [{}, {"solid": [box([0.5, 0.0], [0.7, 0.11], rotate=20)]}, {"dimension": 3}]
+)
 def test_a_liquid_that_has_splashed_keeps_its_density(tables: dict[str, Any]) -> None:
     """Without the correction cells at the floor fill up beyond 1.5."""
-    plain, corrected = dam(density_correction={"every": 0}, **tables), dam(density_correction={}, **tables)
+    plain, corrected = (
+        dam(density_correction={"every": 0}, **tables),
+        dam(density_correction={}, **tables),
+    )
     largest = []
     for simulation in (plain, corrected):
         advance(simulation, 1.0)
         density = wp.zeros_like(simulation.surface.phi)
         wp.copy(density, simulation.surface.level_set.density)
-        largest.append(float((density.numpy() - simulation.boundary.capacity.numpy())[simulation.boundary.base.numpy() != wl.SOLID].max()))
+        largest.append(
+            float(
+                (density.numpy() - simulation.boundary.capacity.numpy())[
+                    simulation.boundary.base.numpy() != wl.SOLID
+                ].max()
+            )
+        )
     assert largest[1] < 0.8 * largest[0]

@@ -15,8 +15,19 @@ def cut(piece, at):
     for inside, low, high in ((left, 0, at), (~left, at, piece["counts"][0])):
         box = piece["box"].copy()
         box[:, 0] = low, high
-        particles = {name: values[inside] for name, values in piece.items() if len(values.shape) and len(values) == len(left)}
-        parts.append({**piece, **particles, **{name: field[..., low:high] for name, field in fields_of(piece).items()}, "box": box})
+        particles = {
+            name: values[inside]
+            for name, values in piece.items()
+            if len(values.shape) and len(values) == len(left)
+        }
+        parts.append(
+            {
+                **piece,
+                **particles,
+                **{name: field[..., low:high] for name, field in fields_of(piece).items()},
+                "box": box,
+            }
+        )
     return parts
 
 
@@ -51,7 +62,10 @@ def test_what_is_missing_is_named():
     with pytest.raises(ValueError, match="do not cover the domain"):
         state_of(pieces[:1], state)
     with pytest.raises(ValueError, match="the pieces lack velocity"):
-        state_of([{name: values for name, values in pieces[0].items() if name != "velocity"}, pieces[1]], state)
+        state_of(
+            [{name: values for name, values in pieces[0].items() if name != "velocity"}, pieces[1]],
+            state,
+        )
     with pytest.raises(ValueError, match="the pieces lack everything"):
         state_of([], state)
     with pytest.raises(ValueError, match="the state lacks cells, position, signature"):

@@ -11,7 +11,13 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.transfer import TINY_WEIGHT
-from warp_lcp.material.particle_assembly import Parts, make_boundary, make_outlets, make_particles, make_sources
+from warp_lcp.material.particle_assembly import (
+    Parts,
+    make_boundary,
+    make_outlets,
+    make_particles,
+    make_sources,
+)
 from warp_lcp.material.particle_log import Row
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.material.particle_simulation import ParticleSimulation
@@ -68,7 +74,9 @@ class Dust(ParticleSimulation):
             marks.assign((weight.numpy() > TINY_WEIGHT).astype(np.int8))
         self.extrapolate_velocity(window, self.known, self.kind, self.contact)
         self.grid_to_particles(window, self.kind, dt)
-        return self.logged(self.move(dt, window) | self.solve_row(None) | {"grains": 7, "unasked": 1})
+        return self.logged(
+            self.move(dt, window) | self.solve_row(None) | {"grains": 7, "unasked": 1}
+        )
 
 
 def make(resolution: int = 16, **tables: Any) -> Dust:
@@ -82,8 +90,18 @@ def make(resolution: int = 16, **tables: Any) -> Dust:
     grid = StaggeredGrid(scene.cell_counts, scene.spacing, scene.dimension, "cpu")
     boundary, _ = make_boundary(scene, grid, Path())
     particles, notes = make_particles(scene, grid, boundary, Path())
-    sources, outlets = make_sources(scene, grid, boundary, Path()), make_outlets(scene, grid, Path())
-    return Dust(scene, grid=grid, parts=Parts(boundary, sources), particles=particles, outlets=outlets, notes=notes)
+    sources, outlets = (
+        make_sources(scene, grid, boundary, Path()),
+        make_outlets(scene, grid, Path()),
+    )
+    return Dust(
+        scene,
+        grid=grid,
+        parts=Parts(boundary, sources),
+        particles=particles,
+        outlets=outlets,
+        notes=notes,
+    )
 
 
 def test_it_falls_as_a_stone_does() -> None:
@@ -95,11 +113,17 @@ def test_it_falls_as_a_stone_does() -> None:
     time = simulation.time
     assert time == pytest.approx(0.160001)
     middle = np.array([0.5, -GRAVITY * (time - 0.5 * dt), 0.0])
-    assert simulation.particles.velocity.numpy() == pytest.approx(np.tile(middle, (8 * 4 * 4, 1)), rel=1e-4)
-    assert simulation.particles.totals().center == pytest.approx(center + np.array([0.5, -0.5 * GRAVITY * time, 0.0]) * time, rel=1e-6)
+    assert simulation.particles.velocity.numpy() == pytest.approx(
+        np.tile(middle, (8 * 4 * 4, 1)), rel=1e-4
+    )
+    assert simulation.particles.totals().center == pytest.approx(
+        center + np.array([0.5, -0.5 * GRAVITY * time, 0.0]) * time, rel=1e-6
+    )
     mass = 1000.0 * 0.5 * 0.25
     assert row["mass"] == pytest.approx(mass)
-    assert row["kinetic_energy"] == pytest.approx(0.5 * mass * (0.25 + (GRAVITY * time) ** 2), rel=1e-4)
+    assert row["kinetic_energy"] == pytest.approx(
+        0.5 * mass * (0.25 + (GRAVITY * time) ** 2), rel=1e-4
+    )
     assert (row["grains"], row["solver"], row["stopped"]) == (7, None, 0)
     assert tuple(row) == simulation.columns()
 
@@ -114,7 +138,11 @@ def test_it_is_what_the_driver_asks_for() -> None:
 
 
 def test_it_goes_on_from_a_state_bit_for_bit() -> None:
-    tables = {"particles": {"transfer": "flip", "reseed": {"every": 1}}, "density_correction": {"every": 2}, "domain": {"open": ["bottom"]}}
+    tables = {
+        "particles": {"transfer": "flip", "reseed": {"every": 1}},
+        "density_correction": {"every": 2},
+        "domain": {"open": ["bottom"]},
+    }
     through, later = make(**tables), make(**tables)
     for _ in range(16):
         through.step(0.02)
@@ -122,8 +150,11 @@ def test_it_goes_on_from_a_state_bit_for_bit() -> None:
     later.restore(saved)
     for _ in range(2):
         assert through.step(0.02) == later.step(0.02)
-    assert all(np.array_equal(value, later.state()[name]) for name, value in through.state().items())
-    assert 0 < through.particles.count < 128  # some have left, so lengths differ from those at the start
+    assert all(
+        np.array_equal(value, later.state()[name]) for name, value in through.state().items()
+    )
+    # some have left, so lengths differ from those at the start
+    assert 0 < through.particles.count < 128
     with pytest.raises(ValueError, match="lacks cells"):
         later.restore({name: value for name, value in saved.items() if name != "cells"})
 
@@ -141,12 +172,17 @@ def test_it_goes_on_on_a_finer_grid() -> None:
     assert "512 particles replace 128" in fine.resample(coarse.state())[0]
     assert fine.time == coarse.time
     held = fine.particles.cells_of(fine.particles.position.numpy())[:, ::-1] + 1
-    assert (np.argwhere(fine.kind.numpy() == wl.FLUID) == np.unique(held, axis=0)).all()  # marked anew: it has moved by a cell
+    # marked anew: it has moved by a cell
+    assert (np.argwhere(fine.kind.numpy() == wl.FLUID) == np.unique(held, axis=0)).all()
     assert fine.step(0.01)["mass"] == pytest.approx(125.0)
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "message"), [("velocity", np.nan, "velocity is not finite"), ("position", 2.0, "position is outside the domain")]
+    ("name", "value", "message"),
+    [
+        ("velocity", np.nan, "velocity is not finite"),
+        ("position", 2.0, "position is outside the domain"),
+    ],
 )
 def test_what_cannot_be_ends_the_run(name: str, value: float, message: str) -> None:
     simulation = make()
@@ -154,12 +190,20 @@ def test_what_cannot_be_ends_the_run(name: str, value: float, message: str) -> N
     host = array.numpy()
     host[5] = value
     array.assign(host)
-    with pytest.raises(SimulationFailed, match=rf"^at the start of step 0: {message} in cell .* \(1 particles\)"):
+    with pytest.raises(
+        SimulationFailed, match=rf"^at the start of step 0: {message} in cell .* \(1 particles\)"
+    ):
         simulation.step(0.01)
 
 
 def test_it_tells_when_something_starts_or_stops() -> None:
-    source = {"shape": "box", "min": [0.0, 0.9], "max": [0.1, 1.0], "velocity": [1.0, 0.0], "start": 0.004}
+    source = {
+        "shape": "box",
+        "min": [0.0, 0.9],
+        "max": [0.1, 1.0],
+        "velocity": [1.0, 0.0],
+        "start": 0.004,
+    }
     drain = {"shape": "box", "min": [0.0, 0.0], "max": [0.1, 0.1], "start": 0.002, "stop": 0.3}
     slide = {"kind": "translation", "velocity": [0.1, 0.0], "start": 0.0015, "stop": 0.25}
     solid = {"shape": "box", "min": [0.3, 0.1], "max": [0.5, 0.3], "motion": slide}
@@ -171,7 +215,14 @@ def test_it_tells_when_something_starts_or_stops() -> None:
 
 
 def test_a_source_that_will_start_shortens_the_step_before() -> None:
-    source = {"shape": "box", "min": [0.0, 0.9], "max": [0.1, 1.0], "velocity": [8.0, 0.0], "start": 0.1, "stop": 0.2}
+    source = {
+        "shape": "box",
+        "min": [0.0, 0.9],
+        "max": [0.1, 1.0],
+        "velocity": [8.0, 0.0],
+        "start": 0.1,
+        "stop": 0.2,
+    }
     simulation, without = make(source=[source]), make()
     assert simulation.stable_dt() == without.stable_dt()
     simulation.time = 0.09
@@ -181,7 +232,13 @@ def test_a_source_that_will_start_shortens_the_step_before() -> None:
 
 
 def test_a_source_that_starts_fills_its_cells() -> None:
-    source = {"shape": "box", "min": [0.0, 0.9], "max": [0.1, 1.0], "velocity": [1.0, 0.0], "start": 0.004}
+    source = {
+        "shape": "box",
+        "min": [0.0, 0.9],
+        "max": [0.1, 1.0],
+        "velocity": [1.0, 0.0],
+        "start": 0.004,
+    }
     simulation = make(source=[source])
     simulation.step(0.001)
     assert simulation.columns()[-1] == "emitted"

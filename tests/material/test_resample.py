@@ -22,7 +22,14 @@ GRADIENT = np.array([[0.0, 3.0, 0.0], [-2.0, 1.0, 0.0], [0.0, 0.0, 0.0]])  # of 
 
 def dam(resolution: int, **tables: Any) -> Any:
     """Return a dam beside a ball, on a grid whose walls are elsewhere for every resolution."""
-    return create(scene(size=[1.0, 0.5], resolution=resolution, liquid=[box([0.0, 0.0], [0.375, 0.375])], **({"solid": [BALL]} | tables)))
+    return create(
+        scene(
+            size=[1.0, 0.5],
+            resolution=resolution,
+            liquid=[box([0.0, 0.0], [0.375, 0.375])],
+            **({"solid": [BALL]} | tables),
+        )
+    )
 
 
 def everywhere(points: np.ndarray) -> np.ndarray:
@@ -35,13 +42,19 @@ def test_mass_momentum_and_a_linear_velocity_stay(resolution):
     state = old.state()
     velocity = np.array([1.0, -0.5, 0.0]) + state["position"] @ GRADIENT.T
     state |= {"velocity": velocity.astype(np.float32)}
-    state |= {f"affine_{axis}": np.tile(GRADIENT[axis].astype(np.float32), (old.particles.count, 1)) for axis in range(2)}
-    arrays, moved = resampled(state, new.grid, everywhere, spacing=old.grid.spacing, per_axis=2, random_seed=7)
+    state |= {
+        f"affine_{axis}": np.tile(GRADIENT[axis].astype(np.float32), (old.particles.count, 1))
+        for axis in range(2)
+    }
+    arrays, moved = resampled(
+        state, new.grid, everywhere, spacing=old.grid.spacing, per_axis=2, random_seed=7
+    )
     count = len(arrays["position"])
     mass = old.particles.count * old.particle_mass
     assert abs(count * new.particle_mass - mass) <= 0.5001 * new.particle_mass
     np.testing.assert_allclose(arrays["velocity"].mean(axis=0), velocity.mean(axis=0), atol=1e-6)
-    # Where a velocity that is linear in space is continued by its gradient, it is that velocity at every new place.
+    # Where a velocity that is linear in space is continued by its gradient, it is that velocity at
+    # every new place.
     error = arrays["velocity"] - (np.array([1.0, -0.5, 0.0]) + arrays["position"] @ GRADIENT.T)
     assert np.abs(error - error.mean(axis=0)).max() < 1e-5
     # A uniform shift makes up for the center of mass, which moves by far less than a cell.
@@ -57,7 +70,9 @@ def test_mass_momentum_and_a_linear_velocity_stay(resolution):
 def test_a_finer_grid_is_filled_evenly():
     """Twice the resolution: four for one, so each new cell inside the liquid holds about four again, and none is empty."""
     old, new = dam(16, solid=[]), dam(32, solid=[])
-    arrays, _ = resampled(old.state(), new.grid, everywhere, spacing=old.grid.spacing, per_axis=2, random_seed=7)
+    arrays, _ = resampled(
+        old.state(), new.grid, everywhere, spacing=old.grid.spacing, per_axis=2, random_seed=7
+    )
     cells = np.floor(arrays["position"][:, :2] / new.grid.spacing).astype(int)
     counts = np.zeros((32, 16), dtype=int)
     np.add.at(counts, tuple(cells.T), 1)
@@ -74,12 +89,17 @@ def test_a_simulation_goes_on(before, after, tables):
     advance(old, 0.25)  # the front is at the ball
     new = dam(after, **tables)
     notes = new.resample(old.state())
-    assert notes[0].startswith(f"resampled from cells of {old.grid.spacing:.4g} m to {new.grid.spacing:.4g} m: {new.particles.count}")
+    assert notes[0].startswith(
+        f"resampled from cells of {old.grid.spacing:.4g} m to {new.grid.spacing:.4g} m: "
+        f"{new.particles.count}"
+    )
     assert (new.time, new.step_count) == (old.time, old.step_count)
     assert new.admits(new.particles.position.numpy().astype(np.float64)).mean() > 0.99
     at = new.particles.totals()
     assert at.mean_square_speed == pytest.approx(old.particles.totals().mean_square_speed, rel=0.05)
-    np.testing.assert_allclose(at.center, old.particles.totals().center, atol=0.2 * max(old.grid.spacing, new.grid.spacing))
+    np.testing.assert_allclose(
+        at.center, old.particles.totals().center, atol=0.2 * max(old.grid.spacing, new.grid.spacing)
+    )
     rows = advance(new, 0.35)
     assert rows[-1]["mass"] == pytest.approx(old.particles.count * old.particle_mass, rel=2e-3)
     again = dam(after, **tables)
@@ -90,7 +110,9 @@ def test_a_simulation_goes_on(before, after, tables):
 def test_another_liquid_is_refused():
     state = dam(16).state()
     for other in (dam(24, particles={"per_axis": 3}), dam(24, particles={"transfer": "pic"})):
-        with pytest.raises(ValueError, match="domain, number of particles a cell or transfer differ"):
+        with pytest.raises(
+            ValueError, match="domain, number of particles a cell or transfer differ"
+        ):
             other.resample(state)
 
 
@@ -112,11 +134,14 @@ def test_a_run_is_resumed_on_another_grid_and_says_so(tmp_path):
     found = json.loads((out / "run.json").read_text())
     assert (found["resumed_from_step"], found["resampled_from_resolution"]) == (8, 24)
     assert "domain.resolution: 24 before, 32 now" in found["changed"]
-    assert any(text.startswith("resampled from cells of 0.06667 m to 0.05 m") for text in found["warnings"])
+    assert any(
+        text.startswith("resampled from cells of 0.06667 m to 0.05 m") for text in found["warnings"]
+    )
     with open(out / "log.csv", newline="") as file:
         mass = {int(row["step"]): float(row["mass"]) for row in csv.DictReader(file)}
     assert mass[9] == pytest.approx(mass[8], rel=2e-3)
-    again = go(out, "domain.resolution=32", "time.duration=0.35", resume=True)  # its own checkpoints are on the new grid
+    # its own checkpoints are on the new grid
+    again = go(out, "domain.resolution=32", "time.duration=0.35", resume=True)
     assert again.resampled_from_resolution is None
     with pytest.raises(OutputError, match=r"domain.size: .* before"):
         go(out, "domain.size=[1.6, 1.6]", resume=True)

@@ -19,14 +19,21 @@ CELLS = 12
 def pool(dimension: int, solid: list[dict[str, Any]] | None = None) -> Any:
     """Return a simulation of a box, of which grid and boundary are used."""
     size = [1.0] * dimension
-    return create(scene(size=size, resolution=CELLS, liquid=[box([0.0] * dimension, size)], solid=solid or []))
+    return create(
+        scene(size=size, resolution=CELLS, liquid=[box([0.0] * dimension, size)], solid=solid or [])
+    )
 
 
-def uneven(simulation: Any, *, bubble: bool = False, top: float = 0.75, seed: int = 12) -> Particles:
+def uneven(
+    simulation: Any, *, bubble: bool = False, top: float = 0.75, seed: int = 12
+) -> Particles:
     """Return particles at random places below `top`, on average as many as at rest, each with a velocity of its own."""
     grid, random = simulation.grid, np.random.default_rng(seed)
     size = np.array([1.0, top, 1.0 if grid.dimension == 3 else 0.0])
-    points = random.uniform(0.001, 0.999, (int(2**grid.dimension * CELLS**grid.dimension * top), 3)) * size
+    points = (
+        random.uniform(0.001, 0.999, (int(2**grid.dimension * CELLS**grid.dimension * top), 3))
+        * size
+    )
     points = points[simulation.boundary.admits(points)]
     if bubble:
         points = points[(np.abs(points[:, :2] * CELLS - [6.0, 4.0]) > [2.0, 2.0]).any(axis=1)]
@@ -38,17 +45,30 @@ def counts(grid: Any, particles: Particles) -> np.ndarray:
     """Return the particles of each cell, shape (nz, ny, nx)."""
     cells = particles.cells_of(particles.position.numpy())
     nx, ny, nz = grid.counts
-    return np.bincount((cells[:, 2] * ny + cells[:, 1]) * nx + cells[:, 0], minlength=nx * ny * nz).reshape(nz, ny, nx)
+    return np.bincount(
+        (cells[:, 2] * ny + cells[:, 1]) * nx + cells[:, 0], minlength=nx * ny * nz
+    ).reshape(nz, ny, nx)
 
 
 def reseeding(simulation: Any, least: int, most: int) -> Reseeding:
     """Return one that is sure of its arguments."""
-    return Reseeding(simulation.grid, simulation.boundary, least=least, most=most, particles_a_cell=2**simulation.grid.dimension, every=1)
+    return Reseeding(
+        simulation.grid,
+        simulation.boundary,
+        least=least,
+        most=most,
+        particles_a_cell=2**simulation.grid.dimension,
+        every=1,
+    )
 
 
 def test_nothing_is_sought_beyond_an_open_side(monkeypatch: pytest.MonkeyPatch) -> None:
     """The ring there is open as cells are, and a look at its neighbors would leave the memory."""
-    simulation = dam(3, particles={"reseed": {"every": 1}}, domain={"size": [1.0, 0.5, 0.25], "resolution": 16, "open": ["top", "right"]})
+    simulation = dam(
+        3,
+        particles={"reseed": {"every": 1}},
+        domain={"size": [1.0, 0.5, 0.25], "resolution": 16, "open": ["top", "right"]},
+    )
     launch, sought = Window.launch, []
 
     def noted(window: Window, kernel: Any, inputs: list[Any], **more: Any) -> None:
@@ -66,14 +86,19 @@ def test_nothing_is_sought_beyond_an_open_side(monkeypatch: pytest.MonkeyPatch) 
 def test_cells_deep_in_the_liquid_hold_enough(dimension: int, least: int, most: int) -> None:
     simulation = pool(dimension)
     grid, particles = simulation.grid, uneven(simulation)
-    deep = (slice(2, -2), slice(2, 7), slice(2, -2)) if dimension == 3 else (slice(None), slice(2, 7), slice(2, -2))
+    deep = (
+        (slice(2, -2), slice(2, 7), slice(2, -2))
+        if dimension == 3
+        else (slice(None), slice(2, 7), slice(2, -2))
+    )
     before = counts(grid, particles)
     assert (before[deep] < least).sum() > 5
     reseed = reseeding(simulation, least, most)
     for step in range(4):
         moved = reseed.apply(particles, grid.everywhere, step)
     after = counts(grid, particles)
-    assert (after[deep] < least).sum() <= 0.15 * (before[deep] < least).sum()  # a thin region around one stays thin
+    # a thin region around one stays thin
+    assert (after[deep] < least).sum() <= 0.15 * (before[deep] < least).sum()
     assert after.sum() == before.sum() == particles.count
     assert moved <= 2
 
@@ -85,7 +110,9 @@ def test_each_keeps_its_velocity_and_goes_to_a_neighboring_cell(dimension: int) 
     grid, particles = simulation.grid, uneven(simulation)
     particles.sort()
     before = {name: array.numpy().copy() for name, array in particles.arrays().items()}
-    moved = reseeding(simulation, 3 * dimension - 3, 6 * dimension).apply(particles, grid.everywhere, 7)
+    moved = reseeding(simulation, 3 * dimension - 3, 6 * dimension).apply(
+        particles, grid.everywhere, 7
+    )
     after = {name: array.numpy() for name, array in particles.arrays().items()}
     for name in before.keys() - {"position"}:
         assert np.array_equal(before[name], after[name])
@@ -126,10 +153,14 @@ def test_nothing_is_drawn_from_cells_that_hold_no_more_than_at_rest() -> None:
 def test_runs_are_repeatable() -> None:
     found = []
     for _ in range(2):
-        simulation = dam(particles={"reseed": {"every": 1, "min": 4, "max": 4}}, density_correction={})
+        simulation = dam(
+            particles={"reseed": {"every": 1, "min": 4, "max": 4}}, density_correction={}
+        )
         rows = advance(simulation, 0.6)
         assert sum(row["reseeded"] for row in rows) > 0
-        found.append({name: array.numpy().copy() for name, array in simulation.particles.arrays().items()})
+        found.append(
+            {name: array.numpy().copy() for name, array in simulation.particles.arrays().items()}
+        )
     for name, array in found[0].items():
         assert np.array_equal(array, found[1][name])
 
@@ -139,12 +170,17 @@ def test_only_a_scene_that_asks_for_it_has_one() -> None:
     assert "reseeded" not in dam().columns()
     simulation = dam(particles={"reseed": {"every": 4}})
     rows = advance(simulation, 0.3)
-    assert [row["reseeded"] is not None for row in rows] == [step % 4 == 0 for step in range(len(rows))]
+    assert [row["reseeded"] is not None for row in rows] == [
+        step % 4 == 0 for step in range(len(rows))
+    ]
 
 
 @pytest.mark.parametrize(("reseed", "key"), [({"min": 5}, "min"), ({"max": 3}, "max")])
 def test_bounds_that_exclude_rest_are_refused(reseed: dict[str, int], key: str) -> None:
-    with pytest.raises((SceneError, ValidationError), match=f"particles.*reseed.*{key}|at (most|least) the 4 particles"):
+    with pytest.raises(
+        (SceneError, ValidationError),
+        match=f"particles.*reseed.*{key}|at (most|least) the 4 particles",
+    ):
         dam(particles={"reseed": reseed})
     with pytest.raises(ValueError, match="4 between them"):
         reseeding(pool(2), *((5, 8) if key == "min" else (2, 3)))

@@ -19,7 +19,15 @@ BALL = {"shape": "sphere", "center": [0.8, 0.1], "radius": 0.1}
 
 def tap(source: list[dict[str, Any]] | None = None, **tables: Any) -> LiquidSimulation:
     """Return a basin with a tap."""
-    return create(scene(size=[1.0, 1.0], resolution=32, liquid=tables.pop("liquid", []), source=source or [TAP], **tables))
+    return create(
+        scene(
+            size=[1.0, 1.0],
+            resolution=32,
+            liquid=tables.pop("liquid", []),
+            source=source or [TAP],
+            **tables,
+        )
+    )
 
 
 def to_frame(simulation: LiquidSimulation, end: float) -> list[dict[str, Any]]:
@@ -40,7 +48,9 @@ def emitted(rows: list[dict[str, Any]]) -> int:
 @pytest.mark.parametrize("solids", ["cut-cell", "voxel"])
 def test_the_rate_is_area_times_velocity(solids: str, surface: str) -> None:
     """Beside it a splash is under way, which would be corrected and its particles' places with it."""
-    simulation = tap(solids=solids, solid=[BALL], pressure={"surface": surface}, density_correction={"every": 0})
+    simulation = tap(
+        solids=solids, solid=[BALL], pressure={"surface": surface}, density_correction={"every": 0}
+    )
     start = simulation.particles.count
     assert start == 4 * 4 * 4  # the source itself is full
     rows = advance(simulation, 1.0)
@@ -53,7 +63,9 @@ def test_the_rate_is_area_times_velocity(solids: str, surface: str) -> None:
     inside = (x[:, 0] < 0.125) & (x[:, 1] > 0.5) & (x[:, 1] < 0.625)
     assert inside.sum() == pytest.approx(start, rel=0.2)  # the seeding density stays
     np.testing.assert_allclose(
-        simulation.particles.velocity.numpy()[inside & (x[:, 0] < 0.09)], [[1.0, 0.0, 0.0]] * (inside & (x[:, 0] < 0.09)).sum(), atol=0.05
+        simulation.particles.velocity.numpy()[inside & (x[:, 0] < 0.09)],
+        [[1.0, 0.0, 0.0]] * (inside & (x[:, 0] < 0.09)).sum(),
+        atol=0.05,
     )
 
 
@@ -65,7 +77,8 @@ def test_the_rate_in_three_dimensions() -> None:
     kind = simulation.projection.kind.numpy()
     expected = np.zeros((12, 16, 16), dtype=bool)
     expected[4:8, 8:12, :4] = True
-    np.testing.assert_array_equal(simulation.grid.interior(kind) == SOLID, expected)  # no pressure where velocities are given
+    # no pressure where velocities are given
+    np.testing.assert_array_equal(simulation.grid.interior(kind) == SOLID, expected)
     assert simulation.projection.counted() == (kind == FLUID).sum() > 0
 
 
@@ -74,11 +87,14 @@ def test_any_direction_in_free_fall(velocity: list[float]) -> None:
     source = box([0.4375, 0.4375], [0.5625, 0.5625], velocity=velocity)
     rows = advance(tap([source], physics={"gravity": [0.0, 0.0]}), 0.15, 0.005)
     across = 0.125 * np.abs(velocity).sum()  # of the square's shadow, times the speed
-    row = across / np.linalg.norm(velocity) * 32 * 2  # of particles: where in its lattice the way begins and ends
+    # of particles: where in its lattice the way begins and ends
+    row = across / np.linalg.norm(velocity) * 32 * 2
     assert emitted(rows) == pytest.approx(across * 0.15 * 32**2 * 4, abs=0.5 * row)
 
 
-def pour(draw: np.random.Generator, source: dict[str, Any], longest: float, stop: float) -> LiquidSimulation:
+def pour(
+    draw: np.random.Generator, source: dict[str, Any], longest: float, stop: float
+) -> LiquidSimulation:
     """Let a source run in free fall, in steps of random lengths that know nothing of its times, until `stop`."""
     simulation = tap([source], physics={"gravity": [0.0, 0.0]}, particles={"seed": 20261})
     while simulation.time < stop:
@@ -88,13 +104,20 @@ def pour(draw: np.random.Generator, source: dict[str, Any], longest: float, stop
 
 
 @pytest.mark.parametrize("cells", [0.25, 1.0, 3.0])
-@pytest.mark.parametrize(("low", "high"), [([0.25, 0.5], [0.28125, 0.625]), ([0.125, 0.5], [0.25, 0.59375])])  # one cell thick, and four
-def test_what_comes_in_is_exact_however_the_time_is_cut_into_steps(low: list[float], high: list[float], cells: float) -> None:
+# one cell thick, and four
+@pytest.mark.parametrize(
+    ("low", "high"), [([0.25, 0.5], [0.28125, 0.625]), ([0.125, 0.5], [0.25, 0.59375])]
+)
+def test_what_comes_in_is_exact_however_the_time_is_cut_into_steps(
+    low: list[float], high: list[float], cells: float
+) -> None:
     """Every place of the lattice that has passed the source is taken once: area times velocity times time, to the particle."""
     draw = np.random.default_rng(int(1000 * cells))
     distance, speed = 1.0 / 64, 2.0
     start, rows = draw.uniform(0.0, 0.02), int(draw.integers(12, 20))
-    source = box(low, high, velocity=[speed, 0.0], start=start, stop=start + rows * distance / speed)
+    source = box(
+        low, high, velocity=[speed, 0.0], start=start, stop=start + rows * distance / speed
+    )
     simulation = pour(draw, source, cells / 32 / speed, source["stop"] + 0.5 * cells / 32 / speed)
     places = simulation.particles.position.numpy()[:, :2] - [speed * (simulation.time - start), 0.0]
     taken = np.floor(places / distance).astype(int)
@@ -102,13 +125,17 @@ def test_what_comes_in_is_exact_however_the_time_is_cut_into_steps(low: list[flo
     expected = {(x, y) for x in range(left - rows, right) for y in range(bottom, top)}
     assert len(taken) == len(expected)
     assert set(map(tuple, taken.tolist())) == expected
-    np.testing.assert_allclose(simulation.particles.velocity.numpy(), [[speed, 0.0, 0.0]] * len(taken), atol=1e-4)  # a jet flies on
+    # a jet flies on
+    np.testing.assert_allclose(
+        simulation.particles.velocity.numpy(), [[speed, 0.0, 0.0]] * len(taken), atol=1e-4
+    )
 
 
 def test_what_comes_in_askew_does_not_depend_on_the_steps() -> None:
     source = box([0.3125, 0.3125], [0.4375, 0.375], velocity=[1.2, 0.7], start=0.013, stop=0.157)
     counts = {
-        pour(np.random.default_rng(seed), source, longest, 0.17).particles.count for seed, longest in ((7, 0.008), (8, 0.02), (9, 0.06))
+        pour(np.random.default_rng(seed), source, longest, 0.17).particles.count
+        for seed, longest in ((7, 0.008), (8, 0.02), (9, 0.06))
     }
     assert len(counts) == 1
     area = 0.125 * 0.7 + 0.0625 * 1.2
@@ -124,15 +151,23 @@ def mixed(word: np.ndarray) -> np.ndarray:
     return word ^ (word >> np.uint64(31))
 
 
-def lattice_points(sources: Sources, number: int, low: np.ndarray, counts: np.ndarray) -> np.ndarray:
+def lattice_points(
+    sources: Sources, number: int, low: np.ndarray, counts: np.ndarray
+) -> np.ndarray:
     """Return jittered points of a source's lattice before it moves [m], x fastest, shape (n, 3)."""
     k, j, i = np.meshgrid(*(np.arange(n) for n in counts[::-1]), indexing="ij")
     lattice = np.stack([i.ravel(), j.ravel(), k.ravel()], axis=1) + low
     with np.errstate(over="ignore"):
-        state = np.full(len(lattice), ((sources.random_seed + number) * 0x9E3779B97F4A7C15 + 1) % 2**64, dtype=np.uint64)
+        state = np.full(
+            len(lattice),
+            ((sources.random_seed + number) * 0x9E3779B97F4A7C15 + 1) % 2**64,
+            dtype=np.uint64,
+        )
         for word in lattice.astype(np.int64).astype(np.uint64).T:
             state = mixed(state ^ word)
-        drawn = [mixed(state + np.uint64((axis + 1) * 0x9E3779B97F4A7C15 % 2**64)) for axis in range(3)]
+        drawn = [
+            mixed(state + np.uint64((axis + 1) * 0x9E3779B97F4A7C15 % 2**64)) for axis in range(3)
+        ]
     jitter = sources.jitter * (np.stack(drawn, axis=1).astype(np.float64) / 2.0**64 - 0.5)
     return (lattice + 0.5 + jitter) * (sources.grid.spacing / sources.per_axis)
 
@@ -147,7 +182,15 @@ def test_points_enter_cells_as_a_fine_look_along_their_way_tells(seed: int) -> N
     way = draw.normal(size=dimension)
     velocity = np.append(way / np.abs(way).max(), np.zeros(3 - dimension))
     source = box(list(low), list(high), velocity=velocity[:dimension].tolist())
-    simulation = create(scene(size=[1.0] * dimension, resolution=16, liquid=[], source=[source], particles={"seed": seed}))
+    simulation = create(
+        scene(
+            size=[1.0] * dimension,
+            resolution=16,
+            liquid=[],
+            source=[source],
+            particles={"seed": seed},
+        )
+    )
     sources, since = simulation.sources, draw.uniform(0.0, 3.0)
     now = since + draw.uniform(0.01, 0.2)
     sources._entered(0, since, now, starts=False)
@@ -173,19 +216,29 @@ def test_points_enter_cells_as_a_fine_look_along_their_way_tells(seed: int) -> N
     stays = (entries == 1) & (last > 0) & (came == 1)
     assert (slot[stays] > 0).all()
     inside = points[stays][:, :dimension]
-    np.testing.assert_allclose(inside, (at_rest + velocity * now)[stays][:, :dimension], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(
+        inside, (at_rest + velocity * now)[stays][:, :dimension], rtol=0, atol=1e-6
+    )
 
 
-@pytest.mark.parametrize(("ends", "acts"), [((0.1, 0.11), True), ((0.09, 0.1), True), ((0.1004, 0.1008), True), ((0.05, 0.1), False)])
-def test_a_drain_acts_when_it_has_been_open_in_a_part_of_a_step(ends: tuple[float, float], acts: bool) -> None:
+@pytest.mark.parametrize(
+    ("ends", "acts"),
+    [((0.1, 0.11), True), ((0.09, 0.1), True), ((0.1004, 0.1008), True), ((0.05, 0.1), False)],
+)
+def test_a_drain_acts_when_it_has_been_open_in_a_part_of_a_step(
+    ends: tuple[float, float], acts: bool
+) -> None:
     drain = {**box([0.0, 0.0], [0.25, 0.125]), "start": ends[0], "stop": ends[1]}
-    simulation = create(scene(size=[1.0, 1.0], resolution=16, liquid=[box([0.0, 0.0], [1.0, 0.25])], drain=[drain]))
+    simulation = create(
+        scene(size=[1.0, 1.0], resolution=16, liquid=[box([0.0, 0.0], [1.0, 0.25])], drain=[drain])
+    )
     simulation.time = 0.095 if ends[0] < 0.1 and acts else 0.1
     assert (simulation.step(0.01)["drained"] > 0) == acts
 
 
 def test_a_source_in_a_pool_pushes_its_volume_in_and_draws_nothing_from_behind() -> None:
-    # were the source's upstream faces open to the pool, its liquid would circulate and the pool would not rise
+    # were the source's upstream faces open to the pool, its liquid would circulate and the pool
+    # would not rise
     source = box([0.4375, 0.1875], [0.5625, 0.25], velocity=[0.0, 0.25])
     simulation = tap([source], liquid=[box([0.0, 0.0], [1.0, 0.5])], density_correction={})
     rows = advance(simulation, 1.0)
@@ -214,7 +267,9 @@ def test_cells_that_are_full_already_are_not_filled() -> None:
 def test_cells_are_filled_that_hold_fewer_than_half(there: int, comes: int) -> None:
     source = box([0.5, 0.5], [0.53125, 0.53125], velocity=[1.0, 0.0], start=0.01)
     simulation = tap([source], physics={"gravity": [0.0, 0.0]})
-    simulation.particles.append(np.full((there, 3), [0.51, 0.51, 0.0], np.float32), np.zeros((there, 3), np.float32))
+    simulation.particles.append(
+        np.full((there, 3), [0.51, 0.51, 0.0], np.float32), np.zeros((there, 3), np.float32)
+    )
     assert simulation.step(0.011)["emitted"] == comes
 
 
@@ -227,7 +282,12 @@ def test_a_box_that_is_full_ends_the_run_with_a_reason() -> None:
 def test_a_drain_takes_what_is_in_it() -> None:
     drain = box([0.0, 0.0], [0.25, 0.125])
     simulation = create(
-        scene(size=[1.0, 1.0], resolution=32, liquid=[box([0.0, 0.0], [1.0, 0.25])], drain=[{**drain, "start": 0.1, "stop": 0.4}])
+        scene(
+            size=[1.0, 1.0],
+            resolution=32,
+            liquid=[box([0.0, 0.0], [1.0, 0.25])],
+            drain=[{**drain, "start": 0.1, "stop": 0.4}],
+        )
     )
     start = simulation.particles.count
     rows = advance(simulation, 0.6)
@@ -243,7 +303,9 @@ def test_a_drain_takes_what_is_in_it() -> None:
 
 @pytest.mark.parametrize("particles", [{}, {"transfer": "flip"}])
 @pytest.mark.parametrize("tables", [{}, {"solid": [BALL]}, {"pressure": {"model": "unilateral"}}])
-def test_an_interrupted_run_goes_on_bit_for_bit(tables: dict[str, Any], particles: dict[str, Any]) -> None:
+def test_an_interrupted_run_goes_on_bit_for_bit(
+    tables: dict[str, Any], particles: dict[str, Any]
+) -> None:
     drain = [box([0.5, 0.0], [0.625, 0.125])]
     through, resumed = (tap(particles=particles, drain=drain, **tables) for _ in range(2))
     advance(through, 0.4)
@@ -279,7 +341,12 @@ def test_arrays_of_different_lengths_are_refused() -> None:
 )
 def test_what_they_may_not_be(tables: dict[str, Any], message: str) -> None:
     with pytest.raises(ValidationError, match=message):
-        scene(size=[1.0, 1.0], resolution=32, liquid=tables.pop("liquid", [box([0.0, 0.0], [0.5, 0.5])]), **tables)
+        scene(
+            size=[1.0, 1.0],
+            resolution=32,
+            liquid=tables.pop("liquid", [box([0.0, 0.0], [0.5, 0.5])]),
+            **tables,
+        )
 
 
 def test_a_source_without_a_cell_is_refused() -> None:
@@ -288,7 +355,18 @@ def test_a_source_without_a_cell_is_refused() -> None:
 
 
 def test_capsules_have_ends_and_times() -> None:
-    capsule = {"shape": "capsule", "from": [0.2, 0.5], "to": [0.4, 0.5], "radius": 0.1, "velocity": [0.0, 1.0], "start": 0.5}
+    capsule = {
+        "shape": "capsule",
+        "from": [0.2, 0.5],
+        "to": [0.4, 0.5],
+        "radius": 0.1,
+        "velocity": [0.0, 1.0],
+        "start": 0.5,
+    }
     model = scene(size=[1.0, 1.0], resolution=32, liquid=[], source=[capsule])
-    assert (model.source[0].start, model.source[0].end, model.source[0].begin) == ([0.2, 0.5], [0.4, 0.5], 0.5)
+    assert (model.source[0].start, model.source[0].end, model.source[0].begin) == (
+        [0.2, 0.5],
+        [0.4, 0.5],
+        0.5,
+    )
     assert create(model).particles.count == 0

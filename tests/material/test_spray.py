@@ -20,7 +20,9 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def with_drops(points: list[list[float]], velocity: list[float], **tables: Any) -> LiquidSimulation:
     """A block of liquid on the floor, and single particles."""
-    simulation = create(scene(size=[6.0, 3.0], resolution=120, liquid=[box([0.0, 0.0], [1.0, 0.5])], **tables))
+    simulation = create(
+        scene(size=[6.0, 3.0], resolution=120, liquid=[box([0.0, 0.0], [1.0, 0.5])], **tables)
+    )
     simulation.particles.append(np.array(points), np.tile(velocity, (len(points), 1)))
     simulation.particles.sort()
     return simulation
@@ -28,7 +30,10 @@ def with_drops(points: list[list[float]], velocity: list[float], **tables: Any) 
 
 def test_it_flies_along_its_parabola_and_nothing_is_lost() -> None:
     simulation = with_drops([[2.5, 1.5, 0.0], [4.0, 1.0, 0.0]], [1.0, 3.0, 0.0])
-    count, start = simulation.particles.count, simulation.particles.position.numpy()[-2:].astype(float)
+    count, start = (
+        simulation.particles.count,
+        simulation.particles.position.numpy()[-2:].astype(float),
+    )
     rows = [simulation.step(0.01) for _ in range(20)]
     assert [row["spray"] for row in rows] == [2] * 20
     assert {row["particles"] for row in rows} == {count}
@@ -76,14 +81,19 @@ def test_it_comes_back_before_it_meets_something(start, velocity, solids):
         assert row["particles"] == count
         positions = simulation.points().points
         for solid in solids:
-            assert (np.linalg.norm(positions[:, :2] - np.array(solid["center"]), axis=1) > solid["radius"]).all()
+            assert (
+                np.linalg.norm(positions[:, :2] - np.array(solid["center"]), axis=1)
+                > solid["radius"]
+            ).all()
     assert flying[0] == 1
     assert flying[-1] == 0
 
 
 def test_it_goes_on_from_a_state_and_leaves_through_open_sides() -> None:
     tables: dict[str, Any] = {}
-    through, later = (with_drops([[2.5, 1.5, 0.0], [5.0, 1.5, 0.0]], [2.0, 3.0, 0.0], **tables) for _ in range(2))
+    through, later = (
+        with_drops([[2.5, 1.5, 0.0], [5.0, 1.5, 0.0]], [2.0, 3.0, 0.0], **tables) for _ in range(2)
+    )
     for _ in range(5):
         through.step(0.01)
     state = through.state()

@@ -32,7 +32,9 @@ surface = true
 
 
 def go(scene: Path, out: Path, *overrides: str, **options):
-    return run_into(load_scene(scene, overrides), out, observer=Lines(Console(quiet=True)), **options)
+    return run_into(
+        load_scene(scene, overrides), out, observer=Lines(Console(quiet=True)), **options
+    )
 
 
 def test_a_run_writes_a_series_of_closed_surfaces(tmp_path):
@@ -44,7 +46,9 @@ def test_a_run_writes_a_series_of_closed_surfaces(tmp_path):
     assert (out / "surface.pvd").read_text().count("DataSet") == 3
     assert not (out / "particles.pvd").exists()
     for index in range(3):
-        vtu, ply = (meshio.read(out / f"frames/surface_{index:06d}.{suffix}") for suffix in ("vtu", "ply"))
+        vtu, ply = (
+            meshio.read(out / f"frames/surface_{index:06d}.{suffix}") for suffix in ("vtu", "ply")
+        )
         corners = vtu.cells_dict["triangle"]
         assert_closed(corners)
         assert enclosed(vtu.points, corners) == pytest.approx(0.25**3, rel=0.08)

@@ -29,12 +29,23 @@ class Air:
             self.known[axis].assign(marks)
             self.velocity[axis].assign((projected * velocity[axis]).astype(np.float32))
 
-    def extend(self, layers: int = 4, wall_velocity: float | None = None) -> tuple[np.ndarray, np.ndarray]:
+    def extend(
+        self, layers: int = 4, wall_velocity: float | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         solid = GRID.faces() if wall_velocity is not None else []
         for field in solid[1:]:
             field.fill_(wall_velocity)
         extend_velocity(
-            GRID.everywhere, self.velocity, self.weights, self.known, self.kind, self.contact, self.index, self.separating, solid, layers
+            GRID.everywhere,
+            self.velocity,
+            self.weights,
+            self.known,
+            self.kind,
+            self.contact,
+            self.index,
+            self.separating,
+            solid,
+            layers,
         )
         u, v = (field.numpy()[1] for field in self.velocity)
         return u, v
@@ -61,7 +72,9 @@ TOP = [(x, y) for x in range(5) for y in (4, 5)]
         (0, RELEASED, -0.5, 0.0),  # a free-slip face of a cell that another wall released
     ],
 )
-def test_closed_faces_of_liquid_cells(separating: int, state: int, speed: float, expected: float) -> None:
+def test_closed_faces_of_liquid_cells(
+    separating: int, state: int, speed: float, expected: float
+) -> None:
     air = Air(cells(*TOP), (0.0, speed))
     air.separating.fill_(separating)
     air.contact.fill_(state)
@@ -72,7 +85,9 @@ def test_closed_faces_of_liquid_cells(separating: int, state: int, speed: float,
 
 @pytest.mark.parametrize("separating", [0, 1])
 @pytest.mark.parametrize(("speed", "expected"), [(0.5, 0.5), (-0.5, 0.0)])
-def test_closed_faces_of_air_lose_only_what_goes_into_the_wall(separating: int, speed: float, expected: float) -> None:
+def test_closed_faces_of_air_lose_only_what_goes_into_the_wall(
+    separating: int, speed: float, expected: float
+) -> None:
     air = Air(cells((2, 2), (2, 3)), (0.0, speed))
     air.separating.fill_(separating)
     _, v = air.extend()
@@ -142,14 +157,29 @@ def test_spray_above_each_other_in_3d_keeps_its_own_velocity() -> None:
     for axis in range(3):
         below = np.roll(kind, 1, 2 - axis)
         projected = (kind != SOLID) & (below != SOLID) & ((kind == FLUID) | (below == FLUID))
-        known[axis].assign(np.where((kind == SOLID) & (below == SOLID), -1, projected).astype(np.int8))
+        known[axis].assign(
+            np.where((kind == SOLID) & (below == SOLID), -1, projected).astype(np.int8)
+        )
     drops = range(4, 12)
     for plane in drops:
         velocity[2][plane, 3, 3:4].fill_(-plane)
         weights[2][plane, 3, 3:4].fill_(1.0)
     index = wp.array(np.where(kind == SOLID, 0, -1).astype(np.int32), device="cpu")
-    walls = [wp.array(kind, device="cpu"), grid.field(wp.uint8), index, wp.array([1], dtype=wp.uint8, device="cpu")]
-    extend_velocity(Window((3, 0, 0), grid.shape, grid.everywhere.device), velocity, weights, known, *walls, [], 12)
+    walls = [
+        wp.array(kind, device="cpu"),
+        grid.field(wp.uint8),
+        index,
+        wp.array([1], dtype=wp.uint8, device="cpu"),
+    ]
+    extend_velocity(
+        Window((3, 0, 0), grid.shape, grid.everywhere.device),
+        velocity,
+        weights,
+        known,
+        *walls,
+        [],
+        12,
+    )
     assert [velocity[2].numpy()[plane, 3, 3] for plane in drops] == [-plane for plane in drops]
 
 

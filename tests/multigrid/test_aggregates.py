@@ -21,7 +21,9 @@ def convection_diffusion(n, wind):
 
 def load(n, shift=2.0):
     x = np.arange(1, n + 1) / (n + 1)
-    return ((shift - 10 * np.outer(np.sin(2 * np.pi * x), np.sin(3 * np.pi * x))) / (n + 1) ** 2).ravel()
+    return (
+        (shift - 10 * np.outer(np.sin(2 * np.pi * x), np.sin(3 * np.pi * x))) / (n + 1) ** 2
+    ).ravel()
 
 
 def fields(device, *values):
@@ -38,7 +40,9 @@ def test_cycles_alone_solve_and_stay_there(wind, dtype, device):
     assert cycles.refresh()
     expected = lemke(A.toarray(), b)
     assert 30 < np.count_nonzero(expected) < n * n - 30
-    x, right, lower, upper = fields(device, np.zeros(n * n), b, np.zeros(n * n), np.full(n * n, np.inf))
+    x, right, lower, upper = fields(
+        device, np.zeros(n * n), b, np.zeros(n * n), np.full(n * n, np.inf)
+    )
     for _ in range(120):
         cycles.cycle(x, right, lower, upper)
         assert x.numpy().min() >= 0
@@ -52,7 +56,9 @@ def test_boxes_and_the_energy(device):
     low, high = -0.02 * rng.random(n * n), 0.02 * rng.random(n * n)
     cycles = MonotoneAggregation(wl.SparseOperator(A, device=device))
     assert cycles.refresh()
-    x, right, lower, upper = fields(device, np.clip(0.05 * rng.standard_normal(n * n), low, high), b, low, high)
+    x, right, lower, upper = fields(
+        device, np.clip(0.05 * rng.standard_normal(n * n), low, high), b, low, high
+    )
     energies = []
     for _ in range(25):
         host = x.numpy()
@@ -67,13 +73,18 @@ def test_boxes_and_the_energy(device):
 
 def test_an_unknown_in_no_aggregate_is_not_moved_with_one(device):
     """Stiff, and all but on its own: what another's correction did to it would come out of its neighbor's energy."""
-    n, stiff, coupling = 20, 1e12, 1999.0  # almost 1e-3 of sqrt(a_ii a_jj), from which on unknowns aggregate
-    A = scipy.sparse.block_array([[scipy.sparse.eye_array(1) * stiff, None], [None, convection_diffusion(n, 0.0)]]).tolil()
+    # almost 1e-3 of sqrt(a_ii a_jj), from which on unknowns aggregate
+    n, stiff, coupling = 20, 1e12, 1999.0
+    A = scipy.sparse.block_array(
+        [[scipy.sparse.eye_array(1) * stiff, None], [None, convection_diffusion(n, 0.0)]]
+    ).tolil()
     A[0, 1] = A[1, 0] = -coupling
     A, b = A.tocsr(), np.concatenate([[0.0], load(n)])
     cycles = MonotoneAggregation(wl.SparseOperator(A, device=device))
     assert cycles.refresh()
-    x, right, lower, upper = fields(device, np.zeros(n * n + 1), b, np.full(n * n + 1, -1.0), np.full(n * n + 1, 1.0))
+    x, right, lower, upper = fields(
+        device, np.zeros(n * n + 1), b, np.full(n * n + 1, -1.0), np.full(n * n + 1, 1.0)
+    )
     energies = []
     for _ in range(12):
         host = x.numpy()
@@ -90,7 +101,9 @@ def test_a_matrix_may_change_and_so_may_the_fields():
     for factor, sign in ((1.0, 1.0), (3.0, 1.0), (3.0, -1.0)):
         operator.update(factor * A)
         assert cycles.refresh()
-        x, right, lower, upper = fields("cpu", np.zeros(n * n), sign * b, np.zeros(n * n), np.full(n * n, np.inf))
+        x, right, lower, upper = fields(
+            "cpu", np.zeros(n * n), sign * b, np.zeros(n * n), np.full(n * n, np.inf)
+        )
         for _ in range(60):
             cycles.cycle(x, right, lower, upper)
         expected = lemke(factor * A.toarray(), sign * b)
@@ -113,7 +126,9 @@ def test_newton_does_not_creep(wind, method, device):
     plain = method(monotone_cycles=0)
     work = plain.init(problem)
     work.system.coarse = None
-    cold = wl.solve(problem, plain, stopping=wl.StoppingCriteria(max_iterations=200), workspace=work)
+    cold = wl.solve(
+        problem, plain, stopping=wl.StoppingCriteria(max_iterations=200), workspace=work
+    )
     assert cold, cold.status
     assert cold.iterations >= 20
     np.testing.assert_allclose(result.x.numpy(), cold.x.numpy(), atol=1e-4 * cold.x.numpy().max())
@@ -126,8 +141,12 @@ def test_warm_starts_and_other_matrices_take_none(device):
     first = wl.solve(problem, wl.MinimumMapNewton())
     again = wl.solve(problem, wl.MinimumMapNewton(), x0=first.x.numpy())
     assert "monotone cycle" not in {r.step for r in again.history}
-    plus = scipy.sparse.csr_array(abs(A))  # positive off the diagonal: aggregates would average what alternates
+    # positive off the diagonal: aggregates would average what alternates
+    plus = scipy.sparse.csr_array(abs(A))
     assert not MonotoneAggregation(wl.SparseOperator(plus, device=device)).refresh()
-    result = wl.solve(wl.LCP(wl.SparseOperator(plus + 4 * scipy.sparse.eye_array(n * n), device=device), b), wl.MinimumMapNewton())
+    result = wl.solve(
+        wl.LCP(wl.SparseOperator(plus + 4 * scipy.sparse.eye_array(n * n), device=device), b),
+        wl.MinimumMapNewton(),
+    )
     assert result, result.status
     assert "monotone cycle" not in {r.step for r in result.history}

@@ -16,7 +16,9 @@ def poisson(*counts):
     A = scipy.sparse.csr_array((1, 1))
     for n in counts:
         T = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(n, n))
-        A = scipy.sparse.kron(A, scipy.sparse.eye_array(n)) + scipy.sparse.kron(scipy.sparse.eye_array(A.shape[0]), T)
+        A = scipy.sparse.kron(A, scipy.sparse.eye_array(n)) + scipy.sparse.kron(
+            scipy.sparse.eye_array(A.shape[0]), T
+        )
     return scipy.sparse.csr_array(A)
 
 
@@ -40,7 +42,8 @@ def hierarchy(matrix, free, shift, device, real=wp.float64, settings=None):
 
 def restrict(H, free, shift):
     H.restrict(
-        wp.array(free.astype(np.uint8), device=H.device), None if shift is None else wp.array(shift, dtype=wp.float64, device=H.device)
+        wp.array(free.astype(np.uint8), device=H.device),
+        None if shift is None else wp.array(shift, dtype=wp.float64, device=H.device),
     )
 
 
@@ -53,7 +56,9 @@ def iterations(matrix, free, shift, device, real=wp.float64):
     count, _ = krylov.solve(1e-6 * float(np.linalg.norm(b)), 60)
     M = principal(matrix, free, np.zeros(len(free)) if shift is None else shift)
     accuracy = 1.1e-6 if real is wp.float64 else 2e-5
-    assert np.linalg.norm(M @ krylov.x.numpy().astype(np.float64) - b) <= accuracy * np.linalg.norm(b)
+    assert np.linalg.norm(M @ krylov.x.numpy().astype(np.float64) - b) <= accuracy * np.linalg.norm(
+        b
+    )
     return count
 
 
@@ -63,7 +68,13 @@ def test_products_are_galerkins(convection, device):
     drift = scipy.sparse.diags_array([-convection, convection], offsets=[-1, 1], shape=(20, 20))
     matrix = (poisson(23, 20) + scipy.sparse.kron(scipy.sparse.eye_array(23), drift)).tocsr()
     rng = np.random.default_rng(5)
-    H = hierarchy(matrix, np.ones(n, dtype=bool), None, device, settings=AlgebraicSettings(coarsest_cpu=8, coarsest_cuda=8))
+    H = hierarchy(
+        matrix,
+        np.ones(n, dtype=bool),
+        None,
+        device,
+        settings=AlgebraicSettings(coarsest_cpu=8, coarsest_cuda=8),
+    )
     assert len(H.levels) >= 3
     d = matrix.diagonal()
     for free, shift in (
@@ -87,7 +98,9 @@ def test_products_are_galerkins(convection, device):
         inverse = H._inverse.numpy()
         dense = M.toarray()
         rows = np.flatnonzero(np.abs(np.diag(dense)) > 0)
-        np.testing.assert_allclose((inverse @ dense)[np.ix_(rows, rows)], np.eye(len(rows)), atol=1e-8)
+        np.testing.assert_allclose(
+            (inverse @ dense)[np.ix_(rows, rows)], np.eye(len(rows)), atol=1e-8
+        )
 
 
 def test_entries_that_cancel_once_may_not_later(device):
@@ -112,7 +125,9 @@ def test_a_cycle_is_symmetric_and_positive(gamma, device):
     rng = np.random.default_rng(7)
     free = rng.random(15 * 14) < 0.8
     settings = AlgebraicSettings(gamma=gamma, coarsest_cpu=4, coarsest_cuda=4)
-    H = hierarchy(poisson(15, 14), free, 10 ** rng.uniform(-4, 6, len(free)), device, settings=settings)
+    H = hierarchy(
+        poisson(15, 14), free, 10 ** rng.uniform(-4, 6, len(free)), device, settings=settings
+    )
     cycle = []
     for e in np.eye(len(free)) * free:
         H.r.assign(e)
@@ -126,7 +141,10 @@ def test_a_cycle_is_symmetric_and_positive(gamma, device):
 
 @pytest.mark.parametrize(("dimension", "sizes"), [(2, (33, 65, 129, 257)), (3, (9, 17, 33))])
 def test_iterations_do_not_grow_with_the_grid(dimension, sizes, device):
-    counts = {kind: [] for kind in ("all", "random mask", "half held", "wide shift", "few stiff", "single")}
+    counts = {
+        kind: []
+        for kind in ("all", "random mask", "half held", "wide shift", "few stiff", "single")
+    }
     for size in sizes:
         matrix, rng = poisson(*[size] * dimension), np.random.default_rng(11)
         n = matrix.shape[0]
@@ -136,8 +154,12 @@ def test_iterations_do_not_grow_with_the_grid(dimension, sizes, device):
         counts["all"].append(iterations(matrix, everything, None, device))
         counts["random mask"].append(iterations(matrix, rng.random(n) < 0.8, None, device))
         counts["half held"].append(iterations(matrix, blob, None, device))
-        counts["wide shift"].append(iterations(matrix, everything, 10 ** rng.uniform(-6, 8, n), device))
-        counts["few stiff"].append(iterations(matrix, everything, np.where(rng.random(n) < 0.02, 1e8, 0.0), device))
+        counts["wide shift"].append(
+            iterations(matrix, everything, 10 ** rng.uniform(-6, 8, n), device)
+        )
+        counts["few stiff"].append(
+            iterations(matrix, everything, np.where(rng.random(n) < 0.02, 1e8, 0.0), device)
+        )
         counts["single"].append(iterations(matrix, blob, None, device, wp.float32))
     for kind, found in counts.items():
         assert found[-1] <= found[0] + 3, (kind, found)
@@ -148,7 +170,10 @@ def test_singular_components_do_not_break_a_cycle(device):
     """A closed domain: constants are in the null space, and a compatible right-hand side is solved up to them."""
     T = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(30, 30)).tolil()
     T[0, 0] = T[-1, -1] = 1.0
-    matrix = (scipy.sparse.kron(T, scipy.sparse.eye_array(30)) + scipy.sparse.kron(scipy.sparse.eye_array(30), T)).tocsr()
+    matrix = (
+        scipy.sparse.kron(T, scipy.sparse.eye_array(30))
+        + scipy.sparse.kron(scipy.sparse.eye_array(30), T)
+    ).tocsr()
     H = hierarchy(matrix, np.ones(900, dtype=bool), None, device)
     krylov = ConjugateGradient(H.product, H)
     b = np.random.default_rng(13).standard_normal(900)
@@ -164,7 +189,8 @@ def test_singular_components_do_not_break_a_cycle(device):
     [
         scipy.sparse.diags_array(np.arange(1.0, 301.0)).tocsr(),  # nothing aggregates
         scipy.sparse.csr_array(np.eye(100) + 1 / 100),  # rows as wide as the matrix
-        scipy.sparse.block_diag([poisson(9, 9), scipy.sparse.csr_array((40, 40))]).tocsr(),  # empty rows
+        # empty rows
+        scipy.sparse.block_diag([poisson(9, 9), scipy.sparse.csr_array((40, 40))]).tocsr(),
         poisson(1),
     ],
 )
@@ -183,10 +209,15 @@ def test_matrices_that_hardly_coarsen(matrix, device):
 @pytest.mark.parametrize("pairs", [1, 2, 3])
 def test_a_coarsest_level_too_large_to_invert_is_swept_forth_and_back(pairs, device):
     """Each pair of sweeps goes on from the one before; the first alone starts from zero."""
-    settings = AlgebraicSettings(strength=0.9, coarsest_cpu=0, coarsest_cuda=0, last_sweeps=pairs)  # so strong that nothing aggregates
+    # so strong that nothing aggregates
+    settings = AlgebraicSettings(strength=0.9, coarsest_cpu=0, coarsest_cuda=0, last_sweeps=pairs)
     H = hierarchy(poisson(5, 6), np.ones(30, dtype=bool), None, device, settings=settings)
     (level,) = H.levels
-    M, inverse, b = stored(level.A), level.inverse.numpy(), np.random.default_rng(19).standard_normal(30)
+    M, inverse, b = (
+        stored(level.A),
+        level.inverse.numpy(),
+        np.random.default_rng(19).standard_normal(30),
+    )
     first, second = settings.weights
     expected = np.zeros(30)
     for pair in range(pairs):
@@ -202,4 +233,8 @@ def test_two_hierarchies_of_one_matrix_are_the_same(device):
     first, second = (hierarchy(matrix, np.ones(420, dtype=bool), None, device) for _ in range(2))
     for one, other in zip(first.levels, second.levels, strict=True):
         assert np.array_equal(one.A.values.numpy(), other.A.values.numpy())
-    assert 1.0 < sum(level.A.values.size for level in first.levels) / first.levels[0].A.values.size < 1.6
+    assert (
+        1.0
+        < sum(level.A.values.size for level in first.levels) / first.levels[0].A.values.size
+        < 1.6
+    )

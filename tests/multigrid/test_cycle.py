@@ -18,7 +18,8 @@ from warp_lcp.multigrid.cycle import Cycle, GatheredLevel
 from warp_lcp.multigrid.cycle_settings import AlgebraicSettings
 
 ALPHA, PAIRS = 1.5, 3  # over-correction, and pairs of sweeps that stand for a projected solve
-OMEGAS = 1 / (1.25 + 0.75 * np.cos(np.pi / 4)), 1 / (1.25 - 0.75 * np.cos(np.pi / 4))  # 1 / the Chebyshev points of [0.5, 2]
+# 1 / the Chebyshev points of [0.5, 2]
+OMEGAS = 1 / (1.25 + 0.75 * np.cos(np.pi / 4)), 1 / (1.25 - 0.75 * np.cos(np.pi / 4))
 
 
 @dataclass
@@ -74,19 +75,37 @@ def test_a_grids_cycle_is_the_plain_loop(shape, gamma, bounded, together, device
     cells, free = rng.choice(3, shape, p=[0.15, 0.8, 0.05]), rng.random(shape) < 0.9
     face = rng.uniform(0.1, 1.0, (*shape[:-1], shape[-1] + 1))
     settings = CycleSettings(
-        gamma=gamma, revisited_cuda=9, over_correction=ALPHA, dirichlet_scaling=1.0, coarsest_cpu=6, coarsest_cuda=6,
-        semicoarsening_threshold=0.0, projected_sweeps=PAIRS, one_launch_cpu=90 * together, one_launch_cuda=90 * together,
-    )  # fmt: skip
-    _, hierarchy = masked_hierarchy(cells, free, (False,) * 3, device, settings, bounded=True, face_x=face)
+        gamma=gamma,
+        revisited_cuda=9,
+        over_correction=ALPHA,
+        dirichlet_scaling=1.0,
+        coarsest_cpu=6,
+        coarsest_cuda=6,
+        semicoarsening_threshold=0.0,
+        projected_sweeps=PAIRS,
+        one_launch_cpu=90 * together,
+        one_launch_cuda=90 * together,
+    )
+    _, hierarchy = masked_hierarchy(
+        cells, free, (False,) * 3, device, settings, bounded=True, face_x=face
+    )
     unknown = (free & (cells == wl.FLUID)).ravel()
     matrices = [assemble(cells, [face, 1.0, 1.0]) * np.outer(unknown, unknown)]
     prolongations = [aggregation(level.stencil.padding.counts) for level in hierarchy.levels[:-1]]
     for P in prolongations:
         matrices.append(P.T @ matrices[-1] @ P)
-    assert [len(A) for A in matrices] == [np.prod(level.stencil.padding.counts) for level in hierarchy.levels]
+    assert [len(A) for A in matrices] == [
+        np.prod(level.stencil.padding.counts) for level in hierarchy.levels
+    ]
     assert len(matrices) > 3
-    b, gaps = rng.standard_normal(unknown.size) * unknown, rng.uniform(0, 0.5, (2, unknown.size)) * unknown
-    finest, inner = hierarchy.finest, np.pad(np.ones(hierarchy.finest.stencil.padding.counts, dtype=bool), 1).ravel()
+    b, gaps = (
+        rng.standard_normal(unknown.size) * unknown,
+        rng.uniform(0, 0.5, (2, unknown.size)) * unknown,
+    )
+    finest, inner = (
+        hierarchy.finest,
+        np.pad(np.ones(hierarchy.finest.stencil.padding.counts, dtype=bool), 1).ravel(),
+    )
     for target, values in ((finest.b, b), (finest.lower, -gaps[0]), (finest.upper, gaps[1])):
         stored = np.zeros(inner.size)
         stored[inner] = values
@@ -95,7 +114,9 @@ def test_a_grids_cycle_is_the_plain_loop(shape, gamma, bounded, together, device
     sides = (-gaps[0], gaps[1]) if bounded else (np.full(b.size, -np.inf), np.full(b.size, np.inf))
     expected = Plain(matrices, prolongations, gamma).cycle(np.zeros(b.size), b, *sides)
     assert np.abs(expected).max() > 0.1
-    np.testing.assert_allclose(finest.x.numpy()[inner], expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+    np.testing.assert_allclose(
+        finest.x.numpy()[inner], expected, rtol=0, atol=1e-12 * np.abs(expected).max()
+    )
 
 
 class PlainRows(Plain):
@@ -121,8 +142,12 @@ def test_an_algebraic_cycle_is_the_plain_loop(gamma, device):
     b, free = np.random.default_rng(gamma).standard_normal(n * n), np.full(n * n, np.inf)
     hierarchy.r.assign(b)
     hierarchy.apply()
-    expected = PlainRows(matrices, prolongations, gamma, 1.0, settings.weights).cycle(np.zeros(n * n), b, -free, free)
-    np.testing.assert_allclose(hierarchy.z.numpy(), expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+    expected = PlainRows(matrices, prolongations, gamma, 1.0, settings.weights).cycle(
+        np.zeros(n * n), b, -free, free
+    )
+    np.testing.assert_allclose(
+        hierarchy.z.numpy(), expected, rtol=0, atol=1e-12 * np.abs(expected).max()
+    )
 
 
 def dense(matrix):
@@ -209,7 +234,12 @@ class Named:
 
 
 V = ["a 0 to b", "b 0 to c", "solve c x 1", "c to b", "b to a"]
-W = ["a 0 to b", "bounds of b", *(2 * ["b 0 to c", "bounds of c", "solve c x 2", "c to b"]), "b to a"]
+W = [
+    "a 0 to b",
+    "bounds of b",
+    *(2 * ["b 0 to c", "bounds of c", "solve c x 2", "c to b"]),
+    "b to a",
+]
 W[6] = "b x to c"  # the second visit goes on from what the first one left
 
 
@@ -224,6 +254,11 @@ def test_a_gathered_levels_cycle_is_that_of_the_whole():
     """Its visits are the whole's, between one gathering and one taking back."""
     levels = [Named(name, 2) for name in "abc"]
     whole = Cycle(levels[1:], levels[-1].solve, projected=True)
-    gathered = GatheredLevel(whole=lambda projected: whole, gather=["gather b"], gather_bounds=["gather bounds"], take="take")
+    gathered = GatheredLevel(
+        whole=lambda projected: whole,
+        gather=["gather b"],
+        gather_bounds=["gather bounds"],
+        take="take",
+    )
     found = list(Cycle(levels[:2], gathered.solve, projected=True).stages())
     assert found == [*W[:2], "gather b", "gather bounds", *W[2:-1], "take", W[-1]]

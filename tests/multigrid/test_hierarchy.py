@@ -18,7 +18,9 @@ CASES = [
 ]
 
 
-def masked_hierarchy(cells, free, periodic, device, settings=None, real=wp.float64, bounded=False, **faces):
+def masked_hierarchy(
+    cells, free, periodic, device, settings=None, real=wp.float64, bounded=False, **faces
+):
     A = wl.GridPoisson(cells, periodic=periodic, device=device, dtype=wp.float64, **faces)
     hierarchy = Hierarchy(A.stencil, real, bounded=bounded, settings=settings)
     mask = A.layout.load(free.astype(np.uint8) * (cells == wl.FLUID).astype(np.uint8), wp.uint8)
@@ -62,10 +64,14 @@ def test_coarse_levels_are_galerkin_products(shape, periodic, arrays, device):
         face = rng.uniform(0.1, 1.0, (*shape[:-1], shape[-1] + 1))
         face[..., -1] = face[..., 0]
         faces["face_x"] = face
-    settings = CycleSettings(coarsest_cpu=1, coarsest_cuda=1, dirichlet_scaling=1.0, semicoarsening_threshold=0.0)
+    settings = CycleSettings(
+        coarsest_cpu=1, coarsest_cuda=1, dirichlet_scaling=1.0, semicoarsening_threshold=0.0
+    )
     _, hierarchy = masked_hierarchy(cells, free, periodic, device, settings, **faces)
     p = (free & (cells == wl.FLUID)).ravel()
-    expected = assemble(cells, [faces.get("face_x", 1.0), 1.0, 1.0], periodic=periodic) * np.outer(p, p)
+    expected = assemble(cells, [faces.get("face_x", 1.0), 1.0, 1.0], periodic=periodic) * np.outer(
+        p, p
+    )
     for fine, coarse in zip(hierarchy.levels, hierarchy.levels[1:], strict=False):
         P = aggregation(fine.stencil.padding.counts)
         expected = P.T @ expected @ P
@@ -83,7 +89,9 @@ def test_two_sweeps_contract_an_interval_of_eigenvalues_as_no_other_two_do(inter
 @pytest.mark.parametrize("strength", [(1.0, 1.0, 100.0), (100.0, 1.0, 100.0), (1.0, 1.0, 1.0)])
 def test_only_strong_axes_are_coarsened_until_the_others_have_caught_up(strength, device):
     cells = np.full((16, 16, 16), wl.FLUID)
-    A = wl.GridPoisson(cells, **{f"face_{a}": c for a, c in zip("xyz", strength, strict=True)}, device=device)
+    A = wl.GridPoisson(
+        cells, **{f"face_{a}": c for a, c in zip("xyz", strength, strict=True)}, device=device
+    )
     hierarchy = Hierarchy(A.stencil, wp.float32, bounded=False)
     factors = [lv.factors for lv in hierarchy.levels[1:]]
     strong = max(strength)
@@ -91,11 +99,15 @@ def test_only_strong_axes_are_coarsened_until_the_others_have_caught_up(strength
     assert np.prod(hierarchy.levels[-1].stencil.padding.counts) <= 64
 
 
-@pytest.mark.parametrize("strength", [(1.0, 1.0, 100.0), (1.0, 100.0, 1.0), (100.0, 1.0, 100.0), (1e-3, 1.0, 1.0)])
+@pytest.mark.parametrize(
+    "strength", [(1.0, 1.0, 100.0), (1.0, 100.0, 1.0), (100.0, 1.0, 100.0), (1e-3, 1.0, 1.0)]
+)
 def test_the_row_sums_of_coarse_levels_are_never_negative(strength, device):
     """Diagonals are sums of positive numbers: taking inner faces off them in float32 would leave an indefinite level."""
     cells = np.random.default_rng(73).choice(3, (24, 24, 24), p=[0.02, 0.9, 0.08])
-    A = wl.GridPoisson(cells, **{f"face_{a}": c for a, c in zip("xyz", strength, strict=True)}, device=device)
+    A = wl.GridPoisson(
+        cells, **{f"face_{a}": c for a, c in zip("xyz", strength, strict=True)}, device=device
+    )
     hierarchy = Hierarchy(A.stencil, wp.float32, bounded=False)
     wp.copy(hierarchy.finest.stencil.d, A.stencil.d)
     hierarchy.rebuild()
@@ -111,7 +123,9 @@ def test_the_row_sums_of_coarse_levels_are_never_negative(strength, device):
 def test_cycle_is_symmetric_positive_definite(gamma, device):
     rng = np.random.default_rng(53)
     cells = rng.choice(3, (9, 10, 8), p=[0.1, 0.8, 0.1])
-    _, hierarchy = masked_hierarchy(cells, np.ones(cells.shape), (False,) * 3, device, CycleSettings(gamma=gamma))
+    _, hierarchy = masked_hierarchy(
+        cells, np.ones(cells.shape), (False,) * 3, device, CycleSettings(gamma=gamma)
+    )
     inside = np.pad(cells == wl.FLUID, 1).ravel()
 
     def cycle(r):
@@ -126,7 +140,8 @@ def test_cycle_is_symmetric_positive_definite(gamma, device):
     assert not Mr[~inside].any()
 
 
-@pytest.mark.parametrize("shape", [(8, 12, 10), (4, 3, 5)])  # the coarsest level's sweeps are followed by others, or are the last
+# the coarsest level's sweeps are followed by others, or are the last
+@pytest.mark.parametrize("shape", [(8, 12, 10), (4, 3, 5)])
 @pytest.mark.parametrize("periodic", [(False,) * 3, (True, False, False)])
 def test_monotone_cycle_keeps_bounds_and_lowers_the_energy(periodic, shape, device):
     rng = np.random.default_rng(59)
@@ -136,7 +151,10 @@ def test_monotone_cycle_keeps_bounds_and_lowers_the_energy(periodic, shape, devi
     inside = np.pad(cells == wl.FLUID, 1).ravel()
     finest = hierarchy.finest
     r = rng.standard_normal(inside.size) * inside
-    lower, upper = -rng.uniform(0, 0.3, inside.size) * inside, rng.uniform(0, 0.3, inside.size) * inside
+    lower, upper = (
+        -rng.uniform(0, 0.3, inside.size) * inside,
+        rng.uniform(0, 0.3, inside.size) * inside,
+    )
     for field, values in ((finest.b, r), (finest.lower, lower), (finest.upper, upper)):
         field.assign(values)
     hierarchy.monotone_cycle.run()
@@ -169,7 +187,11 @@ def test_conjugate_gradients_solve_the_masked_system(device):
         iterations, norm = krylov.solve(1e-10, 60)
         assert iterations < 40
         assert norm <= 1e-10
-        x = krylov.x.numpy().reshape(hierarchy.finest.stencil.padding.shape)[1:-1, 1:-1, 1:-1].ravel()
+        x = (
+            krylov.x.numpy()
+            .reshape(hierarchy.finest.stencil.padding.shape)[1:-1, 1:-1, 1:-1]
+            .ravel()
+        )
         A = assemble(cells)[np.ix_(p, p)]
         np.testing.assert_allclose(x[p], np.linalg.solve(A, b[p]), atol=1e-8)
         assert not x[~p].any()

@@ -59,7 +59,9 @@ def test_changed_rows_give_what_a_complete_rebuild_gives(shape, periodic, number
     """A row that depends on a changed one and is left out keeps a face, or an excess, of the last free set."""
     rng = np.random.default_rng(811)
     cells, A = operator(shape, periodic, numbers, arrays, device, rng)
-    partly, whole = (Hierarchy(A.stencil, wp.float32, bounded=False, settings=SETTINGS) for _ in range(2))
+    partly, whole = (
+        Hierarchy(A.stencil, wp.float32, bounded=False, settings=SETTINGS) for _ in range(2)
+    )
     assert len(whole.levels) > 2
     for free in sets(cells, rng):
         partly.hold(A.stencil.d, stored(A, free & (cells == wl.FLUID)))
@@ -119,11 +121,20 @@ def test_a_solve_leaves_the_hierarchy_of_its_last_free_set(bounds, arrays, devic
     rng = np.random.default_rng(827)
     cells, A = operator((18, 20, 22), (False,) * 3, {}, arrays, device, rng)
     b = np.where(cells == wl.FLUID, rng.standard_normal(cells.shape), 0.0)
-    lower = np.zeros(cells.shape) if bounds == "everywhere" else np.where(rng.random(cells.shape) < 0.2, 0.0, -np.inf)
+    lower = (
+        np.zeros(cells.shape)
+        if bounds == "everywhere"
+        else np.where(rng.random(cells.shape) < 0.2, 0.0, -np.inf)
+    )
     problem, solver = wl.LCP(A, b, lower), wl.ProjectedMultigrid(cycle=SETTINGS)
     work = solver.init(problem)
     for most in (3, 5, 40):
-        result = wl.solve(problem, solver, stopping=wl.StoppingCriteria(rtol=1e-6, max_iterations=most), workspace=work)
+        result = wl.solve(
+            problem,
+            solver,
+            stopping=wl.StoppingCriteria(rtol=1e-6, max_iterations=most),
+            workspace=work,
+        )
         work.hierarchy.rebuild_changed()
         found = snapshot(work.hierarchy)
         work.hierarchy.rebuild()
@@ -142,13 +153,21 @@ def scene(rng):
     return cells
 
 
-@pytest.mark.parametrize("real", [wp.float32, wp.float64])  # float64 corrections have weights of their own
+# float64 corrections have weights of their own
+@pytest.mark.parametrize("real", [wp.float32, wp.float64])
 @pytest.mark.parametrize("arrays", [False, True])
 def test_new_cells_and_weights_rebuild_the_rows_that_they_change(arrays, real, device):
     """Spans shrink, grow and empty; weights change in place; fields that are not 0 off the new spans would enter the next cycle."""
     rng = np.random.default_rng(829)
     padded = (12, 13, 72)
-    faces = {f"face_{a}": wp.array(rng.uniform(0.1, 1, padded), dtype=wp.float32, device=device) for a in "xyz"} if arrays else {}
+    faces = (
+        {
+            f"face_{a}": wp.array(rng.uniform(0.1, 1, padded), dtype=wp.float32, device=device)
+            for a in "xyz"
+        }
+        if arrays
+        else {}
+    )
     A = wl.GridPoisson(scene(rng), device=device, **faces)
     partly = Hierarchy(A.stencil, real, bounded=False, settings=SETTINGS)
     cells = None
@@ -191,7 +210,9 @@ def test_weights_that_keep_every_diagonal_change_their_rows(real, device):
                 values[1, row, column + right] += 0.25 if axis == "x" else -0.25
             faces[f"face_{axis}"].assign(values)
         A.update(wp.array(cells, dtype=wp.int8, device=device))
-        for hierarchy, rebuild in zip(hierarchies, (Hierarchy.rebuild_changed, Hierarchy.rebuild), strict=True):
+        for hierarchy, rebuild in zip(
+            hierarchies, (Hierarchy.rebuild_changed, Hierarchy.rebuild), strict=True
+        ):
             hierarchy.refresh()
             hierarchy.hold(A.stencil.d, stored(A, cells == wl.FLUID))
             rebuild(hierarchy)

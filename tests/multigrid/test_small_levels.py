@@ -24,7 +24,11 @@ def problem(shape, faces, seed=83):
     cells = rng.choice(3, shape, p=[0.1, 0.85, 0.05])
     arrays = rng.uniform(0.1, 1, (*shape[:-1], shape[-1] + 1))
     arrays[..., -1] = arrays[..., 0]
-    return cells, rng.random(shape) < 0.9, {"equal": {}, "numbers": {"face_x": 2.0}, "arrays": {"face_x": arrays}}[faces]
+    return (
+        cells,
+        rng.random(shape) < 0.9,
+        {"equal": {}, "numbers": {"face_x": 2.0}, "arrays": {"face_x": arrays}}[faces],
+    )
 
 
 def fill(hierarchy, cells, seed=89):
@@ -55,16 +59,26 @@ def run_cycle(hierarchy, cells, projected):
 def test_cycles_and_levels_are_those_of_single_launches(shape, periodic, faces, real, device):
     """A stage left out, out of order or on a wrong array changes the cycle by far more than rounding."""
     cells, free, keywords = problem(shape, faces)
-    apart = masked_hierarchy(cells, free, periodic, device, CycleSettings(**APART), real, True, **keywords)[1]
-    together = masked_hierarchy(cells, free, periodic, device, CycleSettings(**TOGETHER), real, True, **keywords)[1]
+    apart = masked_hierarchy(
+        cells, free, periodic, device, CycleSettings(**APART), real, True, **keywords
+    )[1]
+    together = masked_hierarchy(
+        cells, free, periodic, device, CycleSettings(**TOGETHER), real, True, **keywords
+    )[1]
     for one, other in zip(apart.levels, together.levels, strict=True):
         np.testing.assert_array_equal(one.stencil.d.numpy(), other.stencil.d.numpy())
     eps = np.finfo(wp.dtype_to_numpy(real)).eps
     for projected in (False, True):
         expected = run_cycle(apart, cells, projected)
-        np.testing.assert_allclose(run_cycle(together, cells, projected), expected, rtol=0, atol=20 * eps * np.abs(expected).max())
+        np.testing.assert_allclose(
+            run_cycle(together, cells, projected),
+            expected,
+            rtol=0,
+            atol=20 * eps * np.abs(expected).max(),
+        )
         assert np.abs(expected).max() > 0.1
-        # on CUDA, the last launches of the descent, the visits and the first of the ascent have become one
+        # on CUDA, the last launches of the descent, the visits and the first of the ascent have
+        # become one
         program = "monotone_cycle" if projected else "cycle"
         assert device == "cpu" or len(getattr(together, program)) < len(getattr(apart, program))
 
@@ -74,10 +88,13 @@ def test_cycles_and_levels_are_those_of_single_launches(shape, periodic, faces, 
 def test_threads_of_a_block_share_a_stage_in_any_number(shape, periodic, projected):
     """As on a GPU, a cell at a time by strided threads, but with a launch a stage in place of the barriers.
 
-    A cell that two threads or none take, and a stage whose threads read what others of it write, give another result.
+    A cell that two threads or none take, and a stage whose threads read what others of it write,
+    give another result.
     """
     cells, free, keywords = problem(shape, "arrays")
-    hierarchy = masked_hierarchy(cells, free, periodic, "cpu", CycleSettings(**TOGETHER), wp.float64, True, **keywords)[1]
+    hierarchy = masked_hierarchy(
+        cells, free, periodic, "cpu", CycleSettings(**TOGETHER), wp.float64, True, **keywords
+    )[1]
     rows, first = hierarchy._small, hierarchy._small.levels[0]
     inverse = hierarchy._dense.inverse.numpy().copy()
     rng = np.random.default_rng(101)
@@ -90,13 +107,21 @@ def test_threads_of_a_block_share_a_stage_in_any_number(shape, periodic, project
     expected = first.x.numpy() * inside
     assert np.abs(expected).max() > 0.1
 
-    made = [a.numpy() for level in rows.levels[1:] for a in (level.stencil.d, *level.stencil.weights)]
+    made = [
+        a.numpy() for level in rows.levels[1:] for a in (level.stencil.d, *level.stencil.weights)
+    ]
     for level in rows.levels:
         L = level.stencil.rows.single
         level._bound.clear()
         counts = level.stencil.padding.counts
-        level.stencil.__dict__["rows"] = Rows.strided(level.stencil.d.size, first.x.device, (L.base, L.s1, L.s2), counts, cells=1)
-    kernels, s, m = coarsest_kernels(*rows.levels[-1].form[:3]), rows.levels[-1].stencil, len(inverse)
+        level.stencil.__dict__["rows"] = Rows.strided(
+            level.stencil.d.size, first.x.device, (L.base, L.s1, L.s2), counts, cells=1
+        )
+    kernels, s, m = (
+        coarsest_kernels(*rows.levels[-1].form[:3]),
+        rows.levels[-1].stencil,
+        len(inverse),
+    )
     inputs = [
         s.struct,
         s.rows.single,
@@ -121,24 +146,37 @@ def test_threads_of_a_block_share_a_stage_in_any_number(shape, periodic, project
                 w.zero_()
         for sequence in (small.coarsening, cycles):
             for i in range(len(sequence.tables.order)):
-                wp.launch(sequence.kernel, threads, [sequence.tables, i, i + 1, threads], device="cpu")
-        found = [a.numpy() for level in rows.levels[1:] for a in (level.stencil.d, *level.stencil.weights)]
+                wp.launch(
+                    sequence.kernel, threads, [sequence.tables, i, i + 1, threads], device="cpu"
+                )
+        found = [
+            a.numpy()
+            for level in rows.levels[1:]
+            for a in (level.stencil.d, *level.stencil.weights)
+        ]
         for a, expected_field in zip(found, made, strict=True):
             np.testing.assert_array_equal(a, expected_field)
         np.testing.assert_allclose(first.x.numpy() * inside, expected, rtol=0, atol=1e-13)
 
 
 @pytest.mark.parametrize("faces", FACES)
-@pytest.mark.parametrize(("shape", "periodic"), [((3, 4, 5), (False,) * 3), ((2, 3, 2), (True, True, True)), ((7, 9), (True, False))])
+@pytest.mark.parametrize(
+    ("shape", "periodic"),
+    [((3, 4, 5), (False,) * 3), ((2, 3, 2), (True, True, True)), ((7, 9), (True, False))],
+)
 def test_the_coarsest_level_is_inverted(shape, periodic, faces, device):
     """Its matrix comes from its own product, column by column; two faces join the cells of a periodic axis of two."""
     cells, free, keywords = problem(shape, faces)
-    _, hierarchy = masked_hierarchy(cells, free, periodic, device, CycleSettings(**TOGETHER), **keywords)
+    _, hierarchy = masked_hierarchy(
+        cells, free, periodic, device, CycleSettings(**TOGETHER), **keywords
+    )
     assert len(hierarchy.levels) == 1
     matrix, inverse = level_matrix(hierarchy.finest.stencil), hierarchy._dense.inverse.numpy()
     unknown = np.diag(matrix) > 0
     assert 0 < unknown.sum() < cells.size
-    np.testing.assert_allclose((inverse @ matrix)[np.ix_(unknown, unknown)], np.eye(unknown.sum()), atol=1e-12)
+    np.testing.assert_allclose(
+        (inverse @ matrix)[np.ix_(unknown, unknown)], np.eye(unknown.sum()), atol=1e-12
+    )
     assert not inverse[~unknown].any()
     assert not inverse[:, ~unknown].any()
 
@@ -148,7 +186,9 @@ def test_a_singular_coarsest_level_is_pinned(real, device):
     """A closed domain: one unknown of each component is 0, and what remains is a generalized inverse."""
     cells = np.full((4, 4, 4), wl.FLUID)
     cells[:, :, 2] = wl.SOLID  # two components
-    _, hierarchy = masked_hierarchy(cells, np.ones(cells.shape), (False,) * 3, device, CycleSettings(**TOGETHER), real)
+    _, hierarchy = masked_hierarchy(
+        cells, np.ones(cells.shape), (False,) * 3, device, CycleSettings(**TOGETHER), real
+    )
     matrix, inverse = level_matrix(hierarchy.finest.stencil, real), hierarchy._dense.inverse.numpy()
     assert np.linalg.matrix_rank(inverse) == (cells == wl.FLUID).sum() - 2
     np.testing.assert_allclose(matrix @ inverse @ matrix, matrix, atol=1e-11)
@@ -166,7 +206,9 @@ def test_solves_take_the_same_iterations(method, device):
     assert one
     assert other
     assert (one.iterations, one.linear_iterations) == (other.iterations, other.linear_iterations)
-    np.testing.assert_allclose([r.residual for r in other.history], [r.residual for r in one.history], rtol=1e-3)
+    np.testing.assert_allclose(
+        [r.residual for r in other.history], [r.residual for r in one.history], rtol=1e-3
+    )
 
 
 def test_levels_follow_when_the_cells_change(device):
@@ -176,7 +218,10 @@ def test_levels_follow_when_the_cells_change(device):
     moved = np.full(cells.shape, wl.AIR)
     moved[:5, :, 30:] = wl.FLUID
     A = wl.GridPoisson(cells, device=device, dtype=wp.float64)
-    both = [Hierarchy(A.stencil, wp.float64, bounded=True, settings=CycleSettings(**s)) for s in (APART, TOGETHER)]
+    both = [
+        Hierarchy(A.stencil, wp.float64, bounded=True, settings=CycleSettings(**s))
+        for s in (APART, TOGETHER)
+    ]
     for now in (cells, moved):
         A.update(wp.array(now.astype(np.int8), dtype=wp.int8, device=device))
         found = []
@@ -195,21 +240,38 @@ def test_levels_follow_when_the_cells_change(device):
 def test_the_gpu_waits_after_every_stage_and_reads_what_others_wrote(real, tmp_path):
     """Barriers are in the GPU's source only, and no load goes past the cache that sees a block's own writes."""
     cells, free, keywords = problem((8, 12, 10), "arrays")
-    hierarchy = masked_hierarchy(cells, free, (True, False, True), "cpu", CycleSettings(**TOGETHER), real, True, **keywords)[1]
-    modules = {hierarchy._small.solve(1, projected=projected, from_zero=True)[0].kernel.module.name: 1 for projected in (False, True)}
+    hierarchy = masked_hierarchy(
+        cells, free, (True, False, True), "cpu", CycleSettings(**TOGETHER), real, True, **keywords
+    )[1]
+    modules = {
+        hierarchy._small.solve(1, projected=projected, from_zero=True)[0].kernel.module.name: 1
+        for projected in (False, True)
+    }
     modules[hierarchy._small.coarsening.kernel.module.name] = 1
-    modules[coarsest_kernels(True, real, real).invert.module.name] = 3  # assembled, eliminated to and fro
+    # assembled, eliminated to and fro
+    modules[coarsest_kernels(True, real, real).invert.module.name] = 3
     for module, barriers in modules.items():
-        (path,) = wp.compile_aot_module(module, device=None, arch=[80], module_dir=tmp_path, use_ptx=True)
+        (path,) = wp.compile_aot_module(
+            module, device=None, arch=[80], module_dir=tmp_path, use_ptx=True
+        )
         (text,) = path.read_text().split(".visible .entry")[1:]
         assert text.count("bar.sync") == barriers, module
         assert "ld.global.nc" not in text
-        assert f".maxntid {CUDA_THREADS}" in text  # else there may be too few registers for such a block
+        # else there may be too few registers for such a block
+        assert f".maxntid {CUDA_THREADS}" in text
 
 
 def test_levels_of_at_most_so_many_cells_are_taken(device):
     A = wl.GridPoisson(np.full((32, 32, 32), wl.FLUID), device=device)
     for cells in (0, 64, 512, 4096):
-        hierarchy = Hierarchy(A.stencil, wp.float32, bounded=False, settings=CycleSettings(one_launch_cpu=cells, one_launch_cuda=cells))
-        counts = [np.prod(level.stencil.padding.counts) for level in hierarchy.levels[hierarchy._first_small :]]
+        hierarchy = Hierarchy(
+            A.stencil,
+            wp.float32,
+            bounded=False,
+            settings=CycleSettings(one_launch_cpu=cells, one_launch_cuda=cells),
+        )
+        counts = [
+            np.prod(level.stencil.padding.counts)
+            for level in hierarchy.levels[hierarchy._first_small :]
+        ]
         assert counts == [n for n in (4096, 512, 64) if n <= cells]

@@ -18,14 +18,19 @@ def faces_of(shape, strengths):
     out = {}
     for axis in range(len(shape)):
         d = len(shape) - 1 - axis
-        places = [np.arange(n + 1) / n if k == d else (np.arange(n) + 0.5) / n for k, n in enumerate(shape)]
+        places = [
+            np.arange(n + 1) / n if k == d else (np.arange(n) + 0.5) / n
+            for k, n in enumerate(shape)
+        ]
         out[AXES[axis]] = strengths(*reversed(np.meshgrid(*places, indexing="ij")))[axis]
     return out
 
 
 def along(angle, weak):
     """Return strengths in 2-D that are 1 along an angle to x and `weak` across it."""
-    return np.cos(angle) ** 2 + weak * np.sin(angle) ** 2, np.sin(angle) ** 2 + weak * np.cos(angle) ** 2
+    return np.cos(angle) ** 2 + weak * np.sin(angle) ** 2, np.sin(angle) ** 2 + weak * np.cos(
+        angle
+    ) ** 2
 
 
 def turn(weak):
@@ -86,11 +91,16 @@ def matrix(cells, faces):
     off = scipy.sparse.csr_array((cells.size, cells.size))
     for axis in range(cells.ndim):
         ax = cells.ndim - 1 - axis
-        i, j = index.take(range(cells.shape[ax] - 1), ax).ravel(), index.take(range(1, cells.shape[ax]), ax).ravel()
+        i, j = (
+            index.take(range(cells.shape[ax] - 1), ax).ravel(),
+            index.take(range(1, cells.shape[ax]), ax).ravel(),
+        )
         c = faces[AXES[axis]].take(range(1, cells.shape[ax]), ax).ravel()
         np.add.at(d, i, c)
         np.add.at(d, j, c)
-        off = off + scipy.sparse.coo_array((np.r_[c, c], (np.r_[i, j], np.r_[j, i])), shape=off.shape)
+        off = off + scipy.sparse.coo_array(
+            (np.r_[c, c], (np.r_[i, j], np.r_[j, i])), shape=off.shape
+        )
     fluid = scipy.sparse.diags_array((cells.ravel() == wl.FLUID).astype(float))
     return (fluid @ (scipy.sparse.diags_array(d) - off) @ fluid).tocsr()
 
@@ -102,8 +112,16 @@ def solved(shape, strengths, lower=-np.inf, upper=np.inf, solver=None):
     result = wl.solve(wl.LCP(A, b, lower, upper), solver)
     M, q = matrix(cells, faces), np.where(cells == wl.FLUID, b, 0.0).ravel()
     d = np.where(M.diagonal() > 0, M.diagonal(), 1.0)
-    points = result.x.numpy().ravel(), np.clip(np.zeros(q.size), lower, upper) * (cells.ravel() == wl.FLUID)
-    norms = [np.linalg.norm((d * (x - np.clip(x - (M @ x + q) / d, lower, upper)))[cells.ravel() == wl.FLUID]) for x in points]
+    points = (
+        result.x.numpy().ravel(),
+        np.clip(np.zeros(q.size), lower, upper) * (cells.ravel() == wl.FLUID),
+    )
+    norms = [
+        np.linalg.norm(
+            (d * (x - np.clip(x - (M @ x + q) / d, lower, upper)))[cells.ravel() == wl.FLUID]
+        )
+        for x in points
+    ]
     return result, norms[0] / norms[1]
 
 
@@ -140,7 +158,15 @@ def test_turning_in_space(strengths, lower):
     assert result.iterations <= 9
 
 
-@pytest.mark.parametrize("solver", [wl.MinimumMapNewton(), wl.MPRGP(), wl.ProjectedMultigrid(precision="double"), wl.InteriorPoint()])
+@pytest.mark.parametrize(
+    "solver",
+    [
+        wl.MinimumMapNewton(),
+        wl.MPRGP(),
+        wl.ProjectedMultigrid(precision="double"),
+        wl.InteriorPoint(),
+    ],
+)
 def test_other_methods_take_the_same_cycles(solver):
     result, residual = solved((96, 96), halves(1e-3), 0.0, solver=solver)
     assert result, result.status
@@ -150,7 +176,10 @@ def test_other_methods_take_the_same_cycles(solver):
 
 def lognormal(shape):
     rng = np.random.default_rng(71)
-    return {name: np.exp(3 * rng.standard_normal(face.shape)) for name, face in faces_of(shape, turn(1.0)).items()}
+    return {
+        name: np.exp(3 * rng.standard_normal(face.shape))
+        for name, face in faces_of(shape, turn(1.0)).items()
+    }
 
 
 def checkerboard(shape):
@@ -163,7 +192,10 @@ def checkerboard(shape):
 
 def slivers(shape):
     rng = np.random.default_rng(73)
-    return {name: np.where(rng.random(face.shape) < 0.05, 1e-30, 1.0) for name, face in faces_of(shape, turn(1.0)).items()}
+    return {
+        name: np.where(rng.random(face.shape) < 0.05, 1e-30, 1.0)
+        for name, face in faces_of(shape, turn(1.0)).items()
+    }
 
 
 def surface(shape):
@@ -179,7 +211,9 @@ def constant(shape):
 
 
 def layers(shape):
-    return faces_of(shape, lambda x, y: 2 * (np.where(np.floor(y * shape[0]) % 2 == 0, 1.0, 1e-3) + 0 * x,))
+    return faces_of(
+        shape, lambda x, y: 2 * (np.where(np.floor(y * shape[0]) % 2 == 0, 1.0, 1e-3) + 0 * x,)
+    )
 
 
 @pytest.mark.parametrize("faces", [lognormal, checkerboard, slivers, surface, constant, layers])
@@ -216,7 +250,9 @@ def operator(device, periodic=False, shape=(32, 32)):
     """Return two halves that are strong along other axes."""
     cells, faces = np.ones(shape, dtype=int), faces_of(shape, halves(1e-3))
     cells[0] = wl.AIR
-    return wl.GridPoisson(cells, **faces, device=device, dtype=wp.float64, periodic=(False, periodic, False))
+    return wl.GridPoisson(
+        cells, **faces, device=device, dtype=wp.float64, periodic=(False, periodic, False)
+    )
 
 
 def applied(hierarchy, r):
@@ -240,8 +276,12 @@ def test_cycle_is_symmetric_and_positive(device, periodic):
 def test_levels_in_one_launch_leave_the_finest_one_out(device):
     """Such a launch starts from x = 0, and would forget what the other hierarchies did."""
     A = operator(device)
-    r = np.random.default_rng(89).standard_normal(A.layout.size) * (A.cells.numpy().ravel() == wl.FLUID)
-    one, apart = (applied(made(A, CycleSettings(one_launch_cpu=n, one_launch_cuda=n)), r) for n in (4096, 0))
+    r = np.random.default_rng(89).standard_normal(A.layout.size) * (
+        A.cells.numpy().ravel() == wl.FLUID
+    )
+    one, apart = (
+        applied(made(A, CycleSettings(one_launch_cpu=n, one_launch_cuda=n)), r) for n in (4096, 0)
+    )
     np.testing.assert_allclose(one, apart, atol=1e-11 * np.abs(apart).max())
 
 
@@ -263,7 +303,8 @@ def test_new_cells_in_place(device):
     """A workspace that is used again after `update` gives what a new one gives."""
     b, more = load((32, 64)), np.ones((32, 64), dtype=np.int8)
     more[0] = wl.AIR
-    some = np.where(np.indices(more.shape)[1] < 44, more, wl.AIR).astype(np.int8)  # the rows' spans are shorter
+    # the rows' spans are shorter
+    some = np.where(np.indices(more.shape)[1] < 44, more, wl.AIR).astype(np.int8)
     A = operator(device, shape=more.shape)
     problem, method = wl.LCP(A, b), wl.ProjectedMultigrid()
     A.update(wp.array(some, device=device))
@@ -286,11 +327,15 @@ def test_legs_apart_give_the_same_iterates(monkeypatch):
 
 def test_bytes_of_the_finest_level_are_counted_once():
     hierarchy = made(operator("cpu"))
-    finest = Hierarchy.nbytes.fget(hierarchy) - sum(lv_bytes(level) for level in hierarchy.levels[1:])
+    finest = Hierarchy.nbytes.fget(hierarchy) - sum(
+        lv_bytes(level) for level in hierarchy.levels[1:]
+    )
     coarse = [level for part in (hierarchy, *hierarchy.companions) for level in part.levels[1:]]
     assert hierarchy.nbytes == finest + sum(lv_bytes(level) for level in coarse)
 
 
 def lv_bytes(level):
     """Return the bytes of a level's fields."""
-    return sum({v.ptr: v.capacity for v in (level.x, level.b, level.t, level.lower, level.upper)}.values())
+    return sum(
+        {v.ptr: v.capacity for v in (level.x, level.b, level.t, level.lower, level.upper)}.values()
+    )

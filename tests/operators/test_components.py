@@ -39,13 +39,23 @@ def test_same_components_as_scipy(seed, shape, kind, periodic, share):
     faces, shift = [1.0] * 3, None
     if kind == "arrays":
         for axis in range(len(shape)):
-            face = (rng.random([s + (q == len(shape) - 1 - axis) for q, s in enumerate(shape)]) < 0.6).astype(float)
+            face = (
+                rng.random([s + (q == len(shape) - 1 - axis) for q, s in enumerate(shape)]) < 0.6
+            ).astype(float)
             front = np.moveaxis(face, len(shape) - 1 - axis, 0)
             front[-1] = front[0]
             faces[axis] = face
     if kind == "shift":
         shift = (rng.random(shape) < 0.05).astype(float)
-    A = wl.GridPoisson(cells, face_x=faces[0], face_y=faces[1], face_z=faces[2], shift=shift, periodic=periodic, device="cpu")
+    A = wl.GridPoisson(
+        cells,
+        face_x=faces[0],
+        face_y=faces[1],
+        face_z=faces[2],
+        shift=shift,
+        periodic=periodic,
+        device="cpu",
+    )
     found = A.floating_components()
     got = set()
     if found is not None:

@@ -41,7 +41,16 @@ def test_apply_and_diagonal_equal_the_dense_matrix(shape, kind, periodic, dtype,
     rng = np.random.default_rng(5)
     cells = rng.integers(0, 3, shape)
     faces, shift = faces_of(kind, shape, periodic, rng)
-    A = wl.GridPoisson(cells, face_x=faces[0], face_y=faces[1], face_z=faces[2], shift=shift, periodic=periodic, device=device, dtype=dtype)
+    A = wl.GridPoisson(
+        cells,
+        face_x=faces[0],
+        face_y=faces[1],
+        face_z=faces[2],
+        shift=shift,
+        periodic=periodic,
+        device=device,
+        dtype=dtype,
+    )
     dense = assemble(cells, faces, shift, periodic)
     x = rng.standard_normal(shape)
     y = A.apply(wp.array(x, dtype=wp.float64, device=device)).numpy()
@@ -97,7 +106,9 @@ def test_rows_span_their_fluid_cells(n, device, monkeypatch):
     A = wl.GridPoisson(np.zeros(shape, dtype=np.int8), device=device)
     ever = np.zeros(shape[:2], dtype=bool)
     for share in (0.0, 2.0 / n, 0.02, 1.0):
-        cells = np.where(rng.random(shape) < share, wl.FLUID, rng.choice([wl.AIR, wl.SOLID], shape)).astype(np.int8)
+        cells = np.where(
+            rng.random(shape) < share, wl.FLUID, rng.choice([wl.AIR, wl.SOLID], shape)
+        ).astype(np.int8)
         cells[rng.random(shape[:2]) < 0.5] = wl.AIR
         A.update(wp.array(np.pad(cells, 1, constant_values=wl.SOLID), device=device))
         spans, row = np.zeros((*shape[:2], 2), dtype=int), n + 2
@@ -112,7 +123,9 @@ def test_rows_span_their_fluid_cells(n, device, monkeypatch):
             for k, j in np.argwhere(ever):
                 used[((k + 1) * (shape[1] + 2) + j + 1) * row :][:row] = True
             parts = [used[at : at + CPU_CHUNK] for at in range(0, used.size, CPU_CHUNK)]
-            np.testing.assert_array_equal(A.layout.chunks.numpy()[:, 0], [(0, part.size * part.any()) for part in parts])
+            np.testing.assert_array_equal(
+                A.layout.chunks.numpy()[:, 0], [(0, part.size * part.any()) for part in parts]
+            )
 
 
 @pytest.mark.parametrize(
@@ -126,7 +139,10 @@ def test_rows_span_their_fluid_cells(n, device, monkeypatch):
         ({"face_x": np.full((3, 4), np.nan)}, "face_x holds a value that is not finite"),
         ({"shift": -np.ones((3, 3))}, "shift holds a negative value"),
         ({"dtype": int}, "dtype"),
-        ({"face_x": np.arange(12.0).reshape(3, 4), "periodic": (True, False)}, "first and the last faces"),
+        (
+            {"face_x": np.arange(12.0).reshape(3, 4), "periodic": (True, False)},
+            "first and the last faces",
+        ),
     ],
 )
 def test_bad_input_is_named(arguments, message):
@@ -136,5 +152,7 @@ def test_bad_input_is_named(arguments, message):
 
 @pytest.mark.parametrize("device", ["cuda:77", "gpu"])
 def test_a_device_that_is_not_there(device):
-    with pytest.raises(ValueError, match=f"device = '{device}': there is no such device, expected one of cpu"):
+    with pytest.raises(
+        ValueError, match=f"device = '{device}': there is no such device, expected one of cpu"
+    ):
         wl.GridPoisson(np.ones((2, 2), int), device=device)

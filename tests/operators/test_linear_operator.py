@@ -32,7 +32,9 @@ def given(A, kind):
     return {
         "bare": lambda: linear,
         "with rmatvec": lambda: aslinearoperator(A),
-        "function": lambda: wl.LinearOperator(lambda x: A @ x, (N,), symmetric=bool((A == A.T).all()), diagonal=np.diag(A)),
+        "function": lambda: wl.LinearOperator(
+            lambda x: A @ x, (N,), symmetric=bool((A == A.T).all()), diagonal=np.diag(A)
+        ),
         "said": lambda: wl.LinearOperator(linear, symmetric=bool((A == A.T).all())),
         "product": lambda: wl.LinearOperator(scipy.sparse.csr_array(A)),
         "own": lambda: Own(A),
@@ -41,7 +43,12 @@ def given(A, kind):
 
 class Own(wl.Operator):
     def __init__(self, A):
-        self._A, self.shape, self.device, self.symmetric = A, (len(A),), wp.get_device("cpu"), bool((A == A.T).all())
+        self._A, self.shape, self.device, self.symmetric = (
+            A,
+            (len(A),),
+            wp.get_device("cpu"),
+            bool((A == A.T).all()),
+        )
 
     def apply(self, x, out=None):
         out = wp.zeros_like(x) if out is None else out
@@ -50,7 +57,9 @@ class Own(wl.Operator):
 
 
 METHODS = [
-    name for name, cls in wl.METHODS.items() if families(cls) and not getattr(cls, "supports", ()) and getattr(cls, "most_unknowns", N) >= N
+    name
+    for name, cls in wl.METHODS.items()
+    if families(cls) and not getattr(cls, "supports", ()) and getattr(cls, "most_unknowns", N) >= N
 ]
 
 
@@ -66,11 +75,14 @@ def test_methods_that_need_products_only_take_it(name, kind, symmetric):
     slow = {"max_iterations": 500} if name == "gradient-descent" else {}
     try:
         result = wl.solve(problem, wl.METHODS[name](), stopping=replace(STOPPING, **slow))
-    except ValueError as refusal:  # symmetry is needed and not known, or products with the transpose, which are not to be had
+    except ValueError as refusal:
+        # symmetry is needed and not known, or products with the transpose, which are not to be had
         assert "symmetric" in str(refusal) or "transpose" in str(refusal)
         assert not problem.A.symmetric
         return
-    assert result or name == "gradient-descent" or (name == "projected-jacobi" and not symmetric), result.status
+    assert result or name == "gradient-descent" or (name == "projected-jacobi" and not symmetric), (
+        result.status
+    )
     if result:
         np.testing.assert_allclose(result.x.numpy(), lemke(A, b), atol=1e-4)
 
@@ -79,7 +91,12 @@ def test_methods_that_need_products_only_take_it(name, kind, symmetric):
 @pytest.mark.parametrize("seed", [5, 6, 7, 9])
 def test_boxes_by_the_default_method(seed, symmetric):
     rng = np.random.default_rng(seed)
-    A, b, lower, upper = matrix(symmetric, seed), rng.standard_normal(N), np.full(N, -np.inf), rng.uniform(0.0, 0.1, N)
+    A, b, lower, upper = (
+        matrix(symmetric, seed),
+        rng.standard_normal(N),
+        np.full(N, -np.inf),
+        rng.uniform(0.0, 0.1, N),
+    )
     lower[::2] = -upper[::2]
     result = wl.solve(wl.LCP(given(A, "bare"), b, lower, upper), stopping=STOPPING)
     assert result
@@ -92,7 +109,11 @@ def test_symmetry_is_known_of_operators_that_are_their_own_adjoint():
     assert not wl.LinearOperator(aslinearoperator(np.eye(3))).symmetric
     A = wl.LinearOperator(laplacian, (4, 5), symmetric=True)
     x = np.random.default_rng(3).standard_normal((4, 5))
-    np.testing.assert_allclose(A.apply(wp.array(x, device="cpu")).numpy().ravel(), laplacian.toarray() @ x.ravel(), atol=1e-12)
+    np.testing.assert_allclose(
+        A.apply(wp.array(x, device="cpu")).numpy().ravel(),
+        laplacian.toarray() @ x.ravel(),
+        atol=1e-12,
+    )
 
 
 def test_sizes_stand_for_a_diagonal_that_is_not_given():
@@ -140,20 +161,56 @@ def shaped(image, **options):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: wl.LCP(aslinearoperator(np.ones((3, 4))), np.ones(3)), r"A has shape \(3, 4\): expected \(n, n\)"),
-        (lambda: wl.LCP(aslinearoperator(1j * np.eye(3)), np.ones(3)), "A has type complex128: expected real numbers"),
-        (lambda: wl.LCP(shaped(np.ones(4)), np.ones(3)), r"A fails to multiply an array of shape \(3,\): cannot reshape"),
-        (lambda: wl.LCP(shaped(np.full(3, np.nan)), np.ones(3)), "the product of A with normally distributed numbers is not finite"),
-        (lambda: wl.LCP(shaped(np.ones(3) + 1j), np.ones(3)), "A gives a product of type complex128"),
+        (
+            lambda: wl.LCP(aslinearoperator(np.ones((3, 4))), np.ones(3)),
+            r"A has shape \(3, 4\): expected \(n, n\)",
+        ),
+        (
+            lambda: wl.LCP(aslinearoperator(1j * np.eye(3)), np.ones(3)),
+            "A has type complex128: expected real numbers",
+        ),
+        (
+            lambda: wl.LCP(shaped(np.ones(4)), np.ones(3)),
+            r"A fails to multiply an array of shape \(3,\): cannot reshape",
+        ),
+        (
+            lambda: wl.LCP(shaped(np.full(3, np.nan)), np.ones(3)),
+            "the product of A with normally distributed numbers is not finite",
+        ),
+        (
+            lambda: wl.LCP(shaped(np.ones(3) + 1j), np.ones(3)),
+            "A gives a product of type complex128",
+        ),
         (lambda: wl.LinearOperator(lambda x: x), "shape: must be given if A is a function"),
-        (lambda: wl.LinearOperator(lambda x: x[:2], (3,)), r"A gives a product of shape \(2,\): expected \(3,\)"),
+        (
+            lambda: wl.LinearOperator(lambda x: x[:2], (3,)),
+            r"A gives a product of shape \(2,\): expected \(3,\)",
+        ),
         (lambda: wl.LinearOperator(lambda x: x, (0,)), r"shape = \(0,\): expected integers >= 1"),
-        (lambda: wl.LinearOperator(lambda x: x, "ab"), "shape = 'ab': expected a tuple of integers"),
-        (lambda: wl.LinearOperator(aslinearoperator(np.eye(6)), (2, 4)), r"shape = \(2, 4\): expected .* whose product is 6"),
-        (lambda: wl.LinearOperator(lambda x: np.triu(np.ones((3, 3))) @ x, (3,), symmetric=True), "symmetric: A is not"),
-        (lambda: wl.LinearOperator(lambda x: x, (3,), diagonal=np.ones(4)), r"diagonal has shape \(4,\): expected a number or \(3,\)"),
-        (lambda: wl.LinearOperator(lambda x: x, (3,), diagonal=np.nan), "diagonal holds a value that is not finite"),
-        (lambda: wl.LinearOperator(lambda x: x, (3,), transpose=3), "transpose is a int: expected a function"),
+        (
+            lambda: wl.LinearOperator(lambda x: x, "ab"),
+            "shape = 'ab': expected a tuple of integers",
+        ),
+        (
+            lambda: wl.LinearOperator(aslinearoperator(np.eye(6)), (2, 4)),
+            r"shape = \(2, 4\): expected .* whose product is 6",
+        ),
+        (
+            lambda: wl.LinearOperator(lambda x: np.triu(np.ones((3, 3))) @ x, (3,), symmetric=True),
+            "symmetric: A is not",
+        ),
+        (
+            lambda: wl.LinearOperator(lambda x: x, (3,), diagonal=np.ones(4)),
+            r"diagonal has shape \(4,\): expected a number or \(3,\)",
+        ),
+        (
+            lambda: wl.LinearOperator(lambda x: x, (3,), diagonal=np.nan),
+            "diagonal holds a value that is not finite",
+        ),
+        (
+            lambda: wl.LinearOperator(lambda x: x, (3,), transpose=3),
+            "transpose is a int: expected a function",
+        ),
         (lambda: wl.LinearOperator(3), "A is a int: expected a function"),
         (lambda: wl.LCP(lambda x: x, np.ones(3)), "A is a function: pass wl.LinearOperator"),
     ],
@@ -178,7 +235,10 @@ def test_what_stops_being_finite_is_said():
         calls.append(0)
         return 2 * x if len(calls) < 25 else np.full_like(x, np.nan)
 
-    result = wl.solve(wl.LCP(wl.LinearOperator(product, (3,), symmetric=True), -np.ones(3)), wl.AcceleratedProjectedGradient())
+    result = wl.solve(
+        wl.LCP(wl.LinearOperator(product, (3,), symmetric=True), -np.ones(3)),
+        wl.AcceleratedProjectedGradient(),
+    )
     assert not result
     assert result.status is wl.SolveStatus.NON_FINITE
 

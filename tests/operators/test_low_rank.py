@@ -7,7 +7,8 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.operators.low_rank import BlockColumns
 
-ROWS, BLOCKS = np.array([2, 2, 5, 9, 9, 11]), np.array([0, 1, 1, 0, 1, 0])  # two rows belong to both blocks
+# two rows belong to both blocks
+ROWS, BLOCKS = np.array([2, 2, 5, 9, 9, 11]), np.array([0, 1, 1, 0, 1, 0])
 
 
 def columns_on(device, seed):
@@ -32,7 +33,10 @@ def test_rows_that_two_blocks_share_are_added_up(device):
     mask = np.arange(12) != 9
     out.assign(base)
     columns.scatter(
-        wp.array(f, dtype=wp.float64, device=device), out, out, mask=wp.array(mask.astype(np.uint8), dtype=wp.uint8, device=device)
+        wp.array(f, dtype=wp.float64, device=device),
+        out,
+        out,
+        mask=wp.array(mask.astype(np.uint8), dtype=wp.uint8, device=device),
     )
     np.testing.assert_allclose(out.numpy(), base + np.where(mask, U @ f, 0.0), atol=1e-14)
 
@@ -52,7 +56,9 @@ def test_an_operator_takes_what_its_columns_have_become(device):
     columns.assign(rows, blocks, 2.0 * values)
     low.update(3.0 * W)
     assert A.version > version
-    np.testing.assert_allclose(A.apply(x).numpy(), x.numpy() + 12.0 * U @ W @ U.T @ x.numpy(), atol=1e-12)
+    np.testing.assert_allclose(
+        A.apply(x).numpy(), x.numpy() + 12.0 * U @ W @ U.T @ x.numpy(), atol=1e-12
+    )
     with pytest.raises(ValueError, match="weights has shape"):
         low.update(np.eye(5))
     with pytest.raises(ValueError, match="columns are for fields"):
@@ -80,5 +86,7 @@ def test_a_column_that_feels_the_constants_grounds_a_closed_component(column, fl
     cells = np.ones((4, 4), dtype=int)
     U = np.zeros((4, 4, 1))
     U[1, 1], U[1, 2] = column[0], column[1]
-    A = wl.SumOperator(wl.GridPoisson(cells, device=device), wl.LowRankOperator(U, [2.0], device=device))
+    A = wl.SumOperator(
+        wl.GridPoisson(cells, device=device), wl.LowRankOperator(U, [2.0], device=device)
+    )
     assert (A.floating_components() is not None) == floats

@@ -15,7 +15,10 @@ def shuffled(n=N, *, block=1, wind=0.0, seed=30211):
     second = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(n, n))
     convection = scipy.sparse.diags_array([-wind, wind], offsets=[-1, 0], shape=(n, n))
     one = scipy.sparse.eye_array(n)
-    A = scipy.sparse.kron(scipy.sparse.kron(one, second + convection) + scipy.sparse.kron(second, one), np.eye(block) + 0.1).tocsr()
+    A = scipy.sparse.kron(
+        scipy.sparse.kron(one, second + convection) + scipy.sparse.kron(second, one),
+        np.eye(block) + 0.1,
+    ).tocsr()
     rng = np.random.default_rng(seed)
     order = (block * rng.permutation(n * n)[:, None] + np.arange(block)).ravel()
     x = np.linspace(-1, 1, n)
@@ -46,13 +49,21 @@ def test_results_come_back_in_the_numbering_of_the_problem(wind):
     assert result
     assert seen == result.history
     x, d = result.x.numpy(), A.diagonal()
-    scale = np.linalg.norm(d * (np.maximum(lower, 0) - np.maximum(np.maximum(lower, 0) - (A @ np.maximum(lower, 0) + b) / d, lower)))
+    scale = np.linalg.norm(
+        d
+        * (
+            np.maximum(lower, 0)
+            - np.maximum(np.maximum(lower, 0) - (A @ np.maximum(lower, 0) + b) / d, lower)
+        )
+    )
     assert np.linalg.norm(d * (x - np.maximum(x - (A @ x + b) / d, lower))) <= 1.01e-6 * scale
     again = wl.solve(wl.LCP(wl.SparseOperator(A, device="cpu"), b, lower), x0=result.x)
     assert again.iterations == 0
     np.testing.assert_array_equal(again.x.numpy(), x)
     back = np.argsort(order)
-    plain = wl.solve(wl.LCP(wl.SparseOperator(A[back][:, back], device="cpu"), b[back], lower[back]))
+    plain = wl.solve(
+        wl.LCP(wl.SparseOperator(A[back][:, back], device="cpu"), b[back], lower[back])
+    )
     np.testing.assert_allclose(x[back], plain.x.numpy(), atol=1e-4)
 
 
@@ -70,7 +81,10 @@ def test_wrong_guesses_and_limits_are_told_as_elsewhere():
     problem = wl.LCP(wl.SparseOperator(A, device="cpu"), b, lower)
     with pytest.raises(ValueError, match="x0"):
         wl.solve(problem, x0=np.zeros(3))
-    assert wl.solve(problem, stopping=wl.StoppingCriteria(max_seconds=1e-6)).status is wl.SolveStatus.TIME_LIMIT
+    assert (
+        wl.solve(problem, stopping=wl.StoppingCriteria(max_seconds=1e-6)).status
+        is wl.SolveStatus.TIME_LIMIT
+    )
 
 
 def test_good_orders_small_matrices_and_graphs_without_an_order_are_left_alone():
@@ -80,5 +94,7 @@ def test_good_orders_small_matrices_and_graphs_without_an_order_are_left_alone()
     assert renumbering(scipy.sparse.csr_array(A[back][:, back])) is None
     assert renumbering(scipy.sparse.csr_array(shuffled(40)[0])) is None
     n = N * N
-    edges = scipy.sparse.coo_array((np.ones(4 * n), (rng.integers(0, n, 4 * n), rng.integers(0, n, 4 * n))), shape=(n, n)).tocsr()
+    edges = scipy.sparse.coo_array(
+        (np.ones(4 * n), (rng.integers(0, n, 4 * n), rng.integers(0, n, 4 * n))), shape=(n, n)
+    ).tocsr()
     assert renumbering((edges + edges.T).tocsr()) is None

@@ -47,11 +47,15 @@ def test_solutions_and_starts_are_those_of_the_given_problem(name, seed, monkeyp
     restated = form(given)
     assert restated is not None
     stopping = wl.StoppingCriteria(rtol=1e-9, max_iterations=200)
-    found = restated.result(wl.solve(restated.problem, wl.MinimumMapNewton(precision="double"), stopping=stopping))
+    found = restated.result(
+        wl.solve(restated.problem, wl.MinimumMapNewton(precision="double"), stopping=stopping)
+    )
     x = found.x.numpy()
     assert found.problem is given
     assert x.shape == (n,)
     first = natural_residual(dense, b, low, high, np.clip(np.zeros(n), low, high))
     assert natural_residual(dense, b, low, high, x) <= 1.01e-9 * first
-    again = wl.solve(restated.problem, "psor", x0=restated.start(x), stopping=wl.StoppingCriteria(rtol=1e-8))
+    again = wl.solve(
+        restated.problem, "psor", x0=restated.start(x), stopping=wl.StoppingCriteria(rtol=1e-8)
+    )
     assert again.iterations == 0

@@ -29,7 +29,9 @@ def poisson(*counts):
     A = scipy.sparse.csr_array((1, 1))
     for n in counts:
         T = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(n, n))
-        A = scipy.sparse.kron(A, scipy.sparse.eye_array(n)) + scipy.sparse.kron(scipy.sparse.eye_array(A.shape[0]), T)
+        A = scipy.sparse.kron(A, scipy.sparse.eye_array(n)) + scipy.sparse.kron(
+            scipy.sparse.eye_array(A.shape[0]), T
+        )
     return scipy.sparse.csr_array(A)
 
 
@@ -59,8 +61,11 @@ def test_symmetry_is_judged_by_size():
     assert not wl.SparseOperator(skew, device="cpu").symmetric
     skew[3, 4] = base[3, 4] * (1 + 2e-16)
     assert wl.SparseOperator(skew, device="cpu").symmetric
-    scaled = scipy.sparse.block_diag([1e12 * base, scipy.sparse.csr_array([[1.0, 0.5], [0.4, 1.0]])])
-    assert not wl.SparseOperator(scaled, device="cpu").symmetric  # a small block counts, whatever the large one's size
+    scaled = scipy.sparse.block_diag(
+        [1e12 * base, scipy.sparse.csr_array([[1.0, 0.5], [0.4, 1.0]])]
+    )
+    # a small block counts, whatever the large one's size
+    assert not wl.SparseOperator(scaled, device="cpu").symmetric
 
 
 def test_masked_is_the_principal_system(device):
@@ -69,10 +74,15 @@ def test_masked_is_the_principal_system(device):
     free, shift = rng.random(40) < 0.6, rng.random(40)
     A = wl.SparseOperator(matrix, device=device).masked(free.astype(np.uint8), shift)
     P = np.diag(free.astype(float))
-    np.testing.assert_allclose(A.matrix().toarray(), P @ matrix.toarray() @ P + P @ np.diag(shift), atol=1e-14)
+    np.testing.assert_allclose(
+        A.matrix().toarray(), P @ matrix.toarray() @ P + P @ np.diag(shift), atol=1e-14
+    )
 
 
-@pytest.mark.parametrize("matrix", [random_matrix(90, 13), poisson(9, 8), poisson(4, 5, 6), scipy.sparse.csr_array((5, 5))])
+@pytest.mark.parametrize(
+    "matrix",
+    [random_matrix(90, 13), poisson(9, 8), poisson(4, 5, 6), scipy.sparse.csr_array((5, 5))],
+)
 def test_no_two_rows_of_a_color_see_each_other(matrix, device):
     A = wl.SparseOperator(matrix, device=device)
     color = A.coloring()
@@ -87,13 +97,17 @@ def test_no_two_rows_of_a_color_see_each_other(matrix, device):
 
 def test_stencils_are_red_and_black():
     color = wl.SparseOperator(poisson(4, 5, 6), device="cpu").coloring()
-    assert np.array_equal(color, np.add.outer(np.add.outer(np.arange(4), np.arange(5)), np.arange(6)).ravel() % 2)
+    assert np.array_equal(
+        color, np.add.outer(np.add.outer(np.arange(4), np.arange(5)), np.arange(6)).ravel() % 2
+    )
 
 
 @pytest.mark.parametrize("forward", [True, False])
 @pytest.mark.parametrize("colored", [True, False])
 def test_a_sweep_is_the_textbooks(colored, forward, device):
-    matrix = (random_matrix(60, 17) + scipy.sparse.diags_array(np.r_[0.0, np.full(59, 3.0)])).tocsr()
+    matrix = (
+        random_matrix(60, 17) + scipy.sparse.diags_array(np.r_[0.0, np.full(59, 3.0)])
+    ).tocsr()
     A = wl.SparseOperator(matrix, device=device)
     rng = np.random.default_rng(19)
     x, b, lower = rng.random(60), rng.standard_normal(60), -0.2 * rng.random(60)
@@ -102,7 +116,9 @@ def test_a_sweep_is_the_textbooks(colored, forward, device):
     expected = x.copy()
     for i in order if forward else order[::-1]:
         if dense[i, i] != 0:
-            expected[i] = np.clip(expected[i] - 1.3 * (dense[i] @ expected + b[i]) / dense[i, i], lower[i], upper[i])
+            expected[i] = np.clip(
+                expected[i] - 1.3 * (dense[i] @ expected + b[i]) / dense[i, i], lower[i], upper[i]
+            )
     fields = [wp.array(v, dtype=wp.float64, device=device) for v in (x, b, lower, upper)]
     A.relax(*fields, 1.3, forward=forward, colored=colored)
     np.testing.assert_allclose(fields[0].numpy(), expected, atol=1e-13)
@@ -147,10 +163,14 @@ def test_bad_matrices_are_refused(matrix, message):
     with pytest.raises(ValueError, match=message):
         wl.SparseOperator(matrix, device="cpu")
     with pytest.raises(ValueError, match="x has shape"):
-        wl.SparseOperator(poisson(3), device="cpu").apply(wp.zeros(4, dtype=wp.float64, device="cpu"))
+        wl.SparseOperator(poisson(3), device="cpu").apply(
+            wp.zeros(4, dtype=wp.float64, device="cpu")
+        )
 
 
-@pytest.mark.parametrize("kind", [scipy.sparse.csr_array, scipy.sparse.coo_matrix, scipy.sparse.csc_array, np.asarray])
+@pytest.mark.parametrize(
+    "kind", [scipy.sparse.csr_array, scipy.sparse.coo_matrix, scipy.sparse.csc_array, np.asarray]
+)
 def test_problems_take_scipy_and_numpy_matrices(kind):
     rng = np.random.default_rng(37)
     dense = poisson(4, 5).toarray()
@@ -167,7 +187,10 @@ def test_what_is_no_matrix_is_named():
         wl.LCP([[1.0]], np.ones(1))
 
 
-@pytest.mark.parametrize("solver", [wl.MinimumMapNewton(), wl.MinimumMapNewton(precision="double"), wl.ProjectedSOR(omega=1.0)])
+@pytest.mark.parametrize(
+    "solver",
+    [wl.MinimumMapNewton(), wl.MinimumMapNewton(precision="double"), wl.ProjectedSOR(omega=1.0)],
+)
 @pytest.mark.parametrize("symmetric", [True, False])
 def test_boxed_problems_against_enumeration(solver, symmetric, device):
     for seed in range(20):
@@ -177,7 +200,11 @@ def test_boxed_problems_against_enumeration(solver, symmetric, device):
         dense = B @ B.T + 0.5 * np.eye(n)
         if not symmetric:
             dense += 0.3 * (B - B.T)
-        b, lower, upper = rng.standard_normal(n), -rng.random(n), np.where(rng.random(n) < 0.5, np.inf, rng.random(n))
+        b, lower, upper = (
+            rng.standard_normal(n),
+            -rng.random(n),
+            np.where(rng.random(n) < 0.5, np.inf, rng.random(n)),
+        )
         A = wl.SparseOperator(scipy.sparse.csr_array(dense), device=device)
         result = wl.solve(wl.LCP(A, b, lower, upper), solver, stopping=TIGHT)
         assert result, (seed, result.status)
@@ -188,26 +215,42 @@ def test_boxed_problems_against_enumeration(solver, symmetric, device):
 @pytest.mark.parametrize("counts", [(33, 33), (11, 12, 13)])
 def test_a_planted_obstacle_problem(counts, convection, device):
     n = int(np.prod(counts))
-    drift = scipy.sparse.diags_array([-convection, convection], offsets=[-1, 1], shape=(counts[-1],) * 2)
+    drift = scipy.sparse.diags_array(
+        [-convection, convection], offsets=[-1, 1], shape=(counts[-1],) * 2
+    )
     matrix = poisson(*counts) + scipy.sparse.kron(scipy.sparse.eye_array(n // counts[-1]), drift)
     axes = np.meshgrid(*(np.linspace(-1, 1, m) for m in counts), indexing="ij")
     wave = (np.cos(3 * axes[0]) * np.sin(4 * axes[1] + 0.5)).ravel()
     x, y = np.maximum(wave, 0), 1e-2 * np.maximum(-wave, 0)
     A = wl.SparseOperator(matrix, device=device)
-    result = wl.solve(wl.LCP(A, y - matrix @ x), wl.MinimumMapNewton(), stopping=wl.StoppingCriteria(rtol=1e-9))
+    result = wl.solve(
+        wl.LCP(A, y - matrix @ x), wl.MinimumMapNewton(), stopping=wl.StoppingCriteria(rtol=1e-9)
+    )
     assert result, result.status
     np.testing.assert_allclose(result.x.numpy(), x, atol=1e-7)
     assert result.iterations <= 16
 
 
-@pytest.mark.parametrize("B", [np.ones((5, 1)), np.ones((4, 13)), np.zeros((4, 2)), np.full((4, 1), np.nan), np.ones((4, 1, 1))])
+@pytest.mark.parametrize(
+    "B",
+    [
+        np.ones((5, 1)),
+        np.ones((4, 13)),
+        np.zeros((4, 2)),
+        np.full((4, 1), np.nan),
+        np.ones((4, 1, 1)),
+    ],
+)
 def test_a_near_null_space_must_be_fields(B):
     with pytest.raises(ValueError, match="near_null_space"):
         wl.SparseOperator(scipy.sparse.eye_array(4), device="cpu", near_null_space=B)
 
 
 def test_blocks_are_found_and_a_pickle_keeps_the_near_null_space():
-    blocks = scipy.sparse.kron(scipy.sparse.diags_array([-1.0, 2.5, -1.0], offsets=[-1, 0, 1], shape=(8, 8)), np.eye(3) + 0.2)
+    blocks = scipy.sparse.kron(
+        scipy.sparse.diags_array([-1.0, 2.5, -1.0], offsets=[-1, 0, 1], shape=(8, 8)),
+        np.eye(3) + 0.2,
+    )
     A = wl.SparseOperator(blocks, device="cpu", near_null_space=np.ones(24))
     assert (A.block, A.near_null_space.shape) == (3, (24, 1))
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(A)).near_null_space, A.near_null_space)
@@ -218,7 +261,10 @@ def test_blocks_are_found_and_a_pickle_keeps_the_near_null_space():
 @pytest.mark.parametrize("index", [2_000_000, -1, 50])
 def test_indices_out_of_range_are_refused(form, index):
     """They once ended the process."""
-    A = (scipy.sparse.random_array((50, 50), density=0.2, rng=np.random.default_rng(1)) + 20 * scipy.sparse.eye_array(50)).asformat(form)
+    A = (
+        scipy.sparse.random_array((50, 50), density=0.2, rng=np.random.default_rng(1))
+        + 20 * scipy.sparse.eye_array(50)
+    ).asformat(form)
     indices = A.col if form == "coo" else A.indices
     indices[5] = index
     with pytest.raises(ValueError, match="matrix is not a valid sparse matrix"):

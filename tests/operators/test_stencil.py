@@ -17,12 +17,16 @@ NINE = np.array([[-1.0, -4.0, -1.0], [-4.0, 20.0, -4.0], [-1.0, -4.0, -1.0]]) / 
 
 def changed(A, cells):
     """Let the operator take other cells."""
-    A.update(wp.array(np.pad(cells.reshape(A.layout.padding.counts), 1).astype(np.int8), device=A.device))
+    A.update(
+        wp.array(np.pad(cells.reshape(A.layout.padding.counts), 1).astype(np.int8), device=A.device)
+    )
 
 
 def same(found, expected, kind):
     """Compare with what functions of float32, or arrays of float64, allow."""
-    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=2e-5 if kind == "functions" else 1e-11)
+    np.testing.assert_allclose(
+        found, expected, rtol=1e-9, atol=2e-5 if kind == "functions" else 1e-11
+    )
 
 
 def check_definition(seed, kind, device):
@@ -39,7 +43,11 @@ def check_definition(seed, kind, device):
     same(grid_matrix(pickle.loads(pickle.dumps(A))).toarray(), expected, kind)
     assert A.symmetric <= np.allclose(expected, expected.T, atol=1e-14)
     assert A.symmetric or kind not in ("mirrored", "half mirrored")
-    around = [v(*np.argwhere(inside).T) if callable(v) else np.broadcast_to(v, x.shape)[inside] for o, v in stencil.plain.items() if any(o)]
+    around = [
+        v(*np.argwhere(inside).T) if callable(v) else np.broadcast_to(v, x.shape)[inside]
+        for o, v in stencil.plain.items()
+        if any(o)
+    ]
     assert A.monotone == all((np.ravel(v) <= 0).all() for v in around)
     padded = rng.standard_normal([n + 2 for n in x.shape])
     same(A.boundary_term(padded).numpy(), border_sums(stencil, padded), kind)
@@ -72,14 +80,25 @@ def test_more_products_and_matrices_are_those_of_the_definition(seed, kind, devi
 def test_solutions_are_those_of_the_matrix(seed, kind, device):
     stencil = drawn([seed, 9], kind)
     b = np.random.default_rng(seed).standard_normal(stencil.cells.shape)
-    result = wl.solve(wl.LCP(stencil.operator(device), b, -np.inf, np.inf), stopping=wl.StoppingCriteria(rtol=1e-10))
+    result = wl.solve(
+        wl.LCP(stencil.operator(device), b, -np.inf, np.inf),
+        stopping=wl.StoppingCriteria(rtol=1e-10),
+    )
     assert result
-    same(result.x.numpy()[stencil.inside], np.linalg.solve(stencil.matrix(), -b[stencil.inside]), kind)
+    same(
+        result.x.numpy()[stencil.inside],
+        np.linalg.solve(stencil.matrix(), -b[stencil.inside]),
+        kind,
+    )
 
 
 def test_sides_towards_solid_and_air_have_the_coefficients_given(device):
     """Between the two cells the coefficients are one, so that A is symmetric; at the sides they are not."""
-    given = {(0, 0): np.full((1, 2), 20.0), (0, 1): np.array([[-1.0, -5.0]]), (0, -1): np.array([[-3.0, -1.0]])}
+    given = {
+        (0, 0): np.full((1, 2), 20.0),
+        (0, 1): np.array([[-1.0, -5.0]]),
+        (0, -1): np.array([[-3.0, -1.0]]),
+    }
     options = {"device": device, "dtype": wp.float64}
     closed = wl.Stencil(np.ones((1, 2), dtype=int), given, **options)
     assert closed.symmetric
@@ -92,7 +111,14 @@ def test_sides_towards_solid_and_air_have_the_coefficients_given(device):
 
 def test_a_periodic_axis_of_one_cell_is_beside_itself(device):
     given = {(0, 0): 9.0, (1, 0): -1.0, (1, 1): -2.0, (0, 1): -3.0}
-    A = wl.Stencil(np.ones((1, 3), dtype=int), given, periodic=(False, True), outside=wl.AIR, device=device, dtype=wp.float64)
+    A = wl.Stencil(
+        np.ones((1, 3), dtype=int),
+        given,
+        periodic=(False, True),
+        outside=wl.AIR,
+        device=device,
+        dtype=wp.float64,
+    )
     np.testing.assert_array_equal(grid_matrix(A).toarray(), [[8, -5, 0], [0, 8, -5], [0, 0, 8]])
 
 
@@ -101,7 +127,13 @@ def test_other_cells_may_make_a_stencil_unsymmetric(device):
     right, left = np.full((1, 3), -1.0), np.full((1, 3), -1.0)
     right[0, 1] = -2.0
     cells = np.array([[wl.FLUID, wl.FLUID, wl.SOLID]])
-    A = wl.Stencil(cells, {(0, 0): 6.0, (0, 1): right, (0, -1): left}, outside=wl.AIR, device=device, dtype=wp.float64)
+    A = wl.Stencil(
+        cells,
+        {(0, 0): 6.0, (0, 1): right, (0, -1): left},
+        outside=wl.AIR,
+        device=device,
+        dtype=wp.float64,
+    )
     assert A.symmetric
     np.testing.assert_array_equal(grid_matrix(A).toarray(), [[6, -1], [-1, 4]])
     changed(A, np.ones((1, 3), dtype=int))
@@ -118,7 +150,14 @@ def test_sides_across_a_periodic_end_count_for_symmetry(axis, periodic, device):
     lower[(0, slice(None)) if axis == 0 else (slice(None), 0)] = -2.0
     given = {(0, 0): 6.0, step: np.full(shape, -1.0), (-step[0], -step[1]): lower}
     wraps = (periodic and axis == 1, periodic and axis == 0)
-    A = wl.Stencil(np.ones(shape, dtype=int), given, periodic=wraps, outside=wl.AIR, device=device, dtype=wp.float64)
+    A = wl.Stencil(
+        np.ones(shape, dtype=int),
+        given,
+        periodic=wraps,
+        outside=wl.AIR,
+        device=device,
+        dtype=wp.float64,
+    )
     matrix = grid_matrix(A).toarray()
     assert A.symmetric == (not periodic) == np.array_equal(matrix, matrix.T)
     assert np.count_nonzero(matrix == -2.0) == 2 * periodic
@@ -127,13 +166,21 @@ def test_sides_across_a_periodic_end_count_for_symmetry(axis, periodic, device):
 def test_the_five_point_stencil_is_grid_poisson(device):
     cells = np.random.default_rng(17).choice([wl.AIR, wl.FLUID, wl.FLUID, wl.SOLID], (9, 14))
     five = {(0, 0): 4.0, (0, 1): -1.0, (0, -1): -1.0, (1, 0): -1.0, (-1, 0): -1.0}
-    A, G = wl.Stencil(cells, five, shift=0.5, device=device), wl.GridPoisson(cells, shift=0.5, device=device)
+    A, G = (
+        wl.Stencil(cells, five, shift=0.5, device=device),
+        wl.GridPoisson(cells, shift=0.5, device=device),
+    )
     np.testing.assert_array_equal(grid_matrix(A).toarray(), grid_matrix(G).toarray())
     assert A.symmetric
 
 
 def test_an_array_of_numbers_has_the_center_in_the_middle(device):
-    A = wl.Stencil(np.ones((3, 4), dtype=int), np.array([[0, 0, 0], [-2, 9, -1], [0, -3, 0]]), outside=wl.AIR, device=device)
+    A = wl.Stencil(
+        np.ones((3, 4), dtype=int),
+        np.array([[0, 0, 0], [-2, 9, -1], [0, -3, 0]]),
+        outside=wl.AIR,
+        device=device,
+    )
     x = wp.array([[0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 0]], dtype=wp.float64, device=device)
     np.testing.assert_array_equal(A.apply(x).numpy(), [[0, -3, 0, 0], [-1, 9, -2, 0], [0, 0, 0, 0]])
 
@@ -143,11 +190,17 @@ def test_boundary_values_are_a_term_of_b(device):
     rng = np.random.default_rng(5)
     g, full = rng.standard_normal((7, 8)), np.ones((7, 8), dtype=int)
     large = wl.Stencil(full, NINE, outside=wl.AIR, device=device, dtype=wp.float64)
-    A = wl.Stencil(np.ones((5, 6), dtype=int), NINE, outside=wl.AIR, device=device, dtype=wp.float64)
+    A = wl.Stencil(
+        np.ones((5, 6), dtype=int), NINE, outside=wl.AIR, device=device, dtype=wp.float64
+    )
     inner = wp.array(np.ascontiguousarray(g[1:-1, 1:-1]), dtype=wp.float64, device=device)
     expected = large.apply(wp.array(g, dtype=wp.float64, device=device)).numpy()[1:-1, 1:-1]
-    np.testing.assert_allclose(A.apply(inner).numpy() + A.boundary_term(g).numpy(), expected, atol=1e-13)
-    with pytest.raises(ValueError, match=r"values has shape \(5, 7\): expected \(5, 6\) or \(7, 8\)"):
+    np.testing.assert_allclose(
+        A.apply(inner).numpy() + A.boundary_term(g).numpy(), expected, atol=1e-13
+    )
+    with pytest.raises(
+        ValueError, match=r"values has shape \(5, 7\): expected \(5, 6\) or \(7, 8\)"
+    ):
         A.boundary_term(np.zeros((5, 7)))
 
 
@@ -155,7 +208,12 @@ def test_closed_boxes_float_and_incompatible_ones_are_infeasible(device):
     A = wl.Stencil(np.ones((8, 9), dtype=int), NINE, device=device)
     found = A.floating_components()
     assert found is not None and found.count == 1
-    assert wl.Stencil(np.ones((8, 9), dtype=int), NINE, outside=wl.AIR, device=device).floating_components() is None
+    assert (
+        wl.Stencil(
+            np.ones((8, 9), dtype=int), NINE, outside=wl.AIR, device=device
+        ).floating_components()
+        is None
+    )
     b = np.random.default_rng(3).standard_normal((8, 9))
     assert wl.solve(wl.LCP(A, b - b.mean(), -np.inf))
     assert wl.solve(wl.LCP(A, b - b.mean() + 1, -np.inf)).status is wl.SolveStatus.INFEASIBLE
@@ -183,12 +241,32 @@ def test_pickles_and_copies_are_the_same(device):
         ({(0, 0): 1.0, (0, 2): 1.0}, {}, r"offset \(0, 2\): expected \(dy, dx\), each -1, 0 or 1"),
         ({(0, 0): 1.0, (0, 0, 1): 1.0}, {}, r"offset \(0, 0, 1\): expected \(dy, dx\)"),
         ({(0, 1): -1.0}, {}, r"the center, offset \(0, 0\), is missing"),
-        ({(0, 0): np.ones((2, 3))}, {}, r"coefficients\[\(0, 0\)\] has shape \(2, 3\): expected a number or \(4, 5\)"),
+        (
+            {(0, 0): np.ones((2, 3))},
+            {},
+            r"coefficients\[\(0, 0\)\] has shape \(2, 3\): expected a number or \(4, 5\)",
+        ),
         ({(0, 0): np.nan}, {}, "not finite"),
-        ({(0, 0): 1.0, (0, 1): -2.0}, {}, r"the diagonal of cell \(0, 4\) is -1, with its closed sides: must be > 0"),
-        (np.zeros((3, 4)), {}, r"coefficients has shape \(3, 4\): expected \(3, 3\), or a mapping by offset"),
-        ({(0, 0): rising, (0, 1): np.ones((4, 5))}, {}, "arrays and Warp functions cannot be combined"),
-        ({(0, 0): rising_in_space}, {}, "rising_in_space takes 3 arguments: expected the 2 indices of a cell"),
+        (
+            {(0, 0): 1.0, (0, 1): -2.0},
+            {},
+            r"the diagonal of cell \(0, 4\) is -1, with its closed sides: must be > 0",
+        ),
+        (
+            np.zeros((3, 4)),
+            {},
+            r"coefficients has shape \(3, 4\): expected \(3, 3\), or a mapping by offset",
+        ),
+        (
+            {(0, 0): rising, (0, 1): np.ones((4, 5))},
+            {},
+            "arrays and Warp functions cannot be combined",
+        ),
+        (
+            {(0, 0): rising_in_space},
+            {},
+            "rising_in_space takes 3 arguments: expected the 2 indices of a cell",
+        ),
         (NINE, {"outside": 7}, "outside = 7: allowed are wl.AIR = 0 and wl.SOLID = 2"),
         (NINE, {"shift": -1.0}, "shift holds a negative value"),
     ],

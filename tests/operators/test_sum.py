@@ -15,7 +15,10 @@ TIGHT = wl.StoppingCriteria(rtol=1e-10, max_iterations=2000)
 def dense_of(A):
     """Dense matrix of an operator, by its products with unit vectors."""
     n = int(np.prod(A.shape))
-    columns = [A.apply(wp.array(e.reshape(A.shape), dtype=wp.float64, device=A.device)).numpy().ravel() for e in np.eye(n)]
+    columns = [
+        A.apply(wp.array(e.reshape(A.shape), dtype=wp.float64, device=A.device)).numpy().ravel()
+        for e in np.eye(n)
+    ]
     return np.array(columns).T
 
 
@@ -26,7 +29,10 @@ def cells():
     return cells
 
 
-@pytest.mark.parametrize("weights", [np.array([2.0, 0.5, 1.0]), np.array([[1.0, 0.2, 0.0], [-0.3, 2.0, 0.1], [0.0, 0.0, 1.0]])])
+@pytest.mark.parametrize(
+    "weights",
+    [np.array([2.0, 0.5, 1.0]), np.array([[1.0, 0.2, 0.0], [-0.3, 2.0, 0.1], [0.0, 0.0, 1.0]])],
+)
 @pytest.mark.parametrize("dtype", [wp.float32, wp.float64])
 def test_low_rank_products(weights, dtype, device):
     U = np.random.default_rng(5).standard_normal((17, 3))
@@ -35,20 +41,31 @@ def test_low_rank_products(weights, dtype, device):
     x = wp.array(np.random.default_rng(7).standard_normal(17), dtype=wp.float64, device=device)
     accuracy = 1e-13 if dtype is wp.float64 else 1e-5
     np.testing.assert_allclose(A.apply(x).numpy(), U @ W @ U.T @ x.numpy(), atol=accuracy)
-    np.testing.assert_allclose(A.apply_transpose(x).numpy(), U @ W.T @ U.T @ x.numpy(), atol=accuracy)
+    np.testing.assert_allclose(
+        A.apply_transpose(x).numpy(), U @ W.T @ U.T @ x.numpy(), atol=accuracy
+    )
     np.testing.assert_allclose(A.diagonal().numpy(), np.diag(U @ W @ U.T), atol=accuracy)
     assert A.symmetric == (weights.ndim == 1)
     free = np.arange(17) % 3 != 0
     P = np.diag(free.astype(float))
-    np.testing.assert_allclose(A.masked(free.astype(np.uint8)).apply(x).numpy(), P @ U @ W @ U.T @ P @ x.numpy(), atol=accuracy)
+    np.testing.assert_allclose(
+        A.masked(free.astype(np.uint8)).apply(x).numpy(),
+        P @ U @ W @ U.T @ P @ x.numpy(),
+        atol=accuracy,
+    )
     with pytest.raises(ValueError, match="not of low rank"):
         A.masked(free.astype(np.uint8), np.ones(17))
 
 
 def test_sums_of_vectors(device):
     rng = np.random.default_rng(11)
-    S, U = scipy.sparse.random_array((20, 20), density=0.2, rng=rng).tocsr(), rng.standard_normal((20, 2))
-    A = wl.SumOperator(wl.SparseOperator(S, device=device), wl.LowRankOperator(U, [1.0, 2.0], device=device))
+    S, U = (
+        scipy.sparse.random_array((20, 20), density=0.2, rng=rng).tocsr(),
+        rng.standard_normal((20, 2)),
+    )
+    A = wl.SumOperator(
+        wl.SparseOperator(S, device=device), wl.LowRankOperator(U, [1.0, 2.0], device=device)
+    )
     dense = S.toarray() + U @ np.diag([1.0, 2.0]) @ U.T
     np.testing.assert_allclose(dense_of(A), dense, atol=1e-13)
     x = wp.array(rng.standard_normal(20), dtype=wp.float64, device=device)
@@ -85,7 +102,13 @@ def test_weights_that_are_symmetric_but_for_rounding(cells, dtype, device):
     U = rng.standard_normal((*cells.shape, 3)) * (cells == wl.FLUID)[..., None]
     fluid, b = cells.ravel() == wl.FLUID, rng.standard_normal(cells.shape)
     uneven = 0
-    for moments in ([1.0, 1.0, 1.0], [0.2, 0.2, 0.2], [1.0, 1.0, 3.0], [0.7, 1.9, 4.0], [1e-9, 2e-9, 2e-9]):
+    for moments in (
+        [1.0, 1.0, 1.0],
+        [0.2, 0.2, 0.2],
+        [1.0, 1.0, 3.0],
+        [0.7, 1.9, 4.0],
+        [1e-9, 2e-9, 2e-9],
+    ):
         for rotation in Rotation.random(40, rng=rng).as_matrix():
             W = rotation @ np.diag(moments) @ rotation.T
             uneven += not np.array_equal(W, W.T)
@@ -97,36 +120,61 @@ def test_weights_that_are_symmetric_but_for_rounding(cells, dtype, device):
             assert not low.symmetric
     assert uneven > 100
     W = rotation @ np.eye(3) @ rotation.T
-    A, u = wl.SumOperator(grid, wl.LowRankOperator(U, W, device=device, dtype=dtype)), U.reshape(-1, 3)
-    result = wl.solve(wl.LCP(A, b), wl.MinimumMapNewton(precision="double" if dtype is wp.float64 else "mixed"), stopping=TIGHT)
+    A, u = (
+        wl.SumOperator(grid, wl.LowRankOperator(U, W, device=device, dtype=dtype)),
+        U.reshape(-1, 3),
+    )
+    result = wl.solve(
+        wl.LCP(A, b),
+        wl.MinimumMapNewton(precision="double" if dtype is wp.float64 else "mixed"),
+        stopping=TIGHT,
+    )
     assert result, result.status
     expected = lemke((assemble(cells) + u @ u.T)[np.ix_(fluid, fluid)], b.ravel()[fluid])
-    np.testing.assert_allclose(result.x.numpy().ravel()[fluid], expected, atol=1e-7 if dtype is wp.float64 else 1e-5)
+    np.testing.assert_allclose(
+        result.x.numpy().ravel()[fluid], expected, atol=1e-7 if dtype is wp.float64 else 1e-5
+    )
 
 
 @pytest.mark.parametrize("felt", [(), (0,), (1,), (0, 2), (0, 1, 2)])
 def test_chambers_that_a_body_feels_do_not_float(felt, device):
     """Three closed chambers: the null space is the constants of those that no column touches."""
     cells, U = np.full((4, 11), wl.SOLID), np.zeros((4, 11, 1))
-    chambers = [np.arange(44).reshape(4, 11)[chamber].ravel() for chamber in (np.s_[:, :3], np.s_[:3, 4:7], np.s_[1:, 8:])]
+    chambers = [
+        np.arange(44).reshape(4, 11)[chamber].ravel()
+        for chamber in (np.s_[:, :3], np.s_[:3, 4:7], np.s_[1:, 8:])
+    ]
     cells.ravel()[np.concatenate(chambers)] = wl.FLUID
     for k in felt:
         U.ravel()[chambers[k]] = 1.0
-    A = wl.SumOperator(wl.GridPoisson(cells, device=device), wl.LowRankOperator(U, [2.0], device=device))
+    A = wl.SumOperator(
+        wl.GridPoisson(cells, device=device), wl.LowRankOperator(U, [2.0], device=device)
+    )
     found = A.floating_components()
     count = 0 if found is None else found.count
-    label = np.zeros(44) if found is None else found.label.reshape(A.layout.stored_shape)[1, 1:-1, 1:-1].ravel()
-    assert {frozenset(np.flatnonzero(label == c)) for c in range(count)} == {frozenset(c) for k, c in enumerate(chambers) if k not in felt}
+    label = (
+        np.zeros(44)
+        if found is None
+        else found.label.reshape(A.layout.stored_shape)[1, 1:-1, 1:-1].ravel()
+    )
+    assert {frozenset(np.flatnonzero(label == c)) for c in range(count)} == {
+        frozenset(c) for k, c in enumerate(chambers) if k not in felt
+    }
     fluid = cells.ravel() == wl.FLUID
     block = dense_of(A)[np.ix_(fluid, fluid)]
-    assert len(block) - np.linalg.matrix_rank(block) == count + max(0, len(felt) - 1)  # one column holds one constant
+    # one column holds one constant
+    assert len(block) - np.linalg.matrix_rank(block) == count + max(0, len(felt) - 1)
 
 
 def test_an_unsymmetric_sum_in_a_solver(device):
     rng = np.random.default_rng(17)
-    S = (scipy.sparse.random_array((30, 30), density=0.1, rng=rng) + 4 * scipy.sparse.eye_array(30)).tocsr()
+    S = (
+        scipy.sparse.random_array((30, 30), density=0.1, rng=rng) + 4 * scipy.sparse.eye_array(30)
+    ).tocsr()
     U = rng.standard_normal((30, 2))
-    A = wl.SumOperator(wl.SparseOperator(S, device=device), wl.LowRankOperator(U, [0.5, 1.0], device=device))
+    A = wl.SumOperator(
+        wl.SparseOperator(S, device=device), wl.LowRankOperator(U, [0.5, 1.0], device=device)
+    )
     dense, b = S.toarray() + U @ np.diag([0.5, 1.0]) @ U.T, rng.standard_normal(30)
     result = wl.solve(wl.LCP(A, b), wl.MinimumMapNewton(), stopping=TIGHT)
     assert result, result.status

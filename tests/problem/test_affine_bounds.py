@@ -18,7 +18,8 @@ from warp_lcp.solvers.staggering import Staggering
 TIGHT = wl.StoppingCriteria(rtol=1e-11, max_iterations=20_000, patience=2000)
 CONTACTS = 3
 NORMALS = np.array([0, 2, 4])
-INDEX = np.array([-1, 0, -1, 2, -1, 4])  # unknowns 0, 2, 4 are normal, 1, 3, 5 their tangential ones
+# unknowns 0, 2, 4 are normal, 1, 3, 5 their tangential ones
+INDEX = np.array([-1, 0, -1, 2, -1, 4])
 
 SWEEPING = {
     "psor": wl.ProjectedSOR(omega=1.0),
@@ -38,7 +39,8 @@ SWEEPING = {
 def contacts(rng, mu):
     """A = J M^-1 J' of three planar contacts between random bodies, and the velocities they start from; strong but solvable friction."""
     J = rng.standard_normal((2 * CONTACTS, 9))
-    A = J @ np.diag(rng.uniform(0.5, 2.0, 9)) @ J.T / 9 + 0.3 * np.eye(2 * CONTACTS)  # symmetric to rounding only
+    # symmetric to rounding only
+    A = J @ np.diag(rng.uniform(0.5, 2.0, 9)) @ J.T / 9 + 0.3 * np.eye(2 * CONTACTS)
     b = rng.standard_normal(2 * CONTACTS)
     b[NORMALS] -= 1.0
     return A, b, mu
@@ -61,8 +63,13 @@ def enumerate_contacts(A, b, mu):
             x = np.linalg.solve(T, r)
             y = A @ x + b
             normal, friction, slip = x[NORMALS], x[NORMALS + 1], y[NORMALS + 1]
-            ok = (normal >= -1e-9) & (y[NORMALS] >= -1e-9) & (np.abs(friction) <= mu * normal + 1e-9)
-            at_low, at_high = np.abs(friction + mu * normal) <= 1e-9, np.abs(friction - mu * normal) <= 1e-9
+            ok = (
+                (normal >= -1e-9) & (y[NORMALS] >= -1e-9) & (np.abs(friction) <= mu * normal + 1e-9)
+            )
+            at_low, at_high = (
+                np.abs(friction + mu * normal) <= 1e-9,
+                np.abs(friction - mu * normal) <= 1e-9,
+            )
             ok &= (np.abs(slip) <= 1e-9) | (at_low & (slip >= 0)) | (at_high & (slip <= 0))
             if ok.all() and not any(np.allclose(x, other, atol=1e-7) for other in found):
                 found.append(x)
@@ -80,25 +87,43 @@ def test_planar_contacts_have_the_enumerated_solution(name, sparse, device):
         A, b, mu = contacts(rng, 0.4)
         expected = enumerate_contacts(A, b, mu)
         assert len(expected) == 1
-        operator = wl.SparseOperator(scipy.sparse.csr_array(A), device=device) if sparse else wl.DenseOperator(A, device=device)
-        result = wl.solve(wl.LCP(operator, b, *wl.AffineBounds.friction(INDEX, mu)), SWEEPING[name], stopping=TIGHT)
+        operator = (
+            wl.SparseOperator(scipy.sparse.csr_array(A), device=device)
+            if sparse
+            else wl.DenseOperator(A, device=device)
+        )
+        result = wl.solve(
+            wl.LCP(operator, b, *wl.AffineBounds.friction(INDEX, mu)),
+            SWEEPING[name],
+            stopping=TIGHT,
+        )
         assert result, result.status
         np.testing.assert_allclose(result.x.numpy(), expected[0], atol=1e-8)
         x = expected[0]
-        kinds |= {("open", "slides", "sticks")[int(n > 1e-9) * (1 + int(abs(t) < mu * n - 1e-9))] for n, t in x.reshape(3, 2)}
+        kinds |= {
+            ("open", "slides", "sticks")[int(n > 1e-9) * (1 + int(abs(t) < mu * n - 1e-9))]
+            for n, t in x.reshape(3, 2)
+        }
     assert kinds == {"open", "slides", "sticks"}  # each state of Coulomb's law has been met
 
 
 def block_on_a_slope(angle, mu):
     """Normal and friction impulse that hold a block of unit mass on a slope for a unit of time: n = cos, t = min(sin, mu cos)."""
-    return np.eye(2), np.array([-np.cos(angle), -np.sin(angle)]), np.array([np.cos(angle), min(np.sin(angle), mu * np.cos(angle))])
+    return (
+        np.eye(2),
+        np.array([-np.cos(angle), -np.sin(angle)]),
+        np.array([np.cos(angle), min(np.sin(angle), mu * np.cos(angle))]),
+    )
 
 
 @pytest.mark.parametrize("angle", [0.2, 0.5])
 def test_a_block_slides_where_the_slope_is_steeper_than_friction_holds(angle, device):
     mu = 0.3  # holds up to atan(0.3) = 0.29
     A, b, expected = block_on_a_slope(angle, mu)
-    result = wl.solve(wl.LCP(wl.DenseOperator(A, device=device), b, *wl.AffineBounds.friction([-1, 0], mu)), wl.ProjectedSOR(omega=1.0))
+    result = wl.solve(
+        wl.LCP(wl.DenseOperator(A, device=device), b, *wl.AffineBounds.friction([-1, 0], mu)),
+        wl.ProjectedSOR(omega=1.0),
+    )
     assert result
     np.testing.assert_allclose(result.x.numpy(), expected, atol=1e-12)
 
@@ -117,11 +142,14 @@ def test_grid_fields_take_affine_bounds(device):
     cells = np.array([[wl.AIR, wl.FLUID, wl.FLUID, wl.AIR]])
     index = np.array([[-1, -1, 1, -1]])
     upper = wl.AffineBounds(np.where(index < 0, np.inf, 0.0), index, 0.5)
-    # A = [[2, -1], [-1, 2]], b = -(1, 3): free, x = (5/3, 7/3); with x_2 <= x_1 / 2 it is 2 x_1 - x_2 = 1, x_2 = x_1 / 2
+    # A = [[2, -1], [-1, 2]], b = -(1, 3): free, x = (5/3, 7/3); with x_2 <= x_1 / 2 it is 2 x_1 -
+    # x_2 = 1, x_2 = x_1 / 2
     expected = np.array([[0.0, 2 / 3, 1 / 3, 0.0]])
     for method in (wl.ProjectedSOR(omega=1.0), ProjectedJacobi(), Staggering(blocks=[[1], [2]])):
         A = wl.GridPoisson(cells, device=device, dtype=wp.float64)
-        result = wl.solve(wl.LCP(A, np.array([[0.0, -1.0, -3.0, 0.0]]), 0.0, upper), method, stopping=TIGHT)
+        result = wl.solve(
+            wl.LCP(A, np.array([[0.0, -1.0, -3.0, 0.0]]), 0.0, upper), method, stopping=TIGHT
+        )
         assert result, method
         np.testing.assert_allclose(result.x.numpy(), expected, atol=1e-9)
 
@@ -131,10 +159,19 @@ def test_the_residual_uses_bounds_at_x(device):
     problem = wl.LCP(wl.DenseOperator(A, device=device), b, *wl.AffineBounds.friction([-1, 0], 0.5))
     residual = wl.NaturalResidual(problem)
     for x, expected in (([1.0, 0.5], 0.0), ([2.0, 1.0], 1.0), ([1.0, 1.0], 0.5), ([1.0, 0.0], 0.5)):
-        assert residual.evaluate(wp.array(x, dtype=wp.float64, device=device)) == pytest.approx(expected, abs=1e-14)
+        assert residual.evaluate(wp.array(x, dtype=wp.float64, device=device)) == pytest.approx(
+            expected, abs=1e-14
+        )
 
 
-@pytest.mark.parametrize("name", [name for name, cls in METHODS.items() if families(cls) and not getattr(cls, "affine_bounds", False)])
+@pytest.mark.parametrize(
+    "name",
+    [
+        name
+        for name, cls in METHODS.items()
+        if families(cls) and not getattr(cls, "affine_bounds", False)
+    ],
+)
 def test_other_methods_refuse(name):
     if name == "quadratic-program":
         pytest.importorskip("piqp")
@@ -163,7 +200,10 @@ def test_a_guess_is_projected_onto_bounds_at_the_guess(device):
         (lambda: wl.AffineBounds.friction([-1, 0], -0.1), "mu holds a negative value"),
         (lambda: friction_problem(wl.AffineBounds.friction([1, 0], 0.3)), "own bounds are affine"),
         (lambda: friction_problem(wl.AffineBounds.friction([-1, 0, -1], 0.3)), "index has shape"),
-        (lambda: friction_problem(wl.AffineBounds.friction([-1, 0], 0.3, lower=-1.0)), "lower > upper in 1 unknowns"),
+        (
+            lambda: friction_problem(wl.AffineBounds.friction([-1, 0], 0.3, lower=-1.0)),
+            "lower > upper in 1 unknowns",
+        ),
     ],
 )
 def test_wrong_bounds_are_named(make, message):

@@ -54,12 +54,18 @@ def test_equal_finite_values_are_coded_and_come_back(lower, upper):
 def test_other_fields_are_kept_as_they_are(lower):
     bounds = bounds_of(lower)
     assert bounds.code.size == 0
-    np.testing.assert_array_equal(bounds.fields[0].numpy().reshape([n + 2 for n in SHAPE])[1:-1, 1:-1, 1:-1], lower)
+    np.testing.assert_array_equal(
+        bounds.fields[0].numpy().reshape([n + 2 for n in SHAPE])[1:-1, 1:-1, 1:-1], lower
+    )
 
 
 def test_wrong_fields_are_still_named():
     cells, b = pool()
-    for lower, message in ((some(np.nan, -np.inf), "NaN"), (some(np.inf, -np.inf), "lower holds inf"), (np.zeros((2, 2)), "has shape")):
+    for lower, message in (
+        (some(np.nan, -np.inf), "NaN"),
+        (some(np.inf, -np.inf), "lower holds inf"),
+        (np.zeros((2, 2)), "has shape"),
+    ):
         with pytest.raises(ValueError, match=message):
             wl.LCP(operator(cells), b, lower)
     with pytest.raises(ValueError, match="lower > upper"):
@@ -76,7 +82,9 @@ def reference(cells, b, lower, upper):
         guess = x - (A @ x + c) / d
         free = (guess >= low) & (guess <= high)
         x = np.where(guess < low, low, np.where(guess > high, high, 0.0))
-        x[free] = -np.linalg.solve(A[np.ix_(free, free)], c[free] + A[np.ix_(free, ~free)] @ x[~free])
+        x[free] = -np.linalg.solve(
+            A[np.ix_(free, free)], c[free] + A[np.ix_(free, ~free)] @ x[~free]
+        )
     assert natural_residual(A, c, low, high, x) < 1e-12
     return x
 
@@ -96,11 +104,18 @@ def test_coded_bounds_give_the_solution_of_their_fields():
 def test_bounds_changed_in_place_are_coded_again():
     cells, b = pool()
     A = operator(cells)
-    stored = [wp.array(np.pad(v, 1), dtype=wp.float64, device="cpu") for v in (b, some(0.0, -np.inf))]
+    stored = [
+        wp.array(np.pad(v, 1), dtype=wp.float64, device="cpu") for v in (b, some(0.0, -np.inf))
+    ]
     problem, solver = wl.LCP(A, *stored), wl.ProjectedMultigrid()
     work, stopping = solver.init(problem), wl.StoppingCriteria(rtol=1e-11)
     codes = []
-    for lower in (some(0.0, -np.inf), some(0.0, -np.inf, seed=9), some(-0.05, -0.2), some(0.0, -np.inf)):
+    for lower in (
+        some(0.0, -np.inf),
+        some(0.0, -np.inf, seed=9),
+        some(-0.05, -0.2),
+        some(0.0, -np.inf),
+    ):
         stored[1].assign(np.pad(lower, 1))
         result = wl.solve(problem, solver, stopping=stopping, workspace=work)
         codes.append(problem.bounds.code.size > 0)

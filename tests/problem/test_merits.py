@@ -16,18 +16,33 @@ def spd(n, seed):
     return B @ B.T / n + 0.5 * np.eye(n)
 
 
-@pytest.mark.parametrize("method", [wl.ProjectedSOR(omega=1.0), wl.FischerNewton(), wl.InteriorPoint(), wl.MinimumMapNewton(direct=True)])
+@pytest.mark.parametrize(
+    "method",
+    [
+        wl.ProjectedSOR(omega=1.0),
+        wl.FischerNewton(),
+        wl.InteriorPoint(),
+        wl.MinimumMapNewton(direct=True),
+    ],
+)
 def test_each_record_has_the_merits_of_its_iterate(method, device):
     A, b = spd(12, 5101), np.random.default_rng(5103).standard_normal(12)
     problem = wl.LCP(wl.DenseOperator(A, device=device), b)
     work, iterates = method.init(problem), []
-    result = wl.solve(problem, method, stopping=ASKED, workspace=work, callback=lambda record: iterates.append(work.x.numpy().copy()))
+    result = wl.solve(
+        problem,
+        method,
+        stopping=ASKED,
+        workspace=work,
+        callback=lambda record: iterates.append(work.x.numpy().copy()),
+    )
     assert result
     assert len(iterates) == len(result.history) > 2
     for record, x in zip(result.history, iterates, strict=True):
         y = A @ x + b
         assert record.merits.largest == pytest.approx(np.abs(x).max())  # [Book] eq. 2.55
-        assert record.merits.complementarity == pytest.approx(abs(x @ y), abs=1e-13)  # [Book] eq. 2.56
+        # [Book] eq. 2.56
+        assert record.merits.complementarity == pytest.approx(abs(x @ y), abs=1e-13)
         assert record.merits.absolute == pytest.approx(x @ np.abs(y), abs=1e-13)  # [Book] eq. 2.200
     assert result.history[0].merits.absolute == 0  # at x = 0, which is no solution
     assert result.history[-1].merits.absolute < 1e-8
@@ -36,7 +51,9 @@ def test_each_record_has_the_merits_of_its_iterate(method, device):
 def test_sweeps_converge_linearly_in_the_modified_merit():
     """[Book] fig. C.2 draws eq. 2.200 for PGS: a straight line on a logarithmic scale."""
     A, b = spd(40, 5107), np.random.default_rng(5109).standard_normal(40)
-    result = wl.solve(wl.LCP(wl.DenseOperator(A, device="cpu"), b), wl.ProjectedSOR(omega=1.0), stopping=ASKED)
+    result = wl.solve(
+        wl.LCP(wl.DenseOperator(A, device="cpu"), b), wl.ProjectedSOR(omega=1.0), stopping=ASKED
+    )
     merits = np.array([record.merits.absolute for record in result.history[5:]])
     rates = merits[1:] / merits[:-1]
     assert rates.max() < 1
@@ -46,12 +63,23 @@ def test_sweeps_converge_linearly_in_the_modified_merit():
 def test_in_a_box_distances_are_those_to_the_bound_that_y_asks_for():
     """y = x + b; x half above l where y > 0, half below u where y < 0, under u alone, and without a bound."""
     problem = wl.LCP(
-        wl.DenseOperator(np.eye(4), device="cpu"), np.array([2.0, -5.0, 1.0, 5.0]), np.array([-2.25, 1.0, -np.inf, -np.inf]),
+        wl.DenseOperator(np.eye(4), device="cpu"),
+        np.array([2.0, -5.0, 1.0, 5.0]),
+        np.array([-2.25, 1.0, -np.inf, -np.inf]),
         np.array([2.0, 2.0, 4.0, np.inf]),
-    )  # fmt: skip
+    )
     x = np.array([-1.75, 1.5, 0.0, 0.0])
-    result = wl.solve(problem, wl.ProjectedSOR(), x0=x, stopping=wl.StoppingCriteria(max_iterations=0, merits=True))
-    y, distance, sign = x + np.array([2.0, -5.0, 1.0, 5.0]), np.array([0.5, 0.5, 4.0, 0.0]), np.array([1.0, -1.0, -1.0, 1.0])
+    result = wl.solve(
+        problem,
+        wl.ProjectedSOR(),
+        x0=x,
+        stopping=wl.StoppingCriteria(max_iterations=0, merits=True),
+    )
+    y, distance, sign = (
+        x + np.array([2.0, -5.0, 1.0, 5.0]),
+        np.array([0.5, 0.5, 4.0, 0.0]),
+        np.array([1.0, -1.0, -1.0, 1.0]),
+    )
     merits = result.history[0].merits
     assert merits.largest == 1.75
     assert merits.complementarity == pytest.approx(abs(distance @ (sign * y)))
@@ -80,8 +108,13 @@ def test_on_a_grid_cells_that_are_no_unknowns_do_not_count(device):
 
 def test_none_are_recorded_unless_asked_for_and_residuals_stay_as_they_are():
     A, b = scipy.sparse.csr_array(spd(30, 5123)), np.random.default_rng(5129).standard_normal(30)
-    plain, asked = (wl.solve(wl.LCP(A, b), stopping=wl.StoppingCriteria(rtol=1e-8, merits=merits)) for merits in (False, True))
+    plain, asked = (
+        wl.solve(wl.LCP(A, b), stopping=wl.StoppingCriteria(rtol=1e-8, merits=merits))
+        for merits in (False, True)
+    )
     assert all(record.merits is None for record in plain.history)
     assert all(record.merits is not None for record in asked.history)
     np.testing.assert_array_equal(plain.x.numpy(), asked.x.numpy())
-    assert [record.residual for record in plain.history] == [record.residual for record in asked.history]
+    assert [record.residual for record in plain.history] == [
+        record.residual for record in asked.history
+    ]

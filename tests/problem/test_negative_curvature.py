@@ -15,7 +15,10 @@ CURVED, INFEASIBLE = wl.SolveStatus.NEGATIVE_CURVATURE, wl.SolveStatus.INFEASIBL
 
 def laplacian(n):
     T = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(n, n))
-    return (scipy.sparse.kron(scipy.sparse.eye_array(n), T) + scipy.sparse.kron(T, scipy.sparse.eye_array(n))).tocsr()
+    return (
+        scipy.sparse.kron(scipy.sparse.eye_array(n), T)
+        + scipy.sparse.kron(T, scipy.sparse.eye_array(n))
+    ).tocsr()
 
 
 def drawn(seed):
@@ -36,7 +39,12 @@ def drawn(seed):
 def products(A):
     """Return A as an operator that shows products only."""
     symmetric = bool(abs(A - A.T).max() < 1e-12)
-    return wl.LinearOperator(lambda x: A @ x, shape=(A.shape[0],), symmetric=symmetric, transpose=None if symmetric else lambda x: A.T @ x)
+    return wl.LinearOperator(
+        lambda x: A @ x,
+        shape=(A.shape[0],),
+        symmetric=symmetric,
+        transpose=None if symmetric else lambda x: A.T @ x,
+    )
 
 
 def is_feasible(A, b):
@@ -44,7 +52,9 @@ def is_feasible(A, b):
     return scipy.optimize.linprog(np.zeros(len(b)), A_ub=-A, b_ub=b, bounds=(0.0, None)).status == 0
 
 
-@pytest.mark.parametrize("method", [wl.MinimumMapNewton(), wl.PrimalDualActiveSet(), wl.Penalty(), wl.InteriorPoint()])
+@pytest.mark.parametrize(
+    "method", [wl.MinimumMapNewton(), wl.PrimalDualActiveSet(), wl.Penalty(), wl.InteriorPoint()]
+)
 def test_flipped_matrices_take_no_steps(method):
     for seed in range(6201, 6216):
         A = drawn(seed)
@@ -106,7 +116,9 @@ def test_some_negative_entries_are_no_wrong_sign():
         assert not has_negative_curvature(problem)
         result = wl.solve(problem)
         assert result
-        assert natural_residual(A, y - A @ x, 0.0, np.inf, result.x.numpy()) <= 1e-6 * np.linalg.norm(y - A @ x)
+        assert natural_residual(
+            A, y - A @ x, 0.0, np.inf, result.x.numpy()
+        ) <= 1e-6 * np.linalg.norm(y - A @ x)
         assert has_negative_curvature(wl.LCP(form(-np.abs(np.diag(A)) * np.eye(n)), y))
 
 

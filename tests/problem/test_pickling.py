@@ -31,7 +31,10 @@ def columns():
 
 
 def with_bodies(device):
-    return wl.SumOperator(grid(device), wl.LowRankOperator(columns(), np.array([[2.0, 0.5], [0.5, 1.0]]), device=device))
+    return wl.SumOperator(
+        grid(device),
+        wl.LowRankOperator(columns(), np.array([[2.0, 0.5], [0.5, 1.0]]), device=device),
+    )
 
 
 def in_place(device):
@@ -49,20 +52,42 @@ def matrix(n=30):
     return scipy.sparse.diags_array([-1.0, 2.5, -1.2], offsets=[-1, 0, 1], shape=(n, n)).tocsr()
 
 
-FACES = {"face_x": np.linspace(0.5, 1.0, 60).reshape(6, 10), "face_y": 0.7, "shift": np.full(CELLS.shape, 0.1)}
+FACES = {
+    "face_x": np.linspace(0.5, 1.0, 60).reshape(6, 10),
+    "face_y": 0.7,
+    "shift": np.full(CELLS.shape, 0.1),
+}
 WALLS = np.where(np.arange(9) < 4, 0.0, -np.inf) * np.ones(CELLS.shape)
 PROBLEMS = {
-    "dense": lambda device: wl.LCP(wl.DenseOperator(matrix().toarray(), device=device), np.linspace(-1, 1, 30), -0.25, np.full(30, 0.1)),
-    "float32": lambda device: wl.LCP(wl.SparseOperator(matrix(), device=device, dtype=wp.float32), np.linspace(-1, 1, 30)),
-    "sparse": lambda device: wl.LCP(wl.SparseOperator(matrix(), device=device), np.linspace(-1, 1, 30), np.linspace(-1, 0, 30)),
+    "dense": lambda device: wl.LCP(
+        wl.DenseOperator(matrix().toarray(), device=device),
+        np.linspace(-1, 1, 30),
+        -0.25,
+        np.full(30, 0.1),
+    ),
+    "float32": lambda device: wl.LCP(
+        wl.SparseOperator(matrix(), device=device, dtype=wp.float32), np.linspace(-1, 1, 30)
+    ),
+    "sparse": lambda device: wl.LCP(
+        wl.SparseOperator(matrix(), device=device), np.linspace(-1, 1, 30), np.linspace(-1, 0, 30)
+    ),
     "grid": lambda device: wl.LCP(grid(device), field(), WALLS),
-    "faces": lambda device: wl.LCP(grid(device, **FACES, dtype=wp.float64), field(), field(12) - 3.0, field(12) + 0.1),
+    "faces": lambda device: wl.LCP(
+        grid(device, **FACES, dtype=wp.float64), field(), field(12) - 3.0, field(12) + 0.1
+    ),
     "periodic": lambda device: wl.LCP(
-        wl.GridPoisson(np.ones((4, 6), dtype=int), periodic=(True, False), shift=1.0, device=device), -np.ones((4, 6))
+        wl.GridPoisson(
+            np.ones((4, 6), dtype=int), periodic=(True, False), shift=1.0, device=device
+        ),
+        -np.ones((4, 6)),
     ),
     "bodies": lambda device: wl.LCP(with_bodies(device), field()),
     "in place": in_place,
-    "friction": lambda device: wl.LCP(wl.DenseOperator(np.eye(2), device=device), -np.ones(2), *wl.AffineBounds.friction([-1, 0], 0.5)),
+    "friction": lambda device: wl.LCP(
+        wl.DenseOperator(np.eye(2), device=device),
+        -np.ones(2),
+        *wl.AffineBounds.friction([-1, 0], 0.5),
+    ),
 }
 
 
@@ -72,7 +97,11 @@ def test_problems(name, again, device):
     problem = PROBLEMS[name](device)
     twin = again(problem)
     assert twin.device == problem.device
-    assert (type(twin.A), twin.A.dtype, twin.A.shape) == (type(problem.A), problem.A.dtype, problem.A.shape)
+    assert (type(twin.A), twin.A.dtype, twin.A.shape) == (
+        type(problem.A),
+        problem.A.dtype,
+        problem.A.shape,
+    )
     assert (twin.in_place, twin.bounds.in_place, bool(twin.bounds.code.size)) == (
         problem.in_place,
         problem.bounds.in_place,
@@ -94,7 +123,14 @@ def test_results(again, device):
     assert twin.x.device == result.x.device
     assert twin.x.ptr != result.x.ptr
     np.testing.assert_array_equal(twin.x.numpy(), result.x.numpy())
-    for name in ("status", "iterations", "linear_iterations", "residual", "relative_residual", "history"):
+    for name in (
+        "status",
+        "iterations",
+        "linear_iterations",
+        "residual",
+        "relative_residual",
+        "history",
+    ):
         assert getattr(twin, name) == getattr(result, name)
     batch = again(wl.enumerate_batch(np.eye(2)[None], -np.ones((1, 2)), device=device))
     np.testing.assert_array_equal(batch.x.numpy(), [[1.0, 1.0]])
@@ -109,7 +145,9 @@ def test_statuses_go_by_their_names():
 
 def test_a_device_that_is_missing_becomes_the_cpu(device):
     result = wl.solve(PROBLEMS["dense"](device))
-    elsewhere = pickle.dumps(result).replace(result.x.device.alias.encode(), b"xpu"[: len(result.x.device.alias)])
+    elsewhere = pickle.dumps(result).replace(
+        result.x.device.alias.encode(), b"xpu"[: len(result.x.device.alias)]
+    )
     assert pickle.loads(elsewhere).x.device == wp.get_device("cpu")
 
 
@@ -119,6 +157,8 @@ def test_what_is_not_pickled_says_what_to_do(device):
         pickle.dumps(A.masked(np.ones(CELLS.shape)))
     A.layout.across = SimpleNamespace()
     with pytest.raises(
-        TypeError, match="GridPoisson is distributed over ranks and cannot be pickled: pickle its cells and coefficients on each rank"
+        TypeError,
+        match="GridPoisson is distributed over ranks and cannot be pickled: pickle its cells and "
+        "coefficients on each rank",
     ):
         copy.deepcopy(A)

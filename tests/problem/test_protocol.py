@@ -22,7 +22,9 @@ from warp_lcp.problem.protocol import (
 )
 
 STOPPING = wl.StoppingCriteria(rtol=1e-8, max_iterations=20_000, patience=5000)
-ASKED = {capability for method in wl.METHODS.values() for capability in getattr(method, "supports", ())}
+ASKED = {
+    capability for method in wl.METHODS.values() for capability in getattr(method, "supports", ())
+}
 
 
 class Least:
@@ -33,7 +35,10 @@ class Least:
 
     def __init__(self, A, *capabilities):
         self.products = 0
-        for name in (*members(wl.Operator), *(name for capability in capabilities for name in members(capability))):
+        for name in (
+            *members(wl.Operator),
+            *(name for capability in capabilities for name in members(capability)),
+        ):
             setattr(self, name, getattr(A, name))
         self._apply, self.apply, self.apply_transpose = A.apply, self._counted, self._counted
 
@@ -46,18 +51,27 @@ def shown(capability, n):
     """An operator of ours that has a capability, SPD with n unknowns."""
     grid = wl.GridPoisson(np.ones((n, 1), dtype=int), shift=0.5, device="cpu", dtype=wp.float64)
     if capability is HasColumns:
-        return wl.SumOperator(grid, wl.LowRankOperator(np.linspace(0.1, 1.0, n).reshape(n, 1, 1), [2.0], device="cpu"))
+        return wl.SumOperator(
+            grid, wl.LowRankOperator(np.linspace(0.1, 1.0, n).reshape(n, 1, 1), [2.0], device="cpu")
+        )
     if capability is None or "sparse" in CAPABILITIES[capability][1]:
-        return wl.SparseOperator(scipy.sparse.diags_array([-1.0, 2.5, -1.0], offsets=[-1, 0, 1], shape=(n, n)), device="cpu")
+        return wl.SparseOperator(
+            scipy.sparse.diags_array([-1.0, 2.5, -1.0], offsets=[-1, 0, 1], shape=(n, n)),
+            device="cpu",
+        )
     return grid
 
 
 def dense(A):
     fields = np.eye(int(np.prod(A.shape))).reshape(-1, *A.shape)
-    return np.array([A.apply(wp.array(e, dtype=wp.float64, device="cpu")).numpy().ravel() for e in fields])
+    return np.array(
+        [A.apply(wp.array(e, dtype=wp.float64, device="cpu")).numpy().ravel() for e in fields]
+    )
 
 
-@pytest.mark.parametrize("capability", [None, *CAPABILITIES], ids=lambda c: "none" if c is None else c.__name__)
+@pytest.mark.parametrize(
+    "capability", [None, *CAPABILITIES], ids=lambda c: "none" if c is None else c.__name__
+)
 @pytest.mark.parametrize("name", [name for name, cls in wl.METHODS.items() if families(cls)])
 def test_each_capability_lets_in_the_methods_that_ask_for_it(name, capability):
     cls = wl.METHODS[name]
@@ -65,14 +79,22 @@ def test_each_capability_lets_in_the_methods_that_ask_for_it(name, capability):
         pytest.importorskip("piqp")
     n = min(getattr(cls, "most_unknowns", 12), 12)
     A = shown(capability, n)
-    with_it = {None: (), HasCells: (HasCells, HasLayout), HasColumns: (HasColumns, HasCells, HasLayout)}.get(capability, (capability,))
+    with_it = {
+        None: (),
+        HasCells: (HasCells, HasLayout),
+        HasColumns: (HasColumns, HasCells, HasLayout),
+    }.get(capability, (capability,))
     matrix, own = dense(A), Least(A, *with_it)
     b = np.random.default_rng(7).standard_normal(A.shape)
     problem = wl.LCP(own, b)
     asked = getattr(cls, "supports", ())
     if asked and capability not in asked:
         assert not takes(cls, own)
-        with pytest.raises(ValueError, match=f"^{cls.__name__} needs an operator with .*; Least has none: use MinimumMapNewton"):
+        with pytest.raises(
+            ValueError,
+            match=f"^{cls.__name__} needs an operator with .*; Least has none: use "
+            "MinimumMapNewton",
+        ):
             wl.solve(problem, cls())
         assert own.products == 0
         return
@@ -103,7 +125,10 @@ def test_methods_that_messages_name_ask_for_nothing():
     """MinimumMapNewton, and for bounds affine in x ProjectedJacobi: also what is taken and recommended without a word."""
     own = Least(shown(None, 3))
     assert takes(wl.MinimumMapNewton, own)
-    constant, friction = wl.LCP(own, -np.ones(3)), wl.LCP(own, -np.ones(3), *wl.AffineBounds.friction([-1, 0, 0], 0.5))
+    constant, friction = (
+        wl.LCP(own, -np.ones(3)),
+        wl.LCP(own, -np.ones(3), *wl.AffineBounds.friction([-1, 0, 0], 0.5)),
+    )
     assert isinstance(wl.default_method(constant), wl.MinimumMapNewton)
     assert isinstance(wl.default_method(friction), wl.ProjectedJacobi)
     for problem in (constant, friction):
@@ -127,7 +152,11 @@ def test_rows_are_the_operator_s_own():
 @pytest.mark.parametrize("kind", ["dense", "sparse", "empty"])
 def test_rows_as_a_matrix(kind):
     expected = np.random.default_rng(11).standard_normal((5, 5)) * (0.0 if kind == "empty" else 1.0)
-    A = wl.DenseOperator(expected, device="cpu") if kind == "dense" else wl.SparseOperator(scipy.sparse.csr_array(expected), device="cpu")
+    A = (
+        wl.DenseOperator(expected, device="cpu")
+        if kind == "dense"
+        else wl.SparseOperator(scipy.sparse.csr_array(expected), device="cpu")
+    )
     matrix = A.rows().matrix()
     assert scipy.sparse.issparse(matrix) == (kind != "dense")
     np.testing.assert_array_equal(matrix if kind == "dense" else matrix.toarray(), expected)

@@ -18,7 +18,10 @@ def boxes(seed, n=7, *, mixed=0.0):
     rng = np.random.default_rng(seed)
     A, b = definite(n, condition=20, seed=seed).A, rng.standard_normal(n)
     kind = rng.integers(0, 3, n)
-    lower, upper = np.where(kind != 1, -0.5 * rng.random(n), -np.inf), np.where(kind != 0, 0.5 * rng.random(n), np.inf)
+    lower, upper = (
+        np.where(kind != 1, -0.5 * rng.random(n), -np.inf),
+        np.where(kind != 0, 0.5 * rng.random(n), np.inf),
+    )
     free = rng.random(n) < mixed
     lower, upper = np.where(free, -np.inf, lower), np.where(free, np.inf, upper)
     return A, b, lower, upper, boxed(A, b, lower, upper)
@@ -46,7 +49,9 @@ def test_mixed_as_boxed_and_as_the_schur_complement(sparse):
     A = scipy.sparse.csr_array(p.A) if sparse else p.A
     E = rng.random(14) < 0.4
     b = rng.standard_normal(14)
-    as_box, as_lcp = (make(A, b, E, device="cpu") for make in (form.mixed_to_boxed, form.mixed_to_lcp))
+    as_box, as_lcp = (
+        make(A, b, E, device="cpu") for make in (form.mixed_to_boxed, form.mixed_to_lcp)
+    )
     x = as_lcp.back(lemke(as_lcp.A, as_lcp.b))
     y = p.A @ x + b
     assert len(as_lcp.b) == np.count_nonzero(~E)
@@ -81,7 +86,12 @@ def test_boxed_as_quadratic_program(seed):
     limits = scipy.optimize.Bounds(lower, upper)
     start = np.clip(np.zeros(7), lower, upper)
     found = scipy.optimize.minimize(
-        program.objective, start, jac=lambda z: A @ z + b, bounds=limits, method="L-BFGS-B", options={"ftol": 1e-15, "gtol": 1e-11}
+        program.objective,
+        start,
+        jac=lambda z: A @ z + b,
+        bounds=limits,
+        method="L-BFGS-B",
+        options={"ftol": 1e-15, "gtol": 1e-11},
     )
     np.testing.assert_allclose(found.x, x, atol=1e-6)
     assert program.objective(x) <= found.fun + 1e-12
@@ -96,21 +106,42 @@ def test_quadratic_program_with_general_constraints(sparse):
     rng = np.random.default_rng(7)
     n = 6
     Q, c = definite(n, condition=10, seed=7).A, rng.standard_normal(n)
-    G, h, C, d = rng.standard_normal((3, n)), -rng.random(3), rng.standard_normal((1, n)), rng.standard_normal(1) * 0.1
+    G, h, C, d = (
+        rng.standard_normal((3, n)),
+        -rng.random(3),
+        rng.standard_normal((1, n)),
+        rng.standard_normal(1) * 0.1,
+    )
     kind = scipy.sparse.csr_array if sparse else np.asarray
-    program = form.QuadraticProgramData(kind(Q), c, np.full(n, -1.0), np.full(n, np.inf), kind(G), h, kind(C), d)
+    program = form.QuadraticProgramData(
+        kind(Q), c, np.full(n, -1.0), np.full(n, np.inf), kind(G), h, kind(C), d
+    )
     new = form.quadratic_program_to_boxed(program, device="cpu")
     result = wl.solve(new.problem, wl.MinimumMapNewton(), stopping=TIGHT)
-    z = result.x.numpy() if result else boxed(new.A.toarray() if sparse else new.A, new.b, new.lower, new.upper)
-    rules = [{"type": "ineq", "fun": lambda x: G @ x - h}, {"type": "eq", "fun": lambda x: C @ x - d}]
+    z = (
+        result.x.numpy()
+        if result
+        else boxed(new.A.toarray() if sparse else new.A, new.b, new.lower, new.upper)
+    )
+    rules = [
+        {"type": "ineq", "fun": lambda x: G @ x - h},
+        {"type": "eq", "fun": lambda x: C @ x - d},
+    ]
     limits = scipy.optimize.Bounds(program.lower, program.upper)
     found = scipy.optimize.minimize(
-        lambda x: 0.5 * x @ Q @ x + c @ x, np.zeros(n), bounds=limits, constraints=rules, method="SLSQP", options={"ftol": 1e-14}
+        lambda x: 0.5 * x @ Q @ x + c @ x,
+        np.zeros(n),
+        bounds=limits,
+        constraints=rules,
+        method="SLSQP",
+        options={"ftol": 1e-14},
     )
     assert found.success
     np.testing.assert_allclose(new.back(z), found.x, atol=1e-5)
     with pytest.raises(ValueError, match="h is missing"):
-        form.quadratic_program_to_boxed(form.QuadraticProgramData(Q, c, program.lower, program.upper, G))
+        form.quadratic_program_to_boxed(
+            form.QuadraticProgramData(Q, c, program.lower, program.upper, G)
+        )
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -119,7 +150,9 @@ def test_variational_inequality_by_the_extragradient_method(seed):
     inequality = form.boxed_to_variational_inequality(A, b, lower, upper)
     step, z = 0.5 / np.linalg.norm(A, 2), np.clip(np.zeros(7), lower, upper)
     for _ in range(3000):
-        z = inequality.project(z - step * inequality.F(inequality.project(z - step * inequality.F(z))))
+        z = inequality.project(
+            z - step * inequality.F(inequality.project(z - step * inequality.F(z)))
+        )
     np.testing.assert_allclose(z, x, atol=1e-8)
     assert inequality.regularized_gap(x) == pytest.approx(0.0, abs=1e-12)
     rng = np.random.default_rng(seed)
@@ -133,7 +166,9 @@ def test_variational_inequality_by_the_extragradient_method(seed):
 
 
 def test_gap_is_infinite_where_the_cone_has_no_end():
-    inequality = form.boxed_to_variational_inequality(np.eye(2), np.array([-1.0, 1.0]), np.zeros(2), np.full(2, np.inf))
+    inequality = form.boxed_to_variational_inequality(
+        np.eye(2), np.array([-1.0, 1.0]), np.zeros(2), np.full(2, np.inf)
+    )
     assert inequality.gap(np.zeros(2)) == np.inf  # y_0 < 0 and x_0 has no upper bound
     assert inequality.gap(np.array([1.0, 0.0])) == 0.0  # the solution
     assert inequality.gap(np.array([1.0, 2.0])) == 6.0  # y = (0, 3), x - l = (1, 2)
@@ -143,7 +178,9 @@ def test_gap_is_infinite_where_the_cone_has_no_end():
 def test_proximal_form_by_repeated_application(r):
     for seed in range(5):
         A, b, lower, upper, x = boxes(seed, mixed=0.2)
-        prox = form.boxed_to_proximal(A, b, lower, upper, r=None if r is None else 1 / np.linalg.norm(A, 2))
+        prox = form.boxed_to_proximal(
+            A, b, lower, upper, r=None if r is None else 1 / np.linalg.norm(A, 2)
+        )
         np.testing.assert_allclose(prox(x), x, atol=1e-12)
         if r is not None:
             z = np.clip(np.zeros(7), lower, upper)
@@ -157,7 +194,10 @@ def test_proximal_form_by_repeated_application(r):
 @pytest.mark.parametrize("seed", range(6))
 def test_root_forms_vanish_at_solutions_alone(seed):
     A, b, lower, upper, x = boxes(seed, mixed=0.2)
-    minimum, fischer = (make(A, b, lower, upper) for make in (form.boxed_to_minimum_map, form.boxed_to_fischer_burmeister))
+    minimum, fischer = (
+        make(A, b, lower, upper)
+        for make in (form.boxed_to_minimum_map, form.boxed_to_fischer_burmeister)
+    )
     assert np.abs(minimum(x)).max() < 1e-9
     assert np.abs(fischer(x)).max() < 1e-9
     rng = np.random.default_rng(seed)
@@ -165,7 +205,9 @@ def test_root_forms_vanish_at_solutions_alone(seed):
         other = x + 0.1 * rng.standard_normal(7)
         assert np.linalg.norm(minimum(other)) > 1e-4
         assert np.linalg.norm(fischer(other)) > 1e-4
-    found = scipy.optimize.least_squares(fischer, np.clip(np.zeros(7), lower, upper), xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    found = scipy.optimize.least_squares(
+        fischer, np.clip(np.zeros(7), lower, upper), xtol=1e-15, ftol=1e-15, gtol=1e-15
+    )
     np.testing.assert_allclose(found.x, x, atol=1e-5)
 
 
@@ -185,11 +227,17 @@ def test_equations_are_marked_not_numbered(equations):
     for make in (form.mixed_to_lcp, form.mixed_to_boxed):
         with pytest.raises(ValueError, match=r"equations has shape .* expected \(2,\) and bool"):
             make(A, b, equations, device="cpu")
-    assert form.mixed_to_lcp(A, b, [True, False], device="cpu").b == pytest.approx([-2.25])  # -2.5 + 0.5 / 2
+    # -2.5 + 0.5 / 2
+    assert form.mixed_to_lcp(A, b, [True, False], device="cpu").b == pytest.approx([-2.25])
 
 
 def test_bounds_of_a_box_may_be_numbers():
     A, b = np.array([[2.0, -1.0], [-1.0, 2.0]]), np.array([0.5, -2.5])
-    new, same = (form.boxed_to_lcp(A, b, *box, device="cpu") for box in ((0, 1.25), (np.zeros(2), np.full(2, 1.25))))
+    new, same = (
+        form.boxed_to_lcp(A, b, *box, device="cpu")
+        for box in ((0, 1.25), (np.zeros(2), np.full(2, 1.25)))
+    )
     np.testing.assert_array_equal(new.A, same.A)
-    np.testing.assert_allclose(new.back(lemke(new.A, new.b)), boxed(A, b, np.zeros(2), np.full(2, 1.25)), atol=1e-12)
+    np.testing.assert_allclose(
+        new.back(lemke(new.A, new.b)), boxed(A, b, np.zeros(2), np.full(2, 1.25)), atol=1e-12
+    )

@@ -12,7 +12,8 @@ from warp_lcp.problem.protocol import families
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.scale import scale_by_products, scale_of_matrix
 
-TINY = (np.array([[1e-8, -1.0], [1.0, 1e-8]]), np.array([1.0, -1.0]))  # x = (1, 1); (1, 1e-8) and (71, .95) once passed
+# x = (1, 1); (1, 1e-8) and (71, .95) once passed
+TINY = (np.array([[1e-8, -1.0], [1.0, 1e-8]]), np.array([1.0, -1.0]))
 SOLVE_IT = ["interior-point", "lemke", "minimum-map-newton", "primal-dual-active-set"]
 
 
@@ -20,7 +21,12 @@ class Shown:
     """An operator of a user's own: products and the diagonal, no entries."""
 
     def __init__(self, A):
-        self._A, self.shape, self.dtype, self.device = A, (len(A),), wp.float64, wp.get_device("cpu")
+        self._A, self.shape, self.dtype, self.device = (
+            A,
+            (len(A),),
+            wp.float64,
+            wp.get_device("cpu"),
+        )
         self.symmetric = bool((A == A.T).all())
 
     def apply(self, x, out=None, A=None):
@@ -40,16 +46,28 @@ class Shown:
 
 
 def operator(A, kind):
-    made = {"dense": wl.DenseOperator, "sparse": lambda A, device: wl.SparseOperator(scipy.sparse.csr_array(A), device=device)}
+    made = {
+        "dense": wl.DenseOperator,
+        "sparse": lambda A, device: wl.SparseOperator(scipy.sparse.csr_array(A), device=device),
+    }
     return made[kind](A, device="cpu")
 
 
 def program(seed, m=20, n=20):
     """A linear program min c'x, G x >= h, x >= 0 of 40 unknowns with its dual, as an LCP with eps I, and c, G, h."""
     rng = np.random.default_rng([7919, seed])
-    G, x, u = rng.uniform(-1, 1, (m, n)), rng.random(n) * (rng.random(n) < 0.5), rng.random(m) * (rng.random(m) < 0.5)
-    h, c = G @ x - np.where(u > 0, 0.0, rng.random(m)), G.T @ u + np.where(x > 0, 0.0, rng.random(n))
-    M = np.block([[np.zeros((n, n)), -G.T], [G, np.zeros((m, m))]]) + 10.0 ** rng.uniform(-12, -7) * np.eye(n + m)
+    G, x, u = (
+        rng.uniform(-1, 1, (m, n)),
+        rng.random(n) * (rng.random(n) < 0.5),
+        rng.random(m) * (rng.random(m) < 0.5),
+    )
+    h, c = (
+        G @ x - np.where(u > 0, 0.0, rng.random(m)),
+        G.T @ u + np.where(x > 0, 0.0, rng.random(n)),
+    )
+    M = np.block([[np.zeros((n, n)), -G.T], [G, np.zeros((m, m))]]) + 10.0 ** rng.uniform(
+        -12, -7
+    ) * np.eye(n + m)
     return M, np.r_[c, -h], c, G, h
 
 
@@ -65,7 +83,9 @@ def unscaled(M, b, x):
 
 
 @pytest.mark.parametrize("kind", ["dense", "sparse"])
-@pytest.mark.parametrize("method", [n for n, cls in wl.METHODS.items() if families(cls) and n != "blocked-gauss-seidel"])
+@pytest.mark.parametrize(
+    "method", [n for n, cls in wl.METHODS.items() if families(cls) and n != "blocked-gauss-seidel"]
+)
 def test_a_tiny_diagonal_hides_nothing(method, kind):
     M, b = TINY
     try:
@@ -86,7 +106,11 @@ def test_linear_programs_have_their_optimum_or_are_not_solved(method, kind):
         M, b, c, G, h = program(seed)
         problem = wl.LCP(operator(M, kind), b)
         result = wl.solve(problem, wl.default_chain(wl.METHODS[method](), problem))
-        assert result or (method, kind) in {("fischer-newton", "dense"), ("fischer-newton", "sparse"), ("primal-dual-active-set", kind)}
+        assert result or (method, kind) in {
+            ("fischer-newton", "dense"),
+            ("fischer-newton", "sparse"),
+            ("primal-dual-active-set", kind),
+        }
         if result:
             best = linprog(c, A_ub=-G, b_ub=-h).fun
             assert c @ result.x.numpy()[:20] == pytest.approx(best, rel=1e-3, abs=1e-3)
@@ -98,7 +122,10 @@ def test_units_of_rows_and_columns_are_the_users(method):
     for seed in range(4):
         M, b, *_ = program(seed)
         rng = np.random.default_rng(seed)
-        R, C = 10.0 ** rng.uniform(-4, 4, 40) if seed % 2 else np.ones(40), 10.0 ** rng.uniform(-8, 8, 40)
+        R, C = (
+            10.0 ** rng.uniform(-4, 4, 40) if seed % 2 else np.ones(40),
+            10.0 ** rng.uniform(-8, 8, 40),
+        )
         problem = wl.LCP(operator(R[:, None] * M * C, "dense"), R * b)
         result = wl.solve(problem, wl.default_chain(wl.METHODS[method](), problem))
         assert result, (seed, result.status)
@@ -150,7 +177,10 @@ def test_grids_keep_their_stencil():
     coupled = wl.SumOperator(A, low)
     found = NaturalResidual(wl.LCP(coupled, np.ones((2, 3))))
     inside = problem.unknown.numpy() == 1
-    np.testing.assert_array_equal(found.diagonal.numpy()[inside], problem.layout.load(coupled.diagonal(), wp.float64).numpy()[inside])
+    np.testing.assert_array_equal(
+        found.diagonal.numpy()[inside],
+        problem.layout.load(coupled.diagonal(), wp.float64).numpy()[inside],
+    )
 
 
 def test_an_operator_that_shows_its_diagonal_only():
@@ -167,7 +197,9 @@ def test_an_operator_that_shows_its_diagonal_only():
     d = scale_by_products(np.diag(skew), skew.__matmul__, skew.T.__matmul__)
     assert (d >= scale_of_matrix(skew) / 2).all()
     assert (d <= 12 * scale_of_matrix(skew)).all()
-    np.testing.assert_array_equal(NaturalResidual(wl.LCP(Shown(grid), np.ones(30))).diagonal.numpy(), 2.0)
+    np.testing.assert_array_equal(
+        NaturalResidual(wl.LCP(Shown(grid), np.ones(30))).diagonal.numpy(), 2.0
+    )
 
 
 def test_entries_that_change_change_the_scale():

@@ -53,13 +53,19 @@ def test_no_method_calls_the_start_a_solution(name):
     np.testing.assert_allclose(result.x.numpy(), [0.5, 0.0], atol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["minimum-map-newton", "projected-multigrid", "mprgp", "psor", "fischer-newton"])
+@pytest.mark.parametrize(
+    "name", ["minimum-map-newton", "projected-multigrid", "mprgp", "psor", "fischer-newton"]
+)
 @pytest.mark.parametrize("kind", ["poisson", "stencil"])
 def test_nor_on_grids(name, kind):
     cells = np.ones((6, 7), dtype=int)
     cells[0] = wl.AIR
     five = np.array([[0.0, -1, 0], [-1, 4, -1], [0, -1, 0]])
-    A = wl.GridPoisson(cells, device="cpu") if kind == "poisson" else wl.Stencil(cells, five, device="cpu")
+    A = (
+        wl.GridPoisson(cells, device="cpu")
+        if kind == "poisson"
+        else wl.Stencil(cells, five, device="cpu")
+    )
     b = np.full((6, 7), -1.0)
     b[3, 3] = 1e16
     result = wl.solve(wl.LCP(A, b), METHODS[name](), stopping=CRITERIA)
@@ -67,7 +73,10 @@ def test_nor_on_grids(name, kind):
     x = result.x.numpy()
     free = np.ones((6, 7))
     free[3, 3] = free[0] = 0
-    again = wl.solve(wl.LCP(A, np.where(free, b, 0.0), 0.0, np.where(free, np.inf, 0.0)), stopping=wl.StoppingCriteria(rtol=1e-9))
+    again = wl.solve(
+        wl.LCP(A, np.where(free, b, 0.0), 0.0, np.where(free, np.inf, 0.0)),
+        stopping=wl.StoppingCriteria(rtol=1e-9),
+    )
     assert again
     np.testing.assert_allclose(x, again.x.numpy(), atol=1e-3)
     assert x.max() > 5
@@ -86,7 +95,9 @@ def test_rounding_is_judged_row_by_row():
             residual = NaturalResidual(problem)
             residual.start(wp.array(x, dtype=wp.float64, device="cpu"), keep=True)
             rows = np.abs(A @ x + b) <= 4 * EPS * (np.abs(b) + np.abs(A) @ np.abs(x))
-            assert residual.is_rounding(wp.array(x, dtype=wp.float64, device="cpu")) == bool(rows.all())
+            assert residual.is_rounding(wp.array(x, dtype=wp.float64, device="cpu")) == bool(
+                rows.all()
+            )
 
 
 def test_a_start_that_solves_up_to_rounding_takes_no_steps():

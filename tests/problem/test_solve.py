@@ -15,10 +15,14 @@ def poisson(n=16, seed=7, device="cpu", **options):
     """A pool with AIR above, right-hand side random."""
     cells = np.ones((n, n), dtype=int)
     cells[-1] = wl.AIR
-    return wl.GridPoisson(cells, device=device, **options), np.random.default_rng(seed).standard_normal((n, n))
+    return wl.GridPoisson(cells, device=device, **options), np.random.default_rng(
+        seed
+    ).standard_normal((n, n))
 
 
-@pytest.fixture(params=[wl.MinimumMapNewton(), wl.ProjectedMultigrid()], ids=["newton", "multigrid"])
+@pytest.fixture(
+    params=[wl.MinimumMapNewton(), wl.ProjectedMultigrid()], ids=["newton", "multigrid"]
+)
 def method(request):
     return request.param
 
@@ -29,7 +33,12 @@ class Ring:
     symmetric = True
 
     def __init__(self, n, symmetric=True):
-        self.shape, self.dtype, self.device, self.symmetric = (n,), wp.float64, wp.get_device("cpu"), symmetric
+        self.shape, self.dtype, self.device, self.symmetric = (
+            (n,),
+            wp.float64,
+            wp.get_device("cpu"),
+            symmetric,
+        )
 
     def apply(self, x, out=None):
         v = x.numpy()
@@ -54,7 +63,9 @@ def test_natural_residual_is_the_definition_and_scales_with_y():
     d, fluid = A.diagonal().numpy(), np.arange(16)[:, None] < 15
     r = np.where(fluid, np.minimum(d * x, y), 0)
     assert result.residual == pytest.approx(np.linalg.norm(r), rel=1e-12)
-    assert result.relative_residual == pytest.approx(np.linalg.norm(r) / np.linalg.norm(np.where(fluid, np.minimum(0, b), 0)), rel=1e-12)
+    assert result.relative_residual == pytest.approx(
+        np.linalg.norm(r) / np.linalg.norm(np.where(fluid, np.minimum(0, b), 0)), rel=1e-12
+    )
 
 
 def test_history_counts_and_limits_are_exact():
@@ -105,10 +116,17 @@ def test_reused_workspace_gives_the_same_answer_bit_for_bit(method):
 @pytest.mark.parametrize("name", grid_methods())
 def test_in_place_problem_follows_changed_cells_and_b(name):
     """Cells go, and others come to the right of the last ones in their rows: a workspace takes the steps of a new one."""
-    solver, b, cells = wl.METHODS[name](), np.random.default_rng(7).standard_normal((12, 40)), np.full((3, 12, 40), wl.AIR, dtype=np.int8)
+    solver, b, cells = (
+        wl.METHODS[name](),
+        np.random.default_rng(7).standard_normal((12, 40)),
+        np.full((3, 12, 40), wl.AIR, dtype=np.int8),
+    )
     cells[0, 1:-1, :9], cells[1, 1:-1, 4:], cells[2, :-1, :5] = wl.FLUID, wl.FLUID, wl.FLUID
     A = wl.GridPoisson(cells[0], device="cpu")
-    fields = [wp.full(A.layout.stored_shape, value, dtype=wp.float64, device="cpu") for value in (0.0, 0.0, np.inf)]
+    fields = [
+        wp.full(A.layout.stored_shape, value, dtype=wp.float64, device="cpu")
+        for value in (0.0, 0.0, np.inf)
+    ]
     problem = wl.LCP(A, *fields)
     work = solver.init(problem)
     for now in cells[1:]:
@@ -117,7 +135,11 @@ def test_in_place_problem_follows_changed_cells_and_b(name):
         result = wl.solve(problem, solver, workspace=work)
         new = wl.solve(wl.LCP(wl.GridPoisson(now, device="cpu"), b), solver)
         assert tuple(result.x.shape) == A.layout.stored_shape
-        assert (result.status, result.iterations, result.linear_iterations) == (new.status, new.iterations, new.linear_iterations)
+        assert (result.status, result.iterations, result.linear_iterations) == (
+            new.status,
+            new.iterations,
+            new.linear_iterations,
+        )
         np.testing.assert_allclose(result.x.numpy()[1, 1:-1, 1:-1], new.x.numpy(), atol=1e-5)
 
 
@@ -125,7 +147,11 @@ def test_in_place_problem_follows_changed_cells_and_b(name):
 def test_an_in_place_problem_has_its_solution_in_one_array(precision):
     """x lies where the last one did, of the method's precision; another workspace has another array."""
     A, _ = poisson()
-    b = wp.array(np.random.default_rng(7).standard_normal(A.layout.stored_shape), dtype=wp.float64, device="cpu")
+    b = wp.array(
+        np.random.default_rng(7).standard_normal(A.layout.stored_shape),
+        dtype=wp.float64,
+        device="cpu",
+    )
     problem, solver = wl.LCP(A, b), wl.ProjectedMultigrid(precision=precision)
     work, other = solver.init(problem), solver.init(problem)
     first = wl.solve(problem, solver, workspace=work).x
@@ -141,11 +167,17 @@ def test_an_in_place_problem_has_its_solution_in_one_array(precision):
 
 def test_the_workspace_s_own_iterate_may_be_the_guess(method):
     A, _ = poisson()
-    b = wp.array(np.random.default_rng(7).standard_normal(A.layout.stored_shape), dtype=wp.float64, device="cpu")
+    b = wp.array(
+        np.random.default_rng(7).standard_normal(A.layout.stored_shape),
+        dtype=wp.float64,
+        device="cpu",
+    )
     problem, solver = wl.LCP(A, b), method
     work = solver.init(problem)
     first = wl.solve(problem, solver, workspace=work, stopping=wl.StoppingCriteria(rtol=1e-8))
-    again = wl.solve(problem, solver, workspace=work, x0=first.x, stopping=wl.StoppingCriteria(rtol=1e-7))
+    again = wl.solve(
+        problem, solver, workspace=work, x0=first.x, stopping=wl.StoppingCriteria(rtol=1e-7)
+    )
     assert again.iterations == 0
     assert bool(again)
 
@@ -153,7 +185,9 @@ def test_the_workspace_s_own_iterate_may_be_the_guess(method):
 def test_own_operator_through_the_protocol():
     rng = np.random.default_rng(19)
     n, A = 40, Ring(40)
-    dense = np.array([A.apply(wp.array(e, dtype=wp.float64, device="cpu")).numpy() for e in np.eye(n)])
+    dense = np.array(
+        [A.apply(wp.array(e, dtype=wp.float64, device="cpu")).numpy() for e in np.eye(n)]
+    )
     b = rng.standard_normal(n)
     assert isinstance(A, wl.Operator)
     result = wl.solve(wl.LCP(A, b), wl.MinimumMapNewton(), stopping=wl.StoppingCriteria(rtol=1e-10))
@@ -166,8 +200,13 @@ def test_without_a_method_the_fastest_is_taken():
     dense = wl.LCP(wl.DenseOperator(np.eye(3), device="cpu"), -np.ones(3))
     assert isinstance(wl.default_method(wl.LCP(A, b)), wl.ProjectedMultigrid)
     assert isinstance(wl.default_method(dense), wl.MinimumMapNewton)
-    friction = wl.LCP(wl.DenseOperator(np.eye(2), device="cpu"), -np.ones(2), *wl.AffineBounds.friction([-1, 0], 0.5))
-    np.testing.assert_allclose(wl.solve(friction).x.numpy(), [1.0, 0.5], atol=1e-5)  # x_n = 1, and x_t = 1 beyond mu x_n
+    friction = wl.LCP(
+        wl.DenseOperator(np.eye(2), device="cpu"),
+        -np.ones(2),
+        *wl.AffineBounds.friction([-1, 0], 0.5),
+    )
+    # x_n = 1, and x_t = 1 beyond mu x_n
+    np.testing.assert_allclose(wl.solve(friction).x.numpy(), [1.0, 0.5], atol=1e-5)
     assert wl.solve(wl.LCP(A, b)).history[1].step == "monotone cycle"
     assert wl.solve(dense)
     with pytest.raises(ValueError, match="pass the solver"):
@@ -232,7 +271,16 @@ def test_psor_settings_are_checked(bad):
         wl.ProjectedSOR(**bad)
 
 
-@pytest.mark.parametrize("bad", [{"eta": 0.0}, {"monotone_cycles": -1}, {"max_linear_iterations": 0}, {"memory": 0}, {"backtracks": -1}])
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"eta": 0.0},
+        {"monotone_cycles": -1},
+        {"max_linear_iterations": 0},
+        {"memory": 0},
+        {"backtracks": -1},
+    ],
+)
 def test_newton_settings_are_checked(bad):
     with pytest.raises(ValueError, match=next(iter(bad))):
         wl.MinimumMapNewton(**bad)
@@ -243,7 +291,11 @@ class TestStatuses:
 
     def test_floor(self, method):
         A, b = poisson()
-        result = wl.solve(wl.LCP(A, b), replace(method, precision="single"), stopping=wl.StoppingCriteria(rtol=1e-12, patience=8))
+        result = wl.solve(
+            wl.LCP(A, b),
+            replace(method, precision="single"),
+            stopping=wl.StoppingCriteria(rtol=1e-12, patience=8),
+        )
         assert result.status is wl.SolveStatus.FLOOR
         assert result.x.dtype is wp.float32
         assert 1e-9 < result.relative_residual < 1e-4
@@ -254,17 +306,26 @@ class TestStatuses:
 
     def test_stagnated(self):
         A, b = poisson(32)
-        result = wl.solve(wl.LCP(A, b), wl.ProjectedSOR(omega=1.99), stopping=wl.StoppingCriteria(rtol=1e-14, patience=1))
+        result = wl.solve(
+            wl.LCP(A, b),
+            wl.ProjectedSOR(omega=1.99),
+            stopping=wl.StoppingCriteria(rtol=1e-14, patience=1),
+        )
         assert result.status is wl.SolveStatus.STAGNATED
 
     def test_diverged(self):
         A = np.array([[1.0, 3.0], [3.0, 1.0]])
         problem = wl.LCP(wl.DenseOperator(A, device="cpu"), np.array([-1.0, -2.0]), lower=-np.inf)
-        result = wl.solve(problem, wl.ProjectedSOR(omega=1.0), stopping=wl.StoppingCriteria(max_iterations=1000))
+        result = wl.solve(
+            problem, wl.ProjectedSOR(omega=1.0), stopping=wl.StoppingCriteria(max_iterations=1000)
+        )
         assert result.status is wl.SolveStatus.DIVERGED
-        assert result.residual == min(record.residual for record in result.history)  # the best iterate comes back, not the last
+        # the best iterate comes back, not the last
+        assert result.residual == min(record.residual for record in result.history)
         infinite = np.full(2, np.inf)
-        assert natural_residual(A, problem.b.numpy(), -infinite, infinite, result.x.numpy()) == pytest.approx(result.residual)
+        assert natural_residual(
+            A, problem.b.numpy(), -infinite, infinite, result.x.numpy()
+        ) == pytest.approx(result.residual)
 
     def test_non_finite(self):
         A, b = poisson()
@@ -279,7 +340,8 @@ class TestStatuses:
         problem = wl.LCP(wl.DenseOperator(A, device="cpu"), -np.ones(2))
         assert wl.solve(problem, wl.MinimumMapNewton()).status is wl.SolveStatus.NEGATIVE_CURVATURE
         assert wl.solve(problem, wl.Lemke()).status is wl.SolveStatus.INFEASIBLE
-        A = np.array([[3.0, 3.0, 9.0], [3.0, 2.0, -4.0], [9.0, -4.0, 9.0]])  # indefinite, with a positive diagonal
+        # indefinite, with a positive diagonal
+        A = np.array([[3.0, 3.0, 9.0], [3.0, 2.0, -4.0], [9.0, -4.0, 9.0]])
         indefinite = wl.LCP(wl.DenseOperator(A, device="cpu"), np.array([-4.0, 1.0, -2.0]))
         assert wl.solve(indefinite, wl.DirectEnumeration())
         result = wl.solve(indefinite, wl.MinimumMapNewton())
@@ -288,7 +350,10 @@ class TestStatuses:
     def test_infeasible_closed_pool(self, device, method):
         cells = np.full((6, 6), wl.SOLID)
         cells[1:-1, 1:-1] = wl.FLUID
-        A, b = wl.GridPoisson(cells, device=device), np.random.default_rng(13).standard_normal((6, 6))
+        A, b = (
+            wl.GridPoisson(cells, device=device),
+            np.random.default_rng(13).standard_normal((6, 6)),
+        )
         result = wl.solve(wl.LCP(A, b, lower=-np.inf), method)
         assert result.status is wl.SolveStatus.INFEASIBLE
         assert not result
@@ -296,14 +361,21 @@ class TestStatuses:
     def test_compatible_closed_pool_is_solved_with_mean_zero(self, device, method):
         cells = np.full((6, 7), wl.SOLID)
         cells[1:-1, 1:-1] = wl.FLUID
-        A, b = wl.GridPoisson(cells, device=device), np.random.default_rng(13).standard_normal((6, 7))
+        A, b = (
+            wl.GridPoisson(cells, device=device),
+            np.random.default_rng(13).standard_normal((6, 7)),
+        )
         fluid = cells == wl.FLUID
         b -= b[fluid].mean()
-        result = wl.solve(wl.LCP(A, b, lower=-np.inf), method, stopping=wl.StoppingCriteria(rtol=1e-9))
+        result = wl.solve(
+            wl.LCP(A, b, lower=-np.inf), method, stopping=wl.StoppingCriteria(rtol=1e-9)
+        )
         assert result, result.status
         assert abs(result.x.numpy()[fluid].mean()) < 1e-9
 
-    @pytest.mark.parametrize(("sign", "status"), [(1, wl.SolveStatus.CONVERGED), (-1, wl.SolveStatus.INFEASIBLE)])
+    @pytest.mark.parametrize(
+        ("sign", "status"), [(1, wl.SolveStatus.CONVERGED), (-1, wl.SolveStatus.INFEASIBLE)]
+    )
     def test_closed_pool_with_lower_bounds_needs_outflow(self, sign, status, device, method):
         cells = np.ones((5, 5), dtype=int)
         A = wl.GridPoisson(cells, device=device)
@@ -333,7 +405,10 @@ class TestStatuses:
         cells[3:6, 3:6] = wl.SOLID
         cells[4, 4] = wl.FLUID
         cells[-1] = wl.AIR
-        A, b = wl.GridPoisson(cells, device=device), np.random.default_rng(43).standard_normal((9, 9))
+        A, b = (
+            wl.GridPoisson(cells, device=device),
+            np.random.default_rng(43).standard_normal((9, 9)),
+        )
         assert wl.solve(wl.LCP(A, b, lower=-np.inf), method).status is wl.SolveStatus.INFEASIBLE
         b[4, 4] = 0
         assert wl.solve(wl.LCP(A, b, lower=-np.inf), method)
@@ -346,7 +421,10 @@ def test_a_blob_that_moves_through_a_reused_workspace(method, arrays, device):
     shape = (6, 40, 90)
     _, y, x = np.meshgrid(*(np.arange(n) for n in shape), indexing="ij")
     faces = {"face_x": rng.uniform(0.5, 1.0, (6, 40, 91))} if arrays else {}
-    blobs = [((x - cx) ** 2 + (y - cy) ** 2 < r**2) for cx, cy, r in [(20, 20, 12), (70, 12, 9), (45, 30, 8), (20, 20, 5)]]
+    blobs = [
+        ((x - cx) ** 2 + (y - cy) ** 2 < r**2)
+        for cx, cy, r in [(20, 20, 12), (70, 12, 9), (45, 30, 8), (20, 20, 5)]
+    ]
     A = wl.GridPoisson(np.where(blobs[0], wl.FLUID, wl.AIR), **faces, device=device)
     stored = A.layout.stored_shape
     b = wp.zeros(stored, dtype=wp.float64, device=device)
@@ -361,4 +439,8 @@ def test_a_blob_that_moves_through_a_reused_workspace(method, arrays, device):
         fresh = wl.solve(wl.LCP(wl.GridPoisson(cells, **faces, device=device), values), method)
         assert result, result.status
         assert result.iterations == fresh.iterations
-        np.testing.assert_allclose(result.x.numpy()[1:-1, 1:-1, 1:-1], fresh.x.numpy(), atol=1e-5 * np.abs(fresh.x.numpy()).max())
+        np.testing.assert_allclose(
+            result.x.numpy()[1:-1, 1:-1, 1:-1],
+            fresh.x.numpy(),
+            atol=1e-5 * np.abs(fresh.x.numpy()).max(),
+        )

@@ -32,16 +32,24 @@ def nothing_kept(monkeypatch):
 
 def faces_of(rng, shape):
     """Return coefficients of all faces."""
-    return {f"face_{a}": rng.uniform(0.5, 2.0, [n + (axis == i) for i, n in enumerate(shape)]) for axis, a in enumerate("zyx")}
+    return {
+        f"face_{a}": rng.uniform(0.5, 2.0, [n + (axis == i) for i, n in enumerate(shape)])
+        for axis, a in enumerate("zyx")
+    }
 
 
 def sides_of(rng, shape, kind):
     """Return bounds of a kind: numbers, fields that are coded, or other fields."""
     some, inf = rng.random(shape) < 0.3, np.inf
     return {
-        "obstacle": (0.0, inf), "none": (-inf, inf), "box": (-0.1, 0.2), "walls": (np.where(some, 0.0, -inf), inf),
-        "ceiling": (-inf, np.where(some, 0.0, inf)), "fields": (-rng.random(shape), rng.random(shape)), "negative zero": (-0.0, inf),
-    }[kind]  # fmt: skip
+        "obstacle": (0.0, inf),
+        "none": (-inf, inf),
+        "box": (-0.1, 0.2),
+        "walls": (np.where(some, 0.0, -inf), inf),
+        "ceiling": (-inf, np.where(some, 0.0, inf)),
+        "fields": (-rng.random(shape), rng.random(shape)),
+        "negative zero": (-0.0, inf),
+    }[kind]
 
 
 def drawn_problems(rng, shape, bounds, coefficients, count=3, **options):
@@ -55,7 +63,13 @@ def drawn_problems(rng, shape, bounds, coefficients, count=3, **options):
         cells[0, 0, :2] = wl.FLUID
         shift = {"shift": rng.random(shape)} if coefficients == "shift" else {}
         A = wl.GridPoisson(cells, device="cpu", **shift, **options)
-        made.append(wl.LCP(A, rng.standard_normal(shape) * 10.0 ** rng.integers(-2, 3), *sides_of(rng, shape, bounds)))
+        made.append(
+            wl.LCP(
+                A,
+                rng.standard_normal(shape) * 10.0 ** rng.integers(-2, 3),
+                *sides_of(rng, shape, bounds),
+            )
+        )
     return made
 
 
@@ -67,7 +81,9 @@ def bits_of(result):
 
 def both(problem, method, **options):
     """Return the bits of a solve, which may use the kept workspace, and of one on a new workspace."""
-    return bits_of(wl.solve(problem, method, **options)), bits_of(wl.solve(problem, method, workspace=method.init(problem), **options))
+    return bits_of(wl.solve(problem, method, **options)), bits_of(
+        wl.solve(problem, method, workspace=method.init(problem), **options)
+    )
 
 
 def ready(problem, method):
@@ -82,11 +98,16 @@ def test_a_kept_workspace_has_the_bits_of_a_new_one(seed, monkeypatch):
     """Problems of a form in both orders; bounds, coefficients, types, settings, threads and guesses are drawn."""
     rng = np.random.default_rng(seed)
     shape = [(6, 7, 9), (12, 10, 8), (1, 20, 13)][seed % 3]
-    bounds = ["obstacle", "none", "box", "walls", "ceiling", "fields", "negative zero"][rng.integers(7)]
+    bounds = ["obstacle", "none", "box", "walls", "ceiling", "fields", "negative zero"][
+        rng.integers(7)
+    ]
     coefficients = ["uniform", "shift", "faces"][rng.integers(3)]
     options = {"uniform": {"face_x": 2.0}, "shift": {}, "faces": faces_of(rng, shape)}[coefficients]
     dtype = [wp.float32, wp.float64][rng.integers(2)]
-    method, x0 = METHODS[seed % len(METHODS)], rng.standard_normal(shape) if rng.random() < 0.3 else None
+    method, x0 = (
+        METHODS[seed % len(METHODS)],
+        rng.standard_normal(shape) if rng.random() < 0.3 else None,
+    )
     wl.set_threads(1 + seed % 2)
     taken = []
     take = LCP.take
@@ -109,10 +130,27 @@ def test_problems_of_other_forms_have_workspaces_of_their_own():
         wl.solve(wl.LCP(wl.GridPoisson(cells, device="cpu", **options), b, *sides), method)
         return KEPT.last
 
-    forms = [form(), form(-0.0), form(-1.0), form(0.0, 1.0), form(b * 0 - 1.0), form(b * 0 - 1.0, b * 0 + 1.0), form(-abs(b))]
-    forms += [form(face_x=2.0), form(shift=0.5), form(dtype=wp.float64, face_y=2.0), form(periodic=(True, False, False))]
+    forms = [
+        form(),
+        form(-0.0),
+        form(-1.0),
+        form(0.0, 1.0),
+        form(b * 0 - 1.0),
+        form(b * 0 - 1.0, b * 0 + 1.0),
+        form(-abs(b)),
+    ]
+    forms += [
+        form(face_x=2.0),
+        form(shift=0.5),
+        form(dtype=wp.float64, face_y=2.0),
+        form(periodic=(True, False, False)),
+    ]
     forms += [form(method=other) for other in METHODS[1:]]
-    forms += [form(cells=cells[1:], b=b[1:]), form(cells=cells[0], b=b[0]), form(**faces_of(rng, cells.shape))]
+    forms += [
+        form(cells=cells[1:], b=b[1:]),
+        form(cells=cells[0], b=b[0]),
+        form(**faces_of(rng, cells.shape)),
+    ]
     wl.set_threads(2 if wl.get_threads() == 1 else 1)
     forms += [form()]
     assert len(set(forms)) == len(forms)
@@ -121,7 +159,10 @@ def test_problems_of_other_forms_have_workspaces_of_their_own():
 
 def test_problems_without_copies(monkeypatch):
     """Fields in place, operators of subclasses, masked ones, many cells: each solve has a workspace of its own."""
-    cells, b = np.full((6, 7, 9), wl.FLUID, np.int8), np.random.default_rng(0).standard_normal((6, 7, 9))
+    cells, b = (
+        np.full((6, 7, 9), wl.FLUID, np.int8),
+        np.random.default_rng(0).standard_normal((6, 7, 9)),
+    )
     cells[:, -1:] = wl.AIR
     A, method = wl.GridPoisson(cells, device="cpu"), METHODS[0]
     stored = wp.array(np.pad(b, 1), dtype=wp.float64, device="cpu")
@@ -133,7 +174,13 @@ def test_problems_without_copies(monkeypatch):
         pass
 
     masked = A.masked(np.where(cells == wl.FLUID, 1, 0))
-    own = [wl.LCP(A, stored), wl.LCP(A, b, stored), wl.LCP(Other(cells, device="cpu"), b), OtherProblem(A, b), wl.LCP(masked, b)]
+    own = [
+        wl.LCP(A, stored),
+        wl.LCP(A, b, stored),
+        wl.LCP(Other(cells, device="cpu"), b),
+        OtherProblem(A, b),
+        wl.LCP(masked, b),
+    ]
     for problem in own:
         for _ in range(3):
             wl.solve(problem, method)
@@ -150,7 +197,11 @@ def test_the_kept_workspace_keeps_no_problem_and_can_be_freed():
     problems = drawn_problems(rng, (6, 7, 9), "fields", "uniform")
     guess = wp.array(np.zeros((8, 9, 11)), dtype=wp.float64, device="cpu")
     results = [wl.solve(problem, method, x0=guess) for problem in problems]
-    kept = [weakref.ref(p) for p in problems] + [weakref.ref(p.A) for p in problems] + [weakref.ref(p.b) for p in problems]
+    kept = (
+        [weakref.ref(p) for p in problems]
+        + [weakref.ref(p.A) for p in problems]
+        + [weakref.ref(p.b) for p in problems]
+    )
     kept += [weakref.ref(guess)]
     work = KEPT.workspace.work
     held = sum(a.capacity for a in (work.x, work.problem.b, work._p)) + work.hierarchy.nbytes
@@ -165,7 +216,9 @@ def test_the_kept_workspace_keeps_no_problem_and_can_be_freed():
     ready(drawn_problems(rng, (7, 7, 9), "fields", "uniform")[0], method)  # replaces it
     gc.collect()
     assert work() is None
-    assert [np.array_equal(result.x.numpy(), x) for result, x in zip(results, first, strict=True)] == [True] * 3
+    assert [
+        np.array_equal(result.x.numpy(), x) for result, x in zip(results, first, strict=True)
+    ] == [True] * 3
     work = weakref.ref(KEPT.workspace.work)
     wl.release_workspace()
     gc.collect()
@@ -174,9 +227,15 @@ def test_the_kept_workspace_keeps_no_problem_and_can_be_freed():
 
 def test_solves_that_end_badly_and_rows_alone_keep_nothing():
     """A workspace in which something may be infinite is not used again, nor one of which the result is a part."""
-    method, problem = METHODS[0], drawn_problems(np.random.default_rng(5), (6, 7, 9), "obstacle", "uniform")[0]
+    method, problem = (
+        METHODS[0],
+        drawn_problems(np.random.default_rng(5), (6, 7, 9), "obstacle", "uniform")[0],
+    )
     ready(problem, method)
-    assert wl.solve(problem, method, stopping=wl.StoppingCriteria(rtol=1e-8, max_iterations=1)).status is wl.SolveStatus.MAX_ITERATIONS
+    assert (
+        wl.solve(problem, method, stopping=wl.StoppingCriteria(rtol=1e-8, max_iterations=1)).status
+        is wl.SolveStatus.MAX_ITERATIONS
+    )
     assert KEPT.workspace is None
     ready(problem, method)
     with pytest.raises(ValueError, match="x0 holds"):
@@ -184,7 +243,9 @@ def test_solves_that_end_badly_and_rows_alone_keep_nothing():
     assert KEPT.workspace is None
     cells = np.full((1, 1, 40), wl.FLUID, np.int8)
     cells[..., -1] = wl.AIR
-    row = wl.LCP(wl.GridPoisson(cells, device="cpu"), np.random.default_rng(0).standard_normal((1, 1, 40)))
+    row = wl.LCP(
+        wl.GridPoisson(cells, device="cpu"), np.random.default_rng(0).standard_normal((1, 1, 40))
+    )
     wl.solve(row, method)
     before = wl.solve(row, method)
     x = before.x.numpy().copy()
@@ -195,11 +256,18 @@ def test_solves_that_end_badly_and_rows_alone_keep_nothing():
 
 def test_solves_within_solves_and_in_threads():
     """A workspace serves one solve at a time."""
-    method, problems = METHODS[0], drawn_problems(np.random.default_rng(6), (12, 10, 8), "walls", "uniform", count=4)
+    method, problems = (
+        METHODS[0],
+        drawn_problems(np.random.default_rng(6), (12, 10, 8), "walls", "uniform", count=4),
+    )
     expected = [bits_of(wl.solve(p, method, workspace=method.init(p))) for p in problems]
     ready(problems[0], method)
     inner = []
-    outer = wl.solve(problems[1], method, callback=lambda record: inner.append(bits_of(wl.solve(problems[2], method))))
+    outer = wl.solve(
+        problems[1],
+        method,
+        callback=lambda record: inner.append(bits_of(wl.solve(problems[2], method))),
+    )
     assert bits_of(outer) == expected[1]
     assert inner == [expected[2]] * len(inner)
     assert inner

@@ -53,14 +53,23 @@ def solves(up, method, *, in_place):
             result = wl.solve(problem, method, stopping=STOPPING, x0=guess, workspace=work)
             assert result
             found.append((result.x.numpy().copy(), [r.residual for r in result.history]))
-        x0 = np.random.default_rng(71).standard_normal(found[-1][0].shape) * 0.01  # of cells without liquid, too
+        # of cells without liquid, too
+        x0 = np.random.default_rng(71).standard_normal(found[-1][0].shape) * 0.01
     return A, found
 
 
 @pytest.mark.cpu_form("boxes that are partly in use are the CPU's")
 @pytest.mark.parametrize("in_place", [False, True])
 @pytest.mark.parametrize("up", [0, 1])
-@pytest.mark.parametrize("method", [wl.ProjectedMultigrid(), wl.ProjectedMultigrid(precision="double"), wl.MinimumMapNewton(), wl.MPRGP()])
+@pytest.mark.parametrize(
+    "method",
+    [
+        wl.ProjectedMultigrid(),
+        wl.ProjectedMultigrid(precision="double"),
+        wl.MinimumMapNewton(),
+        wl.MPRGP(),
+    ],
+)
 def test_bits_are_those_of_a_problem_that_looks_through_its_box(method, up, in_place, monkeypatch):
     monkeypatch.setattr(grid_operator, "LARGE", 1 << 40)
     whole, expected = solves(up, method, in_place=in_place)
@@ -88,7 +97,9 @@ def test_passes_take_the_chunks_that_have_been_in_use(up, monkeypatch):
     ends = A.stencil.spans.numpy()[..., 1]
     np.testing.assert_array_equal(ends > 0, fluid[1:-1, 1:-1].any(axis=2))
     assert flat.sum() < (0.35, 0.8)[up] * flat.size
-    assert Rows.of_fields(A.layout).places == Rows.flat(A.layout.size, A.device).places == len(chunks)
+    assert (
+        Rows.of_fields(A.layout).places == Rows.flat(A.layout.size, A.device).places == len(chunks)
+    )
     A.update(wp.array(liquid(up, 0.05), device="cpu"))
     np.testing.assert_array_equal(A.layout.chunks.numpy()[:, 0], chunks)
 
@@ -122,10 +133,14 @@ for grid_operator.LARGE in (1 << 20, 1 << 40):
 """
 
 
-@pytest.mark.skipif(resident_bytes() == 0, reason="the system does not tell how much memory is resident")
+@pytest.mark.skipif(
+    resident_bytes() == 0, reason="the system does not tell how much memory is resident"
+)
 def test_fields_take_the_memory_of_the_liquid():
     """In a process of its own: here memory freed by other tests would be taken again."""
-    done = subprocess.run([sys.executable, "-c", TAKEN], check=True, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(
+        [sys.executable, "-c", TAKEN], check=True, capture_output=True, text=True, timeout=300
+    )
     sparse, whole = map(int, done.stdout.split()[-2:])
     assert sparse < 0.35 * whole
 

@@ -26,7 +26,10 @@ def grid(rng, kind, dtype):
     shape = tuple(int(n) for n in rng.integers(3, 8, rng.integers(2, 4)))
     cells = rng.choice(3, shape, p=[0.2, 0.7, 0.1])
     cells[(0,) * len(shape)] = wl.FLUID
-    faces = [drawn(rng, kind, tuple(n + (k == len(shape) - 1 - a) for k, n in enumerate(shape))) for a in range(len(shape))]
+    faces = [
+        drawn(rng, kind, tuple(n + (k == len(shape) - 1 - a) for k, n in enumerate(shape)))
+        for a in range(len(shape))
+    ]
     shift = drawn(rng, kind, shape) if rng.random() < 0.5 else None
     names = dict(zip(("face_x", "face_y", "face_z"), faces, strict=False))
     A = wl.GridPoisson(cells, **names, shift=shift, device="cpu", dtype=dtype)
@@ -45,7 +48,13 @@ def stencil(rng, kind, dtype):
             there = row + np.array([j, i])
             if ((there >= 0) & (there < (n, m))).all():
                 matrix[row[0] * m + row[1], there[0] * m + there[1]] = values[tuple(row)]
-    A = wl.Stencil(np.full((n, m), wl.FLUID), {(0, 0): center, **around}, outside=wl.AIR, device="cpu", dtype=dtype)
+    A = wl.Stencil(
+        np.full((n, m), wl.FLUID),
+        {(0, 0): center, **around},
+        outside=wl.AIR,
+        device="cpu",
+        dtype=dtype,
+    )
     return A, matrix, np.ones(n * m, dtype=bool)
 
 
@@ -54,7 +63,11 @@ def matrix(rng, kind, dtype, dense):
     A = -drawn(rng, kind, (n, n)) * (rng.random((n, n)) < 0.2)
     np.fill_diagonal(A, 2.0 ** np.ceil(np.log2(1 - A.sum(axis=1))))
     given = A if dense else scipy.sparse.csr_array(A)
-    return (wl.DenseOperator if dense else wl.SparseOperator)(given, device="cpu", dtype=dtype), A, np.ones(n, dtype=bool)
+    return (
+        (wl.DenseOperator if dense else wl.SparseOperator)(given, device="cpu", dtype=dtype),
+        A,
+        np.ones(n, dtype=bool),
+    )
 
 
 FAMILIES = {
@@ -86,7 +99,8 @@ def check(family, kind, seed, dtype=wp.float32):
         return None
     assert tight.relative_residual <= 1e-10, (seed, tight.status)
     assert (tight.status is wl.SolveStatus.FLOOR) == (A.storage_rounding() > 1e-10), seed
-    if tight and not (kind == "of float32" and dtype is wp.float32):  # there sums on the diagonal are rounded
+    # there sums on the diagonal are rounded
+    if tight and not (kind == "of float32" and dtype is wp.float32):
         assert residual(M, b, x) <= 2e-10 * size, seed
     return tight.status
 
@@ -96,8 +110,12 @@ def check(family, kind, seed, dtype=wp.float32):
 def test_what_is_converged_is_so_for_the_coefficients_that_were_given(family, kind):
     for seed in range(6):
         found = check(family, kind, seed)
-        rounded = kind == "any" or (kind == "of float32" and family == "stencil")  # whose center is a sum
-        assert found in (None, wl.SolveStatus.FLOOR if rounded else wl.SolveStatus.CONVERGED), (seed, found)
+        # whose center is a sum
+        rounded = kind == "any" or (kind == "of float32" and family == "stencil")
+        assert found in (None, wl.SolveStatus.FLOOR if rounded else wl.SolveStatus.CONVERGED), (
+            seed,
+            found,
+        )
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -111,7 +129,12 @@ def test_the_rounding_is_the_largest_relative_one():
     A = wl.GridPoisson(np.ones((3, 4), dtype=int), **faces, device="cpu")
     of_tenth = abs(float(np.float32(0.1)) - 0.1) / 0.1
     assert A.storage_rounding() == pytest.approx(of_tenth)
-    assert wl.GridPoisson(np.ones((3, 4), dtype=int), face_x=0.1, face_y=0.1, device="cpu").storage_rounding() == 0.0
+    assert (
+        wl.GridPoisson(
+            np.ones((3, 4), dtype=int), face_x=0.1, face_y=0.1, device="cpu"
+        ).storage_rounding()
+        == 0.0
+    )
     entries = np.array([[1.0, -0.1], [0.0, 1.0]])
     sparse = wl.SparseOperator(scipy.sparse.csr_array(entries), device="cpu", dtype=wp.float32)
     for A in (wl.DenseOperator(entries, device="cpu", dtype=wp.float32), sparse):
@@ -127,13 +150,22 @@ def test_arrays_of_float32_are_what_was_given():
     cells = np.ones((6, 7), dtype=int)
     cells[0] = wl.AIR
     face = wp.array(np.full((3, 8, 9), 0.1), dtype=wp.float32, device="cpu")
-    problem = wl.LCP(wl.GridPoisson(cells, face_x=face, device="cpu"), np.random.default_rng(4).standard_normal(cells.shape))
+    problem = wl.LCP(
+        wl.GridPoisson(cells, face_x=face, device="cpu"),
+        np.random.default_rng(4).standard_normal(cells.shape),
+    )
     assert wl.solve(problem, stopping=TIGHT)
 
 
 def test_other_numberings_know_the_rounding():
-    T, I = scipy.sparse.diags_array([-0.1, 0.21, -0.1], offsets=[-1, 0, 1], shape=(260, 260)), scipy.sparse.eye_array(260)
-    A, order = (scipy.sparse.kron(T, I) + scipy.sparse.kron(I, T)).tocsr(), np.random.default_rng(6).permutation(260**2)
+    T, I = (
+        scipy.sparse.diags_array([-0.1, 0.21, -0.1], offsets=[-1, 0, 1], shape=(260, 260)),
+        scipy.sparse.eye_array(260),
+    )
+    A, order = (
+        (scipy.sparse.kron(T, I) + scipy.sparse.kron(I, T)).tocsr(),
+        np.random.default_rng(6).permutation(260**2),
+    )
     for dtype in (wp.float32, wp.float64):
         operator = wl.SparseOperator(A[order][:, order], device="cpu", dtype=dtype)
         found = operator.renumbered()

@@ -32,12 +32,19 @@ def test_pressure_far_from_air_is_that_of_the_linear_system(name):
     x = result.x.numpy()
     np.testing.assert_allclose(x, linear.x.numpy(), atol=1e-3 * x.max())
     if "strip" in name:  # the flux through a face is that of all cells before it
-        np.testing.assert_allclose(x[:, :-1] - x[:, 1:], np.arange(1, cells.shape[1]) * np.ones((len(cells), 1)), rtol=1e-3, atol=0.05)
+        np.testing.assert_allclose(
+            x[:, :-1] - x[:, 1:],
+            np.arange(1, cells.shape[1]) * np.ones((len(cells), 1)),
+            rtol=1e-3,
+            atol=0.05,
+        )
 
 
 @pytest.mark.parametrize("method", ["projected-multigrid", "minimum-map-newton", "mprgp"])
 @pytest.mark.parametrize(
-    "problem", [torsion(250, device="cpu"), torsion(250, 20.0, device="cpu"), dam(257, 385, device="cpu")], ids=lambda p: p.name
+    "problem",
+    [torsion(250, device="cpu"), torsion(250, 20.0, device="cpu"), dam(257, 385, device="cpu")],
+    ids=lambda p: p.name,
 )
 def test_boundaries_of_contact_do_not_creep(problem, method):
     result = wl.solve(problem.lcp(), wl.METHODS[method]())
@@ -46,9 +53,16 @@ def test_boundaries_of_contact_do_not_creep(problem, method):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("make", [lambda: torsion(1000, device="cpu"), lambda: torsion(2000, device="cpu"),
-                                  lambda: dam(1025, 1537, device="cpu"), lambda: dam(4097, 6145, device="cpu")],
-                         ids=["torsion-1000", "torsion-2000", "dam-1025", "dam-4097"])  # fmt: skip
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: torsion(1000, device="cpu"),
+        lambda: torsion(2000, device="cpu"),
+        lambda: dam(1025, 1537, device="cpu"),
+        lambda: dam(4097, 6145, device="cpu"),
+    ],
+    ids=["torsion-1000", "torsion-2000", "dam-1025", "dam-4097"],
+)
 def test_boundaries_of_contact_do_not_creep_on_large_grids(make):
     result = wl.solve(make().lcp())
     assert result, result.status
@@ -56,18 +70,24 @@ def test_boundaries_of_contact_do_not_creep_on_large_grids(make):
 
 
 @pytest.mark.parametrize(
-    "problem", [torsion(6, device="cpu"), torsion(6, 12.0, device="cpu"), dam(6, 8, device="cpu")], ids=lambda p: p.name
+    "problem",
+    [torsion(6, device="cpu"), torsion(6, 12.0, device="cpu"), dam(6, 8, device="cpu")],
+    ids=lambda p: p.name,
 )
 def test_obstacles_against_lemke(problem):
     dense = problem.dense()
     result = wl.solve(problem.lcp(), stopping=wl.StoppingCriteria(rtol=1e-10))
-    assert result.relative_residual <= 1e-10, result.status  # with the stored A; FLOOR where float32 has rounded that
+    # with the stored A; FLOOR where float32 has rounded that
+    assert result.relative_residual <= 1e-10, result.status
     x, fluid = result.x.numpy(), problem.sparse()
     rows = np.flatnonzero(problem.A.cells.numpy()[1, 1:-1, 1:-1].ravel() == wl.FLUID)
     n, gap = len(dense.b), dense.upper - dense.lower
     q = dense.b + dense.A @ dense.lower
     if np.isfinite(gap).all():  # w = A z + q + v, s = gap - z; z with w, v with s
-        z = lemke(np.block([[dense.A, np.eye(n)], [-np.eye(n), np.zeros((n, n))]]), np.concatenate([q, gap]))[:n]
+        z = lemke(
+            np.block([[dense.A, np.eye(n)], [-np.eye(n), np.zeros((n, n))]]),
+            np.concatenate([q, gap]),
+        )[:n]
     else:
         z = lemke(dense.A, q)
     np.testing.assert_allclose(x.ravel()[rows], fluid.lower + z, atol=1e-8 * np.abs(x).max())
@@ -88,7 +108,9 @@ def test_dam_is_that_of_its_definition(ny):
     assert 0 < wet.sum() < wet.size
 
 
-@pytest.mark.parametrize("faces", [{}, {"face_x": 2.0, "face_y": 0.5}, "arrays"], ids=["unit", "flat", "arrays"])
+@pytest.mark.parametrize(
+    "faces", [{}, {"face_x": 2.0, "face_y": 0.5}, "arrays"], ids=["unit", "flat", "arrays"]
+)
 @pytest.mark.parametrize("method", ["projected-multigrid", "minimum-map-newton"])
 def test_energy_is_that_of_the_definition(method, faces):
     rng = np.random.default_rng(20260217)
@@ -105,14 +127,19 @@ def test_energy_is_that_of_the_definition(method, faces):
     work.x.assign(problem.layout.load(x, wp.float64).numpy())
     work.residual.evaluate(work.x)
     inside = np.where(cells == 1, b, 0.0).ravel()
-    assert work.residual.energy == pytest.approx(0.5 * x.ravel() @ dense @ x.ravel() + inside @ x.ravel(), rel=1e-12)
+    assert work.residual.energy == pytest.approx(
+        0.5 * x.ravel() @ dense @ x.ravel() + inside @ x.ravel(), rel=1e-12
+    )
 
 
 @pytest.mark.parametrize("method", [wl.ProjectedMultigrid(), wl.MinimumMapNewton()])
 @pytest.mark.parametrize("size", [1e-3, 40.0])
 def test_a_projected_cycle_solves_a_few_cells(size, method):
     """All of them are on the coarsest level, whose sweeps come to the solution: of the problem itself, whatever its size."""
-    cells, rng = np.pad(np.ones((2, 3), dtype=np.int8), 1, constant_values=wl.AIR), np.random.default_rng(23)
+    cells, rng = (
+        np.pad(np.ones((2, 3), dtype=np.int8), 1, constant_values=wl.AIR),
+        np.random.default_rng(23),
+    )
     inside = cells.ravel() == wl.FLUID
     A, free = assemble(cells)[np.ix_(inside, inside)], 0
     for _ in range(10):
@@ -123,7 +150,9 @@ def test_a_projected_cycle_solves_a_few_cells(size, method):
         assert result.history[1].step == "monotone cycle"
         expected = boxed(A, *(v.ravel()[inside] for v in (b, low, high)))
         np.testing.assert_allclose(result.x.numpy().ravel()[inside], expected, atol=1e-4 * size)
-        free += np.count_nonzero((expected > low.ravel()[inside]) & (expected < high.ravel()[inside]))
+        free += np.count_nonzero(
+            (expected > low.ravel()[inside]) & (expected < high.ravel()[inside])
+        )
     assert 10 < free < 50
 
 
@@ -131,10 +160,16 @@ def test_projected_sweeps_lower_the_energy_from_anywhere():
     """What a solve falls back on if nothing else leads down converges: every sweep lowers the energy, for any iterate."""
     rng = np.random.default_rng(5150)
     cells = rng.choice([0, 1, 1, 1, 1, 2], size=(11, 8)).astype(np.int8)
-    problem = wl.LCP(wl.GridPoisson(cells, device="cpu"), rng.standard_normal(cells.shape), -0.5, 0.7)
+    problem = wl.LCP(
+        wl.GridPoisson(cells, device="cpu"), rng.standard_normal(cells.shape), -0.5, 0.7
+    )
     work = wl.ProjectedMultigrid(precision="double").init(problem)
     work.residual.start(work.x, keep=False)
-    work.x.assign(problem.layout.load(np.where(cells == 1, rng.uniform(-0.5, 0.7, cells.shape), 0.0), wp.float64).numpy())
+    work.x.assign(
+        problem.layout.load(
+            np.where(cells == 1, rng.uniform(-0.5, 0.7, cells.shape), 0.0), wp.float64
+        ).numpy()
+    )
     work.residual.settle_isolated(work.x)
     work.residual.evaluate(work.x)
     work.start(warm=False, tolerance=0.0)
@@ -194,7 +229,11 @@ def test_warm_starts_take_no_more_steps_than_cold_ones():
     n = 129
     X, Y = np.meshgrid(*(np.linspace(-2, 2, n),) * 2)
     cells = np.pad(np.ones((n - 2, n - 2), dtype=np.int8), 1)
-    A, b, x = wl.GridPoisson(cells, device="cpu", dtype=wp.float64), np.where(cells == 1, (4 / (n - 1)) ** 2, 0.0), None
+    A, b, x = (
+        wl.GridPoisson(cells, device="cpu", dtype=wp.float64),
+        np.where(cells == 1, (4 / (n - 1)) ** 2, 0.0),
+        None,
+    )
     for k in range(12):
         low = 0.5 - (X - 0.8 * np.cos(0.03 * k)) ** 2 - (Y - 0.8 * np.sin(0.03 * k)) ** 2
         cold = wl.solve(wl.LCP(A, b, low))
@@ -205,7 +244,10 @@ def test_warm_starts_take_no_more_steps_than_cold_ones():
 
 
 @pytest.mark.parametrize("method", ["projected-multigrid", "minimum-map-newton", "mprgp"])
-@pytest.mark.parametrize(("shape", "periodic"), [((17, 17, 17), (True, True, False)), ((60, 44), (True, True)), ((52, 75), (True, False))])
+@pytest.mark.parametrize(
+    ("shape", "periodic"),
+    [((17, 17, 17), (True, True, False)), ((60, 44), (True, True)), ((52, 75), (True, False))],
+)
 def test_boxes_that_one_bound_holds(shape, periodic, method):
     """Off its bound the box is singular: what b pushes it with is left to the bound, and the rest solved as without it."""
     rng = np.random.default_rng([*shape, 7])

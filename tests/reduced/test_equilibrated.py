@@ -13,7 +13,12 @@ from warp_lcp.solvers.interior_point import InteriorPoint
 TIGHT = wl.StoppingCriteria(rtol=1e-10)
 N = 40
 TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])
-METHODS = [InteriorPoint(), InteriorPoint(mehrotra=False), wl.MinimumMapNewton(), wl.PrimalDualActiveSet()]
+METHODS = [
+    InteriorPoint(),
+    InteriorPoint(mehrotra=False),
+    wl.MinimumMapNewton(),
+    wl.PrimalDualActiveSet(),
+]
 
 
 def name(method):
@@ -28,7 +33,11 @@ def matrix(kind, rng):
 
 
 def problem(A, b, kind, lower=0.0, upper=np.inf):
-    operator = wl.DenseOperator(A, device="cpu") if kind == "dense" else wl.SparseOperator(scipy.sparse.csr_array(A), device="cpu")
+    operator = (
+        wl.DenseOperator(A, device="cpu")
+        if kind == "dense"
+        else wl.SparseOperator(scipy.sparse.csr_array(A), device="cpu")
+    )
     return wl.LCP(operator, b, lower, upper)
 
 
@@ -44,7 +53,9 @@ def test_extreme_rows(kind, method):
         result = wl.solve(scaled, wl.default_chain(method, scaled))
         assert result, (seed, result.status)
         largest = D.max() / 100 < D  # the criterion is in units of y: it tells these rows from 0
-        np.testing.assert_array_equal((result.x.numpy() * D)[largest] < 1e-3, lemke(A, b)[largest] < 1e-3)
+        np.testing.assert_array_equal(
+            (result.x.numpy() * D)[largest] < 1e-3, lemke(A, b)[largest] < 1e-3
+        )
 
 
 @pytest.mark.parametrize("kind", ["dense", "sparse"])
@@ -60,7 +71,12 @@ def test_the_same_steps_in_any_units(kind):
             limits = (lower, upper) if np.isscalar(lower) else (lower / units, upper / units)
             p = problem(units[:, None] * A * units, units * b, kind, *limits)
             work = InteriorPoint().init(p)
-            result = wl.solve(p, InteriorPoint(), workspace=work, stopping=wl.StoppingCriteria(rtol=1e-30, max_iterations=9))
+            result = wl.solve(
+                p,
+                InteriorPoint(),
+                workspace=work,
+                stopping=wl.StoppingCriteria(rtol=1e-30, max_iterations=9),
+            )
             inner = work.inner
             residuals.extend([inner.residual.evaluate(inner.x), result.x.numpy() * units])
         histories.append((plain, scaled))
@@ -105,13 +121,18 @@ def test_entries_bounds_and_b_may_change_in_place(kind):
     work = InteriorPoint().init(p)
     assert isinstance(work, EquilibratedWorkspace)
     for units in (np.ones(N), D, 1 / D) if kind == "sparse" else (np.ones(N), np.full(N, 2.0)):
-        values, right = A if kind == "dense" else units[:, None] * A * units, units * rng.standard_normal(N)
+        values, right = (
+            A if kind == "dense" else units[:, None] * A * units,
+            units * rng.standard_normal(N),
+        )
         if kind == "sparse":
             p.A.update(scipy.sparse.csr_array(values))
         b.assign(right)
         upper.assign(0.5 / units)
         again = wl.solve(p, InteriorPoint(), workspace=work, stopping=TIGHT)
-        fresh = wl.solve(problem(values, right, kind, 0.0, 0.5 / units), InteriorPoint(), stopping=TIGHT)
+        fresh = wl.solve(
+            problem(values, right, kind, 0.0, 0.5 / units), InteriorPoint(), stopping=TIGHT
+        )
         assert again, again.status
         assert again.iterations == fresh.iterations
         np.testing.assert_allclose(again.x.numpy() * units, fresh.x.numpy() * units, atol=1e-6)
@@ -124,7 +145,9 @@ def test_a_guess_counts_in_any_units(kind):
     x, counts = lemke(A, b), []
     for units, guess in ((np.ones(N), None), (np.ones(N), x + 0.01), (D, x + 0.01)):
         p = problem(units[:, None] * A * units, units * b, kind)
-        result = wl.solve(p, InteriorPoint(), x0=None if guess is None else guess / units, stopping=TIGHT)
+        result = wl.solve(
+            p, InteriorPoint(), x0=None if guess is None else guess / units, stopping=TIGHT
+        )
         assert result, result.status
         np.testing.assert_allclose(result.x.numpy() * units, x, atol=1e-6)
         counts.append(result.iterations)

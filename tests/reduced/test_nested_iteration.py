@@ -26,7 +26,10 @@ def natural_residual(A, b, lower, upper, x):
 
 
 def relative_residual(p, x):
-    own, start = (natural_residual(p.A, p.b, p.lower, p.upper, at) for at in (x, np.clip(np.zeros(len(p.b)), p.lower, p.upper)))
+    own, start = (
+        natural_residual(p.A, p.b, p.lower, p.upper, at)
+        for at in (x, np.clip(np.zeros(len(p.b)), p.lower, p.upper))
+    )
     return own / start if start > 0 else own
 
 
@@ -54,12 +57,16 @@ def plain_nested_iteration(A, b, lower, upper, k, *, finest=True):
     G = np.linalg.inv(A[np.ix_(F, F)])
     P, R = G @ A[np.ix_(F, C)], A[np.ix_(C, F)] @ G
     x = np.zeros(n)
-    x[C] = plain_nested_iteration(A[np.ix_(C, C)] - A[np.ix_(C, F)] @ P, b[C] - R @ b[F], lower[C], upper[C], k, finest=False)
+    x[C] = plain_nested_iteration(
+        A[np.ix_(C, C)] - A[np.ix_(C, F)] @ P, b[C] - R @ b[F], lower[C], upper[C], k, finest=False
+    )
     x[F] = -P @ x[C] - G @ b[F]
     return x if finest else newton(A, b, lower, upper, x)
 
 
-@pytest.mark.parametrize("kind", ["chain", "convection", "dominant band", "supported beam", "frame"])
+@pytest.mark.parametrize(
+    "kind", ["chain", "convection", "dominant band", "supported beam", "frame"]
+)
 @pytest.mark.parametrize("seed", [7301, 7302, 7303])
 def test_levels_are_schur_complements(kind, seed):
     p = narrow_problem(kind, seed, 90)
@@ -86,7 +93,8 @@ def test_steps_on_m_matrices_do_not_grow_with_n(kind):
             p = narrow_problem(kind, seed, n)
             result = wl.solve(wl.LCP(p.A, p.b, p.lower, p.upper))
             assert result, f"{p.name}: {result.status.name}"
-            assert result.iterations <= 11, p.name  # four plain steps, nested iteration, and what is left
+            # four plain steps, nested iteration, and what is left
+            assert result.iterations <= 11, p.name
             assert relative_residual(p, result.x.numpy()) <= 1e-6 * (1 + 1e-6)
 
 
@@ -100,7 +108,9 @@ def test_an_upper_bound_in_a_window_at_any_size():
             result = wl.solve(wl.LCP(A, b, 0.0, upper))
             assert result
             assert result.iterations <= 8
-            assert natural_residual(A, b, 0.0, upper, result.x.numpy()) <= 1e-6 * np.linalg.norm(np.minimum(b, 0)) * (1 + 1e-6)
+            assert natural_residual(A, b, 0.0, upper, result.x.numpy()) <= 1e-6 * np.linalg.norm(
+                np.minimum(b, 0)
+            ) * (1 + 1e-6)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -126,7 +136,8 @@ def test_default_solves_large_narrow_problems(n):
             assert result or honest, f"{p.name}: {result.status.name}"
             if result:
                 x = result.x.numpy()
-                rounding = EPS * np.linalg.norm(abs(p.A) @ abs(x))  # of A x: another order of sums leaves another residual
+                # of A x: another order of sums leaves another residual
+                rounding = EPS * np.linalg.norm(abs(p.A) @ abs(x))
                 start = np.clip(np.zeros(len(p.b)), p.lower, p.upper)
                 allowed = 1e-6 * natural_residual(p.A, p.b, p.lower, p.upper, start) + 4 * rounding
                 assert natural_residual(p.A, p.b, p.lower, p.upper, x) <= allowed, p.name
@@ -143,11 +154,15 @@ def test_a_guess_far_from_the_solution_takes_nested_iteration_too():
     assert [record.step for record in again.history[1:]] in ([], ["active set"])
 
 
-@pytest.mark.parametrize("method", [wl.MinimumMapNewton(), wl.InteriorPoint(), wl.MPRGP(), wl.SubspaceMinimization()])
+@pytest.mark.parametrize(
+    "method", [wl.MinimumMapNewton(), wl.InteriorPoint(), wl.MPRGP(), wl.SubspaceMinimization()]
+)
 def test_methods_on_narrow_matrices_agree(method):
     p = narrow_problem("supported beam", 7381, 120)
     problem = wl.LCP(p.A, p.b, p.lower, p.upper)
-    result = wl.solve(problem, method, stopping=wl.StoppingCriteria(rtol=1e-6, max_iterations=2000, patience=500))
+    result = wl.solve(
+        problem, method, stopping=wl.StoppingCriteria(rtol=1e-6, max_iterations=2000, patience=500)
+    )
     assert result, result.status
     x = wl.solve(problem, stopping=wl.StoppingCriteria(rtol=1e-10)).x.numpy()
     np.testing.assert_allclose(result.x.numpy(), x, atol=2e-4 * np.abs(x).max())
@@ -159,9 +174,13 @@ def test_band_factors_with_a_shift(width):
     n = 23
     A = np.triu(np.tril(rng.standard_normal((n, n)), width), -width) + 5 * np.eye(n)
     free, shift, r = rng.random(n) < 0.6, rng.uniform(0, 3, n), rng.standard_normal(n)
-    e = BandedMatrix(bands_of(SparseOperator(scipy.sparse.csr_array(A), device="cpu"), width)).solve(free, r, shift)
+    e = BandedMatrix(
+        bands_of(SparseOperator(scipy.sparse.csr_array(A), device="cpu"), width)
+    ).solve(free, r, shift)
     F = np.flatnonzero(free)
-    np.testing.assert_allclose(e[F], np.linalg.solve(A[np.ix_(F, F)] + np.diag(shift[F]), r[F]), atol=1e-12)
+    np.testing.assert_allclose(
+        e[F], np.linalg.solve(A[np.ix_(F, F)] + np.diag(shift[F]), r[F]), atol=1e-12
+    )
     assert not e[~free].any()
 
 
@@ -169,4 +188,6 @@ def test_a_singular_block_is_told():
     A = scipy.sparse.csr_array(np.array([[1.0, 1.0, 0], [1.0, 1.0, 0.0], [0.0, 0.0, 2.0]]))
     matrix = BandedMatrix(bands_of(SparseOperator(A, device="cpu"), 1))
     assert matrix.solve(np.ones(3, dtype=bool), np.ones(3)) is None
-    np.testing.assert_allclose(matrix.solve(np.array([True, False, True]), np.ones(3)), [1.0, 0.0, 0.5])
+    np.testing.assert_allclose(
+        matrix.solve(np.array([True, False, True]), np.ones(3)), [1.0, 0.0, 0.5]
+    )

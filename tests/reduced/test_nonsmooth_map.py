@@ -11,7 +11,14 @@ from oracle import assemble
 from plain_fischer import LEAST_Q, PlainMap
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.reduced.dense_problem import DenseProblem
-from warp_lcp.reduced.nonsmooth_map import WEIGHTED, HostMap, Kink, MapForm, MapWeights, NonsmoothMap
+from warp_lcp.reduced.nonsmooth_map import (
+    WEIGHTED,
+    HostMap,
+    Kink,
+    MapForm,
+    MapWeights,
+    NonsmoothMap,
+)
 from warp_lcp.solvers.fischer_newton import FischerNewton
 
 FORMS = ["natural", "fischer", "penalized"]
@@ -55,8 +62,12 @@ def test_systems_on_the_device_are_those_of_the_definition(form, kink, device):
     moves = ~kinks if kink is not Kink.PERTURBATION else np.ones(len(x), dtype=bool)
     q = np.maximum(q, LEAST_Q)
     np.testing.assert_allclose(values.numpy(), f, rtol=1e-13, atol=1e-12)
-    np.testing.assert_allclose(shift.numpy(), np.where(moves, np.diag(A) * p / q, 0.0), rtol=1e-8, atol=1e-9)
-    np.testing.assert_allclose(r.numpy(), np.where(moves, -0.25 * f / q, 0.0), rtol=1e-8, atol=1e-12)
+    np.testing.assert_allclose(
+        shift.numpy(), np.where(moves, np.diag(A) * p / q, 0.0), rtol=1e-8, atol=1e-9
+    )
+    np.testing.assert_allclose(
+        r.numpy(), np.where(moves, -0.25 * f / q, 0.0), rtol=1e-8, atol=1e-12
+    )
     np.testing.assert_array_equal(free.numpy(), moves)
     assert merit == pytest.approx(0.5 * f @ f, rel=1e-13)
     assert made.merit(field) == pytest.approx(0.5 * f @ f, rel=1e-13)
@@ -70,7 +81,9 @@ def test_gradients_are_those_of_the_definition(form, device):
     plain = PlainMap(form, A, b, lower, upper, share=0.7)
     expected = plain.jacobian(x).T @ plain.rows(x)[0]
     square, _ = made.descend(field)
-    np.testing.assert_allclose(made.direction.numpy(), expected / plain.d**2, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(
+        made.direction.numpy(), expected / plain.d**2, rtol=1e-10, atol=1e-12
+    )
     assert square == pytest.approx(np.sum((expected / plain.d) ** 2), rel=1e-12)
 
 
@@ -95,7 +108,10 @@ def towards_kinks(seed, n=400):
     Returns the diagonal of A, b, bounds and x; 2^k units, so that a = d (x - l) is exact for l = 0.
     """
     rng = np.random.default_rng(seed)
-    d, angle = 2.0 ** rng.integers(-3, 4, n), rng.choice(np.arange(16) * np.pi / 8, n) + rng.choice([0.0, 1e-9, 0.1], n)
+    d, angle = (
+        2.0 ** rng.integers(-3, 4, n),
+        rng.choice(np.arange(16) * np.pi / 8, n) + rng.choice([0.0, 1e-9, 0.1], n),
+    )
     distance = rng.choice([0.0, *10.0 ** np.arange(-18, 1)], n)
     a, y = distance * np.cos(angle), distance * np.sin(angle)
     kind = rng.integers(0, 4, n)
@@ -111,12 +127,19 @@ def test_host_and_device_agree_step_by_step_at_the_kink(share, seed, device):
     """f, p f and q f of rows at and near their kinks, from one y: to rounding of p and q, which on the host is that of 1 - a / rho."""
     d, b, lower, upper, x = towards_kinks(seed)
     form = "fischer" if share == 1 else "penalized"
-    made, field, problem = device_map(np.diag(d), b, lower, upper, x, form, share, Kink.PERTURBATION, device)
-    y, values, by_x, by_y = made.residual.y.numpy(), *(problem.layout.zeros(wp.float64) for _ in range(3))
+    made, field, problem = device_map(
+        np.diag(d), b, lower, upper, x, form, share, Kink.PERTURBATION, device
+    )
+    y, values, by_x, by_y = (
+        made.residual.y.numpy(),
+        *(problem.layout.zeros(wp.float64) for _ in range(3)),
+    )
     made.values(field, values)
     made._half_sum(WEIGHTED, field, MapWeights(by_x, by_y))
     data = DenseProblem(np.arange(len(b)), np.diag(d), b, lower, upper, 0.0)
-    f, p, q, kinks = HostMap(data, share, Kink.PERTURBATION, np.random.default_rng(1)).linearized(x, y)
+    f, p, q, kinks = HostMap(data, share, Kink.PERTURBATION, np.random.default_rng(1)).linearized(
+        x, y
+    )
     assert 10 < kinks.sum() < len(x) / 2
     np.testing.assert_allclose(values.numpy(), f, rtol=1e-15, atol=0.0)
     for got, slope in ((by_x.numpy() / d, p), (by_y.numpy(), q)):
@@ -128,25 +151,35 @@ def test_the_smoothed_map_is_that_of_the_definition(smoothing):
     """psi = x + y - sqrt(x^2 + y^2 + 2 mu) without cancellation, and its rounded derivatives, beside 60 digits."""
     rng = np.random.default_rng(4049)
     x, y = (rng.choice([-1.0, 1.0], 300) * 10.0 ** rng.uniform(-4, 4, 300) for _ in range(2))
-    data = DenseProblem(np.arange(300), np.eye(300), np.ones(300), np.zeros(300), np.full(300, np.inf), 0.0)
+    data = DenseProblem(
+        np.arange(300), np.eye(300), np.ones(300), np.zeros(300), np.full(300, np.inf), 0.0
+    )
     found = HostMap(data, 1.0, Kink.ZERO, np.random.default_rng(1)).linearized(x, y, smoothing)
     assert not found[3].any()
     with localcontext(prec=60):
-        for f, p, q, a, h in zip(*found[:3], *([Decimal(v) for v in side] for side in (x, y)), strict=True):
+        for f, p, q, a, h in zip(
+            *found[:3], *([Decimal(v) for v in side] for side in (x, y)), strict=True
+        ):
             rho = (a * a + h * h + 2 * Decimal(smoothing)).sqrt()
             # near a h = mu the map itself is 0: to rounding of its terms
-            assert f == pytest.approx(float(a + h - rho), rel=1e-14, abs=1e-15 * float(min(abs(a), abs(h))))
+            assert f == pytest.approx(
+                float(a + h - rho), rel=1e-14, abs=1e-15 * float(min(abs(a), abs(h)))
+            )
             for slope, side in ((p, a), (q, h)):
                 exact = float(1 - side / rho)
                 assert slope == pytest.approx(exact, rel=0.0, abs=1e-15)  # five roundings
-                assert slope == 0 or exact > 1e-17, "a row that does not count makes factors singular"
+                assert slope == 0 or exact > 1e-17, (
+                    "a row that does not count makes factors singular"
+                )
 
 
 def test_random_elements_on_the_host_are_from_the_disc():
     """(1 - p)^2 + (1 - q)^2 <= 1, up to the edge, and not the same for all."""
     n = 2000
     data = DenseProblem(np.arange(n), np.eye(n), np.zeros(n), np.zeros(n), np.full(n, np.inf), 0.0)
-    _, p, q, kinks = HostMap(data, 1.0, Kink.RANDOM, np.random.default_rng(1)).linearized(np.zeros(n))
+    _, p, q, kinks = HostMap(data, 1.0, Kink.RANDOM, np.random.default_rng(1)).linearized(
+        np.zeros(n)
+    )
     assert kinks.all()
     assert ((1 - p) ** 2 + (1 - q) ** 2 <= 1).all()
     for one in (p, q):
@@ -156,7 +189,10 @@ def test_random_elements_on_the_host_are_from_the_disc():
 def test_random_elements_on_the_device_are_from_the_disc(device):
     """D = d p / q: with p and q in [1 - sqrt(1/2), 1] its extremes are 0.293 and 3.414; others in the next step."""
     n, share = 4000, 1 - np.sqrt(0.5)
-    problem = wl.LCP(wl.LinearOperator(lambda x: x, (n,), symmetric=True, diagonal=1.0, device=device), np.zeros(n))
+    problem = wl.LCP(
+        wl.LinearOperator(lambda x: x, (n,), symmetric=True, diagonal=1.0, device=device),
+        np.zeros(n),
+    )
     residual, x = NaturalResidual(problem), problem.layout.zeros(wp.float64)
     made = NonsmoothMap(problem, residual, MapForm.FISCHER, 1.0, Kink.RANDOM)
     residual.evaluate(x)
@@ -180,7 +216,9 @@ def grid_at_kinks(seed, bounds):
     fluid, dense = cells.ravel() == wl.FLUID, assemble(cells)
     A, n = dense[np.ix_(fluid, fluid)], int(fluid.sum())
     lower, upper = (np.full(n, side) for side in bounds)
-    x = np.where(rng.random(n) < 0.5, lower if np.isfinite(bounds[0]) else upper, rng.integers(-3, 4, n))
+    x = np.where(
+        rng.random(n) < 0.5, lower if np.isfinite(bounds[0]) else upper, rng.integers(-3, 4, n)
+    )
     y = np.where(rng.random(n) < 0.5, 0.0, rng.integers(-6, 7, n))
     return cells, fluid, A, y - A @ x, lower, upper, x
 
@@ -194,7 +232,9 @@ def test_systems_over_the_rows_of_a_grid_are_those_of_the_definition(bounds, kin
     problem = wl.LCP(wl.GridPoisson(cells, device="cpu"), _on(fluid, b, cells.shape), *bounds)
     work = FischerNewton(kink=kink, fischer_weight=share, precision="double").init(problem)
     layout, place = problem.layout, problem.layout.places()[fluid]
-    field, move = (layout.load(_on(fluid, v, cells.shape), wp.float64) for v in (x - 0.5, np.full(len(x), 2.0)))
+    field, move = (
+        layout.load(_on(fluid, v, cells.shape), wp.float64) for v in (x - 0.5, np.full(len(x), 2.0))
+    )
     finest, scale = work.system.hierarchy.finest, 0.125
     work.residual.start(work.x, keep=False)  # takes the size of b
     work.map.begin()

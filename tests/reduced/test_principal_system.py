@@ -24,13 +24,21 @@ def families(device):
     cells[0, 0] = wl.AIR
     fluid = cells.ravel() == wl.FLUID
     face = rng.uniform(0.2, 1.0, (9, 11))
-    stencil, columns = assemble(cells), rng.standard_normal((9, 10, 2)) * (cells == wl.FLUID)[..., None]
+    stencil, columns = (
+        assemble(cells),
+        rng.standard_normal((9, 10, 2)) * (cells == wl.FLUID)[..., None],
+    )
     u = columns.reshape(-1, 2)
     T = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(15, 15))
     I = scipy.sparse.eye_array(15)
     laplace = (scipy.sparse.kron(T, I) + scipy.sparse.kron(I, T)).tocsr()
-    wind = scipy.sparse.kron(I, scipy.sparse.diags_array([-0.5, 0.5], offsets=[-1, 1], shape=(15, 15)))
-    wild = (scipy.sparse.random_array((80, 80), density=0.1, rng=rng) * 3 + 1.2 * I.tocsr()[0, 0] * scipy.sparse.eye_array(80)).tocsr()
+    wind = scipy.sparse.kron(
+        I, scipy.sparse.diags_array([-0.5, 0.5], offsets=[-1, 1], shape=(15, 15))
+    )
+    wild = (
+        scipy.sparse.random_array((80, 80), density=0.1, rng=rng) * 3
+        + 1.2 * I.tocsr()[0, 0] * scipy.sparse.eye_array(80)
+    ).tocsr()
     B = rng.standard_normal((20, 20))
     low = rng.standard_normal((225, 2)) * 0.3
     everything = {n: np.ones(n, dtype=bool) for n in (225, 80, 20)}
@@ -38,9 +46,15 @@ def families(device):
     rank = wl.LowRankOperator(low, [0.5, 1.0], device=device)
     return {
         "grid of counts": (grid(cells, device=device), stencil, fluid),
-        "grid of arrays": (grid(cells, face_x=face, device=device), assemble(cells, (face, 1.0, 1.0)), fluid),
+        "grid of arrays": (
+            grid(cells, face_x=face, device=device),
+            assemble(cells, (face, 1.0, 1.0)),
+            fluid,
+        ),
         "grid and body": (
-            wl.SumOperator(grid(cells, device=device), wl.LowRankOperator(columns, [1.0, 3.0], device=device)),
+            wl.SumOperator(
+                grid(cells, device=device), wl.LowRankOperator(columns, [1.0, 3.0], device=device)
+            ),
             stencil + u @ np.diag([1.0, 3.0]) @ u.T,
             fluid,
         ),
@@ -69,7 +83,8 @@ def test_solves_the_masked_and_shifted_system(name, shifted, real, device):
     rng = np.random.default_rng(5)
     system = principal_system(problem, real, bounded=True, shifted=shifted)
     least = 1e-4 if real is wp.float32 else 1e-8
-    for share in (1.0, 0.6, 0.3):  # the second and the third follow a coarsening that must be forgotten
+    # the second and the third follow a coarsening that must be forgotten
+    for share in (1.0, 0.6, 0.3):
         free = unknown & (rng.random(n) < share)
         D = 10 ** rng.uniform(-4, 8, n) if shifted else np.zeros(n)
         system.refresh()
@@ -77,7 +92,11 @@ def test_solves_the_masked_and_shifted_system(name, shifted, real, device):
         system.restrict(layout.load(free.reshape(A.shape), wp.uint8), shift)
         M = dense * np.outer(free, free) + np.diag(D * free)
         d = np.abs(np.diag(M))
-        weight = np.where(d > 0, 1 / np.where(d > 0, d, 1), 1.0) if shifted and name != "dense" else np.ones(n)
+        weight = (
+            np.where(d > 0, 1 / np.where(d > 0, d, 1), 1.0)
+            if shifted and name != "dense"
+            else np.ones(n)
+        )
         r = rng.standard_normal(n) * free / np.sqrt(weight)
         system.r.assign(layout.load(r.reshape(A.shape), system.r.dtype))
         size = system.norm()
@@ -86,7 +105,10 @@ def test_solves_the_masked_and_shifted_system(name, shifted, real, device):
         e = layout.unload(system.e).numpy().ravel().astype(np.float64)
         assert not e[~free].any()
         assert norm <= least * size
-        assert np.linalg.norm(np.sqrt(weight) * (M @ e - r)) <= (20 if real is wp.float32 else 2) * least * size
+        assert (
+            np.linalg.norm(np.sqrt(weight) * (M @ e - r))
+            <= (20 if real is wp.float32 else 2) * least * size
+        )
         assert iterations <= (10 if "grid" in name and "body" not in name else 90)
 
 
@@ -116,7 +138,9 @@ def test_a_grids_iterations_stay_few_for_any_shift(device):
 
 def test_the_methods_suit_the_matrices():
     found = families("cpu")
-    of = lambda name: principal_system(wl.LCP(found[name][0], np.zeros(found[name][0].shape)), wp.float64, bounded=False)  # noqa: E731
+    of = lambda name: principal_system(
+        wl.LCP(found[name][0], np.zeros(found[name][0].shape)), wp.float64, bounded=False
+    )  # noqa: E731
     assert isinstance(of("grid and body"), CoupledGridSystem)
     assert isinstance(of("sum unsymmetric"), DiagonalSystem)
     assert isinstance(of("sparse wild").preconditioner, IncompleteFactors)
@@ -128,9 +152,13 @@ def test_the_methods_suit_the_matrices():
 def test_incomplete_factors_leave_little_to_iterate():
     """More unknowns than are factored completely; with the diagonal alone GMRES takes 29 iterations."""
     rng, n, offsets = np.random.default_rng(3), 2100, [-30, -3, -1, 1, 3, 40]
-    matrix = scipy.sparse.diags_array([*rng.uniform(-1, 1, (6, n)), np.full(n, 2.4)], offsets=[*offsets, 0], shape=(n, n)).tocsr()
+    matrix = scipy.sparse.diags_array(
+        [*rng.uniform(-1, 1, (6, n)), np.full(n, 2.4)], offsets=[*offsets, 0], shape=(n, n)
+    ).tocsr()
     system, r = (
-        principal_system(wl.LCP(wl.SparseOperator(matrix, device="cpu"), np.zeros(n)), wp.float64, bounded=False),
+        principal_system(
+            wl.LCP(wl.SparseOperator(matrix, device="cpu"), np.zeros(n)), wp.float64, bounded=False
+        ),
         rng.standard_normal(n),
     )
     assert isinstance(system.preconditioner, IncompleteFactors)
@@ -171,18 +199,27 @@ def test_an_update_is_taken_and_lost_symmetry_is_told(device):
 def convection_diffusion(m, wind, upwind):
     """A 5-point stencil with a wind along both axes: centered differences, or upwind ones of any strength."""
     T = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(m, m))
-    C = scipy.sparse.diags_array([-2.0, 2.0, 0.0] if upwind else [-1.0, 0.0, 1.0], offsets=[-1, 0, 1], shape=(m, m))
+    C = scipy.sparse.diags_array(
+        [-2.0, 2.0, 0.0] if upwind else [-1.0, 0.0, 1.0], offsets=[-1, 0, 1], shape=(m, m)
+    )
     I, L = scipy.sparse.eye_array(m), (T + wind * C).tocsr()
     return (scipy.sparse.kron(L, I) + scipy.sparse.kron(I, L)).tocsr()
 
 
-@pytest.mark.parametrize(("wind", "upwind", "most"), [(0.1, False, 8), (0.5, False, 22), (0.9, False, 34), (5.0, True, 45)])
+@pytest.mark.parametrize(
+    ("wind", "upwind", "most"),
+    [(0.1, False, 8), (0.5, False, 22), (0.9, False, 34), (5.0, True, 45)],
+)
 def test_convection_does_not_break_the_multigrid(wind, upwind, most, device):
     """Galerkin products of smoothed aggregates are unstable from a wind of 0.5 on: GMRES then stalls at 1e-1."""
     for m in (33, 129):
         matrix = convection_diffusion(m, wind, upwind)
         assert suits_multigrid(matrix)
-        system = principal_system(wl.LCP(wl.SparseOperator(matrix, device=device), np.zeros(m * m)), wp.float64, bounded=False)
+        system = principal_system(
+            wl.LCP(wl.SparseOperator(matrix, device=device), np.zeros(m * m)),
+            wp.float64,
+            bounded=False,
+        )
         rng = np.random.default_rng(13)
         for share in (1.0, 0.8):
             free = rng.random(m * m) < share

@@ -14,7 +14,9 @@ PERIOD_THREE = np.array([[1.0, 0.0, 4.0], [4.0, 1.0, 0.0], [0.0, 4.0, 1.0]])
 FORMS = {
     "dense": lambda A: wl.DenseOperator(A, device="cpu"),
     "sparse": lambda A: wl.SparseOperator(scipy.sparse.csr_array(A), device="cpu"),
-    "products": lambda A: wl.LinearOperator(scipy.sparse.linalg.aslinearoperator(A), symmetric=True, device="cpu"),
+    "products": lambda A: wl.LinearOperator(
+        scipy.sparse.linalg.aslinearoperator(A), symmetric=True, device="cpu"
+    ),
 }
 
 
@@ -22,7 +24,12 @@ def matrix(rng, n=12, width=None):
     """A symmetric positive definite matrix, of few diagonals if a width is given."""
     B = rng.standard_normal((n, n))
     A = B @ B.T / n + np.eye(n)
-    return A if width is None else np.where(np.abs(np.subtract.outer(np.arange(n), np.arange(n))) <= width, 0.1 * A, 0.0) + np.eye(n)
+    return (
+        A
+        if width is None
+        else np.where(np.abs(np.subtract.outer(np.arange(n), np.arange(n))) <= width, 0.1 * A, 0.0)
+        + np.eye(n)
+    )
 
 
 def begun(problem, method, x0):
@@ -38,37 +45,67 @@ def begun(problem, method, x0):
 @pytest.mark.parametrize("lengths", [(1.0,), (1.0, 0.5, 0.25)])
 @pytest.mark.parametrize(
     ("form", "direct", "width"),
-    [("dense", True, None), ("sparse", True, None), ("sparse", True, 2), ("dense", False, None), ("sparse", False, None),
-     ("sparse", False, 2), ("products", False, None)],
-)  # fmt: skip
+    [
+        ("dense", True, None),
+        ("sparse", True, None),
+        ("sparse", True, 2),
+        ("dense", False, None),
+        ("sparse", False, None),
+        ("sparse", False, 2),
+        ("products", False, None),
+    ],
+)
 def test_a_step_by_the_protocol(form, direct, width, lengths):
     """Held unknowns onto their bounds, y = 0 on the others, and parts of the step from there."""
     rng = np.random.default_rng(7101)
     for _ in range(5):
         n = 12 if width is None else 40
-        A, b, lower, upper = matrix(rng, n, width), rng.standard_normal(n), -1.5 * rng.random(n), 1.5 * rng.random(n)
+        A, b, lower, upper = (
+            matrix(rng, n, width),
+            rng.standard_normal(n),
+            -1.5 * rng.random(n),
+            1.5 * rng.random(n),
+        )
         x0 = np.clip(rng.standard_normal(n), lower, upper)
-        work = begun(wl.LCP(FORMS[form](A), b, lower, upper), wl.MinimumMapNewton(direct=direct, **SETTINGS), x0)
+        work = begun(
+            wl.LCP(FORMS[form](A), b, lower, upper),
+            wl.MinimumMapNewton(direct=direct, **SETTINGS),
+            x0,
+        )
         system, d = work.system, work.residual.scale if direct else work.residual.diagonal.numpy()
         target = x0 - (A @ x0 + b) / d
-        held, start = (target < lower) | (target > upper), np.where(target < lower, lower, np.where(target > upper, upper, x0))
+        held, start = (
+            (target < lower) | (target > upper),
+            np.where(target < lower, lower, np.where(target > upper, upper, x0)),
+        )
         free, e = np.flatnonzero(~held), np.zeros(n)
         e[free] = np.linalg.solve(A[np.ix_(free, free)], -(A @ start + b)[free])
         assert system.monotone_cycle() is None
         assert system.classify() is None
         assert system.restrict()
         assert system.solve() >= 1
-        for length in lengths[:1] if system.whole else lengths:  # whole steps are not shortened, nor projected
+        # whole steps are not shortened, nor projected
+        for length in lengths[:1] if system.whole else lengths:
             norm = system.move(length)
             end = start + length * e
-            np.testing.assert_allclose(work.x.numpy(), end if system.whole else np.clip(end, lower, upper), atol=1e-9)
+            np.testing.assert_allclose(
+                work.x.numpy(), end if system.whole else np.clip(end, lower, upper), atol=1e-9
+            )
             assert norm == work.residual.norm
         assert system.accept(3).active == np.count_nonzero(held)
 
 
 def test_which_operator_gets_which():
-    grid, rows = wl.GridPoisson(np.ones((6, 7), dtype=int), shift=1.0, device="cpu"), wl.DenseOperator(np.eye(5), device="cpu")
-    wind = wl.Stencil(np.ones((9, 9), dtype=int), {(0, 0): 4.0, (0, 1): -0.5, (0, -1): -1.5, (1, 0): -1.0}, outside=wl.AIR, device="cpu")
+    grid, rows = (
+        wl.GridPoisson(np.ones((6, 7), dtype=int), shift=1.0, device="cpu"),
+        wl.DenseOperator(np.eye(5), device="cpu"),
+    )
+    wind = wl.Stencil(
+        np.ones((9, 9), dtype=int),
+        {(0, 0): 4.0, (0, 1): -0.5, (0, -1): -1.5, (1, 0): -1.0},
+        outside=wl.AIR,
+        device="cpu",
+    )
     for A, settings, kind in (
         (grid, {}, FusedGridSystem),
         (grid, {"safeguard": False}, CorrectionSystem),
@@ -80,15 +117,27 @@ def test_which_operator_gets_which():
         work = method.init(problem)
         assert type(work.system) is kind
         assert work.x is work.system.iterate.x
-    assert type(wl.PrimalDualActiveSet().init(wl.LCP(grid, np.ones(grid.shape))).system) is CorrectionSystem
+    assert (
+        type(wl.PrimalDualActiveSet().init(wl.LCP(grid, np.ones(grid.shape))).system)
+        is CorrectionSystem
+    )
 
 
 def test_the_change_of_system_keeps_the_iterate():
     """Whole steps go round in a circle of three: searched steps go on, and the next solve begins with whole ones again."""
-    problem, method = wl.LCP(wl.DenseOperator(PERIOD_THREE, device="cpu"), -np.ones(3)), wl.MinimumMapNewton(direct=True)
+    problem, method = (
+        wl.LCP(wl.DenseOperator(PERIOD_THREE, device="cpu"), -np.ones(3)),
+        wl.MinimumMapNewton(direct=True),
+    )
     work = method.init(problem)
     for _ in range(2):
-        result = wl.solve(problem, method, workspace=work, x0=np.array([1.0, 0.0, 0.0]), stopping=wl.StoppingCriteria(rtol=1e-10))
+        result = wl.solve(
+            problem,
+            method,
+            workspace=work,
+            x0=np.array([1.0, 0.0, 0.0]),
+            stopping=wl.StoppingCriteria(rtol=1e-10),
+        )
         assert result
         assert type(work.system) is CorrectionSystem
         assert work.system.iterate is work.iterate
@@ -106,7 +155,11 @@ def test_a_grid_moves_its_iterate_as_it_solves():
     problem = wl.LCP(A, b, -np.inf, np.inf)
 
     def solved(most):
-        work = begun(problem, wl.MinimumMapNewton(precision="double", eta=1e-2, max_linear_iterations=most), np.zeros(problem.layout.size))
+        work = begun(
+            problem,
+            wl.MinimumMapNewton(precision="double", eta=1e-2, max_linear_iterations=most),
+            np.zeros(problem.layout.size),
+        )
         first = work.residual.norm
         assert work.system.classify() is None
         assert work.system.restrict()

@@ -12,13 +12,17 @@ from warp_lcp.cli import commands as cli
 from warp_lcp.render.film import Film, check_rate, film_suffix
 from warp_lcp.render.recording import RenderError
 
-Image = pytest.importorskip("PIL.Image", reason="films need Pillow, which comes with the extra `render`")
+Image = pytest.importorskip(
+    "PIL.Image", reason="films need Pillow, which comes with the extra `render`"
+)
 WIDTH, HEIGHT = 320, 241  # an odd height, which H.264 does not have
 
 
 @pytest.fixture
 def encoder():
-    return pytest.importorskip("imageio_ffmpeg", reason="MP4 films need imageio-ffmpeg, the extra `render`")
+    return pytest.importorskip(
+        "imageio_ffmpeg", reason="MP4 films need imageio-ffmpeg, the extra `render`"
+    )
 
 
 def picture(number: int) -> "Image.Image":
@@ -48,8 +52,11 @@ def test_a_gif_holds_the_images_their_times_and_repeats(encoder, tmp_path):
         for number in range(12):
             film.seek(number)
             durations.append(film.info["duration"])
-            np.testing.assert_allclose(np.asarray(film.convert("RGB"), dtype=int), np.asarray(picture(number)), atol=8)
-    assert sum(durations) == 400  # milliseconds: 12 images at 30 a second, though a GIF knows whole hundredths of a second
+            np.testing.assert_allclose(
+                np.asarray(film.convert("RGB"), dtype=int), np.asarray(picture(number)), atol=8
+            )
+    # milliseconds: 12 images at 30 a second, though a GIF knows whole hundredths of a second
+    assert sum(durations) == 400
     assert set(durations) == {30, 40}
 
 
@@ -59,7 +66,9 @@ def test_images_that_do_not_change_stay(encoder, tmp_path):
             film.add(lambda: picture(3))
     with Image.open(tmp_path / "still.gif") as read:
         assert sum(int(read.seek(n) or read.info["duration"]) for n in range(read.n_frames)) == 500
-        np.testing.assert_allclose(np.asarray(read.convert("RGB"), dtype=int), np.asarray(picture(3)), atol=8)
+        np.testing.assert_allclose(
+            np.asarray(read.convert("RGB"), dtype=int), np.asarray(picture(3)), atol=8
+        )
 
 
 def test_a_gif_leaves_out_what_viewers_cannot_play(encoder, tmp_path):
@@ -78,9 +87,22 @@ def test_an_mp4_holds_the_images(encoder, tmp_path):
     count, seconds = encoder.count_frames_and_secs(str(file))
     assert count == 10
     assert seconds == pytest.approx(10 / 24, abs=0.02)
-    command = [encoder.get_ffmpeg_exe(), "-v", "error", "-i", str(file), "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    command = [
+        encoder.get_ffmpeg_exe(),
+        "-v",
+        "error",
+        "-i",
+        str(file),
+        "-f",
+        "rawvideo",
+        "-pix_fmt",
+        "rgb24",
+        "-",
+    ]
     raw = subprocess.run(command, capture_output=True, check=True).stdout
-    frames = np.frombuffer(raw, dtype=np.uint8).reshape(10, HEIGHT + 1, WIDTH, 3).astype(int)[:, :HEIGHT]
+    frames = (
+        np.frombuffer(raw, dtype=np.uint8).reshape(10, HEIGHT + 1, WIDTH, 3).astype(int)[:, :HEIGHT]
+    )
     for number, pixels in enumerate(frames):
         assert np.abs(pixels - np.asarray(picture(number))).mean() < 2.0  # H.264 loses a little
 
@@ -154,13 +176,16 @@ def test_kinds_and_rates(tmp_path):
 @pytest.mark.parametrize("suffix", ["gif", "mp4"])
 def test_the_command_films_a_run(encoder, dots, tmp_path, suffix):
     pytest.importorskip("pyvista")
-    folder = write_run(tmp_path / "run", [[ball([0.2 + 0.1 * number, 0.5], 0.15)] for number in range(5)])
+    folder = write_run(
+        tmp_path / "run", [[ball([0.2 + 0.1 * number, 0.5], 0.15)] for number in range(5)]
+    )
     film = tmp_path / "new" / f"film.{suffix}"
     result = call(folder, "--film", film, "--size", "320x240")
     assert result.exit_code == 0, result.stderr
     assert f"{film}: 5 frames" in result.stdout
     if suffix == "mp4":
-        assert encoder.count_frames_and_secs(str(film)) == (5, pytest.approx(5 / 20, abs=0.02))  # the scene's frames a second
+        # the scene's frames a second
+        assert encoder.count_frames_and_secs(str(film)) == (5, pytest.approx(5 / 20, abs=0.02))
         return
     with Image.open(film) as read:
         assert read.n_frames == 5
@@ -175,4 +200,6 @@ def test_options_that_a_film_does_not_have(dots, tmp_path, arguments):
     folder = write_run(tmp_path / "run", [[ball([0.5, 0.5], 0.2)]])
     result = call(folder, "--film", tmp_path / "film.gif", *arguments)
     assert result.exit_code == 2
-    assert "cannot be combined with --frame, --frames, --sheet or --out" in result.stderr.replace("\n", " ")
+    assert "cannot be combined with --frame, --frames, --sheet or --out" in result.stderr.replace(
+        "\n", " "
+    )

@@ -22,7 +22,14 @@ from warp_lcp.cli import commands as cli
 from warp_lcp.frames.frames import FrameFolder
 from warp_lcp.frames.vtu import read_vtu
 from warp_lcp.render import live
-from warp_lcp.render.live import LOOPBACK, MOST_ANSWERED, MOST_CONNECTIONS, Answers, LiveServer, live_server
+from warp_lcp.render.live import (
+    LOOPBACK,
+    MOST_ANSWERED,
+    MOST_CONNECTIONS,
+    Answers,
+    LiveServer,
+    live_server,
+)
 from warp_lcp.render.recording import RenderError
 from warp_lcp.simulation import Points
 
@@ -52,7 +59,9 @@ def arrays(body: bytes) -> dict[str, np.ndarray]:
     assert begin % 4 == 0
     found = {}
     for name, length in json.loads(body[:begin])["arrays"].items():
-        found[name] = np.frombuffer(body, "<u4" if name.endswith("_corners") else "<f4", length, begin)
+        found[name] = np.frombuffer(
+            body, "<u4" if name.endswith("_corners") else "<f4", length, begin
+        )
         begin += 4 * length
     assert begin == len(body)
     return found
@@ -60,17 +69,27 @@ def arrays(body: bytes) -> dict[str, np.ndarray]:
 
 def test_solids_that_move_are_where_they_are(dots, tmp_path):
     motion = "motion = { kind = 'translation', velocity = [4.0, 0.0] }\n"
-    folder = write_run(tmp_path / "run", [[dots_at([0.1, 0.1, 0.0])]] * 3, SOLID.replace("[0.5, 0.5]", "[0.3, 0.5]") + motion)
+    folder = write_run(
+        tmp_path / "run",
+        [[dots_at([0.1, 0.1, 0.0])]] * 3,
+        SOLID.replace("[0.5, 0.5]", "[0.3, 0.5]") + motion,
+    )
     with serving(folder) as server:
         for number in range(3):
             status, body = ask(server, f"/frame?number={number}")
             assert status == 200
             points = arrays(body)["solids"].reshape(-1, 3)
-            np.testing.assert_allclose(points.mean(axis=0), [0.3 + 4.0 * number / 20, 0.5, 0.0], atol=0.01)
+            np.testing.assert_allclose(
+                points.mean(axis=0), [0.3 + 4.0 * number / 20, 0.5, 0.0], atol=0.01
+            )
 
 
 def dots_at(*points: list[float]) -> Points:
-    return Points("particles", np.array(points, dtype=np.float32), {"velocity": np.full((len(points), 3), 2.0, dtype=np.float32)})
+    return Points(
+        "particles",
+        np.array(points, dtype=np.float32),
+        {"velocity": np.full((len(points), 3), 2.0, dtype=np.float32)},
+    )
 
 
 def test_frames_reach_the_page_as_they_come(dots, tmp_path):
@@ -84,12 +103,19 @@ def test_frames_reach_the_page_as_they_come(dots, tmp_path):
         FrameFolder(folder).write(1, 0.05, [dots_at([0.1, 0.1, 0.0], [0.3, 0.3, 0.0])])
         state = json.loads(ask(server, "/run")[1])
         assert state["frames"] == [0, 1]
-        assert (state["name"], state["dimension"], state["size"], state["rate"]) == ("drops", 2, [1.0, 1.0, 0.0], 20.0)
+        assert (state["name"], state["dimension"], state["size"], state["rate"]) == (
+            "drops",
+            2,
+            [1.0, 1.0, 0.0],
+            20.0,
+        )
         status, body = ask(server, "/frame?number=1")
     assert status == 200
     assert json.loads(body[: body.index(b"\n")])["time"] == pytest.approx(0.05)
     found = arrays(body)
-    np.testing.assert_array_equal(found["points"].reshape(-1, 3), read_vtu(folder / "frames" / "particles_000001.vtu").points)
+    np.testing.assert_array_equal(
+        found["points"].reshape(-1, 3), read_vtu(folder / "frames" / "particles_000001.vtu").points
+    )
     np.testing.assert_allclose(found["values"], np.sqrt(12.0))
     radius = np.linalg.norm(found["solids"].reshape(-1, 3)[:, :2] - 0.5, axis=1)
     assert len(radius) > 100
@@ -133,9 +159,13 @@ def test_nothing_else_is_told_and_to_nobody_else(dots, tmp_path):
             assert ask(server, path.replace("²", "%C2%B2"))[0] in (400, 404), path
         status, page = ask(server, "/")
         assert status == 200
-        assert b"http://" not in page.replace(b"http://www.w3.org", b""), "the page loads nothing from elsewhere"
+        assert b"http://" not in page.replace(b"http://www.w3.org", b""), (
+            "the page loads nothing from elsewhere"
+        )
         assert b"https://" not in page
-        taken = CliRunner().invoke(cli.app, ["serve", str(folder), "--port", str(server.server_port)])
+        taken = CliRunner().invoke(
+            cli.app, ["serve", str(folder), "--port", str(server.server_port)]
+        )
     assert taken.exit_code == cli.WRONG_INPUT
     assert f"--port {server.server_port}: cannot be used" in taken.stderr
     missing = CliRunner().invoke(cli.app, ["serve", str(tmp_path / "nowhere")])
@@ -155,18 +185,32 @@ def test_a_run_is_served_and_shown_from_its_beginning(dots, tmp_path, monkeypatc
     monkeypatch.setattr(subprocess, "Popen", open_window)
     monkeypatch.setenv("DISPLAY", ":0")
     pytest.importorskip("pyvista", reason="a window needs pyvista, the extra `render`")
-    result = CliRunner().invoke(cli.app, ["run", str(scene), "--out", str(out), "--serve", "--view", "--device", "cpu"])
+    result = CliRunner().invoke(
+        cli.app, ["run", str(scene), "--out", str(out), "--serve", "--view", "--device", "cpu"]
+    )
     assert result.exit_code == 0, result.output
     assert "page: http://127.0.0.1:" in result.output
     assert opened == [["view", str(out)]]
     monkeypatch.delenv("DISPLAY")
-    refused = CliRunner().invoke(cli.app, ["run", str(scene), "--out", str(tmp_path / "other"), "--view", "--device", "cpu"])
+    refused = CliRunner().invoke(
+        cli.app, ["run", str(scene), "--out", str(tmp_path / "other"), "--view", "--device", "cpu"]
+    )
     assert refused.exit_code == cli.WRONG_INPUT
     assert not (tmp_path / "other").exists()
 
 
 @pytest.mark.parametrize(
-    "host", ["localhost:evil", "localhost:", "evil:80", "localhost.evil:80", "evil", "", "localhost:1@evil", "127.0.0.1.evil:80"]
+    "host",
+    [
+        "localhost:evil",
+        "localhost:",
+        "evil:80",
+        "localhost.evil:80",
+        "evil",
+        "",
+        "localhost:1@evil",
+        "127.0.0.1.evil:80",
+    ],
 )
 def test_other_names_of_this_machine_are_refused(dots, tmp_path, host):
     with serving(write_run(tmp_path / "run", [])) as server:
@@ -177,9 +221,21 @@ def test_other_names_of_this_machine_are_refused(dots, tmp_path, host):
 
 
 @pytest.mark.parametrize(
-    ("begin", "status"), [("0", 200), ("5", 200), ("99999999999999", 200), ("999999999999999", 200), ("9999999999999999", 400), ("-1", 400),
-                          ("x", 400), ("", 400), ("1.5", 400), ("%E2%85%A7", 400), ("0x10", 400)]
-)  # fmt: skip
+    ("begin", "status"),
+    [
+        ("0", 200),
+        ("5", 200),
+        ("99999999999999", 200),
+        ("999999999999999", 200),
+        ("9999999999999999", 400),
+        ("-1", 400),
+        ("x", 400),
+        ("", 400),
+        ("1.5", 400),
+        ("%E2%85%A7", 400),
+        ("0x10", 400),
+    ],
+)
 def test_the_log_from_any_byte(dots, tmp_path, begin, status):
     folder = write_run(tmp_path / "run", [])
     (folder / "log.csv").write_text("step,time\n1,0.5\n2,")
@@ -208,7 +264,11 @@ def test_idle_connections_take_few_threads_and_descriptors(dots, tmp_path):
         before = threading.active_count()
         idle = []
         for _ in range(250):
-            idle.append(stack.enter_context(socket.create_connection((LOOPBACK, server.server_port), timeout=30)))
+            idle.append(
+                stack.enter_context(
+                    socket.create_connection((LOOPBACK, server.server_port), timeout=30)
+                )
+            )
             assert threading.active_count() - before <= MOST_ANSWERED
         assert ask(server, "/run")[0] == 200
         for connection in idle[:-MOST_CONNECTIONS]:

@@ -10,8 +10,22 @@ from typer.testing import CliRunner
 from small_runs import ball, box, write_run
 from warp_lcp.cli import commands as cli
 from warp_lcp.render.photo import photo
-from warp_lcp.render.photo.mitsuba_renderer import INSTALL, PASS_PATHS, Quality, displaced, find_llvm, pass_samples, render_radiance
-from warp_lcp.render.photo.photo import PhotoSettings, expected_seconds, frame_range, photograph_film, photograph_run
+from warp_lcp.render.photo.mitsuba_renderer import (
+    INSTALL,
+    PASS_PATHS,
+    Quality,
+    displaced,
+    find_llvm,
+    pass_samples,
+    render_radiance,
+)
+from warp_lcp.render.photo.photo import (
+    PhotoSettings,
+    expected_seconds,
+    frame_range,
+    photograph_film,
+    photograph_run,
+)
 from warp_lcp.render.photo.photo_scene import (
     ABSORPTION,
     Finish,
@@ -36,8 +50,14 @@ def water() -> Surface:
 
 
 def grains(count: int = 300) -> Points:
-    points = np.random.default_rng(3).uniform([0.2, 0.02, 0.2], [0.8, 0.4, 0.8], (count, 3)).astype(np.float32)
-    return Points("particles", points, {"velocity": np.full((count, 3), [0.0, -1.0, 0.0], dtype=np.float32)})
+    points = (
+        np.random.default_rng(3)
+        .uniform([0.2, 0.02, 0.2], [0.8, 0.4, 0.8], (count, 3))
+        .astype(np.float32)
+    )
+    return Points(
+        "particles", points, {"velocity": np.full((count, 3), [0.0, -1.0, 0.0], dtype=np.float32)}
+    )
 
 
 @pytest.fixture
@@ -62,18 +82,30 @@ def test_pictures_with_the_same_settings_are_kept(dots, tmp_path, rendered):
 
     def shoot(**more):
         rendered.clear(), notes.clear()
-        return list(photograph_run(folder, settings=PhotoSettings(size=(64, 36), **more), noted=notes.append))
+        return list(
+            photograph_run(
+                folder, settings=PhotoSettings(size=(64, 36), **more), noted=notes.append
+            )
+        )
 
     files = shoot(samples=4)
-    assert [file.name for file in files] == [f"photo_{number:06d}.png" for number in range(3)] and rendered == [0, 1, 2]
+    assert [file.name for file in files] == [
+        f"photo_{number:06d}.png" for number in range(3)
+    ] and rendered == [0, 1, 2]
     files[1].unlink()  # as if it had been stopped
     files[2].write_bytes(files[2].read_bytes()[:100])
     shoot(samples=4)
-    assert rendered == [1, 2] and notes == ["1 of 3 pictures are there with these settings and are kept"]
+    assert rendered == [1, 2] and notes == [
+        "1 of 3 pictures are there with these settings and are kept"
+    ]
     shoot(samples=8)
-    assert rendered == [0, 1, 2] and notes == ["3 pictures have another samples and are rendered again"]
+    assert rendered == [0, 1, 2] and notes == [
+        "3 pictures have another samples and are rendered again"
+    ]
     frame = folder / "frames" / "surface_000002.vtu"
-    frame.write_bytes((folder / "frames" / "surface_000001.vtu").read_bytes().replace(b"\n", b"\n\n", 1))
+    frame.write_bytes(
+        (folder / "frames" / "surface_000001.vtu").read_bytes().replace(b"\n", b"\n\n", 1)
+    )
     shoot(samples=8)
     assert rendered == [2] and notes[1] == "1 pictures have another frame and are rendered again"
     shoot(samples=8, overrides=["camera.position=[3.0, 2.0, 4.0]"])
@@ -87,7 +119,8 @@ def test_pictures_hold_what_was_rendered(dots, tmp_path, rendered):
     (file,) = photograph_run(folder, settings=SETTINGS, estimated=seconds.append)
     pixels = np.asarray(image.open(file))
     assert pixels.shape == (36, 64, 3) and np.ptp(pixels) <= 1
-    assert pixels[0, 0, 0] == pytest.approx(255 * 0.5**photo.CONTRAST, abs=1)  # middle grey, with the look's contrast
+    # middle grey, with the look's contrast
+    assert pixels[0, 0, 0] == pytest.approx(255 * 0.5**photo.CONTRAST, abs=1)
     assert seconds == [expected_seconds(SETTINGS, "scalar_rgb", liquid=True)]
 
 
@@ -147,15 +180,20 @@ def test_frame_ranges():
 
 def test_the_estimate_grows_with_pixels_and_samples():
     def seconds(size, samples):
-        return expected_seconds(PhotoSettings(size=size, samples=samples), "scalar_rgb", liquid=True)
+        return expected_seconds(
+            PhotoSettings(size=size, samples=samples), "scalar_rgb", liquid=True
+        )
 
     small = seconds((640, 360), 32)
-    assert seconds((1280, 720), 32) - small == pytest.approx(3.0 * (seconds((640, 360), 64) - small))
+    assert seconds((1280, 720), 32) - small == pytest.approx(
+        3.0 * (seconds((640, 360), 64) - small)
+    )
     assert seconds((1280, 720), 32) > small > 0.0
 
 
 @pytest.mark.parametrize(
-    ("size", "samples", "instants"), [((64, 36), 4, 1), ((1280, 720), 64, 8), ((4096, 4096), 3, 8), ((1920, 1080), 100, 1)]
+    ("size", "samples", "instants"),
+    [((64, 36), 4, 1), ((1280, 720), 64, 8), ((4096, 4096), 3, 8), ((1920, 1080), 100, 1)],
 )
 def test_passes_share_the_samples(size, samples, instants):
     shares = pass_samples(Quality(size, samples), instants)
@@ -165,7 +203,9 @@ def test_passes_share_the_samples(size, samples, instants):
 
 def test_the_camera_sees_where_the_material_goes(dots, tmp_path):
     frames = [[ball([0.2 + 0.1 * step, 0.3, 0.5], 0.1)] for step in range(5)]
-    view = PhotoScenes(Recording(write_run(tmp_path / "run", frames, size=(4.0, 2.0, 4.0))), 16 / 9).view
+    view = PhotoScenes(
+        Recording(write_run(tmp_path / "run", frames, size=(4.0, 2.0, 4.0))), 16 / 9
+    ).view
     places = np.concatenate([frame[0].points for frame in frames]) - view.position
     x, y, z = view.axes @ places.T
     slope = np.tan(np.radians(view.angle / 2))
@@ -182,10 +222,20 @@ def test_water_bodies_and_solids_are_described(dots, tmp_path):
     scene = PhotoScenes(Recording(folder), 1.0).frame(0)
     found = {mesh.name: mesh for mesh in scene.meshes}
     assert set(found) == {"solid_0", "body_0", "liquid"}
-    assert found["liquid"].finish is Finish.LIQUID and found["liquid"].color[0] > found["liquid"].color[2] > 0.0
-    assert found["solid_0"].points[:, 0].max() < 1.01 and found["solid_0"].points[:, 2].min() > -0.01  # cut at the domain
+    assert (
+        found["liquid"].finish is Finish.LIQUID
+        and found["liquid"].color[0] > found["liquid"].color[2] > 0.0
+    )
+    # cut at the domain
+    assert (
+        found["solid_0"].points[:, 0].max() < 1.01 and found["solid_0"].points[:, 2].min() > -0.01
+    )
     later = {mesh.name: mesh for mesh in displaced(scene, 0.05).meshes}
-    np.testing.assert_allclose(later["body_0"].points - found["body_0"].points, [[0.0, 0.0, 0.1]] * len(moved.corners) * 3, atol=1e-6)
+    np.testing.assert_allclose(
+        later["body_0"].points - found["body_0"].points,
+        [[0.0, 0.0, 0.1]] * len(moved.corners) * 3,
+        atol=1e-6,
+    )
     np.testing.assert_array_equal(later["solid_0"].points, found["solid_0"].points)
 
 
@@ -196,16 +246,25 @@ def test_particles_become_grains(dots, tmp_path):
     np.testing.assert_allclose(mesh.velocity, [[0.0, -1.0, 0.0]] * len(mesh.points))
     assert mesh.points[:, 1].min() > -0.05
     colors = grain_colors(np.arange(4000))
-    assert colors.min() > 0.1 and colors.max() <= 0.9 and (colors[:, 0] >= colors[:, 2]).all() and len(np.unique(colors, axis=0)) > 500
+    assert (
+        colors.min() > 0.1
+        and colors.max() <= 0.9
+        and (colors[:, 0] >= colors[:, 2]).all()
+        and len(np.unique(colors, axis=0)) > 500
+    )
 
 
 def test_particles_alone_get_a_surface():
-    places = np.stack(np.meshgrid(*[np.arange(0.025, 0.6, 0.05)] * 3), axis=-1).reshape(-1, 3)  # 12 x 12 x 12, a cube in a corner
+    # 12 x 12 x 12, a cube in a corner
+    places = np.stack(np.meshgrid(*[np.arange(0.025, 0.6, 0.05)] * 3), axis=-1).reshape(-1, 3)
     velocity = np.tile([1.0, 2.0, 3.0], (len(places), 1))
     scene = SimpleNamespace(
-        cell_counts=(10, 10, 10), spacing=0.1, domain=SimpleNamespace(size=(1.0, 1.0, 1.0)), particles=SimpleNamespace(per_axis=2),
+        cell_counts=(10, 10, 10),
+        spacing=0.1,
+        domain=SimpleNamespace(size=(1.0, 1.0, 1.0)),
+        particles=SimpleNamespace(per_axis=2),
         output=SimpleNamespace(surface_resolution=None, surface_smoothing=1.0),
-    )  # fmt: skip
+    )
     surface = particle_surface(scene, Points("particles", places, {"velocity": velocity}))
     a, b, c = np.moveaxis(surface.points[surface.corners].astype(float), 1, 0)
     assert np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6.0 == pytest.approx(0.6**3, rel=0.05)
@@ -248,16 +307,21 @@ def shot(folder, seed: int = 1, **more) -> np.ndarray:
     pytest.importorskip("mitsuba", reason="pictures need Mitsuba, the extra `photo`")
     pytest.importorskip("pyoidn", reason="pictures need Open Image Denoise, the extra `photo`")
     recording = Recording(folder, show=more.pop("show", None))
-    return render_radiance(PhotoScenes(recording, 16 / 9).frame(0), Quality((64, 36), 4, **more), seed)
+    return render_radiance(
+        PhotoScenes(recording, 16 / 9).frame(0), Quality((64, 36), 4, **more), seed
+    )
 
 
 def test_water_and_a_body_are_rendered(dots, tmp_path):
-    folder = write_run(tmp_path / "run", [[water(), ball([0.3, 0.5, 0.4], 0.2, "bodies", body=0)]], BODY, size=ROOM)
+    folder = write_run(
+        tmp_path / "run", [[water(), ball([0.3, 0.5, 0.4], 0.2, "bodies", body=0)]], BODY, size=ROOM
+    )
     image = shot(folder)
     assert image.shape == (36, 64, 3) and np.isfinite(image).all() and image.min() >= 0.0
     red, blue = image[..., 0], image[..., 2]
     wet, body = blue > 1.15 * red, red > 2.0 * blue
-    assert 0.15 < wet.mean() < 0.7 and 0.01 < body.mean() < 0.2  # the middle of the picture is water, the ball orange
+    # the middle of the picture is water, the ball orange
+    assert 0.15 < wet.mean() < 0.7 and 0.01 < body.mean() < 0.2
     assert wet[20:28, 24:40].mean() > 0.8
     corner = image[:6, :6].mean(axis=(0, 1))
     assert np.ptp(corner) < 0.15 * corner.mean()  # the ground is grey
@@ -269,7 +333,9 @@ def test_sand_is_rendered(dots, tmp_path, monkeypatch):
     from warp_lcp.scene.scene import Scene
 
     monkeypatch.setattr(Scene, "palette", "sand")
-    image = shot(write_run(tmp_path / "run", [[grains()]], size=ROOM), show=Show.PARTICLES, shutter=0.01)
+    image = shot(
+        write_run(tmp_path / "run", [[grains()]], size=ROOM), show=Show.PARTICLES, shutter=0.01
+    )
     assert np.isfinite(image).all()
     sand = image[..., 0] > 1.25 * image[..., 2]
     assert 0.1 < sand.mean() < 0.9

@@ -19,7 +19,9 @@ from warp_lcp.render.photo.view_transform import MIDDLE_GREY, agx, sigmoid
 from warp_lcp.simulation import Surface
 
 SEEDS = range(4)
-CUBE = np.stack(np.meshgrid([0.0, 1.0], [0.0, 1.0], [0.0, 1.0], indexing="ij"), axis=-1).reshape(-1, 3)
+CUBE = np.stack(np.meshgrid([0.0, 1.0], [0.0, 1.0], [0.0, 1.0], indexing="ij"), axis=-1).reshape(
+    -1, 3
+)
 
 
 def volume(points, corners):
@@ -36,7 +38,11 @@ def lattice(count):
     for axis in range(3):
         for end in (0.0, 1.0):
             side = np.empty((u.size, 3))
-            side[:, axis], side[:, (axis + 1) % 3], side[:, (axis + 2) % 3] = end, u.ravel(), v.ravel()
+            side[:, axis], side[:, (axis + 1) % 3], side[:, (axis + 2) % 3] = (
+                end,
+                u.ravel(),
+                v.ravel(),
+            )
             own = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]) + start
             points.append(side)
             corners.append(own if end else own[:, ::-1])
@@ -54,12 +60,17 @@ def test_agx_follows_its_published_polynomial():
 
 
 def test_agx_of_greys():
-    np.testing.assert_allclose(agx(np.full(3, MIDDLE_GREY)), 0.5, atol=1e-3)  # rows of the inset matrix sum to 1 within 1e-3
+    # rows of the inset matrix sum to 1 within 1e-3
+    np.testing.assert_allclose(agx(np.full(3, MIDDLE_GREY)), 0.5, atol=1e-3)
     greys = agx(np.logspace(-5, 3, 400)[:, None] * np.ones(3))
     assert (np.diff(greys, axis=0) >= 0.0).all()
     assert np.ptp(greys, axis=1).max() < 5e-3
     assert greys[0].max() < 0.01 and greys[-1].min() > 0.99
-    assert agx(np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]), contrast=1.6, saturation=1.3).max() < 1e-6  # and no NaN
+    # and no NaN
+    assert (
+        agx(np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]), contrast=1.6, saturation=1.3).max()
+        < 1e-6
+    )
 
 
 def test_agx_turns_bright_colors_white_and_keeps_dim_ones():
@@ -76,7 +87,11 @@ def test_creases_stay_sharp_and_round_sides_smooth():
     points, corners = CUBE, outward_hull(CUBE)
     at, own, normals = creased(points, corners)
     flat = face_normals(at, own)
-    np.testing.assert_allclose(normals, np.repeat(flat / np.linalg.norm(flat, axis=1, keepdims=True), 3, axis=0), atol=1e-12)
+    np.testing.assert_allclose(
+        normals,
+        np.repeat(flat / np.linalg.norm(flat, axis=1, keepdims=True), 3, axis=0),
+        atol=1e-12,
+    )
     assert volume(at, own) == pytest.approx(1.0)
     points, corners = icosphere(2)
     at, _, normals = creased(points, corners)
@@ -87,7 +102,8 @@ def test_creases_stay_sharp_and_round_sides_smooth():
 def test_a_liquid_is_flat_at_walls_and_reaches_below_the_floor():
     points, corners = lattice(4)
     surface = Surface("surface", points, corners, {"velocity": np.ones_like(points)})
-    at, own, normals, velocity = closed_liquid(surface, (1.0, 1.0, 2.0), 0.25, None)  # the side z = 1 is free
+    # the side z = 1 is free
+    at, own, normals, velocity = closed_liquid(surface, (1.0, 1.0, 2.0), 0.25, None)
     floor = -OVERLAP * 0.25
     assert volume(at, own) == pytest.approx(1.0 - floor)
     assert at[:, 1].min() == pytest.approx(floor)
@@ -99,14 +115,19 @@ def test_a_liquid_is_flat_at_walls_and_reaches_below_the_floor():
         np.testing.assert_array_equal(velocity[wall, axis], 0.0)
     facets = face_normals(at, own)
     facets /= np.linalg.norm(facets, axis=1, keepdims=True)
-    np.testing.assert_allclose(np.einsum("ijk,ik->ij", normals[own], facets), 1.0, atol=1e-9)  # no normal is bent at an edge
+    # no normal is bent at an edge
+    np.testing.assert_allclose(np.einsum("ijk,ik->ij", normals[own], facets), 1.0, atol=1e-9)
     assert velocity[free & (at[:, 0] > 0.1) & (at[:, 0] < 0.9)][:, 0].all()
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_liquid_is_pressed_against_what_it_touches(seed):
     rng = np.random.default_rng(seed)
-    spacing, center, radius = 0.1, rng.uniform([0.4, 0.4, 0.95], [0.6, 0.6, 1.15]), rng.uniform(0.15, 0.3)
+    spacing, center, radius = (
+        0.1,
+        rng.uniform([0.4, 0.4, 0.95], [0.6, 0.6, 1.15]),
+        rng.uniform(0.15, 0.3),
+    )
 
     def distance(p):
         return np.linalg.norm(p - center, axis=1) - radius
@@ -114,18 +135,26 @@ def test_a_liquid_is_pressed_against_what_it_touches(seed):
     points, corners = lattice(12)
     before = np.array(points)
     gap = center[2] - radius - 1.0  # between the side z = 1 and the nearest point of the ball
-    points[:, 2] *= 1.0 + gap - rng.uniform(0.0, 0.5) * spacing  # the side comes so near, or into the ball
+    # the side comes so near, or into the ball
+    points[:, 2] *= 1.0 + gap - rng.uniform(0.0, 0.5) * spacing
     surface = Surface("surface", points, corners)
     at, _, _, _ = closed_liquid(surface, (2.0, 2.0, 2.0), spacing, distance)
     d_before, d = distance(points), distance(at)
-    touched = (np.abs(d_before) < TOUCHING * spacing) & (before[:, 2] == 1.0) & (d_before > -OVERLAP * spacing)
-    facing = touched & (((points - center) / np.linalg.norm(points - center, axis=1, keepdims=True))[:, 2] < -0.4)
+    touched = (
+        (np.abs(d_before) < TOUCHING * spacing)
+        & (before[:, 2] == 1.0)
+        & (d_before > -OVERLAP * spacing)
+    )
+    facing = touched & (
+        ((points - center) / np.linalg.norm(points - center, axis=1, keepdims=True))[:, 2] < -0.4
+    )
     assert facing.any()
     for p in points[facing]:  # each of them has moved along the ball's normal to the overlap
         goal = center + (p - center) / np.linalg.norm(p - center) * (radius - OVERLAP * spacing)
         assert np.linalg.norm(at - goal, axis=1).min() < 0.02 * spacing
     far = d_before > TOUCHING * spacing
-    assert all(np.linalg.norm(at - p, axis=1).min() < OVERLAP * spacing + 1e-9 for p in points[far])  # the floor's moves
+    # the floor's moves
+    assert all(np.linalg.norm(at - p, axis=1).min() < OVERLAP * spacing + 1e-9 for p in points[far])
     assert d.min() > -(OVERLAP + 0.6) * spacing
 
 
@@ -150,9 +179,13 @@ def test_grains_are_closed_irregular_and_told_by_their_seeds(rounds):
     np.testing.assert_array_equal(np.unique(own, return_counts=True)[1], len(points) // 8)
     reach = np.linalg.norm(points - centers[own], axis=1)
     assert reach.min() > 0.03 and reach.max() < 0.3
-    volumes = [volume(points - centers[grain], corners[own[corners[:, 0]] == grain]) for grain in range(8)]
+    volumes = [
+        volume(points - centers[grain], corners[own[corners[:, 0]] == grain]) for grain in range(8)
+    ]
     assert min(volumes) > 0.0 and np.ptp(volumes) > 0.1 * np.mean(volumes)
-    edges = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1)
+    edges = np.sort(
+        np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1
+    )
     assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()
     again = grain_mesh(centers[::-1], 0.1, np.arange(8)[::-1], rounds)[0].reshape(8, -1, 3)[::-1]
     np.testing.assert_array_equal(again.reshape(-1, 3), points)

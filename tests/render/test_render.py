@@ -37,10 +37,13 @@ def pyvista():
 def make_run(dots, tmp_path):
     """Write the folder of a run by hand: a list of frames, each the points [m] and velocities [m/s] of its particles."""
 
-    def make(frames, text: str = "", size=(1.0, 1.0), grid: bool = True, solids: str = "voxel") -> Path:
+    def make(
+        frames, text: str = "", size=(1.0, 1.0), grid: bool = True, solids: str = "voxel"
+    ) -> Path:
         source = tmp_path / "source.toml"
         source.write_text(
-            '[scene]\nsimulator = "dots"\nname = "drops"\n[time]\nduration = 1.0\nframes_per_second = 20\n'
+            '[scene]\nsimulator = "dots"\nname = "drops"\n[time]\nduration = '
+            "1.0\nframes_per_second = 20\n"
             f'[domain]\nsize = {list(size)}\nresolution = 10\nsolids = "{solids}"\n{text}'
         )
         folder = tmp_path / "run"
@@ -48,11 +51,18 @@ def make_run(dots, tmp_path):
         (folder / "scene.toml").write_text(dump_scene(load_scene(source)))
         writer = FrameFolder(folder)
         for index, (points, velocity) in enumerate(frames):
-            points, velocity = np.reshape(points, (-1, 3)).astype(np.float32), np.reshape(velocity, (-1, 3)).astype(np.float32)
-            cells = np.unique(np.floor(points[np.isfinite(points).all(axis=1)] * 10).astype(int), axis=0)
+            points, velocity = (
+                np.reshape(points, (-1, 3)).astype(np.float32),
+                np.reshape(velocity, (-1, 3)).astype(np.float32),
+            )
+            cells = np.unique(
+                np.floor(points[np.isfinite(points).all(axis=1)] * 10).astype(int), axis=0
+            )
             parts = [Points("particles", points, {"velocity": velocity})]
             if grid:
-                parts.append(Cells("grid", cells, 0.1, len(size), {"pressure": 100.0 * cells[:, 1]}))
+                parts.append(
+                    Cells("grid", cells, 0.1, len(size), {"pressure": 100.0 * cells[:, 1]})
+                )
             writer.write(index, index / 20, parts)
         return folder
 
@@ -100,7 +110,10 @@ def test_without_pyvista_the_command_says_what_to_install(make_run, monkeypatch)
     [
         (["{run}/nowhere"], "is not the folder of a run: there is no such folder"),
         (["{run}/frames"], "is not the folder of a run: it has no scene.toml"),
-        (["{run}", "--frame", "0", "--frame", "2"], "--frame 2: there is no such frame; the run has 0 to 1"),
+        (
+            ["{run}", "--frame", "0", "--frame", "2"],
+            "--frame 2: there is no such frame; the run has 0 to 1",
+        ),
         (["{run}", "--frame", "-3"], "--frame -3: there is no such frame"),
         (["{run}", "--size", "1280"], "--size 1280: must be a width and a height"),
         (["{run}", "--size", "99999x720"], "of 240 to 4096 pixels"),
@@ -144,7 +157,10 @@ def test_the_command_writes_the_frames_asked_for(pyvista, make_run, tmp_path):
     result = call(folder, "--frame", -1, "--frame", 1, "--frame", 3, "--size", "320x240")
     assert result.exit_code == 0
     assert "2 images" in result.stdout
-    assert sorted(path.name for path in (folder / "images").iterdir()) == ["frame_000001.png", "frame_000003.png"]
+    assert sorted(path.name for path in (folder / "images").iterdir()) == [
+        "frame_000001.png",
+        "frame_000003.png",
+    ]
     assert pixels(folder / "images" / "frame_000001.png").shape == (240, 320, 3)
     assert call(folder, "--out", tmp_path / "elsewhere", "--size", "320x240").exit_code == 0
     assert len(list((tmp_path / "elsewhere").glob("frame_*.png"))) == 4
@@ -153,11 +169,20 @@ def test_the_command_writes_the_frames_asked_for(pyvista, make_run, tmp_path):
 def test_how_long_drawing_takes_is_told_before_it_begins(pyvista, make_run):
     folder, said = make_run([drops(5) for _ in range(4)]), []
     looks, frames = Looks(size=(320, 240)), [0, 1, 2]
-    drawn = render_run(folder, frames=frames, looks=looks, estimated=said.append, told=lambda done, of: said.append(done))
+    drawn = render_run(
+        folder,
+        frames=frames,
+        looks=looks,
+        estimated=said.append,
+        told=lambda done, of: said.append(done),
+    )
     next(drawn)
     drawn.close()
     assert said == [expected_seconds(Recording(folder), frames, looks), 0, 1]
-    more = [expected_seconds(Recording(folder), frames * 2, looks), expected_seconds(Recording(folder), frames, Looks(size=(640, 480)))]
+    more = [
+        expected_seconds(Recording(folder), frames * 2, looks),
+        expected_seconds(Recording(folder), frames, Looks(size=(640, 480))),
+    ]
     assert more[0] == 2 * said[0]
     assert more[1] > said[0] > 0.0
     result = call(folder, "--size", "320x240")
@@ -165,14 +190,32 @@ def test_how_long_drawing_takes_is_told_before_it_begins(pyvista, make_run):
     assert "takes about" not in call(folder, "--size", "320x240", "--frame", 0).stderr
 
 
-@pytest.mark.parametrize(("simulator", "key", "expected"), [("fluids", "liquid", Show.SURFACE), ("granular", "sand", Show.PARTICLES)])
-def test_sand_is_drawn_as_grains_and_liquid_as_its_surface_unless_told(simulator, key, expected, tmp_path):
+@pytest.mark.parametrize(
+    ("simulator", "key", "expected"),
+    [("fluids", "liquid", Show.SURFACE), ("granular", "sand", Show.PARTICLES)],
+)
+def test_sand_is_drawn_as_grains_and_liquid_as_its_surface_unless_told(
+    simulator, key, expected, tmp_path
+):
     """A heap's surface is lace where it is a grain thin, and a pillar of clay where it is thick."""
     material = {key: [{"shape": "box", "min": [0.0, 0.0], "max": [0.5, 0.5]}]}
-    tables = {"scene": {"simulator": simulator}, "time": {"duration": 1.0}, "domain": {"size": [1.0, 1.0], "resolution": 10}}
-    (tmp_path / "scene.toml").write_text(dump_scene(load_scene({**tables, **material, "output": {"surface": True}})))
+    tables = {
+        "scene": {"simulator": simulator},
+        "time": {"duration": 1.0},
+        "domain": {"size": [1.0, 1.0], "resolution": 10},
+    }
+    (tmp_path / "scene.toml").write_text(
+        dump_scene(load_scene({**tables, **material, "output": {"surface": True}}))
+    )
     points, velocity = drops(5)
-    FrameFolder(tmp_path).write(0, 0.0, [Points("particles", points.astype(np.float32), {"velocity": velocity}), ball([0.5, 0.5], 0.1)])
+    FrameFolder(tmp_path).write(
+        0,
+        0.0,
+        [
+            Points("particles", points.astype(np.float32), {"velocity": velocity}),
+            ball([0.5, 0.5], 0.1),
+        ],
+    )
     assert Recording(tmp_path).show is Live(tmp_path)._recording.show is expected
     assert Recording(tmp_path, show=Show.SURFACE).show is Show.SURFACE
     assert Recording(tmp_path, Color.SPEED).show is Show.PARTICLES
@@ -195,17 +238,25 @@ def test_a_sheet_shows_evenly_spaced_frames(pyvista, make_run):
     areas = []
     for place in range(6):
         top = page.line + place // columns * (height + page.caption) + page.caption
-        areas.append(is_blue(image[top : top + height, place % columns * width : (place % columns + 1) * width]).sum())
+        areas.append(
+            is_blue(
+                image[top : top + height, place % columns * width : (place % columns + 1) * width]
+            ).sum()
+        )
     frames = spread(range(8), 6)
     assert frames == [0, 1, 3, 4, 6, 7]
     np.testing.assert_allclose(np.array(areas) / areas[0], np.array(frames) + 1, rtol=0.25)
 
 
-@pytest.mark.parametrize(("rate", "label"), [(20, "t = 0.05 s"), (100, "t = 0.01 s"), (1000, "t = 0.001 s")])
+@pytest.mark.parametrize(
+    ("rate", "label"), [(20, "t = 0.05 s"), (100, "t = 0.01 s"), (1000, "t = 0.001 s")]
+)
 def test_each_picture_tells_its_own_time(pyvista, make_run, monkeypatch, rate, label):
     folder = make_run([drops(1), drops(1)])
     text = folder / "scene.toml"
-    text.write_text(re.sub(r"frames_per_second = [0-9.]+", f"frames_per_second = {rate}", text.read_text()))
+    text.write_text(
+        re.sub(r"frames_per_second = [0-9.]+", f"frames_per_second = {rate}", text.read_text())
+    )
     page, texts = Page(Recording(folder, Color.SPEED), (400, 300), 2, Picture), []
     monkeypatch.setattr(page, "_write", lambda figure, text, x, y, anchor: texts.append(text))
     page.draw([0, 1])
@@ -220,7 +271,10 @@ def test_discs_have_the_size_of_the_particles(pyvista, make_run):
     page.painter.close()
     pixel = MARGIN / page.tile[1]  # [m]; the height is what limits a square domain here
     assert page.painter.radius == pytest.approx(0.6 * 0.1)
-    assert is_blue(image).sum() * pixel**2 == pytest.approx(30 * np.pi * page.painter.radius**2, rel=0.25)  # neighbors overlap
+    # neighbors overlap
+    assert is_blue(image).sum() * pixel**2 == pytest.approx(
+        30 * np.pi * page.painter.radius**2, rel=0.25
+    )
     assert (image[2:-2, 2:40] == WHITE).all()
 
 
@@ -241,7 +295,9 @@ def test_flat_walls_hide_what_of_discs_reaches_across_them(pyvista, make_run):
     angle = 2.0 * np.pi * along
     sides = [np.stack([np.full(16, end), along], axis=-1) for end in (0.001, 0.999)]
     circle = 0.5 + 0.399 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    points = np.pad(np.concatenate([*sides, *(side[:, ::-1] for side in sides), circle]), ((0, 0), (0, 1)))
+    points = np.pad(
+        np.concatenate([*sides, *(side[:, ::-1] for side in sides), circle]), ((0, 0), (0, 1))
+    )
     folder = make_run([(points, np.tile([1.0, 0.0, 0.0], (len(points), 1)))], DISC)
     page = Page(Recording(folder, Color.SPEED), (400, 300), 1, Picture)
     image = np.asarray(page.draw([0]), dtype=int)[page.line :]
@@ -261,7 +317,9 @@ def test_balls_do_not_reach_beyond_the_outline_of_a_room(pyvista, make_run, size
     ends = np.array([0.001, 0.999])
     grid = np.stack(np.meshgrid(*[np.linspace(0.05, 0.95, 10)] * 2), axis=-1).reshape(-1, 2)
     walls = [np.insert(grid, axis, end, axis=1) for axis in range(3) for end in ends]
-    folder = make_run([(np.concatenate(walls), np.tile([1.0, 0.0, 0.0], (600, 1)))], size=(1.0, 1.0, 1.0))
+    folder = make_run(
+        [(np.concatenate(walls), np.tile([1.0, 0.0, 0.0], (600, 1)))], size=(1.0, 1.0, 1.0)
+    )
     page = Page(Recording(folder, Color.SPEED), parse_size(size), 1, Picture)
     drawn = is_blue(np.asarray(page.draw([0]), dtype=int)[page.line :])
     view, (width, height) = viewpoint(page.recording.scene, page.tile[0] / page.tile[1]), page.tile
@@ -272,7 +330,10 @@ def test_balls_do_not_reach_beyond_the_outline_of_a_room(pyvista, make_run, size
     across, down = width / 2 + focal * x / depth, height / 2 - focal * y / depth
     row, column = np.argwhere(drawn).T
     assert drawn.sum() > 5000
-    found, expected = [column.min(), column.max() + 1, row.min(), row.max() + 1], [across.min(), across.max(), down.min(), down.max()]
+    found, expected = (
+        [column.min(), column.max() + 1, row.min(), row.max() + 1],
+        [across.min(), across.max(), down.min(), down.max()],
+    )
     np.testing.assert_allclose(found, expected, atol=2.5)
 
 
@@ -281,13 +342,18 @@ def test_flat_solids_are_filled_gray(pyvista, make_run):
     page = Page(Recording(folder, Color.SPEED), (400, 300), 1, Picture)
     image = np.asarray(page.draw([0]), dtype=int)[page.line :]
     page.painter.close()
-    gray = (np.ptp(image, axis=-1) < 16) & (image[..., 0] > 150) & (image[..., 0] < 230)  # lighter than the outlines
-    assert gray.sum() * (MARGIN / page.tile[1]) ** 2 == pytest.approx(1.0 - np.pi * 0.4**2, rel=0.03)
+    # lighter than the outlines
+    gray = (np.ptp(image, axis=-1) < 16) & (image[..., 0] > 150) & (image[..., 0] < 230)
+    assert gray.sum() * (MARGIN / page.tile[1]) ** 2 == pytest.approx(
+        1.0 - np.pi * 0.4**2, rel=0.03
+    )
 
 
 def test_colors_mean_the_same_in_every_frame(pyvista, make_run):
     slow, fast = [0.5, 0.0, 0.0], [4.0, 0.0, 0.0]
-    folder = make_run([([0.25, 0.5, 0.0], slow), ([[0.25, 0.5, 0.0], [0.75, 0.5, 0.0]], [slow, fast])])
+    folder = make_run(
+        [([0.25, 0.5, 0.0], slow), ([[0.25, 0.5, 0.0], [0.75, 0.5, 0.0]], [slow, fast])]
+    )
     first, second = draw(folder)
     ours = is_blue(first)
     ours[:30] = False  # the legend
@@ -312,7 +378,14 @@ def test_pressure_and_plain_colors(pyvista, make_run):
 
 def test_empty_frames_and_numbers_that_are_not_finite(pyvista, make_run):
     nothing = np.zeros((0, 3))
-    folder = make_run([drops(4), (nothing, nothing), ([[0.5, 0.5, 0.0], [np.nan, 0.5, 0.0]], [[1, 0, 0], [1, 0, 0]])], grid=False)
+    folder = make_run(
+        [
+            drops(4),
+            (nothing, nothing),
+            ([[0.5, 0.5, 0.0], [np.nan, 0.5, 0.0]], [[1, 0, 0], [1, 0, 0]]),
+        ],
+        grid=False,
+    )
     points, values = Recording(folder, Color.SPEED).read(2)
     assert points.shape == (1, 3)
     assert values == pytest.approx([1.0])
@@ -323,9 +396,9 @@ def test_empty_frames_and_numbers_that_are_not_finite(pyvista, make_run):
 
 @pytest.mark.parametrize("size", [(1.0, 0.5, 0.5), (0.5, 1.0, 0.4), (0.3, 0.3, 1.0)])
 def test_the_camera_shows_the_whole_room(pyvista, make_run, size):
-    image = draw(make_run([(np.multiply(size, 0.5), [1.0, 0.0, 0.0])], size=size), color=Color.PLAIN)[0][
-        20:
-    ]  # without the line with the time
+    image = draw(
+        make_run([(np.multiply(size, 0.5), [1.0, 0.0, 0.0])], size=size), color=Color.PLAIN
+    )[0][20:]  # without the line with the time
     drawn = np.argwhere((image < 200).any(axis=-1))
     margin = np.array([drawn.min(axis=0), image.shape[:2] - drawn.max(axis=0)]) / image.shape[:2]
     assert margin.min() > 0.02  # nothing is cut off,
@@ -334,17 +407,24 @@ def test_the_camera_shows_the_whole_room(pyvista, make_run, size):
 
 
 SOLIDS = {
-    "box": 'shape = "box"\nmin = [0.2, 0.1, 0.3]\nmax = [0.6, 0.4, 0.5]\nrotate = [10.0, 20.0, 30.0]',
+    "box": 'shape = "box"\nmin = [0.2, 0.1, 0.3]\nmax = [0.6, 0.4, 0.5]\nrotate = [10.0, 20.0, '
+    "30.0]",
     "sphere": 'shape = "sphere"\ncenter = [0.5, 0.4, 0.5]\nradius = 0.2\nscale = 0.9',
-    "capsule": 'shape = "capsule"\nfrom = [0.3, 0.3, 0.3]\nto = [0.6, 0.7, 0.5]\nradius = 0.1\ntranslate = [0.0, 0.0, 0.1]',
-    "mesh": 'shape = "mesh"\nfile = "builtin:torus"\nscale = 0.5\nrotate = [40.0, 0.0, 0.0]\ntranslate = [0.5, 0.5, 0.5]',
-    "plane": 'shape = "plane"\npoint = [0.0, 0.3, 0.0]\nnormal = [0.2, 1.0, 0.1]\ntranslate = [0.0, 0.1, 0.0]',
+    "capsule": 'shape = "capsule"\nfrom = [0.3, 0.3, 0.3]\nto = [0.6, 0.7, 0.5]\nradius = '
+    "0.1\ntranslate = [0.0, 0.0, 0.1]",
+    "mesh": 'shape = "mesh"\nfile = "builtin:torus"\nscale = 0.5\nrotate = [40.0, 0.0, '
+    "0.0]\ntranslate = [0.5, 0.5, 0.5]",
+    "plane": 'shape = "plane"\npoint = [0.0, 0.3, 0.0]\nnormal = [0.2, 1.0, 0.1]\ntranslate = '
+    "[0.0, 0.1, 0.0]",
     "cut off": 'shape = "sphere"\ncenter = [0.9, 0.1, 0.5]\nradius = 0.3',
 }
 ROOM = (1.0, 1.0, 1.0)
 
 
-TURN = 'motion = { kind = "rotation", rate = 90.0, center = [0.5, 0.5, 0.5], axis = [0.2, 1.0, 0.3] }\n'
+TURN = (
+    'motion = { kind = "rotation", rate = 90.0, center = [0.5, 0.5, 0.5], axis = [0.2, 1.0, '
+    "0.3] }\n"
+)
 
 
 @pytest.mark.parametrize("time", [0.0, 0.37])
@@ -359,19 +439,27 @@ def test_surfaces_lie_where_the_solver_has_them(pyvista, make_run, name, invert,
     inside = (np.abs(points - 0.5) < 0.5 - 1e-6).all(axis=1)
     assert inside.any() or name == "plane"  # its corners lie on the walls
     distance = wp.empty(len(points), dtype=wp.float32, device="cpu")
-    shape.to_geometry(Path(), 3).moved(pose).signed_distance(wp.array(points, dtype=wp.vec3, device="cpu"), distance)
+    shape.to_geometry(Path(), 3).moved(pose).signed_distance(
+        wp.array(points, dtype=wp.vec3, device="cpu"), distance
+    )
     assert np.abs(distance.numpy()[inside]).max(initial=0.0) < 2e-3
     if not invert:
-        assert distance.numpy().max() < 2e-3  # what closes the surface at the walls is inside the solid
+        # what closes the surface at the walls is inside the solid
+        assert distance.numpy().max() < 2e-3
         assert (points > -1e-6).all()
         assert (points < 1 + 1e-6).all()
     assert mesh.n_open_edges == 0
     corners = points[mesh.triangulate().regular_faces]
-    assert np.linalg.det(corners).sum() / 6 == pytest.approx(mesh.volume, rel=1e-3)  # positive: every triangle faces outward
+    # positive: every triangle faces outward
+    assert np.linalg.det(corners).sum() / 6 == pytest.approx(mesh.volume, rel=1e-3)
 
 
 def test_solids_in_a_room_are_gray(pyvista, make_run):
-    folder = make_run([([0.9, 0.9, 0.9], [1.0, 0.0, 0.0])], "".join(f"[[solid]]\n{SOLIDS[name]}\n" for name in SOLIDS), size=ROOM)
+    folder = make_run(
+        [([0.9, 0.9, 0.9], [1.0, 0.0, 0.0])],
+        "".join(f"[[solid]]\n{SOLIDS[name]}\n" for name in SOLIDS),
+        size=ROOM,
+    )
     image = draw(folder)[0][25:]
     assert ((np.ptp(image, axis=-1) < 16) & (image < 215).all(axis=-1)).mean() > 0.1
 
@@ -384,7 +472,8 @@ def test_a_flat_solid_stands_where_it_is_at_the_time_of_a_frame(pyvista, make_ru
     folder = make_run([([0.05, 0.05, 0.0], [1.0, 0.0, 0.0])] * 5, disc + wall, solids="cut-cell")
     page = Page(Recording(folder, Color.SPEED), (400, 300), 1, Picture)
     pixel = MARGIN / page.tile[1]  # [m]
-    low = 0.5 * (np.array(page.tile) * pixel - 1.0)  # [m] from the image's left and lower edge to the domain's corner
+    # [m] from the image's left and lower edge to the domain's corner
+    low = 0.5 * (np.array(page.tile) * pixel - 1.0)
     for frame, expected in ((0, [0.2, 0.6]), (1, [0.4, 0.55]), (4, [0.6, 0.5]), (0, [0.2, 0.6])):
         image = np.asarray(page.draw([frame]), dtype=int)[page.line :]
         gray = (np.ptp(image, axis=-1) < 16) & (image[..., 0] > 150) & (image[..., 0] < 230)
@@ -392,7 +481,8 @@ def test_a_flat_solid_stands_where_it_is_at_the_time_of_a_frame(pyvista, make_ru
         x, y = (columns + 0.5) * pixel - low[0], (page.tile[1] - rows - 0.5) * pixel - low[1]
         ours = (x > 0.05) & (x < 0.85) & (y > 0.05) & (y < 0.95)
         np.testing.assert_allclose([x[ours].mean(), y[ours].mean()], expected, atol=pixel)
-        assert ours.sum() * pixel**2 == pytest.approx(np.pi * 0.1**2, rel=0.1)  # and nothing is left where it was
+        # and nothing is left where it was
+        assert ours.sum() * pixel**2 == pytest.approx(np.pi * 0.1**2, rel=0.1)
         assert (x[~ours] > 0.9).mean() > 0.8  # the wall stands
     page.painter.close()
 
@@ -408,7 +498,8 @@ def test_a_solid_in_a_room_is_drawn_anew_in_every_frame(pyvista, make_run):
     np.testing.assert_array_equal(images[0], images[3])
     gray = [((np.ptp(image, axis=-1) < 16) & (image < 215).all(axis=-1)).sum() for image in images]
     assert gray[1] > 1.5 * gray[2]
-    assert gray[0] > 1.5 * gray[2]  # by 0.15 s the ball has left through the ceiling; the room's edges stay
+    # by 0.15 s the ball has left through the ceiling; the room's edges stay
+    assert gray[0] > 1.5 * gray[2]
 
 
 def test_containers_do_not_hide_what_is_in_them(pyvista, make_run):
@@ -420,24 +511,43 @@ def test_containers_do_not_hide_what_is_in_them(pyvista, make_run):
 def test_liquid_is_lit_from_above_and_drops_are_not():
     block = np.stack(np.meshgrid(*[np.arange(0.025, 1.0, 0.05)] * 3), axis=-1).reshape(-1, 3)
     drop = np.array([[3.0, 3.0, 3.0]])
-    colors, outer = shaded(np.concatenate([block, drop]), np.full((len(block) + 1, 3), 100.0), 0.1, "water")
+    colors, outer = shaded(
+        np.concatenate([block, drop]), np.full((len(block) + 1, 3), 100.0), 0.1, "water"
+    )
     light = colors.mean(axis=1)
     depth = (0.5 - np.abs(block - 0.5)).min(axis=1)  # only what lies deep inside need not be drawn
     assert outer[-1]
     assert outer[:-1][depth < 0.1].all()
     assert not outer[:-1][depth > 0.3].any()
     middle = (np.abs(block[:, [0, 2]] - 0.5) < 0.1).all(axis=1)
-    top, bottom, core = (light[:-1][middle & (np.abs(block[:, 1] - y) < 0.03)].mean() for y in (0.975, 0.025, 0.525))
+    top, bottom, core = (
+        light[:-1][middle & (np.abs(block[:, 1] - y) < 0.03)].mean() for y in (0.975, 0.025, 0.525)
+    )
     assert top > bottom + 20
     assert core == pytest.approx(100.0, abs=1.0)
     assert light[-1] == pytest.approx(100.0, abs=15.0)
 
 
 def test_scales_end_at_round_numbers():
-    assert [_round_up(value) for value in (0.0, 0.7, 1.0, 2.1, 9.7, 10.0, 4321.0)] == [1.0, 0.8, 1.0, 2.5, 10.0, 10.0, 5000.0]
+    assert [_round_up(value) for value in (0.0, 0.7, 1.0, 2.1, 9.7, 10.0, 4321.0)] == [
+        1.0,
+        0.8,
+        1.0,
+        2.5,
+        10.0,
+        10.0,
+        5000.0,
+    ]
     scale = Scale("", 0.0, 2.0, ("#000000", "#643200"))
-    np.testing.assert_allclose(scale.colors(np.array([-1.0, 1.0, 2.0, 9.0])), [[0, 0, 0], [50, 25, 0], [100, 50, 0], [100, 50, 0]], atol=1)
-    np.testing.assert_array_equal(Scale("", 0.0, 1.0).colors(np.array([0.0, 1.0])), [[68, 1, 84], [253, 231, 36]])  # viridis
+    np.testing.assert_allclose(
+        scale.colors(np.array([-1.0, 1.0, 2.0, 9.0])),
+        [[0, 0, 0], [50, 25, 0], [100, 50, 0], [100, 50, 0]],
+        atol=1,
+    )
+    # viridis
+    np.testing.assert_array_equal(
+        Scale("", 0.0, 1.0).colors(np.array([0.0, 1.0])), [[68, 1, 84], [253, 231, 36]]
+    )
 
 
 def test_negative_pressure_extends_the_scale(pyvista, make_run):

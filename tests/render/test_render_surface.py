@@ -14,7 +14,11 @@ from warp_lcp.scene.camera import MARGIN
 from warp_lcp.simulation import Points, Surface
 
 ROOM = (1.0, 1.0, 1.0)
-PARTICLE = Points("particles", np.array([[0.1, 0.1, 0.0]], dtype=np.float32), {"velocity": np.array([[1.0, 0.0, 0.0]], dtype=np.float32)})
+PARTICLE = Points(
+    "particles",
+    np.array([[0.1, 0.1, 0.0]], dtype=np.float32),
+    {"velocity": np.array([[1.0, 0.0, 0.0]], dtype=np.float32)},
+)
 SIZE = (400, 300)
 TURN = np.array([[0.6, 0.8, 0.0], [-0.8, 0.6, 0.0], [0.0, 0.0, 1.0]], dtype=np.float32)
 
@@ -51,13 +55,17 @@ def middle(mask, folder, page_line=20):
     """Return the mean place of a 2-D image's pixels [m], for a domain of 1 m whose height limits the image."""
     rows, columns = np.nonzero(mask)
     pixel = MARGIN / mask.shape[0]
-    return (columns.mean() + 0.5 - SIZE[0] / 2) * pixel + 0.5, (mask.shape[0] / 2 - rows.mean() - 0.5) * pixel + 0.5
+    return (columns.mean() + 0.5 - SIZE[0] / 2) * pixel + 0.5, (
+        mask.shape[0] / 2 - rows.mean() - 0.5
+    ) * pixel + 0.5
 
 
 def test_outlines_are_filled_inside_and_islands_left_out(pyvista, dots, tmp_path):
     outer, inner = ball([0.5, 0.5], 0.35), ball([0.55, 0.52], 0.15)
     both = Surface(
-        "surface", np.concatenate([outer.points, inner.points]), np.concatenate([outer.corners, inner.corners[:, ::-1] + len(outer.points)])
+        "surface",
+        np.concatenate([outer.points, inner.points]),
+        np.concatenate([outer.corners, inner.corners[:, ::-1] + len(outer.points)]),
     )
     (image,) = draw(write_run(tmp_path / "run", [[both]]))
     mask = is_blue(image)
@@ -85,7 +93,8 @@ def test_the_surface_is_shown_where_there_is_one(dots, tmp_path):
 def test_surfaces_come_back_as_they_were_written(dots, tmp_path):
     surface = ball([0.5, 0.4, 0.3], 0.2)
     surface.points[7] = np.nan
-    surface.points[7:8].view(np.uint32)[0, 0] = 0x7FA00000  # one that raises "invalid" when it is converted
+    # one that raises "invalid" when it is converted
+    surface.points[7:8].view(np.uint32)[0, 0] = 0x7FA00000
     read = Recording(write_run(tmp_path / "run", [[surface]], size=ROOM)).frame(0).surface
     whole = ~(surface.corners == 7).any(axis=1)
     np.testing.assert_array_equal(read.corners, surface.corners[whole])
@@ -93,10 +102,16 @@ def test_surfaces_come_back_as_they_were_written(dots, tmp_path):
 
 
 def test_a_flat_surface_is_filled(pyvista, dots, tmp_path):
-    folder = write_run(tmp_path / "run", [[PARTICLE, ball([0.4, 0.3], 0.2)], [PARTICLE, ball([0.6, 0.7], 0.1)]])
-    for image, center, radius in zip(draw(folder), ([0.4, 0.3], [0.6, 0.7]), (0.2, 0.1), strict=True):
+    folder = write_run(
+        tmp_path / "run", [[PARTICLE, ball([0.4, 0.3], 0.2)], [PARTICLE, ball([0.6, 0.7], 0.1)]]
+    )
+    for image, center, radius in zip(
+        draw(folder), ([0.4, 0.3], [0.6, 0.7]), (0.2, 0.1), strict=True
+    ):
         mask = is_blue(image)
-        assert mask.sum() * (MARGIN / image.shape[0]) ** 2 == pytest.approx(np.pi * radius**2, rel=0.05)
+        assert mask.sum() * (MARGIN / image.shape[0]) ** 2 == pytest.approx(
+            np.pi * radius**2, rel=0.05
+        )
         np.testing.assert_allclose(middle(mask, folder), center, atol=0.01)
         top, bottom = np.nonzero(mask)[0].min() + 6, np.nonzero(mask)[0].max() - 6
         column = round(np.nonzero(mask)[1].mean())
@@ -107,7 +122,9 @@ def test_flat_solids_cover_the_surface(pyvista, dots, tmp_path):
     text = '[[solid]]\nshape = "box"\nmin = [0.0, 0.0]\nmax = [0.5, 1.0]\n'
     image = draw(write_run(tmp_path / "run", [[ball([0.5, 0.5], 0.3)]], text))[0]
     mask = is_blue(image)
-    assert mask.sum() * (MARGIN / image.shape[0]) ** 2 == pytest.approx(np.pi * 0.3**2 / 2, rel=0.05)
+    assert mask.sum() * (MARGIN / image.shape[0]) ** 2 == pytest.approx(
+        np.pi * 0.3**2 / 2, rel=0.05
+    )
 
 
 def test_flat_bodies_are_where_their_outlines_are(pyvista, dots, tmp_path):
@@ -116,17 +133,26 @@ def test_flat_bodies_are_where_their_outlines_are(pyvista, dots, tmp_path):
     for image, x in zip(draw(folder), (0.3, 0.5, 0.8), strict=True):
         mask = is_orange(image)
         np.testing.assert_allclose(middle(mask, folder), [x, 0.6], atol=0.01)
-        assert mask.sum() * (MARGIN / image.shape[0]) ** 2 == pytest.approx(np.pi * 0.15**2, rel=0.08)
+        assert mask.sum() * (MARGIN / image.shape[0]) ** 2 == pytest.approx(
+            np.pi * 0.15**2, rel=0.08
+        )
 
 
 def test_bodies_have_colors_of_their_own_in_every_frame(pyvista, dots, tmp_path):
-    one, two = ball([0.3, 0.5, 0.5], 0.15, "bodies", body=1), ball([0.7, 0.5, 0.5], 0.15, "bodies", body=4)
+    one, two = (
+        ball([0.3, 0.5, 0.5], 0.15, "bodies", body=1),
+        ball([0.7, 0.5, 0.5], 0.15, "bodies", body=4),
+    )
     pair = Surface(
-        "bodies", np.concatenate([one.points, two.points]), np.concatenate([one.corners, two.corners + len(one.points)]),
+        "bodies",
+        np.concatenate([one.points, two.points]),
+        np.concatenate([one.corners, two.corners + len(one.points)]),
         {"body": np.concatenate([one.fields["body"], two.fields["body"]])},
-    )  # fmt: skip
+    )
     text = "[camera]\nposition = [0.5, 0.5, 5.0]\nlook_at = [0.5, 0.5, 0.5]\n"
-    first, again = draw(write_run(tmp_path / "run", [[PARTICLE, pair], [PARTICLE, pair]], text, ROOM))
+    first, again = draw(
+        write_run(tmp_path / "run", [[PARTICLE, pair], [PARTICLE, pair]], text, ROOM)
+    )
     np.testing.assert_array_equal(first, again)
     colored = np.ptp(first, axis=-1) > 40
     left, right = first[:, :200][colored[:, :200]], first[:, 200:][colored[:, 200:]]
@@ -135,21 +161,32 @@ def test_bodies_have_colors_of_their_own_in_every_frame(pyvista, dots, tmp_path)
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_a_ball_that_turns_looks_otherwise_and_fills_the_same_place(pyvista, dots, tmp_path, dimension):
+def test_a_ball_that_turns_looks_otherwise_and_fills_the_same_place(
+    pyvista, dots, tmp_path, dimension
+):
     still = ball([0.5] * dimension, 0.2, "bodies", body=1)
-    turned = Surface("bodies", (still.points - 0.5) @ TURN + np.float32(0.5), still.corners, still.fields)
+    turned = Surface(
+        "bodies", (still.points - 0.5) @ TURN + np.float32(0.5), still.corners, still.fields
+    )
     if dimension == 2:
         turned.points[:, 2] = 0.0
-    text, size = ("[camera]\nposition = [0.5, 0.5, 5.0]\n", ROOM) if dimension == 3 else ("", (1.0, 1.0))
+    text, size = (
+        ("[camera]\nposition = [0.5, 0.5, 5.0]\n", ROOM) if dimension == 3 else ("", (1.0, 1.0))
+    )
     far = Points("particles", PARTICLE.points * np.float32(0.1), PARTICLE.fields)
-    first, second, third = draw(write_run(tmp_path / "run", [[far, still], [far, turned], [far, still]], text, size))
+    first, second, third = draw(
+        write_run(tmp_path / "run", [[far, still], [far, turned], [far, still]], text, size)
+    )
     np.testing.assert_array_equal(first, third)
     assert (np.abs(first - second).max(axis=-1) > 20).sum() > 60
     assert is_orange(first).sum() == pytest.approx(is_orange(second).sum(), rel=0.1)
 
 
 def test_what_is_round():
-    for points, corners in (sphere(), (ball([0.4, 0.6], 0.1).points, ball([0.4, 0.6], 0.1).corners)):
+    for points, corners in (
+        sphere(),
+        (ball([0.4, 0.6], 0.1).points, ball([0.4, 0.6], 0.1).corners),
+    ):
         assert is_round(points, corners)
         assert not is_round(points * [1.0, 1.1, 1.0], corners)
     cube = box([0.0, 0.0, 0.0], [1.0, 1.0, 1.0])
@@ -166,7 +203,8 @@ def test_solids_with_mass_do_not_stand_where_they_began(pyvista, dots, tmp_path)
         assert len(prescribed_solids(Recording(folder).scene)) == count
         (image,) = draw(folder)
         gray = (np.ptp(image, axis=-1) < 16) & (image[..., 0] > 150) & (image[..., 0] < 230)
-        assert (gray[:, : SIZE[0] // 2].sum() > 2000) == (count == 2)  # the domain's edges are gray too
+        # the domain's edges are gray too
+        assert (gray[:, : SIZE[0] // 2].sum() > 2000) == (count == 2)
         assert gray[:, SIZE[0] // 2 :].sum() > 300
 
 
@@ -175,21 +213,37 @@ def test_water_in_a_room_shows_what_is_in_it(pyvista, dots, tmp_path):
     swimmer = ball([0.5, 0.5, 0.5], 0.2, "bodies", body=1)
     text = "[camera]\nposition = [0.5, 0.5, 5.0]\n"
     water = write_run(tmp_path / "water", [[PARTICLE, ball([0.5, 0.5, 0.5], 0.3)]], text, ROOM)
-    with_body = write_run(tmp_path / "body", [[PARTICLE, ball([0.5, 0.5, 0.5], 0.3), swimmer]], text, ROOM)
+    with_body = write_run(
+        tmp_path / "body", [[PARTICLE, ball([0.5, 0.5, 0.5], 0.3), swimmer]], text, ROOM
+    )
     (plain,), (swum,) = draw(water), draw(with_body)
     assert is_blue(plain).sum() > 2000
     assert (plain != swum).any(axis=-1).sum() > 200
     assert is_blue(plain)[plain.shape[0] // 2, SIZE[0] // 2]
-    assert swum[swum.shape[0] // 2, SIZE[0] // 2, 0] > plain[plain.shape[0] // 2, SIZE[0] // 2, 0] + 30  # orange, dimmed
-    many = Points("particles", np.tile([[0.1, 0.8, 0.5]], (5, 1)).astype(np.float32), {"velocity": np.zeros((5, 3), dtype=np.float32)})
+    # orange, dimmed
+    assert (
+        swum[swum.shape[0] // 2, SIZE[0] // 2, 0] > plain[plain.shape[0] // 2, SIZE[0] // 2, 0] + 30
+    )
+    many = Points(
+        "particles",
+        np.tile([[0.1, 0.8, 0.5]], (5, 1)).astype(np.float32),
+        {"velocity": np.zeros((5, 3), dtype=np.float32)},
+    )
     folder = write_run(tmp_path / "both", [[many, ball([0.5, 0.5, 0.5], 0.3)]], text, ROOM)
     (both,), (surface,) = draw(folder, show=Show.BOTH), draw(folder, show=Show.SURFACE)
     assert (both != surface).any(axis=-1)[:120, :200].sum() > 8
 
 
 def test_empty_surfaces_and_frames_without_bodies(pyvista, dots, tmp_path):
-    nothing = Surface("surface", np.zeros((0, 3), dtype=np.float32), np.zeros((0, 3), dtype=np.int32))
-    folder = write_run(tmp_path / "run", [[ball([0.5, 0.5, 0.5], 0.3)], [nothing]], "[camera]\nposition = [0.5, 0.5, 5.0]\n", ROOM)
+    nothing = Surface(
+        "surface", np.zeros((0, 3), dtype=np.float32), np.zeros((0, 3), dtype=np.int32)
+    )
+    folder = write_run(
+        tmp_path / "run",
+        [[ball([0.5, 0.5, 0.5], 0.3)], [nothing]],
+        "[camera]\nposition = [0.5, 0.5, 5.0]\n",
+        ROOM,
+    )
     some, none = draw(folder)
     assert is_blue(some).sum() > 2000
     assert is_blue(none).sum() == 0
@@ -200,7 +254,10 @@ def test_empty_surfaces_and_frames_without_bodies(pyvista, dots, tmp_path):
     [
         (["--show", "surface", "--color", "speed"], "--color speed is for particles"),
         (["--set", "time.duration=3"], "--set time.duration=3: only keys of [camera]"),
-        (["--set", "camera.position=[0.5, 0.5, 0.5]"], "must not be the point that the camera looks at"),
+        (
+            ["--set", "camera.position=[0.5, 0.5, 0.5]"],
+            "must not be the point that the camera looks at",
+        ),
         (["--set", "camera.zoom=2"], "camera.zoom: unknown key"),
         (["--at", "0.5"], "--at: needs --slice"),
         (["--fps", "10"], "--fps: needs --film"),
@@ -222,7 +279,14 @@ def test_a_camera_from_the_command_line(pyvista, dots, tmp_path):
     for number, look_at in enumerate(("[0.2, 0.5, 0.5]", "[0.8, 0.5, 0.5]")):
         out = tmp_path / str(number)
         settings = ["camera.position=[0.5, 0.5, 4.0]", f"camera.look_at={look_at}"]
-        result = call(folder, "--out", out, "--size", "400x300", *(word for text in settings for word in ("--set", text)))
+        result = call(
+            folder,
+            "--out",
+            out,
+            "--size",
+            "400x300",
+            *(word for text in settings for word in ("--set", text)),
+        )
         assert result.exit_code == 0
         seen.append(np.nonzero(is_blue(pixels(out / "frame_000000.png")))[1].mean())
     assert seen[0] == pytest.approx(200, abs=3)
@@ -236,8 +300,17 @@ def test_each_side_of_the_domain_has_its_own_part_of_a_surface():
     pool = Surface("surface", *welded(pool.points, pool.corners), {})
     parts = [mesh for mesh, _ in surface_meshes(pool, "water", (1.0, 1.0, 1.0), 1.0)]
     assert sum(mesh.n_cells for mesh in parts) == len(pool.corners)
-    spans = sorted(tuple(np.ptp(mesh.points, axis=0).astype(float).round(3).tolist()) for mesh in parts)
-    assert spans == [(0.0, 0.4, 1.0), (0.0, 0.4, 1.0), (1.0, 0.0, 1.0), (1.0, 0.0, 1.0), (1.0, 0.4, 0.0), (1.0, 0.4, 0.0)]
+    spans = sorted(
+        tuple(np.ptp(mesh.points, axis=0).astype(float).round(3).tolist()) for mesh in parts
+    )
+    assert spans == [
+        (0.0, 0.4, 1.0),
+        (0.0, 0.4, 1.0),
+        (1.0, 0.0, 1.0),
+        (1.0, 0.0, 1.0),
+        (1.0, 0.4, 0.0),
+        (1.0, 0.4, 0.0),
+    ]
 
 
 def welded(points, corners):

@@ -35,7 +35,10 @@ def material(dimension: int, column: int = 2):
     if dimension == 2:
         points[:, 2] = 0.0
     velocity = np.tile(np.array([1.0, 0.0, 0.0], dtype=np.float32), (len(index), 1))
-    return [Points("particles", points, {"velocity": velocity}), Cells("grid", index, 0.1, dimension, {"pressure": 100.0 * index[:, 1]})]
+    return [
+        Points("particles", points, {"velocity": velocity}),
+        Cells("grid", index, 0.1, dimension, {"pressure": 100.0 * index[:, 1]}),
+    ]
 
 
 def draw(folder, **looks):
@@ -55,7 +58,8 @@ def test_a_section_of_a_sphere_is_a_circle():
         assert len(ends) > 20
         np.testing.assert_allclose(np.linalg.norm(ends, axis=-1), np.sqrt(1.0 - z**2), atol=5e-3)
         length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).sum()
-        assert length == pytest.approx(2.0 * np.pi * np.sqrt(1.0 - z**2), rel=5e-3)  # each part of the circle once
+        # each part of the circle once
+        assert length == pytest.approx(2.0 * np.pi * np.sqrt(1.0 - z**2), rel=5e-3)
         area = 0.5 * (ends[:, 0, 0] * ends[:, 1, 1] - ends[:, 0, 1] * ends[:, 1, 0]).sum()
         assert abs(area) == pytest.approx(np.pi * (1.0 - z**2), rel=1e-2)  # all in one direction
     assert len(cut(points[corners], 1.5)) == 0
@@ -68,7 +72,9 @@ def test_pressure_fills_the_cells(dots, tmp_path, dimension):
     colored = np.ptp(image, axis=-1) > 60
     rows, columns = np.nonzero(colored)
     assert np.ptp(columns) < 0.15 * np.ptp(rows) + 4  # a layer as wide as a cell
-    top, bottom = (image[row, round(columns.mean()) + 2] for row in (rows.min() + 8, rows.max() - 8))
+    top, bottom = (
+        image[row, round(columns.mean()) + 2] for row in (rows.min() + 8, rows.max() - 8)
+    )
     assert top[1] > 180  # yellow: the pressure of these cells grows upward
     assert bottom[1] < 60  # violet
 
@@ -76,7 +82,9 @@ def test_pressure_fills_the_cells(dots, tmp_path, dimension):
 def test_particles_near_the_cut_and_no_others(dots, tmp_path):
     particles, cells = material(3)
     front = particles.points[:, 2] > 0.5
-    particles = Points("particles", particles.points[front], {"velocity": particles.fields["velocity"][front]})
+    particles = Points(
+        "particles", particles.points[front], {"velocity": particles.fields["velocity"][front]}
+    )
     folder = write_run(tmp_path / "run", [[particles, cells]], size=(1.0, 1.0, 1.0))
     near, far = (draw(folder, color=Color.SPEED, at=at)[0] for at in (0.72, 0.22))
     blue = [(image[..., 2] - image[..., 0] > 30).sum() for image in (near, far)]
@@ -86,7 +94,10 @@ def test_particles_near_the_cut_and_no_others(dots, tmp_path):
 
 @pytest.mark.parametrize(("at", "radius"), [(0.5, 0.2), (0.62, 0.16), (0.9, 0.0)])
 def test_solids_are_cut(dots, tmp_path, at, radius):
-    (image,) = draw(write_run(tmp_path / "run", [material(3)], SOLID.format("0.6, 0.5, 0.5"), (1.0, 1.0, 1.0)), at=at)
+    (image,) = draw(
+        write_run(tmp_path / "run", [material(3)], SOLID.format("0.6, 0.5, 0.5"), (1.0, 1.0, 1.0)),
+        at=at,
+    )
     gray = (np.ptp(image, axis=-1) < 12) & (np.abs(image.mean(axis=-1) - 199) < 8)
     frame = np.argwhere((image.max(axis=-1) < 60).sum(axis=1) > 100).ravel()  # the axes' lines
     side = np.ptp(frame)  # pixels of a meter
@@ -95,7 +106,9 @@ def test_solids_are_cut(dots, tmp_path, at, radius):
 
 def test_surfaces_and_bodies_are_outlined(dots, tmp_path):
     body = ball([0.7, 0.5, 0.5], 0.2, "bodies", body=1)
-    folder = write_run(tmp_path / "run", [[*material(3), ball([0.5, 0.5, 0.5], 0.3), body]], size=(1.0, 1.0, 1.0))
+    folder = write_run(
+        tmp_path / "run", [[*material(3), ball([0.5, 0.5, 0.5], 0.3), body]], size=(1.0, 1.0, 1.0)
+    )
     (image,), (plain,) = draw(folder, show=Show.BOTH), draw(folder)
     assert (plain[..., 0] - plain[..., 2] > 80).sum() > 30  # the body
     assert ((image != plain).any(axis=-1)).sum() > 150  # the surface
@@ -103,10 +116,15 @@ def test_surfaces_and_bodies_are_outlined(dots, tmp_path):
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_bodies_are_filled_but_for_their_holes(dots, tmp_path, dimension):
-    outer, inner = (ball([0.6, 0.5, 0.5][:dimension], radius, "bodies", body=1) for radius in (0.3, 0.2))
+    outer, inner = (
+        ball([0.6, 0.5, 0.5][:dimension], radius, "bodies", body=1) for radius in (0.3, 0.2)
+    )
     corners = np.concatenate([outer.corners, inner.corners[:, ::-1] + len(outer.points)])
     shell = Surface(
-        "bodies", np.concatenate([outer.points, inner.points]), corners, {"body": np.ones(len(outer.points) + len(inner.points))}
+        "bodies",
+        np.concatenate([outer.points, inner.points]),
+        corners,
+        {"body": np.ones(len(outer.points) + len(inner.points))},
     )
     (image,) = draw(
         write_run(tmp_path / "run", [[*material(dimension, 0), shell]], size=(1.0,) * dimension),
@@ -114,8 +132,10 @@ def test_bodies_are_filled_but_for_their_holes(dots, tmp_path, dimension):
         at=0.53 if dimension == 3 else None,
     )
     orange = (np.abs(image - [224, 122, 63]) < 12).all(axis=-1)
-    side = np.ptp(np.argwhere((image.max(axis=-1) < 60).sum(axis=1) > 100).ravel())  # pixels of a meter
-    assert orange.sum() / side**2 == pytest.approx(np.pi * (0.3**2 - 0.2**2), rel=0.1)  # but for the lines along its edges
+    # pixels of a meter
+    side = np.ptp(np.argwhere((image.max(axis=-1) < 60).sum(axis=1) > 100).ravel())
+    # but for the lines along its edges
+    assert orange.sum() / side**2 == pytest.approx(np.pi * (0.3**2 - 0.2**2), rel=0.1)
 
 
 def test_a_surface_alone_is_drawn_over_plain_cells(dots, tmp_path):
@@ -133,7 +153,9 @@ def test_a_film_and_a_sheet_of_sections(dots, tmp_path):
     folder = write_run(tmp_path / "run", [material(2, column) for column in (2, 4, 6)])
     assert call(folder, "--slice", "--sheet", "--size", "600x300").exit_code == 0
     assert (folder / "images" / "sheet.png").is_file()
-    assert call(folder, "--slice", "--film", tmp_path / "film.gif", "--size", "320x240").exit_code == 0
+    assert (
+        call(folder, "--slice", "--film", tmp_path / "film.gif", "--size", "320x240").exit_code == 0
+    )
     assert (tmp_path / "film.gif").stat().st_size > 1000
     assert call(folder, "--slice", "--frame", "-1").exit_code == 0
     assert (folder / "images" / "slice_000002.png").is_file()
@@ -141,7 +163,9 @@ def test_a_film_and_a_sheet_of_sections(dots, tmp_path):
 
 def test_a_flat_window(dots, tmp_path):
     whole = draw(write_run(tmp_path / "a", [material(2)]))[0]
-    part = draw(write_run(tmp_path / "b", [material(2)], "[camera]\nmin = [0.0, 0.0]\nmax = [0.5, 0.5]\n"))[0]
+    part = draw(
+        write_run(tmp_path / "b", [material(2)], "[camera]\nmin = [0.0, 0.0]\nmax = [0.5, 0.5]\n")
+    )[0]
     area = [(np.ptp(image, axis=-1) > 60).sum() for image in (whole, part)]
     assert area[1] > 1.6 * area[0]  # twice as wide, and half of the rows
 

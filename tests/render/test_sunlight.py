@@ -17,7 +17,9 @@ WIDTH = 0.01
 
 
 def test_what_lies_behind_something_is_in_its_shadow():
-    plate = np.stack(np.meshgrid(np.arange(0.3, 0.7, WIDTH), [0.5], np.arange(0.3, 0.7, WIDTH)), axis=-1).reshape(-1, 3)
+    plate = np.stack(
+        np.meshgrid(np.arange(0.3, 0.7, WIDTH), [0.5], np.arange(0.3, 0.7, WIDTH)), axis=-1
+    ).reshape(-1, 3)
     sun = Sunlight([plate, np.zeros((0, 3))], WIDTH)
     x, z = RNG.uniform(0.0, 1.0, (2, 4000))
     floor = np.stack([x, np.zeros(4000), z], axis=-1)
@@ -27,7 +29,8 @@ def test_what_lies_behind_something_is_in_its_shadow():
     assert (light[depth > 4 * WIDTH] == 0.0).all()
     assert (light[depth < -4 * WIDTH] == 1.0).all()
     assert ((light > 0.0) & (light < 1.0)).any()  # its edge is soft
-    np.testing.assert_array_equal(sun.reaches(plate + 0.1 * LIGHT), 1.0)  # before the plate, as the plate itself
+    # before the plate, as the plate itself
+    np.testing.assert_array_equal(sun.reaches(plate + 0.1 * LIGHT), 1.0)
     np.testing.assert_array_equal(sun.reaches(plate), 1.0)
     assert (sun.reaches(plate - 2.0 * BEHIND * WIDTH * LIGHT) < 1.0).all()
 
@@ -40,7 +43,9 @@ def test_the_floor_shows_the_shadow():
     pytest.importorskip("pyvista")
     block = RNG.uniform([0.4, 0.1, 0.4], [0.6, 0.3, 0.6], (20000, 3))
     mesh, looks = Sunlight([block], WIDTH).floor([1.0, 0.5, 0.8])
-    np.testing.assert_allclose(np.reshape(mesh.bounds, (3, 2)), [[0.0, 1.0], [-5e-4] * 2, [0.0, 0.8]], atol=1e-6)
+    np.testing.assert_allclose(
+        np.reshape(mesh.bounds, (3, 2)), [[0.0, 1.0], [-5e-4] * 2, [0.0, 0.8]], atol=1e-6
+    )
     assert looks["rgb"]
     dark = mesh["color"][:, 0] < 200
     expected = np.array([0.5, 0.0, 0.5]) - 0.2 / LIGHT[1] * np.array([LIGHT[0], 0.0, LIGHT[2]])
@@ -51,7 +56,8 @@ def test_points_are_scattered_over_a_mesh_evenly():
     pyvista = pytest.importorskip("pyvista")
     points = scattered(pyvista.Box((0.0, 1.0, 0.0, 0.5, 0.0, 0.5)), 0.02)
     assert len(points) == pytest.approx(2 * 2.5 / 0.02**2, rel=0.01)
-    assert np.abs(np.abs(points - [0.5, 0.25, 0.25]) - [0.5, 0.25, 0.25]).min(axis=1).max() < 1e-6  # on its sides
+    # on its sides
+    assert np.abs(np.abs(points - [0.5, 0.25, 0.25]) - [0.5, 0.25, 0.25]).min(axis=1).max() < 1e-6
     assert (points[:, 0] == 0.0).mean() == pytest.approx(0.1, rel=0.1)
     assert scattered(pyvista.PolyData(), 0.02).shape == (0, 3)
 
@@ -68,7 +74,8 @@ def test_grains_lie_about_their_particles_and_do_not_leave(size):
     assert (at[:, len(size) :] == 0.0).all()
     assert colors.mean() == pytest.approx(150.0, rel=0.02)
     assert colors.std() > 5.0
-    order = RNG.permutation(500)  # a run's particles change places in their list: what is seen stays
+    # a run's particles change places in their list: what is seen stays
+    order = RNG.permutation(500)
     again, _, _ = grains(points[order], np.full((500, 3), 150.0), 0.02, size)
     np.testing.assert_array_equal(again.reshape(500, -1, 3), at.reshape(500, -1, 3)[order])
 
@@ -85,9 +92,14 @@ def test_a_surface_is_left_out_where_it_touches_a_solid():
 
     def square(y, up):
         corners = [[0, 2, 1], [0, 3, 2]] if up else [[0, 1, 2], [0, 2, 3]]
-        return np.array([[0.4, y, 0.4], [0.6, y, 0.4], [0.6, y, 0.6], [0.4, y, 0.6]]), np.array(corners)
+        return np.array([[0.4, y, 0.4], [0.6, y, 0.4], [0.6, y, 0.6], [0.4, y, 0.6]]), np.array(
+            corners
+        )
 
     sides = [square(0.51, False), square(0.54, True), square(0.7, False)]
-    points, corners = np.concatenate([p for p, _ in sides]), np.concatenate([c + 4 * n for n, (_, c) in enumerate(sides)])
+    points, corners = (
+        np.concatenate([p for p, _ in sides]),
+        np.concatenate([c + 4 * n for n, (_, c) in enumerate(sides)]),
+    )
     left = apart(Surface("surface", points, corners, {}), [(solid, Pose.identity())], 0.1)
     np.testing.assert_array_equal(left.corners, corners[2:])

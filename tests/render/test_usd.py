@@ -33,7 +33,13 @@ def falls(tmp_path_factory) -> dict[int, Path]:
     for dimension in (2, 3):
         liquid = [{"shape": "sphere", "center": [0.5, 0.65, 0.5][:dimension], "radius": RADIUS}]
         time = {"duration": 1.0, "frames_per_second": RATE, "dt_max": STEP}
-        falling = scene(size=[1.0] * dimension, resolution=16, liquid=liquid, time=time, output={"surface": True})
+        falling = scene(
+            size=[1.0] * dimension,
+            resolution=16,
+            liquid=liquid,
+            time=time,
+            output={"surface": True},
+        )
         runs[dimension] = tmp_path_factory.mktemp("falls") / f"fall-{dimension}"
         run_into(falling, runs[dimension], last_frame=LAST)
     return runs
@@ -59,13 +65,23 @@ def get(stage: Usd.Stage, name: str, attribute: str, code: float) -> np.ndarray:
 def placed(stage: Usd.Stage, name: str, code: float) -> np.ndarray:
     """Return the points of a prim in the stage's coordinates."""
     matrix = UsdGeom.XformCache(code).GetLocalToWorldTransform(prim(stage, name))
-    return np.array([matrix.Transform(Gf.Vec3d(*map(float, point))) for point in get(stage, name, "points", code)])
+    return np.array(
+        [
+            matrix.Transform(Gf.Vec3d(*map(float, point)))
+            for point in get(stage, name, "points", code)
+        ]
+    )
 
 
 def corners(stage: Usd.Stage, name: str, code: float) -> np.ndarray:
     """Return the triangles of a mesh that USD finds valid."""
-    indices, counts = (prim(stage, name).GetAttribute(f"faceVertex{kind}").Get(code) for kind in ("Indices", "Counts"))
-    valid, why = UsdGeom.Mesh.ValidateTopology(indices, counts, len(get(stage, name, "points", code)))
+    indices, counts = (
+        prim(stage, name).GetAttribute(f"faceVertex{kind}").Get(code)
+        for kind in ("Indices", "Counts")
+    )
+    valid, why = UsdGeom.Mesh.ValidateTopology(
+        indices, counts, len(get(stage, name, "points", code))
+    )
     assert valid, why
     assert set(counts) == {3}
     return np.asarray(indices).reshape(-1, 3)
@@ -85,7 +101,9 @@ def test_a_stage_says_units_axes_and_times(falls, tmp_path, dimension):
     assert names(stage) == ["surface", "particles"]
     for name in names(stage):
         for attribute in ("points", "velocities", "extent"):
-            assert prim(stage, name).GetAttribute(attribute).GetTimeSamples() == list(range(LAST + 1))
+            assert prim(stage, name).GetAttribute(attribute).GetTimeSamples() == list(
+                range(LAST + 1)
+            )
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -97,7 +115,9 @@ def test_particles_are_those_of_the_frames(falls, tmp_path, dimension):
     for number in range(LAST + 1):
         frame = meshio.read(falls[dimension] / "frames" / f"particles_{number:06d}.vtu")
         np.testing.assert_array_equal(get(stage, "particles", "points", number), frame.points)
-        np.testing.assert_array_equal(get(stage, "particles", "velocities", number), frame.point_data["velocity"])
+        np.testing.assert_array_equal(
+            get(stage, "particles", "velocities", number), frame.point_data["velocity"]
+        )
         low, high = get(stage, "particles", "extent", number)
         np.testing.assert_allclose(low, frame.points.min(axis=0) - 0.5 * width, atol=1e-6)
         np.testing.assert_allclose(high, frame.points.max(axis=0) + 0.5 * width, atol=1e-6)
@@ -112,7 +132,9 @@ def test_velocities_are_those_of_a_fall(falls, tmp_path, dimension, name):
         velocity = get(stage, name, "velocities", number)
         assert len(velocity) == len(get(stage, name, "points", number)) > 50
         assert np.ptp(velocity, axis=0).max() < 1e-4
-        np.testing.assert_allclose(velocity[0], [0.0, -GRAVITY * number / RATE, 0.0], atol=0.51 * GRAVITY * STEP)
+        np.testing.assert_allclose(
+            velocity[0], [0.0, -GRAVITY * number / RATE, 0.0], atol=0.51 * GRAVITY * STEP
+        )
 
 
 def test_velocities_lead_to_the_next_frame(falls, tmp_path):
@@ -120,10 +142,17 @@ def test_velocities_lead_to_the_next_frame(falls, tmp_path):
     stage = exported(falls[3], tmp_path / "fall.usdc", show=Show.PARTICLES)
     particles = UsdGeom.PointBased(prim(stage, "particles"))
     for number in range(1, LAST):
-        before, after = (get(stage, "particles", "points", code).mean(axis=0) for code in (number, number + 1))
-        halfway = np.mean(particles.ComputePointsAtTime(Usd.TimeCode(number + 0.5), Usd.TimeCode(number)), axis=0)
-        late = 0.5 / RATE + 0.5 * STEP  # of the velocity against the mean one until the next frame [s]
-        np.testing.assert_allclose(halfway, 0.5 * (before + after), atol=1.01 * GRAVITY * late * 0.5 / RATE)
+        before, after = (
+            get(stage, "particles", "points", code).mean(axis=0) for code in (number, number + 1)
+        )
+        halfway = np.mean(
+            particles.ComputePointsAtTime(Usd.TimeCode(number + 0.5), Usd.TimeCode(number)), axis=0
+        )
+        # of the velocity against the mean one until the next frame [s]
+        late = 0.5 / RATE + 0.5 * STEP
+        np.testing.assert_allclose(
+            halfway, 0.5 * (before + after), atol=1.01 * GRAVITY * late * 0.5 / RATE
+        )
         assert halfway[1] < before[1] - 0.4 * GRAVITY * number / RATE**2
 
 
@@ -138,7 +167,11 @@ def test_every_surface_is_closed_and_faces_outward(falls, tmp_path):
         outward = points - points.mean(axis=0)
         assert ((outward * normals).sum(axis=1) > 0.9 * np.linalg.norm(outward, axis=1)).all()
         np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-5)
-        np.testing.assert_allclose(get(stage, "surface", "extent", number), [points.min(axis=0), points.max(axis=0)], atol=1e-6)
+        np.testing.assert_allclose(
+            get(stage, "surface", "extent", number),
+            [points.min(axis=0), points.max(axis=0)],
+            atol=1e-6,
+        )
     assert prim(stage, "surface").GetAttribute("subdivisionScheme").Get() == "none"
 
 
@@ -146,7 +179,10 @@ def test_outlines_of_2_d_are_curves(falls, tmp_path):
     stage = exported(falls[2], tmp_path / "fall.usdc")
     for number in range(LAST + 1):
         frame = meshio.read(falls[2] / "frames" / f"surface_{number:06d}.vtu")
-        counts, points = get(stage, "surface", "curveVertexCounts", number), get(stage, "surface", "points", number)
+        counts, points = (
+            get(stage, "surface", "curveVertexCounts", number),
+            get(stage, "surface", "points", number),
+        )
         np.testing.assert_array_equal(counts, np.full(len(frame.cells[0].data), 2))
         np.testing.assert_array_equal(points.reshape(-1, 2, 3), frame.points[frame.cells[0].data])
         length = np.linalg.norm(points[1::2] - points[::2], axis=1).sum()
@@ -161,25 +197,46 @@ def turned(part: Surface, angle: float, shift: list[float]) -> Surface:
 
 def joined(*parts: Surface) -> Surface:
     first = np.cumsum([0, *(len(part.points) for part in parts)])
-    corners = np.concatenate([part.corners + start for part, start in zip(parts, first, strict=False)])
-    body = np.concatenate([np.full(len(part.points), number, dtype=np.int32) for number, part in enumerate(parts)])
-    return Surface("bodies", np.concatenate([part.points for part in parts]), corners.astype(np.int32), {"body": body})
+    corners = np.concatenate(
+        [part.corners + start for part, start in zip(parts, first, strict=False)]
+    )
+    body = np.concatenate(
+        [np.full(len(part.points), number, dtype=np.int32) for number, part in enumerate(parts)]
+    )
+    return Surface(
+        "bodies",
+        np.concatenate([part.points for part in parts]),
+        corners.astype(np.int32),
+        {"body": body},
+    )
 
 
 def test_bodies_keep_their_shape_and_are_placed(dots, tmp_path):
-    parts = [(box([-0.1, -0.05, -0.02], [0.1, 0.05, 0.02]), [0.5, 0.3, 0.5]), (ball([0.0, 0.0, 0.0], 0.1), [0.2, 0.6, 0.4])]
-    frames = [joined(*(turned(part, 40.0 * number, np.add(place, 0.05 * number)) for part, place in parts)) for number in range(4)]
-    folder = write_run(tmp_path / "run", [[ball([0.5, 0.5, 0.5], 0.2), bodies] for bodies in frames], size=ROOM)
+    parts = [
+        (box([-0.1, -0.05, -0.02], [0.1, 0.05, 0.02]), [0.5, 0.3, 0.5]),
+        (ball([0.0, 0.0, 0.0], 0.1), [0.2, 0.6, 0.4]),
+    ]
+    frames = [
+        joined(
+            *(turned(part, 40.0 * number, np.add(place, 0.05 * number)) for part, place in parts)
+        )
+        for number in range(4)
+    ]
+    folder = write_run(
+        tmp_path / "run", [[ball([0.5, 0.5, 0.5], 0.2), bodies] for bodies in frames], size=ROOM
+    )
     stage = exported(folder, tmp_path / "run.usdc")
     assert names(stage) == ["surface", "body_0", "body_1"]
     for number, bodies in enumerate(frames):
         for body in range(2):
             own = bodies.fields["body"] == body
-            np.testing.assert_allclose(placed(stage, f"body_{body}", number), bodies.points[own], atol=1e-6)
-            volume = 0.2 * 0.1 * 0.04 if body == 0 else 4 / 3 * np.pi * 0.1**3
-            assert enclosed(placed(stage, f"body_{body}", number), corners(stage, f"body_{body}", number)) == pytest.approx(
-                volume, rel=0.02
+            np.testing.assert_allclose(
+                placed(stage, f"body_{body}", number), bodies.points[own], atol=1e-6
             )
+            volume = 0.2 * 0.1 * 0.04 if body == 0 else 4 / 3 * np.pi * 0.1**3
+            assert enclosed(
+                placed(stage, f"body_{body}", number), corners(stage, f"body_{body}", number)
+            ) == pytest.approx(volume, rel=0.02)
     for name in ("points", "faceVertexIndices"):
         assert prim(stage, "body_0").GetAttribute(name).GetTimeSamples() == []
 
@@ -189,7 +246,11 @@ def test_bodies_of_2_d(dots, tmp_path):
     folder = write_run(tmp_path / "run", [[ball([0.5, 0.5], 0.1), bodies] for bodies in frames])
     stage = exported(folder, tmp_path / "run.usdc")
     for number, bodies in enumerate(frames):
-        np.testing.assert_allclose(placed(stage, "body_0", number).reshape(-1, 2, 3), bodies.points[bodies.corners], atol=1e-6)
+        np.testing.assert_allclose(
+            placed(stage, "body_0", number).reshape(-1, 2, 3),
+            bodies.points[bodies.corners],
+            atol=1e-6,
+        )
 
 
 SOLIDS = """
@@ -214,8 +275,18 @@ def test_solids_stand_and_move(dots, tmp_path):
     folder = write_run(tmp_path / "run", [[ball(ROOM, 0.2)]] * 21, SOLIDS, size=ROOM)
     stage = exported(folder, tmp_path / "run.usdc")
     assert names(stage) == ["surface", "solid_1", "solid_2"]  # a plane has no end
-    for code, low, high in ((0.0, [0.4, 0.1, 0.4], [0.6, 0.2, 0.6]), (20.0, [0.8, 0.4, 0.4], [0.9, 0.6, 0.6])):  # 90 degrees in a second
-        np.testing.assert_allclose([placed(stage, "solid_1", code).min(axis=0), placed(stage, "solid_1", code).max(axis=0)], [low, high])
+    # 90 degrees in a second
+    for code, low, high in (
+        (0.0, [0.4, 0.1, 0.4], [0.6, 0.2, 0.6]),
+        (20.0, [0.8, 0.4, 0.4], [0.9, 0.6, 0.6]),
+    ):
+        np.testing.assert_allclose(
+            [
+                placed(stage, "solid_1", code).min(axis=0),
+                placed(stage, "solid_1", code).max(axis=0),
+            ],
+            [low, high],
+        )
     assert prim(stage, "solid_1").GetAttribute("orientation").Get() == "rightHanded"
     assert prim(stage, "solid_2").GetAttribute("orientation").Get() == "leftHanded"
 
@@ -226,19 +297,29 @@ def test_usd_s_own_validators_find_nothing(falls, tmp_path, dimension):
     validators = validation.ValidationRegistry().GetOrLoadAllValidators()
     stage = exported(falls[dimension], tmp_path / "fall.usdc", show=Show.BOTH)
     assert len(validators) > 10
-    assert [error.GetMessage() for error in validation.ValidationContext(validators).Validate(stage)] == []
+    assert [
+        error.GetMessage() for error in validation.ValidationContext(validators).Validate(stage)
+    ] == []
 
 
 @pytest.mark.parametrize("name", ["run.usdc", "run.usda", "run.USD"])
 def test_kinds_of_files(dots, tmp_path, name):
-    folder = write_run(tmp_path / "run", [[ball([0.2 + 0.1 * number, 0.5, 0.5], 0.1)] for number in range(4)], size=ROOM)
+    folder = write_run(
+        tmp_path / "run",
+        [[ball([0.2 + 0.1 * number, 0.5, 0.5], 0.1)] for number in range(4)],
+        size=ROOM,
+    )
     file = tmp_path / "new" / name
     result = call(folder, "--out", file, "--first", 1, "--last", 2)
     assert result.exit_code == 0, result.stderr
     assert f"{file}: 2 frames" in result.stdout.replace("\n", "")
     assert file.read_bytes().startswith(b"#usda" if name.endswith("a") else b"PXR-USDC")
     stage = Usd.Stage.Open(str(file))
-    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode(), stage.GetTimeCodesPerSecond()) == (1.0, 2.0, 20.0)
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode(), stage.GetTimeCodesPerSecond()) == (
+        1.0,
+        2.0,
+        20.0,
+    )
     assert get(stage, "surface", "points", 2)[:, 0].max() == pytest.approx(0.5)
     assert call(folder, "--out", file).exit_code == 0  # in place of the older one
     assert [entry.name for entry in file.parent.iterdir()] == [name]
@@ -246,7 +327,11 @@ def test_kinds_of_files(dots, tmp_path, name):
 
 def test_frames_are_on_the_disk_when_they_are_added(dots, tmp_path):
     """So that one at a time is in memory; and an export that is given up leaves nothing."""
-    folder = write_run(tmp_path / "run", [[ball([0.5, 0.5, 0.5], 0.1 + 0.01 * number)] for number in range(5)], size=ROOM)
+    folder = write_run(
+        tmp_path / "run",
+        [[ball([0.5, 0.5, 0.5], 0.1 + 0.01 * number)] for number in range(5)],
+        size=ROOM,
+    )
     out = tmp_path / "out"
     export, sizes = export_run(folder, out / "run.usdc"), []
     for _ in range(4):
@@ -259,11 +344,19 @@ def test_frames_are_on_the_disk_when_they_are_added(dots, tmp_path):
 
 
 def test_frames_without_material_and_without_velocity(dots, tmp_path):
-    nothing = Surface("surface", np.zeros((0, 3), dtype=np.float32), np.zeros((0, 3), dtype=np.int32))
+    nothing = Surface(
+        "surface", np.zeros((0, 3), dtype=np.float32), np.zeros((0, 3), dtype=np.int32)
+    )
     lost = Points("particles", np.array([[0.1, 0.2, 0.3], [np.nan, 0.0, 0.0]], dtype=np.float32))
-    folder = write_run(tmp_path / "run", [[nothing, lost], [ball([0.5, 0.5, 0.5], 0.1), lost]], size=ROOM)
+    folder = write_run(
+        tmp_path / "run", [[nothing, lost], [ball([0.5, 0.5, 0.5], 0.1), lost]], size=ROOM
+    )
     stage = exported(folder, tmp_path / "run.usdc", show=Show.BOTH)
-    assert len(get(stage, "surface", "points", 0)) == len(get(stage, "surface", "faceVertexIndices", 0)) == 0
+    assert (
+        len(get(stage, "surface", "points", 0))
+        == len(get(stage, "surface", "faceVertexIndices", 0))
+        == 0
+    )
     np.testing.assert_allclose(get(stage, "particles", "points", 1), [[0.1, 0.2, 0.3]])
     assert not prim(stage, "particles").GetAttribute("velocities").HasValue()
 
@@ -280,10 +373,19 @@ def test_the_end_of_a_run_may_lie_between_two_frames(dots, tmp_path):
     [
         (["run", "--out", "a.abc"], "--out a.abc: must end in .usdc, .usda or .usd"),
         (["run", "--out", "folder.usd"], "--out folder.usd: is a folder; name a file"),
-        (["nowhere", "--out", "a.usdc"], "nowhere: is not the folder of a run: there is no such folder"),
+        (
+            ["nowhere", "--out", "a.usdc"],
+            "nowhere: is not the folder of a run: there is no such folder",
+        ),
         (["run", "--out", "a.usdc", "--show", "particles"], "run: holds no frames of particles"),
-        (["run", "--out", "a.usdc", "--first", "7"], "--first 7: there are no such frames; the run has 0 to 1"),
-        (["run", "--out", "a.usdc", "--first", "1", "--last", "0"], "--first 1 --last 0: there are no such frames"),
+        (
+            ["run", "--out", "a.usdc", "--first", "7"],
+            "--first 7: there are no such frames; the run has 0 to 1",
+        ),
+        (
+            ["run", "--out", "a.usdc", "--first", "1", "--last", "0"],
+            "--first 1 --last 0: there are no such frames",
+        ),
         (["run", "--out", "file/a.usdc"], "file/a.usdc: cannot be written"),
         (["run"], "Missing option"),
     ],

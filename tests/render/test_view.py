@@ -28,7 +28,11 @@ def pyvista():
 
 @pytest.fixture
 def folder(dots, tmp_path):
-    return write_run(tmp_path / "run", [[ball([0.2 + 0.05 * n, 0.5, 0.5], 0.15)] for n in range(10)], size=(1.0, 1.0, 1.0))
+    return write_run(
+        tmp_path / "run",
+        [[ball([0.2 + 0.05 * n, 0.5, 0.5], 0.15)] for n in range(10)],
+        size=(1.0, 1.0, 1.0),
+    )
 
 
 @pytest.fixture
@@ -60,7 +64,8 @@ def test_playing_keeps_to_the_clock(viewer):
     viewer.tick()
     assert viewer.place == 0  # it waits
     viewer.play()
-    for seconds, place in ((0.01, 0), (0.06, 1), (0.21, 4), (0.22, 4), (0.4, 8)):  # 20 frames a second
+    # 20 frames a second
+    for seconds, place in ((0.01, 0), (0.06, 1), (0.21, 4), (0.22, 4), (0.4, 8)):
         viewer.clock.now = seconds
         viewer.tick()
         assert viewer.place == place
@@ -85,7 +90,9 @@ def test_a_step_ends_playing(viewer):
     assert viewer.place == 2
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="elsewhere there always is a display")
+@pytest.mark.skipif(
+    not sys.platform.startswith("linux"), reason="elsewhere there always is a display"
+)
 def test_without_a_display_the_command_says_so(pyvista, folder, monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
     result = CliRunner().invoke(cli.app, ["view", str(folder)])
@@ -112,7 +119,10 @@ def test_frames_that_come_are_shown_where_the_newest_was(viewer, folder):
 
 
 def test_wrong_input(pyvista, folder, tmp_path, monkeypatch):
-    for arguments, expected in (([tmp_path / "nowhere"], "no such folder"), ([folder, "--show", "particles"], "holds no frames")):
+    for arguments, expected in (
+        ([tmp_path / "nowhere"], "no such folder"),
+        ([folder, "--show", "particles"], "holds no frames"),
+    ):
         result = CliRunner().invoke(cli.app, ["view", *map(str, arguments)])
         assert result.exit_code == 2
         assert expected in result.stderr.replace("\n", " ")

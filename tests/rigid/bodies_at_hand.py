@@ -11,15 +11,24 @@ GRAVITY = np.array([0.0, -9.81, 0.0])
 SIDES = 0b111111
 
 
-def bodies_of(geometries, dimension, *, solids=(), open_sides=0, density=500.0, settings=None, **common):
+def bodies_of(
+    geometries, dimension, *, solids=(), open_sides=0, density=500.0, settings=None, **common
+):
     """Return bodies of shapes; `settings` has more for each."""
     bodies = [
-        RigidBody(mass_properties(shape, dimension, density=density), name=f"body {n}", **common, **(settings[n] if settings else {}))
+        RigidBody(
+            mass_properties(shape, dimension, density=density),
+            name=f"body {n}",
+            **common,
+            **(settings[n] if settings else {}),
+        )
         for n, shape in enumerate(geometries)
     ]
     walls = domain_walls([1.0] * dimension, open_sides=open_sides)
     around = (walls, *(obstacle(solid, dimension) for solid in solids))
-    return RigidBodies(bodies, geometries, [1 + n for n in range(len(geometries))], around, dimension)
+    return RigidBodies(
+        bodies, geometries, [1 + n for n in range(len(geometries))], around, dimension
+    )
 
 
 def run(bodies, duration, dt=0.01, gravity=GRAVITY):

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-CROSS = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(0, 2, 1).reshape(3, 9)  # v @ CROSS: the matrix of v x
+# v @ CROSS: the matrix of v x
+CROSS = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(0, 2, 1).reshape(3, 9)
 
 
 def cross_matrix(vector):
@@ -11,7 +12,9 @@ def cross_matrix(vector):
 
 def spins(rotation, inverse_inertia, momentum):
     """Angular velocities R I^-1 R' L."""
-    return (rotation @ (inverse_inertia @ (rotation.swapaxes(-1, -2) @ momentum[..., None])))[..., 0]
+    return (rotation @ (inverse_inertia @ (rotation.swapaxes(-1, -2) @ momentum[..., None])))[
+        ..., 0
+    ]
 
 
 def sinc(x):
@@ -39,7 +42,9 @@ def advanced(values, mass, inverse_inertia, dt):
     half, left = 0.5 * time * spins(R, inverse_inertia, L), np.arange(len(R))
     for _ in range(60):
         before = half[left]
-        half[left] = 0.5 * time[left] * spins(rotation_by(before) @ R[left], inverse_inertia[left], L[left])
+        half[left] = (
+            0.5 * time[left] * spins(rotation_by(before) @ R[left], inverse_inertia[left], L[left])
+        )
         left = left[~(np.abs(half[left] - before).max(axis=1) <= 1e-15)]
         if not len(left):
             break
@@ -73,7 +78,9 @@ def top_speed(R, t, boxes, size, span):
         return back, (-back @ t[..., None])[..., 0]
 
     parts, limited = len(R) - 1, np.isfinite(boxes[:, 0, :1])
-    placed = applied(R, t, corners(*np.moveaxis(np.where(limited[:, None] & (size > 0.0), boxes, 0.0), 1, 0)))
+    placed = applied(
+        R, t, corners(*np.moveaxis(np.where(limited[:, None] & (size > 0.0), boxes, 0.0), 1, 0))
+    )
     low = np.where(limited, np.maximum(0.0, placed.min(axis=-2)), 0.0)
     high = np.where(limited, np.minimum(size, placed.max(axis=-2)), size)
     points, inside = corners(low, high), np.all(low <= high, axis=-1)

@@ -20,7 +20,11 @@ def box(low, high, dimension, rotate=0.0):
     if dimension == 3:
         low, high = [*low, 0.4], [*high, 0.6]
     angles = [rotate] if dimension == 2 else [0.0, 0.0, rotate]
-    return Box(lower=low, upper=high, placement=Placement.from_degrees(1.0, angles, [0.0] * dimension, dimension))
+    return Box(
+        lower=low,
+        upper=high,
+        placement=Placement.from_degrees(1.0, angles, [0.0] * dimension, dimension),
+    )
 
 
 def solid(geometry, motion=None):
@@ -31,8 +35,14 @@ def drift(bodies, duration, **settings):
     """Run, and return how far any body moved, and turned, meanwhile."""
     before = [(body.position.copy(), body.rotation.copy()) for body in bodies.bodies]
     run(bodies, duration, **settings)
-    moves = [np.linalg.norm(body.position - position) for body, (position, _) in zip(bodies.bodies, before, strict=True)]
-    turns = [np.abs(body.rotation - rotation).max() for body, (_, rotation) in zip(bodies.bodies, before, strict=True)]
+    moves = [
+        np.linalg.norm(body.position - position)
+        for body, (position, _) in zip(bodies.bodies, before, strict=True)
+    ]
+    turns = [
+        np.abs(body.rotation - rotation).max()
+        for body, (_, rotation) in zip(bodies.bodies, before, strict=True)
+    ]
     return max(moves), max(turns)
 
 
@@ -49,7 +59,10 @@ def test_a_dropped_box_rests_on_the_floor_without_drift(dimension):
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_stack_of_two_stands(dimension):
     """The upper one overhangs; they start a little apart."""
-    bodies = bodies_of([box([0.4, 0.01], [0.6, 0.15], dimension), box([0.47, 0.17], [0.62, 0.3], dimension)], dimension)
+    bodies = bodies_of(
+        [box([0.4, 0.01], [0.6, 0.15], dimension), box([0.47, 0.17], [0.62, 0.3], dimension)],
+        dimension,
+    )
     run(bodies, 1.0)
     heights = [body.position[1] for body in bodies.bodies]
     np.testing.assert_allclose(heights, [0.07, 0.14 + 0.065], atol=1e-6)
@@ -71,7 +84,9 @@ def test_a_box_on_a_slope_slides_beyond_the_angle_of_friction(dimension, slope, 
     """In space along a diagonal, where boxes of friction would hold more than the cone."""
     bodies = bodies_of([box([0.1, 0.0], [0.3, 0.1], dimension)], dimension, friction=0.4)
     angle = np.arctan(slope)
-    along = np.array([1.0, 0.0, 0.0]) if dimension == 2 else np.array([1.0, 0.0, 1.0]) / np.sqrt(2.0)
+    along = (
+        np.array([1.0, 0.0, 0.0]) if dimension == 2 else np.array([1.0, 0.0, 1.0]) / np.sqrt(2.0)
+    )
     gravity = G * (np.sin(angle) * along - np.cos(angle) * np.array([0.0, 1.0, 0.0]))
     start, time = bodies.bodies[0].position.copy(), 0.5
     run(bodies, time, gravity=gravity)
@@ -81,7 +96,8 @@ def test_a_box_on_a_slope_slides_beyond_the_angle_of_friction(dimension, slope, 
         return
     pull = G * (np.sin(angle) - 0.4 * np.cos(angle))
     assert bodies.bodies[0].velocity @ along == pytest.approx(pull * time, rel=1e-6)
-    assert way == pytest.approx(0.5 * pull * time * (time + 0.01), rel=1e-6)  # symplectic Euler in steps of 0.01
+    # symplectic Euler in steps of 0.01
+    assert way == pytest.approx(0.5 * pull * time * (time + 0.01), rel=1e-6)
 
 
 @pytest.mark.parametrize("restitution", [0.0, 0.5, 1.0])
@@ -90,9 +106,18 @@ def test_an_impact_keeps_the_momentum_and_returns_the_speed(restitution, shapes)
     made = {
         "balls": [Sphere(center=[0.3, 0.5], radius=0.1), Sphere(center=[0.7, 0.5], radius=0.15)],
         "boxes": [box([0.2, 0.4], [0.4, 0.6], 2), box([0.6, 0.45], [0.7, 0.55], 2)],
-        "capsule and box": [Capsule(start=[0.3, 0.4], end=[0.3, 0.6], radius=0.05), box([0.6, 0.4], [0.7, 0.6], 2)],
+        "capsule and box": [
+            Capsule(start=[0.3, 0.4], end=[0.3, 0.6], radius=0.05),
+            box([0.6, 0.4], [0.7, 0.6], 2),
+        ],
     }[shapes]
-    bodies = bodies_of(made, 2, open_sides=SIDES, restitution=restitution, settings=[{"velocity": np.array([2.0, 0.0, 0.0])}, {}])
+    bodies = bodies_of(
+        made,
+        2,
+        open_sides=SIDES,
+        restitution=restitution,
+        settings=[{"velocity": np.array([2.0, 0.0, 0.0])}, {}],
+    )
     one, other = bodies.bodies
     momentum, energy = one.momentum + other.momentum, bodies.kinetic_energy()
     run(bodies, 0.35, dt=0.007, gravity=np.zeros(3))
@@ -108,7 +133,12 @@ def test_a_ball_does_not_fly_through_another_in_a_step(fast):
     """It would go seven of its diameters; which of the two is named first makes no difference."""
     centers, settings = [[0.6, 0.5], [0.6, 0.5]], [{}, {}]
     centers[fast], settings[fast] = [0.2, 0.5], {"velocity": np.array([70.0, 0.0, 0.0])}
-    bodies = bodies_of([Sphere(center=center, radius=0.05) for center in centers], 2, open_sides=SIDES, settings=settings)
+    bodies = bodies_of(
+        [Sphere(center=center, radius=0.05) for center in centers],
+        2,
+        open_sides=SIDES,
+        settings=settings,
+    )
     run(bodies, 0.02, gravity=np.zeros(3))
     behind, ahead = bodies.bodies[fast], bodies.bodies[1 - fast]
     assert ahead.position[0] - behind.position[0] == pytest.approx(0.1, abs=1e-3)
@@ -118,11 +148,17 @@ def test_a_ball_does_not_fly_through_another_in_a_step(fast):
 def test_an_oblique_impact_keeps_momentum_and_angular_momentum():
     """In space, with spin and friction."""
     made = [Sphere(center=[0.3, 0.45, 0.5], radius=0.1), box([0.5, 0.4], [0.7, 0.6], 3, 0.0)]
-    start = [{"velocity": np.array([3.0, 0.3, 0.2]), "angular_velocity": np.array([0.0, 5.0, -10.0])}, {}]
+    start = [
+        {"velocity": np.array([3.0, 0.3, 0.2]), "angular_velocity": np.array([0.0, 5.0, -10.0])},
+        {},
+    ]
     bodies = bodies_of(made, 3, restitution=0.7, settings=start, open_sides=SIDES)
 
     def total():
-        return (sum(b.momentum for b in bodies.bodies), sum(b.angular_momentum + np.cross(b.position, b.momentum) for b in bodies.bodies))
+        return (
+            sum(b.momentum for b in bodies.bodies),
+            sum(b.angular_momentum + np.cross(b.position, b.momentum) for b in bodies.bodies),
+        )
 
     linear, angular = total()
     energies = run(bodies, 0.3, dt=0.005, gravity=np.zeros(3))
@@ -135,7 +171,9 @@ def test_an_oblique_impact_keeps_momentum_and_angular_momentum():
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_ball_bounces_to_the_square_of_its_restitution(dimension):
-    bodies = bodies_of([Sphere(center=[0.5, 0.6, 0.5][:dimension], radius=0.1)], dimension, restitution=0.8)
+    bodies = bodies_of(
+        [Sphere(center=[0.5, 0.6, 0.5][:dimension], radius=0.1)], dimension, restitution=0.8
+    )
     heights = []
     for _ in range(600):
         run(bodies, 0.001, dt=0.001)
@@ -173,7 +211,14 @@ def test_an_overlap_is_removed_without_speed(dimension):
 
 def test_a_tumbling_box_never_gains_energy():
     bodies = bodies_of(
-        [Box(lower=[0.4, 0.4, 0.4], upper=[0.6, 0.5, 0.55], placement=Placement.from_degrees(1.0, [20.0, 10.0, 15.0], [0.0] * 3, 3))], 3
+        [
+            Box(
+                lower=[0.4, 0.4, 0.4],
+                upper=[0.6, 0.5, 0.55],
+                placement=Placement.from_degrees(1.0, [20.0, 10.0, 15.0], [0.0] * 3, 3),
+            )
+        ],
+        3,
     )
     total = []
     for _ in range(300):
@@ -187,7 +232,13 @@ def test_a_tumbling_box_never_gains_energy():
 @pytest.mark.parametrize(
     ("shape", "rest"),
     [
-        (TriangleMesh(surface=builtin_mesh("torus"), placement=Placement.from_degrees(0.3, [90.0, 0.0, 0.0], [0.5, 0.1, 0.5], 3)), 0.045),
+        (
+            TriangleMesh(
+                surface=builtin_mesh("torus"),
+                placement=Placement.from_degrees(0.3, [90.0, 0.0, 0.0], [0.5, 0.1, 0.5], 3),
+            ),
+            0.045,
+        ),
         (Capsule(start=[0.4, 0.2, 0.5], end=[0.6, 0.2, 0.5], radius=0.05), 0.05),
     ],
 )
@@ -203,7 +254,9 @@ def test_round_bodies_rest_on_a_box(shape, rest):
 
 def test_a_cut_of_a_mesh_rests_in_the_plane():
     """The torus is cut into a ring: it stands on its outside."""
-    ring = TriangleMesh(surface=builtin_mesh("torus"), placement=Placement.from_degrees(0.4, [0.0], [0.5, 0.3], 2))
+    ring = TriangleMesh(
+        surface=builtin_mesh("torus"), placement=Placement.from_degrees(0.4, [0.0], [0.5, 0.3], 2)
+    )
     bodies = bodies_of([ring], 2, solids=[solid(Box(lower=[0.0, 0.0], upper=[1.0, 0.05]))])
     run(bodies, 1.0)
     assert bodies.bodies[0].position[1] == pytest.approx(0.25, abs=1e-3)
@@ -211,7 +264,9 @@ def test_a_cut_of_a_mesh_rests_in_the_plane():
 
 def test_a_small_ball_rests_inside_a_ring():
     """The distance to the cut of a mesh is that in the plane, also inside its hole."""
-    ring = TriangleMesh(surface=builtin_mesh("torus"), placement=Placement.from_degrees(0.8, [0.0], [0.5, 0.5], 2))
+    ring = TriangleMesh(
+        surface=builtin_mesh("torus"), placement=Placement.from_degrees(0.8, [0.0], [0.5, 0.5], 2)
+    )
     bodies = bodies_of([Sphere(center=[0.5, 0.5], radius=0.05)], 2, solids=[solid(ring)])
     run(bodies, 1.0)
     assert bodies.bodies[0].position[1] == pytest.approx(0.5 - 0.8 * 0.2 + 0.05, abs=1e-3)
@@ -220,7 +275,9 @@ def test_a_small_ball_rests_inside_a_ring():
 def test_a_body_rides_on_a_plate():
     plate = Box(lower=[0.2, 0.1], upper=[0.8, 0.2])
     lift = Translation(velocity=[0.1, 0.2], start=0.0, stop=1.0)
-    bodies = bodies_of([box([0.4, 0.2], [0.5, 0.3], 2)], 2, solids=[solid(plate, lift)], friction=0.8)
+    bodies = bodies_of(
+        [box([0.4, 0.2], [0.5, 0.3], 2)], 2, solids=[solid(plate, lift)], friction=0.8
+    )
     run(bodies, 0.5)
     np.testing.assert_allclose(bodies.bodies[0].velocity[:2], [0.1, 0.2], atol=1e-6)
     np.testing.assert_allclose(bodies.bodies[0].position[:2], [0.5, 0.35], atol=5e-3)
@@ -238,7 +295,9 @@ def test_a_plane_and_an_inverted_box_are_walls():
     ramp = Plane(point=[0.5, 0.3], normal=[-1.0, 1.0])
     room = Box(lower=[0.2, 0.2], upper=[0.9, 0.9], invert=True)
     for other, least in ((solid(ramp), 0.0), (solid(room), 0.2)):
-        bodies = bodies_of([Sphere(center=[0.3, 0.6], radius=0.05)], 2, solids=[other], friction=0.0)
+        bodies = bodies_of(
+            [Sphere(center=[0.3, 0.6], radius=0.05)], 2, solids=[other], friction=0.0
+        )
         run(bodies, 1.0)
         x, y = bodies.bodies[0].position[:2]
         assert y >= least + 0.05 - 1e-6
@@ -264,7 +323,11 @@ def test_bodies_that_overlap_at_the_start_are_refused(shapes, says):
     with pytest.raises(ValueError, match=says):
         bodies_of(shapes, 2)
     with pytest.raises(ValueError, match=r"solid\[0\]"):
-        bodies_of([box([0.4, 0.4], [0.6, 0.6], 2)], 2, solids=[solid(Sphere(center=[0.5, 0.65], radius=0.1))])
+        bodies_of(
+            [box([0.4, 0.4], [0.6, 0.6], 2)],
+            2,
+            solids=[solid(Sphere(center=[0.5, 0.65], radius=0.1))],
+        )
 
 
 def test_contacts_point_from_the_other_to_the_one():
@@ -274,7 +337,10 @@ def test_contacts_point_from_the_other_to_the_one():
         Box(lower=[-0.1, -0.1, -0.1], upper=[0.1, 0.1, 0.1]),
         Sphere(center=[0.0, 0.0, 0.0], radius=0.1),
         Capsule(start=[-0.05, 0.0, 0.0], end=[0.05, 0.0, 0.0], radius=0.08),
-        TriangleMesh(surface=builtin_mesh("torus"), placement=Placement.from_degrees(0.3, [0.0] * 3, [0.0] * 3, 3)),
+        TriangleMesh(
+            surface=builtin_mesh("torus"),
+            placement=Placement.from_degrees(0.3, [0.0] * 3, [0.0] * 3, 3),
+        ),
     ]
     made = [ContactShape.of(shape, 3) for shape in shapes]
     for one in made:
@@ -294,7 +360,10 @@ def test_contacts_point_from_the_other_to_the_one():
 
 @pytest.mark.parametrize("gap", [0.06, -0.02])
 def test_a_contact_lies_halfway_between_the_surfaces(gap):
-    shape, pose = ContactShape.of(Sphere(center=[0.0, 0.0, 0.0], radius=0.1), 3), Pose(np.eye(3), np.array([0.5, 0.1 + gap, 0.5]))
+    shape, pose = (
+        ContactShape.of(Sphere(center=[0.0, 0.0, 0.0], radius=0.1), 3),
+        Pose(np.eye(3), np.array([0.5, 0.1 + gap, 0.5])),
+    )
     touch = on_plane(shape, pose, np.zeros(3), np.array([0.0, 1.0, 0.0]), 0.1)
     np.testing.assert_allclose(touch.point, [[0.5, 0.5 * gap, 0.5]], atol=1e-12)
     np.testing.assert_allclose(touch.gap, gap)
@@ -384,7 +453,12 @@ def test_a_smooth_body_slides_away_under_a_rough_one():
 
 
 def test_a_side_of_an_axis_without_an_end_stops_the_run():
-    bodies = bodies_of([Sphere(center=[0.85, 0.5], radius=0.1)], 2, open_sides=SIDES, velocity=np.array([1.0, 0.0, 0.0]))
+    bodies = bodies_of(
+        [Sphere(center=[0.85, 0.5], radius=0.1)],
+        2,
+        open_sides=SIDES,
+        velocity=np.array([1.0, 0.0, 0.0]),
+    )
     assert bodies.trouble([1.0, 1.0], (0,)) is None
     run(bodies, 0.06)
     assert bodies.trouble([1.0, 1.0], ()) is None

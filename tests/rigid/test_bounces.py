@@ -39,11 +39,15 @@ def tops(bodies, number, floor, lengths, duration):
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_heights_go_by_the_square_of_the_restitution(dimension, restitution, drop, lengths):
     bodies = bodies_of(
-        [Sphere(center=[0.5, 0.1 + drop, 0.5][:dimension], radius=0.1)], dimension, restitution=restitution, open_sides=FLOOR
+        [Sphere(center=[0.5, 0.1 + drop, 0.5][:dimension], radius=0.1)],
+        dimension,
+        restitution=restitution,
+        open_sides=FLOOR,
     )
     found = tops(bodies, 0, 0.1, STEPS[lengths], 1.5)[:3]
     expected = drop * restitution ** (2.0 * np.arange(1, 1 + len(found)))
-    fast = expected > 2.0 * (2.0 * G * max(STEPS[lengths]) * restitution) ** 2 / (2.0 * G)  # slower ones rest
+    # slower ones rest
+    fast = expected > 2.0 * (2.0 * G * max(STEPS[lengths]) * restitution) ** 2 / (2.0 * G)
     assert fast[0]
     np.testing.assert_allclose(found[fast], expected[fast], rtol=1e-9)
 
@@ -68,7 +72,9 @@ def test_balls_that_meet_in_the_air_go_as_far_whatever_the_step(lengths):
         pass
     time = bodies.time
     met = (0.6 - 0.15) / 1.5
-    for body, at, before, after in zip(bodies.bodies, (0.2, 0.8), (1.0, -0.5), (-1.4, 0.1), strict=True):
+    for body, at, before, after in zip(
+        bodies.bodies, (0.2, 0.8), (1.0, -0.5), (-1.4, 0.1), strict=True
+    ):
         assert body.velocity[0] == pytest.approx(after, abs=1e-9)
         expected = [at + before * met + after * (time - met), 0.5 + 2.0 * time - 0.5 * G * time**2]
         np.testing.assert_allclose(body.position[:2], expected, atol=1e-9)
@@ -76,7 +82,11 @@ def test_balls_that_meet_in_the_air_go_as_far_whatever_the_step(lengths):
 
 @pytest.mark.parametrize("lengths", STEPS)
 def test_elastic_bodies_that_rest_stay_at_rest(lengths):
-    shapes = [Box(lower=[0.4, 0.0], upper=[0.6, 0.1]), Box(lower=[0.4, 0.1], upper=[0.6, 0.2]), Sphere(center=[0.8, 0.1], radius=0.1)]
+    shapes = [
+        Box(lower=[0.4, 0.0], upper=[0.6, 0.1]),
+        Box(lower=[0.4, 0.1], upper=[0.6, 0.2]),
+        Sphere(center=[0.8, 0.1], radius=0.1),
+    ]
     bodies = bodies_of(shapes, 2, restitution=1.0)
     before = np.array([body.position for body in bodies.bodies])
     for _ in steps(bodies, STEPS[lengths], 0.4):
@@ -88,10 +98,18 @@ def test_elastic_bodies_that_rest_stay_at_rest(lengths):
 @pytest.mark.parametrize("restitution", [0.5, 1.0])
 def test_a_column_of_balls_gains_no_energy(restitution, lengths, gain):
     """Several impacts in a step, of bodies that hit others on both sides."""
-    bodies = bodies_of([Sphere(center=[0.5, 0.15 + 0.25 * k], radius=0.1) for k in range(3)], 2, open_sides=FLOOR, restitution=restitution)
+    bodies = bodies_of(
+        [Sphere(center=[0.5, 0.15 + 0.25 * k], radius=0.1) for k in range(3)],
+        2,
+        open_sides=FLOOR,
+        restitution=restitution,
+    )
     start, energies = bodies.potential_energy(GRAVITY), []
     for dt in steps(bodies, STEPS[lengths], 1.0):
-        moving = [0.5 * body.properties.mass * np.square(body.velocity + 0.5 * dt * GRAVITY).sum() for body in bodies.bodies]
+        moving = [
+            0.5 * body.properties.mass * np.square(body.velocity + 0.5 * dt * GRAVITY).sum()
+            for body in bodies.bodies
+        ]
         energies.append(sum(moving) + bodies.potential_energy(GRAVITY))
     assert max(energies) < (1.0 + gain) * start
     if restitution == 1.0 and lengths == "fine":
@@ -101,11 +119,19 @@ def test_a_column_of_balls_gains_no_energy(restitution, lengths, gain):
 def test_an_impact_at_an_angle_keeps_angular_momentum():
     """Of two bodies that slide along each other while the gap closes, in a long step."""
     shapes = [Sphere(center=[0.3, 0.5], radius=0.1), Box(lower=[0.5, 0.4], upper=[0.7, 0.6])]
-    start = [{"velocity": np.array([3.0, 1.0, 0.0]), "angular_velocity": np.array([0.0, 0.0, 4.0])}, {}]
+    start = [
+        {"velocity": np.array([3.0, 1.0, 0.0]), "angular_velocity": np.array([0.0, 0.0, 4.0])},
+        {},
+    ]
     bodies = bodies_of(shapes, 2, open_sides=SIDES, restitution=0.6, friction=0.4, settings=start)
 
     def total():
-        return [sum(body.angular_momentum[2] + np.cross(body.position, body.momentum)[2] for body in bodies.bodies)]
+        return [
+            sum(
+                body.angular_momentum[2] + np.cross(body.position, body.momentum)[2]
+                for body in bodies.bodies
+            )
+        ]
 
     before = total()
     for _ in range(10):

@@ -20,10 +20,15 @@ SIDE = 0.1
 def stack(count, ratio, dimension, heavy_on_top=True):
     """Return cubes of two densities in turn, one on the other."""
     far = [[0.4], [0.4 + SIDE]] if dimension == 3 else [[], []]
-    shapes = [Box(lower=[0.4, SIDE * k, *far[0]], upper=[0.4 + SIDE, SIDE * (k + 1), *far[1]]) for k in range(count)]
+    shapes = [
+        Box(lower=[0.4, SIDE * k, *far[0]], upper=[0.4 + SIDE, SIDE * (k + 1), *far[1]])
+        for k in range(count)
+    ]
     densities = [100.0 * ratio if (k % 2 == 1) == heavy_on_top else 100.0 for k in range(count)]
     bodies = [
-        RigidBody(mass_properties(shape, dimension, density=density), name=f"body {k}", friction=0.5)
+        RigidBody(
+            mass_properties(shape, dimension, density=density), name=f"body {k}", friction=0.5
+        )
         for k, (shape, density) in enumerate(zip(shapes, densities, strict=True))
     ]
     walls = domain_walls([1.0, 10.0, 1.0][:dimension])
@@ -42,7 +47,9 @@ def creep(bodies, steps, lengths):
 
 
 @pytest.mark.parametrize("heavy_on_top", [False, True])
-@pytest.mark.parametrize(("dimension", "count", "ratio"), [(2, 20, 1e3), (3, 20, 1e2), (3, 8, 1e6), (2, 40, 1e1)])
+@pytest.mark.parametrize(
+    ("dimension", "count", "ratio"), [(2, 20, 1e3), (3, 20, 1e2), (3, 8, 1e6), (2, 40, 1e1)]
+)
 def test_a_stack_of_heavy_and_light_boxes_stands(dimension, count, ratio, heavy_on_top):
     """Steps differ in length, so that the last step's impulses are never those of the next."""
     lengths = np.random.default_rng(2718).uniform(0.003, 0.01, 40)
@@ -107,6 +114,12 @@ def test_a_part_has_its_own_bodies():
     assert part.bodies == 3
     np.testing.assert_array_equal(part.b, made.b[[3, 1]])
     whole, _, _ = ContactProblem(
-        made.first[[2]], made.second[[2]], made.one[[2]], made.other[[2]], made.b[[2]], made.friction[[2]], 4
+        made.first[[2]],
+        made.second[[2]],
+        made.one[[2]],
+        made.other[[2]],
+        made.b[[2]],
+        made.friction[[2]],
+        4,
     ).solve(EXACT)
     np.testing.assert_allclose(made.part(np.array([2])).solve(EXACT)[0], whole, rtol=1e-12)

@@ -36,18 +36,27 @@ def test_islands_are_the_connected_components_of_pairs():
         first, second = rng.integers(0, bodies, k), rng.integers(0, bodies + 1, k)
         second[second == first] = bodies
         rows = np.zeros((k, 2, 3))
-        order, starts = ContactProblem(first, second, rows, rows, np.zeros((k, 2)), np.zeros(k), bodies).islands()
+        order, starts = ContactProblem(
+            first, second, rows, rows, np.zeros((k, 2)), np.zeros(k), bodies
+        ).islands()
         pairs = second < bodies
-        links = scipy.sparse.coo_array((np.ones(pairs.sum()), (first[pairs], second[pairs])), shape=(bodies, bodies))
+        links = scipy.sparse.coo_array(
+            (np.ones(pairs.sum()), (first[pairs], second[pairs])), shape=(bodies, bodies)
+        )
         labels = connected_components(links, directed=False)[1][first]
         expected = np.argsort(labels, kind="stable")
         np.testing.assert_array_equal(order, expected)
-        np.testing.assert_array_equal(starts, np.append(np.flatnonzero(np.diff(labels[expected], prepend=-1)), k))
+        np.testing.assert_array_equal(
+            starts, np.append(np.flatnonzero(np.diff(labels[expected], prepend=-1)), k)
+        )
 
 
 def stack(dimension, count=3):
     far = [[0.4], [0.6]] if dimension == 3 else [[], []]
-    return [Box(lower=[0.4, 0.1 * k, *far[0]], upper=[0.6, 0.1 * k + 0.1, *far[1]]) for k in range(count)]
+    return [
+        Box(lower=[0.4, 0.1 * k, *far[0]], upper=[0.6, 0.1 * k + 0.1, *far[1]])
+        for k in range(count)
+    ]
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -65,7 +74,11 @@ def test_impulses_solve_the_lcp_with_affine_bounds(dimension, seed):
     norm, none = (residual.evaluate(values) for values in (field, problem.layout.zeros(wp.float64)))
     assert norm <= 2e-7 * none
     assert relative <= 1e-7
-    reference = wl.solve(problem, wl.NNCG(precision="double"), stopping=wl.StoppingCriteria(rtol=1e-9, max_iterations=5000, patience=5000))
+    reference = wl.solve(
+        problem,
+        wl.NNCG(precision="double"),
+        stopping=wl.StoppingCriteria(rtol=1e-9, max_iterations=5000, patience=5000),
+    )
     np.testing.assert_allclose(x.ravel(), reference.x.numpy(), atol=1e-5 * np.abs(x).max())
 
 
@@ -99,7 +112,10 @@ def test_a_stack_on_the_floor_is_held_to_its_top(dimension):
     run(bodies, 0.05)
     bodies.begin_step(bodies.time, 0.01, GRAVITY, 0.01)
     for body in bodies.bodies[:3]:
-        assert np.abs(body.inverse_mass(dimension)).max() < 1e-9 * np.abs(body.free_inverse_mass(dimension)).max()
+        assert (
+            np.abs(body.inverse_mass(dimension)).max()
+            < 1e-9 * np.abs(body.free_inverse_mass(dimension)).max()
+        )
     assert bodies.bodies[3].hold is None
 
 
@@ -110,7 +126,9 @@ def test_a_body_on_a_smooth_one_is_held_upward_only():
     upper = bodies.bodies[1]
     before = upper.velocities(2)
     upper.apply_impulse(np.array([1.0, 1.0, 0.0]))
-    np.testing.assert_allclose(upper.velocities(2) - before, [1.0 / upper.properties.mass, 0.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(
+        upper.velocities(2) - before, [1.0 / upper.properties.mass, 0.0, 0.0], atol=1e-9
+    )
 
 
 def test_a_state_with_contacts_is_continued_bit_for_bit():

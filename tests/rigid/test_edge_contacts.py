@@ -42,8 +42,13 @@ def test_the_gap_of_two_capsules_is_that_of_their_axes(seed):
     best = int(touch.gap.argmin())
     dense = to_segment(sampled(a), b).min() - 0.08
     assert dense - 1e-6 < touch.gap[best] <= dense + 1e-12
-    np.testing.assert_allclose(to_segment(touch.point[best][None], a), 0.03 + 0.5 * touch.gap[best], atol=1e-7)  # halfway between both
-    np.testing.assert_allclose(to_segment(touch.point[best][None], b), 0.05 + 0.5 * touch.gap[best], atol=1e-7)
+    # halfway between both
+    np.testing.assert_allclose(
+        to_segment(touch.point[best][None], a), 0.03 + 0.5 * touch.gap[best], atol=1e-7
+    )
+    np.testing.assert_allclose(
+        to_segment(touch.point[best][None], b), 0.05 + 0.5 * touch.gap[best], atol=1e-7
+    )
 
 
 @pytest.mark.parametrize("seed", range(50, 80))
@@ -51,7 +56,11 @@ def test_the_gap_of_a_capsule_and_a_box_is_that_of_its_axis(seed):
     """Beside a face, across an edge, at a corner, or with the axis inside."""
     rng = np.random.default_rng(seed)
     capsule, ends = capsule_of(rng, 0.02)
-    half, turned, at = rng.uniform(0.03, 0.2, 3), Rotation.random(rng=rng).as_matrix(), rng.uniform(-0.2, 0.2, 3)
+    half, turned, at = (
+        rng.uniform(0.03, 0.2, 3),
+        Rotation.random(rng=rng).as_matrix(),
+        rng.uniform(-0.2, 0.2, 3),
+    )
     box, pose = Box(lower=(-half).tolist(), upper=half.tolist()), Pose(turned, at)
     touch = between(ContactShape.of(capsule, 3), HERE, ContactShape.of(box, 3), pose, FAR, 3)
     beyond = np.abs((sampled(ends) - at) @ turned) - half
@@ -64,9 +73,13 @@ def test_the_gap_of_a_capsule_and_a_box_is_that_of_its_axis(seed):
 def bar(low, high, tilt=(0.0, 0.0, 0.0)):
     """Return a mesh of twelve triangles."""
     low, high = np.array(low), np.array(high)
-    vertices = np.array([[i, j, k] for i in (-0.5, 0.5) for j in (-0.5, 0.5) for k in (-0.5, 0.5)]) * (high - low)
+    vertices = np.array(
+        [[i, j, k] for i in (-0.5, 0.5) for j in (-0.5, 0.5) for k in (-0.5, 0.5)]
+    ) * (high - low)
     placement = Placement.from_degrees(1.0, list(tilt), (0.5 * (low + high)).tolist(), 3)
-    return TriangleMesh(surface=close_surface(vertices, ConvexHull(vertices).simplices, "bar"), placement=placement)
+    return TriangleMesh(
+        surface=close_surface(vertices, ConvexHull(vertices).simplices, "bar"), placement=placement
+    )
 
 
 def lying(kind, top, x):
@@ -75,7 +88,11 @@ def lying(kind, top, x):
     if kind == "capsule":
         return Capsule(start=[x, top - R, 0.1], end=[x, top - R, 0.9], radius=R)
     low, high = [x - HALF, y - HALF, 0.03], [x + HALF, y + HALF, 0.97]
-    return Box(lower=low, upper=high) if kind == "box" else bar(low, high, (0.0, 0.0, 45.0) if kind == "edge" else (0.0, 0.0, 0.0))
+    return (
+        Box(lower=low, upper=high)
+        if kind == "box"
+        else bar(low, high, (0.0, 0.0, 45.0) if kind == "edge" else (0.0, 0.0, 0.0))
+    )
 
 
 def across(kind, bottom):
@@ -102,7 +119,10 @@ def across(kind, bottom):
 def test_what_falls_across_two_others_comes_to_rest_on_them(falling, standing):
     """At neither's ends nor middles, where points of a coarse sample lie."""
     raised = HALF * (np.sqrt(2.0) - 1.0) if standing == "edge" else 0.0
-    solids = [PlacedSolid(geometry=lying(standing, 0.2, x), separating=True, name="solid", motion=None) for x in (0.33, 0.67)]
+    solids = [
+        PlacedSolid(geometry=lying(standing, 0.2, x), separating=True, name="solid", motion=None)
+        for x in (0.33, 0.67)
+    ]
     bodies = bodies_of([across(falling, 0.23)], 3, open_sides=SIDES, solids=solids)
     run(bodies, 0.3, dt=0.005)
     body, half = bodies.bodies[0], R if falling == "capsule" else HALF
@@ -116,7 +136,9 @@ def test_capsules_that_fly_at_each_other_crosswise_meet():
         Capsule(start=[0.3, 0.2, 0.2], end=[0.3, 0.9, 0.2], radius=R),
         Capsule(start=[0.5, 0.53, 0.05], end=[0.5, 0.53, 0.61], radius=R),
     ]
-    bodies = bodies_of(shapes, 3, open_sides=SIDES, settings=[{"velocity": np.array([2.0, 0.0, 0.0])}, {}])
+    bodies = bodies_of(
+        shapes, 3, open_sides=SIDES, settings=[{"velocity": np.array([2.0, 0.0, 0.0])}, {}]
+    )
     momentum = bodies.bodies[0].momentum[0]
     for _ in range(30):
         run(bodies, 0.005, dt=0.005, gravity=0.0 * GRAVITY)

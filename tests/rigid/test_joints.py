@@ -22,17 +22,30 @@ def bar(number: int, dimension: int = 3) -> Box:
     return Box(lower=low[:dimension], upper=high[:dimension])
 
 
-def system(joints: tuple[Joint, ...], count: int, *, dimension: int = 3, method: str = JOINTED, tolerance: float = 1e-9) -> RigidBodies:
+def system(
+    joints: tuple[Joint, ...],
+    count: int,
+    *,
+    dimension: int = 3,
+    method: str = JOINTED,
+    tolerance: float = 1e-9,
+) -> RigidBodies:
     """Return bars of water in a row, with nothing around them."""
     shapes = [bar(number, dimension) for number in range(count)]
-    bodies = [RigidBody(mass_properties(shape, dimension, density=1000.0), name=f"bar {i}") for i, shape in enumerate(shapes)]
+    bodies = [
+        RigidBody(mass_properties(shape, dimension, density=1000.0), name=f"bar {i}")
+        for i, shape in enumerate(shapes)
+    ]
     solver = MethodOfChoice(method, directions=4, tolerance=tolerance, most=2000, device="cpu")
     return RigidBodies(bodies, shapes, range(1, count + 1), (), dimension, solver, joints)
 
 
 def chain(count: int, kind: str = "hinge", **more: float) -> tuple[Joint, ...]:
     """Return joints of a row of bars that hangs on its first end."""
-    return tuple(Joint(i, i - 1 if i else WORLD, np.array([i * LENGTH, 0.0, 0.0]), Z, kind=kind, **more) for i in range(count))
+    return tuple(
+        Joint(i, i - 1 if i else WORLD, np.array([i * LENGTH, 0.0, 0.0]), Z, kind=kind, **more)
+        for i in range(count)
+    )
 
 
 def go(bodies: RigidBodies, dt: float, steps: int, gravity: np.ndarray = DOWN):
@@ -49,7 +62,11 @@ def go(bodies: RigidBodies, dt: float, steps: int, gravity: np.ndarray = DOWN):
 def energy(bodies: RigidBodies, dt: float, gravity: np.ndarray = DOWN) -> float:
     """Return the energy in the middle of the last step, of which velocities are."""
     momentum = np.sum([body.momentum for body in bodies.bodies], axis=0)
-    return bodies.kinetic_energy() + bodies.potential_energy(gravity) + 0.5 * dt * float(momentum @ gravity)
+    return (
+        bodies.kinetic_energy()
+        + bodies.potential_energy(gravity)
+        + 0.5 * dt * float(momentum @ gravity)
+    )
 
 
 def double_pendulum(duration: float, dimension: int) -> np.ndarray:
@@ -61,14 +78,21 @@ def double_pendulum(duration: float, dimension: int) -> np.ndarray:
     def motion(_: float, y: np.ndarray) -> np.ndarray:
         a, b, u, v = y  # angles above the horizontal, and their rates
         coupling = m * LENGTH * c
-        M = np.array([[inertia + m * c**2 + m * LENGTH**2, coupling * np.cos(a - b)], [coupling * np.cos(a - b), inertia + m * c**2]])
+        M = np.array(
+            [
+                [inertia + m * c**2 + m * LENGTH**2, coupling * np.cos(a - b)],
+                [coupling * np.cos(a - b), inertia + m * c**2],
+            ]
+        )
         right = [
             -coupling * np.sin(a - b) * v**2 - 9.81 * np.cos(a) * (m * c + m * LENGTH),
             coupling * np.sin(a - b) * u**2 - 9.81 * np.cos(b) * m * c,
         ]
         return np.concatenate([[u, v], np.linalg.solve(M, right)])
 
-    return solve_ivp(motion, (0.0, duration), np.zeros(4), method="DOP853", rtol=1e-11, atol=1e-12).y[:2, -1]
+    return solve_ivp(
+        motion, (0.0, duration), np.zeros(4), method="DOP853", rtol=1e-11, atol=1e-12
+    ).y[:2, -1]
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -95,7 +119,10 @@ def test_a_bar_swings_with_the_period_of_its_inertia():
     """2 pi sqrt(I / (m g c)) for small swings, by the zeros of the angle."""
     bodies, dt, tilt = system(chain(1), 1), 0.01, np.pi / 2 - 0.05
     turned = rotation_by(-tilt * Z)
-    bodies.bodies[0].position, bodies.bodies[0].rotation = turned @ bodies.bodies[0].position, turned
+    bodies.bodies[0].position, bodies.bodies[0].rotation = (
+        turned @ bodies.bodies[0].position,
+        turned,
+    )
     zeros, last = [], 0.0
     for step in go(bodies, dt, 130):
         angle = bodies.joints[0].angle(bodies.bodies) + np.pi / 2
@@ -109,19 +136,32 @@ def test_a_bar_swings_with_the_period_of_its_inertia():
 
 @pytest.mark.parametrize("kind", ["ball", "hinge", "fixed"])
 def test_joined_bodies_in_flight_keep_both_momenta(kind):
-    bodies = system(tuple(Joint(i, i - 1, np.array([i * LENGTH, 0.01, 0.02]), [1, 2, 3], kind=kind) for i in (1, 2)), 3)
+    bodies = system(
+        tuple(
+            Joint(i, i - 1, np.array([i * LENGTH, 0.01, 0.02]), [1, 2, 3], kind=kind)
+            for i in (1, 2)
+        ),
+        3,
+    )
     rng = np.random.default_rng(5)
     for body in bodies.bodies:
-        body.momentum, body.angular_momentum = body.properties.mass * rng.normal(size=3), 0.2 * rng.normal(size=3)
+        body.momentum, body.angular_momentum = (
+            body.properties.mass * rng.normal(size=3),
+            0.2 * rng.normal(size=3),
+        )
 
     def momenta() -> np.ndarray:
-        each = [np.concatenate([b.momentum, b.angular_momentum + np.cross(b.position, b.momentum)]) for b in bodies.bodies]
+        each = [
+            np.concatenate([b.momentum, b.angular_momentum + np.cross(b.position, b.momentum)])
+            for b in bodies.bodies
+        ]
         return np.sum(each, axis=0)
 
     before = momenta()
     for _ in go(bodies, 0.01, 40, np.zeros(3)):
         pass
-    assert momenta() == pytest.approx(before, abs=1e-6)  # J is of the step's beginning, where anchors are 1e-9 apart
+    # J is of the step's beginning, where anchors are 1e-9 apart
+    assert momenta() == pytest.approx(before, abs=1e-6)
     assert bodies.row()["joint_error"] < 1e-7
     if kind == "fixed":
         turns = [b.rotation for b in bodies.bodies]
@@ -159,7 +199,8 @@ def test_a_motor_reaches_its_speed_with_the_torque_that_it_has():
     body = bodies.bodies[0]
     inertia = body.properties.inertia[2, 2] + body.properties.mass * (LENGTH / 2) ** 2
     for step in go(bodies, 0.02, 45, np.zeros(3)):
-        middle = (step + 0.5) * 0.02  # velocities are of the middle of steps, the first kick is half of one
+        # velocities are of the middle of steps, the first kick is half of one
+        middle = (step + 0.5) * 0.02
         assert body.angular_velocity[2] == pytest.approx(min(3.0, 2.0 / inertia * middle), rel=2e-3)
         torque = bodies.row()["joint0_torque"]
         assert abs(torque) <= 2.0 + 1e-9
@@ -195,10 +236,27 @@ def random_joints(rng: np.random.Generator) -> tuple[Joint, ...]:
         kind = str(rng.choice(["ball", "hinge", "fixed"]))
         more = {}
         if kind == "hinge":
-            more = {"limits": (-rng.uniform(0.01, 1.0), rng.uniform(0.01, 1.0))} if rng.random() < 0.5 else {}
-            more |= {"motor_speed": float(rng.normal()), "motor_torque": float(rng.uniform(0.1, 5.0))} if rng.random() < 0.5 else {}
+            more = (
+                {"limits": (-rng.uniform(0.01, 1.0), rng.uniform(0.01, 1.0))}
+                if rng.random() < 0.5
+                else {}
+            )
+            more |= (
+                {"motor_speed": float(rng.normal()), "motor_torque": float(rng.uniform(0.1, 5.0))}
+                if rng.random() < 0.5
+                else {}
+            )
         second = int(rng.integers(-1, first)) if first else WORLD
-        joints.append(Joint(first, second, rng.uniform([0, -0.1, -0.1], [2.0, 0.1, 0.1]), rng.normal(size=3), kind=kind, **more))
+        joints.append(
+            Joint(
+                first,
+                second,
+                rng.uniform([0, -0.1, -0.1], [2.0, 0.1, 0.1]),
+                rng.normal(size=3),
+                kind=kind,
+                **more,
+            )
+        )
     return tuple(joints)
 
 
@@ -214,11 +272,17 @@ def check_rows(seed: int) -> None:
     ends = []
     for sign in (1.0, -1.0):
         for body, (position, rotation), six in zip(bodies, before, v, strict=True):
-            body.position, body.rotation = position + sign * h * six[:3], rotation_by(sign * h * six[3:]) @ rotation
+            body.position, body.rotation = (
+                position + sign * h * six[:3],
+                rotation_by(sign * h * six[3:]) @ rotation,
+            )
         ends.append(rows.errors(bodies, 3))
     slope = (ends[0] - ends[1]) / (2 * h)
-    np.testing.assert_allclose((rows.jacobian(4) @ v.ravel())[~rows.motors], slope[~rows.motors], atol=1e-7)
-    for body, (position, rotation) in zip(bodies, before, strict=True):  # a screw of all: joints in space see it, others do not
+    np.testing.assert_allclose(
+        (rows.jacobian(4) @ v.ravel())[~rows.motors], slope[~rows.motors], atol=1e-7
+    )
+    # a screw of all: joints in space see it, others do not
+    for body, (position, rotation) in zip(bodies, before, strict=True):
         turn, shift = rotation_by(np.array([0.3, -0.2, 0.5])), np.array([0.1, 0.2, -0.3])
         body.position, body.rotation = turn @ position + shift, turn @ rotation
     for joint in joints:
@@ -235,7 +299,12 @@ def test_rows_are_derivatives_of_errors(seed):
 def test_what_does_not_collide():
     """Bodies of a joint, and of one piece of fixed ones; a hinge to a piece says nothing about the others of it."""
     at = np.zeros(3)
-    joints = (Joint(1, 0, at, kind="fixed"), Joint(2, 1, at, kind="fixed"), Joint(3, 2, at), Joint(4, WORLD, at, kind="fixed"))
+    joints = (
+        Joint(1, 0, at, kind="fixed"),
+        Joint(2, 1, at, kind="fixed"),
+        Joint(3, 2, at),
+        Joint(4, WORLD, at, kind="fixed"),
+    )
     assert joined_pairs(joints, 5) == {(0, 1), (1, 2), (0, 2), (2, 3), (-1, 4)}
 
 

@@ -21,7 +21,9 @@ def test_close_pairs_are_those_that_overlap():
         n = int(rng.integers(1, 30))
         middle, half = rng.integers(0, 12, (n, 3)) / 4.0, rng.integers(0, 4, (n, 3)) / 8.0
         low, high = middle - half, middle + half
-        expected = np.argwhere(np.tril(((low[:, None] <= high) & (low <= high[:, None])).all(axis=2), -1))
+        expected = np.argwhere(
+            np.tril(((low[:, None] <= high) & (low <= high[:, None])).all(axis=2), -1)
+        )
         np.testing.assert_array_equal(np.column_stack(close_pairs(middle, half)), expected)
 
 
@@ -40,7 +42,10 @@ def placed(positions, rng):
 def test_balls_touch_where_each_two_of_them_do():
     """Pair by pair by the distance to the other one; two have the same center."""
     rng, n = np.random.default_rng(3), 25
-    shapes = [ContactShape.of(Sphere(center=[0.0, 0.0, 0.0], radius=float(rng.uniform(0.1, 0.3))), 3) for _ in range(n)]
+    shapes = [
+        ContactShape.of(Sphere(center=[0.0, 0.0, 0.0], radius=float(rng.uniform(0.1, 0.3))), 3)
+        for _ in range(n)
+    ]
     at = rng.uniform(0.0, 1.2, (n, 3))
     at[7] = at[3]
     bodies = placed(at, rng)
@@ -50,7 +55,9 @@ def test_balls_touch_where_each_two_of_them_do():
     expected = {}
     for i in range(n):
         for j in range(i):
-            points = between(shapes[i], places[i], shapes[j], places[j], 0.01 + ways[i] + ways[j], 3)
+            points = between(
+                shapes[i], places[i], shapes[j], places[j], 0.01 + ways[i] + ways[j], 3
+            )
             expected |= {(i, j): points} if len(points) else {}
     assert list(zip(found.first.tolist(), found.second.tolist(), strict=True)) == list(expected)
     assert len(expected) > 20 and (7, 3) in expected
@@ -72,20 +79,36 @@ def test_impulses_come_back_to_the_nearest_contact_of_the_same_two():
         n, k, m = (int(count) for count in rng.integers((1, 1, 1), (5, 30, 30)))
         bodies = placed(rng.standard_normal((n, 3)), rng)
         contacts = Touching(
-            first=rng.integers(0, n, k), second=rng.integers(0, n + 1, k), point=rng.standard_normal((k, 3)).round(1),
-            size=np.full(k, rng.uniform(0, 40)), frames=rng.standard_normal((k, 3, 3)), wall=np.zeros((k, 3)),
-        )  # fmt: skip
+            first=rng.integers(0, n, k),
+            second=rng.integers(0, n + 1, k),
+            point=rng.standard_normal((k, 3)).round(1),
+            size=np.full(k, rng.uniform(0, 40)),
+            frames=rng.standard_normal((k, 3, 3)),
+            wall=np.zeros((k, 3)),
+        )
         memory = ContactMemory(n)
         ends = rng.integers(0, n, m), rng.integers(0, n + 1, m)
-        memory.values = np.column_stack([*ends, rng.standard_normal((m, 3)).round(1), rng.standard_normal((m, 3))])
+        memory.values = np.column_stack(
+            [*ends, rng.standard_normal((m, 3)).round(1), rng.standard_normal((m, 3))]
+        )
         start, old = memory.recall(contacts, bodies), memory.values
-        places = [(p - bodies[i].position) @ bodies[i].rotation for p, i in zip(contacts.point, contacts.first, strict=True)]
+        places = [
+            (p - bodies[i].position) @ bodies[i].rotation
+            for p, i in zip(contacts.point, contacts.first, strict=True)
+        ]
         way = np.linalg.norm(np.array(places)[:, None] - old[:, 2:5], axis=2)
-        way[(contacts.first[:, None] != old[:, 0]) | (contacts.second[:, None] != old[:, 1])] = np.inf
+        way[(contacts.first[:, None] != old[:, 0]) | (contacts.second[:, None] != old[:, 1])] = (
+            np.inf
+        )
         for c in range(k):
             nearest = int(way[c].argmin())
-            known = way[c, nearest] < SAME_PLACE * contacts.size[c] and int(way[:, nearest].argmin()) == c
-            np.testing.assert_allclose(start[c], contacts.frames[c] @ old[nearest, 5:] if known else 0.0, atol=1e-14)
+            known = (
+                way[c, nearest] < SAME_PLACE * contacts.size[c]
+                and int(way[:, nearest].argmin()) == c
+            )
+            np.testing.assert_allclose(
+                start[c], contacts.frames[c] @ old[nearest, 5:] if known else 0.0, atol=1e-14
+            )
             recalled += known
     assert recalled > 20
 
@@ -93,18 +116,31 @@ def test_impulses_come_back_to_the_nearest_contact_of_the_same_two():
 def test_balls_touch_planes_where_each_of_them_does():
     """Body by body and plane by plane, with a box among the balls and an obstacle that has moved."""
     rng, n = np.random.default_rng(8), 12
-    shapes = [ContactShape.of(Sphere(center=[0.0, 0.0, 0.0], radius=float(rng.uniform(0.1, 0.3))), 3) for _ in range(n)]
+    shapes = [
+        ContactShape.of(Sphere(center=[0.0, 0.0, 0.0], radius=float(rng.uniform(0.1, 0.3))), 3)
+        for _ in range(n)
+    ]
     shapes[4] = ContactShape.of(Box(lower=[-0.2, -0.1, -0.3], upper=[0.2, 0.1, 0.3]), 3)
     bodies, normals = placed(rng.uniform(-0.3, 0.5, (n, 3)), rng), turned(rng)
-    still = SimpleNamespace(pose=lambda time: Pose(rotation=np.eye(3), translation=np.array([0.0, 0.1, 0.0])))
-    planes = Obstacle(name="planes", points=rng.uniform(-0.3, 0.0, (3, 3)), normals=normals, motion=still)
+    still = SimpleNamespace(
+        pose=lambda time: Pose(rotation=np.eye(3), translation=np.array([0.0, 0.1, 0.0]))
+    )
+    planes = Obstacle(
+        name="planes", points=rng.uniform(-0.3, 0.0, (3, 3)), normals=normals, motion=still
+    )
     ways = rng.uniform(0.0, 0.02, n)
-    found = ContactDetection(bodies, shapes, (planes,), 3, every=True).find(0.0, ways, np.full(1, 0.01))
+    found = ContactDetection(bodies, shapes, (planes,), 3, every=True).find(
+        0.0, ways, np.full(1, 0.01)
+    )
     found, expected = found.where(found.obstacle == 0), []
     for i, body in enumerate(bodies):
         for point, normal in zip(planes.points + 0.1 * np.eye(3)[1], normals, strict=True):
-            touch = on_plane(shapes[i], Place(body.rotation, body.position), point, normal, 0.01 + ways[i])
-            expected += [(i, *touch.point[k], *touch.normal[k], touch.gap[k]) for k in range(len(touch))]
+            touch = on_plane(
+                shapes[i], Place(body.rotation, body.position), point, normal, 0.01 + ways[i]
+            )
+            expected += [
+                (i, *touch.point[k], *touch.normal[k], touch.gap[k]) for k in range(len(touch))
+            ]
     assert len({i for i, *_ in expected}) > 5 and 4 in found.first and (found.second == n).all()
     rows = np.column_stack([found.first, found.points.point, found.points.normal, found.points.gap])
     np.testing.assert_allclose(rows, expected, atol=1e-12)

@@ -45,7 +45,9 @@ def test_of_a_box_in_space():
     properties = mass_properties(Box(lower=[1.0, 2.0, 3.0], upper=[2.0, 4.0, 6.0]), 3, density=10.0)
     assert properties.mass == pytest.approx(60.0)
     np.testing.assert_allclose(properties.center, [1.5, 3.0, 4.5])
-    np.testing.assert_allclose(properties.inertia, np.diag([60 * 13 / 12, 60 * 10 / 12, 60 * 5 / 12]))
+    np.testing.assert_allclose(
+        properties.inertia, np.diag([60 * 13 / 12, 60 * 10 / 12, 60 * 5 / 12])
+    )
 
 
 @pytest.mark.parametrize(
@@ -65,7 +67,9 @@ def test_in_the_plane(shape, mass, zz):
 def test_mass_scales_the_inertia():
     ball = Sphere(center=[0.0, 0.0, 0.0], radius=0.2, placement=TURNED)
     properties = mass_properties(ball, 3, mass=3.0)
-    np.testing.assert_allclose(properties.inertia, 0.4 * 3.0 * (0.2 * 1.7) ** 2 * np.eye(3), atol=1e-15)
+    np.testing.assert_allclose(
+        properties.inertia, 0.4 * 3.0 * (0.2 * 1.7) ** 2 * np.eye(3), atol=1e-15
+    )
     np.testing.assert_allclose(properties.center, TURNED.translation)
 
 
@@ -95,7 +99,9 @@ def test_of_a_capsule_by_quadrature(dimension):
     assert properties.mass == pytest.approx(integral(lambda s: np.pi * half(s) ** 2))
     along = integral(lambda s: 0.5 * np.pi * half(s) ** 4)
     across = integral(lambda s: np.pi * half(s) ** 2 * ((s - h) ** 2 + 0.25 * half(s) ** 2))
-    np.testing.assert_allclose(np.linalg.eigvalsh(properties.inertia), sorted([along, across, across]), rtol=1e-8)
+    np.testing.assert_allclose(
+        np.linalg.eigvalsh(properties.inertia), sorted([along, across, across]), rtol=1e-8
+    )
     direction = axis / length
     np.testing.assert_allclose(properties.inertia @ direction, along * direction, rtol=1e-8)
 
@@ -122,7 +128,11 @@ def test_a_box_as_a_mesh_in_the_plane_is_the_rectangle():
 def test_far_from_the_origin_the_inertia_is_the_same():
     """The parallel axis theorem: about the center nothing changes with the place."""
     near = mass_properties(box_mesh([0, 0, 0], [1, 2, 3]), 3, density=1.0)
-    far = mass_properties(box_mesh([0, 0, 0], [1, 2, 3], Placement(translation=np.array([300.0, -200.0, 100.0]))), 3, density=1.0)
+    far = mass_properties(
+        box_mesh([0, 0, 0], [1, 2, 3], Placement(translation=np.array([300.0, -200.0, 100.0]))),
+        3,
+        density=1.0,
+    )
     np.testing.assert_allclose(far.inertia, near.inertia, rtol=1e-10, atol=1e-9)
 
 
@@ -131,7 +141,9 @@ def test_two_boxes_in_one_mesh_follow_the_parallel_axis_theorem():
     surfaces = [body_surface(Box(lower=low, upper=high), 3) for low, high in parts]
     points = np.concatenate([surface.points for surface in surfaces])
     corners = np.concatenate([surfaces[0].corners, surfaces[1].corners + 8])
-    both = mass_properties(TriangleMesh(surface=close_surface(points, corners, "two")), 3, density=1.0)
+    both = mass_properties(
+        TriangleMesh(surface=close_surface(points, corners, "two")), 3, density=1.0
+    )
     single = [mass_properties(Box(lower=low, upper=high), 3, density=1.0) for low, high in parts]
     mass = sum(p.mass for p in single)
     center = sum(p.mass * p.center for p in single) / mass
@@ -159,7 +171,10 @@ def test_of_an_irregular_mesh_by_voxels(dimension):
 
 def test_the_outline_has_the_inside_on_its_left():
     for translate in ([0.0, 0.0], [0.3, -0.2]):
-        mesh = TriangleMesh(surface=builtin_mesh("torus"), placement=Placement.from_degrees(1.0, [15.0], translate, 2))
+        mesh = TriangleMesh(
+            surface=builtin_mesh("torus"),
+            placement=Placement.from_degrees(1.0, [15.0], translate, 2),
+        )
         p, q = np.moveaxis(mesh_outline(mesh), 1, 0)
         assert (p[:, 2] == 0.0).all()
         middle, way = 0.5 * (p + q), q - p
@@ -177,16 +192,26 @@ def test_the_surface_of_a_shape_encloses_it(dimension):
         Sphere(center=[0.2, 0.4, 0.6][:dimension], radius=0.2),
         Capsule(start=[0.0, 0.1, 0.2][:dimension], end=[0.5, 0.3, 0.1][:dimension], radius=0.1),
     ]
-    place = Placement.from_degrees(1.3, [40.0] if dimension == 2 else [10.0, 20.0, 30.0], [0.1] * dimension, dimension)
+    place = Placement.from_degrees(
+        1.3, [40.0] if dimension == 2 else [10.0, 20.0, 30.0], [0.1] * dimension, dimension
+    )
     for shape, placement in itertools.product(shapes, (Placement(), place)):
         shape = replace(shape, placement=placement)
         surface = body_surface(shape, dimension)
         corners = surface.points[surface.corners]
         if dimension == 2:
-            volume = 0.5 * (corners[:, 0, 0] * corners[:, 1, 1] - corners[:, 0, 1] * corners[:, 1, 0]).sum()
+            volume = (
+                0.5
+                * (corners[:, 0, 0] * corners[:, 1, 1] - corners[:, 0, 1] * corners[:, 1, 0]).sum()
+            )
         else:
-            volume = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6.0
-        assert volume == pytest.approx(mass_properties(shape, dimension, density=1.0).mass, rel=2e-2)
+            volume = (
+                np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum()
+                / 6.0
+            )
+        assert volume == pytest.approx(
+            mass_properties(shape, dimension, density=1.0).mass, rel=2e-2
+        )
 
 
 @pytest.mark.parametrize(
@@ -205,7 +230,14 @@ def test_what_has_no_mass_is_refused(shape, given, says):
         mass_properties(shape, 2, **given)
 
 
-@pytest.mark.parametrize("inertia", [np.diag([1.0, 1.0, -1.0]), np.array([[1, 1, 0], [0, 1, 0], [0, 0, 1.0]]), np.full((3, 3), np.nan)])
+@pytest.mark.parametrize(
+    "inertia",
+    [
+        np.diag([1.0, 1.0, -1.0]),
+        np.array([[1, 1, 0], [0, 1, 0], [0, 0, 1.0]]),
+        np.full((3, 3), np.nan),
+    ],
+)
 def test_an_inertia_must_be_symmetric_positive_definite(inertia):
     with pytest.raises(ValueError, match="inertia"):
         MassProperties(mass=1.0, center=np.zeros(3), inertia=inertia)
@@ -216,4 +248,6 @@ def test_a_moved_shape_has_the_turned_inertia():
     pose = Pose.about(np.array([0.5, 0.5, 0.0]), TURNED.rotation, np.array([0.1, 0.2, 0.3]))
     before, after = (mass_properties(s, 3, density=2.0) for s in (shape, shape.moved(pose)))
     np.testing.assert_allclose(after.center, pose.apply(before.center), atol=1e-15)
-    np.testing.assert_allclose(after.inertia, TURNED.rotation @ before.inertia @ TURNED.rotation.T, atol=1e-14)
+    np.testing.assert_allclose(
+        after.inertia, TURNED.rotation @ before.inertia @ TURNED.rotation.T, atol=1e-14
+    )

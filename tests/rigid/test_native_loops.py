@@ -1,6 +1,7 @@
 """Native loops of rigid bodies against plain NumPy, step by step: motion, contacts in a plane, impulses, what holds bodies.
 
-The loops take sums in the order of NumPy and OpenBLAS on processors with AVX2, whose bits they have; elsewhere rounding may differ.
+The loops take sums in the order of NumPy and OpenBLAS on processors with AVX2, whose bits they
+have; elsewhere rounding may differ.
 """
 
 import dataclasses
@@ -27,11 +28,18 @@ DT, GRAVITY = 4e-3, np.array([0.0, -9.81, 0.0])
 
 
 def about_z(angles):
-    return Rotation.from_rotvec(np.asarray(angles)[..., None] * np.array([0.0, 0.0, 1.0])).as_matrix()
+    return Rotation.from_rotvec(
+        np.asarray(angles)[..., None] * np.array([0.0, 0.0, 1.0])
+    ).as_matrix()
 
 
 def close(found, expected, atol=0.0):
-    np.testing.assert_allclose(found, expected, rtol=ROUNDING, atol=atol or ROUNDING * max(1.0, np.abs(expected).max(initial=0.0)))
+    np.testing.assert_allclose(
+        found,
+        expected,
+        rtol=ROUNDING,
+        atol=atol or ROUNDING * max(1.0, np.abs(expected).max(initial=0.0)),
+    )
 
 
 def drawn_states(rng, flat):
@@ -41,12 +49,19 @@ def drawn_states(rng, flat):
         root = np.diag(rng.uniform(0.2, 2.0, 3)) if flat else rng.standard_normal((3, 3))
         inertia = root @ root.T + 0.1 * np.eye(3)
         center = rng.standard_normal(3) * ([1.0, 1.0, 0.0] if flat else 1.0)
-        bodies.append(RigidBody(MassProperties(mass=float(rng.uniform(0.1, 5.0)), center=center, inertia=inertia), name=f"body {number}"))
+        bodies.append(
+            RigidBody(
+                MassProperties(mass=float(rng.uniform(0.1, 5.0)), center=center, inertia=inertia),
+                name=f"body {number}",
+            )
+        )
     states = BodyStates(bodies)
     moves = rng.random(n) < 0.8
     states.position[:] = rng.standard_normal((n, 3))
     states.rotation[:] = Rotation.random(n, random_state=int(rng.integers(1 << 30))).as_matrix()
-    states.momentum[:], states.angular_momentum[:] = (rng.standard_normal((n, 3)) * moves[:, None] for _ in range(2))
+    states.momentum[:], states.angular_momentum[:] = (
+        rng.standard_normal((n, 3)) * moves[:, None] for _ in range(2)
+    )
     if flat:
         states.position[:, 2] = states.momentum[:, 2] = states.angular_momentum[:, :2] = 0.0
         states.rotation[:] = about_z(rng.uniform(-3.0, 3.0, n))
@@ -65,16 +80,28 @@ def test_motion_is_that_of_plain_numpy(seed):
     times = np.array([0.5, 0.5 + dt, 0.5 - dt])
     R, t = motions.poses(times)
     for time, rotation, translation in zip(times, R, t, strict=True):
-        later = plain_motion.advanced(states.values, *each, np.full(len(states), time - 0.5)) if time != 0.5 else states.values
+        later = (
+            plain_motion.advanced(states.values, *each, np.full(len(states), time - 0.5))
+            if time != 0.5
+            else states.values
+        )
         close(rotation, later[:, 3:12].reshape(-1, 3, 3))
         close(translation, later[:, :3] - (rotation @ states.center[..., None])[..., 0])
-    for found, expected in zip(motions.velocity_fields(0.5, dt), plain_motion.velocity_fields(states.values, *each), strict=True):
+    for found, expected in zip(
+        motions.velocity_fields(0.5, dt),
+        plain_motion.velocity_fields(states.values, *each),
+        strict=True,
+    ):
         close(found, expected)
     low = rng.uniform(-1.0, 1.0, (len(states), 3))
     boxes = np.stack([low, low + rng.uniform(0.0, 1.0, low.shape)], axis=1)
     boxes[rng.random(len(states)) < 0.2] = motion.UNLIMITED
     size, ends = np.array([1.5, 1.0, 0.0 if seed % 2 else 1.2]), 0.5 + dt * np.arange(5.0) / 4.0
-    close(motions.top_speed(boxes, size, 0.5, dt), plain_motion.top_speed(*motions.poses(ends), boxes, size, dt), atol=1e-12)
+    close(
+        motions.top_speed(boxes, size, 0.5, dt),
+        plain_motion.top_speed(*motions.poses(ends), boxes, size, dt),
+        atol=1e-12,
+    )
     expected = plain_motion.advanced(states.values, *each, np.full(len(states), dt))
     states.advance(dt)
     close(states.values, expected)
@@ -94,7 +121,11 @@ def drawn_shape(rng):
     """A box, disc or capsule; some at right angles and of round sizes, so that sides touch exactly."""
     neat = rng.random() < 0.4
     size = rng.choice([0.05, 0.1], 2) if neat else rng.uniform(0.03, 0.15, 2)
-    angle, scale = (float(rng.choice([0.0, np.pi / 2])), 1.0) if neat else (float(rng.uniform(-3.0, 3.0)), float(rng.uniform(0.7, 1.3)))
+    angle, scale = (
+        (float(rng.choice([0.0, np.pi / 2])), 1.0)
+        if neat
+        else (float(rng.uniform(-3.0, 3.0)), float(rng.uniform(0.7, 1.3)))
+    )
     at = np.round(rng.uniform(0.15, 0.85, 2), 1 if neat else 9)
     place = Placement(rotation=about_z(angle), translation=np.array([*at, 0.0]), scale=scale)
     kind = rng.integers(4)
@@ -112,10 +143,20 @@ def drawn_world(seed, most=6):
     shapes = [drawn_shape(rng) for _ in range(int(rng.integers(1, most + 1)))]
     bodies = []
     for number, shape in enumerate(shapes):
-        speed, spin = np.array([*rng.standard_normal(2), 0.0]), np.array([0.0, 0.0, 5.0 * rng.standard_normal()])
-        touch = {"friction": float(rng.uniform(0.0, 1.0)), "restitution": 0.5 * float(seed % 3 == 0)}
+        speed, spin = (
+            np.array([*rng.standard_normal(2), 0.0]),
+            np.array([0.0, 0.0, 5.0 * rng.standard_normal()]),
+        )
+        touch = {
+            "friction": float(rng.uniform(0.0, 1.0)),
+            "restitution": 0.5 * float(seed % 3 == 0),
+        }
         properties = mass_properties(shape, 2, density=500.0)
-        bodies.append(RigidBody(properties, name=f"body {number}", velocity=speed, angular_velocity=spin, **touch))
+        bodies.append(
+            RigidBody(
+                properties, name=f"body {number}", velocity=speed, angular_velocity=spin, **touch
+            )
+        )
     solids = []
     for number in range(int(rng.integers(0, 3))):
         others = [
@@ -124,13 +165,21 @@ def drawn_world(seed, most=6):
         ]
         geometry = drawn_shape(rng) if rng.random() < 0.6 else others[rng.integers(2)]
         moves = motion.Rotation(rate=50.0, center=(0.5, 0.5)) if rng.random() < 0.3 else None
-        solids.append(PlacedSolid(geometry=geometry, separating=False, name=f"solid {number}", motion=moves))
-    walls = [domain_walls([1.0, 1.0], open_sides=int(rng.choice([0, 1, 8])))] if rng.random() < 0.9 else []
+        solids.append(
+            PlacedSolid(geometry=geometry, separating=False, name=f"solid {number}", motion=moves)
+        )
+    walls = (
+        [domain_walls([1.0, 1.0], open_sides=int(rng.choice([0, 1, 8])))]
+        if rng.random() < 0.9
+        else []
+    )
     return rng, bodies, shapes, (*walls, *(obstacle(solid, 2) for solid in solids))
 
 
 def solve_of(bodies, shapes, obstacles, loops=True):
-    solve = ContactSolve(ContactDetection(bodies, [ContactShape.of(shape, 2) for shape in shapes], obstacles, 2))
+    solve = ContactSolve(
+        ContactDetection(bodies, [ContactShape.of(shape, 2) for shape in shapes], obstacles, 2)
+    )
     assert solve._planar is not None
     if not loops:
         solve._planar = None
@@ -149,7 +198,10 @@ def test_contacts_in_a_plane_are_those_of_the_detection(first):
             states.position[:, :2] += 0.05 * rng.standard_normal((len(bodies), 2))
             states.rotation[:] = about_z(rng.uniform(-3.0, 3.0, len(bodies)))
             if turn == 2:
-                states.position[:, :2], states.rotation[:] = np.round(states.position[:, :2], 1), np.eye(3)
+                states.position[:, :2], states.rotation[:] = (
+                    np.round(states.position[:, :2], 1),
+                    np.eye(3),
+                )
             gravity = GRAVITY * rng.integers(2)
             found, expected = (which.find(0.1, DT, gravity) for which in (solve, plain))
             touching += len(expected)
@@ -184,7 +236,10 @@ def test_overlaps_at_the_end_of_a_step_are_seen():
         contacts = solve.find(0.0, DT, GRAVITY)
         impulses = solve.push_apart(contacts, dt=dt)
         if len(contacts) and solve._pushed is not None and solve._pushed.impulses is impulses:
-            gap = contacts.gap + dt * contacts.velocities(solve.bodies.velocities()[:, [0, 1, 5]])[:, 0]
+            gap = (
+                contacts.gap
+                + dt * contacts.velocities(solve.bodies.velocities()[:, [0, 1, 5]])[:, 0]
+            )
             seen.append(bool((gap < -SLOP * contacts.size).any()))
             assert (solve._pushed.ways is not None) == seen[-1]
     assert set(seen) == {True, False}
@@ -204,7 +259,9 @@ def stepped(seed, loops, steps):
         world.begin_step(world.time, DT, GRAVITY, DT)
         told.append([np.eye(3) if body.hold is None else body.hold for body in world.bodies])
         if step % 2:
-            world.bodies.apply_impulses(0.01 * rng.standard_normal((len(bodies), 3)) * world.bodies.mass[:, None])
+            world.bodies.apply_impulses(
+                0.01 * rng.standard_normal((len(bodies), 3)) * world.bodies.mass[:, None]
+            )
         world.end_step(DT)
         told += [world.bodies.values.copy(), world._solve.memory.values, [world.contacts]]
     return told

@@ -18,20 +18,28 @@ UNEVEN = np.diag([1.0, 2.0, 3.0])
 
 
 def body(inertia=UNEVEN, **kwargs):
-    return RigidBody(MassProperties(mass=2.0, center=CENTER, inertia=inertia), name="body", **kwargs)
+    return RigidBody(
+        MassProperties(mass=2.0, center=CENTER, inertia=inertia), name="body", **kwargs
+    )
 
 
 def tumbling():
     """Near the middle axis, about which a free rotation is unstable."""
     turn = Rotation.from_rotvec([0.3, -0.5, 0.2]).as_matrix()
-    return body(turn @ UNEVEN @ turn.T, angular_velocity=turn @ np.array([0.05, 4.0, -0.03]), velocity=np.array([1.0, 2.0, -0.5]))
+    return body(
+        turn @ UNEVEN @ turn.T,
+        angular_velocity=turn @ np.array([0.05, 4.0, -0.03]),
+        velocity=np.array([1.0, 2.0, -0.5]),
+    )
 
 
 def test_angular_momentum_is_kept_exactly_and_energy_does_not_drift():
     top = tumbling()
     momenta, energies = top.angular_momentum.copy(), []
     start = top.kinetic_energy
-    assert start == pytest.approx(0.5 * (2.0 * (1.0 + 4.0 + 0.25) + 0.05**2 + 2.0 * 4.0**2 + 3.0 * 0.03**2))
+    assert start == pytest.approx(
+        0.5 * (2.0 * (1.0 + 4.0 + 0.25) + 0.05**2 + 2.0 * 4.0**2 + 3.0 * 0.03**2)
+    )
     for _ in range(4000):
         top.advance(0.01)
         energies.append(top.kinetic_energy / start - 1.0)
@@ -49,12 +57,21 @@ def test_a_free_top_follows_a_fine_reference():
 
     def rates(_, state):
         w, q = state[:3], state[3:]
-        spin = np.array([[0, w[2], -w[1], w[0]], [-w[2], 0, w[0], w[1]], [w[1], -w[0], 0, w[2]], [-w[0], -w[1], -w[2], 0]])
+        spin = np.array(
+            [
+                [0, w[2], -w[1], w[0]],
+                [-w[2], 0, w[0], w[1]],
+                [w[1], -w[0], 0, w[2]],
+                [-w[0], -w[1], -w[2], 0],
+            ]
+        )
         return np.concatenate([inverse @ -np.cross(w, inertia @ w), 0.5 * spin @ q])
 
     end = 4.0
     start = np.concatenate([top.angular_velocity, [0.0, 0.0, 0.0, 1.0]])
-    reference = solve_ivp(rates, (0.0, end), start, method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
+    reference = solve_ivp(rates, (0.0, end), start, method="DOP853", rtol=1e-12, atol=1e-12).y[
+        :, -1
+    ]
     wanted = Rotation.from_quat(reference[3:]).as_matrix()
     errors = []
     for steps in (400, 800):
@@ -82,7 +99,9 @@ def test_poses_are_those_of_advance():
         now = motion.pose(top.time)
         np.testing.assert_allclose(predicted.rotation, now.rotation, atol=1e-13)
         np.testing.assert_allclose(predicted.translation, now.translation, atol=1e-13)
-        np.testing.assert_allclose(now.apply(before.inverse().apply(points)) - points, dt * field, atol=1e-13)
+        np.testing.assert_allclose(
+            now.apply(before.inverse().apply(points)) - points, dt * field, atol=1e-13
+        )
 
 
 def test_motions_of_several_bodies_are_those_of_each():
@@ -90,9 +109,13 @@ def test_motions_of_several_bodies_are_those_of_each():
     bodies = []
     for _ in range(4):
         root = rng.normal(size=(3, 3))
-        properties = MassProperties(mass=rng.uniform(0.1, 3), center=rng.uniform(0, 1, 3), inertia=root @ root.T + np.eye(3))
+        properties = MassProperties(
+            mass=rng.uniform(0.1, 3), center=rng.uniform(0, 1, 3), inertia=root @ root.T + np.eye(3)
+        )
         spin = rng.normal(size=3) * rng.choice([0.0, 10.0])
-        bodies.append(RigidBody(properties, name="top", velocity=rng.normal(size=3), angular_velocity=spin))
+        bodies.append(
+            RigidBody(properties, name="top", velocity=rng.normal(size=3), angular_velocity=spin)
+        )
     BodyStates(bodies).advance(0.03)
     turning = prescribed.Rotation(rate=40.0, center=[0.2, 0.1])
     each = [BodyMotion(bodies[0]), turning, *(BodyMotion(body) for body in bodies[1:])]
@@ -100,8 +123,12 @@ def test_motions_of_several_bodies_are_those_of_each():
     rotations, translations = motions.poses(times)
     for m, time in enumerate(times):
         for n, motion in enumerate(each):
-            np.testing.assert_allclose(rotations[m, n], motion.pose(time).rotation, rtol=0, atol=1e-15)
-            np.testing.assert_allclose(translations[m, n], motion.pose(time).translation, rtol=0, atol=1e-15)
+            np.testing.assert_allclose(
+                rotations[m, n], motion.pose(time).rotation, rtol=0, atol=1e-15
+            )
+            np.testing.assert_allclose(
+                translations[m, n], motion.pose(time).translation, rtol=0, atol=1e-15
+            )
     points, h = rng.normal(size=(5, 3)), 1e-6
     for n, (turn, shift) in enumerate(zip(*motions.velocity_fields(times[0], h), strict=True)):
         here = each[n].pose(times[0]).apply(points)
@@ -131,7 +158,9 @@ def test_impulses_and_inverse_masses_of_several_bodies_are_those_of_each(dimensi
 def test_the_center_of_mass_goes_where_its_pose_does():
     top = tumbling()
     top.advance(0.3)
-    np.testing.assert_allclose(BodyMotion(top).pose(top.time).apply(CENTER), top.position, atol=1e-15)
+    np.testing.assert_allclose(
+        BodyMotion(top).pose(top.time).apply(CENTER), top.position, atol=1e-15
+    )
 
 
 def test_steps_back_in_time_undo_steps():
@@ -150,7 +179,9 @@ def test_an_impulse_changes_velocities_by_the_inverse_mass():
         impulse, before = rng.normal(size=k), top.velocities(dimension)
         inverse = top.inverse_mass(dimension)
         top.apply_impulse(impulse)
-        np.testing.assert_allclose(top.velocities(dimension) - before, inverse @ impulse, atol=1e-13)
+        np.testing.assert_allclose(
+            top.velocities(dimension) - before, inverse @ impulse, atol=1e-13
+        )
         assert (np.linalg.eigvalsh(inverse) > 0.0).all()
 
 
@@ -160,12 +191,19 @@ def test_the_inverse_mass_of_a_turned_body_is_exactly_symmetric(spread):
     rng = np.random.default_rng(23)
     for rotation in Rotation.random(20, rng=rng).as_matrix():
         principal = Rotation.random(rng=rng).as_matrix()
-        moments = rng.uniform(1e-3, 1e3) * np.array([1.0, 1.0 / spread, rng.uniform(1.0 / spread, 1.0)])
+        moments = rng.uniform(1e-3, 1e3) * np.array(
+            [1.0, 1.0 / spread, rng.uniform(1.0 / spread, 1.0)]
+        )
         turned = body(principal @ np.diag(moments) @ principal.T)
         turned.rotation = rotation
         W, axes = turned.inverse_mass(3), rotation @ principal
         assert np.array_equal(W, W.T)
-        np.testing.assert_allclose(W[3:, 3:], axes @ np.diag(1.0 / moments) @ axes.T, rtol=0.0, atol=1e-15 * spread * np.abs(W).max())
+        np.testing.assert_allclose(
+            W[3:, 3:],
+            axes @ np.diag(1.0 / moments) @ axes.T,
+            rtol=0.0,
+            atol=1e-15 * spread * np.abs(W).max(),
+        )
 
 
 def test_turns_are_scipys():
@@ -174,7 +212,9 @@ def test_turns_are_scipys():
         vector, top = rng.standard_normal(3), body()
         vector *= size / np.linalg.norm(vector)
         top.shift(np.concatenate([np.zeros(3), vector]))
-        np.testing.assert_allclose(top.rotation, Rotation.from_rotvec(vector).as_matrix(), atol=1e-14)
+        np.testing.assert_allclose(
+            top.rotation, Rotation.from_rotvec(vector).as_matrix(), atol=1e-14
+        )
 
 
 def test_gravity_gives_the_velocity_of_fall():
@@ -189,7 +229,9 @@ def test_whole_turns_are_counted_in_the_plane():
     for _ in range(100):
         disc.advance(0.01)
     assert disc.angle == pytest.approx(20.0)
-    np.testing.assert_allclose(disc.rotation[:2, :2], [[np.cos(20), -np.sin(20)], [np.sin(20), np.cos(20)]], atol=1e-12)
+    np.testing.assert_allclose(
+        disc.rotation[:2, :2], [[np.cos(20), -np.sin(20)], [np.sin(20), np.cos(20)]], atol=1e-12
+    )
 
 
 def test_a_state_is_restored_bit_for_bit():
@@ -203,7 +245,9 @@ def test_a_state_is_restored_bit_for_bit():
     assert (one.state() == other.state()).all()
 
 
-@pytest.mark.parametrize("bad", [{"friction": -0.1}, {"friction": np.inf}, {"restitution": 1.5}, {"restitution": -0.1}])
+@pytest.mark.parametrize(
+    "bad", [{"friction": -0.1}, {"friction": np.inf}, {"restitution": 1.5}, {"restitution": -0.1}]
+)
 def test_coefficients_out_of_range_are_refused(bad):
     with pytest.raises(ValueError, match=next(iter(bad))):
         body(**bad)
@@ -213,7 +257,10 @@ def test_bodies_of_one_array_move_as_each_does_alone():
     """Bit for bit, whatever the others do: some of them need more rounds of the fixed point, one does not turn at all."""
     rng = np.random.default_rng(41)
     spin = [np.zeros(3), *rng.normal(size=(4, 3)) * [[0.1], [1.0], [10.0], [40.0]]]
-    alone = [body(np.diag(rng.uniform(1.0, 3.0, 3)), angular_velocity=w, velocity=rng.normal(size=3)) for w in spin]
+    alone = [
+        body(np.diag(rng.uniform(1.0, 3.0, 3)), angular_velocity=w, velocity=rng.normal(size=3))
+        for w in spin
+    ]
     together = BodyStates([copy(one) for one in alone])
     impulses, ways = rng.normal(size=(5, 6)), 0.1 * rng.normal(size=(5, 6))
     for dt in (0.02, 0.03):
@@ -237,4 +284,6 @@ def test_rotations_off_by_rounding_become_the_nearest_ones():
     u, _, vt = np.linalg.svd(off)
     near = orthonormal(off)
     np.testing.assert_allclose(near, u @ vt, rtol=0.0, atol=1e-14)  # which has rounding of its own
-    np.testing.assert_allclose(near @ near.swapaxes(1, 2), np.broadcast_to(np.eye(3), near.shape), rtol=0.0, atol=2e-15)
+    np.testing.assert_allclose(
+        near @ near.swapaxes(1, 2), np.broadcast_to(np.eye(3), near.shape), rtol=0.0, atol=2e-15
+    )

@@ -32,7 +32,9 @@ print(json.dumps({
 
 def test_a_first_default_solve_compiles_few_modules_and_no_kernel_that_it_does_not_launch():
     """A module costs 0.04 CPU s, a kernel 0.03 to 0.3, each set of flags a precompiled header of a second."""
-    run = subprocess.run([sys.executable, "-c", FIRST_SOLVE], capture_output=True, text=True, check=True)
+    run = subprocess.run(
+        [sys.executable, "-c", FIRST_SOLVE], capture_output=True, text=True, check=True
+    )
     found = json.loads(run.stdout.splitlines()[-1])
     assert len(found["modules"]) <= 17, found["modules"]
     assert all(name.startswith("warp_lcp.") for name in found["modules"])
@@ -40,7 +42,10 @@ def test_a_first_default_solve_compiles_few_modules_and_no_kernel_that_it_does_n
     assert len(found["flags"]) == 1
 
 
-@pytest.mark.parametrize(("version", "inlines"), [("1.19.0", True), ("1.19.3", True), ("1.20.0", False), ("2.0.0", False)])
+@pytest.mark.parametrize(
+    ("version", "inlines"),
+    [("1.19.0", True), ("1.19.3", True), ("1.20.0", False), ("2.0.0", False)],
+)
 def test_options_of_llvm_are_given_to_versions_that_have_them(monkeypatch, version, inlines):
     monkeypatch.setattr(wp, "__version__", version)
     monkeypatch.setattr(wp.config, "cpu_compiler_flags", None)
@@ -48,5 +53,7 @@ def test_options_of_llvm_are_given_to_versions_that_have_them(monkeypatch, versi
     assert flags.startswith(f"-march=native {compiler.HEADER_FLAGS}")
     assert (compiler.INLINE_FIRST in flags) == inlines
     monkeypatch.setattr(wp.config, "cpu_compiler_flags", "-O1")
-    flags = compiler.project_module(f"{compiler.INLINE_LATER[0]}tests").options["cpu_compiler_flags"]
+    flags = compiler.project_module(f"{compiler.INLINE_LATER[0]}tests").options[
+        "cpu_compiler_flags"
+    ]
     assert flags == f"-O1 {compiler.HEADER_FLAGS}"

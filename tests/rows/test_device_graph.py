@@ -63,7 +63,11 @@ def test_a_pass_visits_the_rows_of_each_run(seed):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_cells_and_numbers_are_those_of_each_run(seed):
-    field, memory, factor = wp.zeros(SHAPE, dtype=wp.float32, device=DEVICE), _RangeMemory(), Scalar()
+    field, memory, factor = (
+        wp.zeros(SHAPE, dtype=wp.float32, device=DEVICE),
+        _RangeMemory(),
+        Scalar(),
+    )
     program, places = DeviceProgram(DEVICE), boxes(seed + 10, 6)
 
     def move(box):
@@ -73,7 +77,14 @@ def test_cells_and_numbers_are_those_of_each_run(seed):
         return window, cells
 
     window, cells = move(places[0])
-    program.record_tasks(mark_kernel, (*window.rows, cells.chunks), [cells, factor, field], memory.first, memory.sized, memory)
+    program.record_tasks(
+        mark_kernel,
+        (*window.rows, cells.chunks),
+        [cells, factor, field],
+        memory.first,
+        memory.sized,
+        memory,
+    )
     program.finish()
     k, j, i = np.indices(SHAPE)
     for turn, box in enumerate(places):
@@ -92,7 +103,9 @@ def test_a_list_may_be_replaced_and_grow():
     program = DeviceProgram(DEVICE)
     memory.take(Rows.listed(10, DEVICE, 1).single)
     slot.point_to(lists[0])
-    program.record_tasks(add_kernel, (10,), [wp.vec2i(0, 0), lists[0], change], None, memory.sized, memory)
+    program.record_tasks(
+        add_kernel, (10,), [wp.vec2i(0, 0), lists[0], change], None, memory.sized, memory
+    )
     program.record(DeviceCopy(lists[3], None))
     program.finish()
     for values, number in ((lists[0], 2.0), (lists[1], -3.0), (lists[2], 4.5)):
@@ -101,7 +114,9 @@ def test_a_list_may_be_replaced_and_grow():
         change.value = number
         assert program.fits()
         program.run()
-        np.testing.assert_array_equal(values.numpy(), np.full(len(values), number, dtype=np.float32))
+        np.testing.assert_array_equal(
+            values.numpy(), np.full(len(values), number, dtype=np.float32)
+        )
     memory.take(Rows.listed(20, DEVICE, 1).single)
     assert not program.fits()  # it must be captured again
 

@@ -19,8 +19,12 @@ from warp_lcp.rows.memory import Scalar
 from warp_lcp.rows.program import LaunchGraph, launch
 from warp_lcp.rows.readings import Reading
 
-emulated = pytest.mark.skipif("emulated_cuda" not in sys.modules, reason="the plugin emulated_cuda is not there")
-HELD = re.compile(r"(=|partial\()\s*wp\.(launch|copy|capture_launch|capture_while|capture_if)\b(?!\()")
+emulated = pytest.mark.skipif(
+    "emulated_cuda" not in sys.modules, reason="the plugin emulated_cuda is not there"
+)
+HELD = re.compile(
+    r"(=|partial\()\s*wp\.(launch|copy|capture_launch|capture_while|capture_if)\b(?!\()"
+)
 DEVICE = wp.get_device("cpu")
 
 
@@ -52,7 +56,9 @@ class Chain:
         self.stretches = [LaunchGraph(DEVICE, self._recorder(i)) for i in range(len(factors))]
 
     def _recorder(self, i: int) -> Callable[[], None]:
-        return lambda: launch(affine_kernel, 3, [self.x, self.factors[i], self.shifts[i]], device=DEVICE)
+        return lambda: launch(
+            affine_kernel, 3, [self.x, self.factors[i], self.shifts[i]], device=DEVICE
+        )
 
     def take(self, i: int, shift: float) -> None:
         """Launch stretch i with a shift."""
@@ -89,7 +95,9 @@ def calls_of(step: Callable[[], None]) -> int:
 def test_arrays_of_the_host_are_sent_in_order(chain: Chain) -> None:
     """A stretch reads what was sent last before it, also where the same array is sent several times in a step; sending is no launch."""
     sent = HostArray(3, wp.float64, DEVICE)
-    adding = LaunchGraph(DEVICE, lambda: launch(add_kernel, 3, [chain.x, sent.array], device=DEVICE))
+    adding = LaunchGraph(
+        DEVICE, lambda: launch(add_kernel, 3, [chain.x, sent.array], device=DEVICE)
+    )
 
     def add(value: float) -> None:
         sent.host[:] = value, 2.0 * value, -value
@@ -233,5 +241,9 @@ def test_no_function_of_warp_is_held_from_before_it_settles() -> None:
     for folder in ("warp_lcp", "fluids", "granular"):
         for file in sorted((Path(__file__).parents[2] / folder).rglob("*.py")):
             if "distributed" not in file.parts:  # graphs of steps are of one process
-                held += [f"{file.name}: {line.strip()}" for line in file.read_text().splitlines() if HELD.search(line)]
+                held += [
+                    f"{file.name}: {line.strip()}"
+                    for line in file.read_text().splitlines()
+                    if HELD.search(line)
+                ]
     assert held == []

@@ -44,12 +44,18 @@ def messages() -> tuple[KernelMessages, Said, io.StringIO]:
 def test_a_script_hears_of_its_kernels_once_and_its_compiler_warns_of_none(tmp_path: Path) -> None:
     for compiles in (1, 0):
         done = subprocess.run(
-            [sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=False, env=os.environ | {"WARP_CACHE_PATH": str(tmp_path)}
+            [sys.executable, "-c", SCRIPT],
+            capture_output=True,
+            text=True,
+            check=False,
+            env=os.environ | {"WARP_CACHE_PATH": str(tmp_path)},
         )
         assert done.stdout == "CONVERGED\n", done.stderr
         said = done.stderr.splitlines()
         assert len(said) == compiles, done.stderr
-        assert all(line.startswith("compiling kernels for cpu") and str(tmp_path) in line for line in said)
+        assert all(
+            line.startswith("compiling kernels for cpu") and str(tmp_path) in line for line in said
+        )
 
 
 @pytest.mark.parametrize(
@@ -57,12 +63,20 @@ def test_a_script_hears_of_its_kernels_once_and_its_compiler_warns_of_none(tmp_p
     [
         ("wl.DenseOperator(np.eye(2), device='cpu')", "open"),
         ("wl.DenseOperator(np.eye(2), device='cpu')", "closed"),
-        ("wl.DirectEnumeration; from warp_lcp.grid.staggered import StaggeredGrid; StaggeredGrid((2, 2, 1), 1.0, 2, device='cpu')", "open"),
+        (
+            "wl.DirectEnumeration; from warp_lcp.grid.staggered import StaggeredGrid; "
+            "StaggeredGrid((2, 2, 1), 1.0, 2, device='cpu')",
+            "open",
+        ),
     ],
 )
 def test_nothing_is_said_of_a_driver_that_is_not_there(made: str, stream: str) -> None:
-    script = f"import os, numpy as np, warp_lcp as wl; {'os.close(2); ' * (stream == 'closed')}{made}"
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    script = (
+        f"import os, numpy as np, warp_lcp as wl; {'os.close(2); ' * (stream == 'closed')}{made}"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
     assert done.stdout == done.stderr == ""
 
 
@@ -80,7 +94,9 @@ def test_one_line_a_device_and_only_for_what_is_compiled() -> None:
     assert said.messages == []
 
 
-@pytest.mark.parametrize("message", [MODULE.format("__main__", "cpu", "compiled"), "mine took 3.00 ms", "fluids are wet"])
+@pytest.mark.parametrize(
+    "message", [MODULE.format("__main__", "cpu", "compiled"), "mine took 3.00 ms", "fluids are wet"]
+)
 def test_what_is_not_of_the_library_passes(message: str) -> None:
     heard, said, stream = messages()
     with wp.ScopedLogLevel(wp.LOG_INFO):

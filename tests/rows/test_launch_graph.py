@@ -113,11 +113,15 @@ def test_a_recorded_list_is_that_of_the_run(threads, guarded):
             particles.sort()
         before = {name: array.numpy().copy() for name, array in particles.arrays().items()}
         graph.run()
-        found = {name: array.numpy().copy() for name, array in particles.arrays().items()} | {"u": fields[0].numpy().copy()}
+        found = {name: array.numpy().copy() for name, array in particles.arrays().items()} | {
+            "u": fields[0].numpy().copy()
+        }
         for name, array in particles.arrays().items():
             array.assign(before[name])
         launch()
-        expected = {name: array.numpy() for name, array in particles.arrays().items()} | {"u": fields[0].numpy()}
+        expected = {name: array.numpy() for name, array in particles.arrays().items()} | {
+            "u": fields[0].numpy()
+        }
         for name, values in expected.items():
             np.testing.assert_array_equal(found[name], values)
 
@@ -215,19 +219,26 @@ def pairwise(values: list[float]) -> float:
     sums, whole = values[:8], len(values) - len(values) % 8
     for start in range(8, whole, 8):
         sums = [s + v for s, v in zip(sums, values[start:], strict=False)]
-    total = ((sums[0] + sums[1]) + (sums[2] + sums[3])) + ((sums[4] + sums[5]) + (sums[6] + sums[7]))
+    total = ((sums[0] + sums[1]) + (sums[2] + sums[3])) + (
+        (sums[4] + sums[5]) + (sums[6] + sums[7])
+    )
     for value in values[whole:]:
         total += value
     return total
 
 
-@pytest.mark.parametrize("counts", [(7, 5, 1), (9, 11, 37), (5, 130, 1), (6, 60, 150), (3, 260, 40)])
+@pytest.mark.parametrize(
+    "counts", [(7, 5, 1), (9, 11, 37), (5, 130, 1), (6, 60, 150), (3, 260, 40)]
+)
 def test_rows_are_added_up_pairwise(counts):
     """Sums of rows have the bits of pairwise summation over the rows of the box in order, in parts that fit 8192 values."""
     rng = np.random.default_rng(sum(counts))
     grid = StaggeredGrid(counts, 0.1, 2 if counts[2] == 1 else 3)
     host = {"base": np.full(grid.shape, AIR, dtype=np.int8)}
-    host |= {name: rng.uniform(0.0, 2.0, grid.shape).astype(np.float32) for name in ("density", "capacity")}
+    host |= {
+        name: rng.uniform(0.0, 2.0, grid.shape).astype(np.float32)
+        for name in ("density", "capacity")
+    }
     fields = {name: wp.array(values) for name, values in host.items()}
     tally, all_cells = WindowTally(CROWD, grid), WindowTally(CROWD, grid, grid.domain)
     for _ in range(4):

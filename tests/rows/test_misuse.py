@@ -37,7 +37,13 @@ def row_pass(tmp_path):
 
 @pytest.fixture
 def double(row_pass):
-    return row_pass("double", EACH + "y[k] = x ? 2*x[k] : -1;", reads={"x": "S"}, writes={"y": "S"}, optional=("x",))
+    return row_pass(
+        "double",
+        EACH + "y[k] = x ? 2*x[k] : -1;",
+        reads={"x": "S"},
+        writes={"y": "S"},
+        optional=("x",),
+    )
 
 
 @pytest.fixture
@@ -49,7 +55,10 @@ def test_elements_lie_side_by_side_on_the_rows_device(double):
     numbers, y, rows = array(np.arange(20.0)), zeros(10), Rows.flat(10, CPU)
     double.bind(rows, x=numbers[5:15], y=y).launch()
     np.testing.assert_array_equal(y.numpy(), 2 * np.arange(5, 15))
-    for strided in (numbers[::2], wp.indexedarray(numbers, [wp.array(np.arange(10), dtype=int, device="cpu")])):
+    for strided in (
+        numbers[::2],
+        wp.indexedarray(numbers, [wp.array(np.arange(10), dtype=int, device="cpu")]),
+    ):
         with pytest.raises(ValueError, match=r"misuse\.double: x is strided"):
             double.bind(rows, x=strided, y=y)
     with pytest.raises(ValueError, match=r"misuse\.double: x is on cpu, not .*cuda:7"):
@@ -84,7 +93,9 @@ def test_a_kernel_takes_the_members_of_structs_that_it_declares(double):
         double.bind(rows, Target(z))
     with pytest.raises(TypeError, match=r"misuse\.double: missing \[\], unknown \['other'\]"):
         double.bind(rows, Fields(x, y), other=0)
-    with pytest.raises(TypeError, match=r"misuse\.double: Fields, Target: two of them have \['y'\]"):
+    with pytest.raises(
+        TypeError, match=r"misuse\.double: Fields, Target: two of them have \['y'\]"
+    ):
         double.bind(rows, Fields(x, y), Target(z))
     with pytest.raises(TypeError, match=r"misuse\.double: dict is not a dataclass"):
         double.bind(rows, {"x": x, "y": y})
@@ -92,7 +103,9 @@ def test_a_kernel_takes_the_members_of_structs_that_it_declares(double):
         double.bind(rows, Fields(x, zeros(9)))
 
 
-@pytest.mark.parametrize("absent", [None, zeros(0), zeros(20)[5:5]], ids=["None", "empty", "a slice of nothing"])
+@pytest.mark.parametrize(
+    "absent", [None, zeros(0), zeros(20)[5:5]], ids=["None", "empty", "a slice of nothing"]
+)
 def test_what_is_absent_has_no_address(double, absent):
     y = zeros(10)
     double.bind(Rows.flat(10, CPU), x=absent, y=y).launch()
@@ -100,11 +113,19 @@ def test_what_is_absent_has_no_address(double, absent):
 
 
 def test_stencils_and_bounds_of_another_grid_are_refused(row_pass):
-    one, other = (wl.GridPoisson(np.ones(shape, dtype=int), device="cpu") for shape in ((3, 4, 5), (9, 9, 9)))
+    one, other = (
+        wl.GridPoisson(np.ones(shape, dtype=int), device="cpu") for shape in ((3, 4, 5), (9, 9, 9))
+    )
     y, fields = zeros(other.layout.size), {"writes": {"y": "S"}}
-    with pytest.raises(ValueError, match=r"misuse\.product: the stencil has 210 elements, not 1331"):
-        row_pass("product", ";", stencil=("D", "W"), **fields).bind(other.stencil.rows, stencil=one.stencil, y=y)
-    bounds = wl.LCP(one, np.zeros(one.shape), np.linspace(-1, 1, 60).reshape(one.shape)).bounds.operands
+    with pytest.raises(
+        ValueError, match=r"misuse\.product: the stencil has 210 elements, not 1331"
+    ):
+        row_pass("product", ";", stencil=("D", "W"), **fields).bind(
+            other.stencil.rows, stencil=one.stencil, y=y
+        )
+    bounds = wl.LCP(
+        one, np.zeros(one.shape), np.linspace(-1, 1, 60).reshape(one.shape)
+    ).bounds.operands
     with pytest.raises(ValueError, match=r"misuse\.bounded: bounds have 210 elements, not 1331"):
         row_pass("bounded", ";", bounds=True, **fields).bind(other.stencil.rows, bounds=bounds, y=y)
     with pytest.raises(TypeError, match="a known product is float32, not an array of float64"):
@@ -116,12 +137,19 @@ def test_stencils_and_bounds_of_another_grid_are_refused(row_pass):
 
 
 def test_a_box_lies_within_its_fields(row_pass):
-    fill = row_pass("box", "for (int i = first; i < last; ++i) y[i] = 1;", wp.float64, box={"y": wp.float64})
+    fill = row_pass(
+        "box", "for (int i = first; i < last; ++i) y[i] = 1;", wp.float64, box={"y": wp.float64}
+    )
     for high, shape in (((3, 3, 4), (3, 3, 3)), ((1, 3, 3), (3, 3))):
-        with pytest.raises(ValueError, match=r"misuse\.box: fields have the shape \(3, .*the box ends at \(., 3, .\)"):
+        with pytest.raises(
+            ValueError,
+            match=r"misuse\.box: fields have the shape \(3, .*the box ends at \(., 3, .\)",
+        ):
             fill.bind(Rows.box((0, 0, 0), high, CPU), y=zeros(shape))
     for low, high in (((-1, 0, 0), (3, 3, 3)), ((2, 2, 2), (3, 1, 3))):
-        with pytest.raises(ValueError, match=r"box: from \(.*\) to \(.*\): expected 0 <= low <= high"):
+        with pytest.raises(
+            ValueError, match=r"box: from \(.*\) to \(.*\): expected 0 <= low <= high"
+        ):
             Rows.box(low, high, CPU)
     y = zeros((3, 3, 3))
     for empty in ((2, 2, 0), (2, 0, 2), (0, 2, 2)):
@@ -150,20 +178,32 @@ def test_names_are_checked_when_a_pass_is_declared(row_pass, declared, name):
 def test_what_else_cannot_be_declared(row_pass):
     with pytest.raises(ValueError, match=r"misuse\.my-pass: \['my-pass'\]"):
         row_pass("my-pass", ";", writes={"y": "S"})
-    with pytest.raises(TypeError, match=r"misuse\.wrong: \['v'\]: expected numbers of the types float32, "):
+    with pytest.raises(
+        TypeError, match=r"misuse\.wrong: \['v'\]: expected numbers of the types float32, "
+    ):
         row_pass("wrong", ";", writes={"y": "S"}, numbers={"v": wp.uint8})
     with pytest.raises(ValueError, match=r"misuse\.wrong: \['x'\]"):  # whose shape s1 and s2 are
         row_pass("wrong", ";", wp.float64, box={"x": wp.float64, "y": wp.float64}, optional=("x",))
-    with pytest.raises(TypeError, match=r"misuse\.halves: y is float16: a letter stands for uint8, "):
+    with pytest.raises(
+        TypeError, match=r"misuse\.halves: y is float16: a letter stands for uint8, "
+    ):
         row_pass("halves", ";", writes={"y": "S"}).bind(Rows.flat(3, CPU), y=zeros(3, wp.float16))
 
 
 def test_constants_keep_their_fractions_and_numbers_their_range(row_pass):
-    half = row_pass("half", EACH + "y[k] = HALF + v;", writes={"y": "S"}, constants={"HALF": 0.5}, numbers={"v": wp.int64})
+    half = row_pass(
+        "half",
+        EACH + "y[k] = HALF + v;",
+        writes={"y": "S"},
+        constants={"HALF": 0.5},
+        numbers={"v": wp.int64},
+    )
     y, rows = zeros(3), Rows.flat(3, CPU)
     half.bind(rows, y=y, v=-(1 << 40)).launch()
     assert (y.numpy() == 0.5 - 2.0**40).all()
-    replace(half, name="test_misuse.quarter", constants={"HALF": np.float32(0.25)}).bind(rows, y=y, v=0).launch()
+    replace(half, name="test_misuse.quarter", constants={"HALF": np.float32(0.25)}).bind(
+        rows, y=y, v=0
+    ).launch()
     assert (y.numpy() == 0.25).all()
     half.bind(rows, y=y, v=0, HALF=-3).launch()
     assert (y.numpy() == -3).all()
@@ -180,7 +220,9 @@ def test_a_number_that_is_called_places_moves_no_sums(row_pass):
     x, rows = array(np.arange(20_000.0)), Rows.flat(20_000, CPU)
     out = zeros(2 * rows.places)
     sums.bind(rows, x=x, places=1, out=out).launch()
-    np.testing.assert_array_equal(out.numpy().reshape(2, -1).sum(axis=1), x.numpy().sum() * np.array([1, 2]))
+    np.testing.assert_array_equal(
+        out.numpy().reshape(2, -1).sum(axis=1), x.numpy().sum() * np.array([1, 2])
+    )
 
 
 def test_a_header_that_is_written_anew_is_read_anew(row_pass):
@@ -195,7 +237,12 @@ def test_grids_without_cells_are_left_alone(add, row_pass):
     total = row_pass("total", "T s = 0; " + EACH + "s += x[k];", reads={"x": "S"}, sums=("s",))
     total.bind(Rows.flat(0, CPU), x=zeros(0), out=zeros(0)).launch()
     grids = [Rows.of(Padding(counts), CPU) for counts in ((0, 2, 2), (2, 0, 2), (2, 2, 0))]
-    for rows in (*grids, Rows.flat(0, CPU), Rows.flat(0, CPU, serial=True), Rows.by_turns(0, CPU, 64)):
+    for rows in (
+        *grids,
+        Rows.flat(0, CPU),
+        Rows.flat(0, CPU, serial=True),
+        Rows.by_turns(0, CPU, 64),
+    ):
         y = zeros(rows.size)
         bound = add.bind(rows, y=y)
         bound.launch()
@@ -224,7 +271,12 @@ def test_waves_reach_all_planes_whatever_is_left_out(add):
         wave = Wave("test_misuse.three", *zip((add,) * 3, lags, strict=True))
         for left_out in range(8):
             y.zero_()
-            wave.launch(*(None if left_out >> i & 1 else add.bind(rows, y=y, AMOUNT=10**i) for i in range(3)))
+            wave.launch(
+                *(
+                    None if left_out >> i & 1 else add.bind(rows, y=y, AMOUNT=10**i)
+                    for i in range(3)
+                )
+            )
             assert set(y.numpy()) == {0, sum(10**i for i in range(3) if not left_out >> i & 1)}
 
 
@@ -232,11 +284,19 @@ def test_waves_reach_all_planes_whatever_is_left_out(add):
 def test_a_wave_visits_a_coarse_plane_once(add, row_pass, planes):
     """The last stage is so far behind that the wave goes on after the last fine plane."""
     count = row_pass("count", EACH + "c[k] += x[2*k];", writes={"c": "S"}, other={"x": "S"})
-    fine, coarse = (Rows.of(Padding(counts), CPU) for counts in ((planes, 4, 4), ((planes + 1) // 2, 2, 2)))
+    fine, coarse = (
+        Rows.of(Padding(counts), CPU) for counts in ((planes, 4, 4), ((planes + 1) // 2, 2, 2))
+    )
     x, y, c = zeros(fine.size), zeros(fine.size), zeros(coarse.size)
-    passes = add.bind(fine, y=x), count.bind(coarse.beside(fine, (2, 2, 2)), c=c, x=x), add.bind(fine, y=y)
+    passes = (
+        add.bind(fine, y=x),
+        count.bind(coarse.beside(fine, (2, 2, 2)), c=c, x=x),
+        add.bind(fine, y=y),
+    )
     Wave("test_misuse.coarse", (add, 0), (count, 1), (add, 4)).launch(*passes)
-    assert (c.numpy().reshape(-1, 4, 4)[1:-1, 1:-1, 1:-1] == 1).all() and y.numpy().sum() == planes * 16
+    assert (
+        c.numpy().reshape(-1, 4, 4)[1:-1, 1:-1, 1:-1] == 1
+    ).all() and y.numpy().sum() == planes * 16
 
 
 @pytest.mark.cpu_form("waves are the CPU's")

@@ -63,7 +63,9 @@ def threads(request, monkeypatch):
 
 def counting(left: wp.array, odd: wp.array) -> tuple[Program, wp.array, wp.array]:
     """Return a program that adds 1 to a field in each run, and doubles another after every odd number of runs left."""
-    ones, a, b = (wp.full(5000, value, dtype=wp.float64, device=DEVICE) for value in (1.0, 0.0, 1.0))
+    ones, a, b = (
+        wp.full(5000, value, dtype=wp.float64, device=DEVICE) for value in (1.0, 0.0, 1.0)
+    )
     program, double = Program(DEVICE), Program(DEVICE)
     ADD.bind(rows_of(a), z=ones, x=a).launch(program.launch)
     program.launch(count_down_kernel, 1, [left, odd], device=DEVICE)

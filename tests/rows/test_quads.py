@@ -15,9 +15,12 @@ from warp_lcp.rows.fields import Padding
 from warp_lcp.rows.kernel_file import KernelFile
 from warp_lcp.rows.layout import copy_of, put
 
-EMULATED = pytest.mark.skipif("emulated_cuda" not in sys.modules, reason="the plugin emulated_cuda is not there")
+EMULATED = pytest.mark.skipif(
+    "emulated_cuda" not in sys.modules, reason="the plugin emulated_cuda is not there"
+)
 SEEDS = [1, 2, int(os.environ.get("SEED", "3414447061"))]  # SEED=... draws other grids
-WIDTHS = (1, 2, 3, 4, 5, 7, 8, 11, 13, 18, 30)  # of rows: full quads alone, with some cells left, and none
+# of rows: full quads alone, with some cells left, and none
+WIDTHS = (1, 2, 3, 4, 5, 7, 8, 11, 13, 18, 30)
 
 
 @pytest.fixture
@@ -25,7 +28,11 @@ def checked(monkeypatch):
     """Have each pass by quads run by cells as well; return the counts of launches and of differences."""
     from benchmarks import emulated_cuda
 
-    monkeypatch.setattr(emulated_cuda.context, "invoke", emulated_cuda.checked_by_cells(emulated_cuda.context.invoke))
+    monkeypatch.setattr(
+        emulated_cuda.context,
+        "invoke",
+        emulated_cuda.checked_by_cells(emulated_cuda.context.invoke),
+    )
     emulated_cuda.otherwise.clear()
     emulated_cuda.launched_by_cells.clear()
     yield emulated_cuda.launched_by_cells, emulated_cuda.otherwise
@@ -64,13 +71,24 @@ def test_fields_have_the_bits_of_a_thread_a_cell(seed, checked):
     launched, otherwise = checked
     problem = drawn_problem(seed)
     stopping = wl.StoppingCriteria(rtol=1e-6, max_iterations=8)
-    cycle = CycleSettings(one_launch_cuda=0, coarsest_cuda=2)  # small levels launch by launch, transfers too
+    # small levels launch by launch, transfers too
+    cycle = CycleSettings(one_launch_cuda=0, coarsest_cuda=2)
     multigrid = (wl.ProjectedMultigrid(), wl.ProjectedMultigrid(cycle=cycle))
-    for method in (*multigrid, wl.MinimumMapNewton(), wl.InteriorPoint(), wl.AcceleratedProjectedGradient()):
+    for method in (
+        *multigrid,
+        wl.MinimumMapNewton(),
+        wl.InteriorPoint(),
+        wl.AcceleratedProjectedGradient(),
+    ):
         wl.solve(problem, method, stopping=stopping)
     assert sorted(+otherwise) == [], f"SEED={seed}"
     names = {name.split()[0] for name in launched}
-    assert names >= {"cycle.sweep", "cycle.restrict", "projected_multigrid.assess", "residual.natural"}, f"SEED={seed}"
+    assert names >= {
+        "cycle.sweep",
+        "cycle.restrict",
+        "projected_multigrid.assess",
+        "residual.natural",
+    }, f"SEED={seed}"
 
 
 HEADER = """// Kernels of a test.
@@ -95,7 +113,11 @@ for (int k = 0; k < n; ++k) if (z[k] > 700000) { z[k] = -z[k]; changed[P.row] = 
 def test_sums_of_whole_numbers_are_equal(seed, tmp_path):
     """Such sums are exact in every order: no cell is left out, and none counts twice."""
     (tmp_path / "quads.h").write_text(HEADER)
-    kernel, rng, device = KernelFile(tmp_path / "quads.h")["quads.whole"], np.random.default_rng(seed), wp.get_device("cpu")
+    kernel, rng, device = (
+        KernelFile(tmp_path / "quads.h")["quads.whole"],
+        np.random.default_rng(seed),
+        wp.get_device("cpu"),
+    )
     for width in WIDTHS:
         shape = (int(rng.integers(1, 40)), int(rng.integers(1, 5)), int(width))
         padding = Padding(shape)
@@ -104,7 +126,10 @@ def test_sums_of_whole_numbers_are_equal(seed, tmp_path):
             ends = np.sort(rng.integers(0, width + 1, (*shape[:2], 2)), axis=2)
             spans = wp.array(ends, dtype=wp.vec2i, device=device)
         rows = Rows.of(padding, device, spans)
-        x, y = (wp.array(rng.integers(-9, 10, padding.size).astype(float), device=device) for _ in range(2))
+        x, y = (
+            wp.array(rng.integers(-9, 10, padding.size).astype(float), device=device)
+            for _ in range(2)
+        )
         y = y if rng.random() < 0.5 else None
         cells = replace(rows, quads=None, summed=put(copy_of(rows.single), {"slab": 5}))
         assert rows.quads is not None
@@ -117,5 +142,12 @@ def test_sums_of_whole_numbers_are_equal(seed, tmp_path):
             assert bound.form.quads == (there is rows)
             bound.launch()
             sums = out.numpy().reshape(3, -1)
-            found.append((z.numpy().tobytes(), changed.numpy().tobytes(), *sums[:2].sum(axis=1), sums[2].max()))
+            found.append(
+                (
+                    z.numpy().tobytes(),
+                    changed.numpy().tobytes(),
+                    *sums[:2].sum(axis=1),
+                    sums[2].max(),
+                )
+            )
         assert found[0] == found[1], f"SEED={seed}"

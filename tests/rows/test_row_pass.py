@@ -25,9 +25,14 @@ def row_pass(folder: Path, name: str, source: str, **declared) -> RowPass:
 
 @pytest.fixture(scope="module")
 def product(tmp_path_factory):
-    source = "T xy = 0;\nSIMD for (int k = 0; k < n; ++k) { const T v = product(x, k); y[k] = v; xy += x[k]*v; }\n"
+    source = (
+        "T xy = 0;\nSIMD for (int k = 0; k < n; ++k) { const T v = product(x, k); y[k] = v; "
+        "xy += x[k]*v; }\n"
+    )
     fields = {"reads": {"x": "S"}, "writes": {"y": "S"}, "sums": ("xy",)}
-    return row_pass(tmp_path_factory.mktemp("headers"), "product", source, stencil=("D", "W"), **fields)
+    return row_pass(
+        tmp_path_factory.mktemp("headers"), "product", source, stencil=("D", "W"), **fields
+    )
 
 
 def scene(real, faces, **sides):
@@ -52,7 +57,10 @@ def test_a_product_and_its_sum(product, real, faces):
 
 @pytest.mark.cpu_form("how many cells a thread takes")
 def test_a_product_that_is_known_stands_for_a_stencil(tmp_path):
-    source = "T total = 0;\nSIMD for (int k = 0; k < n; ++k) { const T v = affine(x, b, k)*diagonal(k); y[k] = v; total += v; }\n"
+    source = (
+        "T total = 0;\nSIMD for (int k = 0; k < n; ++k) { const T v = affine(x, b, "
+        "k)*diagonal(k); y[k] = v; total += v; }\n"
+    )
     fields = {"reads": {"x": "S", "b": "S"}, "writes": {"y": "S"}, "sums": ("total",)}
     scaled = row_pass(tmp_path, "scaled", source, stencil=("D", "W"), **fields)
     n = 20_000  # several chunks
@@ -63,24 +71,46 @@ def test_a_product_that_is_known_stands_for_a_stencil(tmp_path):
         Rows.flat(n, wp.get_device("cpu")),
     )
     out = wp.zeros(rows.places, dtype=wp.float64, device="cpu")
-    known = Known(wp.array(d, dtype=wp.float64, device="cpu"), 2.0, wp.array(product, dtype=wp.float64, device="cpu"))
+    known = Known(
+        wp.array(d, dtype=wp.float64, device="cpu"),
+        2.0,
+        wp.array(product, dtype=wp.float64, device="cpu"),
+    )
     scaled.bind(rows, stencil=known, x=x, b=x, y=y, out=out).launch()
     np.testing.assert_allclose(y.numpy(), 2 * d * product, rtol=1e-15)
-    assert rows.places == 3 and out.numpy().sum() == pytest.approx((2 * d * product).sum(), rel=1e-12)
+    assert rows.places == 3 and out.numpy().sum() == pytest.approx(
+        (2 * d * product).sum(), rel=1e-12
+    )
 
 
 @pytest.mark.parametrize(
-    "rows", [Rows.flat(1000, wp.get_device("cpu"), serial=True), Rows.by_turns(1000, wp.get_device("cpu"), 64)], ids=str
+    "rows",
+    [
+        Rows.flat(1000, wp.get_device("cpu"), serial=True),
+        Rows.by_turns(1000, wp.get_device("cpu"), 64),
+    ],
+    ids=str,
 )
 def test_a_flat_field_goes_to_one_thread_or_by_turns_to_many(tmp_path, rows):
     """The second is what CUDA has: thread t sums elements t, t + 64, ...; 1000 is no multiple of 64."""
-    squares = row_pass(tmp_path, "squares", "T xx = 0;\nfor (int k = 0; k < n; ++k) { y[k] = p + k; xx += x[k]*x[k]; }\n",
-                       reads={"x": "S"}, writes={"y": "S"}, sums=("xx",))  # fmt: skip
+    squares = row_pass(
+        tmp_path,
+        "squares",
+        "T xx = 0;\nfor (int k = 0; k < n; ++k) { y[k] = p + k; xx += x[k]*x[k]; }\n",
+        reads={"x": "S"},
+        writes={"y": "S"},
+        sums=("xx",),
+    )
     host = RNG.standard_normal(1000)
-    x, y, out = (wp.array(v, dtype=wp.float64, device="cpu") for v in (host, host, np.full(rows.places + 1, 9.0)))
+    x, y, out = (
+        wp.array(v, dtype=wp.float64, device="cpu")
+        for v in (host, host, np.full(rows.places + 1, 9.0))
+    )
     squares.bind(rows, x=x, y=y, out=out).launch()
     np.testing.assert_array_equal(y.numpy(), np.arange(1000))
-    expected = (host**2).sum() if rows.places == 1 else [(host[t::64] ** 2).sum() for t in range(64)]
+    expected = (
+        (host**2).sum() if rows.places == 1 else [(host[t::64] ** 2).sum() for t in range(64)]
+    )
     np.testing.assert_allclose(out.numpy()[:-1], expected, rtol=1e-13)
     assert out.numpy()[-1] == 9.0
 
@@ -106,7 +136,13 @@ def test_slabs_chunks_and_spans_share_the_same_cells_out(product, monkeypatch):
     spans = np.zeros((5, 6, 2), dtype=np.int32)
     spans[2, 3] = (16, 32)
     y.fill_(7.0)
-    product.bind(Rows.of(s.padding, s.device, wp.array(spans, dtype=wp.vec2i, device="cpu")), stencil=s, x=x, y=y, out=out).launch()
+    product.bind(
+        Rows.of(s.padding, s.device, wp.array(spans, dtype=wp.vec2i, device="cpu")),
+        stencil=s,
+        x=x,
+        y=y,
+        out=out,
+    ).launch()
     stored, all_ = (f.numpy().reshape(7, 8, 39) for f in (y, whole))
     np.testing.assert_array_equal(stored[3, 4, 17:33], all_[3, 4, 17:33])
     stored[3, 4, 17:33] = 7.0
@@ -115,15 +151,27 @@ def test_slabs_chunks_and_spans_share_the_same_cells_out(product, monkeypatch):
 
 def test_a_wave_is_its_passes_one_after_another(product, tmp_path):
     add = row_pass(
-        tmp_path, "add", "SIMD for (int k = 0; k < n; ++k) x[k] += step*z[k];\n", reads={"z": "S"}, writes={"x": "S"}, numbers={"step": "S"}
+        tmp_path,
+        "add",
+        "SIMD for (int k = 0; k < n; ++k) x[k] += step*z[k];\n",
+        reads={"z": "S"},
+        writes={"x": "S"},
+        numbers={"step": "S"},
     )
     wave = Wave("test_rows.wave", (add, 0), (product, 1))
     A, _, x, _ = scene(wp.float64, {})
     z, rows = wp.clone(x), A.stencil.rows
     found = []
     for together in (True, False):
-        moved, y, out = wp.clone(x), wp.zeros_like(x), wp.zeros(rows.places, dtype=wp.float64, device="cpu")
-        passes = add.bind(rows, z=z, x=moved, step=0.5), product.bind(rows, stencil=A.stencil, x=moved, y=y, out=out)
+        moved, y, out = (
+            wp.clone(x),
+            wp.zeros_like(x),
+            wp.zeros(rows.places, dtype=wp.float64, device="cpu"),
+        )
+        passes = (
+            add.bind(rows, z=z, x=moved, step=0.5),
+            product.bind(rows, stencil=A.stencil, x=moved, y=y, out=out),
+        )
         if together:
             wave.launch(*passes)
         else:
@@ -132,15 +180,26 @@ def test_a_wave_is_its_passes_one_after_another(product, tmp_path):
         found.append([f.numpy() for f in (moved, y, out)])
     for one, other in zip(*found, strict=True):
         np.testing.assert_array_equal(one, other)
-    with pytest.raises(TypeError, match=r"test_rows.wave: takes test_rows.add, test_rows.product, in this order"):
+    with pytest.raises(
+        TypeError, match=r"test_rows.wave: takes test_rows.add, test_rows.product, in this order"
+    ):
         wave.launch(*reversed(passes))
 
 
 def test_fields_of_another_level_and_of_ghost_cells(tmp_path):
     """The aggregate of each cell is found, on either side; ghost cells are visited without the cells beside them."""
-    inject = row_pass(tmp_path, "inject", "for (int k = 0; k < n; ++k) x[k] = c[k/2];\n", writes={"x": "S"}, other={"c": "S"})
+    inject = row_pass(
+        tmp_path,
+        "inject",
+        "for (int k = 0; k < n; ++k) x[k] = c[k/2];\n",
+        writes={"x": "S"},
+        other={"c": "S"},
+    )
     fine, coarse = (Rows.of(Padding(n), wp.get_device("cpu")) for n in ((4, 5, 8), (2, 5, 4)))
-    x, values = wp.zeros(fine.size, dtype=wp.float32, device="cpu"), np.arange(coarse.size, dtype=np.float32)
+    x, values = (
+        wp.zeros(fine.size, dtype=wp.float32, device="cpu"),
+        np.arange(coarse.size, dtype=np.float32),
+    )
     c = wp.array(values, device="cpu")
     inject.bind(fine.beside(coarse, (-2, -1, -2)), x=x, c=c).launch()
     expected = values.reshape(4, 7, 6)[1:-1, 1:-1, 1:-1].repeat(2, 0).repeat(2, 2)
@@ -161,22 +220,36 @@ def wrong_launches():
     yield {"y": ...}, TypeError, r"product: missing \['y'\], unknown \[\]"
     yield {"z": short}, TypeError, r"product: missing \[\], unknown \['z'\]"
     yield {"y": short}, ValueError, "product: y has 3 elements, not 2184"
-    yield {"y": wp.zeros(2184, dtype=wp.float64, device="cpu")}, TypeError, "product: y is float64, not an array of float32, as x"
+    yield (
+        {"y": wp.zeros(2184, dtype=wp.float64, device="cpu")},
+        TypeError,
+        "product: y is float64, not an array of float32, as x",
+    )
     yield {"x": 1.0}, TypeError, "product: x is float, not an array"
-    yield {"out": wp.zeros(7, dtype=wp.float64, device="cpu")}, ValueError, "product: out has 7 elements, fewer than 30"
+    yield (
+        {"out": wp.zeros(7, dtype=wp.float64, device="cpu")},
+        ValueError,
+        "product: out has 7 elements, fewer than 30",
+    )
     yield {"out": short}, TypeError, "product: out is float32, not an array of float64"
     yield {"stencil": None}, TypeError, "product: needs stencil"
     yield {"bounds": []}, TypeError, "product: needs stencil, takes no bounds"
 
 
 @pytest.mark.cpu_form("how many cells a thread takes")
-@pytest.mark.parametrize(("change", "error", "message"), [*wrong_launches()], ids=lambda v: next(iter(v)) if isinstance(v, dict) else "")
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [*wrong_launches()],
+    ids=lambda v: next(iter(v)) if isinstance(v, dict) else "",
+)
 def test_a_wrong_launch_is_named(product, change, error, message):
     A, _, x, _ = scene(wp.float32, {})
     out = wp.zeros(A.stencil.rows.places, dtype=wp.float64, device="cpu")
     given = {"stencil": A.stencil, "x": x, "y": wp.zeros_like(x), "out": out} | change
     with pytest.raises(error, match=message):
-        product.bind(A.stencil.rows, **{name: value for name, value in given.items() if value is not ...})
+        product.bind(
+            A.stencil.rows, **{name: value for name, value in given.items() if value is not ...}
+        )
 
 
 def test_a_changed_header_is_compiled_anew(tmp_path):
@@ -186,7 +259,12 @@ def test_a_changed_header_is_compiled_anew(tmp_path):
         folder = tmp_path / str(value)
         folder.mkdir()
         (folder / "value.h").write_text(f"const int value = {value};\n")
-        fill = row_pass(folder, "fill", '#include "value.h"\nfor (int k = 0; k < n; ++k) x[k] = value;\n', writes={"x": "S"})
+        fill = row_pass(
+            folder,
+            "fill",
+            '#include "value.h"\nfor (int k = 0; k < n; ++k) x[k] = value;\n',
+            writes={"x": "S"},
+        )
         x = wp.zeros(4, dtype=wp.float32, device="cpu")
         bound = fill.bind(Rows.flat(4, x.device), x=x)
         bound.launch()
@@ -201,8 +279,13 @@ def test_a_changed_header_is_compiled_anew(tmp_path):
     assert hashes[0] != hashes[1]
 
 
-@pytest.mark.parametrize(("example", "header", "form"), [(0, "energy", "uint8_float32_float32"), (1, "relax", "uint8_float32")])
-def test_the_examples_of_a_new_pass_and_a_new_method_run_and_compile_for_cuda(tmp_path, monkeypatch, example, header, form):
+@pytest.mark.parametrize(
+    ("example", "header", "form"),
+    [(0, "energy", "uint8_float32_float32"), (1, "relax", "uint8_float32")],
+)
+def test_the_examples_of_a_new_pass_and_a_new_method_run_and_compile_for_cuda(
+    tmp_path, monkeypatch, example, header, form
+):
     page = Path(__file__).parents[2] / "CONTRIBUTING.md"
     source, code = blocks(page, "cpp")[example], blocks(page, "python")[example]
     assert len([line for line in (source + code).splitlines() if line]) < 40
@@ -210,4 +293,10 @@ def test_the_examples_of_a_new_pass_and_a_new_method_run_and_compile_for_cuda(tm
     monkeypatch.chdir(tmp_path)
     run(code, page)
     for arch in (80, 90):
-        wp.compile_aot_module(f"warp_lcp.mine.{header}.uniform_{form}", device=None, arch=arch, module_dir=tmp_path, use_ptx=True)
+        wp.compile_aot_module(
+            f"warp_lcp.mine.{header}.uniform_{form}",
+            device=None,
+            arch=arch,
+            module_dir=tmp_path,
+            use_ptx=True,
+        )

@@ -17,7 +17,14 @@ def passes(tmp_path_factory):
     (folder / "add.h").write_text("for (int k = 0; k < n; ++k) y[k] = x[k] + x[k + ym];\n")
     (folder / "scale.h").write_text("for (int k = 0; k < n; ++k) x[k] = factor*y[k];\n")
     add = RowPass("test_sequence.add", folder / "add.h", "S", reads={"x": "S"}, writes={"y": "S"})
-    return add, RowPass("test_sequence.scale", folder / "scale.h", "S", reads={"y": "S"}, writes={"x": "S"}, numbers={"factor": "S"})
+    return add, RowPass(
+        "test_sequence.scale",
+        folder / "scale.h",
+        "S",
+        reads={"y": "S"},
+        writes={"x": "S"},
+        numbers={"factor": "S"},
+    )
 
 
 @pytest.mark.parametrize("threads", [1, 5, 64])
@@ -26,13 +33,21 @@ def test_stages_follow_each_other(passes, cells, threads):
     add, scale = passes
     padding = Padding(COUNTS)
     rows = Rows.strided(
-        padding.size, wp.get_device("cpu"), (padding.plane + padding.row + 1, padding.plane, padding.row), COUNTS, cells=cells
+        padding.size,
+        wp.get_device("cpu"),
+        (padding.plane + padding.row + 1, padding.plane, padding.row),
+        COUNTS,
+        cells=cells,
     )
     host = np.zeros(padding.shape)
     host[1:-1, 1:-1, 1:-1] = np.random.default_rng(3).standard_normal(COUNTS)
     x = wp.array(host.ravel(), dtype=wp.float64, device="cpu")
     y = wp.zeros_like(x)
-    adding, halving, doubling = add.bind(rows, x=x, y=y), scale.bind(rows, x=x, y=y, factor=0.5), scale.bind(rows, x=x, y=y, factor=2.0)
+    adding, halving, doubling = (
+        add.bind(rows, x=x, y=y),
+        scale.bind(rows, x=x, y=y, factor=0.5),
+        scale.bind(rows, x=x, y=y, factor=2.0),
+    )
     sequence = Sequence("test_sequence.all", [adding, halving, adding, adding, doubling])
     assert len(sequence.tables.order) == 5
     assert len(sequence.tables.pieces0) == 1  # what is the same object is kept once
@@ -54,9 +69,16 @@ def test_what_a_sequence_cannot_take(passes, tmp_path):
     rows, x = Rows.flat(8, wp.get_device("cpu")), wp.zeros(8, dtype=wp.float64, device="cpu")
     (tmp_path / "sum.h").write_text("T s = 0; for (int k = 0; k < n; ++k) s += x[k];\n")
     total = RowPass("test_sequence.sum", tmp_path / "sum.h", "S", reads={"x": "S"}, sums=("s",))
-    with pytest.raises(ValueError, match=r"test_sequence\.sum sums, which passes of a sequence cannot"):
-        Sequence("test_sequence.wrong", [total.bind(rows, x=x, out=wp.zeros(1, dtype=wp.float64, device="cpu"))])
+    with pytest.raises(
+        ValueError, match=r"test_sequence\.sum sums, which passes of a sequence cannot"
+    ):
+        Sequence(
+            "test_sequence.wrong",
+            [total.bind(rows, x=x, out=wp.zeros(1, dtype=wp.float64, device="cpu"))],
+        )
     (tmp_path / "set.h").write_text("for (int k = 0; k < n; ++k) x[k] = KIND;\n")
-    many = RowPass("test_sequence.set", tmp_path / "set.h", "S", writes={"x": "S"}, constants={"KIND": 0})
+    many = RowPass(
+        "test_sequence.set", tmp_path / "set.h", "S", writes={"x": "S"}, constants={"KIND": 0}
+    )
     with pytest.raises(ValueError, match="are 6 forms: a sequence takes 5"):
         Sequence("test_sequence.wrong", [many.bind(rows, x=x, KIND=kind) for kind in range(6)])

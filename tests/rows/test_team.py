@@ -53,7 +53,9 @@ def solved(n: int, bounds: str, method: object = None) -> tuple[bytes, int]:
 
 
 @pytest.mark.parametrize("bounds", ["linear", "everywhere"])
-@pytest.mark.parametrize("method", [wl.ProjectedMultigrid(), wl.InteriorPoint(), wl.MPRGP(), wl.MinimumMapNewton()])
+@pytest.mark.parametrize(
+    "method", [wl.ProjectedMultigrid(), wl.InteriorPoint(), wl.MPRGP(), wl.MinimumMapNewton()]
+)
 def test_bits_do_not_depend_on_the_number_of_threads(method, bounds, small_pieces):
     found = []
     for count in COUNTS:
@@ -65,12 +67,31 @@ def test_bits_do_not_depend_on_the_number_of_threads(method, bounds, small_piece
 def passes(folder) -> tuple[RowPass, RowPass, RowPass]:
     """What a wave must get right: x moves in place, t is what is beside x then, in a ring of planes, x what is beside t."""
     (folder / "move.h").write_text("for (int k = 0; k < n; ++k) x[k] += 1 + P.k;\n")
-    (folder / "into.h").write_text("for (int k = 0; k < n; ++k) t[k] = x[k] + x[k + zm] - 2*x[k + zp];\n")
-    (folder / "out.h").write_text("T s = 0;\nfor (int k = 0; k < n; ++k) { x[k] = t[k] + 3*t[k + down] - t[k + up]; s += x[k]; }\n")
+    (folder / "into.h").write_text(
+        "for (int k = 0; k < n; ++k) t[k] = x[k] + x[k + zm] - 2*x[k + zp];\n"
+    )
+    (folder / "out.h").write_text(
+        "T s = 0;\nfor (int k = 0; k < n; ++k) { x[k] = t[k] + 3*t[k + down] - t[k + up]; s += "
+        "x[k]; }\n"
+    )
     f32 = wp.float32
     move = RowPass("test_team.move", folder / "move.h", f32, writes={"x": f32})
-    into = RowPass("test_team.into", folder / "into.h", f32, reads={"x": f32}, writes={"t": f32}, ring=("t",))
-    return move, into, RowPass("test_team.out", folder / "out.h", f32, reads={"t": f32}, writes={"x": f32}, ring=("t",), sums=("s",))
+    into = RowPass(
+        "test_team.into", folder / "into.h", f32, reads={"x": f32}, writes={"t": f32}, ring=("t",)
+    )
+    return (
+        move,
+        into,
+        RowPass(
+            "test_team.out",
+            folder / "out.h",
+            f32,
+            reads={"t": f32},
+            writes={"x": f32},
+            ring=("t",),
+            sums=("s",),
+        ),
+    )
 
 
 @pytest.mark.parametrize("planes", [3, 22, 23, 47, 64])
@@ -88,11 +109,19 @@ def test_slabs_of_a_wave_are_one_stream(planes, tmp_path, small_pieces):
     expected[1:-1, 1:-1, 1:-1] = (t[1:-1] + 3 * t[:-2] - t[2:])[:, 1:-1, 1:-1]
     for count in COUNTS:
         wl.set_threads(count)
-        x, ring = (wp.array(a, dtype=wp.float32, device=CPU) for a in (host.ravel(), 0 * host.ravel()))
+        x, ring = (
+            wp.array(a, dtype=wp.float32, device=CPU) for a in (host.ravel(), 0 * host.ravel())
+        )
         scalars = wp.zeros(1, dtype=wp.float64, device=CPU)
         sums, program = Reduction(rows.size, CPU, scalars, threads=rows.places), Program(CPU)
-        stages = [move.bind(rows, x=x), into.bind(rows, x=x, t=ring), out.bind(rows, t=ring, x=x, out=sums.partials)]
-        Wave("test_team.wave", (move, 0), (into, 1), (out, 2)).launch(*stages, launch=program.launch)
+        stages = [
+            move.bind(rows, x=x),
+            into.bind(rows, x=x, t=ring),
+            out.bind(rows, t=ring, x=x, out=sums.partials),
+        ]
+        Wave("test_team.wave", (move, 0), (into, 1), (out, 2)).launch(
+            *stages, launch=program.launch
+        )
         sums.add_up(0, launch=program.launch)
         program.run()
         np.testing.assert_array_equal(x.numpy().reshape(host.shape)[1:-1], expected[1:-1])
@@ -112,7 +141,10 @@ def test_slabs_fill_their_threads(planes, threads):
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3, 8])
-@pytest.mark.parametrize(("tasks", "cells"), [(1, 1), (9, 30000), (68, 65536), (500, 98), (1850, 98), (10**6, 1), (10**6, 20)])
+@pytest.mark.parametrize(
+    ("tasks", "cells"),
+    [(1, 1), (9, 30000), (68, 65536), (500, 98), (1850, 98), (10**6, 1), (10**6, 20)],
+)
 def test_pieces_of_a_pass_are_as_many_for_each_thread(tasks, cells, threads):
     """Pieces cover all tasks, none is small, and the thread with the most has hardly more than its share."""
     wl.set_threads(threads)
@@ -166,7 +198,9 @@ def test_many_python_threads_for_ten_minutes():
 def run_python(code: str, **variables: str) -> subprocess.CompletedProcess:
     environment = {**os.environ, "WARP_LCP_THREADS": "2", **variables}
     command = [sys.executable, "-c", textwrap.dedent(code)]
-    return subprocess.run(command, check=False, capture_output=True, text=True, env=environment, timeout=300)
+    return subprocess.run(
+        command, check=False, capture_output=True, text=True, env=environment, timeout=300
+    )
 
 
 SOLVE = """
@@ -230,11 +264,16 @@ except KeyboardInterrupt:
 
 @pytest.mark.parametrize("count", [0, -1, 1025, 1.5, "many"])
 def test_wrong_numbers_of_threads(count):
-    with pytest.raises(ValueError, match=rf"count: {count!r}: expected a number of threads from 1 to 1024"):
+    with pytest.raises(
+        ValueError, match=rf"count: {count!r}: expected a number of threads from 1 to 1024"
+    ):
         wl.set_threads(count)
     if not isinstance(count, float):
         done = run_python("import warp_lcp as wl; wl.get_threads()", WARP_LCP_THREADS=str(count))
-        assert f"WARP_LCP_THREADS: '{count}': expected a number of threads from 1 to 1024" in done.stderr
+        assert (
+            f"WARP_LCP_THREADS: '{count}': expected a number of threads from 1 to 1024"
+            in done.stderr
+        )
 
 
 def test_ranks_share_the_cores(monkeypatch):
@@ -251,7 +290,9 @@ def test_another_warp_means_one_thread_and_a_notice(monkeypatch):
     monkeypatch.setattr(team.STATE, "team", None)
     monkeypatch.setattr(team, "_entry", team._entry.__wrapped__)
     monkeypatch.setattr(team, "arguments_of", lambda launch: launch.parameters)
-    with pytest.warns(UserWarning, match=r"one CPU thread: Warp \S+ records launches in an unknown format"):
+    with pytest.warns(
+        UserWarning, match=r"one CPU thread: Warp \S+ records launches in an unknown format"
+    ):
         assert solved(16, "everywhere") == expected
 
 
@@ -269,10 +310,23 @@ def test_a_table_keeps_no_arrays_once_it_is_gone():
 def test_threads_race_for_nothing(control, tmp_path):
     """ThreadSanitizer finds no race in the team, and finds the one that slabs without gaps between them would be."""
     source, program = Path(__file__).parent / "native" / "team.cpp", tmp_path / "team"
-    text = source.read_text().replace("stage(next, &none, 1)", f"stage(next, &none, {0 if control else 1})")
+    text = source.read_text().replace(
+        "stage(next, &none, 1)", f"stage(next, &none, {0 if control else 1})"
+    )
     (tmp_path / "team.cpp").write_text(text)
-    command = ["g++", "-std=c++17", "-O1", "-g", "-fsanitize=thread", "-pthread", f"-I{HEADERS}", str(tmp_path / "team.cpp")]
-    built = subprocess.run([*command, "-o", str(program)], check=False, capture_output=True, text=True)
+    command = [
+        "g++",
+        "-std=c++17",
+        "-O1",
+        "-g",
+        "-fsanitize=thread",
+        "-pthread",
+        f"-I{HEADERS}",
+        str(tmp_path / "team.cpp"),
+    ]
+    built = subprocess.run(
+        [*command, "-o", str(program)], check=False, capture_output=True, text=True
+    )
     if "tsan" in built.stderr:
         pytest.skip("this compiler has no ThreadSanitizer")
     assert built.returncode == 0, built.stderr
@@ -304,9 +358,21 @@ class Small:
 
 @wp.kernel(enable_backward=False, module="tests.rows.packing")
 def packing_kernel(
-    flag: wp.bool, a: wp.array(dtype=wp.float32), n: int, small: Small, b: wp.array3d(dtype=wp.uint8), x: wp.float64, place: wp.vec3i,
-    y: float, many: wp.int64, m: Mixed, point: wp.vec2d, turn: wp.mat22, c: wp.array2d(dtype=wp.vec2i), last: bool,
-):  # fmt: skip
+    flag: wp.bool,
+    a: wp.array(dtype=wp.float32),
+    n: int,
+    small: Small,
+    b: wp.array3d(dtype=wp.uint8),
+    x: wp.float64,
+    place: wp.vec3i,
+    y: float,
+    many: wp.int64,
+    m: Mixed,
+    point: wp.vec2d,
+    turn: wp.mat22,
+    c: wp.array2d(dtype=wp.vec2i),
+    last: bool,
+):
     """a[n] = y, of arguments of all kinds."""
     a[n] = y
 
@@ -314,8 +380,16 @@ def packing_kernel(
 def drawn_arguments(rng):
     """Return arguments of `packing_kernel`: arrays, some of them strided or empty, vectors, a struct, numbers."""
     m, small, sizes = Mixed(), Small(), rng.integers(0, 6, 7)
-    small.count, small.weight, small.place = int(rng.integers(9)), rng.standard_normal(), wp.vec3i(*map(int, rng.integers(-9, 9, 3)))
-    m.flag, m.weight, m.place = bool(rng.integers(2)), rng.standard_normal(), wp.vec3i(*map(int, rng.integers(-9, 9, 3)))
+    small.count, small.weight, small.place = (
+        int(rng.integers(9)),
+        rng.standard_normal(),
+        wp.vec3i(*map(int, rng.integers(-9, 9, 3))),
+    )
+    m.flag, m.weight, m.place = (
+        bool(rng.integers(2)),
+        rng.standard_normal(),
+        wp.vec3i(*map(int, rng.integers(-9, 9, 3))),
+    )
     m.values = wp.zeros(int(sizes[0]), dtype=wp.float64, device=CPU)
     a = wp.zeros(2 * int(sizes[1]) + 8, dtype=wp.float32, device=CPU)[:: int(rng.integers(1, 3))]
     b = wp.zeros(tuple(map(int, sizes[2:5])), dtype=wp.uint8, device=CPU)
@@ -324,7 +398,22 @@ def drawn_arguments(rng):
     y = rng.choice([0.1, -0.0, math.inf, 1e-46, 1e39, 3.0000001])
     number = int(rng.integers(-(1 << 62), 1 << 62))
     flag, last = bool(rng.integers(2)), bool(rng.integers(2))
-    return [flag, a, int(rng.integers(-9, 4)), small, b, rng.standard_normal(), m.place, float(y), number, m, point, turn, c, last]
+    return [
+        flag,
+        a,
+        int(rng.integers(-9, 4)),
+        small,
+        b,
+        rng.standard_normal(),
+        m.place,
+        float(y),
+        number,
+        m,
+        point,
+        turn,
+        c,
+        last,
+    ]
 
 
 def test_arguments_are_packed_as_warp_packs_them():
@@ -334,6 +423,17 @@ def test_arguments_are_packed_as_warp_packs_them():
         inputs = drawn_arguments(np.random.default_rng(seed))
         recorded = wp.launch(packing_kernel, 1, inputs, device=CPU, record_cmd=True)
         assert signature.pack(inputs) == bytes(team.arguments_of(recorded))
-    others = {1: inputs[4], 2: 1 << 31, 3: Mixed(), 4: inputs[1], 6: (1, 2, 3), 9: wp.vec3i(), 10: wp.vec2f(), 12: None}
+    others = {
+        1: inputs[4],
+        2: 1 << 31,
+        3: Mixed(),
+        4: inputs[1],
+        6: (1, 2, 3),
+        9: wp.vec3i(),
+        10: wp.vec2f(),
+        12: None,
+    }
     for place, other in others.items():
-        assert signature.pack([*inputs[:place], other, *inputs[place + 1 :]]) is None, f"argument {place}"
+        assert signature.pack([*inputs[:place], other, *inputs[place + 1 :]]) is None, (
+            f"argument {place}"
+        )

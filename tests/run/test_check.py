@@ -26,7 +26,9 @@ def call(*arguments: object) -> Result:
 
 
 @pytest.mark.usefixtures("only_new_objects")
-@pytest.mark.parametrize(("name", "every"), [("dam-break-2d", 0), ("dam-break", 1), ("mesh-obstacle", 1)])
+@pytest.mark.parametrize(
+    ("name", "every"), [("dam-break-2d", 0), ("dam-break", 1), ("mesh-obstacle", 1)]
+)
 def test_the_parts_add_up_to_what_a_simulation_takes(name: str, every: int) -> None:
     """Without the table the density correction takes its part when it first acts."""
     scene = load_scene(name, [f"density_correction.every={every}"])
@@ -41,22 +43,36 @@ def test_the_parts_add_up_to_what_a_simulation_takes(name: str, every: int) -> N
 def test_the_plan_has_a_line_for_each_part() -> None:
     _, lines = check_scene("mesh-obstacle")
     parts = {word.strip() for word, _ in lines if word.startswith("  ")}
-    assert parts == {"grid", "pressure", "surface", "solids", "particles", "density correction", "bodies in flight"}
+    assert parts == {
+        "grid",
+        "pressure",
+        "surface",
+        "solids",
+        "particles",
+        "density correction",
+        "bodies in flight",
+    }
     without, _ = check_scene("mesh-obstacle", ["density_correction.every=0"])
     assert parts - set(without.memory_parts()) == {"density correction"}
-    with_more, _ = check_scene("dam-break-2d", ["density_correction.every=2", "particles.reseed.every=2"])
+    with_more, _ = check_scene(
+        "dam-break-2d", ["density_correction.every=2", "particles.reseed.every=2"]
+    )
     assert set(with_more.memory_parts()) == parts - {"solids"} | {"reseeding"}
 
 
 def test_sources_count_later() -> None:
     scene, lines = check_scene("tap-and-drain")
     simulation = FluidsSimulator().create(scene, device="cpu", folder=Path.cwd())
-    assert dict(lines)["particles"].startswith(f"{simulation.particles.count} at the start, at most 3,912, ")
+    assert dict(lines)["particles"].startswith(
+        f"{simulation.particles.count} at the start, at most 3,912, "
+    )
     later, _ = check_scene("tap-and-drain", ["source.0.start=0.5"])
     assert dict(later.plan())["particles"].startswith("0 at the start, ")
 
 
-def test_what_does_not_fit_is_refused_unless_forced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_does_not_fit_is_refused_unless_forced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     scene = load_scene("dam-break-2d")
     needed = scene.memory_estimate()
     monkeypatch.setattr(check, "free_memory", lambda device: needed)
@@ -78,17 +94,22 @@ def test_what_does_not_fit_is_refused_unless_forced(tmp_path: Path, monkeypatch:
     assert out.is_dir()
 
 
-def test_a_scene_of_unknown_memory_is_not_refused(dots: Any, scene_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scene_of_unknown_memory_is_not_refused(
+    dots: Any, scene_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(check, "free_memory", lambda device: 0)
     scene = load_scene(scene_file)
     check_memory(scene, "cpu")
     assert scene.memory_estimate() == 0
 
 
-def test_a_system_that_does_not_tell_its_free_memory_refuses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_system_that_does_not_tell_its_free_memory_refuses_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     found = devices.free_memory("cpu")
     assert found is None or found > 2**20
-    for source in ("MEMORY", "OWN_SIZE"):  # of the machine, and of a limit that this process may have
+    # of the machine, and of a limit that this process may have
+    for source in ("MEMORY", "OWN_SIZE"):
         monkeypatch.setattr(claims, source, tmp_path / "nothing")
     assert devices.free_memory("cpu") is None
     check_memory(load_scene("dam-break", ["domain.resolution=4096"]), "cpu")
@@ -106,7 +127,9 @@ def test_long_steps_are_few(dots: Any, scene_file: Path, monkeypatch: pytest.Mon
     assert step_seconds(load_scene(scene_file), device="cpu")[1] == 3
 
 
-def test_check_calibrates_on_request_and_says_when_a_step_fails(dots: Any, scene_file: Path) -> None:
+def test_check_calibrates_on_request_and_says_when_a_step_fails(
+    dots: Any, scene_file: Path
+) -> None:
     assert "seconds a step" not in call("check", scene_file, "--device", "cpu").stdout
     shown = call("check", scene_file, "--device", "cpu", "--calibrate")
     assert shown.exit_code == 0

@@ -29,7 +29,9 @@ def call(*arguments: object) -> Result:
     return CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
 
 
-def written(path: Path, shapes: list[dict[str, Any]], *, simulator: str = "fluids", **tables: Any) -> Path:
+def written(
+    path: Path, shapes: list[dict[str, Any]], *, simulator: str = "fluids", **tables: Any
+) -> Path:
     data = {
         "scene": {"simulator": simulator},
         "time": {"duration": 0.5},
@@ -46,14 +48,37 @@ def written(path: Path, shapes: list[dict[str, Any]], *, simulator: str = "fluid
     [
         ({"solid": [FILLS]}, "the solids fill the whole domain"),
         ({"solid": [FILLS], "domain": {"solids": "voxel"}}, "the solids fill the whole domain"),
-        ({"solid": [{"shape": "plane", "point": [0.0, 0.5], "normal": [0.0, 1.0]}]}, r"liquid\[0\] \(box\) holds no particle"),
-        ({"source": [{"shape": "sphere", "center": [0.5, 0.5], "radius": 0.01, "velocity": [0.0, -1.0]}]}, "holds no open cell's center"),
-        ({"solid": [{"shape": "sphere", "center": [3.0, 0.5], "radius": 0.1}]}, "lies wholly outside the domain"),
+        (
+            {"solid": [{"shape": "plane", "point": [0.0, 0.5], "normal": [0.0, 1.0]}]},
+            r"liquid\[0\] \(box\) holds no particle",
+        ),
+        (
+            {
+                "source": [
+                    {
+                        "shape": "sphere",
+                        "center": [0.5, 0.5],
+                        "radius": 0.01,
+                        "velocity": [0.0, -1.0],
+                    }
+                ]
+            },
+            "holds no open cell's center",
+        ),
+        (
+            {"solid": [{"shape": "sphere", "center": [3.0, 0.5], "radius": 0.1}]},
+            "lies wholly outside the domain",
+        ),
     ],
 )
-def test_what_a_run_refuses_at_its_start_check_refuses_with_the_same_words(tables: dict[str, Any], message: str, tmp_path: Path) -> None:
+def test_what_a_run_refuses_at_its_start_check_refuses_with_the_same_words(
+    tables: dict[str, Any], message: str, tmp_path: Path
+) -> None:
     scene, out = written(tmp_path / "scene.toml", [LIQUID], **tables), tmp_path / "out"
-    checked, ran = call("check", scene, "--device", "cpu"), call("run", scene, "--device", "cpu", "--out", out)
+    checked, ran = (
+        call("check", scene, "--device", "cpu"),
+        call("run", scene, "--device", "cpu", "--out", out),
+    )
     assert checked.exit_code == ran.exit_code == cli.WRONG_INPUT
     with pytest.raises(SceneError, match=message):
         start(load_scene(scene), "cpu")
@@ -73,8 +98,19 @@ def test_both_name_the_shape_whose_mesh_is_open(tmp_path: Path) -> None:
 def test_check_says_what_a_run_says(tmp_path: Path) -> None:
     mesh = tmp_path / "mesh.obj"
     corners = [[x, y, z] for z in (-0.2, 0.2) for y in (0.4, 0.8) for x in (0.4, 0.8)]
-    faces = [[1, 3, 4, 2], [5, 6, 8, 7], [1, 2, 6, 5], [3, 7, 8, 4], [1, 5, 7, 3], [2, 4, 8, 6], [2, 4, 8, 6]]
-    lines = [*("v " + " ".join(map(str, corner)) for corner in corners), *("f " + " ".join(map(str, face)) for face in faces)]
+    faces = [
+        [1, 3, 4, 2],
+        [5, 6, 8, 7],
+        [1, 2, 6, 5],
+        [3, 7, 8, 4],
+        [1, 5, 7, 3],
+        [2, 4, 8, 6],
+        [2, 4, 8, 6],
+    ]
+    lines = [
+        *("v " + " ".join(map(str, corner)) for corner in corners),
+        *("f " + " ".join(map(str, face)) for face in faces),
+    ]
     mesh.write_text("\n".join(lines))
     scene = written(tmp_path / "scene.toml", [LIQUID], solid=[{"shape": "mesh", "file": str(mesh)}])
     shown = call("check", scene, "--device", "cpu")
@@ -106,19 +142,33 @@ def generated(chance: random.Random) -> dict[str, Any]:
 
     def shape() -> dict[str, Any]:
         low = [chance.uniform(0.0, 0.7), chance.uniform(0.0, 0.7)]
-        box = {"shape": "box", "min": low, "max": [low[0] + chance.uniform(0.1, 0.4), low[1] + chance.uniform(0.1, 0.4)]}
+        box = {
+            "shape": "box",
+            "min": low,
+            "max": [low[0] + chance.uniform(0.1, 0.4), low[1] + chance.uniform(0.1, 0.4)],
+        }
         center = [chance.uniform(0.2, 0.8), chance.uniform(0.2, 0.8)]
-        return chance.choice([box, box, {"shape": "sphere", "center": center, "radius": chance.uniform(0.08, 0.2)}])
+        return chance.choice(
+            [box, box, {"shape": "sphere", "center": center, "radius": chance.uniform(0.08, 0.2)}]
+        )
 
-    sources = [{**shape(), "velocity": chance.choice([[0.0, -2.0], [1.0, -1.0], [-3.0, 0.0]])} for _ in range(chance.choice([0, 1, 2]))]
-    particles = {"per_axis": chance.choice([1, 2, 3]), "jitter": chance.choice([0.0, 0.25, 0.5, 1.0])}
+    sources = [
+        {**shape(), "velocity": chance.choice([[0.0, -2.0], [1.0, -1.0], [-3.0, 0.0]])}
+        for _ in range(chance.choice([0, 1, 2]))
+    ]
+    particles = {
+        "per_axis": chance.choice([1, 2, 3]),
+        "jitter": chance.choice([0.0, 0.25, 0.5, 1.0]),
+    }
     return {"material": [shape()], "source": sources, "particles": particles}
 
 
 @pytest.mark.parametrize("seed", range(4420, 4430))
 def test_no_more_particles_than_foretold(seed: int, tmp_path: Path) -> None:
     tables = generated(random.Random(seed))
-    assert_foretold(load_scene(written(tmp_path / "scene.toml", tables.pop("material"), **tables)), 3)
+    assert_foretold(
+        load_scene(written(tmp_path / "scene.toml", tables.pop("material"), **tables)), 3
+    )
 
 
 @pytest.mark.slow
@@ -144,32 +194,60 @@ def test_too_many_shapes_are_refused_before_they_are_read(tmp_path: Path) -> Non
 
 def test_rotate_turns_about_the_origin_or_the_point_that_is_named(tmp_path: Path) -> None:
     center = [0.65, 0.6]
-    turned = load_scene(written(tmp_path / "a.toml", [LIQUID], solid=[{**BEAM, "rotate": 90.0, "about": center}])).solid[0]
+    turned = load_scene(
+        written(tmp_path / "a.toml", [LIQUID], solid=[{**BEAM, "rotate": 90.0, "about": center}])
+    ).solid[0]
     box = turned.bounds(2)
     assert box is not None
     np.testing.assert_allclose(box[:, :2], [[0.6, 0.35], [0.7, 0.85]], atol=1e-12)
-    larger = load_scene(written(tmp_path / "b.toml", [LIQUID], solid=[{**BEAM, "scale": 1.1, "about": center}])).solid[0].bounds(2)
+    larger = (
+        load_scene(
+            written(tmp_path / "b.toml", [LIQUID], solid=[{**BEAM, "scale": 1.1, "about": center}])
+        )
+        .solid[0]
+        .bounds(2)
+    )
     assert larger is not None
     np.testing.assert_allclose(larger[:, :2].mean(axis=0), center, atol=1e-12)
-    with pytest.raises(SceneError, match=r"solid\[0\]\.about = \[0\.65, 0\.6\]: has no effect without rotate or scale"):
+    with pytest.raises(
+        SceneError,
+        match=r"solid\[0\]\.about = \[0\.65, 0\.6\]: has no effect without rotate or scale",
+    ):
         load_scene(written(tmp_path / "c.toml", [LIQUID], solid=[{**BEAM, "about": center}]))
 
 
 def test_a_shape_that_its_rotation_takes_out_of_the_domain_is_told(tmp_path: Path) -> None:
     scene = load_scene(written(tmp_path / "scene.toml", [LIQUID], solid=[{**BEAM, "rotate": 45.0}]))
     (note,) = scene.notes()
-    assert note == "solid[0] (box): rotate about the origin moves it 0.1768 m out of the domain; to rotate it about its center, set " + (
-        "about = [0.65, 0.6]"
+    assert (
+        note
+        == "solid[0] (box): rotate about the origin moves it 0.1768 m out of the domain; to rotate "
+        "it about its center, set " + ("about = [0.65, 0.6]")
     )
     assert note in start(scene, "cpu").notes()
-    assert not load_scene(written(tmp_path / "b.toml", [LIQUID], solid=[{**BEAM, "rotate": 45.0, "about": [0.65, 0.6]}])).notes()
+    assert not load_scene(
+        written(
+            tmp_path / "b.toml", [LIQUID], solid=[{**BEAM, "rotate": 45.0, "about": [0.65, 0.6]}]
+        )
+    ).notes()
 
 
-@pytest.mark.parametrize(("phase", "told"), [(1.5708, "90"), (-3.1416, "-180"), (90.0, None), (-90.0, None), (0.0, None), (1.5, None)])
+@pytest.mark.parametrize(
+    ("phase", "told"),
+    [(1.5708, "90"), (-3.1416, "-180"), (90.0, None), (-90.0, None), (0.0, None), (1.5, None)],
+)
 def test_a_phase_in_radians_is_told(phase: float, told: str | None, tmp_path: Path) -> None:
     motion = {"kind": "sinusoid", "period": 1.0, "amplitude": [0.1, 0.0], "phase": phase}
-    notes = load_scene(written(tmp_path / "scene.toml", [LIQUID], solid=[{**BEAM, "motion": motion}])).notes()
-    assert notes == ([] if told is None else [f"solid[0].motion.phase = {phase:g} is in degrees; if radians were meant, it is {told}"])
+    notes = load_scene(
+        written(tmp_path / "scene.toml", [LIQUID], solid=[{**BEAM, "motion": motion}])
+    ).notes()
+    assert notes == (
+        []
+        if told is None
+        else [
+            f"solid[0].motion.phase = {phase:g} is in degrees; if radians were meant, it is {told}"
+        ]
+    )
 
 
 # --- sand ---
@@ -187,26 +265,50 @@ def test_a_phase_in_radians_is_told(phase: float, told: str | None, tmp_path: Pa
         ),
     ],
 )
-def test_a_friction_angle_is_refused_under_its_own_key(sand: dict[str, Any], material: dict[str, Any], key: str, tmp_path: Path) -> None:
+def test_a_friction_angle_is_refused_under_its_own_key(
+    sand: dict[str, Any], material: dict[str, Any], key: str, tmp_path: Path
+) -> None:
     domain = {"size": [1.0, 1.0, 1.0]} if "friction_angle_test" in material else {}
     box = {**LIQUID, "min": [0.0] * 3, "max": [1.0, 0.3, 1.0]} if domain else LIQUID
     with pytest.raises(SceneError, match=key):
-        load_scene(written(tmp_path / "scene.toml", [{**box, **sand}], simulator="granular", domain=domain, material=material))
+        load_scene(
+            written(
+                tmp_path / "scene.toml",
+                [{**box, **sand}],
+                simulator="granular",
+                domain=domain,
+                material=material,
+            )
+        )
 
 
 @pytest.mark.parametrize(
     ("extra", "reason"),
     [
-        ({"solid": [{**BEAM, "rotate": 10.0, "density": 3000.0, "about": [0.65, 0.6]}]}, "because some solids move"),
-        ({"solid": [{**BEAM, "rotate": 10.0, "about": [0.65, 0.6]}], "domain": {"periodic": [True, False]}}, "because an axis is periodic"),
         (
-            {"solid": [{**BEAM, "rotate": 10.0, "about": [0.65, 0.6]}], "solver": {"method": "interleaved-sweeps"}},
+            {"solid": [{**BEAM, "rotate": 10.0, "density": 3000.0, "about": [0.65, 0.6]}]},
+            "because some solids move",
+        ),
+        (
+            {
+                "solid": [{**BEAM, "rotate": 10.0, "about": [0.65, 0.6]}],
+                "domain": {"periodic": [True, False]},
+            },
+            "because an axis is periodic",
+        ),
+        (
+            {
+                "solid": [{**BEAM, "rotate": 10.0, "about": [0.65, 0.6]}],
+                "solver": {"method": "interleaved-sweeps"},
+            },
             'is "interleaved-sweeps"',
         ),
         ({"solid": [{**BEAM, "rotate": 10.0, "about": [0.65, 0.6]}]}, None),
     ],
 )
-def test_sand_says_where_solids_stay_whole_cells(extra: dict[str, Any], reason: str | None, tmp_path: Path) -> None:
+def test_sand_says_where_solids_stay_whole_cells(
+    extra: dict[str, Any], reason: str | None, tmp_path: Path
+) -> None:
     scene = written(tmp_path / "scene.toml", [LIQUID], simulator="granular", **extra)
     notes = [note for note in start(load_scene(scene), "cpu").notes() if "whole cells" in note]
     assert [reason in note for note in notes] == ([] if reason is None else [True])
@@ -215,5 +317,9 @@ def test_sand_says_where_solids_stay_whole_cells(extra: dict[str, Any], reason: 
 def test_thin_meshes_are_said_to_let_their_own_material_pass(tmp_path: Path) -> None:
     solid = {"shape": "mesh", "file": "builtin:torus", "scale": 0.2, "translate": [0.5, 0.6]}
     for simulator, word in (("fluids", "liquid"), ("granular", "sand")):
-        scene = written(tmp_path / f"{simulator}.toml", [LIQUID], simulator=simulator, solid=[solid])
-        assert any(f": {word} may pass there" in note for note in start(load_scene(scene), "cpu").notes())
+        scene = written(
+            tmp_path / f"{simulator}.toml", [LIQUID], simulator=simulator, solid=[solid]
+        )
+        assert any(
+            f": {word} may pass there" in note for note in start(load_scene(scene), "cpu").notes()
+        )

@@ -10,7 +10,12 @@ import pytest
 from warp_lcp.files.atomic import replacing, write_text
 from warp_lcp.run.checkpoint import Checkpoint, CheckpointError, CheckpointFolder
 
-STATE = {"position": np.random.default_rng(977).random((30, 3)), "count": np.array(7), "name": np.array("apic"), "none": np.empty((0, 3))}
+STATE = {
+    "position": np.random.default_rng(977).random((30, 3)),
+    "count": np.array(7),
+    "name": np.array("apic"),
+    "none": np.empty((0, 3)),
+}
 
 
 @pytest.fixture
@@ -48,7 +53,10 @@ def test_what_is_set_aside_is_neither_read_nor_counted(folder):
     for step in (14, 16):
         folder.write(Checkpoint(step, 0.0, STATE))
     (folder.path(14)).write_text("broken")
-    assert [path.name for path in folder.set_aside(12)] == ["refused_000016.npz", "refused_000014.npz"]
+    assert [path.name for path in folder.set_aside(12)] == [
+        "refused_000016.npz",
+        "refused_000014.npz",
+    ]
     assert folder.steps() == [12]
     assert (folder.folder / "refused_000014.npz").read_text() == "broken"
     folder.prune(1)
@@ -141,7 +149,8 @@ def test_a_flipped_bit_costs_at_most_one_checkpoint(folder):
     good = path.read_bytes()
     found = {20: 0, 12: 0}
     begin = good.index(b"PK\x01\x02")
-    first = [(begin + number // 8, number % 8) for number in range(8 * 16)]  # all of the version, the flags and the packing
+    # all of the version, the flags and the packing
+    first = [(begin + number // 8, number % 8) for number in range(8 * 16)]
     for at, bit in [*first, *((at, at % 8) for at in range(begin, len(good), 11))]:
         path.write_bytes(good[:at] + bytes([good[at] ^ 1 << bit]) + good[at + 1 :])
         newest, refused = folder.newest()
@@ -154,7 +163,16 @@ def test_a_flipped_bit_costs_at_most_one_checkpoint(folder):
 
 
 @pytest.mark.parametrize(
-    "said", [{"time": float("nan")}, {"time": -1.0}, {"time": None}, {"step": "12"}, {"keys": [1]}, {"checksum": 3}, {"format": None}]
+    "said",
+    [
+        {"time": float("nan")},
+        {"time": -1.0},
+        {"time": None},
+        {"step": "12"},
+        {"keys": [1]},
+        {"checksum": 3},
+        {"format": None},
+    ],
 )
 def test_what_a_checkpoint_says_must_be_of_the_right_type(folder, said):
     arrays = dict(np.load(folder.path(12)))

@@ -16,7 +16,10 @@ SCENE = "of a test"
 
 
 def state(rank, step):
-    return {"position": np.full((3 + rank, 2), step, dtype=np.float32), "box": np.array([rank, rank + 1])}
+    return {
+        "position": np.full((3 + rank, 2), step, dtype=np.float32),
+        "box": np.array([rank, rank + 1]),
+    }
 
 
 def write(folder, step, ranks=3, whose=SCENE):
@@ -26,7 +29,9 @@ def write(folder, step, ranks=3, whose=SCENE):
     folder.mkdir(parents=True, exist_ok=True)
     for place, checkpoint in zip(pieces, checkpoints, strict=True):
         place.write(checkpoint)
-    whole = Checkpoint(step, 0.1 * step, {PIECES: np.array([checkpoint.checksum for checkpoint in checkpoints])})
+    whole = Checkpoint(
+        step, 0.1 * step, {PIECES: np.array([checkpoint.checksum for checkpoint in checkpoints])}
+    )
     CheckpointFolder(folder, whose).write(whole)
 
 
@@ -36,10 +41,18 @@ def names(folder):
 
 def test_a_rank_writes_its_piece_and_then_the_whole(tmp_path):
     folder = CheckpointFolder(tmp_path / "c", SCENE, {"time.cfl": 2.0}, Collective.of_one())
-    assert folder.write(Checkpoint(4, 0.5, state(0, 4))) == tmp_path / "c" / "rank_0000" / "step_000004.npz"
+    assert (
+        folder.write(Checkpoint(4, 0.5, state(0, 4)))
+        == tmp_path / "c" / "rank_0000" / "step_000004.npz"
+    )
     found, refused = CheckpointFolder(tmp_path / "c", SCENE).newest()
     assert found is not None and not refused
-    assert (found.step, found.time, found.keys, len(found.state[PIECES])) == (4, 0.5, {"time.cfl": 2.0}, 1)
+    assert (found.step, found.time, found.keys, len(found.state[PIECES])) == (
+        4,
+        0.5,
+        {"time.cfl": 2.0},
+        1,
+    )
     piece = folder.pieces(found)[0]
     assert set(piece) == {"position", "box"} and len(piece) == 2
     np.testing.assert_array_equal(piece["position"], state(0, 4)["position"])
@@ -54,11 +67,16 @@ def test_a_rank_writes_its_piece_and_then_the_whole(tmp_path):
 def test_pieces_without_the_whole_do_not_count(tmp_path):
     write(tmp_path, 3)
     for rank in range(2):  # of a run that was killed then
-        CheckpointFolder(tmp_path / f"rank_000{rank}", SCENE).write(Checkpoint(5, 0.5, state(rank, 5)))
+        CheckpointFolder(tmp_path / f"rank_000{rank}", SCENE).write(
+            Checkpoint(5, 0.5, state(rank, 5))
+        )
     found, refused = CheckpointFolder(tmp_path, SCENE).newest()
     assert found is not None and found.step == 3 and not refused
     CheckpointFolder(tmp_path, SCENE).prune(2)
-    assert names(tmp_path) == [*(f"rank_000{rank}/step_000003.npz" for rank in range(3)), "step_000003.npz"]
+    assert names(tmp_path) == [
+        *(f"rank_000{rank}/step_000003.npz" for rank in range(3)),
+        "step_000003.npz",
+    ]
 
 
 @pytest.mark.parametrize("harm", ["missing", "cut", "of another checkpoint", "of another scene"])
@@ -94,7 +112,11 @@ def test_old_pieces_go_with_their_checkpoint(tmp_path):
     write(tmp_path, 6, ranks=2)
     many = CheckpointFolder(tmp_path, SCENE, {}, Collective.of_one())
     many.prune(1)
-    assert names(tmp_path) == ["rank_0000/step_000006.npz", "rank_0001/step_000006.npz", "step_000006.npz"]
+    assert names(tmp_path) == [
+        "rank_0000/step_000006.npz",
+        "rank_0001/step_000006.npz",
+        "step_000006.npz",
+    ]
 
 
 def test_a_simulator_that_cannot_join_pieces_says_so(dots, scene_file, tmp_path):
@@ -104,5 +126,8 @@ def test_a_simulator_that_cannot_join_pieces_says_so(dots, scene_file, tmp_path)
     for file in (out / "checkpoints").iterdir():
         file.unlink()
     write(out / "checkpoints", 4, whose=fingerprint(scene))
-    with pytest.raises(SceneError, match="the checkpoint was written on several ranks: continue with --engine petsc"):
+    with pytest.raises(
+        SceneError,
+        match="the checkpoint was written on several ranks: continue with --engine petsc",
+    ):
         run_into(scene, out, observer=watcher, resume=True)

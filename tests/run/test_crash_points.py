@@ -22,11 +22,13 @@ from warp_lcp.scene.scene_file import load_scene
 
 pytestmark = [
     pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork"),
-    pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning"),  # the child runs NumPy and its own threads
+    # the child runs NumPy and its own threads
+    pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning"),
 ]
 
 SHORT = ["time.duration=0.1", "output.checkpoint_every=2", "output.checkpoints_kept=2"]
-OPERATIONS = {"open", "os.rename", "os.remove", "os.mkdir", "os.truncate"}  # audit events: raised before the system is asked
+# audit events: raised before the system is asked
+OPERATIONS = {"open", "os.rename", "os.remove", "os.mkdir", "os.truncate"}
 
 
 def go(scene: Path, out: Path, *overrides: str, resume: bool = False, force: bool = False) -> Any:
@@ -36,9 +38,14 @@ def go(scene: Path, out: Path, *overrides: str, resume: bool = False, force: boo
 
 def contents(out: Path) -> dict[str, Any]:
     """Return what equal runs have in common: frames, collections, the log but for its seconds, checkpoints, the scene."""
-    found: dict[str, Any] = {str(p.relative_to(out)): p.read_bytes() for p in [*out.glob("frames/*"), *out.glob("*.pvd")]}
+    found: dict[str, Any] = {
+        str(p.relative_to(out)): p.read_bytes() for p in [*out.glob("frames/*"), *out.glob("*.pvd")]
+    }
     with open(out / "log.csv", newline="") as file:
-        found["log"] = [{key: value for key, value in row.items() if key != "seconds"} for row in csv.DictReader(file)]
+        found["log"] = [
+            {key: value for key, value in row.items() if key != "seconds"}
+            for row in csv.DictReader(file)
+        ]
     for path in out.glob("checkpoints/step_*.npz"):
         found[path.name] = {name: array.tobytes() for name, array in np.load(path).items()}
     found["scene"] = (out / "scene.toml").read_text()
@@ -54,7 +61,8 @@ def killed(run: Callable[[], Any], folder: Path, operation: int) -> bool:
 
         def hook(event: str, arguments: tuple) -> None:
             name = str(arguments[0]) if event in OPERATIONS else ""
-            if name and (name.startswith(str(folder)) or name.endswith(SUFFIX)):  # a temporary file's, relative to its folder
+            # a temporary file's, relative to its folder
+            if name and (name.startswith(str(folder)) or name.endswith(SUFFIX)):
                 left[0] -= 1
                 if left[0] == 0:
                     os.kill(os.getpid(), signal.SIGKILL)
@@ -78,7 +86,9 @@ def revive(scene: Path, out: Path) -> int:
         assert resumed.resumed_from_step is None
     assert resumed.status == "finished"
     assert not [warning for warning in resumed.warnings if "missing" in warning]
-    assert json.loads((out / "run.json").read_text())["resumed_from_step"] == resumed.resumed_from_step
+    assert (
+        json.loads((out / "run.json").read_text())["resumed_from_step"] == resumed.resumed_from_step
+    )
     return resumed.resumed_from_step or 0
 
 

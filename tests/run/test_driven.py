@@ -25,16 +25,25 @@ POOL = {
     "domain": {"size": (1.0, 0.5), "resolution": 24},
     "liquid": [{"shape": "box", "min": np.array([0.0, 0.0]), "max": [1.0, 0.2]}],
 }
-FINE = {**POOL, "time": {"duration": 0.2, "frames_per_second": 50, "dt_max": 0.012}}  # two steps a frame
-CRATE = {**POOL, "solid": [{"shape": "box", "min": [0.4, 0.25], "max": [0.6, 0.4], "density": 400.0}]}
+# two steps a frame
+FINE = {**POOL, "time": {"duration": 0.2, "frames_per_second": 50, "dt_max": 0.012}}
+CRATE = {
+    **POOL,
+    "solid": [{"shape": "box", "min": [0.4, 0.25], "max": [0.6, 0.4], "density": 400.0}],
+}
 SHORT = {"duration": 0.1, "resolution": 32}
 
 
 def contents(folder: Path) -> dict:
     """Return what equal runs have in common: frames, collections, the log but for its times, and what checkpoints hold."""
-    found = {str(p.relative_to(folder)): p.read_bytes() for p in [*folder.glob("frames/*"), *folder.glob("*.pvd"), folder / "scene.toml"]}
+    found = {
+        str(p.relative_to(folder)): p.read_bytes()
+        for p in [*folder.glob("frames/*"), *folder.glob("*.pvd"), folder / "scene.toml"]
+    }
     with open(folder / "log.csv", newline="") as file:
-        found["log"] = [{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(file)]
+        found["log"] = [
+            {k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(file)
+        ]
     for file in folder.glob("checkpoints/*.npz"):
         found[file.name] = {name: array.tobytes() for name, array in np.load(file).items()}
     return found
@@ -42,7 +51,11 @@ def contents(folder: Path) -> dict:
 
 def by_command(scene: str, folder: Path) -> None:
     words = ["run", scene, "--out", str(folder), "--device", "cpu"]
-    words += [word for key, value in {"time.duration": 0.1, "domain.resolution": 32}.items() for word in ("--set", f"{key}={value}")]
+    words += [
+        word
+        for key, value in {"time.duration": 0.1, "domain.resolution": 32}.items()
+        for word in ("--set", f"{key}={value}")
+    ]
     outcome = CliRunner().invoke(app, words)
     assert outcome.exit_code == 0, outcome.output
 
@@ -54,8 +67,12 @@ def test_frames_log_and_checkpoints_are_those_of_the_command_line(scene, tmp_pat
     frames = [(frame.index, frame.time) for frame in run]
     assert contents(tmp_path / "python") == contents(tmp_path / "command")
     assert [index for index, _ in frames] == list(range(run.scene.time.frame_count + 1))
-    assert [time for _, time in frames] == pytest.approx([run.scene.time.frame_time(index) for index, _ in frames])
-    records = [json.loads((tmp_path / name / "run.json").read_text()) for name in ("python", "command")]
+    assert [time for _, time in frames] == pytest.approx(
+        [run.scene.time.frame_time(index) for index, _ in frames]
+    )
+    records = [
+        json.loads((tmp_path / name / "run.json").read_text()) for name in ("python", "command")
+    ]
     for record in records:
         del record["seconds"]
     assert records[0] == records[1]
@@ -65,7 +82,9 @@ def test_a_frame_has_the_simulation_s_own_arrays():
     run = wl.Run(CRATE, device="cpu", frames=2)
     for frame in run:
         assert isinstance(frame.particles.position, wp.array)
-        assert np.shares_memory(frame.particles.position.numpy(), run.simulation.particles.position.numpy())
+        assert np.shares_memory(
+            frame.particles.position.numpy(), run.simulation.particles.position.numpy()
+        )
         assert frame.fields["velocity_x"] is run.simulation.velocity[0]
         assert set(frame.fields) == {"velocity_x", "velocity_y"}
         assert len(frame.bodies) == 1
@@ -105,7 +124,10 @@ def test_a_loop_that_is_left_resumes_bit_for_bit(tmp_path):
         if frame.index == 4:
             break
     record = json.loads((parts / "run.json").read_text())
-    assert (record["status"], record["reason"]) == ("stopped", "stopped by the program after frame 4")
+    assert (record["status"], record["reason"]) == (
+        "stopped",
+        "stopped by the program after frame 4",
+    )
     assert [frame.index for frame in wl.Run.resume(parts, device="cpu")] == [5, 6, 7, 8, 9, 10]
     one, other = contents(whole), contents(parts)
     assert {name: one[name] for name in other.keys() & one.keys() if "step" not in name} == {
@@ -143,13 +165,19 @@ def fail() -> None:
 def test_a_callback_that_fails_in_any_step_costs_no_frame(tmp_path):
     """Of the steps some end a frame: the run that goes on writes it, and hands it to its loop."""
     whole = tmp_path / "whole"
-    steps = [(frame.index, frame.row["step"]) for frame in wl.Run(FINE, folder=whole, device="cpu", frames=3) if frame.index]
+    steps = [
+        (frame.index, frame.row["step"])
+        for frame in wl.Run(FINE, folder=whole, device="cpu", frames=3)
+        if frame.index
+    ]
     assert steps == [(1, 2), (2, 4), (3, 6)]
     ends = {step: index for index, step in steps}
     for step in range(1, steps[-1][1] + 1):
         out = tmp_path / f"{step}"
         with pytest.raises(LookupError, match="mine"):
-            wl.Run(FINE, folder=out, device="cpu", frames=3, on_step=failing_at(step, fail)).finish()
+            wl.Run(
+                FINE, folder=out, device="cpu", frames=3, on_step=failing_at(step, fail)
+            ).finish()
         assert json.loads((out / "run.json").read_text())["reason"] == "LookupError: mine"
         run = wl.Run.resume(out, device="cpu", frames=3)
         seen = [frame.index for frame in run]
@@ -189,18 +217,28 @@ def test_ctrl_c_in_a_loop_stops_the_run_after_its_step(tmp_path, step):
     if step == 1:  # the first step has not ended: nothing is lost
         assert (record["status"], record["steps"]) == ("stopped", 1)
     else:
-        assert (record["status"], record["reason"], record["steps"]) == ("stopped", "interrupted by SIGINT", step)
+        assert (record["status"], record["reason"], record["steps"]) == (
+            "stopped",
+            "interrupted by SIGINT",
+            step,
+        )
         assert (out / "checkpoints" / f"step_{step:06d}.npz").is_file()
     wl.Run.resume(out, device="cpu", frames=3).finish()
     assert without_checkpoints(out) == without_checkpoints(whole)
 
 
 def test_ctrl_c_in_a_step_waits_for_its_end(dots, scene_file, tmp_path):
-    dots.before_step = lambda simulation, dt: signal.raise_signal(signal.SIGINT) if simulation.step_count == 5 else None
+    dots.before_step = lambda simulation, dt: (
+        signal.raise_signal(signal.SIGINT) if simulation.step_count == 5 else None
+    )
     with pytest.raises(KeyboardInterrupt):
         wl.Run(scene_file, folder=tmp_path / "out", device="cpu").finish()
     record = json.loads((tmp_path / "out" / "run.json").read_text())
-    assert (record["status"], record["reason"], record["steps"]) == ("stopped", "interrupted by SIGINT", 6)
+    assert (record["status"], record["reason"], record["steps"]) == (
+        "stopped",
+        "interrupted by SIGINT",
+        6,
+    )
     dots.before_step = lambda simulation, dt: None
     assert wl.Run.resume(tmp_path / "out", device="cpu").finish().resumed_from_step == 6
 
@@ -214,9 +252,15 @@ def test_a_second_ctrl_c_does_not_wait(dots, scene_file, tmp_path):
         pytest.fail("goes on")
 
     with pytest.raises(KeyboardInterrupt):
-        wl.Run(scene_file, folder=tmp_path / "out", device="cpu", on_step=failing_at(4, twice)).finish()
+        wl.Run(
+            scene_file, folder=tmp_path / "out", device="cpu", on_step=failing_at(4, twice)
+        ).finish()
     record = json.loads((tmp_path / "out" / "run.json").read_text())
-    assert (record["status"], record["reason"], record["steps"]) == ("stopped", "interrupted after step 4", 4)
+    assert (record["status"], record["reason"], record["steps"]) == (
+        "stopped",
+        "interrupted after step 4",
+        4,
+    )
     assert wl.Run.resume(tmp_path / "out", device="cpu").finish().resumed_from_step == 4
 
 
@@ -229,12 +273,19 @@ def test_ctrl_c_between_frames_is_the_program_s(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         drive()
     record = json.loads((tmp_path / "run" / "run.json").read_text())
-    assert (record["status"], record["reason"]) == ("stopped", "stopped by the program after frame 2")
+    assert (record["status"], record["reason"]) == (
+        "stopped",
+        "stopped by the program after frame 2",
+    )
 
 
 def test_a_run_in_another_thread_leaves_signals_alone(tmp_path):
     records = []
-    thread = threading.Thread(target=lambda: records.append(wl.Run(FINE, folder=tmp_path / "run", device="cpu", frames=1).finish()))
+    thread = threading.Thread(
+        target=lambda: records.append(
+            wl.Run(FINE, folder=tmp_path / "run", device="cpu", frames=1).finish()
+        )
+    )
     thread.start()
     thread.join()
     assert [record.status for record in records] == ["finished"]
@@ -252,7 +303,11 @@ def test_callbacks_see_every_step_and_stop_the_run(tmp_path):
 
     record = run.finish()
     assert [step for step, _ in seen] == [1, 2, 3, 4, 5]
-    assert (record.status, record.reason, record.steps) == ("stopped", "interrupted by its program", 5)
+    assert (record.status, record.reason, record.steps) == (
+        "stopped",
+        "interrupted by its program",
+        5,
+    )
     assert np.all(np.diff([time for _, time in seen]) > 0)
 
 
@@ -272,7 +327,11 @@ def test_an_impulse_is_what_the_body_s_momentum_changes_by():
 
 def test_gravity_can_turn():
     """What falls freely gains the new gravity's velocity: half of it in the step of the change, by the leapfrog."""
-    drop = {**POOL, "liquid": [{"shape": "sphere", "center": [0.5, 0.3], "radius": 0.08}], "physics": {"gravity": [0.0, 0.0]}}
+    drop = {
+        **POOL,
+        "liquid": [{"shape": "sphere", "center": [0.5, 0.3], "radius": 0.08}],
+        "physics": {"gravity": [0.0, 0.0]},
+    }
     run, speeds, times = wl.Run(drop, device="cpu", duration=0.12), [], []
     for frame in run:
         speeds.append(frame.particles.velocity.numpy()[:, :2].mean(axis=0).astype(float))
@@ -289,8 +348,12 @@ def test_added_material_fills_what_is_empty_and_has_its_velocity():
     for frame in run:
         counts.append(frame.particles.count)
         if frame.index == 2:
-            added = run.add(shape="box", min=[0.25, 0.1], max=[0.5, 0.4], velocity=[0.5, 0.0])  # its lower half is full
-            assert frame.particles.velocity.numpy()[-1] == pytest.approx([0.5, 0.0, 0.0]) or frame.particles.count == counts[-1] + added
+            # its lower half is full
+            added = run.add(shape="box", min=[0.25, 0.1], max=[0.5, 0.4], velocity=[0.5, 0.0])
+            assert (
+                frame.particles.velocity.numpy()[-1] == pytest.approx([0.5, 0.0, 0.0])
+                or frame.particles.count == counts[-1] + added
+            )
             assert run.add(shape="box", min=[0.75, 0.3], max=[0.8, 0.4]) > 0
             with pytest.raises(RunError, match="holds no empty cell"):
                 run.add(shape="box", min=[0.1, 0.02], max=[0.3, 0.1])
@@ -304,7 +367,13 @@ def test_added_material_is_in_the_checkpoint(tmp_path):
 
     def drive(folder, leave):
         run = wl.Run(POOL, folder=folder, device="cpu")
-        run.on_step(lambda run: run.add(shape="box", min=[0.3, 0.3], max=[0.5, 0.4]) if run.row["step"] == 3 else None)
+        run.on_step(
+            lambda run: (
+                run.add(shape="box", min=[0.3, 0.3], max=[0.5, 0.4])
+                if run.row["step"] == 3
+                else None
+            )
+        )
         for frame in run:
             if leave and frame.index == 5:
                 break
@@ -331,7 +400,16 @@ def test_a_run_that_fails_says_so(tmp_path):
     [
         ({"scene": "dam-brake"}, SceneError, "dam-brake.*dam-break"),
         ({"scene": 7}, SceneError, "must be a scene file.*dict.*"),
-        ({"scene": {"scene": {"simulator": "fluids"}, "domain": {"size": [1, 1], "resolution": 0}}}, SceneError, "domain.resolution"),
+        (
+            {
+                "scene": {
+                    "scene": {"simulator": "fluids"},
+                    "domain": {"size": [1, 1], "resolution": 0},
+                }
+            },
+            SceneError,
+            "domain.resolution",
+        ),
         ({"scene": {}}, SceneError, "scene.simulator: is missing"),
         ({"resolutoin": 96}, SceneError, "resolutoin: no such key.*resolution"),
         ({"resolution": "many"}, SceneError, "domain.resolution"),

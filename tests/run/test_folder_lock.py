@@ -24,7 +24,9 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="no flock")
 
 
 def holder(folder: Path) -> subprocess.Popen:
-    process = subprocess.Popen([sys.executable, "-c", HOLDER, str(folder)], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLDER, str(folder)], stdout=subprocess.PIPE, text=True
+    )
     assert process.stdout is not None
     assert process.stdout.readline() == "held\n"
     return process
@@ -41,14 +43,20 @@ def test_the_file_says_who_and_goes_with_the_lock(tmp_path):
     with locked(tmp_path) as remarks:
         assert remarks == []
         assert json.loads((tmp_path / LOCK).read_text())["pid"] == os.getpid()
-        assert (tmp_path / LOCK).stat().st_mode & 0o133 == 0  # nobody else writes it, and it is no program
+        # nobody else writes it, and it is no program
+        assert (tmp_path / LOCK).stat().st_mode & 0o133 == 0
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_second_process_is_refused_and_a_killed_one_is_not_waited_for(tmp_path):
     process = holder(tmp_path)
     try:
-        with pytest.raises(FolderBusyError, match=f"another run writes there .process {process.pid} on "), locked(tmp_path):
+        with (
+            pytest.raises(
+                FolderBusyError, match=f"another run writes there .process {process.pid} on "
+            ),
+            locked(tmp_path),
+        ):
             pass
         assert (tmp_path / LOCK).is_file()  # the one who is refused takes nothing away
     finally:
@@ -70,7 +78,9 @@ def test_any_file_in_the_way_is_taken_over(tmp_path, text):
 
 
 def test_the_number_of_a_living_process_alone_keeps_nobody_out(tmp_path):
-    (tmp_path / LOCK).write_text(json.dumps({"pid": os.getpid(), "host": "here", "since": "yesterday"}))
+    (tmp_path / LOCK).write_text(
+        json.dumps({"pid": os.getpid(), "host": "here", "since": "yesterday"})
+    )
     with locked(tmp_path) as remarks:
         assert f"left by process {os.getpid()} on here" in remarks[0]
 

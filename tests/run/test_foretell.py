@@ -9,7 +9,15 @@ from small_runs import run_into
 from warp_lcp.cli.commands import app
 from warp_lcp.grid.triangle_mesh import builtin_mesh
 from warp_lcp.run.check import start
-from warp_lcp.run.foretell import doubts, expected_bytes, expected_growth, expected_step, expected_steps, foretold, in_words
+from warp_lcp.run.foretell import (
+    doubts,
+    expected_bytes,
+    expected_growth,
+    expected_step,
+    expected_steps,
+    foretold,
+    in_words,
+)
 from warp_lcp.scene.scene_file import dump_scene, load_scene
 
 FACTOR = 1.5
@@ -26,11 +34,16 @@ def told(**tables):
     return list(doubts(scene, start(scene, "cpu")))
 
 
-@pytest.mark.parametrize("name", ["dam-break-2d", "splash-in-circle", "tap-and-drain", "column-collapse-2d"])
+@pytest.mark.parametrize(
+    "name", ["dam-break-2d", "splash-in-circle", "tap-and-drain", "column-collapse-2d"]
+)
 def test_steps_and_bytes_are_those_of_the_run(name: str, tmp_path: Path) -> None:
     scene = load_scene(name, ["domain.resolution=32"])
     simulation = start(scene, "cpu")
-    steps, size = expected_steps(scene, simulation), expected_bytes(scene, simulation, expected_steps(scene, simulation))
+    steps, size = (
+        expected_steps(scene, simulation),
+        expected_bytes(scene, simulation, expected_steps(scene, simulation)),
+    )
     record = run_into(scene, tmp_path / "run")
     taken = sum(file.stat().st_size for file in (tmp_path / "run").rglob("*") if file.is_file())
     assert 1 / FACTOR < steps / record.steps < FACTOR
@@ -39,12 +52,16 @@ def test_steps_and_bytes_are_those_of_the_run(name: str, tmp_path: Path) -> None
 
 def test_twice_the_cells_take_more_steps_and_more_frames_take_more_bytes() -> None:
     coarse, fine, often = (
-        load_scene("dam-break-2d", [o]) for o in ("domain.resolution=64", "domain.resolution=256", "time.frames_per_second=300")
+        load_scene("dam-break-2d", [o])
+        for o in ("domain.resolution=64", "domain.resolution=256", "time.frames_per_second=300")
     )
     steps = [expected_steps(scene, start(scene, "cpu")) for scene in (coarse, fine, often)]
     assert steps[1] > 2 * steps[0]
     assert steps[2] >= often.time.frame_count
-    size = [expected_bytes(scene, start(scene, "cpu"), 0) for scene in (load_scene("dam-break-2d"), often)]
+    size = [
+        expected_bytes(scene, start(scene, "cpu"), 0)
+        for scene in (load_scene("dam-break-2d"), often)
+    ]
     assert size[1] > 4 * size[0]
 
 
@@ -57,20 +74,34 @@ def test_a_measured_step_makes_the_whole_run() -> None:
 
 def test_surface_tension_shortens_the_steps() -> None:
     drop = load_scene(POOL | {"surface_tension": {"coefficient": 1e6}})
-    assert expected_steps(drop, start(drop, "cpu")) > 3 * expected_steps(load_scene(POOL), start(load_scene(POOL), "cpu"))
+    assert expected_steps(drop, start(drop, "cpu")) > 3 * expected_steps(
+        load_scene(POOL), start(load_scene(POOL), "cpu")
+    )
 
 
 def test_what_sources_add_counts_half_and_less_where_it_leaves() -> None:
     stream = {"shape": "box", "min": [0.1, 0.3], "max": [0.3, 0.4], "velocity": [0.0, -2.0]}
-    full, leaks = (load_scene(POOL | {"source": [stream], "domain": POOL["domain"] | tables}) for tables in ({}, {"open": ["right"]}))
+    full, leaks = (
+        load_scene(POOL | {"source": [stream], "domain": POOL["domain"] | tables})
+        for tables in ({}, {"open": ["right"]})
+    )
     most, first = full.particle_estimate(), full.particle_estimate(later=False)
     assert expected_growth(full) == pytest.approx(0.5 * (most + first) / first)
     assert 1.0 < expected_growth(leaks) < expected_growth(full)
-    assert expected_step(full, start(full, "cpu")) > expected_step(load_scene(POOL), start(load_scene(POOL), "cpu"))
+    assert expected_step(full, start(full, "cpu")) > expected_step(
+        load_scene(POOL), start(load_scene(POOL), "cpu")
+    )
 
 
 @pytest.mark.parametrize(
-    ("size", "words"), [(12_345, "0.0123 MB"), (1.5e6, "1.5 MB"), (2e9, "2 GB"), (2.38e12, "2.38 TB"), (5e15, "5e+03 TB")]
+    ("size", "words"),
+    [
+        (12_345, "0.0123 MB"),
+        (1.5e6, "1.5 MB"),
+        (2e9, "2 GB"),
+        (2.38e12, "2.38 TB"),
+        (5e15, "5e+03 TB"),
+    ],
 )
 def test_bytes_are_told_in_the_largest_unit_of_which_there_is_one(size: float, words: str) -> None:
     assert in_words(size) == words
@@ -84,7 +115,9 @@ def test_a_usual_scene_raises_no_doubts() -> None:
 
 
 def test_what_was_hardly_meant_is_told() -> None:
-    assert told(time={"duration": 500.0}) == ["15,000 frames: time.duration 500 s at time.frames_per_second 30; is this intended?"]
+    assert told(time={"duration": 500.0}) == [
+        "15,000 frames: time.duration 500 s at time.frames_per_second 30; is this intended?"
+    ]
     half = told(solid=[{"shape": "box", "min": [0.0, 0.0], "max": [0.625, 0.5]}])
     assert half == ["liquid[0] (box): 62 % of it lies inside solids and is left out"]
     tiny = {"shape": "sphere", "center": [0.5, 0.1], "radius": 0.045, "invert": True}
@@ -99,7 +132,10 @@ def test_what_was_hardly_meant_is_told() -> None:
         (lambda v, t: (v, t[:, ::-1]), "the mesh was inside out; turned"),
         (lambda v, t: (v, [*t[:9, ::-1], *t[9:]]), "turned 9 of 9216 triangles that disagreed"),
         (lambda v, t: (v, [*t, *t[:20]]), "dropped 20 repeated triangles"),
-        (lambda v, t: ([*v, *(0.9 * v + [0.3, 0.0, 0.0])], [*t, *(t + len(v))]), "triangles cross others"),
+        (
+            lambda v, t: ([*v, *(0.9 * v + [0.3, 0.0, 0.0])], [*t, *(t + len(v))]),
+            "triangles cross others",
+        ),
     ],
 )
 def test_what_is_wrong_with_a_mesh_is_told_with_its_repair(spoil, words, tmp_path: Path) -> None:
@@ -109,9 +145,21 @@ def test_what_is_wrong_with_a_mesh_is_told_with_its_repair(spoil, words, tmp_pat
     lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in (map(float, p) for p in vertices)]
     lines += ["f " + " ".join(str(int(n) + 1) for n in triangle) for triangle in triangles]
     (tmp_path / "torus.obj").write_text("\n".join(lines) + "\n")
-    mesh = {"shape": "mesh", "file": str(tmp_path / "torus.obj"), "scale": 0.4, "translate": [0.6, 0.3, 0.5]}
+    mesh = {
+        "shape": "mesh",
+        "file": str(tmp_path / "torus.obj"),
+        "scale": 0.4,
+        "translate": [0.6, 0.3, 0.5],
+    }
     liquid = {"shape": "box", "min": [0.0, 0.0, 0.0], "max": [0.2, 0.6, 1.0]}
-    scene = load_scene(POOL | {"domain": {"size": [1.0, 1.0, 1.0], "resolution": 16}, "liquid": [liquid], "solid": [mesh]})
+    scene = load_scene(
+        POOL
+        | {
+            "domain": {"size": [1.0, 1.0, 1.0], "resolution": 16},
+            "liquid": [liquid],
+            "solid": [mesh],
+        }
+    )
     (tmp_path / "scene.toml").write_text(dump_scene(scene))
     outcome = CliRunner().invoke(app, ["check", str(tmp_path / "scene.toml"), "--device", "cpu"])
     assert outcome.exit_code == 0, outcome.output

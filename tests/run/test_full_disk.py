@@ -47,13 +47,23 @@ class Disk:
                 sizes.append(self.rounded(path.stat().st_size) if path.is_file() else 0)
         return sum(sizes)
 
-    def open(self, file: Any, mode: str = "r", buffering: int = -1, *more: Any, **options: Any) -> Any:
+    def open(
+        self, file: Any, mode: str = "r", buffering: int = -1, *more: Any, **options: Any
+    ) -> Any:
         path = os.readlink(f"/proc/self/fd/{file}") if isinstance(file, int) else str(file)
-        if "opener" in options or "r" in mode.replace("r+", "") or not path.startswith(str(self.folder)):
+        if (
+            "opener" in options
+            or "r" in mode.replace("r+", "")
+            or not path.startswith(str(self.folder))
+        ):
             return self._open(file, mode, buffering, *more, **options)
         raw = Limited(file, mode.replace("b", "").replace("t", ""), path=path, disk=self)
         stream = io.BufferedRandom(raw) if "+" in mode else io.BufferedWriter(raw)
-        return stream if "b" in mode else io.TextIOWrapper(stream, *more, line_buffering=buffering == 1, **options)
+        return (
+            stream
+            if "b" in mode
+            else io.TextIOWrapper(stream, *more, line_buffering=buffering == 1, **options)
+        )
 
     @contextmanager
     def mounted(self) -> Iterator["Disk"]:
@@ -89,7 +99,9 @@ def ends_truly(out: Path, record: RunRecord) -> None:
     assert [path.name for path in out.rglob(".*")] == []
 
 
-def fill(scene: Path, folder: Path, sizes: list[int], *, code: int = errno.ENOSPC, block: int = 1) -> dict[str, int]:
+def fill(
+    scene: Path, folder: Path, sizes: list[int], *, code: int = errno.ENOSPC, block: int = 1
+) -> dict[str, int]:
     """Run on disks of these sizes and go on on larger ones; return in which kinds of files the disks were full first."""
     go(scene, folder / "whole")
     expected, where = contents(folder / "whole"), {}
@@ -107,7 +119,9 @@ def fill(scene: Path, folder: Path, sizes: list[int], *, code: int = errno.ENOSP
             assert record.status == "finished", record.reason
             break
         temporary = atomic.TEMPORARY.fullmatch(disk.refused[0])
-        first = (temporary["name"] if temporary else disk.refused[0]).rstrip("0123456789").split("_")[0]
+        first = (
+            (temporary["name"] if temporary else disk.refused[0]).rstrip("0123456789").split("_")[0]
+        )
         where[first] = where.get(first, 0) + 1
         if (out / "run.json").exists():
             ends_truly(out, record)
@@ -122,7 +136,9 @@ def fill(scene: Path, folder: Path, sizes: list[int], *, code: int = errno.ENOSP
 
 def whole_size(scene: Path, folder: Path) -> int:
     go(scene, folder / "size")
-    return sum(path.stat().st_size for path in (folder / "size").rglob("*") if path.is_file()) + 30_000
+    return (
+        sum(path.stat().st_size for path in (folder / "size").rglob("*") if path.is_file()) + 30_000
+    )
 
 
 @pytest.fixture
@@ -138,7 +154,10 @@ def test_full_at_any_moment(quick, scene_file, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("code", "block", "stride"), [(errno.ENOSPC, 1, 173), (errno.EDQUOT, 1, 577), (errno.ENOSPC, 4096, 811)])
+@pytest.mark.parametrize(
+    ("code", "block", "stride"),
+    [(errno.ENOSPC, 1, 173), (errno.EDQUOT, 1, 577), (errno.ENOSPC, 4096, 811)],
+)
 def test_full_at_every_moment(quick, scene_file, tmp_path, code, block, stride):
     size = (whole_size(scene_file, tmp_path)) * (3 if block > 1 else 1)
     where = fill(scene_file, tmp_path, [*range(1, size, stride), size], code=code, block=block)
@@ -147,7 +166,17 @@ def test_full_at_every_moment(quick, scene_file, tmp_path, code, block, stride):
 
 
 @pytest.mark.parametrize(
-    "name", ["run.json.spare", ".run.json.part", "scene.toml", "log.csv", "particles.pvd", "particles_", "step_", "profile"]
+    "name",
+    [
+        "run.json.spare",
+        ".run.json.part",
+        "scene.toml",
+        "log.csv",
+        "particles.pvd",
+        "particles_",
+        "step_",
+        "profile",
+    ],
 )
 def test_full_in_each_kind_of_file(quick, scene_file, tmp_path, monkeypatch, name):
     """And from then on in every file."""
@@ -188,7 +217,11 @@ def mounted(folder: Path, size: int) -> Iterator[None]:
     """Mount a disk of some size at a folder, which only root can."""
     folder.mkdir()
     command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)]
-    if sys.platform != "linux" or os.geteuid() or subprocess.run(command, capture_output=True, check=False).returncode:
+    if (
+        sys.platform != "linux"
+        or os.geteuid()
+        or subprocess.run(command, capture_output=True, check=False).returncode
+    ):
         pytest.skip("a disk can be mounted only by root")
     try:
         yield
@@ -209,7 +242,11 @@ def test_a_real_disk(dots, scene_file, tmp_path, monkeypatch, left):
             return
         ends_truly(disk / "out", go(scene_file, disk / "out"))
         (disk / "others").unlink()
-        assert go(scene_file, disk / "out", **({"resume": True} if (disk / "out" / "checkpoints").is_dir() else {"force": True})).steps
+        assert go(
+            scene_file,
+            disk / "out",
+            **({"resume": True} if (disk / "out" / "checkpoints").is_dir() else {"force": True}),
+        ).steps
 
 
 def test_a_disk_that_becomes_read_only(dots, scene_file, tmp_path):

@@ -27,14 +27,22 @@ KINDS = ("particles", "grid")
 def out(scene_file: Path, tmp_path: Path) -> Path:
     """A run that was stopped."""
     asked = iter(range(1, 10_000))
-    run_into(load_scene(scene_file), tmp_path / "out", observer=Lines(Console(quiet=True)), stop=lambda: next(asked) >= STEP)
+    run_into(
+        load_scene(scene_file),
+        tmp_path / "out",
+        observer=Lines(Console(quiet=True)),
+        stop=lambda: next(asked) >= STEP,
+    )
     return tmp_path / "out"
 
 
 def resumed(out: Path) -> list[str]:
     """Resume for a frame, see that the terminal says what run.json warns of, and return that."""
     frames = json.loads((out / "run.json").read_text())["frames"]
-    result = CliRunner().invoke(cli.app, ["run", "--resume", "--out", str(out), "--device", "cpu", "--frames", str(frames + 1)])
+    result = CliRunner().invoke(
+        cli.app,
+        ["run", "--resume", "--out", str(out), "--device", "cpu", "--frames", str(frames + 1)],
+    )
     assert result.exit_code == 0, result.stderr
     warnings: list[str] = json.loads((out / "run.json").read_text())["warnings"]
     assert all(f"{warning}\n" in result.stderr for warning in warnings)
@@ -56,7 +64,10 @@ def cut(path: Path, share: float) -> None:
 
 
 def contents(out: Path) -> dict[str, Any]:
-    found: dict[str, Any] = {str(path.relative_to(out)): path.read_bytes() for path in [*out.glob("frames/*"), *out.glob("*.pvd")]}
+    found: dict[str, Any] = {
+        str(path.relative_to(out)): path.read_bytes()
+        for path in [*out.glob("frames/*"), *out.glob("*.pvd")]
+    }
     found["log.csv"] = re.sub(r",[^,]*$", "", (out / "log.csv").read_text(), flags=re.M)
     return found
 
@@ -74,7 +85,10 @@ def test_a_log_that_was_cut_or_deleted(out, share):
         cut(out / "log.csv", share)
     left = steps(out)[:-1] if share == 0.33 else []  # the last row is cut
     (line,) = resumed(out)
-    assert line.startswith(f"log.csv: rows of steps {len(left) + 1} to {STEP} are missing; no earlier checkpoint exists")
+    assert line.startswith(
+        f"log.csv: rows of steps {len(left) + 1} to {STEP} are missing; no earlier checkpoint "
+        "exists"
+    )
     assert steps(out)[: len(left) + 1] == [*left, STEP + 1]
 
 
@@ -108,11 +122,24 @@ def test_frames_without_checkpoints_and_log_are_not_thrown_away(out, scene_file)
     assert frames(out, "grid") == [0, 1, 2, 3]
 
 
-@pytest.mark.parametrize("record", ["{", "[]", '{"steps": "many"}', '{"overrides": 3}', '{"overrides": ["a"]}', '{"mesh_files": [1]}'])
+@pytest.mark.parametrize(
+    "record",
+    [
+        "{",
+        "[]",
+        '{"steps": "many"}',
+        '{"overrides": 3}',
+        '{"overrides": ["a"]}',
+        '{"mesh_files": [1]}',
+    ],
+)
 def test_files_that_say_what_ran(out, scene_file, record):
     (out / "scene.toml").unlink()
     (out / "run.json").write_text(record)
-    result = CliRunner().invoke(cli.app, ["run", str(scene_file), "--resume", "--out", str(out), "--device", "cpu", "--frames", "9"])
+    result = CliRunner().invoke(
+        cli.app,
+        ["run", str(scene_file), "--resume", "--out", str(out), "--device", "cpu", "--frames", "9"],
+    )
     assert result.exit_code == 0, result.stderr
     assert "run.json: was missing or damaged" in result.stderr
     assert "scene.toml: was missing or damaged" in result.stderr
@@ -124,12 +151,21 @@ def test_a_folder_in_the_place_of_a_file_or_a_file_in_that_of_a_folder(out, scen
     kind = "a file, expected a folder" if path.is_dir() else "a folder, expected a file"
     path.rename(out.parent / "aside")
     path.mkdir() if path.suffix else path.touch()
-    result = CliRunner().invoke(cli.app, ["run", str(scene_file), "--resume", "--out", str(out), "--device", "cpu", "--frames", "9"])
+    result = CliRunner().invoke(
+        cli.app,
+        ["run", str(scene_file), "--resume", "--out", str(out), "--device", "cpu", "--frames", "9"],
+    )
     assert result.exit_code == 2
     assert f"{path}: is {kind}; move it away" in result.stderr
 
 
-@pytest.mark.parametrize("seed", [*range(8800, 8806), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(8806, 8900))])
+@pytest.mark.parametrize(
+    "seed",
+    [
+        *range(8800, 8806),
+        *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(8806, 8900)),
+    ],
+)
 def test_whatever_is_missing_is_named(out, seed):
     """Holes in the log and among the frames are those that the lines tell, and the collections are of the frames that there are."""
     rng = random.Random(seed)
@@ -145,7 +181,9 @@ def test_whatever_is_missing_is_named(out, seed):
     if damage == "cut":
         cut(out / "log.csv", rng.random())
     elif damage == "rows":
-        (out / "log.csv").write_text("".join([rows[0], *sorted(rng.sample(rows[1:], rng.randint(0, STEP)), key=rows.index)]))
+        (out / "log.csv").write_text(
+            "".join([rows[0], *sorted(rng.sample(rows[1:], rng.randint(0, STEP)), key=rows.index)])
+        )
     elif damage == "bytes":
         place = rng.randint(1, STEP)
         rows[place] = "\0\udcff" + rows[place][5:]
@@ -162,7 +200,10 @@ def test_whatever_is_missing_is_named(out, seed):
     assert [line.split(";")[0] for line in lines] == told
     assert steps(out) == sorted({*steps(out)})
     for kind in KINDS:
-        assert [int(number) for number in re.findall(r"_(\d{6})\.vtu", (out / f"{kind}.pvd").read_text())] == frames(out, kind)
+        assert [
+            int(number)
+            for number in re.findall(r"_(\d{6})\.vtu", (out / f"{kind}.pvd").read_text())
+        ] == frames(out, kind)
 
 
 def test_numbers_in_words():

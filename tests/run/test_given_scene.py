@@ -28,7 +28,12 @@ def ran(out: Path, given: GivenScene) -> None:
 def edit(file: Path, **changes: str) -> None:
     """Give keys, whose names are unique in a file, other values."""
     lines = file.read_text().splitlines()
-    file.write_text("\n".join(f"{name} = {changes[name]}" if (name := line.partition(" = ")[0]) in changes else line for line in lines))
+    file.write_text(
+        "\n".join(
+            f"{name} = {changes[name]}" if (name := line.partition(" = ")[0]) in changes else line
+            for line in lines
+        )
+    )
 
 
 def frames(out: Path) -> dict[str, bytes]:
@@ -41,23 +46,56 @@ def test_resume_without_repeating_set_is_the_same_run(scene_file, tmp_path, way)
     assert call("run", scene_file, "--out", tmp_path / "whole", *run, "--frames", 2).exit_code == 0
     out = tmp_path / "parts"
     assert call("run", scene_file, "--out", out, *run, "--frames", 1).exit_code == 0
-    named = {"the scene": [scene_file], "the folder's scene": [out / "scene.toml"], "no scene": []}[way]
+    named = {"the scene": [scene_file], "the folder's scene": [out / "scene.toml"], "no scene": []}[
+        way
+    ]
     result = call("run", *named, "--out", out, "--device", "cpu", "--frames", 2, "--resume")
     assert result.exit_code == 0, result.stderr
-    assert ("earlier --set values: domain.resolution=16, time.dt_max=0.01" in result.stderr) == (way == "the scene")
+    assert ("earlier --set values: domain.resolution=16, time.dt_max=0.01" in result.stderr) == (
+        way == "the scene"
+    )
     assert "changed" not in result.stderr
     record = json.loads((out / "run.json").read_text())
     assert (record["changed"], record["resampled_from_resolution"]) == ([], None)
-    assert [entry["set"] for entry in record["overrides"]] == ["domain.resolution=16", "time.dt_max=0.01"]
+    assert [entry["set"] for entry in record["overrides"]] == [
+        "domain.resolution=16",
+        "time.dt_max=0.01",
+    ]
     assert (out / "scene.toml").read_text() == (tmp_path / "whole" / "scene.toml").read_text()
     assert frames(out) == frames(tmp_path / "whole")
 
 
 def test_what_is_given_anew_changes_and_is_told(scene_file, tmp_path):
     out = tmp_path / "out"
-    assert call("run", scene_file, "--out", out, "--device", "cpu", "--set", "time.dt_max=0.01", "--frames", 1).exit_code == 0
+    assert (
+        call(
+            "run",
+            scene_file,
+            "--out",
+            out,
+            "--device",
+            "cpu",
+            "--set",
+            "time.dt_max=0.01",
+            "--frames",
+            1,
+        ).exit_code
+        == 0
+    )
     edit(scene_file, duration="0.6")
-    result = call("run", scene_file, "--out", out, "--device", "cpu", "--frames", 2, "--resume", "--set", "output.checkpoint_every=3")
+    result = call(
+        "run",
+        scene_file,
+        "--out",
+        out,
+        "--device",
+        "cpu",
+        "--frames",
+        2,
+        "--resume",
+        "--set",
+        "output.checkpoint_every=3",
+    )
     assert result.exit_code == 0, result.stderr
     expected = ["output.checkpoint_every: 4 before, 3 now", "time.duration: 0.5 before, 0.6 now"]
     assert json.loads((out / "run.json").read_text())["changed"] == expected
@@ -69,14 +107,22 @@ def test_an_edit_of_what_was_overridden_counts(scene_file, tmp_path):
     ran(out, given_scene(source, ["time.duration=1.0", "time.dt_max=0.01"]))
     edit(scene_file, duration="2.0")
     given = scene_to_resume(out, source, [])
-    assert (given.scene.time.duration, given.scene.time.dt_max, given.kept) == (2.0, 0.01, ["time.dt_max=0.01"])
+    assert (given.scene.time.duration, given.scene.time.dt_max, given.kept) == (
+        2.0,
+        0.01,
+        ["time.dt_max=0.01"],
+    )
 
 
 def test_another_resolution_is_asked_for_by_name(scene_file, tmp_path):
     out, source = tmp_path / "out", str(scene_file)
     ran(out, given_scene(source, ["domain.resolution=16"]))
     (out / "run.json").write_text("{}")  # of a version that did not remember
-    with pytest.raises(OutputError, match=r"domain.resolution is 16, but 8 in .*dots.toml: use --set domain.resolution=8 to resample"):
+    with pytest.raises(
+        OutputError,
+        match=r"domain.resolution is 16, but 8 in .*dots.toml: use --set domain.resolution=8 to "
+        r"resample",
+    ):
         scene_to_resume(out, source, [])
     for resolution in (8, 16, 32):
         given = scene_to_resume(out, source, [f"domain.resolution={resolution}"])
@@ -90,7 +136,11 @@ def test_another_resolution_is_asked_for_by_name(scene_file, tmp_path):
 
 @pytest.mark.parametrize(
     ("arguments", "expected"),
-    [([], "SCENE is missing"), (["--resume"], "needs SCENE or --out DIR"), (["--resume", "--out", "{out}"], "there is no run to resume")],
+    [
+        ([], "SCENE is missing"),
+        (["--resume"], "needs SCENE or --out DIR"),
+        (["--resume", "--out", "{out}"], "there is no run to resume"),
+    ],
 )
 def test_without_a_scene(dots, tmp_path, arguments, expected):
     result = call("run", *(argument.format(out=tmp_path / "none") for argument in arguments))
@@ -99,7 +149,11 @@ def test_without_a_scene(dots, tmp_path, arguments, expected):
     assert not (tmp_path / "none").exists()
 
 
-VALUES = {"duration": ["0.5", "1.0", "2.0"], "dt_max": ["0.02", "0.01", "0.005"], "checkpoint_every": ["4", "9", "12"]}
+VALUES = {
+    "duration": ["0.5", "1.0", "2.0"],
+    "dt_max": ["0.02", "0.01", "0.005"],
+    "checkpoint_every": ["4", "9", "12"],
+}
 TABLE = {"duration": "time", "dt_max": "time", "checkpoint_every": "output"}
 
 
@@ -117,12 +171,19 @@ def test_the_last_word_counts(dots, scene_file, tmp_path, seed):
                 wanted[name] = wanted[name] if value == in_file[name] else value
                 in_file[name] = value
             edit(scene_file, **in_file)
-        given = {name: rng.choice(VALUES[name]) for name in rng.sample(list(VALUES), rng.choice([0, 1, 2]))}
+        given = {
+            name: rng.choice(VALUES[name])
+            for name in rng.sample(list(VALUES), rng.choice([0, 1, 2]))
+        }
         wanted |= given
         overrides = [f"{TABLE[name]}.{name}={value}" for name, value in given.items()]
         settled = route == "scene"
         named = {"scene": source, "own": str(out / "scene.toml"), "none": None}[route]
-        found = given_scene(source, overrides) if part == 0 else scene_to_resume(out, named, overrides)
+        found = (
+            given_scene(source, overrides) if part == 0 else scene_to_resume(out, named, overrides)
+        )
         values = keys(found.scene)
-        assert {name: float(values[f"{TABLE[name]}.{name}"]) for name in VALUES} == {name: float(v) for name, v in wanted.items()}, part
+        assert {name: float(values[f"{TABLE[name]}.{name}"]) for name in VALUES} == {
+            name: float(v) for name, v in wanted.items()
+        }, part
         ran(out, found)

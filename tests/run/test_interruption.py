@@ -22,7 +22,10 @@ EACH = pytest.mark.parametrize("number", SIGNALS, ids=lambda number: number.name
 @pytest.fixture(autouse=True)
 def nothing_is_ignored():
     """As in a terminal, whatever started the tests: nohup ignores SIGHUP, shells ignore SIGINT and SIGQUIT of what is in the background."""
-    fresh = {number: signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL for number in SIGNALS}
+    fresh = {
+        number: signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
+        for number in SIGNALS
+    }
     before = {number: signal.signal(number, handler) for number, handler in fresh.items()}
     yield
     for number, handler in before.items():
@@ -32,7 +35,17 @@ def nothing_is_ignored():
 @pytest.fixture
 def run(scene_file, tmp_path):
     def call(*more: object) -> Result:
-        arguments = ["run", scene_file, "--out", tmp_path / "out", "--device", "cpu", "--set", "time.duration=0.2", *more]
+        arguments = [
+            "run",
+            scene_file,
+            "--out",
+            tmp_path / "out",
+            "--device",
+            "cpu",
+            "--set",
+            "time.duration=0.2",
+            *more,
+        ]
         return CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
 
     return call
@@ -60,7 +73,11 @@ def test_after_a_step(dots, run, tmp_path, number):
     assert result.stderr.count(f"{number.name}: stopping after this step") == 1
     assert f"stopped: interrupted by {number.name}\n" in result.stderr
     found = record(tmp_path)
-    assert (found["status"], found["reason"], found["steps"]) == ("stopped", f"interrupted by {number.name}", 6)
+    assert (found["status"], found["reason"], found["steps"]) == (
+        "stopped",
+        f"interrupted by {number.name}",
+        6,
+    )
     assert (tmp_path / "out" / "checkpoints" / "step_000006.npz").is_file()
     assert [signal.getsignal(each) for each in SIGNALS] == handlers
     dots.before_step = at(-1)
@@ -92,7 +109,11 @@ def test_before_the_first_step_of_a_part(dots, run, tmp_path):
 
 def test_before_the_run_has_begun(dots, run, tmp_path, monkeypatch):
     create = dots.create
-    monkeypatch.setattr(dots, "create", lambda *more, **options: (signal.raise_signal(signal.SIGTERM), create(*more, **options))[1])
+    monkeypatch.setattr(
+        dots,
+        "create",
+        lambda *more, **options: (signal.raise_signal(signal.SIGTERM), create(*more, **options))[1],
+    )
     result = run()
     assert result.exit_code == 1
     assert "stopped: interrupted by SIGTERM before the run began" in result.stderr
@@ -145,10 +166,15 @@ def test_the_record_of_a_run_that_is_ended(run, tmp_path):
     assert run("--frames", 0).exit_code == 0
     mark_ended(tmp_path / "out", "stopped", "interrupted by SIGINT during the first step")
     assert record(tmp_path)["status"] == "finished"
-    (tmp_path / "out" / "run.json").write_text(json.dumps({**record(tmp_path), "status": "running"}))
+    (tmp_path / "out" / "run.json").write_text(
+        json.dumps({**record(tmp_path), "status": "running"})
+    )
     mark_ended(tmp_path / "out", "stopped", "interrupted by SIGINT during the first step")
     found = record(tmp_path)
-    assert (found["status"], found["reason"]) == ("stopped", "interrupted by SIGINT during the first step")
+    assert (found["status"], found["reason"]) == (
+        "stopped",
+        "interrupted by SIGINT during the first step",
+    )
     mark_ended(tmp_path, "stopped", "interrupted by SIGINT")  # of a run that has not begun
 
 
@@ -161,4 +187,9 @@ def test_ranks_wait_for_each_other():
 def test_those_who_call_the_library_need_not_name_a_signal(scene_file, tmp_path):
     from test_run import Watcher, load_scene
 
-    assert run_into(load_scene(scene_file), tmp_path / "out", observer=Watcher(), stop=lambda: True).reason == "interrupted"
+    assert (
+        run_into(
+            load_scene(scene_file), tmp_path / "out", observer=Watcher(), stop=lambda: True
+        ).reason
+        == "interrupted"
+    )

@@ -40,7 +40,9 @@ DAMAGES: dict[str, Callable[[Path], None]] = {
     "half": cut(0.5),
     "all but a byte": lambda file: write(file, file.read_bytes()[:-1].rstrip(b"\0}\n ")),
     "zeros": lambda file: write(file, bytes(file.stat().st_size)),
-    "its end is zeros": lambda file: write(file, file.read_bytes()[: file.stat().st_size // 2] + bytes(file.stat().st_size // 2)),
+    "its end is zeros": lambda file: write(
+        file, file.read_bytes()[: file.stat().st_size // 2] + bytes(file.stat().st_size // 2)
+    ),
     "garbage": lambda file: write(file, random.Random(6_211).randbytes(4000)),
     "a folder": replace_by_folder,
 }
@@ -106,7 +108,10 @@ def test_a_cache_that_cannot_be_written(compiled, tmp_path):
     (tmp_path / "file").write_text("")
     wp.config.kernel_cache_dir = str(tmp_path / "file" / "cache")
     try:
-        with pytest.raises(KernelCacheError, match=r"the folder of compiled kernels .* cannot be used .*WARP_CACHE_PATH"):
+        with pytest.raises(
+            KernelCacheError,
+            match=r"the folder of compiled kernels .* cannot be used .*WARP_CACHE_PATH",
+        ):
             launch()
     finally:
         wp.config.kernel_cache_dir = before

@@ -15,7 +15,16 @@ import pytest
 from rich.console import Console
 
 from small_runs import run_into, write_run
-from warp_lcp.files.atomic import SUFFIX, TEMPORARY, make_folder, open_in_place, replacing, replacing_by_name, reserve, write_text
+from warp_lcp.files.atomic import (
+    SUFFIX,
+    TEMPORARY,
+    make_folder,
+    open_in_place,
+    replacing,
+    replacing_by_name,
+    reserve,
+    write_text,
+)
 from warp_lcp.render.render import Looks, render_run
 from warp_lcp.run.folder import OutputError
 from warp_lcp.run.folder_lock import LOCK, locked
@@ -57,7 +66,10 @@ volume = true
 forces = true
 checkpoint_every = 1
 """
-HIDDEN = {"run.json": [f".run.json{SUFFIX}", f".run.json.spare{SUFFIX}"], "scene.toml": [f".scene.toml{SUFFIX}"]}
+HIDDEN = {
+    "run.json": [f".run.json{SUFFIX}", f".run.json.spare{SUFFIX}"],
+    "scene.toml": [f".scene.toml{SUFFIX}"],
+}
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +105,13 @@ def names(whole: Path) -> list[str]:
     return [
         LOCK,
         *found,
-        *(hidden for name in found for hidden in HIDDEN.get(name, [f"{Path(name).parent / ('.' + Path(name).name)}{SUFFIX}"])),
+        *(
+            hidden
+            for name in found
+            for hidden in HIDDEN.get(
+                name, [f"{Path(name).parent / ('.' + Path(name).name)}{SUFFIX}"]
+            )
+        ),
     ]
 
 
@@ -111,15 +129,36 @@ def lay(link: Path, precious: Path) -> None:
 
 
 def content(precious: Path) -> dict[str, bytes]:
-    files = [precious] if precious.is_file() else [path for path in precious.rglob("*") if path.is_file()]
+    files = (
+        [precious]
+        if precious.is_file()
+        else [path for path in precious.rglob("*") if path.is_file()]
+    )
     return {str(path): path.read_bytes() for path in files}
 
 
 def test_everything_is_written(whole):
     kinds = {name.split("_0")[0] for name in names(whole)}
-    assert kinds >= {"run.lock", "run.json", "scene.toml", "log.csv", "probes.csv", "forces.csv", "profile.json", "particles.pvd",
-                     "frames", "frames/particles", "frames/grid", "frames/surface", "frames/density", "checkpoints", "checkpoints/step",
-                     "problems", "problems/README.md", "problems/problem"}  # fmt: skip
+    assert kinds >= {
+        "run.lock",
+        "run.json",
+        "scene.toml",
+        "log.csv",
+        "probes.csv",
+        "forces.csv",
+        "profile.json",
+        "particles.pvd",
+        "frames",
+        "frames/particles",
+        "frames/grid",
+        "frames/surface",
+        "frames/density",
+        "checkpoints",
+        "checkpoints/step",
+        "problems",
+        "problems/README.md",
+        "problems/problem",
+    }
 
 
 def test_a_resumed_run_writes_through_no_link(scene, whole, begun, tmp_path):
@@ -127,12 +166,19 @@ def test_a_resumed_run_writes_through_no_link(scene, whole, begun, tmp_path):
     for number, name in enumerate(names(whole)):
         if name == "problems":  # named by --record-problems, where the user wants it
             continue
-        out, precious = shutil.copytree(begun, tmp_path / f"{number}"), tmp_path / f"precious_{number}"
+        out, precious = (
+            shutil.copytree(begun, tmp_path / f"{number}"),
+            tmp_path / f"precious_{number}",
+        )
         lay(out / name, precious)
         before = content(precious)
         try:
             assert go(scene, out, resume=True).status == "finished", name
-            assert not [path for path in out.rglob("*") if path.is_symlink() and path.parent.name != "problems"], name
+            assert not [
+                path
+                for path in out.rglob("*")
+                if path.is_symlink() and path.parent.name != "problems"
+            ], name
         except OutputError as error:
             assert "is a link" in str(error), name
         assert content(precious) == before, name
@@ -166,7 +212,8 @@ def test_a_folder_that_becomes_a_link_while_it_runs(scene, tmp_path, name):
         def step(self, row: Any) -> None:
             super().step(row)
             if row["step"] == 2:
-                while not (out / "checkpoints" / "step_000001.npz").exists():  # written beside the run, after the first frame
+                # written beside the run, after the first frame
+                while not (out / "checkpoints" / "step_000001.npz").exists():
                     time.sleep(0.01)
                 shutil.copytree(out / name, elsewhere)
                 (out / name).rename(tmp_path / "before")  # at once: a thread may be writing
@@ -182,8 +229,13 @@ def test_a_folder_that_becomes_a_link_while_it_runs(scene, tmp_path, name):
 
 @pytest.fixture
 def drawn(dots, tmp_path_factory) -> Path:
-    cells = Cells("grid", np.array([[1, 1, 0], [2, 1, 0]]), 0.1, 2, {"pressure": np.ones(2, dtype=np.float32)})
-    return write_run(tmp_path_factory.mktemp("drawn") / "out", 2 * [[Points("particles", np.full((1, 3), 0.15, np.float32), {}), cells]])
+    cells = Cells(
+        "grid", np.array([[1, 1, 0], [2, 1, 0]]), 0.1, 2, {"pressure": np.ones(2, dtype=np.float32)}
+    )
+    return write_run(
+        tmp_path_factory.mktemp("drawn") / "out",
+        2 * [[Points("particles", np.full((1, 3), 0.15, np.float32), {}), cells]],
+    )
 
 
 @pytest.mark.parametrize("name", ["images", "images/slice_000000.png", "images/slice_000001.png"])
@@ -257,7 +309,10 @@ def test_a_lock_that_is_no_plain_file(tmp_path, kind):
         os.link(precious, lock)
     else:
         lock.symlink_to(precious if kind == "link" else tmp_path / "new")
-    with pytest.raises(OSError, match=r"is a link|has other hard links|not a plain file|directory"), locked(lock.parent):
+    with (
+        pytest.raises(OSError, match=r"is a link|has other hard links|not a plain file|directory"),
+        locked(lock.parent),
+    ):
         pass
     assert precious.read_text() == PRECIOUS
     assert not (tmp_path / "new").exists()

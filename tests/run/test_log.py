@@ -15,7 +15,9 @@ def test_rows_arrive_at_once_and_never_say_nan(tmp_path):
     log.append({"step": 1, "time": np.float64(0.1), "speed": None, "status": "A, B"})
     log.append({"step": 2, "time": 0.30000000000000004, "speed": math.nan, "status": None})
     log.append({"step": 3, "speed": True})
-    assert (tmp_path / "log.csv").read_text() == 'step,time,speed,status\n1,0.1,,"A, B"\n2,0.30000000000000004,,\n3,,1,\n'
+    assert (
+        tmp_path / "log.csv"
+    ).read_text() == 'step,time,speed,status\n1,0.1,,"A, B"\n2,0.30000000000000004,,\n3,,1,\n'
     log.close()
 
 

@@ -25,7 +25,9 @@ from warp_lcp.simulation import Surface
 Names = dict[str, int]  # of a folder, with the numbers of what they stand for
 AUDITED = {"open", "os.rename", "os.remove", "os.mkdir", "os.truncate"}
 
-pytestmark = pytest.mark.skipif(os.name == "nt", reason="folders cannot be brought to the disk there")
+pytestmark = pytest.mark.skipif(
+    os.name == "nt", reason="folders cannot be brought to the disk there"
+)
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,8 @@ class Moment:
         names: of each folder, as they are.
         durable: of each folder, as `fsync` has brought them to the disk.
         files: what `fsync` has brought to the disk of each file.
-        promised: the newest step whose checkpoint had been written, for all that the run knew; -1 if none.
+        promised: the newest step whose checkpoint had been written, for all that the run knew; -1
+            if none.
     """
 
     names: dict[int, Names]
@@ -55,7 +58,8 @@ class Moment:
         Args:
             root: the number of the folder above.
             out: the folder, which is not there.
-            ahead: names have reached the disk at once, before what is in the files; they may also come as late as they can.
+            ahead: names have reached the disk at once, before what is in the files; they may also
+                come as late as they can.
         """
         known = self.names if ahead else self.durable
         waiting = [(known.get(root, {}).get(out.name), out)]
@@ -93,7 +97,10 @@ class Disk:
 
     def names(self) -> dict[int, Names]:
         folders = [self.root, *(path for path in self.root.rglob("*") if path.is_dir())]
-        return {folder.stat().st_ino: {entry.name: entry.inode() for entry in os.scandir(folder)} for folder in folders}
+        return {
+            folder.stat().st_ino: {entry.name: entry.inode() for entry in os.scandir(folder)}
+            for folder in folders
+        }
 
     def look(self) -> None:
         try:
@@ -101,7 +108,12 @@ class Disk:
         except FileNotFoundError:  # another thread was faster: the next moment is soon
             return
         last = self.moments[-1] if self.moments else None
-        moment = Moment(now, {key: dict(value) for key, value in self.durable.items()}, dict(self.files), self.promised)
+        moment = Moment(
+            now,
+            {key: dict(value) for key, value in self.durable.items()},
+            dict(self.files),
+            self.promised,
+        )
         if moment != last:
             self.moments.append(moment)
 
@@ -114,7 +126,9 @@ class Disk:
             status = os.fstat(descriptor)
             path = os.readlink(f"/proc/self/fd/{descriptor}")
             if os.path.isdir(path):
-                self.durable[status.st_ino] = {entry.name: entry.inode() for entry in os.scandir(path)}
+                self.durable[status.st_ino] = {
+                    entry.name: entry.inode() for entry in os.scandir(path)
+                }
                 self.calls.append(("fsync folder", os.path.basename(path)))
             else:
                 self.files[status.st_ino] = Path(path).read_bytes()
@@ -124,13 +138,21 @@ class Disk:
 
     def hook(self, event: str, arguments: tuple) -> None:
         name = str(arguments[0]) if event in AUDITED else ""
-        if not self.on or self._busy or not (name.startswith(str(self.root)) or name.endswith(atomic.SUFFIX)):
+        if (
+            not self.on
+            or self._busy
+            or not (name.startswith(str(self.root)) or name.endswith(atomic.SUFFIX))
+        ):
             return
         with self.quietly():
             self.look()
             if event == "os.rename":
                 self.calls.append(("rename", os.path.basename(str(arguments[1]))))
-            elif event == "open" and isinstance(arguments[2], int) and arguments[2] & os.O_ACCMODE != os.O_RDONLY:
+            elif (
+                event == "open"
+                and isinstance(arguments[2], int)
+                and arguments[2] & os.O_ACCMODE != os.O_RDONLY
+            ):
                 self.calls.append(("open", os.path.basename(str(arguments[0]))))
 
     @contextmanager
@@ -170,7 +192,9 @@ def disk(tmp_path, monkeypatch) -> Iterator[Disk]:
     disk.close()
 
 
-def survives(scene: Path, folder: Path, disk: Disk, run: Callable[[Path], Any], stride: int) -> list[int]:
+def survives(
+    scene: Path, folder: Path, disk: Disk, run: Callable[[Path], Any], stride: int
+) -> list[int]:
     """Let the power fail at every `stride`-th moment of a run; return the steps that were gone on from."""
     whole = folder / "whole"
     go(scene, whole)
@@ -186,7 +210,12 @@ def survives(scene: Path, folder: Path, disk: Disk, run: Callable[[Path], Any], 
             out.parent.mkdir()
             moment.restore(disk.number, out, ahead=ahead)
             step = revive(scene, out)
-            assert step >= moment.promised or moment.promised < 0, (index, ahead, step, moment.promised)
+            assert step >= moment.promised or moment.promised < 0, (
+                index,
+                ahead,
+                step,
+                moment.promised,
+            )
             assert contents(out) == expected, (index, ahead)
             steps.append(step)
             shutil.rmtree(out.parent)
@@ -220,7 +249,11 @@ def test_over_another_run(disk, scene_file, tmp_path, stride):
     go(scene_file, tmp_path / "whole")
     twice(disk.root / "out")
     disk.on = False
-    begun = [moment for moment in disk.moments if b'"running"' in moment.durable_file(disk.number, "out", "run.json")]
+    begun = [
+        moment
+        for moment in disk.moments
+        if b'"running"' in moment.durable_file(disk.number, "out", "run.json")
+    ]
     early = [moment for moment in begun if moment.promised < 0]
     for index, moment in enumerate([*early[:: stride // 6 + 1], *begun[::stride]]):
         out = tmp_path / f"{index}" / "out"
@@ -235,8 +268,11 @@ def test_the_end_is_durable(disk, scene_file, tmp_path):
     disk.look()
     disk.moments[-1].restore(disk.number, tmp_path / "out", ahead=False)
     found = contents(tmp_path / "out")
-    assert found == found | contents(disk.root / "out")  # a checkpoint that was deleted may be there again
-    assert (tmp_path / "out" / "run.json").read_bytes() == (disk.root / "out" / "run.json").read_bytes()
+    # a checkpoint that was deleted may be there again
+    assert found == found | contents(disk.root / "out")
+    assert (tmp_path / "out" / "run.json").read_bytes() == (
+        disk.root / "out" / "run.json"
+    ).read_bytes()
 
 
 def _problem(folder: Path) -> None:
@@ -261,4 +297,9 @@ def test_the_order_of_calls(disk, name):
     WRITERS[name](folder / name)
     calls = [(call, re.sub(r"\.[0-9a-f]{16}\.part$", ".part", file)) for call, file in disk.calls]
     calls = [call for call in calls if call[1] in (f".{name}.part", name, "files")]
-    assert calls[-4:] == [("open", f".{name}.part"), ("fsync", f".{name}.part"), ("rename", name), ("fsync folder", "files")]
+    assert calls[-4:] == [
+        ("open", f".{name}.part"),
+        ("fsync", f".{name}.part"),
+        ("rename", name),
+        ("fsync folder", "files"),
+    ]

@@ -13,7 +13,10 @@ from warp_lcp.simulation import NoStopwatch
 
 def test_stages_add_up():
     profile = Profile("cpu")
-    field, vectors = wp.zeros(10, dtype=wp.float32, device="cpu"), wp.zeros((2, 3), dtype=wp.vec3, device="cpu")
+    field, vectors = (
+        wp.zeros(10, dtype=wp.float32, device="cpu"),
+        wp.zeros((2, 3), dtype=wp.vec3, device="cpu"),
+    )
     for _ in range(3):
         with profile.stage("a", field, None, vectors):
             time.sleep(0.002)
@@ -76,7 +79,15 @@ def test_the_file_has_every_stage(tmp_path):
     data = json.loads((tmp_path / "profile.json").read_text())
     assert (data["device"], data["steps"], data["seconds"]) == ("cpu", 7, 1.5)
     assert [stage["stage"] for stage in data["stages"]] == ["a"]
-    assert data["stages"][0].keys() == {"stage", "beside", "calls", "seconds", "first_seconds", "bytes", "shared"}
+    assert data["stages"][0].keys() == {
+        "stage",
+        "beside",
+        "calls",
+        "seconds",
+        "first_seconds",
+        "bytes",
+        "shared",
+    }
 
 
 def test_kernels_that_load_are_a_stage_of_their_own():

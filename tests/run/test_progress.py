@@ -8,7 +8,14 @@ from rich.progress import Progress
 
 from warp_lcp.run.progress import WINDOW, Bar, Count, Lines, describe, time_left
 
-ROW = {"step": 3, "time": 0.5, "dt": 0.01, "solve_iterations": 5, "solve_residual": 2.5e-5, "volume": None}
+ROW = {
+    "step": 3,
+    "time": 0.5,
+    "dt": 0.01,
+    "solve_iterations": 5,
+    "solve_residual": 2.5e-5,
+    "volume": None,
+}
 
 
 def test_time_left_follows_the_recent_rate():
@@ -43,8 +50,15 @@ def test_describe_leaves_out_what_is_not_there():
 def test_the_residual_shown_is_the_one_that_the_tolerance_is_of():
     sand = ROW | {"solve_status": "STAGNATED", "solve_residual": 9.4e-3, "coupled_residual": 2e-3}
     assert describe(sand).endswith("residual 2.0e-03 (STAGNATED)")
-    assert describe(sand | {"solve_status": "CONVERGED", "coupled_residual": 8e-4}).endswith("residual 8.0e-04")
-    assert describe({"step": 1, "time": 0.5, "dt": 0.01, "solve_status": None, "coupled_residual": None}) == "step 1  dt 0.01 s"
+    assert describe(sand | {"solve_status": "CONVERGED", "coupled_residual": 8e-4}).endswith(
+        "residual 8.0e-04"
+    )
+    assert (
+        describe(
+            {"step": 1, "time": 0.5, "dt": 0.01, "solve_status": None, "coupled_residual": None}
+        )
+        == "step 1  dt 0.01 s"
+    )
 
 
 def test_lines_have_one_a_frame():
@@ -81,7 +95,8 @@ def test_a_count_has_a_line_now_and_then():
         for done in range(1, 13):
             now += 2.0
             told(done, 12)
-    told_of = [3, 6, 9]  # each 5 s later than the one before, and not the end, which has words of its own
+    # each 5 s later than the one before, and not the end, which has words of its own
+    told_of = [3, 6, 9]
     lines = [f"drawing: {done} of 12 images  0:00:{2 * (12 - done):02d} left" for done in told_of]
     assert stream.getvalue().splitlines() == lines
     quiet = io.StringIO()

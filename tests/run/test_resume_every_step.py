@@ -34,8 +34,15 @@ def test_built_in_scenes(name):
 
 def test_a_solid_that_moves_through_a_band():
     """The interior counts the cells where the solid was, not those where the scene places it."""
-    solid = {"shape": "sphere", "center": [0.8, 0.25], "radius": 0.12, "motion": {"kind": "translation", "velocity": [1.2, 0.3]}}
-    assert differences_by_step(LiquidScene.model_validate(IN_BAND | {"solid": [solid]}), 17, 4) == {}
+    solid = {
+        "shape": "sphere",
+        "center": [0.8, 0.25],
+        "radius": 0.12,
+        "motion": {"kind": "translation", "velocity": [1.2, 0.3]},
+    }
+    assert (
+        differences_by_step(LiquidScene.model_validate(IN_BAND | {"solid": [solid]}), 17, 4) == {}
+    )
 
 
 def test_a_band_whose_surface_pulls_itself_together():

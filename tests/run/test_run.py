@@ -56,10 +56,15 @@ def record(out: Path) -> dict[str, Any]:
 
 def contents(out: Path) -> dict[str, Any]:
     """Return what two equal runs have in common: every frame, collection and log row, and the last checkpoint."""
-    found: dict[str, Any] = {str(p.relative_to(out)): p.read_bytes() for p in [*out.glob("frames/*"), *out.glob("*.pvd")]}
+    found: dict[str, Any] = {
+        str(p.relative_to(out)): p.read_bytes() for p in [*out.glob("frames/*"), *out.glob("*.pvd")]
+    }
     found["log"] = [{k: v for k, v in row.items() if k != VOLATILE} for row in rows(out)]
     newest = max(out.glob("checkpoints/*.npz"))
-    found["checkpoint"] = (newest.name, {name: array.tobytes() for name, array in np.load(newest).items()})
+    found["checkpoint"] = (
+        newest.name,
+        {name: array.tobytes() for name, array in np.load(newest).items()},
+    )
     return found
 
 
@@ -124,11 +129,25 @@ def test_log_and_record(scene_file, tmp_path):
     out = tmp_path / "out"
     go(scene_file, out)
     log = rows(out)
-    assert list(log[0]) == ["step", "time", "dt", "max_speed", "solve_status", "volume", "retries", "seconds"]
+    assert list(log[0]) == [
+        "step",
+        "time",
+        "dt",
+        "max_speed",
+        "solve_status",
+        "volume",
+        "retries",
+        "seconds",
+    ]
     assert [int(row["step"]) for row in log] == list(range(1, len(log) + 1))
     assert {row["volume"] for row in log} == {""}
     written = record(out)
-    assert (written["status"], written["steps"], written["frames"], written["device"]) == ("finished", len(log), 10, "cpu")
+    assert (written["status"], written["steps"], written["frames"], written["device"]) == (
+        "finished",
+        len(log),
+        10,
+        "cpu",
+    )
     assert written["resumed_from_step"] is None
     assert written["versions"].keys() >= {"warp-lcp", "warp-lang", "numpy", "python"}
     assert load_scene(out / "scene.toml") == load_scene(scene_file)
@@ -144,7 +163,9 @@ def test_checkpoints_are_kept_sparingly(scene_file, tmp_path):
 @pytest.mark.parametrize("kept", [1, 2, 6])
 def test_as_many_checkpoints_are_kept_as_the_scene_says(dots, scene_file, tmp_path, kept):
     most = []
-    dots.before_step = lambda simulation, dt: most.append(len(list(tmp_path.glob("out/checkpoints/step_*.npz"))))
+    dots.before_step = lambda simulation, dt: most.append(
+        len(list(tmp_path.glob("out/checkpoints/step_*.npz")))
+    )
     result = go(scene_file, tmp_path / "out", f"output.checkpoints_kept={kept}")
     names = sorted(path.name for path in (tmp_path / "out" / "checkpoints").iterdir())
     every = [*range(0, result.steps, 4), result.steps]
@@ -159,7 +180,11 @@ def test_checkpoints_by_the_clock(dots, scene_file, tmp_path, monkeypatch):
     monkeypatch.setattr(run_module.clock, "monotonic", lambda: now[0])
     written = []
     write = CheckpointFolder.write
-    monkeypatch.setattr(CheckpointFolder, "write", lambda self, checkpoint: (written.append(checkpoint.step), write(self, checkpoint))[1])
+    monkeypatch.setattr(
+        CheckpointFolder,
+        "write",
+        lambda self, checkpoint: (written.append(checkpoint.step), write(self, checkpoint))[1],
+    )
 
     def before_step(simulation: Any, dt: float) -> None:
         now[0] += 60.0 * (simulation.step_count % 3 == 2)
@@ -170,7 +195,13 @@ def test_checkpoints_by_the_clock(dots, scene_file, tmp_path, monkeypatch):
     assert steps > 18
     assert written == sorted({*range(0, steps, 6), steps})
     written.clear()
-    steps = go(scene_file, tmp_path / "both", "output.checkpoint_every=5", "output.checkpoint_minutes=1.5", last_frame=3).steps
+    steps = go(
+        scene_file,
+        tmp_path / "both",
+        "output.checkpoint_every=5",
+        "output.checkpoint_minutes=1.5",
+        last_frame=3,
+    ).steps
     assert written[:5] == [0, 5, 9, 10, 15]  # the clock starts anew with each
     assert written[-1] == steps
 
@@ -198,7 +229,10 @@ def test_a_killed_run_resumes_from_its_last_checkpoint(dots, scene_file, tmp_pat
     dots.before_step = fail_on(15, error=KeyboardInterrupt)  # the second Ctrl-C
     with pytest.raises(KeyboardInterrupt):
         go(scene_file, parts)
-    assert (record(parts)["status"], record(parts)["reason"]) == ("failed", "the program ended unexpectedly")
+    assert (record(parts)["status"], record(parts)["reason"]) == (
+        "failed",
+        "the program ended unexpectedly",
+    )
     dots.before_step = lambda simulation, dt: None
     assert go(scene_file, parts, resume=True).resumed_from_step == 12
     assert contents(parts) == contents(whole)
@@ -320,7 +354,9 @@ def test_a_full_disk_ends_the_run_with_earlier_files_intact(scene_file, tmp_path
     assert result.status == "failed"
     assert result.reason.startswith("the disk is full")
     assert record(out)["status"] == "failed"
-    assert sorted(path.name for path in (out / "frames").glob("particles*")) == [f"particles_{k:06d}.vtu" for k in range(4)]
+    assert sorted(path.name for path in (out / "frames").glob("particles*")) == [
+        f"particles_{k:06d}.vtu" for k in range(4)
+    ]
     monkeypatch.undo()
 
 
@@ -346,7 +382,9 @@ def test_no_checkpoint_is_ahead_of_its_frames(dots, scene_file, tmp_path, monkey
         steps = sorted(out.glob("checkpoints/*.npz"))
         if steps:
             time_reached = float(np.load(steps[-1])["state/time"])
-            ahead.append(int(time_reached * 20 + 1e-6) - (len(list(out.glob("frames/particles_*.vtu"))) - 1))
+            ahead.append(
+                int(time_reached * 20 + 1e-6) - (len(list(out.glob("frames/particles_*.vtu"))) - 1)
+            )
 
     dots.before_step = look
     result = go(scene_file, out)
@@ -355,26 +393,34 @@ def test_no_checkpoint_is_ahead_of_its_frames(dots, scene_file, tmp_path, monkey
     assert max(ahead) <= 0
 
 
-def test_a_frame_that_fails_late_ends_the_run_without_a_checkpoint_after_it(dots, scene_file, tmp_path, monkeypatch):
+def test_a_frame_that_fails_late_ends_the_run_without_a_checkpoint_after_it(
+    dots, scene_file, tmp_path, monkeypatch
+):
     whole, out = tmp_path / "whole", tmp_path / "out"
     go(scene_file, whole)
     slow_frames(monkeypatch, 0.01, fails=3)
     result = go(scene_file, out)
     assert (result.status, result.frames) == ("failed", 2)
     assert result.reason.startswith("the disk is full")
-    assert sorted(path.name for path in out.glob("frames/particles*")) == [f"particles_{k:06d}.vtu" for k in range(3)]
+    assert sorted(path.name for path in out.glob("frames/particles*")) == [
+        f"particles_{k:06d}.vtu" for k in range(3)
+    ]
     monkeypatch.undo()
     monkeypatch.setattr(
-        "warp_lcp.scene.simulator.entry_points", lambda group: [type("Entry", (), {"name": "dots", "load": lambda _: dots})()]
+        "warp_lcp.scene.simulator.entry_points",
+        lambda group: [type("Entry", (), {"name": "dots", "load": lambda _: dots})()],
     )
     assert go(scene_file, out, resume=True).status == "finished"
     assert contents(out) == contents(whole)
 
 
-def test_a_step_that_fails_after_a_frame_did_writes_no_checkpoint(dots, scene_file, tmp_path, monkeypatch):
+def test_a_step_that_fails_after_a_frame_did_writes_no_checkpoint(
+    dots, scene_file, tmp_path, monkeypatch
+):
     out = tmp_path / "out"
     slow_frames(monkeypatch, 0.2, fails=1)
-    dots.before_step = fail_on(6)  # soon after frame 1, and before it is found that it cannot be written
+    # soon after frame 1, and before it is found that it cannot be written
+    dots.before_step = fail_on(6)
     result = go(scene_file, out, "output.checkpoint_every=50")
     assert result.status == "failed"
     assert "no at 6" in result.reason
@@ -386,14 +432,22 @@ def test_a_profile_counts_every_stage(scene_file, tmp_path):
     out, profile = tmp_path / "out", Profile("cpu")
     result = go(scene_file, out, profile=profile)
     written = json.loads((out / "profile.json").read_text())
-    assert (written["device"], written["steps"], written["seconds"]) == ("cpu", result.steps, result.seconds)
+    assert (written["device"], written["steps"], written["seconds"]) == (
+        "cpu",
+        result.steps,
+        result.seconds,
+    )
     stages = {stage["stage"]: stage for stage in written["stages"]}
     assert stages["frames, written"]["calls"] == 11
     assert stages["frames, written"]["beside"]
-    assert stages["frames, written"]["bytes"] == sum(path.stat().st_size for path in out.glob("frames/*.vtu"))
+    assert stages["frames, written"]["bytes"] == sum(
+        path.stat().st_size for path in out.glob("frames/*.vtu")
+    )
     assert stages["checkpoints"]["calls"] == 1 + result.steps // 4 + (result.steps % 4 > 0)
     assert stages["checkpoints"]["bytes"] > 0
-    assert sum(stage["seconds"] for stage in stages.values() if not stage["beside"]) <= result.seconds
+    assert (
+        sum(stage["seconds"] for stage in stages.values() if not stage["beside"]) <= result.seconds
+    )
 
 
 def test_only_a_profiled_run_measures(dots, scene_file, tmp_path, monkeypatch):
@@ -417,9 +471,16 @@ def test_only_a_profiled_run_measures(dots, scene_file, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("code", "reason"), [(errno.ENOSPC, "the disk is full"), (errno.EROFS, "[Errno 30] Read-only"), (errno.EFBIG, "[Errno 27] File too")]
+    ("code", "reason"),
+    [
+        (errno.ENOSPC, "the disk is full"),
+        (errno.EROFS, "[Errno 30] Read-only"),
+        (errno.EFBIG, "[Errno 27] File too"),
+    ],
 )
-def test_a_checkpoint_that_cannot_be_written_leaves_the_last_good_one(dots, scene_file, tmp_path, monkeypatch, code, reason):
+def test_a_checkpoint_that_cannot_be_written_leaves_the_last_good_one(
+    dots, scene_file, tmp_path, monkeypatch, code, reason
+):
     whole, out = tmp_path / "whole", tmp_path / "out"
     go(scene_file, whole)
     save, calls = np.savez, []
@@ -463,7 +524,9 @@ def test_a_scene_that_cannot_be_simulated(dots, scene_file, tmp_path):
 def test_a_simulator_that_cannot_change_grids(scene_file, tmp_path):
     out = tmp_path / "out"
     go(scene_file, out, stop=stop_at(5))
-    with pytest.raises(SceneError, match=r"domain.resolution: must stay 8: dots cannot change grids"):
+    with pytest.raises(
+        SceneError, match=r"domain.resolution: must stay 8: dots cannot change grids"
+    ):
         go(scene_file, out, "domain.resolution=16", resume=True)
     assert record(out)["status"] == "stopped"  # nothing was touched
     assert go(scene_file, out, resume=True).resumed_from_step == 5

@@ -11,7 +11,15 @@ from warp_lcp.run.folder import OutputError, RunFolder, RunRecord
 from warp_lcp.scene.scene_file import load_scene
 
 SPARE = ".run.json.spare.part"  # room for the last run.json, while a run is on
-RUN_FILES = ["run.json", "scene.toml", "log.csv", "profile.json", "particles.pvd", "frames/grid_000003.vtu", "checkpoints/step_000050.npz"]
+RUN_FILES = [
+    "run.json",
+    "scene.toml",
+    "log.csv",
+    "profile.json",
+    "particles.pvd",
+    "frames/grid_000003.vtu",
+    "checkpoints/step_000050.npz",
+]
 
 
 @pytest.fixture
@@ -58,7 +66,14 @@ def test_leftovers_of_a_killed_run_go_too(folder):
 
 
 @pytest.mark.parametrize(
-    "name", ["notes.txt", "frames/photo.png", "checkpoints/deep/step_000001.npz", "frames2/grid_000001.vtu", ".git/config"]
+    "name",
+    [
+        "notes.txt",
+        "frames/photo.png",
+        "checkpoints/deep/step_000001.npz",
+        "frames2/grid_000001.vtu",
+        ".git/config",
+    ],
 )
 def test_force_never_deletes_what_is_no_runs(folder, name):
     fill(folder, [*RUN_FILES, name])
@@ -146,7 +161,12 @@ def changed(folder: RunFolder, scene_file: Path, *overrides: str) -> RunFolder:
 
 def test_another_scene_is_not_resumed(folder, scene_file):
     begun(folder)
-    asked = ["time.frames_per_second=25.0", "physics.density=900.0", "time.duration=9.0", "output.grid=false"]
+    asked = [
+        "time.frames_per_second=25.0",
+        "physics.density=900.0",
+        "time.duration=9.0",
+        "output.grid=false",
+    ]
     with pytest.raises(OutputError) as caught:
         changed(folder, scene_file, *asked).resume()
     text = str(caught.value)
@@ -159,7 +179,13 @@ def test_another_scene_is_not_resumed(folder, scene_file):
 
 def test_what_may_change_is_told_with_both_values(folder, scene_file):
     begun(folder).checkpoints.write(Checkpoint(8, 0.4, {}))
-    asked = ["time.duration=9.0", "solver.tolerance=1e-3", "output.checkpoints_kept=5", "time.cfl=1.0", "scene.name=other"]
+    asked = [
+        "time.duration=9.0",
+        "solver.tolerance=1e-3",
+        "output.checkpoints_kept=5",
+        "time.cfl=1.0",
+        "scene.name=other",
+    ]
     continued = changed(folder, scene_file, *asked).resume()
     assert continued.changed == [
         "output.checkpoints_kept: 3 before, 5 now",
@@ -170,13 +196,17 @@ def test_what_may_change_is_told_with_both_values(folder, scene_file):
     ]
     assert continued.resampled_from is None
     (remark,) = continued.remarks
-    assert remark.startswith("from step 8 on, steps differ from those of the original run: solver.tolerance")
+    assert remark.startswith(
+        "from step 8 on, steps differ from those of the original run: solver.tolerance"
+    )
     assert "time.duration" not in remark
 
 
 def test_a_duration_that_ends_before_the_checkpoint_would_lose_frames(folder, scene_file):
     begun(folder).checkpoints.write(Checkpoint(8, 0.4, {}))
-    with pytest.raises(OutputError, match=r"time.duration = 0.3 s is less than the checkpoint's time, 0.4 s"):
+    with pytest.raises(
+        OutputError, match=r"time.duration = 0.3 s is less than the checkpoint's time, 0.4 s"
+    ):
         changed(folder, scene_file, "time.duration=0.3").resume()
     assert changed(folder, scene_file, "time.duration=0.4").resume().checkpoint is not None
 
@@ -185,7 +215,8 @@ def test_another_resolution_is_told_from_the_checkpoint(folder, scene_file):
     begun(folder).checkpoints.write(Checkpoint(8, 0.4, {}))
     finer = changed(folder, scene_file, "domain.resolution=16")
     assert finer.resume().resampled_from == 8
-    finer.go_on(RunRecord("dots", "dots", "cpu"), 8)  # killed here: scene.toml is new, the checkpoint is old
+    # killed here: scene.toml is new, the checkpoint is old
+    finer.go_on(RunRecord("dots", "dots", "cpu"), 8)
     assert finer.resume().resampled_from == 8
 
 
@@ -218,12 +249,20 @@ def test_a_mesh_counts_by_what_is_in_it(dots, tmp_path):
     (tmp_path / "b").rename(tmp_path / "a")
     mesh.write_text("v 0 0 1\n")
     edited = RunFolder(folder.path, load_scene(tmp_path / "a" / "scene.toml"))
-    with pytest.raises(OutputError, match=r"solid\[0\].file = .*thing.obj.*: the content of the file has changed since the run began"):
+    with pytest.raises(
+        OutputError,
+        match=r"solid\[0\].file = .*thing.obj.*: the content of the file has changed since the run "
+        r"began",
+    ):
         edited.resume()
-    assert edited.checkpoints.newest()[0] is None  # nor does a checkpoint by itself take the new mesh for the old
+    # nor does a checkpoint by itself take the new mesh for the old
+    assert edited.checkpoints.newest()[0] is None
 
     mesh.write_text("v 0 0 0\n")
-    assert RunFolder(folder.path, load_scene(tmp_path / "a" / "scene.toml")).resume().checkpoint is not None
+    assert (
+        RunFolder(folder.path, load_scene(tmp_path / "a" / "scene.toml")).resume().checkpoint
+        is not None
+    )
 
 
 def test_other_software_is_told(folder):
@@ -240,16 +279,40 @@ def test_going_on_clears_what_was_half_written(folder):
     begun(folder)
     for step in (4, 8, 12):
         folder.checkpoints.write(Checkpoint(step, step / 20, {}))
-    fill(folder, [".log.csv.part", "frames/.grid_000004.vtu.part", "checkpoints/.step_000016.npz.part", "frames/grid_000001.vtu"])
+    fill(
+        folder,
+        [
+            ".log.csv.part",
+            "frames/.grid_000004.vtu.part",
+            "checkpoints/.step_000016.npz.part",
+            "frames/grid_000001.vtu",
+        ],
+    )
     folder.go_on(RunRecord("dots", "dots", "cpu"), 8)
     assert [path.name for path in folder.path.rglob(".*")] == [SPARE]
-    assert sorted(path.name for path in folder.checkpoints.folder.iterdir()) == ["refused_000012.npz", "step_000004.npz", "step_000008.npz"]
+    assert sorted(path.name for path in folder.checkpoints.folder.iterdir()) == [
+        "refused_000012.npz",
+        "step_000004.npz",
+        "step_000008.npz",
+    ]
     assert (folder.path / "frames" / "grid_000001.vtu").is_file()
     folder.check_new(force=True)  # all of it is a run's
 
 
 def test_fingerprint_ignores_what_may_differ(scene_file: Path):
-    same = load_scene(scene_file, ["time.duration=9.0", "output.checkpoint_every=7", "time.dt_max=0.01", "domain.resolution=16"])
+    same = load_scene(
+        scene_file,
+        [
+            "time.duration=9.0",
+            "output.checkpoint_every=7",
+            "time.dt_max=0.01",
+            "domain.resolution=16",
+        ],
+    )
     assert fingerprint(load_scene(scene_file)) == fingerprint(same)
-    assert fingerprint(load_scene(scene_file)) != fingerprint(load_scene(scene_file, ["time.frames_per_second=3.0"]))
-    assert fingerprint(load_scene(scene_file)) != fingerprint(load_scene(scene_file, ["domain.size=[1.0, 0.5]"]))
+    assert fingerprint(load_scene(scene_file)) != fingerprint(
+        load_scene(scene_file, ["time.frames_per_second=3.0"])
+    )
+    assert fingerprint(load_scene(scene_file)) != fingerprint(
+        load_scene(scene_file, ["domain.size=[1.0, 0.5]"])
+    )

@@ -32,14 +32,20 @@ class Clockwork:
         self.period, self.fails = draw.uniform(40.0, 80.0) * self.middle, draw.random() < 0.3
         many, length = draw.integers(0, 12), self.bounds.duration
         times = draw.uniform(-0.1, 1.1, many) * length
-        frames = self.bounds.frame_time(3) + draw.uniform(-1.0, 1.0, 4) * 10.0 ** draw.uniform(-7.0, -2.0, 4)  # close to a frame
+        # close to a frame
+        frames = self.bounds.frame_time(3) + draw.uniform(-1.0, 1.0, 4) * 10.0 ** draw.uniform(
+            -7.0, -2.0, 4
+        )
         close = times[:3] + 10.0 ** draw.uniform(-7.0, -2.0, len(times[:3]))  # to each other
-        dense = np.arange(0.3, 0.6, 10.0 ** draw.uniform(-3.0, -1.5)) if draw.random() < 0.3 else []  # keyframes that were recorded
+        # keyframes that were recorded
+        dense = np.arange(0.3, 0.6, 10.0 ** draw.uniform(-3.0, -1.5)) if draw.random() < 0.3 else []
         self.times = np.sort(np.concatenate([times, frames, close, dense]))
         self.time, self.step_count = 0.0, 0
 
     def stable_dt(self) -> float:
-        return float(self.middle * (1.0 + self.depth * np.sin(2.0 * np.pi * self.time / self.period)))
+        return float(
+            self.middle * (1.0 + self.depth * np.sin(2.0 * np.pi * self.time / self.period))
+        )
 
     def events(self, until: float) -> list[float]:
         return [time for time in self.times.tolist() if self.time < time <= until]
@@ -61,7 +67,9 @@ def run(clock: Any, stop: int = 10**6) -> list[tuple[float, float, int, float]]:
             start, stable = clock.time, clock.stable_dt()
             dt, retries, _ = take_step(clock, stable, end, bounds)
             assert clock.time == start + dt
-            rows.append((start, clock.time, retries, min(max(stable, bounds.dt_min), bounds.dt_max)))
+            rows.append(
+                (start, clock.time, retries, min(max(stable, bounds.dt_min), bounds.dt_max))
+            )
     return rows
 
 
@@ -71,7 +79,9 @@ def check(seed: int) -> None:
     rows = np.array(run(clock))
     starts, ends, retried, allowed = rows.T
     steps = ends - starts
-    frames = np.array([clock.bounds.frame_time(frame) for frame in range(clock.bounds.frame_count + 1)])
+    frames = np.array(
+        [clock.bounds.frame_time(frame) for frame in range(clock.bounds.frame_count + 1)]
+    )
     assert np.abs(ends[:, None] - frames[1:]).min(axis=0).max() < ROUNDING
     assert (steps <= allowed * (1.0 + ROUNDING)).all()
 
@@ -90,7 +100,10 @@ def check(seed: int) -> None:
             continue
         number = int(np.searchsorted(ends, time))  # a step runs across
         soon = time - starts[number] < SHARE * allowed[number]
-        late = np.abs(frames - ends[number]).min() < ROUNDING and ends[number] - time < SHARE * SMOOTH * allowed[number]
+        late = (
+            np.abs(frames - ends[number]).min() < ROUNDING
+            and ends[number] - time < SHARE * SMOOTH * allowed[number]
+        )
         before_another = np.abs(clock.times - ends[number]).min() < ROUNDING
         assert soon or late or before_another or retried[number] > 0
     assert len(rows) <= 2 * len(frames) + 4.0 * np.sum(1.0 / allowed * steps) + 2 * len(clock.times)
@@ -123,7 +136,9 @@ def test_any_run_hits_its_frames_and_has_no_slivers() -> None:
     ],
 )
 def test_events_within_a_step(remaining: float, events: list[float], expected: float) -> None:
-    assert plan_dt(0.05, remaining, Time(duration=1.0, dt_max=0.1), events) == pytest.approx(expected, rel=1e-12)
+    assert plan_dt(0.05, remaining, Time(duration=1.0, dt_max=0.1), events) == pytest.approx(
+        expected, rel=1e-12
+    )
 
 
 def test_a_simulation_in_which_nothing_is_known_to_happen_needs_no_events() -> None:

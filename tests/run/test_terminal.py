@@ -38,12 +38,16 @@ MTX = "%%MatrixMarket matrix coordinate real general\n"
 def call(*arguments: object) -> str:
     """Run a command; return all that it wrote, which holds nothing but printing characters and its own lines."""
     result: Result = CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
-    assert result.exception is None or isinstance(result.exception, SystemExit), repr(result.exception)
+    assert result.exception is None or isinstance(result.exception, SystemExit), repr(
+        result.exception
+    )
     written = result.stdout + result.stderr
     odd = {c for c in written if not c.isprintable() and c not in "\n\t"}
     assert not odd, (arguments, odd)
     if FORGED in " ".join(map(str, arguments)) or result.exit_code:
-        assert not any(line.lstrip("│ ").startswith(FORGED) for line in written.splitlines()), arguments
+        assert not any(line.lstrip("│ ").startswith(FORGED) for line in written.splitlines()), (
+            arguments
+        )
     return written
 
 
@@ -85,7 +89,13 @@ def hostile(text: str, folder: Path, scene: Path) -> None:
     for command in ("run", "check", "render", "view", "solve", "tune", "bench", text):
         call(command, text)
         call(command, folder / text)
-    for more in (["--set", text], ["--set", f"scene.{text}=1"], ["--set", f"scene.name={text}"], ["--device", text], [f"--{text}"]):
+    for more in (
+        ["--set", text],
+        ["--set", f"scene.{text}=1"],
+        ["--set", f"scene.name={text}"],
+        ["--device", text],
+        [f"--{text}"],
+    ):
         call("check", scene, *more)
     for command in ("scenes", "info"):
         call(command, text)
@@ -93,7 +103,9 @@ def hostile(text: str, folder: Path, scene: Path) -> None:
     call("bench", "solvers", "--compare", text, text)
 
 
-@pytest.mark.parametrize("text", [ALL, *[pytest.param(text, marks=pytest.mark.slow) for text in WAYS]], ids=ascii)
+@pytest.mark.parametrize(
+    "text", [ALL, *[pytest.param(text, marks=pytest.mark.slow) for text in WAYS]], ids=ascii
+)
 def test_every_command_shows_what_is_hostile(scene_file, tmp_path, monkeypatch, text):
     monkeypatch.chdir(tmp_path)
     hostile(text, tmp_path / "x", scene_file)
@@ -104,15 +116,29 @@ def test_every_command_shows_what_is_hostile(scene_file, tmp_path, monkeypatch, 
 def test_every_command_shows_random_text(scene_file, tmp_path, monkeypatch, seed):
     monkeypatch.chdir(tmp_path)
     draw = random.Random(90_817 + seed)
-    some = [chr(draw.choice([draw.randrange(1, 32), draw.randrange(127, 160), draw.randrange(0x2000, 0x2070)])) for _ in range(6)]
-    hostile("".join(draw.sample(["x", *some, *draw.sample(CONTROLS, 2)], 9)), tmp_path / "x", scene_file)
+    some = [
+        chr(
+            draw.choice(
+                [draw.randrange(1, 32), draw.randrange(127, 160), draw.randrange(0x2000, 0x2070)]
+            )
+        )
+        for _ in range(6)
+    ]
+    hostile(
+        "".join(draw.sample(["x", *some, *draw.sample(CONTROLS, 2)], 9)), tmp_path / "x", scene_file
+    )
 
 
 @pytest.mark.parametrize("text", [ALL, *CONTROLS], ids=ascii)
 def test_matrices(tmp_path, text):
     b = tmp_path / "b.mtx"
     b.write_text("%%MatrixMarket matrix array real general\n1 1\n1\n")
-    for content in (f"%%MatrixMarket {text}\n", f"{MTX}%{text}\n1 1 1\n1 1 {text}\n", f"{MTX}{text}\n", f"{MTX}1 1 1\n1 1 2\n{text}"):
+    for content in (
+        f"%%MatrixMarket {text}\n",
+        f"{MTX}%{text}\n1 1 1\n1 1 {text}\n",
+        f"{MTX}{text}\n",
+        f"{MTX}1 1 1\n1 1 2\n{text}",
+    ):
         (tmp_path / "A.mtx").write_text(content, encoding="utf-8", newline="")
         call("solve", tmp_path / "A.mtx", b)
         call("solve", tmp_path / "A.mtx", b, "--method", text, "--lower", text)
@@ -125,7 +151,9 @@ def test_what_lies_in_the_folder_of_a_run(scene_file, tmp_path, text):
     run = ["run", scene_file, "--out", out, "--device", "cpu", "--frames"]
     call(*run, 1)
     record = json.loads((out / "run.json").read_text())
-    (out / "run.json").write_text(json.dumps({**record, "versions": dict.fromkeys(record["versions"], text)}))
+    (out / "run.json").write_text(
+        json.dumps({**record, "versions": dict.fromkeys(record["versions"], text)})
+    )
     (out / "run.lock").write_text(json.dumps({"pid": 1, "host": text, "since": text}))
     assert "written with other software" in call(*run, 2, "--resume")
     (out / "log.csv").write_text(text, encoding="utf-8", newline="")
@@ -151,7 +179,9 @@ def test_names_that_are_no_text(dots, tmp_path):
     call("render", folder)
     (folder / "mesh.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     (folder / "mesh.toml").write_text(f'{MINIMAL}[[solid]]\nshape = "mesh"\nfile = "mesh.obj"\n')
-    assert "must be UTF-8 text" in call("run", folder / "mesh.toml", "--out", folder / "out", "--device", "cpu", "--frames", 0)
+    assert "must be UTF-8 text" in call(
+        "run", folder / "mesh.toml", "--out", folder / "out", "--device", "cpu", "--frames", 0
+    )
 
 
 def test_colors_and_bars_of_our_own_reach_the_terminal(capsys):

@@ -12,9 +12,15 @@ from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.simulator import simulators
 
 CELLS = {  # whose sizes need others
-    "jet": 128, "mesh-obstacle": 15, "retracting-wall": 25, "river": 256, "stirred-tank": 24, "water-labyrinth": 24, "waterfall": 32,
+    "jet": 128,
+    "mesh-obstacle": 15,
+    "retracting-wall": 25,
+    "river": 256,
+    "stirred-tank": 24,
+    "water-labyrinth": 24,
+    "waterfall": 32,
     "wave-maker": 30,
-}  # fmt: skip
+}
 
 
 def digests(name: str, count: int, steps: int) -> list[str]:
@@ -26,15 +32,26 @@ def digests(name: str, count: int, steps: int) -> list[str]:
     for _ in range(steps):
         simulation.step(min(simulation.stable_dt(), 0.01))
         state = simulation.state()
-        found.append(hashlib.sha256(b"".join(name.encode() + state[name].tobytes() for name in sorted(state))).hexdigest())
+        found.append(
+            hashlib.sha256(
+                b"".join(name.encode() + state[name].tobytes() for name in sorted(state))
+            ).hexdigest()
+        )
     simulation.frame()
     return found
 
 
-LONG = ("honey-coil", "hourglass", "column-collapse", "paint-pour")  # scenes of more than three seconds, like shorter ones
+# scenes of more than three seconds, like shorter ones
+LONG = ("honey-coil", "hourglass", "column-collapse", "paint-pour")
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name in LONG else ()) for name in particle_scenes()])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow if name in LONG else ())
+        for name in particle_scenes()
+    ],
+)
 def test_a_scene_has_the_same_bits_on_any_number_of_threads(name, monkeypatch):
     for module in ("team", "program", "wave"):
         monkeypatch.setattr(f"warp_lcp.rows.{module}.CELLS", 100)

@@ -44,7 +44,17 @@ def test_points_are_spread_with_their_mass_and_center() -> None:
 @pytest.mark.parametrize(("moved", "distance"), [(0.0, 0.0), (0.05, 0.5), (0.1, 1.0), (0.3, 1.0)])
 def test_the_distance_of_a_point_that_moves(moved: float, distance: float) -> None:
     runs = [
-        Trial(1.0, 1, 1, 1, tuple(Look(t, 3.0 * spread(np.array([[x, 0.45]]), [1.0, 1.0], 0.1), 1.0, x) for t in (0.0, 1.0)), 0.0)
+        Trial(
+            1.0,
+            1,
+            1,
+            1,
+            tuple(
+                Look(t, 3.0 * spread(np.array([[x, 0.45]]), [1.0, 1.0], 0.1), 1.0, x)
+                for t in (0.0, 1.0)
+            ),
+            0.0,
+        )
         for x in (0.25, 0.25 + moved)
     ]
     assert runs[1].distance(runs[0]) == pytest.approx(distance, abs=1e-9)
@@ -91,7 +101,11 @@ class Model:
         self.ran.append((cfl, tolerance))
         if cfl >= self.fails:
             raise StepFailed("too long")
-        return made(self.distance * cfl + 0.005 * (tolerance > 1e-2), (1.0 - 0.1 * float(np.log10(tolerance))) / cfl, self.drift * cfl)
+        return made(
+            self.distance * cfl + 0.005 * (tolerance > 1e-2),
+            (1.0 - 0.1 * float(np.log10(tolerance))) / cfl,
+            self.drift * cfl,
+        )
 
 
 def tuned(monkeypatch: pytest.MonkeyPatch, model: Model) -> tuning.Tuning:
@@ -100,7 +114,9 @@ def tuned(monkeypatch: pytest.MonkeyPatch, model: Model) -> tuning.Tuning:
 
 
 @pytest.mark.parametrize("distance", [0.0001, 0.0037, 0.006, 0.0101, 0.019, 0.05])
-def test_the_longest_step_within_the_bound_is_found(distance: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_longest_step_within_the_bound_is_found(
+    distance: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     model = Model(distance)
     found = tuned(monkeypatch, model)
     bound = price_table()["fluids"].presets["standard"].distance
@@ -144,16 +160,24 @@ class Blurred(Model):
             self.references += 1
             return made(self.noise if scene.time.cfl < 0.85 * reference else 0.0, 100.0)
         ran = super().__call__(scene, **options)
-        return made(float(np.hypot(ran.distance(made(0.0, 1.0)), self.noise)), ran.seconds, self.drift * scene.time.cfl)
+        return made(
+            float(np.hypot(ran.distance(made(0.0, 1.0)), self.noise)),
+            ran.seconds,
+            self.drift * scene.time.cfl,
+        )
 
 
-def test_where_nothing_is_near_enough_the_nearest_is_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_nothing_is_near_enough_the_nearest_is_chosen(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     found = tuned(monkeypatch, Model(0.5))
     assert not found.met
     nearest = min(c.distance for c in found.tried)
     assert nearest <= found.chosen.distance <= 1.05 * nearest
     assert found.scene.time.cfl == price_table()["fluids"].steps[-1][0]
-    assert found.scene.solver.tolerance == 0.1, "which costs the nearest a fiftieth of the distance, and saves time"
+    assert found.scene.solver.tolerance == 0.1, (
+        "which costs the nearest a fiftieth of the distance, and saves time"
+    )
     assert found.noise is not None
     assert found.noise.distance == 0.0
     words = " ".join(found.verdict("standard"))
@@ -166,7 +190,9 @@ def test_where_nothing_is_near_enough_the_nearest_is_chosen(monkeypatch: pytest.
 
 def test_what_shorter_steps_bring_tells_what_would_help(monkeypatch: pytest.MonkeyPatch) -> None:
     falls = tuned(monkeypatch, Steps(0.0, 0.2)).verdict("standard")[-1]
-    assert falls == "the distance decreases with the step: shorter steps than those tried would help"
+    assert (
+        falls == "the distance decreases with the step: shorter steps than those tried would help"
+    )
     stays = tuned(monkeypatch, Steps(0.2, 0.01)).verdict("standard")[-1]
     assert "half or less: increase domain.resolution instead" in stays
     assert stays.startswith("4 times as many steps left 93 % of the distance")
@@ -192,12 +218,16 @@ class Steps(Model):
 
 
 @pytest.mark.parametrize("distance", [0.019, 0.024, 0.035])
-def test_nothing_can_be_nearer_than_references_are_to_each_other(distance: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_can_be_nearer_than_references_are_to_each_other(
+    distance: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The longest step whose own distance keeps the bound is found beneath a noise of four times the bound, as its square adds up."""
     model = Blurred(distance, noise=0.12)
     found = tuned(monkeypatch, model)
     bound = price_table()["fluids"].presets["standard"].distance
-    assert found.scene.time.cfl == max(cfl for cfl, _ in price_table()["fluids"].steps if distance * cfl <= bound)
+    assert found.scene.time.cfl == max(
+        cfl for cfl, _ in price_table()["fluids"].steps if distance * cfl <= bound
+    )
     assert found.met
     assert found.noise is not None
     assert found.bounds.distance == pytest.approx(np.hypot(0.12, bound))
@@ -206,12 +236,17 @@ def test_nothing_can_be_nearer_than_references_are_to_each_other(distance: float
     assert found.chosen.distance > bound
     words = found.verdict("standard")
     assert words[0].startswith("within the noise of the reference, but not standard: ")
-    assert f"distance by a factor of {found.chosen.distance / bound:.2g}; but runs as accurate as the reference differ by 0.12" in words[2]
+    assert (
+        f"distance by a factor of {found.chosen.distance / bound:.2g}; but runs as accurate as the "
+        "reference differ by 0.12" in words[2]
+    )
     far = tuned(monkeypatch, Blurred(0.5, noise=0.12))
     assert not far.met
 
 
-def test_the_reference_is_not_doubted_where_its_bounds_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_reference_is_not_doubted_where_its_bounds_are_kept(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     model = Blurred(0.0001, noise=0.01)
     found = tuned(monkeypatch, model)
     assert model.references == 1
@@ -226,7 +261,18 @@ def call(*arguments: object) -> Any:
 
 def test_the_command_writes_a_scene_that_runs(tmp_path: Path) -> None:
     out = tmp_path / "tuned.toml"
-    options = ["--device", "cpu", "--set", "domain.resolution=32", "--frames", 4, "--accuracy", "preview", "--out", out]
+    options = [
+        "--device",
+        "cpu",
+        "--set",
+        "domain.resolution=32",
+        "--frames",
+        4,
+        "--accuracy",
+        "preview",
+        "--out",
+        out,
+    ]
     result = call("dam-break-2d", *options)
     assert result.exit_code == 0, result.stderr
     assert "preview: time.cfl=" in result.stdout
@@ -238,9 +284,18 @@ def test_the_command_writes_a_scene_that_runs(tmp_path: Path) -> None:
     assert comments[0].startswith("# Tuned for preview accuracy on cpu:")
     again = trial(scene, device="cpu", frames=4)
     reference = trial(
-        load_scene("dam-break-2d", ["domain.resolution=32", "time.cfl=0.25", "time.dt_max=0.0025", "solver.tolerance=1e-8"]),
-        device="cpu", frames=4,
-    )  # fmt: skip
+        load_scene(
+            "dam-break-2d",
+            [
+                "domain.resolution=32",
+                "time.cfl=0.25",
+                "time.dt_max=0.0025",
+                "solver.tolerance=1e-8",
+            ],
+        ),
+        device="cpu",
+        frames=4,
+    )
     assert again.distance(reference) <= price_table()["fluids"].presets["preview"].distance
 
 

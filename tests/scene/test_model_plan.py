@@ -22,26 +22,44 @@ LISTED = {
 
 
 def test_prices_add_up() -> None:
-    models = [Model("walls", "asked for"), Model("band", "asked for"), Model("unknown", "asked for"), Model("walls", "", built=False)]
+    models = [
+        Model("walls", "asked for"),
+        Model("band", "asked for"),
+        Model("unknown", "asked for"),
+        Model("walls", "", built=False),
+    ]
     assert predicted_seconds(models, LISTED, CELLS, PARTICLES) == pytest.approx(5e-3 + 2e-3 - 4e-4)
     assert predicted_seconds(models, {}, CELLS, PARTICLES) == 0.0, "nothing is known"
     bodies = Model("walls", "three of them", count=3)
     assert predicted_seconds([bodies], LISTED, CELLS, PARTICLES) == pytest.approx(5e-3 + 3 * 2e-3)
-    assert model_lines([bodies], LISTED, CELLS, PARTICLES, memory=200_000)[0][1].endswith("75 % of memory, 6 ms a step (55 %)")
+    assert model_lines([bodies], LISTED, CELLS, PARTICLES, memory=200_000)[0][1].endswith(
+        "75 % of memory, 6 ms a step (55 %)"
+    )
 
 
 def test_a_line_tells_why_and_what_it_takes() -> None:
-    models = [Model("walls", "asked for"), Model("surface", "there is none", built=False), Model("band", "too")]
+    models = [
+        Model("walls", "asked for"),
+        Model("surface", "there is none", built=False),
+        Model("band", "too"),
+    ]
     lines = model_lines(models, LISTED, CELLS, PARTICLES, memory=200_000)
     assert lines[0] == ("model", "walls: asked for; 25 % of memory, 2 ms a step (30 %)")
     assert lines[1] == ("not built", "surface: there is none")
-    assert lines[2] == ("model", "band: too; 0 % of memory, 0 ms a step (0 %)"), "what saves takes nothing"
+    assert lines[2] == ("model", "band: too; 0 % of memory, 0 ms a step (0 %)"), (
+        "what saves takes nothing"
+    )
     assert lines[3] == ("step", "about 6.6 ms by the cost table, on one core, all models together")
 
 
 def test_a_measured_step_scales_the_prices() -> None:
-    lines = model_lines([Model("walls", "asked for")], LISTED, CELLS, PARTICLES, memory=200_000, measured=14e-3)
-    assert lines == [("model", "walls: asked for; 25 % of memory, 4 ms a step (29 %)"), ("step", "about 14 ms here, all models together")]
+    lines = model_lines(
+        [Model("walls", "asked for")], LISTED, CELLS, PARTICLES, memory=200_000, measured=14e-3
+    )
+    assert lines == [
+        ("model", "walls: asked for; 25 % of memory, 4 ms a step (29 %)"),
+        ("step", "about 14 ms here, all models together"),
+    ]
 
 
 @pytest.mark.parametrize("simulator", ["fluids", "granular"])
@@ -61,13 +79,19 @@ def test_every_built_in_scene_says_which_models_it_has(name: str) -> None:
     assert said == [model.name for model in scene.models() if model.built]
     assert ("rigid bodies" in said) == any(solid.is_body for solid in scene.solid)
     assert "moving solids" in said or "rigid bodies" not in said, "a body moves, too"
-    assert all(model.count == sum(solid.is_body for solid in scene.solid) for model in scene.models() if model.name == "rigid bodies")
+    assert all(
+        model.count == sum(solid.is_body for solid in scene.solid)
+        for model in scene.models()
+        if model.name == "rigid bodies"
+    )
     assert ("cut cells" in said) == (bool(scene.solid) and scene.domain.solids == "cut-cell")
     assert sum(word == "step" for word, _ in lines) == 1
 
 
 def test_the_command_says_it_too() -> None:
-    shown = CliRunner().invoke(cli.app, ["check", "dam-break-2d", "--set", "density_correction.every=1"])
+    shown = CliRunner().invoke(
+        cli.app, ["check", "dam-break-2d", "--set", "density_correction.every=1"]
+    )
     assert shown.exit_code == 0
     assert "density correction: [density_correction]; " in shown.stdout
     assert load_scene("dam-break-2d").solver.tolerance == 1e-4

@@ -37,7 +37,12 @@ def watching(patch: pytest.MonkeyPatch) -> Iterator[Traces]:
     """Note each kernel module that a launch asks for and each allocation with the source files on the stack."""
     traces, prepared = Traces(), program.prepared
     allocator = type(wp.get_device("cpu").default_allocator)
-    load, allocate, entry, make_array = wp.Module.load, allocator.allocate, pass_form.Form.entry, wp.array.__init__
+    load, allocate, entry, make_array = (
+        wp.Module.load,
+        allocator.allocate,
+        pass_form.Form.entry,
+        wp.array.__init__,
+    )
 
     def noting_load(module: Any, *arguments: Any, **options: Any) -> Any:
         traces.modules.add(module.name)
@@ -91,13 +96,23 @@ LIQUID: dict[str, Any] = {
     "pressure": {"surface": "voxel"},
     "output": QUIET,
 }
-THICK: dict[str, Any] = {"size": [1.0, 0.5, 0.25], "liquid": [small_liquids.box([0.0, 0.0, 0.0], [0.375, 0.375, 0.25])]}
-SAND: dict[str, Any] = {"size": [1.0, 0.5], "resolution": 16, "sand": [small_sands.box([0.0, 0.0], [0.375, 0.375])], "output": QUIET}
+THICK: dict[str, Any] = {
+    "size": [1.0, 0.5, 0.25],
+    "liquid": [small_liquids.box([0.0, 0.0, 0.0], [0.375, 0.375, 0.25])],
+}
+SAND: dict[str, Any] = {
+    "size": [1.0, 0.5],
+    "resolution": 16,
+    "sand": [small_sands.box([0.0, 0.0], [0.375, 0.375])],
+    "output": QUIET,
+}
 
 
 def traces_of(patch: pytest.MonkeyPatch, tables: dict[str, Any], *, sand: bool) -> Traces:
     """Build a simulation, step it and make a frame."""
-    model = small_sands.scene(**(SAND | tables)) if sand else small_liquids.scene(**(LIQUID | tables))
+    model = (
+        small_sands.scene(**(SAND | tables)) if sand else small_liquids.scene(**(LIQUID | tables))
+    )
     with watching(patch) as traces:
         simulation: Any = small_sands.create(model) if sand else small_liquids.create(model)
         for _ in range(3):
@@ -129,105 +144,177 @@ class Case:
 
 CASES = {
     "cut cells": Case(
-        {"solid": [BALL]}, {"solid": [BALL], "solids": "voxel"},
-        modules=("warp_lcp.grid.cut_cells", "warp_lcp.grid.distance_advection", "warp_lcp.material.cut_wall", "fluids.pressure_cut"),
+        {"solid": [BALL]},
+        {"solid": [BALL], "solids": "voxel"},
+        modules=(
+            "warp_lcp.grid.cut_cells",
+            "warp_lcp.grid.distance_advection",
+            "warp_lcp.material.cut_wall",
+            "fluids.pressure_cut",
+        ),
         files=("warp_lcp/grid/cut_cells.py",),
     ),
     "moving solids": Case(
-        {"solid": [SWAYING]}, {"solid": [BALL]}, modules=("warp_lcp.grid.push_out", "fluids.pressure_cut_moving"),
+        {"solid": [SWAYING]},
+        {"solid": [BALL]},
+        modules=("warp_lcp.grid.push_out", "fluids.pressure_cut_moving"),
         columns=("pushed", "stuck"),
     ),
     "rigid bodies": Case(
-        {"solid": [BALL | {"density": 500.0}]}, {"solid": [SWAYING]}, modules=("fluids.coupling", "warp_lcp.low_rank"),
-        files=("fluids/coupling.py", "warp_lcp/operators/low_rank.py"), columns=("body0_x", "contacts"),
+        {"solid": [BALL | {"density": 500.0}]},
+        {"solid": [SWAYING]},
+        modules=("fluids.coupling", "warp_lcp.low_rank"),
+        files=("fluids/coupling.py", "warp_lcp/operators/low_rank.py"),
+        columns=("body0_x", "contacts"),
     ),
     "ghost-fluid surface": Case(
-        {"pressure": {}}, {"density_correction": {"every": 0}}, modules=("fluids.pressure_ghost", "warp_lcp.grid.density"),
+        {"pressure": {}},
+        {"density_correction": {"every": 0}},
+        modules=("fluids.pressure_ghost", "warp_lcp.grid.density"),
         files=("fluids/surface.py", "warp_lcp/grid/level_set.py"),
     ),
     "smoothing": Case({"pressure": {"smoothing": 2}}, {"pressure": {}}),
     "surface tension": Case(
-        {"pressure": {}, "surface_tension": {"coefficient": 0.072}}, {"pressure": {}}, modules=("fluids.surface_tension",),
+        {"pressure": {}, "surface_tension": {"coefficient": 0.072}},
+        {"pressure": {}},
+        modules=("fluids.surface_tension",),
         files=("fluids/surface_tension.py",),
     ),
-    "separating walls": Case({"wall": "separating"}, modules=("warp_lcp.bounds",), files=("warp_lcp/problem/bounds.py",)),
+    "separating walls": Case(
+        {"wall": "separating"}, modules=("warp_lcp.bounds",), files=("warp_lcp/problem/bounds.py",)
+    ),
     "unilateral pressure": Case(
-        {"pressure": {"model": "unilateral"}}, {"pressure": {}}, modules=("fluids.unilateral",), files=("fluids/unilateral.py",)
+        {"pressure": {"model": "unilateral"}},
+        {"pressure": {}},
+        modules=("fluids.unilateral",),
+        files=("fluids/unilateral.py",),
     ),
     "FLIP": Case({"particles": {"transfer": "flip"}}, {"particles": {"transfer": "pic"}}),
     "density correction": Case(
-        {"density_correction": {}}, {"density_correction": {"every": 0}}, modules=("warp_lcp.material.density_correction",),
+        {"density_correction": {}},
+        {"density_correction": {"every": 0}},
+        modules=("warp_lcp.material.density_correction",),
         files=("warp_lcp/material/density_correction.py",),
         columns=("density_status", "density_iterations", "max_density"),
     ),
     "reseeding": Case(
-        {"particles": {"reseed": {"every": 1}}}, modules=("warp_lcp.material.reseeding",), files=("warp_lcp/material/reseeding.py",),
+        {"particles": {"reseed": {"every": 1}}},
+        modules=("warp_lcp.material.reseeding",),
+        files=("warp_lcp/material/reseeding.py",),
         columns=("reseeded",),
     ),
     "narrow band": Case(
-        {"pressure": {}, "particles": {"narrow_band": {"width": 3.0}}}, {"pressure": {}},
-        modules=("warp_lcp.material.narrow_band", "warp_lcp.grid.semi_lagrangian"), files=("warp_lcp/material/narrow_band.py",),
+        {"pressure": {}, "particles": {"narrow_band": {"width": 3.0}}},
+        {"pressure": {}},
+        modules=("warp_lcp.material.narrow_band", "warp_lcp.grid.semi_lagrangian"),
+        files=("warp_lcp/material/narrow_band.py",),
         columns=("interior_density",),
     ),
     "sources": Case(
-        {"source": [small_liquids.box([0.9, 0.4], [1.0, 0.5], velocity=[-1.0, 0.0])]}, modules=("warp_lcp.material.sources",),
-        files=("warp_lcp/material/sources.py",), columns=("emitted",),
+        {"source": [small_liquids.box([0.9, 0.4], [1.0, 0.5], velocity=[-1.0, 0.0])]},
+        modules=("warp_lcp.material.sources",),
+        files=("warp_lcp/material/sources.py",),
+        columns=("emitted",),
     ),
     "outlets": Case(
-        {"drain": [small_liquids.box([0.0, 0.0], [0.1, 0.1])]}, modules=("warp_lcp.material.outlets",),
-        files=("warp_lcp/material/sources.py",), columns=("drained",),
+        {"drain": [small_liquids.box([0.0, 0.0], [0.1, 0.1])]},
+        modules=("warp_lcp.material.outlets",),
+        files=("warp_lcp/material/sources.py",),
+        columns=("drained",),
     ),
     "surface mesh": Case(
-        {"output": QUIET | {"surface": True}}, modules=("warp_lcp.grid.surface_mesh", "warp_lcp.grid.marching_cubes"),
+        {"output": QUIET | {"surface": True}},
+        modules=("warp_lcp.grid.surface_mesh", "warp_lcp.grid.marching_cubes"),
         files=("warp_lcp/grid/surface_mesh.py", "warp_lcp/grid/marching_cubes.py"),
     ),
-    "volume": Case(THICK | {"output": QUIET | {"volume": True}}, THICK, files=("warp_lcp/material/particle_volume.py",)),
+    "volume": Case(
+        THICK | {"output": QUIET | {"volume": True}},
+        THICK,
+        files=("warp_lcp/material/particle_volume.py",),
+    ),
     "diagnostics": Case(
-        {"pressure": {}, "output": {}}, {"pressure": {}}, modules=("warp_lcp.grid.volume",), columns=("volume", "max_divergence")
+        {"pressure": {}, "output": {}},
+        {"pressure": {}},
+        modules=("warp_lcp.grid.volume",),
+        columns=("volume", "max_divergence"),
     ),
     "automatic tolerance": Case(
-        {"solver": {"tolerance": "auto"}}, modules=("warp_lcp.tolerance",), files=("fluids/tolerance.py",),
+        {"solver": {"tolerance": "auto"}},
+        modules=("warp_lcp.tolerance",),
+        files=("fluids/tolerance.py",),
         columns=("tolerance", "time_error"),
     ),
     "probes": Case(
-        {"probe": [{"name": "a", "position": [0.1, 0.1], "quantity": "pressure"}]}, modules=("fluids.probes",), files=("fluids/probes.py",)
+        {"probe": [{"name": "a", "position": [0.1, 0.1], "quantity": "pressure"}]},
+        modules=("fluids.probes",),
+        files=("fluids/probes.py",),
     ),
-    "forces on solids": Case({"output": QUIET | {"forces": True}}, modules=("fluids.forces",), files=("fluids/forces.py",)),
+    "forces on solids": Case(
+        {"output": QUIET | {"forces": True}},
+        modules=("fluids.forces",),
+        files=("fluids/forces.py",),
+    ),
     "drag along walls": Case(
-        {"wall_drag": {"coefficient": 0.01}}, modules=("fluids.wall_drag",), files=("fluids/wall_drag.py", "fluids/forces.py"),
+        {"wall_drag": {"coefficient": 0.01}},
+        modules=("fluids.wall_drag",),
+        files=("fluids/wall_drag.py", "fluids/forces.py"),
         columns=("drag_work",),
     ),
     "rigid bodies in sand": Case(
-        {"solid": [BALL | {"density": 500.0}]}, {"solid": [SWAYING]}, modules=("granular.bodies",), files=("granular/bodies.py",),
-        columns=("body0_x", "contacts"), sand=True,
+        {"solid": [BALL | {"density": 500.0}]},
+        {"solid": [SWAYING]},
+        modules=("granular.bodies",),
+        files=("granular/bodies.py",),
+        columns=("body0_x", "contacts"),
+        sand=True,
     ),
     "friction of walls": Case({"friction": 0.4}, {"friction": 0.0}, sand=True),
     "friction of walls by sweeps": Case(
         {"friction": 0.4, "solver": {"method": "interleaved-sweeps", "max_iterations": 20}},
-        {"friction": 0.0, "solver": {"method": "interleaved-sweeps", "max_iterations": 20}}, sand=True,
+        {"friction": 0.0, "solver": {"method": "interleaved-sweeps", "max_iterations": 20}},
+        sand=True,
     ),
-    "box of friction": Case({"friction": {"model": "box"}}, modules=("granular.stress_2d_float32_step_box",), sand=True),
+    "box of friction": Case(
+        {"friction": {"model": "box"}}, modules=("granular.stress_2d_float32_step_box",), sand=True
+    ),
     "friction that grows with the rate": Case(
-        {"friction": {"dynamic_angle": 40.0, "grain_size": 0.01}}, modules=("granular.stress_2d_float32_step_rate",), sand=True
+        {"friction": {"dynamic_angle": 40.0, "grain_size": 0.01}},
+        modules=("granular.stress_2d_float32_step_rate",),
+        sand=True,
     ),
     "sweeps": Case(
-        {"solver": {"method": "interleaved-sweeps", "max_iterations": 20}}, modules=("granular.interleaved_2d",), sand=True
+        {"solver": {"method": "interleaved-sweeps", "max_iterations": 20}},
+        modules=("granular.interleaved_2d",),
+        sand=True,
     ),
     "gauge": Case({"gauge": {"height": 0.2}}, columns=("flow_rate",), sand=True),
     "cohesion": Case({"material": {"cohesion": 200.0, "tensile_strength": 50.0}}, sand=True),
-    "diagnostics of sand": Case({"output": {}}, columns=("yielded", "dissipation", "predicted_excess"), sand=True),
-    "density correction of sand": Case(
-        {"density_correction": {}}, {"density_correction": {"every": 0}}, modules=("warp_lcp.material.density_correction",),
-        files=("warp_lcp/material/density_correction.py",),
-        columns=("density_status", "density_iterations", "max_density"), sand=True,
+    "diagnostics of sand": Case(
+        {"output": {}}, columns=("yielded", "dissipation", "predicted_excess"), sand=True
     ),
-}  # fmt: skip
+    "density correction of sand": Case(
+        {"density_correction": {}},
+        {"density_correction": {"every": 0}},
+        modules=("warp_lcp.material.density_correction",),
+        files=("warp_lcp/material/density_correction.py",),
+        columns=("density_status", "density_iterations", "max_density"),
+        sand=True,
+    ),
+}
 
 
-PLACED_ELSEWHERE = (  # take another's place, only look, or are numbers of kernels that are there anyway
-    "cut cells", "diagnostics", "diagnostics of sand", "unilateral pressure", "box of friction", "sweeps", "gauge", "cohesion",
+# take another's place, only look, or are numbers of kernels that are there anyway
+PLACED_ELSEWHERE = (
+    "cut cells",
+    "diagnostics",
+    "diagnostics of sand",
+    "unilateral pressure",
+    "box of friction",
+    "sweeps",
+    "gauge",
+    "cohesion",
     "friction that grows with the rate",
-)  # fmt: skip
+)
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -236,7 +323,9 @@ def test_a_model_that_is_off_leaves_no_trace(name: str, monkeypatch: pytest.Monk
     off = traces_of(monkeypatch, case.off, sand=case.sand)
     on = traces_of(monkeypatch, case.on, sand=case.sand)
     for own in case.modules:  # what tells the model's traces must be able to
-        assert any(module.startswith(own) for module in on.modules), f"{own} is not among {sorted(on.modules)}"
+        assert any(module.startswith(own) for module in on.modules), (
+            f"{own} is not among {sorted(on.modules)}"
+        )
         assert not any(module.startswith(own) for module in off.modules)
     for file in case.files:
         assert on.bytes[file] > 0
@@ -248,18 +337,28 @@ def test_a_model_that_is_off_leaves_no_trace(name: str, monkeypatch: pytest.Monk
 
 
 def test_without_a_separating_wall_bounds_take_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    off, on = (traces_of(monkeypatch, {"wall": wall}, sand=False) for wall in ("free-slip", "separating"))
+    off, on = (
+        traces_of(monkeypatch, {"wall": wall}, sand=False) for wall in ("free-slip", "separating")
+    )
     cells = 3 * 10 * 18  # stored
     assert on.total - off.total >= 8 * cells, "a lower bound"
 
 
 @pytest.mark.parametrize("slips", [True, False])
-def test_walls_without_friction_are_not_launched(slips: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_walls_without_friction_are_not_launched(
+    slips: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The kernel of Coulomb friction on walls runs and reads faces only where a wall rubs; a solid that does counts its own alone."""
-    simulation = small_sands.create(small_sands.scene(**(SAND | {"friction": 0.0 if slips else 0.3})))
+    simulation = small_sands.create(
+        small_sands.scene(**(SAND | {"friction": 0.0 if slips else 0.3}))
+    )
     ran: list[str] = []
     entry = pass_form.Form.entry
-    monkeypatch.setattr(pass_form.Form, "entry", lambda form, *given: (ran.append(form.kernel.key), entry(form, *given))[1])
+    monkeypatch.setattr(
+        pass_form.Form,
+        "entry",
+        lambda form, *given: (ran.append(form.kernel.key), entry(form, *given))[1],
+    )
     walls, faces = simulation.stress.walls, 2 * (16 + 8)  # those of the box
     assert walls.count == (0 if slips else faces)
     simulation.step(1e-3)
@@ -272,17 +371,25 @@ def test_walls_without_friction_are_not_launched(slips: bool, monkeypatch: pytes
 
 
 def test_cohesion_takes_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    off, on = (traces_of(monkeypatch, {"material": {"cohesion": c, "tensile_strength": c}}, sand=True) for c in (0.0, 100.0))
+    off, on = (
+        traces_of(monkeypatch, {"material": {"cohesion": c, "tensile_strength": c}}, sand=True)
+        for c in (0.0, 100.0)
+    )
     assert (on.total, on.modules, on.columns) == (off.total, off.modules, off.columns)
 
 
 def test_a_plane_has_no_third_axis(monkeypatch: pytest.MonkeyPatch) -> None:
     simulation = small_liquids.create(small_liquids.scene(**LIQUID))
-    assert len(simulation.velocity) == len(simulation.weights) == len(simulation.projection.known) == 2
+    assert (
+        len(simulation.velocity) == len(simulation.weights) == len(simulation.projection.known) == 2
+    )
 
 
 def test_a_closed_box_full_of_liquid_has_no_surface(monkeypatch: pytest.MonkeyPatch) -> None:
-    full = {"liquid": [small_liquids.box([0.0, 0.0], [1.0, 0.5])], "pressure": {"surface": "ghost-fluid", "smoothing": 1}}
+    full = {
+        "liquid": [small_liquids.box([0.0, 0.0], [1.0, 0.5])],
+        "pressure": {"surface": "ghost-fluid", "smoothing": 1},
+    }
     model = small_liquids.scene(**(LIQUID | full))
     said = {part.name: part for part in model.models()}
     assert not said["ghost-fluid surface"].built
@@ -290,18 +397,29 @@ def test_a_closed_box_full_of_liquid_has_no_surface(monkeypatch: pytest.MonkeyPa
     assert ("not built", f"ghost-fluid surface: {said['ghost-fluid surface'].why}") in model.plan()
     traces = traces_of(monkeypatch, full | {"output": {}}, sand=False)
     assert "warp_lcp/grid/level_set.py" not in traces.bytes
-    assert not any("ghost" in module or module.startswith("warp_lcp.grid.density") for module in traces.modules)
+    assert not any(
+        "ghost" in module or module.startswith("warp_lcp.grid.density") for module in traces.modules
+    )
     assert "surface" not in model.memory_parts()
-    simulation = small_liquids.create(small_liquids.scene(**(LIQUID | full | {"output": {}, "solid": [BALL]})))
+    simulation = small_liquids.create(
+        small_liquids.scene(**(LIQUID | full | {"output": {}, "solid": [BALL]}))
+    )
     row = simulation.step(0.01)
     assert row["volume"] == pytest.approx(0.5 - math.pi * 0.01, rel=0.01)
     assert row["max_speed"] < 1e-3, "it rests"
-    tapped = small_liquids.scene(**(LIQUID | full | {"domain": {"size": [1.0, 0.5], "resolution": 16, "open": ["top"]}}))
+    tapped = small_liquids.scene(
+        **(LIQUID | full | {"domain": {"size": [1.0, 0.5], "resolution": 16, "open": ["top"]}})
+    )
     assert {part.name for part in tapped.models() if part.built} >= {"ghost-fluid surface"}
 
 
 def test_walls_that_are_not_there_cannot_let_go() -> None:
-    domain = {"size": [1.0, 0.5], "resolution": 16, "open": ["left", "right", "top", "bottom"], "wall": "separating"}
+    domain = {
+        "size": [1.0, 0.5],
+        "resolution": 16,
+        "open": ["left", "right", "top", "bottom"],
+        "wall": "separating",
+    }
     model = small_liquids.scene(**(LIQUID | {"domain": domain}))
     walls = next(part for part in model.models() if part.name == "separating walls")
     assert not walls.built

@@ -19,7 +19,9 @@ def build(motion: object, dimension: int = 2, solids: str = "cut-cell") -> Scene
         "scene": {"simulator": "dots"},
         "time": {"duration": 1.0},
         "domain": {"size": [1.6, 0.8, 0.8][:dimension], "resolution": 16, "solids": solids},
-        "solid": [{"shape": "sphere", "center": [0.2] * dimension, "radius": 0.1, "motion": motion}],
+        "solid": [
+            {"shape": "sphere", "center": [0.2] * dimension, "radius": 0.1, "motion": motion}
+        ],
     }
     return validate(Scene, data, "dam.toml")
 
@@ -42,25 +44,74 @@ def place(motion: dict, time: float, point: list[float]) -> list[float]:
     ("motion", "time", "point", "expected"),
     [
         ({"kind": "translation", "velocity": [1.0, -2]}, 0.25, [0.0, 0.0], [0.25, -0.5]),
-        ({"kind": "translation", "velocity": [1.0, 0.0], "start": 0.5, "stop": 0.75}, 9.0, [0.0, 1.0], [0.25, 1.0]),
-        ({"kind": "rotation", "rate": 90.0, "center": [1.0, 0.0]}, 1.0, [2.0, 0.0], [1.0, 1.0]),
-        ({"kind": "rotation", "rate": 90, "center": [0, 0, 0], "axis": [0, 5, 0], "stop": 1}, 3.0, [1.0, 1.0, 0.0], [0.0, 1.0, -1.0]),
-        ({"kind": "sinusoid", "period": 2.0, "amplitude": [0.3, 0.0]}, 0.5, [0.0, 1.0], [0.3, 1.0]),
-        ({"kind": "sinusoid", "period": 2.0, "amplitude": [0.3, 0.0], "phase": 90}, 0.0, [0.0, 1.0], [0.3, 1.0]),
-        ({"kind": "sinusoid", "period": 2.0, "angle": 90.0, "center": [0.0, 1.0]}, 1.5, [1.0, 1.0], [0.0, 0.0]),
-        ({"kind": "sinusoid", "period": 4, "angle": 90, "center": [0, 0, 0], "axis": [1, 0, 0]}, 1, [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]),
-        ({"kind": "keyframes", "times": [0.0, 2.0], "translate": [[0, 0], [1, 2]]}, 0.5, [0.0, 0.0], [0.25, 0.5]),
         (
-            {"kind": "keyframes", "times": [0, 2], "translate": [[0, 0], [1, 2]], "interpolation": "smooth"},
-            0.5, [0.0, 0.0], [0.15625, 0.3125],
+            {"kind": "translation", "velocity": [1.0, 0.0], "start": 0.5, "stop": 0.75},
+            9.0,
+            [0.0, 1.0],
+            [0.25, 1.0],
         ),
-        ({"kind": "keyframes", "times": [0, 1], "rotate": [0, 450], "center": [0, 0]}, 1, [1.0, 0.0], [0.0, 1.0]),
+        ({"kind": "rotation", "rate": 90.0, "center": [1.0, 0.0]}, 1.0, [2.0, 0.0], [1.0, 1.0]),
         (
-            {"kind": "keyframes", "times": [0, 1], "rotate": [[0, 0, 0], [90, 0, 90]], "center": [0, 0, 0]},
-            1, [0.0, 1.0, 0.0], [0.0, 0.0, 1.0],
+            {"kind": "rotation", "rate": 90, "center": [0, 0, 0], "axis": [0, 5, 0], "stop": 1},
+            3.0,
+            [1.0, 1.0, 0.0],
+            [0.0, 1.0, -1.0],
+        ),
+        ({"kind": "sinusoid", "period": 2.0, "amplitude": [0.3, 0.0]}, 0.5, [0.0, 1.0], [0.3, 1.0]),
+        (
+            {"kind": "sinusoid", "period": 2.0, "amplitude": [0.3, 0.0], "phase": 90},
+            0.0,
+            [0.0, 1.0],
+            [0.3, 1.0],
+        ),
+        (
+            {"kind": "sinusoid", "period": 2.0, "angle": 90.0, "center": [0.0, 1.0]},
+            1.5,
+            [1.0, 1.0],
+            [0.0, 0.0],
+        ),
+        (
+            {"kind": "sinusoid", "period": 4, "angle": 90, "center": [0, 0, 0], "axis": [1, 0, 0]},
+            1,
+            [0.0, 1.0, 0.0],
+            [0.0, 0.0, 1.0],
+        ),
+        (
+            {"kind": "keyframes", "times": [0.0, 2.0], "translate": [[0, 0], [1, 2]]},
+            0.5,
+            [0.0, 0.0],
+            [0.25, 0.5],
+        ),
+        (
+            {
+                "kind": "keyframes",
+                "times": [0, 2],
+                "translate": [[0, 0], [1, 2]],
+                "interpolation": "smooth",
+            },
+            0.5,
+            [0.0, 0.0],
+            [0.15625, 0.3125],
+        ),
+        (
+            {"kind": "keyframes", "times": [0, 1], "rotate": [0, 450], "center": [0, 0]},
+            1,
+            [1.0, 0.0],
+            [0.0, 1.0],
+        ),
+        (
+            {
+                "kind": "keyframes",
+                "times": [0, 1],
+                "rotate": [[0, 0, 0], [90, 0, 90]],
+                "center": [0, 0, 0],
+            },
+            1,
+            [0.0, 1.0, 0.0],
+            [0.0, 0.0, 1.0],
         ),
     ],
-)  # fmt: skip
+)
 def test_motions_become_poses(motion, time, point, expected):
     np.testing.assert_allclose(place(motion, time, point), expected, atol=1e-14)
 
@@ -73,26 +124,62 @@ def test_motions_become_poses(motion, time, point, expected):
         ({"kind": "rotate"}, ".kind = \"rotate\": unknown kind; did you mean 'rotation'?"),
         ({"kind": "orbit"}, f'.kind = "orbit": unknown kind; choose from {", ".join(KINDS)}'),
         ({"kind": "translation"}, ".velocity: is missing"),
-        ({"kind": "translation", "velocity": [1.0, 0.0], "stopp": 1}, ".stopp: unknown key; did you mean 'stop'?"),
-        ({"kind": "translation", "velocity": [1.0, 0.0, 0.0]}, ".velocity = [1.0, 0.0, 0.0]: must have 2 entries in 2-D"),
-        ({"kind": "translation", "velocity": [1.0, 0.0], "stop": 0}, ": stop must be later than start = 0.0 s, not 0.0"),
-        ({"kind": "translation", "velocity": [1.0, float("inf")]}, ".velocity[1] = Infinity: must be finite"),
+        (
+            {"kind": "translation", "velocity": [1.0, 0.0], "stopp": 1},
+            ".stopp: unknown key; did you mean 'stop'?",
+        ),
+        (
+            {"kind": "translation", "velocity": [1.0, 0.0, 0.0]},
+            ".velocity = [1.0, 0.0, 0.0]: must have 2 entries in 2-D",
+        ),
+        (
+            {"kind": "translation", "velocity": [1.0, 0.0], "stop": 0},
+            ": stop must be later than start = 0.0 s, not 0.0",
+        ),
+        (
+            {"kind": "translation", "velocity": [1.0, float("inf")]},
+            ".velocity[1] = Infinity: must be finite",
+        ),
         ({"kind": "rotation", "rate": 90.0}, ".center: is missing (point of the axis [m])"),
-        ({"kind": "rotation", "rate": "90", "center": [0, 0]}, '.rate = "90": must be a number (angular velocity [degrees/s]'),
-        ({"kind": "rotation", "rate": 90.0, "center": [0, 0], "axis": [0, 0, 1]}, ".axis = [0.0, 0.0, 1.0]: must be left out in 2-D"),
+        (
+            {"kind": "rotation", "rate": "90", "center": [0, 0]},
+            '.rate = "90": must be a number (angular velocity [degrees/s]',
+        ),
+        (
+            {"kind": "rotation", "rate": 90.0, "center": [0, 0], "axis": [0, 0, 1]},
+            ".axis = [0.0, 0.0, 1.0]: must be left out in 2-D",
+        ),
         ({"kind": "sinusoid", "amplitude": [1, 0]}, ".period: is missing"),
-        ({"kind": "sinusoid", "period": 0, "amplitude": [1, 0]}, ".period = 0: must be greater than 0 (period [s])"),
+        (
+            {"kind": "sinusoid", "period": 0, "amplitude": [1, 0]},
+            ".period = 0: must be greater than 0 (period [s])",
+        ),
         ({"kind": "sinusoid", "period": 1}, ": a sinusoid needs amplitude, angle or both"),
-        ({"kind": "sinusoid", "period": 1, "angle": 9}, ".center: is missing: the point [m] to turn about, since there is angle"),
-        ({"kind": "sinusoid", "period": 1, "amplitude": [1, 0], "center": [0, 0]}, ".center = [0.0, 0.0]: has no effect without angle"),
+        (
+            {"kind": "sinusoid", "period": 1, "angle": 9},
+            ".center: is missing: the point [m] to turn about, since there is angle",
+        ),
+        (
+            {"kind": "sinusoid", "period": 1, "amplitude": [1, 0], "center": [0, 0]},
+            ".center = [0.0, 0.0]: has no effect without angle",
+        ),
         ({"kind": "keyframes", "times": [0, 1]}, ": keyframes need translate, rotate or both"),
-        ({"kind": "keyframes", "times": [0, 1, 1], "translate": [[0, 0]] * 3}, ".times = [0.0, 1.0, 1.0]: must increase"),
-        ({"kind": "keyframes", "times": [0], "translate": [[0, 0]]}, ".times = [0]: must have at least 2 entries"),
+        (
+            {"kind": "keyframes", "times": [0, 1, 1], "translate": [[0, 0]] * 3},
+            ".times = [0.0, 1.0, 1.0]: must increase",
+        ),
+        (
+            {"kind": "keyframes", "times": [0], "translate": [[0, 0]]},
+            ".times = [0]: must have at least 2 entries",
+        ),
         (
             {"kind": "keyframes", "times": [0, 1], "translate": [[0, 0]]},
             ".translate = [[0.0, 0.0]]: must have 2 entries, one for each time",
         ),
-        ({"kind": "keyframes", "times": [0, 1], "translate": [[0, 0], [0, 0, 1]]}, ".translate[1] = [0.0, 0.0, 1.0]: must have 2 entries"),
+        (
+            {"kind": "keyframes", "times": [0, 1], "translate": [[0, 0], [0, 0, 1]]},
+            ".translate[1] = [0.0, 0.0, 1.0]: must have 2 entries",
+        ),
         (
             {"kind": "keyframes", "times": [0, 1], "rotate": [0, 90]},
             ".center: is missing: the point [m] to turn about, since there is rotate",
@@ -102,7 +189,12 @@ def test_motions_become_poses(motion, time, point, expected):
             ".rotate[1] = [1.0, 2.0]: must be one number in 2-D",
         ),
         (
-            {"kind": "keyframes", "times": [0, 1], "translate": [[0, 0]] * 2, "interpolation": "cubic"},
+            {
+                "kind": "keyframes",
+                "times": [0, 1],
+                "translate": [[0, 0]] * 2,
+                "interpolation": "cubic",
+            },
             ".interpolation = \"cubic\": must be 'linear' or 'smooth'",
         ),
     ],
@@ -114,12 +206,26 @@ def test_refused_motions(motion, expected):
 @pytest.mark.parametrize(
     ("motion", "expected"),
     [
-        ({"kind": "rotation", "rate": 1, "center": [0, 0, 0]}, ".axis: is missing: the direction to turn about, such as [0.0, 1.0, 0.0]"),
-        ({"kind": "rotation", "rate": 1, "center": [0, 0, 0], "axis": [0, 0, 0]}, ": axis must not be zero"),
-        ({"kind": "rotation", "rate": 1, "center": [0, 0, 0], "axis": [0, 1]}, ".axis = [0, 1]: must have at least 3 entries"),
+        (
+            {"kind": "rotation", "rate": 1, "center": [0, 0, 0]},
+            ".axis: is missing: the direction to turn about, such as [0.0, 1.0, 0.0]",
+        ),
+        (
+            {"kind": "rotation", "rate": 1, "center": [0, 0, 0], "axis": [0, 0, 0]},
+            ": axis must not be zero",
+        ),
+        (
+            {"kind": "rotation", "rate": 1, "center": [0, 0, 0], "axis": [0, 1]},
+            ".axis = [0, 1]: must have at least 3 entries",
+        ),
         ({"kind": "sinusoid", "period": 1, "angle": 9, "center": [0, 0, 0]}, ".axis: is missing"),
         (
-            {"kind": "keyframes", "times": [0, 1], "rotate": [[0, 0, 0], [0, 200, 0]], "center": [0, 0, 0]},
+            {
+                "kind": "keyframes",
+                "times": [0, 1],
+                "rotate": [[0, 0, 0], [0, 200, 0]],
+                "center": [0, 0, 0],
+            },
             ": rotate must change by less than 180 degrees from one keyframe to the next",
         ),
     ],
@@ -130,12 +236,27 @@ def test_refused_motions_in_space(motion, expected):
 
 def test_solids_of_whole_cells_do_not_move():
     text = complaint({"kind": "translation", "velocity": [1.0, 0.0]}, solids="voxel")
-    assert text == 'dam.toml: solid[0].motion: needs domain.solids = "cut-cell": solids that fill whole cells cannot move'
+    assert (
+        text
+        == 'dam.toml: solid[0].motion: needs domain.solids = "cut-cell": solids that fill whole '
+        "cells cannot move"
+    )
 
 
 def test_liquid_has_no_motion():
-    data = {"scene": {"simulator": "fluids"}, "time": {"duration": 1.0}, "domain": {"size": [1.0, 1.0], "resolution": 8}}
-    data["liquid"] = [{"shape": "box", "min": [0.0, 0.0], "max": [1.0, 0.5], "motion": {"kind": "translation", "velocity": [1.0, 0.0]}}]
+    data = {
+        "scene": {"simulator": "fluids"},
+        "time": {"duration": 1.0},
+        "domain": {"size": [1.0, 1.0], "resolution": 8},
+    }
+    data["liquid"] = [
+        {
+            "shape": "box",
+            "min": [0.0, 0.0],
+            "max": [1.0, 0.5],
+            "motion": {"kind": "translation", "velocity": [1.0, 0.0]},
+        }
+    ]
     from warp_lcp.fluids.scene import LiquidScene
 
     with pytest.raises(SceneError, match=r"liquid\[0\].motion: unknown key"):

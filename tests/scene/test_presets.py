@@ -54,7 +54,9 @@ def test_presets_go_from_fast_to_near(simulator: str) -> None:
     for bound in ("distance", "volume"):
         values = [getattr(prices.presets[name], bound) for name in PRESETS]
         assert values == sorted(set(values), reverse=True)
-    assert [cfl for cfl, _ in prices.steps] == sorted({cfl for cfl, _ in prices.steps}, reverse=True)
+    assert [cfl for cfl, _ in prices.steps] == sorted(
+        {cfl for cfl, _ in prices.steps}, reverse=True
+    )
     assert list(prices.tolerances) == sorted(set(prices.tolerances), reverse=True)
 
 
@@ -80,7 +82,10 @@ def test_without_a_preset_nothing_changes(scene_file: Path) -> None:
 
 def test_the_plan_tells_what_came_from_where(scene_file: Path) -> None:
     _, lines = check_scene(str(scene_file), ["solver.preset=preview", "time.cfl=3.5"])
-    assert dict(lines)["preset"] == "preview: time.dt_max 0.04, solver.tolerance 0.01; the scene's own: time.cfl 3.5"
+    assert (
+        dict(lines)["preset"]
+        == "preview: time.dt_max 0.04, solver.tolerance 0.01; the scene's own: time.cfl 3.5"
+    )
 
 
 def test_a_scene_that_is_written_back_keeps_its_values(scene_file: Path) -> None:
@@ -90,7 +95,9 @@ def test_a_scene_that_is_written_back_keeps_its_values(scene_file: Path) -> None
 
 
 def test_an_unknown_preset_is_refused(scene_file: Path) -> None:
-    with pytest.raises(SceneError, match=r"solver\.preset = \"fast\": must be 'preview', 'standard' or 'final'"):
+    with pytest.raises(
+        SceneError, match=r"solver\.preset = \"fast\": must be 'preview', 'standard' or 'final'"
+    ):
         load_scene(scene_file, ["solver.preset=fast"])
 
 
@@ -105,8 +112,14 @@ def test_faster_presets_take_fewer_steps_and_lie_further_away(scene_file: Path) 
     scene = load_scene(scene_file)
     prices = price_table()["fluids"]
     reference = trial(changed(scene, prices.reference), device="cpu", frames=6)
-    runs = {name: trial(changed(scene, prices.presets[name].settings), device="cpu", frames=6) for name in PRESETS}
+    runs = {
+        name: trial(changed(scene, prices.presets[name].settings), device="cpu", frames=6)
+        for name in PRESETS
+    }
     distances = [runs[name].distance(reference) for name in PRESETS]
     assert distances[0] > distances[1] > distances[2] > 0.0
-    assert all(distance <= prices.presets[name].distance for name, distance in zip(PRESETS, distances, strict=True))
+    assert all(
+        distance <= prices.presets[name].distance
+        for name, distance in zip(PRESETS, distances, strict=True)
+    )
     assert runs["preview"].steps * 4 <= runs["final"].steps

@@ -37,11 +37,13 @@ SCENE_TABLES = tomllib.loads(SCENE)
 FORMS = {
     "table": SCENE,
     "quoted": SCENE.replace("angle_of =", '"angle_of" ='),
-    "inline": SCENE.replace('[material]   # of grains\nangle_of = "plane-strain"  # of a test\nfriction_angle = 30.0\n', "").replace(
-        "# a heap\n", 'material = { angle_of = "plane-strain", friction_angle = 30.0 }\n'
-    ),
+    "inline": SCENE.replace(
+        '[material]   # of grains\nangle_of = "plane-strain"  # of a test\nfriction_angle = 30.0\n',
+        "",
+    ).replace("# a heap\n", 'material = { angle_of = "plane-strain", friction_angle = 30.0 }\n'),
     "dotted at the top": SCENE.replace(
-        '[material]   # of grains\nangle_of = "plane-strain"  # of a test\nfriction_angle = 30.0\n', ""
+        '[material]   # of grains\nangle_of = "plane-strain"  # of a test\nfriction_angle = 30.0\n',
+        "",
     ).replace("# a heap\n", 'material.angle_of = "plane-strain"\nmaterial.friction_angle = 30.0\n'),
 }
 
@@ -50,7 +52,10 @@ def test_old_names_mean_what_the_new_ones_mean(tmp_path):
     old, new = tmp_path / "old.toml", tmp_path / "new.toml"
     old.write_text(SCENE)
     new.write_text(SCENE.replace("angle_of =", "friction_angle_test ="))
-    with pytest.warns(RenamedKeyWarning, match=r"material\.angle_of is now material\.friction_angle_test; `warp-lcp check --fix"):
+    with pytest.warns(
+        RenamedKeyWarning,
+        match=r"material\.angle_of is now material\.friction_angle_test; `warp-lcp check --fix",
+    ):
         read = load_scene(old)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -58,7 +63,10 @@ def test_old_names_mean_what_the_new_ones_mean(tmp_path):
     assert read.material == expected.material
     assert read.material.friction_angle_test == "plane-strain"
     with pytest.warns(RenamedKeyWarning, match=r"material\.angle_of is now"):
-        assert load_scene(SCENE_TABLES, ["material.angle_of=repose"]).material.friction_angle_test == "repose"
+        assert (
+            load_scene(SCENE_TABLES, ["material.angle_of=repose"]).material.friction_angle_test
+            == "repose"
+        )
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -71,9 +79,19 @@ def test_fixed_text_keeps_all_else(form):
 
 
 def test_what_cannot_be_rewritten_is_refused():
-    with pytest.raises(SceneError, match=r"material\.angle_of: is the old name of material\.friction_angle_test, which is there too"):
-        fix_text(SCENE.replace("friction_angle = 30.0", 'friction_angle_test = "repose"'), SandScene, "heap.toml")
-    with pytest.raises(SceneError, match=r"rename by hand: material\.angle_of to material\.friction_angle_test"):
+    with pytest.raises(
+        SceneError,
+        match=r"material\.angle_of: is the old name of material\.friction_angle_test, which is "
+        r"there too",
+    ):
+        fix_text(
+            SCENE.replace("friction_angle = 30.0", 'friction_angle_test = "repose"'),
+            SandScene,
+            "heap.toml",
+        )
+    with pytest.raises(
+        SceneError, match=r"rename by hand: material\.angle_of to material\.friction_angle_test"
+    ):
         fix_text(SCENE.replace("angle_of repose", "angle_of = repose"), SandScene, "heap.toml")
 
 
@@ -82,13 +100,19 @@ def test_check_says_it_and_fix_does_it(tmp_path):
     file.write_text(SCENE)
     done = CliRunner().invoke(app, ["check", str(file)])
     assert done.exit_code == 0
-    assert "material.angle_of is now material.friction_angle_test; `warp-lcp check --fix" in " ".join(done.stderr.split())
+    assert (
+        "material.angle_of is now material.friction_angle_test; `warp-lcp check --fix"
+        in " ".join(done.stderr.split())
+    )
     done = CliRunner().invoke(app, ["check", "--fix", str(file)])
     assert done.exit_code == 0
     assert "material.angle_of is now material.friction_angle_test" in done.stdout
     assert not done.stderr
     assert file.read_text() == SCENE.replace("angle_of =", "friction_angle_test =")
-    assert "nothing: no key has an old name" in CliRunner().invoke(app, ["check", "--fix", str(file)]).stdout
+    assert (
+        "nothing: no key has an old name"
+        in CliRunner().invoke(app, ["check", "--fix", str(file)]).stdout
+    )
     done = CliRunner().invoke(app, ["check", "--fix", "dam-break"])
     assert done.exit_code == 2
     assert "--fix needs a scene file" in done.stderr

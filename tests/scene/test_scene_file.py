@@ -22,7 +22,10 @@ def test_the_file_names_the_scene(scene_file):
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("damm-break", "damm-break: no such file, and no such built-in scene; did you mean 'dam-break'?"),
+        (
+            "damm-break",
+            "damm-break: no such file, and no such built-in scene; did you mean 'dam-break'?",
+        ),
         ("x" * 9, "no such built-in scene; choose from arched-snake, "),
         ("missing.toml", "missing.toml: there is no such file"),
         ("folder/missing", "folder/missing: there is no such file"),
@@ -55,7 +58,10 @@ def test_other_encodings_are_refused(scene_file):
     [
         ("", "scene.simulator: is missing; choose from dots"),
         ("scene = 3", "scene.simulator: is missing; choose from dots"),
-        ('[scene]\nsimulator = "dts"', "scene.simulator = \"dts\": no such simulator; did you mean 'dots'?"),
+        (
+            '[scene]\nsimulator = "dts"',
+            "scene.simulator = \"dts\": no such simulator; did you mean 'dots'?",
+        ),
         ("[scene]\nsimulator = [1]", "scene.simulator = [1]: no such simulator"),
     ],
 )
@@ -76,7 +82,11 @@ def test_overrides_are_toml_values_or_words(scene_file):
         'scene.description="a=b"',
     ]
     scene = load_scene(scene_file, overrides)
-    assert (scene.time.duration, scene.domain.wall, scene.solid[0].max) == (0.25, "free-slip", [0.75, 0.5])
+    assert (scene.time.duration, scene.domain.wall, scene.solid[0].max) == (
+        0.25,
+        "free-slip",
+        [0.75, 0.5],
+    )
     assert (scene.physics.gravity, scene.scene.description) == ([1.0, 0.0], "a=b")
 
 
@@ -89,7 +99,10 @@ def test_overrides_are_toml_values_or_words(scene_file):
         ("tim.cfl=1", "tim: unknown key; did you mean 'time'?"),
         ("time.cfl=fast", 'time.cfl = "fast": must be a number'),
         ("time.duration.x=1", "--set time.duration.x: time.duration has no keys: it is 0.5"),
-        ("domain.size.7=1", "--set domain.size.7: is not an entry of domain.size; there are entries 0 to 1"),
+        (
+            "domain.size.7=1",
+            "--set domain.size.7: is not an entry of domain.size; there are entries 0 to 1",
+        ),
         ("solid.0.max=1", "must be an array of tables, written [[solid]]"),
     ],
 )
@@ -100,7 +113,10 @@ def test_wrong_overrides(scene_file, override, expected):
 
 
 def test_the_resolved_scene_reads_back_equal(scene_file):
-    write(scene_file, '[[solid]]\nshape = "capsule"\nfrom = [0, 0]\nto = [0.5, 0.5]\nradius = 0.1\nrotate = 30\n')
+    write(
+        scene_file,
+        '[[solid]]\nshape = "capsule"\nfrom = [0, 0]\nto = [0.5, 0.5]\nradius = 0.1\nrotate = 30\n',
+    )
     scene = load_scene(scene_file, ["time.dt_min=1e-7"])
     copy = scene_file.with_name("copy.toml")
     copy.write_text(dump_scene(scene))
@@ -111,7 +127,11 @@ def test_the_resolved_scene_reads_back_equal(scene_file):
 def test_keys_are_written_as_in_messages(scene_file):
     write(scene_file, '[[solid]]\nshape = "sphere"\ncenter = [0, 0]\nradius = 0.1\n')
     found = keys(load_scene(scene_file, ["time.cfl=4.0", "solid.0.wall=free-slip"]))
-    assert (found["time.cfl"], found["solid[0].wall"], found["solid[0].center"]) == (4.0, "free-slip", [0.0, 0.0])
+    assert (found["time.cfl"], found["solid[0].wall"], found["solid[0].center"]) == (
+        4.0,
+        "free-slip",
+        [0.0, 0.0],
+    )
     assert "solid[0].motion" not in found
 
 
@@ -134,18 +154,50 @@ def test_built_in_scenes_are_valid(name):
     scene = load_scene(name)
     assert scene.scene.name == name
     assert scene.scene.description
-    assert np.prod(getattr(scene, "covered_counts", 0)) < 200_000  # minutes, not hours, on two cores
+    # minutes, not hours, on two cores
+    assert np.prod(getattr(scene, "covered_counts", 0)) < 200_000
     check_shapes(scene, name)
 
 
 def test_the_promised_scenes_are_there():
-    promised = {"dam-break-2d", "dam-break", "ceiling-drop", "splash-in-circle", "water-labyrinth", "splash-in-square", "mesh-obstacle"}
+    promised = {
+        "dam-break-2d",
+        "dam-break",
+        "ceiling-drop",
+        "splash-in-circle",
+        "water-labyrinth",
+        "splash-in-square",
+        "mesh-obstacle",
+    }
     promised |= {"wave-maker", "retracting-wall", "stirred-tank"}
-    promised |= {"column-collapse-2d", "column-collapse", "hourglass-2d", "hourglass", "pouring-pile", "sand-on-mesh"}
+    promised |= {
+        "column-collapse-2d",
+        "column-collapse",
+        "hourglass-2d",
+        "hourglass",
+        "pouring-pile",
+        "sand-on-mesh",
+    }
     assert promised <= built_in_scenes().keys()
 
 
-NAMES = ["../../../x", "a/b", "a\\b", "/etc/x", "..", ".", "...", ".x", "x.", " x", "x ", "a\0b", "a\nb", "\x1b[2J", "a:b"]
+NAMES = [
+    "../../../x",
+    "a/b",
+    "a\\b",
+    "/etc/x",
+    "..",
+    ".",
+    "...",
+    ".x",
+    "x.",
+    " x",
+    "x ",
+    "a\0b",
+    "a\nb",
+    "\x1b[2J",
+    "a:b",
+]
 NAMES += ["*", "x" * 61, "~/x", "a\u0300"]
 
 
@@ -159,7 +211,9 @@ def test_names_that_would_lead_elsewhere(scene_file, name):
         load_scene(scene_file)
 
 
-@pytest.mark.parametrize("name", ["dam-break", "Dam break 2", "v1.2_b", "\u00fcber", "\u6c34", "x" * 60])
+@pytest.mark.parametrize(
+    "name", ["dam-break", "Dam break 2", "v1.2_b", "\u00fcber", "\u6c34", "x" * 60]
+)
 def test_names(scene_file, tmp_path, name):
     assert load_scene(scene_file, [f"scene.name={json.dumps(name)}"]).scene.name == name
     file = tmp_path / f"{name}.toml"

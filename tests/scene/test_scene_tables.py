@@ -8,7 +8,11 @@ import pytest
 
 from warp_lcp.scene.scene import Scene, SceneError, validate
 
-BASE: dict[str, Any] = {"scene": {"simulator": "dots"}, "time": {"duration": 1.0}, "domain": {"size": [1.6, 0.8], "resolution": 64}}
+BASE: dict[str, Any] = {
+    "scene": {"simulator": "dots"},
+    "time": {"duration": 1.0},
+    "domain": {"size": [1.6, 0.8], "resolution": 64},
+}
 BOX = {"shape": "box", "min": [0.0, 0.0], "max": [0.4, 0.4]}
 
 
@@ -36,7 +40,11 @@ def test_defaults_and_derived_numbers():
     assert (scene.dimension, scene.cell_counts, scene.spacing) == (2, (64, 32, 1), 0.025)
     assert scene.physics.gravity == [0.0, -9.81]
     assert scene.time.frame_count == 30
-    assert (scene.solver.method, scene.domain.wall, scene.output.checkpoint_every) == ("projected-multigrid", "separating", 50)
+    assert (scene.solver.method, scene.domain.wall, scene.output.checkpoint_every) == (
+        "projected-multigrid",
+        "separating",
+        50,
+    )
 
 
 def test_three_dimensions():
@@ -62,13 +70,27 @@ def test_frame_times_end_with_the_run():
         ({"time": {}}, "time.duration: is missing"),
         ({"time": 3}, "time = 3: must be a table"),
         ({"domain.resolution": 64.5}, "domain.resolution = 64.5: must be a whole number"),
-        ({"domain.wall": "glue"}, "domain.wall = \"glue\": must be 'separating', 'free-slip' or 'sticky'"),
+        (
+            {"domain.wall": "glue"},
+            "domain.wall = \"glue\": must be 'separating', 'free-slip' or 'sticky'",
+        ),
         ({"domain.size": [1.6]}, "domain.size = [1.6]: must have at least 2 entries"),
         ({"domain.size": [1.6, -0.8]}, "domain.size[1] = -0.8: must be greater than 0"),
-        ({"domain.size": [1.6, 0.83]}, "domain.size[1] = 0.83: must be a whole number of cells of 0.025 m; the nearest: 0.825 and 0.85"),
-        ({"domain.size": [1.6, 0.001]}, "domain.size[1] = 0.001: must be a whole number of cells of 0.025 m; the nearest: 0.025"),
+        (
+            {"domain.size": [1.6, 0.83]},
+            "domain.size[1] = 0.83: must be a whole number of cells of 0.025 m; the nearest: 0.825 "
+            "and 0.85",
+        ),
+        (
+            {"domain.size": [1.6, 0.001]},
+            "domain.size[1] = 0.001: must be a whole number of cells of 0.025 m; the nearest: "
+            "0.025",
+        ),
         ({"domain.size": 1.6}, "domain.size = 1.6: must be a list"),
-        ({"physics.gravity": [0.0, 0.0, -9.81]}, "physics.gravity = [0.0, 0.0, -9.81]: must have 2 entries, as domain.size has"),
+        (
+            {"physics.gravity": [0.0, 0.0, -9.81]},
+            "physics.gravity = [0.0, 0.0, -9.81]: must have 2 entries, as domain.size has",
+        ),
         ({"time.dt_min": 0.1}, "time.dt_min = 0.1: must not exceed time.dt_max = 0.02"),
         ({"output.grid": 1}, "output.grid = 1: must be true or false"),
         ({"solver.tolerance": 1.0}, "solver.tolerance = 1.0: must be less than 1"),
@@ -83,9 +105,15 @@ def test_refused_values_name_key_value_and_what_is_allowed(changes, expected):
     ("changes", "expected"),
     [
         ({"time.dtmax": 1}, "time.dtmax: unknown key; did you mean 'dt_max'?"),
-        ({"time.zzz": 1}, "time.zzz: unknown key; choose from cfl, dt_max, dt_min, duration, frames_per_second"),
+        (
+            {"time.zzz": 1},
+            "time.zzz: unknown key; choose from cfl, dt_max, dt_min, duration, frames_per_second",
+        ),
         ({"outptu": {}}, "outptu: unknown key; did you mean 'output'?"),
-        ({"solid": [{**BOX, "wal": "separating"}]}, "solid[0].wal: unknown key; did you mean 'wall'?"),
+        (
+            {"solid": [{**BOX, "wal": "separating"}]},
+            "solid[0].wal: unknown key; did you mean 'wall'?",
+        ),
     ],
 )
 def test_unknown_keys_suggest(changes, expected):
@@ -108,13 +136,20 @@ def test_what_another_simulator_has_is_no_typo(changes, path):
 def test_what_comes_later_may_be_off():
     scene = build({"domain.periodic": [False, False]})
     assert scene.domain.periodic == [False, False]
-    assert complaint({"domain.periodic": [False]}) == "dam.toml: domain.periodic = [false]: must have 2 entries"
+    assert (
+        complaint({"domain.periodic": [False]})
+        == "dam.toml: domain.periodic = [false]: must have 2 entries"
+    )
 
 
 def test_all_errors_are_listed():
     with pytest.raises(SceneError) as caught:
         build({"time.cfl": 0, "domain.wal": "x", "solid": [{"shape": "sphere", "center": [0, 0]}]})
-    assert {problem.path for problem in caught.value.problems} == {"time.cfl", "domain.wal", "solid[0].radius"}
+    assert {problem.path for problem in caught.value.problems} == {
+        "time.cfl",
+        "domain.wal",
+        "solid[0].radius",
+    }
     assert str(caught.value).splitlines()[0] == "dam.toml: 3 errors"
 
 
@@ -122,15 +157,39 @@ def test_all_errors_are_listed():
     ("shape", "expected"),
     [
         ({"shape": "bx"}, "solid[0].shape = \"bx\": unknown shape; did you mean 'box'?"),
-        ({"radius": 1.0}, "solid[0].shape: is missing; choose from box, capsule, mesh, plane, sphere"),
-        ({**BOX, "max": [0.4, 0.0]}, "solid[0].max = [0.4, 0.0]: must be greater than min = [0.0, 0.0] along every axis"),
-        ({**BOX, "max": [0.4, 0.4, 0.4]}, "solid[0].max = [0.4, 0.4, 0.4]: must have 2 entries in 2-D"),
-        ({**BOX, "rotate": [0.0, 90.0, 0.0]}, "solid[0].rotate = [0.0, 90.0, 0.0]: must be one number in 2-D"),
+        (
+            {"radius": 1.0},
+            "solid[0].shape: is missing; choose from box, capsule, mesh, plane, sphere",
+        ),
+        (
+            {**BOX, "max": [0.4, 0.0]},
+            "solid[0].max = [0.4, 0.0]: must be greater than min = [0.0, 0.0] along every axis",
+        ),
+        (
+            {**BOX, "max": [0.4, 0.4, 0.4]},
+            "solid[0].max = [0.4, 0.4, 0.4]: must have 2 entries in 2-D",
+        ),
+        (
+            {**BOX, "rotate": [0.0, 90.0, 0.0]},
+            "solid[0].rotate = [0.0, 90.0, 0.0]: must be one number in 2-D",
+        ),
         ({**BOX, "scale": 0}, "solid[0].scale = 0: must be greater than 0"),
-        ({"shape": "sphere", "center": [0, 0], "radius": -1}, "solid[0].radius = -1: must be greater than 0 (radius [m])"),
-        ({"shape": "capsule", "from": [0, 0], "radius": 1}, "solid[0].to: is missing (end of the axis [m])"),
-        ({"shape": "capsule", "from": [0, 0], "to": [0, 0], "radius": 1}, 'solid[0].to = [0.0, 0.0]: must differ from "from"'),
-        ({"shape": "plane", "point": [0, 0], "normal": [0, 0]}, "solid[0].normal = [0.0, 0.0]: must not be zero"),
+        (
+            {"shape": "sphere", "center": [0, 0], "radius": -1},
+            "solid[0].radius = -1: must be greater than 0 (radius [m])",
+        ),
+        (
+            {"shape": "capsule", "from": [0, 0], "radius": 1},
+            "solid[0].to: is missing (end of the axis [m])",
+        ),
+        (
+            {"shape": "capsule", "from": [0, 0], "to": [0, 0], "radius": 1},
+            'solid[0].to = [0.0, 0.0]: must differ from "from"',
+        ),
+        (
+            {"shape": "plane", "point": [0, 0], "normal": [0, 0]},
+            "solid[0].normal = [0.0, 0.0]: must not be zero",
+        ),
     ],
 )
 def test_refused_shapes(shape, expected):
@@ -154,7 +213,15 @@ def test_a_scene_does_not_change():
 
 def test_enclosed_volume_counts_what_is_inside_the_domain():
     sphere = {"shape": "sphere", "center": [0.0, 0.0], "radius": 0.5}
-    scene = build({"solid": [{**BOX, "translate": [1.4, 0.0]}, {**BOX, "translate": [-1.0, 0.0]}, {**sphere, "invert": True}]})
+    scene = build(
+        {
+            "solid": [
+                {**BOX, "translate": [1.4, 0.0]},
+                {**BOX, "translate": [-1.0, 0.0]},
+                {**sphere, "invert": True},
+            ]
+        }
+    )
     volumes = [scene.enclosed_volume(solid) for solid in scene.solid]
     assert volumes == pytest.approx([0.08, 0.0, 1.28])
     complaints = scene.shape_complaints("liquid", scene.solid, inside=True)

@@ -52,11 +52,19 @@ def test_grid_planted(name, shape, arrays, device):
     cells = rng.choice(3, shape, p=[0.15, 0.75, 0.1])
     cells.ravel()[0] = wl.AIR
     faces = [
-        rng.uniform(0.2, 1.0, [s + (q == len(shape) - 1 - a) for q, s in enumerate(shape)]) if arrays else 1.0 for a in range(len(shape))
+        rng.uniform(0.2, 1.0, [s + (q == len(shape) - 1 - a) for q, s in enumerate(shape)])
+        if arrays
+        else 1.0
+        for a in range(len(shape))
     ]
     dense = assemble(cells, faces)
     fluid = cells.ravel() == wl.FLUID
-    A = wl.GridPoisson(cells, **{f"face_{c}": f for c, f in zip("xyz", faces, strict=False)}, device=device, dtype=wp.float64)
+    A = wl.GridPoisson(
+        cells,
+        **{f"face_{c}": f for c, f in zip("xyz", faces, strict=False)},
+        device=device,
+        dtype=wp.float64,
+    )
     b, x = np.zeros(cells.size), np.zeros(cells.size)
     b[fluid], x[fluid] = planted(dense[np.ix_(fluid, fluid)], rng)
     result = wl.solve(wl.LCP(A, b.reshape(shape)), METHODS[name], stopping=TIGHT)
@@ -64,7 +72,9 @@ def test_grid_planted(name, shape, arrays, device):
     assert result.relative_residual <= 1e-10
     got = result.x.numpy().ravel()
     bounds = np.where(fluid, 0, -np.inf), np.full(cells.size, np.inf)
-    assert natural_residual(dense, b, *bounds, got) == pytest.approx(result.residual, rel=1e-6, abs=1e-12)
+    assert natural_residual(dense, b, *bounds, got) == pytest.approx(
+        result.residual, rel=1e-6, abs=1e-12
+    )
     np.testing.assert_allclose(got, x, atol=1e-7)
 
 
@@ -109,13 +119,21 @@ def test_small_boxed_dense_problems(seed, n):
     B = rng.standard_normal((n, n))
     A, b = B @ B.T + 0.2 * np.eye(n), rng.standard_normal(n)
     lower, upper = -rng.random(n), rng.random(n)
-    result = wl.solve(wl.LCP(wl.DenseOperator(A, device="cpu"), b, lower, upper), wl.MinimumMapNewton(), stopping=TIGHT)
+    result = wl.solve(
+        wl.LCP(wl.DenseOperator(A, device="cpu"), b, lower, upper),
+        wl.MinimumMapNewton(),
+        stopping=TIGHT,
+    )
     assert result, result.status
     np.testing.assert_allclose(result.x.numpy(), boxed(A, b, lower, upper), atol=1e-8)
 
 
 def test_unsymmetric_p_matrix_with_a_cycle_of_period_three():
     A = np.array([[1.0, 0.0, 4.0], [4.0, 1.0, 0.0], [0.0, 4.0, 1.0]])
-    result = wl.solve(wl.LCP(wl.DenseOperator(A, device="cpu"), -np.ones(3)), wl.MinimumMapNewton(), stopping=TIGHT)
+    result = wl.solve(
+        wl.LCP(wl.DenseOperator(A, device="cpu"), -np.ones(3)),
+        wl.MinimumMapNewton(),
+        stopping=TIGHT,
+    )
     assert result, result.status
     np.testing.assert_allclose(A @ result.x.numpy(), np.ones(3), atol=1e-9)

@@ -31,7 +31,10 @@ def spiral(n):
 
 def lognormal(n, seed):
     rng = np.random.default_rng(seed)
-    faces = {"face_x": np.exp(3 * rng.standard_normal((n, n + 1))), "face_y": np.exp(3 * rng.standard_normal((n + 1, n)))}
+    faces = {
+        "face_x": np.exp(3 * rng.standard_normal((n, n + 1))),
+        "face_y": np.exp(3 * rng.standard_normal((n + 1, n))),
+    }
     cells = np.full((n, n), wl.FLUID)
     cells[0] = wl.AIR
     return wl.GridPoisson(cells, **faces, device="cpu", dtype=wp.float64), cells
@@ -50,11 +53,15 @@ def relative_residual(A, b, lower, x):
 
 @pytest.mark.parametrize("lower", [0.0, -np.inf], ids=["bounds", "equality"])
 @pytest.mark.parametrize(
-    ("make", "load"), [(lambda: spiral(61), 0.2), (lambda: lognormal(150, 20260303), 0.0)], ids=["spiral", "lognormal"]
+    ("make", "load"),
+    [(lambda: spiral(61), 0.2), (lambda: lognormal(150, 20260303), 0.0)],
+    ids=["spiral", "lognormal"],
 )
 def test_channels_and_random_coefficients(make, load, lower):
     A, cells = make()
-    b = np.where(cells == wl.FLUID, np.random.default_rng(61803).standard_normal(cells.shape) - load, 0.0)
+    b = np.where(
+        cells == wl.FLUID, np.random.default_rng(61803).standard_normal(cells.shape) - load, 0.0
+    )
     result = wl.solve(wl.LCP(A, b, lower))
     assert result, result.status
     assert relative_residual(A, b, lower, result.x.numpy()) <= 1.01e-6
@@ -75,6 +82,13 @@ def test_spiral_is_one_channel():
 def test_easy_solves_stay_on_the_grid():
     cells = np.ones((40, 50), dtype=np.int8)
     cells[0] = 0
-    result = wl.solve(wl.LCP(wl.GridPoisson(cells, device="cpu"), np.where(cells == 1, -1.0, 0.0)), stopping=wl.StoppingCriteria(rtol=0.0))
+    result = wl.solve(
+        wl.LCP(wl.GridPoisson(cells, device="cpu"), np.where(cells == 1, -1.0, 0.0)),
+        stopping=wl.StoppingCriteria(rtol=0.0),
+    )
     assert result.status is wl.SolveStatus.FLOOR
-    assert {record.step for record in result.history} == {"start", "monotone cycle", "truncated cycle"}
+    assert {record.step for record in result.history} == {
+        "start",
+        "monotone cycle",
+        "truncated cycle",
+    }

@@ -16,7 +16,9 @@ def started(precision="mixed", faces=None, closed=False):
     b = np.random.default_rng(17).standard_normal(cells.shape)
     solver = wl.ProjectedMultigrid(precision=precision)
     lower = np.where(np.random.default_rng(3).random(cells.shape) < 0.5, 0.0, -np.inf)
-    problem = wl.LCP(wl.GridPoisson(cells, device="cpu", **(faces or {})), b - (b.mean() if closed else 0), lower)
+    problem = wl.LCP(
+        wl.GridPoisson(cells, device="cpu", **(faces or {})), b - (b.mean() if closed else 0), lower
+    )
     work = solver.init(problem)
     floating = problem.A.floating_components(work.scratch)
     work.residual.start(work.x, keep=False)
@@ -41,7 +43,8 @@ def test_the_best_iterate_comes_back(before, beyond, closed, precision):
     moved = np.abs(work.x.numpy() - best).max()
     assert moved > 0
     work.restore()
-    # a step back is exact but for the rounding of the direction, in float32, where a bound cut the step
+    # a step back is exact but for the rounding of the direction, in float32, where a bound cut the
+    # step
     np.testing.assert_allclose(work.x.numpy(), best, atol=1e-6 * moved)
     assert work.residual.evaluate(work.x) == pytest.approx(norm, rel=1e-5)
     solver.step(problem, work, work.x)

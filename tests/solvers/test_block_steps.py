@@ -22,7 +22,9 @@ def spd(n, seed):
 
 
 def operators(A, device):
-    return wl.DenseOperator(A, device=device), wl.SparseOperator(scipy.sparse.csr_array(A), device=device)
+    return wl.DenseOperator(A, device=device), wl.SparseOperator(
+        scipy.sparse.csr_array(A), device=device
+    )
 
 
 def held_others(A, b, x, block):
@@ -54,7 +56,11 @@ def sliding_block(A, b, normal):
             x = np.linalg.solve(M, r)
             (lower, upper), y = contact_bounds(normal, x), A @ x + b
             signs = {"f": abs(y) < 1e-9, "L": y > -1e-9, "U": y < 1e-9}
-            if (x >= lower - 1e-9).all() and (x <= upper + 1e-9).all() and all(signs[at][i] for i, at in enumerate(kind)):
+            if (
+                (x >= lower - 1e-9).all()
+                and (x <= upper + 1e-9).all()
+                and all(signs[at][i] for i, at in enumerate(kind))
+            ):
                 return x
     return None
 
@@ -77,7 +83,10 @@ def test_sweeps_over_blocks_are_those_of_the_algorithm(omega, direction, device)
     """Each block solved by exhaustive search, x moved by omega of the way and projected."""
     rng = np.random.default_rng(4801)
     A, b = spd(11, 4801), 2 * rng.standard_normal(11)
-    lower, upper = np.where(rng.random(11) < 0.3, -np.inf, -rng.random(11)), np.where(rng.random(11) < 0.3, np.inf, rng.random(11))
+    lower, upper = (
+        np.where(rng.random(11) < 0.3, -np.inf, -rng.random(11)),
+        np.where(rng.random(11) < 0.3, np.inf, rng.random(11)),
+    )
     order = rng.permutation(11)
     blocks = [order[:3], order[3:4], order[4:9], order[9:]]
     expected, x = [], np.zeros(11)
@@ -85,24 +94,33 @@ def test_sweeps_over_blocks_are_those_of_the_algorithm(omega, direction, device)
         for turn in ORDERS[direction]:
             for block in blocks[::turn]:
                 solution = boxed(*held_others(A, b, x, block), lower[block], upper[block])
-                x[block] = np.clip(x[block] + omega * (solution - x[block]), lower[block], upper[block])
+                x[block] = np.clip(
+                    x[block] + omega * (solution - x[block]), lower[block], upper[block]
+                )
         expected.append(x.copy())
     for operator in operators(A, device):
         method = BlockedGaussSeidel(blocks=blocks, omega=omega, direction=direction)
         if operator.device.is_cuda:
             continue  # in colors, another order
-        for got, x in zip(steps_of(wl.LCP(operator, b, lower, upper), method, 4), expected, strict=True):
+        for got, x in zip(
+            steps_of(wl.LCP(operator, b, lower, upper), method, 4), expected, strict=True
+        ):
             np.testing.assert_allclose(got, x, atol=1e-11)
 
 
 @pytest.mark.parametrize("omega", [1.0, 0.7])
 def test_contacts_with_friction_are_blocks_whose_limits_are_part_of_them(omega, device):
     """n >= 0 and |t| <= mu n at once; the normal force, whose bounds are constant, is projected before those that its size limits."""
-    normal, states = np.tile([-1, 0, 0], 3) + np.repeat([0, 3, 6], 3) * (np.tile([0, 1, 1], 3)), set()
+    normal, states = (
+        np.tile([-1, 0, 0], 3) + np.repeat([0, 3, 6], 3) * (np.tile([0, 1, 1], 3)),
+        set(),
+    )
     for seed in range(4811, 4816):
         rng = np.random.default_rng(seed)
         A, b, x = spd(9, seed), 2 * rng.standard_normal(9) - 1.0, np.zeros(9)
-        problem = wl.LCP(wl.DenseOperator(A, device=device), b, *wl.AffineBounds.friction(normal, FRICTION))
+        problem = wl.LCP(
+            wl.DenseOperator(A, device=device), b, *wl.AffineBounds.friction(normal, FRICTION)
+        )
         for got in steps_of(problem, BlockedGaussSeidel(blocks=3, omega=omega), 4):
             for first in (0, 3, 6):
                 block = np.arange(first, first + 3)
@@ -122,9 +140,15 @@ def test_rounds_over_subproblems_are_those_of_the_algorithm(method, direction, d
     rng = np.random.default_rng(4821)
     C = rng.standard_normal((12, 12))
     A, b = spd(12, 4821) + 0.2 * (C - C.T), 2 * rng.standard_normal(12)
-    lower, upper = np.where(rng.random(12) < 0.3, -np.inf, -rng.random(12)), np.where(rng.random(12) < 0.3, np.inf, rng.random(12))
+    lower, upper = (
+        np.where(rng.random(12) < 0.3, -np.inf, -rng.random(12)),
+        np.where(rng.random(12) < 0.3, np.inf, rng.random(12)),
+    )
     order = rng.permutation(12)
-    blocks, turns = [order[:5], order[5:6], order[6:]], ORDERS[direction] if method is BlockedGaussSeidel else (1,)
+    blocks, turns = (
+        [order[:5], order[5:6], order[6:]],
+        ORDERS[direction] if method is BlockedGaussSeidel else (1,),
+    )
     expected, x = [], np.zeros(12)
     for _ in range(3):
         for turn in turns:
@@ -132,11 +156,19 @@ def test_rounds_over_subproblems_are_those_of_the_algorithm(method, direction, d
                 x[block] = boxed(*held_others(A, b, x, block), lower[block], upper[block])
         expected.append(x.copy())
     if method is BlockedGaussSeidel:
-        solver = BlockedGaussSeidel(blocks=blocks, sub_solver=wl.Lemke(), direction=direction, eta=1e-12)
+        solver = BlockedGaussSeidel(
+            blocks=blocks, sub_solver=wl.Lemke(), direction=direction, eta=1e-12
+        )
     else:
-        solver = Staggering(blocks=blocks, solvers=[wl.Lemke(), wl.ProjectedSOR(omega=1.0), wl.MinimumMapNewton(direct=True)], eta=1e-12)
+        solver = Staggering(
+            blocks=blocks,
+            solvers=[wl.Lemke(), wl.ProjectedSOR(omega=1.0), wl.MinimumMapNewton(direct=True)],
+            eta=1e-12,
+        )
     for operator in operators(A, device):
-        for got, x in zip(steps_of(wl.LCP(operator, b, lower, upper), solver, 3), expected, strict=True):
+        for got, x in zip(
+            steps_of(wl.LCP(operator, b, lower, upper), solver, 3), expected, strict=True
+        ):
             np.testing.assert_allclose(got, x, atol=1e-9)
 
 
@@ -148,11 +180,20 @@ def test_normal_and_tangential_forces_in_turn(device):
     slides = sticks = 0
     for seed in range(4831, 4836):
         A, b, x = spd(9, seed), 2 * np.random.default_rng(seed).standard_normal(9), np.zeros(9)
-        problem = wl.LCP(wl.DenseOperator(A, device=device), b, *wl.AffineBounds.friction(normal, FRICTION))
-        method = Staggering(blocks=[normals, tangential], solvers=[wl.Lemke(), wl.MinimumMapNewton(direct=True)], eta=1e-12)
+        problem = wl.LCP(
+            wl.DenseOperator(A, device=device), b, *wl.AffineBounds.friction(normal, FRICTION)
+        )
+        method = Staggering(
+            blocks=[normals, tangential],
+            solvers=[wl.Lemke(), wl.MinimumMapNewton(direct=True)],
+            eta=1e-12,
+        )
         for got in steps_of(problem, method, 4):
             for block in (normals, tangential):
-                x[block] = boxed(*held_others(A, b, x, block), *(side[block] for side in contact_bounds(normal, x)))
+                x[block] = boxed(
+                    *held_others(A, b, x, block),
+                    *(side[block] for side in contact_bounds(normal, x)),
+                )
             np.testing.assert_allclose(got, x, atol=1e-9)
         at_limit = np.abs(x[tangential]) == contact_bounds(normal, x)[1][tangential]
         slides, sticks = slides + at_limit.sum(), sticks + (~at_limit).sum()
@@ -168,10 +209,14 @@ def test_grid_blocks_see_the_others_cells_as_boundary_values(device):
     b, x = np.where(fluid, 2 * rng.standard_normal(18), 0.0), np.zeros(18)
     left = np.broadcast_to(np.arange(6) < 3, cells.shape).ravel()
     blocks = [np.flatnonzero(fluid & left), np.flatnonzero(fluid & ~left)]
-    problem = wl.LCP(wl.GridPoisson(cells, device=device, dtype=wp.float64), b.reshape(cells.shape), 0.0, 0.6)
+    problem = wl.LCP(
+        wl.GridPoisson(cells, device=device, dtype=wp.float64), b.reshape(cells.shape), 0.0, 0.6
+    )
     place = problem.layout.places()[fluid]
     solver = Staggering(blocks=blocks, solvers=wl.ProjectedMultigrid(precision="double"), eta=1e-12)
     for got in steps_of(problem, solver, 3):
         for block in blocks:
-            x[block] = boxed(*held_others(dense, b, x, block), np.zeros(len(block)), np.full(len(block), 0.6))
+            x[block] = boxed(
+                *held_others(dense, b, x, block), np.zeros(len(block)), np.full(len(block), 0.6)
+            )
         np.testing.assert_allclose(got[place], x[fluid], atol=1e-9)

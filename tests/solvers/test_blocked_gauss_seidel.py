@@ -22,7 +22,9 @@ def spd(n, seed, shift=0.2):
 
 
 def operators(A, device):
-    return wl.DenseOperator(A, device=device), wl.SparseOperator(scipy.sparse.csr_array(A), device=device)
+    return wl.DenseOperator(A, device=device), wl.SparseOperator(
+        scipy.sparse.csr_array(A), device=device
+    )
 
 
 def block_sweep(A, b, lower, upper, x, blocks):
@@ -37,13 +39,20 @@ def block_sweep(A, b, lower, upper, x, blocks):
 def test_a_sweep_solves_each_block_exactly(size, device):
     rng = np.random.default_rng(149 + size)
     A, b = spd(13, size), 2 * rng.standard_normal(13)
-    lower, upper = np.where(rng.random(13) < 0.3, -np.inf, -rng.random(13)), np.where(rng.random(13) < 0.3, np.inf, rng.random(13))
+    lower, upper = (
+        np.where(rng.random(13) < 0.3, -np.inf, -rng.random(13)),
+        np.where(rng.random(13) < 0.3, np.inf, rng.random(13)),
+    )
     order = rng.permutation(13)
     blocks = [order[i : i + size] for i in range(0, 13, size)]
     expected = block_sweep(A, b, lower, upper, np.clip(np.zeros(13), lower, upper), blocks)
     for operator in operators(A, device):
         problem = wl.LCP(operator, b, lower, upper)
-        result = wl.solve(problem, BlockedGaussSeidel(blocks=blocks), stopping=wl.StoppingCriteria(rtol=0.0, max_iterations=1))
+        result = wl.solve(
+            problem,
+            BlockedGaussSeidel(blocks=blocks),
+            stopping=wl.StoppingCriteria(rtol=0.0, max_iterations=1),
+        )
         work_x = result.x.numpy() if result.residual < result.history[0].residual else None
         assert work_x is not None
         np.testing.assert_allclose(work_x, expected, atol=1e-11)
@@ -54,7 +63,12 @@ def test_contacts_in_space_are_blocks_without_being_asked_for(device):
     rng = np.random.default_rng(163)
     contacts, b = [spd(3, seed) for seed in range(5)], -rng.random(15)
     A = scipy.sparse.block_diag(contacts).toarray()
-    expected = np.concatenate([boxed(a, b[3 * i : 3 * i + 3], np.zeros(3), np.full(3, np.inf)) for i, a in enumerate(contacts)])
+    expected = np.concatenate(
+        [
+            boxed(a, b[3 * i : 3 * i + 3], np.zeros(3), np.full(3, np.inf))
+            for i, a in enumerate(contacts)
+        ]
+    )
     for operator in operators(A, device):
         result = wl.solve(wl.LCP(operator, b), BlockedGaussSeidel(), stopping=TIGHT)
         assert (result.status, result.iterations) == (wl.SolveStatus.CONVERGED, 1)
@@ -67,11 +81,20 @@ def test_blocks_of_one_are_projected_gauss_seidel(device):
     for operator in operators(A, device):
         problem = wl.LCP(operator, b)
         for direction in ("forward", "backward", "symmetric"):
-            scalar = wl.solve(problem, wl.ProjectedSOR(omega=1.0, direction=direction), stopping=TIGHT)
-            blocks = wl.solve(problem, BlockedGaussSeidel(blocks=1, direction=direction), stopping=TIGHT)
+            scalar = wl.solve(
+                problem, wl.ProjectedSOR(omega=1.0, direction=direction), stopping=TIGHT
+            )
+            blocks = wl.solve(
+                problem, BlockedGaussSeidel(blocks=1, direction=direction), stopping=TIGHT
+            )
             assert scalar
             assert blocks.iterations == scalar.iterations
-            np.testing.assert_allclose([r.residual for r in blocks.history], [r.residual for r in scalar.history], rtol=1e-6, atol=1e-13)
+            np.testing.assert_allclose(
+                [r.residual for r in blocks.history],
+                [r.residual for r in scalar.history],
+                rtol=1e-6,
+                atol=1e-13,
+            )
 
 
 @pytest.mark.parametrize("sub_solver", [None, wl.MinimumMapNewton(), Lemke()])
@@ -79,7 +102,11 @@ def test_one_block_is_its_solver(sub_solver, device):
     rng = np.random.default_rng(157)
     A, b = spd(25, 4), rng.standard_normal(25)
     for operator in operators(A, device):
-        result = wl.solve(wl.LCP(operator, b), BlockedGaussSeidel(blocks=25, sub_solver=sub_solver, eta=1e-12), stopping=TIGHT)
+        result = wl.solve(
+            wl.LCP(operator, b),
+            BlockedGaussSeidel(blocks=25, sub_solver=sub_solver, eta=1e-12),
+            stopping=TIGHT,
+        )
         assert result, result.status
         assert result.iterations == 1
         np.testing.assert_allclose(result.x.numpy(), lemke(A, b), atol=1e-9)
@@ -94,7 +121,11 @@ def test_strong_coupling_inside_blocks_costs_no_sweeps(device):
     for operator in operators(A, device):
         problem = wl.LCP(operator, b)
         blocks = wl.solve(problem, BlockedGaussSeidel(blocks=2), stopping=TIGHT)
-        scalar = wl.solve(problem, wl.ProjectedSOR(omega=1.0), stopping=wl.StoppingCriteria(rtol=1e-10, max_iterations=500))
+        scalar = wl.solve(
+            problem,
+            wl.ProjectedSOR(omega=1.0),
+            stopping=wl.StoppingCriteria(rtol=1e-10, max_iterations=500),
+        )
         assert blocks
         assert blocks.iterations <= 10
         assert scalar.status is wl.SolveStatus.MAX_ITERATIONS
@@ -106,7 +137,11 @@ def test_blocks_that_active_sets_cycle_on_are_solved_all_the_same(device):
     A = np.array([[1.0, 0.0, 4.0], [4.0, 1.0, 0.0], [0.0, 4.0, 1.0]])
     for signs in itertools.product((-1.0, 1.0), repeat=3):
         b = np.array(signs)
-        result = wl.solve(wl.LCP(wl.DenseOperator(A, device=device), b), BlockedGaussSeidel(blocks=3), stopping=TIGHT)
+        result = wl.solve(
+            wl.LCP(wl.DenseOperator(A, device=device), b),
+            BlockedGaussSeidel(blocks=3),
+            stopping=TIGHT,
+        )
         assert result
         np.testing.assert_allclose(result.x.numpy(), lemke(A, b), atol=1e-10)
 
@@ -125,7 +160,11 @@ def test_unsymmetric_blocks_read_rows_not_columns(device):
     b = rng.standard_normal(12)
     for operator in operators(A, device):
         for blocks, sub_solver in ((3, None), (5, None), (7, None), (4, Lemke())):
-            result = wl.solve(wl.LCP(operator, b), BlockedGaussSeidel(blocks=blocks, sub_solver=sub_solver), stopping=TIGHT)
+            result = wl.solve(
+                wl.LCP(operator, b),
+                BlockedGaussSeidel(blocks=blocks, sub_solver=sub_solver),
+                stopping=TIGHT,
+            )
             assert result, result.status
             np.testing.assert_allclose(result.x.numpy(), lemke(A, b), atol=1e-8)
 
@@ -137,10 +176,19 @@ def test_grids_take_given_blocks_with_a_solver(device):
     b = np.where(cells == wl.FLUID, np.random.default_rng(173).standard_normal(cells.shape), 0.0)
     rows = [np.flatnonzero(fluid & (np.arange(24) // 6 == j)) for j in (1, 2, 3)]
     problem = wl.LCP(wl.GridPoisson(cells, device=device, dtype=wp.float64), b)
-    result = wl.solve(problem, BlockedGaussSeidel(blocks=rows, sub_solver=wl.ProjectedSOR()), stopping=TIGHT)
+    result = wl.solve(
+        problem, BlockedGaussSeidel(blocks=rows, sub_solver=wl.ProjectedSOR()), stopping=TIGHT
+    )
     assert result
-    np.testing.assert_allclose(result.x.numpy().ravel()[fluid], lemke(dense[np.ix_(fluid, fluid)], b.ravel()[fluid]), atol=1e-8)
-    with pytest.raises(ValueError, match="gives no access to rows: give BlockedGaussSeidel GridLines, or lists as blocks"):
+    np.testing.assert_allclose(
+        result.x.numpy().ravel()[fluid],
+        lemke(dense[np.ix_(fluid, fluid)], b.ravel()[fluid]),
+        atol=1e-8,
+    )
+    with pytest.raises(
+        ValueError,
+        match="gives no access to rows: give BlockedGaussSeidel GridLines, or lists as blocks",
+    ):
         BlockedGaussSeidel(blocks=3).init(problem)
 
 

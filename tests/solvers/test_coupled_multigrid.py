@@ -20,12 +20,22 @@ def small(device, dtype=wp.float64):
     U = np.zeros((8, 9, 3))
     U[3:6, 3:6] = rng.standard_normal((3, 3, 3))
     U *= (cells == wl.FLUID)[..., None]
-    return wl.GridPoisson(cells, device=device, dtype=dtype), U, assemble(cells), cells.ravel() == wl.FLUID
+    return (
+        wl.GridPoisson(cells, device=device, dtype=dtype),
+        U,
+        assemble(cells),
+        cells.ravel() == wl.FLUID,
+    )
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 30.0])
-@pytest.mark.parametrize("weights", [np.diag([1.0, 2.0, 3.0]), np.diag([1.0, 0.0, 0.0]), np.full((3, 3), 1.0)])
-@pytest.mark.parametrize("solver", [wl.ProjectedMultigrid(), wl.ProjectedMultigrid(precision="double"), wl.MinimumMapNewton()])
+@pytest.mark.parametrize(
+    "weights", [np.diag([1.0, 2.0, 3.0]), np.diag([1.0, 0.0, 0.0]), np.full((3, 3), 1.0)]
+)
+@pytest.mark.parametrize(
+    "solver",
+    [wl.ProjectedMultigrid(), wl.ProjectedMultigrid(precision="double"), wl.MinimumMapNewton()],
+)
 def test_the_dense_oracle_agrees(solver, weights, scale, device):
     """Weights may be singular: a body that rests against a wall cannot move in all directions."""
     grid, U, stencil, fluid = small(device)
@@ -35,7 +45,9 @@ def test_the_dense_oracle_agrees(solver, weights, scale, device):
     A = wl.SumOperator(grid, wl.LowRankOperator(U, W, device=device))
     result = wl.solve(wl.LCP(A, b), solver, stopping=TIGHT)
     assert result, result.status
-    np.testing.assert_allclose(result.x.numpy().ravel()[fluid], lemke(dense, b.ravel()[fluid]), atol=1e-6)
+    np.testing.assert_allclose(
+        result.x.numpy().ravel()[fluid], lemke(dense, b.ravel()[fluid]), atol=1e-6
+    )
 
 
 def tank(n, bodies, ratio, device):
@@ -46,7 +58,10 @@ def tank(n, bodies, ratio, device):
     centers = [(0.5, 0.4, 0.5), (0.25, 0.65, 0.25), (0.75, 0.25, 0.7)][:bodies]
     z, y, x = np.meshgrid(*[(np.arange(n) + 0.5) / n] * 3, indexing="ij")
     half = np.array([0.125, 0.09, 0.1])
-    inside = [np.all([np.abs(a - c) < h for a, c, h in zip((x, y, z), center, half, strict=True)], axis=0) for center in centers]
+    inside = [
+        np.all([np.abs(a - c) < h for a, c, h in zip((x, y, z), center, half, strict=True)], axis=0)
+        for center in centers
+    ]
     for solid in inside:
         cells[solid] = wl.SOLID
     fluid = cells == wl.FLUID
@@ -54,19 +69,37 @@ def tank(n, bodies, ratio, device):
         U = np.zeros((*cells.shape, 6))
         for axis, storage in enumerate((2, 1, 0)):
             for step in (-1, 1):
-                beside = np.roll(solid, -step, axis=storage) & fluid  # the body lies `step` cells on
+                # the body lies `step` cells on
+                beside = np.roll(solid, -step, axis=storage) & fluid
                 place = [x - center[0], y - center[1], z - center[2]]
                 place[axis] = place[axis] + 0.5 * step / n
                 normal = np.zeros(3)
                 normal[axis] = step
                 turn = np.cross(np.stack(place, axis=-1), normal)
-                U[beside] += np.concatenate([np.broadcast_to(normal, turn.shape), turn], axis=-1)[beside]
+                U[beside] += np.concatenate([np.broadcast_to(normal, turn.shape), turn], axis=-1)[
+                    beside
+                ]
         mass = ratio * solid.sum()
-        spread = mass * np.array([half[1] ** 2 + half[2] ** 2, half[0] ** 2 + half[2] ** 2, half[0] ** 2 + half[1] ** 2]) / 3.0
+        spread = (
+            mass
+            * np.array(
+                [
+                    half[1] ** 2 + half[2] ** 2,
+                    half[0] ** 2 + half[2] ** 2,
+                    half[0] ** 2 + half[1] ** 2,
+                ]
+            )
+            / 3.0
+        )
         blocks.append(U)
         weights += [*[1.0 / mass] * 3, *(1.0 / spread)]
     columns, grid = np.concatenate(blocks, axis=-1), wl.GridPoisson(cells, device=device)
-    return cells, columns, wl.SumOperator(grid, wl.LowRankOperator(columns, weights, device=device)), grid
+    return (
+        cells,
+        columns,
+        wl.SumOperator(grid, wl.LowRankOperator(columns, weights, device=device)),
+        grid,
+    )
 
 
 def falls(cells, columns):
@@ -88,7 +121,9 @@ def test_iterations_hardly_depend_on_what_bodies_weigh(solver, bodies, device):
         cells, columns, A, _ = tank(24, bodies, ratio, device)
         b, _ = falls(cells, columns)
         problem = wl.LCP(A, b, -np.inf)
-        result = wl.solve(problem, solver, stopping=wl.StoppingCriteria(rtol=1e-6, max_iterations=100))
+        result = wl.solve(
+            problem, solver, stopping=wl.StoppingCriteria(rtol=1e-6, max_iterations=100)
+        )
         assert result, (ratio, result.status)
         counts[ratio] = result.linear_iterations
     assert max(counts.values()) <= 1.5 * counts[1.0], counts
@@ -106,7 +141,13 @@ def test_iterations_where_walls_let_go(bodies, device):
         stopping = wl.StoppingCriteria(rtol=1e-4, max_iterations=100)
         cold = wl.solve(problem, wl.ProjectedMultigrid(), stopping=stopping, workspace=work)
         assert cold, (ratio, cold.status)
-        warm = wl.solve(problem, wl.ProjectedMultigrid(), stopping=stopping, x0=0.9 * cold.x.numpy(), workspace=work)
+        warm = wl.solve(
+            problem,
+            wl.ProjectedMultigrid(),
+            stopping=stopping,
+            x0=0.9 * cold.x.numpy(),
+            workspace=work,
+        )
         assert warm
         counts[ratio] = warm.linear_iterations
     assert max(counts.values()) <= 2 * counts[1.0] + 1, counts
@@ -122,7 +163,12 @@ def test_a_plain_preconditioner_is_not_enough(device):
         assert isinstance(work, CoupledWorkspace)
         if not corrected:
             work.correction.renew = lambda begins, noted, made: False  # type: ignore[method-assign]
-        result = wl.solve(problem, wl.ProjectedMultigrid(), stopping=wl.StoppingCriteria(rtol=1e-6, max_iterations=100), workspace=work)
+        result = wl.solve(
+            problem,
+            wl.ProjectedMultigrid(),
+            stopping=wl.StoppingCriteria(rtol=1e-6, max_iterations=100),
+            workspace=work,
+        )
         counts.append(result.linear_iterations if result else 100)
         assert (work.correction.slots > 0) == corrected
     assert counts[1] >= 2 * counts[0]
@@ -152,7 +198,8 @@ def test_the_correction_is_symmetric_positive_definite_and_inverts_light_modes(d
         z.append(finest.x.numpy().copy())
     assert z[0] @ r[1] == pytest.approx(z[1] @ r[0], rel=1e-8)
     assert z[0] @ r[0] > 0 < z[1] @ r[1]
-    # M (A + U W U') is near 1 on the potentials of the columns, where a cycle alone would give the mass ratio
+    # M (A + U W U') is near 1 on the potentials of the columns, where a cycle alone would give the
+    # mass ratio
     U = work._low.columns
     e = np.zeros(U.rank)
     e[1] = 1.0
@@ -174,11 +221,17 @@ def test_the_correction_is_symmetric_positive_definite_and_inverts_light_modes(d
 def test_a_closed_box_full_of_liquid_is_solved_if_b_is_compatible(net, device):
     cells, _, A, _ = tank(12, 1, 0.5, device)
     cells[cells == wl.AIR] = wl.FLUID
-    A = wl.SumOperator(wl.GridPoisson(cells, device=device, dtype=wp.float64), A.second.stored_like(A.second))
+    A = wl.SumOperator(
+        wl.GridPoisson(cells, device=device, dtype=wp.float64), A.second.stored_like(A.second)
+    )
     fluid = cells == wl.FLUID
     b = np.where(fluid, np.random.default_rng(61).standard_normal(cells.shape), 0.0)
     b[fluid] += net - b[fluid].mean()
-    result = wl.solve(wl.LCP(A, b, -np.inf), wl.ProjectedMultigrid(), stopping=wl.StoppingCriteria(rtol=1e-6, max_iterations=60))
+    result = wl.solve(
+        wl.LCP(A, b, -np.inf),
+        wl.ProjectedMultigrid(),
+        stopping=wl.StoppingCriteria(rtol=1e-6, max_iterations=60),
+    )
     assert result.status is (wl.SolveStatus.INFEASIBLE if net else wl.SolveStatus.CONVERGED)
     assert np.isfinite(result.x.numpy()).all()
 
@@ -217,10 +270,15 @@ def test_bodies_that_weigh_next_to_nothing_where_walls_let_go(weight, precision)
         U[5:8, 4, i : i + 3, body], U[5:8, 8, i : i + 3, body] = 1.0, -1.0
     b, fluid = rng.standard_normal(cells.shape), cells.ravel() == wl.FLUID
     lower = np.where(rng.random(cells.shape) < 0.5, 0.0, -np.inf)
-    A = wl.SumOperator(wl.GridPoisson(cells, device="cpu", dtype=wp.float64), wl.LowRankOperator(U, [weight] * 2, device="cpu"))
+    A = wl.SumOperator(
+        wl.GridPoisson(cells, device="cpu", dtype=wp.float64),
+        wl.LowRankOperator(U, [weight] * 2, device="cpu"),
+    )
     criteria = wl.StoppingCriteria(rtol=1e-6)
     for _ in range(2):
-        result = wl.solve(wl.LCP(A, b, lower), wl.ProjectedMultigrid(precision=precision), stopping=criteria)
+        result = wl.solve(
+            wl.LCP(A, b, lower), wl.ProjectedMultigrid(precision=precision), stopping=criteria
+        )
         assert result, result.status
         assert result.iterations <= 40
     u = U.reshape(-1, 2)[fluid]
@@ -245,8 +303,12 @@ def test_the_correction_is_of_the_free_set_after_the_projected_cycles(cycles, de
     A = wl.SumOperator(grid, wl.LowRankOperator(U, np.diag([1.0, 2.0, 3.0]), device=device))
     problem = wl.LCP(A, np.random.default_rng(53).standard_normal(grid.shape))
     method = wl.ProjectedMultigrid(monotone_cycles=cycles)
-    result = wl.solve(problem, method, stopping=TIGHT, callback=lambda record: taken.append(record.iteration))
-    assert [record.step for record in result.history[1 : cycles + 2]] == ["monotone cycle"] * cycles + ["truncated cycle"]
+    result = wl.solve(
+        problem, method, stopping=TIGHT, callback=lambda record: taken.append(record.iteration)
+    )
+    assert [record.step for record in result.history[1 : cycles + 2]] == [
+        "monotone cycle"
+    ] * cycles + ["truncated cycle"]
     assert made[0] == (cycles, True)
     assert len(made) > 1
     assert not any(begins for _, begins in made[1:])

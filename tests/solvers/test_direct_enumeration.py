@@ -18,7 +18,11 @@ TIGHT = wl.StoppingCriteria(rtol=1e-12)
 
 
 def solve(A, b, lower=0.0, upper=np.inf):
-    return wl.solve(wl.LCP(wl.DenseOperator(A, device="cpu"), b, lower, upper), DirectEnumeration(), stopping=TIGHT)
+    return wl.solve(
+        wl.LCP(wl.DenseOperator(A, device="cpu"), b, lower, upper),
+        DirectEnumeration(),
+        stopping=TIGHT,
+    )
 
 
 def random_bounds(rng, n):
@@ -42,7 +46,9 @@ def test_any_matrix_any_bounds(seed, n):
         assert result.status is wl.SolveStatus.INFEASIBLE
     else:
         assert result, result.status
-        assert natural_residual(A, b, lower, upper, result.x.numpy()) <= 1e-10 * max(1.0, np.abs(result.x.numpy()).max())
+        assert natural_residual(A, b, lower, upper, result.x.numpy()) <= 1e-10 * max(
+            1.0, np.abs(result.x.numpy()).max()
+        )
 
 
 @pytest.mark.parametrize(
@@ -55,7 +61,9 @@ def test_any_matrix_any_bounds(seed, n):
     ],
 )
 def test_all_solutions(A, b, expected):
-    found = DirectEnumeration().solutions(wl.LCP(wl.DenseOperator(np.array(A), device="cpu"), np.array(b)))
+    found = DirectEnumeration().solutions(
+        wl.LCP(wl.DenseOperator(np.array(A), device="cpu"), np.array(b))
+    )
     assert found.shape == (len(expected), 2)
     for x in expected:
         assert np.abs(found - x).max(axis=1).min() < 1e-12
@@ -71,7 +79,9 @@ def test_singular_free_blocks():
 
 
 def test_too_many_unknowns_are_refused():
-    with pytest.raises(ValueError, match="5 unknowns: DirectEnumeration is a dense method for at most 4"):
+    with pytest.raises(
+        ValueError, match="5 unknowns: DirectEnumeration is a dense method for at most 4"
+    ):
         DirectEnumeration().init(wl.LCP(wl.DenseOperator(np.eye(5), device="cpu"), np.ones(5)))
 
 
@@ -93,10 +103,14 @@ def test_batch(n, dtype, device):
         wrong += (expected is None) != (sets[k] < 0)
         if sets[k] >= 0:
             scale = np.abs(A[k]).sum() * np.abs(x[k]).max() + np.abs(b[k]).sum()
-            assert natural_residual(A[k], b[k], lower[k], upper[k], x[k]) <= (1e-10 if exact else 1e-4) * scale
+            assert (
+                natural_residual(A[k], b[k], lower[k], upper[k], x[k])
+                <= (1e-10 if exact else 1e-4) * scale
+            )
             for i in range(n):  # the set says where x is
                 assert [x[k, i] == lower[k, i], True, x[k, i] == upper[k, i]][sets[k] // 3**i % 3]
-    assert wrong == 0 if exact else wrong <= m // 100  # float32 cannot tell the nearly parallel ones
+    # float32 cannot tell the nearly parallel ones
+    assert wrong == 0 if exact else wrong <= m // 100
 
 
 def test_batch_bounds_of_one_row_and_numbers_and_reused_memory():
@@ -129,7 +143,9 @@ def test_bad_batches_are_refused(arguments, message):
 
 
 def test_out_of_another_shape_is_refused():
-    out = BatchResult(wp.empty((2, 2), dtype=wp.float64, device="cpu"), wp.empty(2, dtype=wp.int32, device="cpu"))
+    out = BatchResult(
+        wp.empty((2, 2), dtype=wp.float64, device="cpu"), wp.empty(2, dtype=wp.int32, device="cpu")
+    )
     with pytest.raises(ValueError, match="out holds x of shape"):
         enumerate_batch(np.ones((2, 3, 3)), np.ones((2, 3)), device="cpu", out=out)
 
@@ -137,7 +153,9 @@ def test_out_of_another_shape_is_refused():
 def test_kernels_compile_for_cuda(tmp_path):
     for n in (1, 4):
         name = enumeration_kernels(n, wp.float64).batch.module.name
-        wp.compile_aot_module(name, device=None, arch=[90], module_dir=tmp_path / str(n), use_ptx=True)
+        wp.compile_aot_module(
+            name, device=None, arch=[90], module_dir=tmp_path / str(n), use_ptx=True
+        )
         assert list((tmp_path / str(n)).rglob("*.ptx"))
 
 

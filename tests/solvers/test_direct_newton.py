@@ -16,7 +16,8 @@ from warp_lcp.solvers.lemke import BandedBasis, Basis
 
 DIRECT = wl.MinimumMapNewton(direct=True)
 TIGHT = wl.StoppingCriteria(rtol=1e-9)
-SURE = set(FAMILIES) - {"definite"}  # nearly skew bands have cycles of whole steps, and defeat proximal points now and then
+# nearly skew bands have cycles of whole steps, and defeat proximal points now and then
+SURE = set(FAMILIES) - {"definite"}
 PERIOD_THREE = np.array([[1.0, 0.0, 4.0], [4.0, 1.0, 0.0], [0.0, 4.0, 1.0]])
 
 
@@ -31,7 +32,10 @@ def lcp(p, device="cpu"):
 
 def residuals(p, x):
     A = full(p.A)
-    return [natural_residual(A, p.b, p.lower, p.upper, at) for at in (x, np.clip(np.zeros(len(p.b)), p.lower, p.upper))]
+    return [
+        natural_residual(A, p.b, p.lower, p.upper, at)
+        for at in (x, np.clip(np.zeros(len(p.b)), p.lower, p.upper))
+    ]
 
 
 def steps(result):
@@ -51,7 +55,9 @@ def test_default_solves_random_problems(family, device):
         if result:
             assert own <= 1e-9 * reference * (1 + 1e-6)
         if len(p.b) <= 6:
-            np.testing.assert_allclose(result.x.numpy(), boxed(full(p.A), p.b, p.lower, p.upper), atol=1e-6)
+            np.testing.assert_allclose(
+                result.x.numpy(), boxed(full(p.A), p.b, p.lower, p.upper), atol=1e-6
+            )
 
 
 @pytest.mark.parametrize("family", ["option", "obstacle", "strings", "m-matrix"])
@@ -68,7 +74,9 @@ def test_a_contact_set_does_not_creep_back_by_a_layer_a_step():
     for seed in (5501, 5505):
         p = string(seed, n=2000, between=False)
         result = wl.solve(lcp(p), stopping=TIGHT)
-        x, plain = plain_active_set(p, np.stack([np.r_[0.0, p.A.diagonal(1)], p.A.diagonal(), np.r_[p.A.diagonal(-1), 0.0]]))
+        x, plain = plain_active_set(
+            p, np.stack([np.r_[0.0, p.A.diagonal(1)], p.A.diagonal(), np.r_[p.A.diagonal(-1), 0.0]])
+        )
         assert result
         assert plain > 200
         assert result.iterations <= plain / 4
@@ -100,7 +108,10 @@ def test_entries_and_bounds_that_change_in_place_count(device):
     lower, upper = (wp.array(np.full(6, v), dtype=wp.float64, device=device) for v in (-1.0, 1.0))
     for make, change in (
         (wl.DenseOperator(A, device=device), lambda A_, new: A_.matrix.assign(new)),
-        (wl.SparseOperator(scipy.sparse.csr_array(A), device=device), lambda A_, new: A_.update(scipy.sparse.csr_array(new))),
+        (
+            wl.SparseOperator(scipy.sparse.csr_array(A), device=device),
+            lambda A_, new: A_.update(scipy.sparse.csr_array(new)),
+        ),
     ):
         problem = wl.LCP(make, b, lower, upper)
         work = DIRECT.init(problem)
@@ -121,7 +132,10 @@ def test_banded_and_dense_factors_agree(width):
     A = np.triu(np.tril(rng.standard_normal((n, n)), width), -width) + 4 * np.eye(n)
     A = 10.0 ** rng.uniform(-2, 2, n)[:, None] * A
     p = SmallProblem("", A, rng.standard_normal(n), np.full(n, -0.1), np.full(n, 0.1))
-    sparse, dense = (wl.solve(wl.LCP(form, p.b, p.lower, p.upper), DIRECT, stopping=TIGHT) for form in (scipy.sparse.csr_array(A), A))
+    sparse, dense = (
+        wl.solve(wl.LCP(form, p.b, p.lower, p.upper), DIRECT, stopping=TIGHT)
+        for form in (scipy.sparse.csr_array(A), A)
+    )
     assert sparse
     assert dense
     np.testing.assert_allclose(sparse.x.numpy(), dense.x.numpy(), atol=1e-8)
@@ -150,12 +164,16 @@ def test_cycles_are_handed_over():
 def test_other_matrices_end_as_by_the_safeguarded_steps(A, b, lower):
     """Singular blocks, none that solves, skew, negative, empty rows: the same status, dense and sparse, with what takes over.
 
-    Where the method stops at a negative diagonal entry, the default's pivots prove that there is no solution.
+    Where the method stops at a negative diagonal entry, the default's pivots prove that there is no
+    solution.
     """
     proved = wl.SolveStatus.NEGATIVE_CURVATURE, wl.SolveStatus.INFEASIBLE
     for form in (A, scipy.sparse.csr_array(A)):
         problem = wl.LCP(form, b, lower)
-        ours, alone = (wl.solve(problem, method) for method in (None, wl.default_chain(wl.MinimumMapNewton(), problem)))
+        ours, alone = (
+            wl.solve(problem, method)
+            for method in (None, wl.default_chain(wl.MinimumMapNewton(), problem))
+        )
         assert ours.status is alone.status or (alone.status, ours.status) == proved
         if ours:
             assert natural_residual(A, b, lower, np.inf, ours.x.numpy()) <= 1e-6
@@ -164,7 +182,9 @@ def test_other_matrices_end_as_by_the_safeguarded_steps(A, b, lower):
 @pytest.mark.cpu_form("direct solves are the CPU's")
 def test_a_small_problem_on_the_cpu_launches_nothing(monkeypatch):
     launched = []
-    monkeypatch.setattr(wp, "launch", lambda kernel, *arguments, **options: launched.append(kernel.key))
+    monkeypatch.setattr(
+        wp, "launch", lambda kernel, *arguments, **options: launched.append(kernel.key)
+    )
     p = FAMILIES["dense"](5531)
     assert wl.solve(lcp(p), stopping=TIGHT)
     p = option(5531, n=500)
@@ -179,12 +199,18 @@ def test_kernels_may_evaluate_the_residual_as_they_do_on_cuda():
         work.residual = work.iterate.residual = NaturalResidual(problem)
         result = wl.solve(problem, DIRECT, workspace=work, x0=p.start, stopping=TIGHT)
         assert result
-        np.testing.assert_allclose(result.x.numpy(), wl.solve(problem, x0=p.start, stopping=TIGHT).x.numpy(), atol=1e-12)
+        np.testing.assert_allclose(
+            result.x.numpy(), wl.solve(problem, x0=p.start, stopping=TIGHT).x.numpy(), atol=1e-12
+        )
 
 
 def test_single_precision_rounds_the_iterate():
     p = string(5537, n=100)
-    result = wl.solve(lcp(p), wl.MinimumMapNewton(direct=True, precision="single"), stopping=wl.StoppingCriteria(rtol=1e-2))
+    result = wl.solve(
+        lcp(p),
+        wl.MinimumMapNewton(direct=True, precision="single"),
+        stopping=wl.StoppingCriteria(rtol=1e-2),
+    )
     x = result.x.numpy()
     assert x.dtype == np.float32
     own, reference = residuals(p, x.astype(np.float64))
@@ -197,7 +223,10 @@ def test_direct_is_for_small_and_narrow_matrices():
     assert not wl.default_method(wl.LCP(wide, np.ones(201))).direct
     assert wl.default_method(wl.LCP(wide.tocsr()[:200, :200], np.ones(200))).direct
     assert wl.default_method(wl.LCP(np.eye(300), np.ones(300))).direct
-    for A, b in ((wide, np.ones(201)), (wl.GridPoisson(np.array([[0, 1, 1]]), device="cpu"), np.ones((1, 3)))):
+    for A, b in (
+        (wide, np.ones(201)),
+        (wl.GridPoisson(np.array([[0, 1, 1]]), device="cpu"), np.ones((1, 3))),
+    ):
         with pytest.raises(ValueError, match="at most 200 unknowns or a bandwidth up to 3"):
             wl.solve(wl.LCP(A, b), DIRECT)
 
@@ -210,12 +239,17 @@ def test_lemke_makes_the_same_pivots_with_banded_factors(flipped):
         p = SmallProblem("", p.A, -p.b, np.full(150, -np.inf), -p.lower)
     sparse, dense = wl.LCP(p.A, p.b, p.lower, p.upper), wl.LCP(p.A.toarray(), p.b, p.lower, p.upper)
     work = [wl.Lemke().init(problem) for problem in (sparse, dense)]
-    banded, plain = (wl.solve(problem, wl.Lemke(), workspace=w, stopping=TIGHT) for problem, w in zip((sparse, dense), work, strict=True))
+    banded, plain = (
+        wl.solve(problem, wl.Lemke(), workspace=w, stopping=TIGHT)
+        for problem, w in zip((sparse, dense), work, strict=True)
+    )
     assert [type(w.basis) for w in work] == [BandedBasis, Basis]
     assert banded
     assert plain
     assert banded.linear_iterations == plain.linear_iterations
-    np.testing.assert_allclose(banded.x.numpy(), wl.solve(sparse, stopping=TIGHT).x.numpy(), atol=1e-8)
+    np.testing.assert_allclose(
+        banded.x.numpy(), wl.solve(sparse, stopping=TIGHT).x.numpy(), atol=1e-8
+    )
 
 
 @pytest.mark.parametrize("form", ["box", "some boxes", "mirrored"])
@@ -231,7 +265,10 @@ def test_lemke_makes_the_same_pivots_in_narrow_boxes(form):
             lower, upper, b = np.where(rng.random(60) < 0.3, -upper, -np.inf), -lower, -b
         sparse, dense = wl.LCP(p.A, b, lower, upper), wl.LCP(p.A.toarray(), b, lower, upper)
         work = [wl.Lemke().init(problem) for problem in (sparse, dense)]
-        banded, plain = (wl.solve(q, wl.Lemke(), workspace=w, stopping=TIGHT) for q, w in zip((sparse, dense), work, strict=True))
+        banded, plain = (
+            wl.solve(q, wl.Lemke(), workspace=w, stopping=TIGHT)
+            for q, w in zip((sparse, dense), work, strict=True)
+        )
         assert [type(w.basis) for w in work] == [BandedBasis, Basis]
         assert banded
         assert plain
@@ -249,7 +286,9 @@ def test_lemke_on_narrow_matrices_with_far_bounds_alone(size):
     b = np.random.default_rng(5581).standard_normal(50)
     result = wl.solve(wl.LCP(A, b, -size, np.inf), wl.Lemke(), stopping=TIGHT)
     assert result
-    np.testing.assert_allclose(result.x.numpy(), scipy.sparse.linalg.spsolve(A.tocsc(), -b), atol=1e-7)
+    np.testing.assert_allclose(
+        result.x.numpy(), scipy.sparse.linalg.spsolve(A.tocsc(), -b), atol=1e-7
+    )
 
 
 def test_lemke_tells_how_far_it_is_on_a_large_narrow_problem():
@@ -258,7 +297,9 @@ def test_lemke_tells_how_far_it_is_on_a_large_narrow_problem():
     result = wl.solve(lcp(p), wl.Lemke(), callback=told.append)
     assert result
     assert len(told) > 2
-    assert all(b.linear_iterations - a.linear_iterations <= 250 for a, b in itertools.pairwise(told))
+    assert all(
+        b.linear_iterations - a.linear_iterations <= 250 for a, b in itertools.pairwise(told)
+    )
     own, reference = residuals(p, result.x.numpy())
     assert own <= 1e-6 * reference
 
@@ -266,7 +307,9 @@ def test_lemke_tells_how_far_it_is_on_a_large_narrow_problem():
 def test_lemke_widens_where_banded_factors_are_singular():
     """Zeros on the diagonal: the basis without z0's column is singular, with it it is not."""
     n = 40
-    A = scipy.sparse.diags_array([np.tile([1.0, 0.0], 20)[:-1], np.tile([-1.0, 0.0], 20)[:-1]], offsets=[-1, 1], shape=(n, n)).tocsr()
+    A = scipy.sparse.diags_array(
+        [np.tile([1.0, 0.0], 20)[:-1], np.tile([-1.0, 0.0], 20)[:-1]], offsets=[-1, 1], shape=(n, n)
+    ).tocsr()
     b = np.tile([1.0, -1.0], 20)
     problem = wl.LCP(A, b)
     work = wl.Lemke().init(problem)

@@ -55,7 +55,9 @@ def check(seed, largest):
     result = wl.solve(wl.LCP(wl.SparseOperator(A, device="cpu"), b))
     assert result, (seed, result.status, result.relative_residual)
     x = result.x.numpy()
-    assert np.linalg.norm(np.minimum(x, A @ x + b)) <= 2e-6 * np.linalg.norm(np.minimum(b, 0.0)), seed
+    assert np.linalg.norm(np.minimum(x, A @ x + b)) <= 2e-6 * np.linalg.norm(np.minimum(b, 0.0)), (
+        seed
+    )
     return A, b, result
 
 
@@ -69,7 +71,11 @@ def test_the_solution_is_that_of_active_sets():
     A, b, _ = check(seed := 9, 3000)
     exact = by_active_sets(A, b)
     tight = wl.StoppingCriteria(rtol=1e-12, max_iterations=200)
-    x = wl.solve(wl.LCP(wl.SparseOperator(A, device="cpu"), b), wl.MinimumMapNewton(precision="double"), stopping=tight).x.numpy()
+    x = wl.solve(
+        wl.LCP(wl.SparseOperator(A, device="cpu"), b),
+        wl.MinimumMapNewton(precision="double"),
+        stopping=tight,
+    ).x.numpy()
     inverse = np.abs(exact).max() / np.abs(b).max()  # what A's inverse multiplies a residual by
     assert np.abs(x - exact).max() <= 1e-10 * inverse * np.abs(exact).max(), seed
 
@@ -80,7 +86,10 @@ def test_factors_take_over_from_a_hierarchy_that_fails(real):
     rng, n = np.random.default_rng(8), 2500
     A = (scipy.sparse.eye_array(n) - 0.999999 * stochastic(rng, n, "several cycles")).tocsr()
     operator = wl.SparseOperator(A, device="cpu")
-    system, r = principal_system(wl.LCP(operator, np.zeros(n)), real, bounded=False), rng.standard_normal(n)
+    system, r = (
+        principal_system(wl.LCP(operator, np.zeros(n)), real, bounded=False),
+        rng.standard_normal(n),
+    )
     for share in (1.0, 0.9):
         free = (rng.random(n) < share).astype(np.uint8)
         system.restrict(wp.array(free, device="cpu"))
@@ -89,8 +98,12 @@ def test_factors_take_over_from_a_hierarchy_that_fails(real):
         iterations, _ = system.solve(1e-5 * system.norm(), 200)
         inside = np.flatnonzero(free)
         e = system.e.numpy()[inside].astype(np.float64)
-        stored = np.finfo(wp.dtype_to_numpy(real)).eps * np.linalg.norm(e)  # what rounding e itself leaves
-        assert np.linalg.norm(A[inside][:, inside] @ e - r[inside]) <= 2e-5 * np.linalg.norm(r) + stored
+        # what rounding e itself leaves
+        stored = np.finfo(wp.dtype_to_numpy(real)).eps * np.linalg.norm(e)
+        assert (
+            np.linalg.norm(A[inside][:, inside] @ e - r[inside])
+            <= 2e-5 * np.linalg.norm(r) + stored
+        )
         assert not before or iterations <= 4
     assert system._substitute is not None
     operator.update((A + 0.5 * scipy.sparse.eye_array(n)).tocsr())
@@ -105,9 +118,20 @@ def test_shifts_are_weighed_as_before():
     """Norms of a shifted system are measured in units of the shifted diagonal, whoever solves."""
     rng, n = np.random.default_rng(9), 1200
     A = (scipy.sparse.eye_array(n) - 0.9999999 * stochastic(rng, n, "shift")).tocsr()
-    system = principal_system(wl.LCP(wl.SparseOperator(A, device="cpu"), np.zeros(n)), wp.float64, bounded=False, shifted=True)
-    D, r = np.where(np.arange(n) % 200 == 0, 10.0 ** rng.uniform(2, 6, n), 0.0), rng.standard_normal(n)
-    system.restrict(wp.array(np.ones(n, dtype=np.uint8), device="cpu"), wp.array(D, dtype=wp.float64, device="cpu"))
+    system = principal_system(
+        wl.LCP(wl.SparseOperator(A, device="cpu"), np.zeros(n)),
+        wp.float64,
+        bounded=False,
+        shifted=True,
+    )
+    D, r = (
+        np.where(np.arange(n) % 200 == 0, 10.0 ** rng.uniform(2, 6, n), 0.0),
+        rng.standard_normal(n),
+    )
+    system.restrict(
+        wp.array(np.ones(n, dtype=np.uint8), device="cpu"),
+        wp.array(D, dtype=wp.float64, device="cpu"),
+    )
     system.r.assign(r)
     tolerance = 1e-9 * system.norm()
     _, norm = system.solve(tolerance, 200)

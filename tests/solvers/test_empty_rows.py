@@ -11,7 +11,11 @@ from warp_lcp.problem.protocol import families
 from warp_lcp.problem.residual import NaturalResidual
 
 N, EMPTY = 12, (3, 4, 9)
-NAMES = [name for name, cls in wl.METHODS.items() if "sparse" in families(cls) and name != "direct-enumeration"]
+NAMES = [
+    name
+    for name, cls in wl.METHODS.items()
+    if "sparse" in families(cls) and name != "direct-enumeration"
+]
 
 
 def chain():
@@ -24,7 +28,11 @@ def chain():
 
 
 def operator(A, sparse, device):
-    return wl.SparseOperator(scipy.sparse.csr_array(A), device=device) if sparse else wl.DenseOperator(A, device=device)
+    return (
+        wl.SparseOperator(scipy.sparse.csr_array(A), device=device)
+        if sparse
+        else wl.DenseOperator(A, device=device)
+    )
 
 
 @pytest.fixture(params=NAMES)
@@ -50,7 +58,10 @@ def test_where_that_bound_is_infinite_there_is_no_solution(method, sparse, devic
     A, b = chain()
     problem = wl.LCP(operator(A, sparse, device), np.where(b == -0.3, 0.3, b))
     try:
-        assert wl.solve(problem, method, stopping=wl.StoppingCriteria(max_iterations=300)).status is wl.SolveStatus.CONVERGED
+        assert (
+            wl.solve(problem, method, stopping=wl.StoppingCriteria(max_iterations=300)).status
+            is wl.SolveStatus.CONVERGED
+        )
         problem = wl.LCP(operator(A, sparse, device), b)
         assert wl.solve(problem, method).status is wl.SolveStatus.INFEASIBLE
     except ValueError as refusal:  # sweeps refuse it before they start
@@ -60,7 +71,9 @@ def test_where_that_bound_is_infinite_there_is_no_solution(method, sparse, devic
 def test_the_rows_are_found_again_when_the_entries_change(device):
     A, b = chain()
     full = scipy.sparse.csr_array(A + np.eye(N))
-    problem = wl.LCP(wl.SparseOperator(full, device=device), np.abs(b) * [(-1) ** k for k in range(N)], 0.0, 2.0)
+    problem = wl.LCP(
+        wl.SparseOperator(full, device=device), np.abs(b) * [(-1) ** k for k in range(N)], 0.0, 2.0
+    )
     assert problem.A.row_sizes is None
     zeroed = full.copy()
     zeroed.data[full.indptr[4] : full.indptr[5]] = 0.0
@@ -74,6 +87,10 @@ def test_the_rows_are_found_again_when_the_entries_change(device):
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_an_x_that_is_not_finite_is_no_solution(value, device):
     """y says nothing of an x whose column is empty."""
-    problem = wl.LCP(wl.SparseOperator(scipy.sparse.csr_array((2, 2)), device=device), np.array([0.0, 0.0]), -np.inf)
+    problem = wl.LCP(
+        wl.SparseOperator(scipy.sparse.csr_array((2, 2)), device=device),
+        np.array([0.0, 0.0]),
+        -np.inf,
+    )
     x = wp.array([value, 0.0], dtype=wp.float64, device=device)
     assert np.isnan(NaturalResidual(problem).evaluate(x))

@@ -26,7 +26,12 @@ class Memory(IterateMemory):
     """Of a toy: where each start was, and with what tolerance."""
 
     def start(self, *, warm, tolerance):
-        self.begun, self.warm, self.tolerance, self.taken = self.x.numpy().copy(), warm, tolerance, 0
+        self.begun, self.warm, self.tolerance, self.taken = (
+            self.x.numpy().copy(),
+            warm,
+            tolerance,
+            0,
+        )
 
 
 @dataclass(frozen=True)
@@ -93,13 +98,24 @@ def after(steps):
 
 @pytest.mark.parametrize("first", [1.0, 0.97, 0.11, 1.1])
 def test_the_chain_is_a_plain_loop(first):
-    rows = [(first, "a", None), (0.9, "b", wl.stalls), (0.3, "c", lambda p: wl.crawls(p) or after(15)(p))]
+    rows = [
+        (first, "a", None),
+        (0.9, "b", wl.stalls),
+        (0.3, "c", lambda p: wl.crawls(p) or after(15)(p)),
+    ]
     problem = lines()
-    chain = wl.Fallback(*((Shrink(rate, name), when) if when else Shrink(rate, name) for rate, name, when in rows))
+    chain = wl.Fallback(
+        *((Shrink(rate, name), when) if when else Shrink(rate, name) for rate, name, when in rows)
+    )
     result = wl.solve(problem, chain, stopping=LINES)
     names, distances = plain(rows, problem, 60)
     assert [record.method for record in result.history] == names
-    np.testing.assert_allclose([record.residual for record in result.history], np.sqrt(3) * distances, rtol=1e-6, atol=1e-15)
+    np.testing.assert_allclose(
+        [record.residual for record in result.history],
+        np.sqrt(3) * distances,
+        rtol=1e-6,
+        atol=1e-15,
+    )
     assert result.method == names[int(np.argmin(distances))]
     assert (len(set(names)) > 1) == (first >= 1.0)
 
@@ -107,7 +123,9 @@ def test_the_chain_is_a_plain_loop(first):
 def test_the_best_iterate_is_handed_on_after_a_failure():
     """The first method doubles the distance and fails; x = 0, the best so far, is where the second begins."""
     second = Shrink(0.1, "b")
-    result = wl.solve(lines(), wl.Fallback(Shrink(2.0, "a", fails_after=3), (second, wl.fails)), stopping=LINES)
+    result = wl.solve(
+        lines(), wl.Fallback(Shrink(2.0, "a", fails_after=3), (second, wl.fails)), stopping=LINES
+    )
     assert result
     np.testing.assert_array_equal(second.works[0].begun, np.zeros(3))
     assert second.works[0].warm
@@ -125,7 +143,9 @@ def test_the_last_iterate_is_handed_on_otherwise():
 def test_a_restarted_method_begins_cold_and_hands_on_what_it_was_given(rate):
     """Whether its own iterates are better or not: the best one is kept for the end."""
     restarted, last = Shrink(rate, "b", fails_after=2), Shrink(0.1, "c")
-    chain = wl.Fallback(Shrink(0.5, "a"), wl.FallbackEntry(restarted, after(3), restart=True), (last, wl.fails))
+    chain = wl.Fallback(
+        Shrink(0.5, "a"), wl.FallbackEntry(restarted, after(3), restart=True), (last, wl.fails)
+    )
     assert wl.solve(lines(), chain, stopping=LINES)
     np.testing.assert_array_equal(restarted.works[0].begun, np.zeros(3))
     assert not restarted.works[0].warm
@@ -136,25 +156,43 @@ def test_a_batch_counts_as_one_step():
     chain = wl.Fallback(Shrink(1.0, "a"), wl.FallbackEntry(Shrink(0.5, "b"), after(1), batch=10))
     result = wl.solve(lines(), chain, stopping=LINES)
     steps = [record for record in result.history if record.method == "b"]
-    np.testing.assert_allclose(steps[0].residual, np.sqrt(3) * 0.5**4)  # the first power below a tenth
+    # the first power below a tenth
+    np.testing.assert_allclose(steps[0].residual, np.sqrt(3) * 0.5**4)
     assert steps[0].linear_iterations == 1 + 4
 
 
 def test_methods_that_refuse_are_skipped():
-    result = wl.solve(lines(), wl.Fallback(Shrink(1.0, "a"), (Refuses(), after(1)), (wl.ProjectedMultigrid(), after(1)),
-                                           (Shrink(0.1, "c"), after(3))), stopping=LINES)  # fmt: skip
+    result = wl.solve(
+        lines(),
+        wl.Fallback(
+            Shrink(1.0, "a"),
+            (Refuses(), after(1)),
+            (wl.ProjectedMultigrid(), after(1)),
+            (Shrink(0.1, "c"), after(3)),
+        ),
+        stopping=LINES,
+    )
     assert result
     assert {record.method for record in result.history} == {"a", "c"}
 
 
 def test_a_failure_without_a_successor_is_the_status():
-    for chain in (Shrink(0.5, fails_after=2), wl.Fallback(Shrink(0.5, fails_after=2), (Refuses(), wl.fails)),
-                  wl.Fallback(Shrink(0.5, fails_after=2), (Shrink(0.1, "b"), after(9)), (Shrink(0.1, "c"), wl.fails))):  # fmt: skip
+    for chain in (
+        Shrink(0.5, fails_after=2),
+        wl.Fallback(Shrink(0.5, fails_after=2), (Refuses(), wl.fails)),
+        wl.Fallback(
+            Shrink(0.5, fails_after=2), (Shrink(0.1, "b"), after(9)), (Shrink(0.1, "c"), wl.fails)
+        ),
+    ):
         assert wl.solve(lines(), chain, stopping=LINES).status is wl.SolveStatus.NON_DESCENT
 
 
 def test_nothing_is_handed_over_at_the_rounding_floor():
-    result = wl.solve(lines(), wl.Fallback(Shrink(0.1, "a"), (Shrink(0.1, "b"), wl.stalls)), stopping=wl.StoppingCriteria(rtol=0.0))
+    result = wl.solve(
+        lines(),
+        wl.Fallback(Shrink(0.1, "a"), (Shrink(0.1, "b"), wl.stalls)),
+        stopping=wl.StoppingCriteria(rtol=0.0),
+    )
     assert {record.method for record in result.history} == {"a"}
 
 
@@ -174,8 +212,13 @@ class AtFloor:
 
 def test_a_restarted_method_hands_over_at_the_rounding_floor():
     """A path that leads nowhere ends, and the solve with FLOOR, not with MAX_ITERATIONS."""
-    entries = [wl.FallbackEntry(AtFloor(), after(3), restart=True), (Shrink(1.0, "c", fails_after=2), wl.stalls)]
-    result = wl.solve(lines(), wl.Fallback(Shrink(0.5, "a"), *entries), stopping=wl.StoppingCriteria(rtol=0.0))
+    entries = [
+        wl.FallbackEntry(AtFloor(), after(3), restart=True),
+        (Shrink(1.0, "c", fails_after=2), wl.stalls),
+    ]
+    result = wl.solve(
+        lines(), wl.Fallback(Shrink(0.5, "a"), *entries), stopping=wl.StoppingCriteria(rtol=0.0)
+    )
     assert result.status is wl.SolveStatus.FLOOR
     assert result.method == "floor"
     assert [record.method for record in result.history[-2:]] == ["c", "c"]
@@ -183,7 +226,9 @@ def test_a_restarted_method_hands_over_at_the_rounding_floor():
 
 def test_a_method_that_may_not_hand_over_at_the_rounding_floor_is_not_waited_for():
     entries = [(AtFloor(), after(3)), (Shrink(1.0, "c"), wl.stalls)]
-    result = wl.solve(lines(), wl.Fallback(Shrink(0.5, "a"), *entries), stopping=wl.StoppingCriteria(rtol=0.0))
+    result = wl.solve(
+        lines(), wl.Fallback(Shrink(0.5, "a"), *entries), stopping=wl.StoppingCriteria(rtol=0.0)
+    )
     assert result.status is wl.SolveStatus.FLOOR
     assert {record.method for record in result.history} == {"a", "floor"}
 
@@ -194,8 +239,16 @@ def test_slow_linear_solves():
     assert [record.method for record in result.history[:3]] == ["a", "a", "b"]
 
 
-@pytest.mark.parametrize(("factor", "tolerance", "crawls"), [(0.5, 1e-6, False), (0.9, 1e-6, True), (1.0, 1e-6, True), (0.2, 0.0, False),
-                                                             (0.9, 0.1, False)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("factor", "tolerance", "crawls"),
+    [
+        (0.5, 1e-6, False),
+        (0.9, 1e-6, True),
+        (1.0, 1e-6, True),
+        (0.2, 0.0, False),
+        (0.9, 0.1, False),
+    ],
+)
 def test_crawls(factor, tolerance, crawls):
     progress = Progress(None, tolerance)
     for k in range(FIRST + 1):
@@ -231,7 +284,10 @@ def test_a_workspace_is_used_again():
     first, second = Shrink(0.5, "a", fails_after=3), Shrink(0.1, "b")
     problem, chain = lines(), wl.Fallback(first, (second, wl.fails))
     work = chain.init(problem)
-    histories = [[r.method for r in wl.solve(problem, chain, stopping=LINES, workspace=work).history] for _ in range(2)]
+    histories = [
+        [r.method for r in wl.solve(problem, chain, stopping=LINES, workspace=work).history]
+        for _ in range(2)
+    ]
     assert histories[0] == histories[1]
     assert len(first.works) == len(second.works) == 1
 
@@ -249,10 +305,15 @@ def test_settings_are_frozen_and_compare():
         chain.entries = ()
 
 
-@pytest.mark.parametrize(("entries", "message"), [
-    ((), "at least one method"), ((wl.Lemke(), wl.ProjectedSOR()), "must be a pair"), ((wl.Lemke,), "with its settings"),
-    ((wl.Lemke(), (wl.ProjectedSOR(), 3)), "must be a condition"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("entries", "message"),
+    [
+        ((), "at least one method"),
+        ((wl.Lemke(), wl.ProjectedSOR()), "must be a pair"),
+        ((wl.Lemke,), "with its settings"),
+        ((wl.Lemke(), (wl.ProjectedSOR(), 3)), "must be a condition"),
+    ],
+)
 def test_wrong_chains_are_refused(entries, message):
     with pytest.raises(ValueError, match=message):
         wl.Fallback(*entries)
@@ -267,12 +328,18 @@ def quarter_turn(kind=scipy.sparse.csr_array):
     return wl.LCP(kind(TURN), np.array([-1.0, 1.0]))
 
 
-@pytest.mark.parametrize("method", [wl.MinimumMapNewton(), wl.PrimalDualActiveSet()], ids=method_name)
+@pytest.mark.parametrize(
+    "method", [wl.MinimumMapNewton(), wl.PrimalDualActiveSet()], ids=method_name
+)
 @pytest.mark.parametrize("kind", [np.array, scipy.sparse.csr_array], ids=["dense", "sparse"])
 def test_newton_and_active_sets_end_in_a_status_of_their_own(kind, method):
     """Free blocks of one unknown are 0: neither method solves the problem alone, and no step is another method's."""
     result = wl.solve(quarter_turn(kind), method)
-    assert result.status in (wl.SolveStatus.STAGNATED, wl.SolveStatus.NON_DESCENT, wl.SolveStatus.CONVERGED)
+    assert result.status in (
+        wl.SolveStatus.STAGNATED,
+        wl.SolveStatus.NON_DESCENT,
+        wl.SolveStatus.CONVERGED,
+    )
     assert {record.method for record in result.history} == {method_name(method)}
     chain = wl.default_chain(method, quarter_turn(kind))
     solved = wl.solve(quarter_turn(kind), chain)
@@ -288,7 +355,9 @@ def maze(n=61):
     cells[::2] = wl.FLUID
     cells[1::4, -1], cells[3::4, 0] = wl.FLUID, wl.FLUID
     cells[0, 0] = wl.AIR
-    b = np.where(cells == wl.FLUID, np.random.default_rng(5).standard_normal(cells.shape) - 0.2, 0.0)
+    b = np.where(
+        cells == wl.FLUID, np.random.default_rng(5).standard_normal(cells.shape) - 0.2, 0.0
+    )
     return wl.LCP(wl.GridPoisson(cells, device="cpu", dtype=wp.float64), b)
 
 
@@ -324,7 +393,9 @@ def test_without_fallback_the_first_method_ends_the_solve():
     advice = wl.recommend(problem)
     assert advice.chain.names[:2] == ("projected-multigrid", "minimum-map-newton")
     assert advice.chain == wl.default_chain(advice.method, problem)
-    assert str(advice.chain).startswith("projected-multigrid, then minimum-map-newton on the assembled matrix (crawls)")
+    assert str(advice.chain).startswith(
+        "projected-multigrid, then minimum-map-newton on the assembled matrix (crawls)"
+    )
 
 
 def test_a_chain_costs_easy_grids_nothing():
@@ -333,11 +404,16 @@ def test_a_chain_costs_easy_grids_nothing():
     cells[0] = 0
     b = np.where(cells == 1, np.random.default_rng(6).standard_normal(cells.shape), 0.0)
     make = lambda: wl.LCP(wl.GridPoisson(cells, device="cpu"), b)  # noqa: E731
-    alone, method = wl.solve(make(), wl.ProjectedMultigrid()), wl.default_chain(wl.ProjectedMultigrid())
+    alone, method = (
+        wl.solve(make(), wl.ProjectedMultigrid()),
+        wl.default_chain(wl.ProjectedMultigrid()),
+    )
     for _ in range(3):
         chain = wl.solve(make(), method)
         np.testing.assert_array_equal(chain.x.numpy(), alone.x.numpy())
-        assert [record.residual for record in chain.history] == [record.residual for record in alone.history]
+        assert [record.residual for record in chain.history] == [
+            record.residual for record in alone.history
+        ]
     wl.release_workspace()
 
 
@@ -361,7 +437,11 @@ def test_methods_import_no_other_inside_functions():
     """A method that turns into another one would have to."""
     found = []
     for file in Path(wl.__file__).parent.joinpath("solvers").glob("*.py"):
-        for function in (node for node in ast.walk(ast.parse(file.read_text())) if isinstance(node, ast.FunctionDef)):
+        for function in (
+            node
+            for node in ast.walk(ast.parse(file.read_text()))
+            if isinstance(node, ast.FunctionDef)
+        ):
             imports = [node for node in ast.walk(function) if isinstance(node, ast.ImportFrom)]
             found += [ast.unparse(node) for node in imports if "warp_lcp" in str(node.module)]
     assert not found

@@ -10,7 +10,14 @@ from warp_lcp.problem.protocol import families
 
 DRAWS = 4  # problems a method, dense and sparse, each with two sizes of bounds
 SIZES = (1e15, 1e20, 1e30, 1e60, 1e100, 1e160, 1e200, 1e300, 1e308)
-ANSWERS = ("lemke", "fischer-newton", "minimum-map-newton", "direct-enumeration", "incremental-pivoting")  # dense: these are sure of it
+# dense: these are sure of it
+ANSWERS = (
+    "lemke",
+    "fischer-newton",
+    "minimum-map-newton",
+    "direct-enumeration",
+    "incremental-pivoting",
+)
 
 
 def drawn(seed, symmetric):
@@ -18,30 +25,53 @@ def drawn(seed, symmetric):
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, 5))
     root, turn = rng.standard_normal((n, n)), rng.standard_normal((n, n))
-    A, b = root @ root.T + 0.3 * np.eye(n) + (0 if symmetric else turn - turn.T), rng.standard_normal(n) * rng.choice([1.0, 1e3])
+    A, b = (
+        root @ root.T + 0.3 * np.eye(n) + (0 if symmetric else turn - turn.T),
+        rng.standard_normal(n) * rng.choice([1.0, 1e3]),
+    )
     lower = np.where(rng.random(n) < 0.5, rng.uniform(-1, 0.5, n), -np.inf)
     upper = np.where(rng.random(n) < 0.5, rng.uniform(0.6, 2, n), np.inf)
     far = rng.choice(SIZES, 2)
     keep = rng.random(n) < 0.2
-    return A, b, lower, upper, np.where(np.isinf(lower), -far[0], lower), np.where(np.isinf(upper) & ~keep, far[1], upper)
+    return (
+        A,
+        b,
+        lower,
+        upper,
+        np.where(np.isinf(lower), -far[0], lower),
+        np.where(np.isinf(upper) & ~keep, far[1], upper),
+    )
 
 
 def check(name, seeds, sparse):
     """No exception or warning, no wrong answer that says CONVERGED, no INFEASIBLE."""
     method, converged = wl.METHODS[name], 0
     for seed in seeds:
-        A, b, lower, upper, low, high = drawn(seed, "symmetric" in getattr(method, "needs", "") or seed % 2)
-        result = wl.solve(wl.LCP(scipy.sparse.csr_array(A) if sparse else A, b, low, high), method())
+        A, b, lower, upper, low, high = drawn(
+            seed, "symmetric" in getattr(method, "needs", "") or seed % 2
+        )
+        result = wl.solve(
+            wl.LCP(scipy.sparse.csr_array(A) if sparse else A, b, low, high), method()
+        )
         assert result.status is not wl.SolveStatus.INFEASIBLE, (name, seed)
         if result:
             expected = boxed(A, b, lower, upper)
-            np.testing.assert_allclose(result.x.numpy(), expected, atol=1e-4 * max(1.0, np.abs(expected).max()), err_msg=f"{name} {seed}")
+            np.testing.assert_allclose(
+                result.x.numpy(),
+                expected,
+                atol=1e-4 * max(1.0, np.abs(expected).max()),
+                err_msg=f"{name} {seed}",
+            )
         converged += bool(result)
     return converged
 
 
 def named(sparse):
-    return [name for name, kind in wl.METHODS.items() if ("sparse" if sparse else "dense") in families(kind)]
+    return [
+        name
+        for name, kind in wl.METHODS.items()
+        if ("sparse" if sparse else "dense") in families(kind)
+    ]
 
 
 @pytest.mark.parametrize("name", named(sparse=False))

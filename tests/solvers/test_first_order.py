@@ -17,7 +17,9 @@ def obstacle(n, seed):
     """Poisson on n^2 cells with AIR around, and a random b: an LCP whose Gauss-Seidel iterations grow as n^2."""
     cells = np.ones((n + 2, n + 2), dtype=int)
     cells[[0, -1]] = cells[:, [0, -1]] = wl.AIR
-    b = np.where(cells == wl.FLUID, np.random.default_rng(seed).standard_normal(cells.shape) - 0.3, 0.0)
+    b = np.where(
+        cells == wl.FLUID, np.random.default_rng(seed).standard_normal(cells.shape) - 0.3, 0.0
+    )
     return cells, b
 
 
@@ -52,17 +54,27 @@ def test_nncg_is_its_algorithm(device):
         np.testing.assert_allclose(work.x.numpy(), x, atol=1e-11)
 
 
-@pytest.mark.parametrize("solver", [NNCG(), NNCG(direction="symmetric"), NNCG(omega=1.2), AcceleratedProjectedGradient()])
+@pytest.mark.parametrize(
+    "solver", [NNCG(), NNCG(direction="symmetric"), NNCG(omega=1.2), AcceleratedProjectedGradient()]
+)
 def test_they_need_far_fewer_sweeps_than_gauss_seidel(solver, device):
     cells, b = obstacle(24, 103)
     fluid, dense = cells.ravel() == wl.FLUID, assemble(cells)
     A = scipy.sparse.csr_array(dense[np.ix_(fluid, fluid)])
     expected = lemke(dense[np.ix_(fluid, fluid)], b.ravel()[fluid]) if fluid.sum() < 200 else None
     assert expected is None
-    pgs = wl.solve(wl.LCP(wl.SparseOperator(A, device=device), b.ravel()[fluid]), wl.ProjectedSOR(omega=1.0), stopping=TIGHT)
+    pgs = wl.solve(
+        wl.LCP(wl.SparseOperator(A, device=device), b.ravel()[fluid]),
+        wl.ProjectedSOR(omega=1.0),
+        stopping=TIGHT,
+    )
     assert pgs
-    grid = wl.solve(wl.LCP(wl.GridPoisson(cells, device=device, dtype=wp.float64), b), solver, stopping=TIGHT)
-    sparse = wl.solve(wl.LCP(wl.SparseOperator(A, device=device), b.ravel()[fluid]), solver, stopping=TIGHT)
+    grid = wl.solve(
+        wl.LCP(wl.GridPoisson(cells, device=device, dtype=wp.float64), b), solver, stopping=TIGHT
+    )
+    sparse = wl.solve(
+        wl.LCP(wl.SparseOperator(A, device=device), b.ravel()[fluid]), solver, stopping=TIGHT
+    )
     for result, x in ((grid, grid.x.numpy().ravel()[fluid]), (sparse, sparse.x.numpy())):
         assert result, result.status
         assert result.linear_iterations <= 0.6 * pgs.linear_iterations
@@ -77,9 +89,14 @@ def test_gradient_steps_are_the_proximal_iteration(device):
     d, L = np.diag(A), 4.0
     x = np.maximum(0, 0 - b / (L * d))
     second = np.maximum(0, x - (A @ x + b) / (L * d))
-    problem, solver = wl.LCP(wl.DenseOperator(A, device=device), b), AcceleratedProjectedGradient(lipschitz=L)
+    problem, solver = (
+        wl.LCP(wl.DenseOperator(A, device=device), b),
+        AcceleratedProjectedGradient(lipschitz=L),
+    )
     for steps, expected in ((1, x), (2, second)):
-        got = wl.solve(problem, solver, stopping=wl.StoppingCriteria(rtol=0.0, max_iterations=steps))
+        got = wl.solve(
+            problem, solver, stopping=wl.StoppingCriteria(rtol=0.0, max_iterations=steps)
+        )
         np.testing.assert_allclose(got.x.numpy(), expected, atol=1e-13)
 
 
@@ -90,7 +107,11 @@ def test_the_first_step_is_as_long_as_the_spectrum_allows(n, device):
     B = rng.standard_normal((n, n))
     A, b = B @ B.T / n + 0.5 * np.eye(n), rng.standard_normal(n)
     problem = wl.LCP(wl.DenseOperator(A, device=device), b, lower=-np.inf)
-    x = wl.solve(problem, AcceleratedProjectedGradient(), stopping=wl.StoppingCriteria(rtol=0.0, max_iterations=1)).x.numpy()
+    x = wl.solve(
+        problem,
+        AcceleratedProjectedGradient(),
+        stopping=wl.StoppingCriteria(rtol=0.0, max_iterations=1),
+    ).x.numpy()
     L = -b / (np.diag(A) * x)
     np.testing.assert_allclose(L, L[0], rtol=1e-12)
     assert 1 <= L[0] / np.linalg.eigvalsh(A / np.sqrt(np.outer(np.diag(A), np.diag(A))))[-1] <= 1.1
@@ -102,7 +123,10 @@ def test_a_wrong_lipschitz_constant_is_corrected_or_only_slow(start, device):
     rng = np.random.default_rng(109)
     B = rng.standard_normal((20, 20))
     A, b = B @ B.T / 20 + 0.5 * np.eye(20), rng.standard_normal(20)
-    problem, solver = wl.LCP(wl.DenseOperator(A, device=device), b), AcceleratedProjectedGradient(lipschitz=start)
+    problem, solver = (
+        wl.LCP(wl.DenseOperator(A, device=device), b),
+        AcceleratedProjectedGradient(lipschitz=start),
+    )
     work = solver.init(problem)
     result = wl.solve(problem, solver, stopping=TIGHT, workspace=work)
     assert result, result.status
@@ -127,13 +151,17 @@ def test_gradient_method_solves_singular_semidefinite_boxes(device):
 
 
 def test_what_they_cannot_take_is_refused():
-    unsymmetric = wl.LCP(wl.DenseOperator(np.array([[1.0, 1.0], [0.0, 1.0]]), device="cpu"), -np.ones(2))
+    unsymmetric = wl.LCP(
+        wl.DenseOperator(np.array([[1.0, 1.0], [0.0, 1.0]]), device="cpu"), -np.ones(2)
+    )
     negative = wl.LCP(wl.DenseOperator(np.diag([1.0, -1.0]), device="cpu"), -np.ones(2), 0.0, 1.0)
     for problem, message in ((unsymmetric, "is not symmetric"), (negative, "negative diagonal")):
         with pytest.raises(ValueError, match=message):
             AcceleratedProjectedGradient().init(problem)
     for settings in ({"lipschitz": 0.0}, {"estimate_steps": 0}, {"precision": "half"}):
-        with pytest.raises(ValueError, match=next(iter(settings)) if "precision" not in settings else "half"):
+        with pytest.raises(
+            ValueError, match=next(iter(settings)) if "precision" not in settings else "half"
+        ):
             AcceleratedProjectedGradient(**settings)
     for settings in ({"omega": 0.0}, {"direction": "up"}, {"precision": "half"}):
         with pytest.raises(ValueError, match=r"omega|direction|half"):

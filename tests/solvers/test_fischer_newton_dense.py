@@ -35,7 +35,12 @@ def test_boxes_hold_their_answers():
     for _ in range(10):
         B = rng.standard_normal((12, 12))
         lower, upper = -rng.random(12), rng.random(12)
-        problem = wl.LCP(wl.DenseOperator(B @ B.T / 12 + 0.1 * np.eye(12), device="cpu"), rng.standard_normal(12), lower, upper)
+        problem = wl.LCP(
+            wl.DenseOperator(B @ B.T / 12 + 0.1 * np.eye(12), device="cpu"),
+            rng.standard_normal(12),
+            lower,
+            upper,
+        )
         result = wl.solve(problem, wl.FischerNewton())
         assert result, result.status
         assert ((result.x.numpy() >= lower) & (result.x.numpy() <= upper)).all()

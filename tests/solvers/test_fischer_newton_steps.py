@@ -16,10 +16,13 @@ from warp_lcp.solvers.fischer_newton import FischerDenseWorkspace, FischerNewton
 from warp_lcp.solvers.gradient_descent import GradientDescent
 
 BOUNDS = [(0.0, np.inf), (-1.0, 0.5), (-np.inf, 0.25), (-np.inf, np.inf)]
-# a merit with a minimum that is no solution, between the bounds, and where it is: A has the eigenvalue -1/4, d = 1
+# a merit with a minimum that is no solution, between the bounds, and where it is: A has the
+# eigenvalue -1/4, d = 1
 MINIMUM = (
-    1.625 * np.eye(3) - 0.625, np.array([-0.5, -0.25, 0.0]), np.array([0.3336377713533389, 0.20990309578279476, 0.09239497058182793])
-)  # fmt: skip
+    1.625 * np.eye(3) - 0.625,
+    np.array([-0.5, -0.25, 0.0]),
+    np.array([0.3336377713533389, 0.20990309578279476, 0.09239497058182793]),
+)
 
 
 def unlike_rows(seed, n=9):
@@ -28,7 +31,9 @@ def unlike_rows(seed, n=9):
     A = rng.integers(-7, 8, (n, n)) / 8
     np.fill_diagonal(A, 1.0)
     lower, upper = np.array([BOUNDS[k % 4] for k in range(n)]).T
-    x = np.where(rng.random(n) < 0.6, np.where(np.isfinite(lower), lower, 0.25), rng.integers(-6, 7, n) / 8)
+    x = np.where(
+        rng.random(n) < 0.6, np.where(np.isfinite(lower), lower, 0.25), rng.integers(-6, 7, n) / 8
+    )
     y = np.where(np.arange(n) < 3, 0.0, rng.integers(-12, 13, n) / 8)
     x[:3] = [0.0, 0.5, 0.25]  # at l, u, u
     x = np.clip(x, lower, upper)
@@ -40,7 +45,9 @@ def shifted_direction(plain, x, drops):
     f, p, q, kinks = plain.rows(x)
     q, moves = np.maximum(q, LEAST_Q), ~kinks if drops else np.full(len(x), True)
     e = np.zeros(len(x))
-    e[moves] = np.linalg.solve((plain.A + np.diag(plain.d * p / q))[np.ix_(moves, moves)], -(f / q)[moves])
+    e[moves] = np.linalg.solve(
+        (plain.A + np.diag(plain.d * p / q))[np.ix_(moves, moves)], -(f / q)[moves]
+    )
     return e
 
 
@@ -91,7 +98,9 @@ def steps_of(problem, method, x0, count, read=lambda work: work.x.numpy()):
 
 
 def operators(A, device):
-    return wl.SparseOperator(scipy.sparse.csr_array(A), device=device), wl.LinearOperator(lambda x: A @ x, (len(A),), diagonal=np.diag(A))
+    return wl.SparseOperator(scipy.sparse.csr_array(A), device=device), wl.LinearOperator(
+        lambda x: A @ x, (len(A),), diagonal=np.diag(A)
+    )
 
 
 @pytest.mark.parametrize("kink", ["perturbation", "zero"])
@@ -104,12 +113,17 @@ def test_matrix_free_steps_are_those_of_the_algorithm(kink, share, safeguard, de
         A, b, lower, upper, x0 = unlike_rows(seed)
         plain = PlainMap("fischer" if share == 1 else "penalized", A, b, lower, upper, share=share)
         assert plain.rows(x0)[3].sum() >= 3
-        expected = plain_newton(plain, x0, 5, shifted_direction, drops=kink == "zero", memory=8 if safeguard else 1)
+        expected = plain_newton(
+            plain, x0, 5, shifted_direction, drops=kink == "zero", memory=8 if safeguard else 1
+        )
         lengths += [t for _, t in expected]
-        method = FischerNewton(kink=kink, fischer_weight=share, safeguard=safeguard, precision="double", eta=1e-14)
+        method = FischerNewton(
+            kink=kink, fischer_weight=share, safeguard=safeguard, precision="double", eta=1e-14
+        )
         for operator in operators(A, device):
             problem = wl.LCP(operator, b, lower, upper)
-            np.testing.assert_allclose(method.init(problem).residual.diagonal.numpy(), plain.d)  # the map's unit
+            # the map's unit
+            np.testing.assert_allclose(method.init(problem).residual.diagonal.numpy(), plain.d)
             for x, (y, _) in zip(steps_of(problem, method, x0, 5), expected, strict=True):
                 np.testing.assert_allclose(x, y, rtol=1e-10, atol=1e-10)
     assert min(lengths) < 1
@@ -119,7 +133,14 @@ def test_matrix_free_steps_are_those_of_the_algorithm(kink, share, safeguard, de
 @pytest.mark.parametrize("share", [1.0, 0.6])
 def test_unscaled_steps_are_those_of_the_algorithm(kink, share, device):
     """d = 1 whatever A's diagonal is, on the host and matrix-free; those of the scaled map are others."""
-    method = FischerNewton(kink=kink, fischer_weight=share, safeguard=False, scaled=False, precision="double", eta=1e-14)
+    method = FischerNewton(
+        kink=kink,
+        fischer_weight=share,
+        safeguard=False,
+        scaled=False,
+        precision="double",
+        eta=1e-14,
+    )
     for seed in (4205, 4207, 4213):
         A, b, lower, upper, x0 = unlike_rows(seed)
         b, A = b - np.arange(9) / 2 * x0, A + np.diag(np.arange(9) / 2)  # y as before
@@ -130,7 +151,9 @@ def test_unscaled_steps_are_those_of_the_algorithm(kink, share, device):
         expected = plain_newton(plain, x0, 4, shifted_direction, drops=kink == "zero")
         assert np.abs(scaled[0][0] - expected[0][0]).max() > 1e-5
         for operator in operators(A, device):
-            for x, (y, _) in zip(steps_of(wl.LCP(operator, b, lower, upper), method, x0, 4), expected, strict=True):
+            for x, (y, _) in zip(
+                steps_of(wl.LCP(operator, b, lower, upper), method, x0, 4), expected, strict=True
+            ):
                 np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-9)
         problem = wl.LCP(wl.DenseOperator(A, device=device), b, lower, upper)
         expected = plain_newton(plain, x0, 4, jacobian_direction, drops=kink == "zero")
@@ -151,9 +174,13 @@ def test_unscaled_gradients_are_those_of_the_map():
     work.residual.evaluate(work.x)
     work.start(warm=True, tolerance=0.0)
     work.map.descend(work.x)
-    np.testing.assert_allclose(work.map.direction.numpy(), plain.jacobian(x0).T @ plain.rows(x0)[0], rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(
+        work.map.direction.numpy(), plain.jacobian(x0).T @ plain.rows(x0)[0], rtol=1e-12, atol=1e-12
+    )
     method = FischerNewton(safeguard=False, scaled=False, fischer_weight=1.0)
-    assert method.descent(problem) == GradientDescent(map="fischer", fischer_weight=1.0, scaled=False)
+    assert method.descent(problem) == GradientDescent(
+        map="fischer", fischer_weight=1.0, scaled=False
+    )
 
 
 def test_unscaled_maps_have_no_safeguards():
@@ -170,7 +197,11 @@ def test_plain_steps_on_the_host_are_those_of_the_algorithm(kink):
         expected = plain_newton(plain, x0, 4, jacobian_direction, drops=kink == "zero")
         lengths += [t for _, t in expected]
         problem = wl.LCP(wl.DenseOperator(A, device="cpu"), b, lower, upper)
-        for x, (y, _) in zip(steps_of(problem, FischerNewton(kink=kink, safeguard=False), x0, 4), expected, strict=True):
+        for x, (y, _) in zip(
+            steps_of(problem, FischerNewton(kink=kink, safeguard=False), x0, 4),
+            expected,
+            strict=True,
+        ):
             np.testing.assert_allclose(x, y, rtol=1e-8, atol=1e-9)
     assert min(lengths) < 1
 
@@ -183,7 +214,11 @@ def test_safeguarded_steps_on_the_host_are_those_of_the_algorithm():
         expected = plain_newton(plain, x0, 4, regularized_direction, memory=8)
         lengths += [t for _, t in expected]
         problem = wl.LCP(wl.DenseOperator(A, device="cpu"), b, lower, upper)
-        for x, (y, _) in zip(steps_of(problem, FischerNewton(), x0, 4, read=lambda w: w._iterate), expected, strict=True):
+        for x, (y, _) in zip(
+            steps_of(problem, FischerNewton(), x0, 4, read=lambda w: w._iterate),
+            expected,
+            strict=True,
+        ):
             np.testing.assert_allclose(x, y, rtol=1e-7, atol=1e-8)
             outside += int(((y < lower) | (y > upper)).any())
     assert outside > 3
@@ -223,10 +258,14 @@ def test_steps_of_the_homotopies_are_those_of_the_smoothed_map(stage):
         x = np.clip(10.0, lower, upper) if stage else x
         y, mu = np.where(low & ~high, np.maximum(A @ x + b, 1.0), A @ x + b), 1.0
         np.testing.assert_allclose(work._y, y)
-        y = work._y = y - 4.0 * (seed % 2)  # so far from A x + b that the gap decides, too, how long steps are
+        # so far from A x + b that the gap decides, too, how long steps are
+        y = work._y = y - 4.0 * (seed % 2)
 
         def map_at(x, y, mu, low=low, high=high, lower=lower, upper=upper):
-            rows = [smoothed_row(x[i] - lower[i], y[i], upper[i] - x[i], low[i], high[i], mu) for i in range(len(x))]
+            rows = [
+                smoothed_row(x[i] - lower[i], y[i], upper[i] - x[i], low[i], high[i], mu)
+                for i in range(len(x))
+            ]
             return tuple(np.array(column) for column in zip(*rows, strict=True))
 
         for _ in range(6):
@@ -235,7 +274,15 @@ def test_steps_of_the_homotopies_are_those_of_the_smoothed_map(stage):
             dx = np.linalg.solve(np.diag(p) + q[:, None] * A, -f - q * gap)
             dy, t, size = A @ dx + gap, 1.0, math.hypot(np.linalg.norm(gap), np.linalg.norm(f))
             while t > 1e-6:
-                after = math.hypot(*(np.linalg.norm(v) for v in (A @ (x + t * dx) + b - y - t * dy, map_at(x + t * dx, y + t * dy, mu)[0])))
+                after = math.hypot(
+                    *(
+                        np.linalg.norm(v)
+                        for v in (
+                            A @ (x + t * dx) + b - y - t * dy,
+                            map_at(x + t * dx, y + t * dy, mu)[0],
+                        )
+                    )
+                )
                 if after <= (1 - 1e-4 * t) * size:
                     break
                 t, halved = t / 2, halved + 1
@@ -248,11 +295,21 @@ def test_steps_of_the_homotopies_are_those_of_the_smoothed_map(stage):
 def test_gradient_steps_are_those_of_the_algorithm():
     """[Book] algorithm 13: x = clip(x - t d^-2 J'f), t halved from Barzilai and Borwein's length until the merit falls."""
     halved = 0
-    for seed, form in ((4205, "fischer"), (4207, "penalized"), (4209, "natural"), (4213, "fischer")):
+    for seed, form in (
+        (4205, "fischer"),
+        (4207, "penalized"),
+        (4209, "natural"),
+        (4213, "fischer"),
+    ):
         A, b, lower, upper, x = unlike_rows(seed)
-        plain, method = PlainMap(form, A, b, lower, upper, share=0.95), GradientDescent(map=form, memory=3)
+        plain, method = (
+            PlainMap(form, A, b, lower, upper, share=0.95),
+            GradientDescent(map=form, memory=3),
+        )
         merits, length, last = [], 1.0, None
-        for got in steps_of(wl.LCP(wl.DenseOperator(A, device="cpu"), b, lower, upper), method, x, 8):
+        for got in steps_of(
+            wl.LCP(wl.DenseOperator(A, device="cpu"), b, lower, upper), method, x, 8
+        ):
             g = plain.jacobian(x).T @ plain.rows(x)[0] / plain.d
             if last is not None:
                 change = 1 - g @ last / (last @ last)
@@ -300,19 +357,31 @@ def test_steps_on_a_grid_are_those_of_the_algorithm(kink, share, safeguard, scal
     A, n = dense[np.ix_(fluid, fluid)], int(fluid.sum())
     x0 = np.where(rng.random(n) < 0.6, 0.0, rng.integers(1, 5, n))
     b = np.where(rng.random(n) < 0.4, 0.0, rng.integers(-6, 7, n)) - A @ x0
-    plain = PlainMap("fischer" if share == 1 else "penalized", A, b, np.zeros(n), np.full(n, np.inf), share=share)
+    plain = PlainMap(
+        "fischer" if share == 1 else "penalized", A, b, np.zeros(n), np.full(n, np.inf), share=share
+    )
     plain.d = plain.d if scaled else np.ones(n)
     assert plain.rows(x0)[3].sum() > 5
-    expected = plain_newton(plain, x0, 5, shifted_direction, drops=kink == "zero", memory=8 if safeguard else 1)
+    expected = plain_newton(
+        plain, x0, 5, shifted_direction, drops=kink == "zero", memory=8 if safeguard else 1
+    )
     fields = [np.zeros(cells.size) for _ in range(2)]
     for field, values in zip(fields, (b, x0), strict=True):
         field[fluid] = values
     problem = wl.LCP(wl.GridPoisson(cells, device="cpu"), fields[0].reshape(cells.shape))
     method = FischerNewton(
-        kink=kink, fischer_weight=share, safeguard=safeguard, scaled=scaled, precision="double", eta=1e-14, monotone_cycles=0
+        kink=kink,
+        fischer_weight=share,
+        safeguard=safeguard,
+        scaled=scaled,
+        precision="double",
+        eta=1e-14,
+        monotone_cycles=0,
     )
     place = problem.layout.places()[fluid]
-    for x, (y, _) in zip(steps_of(problem, method, fields[1].reshape(cells.shape), 5), expected, strict=True):
+    for x, (y, _) in zip(
+        steps_of(problem, method, fields[1].reshape(cells.shape), 5), expected, strict=True
+    ):
         np.testing.assert_allclose(x[place], y, rtol=1e-6, atol=1e-6)
 
 
@@ -331,17 +400,26 @@ def test_slope_is_the_derivative_of_the_merit_along_any_direction(device):
         work.start(warm=True, tolerance=0.0)
         for dtype in (wp.float64, wp.float32):
             got = work.map.slope(work.x, wp.array(e, dtype=dtype, device=device))
-            assert got == pytest.approx(plain.rows(x)[0] @ plain.jacobian(x) @ e, rel=1e-6 if dtype is wp.float32 else 1e-12)
-        assert got == pytest.approx((plain.merit(x + 1e-6 * e) - plain.merit(x - 1e-6 * e)) / 2e-6, rel=1e-5)
+            assert got == pytest.approx(
+                plain.rows(x)[0] @ plain.jacobian(x) @ e, rel=1e-6 if dtype is wp.float32 else 1e-12
+            )
+        assert got == pytest.approx(
+            (plain.merit(x + 1e-6 * e) - plain.merit(x - 1e-6 * e)) / 2e-6, rel=1e-5
+        )
 
 
 def test_inexact_directions_are_searched_by_their_own_slope():
     """Equations with A = [[s, 1], [-1, s]]: an iteration of GMRES finds e = -s / (1 + s^2) y, along which the merit falls by s^2 of itself,
-    less than an exact direction promises: a search that takes the slope for -f'f refuses every step.
+    less than an exact direction promises: a search that takes the slope for -f'f refuses every
+    step.
     """
     s = 5e-3
     A = np.array([[s, 1.0], [-1.0, s]])
-    problem = wl.LCP(wl.LinearOperator(lambda x: A @ x, (2,), diagonal=s, transpose=lambda x: A.T @ x), np.array([1.0, 2.0]), -np.inf)
+    problem = wl.LCP(
+        wl.LinearOperator(lambda x: A @ x, (2,), diagonal=s, transpose=lambda x: A.T @ x),
+        np.array([1.0, 2.0]),
+        -np.inf,
+    )
     method = FischerNewton(safeguard=False, max_linear_iterations=1, precision="double")
     for x, k in zip(steps_of(problem, method, np.zeros(2), 4), range(1, 5), strict=True):
         y = A @ x + [1.0, 2.0]
@@ -379,7 +457,9 @@ def test_a_minimum_of_the_merit_that_is_no_solution_is_called_one(kind):
     assert np.linalg.norm(plain.jacobian(at).T @ plain.rows(at)[0]) < 1e-8
     assert plain.merit(at) > 0.3
     for share in (1.0, 0.999999):
-        result = wl.solve(wl.LCP(of_kind(kind, A), b), FischerNewton(safeguard=False, fischer_weight=share), x0=at)
+        result = wl.solve(
+            wl.LCP(of_kind(kind, A), b), FischerNewton(safeguard=False, fischer_weight=share), x0=at
+        )
         assert result.status is wl.SolveStatus.LOCAL_MINIMUM
         np.testing.assert_allclose(result.x.numpy(), at, atol=1e-4)
 
@@ -388,13 +468,21 @@ def test_a_minimum_of_the_merit_that_is_no_solution_is_called_one(kind):
 def test_a_bound_may_make_the_minimum(kind):
     """y = -x - 1 with x >= 0: the merit would fall beyond x = 0 alone; plain iterates keep to the bounds."""
     problem = wl.LCP(of_kind(kind, np.array([[-1.0]])), np.array([-1.0]))
-    assert wl.solve(problem, FischerNewton(safeguard=False, fischer_weight=1.0)).status is wl.SolveStatus.LOCAL_MINIMUM
+    assert (
+        wl.solve(problem, FischerNewton(safeguard=False, fischer_weight=1.0)).status
+        is wl.SolveStatus.LOCAL_MINIMUM
+    )
 
 
 def test_a_minimum_is_not_told_from_products_alone():
     A, b, at = MINIMUM
-    problem = wl.LCP(wl.LinearOperator(lambda x: A @ x, (3,), diagonal=np.diag(A), symmetric=False), b)
-    assert wl.solve(problem, FischerNewton(safeguard=False), x0=at).status is wl.SolveStatus.NON_DESCENT
+    problem = wl.LCP(
+        wl.LinearOperator(lambda x: A @ x, (3,), diagonal=np.diag(A), symmetric=False), b
+    )
+    assert (
+        wl.solve(problem, FischerNewton(safeguard=False), x0=at).status
+        is wl.SolveStatus.NON_DESCENT
+    )
 
 
 def test_a_failed_search_elsewhere_is_no_minimum():
@@ -403,7 +491,10 @@ def test_a_failed_search_elsewhere_is_no_minimum():
     for seed in (13, 15, 17, 23):
         p = contact(20, seed=seed)
         statuses.append(
-            wl.solve(wl.LCP(wl.DenseOperator(p.A, device="cpu"), p.b), FischerNewton(safeguard=False, fischer_weight=0.95)).status
+            wl.solve(
+                wl.LCP(wl.DenseOperator(p.A, device="cpu"), p.b),
+                FischerNewton(safeguard=False, fischer_weight=0.95),
+            ).status
         )
     assert wl.SolveStatus.NON_DESCENT in statuses
     assert wl.SolveStatus.LOCAL_MINIMUM not in statuses
@@ -415,7 +506,9 @@ def of_kind(kind, A):
         return wl.DenseOperator(A, device="cpu")
     if kind == "sparse":
         return wl.SparseOperator(scipy.sparse.csr_array(A), device="cpu")
-    return wl.LinearOperator(lambda x: A @ x, (len(A),), diagonal=np.diag(A), symmetric=bool((A == A.T).all()))
+    return wl.LinearOperator(
+        lambda x: A @ x, (len(A),), diagonal=np.diag(A), symmetric=bool((A == A.T).all())
+    )
 
 
 def test_the_plain_search_is_armijos():

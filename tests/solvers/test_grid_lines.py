@@ -27,9 +27,16 @@ def test_a_single_line_is_solved_by_one_sweep(axis, arrays, device):
     inside, dense = cells.ravel() == wl.FLUID, assemble(cells, faces)
     b = np.where(inside, 2 * rng.standard_normal(30), 0.0)
     upper = np.where(rng.random(30) < 0.5, rng.random(30), np.inf)
-    A = wl.GridPoisson(cells, **dict(zip(("face_x", "face_y", "face_z"), faces, strict=True)), device=device, dtype=wp.float64)
+    A = wl.GridPoisson(
+        cells,
+        **dict(zip(("face_x", "face_y", "face_z"), faces, strict=True)),
+        device=device,
+        dtype=wp.float64,
+    )
     problem = wl.LCP(A, b.reshape(shape), 0.0, upper.reshape(shape))
-    result = wl.solve(problem, wl.BlockedGaussSeidel(blocks=axis), stopping=wl.StoppingCriteria(rtol=1e-12))
+    result = wl.solve(
+        problem, wl.BlockedGaussSeidel(blocks=axis), stopping=wl.StoppingCriteria(rtol=1e-12)
+    )
     assert result, result.status
     assert result.iterations == 1
     x = result.x.numpy().ravel()
@@ -52,7 +59,12 @@ def test_strong_coefficients_along_lines_cost_nothing(axis, device):
     x = rng.random(len(dense)) * (rng.random(len(dense)) < 0.6)
     b = np.zeros(cells.size)
     b[inside] = np.where(x == 0, rng.random(len(x)), 0.0) - dense @ x
-    A = wl.GridPoisson(cells, **dict(zip(("face_x", "face_y", "face_z"), faces, strict=True)), device=device, dtype=wp.float64)
+    A = wl.GridPoisson(
+        cells,
+        **dict(zip(("face_x", "face_y", "face_z"), faces, strict=True)),
+        device=device,
+        dtype=wp.float64,
+    )
     problem = wl.LCP(A, b.reshape(cells.shape))
     lines = wl.solve(problem, wl.BlockedGaussSeidel(blocks=axis), stopping=TIGHT)
     across = wl.GridLines((axis.value + 1) % 3)
@@ -74,15 +86,25 @@ def test_directions_precisions_and_periodic_sides(direction, device):
     problem = wl.LCP(A, b.reshape(cells.shape))
     expected = lemke(dense[np.ix_(inside, inside)], b[inside])
     for precision, rtol in (("mixed", 1e-10), ("single", 1e-4)):
-        solver = wl.BlockedGaussSeidel(blocks=wl.GridLines.X, direction=direction, precision=precision, omega=1.2)
-        result = wl.solve(problem, solver, stopping=wl.StoppingCriteria(rtol=rtol, max_iterations=500))
+        solver = wl.BlockedGaussSeidel(
+            blocks=wl.GridLines.X, direction=direction, precision=precision, omega=1.2
+        )
+        result = wl.solve(
+            problem, solver, stopping=wl.StoppingCriteria(rtol=rtol, max_iterations=500)
+        )
         assert result, result.status
         np.testing.assert_allclose(result.x.numpy().ravel()[inside], expected, atol=100 * rtol)
 
 
 def test_lines_that_are_none_are_refused():
-    periodic = wl.LCP(wl.GridPoisson(np.array([[0, 1, 1, 1]]), periodic=(True, False), device="cpu"), -np.ones((1, 4)))
-    odd = wl.LCP(wl.GridPoisson(np.ones((3, 4), dtype=int), periodic=(False, True), device="cpu"), -np.ones((3, 4)))
+    periodic = wl.LCP(
+        wl.GridPoisson(np.array([[0, 1, 1, 1]]), periodic=(True, False), device="cpu"),
+        -np.ones((1, 4)),
+    )
+    odd = wl.LCP(
+        wl.GridPoisson(np.ones((3, 4), dtype=int), periodic=(False, True), device="cpu"),
+        -np.ones((3, 4)),
+    )
     dense = wl.LCP(wl.DenseOperator(np.eye(2), device="cpu"), -np.ones(2))
     for problem, message in (
         (periodic, "cannot run along a periodic axis"),

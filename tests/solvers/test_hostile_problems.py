@@ -35,10 +35,16 @@ def test_boxes_on_a_closed_domain_touch_the_bound_that_b_pushes_to(net, method):
     cells = np.ones((1, 3), dtype=int)
     b = np.random.default_rng(89).standard_normal((1, 3)) * 0.3
     b += net - b.mean()
-    result = wl.solve(wl.LCP(wl.GridPoisson(cells, device="cpu"), b, -0.5, 0.5), method, stopping=wl.StoppingCriteria(rtol=1e-9))
+    result = wl.solve(
+        wl.LCP(wl.GridPoisson(cells, device="cpu"), b, -0.5, 0.5),
+        method,
+        stopping=wl.StoppingCriteria(rtol=1e-9),
+    )
     A = np.array([[1.0, -1, 0], [-1, 2, -1], [0, -1, 1]])
     assert result, result.status
-    np.testing.assert_allclose(result.x.numpy().ravel(), boxed(A, b.ravel(), np.full(3, -0.5), np.full(3, 0.5)), atol=1e-7)
+    np.testing.assert_allclose(
+        result.x.numpy().ravel(), boxed(A, b.ravel(), np.full(3, -0.5), np.full(3, 0.5)), atol=1e-7
+    )
 
 
 @pytest.mark.parametrize("value", [np.inf, -np.inf, np.nan, 1e160])
@@ -57,7 +63,9 @@ def test_a_right_hand_side_that_is_not_finite_is_said(value, lower, method):
 def test_far_starts(start, method):
     A = wl.GridPoisson(np.array([[1, 2]]), shift=0.75, device="cpu")
     problem = wl.LCP(A, np.array([[-1.0, 0.0]]))
-    result = wl.solve(problem, method, x0=np.array([[start, 0.0]]), stopping=wl.StoppingCriteria(rtol=1e-9))
+    result = wl.solve(
+        problem, method, x0=np.array([[start, 0.0]]), stopping=wl.StoppingCriteria(rtol=1e-9)
+    )
     assert result, result.status
     assert result.x.numpy()[0, 0] == pytest.approx(4 / 3, rel=1e-8)
 
@@ -102,10 +110,17 @@ def test_single_precision_reports_the_residual_of_the_rounded_start():
     A, b = wl.GridPoisson(cells, device="cpu"), np.random.default_rng(103).standard_normal((16, 16))
     problem = wl.LCP(A, b)
     exact = wl.solve(problem, stopping=wl.StoppingCriteria(rtol=1e-11)).x
-    result = wl.solve(problem, wl.ProjectedMultigrid(precision="single"), x0=exact, stopping=wl.StoppingCriteria(rtol=1e-10))
+    result = wl.solve(
+        problem,
+        wl.ProjectedMultigrid(precision="single"),
+        x0=exact,
+        stopping=wl.StoppingCriteria(rtol=1e-10),
+    )
     assert not result
     y = A.apply(wp.array(result.x.numpy(), dtype=wp.float64, device="cpu")).numpy() + b
-    natural = np.where(cells == wl.FLUID, np.minimum(A.diagonal().numpy() * result.x.numpy(), y), 0.0)
+    natural = np.where(
+        cells == wl.FLUID, np.minimum(A.diagonal().numpy() * result.x.numpy(), y), 0.0
+    )
     assert result.residual == pytest.approx(np.linalg.norm(natural), rel=1e-6)
 
 
@@ -135,14 +150,19 @@ def test_coarsening_does_not_depend_on_the_first_cells(method):
 def linear_fractions(a, b):
     """Open part of an edge between two distances, linear between."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(a * b < 0, np.maximum(a, b) / (np.abs(a) + np.abs(b)), a + b > 0).astype(float)
+        return np.where(a * b < 0, np.maximum(a, b) / (np.abs(a) + np.abs(b)), a + b > 0).astype(
+            float
+        )
 
 
 def box_around_a_disc(n=20, dx=0.04):
     """A box full of falling liquid around a disc on its floor, one cell under the disc AIR; walls separate."""
     y, x = np.meshgrid(np.arange(n + 1) * dx, np.arange(n + 1) * dx, indexing="ij")
     distance = np.hypot(x - 0.4, y - 0.16) - 0.16
-    face_x, face_y = linear_fractions(distance[:-1], distance[1:]), linear_fractions(distance[:, :-1], distance[:, 1:])
+    face_x, face_y = (
+        linear_fractions(distance[:-1], distance[1:]),
+        linear_fractions(distance[:, :-1], distance[:, 1:]),
+    )
     face_x[:, [0, -1]], face_y[[0, -1]] = 0.0, 0.0
     face_x[face_x < 1e-3], face_y[face_y < 1e-3] = 0.0, 0.0
     faces = [face_x[:, 1:], face_x[:, :-1], face_y[1:], face_y[:-1]]
@@ -155,11 +175,17 @@ def box_around_a_disc(n=20, dx=0.04):
 
 def test_an_active_set_that_goes_round_in_a_circle():
     """A box full of liquid around a disc, its only air behind a face that is open in part: guesses of the free set follow each other in
-    a circle of four, in which all unknowns let go at once and the system is all but singular. Projected cycles lead out of it."""
+    a circle of four, in which all unknowns let go at once and the system is all but singular.
+    Projected cycles lead out of it."""
     problem = box_around_a_disc()
     for cycles in (0, 1, 2):
-        result = wl.solve(problem, wl.ProjectedMultigrid(monotone_cycles=cycles), stopping=wl.StoppingCriteria(rtol=1e-8))
-        assert result.relative_residual <= 1e-8, result.status  # FLOOR: the sums of these faces are rounded in float32
+        result = wl.solve(
+            problem,
+            wl.ProjectedMultigrid(monotone_cycles=cycles),
+            stopping=wl.StoppingCriteria(rtol=1e-8),
+        )
+        # FLOOR: the sums of these faces are rounded in float32
+        assert result.relative_residual <= 1e-8, result.status
         assert result.iterations <= 25
     expected = wl.solve(problem, wl.MinimumMapNewton(), stopping=wl.StoppingCriteria(rtol=1e-8))
     np.testing.assert_allclose(result.x.numpy(), expected.x.numpy(), atol=1e-6)
@@ -170,6 +196,15 @@ def test_single_precision_on_bounds_that_are_no_float32_numbers():
     for _ in range(10):
         cells = rng.choice(2, (12, 12), p=[0.1, 0.9])
         A = wl.GridPoisson(cells, device="cpu")
-        problem = wl.LCP(A, rng.standard_normal(cells.shape), lower=-rng.random(cells.shape) / 3, upper=rng.random(cells.shape) / 3)
-        result = wl.solve(problem, wl.ProjectedMultigrid(precision="single"), stopping=wl.StoppingCriteria(rtol=1e-3))
+        problem = wl.LCP(
+            A,
+            rng.standard_normal(cells.shape),
+            lower=-rng.random(cells.shape) / 3,
+            upper=rng.random(cells.shape) / 3,
+        )
+        result = wl.solve(
+            problem,
+            wl.ProjectedMultigrid(precision="single"),
+            stopping=wl.StoppingCriteria(rtol=1e-3),
+        )
         assert result, result.status

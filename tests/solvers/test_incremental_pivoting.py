@@ -15,7 +15,10 @@ TIGHT = wl.StoppingCriteria(rtol=1e-8, max_iterations=1000)
 
 def solve(A, b, lower=0.0, upper=np.inf, solver=None, stopping=TIGHT, **options):
     return wl.solve(
-        wl.LCP(wl.DenseOperator(A, device="cpu"), b, lower, upper), solver or IncrementalPivoting(), stopping=stopping, **options
+        wl.LCP(wl.DenseOperator(A, device="cpu"), b, lower, upper),
+        solver or IncrementalPivoting(),
+        stopping=stopping,
+        **options,
     )
 
 
@@ -113,8 +116,12 @@ def test_a_pivot_is_a_step_where_asked_for():
     assert result
     pivots = result.linear_iterations
     assert pivots <= result.iterations <= pivots + 1
-    assert all(record.linear_iterations == min(record.iteration, pivots) for record in result.history)
-    short = solve(A, b, solver=single, stopping=wl.StoppingCriteria(rtol=1e-8, max_iterations=5, patience=1))
+    assert all(
+        record.linear_iterations == min(record.iteration, pivots) for record in result.history
+    )
+    short = solve(
+        A, b, solver=single, stopping=wl.StoppingCriteria(rtol=1e-8, max_iterations=5, patience=1)
+    )
     assert short.status is wl.SolveStatus.MAX_ITERATIONS
     assert short.iterations == short.linear_iterations == 5
     assert short.residual == min(record.residual for record in short.history)
@@ -145,7 +152,9 @@ def test_settings_and_sizes_are_checked(monkeypatch):
     with pytest.raises(ValueError, match="pivots_per_step = 0"):
         IncrementalPivoting(pivots_per_step=0)
     monkeypatch.setattr(IncrementalPivoting, "most_unknowns", 3)
-    with pytest.raises(ValueError, match="4 unknowns: IncrementalPivoting is a dense method for at most 3"):
+    with pytest.raises(
+        ValueError, match="4 unknowns: IncrementalPivoting is a dense method for at most 3"
+    ):
         solve(np.eye(4), -np.ones(4))
 
 

@@ -5,7 +5,12 @@ import pytest
 import scipy.sparse
 
 import warp_lcp as wl
-from warp_lcp.reduced.dense_problem import DenseProblem, certifies, diagonally_dominant, inconsistent
+from warp_lcp.reduced.dense_problem import (
+    DenseProblem,
+    certifies,
+    diagonally_dominant,
+    inconsistent,
+)
 
 NONE = wl.SolveStatus.INFEASIBLE
 
@@ -30,11 +35,18 @@ def planted_solution(seed):
         np.where(below, -rng.random(n) * rng.integers(0, 2), -np.inf),
         np.where(above, rng.random(n) * rng.integers(1, 3), np.inf),
     )
-    x = np.clip(rng.standard_normal(n) * 10 ** rng.uniform(0, 6 if rng.random() < 0.3 else 0), lower, upper)
+    x = np.clip(
+        rng.standard_normal(n) * 10 ** rng.uniform(0, 6 if rng.random() < 0.3 else 0), lower, upper
+    )
     low = below & (rng.random(n) < 0.5)
     high = above & ~low & (rng.random(n) < 0.5)
     x = np.where(low, lower, np.where(high, upper, x))
-    return A, np.where(low, rng.random(n), np.where(high, -rng.random(n), 0.0)) - A @ x, lower, upper
+    return (
+        A,
+        np.where(low, rng.random(n), np.where(high, -rng.random(n), 0.0)) - A @ x,
+        lower,
+        upper,
+    )
 
 
 def planted_proof(seed):
@@ -42,22 +54,38 @@ def planted_proof(seed):
     A, b, lower, upper = planted_solution(seed)
     rng, n = np.random.default_rng([6, seed]), len(b)
     below, above = np.isfinite(lower), np.isfinite(upper)
-    sign = np.where(below & above, 0, np.where(below, 1, np.where(above, -1, rng.choice([-1, 1], n))))
+    sign = np.where(
+        below & above, 0, np.where(below, 1, np.where(above, -1, rng.choice([-1, 1], n)))
+    )
     z = sign * rng.integers(0, 2, n) * rng.integers(1, 5, n)
     if not z.any():
         return None
     g, drawn = A.T @ z, rng.random(n) * rng.integers(0, 2, n)
-    A = A - np.outer(z, g - np.where(below & above, g, np.where(below, -drawn, np.where(above, drawn, 0.0)))) / (z @ z)
+    A = A - np.outer(
+        z, g - np.where(below & above, g, np.where(below, -drawn, np.where(above, drawn, 0.0)))
+    ) / (z @ z)
     g = A.T @ z
     gains = np.where(g > 0, np.where(above, upper, 0.0) * g, np.where(below, lower, 0.0) * g).sum()
-    return A, b - z * (b @ z + gains + 0.01 * (np.abs(b) @ np.abs(z) + abs(gains) + 1)) / (z @ z), lower, upper
+    return (
+        A,
+        b - z * (b @ z + gains + 0.01 * (np.abs(b) @ np.abs(z) + abs(gains) + 1)) / (z @ z),
+        lower,
+        upper,
+    )
 
 
 def in_units(drawn, seed, sparse=False):
     A, b, lower, upper = drawn
     R, C = units(np.random.default_rng([7, seed]), len(b))
     matrix = R[:, None] * A * C
-    return DenseProblem(np.arange(len(b)), scipy.sparse.csr_array(matrix) if sparse else matrix, R * b, lower / C, upper / C, False)
+    return DenseProblem(
+        np.arange(len(b)),
+        scipy.sparse.csr_array(matrix) if sparse else matrix,
+        R * b,
+        lower / C,
+        upper / C,
+        False,
+    )
 
 
 def check(seeds):
@@ -66,7 +94,10 @@ def check(seeds):
         assert not inconsistent(in_units(planted_solution(seed), seed)), seed
         other = planted_proof(seed)
         if other is not None:
-            drawn, proved = drawn + 1, proved + inconsistent(in_units(other, seed, sparse=seed % 2 == 0))
+            drawn, proved = (
+                drawn + 1,
+                proved + inconsistent(in_units(other, seed, sparse=seed % 2 == 0)),
+            )
     assert proved >= 0.99 * drawn, (proved, drawn)
 
 
@@ -83,23 +114,39 @@ def test_more_drawn_problems():
 @pytest.mark.parametrize(
     ("A", "b", "lower", "upper", "none"),
     [
-        ([[0.0, 0.0], [0.0, 1.0]], [-1.0, 1e16], 0.0, np.inf, True),  # y_1 = -1, whatever the large row says
+        # y_1 = -1, whatever the large row says
+        ([[0.0, 0.0], [0.0, 1.0]], [-1.0, 1e16], 0.0, np.inf, True),
         ([[0.0, 0.0], [0.0, 1.0]], [1.0, -1e16], 0.0, np.inf, False),
-        ([[1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [0.0, 0.0, 1.0]], [-1.0, -1.0, 1e16], 0.0, np.inf, True),
-        ([[1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [0.0, 0.0, 1.0]], [-1.0, 1.0, -1e16], 0.0, np.inf, False),
+        (
+            [[1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+            [-1.0, -1.0, 1e16],
+            0.0,
+            np.inf,
+            True,
+        ),
+        (
+            [[1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+            [-1.0, 1.0, -1e16],
+            0.0,
+            np.inf,
+            False,
+        ),
         ([[1.0, -1.0], [-1.0, 1.0]], [-1.0, 1.0 - 1e-15], 0.0, np.inf, False),  # rounding
         ([[1e-17, 0.0], [0.0, 1.0]], [-1.0, -1.0], 0.0, np.inf, False),  # x = (1e17, 1)
         ([[1.0, -1.0], [-1.0, 1.0]], [1.0, 1.0], -np.inf, 0.0, True),
         ([[1.0, -1.0], [-1.0, 1.0]], [-1.0, -1.0], -np.inf, 0.0, False),
         ([[-1.0]], [-1.0], 0.0, np.inf, True),  # y = -x - 1
-        ([[0.0, 1.0], [0.0, 0.0]], [-3.0, 1.0], [0.0, 0.0], [np.inf, 2.0], True),  # y_1 = x_2 - 3 <= -1
+        # y_1 = x_2 - 3 <= -1
+        ([[0.0, 1.0], [0.0, 0.0]], [-3.0, 1.0], [0.0, 0.0], [np.inf, 2.0], True),
         ([[0.0, 1.0], [0.0, 0.0]], [-1.0, 1.0], [0.0, 0.0], [np.inf, 2.0], False),
     ],
 )
 def test_small_cases(A, b, lower, upper, none):
     n = len(b)
     bounds = (np.broadcast_to(np.asarray(side, dtype=float), (n,)) for side in (lower, upper))
-    assert inconsistent(DenseProblem(np.arange(n), np.array(A), np.array(b), *bounds, False)) is none
+    assert (
+        inconsistent(DenseProblem(np.arange(n), np.array(A), np.array(b), *bounds, False)) is none
+    )
 
 
 def test_multipliers_of_a_wrong_sign_prove_nothing():
@@ -132,7 +179,9 @@ def test_a_full_film(n, eccentricity, method):
     result = wl.solve(wl.LCP(A, b), method)
     x = result.x.numpy()
     assert result and (x >= 0).all(), result.status
-    assert np.linalg.norm(np.minimum(x, (A @ x + b) / A.diagonal())) <= 1e-5 * np.linalg.norm(b / A.diagonal())
+    assert np.linalg.norm(np.minimum(x, (A @ x + b) / A.diagonal())) <= 1e-5 * np.linalg.norm(
+        b / A.diagonal()
+    )
 
 
 @pytest.mark.parametrize("dense", [False, True])
@@ -165,7 +214,9 @@ def equations(seed, largest):
         w = rng.standard_normal(n)
         w -= B @ np.linalg.lstsq(B, w, rcond=None)[0]
     else:
-        W = np.roll(np.diag(rng.uniform(0.5, 2, n)), 1, axis=1) + rng.uniform(0.5, 2, (n, n)) * (rng.random((n, n)) < 3 / n)
+        W = np.roll(np.diag(rng.uniform(0.5, 2, n)), 1, axis=1) + rng.uniform(0.5, 2, (n, n)) * (
+            rng.random((n, n)) < 3 / n
+        )
         W = W if kind == "directed graph" else W + W.T
         A, w = np.diag(W.sum(axis=0)) - W, np.ones(n)  # columns sum to 0
     units = 10 ** rng.uniform(-2, 2, n) if rng.random() < 0.5 else np.ones(n)
@@ -177,7 +228,14 @@ def check_equations(seed, largest):
     b = A @ (rng.standard_normal(len(A)) / np.abs(A).max(axis=0))
     good = wl.solve(wl.LCP(wl.DenseOperator(A, device="cpu"), b, -np.inf, np.inf))
     assert good.status is not wl.SolveStatus.INFEASIBLE, seed
-    bad = wl.solve(wl.LCP(wl.DenseOperator(A, device="cpu"), b + 0.01 * np.linalg.norm(b) * w / np.linalg.norm(w), -np.inf, np.inf))
+    bad = wl.solve(
+        wl.LCP(
+            wl.DenseOperator(A, device="cpu"),
+            b + 0.01 * np.linalg.norm(b) * w / np.linalg.norm(w),
+            -np.inf,
+            np.inf,
+        )
+    )
     return good, bad
 
 
@@ -185,7 +243,9 @@ def test_dense_equations_are_proved_to_have_no_solution():
     """By multipliers from the null space, in three steps: what takes longer comes to linear programs of up to 100 s at 770 unknowns."""
     found = [check_equations(seed, 300) for seed in range(16)]
     assert all(good for good, _ in found), [good.status for good, _ in found]
-    assert all(bad.status is wl.SolveStatus.INFEASIBLE for _, bad in found), [bad.status for _, bad in found]
+    assert all(bad.status is wl.SolveStatus.INFEASIBLE for _, bad in found), [
+        bad.status for _, bad in found
+    ]
     assert max(bad.iterations for _, bad in found) <= 12, [bad.iterations for _, bad in found]
 
 
@@ -193,7 +253,11 @@ def drawn_dominant(seed):
     """Return a matrix whose rows are dominant, most of them weakly, and whether each row leads to a strictly dominant one."""
     rng = np.random.default_rng([8, seed])
     n = int(rng.integers(1, 25))
-    A = np.where(rng.random((n, n)) < rng.uniform(0.02, 0.3), rng.standard_normal((n, n)) * 10 ** rng.uniform(-6, 6, (n, n)), 0.0)
+    A = np.where(
+        rng.random((n, n)) < rng.uniform(0.02, 0.3),
+        rng.standard_normal((n, n)) * 10 ** rng.uniform(-6, 6, (n, n)),
+        0.0,
+    )
     np.fill_diagonal(A, 0.0)
     strict = rng.random(n) < rng.choice([0.0, 0.1, 0.5])
     beside = np.abs(A).sum(axis=1)
@@ -209,7 +273,9 @@ def check_dominance(seeds):
     yes = 0
     for seed in seeds:
         A, expected = drawn_dominant(seed)
-        assert diagonally_dominant(A) == diagonally_dominant(scipy.sparse.csr_array(A)) == expected, seed
+        assert (
+            diagonally_dominant(A) == diagonally_dominant(scipy.sparse.csr_array(A)) == expected
+        ), seed
         yes += expected
         if expected:
             rng = np.random.default_rng([9, seed])
@@ -230,11 +296,19 @@ def test_what_is_not_dominant():
     assert diagonally_dominant(laplacian + np.diag([1e-3, 0.0]))
     assert not diagonally_dominant(-np.eye(2))
     assert not diagonally_dominant(np.array([[1.0, -1.1], [0.0, 1.0]]))
-    assert not diagonally_dominant(np.array([[1.0, 0.0, 0.0], [0.0, 1.0, -1.0], [-1.0, 0.0, 1.0]]) - np.diag([0.0, 0.0, 0.5]))
+    assert not diagonally_dominant(
+        np.array([[1.0, 0.0, 0.0], [0.0, 1.0, -1.0], [-1.0, 0.0, 1.0]]) - np.diag([0.0, 0.0, 0.5])
+    )
 
 
 def test_a_dominant_matrix_needs_no_linear_program(monkeypatch):
-    monkeypatch.setattr("scipy.optimize.linprog", lambda *_, **__: pytest.fail("a linear program was solved"))
+    monkeypatch.setattr(
+        "scipy.optimize.linprog", lambda *_, **__: pytest.fail("a linear program was solved")
+    )
     A = np.array([[2.0, -1.0], [-1.0, 1.0]])
     for lower, upper in ((0.0, np.inf), (-np.inf, 0.0), (-np.inf, np.inf)):
-        assert not inconsistent(DenseProblem(np.arange(2), A, np.array([-3.0, 1.0]), np.full(2, lower), np.full(2, upper)))
+        assert not inconsistent(
+            DenseProblem(
+                np.arange(2), A, np.array([-3.0, 1.0]), np.full(2, lower), np.full(2, upper)
+            )
+        )

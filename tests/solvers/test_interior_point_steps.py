@@ -25,7 +25,9 @@ class PlainPath:
         start: multiple of the size of b from which w d and s begin.
     """
 
-    def __init__(self, A, b, lower, upper, *, mehrotra=True, horizon=100, backoff=0.995, start=15.0):
+    def __init__(
+        self, A, b, lower, upper, *, mehrotra=True, horizon=100, backoff=0.995, start=15.0
+    ):
         self.A, self.b, self.d, n = A, b, np.diag(A), len(b)
         self.mehrotra, self.horizon, self.backoff, self.k = mehrotra, horizon, backoff, 0
         self.moves = lower < upper
@@ -33,11 +35,14 @@ class PlainPath:
         self.pairs = int(self.low.sum() + self.high.sum())
         self.x = np.clip(np.zeros(n), lower, upper)
         y = A @ self.x + b
-        norm = np.linalg.norm(np.maximum(np.minimum(y, self.d * (self.x - lower)), self.d * (self.x - upper)))
+        norm = np.linalg.norm(
+            np.maximum(np.minimum(y, self.d * (self.x - lower)), self.d * (self.x - upper))
+        )
         least = start * max(min(np.linalg.norm(b), 1e6 * norm), norm) / math.sqrt(n)
         self.w, self.v, self.s, self.t = (np.zeros(n) for _ in range(4))
         for i in range(n):
-            if self.low[i] and self.high[i]:  # the nearer bound's distance is chosen, half of the span at most
+            # the nearer bound's distance is chosen, half of the span at most
+            if self.low[i] and self.high[i]:
                 half = (upper[i] - lower[i]) / 2
                 if self.x[i] - lower[i] <= upper[i] - self.x[i]:
                     self.w[i] = min(max(self.x[i] - lower[i], least / self.d[i]), half)
@@ -53,12 +58,17 @@ class PlainPath:
                 self.v[i] = max(upper[i] - self.x[i], least / self.d[i])
                 self.x[i] = upper[i] - self.v[i]
         y = A @ self.x + b
-        self.s, self.t = np.where(self.low, np.maximum(y, least), 0.0), np.where(self.high, np.maximum(-y, least), 0.0)
+        self.s, self.t = (
+            np.where(self.low, np.maximum(y, least), 0.0),
+            np.where(self.high, np.maximum(-y, least), 0.0),
+        )
 
     @property
     def mu(self):
         """Mean of the products."""
-        return (self.w[self.low] @ self.s[self.low] + self.v[self.high] @ self.t[self.high]) / self.pairs
+        return (
+            self.w[self.low] @ self.s[self.low] + self.v[self.high] @ self.t[self.high]
+        ) / self.pairs
 
     def direction(self, tau, correction_w, correction_v):
         """Newton's dx, ds and dt for w s = tau - correction_w and v t = tau - correction_v."""
@@ -72,18 +82,37 @@ class PlainPath:
                 D[i] += self.t[i] / self.v[i]
                 right[i] -= (tau - correction_v[i]) / self.v[i]
         dx = np.zeros(n)
-        dx[self.moves] = np.linalg.solve((self.A + np.diag(D))[np.ix_(self.moves, self.moves)], right[self.moves])
+        dx[self.moves] = np.linalg.solve(
+            (self.A + np.diag(D))[np.ix_(self.moves, self.moves)], right[self.moves]
+        )
         for i in range(n):
             if self.low[i]:
-                ds[i] = (tau - correction_w[i] - self.w[i] * self.s[i] - self.s[i] * dx[i]) / self.w[i]
+                ds[i] = (
+                    tau - correction_w[i] - self.w[i] * self.s[i] - self.s[i] * dx[i]
+                ) / self.w[i]
             if self.high[i]:
-                dt[i] = (tau - correction_v[i] - self.v[i] * self.t[i] + self.t[i] * dx[i]) / self.v[i]
+                dt[i] = (
+                    tau - correction_v[i] - self.v[i] * self.t[i] + self.t[i] * dx[i]
+                ) / self.v[i]
         return dx, ds, dt
 
     def longest(self, dx, ds, dt):
         """How far all of w, v, s and t stay positive."""
-        pairs = [(self.w, dx, self.low), (self.s, ds, self.low), (self.v, -dx, self.high), (self.t, dt, self.high)]
-        return min([-a / da for at, by, there in pairs for a, da in zip(at[there], by[there], strict=True) if da < 0], default=math.inf)
+        pairs = [
+            (self.w, dx, self.low),
+            (self.s, ds, self.low),
+            (self.v, -dx, self.high),
+            (self.t, dt, self.high),
+        ]
+        return min(
+            [
+                -a / da
+                for at, by, there in pairs
+                for a, da in zip(at[there], by[there], strict=True)
+                if da < 0
+            ],
+            default=math.inf,
+        )
 
     def step(self):
         """[Book] algorithm 9 with its rules, or Mehrotra's."""
@@ -100,7 +129,11 @@ class PlainPath:
             tau, share = self.mu / self.k, min(self.backoff, self.k / (self.horizon + 1))
             dx, ds, dt = self.direction(tau, none, none)
         length = min(1.0, share * self.longest(dx, ds, dt))
-        self.x, self.w, self.v = self.x + length * dx, self.w + length * dx * self.low, self.v - length * dx * self.high
+        self.x, self.w, self.v = (
+            self.x + length * dx,
+            self.w + length * dx * self.low,
+            self.v - length * dx * self.high,
+        )
         self.s, self.t = self.s + length * ds, self.t + length * dt
 
 
@@ -130,27 +163,50 @@ def compare(method, work, problem, plain, place, steps, tolerance):
         work.residual.current = False
         method.step(problem, work, work.x)
         plain.step()
-        np.testing.assert_allclose(work.x.numpy()[place], plain.x, rtol=tolerance, atol=tolerance, err_msg=f"step {k + 1}")
+        np.testing.assert_allclose(
+            work.x.numpy()[place], plain.x, rtol=tolerance, atol=tolerance, err_msg=f"step {k + 1}"
+        )
         assert work.mu == pytest.approx(plain.mu, rel=1e-6)
-        sides = (("w", plain.w, plain.low), ("s", plain.s, plain.low), ("v", plain.v, plain.high), ("t", plain.t, plain.high))
+        sides = (
+            ("w", plain.w, plain.low),
+            ("s", plain.s, plain.low),
+            ("v", plain.v, plain.high),
+            ("t", plain.t, plain.high),
+        )
         for name, own, there in sides:
             if work._upper or name in "ws":
                 found = getattr(work._pairs, name).numpy()[place][there]
-                np.testing.assert_allclose(found, own[there], rtol=1e-5, atol=tolerance, err_msg=name)
+                np.testing.assert_allclose(
+                    found, own[there], rtol=1e-5, atol=tolerance, err_msg=name
+                )
 
 
 @pytest.mark.parametrize("kind", ["dense", "sparse"])
 @pytest.mark.parametrize(
-    "settings", [{}, {"start": 0.02}, {"backoff": 0.8}, {"mehrotra": False}, {"mehrotra": False, "horizon": 3}], ids=repr
+    "settings",
+    [{}, {"start": 0.02}, {"backoff": 0.8}, {"mehrotra": False}, {"mehrotra": False, "horizon": 3}],
+    ids=repr,
 )
 def test_steps_are_those_of_the_algorithm(kind, settings, device):
     """Both rules; a start near the bounds, whose first steps are cut short; the book's horizon, after which `backoff` is the share."""
     for seed in (4501, 4502):
         A, b, lower, upper = boxed_rows(seed)
-        operator = wl.DenseOperator(A, device=device) if kind == "dense" else wl.SparseOperator(scipy.sparse.csr_array(A), device=device)
+        operator = (
+            wl.DenseOperator(A, device=device)
+            if kind == "dense"
+            else wl.SparseOperator(scipy.sparse.csr_array(A), device=device)
+        )
         problem, method = wl.LCP(operator, b, lower, upper), InteriorPoint(**EXACT | settings)
         work = started(InteriorPointWorkspace(problem, method), problem)
-        compare(method, work, problem, PlainPath(A, b, lower, upper, **settings), np.arange(len(b)), 7, 1e-8)
+        compare(
+            method,
+            work,
+            problem,
+            PlainPath(A, b, lower, upper, **settings),
+            np.arange(len(b)),
+            7,
+            1e-8,
+        )
 
 
 @pytest.mark.parametrize("mehrotra", [True, False])

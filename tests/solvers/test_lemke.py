@@ -15,14 +15,20 @@ TIGHT = wl.StoppingCriteria(rtol=1e-10, max_iterations=1000)
 
 
 def solve(A, b, lower=0.0, upper=np.inf, solver=None, stopping=TIGHT):
-    return wl.solve(wl.LCP(wl.DenseOperator(A, device="cpu"), b, lower, upper), solver or Lemke(), stopping=stopping)
+    return wl.solve(
+        wl.LCP(wl.DenseOperator(A, device="cpu"), b, lower, upper),
+        solver or Lemke(),
+        stopping=stopping,
+    )
 
 
 def contacts(count, rng, friction=0.5):
     """Stewart-Trinkle LCP of random bodies that touch in random points: blocks of normal, four tangents and the sliding speed beta."""
     bodies = max(2, count // 3)
     masses = rng.uniform(0.5, 2.0, bodies)
-    inverse = np.concatenate([np.r_[np.full(3, 1 / m), 1 / (m * rng.uniform(0.1, 1.0, 3))] for m in masses])
+    inverse = np.concatenate(
+        [np.r_[np.full(3, 1 / m), 1 / (m * rng.uniform(0.1, 1.0, 3))] for m in masses]
+    )
     J = np.zeros((5 * count, 6 * bodies))
     for k in range(count):
         first, second = rng.choice(bodies, 2, replace=False)
@@ -33,8 +39,12 @@ def contacts(count, rng, friction=0.5):
         arms = rng.uniform(-1.0, 1.0, (2, 3))
         other = np.cross(normal, tangent)
         for row, direction in enumerate((normal, tangent, other, -tangent, -other)):
-            J[5 * k + row, 6 * first : 6 * first + 6] = -np.r_[direction, np.cross(arms[0], direction)]
-            J[5 * k + row, 6 * second : 6 * second + 6] = np.r_[direction, np.cross(arms[1], direction)]
+            J[5 * k + row, 6 * first : 6 * first + 6] = -np.r_[
+                direction, np.cross(arms[0], direction)
+            ]
+            J[5 * k + row, 6 * second : 6 * second + 6] = np.r_[
+                direction, np.cross(arms[1], direction)
+            ]
     A, b = np.zeros((6 * count, 6 * count)), np.zeros(6 * count)
     forces = np.flatnonzero(np.arange(6 * count) % 6 != 5)
     A[np.ix_(forces, forces)] = (J * inverse) @ J.T
@@ -51,7 +61,9 @@ def test_contact_problems_of_180_variables(count):
         A, b = contacts(30, np.random.default_rng(9000 + seed))
         result = solve(A, b)
         assert result, f"seed {seed}: {result.status.name}"
-        assert natural_residual(A, b, 0.0, np.inf, result.x.numpy()) <= 1e-10 * natural_residual(A, b, 0.0, np.inf, np.zeros(180))
+        assert natural_residual(A, b, 0.0, np.inf, result.x.numpy()) <= 1e-10 * natural_residual(
+            A, b, 0.0, np.inf, np.zeros(180)
+        )
         pivots.append(result.linear_iterations)
     assert np.mean(pivots) < 180
 
@@ -62,7 +74,9 @@ def test_semidefinite_problems(zeros):
     for _ in range(10):
         B = rng.standard_normal((60, 60 - int(60 * zeros)))
         A, held = B @ B.T, rng.random(60) < 0.5
-        b = np.where(held, rng.uniform(0.1, 1.0, 60), 0.0) - A @ np.where(held, 0.0, rng.uniform(0.1, 1.0, 60))
+        b = np.where(held, rng.uniform(0.1, 1.0, 60), 0.0) - A @ np.where(
+            held, 0.0, rng.uniform(0.1, 1.0, 60)
+        )
         result = solve(A, b)
         assert result, result.status
         assert result.relative_residual <= 1e-10
@@ -72,7 +86,8 @@ def test_against_the_tableau():
     rng = np.random.default_rng(811)
     for _ in range(10):
         B, C = rng.standard_normal((2, 40, 40))
-        A, b = B @ B.T / 40 + 0.1 * np.eye(40) + C - C.T, rng.standard_normal(40)  # positive definite, far from symmetric
+        # positive definite, far from symmetric
+        A, b = B @ B.T / 40 + 0.1 * np.eye(40) + C - C.T, rng.standard_normal(40)
         np.testing.assert_allclose(solve(A, b).x.numpy(), lemke(A, b), atol=1e-9)
 
 
@@ -144,7 +159,9 @@ def test_a_ray_is_not_called_infeasible_where_a_solution_exists():
     for _ in range(60):
         A = rng.standard_normal((8, 8))
         held = rng.random(8) < 0.5
-        b = np.where(held, rng.uniform(0.1, 1.0, 8), 0.0) - A @ np.where(held, 0.0, rng.uniform(0.1, 1.0, 8))
+        b = np.where(held, rng.uniform(0.1, 1.0, 8), 0.0) - A @ np.where(
+            held, 0.0, rng.uniform(0.1, 1.0, 8)
+        )
         statuses.append(solve(A, b).status)
     assert set(statuses) == {wl.SolveStatus.CONVERGED, wl.SolveStatus.STAGNATED}
     assert statuses.count(wl.SolveStatus.CONVERGED) > 30
@@ -160,7 +177,12 @@ def test_limit_counts_single_pivots_where_asked_for():
     full = solve(A, b, solver=Lemke(pivots_per_step=1))
     assert full
     assert full.iterations == full.linear_iterations
-    short = solve(A, b, solver=Lemke(pivots_per_step=1), stopping=wl.StoppingCriteria(rtol=1e-10, max_iterations=4, patience=1))
+    short = solve(
+        A,
+        b,
+        solver=Lemke(pivots_per_step=1),
+        stopping=wl.StoppingCriteria(rtol=1e-10, max_iterations=4, patience=1),
+    )
     assert short.status is wl.SolveStatus.MAX_ITERATIONS
     assert short.iterations == 4
     x = short.x.numpy()
@@ -206,7 +228,12 @@ def flipped(seed):
     B, S = rng.standard_normal((n, n)), rng.standard_normal((n, n))
     A = -(B @ B.T / n + 10 ** rng.uniform(-3, 0) * np.eye(n) + (S - S.T) * 10 ** rng.uniform(-2, 1))
     lower = -(10 ** rng.uniform(-2, 2)) * rng.random(n)
-    return A, rng.standard_normal(n) * 10 ** rng.uniform(-1, 1), lower, lower + 10 ** rng.uniform(-2, 2) * rng.random(n) + 1e-3
+    return (
+        A,
+        rng.standard_normal(n) * 10 ** rng.uniform(-1, 1),
+        lower,
+        lower + 10 ** rng.uniform(-2, 2) * rng.random(n) + 1e-3,
+    )
 
 
 def test_finite_bounds_end_every_path_in_a_solution():
@@ -218,7 +245,9 @@ def test_finite_bounds_end_every_path_in_a_solution():
         x = result.x.numpy()
         at = natural_residual(A, b, lower, upper, np.clip(0.0, lower, upper))
         assert ((lower <= x) & (x <= upper)).all(), seed
-        assert np.linalg.norm(natural_residual(A, b, lower, upper, x)) <= 1e-8 * np.linalg.norm(at), seed
+        assert np.linalg.norm(natural_residual(A, b, lower, upper, x)) <= 1e-8 * np.linalg.norm(
+            at
+        ), seed
 
 
 def test_the_default_solves_flipped_matrices_in_boxes():

@@ -14,7 +14,11 @@ def game(seed, *, integer):
     """Return the costs of two players."""
     rng = np.random.default_rng([seed, 4711])
     shape = tuple(rng.integers(1, 25, 2))
-    draw = (lambda: rng.integers(1, 4, shape).astype(float)) if integer else (lambda: rng.uniform(0.1, 3, shape))
+    draw = (
+        (lambda: rng.integers(1, 4, shape).astype(float))
+        if integer
+        else (lambda: rng.uniform(0.1, 3, shape))
+    )
     return draw(), draw()
 
 
@@ -46,8 +50,14 @@ def test_order_and_units_do_not_matter():
     E, F = game(3, integer=False)
     A, b = problem(E, F)
     rng = np.random.default_rng(9)
-    order, r, c = rng.permutation(len(A)), 10 ** rng.uniform(-2, 2, len(A)), 10 ** rng.uniform(-2, 2, len(A))
-    result = wl.solve(wl.LCP((r[:, None] * A * c)[order][:, order], (r * b)[order]), wl.Lemke(), stopping=EXACT)
+    order, r, c = (
+        rng.permutation(len(A)),
+        10 ** rng.uniform(-2, 2, len(A)),
+        10 ** rng.uniform(-2, 2, len(A)),
+    )
+    result = wl.solve(
+        wl.LCP((r[:, None] * A * c)[order][:, order], (r * b)[order]), wl.Lemke(), stopping=EXACT
+    )
     assert result
     x = np.empty(len(A))
     x[order] = result.x.numpy()
@@ -61,7 +71,13 @@ def test_what_is_no_game_starts_as_before():
     assert strategies(A, b) is not None
     negative, within, positive, zero = A.copy(), A.copy(), b.copy(), A.copy()
     negative[0, -1], within[0, 0], positive[0], zero[0, -1] = -1.0, 1.0, 1.0, 0.0
-    for matrix, side in ((negative, b), (within, b), (A, positive), (zero, b), (np.zeros_like(A), b)):
+    for matrix, side in (
+        (negative, b),
+        (within, b),
+        (A, positive),
+        (zero, b),
+        (np.zeros_like(A), b),
+    ):
         assert strategies(matrix, side) is None
 
 

@@ -12,8 +12,9 @@ from warp_lcp.solvers.lemke import BandedBasis, Basis
 class PlainTableau:
     """[Book] appendix C: w - M z - d z0 = q in whole numbers; variables are w: 0 ... m-1, z: m ... 2m-1, z0: 2m.
 
-    The row that leaves has the lexicographically least (q, e_1, ..., e_m)-part over the entering column, but z0 leaves whenever its ratio
-    is least; z0 enters in the row whose (q_i, e_i) / d_i is lexicographically least.
+    The row that leaves has the lexicographically least (q, e_1, ..., e_m)-part over the entering
+    column, but z0 leaves whenever its ratio is least; z0 enters in the row whose (q_i, e_i) / d_i
+    is lexicographically least.
     """
 
     def __init__(self, M, q, d):
@@ -21,7 +22,9 @@ class PlainTableau:
         self.m, self.variables, self.entering = m, list(range(m)), 2 * m
         columns = np.hstack([np.eye(m, dtype=int), -M, -d[:, None], q[:, None]])
         self.table = [[Fraction(int(v)) for v in row] for row in columns]
-        self.row = min((i for i in range(m) if d[i] > 0), key=lambda i: self.key(i, Fraction(int(d[i]))))
+        self.row = min(
+            (i for i in range(m) if d[i] > 0), key=lambda i: self.key(i, Fraction(int(d[i])))
+        )
         self.ties = 0
 
     def key(self, i, pivot):
@@ -45,7 +48,9 @@ class PlainTableau:
         for i in range(self.m):
             if i != self.row:
                 factor = self.table[i][e]
-                self.table[i] = [a - factor * b for a, b in zip(self.table[i], self.table[self.row], strict=True)]
+                self.table[i] = [
+                    a - factor * b for a, b in zip(self.table[i], self.table[self.row], strict=True)
+                ]
         self.variables[self.row] = e
         if leaving == 2 * self.m:
             return True
@@ -64,7 +69,11 @@ def degenerate(seed, m, band=None, largest=2):
     rng = np.random.default_rng(seed)
     M = rng.integers(-largest // 2, largest + 1, (m, m))
     M = M if band is None else np.triu(np.tril(M, band), -band)
-    return M + 2 * np.eye(m, dtype=int), rng.integers(-1, 2, m), rng.integers(1, 3, m) if seed % 2 else np.ones(m, dtype=int)
+    return (
+        M + 2 * np.eye(m, dtype=int),
+        rng.integers(-1, 2, m),
+        rng.integers(1, 3, m) if seed % 2 else np.ones(m, dtype=int),
+    )
 
 
 @pytest.mark.parametrize(("band", "largest"), [(None, 2), (None, 7), (1, 2)])
@@ -78,7 +87,11 @@ def test_pivots_are_those_of_the_lexicographic_rule(band, largest):
         plain = PlainTableau(M, q, d)
         made = [Basis(M.astype(float), q.astype(float), d.astype(float))]
         if band is not None:
-            made.append(BandedBasis(scipy.sparse.csr_array(M.astype(float)), q.astype(float), d.astype(float)))
+            made.append(
+                BandedBasis(
+                    scipy.sparse.csr_array(M.astype(float)), q.astype(float), d.astype(float)
+                )
+            )
         outcome = None
         while outcome is None:
             outcome = plain.pivot()
@@ -106,13 +119,23 @@ def test_z0_leaves_as_soon_as_it_may():
         M, q, d = degenerate(seed, 4)
         if not (q < 0).any():
             continue
-        basis, plain, outcome = Basis(M.astype(float), q.astype(float), d.astype(float)), PlainTableau(M, q, d), None
+        basis, plain, outcome = (
+            Basis(M.astype(float), q.astype(float), d.astype(float)),
+            PlainTableau(M, q, d),
+            None,
+        )
         while outcome is None:
             e = plain.entering
-            ratios = {i: plain.table[i][-1] / plain.table[i][e] for i in range(4) if e != 8 and plain.table[i][e] > 0}
+            ratios = {
+                i: plain.table[i][-1] / plain.table[i][e]
+                for i in range(4)
+                if e != 8 and plain.table[i][e] > 0
+            }
             tied = [i for i in ratios if ratios[i] == min(ratios.values())]
             there = [i for i in tied if plain.variables[i] == 8]
-            seen += bool(there) and min(tied, key=lambda i: plain.key(i, plain.table[i][e])) != there[0]
+            seen += (
+                bool(there) and min(tied, key=lambda i: plain.key(i, plain.table[i][e])) != there[0]
+            )
             outcome = plain.pivot()
             assert basis.pivot() is outcome
             assert not there or outcome

@@ -28,14 +28,20 @@ def index_sets(d, x, y, lower, upper):
 
 def norm(d, x, y, lower, upper):
     """Norm of the minimum map max(min(y, d (x - l)), d (x - u))."""
-    return np.linalg.norm([max(min(v, e * (a - low)), e * (a - high)) for e, a, v, low, high in zip(d, x, y, lower, upper, strict=True)])
+    return np.linalg.norm(
+        [
+            max(min(v, e * (a - low)), e * (a - high))
+            for e, a, v, low, high in zip(d, x, y, lower, upper, strict=True)
+        ]
+    )
 
 
 def plain_newton(A, b, lower, upper, x, steps, *, memory, backtracks=6):
     """[Book] algorithm 10 with eq. 2.139: held unknowns go onto their bounds, A_FF e = -y_F, and x = clip(x + t e) by Armijo's rule.
 
     Returns:
-        For each step x after it, how many are held, and t; t = 0 where the search fails, which leaves x on its bounds.
+        For each step x after it, how many are held, and t; t = 0 where the search fails, which
+        leaves x on its bounds.
     """
     d, norms, found = np.diag(A), [], []
     for _ in range(steps):
@@ -97,9 +103,18 @@ def test_steps_are_those_of_the_algorithm(kind, safeguard, device):
     for seed in SEEDS:
         A, b, lower, upper, x0 = with_ties(seed)
         expected = plain_newton(A, b, lower, upper, x0, 4, memory=4 if safeguard else 1)
-        operator = wl.DenseOperator(A, device=device) if kind == "dense" else wl.SparseOperator(scipy.sparse.csr_array(A), device=device)
-        problem, method = wl.LCP(operator, b, lower, upper), MinimumMapNewton(precision="double", eta=1e-14, safeguard=safeguard)
-        for (x, step), (y, held, t) in zip(steps_of(problem, method, x0, 4), expected, strict=False):
+        operator = (
+            wl.DenseOperator(A, device=device)
+            if kind == "dense"
+            else wl.SparseOperator(scipy.sparse.csr_array(A), device=device)
+        )
+        problem, method = (
+            wl.LCP(operator, b, lower, upper),
+            MinimumMapNewton(precision="double", eta=1e-14, safeguard=safeguard),
+        )
+        for (x, step), (y, held, t) in zip(
+            steps_of(problem, method, x0, 4), expected, strict=False
+        ):
             if t == 0:  # the search fails
                 break
             np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-10)
@@ -155,7 +170,9 @@ def test_index_sets_on_a_grid(bounds):
     np.testing.assert_array_equal(free, ~(below | above))
     assert residual.active == (below | above).sum()
     residual.hold(work.x)
-    np.testing.assert_array_equal(work.x.numpy()[place], np.where(below, lower, np.where(above, upper, x)))
+    np.testing.assert_array_equal(
+        work.x.numpy()[place], np.where(below, lower, np.where(above, upper, x))
+    )
     moved = np.where(below, lower, np.where(above, upper, x))
     right = finest.b.numpy().ravel()[place] * float(residual.size)
     np.testing.assert_allclose(right[free], -(A @ moved + y - A @ x)[free], atol=1e-12)
@@ -166,7 +183,9 @@ def test_newton_alone_fails_on_contacts_and_says_so():
     outcomes = []
     for seed in range(8):
         p = contact(20, seed=seed)
-        result = wl.solve(wl.LCP(wl.DenseOperator(p.A, device="cpu"), p.b), MinimumMapNewton(safeguard=False))
+        result = wl.solve(
+            wl.LCP(wl.DenseOperator(p.A, device="cpu"), p.b), MinimumMapNewton(safeguard=False)
+        )
         assert {record.step for record in result.history[1:]} == {"newton"}
         assert (np.diff([record.residual for record in result.history]) <= 0).all()
         outcomes.append((result.status, result.iterations))
@@ -178,7 +197,10 @@ def test_newton_alone_fails_on_contacts_and_says_so():
 
 def test_newton_alone_may_go_round_in_no_circle():
     """On the matrix of period three whole steps cycle; searched they cannot, and end where no share of one leads down."""
-    result = wl.solve(wl.LCP(wl.DenseOperator(PERIOD_THREE, device="cpu"), -np.ones(3)), MinimumMapNewton(safeguard=False))
+    result = wl.solve(
+        wl.LCP(wl.DenseOperator(PERIOD_THREE, device="cpu"), -np.ones(3)),
+        MinimumMapNewton(safeguard=False),
+    )
     assert {record.step for record in result.history[1:]} == {"newton"}
     assert result.status in (wl.SolveStatus.CONVERGED, wl.SolveStatus.NON_DESCENT)
 

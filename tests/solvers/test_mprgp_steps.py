@@ -13,15 +13,21 @@ from warp_lcp.solvers.mprgp import MPRGP
 class PlainMPRGP:
     """Preconditioned by the diagonal D.
 
-    The residual r = max(min(y, d (x - l)), d (x - u)) has a free part phi, on unknowns off their bounds, and a chopped part beta, on those
-    at one. If |beta|^2 > gamma^2 phi'y, a step along -D^-1 beta to the least energy comes first; then one of conjugate gradients on the
-    free set, whose direction is new where the set has changed. Both are projected, and halved while the set has changed and the energy
-    rises.
+    The residual r = max(min(y, d (x - l)), d (x - u)) has a free part phi, on unknowns off their
+    bounds, and a chopped part beta, on those at one. If |beta|^2 > gamma^2 phi'y, a step along
+    -D^-1 beta to the least energy comes first; then one of conjugate gradients on the free set,
+    whose direction is new where the set has changed. Both are projected, and halved while the set
+    has changed and the energy rises.
     """
 
     def __init__(self, A, b, lower, upper, x, gamma):
         self.A, self.b, self.lower, self.upper, self.x, self.gamma = A, b, lower, upper, x, gamma
-        self.d, self.p, self.free, self.carry = np.diag(A), np.zeros(len(b)), self.off_bounds(x), False
+        self.d, self.p, self.free, self.carry = (
+            np.diag(A),
+            np.zeros(len(b)),
+            self.off_bounds(x),
+            False,
+        )
         self.steps, self.halvings = [], {"released": 0, "conjugate": 0}
 
     def off_bounds(self, x):
@@ -45,7 +51,9 @@ class PlainMPRGP:
 
     def step(self):
         y = self.A @ self.x + self.b
-        r = np.maximum(np.minimum(y, self.d * (self.x - self.lower)), self.d * (self.x - self.upper))
+        r = np.maximum(
+            np.minimum(y, self.d * (self.x - self.lower)), self.d * (self.x - self.upper)
+        )
         chopped, reduced = np.where(self.free, 0.0, r), np.where(self.free, r * y, 0.0).sum()
         proportioning = chopped @ chopped > self.gamma**2 * reduced
         self.steps.append("proportioning" if proportioning else "conjugate gradient")
@@ -57,7 +65,9 @@ class PlainMPRGP:
         z = np.where(self.free, -y / self.d, 0.0)
         beta = -(z @ self.A @ self.p) / (self.p @ self.A @ self.p) if self.carry else 0.0
         self.p = z + beta * self.p
-        self.carry = bool(self.p.any()) and not self.move(self.p, -(y @ self.p) / (self.p @ self.A @ self.p), "conjugate")
+        self.carry = bool(self.p.any()) and not self.move(
+            self.p, -(y @ self.p) / (self.p @ self.A @ self.p), "conjugate"
+        )
 
 
 def problems():
@@ -70,12 +80,24 @@ def problems():
         rng = np.random.default_rng(seed)
         B = rng.standard_normal((12, 8)) * np.exp(rng.standard_normal((12, 1))) + 4.0
         lower, upper = (np.full(12, side) for side in bounds)
-        yield B @ B.T / 12 + 0.02 * np.eye(12), 2 * rng.standard_normal(12), lower, upper, np.clip(np.zeros(12), lower, upper)
+        yield (
+            B @ B.T / 12 + 0.02 * np.eye(12),
+            2 * rng.standard_normal(12),
+            lower,
+            upper,
+            np.clip(np.zeros(12), lower, upper),
+        )
     for seed in (1, 6, 106, 252, 275):
         rng = np.random.default_rng(seed)
         B = rng.standard_normal((4, 4)) + rng.standard_normal((4, 1))
         b, upper = 2 * rng.standard_normal(4), 10 ** rng.uniform(-2, 0.5, 4)
-        yield B @ B.T / 4 + 0.02 * np.eye(4), b, np.zeros(4), upper, np.where(rng.random(4) < 0.5, 0.0, upper)
+        yield (
+            B @ B.T / 4 + 0.02 * np.eye(4),
+            b,
+            np.zeros(4),
+            upper,
+            np.where(rng.random(4) < 0.5, 0.0, upper),
+        )
 
 
 def started(problem, method, x0):
@@ -93,7 +115,10 @@ def started(problem, method, x0):
 def test_steps_are_those_of_the_algorithm(gamma, device):
     kinds, halvings = [], []
     for A, b, lower, upper, x0 in problems():
-        problem, method = wl.LCP(wl.DenseOperator(A, device=device), b, lower, upper), MPRGP(gamma=gamma)
+        problem, method = (
+            wl.LCP(wl.DenseOperator(A, device=device), b, lower, upper),
+            MPRGP(gamma=gamma),
+        )
         work, plain = started(problem, method, x0), PlainMPRGP(A, b, lower, upper, x0, gamma)
         for k in range(10):
             if work.residual.norm < 1e-9:  # what decides there is rounding
@@ -101,7 +126,9 @@ def test_steps_are_those_of_the_algorithm(gamma, device):
             step = method.step(problem, work, work.x)
             work.residual.evaluate(work.x)
             plain.step()
-            np.testing.assert_allclose(work.x.numpy(), plain.x, rtol=1e-8, atol=1e-9, err_msg=f"step {k + 1}")
+            np.testing.assert_allclose(
+                work.x.numpy(), plain.x, rtol=1e-8, atol=1e-9, err_msg=f"step {k + 1}"
+            )
             assert step.name == plain.steps[-1]
         kinds += plain.steps
         halvings.append(plain.halvings)
@@ -118,8 +145,16 @@ def grid(seed, lower, upper=np.inf):
     cells[0, 0, 0] = wl.AIR
     fluid = cells.ravel() == wl.FLUID
     b = np.where(fluid, rng.standard_normal(cells.size), 0.0)
-    problem = wl.LCP(wl.GridPoisson(cells, device="cpu", dtype=wp.float64), b.reshape(cells.shape), lower, upper)
-    return problem, assemble(cells)[np.ix_(fluid, fluid)], b[fluid], problem.layout.places()[fluid], cells.shape
+    problem = wl.LCP(
+        wl.GridPoisson(cells, device="cpu", dtype=wp.float64), b.reshape(cells.shape), lower, upper
+    )
+    return (
+        problem,
+        assemble(cells)[np.ix_(fluid, fluid)],
+        b[fluid],
+        problem.layout.places()[fluid],
+        cells.shape,
+    )
 
 
 def test_directions_on_a_grid_are_conjugate_and_steps_as_long_as_the_energy_falls():
@@ -154,7 +189,9 @@ def test_proportioning_on_a_grid_goes_down_the_chopped_gradient():
     x = work.x.numpy()[place]
     np.testing.assert_allclose(x, length * s, rtol=1e-12)
     np.testing.assert_array_equal(work.residual.free.numpy()[place], b < 0)
-    np.testing.assert_allclose(work.preconditioner.r.numpy()[place] * size, np.where(b < 0, -(A @ x + b), 0.0), atol=1e-12)
+    np.testing.assert_allclose(
+        work.preconditioner.r.numpy()[place] * size, np.where(b < 0, -(A @ x + b), 0.0), atol=1e-12
+    )
 
 
 def test_a_narrow_box_shortens_the_chopped_gradient_not_the_way_to_the_least_energy():
@@ -177,11 +214,16 @@ def test_gamma_is_the_ratio_of_the_parts(gamma, releases):
     cells = np.array([[wl.AIR, wl.FLUID, wl.AIR, wl.FLUID, wl.AIR]])
     b = np.array([[0.0, 3.0, 0.0, -3.0, 0.0]])  # the diagonal is 2
     on_grid = wl.LCP(wl.GridPoisson(cells, device="cpu", dtype=wp.float64), b, 0.0, 100.0)
-    for problem, x0 in ((dense, np.array([1.0, 0.0])), (on_grid, np.array([[0.0, 0.5, 0.0, 0.0, 0.0]]))):
+    for problem, x0 in (
+        (dense, np.array([1.0, 0.0])),
+        (on_grid, np.array([[0.0, 0.5, 0.0, 0.0, 0.0]])),
+    ):
         method = MPRGP(gamma=gamma, monotone_cycles=0, precision="double")
         work = started(problem, method, x0)
         assert (work.residual.chopped, work.residual.reduced) == pytest.approx((9.0, 4.0))
-        assert method.step(problem, work, work.x).name == ("proportioning" if releases else "conjugate gradient")
+        assert method.step(problem, work, work.x).name == (
+            "proportioning" if releases else "conjugate gradient"
+        )
 
 
 def test_products_of_the_conjugate_direction():
@@ -194,4 +236,6 @@ def test_products_of_the_conjugate_direction():
     assert q @ A @ p == pytest.approx(0.0, abs=1e-12)
     assert (curvature, gain) == pytest.approx((q @ A @ q, g @ q))
     z = p + 1e-3 * z  # nearly the last direction: what is left of it is rounding
-    assert conjugate.func(z @ A @ z, z @ A @ p, g @ z, g @ p, p @ A @ p, 1e-3) == pytest.approx((0.0, z @ A @ z, g @ z))
+    assert conjugate.func(z @ A @ z, z @ A @ p, g @ z, g @ p, p @ A @ p, 1e-3) == pytest.approx(
+        (0.0, z @ A @ z, g @ z)
+    )

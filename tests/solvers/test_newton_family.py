@@ -45,7 +45,11 @@ METHODS = [
     InteriorPoint(),
     InteriorPoint(mehrotra=False),
     wl.Fallback(InteriorPoint(), (wl.MinimumMapNewton(), is_near)),
-    *(FischerNewton(kink=k, safeguard=s, fischer_weight=c) for k in KINKS for s, c in ((True, 0.95), (False, 1.0))),
+    *(
+        FischerNewton(kink=k, safeguard=s, fischer_weight=c)
+        for k in KINKS
+        for s, c in ((True, 0.95), (False, 1.0))
+    ),
     FischerNewton(warm_start=3),
 ]
 
@@ -61,12 +65,16 @@ def test_boxed_mixed_and_held_rows(method):
         np.testing.assert_allclose(result.x.numpy(), boxed(A, b, lower, upper), atol=1e-8)
 
 
-@pytest.mark.parametrize("method", [InteriorPoint(), FischerNewton(), GradientDescent()], ids=lambda m: type(m).__name__)
+@pytest.mark.parametrize(
+    "method", [InteriorPoint(), FischerNewton(), GradientDescent()], ids=lambda m: type(m).__name__
+)
 def test_equations_alone_are_a_linear_solve(method):
     rng = np.random.default_rng(2207)
     B = rng.standard_normal((12, 12))
     A, b = B @ B.T / 12 + np.eye(12), rng.standard_normal(12)
-    result = wl.solve(dense(A, b, -np.inf), method, stopping=wl.StoppingCriteria(rtol=1e-9, max_iterations=2000))
+    result = wl.solve(
+        dense(A, b, -np.inf), method, stopping=wl.StoppingCriteria(rtol=1e-9, max_iterations=2000)
+    )
     assert result, result.status
     np.testing.assert_allclose(result.x.numpy(), np.linalg.solve(A, -b), atol=1e-7)
 
@@ -75,7 +83,9 @@ def test_equations_alone_are_a_linear_solve(method):
 def test_one_unknown(kink):
     """Directions of norm 1 and units of 1: guards that compare with another number than 0 would see them."""
     for a, b, expected in ((1.0, -3.0, 3.0), (1.0, 2.0, 0.0), (4.0, -2.0, 0.5)):
-        result = wl.solve(dense(np.array([[a]]), np.array([b])), FischerNewton(kink=kink), stopping=TIGHT)
+        result = wl.solve(
+            dense(np.array([[a]]), np.array([b])), FischerNewton(kink=kink), stopping=TIGHT
+        )
         assert result and result.x.numpy() == pytest.approx([expected], abs=1e-9)
 
 
@@ -86,14 +96,25 @@ def test_finite_differences_step_on_a_grid_with_walls_as_on_the_matrix_of_its_un
     matrix = scipy.sparse.csr_array(assemble(cells)[np.ix_(fluid, fluid)])
     method = FischerNewton(kink="approximation")
     grid = wl.solve(wl.LCP(wl.GridPoisson(cells, device="cpu"), b), method, stopping=TIGHT)
-    unknowns = wl.solve(wl.LCP(wl.SparseOperator(matrix, device="cpu"), b.ravel()[fluid]), method, stopping=TIGHT)
+    unknowns = wl.solve(
+        wl.LCP(wl.SparseOperator(matrix, device="cpu"), b.ravel()[fluid]), method, stopping=TIGHT
+    )
     assert grid and unknowns
-    assert (grid.iterations, grid.linear_iterations) == (unknowns.iterations, unknowns.linear_iterations)
+    assert (grid.iterations, grid.linear_iterations) == (
+        unknowns.iterations,
+        unknowns.linear_iterations,
+    )
     np.testing.assert_allclose(grid.x.numpy().ravel()[fluid], unknowns.x.numpy(), atol=1e-8)
 
 
 @pytest.mark.parametrize(
-    "method", [InteriorPoint(), InteriorPoint(precision="double"), FischerNewton(), FischerNewton(fischer_weight=0.95)]
+    "method",
+    [
+        InteriorPoint(),
+        InteriorPoint(precision="double"),
+        FischerNewton(),
+        FischerNewton(fischer_weight=0.95),
+    ],
 )
 @pytest.mark.parametrize("upper", [np.inf, 0.4])
 def test_grid_against_a_dense_matrix(method, upper, device):
@@ -101,13 +122,17 @@ def test_grid_against_a_dense_matrix(method, upper, device):
     cells = rng.choice(3, (6, 7, 5), p=[0.1, 0.8, 0.1])
     cells[0, 0, 0] = wl.AIR
     fluid, matrix, b = cells.ravel() == wl.FLUID, assemble(cells), rng.standard_normal(cells.shape)
-    result = wl.solve(wl.LCP(wl.GridPoisson(cells, device=device), b, 0.0, upper), method, stopping=TIGHT)
+    result = wl.solve(
+        wl.LCP(wl.GridPoisson(cells, device=device), b, 0.0, upper), method, stopping=TIGHT
+    )
     assert result, result.status
     n = int(fluid.sum())
     block, x = matrix[np.ix_(fluid, fluid)], result.x.numpy().ravel()[fluid]
     free = (x > 1e-6) & (x < upper - 1e-6)
     expected = np.where(x > 1e-6, np.where(free, 0.0, upper), 0.0)
-    expected[free] = np.linalg.solve(block[np.ix_(free, free)], -(b.ravel()[fluid] + block @ expected)[free])
+    expected[free] = np.linalg.solve(
+        block[np.ix_(free, free)], -(b.ravel()[fluid] + block @ expected)[free]
+    )
     np.testing.assert_allclose(x, expected, atol=1e-8)
     bounds = np.zeros(n), np.full(n, upper)
     assert natural_residual(block, b.ravel()[fluid], *bounds, expected) < 1e-9
@@ -115,12 +140,20 @@ def test_grid_against_a_dense_matrix(method, upper, device):
         np.testing.assert_allclose(x, lemke(block, b.ravel()[fluid]), atol=1e-8)
 
 
-@pytest.mark.parametrize("method", [InteriorPoint(), FischerNewton()], ids=lambda m: type(m).__name__)
+@pytest.mark.parametrize(
+    "method", [InteriorPoint(), FischerNewton()], ids=lambda m: type(m).__name__
+)
 def test_unsymmetric_sparse_matrix(method):
     rng = np.random.default_rng(2221)
-    S = scipy.sparse.random_array((40, 40), density=0.1, rng=rng) + scipy.sparse.diags_array(np.full(40, 4.0))
+    S = scipy.sparse.random_array((40, 40), density=0.1, rng=rng) + scipy.sparse.diags_array(
+        np.full(40, 4.0)
+    )
     b = rng.standard_normal(40)
-    result = wl.solve(wl.LCP(wl.SparseOperator(S, device="cpu"), b), method, stopping=wl.StoppingCriteria(rtol=1e-9))
+    result = wl.solve(
+        wl.LCP(wl.SparseOperator(S, device="cpu"), b),
+        method,
+        stopping=wl.StoppingCriteria(rtol=1e-9),
+    )
     assert result, result.status
     np.testing.assert_allclose(result.x.numpy(), lemke(S.toarray(), b), atol=1e-7)
 
@@ -177,7 +210,11 @@ def test_gradient_descent_on_a_grid(map_):
         stopping=wl.StoppingCriteria(rtol=1e-6, max_iterations=5000),
     )
     assert result, result.status
-    np.testing.assert_allclose(result.x.numpy().ravel()[fluid], lemke(assemble(cells)[np.ix_(fluid, fluid)], b.ravel()[fluid]), atol=1e-4)
+    np.testing.assert_allclose(
+        result.x.numpy().ravel()[fluid],
+        lemke(assemble(cells)[np.ix_(fluid, fluid)], b.ravel()[fluid]),
+        atol=1e-4,
+    )
 
 
 def test_statuses_of_gradient_descent():
@@ -186,12 +223,30 @@ def test_statuses_of_gradient_descent():
     B = rng.standard_normal((30, 30))
     A, b = B @ B.T + 1e-3 * np.eye(30), rng.standard_normal(30)
     many = wl.StoppingCriteria(rtol=1e-12, max_iterations=500, patience=500)
-    assert wl.solve(dense(A, b), GradientDescent(relative=0.5, memory=1), stopping=many).status is wl.SolveStatus.STAGNATED
-    assert wl.solve(dense(A, b), GradientDescent(stagnation=0.5), stopping=many).status is wl.SolveStatus.STAGNATED
-    assert wl.solve(dense(A, b), GradientDescent(gradient=1e3), stopping=many).status is wl.SolveStatus.LOCAL_MINIMUM
-    assert wl.solve(dense(A, b), GradientDescent(), stopping=many).status in (wl.SolveStatus.MAX_ITERATIONS, wl.SolveStatus.STAGNATED)
-    none = wl.solve(dense(np.array([[-1.0]]), np.array([-1.0])), GradientDescent(map="natural"), stopping=many)
-    assert none.status in (wl.SolveStatus.NON_DESCENT, wl.SolveStatus.LOCAL_MINIMUM, wl.SolveStatus.STAGNATED)
+    assert (
+        wl.solve(dense(A, b), GradientDescent(relative=0.5, memory=1), stopping=many).status
+        is wl.SolveStatus.STAGNATED
+    )
+    assert (
+        wl.solve(dense(A, b), GradientDescent(stagnation=0.5), stopping=many).status
+        is wl.SolveStatus.STAGNATED
+    )
+    assert (
+        wl.solve(dense(A, b), GradientDescent(gradient=1e3), stopping=many).status
+        is wl.SolveStatus.LOCAL_MINIMUM
+    )
+    assert wl.solve(dense(A, b), GradientDescent(), stopping=many).status in (
+        wl.SolveStatus.MAX_ITERATIONS,
+        wl.SolveStatus.STAGNATED,
+    )
+    none = wl.solve(
+        dense(np.array([[-1.0]]), np.array([-1.0])), GradientDescent(map="natural"), stopping=many
+    )
+    assert none.status in (
+        wl.SolveStatus.NON_DESCENT,
+        wl.SolveStatus.LOCAL_MINIMUM,
+        wl.SolveStatus.STAGNATED,
+    )
 
 
 @pytest.mark.parametrize("contacts", [20, 30])
@@ -203,7 +258,9 @@ def test_safeguarded_fischer_solves_frictional_contacts(contacts):
         result = wl.solve(dense(problem.A, problem.b), FischerNewton())
         assert result, (seed, result.status)
         n = len(problem.b)
-        own = natural_residual(problem.A, problem.b, np.zeros(n), np.full(n, np.inf), result.x.numpy())
+        own = natural_residual(
+            problem.A, problem.b, np.zeros(n), np.full(n, np.inf), result.x.numpy()
+        )
         assert own == pytest.approx(result.residual, rel=1e-6, abs=1e-12)
         steps.append(result.iterations)
     assert np.mean(steps) <= 20
@@ -211,11 +268,16 @@ def test_safeguarded_fischer_solves_frictional_contacts(contacts):
 
 def test_plain_fischer_fails_on_some_contacts_and_says_so():
     results = [
-        wl.solve(dense(p.A, p.b), FischerNewton(safeguard=False, fischer_weight=0.95)) for p in (contact(20, seed=s) for s in range(12))
+        wl.solve(dense(p.A, p.b), FischerNewton(safeguard=False, fischer_weight=0.95))
+        for p in (contact(20, seed=s) for s in range(12))
     ]
     failed = [r for r in results if not r]
     assert 0 < len(failed) < 12
-    assert {r.status for r in failed} <= {wl.SolveStatus.NON_DESCENT, wl.SolveStatus.LOCAL_MINIMUM, wl.SolveStatus.MAX_ITERATIONS}
+    assert {r.status for r in failed} <= {
+        wl.SolveStatus.NON_DESCENT,
+        wl.SolveStatus.LOCAL_MINIMUM,
+        wl.SolveStatus.MAX_ITERATIONS,
+    }
 
 
 @pytest.mark.parametrize("zeros", [0.0, 0.4, 0.8])
@@ -235,7 +297,11 @@ def test_minimum_map_newton_leaves_the_cycle_of_period_three():
     solver = wl.MinimumMapNewton()
     work = solver.init(problem)
     for k in range(200):
-        x0 = np.where(rng.random(3) < 0.5, 0.0, rng.uniform(0.1, 5.0, 3)) if k % 2 else rng.uniform(-5, 5, 3)
+        x0 = (
+            np.where(rng.random(3) < 0.5, 0.0, rng.uniform(0.1, 5.0, 3))
+            if k % 2
+            else rng.uniform(-5, 5, 3)
+        )
         result = wl.solve(problem, solver, x0=x0, workspace=work, stopping=TIGHT)
         assert result, (k, result.status)
         np.testing.assert_allclose(PERIOD_THREE @ result.x.numpy(), np.ones(3), atol=1e-8)
@@ -246,7 +312,11 @@ def test_levenberg_marquardt_steps_lower_the_residual_from_anywhere():
     rng = np.random.default_rng(229)
     for n in (3, 8, 20):
         B, S = rng.standard_normal((2, n, n))
-        A, b, high = B @ B.T / n + 0.1 * np.eye(n) + S - S.T, rng.standard_normal(n), rng.uniform(0.5, 2.0, n)
+        A, b, high = (
+            B @ B.T / n + 0.1 * np.eye(n) + S - S.T,
+            rng.standard_normal(n),
+            rng.uniform(0.5, 2.0, n),
+        )
         work = wl.MinimumMapNewton().init(wl.LCP(wl.DenseOperator(A, device="cpu"), b, 0.0, high))
         for _ in range(10):
             before = high * rng.random(n)
@@ -257,7 +327,9 @@ def test_levenberg_marquardt_steps_lower_the_residual_from_anywhere():
 
 
 @pytest.mark.parametrize(
-    ("method", "growth"), [(wl.MinimumMapNewton(), 2), (FischerNewton(), 2), (InteriorPoint(), 4)], ids=lambda m: type(m).__name__
+    ("method", "growth"),
+    [(wl.MinimumMapNewton(), 2), (FischerNewton(), 2), (InteriorPoint(), 4)],
+    ids=lambda m: type(m).__name__,
 )
 def test_ball_obstacle_iterations_do_not_grow(method, growth):
     counts = [wl.solve(ball_obstacle(n, device="cpu").lcp(), method) for n in (65, 129, 257)]
@@ -269,7 +341,9 @@ def test_crossover_hands_over_to_the_active_set():
     rng = np.random.default_rng(2267)
     B = rng.standard_normal((30, 30))
     A, b = B @ B.T / 30 + np.eye(30), rng.standard_normal(30)
-    result = wl.solve(dense(A, b), wl.Fallback(InteriorPoint(), (wl.MinimumMapNewton(), is_near)), stopping=TIGHT)
+    result = wl.solve(
+        dense(A, b), wl.Fallback(InteriorPoint(), (wl.MinimumMapNewton(), is_near)), stopping=TIGHT
+    )
     names = [record.step for record in result.history]
     assert "predictor-corrector" in names
     assert names[-1] == "newton"
@@ -292,7 +366,8 @@ def test_nonmonotone_search_remembers():
     search = NonmonotoneSearch(memory=2)
     search.remember(9.0)
     search.remember(1.0)
-    assert search.search(lambda t: 5.0, -1e-3) == (1.0, 5.0)  # above the last merit, below the largest of two
+    # above the last merit, below the largest of two
+    assert search.search(lambda t: 5.0, -1e-3) == (1.0, 5.0)
     search.remember(5.0)
     assert search.search(lambda t: 6.0, -1e-3)[0] == 0.0
     assert search.search(lambda t: 4.0 if t < 0.3 else float("nan"), -1e-3)[0] == 0.25
@@ -320,7 +395,9 @@ def test_interior_points_end_at_their_floor():
     A = wl.GridPoisson(np.ones((12, 12), dtype=int), shift=1.0, device="cpu")
     ends = []
     for precision in ("double", "mixed", "single"):
-        result = wl.solve(wl.LCP(A, b), InteriorPoint(precision=precision), stopping=wl.StoppingCriteria(rtol=0.0))
+        result = wl.solve(
+            wl.LCP(A, b), InteriorPoint(precision=precision), stopping=wl.StoppingCriteria(rtol=0.0)
+        )
         assert result.status is wl.SolveStatus.FLOOR
         assert result.relative_residual <= (1e-6 if precision == "single" else 1e-14)
         ends.append(np.isnan(result.history[-1].residual))

@@ -58,11 +58,20 @@ def as_problem(kind, rng, device):
         for field, values in zip(fields, (b, lower, upper), strict=True):
             field[inside] = values
         operator = wl.GridPoisson(cells, device=device, dtype=wp.float64)
-        return wl.LCP(operator, *(f.reshape(cells.shape) for f in fields)), A, b, lower, upper, inside
+        return (
+            wl.LCP(operator, *(f.reshape(cells.shape) for f in fields)),
+            A,
+            b,
+            lower,
+            upper,
+            inside,
+        )
     operators = {
         "dense": lambda: wl.DenseOperator(A, device=device),
         "sparse": lambda: wl.SparseOperator(scipy.sparse.csr_array(A), device=device),
-        "products": lambda: wl.LinearOperator(lambda x: A @ x, (len(A),), diagonal=np.diag(A), symmetric=True, device=device),
+        "products": lambda: wl.LinearOperator(
+            lambda x: A @ x, (len(A),), diagonal=np.diag(A), symmetric=True, device=device
+        ),
     }
     return wl.LCP(operators[kind](), b, lower, upper), A, b, lower, upper, inside
 
@@ -79,7 +88,9 @@ def test_steps_are_those_of_the_method(kind, device):
         work.residual.start(work.x, keep=False)
         work.residual.evaluate(work.x)
         work.start(warm=False, tolerance=0.0)
-        for x, _, active in plain_penalty(A, b, lower, upper, np.clip(np.zeros(len(b)), lower, upper), 5, RHO):
+        for x, _, active in plain_penalty(
+            A, b, lower, upper, np.clip(np.zeros(len(b)), lower, upper), 5, RHO
+        ):
             step = method.step(problem, work, work.x)
             own = problem.layout.unload(work.x).numpy().ravel()[inside]
             np.testing.assert_allclose(own, x, rtol=1e-9, atol=1e-10)
@@ -96,7 +107,9 @@ def test_bounds_that_are_equal_and_infinite_ones(device):
         A = B @ B.T + 5 * np.eye(5)
         b, (lower, upper) = rng.uniform(-9.0, 9.0, 5), boxes(5, rng)
         result = wl.solve(
-            wl.LCP(wl.DenseOperator(A, device=device), b, lower, upper), wl.Penalty(), stopping=wl.StoppingCriteria(rtol=1e-10)
+            wl.LCP(wl.DenseOperator(A, device=device), b, lower, upper),
+            wl.Penalty(),
+            stopping=wl.StoppingCriteria(rtol=1e-10),
         )
         assert result, result.status
         np.testing.assert_allclose(result.x.numpy(), boxed(A, b, lower, upper), atol=1e-8)
@@ -110,7 +123,10 @@ def test_the_error_is_that_of_the_docstring(device):
     exact = lemke(A, b)
     free = exact > 1e-12
     pushed = np.where(free, 0.0, A @ exact + b) / np.diag(A)
-    problem, stopping = wl.LCP(wl.DenseOperator(A, device=device), b), wl.StoppingCriteria(rtol=0.0, max_iterations=12)
+    problem, stopping = (
+        wl.LCP(wl.DenseOperator(A, device=device), b),
+        wl.StoppingCriteria(rtol=0.0, max_iterations=12),
+    )
     for rho in (1e3, 1e4, 1e5):
         work = wl.Penalty(rho=rho).init(problem)
         result = wl.solve(problem, wl.Penalty(rho=rho), stopping=stopping, workspace=work)
@@ -125,7 +141,10 @@ def test_a_soft_start_reaches_tight_tolerances_on_grids(shape, device):
     rng = np.random.default_rng(7177)
     cells = np.where(rng.random(shape) < 0.02, wl.AIR, wl.FLUID)
     b, lower = rng.uniform(-1.0, 1.0, shape) - 0.05, rng.uniform(-0.3, 0.1, shape)
-    problem, stopping = wl.LCP(wl.GridPoisson(cells, device=device), b, lower, lower + 0.8), wl.StoppingCriteria(rtol=1e-10)
+    problem, stopping = (
+        wl.LCP(wl.GridPoisson(cells, device=device), b, lower, lower + 0.8),
+        wl.StoppingCriteria(rtol=1e-10),
+    )
     reference = wl.solve(problem, wl.ProjectedMultigrid(), stopping=stopping)
     method = wl.Penalty(rho=30.0)
     work = method.init(problem)
@@ -141,8 +160,12 @@ def test_a_soft_start_reaches_tight_tolerances_on_grids(shape, device):
 
 def test_iterations_do_not_grow_with_the_grid():
     """Warm from projected cycles, at most two steps more from 65^2 to 257^2 on the ball, and from 16^3 to 48^3 on the splash."""
-    counts = [wl.solve(ball_obstacle(n).lcp(device="cpu"), wl.Penalty()).iterations for n in (65, 257)]
-    steps = [wl.solve(splash(n).lcp("walls", device="cpu"), wl.Penalty()).iterations for n in (16, 48)]
+    counts = [
+        wl.solve(ball_obstacle(n).lcp(device="cpu"), wl.Penalty()).iterations for n in (65, 257)
+    ]
+    steps = [
+        wl.solve(splash(n).lcp("walls", device="cpu"), wl.Penalty()).iterations for n in (16, 48)
+    ]
     assert counts[1] <= counts[0] + 2, counts
     assert steps[1] <= steps[0] + 2, steps
 
@@ -151,9 +174,11 @@ def test_a_set_that_cycles_ends_without_success(device):
     """A P-matrix that is no M-matrix, on which Newton's sets have period three: no false success, and the best iterate comes back."""
     A = np.array([[1.0, 0.0, 4.0], [4.0, 1.0, 0.0], [0.0, 4.0, 1.0]])
     result = wl.solve(
-        wl.LCP(wl.DenseOperator(A, device=device), np.full(3, -1.0)), wl.Penalty(), x0=np.array([1.0, 0.0, 0.0]),
+        wl.LCP(wl.DenseOperator(A, device=device), np.full(3, -1.0)),
+        wl.Penalty(),
+        x0=np.array([1.0, 0.0, 0.0]),
         stopping=wl.StoppingCriteria(max_iterations=60, patience=15),
-    )  # fmt: skip
+    )
     assert result.status in (wl.SolveStatus.STAGNATED, wl.SolveStatus.MAX_ITERATIONS)
     assert result.residual <= result.history[0].residual
 
@@ -164,7 +189,11 @@ def test_a_tank_without_a_surface(closed, device):
     cells, rng = np.ones((6, 7), dtype=int), np.random.default_rng(7193)
     b = rng.uniform(-1.0, 1.0, cells.shape)
     b -= b.mean() - (0.1 if closed else 0.0)
-    lower = np.broadcast_to(np.where(np.arange(7) == 6, 0.0, -np.inf), (6, 7)).copy() if closed else -np.inf
+    lower = (
+        np.broadcast_to(np.where(np.arange(7) == 6, 0.0, -np.inf), (6, 7)).copy()
+        if closed
+        else -np.inf
+    )
     problem = wl.LCP(wl.GridPoisson(cells, device=device, dtype=wp.float64), b, lower)
     result = wl.solve(problem, wl.Penalty(), stopping=wl.StoppingCriteria(rtol=1e-9))
     assert result, (result.status, result.relative_residual)

@@ -17,12 +17,18 @@ EXACT = wl.solve(wl.LCP(A, B), wl.Lemke(), stopping=wl.StoppingCriteria(rtol=1e-
 
 
 def solve(A, M, method=None, b=B):
-    return wl.solve(wl.LCP(A, b, preconditioner=M), method or wl.MinimumMapNewton(), stopping=STOPPING)
+    return wl.solve(
+        wl.LCP(A, b, preconditioner=M), method or wl.MinimumMapNewton(), stopping=STOPPING
+    )
 
 
 @pytest.mark.parametrize("kind", ["sparse", "products", "dense"])
 def test_multigrid_of_pyamg_takes_few_iterations(kind):
-    operator = {"sparse": A, "products": wl.LinearOperator(aslinearoperator(A), symmetric=True), "dense": A.toarray()}[kind]
+    operator = {
+        "sparse": A,
+        "products": wl.LinearOperator(aslinearoperator(A), symmetric=True),
+        "dense": A.toarray(),
+    }[kind]
     found = solve(operator, pyamg.smoothed_aggregation_solver(A).aspreconditioner())
     assert found
     np.testing.assert_allclose(found.x.numpy(), EXACT, atol=1e-6)
@@ -30,7 +36,10 @@ def test_multigrid_of_pyamg_takes_few_iterations(kind):
         assert 3 * found.linear_iterations < solve(operator, None).linear_iterations
 
 
-@pytest.mark.parametrize("name", [name for name, method in wl.METHODS.items() if getattr(method, "preconditioned", False)])
+@pytest.mark.parametrize(
+    "name",
+    [name for name, method in wl.METHODS.items() if getattr(method, "preconditioned", False)],
+)
 def test_methods_that_say_so_take_one(name):
     calls = []
 
@@ -44,9 +53,18 @@ def test_methods_that_say_so_take_one(name):
     assert len(calls) > 2  # two of them check it
 
 
-@pytest.mark.parametrize("name", [name for name, cls in wl.METHODS.items() if families(cls) and not getattr(cls, "preconditioned", False)])
+@pytest.mark.parametrize(
+    "name",
+    [
+        name
+        for name, cls in wl.METHODS.items()
+        if families(cls) and not getattr(cls, "preconditioned", False)
+    ],
+)
 def test_methods_that_make_no_use_of_one_refuse_it(name):
-    with pytest.raises(ValueError, match=r"preconditioner: .* does not use one: use MinimumMapNewton"):
+    with pytest.raises(
+        ValueError, match=r"preconditioner: .* does not use one: use MinimumMapNewton"
+    ):
         solve(A, scipy.sparse.eye_array(M * M), wl.METHODS[name]())
 
 
@@ -63,7 +81,9 @@ def test_unsymmetric_systems_take_incomplete_factors():
 
 def varying():
     rng = np.random.default_rng(6)
-    return LinearOperator(A.shape, matvec=lambda r: r * rng.uniform(0.1, 1.0, r.size), dtype=np.float64)
+    return LinearOperator(
+        A.shape, matvec=lambda r: r * rng.uniform(0.1, 1.0, r.size), dtype=np.float64
+    )
 
 
 def failing():
@@ -87,7 +107,9 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("operator", [A, wl.LinearOperator(aslinearoperator(A))], ids=["symmetric", "not said to be"])
+@pytest.mark.parametrize(
+    "operator", [A, wl.LinearOperator(aslinearoperator(A))], ids=["symmetric", "not said to be"]
+)
 @pytest.mark.parametrize("kind", WRONG)
 def test_what_is_no_preconditioner_makes_no_success(kind, operator):
     """It may cost iterations, or the solution; what is called converged is it."""
@@ -111,10 +133,19 @@ def test_recommendations_take_it():
     ("given", "message"),
     [
         (3.0, "preconditioner is a float: expected an object with products M @ r"),
-        (pyamg.smoothed_aggregation_solver(A), r"preconditioner is a MultilevelSolver: .* PyAMG's is ml.aspreconditioner\(\)"),
+        (
+            pyamg.smoothed_aggregation_solver(A),
+            r"preconditioner is a MultilevelSolver: .* PyAMG's is ml.aspreconditioner\(\)",
+        ),
         (np.eye(3), r"preconditioner has shape \(3, 3\): expected \(576, 576\)"),
-        (1j * scipy.sparse.eye_array(M * M), "preconditioner gives products of shape .* and type complex128"),
-        (np.nan * scipy.sparse.eye_array(M * M), "preconditioner gives products that are not finite"),
+        (
+            1j * scipy.sparse.eye_array(M * M),
+            "preconditioner gives products of shape .* and type complex128",
+        ),
+        (
+            np.nan * scipy.sparse.eye_array(M * M),
+            "preconditioner gives products that are not finite",
+        ),
     ],
 )
 def test_what_is_refused(given, message):
@@ -124,4 +155,8 @@ def test_what_is_refused(given, message):
 
 def test_grids_have_their_own():
     with pytest.raises(ValueError, match="preconditioner: cannot be given for systems on grids"):
-        wl.LCP(wl.GridPoisson(np.ones((4, 4), dtype=int), shift=1.0, device="cpu"), np.ones((4, 4)), preconditioner=np.eye(16))
+        wl.LCP(
+            wl.GridPoisson(np.ones((4, 4), dtype=int), shift=1.0, device="cpu"),
+            np.ones((4, 4)),
+            preconditioner=np.eye(16),
+        )

@@ -14,9 +14,15 @@ from warp_lcp.solvers.primal_dual_active_set import PrimalDualActiveSet
 TIGHT = wl.StoppingCriteria(rtol=1e-10)
 
 
-@pytest.mark.parametrize("plant", [Plant(), Plant(active=0.8, weak=0.5), Plant(boxed=True, mixed=0.2, active=0.5)])
 @pytest.mark.parametrize(
-    "make", [lambda plant: poisson((9, 7, 5), plant=plant, dtype=wp.float64, device="cpu"), lambda plant: banded(80, plant=plant)]
+    "plant", [Plant(), Plant(active=0.8, weak=0.5), Plant(boxed=True, mixed=0.2, active=0.5)]
+)
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda plant: poisson((9, 7, 5), plant=plant, dtype=wp.float64, device="cpu"),
+        lambda plant: banded(80, plant=plant),
+    ],
 )
 def test_m_matrices_in_few_steps(make, plant):
     p = make(plant)
@@ -54,7 +60,9 @@ def test_period_three_blocks_from_random_starts(boxes):
     cycled = 0
     for seed in range(40):
         p = period_three(2, plant=Plant(active=rng.random(), boxed=boxes), seed=seed)
-        result = wl.solve(p.lcp(device="cpu"), PrimalDualActiveSet(), x0=rng.uniform(0, 5, 6), stopping=TIGHT)
+        result = wl.solve(
+            p.lcp(device="cpu"), PrimalDualActiveSet(), x0=rng.uniform(0, 5, 6), stopping=TIGHT
+        )
         assert result, (seed, result.status)
         np.testing.assert_allclose(result.x.numpy(), boxed(p.A, p.b, p.lower, p.upper), atol=1e-8)
         cycled += result.history[-1].step == "least index"
@@ -75,7 +83,9 @@ def test_contacts_are_solved_or_reported():
         p = contact(4, seed=seed)
         result = wl.solve(p.lcp(device="cpu"), PrimalDualActiveSet())
         own = natural_residual(p.A, p.b, p.lower, p.upper, result.x.numpy())
-        assert bool(result) == (own <= 1e-6 * natural_residual(p.A, p.b, p.lower, p.upper, np.zeros(len(p.b))))
+        assert bool(result) == (
+            own <= 1e-6 * natural_residual(p.A, p.b, p.lower, p.upper, np.zeros(len(p.b)))
+        )
         solved += bool(result)
     assert solved >= 1  # their matrices are no P-matrices: nothing is promised
 
@@ -83,10 +93,14 @@ def test_contacts_are_solved_or_reported():
 def test_splash_takes_as_few_steps_as_newton():
     for bounds in ("walls", "everywhere"):
         problem = splash(32).named(bounds, device="cpu").lcp()
-        ours, newton = (wl.solve(problem, m) for m in (PrimalDualActiveSet(), wl.MinimumMapNewton()))
+        ours, newton = (
+            wl.solve(problem, m) for m in (PrimalDualActiveSet(), wl.MinimumMapNewton())
+        )
         assert ours, ours.status
         assert ours.iterations <= newton.iterations + 1
-        np.testing.assert_allclose(ours.x.numpy(), newton.x.numpy(), atol=1e-4 * np.abs(newton.x.numpy()).max())
+        np.testing.assert_allclose(
+            ours.x.numpy(), newton.x.numpy(), atol=1e-4 * np.abs(newton.x.numpy()).max()
+        )
 
 
 def test_settings_are_checked():
@@ -103,7 +117,9 @@ def whole_steps(A, b, lower, upper):
         target = x - (A @ x + b) / d
         place = np.where(target < lower, -1, np.where(target > upper, 1, 0))
         if any((place == other).all() for other in seen):
-            turned = sum(((one == 0) == (other == 0)).all() for one, other in itertools.combinations(seen, 2))
+            turned = sum(
+                ((one == 0) == (other == 0)).all() for one, other in itertools.combinations(seen, 2)
+            )
             return (place == seen[-1]).all(), turned
         seen.append(place)
         free, x = place == 0, np.where(place < 0, lower, np.where(place > 0, upper, 0.0))
@@ -115,10 +131,18 @@ def test_an_unknown_that_turns_to_its_other_bound_makes_another_set():
     rng, turned = np.random.default_rng(5), 0
     for _ in range(120):
         B, S = rng.standard_normal((2, 6, 6))
-        A, b, half = B @ B.T / 6 + 0.1 * np.eye(6) + S - S.T, rng.standard_normal(6), rng.uniform(0.1, 0.5, 6)
+        A, b, half = (
+            B @ B.T / 6 + 0.1 * np.eye(6) + S - S.T,
+            rng.standard_normal(6),
+            rng.uniform(0.1, 0.5, 6),
+        )
         ends, turns = whole_steps(A, b, -half, half)
         if ends:
-            result = wl.solve(wl.LCP(wl.DenseOperator(A, device="cpu"), b, -half, half), PrimalDualActiveSet(), stopping=TIGHT)
+            result = wl.solve(
+                wl.LCP(wl.DenseOperator(A, device="cpu"), b, -half, half),
+                PrimalDualActiveSet(),
+                stopping=TIGHT,
+            )
             assert result, result.status
             assert "least index" not in {r.step for r in result.history}
             turned += turns

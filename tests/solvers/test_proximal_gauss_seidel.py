@@ -36,7 +36,9 @@ def plain(problem, sweeps, accelerate):
         for c in order:
             n, t = dim * c, np.arange(dim * c + 1, dim * (c + 1))
             x[n] = max(0.0, x[n] - (B[n] @ x + problem.b.ravel()[n]) / B[n, n])
-            free = x[t] - (B[t] @ x + problem.b.ravel()[t]) / np.linalg.eigvalsh(B[np.ix_(t, t)])[-1]
+            free = (
+                x[t] - (B[t] @ x + problem.b.ravel()[t]) / np.linalg.eigvalsh(B[np.ix_(t, t)])[-1]
+            )
             x[t] = free * min(1.0, problem.friction[c] * x[n] / np.linalg.norm(free))
         g = old - x if accelerate else 0.0 * x
         found.append(x.reshape(k, dim).copy())
@@ -44,7 +46,9 @@ def plain(problem, sweeps, accelerate):
 
 
 @pytest.mark.parametrize("family", FAMILIES)
-@pytest.mark.parametrize(("accelerate", "check_every"), [(True, 1), (True, 2), (True, 3), (False, 1)])
+@pytest.mark.parametrize(
+    ("accelerate", "check_every"), [(True, 1), (True, 2), (True, 3), (False, 1)]
+)
 def test_sweeps_are_those_of_a_plain_loop(family, accelerate, check_every, device):
     problem = drawn(family, 7, friction=0.6, ratio=10.0, device=device)
     method, steps = wl.ProximalGaussSeidel(accelerate=accelerate, check_every=check_every), 4
@@ -81,7 +85,11 @@ def test_solutions_are_coulombs_law(family, device):
         result = solved(problem, 1e-7)
         assert result, result.status
         slides, touches = coulomb(problem, result.x.numpy(), 1e-5)
-        seen += [int((touches & slides).sum()), int((touches & ~slides).sum()), int((~touches).sum())]
+        seen += [
+            int((touches & slides).sum()),
+            int((touches & ~slides).sum()),
+            int((~touches).sum()),
+        ]
     assert seen[0] > 0 and seen[1] > 0 and (family == "stack" or seen[2] > 0), seen
 
 
@@ -91,12 +99,19 @@ def cone_program(problem, lift):
     J = problem.jacobian
     b = problem.b.copy()
     b[:, 0] += lift
-    B = scipy.sparse.csc_matrix(scipy.sparse.triu(J @ J.T + scipy.sparse.diags_array(problem.yields.ravel())))
+    B = scipy.sparse.csc_matrix(
+        scipy.sparse.triu(J @ J.T + scipy.sparse.diags_array(problem.yields.ravel()))
+    )
     scale = np.ones((k, dim))
     scale[:, 0] = problem.friction  # (mu r_n, r_t) in the second-order cone
     clarabel = pytest.importorskip("clarabel")
     settings = clarabel.DefaultSettings()
-    settings.verbose, settings.tol_gap_abs, settings.tol_gap_rel, settings.tol_feas = False, 1e-12, 1e-12, 1e-12
+    settings.verbose, settings.tol_gap_abs, settings.tol_gap_rel, settings.tol_feas = (
+        False,
+        1e-12,
+        1e-12,
+        1e-12,
+    )
     rows = scipy.sparse.csc_matrix(scipy.sparse.diags_array(-scale.ravel()))
     cones = [clarabel.SecondOrderConeT(dim) for _ in range(k)]
     found = clarabel.DefaultSolver(B, b.ravel(), rows, np.zeros(k * dim), cones, settings).solve()
@@ -113,7 +128,8 @@ def test_velocities_are_those_of_the_cone_program_with_the_slip_that_they_have(f
     assert result and slip.max() > 1e-3 * np.abs(problem.b).max()
     again = problem.velocities(cone_program(problem, problem.friction * slip))
     np.testing.assert_allclose(again, u, atol=1e-5 * np.abs(problem.b).max())
-    other = problem.velocities(cone_program(problem, 0.0 * slip))  # the associated law lifts what slips
+    # the associated law lifts what slips
+    other = problem.velocities(cone_program(problem, 0.0 * slip))
     assert np.abs(other - u).max() > 0.1 * problem.friction[0] * slip.max()
 
 
@@ -122,7 +138,9 @@ def test_without_friction_it_is_a_linear_complementarity_problem():
     result, J = solved(problem), problem.jacobian[0::3].toarray()
     assert result
     exact = lemke(J @ J.T, problem.b[:, 0])
-    np.testing.assert_allclose(J.T @ result.x.numpy()[:, 0], J.T @ exact, atol=1e-6 * np.abs(problem.b).max())
+    np.testing.assert_allclose(
+        J.T @ result.x.numpy()[:, 0], J.T @ exact, atol=1e-6 * np.abs(problem.b).max()
+    )
     assert not result.x.numpy()[:, 1:].any()
 
 
@@ -134,7 +152,11 @@ def test_r_factors_shrink_where_sweeps_go_round_in_circles():
 
 def test_bits_are_those_of_one_thread():
     """A box of 550 contacts, of which a color has more than a piece."""
-    problem, before, found = drawn("spheres", 11, friction=0.5, ratio=2.0, side=8), wl.get_threads(), set()
+    problem, before, found = (
+        drawn("spheres", 11, friction=0.5, ratio=2.0, side=8),
+        wl.get_threads(),
+        set(),
+    )
     _, starts = colors(problem.first, problem.second, problem.bodies)
     assert np.diff(starts).max() > 32
     try:
@@ -149,7 +171,10 @@ def test_bits_are_those_of_one_thread():
 def test_it_is_listed_and_refuses_other_problems():
     assert ("proximal-gauss-seidel", wl.ProximalGaussSeidel) in wl.METHODS.items()
     problem = wl.LCP(np.eye(2), -np.ones(2))
-    with pytest.raises(ValueError, match="ProximalGaussSeidel takes problems of the class FrictionalContact: this is a LCP"):
+    with pytest.raises(
+        ValueError,
+        match="ProximalGaussSeidel takes problems of the class FrictionalContact: this is a LCP",
+    ):
         wl.solve(problem, "proximal-gauss-seidel")
     assert "proximal-gauss-seidel" not in wl.recommend(problem).alternatives
 
@@ -171,10 +196,14 @@ def honest(family, seed):
     problem = drawn(family, seed)
     result = solved(problem, 1e-6, max_iterations=800)
     r = result.x.numpy()
-    assert result.residual == pytest.approx(problem.residual(r), rel=1e-6, abs=1e-12 * problem.reference)
+    assert result.residual == pytest.approx(
+        problem.residual(r), rel=1e-6, abs=1e-12 * problem.reference
+    )
     assert bool(result) == (result.residual <= 1e-6 * problem.reference)
     assert result.status in (wl.SolveStatus.CONVERGED, wl.SolveStatus.MAX_ITERATIONS)
-    assert (r[:, 0] >= 0).all() and (np.linalg.norm(r[:, 1:], axis=1) <= problem.friction * r[:, 0] * (1 + 1e-12)).all()
+    assert (r[:, 0] >= 0).all() and (
+        np.linalg.norm(r[:, 1:], axis=1) <= problem.friction * r[:, 0] * (1 + 1e-12)
+    ).all()
     return bool(result)
 
 
@@ -191,9 +220,15 @@ def test_what_many_results_say_is_so():
 @pytest.mark.parametrize("dim", [1, 2])
 def test_in_the_plane_and_without_tangents(dim, device):
     rng = np.random.default_rng(4)
-    one, other, b = rng.standard_normal((6, dim, 3)), rng.standard_normal((6, dim, 3)), rng.standard_normal((6, dim))
+    one, other, b = (
+        rng.standard_normal((6, dim, 3)),
+        rng.standard_normal((6, dim, 3)),
+        rng.standard_normal((6, dim)),
+    )
     ends = np.array([0, 1, 2, 3, 0, 1]), np.array([4, 4, 1, 2, 3, 4])
-    problem = wl.FrictionalContact(*ends, one, other, b, np.full(6, 0.3), 4, yields=np.full((6, dim), 0.1), device=device)
+    problem = wl.FrictionalContact(
+        *ends, one, other, b, np.full(6, 0.3), 4, yields=np.full((6, dim), 0.1), device=device
+    )
     result = solved(problem)
     assert result, result.status
     coulomb(problem, result.x.numpy(), 1e-6)
@@ -203,17 +238,27 @@ def test_where_nothing_approaches_there_are_no_impulses():
     problem = drawn("stack", 0, friction=0.5)
     problem.b[:] = [1.0, 0.0, 0.0]
     result = wl.solve(problem, wl.ProximalGaussSeidel())
-    assert (result.status, result.iterations, result.x.numpy().any()) == (wl.SolveStatus.CONVERGED, 0, False)
-    none = wl.FrictionalContact([], [], np.zeros((0, 3, 6)), np.zeros((0, 3, 6)), np.zeros((0, 3)), [], 2)
+    assert (result.status, result.iterations, result.x.numpy().any()) == (
+        wl.SolveStatus.CONVERGED,
+        0,
+        False,
+    )
+    none = wl.FrictionalContact(
+        [], [], np.zeros((0, 3, 6)), np.zeros((0, 3, 6)), np.zeros((0, 3)), [], 2
+    )
     assert wl.solve(none, wl.ProximalGaussSeidel()).x.shape == (0, 3)
 
 
 def test_a_warm_start_and_a_workspace_that_serves_again():
     problem = drawn("spheres", 2, friction=1.2, ratio=10.0)
     method = wl.ProximalGaussSeidel()
-    work, stopping = method.init(problem), wl.StoppingCriteria(rtol=0.0, atol=1e-8 * problem.reference)
+    work, stopping = (
+        method.init(problem),
+        wl.StoppingCriteria(rtol=0.0, atol=1e-8 * problem.reference),
+    )
     first = wl.solve(problem, method, stopping=stopping, workspace=work).x.numpy().copy()
-    assert wl.solve(problem, method, stopping=stopping, workspace=work).iterations == 0  # it goes on from where it is
+    # it goes on from where it is
+    assert wl.solve(problem, method, stopping=stopping, workspace=work).iterations == 0
     again = wl.solve(problem, method, stopping=stopping, workspace=work, x0=np.zeros_like(first))
     assert again.x.numpy().tobytes() == first.tobytes()
 
@@ -254,12 +299,19 @@ def test_redundant_contacts_of_a_pressed_packing_do_not_stall(seed):
     b = p.b + (p.jacobian @ press.ravel()).reshape(p.b.shape)
     assert np.linalg.matrix_rank(p.jacobian.toarray()) < p.b.size
     problem = ContactProblem(p.first, p.second, p.one, p.other, b, p.friction, p.bodies)
-    method = MethodOfChoice("proximal-gauss-seidel", directions=4, tolerance=tolerance, most=most, device="cpu")
+    method = MethodOfChoice(
+        "proximal-gauss-seidel", directions=4, tolerance=tolerance, most=most, device="cpu"
+    )
     found = method(problem, np.zeros_like(b))
     cones = wl.FrictionalContact(p.first, p.second, p.one, p.other, b, p.friction, p.bodies)
     assert method.status is wl.SolveStatus.CONVERGED and found.iterations < most
     assert cones.residual(found.impulses) <= tolerance * cones.reference
     e = problem.yields()[1].reshape(b.shape)
-    yielding = wl.FrictionalContact(p.first, p.second, p.one, p.other, b, p.friction, p.bodies, yields=e)
+    yielding = wl.FrictionalContact(
+        p.first, p.second, p.one, p.other, b, p.friction, p.bodies, yields=e
+    )
     stopping = wl.StoppingCriteria(rtol=tolerance, max_iterations=most, patience=most)
-    assert wl.solve(yielding, wl.ProximalGaussSeidel(), stopping=stopping).relative_residual > 10 * tolerance
+    assert (
+        wl.solve(yielding, wl.ProximalGaussSeidel(), stopping=stopping).relative_residual
+        > 10 * tolerance
+    )

@@ -16,7 +16,11 @@ TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])
 
 
 def problem(A, b, kind, lower=0.0, upper=np.inf):
-    operator = wl.DenseOperator(A, device="cpu") if kind == "dense" else wl.SparseOperator(scipy.sparse.csr_array(A), device="cpu")
+    operator = (
+        wl.DenseOperator(A, device="cpu")
+        if kind == "dense"
+        else wl.SparseOperator(scipy.sparse.csr_array(A), device="cpu")
+    )
     return wl.LCP(operator, b, lower, upper)
 
 
@@ -27,7 +31,11 @@ def solved(p, method, **more):
 
 def program(rng, m, n):
     """The optimality conditions of min c'x, G x >= h, x >= 0 with a solution: skew, so that every diagonal entry is 0."""
-    G, x, z = rng.standard_normal((m, n)), rng.random(n) * (rng.random(n) < 0.5), rng.random(m) * (rng.random(m) < 0.5)
+    G, x, z = (
+        rng.standard_normal((m, n)),
+        rng.random(n) * (rng.random(n) < 0.5),
+        rng.random(m) * (rng.random(m) < 0.5),
+    )
     h = G @ x - np.where(z > 0, 0.0, rng.random(m))
     c = G.T @ z + np.where(x > 0, 0.0, rng.random(n))
     A = np.block([[np.zeros((n, n)), -G.T], [G, np.zeros((m, m))]])
@@ -38,7 +46,9 @@ def program(rng, m, n):
 @pytest.mark.parametrize("kind", ["dense", "sparse"])
 def test_a_quarter_turn(kind, method):
     """y = (x_2 - 1, 1 - x_1): free blocks of one unknown are 0, and active-set methods alone stay at x = 0."""
-    result = solved(problem(TURN, np.array([-1.0, 1.0]), kind), method, stopping=wl.StoppingCriteria(rtol=1e-9))
+    result = solved(
+        problem(TURN, np.array([-1.0, 1.0]), kind), method, stopping=wl.StoppingCriteria(rtol=1e-9)
+    )
     assert result, result.status
     np.testing.assert_allclose(result.x.numpy(), [1.0, 1.0], atol=1e-8)
     assert result.iterations <= 30
@@ -62,7 +72,8 @@ def test_linear_programs(kind, method):
         assert result, result.status
         x, c, h = result.x.numpy(), b[:9], -b[9:]
         assert x.min() >= -1e-6
-        assert c @ x[:9] == pytest.approx(h @ x[9:], abs=1e-5)  # strong duality, which no other pair of feasible points has
+        # strong duality, which no other pair of feasible points has
+        assert c @ x[:9] == pytest.approx(h @ x[9:], abs=1e-5)
 
 
 @pytest.mark.parametrize("method", METHODS, ids=NAMES)
@@ -73,8 +84,11 @@ def test_semidefinite_matrices_are_solved(zeros, method):
         p = semidefinite(100, zeros=zeros, seed=seed)
         result = solved(problem(p.A, p.b, "dense"), method)
         assert result, (seed, result.status)
-        assert result.residual == pytest.approx(natural_residual(p.A, p.b, p.lower, p.upper, result.x.numpy()), rel=1e-6, abs=1e-14)
-        np.testing.assert_allclose(p.A @ (result.x.numpy() - p.solution), 0.0, atol=1e-4)  # y is unique
+        assert result.residual == pytest.approx(
+            natural_residual(p.A, p.b, p.lower, p.upper, result.x.numpy()), rel=1e-6, abs=1e-14
+        )
+        # y is unique
+        np.testing.assert_allclose(p.A @ (result.x.numpy() - p.solution), 0.0, atol=1e-4)
 
 
 def test_regular_problems_take_no_proximal_step():
@@ -109,10 +123,16 @@ def test_the_method_alone_against_lemke(kind):
     """Semi-definite matrices of half the rank: y is unique, and x is where y = 0."""
     for seed in range(3):
         p = semidefinite(40, zeros=0.5, seed=seed)
-        result = wl.solve(problem(p.A, p.b, kind), wl.ProximalPoint(), stopping=wl.StoppingCriteria(rtol=1e-8, max_iterations=400))
+        result = wl.solve(
+            problem(p.A, p.b, kind),
+            wl.ProximalPoint(),
+            stopping=wl.StoppingCriteria(rtol=1e-8, max_iterations=400),
+        )
         assert result, result.status
         assert {record.step for record in result.history[1:]} == {"proximal point"}
-        assert natural_residual(p.A, p.b, p.lower, p.upper, result.x.numpy()) <= 1e-7 * np.linalg.norm(p.b)
+        assert natural_residual(
+            p.A, p.b, p.lower, p.upper, result.x.numpy()
+        ) <= 1e-7 * np.linalg.norm(p.b)
         np.testing.assert_allclose(p.A @ (result.x.numpy() - p.solution), 0.0, atol=1e-5)
 
 
@@ -137,6 +157,8 @@ def test_a_workspace_begins_anew():
 def test_the_solution_nearest_to_the_start_is_found(kind):
     """A = [[1, -1], [-1, 1]] fixes x_1 - x_2 = 1 alone; D (x - c) lies in A's range, so that x_1 + x_2 stays 8."""
     p = problem(np.array([[1.0, -1.0], [-1.0, 1.0]]), np.array([-1.0, 1.0]), kind)
-    result = wl.solve(p, wl.ProximalPoint(), x0=np.array([5.0, 3.0]), stopping=wl.StoppingCriteria(rtol=1e-9))
+    result = wl.solve(
+        p, wl.ProximalPoint(), x0=np.array([5.0, 3.0]), stopping=wl.StoppingCriteria(rtol=1e-9)
+    )
     assert result, result.status
     np.testing.assert_allclose(result.x.numpy(), [4.5, 3.5], atol=1e-4)

@@ -17,7 +17,11 @@ TIGHT = wl.StoppingCriteria(rtol=1e-8)
 
 
 def solve(A, b, lower=0.0, upper=np.inf, solver=None):
-    operator = SparseOperator(A, device="cpu") if scipy.sparse.issparse(A) else wl.DenseOperator(A, device="cpu")
+    operator = (
+        SparseOperator(A, device="cpu")
+        if scipy.sparse.issparse(A)
+        else wl.DenseOperator(A, device="cpu")
+    )
     return wl.solve(wl.LCP(operator, b, lower, upper), solver or QuadraticProgram(), stopping=TIGHT)
 
 
@@ -45,9 +49,13 @@ def test_sparse_problem_larger_than_the_dense_limit(monkeypatch):
     result = solve(A, b)
     assert result, result.status
     found = scipy.optimize.minimize(
-        lambda x: (0.5 * x @ (A @ x) + b @ x, A @ x + b), np.zeros(n), jac=True, bounds=[(0, None)] * n, method="L-BFGS-B",
+        lambda x: (0.5 * x @ (A @ x) + b @ x, A @ x + b),
+        np.zeros(n),
+        jac=True,
+        bounds=[(0, None)] * n,
+        method="L-BFGS-B",
         options={"maxiter": 3000, "ftol": 1e-15, "gtol": 1e-9, "maxfun": 10_000},
-    )  # fmt: skip
+    )
     np.testing.assert_allclose(result.x.numpy(), found.x, atol=1e-4)
 
 
@@ -62,7 +70,9 @@ def test_semidefinite_problem_is_solved_or_infeasible_as_a_linear_program_says(z
         A = (A + A.T) / 2
         feasible = scipy.optimize.linprog(np.zeros(n), A_ub=-A, b_ub=b).status == 0
         result = solve(A, b)
-        assert result.status is (wl.SolveStatus.CONVERGED if feasible else wl.SolveStatus.INFEASIBLE)
+        assert result.status is (
+            wl.SolveStatus.CONVERGED if feasible else wl.SolveStatus.INFEASIBLE
+        )
         seen.add(feasible)
     assert True in seen
 
@@ -90,7 +100,11 @@ def test_without_piqp_the_message_says_what_to_install(monkeypatch):
 def test_limit_of_its_own_iterations_is_reported():
     rng = np.random.default_rng(937)
     B = rng.standard_normal((100, 100))
-    result = solve((B @ B.T + (B @ B.T).T) / 2, rng.standard_normal(100), solver=QuadraticProgram(max_iterations=1))
+    result = solve(
+        (B @ B.T + (B @ B.T).T) / 2,
+        rng.standard_normal(100),
+        solver=QuadraticProgram(max_iterations=1),
+    )
     assert result.status is wl.SolveStatus.MAX_ITERATIONS
 
 

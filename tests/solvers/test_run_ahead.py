@@ -15,7 +15,9 @@ from warp_lcp.problem.stopping import MeanCriteria
 from warp_lcp.reduced.multigrid_ahead import RunAhead
 from warp_lcp.rows.readings import BYTES, LINE, Reading
 
-emulated = pytest.mark.skipif("emulated_cuda" not in sys.modules, reason="the plugin emulated_cuda is not there")
+emulated = pytest.mark.skipif(
+    "emulated_cuda" not in sys.modules, reason="the plugin emulated_cuda is not there"
+)
 SOLVER = wl.ProjectedMultigrid()
 
 
@@ -36,7 +38,11 @@ def random_problem(rng: np.random.Generator, bodies: int = 0) -> tuple[wl.LCP, w
     lower.fill_(-np.inf if rng.random() < 0.3 else 0.0)
     stored = A.layout.stored_shape
     if bodies:
-        U = rng.standard_normal((*shape, 3 * bodies)) * (rng.random(shape) < 0.2)[..., None] * (cells == FLUID)[..., None]
+        U = (
+            rng.standard_normal((*shape, 3 * bodies))
+            * (rng.random(shape) < 0.2)[..., None]
+            * (cells == FLUID)[..., None]
+        )
         A = wl.SumOperator(A, wl.LowRankOperator(U, random_weights(rng, bodies), device="cpu"))
     return wl.LCP(A, b.reshape(stored), lower.reshape(stored), np.inf), b
 
@@ -53,12 +59,21 @@ def random_weights(rng: np.random.Generator, bodies: int) -> np.ndarray:
 def change(problem: wl.LCP, b: wp.array[Any], rng: np.random.Generator) -> None:
     """Give a problem another right-hand side: rough or smooth, large or small, sometimes nothing."""
     inside = problem.unknown.numpy() == 1
-    values = rng.standard_normal(b.size) if rng.random() < 0.5 else np.sin(np.arange(b.size) * rng.uniform(0.01, 1.0))
+    values = (
+        rng.standard_normal(b.size)
+        if rng.random() < 0.5
+        else np.sin(np.arange(b.size) * rng.uniform(0.01, 1.0))
+    )
     b.assign(np.where(inside, values * 10.0 ** rng.integers(-12, 6) * (rng.random() > 0.05), 0.0))
 
 
-@pytest.mark.parametrize(("seed", "precision"), [*((n, "mixed") for n in range(30)), *((n, "single") for n in range(30, 42))])
-def test_solves_are_those_of_the_host(seed: int, precision: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("seed", "precision"),
+    [*((n, "mixed") for n in range(30)), *((n, "single") for n in range(30, 42))],
+)
+def test_solves_are_those_of_the_host(
+    seed: int, precision: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The same iterates, histories and ends, bit for bit, of solves one after another that begin where the last one ended."""
     rng = np.random.default_rng(4000 + seed)
     problem, b = random_problem(rng)
@@ -70,12 +85,16 @@ def test_solves_are_those_of_the_host(seed: int, precision: Any, monkeypatch: py
     guess, begun = problem.layout.zeros(wp.float64), 0
     for _ in range(5):
         change(problem, b, rng)
-        stopping = wl.StoppingCriteria(rtol=10.0 ** -rng.integers(1, 9), max_iterations=int(rng.integers(0, 40)))
+        stopping = wl.StoppingCriteria(
+            rtol=10.0 ** -rng.integers(1, 9), max_iterations=int(rng.integers(0, 40))
+        )
         found = []
         for work in (alone, ahead):
             result = wl.solve(problem, solver, stopping=stopping, x0=guess, workspace=work)
             rows = [(r.iteration, r.residual, r.active, r.step) for r in result.history]
-            found.append((rows, result.status, result.iterations, result.residual, work.x.numpy().tobytes()))
+            found.append(
+                (rows, result.status, result.iterations, result.residual, work.x.numpy().tobytes())
+            )
         for one, other in zip(*found, strict=True):
             assert one == other
         begun += ahead._ahead is not None
@@ -85,7 +104,9 @@ def test_solves_are_those_of_the_host(seed: int, precision: Any, monkeypatch: py
     assert begun == 5 * (ahead.problem.layout.across is None)
 
 
-def solved_in_turn(problem: wl.LCP, b: wp.array[Any], rng: np.random.Generator, works: tuple[Any, ...], bodies: int) -> None:
+def solved_in_turn(
+    problem: wl.LCP, b: wp.array[Any], rng: np.random.Generator, works: tuple[Any, ...], bodies: int
+) -> None:
     """Solve problems with bodies one after another from both workspaces; compare bits, and the energy with that of A x found apart."""
     guess, A, stored = problem.layout.zeros(wp.float64), problem.A, problem.layout.stored_shape
     for _ in range(4):
@@ -96,18 +117,31 @@ def solved_in_turn(problem: wl.LCP, b: wp.array[Any], rng: np.random.Generator, 
             stopping = wl.StoppingCriteria(rtol=1e-6, max_iterations=25)
             result = wl.solve(problem, SOLVER, stopping=stopping, x0=guess, workspace=work)
             rows = [(r.iteration, r.residual, r.active, r.step) for r in result.history]
-            found.append((rows, result.status, result.residual, work.residual.energy, work.x.numpy().tobytes()))
+            found.append(
+                (
+                    rows,
+                    result.status,
+                    result.residual,
+                    work.residual.energy,
+                    work.x.numpy().tobytes(),
+                )
+            )
         assert found[0] == found[1]
         residual, x = works[1].residual, wp.clone(works[1].x)
         residual.evaluate(x)
         y = A.apply(x.reshape(stored)).numpy().ravel()
         terms = x.numpy() * (0.5 * y + b.numpy())
-        assert abs(residual.energy - terms.sum()) <= 1e-11 * np.abs(x.numpy() * y).sum() + 1e-11 * np.abs(terms).sum() + 1e-300
+        assert (
+            abs(residual.energy - terms.sum())
+            <= 1e-11 * np.abs(x.numpy() * y).sum() + 1e-11 * np.abs(terms).sum() + 1e-300
+        )
         wp.copy(guess, works[0].x)
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_solves_with_bodies_are_those_of_the_host(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_solves_with_bodies_are_those_of_the_host(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """As above with a term of low rank: the host follows the free set, the device takes the steps between."""
     rng = np.random.default_rng(4600 + seed)
     bodies = int(rng.integers(1, 4))
@@ -131,7 +165,9 @@ def test_a_warm_solve_is_read_once() -> None:
         b.assign(np.where(problem.unknown.numpy() == 1, rng.standard_normal(b.size), 0.0))
         guess = wp.clone(work.x)
         meter.clear()
-        assert wl.solve(problem, SOLVER, x0=guess, workspace=work, stopping=wl.StoppingCriteria(rtol=1e-2))
+        assert wl.solve(
+            problem, SOLVER, x0=guess, workspace=work, stopping=wl.StoppingCriteria(rtol=1e-2)
+        )
         counts.append(meter["readbacks"])
     assert min(counts) == 1
 
@@ -140,13 +176,23 @@ def test_criteria_of_the_mean_are_known_once_unknowns_are_counted() -> None:
     scene = splash(16)
     problem, asked = scene.lcp("walls", device="cpu"), []
     n = int((scene.cells == wl.FLUID).sum())
-    mean = MeanCriteria(rtol=0.0, atol=1e-3, max_iterations=50, count=lambda: asked.append(1) or float(n))
+    mean = MeanCriteria(
+        rtol=0.0, atol=1e-3, max_iterations=50, count=lambda: asked.append(1) or float(n)
+    )
     from warp_lcp.problem.solve import solve
 
     result = solve(problem, SOLVER, stopping=mean)
-    plain = wl.solve(problem, SOLVER, stopping=wl.StoppingCriteria(rtol=0.0, atol=1e-3 * n**0.5, max_iterations=50))
+    plain = wl.solve(
+        problem,
+        SOLVER,
+        stopping=wl.StoppingCriteria(rtol=0.0, atol=1e-3 * n**0.5, max_iterations=50),
+    )
     assert len(asked) == 1
-    assert (result.status, result.iterations, result.residual) == (plain.status, plain.iterations, plain.residual)
+    assert (result.status, result.iterations, result.residual) == (
+        plain.status,
+        plain.iterations,
+        plain.residual,
+    )
 
 
 @emulated
@@ -178,7 +224,8 @@ def test_readings_come_together_and_their_places_are_used_again() -> None:
     circle.append(circle)
     held = weakref.ref(circle[0])
     del circle
-    many = [Reading(device, LINE) for _ in range(BYTES // LINE // 8 + 4)]  # more than there is room for: a second board has the rest
+    # more than there is room for: a second board has the rest
+    many = [Reading(device, LINE) for _ in range(BYTES // LINE // 8 + 4)]
     assert held() is None  # garbage was collected first
     assert many[-1]._board is many[-2]._board is not board
     assert Reading(device, 2 * BYTES).numpy().size == 2 * BYTES  # larger than a board is by default
@@ -212,12 +259,26 @@ def outcomes(problem: wl.LCP, works: tuple[Any, ...], **options: Any) -> list[An
         limit = options.get("stop_at", 1 << 30)
 
         def look(record: Any, work: Any = work, seen: list[Any] = seen, limit: int = limit) -> None:
-            seen.append((record.iteration, record.residual, record.active, record.step, work.x.numpy().tobytes()))
+            seen.append(
+                (
+                    record.iteration,
+                    record.residual,
+                    record.active,
+                    record.step,
+                    work.x.numpy().tobytes(),
+                )
+            )
             if record.iteration >= limit:
                 raise StopIteration
 
         given = {name: value for name, value in options.items() if name != "stop_at"}
-        result = wl.solve(problem, SOLVER, workspace=work, callback=look if "stop_at" in options else None, **given)
+        result = wl.solve(
+            problem,
+            SOLVER,
+            workspace=work,
+            callback=look if "stop_at" in options else None,
+            **given,
+        )
         rows = [(r.iteration, r.residual, r.active, r.step) for r in result.history]
         found.append((seen, rows, result.status, result.residual, work.x.numpy().tobytes()))
     return found
@@ -225,7 +286,9 @@ def outcomes(problem: wl.LCP, works: tuple[Any, ...], **options: Any) -> list[An
 
 @pytest.mark.cpu_form("threads are the CPU's")
 @pytest.mark.parametrize("threads", [1, 2, 3, 7])
-def test_threads_take_the_steps_of_the_host(threads: int, both: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_threads_take_the_steps_of_the_host(
+    threads: int, both: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     before = wl.get_threads()
     wl.set_threads(threads)
     for module in ("team", "wave", "program"):
@@ -234,7 +297,9 @@ def test_threads_take_the_steps_of_the_host(threads: int, both: Any, monkeypatch
         problem, alone, ahead = both(4100 + threads)
         guess = problem.layout.zeros(wp.float64)
         for rtol in (1e-3, 1e-6, 1e-9):
-            one, other = outcomes(problem, (alone, ahead), x0=guess, stopping=wl.StoppingCriteria(rtol=rtol))
+            one, other = outcomes(
+                problem, (alone, ahead), x0=guess, stopping=wl.StoppingCriteria(rtol=rtol)
+            )
             assert one == other
             wp.copy(guess, alone.x)
             guess = wp.clone(guess)  # elsewhere
@@ -252,13 +317,22 @@ def test_who_looks_at_each_step_sees_its_iterate(stop_at: int, both: Any) -> Non
 
 
 @pytest.mark.parametrize(
-    "limits", [{"max_iterations": 0}, {"max_iterations": 2}, {"rtol": 0.0}, {"rtol": 1e-15, "patience": 3}, {"merits": True}]
+    "limits",
+    [
+        {"max_iterations": 0},
+        {"max_iterations": 2},
+        {"rtol": 0.0},
+        {"rtol": 1e-15, "patience": 3},
+        {"merits": True},
+    ],
 )
 def test_limits_end_both_alike(limits: dict[str, Any], both: Any) -> None:
     problem, alone, ahead = both(4300)
     guess = problem.layout.zeros(wp.float64)
     for _ in range(2):
-        one, other = outcomes(problem, (alone, ahead), x0=guess, stopping=wl.StoppingCriteria(**limits))
+        one, other = outcomes(
+            problem, (alone, ahead), x0=guess, stopping=wl.StoppingCriteria(**limits)
+        )
         assert one == other
         guess.assign(alone.x.numpy() * 0.9)
 
@@ -302,7 +376,9 @@ def test_a_solve_waits_once(least: float) -> None:
         smooth = -np.sin(0.01 * (n + 1) * np.arange(b.size))
         b.assign(np.where(inside, np.minimum(smooth, -0.1), 0.0))  # all unknowns stay off the bound
         meter.clear()
-        result = wl.solve(problem, SOLVER, stopping=wl.StoppingCriteria(rtol=1e-5), x0=guess, workspace=work)
+        result = wl.solve(
+            problem, SOLVER, stopping=wl.StoppingCriteria(rtol=1e-5), x0=guess, workspace=work
+        )
         assert result.status is wl.SolveStatus.CONVERGED
         assert result.iterations > 1
         waits.append(meter["readbacks"])
@@ -318,7 +394,9 @@ def test_nothing_is_solved_where_no_unknown_counts() -> None:
     b.assign(-1.0 * (problem.unknown.numpy() == 1))
     for count in (1.0, 1.0, 0.0, 1.0):
         counted = wp.array([count], dtype=wp.float64, device="cpu")
-        criteria = MeanCriteria(rtol=1e-6, atol=0.0, max_iterations=50, count=lambda count=count: count, counted=counted)
+        criteria = MeanCriteria(
+            rtol=1e-6, atol=0.0, max_iterations=50, count=lambda count=count: count, counted=counted
+        )
         result = wl.solve(problem, SOLVER, stopping=criteria, x0=guess, workspace=work)
         assert bool(result)
         assert (result.iterations == 0) == (count == 0.0)

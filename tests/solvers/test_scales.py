@@ -10,7 +10,8 @@ from warp_lcp.problem.protocol import families
 
 N = 20
 GRID = np.array([[0] * 5] + [[1] * 5] * 3)
-SCALES = [(1e8, 1.0), (1e-8, 1.0), (1.0, 1e8), (1.0, 1e-8), (1e-8, 1e-8), (1e8, 1e8)]  # of A and of x
+# of A and of x
+SCALES = [(1e8, 1.0), (1e-8, 1.0), (1.0, 1e8), (1.0, 1e-8), (1e-8, 1e-8), (1e8, 1e8)]
 CASES = [
     pytest.param(name, family, id=f"{name}-{family}")
     for name, cls in wl.METHODS.items()
@@ -23,7 +24,12 @@ def problem(family, a, x, device):
     rng = np.random.default_rng(5)
     B, b = rng.standard_normal((N, N)), a * x * rng.standard_normal(N)
     if family == "grid":
-        return wl.LCP(wl.GridPoisson(GRID, face_x=a, face_y=a, device=device), b.reshape(GRID.shape) * GRID, 0.0, 2 * x)
+        return wl.LCP(
+            wl.GridPoisson(GRID, face_x=a, face_y=a, device=device),
+            b.reshape(GRID.shape) * GRID,
+            0.0,
+            2 * x,
+        )
     if family == "dense":
         return wl.LCP(wl.DenseOperator(a * (B @ B.T / N + np.eye(N)), device=device), b, 0.0, 2 * x)
     T = scipy.sparse.diags_array([-a, 2.05 * a, -a], offsets=[-1, 0, 1], shape=(N, N))
@@ -54,7 +60,11 @@ def test_a_power_of_two_in_x_changes_no_step(name, family, precision, device):
     plain = wl.solve(problem(family, 1.0, 1.0, device), method, stopping=stopping)
     for unit in (2.0**-20, 2.0**20):
         result = wl.solve(problem(family, 1.0, unit, device), method, stopping=stopping)
-        assert (result.status, result.iterations, result.linear_iterations) == (plain.status, plain.iterations, plain.linear_iterations)
+        assert (result.status, result.iterations, result.linear_iterations) == (
+            plain.status,
+            plain.iterations,
+            plain.linear_iterations,
+        )
         np.testing.assert_array_equal(result.x.numpy(), plain.x.numpy() * unit)
 
 
@@ -66,8 +76,12 @@ def test_enumeration_of_rows_in_different_units(device):
     plain = wl.solve(wl.LCP(wl.DenseOperator(A, device=device), b), wl.DirectEnumeration())
     scaled = wl.LCP(wl.DenseOperator(S[:, None] * A * S, device=device), S * b)
     assert np.count_nonzero(plain.x.numpy()) >= 2
-    np.testing.assert_allclose(wl.solve(scaled, wl.DirectEnumeration()).x.numpy() * S, plain.x.numpy(), atol=1e-12)
-    np.testing.assert_allclose(wl.DirectEnumeration().solutions(scaled) * S, [plain.x.numpy()], atol=1e-12)
+    np.testing.assert_allclose(
+        wl.solve(scaled, wl.DirectEnumeration()).x.numpy() * S, plain.x.numpy(), atol=1e-12
+    )
+    np.testing.assert_allclose(
+        wl.DirectEnumeration().solutions(scaled) * S, [plain.x.numpy()], atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("dtype", [wp.float64, wp.float32])
@@ -84,10 +98,15 @@ def test_batches_of_rows_in_different_units(n, dtype, device):
     def solved(*fields):
         return wl.enumerate_batch(*(wp.array(f, dtype=dtype, device=device) for f in fields))
 
-    plain, scaled = solved(A, b, low, high), solved(D[:, :, None] * A * D[:, None, :], D * b, low / D, high / D)
+    plain, scaled = (
+        solved(A, b, low, high),
+        solved(D[:, :, None] * A * D[:, None, :], D * b, low / D, high / D),
+    )
     assert (plain.sets.numpy() >= 0).all()
     assert len(np.unique(plain.sets.numpy())) > n
-    np.testing.assert_allclose(scaled.x.numpy() * D, plain.x.numpy(), atol=1e-12 if dtype is wp.float64 else 1e-5)
+    np.testing.assert_allclose(
+        scaled.x.numpy() * D, plain.x.numpy(), atol=1e-12 if dtype is wp.float64 else 1e-5
+    )
     np.testing.assert_array_equal(scaled.sets.numpy(), plain.sets.numpy())
 
 

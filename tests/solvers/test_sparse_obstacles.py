@@ -11,7 +11,10 @@ from warp_lcp.multigrid.aggregates import coarse_points
 
 
 def laplacian(n):
-    second, one = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(n, n)), scipy.sparse.eye_array(n)
+    second, one = (
+        scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(n, n)),
+        scipy.sparse.eye_array(n),
+    )
     return (scipy.sparse.kron(one, second) + scipy.sparse.kron(second, one)).tocsr()
 
 
@@ -28,7 +31,9 @@ def border(x, y):
 
 def torsion(n, load=5.0, wind=0.0):
     """An elastic-plastic bar, or upwind convection through it: A, b, l, u."""
-    A = laplacian(n) + wind / (n + 1) * scipy.sparse.diags_array([-1.0, 1.0], offsets=[-1, 0], shape=(n * n, n * n))
+    A = laplacian(n) + wind / (n + 1) * scipy.sparse.diags_array(
+        [-1.0, 1.0], offsets=[-1, 0], shape=(n * n, n * n)
+    )
     d = border(*nodes(n))
     return A.tocsr(), np.full(n * n, -load / (n + 1) ** 2), -d, d
 
@@ -37,17 +42,26 @@ def torsion_on_triangles(n, load=8.0):
     """Linear elements on a Delaunay mesh of n random points."""
     points = np.random.default_rng(6203).random((n, 2))
     line = np.linspace(0, 1, int(np.sqrt(n)))
-    edge = np.concatenate([np.stack(np.broadcast_arrays(*pair), axis=1) for pair in ((line, 0), (line, 1), (0, line), (1, line))])
+    edge = np.concatenate(
+        [
+            np.stack(np.broadcast_arrays(*pair), axis=1)
+            for pair in ((line, 0), (line, 1), (0, line), (1, line))
+        ]
+    )
     points = np.unique(np.concatenate([points, edge]), axis=0)
     triangles = scipy.spatial.Delaunay(points).simplices
     p = points[triangles]
     opposite = np.stack([p[:, 2] - p[:, 1], p[:, 0] - p[:, 2], p[:, 1] - p[:, 0]], axis=1)
-    area = 0.5 * np.abs(opposite[:, 0, 0] * opposite[:, 1, 1] - opposite[:, 0, 1] * opposite[:, 1, 0])
+    area = 0.5 * np.abs(
+        opposite[:, 0, 0] * opposite[:, 1, 1] - opposite[:, 0, 1] * opposite[:, 1, 0]
+    )
     sound = area > 1e-12
     triangles, opposite, area = triangles[sound], opposite[sound], area[sound]
     entries = np.einsum("tik,tjk->tij", opposite, opposite) / (4 * area)[:, None, None]
     rows, columns = np.repeat(triangles, 3, axis=1), np.tile(triangles, 3)
-    A = scipy.sparse.csr_array((entries.ravel(), (rows.ravel(), columns.ravel())), shape=(len(points),) * 2)
+    A = scipy.sparse.csr_array(
+        (entries.ravel(), (rows.ravel(), columns.ravel())), shape=(len(points),) * 2
+    )
     mass, d = np.bincount(triangles.ravel(), np.repeat(area / 3, 3), len(points)), border(*points.T)
     inner = np.flatnonzero(d > 0)
     return A[inner][:, inner].tocsr(), -load * mass[inner], -d[inner], d[inner]
@@ -57,7 +71,12 @@ def between_corners(n):
     """A membrane pressed up and down between a pyramid and its copy above."""
     x, y = nodes(n)
     low = 0.3 - 1.5 * np.maximum(np.abs(x - 0.45), np.abs(y - 0.6))
-    return laplacian(n), -20 * np.sin(4 * np.pi * x) * np.sin(2 * np.pi * y) / (n + 1) ** 2, low, low + 0.05
+    return (
+        laplacian(n),
+        -20 * np.sin(4 * np.pi * x) * np.sin(2 * np.pi * y) / (n + 1) ** 2,
+        low,
+        low + 0.05,
+    )
 
 
 def plate(n, *, clamped):
@@ -82,10 +101,14 @@ def elastic_block(n):
         B[1, 1::2] = B[2, 0::2] = slope[1]
         K += 0.25 * B.T @ C @ B
     node = np.arange((n + 1) ** 2).reshape(n + 1, n + 1)
-    corners = np.stack([node[:-1, :-1], node[:-1, 1:], node[1:, 1:], node[1:, :-1]], axis=-1).reshape(-1, 4)
+    corners = np.stack(
+        [node[:-1, :-1], node[:-1, 1:], node[1:, 1:], node[1:, :-1]], axis=-1
+    ).reshape(-1, 4)
     unknowns = np.stack([2 * corners, 2 * corners + 1], axis=-1).reshape(-1, 8)
     rows, columns = np.repeat(unknowns, 8, axis=1), np.tile(unknowns, 8)
-    A = scipy.sparse.csr_array((np.tile(K.ravel(), n * n), (rows.ravel(), columns.ravel())), shape=(2 * node.size,) * 2)
+    A = scipy.sparse.csr_array(
+        (np.tile(K.ravel(), n * n), (rows.ravel(), columns.ravel())), shape=(2 * node.size,) * 2
+    )
     b, low, kept = np.zeros(2 * node.size), np.full(2 * node.size, -np.inf), 2 * node[-1, 0]
     b[1::2] = 0.4 / n**2
     low[2 * node[0] + 1] = -0.01 - 0.1 * np.linspace(-0.5, 0.5, n + 1) ** 2
@@ -101,11 +124,14 @@ def solved(data, method=None, *, x0=None, device="cpu", chain=False, **stopping)
     """Solve by a method, or its default chain, check the residual by SciPy, return the result."""
     A, b, lower, upper = data
     problem = wl.LCP(wl.SparseOperator(A, device=device), b, lower, upper)
-    method = method or wl.MinimumMapNewton()  # some of the matrices are a grid's, and would be solved as such
+    # some of the matrices are a grid's, and would be solved as such
+    method = method or wl.MinimumMapNewton()
     method = wl.default_chain(method, problem) if chain else method
     result = wl.solve(problem, method, x0=x0, stopping=wl.StoppingCriteria(**stopping))
     assert result, result.status
-    assert natural(*data, result.x.numpy()) <= 1.01e-6 * natural(*data, np.clip(np.zeros(len(b)), lower, upper))
+    assert natural(*data, result.x.numpy()) <= 1.01e-6 * natural(
+        *data, np.clip(np.zeros(len(b)), lower, upper)
+    )
     return result
 
 
@@ -135,7 +161,10 @@ def test_a_set_that_begins_everywhere_is_no_trap():
 @pytest.mark.cpu_form("the CPU factors the coarse problem")
 def test_a_workspace_serves_another_load_and_other_entries():
     A, b, lower, upper = torsion(120)
-    operator, right = wl.SparseOperator(A, device="cpu"), wp.array(b, dtype=wp.float64, device="cpu")
+    operator, right = (
+        wl.SparseOperator(A, device="cpu"),
+        wp.array(b, dtype=wp.float64, device="cpu"),
+    )
     problem, method = wl.LCP(operator, right, lower, upper), wl.MinimumMapNewton()
     work = method.init(problem)
     for factor, load in ((1.0, 1.0), (1.0, -1.0), (4.0, 4.0)):
@@ -157,7 +186,11 @@ def test_coarse_unknowns_are_fine_ones():
     assert coarse_points(scipy.sparse.eye_array(50).tocsr()) is None
 
 
-WEAK = {"clamped": (plate(60, clamped=True), 180), "supported": (plate(60, clamped=False), 190), "elastic": (elastic_block(50), 150)}
+WEAK = {
+    "clamped": (plate(60, clamped=True), 180),
+    "supported": (plate(60, clamped=False), 190),
+    "elastic": (elastic_block(50), 150),
+}
 
 
 def rigid_motions(n):
@@ -186,7 +219,9 @@ def test_rigid_motions_make_contact_as_cheap_as_a_linear_solve(numbered):
     assert result
     assert result.linear_iterations <= 28
     start = np.clip(0.0, lower[order], upper)
-    assert natural(A, b[order], lower[order], upper, result.x.numpy()) <= 1.01e-6 * natural(A, b[order], lower[order], upper, start)
+    assert natural(A, b[order], lower[order], upper, result.x.numpy()) <= 1.01e-6 * natural(
+        A, b[order], lower[order], upper, start
+    )
 
 
 @pytest.mark.parametrize("name", WEAK)
@@ -209,7 +244,9 @@ def test_the_energy_is_the_progress_of_mprgp():
 def test_patience_ends_mprgp_where_rounding_does():
     A, b, lower, upper = plate(20, clamped=True)
     stopping = wl.StoppingCriteria(rtol=0.0, max_iterations=2000)
-    result = wl.solve(wl.LCP(wl.SparseOperator(A, device="cpu"), b, lower, upper), wl.MPRGP(), stopping=stopping)
+    result = wl.solve(
+        wl.LCP(wl.SparseOperator(A, device="cpu"), b, lower, upper), wl.MPRGP(), stopping=stopping
+    )
     assert result.status in (wl.SolveStatus.FLOOR, wl.SolveStatus.STAGNATED)
     assert result.iterations < 500
 
@@ -222,7 +259,9 @@ def test_an_energy_without_a_minimum_goes_back_to_newton():
     problem = wl.LCP(wl.SparseOperator(A, device="cpu"), b)
     result = wl.solve(problem, wl.default_chain(wl.MinimumMapNewton(), problem))
     x = result.x.numpy()
-    assert bool(result) == (natural(A, b, 0.0, np.inf, x) <= 1.01e-6 * natural(A, b, 0.0, np.inf, np.zeros(n)))
+    assert bool(result) == (
+        natural(A, b, 0.0, np.inf, x) <= 1.01e-6 * natural(A, b, 0.0, np.inf, np.zeros(n))
+    )
 
 
 @pytest.mark.slow

@@ -23,9 +23,16 @@ def test_blocks_with_a_method_each(count, device):
     rng = np.random.default_rng(179)
     A, b = spd(24, 7), rng.standard_normal(24)
     blocks = np.array_split(rng.permutation(24), count)
-    solvers = [Lemke(), wl.ProjectedSOR(), wl.MinimumMapNewton(), wl.ProjectedSOR(omega=1.0)][:count]
-    for operator in (wl.DenseOperator(A, device=device), wl.SparseOperator(scipy.sparse.csr_array(A), device=device)):
-        result = wl.solve(wl.LCP(operator, b), Staggering(blocks=blocks, solvers=solvers), stopping=TIGHT)
+    solvers = [Lemke(), wl.ProjectedSOR(), wl.MinimumMapNewton(), wl.ProjectedSOR(omega=1.0)][
+        :count
+    ]
+    for operator in (
+        wl.DenseOperator(A, device=device),
+        wl.SparseOperator(scipy.sparse.csr_array(A), device=device),
+    ):
+        result = wl.solve(
+            wl.LCP(operator, b), Staggering(blocks=blocks, solvers=solvers), stopping=TIGHT
+        )
         assert result, result.status
         np.testing.assert_allclose(result.x.numpy(), lemke(A, b), atol=1e-7)
 
@@ -38,8 +45,13 @@ def test_grid_blocks_are_grids(device):
     fluid, dense = cells.ravel() == wl.FLUID, assemble(cells, (faces, 1.0, 1.0))
     b = np.where(cells == wl.FLUID, np.random.default_rng(191).standard_normal(cells.shape), 0.0)
     left = np.broadcast_to(np.arange(8) < 4, cells.shape).ravel()
-    problem = wl.LCP(wl.GridPoisson(cells, face_x=faces, device=device, dtype=wp.float64), b, 0.0, 2.0)
-    solver = Staggering(blocks=[np.flatnonzero(fluid & left), np.flatnonzero(fluid & ~left)], solvers=[wl.ProjectedMultigrid()])
+    problem = wl.LCP(
+        wl.GridPoisson(cells, face_x=faces, device=device, dtype=wp.float64), b, 0.0, 2.0
+    )
+    solver = Staggering(
+        blocks=[np.flatnonzero(fluid & left), np.flatnonzero(fluid & ~left)],
+        solvers=[wl.ProjectedMultigrid()],
+    )
     result = wl.solve(problem, solver, stopping=TIGHT)
     whole = wl.solve(problem, wl.ProjectedMultigrid(), stopping=TIGHT)
     assert result, result.status
@@ -75,7 +87,11 @@ def test_normal_force_and_friction_meet_at_their_common_solution(pull, device):
     sticking = np.linalg.solve([[2.0, 0.5], [0.5, 3.0]], [1.0, pull])
     slides = sticking[1] > 0.4 * sticking[0]
     assert (pull > 1) == slides
-    np.testing.assert_allclose(result.x.numpy(), [*(np.array([1 / 2.2, 0.4 / 2.2]) if slides else sticking), 0.0], atol=1e-9)
+    np.testing.assert_allclose(
+        result.x.numpy(),
+        [*(np.array([1 / 2.2, 0.4 / 2.2]) if slides else sticking), 0.0],
+        atol=1e-9,
+    )
     assert result.iterations <= 12
     with pytest.raises(ValueError, match="solvers: 3 for 2 blocks"):
         Staggering(blocks=[[0], [1, 2]], solvers=[Lemke()] * 3).init(problem)
@@ -93,7 +109,9 @@ def test_what_cannot_be_taken_apart_is_refused():
         def diagonal(self):
             return wp.full(3, 1.0, dtype=wp.float64, device="cpu")
 
-    with pytest.raises(ValueError, match=r"Staggering needs an operator with rows .* or blocks .*; Ring has none"):
+    with pytest.raises(
+        ValueError, match=r"Staggering needs an operator with rows .* or blocks .*; Ring has none"
+    ):
         Staggering().init(wl.LCP(Ring(), -np.ones(3)))
     for settings in ({"blocks": 0}, {"eta": 1.0}, {"max_block_iterations": 0}):
         with pytest.raises(ValueError, match=next(iter(settings))):
@@ -101,8 +119,13 @@ def test_what_cannot_be_taken_apart_is_refused():
 
 
 def test_one_method_serves_all_blocks():
-    problem = wl.LCP(wl.DenseOperator(spd(8, 3), device="cpu"), np.random.default_rng(197).standard_normal(8))
-    alone, listed = (wl.solve(problem, Staggering(solvers=solvers), stopping=TIGHT) for solvers in (Lemke(), [Lemke()]))
+    problem = wl.LCP(
+        wl.DenseOperator(spd(8, 3), device="cpu"), np.random.default_rng(197).standard_normal(8)
+    )
+    alone, listed = (
+        wl.solve(problem, Staggering(solvers=solvers), stopping=TIGHT)
+        for solvers in (Lemke(), [Lemke()])
+    )
     assert alone
     assert alone.iterations == listed.iterations
     np.testing.assert_array_equal(alone.x.numpy(), listed.x.numpy())
@@ -114,4 +137,6 @@ def test_blocks_of_another_kind_are_named(method, blocks):
     if blocks is None and method is wl.BlockedGaussSeidel:
         pytest.skip("None means 3 unknowns there")
     with pytest.raises(ValueError, match=r"blocks = .*for each block a list of indices"):
-        wl.solve(wl.LCP(wl.DenseOperator(np.eye(4), device="cpu"), -np.ones(4)), method(blocks=blocks))
+        wl.solve(
+            wl.LCP(wl.DenseOperator(np.eye(4), device="cpu"), -np.ones(4)), method(blocks=blocks)
+        )

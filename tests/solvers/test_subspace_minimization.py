@@ -28,7 +28,9 @@ def test_one_solve_on_the_right_set_is_the_solution(device):
     B = rng.standard_normal((60, 60))
     A = B @ B.T / 240 + np.eye(60)
     b, x = planted(A, rng)
-    result = wl.solve(wl.LCP(wl.DenseOperator(A, device=device), b), SubspaceMinimization(), stopping=TIGHT)
+    result = wl.solve(
+        wl.LCP(wl.DenseOperator(A, device=device), b), SubspaceMinimization(), stopping=TIGHT
+    )
     assert result
     assert result.iterations == 1
     np.testing.assert_allclose(result.x.numpy(), x, atol=1e-13)
@@ -44,7 +46,10 @@ def test_grid_and_sparse_agree_in_few_steps(precision, device):
     A, b = dense[np.ix_(fluid, fluid)], rng.standard_normal(cells.shape)
     grid = wl.LCP(wl.GridPoisson(cells, device=device, dtype=wp.float64), b)
     sparse = wl.LCP(wl.SparseOperator(scipy.sparse.csr_array(A), device=device), b.ravel()[fluid])
-    results = [wl.solve(problem, SubspaceMinimization(precision=precision), stopping=TIGHT) for problem in (grid, sparse)]
+    results = [
+        wl.solve(problem, SubspaceMinimization(precision=precision), stopping=TIGHT)
+        for problem in (grid, sparse)
+    ]
     got = results[0].x.numpy().ravel()[fluid]
     for result in results:
         assert result, result.status
@@ -60,7 +65,9 @@ def test_unsymmetric_p_matrices(device):
     for _ in range(10):
         A = rng.uniform(-1, 1, (20, 20)) / 8 + 2 * np.eye(20)
         b = rng.standard_normal(20)
-        result = wl.solve(wl.LCP(wl.DenseOperator(A, device=device), b), SubspaceMinimization(), stopping=TIGHT)
+        result = wl.solve(
+            wl.LCP(wl.DenseOperator(A, device=device), b), SubspaceMinimization(), stopping=TIGHT
+        )
         assert result, result.status
         np.testing.assert_allclose(result.x.numpy(), lemke(A, b), atol=1e-8)
 
@@ -92,7 +99,14 @@ def test_energy_never_rises_with_backtracking(device):
 
 
 def test_wrong_settings_are_named():
-    for settings in ({"sweeps": 0}, {"solves": 0}, {"omega": 2.0}, {"eta": 1.0}, {"max_linear_iterations": 0}, {"backtracks": -2}):
+    for settings in (
+        {"sweeps": 0},
+        {"solves": 0},
+        {"omega": 2.0},
+        {"eta": 1.0},
+        {"max_linear_iterations": 0},
+        {"backtracks": -2},
+    ):
         with pytest.raises(ValueError, match=next(iter(settings))):
             SubspaceMinimization(**settings)
 
@@ -110,11 +124,17 @@ def test_change_is_the_largest(device):
 
 
 # layers, ratio of masses, seed and time step [s]; the first two are not solved by a first attempt
-HEAVY = [(4, 30238.725095795973, 5496, 0.011044782786754172), (4, 8140593.914543829, 4905, 0.0015361144023177268), (3, 1e6, 7, 0.01)]
+HEAVY = [
+    (4, 30238.725095795973, 5496, 0.011044782786754172),
+    (4, 8140593.914543829, 4905, 0.0015361144023177268),
+    (3, 1e6, 7, 0.01),
+]
 
 
 @pytest.mark.parametrize(("layers", "ratio", "seed", "dt"), HEAVY)
-def test_heavy_boxes_on_light_ones_are_solved_by_default_as_dense_matrices_too(layers, ratio, seed, dt):
+def test_heavy_boxes_on_light_ones_are_solved_by_default_as_dense_matrices_too(
+    layers, ratio, seed, dt
+):
     """Exact steps are too long by the ratio of masses: dense matrices ended STAGNATED, with residuals to .5 after a minute."""
     given = BoxedModel().problem(heavy_on_light(layers, ratio=ratio, seed=seed).assemble(dt).system)
     A, b = given.A.toarray(), np.asarray(given.b)
@@ -122,6 +142,9 @@ def test_heavy_boxes_on_light_ones_are_solved_by_default_as_dense_matrices_too(l
     assert result, result.status
     assert result.method == "subspace-minimization"
     x, d = result.x.numpy(), np.diag(A)
-    lower, upper = (side.at(x) if isinstance(side, wl.AffineBounds) else side for side in (given.lower, given.upper))
+    lower, upper = (
+        side.at(x) if isinstance(side, wl.AffineBounds) else side
+        for side in (given.lower, given.upper)
+    )
     residual = d * (x - np.clip(x - (A @ x + b) / d, lower, upper))
     assert np.linalg.norm(residual) <= 2e-6 * result.history[0].residual

@@ -13,7 +13,8 @@ FRICTION = 0.4
 class PlainSubspace:
     """[Book] algorithm 7 with eq. 2.92-2.97, plus the halving of corrections.
 
-    `bounds(x)` returns both sides at x: with friction those of a tangential force depend on its normal force.
+    `bounds(x)` returns both sides at x: with friction those of a tangential force depend on its
+    normal force.
     """
 
     def __init__(self, A, b, bounds, x, *, sweeps, solves, omega, backtracks, affine=False):
@@ -26,7 +27,11 @@ class PlainSubspace:
         return np.linalg.norm(np.maximum(np.minimum(y, d * (x - lower)), d * (x - upper)))
 
     def energy(self, x):
-        return np.inf if self.affine or (self.A != self.A.T).any() else 0.5 * x @ self.A @ x + self.b @ x
+        return (
+            np.inf
+            if self.affine or (self.A != self.A.T).any()
+            else 0.5 * x @ self.A @ x + self.b @ x
+        )
 
     def corrected(self, e):
         """x + e within the bounds at x; where bounds then move, what is at one goes with it, and the rest is projected again."""
@@ -35,14 +40,20 @@ class PlainSubspace:
         if not self.affine:
             return x
         now_lower, now_upper = self.bounds(x)
-        moved = np.where((x <= lower) & (lower != now_lower), now_lower, np.clip(x, now_lower, now_upper))
+        moved = np.where(
+            (x <= lower) & (lower != now_lower), now_lower, np.clip(x, now_lower, now_upper)
+        )
         return np.where((x >= upper) & (upper != now_upper), now_upper, moved)
 
     def step(self):
         for _ in range(self.sweeps):
             for i in range(len(self.x)):
                 lower, upper = self.bounds(self.x)
-                self.x[i] = np.clip(self.x[i] - self.omega * (self.A[i] @ self.x + self.b[i]) / self.A[i, i], lower[i], upper[i])
+                self.x[i] = np.clip(
+                    self.x[i] - self.omega * (self.A[i] @ self.x + self.b[i]) / self.A[i, i],
+                    lower[i],
+                    upper[i],
+                )
         last = None
         for _ in range(self.solves):
             lower, upper = self.bounds(self.x)
@@ -60,7 +71,11 @@ class PlainSubspace:
         e[free] = np.linalg.solve(self.A[np.ix_(free, free)], -(self.A @ self.x + self.b)[free])
         for halving in range(max(self.backtracks, 0) + 1):
             x = self.corrected(0.5**halving * e)
-            if self.backtracks < 0 or self.norm(x) < norm or self.energy(x) < energy - 1e-14 * abs(energy):
+            if (
+                self.backtracks < 0
+                or self.norm(x) < norm
+                or self.energy(x) < energy - 1e-14 * abs(energy)
+            ):
                 self.halved += halving > 0
                 self.x = x
                 return
@@ -82,7 +97,9 @@ def compare(problem, plain, settings, steps, tolerance=1e-9):
         work.residual.current = False
         step = method.step(problem, work, work.x)
         plain.step()
-        np.testing.assert_allclose(work.x.numpy(), plain.x, rtol=tolerance, atol=tolerance, err_msg=f"step {k + 1}")
+        np.testing.assert_allclose(
+            work.x.numpy(), plain.x, rtol=tolerance, atol=tolerance, err_msg=f"step {k + 1}"
+        )
         assert step.name == "subspace"
 
 
@@ -112,7 +129,11 @@ def test_steps_are_those_of_the_algorithm(kind, settings, symmetric, device):
         lower, upper = np.array([BOXES[(seed + k) % 4] for k in range(10)]).T
         x0 = np.clip(np.zeros(10), lower, upper)
         plain = PlainSubspace(A, b, lambda x, l=lower, u=upper: (l, u), x0, **settings)
-        operator = wl.DenseOperator(A, device=device) if kind == "dense" else wl.SparseOperator(scipy.sparse.csr_array(A), device=device)
+        operator = (
+            wl.DenseOperator(A, device=device)
+            if kind == "dense"
+            else wl.SparseOperator(scipy.sparse.csr_array(A), device=device)
+        )
         compare(wl.LCP(operator, b, lower, upper), plain, settings, 4)
         plains.append(plain)
     if settings["backtracks"] > 0:
@@ -141,7 +162,9 @@ def test_friction_is_at_its_limit_before_and_after_a_correction(backtracks, devi
 
         settings = {"sweeps": 1, "solves": 2, "omega": 1.0, "backtracks": backtracks}
         plain = PlainSubspace(A, b, bounds, np.zeros(12), affine=True, **settings)
-        problem = wl.LCP(wl.DenseOperator(A, device=device), b, *wl.AffineBounds.friction(normal, FRICTION))
+        problem = wl.LCP(
+            wl.DenseOperator(A, device=device), b, *wl.AffineBounds.friction(normal, FRICTION)
+        )
         compare(problem, plain, settings, 3)
         slid += int((np.abs(plain.x) == bounds(plain.x)[1])[tangential].sum())
     assert slid > 10

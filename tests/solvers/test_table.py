@@ -31,7 +31,13 @@ def cases():
             for bounds in BOUNDS:
                 for precision in precisions(cls):
                     if family in families(cls) and (bounds == "lcp" or getattr(cls, "boxed", True)):
-                        yield pytest.param(name, family, bounds, precision, id=f"{name}-{family}-{bounds}-{precision}")
+                        yield pytest.param(
+                            name,
+                            family,
+                            bounds,
+                            precision,
+                            id=f"{name}-{family}-{bounds}-{precision}",
+                        )
 
 
 def operator(family, tiny, rng, device):
@@ -42,10 +48,16 @@ def operator(family, tiny, rng, device):
         if not tiny:
             cells[2, 3] = wl.SOLID
         inside = cells.ravel() == wl.FLUID
-        return wl.GridPoisson(cells, device=device, dtype=wp.float64), assemble(cells)[np.ix_(inside, inside)], inside
+        return (
+            wl.GridPoisson(cells, device=device, dtype=wp.float64),
+            assemble(cells)[np.ix_(inside, inside)],
+            inside,
+        )
     n = 3 if tiny else MANY
     if family == "sparse":
-        P = scipy.sparse.random_array((n, n), density=0.15, rng=rng, data_sampler=lambda size: -rng.uniform(0.1, 1.0, size))
+        P = scipy.sparse.random_array(
+            (n, n), density=0.15, rng=rng, data_sampler=lambda size: -rng.uniform(0.1, 1.0, size)
+        )
         P = P + P.T
         A = P + scipy.sparse.diags_array(0.5 - np.asarray(P.sum(axis=1)).ravel())
         return SparseOperator(A, device=device), A.toarray(), np.ones(n, dtype=bool)
@@ -66,7 +78,11 @@ def planted(A, bounds, rng):
     held = rng.integers(0, 3, n)
     low, high = (held == 1) & np.isfinite(lower), (held == 2) & np.isfinite(upper)
     between = np.where(np.isfinite(lower), lower, -1.0), np.where(np.isfinite(upper), upper, 1.0)
-    x = np.where(low, lower, np.where(high, upper, between[0] + rng.uniform(0.1, 0.9, n) * (between[1] - between[0])))
+    x = np.where(
+        low,
+        lower,
+        np.where(high, upper, between[0] + rng.uniform(0.1, 0.9, n) * (between[1] - between[0])),
+    )
     y = np.where(low, 1.0, np.where(high, -1.0, 0.0)) * rng.uniform(0.1, 1.0, n)
     return y - A @ x, lower, upper, x
 
@@ -86,9 +102,19 @@ def test_method(name, family, bounds, precision, device):
     tiny = getattr(cls, "most_unknowns", MANY) < MANY
     A, matrix, inside = operator(family, tiny, rng, device)
     b, lower, upper, x = planted(matrix, bounds, rng)
-    oracle = boxed(matrix, b, lower, upper) if len(b) <= 6 else lemke(matrix, b) if bounds == "lcp" else x
+    oracle = (
+        boxed(matrix, b, lower, upper)
+        if len(b) <= 6
+        else lemke(matrix, b)
+        if bounds == "lcp"
+        else x
+    )
     np.testing.assert_allclose(oracle, x, atol=1e-8)  # the plant and the oracle agree
-    solver = cls(precision=precision) if "precision" in {f.name for f in dataclasses.fields(cls)} else cls()
+    solver = (
+        cls(precision=precision)
+        if "precision" in {f.name for f in dataclasses.fields(cls)}
+        else cls()
+    )
     fields = [scatter(values, inside, A.shape) for values in (b, lower, upper)]
     stopping = wl.StoppingCriteria(rtol=RTOL[precision], **CRITERIA)
     result = wl.solve(wl.LCP(A, *fields), solver, stopping=stopping)
@@ -102,7 +128,9 @@ def test_method(name, family, bounds, precision, device):
     assert len(result.history) == result.iterations + 1
 
 
-@pytest.mark.parametrize("name", [name for name, cls in METHODS.items() if "dense" in families(cls)])
+@pytest.mark.parametrize(
+    "name", [name for name, cls in METHODS.items() if "dense" in families(cls)]
+)
 def test_unsymmetric_matrix(name, device):
     """Strictly diagonally dominant: whatever takes an unsymmetric A solves it; the others refuse it before they start."""
     cls = METHODS[name]

@@ -13,11 +13,17 @@ from warp_lcp.operators.grid_matrix import grid_matrix
 def check_dominant(seed):
     stencil, b, lower, upper = drawn_dominant(seed)
     A, inside = stencil.operator(), stencil.inside
-    result = wl.solve(wl.LCP(A, b, lower, upper), stopping=wl.StoppingCriteria(rtol=1e-8, max_seconds=60))
+    result = wl.solve(
+        wl.LCP(A, b, lower, upper), stopping=wl.StoppingCriteria(rtol=1e-8, max_seconds=60)
+    )
     assert result, f"{result.status.name} at {result.relative_residual:.1e}"
     matrix = grid_matrix(A)
-    found = natural_residual(matrix, matrix.diagonal(), result.x.numpy()[inside], b[inside], lower, upper)
-    assert found <= 1.001e-8 * natural_residual(matrix, matrix.diagonal(), np.clip(0 * b[inside], lower, upper), b[inside], lower, upper)
+    found = natural_residual(
+        matrix, matrix.diagonal(), result.x.numpy()[inside], b[inside], lower, upper
+    )
+    assert found <= 1.001e-8 * natural_residual(
+        matrix, matrix.diagonal(), np.clip(0 * b[inside], lower, upper), b[inside], lower, upper
+    )
 
 
 @pytest.mark.parametrize("seed", [9, 34, 60, 68, 103, 184, 214])
@@ -44,7 +50,8 @@ def test_coefficients_over_decades_take_as_few_steps_as_a_sparse_matrix(seed):
     assert result.iterations <= 5
 
 
-CASES = {  # the sum of b, weighted by the left null vector, over each component; bounds; how a solve ends
+# the sum of b, weighted by the left null vector, over each component; bounds; how a solve ends
+CASES = {
     "compatible": (0.0, -np.inf, np.inf, "CONVERGED"),
     "not compatible": (0.3, -np.inf, np.inf, "INFEASIBLE"),
     "onto lower bounds": (0.3, 0.0, np.inf, "CONVERGED"),
@@ -61,7 +68,8 @@ def check_singular(seed, kind):
     W = np.zeros((matrix.shape[0], count))
     for c in range(count):
         places = np.flatnonzero(number == c)
-        W[places, c] = abs(np.linalg.svd(matrix[places][:, places].toarray())[0][:, -1])  # of irreducible M-matrices: w > 0
+        # of irreducible M-matrices: w > 0
+        W[places, c] = abs(np.linalg.svd(matrix[places][:, places].toarray())[0][:, -1])
     assert abs(W.T @ matrix).max() < 1e-12
     b = np.random.default_rng([seed, 22]).standard_normal(matrix.shape[0])
     b -= W @ (W.T @ b)
@@ -71,7 +79,9 @@ def check_singular(seed, kind):
         result = wl.solve(wl.LCP(A, field, lower, upper))
         assert result.status.name == status, (net, lower, upper)
         if result:
-            found = natural_residual(matrix, matrix.diagonal(), result.x.numpy()[inside], right, lower, upper)
+            found = natural_residual(
+                matrix, matrix.diagonal(), result.x.numpy()[inside], right, lower, upper
+            )
             assert found <= 1e-5 * np.linalg.norm(right)
 
 
@@ -107,7 +117,11 @@ def test_components_are_those_of_the_coefficients():
     nine = np.array([[-1.0, -1, -1], [-1, 8, -1], [-1, -1, -1]])
     assert wl.Stencil(cells, nine, device="cpu").floating_components() is None
     assert wl.Stencil(cells, five, device="cpu").floating_components().count == 1
-    zeros = {o: np.full((6, 6), nine[o[0] + 1, o[1] + 1]) for o in np.ndindex(3, 3) for o in [(o[0] - 1, o[1] - 1)]}
+    zeros = {
+        o: np.full((6, 6), nine[o[0] + 1, o[1] + 1])
+        for o in np.ndindex(3, 3)
+        for o in [(o[0] - 1, o[1] - 1)]
+    }
     zeros[1, 1][2, 2] = zeros[-1, -1][3, 3] = 0.0
     zeros[0, 0] = -sum(a for o, a in zeros.items() if any(o))
     assert wl.Stencil(cells, zeros, device="cpu", dtype=wp.float64).floating_components().count == 1

@@ -33,7 +33,13 @@ def problems(most):
 
 
 @pytest.mark.parametrize(
-    ("name", "family"), [(name, family) for name, cls in wl.METHODS.items() for family in ("dense", "sparse") if family in families(cls)]
+    ("name", "family"),
+    [
+        (name, family)
+        for name, cls in wl.METHODS.items()
+        for family in ("dense", "sparse")
+        if family in families(cls)
+    ],
 )
 def test_on_matrices(name, family):
     if name == "quadratic-program":
@@ -42,17 +48,30 @@ def test_on_matrices(name, family):
     for A, lower, upper in problems(4 if name == "direct-enumeration" else 6):
         matrix = scipy.sparse.csr_array(A) if family == "sparse" else A
         try:
-            result = wl.solve(wl.LCP(matrix, np.zeros(len(A)), lower, upper), wl.METHODS[name](), stopping=STOPPING)
+            result = wl.solve(
+                wl.LCP(matrix, np.zeros(len(A)), lower, upper),
+                wl.METHODS[name](),
+                stopping=STOPPING,
+            )
         except ValueError as error:
             assert "symmetric" in str(error)
             continue
         assert result, (name, result.status)
-        np.testing.assert_allclose(result.x.numpy(), boxed(A, np.zeros(len(A)), lower, upper), atol=1e-5)
+        np.testing.assert_allclose(
+            result.x.numpy(), boxed(A, np.zeros(len(A)), lower, upper), atol=1e-5
+        )
         solved += 1
     assert solved >= 8
 
 
-@pytest.mark.parametrize("name", [name for name, cls in wl.METHODS.items() if "grid" in families(cls) and name != "direct-enumeration"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        name
+        for name, cls in wl.METHODS.items()
+        if "grid" in families(cls) and name != "direct-enumeration"
+    ],
+)
 @pytest.mark.parametrize("lower", [0.3, -0.3])
 def test_on_a_membrane_that_an_obstacle_lifts(name, lower):
     """4 x 5 cells with x = 0 around, x >= lower in the middle; the oracle solves in x - l."""
@@ -61,8 +80,17 @@ def test_on_a_membrane_that_an_obstacle_lifts(name, lower):
     cells, bound = np.zeros((6, 7), dtype=int), np.full((6, 7), -np.inf)
     cells[1:-1, 1:-1] = wl.FLUID
     bound[1:-1, 1:-1], bound[2:4, 2:5] = -1.0, lower
-    path = [scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(n, n)).toarray() for n in (5, 4)]
+    path = [
+        scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(n, n)).toarray()
+        for n in (5, 4)
+    ]
     A, low = np.kron(np.eye(4), path[0]) + np.kron(path[1], np.eye(5)), bound[1:-1, 1:-1].ravel()
-    result = wl.solve(wl.LCP(wl.GridPoisson(cells, device="cpu"), np.zeros(cells.shape), bound), wl.METHODS[name](), stopping=STOPPING)
+    result = wl.solve(
+        wl.LCP(wl.GridPoisson(cells, device="cpu"), np.zeros(cells.shape), bound),
+        wl.METHODS[name](),
+        stopping=STOPPING,
+    )
     assert result, result.status
-    np.testing.assert_allclose(result.x.numpy()[1:-1, 1:-1].ravel(), low + lemke(A, A @ low), atol=1e-6)
+    np.testing.assert_allclose(
+        result.x.numpy()[1:-1, 1:-1].ravel(), low + lemke(A, A @ low), atol=1e-6
+    )

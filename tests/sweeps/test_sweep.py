@@ -17,7 +17,12 @@ from warp_lcp.sweeps.spectrum import scaled_spectrum
 TIGHT = wl.StoppingCriteria(rtol=1e-10, max_iterations=20_000, patience=2000)
 LOOSE = wl.StoppingCriteria(rtol=1e-6, max_iterations=5000, patience=1000)
 ONE = wl.StoppingCriteria(rtol=0.0, max_iterations=1)
-SCALAR = {"psor": wl.ProjectedSOR(omega=1.0), "jacobi": ProjectedJacobi(omega=1.0), "nncg": NNCG(), "blocks": BlockedGaussSeidel(blocks=1)}
+SCALAR = {
+    "psor": wl.ProjectedSOR(omega=1.0),
+    "jacobi": ProjectedJacobi(omega=1.0),
+    "nncg": NNCG(),
+    "blocks": BlockedGaussSeidel(blocks=1),
+}
 
 
 def spd(n, seed):
@@ -26,7 +31,9 @@ def spd(n, seed):
 
 
 def operators(A, device):
-    return wl.DenseOperator(A, device=device), wl.SparseOperator(scipy.sparse.csr_array(A), device=device)
+    return wl.DenseOperator(A, device=device), wl.SparseOperator(
+        scipy.sparse.csr_array(A), device=device
+    )
 
 
 def swept(A, b, x, order, omega):
@@ -46,9 +53,18 @@ def swept_greedily(A, b, x, omega):
 ORDERS = {
     "forward": (wl.ProjectedSOR(omega=1.3), lambda x: range(9)),
     "backward": (wl.ProjectedSOR(omega=1.3, direction="backward"), lambda x: range(8, -1, -1)),
-    "symmetric": (wl.ProjectedSOR(omega=1.3, direction="symmetric"), lambda x: [*range(9), *range(8, -1, -1)]),
-    "permutation": (wl.ProjectedSOR(omega=1.3, permutation=(4, 2, 0, 8, 6, 1, 3, 5, 7)), lambda x: [4, 2, 0, 8, 6, 1, 3, 5, 7]),
-    "magnitude": (wl.ProjectedSOR(omega=1.3, order="magnitude"), lambda x: np.argsort(-np.abs(x), kind="stable")),
+    "symmetric": (
+        wl.ProjectedSOR(omega=1.3, direction="symmetric"),
+        lambda x: [*range(9), *range(8, -1, -1)],
+    ),
+    "permutation": (
+        wl.ProjectedSOR(omega=1.3, permutation=(4, 2, 0, 8, 6, 1, 3, 5, 7)),
+        lambda x: [4, 2, 0, 8, 6, 1, 3, 5, 7],
+    ),
+    "magnitude": (
+        wl.ProjectedSOR(omega=1.3, order="magnitude"),
+        lambda x: np.argsort(-np.abs(x), kind="stable"),
+    ),
     "blocks-of-one": (BlockedGaussSeidel(blocks=1, omega=1.3), lambda x: range(9)),
 }
 
@@ -74,8 +90,12 @@ def test_greedy_sweeps_take_the_row_that_would_change_most(device):
     rng = np.random.default_rng(79)
     A, b = spd(9, 6), rng.standard_normal(9)
     for operator in operators(A, device):
-        result = wl.solve(wl.LCP(operator, b), wl.ProjectedSOR(omega=1.1, order="greedy"), stopping=ONE)
-        np.testing.assert_allclose(result.x.numpy(), swept_greedily(A, b, np.zeros(9), 1.1), atol=1e-13)
+        result = wl.solve(
+            wl.LCP(operator, b), wl.ProjectedSOR(omega=1.1, order="greedy"), stopping=ONE
+        )
+        np.testing.assert_allclose(
+            result.x.numpy(), swept_greedily(A, b, np.zeros(9), 1.1), atol=1e-13
+        )
 
 
 def test_multicolor_is_red_black_on_a_poisson_matrix(device):
@@ -83,8 +103,14 @@ def test_multicolor_is_red_black_on_a_poisson_matrix(device):
     cells[0] = wl.AIR
     fluid, b = cells.ravel() == wl.FLUID, np.random.default_rng(83).standard_normal(cells.shape)
     A = scipy.sparse.csr_array(assemble(cells)[np.ix_(fluid, fluid)])
-    grid = wl.solve(wl.LCP(wl.GridPoisson(cells, device=device), b), wl.ProjectedSOR(omega=1.4), stopping=TIGHT)
-    colored = wl.solve(wl.LCP(wl.SparseOperator(A, device=device), b.ravel()[fluid]), wl.ProjectedSOR(order="multicolor"), stopping=TIGHT)
+    grid = wl.solve(
+        wl.LCP(wl.GridPoisson(cells, device=device), b), wl.ProjectedSOR(omega=1.4), stopping=TIGHT
+    )
+    colored = wl.solve(
+        wl.LCP(wl.SparseOperator(A, device=device), b.ravel()[fluid]),
+        wl.ProjectedSOR(order="multicolor"),
+        stopping=TIGHT,
+    )
     assert colored
     assert colored.iterations == grid.iterations
     np.testing.assert_allclose(colored.x.numpy(), grid.x.numpy().ravel()[fluid], atol=1e-10)
@@ -96,7 +122,9 @@ def test_zero_diagonal_goes_to_the_bound_that_y_asks_for(name, b, expected, devi
     """A_00 = 0: y_0 = b_0 whatever x_0 is, so that only its sign decides; y_0 = 0 leaves every x_0 a solution."""
     A = np.diag([0.0, 2.0])
     for operator in operators(A, device):
-        result = wl.solve(wl.LCP(operator, np.array([b, -1.0]), -1.0, 3.0), SCALAR[name], stopping=TIGHT)
+        result = wl.solve(
+            wl.LCP(operator, np.array([b, -1.0]), -1.0, 3.0), SCALAR[name], stopping=TIGHT
+        )
         assert result, result.status
         x = result.x.numpy()
         assert x[1] == pytest.approx(0.5)
@@ -108,10 +136,17 @@ def test_zero_diagonal_goes_to_the_bound_that_y_asks_for(name, b, expected, devi
 def test_negative_diagonal_goes_to_the_bound_of_lesser_energy(name, device):
     """Of -x^2 / 2 + x / 5 on [-1, 2] both ends are solutions, with energies -0.7 and -1.6: the upright parabola's rule stays inside."""
     for operator in operators(np.array([[-1.0]]), device):
-        result = wl.solve(wl.LCP(operator, np.array([0.2]), -1.0, 2.0), SCALAR[name], stopping=TIGHT)
+        result = wl.solve(
+            wl.LCP(operator, np.array([0.2]), -1.0, 2.0), SCALAR[name], stopping=TIGHT
+        )
         assert result, result.status
-        assert result.x.numpy()[0] == pytest.approx(0.2 if name == "blocks" else 2.0)  # y = 0 at 0.2: a block takes what solves it
-    one_sided = wl.solve(wl.LCP(wl.DenseOperator(np.array([[-1.0]]), device=device), np.array([0.5])), SCALAR[name], stopping=TIGHT)
+        # y = 0 at 0.2: a block takes what solves it
+        assert result.x.numpy()[0] == pytest.approx(0.2 if name == "blocks" else 2.0)
+    one_sided = wl.solve(
+        wl.LCP(wl.DenseOperator(np.array([[-1.0]]), device=device), np.array([0.5])),
+        SCALAR[name],
+        stopping=TIGHT,
+    )
     assert one_sided
     assert one_sided.x.numpy()[0] == 0.0
 
@@ -131,7 +166,12 @@ def test_zero_diagonal_without_a_bound_waits_and_says_so(device):
 @pytest.mark.parametrize("name", ["psor", "jacobi", "nncg"])
 def test_rows_that_no_sweep_can_solve_are_refused(name):
     for A, b, lower, message in (
-        (np.diag([0.0, 1.0]), [-1.0, 1.0], 0.0, "zero on the diagonal where b asks for an unbounded move"),
+        (
+            np.diag([0.0, 1.0]),
+            [-1.0, 1.0],
+            0.0,
+            "zero on the diagonal where b asks for an unbounded move",
+        ),
         (np.diag([-1.0, 1.0]), [-1.0, 1.0], 0.0, "negative diagonal"),
         (np.diag([-1.0, 1.0]), [1.0, 1.0], -np.inf, "negative diagonal"),
     ):
@@ -147,7 +187,9 @@ def test_random_boxes_with_zero_diagonals_never_converge_falsely(device):
         A = (B + B.T) / 4 + np.diag(rng.choice([0.0, 2.0], 4)) - np.diag(np.diag(B)) / 2
         b, lower, upper = rng.standard_normal(4), -rng.random(4), rng.random(4)
         assert boxed(A, b, lower, upper) is not None
-        result = wl.solve(wl.LCP(wl.DenseOperator(A, device=device), b, lower, upper), wl.ProjectedSOR(omega=1.0))
+        result = wl.solve(
+            wl.LCP(wl.DenseOperator(A, device=device), b, lower, upper), wl.ProjectedSOR(omega=1.0)
+        )
         x = result.x.numpy()
         y = A @ x + b
         right = ((x == lower) & (y >= -1e-5)) | ((x == upper) & (y <= 1e-5)) | (np.abs(y) <= 1e-5)
@@ -163,7 +205,8 @@ def test_divergence_is_told_by_contraction(device):
     problem = wl.LCP(wl.DenseOperator(A, device=device), -A @ np.linspace(1, 2, n), -np.inf)
     result = wl.solve(problem, ProjectedJacobi(omega=1.0), stopping=TIGHT)
     assert result.status is wl.SolveStatus.DIVERGED
-    assert result.iterations <= 12  # long before the residual has grown by the 1e8 of the stopping criteria
+    # long before the residual has grown by the 1e8 of the stopping criteria
+    assert result.iterations <= 12
     assert result.residual <= result.history[0].residual  # the best iterate comes back
     damped = wl.solve(problem, ProjectedJacobi(), stopping=TIGHT)
     assert damped
@@ -184,7 +227,9 @@ def test_projection_can_hide_divergence(device):
     """In a box iterates of a diverging method jump between bounds: the solve stagnates, and says so."""
     A = np.ones((9, 9)) + 0.1 * np.eye(9)
     x = np.linspace(0.1, 0.9, 9)
-    result = wl.solve(wl.LCP(wl.DenseOperator(A, device=device), -A @ x, 0.0, 1.0), ProjectedJacobi(omega=1.0))
+    result = wl.solve(
+        wl.LCP(wl.DenseOperator(A, device=device), -A @ x, 0.0, 1.0), ProjectedJacobi(omega=1.0)
+    )
     assert result.status in (wl.SolveStatus.STAGNATED, wl.SolveStatus.MAX_ITERATIONS)
 
 
@@ -197,7 +242,9 @@ def test_advised_omega_saves_most_sweeps(device):
     problem = wl.LCP(wl.GridPoisson(cells, device=device), b, -np.inf)
     omega = advised_omega(problem)
     assert omega == pytest.approx(2 / (1 + np.sin(np.pi / (n + 1))), abs=5e-3)
-    plain, best = (wl.solve(problem, wl.ProjectedSOR(omega=w), stopping=TIGHT) for w in (1.0, omega))
+    plain, best = (
+        wl.solve(problem, wl.ProjectedSOR(omega=w), stopping=TIGHT) for w in (1.0, omega)
+    )
     assert plain
     assert best
     assert best.iterations <= 150 <= 1000 <= plain.iterations
@@ -206,14 +253,19 @@ def test_advised_omega_saves_most_sweeps(device):
 def test_grids_are_swept_by_the_advised_omega(device):
     """Without a word: as by its number, in a third of the sweeps of 1.4 or fewer; elsewhere omega is 1.4."""
     problem = gallery.splash(20).named("walls", device=device).lcp(device=device)
-    found, advised, book = (wl.solve(problem, wl.ProjectedSOR(omega=w), stopping=LOOSE) for w in (None, advised_omega(problem), 1.4))
+    found, advised, book = (
+        wl.solve(problem, wl.ProjectedSOR(omega=w), stopping=LOOSE)
+        for w in (None, advised_omega(problem), 1.4)
+    )
     assert found
     assert found.iterations == advised.iterations <= 80
     assert np.array_equal(found.x.numpy(), advised.x.numpy())
     assert book.iterations >= 2.5 * found.iterations
     for A in operators(spd(9, 5), device):
         matrix = wl.LCP(A, np.linspace(-1, 1, 9))
-        one, other = (wl.solve(matrix, wl.ProjectedSOR(omega=w), stopping=LOOSE) for w in (None, 1.4))
+        one, other = (
+            wl.solve(matrix, wl.ProjectedSOR(omega=w), stopping=LOOSE) for w in (None, 1.4)
+        )
         assert np.array_equal(one.x.numpy(), other.x.numpy())
 
 
@@ -259,7 +311,9 @@ def test_spectrum_is_that_of_the_scaled_matrix():
     d = np.sqrt(np.diag(A))
     values = np.linalg.eigvalsh(A / np.outer(d, d))
     for operator in operators(A, "cpu"):
-        assert scaled_spectrum(wl.LCP(operator, np.ones(12)), 12) == pytest.approx((values[0], values[-1]), rel=1e-8)
+        assert scaled_spectrum(wl.LCP(operator, np.ones(12)), 12) == pytest.approx(
+            (values[0], values[-1]), rel=1e-8
+        )
     cells = np.ones((4, 5), dtype=int)
     cells[1, 2], cells[3, 4] = wl.SOLID, wl.AIR
     fluid, G = cells.ravel() == wl.FLUID, assemble(cells)

@@ -50,7 +50,8 @@ RANKED_SUITE = "scaling"  # what `bench --engine petsc` measures
 app = typer.Typer(
     name="warp-lcp",
     cls=Commands,
-    help="Complementarity solvers and simulators. Exit codes: 0 success, 1 failed or stopped, 2 wrong input.",
+    help="Complementarity solvers and simulators. Exit codes: 0 success, 1 failed or stopped, 2 "
+    "wrong input.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
@@ -62,8 +63,15 @@ def _begin_alike(word: str, names: Iterable[str]) -> list[str]:
 
 def _scenes_alike(incomplete: str) -> list[str]:
     """Return the built-in scenes, scene files and folders that begin with a word, for shell completion."""
-    near = sorted(Path().glob(f"{glob.escape(incomplete)}*")) if not Path(incomplete).is_absolute() else []
-    folders, scene_files = [f"{path}/" for path in near if path.is_dir()], [str(path) for path in near if path.suffix == ".toml"]
+    near = (
+        sorted(Path().glob(f"{glob.escape(incomplete)}*"))
+        if not Path(incomplete).is_absolute()
+        else []
+    )
+    folders, scene_files = (
+        [f"{path}/" for path in near if path.is_dir()],
+        [str(path) for path in near if path.suffix == ".toml"],
+    )
     return [*_begin_alike(incomplete, built_in_scenes()), *scene_files, *folders]
 
 
@@ -77,26 +85,52 @@ def _methods_alike(incomplete: str) -> list[str]:
 
 SceneArgument = Annotated[
     str,
-    typer.Argument(metavar="SCENE", help="Scene file, or name of a built-in scene (see `warp-lcp scenes`).", autocompletion=_scenes_alike),
+    typer.Argument(
+        metavar="SCENE",
+        help="Scene file, or name of a built-in scene (see `warp-lcp scenes`).",
+        autocompletion=_scenes_alike,
+    ),
 ]
 EngineOption = Annotated[
-    Engine, typer.Option(help="single: this process; petsc: MPI ranks of `mpiexec -n N warp-lcp ...` (needs petsc4py and mpi4py).")
+    Engine,
+    typer.Option(
+        help="single: this process; petsc: MPI ranks of `mpiexec -n N warp-lcp ...` (needs "
+        "petsc4py and mpi4py)."
+    ),
 ]
 RankTimeout = Annotated[
-    float, typer.Option(min=0.0, metavar="S", help="Abort all ranks and name the late one after S seconds of waiting; 0: no limit.")
+    float,
+    typer.Option(
+        min=0.0,
+        metavar="S",
+        help="Abort all ranks and name the late one after S seconds of waiting; 0: no limit.",
+    ),
 ]
 SetOption = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="SECTION.KEY=VALUE", help="Override a scene key; repeatable. Entry of an array: liquid.0.max=[1,1]."),
+    typer.Option(
+        "--set",
+        metavar="SECTION.KEY=VALUE",
+        help="Override a scene key; repeatable. Entry of an array: liquid.0.max=[1,1].",
+    ),
 ]
 
 ThreadsOption = Annotated[
     int | None,
     typer.Option(
-        metavar="N", help="CPU threads; results do not depend on them. Default: WARP_LCP_THREADS, else all cores.", show_default=False
+        metavar="N",
+        help="CPU threads; results do not depend on them. Default: WARP_LCP_THREADS, else all "
+        "cores.",
+        show_default=False,
     ),
 ]
-ForceMemory = Annotated[bool, typer.Option("--force-memory", help="Do not check whether the run fits into the free memory of the device.")]
+ForceMemory = Annotated[
+    bool,
+    typer.Option(
+        "--force-memory",
+        help="Do not check whether the run fits into the free memory of the device.",
+    ),
+]
 
 
 def _tell_version(asked: bool) -> None:
@@ -107,7 +141,12 @@ def _tell_version(asked: bool) -> None:
 
 @app.callback()
 def options(
-    version: Annotated[bool, typer.Option("--version", callback=_tell_version, is_eager=True, help="Print the version and exit.")] = False,
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_tell_version, is_eager=True, help="Print the version and exit."
+        ),
+    ] = False,
 ) -> None:
     """Define the options that belong to no command."""
 
@@ -123,36 +162,78 @@ def run(
         str | None,
         typer.Argument(
             metavar="SCENE",
-            help="Scene file, or name of a built-in scene (see `warp-lcp scenes`); optional with --resume --out DIR.",
+            help="Scene file, or name of a built-in scene (see `warp-lcp scenes`); optional with "
+            "--resume --out DIR.",
             show_default=False,
             autocompletion=_scenes_alike,
         ),
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="Run folder. Default: out/NAME.", show_default=False)] = None,
-    device: Annotated[str | None, typer.Option(help="cpu or cuda:N. Default: a GPU, if there is one.", show_default=False)] = None,
-    frames: Annotated[int | None, typer.Option(min=0, metavar="N", help="Stop after frame N.", show_default=False)] = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Continue the run in the folder from its newest checkpoint, with its earlier --set values.")
-    ] = False,
-    force: Annotated[bool, typer.Option("--force", help="Delete an earlier run in the folder first.")] = False,
-    force_memory: ForceMemory = False,
-    profile: Annotated[bool, typer.Option("--profile", help="Measure the time of each part; print it and write profile.json.")] = False,
-    record_problems: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Write the pressure problem of each step to DIR.", show_default=False)
+    out: Annotated[
+        Path | None, typer.Option(help="Run folder. Default: out/NAME.", show_default=False)
     ] = None,
-    page: Annotated[bool, typer.Option("--serve", help="Show the run on a web page while it is in progress, as `serve` does.")] = False,
-    window: Annotated[bool, typer.Option("--view", help="Show the run in a window, as `view` does.")] = False,
+    device: Annotated[
+        str | None,
+        typer.Option(help="cpu or cuda:N. Default: a GPU, if there is one.", show_default=False),
+    ] = None,
+    frames: Annotated[
+        int | None, typer.Option(min=0, metavar="N", help="Stop after frame N.", show_default=False)
+    ] = None,
+    resume: Annotated[
+        bool,
+        typer.Option(
+            "--resume",
+            help="Continue the run in the folder from its newest checkpoint, with its earlier "
+            "--set values.",
+        ),
+    ] = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Delete an earlier run in the folder first.")
+    ] = False,
+    force_memory: ForceMemory = False,
+    profile: Annotated[
+        bool,
+        typer.Option(
+            "--profile", help="Measure the time of each part; print it and write profile.json."
+        ),
+    ] = False,
+    record_problems: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Write the pressure problem of each step to DIR.",
+            show_default=False,
+        ),
+    ] = None,
+    page: Annotated[
+        bool,
+        typer.Option(
+            "--serve", help="Show the run on a web page while it is in progress, as `serve` does."
+        ),
+    ] = False,
+    window: Annotated[
+        bool, typer.Option("--view", help="Show the run in a window, as `view` does.")
+    ] = False,
     engine: EngineOption = Engine.SINGLE,
     rank_timeout: RankTimeout = LIMIT,
     threads: ThreadsOption = None,
     overrides: SetOption = None,
 ) -> None:
     """Simulate a scene; ParaView opens the frames in the run folder."""
-    given = {"--out": out, "--device": device, "--frames": frames, "--resume": resume, "--force": force, "--force-memory": force_memory}
+    given = {
+        "--out": out,
+        "--device": device,
+        "--frames": frames,
+        "--resume": resume,
+        "--force": force,
+        "--force-memory": force_memory,
+    }
     with wrong_input(), launcher_of(engine, rank_timeout=rank_timeout) as launcher:
         _use_threads(threads)
         if resume and force:
-            raise OutputError("--resume and --force exclude each other: --resume continues a run, --force deletes it")
+            raise OutputError(
+                "--resume and --force exclude each other: --resume continues a run, --force "
+                "deletes it"
+            )
         loaded = launcher.load(scene, overrides or (), given)
         chosen, console = launcher.choose_device(device), launcher.console
         folder, name = out or default_folder(loaded.scene), loaded.scene.scene.name
@@ -160,9 +241,16 @@ def run(
         if loaded.kept:
             say(console, f"earlier --set values: {', '.join(loaded.kept)}")
         request = RunRequest(
-            scene=loaded.scene, out=folder, device=chosen, overrides=loaded.overrides, last_frame=frames, resume=resume, force=force,
-            force_memory=force_memory, record_problems=record_problems,
-        )  # fmt: skip
+            scene=loaded.scene,
+            out=folder,
+            device=chosen,
+            overrides=loaded.overrides,
+            last_frame=frames,
+            resume=resume,
+            force=force,
+            force_memory=force_memory,
+            record_problems=record_problems,
+        )
         at_once = launcher.ranks is None
 
         def last(name: str) -> None:
@@ -173,7 +261,9 @@ def run(
         stop = Interruption(partial(say, console), at_once=at_once, last=last)
         with stop, Bar(console) if console.is_terminal else Lines(console) as observer:
             watch = Profile(chosen) if profile and launcher.is_root else None
-            with looked_on(observer, folder, page=page and launcher.is_root, window=window and launcher.is_root) as observers:
+            with looked_on(
+                observer, folder, page=page and launcher.is_root, window=window and launcher.is_root
+            ) as observers:
                 record = launcher.run(request, observer=observers, stop=stop, profile=watch)
     if not launcher.is_root:
         raise typer.Exit(0 if record.status == "finished" else FAILED)
@@ -189,9 +279,17 @@ for command in (render, view, serve, export):  # after `run`, in the list of com
 @app.command()
 def check(
     scene: SceneArgument,
-    device: Annotated[str | None, typer.Option(help="cpu or cuda:N: the device whose memory is checked.", show_default=False)] = None,
-    calibrate: Annotated[bool, typer.Option("--calibrate", help="Also run a few steps and measure the time per step.")] = False,
-    fix: Annotated[bool, typer.Option("--fix", help="First replace old key names in the scene file.")] = False,
+    device: Annotated[
+        str | None,
+        typer.Option(help="cpu or cuda:N: the device whose memory is checked.", show_default=False),
+    ] = None,
+    calibrate: Annotated[
+        bool,
+        typer.Option("--calibrate", help="Also run a few steps and measure the time per step."),
+    ] = False,
+    fix: Annotated[
+        bool, typer.Option("--fix", help="First replace old key names in the scene file.")
+    ] = False,
     force_memory: ForceMemory = False,
     overrides: SetOption = None,
 ) -> None:
@@ -199,13 +297,17 @@ def check(
     with wrong_input():
         chosen = choose_device(device)
         if fix:
-            _print_pairs([("fixed", line) for line in fix_file(scene) or ["nothing: no key has an old name"]])
+            _print_pairs(
+                [("fixed", line) for line in fix_file(scene) or ["nothing: no key has an old name"]]
+            )
         loaded, lines = check_scene(scene, overrides or ())
         _print_pairs(lines)
         if not force_memory:
             check_memory(loaded, chosen)
             beginning = start(loaded, chosen)
-            _print_pairs([("note", note) for note in (*beginning.notes(), *doubts(loaded, beginning))])
+            _print_pairs(
+                [("note", note) for note in (*beginning.notes(), *doubts(loaded, beginning))]
+            )
             if not calibrate:
                 _print_pairs(foretold(loaded, beginning))
         if not calibrate:
@@ -224,10 +326,20 @@ def check(
 @app.command("tune")
 def tune_scene(
     scene: SceneArgument,
-    accuracy: Annotated[PresetName, typer.Option(help="Target accuracy: the preset whose error to match.")] = "standard",
-    frames: Annotated[int, typer.Option(min=1, metavar="N", help="Number of frames of each trial run.")] = FRAMES,
-    out: Annotated[Path | None, typer.Option(metavar="FILE", help="File for the tuned scene.", show_default=False)] = None,
-    device: Annotated[str | None, typer.Option(help="cpu or cuda:N: the device that will run the scene.", show_default=False)] = None,
+    accuracy: Annotated[
+        PresetName, typer.Option(help="Target accuracy: the preset whose error to match.")
+    ] = "standard",
+    frames: Annotated[
+        int, typer.Option(min=1, metavar="N", help="Number of frames of each trial run.")
+    ] = FRAMES,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="File for the tuned scene.", show_default=False),
+    ] = None,
+    device: Annotated[
+        str | None,
+        typer.Option(help="cpu or cuda:N: the device that will run the scene.", show_default=False),
+    ] = None,
     overrides: SetOption = None,
 ) -> None:
     """Find the fastest settings of a scene for an accuracy, by trial runs of its first frames."""
@@ -238,7 +350,13 @@ def tune_scene(
             raise OutputError(f"--out {out}: must be a file in an existing folder")
         check_memory(loaded, chosen)
         try:
-            tuning = tune(loaded, accuracy=accuracy, device=chosen, frames=frames, say=partial(say, Terminal(stderr=True)))
+            tuning = tune(
+                loaded,
+                accuracy=accuracy,
+                device=chosen,
+                frames=frames,
+                say=partial(say, Terminal(stderr=True)),
+            )
         except (StepFailed, SimulationFailed) as error:
             end(str(error), FAILED)
         if out is not None:
@@ -257,25 +375,50 @@ def scenes() -> None:
 
 
 @app.command()
-def schema(simulator: Annotated[str, typer.Option(help="Simulator whose scenes the schema describes.")] = "fluids") -> None:
+def schema(
+    simulator: Annotated[
+        str, typer.Option(help="Simulator whose scenes the schema describes.")
+    ] = "fluids",
+) -> None:
     """Print the JSON schema of scene files, for editors and other programs."""
     with wrong_input():
         installed = installed_simulators()
     if simulator not in installed:
-        end(f"--simulator {simulator}: no such simulator; {nearest(simulator, installed)}", WRONG_INPUT)
+        end(
+            f"--simulator {simulator}: no such simulator; {nearest(simulator, installed)}",
+            WRONG_INPUT,
+        )
     tell(json.dumps(installed[simulator].scene_model.model_json_schema(by_alias=True), indent=2))
 
 
 @app.command()
 def solve(
     problem: Annotated[
-        Path, typer.Argument(metavar="PROBLEM", help="Matrix A as a Matrix Market file A.mtx, or a recorded problem_STEP.npz of a grid.")
+        Path,
+        typer.Argument(
+            metavar="PROBLEM",
+            help="Matrix A as a Matrix Market file A.mtx, or a recorded problem_STEP.npz of a "
+            "grid.",
+        ),
     ],
-    right_side: Annotated[Path | None, typer.Argument(metavar="[b.mtx]", help="Vector b, Matrix Market.", show_default=False)] = None,
-    lower: Annotated[
-        str | None, typer.Option(metavar="NUMBER|FILE", help="Lower bounds of x; -inf: none. Default: 0.", show_default=False)
+    right_side: Annotated[
+        Path | None,
+        typer.Argument(metavar="[b.mtx]", help="Vector b, Matrix Market.", show_default=False),
     ] = None,
-    upper: Annotated[str | None, typer.Option(metavar="NUMBER|FILE", help="Upper bounds of x. Default: inf.", show_default=False)] = None,
+    lower: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NUMBER|FILE",
+            help="Lower bounds of x; -inf: none. Default: 0.",
+            show_default=False,
+        ),
+    ] = None,
+    upper: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NUMBER|FILE", help="Upper bounds of x. Default: inf.", show_default=False
+        ),
+    ] = None,
     method: Annotated[
         str | None,
         typer.Option(
@@ -286,23 +429,46 @@ def solve(
         ),
     ] = None,
     tolerance: Annotated[
-        float, typer.Option(metavar="T", help="Tolerance of the residual, relative to the residual at clip(0, lower, upper).")
+        float,
+        typer.Option(
+            metavar="T",
+            help="Tolerance of the residual, relative to the residual at clip(0, lower, upper).",
+        ),
     ] = 1e-6,
-    max_iterations: Annotated[int, typer.Option(metavar="N", help="Maximum number of iterations.")] = 1000,
+    max_iterations: Annotated[
+        int, typer.Option(metavar="N", help="Maximum number of iterations.")
+    ] = 1000,
     max_seconds: Annotated[
-        float, typer.Option(metavar="S", help="Maximum wall time of the solve in seconds. Default: no limit.", show_default=False)
+        float,
+        typer.Option(
+            metavar="S",
+            help="Maximum wall time of the solve in seconds. Default: no limit.",
+            show_default=False,
+        ),
     ] = math.inf,
-    out: Annotated[Path | None, typer.Option(metavar="FILE", help="File for x: x.mtx, or x.npy for a grid.", show_default=False)] = None,
-    device: Annotated[str, typer.Option(help="cpu or cuda:N; with --engine petsc: cpu or cuda.")] = "cpu",
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="File for x: x.mtx, or x.npy for a grid.", show_default=False
+        ),
+    ] = None,
+    device: Annotated[
+        str, typer.Option(help="cpu or cuda:N; with --engine petsc: cpu or cuda.")
+    ] = "cpu",
     engine: EngineOption = Engine.SINGLE,
     rank_timeout: RankTimeout = LIMIT,
 ) -> None:
     """Solve the complementarity problem y = A x + b, lower <= x <= upper, from files or as recorded by a run."""
     options: dict[str, Any] = {
-        "method": method, "tolerance": tolerance, "max_iterations": max_iterations, "max_seconds": max_seconds
-    }  # fmt: skip
+        "method": method,
+        "tolerance": tolerance,
+        "max_iterations": max_iterations,
+        "max_seconds": max_seconds,
+    }
     with wrong_input(), launcher_of(engine, rank_timeout=rank_timeout) as launcher:
-        launcher.agree({"the problem": file_digest(problem), "--out": out, "--device": device, **options})
+        launcher.agree(
+            {"the problem": file_digest(problem), "--out": out, "--device": device, **options}
+        )
         chosen = launcher.choose_device(device)
         if out is not None and not out.parent.is_dir():
             raise ProblemError(f"--out {out}: no such folder: {out.parent}")
@@ -313,11 +479,23 @@ def solve(
             check_recorded(problem, right_side=right_side, lower=lower, upper=upper, out=out)
             outcome = solve_recorded(problem, device=chosen, ranks=launcher.ranks, **options)
         elif engine is Engine.PETSC:
-            raise ProblemError(f"{problem}: --engine petsc solves only grid problems, as written by `warp-lcp run --record-problems`")
+            raise ProblemError(
+                f"{problem}: --engine petsc solves only grid problems, as written by `warp-lcp run "
+                "--record-problems`"
+            )
         elif right_side is None:
-            raise ProblemError(f"{problem}: is a matrix: b is missing; write warp-lcp solve A.mtx b.mtx")
+            raise ProblemError(
+                f"{problem}: is a matrix: b is missing; write warp-lcp solve A.mtx b.mtx"
+            )
         else:
-            outcome = solve_files(problem, right_side, device=chosen, lower=lower or "0", upper=upper or "inf", **options)
+            outcome = solve_files(
+                problem,
+                right_side,
+                device=chosen,
+                lower=lower or "0",
+                upper=upper or "inf",
+                **options,
+            )
         if out is not None:
             outcome.write(out)
     if not launcher.is_root:
@@ -332,27 +510,54 @@ def solve(
 
 @app.command()
 def bench(
-    suite: Annotated[str, typer.Argument(metavar="SUITE", help=f"{', '.join(suite_names())}.", autocompletion=_suites_alike)],
+    suite: Annotated[
+        str,
+        typer.Argument(
+            metavar="SUITE", help=f"{', '.join(suite_names())}.", autocompletion=_suites_alike
+        ),
+    ],
     scene: Annotated[
         str | None,
         typer.Argument(
-            metavar="[SCENE]", help="Scene of the suite tradeoff. Default: its own.", show_default=False, autocompletion=_scenes_alike
+            metavar="[SCENE]",
+            help="Scene of the suite tradeoff. Default: its own.",
+            show_default=False,
+            autocompletion=_scenes_alike,
         ),
     ] = None,
     device: Annotated[str, typer.Option(help="cpu or cuda:N.")] = "cpu",
-    out: Annotated[Path, typer.Option(help="Folder for SUITE.json, SUITE.md and plots.")] = Path("out/bench"),
-    size: Annotated[list[int] | None, typer.Option(metavar="N", help="Cells along a side; repeatable.", show_default=False)] = None,
-    repeat: Annotated[int, typer.Option(min=1, metavar="K", help="Number of samples of each timing.")] = 5,
+    out: Annotated[Path, typer.Option(help="Folder for SUITE.json, SUITE.md and plots.")] = Path(
+        "out/bench"
+    ),
+    size: Annotated[
+        list[int] | None,
+        typer.Option(metavar="N", help="Cells along a side; repeatable.", show_default=False),
+    ] = None,
+    repeat: Annotated[
+        int, typer.Option(min=1, metavar="K", help="Number of samples of each timing.")
+    ] = 5,
     engine: Annotated[
-        Engine, typer.Option(help="petsc: scaling on 1, 2 and 4 ranks, or on the ranks of `mpiexec -n N warp-lcp ...`.")
+        Engine,
+        typer.Option(
+            help="petsc: scaling on 1, 2 and 4 ranks, or on the ranks of `mpiexec -n N warp-lcp "
+            "...`."
+        ),
     ] = Engine.SINGLE,
     seed: Annotated[
         int | None,
-        typer.Option(metavar="N", help="First seed of random problems, for choose and extremes. Default: the suite's.", show_default=False),
+        typer.Option(
+            metavar="N",
+            help="First seed of random problems, for choose and extremes. Default: the suite's.",
+            show_default=False,
+        ),
     ] = None,
     compare: Annotated[
         tuple[Path, Path] | None,
-        typer.Option(metavar="A.json B.json", help="Compare two result files instead of measuring.", show_default=False),
+        typer.Option(
+            metavar="A.json B.json",
+            help="Compare two result files instead of measuring.",
+            show_default=False,
+        ),
     ] = None,
     threads: ThreadsOption = None,
 ) -> None:
@@ -362,21 +567,33 @@ def bench(
         end(f"{suite}: no such suite; {nearest(suite, installed)}", WRONG_INPUT)
     with wrong_input():
         _use_threads(threads)
-        chosen = device if engine is Engine.PETSC else choose_device(device)  # ranks choose for themselves
+        # ranks choose for themselves
+        chosen = device if engine is Engine.PETSC else choose_device(device)
         if scene:
             load_scene(scene)
     shared = engine is Engine.PETSC
     if shared and suite != RANKED_SUITE:
-        end(f"--engine petsc: the suite {suite} measures one process; use {RANKED_SUITE}", WRONG_INPUT)
+        end(
+            f"--engine petsc: the suite {suite} measures one process; use {RANKED_SUITE}",
+            WRONG_INPUT,
+        )
     try:
         if compare is not None:
             tell(installed[suite].compare(*compare))
             return
-        asked: dict[str, Any] = ({"scene": scene} if scene else {}) | ({} if seed is None else {"seed": seed})
+        asked: dict[str, Any] = ({"scene": scene} if scene else {}) | (
+            {} if seed is None else {"seed": seed}
+        )
         if not shared:  # every rank is here
             tell(f"{suite}: takes about {installed[suite].takes}", error=True)
         files = installed[suite].run(
-            device=chosen, out=out, sizes=tuple(size or ()), repeat=repeat, shared=shared, threads=threads, **asked
+            device=chosen,
+            out=out,
+            sizes=tuple(size or ()),
+            repeat=repeat,
+            shared=shared,
+            threads=threads,
+            **asked,
         )
     except ValueError as error:
         end(str(error), WRONG_INPUT)
@@ -398,7 +615,12 @@ def info() -> None:
     lines.append(("default on grids", str(default_chain(ProjectedMultigrid()))))
     _print_pairs(lines)
     with wrong_input():
-        _print_pairs([(f"simulator {name}", simulator.summary) for name, simulator in installed_simulators().items()])
+        _print_pairs(
+            [
+                (f"simulator {name}", simulator.summary)
+                for name, simulator in installed_simulators().items()
+            ]
+        )
 
 
 def _use_threads(count: int | None) -> None:
@@ -412,7 +634,10 @@ def _print_tuning(tuning: Tuning, accuracy: str, device: str) -> None:
     """Print what was measured and the fastest settings."""
     rows = tuning.rows()
     tell(table_lines(rows[0], rows[1:], left=range(len(rows[0]))))
-    tell(f"{tuning.frames} frames on {device}; distance: displaced fraction of the mass; reference: {tuning.reference.steps} steps")
+    tell(
+        f"{tuning.frames} frames on {device}; distance: displaced fraction of the mass; reference: "
+        f"{tuning.reference.steps} steps"
+    )
     for line in tuning.verdict(accuracy):
         tell(line)
 
@@ -426,13 +651,22 @@ def _report(record: RunRecord, folder: Path) -> None:
     """Print how a run ended."""
     taken = f"{record.steps} steps, {record.time:.6g} s simulated in {record.seconds:.1f} s"
     if record.status == "finished" and record.steps and record.resumed_from_step == record.steps:
-        tell(f"finished earlier, nothing to do: {record.reason}; {record.steps} steps, {record.time:.6g} s simulated, in {folder}")
+        tell(
+            f"finished earlier, nothing to do: {record.reason}; {record.steps} steps, "
+            f"{record.time:.6g} s simulated, in {folder}"
+        )
         return
     if record.status == "finished":
         tell(f"finished: {record.reason}; {taken}; ParaView opens the .pvd files in {folder}")
         return
-    message = f"{record.status}: {record.reason}\n{taken}; frames 0 to {record.frames} are in {folder}"
-    newest = max(folder.glob("checkpoints/step_*.npz"), key=lambda file: int(file.stem.removeprefix("step_")), default=None)
+    message = (
+        f"{record.status}: {record.reason}\n{taken}; frames 0 to {record.frames} are in {folder}"
+    )
+    newest = max(
+        folder.glob("checkpoints/step_*.npz"),
+        key=lambda file: int(file.stem.removeprefix("step_")),
+        default=None,
+    )
     if newest is None:
         end(f"{message}; there is no checkpoint yet", FAILED)
     again = f"warp-lcp run {folder / 'scene.toml'} --out {folder} --device {record.device} --resume"

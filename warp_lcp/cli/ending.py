@@ -31,7 +31,11 @@ def wrong_input() -> Iterator[None]:
     except InputError as error:
         end(str(error), WRONG_INPUT)
     except OSError as error:
-        if error.filename is None or error.errno not in (errno.ENAMETOOLONG, errno.EACCES, errno.ENOTDIR):
+        if error.filename is None or error.errno not in (
+            errno.ENAMETOOLONG,
+            errno.EACCES,
+            errno.ENOTDIR,
+        ):
             raise
         end(f"{error.filename}: {error.strerror}", WRONG_INPUT)
     except Interrupted as error:
@@ -39,7 +43,12 @@ def wrong_input() -> Iterator[None]:
 
 
 def _show_renamed_keys(
-    message: Warning | str, category: type[Warning], filename: str, lineno: int, file: TextIO | None = None, line: str | None = None
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
 ) -> None:
     """Print a warning about a renamed key as one line; all others as Python does."""
     if issubclass(category, RenamedKeyWarning):

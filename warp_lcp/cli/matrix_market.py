@@ -23,7 +23,8 @@ PACKED: dict[str, Callable[[Path], Any]] = {".gz": gzip.open, ".bz2": bz2.open}
 HEADER = re.compile(
     rb"%%MatrixMarket[ \t]+matrix[ \t]+(?P<form>coordinate|array)[ \t]+"
     rb"(?P<field>real|double|integer|unsigned-integer|pattern|complex)[ \t]+"
-    rb"(?P<symmetry>general|symmetric|skew-symmetric|hermitian)[ \t]*\r?\n(?:[ \t]*+(?:%[^\n]*+)?\r?\n)*+"
+    rb"(?P<symmetry>general|symmetric|skew-symmetric|hermitian)[ \t]*\r?\n(?:[ "
+    rb"\t]*+(?:%[^\n]*+)?\r?\n)*+"
     rb"(?P<size>[ \t]*\d{1,18}(?:[ \t]+\d{1,18}){1,2})[ \t]*+(?:\r?\n|\Z)",
     re.IGNORECASE,
 )
@@ -51,12 +52,15 @@ def read_shape(path: Path, fits: Fits, expected: str) -> tuple[int, int]:
     """
     text = _text(path, HEAD)
     header = HEADER.match(text)
-    if len(text) == HEAD and (header is None or header.end() == HEAD):  # a long comment, or a size cut short
+    # a long comment, or a size cut short
+    if len(text) == HEAD and (header is None or header.end() == HEAD):
         header = HEADER.match(_text(path))
     rows, columns, more = _size(header, fits, expected)
     if more and header is not None and path.suffix not in PACKED:
         width = 2 if header["field"].lower() == b"pattern" else 3
-        _check_stored(_entries(rows, columns, more[0]), width * more[0], path.stat().st_size - header.end())
+        _check_stored(
+            _entries(rows, columns, more[0]), width * more[0], path.stat().st_size - header.end()
+        )
     return rows, columns
 
 
@@ -88,7 +92,9 @@ def read_market(path: Path, fits: Fits, expected: str) -> Any:
 def _size(header: re.Match[bytes] | None, fits: Fits, expected: str) -> tuple[int, int, list[int]]:
     """Check a header; return rows, columns and, of a sparse matrix, its number of entries."""
     if header is None:
-        raise MarketError("it must begin with %%MatrixMarket matrix FORM FIELD SYMMETRY and a line with its size")
+        raise MarketError(
+            "it must begin with %%MatrixMarket matrix FORM FIELD SYMMETRY and a line with its size"
+        )
     form, field, symmetry = (header[name].lower() for name in ("form", "field", "symmetry"))
     rows, columns, *more = map(int, header["size"].split())
     if field == b"complex":
@@ -105,7 +111,9 @@ def _size(header: re.Match[bytes] | None, fits: Fits, expected: str) -> tuple[in
 def _dense(body: bytes, rows: int, columns: int, symmetry: bytes) -> np.ndarray:
     """Return an array: all of it by columns, or its lower triangle, without the diagonal if that is 0."""
     skew = symmetry == b"skew-symmetric"
-    count = rows * columns if symmetry == b"general" else rows * (rows - 1 if skew else rows + 1) // 2
+    count = (
+        rows * columns if symmetry == b"general" else rows * (rows - 1 if skew else rows + 1) // 2
+    )
     values = _numbers(body, count, f"{rows} x {columns} values", NUMBER * rows * columns)
     if symmetry == b"general":
         return np.ascontiguousarray(values.reshape(columns, rows).T)
@@ -116,11 +124,15 @@ def _dense(body: bytes, rows: int, columns: int, symmetry: bytes) -> np.ndarray:
     return found
 
 
-def _sparse(body: bytes, rows: int, columns: int, entries: int, symmetry: bytes, *, pattern: bool) -> scipy.sparse.csr_array:
+def _sparse(
+    body: bytes, rows: int, columns: int, entries: int, symmetry: bytes, *, pattern: bool
+) -> scipy.sparse.csr_array:
     """Return a matrix of entries (row, column, value), counted from 1."""
     width = 2 if pattern else 3
     what = _entries(rows, columns, entries)
-    table = _numbers(body, width * entries, what, NUMBER * (rows + columns + 2 * width * entries)).reshape(entries, width)
+    table = _numbers(
+        body, width * entries, what, NUMBER * (rows + columns + 2 * width * entries)
+    ).reshape(entries, width)
     kind: Any = np.int32 if max(rows, columns) <= np.iinfo(np.int32).max else np.int64
     with np.errstate(invalid="ignore"):  # a place that is no such number differs from what was read
         row, column = (table[:, axis].astype(kind) - 1 for axis in range(2))
@@ -148,7 +160,8 @@ def _numbers(body: bytes, count: int, what: str, needed: int) -> np.ndarray:
     _check_stored(what, count, len(body), needed)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error", DeprecationWarning)  # so NumPy says that something is no number
+            # so NumPy says that something is no number
+            warnings.simplefilter("error", DeprecationWarning)
             found = np.fromstring(body, dtype=np.float64, sep=" ") if body.strip() else np.zeros(0)
     except (DeprecationWarning, ValueError) as error:
         raise MarketError("it holds an entry that is not a number") from error

@@ -18,7 +18,14 @@ import typer
 from warp_lcp.cli.ending import wrong_input
 from warp_lcp.render.film import check_rate
 from warp_lcp.render.live import PORT, live_server, served
-from warp_lcp.render.photo.photo import SAMPLES, SHUTTER, PhotoSettings, frame_range, photograph_film, photograph_run
+from warp_lcp.render.photo.photo import (
+    SAMPLES,
+    SHUTTER,
+    PhotoSettings,
+    frame_range,
+    photograph_film,
+    photograph_run,
+)
 from warp_lcp.render.recording import Color, Recording, RenderError, Show
 from warp_lcp.render.render import Looks, film_run, parse_size, render_run
 from warp_lcp.render.usd import export_run
@@ -30,13 +37,26 @@ from warp_lcp.run.terminal import Terminal, say, tell
 RunArgument = Annotated[Path, typer.Argument(metavar="DIR", help="Run folder.")]
 ShowOption = Annotated[
     Show | None,
-    typer.Option(help="Parts to show. Default: the surface if the run wrote one, else particles, else bodies.", show_default=False),
+    typer.Option(
+        help="Parts to show. Default: the surface if the run wrote one, else particles, else "
+        "bodies.",
+        show_default=False,
+    ),
 ]
 ColorOption = Annotated[
-    Color | None, typer.Option(help="Color of the particles, on one scale for the whole run. Default: speed.", show_default=False)
+    Color | None,
+    typer.Option(
+        help="Color of the particles, on one scale for the whole run. Default: speed.",
+        show_default=False,
+    ),
 ]
 CameraOption = Annotated[
-    list[str] | None, typer.Option("--set", metavar="camera.KEY=VALUE", help="Override a key of the scene's table camera; repeatable.")
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="camera.KEY=VALUE",
+        help="Override a key of the scene's table camera; repeatable.",
+    ),
 ]
 
 
@@ -49,63 +69,154 @@ class RenderLook(StrEnum):
 
 def render(
     folder: RunArgument,
-    look: Annotated[RenderLook, typer.Option(help="quick: OpenGL, with legends; photo: path-traced, 3-D.")] = RenderLook.QUICK,
+    look: Annotated[
+        RenderLook, typer.Option(help="quick: OpenGL, with legends; photo: path-traced, 3-D.")
+    ] = RenderLook.QUICK,
     frame: Annotated[
-        list[int] | None, typer.Option(metavar="N", help="Frame to draw; negative: from the end; repeatable. Default: all.")
+        list[int] | None,
+        typer.Option(
+            metavar="N", help="Frame to draw; negative: from the end; repeatable. Default: all."
+        ),
     ] = None,
-    frames: Annotated[str | None, typer.Option(metavar="A:B", help="Frames A to B, both included.", show_default=False)] = None,
-    size: Annotated[str, typer.Option(metavar="WxH", help="Image size in pixels; a sheet may be lower.")] = "1280x720",
-    out: Annotated[Path | None, typer.Option(help="Folder for images. Default: DIR/images or DIR/photo.", show_default=False)] = None,
+    frames: Annotated[
+        str | None,
+        typer.Option(metavar="A:B", help="Frames A to B, both included.", show_default=False),
+    ] = None,
+    size: Annotated[
+        str, typer.Option(metavar="WxH", help="Image size in pixels; a sheet may be lower.")
+    ] = "1280x720",
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder for images. Default: DIR/images or DIR/photo.", show_default=False
+        ),
+    ] = None,
     show: ShowOption = None,
     color: ColorOption = None,
-    sheet: Annotated[bool, typer.Option("--sheet", help="Draw the chosen frames, or six of all, side by side into sheet.png.")] = False,
+    sheet: Annotated[
+        bool,
+        typer.Option(
+            "--sheet", help="Draw the chosen frames, or six of all, side by side into sheet.png."
+        ),
+    ] = False,
     film: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Draw all frames into a film, .mp4 or (repeating) .gif.", show_default=False)
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Draw all frames into a film, .mp4 or (repeating) .gif.",
+            show_default=False,
+        ),
     ] = None,
-    fps: Annotated[float | None, typer.Option(help="Frames per second of the film. Default: the scene's.", show_default=False)] = None,
-    cut: Annotated[bool, typer.Option("--slice", help="Draw a cross-section with Matplotlib, without pyvista.")] = False,
+    fps: Annotated[
+        float | None,
+        typer.Option(
+            help="Frames per second of the film. Default: the scene's.", show_default=False
+        ),
+    ] = None,
+    cut: Annotated[
+        bool, typer.Option("--slice", help="Draw a cross-section with Matplotlib, without pyvista.")
+    ] = False,
     at: Annotated[
         float | None,
-        typer.Option(metavar="Z", help="Position z of the cross-section of a 3-D run, in meters. Default: the middle.", show_default=False),
+        typer.Option(
+            metavar="Z",
+            help="Position z of the cross-section of a 3-D run, in meters. Default: the middle.",
+            show_default=False,
+        ),
     ] = None,
-    samples: Annotated[int | None, typer.Option(metavar="N", help="Photo: samples per pixel. Default: 64.", show_default=False)] = None,
+    samples: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N", help="Photo: samples per pixel. Default: 64.", show_default=False
+        ),
+    ] = None,
     shutter: Annotated[
-        float | None, typer.Option(metavar="SHARE", help="Photo: exposure time in frame intervals. Default: 0.25.", show_default=False)
+        float | None,
+        typer.Option(
+            metavar="SHARE",
+            help="Photo: exposure time in frame intervals. Default: 0.25.",
+            show_default=False,
+        ),
     ] = None,
     overrides: CameraOption = None,
 ) -> None:
     """Draw the frames of a run as PNG images or as a film (needs the extra `render` or `photo`)."""
-    devices()  # starts Warp, which draws surfaces and samples 2-D solids, without its native messages
+    # starts Warp, which draws surfaces and samples 2-D solids, without its native messages
+    devices()
     console = Terminal(stderr=True)
 
     def estimated(seconds: float) -> None:
-        say(console, f"drawing takes about {timedelta(seconds=math.ceil(seconds))}{'' if look is RenderLook.PHOTO else ' on one core'}")
+        say(
+            console,
+            "drawing takes about "
+            f"{timedelta(seconds=math.ceil(seconds))}{'' if look is RenderLook.PHOTO else ' on one core'}",
+        )
 
     with wrong_input(), Count(console, "drawing", "images") as told:
-        frame = [*(frame or ()), *(frame_range(frames, Recording(folder, color, show).numbers) if frames else ())]
+        frame = [
+            *(frame or ()),
+            *(frame_range(frames, Recording(folder, color, show).numbers) if frames else ()),
+        ]
         if look is RenderLook.PHOTO:
             if fps is not None and film is None:
                 raise RenderError("--fps: needs --film")
             refuse_quick_options(sheet=sheet, slice=cut, at=at is not None, color=color is not None)
-            exposure: Any = {"samples": SAMPLES if samples is None else samples, "shutter": SHUTTER if shutter is None else shutter}
-            settings = PhotoSettings(size=parse_size(size), show=show, overrides=overrides or (), **exposure)
-            draw = partial(photograph_film, film=film, rate=check_rate(fps)) if film else photograph_run
+            exposure: Any = {
+                "samples": SAMPLES if samples is None else samples,
+                "shutter": SHUTTER if shutter is None else shutter,
+            }
+            settings = PhotoSettings(
+                size=parse_size(size), show=show, overrides=overrides or (), **exposure
+            )
+            draw = (
+                partial(photograph_film, film=film, rate=check_rate(fps))
+                if film
+                else photograph_run
+            )
             report: Any = {"told": told, "estimated": estimated, "noted": partial(say, console)}
             images = list(draw(folder, frames=frame, settings=settings, out=out, **report))
             tell(f"{film}: {len(images)} frames" if film else _listed(images))
             return
         if samples is not None or shutter is not None:
-            raise RenderError(f"--{'shutter' if samples is None else 'samples'}: needs --look photo")
-        looks = Looks(size=parse_size(size), color=color, show=show, cut=cut, at=at, overrides=overrides or ())
+            raise RenderError(
+                f"--{'shutter' if samples is None else 'samples'}: needs --look photo"
+            )
+        looks = Looks(
+            size=parse_size(size), color=color, show=show, cut=cut, at=at, overrides=overrides or ()
+        )
         if film is not None:
             if frame or sheet or out:
-                raise RenderError("--film: draws all frames into one file; cannot be combined with --frame, --frames, --sheet or --out")
-            count = len(list(film_run(folder, film, looks=looks, rate=check_rate(fps), told=told, estimated=estimated)))
+                raise RenderError(
+                    "--film: draws all frames into one file; cannot be combined with --frame, "
+                    "--frames, --sheet or --out"
+                )
+            count = len(
+                list(
+                    film_run(
+                        folder,
+                        film,
+                        looks=looks,
+                        rate=check_rate(fps),
+                        told=told,
+                        estimated=estimated,
+                    )
+                )
+            )
             tell(f"{film}: {count} frames")
             return
         if fps is not None:
             raise RenderError("--fps: needs --film")
-        images = list(render_run(folder, frames=frame or (), looks=looks, out=out, sheet=sheet, told=told, estimated=estimated))
+        images = list(
+            render_run(
+                folder,
+                frames=frame or (),
+                looks=looks,
+                out=out,
+                sheet=sheet,
+                told=told,
+                estimated=estimated,
+            )
+        )
     tell(_listed(images))
 
 
@@ -122,10 +233,19 @@ def refuse_quick_options(**given: bool) -> None:
 
 def _listed(images: list[Path]) -> str:
     """Return one line that names the images."""
-    return f"{images[0]}" if len(images) == 1 else f"{len(images)} images, {images[0]} to {images[-1].name}"
+    return (
+        f"{images[0]}"
+        if len(images) == 1
+        else f"{len(images)} images, {images[0]} to {images[-1].name}"
+    )
 
 
-def view(folder: RunArgument, show: ShowOption = None, color: ColorOption = None, overrides: CameraOption = None) -> None:
+def view(
+    folder: RunArgument,
+    show: ShowOption = None,
+    color: ColorOption = None,
+    overrides: CameraOption = None,
+) -> None:
     """Show a run in a window, also while it is in progress (needs a display and the extra `render`)."""
     devices()
     with wrong_input():
@@ -134,14 +254,21 @@ def view(folder: RunArgument, show: ShowOption = None, color: ColorOption = None
 
 def serve(
     folder: RunArgument,
-    port: Annotated[int, typer.Option(min=0, max=65535, metavar="N", help="Port on the loopback address; 0: any free one.")] = PORT,
+    port: Annotated[
+        int,
+        typer.Option(
+            min=0, max=65535, metavar="N", help="Port on the loopback address; 0: any free one."
+        ),
+    ] = PORT,
     show: ShowOption = None,
 ) -> None:
     """Show frames and log of a run on a web page, also while it is in progress; Ctrl-C ends it."""
     devices()
     with wrong_input():
         if not folder.is_dir():
-            raise RenderError(f"{folder}: no such folder; expected the folder of a run, finished or in progress")
+            raise RenderError(
+                f"{folder}: no such folder; expected the folder of a run, finished or in progress"
+            )
         server = live_server(folder, port=port, show=show)
     with server:
         tell(f"{folder}: {server.address}  (Ctrl-C ends)")
@@ -151,10 +278,25 @@ def serve(
 
 def export(
     folder: RunArgument,
-    out: Annotated[Path, typer.Option(metavar="FILE", help="USD file: .usdc, .usda (text) or .usd.", show_default=False)],
+    out: Annotated[
+        Path,
+        typer.Option(
+            metavar="FILE", help="USD file: .usdc, .usda (text) or .usd.", show_default=False
+        ),
+    ],
     show: ShowOption = None,
-    first: Annotated[int | None, typer.Option(metavar="N", help="First frame. Default: the first of the run.", show_default=False)] = None,
-    last: Annotated[int | None, typer.Option(metavar="N", help="Last frame. Default: the last of the run.", show_default=False)] = None,
+    first: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N", help="First frame. Default: the first of the run.", show_default=False
+        ),
+    ] = None,
+    last: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N", help="Last frame. Default: the last of the run.", show_default=False
+        ),
+    ] = None,
 ) -> None:
     """Write the frames of a run to one USD file, for Blender, Houdini and Maya (needs the extra `usd`)."""
     devices()
@@ -188,6 +330,9 @@ def looked_on(observer: Observer, folder: Path, *, page: bool, window: bool) -> 
                 observer.note(f"page: {stack.enter_context(served(folder))}")
             if window:
                 program = "from warp_lcp.cli.commands import main; main()"
-                subprocess.Popen([sys.executable, "-c", program, "view", str(folder.resolve())], start_new_session=True)
+                subprocess.Popen(
+                    [sys.executable, "-c", program, "view", str(folder.resolve())],
+                    start_new_session=True,
+                )
 
         yield cast(Observer, _Begun(observer, begin)) if page or window else observer

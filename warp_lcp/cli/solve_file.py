@@ -52,26 +52,50 @@ class Outcome:
         A = self.problem.A
         kind = f"{A.nnz} entries, " if isinstance(A, SparseOperator) else "dense, "
         symmetry = "symmetric" if A.symmetric else "unsymmetric"
-        return f"{self.problem.layout.size} unknowns, {kind}{symmetry}, by {self.methods} on {self.problem.device}"
+        return (
+            f"{self.problem.layout.size} unknowns, {kind}{symmetry}, by {self.methods} on "
+            f"{self.problem.device}"
+        )
 
     @property
     def methods(self) -> str:
         """Names of the methods that were used, in order."""
-        return ", then ".join(dict.fromkeys(record.method or self.name for record in self.result.history))
+        return ", then ".join(
+            dict.fromkeys(record.method or self.name for record in self.result.history)
+        )
 
     def table(self) -> Table:
         """Return the history as a table."""
-        table = Table("iteration", "residual", "linear", "active", "step", "seconds", box=None, header_style="bold")
+        table = Table(
+            "iteration",
+            "residual",
+            "linear",
+            "active",
+            "step",
+            "seconds",
+            box=None,
+            header_style="bold",
+        )
         for column in table.columns[:4]:
             column.justify = "right"
         history = self.result.history
-        shown = [*history[: MOST_ROWS // 2], None, *history[-(MOST_ROWS // 2) :]] if len(history) > MOST_ROWS else history
+        shown = (
+            [*history[: MOST_ROWS // 2], None, *history[-(MOST_ROWS // 2) :]]
+            if len(history) > MOST_ROWS
+            else history
+        )
         for record in shown:
             if record is None:
                 table.add_row("...")
                 continue
             active = "" if record.active is None else str(record.active)
-            row = [str(record.iteration), f"{record.residual:.3e}", str(record.linear_iterations), active, record.step]
+            row = [
+                str(record.iteration),
+                f"{record.residual:.3e}",
+                str(record.linear_iterations),
+                active,
+                record.step,
+            ]
             table.add_row(*row, f"{record.seconds:.3f}")
         return table
 
@@ -120,13 +144,20 @@ def solve_files(
     """
     stopping = criteria(tolerance, max_iterations, max_seconds)
     n = _checked(matrix, *SQUARE)[0]  # sizes first: a file may claim rows that take minutes
-    for path in (right_side, *(Path(side) for side in (lower, upper) if _number(side) is None and Path(side).exists())):
+    for path in (
+        right_side,
+        *(Path(side) for side in (lower, upper) if _number(side) is None and Path(side).exists()),
+    ):
         _checked(path, *_vector_of(n))
     A = read_matrix(matrix)
     b = read_vector(right_side, n)
     sides = [_bound(value, n, f"--{name}") for name, value in (("lower", lower), ("upper", upper))]
     try:
-        operator = SparseOperator(A, device=device) if scipy.sparse.issparse(A) else DenseOperator(A, device=device)
+        operator = (
+            SparseOperator(A, device=device)
+            if scipy.sparse.issparse(A)
+            else DenseOperator(A, device=device)
+        )
         problem = LCP(operator, b, *sides)
         family = "sparse" if isinstance(operator, SparseOperator) else "dense"
         solver = None if method is None else method_named(method, family)
@@ -143,7 +174,9 @@ def criteria(tolerance: float, max_iterations: int, max_seconds: float) -> Stopp
         ProblemError: an option is outside its range; the message names it.
     """
     try:
-        return StoppingCriteria(rtol=tolerance, max_iterations=max_iterations, max_seconds=max_seconds)
+        return StoppingCriteria(
+            rtol=tolerance, max_iterations=max_iterations, max_seconds=max_seconds
+        )
     except SettingError as error:
         option = "tolerance" if error.name == "rtol" else error.name.replace("_", "-")
         raise ProblemError(f"--{option} {error.value}: must be {error.rule}") from error
@@ -183,7 +216,10 @@ def write_vector(path: Path, x: np.ndarray) -> None:
 
 def _vector_of(n: int) -> tuple[Fits, str]:
     """Return which shapes a vector may have, and what a message says of others."""
-    return lambda rows, columns: (rows, columns) in ((n, 1), (1, n)), f"expected {n} x 1, a number for each row of A"
+    return (
+        lambda rows, columns: (rows, columns) in ((n, 1), (1, n)),
+        f"expected {n} x 1, a number for each row of A",
+    )
 
 
 def _checked(path: Path, fits: Fits, expected: str) -> tuple[int, int]:
@@ -214,7 +250,10 @@ def _read(path: Path, fits: Fits, expected: str, *, infinite: bool = False) -> A
     values = matrix.data if scipy.sparse.issparse(matrix) else matrix
     wrong = np.isnan(values) if infinite else ~np.isfinite(values)
     if wrong.any():
-        raise ProblemError(f"{path}: holds {np.count_nonzero(wrong)} values that are {'NaN' if infinite else 'not finite'}")
+        raise ProblemError(
+            f"{path}: holds {np.count_nonzero(wrong)} values that are "
+            f"{'NaN' if infinite else 'not finite'}"
+        )
     return matrix
 
 
@@ -231,10 +270,14 @@ def _bound(value: str, n: int, option: str) -> float | np.ndarray:
     number = _number(value)
     if number is None and not Path(value).exists():
         raise ProblemError(f"{option} {value}: neither a number nor a file")
-    side = huge_as_infinite(read_vector(Path(value), n, infinite=True) if number is None else np.asarray(number))
+    side = huge_as_infinite(
+        read_vector(Path(value), n, infinite=True) if number is None else np.asarray(number)
+    )
     wrong = np.inf if option == "--lower" else -np.inf
     if (side == wrong).any():
-        raise ProblemError(f"{option} {value}: is {wrong} (1e20 and more count as infinite): no x could meet it")
+        raise ProblemError(
+            f"{option} {value}: is {wrong} (1e20 and more count as infinite): no x could meet it"
+        )
     return side if side.ndim else float(side)
 
 
@@ -242,9 +285,19 @@ def method_named(name: str, family: str, *, shared: bool = False) -> Any:
     """Return a method by its name, for a family of operators, perhaps on several ranks."""
     if name not in METHODS:
         raise ProblemError(f"--method {name}: no such method; {METHODS.nearest(name)}")
-    fits = [known for known, kind in METHODS.items() if family in families(kind) and (not shared or getattr(kind, "distributed", False))]
+    fits = [
+        known
+        for known, kind in METHODS.items()
+        if family in families(kind) and (not shared or getattr(kind, "distributed", False))
+    ]
     if name not in fits:
-        what = "work on several ranks" if shared else "solve grid problems" if family == "grid" else f"accept {family} matrices"
+        what = (
+            "work on several ranks"
+            if shared
+            else "solve grid problems"
+            if family == "grid"
+            else f"accept {family} matrices"
+        )
         raise ProblemError(f"--method {name}: does not {what}; choose from {', '.join(fits)}")
     try:
         return METHODS[name]()

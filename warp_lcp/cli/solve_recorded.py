@@ -50,7 +50,9 @@ class GridOutcome(Outcome):
     def heading(self) -> str:
         """Return a line that says what was solved."""
         cells = " x ".join(map(str, reversed(self.shape)))
-        line = f"{self.unknowns} unknowns, {cells} cells, by {self.methods} on {self.problem.device}"
+        line = (
+            f"{self.unknowns} unknowns, {cells} cells, by {self.methods} on {self.problem.device}"
+        )
         if self.decomposition is None:
             return line
         boxes = " x ".join(map(str, self.decomposition.processes))
@@ -94,7 +96,8 @@ def solve_recorded(
         max_iterations: maximum number of steps.
         max_seconds: the most wall time of the solve.
         device: a Warp device.
-        ranks: who solve it together, each of them its own box of cells; collective. None: this process alone.
+        ranks: who solve it together, each of them its own box of cells; collective. None: this
+            process alone.
 
     Raises:
         ProblemError: the file or an option is wrong.
@@ -110,10 +113,20 @@ def solve_recorded(
         result = solve(problem, solver, stopping=stopping)
     except ValueError as error:
         raise ProblemError(str(error)) from error
-    return GridOutcome(problem, solver, method or str(result.method), result, shape, problem.A.unknowns, decomposition)  # type: ignore[attr-defined]
+    return GridOutcome(
+        problem,
+        solver,
+        method or str(result.method),
+        result,
+        shape,
+        problem.A.unknowns,
+        decomposition,
+    )  # type: ignore[attr-defined]
 
 
-def check_recorded(path: Path, *, right_side: Path | None, lower: str | None, upper: str | None, out: Path | None) -> None:
+def check_recorded(
+    path: Path, *, right_side: Path | None, lower: str | None, upper: str | None, out: Path | None
+) -> None:
     """Refuse options that are of matrices.
 
     Raises:
@@ -125,7 +138,9 @@ def check_recorded(path: Path, *, right_side: Path | None, lower: str | None, up
         if value is not None:
             raise ProblemError(f"--{option} {value}: {path} has bounds of its own")
     if out is not None and out.suffix != FIELD:
-        raise ProblemError(f"--out {out}: x of a grid is written as a NumPy array: the name must end in {FIELD}")
+        raise ProblemError(
+            f"--out {out}: x of a grid is written as a NumPy array: the name must end in {FIELD}"
+        )
 
 
 def file_digest(path: Path) -> str | None:
@@ -147,14 +162,30 @@ def _decomposition(shape: tuple[int, ...], ranks: Ranks) -> Decomposition:
     return Decomposition((nx, ny, nz), ranks)
 
 
-def _problem(path: Path, shape: tuple[int, ...], decomposition: Decomposition | None, device: str, tolerance: float) -> LCP:
+def _problem(
+    path: Path,
+    shape: tuple[int, ...],
+    decomposition: Decomposition | None,
+    device: str,
+    tolerance: float,
+) -> LCP:
     """Return the problem, or this rank's part of it."""
-    part = tuple(slice(0, n) for n in shape) if decomposition is None else decomposition.box.slices[-len(shape) :]
+    part = (
+        tuple(slice(0, n) for n in shape)
+        if decomposition is None
+        else decomposition.box.slices[-len(shape) :]
+    )
     kept = load_part(path, part)
     cells, b, lower, upper = (kept.pop(name) for name in ("cells", "b", "lower", "upper"))
-    kind = wp.float64 if tolerance < FLOAT32_ROUNDING else wp.float32  # less than float32 tells asks for the file's own numbers
+    # less than float32 tells asks for the file's own numbers
+    kind = wp.float64 if tolerance < FLOAT32_ROUNDING else wp.float32
     coefficients: dict[str, Any] = {**kept, "device": device, "dtype": kind}
-    return LCP(GridPoisson(cells, decomposition=decomposition, **coefficients), b, _bound(lower), _bound(upper))
+    return LCP(
+        GridPoisson(cells, decomposition=decomposition, **coefficients),
+        b,
+        _bound(lower),
+        _bound(upper),
+    )
 
 
 def _bound(values: np.ndarray) -> float | np.ndarray:
@@ -162,7 +193,9 @@ def _bound(values: np.ndarray) -> float | np.ndarray:
     return values if values.ndim else float(values)
 
 
-def _write_boxes(path: Path, x: np.ndarray, shape: tuple[int, ...], decomposition: Decomposition) -> None:
+def _write_boxes(
+    path: Path, x: np.ndarray, shape: tuple[int, ...], decomposition: Decomposition
+) -> None:
     """Write the ranks' boxes of x into one array, of which the root rank holds one box at a time."""
     from warp_lcp.distributed.waiting import waiting
 

@@ -44,30 +44,51 @@ def tree_of(joints: Sequence[Joint], bodies: int) -> list[int]:
     """Return the joints' numbers in an order in which each follows the one that carries it.
 
     Raises:
-        ValueError: a body has no hinge of its own, or several; a joint is no hinge; or bodies form a ring.
+        ValueError: a body has no hinge of its own, or several; a joint is no hinge; or bodies form
+            a ring.
     """
     own = {joint.first: number for number, joint in enumerate(joints)}
-    if sorted(joint.first for joint in joints) != list(range(bodies)) or any(joint.kind != "hinge" for joint in joints):
-        raise ValueError("every body must be the first body of exactly one hinge, and there must be no other joints")
+    if sorted(joint.first for joint in joints) != list(range(bodies)) or any(
+        joint.kind != "hinge" for joint in joints
+    ):
+        raise ValueError(
+            "every body must be the first body of exactly one hinge, and there must be no other "
+            "joints"
+        )
     order: list[int] = []
     while len(order) < bodies:
         placed = {joints[number].first for number in order} | {WORLD}
-        more = [number for body, number in sorted(own.items()) if body not in placed and joints[number].second in placed]
+        more = [
+            number
+            for body, number in sorted(own.items())
+            if body not in placed and joints[number].second in placed
+        ]
         if not more:
-            raise ValueError("hinges must form trees rooted at fixed solids or in space; some form a loop")
+            raise ValueError(
+                "hinges must form trees rooted at fixed solids or in space; some form a loop"
+            )
         order += more
     return order
 
 
-def figure_of(joints: Sequence[Joint], order: Sequence[int], targets: Sequence[Target], dimension: int) -> ArticulatedFigure:
+def figure_of(
+    joints: Sequence[Joint], order: Sequence[int], targets: Sequence[Target], dimension: int
+) -> ArticulatedFigure:
     """Return the figure that hinges and targets make, hinges in an order of `tree_of`."""
     place = {joints[number].first: index for index, number in enumerate(order)}
     hinges = [joints[number] for number in order]
     parents = tuple(place.get(hinge.second, -1) for hinge in hinges)
     anchors = np.array([hinge.anchor for hinge in hinges])
-    offsets = np.array([a - (anchors[parent] if parent >= 0 else 0.0) for a, parent in zip(anchors, parents, strict=True)])
+    offsets = np.array(
+        [
+            a - (anchors[parent] if parent >= 0 else 0.0)
+            for a, parent in zip(anchors, parents, strict=True)
+        ]
+    )
     carriers = tuple(place[target.body] for target in targets)
-    tips = np.array([target.point - anchors[carrier] for target, carrier in zip(targets, carriers, strict=True)])
+    tips = np.array(
+        [target.point - anchors[carrier] for target, carrier in zip(targets, carriers, strict=True)]
+    )
     axes = np.array([hinge.axis for hinge in hinges])
     lower, upper = np.array([hinge.limits for hinge in hinges]).T
     return ArticulatedFigure(parents, axes, offsets, carriers, tips, lower, upper, dimension)
@@ -90,8 +111,21 @@ class KinematicSimulation:
         theta: angles of the hinges, in the order of `tree_of` [rad], shape (n,).
     """
 
-    def __init__(self, bodies: RigidBodies, targets: Sequence[Target], solver: InverseKinematics, method: str, dt: float) -> None:
-        self.bodies, self.targets, self._solver, self._method, self._dt = bodies, list(targets), solver, method, dt
+    def __init__(
+        self,
+        bodies: RigidBodies,
+        targets: Sequence[Target],
+        solver: InverseKinematics,
+        method: str,
+        dt: float,
+    ) -> None:
+        self.bodies, self.targets, self._solver, self._method, self._dt = (
+            bodies,
+            list(targets),
+            solver,
+            method,
+            dt,
+        )
         self._order = tree_of(bodies.joints, len(bodies.bodies))
         self.figure = figure_of(bodies.joints, self._order, self.targets, bodies.dimension)
         self.theta = np.zeros(self.figure.hinges)
@@ -121,22 +155,31 @@ class KinematicSimulation:
     def columns(self) -> tuple[str, ...]:
         """Return the names of the log's columns.
 
-        target_error: the largest distance of a target from what is to be there [m]. solve_iterations: problems solved, one for each
-        change of the angles; solve_residual: the projected gradient [rad] of half the squared distances. The bodies' are those of
+        target_error: the largest distance of a target from what is to be there [m].
+        solve_iterations: problems solved, one for each change of the angles; solve_residual: the
+        projected gradient [rad] of half the squared distances. The bodies' are those of
         `RigidBodies.columns`.
         """
         return (*COLUMNS, *self.bodies.columns())
 
     def frame(self) -> list[Part]:
         """Return the surfaces of the bodies, and octahedra (squares in 2-D) where targets are: `body` goes on counting with them."""
-        own, marks = self.bodies.surfaces(), [self._mark(number) for number in range(len(self.targets))]
+        own, marks = (
+            self.bodies.surfaces(),
+            [self._mark(number) for number in range(len(self.targets))],
+        )
         surface = BodySurface.joined([own, *marks])
         return [Surface("bodies", surface.points, surface.corners, surface.fields)]
 
     def state(self) -> dict[str, np.ndarray]:
         """Return everything that `restore` needs."""
         clock = np.array([self.time])
-        return {"clock": clock, "step_count": np.array(self.step_count), "angles": self.theta, **self.bodies.state()}
+        return {
+            "clock": clock,
+            "step_count": np.array(self.step_count),
+            "angles": self.theta,
+            **self.bodies.state(),
+        }
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Continue from `state`.
@@ -146,13 +189,22 @@ class KinematicSimulation:
         """
         angles = np.asarray(state.get("angles", []), dtype=np.float64)
         if angles.shape != self.theta.shape:
-            raise ValueError(f"the state has {angles.size} angles: this scene has {self.theta.size} hinges")
+            raise ValueError(
+                f"the state has {angles.size} angles: this scene has {self.theta.size} hinges"
+            )
         self.bodies.restore(state)
-        self.theta, self.time, self.step_count = angles.copy(), float(state["clock"][0]), int(state["step_count"])
+        self.theta, self.time, self.step_count = (
+            angles.copy(),
+            float(state["clock"][0]),
+            int(state["step_count"]),
+        )
 
     def notes(self) -> list[str]:
         """Return facts for the start of a run."""
-        return [f"inverse kinematics: {self.figure.hinges} hinges, {len(self.targets)} targets, reach {self.figure.reach:g} m"]
+        return [
+            f"inverse kinematics: {self.figure.hinges} hinges, {len(self.targets)} targets, reach "
+            f"{self.figure.reach:g} m"
+        ]
 
     def _goals(self, time: float) -> np.ndarray:
         return np.array([target.place(time) for target in self.targets])[:, : self.bodies.dimension]
@@ -163,8 +215,12 @@ class KinematicSimulation:
         anchors: list[np.ndarray] = []
         figure = self.figure
         for index, (number, parent) in enumerate(zip(self._order, figure.parents, strict=True)):
-            carrier, at = (turns[parent], anchors[parent]) if parent >= 0 else (np.eye(3), np.zeros(3))
-            turns.append(carrier @ Rotation.from_rotvec(self.theta[index] * figure.axes[index]).as_matrix())
+            carrier, at = (
+                (turns[parent], anchors[parent]) if parent >= 0 else (np.eye(3), np.zeros(3))
+            )
+            turns.append(
+                carrier @ Rotation.from_rotvec(self.theta[index] * figure.axes[index]).as_matrix()
+            )
             anchors.append(at + carrier @ figure.offsets[index])
             joint = self.bodies.joints[number]
             body = self.bodies.bodies[joint.first]
@@ -173,7 +229,10 @@ class KinematicSimulation:
             velocity = (position - body.position) / dt
             body.angle += dt * float(spin[2])
             body.position, body.rotation, body.time = position, turns[-1], self.time
-            body.momentum, body.angular_momentum = body.properties.mass * velocity, body.inertia @ spin
+            body.momentum, body.angular_momentum = (
+                body.properties.mass * velocity,
+                body.inertia @ spin,
+            )
 
     def _mark(self, number: int) -> BodySurface:
         """Return what shows a target."""
@@ -183,12 +242,27 @@ class KinematicSimulation:
             points, corners = ends[[0, 1, 3, 4]], np.array([[0, 1], [1, 2], [2, 3], [3, 0]])
         else:
             points = ends
-            corners = np.array([[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]])
+            corners = np.array(
+                [
+                    [0, 1, 2],
+                    [1, 3, 2],
+                    [3, 4, 2],
+                    [4, 0, 2],
+                    [1, 0, 5],
+                    [3, 1, 5],
+                    [4, 3, 5],
+                    [0, 4, 5],
+                ]
+            )
         fields = {
             "body": np.full(len(points), len(self.bodies.bodies) + number, dtype=np.int32),
             "velocity": np.zeros((len(points), 3), dtype=np.float32),
         }
-        return BodySurface((points + self.targets[number].place(self.time)).astype(np.float32), corners.astype(np.int32), fields)
+        return BodySurface(
+            (points + self.targets[number].place(self.time)).astype(np.float32),
+            corners.astype(np.int32),
+            fields,
+        )
 
     def _row(self, pose: ReachedPose, goals: np.ndarray) -> dict[str, float | int | str | None]:
         off = np.linalg.norm(self.figure.positions(self.theta) - goals, axis=1)

@@ -32,14 +32,22 @@ class ContactSolver(Table):
     preset: PresetName | None = Field(default=None, description="unused with bodies alone")
     method: Literal[DEFAULT, *BOXED, *STEWART_TRINKLE, *CONE] = Field(
         default=DEFAULT,
-        description="sweeps-and-newton: as for bodies in liquids; lemke and after: friction model of Stewart and Trinkle; "
-        f"proximal-gauss-seidel: circular cone; others: boxed friction; default with joints: {JOINTED}",
+        description="sweeps-and-newton: as for bodies in liquids; lemke and after: friction model "
+        "of Stewart and Trinkle; "
+        "proximal-gauss-seidel: circular cone; others: boxed friction; default with joints: "
+        f"{JOINTED}",
     )
     directions: int = Field(
-        default=4, ge=2, le=64, multiple_of=2, description="sides of the friction cone of Stewart and Trinkle in 3-D, even"
+        default=4,
+        ge=2,
+        le=64,
+        multiple_of=2,
+        description="sides of the friction cone of Stewart and Trinkle in 3-D, even",
     )
     tolerance: Share = Field(default=1e-5, description="residual, relative to that of no impulses")
-    max_iterations: Count = Field(default=600, description="after these the step accepts the impulses")
+    max_iterations: Count = Field(
+        default=600, description="after these the step accepts the impulses"
+    )
     precision: PrecisionName = Field(default="double", description="double only")
 
 
@@ -53,57 +61,101 @@ class ContactOutput(Output):
 class JointTable(Table):
     """[[joint]]: connects two bodies at a point, or a body with space. Bodies of a joint do not collide."""
 
-    kind: JointKind = Field(description="ball: turns about the anchor; hinge: about an axis; fixed: not")
+    kind: JointKind = Field(
+        description="ball: turns about the anchor; hinge: about an axis; fixed: not"
+    )
     solids: list[int] = Field(
         min_length=1,
         max_length=2,
-        description="numbers of [[solid]] tables from 0: a rigid body, and a body or fixed solid; one number: joint to space",
+        description="numbers of [[solid]] tables from 0: a rigid body, and a body or fixed solid; "
+        "one number: joint to space",
     )
     anchor: Vector = Field(description="anchor in the initial pose [m]")
     axis: Vector | None = Field(default=None, description="axis of a hinge in 3-D; z in 2-D")
     limits: list[float] | None = Field(
-        default=None, min_length=2, max_length=2, description="least and largest angle of a hinge [degrees], initially 0"
+        default=None,
+        min_length=2,
+        max_length=2,
+        description="least and largest angle of a hinge [degrees], initially 0",
     )
-    motor_speed: float | None = Field(default=None, description="target speed of the motor of a hinge [degrees/s]")
-    motor_torque: Positive | None = Field(default=None, description="largest torque of the motor [N m]")
+    motor_speed: float | None = Field(
+        default=None, description="target speed of the motor of a hinge [degrees/s]"
+    )
+    motor_torque: Positive | None = Field(
+        default=None, description="largest torque of the motor [N m]"
+    )
 
     def complaints(self, dimension: int, solids: Sequence[Any]) -> list[Complaint]:
         """Return what is wrong with the joint among these solids in a scene of 2 or 3 dimensions."""
         found, hinge = [], self.kind == "hinge"
         for number in self.solids:
             if not 0 <= number < len(solids):
-                found.append(Complaint(("solids",), self.solids, f"must be numbers of [[solid]]s, from 0 to {len(solids) - 1}"))
+                found.append(
+                    Complaint(
+                        ("solids",),
+                        self.solids,
+                        f"must be numbers of [[solid]]s, from 0 to {len(solids) - 1}",
+                    )
+                )
             elif solids[number].motion is not None:
                 found.append(
-                    Complaint(("solids",), self.solids, f"solid[{number}] has a motion: bodies can be joined only to a fixed solid")
+                    Complaint(
+                        ("solids",),
+                        self.solids,
+                        f"solid[{number}] has a motion: bodies can be joined only to a fixed solid",
+                    )
                 )
         if not found and not solids[self.solids[0]].is_body:
-            found.append(Complaint(("solids",), self.solids, "the first must be a rigid body: give it a density or a mass"))
+            found.append(
+                Complaint(
+                    ("solids",),
+                    self.solids,
+                    "the first must be a rigid body: give it a density or a mass",
+                )
+            )
         if len(set(self.solids)) < len(self.solids):
             found.append(Complaint(("solids",), self.solids, "must differ"))
         for key in ("anchor", "axis"):
             value = getattr(self, key)
             if value is not None and len(value) != dimension:
-                found.append(Complaint((key,), value, f"must {counted(dimension)} in {dimension}-D"))
+                found.append(
+                    Complaint((key,), value, f"must {counted(dimension)} in {dimension}-D")
+                )
         for key in ("axis", "limits", "motor_speed", "motor_torque"):
             if not hinge and getattr(self, key) is not None:
-                found.append(Complaint((key,), getattr(self, key), f"is only for hinges: this joint is {self.kind}"))
+                found.append(
+                    Complaint(
+                        (key,), getattr(self, key), f"is only for hinges: this joint is {self.kind}"
+                    )
+                )
         if (self.motor_speed is None) != (self.motor_torque is None):
-            found.append(Complaint(("motor_torque",), self.motor_torque, "must be given together with motor_speed"))
+            found.append(
+                Complaint(
+                    ("motor_torque",), self.motor_torque, "must be given together with motor_speed"
+                )
+            )
         if hinge and dimension == 3 and (self.axis is None or not any(self.axis)):
-            found.append(Complaint(("axis",), self.axis, "must be given for a hinge in 3-D, and not be zero"))
+            found.append(
+                Complaint(("axis",), self.axis, "must be given for a hinge in 3-D, and not be zero")
+            )
         if hinge and dimension == 2 and self.axis is not None:
             found.append(Complaint(("axis",), self.axis, "must be left out in 2-D, where it is z"))
         if self.kind == "ball" and dimension == 2:
             found.append(Complaint(("kind",), self.kind, "must be hinge in 2-D"))
         if self.limits is not None and not -180.0 <= self.limits[0] <= self.limits[1] <= 180.0:
-            found.append(Complaint(("limits",), self.limits, "must be in order and within 180 degrees"))
+            found.append(
+                Complaint(("limits",), self.limits, "must be in order and within 180 degrees")
+            )
         return found
 
     def to_joint(self, bodies: Sequence[int]) -> Joint:
         """Return the joint; `bodies` has the number among the bodies of each solid, WORLD of what stands."""
-        first, second = [bodies[number] for number in [*self.solids, *([-1] if len(self.solids) == 1 else [])]]
-        anchor, axis = (np.array([*vector, 0.0][:3]) for vector in (self.anchor, self.axis or [0.0, 0.0, 1.0]))
+        first, second = [
+            bodies[number] for number in [*self.solids, *([-1] if len(self.solids) == 1 else [])]
+        ]
+        anchor, axis = (
+            np.array([*vector, 0.0][:3]) for vector in (self.anchor, self.axis or [0.0, 0.0, 1.0])
+        )
         limits = np.radians([-np.inf, np.inf] if self.limits is None else self.limits).tolist()
         speed, torque = float(np.radians(self.motor_speed or 0.0)), self.motor_torque or 0.0
         return Joint(first, second, anchor, axis, (limits[0], limits[1]), speed, torque, self.kind)
@@ -118,27 +170,40 @@ class TargetTable(Table):
     solid: int = Field(ge=0, description="number of the body among the [[solid]] tables, from 0")
     point: Vector = Field(description="point of the body, initial pose [m]")
     times: list[float] = Field(min_length=1, description="increasing [s]")
-    places: list[Vector] = Field(min_length=1, description="its places at these times [m], straight lines between")
+    places: list[Vector] = Field(
+        min_length=1, description="its places at these times [m], straight lines between"
+    )
 
     def complaints(self, dimension: int, solids: Sequence[Any]) -> list[Complaint]:
         """Return what is wrong with the target among these solids in a scene of 2 or 3 dimensions."""
         found = []
         if self.solid >= len(solids) or not solids[self.solid].is_body:
             found.append(Complaint(("solid",), self.solid, "must be the number of a rigid body"))
-        for place, value in [(("point",), self.point), *((("places", index), row) for index, row in enumerate(self.places))]:
+        for place, value in [
+            (("point",), self.point),
+            *((("places", index), row) for index, row in enumerate(self.places)),
+        ]:
             if len(value) != dimension:
                 found.append(Complaint(place, value, f"must {counted(dimension)} in {dimension}-D"))
         if not (np.diff(self.times) > 0.0).all():
             found.append(Complaint(("times",), self.times, "must increase"))
         if len(self.places) != len(self.times):
-            found.append(Complaint(("places",), self.places, f"must have {len(self.times)} entries, one for each time"))
+            found.append(
+                Complaint(
+                    ("places",),
+                    self.places,
+                    f"must have {len(self.times)} entries, one for each time",
+                )
+            )
         return found
 
 
 class ContactScene(Scene):
     """A scene of rigid bodies without a material."""
 
-    elsewhere: ClassVar = dict.fromkeys(("sand", "material", "friction"), "granular") | dict.fromkeys(("liquid", "particles"), "fluids")
+    elsewhere: ClassVar = dict.fromkeys(
+        ("sand", "material", "friction"), "granular"
+    ) | dict.fromkeys(("liquid", "particles"), "fluids")
     domain: ContactDomain
     solver: ContactSolver = Field(default_factory=ContactSolver)  # type: ignore[assignment]
     output: ContactOutput = Field(default_factory=ContactOutput)
@@ -157,7 +222,9 @@ class ContactScene(Scene):
     def body_numbers(self) -> list[int]:
         """Return the number among the bodies of each solid, WORLD of what stands, and WORLD once more at the end."""
         moving = [solid.is_body for solid in self.solid]
-        return [int(sum(moving[:index])) if body else WORLD for index, body in enumerate(moving)] + [WORLD]
+        return [
+            int(sum(moving[:index])) if body else WORLD for index, body in enumerate(moving)
+        ] + [WORLD]
 
     def joints(self) -> list[Joint]:
         """Return the joints, between bodies by their numbers among the bodies."""
@@ -165,35 +232,70 @@ class ContactScene(Scene):
 
     def targets(self) -> list[Target]:
         """Return the targets of inverse kinematics."""
-        rows = [(table, np.array([[*row, 0.0][:3] for row in [table.point, *table.places]])) for table in self.target]
-        return [Target(self.body_numbers()[table.solid], of[0], np.array(table.times), of[1:]) for table, of in rows]
+        rows = [
+            (table, np.array([[*row, 0.0][:3] for row in [table.point, *table.places]]))
+            for table in self.target
+        ]
+        return [
+            Target(self.body_numbers()[table.solid], of[0], np.array(table.times), of[1:])
+            for table, of in rows
+        ]
 
     def complaints(self) -> list[Complaint]:
         """Return what is wrong across keys."""
         found = super().complaints()
         if not any(solid.is_body for solid in self.solid):
-            found.append(Complaint(("solid",), None, "has no rigid body: give one a density or a mass"))
+            found.append(
+                Complaint(("solid",), None, "has no rigid body: give one a density or a mass")
+            )
         for key in ("particles", "grid", "surface", "volume", "forces"):
             if getattr(self.output, key):
                 found.append(Complaint(("output", key), True, f"must be false: {NO_MATERIAL}"))
         if self.physics.density != type(self.physics).model_fields["density"].default:
-            found.append(Complaint(("physics", "density"), self.physics.density, f"{NO_MATERIAL}; density is a key of each [[solid]]"))
+            found.append(
+                Complaint(
+                    ("physics", "density"),
+                    self.physics.density,
+                    f"{NO_MATERIAL}; density is a key of each [[solid]]",
+                )
+            )
         for key, usual in (("wall", "separating"), ("solids", "cut-cell"), ("follow", True)):
             if getattr(self.domain, key) != usual:
-                found.append(Complaint(("domain", key), getattr(self.domain, key), f"must be left out: {NO_MATERIAL}"))
+                found.append(
+                    Complaint(
+                        ("domain", key),
+                        getattr(self.domain, key),
+                        f"must be left out: {NO_MATERIAL}",
+                    )
+                )
         if self.solver.preset is not None:
             found.append(
                 Complaint(
-                    ("solver", "preset"), self.solver.preset, "must be left out for bodies alone: give time.dt_max and solver.tolerance"
+                    ("solver", "preset"),
+                    self.solver.preset,
+                    "must be left out for bodies alone: give time.dt_max and solver.tolerance",
                 )
             )
         if self.solver.precision != "double":
-            found.append(Complaint(("solver", "precision"), self.solver.precision, "must be double"))
+            found.append(
+                Complaint(("solver", "precision"), self.solver.precision, "must be double")
+            )
         if self.solver.directions != 4 and self.solver.method not in STEWART_TRINKLE:
-            others = "uses the circular cone" if self.solver.method in CONE else "uses the boxed friction model"
-            message = f"is only for the methods {', '.join(STEWART_TRINKLE)}; {self.solver.method} {others}"
+            others = (
+                "uses the circular cone"
+                if self.solver.method in CONE
+                else "uses the boxed friction model"
+            )
+            message = (
+                f"is only for the methods {', '.join(STEWART_TRINKLE)}; {self.solver.method} "
+                f"{others}"
+            )
             found.append(Complaint(("solver", "directions"), self.solver.directions, message))
-        return found + (self._joint_complaints() if self.joint else []) + (self._target_complaints() if self.target else [])
+        return (
+            found
+            + (self._joint_complaints() if self.joint else [])
+            + (self._target_complaints() if self.target else [])
+        )
 
     def _target_complaints(self) -> list[Complaint]:
         """Return what is wrong with targets, and with what they move."""
@@ -207,7 +309,13 @@ class ContactScene(Scene):
             found.append(Complaint(("solver", "method"), self.solver.method, message))
         for index, table in enumerate(self.joint):
             if table.motor_torque is not None:
-                found.append(Complaint(("joint", index, "motor_torque"), table.motor_torque, "must be left out: targets move the bodies"))
+                found.append(
+                    Complaint(
+                        ("joint", index, "motor_torque"),
+                        table.motor_torque,
+                        "must be left out: targets move the bodies",
+                    )
+                )
         if not found and not self._joint_complaints():
             try:
                 tree_of(self.joints(), sum(solid.is_body for solid in self.solid))
@@ -223,13 +331,26 @@ class ContactScene(Scene):
             for c in table.complaints(self.dimension, self.solid)
         ]
         if self.solver.method in (DEFAULT, *CONE):
-            message = f"cannot solve joints, which are equations; choose from {', '.join((*BOXED, *STEWART_TRINKLE))}"
+            message = (
+                "cannot solve joints, which are equations; choose from "
+                f"{', '.join((*BOXED, *STEWART_TRINKLE))}"
+            )
             found.append(Complaint(("solver", "method"), self.solver.method, message))
         if self.domain.open:
-            found.append(Complaint(("domain", "open"), self.domain.open, "must be left out in a scene with joints"))
+            found.append(
+                Complaint(
+                    ("domain", "open"), self.domain.open, "must be left out in a scene with joints"
+                )
+            )
         for index, solid in enumerate(self.solid):
             if solid.restitution:
-                found.append(Complaint(("solid", index, "restitution"), solid.restitution, "must be 0 where there are joints"))
+                found.append(
+                    Complaint(
+                        ("solid", index, "restitution"),
+                        solid.restitution,
+                        "must be 0 where there are joints",
+                    )
+                )
         return found
 
     def plan(self) -> list[tuple[str, str]]:
@@ -237,21 +358,42 @@ class ContactScene(Scene):
         kept = {"preset", "open", "moving", "bodies", "time", "frames"}
         solver, moving = self.solver, sum(solid.is_body for solid in self.solid)
         model = "the circular cone" if solver.method in CONE else "boxes"
-        model = f"Stewart and Trinkle, {solver.directions} sides" if solver.method in STEWART_TRINKLE else model
+        model = (
+            f"Stewart and Trinkle, {solver.directions} sides"
+            if solver.method in STEWART_TRINKLE
+            else model
+        )
         return [
-            *((word, line) for word, line in super().plan() if word in kept and (word != "bodies" or moving <= 8)),
+            *(
+                (word, line)
+                for word, line in super().plan()
+                if word in kept and (word != "bodies" or moving <= 8)
+            ),
             *([("bodies", f"{moving} of {len(self.solid)} solids")] if moving > 8 else []),
             *([("joints", self._joint_line())] if self.joint else []),
             *([("targets", f"{len(self.target)}, of inverse kinematics")] if self.target else []),
-            ("solver", f"{solver.method} to {solver.tolerance:g} rad, at most {solver.max_iterations} problems a step")
+            (
+                "solver",
+                f"{solver.method} to {solver.tolerance:g} rad, at most {solver.max_iterations} "
+                "problems a step",
+            )
             if self.target
-            else ("solver", f"{solver.method} to {solver.tolerance:g}, at most {solver.max_iterations} iterations; friction: {model}"),
+            else (
+                "solver",
+                f"{solver.method} to {solver.tolerance:g}, at most {solver.max_iterations} "
+                f"iterations; friction: {model}",
+            ),
         ]
 
     def _joint_line(self) -> str:
         """Return what joints there are, for the plan."""
-        counts = {kind: sum(table.kind == kind for table in self.joint) for kind in get_args(JointKind)}
-        motors, limited = (sum(getattr(table, key) is not None for table in self.joint) for key in ("motor_torque", "limits"))
+        counts = {
+            kind: sum(table.kind == kind for table in self.joint) for kind in get_args(JointKind)
+        }
+        motors, limited = (
+            sum(getattr(table, key) is not None for table in self.joint)
+            for key in ("motor_torque", "limits")
+        )
         named = {f"{count} {kind}": count for kind, count in counts.items()} | {
             f"{limited} with limits": limited,
             f"{motors} with motors": motors,
@@ -262,5 +404,11 @@ class ContactScene(Scene):
         """Return what is wrong with the domain; its sides need not be whole numbers of cells."""
         found = self.domain.spacing_complaints()
         if self.domain.periodic is not None and len(self.domain.periodic) != self.dimension:
-            found.append(Complaint(("domain", "periodic"), self.domain.periodic, f"must have {self.dimension} entries"))
+            found.append(
+                Complaint(
+                    ("domain", "periodic"),
+                    self.domain.periodic,
+                    f"must have {self.dimension} entries",
+                )
+            )
         return found

@@ -18,13 +18,22 @@ from warp_lcp.scene.scene import Scene
 from warp_lcp.simulation import NoStopwatch, Part, SimulationFailed, Stopwatch, Surface
 from warp_lcp.solvers.registry import METHODS
 
-COLUMNS = ("kinetic_energy", "potential_energy", "max_speed", "solver", "solve_status", "solve_iterations", "solve_residual")
+COLUMNS = (
+    "kinetic_energy",
+    "potential_energy",
+    "max_speed",
+    "solver",
+    "solve_status",
+    "solve_iterations",
+    "solve_residual",
+)
 
 
 class ContactSimulation:
     """Rigid bodies on their way, as `RigidBodies` moves them.
 
-    Velocities are those of the middle of the last step: v' = v + g (dt + dt_before) / 2 + M^-1 J' r, x' = x + dt v'.
+    Velocities are those of the middle of the last step: v' = v + g (dt + dt_before) / 2 + M^-1 J'
+    r, x' = x + dt v'.
 
     Args:
         scene: what is simulated.
@@ -71,9 +80,11 @@ class ContactSimulation:
     def columns(self) -> tuple[str, ...]:
         """Return the names of the log's columns.
 
-        Energies [J; J/m in 2-D] are those of the step's middle, of which the velocities are; potential_energy is 0 at the origin.
-        max_speed: of a point of a body [m/s]. solve_residual: of the problem of the contacts' impulses as the method takes it, relative
-        to that of no impulses; empty, as what stands before it, where nothing touches. The bodies' are those of `RigidBodies.columns`.
+        Energies [J; J/m in 2-D] are those of the step's middle, of which the velocities are;
+        potential_energy is 0 at the origin. max_speed: of a point of a body [m/s]. solve_residual:
+        of the problem of the contacts' impulses as the method takes it, relative to that of no
+        impulses; empty, as what stands before it, where nothing touches. The bodies' are those of
+        `RigidBodies.columns`.
         """
         return (*COLUMNS, *self.bodies.columns())
 
@@ -95,7 +106,10 @@ class ContactSimulation:
         """
         missing = {"clock", "step_count", "bodies"} - set(state)
         if missing:
-            raise ValueError(f"the state does not belong to a scene of bodies alone: it lacks {', '.join(sorted(missing))}")
+            raise ValueError(
+                "the state does not belong to a scene of bodies alone: it lacks "
+                f"{', '.join(sorted(missing))}"
+            )
         self.bodies.restore(state)
         self.time, self._last_dt = (float(value) for value in state["clock"])
         self.step_count = int(state["step_count"])
@@ -105,12 +119,16 @@ class ContactSimulation:
         sides = " x ".join(f"{side:g}" for side in self.scene.domain.size)
         count = len(self.bodies.bodies)
         room = "an unbounded domain" if self.scene.domain.boundless else f"{sides} m"
-        return [f"{count} rigid {'body' if count == 1 else 'bodies'} in {room}", *self.scene.notes()]
+        return [
+            f"{count} rigid {'body' if count == 1 else 'bodies'} in {room}",
+            *self.scene.notes(),
+        ]
 
     def _row(self, dt: float, status: str) -> dict[str, float | int | str | None]:
         bodies, solved = self.bodies, self.bodies.contacts > 0 or bool(self.bodies.joints)
         momentum = bodies.bodies.momentum.sum(axis=0)
-        energy = bodies.potential_energy(self.gravity) + 0.5 * dt * float(momentum @ self.gravity)  # back by half a step
+        # back by half a step
+        energy = bodies.potential_energy(self.gravity) + 0.5 * dt * float(momentum @ self.gravity)
         own: dict[str, float | int | str | None] = {
             "kinetic_energy": bodies.kinetic_energy(),
             "potential_energy": energy,
@@ -130,24 +148,34 @@ class ContactSimulator:
     summary = "rigid bodies that stack, slide, topple and bounce"
     scene_model = ContactScene
 
-    def create(self, scene: Scene, *, device: str, folder: Path) -> ContactSimulation | KinematicSimulation:
+    def create(
+        self, scene: Scene, *, device: str, folder: Path
+    ) -> ContactSimulation | KinematicSimulation:
         """Build a simulation of `scene`.
 
         Args:
             scene: a ContactScene.
-            device: a Warp device's name; of the methods but the default one, which works on the CPU.
+            device: a Warp device's name; of the methods but the default one, which works on the
+                CPU.
             folder: where the files are that the scene names.
 
         Raises:
-            ValueError: the scene cannot be simulated; the message names the key and what is allowed.
+            ValueError: the scene cannot be simulated; the message names the key and what is
+                allowed.
         """
         if not isinstance(scene, ContactScene):
             raise ValueError("scene.simulator: contacts needs a scene of rigid bodies")
         solver = scene.solver
         method = MethodOfChoice(
-            solver.method, directions=solver.directions, tolerance=solver.tolerance, most=solver.max_iterations, device=device
+            solver.method,
+            directions=solver.directions,
+            tolerance=solver.tolerance,
+            most=solver.max_iterations,
+            device=device,
         )
-        bodies = make_bodies(scene, placed_solids(scene, folder), partial(RigidBodies, solver=method))
+        bodies = make_bodies(
+            scene, placed_solids(scene, folder), partial(RigidBodies, solver=method)
+        )
         assert bodies is not None  # of which the scene has one
         if scene.target:
             solve = InverseKinematics(
@@ -157,5 +185,7 @@ class ContactSimulator:
                 curvature=True,
                 device=device,
             )
-            return KinematicSimulation(bodies, scene.targets(), solve, solver.method, scene.time.dt_max)
+            return KinematicSimulation(
+                bodies, scene.targets(), solve, solver.method, scene.time.dt_max
+            )
         return ContactSimulation(scene, bodies, method)

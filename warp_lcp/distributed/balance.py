@@ -16,7 +16,8 @@ from warp_lcp.multigrid.halo_levels import GATHERED
 if TYPE_CHECKING:
     from warp_lcp.distributed.subdomain import Subdomain
 
-STEP = 1 << 13  # cells full of material whose work is that which a step takes however little there is of it
+# cells full of material whose work is that which a step takes however little there is of it
+STEP = 1 << 13
 BLOCKS = 128  # of a rank, five along an axis
 ROUNDS = 4  # over the axes: each leaves the busiest rank no more to do than before
 
@@ -41,21 +42,31 @@ class Load:
     edge: int
     material: np.ndarray
 
-    def best(self, ranks: int, start: Parts | None = None, *, rank: int | None = None) -> tuple[float, Parts] | None:
+    def best(
+        self, ranks: int, start: Parts | None = None, *, rank: int | None = None
+    ) -> tuple[float, Parts] | None:
         """Return what the busiest rank has to do at least, and the cuts for that; None: there are too many ranks for the grid.
 
-        Cuts along one axis are the best there are for those along the others (dynamic programming); the axes take turns.
+        Cuts along one axis are the best there are for those along the others (dynamic programming);
+        the axes take turns.
 
         Args:
             ranks: how many.
             start: cuts to start from as well, so that what is found is no worse.
-            rank: look at what falls to this one where all look, each at some numbers of boxes along x, y, z; None: at all.
+            rank: look at what falls to this one where all look, each at some numbers of boxes along
+                x, y, z; None: at all.
         """
         total, found = float(self.material.sum()), list[tuple[float, Parts]]()
 
         def least(p: Triple) -> float:
             """Return what the busiest rank has to do if all have as much."""
-            return (total + OPEN * math.prod(n + 2 * self.layers * (a - 1) for n, a in zip(self.counts, p, strict=True))) / ranks
+            return (
+                total
+                + OPEN
+                * math.prod(
+                    n + 2 * self.layers * (a - 1) for n, a in zip(self.counts, p, strict=True)
+                )
+            ) / ranks
 
         processes = sorted(cuttings(self.counts, ranks), key=lambda p: (least(p), p))
         for p in processes if rank is None else processes[rank::ranks]:
@@ -88,13 +99,26 @@ class Load:
         """Return the best cuts along an axis for those along the others, and what the busiest rank then has to do; None: there are none."""
         n, ranks, others = self.counts[axis], len(cut[axis]), [a for a in range(3) if a != axis]
         ends = np.append(np.arange(0, n, self.edge), n)
-        beside, material = seen_by(self.counts, [*cut[:axis], [n], *cut[axis + 1 :]], self.layers), np.moveaxis(self.material, axis, 0)
+        beside, material = (
+            seen_by(self.counts, [*cut[:axis], [n], *cut[axis + 1 :]], self.layers),
+            np.moveaxis(self.material, axis, 0),
+        )
         for place, other in enumerate(others, start=1):
-            material = np.diff(_through(material, place).take(-(-np.cumsum([0, *cut[other]]) // self.edge), axis=place), axis=place)
+            material = np.diff(
+                _through(material, place).take(
+                    -(-np.cumsum([0, *cut[other]]) // self.edge), axis=place
+                ),
+                axis=place,
+            )
         through = _through(material.reshape(len(material), -1), 0)
         thick = ends[None] - ends[:, None]
-        seen = OPEN / n * (np.minimum(ends + self.layers, n)[None] - np.maximum(ends - self.layers, 0)[:, None])
-        work = np.where(thick >= min(max(self.layers, self.edge), n), 0.0, np.inf)  # of the busiest box from a block up to another
+        seen = (
+            OPEN
+            / n
+            * (np.minimum(ends + self.layers, n)[None] - np.maximum(ends - self.layers, 0)[:, None])
+        )
+        # of the busiest box from a block up to another
+        work = np.where(thick >= min(max(self.layers, self.edge), n), 0.0, np.inf)
         for box, cells in enumerate(beside.ravel()):
             np.maximum(work, through[None, :, box] - through[:, None, box] + cells * seen, out=work)
         most, came = work[0], list[np.ndarray]()
@@ -120,13 +144,14 @@ def _through(material: np.ndarray, axis: int) -> np.ndarray:
 class Balance:
     """When the boxes of ranks are cut anew.
 
-    Whether that is in a step depends on the step's number, on where particles are and on the boxes alone, so that a run that goes on from a
-    checkpoint does the same.
+    Whether that is in a step depends on the step's number, on where particles are and on the boxes
+    alone, so that a run that goes on from a checkpoint does the same.
 
     Args:
         every: steps between two looks.
-        bound: how many times what it will be the time of a step must be: then a fifth of `every` steps is gained until the next look. To
-            cut anew takes the time of 2 to 3 steps, of 5 to 8 where it has to measure a mesh.
+        bound: how many times what it will be the time of a step must be: then a fifth of `every`
+            steps is gained until the next look. To cut anew takes the time of 2 to 3 steps, of 5 to
+            8 where it has to measure a mesh.
         fixed: what a step takes besides, in cells full of material.
     """
 
@@ -149,14 +174,22 @@ class Balance:
         now, layers, fixed = part.decomposition, part.layers, self.fixed
         work = [
             n / a_cell + OPEN * seen
-            for n, seen in zip(particles.exchange.counts, seen_by(now.counts, now.parts, layers).ravel("F"), strict=True)
+            for n, seen in zip(
+                particles.exchange.counts,
+                seen_by(now.counts, now.parts, layers).ravel("F"),
+                strict=True,
+            )
         ]
-        if max(work) + fixed <= self.bound * (math.fsum(work) / len(work) + fixed):  # the same on all ranks
+        # the same on all ranks
+        if max(work) + fixed <= self.bound * (math.fsum(work) / len(work) + fixed):
             return None
         edge = edge_of_blocks(now.counts, part.ranks.size)
         load = Load(now.counts, layers, edge, blocks(part, particles, edge) / a_cell)
         everyone = part.ranks.collect(load.best(part.ranks.size, now.parts, rank=part.ranks.rank))
-        least, cut = min((found for found in everyone if found is not None), default=(math.inf, now.parts))  # none end between blocks
+        # none end between blocks
+        least, cut = min(
+            (found for found in everyone if found is not None), default=(math.inf, now.parts)
+        )
         gains = cut != now.parts and max(work) + fixed > self.bound * (least + fixed)
         return now.repartition(cut) if gains else None
 
@@ -173,7 +206,11 @@ def blocks(part: Subdomain, particles: Particles, edge: int) -> np.ndarray:
     """Return how many of all ranks' particles each block of cells has; collective."""
     counts = part.decomposition.counts
     shape = [-(-n // edge) for n in counts]
-    place = np.clip((particles.position.numpy() / (part.grid.spacing * edge)).astype(np.int64), 0, np.array(shape) - 1)
+    place = np.clip(
+        (particles.position.numpy() / (part.grid.spacing * edge)).astype(np.int64),
+        0,
+        np.array(shape) - 1,
+    )
     if part.dimension == 2:
         place[:, 2] = 0
     mine = np.bincount(np.ravel_multi_index(tuple(place.T), shape), minlength=math.prod(shape))

@@ -16,7 +16,9 @@ from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.waiting import finish, waiting
 from warp_lcp.distributed.watchdog import Watchdog
 
-PATIENCE = 5.0  # seconds that a rank waits for the others after a failure: they may be inside MPI, from where nothing brings them back
+# seconds that a rank waits for the others after a failure: they may be inside MPI, from where
+# nothing brings them back
+PATIENCE = 5.0
 SHOWN = 3  # failures in one message
 
 
@@ -46,9 +48,10 @@ class Failure:
 class Collective:
     """Collective blocks of code: an exception on one rank is raised on all ranks.
 
-    At the end of a block the ranks exchange its outcome. If it failed on some ranks, all raise: the error's own class if that is
-    among `planned`, with a message that names the rank; else `RankFailed`. If a rank fails while the others are inside a
-    collective operation, it waits PATIENCE seconds for them and then aborts all processes.
+    At the end of a block the ranks exchange its outcome. If it failed on some ranks, all raise: the
+    error's own class if that is among `planned`, with a message that names the rank; else
+    `RankFailed`. If a rank fails while the others are inside a collective operation, it waits
+    PATIENCE seconds for them and then aborts all processes.
 
     Args:
         ranks: the ranks.
@@ -67,7 +70,10 @@ class Collective:
     """
 
     def __init__(
-        self, ranks: Ranks, planned: tuple[type[Exception], ...] = (OSError,), last_words: Callable[[str], object] = lambda text: None
+        self,
+        ranks: Ranks,
+        planned: tuple[type[Exception], ...] = (OSError,),
+        last_words: Callable[[str], object] = lambda text: None,
     ) -> None:
         """Take a communicator of its own, so that its messages are never mistaken for others."""
         self.ranks = ranks
@@ -126,7 +132,8 @@ class Collective:
             named: say which rank has failed.
 
         Raises:
-            BaseException: what failed on other ranks, or on this one with a message that tells the rank.
+            BaseException: what failed on other ranks, or on this one with a message that tells the
+                rank.
         """
         failure = self._failure(error)
         found = self._meet(error, failure)
@@ -171,10 +178,15 @@ class Collective:
             found: list[tuple[int, Failure | None]] = self._own.collect((self._depth, failure))
             if max(depth for depth, _ in found) <= self._depth or failure is None:
                 return [other for _, other in found]
-            # a rank that failed between two blocks meets those that were still inside one: they come again
+            # a rank that failed between two blocks meets those that were still inside one: they
+            # come again
 
     def _end_all(self, error: BaseException) -> None:
-        text = str(error) if isinstance(error, self._planned) else "".join(traceback.format_exception(error)).rstrip()
+        text = (
+            str(error)
+            if isinstance(error, self._planned)
+            else "".join(traceback.format_exception(error)).rstrip()
+        )
         self.end_all(f"rank {self.ranks.rank} of {self.ranks.size}: {text}\nall ranks are aborted")
 
     def told_as(self, error: BaseException) -> BaseException:
@@ -192,7 +204,8 @@ def _joined(failed: list[tuple[int, Failure]], named: bool) -> BaseException:
     """Return one error for what failed on some ranks."""
     first = failed[0][1]
     texts = list(_lines(failed)) if named else [first.text]
-    error = first.kind.__new__(first.kind)  # without __init__, whose arguments are not the same for all kinds
+    # without __init__, whose arguments are not the same for all kinds
+    error = first.kind.__new__(first.kind)
     error.args = ("; ".join(texts),)
     if isinstance(error, OSError):
         error.errno = first.errno
@@ -205,7 +218,11 @@ def _lines(failed: list[tuple[int, Failure]]) -> Iterator[str]:
     for rank, failure in failed:
         ranks.setdefault(failure.text, []).append(rank)
     for text, those in list(ranks.items())[:SHOWN]:
-        yield f"rank {those[0]}: {text}" if len(those) == 1 else f"ranks {', '.join(map(str, those))}: {text}"
+        yield (
+            f"rank {those[0]}: {text}"
+            if len(those) == 1
+            else f"ranks {', '.join(map(str, those))}: {text}"
+        )
     if len(ranks) > SHOWN:
         yield f"and {len(ranks) - SHOWN} other messages"
 

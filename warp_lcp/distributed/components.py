@@ -25,5 +25,7 @@ def joined(ranks: Ranks, nodes: int, edges: np.ndarray) -> np.ndarray:
         edges: pairs of nodes that this rank knows to belong together, int32, shape (n, 2).
     """
     everyone = np.concatenate(ranks.collect(edges))
-    graph = scipy.sparse.coo_matrix((np.ones(len(everyone)), tuple(everyone.T)), shape=(nodes, nodes))
+    graph = scipy.sparse.coo_matrix(
+        (np.ones(len(everyone)), tuple(everyone.T)), shape=(nodes, nodes)
+    )
     return np.asarray(scipy.sparse.csgraph.connected_components(graph, directed=False)[1])

@@ -20,7 +20,9 @@ from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.grid.cell_box import CellBox, Triple
 from warp_lcp.settings import renamed_method
 
-UNEVEN = 1.125  # the largest part may exceed an even share by this factor, so that cuts lie at multiples of large powers of two
+# the largest part may exceed an even share by this factor, so that cuts lie at multiples of large
+# powers of two
+UNEVEN = 1.125
 
 
 class Decomposition:
@@ -30,7 +32,8 @@ class Decomposition:
         counts: cells (nx, ny, nz) of the whole grid; nz = 1 in 2-D.
         ranks: the ranks.
         processes: ranks along x, y, z; None: those with the fewest cells at cuts.
-        cuts: cells of each box along x, y, z; None: even ones, with cuts at multiples of a power of two.
+        cuts: cells of each box along x, y, z; None: even ones, with cuts at multiples of a power of
+            two.
         periodic: periodic axes.
 
     Attributes:
@@ -48,17 +51,32 @@ class Decomposition:
     """
 
     def __init__(
-        self, counts: Triple, ranks: Ranks, *, processes: Triple | None = None, cuts: Sequence[Sequence[int]] | None = None,
+        self,
+        counts: Triple,
+        ranks: Ranks,
+        *,
+        processes: Triple | None = None,
+        cuts: Sequence[Sequence[int]] | None = None,
         periodic: Sequence[int] = (),
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.counts, self.ranks, self.periodic = counts, ranks, tuple(periodic)
         self.processes = processes or _processes(counts, ranks.size)
         if math.prod(self.processes) != ranks.size:
-            raise ValueError(f"processes = {self.processes}: the product must be the number of ranks, {ranks.size}")
-        self.parts = [list(c) for c in cuts] if cuts else [parts(n, p) for n, p in zip(counts, self.processes, strict=True)]
+            raise ValueError(
+                f"processes = {self.processes}: the product must be the number of ranks, "
+                f"{ranks.size}"
+            )
+        self.parts = (
+            [list(c) for c in cuts]
+            if cuts
+            else [parts(n, p) for n, p in zip(counts, self.processes, strict=True)]
+        )
         starts = [[0, *itertools.accumulate(part)] for part in self.parts]
         places = map(self.place, range(ranks.size))
-        self.boxes = [CellBox.of(*([s[p + n] for s, p in zip(starts, place, strict=True)] for n in range(2))) for place in places]
+        self.boxes = [
+            CellBox.of(*([s[p + n] for s, p in zip(starts, place, strict=True)] for n in range(2)))
+            for place in places
+        ]
 
     def repartition(self, cuts: Sequence[Sequence[int]]) -> Decomposition:
         """Return a decomposition of the same cells and ranks with other box sizes.
@@ -66,7 +84,9 @@ class Decomposition:
         `cuts` holds the cells of each box along x, y, z.
         """
         px, py, pz = map(len, cuts)
-        other = Decomposition(self.counts, self.ranks, processes=(px, py, pz), cuts=cuts, periodic=self.periodic)
+        other = Decomposition(
+            self.counts, self.ranks, processes=(px, py, pz), cuts=cuts, periodic=self.periodic
+        )
         other.collective = self.collective  # a communicator of its own for each would use them up
         return other
 
@@ -129,11 +149,17 @@ class Decomposition:
         """
         new = []
         for part, factor in zip(self.parts, factors, strict=True):
-            if len(part) > 1 and (any(m % factor for m in part[:-1]) or -(-part[-1] // factor) < 1 or min(part) < factor):
+            if len(part) > 1 and (
+                any(m % factor for m in part[:-1])
+                or -(-part[-1] // factor) < 1
+                or min(part) < factor
+            ):
                 return None
             new.append([-(-m // factor) for m in part])
         nx, ny, nz = (-(-n // f) for n, f in zip(self.counts, factors, strict=True))
-        return Decomposition((nx, ny, nz), self.ranks, processes=self.processes, cuts=new, periodic=self.periodic)
+        return Decomposition(
+            (nx, ny, nz), self.ranks, processes=self.processes, cuts=new, periodic=self.periodic
+        )
 
     @property
     def ghosts(self) -> Halo | None:
@@ -149,7 +175,9 @@ class Decomposition:
         """Return a block in which an exception of one rank is raised on all."""
         return self.collective.together()
 
-    def check_operator(self, shape: tuple[int, ...], periodic: Sequence[bool], coefficients: Mapping[str, Any]) -> None:
+    def check_operator(
+        self, shape: tuple[int, ...], periodic: Sequence[bool], coefficients: Mapping[str, Any]
+    ) -> None:
         """Refuse a grid operator that does not fit the boxes; collective.
 
         Args:
@@ -158,19 +186,29 @@ class Decomposition:
             coefficients: numbers, arrays or None, by name.
 
         Raises:
-            ValueError: the shape is not that of the box, an axis is periodic, a box is one cell thin at a cut, or the kinds of coefficients
-                differ; on all ranks.
+            ValueError: the shape is not that of the box, an axis is periodic, a box is one cell
+                thin at a cut, or the kinds of coefficients differ; on all ranks.
         """
         with self.together():
             expected = tuple(reversed(self.box.counts))
             if any(periodic):
-                raise ValueError("periodic: periodic axes are not supported on several ranks; use one rank")
+                raise ValueError(
+                    "periodic: periodic axes are not supported on several ranks; use one rank"
+                )
             if shape != expected and not (shape == expected[1:] and self.counts[2] == 1):
-                raise ValueError(f"cells has shape {shape}: expected {expected}, the cells of rank {self.ranks.rank}")
+                raise ValueError(
+                    f"cells has shape {shape}: expected {expected}, the cells of rank "
+                    f"{self.ranks.rank}"
+                )
             for axis in self.cut_axes:
                 if min(self.parts[axis]) < 2:
-                    raise ValueError(f"a rank has one cell along {'xyz'[axis]}: boxes of shared operators have at least two")
-        kinds = [(name, np.ndim(value) > 0 or value) for name, value in sorted(coefficients.items())]
+                    raise ValueError(
+                        f"a rank has one cell along {'xyz'[axis]}: boxes of shared operators have "
+                        "at least two"
+                    )
+        kinds = [
+            (name, np.ndim(value) > 0 or value) for name, value in sorted(coefficients.items())
+        ]
         self.ranks.agree("the kind of coefficients", kinds)
 
     @cached_property
@@ -188,9 +226,15 @@ class Decomposition:
         """DMDA of PETSc with these boxes: one value per cell, 7-point stencils."""
         PETSc = petsc()
         made = PETSc.DMDA().create(
-            dim=3, dof=1, sizes=self.counts, proc_sizes=self.processes, ownership_ranges=self.parts, stencil_width=1,
-            stencil_type=PETSc.DMDA.StencilType.STAR, comm=self.ranks.comm,
-        )  # fmt: skip
+            dim=3,
+            dof=1,
+            sizes=self.counts,
+            proc_sizes=self.processes,
+            ownership_ranges=self.parts,
+            stencil_width=1,
+            stencil_type=PETSc.DMDA.StencilType.STAR,
+            comm=self.ranks.comm,
+        )
         weakref.finalize(self, made.destroy)  # as of `halo.StarForest`
         return made
 
@@ -214,26 +258,37 @@ def parts(n: int, p: int) -> list[int]:
 def _processes(counts: Triple, size: int) -> Triple:
     """Return the ranks along x, y, z with the least cells at cuts; of equal ones those that cut z, whose planes lie in one piece."""
     nx, ny, nz = counts
-    found = [((px - 1) * ny * nz + (py - 1) * nx * nz + (pz - 1) * nx * ny, px, py, (px, py, pz)) for px, py, pz in cuttings(counts, size)]
+    found = [
+        ((px - 1) * ny * nz + (py - 1) * nx * nz + (pz - 1) * nx * ny, px, py, (px, py, pz))
+        for px, py, pz in cuttings(counts, size)
+    ]
     if not found:
         most = next(fewer for fewer in range(size - 1, 0, -1) if cuttings(counts, fewer))
-        raise ValueError(f"{size} ranks cannot share {' x '.join(map(str, counts))} cells, each with a box: start {most} or fewer")
+        raise ValueError(
+            f"{size} ranks cannot share {' x '.join(map(str, counts))} cells, each with a box: "
+            f"start {most} or fewer"
+        )
     return min(found)[3]
 
 
 def cuttings(counts: Triple, size: int) -> list[Triple]:
     """Return the numbers of ranks along x, y, z, whose product is `size`, that leave each rank a cell."""
     divisors = [p for p in range(1, size + 1) if size % p == 0]
-    triples = [(px, py, size // (px * py)) for px in divisors for py in divisors if size // px % py == 0]
+    triples = [
+        (px, py, size // (px * py)) for px in divisors for py in divisors if size // px % py == 0
+    ]
     return [p for p in triples if all(a <= n for a, n in zip(p, counts, strict=True))]
 
 
-OPEN = 0.1  # of the work that a cell full of material makes: what a cell without makes, ghost cells too
+# of the work that a cell full of material makes: what a cell without makes, ghost cells too
+OPEN = 0.1
 
 Corners = tuple[np.ndarray, np.ndarray]  # low and high x, y, z of a box of material, in cells
 
 
-def balanced_processes(counts: Triple, size: int, *, layers: int, states: Sequence[Sequence[Corners]]) -> Triple | None:
+def balanced_processes(
+    counts: Triple, size: int, *, layers: int, states: Sequence[Sequence[Corners]]
+) -> Triple | None:
     """Return the ranks along x, y, z for which the busiest has least to do; None if there are too many for the grid.
 
     Args:
@@ -275,18 +330,30 @@ def pool(counts: Triple, dimension: int, volume: float, gravity: np.ndarray) -> 
     return low, high
 
 
-def _most_work(counts: Triple, cuts: list[list[int]], layers: int, state: Sequence[Corners]) -> float:
+def _most_work(
+    counts: Triple, cuts: list[list[int]], layers: int, state: Sequence[Corners]
+) -> float:
     """Return what the busiest rank has to do, in cells full of material."""
     low, high = _ends(cuts)
     work = OPEN * seen_by(counts, cuts, layers)
     for corners in state:
-        work += _of_boxes([np.clip(np.minimum(b, h) - np.maximum(a, l), 0.0, None) for a, b, l, h in zip(*corners, low, high, strict=True)])
+        work += _of_boxes(
+            [
+                np.clip(np.minimum(b, h) - np.maximum(a, l), 0.0, None)
+                for a, b, l, h in zip(*corners, low, high, strict=True)
+            ]
+        )
     return float(work.max())
 
 
 def seen_by(counts: Triple, cuts: Sequence[Sequence[int]], layers: int) -> np.ndarray:
     """Return how many cells each box has with its ghost layers, shape (boxes along x, y, z)."""
-    return _of_boxes([np.minimum(h + layers, n) - np.maximum(l - layers, 0) for l, h, n in zip(*_ends(cuts), counts, strict=True)])
+    return _of_boxes(
+        [
+            np.minimum(h + layers, n) - np.maximum(l - layers, 0)
+            for l, h, n in zip(*_ends(cuts), counts, strict=True)
+        ]
+    )
 
 
 def _ends(cuts: Sequence[Sequence[int]]) -> tuple[list[np.ndarray], list[np.ndarray]]:

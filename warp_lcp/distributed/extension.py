@@ -11,14 +11,16 @@ import warp as wp
 if TYPE_CHECKING:
     from warp_lcp.distributed.subdomain import Subdomain
 
-LEAST_RIGHT = 2  # layers of ghost cells that stay right while the velocity is continued: faces at cut cells look so far
+# layers of ghost cells that stay right while the velocity is continued: faces at cut cells look so
+# far
+LEAST_RIGHT = 2
 
 
 def too_far(part: Subdomain, velocity: Sequence[wp.array], dt: float) -> float:
     """Return how many cells a face's velocity goes in a time step that may take particles out of the ghost layers; 0: none does.
 
-    A particle at most looks at faces three quarters of its way from where it starts, so that those deep in the box may be faster. Values
-    that are not finite are left to the particles to tell.
+    A particle at most looks at faces three quarters of its way from where it starts, so that those
+    deep in the box may be faster. Values that are not finite are left to the particles to tell.
 
     Args:
         part: where this rank works.

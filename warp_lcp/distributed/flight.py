@@ -21,9 +21,10 @@ Plane = tuple[tuple[slice, ...], np.ndarray]  # cells, and their nodes
 class TreesAtCuts:
     """Join the trees of several ranks to bodies.
 
-    A rank grows the trees of its cells and of those beside them at cuts, where weights are right. Its trees are nodes of a graph, whose
-    edges are cells that two ranks know. Sums over the particles of a body are whole numbers, so that those of all ranks, of bodies that
-    several have trees of, are one process's to the bit; a rank keeps all others to itself.
+    A rank grows the trees of its cells and of those beside them at cuts, where weights are right.
+    Its trees are nodes of a graph, whose edges are cells that two ranks know. Sums over the
+    particles of a body are whole numbers, so that those of all ranks, of bodies that several have
+    trees of, are one process's to the bit; a rank keeps all others to itself.
 
     Args:
         part: where this rank works.
@@ -31,12 +32,20 @@ class TreesAtCuts:
 
     def __init__(self, part: Subdomain) -> None:
         self._part = part
-        self._cuts = [self._planes(axis, side) for axis in range(part.dimension) for side in range(2) if part.cuts >> 2 * axis + side & 1]
+        self._cuts = [
+            self._planes(axis, side)
+            for axis in range(part.dimension)
+            for side in range(2)
+            if part.cuts >> 2 * axis + side & 1
+        ]
 
     def _planes(self, axis: int, side: int) -> list[Window]:
         """Return the cells of the box at a cut, and those beyond it, with the rings at the domain's sides."""
         known, place = self._part.known, 2 - axis
-        first, planes = self._part.owned.high[place] - 1 if side else self._part.owned.low[place], []
+        first, planes = (
+            self._part.owned.high[place] - 1 if side else self._part.owned.low[place],
+            [],
+        )
         for n in (first, first + 2 * side - 1):
             low, high = list(known.low[::-1]), list(known.high[::-1])
             low[place], high[place] = n, n + 1
@@ -75,7 +84,9 @@ class TreesAtCuts:
         several[component[GROUND]] = False
         mine, shared = component[first : first + trees], int(several.sum())
         own = ~several[mine] & (mine != component[GROUND])
-        rows = np.where(own, shared + np.cumsum(own) - 1, np.where(several, np.cumsum(several) - 1, -1)[mine])
+        rows = np.where(
+            own, shared + np.cumsum(own) - 1, np.where(several, np.cumsum(several) - 1, -1)[mine]
+        )
         return BodyNumbers(shared + int(own.sum()), shared, rows.astype(np.int32))
 
     def _nodes_at_cuts(self, seen: Window | None, *found: wp.array) -> list[list[Plane]]:
@@ -83,7 +94,14 @@ class TreesAtCuts:
         fields = [field.numpy() for field in found]
         return [[self._nodes(plane, seen, *fields) for plane in pair] for pair in self._cuts]
 
-    def _nodes(self, plane: Window, seen: Window | None, parent: np.ndarray, number: np.ndarray, held: np.ndarray) -> Plane:
+    def _nodes(
+        self,
+        plane: Window,
+        seen: Window | None,
+        parent: np.ndarray,
+        number: np.ndarray,
+        held: np.ndarray,
+    ) -> Plane:
         """Return those of a plane's cells that were seen, and their nodes with this rank's first tree as 1, int32, in their shape."""
         inside = None if seen is None else plane.common(seen)
         if inside is None:
@@ -92,5 +110,7 @@ class TreesAtCuts:
         roots = parent.reshape(self._part.grid.shape)[cells]
         while not np.array_equal(roots, higher := parent[roots]):
             roots = higher
-        nodes = np.where(number[roots] >= 0, number[roots] + 1, np.where(held[roots] > 0, GROUND, ALONE))
+        nodes = np.where(
+            number[roots] >= 0, number[roots] + 1, np.where(held[roots] > 0, GROUND, ALONE)
+        )
         return cells, nodes.astype(np.int32)

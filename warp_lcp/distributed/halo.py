@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 class Halo:
     """Halo exchange: fill the ghost cells of fields that each rank stores for its box.
 
-    A star forest of PETSc maps each ghost cell to a cell of another rank: neighbors send each other the values
-    at their sides, edges and corners in one message each. Elements have 1, 2, 4 or 8 bytes. Ghost cells at the
-    domain's own sides keep their values.
+    A star forest of PETSc maps each ghost cell to a cell of another rank: neighbors send each other
+    the values at their sides, edges and corners in one message each. Elements have 1, 2, 4 or 8
+    bytes. Ghost cells at the domain's own sides keep their values.
 
     Args:
         decomposition: the boxes.
@@ -53,7 +53,9 @@ class Halo:
         boxes = decomposition.boxes
         stored = [box.grown(width) for box in boxes]
         several, shifts = decomposition.ranks.size > 1, decomposition.shifts
-        self._forest = star_forest(decomposition.ranks, boxes, stored, shifts=shifts) if several else None
+        self._forest = (
+            star_forest(decomposition.ranks, boxes, stored, shifts=shifts) if several else None
+        )
         self._staging: dict[Any, np.ndarray] = {}
         self._coarser: dict[tuple[int, int, int], Halo | None] = {}
 
@@ -67,27 +69,39 @@ class Halo:
     def cuts(self) -> list[tuple[int, int]]:
         """Sides of the box with a neighbor rank, as (axis, 0 lower or 1 upper)."""
         d = self.decomposition
-        return [(axis, side) for axis in d.cut_axes for side in range(2) if d.neighbor(axis, side) is not None]
+        return [
+            (axis, side)
+            for axis in d.cut_axes
+            for side in range(2)
+            if d.neighbor(axis, side) is not None
+        ]
 
     def coarser(self, factors: tuple[int, int, int]) -> Halo | None:
         """Return the halo of aggregates of cells along x, y, z; None if one is cut."""
         if factors not in self._coarser:  # solves on the same boxes share what it takes to exchange
             decomposition = self.decomposition.coarser(factors)
-            self._coarser[factors] = None if decomposition is None else Halo(decomposition, self.width)
+            self._coarser[factors] = (
+                None if decomposition is None else Halo(decomposition, self.width)
+            )
         return self._coarser[factors]
 
-    def join_components(self, number: np.ndarray, held: np.ndarray, faces: Sequence[np.ndarray | float]) -> np.ndarray | None:
+    def join_components(
+        self, number: np.ndarray, held: np.ndarray, faces: Sequence[np.ndarray | float]
+    ) -> np.ndarray | None:
         """Join components of this rank's cells with those of others; collective.
 
-        Components of boxes that nothing holds are nodes of a graph, whose edges are open faces at cuts; one more node is all that is held.
+        Components of boxes that nothing holds are nodes of a graph, whose edges are open faces at
+        cuts; one more node is all that is held.
 
         Args:
-            number: of the component of each stored cell, flat, from 0; -1: none, or something holds it.
+            number: of the component of each stored cell, flat, from 0; -1: none, or something holds
+                it.
             held: which stored cells belong to components that something holds, bool.
             faces: coefficients of the lower faces along x, y, z, stored or one number; 0: closed.
 
         Returns:
-            The numbers of the joined components that nothing holds on any rank, int32, flat, from 0, -1 elsewhere; None: there are none.
+            The numbers of the joined components that nothing holds on any rank, int32, flat, from
+            0, -1 elsewhere; None: there are none.
         """
         ranks = self.decomposition.ranks
         first, nodes = nodes_of(ranks, ranks.gather(int(number.max(initial=-1)) + 1))
@@ -103,7 +117,8 @@ class Halo:
     def _edges(self, node: np.ndarray, faces: Sequence[np.ndarray | float]) -> np.ndarray:
         """Return the pairs of nodes of this rank and its neighbors between which a face at a cut is open, shape (n, 2)."""
         found, grid = [], node.reshape(self.shape).copy()
-        for axis in self.decomposition.cut_axes:  # ghost cells at the domain's sides are not written
+        # ghost cells at the domain's sides are not written
+        for axis in self.decomposition.cut_axes:
             for end in (0, -1):
                 grid[(*[slice(None)] * (2 - axis), end, ...)] = -1
         self.fill(grid)
@@ -116,7 +131,9 @@ class Halo:
             face = np.broadcast_to(faces[axis], self.shape)[tuple(upper)].ravel()
             open_faces = (a >= 0) & (b >= 0) & (face > 0)
             found.append(np.stack([a[open_faces], b[open_faces]], axis=1))
-        return np.unique(np.concatenate(found), axis=0) if found else np.empty((0, 2), dtype=np.int32)
+        return (
+            np.unique(np.concatenate(found), axis=0) if found else np.empty((0, 2), dtype=np.int32)
+        )
 
     @cached_property
     def gathering(self) -> Gathering:
@@ -143,17 +160,25 @@ class Halo:
         if field.device.is_cuda:
             return Task(partial(self.fill, field))
         assert self._forest is not None
-        return Task(partial(self.fill, field), partial(exchanging, self._forest, field.numpy(), field.numpy()))
+        return Task(
+            partial(self.fill, field),
+            partial(exchanging, self._forest, field.numpy(), field.numpy()),
+        )
 
     def _fill_through_host(self, field: wp.array[Any]) -> None:
         """Fill a field on a device: what lies within the width of the cuts goes through the host's memory, PETSc needs no CUDA then."""
         assert self._forest is not None
-        host = self._staging.setdefault(field.dtype, np.zeros(self.shape, dtype=wp.dtype_to_numpy(field.dtype)))
+        host = self._staging.setdefault(
+            field.dtype, np.zeros(self.shape, dtype=wp.dtype_to_numpy(field.dtype))
+        )
         for inner in self._slabs(ghost=False):
             host[inner] = field[inner].numpy()
         exchange(self._forest, host)
         for outer in self._slabs(ghost=True):
-            wp.copy(field[outer], wp.array(np.ascontiguousarray(host[outer]), dtype=field.dtype, device="cpu"))
+            wp.copy(
+                field[outer],
+                wp.array(np.ascontiguousarray(host[outer]), dtype=field.dtype, device="cpu"),
+            )
 
     def _slabs(self, *, ghost: bool) -> list[tuple[slice, ...]]:
         """Return the slabs of a stored field beside this rank's cuts: ghost cells, or the cells that other ranks' ghost cells repeat."""
@@ -178,10 +203,15 @@ class Gathering:
         self.decomposition = decomposition
         whole = CellBox((0, 0, 0), decomposition.counts)
         boxes = decomposition.boxes
-        self._forest = star_forest(decomposition.ranks, boxes, [box.grown(1) for box in boxes], whole=whole.grown(1))
+        self._forest = star_forest(
+            decomposition.ranks, boxes, [box.grown(1) for box in boxes], whole=whole.grown(1)
+        )
         self._low = [first.start for first in decomposition.box.grown(1).moved((1, 1, 1)).slices]
         nx, ny, nz = decomposition.box.counts
-        self._shape, self._whole = (nz + 2, ny + 2, nx + 2), tuple(n + 2 for n in reversed(decomposition.counts))
+        self._shape, self._whole = (
+            (nz + 2, ny + 2, nx + 2),
+            tuple(n + 2 for n in reversed(decomposition.counts)),
+        )
 
     def collect(self, mine: wp.array[Any], whole: wp.array[Any]) -> None:
         """Write the ranks' cells to the whole grid's field on every rank."""
@@ -194,7 +224,10 @@ class Gathering:
         """Return `collect`, now or among the launches of a program."""
         if whole.device.is_cuda:
             return Task(partial(self.collect, mine, whole))
-        return Task(partial(self.collect, mine, whole), partial(exchanging, self._forest, mine.numpy(), whole.numpy()))
+        return Task(
+            partial(self.collect, mine, whole),
+            partial(exchanging, self._forest, mine.numpy(), whole.numpy()),
+        )
 
     def take(self, whole: wp.array[Any], mine: wp.array[Any], launch: Launch = launch_now) -> None:
         """Write this rank's part of the whole grid's field to its own, ghost cells too."""
@@ -204,7 +237,9 @@ class Gathering:
 
 @forward_kernel(module="warp_lcp.distributed.halo")
 @no_type_check
-def take_kernel(whole: wp.array3d(dtype=Any), mine: wp.array3d(dtype=Any), k0: int, j0: int, i0: int):
+def take_kernel(
+    whole: wp.array3d(dtype=Any), mine: wp.array3d(dtype=Any), k0: int, j0: int, i0: int
+):
     """Copy a row of a box."""
     k, j = wp.tid()
     for i in range(mine.shape[2]):
@@ -218,15 +253,16 @@ for _T in (wp.float32, wp.float64):
 class StarForest:
     """A star forest of PETSc that is freed with the last reference to it.
 
-    What Python frees as a part of a cycle petsc4py keeps for PETSc's own end, for which ranks wait for ever unless all have kept equally
-    much; but each looks for cycles at another time.
+    What Python frees as a part of a cycle petsc4py keeps for PETSc's own end, for which ranks wait
+    for ever unless all have kept equally much; but each looks for cycles at another time.
 
     Args:
         made: the forest, of no use when this is gone.
 
     Attributes:
         handle: PETSc's handle of it, which recorded exchanges read in each run.
-        pairs: units and addresses of roots and leaves that recorded exchanges read, by what they hold.
+        pairs: units and addresses of roots and leaves that recorded exchanges read, by what they
+            hold.
     """
 
     def __init__(self, made: Any) -> None:
@@ -243,10 +279,17 @@ class StarForest:
 
 
 def star_forest(
-    ranks: Ranks, owned: Sequence[CellBox], stored: Sequence[CellBox], *, filled: CellBox | None = None, layers: int = 1,
-    whole: CellBox | None = None, which: np.ndarray | None = None, shifts: Sequence[Triple] = ((0, 0, 0),),
+    ranks: Ranks,
+    owned: Sequence[CellBox],
+    stored: Sequence[CellBox],
+    *,
+    filled: CellBox | None = None,
+    layers: int = 1,
+    whole: CellBox | None = None,
+    which: np.ndarray | None = None,
+    shifts: Sequence[Triple] = ((0, 0, 0),),
     into: StarForest | None = None,
-) -> StarForest:  # fmt: skip
+) -> StarForest:
     """Return the star forest whose leaves are this rank's ghost cells and whose roots are the cells that they repeat; collective.
 
     Args:
@@ -255,8 +298,10 @@ def star_forest(
         stored: the cells that each rank stores.
         filled: the ghost cells that are wanted lie in it; None: all.
         layers: of numbers of those cells, one behind the other.
-        whole: the cells of other fields, in which what each rank knows is wanted, this one too; None: leaves lie among the roots.
-        which: of the cells that this rank stores are wanted, bool of their shape (nz, ny, nx); None: all.
+        whole: the cells of other fields, in which what each rank knows is wanted, this one too;
+            None: leaves lie among the roots.
+        which: of the cells that this rank stores are wanted, bool of their shape (nz, ny, nx);
+            None: all.
         shifts: cells along x, y, z by which what ranks know lies around this one again.
         into: a forest that this one replaces, see `StarForest.replace`; None: there is none.
     """
@@ -264,7 +309,9 @@ def star_forest(
     around = whole or stored[mine]
     wanted = around if filled is None else around.common(filled)
     leaves, remotes = [np.empty(0, dtype=np.int64)], [np.empty((0, 2), dtype=np.int32)]
-    for (rank, (box, remote)), shift in itertools.product(enumerate(zip(owned, stored, strict=True)), shifts):
+    for (rank, (box, remote)), shift in itertools.product(
+        enumerate(zip(owned, stored, strict=True)), shifts
+    ):
         shared = wanted.common(box.moved(shift))
         if (whole or rank != mine) and shared.cells:
             here, there = _elements(shared, around), _elements(shared.moved(shift, -1), remote)

@@ -10,14 +10,21 @@ import sys
 from collections.abc import Mapping
 from typing import Any
 
-DEBIAN_PETSC = "/usr/lib/petscdir/petsc*/*-real"  # where Debian keeps the builds that petsc4py chooses from by PETSC_DIR
-INSTALL = "install MPI, petsc4py and mpi4py (the extra `distributed`, or Debian's python3-petsc4py, openmpi-bin and python3-mpi4py)"
+# where Debian keeps the builds that petsc4py chooses from by PETSC_DIR
+DEBIAN_PETSC = "/usr/lib/petscdir/petsc*/*-real"
+INSTALL = (
+    "install MPI, petsc4py and mpi4py (the extra `distributed`, or Debian's "
+    "python3-petsc4py, openmpi-bin and python3-mpi4py)"
+)
 HOW_TO_INSTALL = (
-    "the PETSc engine needs petsc4py and mpi4py: pip install 'warp-lcp[distributed]', or on Debian and Ubuntu apt-get install "
-    "python3-petsc4py python3-mpi4py openmpi-bin, a virtual environment of the system's Python with --system-site-packages and numpy < 2, "
+    "the PETSc engine needs petsc4py and mpi4py: pip install 'warp-lcp[distributed]', or on Debian "
+    "and Ubuntu apt-get install "
+    "python3-petsc4py python3-mpi4py openmpi-bin, a virtual environment of the system's Python "
+    "with --system-site-packages and numpy < 2, "
     "and PETSC_DIR set to a folder like /usr/lib/petscdir/petsc3.18/x86_64-linux-gnu-real"
 )
-# Open MPI: more ranks than cores, none bound to a core, root; MPICH allows all of that and ignores these names
+# Open MPI: more ranks than cores, none bound to a core, root; MPICH allows all of that and ignores
+# these names
 OPEN_MPI = {
     "OMPI_ALLOW_RUN_AS_ROOT": "1",
     "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1",
@@ -27,8 +34,10 @@ OPEN_MPI = {
     "PRTE_MCA_rmaps_default_mapping_policy": ":oversubscribe",  # the same of Open MPI 5
     "PRTE_MCA_hwloc_default_binding_policy": "none",
 }
-ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}  # each rank has a core, not a machine
-RANK = ("OMPI_COMM_WORLD_RANK", "PMIX_RANK", "PMI_RANK")  # what mpiexec and srun tell the processes that they start
+# each rank has a core, not a machine
+ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+# what mpiexec and srun tell the processes that they start
+RANK = ("OMPI_COMM_WORLD_RANK", "PMIX_RANK", "PMI_RANK")
 
 
 def rank_here() -> int | None:
@@ -44,9 +53,14 @@ def find_petsc() -> None:
 
     It is located next to the PETSc build that PETSC_DIR names when Python starts.
 
-    Does nothing where petsc4py is found already, where PETSC_DIR is set, and in an interpreter without Debian's mpi4py.
+    Does nothing where petsc4py is found already, where PETSC_DIR is set, and in an interpreter
+    without Debian's mpi4py.
     """
-    if "PETSC_DIR" in os.environ or importlib.util.find_spec("petsc4py") or not importlib.util.find_spec("mpi4py"):
+    if (
+        "PETSC_DIR" in os.environ
+        or importlib.util.find_spec("petsc4py")
+        or not importlib.util.find_spec("mpi4py")
+    ):
         return
     for directory in debian_petsc():
         os.environ["PETSC_DIR"] = directory

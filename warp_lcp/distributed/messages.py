@@ -47,15 +47,29 @@ class MpiMailbox:
         from mpi4py import MPI
 
         neighbors, comm = sorted(outgoing), self._comm
-        sizes = np.array([[len(outgoing[rank]) for rank in neighbors], [0] * len(neighbors)], dtype=np.int64)
-        requests = [comm.Irecv(sizes[1, n : n + 1], rank, COUNT) for n, rank in enumerate(neighbors)]
-        requests += [comm.Isend(sizes[0, n : n + 1], rank, COUNT) for n, rank in enumerate(neighbors)]
+        sizes = np.array(
+            [[len(outgoing[rank]) for rank in neighbors], [0] * len(neighbors)], dtype=np.int64
+        )
+        requests = [
+            comm.Irecv(sizes[1, n : n + 1], rank, COUNT) for n, rank in enumerate(neighbors)
+        ]
+        requests += [
+            comm.Isend(sizes[0, n : n + 1], rank, COUNT) for n, rank in enumerate(neighbors)
+        ]
         with waiting("counts of migrating particles"):
             MPI.Request.Waitall(requests)
         kind = outgoing[neighbors[0]].dtype if neighbors else np.dtype(np.int64)
         incoming = [np.empty(int(size), dtype=kind) for size in sizes[1]]
-        requests = [comm.Irecv([a.view(np.uint8), MPI.BYTE], rank, DATA) for a, rank in zip(incoming, neighbors, strict=True) if a.size]
-        requests += [comm.Isend([outgoing[rank].view(np.uint8), MPI.BYTE], rank, DATA) for rank in neighbors if outgoing[rank].size]
+        requests = [
+            comm.Irecv([a.view(np.uint8), MPI.BYTE], rank, DATA)
+            for a, rank in zip(incoming, neighbors, strict=True)
+            if a.size
+        ]
+        requests += [
+            comm.Isend([outgoing[rank].view(np.uint8), MPI.BYTE], rank, DATA)
+            for rank in neighbors
+            if outgoing[rank].size
+        ]
         with waiting("particles"):
             MPI.Request.Waitall(requests)
         return incoming
@@ -77,8 +91,14 @@ __atomic_fetch_add(told, 1, __ATOMIC_SEQ_CST);
 #endif
 """)
 def copy_to_leaves(
-    begin_: wp.uint64, end_: wp.uint64, forest_: wp.uint64, pairs_: wp.uint64, replace_: wp.uint64, count: int, told_: wp.uint64
-):  # fmt: skip
+    begin_: wp.uint64,
+    end_: wp.uint64,
+    forest_: wp.uint64,
+    pairs_: wp.uint64,
+    replace_: wp.uint64,
+    count: int,
+    told_: wp.uint64,
+):
     """Call PetscSFBcastBegin for each pair, a unit and the addresses of roots and leaves, then PetscSFBcastEnd.
 
     `forest_` is the address of the star forest's handle, read in each run.
@@ -99,22 +119,42 @@ __atomic_fetch_add(told, 1, __ATOMIC_SEQ_CST);
 #endif
 """)
 def add_of_all(
-    gather_: wp.uint64, unit_: wp.uint64, comm_: wp.uint64, sums_: wp.uint64, of_all_: wp.uint64, count: int, ranks: int, told_: wp.uint64
+    gather_: wp.uint64,
+    unit_: wp.uint64,
+    comm_: wp.uint64,
+    sums_: wp.uint64,
+    of_all_: wp.uint64,
+    count: int,
+    ranks: int,
+    told_: wp.uint64,
 ):
     """Call MPI_Allgather, and add up in the order of the ranks."""
 
 
 @forward_kernel(module="warp_lcp.messages")
 def exchange_kernel(
-    begin: wp.uint64, end: wp.uint64, forest: wp.uint64, pairs: wp.uint64, replace: wp.uint64, count: int, told: wp.uint64
-):  # fmt: skip
+    begin: wp.uint64,
+    end: wp.uint64,
+    forest: wp.uint64,
+    pairs: wp.uint64,
+    replace: wp.uint64,
+    count: int,
+    told: wp.uint64,
+):
     """Copy roots to leaves over a star forest; one thread, on the CPU."""
     copy_to_leaves(begin, end, forest, pairs, replace, count, told)
 
 
 @forward_kernel(module="warp_lcp.messages")
 def add_kernel(
-    gather: wp.uint64, unit: wp.uint64, comm: wp.uint64, sums: wp.uint64, of_all: wp.uint64, count: int, ranks: int, told: wp.uint64
+    gather: wp.uint64,
+    unit: wp.uint64,
+    comm: wp.uint64,
+    sums: wp.uint64,
+    of_all: wp.uint64,
+    count: int,
+    ranks: int,
+    told: wp.uint64,
 ):
     """Add to sums those of the other ranks; one thread, on the CPU."""
     add_of_all(gather, unit, comm, sums, of_all, count, ranks, told)
@@ -123,16 +163,24 @@ def add_kernel(
 class _Library:
     """Functions of PETSc and MPI, and MPI's constants, as C takes them.
 
-    petsc4py lets no other thread of Python run while PETSc waits for other ranks, no watchdog either: PETSc is called directly.
+    petsc4py lets no other thread of Python run while PETSc waits for other ranks, no watchdog
+    either: PETSc is called directly.
     """
 
     def __init__(self) -> None:
         from mpi4py import MPI
 
-        self.units = {size: handle(unit) for size, unit in {1: MPI.SIGNED_CHAR, 2: MPI.SHORT, 4: MPI.INT, 8: MPI.DOUBLE}.items()}
+        self.units = {
+            size: handle(unit)
+            for size, unit in {1: MPI.SIGNED_CHAR, 2: MPI.SHORT, 4: MPI.INT, 8: MPI.DOUBLE}.items()
+        }
         self.replace = handle(MPI.REPLACE)
         functions = ctypes.CDLL(petsc().__file__), ctypes.CDLL(MPI.__file__)
-        self.begin, self.end, self.gather = functions[0].PetscSFBcastBegin, functions[0].PetscSFBcastEnd, functions[1].MPI_Allgather
+        self.begin, self.end, self.gather = (
+            functions[0].PetscSFBcastBegin,
+            functions[0].PetscSFBcastEnd,
+            functions[1].MPI_Allgather,
+        )
 
 
 _library = cache(_Library)
@@ -162,7 +210,14 @@ def exchange_all(forest: StarForest, pairs: Sequence[tuple[np.ndarray, np.ndarra
         for call in (library.begin, library.end):
             for roots, leaves in pairs:
                 where = (ctypes.c_void_p(array.ctypes.data) for array in (roots, leaves))
-                _check(call(ctypes.c_void_p(forest.made.handle), library.units[roots.dtype.itemsize], *where, library.replace))
+                _check(
+                    call(
+                        ctypes.c_void_p(forest.made.handle),
+                        library.units[roots.dtype.itemsize],
+                        *where,
+                        library.replace,
+                    )
+                )
 
 
 def exchanging(forest: StarForest, roots: np.ndarray, leaves: np.ndarray) -> Operation:
@@ -174,22 +229,39 @@ def exchanging_all(forest: StarForest, pairs: Sequence[tuple[np.ndarray, np.ndar
     """Return `exchange_all` as an operation of the team."""
     library = _library()
     functions = (ctypes.cast(call, ctypes.c_void_p).value for call in (library.begin, library.end))
-    listed = [(library.units[a.dtype.itemsize].value, a.ctypes.data, b.ctypes.data) for a, b in pairs]
+    listed = [
+        (library.units[a.dtype.itemsize].value, a.ctypes.data, b.ctypes.data) for a, b in pairs
+    ]
     key = tuple(word & (1 << 64) - 1 for pair in listed for word in pair)
     words = forest.pairs.setdefault(key, (ctypes.c_uint64 * len(key))(*key))
-    given = [*functions, ctypes.addressof(forest.handle), ctypes.addressof(words), library.replace.value, len(pairs)]
+    given = [
+        *functions,
+        ctypes.addressof(forest.handle),
+        ctypes.addressof(words),
+        library.replace.value,
+        len(pairs),
+    ]
     return _operation(exchange_kernel, given, (forest, words, pairs))
 
 
 def adding(comm: Any, sums: np.ndarray) -> Operation:
     """Return what replaces float64 sums by those over all ranks, in their order, as an operation of the team."""
     library, of_all = _library(), np.empty((comm.size, sums.size))
-    given = [ctypes.cast(library.gather, ctypes.c_void_p).value, library.units[8].value, handle(comm).value]
-    return _operation(add_kernel, [*given, sums.ctypes.data, of_all.ctypes.data, sums.size, comm.size], (comm, sums, of_all))
+    given = [
+        ctypes.cast(library.gather, ctypes.c_void_p).value,
+        library.units[8].value,
+        handle(comm).value,
+    ]
+    return _operation(
+        add_kernel,
+        [*given, sums.ctypes.data, of_all.ctypes.data, sums.size, comm.size],
+        (comm, sums, of_all),
+    )
 
 
 def _operation(kernel: Any, given: list[Any], kept: Any) -> Operation:
-    words = [word & (1 << 64) - 1 for word in (*given, ctypes.addressof(waiting.native))]  # handles of MPICH may be negative
+    # handles of MPICH may be negative
+    words = [word & (1 << 64) - 1 for word in (*given, ctypes.addressof(waiting.native))]
     launch = wp.launch(kernel, 1, words, device="cpu", record_cmd=True)
     operation = launched_alone(launch, kept)
     operation.check = _check_native

@@ -30,27 +30,41 @@ def migrate(piece: Piece, particles: Sequence[str], before: Subdomain, now: Subd
     def gives(giver: int, taker: int) -> bool:  # particles move on to their rank when a step begins
         return now.decomposition.meet(old[giver].grown(before.layers), new[taker])
 
-    others = [rank for rank in range(now.ranks.size) if rank != mine and (gives(mine, rank) or gives(rank, mine))]
+    others = [
+        rank
+        for rank in range(now.ranks.size)
+        if rank != mine and (gives(mine, rank) or gives(rank, mine))
+    ]
     owner = now.owners(cells_of(now, piece["position"]))
     taken = {**piece, "box": np.array([now.box.low, now.box.high])}
     for name in (*particles, "place"):
         values = np.asarray(piece[name])
         come = now.mailbox.swap({rank: values[owner == rank].ravel() for rank in others})
-        taken[name] = np.concatenate([values[owner == mine], *(found.reshape(-1, *values.shape[1:]) for found in come)])
+        taken[name] = np.concatenate(
+            [values[owner == mine], *(found.reshape(-1, *values.shape[1:]) for found in come)]
+        )
     for name, values in fields_of(piece).items():
         taken[name] = np.zeros((*values.shape[:-3], *now.box.counts[::-1]), dtype=values.dtype)
         sent = {rank: _cut_out(values, old[mine], new[rank]) for rank in (mine, *others)}
-        for rank, found in zip((mine, *others), [sent.pop(mine), *now.mailbox.swap(sent)], strict=True):
+        for rank, found in zip(
+            (mine, *others), [sent.pop(mine), *now.mailbox.swap(sent)], strict=True
+        ):
             box = old[rank].common(new[mine])
             if box.cells:
-                taken[name][..., *box.moved(now.box.low, -1).slices] = found.reshape(*values.shape[:-3], *box.counts[::-1])
+                taken[name][..., *box.moved(now.box.low, -1).slices] = found.reshape(
+                    *values.shape[:-3], *box.counts[::-1]
+                )
     return taken
 
 
 def _cut_out(values: np.ndarray, box: CellBox, other: CellBox) -> np.ndarray:
     """Return the values of a box's cells that are in another one too, one after another."""
     shared = box.common(other)
-    return values[..., *shared.moved(box.low, -1).slices].ravel() if shared.cells else values[:0].ravel()
+    return (
+        values[..., *shared.moved(box.low, -1).slices].ravel()
+        if shared.cells
+        else values[:0].ravel()
+    )
 
 
 def cuts_of(pieces: Sequence[Piece], part: Subdomain) -> list[list[int]] | None:
@@ -64,6 +78,11 @@ def cuts_of(pieces: Sequence[Piece], part: Subdomain) -> list[list[int]] | None:
     if len(pieces) != now.ranks.size or any("box" not in piece for piece in pieces):
         return None
     boxes = [CellBox.of(*piece["box"]) for piece in pieces]
-    cuts = [np.diff([*sorted({box.low[axis] for box in boxes}), n]).tolist() for axis, n in enumerate(now.counts)]
-    fits = math.prod(map(len, cuts)) == len(boxes) and all(len(cut) == 1 or min(cut) >= part.layers for cut in cuts)
+    cuts = [
+        np.diff([*sorted({box.low[axis] for box in boxes}), n]).tolist()
+        for axis, n in enumerate(now.counts)
+    ]
+    fits = math.prod(map(len, cuts)) == len(boxes) and all(
+        len(cut) == 1 or min(cut) >= part.layers for cut in cuts
+    )
     return cuts if fits and now.repartition(cuts).boxes == boxes else None

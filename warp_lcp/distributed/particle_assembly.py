@@ -13,10 +13,14 @@ from warp_lcp.distributed.subdomain import DEFAULT_BALANCE, Subdomain, ghost_lay
 from warp_lcp.grid.surface_mesh import surface_layers
 from warp_lcp.material.particle_scene import ParticleScene
 
-NOT_ON_RANKS = "is not there on several processes (--engine petsc) yet: leave it out, or run on one process"
+NOT_ON_RANKS = (
+    "is not there on several processes (--engine petsc) yet: leave it out, or run on one process"
+)
 
 
-def check_shared(scene: ParticleScene, ranks: Ranks, refused: Sequence[str], methods: Sequence[str]) -> None:
+def check_shared(
+    scene: ParticleScene, ranks: Ranks, refused: Sequence[str], methods: Sequence[str]
+) -> None:
     """Refuse a scene that is not the same on all ranks, or asks for what runs on ranks have not; collective.
 
     Args:
@@ -31,15 +35,24 @@ def check_shared(scene: ParticleScene, ranks: Ranks, refused: Sequence[str], met
     ranks.agree("the scene", scene.model_dump(mode="json"))
     told = [f"{key} {NOT_ON_RANKS}" for key in refused]
     if scene.solver.method not in methods:
-        told.append(f"solver.method = {scene.solver.method} works on one process only (without --engine petsc): {' or '.join(methods)}")
+        told.append(
+            f"solver.method = {scene.solver.method} works on one process only (without --engine "
+            f"petsc): {' or '.join(methods)}"
+        )
     if told:
         raise ValueError("; ".join(told))
 
 
 def part_of(
-    scene: ParticleScene, ranks: Ranks, device: str, *, methods: Sequence[str], refused: Sequence[str] = (), smoothing: int = 0,
+    scene: ParticleScene,
+    ranks: Ranks,
+    device: str,
+    *,
+    methods: Sequence[str],
+    refused: Sequence[str] = (),
+    smoothing: int = 0,
     balance: Balance = DEFAULT_BALANCE,
-) -> Subdomain:  # fmt: skip
+) -> Subdomain:
     """Return where this rank works: all have about as much material, at the start and when it has come to rest; collective.
 
     Args:
@@ -57,12 +70,18 @@ def part_of(
     check_shared(scene, ranks, refused, methods)
     counts, layers = scene.cell_counts, ghost_layers(scene.time.cfl, smoothing)
     if scene.output.surface:
-        layers = max(layers, surface_layers(scene.output.surface_resolution or scene.particles.per_axis))
+        layers = max(
+            layers, surface_layers(scene.output.surface_resolution or scene.particles.per_axis)
+        )
     size = np.array([*scene.domain.size, scene.spacing][:3])
     start = []
     for shape in scene.materials()[1]:
         bounds = shape.bounds(scene.dimension)
-        low, high = (np.zeros(3), size) if bounds is None else (np.clip(corner, 0.0, size) for corner in bounds)
+        low, high = (
+            (np.zeros(3), size)
+            if bounds is None
+            else (np.clip(corner, 0.0, size) for corner in bounds)
+        )
         if scene.dimension == 2:
             low[2], high[2] = 0.0, scene.spacing
         start.append((low / scene.spacing, high / scene.spacing))
@@ -70,4 +89,11 @@ def part_of(
     rest = pool(counts, scene.dimension, volume, np.array(scene.physics.gravity))
     processes = balanced_processes(counts, ranks.size, layers=layers, states=[start, [rest]])
     decomposition = Decomposition(counts, ranks, processes=processes, periodic=scene.endless)
-    return Subdomain(decomposition, spacing=scene.spacing, dimension=scene.dimension, device=device, layers=layers, balance=balance)
+    return Subdomain(
+        decomposition,
+        spacing=scene.spacing,
+        dimension=scene.dimension,
+        device=device,
+        layers=layers,
+        balance=balance,
+    )

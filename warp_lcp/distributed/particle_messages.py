@@ -25,7 +25,8 @@ COLUMNS = ("position", "velocity", "affine_0", "affine_1", "affine_2", "kept")
 PLACE_WORDS, COLUMN_WORDS = 2, 3  # of 4 bytes, of a particle in a message
 KERNELS = KernelFile(Path(__file__).parent / "headers/distributed.h")
 FIND_BORDER, PACK, UNPACK, SETTLE, GIVE_PLACES = (
-    KERNELS[f"warp_lcp.distributed.particles.{name}"] for name in ("find_border", "pack", "unpack", "settle", "give_places")
+    KERNELS[f"warp_lcp.distributed.particles.{name}"]
+    for name in ("find_border", "pack", "unpack", "settle", "give_places")
 )
 
 
@@ -72,10 +73,14 @@ class ParticleMessages:
         neighbors: ranks, ascending.
     """
 
-    def __init__(self, part: Subdomain, particles: Particles, place: Buffer, neighbors: Sequence[int]) -> None:
+    def __init__(
+        self, part: Subdomain, particles: Particles, place: Buffer, neighbors: Sequence[int]
+    ) -> None:
         self.part, self._particles, self._place, self._neighbors = part, particles, place, neighbors
         self._boxes, self._border, self._cells, self._found = (Buffer(wp.int32) for _ in range(4))
-        self._outgoing, self._incoming, self._others, self._ghosts, self._flags, self._moved = (Buffer(wp.int32) for _ in range(6))
+        self._outgoing, self._incoming, self._others, self._ghosts, self._flags, self._moved = (
+            Buffer(wp.int32) for _ in range(6)
+        )
         self._offsets = Buffer(wp.float64)
         self._device, self._count, self._come = wp.get_device("cpu"), Scalar(), Scalar()
         self._bounds = bounds_of(part)
@@ -83,15 +88,21 @@ class ParticleMessages:
         self._ends = self._take_boxes()
         self._copies: dict[str, wp.array[Any]] = {}
         copied = particles.grid.device.is_cuda  # others in each run
-        launches = self._launch_packing, self._launch_unpacking, self._launch_settling, self._launch_search, self._launch_places
+        launches = (
+            self._launch_packing,
+            self._launch_unpacking,
+            self._launch_settling,
+            self._launch_search,
+            self._launch_places,
+        )
         graphs = (LaunchGraph(self._device, launch, at_once=copied) for launch in launches)
         self._packing, self._unpacking, self._settling, self._search, self._giving = graphs
 
     def _take_boxes(self) -> list[int]:
         """Set the boxes that are searched, and return how many each neighbor has, this rank behind them.
 
-        Particles are in a neighbor's sight in its box and within REACH of it, at every periodic shift of it; in that of this rank itself
-        at those other than 0.
+        Particles are in a neighbor's sight in its box and within REACH of it, at every periodic
+        shift of it; in that of this rank itself at those other than 0.
         """
         part, joined, mine = self.part, self.part.decomposition.joined, self.part.ranks.rank
         counts, origin = np.array(part.grid.counts), np.array(part.grid.origin)
@@ -101,10 +112,15 @@ class ParticleMessages:
         shifts = part.decomposition.shifts
         ranks = [*self._neighbors, mine] if joined else self._neighbors
         seen = [(rank, shift) for rank in ranks for shift in shifts[rank == mine :]]
-        boxes = [part.decomposition.boxes[rank].grown(REACH).moved(shift, -1) for rank, shift in seen]
+        boxes = [
+            part.decomposition.boxes[rank].grown(REACH).moved(shift, -1) for rank, shift in seen
+        ]
         table = [limits, _corners(part.box), *map(_corners, boxes)]
         self._boxes.take(np.array(table, dtype=np.int32))
-        self._offsets.take(np.array([shift for _, shift in seen], dtype=np.float64).reshape(-1, 3) * part.grid.spacing)
+        self._offsets.take(
+            np.array([shift for _, shift in seen], dtype=np.float64).reshape(-1, 3)
+            * part.grid.spacing
+        )
         self._found.reserve(max(1 + len(seen), 3))
         return [sum(rank == other for other, _ in seen) for rank in ranks]
 
@@ -121,7 +137,10 @@ class ParticleMessages:
         self._cells.reserve(3 * count)
         self._count.value = count
         self._search.run()
-        inside, ends = self._found.host[1 : 1 + sum(self._ends)].tolist(), [0, *np.cumsum(self._ends).tolist()]
+        inside, ends = (
+            self._found.host[1 : 1 + sum(self._ends)].tolist(),
+            [0, *np.cumsum(self._ends).tolist()],
+        )
         to = [words * sum(inside[:end]) for end in ends]
         self._outgoing.reserve(to[-1])
         self._packing.run(positions_only, variant=positions_only)
@@ -145,7 +164,8 @@ class ParticleMessages:
             come: what `exchange` has returned.
 
         Returns:
-            How many are this rank's, how many there are with ghosts, and the numbers of those before this rank's end that are others now.
+            How many are this rank's, how many there are with ghosts, and the numbers of those
+            before this rank's end that are others now.
         """
         found = self._found.host
         most = int(found[0]) + come
@@ -174,7 +194,9 @@ class ParticleMessages:
         if self._particles.grid.device.is_cuda:
             arrays = self._particles.arrays()
             names = ["position"] if positions_only else list(arrays)
-            self._copies = {name: wp.array(arrays[name].numpy(), dtype=wp.vec3, device="cpu") for name in names}
+            self._copies = {
+                name: wp.array(arrays[name].numpy(), dtype=wp.vec3, device="cpu") for name in names
+            }
 
     def _send(self) -> None:
         """Send the copies back."""
@@ -184,44 +206,93 @@ class ParticleMessages:
     def _columns(self, positions_only: bool = False) -> dict[str, wp.array[Any] | None]:
         """Return the columns in the host's memory."""
         arrays = self._copies or self._particles.arrays()
-        return dict.fromkeys(COLUMNS) | ({"position": arrays["position"]} if positions_only else arrays)
+        return dict.fromkeys(COLUMNS) | (
+            {"position": arrays["position"]} if positions_only else arrays
+        )
 
     def _launch_search(self) -> None:
         position = self._columns(positions_only=True)["position"]
         numbers = {**self._bounds, "count": self._count, "ends": sum(self._ends)}
-        self._bind(FIND_BORDER, self._placed | numbers | self._border_found | {"position": position})
+        self._bind(
+            FIND_BORDER, self._placed | numbers | self._border_found | {"position": position}
+        )
 
     def _launch_packing(self, positions_only: bool) -> None:
         end_x, end_y, end_z = map(float, self._end)
-        given = {"message": self._outgoing.array, "offsets": self._offsets.array, "place": self._place.array}
-        numbers = {"ends": sum(self._ends), "around": bool(self.part.decomposition.joined), "end_x": end_x, "end_y": end_y, "end_z": end_z}
+        given = {
+            "message": self._outgoing.array,
+            "offsets": self._offsets.array,
+            "place": self._place.array,
+        }
+        numbers = {
+            "ends": sum(self._ends),
+            "around": bool(self.part.decomposition.joined),
+            "end_x": end_x,
+            "end_y": end_y,
+            "end_z": end_z,
+        }
         self._bind(PACK, given | numbers | self._border_found | self._columns(positions_only))
 
     def _launch_unpacking(self, positions_only: bool) -> None:
-        given = {"message": self._incoming.array, "found": self._found.array, "place": self._place.array}
-        self._bind(UNPACK, given | self._columns(positions_only) | {"count": self._count, "come": self._come})
+        given = {
+            "message": self._incoming.array,
+            "found": self._found.array,
+            "place": self._place.array,
+        }
+        self._bind(
+            UNPACK,
+            given | self._columns(positions_only) | {"count": self._count, "come": self._come},
+        )
 
     def _launch_settling(self) -> None:
-        given = {"message": self._moved.array, "others": self._others.array, "ghosts": self._ghosts.array, "flags": self._flags.array}
+        given = {
+            "message": self._moved.array,
+            "others": self._others.array,
+            "ghosts": self._ghosts.array,
+            "flags": self._flags.array,
+        }
         given |= {"place": self._place.array, "count": self._count, "come": self._come}
-        self._bind(SETTLE, self._placed | self._bounds | self._border_found | given | self._columns())
+        self._bind(
+            SETTLE, self._placed | self._bounds | self._border_found | given | self._columns()
+        )
 
     def _launch_places(self) -> None:
         grid, key = self.part.grid, self._particles.key
         key = wp.array(key.numpy(), dtype=wp.int32, device="cpu") if key.device.is_cuda else key
-        numbers = dict(zip(("all_x", "all_y", "all_z"), self.part.decomposition.counts, strict=True)) | {"most_a_cell": MOST_A_CELL}
-        numbers |= dict(zip(("before_x", "before_y", "before_z", "nx", "ny"), (*grid.origin, *grid.counts[:2]), strict=True))
-        given = {"key": key, "place": self._place.array, "found": self._found.array, "count": self._count}
+        numbers = dict(
+            zip(("all_x", "all_y", "all_z"), self.part.decomposition.counts, strict=True)
+        ) | {"most_a_cell": MOST_A_CELL}
+        numbers |= dict(
+            zip(
+                ("before_x", "before_y", "before_z", "nx", "ny"),
+                (*grid.origin, *grid.counts[:2]),
+                strict=True,
+            )
+        )
+        given = {
+            "key": key,
+            "place": self._place.array,
+            "found": self._found.array,
+            "count": self._count,
+        }
         self._bind(GIVE_PLACES, given | numbers)
 
     @property
     def _border_found(self) -> dict[str, wp.array[Any]]:
-        return {"boxes": self._boxes.array, "border": self._border.array, "cells": self._cells.array, "found": self._found.array}
+        return {
+            "boxes": self._boxes.array,
+            "border": self._border.array,
+            "cells": self._cells.array,
+            "found": self._found.array,
+        }
 
     @property
     def _placed(self) -> dict[str, Any]:
         placement = self.part.grid.placement
-        return {name: getattr(placement, name) for name in ("planes", "dx", "inverse_dx", "before_x", "before_y", "before_z")}
+        return {
+            name: getattr(placement, name)
+            for name in ("planes", "dx", "inverse_dx", "before_x", "before_y", "before_z")
+        }
 
     def _bind(self, kernel: Any, given: dict[str, Any]) -> None:
         kernel.bind(Rows.entries(1, self._device), **given).launch()

@@ -18,62 +18,102 @@ CLOCK = ("time", "step_count", "last_dt")
 
 
 def take_pieces(
-    part: Subdomain, particles: Sequence[str], like: Mapping[str, np.ndarray], signature: np.ndarray, pieces: Sequence[Piece],
+    part: Subdomain,
+    particles: Sequence[str],
+    like: Mapping[str, np.ndarray],
+    signature: np.ndarray,
+    pieces: Sequence[Piece],
     solids: np.ndarray | None,
-) -> tuple[Piece, Piece, Piece]:  # fmt: skip
+) -> tuple[Piece, Piece, Piece]:
     """Take from pieces what lies in this rank's box; collective.
 
     Args:
         part: where this rank works.
         particles: names of the particles' arrays, float32 of shape (n, 3).
-        like: what else there is of the part: its fields, `cells` among them, and numbers, which all pieces have alike.
+        like: what else there is of the part: its fields, `cells` among them, and numbers, which all
+            pieces have alike.
         signature: numbers that tell this scene's state from another's.
         pieces: of all ranks of a run.
         solids: int8, SOLID in cells without material, of the part; None: solids move.
 
     Returns:
-        By name: the particles with their `place`, the cells of this rank's box, shape (..., nz, ny, nx), and numbers that all pieces have
-        alike.
+        By name: the particles with their `place`, the cells of this rank's box, shape (..., nz, ny,
+        nx), and numbers that all pieces have alike.
 
     Raises:
-        ValueError: the pieces do not belong to this scene, or do not cover the domain; on all ranks.
+        ValueError: the pieces do not belong to this scene, or do not cover the domain; on all
+            ranks.
     """
     with part.decomposition.collective.led():
         fields = fields_of(like)
         alike = (*CLOCK, *(name for name in like if name not in fields), "signature", "counts")
-        numbers = _numbers(pieces, alike, [*particles, "place", "box", *(name for name in fields if name not in LATER)], signature)
-        kinds = {name: (field.dtype, field.shape[:-3]) for name, field in fields.items() if name not in LATER}
-        kinds |= {name: (np.dtype(dtype), ()) for name, dtype in LATER.items() if all(name in piece for piece in pieces)}
-        cells = {name: np.zeros((*layers, *part.box.counts[::-1]), dtype=dtype) for name, (dtype, layers) in kinds.items()}
-        own: Piece = {name: np.empty((0, 3), dtype=np.float32) for name in particles} | {"place": np.empty(0, dtype=np.int64)}
+        numbers = _numbers(
+            pieces,
+            alike,
+            [*particles, "place", "box", *(name for name in fields if name not in LATER)],
+            signature,
+        )
+        kinds = {
+            name: (field.dtype, field.shape[:-3])
+            for name, field in fields.items()
+            if name not in LATER
+        }
+        kinds |= {
+            name: (np.dtype(dtype), ())
+            for name, dtype in LATER.items()
+            if all(name in piece for piece in pieces)
+        }
+        cells = {
+            name: np.zeros((*layers, *part.box.counts[::-1]), dtype=dtype)
+            for name, (dtype, layers) in kinds.items()
+        }
+        own: Piece = {name: np.empty((0, 3), dtype=np.float32) for name in particles} | {
+            "place": np.empty(0, dtype=np.int64)
+        }
         covered, found = 0, [own]
         for piece in pieces:
             box = CellBox.of(*piece["box"])
             shared = box.common(part.box)
             covered += shared.cells
             for name, values in cells.items() if shared.cells else ():
-                values[..., *shared.moved(part.box.low, -1).slices] = piece[name][..., *shared.moved(box.low, -1).slices]
-            if part.decomposition.meet(box.grown(part.layers), part.box):  # particles move on to their rank when the next step begins
+                values[..., *shared.moved(part.box.low, -1).slices] = piece[name][
+                    ..., *shared.moved(box.low, -1).slices
+                ]
+            # particles move on to their rank when the next step begins
+            if part.decomposition.meet(box.grown(part.layers), part.box):
                 inside = part.owners(cells_of(part, piece["position"])) == part.ranks.rank
                 found.append({name: np.asarray(piece[name])[inside] for name in own})
         own = {name: np.ascontiguousarray(np.concatenate([p[name] for p in found])) for name in own}
         if covered != part.box.cells:
             raise ValueError("the pieces do not cover the domain: some are missing or duplicated")
-        if any(values.dtype.kind == "f" and not np.isfinite(values).all() for values in (*own.values(), *cells.values())):
+        if any(
+            values.dtype.kind == "f" and not np.isfinite(values).all()
+            for values in (*own.values(), *cells.values())
+        ):
             raise ValueError("the pieces hold values that are not finite")
-        if solids is not None and not np.array_equal(cells["cells"] == wl.SOLID, part.box_of(solids) == wl.SOLID):
+        if solids is not None and not np.array_equal(
+            cells["cells"] == wl.SOLID, part.box_of(solids) == wl.SOLID
+        ):
             raise ValueError("the state's solids are not this scene's")
         return own, cells, numbers
 
 
-def _numbers(pieces: Sequence[Piece], names: Sequence[str], others: Sequence[str], signature: np.ndarray) -> dict[str, np.ndarray]:
+def _numbers(
+    pieces: Sequence[Piece], names: Sequence[str], others: Sequence[str], signature: np.ndarray
+) -> dict[str, np.ndarray]:
     """Return the numbers that all pieces have alike, after a look whether they have all else, and belong to a scene."""
     missing = sorted({name for piece in pieces for name in (*names, *others) if name not in piece})
     if missing or not pieces:
-        raise ValueError(f"the state lacks {', '.join(missing) or 'pieces'}: it does not belong to this scene on ranks")
+        raise ValueError(
+            f"the state lacks {', '.join(missing) or 'pieces'}: it does not belong to this scene "
+            "on ranks"
+        )
     numbers = {name: np.asarray(pieces[0][name]) for name in names}
     if not np.array_equal(numbers["signature"], signature):
-        raise ValueError("the state's grid, spacing, number of particles a cell or transfer differ from this scene's")
+        raise ValueError(
+            "the state's grid, spacing, number of particles a cell or transfer differ from this "
+            "scene's"
+        )
     if any(not np.array_equal(numbers[name], piece[name]) for piece in pieces for name in names):
         raise ValueError("the pieces belong to different states")
     return numbers
@@ -85,5 +125,8 @@ def cells_of(part: Subdomain, position: np.ndarray) -> np.ndarray:
     cells = np.zeros((len(position), 3), dtype=np.int64)
     for axis in range(part.grid.dimension):
         coordinate = np.asarray(position[:, axis], dtype=np.float32) * inverse + one
-        cells[:, axis] = np.clip(coordinate, one, np.float32(part.decomposition.counts[axis])).astype(np.int64) - 1
+        cells[:, axis] = (
+            np.clip(coordinate, one, np.float32(part.decomposition.counts[axis])).astype(np.int64)
+            - 1
+        )
     return cells

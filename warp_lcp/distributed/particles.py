@@ -1,10 +1,11 @@
 """Particles that belong to the rank whose box they are in: they move on to others, and cells at a cut know those beside them.
 
-In a step a rank has its own particles and copies of those within a cell of its box, ghosts; then its own alone. Sums take all in one order
-that does not depend on the ranks, so that those around a face have the same bits on any number of ranks: that of the last sort by cell,
-which a number stands for, the particle's `place`. Until the next sort ghosts lie behind the others, and what comes takes the room of what
-goes: `runs` tell the order. Messages go from rank to rank: their lengths change from step to step, so that a star forest would have to be
-made anew each time.
+In a step a rank has its own particles and copies of those within a cell of its box, ghosts; then
+its own alone. Sums take all in one order that does not depend on the ranks, so that those around a
+face have the same bits on any number of ranks: that of the last sort by cell, which a number stands
+for, the particle's `place`. Until the next sort ghosts lie behind the others, and what comes takes
+the room of what goes: `runs` tell the order. Messages go from rank to rank: their lengths change
+from step to step, so that a star forest would have to be made anew each time.
 """
 
 from __future__ import annotations
@@ -16,7 +17,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
-from warp_lcp.distributed.particle_messages import KERNELS, REACH, Buffer, ParticleMessages, bounds_of
+from warp_lcp.distributed.particle_messages import (
+    KERNELS,
+    REACH,
+    Buffer,
+    ParticleMessages,
+    bounds_of,
+)
 from warp_lcp.distributed.place_order import PlaceOrder
 from warp_lcp.grid.part import ParticleExchange
 from warp_lcp.grid.particle_loops import launch
@@ -25,7 +32,8 @@ from warp_lcp.grid.particles import NEW, Particles, ParticleTotals
 if TYPE_CHECKING:
     from warp_lcp.distributed.subdomain import Subdomain
 
-INNER, BORDER, OUTSIDE = 0, 1, 2  # of a box: in it and away from its cuts, within reach of them, beyond them
+# of a box: in it and away from its cuts, within reach of them, beyond them
+INNER, BORDER, OUTSIDE = 0, 1, 2
 WHERE = KERNELS["warp_lcp.distributed.particles.where"]
 ROOM = 1.25  # of the storage over the particles at the start: ghosts come before the first step
 
@@ -49,9 +57,14 @@ class ParticleMigration(ParticleExchange):
     def move_to(self, part: Subdomain) -> None:  # type: ignore[override]
         """Belong to another box from now on; `assign` then brings what lies in it."""
         self.part, decomposition, around = part, part.decomposition, part.box.grown(REACH)
-        self._own: np.ndarray | int | None = None  # which particles are this rank's, or how many of the first; None: all
+        # which particles are this rank's, or how many of the first; None: all
+        self._own: np.ndarray | int | None = None
         self._lying: PlaceOrder | None = None  # of those of this rank; None: not known
-        self._neighbors = [r for r, box in enumerate(decomposition.boxes) if r != part.ranks.rank and decomposition.meet(box, around)]
+        self._neighbors = [
+            r
+            for r, box in enumerate(decomposition.boxes)
+            if r != part.ranks.rank and decomposition.meet(box, around)
+        ]
         self._messages = ParticleMessages(part, self.particles, self._places, self._neighbors)
         if self._neighbors:
             self.room = ROOM
@@ -132,7 +145,9 @@ class ParticleMigration(ParticleExchange):
         """Bring the first particles into the order of their places, of which others have been added or gone."""
         place = self.place[:count]
         if (place[1:] < place[:-1]).any():
-            self._take(np.append(np.argsort(place, kind="stable"), np.arange(count, self.particles.count)))
+            self._take(
+                np.append(np.argsort(place, kind="stable"), np.arange(count, self.particles.count))
+            )
             self.particles.number()
 
     def _take(self, order: np.ndarray) -> None:
@@ -212,14 +227,25 @@ class ParticleMigration(ParticleExchange):
         with np.errstate(invalid="ignore"):
             mine[3:10] *= n
             everyone = ranks.gather(mine)
-        sums, most, self._counts = everyone.sum(axis=0), everyone[:, -7:].max(axis=0), everyone[:, 0].astype(np.int64).tolist()
+        sums, most, self._counts = (
+            everyone.sum(axis=0),
+            everyone[:, -7:].max(axis=0),
+            everyone[:, 0].astype(np.int64).tolist(),
+        )
         count, self._expected = int(sums[0]), before + int(sums[10])
         if count == 0:
             return own
         return ParticleTotals(
-            count=count, mean_square_speed=float(sums[3]) / count, velocity=sums[7:10] / count, center=sums[4:7] / count, low=-most[1:4],
-            high=most[4:7], max_speed=float(most[0]), bad_positions=int(sums[1]), bad_velocities=int(sums[2]),
-        )  # fmt: skip
+            count=count,
+            mean_square_speed=float(sums[3]) / count,
+            velocity=sums[7:10] / count,
+            center=sums[4:7] / count,
+            low=-most[1:4],
+            high=most[4:7],
+            max_speed=float(most[0]),
+            bad_positions=int(sums[1]),
+            bad_velocities=int(sums[2]),
+        )
 
     def assign(self, arrays: Mapping[str, np.ndarray], place: np.ndarray) -> None:
         """Take other particles, in the order of their places; collective."""
@@ -233,5 +259,12 @@ class ParticleMigration(ParticleExchange):
         grid, count = self.part.grid, self.particles.count
         found = wp.empty(count, dtype=wp.uint8, device=grid.device)
         if count:
-            launch(WHERE, count, grid, position=self.particles.position, where=found, **bounds_of(self.part))
+            launch(
+                WHERE,
+                count,
+                grid,
+                position=self.particles.position,
+                where=found,
+                **bounds_of(self.part),
+            )
         return np.asarray(found.numpy())

@@ -1,7 +1,8 @@
 """The grid operator as PETSc's Mat and a multigrid cycle as PETSc's PC: for KSP, SNES and TAO, matrix-free.
 
-Vectors are those of a DMDA with one degree of freedom a cell: each rank's cells one after another, x fastest, without ghost cells. Warp
-reads and writes them where PETSc keeps them; fields have a ring of ghost cells, so each product and each cycle costs two strided copies.
+Vectors are those of a DMDA with one degree of freedom a cell: each rank's cells one after another,
+x fastest, without ghost cells. Warp reads and writes them where PETSc keeps them; fields have a
+ring of ghost cells, so each product and each cycle costs two strided copies.
 """
 
 from __future__ import annotations
@@ -30,7 +31,9 @@ if TYPE_CHECKING:
 KERNELS = KernelFile(Path(__file__).parent / "headers/distributed.h")
 ENTER = KERNELS["vector_copies.enter"]
 LEAVE = KERNELS["vector_copies.leave"]
-TRUE_RESIDUAL = frozenset({"cg", "cgne", "fcg", "pipefcg", "groppcg", "pipecg", "bcgs", "tfqmr", "fgmres", "richardson"})
+TRUE_RESIDUAL = frozenset(
+    {"cg", "cgne", "fcg", "pipefcg", "groppcg", "pipecg", "bcgs", "tfqmr", "fgmres", "richardson"}
+)
 """Methods of KSP that measure b - A x if asked to; others know other norms only."""
 
 
@@ -38,7 +41,8 @@ class VectorCopies:
     """Copies between PETSc's vectors and the stored fields of a stencil's grid.
 
     Args:
-        stencil: of the rank's cells; its diagonal says which of them are unknowns. Read at every copy.
+        stencil: of the rank's cells; its diagonal says which of them are unknowns. Read at every
+            copy.
         comm: PETSc's communicator of the vectors, each rank having its own cells.
 
     Attributes:
@@ -53,7 +57,11 @@ class VectorCopies:
         dense = Rows.strided(self._n, self.device, (0, counts[1] * counts[2], counts[2]), counts)
         self._rows = Rows.of(stencil.padding, self.device).beside(dense, (1, 1, 1))
         staged = self.device.is_cuda  # PETSc's vectors are the host's
-        self._staging = [wp.zeros(self._n, dtype=wp.float64, device=self.device) for _ in range(2)] if staged else []
+        self._staging = (
+            [wp.zeros(self._n, dtype=wp.float64, device=self.device) for _ in range(2)]
+            if staged
+            else []
+        )
 
     def vector(self) -> PETSc.Vec:
         """Return a vector of zeros."""
@@ -66,21 +74,29 @@ class VectorCopies:
     def enter(self, v: PETSc.Vec, field: wp.array[Any], scale: float = 1.0) -> None:
         """Set the field to scale v on the unknowns and to 0 on the other cells; its ghost cells stay as they are."""
         values = v.getArray(readonly=True)  # PETSc counts accesses: it ends with the array
-        ENTER.bind(self._rows, v=self._seen(values, 0), d=self.stencil.d, x=field, scale=scale).launch()
+        ENTER.bind(
+            self._rows, v=self._seen(values, 0), d=self.stencil.d, x=field, scale=scale
+        ).launch()
 
-    def leave(self, field: wp.array[Any], others: PETSc.Vec | None, v: PETSc.Vec, scale: float = 1.0) -> None:
+    def leave(
+        self, field: wp.array[Any], others: PETSc.Vec | None, v: PETSc.Vec, scale: float = 1.0
+    ) -> None:
         """Set v to scale times the field on the unknowns and to `others` (0 if None) on the other cells."""
         given = None if others is None else others.getArray(readonly=True)
         values = v.getArray()
         seen, target = None if given is None else self._seen(given, 0), self._seen(values, 1)
-        LEAVE.bind(self._rows, x=field, d=self.stencil.d, others=seen, v=target, scale=scale).launch()
+        LEAVE.bind(
+            self._rows, x=field, d=self.stencil.d, others=seen, v=target, scale=scale
+        ).launch()
         if self._staging:
             values[:] = target.numpy()
 
     def _seen(self, values: np.ndarray, buffer: int) -> wp.array[Any]:
         """Return a vector's memory as the device sees it: itself on the CPU, a copy on a GPU."""
         if not self._staging:
-            return wp.array(ptr=values.ctypes.data, dtype=wp.float64, shape=self._n, device=self.device)
+            return wp.array(
+                ptr=values.ctypes.data, dtype=wp.float64, shape=self._n, device=self.device
+            )
         self._staging[buffer].assign(values)
         return self._staging[buffer]
 
@@ -88,8 +104,9 @@ class VectorCopies:
 class StencilMatrix:
     """The product with a stencil, as the context of a Mat of PETSc's type `python`.
 
-    B = A on the cells with a diagonal that is not 0, for x = 0 on the others; the identity on the others. A stencil whose diagonal a free
-    set I has masked thus gives B = D_I A D_I + D_(not I), symmetric if A is, and on ranks the same matrix as on one.
+    B = A on the cells with a diagonal that is not 0, for x = 0 on the others; the identity on the
+    others. A stencil whose diagonal a free set I has masked thus gives B = D_I A D_I + D_(not I),
+    symmetric if A is, and on ranks the same matrix as on one.
 
     Args:
         stencil: as it is at each product.
@@ -98,7 +115,9 @@ class StencilMatrix:
 
     def __init__(self, stencil: PaddedStencil, copies: VectorCopies) -> None:
         self._stencil, self._copies = stencil, copies
-        self._x, self._y = (zeros(stencil.padding.size, wp.float64, stencil.device) for _ in range(2))
+        self._x, self._y = (
+            zeros(stencil.padding.size, wp.float64, stencil.device) for _ in range(2)
+        )
 
     def as_mat(self) -> PETSc.Mat:
         """Return it as a Mat of PETSc."""
@@ -124,7 +143,10 @@ class StencilMatrix:
     def getDiagonal(self, matrix: PETSc.Mat, d: PETSc.Vec) -> None:  # noqa: N802  # PETSc's name
         """Write the diagonal of B to d."""
         padding = self._stencil.padding
-        own = self._stencil.d.numpy().reshape(padding.shape)[1:-1, 1:-1, 1:-1].astype(np.float64) * self._stencil.unit
+        own = (
+            self._stencil.d.numpy().reshape(padding.shape)[1:-1, 1:-1, 1:-1].astype(np.float64)
+            * self._stencil.unit
+        )
         d.setArray(np.where(own == 0, 1.0, own).ravel())
 
 
@@ -142,7 +164,9 @@ class CyclePreconditioner:
     def apply(self, preconditioner: PETSc.PC, r: PETSc.Vec, z: PETSc.Vec) -> None:
         """Z = one cycle on r; the identity on cells that are held."""
         finest = self._hierarchy.finest
-        size = r.norm()  # corrections may be float32: r is brought to length 1. PETSc remembers the norms that its KSP has asked for
+        # corrections may be float32: r is brought to length 1. PETSc remembers the norms that its
+        # KSP has asked for
+        size = r.norm()
         if size == 0 or not math.isfinite(size):
             r.copy(z)
             return
@@ -156,21 +180,25 @@ class CyclePreconditioner:
 class PetscGrid:
     """Grid operator and multigrid cycle as PETSc objects.
 
-    PETSc's own methods then work on the operator, matrix-free: KSP with the cycle; SNES's vinewtonrsls and TAO's tron and gpcg, which
-    take free sets out of the operator themselves, with `-pc_type none` or jacobi. Everything here is collective where ranks share the
-    operator. Keep the grid while PETSc uses its objects.
+    PETSc's own methods then work on the operator, matrix-free: KSP with the cycle; SNES's
+    vinewtonrsls and TAO's tron and gpcg, which take free sets out of the operator themselves, with
+    `-pc_type none` or jacobi. Everything here is collective where ranks share the operator. Keep
+    the grid while PETSc uses its objects.
 
-    Grids whose FLUID cells touch neither AIR nor a shift are singular: set the constants as the null space of PETSc's matrices.
+    Grids whose FLUID cells touch neither AIR nor a shift are singular: set the constants as the
+    null space of PETSc's matrices.
 
     Args:
         A: the operator, of one process or distributed over ranks.
-        hierarchy: of A, its finest diagonal filled by the caller; None: one of its own, for all unknowns until `hold` is called.
+        hierarchy: of A, its finest diagonal filled by the caller; None: one of its own, for all
+            unknowns until `hold` is called.
         real: type in which its cycles work.
         cycle: settings of the cycles.
 
     Attributes:
         operator: A as a Mat, the identity on cells that are no FLUID.
-        matrix: A on the free set as a Mat, the identity on other cells; in the hierarchy's storage, so with coefficients of type `real`.
+        matrix: A on the free set as a Mat, the identity on other cells; in the hierarchy's storage,
+            so with coefficients of type `real`.
         cycle: context of a PC on the free set.
         copies: between vectors and stored fields.
 
@@ -183,10 +211,16 @@ class PetscGrid:
     """
 
     def __init__(
-        self, A: HasStencil, hierarchy: Hierarchy | None = None, *, real: Any = wp.float32, cycle: CycleSettings | None = None
+        self,
+        A: HasStencil,
+        hierarchy: Hierarchy | None = None,
+        *,
+        real: Any = wp.float32,
+        cycle: CycleSettings | None = None,
     ) -> None:
         self._A, comm = A, communicator(A)
-        petsc().garbage_cleanup(comm)  # what ranks share ends when all have let go of it, and PETSc has time to look
+        # what ranks share ends when all have let go of it, and PETSc has time to look
+        petsc().garbage_cleanup(comm)
         self._kept: list[Any] = []
         weakref.finalize(self, _let_go, self._kept).atexit = False
         self.hierarchy = hierarchy or make_hierarchy(A.stencil, real, bounded=False, settings=cycle)
@@ -200,7 +234,9 @@ class PetscGrid:
     @cached_property
     def operator(self) -> PETSc.Mat:
         """Matrix of A on all unknowns, built at first access."""
-        return self._keep(StencilMatrix(self._A.stencil, VectorCopies(self._A.stencil, self.copies.comm)).as_mat())
+        return self._keep(
+            StencilMatrix(self._A.stencil, VectorCopies(self._A.stencil, self.copies.comm)).as_mat()
+        )
 
     def vector(self, field: Any = None) -> PETSc.Vec:
         """Return a vector with the values of a field of A's shape; zeros if None."""
@@ -243,7 +279,8 @@ class PetscGrid:
     def _keep(self, thing: Any) -> Any:
         """Return an object whose methods are Python's, with one reference more as long as this grid lives.
 
-        When a program ends, PETSc ends what is left of its objects, and Python has ended already: it must not come to these.
+        When a program ends, PETSc ends what is left of its objects, and Python has ended already:
+        it must not come to these.
         """
         thing.incRef()
         self._kept.append(thing)

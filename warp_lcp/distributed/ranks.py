@@ -24,8 +24,8 @@ class Ranks:
     All methods are collective: every rank must call them, in the same order, and gets the same
     result.
 
-    Every rank sends its part to all and adds the parts in rank order, so that all ranks have the same bits and take the same
-    decisions.
+    Every rank sends its part to all and adds the parts in rank order, so that all ranks have the
+    same bits and take the same decisions.
 
     Args:
         comm: of mpi4py.
@@ -38,7 +38,8 @@ class Ranks:
         """Return the ranks that `mpiexec` has started.
 
         Raises:
-            ImportError: petsc4py or mpi4py cannot be imported; the message says how to install them.
+            ImportError: petsc4py or mpi4py cannot be imported; the message says how to install
+                them.
         """
         return cls(_world().tompi4py())
 
@@ -125,11 +126,16 @@ class Ranks:
         Raises:
             ValueError: it is not; on all ranks.
         """
-        mine = np.frombuffer(hashlib.blake2b(pickle.dumps(value), digest_size=16).digest(), dtype=np.uint8)
+        mine = np.frombuffer(
+            hashlib.blake2b(pickle.dumps(value), digest_size=16).digest(), dtype=np.uint8
+        )
         found = self.gather(mine)
         others = np.flatnonzero((found != found[0]).any(axis=1))
         if others.size:
-            raise ValueError(f"{name} on rank {others[0]} differs from rank 0: start all ranks with the same command and files")
+            raise ValueError(
+                f"{name} on rank {others[0]} differs from rank 0: start all ranks with the same "
+                "command and files"
+            )
 
     def free_ended(self) -> None:
         """Free PETSc objects that Python has released on every rank.
@@ -165,8 +171,9 @@ def _in_rows(handle: int, count: int) -> Ranks:
 def _world() -> Any:
     """Return PETSc's own communicator of all ranks, for the life of this process.
 
-    PETSc would make it with the first object on a communicator, which all ranks must do together, and free it with the last one. Python
-    ends objects on each rank at another time: with none left on one rank, that rank would wait for the others to make it again.
+    PETSc would make it with the first object on a communicator, which all ranks must do together,
+    and free it with the last one. Python ends objects on each rank at another time: with none left
+    on one rank, that rank would wait for the others to make it again.
     """
     return petsc().COMM_WORLD.duplicate()
 
@@ -174,12 +181,13 @@ def _world() -> Any:
 def device_of_rank(ranks: Ranks, name: str | None = None) -> str:
     """Return the Warp device of this rank; collective.
 
-    Ranks on GPUs exchange ghost cells through the host's memory. None has run on more than one GPU so far.
+    Ranks on GPUs exchange ghost cells through the host's memory. None has run on more than one GPU
+    so far.
 
     Args:
         ranks: all of them.
-        name: `cpu`; `cuda`: the GPUs of a machine in turns, one a rank; `cuda:N`: that one on every machine; None: GPUs where there
-            are some.
+        name: `cpu`; `cuda`: the GPUs of a machine in turns, one a rank; `cuda:N`: that one on every
+            machine; None: GPUs where there are some.
 
     Raises:
         ValueError: the machine of this rank has no such device; the message names the rank.
@@ -216,7 +224,10 @@ def dealt(name: str | None, number: int, found: list[str]) -> str:
         return found[number % len(found)]
     if name in found:
         return str(name)
-    raise ValueError(f"--device {name}: there is no such device on this machine; choose from {', '.join([*found, 'cpu'])}")
+    raise ValueError(
+        f"--device {name}: there is no such device on this machine; choose from "
+        f"{', '.join([*found, 'cpu'])}"
+    )
 
 
 def _shared() -> int:

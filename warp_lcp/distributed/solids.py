@@ -19,14 +19,17 @@ if TYPE_CHECKING:
     from warp_lcp.distributed.subdomain import Subdomain
 
 
-def boundary_of_part(scene: ParticleScene, part: Subdomain, solids: Sequence[PlacedSolid]) -> tuple[Boundary, list[str]]:
+def boundary_of_part(
+    scene: ParticleScene, part: Subdomain, solids: Sequence[PlacedSolid]
+) -> tuple[Boundary, list[str]]:
     """Return the solids that meet a rank's part, and the domain's walls where it has them; collective.
 
-    Each rank measures its part and takes what lies beyond its cuts from the ranks that have measured more of it. If no rank has cut cells
-    all have whole ones.
+    Each rank measures its part and takes what lies beyond its cuts from the ranks that have
+    measured more of it. If no rank has cut cells all have whole ones.
 
     Args:
-        scene: says whether solids cut cells, the domain's wall separates, sides are open, and cells turn SOLID as those of sources do.
+        scene: says whether solids cut cells, the domain's wall separates, sides are open, and cells
+            turn SOLID as those of sources do.
         part: of the grid.
         solids: in the order of their numbers.
 
@@ -50,7 +53,9 @@ def boundary_of_part(scene: ParticleScene, part: Subdomain, solids: Sequence[Pla
         shapes = [solid.geometry for solid in solids]
     notes = start_notes(solids, grid)
     voxels = voxelize(grid, solids, open_sides=with_periodic(ends, sides), **walls)
-    notes += small_notes((solid.name for solid in solids), ranks.sum([*voxels.covered, 0]), grid.spacing)
+    notes += small_notes(
+        (solid.name for solid in solids), ranks.sum([*voxels.covered, 0]), grid.spacing
+    )
     part.fill(voxels.index)
     still = np.zeros((1 + len(solids), 3)) if scene.source else None
     boundary = WholeCells(grid, voxels, still, open_sides=ends, sides=sides, shapes=shapes)

@@ -36,17 +36,20 @@ from warp_lcp.rows.vectors import Across, convert
 
 DEFAULT_BALANCE = Balance()
 MOST_KEPT = 32  # exchanges of fields that are filled again and again
-LAYERS = 5  # of ghost cells: at a face that a wall closes the liquid up to 4.8 cells away tells whether it is held
+# of ghost cells: at a face that a wall closes the liquid up to 4.8 cells away tells whether it is
+# held
+LAYERS = 5
 
 
 def ghost_layers(cfl: float, smoothing: int) -> int:
     """Return how many layers of ghost cells a box needs.
 
-    Ghost layers are right when they have been filled; what a face or cell takes from its neighbors is then wrong in the outermost layer,
-    what those take in the next, and so on. Fields are filled again before that would reach the box. Nothing is filled while particles move:
-    a stage of their way looks at faces within 1.5 cells of a place, and three layers more than the Courant number leave room for liquid
-    that the step makes faster. Nor between the binomial passes over a level set, a layer each, the slope beside walls, another, and the two
-    layers of cells in solids.
+    Ghost layers are right when they have been filled; what a face or cell takes from its neighbors
+    is then wrong in the outermost layer, what those take in the next, and so on. Fields are filled
+    again before that would reach the box. Nothing is filled while particles move: a stage of their
+    way looks at faces within 1.5 cells of a place, and three layers more than the Courant number
+    leave room for liquid that the step makes faster. Nor between the binomial passes over a level
+    set, a layer each, the slope beside walls, another, and the two layers of cells in solids.
 
     Args:
         cfl: the Courant number of the run.
@@ -99,9 +102,10 @@ def _filling(forest: StarForest, fields: Sequence[wp.array | np.ndarray]) -> Ope
 class Subdomain(GridPart):
     """A rank's part of a grid: the cells of its box, and of those around it what lies in the domain within some layers.
 
-    The outermost layer is the ring that every staggered grid has around its cells. At the domain's sides the ring is that of the whole
-    grid, at cuts it is the last of the ghost layers: there the sides of the part must be open, see `cuts`. Along an axis without an end
-    that is cut, the part goes on beyond the domain's sides, with the cells that lie there again.
+    The outermost layer is the ring that every staggered grid has around its cells. At the domain's
+    sides the ring is that of the whole grid, at cuts it is the last of the ghost layers: there the
+    sides of the part must be open, see `cuts`. Along an axis without an end that is cut, the part
+    goes on beyond the domain's sides, with the cells that lie there again.
 
     Args:
         decomposition: the boxes of all ranks.
@@ -115,7 +119,8 @@ class Subdomain(GridPart):
     Attributes:
         grid: the part as a grid, whose coordinates and positions are those of the whole domain.
         cuts: has bit n set if side n of the part, see `warp_lcp.grid.sides`, is a cut.
-        own_faces: those whose lower faces belong to the box: its cells, and the ring beyond the domain's upper sides that it touches.
+        own_faces: those whose lower faces belong to the box: its cells, and the ring beyond the
+            domain's upper sides that it touches.
 
     Raises:
         ValueError: a box has fewer cells along a cut axis than layers; on all ranks.
@@ -124,11 +129,22 @@ class Subdomain(GridPart):
     shared = True
 
     def __init__(
-        self, decomposition: Decomposition, *, spacing: float, dimension: int, device: Any, layers: int, mailbox: Mailbox | None = None,
+        self,
+        decomposition: Decomposition,
+        *,
+        spacing: float,
+        dimension: int,
+        device: Any,
+        layers: int,
+        mailbox: Mailbox | None = None,
         balance: Balance = DEFAULT_BALANCE,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.decomposition, self.layers, self.dimension = decomposition, layers, dimension
-        self.ranks, self.box, self.joined = decomposition.ranks, decomposition.box, tuple(decomposition.joined)
+        self.ranks, self.box, self.joined = (
+            decomposition.ranks,
+            decomposition.box,
+            tuple(decomposition.joined),
+        )
         self.balance, self.mailbox = balance, mailbox or MpiMailbox(self.ranks.comm)
         self._fillings: dict[Any, Table] = {}
         self._forests: dict[tuple[int, int | None, int], StarForest] = {}
@@ -136,18 +152,34 @@ class Subdomain(GridPart):
         self._trees: TreesAtCuts | None = None
         self._near: dict[int, tuple[Window, ActiveWindow]] = {}  # by the layers around the box
         for axis in decomposition.cut_axes:
-            least, most = min(decomposition.parts[axis]), max(decomposition.counts[axis] // layers, 1)
+            least, most = (
+                min(decomposition.parts[axis]),
+                max(decomposition.counts[axis] // layers, 1),
+            )
             if least < layers:
                 raise ValueError(
-                    f"{decomposition.processes[axis]} ranks along {'xyz'[axis]} have boxes of {least} cells, but a step needs "
-                    f"{layers} layers around a box: start fewer ranks (at most {most} along that axis), or refine the grid"
+                    f"{decomposition.processes[axis]} ranks along {'xyz'[axis]} have boxes of "
+                    f"{least} cells, but a step needs "
+                    f"{layers} layers around a box: start fewer ranks (at most {most} along that "
+                    "axis), or refine the grid"
                 )
         cells = self._cells(self.box)
-        self.grid = StaggeredGrid(cells.counts, spacing, dimension, device, origin=cells.low, whole=decomposition.counts, part=self)
+        self.grid = StaggeredGrid(
+            cells.counts,
+            spacing,
+            dimension,
+            device,
+            origin=cells.low,
+            whole=decomposition.counts,
+            part=self,
+        )
         inner = self.box.moved(cells.low, -1)
         self._owned = self.grid.window([low + 1 for low in inner.low], inner.high)
         last = self._at_sides(self.box)[1]
-        self.own_faces = self.grid.window([low + 1 for low in inner.low], [high + end for high, end in zip(inner.high, last, strict=True)])
+        self.own_faces = self.grid.window(
+            [low + 1 for low in inner.low],
+            [high + end for high, end in zip(inner.high, last, strict=True)],
+        )
         self.cuts = 0
         for axis in range(dimension):
             for side in range(2):
@@ -190,9 +222,14 @@ class Subdomain(GridPart):
     def repartition(self, decomposition: Decomposition) -> Subdomain:
         """Return the part that this rank works on with other boxes."""
         return Subdomain(
-            decomposition, spacing=self.grid.spacing, dimension=self.dimension, device=self.grid.device, layers=self.layers,
-            mailbox=self.mailbox, balance=self.balance,
-        )  # fmt: skip
+            decomposition,
+            spacing=self.grid.spacing,
+            dimension=self.dimension,
+            device=self.grid.device,
+            layers=self.layers,
+            mailbox=self.mailbox,
+            balance=self.balance,
+        )
 
     def should_rebalance(self, step: int) -> bool:
         """Return whether the ranks look for better boxes in a step."""
@@ -216,9 +253,13 @@ class Subdomain(GridPart):
         return self.repartition(self.decomposition.repartition(cuts))
 
     def take_pieces(
-        self, pieces: Sequence[Piece], particles: Sequence[str], like: Mapping[str, np.ndarray], signature: np.ndarray,
+        self,
+        pieces: Sequence[Piece],
+        particles: Sequence[str],
+        like: Mapping[str, np.ndarray],
+        signature: np.ndarray,
         solids: np.ndarray | None,
-    ) -> tuple[Piece, Piece, Piece]:  # fmt: skip
+    ) -> tuple[Piece, Piece, Piece]:
         """Return what of pieces lies in this box; collective. See `warp_lcp.distributed.particle_pieces.take_pieces`."""
         return take_pieces(self, particles, like, signature, pieces, solids)
 
@@ -234,7 +275,10 @@ class Subdomain(GridPart):
     def kept(self, fields: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Return what fields have in the box, shape (..., nz, ny, nx), and numbers among them as they are."""
         cells = fields_of(fields)
-        return {name: np.ascontiguousarray(self.box_of(values)) if name in cells else values for name, values in fields.items()}
+        return {
+            name: np.ascontiguousarray(self.box_of(values)) if name in cells else values
+            for name, values in fields.items()
+        }
 
     def refill(self) -> Refill:
         """Return what fills ghost cells again while velocities are continued, before what is wrong in them comes near the box."""
@@ -247,8 +291,13 @@ class Subdomain(GridPart):
     def notes(self) -> list[str]:
         """Return how many ranks there are, and how large their boxes."""
         boxes = self.decomposition.boxes
-        largest = " x ".join(map(str, max(boxes, key=lambda box: box.cells).counts[: self.dimension]))
-        return [f"{len(boxes)} ranks, boxes of up to {largest} cells and {self.layers} layers of ghost cells"]
+        largest = " x ".join(
+            map(str, max(boxes, key=lambda box: box.cells).counts[: self.dimension])
+        )
+        return [
+            f"{len(boxes)} ranks, boxes of up to {largest} cells and {self.layers} layers of ghost "
+            "cells"
+        ]
 
     def coarser(self, layers: int) -> StaggeredGrid | None:
         """Return this rank's part of the grid of cells of twice the edge; None if a cut lies in one, or a box is thinner than `layers`."""
@@ -257,27 +306,47 @@ class Subdomain(GridPart):
         boxes, grid = self.decomposition.coarser((2, 2, self.dimension - 1)), self.grid
         if boxes is None or any(min(boxes.parts[axis]) < layers for axis in boxes.cut_axes):
             return None
-        return Subdomain(boxes, spacing=2.0 * grid.spacing, dimension=self.dimension, device=grid.device, layers=layers).grid
+        return Subdomain(
+            boxes,
+            spacing=2.0 * grid.spacing,
+            dimension=self.dimension,
+            device=grid.device,
+            layers=layers,
+        ).grid
 
     @property
     def row_ranks(self) -> Any:
         """The ranks that have cells of the same rows along x, in their order; None if rows are not cut."""
-        return self.ranks.in_rows(self.decomposition.processes[0]) if 0 in self.decomposition.cut_axes else None
+        return (
+            self.ranks.in_rows(self.decomposition.processes[0])
+            if 0 in self.decomposition.cut_axes
+            else None
+        )
 
     def _cells(self, box: CellBox) -> CellBox:
         """Return the cells of the part around a box, without its ring."""
         counts, joined = self.decomposition.counts, self.decomposition.joined
         more = [self.layers if axis in joined else 0 for axis in range(3)]
-        return box.grown(self.layers - 1).common(CellBox.of([-m for m in more], [n + m for n, m in zip(counts, more, strict=True)]))
+        return box.grown(self.layers - 1).common(
+            CellBox.of([-m for m in more], [n + m for n, m in zip(counts, more, strict=True)])
+        )
 
     def _at_sides(self, box: CellBox) -> list[list[bool]]:
         """Tell whether a box ends at the domain's lower and upper sides along x, y, z, beyond which nothing goes on."""
         counts, joined = self.decomposition.counts, self.decomposition.joined
-        ends = [[n == 0 for n in box.low], [n == count for n, count in zip(box.high, counts, strict=True)]]
+        ends = [
+            [n == 0 for n in box.low],
+            [n == count for n, count in zip(box.high, counts, strict=True)],
+        ]
         return [[at and axis not in joined for axis, at in enumerate(end)] for end in ends]
 
     def forest(
-        self, layers: int = 1, width: int | None = None, parts: int = 1, which: np.ndarray | None = None, into: StarForest | None = None
+        self,
+        layers: int = 1,
+        width: int | None = None,
+        parts: int = 1,
+        which: np.ndarray | None = None,
+        into: StarForest | None = None,
     ) -> StarForest:
         """Return the star forest of several ranks that fills ghost cells and the rings beside them; collective.
 
@@ -292,13 +361,26 @@ class Subdomain(GridPart):
         owned = [self._with_sides(box, parts) for box in boxes]
         filled = None if width is None else self._refined(self.box.grown(width), parts)
         stored = [self._refined(self._cells(box), parts).grown(1) for box in boxes]
-        shifts = [self._refined(CellBox(shift, shift), parts).low for shift in self.decomposition.shifts]
-        return star_forest(self.ranks, owned, stored, filled=filled, layers=layers, which=which, shifts=shifts, into=into)
+        shifts = [
+            self._refined(CellBox(shift, shift), parts).low for shift in self.decomposition.shifts
+        ]
+        return star_forest(
+            self.ranks,
+            owned,
+            stored,
+            filled=filled,
+            layers=layers,
+            which=which,
+            shifts=shifts,
+            into=into,
+        )
 
     def _refined(self, box: CellBox, parts: int) -> CellBox:
         """Return a box in cells that are cut into so many along each axis."""
         each = [parts if axis < self.dimension else 1 for axis in range(3)]
-        return CellBox.of(*([n * p for n, p in zip(corner, each, strict=True)] for corner in (box.low, box.high)))
+        return CellBox.of(
+            *([n * p for n, p in zip(corner, each, strict=True)] for corner in (box.low, box.high))
+        )
 
     def _with_sides(self, box: CellBox, parts: int = 1) -> CellBox:
         """Return a box, refined, with the ring beyond the domain's sides that it touches: it is the one to know that, too."""
@@ -310,13 +392,20 @@ class Subdomain(GridPart):
             high[axis] += at_high[axis]
         return CellBox.of(low, high)
 
-    def fill(self, *fields: wp.array | np.ndarray, width: int | None = None, parts: int = 1, forest: StarForest | None = None) -> None:
+    def fill(
+        self,
+        *fields: wp.array | np.ndarray,
+        width: int | None = None,
+        parts: int = 1,
+        forest: StarForest | None = None,
+    ) -> None:
         """Fill the ghost cells of fields of the part, or of stacks of equally many layers of those; collective.
 
         On the CPU it may be recorded among launches, which all ranks then run alike.
 
         Args:
-            fields: any types, the last axes z, y, x; or the host's views of their memory, which cost less to fill often.
+            fields: any types, the last axes z, y, x; or the host's views of their memory, which
+                cost less to fill often.
             width: how far from the box; None: all.
             parts: the fields are of `grid.refined(parts)`.
             forest: of `forest`, for such fields; None: one that is made once.
@@ -351,9 +440,14 @@ class Subdomain(GridPart):
         if self._gathering is None:
             boxes, cells = self.decomposition.boxes, CellBox((0, 0, 0), self.decomposition.counts)
             stored = [self._cells(box).grown(1) for box in boxes]
-            self._gathering = star_forest(self.ranks, [self._with_sides(box) for box in boxes], stored, whole=cells.grown(1))
+            self._gathering = star_forest(
+                self.ranks, [self._with_sides(box) for box in boxes], stored, whole=cells.grown(1)
+            )
         hosts = [field.numpy() for field in whole]
-        exchange_all(self._gathering, [(field.numpy(), host) for field, host in zip(fields, hosts, strict=True)])
+        exchange_all(
+            self._gathering,
+            [(field.numpy(), host) for field, host in zip(fields, hosts, strict=True)],
+        )
         for field, host in zip(whole, hosts, strict=True):
             if field.device.is_cuda:
                 field.assign(host)
@@ -386,7 +480,11 @@ class Subdomain(GridPart):
     def box_like(self, field: wp.array) -> wp.array:
         """Return a field of the box with a ring: memory of the field itself where boxes are layers of planes, else one of zeros."""
         view = self.stored_box_of(field)
-        return view if view.is_contiguous else wp.zeros(view.shape, dtype=field.dtype, device=self.grid.device)
+        return (
+            view
+            if view.is_contiguous
+            else wp.zeros(view.shape, dtype=field.dtype, device=self.grid.device)
+        )
 
     def copy_to_box(self, field: wp.array, box: wp.array) -> None:
         """Give a field of the box what one of the part holds, if it does not share its memory."""
@@ -429,12 +527,17 @@ class Subdomain(GridPart):
 
     def keep_own(self, cells: np.ndarray) -> None:
         """Set a mask of the part's cells to False outside the box."""
-        own = tuple(slice(low - 1, high - 1) for low, high in zip(self.owned.low, self.owned.high, strict=True))
+        own = tuple(
+            slice(low - 1, high - 1)
+            for low, high in zip(self.owned.low, self.owned.high, strict=True)
+        )
         inside = cells[own].copy()
         cells[...] = False
         cells[own] = inside
 
-    def make_boundary(self, scene: ParticleScene, solids: Sequence[PlacedSolid]) -> tuple[Boundary, list[str]]:
+    def make_boundary(
+        self, scene: ParticleScene, solids: Sequence[PlacedSolid]
+    ) -> tuple[Boundary, list[str]]:
         """Return solids and walls of the part as the whole grid would have them, and warnings; collective."""
         return boundary_of_part(scene, self, solids)
 
@@ -463,7 +566,9 @@ class Subdomain(GridPart):
         active.move_to(common)
         return active
 
-    def join_trees(self, trees: int, seen: Window | None, parent: wp.array, number: wp.array, held: wp.array) -> BodyNumbers:
+    def join_trees(
+        self, trees: int, seen: Window | None, parent: wp.array, number: wp.array, held: wp.array
+    ) -> BodyNumbers:
         """Join the trees of cells that reach over several ranks' boxes to bodies; collective."""
         if self._trees is None:
             self._trees = TreesAtCuts(self)
@@ -471,6 +576,9 @@ class Subdomain(GridPart):
 
     def owners(self, cells: np.ndarray) -> np.ndarray:
         """Return the rank that has each cell (x, y, z) of the whole domain, shape (n, 3)."""
-        place = [np.searchsorted(np.cumsum(part)[:-1], cells[:, axis], side="right") for axis, part in enumerate(self.decomposition.parts)]
+        place = [
+            np.searchsorted(np.cumsum(part)[:-1], cells[:, axis], side="right")
+            for axis, part in enumerate(self.decomposition.parts)
+        ]
         px, py, _ = self.decomposition.processes
         return np.asarray(place[0] + px * (place[1] + py * place[2]))

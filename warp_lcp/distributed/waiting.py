@@ -7,7 +7,8 @@ import math
 import time
 from typing import Any, Self
 
-AWAKE = 1e-3  # seconds that a wait spends asking: between two operations ranks rarely differ by more
+# seconds that a wait spends asking: between two operations ranks rarely differ by more
+AWAKE = 1e-3
 SHARE = 1 / 16  # of a wait's length so far, which a rank that has nothing to do sleeps at a time
 LONGEST = 5e-3  # seconds of such a sleep
 
@@ -16,7 +17,8 @@ class Waiting:
     """Tells others, such as a `Watchdog`, whether this process is inside an operation that other ranks take part in.
 
     Attributes:
-        native: entries and exits of operations in native code, and the error of the first one that has failed, 0 while none has.
+        native: entries and exits of operations in native code, and the error of the first one that
+            has failed, 0 while none has.
 
     >>> waiting = Waiting()
     >>> with waiting("a sum"):

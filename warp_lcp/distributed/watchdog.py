@@ -24,13 +24,22 @@ from warp_lcp.files.atomic import SUFFIX, open_in_place
 LIMIT = 600.0  # seconds: kernels that are compiled, and the largest frames, take less
 BEATS = 20  # of the thread within the limit; it looks at the clock no more often
 LONGEST_BEAT = 30.0  # seconds
-SILENT, SILENCE = 4, 2.0  # beats, and seconds, after which a rank that has told nothing new cannot: stopped, or its machine is gone
+# beats, and seconds, after which a rank that has told nothing new cannot: stopped, or its machine
+# is gone
+SILENT, SILENCE = 4, 2.0
 POST = r"waits_\d{4,}"  # names of the files
-FIRST = 5  # ranks that look one beat after another, so that one of them speaks; later ones only if those cannot
-GRACE = 5.0  # seconds that it may take to end all ranks before this one ends itself, which mpiexec notices
+# ranks that look one beat after another, so that one of them speaks; later ones only if those
+# cannot
+FIRST = 5
+# seconds that it may take to end all ranks before this one ends itself, which mpiexec notices
+GRACE = 5.0
 ROOM = 512  # bytes of a post: written over in place, which a full disk allows
 OWN = "warp_lcp."
-PASSING = {"contextlib", *(f"{OWN}distributed.{name}" for name in ("waiting", "ranks", "collective", "halo"))}  # wait for whom calls them
+# wait for whom calls them
+PASSING = {
+    "contextlib",
+    *(f"{OWN}distributed.{name}" for name in ("waiting", "ranks", "collective", "halo")),
+}
 
 
 @dataclass(frozen=True)
@@ -90,9 +99,10 @@ class Board:
 class Watchdog:
     """A `with` block in which all ranks end, with a message, once one has kept the others waiting for too long.
 
-    On each rank a thread tells by a small file, some times within the limit, what its main thread does. A rank that has waited so long
-    reads what the others have told, and says who is late. Time in which processes are stopped, by Ctrl-Z or a batch system, does not count.
-    Before there is a folder that all see, ranks of one machine hear of each other.
+    On each rank a thread tells by a small file, some times within the limit, what its main thread
+    does. A rank that has waited so long reads what the others have told, and says who is late. Time
+    in which processes are stopped, by Ctrl-Z or a batch system, does not count. Before there is a
+    folder that all see, ranks of one machine hear of each other.
 
     Args:
         ranks: all of them.
@@ -105,23 +115,38 @@ class Watchdog:
     ...     pass
     """
 
-    def __init__(self, ranks: Ranks, limit: float, end: Callable[[str], object], *, watched: Waiting = waiting) -> None:
+    def __init__(
+        self,
+        ranks: Ranks,
+        limit: float,
+        end: Callable[[str], object],
+        *,
+        watched: Waiting = waiting,
+    ) -> None:
         """Agree on a label; collective."""
         self._ranks, self._limit, self._end, self._watched = ranks, limit, end, watched
         self._beat = min(limit / BEATS, LONGEST_BEAT)
-        self._board = Board(Path(tempfile.gettempdir()), f"warp-lcp-{ranks.share(secrets.token_hex(8))}-")
+        self._board = Board(
+            Path(tempfile.gettempdir()), f"warp-lcp-{ranks.share(secrets.token_hex(8))}-"
+        )
         self._posting = threading.Lock()
         self._over = threading.Event()
         self._main = threading.main_thread().ident
         self._thread = threading.Thread(target=self._watch, name="watchdog", daemon=True)
-        self._seen: dict[int, tuple[Post | None, Post | None, int]] = {}  # of ranks: since when they stay, the last post, its age in beats
+        # of ranks: since when they stay, the last post, its age in beats
+        self._seen: dict[int, tuple[Post | None, Post | None, int]] = {}
 
     def __enter__(self) -> Self:
         if self._limit and self._ranks.size > 1:
             self._thread.start()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
         self._over.set()
         if self._thread.is_alive():
             self._thread.join(1.0)  # not longer: a file system may hang
@@ -133,20 +158,29 @@ class Watchdog:
             self._board.clear([self._ranks.rank])
             self._board = Board(folder)
             if self._thread.is_alive():
-                self._board.write(self._ranks.rank, Post(0, 0, "", 0.0, "its beginning"))  # while the disk has room
+                # while the disk has room
+                self._board.write(self._ranks.rank, Post(0, 0, "", 0.0, "its beginning"))
 
     def _watch(self) -> None:
         beat, count, idle, then = 0, self._watched.count, 0.0, time.monotonic()
         while not self._over.wait(self._beat):
             now = time.monotonic()
-            beat, idle, then = beat + 1, idle + min(now - then, 2 * self._beat), now  # longer if the process was stopped
+            # longer if the process was stopped
+            beat, idle, then = beat + 1, idle + min(now - then, 2 * self._beat), now
             if count != self._watched.count:
                 count, idle = self._watched.count, 0.0
-            mine = Post(beat, count, self._watched.name, idle, place_of(sys._current_frames().get(self._main or 0)))
+            mine = Post(
+                beat,
+                count,
+                self._watched.name,
+                idle,
+                place_of(sys._current_frames().get(self._main or 0)),
+            )
             with self._posting:
                 if self._over.is_set():
                     return
-                with suppress(OSError):  # a disk that takes no file: the others will say that this rank tells nothing
+                # a disk that takes no file: the others will say that this rank tells nothing
+                with suppress(OSError):
                     self._board.write(self._ranks.rank, mine)
             if idle < self._limit + min(self._ranks.rank, FIRST) * self._beat:
                 self._seen.clear()
@@ -158,7 +192,8 @@ class Watchdog:
 
     def _look(self, mine: Post) -> str:
         """Return what is wrong; "" while ranks go on, or have not yet told twice that they do not."""
-        patience = max(SILENT, math.ceil(SILENCE / self._beat), 0 if mine.name else BEATS)  # a rank that computes waits for nobody
+        # a rank that computes waits for nobody
+        patience = max(SILENT, math.ceil(SILENCE / self._beat), 0 if mine.name else BEATS)
         posts: dict[int, Post | None] = {self._ranks.rank: mine}
         certain = True
         for rank in (rank for rank in range(self._ranks.size) if rank != self._ranks.rank):
@@ -169,7 +204,10 @@ class Watchdog:
             age = 0 if post and last and post.beat != last.beat else age + 1
             self._seen[rank] = first or post, post or last, age
             posts[rank] = None if age > patience else post or last
-            certain = certain and (age > patience or (post is not None and first is not None and post.beat != first.beat))
+            certain = certain and (
+                age > patience
+                or (post is not None and first is not None and post.beat != first.beat)
+            )
         return verdict(posts) if certain else ""
 
 
@@ -187,13 +225,22 @@ def verdict(posts: Mapping[int, Post | None]) -> str:
     waits = _grouped({rank: f"{post.name} ({post.place})" for rank, post in inside.items()})
     if not outside and not silent:
         return f"all ranks wait for each other in different operations: {waits}"
-    late = [f"rank {rank} has been at {post.place} for {post.seconds:.0f} s" for rank, post in outside.items()]
-    late += [f"{_named(silent)} sends no heartbeat: stopped, unreachable, or inside a library call that does not return"] * bool(silent)
+    late = [
+        f"rank {rank} has been at {post.place} for {post.seconds:.0f} s"
+        for rank, post in outside.items()
+    ]
+    late += [
+        f"{_named(silent)} sends no heartbeat: stopped, unreachable, or inside a library call that "
+        "does not return"
+    ] * bool(silent)
     if not inside:
         return "; ".join(late)
     who, seconds = sorted([*outside, *silent]), max(post.seconds for post in inside.values())
     keeps = "keep" if len(who) > 1 else "keeps"
-    return f"{_named(who)} of {len(posts)} {keeps} the others waiting: {'; '.join(late)}; {waits} for {seconds:.0f} s"
+    return (
+        f"{_named(who)} of {len(posts)} {keeps} the others waiting: {'; '.join(late)}; {waits} "
+        f"for {seconds:.0f} s"
+    )
 
 
 def place_of(frame: FrameType | None) -> str:

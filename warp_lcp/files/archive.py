@@ -24,13 +24,24 @@ HEADER = re.compile(  # as NumPy writes it; its own reader evaluates whatever st
     rb"\{'descr': '(?P<type>[<>|=][?bBiufcSUO]\d*)', 'fortran_order': (?P<order>True|False), "
     rb"'shape': \((?P<shape>(?:\d{1,19}, ?)*(?:\d{1,19})?)\),? ?\}\s*"
 )
-LENGTH_BYTES = {(1, 0): 2, (2, 0): 4, (3, 0): 4}  # of a header's length, by the version of the format
+# of a header's length, by the version of the format
+LENGTH_BYTES = {(1, 0): 2, (2, 0): 4, (3, 0): 4}
 LONGEST = 10_000  # characters of a header, NumPy's own limit
 DEFLATED = 1032  # a byte that deflate wrote never becomes more (zlib.net/zlib_tech.html)
 FAULTS = (  # what zipfile, zlib and NumPy raise for files that are no archives
-    OSError, ValueError, TypeError, LookupError, ArithmeticError, EOFError, MemoryError, RuntimeError, SyntaxError,
-    struct.error, zipfile.BadZipFile, zlib.error,
-)  # fmt: skip
+    OSError,
+    ValueError,
+    TypeError,
+    LookupError,
+    ArithmeticError,
+    EOFError,
+    MemoryError,
+    RuntimeError,
+    SyntaxError,
+    struct.error,
+    zipfile.BadZipFile,
+    zlib.error,
+)
 
 
 class ArchiveError(ValueError):
@@ -87,7 +98,9 @@ class Archive:
         try:
             with _faults_named():
                 self._file = zipfile.ZipFile(self._stream)
-                self._members = {info.filename.removesuffix(SUFFIX): info for info in self._file.infolist()}
+                self._members = {
+                    info.filename.removesuffix(SUFFIX): info for info in self._file.infolist()
+                }
                 self._check_members(path.stat().st_size)
                 self.headers = {name: self._header(info) for name, info in self._members.items()}
         except ArchiveError:
@@ -98,7 +111,8 @@ class Archive:
         """Read arrays.
 
         Raises:
-            ArchiveError: there are no such arrays, they are damaged, or together they do not fit the free memory.
+            ArchiveError: there are no such arrays, they are damaged, or together they do not fit
+                the free memory.
         """
         self._check_memory(names)
         found = {}
@@ -125,13 +139,17 @@ class Archive:
         plane = prod(header.shape[1:]) * header.dtype.itemsize
         shape = [part.stop - part.start for part in box]
         with _faults_named(name), self._file.open(self._members[name]) as stream:
-            check_claim(f"{'x'.join(map(str, shape))} values", prod(shape) * header.dtype.itemsize + plane)
+            check_claim(
+                f"{'x'.join(map(str, shape))} values", prod(shape) * header.dtype.itemsize + plane
+            )
             found = np.empty(shape, dtype=header.dtype)
             _exactly(stream, header.length)
             for row in range(rows.stop):
                 read = _exactly(stream, plane)
                 if row >= rows.start:
-                    found[row - rows.start] = np.frombuffer(read, dtype=header.dtype).reshape(header.shape[1:])[tuple(others)]
+                    found[row - rows.start] = np.frombuffer(read, dtype=header.dtype).reshape(
+                        header.shape[1:]
+                    )[tuple(others)]
         return found
 
     def close(self) -> None:
@@ -143,7 +161,12 @@ class Archive:
         """Return the open archive itself."""
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
         """Close the file when the block ends."""
         self.close()
 
@@ -155,9 +178,15 @@ class Archive:
         if sum(info.compress_size for info in infos) > size:
             raise ArchiveError(f"its arrays take more than its {size} bytes")
         for name, info in self._members.items():
-            if info.filename != name + SUFFIX or info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) or info.flag_bits & 1:
+            if (
+                info.filename != name + SUFFIX
+                or info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+                or info.flag_bits & 1
+            ):
                 raise ArchiveError(f"{info.filename!r} is not a plain array")
-            most = info.compress_size * (DEFLATED if info.compress_type == zipfile.ZIP_DEFLATED else 1)
+            most = info.compress_size * (
+                DEFLATED if info.compress_type == zipfile.ZIP_DEFLATED else 1
+            )
             check_claim(f"{name!r} of {info.file_size} bytes", 0, stored=info.file_size, held=most)
 
     def _header(self, info: zipfile.ZipInfo) -> Header:
@@ -170,7 +199,9 @@ class Archive:
             begin = np.lib.format.MAGIC_LEN + LENGTH_BYTES[version] + length
             match = HEADER.fullmatch(_exactly(stream, length)) if length <= LONGEST else None
             if match is None:
-                raise ArchiveError("its header is not a NumPy header, or it declares structured values")
+                raise ArchiveError(
+                    "its header is not a NumPy header, or it declares structured values"
+                )
             dtype = np.dtype(match["type"].decode())
             if dtype.hasobject:
                 raise ArchiveError("it holds objects")
@@ -178,7 +209,10 @@ class Archive:
             header = Header(shape, dtype, match["order"] == b"True", begin)
             if header.nbytes != info.file_size - begin:
                 what = f"{'x'.join(map(str, shape)) or 'one'} of {dtype.itemsize} bytes"
-                raise ArchiveError(f"{what}: these take {header.nbytes} bytes, and the file has {info.file_size - begin}")
+                raise ArchiveError(
+                    f"{what}: these take {header.nbytes} bytes, and the file has "
+                    f"{info.file_size - begin}"
+                )
             return header
 
     def _check_memory(self, names: Collection[str]) -> None:
@@ -196,12 +230,17 @@ class Archive:
 def _faults_named(name: str = "") -> Iterator[None]:
     """Turn what can go wrong while an archive is read into one error, which names the array."""
     try:
-        with warnings.catch_warnings(action="ignore", category=UserWarning):  # of NumPy, on headers that Python 2 wrote
+        # of NumPy, on headers that Python 2 wrote
+        with warnings.catch_warnings(action="ignore", category=UserWarning):
             yield
     except FAULTS as error:
         if isinstance(error, ArchiveError) and not name:
             raise
-        reason = (error.strerror if isinstance(error, OSError) else None) or str(error) or type(error).__name__
+        reason = (
+            (error.strerror if isinstance(error, OSError) else None)
+            or str(error)
+            or type(error).__name__
+        )
         raise ArchiveError(f"{name!r}: {reason}" if name else reason) from error
 
 

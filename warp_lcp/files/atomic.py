@@ -16,7 +16,8 @@ from typing import BinaryIO
 SPARE = ".spare"  # of room that is kept
 SUFFIX = ".part"  # of the temporary files, which a killed run may leave behind
 LINK = "is a link and is not followed"
-TEMPORARY = re.compile(rf"\.(?P<name>.+?)(?:\.[0-9a-f]{{16}})?{re.escape(SUFFIX)}")  # those of older versions have no random part
+# those of older versions have no random part
+TEMPORARY = re.compile(rf"\.(?P<name>.+?)(?:\.[0-9a-f]{{16}})?{re.escape(SUFFIX)}")
 NO_LINKS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
 BY_DESCRIPTOR = {os.open, os.rename, os.unlink} <= os.supports_dir_fd  # not on Windows
 
@@ -36,7 +37,9 @@ class _Folder:
     @classmethod
     @contextmanager
     def opened(cls, path: Path) -> Iterator[_Folder]:
-        descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC) if BY_DESCRIPTOR else None
+        descriptor = (
+            os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC) if BY_DESCRIPTOR else None
+        )
         try:
             yield cls(path, descriptor)
         finally:
@@ -47,7 +50,9 @@ class _Folder:
         return os.open(self._at(name), flags | NO_LINKS, 0o666, dir_fd=self.descriptor)
 
     def rename(self, name: str, other: str) -> None:
-        os.replace(self._at(name), self._at(other), src_dir_fd=self.descriptor, dst_dir_fd=self.descriptor)
+        os.replace(
+            self._at(name), self._at(other), src_dir_fd=self.descriptor, dst_dir_fd=self.descriptor
+        )
 
     def unlink(self, name: str) -> None:
         os.unlink(self._at(name), dir_fd=self.descriptor)
@@ -118,10 +123,12 @@ def open_in_place(path: Path, flags: int, mode: int = 0o666) -> int:
         mode: of a file that is made.
 
     Raises:
-        OSError: it cannot be opened, or is a link, has other names too, or is a pipe, a device or a folder.
+        OSError: it cannot be opened, or is a link, has other names too, or is a pipe, a device or a
+            folder.
     """
     try:
-        descriptor = os.open(path, flags | NO_LINKS | getattr(os, "O_NONBLOCK", 0), mode)  # a pipe would be waited for
+        # a pipe would be waited for
+        descriptor = os.open(path, flags | NO_LINKS | getattr(os, "O_NONBLOCK", 0), mode)
     except OSError as error:
         if error.errno in (errno.ELOOP, errno.EMLINK):
             raise OSError(errno.ELOOP, LINK, str(path)) from error
@@ -154,7 +161,8 @@ def make_folder(folder: Path, *, within: Path | None = None) -> None:
 
     Args:
         folder: the folder.
-        within: a folder; if it is above, none in between may be a link: what is written there stays there.
+        within: a folder; if it is above, none in between may be a link: what is written there stays
+            there.
 
     Raises:
         OSError: it cannot be made, or leads elsewhere.

@@ -19,13 +19,16 @@ class ClaimError(ValueError):
     """A file claims more than it has or than there is room for; the message says how much, not which file."""
 
 
-def check_claim(what: str, needed: int, *, stored: int | None = None, held: int | None = None) -> None:
+def check_claim(
+    what: str, needed: int, *, stored: int | None = None, held: int | None = None
+) -> None:
     """Refuse what a file claims before anything is allocated for it. Call it with counts as they were read, of any size or sign.
 
     Args:
         what: the claim, as the message begins, such as `1000000000000 vertices`.
         needed: memory that reading it takes [bytes].
-        stored: the least that it takes in the file [bytes]; None: a file may leave it out, as a sparse matrix does its zeros.
+        stored: the least that it takes in the file [bytes]; None: a file may leave it out, as a
+            sparse matrix does its zeros.
         held: what the file has for it [bytes].
 
     Raises:
@@ -37,7 +40,9 @@ def check_claim(what: str, needed: int, *, stored: int | None = None, held: int 
         raise ClaimError(f"{what}: these take {_bytes(stored)}, and the file has {_bytes(held)}")
     free = free_host_memory()
     if free is not None and needed > free:
-        raise ClaimError(f"{what}: these need {_bytes(needed)} of memory, and {_bytes(free)} are free")
+        raise ClaimError(
+            f"{what}: these need {_bytes(needed)} of memory, and {_bytes(free)} are free"
+        )
 
 
 def read_whole(path: Path, *, copies: int = 2) -> bytes:
@@ -61,19 +66,33 @@ def read_whole(path: Path, *, copies: int = 2) -> bytes:
 def free_host_memory() -> int | None:
     """Return the memory that this process may still take [bytes]: what the machine has free and its own limit allows; None: not known."""
     found: list[int] = []
-    if MEMORY.exists() and (available := re.search(r"MemAvailable:\s+(\d+) kB", MEMORY.read_text(encoding="ascii"))):
+    if MEMORY.exists() and (
+        available := re.search(r"MemAvailable:\s+(\d+) kB", MEMORY.read_text(encoding="ascii"))
+    ):
         found.append(1024 * int(available[1]))
     if resource is not None and OWN_SIZE.exists():
         limit = resource.getrlimit(resource.RLIMIT_AS)[0]
         if limit != resource.RLIM_INFINITY:
-            found.append(max(0, limit - resource.getpagesize() * int(OWN_SIZE.read_text(encoding="ascii").split()[0])))
+            found.append(
+                max(
+                    0,
+                    limit
+                    - resource.getpagesize() * int(OWN_SIZE.read_text(encoding="ascii").split()[0]),
+                )
+            )
     return min(found, default=None)
 
 
 def _bytes(count: int) -> str:
     """Return a number of bytes as a reader grasps it."""
     count = min(count, 10**24)  # beyond what a float holds nobody counts
-    return f"{count} bytes" if count < 10_000 else f"{count / 1e6:.3g} MB" if count < 10_000_000 else f"{count / 1e9:.3g} GB"
+    return (
+        f"{count} bytes"
+        if count < 10_000
+        else f"{count / 1e6:.3g} MB"
+        if count < 10_000_000
+        else f"{count / 1e9:.3g} GB"
+    )
 
 
 def visible(text: str) -> str:
@@ -84,7 +103,9 @@ def visible(text: str) -> str:
     """
     if text.isprintable():
         return text
-    return "".join(c if c.isprintable() or c in LAYOUT else c.encode("unicode_escape").decode() for c in text)
+    return "".join(
+        c if c.isprintable() or c in LAYOUT else c.encode("unicode_escape").decode() for c in text
+    )
 
 
 def one_line(text: str) -> str:
@@ -93,4 +114,8 @@ def one_line(text: str) -> str:
     >>> one_line("pool\nfinished: frame 4 of 4")
     'pool\\nfinished: frame 4 of 4'
     """
-    return text if text.isprintable() else "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+    return (
+        text
+        if text.isprintable()
+        else "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+    )

@@ -1,6 +1,7 @@
 """Frames as ParaView opens them: VTU or VTI files, and PVD collections that give each its time; volumes as NanoVDB, surfaces as PLY too.
 
-Or in a format of meshio's, in which no collection is written: ParaView takes numbered files as a series.
+Or in a format of meshio's, in which no collection is written: ParaView takes numbered files as a
+series.
 """
 
 from __future__ import annotations
@@ -15,7 +16,14 @@ from types import TracebackType
 from typing import Any, Literal, Protocol, Self, cast
 
 from warp_lcp.files.atomic import make_folder, write_text
-from warp_lcp.frames.meshio_format import SUFFIXES, FrameFormat, holds, kind_of, meshio_bytes, write_meshio
+from warp_lcp.frames.meshio_format import (
+    SUFFIXES,
+    FrameFormat,
+    holds,
+    kind_of,
+    meshio_bytes,
+    write_meshio,
+)
 from warp_lcp.frames.nvdb import nvdb_bytes, write_nvdb
 from warp_lcp.frames.pieces import WHOLE, in_ranks, piece_files
 from warp_lcp.frames.ply import ply_bytes, write_ply
@@ -23,13 +31,16 @@ from warp_lcp.frames.vti import vti_bytes, write_vti
 from warp_lcp.frames.vtu import vtu_bytes, write_vtu
 from warp_lcp.simulation import Cells, NoStopwatch, Part, Points, Stopwatch, Surface, Volume
 
-FRAME_FILE = re.compile(rf"(?P<name>[a-z][a-z_]*)_(?P<index>\d{{6,}})\.(?P<format>p?vtu|p?vti|nvdb|{'|'.join(SUFFIXES.values())})")
+FRAME_FILE = re.compile(
+    rf"(?P<name>[a-z][a-z_]*)_(?P<index>\d{{6,}})\.(?P<format>p?vtu|p?vti|nvdb|{'|'.join(SUFFIXES.values())})"
+)
 COLLECTED = ("vtu", "vti", "pvtu", "pvti")  # what ParaView opens as a series
 WAITING = 2  # frames in memory, the one being written included
 END = b"</VTKFile>\n"  # of those that are whole
 
 GridFormat = Literal["vtu", "vti"]
-OWN_FORMATS: dict[str, tuple[Callable[[Path, Any], None], Callable[[Any], int]]] = {  # what writes a part, how many bytes that takes
+# what writes a part, how many bytes that takes
+OWN_FORMATS: dict[str, tuple[Callable[[Path, Any], None], Callable[[Any], int]]] = {
     "vtu": (write_vtu, vtu_bytes),
     "vti": (write_vti, vti_bytes),
     "nvdb": (write_nvdb, nvdb_bytes),
@@ -43,15 +54,25 @@ class FrameFolder:
         folder: of the run.
         grid_format: of the cells; "vtu": as the rest.
         surface_ply: write surfaces as PLY files too.
-        frame_format: of particles, surfaces and bodies; one without points, where the format does not hold that, is a VTU file.
+        frame_format: of particles, surfaces and bodies; one without points, where the format does
+            not hold that, is a VTU file.
     """
 
     def __init__(
-        self, folder: Path, grid_format: GridFormat = "vtu", *, surface_ply: bool = False, frame_format: FrameFormat = "vtu"
+        self,
+        folder: Path,
+        grid_format: GridFormat = "vtu",
+        *,
+        surface_ply: bool = False,
+        frame_format: FrameFormat = "vtu",
     ) -> None:
         """Look at a run's folder; nothing is written before the first frame."""
         self.folder = folder
-        self.grid_format, self.surface_ply, self.frame_format = grid_format, surface_ply, frame_format
+        self.grid_format, self.surface_ply, self.frame_format = (
+            grid_format,
+            surface_ply,
+            frame_format,
+        )
         self.frames = folder / "frames"
         self._times: dict[str, list[tuple[float, str]]] = {}
 
@@ -115,7 +136,9 @@ class FrameFolder:
             if index >= len(times):
                 file.unlink()
             elif match["format"] in COLLECTED and file.parent == self.frames:
-                self._times.setdefault(match["name"], []).append((times[index], f"frames/{file.name}"))
+                self._times.setdefault(match["name"], []).append(
+                    (times[index], f"frames/{file.name}")
+                )
         for name, entries in self._times.items():
             if self.frame_format != "vtu" and not (self.folder / f"{name}.pvd").is_file():
                 continue  # of a format without collections, in which those are empty frames
@@ -123,7 +146,9 @@ class FrameFolder:
 
     def kinds(self, frame: Sequence[Part]) -> list[str]:
         """Return what `missing` looks for in a frame: the names of its parts, with `.ply` where a part has such a file too."""
-        return [part.name for part in frame] + [f"{part.name}.ply" for part in frame if self.surface_ply and isinstance(part, Surface)]
+        return [part.name for part in frame] + [
+            f"{part.name}.ply" for part in frame if self.surface_ply and isinstance(part, Surface)
+        ]
 
     def missing(self, kind: str, count: int) -> list[int]:
         """Return which of the first `count` frames have no file of a kind, or not all pieces of one that ranks wrote.
@@ -136,7 +161,8 @@ class FrameFolder:
             match = FRAME_FILE.fullmatch(file.name)
             if match is None or match["name"] != name:
                 continue
-            is_ply = match["format"] == "ply" and self.frame_format != "ply"  # a file beside the frame's own
+            # a file beside the frame's own
+            is_ply = match["format"] == "ply" and self.frame_format != "ply"
             if is_ply == is_beside and _is_whole(file):
                 found.add(int(match["index"]))
         return sorted({*range(count)} - found)
@@ -166,8 +192,9 @@ class Frames(Protocol):
 class FrameWriter:
     """Write frames, and what comes after them, on a thread of its own while the simulation goes on; at most WAITING are in memory.
 
-    What goes wrong there is raised by every later call of `put`, `then`, `check` or `flush`, and nothing later is written. Leaving the
-    `with` block waits for what was put, whatever ended the block, and raises only if nothing else did.
+    What goes wrong there is raised by every later call of `put`, `then`, `check` or `flush`, and
+    nothing later is written. Leaving the `with` block waits for what was put, whatever ended the
+    block, and raises only if nothing else did.
     """
 
     def __init__(self, folder: Frames, watch: Stopwatch | None = None) -> None:
@@ -231,7 +258,12 @@ class FrameWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
         self.end()
         if kind is None:
             self.flush()
@@ -251,7 +283,13 @@ class FrameWriter:
         self._failed = False
 
 
-def frame_bytes(frame: list[Part], grid_format: GridFormat = "vtu", *, surface_ply: bool = False, frame_format: FrameFormat = "vtu") -> int:
+def frame_bytes(
+    frame: list[Part],
+    grid_format: GridFormat = "vtu",
+    *,
+    surface_ply: bool = False,
+    frame_format: FrameFormat = "vtu",
+) -> int:
     """Return about how many bytes the files of a frame take; rather more than less.
 
     Args:
@@ -263,7 +301,11 @@ def frame_bytes(frame: list[Part], grid_format: GridFormat = "vtu", *, surface_p
     total = sum(ply_bytes(part) for part in frame if surface_ply and isinstance(part, Surface))
     for part in frame:
         name = part_format(part, grid_format, frame_format)
-        total += OWN_FORMATS[name][1](part) if name in OWN_FORMATS else meshio_bytes(cast(Points | Cells | Surface, part), name)
+        total += (
+            OWN_FORMATS[name][1](part)
+            if name in OWN_FORMATS
+            else meshio_bytes(cast(Points | Cells | Surface, part), name)
+        )
     return total
 
 
@@ -274,13 +316,19 @@ def part_format(part: Part, grid_format: GridFormat, frame_format: FrameFormat =
     if isinstance(part, Cells) and grid_format == "vti":
         return "vti"
     size = len(part.index if isinstance(part, Cells) else part.points)
-    return frame_format if frame_format == "vtu" or size or holds(frame_format, *kind_of(part)).empty else "vtu"
+    return (
+        frame_format
+        if frame_format == "vtu" or size or holds(frame_format, *kind_of(part)).empty
+        else "vtu"
+    )
 
 
 def _is_whole(file: Path) -> bool:
     """Return whether a frame's file has an end, and so have all that one with the pieces of ranks names."""
     try:
-        return _has_end(file) and (file.suffix[1:] not in WHOLE.values() or all(map(_has_end, piece_files(file))))
+        return _has_end(file) and (
+            file.suffix[1:] not in WHOLE.values() or all(map(_has_end, piece_files(file)))
+        )
     except ValueError:
         return False
 
@@ -296,6 +344,9 @@ def _has_end(file: Path) -> bool:
 
 def collection(entries: list[tuple[float, str]]) -> str:
     """Return a PVD collection of files [s, path relative to the collection] as text."""
-    lines = [f'    <DataSet timestep="{time!r}" group="" part="0" file="{file}"/>' for time, file in entries]
+    lines = [
+        f'    <DataSet timestep="{time!r}" group="" part="0" file="{file}"/>'
+        for time, file in entries
+    ]
     head = ['<?xml version="1.0"?>', '<VTKFile type="Collection" version="0.1">', "  <Collection>"]
     return "\n".join([*head, *lines, "  </Collection>", "</VTKFile>", ""])

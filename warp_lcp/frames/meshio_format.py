@@ -22,14 +22,52 @@ from warp_lcp.frames.vtu import Mesh, mesh_of, vtu_bytes
 from warp_lcp.simulation import Cells, Points, Surface, Volume
 
 FrameFormat = Literal[  # those that meshio reads back as they were
-    "vtu", "xdmf", "vtk", "gmsh", "med", "exodus", "ply", "stl", "obj", "off", "abaqus", "avsucd", "dolfin-xml", "flac3d", "h5m", "hmf",
-    "mdpa", "medit", "netgen", "permas", "su2", "tecplot",
-]  # fmt: skip
+    "vtu",
+    "xdmf",
+    "vtk",
+    "gmsh",
+    "med",
+    "exodus",
+    "ply",
+    "stl",
+    "obj",
+    "off",
+    "abaqus",
+    "avsucd",
+    "dolfin-xml",
+    "flac3d",
+    "h5m",
+    "hmf",
+    "mdpa",
+    "medit",
+    "netgen",
+    "permas",
+    "su2",
+    "tecplot",
+]
 SUFFIXES = {  # of meshio's formats, by its names; of several the first without compression
-    "xdmf": "xdmf", "vtk": "vtk", "gmsh": "msh", "med": "med", "exodus": "e", "ply": "ply", "stl": "stl", "obj": "obj", "off": "off",
-    "abaqus": "inp", "avsucd": "avs", "dolfin-xml": "xml", "flac3d": "f3grid", "h5m": "h5m", "hmf": "hmf", "mdpa": "mdpa", "medit": "mesh",
-    "netgen": "vol", "permas": "dato", "su2": "su2", "tecplot": "dat",
-}  # fmt: skip
+    "xdmf": "xdmf",
+    "vtk": "vtk",
+    "gmsh": "msh",
+    "med": "med",
+    "exodus": "e",
+    "ply": "ply",
+    "stl": "stl",
+    "obj": "obj",
+    "off": "off",
+    "abaqus": "inp",
+    "avsucd": "avs",
+    "dolfin-xml": "xml",
+    "flac3d": "f3grid",
+    "h5m": "h5m",
+    "hmf": "hmf",
+    "mdpa": "mdpa",
+    "medit": "mesh",
+    "netgen": "vol",
+    "permas": "dato",
+    "su2": "su2",
+    "tecplot": "dat",
+}
 WRITTEN_ONLY = {"mdpa", "tecplot"}  # meshio's readers of these do not end where a file was cut
 FORMAT_OF = {suffix: name for name, suffix in SUFFIXES.items()}
 MODULES = {"dolfin-xml": "dolfin"}  # of meshio, where they have other names than the format
@@ -42,10 +80,25 @@ CORNERS = {kind: corners for corners, kind in CELL_KINDS.items()}
 ADDED = re.compile(":|^GLOBAL_ID$")  # in names that meshio's readers add, such as gmsh:dim_tags
 AXES = re.compile(r"(?P<name>.+)_(?P<axis>[xyz])")
 SAMPLE = 1000  # about as many cells has what a format is tried with
-FAULTS = (  # what meshio's readers and writers raise where a format does not hold a mesh, or a file is damaged
-    OSError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, AssertionError, NameError, RuntimeError, EOFError,
-    ImportError, StopIteration, MemoryError, struct.error, zlib.error, ElementTree.ParseError,
-)  # fmt: skip
+# what meshio's readers and writers raise where a format does not hold a mesh, or a file is damaged
+FAULTS = (
+    OSError,
+    ValueError,
+    TypeError,
+    LookupError,
+    AttributeError,
+    ArithmeticError,
+    AssertionError,
+    NameError,
+    RuntimeError,
+    EOFError,
+    ImportError,
+    StopIteration,
+    MemoryError,
+    struct.error,
+    zlib.error,
+    ElementTree.ParseError,
+)
 
 
 class Dress(IntEnum):
@@ -77,8 +130,9 @@ class Holds:
 def to_meshio(part: Points | Cells | Surface | Volume) -> Any:
     """Return a part of a frame as a `meshio.Mesh`: points [m], cells, and its fields as point data or cell data.
 
-    Points become vertices, surfaces triangles or lines, cells quadrilaterals or hexahedra that share their corners. Of a volume the voxels
-    become hexahedra that a NanoVDB file would hold as active: those nearer to the surface than its band, or where the density is not 0.
+    Points become vertices, surfaces triangles or lines, cells quadrilaterals or hexahedra that
+    share their corners. Of a volume the voxels become hexahedra that a NanoVDB file would hold as
+    active: those nearer to the surface than its band, or where the density is not 0.
 
     >>> import numpy as np
     >>> from warp_lcp.simulation import Points
@@ -96,22 +150,39 @@ def from_meshio(mesh: Any) -> Mesh:
         ValueError: it has cells of several kinds, or of others than frames have.
     """
     points = np.asarray(mesh.points)
-    points = np.zeros((0, 3)) if not points.size else np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
+    points = (
+        np.zeros((0, 3)) if not points.size else np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
+    )
     filled = [block for block in mesh.cells if len(block.data)]
     kinds = {block.type for block in filled}
     if len(kinds) > 1 or not kinds <= CORNERS.keys():
-        raise ValueError(f"its cells are of the kinds {', '.join(sorted(kinds))}; allowed are only {', '.join(CORNERS)}")
+        raise ValueError(
+            f"its cells are of the kinds {', '.join(sorted(kinds))}; allowed are only "
+            f"{', '.join(CORNERS)}"
+        )
     each = CORNERS[kinds.pop()] if kinds else 1
-    corners = np.concatenate([np.asarray(block.data) for block in filled]) if filled else np.zeros((0, each), dtype=np.int32)
+    corners = (
+        np.concatenate([np.asarray(block.data) for block in filled])
+        if filled
+        else np.zeros((0, each), dtype=np.int32)
+    )
     if corners.size and not 0 <= corners.min() <= corners.max() < len(points):
         raise ValueError(f"a cell names a point that does not exist (there are {len(points)})")
-    at_points = {name: np.asarray(values) for name, values in mesh.point_data.items() if not ADDED.search(name)}
+    at_points = {
+        name: np.asarray(values)
+        for name, values in mesh.point_data.items()
+        if not ADDED.search(name)
+    }
     in_cells = {name: parts for name, parts in mesh.cell_data.items() if not ADDED.search(name)}
     on_cells = not at_points and bool(in_cells)
     used = [number for number, block in enumerate(mesh.cells) if len(block.data)]
     fields = at_points
     if on_cells:
-        fields = {name: np.concatenate([np.asarray(parts[number]) for number in used]) for name, parts in in_cells.items() if used}
+        fields = {
+            name: np.concatenate([np.asarray(parts[number]) for number in used])
+            for name, parts in in_cells.items()
+            if used
+        }
     if any(len(values) != len(corners if on_cells else points) for values in fields.values()):
         raise ValueError("a field has not as many values as there are points or cells")
     return Mesh(points, corners, _joined(fields), on_cells)
@@ -139,7 +210,9 @@ def write_meshio(path: Path, part: Points | Cells | Surface, name: str) -> None:
         except OSError:
             raise
         except _faults() as error:
-            raise ValueError(f"{path}: cannot be written as {name}: {str(error) or type(error).__name__}") from error
+            raise ValueError(
+                f"{path}: cannot be written as {name}: {str(error) or type(error).__name__}"
+            ) from error
 
 
 def read_meshio(path: Path, name: str) -> Mesh:
@@ -151,11 +224,16 @@ def read_meshio(path: Path, name: str) -> Mesh:
     """
     path.stat()  # whose error is the system's
     if name in WRITTEN_ONLY:
-        raise ValueError(f"{path}: is not a readable frame: {name} files are written for other programs and cannot be read back")
+        raise ValueError(
+            f"{path}: is not a readable frame: {name} files are written for other programs and "
+            "cannot be read back"
+        )
     try:
         return from_meshio(_module(name).read(str(path)))
     except _faults() as error:
-        raise ValueError(f"{path}: is not a readable frame: {str(error) or type(error).__name__}") from error
+        raise ValueError(
+            f"{path}: is not a readable frame: {str(error) or type(error).__name__}"
+        ) from error
 
 
 def meshio_bytes(part: Points | Cells | Surface, name: str) -> int:
@@ -179,9 +257,16 @@ def holds(name: str, kind: type, dimension: int) -> Holds:
         kind: of the parts.
         dimension: of their cells.
     """
-    sample, none = _sample(kind, dimension, round(SAMPLE ** (1.0 / dimension))), _sample(kind, dimension, 0)
+    sample, none = (
+        _sample(kind, dimension, round(SAMPLE ** (1.0 / dimension))),
+        _sample(kind, dimension, 0),
+    )
     found, why, said = None, "", io.StringIO()
-    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        contextlib.redirect_stderr(said),
+        contextlib.redirect_stdout(said),
+    ):
         path = Path(folder) / f"sample.{SUFFIXES[name]}"
         for dress in Dress:
             if found and dress is Dress.BARE:
@@ -193,7 +278,9 @@ def holds(name: str, kind: type, dimension: int) -> Holds:
                     continue
                 warns, size = bool(said.getvalue()), path.stat().st_size / vtu_bytes(sample)
             except _faults() as error:
-                why = why or (f"needs {error.name}" if isinstance(error, ModuleNotFoundError) else str(error))
+                why = why or (
+                    f"needs {error.name}" if isinstance(error, ModuleNotFoundError) else str(error)
+                )
                 continue
             empty = False
             with contextlib.suppress(*_faults()):
@@ -210,7 +297,9 @@ def _comes_back(path: Path, part: Points | Cells | Surface, name: str, dress: Dr
     _write(path, _dressed(expected, dress), name)
     found = from_meshio(_module(name).read(str(path)))
     points = np.asarray(found.points, dtype=np.float64)
-    if expected.points.shape != points.shape or not np.allclose(points, expected.points, rtol=1e-6, atol=1e-7):
+    if expected.points.shape != points.shape or not np.allclose(
+        points, expected.points, rtol=1e-6, atol=1e-7
+    ):
         return False
     if expected.corners.size and not np.array_equal(found.corners, expected.corners):
         return False
@@ -218,7 +307,9 @@ def _comes_back(path: Path, part: Points | Cells | Surface, name: str, dress: Dr
         dress is Dress.BARE
         or not len(points)
         or all(
-            key in found.fields and found.fields[key].shape == values.shape and np.allclose(found.fields[key], values, rtol=1e-6)
+            key in found.fields
+            and found.fields[key].shape == values.shape
+            and np.allclose(found.fields[key], values, rtol=1e-6)
             for key, values in expected.fields.items()
         )
     )
@@ -229,12 +320,19 @@ def _dressed(mesh: Mesh, dress: Dress) -> Mesh:
     if dress is Dress.AS_IS:
         return mesh
     fields = {} if dress is Dress.BARE else mesh.fields
-    fields = {name: values.astype(np.int32) if values.dtype.kind in "biu" else values for name, values in fields.items()}
+    fields = {
+        name: values.astype(np.int32) if values.dtype.kind in "biu" else values
+        for name, values in fields.items()
+    }
     if dress is Dress.SCALARS:
         flat: dict[str, np.ndarray] = {}
         for name, values in fields.items():
             flat |= (
-                {name: values} if values.ndim == 1 else {f"{name}_{axis}": values[:, number].copy() for number, axis in enumerate("xyz")}
+                {name: values}
+                if values.ndim == 1
+                else {
+                    f"{name}_{axis}": values[:, number].copy() for number, axis in enumerate("xyz")
+                }
             )
         fields = flat
     return Mesh(mesh.points.astype(np.float64), mesh.corners, fields, mesh.on_cells)
@@ -259,7 +357,11 @@ def meshio_of(mesh: Mesh) -> Any:
 
     kind = CELL_KINDS[mesh.corners.shape[1]]
     if mesh.on_cells:
-        return meshio.Mesh(mesh.points, [(kind, mesh.corners)], cell_data={name: [values] for name, values in mesh.fields.items()})
+        return meshio.Mesh(
+            mesh.points,
+            [(kind, mesh.corners)],
+            cell_data={name: [values] for name, values in mesh.fields.items()},
+        )
     return meshio.Mesh(mesh.points, [(kind, mesh.corners)], point_data=dict(mesh.fields))
 
 
@@ -283,7 +385,9 @@ def _faults() -> tuple[type[Exception], ...]:
 
 def _active(volume: Volume) -> Cells:
     """Return the voxels of a volume that a NanoVDB file holds as active."""
-    active = np.abs(volume.values) < volume.band if volume.band is not None else volume.values != 0.0
+    active = (
+        np.abs(volume.values) < volume.band if volume.band is not None else volume.values != 0.0
+    )
     index = np.argwhere(active)[:, ::-1] + np.array(volume.origin)
     return Cells(volume.name, index, volume.spacing, 3, {volume.name: volume.values[active]})
 
@@ -301,7 +405,9 @@ def _sample(kind: type, dimension: int, side: int) -> Points | Cells | Surface:
         "wall": (numbers > 0.0).astype(np.uint8),
         "body": np.arange(count, dtype=np.int32),
     }
-    points = ((index + 0.3 * np.sin(np.arange(3 * count).reshape(-1, 3))) * 0.137).astype(np.float32)
+    points = ((index + 0.3 * np.sin(np.arange(3 * count).reshape(-1, 3))) * 0.137).astype(
+        np.float32
+    )
     if kind is Cells:
         return Cells("grid", index, 0.137, dimension, fields)
     if kind is Points:
@@ -309,6 +415,10 @@ def _sample(kind: type, dimension: int, side: int) -> Points | Cells | Surface:
     if dimension < 3:
         points[:, 2] = 0.0
     corners = (
-        np.stack([np.arange(count - dimension + 1) + number for number in range(dimension)], axis=-1) if count else np.zeros((0, dimension))
+        np.stack(
+            [np.arange(count - dimension + 1) + number for number in range(dimension)], axis=-1
+        )
+        if count
+        else np.zeros((0, dimension))
     )
     return Surface("surface", points, corners.astype(np.int32), fields)

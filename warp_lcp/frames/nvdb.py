@@ -1,11 +1,13 @@
 """NanoVDB files of volumes: sparse voxels as renderers and Warp read them, written by NumPy, so that no other thread is disturbed.
 
-The places are those of the format's version 32, for trees of 5, 4 and 3 bits an axis (Warp's `native/nanovdb/NanoVDB.h` describes them):
-a grid's header, the tree's, a root with one entry, one upper node of 32^3 entries, lower nodes of 16^3 and leaves of 8^3 voxels. An entry
-is a value, or how far after its own node the child begins.
+The places are those of the format's version 32, for trees of 5, 4 and 3 bits an axis (Warp's
+`native/nanovdb/NanoVDB.h` describes them): a grid's header, the tree's, a root with one entry, one
+upper node of 32^3 entries, lower nodes of 16^3 and leaves of 8^3 voxels. An entry is a value, or
+how far after its own node the child begins.
 
-Warp's own (1.19: `Volume.allocate_by_tiles`, `save_to_nvdb`) is as fast, but its files have neither a name nor a class nor a box nor a
-number of active voxels (all 0), and what is deep inside a level set reads as outside: readers that ask for "level_set" find nothing.
+Warp's own (1.19: `Volume.allocate_by_tiles`, `save_to_nvdb`) is as fast, but its files have neither
+a name nor a class nor a box nor a number of active voxels (all 0), and what is deep inside a level
+set reads as outside: readers that ask for "level_set" find nothing.
 """
 
 from __future__ import annotations
@@ -28,51 +30,107 @@ NO_CHECKSUM = 2**64 - 1
 
 GRID = np.dtype(
     [
-        ("magic", "S8"), ("checksum", "<u8"), ("version", "<u4"), ("flags", "<u4"), ("index", "<u4"), ("count", "<u4"), ("bytes", "<u8"),
-        ("name", "S256"), ("float_map", "<f4", 9), ("float_inverse", "<f4", 9), ("float_origin", "<f4", 3), ("float_taper", "<f4"),
-        ("map", "<f8", 9), ("inverse", "<f8", 9), ("origin", "<f8", 3), ("taper", "<f8"), ("box", "<f8", 6), ("voxel", "<f8", 3),
-        ("class", "<u4"), ("type", "<u4"), ("blind_data", "<i8"), ("more", "V24"),
+        ("magic", "S8"),
+        ("checksum", "<u8"),
+        ("version", "<u4"),
+        ("flags", "<u4"),
+        ("index", "<u4"),
+        ("count", "<u4"),
+        ("bytes", "<u8"),
+        ("name", "S256"),
+        ("float_map", "<f4", 9),
+        ("float_inverse", "<f4", 9),
+        ("float_origin", "<f4", 3),
+        ("float_taper", "<f4"),
+        ("map", "<f8", 9),
+        ("inverse", "<f8", 9),
+        ("origin", "<f8", 3),
+        ("taper", "<f8"),
+        ("box", "<f8", 6),
+        ("voxel", "<f8", 3),
+        ("class", "<u4"),
+        ("type", "<u4"),
+        ("blind_data", "<i8"),
+        ("more", "V24"),
     ]
-)  # fmt: skip
+)
 BOX = [("low", "<i4", 3), ("high", "<i4", 3)]  # of active voxels
-TREE = np.dtype([("offsets", "<i8", 4), ("nodes", "<u4", 3), ("tiles", "<u4", 3), ("voxels", "<u8")])  # leaves, lower, upper, root
+# leaves, lower, upper, root
+TREE = np.dtype(
+    [("offsets", "<i8", 4), ("nodes", "<u4", 3), ("tiles", "<u4", 3), ("voxels", "<u8")]
+)
 ROOT = np.dtype(
     [
-        *BOX, ("entries", "<u4"), ("background", "<f4"), ("statistics", "<f4", 4), ("padding", "V16"),
-        ("key", "<u8"), ("child", "<i8"), ("state", "<u4"), ("value", "<f4"), ("more", "V8"),  # its only entry
+        *BOX,
+        ("entries", "<u4"),
+        ("background", "<f4"),
+        ("statistics", "<f4", 4),
+        ("padding", "V16"),
+        # its only entry
+        ("key", "<u8"),
+        ("child", "<i8"),
+        ("state", "<u4"),
+        ("value", "<f4"),
+        ("more", "V8"),
     ]
-)  # fmt: skip
-VALUE = np.dtype({"names": ["value", "child"], "formats": ["<f4", "<i8"], "offsets": [0, 0], "itemsize": 8})  # an entry of a node
+)
+# an entry of a node
+VALUE = np.dtype(
+    {"names": ["value", "child"], "formats": ["<f4", "<i8"], "offsets": [0, 0], "itemsize": 8}
+)
 UPPER_NODE, LOWER_NODE = (
     np.dtype(
         [
-            *BOX, ("flags", "<u8"), ("active", "u1", edge**3 // 8), ("children", "u1", edge**3 // 8), ("statistics", "<f4", 4),
-            ("padding", "V16"), ("table", VALUE, edge**3),
+            *BOX,
+            ("flags", "<u8"),
+            ("active", "u1", edge**3 // 8),
+            ("children", "u1", edge**3 // 8),
+            ("statistics", "<f4", 4),
+            ("padding", "V16"),
+            ("table", VALUE, edge**3),
         ]
     )
     for edge in (UPPER, LOWER)
-)  # fmt: skip
+)
 LEAF_NODE = np.dtype(
     [
-        ("low", "<i4", 3), ("extent", "u1", 3), ("flags", "u1"), ("active", "u1", LEAF**3 // 8), ("statistics", "<f4", 4),
+        ("low", "<i4", 3),
+        ("extent", "u1", 3),
+        ("flags", "u1"),
+        ("active", "u1", LEAF**3 // 8),
+        ("statistics", "<f4", 4),
         ("values", "<f4", LEAF**3),
     ]
-)  # fmt: skip
+)
 FILE = np.dtype([("magic", "S8"), ("version", "<u4"), ("grids", "<u2"), ("codec", "<u2")])
 META = np.dtype(
     [
-        ("grid_bytes", "<u8"), ("file_bytes", "<u8"), ("name_key", "<u8"), ("voxels", "<u8"), ("type", "<u4"), ("class", "<u4"),
-        ("world_box", "<f8", 6), ("index_low", "<i4", 3), ("index_high", "<i4", 3), ("voxel", "<f8", 3), ("name_bytes", "<u4"),
-        ("nodes", "<u4", 4), ("tiles", "<u4", 3), ("codec", "<u2"), ("padding", "<u2"), ("version", "<u4"),
+        ("grid_bytes", "<u8"),
+        ("file_bytes", "<u8"),
+        ("name_key", "<u8"),
+        ("voxels", "<u8"),
+        ("type", "<u4"),
+        ("class", "<u4"),
+        ("world_box", "<f8", 6),
+        ("index_low", "<i4", 3),
+        ("index_high", "<i4", 3),
+        ("voxel", "<f8", 3),
+        ("name_bytes", "<u4"),
+        ("nodes", "<u4", 4),
+        ("tiles", "<u4", 3),
+        ("codec", "<u2"),
+        ("padding", "<u2"),
+        ("version", "<u4"),
     ]
-)  # fmt: skip
+)
 
 
 def write_nvdb(path: Path, volume: Volume) -> None:
     """Write a volume as a NanoVDB file, uncompressed, atomically.
 
-    Index (i, j, k) is the center of that cell. A level set has its band's width where it is not known: + outside and - inside, neither of
-    which takes room. Voxels are active within the band; those of a density are where it is not 0.
+    Index (i, j, k) is the center of that cell. A level set has its band's width where it is not
+    known: + outside and - inside, neither of which takes room. Voxels are active within the band;
+    those of a density are where it is not 0.
 
     Args:
         path: the file.
@@ -82,8 +140,15 @@ def write_nvdb(path: Path, volume: Volume) -> None:
         OSError: the file cannot be written.
         ValueError: the values are not of a 3-D grid, not finite, or more than 4096 along an axis.
     """
-    if volume.values.ndim != 3 or not np.isfinite(volume.values).all() or max(volume.values.shape) > LARGEST:
-        raise ValueError(f"the volume {volume.name!r} must hold finite values of a 3-D grid, at most {LARGEST} along an axis")
+    if (
+        volume.values.ndim != 3
+        or not np.isfinite(volume.values).all()
+        or max(volume.values.shape) > LARGEST
+    ):
+        raise ValueError(
+            f"the volume {volume.name!r} must hold finite values of a 3-D grid, at most {LARGEST} "
+            "along an axis"
+        )
     grid, header = _grid(volume)
     with replacing(path) as file:
         file.write(header)
@@ -93,8 +158,16 @@ def write_nvdb(path: Path, volume: Volume) -> None:
 
 def nvdb_bytes(volume: Volume) -> int:
     """Return how many bytes the file of a volume takes at most."""
-    leaves, lower = (int(np.prod([-(-count // edge) for count in volume.values.shape])) for edge in (LEAF, LEAF * LOWER))
-    return 2 * GRID.itemsize + UPPER_NODE.itemsize + lower * LOWER_NODE.itemsize + leaves * LEAF_NODE.itemsize
+    leaves, lower = (
+        int(np.prod([-(-count // edge) for count in volume.values.shape]))
+        for edge in (LEAF, LEAF * LOWER)
+    )
+    return (
+        2 * GRID.itemsize
+        + UPPER_NODE.itemsize
+        + lower * LOWER_NODE.itemsize
+        + leaves * LEAF_NODE.itemsize
+    )
 
 
 def name_key(name: bytes) -> int:
@@ -116,11 +189,14 @@ def _grid(volume: Volume) -> tuple[list[np.ndarray], bytes]:
     lower, upper = _nodes(used, inside, background)
     root, tree, grid = np.zeros(1, dtype=ROOT), np.zeros(1, dtype=TREE), np.zeros(1, dtype=GRID)
     parts = [grid, tree, root, upper, lower, leaves]
-    begins = np.cumsum([part.nbytes for part in parts]) - grid.nbytes  # of the next part, from the tree's beginning
+    # of the next part, from the tree's beginning
+    begins = np.cumsum([part.nbytes for part in parts]) - grid.nbytes
     tree["offsets"], tree["nodes"] = begins[[4, 3, 2, 1]], [len(leaves), len(lower), 1]
     tree["voxels"] = np.unpackbits(leaves["active"]).sum(dtype=np.int64)
     root["entries"], root["background"], root["child"] = 1, background, root.nbytes
-    root["low"], root["high"] = upper["low"], upper["high"] = lower["low"], lower["high"] = _box(leaves)
+    root["low"], root["high"] = upper["low"], upper["high"] = lower["low"], lower["high"] = _box(
+        leaves
+    )
     _describe(grid, root, volume, sum(part.nbytes for part in parts))
     return parts, _header(grid, tree, root)
 
@@ -145,11 +221,16 @@ def _leaves(tiles: np.ndarray, used: np.ndarray, band: float | None) -> np.ndarr
     return leaves
 
 
-def _nodes(used: np.ndarray, inside: np.ndarray, background: np.float32) -> tuple[np.ndarray, np.ndarray]:
+def _nodes(
+    used: np.ndarray, inside: np.ndarray, background: np.float32
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the lower nodes, in the order of their places, and the upper one."""
     counts = [-(-count // LOWER) for count in used.shape]
-    kinds = np.zeros([LOWER * count for count in counts], dtype=np.int64)  # 0: outside, -1: inside, else the number of a leaf, from 1
-    kinds[tuple(slice(count) for count in used.shape)] = np.where(used, np.cumsum(used).reshape(used.shape), -1 * inside)
+    # 0: outside, -1: inside, else the number of a leaf, from 1
+    kinds = np.zeros([LOWER * count for count in counts], dtype=np.int64)
+    kinds[tuple(slice(count) for count in used.shape)] = np.where(
+        used, np.cumsum(used).reshape(used.shape), -1 * inside
+    )
     nx, ny, nz = counts
     kinds = kinds.reshape(nx, LOWER, ny, LOWER, nz, LOWER).transpose(0, 2, 4, 1, 3, 5)
     found = kinds.any(axis=(3, 4, 5))
@@ -172,7 +253,11 @@ def _nodes(used: np.ndarray, inside: np.ndarray, background: np.float32) -> tupl
 
 def _box(leaves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the first and the last active voxel along each axis; an empty box if there is none."""
-    active = np.unpackbits(leaves["active"], axis=1, bitorder="little").astype(bool).reshape(-1, LEAF, LEAF, LEAF)
+    active = (
+        np.unpackbits(leaves["active"], axis=1, bitorder="little")
+        .astype(bool)
+        .reshape(-1, LEAF, LEAF, LEAF)
+    )
     low, high = np.zeros(3, dtype=np.int32), np.full(3, -1, dtype=np.int32)
     for axis, others in enumerate([(2, 3), (1, 3), (1, 2)]) if active.any() else ():
         found = (leaves["low"][:, axis, None] + np.arange(LEAF))[active.any(axis=others)]
@@ -184,15 +269,26 @@ def _describe(grid: np.ndarray, root: np.ndarray, volume: Volume, size: int) -> 
     """Write what the grid is, and where."""
     spacing = float(volume.spacing)
     low = (np.array(volume.origin) + 0.5) * spacing  # of the first cell's center
-    grid["magic"], grid["checksum"], grid["version"], grid["flags"] = b"NanoVDB1", NO_CHECKSUM, VERSION, HAS_BOX | BREADTH_FIRST
+    grid["magic"], grid["checksum"], grid["version"], grid["flags"] = (
+        b"NanoVDB1",
+        NO_CHECKSUM,
+        VERSION,
+        HAS_BOX | BREADTH_FIRST,
+    )
     grid["count"], grid["bytes"], grid["blind_data"] = 1, size, size
-    grid["name"], grid["type"], grid["class"] = volume.name.encode(), FLOAT, FOG_VOLUME if volume.band is None else LEVEL_SET
+    grid["name"], grid["type"], grid["class"] = (
+        volume.name.encode(),
+        FLOAT,
+        FOG_VOLUME if volume.band is None else LEVEL_SET,
+    )
     grid["float_map"] = grid["map"] = spacing * np.eye(3).ravel()
     grid["float_inverse"] = grid["inverse"] = np.eye(3).ravel() / spacing
     grid["float_origin"] = grid["origin"] = low
     grid["float_taper"] = grid["taper"] = 1.0
     grid["voxel"] = spacing
-    grid["box"] = np.concatenate([root["low"], root["high"] + 1], axis=1) * spacing + np.tile(low, 2)
+    grid["box"] = np.concatenate([root["low"], root["high"] + 1], axis=1) * spacing + np.tile(
+        low, 2
+    )
 
 
 def _header(grid: np.ndarray, tree: np.ndarray, root: np.ndarray) -> bytes:
@@ -204,6 +300,10 @@ def _header(grid: np.ndarray, tree: np.ndarray, root: np.ndarray) -> bytes:
     meta["name_key"], meta["name_bytes"] = name_key(name), len(name) + 1
     for key in ("type", "class", "voxel", "version"):
         meta[key] = grid[key]
-    meta["world_box"], meta["index_low"], meta["index_high"] = grid["box"], root["low"], root["high"]
+    meta["world_box"], meta["index_low"], meta["index_high"] = (
+        grid["box"],
+        root["low"],
+        root["high"],
+    )
     meta["voxels"], meta["nodes"][:, :3], meta["nodes"][:, 3] = tree["voxels"], tree["nodes"], 1
     return file.tobytes() + meta.tobytes() + name + b"\0"

@@ -17,7 +17,8 @@ from warp_lcp.frames.vtk_xml import attributes, opening, read_back, root, writab
 from warp_lcp.frames.vtu import Mesh
 from warp_lcp.simulation import Cells, Points, Surface
 
-RANK_FOLDER = re.compile(r"rank_\d{4,}")  # where each process keeps its pieces of frames and checkpoints
+# where each process keeps its pieces of frames and checkpoints
+RANK_FOLDER = re.compile(r"rank_\d{4,}")
 SURFACES = (2, 3)  # corners of segments and triangles
 WHOLE = {"vtu": "pvtu", "vti": "pvti"}  # the suffix of the file that names the pieces, by theirs
 
@@ -59,7 +60,9 @@ def describe(part: Points | Cells | Surface, kind: Kind) -> Piece:
         fields = (*fields, attributes(GHOSTS, np.zeros(0, dtype=np.uint8)))
         return Piece(kind, size, fields, "", cells, (_triple(low), _triple(end)), part.spacing)
     points = np.zeros((0, 3), dtype=np.float32) if isinstance(part, Cells) else part.points
-    return Piece(kind, size, fields, attributes("Points", writable("points", points, len(points))), cells)
+    return Piece(
+        kind, size, fields, attributes("Points", writable("points", points, len(points))), cells
+    )
 
 
 def write_whole(path: Path, pieces: Sequence[tuple[str, Piece]]) -> None:
@@ -67,7 +70,8 @@ def write_whole(path: Path, pieces: Sequence[tuple[str, Piece]]) -> None:
 
     Args:
         path: the file, whose suffix is that of `WHOLE`.
-        pieces: of one kind: their files, relative to `path`, and what is in them; empty ones count only if all are.
+        pieces: of one kind: their files, relative to `path`, and what is in them; empty ones count
+            only if all are.
 
     Raises:
         OSError: the file cannot be written.
@@ -77,7 +81,10 @@ def write_whole(path: Path, pieces: Sequence[tuple[str, Piece]]) -> None:
     first = filled[0][1]
     for file, piece in filled:
         if (piece.kind, piece.fields, piece.points) != (first.kind, first.fields, first.points):
-            raise ValueError(f"{path}: {file} has other fields than {filled[0][0]}: {piece.fields} instead of {first.fields}")
+            raise ValueError(
+                f"{path}: {file} has other fields than {filled[0][0]}: {piece.fields} instead of "
+                f"{first.fields}"
+            )
     lines = _image(pieces, first) if first.kind == "vti" else _mesh(filled, first)
     write_text(path, "".join(lines))
 
@@ -91,12 +98,21 @@ def piece_files(path: Path) -> list[Path]:
     """
     with read_back(path):
         kind = path.suffix.removeprefix(".p")
-        pieces = root(read_whole(path), f"P{'ImageData' if kind == 'vti' else 'UnstructuredGrid'}").iter("Piece")
+        pieces = root(
+            read_whole(path), f"P{'ImageData' if kind == 'vti' else 'UnstructuredGrid'}"
+        ).iter("Piece")
         found = [Path(str(piece.get("Source"))) for piece in pieces]
         for file in found:
-            own = len(file.parts) == 2 and RANK_FOLDER.fullmatch(file.parts[0]) and file.parts[1] == f"{path.stem}.{kind}"
+            own = (
+                len(file.parts) == 2
+                and RANK_FOLDER.fullmatch(file.parts[0])
+                and file.parts[1] == f"{path.stem}.{kind}"
+            )
             if not own or not (path.parent / file).resolve().is_relative_to(path.parent.resolve()):
-                raise ValueError(f"names {str(file)!r}: a piece is rank_0000/{path.stem}.{kind} in its own folder")
+                raise ValueError(
+                    f"names {str(file)!r}: a piece is rank_0000/{path.stem}.{kind} in its own "
+                    "folder"
+                )
         if len(set(found)) != len(found):
             raise ValueError("names a piece twice")
         return [path.parent / file for file in found]
@@ -105,19 +121,25 @@ def piece_files(path: Path) -> list[Path]:
 def one_mesh(meshes: Sequence[Mesh]) -> Mesh:
     """Return the mesh of all pieces, of which there is at least one; empty ones need not have the kind of cells of the others.
 
-    Pieces of a surface have the points on cuts twice, in the same place to the last bit: it comes back with each once.
+    Pieces of a surface have the points on cuts twice, in the same place to the last bit: it comes
+    back with each once.
 
     Raises:
         ValueError: they have other fields or cells than each other.
     """
     filled = [mesh for mesh in meshes if len(mesh.points)] or list(meshes[:1])
     first = filled[0]
-    if any(mesh.fields.keys() != first.fields.keys() or mesh.on_cells != first.on_cells for mesh in filled):
+    if any(
+        mesh.fields.keys() != first.fields.keys() or mesh.on_cells != first.on_cells
+        for mesh in filled
+    ):
         raise ValueError("its pieces have different fields")
     starts = np.cumsum([0, *(len(mesh.points) for mesh in filled)])
     whole = Mesh(
         np.concatenate([mesh.points for mesh in filled]),
-        np.concatenate([mesh.corners + start for mesh, start in zip(filled, starts[:-1], strict=True)]),
+        np.concatenate(
+            [mesh.corners + start for mesh, start in zip(filled, starts[:-1], strict=True)]
+        ),
         {name: np.concatenate([mesh.fields[name] for mesh in filled]) for name in first.fields},
         first.on_cells,
     )
@@ -134,7 +156,13 @@ def one_grid(parts: Sequence[Cells]) -> Cells:
     if any(part.fields.keys() != first.fields.keys() for part in parts):
         raise ValueError("its pieces have different fields")
     fields = {name: np.concatenate([part.fields[name] for part in parts]) for name in first.fields}
-    return Cells(first.name, np.concatenate([part.index for part in parts]), first.spacing, first.dimension, fields)
+    return Cells(
+        first.name,
+        np.concatenate([part.index for part in parts]),
+        first.spacing,
+        first.dimension,
+        fields,
+    )
 
 
 def rank_folder(rank: int) -> str:
@@ -164,10 +192,16 @@ def remove_empty_ranks(folder: Path) -> None:
 
 def _sewn(mesh: Mesh) -> Mesh:
     """Return a mesh with the points of one place as one point, the first of them."""
-    places = np.ascontiguousarray(mesh.points).view(np.dtype((np.void, mesh.points.strides[0]))).ravel()
+    places = (
+        np.ascontiguousarray(mesh.points).view(np.dtype((np.void, mesh.points.strides[0]))).ravel()
+    )
     _, first, place = np.unique(places, return_index=True, return_inverse=True)
     kept, number = np.unique(first, return_inverse=True)
-    fields = mesh.fields if mesh.on_cells else {name: values[kept] for name, values in mesh.fields.items()}
+    fields = (
+        mesh.fields
+        if mesh.on_cells
+        else {name: values[kept] for name, values in mesh.fields.items()}
+    )
     return Mesh(mesh.points[kept], number[place][mesh.corners], fields, mesh.on_cells)
 
 

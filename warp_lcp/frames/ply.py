@@ -1,7 +1,7 @@
 """PLY files of surfaces, which modelers such as Blender read.
 
-meshio writes such files too, but with the time of day in them, so that no two runs make the same bytes, and
-segments as faces of two corners.
+meshio writes such files too, but with the time of day in them, so that no two runs make the same
+bytes, and segments as faces of two corners.
 """
 
 from __future__ import annotations
@@ -13,7 +13,16 @@ import numpy as np
 from warp_lcp.files.atomic import replacing
 from warp_lcp.simulation import Surface
 
-TYPES = {"f4": "float", "f8": "double", "i4": "int", "u4": "uint", "i2": "short", "u2": "ushort", "i1": "char", "u1": "uchar"}
+TYPES = {
+    "f4": "float",
+    "f8": "double",
+    "i4": "int",
+    "u4": "uint",
+    "i2": "short",
+    "u2": "ushort",
+    "i1": "char",
+    "u1": "uchar",
+}
 AXES = ("x", "y", "z")
 HEADER_BYTES = 1000
 
@@ -23,16 +32,23 @@ def write_ply(path: Path, surface: Surface) -> None:
 
     Args:
         path: the file.
-        surface: its fields become properties of the vertices; vectors have one named for each axis, such as `velocity_x`.
+        surface: its fields become properties of the vertices; vectors have one named for each axis,
+            such as `velocity_x`.
 
     Raises:
         OSError: the file cannot be written.
     """
     columns = {axis: surface.points[:, number].astype("<f4") for number, axis in enumerate(AXES)}
     for name, values in surface.fields.items():
-        parts = {name: values} if values.ndim == 1 else {f"{name}_{axis}": values[:, number] for number, axis in enumerate(AXES)}
+        parts = (
+            {name: values}
+            if values.ndim == 1
+            else {f"{name}_{axis}": values[:, number] for number, axis in enumerate(AXES)}
+        )
         columns |= {key: part.astype(part.dtype.newbyteorder("<")) for key, part in parts.items()}
-    vertices = np.rec.fromarrays(list(columns.values()), dtype=[(name, column.dtype) for name, column in columns.items()])
+    vertices = np.rec.fromarrays(
+        list(columns.values()), dtype=[(name, column.dtype) for name, column in columns.items()]
+    )
     count, size = surface.corners.shape
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
     header += [f"property {TYPES[column.dtype.str[1:]]} {name}" for name, column in columns.items()]
@@ -52,4 +68,9 @@ def write_ply(path: Path, surface: Surface) -> None:
 def ply_bytes(surface: Surface) -> int:
     """Return about how many bytes the file of a surface takes."""
     fields = sum(values.nbytes for values in surface.fields.values())
-    return HEADER_BYTES + surface.points.nbytes + fields + len(surface.corners) * (4 * surface.corners.shape[1] + 1)
+    return (
+        HEADER_BYTES
+        + surface.points.nbytes
+        + fields
+        + len(surface.corners) * (4 * surface.corners.shape[1] + 1)
+    )

@@ -14,9 +14,13 @@ from warp_lcp.frames.vti import read_vti
 from warp_lcp.frames.vtu import Mesh, read_vtu
 from warp_lcp.simulation import Cells
 
-READERS: dict[str, tuple[Callable[[Path], Any], Callable[[list[Any]], Any]]] = {"vtu": (read_vtu, one_mesh), "vti": (read_vti, one_grid)}
+READERS: dict[str, tuple[Callable[[Path], Any], Callable[[list[Any]], Any]]] = {
+    "vtu": (read_vtu, one_mesh),
+    "vti": (read_vti, one_grid),
+}
 MESHIO_READS = (suffix for suffix, name in FORMAT_OF.items() if name not in WRITTEN_ONLY)
-READABLE = ("vti", "pvti", "pvtu", "vtu", *MESHIO_READS)  # suffixes of a part's file, the one that counts first
+# suffixes of a part's file, the one that counts first
+READABLE = ("vti", "pvti", "pvtu", "vtu", *MESHIO_READS)
 
 
 def read_part(file: Path) -> Mesh | Cells:
@@ -29,7 +33,8 @@ def read_part(file: Path) -> Mesh | Cells:
     match = FRAME_FILE.fullmatch(file.name)
     if match is None or match["format"] not in READABLE:
         raise ValueError(
-            f"{file}: is not a readable frame: its name must be like particles_000012.vtu, and its format one of {', '.join(READABLE)}"
+            f"{file}: is not a readable frame: its name must be like particles_000012.vtu, and its "
+            f"format one of {', '.join(READABLE)}"
         )
     kind = match["format"]
     if kind in FORMAT_OF:
@@ -45,8 +50,9 @@ def read_part(file: Path) -> Mesh | Cells:
 def read_frame(file: str | PathLike[str]) -> Any:
     """Read a file of a run's `frames` as a `meshio.Mesh`.
 
-    meshio itself reads neither VTU files without cells, as frames before the first drop are, nor VTI files, nor files that name the pieces
-    of ranks; all of these are read here, and other formats of `output.format`. Volumes are not meshes: see `wp.Volume.load_from_nvdb`.
+    meshio itself reads neither VTU files without cells, as frames before the first drop are, nor
+    VTI files, nor files that name the pieces of ranks; all of these are read here, and other
+    formats of `output.format`. Volumes are not meshes: see `wp.Volume.load_from_nvdb`.
 
     Args:
         file: such as `out/frames/particles_000012.vtu`.

@@ -10,7 +10,17 @@ import numpy as np
 
 from warp_lcp.files.atomic import replacing
 from warp_lcp.files.claims import read_whole
-from warp_lcp.frames.vtk_xml import LENGTH_BYTES, array_values, attributes, length, opening, raw, read_back, root, writable_fields
+from warp_lcp.frames.vtk_xml import (
+    LENGTH_BYTES,
+    array_values,
+    attributes,
+    length,
+    opening,
+    raw,
+    read_back,
+    root,
+    writable_fields,
+)
 from warp_lcp.simulation import Cells
 
 HIDDEN = 32  # vtkDataSetAttributes::HIDDENCELL
@@ -33,8 +43,13 @@ def write_vti(path: Path, cells: Cells) -> None:
     _, fields = writable_fields(cells)
     low, counts = image_box(cells)
     columns = cells.index.T
-    if len(cells.index) and any(c.min() < a or c.max() >= a + n for c, a, n in zip(columns, low, counts, strict=True)):
-        raise ValueError(f"the grid of {' x '.join(map(str, counts))} cells does not hold all cells of {cells.name!r}")
+    if len(cells.index) and any(
+        c.min() < a or c.max() >= a + n for c, a, n in zip(columns, low, counts, strict=True)
+    ):
+        raise ValueError(
+            f"the grid of {' x '.join(map(str, counts))} cells does not hold all cells of "
+            f"{cells.name!r}"
+        )
     x, y, z = (column - first for column, first in zip(columns, low, strict=True))
     flat = (z * counts[1] + y) * counts[0] + x
     end = image_end(low, counts, cells.dimension)
@@ -54,7 +69,9 @@ def extent_of(low: np.ndarray, end: np.ndarray) -> str:
 
 def vti_bytes(cells: Cells) -> int:
     """Return how many bytes the file of cells takes, or a little more."""
-    each = sum(values.itemsize * values[:1].size if len(values) else 8 for values in cells.fields.values())
+    each = sum(
+        values.itemsize * values[:1].size if len(values) else 8 for values in cells.fields.values()
+    )
     return XML_BYTES + int(image_box(cells)[1].prod()) * (each + 1)
 
 
@@ -76,17 +93,24 @@ def read_vti(path: Path) -> Cells:
         extent = [int(number) for number in image.get("WholeExtent", "").split()]
         low, end = np.array(extent[::2], dtype=np.int64), np.array(extent[1::2], dtype=np.int64)
         spacing = float(image.get("Spacing", "").split()[0])
-        counts = [max(last - first, 1) for first, last in zip(extent[::2], extent[1::2], strict=True)]
-        arrays = {str(array.get("Name")): array_values(array, data, int(array.get("offset", "0"))) for array in image.iter("DataArray")}
-        fits = all(len(array) == math.prod(counts) for array in arrays.values()) and sum(array.nbytes for array in arrays.values()) <= len(
-            data
-        )
+        counts = [
+            max(last - first, 1) for first, last in zip(extent[::2], extent[1::2], strict=True)
+        ]
+        arrays = {
+            str(array.get("Name")): array_values(array, data, int(array.get("offset", "0")))
+            for array in image.iter("DataArray")
+        }
+        fits = all(len(array) == math.prod(counts) for array in arrays.values()) and sum(
+            array.nbytes for array in arrays.values()
+        ) <= len(data)
         if len(extent) != 6 or not 0.0 < spacing < math.inf or not fits:
             raise ValueError(f"its arrays do not match its {' x '.join(map(str, counts))} cells")
         shown = np.flatnonzero(arrays.pop(GHOSTS) == 0)
         index = np.stack(np.unravel_index(shown, counts, order="F"), axis=-1) + low
         fields = {name: array[shown] for name, array in arrays.items()}
-        return Cells(path.stem.rpartition("_")[0], index, spacing, 2 if low[2] == end[2] else 3, fields)
+        return Cells(
+            path.stem.rpartition("_")[0], index, spacing, 2 if low[2] == end[2] else 3, fields
+        )
 
 
 def image_box(cells: Cells) -> tuple[np.ndarray, np.ndarray]:
@@ -103,7 +127,12 @@ def image_box(cells: Cells) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _vti(
-    low: np.ndarray, end: np.ndarray, spacing: float, fields: dict[str, np.ndarray], flat: np.ndarray, size: int
+    low: np.ndarray,
+    end: np.ndarray,
+    spacing: float,
+    fields: dict[str, np.ndarray],
+    flat: np.ndarray,
+    size: int,
 ) -> Iterator[bytes | memoryview]:
     """Yield the parts of a VTI file; one field at a time is in memory as all cells of the image have it.
 
@@ -118,11 +147,16 @@ def _vti(
     hidden = np.zeros(1, dtype=np.uint8)
     extent = extent_of(low, end)
     yield opening("ImageData")
-    yield f'<ImageData WholeExtent="{extent}" Origin="0 0 0" Spacing="{spacing} {spacing} {spacing}">\n'.encode()
+    yield (
+        f'<ImageData WholeExtent="{extent}" Origin="0 0 0" Spacing="{spacing} {spacing} '
+        f'{spacing}">\n'
+    ).encode()
     yield f'<Piece Extent="{extent}">\n<CellData>\n'.encode()
     offset = 0
     for name, values in {**fields, GHOSTS: hidden}.items():
-        yield f'<DataArray {attributes(name, values)} format="appended" offset="{offset}"/>\n'.encode()
+        yield (
+            f'<DataArray {attributes(name, values)} format="appended" offset="{offset}"/>\n'
+        ).encode()
         offset += LENGTH_BYTES + size * math.prod(values.shape[1:]) * values.itemsize
     yield b"</CellData>\n</Piece>\n</ImageData>\n" + APPENDED
     for values in fields.values():

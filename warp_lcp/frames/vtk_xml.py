@@ -13,7 +13,8 @@ import numpy as np
 
 from warp_lcp.simulation import Cells, Points, Surface
 
-ENCODED = 3 * 2**18  # bytes encoded at a time, a multiple of 3: memory stays small, and other threads go on in between
+# bytes encoded at a time, a multiple of 3: memory stays small, and other threads go on in between
+ENCODED = 3 * 2**18
 TYPE = re.compile(r"(?P<kind>Float|Int|UInt)(?P<bits>8|16|32|64)")
 LENGTH_BYTES = 8  # before each array, as header_type says
 
@@ -24,7 +25,10 @@ def opening(kind: str) -> bytes:
     Args:
         kind: of the data set, such as `ImageData`.
     """
-    return f'<?xml version="1.0"?>\n<VTKFile type="{kind}" version="1.0" byte_order="LittleEndian" header_type="UInt64">\n'.encode()
+    return (
+        f'<?xml version="1.0"?>\n<VTKFile type="{kind}" version="1.0" byte_order="LittleEndian" '
+        'header_type="UInt64">\n'
+    ).encode()
 
 
 def writable(name: str, values: np.ndarray, size: int) -> np.ndarray:
@@ -55,7 +59,9 @@ def writable_fields(part: Points | Cells | Surface) -> tuple[int, dict[str, np.n
 
 def attributes(name: str, values: np.ndarray) -> str:
     """Return the attributes of a data array that do not depend on where its bytes are."""
-    kind = {"f": "Float", "i": "Int", "u": "UInt"}[values.dtype.kind] + str(8 * values.dtype.itemsize)
+    kind = {"f": "Float", "i": "Int", "u": "UInt"}[values.dtype.kind] + str(
+        8 * values.dtype.itemsize
+    )
     components = f' NumberOfComponents="{values.shape[1]}"' if values.ndim == 2 else ""
     return f'type="{kind}" Name="{name}"{components}'
 
@@ -96,15 +102,26 @@ def read_back(path: Path) -> Iterator[None]:
     """
     try:
         yield
-    except (ValueError, LookupError, TypeError, OverflowError, MemoryError, AttributeError, ElementTree.ParseError) as error:
-        raise ValueError(f"{path}: is not a readable frame: {str(error) or type(error).__name__}") from error
+    except (
+        ValueError,
+        LookupError,
+        TypeError,
+        OverflowError,
+        MemoryError,
+        AttributeError,
+        ElementTree.ParseError,
+    ) as error:
+        raise ValueError(
+            f"{path}: is not a readable frame: {str(error) or type(error).__name__}"
+        ) from error
 
 
 def root(text: bytes, kind: str) -> ElementTree.Element:
     """Return the data set of a file that `opening` began.
 
     Raises:
-        ValueError: it is another one, or declares entities, of which a few bytes may become any number.
+        ValueError: it is another one, or declares entities, of which a few bytes may become any
+            number.
         ParseError: it is not XML.
     """
     if b"<!" in text:
@@ -114,8 +131,14 @@ def root(text: bytes, kind: str) -> ElementTree.Element:
     except ElementTree.ParseError as error:
         raise ValueError(f"not XML: {error}") from error
     data = file.find(kind)
-    if data is None or (file.get("byte_order"), file.get("header_type")) != ("LittleEndian", "UInt64") or file.get("compressor"):
-        raise ValueError(f"not a {kind} as a run writes it: little-endian, 64-bit lengths, uncompressed")
+    if (
+        data is None
+        or (file.get("byte_order"), file.get("header_type")) != ("LittleEndian", "UInt64")
+        or file.get("compressor")
+    ):
+        raise ValueError(
+            f"not a {kind} as a run writes it: little-endian, 64-bit lengths, uncompressed"
+        )
     return data
 
 
@@ -146,7 +169,10 @@ def array_values(array: ElementTree.Element, data: bytes, at: int = 0) -> np.nda
     size = int.from_bytes(data[at : at + LENGTH_BYTES], "little")
     held = len(data) - at - LENGTH_BYTES
     if at < 0 or not 0 <= size <= held or components < 1 or size % (components * dtype.itemsize):
-        raise ValueError(f"{array.get('Name')!r} of {size} bytes is cut short, or not a multiple of {components} values")
+        raise ValueError(
+            f"{array.get('Name')!r} of {size} bytes is cut short, or not a multiple of "
+            f"{components} values"
+        )
     found = np.frombuffer(data, dtype, size // dtype.itemsize, at + LENGTH_BYTES)
     return found.reshape(-1, components) if components > 1 else found
 

@@ -10,12 +10,23 @@ import numpy as np
 
 from warp_lcp.files.atomic import replacing
 from warp_lcp.files.claims import read_whole
-from warp_lcp.frames.vtk_xml import inline, inline_values, opening, read_back, root, writable, writable_fields
+from warp_lcp.frames.vtk_xml import (
+    inline,
+    inline_values,
+    opening,
+    read_back,
+    root,
+    writable,
+    writable_fields,
+)
 from warp_lcp.simulation import Cells, Points, Surface
 
 # Corners of a cell in VTK's order for quadrilaterals (the first four) and hexahedra, as x, y, z.
-CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])
-VTK_TYPES = {1: 1, 2: 3, 3: 5, 4: 9, 8: 12}  # vertex, line, triangle, quadrilateral and hexahedron by their corners
+CORNERS = np.array(
+    [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]]
+)
+# vertex, line, triangle, quadrilateral and hexahedron by their corners
+VTK_TYPES = {1: 1, 2: 3, 3: 5, 4: 9, 8: 12}
 VTK_CORNERS = {kind: corners for corners, kind in VTK_TYPES.items()}
 BASE64 = 4 / 3  # what the encoding adds to the bytes
 XML_BYTES = 2000  # of the text around the arrays
@@ -42,11 +53,13 @@ class Mesh:
 def write_vtu(path: Path, part: Points | Cells | Surface) -> None:
     """Write a part of a frame as a VTU file: binary, uncompressed (compression takes three times as long as writing), atomically.
 
-    The arrays are base64 text. Appended raw bytes would take 3/4 of the room and 0.6 to 0.8 of the time, but meshio cannot read them.
+    The arrays are base64 text. Appended raw bytes would take 3/4 of the room and 0.6 to 0.8 of the
+    time, but meshio cannot read them.
 
     Args:
         path: the file.
-        part: points become vertices, surfaces triangles or lines; cells become quadrilaterals or hexahedra that share their corners.
+        part: points become vertices, surfaces triangles or lines; cells become quadrilaterals or
+            hexahedra that share their corners.
 
     Raises:
         OSError: the file cannot be written.
@@ -54,7 +67,11 @@ def write_vtu(path: Path, part: Points | Cells | Surface) -> None:
     """
     mesh = mesh_of(part)
     with replacing(path) as file:
-        file.writelines(_vtu(mesh.points, mesh.corners, mesh.fields, "CellData" if mesh.on_cells else "PointData"))
+        file.writelines(
+            _vtu(
+                mesh.points, mesh.corners, mesh.fields, "CellData" if mesh.on_cells else "PointData"
+            )
+        )
 
 
 def mesh_of(part: Points | Cells | Surface) -> Mesh:
@@ -65,9 +82,15 @@ def mesh_of(part: Points | Cells | Surface) -> Mesh:
     """
     size, fields = writable_fields(part)
     if isinstance(part, Points):
-        points, corners = writable("points", part.points, size), np.arange(size, dtype="<i4")[:, None]
+        points, corners = (
+            writable("points", part.points, size),
+            np.arange(size, dtype="<i4")[:, None],
+        )
     elif isinstance(part, Surface):
-        points, corners = writable("points", part.points, size), part.corners.astype("<i4", copy=False)
+        points, corners = (
+            writable("points", part.points, size),
+            part.corners.astype("<i4", copy=False),
+        )
     else:
         points, corners = _corners(part)
     return Mesh(points, corners, fields, isinstance(part, Cells))
@@ -84,7 +107,12 @@ def read_vtu(path: Path) -> Mesh:
         piece = root(read_whole(path, copies=3), "UnstructuredGrid").find("Piece")
         if piece is None:
             raise ValueError("no Piece")
-        arrays = {place.tag: {str(array.get("Name")): inline_values(array) for array in place.iter("DataArray")} for place in piece}
+        arrays = {
+            place.tag: {
+                str(array.get("Name")): inline_values(array) for array in place.iter("DataArray")
+            }
+            for place in piece
+        }
         points, cells = np.reshape(arrays["Points"]["Points"], (-1, 3)), arrays["Cells"]
         each = VTK_CORNERS[int(cells["types"][0])] if len(cells["types"]) else 1
         corners = np.reshape(cells["connectivity"], (-1, each))
@@ -109,7 +137,8 @@ def vtu_bytes(part: Points | Cells | Surface) -> int:
     elif isinstance(part, Surface):
         points, (cells, each) = part.points.nbytes, part.corners.shape
     else:
-        points, cells, each = len(part.index) * 2 * POINT_BYTES, len(part.index), 2**part.dimension  # about two corner points a cell
+        # about two corner points a cell
+        points, cells, each = len(part.index) * 2 * POINT_BYTES, len(part.index), 2**part.dimension
     return int(BASE64 * (total + points + cells * (4 * each + OFFSET_BYTES + TYPE_BYTES)))
 
 
@@ -123,7 +152,8 @@ def _corners(cells: Cells) -> tuple[np.ndarray, np.ndarray]:
     strides = np.array([shape[1] * shape[2], shape[2], 1])
     x, y, z = (cells.index - low).T
     flat = ((x * shape[1] + y) * shape[2] + z)[:, None] + CORNERS[:each] @ strides
-    used = np.zeros(shape.prod(), dtype=bool)  # a table over the bounding box: much faster than sorting the corners
+    # a table over the bounding box: much faster than sorting the corners
+    used = np.zeros(shape.prod(), dtype=bool)
     used[flat] = True
     number = np.cumsum(used, dtype="<i4")
     number -= 1
@@ -133,11 +163,16 @@ def _corners(cells: Cells) -> tuple[np.ndarray, np.ndarray]:
     return (lattice * cells.spacing).astype("<f4"), number[flat]
 
 
-def _vtu(points: np.ndarray, corners: np.ndarray, fields: dict[str, np.ndarray], where: str) -> Iterator[bytes]:
+def _vtu(
+    points: np.ndarray, corners: np.ndarray, fields: dict[str, np.ndarray], where: str
+) -> Iterator[bytes]:
     """Yield the parts of a VTU file. One without points still names its fields, so that a viewer finds them in every frame."""
     count, each = corners.shape
     yield opening("UnstructuredGrid")
-    yield f'<UnstructuredGrid>\n<Piece NumberOfPoints="{len(points)}" NumberOfCells="{count}">\n<Points>\n'.encode()
+    yield (
+        f'<UnstructuredGrid>\n<Piece NumberOfPoints="{len(points)}" '
+        f'NumberOfCells="{count}">\n<Points>\n'
+    ).encode()
     yield from inline("Points", points)
     yield b"</Points>\n<Cells>\n"
     yield from inline("connectivity", corners.reshape(-1))

@@ -1,6 +1,12 @@
 """Problems to try methods on, each deterministic by its seed; most with a known solution."""
 
-from warp_lcp.gallery.contact_models import BoxedModel, ContactSystem, FrozenBoxModel, StewartTrinkleModel, proximal_sweeps
+from warp_lcp.gallery.contact_models import (
+    BoxedModel,
+    ContactSystem,
+    FrozenBoxModel,
+    StewartTrinkleModel,
+    proximal_sweeps,
+)
 from warp_lcp.gallery.contact_scenes import SCENES, contact, contact_scene
 from warp_lcp.gallery.contact_stepper import ContactStepper
 from warp_lcp.gallery.families import FAMILIES

@@ -19,10 +19,12 @@ class ArticulatedFigure:
 
     Each hinge turns its link about an axis fixed in its parent's link.
 
-    With R_j = R_parent Rot(axis_j, theta_j) and p_j = p_parent + R_parent offset_j, an end effector on link j is at p_j + R_j tip.
+    With R_j = R_parent Rot(axis_j, theta_j) and p_j = p_parent + R_parent offset_j, an end effector
+    on link j is at p_j + R_j tip.
 
     Args:
-        parents: of each hinge, the hinge before it on the way to the root; -1 for a hinge on the fixed root; parents come first.
+        parents: of each hinge, the hinge before it on the way to the root; -1 for a hinge on the
+            fixed root; parents come first.
         axes: unit vectors in the parent's frame, shape (n, 3).
         offsets: places of the hinges in the parent's frame [m], shape (n, 3).
         effectors: the hinges whose links carry end effectors.
@@ -56,16 +58,32 @@ class ArticulatedFigure:
         """Check the tree and the shapes."""
         n, e = len(self.parents), len(self.effectors)
         if n == 0 or not all(-1 <= parent < j for j, parent in enumerate(self.parents)):
-            raise ValueError(f"parents = {self.parents}: expected at least one hinge, and each parent before its children")
-        for name, shape in (("axes", (n, 3)), ("offsets", (n, 3)), ("tips", (e, 3)), ("lower", (n,)), ("upper", (n,))):
+            raise ValueError(
+                f"parents = {self.parents}: expected at least one hinge, and each parent before "
+                "its children"
+            )
+        for name, shape in (
+            ("axes", (n, 3)),
+            ("offsets", (n, 3)),
+            ("tips", (e, 3)),
+            ("lower", (n,)),
+            ("upper", (n,)),
+        ):
             if np.shape(getattr(self, name)) != shape:
-                raise ValueError(f"{name} has shape {np.shape(getattr(self, name))}: expected {shape}")
+                raise ValueError(
+                    f"{name} has shape {np.shape(getattr(self, name))}: expected {shape}"
+                )
         if e == 0 or not all(0 <= j < n for j in self.effectors):
-            raise ValueError(f"effectors = {self.effectors}: expected at least one, each the number of a hinge")
+            raise ValueError(
+                f"effectors = {self.effectors}: expected at least one, each the number of a hinge"
+            )
         if not np.allclose(np.linalg.norm(self.axes, axis=1), 1):
             raise ValueError("axes: each must be a unit vector")
         if not 0 < self.reach < np.inf:
-            raise ValueError(f"offsets and tips: an end effector must be some way from the first hinge, but reach = {self.reach:.6g} m")
+            raise ValueError(
+                "offsets and tips: an end effector must be some way from the first hinge, but "
+                f"reach = {self.reach:.6g} m"
+            )
         if not (self.lower <= self.upper).all():
             raise ValueError("lower > upper, or a NaN, in the limits")
         if self.dimension not in (2, 3) or (self.dimension == 2 and not np.allclose(self.axes, Z)):
@@ -123,7 +141,8 @@ class ArticulatedFigure:
     def curvature(self, theta: Vector, weights: Vector) -> Vector:
         """Return sum_k w_k d^2 f_k / dtheta^2 [m^2], shape (n, n), symmetric.
 
-        d^2 f_i / dtheta_j dtheta_k = a_j x (a_k x (f_i - p_k)), j on k's way to the root or k itself, and k on effector i's.
+        d^2 f_i / dtheta_j dtheta_k = a_j x (a_k x (f_i - p_k)), j on k's way to the root or k
+        itself, and k on effector i's.
 
         Args:
             theta: angles [rad], shape (n,).
@@ -133,7 +152,8 @@ class ArticulatedFigure:
         w = np.zeros_like(ends)
         w[:, : self.dimension] = weights.reshape(len(ends), -1)
         arms = np.cross(axes[None], ends[:, None] - places[None]) * self.ancestors[..., None]
-        second = np.einsum("ekc,ejc->jk", arms, np.cross(w[:, None], axes[None]))  # w . (a_j x arm_k) = (w x a_j) . arm_k
+        # w . (a_j x arm_k) = (w x a_j) . arm_k
+        second = np.einsum("ekc,ejc->jk", arms, np.cross(w[:, None], axes[None]))
         above = np.zeros((self.hinges, self.hinges), dtype=bool)  # j is k or on its way to the root
         for k, parent in enumerate(self.parents):
             above[:, k] = above[:, parent] if parent >= 0 else False
@@ -142,7 +162,9 @@ class ArticulatedFigure:
         return upper + upper.T - np.diag(np.diag(upper))
 
 
-def planar_chain(lengths: Sequence[float], *, lower: float | Vector = -2.0, upper: float | Vector = 2.0) -> ArticulatedFigure:
+def planar_chain(
+    lengths: Sequence[float], *, lower: float | Vector = -2.0, upper: float | Vector = 2.0
+) -> ArticulatedFigure:
     """Return a chain in the x-y plane that lies along x at theta = 0.
 
     Args:
@@ -152,15 +174,23 @@ def planar_chain(lengths: Sequence[float], *, lower: float | Vector = -2.0, uppe
     """
     n = len(lengths)
     if n == 0 or not np.isfinite(lengths).all() or not np.any(lengths):
-        raise ValueError(f"lengths = {lengths}: expected finite lengths [m], at least one of them not 0")
+        raise ValueError(
+            f"lengths = {lengths}: expected finite lengths [m], at least one of them not 0"
+        )
     offsets = np.zeros((n, 3))
     offsets[1:, 0] = lengths[:-1]
     tips = np.array([[lengths[-1], 0.0, 0.0]])
-    low, high = (np.broadcast_to(np.asarray(side, dtype=np.float64), (n,)) for side in (lower, upper))
-    return ArticulatedFigure(tuple(range(-1, n - 1)), np.tile(Z, (n, 1)), offsets, (n - 1,), tips, low, high, dimension=2)
+    low, high = (
+        np.broadcast_to(np.asarray(side, dtype=np.float64), (n,)) for side in (lower, upper)
+    )
+    return ArticulatedFigure(
+        tuple(range(-1, n - 1)), np.tile(Z, (n, 1)), offsets, (n - 1,), tips, low, high, dimension=2
+    )
 
 
-def spatial_chain(lengths: Sequence[float], *, lower: float | Vector = -2.0, upper: float | Vector = 2.0) -> ArticulatedFigure:
+def spatial_chain(
+    lengths: Sequence[float], *, lower: float | Vector = -2.0, upper: float | Vector = 2.0
+) -> ArticulatedFigure:
     """Return a chain in space that lies along x at theta = 0.
 
     The axes of its hinges are z, y, x, z, y, x and so on.
@@ -172,7 +202,9 @@ def spatial_chain(lengths: Sequence[float], *, lower: float | Vector = -2.0, upp
     """
     flat = planar_chain(lengths, lower=lower, upper=upper)
     axes = np.eye(3)[[2 - j % 3 for j in range(flat.hinges)]]
-    return ArticulatedFigure(flat.parents, axes, flat.offsets, flat.effectors, flat.tips, flat.lower, flat.upper)
+    return ArticulatedFigure(
+        flat.parents, axes, flat.offsets, flat.effectors, flat.tips, flat.lower, flat.upper
+    )
 
 
 def branching_figure() -> ArticulatedFigure:
@@ -180,7 +212,8 @@ def branching_figure() -> ArticulatedFigure:
 
     A spine of 3 hinges, two arms of 5 and a head of 2.
 
-    y is up at theta = 0, with the arms hanging out sideways; 1 m from hip to shoulders and to a hand; limits are a person's, roughly.
+    y is up at theta = 0, with the arms hanging out sideways; 1 m from hip to shoulders and to a
+    hand; limits are a person's, roughly.
     """
     x, y, z = np.eye(3)
     joints: list[tuple[int, Vector, Vector, float, float]] = [  # parent, axis, offset, limits
@@ -193,10 +226,14 @@ def branching_figure() -> ArticulatedFigure:
         shoulder = len(joints)
         low, high = sorted((-0.5 * side, 1.5 * side))
         joints += [
-            (2, y, 0.5 * y + 0.2 * side * x, -1.5, 0.6) if side < 0 else (2, y, 0.5 * y + 0.2 * side * x, -0.6, 1.5),
+            (2, y, 0.5 * y + 0.2 * side * x, -1.5, 0.6)
+            if side < 0
+            else (2, y, 0.5 * y + 0.2 * side * x, -0.6, 1.5),
             (shoulder, z, 0 * y, low, high),
             (shoulder + 1, x, 0 * y, -1.5, 1.5),
-            (shoulder + 2, y, 0.35 * side * x, -2.4, 0.0) if side < 0 else (shoulder + 2, y, 0.35 * side * x, 0.0, 2.4),
+            (shoulder + 2, y, 0.35 * side * x, -2.4, 0.0)
+            if side < 0
+            else (shoulder + 2, y, 0.35 * side * x, 0.0, 2.4),
             (shoulder + 3, z, 0.3 * side * x, -1.0, 1.0),
         ]
         ends.append((shoulder + 4, 0.15 * side * x))
@@ -205,5 +242,12 @@ def branching_figure() -> ArticulatedFigure:
     parents, axes, offsets, lower, upper = zip(*joints, strict=True)
     effectors, tips = zip(*ends, strict=True)
     return ArticulatedFigure(
-        parents, np.array(axes), np.array(offsets), effectors, np.array(tips), np.array(lower), np.array(upper), dimension=3
+        parents,
+        np.array(axes),
+        np.array(offsets),
+        effectors,
+        np.array(tips),
+        np.array(lower),
+        np.array(upper),
+        dimension=3,
     )

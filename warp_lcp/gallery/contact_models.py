@@ -2,7 +2,8 @@
 
 See [Book] 1.3.5.
 
-All start from a `ContactSystem`: relative velocities at the contacts after impulses r, u = B r + q, whatever made them.
+All start from a `ContactSystem`: relative velocities at the contacts after impulses r, u = B r + q,
+whatever made them.
 """
 
 from __future__ import annotations
@@ -22,11 +23,13 @@ from warp_lcp.problem.affine_bounds import AffineBounds
 class ContactSystem:
     """Velocities u = B r + q at k contacts and m further rows (joints) for impulses r.
 
-    The rows of a contact are consecutive: normal, then `dim - 1` tangents; joints follow the contacts.
+    The rows of a contact are consecutive: normal, then `dim - 1` tangents; joints follow the
+    contacts.
 
     Args:
         name: of the scene.
-        B: J M^-1 J', symmetric positive semi-definite [1/kg], scipy.sparse, shape (dim k + m, dim k + m).
+        B: J M^-1 J', symmetric positive semi-definite [1/kg], scipy.sparse, shape (dim k + m, dim k
+            + m).
         q: velocities without impulses, plus position correction [m/s], shape (dim k + m,).
         friction: coefficient mu >= 0 of each contact, shape (k,).
         lower: least impulse of each joint row [N s], shape (m,); none where -inf.
@@ -50,7 +53,10 @@ class ContactSystem:
         if self.dim not in (2, 3):
             raise ValueError(f"dim = {self.dim}: must be 2 or 3")
         if self.B.shape != (n, n) or self.q.shape != (n,) or self.upper.shape != self.lower.shape:
-            raise ValueError(f"B has shape {self.B.shape}, q {self.q.shape}: expected {n} rows for {len(self.friction)} contacts")
+            raise ValueError(
+                f"B has shape {self.B.shape}, q {self.q.shape}: expected {n} rows for "
+                f"{len(self.friction)} contacts"
+            )
         if not (self.friction >= 0).all():
             raise ValueError("friction holds a negative value or NaN")
 
@@ -82,9 +88,13 @@ class ContactSystem:
         """
         blocks = list(np.arange(self.dim * self.contacts).reshape(self.contacts, self.dim))
         free = np.isinf(self.lower) & np.isinf(self.upper)
-        for equations, group in groupby(zip(self.joints, free, strict=True), key=lambda entry: entry[1]):
+        for equations, group in groupby(
+            zip(self.joints, free, strict=True), key=lambda entry: entry[1]
+        ):
             rows = np.array([row for row, _ in group])
-            blocks += np.split(rows, range(most if equations else 1, len(rows), most if equations else 1))
+            blocks += np.split(
+                rows, range(most if equations else 1, len(rows), most if equations else 1)
+            )
         return blocks
 
     def staggered(self) -> list[np.ndarray]:
@@ -100,9 +110,11 @@ class ContactSystem:
 
         The map projects onto the circular cone.
 
-        With u = B r + q and d a contact's mean diagonal of B: d (r_n - max(0, r_n - u_n / d)), and for friction the same with the
-        projection onto |r_t| <= mu r_n ([Book] 1.1.4, 1.3.5; the disk of the true normal impulse). 0 exactly where Coulomb's law holds:
-        r_n >= 0, u_n >= 0, r_n u_n = 0, and r_t is in the disk and opposite to u_t where that is not 0. Joint rows are clipped.
+        With u = B r + q and d a contact's mean diagonal of B: d (r_n - max(0, r_n - u_n / d)), and
+        for friction the same with the projection onto |r_t| <= mu r_n ([Book] 1.1.4, 1.3.5; the
+        disk of the true normal impulse). 0 exactly where Coulomb's law holds: r_n >= 0, u_n >= 0,
+        r_n u_n = 0, and r_t is in the disk and opposite to u_t where that is not 0. Joint rows are
+        clipped.
         """
         u, d = self.B @ r + self.q, np.abs(self.B.diagonal())
         d = np.where(d > 0, d, 1.0)
@@ -147,8 +159,9 @@ class BoxedModel:
 
     Bounds are affine in r_n ([Book] 1.3.5).
 
-    The cone has four sides and its friction up to sqrt(2) mu along diagonals, and friction does not oppose the slip exactly. The problem
-    is symmetric positive semi-definite, with n = dim k + m unknowns, and for methods that take affine bounds.
+    The cone has four sides and its friction up to sqrt(2) mu along diagonals, and friction does not
+    oppose the slip exactly. The problem is symmetric positive semi-definite, with n = dim k + m
+    unknowns, and for methods that take affine bounds.
     """
 
     def problem(self, system: ContactSystem) -> Problem:
@@ -159,8 +172,12 @@ class BoxedModel:
         low, high = np.zeros(n), np.full(n, np.inf)
         low[system.joints], high[system.joints] = system.lower, system.upper
         lower, upper = AffineBounds.friction(normal, mu, low, high)
-        facts = {"symmetric", "semidefinite", "boxed", "affine"} | ({"mixed"} if np.isinf(system.lower).any() else set())
-        return Problem(f"{system.name}: boxed", system.B, system.q, lower, upper, None, frozenset(facts))
+        facts = {"symmetric", "semidefinite", "boxed", "affine"} | (
+            {"mixed"} if np.isinf(system.lower).any() else set()
+        )
+        return Problem(
+            f"{system.name}: boxed", system.B, system.q, lower, upper, None, frozenset(facts)
+        )
 
     def impulses(self, system: ContactSystem, x: np.ndarray) -> np.ndarray:
         """Return x: the unknowns are the impulses."""
@@ -194,7 +211,9 @@ class FrozenBoxModel(BoxedModel):
         at = np.zeros(len(p.b))
         at[system.normals] = np.maximum(self.normal, 0.0)
         facts = p.facts - {"affine"} | {"solvable"}
-        return Problem(f"{system.name}: frozen boxes", p.A, p.b, p.lower.at(at), p.upper.at(at), None, facts)
+        return Problem(
+            f"{system.name}: frozen boxes", p.A, p.b, p.lower.at(at), p.upper.at(at), None, facts
+        )
 
 
 @dataclass(frozen=True)
@@ -203,11 +222,13 @@ class StewartTrinkleModel:
 
     [Book] 1.3.5, eqs. 1.146-1.147.
 
-    Friction is a sum of non-negative impulses along K unit vectors evenly around the normal; with beta, the slip speed, a contact has the
-    rows y_n = u_n, y_t = u_t + beta, y_beta = mu x_n - sum of x_t, each complementary to its x >= 0. The last sign makes it
-    [B_nn, B_nt, 0; B_tn, B_tt, e; mu, -e', 0]. Not symmetric, beta's diagonal is 0, copositive: Lemke's method and Newton-type methods.
-    Unknowns: (2 + K) k + m. The cone lies inside the circular one and touches it along the K vectors; its sides recede by the factor
-    cos(pi / K). In the plane the vectors are +-t, K = 2, whatever `directions` is.
+    Friction is a sum of non-negative impulses along K unit vectors evenly around the normal; with
+    beta, the slip speed, a contact has the rows y_n = u_n, y_t = u_t + beta, y_beta = mu x_n - sum
+    of x_t, each complementary to its x >= 0. The last sign makes it
+    [B_nn, B_nt, 0; B_tn, B_tt, e; mu, -e', 0]. Not symmetric, beta's diagonal is 0, copositive:
+    Lemke's method and Newton-type methods. Unknowns: (2 + K) k + m. The cone lies inside the
+    circular one and touches it along the K vectors; its sides recede by the factor cos(pi / K). In
+    the plane the vectors are +-t, K = 2, whatever `directions` is.
 
     Args:
         directions: K, even; 2 are opposite, and friction acts along one tangent alone.
@@ -236,7 +257,10 @@ class StewartTrinkleModel:
         Impulses are r = T'x of the unknowns x, velocities along the vectors T u.
         """
         each = np.vstack([self.spread(system.dim), np.zeros(system.dim)])
-        blocks = [scipy.sparse.kron(scipy.sparse.eye_array(system.contacts), each), scipy.sparse.eye_array(len(system.lower))]
+        blocks = [
+            scipy.sparse.kron(scipy.sparse.eye_array(system.contacts), each),
+            scipy.sparse.eye_array(len(system.lower)),
+        ]
         return scipy.sparse.csr_array(scipy.sparse.block_diag(blocks))
 
     def problem(self, system: ContactSystem) -> Problem:
@@ -247,14 +271,26 @@ class StewartTrinkleModel:
         beta[1:-1, -1], beta[-1, 1:-1] = 1.0, -1.0
         slope = np.zeros((2 + K, 2 + K))
         slope[-1, 0] = 1.0
-        cones = scipy.sparse.kron(scipy.sparse.eye_array(k), beta) + scipy.sparse.kron(scipy.sparse.diags_array(system.friction), slope)
-        A = scipy.sparse.csr_array(T @ system.B @ T.T + scipy.sparse.block_diag([cones, scipy.sparse.csr_array((m, m))]))
+        cones = scipy.sparse.kron(scipy.sparse.eye_array(k), beta) + scipy.sparse.kron(
+            scipy.sparse.diags_array(system.friction), slope
+        )
+        A = scipy.sparse.csr_array(
+            T @ system.B @ T.T + scipy.sparse.block_diag([cones, scipy.sparse.csr_array((m, m))])
+        )
         n = A.shape[0]
         lower, upper = np.zeros(n), np.full(n, np.inf)
         lower[n - m :], upper[n - m :] = system.lower, system.upper
         facts = {"copositive"} | ({"mixed"} if np.isinf(system.lower).any() else set())
         facts |= {"boxed"} if np.isfinite(system.upper).any() else set()
-        return Problem(f"{system.name}: Stewart-Trinkle, {K} sides", A, T @ system.q, lower, upper, None, frozenset(facts))
+        return Problem(
+            f"{system.name}: Stewart-Trinkle, {K} sides",
+            A,
+            T @ system.q,
+            lower,
+            upper,
+            None,
+            frozenset(facts),
+        )
 
     def impulses(self, system: ContactSystem, x: np.ndarray) -> np.ndarray:
         """Return r: friction is the sum over the tangent vectors."""
@@ -276,7 +312,10 @@ class StewartTrinkleModel:
         else:
             turn = np.arctan2(own[:, 2], own[:, 1]) % (2 * np.pi) * K / (2 * np.pi)
             before = np.floor(turn).astype(int) % K
-            length, rest = np.linalg.norm(own[:, 1:], axis=1), (turn - np.floor(turn)) * 2 * np.pi / K
+            length, rest = (
+                np.linalg.norm(own[:, 1:], axis=1),
+                (turn - np.floor(turn)) * 2 * np.pi / K,
+            )
             each = np.arange(k)
             x[each, 1 + before] = length * np.sin(2 * np.pi / K - rest) / np.sin(2 * np.pi / K)
             x[each, 1 + (before + 1) % K] = length * np.sin(rest) / np.sin(2 * np.pi / K)
@@ -285,15 +324,20 @@ class StewartTrinkleModel:
 
 
 def proximal_sweeps(
-    system: ContactSystem, *, tolerance: float = 1e-9, most: int = 1000, r0: np.ndarray | None = None
+    system: ContactSystem,
+    *,
+    tolerance: float = 1e-9,
+    most: int = 1000,
+    r0: np.ndarray | None = None,
 ) -> tuple[np.ndarray, float, int]:
     """Solve the proximal form with the circular cone by Gauss-Seidel sweeps.
 
     Over contacts, on the host ([Book] 1.1.4, 1.3.5).
 
-    r_n <- max(0, r_n - u_n / B_nn), then r_t <- proj(r_t - u_t / rho) onto |r_t| <= mu r_n with rho the largest eigenvalue of the
-    contact's B_tt; joint rows <- clip(r - u / B_ii). No proof of convergence for mu > 0; the reference for the polyhedral cones here, in
-    systems of up to some hundred contacts.
+    r_n <- max(0, r_n - u_n / B_nn), then r_t <- proj(r_t - u_t / rho) onto |r_t| <= mu r_n with rho
+    the largest eigenvalue of the contact's B_tt; joint rows <- clip(r - u / B_ii). No proof of
+    convergence for mu > 0; the reference for the polyhedral cones here, in systems of up to some
+    hundred contacts.
 
     Args:
         system: the contact system.

@@ -2,7 +2,8 @@
 
 Stacks, walls, heavy on light bodies, chains of hinges, inclines, gears, motors.
 
-Each makes a `World`, deterministic by its seed, in meters and kilograms; `contact_scene` makes a problem of one by its name.
+Each makes a `World`, deterministic by its seed, in meters and kilograms; `contact_scene` makes a
+problem of one by its name.
 """
 
 from __future__ import annotations
@@ -14,7 +15,12 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
-from warp_lcp.gallery.contact_models import BoxedModel, ContactModel, ContactSystem, StewartTrinkleModel
+from warp_lcp.gallery.contact_models import (
+    BoxedModel,
+    ContactModel,
+    ContactSystem,
+    StewartTrinkleModel,
+)
 from warp_lcp.gallery.contact_stepper import ContactStepper
 from warp_lcp.gallery.problem import Problem
 from warp_lcp.gallery.rigid_world import FIXED, GRAVITY, Parts, World
@@ -33,7 +39,9 @@ Vector = Sequence[float] | np.ndarray
 
 def box(center: Vector, half: Vector, turn: Rotation | None = None) -> Box:
     """Return a box by its center and half sides [m], turned about the center."""
-    place = Placement(rotation=(turn or Rotation.identity()).as_matrix(), translation=np.array(center))
+    place = Placement(
+        rotation=(turn or Rotation.identity()).as_matrix(), translation=np.array(center)
+    )
     return Box(lower=tuple(-h for h in half), upper=tuple(half), placement=place)
 
 
@@ -42,7 +50,14 @@ def gear(center: Vector, half: Vector, phase: float) -> list[Box]:
 
     BARS bars of half sides [m], the first at an angle [rad].
     """
-    return [box(center, half, about((1.0, 0.0, 0.0), np.pi / 2) * about((0.0, 0.0, 1.0), phase + np.pi * k / BARS)) for k in range(BARS)]
+    return [
+        box(
+            center,
+            half,
+            about((1.0, 0.0, 0.0), np.pi / 2) * about((0.0, 0.0, 1.0), phase + np.pi * k / BARS),
+        )
+        for k in range(BARS)
+    ]
 
 
 def about(axis: Vector, angle: float) -> Rotation:
@@ -68,7 +83,9 @@ def sphere_stack(count: int = 6, *, seed: int = 2015) -> World:
     """
     _check("count", count, 1)
     radius = 0.25
-    mass = DENSITY * 4 / 3 * np.pi * radius**3 * np.random.default_rng(seed).uniform(0.9, 1.1, count)
+    mass = (
+        DENSITY * 4 / 3 * np.pi * radius**3 * np.random.default_rng(seed).uniform(0.9, 1.1, count)
+    )
     balls = [Sphere(center=[0.0, 0.0, radius * (2 * i + 1)], radius=radius) for i in range(count)]
     return World(f"stack of {count} spheres", balls, mass)
 
@@ -82,7 +99,10 @@ def box_stack(count: int = 10, *, seed: int = 2015) -> World:
     _check("count", count, 1)
     half, rng = (0.25, 0.25, 0.25), np.random.default_rng(seed)
     position = [[*rng.uniform(-0.02, 0.02, 2), 0.25 + 0.5 * i] for i in range(count)]
-    boxes = [box(x, half, about((0.0, 0.0, 1.0), a)) for x, a in zip(position, rng.uniform(-0.1, 0.1, count), strict=True)]
+    boxes = [
+        box(x, half, about((0.0, 0.0, 1.0), a))
+        for x, a in zip(position, rng.uniform(-0.1, 0.1, count), strict=True)
+    ]
     return World(f"stack of {count} boxes", boxes, [box_mass(half)] * count)
 
 
@@ -100,11 +120,17 @@ def wall(rows: int = 4, *, columns: int = 4, seed: int = 2015) -> World:
     whole, half = (0.25, 0.125, 0.125), (0.12375, 0.125, 0.125)
     bricks = []
     for i in range(rows):
-        bricks += [(x, i, half) for x in ([-0.12625, 0.505 * (columns - 1) + 0.12625] if i % 2 else [])]
+        bricks += [
+            (x, i, half) for x in ([-0.12625, 0.505 * (columns - 1) + 0.12625] if i % 2 else [])
+        ]
         bricks += [(0.505 * (j + 0.5 * (i % 2)), i, whole) for j in range(columns - i % 2)]
     density = np.random.default_rng(seed).uniform(0.9, 1.1, len(bricks))
     mass = [d * box_mass(sides) for d, (_, _, sides) in zip(density, bricks, strict=True)]
-    return World(f"wall of {rows} x {columns} bricks", [box((x, 0.0, 0.125 + 0.25 * i), sides) for x, i, sides in bricks], mass)
+    return World(
+        f"wall of {rows} x {columns} bricks",
+        [box((x, 0.0, 0.125 + 0.25 * i), sides) for x, i, sides in bricks],
+        mass,
+    )
 
 
 def heavy_on_light(layers: int = 2, *, ratio: float = 1000.0, seed: int = 2015) -> World:
@@ -118,17 +144,35 @@ def heavy_on_light(layers: int = 2, *, ratio: float = 1000.0, seed: int = 2015) 
     _check("layers", layers, 1)
     _check("ratio", ratio, 1e-12)
     small, large, rng = (0.125, 0.125, 0.125), (0.3, 0.3, 0.3), np.random.default_rng(seed)
-    position = [[0.3 * i - 0.15, 0.3 * j - 0.15, 0.125 + 0.25 * k] for k in range(layers) for i in (0, 1) for j in (0, 1)]
-    position = [[x + a, y + b, z] for (x, y, z), (a, b) in zip(position, rng.uniform(-0.01, 0.01, (len(position), 2)), strict=True)]
-    boxes, light = [*(box(x, small) for x in position), box([0.0, 0.0, 0.25 * layers + 0.3], large)], box_mass(small)
-    return World(f"heavy box on {layers} layers, mass ratio {ratio:g}", boxes, [*([light] * len(position)), ratio * light])
+    position = [
+        [0.3 * i - 0.15, 0.3 * j - 0.15, 0.125 + 0.25 * k]
+        for k in range(layers)
+        for i in (0, 1)
+        for j in (0, 1)
+    ]
+    position = [
+        [x + a, y + b, z]
+        for (x, y, z), (a, b) in zip(
+            position, rng.uniform(-0.01, 0.01, (len(position), 2)), strict=True
+        )
+    ]
+    boxes, light = (
+        [*(box(x, small) for x in position), box([0.0, 0.0, 0.25 * layers + 0.3], large)],
+        box_mass(small),
+    )
+    return World(
+        f"heavy box on {layers} layers, mass ratio {ratio:g}",
+        boxes,
+        [*([light] * len(position)), ratio * light],
+    )
 
 
 def _arch(links: int) -> tuple[list[Box], list[np.ndarray], np.ndarray]:
     """Return half a regular polygon of links that stands on z = 0, the points between them, and the center of the one on top."""
     step = np.pi / links
     radius = LINK[0] / np.tan(step / 2)
-    up = np.array([0.0, 0.0, LINK[2] * np.sin(step / 2)])  # the first link leans by step / 2: its lowest corner is that far below its end
+    # the first link leans by step / 2: its lowest corner is that far below its end
+    up = np.array([0.0, 0.0, LINK[2] * np.sin(step / 2)])
 
     def at(distance: float, angle: float) -> np.ndarray:
         return distance * np.array([np.cos(angle), 0.0, np.sin(angle)]) + up
@@ -169,9 +213,16 @@ def arched_snake(links: int = 9, *, heavy: float = 0.0, seed: int = 2015) -> Wor
     _check("heavy", heavy, 0.0)
     if links % 2 == 0:
         raise ValueError(f"links = {links}: must be odd, so that one is on top")
-    (boxes, points, top), mass, name = _arch(links), [box_mass(LINK)] * links, f"arched snake of {links} links"
+    (boxes, points, top), mass, name = (
+        _arch(links),
+        [box_mass(LINK)] * links,
+        f"arched snake of {links} links",
+    )
     if heavy > 0:
-        boxes, mass = [*boxes, box(top + np.array([0.0, 0.0, 0.08 + 0.25]), (0.25, 0.25, 0.25))], [*mass, heavy * mass[0]]
+        boxes, mass = (
+            [*boxes, box(top + np.array([0.0, 0.0, 0.08 + 0.25]), (0.25, 0.25, 0.25))],
+            [*mass, heavy * mass[0]],
+        )
         name += f" under a box of {heavy:g} links"
     hinges = _chain(points, np.random.default_rng(seed).uniform(0.02, 0.04, links - 1))
     return World(name, boxes, mass, hinges=hinges, friction=0.8, ignored=_next_but_one(links))
@@ -186,18 +237,26 @@ def hanging_snake(links: int = 8, *, seed: int = 2015) -> World:
         ValueError: there are less than two links.
     """
     _check("links", links, 2)
-    boxes, mass = [box([0.42 * i, 0.0, 2.0], LINK) for i in range(links)], [FIXED, *([box_mass(LINK)] * (links - 1))]
+    boxes, mass = (
+        [box([0.42 * i, 0.0, 2.0], LINK) for i in range(links)],
+        [FIXED, *([box_mass(LINK)] * (links - 1))],
+    )
     points = [(0.42 * i + 0.21, 0.0, 2.0) for i in range(links - 1)]
     hinges = _chain(points, np.random.default_rng(seed).uniform(0.02, 0.05, links - 1))
-    return World(f"hanging snake of {links} links", boxes, mass, hinges=hinges, ignored=_next_but_one(links))
+    return World(
+        f"hanging snake of {links} links", boxes, mass, hinges=hinges, ignored=_next_but_one(links)
+    )
 
 
-def incline(count: int = 1, *, angle: float = 0.3, friction: float = 0.5, seed: int = 2015) -> World:
+def incline(
+    count: int = 1, *, angle: float = 0.3, friction: float = 0.5, seed: int = 2015
+) -> World:
     """Return boxes in a row on a slope (fig. 2.9e, 2.11a).
 
     Each rests below atan(mu) and slides with g (sin - mu cos) above.
 
-    The plane goes through the origin and rises toward -x; boxes are 1:1:0.5, so that they do not topple, with masses within a tenth.
+    The plane goes through the origin and rises toward -x; boxes are 1:1:0.5, so that they do not
+    topple, with masses within a tenth.
 
     Args:
         count: boxes.
@@ -215,10 +274,14 @@ def incline(count: int = 1, *, angle: float = 0.3, friction: float = 0.5, seed: 
     boxes = [box(turn.apply([0.8 * i, 0.0, half[2]]), half, turn) for i in range(count)]
     mass = box_mass(half) * np.random.default_rng(seed).uniform(0.9, 1.1, count)
     slope = Obstacle(name="slope", points=np.zeros((1, 3)), normals=turn.apply([[0.0, 0.0, 1.0]]))
-    return World(f"{count} boxes on a slope of {angle:g} rad", boxes, mass, (slope,), friction=friction)
+    return World(
+        f"{count} boxes on a slope of {angle:g} rad", boxes, mass, (slope,), friction=friction
+    )
 
 
-def leaning_wall(rows: int = 4, *, columns: int = 3, angle: float = 0.25, seed: int = 2015) -> World:
+def leaning_wall(
+    rows: int = 4, *, columns: int = 3, angle: float = 0.25, seed: int = 2015
+) -> World:
     """Return a wall on a slope of `angle` [rad] (fig. 2.9h, 2.11b).
 
     Friction holds every brick.
@@ -230,7 +293,12 @@ def leaning_wall(rows: int = 4, *, columns: int = 3, angle: float = 0.25, seed: 
     if not 0 <= angle < np.pi / 2:
         raise ValueError(f"angle = {angle}: must be in [0, pi / 2), in rad")
     x, y, z = about(-Y_AXIS, angle).apply(GRAVITY).tolist()
-    return World(f"wall of {rows} x {columns} bricks leaning by {angle:g} rad", flat.solids, flat.mass, gravity=(x, y, z))
+    return World(
+        f"wall of {rows} x {columns} bricks leaning by {angle:g} rad",
+        flat.solids,
+        flat.mass,
+        gravity=(x, y, z),
+    )
 
 
 def gear_pyramid(rows: int = 3, *, seed: int = 2015) -> World:
@@ -238,7 +306,8 @@ def gear_pyramid(rows: int = 3, *, seed: int = 2015) -> World:
 
     The gears lean on each other, the lowest row between posts.
 
-    Gears of a row are a tooth's width apart, those above are let in from a little height: it needs some steps to settle.
+    Gears of a row are a tooth's width apart, those above are let in from a little height: it needs
+    some steps to settle.
 
     Raises:
         ValueError: there is no row.
@@ -252,7 +321,10 @@ def gear_pyramid(rows: int = 3, *, seed: int = 2015) -> World:
             solids.append(gear([pitch * (i + 0.5 * row), 0.0, 0.31 + 0.62 * row], half, phase))
     gears = len(solids)
     solids += [box([x, 0.0, 0.3], (0.05, 0.3, 0.3)) for x in (-0.37, pitch * (rows - 1) + 0.37)]
-    points, normals = [[0.0, 0.0, 0.0], [0.0, -0.101, 0.0], [0.0, 0.101, 0.0]], [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]]
+    points, normals = (
+        [[0.0, 0.0, 0.0], [0.0, -0.101, 0.0], [0.0, 0.101, 0.0]],
+        [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]],
+    )
     frame = Obstacle(name="ground and panes", points=np.array(points), normals=np.array(normals))
     mass = [*([BARS * box_mass(half)] * gears), FIXED, FIXED]
     return World(f"pyramid of {gears} gears", solids, mass, (frame,), friction=0.4)
@@ -263,7 +335,8 @@ def motor_arm(links: int = 4, *, torque: float = 400.0, seed: int = 2015) -> Wor
 
     Speeds up to 0.5 rad/s, torques limited [N m].
 
-    Motors near the base carry more; their limits grow with the square of the links they carry, times `torque` / links^2.
+    Motors near the base carry more; their limits grow with the square of the links they carry,
+    times `torque` / links^2.
 
     Raises:
         ValueError: links or torque is out of range.
@@ -274,8 +347,20 @@ def motor_arm(links: int = 4, *, torque: float = 400.0, seed: int = 2015) -> Wor
     boxes, hinges = [box([0.42 * i, 0.0, 1.0], half) for i in range(links + 1)], []
     for i in range(links):
         anchor, most = np.array([0.42 * i + 0.21, 0.0, 1.0]), torque * ((links - i) / links) ** 2
-        hinges.append(Joint(i + 1, i, anchor, Y_AXIS, (-1.0, 1.0), motor_speed=float(rng.uniform(-0.5, 0.5)), motor_torque=most))
-    return World(f"arm of {links} motors", boxes, [FIXED, *([box_mass(half)] * links)], hinges=tuple(hinges))
+        hinges.append(
+            Joint(
+                i + 1,
+                i,
+                anchor,
+                Y_AXIS,
+                (-1.0, 1.0),
+                motor_speed=float(rng.uniform(-0.5, 0.5)),
+                motor_torque=most,
+            )
+        )
+    return World(
+        f"arm of {links} motors", boxes, [FIXED, *([box_mass(half)] * links)], hinges=tuple(hinges)
+    )
 
 
 def driven_gears(count: int = 3, *, seed: int = 2015) -> World:
@@ -286,19 +371,39 @@ def driven_gears(count: int = 3, *, seed: int = 2015) -> World:
     """
     _check("count", count, 1)
     half, phase = (0.3, 0.04, 0.1), float(np.random.default_rng(seed).uniform(-0.05, 0.05))
-    gears = [gear([0.5 * i, 0.0, 1.0], half, np.pi / 6 * (i % 2) + phase * (-1) ** i) for i in range(count)]
+    gears = [
+        gear([0.5 * i, 0.0, 1.0], half, np.pi / 6 * (i % 2) + phase * (-1) ** i)
+        for i in range(count)
+    ]
     torques = [50.0] + [0.0] * (count - 1)
-    axles = [Joint(i, WORLD, np.array([0.5 * i, 0.0, 1.0]), Y_AXIS, motor_speed=1.0, motor_torque=t) for i, t in enumerate(torques)]
-    return World(f"{count} driven gears", gears, [BARS * box_mass(half)] * count, hinges=tuple(axles), friction=0.2)
+    axles = [
+        Joint(i, WORLD, np.array([0.5 * i, 0.0, 1.0]), Y_AXIS, motor_speed=1.0, motor_torque=t)
+        for i, t in enumerate(torques)
+    ]
+    return World(
+        f"{count} driven gears",
+        gears,
+        [BARS * box_mass(half)] * count,
+        hinges=tuple(axles),
+        friction=0.2,
+    )
 
 
-def contact(contacts: int, *, directions: int = 4, bodies: int | None = None, friction: float = 0.5, seed: int = 2015) -> Problem:
+def contact(
+    contacts: int,
+    *,
+    directions: int = 4,
+    bodies: int | None = None,
+    friction: float = 0.5,
+    seed: int = 2015,
+) -> Problem:
     """Return the impulse problem of random bodies in contact.
 
     In the model of Stewart and Trinkle ([Book] 1.3.5).
 
-    Bodies are balls of radius 1 with velocities v; each contact joins one to another or to the ground at a random point of its surface, the
-    tangents turned at random. Whatever v is there is a solution (Anitescu, Potra), which Lemke's method finds; impulses need not be unique.
+    Bodies are balls of radius 1 with velocities v; each contact joins one to another or to the
+    ground at a random point of its surface, the tangents turned at random. Whatever v is there is a
+    solution (Anitescu, Potra), which Lemke's method finds; impulses need not be unique.
 
     Args:
         contacts: how many; a problem has (2 + directions) contacts unknowns.
@@ -312,10 +417,17 @@ def contact(contacts: int, *, directions: int = 4, bodies: int | None = None, fr
     """
     model = StewartTrinkleModel(directions)
     if contacts < 1 or not friction >= 0:
-        raise ValueError(f"contacts = {contacts}, friction = {friction}: at least one contact, friction >= 0")
+        raise ValueError(
+            f"contacts = {contacts}, friction = {friction}: at least one contact, friction >= 0"
+        )
     bodies = bodies or max(1, contacts // 2)
-    rng, first = np.random.default_rng(seed), np.arange(contacts) % bodies  # every body has a contact
-    second, one, other = np.full(contacts, bodies), np.zeros((contacts, 3, 6)), np.zeros((contacts, 3, 6))
+    # every body has a contact
+    rng, first = np.random.default_rng(seed), np.arange(contacts) % bodies
+    second, one, other = (
+        np.full(contacts, bodies),
+        np.zeros((contacts, 3, 6)),
+        np.zeros((contacts, 3, 6)),
+    )
     for k in range(contacts):
         j, normal = int(rng.integers(-1, bodies)), rng.standard_normal(3)
         normal /= np.linalg.norm(normal)
@@ -326,11 +438,16 @@ def contact(contacts: int, *, directions: int = 4, bodies: int | None = None, fr
             second[k], other[k] = j, -np.hstack([frame, np.cross(-arm, frame)])
     J = jacobian(first, second, one, other, bodies)
     mass = rng.uniform(0.5, 2.0, bodies)
-    inverse_mass = np.repeat(1 / mass, 6) * np.tile([1.0, 1.0, 1.0, 2.5, 2.5, 2.5], bodies)  # a solid sphere's inertia is 2/5 m r^2
+    # a solid sphere's inertia is 2/5 m r^2
+    inverse_mass = np.repeat(1 / mass, 6) * np.tile([1.0, 1.0, 1.0, 2.5, 2.5, 2.5], bodies)
     B = csr_array(J @ (inverse_mass[:, None] * J.toarray().T))
     system = ContactSystem("", B, J @ rng.standard_normal(6 * bodies), np.full(contacts, friction))
     facts = frozenset({"copositive", "solvable"})
-    return replace(model.problem(system).dense(), name=f"contact {contacts} x {directions} directions", facts=facts)
+    return replace(
+        model.problem(system).dense(),
+        name=f"contact {contacts} x {directions} directions",
+        facts=facts,
+    )
 
 
 SCENES: dict[str, Callable[..., World]] = {
@@ -348,11 +465,18 @@ SCENES: dict[str, Callable[..., World]] = {
     "driven-gears": driven_gears,
 }
 
-SETTLING = {"gear-pyramid": 60, "hanging-snake": 60, "driven-gears": 40}  # steps after which these scenes have their contacts or limits
+# steps after which these scenes have their contacts or limits
+SETTLING = {"gear-pyramid": 60, "hanging-snake": 60, "driven-gears": 40}
 
 
 def contact_scene(
-    name: str, size: int | None = None, *, model: ContactModel | None = None, dt: float = 0.01, steps: int = 0, seed: int = 2015
+    name: str,
+    size: int | None = None,
+    *,
+    model: ContactModel | None = None,
+    dt: float = 0.01,
+    steps: int = 0,
+    seed: int = 2015,
 ) -> Problem:
     """Return the contact problem of a scene's next time step.
 
@@ -361,7 +485,8 @@ def contact_scene(
         size: bodies, rows or links, what the scene counts; its own if None.
         model: how friction becomes a problem; BoxedModel() if None.
         dt: time step [s].
-        steps: made before the problem is taken, each by 500 iterations of NNCG at most; where a scene has to settle, see SETTLING.
+        steps: made before the problem is taken, each by 500 iterations of NNCG at most; where a
+            scene has to settle, see SETTLING.
         seed: of the scene.
 
     Raises:

@@ -1,6 +1,7 @@
 """Velocity-level time stepper of rigid bodies: semi-implicit Euler, any method.
 
-For experiments with contact methods; not a general engine: one coefficient of friction, no restitution.
+For experiments with contact methods; not a general engine: one coefficient of friction, no
+restitution.
 """
 
 from __future__ import annotations
@@ -49,15 +50,16 @@ class ContactStepper:
 
     A step detects contacts, solves for impulses, changes velocities, and moves the bodies.
 
-    v' = v + dt g + M^-1 J'r, x' = x + dt v'. Overlaps are removed by position correction: "baumgarte" adds a part of
-    the overlap over dt in the problem itself, which bodies keep as velocity; "split" moves bodies by a second, frictionless problem's
-    velocities, which are forgotten (50 sweeps of projected Gauss-Seidel); "none" leaves them. Impulses start from those of the step
-    before at the same contacts, as `ContactMemory` knows them.
+    v' = v + dt g + M^-1 J'r, x' = x + dt v'. Overlaps are removed by position correction:
+    "baumgarte" adds a part of the overlap over dt in the problem itself, which bodies keep as
+    velocity; "split" moves bodies by a second, frictionless problem's velocities, which are
+    forgotten (50 sweeps of projected Gauss-Seidel); "none" leaves them. Impulses start from those
+    of the step before at the same contacts, as `ContactMemory` knows them.
 
     Args:
         world: the world; its state is updated.
-        method: a method of `wl.METHODS` that takes the model's problem, or a function that returns one for a system, as blocks depend on
-            it; projected Gauss-Seidel if None.
+        method: a method of `wl.METHODS` that takes the model's problem, or a function that returns
+            one for a system, as blocks depend on it; projected Gauss-Seidel if None.
         model: how friction becomes a problem.
         dt: time step [s].
         stabilization: "baumgarte", "split" or "none".
@@ -92,7 +94,9 @@ class ContactStepper:
         device: Any = None,
     ) -> None:
         if stabilization not in STABILIZATIONS:
-            raise ValueError(f"stabilization = {stabilization!r}: must be one of {', '.join(STABILIZATIONS)}")
+            raise ValueError(
+                f"stabilization = {stabilization!r}: must be one of {', '.join(STABILIZATIONS)}"
+            )
         if not (dt > 0 and 0 <= rate <= 1):
             raise ValueError(f"dt = {dt}, rate = {rate}: must be > 0 and in [0, 1]")
         self.world, self.dt, self.rate, self.warm = world, dt, rate, warm
@@ -101,7 +105,8 @@ class ContactStepper:
         self.stabilization, self.device = stabilization, device or "cpu"
         self.stopping = stopping or StoppingCriteria(rtol=1e-6, max_iterations=500, patience=500)
         self.time = 0.0
-        self._joints: np.ndarray | None = None  # impulses of the last step; those of contacts are in the world's memory
+        # impulses of the last step; those of contacts are in the world's memory
+        self._joints: np.ndarray | None = None
 
     def step(self) -> StepReport:
         """Advance the world by dt and return the report of the solve."""
@@ -116,7 +121,9 @@ class ContactStepper:
         for i in moving:
             world.bodies[i].accelerate(np.array(world.gravity), dt)
             world.bodies[i].push(impulses[i])
-        world.contact_solve.memory.keep(assembly.contacts, r[: 3 * system.contacts].reshape(-1, 3), world.bodies)
+        world.contact_solve.memory.keep(
+            assembly.contacts, r[: 3 * system.contacts].reshape(-1, 3), world.bodies
+        )
         self._joints = r[system.joints]
         ways = dt * self._separation() if self.stabilization == "split" and r.size else None
         for i in moving:
@@ -133,15 +140,35 @@ class ContactStepper:
         if not hasattr(method, "step"):
             method = method(system)
         problem = self.model.problem(system).lcp(device=self.device)
-        x0 = self.model.guess(system, self._guess(assembly)) if self.warm and self._joints is not None else None
+        x0 = (
+            self.model.guess(system, self._guess(assembly))
+            if self.warm and self._joints is not None
+            else None
+        )
         result = solve(problem, method, stopping=self.stopping, x0=x0)
-        return self.model.impulses(system, result.x.numpy()), result.iterations, result.relative_residual, result.status
+        return (
+            self.model.impulses(system, result.x.numpy()),
+            result.iterations,
+            result.relative_residual,
+            result.status,
+        )
 
     def _guess(self, assembly: Assembly) -> np.ndarray:
         """Return impulses of the step before where they are known, 0 elsewhere."""
         joints = assembly.system.joints
-        known = self._joints if self._joints is not None and len(self._joints) == len(joints) else np.zeros(len(joints))
-        return np.concatenate([self.world.contact_solve.memory.recall(assembly.contacts, self.world.bodies).ravel(), known])
+        known = (
+            self._joints
+            if self._joints is not None and len(self._joints) == len(joints)
+            else np.zeros(len(joints))
+        )
+        return np.concatenate(
+            [
+                self.world.contact_solve.memory.recall(
+                    assembly.contacts, self.world.bodies
+                ).ravel(),
+                known,
+            ]
+        )
 
     def _separation(self) -> np.ndarray:
         """Return velocities that remove overlaps and errors of joints, of a frictionless problem of bodies at rest, shape (n, 6)."""
@@ -153,7 +180,9 @@ class ContactStepper:
             return np.zeros_like(assembly.falling)
         lower = np.concatenate([np.zeros(system.contacts), system.lower])
         upper = np.concatenate([np.full(system.contacts, np.inf), system.upper])
-        problem = LCP(SparseOperator(system.B[keep][:, keep], device=self.device), bias, lower, upper)
+        problem = LCP(
+            SparseOperator(system.B[keep][:, keep], device=self.device), bias, lower, upper
+        )
         stopping = StoppingCriteria(rtol=1e-3, max_iterations=50, patience=50)
         x = solve(problem, ProjectedSOR(omega=1.0), stopping=stopping).x.numpy()
         return np.asarray(assembly.response[:, keep] @ x).reshape(-1, 6)

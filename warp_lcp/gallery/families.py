@@ -21,7 +21,9 @@ def _some(seed: int) -> Any:
 
 def _poisson(seed: int, *, plant: Plant, **options: Any) -> Problem:
     rng = _some(seed)
-    shape = tuple(int(n) for n in (rng.integers(3, 9, 2) if rng.random() < 0.5 else rng.integers(2, 5, 3)))
+    shape = tuple(
+        int(n) for n in (rng.integers(3, 9, 2) if rng.random() < 0.5 else rng.integers(2, 5, 3))
+    )
     return poisson(shape, plant=plant, seed=seed, dtype=wp.float64, **options)
 
 
@@ -30,15 +32,31 @@ FAMILIES: dict[str, Callable[[int], Problem]] = {
     "poisson-weak": lambda seed: _poisson(seed, plant=Plant(active=0.5, weak=0.5)),
     "poisson-boxed": lambda seed: _poisson(seed, plant=Plant(active=0.5, boxed=True, mixed=0.2)),
     "poisson-cavities": lambda seed: _poisson(
-        seed, plant=Plant(size=10.0 ** _some(seed + 1).integers(-6, 7)), air=0.1, solid=0.2, coefficients="random"
+        seed,
+        plant=Plant(size=10.0 ** _some(seed + 1).integers(-6, 7)),
+        air=0.1,
+        solid=0.2,
+        coefficients="random",
     ),
-    "banded": lambda seed: banded(int(_some(seed).integers(8, 60)), bands=int(_some(seed).integers(1, 6)), seed=seed),
-    "banded-boxed": lambda seed: banded(int(_some(seed).integers(8, 60)), plant=Plant(boxed=True, mixed=0.2), seed=seed),
-    "definite": lambda seed: definite(int(_some(seed).integers(2, 40)), condition=10.0 ** _some(seed + 1).uniform(0, 4), seed=seed),
-    "definite-boxed": lambda seed: definite(int(_some(seed).integers(2, 40)), plant=Plant(boxed=True, mixed=0.2, active=0.5), seed=seed),
-    "semidefinite": lambda seed: semidefinite(int(_some(seed).integers(4, 40)), zeros=_some(seed + 1).uniform(0, 0.8), seed=seed),
+    "banded": lambda seed: banded(
+        int(_some(seed).integers(8, 60)), bands=int(_some(seed).integers(1, 6)), seed=seed
+    ),
+    "banded-boxed": lambda seed: banded(
+        int(_some(seed).integers(8, 60)), plant=Plant(boxed=True, mixed=0.2), seed=seed
+    ),
+    "definite": lambda seed: definite(
+        int(_some(seed).integers(2, 40)), condition=10.0 ** _some(seed + 1).uniform(0, 4), seed=seed
+    ),
+    "definite-boxed": lambda seed: definite(
+        int(_some(seed).integers(2, 40)), plant=Plant(boxed=True, mixed=0.2, active=0.5), seed=seed
+    ),
+    "semidefinite": lambda seed: semidefinite(
+        int(_some(seed).integers(4, 40)), zeros=_some(seed + 1).uniform(0, 0.8), seed=seed
+    ),
     "skewed": lambda seed: skewed(int(_some(seed).integers(4, 40)), seed=seed),
-    "period-three": lambda seed: period_three(int(_some(seed).integers(1, 5)), plant=Plant(active=_some(seed + 1).random()), seed=seed),
+    "period-three": lambda seed: period_three(
+        int(_some(seed).integers(1, 5)), plant=Plant(active=_some(seed + 1).random()), seed=seed
+    ),
     "contact": lambda seed: contact(int(_some(seed).integers(1, 7)), seed=seed),
     "tiny": lambda seed: definite(int(_some(seed).integers(1, 5)), condition=10.0, seed=seed),
 }

@@ -2,11 +2,13 @@
 
 Extra `contact`.
 
-Layout, as FCLIB's own writer makes it (github.com/FrictionalContactLibrary/fclib, src/fclib.h and src/fclib.c):
-/fclib_local holds spacedim, matrices W and, together, V and R, and vectors/{q, mu, s}: u = W r + V l + q, V'r + R l + s = 0;
-/fclib_global holds spacedim, M, H and perhaps G, and vectors/{f, w, mu, b}: M v = H r + G l + f, u = H'v + w, G'v + b = 0.
-A matrix is a group of m, n, nz, nzmax, p, i, x: triplets (rows p, columns i) where nz >= 0, compressed columns where nz = -1, compressed
-rows where nz = -2. Rows of a contact are normal, then tangents. /solution/{r, l} may hold a solution.
+Layout, as FCLIB's own writer makes it (github.com/FrictionalContactLibrary/fclib, src/fclib.h and
+src/fclib.c): /fclib_local holds spacedim, matrices W and, together, V and R, and vectors/{q, mu,
+s}: u = W r + V l + q, V'r + R l + s = 0; /fclib_global holds spacedim, M, H and perhaps G, and
+vectors/{f, w, mu, b}: M v = H r + G l + f, u = H'v + w, G'v + b = 0. A matrix is a group of m, n,
+nz, nzmax, p, i, x: triplets (rows p, columns i) where nz >= 0, compressed columns where nz = -1,
+compressed rows where nz = -2. Rows of a contact are normal, then tangents. /solution/{r, l} may
+hold a solution.
 """
 
 from __future__ import annotations
@@ -32,7 +34,8 @@ class FclibProblem:
 
     Args:
         system: velocities at contacts for impulses; equations of l are its joint rows.
-        solution: impulses (r, l) that the file gives [N s], a vector like `system.q`; None without any.
+        solution: impulses (r, l) that the file gives [N s], a vector like `system.q`; None without
+            any.
         title: of the problem; empty without any.
     """
 
@@ -61,7 +64,9 @@ def read_fclib(path: Path | str) -> FclibProblem:
     except ClaimError as error:
         raise ValueError(f"{path}: {error}") from error
     except (OSError, RuntimeError, KeyError, TypeError, OverflowError, MemoryError) as error:
-        raise ValueError(f"{path}: cannot be read as HDF5: {error or type(error).__name__}") from error
+        raise ValueError(
+            f"{path}: cannot be read as HDF5: {error or type(error).__name__}"
+        ) from error
 
 
 def _read(file: Any, path: Path) -> FclibProblem:
@@ -76,7 +81,9 @@ def _read(file: Any, path: Path) -> FclibProblem:
     with np.errstate(over="ignore", invalid="ignore"):
         B, q, joints = (_local if kind == "fclib_local" else _global)(group, path)
     if not (np.isfinite(B.data).all() and np.isfinite(q).all()):
-        raise ValueError(f"{path}: products of the matrices and vectors overflow: their entries are too large")
+        raise ValueError(
+            f"{path}: products of the matrices and vectors overflow: their entries are too large"
+        )
     mu, rows = _values(group, "vectors/mu", path), len(q) - joints
     if dim * len(mu) != rows:
         raise ValueError(f"{path}: mu has {len(mu)} values for {rows} rows of {dim} a contact")
@@ -97,7 +104,11 @@ def _local(group: Any, path: Path) -> tuple[scipy.sparse.csr_array, np.ndarray, 
         return _symmetric(W, path), q, 0
     s = _values(group, "vectors/s", path)
     V, R = _matrix(group, "V", (len(q), len(s)), path), _matrix(group, "R", (len(s), len(s)), path)
-    return _symmetric(scipy.sparse.block_array([[W, V], [V.T, R]]), path), np.concatenate([q, s]), len(s)
+    return (
+        _symmetric(scipy.sparse.block_array([[W, V], [V.T, R]]), path),
+        np.concatenate([q, s]),
+        len(s),
+    )
 
 
 def _global(group: Any, path: Path) -> tuple[scipy.sparse.csr_array, np.ndarray, int]:
@@ -107,9 +118,13 @@ def _global(group: Any, path: Path) -> tuple[scipy.sparse.csr_array, np.ndarray,
     M, C = _matrix(group, "M", (len(f), len(f)), path), _matrix(group, "H", (len(f), len(q)), path)
     if "G" in group:
         b = _values(group, "vectors/b", path)
-        C = scipy.sparse.csr_array(scipy.sparse.hstack([C, _matrix(group, "G", (len(f), len(b)), path)]))
+        C = scipy.sparse.csr_array(
+            scipy.sparse.hstack([C, _matrix(group, "G", (len(f), len(b)), path)])
+        )
         q, joints = np.concatenate([q, b]), len(b)
-    check_claim(f"M^-1 C of {len(f)} x {len(q)} values", 2 * np.dtype(np.float64).itemsize * len(f) * len(q))
+    check_claim(
+        f"M^-1 C of {len(f)} x {len(q)} values", 2 * np.dtype(np.float64).itemsize * len(f) * len(q)
+    )
     try:
         solve = scipy.sparse.linalg.splu(scipy.sparse.csc_array(M)).solve
     except RuntimeError as error:
@@ -124,7 +139,10 @@ def _matrix(group: Any, name: str, shape: tuple[int, int], path: Path) -> scipy.
         raise ValueError(f"{path}: {group.name} has no matrix {name}")
     m, n, nz = (_number(group, f"{name}/{key}", path) for key in ("m", "n", "nz"))
     if (m, n) != shape:
-        raise ValueError(f"{path}: {group.name}/{name} has shape {m} x {n}: expected, from the vectors, {shape[0]} x {shape[1]}")
+        raise ValueError(
+            f"{path}: {group.name}/{name} has shape {m} x {n}: expected, from the vectors, "
+            f"{shape[0]} x {shape[1]}"
+        )
     p, i = (_values(group, f"{name}/{key}", path, "iu").astype(np.int64) for key in ("p", "i"))
     x = _values(group, f"{name}/x", path)
     try:
@@ -177,9 +195,15 @@ def _dataset(group: Any, name: str, path: Path) -> Any:
     if not isinstance(found, h5py.Dataset) or found.is_virtual or found.external:
         raise ValueError(f"{path}: {group.name}/{name} is not a dataset of this file")
     size, stored = int(found.nbytes), int(found.id.get_storage_size())
-    if stored == 0 and size <= UNWRITTEN and not found.chunks:  # its fill value, which is 0: FCLIB makes datasets that it writes nothing to
+    # its fill value, which is 0: FCLIB makes datasets that it writes nothing to
+    if stored == 0 and size <= UNWRITTEN and not found.chunks:
         return found
-    check_claim(f"{name} of {size} bytes", size, stored=-(-size // DEFLATED) if found.chunks else size, held=stored)
+    check_claim(
+        f"{name} of {size} bytes",
+        size,
+        stored=-(-size // DEFLATED) if found.chunks else size,
+        held=stored,
+    )
     return found
 
 
@@ -207,7 +231,11 @@ def _solution(file: Any, rows: int, joints: int, path: Path) -> np.ndarray | Non
     if "solution/r" not in file:
         return None
     r = _values(file, "solution/r", path)
-    r = np.concatenate([r, _values(file, "solution/l", path)]) if joints and "solution/l" in file else r
+    r = (
+        np.concatenate([r, _values(file, "solution/l", path)])
+        if joints and "solution/l" in file
+        else r
+    )
     if len(r) != rows:
         raise ValueError(f"{path}: the solution has {len(r)} values: expected {rows}")
     return r

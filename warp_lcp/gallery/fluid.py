@@ -50,7 +50,8 @@ class Splash:
         """Return the problem for a solver, with float32 coefficients.
 
         Args:
-            bounds: one of BOUNDS; "walls" lets the liquid separate from walls, "everywhere" from all.
+            bounds: one of BOUNDS; "walls" lets the liquid separate from walls, "everywhere" from
+                all.
             device: Warp device of the operator; the default device if None.
             b: net outflow of each FLUID cell, shape (n, n, n); that of the splash if None.
         """
@@ -59,7 +60,9 @@ class Splash:
 
     def problem(self, bounds: str, device: str, b: Any = None) -> LCP:
         """Return `lcp(bounds, device=device, b=b)`; deprecated, use `lcp`."""
-        warnings.warn("Splash.problem is now Splash.lcp(bounds, device=...)", DeprecationWarning, stacklevel=2)
+        warnings.warn(
+            "Splash.problem is now Splash.lcp(bounds, device=...)", DeprecationWarning, stacklevel=2
+        )
         return self.lcp(bounds, device=device, b=b)
 
     def matrix(self) -> scipy.sparse.csr_array:
@@ -75,9 +78,19 @@ class Splash:
             dtype: its storage.
         """
         A = GridPoisson(self.cells, device=device, dtype=dtype, **self.faces)
-        lower = np.broadcast_to(np.asarray(self.lower(bounds), dtype=np.float64), self.b.shape).copy()
+        lower = np.broadcast_to(
+            np.asarray(self.lower(bounds), dtype=np.float64), self.b.shape
+        ).copy()
         facts = M_MATRIX | {"unique", "solvable"} | ({"mixed"} if np.isinf(lower).any() else set())
-        return Problem(f"splash {self.n}^3, {bounds}", A, self.b, lower, np.full(self.b.shape, np.inf), None, facts)
+        return Problem(
+            f"splash {self.n}^3, {bounds}",
+            A,
+            self.b,
+            lower,
+            np.full(self.b.shape, np.inf),
+            None,
+            facts,
+        )
 
 
 @dataclass(frozen=True)
@@ -85,7 +98,8 @@ class SplashPart:
     """Cells of a part of a splash.
 
     Args:
-        cells: their types with those of the cells around, SOLID beyond the box of the liquid: two more along each axis than `b`.
+        cells: their types with those of the cells around, SOLID beyond the box of the liquid: two
+            more along each axis than `b`.
         b: net outflow of each FLUID cell, float64.
         wall: which FLUID cells touch a solid, of the shape of `b`.
     """
@@ -123,7 +137,9 @@ def splash_part(n: int, part: tuple[slice, ...], *, phase: float = 0.0) -> Splas
     """
     numbers = [np.arange(s.start - 1, s.stop + 1) for s in part]
     x, y, z = np.meshgrid(*((i + 0.5) / n for i in numbers), indexing="ij", sparse=True)
-    solid = sum((a - m) ** 2 for a, m in zip((x, y, z), SOLID_CENTER, strict=True)) < SOLID_RADIUS**2
+    solid = (
+        sum((a - m) ** 2 for a, m in zip((x, y, z), SOLID_CENTER, strict=True)) < SOLID_RADIUS**2
+    )
     liquid = ((x < 0.45) & (z < 0.7)) | (z < 0.25) | ((x > 0.93) & (z < 0.8))
     liquid = liquid | ((x - 0.7) ** 2 + (y - 0.6) ** 2 + (z - 0.95) ** 2 < 0.25**2)
     around = np.where(solid, SOLID, np.where(liquid, FLUID, AIR)).astype(np.int8)
@@ -135,8 +151,16 @@ def splash_part(n: int, part: tuple[slice, ...], *, phase: float = 0.0) -> Splas
         s = start + phase
         places = (i[1:] / n if a == axis else (i[1:-1] + 0.5) / n for a, i in enumerate(numbers))
         x, y, z = np.meshgrid(*places, indexing="ij", sparse=True)
-        u = np.sin(2 * np.pi * (1.5 * x + s)) * np.cos(2 * np.pi * (1.3 * y + 2 * s)) * np.sin(2 * np.pi * (1.7 * z - s))
-        u = u + 0.4 * np.sin(9 * np.pi * x + s) * np.sin(7 * np.pi * y) * np.cos(8 * np.pi * z) + offset
+        u = (
+            np.sin(2 * np.pi * (1.5 * x + s))
+            * np.cos(2 * np.pi * (1.3 * y + 2 * s))
+            * np.sin(2 * np.pi * (1.7 * z - s))
+        )
+        u = (
+            u
+            + 0.4 * np.sin(9 * np.pi * x + s) * np.sin(7 * np.pi * y) * np.cos(8 * np.pi * z)
+            + offset
+        )
         inner = tuple(slice(None) if a == axis else slice(1, -1) for a in range(3))
         is_solid, m = around[inner] == SOLID, cells.shape[axis]
         low, high = is_solid.take(range(m + 1), axis), is_solid.take(range(1, m + 2), axis)

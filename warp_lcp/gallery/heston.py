@@ -27,7 +27,9 @@ IMPLICIT = 2  # steps of implicit Euler before those of Crank and Nicolson: the 
 DENSE = 0.2  # of K: within it nodes of S are as dense as can be
 
 
-def differences(x: np.ndarray, diffusion: np.ndarray, drift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def differences(
+    x: np.ndarray, diffusion: np.ndarray, drift: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return difference weights of diffusion u'' + drift u' at nodes x.
 
     Weights below and above the diagonal: central differences, upwind where a central weight would
@@ -40,7 +42,10 @@ def differences(x: np.ndarray, diffusion: np.ndarray, drift: np.ndarray) -> tupl
     """
     below = np.diff(x, prepend=2 * x[0] - x[1])
     above = np.diff(x, append=2 * x[-1] - x[-2])
-    low, high = (2 * diffusion - drift * above) / (below * (below + above)), (2 * diffusion + drift * below) / (above * (below + above))
+    low, high = (
+        (2 * diffusion - drift * above) / (below * (below + above)),
+        (2 * diffusion + drift * below) / (above * (below + above)),
+    )
     upwind = (low < 0) | (high < 0)
     low_upwind = 2 * diffusion / (below * (below + above)) + np.maximum(-drift, 0) / below
     high_upwind = 2 * diffusion / (above * (below + above)) + np.maximum(drift, 0) / above
@@ -54,9 +59,9 @@ class Heston:
     dS = r S dt + sqrt(v) S dW1, dv = kappa (theta - v) dt + sigma sqrt(v) dW2, with correlated dW1
     and dW2.
 
-    Its price u(S, v) at time t before expiry obeys u_t + L u >= 0, u >= max(K - S, 0), one of them with equality, where L u =
-    -(v S^2 u_SS / 2 + rho sigma v S u_Sv + sigma^2 v u_vv / 2 + r S u_S + kappa (theta - v) u_v - r u). The defaults are the test
-    of Ikonen and Toivanen (2005).
+    Its price u(S, v) at time t before expiry obeys u_t + L u >= 0, u >= max(K - S, 0), one of them
+    with equality, where L u = -(v S^2 u_SS / 2 + rho sigma v S u_Sv + sigma^2 v u_vv / 2 + r S u_S
+    + kappa (theta - v) u_v - r u). The defaults are the test of Ikonen and Toivanen (2005).
 
     Args:
         strike: K > 0.
@@ -111,8 +116,9 @@ class Heston:
 
         {(dv, dS): array of shape (v, S)}, of second order on smooth grids but where v is next to 0.
 
-        The mixed derivative is the mean of those of the two squares in whose direction it is positive, which keeps A an M-matrix
-        where the ratio of spacings lets it. Above the last v the price does not change, beyond the last S it is 0.
+        The mixed derivative is the mean of those of the two squares in whose direction it is
+        positive, which keeps A an M-matrix where the ratio of spacings lets it. Above the last v
+        the price does not change, beyond the last S it is 0.
 
         Args:
             S: nodes, rising from 0.
@@ -120,15 +126,25 @@ class Heston:
         """
         X, V = np.meshgrid(S, v)
         west, east = differences(S, V * X**2 / 2, self.rate * X)
-        south, north = (d.T for d in differences(v, (self.volatility**2 * V / 2).T, (self.reversion * (self.mean - V)).T))
+        south, north = (
+            d.T
+            for d in differences(
+                v, (self.volatility**2 * V / 2).T, (self.reversion * (self.mean - V)).T
+            )
+        )
         a = {(0, -1): -west, (0, 1): -east, (-1, 0): -south, (1, 0): -north}
         h, k = np.diff(S), np.diff(v)
-        mixed = np.where((X > 0) & (V > 0), abs(self.correlation) * self.volatility * V * X / 2, 0.0)
+        mixed = np.where(
+            (X > 0) & (V > 0), abs(self.correlation) * self.volatility * V * X / 2, 0.0
+        )
         mixed[-1] = mixed[:, -1] = 0.0
         side = 1 if self.correlation > 0 else -1
         for up in (1, -1):
             right = side * up
-            width, height = (np.append(s, s[-1]) if step > 0 else np.append(s[:1], s) for s, step in ((h, right), (k, up)))
+            width, height = (
+                np.append(s, s[-1]) if step > 0 else np.append(s[:1], s)
+                for s, step in ((h, right), (k, up))
+            )
             part = mixed / (width * height[:, None])
             a[up, right] = -part
             a[0, right] = a[0, right] + part
@@ -136,17 +152,21 @@ class Heston:
         a[0, 0] = self.rate - np.sum(list(a.values()), axis=0)
         return a
 
-    def put(self, ns: int, nv: int, steps: int, *, american: bool = True, device: Any = None) -> Prices:
+    def put(
+        self, ns: int, nv: int, steps: int, *, american: bool = True, device: Any = None
+    ) -> Prices:
         """Return the prices of the put at time 0.
 
         Each time step is a complementarity problem, which starts from the last one's solution.
 
-        Time steps grow like their number, since the price is smooth later on and its free boundary moves slower.
+        Time steps grow like their number, since the price is smooth later on and its free boundary
+        moves slower.
 
         Args:
             ns: intervals of S, >= 8.
             nv: intervals of v, >= 4.
-            steps: of time, > 2, of which the first 2 are implicit Euler's, others Crank and Nicolson's.
+            steps: of time, > 2, of which the first 2 are implicit Euler's, others Crank and
+                Nicolson's.
             american: whether it may be exercised at any time; else there are no bounds.
             device: Warp device of the operator.
 
@@ -171,11 +191,14 @@ class Heston:
         work = method.init(problem)
         for step, (before, after) in enumerate(pairwise(times)):
             share = 1.0 if step < IMPLICIT else 0.5
-            unit = 1 / (share * (after - before))  # of y, so that only the shift changes from step to step
+            # of y, so that only the shift changes from step to step
+            unit = 1 / (share * (after - before))
             shift.fill_(unit)
             A.update(A.cells)
             rest = np.pad((L @ u[:, :-1].ravel()).reshape(nv + 1, ns), ((0, 0), (0, 1)))
-            b.assign(A.layout.load((1 - share) / share * rest - unit * u, wp.float64).reshape(b.shape))
+            b.assign(
+                A.layout.load((1 - share) / share * rest - unit * u, wp.float64).reshape(b.shape)
+            )
             stopping = StoppingCriteria(rtol=1e-7, atol=1e-9 * unit, max_iterations=1000)
             result = solve(problem, method, x0=u, stopping=stopping, workspace=work)
             if not result:
@@ -183,7 +206,9 @@ class Heston:
             u = A.layout.unload(result.x.flatten()).numpy().copy()
         return Prices(S, v, u)
 
-    def extrapolated(self, spot: Any, variance: float, ns: int, nv: int, steps: int, **options: Any) -> np.ndarray:
+    def extrapolated(
+        self, spot: Any, variance: float, ns: int, nv: int, steps: int, **options: Any
+    ) -> np.ndarray:
         """Return Richardson-extrapolated prices from this grid and one twice as fine.
 
         4/3 of the fine grid's prices less 1/3 of this grid's.
@@ -196,7 +221,9 @@ class Heston:
             steps: of time.
             options: of `put`.
         """
-        coarse, fine = (self.put(k * ns, k * nv, k * steps, **options).at(spot, variance) for k in (1, 2))
+        coarse, fine = (
+            self.put(k * ns, k * nv, k * steps, **options).at(spot, variance) for k in (1, 2)
+        )
         return (4 * fine - coarse) / 3
 
 
@@ -216,4 +243,6 @@ class Prices:
 
     def at(self, spot: Any, variance: float) -> Any:
         """Return interpolated prices: cubic splines, first in v, then in S."""
-        return scipy.interpolate.CubicSpline(self.S, scipy.interpolate.CubicSpline(self.v, self.u)(variance))(spot)
+        return scipy.interpolate.CubicSpline(
+            self.S, scipy.interpolate.CubicSpline(self.v, self.u)(variance)
+        )(spot)

@@ -18,10 +18,12 @@ from warp_lcp.settings import CountOrZero, NonNegative, Positive, Settings
 from warp_lcp.solvers.incremental_pivoting import IncrementalPivoting
 
 Vector = np.ndarray
-AGREES, DISAGREES = 0.75, 0.25  # shares of the model's decrease from which on the trust region grows, and below which it shrinks
+# shares of the model's decrease from which on the trust region grows, and below which it shrinks
+AGREES, DISAGREES = 0.75, 0.25
 LEAST_RADIUS = 1e-13  # [rad]: smaller steps are rounding
 INNER = StoppingCriteria(rtol=1e-10, max_iterations=500)  # of each LCP
-DEFINITE = 1e-6  # of reach^2: the least eigenvalue that a model with curvature is shifted to, where its own is less
+# of reach^2: the least eigenvalue that a model with curvature is shifted to, where its own is less
+DEFINITE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,11 +53,13 @@ class StepProblem:
 
         [Book] eq. 1.143-1.144; all limits must be finite.
 
-        With B = [I; -I]: H d + c = B'x, so that 0 <= x is complementary to B H^-1 B' x + (-l; u) - B H^-1 c >= 0. The matrix is positive
-        semi-definite of rank n: a limit's two rows are each other's negatives.
+        With B = [I; -I]: H d + c = B'x, so that 0 <= x is complementary to B H^-1 B' x + (-l; u) -
+        B H^-1 c >= 0. The matrix is positive semi-definite of rank n: a limit's two rows are each
+        other's negatives.
 
         Raises:
-            ValueError: H is singular: without damping it is wherever there are more hinges than goals; or a bound is infinite.
+            ValueError: H is singular: without damping it is wherever there are more hinges than
+                goals; or a bound is infinite.
         """
         if not np.isfinite([self.lower, self.upper]).all():
             raise ValueError("lower and upper must be finite, for one multiplier each")
@@ -65,7 +69,10 @@ class StepProblem:
         except np.linalg.LinAlgError:
             raise ValueError("H is singular: damping must be positive") from None
         M = B @ solved[:, :-1]
-        return LCP(DenseOperator(0.5 * (M + M.T), device=device), np.concatenate([-self.lower, self.upper]) - B @ solved[:, -1])
+        return LCP(
+            DenseOperator(0.5 * (M + M.T), device=device),
+            np.concatenate([-self.lower, self.upper]) - B @ solved[:, -1],
+        )
 
     def step(self, x: Vector) -> Vector:
         """Return the step d = H^-1 (B'x - c) of multipliers x."""
@@ -85,11 +92,13 @@ class ReachedPose:
         theta: angles [rad], shape (n,), within the limits.
         objective: 1/2 |g - f(theta)|^2 [m^2].
         projected_gradient: the measure of convergence [rad].
-        status: CONVERGED; MAX_ITERATIONS; or STAGNATED: no step above rounding lowers the objective.
+        status: CONVERGED; MAX_ITERATIONS; or STAGNATED: no step above rounding lowers the
+            objective.
         iterations: LCPs solved, one an iteration.
         rejected: how many of their steps did not lower the objective.
         unsolved: how many of the LCPs did not converge.
-        overshoot: the most by which a solution of an LCP left its bounds [rad] before it was clipped to them.
+        overshoot: the most by which a solution of an LCP left its bounds [rad] before it was
+            clipped to them.
         history: objective at the start and after each iteration [m^2]; it never grows.
     """
 
@@ -114,22 +123,27 @@ class InverseKinematics(Settings):
 
     Minimizes 1/2 |g - f(theta)|^2 ([Book] 1.3.4, eqs. 1.130-1.144).
 
-    The Gauss-Newton model at theta, (J'J + mu I) d - J'(g - f) = y with max(l - theta, -radius) <= d <= min(u - theta, radius), is solved
-    by any method. The book takes its steps as they are; here a step is taken only if the objective falls, and the box's radius follows how
-    well the model predicts it. Converged: |theta - clip(theta - grad / reach^2, l, u)| <= tolerance in the largest angle.
+    The Gauss-Newton model at theta, (J'J + mu I) d - J'(g - f) = y with max(l - theta, -radius) <=
+    d <= min(u - theta, radius), is solved by any method. The book takes its steps as they are; here
+    a step is taken only if the objective falls, and the box's radius follows how well the model
+    predicts it. Converged: |theta - clip(theta - grad / reach^2, l, u)| <= tolerance in the largest
+    angle.
 
-    The damping mu keeps H definite, which most methods need, and shortens steps where J is nearly singular, at a price in iterations:
-    see docs/theory.md for measurements. A goal out of reach leaves a residual, whose curvature the Gauss-Newton model lacks:
-    `curvature` adds -sum_k (g - f)_k f_k'' and shifts the sum to be definite.
+    The damping mu keeps H definite, which most methods need, and shortens steps where J is nearly
+    singular, at a price in iterations: see docs/theory.md for measurements. A goal out of reach
+    leaves a residual, whose curvature the Gauss-Newton model lacks: `curvature` adds -sum_k (g -
+    f)_k f_k'' and shifts the sum to be definite.
 
     Args:
-        method: of the LCPs, with its default chain; the default takes any damping; with `multipliers` it must be one for semi-definite A.
+        method: of the LCPs, with its default chain; the default takes any damping; with
+            `multipliers` it must be one for semi-definite A.
         damping: mu in units of reach^2, >= 0.
         radius: first largest change of an angle in a step [rad], > 0.
         tolerance: of the projected gradient [rad], > 0.
         max_iterations: maximum number of LCPs, >= 0.
         curvature: model the objective's second derivative wholly.
-        multipliers: solve the book's LCP in the multipliers of the limits instead of the boxed one in the step.
+        multipliers: solve the book's LCP in the multipliers of the limits instead of the boxed one
+            in the step.
         device: Warp device of the LCPs; the default device if None.
 
     Raises:
@@ -152,7 +166,9 @@ class InverseKinematics(Settings):
     multipliers: bool = False
     device: Any = None
 
-    def solve(self, figure: ArticulatedFigure, goals: Vector, start: Vector | None = None) -> ReachedPose:
+    def solve(
+        self, figure: ArticulatedFigure, goals: Vector, start: Vector | None = None
+    ) -> ReachedPose:
         """Return the pose whose end effectors are closest to their goals.
 
         A local minimum near the start.
@@ -166,10 +182,22 @@ class InverseKinematics(Settings):
             ValueError: goals or start has a wrong shape or holds values that are not finite.
         """
         lower, upper, scale = figure.lower, figure.upper, figure.reach**2
-        theta = np.clip(_checked(np.zeros(figure.hinges) if start is None else start, (figure.hinges,), "start"), lower, upper)
+        theta = np.clip(
+            _checked(
+                np.zeros(figure.hinges) if start is None else start, (figure.hinges,), "start"
+            ),
+            lower,
+            upper,
+        )
         goals = _checked(goals, (len(figure.effectors), figure.dimension), "goals")
         error = (goals - figure.positions(theta)).ravel()
-        history, radius, rejected, unsolved, overshoot = [0.5 * float(error @ error)], self.radius, 0, 0, 0.0
+        history, radius, rejected, unsolved, overshoot = (
+            [0.5 * float(error @ error)],
+            self.radius,
+            0,
+            0,
+            0.0,
+        )
         status, gradient = None, -figure.jacobian(theta).T @ error
         while status is None:
             measure = float(np.abs(theta - np.clip(theta - gradient / scale, lower, upper)).max())
@@ -181,14 +209,27 @@ class InverseKinematics(Settings):
             unsolved, overshoot = unsolved + (not solved), max(overshoot, beyond)
             trial = np.clip(theta + d, lower, upper)
             new = (goals - figure.positions(trial)).ravel()
-            fall, foretold = 0.5 * float((error - new) @ (error + new)), model.decrease(trial - theta)
+            fall, foretold = (
+                0.5 * float((error - new) @ (error + new)),
+                model.decrease(trial - theta),
+            )
             if fall > 0 and 0.5 * float(new @ new) <= history[-1]:
                 theta, error, gradient = trial, new, -figure.jacobian(trial).T @ new
             else:
                 rejected += 1
             history.append(0.5 * float(error @ error))
             radius = self._radius(radius, fall, foretold, float(np.abs(d).max()))
-        return ReachedPose(theta, history[-1], measure, status, len(history) - 1, rejected, unsolved, overshoot, history)
+        return ReachedPose(
+            theta,
+            history[-1],
+            measure,
+            status,
+            len(history) - 1,
+            rejected,
+            unsolved,
+            overshoot,
+            history,
+        )
 
     def _status(self, measure: float, radius: float, iterations: int) -> SolveStatus | None:
         """Return how the iteration ends now, None if it goes on."""
@@ -198,7 +239,9 @@ class InverseKinematics(Settings):
             return SolveStatus.MAX_ITERATIONS
         return SolveStatus.STAGNATED if radius < LEAST_RADIUS else None
 
-    def _model(self, figure: ArticulatedFigure, theta: Vector, error: Vector, radius: float) -> StepProblem:
+    def _model(
+        self, figure: ArticulatedFigure, theta: Vector, error: Vector, radius: float
+    ) -> StepProblem:
         """Return the problem of a step from theta, where g - f is `error`."""
         J, scale = figure.jacobian(theta), figure.reach**2
         H, shift = J.T @ J, self.damping * scale
@@ -206,11 +249,20 @@ class InverseKinematics(Settings):
             H = H - figure.curvature(theta, error)
             shift += max(0.0, DEFINITE * scale - float(np.linalg.eigvalsh(H)[0]))
         H = H + shift * np.eye(len(theta))
-        return StepProblem(H, -J.T @ error, np.maximum(figure.lower - theta, -radius), np.minimum(figure.upper - theta, radius))
+        return StepProblem(
+            H,
+            -J.T @ error,
+            np.maximum(figure.lower - theta, -radius),
+            np.minimum(figure.upper - theta, radius),
+        )
 
     def _step(self, model: StepProblem) -> tuple[Vector, bool, float]:
         """Return a step within its bounds, whether its LCP converged, and by how much its solution left the bounds."""
-        problem = model.multipliers(device=self.device) if self.multipliers else model.lcp(device=self.device)
+        problem = (
+            model.multipliers(device=self.device)
+            if self.multipliers
+            else model.lcp(device=self.device)
+        )
         result = solve(problem, default_chain(self.method, problem), stopping=INNER)
         x = result.x.numpy().astype(np.float64)
         d = model.step(x) if self.multipliers else x

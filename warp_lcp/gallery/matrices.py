@@ -21,12 +21,15 @@ def spectrum_matrix(eigenvalues: np.ndarray, rng: np.random.Generator) -> np.nda
     return 0.5 * (A + A.T)
 
 
-def definite(n: int, *, condition: float = 100.0, plant: Plant | None = None, seed: int = 2015) -> Problem:
+def definite(
+    n: int, *, condition: float = 100.0, plant: Plant | None = None, seed: int = 2015
+) -> Problem:
     """Return a planted problem with a dense symmetric positive definite matrix.
 
     Args:
         n: unknowns.
-        condition: largest over smallest eigenvalue, >= 1; they are spaced evenly in their logarithm, the largest is 1.
+        condition: largest over smallest eigenvalue, >= 1; they are spaced evenly in their
+            logarithm, the largest is 1.
         plant: how the solution is chosen.
         seed: of all choices.
 
@@ -37,10 +40,18 @@ def definite(n: int, *, condition: float = 100.0, plant: Plant | None = None, se
         raise ValueError(f"condition = {condition}: must be >= 1")
     rng = np.random.default_rng(seed)
     A = spectrum_matrix(np.geomspace(1 / condition, 1, n), rng)
-    return planted(A, rng, plant or Plant(), name=f"definite {n}, condition {condition:g}", facts=M_MATRIX - {"m-matrix"})
+    return planted(
+        A,
+        rng,
+        plant or Plant(),
+        name=f"definite {n}, condition {condition:g}",
+        facts=M_MATRIX - {"m-matrix"},
+    )
 
 
-def semidefinite(n: int, *, zeros: float = 0.5, plant: Plant | None = None, seed: int = 2015) -> Problem:
+def semidefinite(
+    n: int, *, zeros: float = 0.5, plant: Plant | None = None, seed: int = 2015
+) -> Problem:
     """Return a planted problem with a dense semidefinite matrix.
 
     B B' of rank n - zeros n, symmetric; planted, hence solvable.
@@ -61,8 +72,16 @@ def semidefinite(n: int, *, zeros: float = 0.5, plant: Plant | None = None, seed
     rng = np.random.default_rng(seed)
     rank = n - round(zeros * n)
     B = rng.standard_normal((n, max(rank, 1))) / np.sqrt(n)
-    facts = {"symmetric", "semidefinite", "positive-diagonal"} | ({"positive-definite", "p-matrix"} if rank == n else set())
-    return planted(B @ B.T, rng, plant or Plant(), name=f"semidefinite {n}, {zeros:.0%} zeros", facts=frozenset(facts))
+    facts = {"symmetric", "semidefinite", "positive-diagonal"} | (
+        {"positive-definite", "p-matrix"} if rank == n else set()
+    )
+    return planted(
+        B @ B.T,
+        rng,
+        plant or Plant(),
+        name=f"semidefinite {n}, {zeros:.0%} zeros",
+        facts=frozenset(facts),
+    )
 
 
 def skewed(n: int, *, skew: float = 1.0, plant: Plant | None = None, seed: int = 2015) -> Problem:
@@ -79,19 +98,28 @@ def skewed(n: int, *, skew: float = 1.0, plant: Plant | None = None, seed: int =
     rng = np.random.default_rng(seed)
     B, C = (rng.standard_normal((n, n)) / np.sqrt(n) for _ in range(2))
     facts = frozenset({"positive-definite", "p-matrix", "positive-diagonal"})
-    return planted(B @ B.T + 0.5 * np.eye(n) + skew * (C - C.T), rng, plant or Plant(), name=f"skewed {n}", facts=facts)
+    return planted(
+        B @ B.T + 0.5 * np.eye(n) + skew * (C - C.T),
+        rng,
+        plant or Plant(),
+        name=f"skewed {n}",
+        facts=facts,
+    )
 
 
-def period_three(blocks: int = 1, *, plant: Plant | None = None, seed: int | None = None) -> Problem:
+def period_three(
+    blocks: int = 1, *, plant: Plant | None = None, seed: int | None = None
+) -> Problem:
     """Return P-matrices on which the minimum-map Newton method cycles.
 
     Size 3; from some starts the period is 3 (Ben Gharbia, Gilbert).
 
-    Each block is [[1, 0, a], [a, 1, 0], [0, a, 1]], whose principal minors are 1, 1 and 1 + a^3. Without a plant b = -1.
+    Each block is [[1, 0, a], [a, 1, 0], [0, a, 1]], whose principal minors are 1, 1 and 1 + a^3.
+    Without a plant b = -1.
 
     Args:
-        blocks: how many, each with its own a in [1.5, 4.5], their rows and columns scaled by positive numbers; with seed=None one
-            block with a = 4, unscaled.
+        blocks: how many, each with its own a in [1.5, 4.5], their rows and columns scaled by
+            positive numbers; with seed=None one block with a = 4, unscaled.
         plant: how the solution is chosen; b = -1 if None.
         seed: of all choices.
 
@@ -113,7 +141,9 @@ def period_three(blocks: int = 1, *, plant: Plant | None = None, seed: int | Non
         return planted(A, rng, plant, name=name, facts=facts)
     n = len(A)
     x = np.linalg.solve(A, np.ones(n)) if seed is None else None
-    return Problem(name, A, -np.ones(n), np.zeros(n), np.full(n, np.inf), x, facts | {"solvable", "unique"})
+    return Problem(
+        name, A, -np.ones(n), np.zeros(n), np.full(n, np.inf), x, facts | {"solvable", "unique"}
+    )
 
 
 def banded_matrix(n: int, bands: int, rng: np.random.Generator) -> scipy.sparse.csr_array:
@@ -124,7 +154,11 @@ def banded_matrix(n: int, bands: int, rng: np.random.Generator) -> scipy.sparse.
     """
     values = -rng.random(bands)
     diagonals = [np.ones(n), *(np.full(n, v) for v in values)]
-    lowest = float(scipy.linalg.eigvals_banded(np.stack(diagonals), lower=True, select="i", select_range=(0, 0))[0])
+    lowest = float(
+        scipy.linalg.eigvals_banded(
+            np.stack(diagonals), lower=True, select="i", select_range=(0, 0)
+        )[0]
+    )
     shift = 0.0 if lowest > 0 else 0.5 - lowest
     offsets = [0, *(k for d in range(1, bands + 1) for k in (-d, d))]
     entries = [1.0 + shift, *(v for v in values for _ in (0, 1))]
@@ -148,4 +182,10 @@ def banded(n: int, *, bands: int = 3, plant: Plant | None = None, seed: int = 20
     if not 0 <= bands < n:
         raise ValueError(f"bands = {bands}: must be in [0, n - 1] with n = {n}")
     rng = np.random.default_rng(seed)
-    return planted(banded_matrix(n, bands, rng), rng, plant or Plant(), name=f"banded {n}, {bands} bands", facts=M_MATRIX)
+    return planted(
+        banded_matrix(n, bands, rng),
+        rng,
+        plant or Plant(),
+        name=f"banded {n}, {bands} bands",
+        facts=M_MATRIX,
+    )

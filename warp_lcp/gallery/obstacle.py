@@ -11,7 +11,8 @@ from warp_lcp.gallery.problem import M_MATRIX, Problem
 from warp_lcp.operators.grid_poisson import AIR, FLUID, GridPoisson
 
 RADIUS = 0.697965148223374  # a, where the membrane leaves the ball: a^2 (log 2 - log a) = 1 - a^2
-EDGE = 0.9  # beyond it the ball is continued by its tangent cone, so that psi is defined on the square
+# beyond it the ball is continued by its tangent cone, so that psi is defined on the square
+EDGE = 0.9
 UNIQUE = M_MATRIX | {"unique", "solvable"}
 SLOPE = RADIUS**2 / np.sqrt(1 - RADIUS**2)  # of the membrane against -log r
 
@@ -19,7 +20,9 @@ SLOPE = RADIUS**2 / np.sqrt(1 - RADIUS**2)  # of the membrane against -log r
 def ball_height(r: np.ndarray) -> np.ndarray:
     """Return the obstacle psi: sqrt(1 - r^2) for r <= EDGE, its tangent beyond."""
     edge = np.sqrt(1 - EDGE**2)
-    return np.where(r <= EDGE, np.sqrt(1 - np.minimum(r, EDGE) ** 2), edge - EDGE / edge * (r - EDGE))
+    return np.where(
+        r <= EDGE, np.sqrt(1 - np.minimum(r, EDGE) ** 2), edge - EDGE / edge * (r - EDGE)
+    )
 
 
 def membrane_height(r: np.ndarray) -> np.ndarray:
@@ -35,9 +38,9 @@ def ball_obstacle(n: int, *, device: Any = None, dtype: Any = wp.float32) -> Pro
 
     -Laplace u >= 0, u >= psi, with the exact solution's values on the border.
 
-    The operator is h^2 times the 5-point one, h = 4 / (n - 1); border nodes are AIR and their values part of b. `solution` is the exact
-    one at the nodes, not that of the discrete problem: the difference is the discretization's error, O(h^2) away from the free boundary
-    r = RADIUS.
+    The operator is h^2 times the 5-point one, h = 4 / (n - 1); border nodes are AIR and their
+    values part of b. `solution` is the exact one at the nodes, not that of the discrete problem:
+    the difference is the discretization's error, O(h^2) away from the free boundary r = RADIUS.
 
     Args:
         n: nodes a side, the border included; odd numbers have a node at the origin.
@@ -59,22 +62,34 @@ def ball_obstacle(n: int, *, device: Any = None, dtype: Any = wp.float32) -> Pro
     b, lower, u = (np.zeros((n, n)) for _ in range(3))
     b[inner] = -(border[2:, 1:-1] + border[:-2, 1:-1] + border[1:-1, 2:] + border[1:-1, :-2])
     lower[inner], u[inner] = ball_height(r)[inner], exact[inner]
-    return Problem(f"ball obstacle {n}x{n}", GridPoisson(cells, device=device, dtype=dtype), b, lower, np.full((n, n), np.inf), u, UNIQUE)
+    return Problem(
+        f"ball obstacle {n}x{n}",
+        GridPoisson(cells, device=device, dtype=dtype),
+        b,
+        lower,
+        np.full((n, n), np.inf),
+        u,
+        UNIQUE,
+    )
 
 
-def torsion(n: int, load: float = 5.0, *, border: float = 1.0, device: Any = None, dtype: Any = wp.float32) -> Problem:
+def torsion(
+    n: int, load: float = 5.0, *, border: float = 1.0, device: Any = None, dtype: Any = wp.float32
+) -> Problem:
     """Return the elastic-plastic torsion of a square bar.
 
     -Laplace u = load where |u| is less than the distance to the border.
 
-    The unit square has n nodes a side, the border not included; u is Prandtl's stress function, whose slope is 1 at most. Where |u| is the
-    distance, the bar has yielded: along the diagonals it never does. With n = 2 Q - 2 it is CUTEst's TORSIONA to F, that of MINPACK-2,
-    and with border = 0.5 TORSION1 to 6, for loads of 5, 10 and 20.
+    The unit square has n nodes a side, the border not included; u is Prandtl's stress function,
+    whose slope is 1 at most. Where |u| is the distance, the bar has yielded: along the diagonals it
+    never does. With n = 2 Q - 2 it is CUTEst's TORSIONA to F, that of MINPACK-2, and with border =
+    0.5 TORSION1 to 6, for loads of 5, 10 and 20.
 
     Args:
         n: inner nodes a side.
         load: twice the shear modulus times the twist, in units of the yield stress.
-        border: weight of differences to the border in the energy, > 0; 0.5: each inner node has a quarter of the squares of all its four.
+        border: weight of differences to the border in the energy, > 0; 0.5: each inner node has a
+            quarter of the squares of all its four.
         device: Warp device of the operator.
         dtype: its storage.
 
@@ -104,13 +119,16 @@ def _faces(cells: np.ndarray, x: float, y: float, border: float) -> dict[str, An
     return {"face_x": face_x, "face_y": face_y}
 
 
-def sine_obstacle(nx: int, ny: int, *, between: bool = False, device: Any = None, dtype: Any = wp.float32) -> Problem:
+def sine_obstacle(
+    nx: int, ny: int, *, between: bool = False, device: Any = None, dtype: Any = wp.float32
+) -> Problem:
     """Return the membrane of Dembo and Tulowitzki: -Laplace u >= 1 over an obstacle.
 
     Above a hill, or between four hills and holes; CUTEst's OBSTCLA and OBSTCLB.
 
-    u >= sin(3.2 y) sin(3.3 x), or s^3 <= u <= s^2 + 0.02 with s = sin(9.2 y) sin(9.3 x), on the unit square; u = 0 on the border, whose
-    differences have half the weight of others in the energy, as in CUTEst.
+    u >= sin(3.2 y) sin(3.3 x), or s^3 <= u <= s^2 + 0.02 with s = sin(9.2 y) sin(9.3 x), on the
+    unit square; u = 0 on the border, whose differences have half the weight of others in the
+    energy, as in CUTEst.
 
     Args:
         nx: nodes along x, the border included.
@@ -128,23 +146,42 @@ def sine_obstacle(nx: int, ny: int, *, between: bool = False, device: Any = None
     hx, hy = 1 / (nx - 1), 1 / (ny - 1)
     X, Y = np.meshgrid(np.linspace(0, 1, nx), np.linspace(0, 1, ny))
     s = np.sin(9.2 * Y) * np.sin(9.3 * X)
-    lower, upper = (s**3, s**2 + 0.02) if between else (np.sin(3.2 * Y) * np.sin(3.3 * X), np.full_like(s, np.inf))
+    lower, upper = (
+        (s**3, s**2 + 0.02)
+        if between
+        else (np.sin(3.2 * Y) * np.sin(3.3 * X), np.full_like(s, np.inf))
+    )
     A = GridPoisson(cells, **_faces(cells, hy / hx, hx / hy, 0.5), device=device, dtype=dtype)
     b = np.where(cells == FLUID, -hx * hy, 0.0)
-    return Problem(f"sine obstacle {nx}x{ny}", A, b, lower, upper, None, UNIQUE | ({"boxed"} if between else set()))
+    return Problem(
+        f"sine obstacle {nx}x{ny}",
+        A,
+        b,
+        lower,
+        upper,
+        None,
+        UNIQUE | ({"boxed"} if between else set()),
+    )
 
 
 def journal_bearing(
-    nx: int, ny: int, eccentricity: float = 0.1, *, half_width: float = 10.0, device: Any = None, dtype: Any = wp.float64
+    nx: int,
+    ny: int,
+    eccentricity: float = 0.1,
+    *,
+    half_width: float = 10.0,
+    device: Any = None,
+    dtype: Any = wp.float64,
 ) -> Problem:
     """Return the pressure u >= 0 of the film in a journal bearing.
 
     Reynolds' equation; the film cavitates where u = 0.
 
-    u minimizes the integral of h^3 |grad u|^2 / 2 - e sin(x) u over [0, 2 pi] x [0, 2 half_width], with the film's thickness
-    h = 1 + e cos x and u = 0 on the border, by linear elements on right triangles whose h^3 is the mean of their corners'. It is problem
-    DPJB of MINPACK-2, PETSc's jbearing2.c and, with two nodes less, CUTEst's JNLBRNG1 (e = 0.1) and 2 (e = 0.5). Lengths around the
-    shaft in radii, pressures in 6 viscosity speed radius / clearance^2.
+    u minimizes the integral of h^3 |grad u|^2 / 2 - e sin(x) u over [0, 2 pi] x [0, 2 half_width],
+    with the film's thickness h = 1 + e cos x and u = 0 on the border, by linear elements on right
+    triangles whose h^3 is the mean of their corners'. It is problem DPJB of MINPACK-2, PETSc's
+    jbearing2.c and, with two nodes less, CUTEst's JNLBRNG1 (e = 0.1) and 2 (e = 0.5). Lengths
+    around the shaft in radii, pressures in 6 viscosity speed radius / clearance^2.
 
     Args:
         nx: inner nodes around.
@@ -169,7 +206,9 @@ def journal_bearing(
     cube = (1 + eccentricity * np.cos(x)) ** 3
     face_x = np.zeros((ny + 2, nx + 3))
     face_x[:, 1:-1] = hy / hx * (cube[1:-2] + cube[2:-1]) / 2
-    face_y = np.broadcast_to(hx / hy * (cube[:-2] + 4 * cube[1:-1] + cube[2:]) / 6, (ny + 3, nx + 2))
+    face_y = np.broadcast_to(
+        hx / hy * (cube[:-2] + 4 * cube[1:-1] + cube[2:]) / 6, (ny + 3, nx + 2)
+    )
     b = np.where(cells == FLUID, -eccentricity * hx * hy * np.sin(x[1:-1]), 0.0)
     A = GridPoisson(cells, face_x=face_x, face_y=face_y, device=device, dtype=dtype)
     name = f"journal bearing {nx}x{ny}, {eccentricity:g}"
@@ -177,14 +216,22 @@ def journal_bearing(
 
 
 def dam(
-    nx: int, ny: int, *, width: float = 16.0, high: float = 24.0, low: float = 4.0, device: Any = None, dtype: Any = wp.float32
+    nx: int,
+    ny: int,
+    *,
+    width: float = 16.0,
+    high: float = 24.0,
+    low: float = 4.0,
+    device: Any = None,
+    dtype: Any = wp.float32,
 ) -> Problem:
     """Return the problem of water seepage through a dam.
 
     From a full reservoir to water of depth `low`.
 
-    By Baiocchi's transform, w(x, y) is the integral of the pressure's head from y up: w >= 0, -Laplace w + 1 >= 0, and w has its values
-    on the border. Where w > 0 the dam is wet. `b` holds hx hy and the border's values, which are AIR.
+    By Baiocchi's transform, w(x, y) is the integral of the pressure's head from y up: w >= 0,
+    -Laplace w + 1 >= 0, and w has its values on the border. Where w > 0 the dam is wet. `b` holds
+    hx hy and the border's values, which are AIR.
 
     Args:
         nx: nodes along x, the border included.
@@ -209,6 +256,10 @@ def dam(
     inner = (slice(1, -1),) * 2
     cells[inner], w[inner] = FLUID, 0.0
     b = np.zeros((ny, nx))
-    b[inner] = x[1] * y[1] - faces[0] * (w[1:-1, 2:] + w[1:-1, :-2]) - faces[1] * (w[2:, 1:-1] + w[:-2, 1:-1])
+    b[inner] = (
+        x[1] * y[1]
+        - faces[0] * (w[1:-1, 2:] + w[1:-1, :-2])
+        - faces[1] * (w[2:, 1:-1] + w[:-2, 1:-1])
+    )
     A = GridPoisson(cells, face_x=faces[0], face_y=faces[1], device=device, dtype=dtype)
     return Problem(f"dam {nx}x{ny}", A, b, np.zeros_like(b), np.full_like(b, np.inf), None, UNIQUE)

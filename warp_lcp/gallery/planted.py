@@ -24,7 +24,8 @@ class Plant(Settings):
         weak: share of those where y = 0 as well, so that strict complementarity fails.
         boxed: finite upper bounds too; active unknowns sit at either with equal chance.
         mixed: share of the rows that are equations.
-        size: x and y off their zeros are uniform in [0.1, 1] times this; y also times A's mean diagonal.
+        size: x and y off their zeros are uniform in [0.1, 1] times this; y also times A's mean
+            diagonal.
 
     Raises:
         ValueError: a share is outside [0, 1], or the size is not positive.
@@ -37,11 +38,13 @@ class Plant(Settings):
     size: Positive = 1.0
 
 
-def planted(A: Any, rng: np.random.Generator, plant: Plant, *, name: str, facts: frozenset[str]) -> Problem:
+def planted(
+    A: Any, rng: np.random.Generator, plant: Plant, *, name: str, facts: frozenset[str]
+) -> Problem:
     """Return a problem with a given matrix and a planted solution.
 
-    l <= x <= u, y >= 0 where x = l, y <= 0 where x = u, y = 0 elsewhere and on equations; the lower bounds are 0, or in
-    [-1, 0] times `plant.size` where there are upper ones.
+    l <= x <= u, y >= 0 where x = l, y <= 0 where x = u, y = 0 elsewhere and on equations; the lower
+    bounds are 0, or in [-1, 0] times `plant.size` where there are upper ones.
 
     Args:
         A: numpy or scipy.sparse matrix, shape (n, n).
@@ -61,14 +64,26 @@ def planted(A: Any, rng: np.random.Generator, plant: Plant, *, name: str, facts:
     at_upper = held & (rng.random(n) < 0.5) & plant.boxed
     weak = held & (rng.random(n) < plant.weak)
     lower = np.where(equation, -np.inf, -S * rng.random(n) if plant.boxed else 0.0)
-    upper = np.where(equation | (not plant.boxed), np.inf, np.where(equation, 0.0, lower) + S * rng.uniform(1, 2, n))
+    upper = np.where(
+        equation | (not plant.boxed),
+        np.inf,
+        np.where(equation, 0.0, lower) + S * rng.uniform(1, 2, n),
+    )
     inside = rng.uniform(0.1, 1.0, n) * S
     with np.errstate(invalid="ignore"):
-        offset = np.where(equation, inside - 0.55 * S, lower + (0.9 * inside / S * (upper - lower) if plant.boxed else inside))
+        offset = np.where(
+            equation,
+            inside - 0.55 * S,
+            lower + (0.9 * inside / S * (upper - lower) if plant.boxed else inside),
+        )
     x = np.where(held, np.where(at_upper, upper, lower), offset)
     push = rng.uniform(0.1, 1.0, n) * S * float(np.abs(A.diagonal()).mean() or 1.0)
     y = np.where(held & ~weak, np.where(at_upper, -push, push), 0.0)
-    added = {"solvable"} | ({"boxed"} if plant.boxed else set()) | ({"mixed"} if equation.any() else set())
+    added = (
+        {"solvable"}
+        | ({"boxed"} if plant.boxed else set())
+        | ({"mixed"} if equation.any() else set())
+    )
     if not weak.any():
         added.add("strict")
     if facts & {"p-matrix", "positive-definite"}:
@@ -76,12 +91,16 @@ def planted(A: Any, rng: np.random.Generator, plant: Plant, *, name: str, facts:
     return Problem(name, A, y - A @ x, lower, upper, x, facts | added)
 
 
-def random_cells(shape: tuple[int, ...], rng: np.random.Generator, *, air: float, solid: float, ring: bool) -> np.ndarray:
+def random_cells(
+    shape: tuple[int, ...], rng: np.random.Generator, *, air: float, solid: float, ring: bool
+) -> np.ndarray:
     """Return random cell types: fractions of AIR and SOLID.
 
     AIR all around if `ring`; FLUID without AIR in its component becomes SOLID.
     """
-    cells = rng.choice(np.array([AIR, FLUID, SOLID], dtype=np.int8), shape, p=[air, 1 - air - solid, solid])
+    cells = rng.choice(
+        np.array([AIR, FLUID, SOLID], dtype=np.int8), shape, p=[air, 1 - air - solid, solid]
+    )
     if ring:
         cells = np.pad(cells, 1, constant_values=AIR)
     open_parts, count = scipy.ndimage.label(cells != SOLID)
@@ -89,7 +108,9 @@ def random_cells(shape: tuple[int, ...], rng: np.random.Generator, *, air: float
     with_air[np.unique(open_parts[cells == AIR])] = True
     if not (with_air[open_parts] & (cells == FLUID)).any():
         cells.ravel()[:2] = AIR, FLUID
-        return np.where((np.arange(cells.size).reshape(cells.shape) < 2) | with_air[open_parts], cells, SOLID).astype(np.int8)
+        return np.where(
+            (np.arange(cells.size).reshape(cells.shape) < 2) | with_air[open_parts], cells, SOLID
+        ).astype(np.int8)
     return np.where(with_air[open_parts], cells, SOLID).astype(np.int8)
 
 
@@ -112,7 +133,8 @@ def poisson(
         plant: how the solution is chosen; a share of 0.3 active, strictly complementary, if None.
         air: share of AIR cells among them.
         solid: share of SOLID cells.
-        ring: surround them by AIR: x = 0 on the border, as in 'the 7-point matrix of 10^3 unknowns'.
+        ring: surround them by AIR: x = 0 on the border, as in 'the 7-point matrix of 10^3
+            unknowns'.
         coefficients: "uniform" (1) or "random" (in [0.2, 1], exact in float32).
         seed: of all choices.
         device: Warp device of the operator.
@@ -126,11 +148,19 @@ def poisson(
     rng, plant = np.random.default_rng(seed), plant or Plant()
     cells = random_cells(shape, rng, air=air, solid=solid, ring=ring)
     faces: dict[str, np.ndarray] = {}
-    for axis, face in enumerate(("face_x", "face_y", "face_z")[: cells.ndim] if coefficients == "random" else ()):
+    for axis, face in enumerate(
+        ("face_x", "face_y", "face_z")[: cells.ndim] if coefficients == "random" else ()
+    ):
         counts = [n + (k == cells.ndim - 1 - axis) for k, n in enumerate(cells.shape)]
         faces[face] = rng.uniform(0.2, 1.0, counts).astype(np.float32).astype(np.float64)
     A = GridPoisson(cells, device=device, dtype=dtype, **faces)  # type: ignore[arg-type]
-    flat = planted(grid_matrix(A), rng, plant, name=f"poisson {'x'.join(map(str, cells.shape))}", facts=M_MATRIX)
+    flat = planted(
+        grid_matrix(A),
+        rng,
+        plant,
+        name=f"poisson {'x'.join(map(str, cells.shape))}",
+        facts=M_MATRIX,
+    )
     fluid = cells == FLUID
 
     def field(values: np.ndarray) -> np.ndarray:
@@ -140,4 +170,12 @@ def poisson(
 
     assert flat.solution is not None
     x = field(flat.solution)
-    return Problem(f"{flat.name}, {coefficients}", A, field(flat.b), field(flat.lower), field(flat.upper), x, flat.facts)
+    return Problem(
+        f"{flat.name}, {coefficients}",
+        A,
+        field(flat.b),
+        field(flat.lower),
+        field(flat.upper),
+        x,
+        flat.facts,
+    )

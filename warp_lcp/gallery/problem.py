@@ -33,7 +33,10 @@ FACTS = frozenset(
         "solvable",  # there is one at least
     }
 )
-M_MATRIX = frozenset({"symmetric", "positive-definite", "p-matrix", "m-matrix", "positive-diagonal"})  # facts of Laplacians
+# facts of Laplacians
+M_MATRIX = frozenset(
+    {"symmetric", "positive-definite", "p-matrix", "m-matrix", "positive-diagonal"}
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +86,10 @@ class Problem:
             device: Warp device of a matrix; the default device if None.
             dtype: storage of a matrix.
         """
-        make = {"grid": lambda: self.A, "sparse": lambda: SparseOperator(self.A, device=device, dtype=dtype)}
+        make = {
+            "grid": lambda: self.A,
+            "sparse": lambda: SparseOperator(self.A, device=device, dtype=dtype),
+        }
         A = make.get(self.kind, lambda: DenseOperator(self.A, device=device, dtype=dtype))()
         return LCP(A, self.b, _number_or_field(self.lower), _number_or_field(self.upper))
 
@@ -110,14 +116,18 @@ class Problem:
         rows = np.flatnonzero(self.A.cells.numpy()[1:-1, 1:-1, 1:-1].ravel() == FLUID)
         b, lower, upper = (f.ravel()[rows] for f in (self.b, self.lower, self.upper))
         x = None if self.solution is None else self.solution.ravel()[rows]
-        return Problem(f"{self.name} as sparse", grid_matrix(self.A), b, lower, upper, x, self.facts)
+        return Problem(
+            f"{self.name} as sparse", grid_matrix(self.A), b, lower, upper, x, self.facts
+        )
 
     def dense(self) -> Problem:
         """Return the problem with a numpy matrix; of a grid, only its FLUID cells."""
         if self.kind == "dense":
             return self
         p = self.sparse()
-        return Problem(f"{self.name} as dense", p.A.toarray(), p.b, p.lower, p.upper, p.solution, p.facts)
+        return Problem(
+            f"{self.name} as dense", p.A.toarray(), p.b, p.lower, p.upper, p.solution, p.facts
+        )
 
 
 def _number_or_field(bound: Any) -> Any:

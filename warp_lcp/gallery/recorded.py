@@ -97,7 +97,9 @@ def arrays(problem: LCP, x0: wp.array[Any]) -> dict[str, np.ndarray]:
     for name, bound, none in (("lower", problem.lower, -np.inf), ("upper", problem.upper, np.inf)):
         host = _inner(bound, A)
         first = host[fluid][0]
-        kept[name] = np.array(first) if (host[fluid] == first).all() else np.where(fluid, host, none)
+        kept[name] = (
+            np.array(first) if (host[fluid] == first).all() else np.where(fluid, host, none)
+        )
     for axis in range(len(A.shape)):
         if A.faces[axis].size:
             kept[f"face_{AXES[axis]}"] = _inner(A.faces[axis], A, axis)
@@ -113,13 +115,19 @@ def arrays(problem: LCP, x0: wp.array[Any]) -> dict[str, np.ndarray]:
 def _inner(field: wp.array[Any], A: GridPoisson, axis: int | None = None) -> np.ndarray:
     """Return a stored field without its ring; of faces the upper ones of the last cells too."""
     host = field.numpy().reshape(A.layout.stored_shape)
-    inner = host[tuple(slice(1, None if axis is not None and a == 2 - axis else -1) for a in range(3))]
+    inner = host[
+        tuple(slice(1, None if axis is not None and a == 2 - axis else -1) for a in range(3))
+    ]
     return np.ascontiguousarray(inner if len(A.shape) == 3 else inner[0])
 
 
 def files(folder: Path) -> list[Path]:
     """Return the problem files of a folder by step; empty if there is no folder."""
-    found = [(int(match["step"]), path) for path in folder.glob("problem_*.npz") if (match := PROBLEM_FILE.fullmatch(path.name))]
+    found = [
+        (int(match["step"]), path)
+        for path in folder.glob("problem_*.npz")
+        if (match := PROBLEM_FILE.fullmatch(path.name))
+    ]
     return [path for _, path in sorted(found)]
 
 
@@ -132,16 +140,26 @@ def load(path: Path, *, device: Any = None, dtype: Any = wp.float32) -> Recorded
         dtype: of the operator's coefficients.
 
     Raises:
-        ValueError: the file is none of a problem, or is damaged or of a later version; the message names it.
+        ValueError: the file is none of a problem, or is damaged or of a later version; the message
+            names it.
     """
     with opened(path) as archive:
         kept = archive.read(sorted(KNOWN & archive.headers.keys()))
-        coefficients: dict[str, Any] = {name: kept[name] for name in ("face_x", "face_y", "face_z", "shift") if name in kept}
+        coefficients: dict[str, Any] = {
+            name: kept[name] for name in ("face_x", "face_y", "face_z", "shift") if name in kept
+        }
         A = GridPoisson(kept["cells"], device=device, dtype=dtype, **coefficients)
-        b, lower, upper, x0 = (np.broadcast_to(kept[name], A.shape).astype(np.float64) for name in ("b", "lower", "upper", "x0"))
+        b, lower, upper, x0 = (
+            np.broadcast_to(kept[name], A.shape).astype(np.float64)
+            for name in ("b", "lower", "upper", "x0")
+        )
         numbers: dict[str, Any] = {name: kept[name].item() for name in NUMBERS}
-        facts = {"symmetric", "semidefinite"} | ({"mixed"} if np.isneginf(lower[kept["cells"] == FLUID]).any() else set())
-        return RecordedProblem(Path(path).stem, A, b, lower, upper, None, frozenset(facts), x0, **numbers)
+        facts = {"symmetric", "semidefinite"} | (
+            {"mixed"} if np.isneginf(lower[kept["cells"] == FLUID]).any() else set()
+        )
+        return RecordedProblem(
+            Path(path).stem, A, b, lower, upper, None, frozenset(facts), x0, **numbers
+        )
 
 
 def check(path: Path) -> None:
@@ -159,8 +177,9 @@ def opened(path: Path) -> Iterator[Archive]:
     """Open a recorded problem and check it, without reading its fields.
 
     Raises:
-        ValueError: it is not, is damaged, of a later version, or larger than the free memory; the message names it. Errors of the block
-            about the content of the file are reported in the same way.
+        ValueError: it is not, is damaged, of a later version, or larger than the free memory; the
+            message names it. Errors of the block about the content of the file are reported in the
+            same way.
     """
     try:
         with Archive(Path(path)) as archive:
@@ -173,7 +192,11 @@ def opened(path: Path) -> Iterator[Archive]:
 def _check(archive: Archive) -> None:
     """Refuse an archive whose arrays are not those of a problem."""
     headers = archive.headers
-    if "format" in headers and not headers["format"].shape and (version := archive.read(["format"])["format"].item()) != FORMAT:
+    if (
+        "format" in headers
+        and not headers["format"].shape
+        and (version := archive.read(["format"])["format"].item()) != FORMAT
+    ):
         raise ValueError(f"its format is {version!r}, this version reads {FORMAT}")
     missing = sorted(REQUIRED - headers.keys())
     if missing:
@@ -181,22 +204,31 @@ def _check(archive: Archive) -> None:
     shape = headers["cells"].shape
     if len(shape) not in (2, 3) or headers["cells"].dtype != np.int8:
         raise ValueError(f"cells is {headers['cells']}: must be int8 of 2 or 3 axes")
-    faces = {f"face_{axis}": tuple(n + (a == number) for a, n in enumerate(reversed(shape)))[::-1] for number, axis in enumerate(AXES)}
+    faces = {
+        f"face_{axis}": tuple(n + (a == number) for a, n in enumerate(reversed(shape)))[::-1]
+        for number, axis in enumerate(AXES)
+    }
     for name in KNOWN & headers.keys() - {"cells"}:
         header, allowed = headers[name], [faces.get(name, shape)] if name in FIELDS else [()]
         if name in ("lower", "upper"):
             allowed = [(), shape]
         if header.shape not in allowed or header.dtype.kind not in "fi":
-            raise ValueError(f"{name} is {header}: must be numbers of shape {' or '.join(map(str, allowed))}")
+            raise ValueError(
+                f"{name} is {header}: must be numbers of shape {' or '.join(map(str, allowed))}"
+            )
     values = prod(shape) * len(FIELDS & headers.keys())
-    check_claim(f"fields of {' x '.join(map(str, reversed(shape)))} cells", values * np.dtype(np.float64).itemsize)
+    check_claim(
+        f"fields of {' x '.join(map(str, reversed(shape)))} cells",
+        values * np.dtype(np.float64).itemsize,
+    )
 
 
 def cell_counts(path: Path) -> tuple[int, ...]:
     """Return the shape of a recorded problem's cells, (nz, ny, nx) or (ny, nx).
 
     Raises:
-        ValueError: the file is none of a problem, or is damaged or of a later version; the message names it.
+        ValueError: the file is none of a problem, or is damaged or of a later version; the message
+            names it.
     """
     with opened(path) as archive:
         return archive.headers["cells"].shape
@@ -214,12 +246,19 @@ def load_part(path: Path, part: tuple[slice, ...]) -> dict[str, np.ndarray]:
         part: which cells, a slice of each axis of `cells`.
 
     Raises:
-        ValueError: the file is none of a problem, or is damaged or of a later version; the message names it.
+        ValueError: the file is none of a problem, or is damaged or of a later version; the message
+            names it.
     """
     faces = {f"face_{AXES[axis]}": len(part) - 1 - axis for axis in range(len(part))}
     with opened(path) as archive:
         return {
-            name: archive.read_box(name, tuple(slice(s.start, s.stop + (faces.get(name) == axis)) for axis, s in enumerate(part)))
+            name: archive.read_box(
+                name,
+                tuple(
+                    slice(s.start, s.stop + (faces.get(name) == axis))
+                    for axis, s in enumerate(part)
+                ),
+            )
             for name in (*PLACED, *faces)
             if name in archive.headers
         }

@@ -24,9 +24,12 @@ Parts = Sphere | Box | Sequence[Box]  # a ball, a box, or boxes that share their
 FIXED = np.inf  # mass [kg] of a body that does not move
 GROUND = Obstacle(name="ground", points=np.zeros((1, 3)), normals=np.array([[0.0, 0.0, 1.0]]))
 GRAVITY = (0.0, 0.0, -9.81)  # [m/s^2]
-MARGIN = 0.02  # of the smallest body's reach: gaps up to it are contacts, besides those that the fastest bodies may close in a step
+# of the smallest body's reach: gaps up to it are contacts, besides those that the fastest bodies
+# may close in a step
+MARGIN = 0.02
 NEAR_LIMIT = 0.2  # [rad]: a limit that is farther away has no row
-SLOP = 0.002  # of the smallest body's reach: overlap that is left alone, so that resting contacts stay
+# of the smallest body's reach: overlap that is left alone, so that resting contacts stay
+SLOP = 0.002
 
 
 @dataclass(eq=False)
@@ -35,7 +38,8 @@ class World:
 
     Args:
         name: the scene, with its parameters.
-        solids: the shape of each body, as it is placed: a ball, a box, or boxes that share their center and the body's mass evenly.
+        solids: the shape of each body, as it is placed: a ball, a box, or boxes that share their
+            center and the body's mass evenly.
         mass: of each [kg]; FIXED for one that does not move.
         obstacles: the ground.
         hinges: joints; the bodies of one do not collide.
@@ -50,7 +54,8 @@ class World:
         size: reach of the smallest body [m].
 
     Raises:
-        ValueError: there is no body, a mass is not positive, friction is negative, or gravity is not finite.
+        ValueError: there is no body, a mass is not positive, friction is negative, or gravity is
+            not finite.
     """
 
     name: str
@@ -73,10 +78,20 @@ class World:
         if not len(self.solids):
             raise ValueError("solids is empty: expected at least one body")
         self.fixed = np.isposinf(self.mass)
-        made = [_made(solid, 1.0 if m == FIXED else m) for solid, m in zip(self.solids, self.mass, strict=True)]
-        self.bodies = BodyStates([RigidBody(p, name=f"body {i}", friction=self.friction) for i, (p, _) in enumerate(made)])
+        made = [
+            _made(solid, 1.0 if m == FIXED else m)
+            for solid, m in zip(self.solids, self.mass, strict=True)
+        ]
+        self.bodies = BodyStates(
+            [
+                RigidBody(p, name=f"body {i}", friction=self.friction)
+                for i, (p, _) in enumerate(made)
+            ]
+        )
         shapes = [shape for _, shape in made]
-        self.contact_solve = ContactSolve(ContactDetection(self.bodies, shapes, self.obstacles, 3, every=True))
+        self.contact_solve = ContactSolve(
+            ContactDetection(self.bodies, shapes, self.obstacles, 3, every=True)
+        )
         self.size = min(shape.reach(properties.center) for properties, shape in made)
 
     def velocities(self) -> np.ndarray:
@@ -90,13 +105,19 @@ class World:
 
         Args:
             dt: time step [s].
-            margin: gap [m] up to which there is a contact; what bodies and their speeds ask for if None.
+            margin: gap [m] up to which there is a contact; what bodies and their speeds ask for if
+                None.
         """
-        fastest, near = float(np.linalg.norm(self.velocities()[:, :3], axis=1).max()), MARGIN * self.size
+        fastest, near = (
+            float(np.linalg.norm(self.velocities()[:, :3], axis=1).max()),
+            MARGIN * self.size,
+        )
         near, way = (near, dt * fastest) if margin is None else (margin, 0.0)
         n, ignored = len(self.bodies), self.ignored | {hinge.pair for hinge in self.hinges}
         still = np.append(self.fixed, True)
-        found = self.contact_solve.detection.find(0.0, np.full(n, way), np.full(len(self.obstacles), near + way), near)
+        found = self.contact_solve.detection.find(
+            0.0, np.full(n, way), np.full(len(self.obstacles), near + way), near
+        )
         found = found.without(ignored)
         found = found.where(~(still[found.first] & still[found.second]))
         found = found.where(np.lexsort((found.first, found.second, found.obstacle == NONE)))
@@ -105,8 +126,9 @@ class World:
     def assemble(self, dt: float, *, rate: float = 0.2) -> Assembly:
         """Return the velocity problem of a step.
 
-        u = J v' + c with v' = v + dt g + M^-1 J'r. For a contact's normal row c = gap / dt where there is a gap, so that what approaches
-        arrives in the step, and rate min(gap + slop, 0) / dt where bodies overlap (Baumgarte); joints see `JointRows.bias`.
+        u = J v' + c with v' = v + dt g + M^-1 J'r. For a contact's normal row c = gap / dt where
+        there is a gap, so that what approaches arrives in the step, and rate min(gap + slop, 0) /
+        dt where bodies overlap (Baumgarte); joints see `JointRows.bias`.
 
         Args:
             dt: time step [s].
@@ -119,24 +141,43 @@ class World:
             raise ValueError(f"dt = {dt}, rate = {rate}: must be > 0 and in [0, 1]")
         n, contacts = len(self.bodies), self.contacts(dt)
         joints = [_near(hinge.rows(self.bodies, dt)) for hinge in self.hinges]
-        J = scipy.sparse.csr_array(scipy.sparse.vstack([contacts.jacobian(n), *(rows.jacobian(n) for rows in joints)]))
-        masses = [np.zeros((6, 6)) if still else body.free_inverse_mass(3) for body, still in zip(self.bodies, self.fixed, strict=True)]
-        response = scipy.sparse.csr_array(scipy.sparse.bsr_array((np.array(masses), np.arange(n), np.arange(n + 1))) @ J.T)
+        J = scipy.sparse.csr_array(
+            scipy.sparse.vstack([contacts.jacobian(n), *(rows.jacobian(n) for rows in joints)])
+        )
+        masses = [
+            np.zeros((6, 6)) if still else body.free_inverse_mass(3)
+            for body, still in zip(self.bodies, self.fixed, strict=True)
+        ]
+        response = scipy.sparse.csr_array(
+            scipy.sparse.bsr_array((np.array(masses), np.arange(n), np.arange(n + 1))) @ J.T
+        )
         falling = self.velocities()
         falling[~self.fixed, :3] += dt * np.array(self.gravity)
         bias, gap = np.zeros((len(contacts), 3)), contacts.gap
         bias[:, 0] = np.where(gap > 0, gap, rate * np.minimum(gap + SLOP * self.size, 0.0)) / dt
         bias = np.concatenate([bias.ravel(), *(rows.bias(dt, rate) for rows in joints)])
-        low, high = (np.concatenate([np.zeros(0), *(getattr(rows, name) for rows in joints)]) for name in ("lower", "upper"))
+        low, high = (
+            np.concatenate([np.zeros(0), *(getattr(rows, name) for rows in joints)])
+            for name in ("lower", "upper")
+        )
         B = scipy.sparse.csr_array(J @ response)
         B = scipy.sparse.csr_array(0.5 * (B + B.T))  # rounding must not make it unsymmetric
-        system = ContactSystem(self.name, B, J @ falling.ravel() + bias, np.full(len(contacts), self.friction), low, high)
+        system = ContactSystem(
+            self.name,
+            B,
+            J @ falling.ravel() + bias,
+            np.full(len(contacts), self.friction),
+            low,
+            high,
+        )
         return Assembly(system, contacts, J, response, falling, bias)
 
     def energy(self) -> float:
         """Return kinetic plus potential energy of the moving bodies [J]."""
         moving = [body for body, still in zip(self.bodies, self.fixed, strict=True) if not still]
-        return sum(body.kinetic_energy + body.potential_energy(np.array(self.gravity)) for body in moving)
+        return sum(
+            body.kinetic_energy + body.potential_energy(np.array(self.gravity)) for body in moving
+        )
 
     def deepest(self) -> float:
         """Return the largest overlap of bodies [m], 0 without overlap."""
@@ -175,7 +216,9 @@ def _made(solid: Parts, mass: float) -> tuple[MassProperties, ContactShape]:
     boxes = [solid] if isinstance(solid, Box) else solid
     parts = [mass_properties(box, 3, mass=mass / len(boxes)) for box in boxes]
     inertia = np.sum([part.inertia for part in parts], axis=0)
-    return MassProperties(mass=mass, center=parts[0].center, inertia=inertia), ContactShape.united(boxes)
+    return MassProperties(mass=mass, center=parts[0].center, inertia=inertia), ContactShape.united(
+        boxes
+    )
 
 
 def _near(rows: JointRows) -> JointRows:

@@ -19,11 +19,14 @@ from warp_lcp.problem.stopping import StoppingCriteria
 
 STEPS = 60  # of Newton's method, which took 7 at the most
 TIGHT = StoppingCriteria(rtol=1e-10, max_iterations=200)
-# Where a cell's fluxes are taken, in its own coordinates; along which axis; and the corners (x, y) that each leaves and enters.
+# Where a cell's fluxes are taken, in its own coordinates; along which axis; and the corners (x, y)
+# that each leaves and enters.
 POINTS = (
-    ((0.5, 0.25), 0, (0, 0), (1, 0)), ((0.5, 0.75), 0, (0, 1), (1, 1)),
-    ((0.25, 0.5), 1, (0, 0), (0, 1)), ((0.75, 0.5), 1, (1, 0), (1, 1)),
-)  # fmt: skip
+    ((0.5, 0.25), 0, (0, 0), (1, 0)),
+    ((0.5, 0.75), 0, (0, 1), (1, 1)),
+    ((0.25, 0.5), 1, (0, 0), (0, 1)),
+    ((0.75, 0.5), 1, (1, 0), (1, 1)),
+)
 CORNERS = ((0, 0), (1, 0), (1, 1), (0, 1))
 
 
@@ -33,10 +36,11 @@ class IceDome:
 
     div q = m where H > 0, q = -Gamma H^(n+2) |grad H|^(n-1) grad H.
 
-    The surface mass balance m is what keeps the dome as it is; outside, more melts than flows in. Discretized by the control volumes of
-    Bueler (2016) on bilinear elements with two fluxes a side, as his program p4pdes/ice.c does: F(H) >= 0, H >= 0, H'F(H) = 0, F the
-    outflow of each volume less what falls on it, and D = (1 - regularization) Gamma H^(n+2) (|grad H|^2 + slope^2)^((n-1)/2) +
-    regularization * 1 m^2/s for the diffusivity. H = 0 on the border.
+    The surface mass balance m is what keeps the dome as it is; outside, more melts than flows in.
+    Discretized by the control volumes of Bueler (2016) on bilinear elements with two fluxes a side,
+    as his program p4pdes/ice.c does: F(H) >= 0, H >= 0, H'F(H) = 0, F the outflow of each volume
+    less what falls on it, and D = (1 - regularization) Gamma H^(n+2) (|grad H|^2 +
+    slope^2)^((n-1)/2) + regularization * 1 m^2/s for the diffusivity. H = 0 on the border.
 
     Args:
         nodes: a side of the square, the border included, >= 3.
@@ -64,8 +68,17 @@ class IceDome:
     def __post_init__(self) -> None:
         """Check that all numbers are in range."""
         if self.nodes < 3:
-            raise ValueError(f"nodes = {self.nodes}: must be >= 3, the nodes along a side, border included")
-        for name, least in (("side", 0), ("radius", 0), ("height", 0), ("exponent", 1), ("softness", 0), ("slope", 0)):
+            raise ValueError(
+                f"nodes = {self.nodes}: must be >= 3, the nodes along a side, border included"
+            )
+        for name, least in (
+            ("side", 0),
+            ("radius", 0),
+            ("height", 0),
+            ("exponent", 1),
+            ("softness", 0),
+            ("slope", 0),
+        ):
             if not least < getattr(self, name) < np.inf:
                 raise ValueError(f"{name} = {getattr(self, name)}: must be > {least} and finite")
         if not 0 < self.regularization <= 1:
@@ -116,7 +129,18 @@ class IceDome:
         F, rows, columns, entries = np.zeros(N * N), [], [], []
         for (px, py), axis, left, right in POINTS:
             weight = np.array([(px if x else 1 - px) * (py if y else 1 - py) for x, y in CORNERS])
-            grad = np.array([[(1 if x else -1) * (py if y else 1 - py), (px if x else 1 - px) * (1 if y else -1)] for x, y in CORNERS]) / h
+            grad = (
+                np.array(
+                    [
+                        [
+                            (1 if x else -1) * (py if y else 1 - py),
+                            (px if x else 1 - px) * (1 if y else -1),
+                        ]
+                        for x, y in CORNERS
+                    ]
+                )
+                / h
+            )
             value = np.tensordot(weight, corners, 1)
             gx, gy = (np.tensordot(grad[:, a], corners, 1) for a in (0, 1))
             steep = gx**2 + gy**2 + self.slope**2
@@ -125,7 +149,13 @@ class IceDome:
             along = (gx, gy)[axis]
             q = -D * along
             for k, corner in enumerate(CORNERS):
-                turn = sliding * np.abs(value) ** (n + 2) * (n - 1) / steep * (gx * grad[k, 0] + gy * grad[k, 1])
+                turn = (
+                    sliding
+                    * np.abs(value) ** (n + 2)
+                    * (n - 1)
+                    / steep
+                    * (gx * grad[k, 0] + gy * grad[k, 1])
+                )
                 thick = sliding * (n + 2) * np.abs(value) ** (n + 1) * np.sign(value) * weight[k]
                 dq = -(D * grad[k, axis] + along * (turn + thick)) * h / 2
                 for node, sign in ((left, 1), (right, -1)):
@@ -134,7 +164,10 @@ class IceDome:
                     entries.append(sign * dq.ravel())
             np.add.at(F, at[left], q.ravel() * h / 2)
             np.add.at(F, at[right], -q.ravel() * h / 2)
-        J = scipy.sparse.coo_array((np.concatenate(entries), (np.concatenate(rows), np.concatenate(columns))), shape=(N * N,) * 2)
+        J = scipy.sparse.coo_array(
+            (np.concatenate(entries), (np.concatenate(rows), np.concatenate(columns))),
+            shape=(N * N,) * 2,
+        )
         return F.reshape(N, N), J.tocsr()
 
     def solve(self, *, device: Any = None) -> np.ndarray:
@@ -142,14 +175,15 @@ class IceDome:
 
         Shape (nodes, nodes). Each step is a linear complementarity problem, H >= 0.
 
-        The share of the constant diffusivity falls from 1, where the problem is linear, by a third of a decade each time, to
-        `regularization`.
+        The share of the constant diffusivity falls from 1, where the problem is linear, by a third
+        of a decade each time, to `regularization`.
 
         Args:
             device: Warp device of the operators.
 
         Raises:
-            RuntimeError: a linear problem was not solved, or Newton's method did not converge; the message says which.
+            RuntimeError: a linear problem was not solved, or Newton's method did not converge; the
+                message says which.
         """
         H, share = np.zeros((self.nodes,) * 2), 1.0
         while True:
@@ -168,7 +202,11 @@ class IceDome:
             if np.linalg.norm(np.minimum(x / self.height, y / np.abs(falls).max())) <= 1e-7:
                 return H
             A = SparseOperator(J[inner][:, inner], device=device, dtype=wp.float64)
-            result = solve(LCP(A, y - A.apply(wp.array(x, dtype=wp.float64, device=A.device)).numpy()), x0=x, stopping=TIGHT)
+            result = solve(
+                LCP(A, y - A.apply(wp.array(x, dtype=wp.float64, device=A.device)).numpy()),
+                x0=x,
+                stopping=TIGHT,
+            )
             if not result:
                 raise RuntimeError(f"share {share:.1e}: {result.status.name}")
             H = H.copy()

@@ -17,17 +17,25 @@ from warp_lcp.problem.stopping import StoppingCriteria
 
 
 def solve(
-    A: Any, b: Any, lower: Any = 0.0, upper: Any = np.inf, *, coefficients: Mapping[str, Any] | None = None,
-    adjoint: StoppingCriteria | None = None, **options: Any,
-) -> Any:  # fmt: skip
+    A: Any,
+    b: Any,
+    lower: Any = 0.0,
+    upper: Any = np.inf,
+    *,
+    coefficients: Mapping[str, Any] | None = None,
+    adjoint: StoppingCriteria | None = None,
+    **options: Any,
+) -> Any:
     """Return the solution x as a JAX array with gradients to all arguments.
 
     x solves y = A x + b with bounds; it has the type of b.
 
-    Callbacks are pure: going back begins with a solve from x, which takes no step where x has not been rounded to float32.
+    Callbacks are pure: going back begins with a solve from x, which takes no step where x has not
+    been rounded to float32.
 
     Args:
-        A: an operator, or a function of `coefficients` that returns one, such as `functools.partial(wl.GridPoisson, cells)`; any device.
+        A: an operator, or a function of `coefficients` that returns one, such as
+            `functools.partial(wl.GridPoisson, cells)`; any device.
         b: as of `wl.LCP`.
         lower: an array or a number.
         upper: likewise.
@@ -36,7 +44,8 @@ def solve(
         options: of `wl.solve`.
 
     Raises:
-        Exception: JAX's own, with the message of an ArithmeticError where a solve does not converge, or of a ValueError.
+        Exception: JAX's own, with the message of an ArithmeticError where a solve does not
+            converge, or of a ValueError.
     """
     import jax
 
@@ -46,15 +55,23 @@ def solve(
     def solved(data: Sequence[Any], x0: Any = None) -> SolveResult:
         host = [np.asarray(v) for v in data]
         parts = nested(names[3:], host[3:])
-        result = solve_problem(LCP(A(**parts) if parts else A, *host[:3]), **{**options, **({} if x0 is None else {"x0": np.asarray(x0)})})
+        result = solve_problem(
+            LCP(A(**parts) if parts else A, *host[:3]),
+            **{**options, **({} if x0 is None else {"x0": np.asarray(x0)})},
+        )
         if not result:
-            raise ArithmeticError(f"the solve ended with {result.status.name}: {result.status.value}")
+            raise ArithmeticError(
+                f"the solve ended with {result.status.name}: {result.status.value}"
+            )
         return result
 
     def derived(data: Sequence[Any], x: Any, cotangent: Any) -> tuple[Any, ...]:
         found = vjp(solved(data, x), np.asarray(cotangent), stopping=adjoint).by_name
         parts = (found[name] for name in names)
-        return tuple(np.asarray(p.numpy() if isinstance(p, wp.array) else p, dtype=v.dtype) for p, v in zip(parts, data, strict=True))
+        return tuple(
+            np.asarray(p.numpy() if isinstance(p, wp.array) else p, dtype=v.dtype)
+            for p, v in zip(parts, data, strict=True)
+        )
 
     @jax.custom_vjp
     def solution(data: Sequence[Any]) -> Any:

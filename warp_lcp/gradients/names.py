@@ -10,7 +10,11 @@ def flat(values: Mapping[str, Any]) -> dict[Any, Any]:
     """Return values by their names, those in mappings by pairs of names."""
     found: dict[Any, Any] = {}
     for name, value in values.items():
-        found |= {(name, key): v for key, v in value.items()} if isinstance(value, Mapping) else {name: value}
+        found |= (
+            {(name, key): v for key, v in value.items()}
+            if isinstance(value, Mapping)
+            else {name: value}
+        )
     return found
 
 

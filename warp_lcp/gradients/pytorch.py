@@ -17,15 +17,22 @@ from warp_lcp.problem.stopping import StoppingCriteria
 
 
 def solve(
-    A: Any, b: Any, lower: Any = 0.0, upper: Any = np.inf, *, coefficients: Mapping[str, Any] | None = None,
-    adjoint: StoppingCriteria | None = None, **options: Any,
-) -> Any:  # fmt: skip
+    A: Any,
+    b: Any,
+    lower: Any = 0.0,
+    upper: Any = np.inf,
+    *,
+    coefficients: Mapping[str, Any] | None = None,
+    adjoint: StoppingCriteria | None = None,
+    **options: Any,
+) -> Any:
     """Return the solution x as a PyTorch tensor with gradients to all tensors given.
 
     x solves y = A x + b with bounds; it has the type of b.
 
     Args:
-        A: an operator, or a function of `coefficients` that returns one, such as `functools.partial(wl.GridPoisson, cells)`; same device.
+        A: an operator, or a function of `coefficients` that returns one, such as
+            `functools.partial(wl.GridPoisson, cells)`; same device.
         b: as of `wl.LCP`, a tensor.
         lower: a tensor or a number.
         upper: likewise.
@@ -50,22 +57,39 @@ def _solution() -> Any:
         @staticmethod
         def forward(ctx: Any, how: Any, *values: Any) -> Any:
             A, options, ctx.adjoint, ctx.names = how
-            ctx.kinds = [(v.dtype, v.device) if isinstance(v, torch.Tensor) else None for v in values]
+            ctx.kinds = [
+                (v.dtype, v.device) if isinstance(v, torch.Tensor) else None for v in values
+            ]
             shared = [_shared(v) if kind else v for v, kind in zip(values, ctx.kinds, strict=True)]
             b, lower, upper = shared[:3]
             parts = nested(ctx.names[3:], shared[3:])
             ctx.result = solve_problem(LCP(A(**parts) if parts else A, b, lower, upper), **options)
             if not ctx.result:
-                raise ArithmeticError(f"the solve ended with {ctx.result.status.name}: {ctx.result.status.value}")
+                raise ArithmeticError(
+                    f"the solve ended with {ctx.result.status.name}: {ctx.result.status.value}"
+                )
             return wp.to_torch(ctx.result.x).to(values[0].dtype)
 
         @staticmethod
         @torch.autograd.function.once_differentiable
         def backward(ctx: Any, cotangent: Any) -> Any:
             found = vjp(ctx.result, _shared(cotangent), stopping=ctx.adjoint).by_name
-            values = [found[name] if kind else None for name, kind in zip(ctx.names, ctx.kinds, strict=True)]
-            tensors = [wp.to_torch(v) if isinstance(v, wp.array) else None if v is None else torch.tensor(v) for v in values]
-            return None, *(t if t is None else t.to(*kind[::-1]) for t, kind in zip(tensors, ctx.kinds, strict=True))
+            values = [
+                found[name] if kind else None
+                for name, kind in zip(ctx.names, ctx.kinds, strict=True)
+            ]
+            tensors = [
+                wp.to_torch(v)
+                if isinstance(v, wp.array)
+                else None
+                if v is None
+                else torch.tensor(v)
+                for v in values
+            ]
+            return None, *(
+                t if t is None else t.to(*kind[::-1])
+                for t, kind in zip(tensors, ctx.kinds, strict=True)
+            )
 
     return Solution
 

@@ -18,9 +18,16 @@ from warp_lcp.rows.vectors import ADD, convert, rows_of
 
 
 def solve(
-    tape: wp.Tape, A: Any, b: Any, lower: Any = 0.0, upper: Any = np.inf, *, coefficients: Mapping[str, Any] | None = None,
-    adjoint: StoppingCriteria | None = None, **options: Any,
-) -> SolveResult:  # fmt: skip
+    tape: wp.Tape,
+    A: Any,
+    b: Any,
+    lower: Any = 0.0,
+    upper: Any = np.inf,
+    *,
+    coefficients: Mapping[str, Any] | None = None,
+    adjoint: StoppingCriteria | None = None,
+    **options: Any,
+) -> SolveResult:
     """Solve y = A x + b with bounds and record the solve on a Warp tape.
 
     `tape.backward` then adds to the gradients of all arrays that have one.
@@ -29,8 +36,10 @@ def solve(
 
     Args:
         tape: continued by what follows the solve.
-        A: an operator, or a function of `coefficients` that returns one, such as `functools.partial(wl.GridPoisson, cells)`.
-        b: as of `wl.LCP`; like bounds and coefficients an array with `requires_grad=True` if its gradient is wanted.
+        A: an operator, or a function of `coefficients` that returns one, such as
+            `functools.partial(wl.GridPoisson, cells)`.
+        b: as of `wl.LCP`; like bounds and coefficients an array with `requires_grad=True` if its
+            gradient is wanted.
         lower: likewise.
         upper: likewise.
         coefficients: arguments of A by name.
@@ -44,7 +53,9 @@ def solve(
         ValueError: as of `wl.LCP` and `wl.solve`, and while going back as of `wl.vjp`.
     """
     given = flat({"b": b, "lower": lower, "upper": upper, **(coefficients or {})})
-    result = solve_problem(LCP(A(**coefficients) if coefficients else A, b, lower, upper), **options)
+    result = solve_problem(
+        LCP(A(**coefficients) if coefficients else A, b, lower, upper), **options
+    )
     result.x.requires_grad = True
     wanted = {name: v for name, v in given.items() if isinstance(v, wp.array) and v.requires_grad}
 

@@ -1,8 +1,9 @@
 """Gradients through the solution of an LCP: one linear solve with A' on the free unknowns, whatever the method and its iterations were.
 
-With y = A x + b, the free set F = {l < x < u, y = 0} and the unknowns L and U held at their bounds, the solution map has the derivative
-A_FF dx_F = -(db_F + (dA x)_F + A_FL dl_L + A_FU du_U), dx_L = dl_L, dx_U = du_U, wherever y is not 0 on L and U. So with g = dL/dx and
-A_FF' mu_F = -g_F, mu = 0 elsewhere, the gradients are mu for b, g + A'mu on L and U for the bounds, and mu_i x_j for a_ij.
+With y = A x + b, the free set F = {l < x < u, y = 0} and the unknowns L and U held at their bounds,
+the solution map has the derivative A_FF dx_F = -(db_F + (dA x)_F + A_FL dl_L + A_FU du_U), dx_L =
+dl_L, dx_U = du_U, wherever y is not 0 on L and U. So with g = dL/dx and A_FF' mu_F = -g_F, mu = 0
+elsewhere, the gradients are mu for b, g + A'mu on L and U for the bounds, and mu_i x_j for a_ij.
 """
 
 from __future__ import annotations
@@ -42,7 +43,8 @@ KERNELS = KernelFile(Path(__file__).parent / "headers/vjp.h")
 LARGEST = KERNELS["gradients.largest"]
 SETS = KERNELS["gradients.sets"]
 HELD = KERNELS["gradients.held"]
-ROUNDING = 8 * float(np.finfo(np.float64).eps)  # of 2 |d x| + |b|, as of the residual's floor: what a sum of a few terms leaves
+# of 2 |d x| + |b|, as of the residual's floor: what a sum of a few terms leaves
+ROUNDING = 8 * float(np.finfo(np.float64).eps)
 CHANGED = 2.0  # times the result's residual: a larger one is that of another problem
 
 
@@ -54,14 +56,17 @@ class Gradients:
 
     Attributes:
         b: of the shape of the result's x, float64; 0 where x is held.
-        lower: of that shape, 0 where the lower bound does not hold x; where it was given as a number, the derivative by that.
+        lower: of that shape, 0 where the lower bound does not hold x; where it was given as a
+            number, the derivative by that.
         upper: likewise.
-        coefficients: of A, by the names of its constructor's arguments: `matrix` of a dense matrix (n, n) or, in the order of `indices`, of
-            a sparse one (nnz,); `face_x`, `face_y`, `face_z`, `shift` of a grid, arrays or numbers as they were given; `coefficients` of a
+        coefficients: of A, by the names of its constructor's arguments: `matrix` of a dense matrix
+            (n, n) or, in the order of `indices`, of a sparse one (nnz,); `face_x`, `face_y`,
+            `face_z`, `shift` of a grid, arrays or numbers as they were given; `coefficients` of a
             stencil, by offset, and `shift`. Empty for operators without `coefficient_gradient`.
         free: unknowns off their bounds.
-        degenerate: unknowns at a bound where y is 0, too, as far as the residual tells: the solution has derivatives to one side only, and
-            these gradients are those of the side on which the bound holds.
+        degenerate: unknowns at a bound where y is 0, too, as far as the residual tells: the
+            solution has derivatives to one side only, and these gradients are those of the side on
+            which the bound holds.
         status: how the linear solve ended, whose solution is b.
         linear_iterations: of it.
         relative_residual: ||g_F + A_FF'mu_F|| over ||g_F||, recomputed in float64.
@@ -90,27 +95,37 @@ class Gradients:
         return flat({"b": self.b, "lower": self.lower, "upper": self.upper, **self.coefficients})
 
 
-def vjp(result: SolveResult, cotangent: Array, *, stopping: StoppingCriteria | None = None, allow_inexact: bool = False) -> Gradients:
+def vjp(
+    result: SolveResult,
+    cotangent: Array,
+    *,
+    stopping: StoppingCriteria | None = None,
+    allow_inexact: bool = False,
+) -> Gradients:
     """Return the gradients of a scalar L(x) of the solution x of a problem.
 
     Vector-Jacobian product of the solution map.
 
     They cost one linear solve on the free unknowns.
 
-    An unknown is free if it is off its bounds by more than the largest entry of the natural residual, in units of y, and what rounding
-    leaves; the others are held. Where y is 0 at a bound too, that is a choice: an element of the B-subdifferential of the solution map, if
-    A is a P-matrix, and `Gradients.degenerate` counts such unknowns. Where a grid's component is free as a whole and neither AIR nor a
-    shift holds it, x is defined but for a constant, and the mean of `cotangent` over it counts for nothing.
+    An unknown is free if it is off its bounds by more than the largest entry of the natural
+    residual, in units of y, and what rounding leaves; the others are held. Where y is 0 at a bound
+    too, that is a choice: an element of the B-subdifferential of the solution map, if A is a
+    P-matrix, and `Gradients.degenerate` counts such unknowns. Where a grid's component is free as a
+    whole and neither AIR nor a shift holds it, x is defined but for a constant, and the mean of
+    `cotangent` over it counts for nothing.
 
     Args:
         result: of `wl.solve` on an LCP that has not changed since.
         cotangent: dL/dx, field of the problem's shape; entries off the unknowns do not count.
         stopping: of the linear solve; defaults to `StoppingCriteria()`.
-        allow_inexact: take a result that did not converge, and return gradients whose linear solve did not.
+        allow_inexact: take a result that did not converge, and return gradients whose linear solve
+            did not.
 
     Raises:
-        ValueError: an argument is of another kind or shape or not finite, the result did not converge or has no problem, its operator or
-            other data have changed since, or the problem has bounds that are affine in x or is shared by ranks.
+        ValueError: an argument is of another kind or shape or not finite, the result did not
+            converge or has no problem, its operator or other data have changed since, or the
+            problem has bounds that are affine in x or is shared by ranks.
         ArithmeticError: the linear solve did not converge; the message says how it ended.
 
     Example:
@@ -125,18 +140,31 @@ def vjp(result: SolveResult, cotangent: Array, *, stopping: StoppingCriteria | N
     layout = problem.layout
     x, g = layout.load(result.x, f64, "result.x"), layout.load(cotangent, f64, "cotangent")
     y, cells, side, free, degenerate = _classified(problem, result, x, g)
-    adjoint, multiplier = _adjoint(problem, cells, g, free, result.grid is not None, stopping or StoppingCriteria())
-    ended = f"{adjoint.status.name} at {adjoint.relative_residual:.1e} of its right-hand side ({adjoint.status.value})"
+    adjoint, multiplier = _adjoint(
+        problem, cells, g, free, result.grid is not None, stopping or StoppingCriteria()
+    )
+    ended = (
+        f"{adjoint.status.name} at {adjoint.relative_residual:.1e} of its right-hand side "
+        f"({adjoint.status.value})"
+    )
     if not (adjoint or allow_inexact):
-        raise ArithmeticError(f"the linear solve of the gradients: {ended}; allow_inexact=True returns the inexact gradient")
+        raise ArithmeticError(
+            f"the linear solve of the gradients: {ended}; allow_inexact=True returns the inexact "
+            "gradient"
+        )
     A, varying, z = problem.A, problem.bounds.varying, y
     _gather(problem, multiplier, g, z)
     found = A.coefficient_gradient(multiplier, x) if has(A, HasCoefficients) else {}
     at_upper = layout.zeros(f64) if varying[1] else None
     sums = Sums(_rows(problem), 2).of(HELD, side=side, z=z, upper=at_upper).tolist()
-    lower, upper = (_as_given(problem, v) if varies else s for v, varies, s in zip((z, at_upper), varying, sums, strict=True))
+    lower, upper = (
+        _as_given(problem, v) if varies else s
+        for v, varies, s in zip((z, at_upper), varying, sums, strict=True)
+    )
     numbers = adjoint.status, adjoint.linear_iterations, adjoint.relative_residual
-    return Gradients(_as_given(problem, multiplier), lower, upper, found, free, degenerate, *numbers)
+    return Gradients(
+        _as_given(problem, multiplier), lower, upper, found, free, degenerate, *numbers
+    )
 
 
 def _rows(problem: LCP) -> Rows:
@@ -146,7 +174,11 @@ def _rows(problem: LCP) -> Rows:
 
 def _as_given(problem: LCP, stored: wp.array[Any]) -> wp.array[Any]:
     """Return a stored field in the layout of the result's x."""
-    return stored.reshape(problem.layout.stored_shape) if problem.in_place else problem.layout.unload(stored)
+    return (
+        stored.reshape(problem.layout.stored_shape)
+        if problem.in_place
+        else problem.layout.unload(stored)
+    )
 
 
 def _checked(result: Any, allow_inexact: bool) -> LCP:
@@ -157,40 +189,73 @@ def _checked(result: Any, allow_inexact: bool) -> LCP:
     if problem is None:
         raise ValueError("result has no problem, which pickling leaves out: solve again")
     if not isinstance(problem, LCP):
-        raise ValueError(f"result is that of a {type(problem).__name__}: gradients are those of an LCP")
+        raise ValueError(
+            f"result is that of a {type(problem).__name__}: gradients are those of an LCP"
+        )
     if problem.bounds.affine is not None:
-        raise ValueError("result is that of a problem with bounds that are affine in x: gradients need numbers or fields")
+        raise ValueError(
+            "result is that of a problem with bounds that are affine in x: gradients need numbers "
+            "or fields"
+        )
     if problem.layout.across is not None:
         raise ValueError("result belongs to a problem on several ranks: gradients need one process")
     if not (result or allow_inexact):
-        raise ValueError(f"result did not converge ({result.status.name}): solve further, or pass allow_inexact=True")
+        raise ValueError(
+            f"result did not converge ({result.status.name}): solve further, or pass "
+            "allow_inexact=True"
+        )
     if version_of(problem.A) != result.version:
-        raise ValueError("the operator has changed in place since the result was computed: solve again")
+        raise ValueError(
+            "the operator has changed in place since the result was computed: solve again"
+        )
     return problem
 
 
-def _classified(problem: LCP, result: SolveResult, x: Any, g: Any) -> tuple[Any, Any, Any, int, int]:
+def _classified(
+    problem: LCP, result: SolveResult, x: Any, g: Any
+) -> tuple[Any, Any, Any, int, int]:
     """Return y, the cell types with 0 where an unknown is held, which bound holds it, and how many are free and degenerate."""
     residual, rows, layout = NaturalResidual(problem), _rows(problem), problem.layout
     problem.bounds.refresh()
     residual.affine(x)
-    tally, bounds, y, d = Tally(LARGEST, problem.device), problem.bounds.operands, residual.y, residual.diagonal
+    tally, bounds, y, d = (
+        Tally(LARGEST, problem.device),
+        problem.bounds.operands,
+        residual.y,
+        residual.diagonal,
+    )
     tally.take(rows, bounds=bounds, x=x, y=y, d=d, unknown=problem.unknown, unit=residual.unit)
     square, largest = tally.read()
     norm, allowed = float(square) ** 0.5, CHANGED * result.residual
     if not norm <= allowed and not norm <= allowed + residual.rounding_floor(x, ROUNDING):
-        raise ValueError(f"result has a residual of {norm:.1e} instead of {result.residual:.1e}: its problem has changed in place since")
+        raise ValueError(
+            f"result has a residual of {norm:.1e} instead of {result.residual:.1e}: its problem "
+            "has changed in place since"
+        )
     cells, side = wp.clone(problem.unknown), layout.zeros(i8)
     free, degenerate, wrong = Sums(rows, 3).of(
-        SETS, bounds=bounds, x=x, y=y, d=d, unknown=problem.unknown, unit=residual.unit, b=problem.b, g=g, cells=cells, side=side,
-        tolerance=float(largest), rounding=ROUNDING,
-    )  # fmt: skip
+        SETS,
+        bounds=bounds,
+        x=x,
+        y=y,
+        d=d,
+        unknown=problem.unknown,
+        unit=residual.unit,
+        b=problem.b,
+        g=g,
+        cells=cells,
+        side=side,
+        tolerance=float(largest),
+        rounding=ROUNDING,
+    )
     if wrong:
         raise ValueError(f"cotangent holds {int(wrong)} values that are not finite")
     return residual.y, cells, side, int(free), int(degenerate)
 
 
-def _adjoint(problem: LCP, cells: Any, g: Any, count: int, on_grid: bool, stopping: StoppingCriteria) -> tuple[SolveResult, wp.array[Any]]:
+def _adjoint(
+    problem: LCP, cells: Any, g: Any, count: int, on_grid: bool, stopping: StoppingCriteria
+) -> tuple[SolveResult, wp.array[Any]]:
     """Solve A_FF' mu_F = -g_F; return how that went, and mu as a stored field, 0 elsewhere."""
     A, layout = problem.A, problem.layout
     if count == 0:  # what is solved is 1 x = 0
@@ -198,20 +263,28 @@ def _adjoint(problem: LCP, cells: Any, g: Any, count: int, on_grid: bool, stoppi
     if has(A, HasBlocks):
         block = _transposed(A).on_cells(cells.numpy())
         right = _projected(_floating(block), g, cells)  # what it has in AIR does not count
-        result = solve(LCP(block, right.reshape(layout.stored_shape), -np.inf, np.inf), stopping=stopping)
+        result = solve(
+            LCP(block, right.reshape(layout.stored_shape), -np.inf, np.inf), stopping=stopping
+        )
         return result, result.x.flatten()
     free = cells.numpy() == 1
     if has(A, HasRows) and not on_grid:
-        free = free if A.row_sizes is None else free & (A.row_sizes.numpy() > 0)  # mu of an empty row is anything: 0
+        # mu of an empty row is anything: 0
+        free = free if A.row_sizes is None else free & (A.row_sizes.numpy() > 0)
         matrix, near = A.rows().matrix()[free][:, free].T, getattr(A, "near_null_space", None)
-        block = as_operator(matrix, problem.device) if near is None else SparseOperator(matrix, device=A.device, near_null_space=near[free])
+        block = (
+            as_operator(matrix, problem.device)
+            if near is None
+            else SparseOperator(matrix, device=A.device, near_null_space=near[free])
+        )
         result = solve(LCP(block, g.numpy()[free], -np.inf, np.inf), stopping=stopping)
         multiplier = np.zeros(layout.size)
         multiplier[free] = result.x.numpy()
         return result, wp.array(multiplier, dtype=f64, device=problem.device)
     floating = _floating(A)
     b = _projected(None if floating is None else floating.transposed(), g, cells).numpy()
-    held = np.where(free, b, np.abs(b[free]).max() or 1.0).reshape(layout.stored_shape)  # not 0, or it would seem to be free
+    # not 0, or it would seem to be free
+    held = np.where(free, b, np.abs(b[free]).max() or 1.0).reshape(layout.stored_shape)
     sides = (np.where(free, side, 0.0).reshape(layout.stored_shape) for side in (-np.inf, np.inf))
     result = solve(LCP(_transposed(A), held, *sides), stopping=stopping)
     return result, layout.load(result.x, f64)
@@ -247,7 +320,9 @@ def _transposed(A: Operator) -> Any:
     if isinstance(A, Stencil):
         return A.transposed()
     if isinstance(A, SparseOperator):
-        return SparseOperator(A.matrix().T, device=A.device, dtype=A.dtype, near_null_space=A.near_null_space)
+        return SparseOperator(
+            A.matrix().T, device=A.device, dtype=A.dtype, near_null_space=A.near_null_space
+        )
     return Transpose(A)
 
 
@@ -257,8 +332,15 @@ class Transpose(Operator):
     symmetric = False
 
     def __init__(self, A: Operator) -> None:
-        self._A, self.shape, self.dtype, self.device, self.layout = A, A.shape, A.dtype, A.device, layout_of(A)
-        if has(A, HasCells):  # ghost cells, which products fill along periodic axes, are no unknowns
+        self._A, self.shape, self.dtype, self.device, self.layout = (
+            A,
+            A.shape,
+            A.dtype,
+            A.device,
+            layout_of(A),
+        )
+        # ghost cells, which products fill along periodic axes, are no unknowns
+        if has(A, HasCells):
             self.cells = A.cells
 
     def apply(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:

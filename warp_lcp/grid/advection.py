@@ -1,23 +1,29 @@
 """Advection of particles and fields by the velocity of the grid.
 
-Third-order Runge-Kutta with the weights 2/9, 3/9, 4/9 at 0, 1/2, 3/4 of the step [Ralston 1962]. Three ways:
+Third-order Runge-Kutta with the weights 2/9, 3/9, 4/9 at 0, 1/2, 3/4 of the step [Ralston 1962].
+Three ways:
 
-Particles among whole cells (`advect`) never enter a SOLID one. Every stage walks from cell to cell: a particle that meets a closed face
-stops before it and slides along it. Whole-cell solids need no distance, and a distance would not work: pushing particles out along
-it strands them in SOLID cells. The number of cells to the nearest solid shows which particles cannot be stopped; only the others
+Particles among whole cells (`advect`) never enter a SOLID one. Every stage walks from cell to cell:
+a particle that meets a closed face stops before it and slides along it. Whole-cell solids need no
+distance, and a distance would not work: pushing particles out along it strands them in SOLID cells.
+The number of cells to the nearest solid shows which particles cannot be stopped; only the others
 walk.
 
-Particles among walls that are given by their distance (`advect_with_distance`). One whose distance to walls exceeds its way needs no care.
-The others go in strides that the distance allows, but of half a cell at least, so that one that rests on a wall gets on; whoever ends a
-stride too near a wall or inside it is put back along the normal. On a plane that takes just the normal part from the way. The rest of the
-way loses its part into the wall, and between two walls all but the part along their edge. A stride that would end on another side of a
-wall is halved, so that plates of more than a cell are not tunnelled at any speed. Positions are measured by the distance that is
-interpolated between nodes, which defines where solids are, and by that to the domain's walls.
+Particles among walls that are given by their distance (`advect_with_distance`). One whose distance
+to walls exceeds its way needs no care. The others go in strides that the distance allows, but of
+half a cell at least, so that one that rests on a wall gets on; whoever ends a stride too near a
+wall or inside it is put back along the normal. On a plane that takes just the normal part from the
+way. The rest of the way loses its part into the wall, and between two walls all but the part along
+their edge. A stride that would end on another side of a wall is halved, so that plates of more than
+a cell are not tunnelled at any speed. Positions are measured by the distance that is interpolated
+between nodes, which defines where solids are, and by that to the domain's walls.
 
-Fields (`carry_field`): f(x, t + dt) = f(y, t), where y is found by such a step back along the velocity, so that they go the same way as
-particles. A velocity is interpolated by cubics through four nodes along each axis (Catmull and Rom's), kept within the range of the
-2^dimension nodes around y: a wave of 16 cells that moves by 0.4 cells a step has 87 % of its height after 80 steps, with linear
-interpolation 23 %. A distance is interpolated linearly, which is exact where it is one to a plane.
+Fields (`carry_field`): f(x, t + dt) = f(y, t), where y is found by such a step back along the
+velocity, so that they go the same way as particles. A velocity is interpolated by cubics through
+four nodes along each axis (Catmull and Rom's), kept within the range of the 2^dimension nodes
+around y: a wave of 16 cells that moves by 0.4 cells a step has 87 % of its height after 80 steps,
+with linear interpolation 23 %. A distance is interpolated linearly, which is exact where it is one
+to a plane.
 """
 
 import functools
@@ -35,34 +41,51 @@ from warp_lcp.rows import KernelFile, RowPass
 from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.memory import Scalar, scaled
 
-MAX_CLEARANCE = 6  # cells; a particle that moves further in a step takes the careful way, which is always right
+# cells; a particle that moves further in a step takes the careful way, which is always right
+MAX_CLEARANCE = 6
 CENTERS = 3  # the `axis` of a field at cell centers
 
-AIM = 1.1 * MARGIN  # where particles are put: float32 positions in 10^3 cells round by less than the difference
+# where particles are put: float32 positions in 10^3 cells round by less than the difference
+AIM = 1.1 * MARGIN
 SLACK = 0.25  # cells by which the interpolated distance may exceed the way that is free
-STRIDE = 0.5  # cells a particle goes near a wall before it looks again; shorter where it would come out on another side
+# cells a particle goes near a wall before it looks again; shorter where it would come out on
+# another side
+STRIDE = 0.5
 SHORTEST = 0.02  # cells a stride is cut to where a wall is thinner than that
 STRIDES = 64  # of a move: 32 cells along a wall
-CORNER = 0.5  # walls whose normals are further apart (cosine) stop a particle between them, nearer ones it slides over
+# walls whose normals are further apart (cosine) stop a particle between them, nearer ones it slides
+# over
+CORNER = 0.5
 BEND = 0.9  # normals that are nearer than this are one wall
 LEG = 0.25  # cells of such a search in one direction
-REACH = 1.0  # cells that a step may put a particle back: more than its stride and the diagonal of the walls' rounding
+# cells that a step may put a particle back: more than its stride and the diagonal of the walls'
+# rounding
+REACH = 1.0
 PUSH = 3.0  # cells that a wall may push a particle in a step
 
-_WALLS = {"MARGIN": MARGIN, "AIM": AIM, "SLACK": SLACK, "STRIDE": STRIDE, "SHORTEST": SHORTEST, "LEG": LEG, "REACH": REACH} | {
-    "STRIDES": STRIDES, "CORNER": CORNER, "BEND": BEND, "CENTERS": CENTERS,
-}  # fmt: skip
+_WALLS = {
+    "MARGIN": MARGIN,
+    "AIM": AIM,
+    "SLACK": SLACK,
+    "STRIDE": STRIDE,
+    "SHORTEST": SHORTEST,
+    "LEG": LEG,
+    "REACH": REACH,
+} | {"STRIDES": STRIDES, "CORNER": CORNER, "BEND": BEND, "CENTERS": CENTERS}
 KERNELS = KernelFile(Path(__file__).parent / "headers/advection.h", _WALLS)
-PUSH_OUT = KernelFile(Path(__file__).parent / "headers/walls.h", {"MARGIN": MARGIN, "LEG": LEG, "AIM": AIM, "PUSH": PUSH})[
-    "warp_lcp.grid.push_out.push_out"
-]
+PUSH_OUT = KernelFile(
+    Path(__file__).parent / "headers/walls.h",
+    {"MARGIN": MARGIN, "LEG": LEG, "AIM": AIM, "PUSH": PUSH},
+)["warp_lcp.grid.push_out.push_out"]
 
 
 @functools.cache
 def advect_pass(endless: int) -> RowPass:
     """Return the kernel of `advect` for a set of periodic axes (bit n: axis n)."""
     module = "warp_lcp.grid.advection" + f"_{endless}" * (endless > 0)
-    return KERNELS.kernel("warp_lcp.grid.advection.advect", module=module, constants={"ENDLESS": endless})
+    return KERNELS.kernel(
+        "warp_lcp.grid.advection.advect", module=module, constants={"ENDLESS": endless}
+    )
 
 
 @functools.cache
@@ -77,19 +100,26 @@ def distance_pass(endless: int) -> RowPass:
 def carry_pass(axis: int) -> RowPass:
     """Return the kernel of `carry_field` for the faces of an axis or `CENTERS`."""
     module = f"warp_lcp.grid.semi_lagrangian_{axis}"
-    return KERNELS.kernel("warp_lcp.grid.semi_lagrangian.carry", module=module, constants={"AXIS": axis})
+    return KERNELS.kernel(
+        "warp_lcp.grid.semi_lagrangian.carry", module=module, constants={"AXIS": axis}
+    )
 
 
 @forward_kernel(module="warp_lcp.grid.clearance")
 @typing.no_type_check
-def clearance_kernel(cells: wp.array3d(dtype=wp.int8), planes: int, distance: int, room: wp.array3d(dtype=wp.int8)):
+def clearance_kernel(
+    cells: wp.array3d(dtype=wp.int8), planes: int, distance: int, room: wp.array3d(dtype=wp.int8)
+):
     """Pass `distance` = 0 marks SOLID cells 0 and others MAX_CLEARANCE; pass d marks those around cells of d - 1 with d.
 
-    In place without a race: a cell that another thread marks in this launch was more than d - 1 and becomes d, no source either way.
+    In place without a race: a cell that another thread marks in this launch was more than d - 1 and
+    becomes d, no source either way.
     """
     k, j, i = wp.tid()
     if distance == 0:
-        room[k, j, i] = wp.where(cells[k, j, i] == wp.int8(SOLID), wp.int8(0), wp.int8(MAX_CLEARANCE))
+        room[k, j, i] = wp.where(
+            cells[k, j, i] == wp.int8(SOLID), wp.int8(0), wp.int8(MAX_CLEARANCE)
+        )
     elif int(room[k, j, i]) > distance:
         near = int(0)
         for c in range(wp.max(k - planes + 1, 0), wp.min(k + planes, room.shape[0])):
@@ -129,20 +159,29 @@ def clearance(grid: StaggeredGrid, cells: wp.array) -> wp.array:
 
     Args:
         grid: the grid.
-        cells: int8 of AIR, FLUID, SOLID, in the stored shape; the ring is SOLID, or AIR where particles may leave the domain.
+        cells: int8 of AIR, FLUID, SOLID, in the stored shape; the ring is SOLID, or AIR where
+            particles may leave the domain.
 
     Returns:
         int8, in the stored shape.
     """
     room = grid.field(wp.int8)
     for distance in range(MAX_CLEARANCE):
-        wp.launch(clearance_kernel, grid.shape, [cells, grid.planes, distance, room], device=grid.device)
+        wp.launch(
+            clearance_kernel, grid.shape, [cells, grid.planes, distance, room], device=grid.device
+        )
     return room
 
 
 def advect(
-    grid: StaggeredGrid, fields: list[wp.array], room: wp.array, dt: float | Scalar, position: wp.array, stopped: wp.array, endless: int = 0
-) -> None:  # fmt: skip
+    grid: StaggeredGrid,
+    fields: list[wp.array],
+    room: wp.array,
+    dt: float | Scalar,
+    position: wp.array,
+    stopped: wp.array,
+    endless: int = 0,
+) -> None:
     """Advect particles for a time step among whole-cell solids.
 
     Args:
@@ -152,44 +191,73 @@ def advect(
         dt: time step [s].
         position: [m], shape (n,) (updated).
         stopped: int32, shape (1,): raised by the number of particles that a closed face stopped.
-        endless: has bit n set if axis n has no end: velocities beyond its sides are those at the other, as the ring's are. Particles may
-            end up there.
+        endless: has bit n set if axis n has no end: velocities beyond its sides are those at the
+            other, as the ring's are. Particles may end up there.
     """
     launch(
-        advect_pass(endless), len(position), grid, FaceVelocity.of(fields), position=position, room=room, stopped=stopped,
+        advect_pass(endless),
+        len(position),
+        grid,
+        FaceVelocity.of(fields),
+        position=position,
+        room=room,
+        stopped=stopped,
         h=scaled(dt, 1.0 / grid.spacing),
-    )  # fmt: skip
+    )
 
 
 def advect_with_distance(
-    grid: StaggeredGrid, fields: list[wp.array], distance: wp.array, dt: float | Scalar, position: wp.array, stopped: wp.array, *,
-    open_sides: int = 0, endless: int = 0,
-) -> None:  # fmt: skip
+    grid: StaggeredGrid,
+    fields: list[wp.array],
+    distance: wp.array,
+    dt: float | Scalar,
+    position: wp.array,
+    stopped: wp.array,
+    *,
+    open_sides: int = 0,
+    endless: int = 0,
+) -> None:
     """Advect particles for a time step among walls given by their distance.
 
     No particle ends within MARGIN cells of a wall unless it started there.
 
-    Where no way back out of a wall is found within a cell, a particle stays where its last stride was open. A move goes at most 1024
-    cells, and 32 along walls.
+    Where no way back out of a wall is found within a cell, a particle stays where its last stride
+    was open. A move goes at most 1024 cells, and 32 along walls.
 
     Args:
         grid: the grid.
         fields: velocity of each component on the faces [m/s].
-        distance: to solids at the low corners of the cells, float32 in cells, > 0 in the open; in the stored shape. In 2-D the plane
-            k = 1 is used. The domain's walls need not be in it.
+        distance: to solids at the low corners of the cells, float32 in cells, > 0 in the open; in
+            the stored shape. In 2-D the plane k = 1 is used. The domain's walls need not be in it.
         dt: time step [s].
         position: [m], shape (n,) (updated).
         stopped: int32, shape (1,): raised by the number of particles that met a wall.
-        open_sides: of `warp_lcp.grid.sides.side_bits`: particles cross them and end on them or beyond.
+        open_sides: of `warp_lcp.grid.sides.side_bits`: particles cross them and end on them or
+            beyond.
         endless: has bit n set if axis n has no end, see `advect`; its sides are open, and alike.
     """
     launch(
-        distance_pass(endless), len(position), grid, FaceVelocity.of(fields), position=position, distance=distance, stopped=stopped,
-        h=scaled(dt, 1.0 / grid.spacing), open_sides=open_sides,
-    )  # fmt: skip
+        distance_pass(endless),
+        len(position),
+        grid,
+        FaceVelocity.of(fields),
+        position=position,
+        distance=distance,
+        stopped=stopped,
+        h=scaled(dt, 1.0 / grid.spacing),
+        open_sides=open_sides,
+    )
 
 
-def push_out(grid: StaggeredGrid, distance: wp.array, position: wp.array, moved: wp.array, left: wp.array, *, open_sides: int = 0) -> None:
+def push_out(
+    grid: StaggeredGrid,
+    distance: wp.array,
+    position: wp.array,
+    moved: wp.array,
+    left: wp.array,
+    *,
+    open_sides: int = 0,
+) -> None:
     """Push particles out of walls along the gradient of the distance.
 
     Of walls that have moved over them or come too close.
@@ -199,16 +267,35 @@ def push_out(grid: StaggeredGrid, distance: wp.array, position: wp.array, moved:
         distance: to solids in cells, as for `advect_with_distance`.
         position: [m], shape (n,) (updated): moved by at most PUSH cells.
         moved: int32, shape (1,): raised by the number of particles that were put outside.
-        left: int32, shape (1,): raised by the number of those for which no way out was found; they stay where they were.
+        left: int32, shape (1,): raised by the number of those for which no way out was found; they
+            stay where they were.
         open_sides: of `warp_lcp.grid.sides.side_bits`: particles beyond stay there.
     """
-    launch(PUSH_OUT, len(position), grid, position=position, distance=distance, open_sides=open_sides, moved=moved, left=left)
+    launch(
+        PUSH_OUT,
+        len(position),
+        grid,
+        position=position,
+        distance=distance,
+        open_sides=open_sides,
+        moved=moved,
+        left=left,
+    )
 
 
 def carry_field(
-    grid: StaggeredGrid, window: Window, velocity: list[wp.array], way: float | Scalar, field: wp.array, out: wp.array, *, axis: int,
-    level: wp.array, least: float, before: tuple[int, int, int] = (0, 0, 0),
-) -> None:  # fmt: skip
+    grid: StaggeredGrid,
+    window: Window,
+    velocity: list[wp.array],
+    way: float | Scalar,
+    field: wp.array,
+    out: wp.array,
+    *,
+    axis: int,
+    level: wp.array,
+    least: float,
+    before: tuple[int, int, int] = (0, 0, 0),
+) -> None:
     """Advect a field for a time step (semi-Lagrangian).
 
     Args:
@@ -217,7 +304,8 @@ def carry_field(
         velocity: of each component on the faces [m/s].
         way: dt / dx [s/m].
         field: float32, of faces or cells; not `out`.
-        out: float32 (written). Where the level is no more than `least`: the velocity as it was, 0 at cell centers.
+        out: float32 (written). Where the level is no more than `least`: the velocity as it was, 0
+            at cell centers.
         axis: whose faces the field lies on, or `CENTERS`.
         level: float32 of cells; a face has the mean of its two.
         least: see `out`.
@@ -227,6 +315,15 @@ def carry_field(
         window = Window.of([max(start, 1) for start in window.low], window.high, window.device)
     before_x, before_y, before_z = before
     window.run(
-        carry_pass(axis), FaceVelocity.of(velocity), planes=grid.planes, h=way, least=least, level=level, field=field,
-        out=out, before_x=before_x, before_y=before_y, before_z=before_z,
-    )  # fmt: skip
+        carry_pass(axis),
+        FaceVelocity.of(velocity),
+        planes=grid.planes,
+        h=way,
+        least=least,
+        level=level,
+        field=field,
+        out=out,
+        before_x=before_x,
+        before_y=before_y,
+        before_z=before_z,
+    )

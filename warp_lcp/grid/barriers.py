@@ -1,10 +1,11 @@
 """Barriers: solids thinner than cells, which hold apart what lies on their two sides.
 
-A face between two cells is closed where a solid stands between the cells' centers, although neither lies in it, and has the velocity of
-the solid there. Nothing else is exchanged either: a particle takes part in the faces and cells that it sees, in a straight line, and a
-field is continued from places that are seen. So both sides have velocities, pressures, densities and a surface of their own, in the same
-fields: a place belongs to the side of the wall that it lies on. What a particle does not see of the faces around it has the mean of what
-it sees.
+A face between two cells is closed where a solid stands between the cells' centers, although neither
+lies in it, and has the velocity of the solid there. Nothing else is exchanged either: a particle
+takes part in the faces and cells that it sees, in a straight line, and a field is continued from
+places that are seen. So both sides have velocities, pressures, densities and a surface of their
+own, in the same fields: a place belongs to the side of the wall that it lies on. What a particle
+does not see of the faces around it has the mean of what it sees.
 
 Far from these solids everything is as without them, and costs a byte a cell.
 """
@@ -25,7 +26,8 @@ from warp_lcp.grid.thin_walls import ThinWalls
 from warp_lcp.operators.grid_poisson import FLUID
 from warp_lcp.rows.program import copy
 
-BARRIER = {2: 1.5, 3: 1.75}  # cells: corners of cells lie close enough in what is thicker, at any angle, to close its faces
+# cells: corners of cells lie close enough in what is thicker, at any angle, to close its faces
+BARRIER = {2: 1.5, 3: 1.75}
 PARTS = {2: 6, 3: 3}  # points of a cell an axis, for the share of its kernel that its center sees
 PARTS_MOVING = {2: 4, 3: 2}  # the same, at each step
 COST = 256  # of a particle, in cells of a usual pass
@@ -52,12 +54,14 @@ class Barriers:
 
     Attributes:
         near: uint8, 1 in cells that one of the solids is near.
-        apart: uint8 for the faces of each component and, last, the cells: bit d is set where a solid stands between a place and the one
-            before it along axis d.
+        apart: uint8 for the faces of each component and, last, the cells: bit d is set where a
+            solid stands between a place and the one before it along axis d.
         number: int16, one field a component: the solid that crosses a lower face, 0 if none does.
-        below: float32, one field a component: distance from the center of the cell below a crossed face to the solid [cells].
+        below: float32, one field a component: distance from the center of the cell below a crossed
+            face to the solid [cells].
         above: the same from the cell above.
-        calm: int8, base of the cells, SOLID in those near the solids: where particles may not be taken from one cell to another.
+        calm: int8, base of the cells, SOLID in those near the solids: where particles may not be
+            taken from one cell to another.
     """
 
     def __init__(self, grid: StaggeredGrid, walls: ThinWalls, cut: CutCells) -> None:
@@ -68,8 +72,16 @@ class Barriers:
         self.below, self.above = grid.faces(), grid.faces()
         self._share.fill_(1.0)
         self._barrier = kernels.Barrier()
-        self._barrier.shapes, self._barrier.groups, self._barrier.near = walls.shapes, walls.groups, self.near
-        self._barrier.planes, self._barrier.dx, self._barrier.origin = grid.planes, grid.spacing, wp.vec3i(*grid.origin)
+        self._barrier.shapes, self._barrier.groups, self._barrier.near = (
+            walls.shapes,
+            walls.groups,
+            self.near,
+        )
+        self._barrier.planes, self._barrier.dx, self._barrier.origin = (
+            grid.planes,
+            grid.spacing,
+            wp.vec3i(*grid.origin),
+        )
         margin = MARGIN * grid.spacing
         self._low, self._high = wp.vec3(margin, margin, margin), wp.vec3(*(grid.extent - margin))
         self.calm = grid.field(wp.int8)
@@ -92,7 +104,9 @@ class Barriers:
         self._all = Window.of(low, high, grid.device)
         self._all.launch(kernels.near_kernel, [barrier, self.near])
         for axis, apart in enumerate(self.apart):
-            self._all.launch(kernels.apart_kernel, [barrier, CENTERS if axis == grid.dimension else axis, apart])
+            self._all.launch(
+                kernels.apart_kernel, [barrier, CENTERS if axis == grid.dimension else axis, apart]
+            )
         parts = (PARTS_MOVING if self.walls.moves else PARTS)[grid.dimension]
         self._all.launch(kernels.share_kernel, [barrier, parts, self._share])
 
@@ -100,18 +114,28 @@ class Barriers:
         """Return the cells near the solids, those of the ring among them."""
         grid = self.grid
         low, high = self.walls.bounds()
-        first = np.clip(np.floor(low / grid.spacing) - np.array(grid.origin), -1, np.array(grid.counts)).astype(int)
-        last = np.clip(np.floor(high / grid.spacing) - np.array(grid.origin), -1, np.array(grid.counts)).astype(int)
-        return grid.window(first.tolist(), last.tolist(), grow=int(np.ceil(kernels.REACH)) + 1, shift=1)
+        first = np.clip(
+            np.floor(low / grid.spacing) - np.array(grid.origin), -1, np.array(grid.counts)
+        ).astype(int)
+        last = np.clip(
+            np.floor(high / grid.spacing) - np.array(grid.origin), -1, np.array(grid.counts)
+        ).astype(int)
+        return grid.window(
+            first.tolist(), last.tolist(), grow=int(np.ceil(kernels.REACH)) + 1, shift=1
+        )
 
     def cross(self) -> None:
         """Close the faces that the solids cross, after the cut cells have been placed."""
         cut, barrier = self.cut, self._barrier
-        for axis, (number, open_, wall) in enumerate(zip(self.number, cut.open, cut.wall, strict=True)):
+        for axis, (number, open_, wall) in enumerate(
+            zip(self.number, cut.open, cut.wall, strict=True)
+        ):
             gaps = self.below[axis], self.above[axis]
             if cut.velocity is not None:
                 self._all.launch(kernels.forget_kernel, [number, cut.velocity[axis]])
-            self._all.launch(kernels.cross_kernel, [barrier, axis, self.apart[-1], open_, wall, number, *gaps])
+            self._all.launch(
+                kernels.cross_kernel, [barrier, axis, self.apart[-1], open_, wall, number, *gaps]
+            )
         inner = self._all.common(self.grid.domain)
         if inner is not None:
             inner.launch(kernels.solid_kernel, [barrier, *(*cut.open, *cut.open[:1])[:3], cut.base])
@@ -122,8 +146,13 @@ class Barriers:
     def set_velocity(self) -> None:
         """Set the velocity of the crossed faces, after those of the cut cells."""
         cut = self.cut
-        for axis, (number, velocity) in enumerate(zip(self.number, cut.velocity or (), strict=False)):
-            self._all.launch(kernels.wall_velocity_kernel, [self._barrier, axis, number, cut.turn, cut.shift, velocity])
+        for axis, (number, velocity) in enumerate(
+            zip(self.number, cut.velocity or (), strict=False)
+        ):
+            self._all.launch(
+                kernels.wall_velocity_kernel,
+                [self._barrier, axis, number, cut.turn, cut.shift, velocity],
+            )
 
     def enter(self, index: wp.array) -> None:
         """Enter the solids into whole cells.
@@ -133,7 +162,9 @@ class Barriers:
         Args:
             index: int32: -1 in open cells, the wall's number elsewhere (updated).
         """
-        for axis, (number, below, above) in enumerate(zip(self.number, self.below, self.above, strict=True)):
+        for axis, (number, below, above) in enumerate(
+            zip(self.number, self.below, self.above, strict=True)
+        ):
             self._all.launch(kernels.whole_kernel, [axis, number, below, above, index])
 
     def notes(self) -> list[str]:
@@ -145,31 +176,53 @@ class Barriers:
                 inner.launch(kernels.gap_kernel, [self._barrier, axis, open_, number, gaps])
         cell = f"a cell of {self.grid.spacing:.4g} m"
         return [
-            f"{name}: a gap beside it is narrower than {cell} and lets nothing through ({count} faces of cells)"
+            f"{name}: a gap beside it is narrower than {cell} and lets nothing through ({count} "
+            "faces of cells)"
             for name, count in zip(cut.names, gaps.numpy().tolist(), strict=True)
             if count
         ]
 
     def particles_to_faces(
-        self, window: Window, axis: int, offsets: wp.array, position: wp.array, velocity: wp.array, gradient: wp.array | None,
-        field: wp.array, weight: wp.array,
-    ) -> None:  # fmt: skip
+        self,
+        window: Window,
+        axis: int,
+        offsets: wp.array,
+        position: wp.array,
+        velocity: wp.array,
+        gradient: wp.array | None,
+        field: wp.array,
+        weight: wp.array,
+    ) -> None:
         """Average velocities again on faces near the solids; arguments as of `warp_lcp.grid.transfer.particles_to_faces`."""
-        window.launch(kernels.gather_kernel, [self._barrier, axis, offsets, position, velocity, gradient, field, weight])
+        window.launch(
+            kernels.gather_kernel,
+            [self._barrier, axis, offsets, position, velocity, gradient, field, weight],
+        )
 
     def faces_to_particles(
-        self, axis: int, field: wp.array, saved: wp.array | None, flip: float, before: wp.array, position: wp.array, velocity: wp.array,
+        self,
+        axis: int,
+        field: wp.array,
+        saved: wp.array | None,
+        flip: float,
+        before: wp.array,
+        position: wp.array,
+        velocity: wp.array,
         gradient: wp.array | None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Interpolate again at particles near the solids.
 
         Args as of `warp_lcp.grid.transfer.faces_to_particles`, but:
             before: velocities before, for FLIP [m/s].
         """
         given = [self._barrier, axis, field, saved, flip, before, position, velocity, gradient]
-        launch_list(kernels.interpolate_kernel, len(position), given, device=self.grid.device, cost=COST)
+        launch_list(
+            kernels.interpolate_kernel, len(position), given, device=self.grid.device, cost=COST
+        )
 
-    def density(self, window: Window, offsets: wp.array, position: wp.array, density: wp.array, each: float) -> None:
+    def density(
+        self, window: Window, offsets: wp.array, position: wp.array, density: wp.array, each: float
+    ) -> None:
         """Add up particles again in cells near the solids, `each` of them."""
         window.launch(kernels.density_kernel, [self._barrier, each, offsets, position, density])
 
@@ -182,10 +235,21 @@ class Barriers:
             start: where they are [m], shape (n,).
         """
         if len(self._aim) < len(start):
-            self._aim = wp.empty(len(start) + len(start) // 4, dtype=wp.vec3, device=self.grid.device)
+            self._aim = wp.empty(
+                len(start) + len(start) // 4, dtype=wp.vec3, device=self.grid.device
+            )
         aim = self._aim[: len(start)]
         copy(aim, start)
-        given = [self._barrier, self.cut.distance, *three_components(velocity), dt, self._low, self._high, start, aim]
+        given = [
+            self._barrier,
+            self.cut.distance,
+            *three_components(velocity),
+            dt,
+            self._low,
+            self._high,
+            start,
+            aim,
+        ]
         launch_list(kernels.carry_kernel, len(start), given, device=self.grid.device, cost=COST)
 
     def bring(self, start: wp.array, position: wp.array) -> None:
@@ -195,9 +259,22 @@ class Barriers:
             start: as there.
             position: where others come to [m], shape (n,) (updated).
         """
-        launch_list(bring_kernel, len(position), [start, self._aim[: len(position)], position], device=self.grid.device)
+        launch_list(
+            bring_kernel,
+            len(position),
+            [start, self._aim[: len(position)], position],
+            device=self.grid.device,
+        )
 
-    def constrain(self, window: Window, velocity: Faces, known: Faces, kind: wp.array, contact: wp.array, released: int) -> None:
+    def constrain(
+        self,
+        window: Window,
+        velocity: Faces,
+        known: Faces,
+        kind: wp.array,
+        contact: wp.array,
+        released: int,
+    ) -> None:
         """Let crossed faces keep what of a velocity does not go through the wall that they are beside.
 
         Args:
@@ -213,7 +290,22 @@ class Barriers:
             setattr(components, name, field)
             setattr(marks, name, mark)
         for axis, (number, result) in enumerate(zip(self.number, self._scratch, strict=True)):
-            given = [self._barrier, axis, number, components, marks, self.cut.turn, self.cut.shift, kind, contact, FLUID, released, result]
+            given = [
+                self._barrier,
+                axis,
+                number,
+                components,
+                marks,
+                self.cut.turn,
+                self.cut.shift,
+                kind,
+                contact,
+                FLUID,
+                released,
+                result,
+            ]
             window.launch(kernels.constrain_kernel, given)
-        for number, result, field, mark in zip(self.number, self._scratch, velocity, known, strict=True):
+        for number, result, field, mark in zip(
+            self.number, self._scratch, velocity, known, strict=True
+        ):
             window.launch(kernels.take_kernel, [number, result, field, mark])

@@ -3,16 +3,31 @@
 
 import warp as wp
 
-from warp_lcp.grid.cell_kernel import F32, I8, I16, I32, INTS, POINTS, U8, cell_below, cell_kernel, list_kernel
+from warp_lcp.grid.cell_kernel import (
+    F32,
+    I8,
+    I16,
+    I32,
+    INTS,
+    POINTS,
+    U8,
+    cell_below,
+    cell_kernel,
+    list_kernel,
+)
 from warp_lcp.grid.thin_walls_kernels import GROUPS, MISS, SHAPES, away, hit, into_group
 from warp_lcp.operators.grid_poisson import AIR, SOLID
 
 MODULE = "warp_lcp.grid.barriers"
 CENTERS = 3  # the `axis` of a field at cell centers
-REACH = 2.8  # cells from a cell's center to a solid that may be between a particle in the cell and a face it touches, or a kernel's end
-EDGE = 1.0e-5  # the least weight of a face that a particle's own cell has, as in `warp_lcp.grid.transfer`
+# cells from a cell's center to a solid that may be between a particle in the cell and a face it
+# touches, or a kernel's end
+REACH = 2.8
+# the least weight of a face that a particle's own cell has, as in `warp_lcp.grid.transfer`
+EDGE = 1.0e-5
 TINY_WEIGHT = 1.0e-9
-SURFACE = 1.0e-6  # cells: points within it of a surface lie on it, and in the solid; particles keep a larger distance
+# cells: points within it of a surface lie on it, and in the solid; particles keep a larger distance
+SURFACE = 1.0e-6
 FREE = 2.5  # cells from solids that cut cells, beyond which a particle's way is not theirs
 
 _AIR, _SOLID = wp.constant(wp.int8(AIR)), wp.constant(wp.int8(SOLID))
@@ -129,27 +144,53 @@ def apart_kernel(k, j, i, B: Barrier, axis: int, apart: U8):
     if B.near[k, j, i] != wp.uint8(0):
         x = place_of(B, axis, k, j, i)
         for d in range(B.planes + 1):
-            y = place_of(B, axis, k - wp.where(d == 2, 1, 0), j - wp.where(d == 1, 1, 0), i - wp.where(d == 0, 1, 0))
+            y = place_of(
+                B,
+                axis,
+                k - wp.where(d == 2, 1, 0),
+                j - wp.where(d == 1, 1, 0),
+                i - wp.where(d == 0, 1, 0),
+            )
             if not sees(B, x, y):
                 bits = bits | (1 << d)
     apart[k, j, i] = wp.uint8(bits)
 
 
 @cell_kernel(MODULE)
-def cross_kernel(k, j, i, B: Barrier, axis: int, apart: U8, open: F32, wall: I16, number: I16, below: F32, above: F32):
+def cross_kernel(
+    k,
+    j,
+    i,
+    B: Barrier,
+    axis: int,
+    apart: U8,
+    open: F32,
+    wall: I16,
+    number: I16,
+    below: F32,
+    above: F32,
+):
     """Close the lower faces between cells whose centers a solid stands between; the domain's stay its own.
 
-    `below` and `above` are the distances to it from the centers of the cells below and above a face, in cells.
+    `below` and `above` are the distances to it from the centers of the cells below and above a
+    face, in cells.
     """
     crossed = int(0)
     if (int(apart[k, j, i]) >> axis) & 1 != 0:
         if wall[k, j, i] != wp.int16(0):
             x = place_of(B, CENTERS, k, j, i)
-            y = place_of(B, CENTERS, k - wp.where(axis == 2, 1, 0), j - wp.where(axis == 1, 1, 0), i - wp.where(axis == 0, 1, 0))
+            y = place_of(
+                B,
+                CENTERS,
+                k - wp.where(axis == 2, 1, 0),
+                j - wp.where(axis == 1, 1, 0),
+                i - wp.where(axis == 0, 1, 0),
+            )
             found, t = wall_between(B, x, y)
             crossed = found
             above[k, j, i] = wp.min(t, 1.0)
-            _found, t = wall_between(B, y, x)  # which rounding may let miss an end that lies on the surface
+            # which rounding may let miss an end that lies on the surface
+            _found, t = wall_between(B, y, x)
             below[k, j, i] = wp.min(t, 1.0)
             if open[k, j, i] > 0.0:
                 wall[k, j, i] = wp.int16(crossed)
@@ -212,7 +253,14 @@ def gap_kernel(k, j, i, B: Barrier, axis: int, open: F32, number: I16, gaps: INT
                     way = wp.vec3()
                     way[d] = B.dx * float(side) * wp.where(n < 2, 0.2, 0.4)
                     if beside(B, x, y, way):
-                        if open[k + wp.where(d == 2, side, 0), j + wp.where(d == 1, side, 0), i + wp.where(d == 0, side, 0)] == 0.0:
+                        if (
+                            open[
+                                k + wp.where(d == 2, side, 0),
+                                j + wp.where(d == 1, side, 0),
+                                i + wp.where(d == 0, side, 0),
+                            ]
+                            == 0.0
+                        ):
                             found = 1
         if found > 0:
             wp.atomic_add(gaps, int(number[k, j, i]), 1)
@@ -269,7 +317,9 @@ def density_kernel(k, j, i, B: Barrier, each: float, offsets: INTS, position: PO
         for c in range(wp.max(k - B.planes + 1, 0), wp.min(k + B.planes, density.shape[0])):
             for b in range(wp.max(j - 1, 0), wp.min(j + 2, density.shape[1])):
                 row = (c * density.shape[1] + b) * density.shape[2]
-                for p in range(offsets[row + wp.max(i - 1, 0)], offsets[row + wp.min(i + 2, density.shape[2])]):
+                for p in range(
+                    offsets[row + wp.max(i - 1, 0)], offsets[row + wp.min(i + 2, density.shape[2])]
+                ):
                     way = (position[p] - center) / B.dx
                     w = spline(way[0]) * spline(way[1])
                     if B.planes == 2:
@@ -294,7 +344,17 @@ def tent(B: Barrier, axis: int, way: wp.vec3):
 
 @cell_kernel(MODULE)
 def gather_kernel(
-    k, j, i, B: Barrier, axis: int, offsets: INTS, position: POINTS, velocity: POINTS, gradient: POINTS, field: F32, weight: F32
+    k,
+    j,
+    i,
+    B: Barrier,
+    axis: int,
+    offsets: INTS,
+    position: POINTS,
+    velocity: POINTS,
+    gradient: POINTS,
+    field: F32,
+    weight: F32,
 ):
     """Average the velocities of the particles around a face that it sees."""
     if B.near[k, j, i] != wp.uint8(0):
@@ -325,7 +385,9 @@ def seen(B: Barrier, axis: int, x: wp.vec3, field: F32):
 
     Those that it does not see have the mean of the others.
     """
-    g = x / B.dx + wp.vec3(1.0 - float(B.origin[0]), 1.0 - float(B.origin[1]), 1.0 - float(B.origin[2]))
+    g = x / B.dx + wp.vec3(
+        1.0 - float(B.origin[0]), 1.0 - float(B.origin[1]), 1.0 - float(B.origin[2])
+    )
     for d in range(3):
         if d != axis:
             g[d] = g[d] - 0.5
@@ -395,7 +457,16 @@ def shape_of(field: U8):
 
 @list_kernel(MODULE)
 def interpolate_kernel(
-    i, B: Barrier, axis: int, field: F32, saved: F32, flip: float, before: POINTS, position: POINTS, velocity: POINTS, gradient: POINTS
+    i,
+    B: Barrier,
+    axis: int,
+    field: F32,
+    saved: F32,
+    flip: float,
+    before: POINTS,
+    position: POINTS,
+    velocity: POINTS,
+    gradient: POINTS,
 ):
     """Give particles near thin solids what they see of the velocity of faces, see `warp_lcp.grid.transfer`."""
     x = position[i]
@@ -426,7 +497,17 @@ def velocity_at(B: Barrier, u: F32, v: F32, w: F32, x: wp.vec3):
 
 @list_kernel(MODULE)
 def carry_kernel(
-    i, B: Barrier, distance: F32, u: F32, v: F32, w: F32, dt: float, low: wp.vec3, high: wp.vec3, start: POINTS, position: POINTS
+    i,
+    B: Barrier,
+    distance: F32,
+    u: F32,
+    v: F32,
+    w: F32,
+    dt: float,
+    low: wp.vec3,
+    high: wp.vec3,
+    start: POINTS,
+    position: POINTS,
 ):
     """Move particles that start near thin solids, and far from others, by the velocity that they see, with that of half their way."""
     x = start[i]
@@ -444,7 +525,11 @@ def carry_kernel(
                 if sees(B, x, y):
                     way = velocity_at(B, u, v, w, y)
             y = x + dt * way
-            position[i] = wp.vec3(wp.clamp(y[0], low[0], high[0]), wp.clamp(y[1], low[1], high[1]), wp.clamp(y[2], low[2], high[2]))
+            position[i] = wp.vec3(
+                wp.clamp(y[0], low[0], high[0]),
+                wp.clamp(y[1], low[1], high[1]),
+                wp.clamp(y[2], low[2], high[2]),
+            )
 
 
 @wp.func
@@ -468,9 +553,22 @@ def mean_around(B: Barrier, axis: int, other: int, k: int, j: int, i: int, field
 
 @cell_kernel(MODULE)
 def constrain_kernel(
-    k, j, i, B: Barrier, axis: int, number: I16, U: Components, K: Marks, turn: TURNS, shift: SHIFTS, kind: I8, contact: U8, fluid: int,
-    released: int, result: F32,
-):  # fmt: skip
+    k,
+    j,
+    i,
+    B: Barrier,
+    axis: int,
+    number: I16,
+    U: Components,
+    K: Marks,
+    turn: TURNS,
+    shift: SHIFTS,
+    kind: I8,
+    contact: U8,
+    fluid: int,
+    released: int,
+    result: F32,
+):
     """Write what crossed faces become: without the velocity into the wall that they are beside, or any relative to it along its normal.
 
     They lie on one side of the wall, and only what is there sees them.
@@ -530,7 +628,9 @@ def forget_kernel(k, j, i, number: I16, velocity: F32):
 
 
 @cell_kernel(MODULE)
-def wall_velocity_kernel(k, j, i, B: Barrier, axis: int, number: I16, turn: TURNS, shift: SHIFTS, velocity: F32):
+def wall_velocity_kernel(
+    k, j, i, B: Barrier, axis: int, number: I16, turn: TURNS, shift: SHIFTS, velocity: F32
+):
     """Fill the velocity of the solids on the faces that they cross."""
     solid = int(number[k, j, i])
     if solid > 0:
@@ -550,7 +650,14 @@ def fill_layer_kernel(k, j, i, layer: int, fill: int, apart: U8, known: I8, fiel
             c = k + wp.where(d == 2, side, 0)
             b = j + wp.where(d == 1, side, 0)
             a = i + wp.where(d == 0, side, 0)
-            if c >= 0 and b >= 0 and a >= 0 and c < known.shape[0] and b < known.shape[1] and a < known.shape[2]:
+            if (
+                c >= 0
+                and b >= 0
+                and a >= 0
+                and c < known.shape[0]
+                and b < known.shape[1]
+                and a < known.shape[2]
+            ):
                 mark = int(known[c, b, a])
                 if mark > 0 and mark <= layer:
                     bits = int(apart[wp.max(c, k), wp.max(b, j), wp.max(a, i)])

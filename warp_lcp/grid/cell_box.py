@@ -49,4 +49,9 @@ class CellBox:
 
     def moved(self, by: Sequence[int], sign: int = 1) -> CellBox:
         """Return the box shifted by a number of cells along x, y, z, or back."""
-        return CellBox.of(*([a + sign * b for a, b in zip(corner, by, strict=True)] for corner in (self.low, self.high)))
+        return CellBox.of(
+            *(
+                [a + sign * b for a, b in zip(corner, by, strict=True)]
+                for corner in (self.low, self.high)
+            )
+        )

@@ -14,7 +14,8 @@ from warp_lcp.grid.staggered import CellRange
 from warp_lcp.rows.compiler import forward_kernel, project_module
 from warp_lcp.rows.program import Launch, call, is_recording, launch, launch_ranges
 
-F32, F64, I8, U8 = (wp.array3d(dtype=t) for t in (wp.float32, wp.float64, wp.int8, wp.uint8))  # fields
+# fields
+F32, F64, I8, U8 = (wp.array3d(dtype=t) for t in (wp.float32, wp.float64, wp.int8, wp.uint8))
 I16, I32 = wp.array3d(dtype=wp.int16), wp.array3d(dtype=wp.int32)
 INTS, POINTS = wp.array(dtype=wp.int32), wp.array(dtype=wp.vec3)  # lists
 PIECE = """
@@ -47,7 +48,11 @@ for i in range(tasks[0] + own, wp.max(tasks[1], tasks[0] + own + 1)):
 @wp.func
 def cell_below(axis: int, k: int, j: int, i: int):
     """Return the cell on the other side of a cell's lower face; at the array's edge the cell itself."""
-    return (wp.max(k - wp.where(axis == 2, 1, 0), 0), wp.max(j - wp.where(axis == 1, 1, 0), 0), wp.max(i - wp.where(axis == 0, 1, 0), 0))
+    return (
+        wp.max(k - wp.where(axis == 2, 1, 0), 0),
+        wp.max(j - wp.where(axis == 1, 1, 0), 0),
+        wp.max(i - wp.where(axis == 0, 1, 0), 0),
+    )
 
 
 @wp.func
@@ -60,13 +65,25 @@ def interpolated(field: F32, planes: int, x: float, y: float, z: float):
     k = int(1)
     fx = cx - float(i)
     fy = cy - float(j)
-    value = wp.lerp(wp.lerp(field[1, j, i], field[1, j, i + 1], fx), wp.lerp(field[1, j + 1, i], field[1, j + 1, i + 1], fx), fy)
+    value = wp.lerp(
+        wp.lerp(field[1, j, i], field[1, j, i + 1], fx),
+        wp.lerp(field[1, j + 1, i], field[1, j + 1, i + 1], fx),
+        fy,
+    )
     if planes == 2:
         cz = wp.clamp(z, 0.0, float(field.shape[0]) - 1.001)
         k = int(cz)
-        low = wp.lerp(wp.lerp(field[k, j, i], field[k, j, i + 1], fx), wp.lerp(field[k, j + 1, i], field[k, j + 1, i + 1], fx), fy)
+        low = wp.lerp(
+            wp.lerp(field[k, j, i], field[k, j, i + 1], fx),
+            wp.lerp(field[k, j + 1, i], field[k, j + 1, i + 1], fx),
+            fy,
+        )
         k += 1
-        high = wp.lerp(wp.lerp(field[k, j, i], field[k, j, i + 1], fx), wp.lerp(field[k, j + 1, i], field[k, j + 1, i + 1], fx), fy)
+        high = wp.lerp(
+            wp.lerp(field[k, j, i], field[k, j, i + 1], fx),
+            wp.lerp(field[k, j + 1, i], field[k, j + 1, i + 1], fx),
+            fy,
+        )
         value = wp.lerp(low, high, cz - float(k - 1))
     return value
 
@@ -74,9 +91,10 @@ def interpolated(field: F32, planes: int, x: float, y: float, z: float):
 def cell_kernel(module: str, *, ordered: bool = False) -> Callable[[Callable], wp.Kernel]:
     """Return a decorator that makes a kernel(cells, ...) for `Window.launch`, in a Warp module, of what is done to a cell or a piece.
 
-    The function's parameters without a type are the kernel's own: the cell `k, j, i`, or the piece `k, j, first, end` of a row, the cells
-    first <= i < end, and how many planes, rows and pieces are before it, `plane, row, chunk`. A function cannot return early. Where cells
-    write what others read or write, `ordered`, one CPU thread takes them in order.
+    The function's parameters without a type are the kernel's own: the cell `k, j, i`, or the piece
+    `k, j, first, end` of a row, the cells first <= i < end, and how many planes, rows and pieces
+    are before it, `plane, row, chunk`. A function cannot return early. Where cells write what
+    others read or write, `ordered`, one CPU thread takes them in order.
     """
 
     def made(function: Callable) -> wp.Kernel:
@@ -90,15 +108,22 @@ def cell_kernel(module: str, *, ordered: bool = False) -> Callable[[Callable], w
 def list_kernel(module: str) -> Callable:
     """Return a decorator that makes a kernel(tasks, ...) for `launch_list`, in a Warp module, of what is done to an element `i` of lists.
 
-    The function's parameter without a type is `i`. It cannot return early, and writes nothing that others read or write.
+    The function's parameter without a type is `i`. It cannot return early, and writes nothing that
+    others read or write.
     """
     return lambda function: _made(function, module, ("tasks", wp.vec2i), ELEMENTS, "")
 
 
 def launch_list(
-    kernel: wp.Kernel, count: int, inputs: list, *, device: wp.Device, cost: int = 1, launch: Launch | None = None,
+    kernel: wp.Kernel,
+    count: int,
+    inputs: list,
+    *,
+    device: wp.Device,
+    cost: int = 1,
+    launch: Launch | None = None,
     ordered: bool = False,
-) -> None:  # fmt: skip
+) -> None:
     """Launch a kernel of `list_kernel`, or record it: then for as many as the list of one of its arrays has when it runs.
 
     Args:
@@ -110,10 +135,22 @@ def launch_list(
         launch: of a program.
         ordered: whether several entries may write the same element.
     """
-    listed = next((a.listed for a in inputs if hasattr(a, "listed")), None) if is_recording() else None
+    listed = (
+        next((a.listed for a in inputs if hasattr(a, "listed")), None) if is_recording() else None
+    )
     inputs, sized = [wp.vec2i(0, 0), *inputs], 0 if listed is None else listed.entries
     extent = None if listed is None else listed.rows
-    launch_ranges(kernel, (count,), cost, inputs, device=wp.get_device(device), launch=launch, ordered=ordered, sized=sized, extent=extent)
+    launch_ranges(
+        kernel,
+        (count,),
+        cost,
+        inputs,
+        device=wp.get_device(device),
+        launch=launch,
+        ordered=ordered,
+        sized=sized,
+        extent=extent,
+    )
 
 
 @forward_kernel(module="warp_lcp.grid.scan")
@@ -140,11 +177,15 @@ def _kernel(function: Callable, module: str) -> wp.Kernel:
     return _made(function, module, ("cells", CellRange), PIECE, TASK + LOOP if of_a_cell else TASK)
 
 
-def _made(function: Callable, module: str, first: tuple[str, Any], loop: str, before: str) -> wp.Kernel:
+def _made(
+    function: Callable, module: str, first: tuple[str, Any], loop: str, before: str
+) -> wp.Kernel:
     """Put the function's body, behind what opens a task, into the loop over tasks. Warp is given the text that results, which it hashes."""
     tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
     made = tree.body[0]
-    typed = [p for p in inspect.signature(function).parameters.values() if p.annotation is not p.empty]
+    typed = [
+        p for p in inspect.signature(function).parameters.values() if p.annotation is not p.empty
+    ]
     task = ast.parse(before).body
     if task and isinstance(task[-1], ast.For):
         task[-1].body = made.body
@@ -153,8 +194,16 @@ def _made(function: Callable, module: str, first: tuple[str, Any], loop: str, be
     opened = ast.parse(loop).body
     opened[-1].body = task
     name, kind = first
-    made.body, made.decorator_list, made.args.args = opened, [], [ast.arg(name), *(ast.arg(p.name) for p in typed)]
-    function.__signature__ = inspect.Signature([inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD), *typed])
+    made.body, made.decorator_list, made.args.args = (
+        opened,
+        [],
+        [ast.arg(name), *(ast.arg(p.name) for p in typed)],
+    )
+    function.__signature__ = inspect.Signature(
+        [inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD), *typed]
+    )
     function.__annotations__ = {name: kind} | {p.name: p.annotation for p in typed}
     key = function.__qualname__.replace("<locals>.", "").replace(".", "__")
-    return wp.Kernel(function, key, project_module(module), {"enable_backward": False}, source=ast.unparse(tree))
+    return wp.Kernel(
+        function, key, project_module(module), {"enable_backward": False}, source=ast.unparse(tree)
+    )

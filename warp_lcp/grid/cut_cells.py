@@ -1,7 +1,8 @@
 """Cut cells: open fractions of faces and the velocity of solids.
 
-All of it comes from the solids' signed distances at the nodes of the grid (the cells' corners), linear in between: exact for planes, of
-second order for smooth walls; at a solid's edges, and where it or a gap is thinner than two cells, off by a part of a cell.
+All of it comes from the solids' signed distances at the nodes of the grid (the cells' corners),
+linear in between: exact for planes, of second order for smooth walls; at a solid's edges, and where
+it or a gap is thinner than two cells, off by a part of a cell.
 """
 
 from __future__ import annotations
@@ -16,7 +17,14 @@ import warp as wp
 from warp_lcp.grid import cut_cells_kernels as kernels
 from warp_lcp.grid.cut_cells_kernels import integrate_kernel
 from warp_lcp.grid.motion import Motions, Pose
-from warp_lcp.grid.node_distance import NodeBox, NodeDistances, NodeSampler, ShapeTable, box_near, node_window
+from warp_lcp.grid.node_distance import (
+    NodeBox,
+    NodeDistances,
+    NodeSampler,
+    ShapeTable,
+    box_near,
+    node_window,
+)
 from warp_lcp.grid.placed_mesh import FlatCells, PlacedMesh, tables_of
 from warp_lcp.grid.shared_distance import enter_layers, measure_together
 from warp_lcp.grid.sides import SIDES, continue_beyond, open_ring
@@ -36,80 +44,132 @@ DEEP = 1e-2  # cells: nodes within it of a solid's surface lie on it
 class CutCells:
     """Cut cells: open fractions of faces and cells beside solids at a time.
 
-    Node (k, j, i) is the low corner of stored cell (k, j, i), face (k, j, i) of a component the cell's lower face; 2-D uses plane k = 1.
-    On a rank's part of a grid making it, and `place`, are collective where solids move or periodic axes are cut.
+    Node (k, j, i) is the low corner of stored cell (k, j, i), face (k, j, i) of a component the
+    cell's lower face; 2-D uses plane k = 1. On a rank's part of a grid making it, and `place`, are
+    collective where solids move or periodic axes are cut.
 
     Args:
         grid: the grid.
         solids: in the order of their numbers, 1 + s; the domain is number 0.
         wall_separating: whether liquid may leave the domain's wall.
         capacity: whether to keep the capacity.
-        remarks: make notes of faces and refuse a grid without open cells; False: the grid is a part of a larger one.
+        remarks: make notes of faces and refuse a grid without open cells; False: the grid is a part
+            of a larger one.
         left_out: numbers of solids that cut no cells; their velocities are kept.
-        open_sides: of `warp_lcp.grid.sides.side_bits`: there the faces are open as far as no solid closes them, and the ring is air.
+        open_sides: of `warp_lcp.grid.sides.side_bits`: there the faces are open as far as no solid
+            closes them, and the ring is air.
 
     Attributes:
-        distance: float32 signed distance to the nearest solid at nodes [cells], positive in the open, exact below `FAR` cells; others are
-            at least that. Without the domain's walls: beside them linear interpolation would close what is open by less than a cell.
-        nearest: the solids' two nearest to each node, see `NodeDistances`: owner, next_near, next_owner; empty when no solid moves.
-        open: float32 open fraction of each face, a list of one field a component: 0, or in [1e-3, 1]; 0 on the domain's faces and outside.
-        wall: int16 number of the solid that closes a face, the nearest to its center: -1 on open faces, 0 on the domain's.
+        distance: float32 signed distance to the nearest solid at nodes [cells], positive in the
+            open, exact below `FAR` cells; others are at least that. Without the domain's walls:
+            beside them linear interpolation would close what is open by less than a cell.
+        nearest: the solids' two nearest to each node, see `NodeDistances`: owner, next_near,
+            next_owner; empty when no solid moves.
+        open: float32 open fraction of each face, a list of one field a component: 0, or in [1e-3,
+            1]; 0 on the domain's faces and outside.
+        wall: int16 number of the solid that closes a face, the nearest to its center: -1 on open
+            faces, 0 on the domain's.
         base: int8, SOLID where all faces of a cell are closed, else AIR; the ring is SOLID.
-        capacity: float32 integral of the cell's quadratic B-spline kernel over what is open, 1 away from walls; None if not asked for.
-        velocity: float32 mean velocity of what is not open of each face [m/s], the component along the face's normal: that of the solid
-            that moves, times its part; None when no solid moves.
-        turn: mat33 of shape (1 + solids,): the velocity of a solid's point x is turn x + shift [1/s].
+        capacity: float32 integral of the cell's quadratic B-spline kernel over what is open, 1 away
+            from walls; None if not asked for.
+        velocity: float32 mean velocity of what is not open of each face [m/s], the component along
+            the face's normal: that of the solid that moves, times its part; None when no solid
+            moves.
+        turn: mat33 of shape (1 + solids,): the velocity of a solid's point x is turn x + shift
+            [1/s].
         shift: vec3 [m/s].
         separating: uint8 of shape (1 + solids,).
         names: of those numbers, the first "domain".
         notes: warnings worth a line at the start of a run.
-        whole_cells: whether every face is open or closed, no solid reaches into a cell with an open face and nothing moves.
+        whole_cells: whether every face is open or closed, no solid reaches into a cell with an open
+            face and nothing moves.
         moves: whether a solid moves.
         moving: kernel argument with the moving solids that cover a face.
 
     Raises:
-        ValueError: a solid that stands still lies wholly outside the domain, or the solids leave no open cell.
+        ValueError: a solid that stands still lies wholly outside the domain, or the solids leave no
+            open cell.
     """
 
     def __init__(
-        self, grid: StaggeredGrid, solids: Sequence[PlacedSolid], *, wall_separating: bool, capacity: bool = True, open_sides: int = 0,
-        remarks: bool = True, left_out: Collection[int] = (),
-    ) -> None:  # fmt: skip
-        self.grid, self.solids, self.open_sides, self._left_out = grid, tuple(solids), open_sides, frozenset(left_out)
+        self,
+        grid: StaggeredGrid,
+        solids: Sequence[PlacedSolid],
+        *,
+        wall_separating: bool,
+        capacity: bool = True,
+        open_sides: int = 0,
+        remarks: bool = True,
+        left_out: Collection[int] = (),
+    ) -> None:
+        self.grid, self.solids, self.open_sides, self._left_out = (
+            grid,
+            tuple(solids),
+            open_sides,
+            frozenset(left_out),
+        )
         self.moves = any(solid.motion is not None for solid in solids)
-        self._differences: dict[int, float] = {}  # between the sides of each periodic axis that is cut [cells]
+        # between the sides of each periodic axis that is cut [cells]
+        self._differences: dict[int, float] = {}
         self.names = ("domain", *(solid.name for solid in solids))
-        self.separating = wp.array([wall_separating, *(solid.separating for solid in solids)], dtype=wp.uint8, device=grid.device)
+        self.separating = wp.array(
+            [wall_separating, *(solid.separating for solid in solids)],
+            dtype=wp.uint8,
+            device=grid.device,
+        )
         self.open, self.wall = grid.faces(), grid.faces(wp.int16)
         self.base, self._state = grid.field(wp.int8), grid.field(wp.int8)
         if open_sides:
-            self._state.assign(np.where(open_ring(grid.shape, open_sides), kernels.OPEN, kernels.CLOSED).astype(np.int8))
+            self._state.assign(
+                np.where(open_ring(grid.shape, open_sides), kernels.OPEN, kernels.CLOSED).astype(
+                    np.int8
+                )
+            )
         self.capacity = grid.field() if capacity else None
         self.velocity = grid.faces() if self.moves else None
         self._counts = wp.zeros(2, dtype=wp.int32, device=grid.device)
-        self._turn, self._shift = (HostArray(1 + len(solids), of, grid.device) for of in (wp.mat33, wp.vec3))
+        self._turn, self._shift = (
+            HostArray(1 + len(solids), of, grid.device) for of in (wp.mat33, wp.vec3)
+        )
         self.turn, self.shift = self._turn.array, self._shift.array
         notes = start_notes(self.solids, grid, self._left_out)
         self._sampler, self._nodes = NodeSampler(grid), NodeDistances(grid, second=len(solids) > 1)
         self.distance = self._nodes.near
         self.nearest = self._nodes.arrays[1:] if self.moves else []
-        standing = [(number, solid.geometry) for number, solid in self._cutting() if solid.motion is None]
+        standing = [
+            (number, solid.geometry) for number, solid in self._cutting() if solid.motion is None
+        ]
         for number, geometry in standing:
             self._sampler.enter(self._nodes, number, geometry)
         self._marks = wp.array(_ring(grid, open_sides), dtype=wp.int8, device=grid.device)
-        self._sampler.look_at_centers(self._nodes, lambda: [geometry for _, geometry in standing], (0, 0, 0), grid.shape[::-1], self._marks)
+        self._sampler.look_at_centers(
+            self._nodes,
+            lambda: [geometry for _, geometry in standing],
+            (0, 0, 0),
+            grid.shape[::-1],
+            self._marks,
+        )
         wp.copy(self.base, self._marks)
-        self._moved_from: NodeBox | None = None  # nodes near the solids that move, where the velocity was filled last
+        # nodes near the solids that move, where the velocity was filled last
+        self._moved_from: NodeBox | None = None
         self._moved_to: NodeBox | None = None  # and where they are
-        moving = [(number, solid) for number, solid in enumerate(solids, start=1) if solid.motion is not None]
+        moving = [
+            (number, solid)
+            for number, solid in enumerate(solids, start=1)
+            if solid.motion is not None
+        ]
         self.motions, self._moving = (
             Motions([solid.motion for _, solid in moving if solid.motion is not None]),
             [number for number, _ in moving],
         )
         next_to_each_other = len(moving) and self._moving[-1] - self._moving[0] == len(moving) - 1
-        self._moves = slice(self._moving[0], self._moving[-1] + 1) if next_to_each_other else self._moving
+        self._moves = (
+            slice(self._moving[0], self._moving[-1] + 1) if next_to_each_other else self._moving
+        )
         if self.moves:
-            self._runs = list(_runs(grid, [(number, solid.geometry) for number, solid in moving], self._left_out))
+            self._runs = list(
+                _runs(grid, [(number, solid.geometry) for number, solid in moving], self._left_out)
+            )
             self._standing = NodeDistances(grid, second=len(solids) > 1)
             self._standing.copy_from(self._nodes)
             self._flat = self._flat_cells(standing)
@@ -122,7 +182,9 @@ class CutCells:
             self._filling = LaunchGraph(grid.device, self._launch_velocity)
             self.moving = kernels.Moving()
             self.moving.nodes, self.moving.standing = self._nodes.struct, self._standing.near
-            self.moving.moves = wp.array([False, *(s.motion is not None for s in solids)], dtype=wp.uint8, device=grid.device)
+            self.moving.moves = wp.array(
+                [False, *(s.motion is not None for s in solids)], dtype=wp.uint8, device=grid.device
+            )
             self.place(0.0)
         else:
             self._join()
@@ -135,7 +197,11 @@ class CutCells:
 
     def _cutting(self) -> Iterator[tuple[int, PlacedSolid]]:
         """Yield the solids that cut cells, and their numbers."""
-        return ((number, solid) for number, solid in enumerate(self.solids, start=1) if number not in self._left_out)
+        return (
+            (number, solid)
+            for number, solid in enumerate(self.solids, start=1)
+            if number not in self._left_out
+        )
 
     @property
     def dropped(self) -> int:
@@ -174,8 +240,9 @@ class CutCells:
     def set_velocity(self, time: float, dt: float) -> None:
         """Set the velocity: displacement of the solids' points over a time, divided by it.
 
-        So the volume that a wall sweeps is its displacement's, whatever the motion is like within the step. Bodies that the material moves
-        have the velocities of their state: those are what it changes, and no rotation of such a field changes a volume.
+        So the volume that a wall sweeps is its displacement's, whatever the motion is like within
+        the step. Bodies that the material moves have the velocities of their state: those are what
+        it changes, and no rotation of such a field changes a volume.
 
         Args:
             time: at which the solids were placed [s].
@@ -188,7 +255,9 @@ class CutCells:
             return
         if dt == 0.0:
             raise ValueError("dt = 0: a velocity needs two different times")
-        self._turn.host[self._moves], self._shift.host[self._moves] = self.motions.velocity_fields(time, dt)
+        self._turn.host[self._moves], self._shift.host[self._moves] = self.motions.velocity_fields(
+            time, dt
+        )
         self._turn.send()
         self._shift.send()
         near = _around([box for box in (self._moved_from, self._moved_to) if box is not None])
@@ -205,9 +274,22 @@ class CutCells:
         """Launch the pass that sets the velocity of the solids on faces."""
         assert self.velocity is not None, "a solid moves"
         grid = self.grid
-        fields = [field for each in (self.open, self.wall, self.velocity) for field in (*each, *each[1:2])[:3]]  # in 2-D no third one
-        inputs = [self.moving, grid.planes, grid.spacing, wp.vec3i(*grid.origin), wp.vec3i(*grid.counts)]
-        self._swept.launch(kernels.velocity_kernel, [*inputs, *fields[:6], self.turn, self.shift, *fields[6:]])
+        # in 2-D no third one
+        fields = [
+            field
+            for each in (self.open, self.wall, self.velocity)
+            for field in (*each, *each[1:2])[:3]
+        ]
+        inputs = [
+            self.moving,
+            grid.planes,
+            grid.spacing,
+            wp.vec3i(*grid.origin),
+            wp.vec3i(*grid.counts),
+        ]
+        self._swept.launch(
+            kernels.velocity_kernel, [*inputs, *fields[:6], self.turn, self.shift, *fields[6:]]
+        )
 
     def moving_block(self) -> tuple[list[int], list[int]] | None:
         """Return the block of cells beside moving solids, or None.
@@ -216,7 +298,10 @@ class CutCells:
         """
         if self._moved_to is None:
             return None
-        first, last = [max(start - 1, 1) for start in self._moved_to[0]], list(map(min, self._moved_to[1], self.grid.counts))
+        first, last = (
+            [max(start - 1, 1) for start in self._moved_to[0]],
+            list(map(min, self._moved_to[1], self.grid.counts)),
+        )
         return (first, last) if all(map(le, first, last)) else None
 
     def _enter_moving(self, time: float) -> None:
@@ -227,12 +312,19 @@ class CutCells:
         for run in self._runs:
             if not isinstance(run, int):
                 run.place(rotations[0, run.places], translations[0, run.places])
-        boxes = [box_near(self.grid, self._placed(run)) if isinstance(run, int) else run.box for run in self._runs]
+        boxes = [
+            box_near(self.grid, self._placed(run)) if isinstance(run, int) else run.box
+            for run in self._runs
+        ]
         self._moved_to = _around([box for box in boxes if box is not None])
-        self._near.move_to(node_window(self.grid, *self._sampler.inner(*(self._moved_to or NOWHERE))))
+        self._near.move_to(
+            node_window(self.grid, *self._sampler.inner(*(self._moved_to or NOWHERE)))
+        )
         self._entering.run()
         if self._moved_to is not None and self._flat is None:
-            self._sampler.look_at_centers(self._nodes, self._all_placed, *self._moved_to, self.base, listed=True)
+            self._sampler.look_at_centers(
+                self._nodes, self._all_placed, *self._moved_to, self.base, listed=True
+            )
 
     def _launch_refreshing(self) -> None:
         self._refresh()
@@ -268,12 +360,20 @@ class CutCells:
     def _all_placed(self) -> list[Geometry]:
         """Return all solids where they are."""
         standing = [solid.geometry for _, solid in self._cutting() if solid.motion is None]
-        return [*standing, *(self._placed(place) for place, number in enumerate(self._moving) if number not in self._left_out)]
+        return [
+            *standing,
+            *(
+                self._placed(place)
+                for place, number in enumerate(self._moving)
+                if number not in self._left_out
+            ),
+        ]
 
     def _enter(self) -> None:
         """Enter the distances of the solids that move where they are.
 
-        A mesh takes microseconds a node, so that several processes share its nodes; then it is collective.
+        A mesh takes microseconds a node, so that several processes share its nodes; then it is
+        collective.
         """
         placed = {run: self._placed(run) for run in self._runs if isinstance(run, int)}
         meshes = {run: solid for run, solid in placed.items() if isinstance(solid, TriangleMesh)}
@@ -295,8 +395,11 @@ class CutCells:
         part.fill(*self._nodes.arrays, self.base)
         apart = np.abs(measured - np.clip(near.numpy(), -CLOSE, CLOSE))
         for axis in part.joined:
-            end = self.grid.domain_counts[axis] + 1 - self.grid.origin[axis]  # the domain's upper side, where the part reaches it
-            self._differences[axis] = float(np.moveaxis(apart, 2 - axis, 0)[end : end + 1].max(initial=0.0))
+            # the domain's upper side, where the part reaches it
+            end = self.grid.domain_counts[axis] + 1 - self.grid.origin[axis]
+            self._differences[axis] = float(
+                np.moveaxis(apart, 2 - axis, 0)[end : end + 1].max(initial=0.0)
+            )
 
     def difference(self, axis: int) -> float:
         """Return the difference of distances at two periodic sides [cells]; collective.
@@ -338,9 +441,20 @@ class CutCells:
         for number in range(2 * grid.dimension):
             if self.open_sides >> number & 1:
                 self._open_side(number >> 1, SIDES[number])
-        grid.domain.run(kernels.STATES, planes=planes, d=nodes.near, base=self.base, state=self._state, ax=ax, ay=ay, az=az)
+        grid.domain.run(
+            kernels.STATES,
+            planes=planes,
+            d=nodes.near,
+            base=self.base,
+            state=self._state,
+            ax=ax,
+            ay=ay,
+            az=az,
+        )
         if self.capacity is not None:
-            integrate_kernel(grid.domain, planes, nodes.near, self._state, self.capacity, grid.origin)
+            integrate_kernel(
+                grid.domain, planes, nodes.near, self._state, self.capacity, grid.origin
+            )
             continue_beyond(grid, self.open_sides, self.capacity)
 
     def _open_side(self, axis: int, name: str) -> None:
@@ -349,7 +463,15 @@ class CutCells:
         face = 1 + grid.counts[axis] if SIDES.index(name) & 1 else 1
         low, high = [1, 1, 1], list(grid.counts)
         low[axis] = high[axis] = face
-        inputs = [grid.planes, axis, self._nodes.near, self._nodes.arrays[1], self.open[axis], self.wall[axis], self._counts]
+        inputs = [
+            grid.planes,
+            axis,
+            self._nodes.near,
+            self._nodes.arrays[1],
+            self.open[axis],
+            self.wall[axis],
+            self._counts,
+        ]
         grid.window(low, high).launch(kernels.side_kernel, inputs)
 
     def _reaches_into_open_cells(self) -> bool:
@@ -357,16 +479,24 @@ class CutCells:
         corners = self.distance.numpy()
         for axis in range(self.grid.dimension):
             corners = np.minimum(corners, np.roll(corners, -1, axis=2 - axis))
-        return bool((self.grid.interior(corners)[self.grid.interior(self.base.numpy()) != SOLID] < -DEEP).any())
+        return bool(
+            (
+                self.grid.interior(corners)[self.grid.interior(self.base.numpy()) != SOLID] < -DEEP
+            ).any()
+        )
 
     def _result_notes(self, dropped: int) -> list[str]:
         """Return what is to be said about the faces."""
         grid = self.grid
         check_open(not self.solids or bool((grid.interior(self.base.numpy()) != SOLID).any()))
-        counts = [np.bincount(wall.numpy().ravel() + 1, minlength=1 + len(self.names)) for wall in self.wall]
+        counts = [
+            np.bincount(wall.numpy().ravel() + 1, minlength=1 + len(self.names))
+            for wall in self.wall
+        ]
         closed = np.sum(counts, axis=0)[1:]
         notes = [
-            f"{solid.name} closes no part of a face: it is too small for cells of {grid.spacing:.4g} m, or lies in other solids"
+            f"{solid.name} closes no part of a face: it is too small for cells of "
+            f"{grid.spacing:.4g} m, or lies in other solids"
             for number, solid in self._cutting()
             if not closed[number] and solid.motion is None
         ]
@@ -386,7 +516,11 @@ def _ring(grid: StaggeredGrid, open_sides: int) -> np.ndarray:
 def _around(boxes: Sequence[NodeBox]) -> NodeBox | None:
     """Return the box around boxes of nodes; None: there are none."""
     lows, highs = zip(*boxes, strict=True) if boxes else ((), ())
-    return (tuple(map(min, zip(*lows, strict=True))), tuple(map(max, zip(*highs, strict=True)))) if boxes else None
+    return (
+        (tuple(map(min, zip(*lows, strict=True))), tuple(map(max, zip(*highs, strict=True))))
+        if boxes
+        else None
+    )
 
 
 def _runs(

@@ -15,10 +15,15 @@ from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.native import text
 from warp_lcp.rows.program import launch
 
-DROP = 1.0e-3  # open fractions below become 0: raised, they would lift a flow along the wall; kept, they spoil the condition number
+# open fractions below become 0: raised, they would lift a flow along the wall; kept, they spoil the
+# condition number
+DROP = 1.0e-3
 CLOSED, OPEN, CUT = 0, 1, 2  # states of cells
 
-KERNELS = KernelFile(Path(__file__).parent / "headers/cut_cells.h", {"DROP": DROP, "HOLLOW": HOLLOW, "AIR": AIR, "SOLID": SOLID})
+KERNELS = KernelFile(
+    Path(__file__).parent / "headers/cut_cells.h",
+    {"DROP": DROP, "HOLLOW": HOLLOW, "AIR": AIR, "SOLID": SOLID},
+)
 FRACTIONS = KERNELS["warp_lcp.grid.cut_cells.fractions"]
 STATES = KERNELS["warp_lcp.grid.cut_cells.states"]
 
@@ -52,11 +57,27 @@ def open_face(near: F32, axis: int, planes: int, k: int, j: int, i: int):
     """Return which share of a lower face is open, from a distance at nodes."""
     c, b, a = corner(axis, planes, 1)
     z, y, x = corner(axis, planes, 2)
-    return open_area(near[k, j, i], near[k + c, j + b, i + a], near[k + c + z, j + b + y, i + a + x], near[k + z, j + y, i + x])
+    return open_area(
+        near[k, j, i],
+        near[k + c, j + b, i + a],
+        near[k + c + z, j + b + y, i + a + x],
+        near[k + z, j + y, i + x],
+    )
 
 
 @cell_kernel("warp_lcp.grid.cut_cells", ordered=True)
-def side_kernel(k, j, i, planes: int, axis: int, near: F32, owner: I16, open: F32, wall: I16, counts: wp.array(dtype=wp.int32)):
+def side_kernel(
+    k,
+    j,
+    i,
+    planes: int,
+    axis: int,
+    near: F32,
+    owner: I16,
+    open: F32,
+    wall: I16,
+    counts: wp.array(dtype=wp.int32),
+):
     """Fill open fractions and wall numbers of the faces on an open side of the domain; count the dropped and the partial ones."""
     free = open_face(near, axis, planes, k, j, i)
     if free > 0.0 and free < DROP:
@@ -105,8 +126,9 @@ def least_moving(S: Moving, k: int, j: int, i: int):
 def moving_part(S: Moving, axis: int, planes: int, k: int, j: int, i: int, open: F32, wall: I16):
     """Return the moving solid that covers a face, 0 if none does, and its part of what is not open.
 
-    What the solids that stand still cover rests, and so does a face of the domain but for the part that a moving solid covers: of a
-    piston that slides over a floor, the part above the floor displaces liquid.
+    What the solids that stand still cover rests, and so does a face of the domain but for the part
+    that a moving solid covers: of a piston that slides over a floor, the part above the floor
+    displaces liquid.
     """
     free = open[k, j, i]
     solid = int(0)
@@ -135,14 +157,29 @@ def moving_part(S: Moving, axis: int, planes: int, k: int, j: int, i: int, open:
 
 @wp.func
 def face_velocity(
-    S: Moving, axis: int, planes: int, spacing: float, origin: wp.vec3i, k: int, j: int, i: int, open: F32, wall: I16, turn: _TURNS,
+    S: Moving,
+    axis: int,
+    planes: int,
+    spacing: float,
+    origin: wp.vec3i,
+    k: int,
+    j: int,
+    i: int,
+    open: F32,
+    wall: I16,
+    turn: _TURNS,
     shift: _SHIFTS,
-):  # fmt: skip
+):
     """Return the mean velocity of what is not open of a face [m/s], at its center turn x + shift of a solid that moves."""
     value = float(0.0)
     solid, part = moving_part(S, axis, planes, k, j, i, open, wall)
     if solid > 0:
-        x = wp.vec3(float(i + origin[0]) - 0.5, float(j + origin[1]) - 0.5, float(k + origin[2]) - 0.5) * spacing
+        x = (
+            wp.vec3(
+                float(i + origin[0]) - 0.5, float(j + origin[1]) - 0.5, float(k + origin[2]) - 0.5
+            )
+            * spacing
+        )
         x[axis] = x[axis] - 0.5 * spacing
         if planes == 1:
             x[2] = 0.0
@@ -152,9 +189,26 @@ def face_velocity(
 
 @cell_kernel("warp_lcp.grid.cut_cells")
 def velocity_kernel(
-    k, j, i, S: Moving, planes: int, spacing: float, origin: wp.vec3i, counts: wp.vec3i, ax: F32, ay: F32, az: F32, wx: I16, wy: I16,
-    wz: I16, turn: _TURNS, shift: _SHIFTS, u: F32, v: F32, w: F32,
-):  # fmt: skip
+    k,
+    j,
+    i,
+    S: Moving,
+    planes: int,
+    spacing: float,
+    origin: wp.vec3i,
+    counts: wp.vec3i,
+    ax: F32,
+    ay: F32,
+    az: F32,
+    wx: I16,
+    wy: I16,
+    wz: I16,
+    turn: _TURNS,
+    shift: _SHIFTS,
+    u: F32,
+    v: F32,
+    w: F32,
+):
     """Fill the velocities of the lower faces of cells, and of the domain's upper ones."""
     if j <= counts[1] and (planes == 1 or k <= counts[2]):
         u[k, j, i] = face_velocity(S, 0, planes, spacing, origin, k, j, i, ax, wx, turn, shift)
@@ -178,7 +232,8 @@ def cut_cell(near_: F32, out_: F32, planes: int, k: int, j: int, i: int): ...
 def cut_kernel(cells: CellRange, color: wp.vec3i, planes: int, near: F32, state: I8, capacity: F32):
     """Integrate over every third cut cell along each axis, from cell (color[2], color[1], color[0]) of the box on.
 
-    Cells add to their neighbors: those of one color have none in common, so nothing races and sums keep their order.
+    Cells add to their neighbors: those of one color have none in common, so nothing races and sums
+    keep their order.
     """
     plane, row, chunk = wp.tid()
     k = cells.k + color[2] + COLORS * plane
@@ -190,7 +245,15 @@ def cut_kernel(cells: CellRange, color: wp.vec3i, planes: int, near: F32, state:
 
 
 @forward_kernel(**options)
-def cut_in_order_kernel(low: wp.vec3i, high: wp.vec3i, origin: wp.vec3i, planes: int, near: F32, state: I8, capacity: F32):
+def cut_in_order_kernel(
+    low: wp.vec3i,
+    high: wp.vec3i,
+    origin: wp.vec3i,
+    planes: int,
+    near: F32,
+    state: I8,
+    capacity: F32,
+):
     """Integrate over the cut cells of a box, color after color; one thread."""
     colors = COLORS * COLORS
     if planes == 2:
@@ -207,7 +270,12 @@ def cut_in_order_kernel(low: wp.vec3i, high: wp.vec3i, origin: wp.vec3i, planes:
 
 
 def integrate_kernel(
-    window: Window, planes: int, near: wp.array, state: wp.array, capacity: wp.array, origin: tuple[int, int, int] = (0, 0, 0)
+    window: Window,
+    planes: int,
+    near: wp.array,
+    state: wp.array,
+    capacity: wp.array,
+    origin: tuple[int, int, int] = (0, 0, 0),
 ) -> None:
     """Integrate each cell's kernel over what is open.
 
@@ -219,17 +287,40 @@ def integrate_kernel(
         capacity: float32 (written, the ring included).
         origin: of a part of a grid, in which sums then keep the order that they have in all of it.
     """
-    everywhere = Window((1, 0, 0) if planes == 1 else (0, 0, 0), (2 if planes == 1 else state.shape[0], *state.shape[1:]), window.device)
+    everywhere = Window(
+        (1, 0, 0) if planes == 1 else (0, 0, 0),
+        (2 if planes == 1 else state.shape[0], *state.shape[1:]),
+        window.device,
+    )
     everywhere.run(OPEN_CELLS, planes=planes, state=state, capacity=capacity)
     if window.device.is_cpu:
-        inputs = [wp.vec3i(*window.low), wp.vec3i(*window.high), wp.vec3i(*origin), planes, near, state, capacity]
+        inputs = [
+            wp.vec3i(*window.low),
+            wp.vec3i(*window.high),
+            wp.vec3i(*origin),
+            planes,
+            near,
+            state,
+            capacity,
+        ]
         launch(cut_in_order_kernel, 1, inputs, device=window.device)
         return
     chunks = -(-(window.high[2] - window.low[2]) // window.cells.grain)
-    for color in itertools.product(range(COLORS if planes == 2 else 1), range(COLORS), range(COLORS)):
+    for color in itertools.product(
+        range(COLORS if planes == 2 else 1), range(COLORS), range(COLORS)
+    ):
         z, y, x = ((c - before) % COLORS for c, before in zip(color, reversed(origin), strict=True))
-        # rows and planes of this color; chunks of a row are counted in cells of this color too, the last may be empty
-        rows = [-(-max(high - low - color, 0) // COLORS) for low, high, color in zip(window.low, window.high, (z, y, x), strict=True)]
+        # rows and planes of this color; chunks of a row are counted in cells of this color too, the
+        # last may be empty
+        rows = [
+            -(-max(high - low - color, 0) // COLORS)
+            for low, high, color in zip(window.low, window.high, (z, y, x), strict=True)
+        ]
         if min(rows) > 0:
             dim = (rows[0], rows[1], -(-rows[2] // window.cells.grain) if chunks > 1 else 1)
-            launch(cut_kernel, dim, [window.cells, wp.vec3i(x, y, z), planes, near, state, capacity], device=window.device)
+            launch(
+                cut_kernel,
+                dim,
+                [window.cells, wp.vec3i(x, y, z), planes, near, state, capacity],
+                device=window.device,
+            )

@@ -14,7 +14,9 @@ from warp_lcp.rows import KernelFile
 
 BLOCKED = -1  # not to be filled
 UNKNOWN = 0  # to be filled; positive: known since that layer, 1 from the start
-REACH = 2  # layers around faces with weight: as far as the density of a cell tells of particles beyond its neighbors
+# layers around faces with weight: as far as the density of a cell tells of particles beyond its
+# neighbors
+REACH = 2
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/staggered.h")
 LAYER = KERNELS["warp_lcp.grid.extrapolate.fill_layer"]
@@ -28,9 +30,13 @@ def weighted_kernel(k, j, i, least: float, weight: F32, known: I8):
 
 
 def complete(
-    window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], known: Sequence[wp.array],
-    join: Callable[[wp.array, wp.array], None] | None = None, barriers: typing.Any = None,
-) -> None:  # fmt: skip
+    window: Window,
+    velocity: Sequence[wp.array],
+    weights: Sequence[wp.array],
+    known: Sequence[wp.array],
+    join: Callable[[wp.array, wp.array], None] | None = None,
+    barriers: typing.Any = None,
+) -> None:
     """Extrapolate the particles' velocity to nearby faces without weight.
 
     Cells beyond those may be full or dense.
@@ -48,26 +54,43 @@ def complete(
         window.launch(weighted_kernel, [TINY_WEIGHT, weight, marks])
         if join is not None:  # weights are 0 in the ring
             join(marks, field)
-        extrapolate(window, marks, field, REACH, join=join, apart=None if barriers is None else barriers.apart[axis])
+        extrapolate(
+            window,
+            marks,
+            field,
+            REACH,
+            join=join,
+            apart=None if barriers is None else barriers.apart[axis],
+        )
 
 
 def extrapolate(
-    window: Window, known: wp.array, field: wp.array, layers: int, *, start: int = 1, fill: int = UNKNOWN,
-    join: Callable[[wp.array, wp.array], None] | None = None, apart: wp.array | None = None,
-) -> None:  # fmt: skip
+    window: Window,
+    known: wp.array,
+    field: wp.array,
+    layers: int,
+    *,
+    start: int = 1,
+    fill: int = UNKNOWN,
+    join: Callable[[wp.array, wp.array], None] | None = None,
+    apart: wp.array | None = None,
+) -> None:
     """Extrapolate a field: unknown faces get the mean of their known neighbors.
 
     One layer after the other.
 
     Args:
         window: faces to consider; `known` must not be positive outside it.
-        known: int8, one value a face: positive where `field` is known, `UNKNOWN`, or `BLOCKED` (updated: layer + 1).
+        known: int8, one value a face: positive where `field` is known, `UNKNOWN`, or `BLOCKED`
+            (updated: layer + 1).
         field: one component of the velocity [m/s] (updated).
         layers: how many layers to fill, >= 0.
         start: faces marked 1..start are sources of the first layer.
         fill: the mark of the faces to fill, `UNKNOWN` or `BLOCKED`.
-        join: called with known and field after each layer, where faces at two sides of the domain are the same.
-        apart: uint8, which neighbors thin solids hold apart, see `warp_lcp.grid.barriers`; None: none.
+        join: called with known and field after each layer, where faces at two sides of the domain
+            are the same.
+        apart: uint8, which neighbors thin solids hold apart, see `warp_lcp.grid.barriers`; None:
+            none.
 
     Raises:
         ValueError: the marks would not fit in int8.

@@ -24,14 +24,17 @@ PARTS = {2: 4, 3: 2}  # points an axis that a cell on the surface is sampled at
 class LevelSet:
     """Level set: signed distance of cell centers to the liquid's surface.
 
-    The density is the sum of the particles' quadratic B-splines at the cell's center, in units of the density at rest. Divided by the
-    capacity, what the cell's kernel can hold beside solids, it is the filled share of the kernel, and phi is the distance at which a half
-    space fills that share: unbiased for a plane along an axis, at a wall that the plane is perpendicular to as well, without a radius to
-    tune. A plane across the axes is off by up to 0.01 cells. A film on a wall within the kernel's reach looks too thin: phi is 0
-    with the liquid still 0.11 cells above the center of a cell that the wall bounds, 0.36 above a center that lies on the wall.
+    The density is the sum of the particles' quadratic B-splines at the cell's center, in units of
+    the density at rest. Divided by the capacity, what the cell's kernel can hold beside solids, it
+    is the filled share of the kernel, and phi is the distance at which a half space fills that
+    share: unbiased for a plane along an axis, at a wall that the plane is perpendicular to as well,
+    without a radius to tune. A plane across the axes is off by up to 0.01 cells. A film on a wall
+    within the kernel's reach looks too thin: phi is 0 with the liquid still 0.11 cells above the
+    center of a cell that the wall bounds, 0.36 above a center that lies on the wall.
 
-    Binomial passes (1, 2, 1)/4 over density and capacity make the kernel wider and closer to the normal distribution of variance
-    1/4 + passes/2, whose quantile phi then is. They quiet a surface at rest and erase thin fronts.
+    Binomial passes (1, 2, 1)/4 over density and capacity make the kernel wider and closer to the
+    normal distribution of variance 1/4 + passes/2, whose quantile phi then is. They quiet a surface
+    at rest and erase thin fronts.
 
     Args:
         grid: the grid.
@@ -39,9 +42,11 @@ class LevelSet:
         smoothing: binomial passes, >= 0.
 
     Attributes:
-        phi: [cells], float32, < 0 in the liquid, within +-`limit`; SOLID cells within two of an open one have the mean of their
-            neighbors, others and all cells outside the window are air.
-        density: in units of the density at rest, float32, in open cells and in SOLID ones next to them.
+        phi: [cells], float32, < 0 in the liquid, within +-`limit`; SOLID cells within two of an
+            open one have the mean of their neighbors, others and all cells outside the window are
+            air.
+        density: in units of the density at rest, float32, in open cells and in SOLID ones next to
+            them.
         limit: the largest |phi| [cells].
 
     Raises:
@@ -60,19 +65,34 @@ class LevelSet:
         self.phi.fill_(self.limit)
         self._scratch = [grid.field() for _ in range(3)] if smoothing else []
         self._volume: WindowTally | None = None  # made when it is first asked for
-        self._box, self._measuring = ActiveWindow(grid.domain), LaunchGraph(grid.device, self._launch_volume)
-        self._left, self._leaving = ActiveWindow(grid.domain), LaunchGraph(grid.device, self._launch_leaving)
+        self._box, self._measuring = (
+            ActiveWindow(grid.domain),
+            LaunchGraph(grid.device, self._launch_volume),
+        )
+        self._left, self._leaving = (
+            ActiveWindow(grid.domain),
+            LaunchGraph(grid.device, self._launch_leaving),
+        )
         self._measured = False
         self._filled: Window | None = None
 
-    def update(self, particles: Particles, window: Window, capacity: wp.array | None, base: wp.array, *, fill: Fill | None = None) -> None:
+    def update(
+        self,
+        particles: Particles,
+        window: Window,
+        capacity: wp.array | None,
+        base: wp.array,
+        *,
+        fill: Fill | None = None,
+    ) -> None:
         """Compute the level set of the particles.
 
         Args:
-            particles: the liquid. If it is indexed it must not have moved since it was sorted: each cell then gathers from the particles
-                around it, the same bits on every run of a GPU. Otherwise they scatter.
-            window: cells that hold all particles, with 2 + 2 `smoothing` to spare on each side: what a pass reads from beyond the window
-                then stays out of reach of the density.
+            particles: the liquid. If it is indexed it must not have moved since it was sorted: each
+                cell then gathers from the particles around it, the same bits on every run of a GPU.
+                Otherwise they scatter.
+            window: cells that hold all particles, with 2 + 2 `smoothing` to spare on each side:
+                what a pass reads from beyond the window then stays out of reach of the density.
             capacity: share of each cell's kernel that is open, float32; None: 1 everywhere.
             base: int8, SOLID in cells that hold no liquid.
             fill: adds the density of liquid without particles in a window.
@@ -90,7 +110,15 @@ class LevelSet:
     def _launch_leaving(self) -> None:
         self._left.launch(kernels.clear_kernel, [self.limit, self.phi, self._known])
 
-    def compute(self, particles: Particles, window: Window, capacity: wp.array | None, base: wp.array, *, fill: Fill | None = None) -> None:
+    def compute(
+        self,
+        particles: Particles,
+        window: Window,
+        capacity: wp.array | None,
+        base: wp.array,
+        *,
+        fill: Fill | None = None,
+    ) -> None:
         """Launch what `update` does after `leave`."""
         grid = self.grid
         particle_density(grid, particles, window, self.particles_a_cell, self.density)
@@ -98,18 +126,30 @@ class LevelSet:
             fill(window, self.density)
         density, smooth = self.density, None
         if self.smoothing:
-            clear(*self._scratch[:2])  # a pass looks one cell beyond the window, where an earlier update may have left something
+            # a pass looks one cell beyond the window, where an earlier update may have left
+            # something
+            clear(*self._scratch[:2])
             density = self._smoothed(window, self.density, self._scratch[0], self._scratch[1])
             if capacity is not None:
                 free = self._scratch[1] if density is self._scratch[0] else self._scratch[0]
                 smooth = self._smoothed(window, capacity, free, self._scratch[2])
         window.run(
-            kernels.DISTANCE, density=density, capacity=capacity, smooth=smooth, base=base, phi=self.phi, known=self._known,
-            spread=self._spread, limit=self.limit,
-        )  # fmt: skip
+            kernels.DISTANCE,
+            density=density,
+            capacity=capacity,
+            smooth=smooth,
+            base=base,
+            phi=self.phi,
+            known=self._known,
+            spread=self._spread,
+            limit=self.limit,
+        )
         if smooth is not None:
             shifted = next(field for field in self._scratch if field is not smooth)
-            window.launch(kernels.wall_shift_kernel, [self._spread**2, self.limit, smooth, self.phi, self._known, shifted])
+            window.launch(
+                kernels.wall_shift_kernel,
+                [self._spread**2, self.limit, smooth, self.phi, self._known, shifted],
+            )
             window.run(COPY, source=shifted, field=self.phi)
         apart = grid.barriers.apart[-1] if grid.barriers is not None else None
         extrapolate(window, self._known, self.phi, kernels.EXTENDED, apart=apart)
@@ -120,8 +160,8 @@ class LevelSet:
         phi is multilinear between the cells' centers.
 
         Args:
-            distance: signed distance to the solids at the cells' low corners [cells], > 0 in the open, float32; None: solids are the
-                cells that were SOLID in the last update.
+            distance: signed distance to the solids at the cells' low corners [cells], > 0 in the
+                open, float32; None: solids are the cells that were SOLID in the last update.
             window: that of the last update.
         """
         self.measure(distance, window)
@@ -145,14 +185,27 @@ class LevelSet:
     def _launch_volume(self, distance: wp.array | None) -> None:
         grid = self.grid
         assert self._volume is not None
-        self._volume.take(self._box, phi=self.phi, known=self._known, distance=distance, planes=grid.planes, parts=PARTS[grid.dimension])
+        self._volume.take(
+            self._box,
+            phi=self.phi,
+            known=self._known,
+            distance=distance,
+            planes=grid.planes,
+            parts=PARTS[grid.dimension],
+        )
 
     @property
     def measured(self) -> float:
         """Measured volume [m^3; m^2 in 2-D]."""
-        return self._volume.read()[0] * self.grid.cell_volume if self._volume is not None and self._measured else 0.0
+        return (
+            self._volume.read()[0] * self.grid.cell_volume
+            if self._volume is not None and self._measured
+            else 0.0
+        )
 
-    def _smoothed(self, window: Window, source: wp.array, first: wp.array, second: wp.array) -> wp.array:
+    def _smoothed(
+        self, window: Window, source: wp.array, first: wp.array, second: wp.array
+    ) -> wp.array:
         """Return the source after the binomial passes; in one of two scratch fields."""
         for _ in range(self.smoothing):
             window.run(kernels.BINOMIAL, planes=self.grid.planes, source=source, out=first)
@@ -160,7 +213,13 @@ class LevelSet:
         return source
 
 
-def particle_density(grid: StaggeredGrid, particles: Particles, window: Window, particles_a_cell: int, density: wp.array) -> None:
+def particle_density(
+    grid: StaggeredGrid,
+    particles: Particles,
+    window: Window,
+    particles_a_cell: int,
+    density: wp.array,
+) -> None:
     """Compute the density of particles at cell centers, relative to rest.
 
     By quadratic B-splines.
@@ -175,12 +234,27 @@ def particle_density(grid: StaggeredGrid, particles: Particles, window: Window, 
     position, each = particles.position, 1.0 / particles_a_cell
     clear(density)
     if particles.offsets is not None:
-        window.run(kernels.GATHER, grid.placement, position=position, offsets=particles.offsets, density=density, each=each)
+        window.run(
+            kernels.GATHER,
+            grid.placement,
+            position=position,
+            offsets=particles.offsets,
+            density=density,
+            each=each,
+        )
         if grid.barriers is not None:
             grid.barriers.density(window, particles.offsets, position, density, each)
     else:
         touched = touched_planes(grid, position)
-        scatter(kernels.SCATTER, grid, position, touched, runs=particles.runs, density=density, each=each)
+        scatter(
+            kernels.SCATTER,
+            grid,
+            position,
+            touched,
+            runs=particles.runs,
+            density=density,
+            each=each,
+        )
 
 
 def whole_cell_capacity(grid: StaggeredGrid, base: wp.array, capacity: wp.array) -> None:

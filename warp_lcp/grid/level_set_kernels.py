@@ -1,9 +1,9 @@
 # mypy: ignore-errors
 """Kernels of the level set: the particles' density, the distance that a filled share of a cell's kernel means, the volume it encloses.
 
-A cell's kernel is the quadratic B-spline around its center, three cells wide along each axis. G(s), the share of it that a half space
-filled up to s cells from its center holds, is a cubic in pieces: (s + 3/2)^3 / 6 up to -1/2, 1/2 + 3/4 s - s^3 / 3 up to 1/2, and
-G(-s) = 1 - G(s).
+A cell's kernel is the quadratic B-spline around its center, three cells wide along each axis. G(s),
+the share of it that a half space filled up to s cells from its center holds, is a cubic in pieces:
+(s + 3/2)^3 / 6 up to -1/2, 1/2 + 3/4 s - s^3 / 3 up to 1/2, and G(-s) = 1 - G(s).
 """
 
 from pathlib import Path
@@ -14,8 +14,9 @@ from warp_lcp.grid.cell_kernel import F32, I8, cell_kernel
 from warp_lcp.operators.grid_poisson import SOLID
 from warp_lcp.rows import KernelFile
 
-# Of a cell's kernel: where less is open, too few particles fit to tell (one, of four a cell), and an empty wedge deep in the liquid would
-# count as air, into which the liquid falls. Such a cell is given its neighbors' distance.
+# Of a cell's kernel: where less is open, too few particles fit to tell (one, of four a cell), and
+# an empty wedge deep in the liquid would count as air, into which the liquid falls. Such a cell is
+# given its neighbors' distance.
 MIN_CAPACITY = 0.25
 TAIL = 1e-4  # the least filled share whose quantile is taken after smoothing
 EXTENDED = 2  # layers of cells without a distance of their own that are given one
@@ -42,21 +43,49 @@ def slope_beside(here: float, below: float, above: float, has_below: bool, has_a
 
 
 @cell_kernel("warp_lcp.grid.level_set")
-def wall_shift_kernel(k, j, i, variance: float, limit: float, capacity: F32, phi: F32, known: I8, out: F32):
+def wall_shift_kernel(
+    k, j, i, variance: float, limit: float, capacity: F32, phi: F32, known: I8, out: F32
+):
     """Bring phi from the mean place of the open part of a cell's kernel back to the cell's center.
 
-    A wall cuts a part off the kernel, so that what remains measures the liquid at c + s, s = integral of (x - c) K over the open part by
-    its capacity. For a Gaussian of that variance s = variance grad(capacity) / capacity; hence phi - s . grad(phi).
+    A wall cuts a part off the kernel, so that what remains measures the liquid at c + s, s =
+    integral of (x - c) K over the open part by its capacity. For a Gaussian of that variance s =
+    variance grad(capacity) / capacity; hence phi - s . grad(phi).
     """
     one = wp.int8(1)
     here = phi[k, j, i]
     value = here
     c = capacity[k, j, i]
-    inside = k > 0 and j > 0 and i > 0 and k + 1 < phi.shape[0] and j + 1 < phi.shape[1] and i + 1 < phi.shape[2]
+    inside = (
+        k > 0
+        and j > 0
+        and i > 0
+        and k + 1 < phi.shape[0]
+        and j + 1 < phi.shape[1]
+        and i + 1 < phi.shape[2]
+    )
     if inside and known[k, j, i] == one and c < 0.999 and wp.abs(here) < 0.98 * limit:
-        gx = slope_beside(here, phi[k, j, i - 1], phi[k, j, i + 1], known[k, j, i - 1] == one, known[k, j, i + 1] == one)
-        gy = slope_beside(here, phi[k, j - 1, i], phi[k, j + 1, i], known[k, j - 1, i] == one, known[k, j + 1, i] == one)
-        gz = slope_beside(here, phi[k - 1, j, i], phi[k + 1, j, i], known[k - 1, j, i] == one, known[k + 1, j, i] == one)
+        gx = slope_beside(
+            here,
+            phi[k, j, i - 1],
+            phi[k, j, i + 1],
+            known[k, j, i - 1] == one,
+            known[k, j, i + 1] == one,
+        )
+        gy = slope_beside(
+            here,
+            phi[k, j - 1, i],
+            phi[k, j + 1, i],
+            known[k, j - 1, i] == one,
+            known[k, j + 1, i] == one,
+        )
+        gz = slope_beside(
+            here,
+            phi[k - 1, j, i],
+            phi[k + 1, j, i],
+            known[k - 1, j, i] == one,
+            known[k + 1, j, i] == one,
+        )
         grad = wp.vec3(gx, gy, gz) / wp.max(wp.length(wp.vec3(gx, gy, gz)), 1.0)
         s = 0.5 * wp.vec3(
             capacity[k, j, i + 1] - capacity[k, j, i - 1],

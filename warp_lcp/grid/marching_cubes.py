@@ -2,13 +2,16 @@
 
 Closed, without duplicate points; segments in 2-D.
 
-One thread takes a row of cells, and knows from a scan where its points and triangles go. A point belongs to the node at the low end of its
-edge; a node's points are numbered x, y, z from the number that the node keeps.
+One thread takes a row of cells, and knows from a scan where its points and triangles go. A point
+belongs to the node at the low end of its edge; a node's points are numbered x, y, z from the number
+that the node keeps.
 
-The triangles of a case are worked out from the cube instead of typed in. Corner c of a cell lies at (c & 1, c >> 1 & 1, c >> 2 & 1), x
-first; bit c of a case is set if the corner is inside. Edge 4 a + b runs along axis a from the b-th of the four corners that are low along
-it. On a face each run of inside corners is cut off by a segment, so that two cells see the same segments on the face between them: the
-surface is closed. No triangle has an edge within a face that is no segment, so that each of its edges belongs to two triangles.
+The triangles of a case are worked out from the cube instead of typed in. Corner c of a cell lies at
+(c & 1, c >> 1 & 1, c >> 2 & 1), x first; bit c of a case is set if the corner is inside. Edge 4 a +
+b runs along axis a from the b-th of the four corners that are low along it. On a face each run of
+inside corners is cut off by a segment, so that two cells see the same segments on the face between
+them: the surface is closed. No triangle has an edge within a face that is no segment, so that each
+of its edges belongs to two triangles.
 """
 
 import functools
@@ -23,7 +26,12 @@ from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.rows import KernelFile
 
 MOST = 5  # triangles of a cell
-EDGES = tuple((corner, corner | 1 << axis) for axis in range(3) for corner in range(8) if not corner >> axis & 1)
+EDGES = tuple(
+    (corner, corner | 1 << axis)
+    for axis in range(3)
+    for corner in range(8)
+    if not corner >> axis & 1
+)
 Edge = int
 Loop = tuple[Edge, ...]
 Cut = tuple[float, tuple[tuple[Edge, Edge, Edge], ...]]  # a length, and triangles
@@ -80,7 +88,9 @@ def _on_one_face(a: Edge, b: Edge) -> bool:
 
 @functools.cache
 def _midpoint(edge: Edge) -> np.ndarray:
-    return np.array([[corner >> axis & 1 for axis in range(3)] for corner in EDGES[edge]]).mean(axis=0)
+    return np.array([[corner >> axis & 1 for axis in range(3)] for corner in EDGES[edge]]).mean(
+        axis=0
+    )
 
 
 @functools.cache
@@ -89,7 +99,8 @@ def _cut(loop: Loop) -> Cut | None:
     if len(loop) == 3:
         return 0.0, ((loop[0], loop[1], loop[2]),)
     best = None
-    for middle in range(1, len(loop) - 1):  # the corner opposite to the side between the loop's ends
+    # the corner opposite to the side between the loop's ends
+    for middle in range(1, len(loop) - 1):
         parts: list[Cut] = [(0.0, ((loop[0], loop[middle], loop[-1]),))]
         for part in (loop[: middle + 1], loop[middle:]):
             if len(part) < 3:
@@ -97,7 +108,12 @@ def _cut(loop: Loop) -> Cut | None:
             found = None if _on_one_face(part[0], part[-1]) else _cut(part)
             if found is None:
                 break
-            parts.append((found[0] + float(np.linalg.norm(_midpoint(part[0]) - _midpoint(part[-1]))), found[1]))
+            parts.append(
+                (
+                    found[0] + float(np.linalg.norm(_midpoint(part[0]) - _midpoint(part[-1]))),
+                    found[1],
+                )
+            )
         else:
             length = sum(part[0] for part in parts)
             if best is None or length < best[0] - 1e-9:
@@ -138,7 +154,8 @@ def segment_table() -> np.ndarray:
     return table
 
 
-CLOSEST = 0.01  # of an edge: how near to its end a point may come, so that no triangle shrinks to nothing
+# of an edge: how near to its end a point may come, so that no triangle shrinks to nothing
+CLOSEST = 0.01
 
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/surface_mesh.h", {"CLOSEST": CLOSEST})
@@ -153,7 +170,8 @@ class DeviceMesh:
 
     Attributes:
         points: [m], wp.vec3, shape (n,).
-        corners: int32, shape (m, 3) of triangles, counterclockwise seen from where phi > 0, or (m, 2) of segments, phi < 0 on the left.
+        corners: int32, shape (m, 3) of triangles, counterclockwise seen from where phi > 0, or (m,
+            2) of segments, phi < 0 on the left.
     """
 
     points: wp.array
@@ -169,31 +187,50 @@ class MarchingCubes:
 
     def __init__(self, grid: StaggeredGrid) -> None:
         self.grid = grid
-        self._table = wp.array(triangle_table() if grid.dimension == 3 else segment_table(), dtype=wp.int8, device=grid.device)
+        self._table = wp.array(
+            triangle_table() if grid.dimension == 3 else segment_table(),
+            dtype=wp.int8,
+            device=grid.device,
+        )
 
     def contour(self, phi: wp.array, number: wp.array) -> DeviceMesh:
         """Return the surface phi = 0, linear between cell centers.
 
         Flat on the domain's sides where it is cut off there.
 
-        Where it meets a side at a right angle it ends there in an edge: what crosses it between centers beside a side is put on the side.
-        The same points in the same order on every run.
+        Where it meets a side at a right angle it ends there in an edge: what crosses it between
+        centers beside a side is put on the side. The same points in the same order on every run.
 
         Args:
-            phi: float32 at cell centers, in the stored shape; > 0 in the ring, so that the surface is closed.
+            phi: float32 at cell centers, in the stored shape; > 0 in the ring, so that the surface
+                is closed.
             number: int32 in the stored shape, scratch memory.
         """
         grid, device = self.grid, self.grid.device
         low = (1, 0, 0) if grid.dimension == 2 else (0, 0, 0)
-        high = (2 if grid.dimension == 2 else grid.shape[0] - 1, grid.shape[1] - 1, grid.shape[2] - 1)
-        cells = Window(low, high, device)  # between the centers of cells and of their upper neighbors
+        high = (
+            2 if grid.dimension == 2 else grid.shape[0] - 1,
+            grid.shape[1] - 1,
+            grid.shape[2] - 1,
+        )
+        # between the centers of cells and of their upper neighbors
+        cells = Window(low, high, device)
         owned, made = self._counted(cells, phi)
         points = wp.empty(_total(owned[1]), dtype=wp.vec3, device=device)
         most_x, most_y, most_z = grid.domain_counts
         cells.run(
-            POINTS, grid.placement, whole=True, counts=owned[0], ends=owned[1], into=points, phi=phi, number=number,
-            most_x=most_x, most_y=most_y, most_z=most_z,
-        )  # fmt: skip
+            POINTS,
+            grid.placement,
+            whole=True,
+            counts=owned[0],
+            ends=owned[1],
+            into=points,
+            phi=phi,
+            number=number,
+            most_x=most_x,
+            most_y=most_y,
+            most_z=most_z,
+        )
         return DeviceMesh(points, self._corners(cells, phi, number, made))
 
     def corners(self, phi: wp.array, number: wp.array, cells: Window) -> wp.array:
@@ -206,22 +243,45 @@ class MarchingCubes:
         """
         return self._corners(cells, phi, number, self._counted(cells, phi)[1])
 
-    def _counted(self, cells: Window, phi: wp.array) -> tuple[tuple[wp.array, wp.array], tuple[wp.array, wp.array]]:
+    def _counted(
+        self, cells: Window, phi: wp.array
+    ) -> tuple[tuple[wp.array, wp.array], tuple[wp.array, wp.array]]:
         """Return how many points nodes of rows own, and triangles their cells have, each with sums up to and with each row."""
         owned, made = (wp.empty(cells.rows, dtype=wp.int32, device=cells.device) for _ in range(2))
-        cells.run(COUNT, whole=True, phi=phi, planes=self.grid.planes, table=self._table, owned=owned, made=made)
-        ends = [wp.empty(count.size, dtype=wp.int32, device=cells.device) for count in (owned, made)]
+        cells.run(
+            COUNT,
+            whole=True,
+            phi=phi,
+            planes=self.grid.planes,
+            table=self._table,
+            owned=owned,
+            made=made,
+        )
+        ends = [
+            wp.empty(count.size, dtype=wp.int32, device=cells.device) for count in (owned, made)
+        ]
         for count, end in zip((owned, made), ends, strict=True):
             wp.utils.array_scan(count.flatten(), end, inclusive=True)
         return (owned, ends[0]), (made, ends[1])
 
-    def _corners(self, cells: Window, phi: wp.array, number: wp.array, made: tuple[wp.array, wp.array]) -> wp.array:
+    def _corners(
+        self, cells: Window, phi: wp.array, number: wp.array, made: tuple[wp.array, wp.array]
+    ) -> wp.array:
         """Return the triangles of cells, whose rows have so many."""
-        corners = wp.empty((_total(made[1]), self.grid.dimension), dtype=wp.int32, device=cells.device)
+        corners = wp.empty(
+            (_total(made[1]), self.grid.dimension), dtype=wp.int32, device=cells.device
+        )
         cells.run(
-            CORNERS, whole=True, counts=made[0], ends=made[1], phi=phi, planes=self.grid.planes, number=number, table=self._table,
+            CORNERS,
+            whole=True,
+            counts=made[0],
+            ends=made[1],
+            phi=phi,
+            planes=self.grid.planes,
+            number=number,
+            table=self._table,
             into=corners,
-        )  # fmt: skip
+        )
         return corners
 
 

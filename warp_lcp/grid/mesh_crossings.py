@@ -1,8 +1,9 @@
 """Where a closed surface crosses itself, or lies inside itself: there the winding number is neither 0 nor 1.
 
-Two triangles cross where the segments that each has in common with the other's plane overlap. Parts that only touch do so
-too, face to face or along edges; so winding numbers on the four sides of the crossing decide. Parts that do not cross have the same winding
-number all over, which one of their triangles tells.
+Two triangles cross where the segments that each has in common with the other's plane overlap. Parts
+that only touch do so too, face to face or along edges; so winding numbers on the four sides of the
+crossing decide. Parts that do not cross have the same winding number all over, which one of their
+triangles tells.
 """
 
 import typing
@@ -16,12 +17,16 @@ from scipy.sparse.csgraph import connected_components
 from warp_lcp.rows.compiler import forward_kernel
 
 MODULE = "warp_lcp.grid.mesh_crossings"
-NEAR = wp.constant(1.0e-9)  # half diagonals of the mesh: closer than rounding of float64 coordinates tells
-SHORT = wp.constant(1.0e-5)  # a common segment that is shorter counts as a point: vertices are equal within 1e-6
-ASIDE = wp.constant(1.0e-4)  # from the surface, where winding numbers are looked at; float32 tells it from 0
+# half diagonals of the mesh: closer than rounding of float64 coordinates tells
+NEAR = wp.constant(1.0e-9)
+# a common segment that is shorter counts as a point: vertices are equal within 1e-6
+SHORT = wp.constant(1.0e-5)
+# from the surface, where winding numbers are looked at; float32 tells it from 0
+ASIDE = wp.constant(1.0e-4)
 DOUBLED = wp.constant(1)
 INVERTED = wp.constant(2)
-SAMPLE = 4096  # points of the surface whose sides are looked at, to tell how much of it is wrong: to 1 %
+# points of the surface whose sides are looked at, to tell how much of it is wrong: to 1 %
+SAMPLE = 4096
 
 
 @dataclass(frozen=True)
@@ -30,9 +35,12 @@ class Crossings:
 
     Attributes:
         count: triangles that cross others.
-        place: of the first of them, or else of a part that lies inside another, in the mesh's units, shape (3,); None: all is well.
-        doubled: about which share of the surface's area lies inside the solid, between what is surrounded once and twice.
-        inverted: about which share of it is turned inside out, so that what it surrounds counts as outside.
+        place: of the first of them, or else of a part that lies inside another, in the mesh's
+            units, shape (3,); None: all is well.
+        doubled: about which share of the surface's area lies inside the solid, between what is
+            surrounded once and twice.
+        inverted: about which share of it is turned inside out, so that what it surrounds counts as
+            outside.
     """
 
     count: int = 0
@@ -99,7 +107,9 @@ def height(x: wp.vec3d, origin: wp.vec3d, normal: wp.vec3d, shared: bool) -> wp.
 
 @forward_kernel(module=MODULE)
 @typing.no_type_check
-def find_crossings(mesh: wp.uint64, points: Points, corners: Corners, crosses: wp.array(dtype=wp.uint8)):
+def find_crossings(
+    mesh: wp.uint64, points: Points, corners: Corners, crosses: wp.array(dtype=wp.uint8)
+):
     """Mark the triangles that cross another one."""
     t = wp.tid()
     a, b, c = triangle(points, corners, t)
@@ -129,8 +139,16 @@ def find_crossings(mesh: wp.uint64, points: Points, corners: Corners, crosses: w
         if wp.length(line) < wp.float64(1.0e-6):  # in parallel planes
             continue
         along = wp.normalize(line)
-        h = wp.vec3d(height(a, d, m, ours[0] == 1), height(b, d, m, ours[1] == 1), height(c, d, m, ours[2] == 1))
-        g = wp.vec3d(height(d, a, n, theirs[0] == 1), height(e, a, n, theirs[1] == 1), height(f, a, n, theirs[2] == 1))
+        h = wp.vec3d(
+            height(a, d, m, ours[0] == 1),
+            height(b, d, m, ours[1] == 1),
+            height(c, d, m, ours[2] == 1),
+        )
+        g = wp.vec3d(
+            height(d, a, n, theirs[0] == 1),
+            height(e, a, n, theirs[1] == 1),
+            height(f, a, n, theirs[2] == 1),
+        )
         low1, high1, found1 = cut_by_plane(a, b, c, h, along)
         low2, high2, found2 = cut_by_plane(d, e, f, g, along)
         if found1 < 2 or found2 < 2:
@@ -156,7 +174,12 @@ def find_crossings(mesh: wp.uint64, points: Points, corners: Corners, crosses: w
 @forward_kernel(module=MODULE)
 @typing.no_type_check
 def look_beside(
-    mesh: wp.uint64, points: Points, corners: Corners, which: wp.array(dtype=wp.int32), at: Points, kind: wp.array(dtype=wp.uint8)
+    mesh: wp.uint64,
+    points: Points,
+    corners: Corners,
+    which: wp.array(dtype=wp.int32),
+    at: Points,
+    kind: wp.array(dtype=wp.uint8),
 ):
     """Tell at which points of triangles `which` one side is surrounded twice, DOUBLED, or less than never, INVERTED."""
     i = wp.tid()
@@ -172,11 +195,16 @@ def find_self_crossings(mesh: wp.Mesh, vertices: np.ndarray, triangles: np.ndarr
 
     Args:
         mesh: the surface.
-        vertices: of it, in half diagonals of its bounding box from its center, float64 of shape (n, 3).
+        vertices: of it, in half diagonals of its bounding box from its center, float64 of shape (n,
+            3).
         triangles: of it, int32 of shape (m, 3).
     """
     device = mesh.points.device
-    inputs = [mesh.id, wp.array(vertices, dtype=wp.vec3d, device=device), wp.array(triangles, dtype=wp.int32, device=device)]
+    inputs = [
+        mesh.id,
+        wp.array(vertices, dtype=wp.vec3d, device=device),
+        wp.array(triangles, dtype=wp.int32, device=device),
+    ]
     marks = wp.zeros(len(triangles), dtype=wp.uint8, device=device)
     wp.launch(find_crossings, len(triangles), inputs, outputs=[marks], device=device)
     crossing = np.flatnonzero(marks.numpy())
@@ -185,21 +213,36 @@ def find_self_crossings(mesh: wp.Mesh, vertices: np.ndarray, triangles: np.ndarr
 
     def beside(which: np.ndarray, weights: np.ndarray) -> np.ndarray:
         points = np.einsum("ij,ijk->ik", weights, corners[which])
-        sides = [wp.array(which, dtype=wp.int32, device=device), wp.array(points, dtype=wp.vec3d, device=device)]
+        sides = [
+            wp.array(which, dtype=wp.int32, device=device),
+            wp.array(points, dtype=wp.vec3d, device=device),
+        ]
         kind = wp.zeros(len(which), dtype=wp.uint8, device=device)
         wp.launch(look_beside, len(which), [*inputs, *sides], outputs=[kind], device=device)
         return kind.numpy()
 
     firsts = _first_of_parts(triangles, len(vertices))
-    nested = firsts[beside(firsts, np.full((len(firsts), 3), 1.0 / 3.0)) > 0] if len(firsts) > 1 else firsts[:0]
+    nested = (
+        firsts[beside(firsts, np.full((len(firsts), 3), 1.0 / 3.0)) > 0]
+        if len(firsts) > 1
+        else firsts[:0]
+    )
     if not len(crossing) and not len(nested):
         return Crossings()
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    area = np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    )
     chance = np.random.default_rng(SAMPLE)
-    which = np.searchsorted(np.cumsum(area), area.sum() * (np.arange(SAMPLE) + 0.5) / SAMPLE).clip(max=len(triangles) - 1)
+    which = np.searchsorted(np.cumsum(area), area.sum() * (np.arange(SAMPLE) + 0.5) / SAMPLE).clip(
+        max=len(triangles) - 1
+    )
     kind = beside(which, chance.dirichlet(np.ones(3), SAMPLE))
     first = crossing[0] if len(crossing) else nested[0]
-    return Crossings(len(crossing), corners[first].mean(axis=0), *(float((kind == int(what)).mean()) for what in (DOUBLED, INVERTED)))
+    return Crossings(
+        len(crossing),
+        corners[first].mean(axis=0),
+        *(float((kind == int(what)).mean()) for what in (DOUBLED, INVERTED)),
+    )
 
 
 def _first_of_parts(triangles: np.ndarray, vertices: int) -> np.ndarray:

@@ -19,19 +19,29 @@ from warp_lcp.files.claims import check_claim
 FORMATS = (".obj", ".ply", ".stl")
 MARK = b"\xef\xbb\xbf"  # that some editors write before UTF-8 text
 WIDE = (b"\xff\xfe", b"\xfe\xff")  # and before UTF-16
-STL_WORDS = re.compile(rb"^[ \t]*(?:facet|endsolid)\b", flags=re.MULTILINE | re.IGNORECASE)  # of a text STL, behind the first
+# of a text STL, behind the first
+STL_WORDS = re.compile(rb"^[ \t]*(?:facet|endsolid)\b", flags=re.MULTILINE | re.IGNORECASE)
 STL_HEADER = 84  # bytes before the first triangle of a binary STL: 80 of text and a count
 STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("color", "<u2")])
 PLY_TYPES = {
     name: code
     for names, code in (
-        ("char int8", "i1"), ("uchar uint8", "u1"), ("short int16", "i2"), ("ushort uint16", "u2"),
-        ("int int32", "i4"), ("uint uint32", "u4"), ("float float32", "f4"), ("double float64", "f8"), ("int64", "i8"), ("uint64", "u8"),
+        ("char int8", "i1"),
+        ("uchar uint8", "u1"),
+        ("short int16", "i2"),
+        ("ushort uint16", "u2"),
+        ("int int32", "i4"),
+        ("uint uint32", "u4"),
+        ("float float32", "f4"),
+        ("double float64", "f8"),
+        ("int64", "i8"),
+        ("uint64", "u8"),
     )
     for name in names.split()
-}  # fmt: skip
+}
 PLY_ORDERS = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}
-PLY_CORNERS = ("vertex_indices", "vertex_index")  # the names of a face's list of corners that are in use
+# the names of a face's list of corners that are in use
+PLY_CORNERS = ("vertex_indices", "vertex_index")
 LARGEST_INDEX = 2**31 - 1
 
 Corners = list[np.ndarray]  # of polygons, each of shape (count, corners)
@@ -42,14 +52,15 @@ def read_triangles(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
     Texture coordinates, normals, colors, points and lines are ignored.
 
-    Polygons become fans about their first corner. (Where a polygon is not convex, triangles then overlap with opposite orientation: the
-    inside stays right.)
+    Polygons become fans about their first corner. (Where a polygon is not convex, triangles then
+    overlap with opposite orientation: the inside stays right.)
 
     Args:
         path: a file whose name ends in .obj, .stl or .ply.
 
     Returns:
-        Vertices, float64 of shape (n, 3), and triangles, int64 of shape (m, 3). Nothing is checked but that the indices exist.
+        Vertices, float64 of shape (n, 3), and triangles, int64 of shape (m, 3). Nothing is checked
+        but that the indices exist.
 
     Raises:
         ValueError: the file is missing, of another format or not readable; the message names it.
@@ -62,15 +73,27 @@ def read_triangles(path: Path) -> tuple[np.ndarray, np.ndarray]:
     except FileNotFoundError:
         raise ValueError(f"{path}: there is no such mesh file") from None
     except OSError as error:
-        raise ValueError(f"{path}: the mesh file cannot be read ({error.strerror or error})") from error
+        raise ValueError(
+            f"{path}: the mesh file cannot be read ({error.strerror or error})"
+        ) from error
     if not data:
-        raise ValueError(f"{path}: the mesh file is empty: it has no vertices, so it is not a readable {suffix[1:].upper()} file")
-    if data.startswith(WIDE) and (suffix != ".stl" or data[2:].replace(b"\0", b"")[:5].lower() == b"solid"):
-        raise ValueError(f"{path}: not a readable {suffix[1:].upper()} file (it is UTF-16 text; save it as UTF-8)")
+        raise ValueError(
+            f"{path}: the mesh file is empty: it has no vertices, so it is not a readable "
+            f"{suffix[1:].upper()} file"
+        )
+    if data.startswith(WIDE) and (
+        suffix != ".stl" or data[2:].replace(b"\0", b"")[:5].lower() == b"solid"
+    ):
+        raise ValueError(
+            f"{path}: not a readable {suffix[1:].upper()} file (it is UTF-16 text; save it as "
+            "UTF-8)"
+        )
     if suffix == ".stl" and not _is_binary_stl(data):
         return _parse_text_stl(path, data)
     try:
-        points, blocks = {".obj": _parse_obj, ".ply": _parse_ply, ".stl": _parse_binary_stl}[suffix](data)
+        points, blocks = {".obj": _parse_obj, ".ply": _parse_ply, ".stl": _parse_binary_stl}[
+            suffix
+        ](data)
     except ValueError as error:
         raise ValueError(f"{path}: not a readable {suffix[1:].upper()} file ({error})") from error
     return _triangulate(path, points, [block for block in blocks if len(block)])
@@ -80,12 +103,18 @@ def _triangulate(path: Path, points: np.ndarray, blocks: Corners) -> tuple[np.nd
     """Cut blocks of equal polygons, each of shape (count, corners), into triangles."""
     if points.size == 0:
         raise ValueError(f"{path}: the mesh has no vertices")
-    fans = [np.stack([block[:, [0, i, i + 1]] for i in range(1, block.shape[1] - 1)], axis=1) for block in blocks if block.shape[1] >= 3]
+    fans = [
+        np.stack([block[:, [0, i, i + 1]] for i in range(1, block.shape[1] - 1)], axis=1)
+        for block in blocks
+        if block.shape[1] >= 3
+    ]
     if not fans:
         raise ValueError(f"{path}: the mesh has no triangles")
     triangles = np.concatenate([fan.reshape(-1, 3) for fan in fans])
     if triangles.min() < 0 or triangles.max() >= len(points):
-        raise ValueError(f"{path}: a triangle names a vertex that does not exist (there are {len(points)})")
+        raise ValueError(
+            f"{path}: a triangle names a vertex that does not exist (there are {len(points)})"
+        )
     return points, triangles
 
 
@@ -98,7 +127,9 @@ def _is_binary_stl(data: bytes) -> bool:
     """Tell a binary STL by its length, or by what no text has: its first bytes may say "solid" all the same."""
     if len(data) < STL_HEADER:
         return False
-    is_text = data.removeprefix(MARK).lstrip()[:5].lower() == b"solid" and (b"\0" not in data or STL_WORDS.search(data) is not None)
+    is_text = data.removeprefix(MARK).lstrip()[:5].lower() == b"solid" and (
+        b"\0" not in data or STL_WORDS.search(data) is not None
+    )
     return len(data) == STL_HEADER + STL_TRIANGLE.itemsize * _stl_count(data) or not is_text
 
 
@@ -110,10 +141,17 @@ def _parse_binary_stl(data: bytes) -> tuple[np.ndarray, Corners]:
     """Read the corners of a binary STL, three for each triangle; bytes behind the last one, which some programs write, are passed over."""
     count, held = _stl_count(data), (len(data) - STL_HEADER) // STL_TRIANGLE.itemsize
     if held < count:
-        raise ValueError(f"neither text nor a binary file of the right length: it declares {count} triangles and holds {held}")
+        raise ValueError(
+            f"neither text nor a binary file of the right length: it declares {count} triangles "
+            f"and holds {held}"
+        )
     if not count:
         raise ValueError(f"it declares no triangles, but {len(data) - STL_HEADER} bytes follow")
-    points = np.frombuffer(data, STL_TRIANGLE, count, STL_HEADER)["corners"].reshape(-1, 3).astype(np.float64)
+    points = (
+        np.frombuffer(data, STL_TRIANGLE, count, STL_HEADER)["corners"]
+        .reshape(-1, 3)
+        .astype(np.float64)
+    )
     return points, [np.arange(len(points)).reshape(-1, 3)]
 
 
@@ -121,11 +159,17 @@ def _parse_text_stl(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
     """Read the corners of a text STL; blank lines and words in capitals do not matter."""
     data = data.removeprefix(MARK).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     if not data.lstrip()[:5].lower() == b"solid":
-        raise ValueError(f"{path}: not a readable STL file (neither text nor a binary file of the right length)")
-    corners = re.findall(rb"^\s*vertex\s+(\S+)\s+(\S+)\s+(\S+)\s*$", data, flags=re.MULTILINE | re.IGNORECASE)
+        raise ValueError(
+            f"{path}: not a readable STL file (neither text nor a binary file of the right length)"
+        )
+    corners = re.findall(
+        rb"^\s*vertex\s+(\S+)\s+(\S+)\s+(\S+)\s*$", data, flags=re.MULTILINE | re.IGNORECASE
+    )
     facets = len(re.findall(rb"^\s*endfacet\b", data, flags=re.MULTILINE | re.IGNORECASE))
     if len(corners) != 3 * facets:
-        raise ValueError(f"{path}: not a readable STL file ({len(corners)} corners in {facets} facets)")
+        raise ValueError(
+            f"{path}: not a readable STL file ({len(corners)} corners in {facets} facets)"
+        )
     if not facets:
         raise ValueError(f"{path}: the mesh has no triangles")
     try:
@@ -147,7 +191,11 @@ class _Element:
 def _parse_ply(data: bytes) -> tuple[np.ndarray, Corners]:
     """Read vertices and faces of a PLY file; other elements and properties are passed over."""
     data = data.removeprefix(MARK)
-    head = re.match(rb"ply[ \t]*(?P<end>\r\n|\n|\r)(?P<lines>.*?(?P=end))\s*end_header[ \t]*(?P=end)", data, flags=re.DOTALL)
+    head = re.match(
+        rb"ply[ \t]*(?P<end>\r\n|\n|\r)(?P<lines>.*?(?P=end))\s*end_header[ \t]*(?P=end)",
+        data,
+        flags=re.DOTALL,
+    )
     if not head:
         raise ValueError("its header does not begin with ply and end with end_header")
     order, elements = _ply_header(head["lines"].decode("ascii", "replace"))
@@ -158,9 +206,17 @@ def _parse_ply(data: bytes) -> tuple[np.ndarray, Corners]:
         names = [name for name, _, _ in element.properties]
         if not names or not element.count:
             continue
-        check_claim(f"{element.count} x {element.name}", 8 * element.count * len(names), **source.claim(element))
+        check_claim(
+            f"{element.count} x {element.name}",
+            8 * element.count * len(names),
+            **source.claim(element),
+        )
         if any(length for _, _, length in element.properties):
-            corners = next((names.index(name) for name in PLY_CORNERS if name in names), -1) if element.name == "face" else -1
+            corners = (
+                next((names.index(name) for name in PLY_CORNERS if name in names), -1)
+                if element.name == "face"
+                else -1
+            )
             if corners >= 0 and element.properties[corners][1][0] == "f":
                 raise ValueError("vertex indices of its faces are not integers")
             polygons += source.lists(element, corners)
@@ -183,7 +239,9 @@ def _ply_header(text: str) -> tuple[str | None, list[_Element]]:
                 order = PLY_ORDERS[kind]
             case ["element", name, count] if count.isdecimal() and len(count) < 20:
                 elements.append(_Element(name, int(count)))
-            case ["property", "list", length, kind, name] if elements and kind in PLY_TYPES and PLY_TYPES.get(length, "f")[0] != "f":
+            case ["property", "list", length, kind, name] if (
+                elements and kind in PLY_TYPES and PLY_TYPES.get(length, "f")[0] != "f"
+            ):
                 elements[-1].properties.append((name, PLY_TYPES[kind], PLY_TYPES[length]))
             case ["property", kind, name] if elements and kind in PLY_TYPES:
                 elements[-1].properties.append((name, PLY_TYPES[kind], None))
@@ -214,7 +272,12 @@ class _Records:
         if self.order is None:
             words = self._take("f8", element.count * len(element.properties), element)
             return np.array([_number(word) for word in words]).reshape(element.count, -1)
-        record = np.dtype([(str(number), self.order + kind) for number, (_, kind, _) in enumerate(element.properties)])
+        record = np.dtype(
+            [
+                (str(number), self.order + kind)
+                for number, (_, kind, _) in enumerate(element.properties)
+            ]
+        )
         rows = np.frombuffer(self.body, record, element.count, self.at)
         self.at += rows.nbytes
         return np.stack([rows[name].astype(np.float64) for name in record.names or ()], axis=1)
@@ -240,14 +303,24 @@ class _Records:
         begin, self.at = self.at, self.at + count * self._width(kind)
         if not begin <= self.at <= len(self.body):
             raise ValueError(f"it ends within a {element.name}")
-        return self.body[begin : self.at] if self.order is None else np.frombuffer(self.body, self.order + kind, count, begin)
+        return (
+            self.body[begin : self.at]
+            if self.order is None
+            else np.frombuffer(self.body, self.order + kind, count, begin)
+        )
 
 
 def _parse_obj(data: bytes) -> tuple[np.ndarray, Corners]:
     """Read vertices and faces of an OBJ file, whose indices count from 1, or backwards from the last vertex so far."""
     vertices: list[list[float]] = []
     polygons: list[list[int]] = []
-    for line in data.removeprefix(MARK).decode("utf-8", errors="replace").replace("\\\r\n", " ").replace("\\\n", " ").splitlines():
+    for line in (
+        data.removeprefix(MARK)
+        .decode("utf-8", errors="replace")
+        .replace("\\\r\n", " ")
+        .replace("\\\n", " ")
+        .splitlines()
+    ):
         words = line.split("#", 1)[0].split()
         if words[:1] == ["v"]:
             if len(words) < 4:
@@ -255,7 +328,9 @@ def _parse_obj(data: bytes) -> tuple[np.ndarray, Corners]:
             vertices.append([_number(word) for word in words[1:4]])
         elif words[:1] == ["f"]:
             indices = [_index(word.split("/", 1)[0]) for word in words[1:]]
-            polygons.append([index - 1 if index >= 0 else index + len(vertices) for index in indices])
+            polygons.append(
+                [index - 1 if index >= 0 else index + len(vertices) for index in indices]
+            )
     return np.array(vertices, dtype=np.float64).reshape(-1, 3), _blocks(polygons)
 
 

@@ -15,9 +15,13 @@ from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.rows import KernelFile
 from warp_lcp.rows.compiler import forward_kernel
 
-TOUCHING = 0.015  # lattice cells from the domain's side: points that close the surface there are 0.01 off its other sides
+# lattice cells from the domain's side: points that close the surface there are 0.01 off its other
+# sides
+TOUCHING = 0.015
 ON_SIDE, ON_SOLID = 1, 2  # bits of a mark
-NEAR = 0.25  # lattice cells: a point on a solid, as accurately as a distance that is linear between nodes can tell
+# lattice cells: a point on a solid, as accurately as a distance that is linear between nodes can
+# tell
+NEAR = 0.25
 
 _SUMS, _BYTES = wp.array2d(dtype=wp.float32), wp.array(dtype=wp.uint8)
 _options = {"module": "warp_lcp.grid.mesh_smoothing"}
@@ -28,7 +32,15 @@ SEE_NEIGHBORS = KERNELS["warp_lcp.grid.mesh_smoothing.see_neighbors"]
 
 @forward_kernel(**_options)
 @typing.no_type_check
-def hold_kernel(planes: int, dx: float, origin: wp.vec3, points: POINTS, room: F32, counts: wp.vec3, held: _BYTES):
+def hold_kernel(
+    planes: int,
+    dx: float,
+    origin: wp.vec3,
+    points: POINTS,
+    room: F32,
+    counts: wp.vec3,
+    held: _BYTES,
+):
     """Mark points that stay: those on the domain's sides, so that these end in an edge, and on solids, with ON_SIDE + ON_SOLID."""
     p = wp.tid()
     x = points[p] / dx
@@ -37,14 +49,27 @@ def hold_kernel(planes: int, dx: float, origin: wp.vec3, points: POINTS, room: F
         if x[axis] < TOUCHING or x[axis] > counts[axis] - TOUCHING:
             mark = ON_SIDE
     if room:
-        if interpolated(room, planes, x[0] + 0.5 - origin[0], x[1] + 0.5 - origin[1], x[2] + 0.5 - origin[2]) < NEAR:
+        if (
+            interpolated(
+                room, planes, x[0] + 0.5 - origin[0], x[1] + 0.5 - origin[1], x[2] + 0.5 - origin[2]
+            )
+            < NEAR
+        ):
             mark = mark + ON_SOLID
     held[p] = wp.uint8(mark)
 
 
 @forward_kernel(**_options)
 @typing.no_type_check
-def move_kernel(share: float, most: float, sums: _SUMS, held: _BYTES, size: wp.vec3, start: POINTS, points: POINTS):
+def move_kernel(
+    share: float,
+    most: float,
+    sums: _SUMS,
+    held: _BYTES,
+    size: wp.vec3,
+    start: POINTS,
+    points: POINTS,
+):
     """Move a point a share of the way to the mean of its neighbors, within the domain and not too far from where it started."""
     p = wp.tid()
     if held[p] != wp.uint8(0):
@@ -56,20 +81,29 @@ def move_kernel(share: float, most: float, sums: _SUMS, held: _BYTES, size: wp.v
     far = wp.length(way)
     if far > most:
         x = start[p] + (most / far) * way
-    points[p] = wp.vec3(wp.clamp(x[0], 0.0, size[0]), wp.clamp(x[1], 0.0, size[1]), wp.clamp(x[2], 0.0, size[2]))
+    points[p] = wp.vec3(
+        wp.clamp(x[0], 0.0, size[0]), wp.clamp(x[1], 0.0, size[1]), wp.clamp(x[2], 0.0, size[2])
+    )
 
 
-FORTH, BACK = 0.5, -0.53  # shares of the way to the neighbors' mean: waves longer than about 9 points keep their height, short ones lose it
-MOST = 0.3  # lattice cells that a point may move: facets are shallower, drops of few points are not squeezed to nothing
+# shares of the way to the neighbors' mean: waves longer than about 9 points keep their height,
+# short ones lose it
+FORTH, BACK = 0.5, -0.53
+# lattice cells that a point may move: facets are shallower, drops of few points are not squeezed to
+# nothing
+MOST = 0.3
 
 
-def smooth(mesh: DeviceMesh, lattice: StaggeredGrid, room: wp.array | None, rounds: int) -> wp.array:
+def smooth(
+    mesh: DeviceMesh, lattice: StaggeredGrid, room: wp.array | None, rounds: int
+) -> wp.array:
     """Smooth a surface; points on the domain's sides and on solids are fixed.
 
     Args:
         mesh: a closed surface from `warp_lcp.grid.marching_cubes` (updated).
         lattice: the grid that it was found on.
-        room: distance to solids at the lattice's cell centers [lattice cells], float32; None: there are no solids.
+        room: distance to solids at the lattice's cell centers [lattice cells], float32; None: there
+            are no solids.
         rounds: steps forth and back; each lets a point look two points farther.
 
     Returns:
@@ -80,13 +114,21 @@ def smooth(mesh: DeviceMesh, lattice: StaggeredGrid, room: wp.array | None, roun
     if not count:
         return held
     ends = [wp.vec3(*numbers) for numbers in (lattice.origin, lattice.domain_counts)]
-    wp.launch(hold_kernel, count, [lattice.planes, lattice.spacing, ends[0], mesh.points, room, ends[1], held], device=device)
+    wp.launch(
+        hold_kernel,
+        count,
+        [lattice.planes, lattice.spacing, ends[0], mesh.points, room, ends[1], held],
+        device=device,
+    )
     start, most = wp.clone(mesh.points), MOST * lattice.spacing
-    sums = wp.empty((count, 4), dtype=wp.float32, device=device)  # of the neighbors' coordinates, and how many they are
+    # of the neighbors' coordinates, and how many they are
+    sums = wp.empty((count, 4), dtype=wp.float32, device=device)
     size = wp.vec3(*lattice.extent)
     rows = chunks(len(mesh.corners), device)
     for share in (FORTH, BACK) * rounds:
         sums.zero_()
         SEE_NEIGHBORS.bind(rows, corners=mesh.corners, points=mesh.points, sums=sums).launch()
-        wp.launch(move_kernel, count, [share, most, sums, held, size, start, mesh.points], device=device)
+        wp.launch(
+            move_kernel, count, [share, most, sums, held, size, start, mesh.points], device=device
+        )
     return held

@@ -1,11 +1,13 @@
 """Fit a surface's points on solids to the solids' own shapes, with sharp edges.
 
-Marching cubes puts these points where the distance is 0, linear between the grid's nodes: planes are exact, while edges and corners of a
-solid are cut off by up to half a cell, and the surface leaves a solid by up to a quarter of a cell where it meets the domain's side. Here
-a point x moves to x - (d(x) + OVERLAP) grad d / |grad d|^2, d the distance to the shapes themselves; on a side of the domain along it.
-Then edges of the mesh between points with different normals cross an edge of the solid: one of their ends moves to the common point of the
-planes through both, as in dual contouring (Ju et al. 2002), so that each triangle lies on one face of the solid. Connections stay, so a
-closed surface stays closed.
+Marching cubes puts these points where the distance is 0, linear between the grid's nodes: planes
+are exact, while edges and corners of a solid are cut off by up to half a cell, and the surface
+leaves a solid by up to a quarter of a cell where it meets the domain's side. Here a point x moves
+to x - (d(x) + OVERLAP) grad d / |grad d|^2, d the distance to the shapes themselves; on a side of
+the domain along it. Then edges of the mesh between points with different normals cross an edge of
+the solid: one of their ends moves to the common point of the planes through both, as in dual
+contouring (Ju et al. 2002), so that each triangle lies on one face of the solid. Connections stay,
+so a closed surface stays closed.
 """
 
 from __future__ import annotations
@@ -18,11 +20,16 @@ import warp as wp
 
 from warp_lcp.grid.solids import Geometry
 
-OVERLAP = 0.03  # cells that the surface reaches into solids, so that renderers see no film of air and no two faces at one place
-STEP, ROUNDING = 0.01, 1.2e-5  # cells, of the differences that give grad d, and of a coordinate at least, which float32 rounds
+# cells that the surface reaches into solids, so that renderers see no film of air and no two faces
+# at one place
+OVERLAP = 0.03
+# cells, of the differences that give grad d, and of a coordinate at least, which float32 rounds
+STEP, ROUNDING = 0.01, 1.2e-5
 FARTHEST = 1.25  # cells that a point may move
 SHARP = 0.9  # cosine of the angle between normals: less is an edge of the solid
-MISSED = 0.06  # cells from the wall: a common point of planes farther from it is none of an edge, but of something round
+# cells from the wall: a common point of planes farther from it is none of an edge, but of something
+# round
+MISSED = 0.06
 SINGULAR = 0.05  # of the largest eigenvalue: directions in which planes do not tell where they meet
 TETRAHEDRON = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3.0)
 TRIANGLE = np.array([[np.cos(a), np.sin(a), 0.0] for a in 2.0 * np.pi / 3.0 * np.arange(3)])
@@ -38,7 +45,9 @@ class Walls:
         device: that the solids are on.
     """
 
-    def __init__(self, solids: Sequence[Geometry], spacing: float, dimension: int, device: wp.Device) -> None:
+    def __init__(
+        self, solids: Sequence[Geometry], spacing: float, dimension: int, device: wp.Device
+    ) -> None:
         self.solids, self.spacing, self.dimension, self.device = solids, spacing, dimension, device
 
     def distance(self, points: np.ndarray) -> np.ndarray:
@@ -67,17 +76,22 @@ class Walls:
         d = self.distance(around).reshape(len(points), -1)
         known = np.isfinite(d).all(axis=1)
         slope = np.where(known[:, None], d, 0.0) @ directions
-        return np.where(known, d.mean(axis=1), np.inf), self.dimension / (len(directions) * step) * slope
+        return np.where(known, d.mean(axis=1), np.inf), self.dimension / (
+            len(directions) * step
+        ) * slope
 
 
-def fit_to_walls(points: np.ndarray, corners: np.ndarray, on_solid: np.ndarray, fixed: np.ndarray, walls: Walls) -> np.ndarray:
+def fit_to_walls(
+    points: np.ndarray, corners: np.ndarray, on_solid: np.ndarray, fixed: np.ndarray, walls: Walls
+) -> np.ndarray:
     """Return the points of a surface with those on solids moved onto the solids' shapes.
 
     Args:
         points: of the surface [cells], shape (n, 3).
         corners: of its triangles, shape (m, 3), or segments, shape (m, 2).
         on_solid: whether a point lies on a solid, shape (n,).
-        fixed: which coordinates of a point may not change, as it lies on a side of the domain, bool, shape (n, 3).
+        fixed: which coordinates of a point may not change, as it lies on a side of the domain,
+            bool, shape (n, 3).
         walls: the solids.
 
     Returns:
@@ -88,7 +102,8 @@ def fit_to_walls(points: np.ndarray, corners: np.ndarray, on_solid: np.ndarray, 
         return points
     start, free = points[own].astype(np.float64), ~fixed[own]
     x, gradient, d = start.copy(), np.zeros_like(start), np.zeros(len(start))
-    for _ in range(2):  # the second time from within rounding of the wall, so that its gradient is that there
+    # the second time from within rounding of the wall, so that its gradient is that there
+    for _ in range(2):
         d, gradient = walls.distance_and_gradient(x)
         along = gradient * free
         square = np.einsum("ij,ij->i", along, along)
@@ -110,10 +125,14 @@ def _sharp_edges(corners: np.ndarray, normal: np.ndarray) -> np.ndarray:
     sides = [(0, 1)] if corners.shape[1] == 2 else [(0, 1), (1, 2), (2, 0)]
     edges = np.concatenate([corners[:, side] for side in sides])
     edges = np.unique(np.sort(edges[(edges >= 0).all(axis=1)], axis=1), axis=0)
-    return cast(np.ndarray, edges[np.einsum("ij,ij->i", normal[edges[:, 0]], normal[edges[:, 1]]) < SHARP])
+    return cast(
+        np.ndarray, edges[np.einsum("ij,ij->i", normal[edges[:, 0]], normal[edges[:, 1]]) < SHARP]
+    )
 
 
-def _sharpened(x: np.ndarray, normal: np.ndarray, free: np.ndarray, corners: np.ndarray, walls: Walls) -> np.ndarray:
+def _sharpened(
+    x: np.ndarray, normal: np.ndarray, free: np.ndarray, corners: np.ndarray, walls: Walls
+) -> np.ndarray:
     """Move points onto edges of the solid, then onto its corners.
 
     Args:
@@ -133,7 +152,10 @@ def _sharpened(x: np.ndarray, normal: np.ndarray, free: np.ndarray, corners: np.
     sides = Planes.through(x, np.zeros_like(x))
     sides.add_sides(x, free)
     around = planes.of(np.arange(len(x))[:, None])
-    around.add(np.concatenate([edges[:, 0], edges[:, 1]]), planes.of(np.concatenate([edges[:, 1:], edges[:, :1]])))
+    around.add(
+        np.concatenate([edges[:, 0], edges[:, 1]]),
+        planes.of(np.concatenate([edges[:, 1:], edges[:, :1]])),
+    )
     around.add(np.arange(len(x)), sides)
     result = x.copy()
     _move(result, moves, around.of(moves[:, None]).common_point(x[moves]), free, walls)
@@ -160,10 +182,14 @@ def _nearest_ends(x: np.ndarray, simplices: np.ndarray, target: np.ndarray) -> n
     return cast(np.ndarray, far <= far.min(axis=1, keepdims=True))
 
 
-def _move(x: np.ndarray, chosen: np.ndarray, target: np.ndarray, free: np.ndarray, walls: Walls) -> None:
+def _move(
+    x: np.ndarray, chosen: np.ndarray, target: np.ndarray, free: np.ndarray, walls: Walls
+) -> None:
     """Move points (updated) to their targets, where these are on the wall, near, and along the sides that the points lie on."""
     way = target - x[chosen]
-    good = (np.linalg.norm(way, axis=1) <= FARTHEST) & (np.abs(way * ~free[chosen]) < MISSED).all(axis=1)
+    good = (np.linalg.norm(way, axis=1) <= FARTHEST) & (np.abs(way * ~free[chosen]) < MISSED).all(
+        axis=1
+    )
     good &= np.abs(walls.distance(target) + OVERLAP) < MISSED
     x[chosen[good]] += way[good] * free[chosen[good]]
 
@@ -177,7 +203,10 @@ class Planes:
     @classmethod
     def through(cls, x: np.ndarray, normal: np.ndarray) -> Planes:
         """Return a plane through each point, shape (n, 3), with this normal; 0: none."""
-        return cls(normal[:, :, None] * normal[:, None, :], normal * np.einsum("ij,ij->i", normal, x)[:, None])
+        return cls(
+            normal[:, :, None] * normal[:, None, :],
+            normal * np.einsum("ij,ij->i", normal, x)[:, None],
+        )
 
     def of(self, groups: np.ndarray) -> Planes:
         """Return the planes of groups of points together, shape (m, k)."""
@@ -198,4 +227,6 @@ class Planes:
         residual = self.right - np.einsum("nij,nj->ni", self.matrix, near)
         values, vectors = np.linalg.eigh(self.matrix)
         inverse = np.where(values > SINGULAR * values[:, -1:], 1.0 / np.maximum(values, 1e-12), 0.0)
-        return cast(np.ndarray, near + np.einsum("nij,nj,nkj,nk->ni", vectors, inverse, vectors, residual))
+        return cast(
+            np.ndarray, near + np.einsum("nij,nj,nkj,nk->ni", vectors, inverse, vectors, residual)
+        )

@@ -2,8 +2,9 @@
 
 A motion is a pose over time, relative to the placement in the scene.
 
-All motions are functions of time alone, in float64: a solid that turns for a million steps has not drifted, and a run that is resumed sees
-the same poses. Points and directions are those of the domain [m]; two coordinates mean z = 0, and a 2-D scene turns about z.
+All motions are functions of time alone, in float64: a solid that turns for a million steps has not
+drifted, and a run that is resumed sees the same poses. Points and directions are those of the
+domain [m]; two coordinates mean z = 0, and a 2-D scene turns about z.
 """
 
 from __future__ import annotations
@@ -24,9 +25,12 @@ from warp_lcp.rows.host_kernel import HostKernel
 Vector = Sequence[float] | np.ndarray
 
 ROTATION_ERROR = 1e-9  # of a pose's R R' - 1; products of a few rotations stay near 1e-15
-FASTEST = 1e18  # [m/s] or [degrees/s], between keyframes of a smooth motion: cubics have its square and more
+# [m/s] or [degrees/s], between keyframes of a smooth motion: cubics have its square and more
+FASTEST = 1e18
 SPEED_SAMPLES = 4  # of a span in which the top speed is looked for
-TOP_SPEED = HostKernel(KernelFile(Path(__file__).parent / "headers/moving_solids.h")["warp_lcp.grid.motion.top_speed"])
+TOP_SPEED = HostKernel(
+    KernelFile(Path(__file__).parent / "headers/moving_solids.h")["warp_lcp.grid.motion.top_speed"]
+)
 PARTS = np.arange(SPEED_SAMPLES + 1.0)
 UNLIMITED = np.array([[-np.inf], [np.inf]]) * np.ones(3)  # bounds of a solid without an end
 SAME_AXIS = 1e-9  # 1 - cosine of the angle between two axes that count as one
@@ -42,7 +46,9 @@ def keep_checked(frozen: Any, error: float) -> None:
     Raises:
         ValueError: a value is not finite, or the matrix is not a rotation.
     """
-    rotation, translation = (np.array(of, dtype=np.float64) for of in (frozen.rotation, frozen.translation))
+    rotation, translation = (
+        np.array(of, dtype=np.float64) for of in (frozen.rotation, frozen.translation)
+    )
     if rotation.shape != (3, 3):
         raise ValueError(f"rotation must be a 3 x 3 matrix, not of shape {rotation.shape}")
     if not np.abs(rotation @ rotation.T - np.eye(3)).max() < error or np.linalg.det(rotation) < 0.0:
@@ -101,7 +107,9 @@ class Pose:
 
     def after(self, other: Pose) -> Pose:
         """Return the composition: (a.after(b)).apply(p) = a.apply(b.apply(p))."""
-        return Pose._of(self.rotation @ other.rotation, self.rotation @ other.translation + self.translation)
+        return Pose._of(
+            self.rotation @ other.rotation, self.rotation @ other.translation + self.translation
+        )
 
     def inverse(self) -> Pose:
         """Return the inverse transformation."""
@@ -193,7 +201,9 @@ class Rotation:
     def pose(self, time: float) -> Pose:
         """Return the pose at `time` [s]."""
         degrees = self.rate * _elapsed(time, self.start, self.stop)
-        return Pose.about(np.asarray(self.center), _turn(np.asarray(self.axis), degrees), np.zeros(3))
+        return Pose.about(
+            np.asarray(self.center), _turn(np.asarray(self.axis), degrees), np.zeros(3)
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -202,7 +212,8 @@ class Sinusoid:
 
     sin(2 pi time / period + phase) times an amplitude, of a shift, an angle or both.
 
-    With phase 0 the solid passes its middle at time 0, at full speed; with -90 degrees it starts at rest at the far end.
+    With phase 0 the solid passes its middle at time 0, at full speed; with -90 degrees it starts at
+    rest at the far end.
 
     Args:
         period: [s], > 0.
@@ -244,20 +255,24 @@ class Sinusoid:
 class Keyframes:
     """Poses at given times; at rest before the first and after the last.
 
-    Between them shifts and angles are linear in time, or smooth: monotone cubics (Fritsch & Carlson 1980) that begin and end at rest and do
-    not overshoot. In 3-D the turn from one keyframe to the next is the one about a fixed axis (slerp); when smooth, it comes to rest
+    Between them shifts and angles are linear in time, or smooth: monotone cubics
+    (Fritsch & Carlson 1980) that begin and end at rest and do not overshoot. In 3-D the turn from
+    one keyframe to the next is the one about a fixed axis (slerp); when smooth, it comes to rest
     wherever that axis changes.
 
     Args:
         times: [s], increasing, shape (n,), n >= 2.
         translate: shifts [m], shape (n, 2) or (n, 3); none unless given.
-        rotate: [degrees]: angles about z, shape (n,), as many turns as they say; or angles about the fixed axes x, y, z in that order,
-            shape (n, 3), of less than half a turn from one keyframe to the next.
-        center: the point [m] that the turns leave where it is, 2 or 3 numbers; it takes part in the shifts.
+        rotate: [degrees]: angles about z, shape (n,), as many turns as they say; or angles about
+            the fixed axes x, y, z in that order, shape (n, 3), of less than half a turn from one
+            keyframe to the next.
+        center: the point [m] that the turns leave where it is, 2 or 3 numbers; it takes part in the
+            shifts.
         smooth: whether velocities are continuous.
 
     Raises:
-        ValueError: times do not increase, a shape does not fit, a value is not finite, or a turn is ambiguous.
+        ValueError: times do not increase, a shape does not fit, a value is not finite, or a turn is
+            ambiguous.
     """
 
     times: Vector
@@ -279,10 +294,14 @@ class Keyframes:
             raise ValueError("keyframes need translate, rotate or both")
         shift = turns = None
         if self.translate is not None:
-            shift = _Curve(times, _rows("translate", self.translate, len(times), (2, 3)), smooth=self.smooth)
+            shift = _Curve(
+                times, _rows("translate", self.translate, len(times), (2, 3)), smooth=self.smooth
+            )
         if self.rotate is not None:
             angles = np.array(self.rotate, dtype=np.float64)
-            angles = _rows("rotate", angles[:, None] if angles.ndim == 1 else angles, len(times), (1, 3))
+            angles = _rows(
+                "rotate", angles[:, None] if angles.ndim == 1 else angles, len(times), (1, 3)
+            )
             turns = _Turns(times, angles, smooth=self.smooth)
         object.__setattr__(self, "center", _in_space("center", self.center))
         object.__setattr__(self, "_shift", shift)
@@ -308,12 +327,17 @@ class Motions:
     def __init__(self, motions: Sequence[Motion]) -> None:
         self.motions = tuple(motions)
         rigid = [isinstance(motion, RigidMotion) for motion in motions]
-        kinds = dict.fromkeys(type(motion) for motion, is_rigid in zip(motions, rigid, strict=True) if is_rigid)
-        of_kind = {kind: [n for n, motion in enumerate(motions) if type(motion) is kind] for kind in kinds}
+        kinds = dict.fromkeys(
+            type(motion) for motion, is_rigid in zip(motions, rigid, strict=True) if is_rigid
+        )
+        of_kind = {
+            kind: [n for n, motion in enumerate(motions) if type(motion) is kind] for kind in kinds
+        }
         self._groups: list[tuple[Any, list[int], list[Any]]] = [
             (kind, numbers, [motions[n] for n in numbers]) for kind, numbers in of_kind.items()
         ]
-        self._alone: Any = next(iter(kinds)) if len(kinds) == 1 and all(rigid) else None  # the kind of all
+        # the kind of all
+        self._alone: Any = next(iter(kinds)) if len(kinds) == 1 and all(rigid) else None
         self._prescribed = [n for n, is_rigid in enumerate(rigid) if not is_rigid]
 
     def __len__(self) -> int:
@@ -329,7 +353,10 @@ class Motions:
         times = np.asarray(times, dtype=np.float64)
         if self._alone is not None:
             return cast(tuple[np.ndarray, np.ndarray], self._alone.poses_of(self.motions, times))
-        rotations, translations = np.empty((len(times), len(self), 3, 3)), np.empty((len(times), len(self), 3))
+        rotations, translations = (
+            np.empty((len(times), len(self), 3, 3)),
+            np.empty((len(times), len(self), 3)),
+        )
         for kind, numbers, members in self._groups:
             rotations[:, numbers], translations[:, numbers] = kind.poses_of(members, times)
         for number in self._prescribed:
@@ -355,14 +382,21 @@ class Motions:
             turns[number], shifts[number] = (way.rotation - np.eye(3)) / dt, way.translation / dt
         return turns, shifts
 
-    def top_speed(self, bounds: Sequence[np.ndarray | None] | np.ndarray, size: np.ndarray, time: float, span: float) -> float:
+    def top_speed(
+        self,
+        bounds: Sequence[np.ndarray | None] | np.ndarray,
+        size: np.ndarray,
+        time: float,
+        span: float,
+    ) -> float:
         """Return the largest future speed of a point of a solid in the domain [m/s].
 
-        A rigid body is fastest at a corner of a box around it; velocities are means over a few parts of the span.
+        A rigid body is fastest at a corner of a box around it; velocities are means over a few
+        parts of the span.
 
         Args:
-            bounds: low and high corner [m] of a box around each solid as it is placed, shape (2, 3); None: it has no limits. Or
-                these in one array, see `boxes_of`.
+            bounds: low and high corner [m] of a box around each solid as it is placed, shape (2,
+                3); None: it has no limits. Or these in one array, see `boxes_of`.
             size: of the domain [m], shape (3,), z = 0 in 2-D.
             time: [s].
             span: time to look ahead [s], > 0.
@@ -403,11 +437,14 @@ class _Curve:
         rests: numbers of keyframes where a smooth curve of monotone values must have slope 0.
     """
 
-    def __init__(self, times: np.ndarray, values: np.ndarray, *, smooth: bool, rests: Sequence[int] = ()) -> None:
+    def __init__(
+        self, times: np.ndarray, values: np.ndarray, *, smooth: bool, rests: Sequence[int] = ()
+    ) -> None:
         self.times, self.values = times, values
         self._spline = None
         if smooth:
-            with np.errstate(over="ignore", divide="ignore"):  # by slopes of almost 0: weights of slopes that are 0
+            # by slopes of almost 0: weights of slopes that are 0
+            with np.errstate(over="ignore", divide="ignore"):
                 if (np.abs(np.diff(values, axis=0)) > FASTEST * np.diff(times)[:, None]).any():
                     raise ValueError("times are too close to each other for a smooth motion")
                 slopes = PchipInterpolator(times, values).derivative()(times)
@@ -445,9 +482,11 @@ class _Turns:
         if len(leaps):
             first, last = angles[leaps[0]].tolist(), angles[leaps[0] + 1].tolist()
             raise ValueError(
-                f"rotate must change by less than 180 degrees from one keyframe to the next, not from {first} to {last}; add one between"
+                "rotate must change by less than 180 degrees from one keyframe to the next, not "
+                f"from {first} to {last}; add one between"
             )
-        rotations = transform.Rotation.from_euler("xyz", angles, degrees=True)  # lower case: about fixed axes
+        # lower case: about fixed axes
+        rotations = transform.Rotation.from_euler("xyz", angles, degrees=True)
         self._slerp = transform.Slerp(np.arange(len(times)), rotations)
         steps = (rotations[1:] * rotations[:-1].inv()).as_rotvec(degrees=True)
         self._size = np.linalg.norm(steps, axis=1)
@@ -461,7 +500,9 @@ class _Turns:
         angle = float(self._angle.at(time)[0])
         if self._slerp is None:
             return _turn(np.array([0.0, 0.0, 1.0]), angle)
-        step = int(np.clip(np.searchsorted(self.times, time, side="right") - 1, 0, len(self._size) - 1))
+        step = int(
+            np.clip(np.searchsorted(self.times, time, side="right") - 1, 0, len(self._size) - 1)
+        )
         size = self._size[step]
         within = (angle - float(self._angle.values[step, 0])) / size if size > 0.0 else 0.0
         return cast(np.ndarray, self._slerp(step + min(max(within, 0.0), 1.0)).as_matrix())
@@ -469,7 +510,12 @@ class _Turns:
 
 def _turn(axis: np.ndarray, degrees: float) -> np.ndarray:
     """Return the matrix of a turn about a unit axis, shape (3, 3)."""
-    return cast(np.ndarray, transform.Rotation.from_rotvec(math.radians(math.remainder(degrees, 360.0)) * axis).as_matrix())
+    return cast(
+        np.ndarray,
+        transform.Rotation.from_rotvec(
+            math.radians(math.remainder(degrees, 360.0)) * axis
+        ).as_matrix(),
+    )
 
 
 def _elapsed(time: float, start: float, stop: float) -> float:
@@ -514,16 +560,23 @@ def unit(name: str, value: Vector) -> tuple[float, ...]:
     return tuple((direction / np.linalg.norm(direction)).tolist())
 
 
-def _rows(name: str, value: Sequence[Vector] | np.ndarray, count: int, widths: tuple[int, ...]) -> np.ndarray:
+def _rows(
+    name: str, value: Sequence[Vector] | np.ndarray, count: int, widths: tuple[int, ...]
+) -> np.ndarray:
     """Return a table of finite numbers with one row a keyframe."""
     try:
         rows = np.array(value, dtype=np.float64)
     except ValueError as error:
         raise ValueError(f"{name} must have as many numbers at every time") from error
     if rows.ndim != 2 or rows.shape[1] not in widths:
-        raise ValueError(f"{name} must have {' or '.join(map(str, widths))} numbers at every time, not shape {rows.shape}")
+        raise ValueError(
+            f"{name} must have {' or '.join(map(str, widths))} numbers at every time, not shape "
+            f"{rows.shape}"
+        )
     if len(rows) != count:
-        raise ValueError(f"{name} must have an entry for each of the {count} times, not {len(rows)}")
+        raise ValueError(
+            f"{name} must have an entry for each of the {count} times, not {len(rows)}"
+        )
     if not np.isfinite(rows).all():
         raise ValueError(f"{name} must be finite, not {rows.tolist()}")
     return rows

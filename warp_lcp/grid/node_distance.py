@@ -1,7 +1,8 @@
 """Signed distances of solids at the nodes of a grid, in cells, positive in the open.
 
-Node (k, j, i) is the low corner of stored cell (k, j, i). Each node keeps the two nearest solids, so that a face can tell which of them is
-nearest to its center. Distances below `FAR` cells are exact, others are at least that large: only nodes near solids are measured.
+Node (k, j, i) is the low corner of stored cell (k, j, i). Each node keeps the two nearest solids,
+so that a face can tell which of them is nearest to its center. Distances below `FAR` cells are
+exact, others are at least that large: only nodes near solids are measured.
 """
 
 from __future__ import annotations
@@ -27,9 +28,20 @@ from warp_lcp.rows.program import clear, copy
 
 NodeBox = tuple[Sequence[int], Sequence[int]]  # the first node (x, y, z) and one past the last
 CHUNK = 1 << 18  # points at a time: 8 MB of positions, distances and nodes
-KINDS: dict[Any, int] = {Box: kernels.BOX, Sphere: kernels.SPHERE, Capsule: kernels.CAPSULE, Plane: kernels.PLANE}
-PLACE = HostKernel(KernelFile(Path(__file__).parent / "headers/moving_solids.h")["warp_lcp.grid.node_distance.place"])
-SNAP = 1e-6  # of the domain's longest side: distances below it are rounding errors of float32 positions, and count as 0
+KINDS: dict[Any, int] = {
+    Box: kernels.BOX,
+    Sphere: kernels.SPHERE,
+    Capsule: kernels.CAPSULE,
+    Plane: kernels.PLANE,
+}
+PLACE = HostKernel(
+    KernelFile(Path(__file__).parent / "headers/moving_solids.h")[
+        "warp_lcp.grid.node_distance.place"
+    ]
+)
+# of the domain's longest side: distances below it are rounding errors of float32 positions, and
+# count as 0
+SNAP = 1e-6
 
 
 class NodeDistances:
@@ -37,7 +49,8 @@ class NodeDistances:
 
     Args:
         grid: the grid; arrays have its stored shape.
-        second: whether to keep the second nearest, too; without it its arrays are those of the nearest.
+        second: whether to keep the second nearest, too; without it its arrays are those of the
+            nearest.
 
     Attributes:
         near: float32 distance to the nearest solid [cells].
@@ -50,7 +63,9 @@ class NodeDistances:
     def __init__(self, grid: StaggeredGrid, *, second: bool) -> None:
         self.grid = grid
         self.near, self.owner = grid.field(), grid.field(wp.int16)
-        self.next_near, self.next_owner = (grid.field(), grid.field(wp.int16)) if second else (self.near, self.owner)
+        self.next_near, self.next_owner = (
+            (grid.field(), grid.field(wp.int16)) if second else (self.near, self.owner)
+        )
         self.near.fill_(FAR)
         self.next_near.fill_(FAR)
         self.struct = Nearest()
@@ -75,7 +90,9 @@ def node_window(grid: StaggeredGrid, low: Sequence[int], high: Sequence[int]) ->
     return Window(_kji(low), _kji(high), grid.device)
 
 
-def nodes_near(grid: StaggeredGrid, geometry: Geometry, reach: float = FAR) -> tuple[np.ndarray, np.ndarray] | None:
+def nodes_near(
+    grid: StaggeredGrid, geometry: Geometry, reach: float = FAR
+) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the first stored node and the one past the last (x, y, z) within `reach` cells of a solid's bounds; None: there are none."""
     bounds = geometry.bounds()
     low, high = nodes_within(grid, UNLIMITED if bounds is None else bounds, reach)
@@ -88,13 +105,19 @@ def box_near(grid: StaggeredGrid, geometry: Geometry) -> NodeBox | None:
     return None if near is None else (near[0].tolist(), near[1].tolist())
 
 
-def nodes_within(grid: StaggeredGrid, bounds: np.ndarray, reach: float = FAR) -> tuple[np.ndarray, np.ndarray]:
+def nodes_within(
+    grid: StaggeredGrid, bounds: np.ndarray, reach: float = FAR
+) -> tuple[np.ndarray, np.ndarray]:
     """Return first nodes and those past the last (x, y, z) within `reach` cells of boxes [m], shape (..., 2, 3).
 
     Shapes (..., 3); not all of one are less than those of the other where no node is near.
     """
     end = np.array(grid.shape[::-1])
-    touched = np.clip(bounds / grid.spacing + 1.0 - np.array(grid.origin) + np.array([[-reach], [reach]]), -1.0, end)
+    touched = np.clip(
+        bounds / grid.spacing + 1.0 - np.array(grid.origin) + np.array([[-reach], [reach]]),
+        -1.0,
+        end,
+    )
     low = np.ceil(np.maximum(touched[..., 0, :], 0.0)).astype(np.int64)
     high = np.minimum(np.floor(touched[..., 1, :]).astype(np.int64) + 1, end)
     if grid.dimension == 2:
@@ -116,7 +139,9 @@ class ShapeTable:
         box: around the nodes near them; None: there are none.
     """
 
-    def __init__(self, grid: StaggeredGrid, solids: Sequence[tuple[int, Geometry]], places: Sequence[int]) -> None:
+    def __init__(
+        self, grid: StaggeredGrid, solids: Sequence[tuple[int, Geometry]], places: Sequence[int]
+    ) -> None:
         self.grid, self.places = grid, list(places)
         shapes = [part for _, geometry in solids for part in _parts(geometry)]
         counts = [len(_parts(geometry)) for _, geometry in solids]
@@ -124,27 +149,46 @@ class ShapeTable:
         hulls = [shape.hull() for shape in shapes]
         most = max(1, *(len(corners) for corners, _ in hulls))
         corners = [np.resize(c, (most, 3)) if len(c) else np.zeros((most, 3)) for c, _ in hulls]
-        limits = [UNLIMITED if (box := shape.bounds()) is None else np.where(np.isfinite(box), 0.0, box) for shape in shapes]
+        limits = [
+            UNLIMITED if (box := shape.bounds()) is None else np.where(np.isfinite(box), 0.0, box)
+            for shape in shapes
+        ]
         placements = [shape.placement for shape in shapes]
-        of_placements = [[getattr(p, name) for p in placements] for name in ("rotation", "translation", "scale")]
+        of_placements = [
+            [getattr(p, name) for p in placements] for name in ("rotation", "translation", "scale")
+        ]
         of_shapes = [
             [shape.origin() for shape in shapes],
             corners,
             [margin for _, margin in hulls],
             limits,
         ]  # infinite where without an end
-        self._fixed = np.concatenate([np.ravel(of) for of in (*of_placements, *of_shapes, [grid.spacing, FAR])])
+        self._fixed = np.concatenate(
+            [np.ravel(of) for of in (*of_placements, *of_shapes, [grid.spacing, FAR])]
+        )
         self._places = np.concatenate([starts, grid.origin, grid.shape[::-1]])
-        self._numbers = {"count": len(solids), "shapes": len(shapes), "corners": most, "flat": grid.dimension == 2}
+        self._numbers = {
+            "count": len(solids),
+            "shapes": len(shapes),
+            "corners": most,
+            "flat": grid.dimension == 2,
+        }
         self._solids = HostArray(len(solids), kernels.ShapeGroup, grid.device)
         self._shapes = HostArray(len(shapes), kernels.PlacedShape, grid.device)
         for row, shape in zip(self._shapes.host, shapes, strict=True):
             row["kind"], numbers = KINDS[type(shape)], shape.parameters(grid.device)
-            row["frame"]["scale"], row["frame"]["sign"] = shape.placement.scale * shape.unit_length(), -1.0 if shape.invert else 1.0
+            row["frame"]["scale"], row["frame"]["sign"] = (
+                shape.placement.scale * shape.unit_length(),
+                -1.0 if shape.invert else 1.0,
+            )
             for number in numbers:
                 row["radius" if isinstance(number, float) else "way"] = number
         groups = self._solids.host
-        groups["number"], groups["first"], groups["end"] = [number for number, _ in solids], starts[:-1], starts[1:]
+        groups["number"], groups["first"], groups["end"] = (
+            [number for number, _ in solids],
+            starts[:-1],
+            starts[1:],
+        )
         self._block = block_of(np.zeros(3), np.ones(3), grid.spacing, grid.dimension, grid.origin)
         self.low = self.high = np.zeros((len(solids), 3), dtype=np.int64)
         self.box: NodeBox | None = None
@@ -159,13 +203,25 @@ class ShapeTable:
         """Place the solids by poses, shapes (n, 3, 3) and (n, 3) [m]."""
         n, shapes = self._numbers["count"], self._numbers["shapes"]
         given = (rotation, translation, self._fixed)
-        reals, (near,) = PLACE.run(given, (self._places,), work=12 * shapes + 6 * n + 6, **self._numbers)
+        reals, (near,) = PLACE.run(
+            given, (self._places,), work=12 * shapes + 6 * n + 6, **self._numbers
+        )
         begin = 12 * n + len(self._fixed)
         middle, after = begin + 9 * shapes, begin + 12 * shapes
         inverse, origin = reals[begin:middle], reals[middle:after]
-        nodes, around = reals[after : after + 6 * n], reals[after + 6 * n : after + 6 * n + 6].tolist()
-        frame, solids, boxes = self._shapes.host["frame"], self._solids.host, nodes.reshape(n, 2, 3).astype(np.int64)
-        frame["inverse_rotation"], frame["translation"] = inverse.reshape(-1, 3, 3), origin.reshape(-1, 3)
+        nodes, around = (
+            reals[after : after + 6 * n],
+            reals[after + 6 * n : after + 6 * n + 6].tolist(),
+        )
+        frame, solids, boxes = (
+            self._shapes.host["frame"],
+            self._solids.host,
+            nodes.reshape(n, 2, 3).astype(np.int64),
+        )
+        frame["inverse_rotation"], frame["translation"] = (
+            inverse.reshape(-1, 3, 3),
+            origin.reshape(-1, 3),
+        )
         self.low, self.high = boxes[:, 0], boxes[:, 1]
         solids["low"], solids["high"] = self.low, self.high
         self._solids.send()
@@ -181,7 +237,10 @@ class ShapeTable:
 
     def enter(self, nodes: NodeDistances, snap: float) -> None:
         """Enter the solids' distances; those within `snap` [cells] of a surface are 0."""
-        self._window.launch(kernels.enter_solids, [self._block, self._solids.array, self._shapes.array, snap, nodes.struct])
+        self._window.launch(
+            kernels.enter_solids,
+            [self._block, self._solids.array, self._shapes.array, snap, nodes.struct],
+        )
 
 
 class NodeSampler:
@@ -197,7 +256,10 @@ class NodeSampler:
         size = max(min(CHUNK, grid.size), max(grid.shape) * COARSE**2)  # a row of groups fits
         self._points = wp.empty(size, dtype=wp.vec3, device=grid.device)
         self._distances = wp.empty(size, dtype=wp.float32, device=grid.device)
-        self._list, self._sure = (wp.empty(size, dtype=wp.vec4i, device=grid.device) for _ in range(2))  # (x, y, z, sign if sure)
+        # (x, y, z, sign if sure)
+        self._list, self._sure = (
+            wp.empty(size, dtype=wp.vec4i, device=grid.device) for _ in range(2)
+        )
         self._listed = wp.zeros(2, dtype=wp.int32, device=grid.device)
 
     def enter(self, nodes: NodeDistances, number: int, geometry: Geometry) -> None:
@@ -211,10 +273,12 @@ class NodeSampler:
         near, before = nodes_near(nodes.grid, geometry), nodes.grid.origin
         if near is None:
             return
-        # A mesh takes microseconds a node, most of them for the sign: the distance at the middle of a group of nodes tells whether the
-        # others matter, and the sign of many.
+        # A mesh takes microseconds a node, most of them for the sign: the distance at the middle of
+        # a group of nodes tells whether the others matter, and the sign of many.
         stride = COARSE if isinstance(geometry, TriangleMesh) else 1
-        for block, distances in self.measured(geometry, *near, stride=stride, offset=0.5 * (stride - 1), before=before):
+        for block, distances in self.measured(
+            geometry, *near, stride=stride, offset=0.5 * (stride - 1), before=before
+        ):
             if stride == 1:
                 inputs = [block, distances, self.snap, number, nodes.struct]
                 wp.launch(kernels.claim_nodes, len(distances), inputs, device=self.grid.device)
@@ -223,17 +287,26 @@ class NodeSampler:
             inputs = [block, distances, number, nodes.struct, self._list, self._sure, self._listed]
             wp.launch(kernels.claim_groups, len(distances), inputs, device=self.grid.device)
             block.offset = 0.0
-            for listed, count in zip((self._list, self._sure), self._listed.numpy().tolist(), strict=True):
+            for listed, count in zip(
+                (self._list, self._sure), self._listed.numpy().tolist(), strict=True
+            ):
                 if count:
                     known = listed is self._sure
-                    distances = self._measure(geometry, count, kernels.listed_points, [block, listed], unsigned=known)
+                    distances = self._measure(
+                        geometry, count, kernels.listed_points, [block, listed], unsigned=known
+                    )
                     inputs = [block, listed, distances, self.snap, number, nodes.struct]
                     wp.launch(kernels.claim_listed, count, inputs, device=self.grid.device)
 
     def look_at_centers(
-        self, nodes: NodeDistances, solids: Callable[[], Sequence[Geometry]], low: Sequence[int], high: Sequence[int], marks: wp.array,
+        self,
+        nodes: NodeDistances,
+        solids: Callable[[], Sequence[Geometry]],
+        low: Sequence[int],
+        high: Sequence[int],
+        marks: wp.array,
         listed: bool = False,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Mark as HOLLOW the cells in the open whose corners all have distance 0: gaps of one cell, where plates have no mark.
 
         Args:
@@ -255,24 +328,47 @@ class NodeSampler:
             middle = (low[longest] + high[longest]) // 2
             for part in (slice(None, middle), slice(middle, None)):
                 begin, end = list(low), list(high)
-                begin[longest], end[longest] = part.start or begin[longest], part.stop or end[longest]
+                begin[longest], end[longest] = (
+                    part.start or begin[longest],
+                    part.stop or end[longest],
+                )
                 self.look_at_centers(nodes, solids, begin, end, marks)
         elif found:
-            block, listed = self._block(np.array(low), np.array(high), offset=0.5), self._list[:found]
+            block, listed = (
+                self._block(np.array(low), np.array(high), offset=0.5),
+                self._list[:found],
+            )
             for order, geometry in enumerate(solids()):
                 distances = self._measure(geometry, found, kernels.listed_points, [block, listed])
-                wp.launch(kernels.mark_listed, found, [listed, distances, order == 0, marks], device=self.grid.device)
+                wp.launch(
+                    kernels.mark_listed,
+                    found,
+                    [listed, distances, order == 0, marks],
+                    device=self.grid.device,
+                )
 
     def inner(self, low: Sequence[int], high: Sequence[int]) -> NodeBox:
         """Return a box of nodes without those that are the low corner of no cell inside the ring."""
-        return [max(start, 1) for start in low], [min(stop, end - 1) for stop, end in zip(high, self.grid.shape[::-1], strict=True)]
+        return [max(start, 1) for start in low], [
+            min(stop, end - 1) for stop, end in zip(high, self.grid.shape[::-1], strict=True)
+        ]
 
     def list_flat_cells(self, nodes: NodeDistances, window: Window) -> None:
         """List the cells of a window in the open whose corners all have distance 0."""
         clear(self._listed)
-        window.launch(kernels.find_flat_cells, [self.grid.planes, nodes.near, self._list, self._listed])
+        window.launch(
+            kernels.find_flat_cells, [self.grid.planes, nodes.near, self._list, self._listed]
+        )
 
-    def _measure(self, geometry: Geometry, count: int, fill: wp.Kernel, inputs: list[Any], *, unsigned: bool = False) -> wp.array:
+    def _measure(
+        self,
+        geometry: Geometry,
+        count: int,
+        fill: wp.Kernel,
+        inputs: list[Any],
+        *,
+        unsigned: bool = False,
+    ) -> wp.array:
         """Return the distances [m] of `count` points that a kernel makes; only a mesh can be asked for those without sign."""
         points, distances = self._points[:count], self._distances[:count]
         wp.launch(fill, count, [*inputs, points], device=self.grid.device)
@@ -282,13 +378,27 @@ class NodeSampler:
             geometry.signed_distance(points, distances)
         return distances
 
-    def _block(self, low: np.ndarray, high: np.ndarray, before: tuple[int, int, int] | None = None, **more: Any) -> Any:
-        return block_of(low, high, self.grid.spacing, self.grid.dimension, before or self.grid.origin, **more)
+    def _block(
+        self,
+        low: np.ndarray,
+        high: np.ndarray,
+        before: tuple[int, int, int] | None = None,
+        **more: Any,
+    ) -> Any:
+        return block_of(
+            low, high, self.grid.spacing, self.grid.dimension, before or self.grid.origin, **more
+        )
 
     def measured(
-        self, geometry: Geometry, low: np.ndarray, high: np.ndarray, *, stride: int = 1, offset: float,
+        self,
+        geometry: Geometry,
+        low: np.ndarray,
+        high: np.ndarray,
+        *,
+        stride: int = 1,
+        offset: float,
         before: tuple[int, int, int] | None = None,
-    ) -> Iterator[tuple[Any, wp.array]]:  # fmt: skip
+    ) -> Iterator[tuple[Any, wp.array]]:
         """Cut a box of nodes into blocks that fit, planes or else rows, and yield each with its distances [m].
 
         Args:
@@ -297,23 +407,39 @@ class NodeSampler:
             high: one past the last.
             stride: nodes along each axis for which one distance stands.
             offset: from the low one of them to where it is measured, in cells.
-            before: cells (x, y, z) of the whole grid before the first node's; None: those before the sampler's grid.
+            before: cells (x, y, z) of the whole grid before the first node's; None: those before
+                the sampler's grid.
         """
         room = len(self._points) // stride**3
         across, rows, _ = (int(v) for v in -(-(high - low) // stride))
-        depth, height = (room // (across * rows), rows) if across * rows <= room else (1, max(room // across, 1))
+        depth, height = (
+            (room // (across * rows), rows)
+            if across * rows <= room
+            else (1, max(room // across, 1))
+        )
         for bottom in range(int(low[2]), int(high[2]), depth * stride):
             for front in range(int(low[1]), int(high[1]), height * stride):
                 begin = np.array([low[0], front, bottom])
-                end = np.minimum(begin + np.array([high[0] - low[0], height * stride, depth * stride]), high)
+                end = np.minimum(
+                    begin + np.array([high[0] - low[0], height * stride, depth * stride]), high
+                )
                 block = self._block(begin, end, before, stride=stride, offset=offset)
                 counts = block.counts
-                yield block, self._measure(geometry, counts[0] * counts[1] * counts[2], item_points, [block])
+                yield (
+                    block,
+                    self._measure(
+                        geometry, counts[0] * counts[1] * counts[2], item_points, [block]
+                    ),
+                )
 
 
 def _parts(geometry: Geometry) -> list[Any]:
     """Return the shapes that a solid is the union of."""
-    return [shape for part in geometry.parts for shape in _parts(part)] if isinstance(geometry, Union) else [geometry]
+    return (
+        [shape for part in geometry.parts for shape in _parts(part)]
+        if isinstance(geometry, Union)
+        else [geometry]
+    )
 
 
 def _kji(corner: Sequence[int]) -> tuple[int, int, int]:

@@ -21,7 +21,8 @@ from warp_lcp.rows.compiler import forward_kernel
 FAR = 4.0  # cells: distances below it are exact, others at least this large
 COARSE = 3  # nodes along an axis of a block in which one distance may stand for all
 ROUNDING = 1.0e-3  # cells: signs this near to 0 are not relied on
-HOLLOW = 1  # a mark of cells with distance 0 at all corners whose center is open: one cell wide gaps
+# a mark of cells with distance 0 at all corners whose center is open: one cell wide gaps
+HOLLOW = 1
 
 BOX, SPHERE, CAPSULE, PLANE = range(4)  # kinds of a PlacedShape
 
@@ -109,7 +110,15 @@ def claim_nodes(block: Block, distance: Distances, snap: float, solid: int, node
 
 @cell_kernel("warp_lcp.grid.node_distance")
 def enter_solids(
-    k, j, first, end, block: Block, solids: wp.array(dtype=ShapeGroup), shapes: wp.array(dtype=PlacedShape), snap: float, nodes: Nearest
+    k,
+    j,
+    first,
+    end,
+    block: Block,
+    solids: wp.array(dtype=ShapeGroup),
+    shapes: wp.array(dtype=PlacedShape),
+    snap: float,
+    nodes: Nearest,
 ):
     """Enter the distances of several solids, one after the other, at a row of nodes."""
     for s in range(solids.shape[0]):
@@ -126,7 +135,13 @@ def enter_solids(
 
 @forward_kernel(**options)
 def claim_groups(
-    block: Block, distance: Distances, solid: int, nodes: Nearest, unsure: Listed, sure: Listed, listed: wp.array(dtype=wp.int32)
+    block: Block,
+    distance: Distances,
+    solid: int,
+    nodes: Nearest,
+    unsure: Listed,
+    sure: Listed,
+    listed: wp.array(dtype=wp.int32),
 ):
     """Bound the distances of groups of nodes by that of their middles; list the nodes that may be nearer than FAR.
 
@@ -162,7 +177,9 @@ def listed_points(block: Block, list: Listed, out: Points):
 
 
 @forward_kernel(**options)
-def claim_listed(block: Block, list: Listed, distance: Distances, snap: float, solid: int, nodes: Nearest):
+def claim_listed(
+    block: Block, list: Listed, distance: Distances, snap: float, solid: int, nodes: Nearest
+):
     """Enter the distances [m] of a solid at listed nodes; where the list has a sign, it is that of the distance."""
     c = wp.tid()
     node = list[c]

@@ -1,8 +1,9 @@
 """The part of a grid that a process works on, and what it finds out from the processes that work on the others.
 
-One process works on all of the grid; then nothing is exchanged, and a sum over all processes is the number itself. The part of a rank
-among several is `warp_lcp.distributed.subdomain.Subdomain`. Methods named *collective* must be called by every rank, in the same order,
-also by one that has no material.
+One process works on all of the grid; then nothing is exchanged, and a sum over all processes is the
+number itself. The part of a rank among several is `warp_lcp.distributed.subdomain.Subdomain`.
+Methods named *collective* must be called by every rank, in the same order, also by one that has no
+material.
 """
 
 from __future__ import annotations
@@ -107,7 +108,9 @@ class ParticleExchange:
             place: int64, shape (n,).
         """
         order = np.argsort(place, kind="stable")
-        self.particles.assign({name: np.ascontiguousarray(values[order]) for name, values in arrays.items()})
+        self.particles.assign(
+            {name: np.ascontiguousarray(values[order]) for name, values in arrays.items()}
+        )
 
     def count(self) -> None:
         """Count the particles of all processes; collective."""
@@ -157,7 +160,8 @@ class BodyNumbers:
     Attributes:
         count: of bodies that this process knows.
         several: how many of them, the first ones, several processes have trees of.
-        of_tree: the body of each tree of this process, int32, -1: none, shape (trees,); None: each tree is a body.
+        of_tree: the body of each tree of this process, int32, -1: none, shape (trees,); None: each
+            tree is a body.
     """
 
     count: int
@@ -169,7 +173,8 @@ class GridPart:
     """The part of a grid that a process works on: here all of it.
 
     Args:
-        grid: the grid, whose fields have the cells of the part and a ring, or layers of ghost cells, around them.
+        grid: the grid, whose fields have the cells of the part and a ring, or layers of ghost
+            cells, around them.
 
     Attributes:
         grid: as given.
@@ -177,8 +182,10 @@ class GridPart:
         decomposition: their boxes of cells; None: there is one process.
         layers: of ghost cells around the part, its ring included.
         shared: whether there may be others.
-        joined: axes without an end that are cut, along which another process goes on beyond the domain's sides.
-        cuts: has bit n set if beyond side n of the part, see `warp_lcp.grid.sides`, another process goes on.
+        joined: axes without an end that are cut, along which another process goes on beyond the
+            domain's sides.
+        cuts: has bit n set if beyond side n of the part, see `warp_lcp.grid.sides`, another process
+            goes on.
     """
 
     shared: ClassVar[bool] = False
@@ -231,7 +238,9 @@ class GridPart:
         """Return the cells of a window that this process owns or that are at most so many layers away; None: none."""
         return window
 
-    def join_trees(self, trees: int, seen: Window | None, parent: wp.array, number: wp.array, held: wp.array) -> BodyNumbers:
+    def join_trees(
+        self, trees: int, seen: Window | None, parent: wp.array, number: wp.array, held: wp.array
+    ) -> BodyNumbers:
         """Join the trees of cells that reach over several processes' parts to bodies; collective.
 
         Args:
@@ -298,7 +307,13 @@ class GridPart:
         """Return the process that owns each cell (x, y, z) of the whole domain, shape (n, 3)."""
         return np.zeros(len(cells), dtype=np.int64)
 
-    def fill(self, *fields: wp.array | np.ndarray, width: int | None = None, parts: int = 1, forest: Any = None) -> None:
+    def fill(
+        self,
+        *fields: wp.array | np.ndarray,
+        width: int | None = None,
+        parts: int = 1,
+        forest: Any = None,
+    ) -> None:
         """Fill the ghost cells of fields with what other processes know (halo exchange); collective.
 
         Args:
@@ -336,13 +351,23 @@ class GridPart:
     def box_of(self, field: Any) -> Any:
         """Return the view of a field, host or device, or of layers of one, on the owned cells."""
         low, high = self.owned.low, self.owned.high
-        return field[(slice(None),) * (field.ndim - 3) + tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
+        return field[
+            (slice(None),) * (field.ndim - 3)
+            + tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+        ]
 
     def filling(self, *fields: wp.array | np.ndarray, forest: Any) -> Task:
         """Return `fill` of the cells of a `forest`, to run now or within a recorded program."""
         return Task(partial(self.fill, *fields, forest=forest))
 
-    def forest(self, layers: int = 1, width: int | None = None, *, which: np.ndarray | None = None, into: Any = None) -> Any:
+    def forest(
+        self,
+        layers: int = 1,
+        width: int | None = None,
+        *,
+        which: np.ndarray | None = None,
+        into: Any = None,
+    ) -> Any:
         """Return what `fill` exchanges of some cells alone; collective.
 
         Args:
@@ -371,4 +396,6 @@ class GridPart:
 
     def poisson(self, cells: np.ndarray, **coefficients: Any) -> GridPoisson:
         """Return the operator of all processes' problem on the owned cells; coefficients are fields of `box_like`, see `GridPoisson`."""
-        return GridPoisson(cells, device=self.grid.device, decomposition=self.decomposition, **coefficients)
+        return GridPoisson(
+            cells, device=self.grid.device, decomposition=self.decomposition, **coefficients
+        )

@@ -1,8 +1,9 @@
 """Passes over particles: how these are shared out, and what they are told of the grid.
 
-Written plainly, one thread a particle, the transfers take 71 and 74 ns a particle in 3-D and the advection 129 (one core, 8 particles a
-cell, sorted); as native loops over a grain of particles they take 25, 12 and 34. clang vectorizes a loop whose arrays it is told not to
-alias, gathers from the fields included.
+Written plainly, one thread a particle, the transfers take 71 and 74 ns a particle in 3-D and the
+advection 129 (one core, 8 particles a cell, sorted); as native loops over a grain of particles they
+take 25, 12 and 34. clang vectorizes a loop whose arrays it is told not to alias, gathers from the
+fields included.
 """
 
 import ctypes
@@ -23,12 +24,17 @@ if TYPE_CHECKING:
 
     from warp_lcp.grid.staggered import StaggeredGrid
 
-CPU_GRAIN = 4096  # particles that a CPU thread takes: the launch then costs nothing, the arrays stay in the L2 cache
-SHARES = 2  # that a thread's planes are cut into where particles add to them: chunks that touch two shares are read twice
+# particles that a CPU thread takes: the launch then costs nothing, the arrays stay in the L2 cache
+CPU_GRAIN = 4096
+# that a thread's planes are cut into where particles add to them: chunks that touch two shares are
+# read twice
+SHARES = 2
 LEAST_PLANES = 4  # of a share
 PARTICLE = 16  # cells of a usual pass that a particle of one costs
 LIST_ROOM = 1.25  # of the threads of a captured launch over a list's entries
-MARGIN = 1e-3  # how far from a wall particles stay, in cells: well above the rounding of float32 positions in 10^3 cells
+# how far from a wall particles stay, in cells: well above the rounding of float32 positions in 10^3
+# cells
+MARGIN = 1e-3
 KERNELS = KernelFile(Path(__file__).parent / "headers/particles.h")
 
 
@@ -81,7 +87,11 @@ class ListMemory:
 
 
 TOUCHED: dict[Any, RowPass] = {
-    vector: KERNELS.kernel("warp_lcp.grid.touched.touched", module=f"warp_lcp.grid.touched_{real.__name__}", compute=real)
+    vector: KERNELS.kernel(
+        "warp_lcp.grid.touched.touched",
+        module=f"warp_lcp.grid.touched_{real.__name__}",
+        compute=real,
+    )
     for vector, real in ((wp.vec3, wp.float32), (wp.vec3d, wp.float64))
 }
 
@@ -91,15 +101,24 @@ def touched_planes(grid: "StaggeredGrid", position: wp.array[Any]) -> wp.array[w
     if grid.device.is_cuda or get_threads() == 1:
         return None
     listed = getattr(position, "listed", None) if is_recording() else None
-    touched = wp.empty(2 * -(-max(len(position), 1) // CPU_GRAIN), dtype=wp.int32, device=grid.device) if listed is None else listed.touched
+    touched = (
+        wp.empty(2 * -(-max(len(position), 1) // CPU_GRAIN), dtype=wp.int32, device=grid.device)
+        if listed is None
+        else listed.touched
+    )
     launch(TOUCHED[position.dtype], len(position), grid, position=position, touched=touched)
     return touched
 
 
 def scatter(
-    passed: RowPass, grid: "StaggeredGrid", position: wp.array[Any], touched: wp.array[wp.int32] | None, *structs: "DataclassInstance",
-    runs: wp.array[wp.int32] | None = None, **given: Any,
-) -> None:  # fmt: skip
+    passed: RowPass,
+    grid: "StaggeredGrid",
+    position: wp.array[Any],
+    touched: wp.array[wp.int32] | None,
+    *structs: "DataclassInstance",
+    runs: wp.array[wp.int32] | None = None,
+    **given: Any,
+) -> None:
     """Launch a pass in which particles add to a field: on the CPU each task has planes of its own (rows in 2-D).
 
     Args:
@@ -123,7 +142,13 @@ def scatter(
         planes = grid.shape[3 - grid.dimension]
         shares = 1 if touched is None else min(SHARES * get_threads(), -(-planes // LEAST_PLANES))
         rows = Rows.listed(shares, grid.device, 1, weight=1 << 20)  # a share is a piece
-    given |= {"touched": touched, "runs": runs, "count": number, "chunk": CPU_GRAIN, "shares": shares}
+    given |= {
+        "touched": touched,
+        "runs": runs,
+        "count": number,
+        "chunk": CPU_GRAIN,
+        "shares": shares,
+    }
     given["position"] = position
     passed.bind_arguments(rows, (grid.placement, *structs), given).launch()
 
@@ -154,10 +179,13 @@ def chunks(count: int, device: wp.Device) -> Rows:
     return Rows.entries(count, device, 1 if device.is_cuda else CPU_GRAIN, weight=PARTICLE)
 
 
-def launch(passed: RowPass, count: int, grid: "StaggeredGrid", *structs: "DataclassInstance", **given: Any) -> None:
+def launch(
+    passed: RowPass, count: int, grid: "StaggeredGrid", *structs: "DataclassInstance", **given: Any
+) -> None:
     """Launch a pass, bound as by `RowPass.bind` with the grid's placement, over the first particles of a list.
 
-    A launch that is recorded takes as many as the list has when it runs, if one of its arrays is of a `ListMemory`.
+    A launch that is recorded takes as many as the list has when it runs, if one of its arrays is of
+    a `ListMemory`.
     """
     rows, listed = chunks(count, grid.device), None
     if is_recording():

@@ -24,13 +24,18 @@ from warp_lcp.rows.vectors import Tally
 CHUNK = 256  # the fewest particles that one thread adds up
 THREADS = 1024  # the most threads of a sum, each a partial result that the host adds up
 CUDA_CHUNK, CUDA_THREADS = 16, 1 << 15  # the same on a GPU
-GROWTH = 1.5  # of the storage when it is full: n appended particles are copied 2 n times at most, a third of it lies idle at most
-SORT_PIECES = 32  # of the keys that are sorted: with more there is more to add up between two passes
+# of the storage when it is full: n appended particles are copied 2 n times at most, a third of it
+# lies idle at most
+GROWTH = 1.5
+# of the keys that are sorted: with more there is more to add up between two passes
+SORT_PIECES = 32
 # Places of particles in the order of all ranks' particles, see `warp_lcp.distributed.particles`.
 MOST_A_CELL = 1 << 20  # particles; places of one cell are numbers below those of the next
 NEW = 1 << 62  # places from which on particles have come since the last sort
 SORTED, UNSORTED = 0, 1  # steps in which `arrange` sorts, and in which it need not
-SORT_EVERY = 8  # steps between sorts where nothing needs the order: the transfers get no slower in 16 steps at CFL 2, a sort costs 25 ns
+# steps between sorts where nothing needs the order: the transfers get no slower in 16 steps at CFL
+# 2, a sort costs 25 ns
+SORT_EVERY = 8
 
 
 @dataclass(frozen=True)
@@ -151,14 +156,17 @@ class Particles:
         velocity: [m/s], shape (n, 3).
         affine: also carry the gradient of each velocity component [1/s].
         kept: a number of each particle that it takes along, shape (n,); None: they have none.
-        indexed: sort every step and know where each cell's particles begin, for transfers that gather; those that need it on CUDA are
-            the default there.
+        indexed: sort every step and know where each cell's particles begin, for transfers that
+            gather; those that need it on CUDA are the default there.
 
     Attributes:
         count: particles.
-        key: number of the stored cell of each particle when last numbered or sorted, shape (2 capacity,), the first `count` in use.
-        offsets: first particle of each stored cell, int32, shape (cells + 1,), at the last sort; None unless `indexed`.
-        runs: begin and end of each run of particles that lie in the order in which sums take them, int32, shape (2 runs,); None: all do.
+        key: number of the stored cell of each particle when last numbered or sorted, shape (2
+            capacity,), the first `count` in use.
+        offsets: first particle of each stored cell, int32, shape (cells + 1,), at the last sort;
+            None unless `indexed`.
+        runs: begin and end of each run of particles that lie in the order in which sums take them,
+            int32, shape (2 runs,); None: all do.
         exchange: knows the particles of other processes, see `warp_lcp.grid.part.ParticleExchange`.
 
     Raises:
@@ -170,21 +178,36 @@ class Particles:
     _spare: Column  # where the next reordered column goes
 
     def __init__(
-        self, grid: StaggeredGrid, position: np.ndarray, velocity: np.ndarray, *, affine: bool, kept: np.ndarray | None = None,
+        self,
+        grid: StaggeredGrid,
+        position: np.ndarray,
+        velocity: np.ndarray,
+        *,
+        affine: bool,
+        kept: np.ndarray | None = None,
         indexed: bool | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         _check_shapes(position, velocity)
         self.grid, self.count, self._capacity = grid, 0, 0
         indexed = grid.device.is_cuda if indexed is None else indexed
-        self.offsets = wp.zeros(grid.size + 1, dtype=wp.int32, device=grid.device) if indexed else None
-        self._names = ["position", "velocity", *(f"affine_{c}" for c in range(grid.dimension if affine else 0))]
+        self.offsets = (
+            wp.zeros(grid.size + 1, dtype=wp.int32, device=grid.device) if indexed else None
+        )
+        self._names = [
+            "position",
+            "velocity",
+            *(f"affine_{c}" for c in range(grid.dimension if affine else 0)),
+        ]
         self._names += ["kept"] * (kept is not None)
         self._tally, columns, device = None, len(kernels.TOTAL.found), grid.device
         launches = self._launch_totals, self._launch_numbers, self._launch_sort
-        self._totals, self._numbering, self._sorting = (LaunchGraph(device, launch) for launch in launches)
+        self._totals, self._numbering, self._sorting = (
+            LaunchGraph(device, launch) for launch in launches
+        )
         self._removal = LaunchGraph(device, self._launch_removal)
         self._removed = Reading(device, 2, wp.int32)
-        self._marks: tuple[tuple[typing.Any, int], wp.array | None] = (None, 0), None  # of the memory and the count that they are for
+        # of the memory and the count that they are for
+        self._marks: tuple[tuple[typing.Any, int], wp.array | None] = (None, 0), None
         self._stays: wp.array | None = None  # beside them
         self._total_rows = rows_memory(device, LIST_ROOM)
         if device.is_cuda:
@@ -245,7 +268,9 @@ class Particles:
         """
         return self._columns["kept"].view if "kept" in self._columns else None
 
-    def append(self, position: np.ndarray, velocity: np.ndarray, kept: np.ndarray | float | None = None) -> None:
+    def append(
+        self, position: np.ndarray, velocity: np.ndarray, kept: np.ndarray | float | None = None
+    ) -> None:
         """Add particles at the end, with zero gradient.
 
         They are out of order until the next sort.
@@ -253,7 +278,8 @@ class Particles:
         Args:
             position: [m], shape (n, 3).
             velocity: [m/s], shape (n, 3).
-            kept: the number that each takes along, or one for all; for particles that have one, 1 unless given.
+            kept: the number that each takes along, or one for all; for particles that have one, 1
+                unless given.
 
         Raises:
             ValueError: the shapes do not match.
@@ -265,7 +291,10 @@ class Particles:
         self.resize(before + len(position))
         for name, column in self._columns.items():
             if name == "kept":
-                numbers = np.broadcast_to(np.float32(1.0) if kept is None else np.asarray(kept, dtype=np.float32), len(position))
+                numbers = np.broadcast_to(
+                    np.float32(1.0) if kept is None else np.asarray(kept, dtype=np.float32),
+                    len(position),
+                )
                 column.set_from(before, np.repeat(numbers[:, None], 3, axis=1))
             else:  # sorting may have left anything behind the particles in use
                 column.set_from(before, {"position": position, "velocity": velocity}.get(name, 0.0))
@@ -319,10 +348,16 @@ class Particles:
         device = self.grid.device
         if device.is_cuda:
             clear(self._removed.array)
-            launch_list(kernels.stays_kernel, self.count, [marks, stay, self._removed.array], device=device)
+            launch_list(
+                kernels.stays_kernel, self.count, [marks, stay, self._removed.array], device=device
+            )
             return
         columns = dict.fromkeys(("affine_0", "affine_1", "affine_2", "kept")) | self.arrays()
-        counted: dict[str, typing.Any] = {"removed": self._removed.array, "marks": marks, "count": self._memory.count}
+        counted: dict[str, typing.Any] = {
+            "removed": self._removed.array,
+            "marks": marks,
+            "count": self._memory.count,
+        }
         kernels.CLOSE_RANKS.bind(Rows.entries(1, device), **counted, **columns).launch()
 
     def finish_removal(self, marks: wp.array) -> tuple[int, int]:
@@ -342,7 +377,9 @@ class Particles:
                 wp.utils.array_scan(stay, stay, inclusive=True)
                 for name, column in self._columns.items():
                     inputs = [marks, stay, column.view, self._spare.view]
-                    wp.launch(kernels.close_ranks_kernel, self.count, inputs, device=self.grid.device)
+                    wp.launch(
+                        kernels.close_ranks_kernel, self.count, inputs, device=self.grid.device
+                    )
                     self._columns[name], self._spare = self._spare, column
             self.exchange.removing(marks)
             self.resize(self.count - first - others)
@@ -352,9 +389,20 @@ class Particles:
         """Keep the particles with these numbers, in this order."""
         device, count = self.grid.device, len(order)
         if count:
-            numbers = wp.array(order.astype(np.int32, copy=False), dtype=wp.int32, device=device, copy=device.is_cuda)
+            numbers = wp.array(
+                order.astype(np.int32, copy=False),
+                dtype=wp.int32,
+                device=device,
+                copy=device.is_cuda,
+            )
             for name, column in self._columns.items():
-                launch_list(kernels.reorder_kernel, count, [numbers, column.view, self._spare.view], device=device, cost=4)
+                launch_list(
+                    kernels.reorder_kernel,
+                    count,
+                    [numbers, column.view, self._spare.view],
+                    device=device,
+                    cost=4,
+                )
                 self._columns[name], self._spare = self._spare, column
         self.resize(count)
 
@@ -397,7 +445,9 @@ class Particles:
         if count != memory.count.value and self._tally is not None:
             self._total_rows.take(self._rows_of_totals().summed)
         elif count != memory.count.value:
-            self._places.value = self._total_rows.take_entries(count, _chunk_of_totals(count, self.grid.device))
+            self._places.value = self._total_rows.take_entries(
+                count, _chunk_of_totals(count, self.grid.device)
+            )
             self._sort_pieces.value = self._sort_rows.take_entries(count, _piece_of_sort(count))
         for name, column in self._columns.items():
             column.publish(memory, name)
@@ -445,7 +495,16 @@ class Particles:
     def _launch_numbers(self) -> None:
         grid = self.grid
         nx, ny, nz = grid.counts
-        launch(kernels.NUMBER, self.count, grid, position=self.position, key=self.key, nx=nx, ny=ny, nz=nz)
+        launch(
+            kernels.NUMBER,
+            self.count,
+            grid,
+            position=self.position,
+            key=self.key,
+            nx=nx,
+            ny=ny,
+            nz=nz,
+        )
 
     def sort(self) -> None:
         """Sort the particles by cell (stable, so that runs are repeatable)."""
@@ -460,7 +519,9 @@ class Particles:
                 self.offsets.zero_()
             return
         if self._tally is None:
-            least = int(self._sort_pieces.value) * ((1 << digits_of(grid.size.bit_length())[1]) + kernels.APART)
+            least = int(self._sort_pieces.value) * (
+                (1 << digits_of(grid.size.bit_length())[1]) + kernels.APART
+            )
             if self._counts.size < least:
                 self._counts = wp.zeros(least, dtype=wp.int32, device=grid.device)
                 self._sorting.forget()
@@ -471,7 +532,12 @@ class Particles:
             self._columns[name], self._spare = self._spare, column
         self._publish()
         if self.offsets is not None and self._tally is None:
-            wp.launch(kernels.offset_kernel, grid.size + 1, [self.key, self.count, self.offsets], device=grid.device)
+            wp.launch(
+                kernels.offset_kernel,
+                grid.size + 1,
+                [self.key, self.count, self.offsets],
+                device=grid.device,
+            )
 
     def _keys_to_sort(self) -> int:
         """Return how many keys a GPU sorts: at most a quarter more than particles.
@@ -485,22 +551,38 @@ class Particles:
         """Launch the numbering, the sort of the numbers, and the move of each column to where the one before it was.
 
         Args:
-            keys: how many a GPU sorts: those behind the particles' have the largest number, and stay behind them.
+            keys: how many a GPU sorts: those behind the particles' have the largest number, and
+                stay behind them.
         """
         device, size, count = self.grid.device, self.grid.size, self._memory.count
         bits = size.bit_length()
         self._launch_numbers()
         if device.is_cuda:
-            launch_recorded(kernels.count_up_kernel, keys, [self._order, self.key, count, (1 << bits) - 1], device=device)
+            launch_recorded(
+                kernels.count_up_kernel,
+                keys,
+                [self._order, self.key, count, (1 << bits) - 1],
+                device=device,
+            )
             call(partial(wp.utils.radix_sort_pairs, self.key, self._order, keys, end_bit=bits))
             if self.offsets is not None:
-                launch_recorded(kernels.offset_kernel, size + 1, [self.key, count, self.offsets], device=device)
+                launch_recorded(
+                    kernels.offset_kernel, size + 1, [self.key, count, self.offsets], device=device
+                )
         else:
             rows = replace(_rows_of_sort(self.count, device), memory=self._sort_rows)
-            sort_keys(_halves(self.key), _halves(self._order), self._counts, rows, self._sort_pieces, bits)
+            sort_keys(
+                _halves(self.key), _halves(self._order), self._counts, rows, self._sort_pieces, bits
+            )
         views = [self._spare.view, *(column.view for column in self._columns.values())]
         for target, source in itertools.pairwise(views):
-            launch_list(kernels.reorder_kernel, self.count, [self._order, source, target], device=device, cost=4)
+            launch_list(
+                kernels.reorder_kernel,
+                self.count,
+                [self._order, source, target],
+                device=device,
+                cost=4,
+            )
 
     def totals(self) -> ParticleTotals:
         """Return sums over the particles of all ranks; collective.
@@ -537,18 +619,32 @@ class Particles:
 
     def _rows_of_totals(self) -> Rows:
         """Return how the particles are shared out for sums over them."""
-        return Rows.entries(self.count, self.grid.device, _chunk_of_totals(self.count, self.grid.device))
+        return Rows.entries(
+            self.count, self.grid.device, _chunk_of_totals(self.count, self.grid.device)
+        )
 
     def _launch_totals(self) -> None:
         """Launch the sums over the particles, and those of the threads' sums."""
         rows = replace(self._rows_of_totals(), memory=self._total_rows)
         if self._tally is not None:
-            self._tally.take(rows, self.grid.placement, position=self.position, velocity=self.velocity)
+            self._tally.take(
+                rows, self.grid.placement, position=self.position, velocity=self.velocity
+            )
             return
-        kernels.TOTAL.bind(rows, self.grid.placement, position=self.position, velocity=self.velocity, out=self._partials).launch()
+        kernels.TOTAL.bind(
+            rows,
+            self.grid.placement,
+            position=self.position,
+            velocity=self.velocity,
+            out=self._partials,
+        ).launch()
         columns = Rows.flat(len(kernels.TOTAL.found), self.grid.device, serial=True)
         kernels.ADD_IN_ORDER.bind(
-            columns, partials=self._partials, results=self._found.array, places_of_sums=self._places, sums_=len(kernels.TOTAL.sums)
+            columns,
+            partials=self._partials,
+            results=self._found.array,
+            places_of_sums=self._places,
+            sums_=len(kernels.TOTAL.sums),
         ).launch()
 
     def launch_totals(self) -> None:
@@ -577,7 +673,9 @@ class Particles:
         """
         grid = self.grid
         cells = np.floor(np.nan_to_num(np.asarray(positions, dtype=np.float64)) / grid.spacing)
-        return grid.part.nearest(np.clip(cells, 0, np.array(grid.domain_counts) - 1).astype(int) - np.array(grid.origin))
+        return grid.part.nearest(
+            np.clip(cells, 0, np.array(grid.domain_counts) - 1).astype(int) - np.array(grid.origin)
+        )
 
     def cell_of(self, position: typing.Sequence[float] | np.ndarray) -> tuple[int, int, int]:
         """Return the interior cell (x, y, z), counted from 0, of one position [m].
@@ -598,7 +696,10 @@ class Particles:
 
 def _chunk_of_totals(count: int, device: wp.Device) -> int:
     """Return how many particles a thread adds up."""
-    return max(CUDA_CHUNK if device.is_cuda else CHUNK, -(-count // (CUDA_THREADS if device.is_cuda else THREADS)))
+    return max(
+        CUDA_CHUNK if device.is_cuda else CHUNK,
+        -(-count // (CUDA_THREADS if device.is_cuda else THREADS)),
+    )
 
 
 def _piece_of_sort(count: int) -> int:
@@ -618,12 +719,19 @@ def _halves(array: wp.array) -> tuple[wp.array, wp.array]:
 
 def digits_of(bits: int) -> tuple[int, int]:
     """Return the rounds of the sort of keys of some bits, and the bits of a round."""
-    rounds = 2 * -(-bits // 22)  # an even number: the last one ends where the keys were; 2048 digits of a round stay in the L1 cache
+    # an even number: the last one ends where the keys were; 2048 digits of a round stay in the L1
+    # cache
+    rounds = 2 * -(-bits // 22)
     return rounds, -(-bits // rounds)
 
 
 def sort_keys(
-    keys: tuple[wp.array, wp.array], order: tuple[wp.array, wp.array], counts: wp.array, rows: Rows, pieces: int | Scalar, bits: int
+    keys: tuple[wp.array, wp.array],
+    order: tuple[wp.array, wp.array],
+    counts: wp.array,
+    rows: Rows,
+    pieces: int | Scalar,
+    bits: int,
 ) -> None:
     """Launch the sort of keys in place on the CPU, by a radix sort that is stable.
 
@@ -641,25 +749,39 @@ def sort_keys(
     for shift in range(0, rounds * each, each):
         digits = 1 << each
         kernels.SORT_COUNT.bind(rows, key=here, counts=counts, digits=digits, shift=shift).launch()
-        kernels.SORT_BEGIN.bind(Rows.entries(1, device), counts=counts, digits=digits, pieces=pieces).launch()
+        kernels.SORT_BEGIN.bind(
+            Rows.entries(1, device), counts=counts, digits=digits, pieces=pieces
+        ).launch()
         kernels.SORT_PLACE.bind(
-            rows, key=here, order=before, sorted=there, moved=moved_to, counts=counts, digits=digits, shift=shift
+            rows,
+            key=here,
+            order=before,
+            sorted=there,
+            moved=moved_to,
+            counts=counts,
+            digits=digits,
+            shift=shift,
         ).launch()
         here, there, before, moved_to, moved_from = there, here, moved_to, moved_from, moved_to
 
 
 def _check_shapes(position: np.ndarray, velocity: np.ndarray) -> None:
     if position.shape != (len(position), 3) or velocity.shape != position.shape:
-        raise ValueError(f"position {position.shape} and velocity {velocity.shape}: must both be (n, 3)")
+        raise ValueError(
+            f"position {position.shape} and velocity {velocity.shape}: must both be (n, 3)"
+        )
 
 
-def lattice(grid: StaggeredGrid, per_axis: int, jitter: float, random_seed: int, plane: int) -> np.ndarray:
+def lattice(
+    grid: StaggeredGrid, per_axis: int, jitter: float, random_seed: int, plane: int
+) -> np.ndarray:
     """Return jittered lattice points in one plane of cells.
 
     per_axis^dimension points per cell; the same in a part of a grid as in the whole.
 
     Args:
-        grid: the grid; of a part one cell more on each side, from which points may be moved into it.
+        grid: the grid; of a part one cell more on each side, from which points may be moved into
+            it.
         per_axis: points along an edge of a cell.
         jitter: width of the uniform random displacement, as a fraction of the points' spacing.
         random_seed: of the displacements, which are one sequence over all of the grid.
@@ -673,33 +795,47 @@ def lattice(grid: StaggeredGrid, per_axis: int, jitter: float, random_seed: int,
     low = np.maximum(np.array(grid.origin[:2]) - 1, 0) * per_axis
     high = np.minimum((np.array(grid.origin[:2]) + grid.counts[:2] + 1) * per_axis, whole)
     x, y = (np.arange(first, last) for first, last in zip(low, high, strict=True))
-    z = np.arange(plane * per_axis, (plane + 1) * per_axis) if dimension == 3 else np.zeros(1, dtype=int)
+    z = (
+        np.arange(plane * per_axis, (plane + 1) * per_axis)
+        if dimension == 3
+        else np.zeros(1, dtype=int)
+    )
     moved = np.empty((len(z), len(y), len(x), dimension))
     for number, layer in enumerate(z):
         drawn = np.random.PCG64(random_seed)
-        drawn.advance(int((layer * whole[1] + low[1]) * whole[0]) * dimension)  # what the points before have drawn
+        # what the points before have drawn
+        drawn.advance(int((layer * whole[1] + low[1]) * whole[0]) * dimension)
         rows = np.random.Generator(drawn).random((len(y), whole[0], dimension))
         moved[number] = rows[:, low[0] : high[0]]
-    Z, Y, X = np.meshgrid(z + 0.5 if dimension == 3 else np.zeros(1), y + 0.5, x + 0.5, indexing="ij")
+    Z, Y, X = np.meshgrid(
+        z + 0.5 if dimension == 3 else np.zeros(1), y + 0.5, x + 0.5, indexing="ij"
+    )
     points = np.stack([X.ravel(), Y.ravel(), Z.ravel()], axis=1)
     points[:, :dimension] += jitter * (moved.reshape(-1, dimension) - 0.5)
     return points * spacing
 
 
 def seed(
-    grid: StaggeredGrid, regions: typing.Sequence[typing.Callable[[np.ndarray], np.ndarray]], open_cells: np.ndarray, *, per_axis: int,
-    jitter: float, random_seed: int,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    grid: StaggeredGrid,
+    regions: typing.Sequence[typing.Callable[[np.ndarray], np.ndarray]],
+    open_cells: np.ndarray,
+    *,
+    per_axis: int,
+    jitter: float,
+    random_seed: int,
+) -> tuple[np.ndarray, np.ndarray]:
     """Fill regions with particles on a jittered lattice.
 
     A point in several regions belongs to the first.
 
     Args:
         grid: the grid.
-        regions: functions of points [m], shape (n, 3), that return which lie in the region, shape (n,).
+        regions: functions of points [m], shape (n, 3), that return which lie in the region, shape
+            (n,).
         open_cells: mask of the cells that may hold particles, shape (nz, ny, nx).
         per_axis: points along an edge of a cell, >= 1.
-        jitter: width of the random displacement as a fraction of the points' spacing, 0 <= jitter <= 1.
+        jitter: width of the random displacement as a fraction of the points' spacing, 0 <= jitter
+            <= 1.
         random_seed: of the displacements; they do not depend on the regions.
 
     Returns:
@@ -718,7 +854,9 @@ def seed(
     for plane in range(grid.origin[2], grid.origin[2] + grid.counts[2]):
         points = lattice(grid, per_axis, jitter, random_seed, plane).astype(np.float32)
         np.clip(points[:, axes], margin, size[axes] - margin, out=points[:, axes])
-        cells = np.minimum((points.astype(np.float64) / grid.spacing).astype(int), last) - np.array(grid.origin)
+        cells = np.minimum((points.astype(np.float64) / grid.spacing).astype(int), last) - np.array(
+            grid.origin
+        )
         if grid.whole is not None:
             ours = ((cells >= 0) & (cells < np.array(grid.counts)))[:, :2].all(axis=1)
             points, cells = points[ours], cells[ours]

@@ -23,7 +23,9 @@ SORT_PLACE = KERNELS.kernel("warp_lcp.grid.particles.sort_place", constants=_SOR
 
 
 @forward_kernel(module="warp_lcp.grid.particles")
-def count_up_kernel(order: wp.array(dtype=wp.int32), key: wp.array(dtype=wp.int32), count: int, last: int):
+def count_up_kernel(
+    order: wp.array(dtype=wp.int32), key: wp.array(dtype=wp.int32), count: int, last: int
+):
     """Write 0, 1, 2, ..., and a key beyond all others behind those of the particles."""
     p = wp.tid()
     order[p] = p
@@ -42,13 +44,23 @@ def offset_kernel(key: wp.array(dtype=wp.int32), count: int, offsets: wp.array(d
 
 
 @list_kernel("warp_lcp.grid.particles")
-def reorder_kernel(i, order: wp.array(dtype=wp.int32), source: wp.array(dtype=wp.vec3), target: wp.array(dtype=wp.vec3)):
+def reorder_kernel(
+    i,
+    order: wp.array(dtype=wp.int32),
+    source: wp.array(dtype=wp.vec3),
+    target: wp.array(dtype=wp.vec3),
+):
     """Take the particles in a new order."""
     target[i] = source[order[i]]
 
 
 @list_kernel("warp_lcp.grid.particles_removal")
-def stays_kernel(i, marks: wp.array(dtype=wp.int32), stays: wp.array(dtype=wp.int32), removed: wp.array(dtype=wp.int32)):
+def stays_kernel(
+    i,
+    marks: wp.array(dtype=wp.int32),
+    stays: wp.array(dtype=wp.int32),
+    removed: wp.array(dtype=wp.int32),
+):
     """Write 1 for a particle without a mark, 0 for others; count those with the mark 1, and those with another."""
     mark = marks[i]
     stays[i] = wp.where(mark == 0, 1, 0)
@@ -58,7 +70,10 @@ def stays_kernel(i, marks: wp.array(dtype=wp.int32), stays: wp.array(dtype=wp.in
 
 @forward_kernel(module="warp_lcp.grid.particles")
 def close_ranks_kernel(
-    marks: wp.array(dtype=wp.int32), stay: wp.array(dtype=wp.int32), source: wp.array(dtype=wp.vec3), target: wp.array(dtype=wp.vec3)
+    marks: wp.array(dtype=wp.int32),
+    stay: wp.array(dtype=wp.int32),
+    source: wp.array(dtype=wp.vec3),
+    target: wp.array(dtype=wp.vec3),
 ):
     """Move particles without a mark to where `stay`, the number of those up to and with each, says."""
     p = wp.tid()

@@ -11,15 +11,36 @@ import warp as wp
 from warp_lcp.grid.cell_kernel import F32, I8, cell_kernel
 from warp_lcp.grid.motion import Pose
 from warp_lcp.grid.node_distance import NodeBox, NodeDistances, ShapeTable, node_window, nodes_near
-from warp_lcp.grid.node_distance_kernels import COARSE, FAR, HOLLOW, ROUNDING, Nearest, PlacedShape, enter, shape_distance, snapped
+from warp_lcp.grid.node_distance_kernels import (
+    COARSE,
+    FAR,
+    HOLLOW,
+    ROUNDING,
+    Nearest,
+    PlacedShape,
+    enter,
+    shape_distance,
+    snapped,
+)
 from warp_lcp.grid.solids import Geometry, TriangleMesh
-from warp_lcp.grid.solids_kernels import Block, ShapeFrame, block_of, node_position, to_mesh, to_mesh_surface
+from warp_lcp.grid.solids_kernels import (
+    Block,
+    ShapeFrame,
+    block_of,
+    node_position,
+    to_mesh,
+    to_mesh_surface,
+)
 from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window
 from warp_lcp.rows.host_array import HostArray
 
 MODULE = "warp_lcp.grid.placed_mesh"
 _FAR, _ROUNDING, _HOLLOW = wp.constant(FAR), wp.constant(ROUNDING), wp.constant(wp.int8(HOLLOW))
-Blocks, Frames, Distances = wp.array(dtype=Block), wp.array(dtype=ShapeFrame), wp.array(dtype=wp.float32)
+Blocks, Frames, Distances = (
+    wp.array(dtype=Block),
+    wp.array(dtype=ShapeFrame),
+    wp.array(dtype=wp.float32),
+)
 
 
 @cell_kernel(MODULE)
@@ -32,8 +53,17 @@ def measure_groups(k, j, i, blocks: Blocks, frames: Frames, mesh: wp.uint64, out
 
 @cell_kernel(MODULE)
 def enter_mesh(
-    k, j, i, blocks: Blocks, frames: Frames, mesh: wp.uint64, distance: Distances, snap: float, solid: int, nodes: Nearest
-):  # fmt: skip
+    k,
+    j,
+    i,
+    blocks: Blocks,
+    frames: Frames,
+    mesh: wp.uint64,
+    distance: Distances,
+    snap: float,
+    solid: int,
+    nodes: Nearest,
+):
     """Enter a mesh's distance at a node; that of the middle of its group bounds it, and may tell its sign, as in `claim_groups`."""
     block = blocks[0]
     node = wp.vec3i(i, j, k)
@@ -73,7 +103,17 @@ def is_flat(k: int, j: int, i: int, planes: int, near: F32):
 
 
 @cell_kernel(MODULE)
-def mark_flat_cells(k, j, i, planes: int, near: F32, block: Block, shapes: wp.array(dtype=PlacedShape), begin: bool, marks: I8):
+def mark_flat_cells(
+    k,
+    j,
+    i,
+    planes: int,
+    near: F32,
+    block: Block,
+    shapes: wp.array(dtype=PlacedShape),
+    begin: bool,
+    marks: I8,
+):
     """Mark the flat cells HOLLOW that no solid so far covers at their center, see `mark_listed`."""
     if is_flat(k, j, i, planes, near):
         p = node_position(block, wp.vec3i(i, j, k), 0.5)
@@ -85,7 +125,18 @@ def mark_flat_cells(k, j, i, planes: int, near: F32, block: Block, shapes: wp.ar
 
 
 @cell_kernel(MODULE)
-def mark_flat_cells_of_mesh(k, j, i, planes: int, near: F32, block: Block, frames: Frames, mesh: wp.uint64, begin: bool, marks: I8):
+def mark_flat_cells_of_mesh(
+    k,
+    j,
+    i,
+    planes: int,
+    near: F32,
+    block: Block,
+    frames: Frames,
+    mesh: wp.uint64,
+    begin: bool,
+    marks: I8,
+):
     """The same of a mesh."""
     if is_flat(k, j, i, planes, near):
         if begin:
@@ -104,9 +155,14 @@ class PlacedMesh:
         places: of it among the solids that move.
     """
 
-    def __init__(self, grid: StaggeredGrid, number: int, geometry: TriangleMesh, places: Sequence[int] = ()) -> None:
+    def __init__(
+        self, grid: StaggeredGrid, number: int, geometry: TriangleMesh, places: Sequence[int] = ()
+    ) -> None:
         self.grid, self.places, self._number, self._geometry = grid, list(places), number, geometry
-        self._block, self._frame = HostArray(1, Block, grid.device), HostArray(1, ShapeFrame, grid.device)
+        self._block, self._frame = (
+            HostArray(1, Block, grid.device),
+            HostArray(1, ShapeFrame, grid.device),
+        )
         size = math.prod(-(-n // COARSE) for n in grid.shape)
         self._distances = wp.empty(size, dtype=wp.float32, device=grid.device)
         self._groups, self._window = ActiveWindow(grid.domain), ActiveWindow(grid.domain)
@@ -124,10 +180,19 @@ class PlacedMesh:
         if near is None:
             self._groups.move_to(self._window)
             return
-        block = block_of(*near, grid.spacing, grid.dimension, grid.origin, stride=COARSE, offset=0.5 * (COARSE - 1))
+        block = block_of(
+            *near,
+            grid.spacing,
+            grid.dimension,
+            grid.origin,
+            stride=COARSE,
+            offset=0.5 * (COARSE - 1),
+        )
         self._block.host[0] = block.numpy_value()
         self._block.send()
-        self._groups.move_to(Window((0, 0, 0), tuple(int(n) for n in reversed(list(block.counts))), grid.device))
+        self._groups.move_to(
+            Window((0, 0, 0), tuple(int(n) for n in reversed(list(block.counts))), grid.device)
+        )
 
     def enter(self, nodes: NodeDistances, snap: float) -> None:
         """Enter the mesh's distances; those within `snap` [cells] of its surface are 0."""
@@ -135,7 +200,9 @@ class PlacedMesh:
         self._groups.launch(measure_groups, inputs)
         self._window.launch(enter_mesh, [*inputs, snap, self._number, nodes.struct])
 
-    def mark(self, window: Window, near: wp.array, block: Any, marks: wp.array, *, begin: bool) -> None:
+    def mark(
+        self, window: Window, near: wp.array, block: Any, marks: wp.array, *, begin: bool
+    ) -> None:
         """Unmark flat cells that it covers, see `FlatCells`."""
         inputs = [self.grid.planes, near, block, self._frame.array, self._mesh, begin, marks]
         window.launch(mark_flat_cells_of_mesh, inputs)
@@ -165,11 +232,20 @@ class FlatCells:
             if isinstance(solid, PlacedMesh):
                 solid.mark(window, nodes.near, self._block, marks, begin=order == 0)
             else:
-                inputs = [self.grid.planes, nodes.near, self._block, solid.placed, order == 0, marks]
+                inputs = [
+                    self.grid.planes,
+                    nodes.near,
+                    self._block,
+                    solid.placed,
+                    order == 0,
+                    marks,
+                ]
                 window.launch(mark_flat_cells, inputs)
 
 
-def tables_of(grid: StaggeredGrid, solids: Sequence[tuple[int, Geometry]]) -> list[ShapeTable | PlacedMesh] | None:
+def tables_of(
+    grid: StaggeredGrid, solids: Sequence[tuple[int, Geometry]]
+) -> list[ShapeTable | PlacedMesh] | None:
     """Return tables of solids that stand still, each at its place; None if there is one that none holds."""
     made: list[ShapeTable | PlacedMesh] = []
     for number, geometry in solids:

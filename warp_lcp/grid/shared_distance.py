@@ -14,10 +14,13 @@ from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.solids_kernels import block_of
 from warp_lcp.grid.staggered import StaggeredGrid
 
-Layer = tuple[CellBox, np.ndarray]  # nodes of the domain, and the distances [cells] there, shape (nz, ny, nx)
+# nodes of the domain, and the distances [cells] there, shape (nz, ny, nx)
+Layer = tuple[CellBox, np.ndarray]
 
 
-def measure_together(sampler: NodeSampler, geometries: Mapping[int, Geometry]) -> dict[int, list[Layer]]:
+def measure_together(
+    sampler: NodeSampler, geometries: Mapping[int, Geometry]
+) -> dict[int, list[Layer]]:
     """Measure solids, each process a layer of equally many nodes of each solid; collective.
 
     Args:
@@ -29,11 +32,18 @@ def measure_together(sampler: NodeSampler, geometries: Mapping[int, Geometry]) -
     """
     grid, ranks = sampler.grid, sampler.grid.part.ranks
     domain = StaggeredGrid(grid.domain_counts, grid.spacing, grid.dimension, grid.device)
-    boxes = {key: box for key, geometry in geometries.items() if (box := nodes_near(domain, geometry)) is not None}
+    boxes = {
+        key: box
+        for key, geometry in geometries.items()
+        if (box := nodes_near(domain, geometry)) is not None
+    }
     found: dict[int, list[Layer]] = {key: [] for key in geometries}
     if not boxes:
         return found
-    layers = {key: [layer_of(box, rank, ranks.size) for rank in range(ranks.size)] for key, box in boxes.items()}
+    layers = {
+        key: [layer_of(box, rank, ranks.size) for rank in range(ranks.size)]
+        for key, box in boxes.items()
+    }
     thickest = {key: of[0].cells for key, of in layers.items()}
     mine = np.empty(sum(thickest.values()), dtype=np.float32)
     first = 0
@@ -66,7 +76,9 @@ def _measure(sampler: NodeSampler, geometry: Geometry, layer: CellBox) -> np.nda
     grid = sampler.grid
     nx, ny, nz = (max(n - 2, 1) for n in layer.counts)
     before = (*layer.low[:2], layer.low[2] if grid.dimension == 3 else 0)
-    around = StaggeredGrid((nx, ny, nz), grid.spacing, grid.dimension, grid.device, before, grid.domain_counts)
+    around = StaggeredGrid(
+        (nx, ny, nz), grid.spacing, grid.dimension, grid.device, before, grid.domain_counts
+    )
     nodes = NodeDistances(around, second=False)
     sampler.enter(nodes, 1, geometry)
     return np.asarray(nodes.near.numpy()[layer.moved(before, -1).slices].ravel())
@@ -86,6 +98,15 @@ def enter_layers(nodes: NodeDistances, number: int, layers: list[Layer]) -> None
         common = layer.common(stored)
         if common.cells:
             inside, here = common.moved(layer.low, -1), common.moved(grid.origin, -1)
-            given = wp.array(np.ascontiguousarray(distances[inside.slices]).ravel(), dtype=wp.float32, device=grid.device)
+            given = wp.array(
+                np.ascontiguousarray(distances[inside.slices]).ravel(),
+                dtype=wp.float32,
+                device=grid.device,
+            )
             block = block_of(here.low, here.high, 1.0, grid.dimension, grid.origin)
-            wp.launch(claim_nodes, len(given), [block, given, 0.0, number, nodes.struct], device=grid.device)
+            wp.launch(
+                claim_nodes,
+                len(given),
+                [block, given, 0.0, number, nodes.struct],
+                device=grid.device,
+            )

@@ -1,7 +1,7 @@
 """Sides of the domain without a wall.
 
-Beyond an open side lies open air, and what crosses it has left. An axis without an end is periodic: what leaves at one side comes in at the
-other, and each field's ring holds what lies there.
+Beyond an open side lies open air, and what crosses it has left. An axis without an end is periodic:
+what leaves at one side comes in at the other, and each field's ring holds what lies there.
 """
 
 import functools
@@ -18,8 +18,10 @@ from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.program import Launch, launch
 
-SIDES = ("left", "right", "bottom", "top", "back", "front")  # at low x, high x, low y, high y, low z, high z; bit n is side n
-GONE = 0.75 * MARGIN  # cells from an open side at which a particle has left: nearer than particles keep from walls
+# at low x, high x, low y, high y, low z, high z; bit n is side n
+SIDES = ("left", "right", "bottom", "top", "back", "front")
+# cells from an open side at which a particle has left: nearer than particles keep from walls
+GONE = 0.75 * MARGIN
 
 
 def side_bits(names: Iterable[str]) -> int:
@@ -40,7 +42,10 @@ def open_sides_of(grid: StaggeredGrid, bits: int) -> int:
     """Return the sides of a grid that nothing closes: open ones of the domain, and those at which a part of it ends inside."""
     for axis in range(grid.dimension):
         low, count = grid.origin[axis], grid.counts[axis]
-        for number, inside in ((2 * axis, low > 0), (2 * axis + 1, low + count < grid.domain_counts[axis])):
+        for number, inside in (
+            (2 * axis, low > 0),
+            (2 * axis + 1, low + count < grid.domain_counts[axis]),
+        ):
             bits |= inside << number
     return bits
 
@@ -89,7 +94,15 @@ def continue_beyond(grid: StaggeredGrid, bits: int, field: wp.array) -> None:
 
 @list_kernel("warp_lcp.grid.sides")
 @typing.no_type_check
-def gone_kernel(i, bits: int, axes: int, low: float, high: wp.vec3, position: wp.array(dtype=wp.vec3), marks: wp.array(dtype=wp.int32)):
+def gone_kernel(
+    i,
+    bits: int,
+    axes: int,
+    low: float,
+    high: wp.vec3,
+    position: wp.array(dtype=wp.vec3),
+    marks: wp.array(dtype=wp.int32),
+):
     """Mark particles that have reached an open side, of all others 0."""
     gone = int(0)
     for axis in range(axes):
@@ -117,7 +130,9 @@ def mark_gone(grid: StaggeredGrid, bits: int, position: wp.array, marks: wp.arra
     launch_list(gone_kernel, len(position), inputs, device=grid.device)
 
 
-END = 0.6 * MARGIN  # cells from the upper side within which no particle may lie: a tent there would reach beyond what is stored
+# cells from the upper side within which no particle may lie: a tent there would reach beyond what
+# is stored
+END = 0.6 * MARGIN
 
 
 def periodic_sides(axes: Sequence[int]) -> list[str]:
@@ -137,8 +152,9 @@ def with_periodic(open_sides: int, sides: "PeriodicSides | None") -> int:
 class PeriodicSides:
     """Join the sides of axes that have no end.
 
-    Of n cells along such an axis, stored with a ring, 0 is cell n again and n + 1 is cell 1; so it is with faces. What particles add up
-    in the ring belongs to the cells and faces that it repeats. Along axes that `grid.part` has cut, other ranks fill what lies beyond.
+    Of n cells along such an axis, stored with a ring, 0 is cell n again and n + 1 is cell 1; so it
+    is with faces. What particles add up in the ring belongs to the cells and faces that it repeats.
+    Along axes that `grid.part` has cut, other ranks fill what lies beyond.
 
     Args:
         grid: the grid.
@@ -160,16 +176,31 @@ class PeriodicSides:
             layers = field if field.ndim == 4 else field.reshape((1, *self.grid.shape))
             for axis in self.axes:
                 lines = self._lines(layers, axis)
-                launch(wrap_kernel(field.dtype), lines.shape[:3], [self.grid.counts[axis], lines], device=self.grid.device)
+                launch(
+                    wrap_kernel(field.dtype),
+                    lines.shape[:3],
+                    [self.grid.counts[axis], lines],
+                    device=self.grid.device,
+                )
 
     def add(self, field: wp.array) -> None:
         """Add what lies in the ring of a sum over particles to the cells that it repeats."""
         for axis in self.axes:
             lines = self._lines(field, axis)
-            launch(add_kernel, lines.shape[:2], [self.grid.counts[axis], lines], device=self.grid.device)
+            launch(
+                add_kernel,
+                lines.shape[:2],
+                [self.grid.counts[axis], lines],
+                device=self.grid.device,
+            )
         self.wrap(field)
 
-    def average(self, velocity: Sequence[wp.array], weights: Sequence[wp.array], saved: Sequence[wp.array] = ()) -> None:
+    def average(
+        self,
+        velocity: Sequence[wp.array],
+        weights: Sequence[wp.array],
+        saved: Sequence[wp.array] = (),
+    ) -> None:
         """Make means over particles of the means on faces that are the same.
 
         Args:
@@ -180,8 +211,16 @@ class PeriodicSides:
         for number, (field, weight) in enumerate(zip(velocity, weights, strict=True)):
             old = saved[number] if saved else None
             for axis in self.axes:
-                lines, means = self._lines(weight, axis), [None if v is None else self._lines(v, axis) for v in (field, old)]
-                launch(average_kernel, lines.shape[:2], [self.grid.counts[axis], lines, *means], device=self.grid.device)
+                lines, means = (
+                    self._lines(weight, axis),
+                    [None if v is None else self._lines(v, axis) for v in (field, old)],
+                )
+                launch(
+                    average_kernel,
+                    lines.shape[:2],
+                    [self.grid.counts[axis], lines, *means],
+                    device=self.grid.device,
+                )
             self.wrap(field, *([old] if old is not None else []))
 
     def carry(self, position: wp.array) -> None:
@@ -252,7 +291,9 @@ def average_kernel(count: int, weight: F32, field: F32, saved: F32):
 
 @forward_kernel(module="warp_lcp.grid.periodic")
 @typing.no_type_check
-def carry_kernel(endless: wp.vec3i, axes: int, size: wp.vec3, spacing: float, position: wp.array(dtype=wp.vec3)):
+def carry_kernel(
+    endless: wp.vec3i, axes: int, size: wp.vec3, spacing: float, position: wp.array(dtype=wp.vec3)
+):
     """Positions modulo the domain's size, off the very end of it; who has crossed keeps off the walls, which stopped nobody beyond."""
     p = wp.tid()
     x = position[p]

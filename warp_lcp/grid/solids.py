@@ -2,9 +2,10 @@
 
 Box, sphere, capsule, plane, triangle mesh and unions, for solids and regions of material.
 
-A 2-D scene is the plane z = 0 of these shapes: its callers pass points with z = 0. Boxes given with two coordinates extend without limit in
-z, spheres and capsules lie at z = 0 (discs and stadiums there), and a mesh is cut by the plane z = 0: the sign is that of the cut, the
-distance is the one to the surface in space, never more than the one to the cut.
+A 2-D scene is the plane z = 0 of these shapes: its callers pass points with z = 0. Boxes given with
+two coordinates extend without limit in z, spheres and capsules lie at z = 0 (discs and stadiums
+there), and a mesh is cut by the plane z = 0: the sign is that of the cut, the distance is the one
+to the surface in space, never more than the one to the cut.
 """
 
 from __future__ import annotations
@@ -38,7 +39,9 @@ from warp_lcp.settings import Positive, checked
 class Geometry(Protocol):
     """Region of space with a signed distance, negative inside."""
 
-    def signed_distance(self, points: wp.array(dtype=wp.vec3), out: wp.array(dtype=wp.float32)) -> None:
+    def signed_distance(
+        self, points: wp.array(dtype=wp.vec3), out: wp.array(dtype=wp.float32)
+    ) -> None:
         """Write the signed distance [m] of points [m], shape (m,), into `out`.
 
         2-D callers pass z = 0.
@@ -54,7 +57,8 @@ class Geometry(Protocol):
 def _rotation_about(axis: int, degrees: float) -> np.ndarray:
     """Return the matrix that turns counterclockwise about a coordinate axis."""
     angle = np.deg2rad(degrees)
-    quarters = degrees / 90.0  # whole quarter turns stay exact, so that a turned box keeps its faces on the grid's
+    # whole quarter turns stay exact, so that a turned box keeps its faces on the grid's
+    quarters = degrees / 90.0
     cosine, sine = np.cos(angle), np.sin(angle)
     if quarters == int(quarters):
         cosine, sine = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[int(quarters) % 4]
@@ -77,7 +81,8 @@ class Placement:
         translation: [m], shape (3,).
 
     Raises:
-        ValueError: a value is not finite, the scale is not positive, or the matrix is not a rotation.
+        ValueError: a value is not finite, the scale is not positive, or the matrix is not a
+            rotation.
     """
 
     scale: float = 1.0
@@ -90,12 +95,15 @@ class Placement:
         keep_checked(self, 1e-5)
 
     @classmethod
-    def from_degrees(cls, scale: float, rotate: float | Vector, translate: Vector, dimension: int) -> Placement:
+    def from_degrees(
+        cls, scale: float, rotate: float | Vector, translate: Vector, dimension: int
+    ) -> Placement:
         """Return the placement described by a scene.
 
         Args:
             scale: uniform factor, > 0.
-            rotate: angles [degrees] about x, then y, then z in 3-D; one angle (or a sequence of one), about z, in 2-D.
+            rotate: angles [degrees] about x, then y, then z in 3-D; one angle (or a sequence of
+                one), about z, in 2-D.
             translate: [m], `dimension` numbers.
             dimension: 2 or 3.
 
@@ -107,14 +115,22 @@ class Placement:
         if wanted is None:
             raise ValueError(f"dimension must be 2 or 3, not {dimension}")
         if len(angles) != wanted or not np.isfinite(angles).all():
-            meaning = "one finite angle in degrees, about z" if dimension == 2 else "three finite angles in degrees, about x, y and z"
+            meaning = (
+                "one finite angle in degrees, about z"
+                if dimension == 2
+                else "three finite angles in degrees, about x, y and z"
+            )
             raise ValueError(f"rotate needs {meaning}, not {rotate}")
         if len(translate) != dimension:
             raise ValueError(f"translate needs {dimension} numbers, not {len(translate)}")
         if dimension == 2:
             angles = [0.0, 0.0, *angles]
         x, y, z = (_rotation_about(axis, angle) for axis, angle in enumerate(angles))
-        return cls(scale=scale, rotation=z @ y @ x, translation=in_space(checked_vector("translate", translate)))
+        return cls(
+            scale=scale,
+            rotation=z @ y @ x,
+            translation=in_space(checked_vector("translate", translate)),
+        )
 
     def apply(self, points: np.ndarray) -> np.ndarray:
         """Return points, shape (m, 3), transformed from the shape to the domain [m]."""
@@ -126,7 +142,9 @@ class Placement:
         Instead of the origin; two or three coordinates.
         """
         center = in_space(checked_vector("about", point))
-        return replace(self, translation=self.translation + center - self.scale * self.rotation @ center)
+        return replace(
+            self, translation=self.translation + center - self.scale * self.rotation @ center
+        )
 
     def moved(self, pose: Pose) -> Placement:
         """Return this placement followed by a pose."""
@@ -144,7 +162,9 @@ class _Shape(ABC):
     kernel: ClassVar[Any]
     cost: ClassVar[int] = 8  # of a point, in cells of a usual pass
 
-    def signed_distance(self, points: wp.array(dtype=wp.vec3), out: wp.array(dtype=wp.float32)) -> None:
+    def signed_distance(
+        self, points: wp.array(dtype=wp.vec3), out: wp.array(dtype=wp.float32)
+    ) -> None:
         """Write the Euclidean distance to the surface, negative inside (outside when inverted).
 
         Args:
@@ -166,7 +186,10 @@ class _Shape(ABC):
         """Return where the shape stands, as kernels take it."""
         placement, frame = self.placement, ShapeFrame()
         translation = placement.translation + placement.scale * placement.rotation @ self.origin()
-        frame.inverse_rotation, frame.translation = wp.mat33(placement.rotation.T), wp.vec3(*translation)
+        frame.inverse_rotation, frame.translation = (
+            wp.mat33(placement.rotation.T),
+            wp.vec3(*translation),
+        )
         frame.scale, frame.sign = placement.scale * self.unit_length(), -1.0 if self.invert else 1.0
         return frame
 
@@ -231,7 +254,10 @@ class Box(_Shape):
         if len(lower) != len(upper):
             raise ValueError(f"a box's min has {len(lower)} numbers and its max {len(upper)}")
         if not all(a < b for a, b in zip(lower, upper, strict=True)):
-            raise ValueError(f"a box's min must be less than its max in every direction, not {list(lower)} and {list(upper)}")
+            raise ValueError(
+                f"a box's min must be less than its max in every direction, not {list(lower)} and "
+                f"{list(upper)}"
+            )
         object.__setattr__(self, "lower", lower)
         object.__setattr__(self, "upper", upper)
 
@@ -380,7 +406,9 @@ class Plane(_Shape):
         """Check the point, and give the normal unit length."""
         point, normal = checked_vector("point", self.point), checked_vector("normal", self.normal)
         if len(point) != len(normal):
-            raise ValueError(f"a plane's point has {len(point)} numbers and its normal {len(normal)}")
+            raise ValueError(
+                f"a plane's point has {len(point)} numbers and its normal {len(normal)}"
+            )
         object.__setattr__(self, "point", point)
         object.__setattr__(self, "normal", unit("a plane's normal", normal))
 
@@ -401,7 +429,8 @@ class Plane(_Shape):
 class TriangleMesh(_Shape):
     """Interior of a closed triangle surface.
 
-    The distance is the one to the closest triangle; the sign comes from the winding number, summed over the triangles.
+    The distance is the one to the closest triangle; the sign comes from the winding number, summed
+    over the triangles.
 
     Args:
         surface: the checked surface, in the mesh's own coordinates.
@@ -415,7 +444,14 @@ class TriangleMesh(_Shape):
     cost: ClassVar[int] = 500
 
     @classmethod
-    def from_file(cls, file: str, *, folder: Path | None = None, placement: Placement | None = None, invert: bool = False) -> TriangleMesh:
+    def from_file(
+        cls,
+        file: str,
+        *,
+        folder: Path | None = None,
+        placement: Placement | None = None,
+        invert: bool = False,
+    ) -> TriangleMesh:
         """Read an OBJ, STL or PLY file, or a built-in mesh.
 
         Built-in: `builtin:torus`, `builtin:knot`.
@@ -427,16 +463,21 @@ class TriangleMesh(_Shape):
             invert: make it everything but the inside.
 
         Raises:
-            ValueError: the file is missing or not a closed surface; the message names the file and what to do.
+            ValueError: the file is missing or not a closed surface; the message names the file and
+                what to do.
         """
-        return cls(surface=load_surface(file, folder), placement=placement or Placement(), invert=invert)
+        return cls(
+            surface=load_surface(file, folder), placement=placement or Placement(), invert=invert
+        )
 
     @property
     def volume(self) -> float:
         """Volume inside the surface as placed [m^3]."""
         return self.surface.volume * self.placement.scale**3
 
-    def distance_to_surface(self, points: wp.array(dtype=wp.vec3), out: wp.array(dtype=wp.float32)) -> None:
+    def distance_to_surface(
+        self, points: wp.array(dtype=wp.vec3), out: wp.array(dtype=wp.float32)
+    ) -> None:
         """Write the unsigned distance to the closest triangle.
 
         For points whose sign is known: a fifth of the work of `signed_distance`.
@@ -483,7 +524,9 @@ class Union:
 
     parts: tuple[Geometry, ...]
 
-    def signed_distance(self, points: wp.array(dtype=wp.vec3), out: wp.array(dtype=wp.float32)) -> None:
+    def signed_distance(
+        self, points: wp.array(dtype=wp.vec3), out: wp.array(dtype=wp.float32)
+    ) -> None:
         """Write the smallest signed distance [m] to the parts, as for `Geometry`."""
         self.parts[0].signed_distance(points, out)
         other = wp.empty_like(out) if len(self.parts) > 1 else out
@@ -494,7 +537,11 @@ class Union:
     def bounds(self) -> np.ndarray | None:
         """Return the bounding box [m], shape (2, 3); None if a part is unbounded."""
         boxes = [box for part in self.parts if (box := part.bounds()) is not None]
-        return np.stack([np.min(boxes, axis=0)[0], np.max(boxes, axis=0)[1]]) if len(boxes) == len(self.parts) else None
+        return (
+            np.stack([np.min(boxes, axis=0)[0], np.max(boxes, axis=0)[1]])
+            if len(boxes) == len(self.parts)
+            else None
+        )
 
     def moved(self, pose: Pose) -> Union:
         """Return the union moved by a pose."""

@@ -10,7 +10,8 @@ from warp_lcp.rows.compiler import forward_kernel
 
 MODULE = "warp_lcp.solids"
 Points, Distances = wp.array(dtype=wp.vec3), wp.array(dtype=wp.float32)
-FAR = 1.0e10  # a mesh query's reach, in half diagonals of the mesh; its square is still finite in float32
+# a mesh query's reach, in half diagonals of the mesh; its square is still finite in float32
+FAR = 1.0e10
 
 
 @wp.struct
@@ -64,7 +65,8 @@ def to_plane(p: wp.vec3, frame: ShapeFrame, normal: wp.vec3) -> float:
 def to_mesh(p: wp.vec3, frame: ShapeFrame, mesh: wp.uint64) -> float:
     """Return the distance of the inside of a closed mesh: that to the closest triangle, with the sign from the winding number."""
     q = to_shape(p, frame)
-    # 2: groups of triangles farther than twice their radius count as one dipole; a closed surface has whole numbers, so 0.5 has room.
+    # 2: groups of triangles farther than twice their radius count as one dipole; a closed surface
+    # has whole numbers, so 0.5 has room.
     query = wp.mesh_query_point_sign_winding_number(mesh, q, FAR, 2.0, 0.5)
     distance = FAR
     if query.result:
@@ -96,7 +98,9 @@ def sphere_distance(i, points: Points, frame: ShapeFrame, radius: float, out: Di
 
 
 @list_kernel(MODULE)
-def capsule_distance(i, points: Points, frame: ShapeFrame, axis: wp.vec3, radius: float, out: Distances):
+def capsule_distance(
+    i, points: Points, frame: ShapeFrame, axis: wp.vec3, radius: float, out: Distances
+):
     """Measure a capsule."""
     out[i] = to_capsule(points[i], frame, axis, radius)
 
@@ -182,7 +186,13 @@ def item_points(block: Block, out: Points):
 
 
 @forward_kernel(module=MODULE)
-def claim_cells(block: Block, distance: Distances, solid: int, index: wp.array3d(dtype=wp.int32), covered: wp.array(dtype=wp.int32)):
+def claim_cells(
+    block: Block,
+    distance: Distances,
+    solid: int,
+    index: wp.array3d(dtype=wp.int32),
+    covered: wp.array(dtype=wp.int32),
+):
     """Give the open cells of a block whose center lies inside to `solid`, and count those that lie inside, claimed or not."""
     c = wp.tid()
     if distance[c] < 0.0:
@@ -192,10 +202,25 @@ def claim_cells(block: Block, distance: Distances, solid: int, index: wp.array3d
         wp.atomic_add(covered, solid, 1)
 
 
-def block_of(low: Any, high: Any, spacing: float, dimension: int, origin: Any, *, stride: int = 1, offset: float = 0.0) -> Any:
+def block_of(
+    low: Any,
+    high: Any,
+    spacing: float,
+    dimension: int,
+    origin: Any,
+    *,
+    stride: int = 1,
+    offset: float = 0.0,
+) -> Any:
     """Return the nodes or cells low <= (x, y, z) < high in groups of `stride` along each axis, their points moved by `offset` cells."""
     block = Block()
     block.low, block.high = wp.vec3i(*(int(v) for v in low)), wp.vec3i(*(int(v) for v in high))
     block.counts = wp.vec3i(*(-(-int(b - a) // stride) for a, b in zip(low, high, strict=True)))
-    block.stride, block.flat, block.spacing, block.origin, block.offset = stride, dimension == 2, spacing, wp.vec3i(*origin), offset
+    block.stride, block.flat, block.spacing, block.origin, block.offset = (
+        stride,
+        dimension == 2,
+        spacing,
+        wp.vec3i(*origin),
+        offset,
+    )
     return block

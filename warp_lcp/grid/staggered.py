@@ -1,10 +1,12 @@
 """Staggered grid: layout of cells, faces and fields; windows for launches.
 
-A grid of nx x ny x nz cells is stored with one ring of ghost cells, shape (nz + 2, ny + 2, nx + 2), x fastest; a 2-D grid is nz = 1 and
-only its plane k = 1 is used. Face fields have the shape of the cells: element (k, j, i) of component 0 (x), 1 (y) or 2 (z) lies on the
-lower x, y or z face of cell (k, j, i). Grid coordinates are X = x / dx + 1 with x [m] the distance from the low corner of the domain, so
-that a point lies in cell floor(X). In 2-D, z is ignored. A grid may be a part of a larger one: points and grid coordinates are then those
-of the larger grid, so that a point has the same in all parts, and lies in stored cell floor(X) - origin.
+A grid of nx x ny x nz cells is stored with one ring of ghost cells, shape (nz + 2, ny + 2, nx + 2),
+x fastest; a 2-D grid is nz = 1 and only its plane k = 1 is used. Face fields have the shape of the
+cells: element (k, j, i) of component 0 (x), 1 (y) or 2 (z) lies on the lower x, y or z face of cell
+(k, j, i). Grid coordinates are X = x / dx + 1 with x [m] the distance from the low corner of the
+domain, so that a point lies in cell floor(X). In 2-D, z is ignored. A grid may be a part of a
+larger one: points and grid coordinates are then those of the larger grid, so that a point has the
+same in all parts, and lies in stored cell floor(X) - origin.
 """
 
 import ctypes
@@ -32,7 +34,9 @@ if typing.TYPE_CHECKING:
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/staggered.h")
 CLEAR: dict[typing.Any, RowPass] = {
-    dtype: KERNELS.kernel("warp_lcp.grid.clear.clear", module=f"warp_lcp.grid.clear_{dtype.__name__}", compute=dtype)
+    dtype: KERNELS.kernel(
+        "warp_lcp.grid.clear.clear", module=f"warp_lcp.grid.clear_{dtype.__name__}", compute=dtype
+    )
     for dtype in (wp.int8, wp.float32, wp.float64)
 }
 COPY = KERNELS["warp_lcp.grid.copy_box.copy"]
@@ -43,7 +47,8 @@ SEGMENT = 8  # cells of a row that are visited together where a box is visited i
 class CellRange:
     """A box of cells as kernels see it; a thread takes `grain` cells of a row."""
 
-    begin: int  # of the tasks that a team's thread takes: the first, one past the last; 0: one task a thread
+    # of the tasks that a team's thread takes: the first, one past the last; 0: one task a thread
+    begin: int
     finish: int
     rows: int
     chunks: int  # of a row
@@ -52,7 +57,8 @@ class CellRange:
     i: int
     end: int  # one past the last i
     grain: int  # 0: a piece
-    pieces: wp.array2d(dtype=wp.vec2i)  # (k, j) and (first, one past the last i) of each piece of a box in part
+    # (k, j) and (first, one past the last i) of each piece of a box in part
+    pieces: wp.array2d(dtype=wp.vec2i)
 
 
 @wp.func
@@ -74,7 +80,9 @@ def cell_index(coordinate: float, count: int):
     return wp.min(int(inside(coordinate, count)), count)
 
 
-def _corners(choose: typing.Callable[[int, int], int], one: tuple[int, int, int], other: tuple[int, int, int]) -> tuple[int, int, int]:
+def _corners(
+    choose: typing.Callable[[int, int], int], one: tuple[int, int, int], other: tuple[int, int, int]
+) -> tuple[int, int, int]:
     """Return the smaller or the larger of two corners' coordinates, `choose` being min or max."""
     return choose(one[0], other[0]), choose(one[1], other[1]), choose(one[2], other[2])
 
@@ -87,8 +95,9 @@ class Window:
         low: first (k, j, i), ring included.
         high: one past the last (k, j, i).
         device: where kernels run.
-        near: active segments of rows, see `warp_lcp.grid.vicinity`; the rest of the box need not be visited; None: all. Sums
-            over rows visit what lies between the first and the last of a row.
+        near: active segments of rows, see `warp_lcp.grid.vicinity`; the rest of the box need not be
+            visited; None: all. Sums over rows visit what lies between the first and the last of a
+            row.
     """
 
     low: tuple[int, int, int]
@@ -97,7 +106,9 @@ class Window:
     near: np.ndarray | None = field(default=None, compare=False, repr=False)
 
     @classmethod
-    def of(cls, low: typing.Sequence[int], high: typing.Sequence[int], device: wp.Device) -> "Window":
+    def of(
+        cls, low: typing.Sequence[int], high: typing.Sequence[int], device: wp.Device
+    ) -> "Window":
         """Return the box between two corners (k, j, i) given as any sequences."""
         (k, j, i), (c, b, a) = low, high
         return cls((k, j, i), (c, b, a), device)
@@ -112,19 +123,27 @@ class Window:
     @cached_property
     def cells(self) -> typing.Any:
         """The CellRange that kernels take as their first argument."""
-        return self._cells(grain(self.high[2] - self.low[2], self.device)) if self.near is None else _in_part(self._pieces)
+        return (
+            self._cells(grain(self.high[2] - self.low[2], self.device))
+            if self.near is None
+            else _in_part(self._pieces)
+        )
 
     @cached_property
     def _pieces(self) -> wp.array:
         """The pieces that are visited, see `pieces_of`."""
         assert self.near is not None
-        return wp.array(pieces_of(self.near, self.low, self.high), dtype=wp.vec2i, device=self.device)
+        return wp.array(
+            pieces_of(self.near, self.low, self.high), dtype=wp.vec2i, device=self.device
+        )
 
     @cached_property
     def _hulls(self) -> wp.array:
         """The pieces that sums over rows visit, one a row."""
         host = self._pieces.numpy()
-        first = np.flatnonzero(np.append(True, (host[1:, 0] != host[:-1, 0]).any(axis=1))[: len(host)])
+        first = np.flatnonzero(
+            np.append(True, (host[1:, 0] != host[:-1, 0]).any(axis=1))[: len(host)]
+        )
         made = host[first]
         made[:, 1, 1] = host[np.append(first[1:], len(host))[: len(first)] - 1, 1, 1]
         return wp.array(made, dtype=wp.vec2i, device=self.device)
@@ -153,7 +172,12 @@ class Window:
         return np.where(visited.reshape(*visited.shape, *[1] * (rows.ndim - 2)), rows, 0)
 
     def run(
-        self, passed: RowPass, *structs: "DataclassInstance", whole: bool = False, launch: Launch | None = None, **given: typing.Any
+        self,
+        passed: RowPass,
+        *structs: "DataclassInstance",
+        whole: bool = False,
+        launch: Launch | None = None,
+        **given: typing.Any,
     ) -> None:
         """Launch a pass over the box, or record it with `Program.launch`.
 
@@ -203,7 +227,9 @@ class Window:
             else:
                 self.run(CLEAR[array.dtype], field=array)
 
-    def launch(self, kernel: wp.Kernel, inputs: list[typing.Any], *, launch: Launch | None = None) -> None:
+    def launch(
+        self, kernel: wp.Kernel, inputs: list[typing.Any], *, launch: Launch | None = None
+    ) -> None:
         """Launch kernel(cells, *inputs) with threads (plane, row, chunk of a row).
 
         Or record it with `Program.launch`.
@@ -215,15 +241,21 @@ class Window:
 
         For sums that are the same on every run.
         """
-        cells = self._cells(self.high[2] - self.low[2]) if self.near is None else _in_part(self._hulls)
+        cells = (
+            self._cells(self.high[2] - self.low[2]) if self.near is None else _in_part(self._hulls)
+        )
         self._launch(kernel, cells, inputs, None)
 
-    def _launch(self, kernel: wp.Kernel, cells: typing.Any, inputs: list[typing.Any], launch: Launch | None) -> None:
+    def _launch(
+        self, kernel: wp.Kernel, cells: typing.Any, inputs: list[typing.Any], launch: Launch | None
+    ) -> None:
         ordered = getattr(kernel, "ordered", False)
         dim, cost = (*self.rows, cells.chunks), cells.grain
         if self.near is not None:
             dim, cost = (1, 1, cells.chunks), self._visited // max(cells.chunks, 1)
-        launch_ranges(kernel, dim, cost, [cells, *inputs], device=self.device, launch=launch, ordered=ordered)
+        launch_ranges(
+            kernel, dim, cost, [cells, *inputs], device=self.device, launch=launch, ordered=ordered
+        )
 
     @property
     def identity(self) -> typing.Hashable:
@@ -267,7 +299,9 @@ class _RangeMemory:
     def take_box(self, rows: int, k: int, j: int, i: int, end: int, tasks: int) -> None:
         """Take a box of whole rows over, see `CellRange`."""
         ctypes.memset(self.first[1], 0, self.first[2])
-        BOX_OF_CELLS.pack_into(self.range, _native(NO_CELLS).rows.offset, rows, 1, k, j, i, end, end - i)
+        BOX_OF_CELLS.pack_into(
+            self.range, _native(NO_CELLS).rows.offset, rows, 1, k, j, i, end, end - i
+        )
         self.tasks.value = tasks
 
 
@@ -295,10 +329,16 @@ class ActiveWindow(Window):
 
     def __init__(self, window: Window) -> None:
         rows = tuple(rows_memory(window.device) for _ in range(2))
-        memory = {"_rows": rows, "_sums": {}, "_ranges": (_RangeMemory(), _RangeMemory()), "hulls": Slot()}
+        memory = {
+            "_rows": rows,
+            "_sums": {},
+            "_ranges": (_RangeMemory(), _RangeMemory()),
+            "hulls": Slot(),
+        }
         numbers = {"first": (Scalar(), Scalar()), "sizes": (Scalar(), Scalar()), "pieces": Scalar()}
         for name, value in {"device": window.device, **memory, **numbers, "_now": None}.items():
-            object.__setattr__(self, name, value)  # which a dataclass that is frozen does not allow otherwise
+            # which a dataclass that is frozen does not allow otherwise
+            object.__setattr__(self, name, value)
         self.move_to(window)
 
     __eq__, __hash__ = object.__eq__, object.__hash__
@@ -375,11 +415,20 @@ class ActiveWindow(Window):
 
     def launch_rows(self, kernel: wp.Kernel, inputs: list[typing.Any]) -> None:
         """Launch kernel(cells, *inputs) with one thread per row."""
-        cells = self._now._cells(self.high[2] - self.low[2]) if self.near is None else _in_part(self._now._hulls)
+        cells = (
+            self._now._cells(self.high[2] - self.low[2])
+            if self.near is None
+            else _in_part(self._now._hulls)
+        )
         self._launch(kernel, cells, inputs, None, self._ranges[1])
 
     def _launch(
-        self, kernel: wp.Kernel, cells: typing.Any, inputs: list[typing.Any], launch: Launch | None, memory: _RangeMemory | None = None
+        self,
+        kernel: wp.Kernel,
+        cells: typing.Any,
+        inputs: list[typing.Any],
+        launch: Launch | None,
+        memory: _RangeMemory | None = None,
     ) -> None:
         memory = memory or self._ranges[0]
         dim, cost = (*self.rows, cells.chunks), cells.grain
@@ -387,9 +436,17 @@ class ActiveWindow(Window):
             dim, cost = (1, 1, cells.chunks), self._now._visited // max(cells.chunks, 1)
         ordered = getattr(kernel, "ordered", False)
         launch_ranges(
-            kernel, dim, cost, [cells, *inputs], device=self.device, launch=launch, ordered=ordered,
-            first=memory.first, sized=memory.sized, extent=memory,
-        )  # fmt: skip
+            kernel,
+            dim,
+            cost,
+            [cells, *inputs],
+            device=self.device,
+            launch=launch,
+            ordered=ordered,
+            first=memory.first,
+            sized=memory.sized,
+            extent=memory,
+        )
 
 
 class DirtyRegion:
@@ -418,7 +475,9 @@ class DirtyRegion:
         now, last = (window and window.now.common(self.all)) or self.all, self._last
         self._last = now
         near = None if now.near is None or last.near is None else now.near | last.near
-        return Window(_corners(min, now.low, last.low), _corners(max, now.high, last.high), now.device, near)
+        return Window(
+            _corners(min, now.low, last.low), _corners(max, now.high, last.high), now.device, near
+        )
 
 
 def _in_part(pieces: wp.array) -> typing.Any:
@@ -428,7 +487,9 @@ def _in_part(pieces: wp.array) -> typing.Any:
     return part
 
 
-def pieces_of(near: np.ndarray, low: typing.Sequence[int], high: typing.Sequence[int]) -> np.ndarray:
+def pieces_of(
+    near: np.ndarray, low: typing.Sequence[int], high: typing.Sequence[int]
+) -> np.ndarray:
     """Return the runs of marked segments in a box of cells, in order.
 
     (k, j) and (first, one past the last i), int32, shape (n, 2, 2).
@@ -440,13 +501,16 @@ def pieces_of(near: np.ndarray, low: typing.Sequence[int], high: typing.Sequence
     """
     part = near[low[0] : high[0], low[1] : high[1]]
     planes, rows, segments = part.shape
-    flat = np.zeros(planes * rows * (segments + 1) + 1, dtype=bool)  # each row behind an element that is not marked
+    # each row behind an element that is not marked
+    flat = np.zeros(planes * rows * (segments + 1) + 1, dtype=bool)
     flat[:-1].reshape(planes, rows, segments + 1)[..., 1:] = part
     changes = np.flatnonzero(flat[1:] != flat[:-1]) + 1
     row, first = np.divmod(changes[::2], segments + 1)
     first, last = (first - 1) * SEGMENT, (changes[1::2] - row * (segments + 1) - 1) * SEGMENT
     k, j = np.divmod(row, rows)
-    made = np.stack((k + low[0], j + low[1], np.maximum(first, low[2]), np.minimum(last, high[2])), axis=-1)
+    made = np.stack(
+        (k + low[0], j + low[1], np.maximum(first, low[2]), np.minimum(last, high[2])), axis=-1
+    )
     return made[made[:, 2] < made[:, 3]].astype(np.int32).reshape(-1, 2, 2)
 
 
@@ -461,11 +525,13 @@ class StaggeredGrid:
         device: a Warp device or its name.
         origin: cells (x, y, z) of a larger grid before the first one of this.
         whole: cells of the larger grid that this is a part of; None: it is no part.
-        sparse: whether only a small part of its fields will be written, for which memory is taken in small pages.
+        sparse: whether only a small part of its fields will be written, for which memory is taken
+            in small pages.
         part: what this process has of it; all if None.
 
     Attributes:
-        barriers: solids thinner than its cells, `warp_lcp.grid.barriers.Barriers`, set by who places them; None: there are none.
+        barriers: solids thinner than its cells, `warp_lcp.grid.barriers.Barriers`, set by who
+            places them; None: there are none.
 
     Raises:
         ValueError: a count is not positive, nz is not 1 in 2-D, or the spacing is not positive.
@@ -486,7 +552,9 @@ class StaggeredGrid:
         if self.dimension not in (2, 3):
             raise ValueError(f"dimension = {self.dimension}: must be 2 or 3")
         if min(self.counts) < 1 or (self.dimension == 2 and self.counts[2] != 1):
-            raise ValueError(f"counts = {self.counts}: must be at least 1 cell (nx, ny, nz), and nz = 1 in 2-D")
+            raise ValueError(
+                f"counts = {self.counts}: must be at least 1 cell (nx, ny, nz), and nz = 1 in 2-D"
+            )
         if not (np.isfinite(self.spacing) and self.spacing > 0):
             raise ValueError(f"spacing = {self.spacing}: must be a positive length [m]")
         object.__setattr__(self, "device", checked_device(self.device))
@@ -538,11 +606,15 @@ class StaggeredGrid:
     def refined(self, parts: int) -> "StaggeredGrid":
         """Return the grid with each cell split along each axis; in 2-D not along z."""
         counts, origin, whole = (
-            None if n is None else (n[0] * parts, n[1] * parts, n[2] * (parts if self.dimension == 3 else 1))
+            None
+            if n is None
+            else (n[0] * parts, n[1] * parts, n[2] * (parts if self.dimension == 3 else 1))
             for n in (self.counts, self.origin, self.whole)
         )
         assert counts is not None and origin is not None
-        return StaggeredGrid(counts, self.spacing / parts, self.dimension, self.device, origin, whole)
+        return StaggeredGrid(
+            counts, self.spacing / parts, self.dimension, self.device, origin, whole
+        )
 
     def coarser(self) -> "StaggeredGrid":
         """Return the grid of cells of twice the edge that covers this one, in one process."""
@@ -584,7 +656,9 @@ class StaggeredGrid:
         """All cells without the ring."""
         return self.window((1, 1, 1), self.counts)
 
-    def window(self, low: typing.Sequence[int], high: typing.Sequence[int], grow: int = 0, shift: int = 0) -> Window:
+    def window(
+        self, low: typing.Sequence[int], high: typing.Sequence[int], grow: int = 0, shift: int = 0
+    ) -> Window:
         """Return the window of cells from low to high, moved, grown and clipped.
 
         (x, y, z), both included; moved by `shift` along each axis.
@@ -598,7 +672,9 @@ class StaggeredGrid:
                 last.append(2)
                 continue
             first.append(min(max(int(low[axis]) + shift - grow, 0), self.counts[axis] + 1))
-            last.append(max(min(int(high[axis]) + shift + grow + 1, self.counts[axis] + 2), first[-1] + 1))
+            last.append(
+                max(min(int(high[axis]) + shift + grow + 1, self.counts[axis] + 2), first[-1] + 1)
+            )
         return Window.of(first, last, self.device)
 
 

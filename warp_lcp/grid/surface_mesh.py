@@ -24,10 +24,15 @@ from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.transfer import faces_to_particles, particles_to_faces
 
-SHARPEST = 0.5  # particle distances: standard deviation of the narrowest kernel that has no gaps, the quadratic B-spline
+# particle distances: standard deviation of the narrowest kernel that has no gaps, the quadratic
+# B-spline
+SHARPEST = 0.5
 EXTENDED = 2  # layers that the distance is continued into solids, and the velocity into air
-CROWD = 0.1  # the largest smoothed share that a lone particle is taken to have: kernels as narrow as particles cannot tell it from others
-ROUNDS = 3  # of smoothing the mesh: facets as large as lattice cells are gone, and 0.1 % of the volume
+# the largest smoothed share that a lone particle is taken to have: kernels as narrow as particles
+# cannot tell it from others
+CROWD = 0.1
+# of smoothing the mesh: facets as large as lattice cells are gone, and 0.1 % of the volume
+ROUNDS = 3
 SEEN = 2 * ROUNDS + 1  # lattice cells around one that its points depend on by the smoothing
 OUTSIDE = 1.0  # of the surface, in the ring at cuts
 MESH_LATTICE_BYTES, MESH_SOLID_BYTES = 12, 9  # a lattice cell, and more where there are solids
@@ -49,10 +54,12 @@ class Obstacles:
 
     Attributes:
         base: int8, SOLID in cells that hold no material.
-        distance: signed distance at the cells' low corners [cells], float32, > 0 in the open; None: solids are whole cells.
+        distance: signed distance at the cells' low corners [cells], float32, > 0 in the open; None:
+            solids are whole cells.
         moves: whether they may be somewhere else each time.
-        shapes: returns the solids' shapes where they are; the surface then ends `mesh_walls.OVERLAP` inside them. None: it ends where
-            `distance`, or the cells, have the walls.
+        shapes: returns the solids' shapes where they are; the surface then ends
+            `mesh_walls.OVERLAP` inside them. None: it ends where `distance`, or the cells, have the
+            walls.
     """
 
     base: wp.array
@@ -79,18 +86,22 @@ class Interior:
 class SurfaceMesh:
     """Surface mesh around particles.
 
-    On a lattice, finer than the grid, the particles' density is smoothed over `smoothing` particle distances and divided by what solids and
-    walls leave of the kernel: the filled share. Where it is 1/2 there is the surface: unbiased for a plane and flat at walls that the
-    plane meets at a right angle; a ball of radius R shrinks by up to smoothing^2 / R [particle distances]. Where particles have few others
-    around them, in drops, filaments and sheets too thin for the kernel, a narrow kernel is added to the share with a weight that grows as
-    the smoothed share falls, so that a drop of one particle is still there. The surface is cut along walls, solids and
-    the domain's sides, those that are open or periodic too.
+    On a lattice, finer than the grid, the particles' density is smoothed over `smoothing` particle
+    distances and divided by what solids and walls leave of the kernel: the filled share. Where it
+    is 1/2 there is the surface: unbiased for a plane and flat at walls that the plane meets at a
+    right angle; a ball of radius R shrinks by up to smoothing^2 / R [particle distances]. Where
+    particles have few others around them, in drops, filaments and sheets too thin for the kernel, a
+    narrow kernel is added to the share with a weight that grows as the smoothed share falls, so
+    that a drop of one particle is still there. The surface is cut along walls, solids and the
+    domain's sides, those that are open or periodic too.
 
     Args:
         grid: the grid.
         per_axis: particles along the edge of a full cell at rest.
-        resolution: lattice cells along the edge of a cell; default: as many as particles, the finest useful resolution.
-        smoothing: standard deviation of the kernel [particle distances], at least that of the narrow one, 1/2.
+        resolution: lattice cells along the edge of a cell; default: as many as particles, the
+            finest useful resolution.
+        smoothing: standard deviation of the kernel [particle distances], at least that of the
+            narrow one, 1/2.
         obstacles: solids; None: there are none but the domain's walls.
 
     Raises:
@@ -98,23 +109,37 @@ class SurfaceMesh:
     """
 
     def __init__(
-        self, grid: StaggeredGrid, *, per_axis: int, resolution: int | None = None, smoothing: float = 1.5,
+        self,
+        grid: StaggeredGrid,
+        *,
+        per_axis: int,
+        resolution: int | None = None,
+        smoothing: float = 1.5,
         obstacles: Obstacles | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         parts = per_axis if resolution is None else resolution
         if per_axis < 1 or parts < 1:
-            raise ValueError(f"per_axis = {per_axis}, resolution = {resolution}: must be at least 1")
+            raise ValueError(
+                f"per_axis = {per_axis}, resolution = {resolution}: must be at least 1"
+            )
         if not (math.isfinite(smoothing) and smoothing >= SHARPEST):
-            raise ValueError(f"smoothing = {smoothing}: must be at least {SHARPEST} particle distances")
+            raise ValueError(
+                f"smoothing = {smoothing}: must be at least {SHARPEST} particle distances"
+            )
         self.grid, self.obstacles, self._parts = grid, obstacles, parts
         self.lattice = grid.refined(parts)
         distance = parts / per_axis  # of particles at rest, in lattice cells
         self._each = distance**grid.dimension
-        self._thin_passes, self._passes = (max(0, round(2.0 * ((sigma * distance) ** 2 - 0.25))) for sigma in (SHARPEST, smoothing))
+        self._thin_passes, self._passes = (
+            max(0, round(2.0 * ((sigma * distance) ** 2 - 0.25))) for sigma in (SHARPEST, smoothing)
+        )
         self._spread = math.sqrt(0.25 + 0.5 * self._passes)
-        # A drop of one particle has at least 2^-dimension of its narrow kernel on one lattice node: that shall be the share 1/2.
+        # A drop of one particle has at least 2^-dimension of its narrow kernel on one lattice node:
+        # that shall be the share 1/2.
         self._most = 2.0 ** (grid.dimension - 1)
-        alone = min(self._each * (2.0 * math.pi * self._spread**2) ** (-0.5 * grid.dimension), CROWD)
+        alone = min(
+            self._each * (2.0 * math.pi * self._spread**2) ** (-0.5 * grid.dimension), CROWD
+        )
         self._gain = self._most / ((kernels.THIN / alone) ** kernels.POWER - 1.0)
         self._fields = [self.lattice.field() for _ in range(3)]
         self._room = self.lattice.field() if obstacles else None
@@ -122,7 +147,8 @@ class SurfaceMesh:
         self._known = self.lattice.field(wp.int8) if obstacles else None
         self._cubes = MarchingCubes(self.lattice)
         self._placed = False
-        self._kept = self._lattice_cells() if grid.part.shared else None  # whose triangles this rank keeps; None: all
+        # whose triangles this rank keeps; None: all
+        self._kept = self._lattice_cells() if grid.part.shared else None
 
     def find(self, position: wp.array, interior: Interior | None = None) -> DeviceMesh:
         """Return the surface around particles, ghosts among them; collective.
@@ -138,28 +164,56 @@ class SurfaceMesh:
             self._place(self.obstacles)
         raw, first, second = self._fields
         raw.zero_()
-        scatter(SCATTER, lattice, position, touched_planes(lattice, position), each=self._each, density=raw)
+        scatter(
+            SCATTER,
+            lattice,
+            position,
+            touched_planes(lattice, position),
+            each=self._each,
+            density=raw,
+        )
         self._mirror(raw, fold=True)
         if interior is not None:
-            inputs = [lattice.planes, self._parts, interior.least, interior.depth, interior.base, raw]
+            inputs = [
+                lattice.planes,
+                self._parts,
+                interior.least,
+                interior.depth,
+                interior.base,
+                raw,
+            ]
             lattice.domain.launch(kernels.fill_kernel, inputs)
             self._mirror(raw)
         smooth = self._smoothed(raw, first, second, self._passes)
         thin, phi = (field for field in self._fields if field is not smooth)
         thin.zero_()
         launch(
-            kernels.BOOST, len(position), lattice, position=position, each=self._each, smooth=smooth, capacity=self._capacity,
-            thin=thin, gain=self._gain, most=self._most,
-        )  # fmt: skip
+            kernels.BOOST,
+            len(position),
+            lattice,
+            position=position,
+            each=self._each,
+            smooth=smooth,
+            capacity=self._capacity,
+            thin=thin,
+            gain=self._gain,
+            most=self._most,
+        )
         self._mirror(thin, fold=True)
         if self._thin_passes:
             done = self._smoothed(thin, phi, thin, self._thin_passes)
             thin, phi = done, phi if done is thin else thin
         window = lattice.everywhere
         window.run(
-            kernels.DISTANCE, phi=phi, known=self._known, smooth=smooth, thin=thin, capacity=self._capacity, planes=lattice.planes,
+            kernels.DISTANCE,
+            phi=phi,
+            known=self._known,
+            smooth=smooth,
+            thin=thin,
+            capacity=self._capacity,
+            planes=lattice.planes,
             spread=self._spread,
-        )  # fmt: skip
+        )
         if self._room is not None:
             extrapolate(window, self._known, phi, EXTENDED)
             window.run(kernels.CARVE, room=self._room, phi=phi)
@@ -169,7 +223,9 @@ class SurfaceMesh:
         """Return the lattice cells that have their low node in this rank's box, or in the ring beyond the domain's low sides."""
         lattice, part = self.lattice, self.grid.part
         each = np.array([self._parts] * 2 + [self._parts if lattice.dimension == 3 else 1])[::-1]
-        low, high = ((np.array(corner) - 1) * each + 1 for corner in (part.owned.low, part.owned.high))
+        low, high = (
+            (np.array(corner) - 1) * each + 1 for corner in (part.owned.low, part.owned.high)
+        )
         for axis in range(lattice.dimension):
             low[2 - axis] -= part.first[axis] == 0
         return Window.of(low.tolist(), high.tolist(), lattice.device)
@@ -183,18 +239,26 @@ class SurfaceMesh:
         for axis in range(lattice.dimension):
             for side in range(2):
                 if part.cuts >> 2 * axis + side & 1:
-                    phi.transpose((2 - axis, *(n for n in range(3) if n != 2 - axis)))[-side].fill_(OUTSIDE)
+                    phi.transpose((2 - axis, *(n for n in range(3) if n != 2 - axis)))[-side].fill_(
+                        OUTSIDE
+                    )
         mesh = self._whole_mesh(phi, number)
         kept = self._cubes.corners(phi, number, self._kept).numpy()
         used, corners = np.unique(kept, return_inverse=True)
         points = wp.array(mesh.points.numpy()[used], dtype=wp.vec3, device=lattice.device)
-        return DeviceMesh(points, wp.array(corners.reshape(kept.shape), dtype=wp.int32, device=lattice.device))
+        return DeviceMesh(
+            points, wp.array(corners.reshape(kept.shape), dtype=wp.int32, device=lattice.device)
+        )
 
     def _whole_mesh(self, phi: wp.array, number: wp.array) -> DeviceMesh:
         """Return the smoothed surface phi = 0 of all lattice cells."""
         mesh = self._cubes.contour(phi, number)
         held = smooth_mesh(mesh, self.lattice, self._room, ROUNDS)
-        shapes = self.obstacles.shapes() if self.obstacles is not None and self.obstacles.shapes is not None else ()
+        shapes = (
+            self.obstacles.shapes()
+            if self.obstacles is not None and self.obstacles.shapes is not None
+            else ()
+        )
         if shapes and len(mesh.points):
             self._fit(mesh, held.numpy(), shapes)
         return mesh
@@ -209,7 +273,8 @@ class SurfaceMesh:
         walls = Walls(shapes, spacing, lattice.dimension, lattice.device)
         on_solid = (held & ON_SOLID) > 0
         fitted = fit_to_walls(points, mesh.corners.numpy(), on_solid, fixed, walls)
-        size = np.asarray(lattice.extent)  # along a side a point could leave the domain beyond a corner
+        # along a side a point could leave the domain beyond a corner
+        size = np.asarray(lattice.extent)
         mesh.points.assign(np.clip(fitted * spacing, 0.0, size).astype(np.float32))
 
     def _place(self, obstacles: Obstacles) -> None:
@@ -217,19 +282,31 @@ class SurfaceMesh:
         lattice, domain = self.lattice, self.lattice.domain
         room, capacity = self._room, self._capacity
         if obstacles.distance is not None:
-            domain.run(kernels.ROOM, distance=obstacles.distance, out=room, planes=lattice.planes, parts=self._parts)
+            domain.run(
+                kernels.ROOM,
+                distance=obstacles.distance,
+                out=room,
+                planes=lattice.planes,
+                parts=self._parts,
+            )
         else:
-            domain.launch(kernels.whole_cell_room_kernel, [lattice.planes, self._parts, obstacles.base, room])
+            domain.launch(
+                kernels.whole_cell_room_kernel, [lattice.planes, self._parts, obstacles.base, room]
+            )
         self._mirror(room)
         lattice.everywhere.launch(kernels.open_share_kernel, [room, capacity])
         passes = self._passes + 1  # a cell's own extent widens the kernel by about as much
         wp.copy(capacity, self._smoothed(capacity, self._fields[0], self._fields[1], passes))
         self._placed = True
 
-    def _smoothed(self, source: wp.array, first: wp.array, second: wp.array, passes: int) -> wp.array:
+    def _smoothed(
+        self, source: wp.array, first: wp.array, second: wp.array, passes: int
+    ) -> wp.array:
         """Return the source after binomial passes (1, 2, 1)/4, mirrored at the domain's sides; in one of the two other fields."""
         for _ in range(passes):
-            self.lattice.everywhere.run(BINOMIAL, planes=self.lattice.planes, source=source, out=first)
+            self.lattice.everywhere.run(
+                BINOMIAL, planes=self.lattice.planes, source=source, out=first
+            )
             self._mirror(first)
             source, first, second = first, second, first
         return source
@@ -238,13 +315,19 @@ class SurfaceMesh:
         """Continue a field beyond the domain's sides as in a mirror; `fold`: after folding in what has been added there."""
         for axis in range(self.lattice.dimension):
             lines = field.transpose((*(n for n in range(3) if n != 2 - axis), 2 - axis))
-            wp.launch(kernels.mirror_kernel, lines.shape[:2], [fold, lines], device=self.lattice.device)
+            wp.launch(
+                kernels.mirror_kernel, lines.shape[:2], [fold, lines], device=self.lattice.device
+            )
         self.grid.part.fill(field, parts=self._parts)
 
 
 def faces_from_particles(
-    grid: StaggeredGrid, position: wp.array, velocity: wp.array, fields: list[wp.array], weights: list[wp.array],
-) -> None:  # fmt: skip
+    grid: StaggeredGrid,
+    position: wp.array,
+    velocity: wp.array,
+    fields: list[wp.array],
+    weights: list[wp.array],
+) -> None:
     """Transfer velocity from particles to the faces, and extrapolate.
 
     By `EXTENDED` layers.
@@ -273,7 +356,8 @@ def sample(grid: StaggeredGrid, fields: list[wp.array], points: wp.array) -> wp.
         points: [m], shape (m,), vectors.
     """
     sampled, within = (wp.zeros(len(points), dtype=wp.vec3, device=grid.device) for _ in range(2))
-    size = wp.vec3(*((n - MARGIN) * grid.spacing for n in grid.domain_counts))  # as near to the far sides as particles may come
+    # as near to the far sides as particles may come
+    size = wp.vec3(*((n - MARGIN) * grid.spacing for n in grid.domain_counts))
     wp.launch(kernels.clamp_kernel, len(points), [points, size, within], device=grid.device)
     faces_to_particles(grid, fields, within, sampled, [])
     return sampled

@@ -11,16 +11,21 @@ from warp_lcp.rows import KernelFile
 from warp_lcp.rows.compiler import forward_kernel
 
 FAR = 2.0  # lattice cells: a distance to solids that takes nothing from the liquid
-LEAST_OPEN = 0.25  # of a kernel: where less of it is open the distance is continued from outside the solid
-# A particle is boosted by gain ((THIN / share)^POWER - 1) where the smoothed share is below THIN: by nothing at a plane surface, where the
-# outermost particles have about 0.63, by most in a drop of one particle, by about 1/2 in a sheet of one layer, which keeps its thickness.
+# of a kernel: where less of it is open the distance is continued from outside the solid
+LEAST_OPEN = 0.25
+# A particle is boosted by gain ((THIN / share)^POWER - 1) where the smoothed share is below THIN:
+# by nothing at a plane surface, where the outermost particles have about 0.63, by most in a drop of
+# one particle, by about 1/2 in a sheet of one layer, which keeps its thickness.
 THIN, POWER = 0.6, 0.4
 
 
 _options = {"module": "warp_lcp.grid.surface_mesh"}
 
 
-KERNELS = KernelFile(Path(__file__).parent / "headers/surface_mesh.h", {"LEAST_OPEN": LEAST_OPEN, "THIN": THIN, "POWER": POWER})
+KERNELS = KernelFile(
+    Path(__file__).parent / "headers/surface_mesh.h",
+    {"LEAST_OPEN": LEAST_OPEN, "THIN": THIN, "POWER": POWER},
+)
 DISTANCE = KERNELS["warp_lcp.grid.surface_mesh.surface_distance"]
 ROOM = KERNELS["warp_lcp.grid.surface_mesh.room"]
 CARVE = KERNELS["warp_lcp.grid.surface_mesh.carve"]
@@ -60,7 +65,9 @@ def whole_cell_room_kernel(k, j, i, planes: int, parts: int, base: I8, out: F32)
                 d = float(0.5)
             if is_solid(base, planes, parts, k, wp.clamp(j + s, 1, out.shape[1] - 2), i):
                 d = float(0.5)
-            if planes == 2 and is_solid(base, planes, parts, wp.clamp(k + s, 1, out.shape[0] - 2), j, i):
+            if planes == 2 and is_solid(
+                base, planes, parts, wp.clamp(k + s, 1, out.shape[0] - 2), j, i
+            ):
                 d = float(0.5)
     out[k, j, i] = d
 

@@ -14,7 +14,8 @@ from warp_lcp.rows.vectors import Tally
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-CUDA_SUMS = 1 << 20  # columns of cells, a thread each, into which a GPU cuts a grid: some waves of the largest ones
+# columns of cells, a thread each, into which a GPU cuts a grid: some waves of the largest ones
+CUDA_SUMS = 1 << 20
 CUDA_PLANES = 16  # of one of them, at least
 
 ADD_ROWS = KERNELS["warp_lcp.grid.tally.add_rows"]
@@ -29,16 +30,27 @@ class WindowTally:
         counted: cells whose rows the CPU adds up; None: those of the window.
     """
 
-    def __init__(self, declared: RowPass, grid: StaggeredGrid, counted: Window | None = None) -> None:
+    def __init__(
+        self, declared: RowPass, grid: StaggeredGrid, counted: Window | None = None
+    ) -> None:
         self._shape, domain, self._declared = grid.shape[:2], grid.domain, declared
         self._planes = max(CUDA_PLANES, grid.size // CUDA_SUMS)
         self.name, self._counted = declared.name, counted
         columns, device = len(declared.found), grid.device
-        self._tally = Tally(declared, device, domain.rows_of_sums(self._planes).places) if device.is_cuda else None
+        self._tally = (
+            Tally(declared, device, domain.rows_of_sums(self._planes).places)
+            if device.is_cuda
+            else None
+        )
         if self._tally is None:
             rows = self._shape[0] * self._shape[1]
-            self._partials, self._host = (wp.zeros(columns * rows, dtype=wp.float64, device=device) for _ in range(2))
-            self._reading, self._columns = Reading(device, columns), Rows.flat(columns, device, serial=True)
+            self._partials, self._host = (
+                wp.zeros(columns * rows, dtype=wp.float64, device=device) for _ in range(2)
+            )
+            self._reading, self._columns = (
+                Reading(device, columns),
+                Rows.flat(columns, device, serial=True),
+            )
 
     def take(self, window: Window, *structs: DataclassInstance, **given: Any) -> None:
         """Launch the pass, bound as by `RowPass.bind`, over a window."""
@@ -52,10 +64,24 @@ class WindowTally:
         box_k, box_j, box_planes, box_rows = _numbers(self._counted or window)
         hulls, pieces = _hulls(window)
         ADD_ROWS.bind(
-            self._columns, partials=self._partials, host=self._host, results=self._reading.array, hulls=hulls, pieces=pieces,
-            first_k=first_k, first_j=first_j, planes=planes, rows_=rows, box_k=box_k, box_j=box_j, box_planes=box_planes,
-            box_rows=box_rows, sums_=len(self._declared.sums), all_planes=self._shape[0], all_rows=self._shape[1],
-        ).launch()  # fmt: skip
+            self._columns,
+            partials=self._partials,
+            host=self._host,
+            results=self._reading.array,
+            hulls=hulls,
+            pieces=pieces,
+            first_k=first_k,
+            first_j=first_j,
+            planes=planes,
+            rows_=rows,
+            box_k=box_k,
+            box_j=box_j,
+            box_planes=box_planes,
+            box_rows=box_rows,
+            sums_=len(self._declared.sums),
+            all_planes=self._shape[0],
+            all_rows=self._shape[1],
+        ).launch()
         self._reading.changed()
 
     def changed(self) -> None:

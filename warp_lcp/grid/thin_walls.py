@@ -1,8 +1,9 @@
 """Thin solids: those that a grid's cells cannot hold apart, met by particles as the exact shapes that they are.
 
-Distances at the nodes of a grid do not see a wall that lies between them, and a particle that a step takes to the other side of one finds
-itself in the open. So the path of each particle within a step is looked at in the frame of each solid, from where that was to where it
-is: what crosses the surface stops there and slides on, at the true surface and on its own side.
+Distances at the nodes of a grid do not see a wall that lies between them, and a particle that a
+step takes to the other side of one finds itself in the open. So the path of each particle within a
+step is looked at in the frame of each solid, from where that was to where it is: what crosses the
+surface stops there and slides on, at the true surface and on its own side.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ from warp_lcp.rows.program import copy
 
 THIN = 2.5  # cells: what is thinner is met as its exact shape
 STRIDE_ROOM = 0.5  # cells that a moving solid must be thicker than what it may go in a step
-SKIN = 1e-4  # cells by which shapes are larger than they are, so that there is no crack between those that touch
+# cells by which shapes are larger than they are, so that there is no crack between those that touch
+SKIN = 1e-4
 THIN_SHARE = 1e-3  # of a mesh's surface that must be thin for that
 COST = 32  # of a particle, in cells of a usual pass
 Simple = Box | Sphere | Capsule | TriangleMesh
@@ -34,7 +36,11 @@ Simple = Box | Sphere | Capsule | TriangleMesh
 
 def parts_of(geometry: Geometry) -> list[Geometry]:
     """Return the shapes that a region is the union of."""
-    return [part for of in geometry.parts for part in parts_of(of)] if isinstance(geometry, Union) else [geometry]
+    return (
+        [part for of in geometry.parts for part in parts_of(of)]
+        if isinstance(geometry, Union)
+        else [geometry]
+    )
 
 
 def is_thin(geometry: Geometry, thickness: float, device: wp.Device) -> bool:
@@ -57,7 +63,9 @@ def fills_cells(geometry: Geometry, grid: StaggeredGrid, error: float) -> bool:
 
 
 def _fills_cells(shape: Geometry, grid: StaggeredGrid, error: float) -> bool:
-    if not isinstance(shape, Box) or not np.allclose(np.abs(shape.placement.rotation).max(axis=0), 1.0, rtol=0.0, atol=1e-12):
+    if not isinstance(shape, Box) or not np.allclose(
+        np.abs(shape.placement.rotation).max(axis=0), 1.0, rtol=0.0, atol=1e-12
+    ):
         return False
     bounds = shape.bounds()
     assert bounds is not None, "the box is not inverted"
@@ -82,7 +90,13 @@ class ThinWalls:
 
     enabled: ClassVar[bool] = os.environ.get("WARP_LCP_THIN_WALLS") == "1"
 
-    def __init__(self, grid: StaggeredGrid, solids: Sequence[PlacedSolid], thin: Sequence[bool], open_sides: int) -> None:
+    def __init__(
+        self,
+        grid: StaggeredGrid,
+        solids: Sequence[PlacedSolid],
+        thin: Sequence[bool],
+        open_sides: int,
+    ) -> None:
         self.grid = grid
         self.numbers = [number for number, is_one in enumerate(thin, start=1) if is_one]
         self.moves = any(solids[number - 1].motion is not None for number in self.numbers)
@@ -96,8 +110,13 @@ class ThinWalls:
             of += [(number, part) for part in parts_of(solid.geometry)]
         self._motions = Motions([motion for motion, _ in groups if motion is not None])
         self._moving = [place for place, (motion, _) in enumerate(groups) if motion is not None]
-        shapes = [_shape(number, part, grid.device, SKIN * grid.spacing) for _, of in groups for number, part in of]
-        self._geometries = [part for _, of in groups for _, part in of]  # whose meshes are on the device
+        shapes = [
+            _shape(number, part, grid.device, SKIN * grid.spacing)
+            for _, of in groups
+            for number, part in of
+        ]
+        # whose meshes are on the device
+        self._geometries = [part for _, of in groups for _, part in of]
         ends = np.cumsum([0, *(len(of) for _, of in groups)])
         self._groups = []
         for first, end in pairwise(ends):
@@ -110,8 +129,14 @@ class ThinWalls:
         margin = MARGIN * grid.spacing
         low, high = np.full(3, margin), grid.extent - margin
         for axis in range(3):
-            low[axis] = low[axis] if axis < grid.dimension and not open_sides >> (2 * axis) & 1 else -np.inf
-            high[axis] = high[axis] if axis < grid.dimension and not open_sides >> (2 * axis + 1) & 1 else np.inf
+            low[axis] = (
+                low[axis] if axis < grid.dimension and not open_sides >> (2 * axis) & 1 else -np.inf
+            )
+            high[axis] = (
+                high[axis]
+                if axis < grid.dimension and not open_sides >> (2 * axis + 1) & 1
+                else np.inf
+            )
         self._margin, self._low, self._high = wp.float64(margin), wp.vec3d(*low), wp.vec3d(*high)
         self._start = wp.empty(0, dtype=wp.vec3, device=grid.device)
         self.place(0.0)
@@ -122,7 +147,9 @@ class ThinWalls:
         if not self._moving:
             return
         rotations, translations = self._motions.poses([time])
-        for place, rotation, translation in zip(self._moving, rotations[0], translations[0], strict=True):
+        for place, rotation, translation in zip(
+            self._moving, rotations[0], translations[0], strict=True
+        ):
             group = self._groups[place]
             group.turn_before, group.shift_before = group.turn, group.shift
             group.turn, group.shift = wp.mat33d(rotation), wp.vec3d(*translation)
@@ -145,7 +172,9 @@ class ThinWalls:
     def remember(self, position: wp.array) -> None:
         """Keep the places of particles [m], shape (n,), from which they are about to be moved."""
         if len(self._start) < len(position):
-            self._start = wp.empty(len(position) + len(position) // 4, dtype=wp.vec3, device=self.grid.device)
+            self._start = wp.empty(
+                len(position) + len(position) // 4, dtype=wp.vec3, device=self.grid.device
+            )
         copy(self._start[: len(position)], position)
 
     def start_of(self, position: wp.array) -> wp.array:
@@ -159,21 +188,49 @@ class ThinWalls:
             position: [m], shape (n,) (updated).
             still: whether the solids have not moved since then.
         """
-        given = [self.start_of(position), position, self.shapes, self.groups, int(still), self._margin, self.grid.planes]
-        launch_list(kernels.stop_kernel, len(position), [*given, self._low, self._high], device=self.grid.device, cost=COST)
+        given = [
+            self.start_of(position),
+            position,
+            self.shapes,
+            self.groups,
+            int(still),
+            self._margin,
+            self.grid.planes,
+        ]
+        launch_list(
+            kernels.stop_kernel,
+            len(position),
+            [*given, self._low, self._high],
+            device=self.grid.device,
+            cost=COST,
+        )
 
     def admits(self, points: np.ndarray) -> np.ndarray:
         """Return which points [m], shape (n, 3), keep the distance from these solids; a particle may start there."""
         at = wp.array(np.asarray(points, dtype=np.float32), dtype=wp.vec3, device=self.grid.device)
         room = wp.empty(len(points), dtype=wp.float64, device=self.grid.device)
         reach = wp.float64(2.0 * float(self._margin))
-        launch_list(kernels.room_kernel, len(points), [at, self.shapes, self.groups, reach, room], device=self.grid.device, cost=COST)
+        launch_list(
+            kernels.room_kernel,
+            len(points),
+            [at, self.shapes, self.groups, reach, room],
+            device=self.grid.device,
+            cost=COST,
+        )
         result = room.numpy() >= float(self._margin)
-        meshes = [place for place, geometry in enumerate(self._geometries) if isinstance(geometry, TriangleMesh)]
+        meshes = [
+            place
+            for place, geometry in enumerate(self._geometries)
+            if isinstance(geometry, TriangleMesh)
+        ]
         for place in meshes:
             group = next(g for g in self._groups if g.first <= place < g.end)
             turn, shift = np.array(group.turn).reshape(3, 3), np.array(group.shift)
-            own = wp.array(((np.asarray(points) - shift) @ turn).astype(np.float32), dtype=wp.vec3, device=self.grid.device)
+            own = wp.array(
+                ((np.asarray(points) - shift) @ turn).astype(np.float32),
+                dtype=wp.vec3,
+                device=self.grid.device,
+            )
             distance = wp.empty(len(points), dtype=wp.float32, device=self.grid.device)
             self._geometries[place].signed_distance(own, distance)
             result &= distance.numpy() > 0.0

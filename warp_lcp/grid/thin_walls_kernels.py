@@ -1,8 +1,8 @@
 # mypy: ignore-errors
 """Exact geometry of thin solids: where a straight path meets them, and kernels that stop particles there.
 
-All of it is float64: a particle keeps a distance of a thousandth of a cell from a wall, and that must survive the way from the domain's
-coordinates into those of a shape and back.
+All of it is float64: a particle keeps a distance of a thousandth of a cell from a wall, and that
+must survive the way from the domain's coordinates into those of a shape and back.
 """
 
 import warp as wp
@@ -18,7 +18,11 @@ HALVINGS = 6  # of a way into a corner, until there is that room
 MISS = 2.0  # a parameter of a path beyond its end
 ENDLESS = 1.0e30  # half extent [m] of a box without ends
 
-_ONE, _ZERO, _MISS = wp.constant(wp.float64(1.0)), wp.constant(wp.float64(0.0)), wp.constant(wp.float64(MISS))
+_ONE, _ZERO, _MISS = (
+    wp.constant(wp.float64(1.0)),
+    wp.constant(wp.float64(0.0)),
+    wp.constant(wp.float64(MISS)),
+)
 _TINY = wp.constant(wp.float64(1.0e-300))
 
 
@@ -186,15 +190,25 @@ def away(shape: ThinShape, p: wp.vec3d, reach: wp.float64):
                 distance = wp.length(beyond)
                 n = beyond / distance
         elif shape.kind == MESH:
-            query = wp.mesh_query_point_no_sign(shape.mesh, wp.vec3(q / shape.radius), float(reach / shape.radius))
+            query = wp.mesh_query_point_no_sign(
+                shape.mesh, wp.vec3(q / shape.radius), float(reach / shape.radius)
+            )
             if query.result:
-                n = q - wp.vec3d(wp.mesh_eval_position(shape.mesh, query.face, query.u, query.v)) * shape.radius
+                n = (
+                    q
+                    - wp.vec3d(wp.mesh_eval_position(shape.mesh, query.face, query.u, query.v))
+                    * shape.radius
+                )
                 distance = wp.length(n)
                 n = wp.normalize(n)
         else:
             n = q
             if shape.kind == CAPSULE:
-                n = q - wp.clamp(wp.dot(q, shape.half) / wp.dot(shape.half, shape.half), _ZERO, _ONE) * shape.half
+                n = (
+                    q
+                    - wp.clamp(wp.dot(q, shape.half) / wp.dot(shape.half, shape.half), _ZERO, _ONE)
+                    * shape.half
+                )
             distance = wp.length(n) - shape.radius
             n = wp.normalize(n)
         n = wp.transpose(shape.turn) * n
@@ -227,7 +241,9 @@ def first_hit(shapes: SHAPES, first: int, end: int, a: wp.vec3d, b: wp.vec3d, bu
 
 
 @wp.func
-def clear_of(shapes: SHAPES, first: int, end: int, p: wp.vec3d, margin: wp.float64, planes: int, inside: bool):
+def clear_of(
+    shapes: SHAPES, first: int, end: int, p: wp.vec3d, margin: wp.float64, planes: int, inside: bool
+):
     """Return a point moved off the shapes that it is nearer to than `margin`, or only off those that it lies in; and whether it was."""
     x = p
     moved = bool(False)
@@ -254,11 +270,20 @@ def has_room(shapes: SHAPES, first: int, end: int, p: wp.vec3d, room: wp.float64
 
 
 @wp.func
-def free_way(shapes: SHAPES, first: int, end: int, start: wp.vec3d, aim: wp.vec3d, margin: wp.float64, planes: int):
+def free_way(
+    shapes: SHAPES,
+    first: int,
+    end: int,
+    start: wp.vec3d,
+    aim: wp.vec3d,
+    margin: wp.float64,
+    planes: int,
+):
     """Return where a particle ends that goes from `start` towards `aim` among shapes that rest, and whether one was in its way.
 
-    It slides on along the surface of what it meets, at a distance of `margin` [m]. Each piece of its way is looked at; where no more can
-    be done it stops at the end of the last one that was free.
+    It slides on along the surface of what it meets, at a distance of `margin` [m]. Each piece of
+    its way is looked at; where no more can be done it stops at the end of the last one that was
+    free.
     """
     x, met = clear_of(shapes, first, end, start, margin, planes, True)
     for _again in range(3):
@@ -275,8 +300,13 @@ def free_way(shapes: SHAPES, first: int, end: int, start: wp.vec3d, aim: wp.vec3
                 p = x + t * way + margin * n
                 blocked, _n, _which = first_hit(shapes, first, end, x + t * way, p, which)
                 room = wp.float64(ROOM) * margin
-                if blocked <= _ONE or not has_room(shapes, first, end, p, room) or wp.dot(n, n) < wp.float64(0.5):
-                    # the corner of two walls: as far as a place that rounding does not take into one of them
+                if (
+                    blocked <= _ONE
+                    or not has_room(shapes, first, end, p, room)
+                    or wp.dot(n, n) < wp.float64(0.5)
+                ):
+                    # the corner of two walls: as far as a place that rounding does not take into
+                    # one of them
                     s = wp.max(t - margin / wp.max(wp.length(way), _TINY), _ZERO)
                     for _half in range(HALVINGS):
                         if not has_room(shapes, first, end, x + s * way, room):
@@ -305,14 +335,23 @@ def into_group(turn: wp.mat33d, shift: wp.vec3d, x: wp.vec3d):
 
 @list_kernel(MODULE)
 def stop_kernel(
-    i, start: POINTS, position: POINTS, shapes: SHAPES, groups: GROUPS, still: int, margin: wp.float64, planes: int, low: wp.vec3d,
+    i,
+    start: POINTS,
+    position: POINTS,
+    shapes: SHAPES,
+    groups: GROUPS,
+    still: int,
+    margin: wp.float64,
+    planes: int,
+    low: wp.vec3d,
     high: wp.vec3d,
-):  # fmt: skip
+):
     """Let no particle on its way from `start` to `position` pass a thin solid.
 
-    Within the frame of a group, from where its solids were to where they are, a straight way is looked at. It is exact for translations;
-    that of a particle beside a solid that turns differs by its bend from the true one, and its ends do not.
-    With `still` the solids have not moved. `low` and `high` are corners of what particles may not leave.
+    Within the frame of a group, from where its solids were to where they are, a straight way is
+    looked at. It is exact for translations; that of a particle beside a solid that turns differs by
+    its bend from the true one, and its ends do not. With `still` the solids have not moved. `low`
+    and `high` are corners of what particles may not leave.
     """
     x = wp.vec3d(start[i])
     y = wp.vec3d(position[i])
@@ -334,7 +373,11 @@ def stop_kernel(
             agreed += 1
             if met:
                 y = group.turn * end + group.shift
-                y = wp.vec3d(wp.clamp(y[0], low[0], high[0]), wp.clamp(y[1], low[1], high[1]), wp.clamp(y[2], low[2], high[2]))
+                y = wp.vec3d(
+                    wp.clamp(y[0], low[0], high[0]),
+                    wp.clamp(y[1], low[1], high[1]),
+                    wp.clamp(y[2], low[2], high[2]),
+                )
                 changed = True
                 agreed = 1
             g = (g + 1) % count
@@ -345,7 +388,14 @@ def stop_kernel(
 
 
 @list_kernel(MODULE)
-def room_kernel(i, points: POINTS, shapes: SHAPES, groups: GROUPS, reach: wp.float64, room: wp.array(dtype=wp.float64)):
+def room_kernel(
+    i,
+    points: POINTS,
+    shapes: SHAPES,
+    groups: GROUPS,
+    reach: wp.float64,
+    room: wp.array(dtype=wp.float64),
+):
     """Measure the distance of points from the nearest thin solid [m], at most `reach`; from a mesh's surface on either side."""
     x = wp.vec3d(points[i])
     least = reach

@@ -1,15 +1,19 @@
 """Particles to grid and grid to particles: PIC, FLIP and APIC, tent weights.
 
-APIC [Jiang et al. 2015] carries the gradient of each component. With multilinear weights on faces its momentum a node is
-m_i v_i = sum_p w_ip m_p (v_p + c_p . (x_i - x_p)) and the gradient on the way back is that of the interpolated field, c_p = sum_i
-grad w_ip v_i, so that linear and angular momentum survive the round trip.
+APIC [Jiang et al. 2015] carries the gradient of each component. With multilinear weights on faces
+its momentum a node is m_i v_i = sum_p w_ip m_p (v_p + c_p . (x_i - x_p)) and the gradient on the
+way back is that of the interpolated field, c_p = sum_i grad w_ip v_i, so that linear and angular
+momentum survive the round trip.
 
-The sum over particles has two forms. Particles *scatter* to the faces around them: the faster form on a CPU, where each task adds to
-planes of its own, always in the same order. Or each face *gathers* from the particles of the cells around it, which takes sorted
-particles and the first particle of each cell: no two threads write one face, so that a GPU too gives the same bits on every run.
+The sum over particles has two forms. Particles *scatter* to the faces around them: the faster form
+on a CPU, where each task adds to planes of its own, always in the same order. Or each face
+*gathers* from the particles of the cells around it, which takes sorted particles and the first
+particle of each cell: no two threads write one face, so that a GPU too gives the same bits on every
+run.
 
-Node (k, j, i) of component `axis` lies at the grid coordinates (i, j + 1/2, k + 1/2) with the axis' own 1/2 left out, plus the origin of a
-part of a grid. In 2-D the nodes of one plane are used: the coordinate along z is that of the plane, and the plane above is the same one.
+Node (k, j, i) of component `axis` lies at the grid coordinates (i, j + 1/2, k + 1/2) with the axis'
+own 1/2 left out, plus the origin of a part of a grid. In 2-D the nodes of one plane are used: the
+coordinate along z is that of the plane, and the plane above is the same one.
 """
 
 import functools
@@ -28,7 +32,8 @@ from warp_lcp.rows import KernelFile
 from warp_lcp.rows.memory import Scalar, value_of
 
 TINY_WEIGHT = 1e-9  # below it a face counts as untouched
-# A particle that lies exactly on the boundary between cells would leave one face of its own cell without weight, hence without gravity.
+# A particle that lies exactly on the boundary between cells would leave one face of its own cell
+# without weight, hence without gravity.
 EDGE = {wp.float32: 1e-5, wp.float64: 1e-12}
 KERNELS = KernelFile(Path(__file__).parent / "headers/transfer.h")
 
@@ -40,7 +45,9 @@ def transfer_passes(real: Any) -> SimpleNamespace:
     Two forms of the sum over particles, its adjoint `interpolate`, and the division by the weights.
     """
     name = f"warp_lcp.grid.transfer_{real.__name__}"
-    made = functools.partial(KERNELS.kernel, compute=real, constants={"EDGE": EDGE[real], "TINY_WEIGHT": TINY_WEIGHT})
+    made = functools.partial(
+        KERNELS.kernel, compute=real, constants={"EDGE": EDGE[real], "TINY_WEIGHT": TINY_WEIGHT}
+    )
 
     @cell_kernel(name)
     @typing.no_type_check
@@ -60,9 +67,17 @@ def transfer_passes(real: Any) -> SimpleNamespace:
 
 
 def particles_to_faces(
-    grid: StaggeredGrid, position: wp.array, velocity: wp.array, affine: list[wp.array], fields: list[wp.array], weights: list[wp.array], *,
-    window: Window | None = None, offsets: wp.array | None = None, runs: wp.array | None = None,
-) -> None:  # fmt: skip
+    grid: StaggeredGrid,
+    position: wp.array,
+    velocity: wp.array,
+    affine: list[wp.array],
+    fields: list[wp.array],
+    weights: list[wp.array],
+    *,
+    window: Window | None = None,
+    offsets: wp.array | None = None,
+    runs: wp.array | None = None,
+) -> None:
     """Particles to grid: average the particles' velocities on the faces.
 
     All particles have the same weight.
@@ -75,8 +90,9 @@ def particles_to_faces(
         fields: velocity of each component [m/s] (written), 0 on faces without weight.
         weights: sum of the tent weights of each component (written), in particles.
         window: faces that particles can reach; all of them if None.
-        offsets: first particle of each stored cell, int32, shape (cells + 1,), of particles that are sorted by cell: faces gather.
-            None: particles scatter, in any order; on CUDA the last bits then differ from run to run.
+        offsets: first particle of each stored cell, int32, shape (cells + 1,), of particles that
+            are sorted by cell: faces gather. None: particles scatter, in any order; on CUDA the
+            last bits then differ from run to run.
         runs: of `Particles`.
     """
     passes = transfer_passes(fields[0].dtype)
@@ -87,30 +103,54 @@ def particles_to_faces(
         gradient = affine[axis] if affine else None
         if offsets is not None:
             window.run(
-                passes.gather_weights, grid.placement, position=position, velocity=velocity, gradient=gradient, axis=axis,
-                offsets=offsets, field=field, weight=weight,
-            )  # fmt: skip
+                passes.gather_weights,
+                grid.placement,
+                position=position,
+                velocity=velocity,
+                gradient=gradient,
+                axis=axis,
+                offsets=offsets,
+                field=field,
+                weight=weight,
+            )
             if grid.barriers is not None:
-                grid.barriers.particles_to_faces(window, axis, offsets, position, velocity, gradient, field, weight)
+                grid.barriers.particles_to_faces(
+                    window, axis, offsets, position, velocity, gradient, field, weight
+                )
             continue
         scatter(
-            passes.scatter, grid, position, touched, runs=runs, velocity=velocity, gradient=gradient, axis=axis, momentum=field,
+            passes.scatter,
+            grid,
+            position,
+            touched,
+            runs=runs,
+            velocity=velocity,
+            gradient=gradient,
+            axis=axis,
+            momentum=field,
             weight=weight,
-        )  # fmt: skip
+        )
         window.launch(passes.normalize, [weight, field])
 
 
 def faces_to_particles(
-    grid: StaggeredGrid, fields: list[wp.array], position: wp.array, velocity: wp.array, affine: list[wp.array], *,
-    saved: list[wp.array] | None = None, flip: float = 0.0,
-) -> None:  # fmt: skip
+    grid: StaggeredGrid,
+    fields: list[wp.array],
+    position: wp.array,
+    velocity: wp.array,
+    affine: list[wp.array],
+    *,
+    saved: list[wp.array] | None = None,
+    flip: float = 0.0,
+) -> None:
     """Grid to particles: interpolate the faces' velocities at the particles.
 
     Args:
         grid: the grid; every particle lies in its domain.
         fields: velocity of each component on the faces [m/s].
         position: [m], shape (n,), vectors.
-        velocity: [m/s], shape (n,), vectors (written): v = interpolated + flip (v_before - interpolated `saved`).
+        velocity: [m/s], shape (n,), vectors (written): v = interpolated + flip (v_before -
+            interpolated `saved`).
         affine: gradient of each component [1/s] (written, APIC), or empty.
         saved: the faces' velocities as they came from the particles [m/s], for FLIP.
         flip: share of FLIP, 0 (PIC) to 1; needs `saved`.
@@ -121,11 +161,21 @@ def faces_to_particles(
         gradient = affine[axis] if affine else None
         old = saved[axis] if saved and flip > 0.0 else None
         launch(
-            passes.interpolate, len(position), grid, position=position, velocity=velocity, gradient=gradient, axis=axis, flip=flip,
-            field=field, saved=old,
-        )  # fmt: skip
+            passes.interpolate,
+            len(position),
+            grid,
+            position=position,
+            velocity=velocity,
+            gradient=gradient,
+            axis=axis,
+            flip=flip,
+            field=field,
+            saved=old,
+        )
         if grid.barriers is not None:
-            grid.barriers.faces_to_particles(axis, field, old, flip if old else 0.0, before, position, velocity, gradient)
+            grid.barriers.faces_to_particles(
+                axis, field, old, flip if old else 0.0, before, position, velocity, gradient
+            )
 
 
 @cell_kernel("warp_lcp.grid.gravity")
@@ -136,7 +186,12 @@ def accelerate_kernel(k, j, i, change: float, weight: F32, field: F32):
         field[k, j, i] = field[k, j, i] + change
 
 
-def accelerate(window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], change: Sequence[float | Scalar]) -> None:
+def accelerate(
+    window: Window,
+    velocity: Sequence[wp.array],
+    weights: Sequence[wp.array],
+    change: Sequence[float | Scalar],
+) -> None:
     """Change the velocity of every face with particle weight.
 
     Closed faces included: they pass it on to the material beside them.
@@ -145,7 +200,8 @@ def accelerate(window: Window, velocity: Sequence[wp.array], weights: Sequence[w
         window: faces that particles can reach.
         velocity: each component [m/s] (updated).
         weights: of the particles on each component's faces.
-        change: of each component [m/s], shape (3,); a recorded launch has one for those that are not 0 then.
+        change: of each component [m/s], shape (3,); a recorded launch has one for those that are
+            not 0 then.
     """
     for axis, (field, weight) in enumerate(zip(velocity, weights, strict=True)):
         if value_of(change[axis]) != 0.0:

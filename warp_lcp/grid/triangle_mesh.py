@@ -20,14 +20,17 @@ from warp_lcp.grid.solids_kernels import mesh_thickness
 Triangles = tuple[np.ndarray, np.ndarray]  # vertices, and triangles of them
 
 
-def tube(curve: np.ndarray, normals: np.ndarray, binormals: np.ndarray, radius: float, sides: int) -> Triangles:
+def tube(
+    curve: np.ndarray, normals: np.ndarray, binormals: np.ndarray, radius: float, sides: int
+) -> Triangles:
     """Return the closed tube around a closed curve, oriented outward.
 
     Args:
         curve: points along the curve, shape (n, 3); the last is joined to the first.
         normals: unit vectors across the curve, shape (n, 3).
         binormals: tangent x normal, shape (n, 3).
-        radius: of the tube, less than the curve's radius of curvature and half the distance of its strands.
+        radius: of the tube, less than the curve's radius of curvature and half the distance of its
+            strands.
         sides: number of vertices around the tube.
 
     Returns:
@@ -41,7 +44,9 @@ def tube(curve: np.ndarray, normals: np.ndarray, binormals: np.ndarray, radius: 
     b = (along + 1) % len(curve) * sides + around
     c = (along + 1) % len(curve) * sides + (around + 1) % sides
     d = along * sides + (around + 1) % sides
-    triangles = np.concatenate([np.stack([a, c, b], axis=-1).reshape(-1, 3), np.stack([a, d, c], axis=-1).reshape(-1, 3)])
+    triangles = np.concatenate(
+        [np.stack([a, c, b], axis=-1).reshape(-1, 3), np.stack([a, d, c], axis=-1).reshape(-1, 3)]
+    )
     return vertices, triangles
 
 
@@ -63,10 +68,17 @@ def knot() -> Triangles:
     The curve is (sin t + 2 sin 2t, cos t - 2 cos 2t, -sin 3t), scaled.
     """
     t = 2.0 * np.pi * np.arange(240) / 240
-    curve = np.stack([np.sin(t) + 2 * np.sin(2 * t), np.cos(t) - 2 * np.cos(2 * t), -np.sin(3 * t)], axis=-1)
-    first = np.stack([np.cos(t) + 4 * np.cos(2 * t), -np.sin(t) + 4 * np.sin(2 * t), -3 * np.cos(3 * t)], axis=-1)
-    second = np.stack([-np.sin(t) - 8 * np.sin(2 * t), -np.cos(t) + 8 * np.cos(2 * t), 9 * np.sin(3 * t)], axis=-1)
-    binormals = np.cross(first, second)  # never zero on this curve, so Frenet's frame closes without a seam
+    curve = np.stack(
+        [np.sin(t) + 2 * np.sin(2 * t), np.cos(t) - 2 * np.cos(2 * t), -np.sin(3 * t)], axis=-1
+    )
+    first = np.stack(
+        [np.cos(t) + 4 * np.cos(2 * t), -np.sin(t) + 4 * np.sin(2 * t), -3 * np.cos(3 * t)], axis=-1
+    )
+    second = np.stack(
+        [-np.sin(t) - 8 * np.sin(2 * t), -np.cos(t) + 8 * np.cos(2 * t), 9 * np.sin(3 * t)], axis=-1
+    )
+    # never zero on this curve, so Frenet's frame closes without a seam
+    binormals = np.cross(first, second)
     binormals /= np.linalg.norm(binormals, axis=1, keepdims=True)
     tangents = first / np.linalg.norm(first, axis=1, keepdims=True)
     normals = np.cross(binormals, tangents)
@@ -84,7 +96,9 @@ WELD = 1e-6  # of the mesh's diagonal: coarser than float32 coordinates, far fin
 FLAT = 1e-12  # twice the area over the longest edge squared, below which a triangle has none
 NO_VOLUME = 1e-9  # of the mesh's diagonal cubed
 LARGEST = 1e18  # of a coordinate, as of a scene's numbers
-CLOSE_VERTICES = 64  # to merge with each, on the average, at most: more are a mesh that shrank to a point beside a vertex astray
+# to merge with each, on the average, at most: more are a mesh that shrank to a point beside a
+# vertex astray
+CLOSE_VERTICES = 64
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -130,7 +144,9 @@ class ClosedSurface:
         """
         mesh = self._meshes.get(str(device))
         if mesh is None:
-            points = wp.array((self.vertices - self.center) / self.size, dtype=wp.vec3, device=device)
+            points = wp.array(
+                (self.vertices - self.center) / self.size, dtype=wp.vec3, device=device
+            )
             indices = wp.array(self.triangles.ravel(), dtype=wp.int32, device=device)
             mesh = wp.Mesh(points, indices, support_winding_number=True)
             self._meshes[str(device)] = mesh
@@ -141,7 +157,11 @@ class ClosedSurface:
         """Self-intersections of the surface and parts inside itself; found on the CPU."""
         mesh = self.on_device(wp.get_device("cpu"))
         found = find_self_crossings(mesh, (self.vertices - self.center) / self.size, self.triangles)
-        return found if found.place is None else replace(found, place=self.center + self.size * found.place)
+        return (
+            found
+            if found.place is None
+            else replace(found, place=self.center + self.size * found.place)
+        )
 
     def thin_fraction(self, thickness: float, device: wp.Device) -> float:
         """Return the fraction of the surface where the solid is thin.
@@ -151,7 +171,13 @@ class ClosedSurface:
         faces = len(self.triangles)
         out = wp.empty(faces, dtype=wp.float32, device=device)
         reach = thickness / self.size
-        wp.launch(mesh_thickness, dim=faces, inputs=[self.on_device(device).id, reach], outputs=[out], device=device)
+        wp.launch(
+            mesh_thickness,
+            dim=faces,
+            inputs=[self.on_device(device).id, reach],
+            outputs=[out],
+            device=device,
+        )
         area = np.linalg.norm(_double_areas(self.vertices, self.triangles), axis=1)
         return float(area[out.numpy() < np.float32(reach)].sum() / area.sum())
 
@@ -179,7 +205,8 @@ def builtin_mesh(name: str) -> ClosedSurface:
     """
     if name not in BUILTIN:
         raise ValueError(
-            f"there is no mesh {BUILTIN_PREFIX}{name}; choose from {', '.join(BUILTIN_PREFIX + known for known in sorted(BUILTIN))}"
+            f"there is no mesh {BUILTIN_PREFIX}{name}; choose from "
+            f"{', '.join(BUILTIN_PREFIX + known for known in sorted(BUILTIN))}"
         )
     vertices, triangles = BUILTIN[name]()
     return close_surface(vertices, triangles, BUILTIN_PREFIX + name)
@@ -191,7 +218,8 @@ def read_mesh(path: str | Path) -> ClosedSurface:
     Polygons are triangulated, equal vertices merged.
 
     Raises:
-        ValueError: the file is missing, unreadable, empty or not a closed surface; the message names it and says what to do.
+        ValueError: the file is missing, unreadable, empty or not a closed surface; the message
+            names it and says what to do.
     """
     vertices, triangles = read_triangles(Path(path))
     return close_surface(vertices, triangles, str(path))
@@ -215,12 +243,16 @@ def close_surface(vertices: np.ndarray, triangles: np.ndarray, name: str) -> Clo
     bad = int((~np.isfinite(vertices).all(axis=1)).sum())
     if bad:
         raise ValueError(
-            f"{name}: {bad} of {len(vertices)} vertices {'is' if bad == 1 else 'are'} not finite (NaN or infinite coordinates)"
+            f"{name}: {bad} of {len(vertices)} vertices {'is' if bad == 1 else 'are'} not finite "
+            "(NaN or infinite coordinates)"
         )
     if not len(triangles):
         raise ValueError(f"{name}: the mesh has no triangles")
     if np.abs(vertices).max() > LARGEST:
-        raise ValueError(f"{name}: a vertex lies {np.abs(vertices).max():.3g} from the origin: coordinates must not be beyond {LARGEST:g}")
+        raise ValueError(
+            f"{name}: a vertex lies {np.abs(vertices).max():.3g} from the origin: coordinates must "
+            f"not be beyond {LARGEST:g}"
+        )
     try:
         vertices, triangles = weld(vertices, triangles)
     except ValueError as error:
@@ -236,21 +268,34 @@ def close_surface(vertices: np.ndarray, triangles: np.ndarray, name: str) -> Clo
     kept = _without_repeated(triangles)
     if len(kept) < len(triangles):
         again = np.setdiff1d(np.arange(len(triangles)), kept)
-        warnings.append(f"{name}: dropped {len(again)} repeated triangles, {_first(vertices[triangles[again]])}")
+        warnings.append(
+            f"{name}: dropped {len(again)} repeated triangles, {_first(vertices[triangles[again]])}"
+        )
         triangles = triangles[kept]
     _check_closed(vertices, triangles, name)
     triangles, flipped = _orient(vertices, triangles, name)
     warnings += flipped
-    # Only now: a triangle without area may be what closes the seam between a long edge and the halves that meet it.
+    # Only now: a triangle without area may be what closes the seam between a long edge and the
+    # halves that meet it.
     flat = _flat(vertices, triangles)
     degenerate += int(flat.sum())
     if degenerate:
         where = _first(np.concatenate([nothing, vertices[triangles[flat]]]))
-        warnings.append(f"{name}: dropped {degenerate} degenerate triangles (without area), {where}")
-    surface = ClosedSurface(name=name, vertices=vertices, triangles=triangles[~flat].astype(np.int32), warnings=tuple(warnings))
+        warnings.append(
+            f"{name}: dropped {degenerate} degenerate triangles (without area), {where}"
+        )
+    surface = ClosedSurface(
+        name=name,
+        vertices=vertices,
+        triangles=triangles[~flat].astype(np.int32),
+        warnings=tuple(warnings),
+    )
     if not flat.all() and surface.volume > NO_VOLUME * _diagonal(vertices) ** 3:
         return surface
-    raise ValueError(f"{name}: the surface encloses no volume (is it flat, or is every triangle there twice, in both orientations?)")
+    raise ValueError(
+        f"{name}: the surface encloses no volume (is it flat, or is every triangle there twice, in "
+        "both orientations?)"
+    )
 
 
 def weld(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -264,12 +309,19 @@ def weld(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.nd
     used, flat = np.unique(triangles, return_inverse=True)
     exact, same = np.unique(vertices[used], axis=0, return_inverse=True)
     tree, near = cKDTree(exact), WELD * _diagonal(exact)
-    if len(exact) > CLOSE_VERTICES and tree.count_neighbors(tree, near) > (1 + CLOSE_VERTICES) * len(exact):
+    if len(exact) > CLOSE_VERTICES and tree.count_neighbors(tree, near) > (
+        1 + CLOSE_VERTICES
+    ) * len(exact):
         low, high = exact.min(axis=0), exact.max(axis=0)
         spans = f"the mesh spans {_point(low)} to {_point(high)}"
-        raise ValueError(f"most vertices lie within {near:.3g} of others, where {spans}: is there an outlier?")
+        raise ValueError(
+            f"most vertices lie within {near:.3g} of others, where {spans}: is there an outlier?"
+        )
     pairs = tree.query_pairs(near, output_type="ndarray")
-    links = coo_array((np.ones(len(pairs), dtype=bool), (pairs[:, 0], pairs[:, 1])), shape=(len(exact), len(exact)))
+    links = coo_array(
+        (np.ones(len(pairs), dtype=bool), (pairs[:, 0], pairs[:, 1])),
+        shape=(len(exact), len(exact)),
+    )
     count, label = connected_components(links, directed=False)
     merged = np.empty((count, 3))
     merged[label[::-1]] = exact[::-1]  # the first of each group stays
@@ -302,8 +354,8 @@ def _cone_volumes(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 def _without_repeated(triangles: np.ndarray) -> np.ndarray:
     """Return the numbers of triangles without those that there are before with the same corners.
 
-    Of triangles that are there in both orientations one is left where that closes the surface; where it does not, as in a fin without
-    thickness, they belong there.
+    Of triangles that are there in both orientations one is left where that closes the surface;
+    where it does not, as in a fin without thickness, they belong there.
     """
     first = triangles.argmin(axis=1)[:, None]
     turned = np.take_along_axis(triangles, (first + np.arange(3)) % 3, axis=1)
@@ -326,7 +378,9 @@ def _edges(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return each side's edge number and direction, shape (3 m,) with side s of triangle t at 3 t + s, and each edge's number of sides."""
     sides = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=-1).reshape(-1, 2)
     forward = sides[:, 0] < sides[:, 1]
-    _, edge, uses = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True, return_counts=True)
+    _, edge, uses = np.unique(
+        np.sort(sides, axis=1), axis=0, return_inverse=True, return_counts=True
+    )
     return edge.ravel(), forward, uses
 
 
@@ -336,9 +390,11 @@ def _check_closed(vertices: np.ndarray, triangles: np.ndarray, name: str) -> Non
     if odd:
         where = _first(vertices[triangles[(uses[edge] % 2).reshape(-1, 3).any(axis=1)]])
         raise ValueError(
-            f"{name}: the surface is not closed: {odd} of its {len(uses)} edges are open, {where}, so inside and outside are undefined "
+            f"{name}: the surface is not closed: {odd} of its {len(uses)} edges are open, {where}, "
+            "so inside and outside are undefined "
             "and the material would leak through. "
-            "Fill the holes (in Blender: Mesh > Clean Up > Merge by Distance, Fill Holes; in MeshLab: Close Holes)"
+            "Fill the holes (in Blender: Mesh > Clean Up > Merge by Distance, Fill Holes; in "
+            "MeshLab: Close Holes)"
         )
 
 
@@ -354,26 +410,38 @@ def _orient(vertices: np.ndarray, triangles: np.ndarray, name: str) -> tuple[np.
         tangled = int(np.count_nonzero(np.bincount(edge, weights=np.where(forward, 1.0, -1.0))))
         if tangled:
             raise ValueError(
-                f"{name}: at {tangled} edges more than two triangles meet without a consistent orientation, so inside and outside are "
-                "undefined. Separate the parts that touch there, or repair the mesh (in MeshLab: Repair non Manifold Edges)"
+                f"{name}: at {tangled} edges more than two triangles meet without a consistent "
+                "orientation, so inside and outside are "
+                "undefined. Separate the parts that touch there, or repair the mesh (in MeshLab: "
+                "Repair non Manifold Edges)"
             )
         where = _first(vertices[triangles[turn]])
         warnings.append(
-            f"{name}: turned {int(turn.sum())} of {len(triangles)} triangles that disagreed with their neighbors' orientation, {where}"
+            f"{name}: turned {int(turn.sum())} of {len(triangles)} triangles that disagreed with "
+            f"their neighbors' orientation, {where}"
         )
     parts, part = _parts(edge, forward, uses)
-    volume = np.bincount(part, weights=_cone_volumes(vertices - vertices.mean(axis=0), triangles), minlength=parts)
+    volume = np.bincount(
+        part, weights=_cone_volumes(vertices - vertices.mean(axis=0), triangles), minlength=parts
+    )
     turn = np.zeros(parts, dtype=bool)
     if volume.sum() < 0.0:
         turn[:] = True
     outward = np.where(turn, -volume, volume)
-    for p in np.flatnonzero(outward < 0.0):  # a hollow is one only where there is something around it
+    # a hollow is one only where there is something around it
+    for p in np.flatnonzero(outward < 0.0):
         others = part != p
-        corners = vertices[np.where(turn[part[others]][:, None], triangles[others][:, ::-1], triangles[others])]
+        corners = vertices[
+            np.where(turn[part[others]][:, None], triangles[others][:, ::-1], triangles[others])
+        ]
         turn[p] ^= winding_number(vertices[triangles[part == p][0, 0]], corners) < 0.5
     if turn.any():
         where = _first(vertices[triangles[turn[part]]])
-        what = "the mesh was inside out" if turn.all() else f"{int(turn.sum())} of its {parts} parts were inside out, {where}"
+        what = (
+            "the mesh was inside out"
+            if turn.all()
+            else f"{int(turn.sum())} of its {parts} parts were inside out, {where}"
+        )
         warnings.append(f"{name}: {what}; turned")
         triangles = np.where(turn[part][:, None], triangles[:, ::-1], triangles)
     return triangles, warnings
@@ -387,21 +455,29 @@ def _parts(edge: np.ndarray, forward: np.ndarray, uses: np.ndarray) -> tuple[int
     def components(edges: np.ndarray) -> tuple[int, np.ndarray]:
         neighbors = (edge[order[1:]] == edge[order[:-1]]) & edges[edge[order[1:]]]
         rows, columns = owner[order[1:]][neighbors], owner[order[:-1]][neighbors]
-        links = coo_array((np.ones(rows.size, dtype=bool), (rows, columns)), shape=(owner[-1] + 1, owner[-1] + 1))
+        links = coo_array(
+            (np.ones(rows.size, dtype=bool), (rows, columns)), shape=(owner[-1] + 1, owner[-1] + 1)
+        )
         return connected_components(links, directed=False)
 
     parts, part = components(uses == 2)
-    # Where more than two triangles meet, parts are one only if none is balanced there by itself (they do more than touch).
+    # Where more than two triangles meet, parts are one only if none is balanced there by itself
+    # (they do more than touch).
     meetings, meeting = np.unique(edge * parts + part[owner], return_inverse=True)
-    unbalanced = meetings[np.bincount(meeting.ravel(), weights=np.where(forward, 1.0, -1.0)) != 0.0] // parts
+    unbalanced = (
+        meetings[np.bincount(meeting.ravel(), weights=np.where(forward, 1.0, -1.0)) != 0.0] // parts
+    )
     return components((uses == 2) | np.isin(np.arange(uses.size), unbalanced))
 
 
-def _disagreeing(triangles: np.ndarray, edge: np.ndarray, forward: np.ndarray, uses: np.ndarray, name: str) -> np.ndarray:
+def _disagreeing(
+    triangles: np.ndarray, edge: np.ndarray, forward: np.ndarray, uses: np.ndarray, name: str
+) -> np.ndarray:
     """Mark the fewest triangles, shape (m,), whose turning makes all neighbors across edges of two triangles agree.
 
-    Every triangle t appears as t (kept) and t + m (turned). Neighbors that agree are linked like with like, others crosswise: the connected
-    parts of this double cover are the consistent choices, and a triangle linked with its own turned self lies on a one-sided surface.
+    Every triangle t appears as t (kept) and t + m (turned). Neighbors that agree are linked like
+    with like, others crosswise: the connected parts of this double cover are the consistent
+    choices, and a triangle linked with its own turned self lies on a one-sided surface.
     """
     m = len(triangles)
     order = np.argsort(edge, kind="stable")
@@ -409,10 +485,16 @@ def _disagreeing(triangles: np.ndarray, edge: np.ndarray, forward: np.ndarray, u
     t, s = order[:, 0] // 3, order[:, 1] // 3
     crosswise = m * (forward[order[:, 0]] == forward[order[:, 1]])
     rows, columns = np.concatenate([t, t + m]), np.concatenate([s + crosswise, s + m - crosswise])
-    _, label = connected_components(coo_array((np.ones(rows.size, dtype=bool), (rows, columns)), shape=(2 * m, 2 * m)), directed=False)
+    _, label = connected_components(
+        coo_array((np.ones(rows.size, dtype=bool), (rows, columns)), shape=(2 * m, 2 * m)),
+        directed=False,
+    )
     kept, turned = label[:m], label[m:]
     if (kept == turned).any():
-        raise ValueError(f"{name}: the surface has one side only (like a Klein bottle), so inside and outside are undefined")
+        raise ValueError(
+            f"{name}: the surface has one side only (like a Klein bottle), so inside and outside "
+            "are undefined"
+        )
     group, bit = np.minimum(kept, turned), kept > turned
     majority = 2 * np.bincount(group, weights=bit) > np.bincount(group)
     return bit ^ majority[group]
@@ -423,10 +505,13 @@ def winding_number(point: np.ndarray, corners: np.ndarray) -> float:
 
     `corners` of shape (m, 3, 3); the sum of their solid angles over 4 pi.
 
-    By van Oosterom and Strackee's formula, the tangent of half a solid angle is a.(b x c) / (|a||b||c| + (a.b)|c| + (b.c)|a| + (c.a)|b|).
+    By van Oosterom and Strackee's formula, the tangent of half a solid angle is a.(b x c) /
+    (|a||b||c| + (a.b)|c| + (b.c)|a| + (c.a)|b|).
     """
     a, b, c = np.moveaxis(corners - point, 1, 0)
     la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
     ab, bc, ca = (np.einsum("ij,ij->i", *pair) for pair in ((a, b), (b, c), (c, a)))
     triple = np.einsum("ij,ij->i", a, np.cross(b, c))
-    return float(np.arctan2(triple, la * lb * lc + ab * lc + bc * la + ca * lb).sum() / (2.0 * np.pi))
+    return float(
+        np.arctan2(triple, la * lb * lc + ab * lc + bc * la + ca * lb).sum() / (2.0 * np.pi)
+    )

@@ -12,7 +12,9 @@ from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import SEGMENT, StaggeredGrid, Window
 from warp_lcp.rows import KernelFile
 
-LEAST_CELLS = 1 << 17  # of a box that may be visited in part: finding the part costs as much as a pass over particles and one over segments
+# of a box that may be visited in part: finding the part costs as much as a pass over particles and
+# one over segments
+LEAST_CELLS = 1 << 17
 MOST = 0.4  # of a box's segments that a part may have
 REST = 6  # steps after which one looks again whether a part has become smaller
 
@@ -23,12 +25,13 @@ MARK = KERNELS["warp_lcp.grid.vicinity.mark_segments"]
 class Vicinity:
     """Find what the particles of a simulation reach.
 
-    A step leaves something in fields where it reaches, nothing elsewhere: one that visits what is reached in it and what was in the step
-    before leaves fields as if it had visited all cells.
+    A step leaves something in fields where it reaches, nothing elsewhere: one that visits what is
+    reached in it and what was in the step before leaves fields as if it had visited all cells.
 
     Args:
         grid: of the particles.
-        before: what has looked at another part of the same domain, whose cells begin a multiple of `SEGMENT` apart.
+        before: what has looked at another part of the same domain, whose cells begin a multiple of
+            `SEGMENT` apart.
     """
 
     def __init__(self, grid: StaggeredGrid, before: "Vicinity | None" = None) -> None:
@@ -51,7 +54,9 @@ class Vicinity:
         shift = np.array(other.grid.origin) - self.grid.origin
         made = np.zeros(self._shape, dtype=np.uint8)
         into, of = [], []
-        for steps, mine, theirs in zip((shift[2], shift[1], shift[0] // SEGMENT), made.shape, other._now.shape, strict=True):
+        for steps, mine, theirs in zip(
+            (shift[2], shift[1], shift[0] // SEGMENT), made.shape, other._now.shape, strict=True
+        ):
             first, last = max(steps, 0), min(mine, theirs + steps)
             into.append(slice(first, max(last, first)))
             of.append(slice(first - steps, max(last, first) - steps))
@@ -90,14 +95,23 @@ class Vicinity:
         self._marks.zero_()
         in_z, in_y, in_x = self._shape
         launch(
-            MARK, len(particles.position), self.grid, position=particles.position, marks=self._marks, segment=SEGMENT,
-            in_z=in_z, in_y=in_y, in_x=in_x,
-        )  # fmt: skip
+            MARK,
+            len(particles.position),
+            self.grid,
+            position=particles.position,
+            marks=self._marks,
+            segment=SEGMENT,
+            in_z=in_z,
+            in_y=in_y,
+            in_x=in_x,
+        )
         near = np.zeros(self._shape, dtype=np.uint8)
         part = tuple(slice(low, high) for low, high in zip(box.low, box.high, strict=True))
         part = (*part[:2], slice(part[2].start // SEGMENT, -(-part[2].stop // SEGMENT)))
         found = self._marks.numpy().reshape(self._shape)[part]
-        for axis, cells in enumerate((grow * (self.grid.dimension == 3), grow, -(-grow // SEGMENT))):
+        for axis, cells in enumerate(
+            (grow * (self.grid.dimension == 3), grow, -(-grow // SEGMENT))
+        ):
             found = spread(found, cells, axis)
         near[part] = found
         return near

@@ -22,7 +22,9 @@ OPEN = -1
 DOMAIN_WALL = 0
 STRAY = 0.5  # of a cell: a mesh may reach this far out of the domain before anyone is told
 THIN_SHARE = 0.01  # of a mesh's surface, from which thin parts are worth a warning
-INVERTED_SHARE = 0.01  # of a mesh's surface, from which what is inside out is no longer a blemish: its inside would be missing
+# of a mesh's surface, from which what is inside out is no longer a blemish: its inside would be
+# missing
+INVERTED_SHARE = 0.01
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,11 +51,13 @@ class VoxelSolids:
     """Solids as whole cells.
 
     Args:
-        index: int32 of shape (nz + 2, ny + 2, nx + 2): -1 in open cells, 0 in the domain's wall (the ring, but for what lies beyond open
-            sides), 1 + s in cells of solid s.
-        separating: uint8 of shape (1 + solids,), on the device: 1 where the wall of that index lets liquid leave.
+        index: int32 of shape (nz + 2, ny + 2, nx + 2): -1 in open cells, 0 in the domain's wall
+            (the ring, but for what lies beyond open sides), 1 + s in cells of solid s.
+        separating: uint8 of shape (1 + solids,), on the device: 1 where the wall of that index lets
+            liquid leave.
         names: of those indices, the first "domain".
-        covered: number of cells whose center lies in each solid (whichever claimed it), without the domain; shape (solids,).
+        covered: number of cells whose center lies in each solid (whichever claimed it), without the
+            domain; shape (solids,).
         notes: warnings worth a line at the start of a run.
     """
 
@@ -65,9 +69,14 @@ class VoxelSolids:
 
 
 def voxelize(
-    grid: StaggeredGrid, solids: Sequence[PlacedSolid], *, wall_separating: bool, open_sides: int = 0, remarks: bool = True,
+    grid: StaggeredGrid,
+    solids: Sequence[PlacedSolid],
+    *,
+    wall_separating: bool,
+    open_sides: int = 0,
+    remarks: bool = True,
     counts: bool = True,
-) -> VoxelSolids:  # fmt: skip
+) -> VoxelSolids:
     """Assign every cell whose center lies inside a solid to the first such solid.
 
     Args:
@@ -79,7 +88,8 @@ def voxelize(
         counts: fill `covered`, which waits for the device; needed for remarks.
 
     Raises:
-        ValueError: with `remarks`, a solid lies wholly outside the domain, or the solids leave no open cell.
+        ValueError: with `remarks`, a solid lies wholly outside the domain, or the solids leave no
+            open cell.
     """
     host = np.full(grid.shape, DOMAIN_WALL, dtype=np.int32)
     grid.interior(host)[...] = OPEN
@@ -90,23 +100,38 @@ def voxelize(
     sampler, end = NodeSampler(grid), np.array(grid.shape[::-1]) - 1
     for number, solid in enumerate(solids, start=1):
         near = nodes_near(grid, solid.geometry, reach=1.0)
-        low, high = (end, end) if near is None else (np.maximum(near[0], 1), np.minimum(near[1], end))
-        for block, distances in sampler.measured(solid.geometry, low, high, offset=0.5) if (low < high).all() else ():
-            wp.launch(claim_cells, len(distances), [block, distances, number, index, covered], device=grid.device)
+        low, high = (
+            (end, end) if near is None else (np.maximum(near[0], 1), np.minimum(near[1], end))
+        )
+        for block, distances in (
+            sampler.measured(solid.geometry, low, high, offset=0.5) if (low < high).all() else ()
+        ):
+            wp.launch(
+                claim_cells,
+                len(distances),
+                [block, distances, number, index, covered],
+                device=grid.device,
+            )
     claimed = covered.numpy()[1:] if counts else np.zeros(len(solids), dtype=np.int32)
     if remarks:
         notes += small_notes((solid.name for solid in solids), claimed, grid.spacing)
         check_open(not solids or bool((grid.interior(index.numpy()) == OPEN).any()))
     return VoxelSolids(
         index=index,
-        separating=wp.array([wall_separating, *(solid.separating for solid in solids)], dtype=wp.uint8, device=grid.device),
+        separating=wp.array(
+            [wall_separating, *(solid.separating for solid in solids)],
+            dtype=wp.uint8,
+            device=grid.device,
+        ),
         names=("domain", *(solid.name for solid in solids)),
         covered=tuple(int(cells) for cells in claimed),
         notes=tuple(notes),
     )
 
 
-def inside(geometries: Sequence[Geometry], points: np.ndarray, *, device: wp.Device | str) -> np.ndarray:
+def inside(
+    geometries: Sequence[Geometry], points: np.ndarray, *, device: wp.Device | str
+) -> np.ndarray:
     """Return which points lie inside any of the geometries.
 
     Args:
@@ -127,7 +152,10 @@ def inside(geometries: Sequence[Geometry], points: np.ndarray, *, device: wp.Dev
     for geometry in geometries:
         bounds = geometry.bounds()
         wanted = np.flatnonzero(~result) if result.any() else np.arange(len(points))
-        for axis, low, high in [] if bounds is None else list(zip(range(3), *bounds, strict=True))[::-1]:  # points often are of one plane
+        # points often are of one plane
+        for axis, low, high in (
+            [] if bounds is None else list(zip(range(3), *bounds, strict=True))[::-1]
+        ):
             column = points[wanted, axis]
             wanted = wanted[(column >= low) & (column <= high)]
         for first in range(0, len(wanted), CHUNK):
@@ -139,18 +167,26 @@ def inside(geometries: Sequence[Geometry], points: np.ndarray, *, device: wp.Dev
     return result
 
 
-def start_notes(solids: Sequence[PlacedSolid], grid: StaggeredGrid, held: Collection[int] = ()) -> list[str]:
+def start_notes(
+    solids: Sequence[PlacedSolid], grid: StaggeredGrid, held: Collection[int] = ()
+) -> list[str]:
     """Return warnings about solids at the start of a run.
 
-    Solids that move may enter later and are checked less. Those with the numbers `held`, from 1 on, may be thinner than cells.
+    Solids that move may enter later and are checked less. Those with the numbers `held`, from 1 on,
+    may be thinner than cells.
 
     Raises:
-        ValueError: a solid that stands still lies wholly outside the domain, or a part of a mesh is turned inside out.
+        ValueError: a solid that stands still lies wholly outside the domain, or a part of a mesh is
+            turned inside out.
     """
     notes = []
     for number, solid in enumerate(solids, start=1):
         still = solid.motion is None
-        notes += placement_notes(solid.geometry, solid.name, grid) if still else repair_notes(solid.geometry, solid.name)
+        notes += (
+            placement_notes(solid.geometry, solid.name, grid)
+            if still
+            else repair_notes(solid.geometry, solid.name)
+        )
         notes += [] if number in held else _thin_notes(solid, grid)
     return notes
 
@@ -163,7 +199,8 @@ def check_open(any_open: bool) -> None:
     """
     if not any_open:
         raise ValueError(
-            "the solids fill the whole domain: no open cell is left (is one inverted, or a plane's normal the wrong way round?)"
+            "the solids fill the whole domain: no open cell is left (is one inverted, or a plane's "
+            "normal the wrong way round?)"
         )
 
 
@@ -195,7 +232,8 @@ def placement_notes(geometry: Geometry, name: str, grid: StaggeredGrid) -> list[
     dimension, spacing = grid.dimension, grid.spacing
     if dimension == 2 and (low[2] > 0.0 or high[2] < 0.0):
         raise ValueError(
-            f"{name} spans z = [{low[2]:.4g}, {high[2]:.4g}] m and misses z = 0, the plane of a 2-D scene; check its translation"
+            f"{name} spans z = [{low[2]:.4g}, {high[2]:.4g}] m and misses z = 0, the plane of a "
+            "2-D scene; check its translation"
         )
     low, high = low[:dimension], high[:dimension]
     size = spacing * np.array(grid.domain_counts[:dimension])
@@ -203,11 +241,14 @@ def placement_notes(geometry: Geometry, name: str, grid: StaggeredGrid) -> list[
         spans = " x ".join(f"[{a:.4g}, {b:.4g}]" for a, b in zip(low, high, strict=True))
         domain = " x ".join(f"[0, {extent:.4g}]" for extent in size)
         raise ValueError(
-            f"{name} lies wholly outside the domain: it spans {spans} m, the domain {domain} m; check its scale and translation"
+            f"{name} lies wholly outside the domain: it spans {spans} m, the domain {domain} m; "
+            "check its scale and translation"
         )
     stray = max(float((-low).max()), float((high - size).max()))
     if isinstance(geometry, TriangleMesh) and stray > STRAY * spacing:
-        notes.append(f"{name} reaches {stray:.4g} m out of the domain; the part outside has no effect")
+        notes.append(
+            f"{name} reaches {stray:.4g} m out of the domain; the part outside has no effect"
+        )
     return notes
 
 
@@ -215,7 +256,8 @@ def repair_notes(geometry: Geometry, name: str) -> list[str]:
     """Return the repairs and self-intersections of a mesh, a line each.
 
     Raises:
-        ValueError: a part of the mesh is turned inside out, so that its inside would count as outside.
+        ValueError: a part of the mesh is turned inside out, so that its inside would count as
+            outside.
     """
     if not isinstance(geometry, TriangleMesh):
         return []
@@ -223,12 +265,18 @@ def repair_notes(geometry: Geometry, name: str) -> list[str]:
     notes = [f"{name}: {warning}" for warning in surface.warnings]
     if found.place is None:
         return notes
-    what = f"{found.count} of its {len(surface.triangles)} triangles cross others, first" if found.count else "a part lies inside another,"
+    what = (
+        f"{found.count} of its {len(surface.triangles)} triangles cross others, first"
+        if found.count
+        else "a part lies inside another,"
+    )
     what += f" at {[float(f'{coordinate:.4g}') for coordinate in found.place]}"
     if found.inverted > INVERTED_SHARE:
         raise ValueError(
-            f"{name}: {surface.name}: {what}, and about {found.inverted:.0%} of its surface is inside out there: what that surrounds would "
-            "count as outside. Repair the mesh (in Blender: a Remesh modifier; in MeshLab: Remove Self Intersecting Faces, Close Holes)"
+            f"{name}: {surface.name}: {what}, and about {found.inverted:.0%} of its surface is "
+            "inside out there: what that surrounds would "
+            "count as outside. Repair the mesh (in Blender: a Remesh modifier; in MeshLab: Remove "
+            "Self Intersecting Faces, Close Holes)"
         )
     return [*notes, f"{name}: {surface.name}: {what}; overlapping parts count as inside, once"]
 
@@ -241,4 +289,7 @@ def _thin_notes(solid: PlacedSolid, grid: StaggeredGrid) -> list[str]:
     thin = geometry.thin_fraction(grid.spacing, grid.device)
     if thin <= THIN_SHARE:
         return []
-    return [f"{solid.name} is thinner than a cell of {grid.spacing:.4g} m under {thin:.0%} of its surface: {solid.among} may pass there"]
+    return [
+        f"{solid.name} is thinner than a cell of {grid.spacing:.4g} m under {thin:.0%} of its "
+        f"surface: {solid.among} may pass there"
+    ]

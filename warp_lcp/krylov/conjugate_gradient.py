@@ -19,17 +19,22 @@ from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import Across, Reduction, rows_of
 
 RZ, PQ, RZ_OLD = wp.constant(0), wp.constant(1), wp.constant(2)  # slots of the device scalars
-RR = wp.constant(3)  # those of the decision to go on begin here, as elsewhere at the residual's square
-TOLERANCE, BEST, ITERATIONS, LIMIT = (wp.constant(int(RR) + i) for i in range(1, 5))  # the least norm so far; done, and the most allowed
+# those of the decision to go on begin here, as elsewhere at the residual's square
+RR = wp.constant(3)
+# the least norm so far; done, and the most allowed
+TOLERANCE, BEST, ITERATIONS, LIMIT = (wp.constant(int(RR) + i) for i in range(1, 5))
 BY_ERROR = wp.constant(8)
 SLOTS = 9
 
-GROWTH = wp.constant(wp.float64(1e3))  # of the carried residual over its least: A or M is not positive definite to this precision
+# of the carried residual over its least: A or M is not positive definite to this precision
+GROWTH = wp.constant(wp.float64(1e3))
 
 
 @no_type_check
 @wp.func
-def first_iteration(scalars: wp.array(dtype=wp.float64), rr: int, tolerance: wp.float64, limit: int):
+def first_iteration(
+    scalars: wp.array(dtype=wp.float64), rr: int, tolerance: wp.float64, limit: int
+):
     """Prepare the slots from the residual's square on: no norm yet. Return whether an iteration follows."""
     scalars[rr] = wp.float64(wp.inf)
     scalars[rr + 1] = tolerance
@@ -53,7 +58,13 @@ def next_iteration(scalars: wp.array(dtype=wp.float64), rr: int):
 
 @no_type_check
 @forward_kernel(module="warp_lcp.conjugate_gradient")
-def begin_kernel(scalars: wp.array(dtype=wp.float64), going: wp.array(dtype=int), tolerance: wp.float64, limit: int, by_error: int):
+def begin_kernel(
+    scalars: wp.array(dtype=wp.float64),
+    going: wp.array(dtype=int),
+    tolerance: wp.float64,
+    limit: int,
+    by_error: int,
+):
     """Before the first iteration: no old direction."""
     scalars[BY_ERROR] = wp.float64(by_error)
     scalars[RZ_OLD] = wp.float64(0.0)
@@ -98,20 +109,22 @@ class Preconditioner(Protocol):
 class ConjugateGradient:
     """Preconditioned conjugate gradients for symmetric positive semi-definite A.
 
-    The right-hand side is the preconditioner's field `r`, which becomes the residual; the solution is `x`. From x = 0, p = 0 an iteration
-    is
+    The right-hand side is the preconditioner's field `r`, which becomes the residual; the solution
+    is `x`. From x = 0, p = 0 an iteration is
 
         z = M r,   p = z + beta p,   x += alpha p,   r -= alpha A p
 
-    with beta such that p is conjugate to the last direction, and alpha such that x minimizes along p. This class launches a pass for each
-    operation; a subclass overrides `_turn` and `_move` by fused passes. The device decides after each iteration whether another one
-    follows. Where graphs have loops the host waits once a solve, else it reads that decision every time.
+    with beta such that p is conjugate to the last direction, and alpha such that x minimizes along
+    p. This class launches a pass for each operation; a subclass overrides `_turn` and `_move` by
+    fused passes. The device decides after each iteration whether another one follows. Where graphs
+    have loops the host waits once a solve, else it reads that decision every time.
 
     Args:
         product: A.
-        preconditioner: M. If it is recorded (has a `program`), so must A be, and an iteration is one program.
-        weight: residuals are measured as ||weight^(1/2) r||, field like r >= 0; None: all 1. Rows that a large shift makes stiff would
-            else decide when to stop.
+        preconditioner: M. If it is recorded (has a `program`), so must A be, and an iteration is
+            one program.
+        weight: residuals are measured as ||weight^(1/2) r||, field like r >= 0; None: all 1. Rows
+            that a large shift makes stiff would else decide when to stop.
         rows: of the unknowns, where fields hold others, such as ghost cells; None: all of a field.
         across: communicator; None if serial.
     """
@@ -119,29 +132,57 @@ class ConjugateGradient:
     _end_kernel: Any = end_kernel
 
     def __init__(
-        self, product: LinearMap, preconditioner: Preconditioner, *, weight: wp.array[Any] | None = None, rows: Rows | None = None,
+        self,
+        product: LinearMap,
+        preconditioner: Preconditioner,
+        *,
+        weight: wp.array[Any] | None = None,
+        rows: Rows | None = None,
         across: Across | None = None,
-    ) -> None:  # fmt: skip
-        self._product, self._preconditioner, self._rows, r = product, preconditioner, rows, preconditioner.r
+    ) -> None:
+        self._product, self._preconditioner, self._rows, r = (
+            product,
+            preconditioner,
+            rows,
+            preconditioner.r,
+        )
         self._allocate(r, SLOTS, int(RR))
         self._q, self._shared = zeros_like(r), across is not None
-        self._reduction = Reduction(r.size, r.device, self._scalars.array, threads=None if rows is None else rows.places, across=across)
+        self._reduction = Reduction(
+            r.size,
+            r.device,
+            self._scalars.array,
+            threads=None if rows is None else rows.places,
+            across=across,
+        )
         rows = rows or rows_of(r)
-        self._direction = DIRECTION.bind(rows, z=preconditioner.z, direction=self._p, scalars=self._scalars.array)
+        self._direction = DIRECTION.bind(
+            rows, z=preconditioner.z, direction=self._p, scalars=self._scalars.array
+        )
         self._update = UPDATE.bind(
-            rows, direction=self._p, q=self._q, w=weight, x=self.x, r=r, scalars=self._scalars.array, out=self._reduction.partials
+            rows,
+            direction=self._p,
+            q=self._q,
+            w=weight,
+            x=self.x,
+            r=r,
+            scalars=self._scalars.array,
+            out=self._reduction.partials,
         )
 
     def _allocate(self, r: wp.array[Any], slots: int, square: int) -> None:
         """Allocate x, p and device scalars; from slot `square` on they are r'r and what `next_iteration` decides by."""
         self.device, self.x, self._p = r.device, zeros_like(r), zeros_like(r)
         self._scalars, self._square, self._shared = Reading(r.device, slots), square, False
-        self._goal = [Scalar() for _ in range(3)]  # tolerance, iterations at most, whether the error decides
+        # tolerance, iterations at most, whether the error decides
+        self._goal = [Scalar() for _ in range(3)]
         self._beginning = LaunchGraph(r.device, self._launch_beginning)
         self._going = wp.zeros(1, dtype=wp.int32, device=r.device)
         self._program: Program | None = None
 
-    def solve(self, tolerance: float, max_iterations: int, *, by_error: bool = False) -> tuple[int, float]:
+    def solve(
+        self, tolerance: float, max_iterations: int, *, by_error: bool = False
+    ) -> tuple[int, float]:
         """Iterate from x = 0 until the residual norm is at most the tolerance.
 
         Also ends if the norm is not a number, or has grown by GROWTH over its least.
@@ -149,11 +190,13 @@ class ConjugateGradient:
         Args:
             tolerance: of the norm.
             max_iterations: maximum number of iterations.
-            by_error: whether (r'M r)^(1/2) decides, the error's energy norm as M sees it, a step late, by a tolerance relative to that of
-                the start. In a stiff system a small residual may leave a large error in modes with small eigenvalues.
+            by_error: whether (r'M r)^(1/2) decides, the error's energy norm as M sees it, a step
+                late, by a tolerance relative to that of the start. In a stiff system a small
+                residual may leave a large error in modes with small eigenvalues.
 
         Returns:
-            The iterations done and the norm of the carried residual, an estimate that rounding bounds from below.
+            The iterations done and the norm of the carried residual, an estimate that rounding
+            bounds from below.
         """
         self.start(tolerance, max_iterations, by_error=by_error)
         return self.found()
@@ -163,7 +206,9 @@ class ConjugateGradient:
 
         Arguments as of `solve`.
         """
-        for number, value in zip(self._goal, (tolerance, max_iterations, int(by_error)), strict=True):
+        for number, value in zip(
+            self._goal, (tolerance, max_iterations, int(by_error)), strict=True
+        ):
             number.value = value
         if self._program is None:
             self._program = self._recorded()
@@ -216,7 +261,9 @@ class ConjugateGradient:
 
     def _turn(self, launch: Launch) -> None:
         """p = z + beta p, beta = r'z / (r'z)_old; and q = A p with p'q, of which alpha = r'z / p'q."""
-        self._reduction.dot(self._preconditioner.r, self._preconditioner.z, int(RZ), rows=self._rows, launch=launch)
+        self._reduction.dot(
+            self._preconditioner.r, self._preconditioner.z, int(RZ), rows=self._rows, launch=launch
+        )
         self._direction.launch(launch)
         self._product(self._p, self._q, launch=launch)
         self._reduction.dot(self._p, self._q, int(PQ), rows=self._rows, launch=launch)

@@ -21,15 +21,20 @@ WEIGH = KERNELS["gmres.weigh"]
 DOTS = KERNELS["gmres.dots"]
 COMBINE = KERNELS["gmres.combine"]
 STORE = KERNELS["gmres.store"]
-KEPT = 8  # vectors of whom the preconditioned ones are kept: solves that take no more of them need no last preconditioning
-STALLED = 0.99  # a restart that leaves more than this share of the residual gains nothing that another one would not
+# vectors of whom the preconditioned ones are kept: solves that take no more of them need no last
+# preconditioning
+KEPT = 8
+# a restart that leaves more than this share of the residual gains nothing that another one would
+# not
+STALLED = 0.99
 
 
 class GMRES:
     """Restarted, right-preconditioned GMRES for any A.
 
-    The right-hand side is the preconditioner's field `r`, which is overwritten; the solution is `x`. Preconditioned from the right, the
-    residual that is minimized is the true one; it is computed from x after every restart, and only that one is ever reported.
+    The right-hand side is the preconditioner's field `r`, which is overwritten; the solution is
+    `x`. Preconditioned from the right, the residual that is minimized is the true one; it is
+    computed from x after every restart, and only that one is ever reported.
 
     Args:
         product: A.
@@ -39,7 +44,12 @@ class GMRES:
     """
 
     def __init__(
-        self, product: LinearMap, preconditioner: Preconditioner, *, restart: int = 30, weight: wp.array[Any] | None = None
+        self,
+        product: LinearMap,
+        preconditioner: Preconditioner,
+        *,
+        restart: int = 30,
+        weight: wp.array[Any] | None = None,
     ) -> None:
         r = preconditioner.r
         self._product, self._preconditioner, self._restart = product, preconditioner, restart
@@ -47,12 +57,18 @@ class GMRES:
         self._b, self._q = zeros_like(r), zeros_like(r)
         self._weight = weight
         self._basis = zeros((restart + 1) * r.size, r.dtype, r.device)  # fields, one after another
-        self._images = zeros(min(KEPT, restart) * r.size, r.dtype, r.device)  # the first ones, preconditioned
-        self._sums = Sums(rows_of(r), restart + 1, slots=restart + 2)  # products with them, and a square at last
+        # the first ones, preconditioned
+        self._images = zeros(min(KEPT, restart) * r.size, r.dtype, r.device)
+        # products with them, and a square at last
+        self._sums = Sums(rows_of(r), restart + 1, slots=restart + 2)
         self._factors = wp.zeros(restart + 1, dtype=wp.float64, device=r.device)
         self._residual = RESIDUAL.bind(rows_of(r), b=self._b, w=weight, q=self._q)
         self._increase = ADD.bind(rows_of(r), z=preconditioner.z, x=self.x)
-        self._H, self._rotations, self._g = np.zeros((restart + 1, restart)), np.zeros((restart, 2)), np.zeros(restart + 1)
+        self._H, self._rotations, self._g = (
+            np.zeros((restart + 1, restart)),
+            np.zeros((restart, 2)),
+            np.zeros(restart + 1),
+        )
 
     def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
         """Iterate from x = 0 until the residual norm is at most the tolerance.
@@ -60,7 +76,8 @@ class GMRES:
         The norm is computed from x. Also ends if it is not a number, or stagnates.
 
         Returns:
-            The iterations done, products with A that restarts cost not counted, and the norm of the residual.
+            The iterations done, products with A that restarts cost not counted, and the norm of the
+            residual.
         """
         wp.copy(self._b, self._preconditioner.r)
         self.x.zero_()
@@ -89,11 +106,18 @@ class GMRES:
         g[0] = norm
         for k in range(most):
             check_time()
-            wp.copy(self._preconditioner.r, self._basis, src_offset=k * self._q.size, count=self._q.size)
+            wp.copy(
+                self._preconditioner.r, self._basis, src_offset=k * self._q.size, count=self._q.size
+            )
             self._weigh(self._preconditioner.r, inverse=True)
             self._preconditioner.apply()
             if k < KEPT:
-                wp.copy(self._images, self._preconditioner.z, dest_offset=k * self._q.size, count=self._q.size)
+                wp.copy(
+                    self._images,
+                    self._preconditioner.z,
+                    dest_offset=k * self._q.size,
+                    count=self._q.size,
+                )
             self._product(self._preconditioner.z, self._q)
             self._weigh(self._q)
             H[: k + 2, k] = self._orthogonalize(k + 1)
@@ -111,23 +135,52 @@ class GMRES:
         """Take the first vectors out of `_q`, twice, and store the rest as the next one; return the column of H."""
         column = np.zeros(count)
         for _ in range(2):
-            DOTS.bind(rows_of(self._q), basis=self._basis, size=self._q.size, count=count, x=self._q, out=self._sums.partials).launch()
+            DOTS.bind(
+                rows_of(self._q),
+                basis=self._basis,
+                size=self._q.size,
+                count=count,
+                x=self._q,
+                out=self._sums.partials,
+            ).launch()
             self._sums.add_up(0, columns=count)
             self._combine(self._sums.scalars, self._q, count, sign=-1.0)
             column += self._sums.scalars.numpy()[:count]
         return np.r_[column, np.sqrt(self._stored(count)[-1])]
 
-    def _combine(self, factors: wp.array[Any], x: wp.array[Any], count: int, *, sign: float = 1.0, of: wp.array[Any] | None = None) -> None:
+    def _combine(
+        self,
+        factors: wp.array[Any],
+        x: wp.array[Any],
+        count: int,
+        *,
+        sign: float = 1.0,
+        of: wp.array[Any] | None = None,
+    ) -> None:
         """x += sign times the sum of factors_j v_j over the first `count` vectors; the last of the sums becomes x'x."""
         basis = self._basis if of is None else of
-        self._sums.of(COMBINE, slot=self._restart + 1, basis=basis, size=x.size, factors=factors, x=x, count=count, sign=sign)
+        self._sums.of(
+            COMBINE,
+            slot=self._restart + 1,
+            basis=basis,
+            size=x.size,
+            factors=factors,
+            x=x,
+            count=count,
+            sign=sign,
+        )
 
     def _stored(self, place: int) -> np.ndarray:
         """Store `_q`, normalized, as a vector; return the sums."""
         STORE.bind(
-            rows_of(self._q), basis=self._basis, size=self._q.size, place=place, sums=self._sums.scalars, x=self._q,
+            rows_of(self._q),
+            basis=self._basis,
+            size=self._q.size,
+            place=place,
+            sums=self._sums.scalars,
+            x=self._q,
             last=self._restart + 1,
-        ).launch()  # fmt: skip
+        ).launch()
         return self._sums.scalars.numpy()
 
     def _rotate(self, k: int) -> None:

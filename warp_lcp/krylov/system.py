@@ -20,13 +20,28 @@ class KrylovSystem:
 
     r: wp.array[Any]
 
-    def _iterate_by(self, method: Any, weight: wp.array[Any] | None, rows: Rows | None = None, across: Across | None = None) -> None:
+    def _iterate_by(
+        self,
+        method: Any,
+        weight: wp.array[Any] | None,
+        rows: Rows | None = None,
+        across: Across | None = None,
+    ) -> None:
         """Take what iterates: it has `solve`, and the solution in `x`. Norms are weighted like its own, over the same rows."""
-        self._krylov, self.e, self._norms, self._weighted_by = method, method.x, Sums(rows or rows_of(self.r), across=across), weight
+        self._krylov, self.e, self._norms, self._weighted_by = (
+            method,
+            method.x,
+            Sums(rows or rows_of(self.r), across=across),
+            weight,
+        )
 
     def norm(self, field: wp.array[Any] | None = None) -> float:
         """Return the norm ||weight^(1/2) r||, or that of another field like r."""
-        return float(np.sqrt(self._norms.of(NORM, r=self.r if field is None else field, w=self._weighted_by)[0]))
+        return float(
+            np.sqrt(
+                self._norms.of(NORM, r=self.r if field is None else field, w=self._weighted_by)[0]
+            )
+        )
 
     def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
         """Iterate from e = 0 until the norm is at most the tolerance; return iterations and the norm reached."""

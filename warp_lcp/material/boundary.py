@@ -1,7 +1,7 @@
 """Walls and solids: open fractions and velocity of faces, admitted positions.
 
-Two forms with one face: `WholeCells`, whose cells are solid or open, and `CutBoundary`, whose faces are open in part, whose particles keep
-their distance, and whose solids may move.
+Two forms with one face: `WholeCells`, whose cells are solid or open, and `CutBoundary`, whose faces
+are open in part, whose particles keep their distance, and whose solids may move.
 """
 
 from __future__ import annotations
@@ -36,13 +36,19 @@ class Boundary(Protocol):
 
     Attributes:
         sides: of axes without an end; None: there are none.
-        open_sides: of the domain, see `warp_lcp.grid.sides`; those of axes without an end are among them.
-        base: int8 cells without material: SOLID or AIR. The ring is SOLID, or AIR beyond open sides.
-        touch: uint8 a cell: TOUCHES if a face is not open, LETS_GO if the wall of such a face separates.
-        open: float32 open fraction a_f of each component's lower faces; empty: a face is closed where a cell beside it is SOLID.
-        velocity: float32 velocity of the solids on each component's faces [m/s]; empty: they stand still.
+        open_sides: of the domain, see `warp_lcp.grid.sides`; those of axes without an end are among
+            them.
+        base: int8 cells without material: SOLID or AIR. The ring is SOLID, or AIR beyond open
+            sides.
+        touch: uint8 a cell: TOUCHES if a face is not open, LETS_GO if the wall of such a face
+            separates.
+        open: float32 open fraction a_f of each component's lower faces; empty: a face is closed
+            where a cell beside it is SOLID.
+        velocity: float32 velocity of the solids on each component's faces [m/s]; empty: they stand
+            still.
         capacity: float32 share of a cell's quadratic kernel that is open.
-        distance: float32 distance to the solids at the cells' low corners [cells]; None: whole cells, no distance.
+        distance: float32 distance to the solids at the cells' low corners [cells]; None: whole
+            cells, no distance.
         kinks: times [s] at which the velocity of a solid jumps.
         thin: solids that particles meet as exact shapes; None: none is thin.
     """
@@ -69,9 +75,16 @@ class Boundary(Protocol):
         """Compute the velocity of the solids from `time` on [s]."""
 
     def extrapolate_velocity(
-        self, window: Window, velocity: Faces, weights: Faces, known: Faces, kind: wp.array, contact: wp.array, layers: int,
+        self,
+        window: Window,
+        velocity: Faces,
+        weights: Faces,
+        known: Faces,
+        kind: wp.array,
+        contact: wp.array,
+        layers: int,
         join: Join | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Extrapolate the projected velocity into air and walls.
 
         See `warp_lcp.material.wall`, also for `join`.
@@ -117,8 +130,8 @@ class WholeCells:
     Args:
         grid: the grid.
         solids: which cells are solid, and whose walls separate.
-        wall_velocity: velocity [m/s] of the domain's wall and of each solid, shape (1 + solids, 3), constant; the cells stay where they
-            are. None: all stand still.
+        wall_velocity: velocity [m/s] of the domain's wall and of each solid, shape (1 + solids, 3),
+            constant; the cells stay where they are. None: all stand still.
         open_sides: those that `solids` was made with, but for the next.
         sides: of axes without an end; `solids` has them open.
         shapes: of the solids, if they fill whole cells exactly.
@@ -133,14 +146,30 @@ class WholeCells:
     thin: ThinWalls | None = None
 
     def __init__(
-        self, grid: StaggeredGrid, solids: VoxelSolids, wall_velocity: np.ndarray | None = None, *, open_sides: int,
-        sides: PeriodicSides | None = None, shapes: Sequence[Geometry] = (),
-    ) -> None:  # fmt: skip
+        self,
+        grid: StaggeredGrid,
+        solids: VoxelSolids,
+        wall_velocity: np.ndarray | None = None,
+        *,
+        open_sides: int,
+        sides: PeriodicSides | None = None,
+        shapes: Sequence[Geometry] = (),
+    ) -> None:
         self.grid, self.solids, self.sides, self._shapes = grid, solids, sides, tuple(shapes)
-        self.open_sides, self._endless = with_periodic(open_sides, sides), sides.bits if sides is not None else 0
+        self.open_sides, self._endless = (
+            with_periodic(open_sides, sides),
+            sides.bits if sides is not None else 0,
+        )
         if wall_velocity is not None and np.shape(wall_velocity) != (len(solids.separating), 3):
-            raise ValueError(f"wall_velocity has shape {np.shape(wall_velocity)}: expected ({len(solids.separating)}, 3)")
-        self.base, self.touch, self.capacity = grid.field(wp.int8), grid.field(wp.uint8), grid.field()
+            raise ValueError(
+                f"wall_velocity has shape {np.shape(wall_velocity)}: expected "
+                f"({len(solids.separating)}, 3)"
+            )
+        self.base, self.touch, self.capacity = (
+            grid.field(wp.int8),
+            grid.field(wp.uint8),
+            grid.field(),
+        )
         self.open: Faces = []
         self.wall_velocity = wall_velocity
         self.velocity: Faces = grid.faces() if wall_velocity is not None else []
@@ -148,13 +177,17 @@ class WholeCells:
         everywhere.launch(kernels.base_kernel, [solids.index, self.base])
         if sides is not None:
             sides.wrap(self.base)
-        grid.domain.launch(kernels.touch_kernel, [solids.index, solids.separating, grid.planes, self.touch])
+        grid.domain.launch(
+            kernels.touch_kernel, [solids.index, solids.separating, grid.planes, self.touch]
+        )
         whole_cell_capacity(grid, self.base, self.capacity)
         continue_beyond(grid, open_sides, self.capacity)
         if sides is not None:
             sides.wrap(self.capacity)
         if wall_velocity is not None:
-            shift = wp.array(np.asarray(wall_velocity, dtype=np.float32), dtype=wp.vec3, device=grid.device)
+            shift = wp.array(
+                np.asarray(wall_velocity, dtype=np.float32), dtype=wp.vec3, device=grid.device
+            )
             turn = wp.zeros(len(shift), dtype=wp.mat33, device=grid.device)
             walls = [grid.planes, grid.spacing, wp.vec3i(*grid.origin), solids.index, turn, shift]
             for axis, field in enumerate(self.velocity):
@@ -172,12 +205,31 @@ class WholeCells:
         """Do nothing: velocities are constant."""
 
     def extrapolate_velocity(
-        self, window: Window, velocity: Faces, weights: Faces, known: Faces, kind: wp.array, contact: wp.array, layers: int,
+        self,
+        window: Window,
+        velocity: Faces,
+        weights: Faces,
+        known: Faces,
+        kind: wp.array,
+        contact: wp.array,
+        layers: int,
         join: Join | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Extrapolate the projected velocity into air and walls."""
         s = self.solids
-        extend_velocity(window, velocity, weights, known, kind, contact, s.index, s.separating, self.velocity, layers, join=join)
+        extend_velocity(
+            window,
+            velocity,
+            weights,
+            known,
+            kind,
+            contact,
+            s.index,
+            s.separating,
+            self.velocity,
+            layers,
+            join=join,
+        )
 
     def placed(self) -> list[wp.array]:
         """Return the fields of the solids."""
@@ -191,7 +243,9 @@ class WholeCells:
 
     def _advect(self, fields: Faces, position: wp.array) -> None:
         clear(self._stopped.array)
-        advect(self.grid, fields, self._room, self._dt, position, self._stopped.array, self._endless)
+        advect(
+            self.grid, fields, self._room, self._dt, position, self._stopped.array, self._endless
+        )
 
     def met(self) -> tuple[int, int, int]:
         """Return the number of particles that met a wall."""
@@ -222,41 +276,67 @@ ALIKE = 1e-2  # cells by which solids may differ at the two sides of a periodic 
 class CutBoundary:
     """Solids as cut cells with a distance; implements `Boundary`.
 
-    In a step that starts at time t the pressure meets the solids where they are at t, moving as they will until t + dt. Then they move,
-    and the particles with them: a particle may go where it is open before or after, and what is then inside a solid is pushed out. So a
-    wall that advances pushes what its own velocity has not carried away, and one that retreats can be followed.
-    On ranks making it is collective, and so are `place` and `top_speed` where solids move.
+    In a step that starts at time t the pressure meets the solids where they are at t, moving as
+    they will until t + dt. Then they move, and the particles with them: a particle may go where it
+    is open before or after, and what is then inside a solid is pushed out. So a wall that advances
+    pushes what its own velocity has not carried away, and one that retreats can be followed. On
+    ranks making it is collective, and so are `place` and `top_speed` where solids move.
 
     Args:
         grid: the grid.
         cut: the solids, with their capacity.
         sides: of axes without an end, if there are any; `cut` has walls there.
         thin: those of the solids that particles meet as exact shapes; None: none is thin.
-        barriers: those of them that do not cut cells but hold apart what is on their two sides; None: there are none.
+        barriers: those of them that do not cut cells but hold apart what is on their two sides;
+            None: there are none.
 
     Raises:
         ValueError: solids differ at the two sides of an axis without an end.
     """
 
     def __init__(
-        self, grid: StaggeredGrid, cut: CutCells, *, sides: PeriodicSides | None = None, thin: ThinWalls | None = None,
+        self,
+        grid: StaggeredGrid,
+        cut: CutCells,
+        *,
+        sides: PeriodicSides | None = None,
+        thin: ThinWalls | None = None,
         barriers: Barriers | None = None,
-    ) -> None:  # fmt: skip
-        self.grid, self.cut, self.moves, self.sides, self.thin, self.barriers = grid, cut, cut.moves, sides, thin, barriers
-        self.open_sides, self._endless = with_periodic(cut.open_sides, sides), sides.bits if sides is not None else 0
+    ) -> None:
+        self.grid, self.cut, self.moves, self.sides, self.thin, self.barriers = (
+            grid,
+            cut,
+            cut.moves,
+            sides,
+            thin,
+            barriers,
+        )
+        self.open_sides, self._endless = (
+            with_periodic(cut.open_sides, sides),
+            sides.bits if sides is not None else 0,
+        )
         self._time = 0.0
-        self.base, self.open, self.capacity, self.distance = cut.base, cut.open, cut.capacity, cut.distance
+        self.base, self.open, self.capacity, self.distance = (
+            cut.base,
+            cut.open,
+            cut.capacity,
+            cut.distance,
+        )
         self.velocity: Faces = cut.velocity or []
         self.touch = grid.field(wp.uint8)
         self._scratch = grid.faces()
-        self._reachable = grid.field() if cut.moves else cut.distance  # distance where particles may go within a step
+        # distance where particles may go within a step
+        self._reachable = grid.field() if cut.moves else cut.distance
         self._counts, self._dt = Reading(grid.device, 3, wp.int32), Scalar()
         self._advection = LaunchGraph(grid.device, self._advect)
         self._displacement = LaunchGraph(grid.device, self._displace)
         ranks = grid.part.ranks
-        share = slice(ranks.rank, None, ranks.size)  # of the solids, whose speeds this process looks at
+        # of the solids, whose speeds this process looks at
+        share = slice(ranks.rank, None, ranks.size)
         self._motions = Motions(cut.motions.motions[share])
-        self._bounds = boxes_of([solid.geometry.bounds() for solid in cut.solids if solid.motion is not None])[share]
+        self._bounds = boxes_of(
+            [solid.geometry.bounds() for solid in cut.solids if solid.motion is not None]
+        )[share]
         self._size = grid.extent
         self._size[grid.dimension :] = 0.0
         self.kinks = tuple(time for motion in cut.motions.motions for time in kinks(motion))
@@ -283,16 +363,42 @@ class CutBoundary:
                 self.barriers.set_velocity()
 
     def extrapolate_velocity(
-        self, window: Window, velocity: Faces, weights: Faces, known: Faces, kind: wp.array, contact: wp.array, layers: int,
+        self,
+        window: Window,
+        velocity: Faces,
+        weights: Faces,
+        known: Faces,
+        kind: wp.array,
+        contact: wp.array,
+        layers: int,
         join: Join | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Extrapolate the projected velocity into air and walls."""
-        extend_velocity_cut(window, velocity, weights, known, kind, contact, self.cut, self._scratch, layers, join=join)
+        extend_velocity_cut(
+            window,
+            velocity,
+            weights,
+            known,
+            kind,
+            contact,
+            self.cut,
+            self._scratch,
+            layers,
+            join=join,
+        )
 
     def placed(self) -> list[wp.array]:
         """Return the fields of the placed solids."""
         capacity = [] if self.capacity is None else [self.capacity]
-        return [self.base, self.touch, self.cut.distance, *self.cut.nearest, *self.open, *self.cut.wall, *capacity]
+        return [
+            self.base,
+            self.touch,
+            self.cut.distance,
+            *self.cut.nearest,
+            *self.open,
+            *self.cut.wall,
+            *capacity,
+        ]
 
     def advect(self, fields: Faces, dt: float, time: float, position: wp.array) -> None:
         """Advect particles, then move the solids to `time`."""
@@ -323,9 +429,16 @@ class CutBoundary:
         counts, distance = self._counts.array, self.cut.distance
         clear(counts)
         if self.moves:
-            launch(kernels.larger_kernel, self.grid.size, [distance.flatten(), self._reachable.flatten()], device=self.grid.device)
+            launch(
+                kernels.larger_kernel,
+                self.grid.size,
+                [distance.flatten(), self._reachable.flatten()],
+                device=self.grid.device,
+            )
         sides, ways = self.open_sides, {"open_sides": self.open_sides, "endless": self._endless}
-        advect_with_distance(self.grid, fields, self._reachable, self._dt, position, counts[0:1], **ways)
+        advect_with_distance(
+            self.grid, fields, self._reachable, self._dt, position, counts[0:1], **ways
+        )
         if self.moves:
             push_out(self.grid, distance, position, counts[1:2], counts[2:3], open_sides=sides)
 
@@ -342,7 +455,9 @@ class CutBoundary:
 
     def _displace(self, fields: Faces, position: wp.array) -> None:
         ways = {"open_sides": self.open_sides, "endless": self._endless}
-        advect_with_distance(self.grid, fields, self.cut.distance, 1.0, position, self._counts.array[0:1], **ways)
+        advect_with_distance(
+            self.grid, fields, self.cut.distance, 1.0, position, self._counts.array[0:1], **ways
+        )
 
     def place(self, time: float) -> None:
         """Place the solids at `time` [s]."""
@@ -359,7 +474,10 @@ class CutBoundary:
 
     def shapes(self) -> Sequence[Geometry]:
         """Return the solids' shapes where they are."""
-        return [s.geometry if s.motion is None else s.geometry.moved(s.motion.pose(self._time)) for s in self.cut.solids]
+        return [
+            s.geometry if s.motion is None else s.geometry.moved(s.motion.pose(self._time))
+            for s in self.cut.solids
+        ]
 
     def admits(self, points: np.ndarray) -> np.ndarray:
         """Return which points [m], shape (n, 3), keep the distance from walls."""
@@ -376,12 +494,15 @@ class CutBoundary:
             return np.asarray(distance[cell], dtype=np.float64)
 
         planes = [
-            (1 - y) * ((1 - x) * d(c, j, i) + x * d(c, j, i + 1)) + y * ((1 - x) * d(c, j + 1, i) + x * d(c, j + 1, i + 1))
+            (1 - y) * ((1 - x) * d(c, j, i) + x * d(c, j, i + 1))
+            + y * ((1 - x) * d(c, j + 1, i) + x * d(c, j + 1, i + 1))
             for c in (k, k + 1)
         ]
         between = planes[0] if self.grid.dimension == 2 else (1 - z) * planes[0] + z * planes[1]
         axes = slice(self.grid.dimension)
-        side = np.minimum(coordinates - 1.0, np.array(self.grid.domain_counts) + 1.0 - coordinates)[:, axes].min(axis=1)
+        side = np.minimum(coordinates - 1.0, np.array(self.grid.domain_counts) + 1.0 - coordinates)[
+            :, axes
+        ].min(axis=1)
         result = np.asarray(np.minimum(between, side) >= MARGIN)
         return result if self.thin is None else result & self.thin.admits(points)
 
@@ -394,7 +515,8 @@ class CutBoundary:
         for axis in self.sides.endless:
             if self.cut.difference(axis) > ALIKE:
                 raise ValueError(
-                    f"solids differ at the two sides of the periodic {'xyz'[axis]} axis: a solid at one side must continue at the other"
+                    f"solids differ at the two sides of the periodic {'xyz'[axis]} axis: a solid "
+                    "at one side must continue at the other"
                 )
 
     def _keep_distance(self) -> None:
@@ -409,4 +531,6 @@ class CutBoundary:
 
     def _find_walls(self) -> None:
         walls = (*self.cut.wall, *self.cut.wall[1:2])[:3]  # in 2-D nothing is asked of the third
-        self.grid.domain.launch(kernels.touch_cut_kernel, [self.grid.planes, *walls, self.cut.separating, self.touch])
+        self.grid.domain.launch(
+            kernels.touch_cut_kernel, [self.grid.planes, *walls, self.cut.separating, self.touch]
+        )

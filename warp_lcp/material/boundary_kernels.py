@@ -43,14 +43,20 @@ def touch_kernel(k, j, i, index: I32, separating: wp.array(dtype=wp.uint8), plan
     for n in range(2 * planes + 2):
         side = 2 * (n & 1) - 1
         axis = n >> 1
-        wall = index[k + wp.where(axis == 2, side, 0), j + wp.where(axis == 1, side, 0), i + wp.where(axis == 0, side, 0)]
+        wall = index[
+            k + wp.where(axis == 2, side, 0),
+            j + wp.where(axis == 1, side, 0),
+            i + wp.where(axis == 0, side, 0),
+        ]
         if wall >= 0:
             found = found | touch_of(separating[wall])
     touch[k, j, i] = wp.uint8(found)
 
 
 @cell_kernel("warp_lcp.material.boundary")
-def touch_cut_kernel(k, j, i, planes: int, wx: I16, wy: I16, wz: I16, separating: wp.array(dtype=wp.uint8), touch: U8):
+def touch_cut_kernel(
+    k, j, i, planes: int, wx: I16, wy: I16, wz: I16, separating: wp.array(dtype=wp.uint8), touch: U8
+):
     """Find the walls on the faces of each cell; -1 is a face that is open."""
     found = int(0)
     for side in range(2):
@@ -69,9 +75,18 @@ def touch_cut_kernel(k, j, i, planes: int, wx: I16, wy: I16, wz: I16, separating
 
 @cell_kernel("warp_lcp.material.boundary")
 def wall_velocity_kernel(
-    k, j, i, axis: int, planes: int, spacing: float, origin: wp.vec3i, index: I32, turn: wp.array(dtype=wp.mat33),
-    shift: wp.array(dtype=wp.vec3), field: F32,
-):  # fmt: skip
+    k,
+    j,
+    i,
+    axis: int,
+    planes: int,
+    spacing: float,
+    origin: wp.vec3i,
+    index: I32,
+    turn: wp.array(dtype=wp.mat33),
+    shift: wp.array(dtype=wp.vec3),
+    field: F32,
+):
     """Velocity turn x + shift [m/s] of the wall on the faces of one component that it closes, 0 elsewhere."""
     c, b, a = cell_below(axis, k, j, i)
     wall = wp.max(index[k, j, i], index[c, b, a])

@@ -29,7 +29,8 @@ from warp_lcp.rows.program import LaunchGraph, launch
 from warp_lcp.settings import renamed_names
 
 CONSTANTS = {"FLUID": FLUID, "SOLID": SOLID, "AIR": AIR, "RELEASED": RELEASED} | {
-    "LEAST_DENSITY": 0.5,  # that displacements are divided by: thin spray need not carry off what a full cell has too much
+    # that displacements are divided by: thin spray need not carry off what a full cell has too much
+    "LEAST_DENSITY": 0.5,
     "LEAST_CAPACITY": 0.1,  # that densities are divided by there
     "HALF": 0.5,  # of what a cell holds: with less it is at the surface
 }
@@ -49,14 +50,18 @@ def displacement_pass(cut: bool) -> RowPass:
 
 
 @forward_kernel(module="warp_lcp.material.density_correction.count")
-def add_kernel(a: wp.array(dtype=wp.float64), b: wp.array(dtype=wp.float64), sum: wp.array(dtype=wp.float64)):
+def add_kernel(
+    a: wp.array(dtype=wp.float64), b: wp.array(dtype=wp.float64), sum: wp.array(dtype=wp.float64)
+):
     """Add up two numbers."""
     sum[0] = a[0] + b[0]
 
 
 LONGEST = 0.5  # cells that a correction moves a particle at most
 EXCESS = 1e-3  # of a cell, root mean square over the over-full cells, that is not worth a solve
-SHIFT = 1e-5  # of the diagonal: gives closed pockets a solution, and leaves 0.5 % of what is too much 45 cells deep
+# of the diagonal: gives closed pockets a solution, and leaves 0.5 % of what is too much 45 cells
+# deep
+SHIFT = 1e-5
 
 
 class DensityMonitor:
@@ -71,8 +76,15 @@ class DensityMonitor:
         max_density: of a cell, in units of the density at rest.
     """
 
-    def __init__(self, grid: StaggeredGrid, boundary: Boundary, *, particles_a_cell: int, max_density: float) -> None:
-        self.grid, self.boundary, self.particles_a_cell, self.max_density = grid, boundary, particles_a_cell, max_density
+    def __init__(
+        self, grid: StaggeredGrid, boundary: Boundary, *, particles_a_cell: int, max_density: float
+    ) -> None:
+        self.grid, self.boundary, self.particles_a_cell, self.max_density = (
+            grid,
+            boundary,
+            particles_a_cell,
+            max_density,
+        )
         self._crowd = WindowTally(CROWD, grid, grid.part.owned)
         self._density: wp.array | None = None
         self._known: tuple[float, float] | None = None  # what was found since the last `measure`
@@ -84,7 +96,8 @@ class DensityMonitor:
 
         Args:
             density: of the particles, in units of that at rest, float32; None: it is found here.
-            particles: the material; where the density is found here they must not have moved since they were sorted.
+            particles: the material; where the density is found here they must not have moved since
+                they were sorted.
             window: cells that hold all particles, with two to spare on each side.
         """
         if density is None:
@@ -97,7 +110,9 @@ class DensityMonitor:
 
     def _launch(self, density: wp.array) -> None:
         b = self.boundary
-        self._crowd.take(self._cells, base=b.base, density=density, capacity=b.capacity, most=self.max_density)
+        self._crowd.take(
+            self._cells, base=b.base, density=density, capacity=b.capacity, most=self.max_density
+        )
 
     def found(self) -> tuple[float, float]:
         """Return the fraction of material above the limit, and the largest density.
@@ -112,7 +127,13 @@ class DensityMonitor:
         return self._known
 
 
-def density_of_all(grid: StaggeredGrid, particles: Particles, window: Window, particles_a_cell: int, density: wp.array) -> None:
+def density_of_all(
+    grid: StaggeredGrid,
+    particles: Particles,
+    window: Window,
+    particles_a_cell: int,
+    density: wp.array,
+) -> None:
     """Find the density of all processes' particles; collective.
 
     Arguments as of `particle_density`.
@@ -151,7 +172,8 @@ class Correction:
     Attributes:
         result: of the solve; None: no cell was overfull, and nothing has moved.
         over_full: cells above the largest density, and cells deep inside below the least.
-        max_density: before the correction, in units of the density at rest: 1 and the most by which a cell exceeds what fits beside walls.
+        max_density: before the correction, in units of the density at rest: 1 and the most by which
+            a cell exceeds what fits beside walls.
     """
 
     result: wl.SolveResult | None
@@ -162,34 +184,42 @@ class Correction:
 class DensityCorrection:
     """Density correction: moves particles out of overfull cells.
 
-    With rho the particles' density on the grid, in units of that at rest, a displacement d = -grad x / rho makes it
+    With rho the particles' density on the grid, in units of that at rest, a displacement d = -grad
+    x / rho makes it
 
         rho - div(rho d) = rho + lap x,
 
-    ([Book] eq. (1.116) has the other sign, which would draw particles together), and no cell may hold more than rho_max of its capacity:
+    ([Book] eq. (1.116) has the other sign, which would draw particles together), and no cell may
+    hold more than rho_max of its capacity:
 
-        0 <= x_i  complementary to  y_i = sum over faces of a_f (x_i - x_neighbor) + rho_max capacity_i - rho_i >= 0,
+        0 <= x_i complementary to y_i = sum over faces of a_f (x_i - x_neighbor) + rho_max
+        capacity_i - rho_i >= 0,
 
-    a_f the open fraction of a face. Every open cell that a particle's kernel reaches is an unknown, those at the surface too, x = 0 in the
-    others: nothing pulls, the surface needs no condition. Particles go d = -(x_right - x_left) / max(rho_face, 1/2), at most half a cell,
-    along walls where they meet one. Their velocities stay as they are, so momentum is conserved.
+    a_f the open fraction of a face. Every open cell that a particle's kernel reaches is an unknown,
+    those at the surface too, x = 0 in the others: nothing pulls, the surface needs no condition.
+    Particles go d = -(x_right - x_left) / max(rho_face, 1/2), at most half a cell, along walls
+    where they meet one. Their velocities stay as they are, so momentum is conserved.
 
-    With `even` a cell is an equation where it and all cells around it are more than half full: inside a liquid that keeps its volume.
-    y_i = 0 then moves what is beyond rho_max, or below 2 - rho_max, to or from the surface, and leaves the density of other cells as it is;
-    x may have either sign. Without it nothing closes the voids that a flow draws, every cell is truncated at rho_max from above
-    alone, and the liquid grows: a thin pool by 5 %. Where a wall lets go there is a surface too, and nothing is drawn to it.
+    With `even` a cell is an equation where it and all cells around it are more than half full:
+    inside a liquid that keeps its volume. y_i = 0 then moves what is beyond rho_max, or below 2 -
+    rho_max, to or from the surface, and leaves the density of other cells as it is; x may have
+    either sign. Without it nothing closes the voids that a flow draws, every cell is truncated at
+    rho_max from above alone, and the liquid grows: a thin pool by 5 %. Where a wall lets go there
+    is a surface too, and nothing is drawn to it.
 
-    The operator, the method and its hierarchy are the pressure's. Where solids cut cells, pockets between them may be closed and count
-    particles beyond a thin wall; SHIFT keeps their problem solvable.
+    The operator, the method and its hierarchy are the pressure's. Where solids cut cells, pockets
+    between them may be closed and count particles beyond a thin wall; SHIFT keeps their problem
+    solvable.
 
     Args:
         grid: the grid.
         boundary: solids and walls.
         solver: settings of the method.
         particles_a_cell: of material at rest.
-        max_density: rho_max, > 0. A material at rest whose particles lie at random would grow with 1.
-        gain: factor of what a cell holds too much, >= 1: a kernel spreads what a single cell gives away, so that its density falls by less
-            than the problem says.
+        max_density: rho_max, > 0. A material at rest whose particles lie at random would grow with
+            1.
+        gain: factor of what a cell holds too much, >= 1: a kernel spreads what a single cell gives
+            away, so that its density falls by less than the problem says.
         even: whether cells inside the material are to hold neither too much nor too little.
         every: steps from one correction to the next.
         tolerance: relative residual at which a solve is done.
@@ -202,36 +232,73 @@ class DensityCorrection:
     """
 
     def __init__(
-        self, grid: StaggeredGrid, boundary: Boundary, solver: Any, *, particles_a_cell: int, max_density: float, gain: float = 1.0,
-        even: bool = False, every: int = 1, tolerance: float = 1e-2, max_iterations: int = 20,
-    ) -> None:  # fmt: skip
+        self,
+        grid: StaggeredGrid,
+        boundary: Boundary,
+        solver: Any,
+        *,
+        particles_a_cell: int,
+        max_density: float,
+        gain: float = 1.0,
+        even: bool = False,
+        every: int = 1,
+        tolerance: float = 1e-2,
+        max_iterations: int = 20,
+    ) -> None:
         self.grid, self.boundary, self.solver = grid, boundary, solver
         self.particles_a_cell, self.max_density, self.gain = particles_a_cell, max_density, gain
         self.every = every
         self.tolerance, self.max_iterations = tolerance, max_iterations
         self.x, self._b = grid.field(wp.float64), grid.field(wp.float64)
-        self.density, self.displacement, self._kind = grid.field(), grid.faces(), grid.field(wp.int8)
+        self.density, self.displacement, self._kind = (
+            grid.field(),
+            grid.faces(),
+            grid.field(wp.int8),
+        )
         wp.copy(self._kind, boundary.base)
         self._displace = displacement_pass(bool(boundary.open))
         self._over, self._lacking = WindowTally(PREPARE, grid), WindowTally(EVEN, grid)
         self._inside = self._lower = None
-        self._counted = wp.zeros(1, dtype=wp.float64, device=grid.device) if even and grid.device.is_cuda else None
+        self._counted = (
+            wp.zeros(1, dtype=wp.float64, device=grid.device)
+            if even and grid.device.is_cuda
+            else None
+        )
         if even:  # the ring stays as it is
-            self._inside = wp.array(boundary.base.numpy() == SOLID, dtype=wp.uint8, device=grid.device)
+            self._inside = wp.array(
+                boundary.base.numpy() == SOLID, dtype=wp.uint8, device=grid.device
+            )
             self._lower = grid.field(wp.float64)
-        self._shift = wp.full(grid.shape, SHIFT, dtype=wp.float32, device=grid.device) if boundary.open or even else None
-        self._problem: wl.LCP | None = None  # built when there is material: an empty problem is refused
+        self._shift = (
+            wp.full(grid.shape, SHIFT, dtype=wp.float32, device=grid.device)
+            if boundary.open or even
+            else None
+        )
+        # built when there is material: an empty problem is refused
+        self._problem: wl.LCP | None = None
         self._solved = grid.part.owned  # the cells of the problem
-        self._copied: list[tuple[wp.array, wp.array]] = []  # fields of a rank's part, and those of its problem
+        # fields of a rank's part, and those of its problem
+        self._copied: list[tuple[wp.array, wp.array]] = []
         self._copied_faces: list[tuple[wp.array, wp.array]] = []
         self._guess = grid.part.box_like(self.x).flatten()
         self._way = Scalar()  # by which the displacement is multiplied [m]
-        launches = self._launch_preparation, self._launch_displacement, self._copy_cells, self._copy_faces
+        launches = (
+            self._launch_preparation,
+            self._launch_displacement,
+            self._copy_cells,
+            self._copy_faces,
+        )
         graphs = (LaunchGraph(grid.device, f, at_once=grid.part.at_once) for f in launches)
         self._preparation, self._displacing, self._copying, self._copying_faces = graphs
 
     def apply(
-        self, particles: Particles, window: Window, *, fill: Fill | None = None, contact: wp.array | None = None, share: float = 1.0
+        self,
+        particles: Particles,
+        window: Window,
+        *,
+        fill: Fill | None = None,
+        contact: wp.array | None = None,
+        share: float = 1.0,
     ) -> Correction:
         """Correct the particles' positions.
 
@@ -239,11 +306,13 @@ class DensityCorrection:
             particles: the material (moved). If they are indexed they are sorted first.
             window: cells that hold all particles, with two to spare on each side.
             fill: adds the density of liquid without particles in a window.
-            contact: uint8, RELEASED where walls let go, see `warp_lcp.material.boundary_kernels`; None: they do not.
+            contact: uint8, RELEASED where walls let go, see `warp_lcp.material.boundary_kernels`;
+                None: they do not.
             share: of the displacement that particles go.
         """
         if particles.offsets is not None:
-            particles.sort()  # they have moved: gathering needs the order, and gives the same bits on every run
+            # they have moved: gathering needs the order, and gives the same bits on every run
+            particles.sort()
         particles.look_around()
         variant = window.near is None, contact is None, particles.runs is None
         self._preparation.run(particles, window, fill, contact, variant=variant)
@@ -257,7 +326,8 @@ class DensityCorrection:
             self.x.zero_()
             return Correction(None, 0, most)
         result = self._solve(over_full) if result is None else result
-        if result.status in (wl.SolveStatus.INFEASIBLE, wl.SolveStatus.NON_FINITE):  # a closed room is too full: there is no way out
+        # a closed room is too full: there is no way out
+        if result.status in (wl.SolveStatus.INFEASIBLE, wl.SolveStatus.NON_FINITE):
             self.x.zero_()
             return Correction(result, over_full, most)
         self._way.value = share * self.grid.spacing
@@ -272,11 +342,21 @@ class DensityCorrection:
         for axis, field in enumerate(self.displacement):
             open_ = self.boundary.open[axis] if self.boundary.open else None
             self.grid.domain.run(
-                self._displace, x=self.x, kind=self._kind, open=open_, density=self.density, capacity=self.boundary.capacity,
-                axis=axis, most=longest, dx=self._way, d=field,
-            )  # fmt: skip
+                self._displace,
+                x=self.x,
+                kind=self._kind,
+                open=open_,
+                density=self.density,
+                capacity=self.boundary.capacity,
+                axis=axis,
+                most=longest,
+                dx=self._way,
+                d=field,
+            )
 
-    def _launch_preparation(self, particles: Particles, window: Window, fill: Fill | None, contact: wp.array | None) -> None:
+    def _launch_preparation(
+        self, particles: Particles, window: Window, fill: Fill | None, contact: wp.array | None
+    ) -> None:
         """Launch the density and the set-up of the problem."""
         particle_density(self.grid, particles, window, self.particles_a_cell, self.density)
         self.grid.part.fill(self.density)
@@ -297,13 +377,20 @@ class DensityCorrection:
         """Set up the problem, and count over-full cells."""
         b, most = self.boundary, self.max_density
         fields = DensityFields(self._kind, self._b, self.x, self.density, b.capacity, self._inside)
-        self._over.take(self._solved, fields, base=b.base, contact=contact, most=most, gain=self.gain)
+        self._over.take(
+            self._solved, fields, base=b.base, contact=contact, most=most, gain=self.gain
+        )
         if self._inside is not None:
             self.grid.part.fill(self._inside)  # before those deep inside are told by them
             least, planes = min(most, 2.0 - most), self.grid.planes - 1
             self._lacking.take(self._solved, fields, least=least, planes=planes, lower=self._lower)
             if self._counted is not None:
-                launch(add_kernel, 1, [self._over.on_device(), self._lacking.on_device(), self._counted], device=self.grid.device)
+                launch(
+                    add_kernel,
+                    1,
+                    [self._over.on_device(), self._lacking.on_device(), self._counted],
+                    device=self.grid.device,
+                )
 
     def _found(self) -> tuple[int, float]:
         """Return how many cells are over-full or lack material deep inside, and the largest density; collective."""
@@ -319,25 +406,37 @@ class DensityCorrection:
             self._problem = self._make_problem()
             self._work = self.solver.init(self._problem)
         self._take_cells()
-        criteria = wl.StoppingCriteria(rtol=self.tolerance, atol=EXCESS * over_full**0.5, max_iterations=self.max_iterations)
+        criteria = wl.StoppingCriteria(
+            rtol=self.tolerance, atol=EXCESS * over_full**0.5, max_iterations=self.max_iterations
+        )
         return self._solved_to(criteria)
 
     def _begins_ahead(self) -> bool:
         """Return whether a GPU begins the solve before the host knows of over-full cells."""
-        return self._problem is not None and not self.grid.part.shared and bool(getattr(self._work, "begins_ahead", False))
+        return (
+            self._problem is not None
+            and not self.grid.part.shared
+            and bool(getattr(self._work, "begins_ahead", False))
+        )
 
     def _solve_counting(self) -> wl.SolveResult:
         """Solve while the cells are counted: one readback has the count, too; without such cells nothing is solved."""
         self._take_cells()
         counted = self._over.on_device() if self._inside is None else self._counted
         criteria = MeanCriteria(
-            rtol=self.tolerance, atol=EXCESS, max_iterations=self.max_iterations, count=lambda: self._found()[0], counted=counted
+            rtol=self.tolerance,
+            atol=EXCESS,
+            max_iterations=self.max_iterations,
+            count=lambda: self._found()[0],
+            counted=counted,
         )
         return self._solved_to(criteria)
 
     def _solved_to(self, criteria: wl.StoppingCriteria | MeanCriteria) -> wl.SolveResult:
         assert self._problem is not None
-        return wl.solve(self._problem, self.solver, stopping=criteria, x0=self._guess, workspace=self._work)
+        return wl.solve(
+            self._problem, self.solver, stopping=criteria, x0=self._guess, workspace=self._work
+        )
 
     def _take_cells(self) -> None:
         """Give the problem the cells, and where solids meet them."""
@@ -349,10 +448,17 @@ class DensityCorrection:
     def _make_problem(self) -> wl.LCP:
         part, opened = self.grid.part, self.boundary.open
         self._cells, b = part.box_like(self._kind), part.box_like(self._b)
-        lower, shift = (None if field is None else part.box_like(field) for field in (self._lower, self._shift))
+        lower, shift = (
+            None if field is None else part.box_like(field) for field in (self._lower, self._shift)
+        )
         faces = [part.box_like(field) for field in opened]
         if part.shared:
-            pairs = [(self._kind, self._cells), (self._b, b), (self._lower, lower), (self._shift, shift)]
+            pairs = [
+                (self._kind, self._cells),
+                (self._b, b),
+                (self._lower, lower),
+                (self._shift, shift),
+            ]
             pairs.append((self.x, self._guess.reshape(b.shape)))
             self._copied = [(field, box) for field, box in pairs if field is not None]
             self._copied_faces = [*zip(opened, faces, strict=True)]

@@ -19,7 +19,9 @@ from warp_lcp.rows.memory import Scalar
 from warp_lcp.rows.program import LaunchGraph, clear
 from warp_lcp.rows.readings import Reading
 
-NARROW = 1.0  # [cells^2] the least second moment about an axis, a particle, of a body whose turning the grid resolves
+# [cells^2] the least second moment about an axis, a particle, of a body whose turning the grid
+# resolves
+NARROW = 1.0
 ROOM, LEAST = 2, 64  # of bodies that memory is for, over those there are; at least
 VECTORS = 5  # of a body that kernels need
 Sums = np.ndarray  # of `kernels.add_up`, float64, shape (bodies, COLUMNS)
@@ -29,50 +31,81 @@ NOTHING: Sums = np.zeros((0, kernels.COLUMNS))
 class Flights:
     """Find the bodies of material that no wall touches in a step, and keep their momenta.
 
-    The pressure's impulses on a body in flight add up to nothing, but not what particles take of them: they are not spread as evenly as
-    the volume that the pressure is solved for, and those outside the surface take the velocity of liquid beside them. And a particle that
-    goes along with a flow that turns by an angle a in a step keeps a velocity that does not: a rigid rotation loses a^2 / 2 of its angular
-    momentum. So a body's particles are moved anew once it is known where the step brings them:
+    The pressure's impulses on a body in flight add up to nothing, but not what particles take of
+    them: they are not spread as evenly as the volume that the pressure is solved for, and those
+    outside the surface take the velocity of liquid beside them. And a particle that goes along with
+    a flow that turns by an angle a in a step keeps a velocity that does not: a rigid rotation loses
+    a^2 / 2 of its angular momentum. So a body's particles are moved anew once it is known where the
+    step brings them:
 
-    - through a velocity that goes along with the body: in one that stays where it is the middle of a spinning drop moves aside by a / 2
-      of its way;
-    - what they have of the body's rigid rotation turns with it, which is what the pressure that keeps it together does;
-    - a rigid motion, by which nothing is strained, gives the body back the momentum and the angular momentum, of the particles' x and v,
-      that it had before the transfer to the grid, and gravity's;
-    - where it then moved faster within itself than before, what is not rigid slows down until it does not.
+    - through a velocity that goes along with the body: in one that stays where it is the middle of
+      a spinning drop moves aside by a / 2 of its way;
+    - what they have of the body's rigid rotation turns with it, which is what the pressure that
+      keeps it together does;
+    - a rigid motion, by which nothing is strained, gives the body back the momentum and the angular
+      momentum, of the particles' x and v, that it had before the transfer to the grid, and
+      gravity's;
+    - where it then moved faster within itself than before, what is not rigid slows down until it
+      does not.
 
-    Bodies are made of cells with faces between them that particles gave weight; a lone particle is one.
+    Bodies are made of cells with faces between them that particles gave weight; a lone particle is
+    one.
 
     Args:
         grid: the grid.
         boundary: solids and walls.
-        coheres: whether a pressure below that of the air keeps a body that turns together; else its particles go straight on.
-        settles: whether what is packed too densely is pushed apart in flight, and so may move faster within itself.
+        coheres: whether a pressure below that of the air keeps a body that turns together; else its
+            particles go straight on.
+        settles: whether what is packed too densely is pushed apart in flight, and so may move
+            faster within itself.
     """
 
-    def __init__(self, grid: StaggeredGrid, boundary: Boundary, *, coheres: bool = True, settles: bool = False) -> None:
+    def __init__(
+        self,
+        grid: StaggeredGrid,
+        boundary: Boundary,
+        *,
+        coheres: bool = True,
+        settles: bool = False,
+    ) -> None:
         self.grid, self.boundary, self._settles = grid, boundary, settles
-        self._parent, self._number = (wp.zeros(grid.size, dtype=wp.int32, device=grid.device) for _ in range(2))
-        self._held, self._several = (wp.zeros(grid.size, dtype=wp.uint8, device=grid.device) for _ in range(2))
+        self._parent, self._number = (
+            wp.zeros(grid.size, dtype=wp.int32, device=grid.device) for _ in range(2)
+        )
+        self._held, self._several = (
+            wp.zeros(grid.size, dtype=wp.uint8, device=grid.device) for _ in range(2)
+        )
         self._count, self._found = Reading(grid.device, 2, wp.int32), False
         self._flight = kernels.Flight()
         self._flight.straight = not coheres
         self._flight.planes, self._flight.inverse_dx = grid.planes, 1.0 / grid.spacing
         self._flight.origin = wp.vec3i(*grid.origin)
         self._before: Sums = NOTHING
-        self._seen: Window | None = None  # of the last search; None: nothing near this process's cells
+        # of the last search; None: nothing near this process's cells
+        self._seen: Window | None = None
         self._numbers = BodyNumbers(0)
         self._growing = LaunchGraph(grid.device, self._launch_growth)
         self._rate, self._quanta = Scalar(), Scalar()  # see `flight_kernels.add_up`
         self._list = ListMemory(grid.device)  # of the bodies' particles
-        self._vectors, self._start = np.zeros((0, VECTORS, 3), dtype=np.float32), wp.zeros(0, dtype=wp.vec3, device=grid.device)
-        launches = self._launch_boarding, self._launch_lift, self._launch_flight, self._launch_landing
-        self._boarding, self._lifting, self._flying, self._landing = (LaunchGraph(grid.device, launch) for launch in launches)
+        self._vectors, self._start = (
+            np.zeros((0, VECTORS, 3), dtype=np.float32),
+            wp.zeros(0, dtype=wp.vec3, device=grid.device),
+        )
+        launches = (
+            self._launch_boarding,
+            self._launch_lift,
+            self._launch_flight,
+            self._launch_landing,
+        )
+        self._boarding, self._lifting, self._flying, self._landing = (
+            LaunchGraph(grid.device, launch) for launch in launches
+        )
 
     def find(self, window: Window, weights: Sequence[wp.array], kind: wp.array) -> None:
         """Find bodies in flight, without waiting for their number; arguments as of `begin`.
 
-        Grow the trees of the window's cells and of those below it whose faces they are: of a part of the grid beside its own cells.
+        Grow the trees of the window's cells and of those below it whose faces they are: of a part
+        of the grid beside its own cells.
         """
         part, self._found = self.grid.part, True
         self._seen, around = part.near(window, 1), part.near(window, 2)
@@ -82,18 +115,41 @@ class Flights:
             self._growing.run(self._seen, around, weights, kind, variant=window.near is None)
         self._count.changed()
 
-    def _launch_growth(self, window: Window, around: Window, weights: Sequence[wp.array], kind: wp.array) -> None:
+    def _launch_growth(
+        self, window: Window, around: Window, weights: Sequence[wp.array], kind: wp.array
+    ) -> None:
         """Launch what grows the trees, and numbers the bodies."""
         parent, held, several = self._parent, self._held, self._several
         u, v, w = three_components(weights)
         around.run(kernels.ALONE, kind=kind, parent=parent, held=held, several=several)
         window.run(kernels.UNITE, u=u, v=v, w=w, parent=parent)
-        window.run(kernels.HOLD, kind=kind, touch=self.boundary.touch, parent=parent, held=held, several=several)
+        window.run(
+            kernels.HOLD,
+            kind=kind,
+            touch=self.boundary.touch,
+            parent=parent,
+            held=held,
+            several=several,
+        )
         clear(self._count.array)
-        around.run(kernels.NUMBER, kind=kind, parent=parent, held=held, several=several, number=self._number, count=self._count.array)
+        around.run(
+            kernels.NUMBER,
+            kind=kind,
+            parent=parent,
+            held=held,
+            several=several,
+            number=self._number,
+            count=self._count.array,
+        )
 
     def begin(
-        self, particles: Particles, window: Window, weights: Sequence[wp.array], kind: wp.array, dt: float, change: np.ndarray
+        self,
+        particles: Particles,
+        window: Window,
+        weights: Sequence[wp.array],
+        kind: wp.array,
+        dt: float,
+        change: np.ndarray,
     ) -> int:
         """Find the bodies before particles take their new velocities, and return how many there are.
 
@@ -108,7 +164,9 @@ class Flights:
         if not self._found:
             self.find(window, weights, kind)
         self._found, trees = False, int(self._count.numpy()[0])
-        self._numbers = self.grid.part.join_trees(trees, self._seen, self._parent, self._number, self._held)
+        self._numbers = self.grid.part.join_trees(
+            trees, self._seen, self._parent, self._number, self._held
+        )
         bodies = self._numbers.count
         self._before = np.zeros((bodies, kernels.COLUMNS)) if bodies else NOTHING
         if bodies == 0:
@@ -116,9 +174,12 @@ class Flights:
         self._reserve(particles, bodies)
         self._list.resize(self._board(particles))
         self._rate.value = dt / self.grid.spacing
-        # no sum of products of positions and velocities, which are of fewer cells than the domain has along its longest side, overflows
+        # no sum of products of positions and velocities, which are of fewer cells than the domain
+        # has along its longest side, overflows
         longest = max(self.grid.domain_counts)
-        self._quanta.value = 2.0 ** math.floor(60.0 - math.log2(sum(particles.exchange.counts) * longest**2))
+        self._quanta.value = 2.0 ** math.floor(
+            60.0 - math.log2(sum(particles.exchange.counts) * longest**2)
+        )
         self._lifting.run(particles)
         self._before = self._sums(bodies)
         self._change = change * self._rate.value
@@ -136,15 +197,26 @@ class Flights:
         flight.sums = wp.zeros((rows, kernels.COLUMNS), dtype=wp.int64, device=device)
         self._vectors = np.zeros((rows, VECTORS, 3), dtype=np.float32)
         self._motion = wp.array(self._vectors, dtype=wp.vec3, device=device, copy=device.is_cuda)
-        self._start, self._end, self._x = (wp.zeros(most, dtype=wp.vec3, device=device) for _ in range(3))
+        self._start, self._end, self._x = (
+            wp.zeros(most, dtype=wp.vec3, device=device) for _ in range(3)
+        )
         self._near = wp.zeros(most, dtype=wp.uint8, device=device)
         for graph in (self._boarding, self._lifting, self._flying, self._landing):
             graph.forget()
 
     def _launch_boarding(self, particles: Particles) -> None:
         """Launch the list of the particles of bodies."""
-        inputs = [particles.key, self._parent, self._number, self._who, self._body, self._count.array]
-        launch_list(kernels.board_kernel, particles.count, inputs, device=self.grid.device, ordered=True)
+        inputs = [
+            particles.key,
+            self._parent,
+            self._number,
+            self._who,
+            self._body,
+            self._count.array,
+        ]
+        launch_list(
+            kernels.board_kernel, particles.count, inputs, device=self.grid.device, ordered=True
+        )
 
     def _launch_lift(self, particles: Particles) -> None:
         """Launch the sums over the bodies' particles where they are."""
@@ -155,7 +227,15 @@ class Flights:
         """Launch the way of the bodies' particles, and the sums over them where they come to."""
         clear(self._flight.sums)
         wall, arrived = self.boundary, [self._x, self._near]
-        inputs = [*three_components(velocity), self._motion, wall.base, wall.touch, self._start, self._end, *arrived]
+        inputs = [
+            *three_components(velocity),
+            self._motion,
+            wall.base,
+            wall.touch,
+            self._start,
+            self._end,
+            *arrived,
+        ]
         self._carry(kernels.fly_kernel, [self._rate, particles.velocity, *inputs])
         self._add(kernels.arrive_kernel, particles, arrived)
 
@@ -168,13 +248,19 @@ class Flights:
         """Move the bodies' particles anew, after all have moved, and give them what they lack.
 
         Args:
-            particles: those of `begin`, in their order, with new velocities (updated: position, velocity, gradients).
+            particles: those of `begin`, in their order, with new velocities (updated: position,
+                velocity, gradients).
             velocity: of each component on the faces [m/s].
         """
         if len(self._before) == 0:
             return
         rate = self._rate.value
-        before, dx, dt, had = self._before, self.grid.spacing, rate * self.grid.spacing, _about_center(self._before)
+        before, dx, dt, had = (
+            self._before,
+            self.grid.spacing,
+            rate * self.grid.spacing,
+            _about_center(self._before),
+        )
         number = np.maximum(before[:, :1], 1.0)
         center, drift = before[:, 1:4] / number, before[:, 4:7] / number + self._change
         spin = np.zeros_like(drift) if self._flight.straight else _turning(before, had)[0]
@@ -230,12 +316,16 @@ class Flights:
         """Launch a kernel that adds up the bodies' particles."""
         flight = self._flight
         given = [self._who, flight, self._rate, self._quanta, particles.velocity, *inputs]
-        launch_list(kernel, int(self._list.count.value), given, device=self.grid.device, ordered=True)
+        launch_list(
+            kernel, int(self._list.count.value), given, device=self.grid.device, ordered=True
+        )
 
     def _carry(self, kernel: wp.Kernel, inputs: Sequence[object]) -> None:
         """Launch a kernel that moves the bodies' particles."""
         flight, count = self._flight, int(self._list.count.value)
-        launch_list(kernel, count, [self._who, flight, *inputs], device=self.grid.device, cost=PARTICLE)
+        launch_list(
+            kernel, count, [self._who, flight, *inputs], device=self.grid.device, cost=PARTICLE
+        )
 
 
 def _about_center(sums: Sums) -> np.ndarray:
@@ -250,9 +340,19 @@ def _about_mean(sums: Sums) -> np.ndarray:
 
 def _turning(sums: Sums, *momenta: np.ndarray) -> list[np.ndarray]:
     """Return the rigid rotations that have angular momenta about the bodies' centers, in cells and steps, shape (bodies, 3) each."""
-    least, center = NARROW * np.maximum(sums[:, :1], 1.0), sums[:, 1:4] / np.maximum(sums[:, :1], 1.0)
+    least, center = (
+        NARROW * np.maximum(sums[:, :1], 1.0),
+        sums[:, 1:4] / np.maximum(sums[:, :1], 1.0),
+    )
     xx, yy, zz, xy, xz, yz = sums[:, 10:16].T
-    moments = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3) - sums[:, 1:4, None] * center[:, None, :]
-    values, axes = np.linalg.eigh(np.trace(moments, axis1=1, axis2=2)[:, None, None] * np.eye(3) - moments)
-    inverse = (axes * np.where(values > least, 1.0 / np.maximum(values, least), 0.0)[:, None, :]) @ axes.swapaxes(1, 2)
+    moments = (
+        np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3)
+        - sums[:, 1:4, None] * center[:, None, :]
+    )
+    values, axes = np.linalg.eigh(
+        np.trace(moments, axis1=1, axis2=2)[:, None, None] * np.eye(3) - moments
+    )
+    inverse = (
+        axes * np.where(values > least, 1.0 / np.maximum(values, least), 0.0)[:, None, :]
+    ) @ axes.swapaxes(1, 2)
     return [(inverse @ momentum[:, :, None])[:, :, 0] for momentum in momenta]

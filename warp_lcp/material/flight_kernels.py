@@ -1,7 +1,8 @@
 # mypy: ignore-errors
 """Kernels that find bodies of material in flight, add up their momenta and move them.
 
-Sums are of int64, in fixed point: whole numbers add up to the same in any order, so that a GPU gives the same bits on every run.
+Sums are of int64, in fixed point: whole numbers add up to the same in any order, so that a GPU
+gives the same bits on every run.
 """
 
 from pathlib import Path
@@ -41,7 +42,10 @@ class Flight:
     sums: wp.array2d(dtype=wp.int64)
 
 
-KERNELS = KernelFile(Path(__file__).parent / "headers/flight.h", {"SOLID": SOLID, "TOUCHES": TOUCHES, "TINY_WEIGHT": TINY_WEIGHT})
+KERNELS = KernelFile(
+    Path(__file__).parent / "headers/flight.h",
+    {"SOLID": SOLID, "TOUCHES": TOUCHES, "TINY_WEIGHT": TINY_WEIGHT},
+)
 UNITE = KERNELS["warp_lcp.material.flight.unite"]
 ALONE = KERNELS["warp_lcp.material.flight.alone"]
 NUMBER = KERNELS["warp_lcp.material.flight.number"]
@@ -67,8 +71,9 @@ def put(sums: wp.array2d(dtype=wp.int64), body: int, column: int, quanta: wp.flo
 def add_up(flight: Flight, rate: float, q: wp.float64, velocity: Vectors, n: int, x: wp.vec3):
     """Add the n-th particle at x [cells] to its body's sums, in cells and steps.
 
-    `rate` is cells a step in one m/s, and q of the sums' units are one cell or cell a step or product of two of them.
-    [0] particles; [1:4] x; [4:7] v; [7:10] x cross v; [10:16] xx, yy, zz, xy, xz, yz; [16] v v.
+    `rate` is cells a step in one m/s, and q of the sums' units are one cell or cell a step or
+    product of two of them. [0] particles; [1:4] x; [4:7] v; [7:10] x cross v; [10:16] xx, yy, zz,
+    xy, xz, yz; [16] v v.
     """
     b = flight.body[n]
     v = velocity[flight.who[n]] * rate
@@ -86,7 +91,15 @@ def add_up(flight: Flight, rate: float, q: wp.float64, velocity: Vectors, n: int
 
 
 @list_kernel("warp_lcp.material.flight")
-def board_kernel(i, key: Integers, parent: Integers, number: Integers, who: Integers, body: Integers, count: Integers):
+def board_kernel(
+    i,
+    key: Integers,
+    parent: Integers,
+    number: Integers,
+    who: Integers,
+    body: Integers,
+    count: Integers,
+):
     """List the particles of bodies; count[1] becomes their number. All others take no more than this look."""
     b = number[root_of(parent, key[i])]
     if b >= 0:
@@ -96,7 +109,16 @@ def board_kernel(i, key: Integers, parent: Integers, number: Integers, who: Inte
 
 
 @list_kernel("warp_lcp.material.flight")
-def lift_kernel(i, who: Integers, flight: Flight, rate: float, quanta: wp.float64, velocity: Vectors, position: Vectors, start: Vectors):
+def lift_kernel(
+    i,
+    who: Integers,
+    flight: Flight,
+    rate: float,
+    quanta: wp.float64,
+    velocity: Vectors,
+    position: Vectors,
+    start: Vectors,
+):
     """Note where particles are, and add them up."""
     x = position[who[i]]
     start[i] = x
@@ -109,7 +131,11 @@ def velocity_at(u: Field, v: Field, w: Field, planes: int, origin: wp.vec3i, x: 
     a = x[0] + 1.0 - float(origin[0])
     b = x[1] + 1.0 - float(origin[1])
     c = x[2] + 1.0 - float(origin[2])
-    at = wp.vec3(interpolated(u, planes, a, b - 0.5, c - 0.5), interpolated(v, planes, a - 0.5, b, c - 0.5), 0.0)
+    at = wp.vec3(
+        interpolated(u, planes, a, b - 0.5, c - 0.5),
+        interpolated(v, planes, a - 0.5, b, c - 0.5),
+        0.0,
+    )
     if planes == 2:
         at[2] = interpolated(w, planes, a - 0.5, b - 0.5, c)
     return at
@@ -122,7 +148,9 @@ def turned(angle: wp.vec3, a: wp.vec3):
     if size == 0.0:
         return a
     n = angle / size
-    return wp.cos(size) * a + wp.sin(size) * wp.cross(n, a) + (1.0 - wp.cos(size)) * wp.dot(n, a) * n
+    return (
+        wp.cos(size) * a + wp.sin(size) * wp.cross(n, a) + (1.0 - wp.cos(size)) * wp.dot(n, a) * n
+    )
 
 
 @wp.func
@@ -134,19 +162,40 @@ def is_near(base: Kinds, touch: U8, planes: int, origin: wp.vec3i, x: wp.vec3):
     if planes == 2:
         k = int(wp.floor(x[2])) + 1 - origin[2]
     near = bool(True)
-    if i > 0 and j > 0 and k > 0 and i + 1 < base.shape[2] and j + 1 < base.shape[1] and k + 1 < base.shape[0]:
+    if (
+        i > 0
+        and j > 0
+        and k > 0
+        and i + 1 < base.shape[2]
+        and j + 1 < base.shape[1]
+        and k + 1 < base.shape[0]
+    ):
         near = base[k, j, i] == _SOLID or (touch[k, j, i] & _TOUCHES) != wp.uint8(0)
     return near
 
 
 @list_kernel("warp_lcp.material.flight")
 def fly_kernel(
-    i, who: Integers, flight: Flight, h: float, velocity: Vectors, u: Field, v: Field, w: Field, motion: Motions, base: Kinds, touch: U8,
-    start: Vectors, end: Vectors, x: Vectors, near: Bytes,
-):  # fmt: skip
+    i,
+    who: Integers,
+    flight: Flight,
+    h: float,
+    velocity: Vectors,
+    u: Field,
+    v: Field,
+    w: Field,
+    motion: Motions,
+    base: Kinds,
+    touch: U8,
+    start: Vectors,
+    end: Vectors,
+    x: Vectors,
+    near: Bytes,
+):
     """Carry particles through the velocity that moves along with their body, a third-order Runge-Kutta step, to x [cells].
 
-    What they have of the body's spin turns with it. A motion is the body's [0] velocity, [1] spin, [2] center.
+    What they have of the body's spin turns with it. A motion is the body's [0] velocity, [1] spin,
+    [2] center.
     """
     p = who[i]
     b = flight.body[i]
@@ -167,14 +216,25 @@ def fly_kernel(
     strides = wp.clamp(int(wp.ceil(longest)), 1, MOST_STRIDES)
     met = wp.uint8(0)
     for stride in range(strides):
-        if is_near(base, touch, flight.planes, flight.origin, x1 - (float(stride) / float(strides)) * way):
+        if is_near(
+            base, touch, flight.planes, flight.origin, x1 - (float(stride) / float(strides)) * way
+        ):
             met = wp.uint8(1)
     x[i] = x1
     near[i] = met
 
 
 @list_kernel("warp_lcp.material.flight")
-def arrive_kernel(i, who: Integers, flight: Flight, rate: float, quanta: wp.float64, velocity: Vectors, x: Vectors, near: Bytes):
+def arrive_kernel(
+    i,
+    who: Integers,
+    flight: Flight,
+    rate: float,
+    quanta: wp.float64,
+    velocity: Vectors,
+    x: Vectors,
+    near: Bytes,
+):
     """Add up the particles where they have come to [cells], and those that came near a wall or an open side."""
     add_up(flight, rate, quanta, velocity, i, x[i])
     if near[i] != wp.uint8(0):
@@ -183,12 +243,21 @@ def arrive_kernel(i, who: Integers, flight: Flight, rate: float, quanta: wp.floa
 
 @list_kernel("warp_lcp.material.flight")
 def land_kernel(
-    i, who: Integers, flight: Flight, velocity: Vectors, gradient_u: Vectors, gradient_v: Vectors, gradient_w: Vectors, motion: Motions,
-    end: Vectors, position: Vectors,
-):  # fmt: skip
+    i,
+    who: Integers,
+    flight: Flight,
+    velocity: Vectors,
+    gradient_u: Vectors,
+    gradient_v: Vectors,
+    gradient_w: Vectors,
+    motion: Motions,
+    end: Vectors,
+    position: Vectors,
+):
     """Give particles their places, a share of their velocity and a rigid motion; bodies without a share stay as they are.
 
-    A motion is [0] the shift, [1] the velocity, [2] the spin, [3] the center, [4] the share, three times.
+    A motion is [0] the shift, [1] the velocity, [2] the spin, [3] the center, [4] the share, three
+    times.
     """
     p = who[i]
     b = flight.body[i]

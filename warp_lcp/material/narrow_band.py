@@ -1,27 +1,34 @@
 """Narrow band: particles near the surface only, grid velocity below.
 
-After narrow band FLIP [Ferstl et al. 2016]; the scheme is derived here. Deep inside a liquid the particles carry
-no information: their density is that at rest, and their velocity is that of the grid. Let d(x) be the depth,
-the distance to the surface [cells], and W the band's width.
+After narrow band FLIP [Ferstl et al. 2016]; the scheme is derived here. Deep inside a liquid the
+particles carry no information: their density is that at rest, and their velocity is that of the
+grid. Let d(x) be the depth, the distance to the surface [cells], and W the band's width.
 
-1. Where. A step starts with the depth d* that the last one has carried along, so {d* > W} is where no particle is: it is liquid that
-   was deeper than W and moved with the flow. Cells with d* >= D = min(2, W / 2) count as full, all others as full as their particles
-   say, which reach beyond any kernel around these. So the surface is the particles' alone, and no error of d* builds up: after the
-   solve d is measured again as a chamfer distance from air cells, with the fraction of a cell from their level set; solids do not count.
-2. How fast. On faces deeper than W - 1 the velocity u* is the last step's, carried along by a semi-Lagrangian step of third order
-   (`warp_lcp.grid.advection`); on those above W - 2 it is the particles' mean, in between it goes over linearly. Gravity and
-   pressure act on both alike.
-3. Exchange. Particles deeper than W go. The band's last layer, W - 1 < d <= W, and what was {d* > W - 1} and is now shallower (a wall has
-   let go of it, say), gets fresh particles in each step: a reservoir of even density, out of which the flow takes exactly what it carries
-   away. Their lattice moves on through the cell by irrational steps, so that in the mean over steps every place is as likely: on a lattice
-   that stays no particle ever is where a slow flow could take it along, and cells filled up to a count lose 10 % to the same bias. They
-   take their velocity and its gradient from the grid, as all others do at that time.
-4. Mass. H counts the particles that the interior stands for: those that went in less those that came out. What the fresh layer holds
-   and what the density correction sees there is H by the particles that {d* > W} would hold at rest, within a tenth of 1: particles and
-   H are as many as without a band, so that liquid lost to one side is pushed back by the correction as it would be without.
+1. Where. A step starts with the depth d* that the last one has carried along, so {d* > W} is where
+   no particle is: it is liquid that was deeper than W and moved with the flow. Cells with d* >= D =
+   min(2, W / 2) count as full, all others as full as their particles say, which reach beyond any
+   kernel around these. So the surface is the particles' alone, and no error of d* builds up: after
+   the solve d is measured again as a chamfer distance from air cells, with the fraction of a cell
+   from their level set; solids do not count.
+2. How fast. On faces deeper than W - 1 the velocity u* is the last step's, carried along by a
+   semi-Lagrangian step of third order (`warp_lcp.grid.advection`); on those above W - 2 it is the
+   particles' mean, in between it goes over linearly. Gravity and pressure act on both alike.
+3. Exchange. Particles deeper than W go. The band's last layer, W - 1 < d <= W, and what was {d* > W
+   - 1} and is now shallower (a wall has let go of it, say), gets fresh particles in each step: a
+   reservoir of even density, out of which the flow takes exactly what it carries away. Their
+   lattice moves on through the cell by irrational steps, so that in the mean over steps every place
+   is as likely: on a lattice that stays no particle ever is where a slow flow could take it along,
+   and cells filled up to a count lose 10 % to the same bias. They take their velocity and its
+   gradient from the grid, as all others do at that time.
+4. Mass. H counts the particles that the interior stands for: those that went in less those that
+   came out. What the fresh layer holds and what the density correction sees there is H by the
+   particles that {d* > W} would hold at rest, within a tenth of 1: particles and H are as many as
+   without a band, so that liquid lost to one side is pushed back by the correction as it would be
+   without.
 
-In sums the interior counts by whole cells, so that a log's center of mass may be off by a part of a cell, and its potential energy by as
-much. Particles also stay within W of where liquid leaves a wall, where solids cut cells or move, and of sources, drains and open sides.
+In sums the interior counts by whole cells, so that a log's center of mass may be off by a part of a
+cell, and its potential energy by as much. Particles also stay within W of where liquid leaves a
+wall, where solids cut cells or move, and of sources, drains and open sides.
 """
 
 from __future__ import annotations
@@ -47,7 +54,8 @@ from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
 from warp_lcp.rows.memory import Scalar
 from warp_lcp.rows.program import LaunchGraph, clear, is_recording
 
-BEYOND = 3.0  # cells below the band that depths are told apart: what is carried into it must have a slope
+# cells below the band that depths are told apart: what is carried into it must have a slope
+BEYOND = 3.0
 DEEP = 2.0  # cells below the surface from which on a cell counts as full whatever particles say
 REACH = 1.5  # of a cell's kernel, in cells
 FALLS = 2  # passes over rows, back and forth, after which most depths are found
@@ -57,8 +65,9 @@ UNEVEN = 0.1  # how far the interior's density may differ from that at rest
 class NarrowBand:
     """Narrow band of particles; the grid carries the liquid below it.
 
-    A step calls `blend` when the particles' velocity is on the faces, `fill` where their density is taken, `exchange` between the solve and
-    the way back to the particles, and `carry` when they have moved.
+    A step calls `blend` when the particles' velocity is on the faces, `fill` where their density is
+    taken, `exchange` between the solve and the way back to the particles, and `carry` when they
+    have moved.
 
     Args:
         grid: the grid.
@@ -72,7 +81,8 @@ class NarrowBand:
     Attributes:
         depth: d* [cells], float32; 0 in air. More than `width` where there are no particles.
         velocity: of each component's faces, carried along with it [m/s].
-        held: H, particles that the interior stands for; negative if the band has got more than there was.
+        held: H, particles that the interior stands for; negative if the band has got more than
+            there was.
         interior: sums over the cells without particles, at their centers; its count is theirs.
         full: depth from which on cells count as full [cells].
         fresh: particles that the last exchange has put into the band.
@@ -82,9 +92,16 @@ class NarrowBand:
     """
 
     def __init__(
-        self, grid: StaggeredGrid, boundary: Boundary, *, width: float, per_axis: int, jitter: float, random_seed: int,
+        self,
+        grid: StaggeredGrid,
+        boundary: Boundary,
+        *,
+        width: float,
+        per_axis: int,
+        jitter: float,
+        random_seed: int,
         keep: np.ndarray | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         if not width >= 3.0:
             raise ValueError(f"width = {width}: must be at least 3 cells")
         self.grid, self.boundary, self.width = grid, boundary, float(width)
@@ -92,33 +109,57 @@ class NarrowBand:
         self.particles_a_cell = per_axis**grid.dimension
         self.full = min(DEEP, 0.5 * self.width)
         self.depth, self._now, self.velocity = grid.field(), grid.field(), grid.faces()
-        self._keep = wp.array(keep.astype(np.int8), dtype=wp.int8, device=grid.device) if keep is not None else None
+        self._keep = (
+            wp.array(keep.astype(np.int8), dtype=wp.int8, device=grid.device)
+            if keep is not None
+            else None
+        )
         self._total = wp.zeros(grid.size, dtype=wp.int32, device=grid.device)
         self._sum = self._total[-1:]
         self._changed = wp.zeros(1, dtype=wp.int32, device=grid.device)
         self._seeds = random_seed % 2**31 - 1
-        self._steps = np.append(PLASTIC[grid.dimension] ** -np.arange(1.0, grid.dimension + 1), 0.0)[:3]
-        self._sums = wp.zeros((*grid.shape[:2], kernels.COLUMNS), dtype=wp.float64, device=grid.device)
+        self._steps = np.append(
+            PLASTIC[grid.dimension] ** -np.arange(1.0, grid.dimension + 1), 0.0
+        )[:3]
+        self._sums = wp.zeros(
+            (*grid.shape[:2], kernels.COLUMNS), dtype=wp.float64, device=grid.device
+        )
         self.held = self.fresh = 0
         self._numbered = kernels.Numbered()
-        self._numbered.origin, self._numbered.across = wp.vec3i(*grid.origin), wp.vec2i(*(n + 2 for n in grid.domain_counts[:2]))
+        self._numbered.origin, self._numbered.across = (
+            wp.vec3i(*grid.origin),
+            wp.vec2i(*(n + 2 for n in grid.domain_counts[:2])),
+        )
         self._own, self._before = grid.part.owned, grid.origin
-        self._window, self._owned, self._inner = (ActiveWindow(w) for w in (grid.everywhere, grid.domain, grid.domain))
+        self._window, self._owned, self._inner = (
+            ActiveWindow(w) for w in (grid.everywhere, grid.domain, grid.domain)
+        )
         self._last = Scalar(), Scalar()  # plane and row of the window
         self._each, self._at_rest, self._way, self._behind = (Scalar() for _ in range(4))
         self._shift = Scalar(), Scalar(), Scalar()  # of fresh particles' lattice
-        launches = (self._launch_depth, self._fall, self._launch_quota, self._launch_carry, self._launch_seeds)
+        launches = (
+            self._launch_depth,
+            self._fall,
+            self._launch_quota,
+            self._launch_carry,
+            self._launch_seeds,
+        )
         self._depths, self._falling, self._quota, self._carrying, self._seeding = (
             LaunchGraph(grid.device, launch, at_once=grid.part.at_once) for launch in launches
         )
-        self._leaving = LaunchGraph(grid.device, self._launch_leaving, at_once=grid.device.is_cuda)  # a scan of Warp's
+        # a scan of Warp's
+        self._leaving = LaunchGraph(grid.device, self._launch_leaving, at_once=grid.device.is_cuda)
         self._move_to(grid.everywhere)
         self.interior = self._summed(grid.everywhere)
 
     @property
     def mean_density(self) -> float | None:
         """H relative to the interior at rest; None without interior."""
-        return self.held / (self.particles_a_cell * self.interior.count) if self.interior.count else None
+        return (
+            self.held / (self.particles_a_cell * self.interior.count)
+            if self.interior.count
+            else None
+        )
 
     @property
     def density(self) -> float:
@@ -142,7 +183,10 @@ class NarrowBand:
         grid, padded = self.grid, np.full(self.grid.shape, -1)
         padded[1:-1, 1:-1, 1:-1] = owner
         base = self.boundary.base.numpy()
-        kind = wp.array(np.where(base == SOLID, SOLID, np.where(padded >= 0, FLUID, AIR)).astype(np.int8), device=grid.device)
+        kind = wp.array(
+            np.where(base == SOLID, SOLID, np.where(padded >= 0, FLUID, AIR)).astype(np.int8),
+            device=grid.device,
+        )
         self._measure(grid.everywhere, kind, None, grid.field(wp.uint8))
         wp.copy(self.depth, self._now)
         deep = (self.depth.numpy() > self.width) & (padded >= 0)
@@ -152,12 +196,18 @@ class NarrowBand:
             speed = np.where(padded >= 0, velocities[padded, axis], np.nan)
             both = np.stack([speed, np.roll(speed, 1, axis=2 - axis)])
             known = np.isfinite(both)
-            field.assign((np.where(known, both, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)).astype(np.float32))
+            field.assign(
+                (np.where(known, both, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)).astype(
+                    np.float32
+                )
+            )
         self.grid.part.fill(*self.velocity)
         self.interior = self._summed(grid.everywhere)
         return np.asarray(grid.interior(deep))
 
-    def blend(self, window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array]) -> None:
+    def blend(
+        self, window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array]
+    ) -> None:
         """Blend the carried velocity into the faces deep inside.
 
         Args:
@@ -166,8 +216,13 @@ class NarrowBand:
             weights: of the particles on each component's faces (updated).
         """
         start, full = self.width - 2.0, float(self.particles_a_cell)
-        for axis, (carried, field, weight) in enumerate(zip(self.velocity, velocity, weights, strict=True)):
-            window.launch(kernels.blend_kernel, [axis, start, full, self.depth, self.boundary.base, carried, field, weight])
+        for axis, (carried, field, weight) in enumerate(
+            zip(self.velocity, velocity, weights, strict=True)
+        ):
+            window.launch(
+                kernels.blend_kernel,
+                [axis, start, full, self.depth, self.boundary.base, carried, field, weight],
+            )
 
     def fill(self, window: Window, density: wp.array) -> None:
         """Set deep cells to the density at rest, for the surface.
@@ -176,7 +231,9 @@ class NarrowBand:
             window: cells that material can reach.
             density: of the particles, in units of that at rest (updated).
         """
-        window.launch(kernels.fill_kernel, [self.full, 1.0, self.depth, self.boundary.capacity, density])
+        window.launch(
+            kernels.fill_kernel, [self.full, 1.0, self.depth, self.boundary.capacity, density]
+        )
 
     def fill_interior(self, window: Window, density: wp.array) -> None:
         """Set the interior's density where particles do not fill the kernel.
@@ -188,15 +245,24 @@ class NarrowBand:
         least = max(self.width - REACH, self.full)
         if not is_recording():
             self._at_rest.value = self.density
-        window.launch(kernels.fill_kernel, [least, self._at_rest, self.depth, self.boundary.capacity, density])
+        window.launch(
+            kernels.fill_kernel, [least, self._at_rest, self.depth, self.boundary.capacity, density]
+        )
 
     def exchange(
-        self, particles: Particles, window: Window, kind: wp.array, phi: wp.array | None, contact: wp.array, step: int,
+        self,
+        particles: Particles,
+        window: Window,
+        kind: wp.array,
+        phi: wp.array | None,
+        contact: wp.array,
+        step: int,
         saved: Sequence[wp.array] = (),
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Measure the depth; remove deep particles and renew the band's inner layer.
 
-        The new ones have no velocity yet but for FLIP; `warp_lcp.grid.transfer.faces_to_particles` gives it to them.
+        The new ones have no velocity yet but for FLIP; `warp_lcp.grid.transfer.faces_to_particles`
+        gives it to them.
 
         Args:
             particles: the liquid (updated); `key` holds its cells.
@@ -245,7 +311,10 @@ class NarrowBand:
         """Launch the advection, and the sums over the cells without particles."""
         more: dict[str, Any] = {"level": self._now, "least": 0.0, "before": self._before}
         more |= {"grid": self.grid, "window": self._inner, "velocity": velocity, "way": self._way}
-        for axis, field, out in [(CENTERS, self._now, self.depth), *zip(range(3), velocity, self.velocity, strict=False)]:
+        for axis, field, out in [
+            (CENTERS, self._now, self.depth),
+            *zip(range(3), velocity, self.velocity, strict=False),
+        ]:
             clear(out)
             carry_field(field=field, out=out, axis=axis, **more)
         self.grid.part.fill(self.depth, *self.velocity)
@@ -257,7 +326,10 @@ class NarrowBand:
         clear(self._total)
         where = [self.boundary.base, self._now, self.depth, self._total.reshape(self.grid.shape)]
         if self._here:
-            self._owned.launch(kernels.quota_kernel, [self._numbered, self.width, self._each, self._seeds, self._shift[0], *where])
+            self._owned.launch(
+                kernels.quota_kernel,
+                [self._numbered, self.width, self._each, self._seeds, self._shift[0], *where],
+            )
         scan(self._total, self._total, inclusive=True)
 
     def _launch_leaving(self, particles: Particles, marks: wp.array) -> None:
@@ -269,8 +341,9 @@ class NarrowBand:
     def with_interior(self, totals: ParticleTotals) -> ParticleTotals:
         """Return sums over the particles and the interior.
 
-        They are counted as H, and weighted as at rest: what H differs by is spread over all the liquid. Its center would otherwise move
-        with every particle that the band has more or less than its share.
+        They are counted as H, and weighted as at rest: what H differs by is spread over all the
+        liquid. Its center would otherwise move with every particle that the band has more or less
+        than its share.
         """
         inside, count = self.interior, totals.count + self.held
         if inside.count == 0 or count <= 0:
@@ -280,7 +353,8 @@ class NarrowBand:
         return replace(
             totals,
             count=count,
-            mean_square_speed=(1.0 - share) * totals.mean_square_speed + share * inside.mean_square_speed,
+            mean_square_speed=(1.0 - share) * totals.mean_square_speed
+            + share * inside.mean_square_speed,
             velocity=(1.0 - share) * totals.velocity + share * inside.velocity,
             center=(1.0 - share) * totals.center + share * inside.center,
             low=np.minimum(totals.low, inside.low) if totals.count else inside.low,
@@ -296,7 +370,8 @@ class NarrowBand:
         for axis, field in enumerate(self.velocity):
             near = wanted | np.roll(wanted, 1, axis=2 - axis)
             faces[f"interior_velocity_{axis}"] = np.where(near, field.numpy(), np.float32(0.0))
-        inside = list(vars(self.interior).values())[:7]  # all but the bad ones; over where solids were, in an order that windows set
+        # all but the bad ones; over where solids were, in an order that windows set
+        inside = list(vars(self.interior).values())[:7]
         sums = np.hstack([self.held, self.width, *inside])
         return {"depth": np.where(wanted, depth, np.float32(0.0)), "interior": sums} | faces
 
@@ -308,7 +383,9 @@ class NarrowBand:
         """
         held, width, cells, squares, *vectors, fastest = state["interior"].tolist()
         if width != self.width:
-            raise ValueError(f"the state's narrow band is {width:g} cells wide: this scene's is {self.width:g}")
+            raise ValueError(
+                f"the state's narrow band is {width:g} cells wide: this scene's is {self.width:g}"
+            )
         self.depth.assign(state["depth"])
         for axis, field in enumerate(self.velocity):
             field.assign(state[f"interior_velocity_{axis}"])
@@ -327,8 +404,11 @@ class NarrowBand:
     def _move_to(self, window: Window) -> None:
         """Have launches visit a window."""
         self._window.move_to(window)
-        # something is carried to the domain and the ring's upper layer: faces below the first cell lie in the wall
-        self._inner.move_to(Window.of([max(start, 1) for start in window.low], window.high, window.device))
+        # something is carried to the domain and the ring's upper layer: faces below the first cell
+        # lie in the wall
+        self._inner.move_to(
+            Window.of([max(start, 1) for start in window.low], window.high, window.device)
+        )
         for number, end in zip(self._last, window.high, strict=False):
             number.value = end - 1
         own = window.common(self._own)
@@ -336,7 +416,9 @@ class NarrowBand:
         if own is not None:
             self._owned.move_to(own)
 
-    def _measure(self, window: Window, kind: wp.array, phi: wp.array | None, contact: wp.array) -> None:
+    def _measure(
+        self, window: Window, kind: wp.array, phi: wp.array | None, contact: wp.array
+    ) -> None:
         """Find how deep a window's cells lie, up to `BEYOND` below the band."""
         self._move_to(window)
         self._shore(kind, phi, contact)
@@ -359,7 +441,14 @@ class NarrowBand:
         if self.grid.device.is_cpu:
             clear(self._changed)
         plane, row = (0, 0) if forth else self._last
-        self._window.run(kernels.RELAX, depth=self._now, changed=self._changed, planes=self.grid.planes, last_plane=plane, last_row=row)
+        self._window.run(
+            kernels.RELAX,
+            depth=self._now,
+            changed=self._changed,
+            planes=self.grid.planes,
+            last_plane=plane,
+            last_row=row,
+        )
 
     def _relax(self, fallen: int = 0) -> None:
         """Let the depth fall until it is what neighbors allow, after so many passes; a way to the shore may lead over several ranks."""
@@ -377,7 +466,8 @@ class NarrowBand:
     def _relax_here(self, fallen: int) -> None:
         """Let the depth of this process's cells fall."""
         for number in range(fallen, math.ceil(self.width + BEYOND) + 1):
-            if number and self.grid.device.is_cpu and self._changed.numpy()[0] == 0:  # rows one after the other: three passes or so
+            # rows one after the other: three passes or so
+            if number and self.grid.device.is_cpu and self._changed.numpy()[0] == 0:
                 break
             self._falling.run(number % 2 == 1, variant=number % 2 == 1)
 
@@ -391,7 +481,9 @@ class NarrowBand:
         stored = np.flatnonzero(counts)
         counts = counts[stored]
         k, j, i = np.unravel_index(stored, self.grid.shape)
-        x, y, z = (cells + before for cells, before in zip((i, j, k), self.grid.origin, strict=True))
+        x, y, z = (
+            cells + before for cells, before in zip((i, j, k), self.grid.origin, strict=True)
+        )
         nx, ny, _ = (n + 2 for n in self.grid.domain_counts)
         first = ((z * ny + y) * nx + x) * MOST_A_CELL - np.cumsum(counts) + counts
         particles.exchange.add_places(behind + np.repeat(first, counts) + np.arange(counts.sum()))
@@ -410,19 +502,32 @@ class NarrowBand:
     def _launch_seeds(self, particles: Particles) -> None:
         """Launch what puts fresh particles on their sites."""
         grid, sites = self.grid, kernels.Sites()
-        sites.planes, sites.per_axis, sites.jitter, sites.seed = grid.planes, self.per_axis, self.jitter, self._seeds
+        sites.planes, sites.per_axis, sites.jitter, sites.seed = (
+            grid.planes,
+            self.per_axis,
+            self.jitter,
+            self._seeds,
+        )
         sites.dx = grid.spacing
         numbers = [*self._shift, self._behind, *grid.shape[1:]]
-        self._owned.launch(kernels.seed_kernel, [sites, self._numbered, *numbers, self._total, particles.position])
+        self._owned.launch(
+            kernels.seed_kernel, [sites, self._numbered, *numbers, self._total, particles.position]
+        )
 
     def _launch_sums(self, box: Window) -> None:
         """Launch the sums over a box's cells without particles."""
         u, v, w = three_components(self.velocity)
-        box.launch_rows(kernels.sum_kernel, [self.grid.planes, self.width, self.boundary.base, self.depth, u, v, w, self._sums])
+        box.launch_rows(
+            kernels.sum_kernel,
+            [self.grid.planes, self.width, self.boundary.base, self.depth, u, v, w, self._sums],
+        )
 
     def _summed(self, window: Window, *, launched: bool = False) -> ParticleTotals:
         """Add up the cells of all processes without particles, once the sums over rows are launched."""
-        return reduce(ParticleTotals.joined, self.grid.part.ranks.collect(self._summed_here(window, launched=launched)))
+        return reduce(
+            ParticleTotals.joined,
+            self.grid.part.ranks.collect(self._summed_here(window, launched=launched)),
+        )
 
     def _summed_here(self, window: Window, *, launched: bool) -> ParticleTotals:
         """Add up those of this process."""
@@ -435,14 +540,28 @@ class NarrowBand:
         cells, dx = int(rows[:, 0].sum()), self.grid.spacing
         if cells == 0:
             return ParticleTotals()
-        center, lowest, highest = rows[:, 2:5].sum(axis=0) / cells, rows[:, 6:9].min(axis=0), rows[:, 9:12].max(axis=0)
+        center, lowest, highest = (
+            rows[:, 2:5].sum(axis=0) / cells,
+            rows[:, 6:9].min(axis=0),
+            rows[:, 9:12].max(axis=0),
+        )
         places = (np.stack([center, lowest, highest]) + np.array(self.grid.origin) - 0.5) * dx
         places[:, self.grid.dimension :] = 0.0
         squares, fastest = float(rows[:, 1].sum()) / cells, float(rows[:, 5].max())
-        return ParticleTotals(cells, squares, rows[:, 12:15].sum(axis=0) / cells, places[0], places[1], places[2], math.sqrt(fastest))
+        return ParticleTotals(
+            cells,
+            squares,
+            rows[:, 12:15].sum(axis=0) / cells,
+            places[0],
+            places[1],
+            places[2],
+            math.sqrt(fastest),
+        )
 
 
-def without_band(state: Mapping[str, np.ndarray], spacing: float, random_seed: int) -> Mapping[str, np.ndarray]:
+def without_band(
+    state: Mapping[str, np.ndarray], spacing: float, random_seed: int
+) -> Mapping[str, np.ndarray]:
     """Return a state with the interior of its narrow band filled with particles.
 
     A state without a band is returned unchanged.
@@ -459,14 +578,25 @@ def without_band(state: Mapping[str, np.ndarray], spacing: float, random_seed: i
     k, j, i = np.nonzero((state["depth"] > width) & ~solid)
     if len(i) == 0:
         return state
-    faces = [state[f"interior_velocity_{axis}"] for axis in range(3) if f"interior_velocity_{axis}" in state]
+    faces = [
+        state[f"interior_velocity_{axis}"]
+        for axis in range(3)
+        if f"interior_velocity_{axis}" in state
+    ]
     dimension = len(faces)
     ends = np.arange(len(i) + 1) * held // len(i)
     cell = np.repeat(np.arange(len(i)), np.diff(ends))
-    steps, shift = PLASTIC[dimension] ** -np.arange(1.0, dimension + 1), np.random.default_rng(random_seed).random(dimension)
+    steps, shift = (
+        PLASTIC[dimension] ** -np.arange(1.0, dimension + 1),
+        np.random.default_rng(random_seed).random(dimension),
+    )
     place = (shift + np.arange(held)[:, None] * steps) % 1.0
     position, velocity = np.zeros((held, 3)), np.zeros((held, 3))
-    position[:, :dimension] = np.stack([i, j, k], axis=1)[cell, :dimension] - 1.0 + np.clip(place, kernels.INSET, 1.0 - kernels.INSET)
+    position[:, :dimension] = (
+        np.stack([i, j, k], axis=1)[cell, :dimension]
+        - 1.0
+        + np.clip(place, kernels.INSET, 1.0 - kernels.INSET)
+    )
     more = {}
     for axis, field in enumerate(faces):
         low = field[k, j, i]
@@ -476,4 +606,7 @@ def without_band(state: Mapping[str, np.ndarray], spacing: float, random_seed: i
         gradient[:, axis] = change[cell] / spacing
         more[f"affine_{axis}"] = gradient
     added = {"position": position * spacing, "velocity": velocity} | more
-    return {name: np.concatenate([v, added[name].astype(v.dtype)]) if name in added else v for name, v in state.items()}
+    return {
+        name: np.concatenate([v, added[name].astype(v.dtype)]) if name in added else v
+        for name, v in state.items()
+    }

@@ -35,7 +35,19 @@ def solid_inside(distance: F32, k: int, j: int, i: int, planes: int):
 
 
 @cell_kernel("warp_lcp.material.narrow_band")
-def shore_kernel(k, j, i, planes: int, most: float, kind: I8, phi: F32, contact: U8, keep: I8, distance: F32, depth: F32):
+def shore_kernel(
+    k,
+    j,
+    i,
+    planes: int,
+    most: float,
+    kind: I8,
+    phi: F32,
+    contact: U8,
+    keep: I8,
+    distance: F32,
+    depth: F32,
+):
     """Depth is -phi in air, 0 where particles stay for another reason, and yet unknown elsewhere, solids included."""
     value = most
     if kind[k, j, i] == _FLUID:
@@ -66,7 +78,18 @@ def fill_kernel(k, j, i, least: float, filled: float, depth: F32, capacity: F32,
 
 @cell_kernel("warp_lcp.material.narrow_band")
 def blend_kernel(
-    k, j, first, end, axis: int, start: float, full_weight: float, depth: F32, base: I8, carried: F32, field: F32, weight: F32
+    k,
+    j,
+    first,
+    end,
+    axis: int,
+    start: float,
+    full_weight: float,
+    depth: F32,
+    base: I8,
+    carried: F32,
+    field: F32,
+    weight: F32,
 ):
     """Go over from the particles' velocity to the carried one within a cell from depth `start` on."""
     c = wp.max(k - wp.where(axis == 2, 1, 0), 0)
@@ -108,12 +131,27 @@ class Numbered:
 @wp.func
 def number_of(where: Numbered, k: int, j: int, i: int):
     """Return the number that a stored cell has in the larger grid."""
-    return ((k + where.origin[2]) * where.across[1] + j + where.origin[1]) * where.across[0] + i + where.origin[0]
+    return (
+        ((k + where.origin[2]) * where.across[1] + j + where.origin[1]) * where.across[0]
+        + i
+        + where.origin[0]
+    )
 
 
 @cell_kernel("warp_lcp.material.narrow_band")
 def quota_kernel(
-    k, j, i, where: Numbered, width: float, particles: float, seed: int, shift: float, base: I8, depth: F32, before: F32, quota: I32
+    k,
+    j,
+    i,
+    where: Numbered,
+    width: float,
+    particles: float,
+    seed: int,
+    shift: float,
+    base: I8,
+    depth: F32,
+    before: F32,
+    quota: I32,
 ):
     """Find how many fresh particles each cell gets: so many on average, over the cells and, as `shift` goes on, over the steps."""
     count = int(0)
@@ -124,7 +162,14 @@ def quota_kernel(
 
 
 @list_kernel("warp_lcp.material.narrow_band")
-def leave_kernel(i, width: float, key: INTS, depth: wp.array(dtype=wp.float32), before: wp.array(dtype=wp.float32), marks: INTS):
+def leave_kernel(
+    i,
+    width: float,
+    key: INTS,
+    depth: wp.array(dtype=wp.float32),
+    before: wp.array(dtype=wp.float32),
+    marks: INTS,
+):
     """Mark the particles of cells deeper than the band, and of those that get fresh ones."""
     cell = key[i]
     now = depth[cell]
@@ -144,9 +189,20 @@ class Sites:
 
 @cell_kernel("warp_lcp.material.narrow_band")
 def seed_kernel(
-    k, j, i, S: Sites, where: Numbered, shift_x: float, shift_y: float, shift_z: float, behind: int, ny: int, nx: int, total: INTS,
+    k,
+    j,
+    i,
+    S: Sites,
+    where: Numbered,
+    shift_x: float,
+    shift_y: float,
+    shift_z: float,
+    behind: int,
+    ny: int,
+    nx: int,
+    total: INTS,
     position: POINTS,
-):  # fmt: skip
+):
     """Put a cell's particles on their sites, that a shift moves through the cell; `total` counts up to and with each cell."""
     planes, per_axis, seed, shift = S.planes, S.per_axis, S.seed, wp.vec3(shift_x, shift_y, shift_z)
     sites = per_axis * per_axis * wp.where(planes == 2, per_axis, 1)
@@ -157,23 +213,46 @@ def seed_kernel(
     if count > 0:
         own = wp.rand_init(seed, cell)
         way = shift + wp.vec3(wp.randf(own), wp.randf(own), wp.randf(own))
-        skip = int(wp.randf(own) * float(sites)) + int(shift[0] * float(sites))  # where it is left out, or begins again
+        # where it is left out, or begins again
+        skip = int(wp.randf(own) * float(sites)) + int(shift[0] * float(sites))
         for n in range(count):
             site = (skip + n) % sites
             state = wp.rand_init(seed + 1, cell * 64 + n)
-            x = wp.vec3(float(site % per_axis), float((site // per_axis) % per_axis), float(site // (per_axis * per_axis)))
-            x = (x + S.jitter * wp.vec3(wp.randf(state), wp.randf(state), wp.randf(state))) / float(per_axis) + way
-            x = wp.vec3(wp.frac(x[0]), wp.frac(x[1]), wp.frac(x[2])) * (1.0 - 2.0 * INSET) + wp.vec3(INSET, INSET, INSET)
+            x = wp.vec3(
+                float(site % per_axis),
+                float((site // per_axis) % per_axis),
+                float(site // (per_axis * per_axis)),
+            )
+            x = (x + S.jitter * wp.vec3(wp.randf(state), wp.randf(state), wp.randf(state))) / float(
+                per_axis
+            ) + way
+            x = wp.vec3(wp.frac(x[0]), wp.frac(x[1]), wp.frac(x[2])) * (
+                1.0 - 2.0 * INSET
+            ) + wp.vec3(INSET, INSET, INSET)
             at = wp.vec3i(i - 1, j - 1, k - 1) + where.origin
             x = (x + wp.vec3(float(at[0]), float(at[1]), float(at[2]))) * S.dx
             position[behind + start + n] = wp.vec3(x[0], x[1], wp.where(planes == 2, x[2], 0.0))
 
 
 @cell_kernel("warp_lcp.material.narrow_band")
-def sum_kernel(k, j, first, end, planes: int, width: float, base: I8, depth: F32, u: F32, v: F32, w: F32, sums: F64):
+def sum_kernel(
+    k,
+    j,
+    first,
+    end,
+    planes: int,
+    width: float,
+    base: I8,
+    depth: F32,
+    u: F32,
+    v: F32,
+    w: F32,
+    sums: F64,
+):
     """Add up a row's cells deeper than the band.
 
-    [0] cells, [1] |u|^2, [2-4] indices (i, j, k), [5] largest |u|^2, [6-8] lowest, [9-11] highest indices, [12-14] u.
+    [0] cells, [1] |u|^2, [2-4] indices (i, j, k), [5] largest |u|^2, [6-8] lowest, [9-11] highest
+    indices, [12-14] u.
     """
     count = int(0)
     squares = wp.float64(0.0)

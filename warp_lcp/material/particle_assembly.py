@@ -45,17 +45,32 @@ def placed_solids(scene: Scene, folder: Path) -> list[PlacedSolid]:
         ValueError: a file cannot be read, or a rigid body has no mass of its own.
     """
     placed = []
-    for number, (solid, friction) in enumerate(zip(scene.solid, scene.body_frictions(), strict=True)):
-        geometry, name = solid.to_geometry(folder, scene.dimension), f"solid[{number}] ({solid.shape})"
+    for number, (solid, friction) in enumerate(
+        zip(scene.solid, scene.body_frictions(), strict=True)
+    ):
+        geometry, name = (
+            solid.to_geometry(folder, scene.dimension),
+            f"solid[{number}] ({solid.shape})",
+        )
         motion = solid.motion.to_motion(scene.dimension) if solid.motion else None
         if solid.is_body:
             motion = BodyMotion(_body(solid, geometry, name, friction, scene.dimension))
         separating = (solid.wall or scene.domain.wall) == "separating"
-        placed.append(PlacedSolid(geometry=geometry, separating=separating, name=name, motion=motion, among=scene.materials()[0]))
+        placed.append(
+            PlacedSolid(
+                geometry=geometry,
+                separating=separating,
+                name=name,
+                motion=motion,
+                among=scene.materials()[0],
+            )
+        )
     return placed
 
 
-def make_bodies(scene: Scene, placed: Sequence[PlacedSolid], make: Callable[..., RigidBodies] = RigidBodies) -> RigidBodies | None:
+def make_bodies(
+    scene: Scene, placed: Sequence[PlacedSolid], make: Callable[..., RigidBodies] = RigidBodies
+) -> RigidBodies | None:
     """Return the rigid bodies among a scene's solids, if there are any, among its walls and the other solids.
 
     Args:
@@ -64,20 +79,43 @@ def make_bodies(scene: Scene, placed: Sequence[PlacedSolid], make: Callable[...,
         make: makes them of what `RigidBodies` takes.
 
     Raises:
-        ValueError: a body overlaps a wall, a solid or another body, or its center lies outside the domain.
+        ValueError: a body overlaps a wall, a solid or another body, or its center lies outside the
+            domain.
     """
-    motions = {number: solid.motion for number, solid in enumerate(placed, start=1) if isinstance(solid.motion, BodyMotion)}
+    motions = {
+        number: solid.motion
+        for number, solid in enumerate(placed, start=1)
+        if isinstance(solid.motion, BodyMotion)
+    }
     if not motions:
         return None
-    walls = domain_walls(scene.domain.size, open_sides=side_bits(scene.domain.open), endless=scene.endless)
-    others = [obstacle(solid, scene.dimension) for number, solid in enumerate(placed, start=1) if number not in motions]
+    walls = domain_walls(
+        scene.domain.size, open_sides=side_bits(scene.domain.open), endless=scene.endless
+    )
+    others = [
+        obstacle(solid, scene.dimension)
+        for number, solid in enumerate(placed, start=1)
+        if number not in motions
+    ]
     bodies = [motion.body for motion in motions.values()]
     for body in bodies:
-        if not ((body.position >= 0.0) & (body.position <= np.array(_vector(scene.domain.size)))).all():
-            raise ValueError(f"{body.name} has its center of mass at {body.position.round(6).tolist()} m, outside the domain")
+        if not (
+            (body.position >= 0.0) & (body.position <= np.array(_vector(scene.domain.size)))
+        ).all():
+            raise ValueError(
+                f"{body.name} has its center of mass at {body.position.round(6).tolist()} m, "
+                "outside the domain"
+            )
     shapes = [placed[number - 1].geometry for number in motions]
     joints = scene.joints()
-    made = make(bodies, shapes, list(motions), (walls, *others), scene.dimension, **({"joints": joints} if joints else {}))
+    made = make(
+        bodies,
+        shapes,
+        list(motions),
+        (walls, *others),
+        scene.dimension,
+        **({"joints": joints} if joints else {}),
+    )
     made.exits = (scene.domain.size, side_bits(scene.domain.open))
     return made
 
@@ -96,8 +134,8 @@ def make_boundary(
         scene: the scene.
         grid: its grid.
         folder: where the files are that it names.
-        wall_velocity: velocity [m/s] of the domain's wall and of each solid, shape (1 + solids, 3), constant; None: all stand still, or
-            have their own motion.
+        wall_velocity: velocity [m/s] of the domain's wall and of each solid, shape (1 + solids, 3),
+            constant; None: all stand still, or have their own motion.
         solids: of `placed_solids`; made anew if None.
 
     Raises:
@@ -113,26 +151,47 @@ def make_boundary(
     shapes: list[Geometry] = []
     if scene.domain.solids == "cut-cell":
         if wall_velocity is not None:
-            raise ValueError('wall_velocity: only for solids = "voxel"; with cut cells, give the solid a motion')
-        thin, crossing = (make_thin_walls(scene, grid, placed, sides, crossing=c) for c in (False, True))
+            raise ValueError(
+                'wall_velocity: only for solids = "voxel"; with cut cells, give the solid a motion'
+            )
+        thin, crossing = (
+            make_thin_walls(scene, grid, placed, sides, crossing=c) for c in (False, True)
+        )
         numbers = crossing.numbers if crossing is not None else ()
-        cut = CutCells(grid, placed, wall_separating=separating, open_sides=sides, remarks=not covered, left_out=numbers)
-        if not cut.whole_cells or (covered and placed) or thin is not None:  # solids may cut cells elsewhere
+        cut = CutCells(
+            grid,
+            placed,
+            wall_separating=separating,
+            open_sides=sides,
+            remarks=not covered,
+            left_out=numbers,
+        )
+        # solids may cut cells elsewhere
+        if not cut.whole_cells or (covered and placed) or thin is not None:
             barriers = Barriers(grid, crossing, cut) if crossing is not None else None
             grid.divide(barriers)
             boundary = CutBoundary(grid, cut, sides=around, thin=thin, barriers=barriers)
             return boundary, (*cut.notes, *(barriers.notes() if barriers is not None else ()))
         shapes = [solid.geometry for solid in placed]
     ends = side_bits(periodic_sides(scene.endless))
-    voxels = voxelize(grid, placed, wall_separating=separating, open_sides=sides | ends, remarks=not covered)
+    voxels = voxelize(
+        grid, placed, wall_separating=separating, open_sides=sides | ends, remarks=not covered
+    )
     if wall_velocity is None and scene.source:
         wall_velocity = np.zeros((1 + len(placed), 3))  # what a source's faces are given goes there
-    return WholeCells(grid, voxels, wall_velocity, open_sides=sides, sides=around, shapes=shapes), voxels.notes
+    return WholeCells(
+        grid, voxels, wall_velocity, open_sides=sides, sides=around, shapes=shapes
+    ), voxels.notes
 
 
 def make_thin_walls(
-    scene: ParticleScene, grid: StaggeredGrid, placed: Sequence[PlacedSolid], open_sides: int, *, crossing: bool
-) -> ThinWalls | None:  # fmt: skip
+    scene: ParticleScene,
+    grid: StaggeredGrid,
+    placed: Sequence[PlacedSolid],
+    open_sides: int,
+    *,
+    crossing: bool,
+) -> ThinWalls | None:
     """Return the solids that are too thin for the grid, which particles meet as exact shapes; None: there are none.
 
     One that moves must be thicker than what it may go in a step.
@@ -142,7 +201,8 @@ def make_thin_walls(
         grid: its grid.
         placed: its solids.
         open_sides: of `warp_lcp.grid.sides.side_bits`.
-        crossing: only those that are too thin to cut cells, but for rigid bodies, which the pressure pushes by the cells that they cut.
+        crossing: only those that are too thin to cut cells, but for rigid bodies, which the
+            pressure pushes by the cells that they cut.
     """
     if not ThinWalls.enabled:
         return None
@@ -175,29 +235,51 @@ class Parts:
     solids: Any = None
 
 
-def make_spray(scene: ParticleScene, coverage: Coverage | None, placed: Sequence[PlacedSolid]) -> Spray | None:
+def make_spray(
+    scene: ParticleScene, coverage: Coverage | None, placed: Sequence[PlacedSolid]
+) -> Spray | None:
     """Return what carries particles that are alone, if they need no grid: where one follows the material, and no surface is wrapped."""
-    if coverage is None or not (coverage.active and scene.flies) or scene.output.surface or scene.output.volume:
+    if (
+        coverage is None
+        or not (coverage.active and scene.flies)
+        or scene.output.surface
+        or scene.output.volume
+    ):
         return None
-    return Spray(coverage.domain, placed, side_bits(scene.domain.open), keeps=scene.kept(()) is not None)
+    return Spray(
+        coverage.domain, placed, side_bits(scene.domain.open), keeps=scene.kept(()) is not None
+    )
 
 
 def make_flights(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary) -> Flights | None:
     """Return what gives bodies in flight their momenta back, if any can be told."""
-    return Flights(grid, boundary, coheres=scene.coheres, settles=scene.speeds_up) if scene.flies else None
+    return (
+        Flights(grid, boundary, coheres=scene.coheres, settles=scene.speeds_up)
+        if scene.flies
+        else None
+    )
 
 
-def make_surface_mesh(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary) -> SurfaceMesh | None:
+def make_surface_mesh(
+    scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary
+) -> SurfaceMesh | None:
     """Return what wraps the particles in a surface, if the scene's output has one."""
     if not scene.output.surface:
         return None
     return SurfaceMesh(
-        grid, per_axis=scene.particles.per_axis, resolution=scene.output.surface_resolution, smoothing=scene.output.surface_smoothing,
-        obstacles=Obstacles(boundary.base, boundary.distance, boundary.moves, boundary.shapes) if scene.solid else None,
-    )  # fmt: skip
+        grid,
+        per_axis=scene.particles.per_axis,
+        resolution=scene.output.surface_resolution,
+        smoothing=scene.output.surface_smoothing,
+        obstacles=Obstacles(boundary.base, boundary.distance, boundary.moves, boundary.shapes)
+        if scene.solid
+        else None,
+    )
 
 
-def make_particle_volume(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary) -> ParticleVolume | None:
+def make_particle_volume(
+    scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary
+) -> ParticleVolume | None:
     """Return what measures the material's volume, if the scene's output has it."""
     if not scene.output.volume:
         return None
@@ -205,7 +287,11 @@ def make_particle_volume(scene: ParticleScene, grid: StaggeredGrid, boundary: Bo
 
 
 def seed_materials(
-    scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, folder: Path, without: np.ndarray | None = None
+    scene: ParticleScene,
+    grid: StaggeredGrid,
+    boundary: Boundary,
+    folder: Path,
+    without: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, list[str]]:
     """Fill the scene's materials with points, where this process's cells are; collective.
 
@@ -217,7 +303,8 @@ def seed_materials(
         without: cells that get no points, bool of shape (nz, ny, nx).
 
     Returns:
-        Positions [m], float32, shape (n, 3); the entry of `scene.materials()` that each belongs to, shape (n,); warnings.
+        Positions [m], float32, shape (n, 3); the entry of `scene.materials()` that each belongs to,
+        shape (n,); warnings.
 
     Raises:
         ValueError: a material has no particle on any rank; on all ranks.
@@ -231,26 +318,37 @@ def seed_materials(
         notes += placement_notes(geometry, name, grid)
     settings = scene.particles
     open_cells = grid.interior(boundary.base.numpy()) != wl.SOLID
-    if grid.barriers is not None:  # a cell whose center lies in a thin solid may have room beside it
+    # a cell whose center lies in a thin solid may have room beside it
+    if grid.barriers is not None:
         open_cells |= grid.interior(grid.barriers.near.numpy()) > 0
     if without is not None:
         open_cells &= ~without
     grid.part.keep_own(open_cells)
     position, owner = seed(
-        grid, regions, open_cells, per_axis=settings.per_axis, jitter=settings.jitter, random_seed=settings.seed
-    )  # fmt: skip
+        grid,
+        regions,
+        open_cells,
+        per_axis=settings.per_axis,
+        jitter=settings.jitter,
+        random_seed=settings.seed,
+    )
     counts = grid.part.ranks.sum(np.bincount(owner, minlength=len(geometries)))
     for name, count in zip(names, counts, strict=False):
         if count == 0 and without is None:
             raise ValueError(
-                f"{name} holds no particle: it is too small for cells of {grid.spacing:.4g} m, or lies in solids, outside the domain or in "
+                f"{name} holds no particle: it is too small for cells of {grid.spacing:.4g} m, or "
+                "lies in solids, outside the domain or in "
                 f"an earlier {key}"
             )
     return position, owner, notes
 
 
 def make_particles(
-    scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, folder: Path, without: np.ndarray | None = None
+    scene: ParticleScene,
+    grid: StaggeredGrid,
+    boundary: Boundary,
+    folder: Path,
+    without: np.ndarray | None = None,
 ) -> tuple[Particles, list[str]]:
     """Return the particles of all materials, in the order of `seed_materials`, and warnings; arguments as there.
 
@@ -272,10 +370,15 @@ def kept_by(scene: ParticleScene, owner: np.ndarray) -> np.ndarray | None:
 
 def start_velocities(scene: ParticleScene) -> np.ndarray:
     """Return the velocity of each material at the start [m/s], shape (materials, 3); one of rest if there is none."""
-    return np.array([_vector(material.velocity or [0.0, 0.0]) for material in scene.materials()[1]] or [_vector([0.0, 0.0])])
+    return np.array(
+        [_vector(material.velocity or [0.0, 0.0]) for material in scene.materials()[1]]
+        or [_vector([0.0, 0.0])]
+    )
 
 
-def make_sources(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, folder: Path) -> Sources | None:
+def make_sources(
+    scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, folder: Path
+) -> Sources | None:
     """Return the scene's sources, if it has any; collective.
 
     Raises:
@@ -296,7 +399,14 @@ def make_sources(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, 
         for number, source in enumerate(scene.source)
     ]
     settings = scene.particles
-    return Sources(grid, boundary, sources, per_axis=settings.per_axis, jitter=settings.jitter, random_seed=settings.seed)
+    return Sources(
+        grid,
+        boundary,
+        sources,
+        per_axis=settings.per_axis,
+        jitter=settings.jitter,
+        random_seed=settings.seed,
+    )
 
 
 def make_outlets(scene: ParticleScene, grid: StaggeredGrid, folder: Path) -> Outlets | None:
@@ -304,28 +414,48 @@ def make_outlets(scene: ParticleScene, grid: StaggeredGrid, folder: Path) -> Out
     if not scene.drain and not scene.domain.open:
         return None
     drains = [
-        Drain(drain.to_geometry(folder, scene.dimension), drain.begin, np.inf if drain.stop is None else drain.stop)
+        Drain(
+            drain.to_geometry(folder, scene.dimension),
+            drain.begin,
+            np.inf if drain.stop is None else drain.stop,
+        )
         for drain in scene.drain
     ]
     return Outlets(grid, drains, side_bits(scene.domain.open))
 
 
-def make_narrow_band(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, folder: Path) -> NarrowBand | None:
+def make_narrow_band(
+    scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, folder: Path
+) -> NarrowBand | None:
     """Return what carries the material deeper than a band; None: nothing does. Collective."""
     settings, particles = scene.particles.narrow_band, scene.particles
     if settings is None:
         return None
     return NarrowBand(
-        grid, boundary, width=settings.width, per_axis=particles.per_axis, jitter=particles.jitter, random_seed=particles.seed,
+        grid,
+        boundary,
+        width=settings.width,
+        per_axis=particles.per_axis,
+        jitter=particles.jitter,
+        random_seed=particles.seed,
         keep=_exchange_cells(scene, grid, folder),
-    )  # fmt: skip
+    )
 
 
-def start_band(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, folder: Path, band: NarrowBand | None) -> np.ndarray | None:
+def start_band(
+    scene: ParticleScene,
+    grid: StaggeredGrid,
+    boundary: Boundary,
+    folder: Path,
+    band: NarrowBand | None,
+) -> np.ndarray | None:
     """Put the material that particles need not carry into a band, and return its cells, bool of shape (nz, ny, nx); None: no band."""
     if band is None:
         return None
-    regions = [region_of(material.to_geometry(folder, scene.dimension), boundary, grid.device) for material in scene.materials()[1]]
+    regions = [
+        region_of(material.to_geometry(folder, scene.dimension), boundary, grid.device)
+        for material in scene.materials()[1]
+    ]
     open_cells = grid.interior(boundary.base.numpy()) != wl.SOLID
     position, number = seed(grid, regions, open_cells, per_axis=1, jitter=0.0, random_seed=0)
     i, j, k = ((position / grid.spacing).astype(int) - np.array(grid.origin)).T
@@ -341,7 +471,9 @@ def _exchange_cells(scene: ParticleScene, grid: StaggeredGrid, folder: Path) -> 
         return None
     near = np.zeros(grid.shape, dtype=bool)
     K, J, I = np.meshgrid(*(np.arange(1, n + 1) for n in grid.counts[::-1]), indexing="ij")
-    centers = grid.to_world(np.stack([I.ravel(), J.ravel(), K.ravel()], axis=1) + np.array(grid.origin) + 0.5)
+    centers = grid.to_world(
+        np.stack([I.ravel(), J.ravel(), K.ravel()], axis=1) + np.array(grid.origin) + 0.5
+    )
     if grid.dimension == 2:
         centers[:, 2] = 0.0
     points = wp.array(centers.astype(np.float32), dtype=wp.vec3, device=grid.device)
@@ -352,17 +484,23 @@ def _exchange_cells(scene: ParticleScene, grid: StaggeredGrid, folder: Path) -> 
     return near
 
 
-def make_reseeding(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary) -> Reseeding | None:
+def make_reseeding(
+    scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary
+) -> Reseeding | None:
     """Return what evens out the particles, if a scene asks for it."""
     settings = scene.particles.reseed
     if settings is None:
         return None
     at_rest = scene.particles.per_axis**grid.dimension
     least, most = scene.particles.reseed_range(grid.dimension)
-    return Reseeding(grid, boundary, least=least, most=most, particles_a_cell=at_rest, every=settings.every)
+    return Reseeding(
+        grid, boundary, least=least, most=most, particles_a_cell=at_rest, every=settings.every
+    )
 
 
-def make_density_correction(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary) -> DensityCorrection:
+def make_density_correction(
+    scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary
+) -> DensityCorrection:
     """Return what moves the particles of a scene apart.
 
     Raises:
@@ -373,13 +511,21 @@ def make_density_correction(scene: ParticleScene, grid: StaggeredGrid, boundary:
         raise ValueError("density_correction.every = 0: must be at least 1")
     solver = wl.default_chain(wl.ProjectedMultigrid(precision=scene.solver.precision))
     return DensityCorrection(
-        grid, boundary, solver, particles_a_cell=scene.particles.per_axis**grid.dimension,
-        max_density=settings.largest(scene.particles.per_axis), every=settings.every, gain=scene.correction_gain, even=scene.keeps_volume,
+        grid,
+        boundary,
+        solver,
+        particles_a_cell=scene.particles.per_axis**grid.dimension,
+        max_density=settings.largest(scene.particles.per_axis),
+        every=settings.every,
+        gain=scene.correction_gain,
+        even=scene.keeps_volume,
         tolerance=settings.tolerance,
-    )  # fmt: skip
+    )
 
 
-def make_density_monitor(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary) -> DensityMonitor | None:
+def make_density_monitor(
+    scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary
+) -> DensityMonitor | None:
     """Return what tells when the particles of a scene are to be moved apart; None: the scene says so itself, or they never are.
 
     Args:
@@ -391,10 +537,14 @@ def make_density_monitor(scene: ParticleScene, grid: StaggeredGrid, boundary: Bo
     if scene.density_correction is not None or settings is None:
         return None
     count = scene.particles.per_axis
-    return DensityMonitor(grid, boundary, particles_a_cell=count**grid.dimension, max_density=settings.largest(count))
+    return DensityMonitor(
+        grid, boundary, particles_a_cell=count**grid.dimension, max_density=settings.largest(count)
+    )
 
 
-def _body(solid: SolidProperties, geometry: Geometry, name: str, friction: float, dimension: int) -> RigidBody:
+def _body(
+    solid: SolidProperties, geometry: Geometry, name: str, friction: float, dimension: int
+) -> RigidBody:
     """Return the rigid body that a solid is."""
     try:
         properties = mass_properties(geometry, dimension, mass=solid.mass, density=solid.density)
@@ -402,9 +552,13 @@ def _body(solid: SolidProperties, geometry: Geometry, name: str, friction: float
         raise ValueError(f"{name}: {error}") from error
     spin = np.radians(solid.angular_velocity or [0.0] * 3)
     return RigidBody(
-        properties, name=name, friction=friction, restitution=solid.restitution, velocity=np.array(_vector(solid.velocity or [0.0, 0.0])),
+        properties,
+        name=name,
+        friction=friction,
+        restitution=solid.restitution,
+        velocity=np.array(_vector(solid.velocity or [0.0, 0.0])),
         angular_velocity=np.array([0.0, 0.0, *spin][-3:]),
-    )  # fmt: skip
+    )
 
 
 def _vector(entries: list[float]) -> list[float]:
@@ -417,7 +571,9 @@ def _inside(geometry: Geometry, device: wp.Device) -> Callable[[np.ndarray], np.
     return lambda points: inside([geometry], points, device=device)
 
 
-def region_of(geometry: Geometry, boundary: Boundary, device: wp.Device) -> Callable[[np.ndarray], np.ndarray]:
+def region_of(
+    geometry: Geometry, boundary: Boundary, device: wp.Device
+) -> Callable[[np.ndarray], np.ndarray]:
     """Return a function that tells which points lie in a geometry and outside solids."""
 
     def holds(points: np.ndarray) -> np.ndarray:

@@ -77,27 +77,37 @@ class ParticleCheckpoints(ParticleFrames):
 
     def _particle_arrays(self) -> dict[str, np.ndarray]:
         """Return copies of the particles' arrays by name, those of the spray at the end."""
-        return {name: self.spray.behind(name, array.numpy()) for name, array in self.particles.arrays().items()}
+        return {
+            name: self.spray.behind(name, array.numpy())
+            for name, array in self.particles.arrays().items()
+        }
 
     def _assign(self, arrays: Mapping[str, np.ndarray], flying: int = 0) -> None:
         """Take other particles, of which the last ones fly."""
         on_grid = len(arrays["position"]) - (flying if self.spray.active else 0)
         self.particles.assign({name: arrays[name][:on_grid] for name in self.particles.arrays()})
-        self.spray.particles.assign({name: arrays[name][on_grid:] for name in self.spray.particles.arrays()})
+        self.spray.particles.assign(
+            {name: arrays[name][on_grid:] for name in self.spray.particles.arrays()}
+        )
         self._faces_know = False
 
     def state(self) -> dict[str, np.ndarray]:
         """Return what `restore` needs to continue bit for bit on the CPU; of a grid that covers a part of the domain its `box`, too.
 
-        On several ranks it is this rank's piece of the state, in the whole domain's coordinates, without pickles. Names and shapes: `box`
-        int64 (2, 3), the low and high (exclusive) cell x, y, z of this rank; `counts` int64 (3,), the whole grid's; `time`, `step_count`,
-        `last_dt`, `signature`; particles: `position`, `velocity`, `affine_0` ... float32 (n, 3) and `place` int64 (n,), their order; of the
-        box, shape (..., nz, ny, nx): `cells` int8, the other fields of `own_state` and those of a narrow band, and once particles were
-        moved apart `density_correction` float64; the numbers of `own_state`, of a band and of bodies, the same on all ranks.
+        On several ranks it is this rank's piece of the state, in the whole domain's coordinates,
+        without pickles. Names and shapes: `box` int64 (2, 3), the low and high (exclusive) cell x,
+        y, z of this rank; `counts` int64 (3,), the whole grid's; `time`, `step_count`, `last_dt`,
+        `signature`; particles: `position`, `velocity`, `affine_0` ... float32 (n, 3) and `place`
+        int64 (n,), their order; of the box, shape (..., nz, ny, nx): `cells` int8, the other fields
+        of `own_state` and those of a narrow band, and once particles were moved apart
+        `density_correction` float64; the numbers of `own_state`, of a band and of bodies, the same
+        on all ranks.
         """
         part, flying = self.grid.part, self.spray.particles.count
         counts = {"spray": flying, "added": self.added}
-        particles = self._particle_arrays() | {name: np.array(count) for name, count in counts.items() if count}
+        particles = self._particle_arrays() | {
+            name: np.array(count) for name, count in counts.items() if count
+        }
         particles |= self.particles.exchange.state()
         clock = {name: np.array(getattr(self, name)) for name in ("time", "step_count", "last_dt")}
         bodies = self.bodies.state() if self.bodies is not None else {}
@@ -115,17 +125,27 @@ class ParticleCheckpoints(ParticleFrames):
             return
         state = self._on_this_grid(state)
         self.rearrangement.expect(state)
-        expected, state = self.state(), {"last_dt": np.array(0.0), **state}  # older states have velocities of their own time
+        # older states have velocities of their own time
+        expected, state = self.state(), {"last_dt": np.array(0.0), **state}
         self.added = int(state.get("added", 0))
         varies = bool(self.sources or self.outlets or self.band or self.added)
-        check_state(state, expected, changing=[*self.particles.arrays()] if varies else [], solids_move=self.boundary.moves)
+        check_state(
+            state,
+            expected,
+            changing=[*self.particles.arrays()] if varies else [],
+            solids_move=self.boundary.moves,
+        )
         self._assign(state, int(state.get("spray", 0)))
         self._take_fields(state)
         self._take_clock(state)
 
     def _take_clock(self, state: Mapping[str, np.ndarray]) -> None:
         """Go on at the time of a state, with its bodies, and solids where they are then."""
-        self.time, self.step_count, self.last_dt = float(state["time"]), int(state["step_count"]), float(state["last_dt"])
+        self.time, self.step_count, self.last_dt = (
+            float(state["time"]),
+            int(state["step_count"]),
+            float(state["last_dt"]),
+        )
         if self.bodies is not None:
             self.bodies.restore(state)
         self.boundary.place(self.time)
@@ -134,11 +154,12 @@ class ParticleCheckpoints(ParticleFrames):
         """Continue from the pieces of all ranks of a run on any number of ranks; each rank takes what lies in its box. Collective.
 
         Args:
-            pieces: of `state`, of all ranks, in any order. Of a piece that has nothing in this rank's box grown by some cells the arrays of
-                particles and cells are not read.
+            pieces: of `state`, of all ranks, in any order. Of a piece that has nothing in this
+                rank's box grown by some cells the arrays of particles and cells are not read.
 
         Raises:
-            ValueError: the pieces do not belong to this scene, or do not cover the domain; on all ranks.
+            ValueError: the pieces do not belong to this scene, or do not cover the domain; on all
+                ranks.
         """
         part: Any = self.grid.part  # `Subdomain` where there are several ranks
         if not part.shared:
@@ -162,7 +183,9 @@ class ParticleCheckpoints(ParticleFrames):
 
     def _everyone(self) -> int:
         """Return how many particles all ranks have, with those that a narrow band stands for."""
-        return sum(self.particles.exchange.counts) + (self.band.held if self.band is not None else 0)
+        return sum(self.particles.exchange.counts) + (
+            self.band.held if self.band is not None else 0
+        )
 
     def _work_on(self, part: Any) -> None:
         """Allocate what belongs to another part of the grid; its particles and fields are still to come."""
@@ -177,11 +200,16 @@ class ParticleCheckpoints(ParticleFrames):
             expected: how many particles they must have if none come in or leave.
         """
         part: Any = self.grid.part
-        names, bodies = list(self.particles.arrays()), self.bodies.state() if self.bodies is not None else {}
+        names, bodies = (
+            list(self.particles.arrays()),
+            self.bodies.state() if self.bodies is not None else {},
+        )
         band = self.band.state() if self.band is not None else {}
         own = self.own_state() | band
         solids = None if self.boundary.moves else own["cells"]
-        particles, cells, numbers = part.take_pieces(pieces, names, own | bodies, signature(self.scene, self.grid), solids)
+        particles, cells, numbers = part.take_pieces(
+            pieces, names, own | bodies, signature(self.scene, self.grid), solids
+        )
         interior = int(numbers["interior"][0]) if self.band is not None else 0
         everyone = int(part.ranks.sum(len(particles["place"]))) + interior
         if everyone != expected and not (self.sources or self.outlets):
@@ -202,7 +230,11 @@ class ParticleCheckpoints(ParticleFrames):
             ValueError: its box is not in this domain.
         """
         same = np.array_equal(state.get("signature", ()), signature(self.scene, self.grid))
-        grid = self._coverage.at(state.get("box")) if self._coverage is not None and same else self.grid
+        grid = (
+            self._coverage.at(state.get("box"))
+            if self._coverage is not None and same
+            else self.grid
+        )
         if grid != self.grid and self.scene.domain.follow:
             self.regrid(grid, state)
         if grid == self.grid:
@@ -223,15 +255,21 @@ class ParticleCheckpoints(ParticleFrames):
         settings, wanted = self.scene.particles, self.particles.arrays().keys()
         state = without_band(state, spacing, settings.seed)
         arrays, moved = resampled(
-            {name: np.asarray(state[name]) for name in wanted}, self.grid, self.admits, spacing=spacing,
-            per_axis=settings.per_axis, random_seed=settings.seed + self.step_count,
-        )  # fmt: skip
+            {name: np.asarray(state[name]) for name in wanted},
+            self.grid,
+            self.admits,
+            spacing=spacing,
+            per_axis=settings.per_axis,
+            random_seed=settings.seed + self.step_count,
+        )
         self._assign(arrays)
         if self.band is not None:
             self.band.forget()
         self.particles.sort()
         self.mark()
-        return resampling_notes(len(state["position"]), self.particles.count, moved, spacing, self.grid)
+        return resampling_notes(
+            len(state["position"]), self.particles.count, moved, spacing, self.grid
+        )
 
     def add(self, position: np.ndarray, velocity: np.ndarray) -> None:
         """Add particles between two steps; positions [m] and velocities [m/s] of shape (n, 3), where the material may be."""

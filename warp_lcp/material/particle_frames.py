@@ -45,7 +45,11 @@ class ParticleFrames(ABC):
     def points(self) -> Points:
         """Return the particles as a frame shows them, with velocity and speed [m/s]."""
         position, velocity = (self._particle_arrays()[name] for name in ("position", "velocity"))
-        return Points("particles", position, {"velocity": velocity, "speed": np.sqrt(np.einsum("ij,ij->i", velocity, velocity))})
+        return Points(
+            "particles",
+            position,
+            {"velocity": velocity, "speed": np.sqrt(np.einsum("ij,ij->i", velocity, velocity))},
+        )
 
     def surfaces(self) -> list[Surface]:
         """Return the material's surface as a frame shows it, with the velocity [m/s] of the particles around it, if the scene wants it.
@@ -61,11 +65,21 @@ class ParticleFrames(ABC):
         """Return the surface around the particles and their ghosts."""
         position = self.particles.position
         band = self.band
-        mesh = surface.find(position, Interior(band.depth, band.full, self.boundary.base) if band is not None else None)
+        mesh = surface.find(
+            position,
+            Interior(band.depth, band.full, self.boundary.base) if band is not None else None,
+        )
         if not self._faces_know:  # the next step overwrites what the faces are given here
-            faces_from_particles(self.grid, position, self.particles.velocity, self.velocity, self.weights)
+            faces_from_particles(
+                self.grid, position, self.particles.velocity, self.velocity, self.weights
+            )
         velocity = sample(self.grid, self.velocity, mesh.points)
-        return Surface("surface", mesh.points.numpy().copy(), mesh.corners.numpy().copy(), {"velocity": velocity.numpy().copy()})
+        return Surface(
+            "surface",
+            mesh.points.numpy().copy(),
+            mesh.corners.numpy().copy(),
+            {"velocity": velocity.numpy().copy()},
+        )
 
     def volumes(self) -> list[Volume]:
         """Return the material's level set and density as a frame shows them, if the scene wants them; of all ranks on the root.
@@ -79,7 +93,11 @@ class ParticleFrames(ABC):
             found = self.particle_volume.measure(self.particles, fill=self._fill_density())
         whole = [part.gathered(volume.values) for volume in found]
         first = part.gathered_from
-        return [replace(v, values=values, origin=first) for v, values in zip(found, whole, strict=True) if values is not None]
+        return [
+            replace(v, values=values, origin=first)
+            for v, values in zip(found, whole, strict=True)
+            if values is not None
+        ]
 
     def _fill_density(self) -> Fill | None:
         """Return what adds to the particles' density in a window what none of them stands for, as a surface sees it; None: nothing does."""

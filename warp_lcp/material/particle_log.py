@@ -31,20 +31,23 @@ COLUMNS = (
 def columns(own: Sequence[str], told: Mapping[str, bool], bodies: Sequence[str]) -> tuple[str, ...]:
     """Return the names of the log's columns.
 
-    SI units; in 2-D mass and energies are per meter of depth. Energies are the particles' own; potential_energy is 0 at the origin.
-    Velocities, in frames too, are those of the step's middle, which move things through it; kinetic_energy is that of its end.
-    With a narrow band mass, energies and center count the interior, particles does not; interior_density is that of the interior, in
-    units of that at rest, if the mass is to be what it was.
-    solve_residual is relative to the right-hand side's, which in free fall is rounding noise that is not iterated on: it may then be
-    up to 1. stopped: particles that met a wall; pushed: those that a moving solid swept along; stuck: those inside solids that found
-    no way out, between solids that close, say. max_density: before the density correction of the step, of material at rest 1, or at the
-    start of a step that none was due in; density_status and density_iterations: of that correction, empty where none was due;
-    reseeded: particles that went to a neighboring cell; emitted, drained, departed: those that sources have added in the step, that
-    drains have swallowed, and that have left through open sides; spray: those that fly off the grid, see `warp_lcp.material.spray`.
-    Rigid bodies, numbered from 0 in the order of the scene's solids, have body0_x, body0_y, body0_z [m], the center of mass; body0_vx,
-    body0_vy, body0_vz [m/s]; 2-D: body0_angle [degrees], how far it has turned, and body0_spin [degrees/s]; 3-D: body0_wx, body0_wy,
-    body0_wz [degrees/s], the angular velocity. contacts: points where
-    bodies touch walls or each other, or nearly do.
+    SI units; in 2-D mass and energies are per meter of depth. Energies are the particles' own;
+    potential_energy is 0 at the origin. Velocities, in frames too, are those of the step's middle,
+    which move things through it; kinetic_energy is that of its end. With a narrow band mass,
+    energies and center count the interior, particles does not; interior_density is that of the
+    interior, in units of that at rest, if the mass is to be what it was. solve_residual is relative
+    to the right-hand side's, which in free fall is rounding noise that is not iterated on: it may
+    then be up to 1. stopped: particles that met a wall; pushed: those that a moving solid swept
+    along; stuck: those inside solids that found no way out, between solids that close, say.
+    max_density: before the density correction of the step, of material at rest 1, or at the start
+    of a step that none was due in; density_status and density_iterations: of that correction, empty
+    where none was due; reseeded: particles that went to a neighboring cell; emitted, drained,
+    departed: those that sources have added in the step, that drains have swallowed, and that have
+    left through open sides; spray: those that fly off the grid, see `warp_lcp.material.spray`.
+    Rigid bodies, numbered from 0 in the order of the scene's solids, have body0_x, body0_y, body0_z
+    [m], the center of mass; body0_vx, body0_vy, body0_vz [m/s]; 2-D: body0_angle [degrees], how far
+    it has turned, and body0_spin [degrees/s]; 3-D: body0_wx, body0_wy, body0_wz [degrees/s], the
+    angular velocity. contacts: points where bodies touch walls or each other, or nearly do.
 
     Args:
         own: of the material's own models.
@@ -99,9 +102,12 @@ def totals_row(totals: ParticleTotals, moved: Moved, particles: int, spacing: fl
 def _kinetic_energy(totals: ParticleTotals, moved: Moved) -> float:
     """Return the energy of motion at the end of a step over mass [m^2/s^2]; the particles' velocities are those of its middle.
 
-    For half a step more gravity works on what moves, V, and by what it has changed V in this one: nothing where solids bear it.
+    For half a step more gravity works on what moves, V, and by what it has changed V in this one:
+    nothing where solids bear it.
     """
     g, dt = moved.gravity, moved.dt
     gained = float(g @ (totals.velocity - moved.velocity_before)) / moved.kick_dt
-    work = 0.5 * dt * float(g @ totals.velocity) + 0.125 * dt**2 * min(max(gained, 0.0), float(g @ g))
+    work = 0.5 * dt * float(g @ totals.velocity) + 0.125 * dt**2 * min(
+        max(gained, 0.0), float(g @ g)
+    )
     return max(0.5 * totals.mean_square_speed + work, 0.0)

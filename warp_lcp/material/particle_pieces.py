@@ -8,7 +8,8 @@ import numpy as np
 
 from warp_lcp.material.particle_rearrangement import STATE
 
-Piece = Mapping[str, np.ndarray]  # what one rank has of a simulation's state; the last axes of what lies in cells are z, y, x
+# what one rank has of a simulation's state; the last axes of what lies in cells are z, y, x
+Piece = Mapping[str, np.ndarray]
 
 ALIKE = ("bodies", "body_contacts")  # tables of what all ranks have
 LATER = {STATE: np.float64}  # there once particles have been moved apart
@@ -29,9 +30,18 @@ def piece_of(state: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     if missing:
         raise ValueError(f"the state lacks {', '.join(missing)}: it does not belong to this scene")
     counts = np.asarray(state["signature"][:3], dtype=np.int64)
-    cells = {name: np.ascontiguousarray(field[..., 1:-1, 1:-1, 1:-1]) for name, field in fields_of(state).items()}
+    cells = {
+        name: np.ascontiguousarray(field[..., 1:-1, 1:-1, 1:-1])
+        for name, field in fields_of(state).items()
+    }
     place = np.arange(len(state["position"]), dtype=np.int64)
-    return {**state, **cells, "counts": counts, "box": np.array([np.zeros(3, dtype=np.int64), counts]), "place": place}
+    return {
+        **state,
+        **cells,
+        "counts": counts,
+        "box": np.array([np.zeros(3, dtype=np.int64), counts]),
+        "place": place,
+    }
 
 
 def state_of(pieces: Sequence[Piece], like: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -39,16 +49,31 @@ def state_of(pieces: Sequence[Piece], like: Mapping[str, np.ndarray]) -> dict[st
 
     Args:
         pieces: of all ranks.
-        like: a state of the same scene in one process, which gives names, types and what lies around the domain.
+        like: a state of the same scene in one process, which gives names, types and what lies
+            around the domain.
 
     Raises:
         ValueError: the pieces do not cover the domain, or lack something.
     """
-    missing = sorted({name for piece in pieces for name in (*like, "place", "box") if name not in (*piece, *LATER)})
+    missing = sorted(
+        {
+            name
+            for piece in pieces
+            for name in (*like, "place", "box")
+            if name not in (*piece, *LATER)
+        }
+    )
     if missing or not pieces:
-        raise ValueError(f"the pieces lack {', '.join(missing) or 'everything'}: they do not belong to this scene")
+        raise ValueError(
+            f"the pieces lack {', '.join(missing) or 'everything'}: they do not belong to this "
+            "scene"
+        )
     order = np.argsort(np.concatenate([piece["place"] for piece in pieces]), kind="stable")
-    later = {name: np.zeros(like["cells"].shape, dtype) for name, dtype in LATER.items() if all(name in piece for piece in pieces)}
+    later = {
+        name: np.zeros(like["cells"].shape, dtype)
+        for name, dtype in LATER.items()
+        if all(name in piece for piece in pieces)
+    }
     like = {name: values for name, values in like.items() if name not in LATER} | later
     whole, covered, fields = {}, 0, fields_of(like)
     for name, values in like.items():

@@ -13,7 +13,11 @@ from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.density_correction import DensityCorrection
-from warp_lcp.material.particle_assembly import make_density_correction, make_density_monitor, make_reseeding
+from warp_lcp.material.particle_assembly import (
+    make_density_correction,
+    make_density_monitor,
+    make_reseeding,
+)
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.simulation import Stopwatch
 
@@ -25,11 +29,12 @@ PACE = 2.0  # of sqrt(dx / g), in which a correction that acts by itself takes o
 class Rearrangement:
     """Particle redistribution: density correction and reseeding, when they are due.
 
-    Without the table [density_correction] a correction acts in steps that begin with more than the fraction `ParticleScene.most_crowded`
-    of the material in excess of what cells may hold. It removes the excess over a time `PACE` sqrt(dx / g), so that a short step lifts
-    little material. The density is that at the start of the step, which the liquid's surface and the sand's
-    packing have computed already: whether a step acts depends on the particles' positions only, so that a checkpoint needs no more
-    state. The fields of the correction are allocated when it first acts.
+    Without the table [density_correction] a correction acts in steps that begin with more than the
+    fraction `ParticleScene.most_crowded` of the material in excess of what cells may hold. It
+    removes the excess over a time `PACE` sqrt(dx / g), so that a short step lifts little material.
+    The density is that at the start of the step, which the liquid's surface and the sand's packing
+    have computed already: whether a step acts depends on the particles' positions only, so that a
+    checkpoint needs no more state. The fields of the correction are allocated when it first acts.
 
     Args:
         scene: what asks for it.
@@ -38,7 +43,8 @@ class Rearrangement:
 
     Attributes:
         reseeding: the reseeding; None: the scene does not ask for it.
-        density_monitor: decides when to correct; None: the scene decides, or there is no correction.
+        density_monitor: decides when to correct; None: the scene decides, or there is no
+            correction.
         correction: the density correction; None: it has not acted yet, or never does.
         moved: whether the last `apply` may have moved particles.
     """
@@ -56,14 +62,18 @@ class Rearrangement:
         g = math.hypot(*scene.physics.gravity)
         self._pace = PACE * math.sqrt(grid.spacing / g) if g > 0.0 else 0.0  # [s]
         self.moved = False
-        self._looked, self._step = False, -1  # whether a step has measured the density_monitor, and which one has been looked at
+        # whether a step has measured the density_monitor, and which one has been looked at
+        self._looked, self._step = False, -1
 
-    def look(self, step: int, density: wp.array | None, particles: Particles, window: Window) -> None:
+    def look(
+        self, step: int, density: wp.array | None, particles: Particles, window: Window
+    ) -> None:
         """Measure the density_monitor at the start of a step, before anything moves, if that is what decides.
 
         Args:
             step: its number.
-            density: of the particles, in units of that at rest, float32; None: nobody has found it yet.
+            density: of the particles, in units of that at rest, float32; None: nobody has found it
+                yet.
             particles: the material.
             window: cells that hold all of it, with two to spare on each side.
         """
@@ -81,7 +91,11 @@ class Rearrangement:
     @property
     def max_density(self) -> float | None:
         """Return the largest density at the start of the step, if it was measured."""
-        return self.density_monitor.found()[1] if self.density_monitor is not None and self._looked else None
+        return (
+            self.density_monitor.found()[1]
+            if self.density_monitor is not None and self._looked
+            else None
+        )
 
     def due(self, step: int) -> bool:
         """Return whether a step moves anything."""
@@ -92,7 +106,14 @@ class Rearrangement:
         return not self._evens(step) and self._parts(step)
 
     def apply(
-        self, particles: Particles, window: Window, step: int, dt: float, watch: Stopwatch, fill: Fill | None, contact: wp.array | None
+        self,
+        particles: Particles,
+        window: Window,
+        step: int,
+        dt: float,
+        watch: Stopwatch,
+        fill: Fill | None,
+        contact: wp.array | None,
     ) -> dict[str, float | int | str]:
         """Even out the particles and move them apart, if it is time.
 
@@ -115,10 +136,20 @@ class Rearrangement:
                 row["reseeded"] = self.reseeding.apply(particles, window, step)
         if self._parts(step):
             correction = self.correction = self.correction or self._made()
-            with watch.stage("density correction", particles.position, correction.density, correction.x, *correction.displacement):
-                done = correction.apply(particles, window, fill=fill, contact=contact, share=self._share(dt))
+            with watch.stage(
+                "density correction",
+                particles.position,
+                correction.density,
+                correction.x,
+                *correction.displacement,
+            ):
+                done = correction.apply(
+                    particles, window, fill=fill, contact=contact, share=self._share(dt)
+                )
             self.moved = self.moved or done.result is not None
-            row["density_status"] = done.result.status.name if done.result is not None else "NOTHING_TO_DO"
+            row["density_status"] = (
+                done.result.status.name if done.result is not None else "NOTHING_TO_DO"
+            )
             row["density_iterations"] = done.result.iterations if done.result is not None else 0
             row["max_density"] = done.max_density
         return row
@@ -133,7 +164,11 @@ class Rearrangement:
 
     def _share(self, dt: float) -> float:
         """Return how much of what crowds a step moves apart: all where the scene says when, else at a rate that knows of no steps."""
-        return min(1.0, dt / self._pace) if self.density_monitor is not None and self._pace > 0.0 else 1.0
+        return (
+            min(1.0, dt / self._pace)
+            if self.density_monitor is not None and self._pace > 0.0
+            else 1.0
+        )
 
     def columns(self) -> tuple[str, ...]:
         """Return the names of the log's columns that `apply` fills."""

@@ -26,16 +26,20 @@ GRID_BYTES = 36  # fields of the grid, a cell
 CUT_BYTES = 45
 MOVING_BYTES = 30
 SOURCE_BYTES = 8
-CORRECTION_BYTES, CUT_CORRECTION_BYTES = 54, 22  # the density correction's fields and method, and more where cells are cut
+# the density correction's fields and method, and more where cells are cut
+CORRECTION_BYTES, CUT_CORRECTION_BYTES = 54, 22
 EVEN_BYTES = 9  # and more where it closes voids
 RESEED_BYTES = 13
 BAND_BYTES = 24
 FLIGHT_BYTES = 10  # what says which cells belong to bodies in flight
-SPREAD = 2.0  # how much a narrow band may grow as its surface does: 1.3 times in a double dam break, 1.7 in a dam break in 3-D
+# how much a narrow band may grow as its surface does: 1.3 times in a double dam break, 1.7 in a dam
+# break in 3-D
+SPREAD = 2.0
 PLANES = 2.5  # that a 2-D cell counts for: its fields have three, the solver's one
 VECTOR_BYTES, KEY_BYTES = 12, 16  # a particle's vectors, one of them spare, and its sort keys
 SEEDING_BYTES = 136  # a particle on the host, while the material is made and the solver is not
-SITE_SLACK = 1e-3  # of the distance of particles: their float32 coordinates may be off by that on 4096 cells
+# of the distance of particles: their float32 coordinates may be off by that on 4096 cells
+SITE_SLACK = 1e-3
 LATTICE_BYTES = 50  # a point of one plane of cells, while particles are chosen from them
 
 
@@ -43,23 +47,33 @@ class Reseed(Table):
     """[particles.reseed]: reseeding inside the material; off without the table."""
 
     every: Count = Field(default=2, description="steps between reseedings")
-    min: Count | None = Field(default=None, description="fewest particles of a cell; default: 3/8 of those at rest")
-    max: Count | None = Field(default=None, description="most particles of a cell; default: twice those at rest")
+    min: Count | None = Field(
+        default=None, description="fewest particles of a cell; default: 3/8 of those at rest"
+    )
+    max: Count | None = Field(
+        default=None, description="most particles of a cell; default: twice those at rest"
+    )
 
 
 class NarrowBandSettings(Table):
     """[particles.narrow_band]: particles only near the surface; off without the table."""
 
-    width: float = Field(default=4.0, ge=3, description="cells below the surface that hold particles")
+    width: float = Field(
+        default=4.0, ge=3, description="cells below the surface that hold particles"
+    )
 
 
 class ParticleSettings(Table):
     """[particles]: sampling of the material, transfers between particles and grid."""
 
     per_axis: int = Field(default=2, ge=1, le=4, description="particles per cell edge at the start")
-    transfer: Literal["apic", "flip", "pic"] = Field(default="apic", description="apic, flip (livelier, noisier) or pic (damps)")
+    transfer: Literal["apic", "flip", "pic"] = Field(
+        default="apic", description="apic, flip (livelier, noisier) or pic (damps)"
+    )
     flip_ratio: Part = Field(default=0.95, description="share of FLIP; the rest is PIC")
-    jitter: Part = Field(default=0.25, description="random initial displacement [particle distances]")
+    jitter: Part = Field(
+        default=0.25, description="random initial displacement [particle distances]"
+    )
     seed: CountOrZero = Field(default=2015, description="seed of jitter")
     reseed: Reseed | None = None
     narrow_band: NarrowBandSettings | None = None
@@ -76,7 +90,10 @@ class DensityCorrectionSettings(Table):
     every: CountOrZero = Field(default=1, description="steps between corrections; 0: off")
     tolerance: Share = Field(default=1e-2, description="relative residual")
     max_density: float | None = Field(
-        default=None, gt=0, le=2, description="largest relative density of a cell; default: 1 + 0.1 / particles.per_axis"
+        default=None,
+        gt=0,
+        le=2,
+        description="largest relative density of a cell; default: 1 + 0.1 / particles.per_axis",
     )
 
     def largest(self, per_axis: int) -> float:
@@ -90,12 +107,18 @@ class ParticleScene(Scene):
     Subclasses add the list of the material's shapes and name it in `materials`.
     """
 
-    solve_bytes: ClassVar[int] = 0  # a cell, of the fields of the solve that are there before the particles are made
+    # a cell, of the fields of the solve that are there before the particles are made
+    solve_bytes: ClassVar[int] = 0
     correction_gain: ClassVar[float] = 1.0  # of the density correction
-    crowded: ClassVar[float] = 2e-3  # of the material, over particles.per_axis: a pool at rest has 1e-3 / 3e-5 at 1 / 2, splashed 1e-2
-    fall_speed: ClassVar[float] = 1.0  # of its fastest particle in the mean of a run, in units of that after its whole fall
-    stirred: ClassVar[float] = 1.0  # times a step's price while a column falls: what a step takes in the mean of a run
-    carried_by_grid: ClassVar[bool] = False  # whether the grid can carry the material without particles
+    # of the material, over particles.per_axis: a pool at rest has 1e-3 / 3e-5 at 1 / 2, splashed
+    # 1e-2
+    crowded: ClassVar[float] = 2e-3
+    # of its fastest particle in the mean of a run, in units of that after its whole fall
+    fall_speed: ClassVar[float] = 1.0
+    # times a step's price while a column falls: what a step takes in the mean of a run
+    stirred: ClassVar[float] = 1.0
+    # whether the grid can carry the material without particles
+    carried_by_grid: ClassVar[bool] = False
 
     particles: ParticleSettings = Field(default_factory=ParticleSettings)
     density_correction: DensityCorrectionSettings | None = None
@@ -106,7 +129,9 @@ class ParticleScene(Scene):
     def materials(self) -> tuple[str, Sequence[MaterialProperties]]:
         """Return the key of the material's shapes in the file, such as `liquid`, and the shapes."""
 
-    def kept(self, materials: Sequence[MaterialProperties | SourceProperties]) -> list[float] | None:
+    def kept(
+        self, materials: Sequence[MaterialProperties | SourceProperties]
+    ) -> list[float] | None:
         """Return the number that the particles of each material or source take along; None: particles have none."""
         return None
 
@@ -121,8 +146,12 @@ class ParticleScene(Scene):
             "moving solids": _solids(moving) if moving else "",
             "rigid bodies": _solids(bodies) if bodies else "",
             "FLIP": 'particles.transfer = "flip"' if settings.transfer == "flip" else "",
-            "density correction": "[density_correction]" if self.density_correction is not None and self.correction is not None else "",
-            "automatic density correction": "particles are moved out of overfull cells" if automatic else "",
+            "density correction": "[density_correction]"
+            if self.density_correction is not None and self.correction is not None
+            else "",
+            "automatic density correction": "particles are moved out of overfull cells"
+            if automatic
+            else "",
             "reseeding": "[particles.reseed]" if settings.reseed is not None else "",
             "narrow band": "[particles.narrow_band]" if settings.narrow_band is not None else "",
             "sources": "[[source]]" if self.source else "",
@@ -131,7 +160,11 @@ class ParticleScene(Scene):
             "volume": "output.volume" if output.volume else "",
             "diagnostics": "output.diagnostics" if output.diagnostics else "",
         }
-        return [Model(name, why, count=len(bodies) if name == "rigid bodies" else 1) for name, why in used.items() if why]
+        return [
+            Model(name, why, count=len(bodies) if name == "rigid bodies" else 1)
+            for name, why in used.items()
+            if why
+        ]
 
     @property
     def correction(self) -> DensityCorrectionSettings | None:
@@ -181,9 +214,15 @@ class ParticleScene(Scene):
     def complaints(self) -> list[Complaint]:
         """Return what is wrong across keys."""
         key, materials = self.materials()
-        found = [] if materials or self.source else [Complaint((key,), None, "is missing, and there is no [[source]] either")]
+        found = (
+            []
+            if materials or self.source
+            else [Complaint((key,), None, "is missing, and there is no [[source]] either")]
+        )
         found += self.shape_complaints(key, materials, inside=True)
-        found += self.shape_complaints("source", self.source, inside=True) + self.shape_complaints("drain", self.drain, inside=True)
+        found += self.shape_complaints("source", self.source, inside=True) + self.shape_complaints(
+            "drain", self.drain, inside=True
+        )
         if self.particles.narrow_band is not None and not self.carried_by_grid:
             message = "is for liquids only: the state of sand is stored on its particles"
             found.append(Complaint(("particles", "narrow_band"), None, message))
@@ -191,7 +230,11 @@ class ParticleScene(Scene):
             found.append(Complaint(("output", "forces"), True, "is for liquids only"))
         for number, source in enumerate(self.source if not self.carried_by_grid else []):
             if source.viscosity is not None:
-                found.append(Complaint(("source", number, "viscosity"), source.viscosity, "is for liquids only"))
+                found.append(
+                    Complaint(
+                        ("source", number, "viscosity"), source.viscosity, "is for liquids only"
+                    )
+                )
         return super().complaints() + found + self._reseed_complaints()
 
     def notes(self) -> list[str]:
@@ -210,17 +253,24 @@ class ParticleScene(Scene):
     def particle_estimate(self, *, later: bool = True) -> int:
         """Return how many particles the scene has at most: meshes and slanted shapes count as the boxes around them.
 
-        Sources may fill the domain; whether they do, and what leaves it, is not known before. How a narrow band grows is not known either:
-        with one it is an estimate.
+        Sources may fill the domain; whether they do, and what leaves it, is not known before. How a
+        narrow band grows is not known either: with one it is an estimate.
 
         Args:
             later: count what sources let in; False: what is there at the start.
         """
         let_in = sum(self._source_sites(source, later=later) for source in self.source)
-        at_start = sum(int(self._sites(shape.bounds(self.dimension)).prod()) for shape in self.materials()[1])
-        count = min(at_start + let_in, math.prod(self.cell_counts) * self.particles.per_axis**self.dimension)
+        at_start = sum(
+            int(self._sites(shape.bounds(self.dimension)).prod()) for shape in self.materials()[1]
+        )
+        count = min(
+            at_start + let_in, math.prod(self.cell_counts) * self.particles.per_axis**self.dimension
+        )
         if self.particles.narrow_band is not None:
-            band = sum(self._band_volume(shape, self.particles.narrow_band.width) for shape in self.materials()[1])
+            band = sum(
+                self._band_volume(shape, self.particles.narrow_band.width)
+                for shape in self.materials()[1]
+            )
             sites = band / self.spacing**self.dimension * self.particles.per_axis**self.dimension
             count = min(count, round((SPREAD if later else 1.0) * (sites + let_in)))
         return count
@@ -249,16 +299,28 @@ class ParticleScene(Scene):
         at_start = int(held.prod()) if later or source.begin == 0.0 else 0
         seconds = max(min(source.stop or math.inf, self.time.duration) - source.begin, 0.0)
         speed = np.abs(source.velocity)
-        across = held + (speed > 0.0)  # a lattice that moves along an axis may have one more point there
-        layers = np.where(speed > 0.0, np.ceil(speed * seconds * self.particles.per_axis / self.spacing) + 1.0, 0.0)
-        let_in = sum(layers[axis] * np.delete(across, axis).prod(dtype=float) for axis in range(self.dimension))
+        # a lattice that moves along an axis may have one more point there
+        across = held + (speed > 0.0)
+        layers = np.where(
+            speed > 0.0,
+            np.ceil(speed * seconds * self.particles.per_axis / self.spacing) + 1.0,
+            0.0,
+        )
+        let_in = sum(
+            layers[axis] * np.delete(across, axis).prod(dtype=float)
+            for axis in range(self.dimension)
+        )
         return at_start + (int(min(let_in, 2.0**62)) if later and held.all() else 0)
 
     def _band_volume(self, shape: MaterialProperties, width: float) -> float:
         """Return the part of the box around a shape that is no deeper than a band below a free side [m^3; m^2 in 2-D]."""
         size, deep = np.array(self.domain.size), width * self.spacing
         bounds = shape.bounds(self.dimension)
-        low, high = (np.zeros_like(size), size) if bounds is None else (corner[: self.dimension] for corner in bounds)
+        low, high = (
+            (np.zeros_like(size), size)
+            if bounds is None
+            else (corner[: self.dimension] for corner in bounds)
+        )
         low, high = np.maximum(low, 0.0), np.minimum(high, size)
         inner = high - low - deep * ((low > 0.0).astype(float) + (high < size))
         return float(np.maximum(high - low, 0.0).prod() - np.maximum(inner, 0.0).prod())
@@ -269,49 +331,81 @@ class ParticleScene(Scene):
         settings = self.particles
         at_first = f"{self.particle_estimate(later=False):,} at the start, " if self.source else ""
         most = "about" if settings.narrow_band is not None else "at most"
-        covered = f"{' x '.join(map(str, self.covered_counts[: self.dimension]))} cells at the start; the grid follows the material"
+        covered = (
+            f"{' x '.join(map(str, self.covered_counts[: self.dimension]))} cells at the "
+            "start; the grid follows the material"
+        )
         part = [("covered", covered)] if self.covered_counts != self.cell_counts else []
         return [
             *super().plan(),
             *part,
-            ("particles", f"{at_first}{most} {particles:,}, {settings.per_axis**self.dimension} a cell, {settings.transfer}"),
+            (
+                "particles",
+                f"{at_first}{most} {particles:,}, {settings.per_axis**self.dimension} a cell, "
+                f"{settings.transfer}",
+            ),
             *self._rearrangement(),
             *self.model_plan(),
             ("memory", f"about {_megabytes(self.memory_estimate())} MB"),
-            *((f"  {name}", f"{_megabytes(count)} MB") for name, count in self.memory_parts().items()),
+            *(
+                (f"  {name}", f"{_megabytes(count)} MB")
+                for name, count in self.memory_parts().items()
+            ),
         ]
 
     def model_plan(self, measured: float | None = None) -> list[tuple[str, str]]:
         """Return the models in words, with their shares of memory and time.
 
         Args:
-            measured: how long a step takes on the machine at hand [s]; None: as where the prices were measured.
+            measured: how long a step takes on the machine at hand [s]; None: as where the prices
+                were measured.
         """
         cells, particles = math.prod(self.covered_counts), self.particle_estimate()
         listed = prices(self.scene.simulator, self.dimension)
-        return model_lines(self.models(), listed, cells, particles, memory=sum(self.memory_parts().values()), measured=measured)
+        return model_lines(
+            self.models(),
+            listed,
+            cells,
+            particles,
+            memory=sum(self.memory_parts().values()),
+            measured=measured,
+        )
 
     def _rearrangement(self) -> list[tuple[str, str]]:
         """Return what moves particles apart from the flow."""
         lines, correction, reseed = [], self.correction, self.particles.reseed
         band = self.particles.narrow_band
         if band is not None:
-            lines.append(("narrow band", f"particles within {band.width:g} cells of the surface, the grid stores the rest"))
+            lines.append(
+                (
+                    "narrow band",
+                    f"particles within {band.width:g} cells of the surface, the grid stores the "
+                    "rest",
+                )
+            )
         if correction is not None:
             most, when = correction.largest(self.particles.per_axis), _steps(correction.every)
             if self.density_correction is None:
-                when += f" if more than {100.0 * self.most_crowded:.2g} % of the material exceeds it"
-            lines.append(("density", f"at most {most:.4g} times the density at rest, corrected {when}"))
+                when += (
+                    f" if more than {100.0 * self.most_crowded:.2g} % of the material exceeds it"
+                )
+            lines.append(
+                ("density", f"at most {most:.4g} times the density at rest, corrected {when}")
+            )
         if reseed is not None:
             least, many = self.particles.reseed_range(self.dimension)
-            lines.append(("reseeding", f"{least} to {many} particles a cell, {_steps(reseed.every)}"))
+            lines.append(
+                ("reseeding", f"{least} to {many} particles a cell, {_steps(reseed.every)}")
+            )
         return lines
 
     def memory_parts(self) -> dict[str, int]:
         """Return about how much memory each part of a run takes at most on its device [bytes]; parts that it does not have are left out."""
         cells, settings, cut = self.counted_cells, self.particles, self.cuts_cells
         moving = any(solid.moves for solid in self.solid)
-        vectors = 3 + (self.dimension if settings.transfer == "apic" else 0) + (self.kept(()) is not None)
+        vectors = (
+            3 + (self.dimension if settings.transfer == "apic" else 0) + (self.kept(()) is not None)
+        )
         correction = CORRECTION_BYTES + CUT_CORRECTION_BYTES * cut + EVEN_BYTES * self.keeps_volume
         parts = {
             "grid": cells * (GRID_BYTES + 4 * self.dimension * (settings.transfer == "flip")),
@@ -330,10 +424,16 @@ class ParticleScene(Scene):
 
     def _surface_bytes(self) -> int:
         """Return what the lattice of a surface mesh takes, and a mesh as large as the domain's sides [bytes]."""
-        nx, ny, nz = (n * (self.output.surface_resolution or self.particles.per_axis) for n in self.covered_counts)
+        nx, ny, nz = (
+            n * (self.output.surface_resolution or self.particles.per_axis)
+            for n in self.covered_counts
+        )
         cells = nx * ny * (nz if self.dimension == 3 else 3)
         points = 2 * (nx * ny + ny * nz + nz * nx) if self.dimension == 3 else 2 * (nx + ny)
-        return cells * (MESH_LATTICE_BYTES + MESH_SOLID_BYTES * bool(self.solid)) + points * MESH_POINT_BYTES
+        return (
+            cells * (MESH_LATTICE_BYTES + MESH_SOLID_BYTES * bool(self.solid))
+            + points * MESH_POINT_BYTES
+        )
 
     def own_memory_parts(self) -> dict[str, int]:
         """Return what the material's own models take at most on the device [bytes]; parts that a scene does not have count 0."""
@@ -343,7 +443,10 @@ class ParticleScene(Scene):
         """Return about how much memory a run takes at most [bytes], without the program itself; the particles' making may take the most."""
         nx, ny, _ = self.covered_counts
         lattice = nx * ny * self.particles.per_axis**self.dimension
-        making = self.counted_cells * (GRID_BYTES + self.solve_bytes) // 2 + self.particle_estimate() * SEEDING_BYTES
+        making = (
+            self.counted_cells * (GRID_BYTES + self.solve_bytes) // 2
+            + self.particle_estimate() * SEEDING_BYTES
+        )
         return max(super().memory_estimate(), making + lattice * LATTICE_BYTES)
 
     @property

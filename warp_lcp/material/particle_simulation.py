@@ -16,7 +16,12 @@ from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window
 from warp_lcp.grid.transfer import accelerate, faces_to_particles, particles_to_faces
 from warp_lcp.grid.vicinity import Vicinity
 from warp_lcp.material.coverage import Coverage, carry_over, cells_between, pace_of, travel
-from warp_lcp.material.particle_assembly import Parts, make_flights, make_particle_volume, make_surface_mesh
+from warp_lcp.material.particle_assembly import (
+    Parts,
+    make_flights,
+    make_particle_volume,
+    make_surface_mesh,
+)
 from warp_lcp.material.particle_checkpoints import ParticleCheckpoints
 from warp_lcp.material.particle_log import Moved, Row, columns, solve_row, totals_row
 from warp_lcp.material.particle_rearrangement import Rearrangement
@@ -30,33 +35,41 @@ from warp_lcp.rows.memory import Scalar
 from warp_lcp.rows.program import LaunchGraph, copy
 from warp_lcp.simulation import NoStopwatch, SimulationFailed, StepFailed, Stopwatch
 
-CONTACTS_MISSED = 1e-2  # relative residual of bodies' contacts: what gravity makes in a step is wrong by a hundredth, and bodies creep
+# relative residual of bodies' contacts: what gravity makes in a step is wrong by a hundredth, and
+# bodies creep
+CONTACTS_MISSED = 1e-2
 
 
 class ParticleSimulation(ParticleCheckpoints):
     """Particles, the fields that they share, and the parts of a step around a solve, for a subclass to call in its own `step`.
 
-    Particles have the velocities of the middle of the last step, the grid in a step those of its middle: forces act for `kick_dt`, half of
-    the last step and half of this one, and then particles move for all of it (the leapfrog of Verlet). One solve a step so makes a scheme
-    that is its own inverse in time, whatever the steps' lengths: what flies goes along its parabola.
+    Particles have the velocities of the middle of the last step, the grid in a step those of its
+    middle: forces act for `kick_dt`, half of the last step and half of this one, and then particles
+    move for all of it (the leapfrog of Verlet). One solve a step so makes a scheme that is its own
+    inverse in time, whatever the steps' lengths: what flies goes along its parabola.
 
-    The grid's part says what of it this process works on. On several ranks making a simulation, `stable_dt`, `step`, `mark`, `frame` and
-    `restore_pieces` are collective and give every rank the same numbers, or raise the same error on all: rows of the log are of the whole
-    material; a frame shows this rank's particles and cells. What another rank knows comes in where the chain of dependence needs it:
-    particles a cell from the cut before they are brought to the faces; velocities and weights of the faces; what a material finds of its
-    cells; the solve, which is one of all ranks; the velocity that it leaves, and again while that is continued into air and walls. All of
-    it is computed by the same kernels from the same numbers in the same order as by one process, so that runs on any number of ranks
-    differ by the rounding in the solver and in sums over all particles alone.
+    The grid's part says what of it this process works on. On several ranks making a simulation,
+    `stable_dt`, `step`, `mark`, `frame` and `restore_pieces` are collective and give every rank the
+    same numbers, or raise the same error on all: rows of the log are of the whole material; a frame
+    shows this rank's particles and cells. What another rank knows comes in where the chain of
+    dependence needs it: particles a cell from the cut before they are brought to the faces;
+    velocities and weights of the faces; what a material finds of its cells; the solve, which is one
+    of all ranks; the velocity that it leaves, and again while that is continued into air and walls.
+    All of it is computed by the same kernels from the same numbers in the same order as by one
+    process, so that runs on any number of ranks differ by the rounding in the solver and in sums
+    over all particles alone.
 
-    A step calls `begin_step`, `window` and `particles_to_grid`; changes `velocity` by the laws of its material; then calls
-    `extrapolate_velocity`, `grid_to_particles` and `move`, and returns the log columns of `logged`. Until `move` the state is
-    unchanged except for the order of the particles, so that a solve may fail: all of it is in the context `attempt`.
+    A step calls `begin_step`, `window` and `particles_to_grid`; changes `velocity` by the laws of
+    its material; then calls `extrapolate_velocity`, `grid_to_particles` and `move`, and returns the
+    log columns of `logged`. Until `move` the state is unchanged except for the order of the
+    particles, so that a solve may fail: all of it is in the context `attempt`.
 
-    Rigid bodies take part by themselves: `begin_step` starts their step and `move` ends it. In between the subclass gives them the impulses
-    of its solve and calls `solve_contacts`.
+    Rigid bodies take part by themselves: `begin_step` starts their step and `move` ends it. In
+    between the subclass gives them the impulses of its solve and calls `solve_contacts`.
 
-    With `parts`, `particles`, `outlets` and `bodies` of `particle_assembly` it has a Simulation's clock, time
-    step, checkpoints, resampling, notes and columns; `step` and `frame` are the subclass's.
+    With `parts`, `particles`, `outlets` and `bodies` of `particle_assembly` it has a Simulation's
+    clock, time step, checkpoints, resampling, notes and columns; `step` and `frame` are the
+    subclass's.
 
     Args:
         scene: what to simulate.
@@ -74,18 +87,21 @@ class ParticleSimulation(ParticleCheckpoints):
         particles: the material, but for its spray.
         velocity: of the last step on the faces, one field a component [m/s].
         weights: of the particles on each component's faces, in the last step.
-        flights: gives bodies in flight their momenta back; None: the material has none, or none that can be told.
+        flights: gives bodies in flight their momenta back; None: the material has none, or none
+            that can be told.
         gravity: [m/s^2], shape (3,).
         particle_mass: [kg]; 2-D: [kg/m].
         layers: how far the velocity is continued into air and walls, in faces.
-        reach: how far from particles a step touches cells; more than `layers` where a subclass needs it.
+        reach: how far from particles a step touches cells; more than `layers` where a subclass
+            needs it.
         time: [s].
         step_count: steps done.
         last_dt: length of the last step [s], 0 before the first.
         kick_dt: how long forces act in the step that has begun [s].
         watch: what the stages of a step are measured with.
         sides: joins the ends of axes without an end; None: there are none.
-        diagnostics: are called before the totals of particles that have moved, to launch what is read with them.
+        diagnostics: are called before the totals of particles that have moved, to launch what is
+            read with them.
         vicinity: finds the cells that a step must visit; None: all around the particles.
     """
 
@@ -107,14 +123,18 @@ class ParticleSimulation(ParticleCheckpoints):
     ) -> None:
         """Allocate the fields, fill the sources that run at the start and sort the particles."""
         self.scene, self.particles, self.outlets, self.bodies = scene, particles, outlets, bodies
-        self._bodies_at_start = [body.state() for body in bodies.bodies] if bodies is not None else []
+        self._bodies_at_start = (
+            [body.state() for body in bodies.bodies] if bodies is not None else []
+        )
         self.time, self.step_count, self.last_dt, self.kick_dt = 0.0, 0, 0.0, 0.0
         self._make_parts = make_parts
         self.diagnostics: list[Callable[[], None]] = []
         self._velocity_before = np.zeros(3)  # mean of the particles at the start of the step [m/s]
         self.watch: Stopwatch = NoStopwatch()
         self.gravity = np.array([*scene.physics.gravity, 0.0][:3])
-        self.particle_mass = scene.physics.density * grid.cell_volume / scene.particles.per_axis**grid.dimension
+        self.particle_mass = (
+            scene.physics.density * grid.cell_volume / scene.particles.per_axis**grid.dimension
+        )
         self.layers = self.reach = math.ceil(scene.time.cfl) + 2
         self._coverage, self.spray = coverage, spray or Spray(grid, (), 0, active=False)
         others = set(vars(self))
@@ -132,16 +152,23 @@ class ParticleSimulation(ParticleCheckpoints):
         self.sources, self.band = parts.sources, parts.band
         self._faces_know = False  # the velocity of the particles, around them
         self._columns: tuple[str, ...] | None = None  # of the log, once they are asked for
-        self._ends = grid.extent - 0.5 * MARGIN * grid.spacing  # [m]; a tent at the very end would reach beyond what is stored
+        # [m]; a tent at the very end would reach beyond what is stored
+        self._ends = grid.extent - 0.5 * MARGIN * grid.spacing
         self.active, self.kicks = ActiveWindow(grid.everywhere), [Scalar() for _ in range(3)]
         self.sides, at_once = parts.boundary.sides, grid.part.at_once
-        self._transfer_to_grid = LaunchGraph(grid.device, self._launch_particles_to_grid, at_once=at_once)
+        self._transfer_to_grid = LaunchGraph(
+            grid.device, self._launch_particles_to_grid, at_once=at_once
+        )
         self._extrapolation = LaunchGraph(grid.device, self._launch_extrapolation, at_once=at_once)
-        at_once |= grid.barriers is not None  # beside those FLIP copies velocities, as many as there are
-        self._transfer_to_particles = LaunchGraph(grid.device, self._launch_grid_to_particles, at_once=at_once)
+        # beside those FLIP copies velocities, as many as there are
+        at_once |= grid.barriers is not None
+        self._transfer_to_particles = LaunchGraph(
+            grid.device, self._launch_grid_to_particles, at_once=at_once
+        )
         self.velocity, self.weights = grid.faces(), grid.faces()
         self._saved = grid.faces() if scene.particles.transfer == "flip" else None
-        if not (grid.part.shared or self.band is not None or scene.endless):  # without an interior, and ends where the grid does
+        # without an interior, and ends where the grid does
+        if not (grid.part.shared or self.band is not None or scene.endless):
             self.vicinity = Vicinity(grid, self.vicinity)
         self.flights = make_flights(scene, grid, self.boundary)
         self.rearrangement = Rearrangement(scene, grid, self.boundary)
@@ -184,15 +211,22 @@ class ParticleSimulation(ParticleCheckpoints):
         """Go on on another grid if the material leaves this one in a step or is much smaller, or in other boxes of ranks."""
         if self.grid.part.should_rebalance(self.step_count):
             self.rebalance()
-        if self._coverage is None or (self._coverage.domain == self.grid and not self._coverage.active and not self.scene.domain.boundless):
+        if self._coverage is None or (
+            self._coverage.domain == self.grid
+            and not self._coverage.active
+            and not self.scene.domain.boundless
+        ):
             return
         way = travel(totals.max_speed, float(np.linalg.norm(self.gravity)), dt, self.grid.spacing)
-        grow = self.reach + 3 + way  # `window`, a cell off the grid's end, where the step brings the material
+        # `window`, a cell off the grid's end, where the step brings the material
+        grow = self.reach + 3 + way
         low, high = cells_between(totals.low, totals.high, self.grid.spacing, grow)
         if self.scene.domain.boundless and (trouble := self._coverage.beyond(high)):
             raise SimulationFailed(f"step {self.step_count}: {trouble}")
         filled = totals.count / self.scene.particles.per_axis**self.grid.dimension
-        grid = self._coverage.around(low, high, self.grid, pace_of(totals, dt, self.grid.spacing), filled=filled)
+        grid = self._coverage.around(
+            low, high, self.grid, pace_of(totals, dt, self.grid.spacing), filled=filled
+        )
         if grid != self.grid:
             with self.watch.stage("regridding", *self.velocity):
                 self.regrid(grid)
@@ -201,22 +235,40 @@ class ParticleSimulation(ParticleCheckpoints):
         """Return CFL dx / (v_max + sqrt(CFL g dx)) [s]; v_max is of the material, and of solids and sources in the time to come."""
         cfl, dx = self.scene.time.cfl, self.grid.spacing
         with self.watch.stage("diagnostics", self.particles.position, self.particles.velocity):
-            totals = self.particles.totals() if self.band is None else self.band.with_interior(self.particles.totals())
-        driven = [part.top_speed(self.time, self.scene.time.dt_max) for part in (self.boundary, self.sources) if part is not None]
+            totals = (
+                self.particles.totals()
+                if self.band is None
+                else self.band.with_interior(self.particles.totals())
+            )
+        driven = [
+            part.top_speed(self.time, self.scene.time.dt_max)
+            for part in (self.boundary, self.sources)
+            if part is not None
+        ]
         # gravity's own speed counts, so that a material at rest does not take off
-        speed = max(totals.max_speed, *driven) + math.sqrt(cfl * math.sqrt(self.gravity @ self.gravity) * dx)
+        speed = max(totals.max_speed, *driven) + math.sqrt(
+            cfl * math.sqrt(self.gravity @ self.gravity) * dx
+        )
         return cfl * dx / speed if speed > 0.0 else math.inf
 
     def events(self, until: float) -> list[float]:
         """Return the times [s] later than now, up to `until`, at which a source or drain starts or stops or a solid's velocity jumps."""
-        timed: list[Source | Drain] = [*(self.sources.sources if self.sources else ()), *(self.outlets.drains if self.outlets else ())]
-        times = (*self.boundary.kinks, *(time for part in timed for time in (part.start, part.stop)))
+        timed: list[Source | Drain] = [
+            *(self.sources.sources if self.sources else ()),
+            *(self.outlets.drains if self.outlets else ()),
+        ]
+        times = (
+            *self.boundary.kinks,
+            *(time for part in timed for time in (part.start, part.stop)),
+        )
         return [time for time in times if self.time < time <= until]
 
     def rebalance(self) -> None:
         """Go on in the boxes of ranks in which the busiest has least to do, if they are much better than those there are; collective."""
         with self.watch.stage("repartitioning", self.particles.position):
-            part = self.grid.part.rebalance(self.particles, self.scene.particles.per_axis**self.grid.dimension)
+            part = self.grid.part.rebalance(
+                self.particles, self.scene.particles.per_axis**self.grid.dimension
+            )
             if part is not None:
                 self.repartition(part)
 
@@ -249,7 +301,10 @@ class ParticleSimulation(ParticleCheckpoints):
         if self.spray.active:
             with self.watch.stage("spray", self.particles.position):
                 totals = self.spray.exchange(self.particles, totals, self.step_count, self.time, dt)
-        self.kick_dt, self._velocity_before = 0.5 * (self.last_dt + dt), self.spray.with_own(totals).velocity
+        self.kick_dt, self._velocity_before = (
+            0.5 * (self.last_dt + dt),
+            self.spray.with_own(totals).velocity,
+        )
         self._follow(totals, dt)
         with self.watch.stage("sort", *self.particles.arrays().values()):
             self.particles.arrange(self.step_count)
@@ -275,7 +330,8 @@ class ParticleSimulation(ParticleCheckpoints):
         residual = self.bodies.contact_residual
         if residual > CONTACTS_MISSED:
             raise StepFailed(
-                f"the rigid bodies' contacts are solved to a relative residual of {residual:.2e} only (allowed: {CONTACTS_MISSED}): "
+                f"the rigid bodies' contacts are solved to a relative residual of {residual:.2e} "
+                f"only (allowed: {CONTACTS_MISSED}): "
                 "bodies of very different masses press on each other"
             )
 
@@ -288,7 +344,11 @@ class ParticleSimulation(ParticleCheckpoints):
         """Return the cells that the particles can touch in a step."""
         low, high = (self.particles.cell_of(corner) for corner in (totals.low, totals.high))
         box = self.grid.window(low, high, grow=self.reach + 2, shift=1)
-        return box if self.vicinity is None else self.vicinity.window(box, self.particles, self.reach + 2, self.step_count)
+        return (
+            box
+            if self.vicinity is None
+            else self.vicinity.window(box, self.particles, self.reach + 2, self.step_count)
+        )
 
     def top_speed(self, totals: ParticleTotals) -> float:
         """Return the scale of the velocities that `particles_to_grid` leaves [m/s]."""
@@ -297,16 +357,28 @@ class ParticleSimulation(ParticleCheckpoints):
     def particles_to_grid(self, window: Window) -> None:
         """Bring the particles' velocities to the faces, and let gravity act on them for `kick_dt`."""
         p = self.particles
-        with self.watch.stage("particles-to-grid", *p.arrays().values(), *self.velocity, *self.weights):
+        with self.watch.stage(
+            "particles-to-grid", *p.arrays().values(), *self.velocity, *self.weights
+        ):
             for kick, change in zip(self.kicks, self.gravity * self.kick_dt, strict=True):
                 kick.value = float(change)
-            acts = tuple(kick.value != 0.0 for kick in self.kicks)  # gravity may be turned between steps
+            # gravity may be turned between steps
+            acts = tuple(kick.value != 0.0 for kick in self.kicks)
             self._transfer_to_grid.run(window, variant=(window.near is None, acts, p.runs is None))
 
     def _launch_particles_to_grid(self, window: Window) -> None:
         p = self.particles
         order = {"offsets": p.offsets, "runs": p.runs}
-        particles_to_faces(self.grid, p.position, p.velocity, p.affine, self.velocity, self.weights, window=window, **order)
+        particles_to_faces(
+            self.grid,
+            p.position,
+            p.velocity,
+            p.affine,
+            self.velocity,
+            self.weights,
+            window=window,
+            **order,
+        )
         if self.band is not None:
             self.band.blend(window, self.velocity, self.weights)
         for field, saved in zip(self.velocity, self._saved or (), strict=False):
@@ -315,38 +387,65 @@ class ParticleSimulation(ParticleCheckpoints):
         self.grid.part.fill(*self.velocity, *self.weights, *(self._saved or ()))
 
     def extrapolate_velocity(
-        self, window: Window, known: Sequence[wp.array], kind: wp.array, contact: wp.array, dt: float = 0.0
-    ) -> None:  # fmt: skip
+        self,
+        window: Window,
+        known: Sequence[wp.array],
+        kind: wp.array,
+        contact: wp.array,
+        dt: float = 0.0,
+    ) -> None:
         """Continue the velocity from the faces that a solve has made valid into air and walls, see `warp_lcp.material.wall`.
 
         Args:
             window: faces to consider.
-            known: int8 of each component (updated): 1 on valid faces, 0 on others, -1 inside solids of whole cells.
+            known: int8 of each component (updated): 1 on valid faces, 0 on others, -1 inside solids
+                of whole cells.
             kind: int8 of AIR, FLUID, SOLID.
-            contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED, see `warp_lcp.material.boundary_kernels`.
+            contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED, see
+                `warp_lcp.material.boundary_kernels`.
             dt: time step [s] that particles then move by.
 
         Raises:
             StepFailed: it is so fast that particles would leave the ghost cells of a rank.
         """
-        with self.watch.stage("extrapolation", *self.velocity, *self.weights, *known, kind, contact, *self.boundary.open):
+        with self.watch.stage(
+            "extrapolation",
+            *self.velocity,
+            *self.weights,
+            *known,
+            kind,
+            contact,
+            *self.boundary.open,
+        ):
             self._extrapolation.run(window, list(known), kind, contact, variant=window.near is None)
         cells = self.grid.part.cells_too_far(self.velocity, dt)
         if cells > 0.0:
             material, layers = self.scene.materials()[0], self.grid.part.layers - 1
             raise StepFailed(
-                f"step {self.step_count}: {material} would move {cells:.1f} cells, more than the ghost layers of a rank, {layers}"
+                f"step {self.step_count}: {material} would move {cells:.1f} cells, more than the "
+                f"ghost layers of a rank, {layers}"
             )
 
-    def _launch_extrapolation(self, window: Window, known: list[wp.array], kind: wp.array, contact: wp.array) -> None:
+    def _launch_extrapolation(
+        self, window: Window, known: list[wp.array], kind: wp.array, contact: wp.array
+    ) -> None:
         self._continue(window, known, kind, contact, self._layer_filled())
         if self.sources is not None:
             self.sources.hold(self.velocity, [])
         self.grid.part.fill(*self.velocity)
 
-    def _continue(self, window: Window, known: list[wp.array], kind: wp.array, contact: wp.array, join: Join | None) -> None:
+    def _continue(
+        self,
+        window: Window,
+        known: list[wp.array],
+        kind: wp.array,
+        contact: wp.array,
+        join: Join | None,
+    ) -> None:
         """Continue the velocity among the boundary's walls; `join` is called after each layer."""
-        self.boundary.extrapolate_velocity(window, self.velocity, self.weights, known, kind, contact, self.layers, join)
+        self.boundary.extrapolate_velocity(
+            window, self.velocity, self.weights, known, kind, contact, self.layers, join
+        )
 
     def _layer_filled(self) -> Join | None:
         """Return what is called with marks and field of a component when a layer of faces is filled: ghost cells, and ends, follow."""
@@ -360,11 +459,17 @@ class ParticleSimulation(ParticleCheckpoints):
 
         return join
 
-    def exchange(self, window: Window, kind: wp.array, phi: wp.array | None, contact: wp.array) -> None:
+    def exchange(
+        self, window: Window, kind: wp.array, phi: wp.array | None, contact: wp.array
+    ) -> None:
         """Exchange particles with the interior, if there is one; arguments as of `warp_lcp.material.narrow_band.NarrowBand`."""
         if self.band is not None:
-            with self.watch.stage("narrow band", *self.particles.arrays().values(), self.band.depth):
-                self.band.exchange(self.particles, window, kind, phi, contact, self.step_count, self._saved or ())
+            with self.watch.stage(
+                "narrow band", *self.particles.arrays().values(), self.band.depth
+            ):
+                self.band.exchange(
+                    self.particles, window, kind, phi, contact, self.step_count, self._saved or ()
+                )
 
     def grid_to_particles(self, window: Window, kind: wp.array, dt: float) -> None:
         """Find the bodies in flight, and give the particles the velocity of the faces.
@@ -378,23 +483,35 @@ class ParticleSimulation(ParticleCheckpoints):
         particles.drop_ghosts()
         if self.flights is not None:
             with self.watch.stage("bodies in flight", particles.position):
-                self.flights.begin(particles, window, self.weights, kind, dt, self.gravity * self.kick_dt)
+                self.flights.begin(
+                    particles, window, self.weights, kind, dt, self.gravity * self.kick_dt
+                )
         self._faces_know = True
         with self.watch.stage("grid-to-particles", *particles.arrays().values(), *self.velocity):
             self._transfer_to_particles.run()
 
     def _launch_grid_to_particles(self) -> None:
         p, flip = self.particles, self.scene.particles.flip_ratio if self._saved else 0.0
-        faces_to_particles(self.grid, self.velocity, p.position, p.velocity, p.affine, saved=self._saved, flip=flip)
+        faces_to_particles(
+            self.grid, self.velocity, p.position, p.velocity, p.affine, saved=self._saved, flip=flip
+        )
 
-    def move(self, dt: float, window: Window, density: wp.array | None = None, contact: wp.array | None = None) -> Row:
+    def move(
+        self,
+        dt: float,
+        window: Window,
+        density: wp.array | None = None,
+        contact: wp.array | None = None,
+    ) -> Row:
         """Move particles and solids by dt [s], exchange particles with sources and outlets, even them out, and advance the clock.
 
         Args:
             dt: time step [s].
             window: of the step.
-            density: of the particles before they move, in units of that at rest; None: no step has found it yet.
-            contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED: the contact with walls in the step; None: not known.
+            density: of the particles before they move, in units of that at rest; None: no step has
+                found it yet.
+            contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED: the contact with walls in the step;
+                None: not known.
 
         Returns:
             What the log says of it and of the particles.
@@ -409,7 +526,9 @@ class ParticleSimulation(ParticleCheckpoints):
         if self.band is not None:
             with self.watch.stage("narrow band", self.band.depth, *self.velocity):
                 self.band.carry(self.velocity, dt)
-        exchanged = self._exchange(dt) if self.outlets is not None or self.sources is not None else {}
+        exchanged = (
+            self._exchange(dt) if self.outlets is not None or self.sources is not None else {}
+        )
         if not early:
             after = self._totals_after_move("after")
             stopped, pushed, stuck = self.met()
@@ -417,18 +536,34 @@ class ParticleSimulation(ParticleCheckpoints):
         if self.rearrangement.due(self.step_count):
             fill = self.band.fill_interior if self.band is not None else None
             window = self._everywhere() if early else self.window(after)
-            rearranged |= self.rearrangement.apply(self.particles, window, self.step_count, dt, self.watch, fill, contact)
-            if self.outlets is not None:  # the density correction may push particles out through open sides
-                exchanged["departed"] += int(self.grid.part.ranks.sum(self.outlets.remove_departed(self.particles)))
+            rearranged |= self.rearrangement.apply(
+                self.particles, window, self.step_count, dt, self.watch, fill, contact
+            )
+            # the density correction may push particles out through open sides
+            if self.outlets is not None:
+                exchanged["departed"] += int(
+                    self.grid.part.ranks.sum(self.outlets.remove_departed(self.particles))
+                )
             if early:
-                stopped, pushed, stuck = self.met()  # as read with the solve, before particles have been displaced
-            if early or self.rearrangement.moved or self.outlets is not None or self.grid.part.shared:
+                # as read with the solve, before particles have been displaced
+                stopped, pushed, stuck = self.met()
+            if (
+                early
+                or self.rearrangement.moved
+                or self.outlets is not None
+                or self.grid.part.shared
+            ):
                 after = self._totals_after_move("after the density correction of")
         self.particles.totals_stay(True)
         self.time += dt
         self.step_count += 1
         self.last_dt = dt
-        return self._totals_row(after, dt) | {"stopped": stopped, "pushed": pushed, "stuck": stuck} | rearranged | exchanged
+        return (
+            self._totals_row(after, dt)
+            | {"stopped": stopped, "pushed": pushed, "stuck": stuck}
+            | rearranged
+            | exchanged
+        )
 
     def monitor_density(self, window: Window, density: wp.array | None) -> None:
         """Measure the density at the start of a step, before anything moves, if that has not been done.
@@ -443,8 +578,16 @@ class ParticleSimulation(ParticleCheckpoints):
     @property
     def _monitored(self) -> bool:
         """Whether a GPU knows what a density correction is decided by before particles move, and need not measure them in between."""
-        kept = self.grid.part.shared or self.band is not None or self.outlets is not None or self.sources is not None or self.spray.active
-        return self.grid.device.is_cuda and not kept and self.rearrangement.has_looked(self.step_count)
+        kept = (
+            self.grid.part.shared
+            or self.band is not None
+            or self.outlets is not None
+            or self.sources is not None
+            or self.spray.active
+        )
+        return (
+            self.grid.device.is_cuda and not kept and self.rearrangement.has_looked(self.step_count)
+        )
 
     def _everywhere(self) -> Window:
         """Return all cells, as the step's `active` window."""
@@ -491,21 +634,34 @@ class ParticleSimulation(ParticleCheckpoints):
     def columns(self) -> tuple[str, ...]:
         """Return the names of the log's columns, see `warp_lcp.material.particle_log.columns`."""
         told = {
-            **{"stopped": True, "pushed": self.boundary.moves, "stuck": self.boundary.moves, "interior_density": self.band is not None},
+            **{
+                "stopped": True,
+                "pushed": self.boundary.moves,
+                "stuck": self.boundary.moves,
+                "interior_density": self.band is not None,
+            },
             **dict.fromkeys(self.rearrangement.columns(), True),
             "spray": self.spray.active,
             "emitted": bool(self.scene.source),
             "drained": bool(self.scene.drain),
             "departed": bool(self.scene.domain.open),
         }
-        return columns(self.own_columns(), told, self.bodies.columns() if self.bodies is not None else ())
+        return columns(
+            self.own_columns(), told, self.bodies.columns() if self.bodies is not None else ()
+        )
 
     def notes(self) -> list[str]:
         """Return warnings and facts worth a line at the start of a run."""
-        cells, covered = (" x ".join(map(str, n[: self.grid.dimension])) for n in (self.grid.domain_counts, self.grid.counts))
+        cells, covered = (
+            " x ".join(map(str, n[: self.grid.dimension]))
+            for n in (self.grid.domain_counts, self.grid.counts)
+        )
         follows = self.grid.whole is not None and not self.grid.part.shared
         part = f", of which the grid covers {covered} around the material" if follows else ""
-        first = f"{sum(self.particles.exchange.counts)} particles, {cells} cells of {self.grid.spacing:.4g} m{part}"
+        first = (
+            f"{sum(self.particles.exchange.counts)} particles, {cells} cells of "
+            f"{self.grid.spacing:.4g} m{part}"
+        )
         return [first, *self.grid.part.notes(), *self.scene.notes(), *self._notes]
 
     def checked_totals(self, when: str) -> ParticleTotals:
@@ -515,20 +671,30 @@ class ParticleSimulation(ParticleCheckpoints):
             when: where in the step, such as `after`, for the message.
 
         Raises:
-            SimulationFailed: a value is not finite, a particle lies outside the domain, or not all are there; on all ranks.
+            SimulationFailed: a value is not finite, a particle lies outside the domain, or not all
+                are there; on all ranks.
         """
         with self.watch.stage("diagnostics", self.particles.position, self.particles.velocity):
             totals = self.particles.totals()
         end = self._ends
         inside = all(
-            low >= 0.0 and high <= most for low, high, most in zip(totals.low[: self.grid.dimension], totals.high, end, strict=False)
+            low >= 0.0 and high <= most
+            for low, high, most in zip(
+                totals.low[: self.grid.dimension], totals.high, end, strict=False
+            )
         )
         if not (totals.finite and inside):
-            told = self.grid.part.ranks.collect(particle_trouble(self.particles, self.grid, totals, end))
-            raise SimulationFailed(f"{when} step {self.step_count}: {next((text for text in told if text), '')}")
+            told = self.grid.part.ranks.collect(
+                particle_trouble(self.particles, self.grid, totals, end)
+            )
+            raise SimulationFailed(
+                f"{when} step {self.step_count}: {next((text for text in told if text), '')}"
+            )
         if totals.count != self.particles.exchange.expected:
             expected = self.particles.exchange.expected
-            raise SimulationFailed(f"{when} step {self.step_count}: {totals.count} particles are left of {expected}")
+            raise SimulationFailed(
+                f"{when} step {self.step_count}: {totals.count} particles are left of {expected}"
+            )
         return totals if self.band is None else self.band.with_interior(totals)
 
     def _exchange(self, dt: float) -> dict[str, int]:
@@ -540,13 +706,23 @@ class ParticleSimulation(ParticleCheckpoints):
                     swallowed, gone = outlets.apply(particles, *span)
                     drained, departed = drained + swallowed, departed + gone
             emitted = self.sources.emit(self.particles, *span) if self.sources is not None else 0
-        emitted, drained, departed = self.grid.part.ranks.sum(np.array([emitted, drained, departed])).tolist()
+        emitted, drained, departed = self.grid.part.ranks.sum(
+            np.array([emitted, drained, departed])
+        ).tolist()
         return {"emitted": emitted, "drained": drained, "departed": departed}
 
     def _totals_row(self, totals: ParticleTotals, dt: float) -> Row:
         moved = Moved(self.particle_mass, self.gravity, self._velocity_before, dt, self.kick_dt)
-        density, flying = self.band.mean_density if self.band is not None else None, self.spray.particles.count
-        row = totals_row(self.spray.with_own(totals), moved, sum(self.particles.exchange.counts) + flying, self.grid.spacing)
+        density, flying = (
+            self.band.mean_density if self.band is not None else None,
+            self.spray.particles.count,
+        )
+        row = totals_row(
+            self.spray.with_own(totals),
+            moved,
+            sum(self.particles.exchange.counts) + flying,
+            self.grid.spacing,
+        )
         return row | {"interior_density": density, "spray": flying}
 
     def admits(self, points: np.ndarray) -> np.ndarray:

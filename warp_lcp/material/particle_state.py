@@ -17,11 +17,17 @@ def signature(scene: ParticleScene, grid: StaggeredGrid) -> np.ndarray:
     settings = scene.particles
     transfer = ("apic", "flip", "pic").index(settings.transfer)
     counts = grid.domain_counts
-    return np.array([*counts, grid.dimension, grid.spacing, settings.per_axis, transfer], dtype=np.float64)
+    return np.array(
+        [*counts, grid.dimension, grid.spacing, settings.per_axis, transfer], dtype=np.float64
+    )
 
 
 def check_state(
-    state: Mapping[str, np.ndarray], expected: Mapping[str, np.ndarray], *, changing: Collection[str] = (), solids_move: bool = False
+    state: Mapping[str, np.ndarray],
+    expected: Mapping[str, np.ndarray],
+    *,
+    changing: Collection[str] = (),
+    solids_move: bool = False,
 ) -> None:
     """Refuse a state that is not of the same scene.
 
@@ -38,9 +44,14 @@ def check_state(
     if missing:
         raise ValueError(f"the state lacks {', '.join(missing)}: it does not belong to this scene")
     if not np.array_equal(state["signature"], expected["signature"]):
-        raise ValueError("the state's grid, spacing, number of particles a cell or transfer differ from this scene's")
+        raise ValueError(
+            "the state's grid, spacing, number of particles a cell or transfer differ from this "
+            "scene's"
+        )
     if "interior" in state and "interior" not in expected:
-        raise ValueError("the state's particles are a narrow band: this scene has no particles.narrow_band")
+        raise ValueError(
+            "the state's particles are a narrow band: this scene has no particles.narrow_band"
+        )
     for name, value in expected.items():
         given = np.asarray(state[name])
         if name in changing:
@@ -54,7 +65,9 @@ def check_state(
         raise ValueError("the state's solids are not this scene's")
 
 
-def other_spacing(state: Mapping[str, np.ndarray], scene: ParticleScene, grid: StaggeredGrid) -> float:
+def other_spacing(
+    state: Mapping[str, np.ndarray], scene: ParticleScene, grid: StaggeredGrid
+) -> float:
     """Return the cells' width [m] of a state of the same scene on another grid.
 
     Raises:
@@ -62,23 +75,37 @@ def other_spacing(state: Mapping[str, np.ndarray], scene: ParticleScene, grid: S
     """
     before, now = np.asarray(state.get("signature", np.zeros(7))), signature(scene, grid)
     size = before[:3] * before[4], now[:3] * now[4]
-    if not np.array_equal(before[[3, 5, 6]], now[[3, 5, 6]]) or not np.allclose(*(side[: grid.dimension] for side in size)):
-        raise ValueError("the state's domain, number of particles a cell or transfer differ from this scene's")
+    if not np.array_equal(before[[3, 5, 6]], now[[3, 5, 6]]) or not np.allclose(
+        *(side[: grid.dimension] for side in size)
+    ):
+        raise ValueError(
+            "the state's domain, number of particles a cell or transfer differ from this scene's"
+        )
     return float(before[4])
 
 
-def particle_trouble(particles: Particles, grid: StaggeredGrid, totals: ParticleTotals, end: np.ndarray) -> str:
+def particle_trouble(
+    particles: Particles, grid: StaggeredGrid, totals: ParticleTotals, end: np.ndarray
+) -> str:
     """Say which particles are not finite, or outside the domain, which ends at `end` [m]; "" if there are none."""
     position, velocity = particles.position.numpy(), particles.velocity.numpy()
     if totals.bad_velocities:
-        field, bad = "velocity", ~((velocity.astype(np.float64) ** 2).sum(axis=1) <= np.finfo(np.float32).max)
+        field, bad = (
+            "velocity",
+            ~((velocity.astype(np.float64) ** 2).sum(axis=1) <= np.finfo(np.float32).max),
+        )
     elif totals.bad_positions:
         field, bad = "position", ~np.isfinite(position).all(axis=1)
     else:
-        field, bad = "position", ((position < 0.0) | (position > end))[:, : grid.dimension].any(axis=1)
+        field, bad = (
+            "position",
+            ((position < 0.0) | (position > end))[:, : grid.dimension].any(axis=1),
+        )
     found, wrong = np.flatnonzero(bad), "outside the domain" if totals.finite else "not finite"
     if not len(found):
         return ""
-    k, j, i = np.unravel_index(int(particles.key.numpy()[found[0]]), grid.shape)  # of the cell that it was last sorted into
-    cell = tuple(int(c) - 1 + before for c, before in zip((i, j, k), grid.origin, strict=True))  # counted from 0
+    # of the cell that it was last sorted into
+    k, j, i = np.unravel_index(int(particles.key.numpy()[found[0]]), grid.shape)
+    # counted from 0
+    cell = tuple(int(c) - 1 + before for c, before in zip((i, j, k), grid.origin, strict=True))
     return f"{field} is {wrong} in cell (x, y, z) = {cell} ({len(found)} particles)"

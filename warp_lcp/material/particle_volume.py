@@ -30,14 +30,20 @@ class ParticleVolume:
         """Return the volumes `level_set`, the distance to the surface [m], < 0 inside, and `density`, in units of that at rest.
 
         Args:
-            particles: of the material; where it is needed, on CUDA, they are sorted, as the next step would do.
+            particles: of the material; where it is needed, on CUDA, they are sorted, as the next
+                step would do.
             fill: adds to the density in a window what no particle stands for.
         """
         if particles.offsets is not None:
             particles.sort()
         grid, level_set = self._grid, self._level_set
-        level_set.update(particles, grid.everywhere, self._boundary.capacity, self._boundary.base, fill=fill)
+        level_set.update(
+            particles, grid.everywhere, self._boundary.capacity, self._boundary.base, fill=fill
+        )
         spacing, band = grid.spacing, level_set.limit * grid.spacing
         distance = grid.interior(level_set.phi.numpy()) * np.float32(spacing)
         density = grid.interior(level_set.density.numpy()).copy()
-        return [Volume("level_set", distance, spacing, band, grid.origin), Volume("density", density, spacing, origin=grid.origin)]
+        return [
+            Volume("level_set", distance, spacing, band, grid.origin),
+            Volume("density", density, spacing, origin=grid.origin),
+        ]

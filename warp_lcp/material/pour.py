@@ -26,15 +26,28 @@ def pour(simulation: ParticleSimulation, shape: MaterialProperties, name: str) -
     """
     grid, settings, boundary = simulation.grid, simulation.scene.particles, simulation.boundary
     if grid.whole is not None:
-        raise ValueError(f"{name}: the grid follows the material and may not cover this place; set domain.follow = false")
+        raise ValueError(
+            f"{name}: the grid follows the material and may not cover this place; set "
+            "domain.follow = false"
+        )
     cells = grid.interior(simulation.own_state()["cells"])
     free = (cells == wl.AIR) & (grid.interior(boundary.base.numpy()) != wl.SOLID)
     i, j, k = simulation.particles.cells_of(simulation.particles.position.numpy()).T
     free[k, j, i] = False  # where material has gone since the last solve
     region = region_of(shape.to_geometry(Path.cwd(), grid.dimension), boundary, grid.device)
-    points, _ = seed(grid, [region], free, per_axis=settings.per_axis, jitter=settings.jitter, random_seed=settings.seed)
+    points, _ = seed(
+        grid,
+        [region],
+        free,
+        per_axis=settings.per_axis,
+        jitter=settings.jitter,
+        random_seed=settings.seed,
+    )
     if not len(points):
-        raise ValueError(f"{name} holds no empty cell: it lies in solids, in material or outside the domain, or is too small")
+        raise ValueError(
+            f"{name} holds no empty cell: it lies in solids, in material or outside the domain, or "
+            "is too small"
+        )
     velocity = np.zeros((len(points), 3), dtype=np.float32)
     velocity[:, : grid.dimension] = shape.velocity or 0.0
     simulation.add(points, velocity)

@@ -24,18 +24,24 @@ COST = 8 * PARTICLE  # of a cell that wants particles, in cells of a usual pass
 class Reseeding:
     """Reseeding: sparse cells deep inside take particles from dense neighbors.
 
-    A flow draws particles together along some streamlines and apart along others. A density correction cures the first, but voids between
-    particles remain: they count as material as long as the surface does not see them, and the volume grows. A cell that no wall touches,
-    whose surroundings of 3^dimension cells are full, takes particles from neighbors that hold more than at rest, if it holds fewer than
-    `least`; and from those with more than `most`, until it holds as many as at rest. So nothing comes or goes:
+    A flow draws particles together along some streamlines and apart along others. A density
+    correction cures the first, but voids between particles remain: they count as material as long
+    as the surface does not see them, and the volume grows. A cell that no wall touches, whose
+    surroundings of 3^dimension cells are full, takes particles from neighbors that hold more than
+    at rest, if it holds fewer than `least`; and from those with more than `most`, until it holds as
+    many as at rest. So nothing comes or goes:
 
-    - mass: particles only move, to the emptiest part of the cell, by less than two cells along each axis;
-    - momentum and kinetic energy: each keeps its velocity and its gradient, which over this way differ from the flow's by as much as the
-      interpolation errs. Angular momentum and the center of mass change with the particles' places;
-    - the surface and bubbles of more than a cell: what is not full around is left alone. A whole region that is thin stays thin.
+    - mass: particles only move, to the emptiest part of the cell, by less than two cells along each
+      axis;
+    - momentum and kinetic energy: each keeps its velocity and its gradient, which over this way
+      differ from the flow's by as much as the interpolation errs. Angular momentum and the center
+      of mass change with the particles' places;
+    - the surface and bubbles of more than a cell: what is not full around is left alone. A whole
+      region that is thin stays thin.
 
-    The result is the same on every run. `apply` is collective: a rank does what its cells and those beside them do, whose particles it
-    knows as ghosts; after each direction all agree about how many particles cells hold.
+    The result is the same on every run. `apply` is collective: a rank does what its cells and those
+    beside them do, whose particles it knows as ghosts; after each direction all agree about how
+    many particles cells hold.
 
     Args:
         grid: the grid.
@@ -49,12 +55,27 @@ class Reseeding:
         ValueError: `least` <= `particles_a_cell` <= `most` does not hold.
     """
 
-    def __init__(self, grid: StaggeredGrid, boundary: Boundary, *, least: int, most: int, particles_a_cell: int, every: int) -> None:
+    def __init__(
+        self,
+        grid: StaggeredGrid,
+        boundary: Boundary,
+        *,
+        least: int,
+        most: int,
+        particles_a_cell: int,
+        every: int,
+    ) -> None:
         if not 1 <= least <= particles_a_cell <= most:
-            raise ValueError(f"least = {least}, most = {most}: must be at least 1, and {particles_a_cell} between them")
+            raise ValueError(
+                f"least = {least}, most = {most}: must be at least 1, and {particles_a_cell} "
+                "between them"
+            )
         self.grid, self.boundary, self.every = grid, boundary, every
         self.least, self.most, self.particles_a_cell = least, most, particles_a_cell
-        self._count, self._takers = grid.field(wp.int32), wp.zeros(grid.size, dtype=wp.int32, device=grid.device)
+        self._count, self._takers = (
+            grid.field(wp.int32),
+            wp.zeros(grid.size, dtype=wp.int32, device=grid.device),
+        )
         low, high = grid.part.owned.low, grid.part.owned.high
         beside = grid.window(low[::-1], [n - 1 for n in high[::-1]], grow=1).common(grid.domain)
         assert beside is not None, "a process has cells"
@@ -62,17 +83,26 @@ class Reseeding:
         self._inside = ActiveWindow(grid.domain)  # those of a step
         self._setting = self._settings()
         self._seed, self._list = Scalar(), ListMemory(grid.device)
-        self._finding, self._exchanging = (LaunchGraph(grid.device, f, at_once=grid.part.at_once) for f in (self._find, self._exchange))
+        self._finding, self._exchanging = (
+            LaunchGraph(grid.device, f, at_once=grid.part.at_once)
+            for f in (self._find, self._exchange)
+        )
         self._offsets = wp.zeros(grid.size + 1, dtype=wp.int32, device=grid.device)
-        self._numbers = wp.zeros(2, dtype=wp.int32, device=grid.device)  # of takers, and of particles moved
+        # of takers, and of particles moved
+        self._numbers = wp.zeros(2, dtype=wp.int32, device=grid.device)
         steps = [(-1, 0, 1) if axis < grid.dimension else (0,) for axis in (2, 1, 0)]
-        self._directions = sorted((d for d in itertools.product(*steps) if any(d)), key=lambda d: sum(map(abs, d)))
+        self._directions = sorted(
+            (d for d in itertools.product(*steps) if any(d)), key=lambda d: sum(map(abs, d))
+        )
 
     def _settings(self) -> typing.Any:
         """Return what is the same for all cells and steps, as kernels take it."""
         grid, s = self.grid, kernels.ReseedingSetting()
         s.planes, s.dx, s.inverse_dx = grid.planes, grid.spacing, 1.0 / grid.spacing
-        s.origin, s.across = wp.vec3i(*grid.origin), wp.vec2i(*(n + 2 for n in grid.domain_counts[:2]))
+        s.origin, s.across = (
+            wp.vec3i(*grid.origin),
+            wp.vec2i(*(n + 2 for n in grid.domain_counts[:2])),
+        )
         s.least, s.at_rest, s.most = self.least, self.particles_a_cell, self.most
         return s
 
@@ -88,7 +118,8 @@ class Reseeding:
         if not ranks.any(particles.count > 0):
             return 0
         particles.arrange(SORTED)
-        inside = window.common(self._asked)  # beyond open sides lies air without particles, and nothing beyond that
+        # beyond open sides lies air without particles, and nothing beyond that
+        inside = window.common(self._asked)
         self._seed.value = step
         if inside is not None:
             self._inside.move_to(inside)
@@ -108,23 +139,51 @@ class Reseeding:
         b, offsets = self.boundary, particles.offsets
         if offsets is None:
             offsets, count = self._offsets, particles.listed_count
-            launch(offset_kernel, self.grid.size + 1, [particles.key, count, offsets], device=self.grid.device)
+            launch(
+                offset_kernel,
+                self.grid.size + 1,
+                [particles.key, count, offsets],
+                device=self.grid.device,
+            )
         clear(self._numbers)
         window.launch(kernels.count_kernel, [offsets, self._count])
         self.grid.part.fill(self._count)
         if not nothing:
             base = b.base if self.grid.barriers is None else self.grid.barriers.calm
-            inputs = [self._setting, self._count, b.capacity, base, b.touch, self._takers, self._numbers]
+            inputs = [
+                self._setting,
+                self._count,
+                b.capacity,
+                base,
+                b.touch,
+                self._takers,
+                self._numbers,
+            ]
             self._inside.launch(kernels.find_kernel, inputs)
 
     def _exchange(self, particles: Particles) -> None:
         """Launch what lets cells take from their neighbors, one direction after another."""
         offsets = self._offsets if particles.offsets is None else particles.offsets
         count = int(self._list.count.value)
-        inputs = [self._seed, self._setting, self._takers, offsets, self._count, particles.position, self._numbers]
+        inputs = [
+            self._seed,
+            self._setting,
+            self._takers,
+            offsets,
+            self._count,
+            particles.position,
+            self._numbers,
+        ]
         for direction in self._directions:
             given = [wp.vec3i(*direction), *inputs]
-            launch_list(kernels.exchange_kernel, count, given, device=self.grid.device, cost=COST, ordered=True)
+            launch_list(
+                kernels.exchange_kernel,
+                count,
+                given,
+                device=self.grid.device,
+                cost=COST,
+                ordered=True,
+            )
             self.grid.part.fill(self._count)
 
     def _held(self) -> np.ndarray | None:

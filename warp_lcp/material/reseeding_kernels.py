@@ -7,8 +7,12 @@ from warp_lcp.grid.cell_kernel import F32, I8, I32, INTS, POINTS, U8, cell_kerne
 from warp_lcp.material.boundary_kernels import TOUCHES
 from warp_lcp.operators.grid_poisson import AIR
 
-JITTER = 0.25  # of half a cell: how far from the center of its part of a cell a particle is put at random, as at the start
-FULL = 0.75  # of what the cells around one can hold: less, and it is near a surface (a level one: 2/3), or in a bubble of more than a cell
+# of half a cell: how far from the center of its part of a cell a particle is put at random, as at
+# the start
+JITTER = 0.25
+# of what the cells around one can hold: less, and it is near a surface (a level one: 2/3), or in a
+# bubble of more than a cell
+FULL = 0.75
 
 _AIR = wp.constant(wp.int8(AIR))
 _TOUCHES = wp.constant(wp.uint8(TOUCHES))
@@ -36,7 +40,18 @@ def count_kernel(k, j, i, offsets: INTS, count: I32):
 
 
 @cell_kernel("warp_lcp.material.reseeding", ordered=True)
-def find_kernel(k, j, i, s: ReseedingSetting, count: I32, capacity: F32, base: I8, touch: U8, takers: INTS, numbers: INTS):
+def find_kernel(
+    k,
+    j,
+    i,
+    s: ReseedingSetting,
+    count: I32,
+    capacity: F32,
+    base: I8,
+    touch: U8,
+    takers: INTS,
+    numbers: INTS,
+):
     """List open cells that no wall touches, that want particles, and whose surroundings, themselves included, are full but for a little.
 
     The order of the list differs from run to run on CUDA, and does not matter.
@@ -58,7 +73,14 @@ def find_kernel(k, j, i, s: ReseedingSetting, count: I32, capacity: F32, base: I
 
 
 @wp.func
-def emptiest(planes: int, cell: wp.vec3i, start: int, here: int, inverse_dx: float, position: wp.array(dtype=wp.vec3)):
+def emptiest(
+    planes: int,
+    cell: wp.vec3i,
+    start: int,
+    here: int,
+    inverse_dx: float,
+    position: wp.array(dtype=wp.vec3),
+):
     """Return which of the 2^dimension parts of a cell (x, y, z) held the fewest of its particles `start` ... `start + here` at the sort."""
     part = int(0)
     fewest = int(1 << 30)
@@ -66,7 +88,9 @@ def emptiest(planes: int, cell: wp.vec3i, start: int, here: int, inverse_dx: flo
         inside = int(0)
         for p in range(start, start + here):
             x = position[p] * inverse_dx + wp.vec3(1.0, 1.0, 1.0)
-            bits = wp.where(x[0] - float(cell[0]) >= 0.5, 1, 0) + wp.where(x[1] - float(cell[1]) >= 0.5, 2, 0)
+            bits = wp.where(x[0] - float(cell[0]) >= 0.5, 1, 0) + wp.where(
+                x[1] - float(cell[1]) >= 0.5, 2, 0
+            )
             if planes == 2:
                 bits += wp.where(x[2] - float(cell[2]) >= 0.5, 4, 0)
             if bits == q:
@@ -78,11 +102,20 @@ def emptiest(planes: int, cell: wp.vec3i, start: int, here: int, inverse_dx: flo
 
 
 @wp.func
-def take_from(cell: int, way: wp.vec3i, seed: int, s: ReseedingSetting, offsets: INTS, count: I32, position: POINTS, numbers: INTS):
+def take_from(
+    cell: int,
+    way: wp.vec3i,
+    seed: int,
+    s: ReseedingSetting,
+    offsets: INTS,
+    count: I32,
+    position: POINTS,
+    numbers: INTS,
+):
     """Let a cell that wants particles take some from the neighbor in one direction.
 
-    No race, though a cell may be the neighbor of another that takes: whoever gives holds more than `at_rest` before and no less after,
-    whoever takes holds less before and no more after.
+    No race, though a cell may be the neighbor of another that takes: whoever gives holds more than
+    `at_rest` before and no less after, whoever takes holds less before and no more after.
     """
     i = cell % count.shape[2]
     j = (cell // count.shape[2]) % count.shape[1]
@@ -99,17 +132,35 @@ def take_from(cell: int, way: wp.vec3i, seed: int, s: ReseedingSetting, offsets:
     donor = offsets[other]
     here_too = offsets[other + 1] > donor  # its particles: those of another rank's cell may not be
     place = wp.vec3i(i, j, k) + s.origin
-    own = (place[2] * s.across[1] + place[1]) * s.across[0] + place[0]  # the same number in all parts of a grid
+    # the same number in all parts of a grid
+    own = (place[2] * s.across[1] + place[1]) * s.across[0] + place[0]
     first_part = emptiest(planes, place, start, here, s.inverse_dx, position)
     taken = int(0)
     while gives > at_rest and (has < least or (has < at_rest and gives > most)):
         part = (first_part + has - here) % (2 << planes)
         state = wp.rand_init(seed, own * 64 + has)
-        x = float(place[0] - 1) + 0.25 + 0.5 * float(part % 2) + 0.5 * JITTER * (wp.randf(state) - 0.5)
-        y = float(place[1] - 1) + 0.25 + 0.5 * float((part // 2) % 2) + 0.5 * JITTER * (wp.randf(state) - 0.5)
-        z = float(place[2] - 1) + 0.25 + 0.5 * float(part // 4) + 0.5 * JITTER * (wp.randf(state) - 0.5)
+        x = (
+            float(place[0] - 1)
+            + 0.25
+            + 0.5 * float(part % 2)
+            + 0.5 * JITTER * (wp.randf(state) - 0.5)
+        )
+        y = (
+            float(place[1] - 1)
+            + 0.25
+            + 0.5 * float((part // 2) % 2)
+            + 0.5 * JITTER * (wp.randf(state) - 0.5)
+        )
+        z = (
+            float(place[2] - 1)
+            + 0.25
+            + 0.5 * float(part // 4)
+            + 0.5 * JITTER * (wp.randf(state) - 0.5)
+        )
         if here_too:
-            position[donor + gives - 1] = wp.vec3(x * dx, y * dx, wp.where(planes == 2, z * dx, 0.0))
+            position[donor + gives - 1] = wp.vec3(
+                x * dx, y * dx, wp.where(planes == 2, z * dx, 0.0)
+            )
         gives -= 1
         has += 1
         taken += 1
@@ -120,7 +171,15 @@ def take_from(cell: int, way: wp.vec3i, seed: int, s: ReseedingSetting, offsets:
 
 @list_kernel("warp_lcp.material.reseeding")
 def exchange_kernel(
-    i, way: wp.vec3i, seed: int, s: ReseedingSetting, takers: INTS, offsets: INTS, count: I32, position: POINTS, numbers: INTS
+    i,
+    way: wp.vec3i,
+    seed: int,
+    s: ReseedingSetting,
+    takers: INTS,
+    offsets: INTS,
+    count: I32,
+    position: POINTS,
+    numbers: INTS,
 ):
     """Let each cell that wants particles take some from the neighbor in one direction."""
     take_from(takers[i], way, seed, s, offsets, count, position, numbers)

@@ -58,13 +58,16 @@ class Sources:
 
     The area of the inflow is that of the cells' faces.
 
-    While a source runs, the faces of its cells have its velocity, and the pressure sees the cells as a solid that moves at it: what leaves
-    them is area times velocity, whatever is in the way. Material behind a source is not drawn in. Particles lie on a jittered lattice that
-    moves with the source; those that the lattice brings into the cells in a step are new. It is a function of time alone, so that an
-    resumed run is bitwise identical. A source that starts fills its cells, unless they are full already.
+    While a source runs, the faces of its cells have its velocity, and the pressure sees the cells
+    as a solid that moves at it: what leaves them is area times velocity, whatever is in the way.
+    Material behind a source is not drawn in. Particles lie on a jittered lattice that moves with
+    the source; those that the lattice brings into the cells in a step are new. It is a function of
+    time alone, so that an resumed run is bitwise identical. A source that starts fills its cells,
+    unless they are full already.
 
-    A step need not end where a source starts or stops. What comes in is what the lattice brings in from start to stop, to the particle,
-    however the time is cut into steps; the flow has the source's velocity in the steps in whose middle it runs.
+    A step need not end where a source starts or stops. What comes in is what the lattice brings in
+    from start to stop, to the particle, however the time is cut into steps; the flow has the
+    source's velocity in the steps in whose middle it runs.
 
     Args:
         grid: the grid.
@@ -79,7 +82,14 @@ class Sources:
     """
 
     def __init__(
-        self, grid: StaggeredGrid, boundary: Boundary, sources: Sequence[Source], *, per_axis: int, jitter: float, random_seed: int
+        self,
+        grid: StaggeredGrid,
+        boundary: Boundary,
+        sources: Sequence[Source],
+        *,
+        per_axis: int,
+        jitter: float,
+        random_seed: int,
     ) -> None:
         self.grid, self.boundary, self.sources = grid, boundary, tuple(sources)
         self.per_axis, self.jitter, self.random_seed = per_axis, jitter, random_seed
@@ -91,8 +101,11 @@ class Sources:
         part = grid.part
         self._check_cells(part.ranks.sum(np.bincount(self._owner, minlength=len(self.sources))))
         low, high = np.array(part.owned.low) - 1, np.array(part.owned.high) - 1
-        self._emits = np.append(True, ((cells >= low) & (cells < high)).all(axis=1))  # by slot: whether the cell is this process's
-        self._boxes = [self._box(cells[self._owner == number]) for number in range(len(self.sources))]
+        # by slot: whether the cell is this process's
+        self._emits = np.append(True, ((cells >= low) & (cells < high)).all(axis=1))
+        self._boxes = [
+            self._box(cells[self._owner == number]) for number in range(len(self.sources))
+        ]
         device = grid.device
         self._fields = [
             wp.array(self._slots, dtype=wp.int32, device=device),
@@ -104,22 +117,39 @@ class Sources:
         self._counts = wp.zeros(len(cells), dtype=wp.int32, device=device)
         self._window: Window | None = None
         if len(cells):
-            self._window = grid.window((cells.min(axis=0) + 1)[::-1], (cells.max(axis=0) + 1)[::-1], grow=1)
+            self._window = grid.window(
+                (cells.min(axis=0) + 1)[::-1], (cells.max(axis=0) + 1)[::-1], grow=1
+            )
         self._moving_walls = boundary.velocity if not boundary.open else []
         self._running: list[bool] | None = None  # what the device knows of it
-        self._imposing, self._counting = (LaunchGraph(device, record) for record in (self._impose, self._count))
+        self._imposing, self._counting = (
+            LaunchGraph(device, record) for record in (self._impose, self._count)
+        )
         self._entering = LaunchGraph(device, self._enter)
-        self._nothing = *(np.zeros(0, dtype=np.int32) for _ in range(3)), np.zeros((0, 3), dtype=np.float32)
+        self._nothing = (
+            *(np.zeros(0, dtype=np.int32) for _ in range(3)),
+            np.zeros((0, 3), dtype=np.float32),
+        )
         self._span = HostArray(14, wp.float64, device)  # see `sources.h`
         self._lattice, self._memory = ListMemory(device), zeros(0, wp.int32, device)
-        self._points, self._found = dict.fromkeys(("entries", "slot", "filled", "point"), zeros(0, wp.int32, device)), list[np.ndarray]()
+        self._points, self._found = (
+            dict.fromkeys(("entries", "slot", "filled", "point"), zeros(0, wp.int32, device)),
+            list[np.ndarray](),
+        )
 
     def top_speed(self, time: float, span: float) -> float:
         """Return the largest speed of sources that run in a time span [m/s].
 
         From `time` to `time` + `span` [s].
         """
-        return max((float(np.linalg.norm(s.velocity)) for s in self.sources if s.start <= time + span and s.stop > time), default=0.0)
+        return max(
+            (
+                float(np.linalg.norm(s.velocity))
+                for s in self.sources
+                if s.start <= time + span and s.stop > time
+            ),
+            default=0.0,
+        )
 
     def supply(self, time: float, velocity: Faces, kind: wp.array) -> None:
         """Set the velocity of running sources on faces; close their cells to the pressure.
@@ -161,14 +191,20 @@ class Sources:
             now: at its end [s].
         """
         since = now if before is None else before
-        running = [number for number, source in enumerate(self.sources) if source.start <= now + NOW and source.stop > since + NOW]
+        running = [
+            number
+            for number, source in enumerate(self.sources)
+            if source.start <= now + NOW and source.stop > since + NOW
+        ]
         if not running:
             return 0
         entered = []
         for number in running:
             start = self.sources[number].start
             starts = before is None or start > before + NOW
-            found = self._entered(number, min(max(since, start), now) if starts else since, now, starts=starts)
+            found = self._entered(
+                number, min(max(since, start), now) if starts else since, now, starts=starts
+            )
             if len(found[-1]):
                 entered.append((number, found))
         if not entered and not self.grid.part.shared:  # ranks count together
@@ -177,7 +213,11 @@ class Sources:
         emitted = 0
         for number, found in entered:
             source, points = self.sources[number], self._new(held, *found)
-            particles.append(points, np.broadcast_to(source.velocity.astype(np.float32), points.shape), source.kept)
+            particles.append(
+                points,
+                np.broadcast_to(source.velocity.astype(np.float32), points.shape),
+                source.kept,
+            )
             emitted += len(points)
         return emitted
 
@@ -186,7 +226,8 @@ class Sources:
         for source, count in zip(self.sources, counts, strict=True):
             if count == 0:
                 raise ValueError(
-                    f"{source.name} holds no open cell's center: it is too small for cells of {self.grid.spacing:.4g} m, or lies in "
+                    f"{source.name} holds no open cell's center: it is too small for cells of "
+                    f"{self.grid.spacing:.4g} m, or lies in "
                     "solids, outside the domain or in an earlier source"
                 )
 
@@ -212,34 +253,49 @@ class Sources:
     def _count(self, particles: Particles) -> None:
         """Launch the count of the particles in each cell."""
         clear(self._counts)
-        numbers = [1.0 / self.grid.spacing, wp.vec3i(*self.grid.counts), wp.vec3i(*self.grid.origin)]
+        numbers = [
+            1.0 / self.grid.spacing,
+            wp.vec3i(*self.grid.counts),
+            wp.vec3i(*self.grid.origin),
+        ]
         inputs = [*numbers, self._fields[0], particles.position, self._counts]
-        launch_list(kernels.occupants_kernel, particles.count, inputs, device=self.grid.device, ordered=True)
+        launch_list(
+            kernels.occupants_kernel, particles.count, inputs, device=self.grid.device, ordered=True
+        )
 
-    def _entered(self, number: int, since: float, now: float, *, starts: bool) -> tuple[np.ndarray, ...]:
+    def _entered(
+        self, number: int, since: float, now: float, *, starts: bool
+    ) -> tuple[np.ndarray, ...]:
         """Find the points that a source's lattice has brought in since a time [s].
 
         Returns:
-            Of each point the slot of the cell that it has come into last, how often it came into one, and, if the source starts
-            then, the slot of the cell that it was in at first, which are 0 for none; float32, shape (n, 3): where it is [m].
-            Some have left the cells again.
+            Of each point the slot of the cell that it has come into last, how often it came into
+            one, and, if the source starts then, the slot of the cell that it was in at first, which
+            are 0 for none; float32, shape (n, 3): where it is [m]. Some have left the cells again.
         """
         box, until = self._boxes[number], min(now, self.sources[number].stop)
         if box is None:
             return self._nothing
-        distance, ways = self.grid.spacing / self.per_axis, [self._way(number, time) for time in (since, until, now)]
+        distance, ways = (
+            self.grid.spacing / self.per_axis,
+            [self._way(number, time) for time in (since, until, now)],
+        )
         low, counts = [0.0] * 3, [1] * 3
         for axis in range(self.grid.dimension):
             begin, end = ways[0][axis], ways[1][axis]
             low[axis] = math.floor((box[0][axis] - max(begin, end)) / distance) - 1.0
-            counts[axis] = int(math.ceil((box[1][axis] - min(begin, end)) / distance) + 1.0 - low[axis])
+            counts[axis] = int(
+                math.ceil((box[1][axis] - min(begin, end)) / distance) + 1.0 - low[axis]
+            )
         self._reserve(math.prod(counts))
         self._span.host[:] = (*ways[0], *ways[1], *ways[2], *low, *counts[:2])
         self._span.send()
         self._entering.run(number)
         if self.grid.device.is_cuda:
             self._found = self._split(self._memory.numpy())
-        entries, slot, filled, points = (array[: int(self._lattice.count.value)] for array in self._found)
+        entries, slot, filled, points = (
+            array[: int(self._lattice.count.value)] for array in self._found
+        )
         which = np.flatnonzero(entries | filled if starts else entries)
         if not len(which):
             return self._nothing
@@ -249,18 +305,50 @@ class Sources:
         """Launch what follows the points of a source's lattice through its cells."""
         grid, seed = self.grid, (self.random_seed + number) * 0x9E3779B97F4A7C15 + 1
         size = dict(zip(("size_x", "size_y", "size_z"), map(float, grid.extent), strict=True))
-        numbers = {"number": number, "nx": grid.shape[2], "ny": grid.shape[1], "nz": grid.shape[0], "seed": (seed + 2**63) % 2**64 - 2**63}
-        lengths = {"distance": grid.spacing / self.per_axis, "jitter": self.jitter, "grazed": GRAZED, "margin": 1.1 * MARGIN * grid.spacing}
-        given = {"slots": self._fields[0].flatten(), "owner": self._fields[1], "span": self._span.array, **self._points}
-        launch(kernels.ENTER, int(self._lattice.count.value), grid, **given, **numbers, **lengths, **size)
+        numbers = {
+            "number": number,
+            "nx": grid.shape[2],
+            "ny": grid.shape[1],
+            "nz": grid.shape[0],
+            "seed": (seed + 2**63) % 2**64 - 2**63,
+        }
+        lengths = {
+            "distance": grid.spacing / self.per_axis,
+            "jitter": self.jitter,
+            "grazed": GRAZED,
+            "margin": 1.1 * MARGIN * grid.spacing,
+        }
+        given = {
+            "slots": self._fields[0].flatten(),
+            "owner": self._fields[1],
+            "span": self._span.array,
+            **self._points,
+        }
+        launch(
+            kernels.ENTER,
+            int(self._lattice.count.value),
+            grid,
+            **given,
+            **numbers,
+            **lengths,
+            **size,
+        )
 
     def _reserve(self, count: int) -> None:
         """Have room for so many points of a lattice."""
         if count > len(self._points["entries"]):
-            size, memory = int(GROWTH * count), zeros(6 * int(GROWTH * count), wp.int32, self.grid.device)
+            size, memory = (
+                int(GROWTH * count),
+                zeros(6 * int(GROWTH * count), wp.int32, self.grid.device),
+            )
             for place, name in enumerate(self._points):  # in one memory, which is read by one copy
                 kind = wp.vec3 if name == "point" else wp.int32
-                self._points[name] = wp.array(ptr=memory.ptr + 4 * place * size, dtype=kind, shape=size, device=self.grid.device)
+                self._points[name] = wp.array(
+                    ptr=memory.ptr + 4 * place * size,
+                    dtype=kind,
+                    shape=size,
+                    device=self.grid.device,
+                )
             self._memory = memory
             self._lattice.take(count, self._points)
             if self.grid.device.is_cpu:
@@ -271,9 +359,19 @@ class Sources:
     def _split(memory: np.ndarray) -> list[np.ndarray]:
         """Return entries, slots, filled and points, shape (n, 3), as they lie in one memory."""
         size = len(memory) // 6
-        return [*memory[: 3 * size].reshape(3, size), memory[3 * size :].view(np.float32).reshape(size, 3)]
+        return [
+            *memory[: 3 * size].reshape(3, size),
+            memory[3 * size :].view(np.float32).reshape(size, 3),
+        ]
 
-    def _new(self, held: np.ndarray, slot: np.ndarray, entries: np.ndarray, filled: np.ndarray, points: np.ndarray) -> np.ndarray:
+    def _new(
+        self,
+        held: np.ndarray,
+        slot: np.ndarray,
+        entries: np.ndarray,
+        filled: np.ndarray,
+        points: np.ndarray,
+    ) -> np.ndarray:
         """Return where particles come in [m], of the points of `_entered`: if the source starts, those that fill cells are among them.
 
         Args:
@@ -297,7 +395,10 @@ class Sources:
         """Return the low and the high corner [m] of cells (k, j, i); None: there are none."""
         if not len(cells):
             return None
-        low, high = (corner[::-1] + np.array(self.grid.origin) for corner in (cells.min(axis=0), cells.max(axis=0) + 1))
+        low, high = (
+            corner[::-1] + np.array(self.grid.origin)
+            for corner in (cells.min(axis=0), cells.max(axis=0) + 1)
+        )
         return (low * self.grid.spacing).tolist(), (high * self.grid.spacing).tolist()
 
     def _impose(self, velocity: Faces, known: Faces, cells: wp.array | None, supply: bool) -> None:
@@ -307,7 +408,9 @@ class Sources:
             return
         for axis, field in enumerate(velocity):
             given = [field, walls[axis] if walls else None, known[axis] if known else None]
-            self._window.launch(kernels.impose_kernel, [axis, int(supply), *self._fields, self._velocities, *given])
+            self._window.launch(
+                kernels.impose_kernel, [axis, int(supply), *self._fields, self._velocities, *given]
+            )
         if cells is not None:
             self._window.launch(kernels.occupy_kernel, [*self._fields, int(not supply), cells])
 
@@ -316,7 +419,9 @@ def _owners(grid: StaggeredGrid, boundary: Boundary, sources: Sequence[Source]) 
     """Return the source that each open cell belongs to, -1 for none, shape (nz, ny, nx)."""
     nz, ny, nx = (n - 2 for n in grid.shape)
     K, J, I = np.meshgrid(np.arange(nz), np.arange(ny), np.arange(nx), indexing="ij")
-    centers = (np.stack([I.ravel(), J.ravel(), K.ravel()], axis=1) + np.array(grid.origin) + 0.5) * grid.spacing
+    centers = (
+        np.stack([I.ravel(), J.ravel(), K.ravel()], axis=1) + np.array(grid.origin) + 0.5
+    ) * grid.spacing
     if grid.dimension == 2:
         centers[:, 2] = 0.0
     owner = np.full(len(centers), -1)
@@ -386,7 +491,9 @@ class Outlets:
         Returns:
             How many drains have swallowed, and how many have left through open sides.
         """
-        return self._remove(particles, tuple(drain for drain in self.drains if drain.opens(before, now)))
+        return self._remove(
+            particles, tuple(drain for drain in self.drains if drain.opens(before, now))
+        )
 
     def remove_departed(self, particles: Particles) -> int:
         """Remove particles beyond open sides; return their number."""
@@ -408,11 +515,15 @@ class Outlets:
         departed, drained = particles.finish_removal(marks)
         return drained, departed
 
-    def _launch(self, particles: Particles, drains: tuple[Drain, ...], marks: wp.array, distance: wp.array) -> None:
+    def _launch(
+        self, particles: Particles, drains: tuple[Drain, ...], marks: wp.array, distance: wp.array
+    ) -> None:
         """Launch the marks of the particles that leave, and their removal."""
         position = particles.position
         mark_gone(self.grid, self.open_sides, position, marks)
         for drain in drains:
             drain.geometry.signed_distance(position, distance)
-            launch_list(mark_inside_kernel, particles.count, [distance, marks], device=self.grid.device)
+            launch_list(
+                mark_inside_kernel, particles.count, [distance, marks], device=self.grid.device
+            )
         particles.launch_removal(marks)

@@ -5,7 +5,16 @@ from pathlib import Path
 
 import warp as wp
 
-from warp_lcp.grid.cell_kernel import F32, I8, I32, INTS, POINTS, cell_below, cell_kernel, list_kernel
+from warp_lcp.grid.cell_kernel import (
+    F32,
+    I8,
+    I32,
+    INTS,
+    POINTS,
+    cell_below,
+    cell_kernel,
+    list_kernel,
+)
 from warp_lcp.grid.staggered import cell_index
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
 from warp_lcp.rows import KernelFile
@@ -30,12 +39,23 @@ def source_of(slot: int, sources: INTS, running: _BYTES):
 
 @cell_kernel("warp_lcp.material.sources")
 def impose_kernel(
-    k, j, i, axis: int, supply: int, slots: I32, sources: INTS, running: _BYTES, velocities: POINTS, field: F32, solid: F32, known: I8
+    k,
+    j,
+    i,
+    axis: int,
+    supply: int,
+    slots: I32,
+    sources: INTS,
+    running: _BYTES,
+    velocities: POINTS,
+    field: F32,
+    solid: F32,
+    known: I8,
 ):
     """Give the faces of the running sources' cells their velocity.
 
-    Where the flow would enter a source nothing passes as far as the pressure is concerned (`supply`): its material comes from nowhere, not
-    from the material behind it.
+    Where the flow would enter a source nothing passes as far as the pressure is concerned
+    (`supply`): its material comes from nowhere, not from the material behind it.
     """
     c, b, a = cell_below(axis, k, j, i)
     if slots[k, j, i] > 0 or slots[c, b, a] > 0:
@@ -56,19 +76,34 @@ def impose_kernel(
 
 
 @cell_kernel("warp_lcp.material.sources")
-def occupy_kernel(k, j, i, slots: I32, sources: wp.array(dtype=wp.int32), running: wp.array(dtype=wp.uint8), fluid: int, kind: I8):
+def occupy_kernel(
+    k,
+    j,
+    i,
+    slots: I32,
+    sources: wp.array(dtype=wp.int32),
+    running: wp.array(dtype=wp.uint8),
+    fluid: int,
+    kind: I8,
+):
     """Mark the cells of running sources SOLID, since their faces' velocities are given, or (`fluid`) as the material that they hold."""
     if source_of(slots[k, j, i], sources, running) >= 0:
         kind[k, j, i] = wp.where(fluid != 0, _FLUID, _SOLID)
 
 
 @list_kernel("warp_lcp.material.sources")
-def occupants_kernel(i, inverse_dx: float, n: wp.vec3i, origin: wp.vec3i, slots: I32, position: POINTS, counts: INTS):
+def occupants_kernel(
+    i, inverse_dx: float, n: wp.vec3i, origin: wp.vec3i, slots: I32, position: POINTS, counts: INTS
+):
     """Count the particles in each slot."""
     x = position[i] * inverse_dx
     k = int(1)
     if slots.shape[0] > 3:
         k = cell_index(x[2] + 1.0 - float(origin[2]), n[2])
-    slot = slots[k, cell_index(x[1] + 1.0 - float(origin[1]), n[1]), cell_index(x[0] + 1.0 - float(origin[0]), n[0])]
+    slot = slots[
+        k,
+        cell_index(x[1] + 1.0 - float(origin[1]), n[1]),
+        cell_index(x[0] + 1.0 - float(origin[0]), n[0]),
+    ]
     if slot > 0:
         wp.atomic_add(counts, slot - 1, 1)

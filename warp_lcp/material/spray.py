@@ -19,7 +19,8 @@ from warp_lcp.rows.program import LaunchGraph
 EVERY = 8  # steps between looks for particles that have left the others
 TILE = 8  # cells: clusters of particles are told apart by empty tiles between them
 FEW = 8  # particles: no more make a cluster that flies off the grid
-AWAY = 2 * TILE  # cells from the box around all others from which on it does; it comes back at half of that
+# cells from the box around all others from which on it does; it comes back at half of that
+AWAY = 2 * TILE
 MOST_TILES = 1 << 22  # else they are larger
 CLEAR = 3  # cells from a solid or a wall, and its way in a step: nearer than that it is on the grid
 
@@ -27,9 +28,14 @@ CLEAR = 3  # cells from a solid or a wall, and its way in a step: nearer than th
 @list_kernel("warp_lcp.material.spray")
 @no_type_check
 def fly_kernel(
-    i, change_x: float, change_y: float, change_z: float, dt: float, position: wp.array(dtype=wp.vec3),
+    i,
+    change_x: float,
+    change_y: float,
+    change_z: float,
+    dt: float,
+    position: wp.array(dtype=wp.vec3),
     velocity: wp.array(dtype=wp.vec3),
-):  # fmt: skip
+):
     """Change velocities, then move for a time step."""
     v = velocity[i] + wp.vec3(change_x, change_y, change_z)
     velocity[i] = v
@@ -39,9 +45,10 @@ def fly_kernel(
 class Spray:
     """Carry particles that are alone along their parabolas, off the grid, until they come near others, a solid or a wall.
 
-    A cluster of at most `FEW` particles far outside the box around all others flies: the grid need not reach there. Its particles go
-    straight on with what forces give them, as a body in flight on the grid would, but for its turning: mass, momentum, energy and angular
-    momentum stay what they are. The gradients that APIC carries are lost, those of a lone particle move nothing.
+    A cluster of at most `FEW` particles far outside the box around all others flies: the grid need
+    not reach there. Its particles go straight on with what forces give them, as a body in flight on
+    the grid would, but for its turning: mass, momentum, energy and angular momentum stay what they
+    are. The gradients that APIC carries are lost, those of a lone particle move nothing.
 
     Args:
         grid: any of the simulation's.
@@ -55,7 +62,13 @@ class Spray:
     """
 
     def __init__(
-        self, grid: StaggeredGrid, solids: Sequence[PlacedSolid], open_sides: int, *, active: bool = True, keeps: bool = False
+        self,
+        grid: StaggeredGrid,
+        solids: Sequence[PlacedSolid],
+        open_sides: int,
+        *,
+        active: bool = True,
+        keeps: bool = False,
     ) -> None:
         self.active, self._solids, self._open, self._extent, self._dimension = (
             active,
@@ -67,9 +80,18 @@ class Spray:
         self._numbers = [Scalar() for _ in range(4)]  # change of the velocity [m/s], time step [s]
         self._flying = LaunchGraph(grid.device, self._launch)
         nothing = np.zeros((0, 3), dtype=np.float32)
-        self.particles = Particles(grid, nothing, nothing, affine=False, kept=nothing[:, 0] if keeps else None, indexed=False)
+        self.particles = Particles(
+            grid,
+            nothing,
+            nothing,
+            affine=False,
+            kept=nothing[:, 0] if keeps else None,
+            indexed=False,
+        )
 
-    def exchange(self, particles: Particles, totals: ParticleTotals, step: int, time: float, dt: float) -> ParticleTotals:
+    def exchange(
+        self, particles: Particles, totals: ParticleTotals, step: int, time: float, dt: float
+    ) -> ParticleTotals:
         """Take what has left the others, give back what comes near something, and return sums over those on the grid.
 
         Args:
@@ -82,7 +104,9 @@ class Spray:
         own, dx, before = self.particles, particles.grid.spacing, particles.count
         if own.count:
             reach = 0.5 * AWAY * dx
-            near = self._within(own, totals.low - reach, totals.high + reach) | self._meets(own, time, dt, dx)
+            near = self._within(own, totals.low - reach, totals.high + reach) | self._meets(
+                own, time, dt, dx
+            )
             self._move(own, particles, near)
         if self.active and step % EVERY == 0 and particles.count:
             self._move(particles, own, self._leaves(particles, time, dt, dx))
@@ -99,12 +123,24 @@ class Spray:
     def _launch(self) -> None:
         """Launch the way of the particles in a step."""
         own = self.particles
-        launch_list(fly_kernel, own.count, [*self._numbers, own.position, own.velocity], device=own.grid.device)
+        launch_list(
+            fly_kernel,
+            own.count,
+            [*self._numbers, own.position, own.velocity],
+            device=own.grid.device,
+        )
 
     def behind(self, name: str, array: np.ndarray) -> np.ndarray:
         """Return an array of the particles on the grid with that of those that fly behind it, shape (n, 3)."""
         own = self.particles.arrays().get(name)
-        return np.concatenate([array, np.zeros((self.particles.count, 3), dtype=array.dtype) if own is None else own.numpy()])
+        return np.concatenate(
+            [
+                array,
+                np.zeros((self.particles.count, 3), dtype=array.dtype)
+                if own is None
+                else own.numpy(),
+            ]
+        )
 
     def with_own(self, totals: ParticleTotals) -> ParticleTotals:
         """Return sums over particles on the grid with those over the ones that fly."""
@@ -116,7 +152,9 @@ class Spray:
         alone = self._alone(x, dx)
         if alone.any() and not alone.all():
             rest = x[~alone]
-            alone &= ~self._within(particles, rest.min(axis=0) - AWAY * dx, rest.max(axis=0) + AWAY * dx)
+            alone &= ~self._within(
+                particles, rest.min(axis=0) - AWAY * dx, rest.max(axis=0) + AWAY * dx
+            )
         if alone.any():
             alone[alone] = ~self._meets(particles, time, dt, dx, alone)
         return alone
@@ -126,9 +164,19 @@ class Spray:
         x, axes = particles.position.numpy(), slice(self._dimension)
         return np.asarray(((x >= low) & (x <= high))[:, axes].all(axis=1))
 
-    def _meets(self, particles: Particles, time: float, dt: float, dx: float, which: np.ndarray | None = None) -> np.ndarray:
+    def _meets(
+        self,
+        particles: Particles,
+        time: float,
+        dt: float,
+        dx: float,
+        which: np.ndarray | None = None,
+    ) -> np.ndarray:
         """Tell which of some particles may come near a solid or a closed side of the domain in a step."""
-        x, v = (array.numpy() if which is None else array.numpy()[which] for array in (particles.position, particles.velocity))
+        x, v = (
+            array.numpy() if which is None else array.numpy()[which]
+            for array in (particles.position, particles.velocity)
+        )
         room = CLEAR * dx + (np.linalg.norm(v, axis=1) + 10.0 * dx) * dt
         near = ~np.isfinite(x + v).all(axis=1)
         for axis in range(self._dimension):
@@ -138,14 +186,21 @@ class Spray:
         points = wp.array(x, dtype=wp.vec3, device=particles.grid.device)
         distance = wp.empty(len(x), dtype=wp.float32, device=particles.grid.device)
         for solid in self._solids:
-            geometry = solid.geometry if solid.motion is None else solid.geometry.moved(solid.motion.pose(time))
+            geometry = (
+                solid.geometry
+                if solid.motion is None
+                else solid.geometry.moved(solid.motion.pose(time))
+            )
             geometry.signed_distance(points, distance)
             near |= distance.numpy() < room
         return near
 
     def _alone(self, position: np.ndarray, dx: float) -> np.ndarray:
         """Tell which particles [m] belong to clusters of few."""
-        tile, low = np.floor(position / (TILE * dx)).astype(np.int64), np.floor(position.min(axis=0) / (TILE * dx)).astype(np.int64)
+        tile, low = (
+            np.floor(position / (TILE * dx)).astype(np.int64),
+            np.floor(position.min(axis=0) / (TILE * dx)).astype(np.int64),
+        )
         while np.prod((tile - low).max(axis=0) + 1.0) > MOST_TILES:
             tile, low = tile // 2, low // 2
         tile -= low

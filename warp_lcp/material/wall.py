@@ -1,19 +1,25 @@
 """Velocity around the material after the projection: into the air, and at walls that hold it or let it go.
 
-The order matters. 0. Closed faces of RELEASED cells that particles gave weight keep their own velocity, but no more than the mean of the
-projected faces around them: a layer over them would throw all that rests at a wall after the one particle that leaves it, and their own
-alone would let a cell's worth of a full box fall. 1. One layer is extrapolated from the projected faces. 2. Faces between AIR cells that
-particles gave weight keep their own velocity: extrapolating over spray would make a droplet hang above a pool. 3. Further layers are
-extrapolated from all of them. Closed faces have taken part and now carry the material's velocity, not the wall's. 4. Held cells give their
-closed faces the wall's normal velocity (not merely less of the inward one: a moving wall drags its material along); released and AIR cells
-lose only the part into the wall, so that the last particles can leave. 5. Faces inside solids follow the faces beside them, so that
-tangential flow is not slowed by a wall.
+The order matters. 0. Closed faces of RELEASED cells that particles gave weight keep their own
+velocity, but no more than the mean of the projected faces around them: a layer over them would
+throw all that rests at a wall after the one particle that leaves it, and their own alone would let
+a cell's worth of a full box fall. 1. One layer is extrapolated from the projected faces. 2. Faces
+between AIR cells that particles gave weight keep their own velocity: extrapolating over spray would
+make a droplet hang above a pool. 3. Further layers are extrapolated from all of them. Closed faces
+have taken part and now carry the material's velocity, not the wall's. 4. Held cells give their
+closed faces the wall's normal velocity (not merely less of the inward one: a moving wall drags its
+material along); released and AIR cells lose only the part into the wall, so that the last particles
+can leave. 5. Faces inside solids follow the faces beside them, so that tangential flow is not
+slowed by a wall.
 
-Where walls cut cells the order is the same, for the same reasons; partly open faces have been projected and keep their velocity. 4. With n
-the gradient of the distance to the wall that closes a face, at the face's center, u the velocity there (of known faces alone) and u_s the
-wall's, w = n.(u - u_s) is the relative normal velocity. (Beside two walls the gradient of the smaller distance lies between their normals:
-with one wall's u_s it would turn the flow before a piston away from the floor.) Where the wall holds the material the face loses w n, of
-either sign; released cells and AIR lose it only where w < 0. 5. Faces of the ring beside the domain's walls follow the faces next to them.
+Where walls cut cells the order is the same, for the same reasons; partly open faces have been
+projected and keep their velocity. 4. With n the gradient of the distance to the wall that closes a
+face, at the face's center, u the velocity there (of known faces alone) and u_s the wall's, w = n.(u
+- u_s) is the relative normal velocity. (Beside two walls the gradient of the smaller distance lies
+between their normals: with one wall's u_s it would turn the flow before a piston away from the
+floor.) Where the wall holds the material the face loses w n, of either sign; released cells and AIR
+lose it only where w < 0. 5. Faces of the ring beside the domain's walls follow the faces next to
+them.
 """
 
 import typing
@@ -35,10 +41,14 @@ from warp_lcp.rows import KernelFile
 
 Join = Callable[[wp.array, wp.array], None]  # takes the marks and the velocity of a component
 
-DEPTH = 2.0  # cells inside a wall beyond which no particle's tent reaches a face: sqrt(3), and what the distance errs
+# cells inside a wall beyond which no particle's tent reaches a face: sqrt(3), and what the distance
+# errs
+DEPTH = 2.0
 _CONSTANTS = {"TINY_WEIGHT": TINY_WEIGHT, "DEPTH": DEPTH, "SOLID": SOLID, "FLUID": FLUID} | {
-    "TOUCHES_NOTHING": TOUCHES_NOTHING, "HELD": HELD, "RELEASED": RELEASED,
-}  # fmt: skip
+    "TOUCHES_NOTHING": TOUCHES_NOTHING,
+    "HELD": HELD,
+    "RELEASED": RELEASED,
+}
 KERNELS = KernelFile(Path(__file__).parent / "headers/wall.h", _CONSTANTS)
 KEEP_SPRAY = KERNELS["warp_lcp.material.wall.keep_spray"]
 _FLUID = wp.constant(wp.int8(FLUID))
@@ -46,12 +56,16 @@ _FLUID = wp.constant(wp.int8(FLUID))
 
 @cell_kernel("warp_lcp.material.wall")
 @typing.no_type_check
-def keep_released_kernel(k, j, i, axis: int, kind: I8, contact: U8, weight: F32, field: F32, known: I8):
+def keep_released_kernel(
+    k, j, i, axis: int, kind: I8, contact: U8, weight: F32, field: F32, known: I8
+):
     """Faces of RELEASED cells that are still unknown, closed ones, become known after the first layer if they carry weight.
 
-    They move as their own particles do, but no faster than the known faces around them in the mean, nor against those.
+    They move as their own particles do, but no faster than the known faces around them in the mean,
+    nor against those.
     """
-    if known[k, j, i] == wp.int8(0) and weight[k, j, i] > TINY_WEIGHT:  # and so no face of the array's edge, see below
+    # and so no face of the array's edge, see below
+    if known[k, j, i] == wp.int8(0) and weight[k, j, i] > TINY_WEIGHT:
         c = k - wp.where(axis == 2, 1, 0)
         b = j - wp.where(axis == 1, 1, 0)
         a = i - wp.where(axis == 0, 1, 0)
@@ -71,13 +85,26 @@ def keep_released_kernel(k, j, i, axis: int, kind: I8, contact: U8, weight: F32,
             if count > 0.0:
                 own = field[k, j, i]
                 around = total / count
-                field[k, j, i] = wp.where(own * around > 0.0, wp.sign(own) * wp.min(wp.abs(own), wp.abs(around)), 0.0)
+                field[k, j, i] = wp.where(
+                    own * around > 0.0, wp.sign(own) * wp.min(wp.abs(own), wp.abs(around)), 0.0
+                )
             known[k, j, i] = wp.int8(2)
 
 
 @cell_kernel("warp_lcp.material.wall")
 @typing.no_type_check
-def closed_face_kernel(k, j, i, axis: int, kind: I8, contact: U8, index: I32, separating: wp.array(dtype=wp.uint8), solid: F32, field: F32):
+def closed_face_kernel(
+    k,
+    j,
+    i,
+    axis: int,
+    kind: I8,
+    contact: U8,
+    index: I32,
+    separating: wp.array(dtype=wp.uint8),
+    solid: F32,
+    field: F32,
+):
     """Closed faces take the wall's normal velocity, or lose only the velocity into the wall."""
     c, b, a = cell_below(axis, k, j, i)
     here = index[k, j, i]
@@ -100,23 +127,36 @@ def closed_face_kernel(k, j, i, axis: int, kind: I8, contact: U8, index: I32, se
 
 
 def extend_velocity(
-    window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], known: Sequence[wp.array], kind: wp.array, contact: wp.array,
-    index: wp.array, separating: wp.array, solid_velocity: Sequence[wp.array], layers: int, *, join: Join | None = None,
-) -> None:  # fmt: skip
+    window: Window,
+    velocity: Sequence[wp.array],
+    weights: Sequence[wp.array],
+    known: Sequence[wp.array],
+    kind: wp.array,
+    contact: wp.array,
+    index: wp.array,
+    separating: wp.array,
+    solid_velocity: Sequence[wp.array],
+    layers: int,
+    *,
+    join: Join | None = None,
+) -> None:
     """Continue the projected velocity into air and walls.
 
     Args:
         window: faces to consider.
-        velocity: each component [m/s] (updated): projected where `known`, the particles' average where there is weight.
+        velocity: each component [m/s] (updated): projected where `known`, the particles' average
+            where there is weight.
         weights: of the particles on each component's faces.
-        known: int8 of each component (updated): 1 on projected faces, 0 on others, -1 inside solids.
+        known: int8 of each component (updated): 1 on projected faces, 0 on others, -1 inside
+            solids.
         kind: int8 of AIR, FLUID, SOLID.
         contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED.
         index: int32: -1 in open cells, the wall's number elsewhere.
         separating: uint8 a wall.
         solid_velocity: of the solids on each component's faces [m/s], or empty if all stand still.
         layers: how far into the air, in faces.
-        join: called with the marks and the velocity of a component after each layer, see `warp_lcp.grid.extrapolate`.
+        join: called with the marks and the velocity of a component after each layer, see
+            `warp_lcp.grid.extrapolate`.
     """
     for axis, (field, weight, marks) in enumerate(zip(velocity, weights, known, strict=True)):
         window.launch(keep_released_kernel, [axis, kind, contact, weight, field, marks])
@@ -130,7 +170,9 @@ def extend_velocity(
         if join is not None:
             join(marks, field)
         # a particle's tent reaches faces inside a solid beside its cell, and in 3-D beside those
-        extrapolate(window, marks, field, len(velocity) - 1, start=layers + 1, fill=BLOCKED, join=join)
+        extrapolate(
+            window, marks, field, len(velocity) - 1, start=layers + 1, fill=BLOCKED, join=join
+        )
 
 
 CONSTRAIN = KERNELS["warp_lcp.material.cut_wall.constrain"]
@@ -180,25 +222,37 @@ class WallFields:
     @classmethod
     def of(cls, cut: CutCells, known: Sequence[wp.array]) -> "WallFields":
         """Return the fields of walls, with the marks of each component's faces."""
-        components = [field for of in (known, cut.wall, cut.velocity or ()) for field in three_components(of)]
+        components = [
+            field for of in (known, cut.wall, cut.velocity or ()) for field in three_components(of)
+        ]
         nearest = cut.nearest or [None, None, None]
         return cls(*[*components, *nearest, cut.distance, cut.turn, cut.shift, cut.separating])
 
 
 def extend_velocity_cut(
-    window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], known: Sequence[wp.array], kind: wp.array, contact: wp.array,
-    cut: CutCells, scratch: Sequence[wp.array], layers: int, *, join: Join | None = None,
-) -> None:  # fmt: skip
+    window: Window,
+    velocity: Sequence[wp.array],
+    weights: Sequence[wp.array],
+    known: Sequence[wp.array],
+    kind: wp.array,
+    contact: wp.array,
+    cut: CutCells,
+    scratch: Sequence[wp.array],
+    layers: int,
+    *,
+    join: Join | None = None,
+) -> None:
     """Continue the projected velocity into air and walls.
 
     Args as of `extend_velocity`, but:
-        known: -1 on faces deep inside solids.
-        cut: the walls: distances at nodes, open fractions, whose wall closes a face, and its velocity.
-        scratch: a float32 field for each component (written).
-        layers: how far into air and walls, in faces.
+        known: -1 on faces deep inside solids. cut: the walls: distances at nodes, open fractions,
+        whose wall closes a face, and its velocity. scratch: a float32 field for each component
+        (written). layers: how far into air and walls, in faces.
     """
     barriers = cut.grid.barriers
-    for axis, (field, weight, marks, fraction) in enumerate(zip(velocity, weights, known, cut.open, strict=True)):
+    for axis, (field, weight, marks, fraction) in enumerate(
+        zip(velocity, weights, known, cut.open, strict=True)
+    ):
         window.launch(keep_released_kernel, [axis, kind, contact, weight, field, marks])
         apart = barriers.apart[axis] if barriers is not None else None
         extrapolate(window, marks, field, 1, join=join, apart=apart)
@@ -209,6 +263,19 @@ def extend_velocity_cut(
     faces, placement = FaceVelocity.of(velocity), cut.grid.placement
     walls = WallFields.of(cut, known)
     for axis, (marks, open_, result) in enumerate(zip(known, cut.open, scratch, strict=True)):
-        window.run(CONSTRAIN, placement, faces, walls, axis=axis, known=marks, open=open_, result=result, kind=kind, contact=contact)
-    for axis, (marks, open_, result, field) in enumerate(zip(known, cut.open, scratch, velocity, strict=True)):
+        window.run(
+            CONSTRAIN,
+            placement,
+            faces,
+            walls,
+            axis=axis,
+            known=marks,
+            open=open_,
+            result=result,
+            kind=kind,
+            contact=contact,
+        )
+    for axis, (marks, open_, result, field) in enumerate(
+        zip(known, cut.open, scratch, velocity, strict=True)
+    ):
         window.run(TAKE, placement, axis=axis, known=marks, open=open_, result=result, field=field)

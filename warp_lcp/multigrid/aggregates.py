@@ -25,7 +25,17 @@ f64, i32 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int32)
 @no_type_check
 @forward_kernel(module="warp_lcp.aggregates")
 def restrict_kernel(
-    first: i32, members: i32, y: f64, x: f64, lower: f64, upper: f64, factor: wp.float64, b: f64, low: f64, high: f64, e: f64
+    first: i32,
+    members: i32,
+    y: f64,
+    x: f64,
+    lower: f64,
+    upper: f64,
+    factor: wp.float64,
+    b: f64,
+    low: f64,
+    high: f64,
+    e: f64,
 ):
     """Sum y over an aggregate; bound its correction by the narrowest of the members' gaps over `factor`, and begin it at 0."""
     j = wp.tid()
@@ -54,7 +64,16 @@ def correct_kernel(owner: i32, e: f64, factor: wp.float64, lower: f64, upper: f6
 @no_type_check
 @forward_kernel(module="warp_lcp.aggregates")
 def settle_kernel(
-    indptr: i32, indices: i32, values: f64, diagonal: f64, b: f64, lower: f64, upper: f64, sweeps: int, enough: wp.float64, x: f64
+    indptr: i32,
+    indices: i32,
+    values: f64,
+    diagonal: f64,
+    b: f64,
+    lower: f64,
+    upper: f64,
+    sweeps: int,
+    enough: wp.float64,
+    x: f64,
 ):
     """Sweep a small level forth and back by one thread, until the largest change is small beside the first one."""
     n = x.shape[0]
@@ -76,13 +95,18 @@ def settle_kernel(
                 first = change
 
 
-# of 1, 1.4 and 1.8 with 2 and 3 coarse cycles: obstacles under diffusion and convection on 257^2 cells, Newton's steps after 4 cycles
-ALPHA = wp.float64(1.4)  # over-correction of plain aggregates' corrections, which are too small where x is smooth
+# of 1, 1.4 and 1.8 with 2 and 3 coarse cycles: obstacles under diffusion and convection on 257^2
+# cells, Newton's steps after 4 cycles
+# over-correction of plain aggregates' corrections, which are too small where x is smooth
+ALPHA = wp.float64(1.4)
 GAMMA = 3  # coarse cycles a level: aggregates of 5 to 9 unknowns leave room for them
-COARSEST, STALL = 64, 0.7  # unknowns of the coarsest level, and the largest share of unknowns that a level may keep
-SWEEPS, ENOUGH = 20, 1e-2  # the most pairs of sweeps of the coarsest level, and the part of the first change at which they end
+# unknowns of the coarsest level, and the largest share of unknowns that a level may keep
+COARSEST, STALL = 64, 0.7
+# the most pairs of sweeps of the coarsest level, and the part of the first change at which they end
+SWEEPS, ENOUGH = 20, 1e-2
 STRENGTH = 1e-3  # entries below this share of sqrt(a_ii a_jj) do not aggregate
-DOMINANT = 0.9  # share of rows that must be diagonally dominant for multigrid to serve an unsymmetric matrix
+# share of rows that must be diagonally dominant for multigrid to serve an unsymmetric matrix
+DOMINANT = 0.9
 POSITIVE = 0.1  # share of the off-diagonal entries' magnitude that may be positive there
 
 
@@ -106,7 +130,12 @@ class Aggregation:
         owner = np.full(aggregates.shape[0], -1)
         owner[np.diff(aggregates.indptr) > 0] = aggregates.indices
         turned = aggregates.T.tocsr()
-        return cls(*(wp.array(v, dtype=wp.int32, device=device) for v in (owner, turned.indptr, turned.indices)))
+        return cls(
+            *(
+                wp.array(v, dtype=wp.int32, device=device)
+                for v in (owner, turned.indptr, turned.indices)
+            )
+        )
 
 
 @dataclass(frozen=True)
@@ -134,14 +163,30 @@ class AggregateLevel:
     visits: int = GAMMA
     _legs: dict[str, list[CycleStage]] = field(default_factory=dict, init=False, repr=False)
 
-    def descend(self, coarse: AggregateLevel, *, projected: bool, from_zero: bool) -> list[CycleStage]:
+    def descend(
+        self, coarse: AggregateLevel, *, projected: bool, from_zero: bool
+    ) -> list[CycleStage]:
         """Return steps 1 to 3 of a cycle: a projected Gauss-Seidel sweep; sums and bounds of aggregates, from x_c = 0."""
         assert self.aggregation is not None, "not the coarsest level"
         if "down" not in self._legs:
             parts, bounds = self.aggregation, [self.x, self.lower, self.upper]
             residual = Launches(partial(self.A.product, self.x, self.y, plus=self.b))
-            sums = [parts.first, parts.members, self.y, *bounds, ALPHA, coarse.b, coarse.lower, coarse.upper, coarse.x]
-            self._legs["down"] = [self._sweep(forward=True), residual, self._launch(restrict_kernel, coarse.x.size, sums)]
+            sums = [
+                parts.first,
+                parts.members,
+                self.y,
+                *bounds,
+                ALPHA,
+                coarse.b,
+                coarse.lower,
+                coarse.upper,
+                coarse.x,
+            ]
+            self._legs["down"] = [
+                self._sweep(forward=True),
+                residual,
+                self._launch(restrict_kernel, coarse.x.size, sums),
+            ]
         return self._legs["down"]
 
     def coarsen_bounds(self, coarse: AggregateLevel) -> tuple[()]:
@@ -153,17 +198,33 @@ class AggregateLevel:
         assert self.aggregation is not None, "not the coarsest level"
         if "up" not in self._legs:
             inputs = [self.aggregation.owner, coarse.x, ALPHA, self.lower, self.upper, self.x]
-            self._legs["up"] = [self._launch(correct_kernel, self.x.size, inputs), self._sweep(forward=False)]
+            self._legs["up"] = [
+                self._launch(correct_kernel, self.x.size, inputs),
+                self._sweep(forward=False),
+            ]
         return self._legs["up"]
 
     def solve(self, visits: int, *, projected: bool, from_zero: bool) -> list[CycleStage]:
         """Return the stages of a `CoarsestSolver`: projected Gauss-Seidel by one thread, until it converges."""
         A, last = self.A, wp.float64(ENOUGH)
-        inputs = [A.indptr, A.indices, A.values, A.diagonal(), self.b, self.lower, self.upper, SWEEPS, last, self.x]
+        inputs = [
+            A.indptr,
+            A.indices,
+            A.values,
+            A.diagonal(),
+            self.b,
+            self.lower,
+            self.upper,
+            SWEEPS,
+            last,
+            self.x,
+        ]
         return self._legs.setdefault("solve", [self._launch(settle_kernel, 1, inputs)])
 
     def _sweep(self, *, forward: bool) -> CycleStage:
-        return Launches(partial(self.A.relax, self.x, self.b, self.lower, self.upper, 1.0, forward=forward))
+        return Launches(
+            partial(self.A.relax, self.x, self.b, self.lower, self.upper, 1.0, forward=forward)
+        )
 
     def _launch(self, kernel: Any, dim: int, inputs: list[Any]) -> CycleStage:
         return Launches.of_kernel(kernel, dim, inputs, self.A.device)
@@ -172,9 +233,10 @@ class AggregateLevel:
 class MonotoneAggregation:
     """Projected W-cycles: sweeps within the bounds, and corrections of whole aggregates within their members' gaps (Kornhuber 1994).
 
-    A coarse unknown may move by what its most confined member may, so that no bound is overstepped and nothing need be projected
-    afterwards: an obstacle problem's energy falls in every cycle. That frees or holds whole aggregates at once, where a Newton step moves
-    the boundary of the active set by about one row. Aggregates are those of A's symmetric part, coarse matrices P'A P.
+    A coarse unknown may move by what its most confined member may, so that no bound is overstepped
+    and nothing need be projected afterwards: an obstacle problem's energy falls in every cycle.
+    That frees or holds whole aggregates at once, where a Newton step moves the boundary of the
+    active set by about one row. Aggregates are those of A's symmetric part, coarse matrices P'A P.
 
     Args:
         A: the matrix, with a positive diagonal.
@@ -196,25 +258,42 @@ class MonotoneAggregation:
             host, n = operator.matrix(), operator.unknowns
             found = _aggregates(host) if n > COARSEST else None
             x, b, lower, upper, y = (wp.zeros(n, dtype=wp.float64, device=device) for _ in range(5))
-            self._levels.append(AggregateLevel(operator, x, b, lower, upper, y, None if found is None else Aggregation.of(found, device)))
+            self._levels.append(
+                AggregateLevel(
+                    operator,
+                    x,
+                    b,
+                    lower,
+                    upper,
+                    y,
+                    None if found is None else Aggregation.of(found, device),
+                )
+            )
             more = found is not None
             if found is not None:
                 operator = SparseOperator(found.T @ host @ found, device=device, dtype=wp.float64)
         return len(self._levels) > 1
 
-    def cycle(self, x: wp.array[Any], b: wp.array[Any], lower: wp.array[Any], upper: wp.array[Any]) -> None:
+    def cycle(
+        self, x: wp.array[Any], b: wp.array[Any], lower: wp.array[Any], upper: wp.array[Any]
+    ) -> None:
         """Move x (float64, within its bounds) by one cycle. It is recorded, and recorded anew where a field is another."""
         fields = tuple(field.ptr for field in (x, b, lower, upper))
         if self._program is None or self._fields != fields:
             finest = replace(self._levels[0], x=x, b=b, lower=lower, upper=upper)
             cycle = Cycle([finest, *self._levels[1:]], self._levels[-1].solve, projected=True)
-            self._fields, self._program = fields, recorded(self.A.device, cycle.stages(from_zero=False))
+            self._fields, self._program = (
+                fields,
+                recorded(self.A.device, cycle.stages(from_zero=False)),
+            )
         self._program.run()
 
 
 def _aggregates(host: scipy.sparse.csr_array) -> scipy.sparse.csr_array | None:
     """Return which unknowns belong together, None where too few do."""
-    found = aggregated(symmetric_strength_of_connection(symmetric_part(host), theta=STRENGTH), STALL)
+    found = aggregated(
+        symmetric_strength_of_connection(symmetric_part(host), theta=STRENGTH), STALL
+    )
     return None if found is None else scipy.sparse.csr_array(found).astype(np.float64)
 
 
@@ -252,8 +331,9 @@ SPLIT_KEEPS = 0.9  # the largest share of the unknowns that a split may keep
 def coarse_points(host: Any) -> tuple[Any, Any, np.ndarray] | None:
     """Return P, P'A P and the points, for a scipy.sparse matrix A that is nearly an M-matrix; None where it does not get smaller.
 
-    A coarse unknown is one of the fine ones: (P e)_i = e_j where point j is unknown i. So the bounds of the coarse problem are those of
-    unknowns, where those of aggregates would have to be averaged.
+    A coarse unknown is one of the fine ones: (P e)_i = e_j where point j is unknown i. So the
+    bounds of the coarse problem are those of unknowns, where those of aggregates would have to be
+    averaged.
     """
     A, P, points = scipy.sparse.csr_matrix(host), None, np.arange(host.shape[0])
     while len(points) * LEAST > host.shape[0]:
@@ -262,7 +342,11 @@ def coarse_points(host: Any) -> tuple[Any, Any, np.ndarray] | None:
         if not 0 < splitting.sum() <= SPLIT_KEEPS * len(points):
             return None
         step = scipy.sparse.csr_matrix(classical_interpolation(A, strong, splitting))
-        A, P, points = (step.T @ A @ step).tocsr(), step if P is None else (P @ step).tocsr(), points[splitting != 0]
+        A, P, points = (
+            (step.T @ A @ step).tocsr(),
+            step if P is None else (P @ step).tocsr(),
+            points[splitting != 0],
+        )
     return (P, A, points) if P is not None else None
 
 

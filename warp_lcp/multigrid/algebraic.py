@@ -1,7 +1,8 @@
 """Algebraic multigrid for the principal systems of a sparse matrix: PyAMG's aggregates, cycled and coarsened anew on the device.
 
-Which unknowns make up a coarse one is decided once, on A. When the free set or the shift changes, only numbers are computed again: the
-Galerkin products P' M P go into patterns that are known, by lists of places made once.
+Which unknowns make up a coarse one is decided once, on A. When the free set or the shift changes,
+only numbers are computed again: the Galerkin products P' M P go into patterns that are known, by
+lists of places made once.
 """
 
 from __future__ import annotations
@@ -18,7 +19,13 @@ from pyamg.aggregation.tentative import fit_candidates
 from pyamg.strength import symmetric_strength_of_connection
 
 from warp_lcp.multigrid.aggregates import aggregated, symmetric_part
-from warp_lcp.multigrid.algebraic_kernels import densify_kernel, factor_kernel, invert_kernel, places_kernel, solve_kernel
+from warp_lcp.multigrid.algebraic_kernels import (
+    densify_kernel,
+    factor_kernel,
+    invert_kernel,
+    places_kernel,
+    solve_kernel,
+)
 from warp_lcp.multigrid.coarsest_kernels import PINNED
 from warp_lcp.multigrid.cycle import Cycle, CycleStage, Launches, recorded
 from warp_lcp.multigrid.cycle_settings import AlgebraicSettings
@@ -46,14 +53,19 @@ class DeviceMatrix:
         self.shape, self.device = host.shape, device
         self.indptr, self.indices = (kept(v, wp.int32, device) for v in (host.indptr, host.indices))
         self.values = kept(host.data, real, device)
-        self.rows, self.entries = Rows.flat(self.shape[0], device), RowEntries(self.indptr, self.indices, self.values)
+        self.rows, self.entries = (
+            Rows.flat(self.shape[0], device),
+            RowEntries(self.indptr, self.indices, self.values),
+        )
 
     def multiplying(self, x: wp.array[Any], y: wp.array[Any], *, add: bool = False) -> Bound:
         """Return the kernel y = A x, or y + A x."""
         return PRODUCT.bind(self.rows, self.entries, x=x, plus=y if add else None, y=y)
 
 
-def product_pass(left: DeviceMatrix, right: DeviceMatrix, out: DeviceMatrix, hosts: tuple[Matrix, Matrix, Matrix]) -> Bound:
+def product_pass(
+    left: DeviceMatrix, right: DeviceMatrix, out: DeviceMatrix, hosts: tuple[Matrix, Matrix, Matrix]
+) -> Bound:
     """Return what computes A B into a known pattern.
 
     Args:
@@ -65,14 +77,22 @@ def product_pass(left: DeviceMatrix, right: DeviceMatrix, out: DeviceMatrix, hos
     A, B, C = hosts
     ends = np.concatenate([[0], np.cumsum(np.diff(B.indptr).astype(np.int64)[A.indices])])
     place = wp.zeros(int(ends[-1]), dtype=wp.uint16, device="cpu")
-    patterns = [wp.array(v, dtype=wp.int32, device="cpu") for m in hosts for v in (m.indptr, m.indices)]
+    patterns = [
+        wp.array(v, dtype=wp.int32, device="cpu") for m in hosts for v in (m.indptr, m.indices)
+    ]
     at = wp.zeros(C.shape[1], dtype=wp.int32, device="cpu")
     wp.launch(places_kernel, 1, [*patterns, at, place, A.shape[0]], device="cpu")
     begins = wp.array(ends[A.indptr[:-1]], dtype=wp.int64, device=left.device)
     return MULTIPLY.bind(
-        left.rows, left.entries, right=right.indptr, b=right.values, starts=out.indptr, place=place.to(left.device),
-        result=out.values, begins=begins,
-    )  # fmt: skip
+        left.rows,
+        left.entries,
+        right=right.indptr,
+        b=right.values,
+        starts=out.indptr,
+        place=place.to(left.device),
+        result=out.values,
+        begins=begins,
+    )
 
 
 class AlgebraicLevel:
@@ -89,7 +109,9 @@ class AlgebraicLevel:
         x, b, t: iterate, right-hand side and what lies between two sweeps.
     """
 
-    def __init__(self, host: Matrix, real: Any, device: wp.Device, weights: tuple[float, float], visits: int) -> None:
+    def __init__(
+        self, host: Matrix, real: Any, device: wp.Device, weights: tuple[float, float], visits: int
+    ) -> None:
         self.size, self.device, self.weights, self.visits = host.shape[0], device, weights, visits
         self._legs: dict[tuple[str, bool], list[CycleStage]] = {}
         self.A = DeviceMatrix(host, real, device)
@@ -99,7 +121,11 @@ class AlgebraicLevel:
     def connect(self, hosts: tuple[Matrix, ...], coarse: AlgebraicLevel, real: Any) -> None:
         """Take the prolongation from a coarser level; `hosts` are A, P, R = P', the patterns of A P and of the coarse matrix."""
         device, (host, P, R, AP, coarse_host) = self.device, hosts
-        turn = scipy.sparse.csr_array((np.arange(P.nnz), P.indices, P.indptr), shape=P.shape).T.tocsr().data
+        turn = (
+            scipy.sparse.csr_array((np.arange(P.nnz), P.indices, P.indptr), shape=P.shape)
+            .T.tocsr()
+            .data
+        )
         self.P, self.R = DeviceMatrix(P, real, device), DeviceMatrix(R, real, device)
         self.plain = wp.clone(self.P.values)  # P's entries before its rows are scaled
         self.turn = wp.array(turn, dtype=wp.int32, device=device)
@@ -109,22 +135,42 @@ class AlgebraicLevel:
             product_pass(self.R, self.AP, coarse.A, (R, AP, coarse_host)),
         )
 
-    def sweep(self, y: wp.array[Any], x: wp.array[Any], omega: float, *, from_zero: bool = False) -> Bound:
+    def sweep(
+        self, y: wp.array[Any], x: wp.array[Any], omega: float, *, from_zero: bool = False
+    ) -> Bound:
         """Return the sweep y = x + omega (b - A x) over the rows' l1 norms; x is taken for 0 if from_zero."""
         A = self.A
-        return SMOOTH.bind(A.rows, A.entries, inverse=self.inverse, x=x, b=self.b, y=y, omega=omega, from_zero=from_zero)
+        return SMOOTH.bind(
+            A.rows,
+            A.entries,
+            inverse=self.inverse,
+            x=x,
+            b=self.b,
+            y=y,
+            omega=omega,
+            from_zero=from_zero,
+        )
 
     def pair(self, weights: tuple[float, float], *, from_zero: bool = False) -> list[CycleStage]:
         """Return two sweeps, x to t and back."""
-        return [self.sweep(self.t, self.x, weights[0], from_zero=from_zero), self.sweep(self.x, self.t, weights[1])]
+        return [
+            self.sweep(self.t, self.x, weights[0], from_zero=from_zero),
+            self.sweep(self.x, self.t, weights[1]),
+        ]
 
-    def descend(self, coarse: AlgebraicLevel, *, projected: bool, from_zero: bool) -> list[CycleStage]:
+    def descend(
+        self, coarse: AlgebraicLevel, *, projected: bool, from_zero: bool
+    ) -> list[CycleStage]:
         """Return steps 1 and 2 of a cycle: a pair of Chebyshev-Jacobi sweeps, and b_c = P'(b - A x)."""
         assert not projected, "smoothed aggregates know no bounds"
         key = "down", from_zero
         if key not in self._legs:
             residual = REMAINDER.bind(self.A.rows, self.A.entries, x=self.x, b=self.b, y=self.t)
-            self._legs[key] = [*self.pair(self.weights, from_zero=from_zero), residual, self.R.multiplying(self.t, coarse.b)]
+            self._legs[key] = [
+                *self.pair(self.weights, from_zero=from_zero),
+                residual,
+                self.R.multiplying(self.t, coarse.b),
+            ]
         return self._legs[key]
 
     def coarsen_bounds(self, coarse: AlgebraicLevel) -> tuple[()]:
@@ -136,16 +182,20 @@ class AlgebraicLevel:
         key = "up", projected
         if key not in self._legs:
             assert self.P is not None, "not the coarsest level"
-            self._legs[key] = [self.P.multiplying(coarse.x, self.x, add=True), *self.pair(self.weights[::-1])]
+            self._legs[key] = [
+                self.P.multiplying(coarse.x, self.x, add=True),
+                *self.pair(self.weights[::-1]),
+            ]
         return self._legs[key]
 
 
 class AlgebraicHierarchy:
     """Multigrid for M e = r, M = P A P + P D P, with a sparse A.
 
-    Rows of the finest prolongation are scaled by a_ii / (a_ii + D_i), the value that the row's own equation asks for, and are 0 off the
-    free set: a coarse correction then leaves stiff unknowns alone, whatever D's size. On an unsymmetric A the aggregates are those of its
-    symmetric part, smoothed where that part rules, and the coarse matrices are P' M P with M as it is.
+    Rows of the finest prolongation are scaled by a_ii / (a_ii + D_i), the value that the row's own
+    equation asks for, and are 0 off the free set: a coarse correction then leaves stiff unknowns
+    alone, whatever D's size. On an unsymmetric A the aggregates are those of its symmetric part,
+    smoothed where that part rules, and the coarse matrices are P' M P with M as it is.
 
     Args:
         A: the matrix.
@@ -157,8 +207,15 @@ class AlgebraicHierarchy:
         weight: one over the diagonal of M, field like r; 1 where that is 0, 0 off the free set.
     """
 
-    def __init__(self, A: SparseOperator, real: Any, settings: AlgebraicSettings | None = None) -> None:
-        self.settings, self.real, self.source, self.device = settings or AlgebraicSettings(), real, A, A.device
+    def __init__(
+        self, A: SparseOperator, real: Any, settings: AlgebraicSettings | None = None
+    ) -> None:
+        self.settings, self.real, self.source, self.device = (
+            settings or AlgebraicSettings(),
+            real,
+            A,
+            A.device,
+        )
         host = A.matrix()
         pattern = _with_diagonal(host if A.symmetric else _union(host))
         self._order = self._find_entries(host, pattern)
@@ -168,16 +225,27 @@ class AlgebraicHierarchy:
         self.weight = zeros(n, real, self.device)
         self.inverts = last <= self._most
         shape = (last, last) if self.inverts else (0, 0)
-        self._matrix, self._inverse = (wp.zeros(shape, dtype=wp.float64, device=self.device) for _ in range(2))
+        self._matrix, self._inverse = (
+            wp.zeros(shape, dtype=wp.float64, device=self.device) for _ in range(2)
+        )
         self.r, self.z = self.levels[0].b, self.levels[0].x
 
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
         """Take a free set (uint8 field) and a shift D >= 0 (float64 field; None: 0), and coarsen."""
         finest, A = self.levels[0], self.source
         FILL.bind(
-            finest.A.rows, finest.A.entries, a=A.values, order=self._order, m=finest.A.values, d=A.diagonal(), free=free,
-            shift=shift, inverse=finest.inverse, scale=self.scale, weight=self.weight,
-        ).launch()  # fmt: skip
+            finest.A.rows,
+            finest.A.entries,
+            a=A.values,
+            order=self._order,
+            m=finest.A.values,
+            d=A.diagonal(),
+            free=free,
+            shift=shift,
+            inverse=finest.inverse,
+            scale=self.scale,
+            weight=self.weight,
+        ).launch()
         self._coarsening.run()
 
     def product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = launch_now) -> None:
@@ -201,16 +269,29 @@ class AlgebraicHierarchy:
             P = fine.P
             assert P is not None
             if depth == 0:
-                SCALE_ROWS.bind(P.rows, ptr=P.indptr, a=fine.plain, scale=self.scale, scaled=P.values).launch(launch)
+                SCALE_ROWS.bind(
+                    P.rows, ptr=P.indptr, a=fine.plain, scale=self.scale, scaled=P.values
+                ).launch(launch)
                 turned = Rows.flat(fine.turn.size, self.device)
-                GATHER.bind(turned, source=P.values, order=fine.turn, taken=fine.R.values).launch(launch)
+                GATHER.bind(turned, source=P.values, order=fine.turn, taken=fine.R.values).launch(
+                    launch
+                )
             for product in fine.products:
                 product.launch(launch)
-            INVERSE.bind(coarse.A.rows, ptr=coarse.A.indptr, a=coarse.A.values, inverse=coarse.inverse).launch(launch)
+            INVERSE.bind(
+                coarse.A.rows, ptr=coarse.A.indptr, a=coarse.A.values, inverse=coarse.inverse
+            ).launch(launch)
         if self.inverts:
             last = self.levels[-1]
-            launch(densify_kernel, last.size, [last.A.indptr, last.A.indices, last.A.values, self._matrix], device=self.device)
-            launch(factor_kernel, 1, [self._matrix, wp.float64(PINNED[self.real])], device=self.device)
+            launch(
+                densify_kernel,
+                last.size,
+                [last.A.indptr, last.A.indices, last.A.values, self._matrix],
+                device=self.device,
+            )
+            launch(
+                factor_kernel, 1, [self._matrix, wp.float64(PINNED[self.real])], device=self.device
+            )
             launch(invert_kernel, last.size, [self._matrix, self._inverse], device=self.device)
         return program
 
@@ -219,13 +300,21 @@ class AlgebraicHierarchy:
         last, weights = self.levels[-1], self.settings.weights
         if not self.inverts:  # forth and back, so that the whole is symmetric
             pairs = range(self.settings.last_sweeps)
-            return [s for i in pairs for s in last.pair(weights[::-1] if i % 2 else weights, from_zero=from_zero and i == 0)]
+            return [
+                s
+                for i in pairs
+                for s in last.pair(
+                    weights[::-1] if i % 2 else weights, from_zero=from_zero and i == 0
+                )
+            ]
         return [self._multiply_by_inverse]
 
     @cached_property
     def _multiply_by_inverse(self) -> CycleStage:
         last = self.levels[-1]
-        return Launches.of_kernel(solve_kernel, last.size, [self._inverse, last.b, last.x], self.device)
+        return Launches.of_kernel(
+            solve_kernel, last.size, [self._inverse, last.b, last.x], self.device
+        )
 
     @property
     def _most(self) -> int:
@@ -240,7 +329,14 @@ class AlgebraicHierarchy:
         return wp.array(order, dtype=wp.int32, device=self.device)
 
 
-def _coarsen(source: SparseOperator, A: Matrix, pattern: Matrix, real: Any, settings: AlgebraicSettings, most: int) -> list[AlgebraicLevel]:
+def _coarsen(
+    source: SparseOperator,
+    A: Matrix,
+    pattern: Matrix,
+    real: Any,
+    settings: AlgebraicSettings,
+    most: int,
+) -> list[AlgebraicLevel]:
     """Return the levels of a matrix, `A` on the host, whose entries are stored in `pattern`; nodes aggregate where there are blocks."""
     device, B, block = source.device, source.near_null_space, source.block
     values = np.zeros(pattern.nnz)
@@ -259,23 +355,29 @@ def _coarsen(source: SparseOperator, A: Matrix, pattern: Matrix, real: Any, sett
             break
         T, candidates = fit_candidates(aggregates, candidates)
         block = candidates.shape[1]
-        # local weights are sums of magnitudes; spectral ones start from random vectors, so runs would differ
+        # local weights are sums of magnitudes; spectral ones start from random vectors, so runs
+        # would differ
         P = T
         if _skewness(current, entries) <= settings.skew:
-            P = jacobi_prolongation_smoother(entries, T, C, candidates, omega=4 / 3, weighting="local")
+            P = jacobi_prolongation_smoother(
+                entries, T, C, candidates, omega=4 / 3, weighting="local"
+            )
         P = scipy.sparse.csr_array(P)
         P.sort_indices()
         R = P.T.tocsr()
         AP = _pattern_product(current, P)
         coarse = _pattern_product(R, AP)
-        if coarse.nnz > current.nnz or np.diff(AP.indptr).max() > WIDEST:  # wide rows, which coarsening fills
+        # wide rows, which coarsening fills
+        if coarse.nnz > current.nnz or np.diff(AP.indptr).max() > WIDEST:
             break
         levels.append(AlgebraicLevel(coarse, real, device, *cycles))
         fine.connect((current, P, R, AP, coarse), levels[-1], real)
         for product in fine.products:
             product.launch()
         values = levels[-1].A.values.numpy().astype(np.float64)
-        current = scipy.sparse.csr_array((values, coarse.indices, coarse.indptr), shape=coarse.shape)
+        current = scipy.sparse.csr_array(
+            (values, coarse.indices, coarse.indptr), shape=coarse.shape
+        )
     return levels
 
 
@@ -307,7 +409,9 @@ def _places(A: Matrix, pattern: Matrix) -> np.ndarray:
 
 
 def _ones(matrix: Matrix) -> Matrix:
-    return scipy.sparse.csr_array((np.ones(matrix.nnz, dtype=np.float32), matrix.indices, matrix.indptr), shape=matrix.shape)
+    return scipy.sparse.csr_array(
+        (np.ones(matrix.nnz, dtype=np.float32), matrix.indices, matrix.indptr), shape=matrix.shape
+    )
 
 
 def _union(matrix: Matrix) -> Matrix:

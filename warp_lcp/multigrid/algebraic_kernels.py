@@ -12,9 +12,16 @@ INDICES, MATRIX = wp.array(dtype=wp.int32), wp.array2d(dtype=wp.float64)
 
 @forward_kernel(module="warp_lcp.algebraic")
 def places_kernel(
-    ptr: INDICES, col: INDICES, right_ptr: INDICES, right_col: INDICES, out_ptr: INDICES, out_col: INDICES, at: INDICES,
-    place: wp.array(dtype=wp.uint16), n: int,
-):  # fmt: skip
+    ptr: INDICES,
+    col: INDICES,
+    right_ptr: INDICES,
+    right_col: INDICES,
+    out_ptr: INDICES,
+    out_col: INDICES,
+    at: INDICES,
+    place: wp.array(dtype=wp.uint16),
+    n: int,
+):
     """Where in its row of the product each product of two entries belongs; by one thread, once a pattern. `at` is memory for a row."""
     c = wp.int64(0)
     for i in range(n):
@@ -40,8 +47,8 @@ def densify_kernel(ptr: INDICES, col: INDICES, a: wp.array(dtype=Any), out: MATR
 def factor_kernel(matrix: MATRIX, rounding: wp.float64):
     """L U in place without pivoting, by one thread.
 
-    A pivot whose magnitude is below `rounding` times its diagonal is what rounding left of a singular component, or a row of zeros: its
-    unknown is taken out, and its pivot is 0.
+    A pivot whose magnitude is below `rounding` times its diagonal is what rounding left of a
+    singular component, or a row of zeros: its unknown is taken out, and its pivot is 0.
     """
     n = matrix.shape[0]
     for c in range(n):

@@ -1,8 +1,8 @@
 # mypy: ignore-errors
 """Kernels that assemble the coarsest level's matrix and factor or invert it.
 
-A pivot below `rounding` times its diagonal is a singular component's rounding: its unknown is pinned at 0. Positive semi-definite matrices
-need no other order of the pivots.
+A pivot below `rounding` times its diagonal is a singular component's rounding: its unknown is
+pinned at 0. Positive semi-definite matrices need no other order of the pivots.
 """
 
 import functools
@@ -16,7 +16,8 @@ from warp_lcp.rows.layout import RowLayout, stencil_struct
 from warp_lcp.rows.sequence import CUDA_THREADS, meet
 
 square = wp.array2d(dtype=wp.float64)
-# of a coarsest level's diagonal: what rounding leaves of a singular component's last pivot, with a margin
+# of a coarsest level's diagonal: what rounding leaves of a singular component's last pivot, with a
+# margin
 PINNED = {wp.float32: 3e-5, wp.float64: 1e-13}
 
 
@@ -34,7 +35,12 @@ def none_changed(changed: wp.array2d(dtype=wp.uint8)):
 @wp.func
 def element(L: RowLayout, r: int):
     """Element of a stored field that holds cell r."""
-    return L.base + wp.int64(r // (L.rows * L.nx)) * L.s1 + wp.int64((r // L.nx) % L.rows) * L.s2 + wp.int64(r % L.nx)
+    return (
+        L.base
+        + wp.int64(r // (L.rows * L.nx)) * L.s1
+        + wp.int64((r // L.nx) % L.rows) * L.s2
+        + wp.int64(r % L.nx)
+    )
 
 
 @wp.func
@@ -102,8 +108,13 @@ def coarsest_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
 
     @forward_kernel(module=f"warp_lcp.coarsest.factor_{name}")
     def factor(
-        S: Stencil, L: RowLayout, periodic: wp.vec3i, rounding: wp.float64, changed: wp.array2d(dtype=wp.uint8), matrix: square
-    ):  # fmt: skip
+        S: Stencil,
+        L: RowLayout,
+        periodic: wp.vec3i,
+        rounding: wp.float64,
+        changed: wp.array2d(dtype=wp.uint8),
+        matrix: square,
+    ):
         """Assemble and factor in place; nothing to do if none of the rows of cells has changed."""
         if none_changed(changed):
             return
@@ -152,7 +163,15 @@ def coarsest_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
         meet()
 
     @forward_kernel(module=f"warp_lcp.coarsest.invert_{name}", launch_bounds=CUDA_THREADS)
-    def invert(S: Stencil, L: RowLayout, periodic: wp.vec3i, rounding: wp.float64, threads: int, other: square, inverse: square):
+    def invert(
+        S: Stencil,
+        L: RowLayout,
+        periodic: wp.vec3i,
+        rounding: wp.float64,
+        threads: int,
+        other: square,
+        inverse: square,
+    ):
         """Assemble and invert; every thread of the block passes every barrier."""
         t = wp.tid()
         m = inverse.shape[0]

@@ -17,13 +17,22 @@ def coarser_pattern(pattern: Pattern, factors: Counts) -> Pattern:
     """Return the neighbors of aggregates of so many cells along x, y, z: those of cells, and theirs along axes that are aggregated."""
     found = set()
     for offset in pattern.offsets:
-        steps = [{step, 0} if factor == 2 else {step} for step, factor in zip(offset, factors, strict=True)]
+        steps = [
+            {step, 0} if factor == 2 else {step}
+            for step, factor in zip(offset, factors, strict=True)
+        ]
         found |= {tuple(place) for place in itertools.product(*steps)}
     offsets = sorted(found - {(0, 0, 0)}, key=lambda o: o[::-1])
-    return Pattern(tuple(o for o in offsets if not pattern.symmetric or o[::-1] < (0, 0, 0)), pattern.symmetric, "arrays")  # type: ignore[misc]
+    return Pattern(
+        tuple(o for o in offsets if not pattern.symmetric or o[::-1] < (0, 0, 0)),
+        pattern.symmetric,
+        "arrays",
+    )  # type: ignore[misc]
 
 
-def weights_block(pattern: Pattern, padding: Padding, real: Any, device: wp.Device) -> tuple[wp.array[Any], tuple[wp.array[Any], ...]]:
+def weights_block(
+    pattern: Pattern, padding: Padding, real: Any, device: wp.Device
+) -> tuple[wp.array[Any], tuple[wp.array[Any], ...]]:
     """Return memory for a pattern's weights, one field after another, and each of them."""
     n, count = padding.size, len(pattern.offsets)
     block = zeros(count * n, real, device)

@@ -78,14 +78,20 @@ class Cycle:
     solve: CoarsestSolver
     projected: bool = False
 
-    def stages(self, depth: int = 0, *, visits: int = 1, from_zero: bool = True) -> Iterator[CycleStage]:
+    def stages(
+        self, depth: int = 0, *, visits: int = 1, from_zero: bool = True
+    ) -> Iterator[CycleStage]:
         """Yield consecutive cycles on level `depth`; the numbers are steps of Algorithm 1."""
         if depth == len(self.levels) - 1:
-            yield from self.solve(visits, projected=self.projected, from_zero=from_zero)  # 4, coarsest level
+            # 4, coarsest level
+            yield from self.solve(visits, projected=self.projected, from_zero=from_zero)
             return
         fine, coarse = self.levels[depth], self.levels[depth + 1]
         for visit in range(visits):
-            yield from fine.descend(coarse, projected=self.projected, from_zero=from_zero and visit == 0)  # 1, 2
+            # 1, 2
+            yield from fine.descend(
+                coarse, projected=self.projected, from_zero=from_zero and visit == 0
+            )
             if self.projected:
                 yield from fine.coarsen_bounds(coarse)  # 3
             yield from self.stages(depth + 1, visits=coarse.visits)  # 4
@@ -137,7 +143,9 @@ class Launches:
         self.function(launch=launch)
 
 
-def _launch_kernel(kernel: Any, dim: int, inputs: list[Any], device: wp.Device, *, launch: Launch) -> None:
+def _launch_kernel(
+    kernel: Any, dim: int, inputs: list[Any], device: wp.Device, *, launch: Launch
+) -> None:
     launch(kernel, dim, inputs, device=device)
 
 

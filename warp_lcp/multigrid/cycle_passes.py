@@ -1,11 +1,13 @@
 """Passes of a hierarchy: of its cycles, with the legs that are waves of them and stream memory once, and those that build its levels.
 
-Coarser levels are the Galerkin product with piecewise-constant 2 x 2 x 2 aggregates. They keep the 7-point stencil on every level and cope
-with any mask: the weight between two aggregates is the sum over the faces between them. A cell's excess is its diagonal less its faces to
-other unknowns: what AIR, held unknowns and the shift contribute. An aggregate's diagonal is the sum of its cells' excesses plus its outer
-faces, a sum of positive numbers: taking inner faces off the diagonals would cancel. Weights along axes that are not aggregated are not too
-stiff, so they are multiplied by `stiffen`, the over-correction that the prolongation applies to all; the excess, whose held neighbors are
-one cell and not one aggregate away, by `held`.
+Coarser levels are the Galerkin product with piecewise-constant 2 x 2 x 2 aggregates. They keep the
+7-point stencil on every level and cope with any mask: the weight between two aggregates is the sum
+over the faces between them. A cell's excess is its diagonal less its faces to other unknowns: what
+AIR, held unknowns and the shift contribute. An aggregate's diagonal is the sum of its cells'
+excesses plus its outer faces, a sum of positive numbers: taking inner faces off the diagonals would
+cancel. Weights along axes that are not aggregated are not too stiff, so they are multiplied by
+`stiffen`, the over-correction that the prolongation applies to all; the excess, whose held
+neighbors are one cell and not one aggregate away, by `held`.
 """
 
 from dataclasses import dataclass
@@ -28,9 +30,12 @@ CORRECT = KERNELS["cycle.correct"]
 COARSE_BOUNDS = KERNELS["cycle.bounds"]
 DESCEND = Wave("cycle.descend", (SWEEP_INTO_RING, 0), (SWEEP_OUT_OF_RING, 1), (RESTRICT, 2))
 ASCEND = Wave("cycle.ascend", (CORRECT, 0), (SWEEP_INTO_RING, 1), (SWEEP_OUT_OF_RING, 2))
-# On a box of cells among those of other processes: the first sweep from zero is made in ghost cells, too, where it needs only their
-# right-hand side. So what follows waits for no exchange, but for the residual beside others' cells, which is found again.
-DESCEND_FROM_GHOSTS = Wave("cycle.descend_from_ghosts", (SWEEP_INTO_RING, 0), (SWEEP_OUT_OF_RING, 2), (RESTRICT, 3))
+# On a box of cells among those of other processes: the first sweep from zero is made in ghost
+# cells, too, where it needs only their right-hand side. So what follows waits for no exchange, but
+# for the residual beside others' cells, which is found again.
+DESCEND_FROM_GHOSTS = Wave(
+    "cycle.descend_from_ghosts", (SWEEP_INTO_RING, 0), (SWEEP_OUT_OF_RING, 2), (RESTRICT, 3)
+)
 COARSEN = LEVELS["coarsen.aggregates"]
 COARSEN_COMPACT = LEVELS["coarsen.compact"]
 ASSEMBLE = LEVELS["coarsen.assemble"]

@@ -5,7 +5,17 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from warp_lcp.settings import Count, CountOrZero, NonNegative, Part, Positive, SettingError, Settings, ShareOrZero, renamed
+from warp_lcp.settings import (
+    Count,
+    CountOrZero,
+    NonNegative,
+    Part,
+    Positive,
+    SettingError,
+    Settings,
+    ShareOrZero,
+    renamed,
+)
 
 
 class Smoothing(Settings):
@@ -23,7 +33,9 @@ class Smoothing(Settings):
     def weights(self) -> tuple[float, float]:
         """Relaxation weights: reciprocals of the Chebyshev points of the interval."""
         a, b = self.interval
-        points = [0.5 * (a + b) + 0.5 * (b - a) * math.cos(math.pi * (2 * i + 1) / 4) for i in range(2)]
+        points = [
+            0.5 * (a + b) + 0.5 * (b - a) * math.cos(math.pi * (2 * i + 1) / 4) for i in range(2)
+        ]
         return 1 / points[0], 1 / points[1]
 
 
@@ -35,24 +47,30 @@ class CycleSettings(Smoothing):
     The defaults are the best measured on 7-point stencils with piecewise-constant aggregates.
 
     Args:
-        gamma: coarse cycles a level; 1 is a V-cycle, 2 a W-cycle. Where one axis is coarsened at a time, every second level
-            is visited once.
-        revisited_cpu: the most levels below the finest that are visited `gamma` times by each visit of the level above; those further down
-            once.
-        revisited_cuda: the same on a GPU, where small levels take as long as large ones: a W-cycle doubles their launches with each level.
-        over_correction: factor on coarse corrections: piecewise-constant aggregates are too stiff by about two.
-        dirichlet_scaling: factor on the contributions of AIR and of unknowns at their bounds to an aggregate's diagonal.
-            They are nearer than the next aggregate, so the over-correction applies to them in part only.
+        gamma: coarse cycles a level; 1 is a V-cycle, 2 a W-cycle. Where one axis is coarsened at a
+            time, every second level is visited once.
+        revisited_cpu: the most levels below the finest that are visited `gamma` times by each visit
+            of the level above; those further down once.
+        revisited_cuda: the same on a GPU, where small levels take as long as large ones: a W-cycle
+            doubles their launches with each level.
+        over_correction: factor on coarse corrections: piecewise-constant aggregates are too stiff
+            by about two.
+        dirichlet_scaling: factor on the contributions of AIR and of unknowns at their bounds to an
+            aggregate's diagonal. They are nearer than the next aggregate, so the over-correction
+            applies to them in part only.
         interval: bounds of the spectrum of D^-1 A that the two Chebyshev-Jacobi sweeps damp.
         coarsest_cpu: the most cells of the coarsest level, which is inverted densely.
-        coarsest_cuda: the same on a GPU; without `one_launch_cuda` one thread factors it, which is quick for 16 cells only.
-        one_launch_cpu: the most cells of levels that run together in one launch of one thread; 0: none do. On the CPU a captured graph's
-            launches cost next to nothing, and its legs that stream through a level are faster.
-        one_launch_cuda: the same on a GPU, in one block of threads: 8^3 cells; with 16^3 one multiprocessor
-            works longer than launches would take, 2 ms of a solve on an H200.
-        semicoarsening_threshold: an axis is coarsened once its mean weight is at least this fraction
-            of the strongest axis's mean weight.
-        projected_sweeps: pairs of sweeps that stand for a solve on the coarsest level of a projected cycle.
+        coarsest_cuda: the same on a GPU; without `one_launch_cuda` one thread factors it, which is
+            quick for 16 cells only.
+        one_launch_cpu: the most cells of levels that run together in one launch of one thread; 0:
+            none do. On the CPU a captured graph's launches cost next to nothing, and its legs that
+            stream through a level are faster.
+        one_launch_cuda: the same on a GPU, in one block of threads: 8^3 cells; with 16^3 one
+            multiprocessor works longer than launches would take, 2 ms of a solve on an H200.
+        semicoarsening_threshold: an axis is coarsened once its mean weight is at least this
+            fraction of the strongest axis's mean weight.
+        projected_sweeps: pairs of sweeps that stand for a solve on the coarsest level of a
+            projected cycle.
     """
 
     gamma: Count = 2
@@ -74,13 +92,15 @@ class AlgebraicSettings(Smoothing):
     """How the hierarchy is built and cycled.
 
     Args:
-        strength: entries below this share of sqrt(a_ii a_jj) do not aggregate. It must be above what rounding leaves of
-            entries that cancel.
+        strength: entries below this share of sqrt(a_ii a_jj) do not aggregate. It must be above
+            what rounding leaves of entries that cancel.
         gamma: coarse cycles a level; 1 is a V-cycle.
         gamma_unsymmetric: the same on an unsymmetric A.
-        skew: a level whose skew part is larger than this share of its symmetric off-diagonal part takes plain aggregates: Galerkin products
-            of smoothed ones are centered differences, which are unstable where convection rules; those of plain ones stay M-matrices.
-        interval: bounds of the spectrum, in units of its l1 bound, that the two Chebyshev-Jacobi sweeps damp.
+        skew: a level whose skew part is larger than this share of its symmetric off-diagonal part
+            takes plain aggregates: Galerkin products of smoothed ones are centered differences,
+            which are unstable where convection rules; those of plain ones stay M-matrices.
+        interval: bounds of the spectrum, in units of its l1 bound, that the two Chebyshev-Jacobi
+            sweeps damp.
         coarsest_cpu: the most unknowns of the coarsest level, which is inverted densely.
         coarsest_cuda: the same on a GPU, where one thread factors it.
         stall: a level that keeps more than this share of its unknowns is not coarsened.

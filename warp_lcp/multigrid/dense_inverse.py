@@ -31,19 +31,32 @@ class DenseInverse:
     """
 
     def __init__(self, level: Any) -> None:
-        self.level, self._counts, self._device = level, level.stencil.padding.counts, level.stencil.device
+        self.level, self._counts, self._device = (
+            level,
+            level.stencil.padding.counts,
+            level.stencil.device,
+        )
         nz, ny, nx = self._counts
         m = math.prod(self._counts)
         self.matrix, self.inverse = (zeros((m, m), wp.float64, self._device) for _ in range(2))
         self._own = zeros(m, wp.float64, self._device)
-        self.product: Bound = SOLVE.bind(Rows.flat(m, self._device), inverse=self.inverse, b=level.b, x=level.x, nx=nx, ny=ny, nz=nz)
+        self.product: Bound = SOLVE.bind(
+            Rows.flat(m, self._device),
+            inverse=self.inverse,
+            b=level.b,
+            x=level.x,
+            nx=nx,
+            ny=ny,
+            nz=nz,
+        )
 
     def record(self, program: Program, *, by_block: bool) -> None:
         """Record the inversion of the matrix as it will be.
 
         Args:
             program: that records.
-            by_block: whether one block of a GPU inverts a matrix of seven points; else one thread factors it.
+            by_block: whether one block of a GPU inverts a matrix of seven points; else one thread
+                factors it.
         """
         if self.level.stencil.pattern is None:
             self._record_seven_points(program, by_block=by_block)
@@ -55,25 +68,55 @@ class DenseInverse:
         s, (nz, ny, nx) = self.level.stencil, self._counts
         (px, py, pz), least = s.periodic, PINNED[self.level.x.dtype]
         matrix, inverse = self.matrix.flatten(), self.inverse.flatten()
-        rows, one = Rows.of(s.padding, self._device, whole=True), Rows.flat(1, self._device, serial=True)
-        ASSEMBLE.bind(rows, stencil=s, matrix=matrix, cells=nx, lines=ny, planes=nz, periodic_x=px, periodic_y=py, periodic_z=pz).launch(
-            program.launch
+        rows, one = (
+            Rows.of(s.padding, self._device, whole=True),
+            Rows.flat(1, self._device, serial=True),
         )
-        ELIMINATE.bind(one, matrix=matrix, inverse=inverse, own=self._own, m=nz * ny * nx, least=least).launch(program.launch)
+        ASSEMBLE.bind(
+            rows,
+            stencil=s,
+            matrix=matrix,
+            cells=nx,
+            lines=ny,
+            planes=nz,
+            periodic_x=px,
+            periodic_y=py,
+            periodic_z=pz,
+        ).launch(program.launch)
+        ELIMINATE.bind(
+            one, matrix=matrix, inverse=inverse, own=self._own, m=nz * ny * nx, least=least
+        ).launch(program.launch)
 
     def _record_seven_points(self, program: Program, *, by_block: bool) -> None:
         """Record L D L' and the columns of the inverse; on CUDA, Gauss-Jordan elimination by one block."""
-        s, changed, real, m = self.level.stencil, self.level.changed, self.level.x.dtype, self.matrix.shape[0]
+        s, changed, real, m = (
+            self.level.stencil,
+            self.level.changed,
+            self.level.x.dtype,
+            self.matrix.shape[0],
+        )
         kernels = coarsest_kernels(s.weights is not None, s.d.dtype, real)
-        inputs = [s.struct, s.rows.single, wp.vec3i(*map(int, s.periodic)), wp.float64(PINNED[real])]
+        inputs = [
+            s.struct,
+            s.rows.single,
+            wp.vec3i(*map(int, s.periodic)),
+            wp.float64(PINNED[real]),
+        ]
         if by_block:
             inputs += [CUDA_THREADS, self.matrix, self.inverse]
-            program.launch(kernels.invert, CUDA_THREADS, inputs, device=self._device, block_dim=CUDA_THREADS)
+            program.launch(
+                kernels.invert, CUDA_THREADS, inputs, device=self._device, block_dim=CUDA_THREADS
+            )
             return
         program.launch(kernels.factor, 1, [*inputs, changed, self.matrix], device=self._device)
-        INVERT.bind(Rows.flat(m, self._device), changed=changed, matrix=self.matrix, inverse=self.inverse, m=m, flags=changed.size).launch(
-            program.launch
-        )
+        INVERT.bind(
+            Rows.flat(m, self._device),
+            changed=changed,
+            matrix=self.matrix,
+            inverse=self.inverse,
+            m=m,
+            flags=changed.size,
+        ).launch(program.launch)
 
     def solve(self, visits: int, *, projected: bool, from_zero: bool) -> Iterable[CycleStage]:
         """Return the stages of a `CoarsestSolver`: once, whatever `visits` is, for this is the solution."""
@@ -83,5 +126,7 @@ class DenseInverse:
         """Yield projected pairs of sweeps, forth and back: symmetric."""
         level, settings = self.level, self.level.settings
         for sweep in range(settings.projected_sweeps):
-            yield from level.pair(settings.weights, projected=True, from_zero=from_zero and sweep == 0)
+            yield from level.pair(
+                settings.weights, projected=True, from_zero=from_zero and sweep == 0
+            )
             yield from level.pair(settings.weights[::-1], projected=True)

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 class FusedCoarseLevels:
     """Coarsest solver: the last levels of a hierarchy, which one block of a GPU (one thread of a CPU) cycles through.
 
-    The cycle's stages are unrolled into a table on the device. Results are those of one launch a stage, to rounding.
+    The cycle's stages are unrolled into a table on the device. Results are those of one launch a
+    stage, to rounding.
 
     Args:
         levels: the levels, stored alike.
@@ -34,7 +35,9 @@ class FusedCoarseLevels:
     @functools.cached_property
     def coarsening(self) -> Sequence:
         """The making of all levels from the first one."""
-        stages: list[Any] = [s for fine, coarse in itertools.pairwise(self.levels) for s in fine.coarsened(coarse)]
+        stages: list[Any] = [
+            s for fine, coarse in itertools.pairwise(self.levels) for s in fine.coarsened(coarse)
+        ]
         return Sequence("small_levels.coarsen", stages)
 
     def solve(self, visits: int, *, projected: bool, from_zero: bool) -> tuple[Sequence]:
@@ -43,13 +46,19 @@ class FusedCoarseLevels:
         if key not in self._sequences:
             cycle = Cycle(self.levels, self._solve, projected)
             stages: list[Any] = list(cycle.stages(visits=visits, from_zero=from_zero))
-            self._sequences[key] = Sequence("small_levels.projected" if projected else "small_levels.cycle", stages)
+            self._sequences[key] = Sequence(
+                "small_levels.projected" if projected else "small_levels.cycle", stages
+            )
         return (self._sequences[key],)
 
 
 def first_small(levels: Listed[StencilLevel], cells: int) -> int:
     """Return the index of the first of the last levels that have at most so many cells each and are stored alike."""
     first = len(levels)
-    while first > 0 and math.prod(levels[first - 1].stencil.padding.counts) <= cells and levels[first - 1].form == levels[-1].form:
+    while (
+        first > 0
+        and math.prod(levels[first - 1].stencil.padding.counts) <= cells
+        and levels[first - 1].form == levels[-1].form
+    ):
         first -= 1
     return first

@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 
 Corner = list[int]  # k, j, i
 GATHERED = 32_768  # cells at which a level is gathered: exchanges would take as long as its cells
-BESIDE = 4  # cells from a cut corrected ahead: two are swept, the next one, and its aggregate's other
+# cells from a cut corrected ahead: two are swept, the next one, and its aggregate's other
+BESIDE = 4
 
 
 def whole_counts(stencil: PaddedStencil) -> tuple[int, int, int]:
@@ -48,7 +49,12 @@ def keep_side_kernel(d: wp.array3d(dtype=Any), axis: int, at: int, known: wp.arr
 @forward_kernel(module="warp_lcp.multigrid.halo_levels")
 @no_type_check
 def mark_side_kernel(
-    d: wp.array3d(dtype=Any), axis: int, at: int, row: int, known: wp.array2d(dtype=Any), changed: wp.array2d(dtype=wp.uint8)
+    d: wp.array3d(dtype=Any),
+    axis: int,
+    at: int,
+    row: int,
+    known: wp.array2d(dtype=Any),
+    changed: wp.array2d(dtype=wp.uint8),
 ):
     """Mark rows beside ghost cells that differ from those that are known."""
     a, b = wp.tid()
@@ -82,7 +88,9 @@ def share_changes(level: StencilLevel, launch: Launch) -> None:
         launch(keep_side_kernel, known.shape, [d, axis, at, known], device=s.device)
     s.ghosts.filling(s.d).launch(launch)
     for axis, at, row, known in sides:
-        launch(mark_side_kernel, known.shape, [d, axis, at, row, known, level.changed], device=s.device)
+        launch(
+            mark_side_kernel, known.shape, [d, axis, at, row, known, level.changed], device=s.device
+        )
 
 
 def beside_cuts(stencil: PaddedStencil, depth: int) -> list[tuple[Corner, Corner]]:
@@ -106,14 +114,24 @@ def descent(level: StencilLevel, coarse: StencilLevel, *, projected: bool) -> It
     The first sweep is made in ghost cells, too, where it needs their right-hand side alone; the
     residual beside others' cells is found again when ghost cells are filled.
     """
-    for field in (level.b, level.lower, level.upper)[: 3 if projected and level.upper.size else 1 + projected]:
+    for field in (level.b, level.lower, level.upper)[
+        : 3 if projected and level.upper.size else 1 + projected
+    ]:
         yield from level.stencil.fillings(field)
     s, (first, second) = level.stencil, level.settings.weights
     everywhere, inside = Rows.stored(s.padding, s.device), s.rows.after_ghosts()
     into_ring = level.sweeping(
-        level.t, level.x, first, projected=projected, from_zero=True, kind=passes.SWEEP_INTO_RING, rows=everywhere
-    )  # fmt: skip
-    out_of_ring = level.sweeping(level.x, level.t, second, projected=projected, kind=passes.SWEEP_OUT_OF_RING, rows=inside)
+        level.t,
+        level.x,
+        first,
+        projected=projected,
+        from_zero=True,
+        kind=passes.SWEEP_INTO_RING,
+        rows=everywhere,
+    )
+    out_of_ring = level.sweeping(
+        level.x, level.t, second, projected=projected, kind=passes.SWEEP_OUT_OF_RING, rows=inside
+    )
     yield Leg(passes.DESCEND_FROM_GHOSTS, (into_ring, out_of_ring, level.restricting(coarse)))
     yield from level.filling("x")
     for low, high in beside_cuts(coarse.stencil, 1):
@@ -127,28 +145,42 @@ def ascent(level: StencilLevel, coarse: StencilLevel, *, projected: bool) -> Ite
     if not coarse.gathered:  # then its ghost cells have been taken with its part
         yield from coarse.stencil.fillings(coarse.x)
     for axis, end in s.ghosts.cuts:  # those of x are filled since the restriction
-        ours, theirs = (Rows.beyond(v.stencil.padding, s.device, axis, end) for v in (level, coarse))
+        ours, theirs = (
+            Rows.beyond(v.stencil.padding, s.device, axis, end) for v in (level, coarse)
+        )
         factors = [1 if a == axis else f for a, f in enumerate(coarse.factors)]
         rows = ours.beside(theirs, (-factors[0], -factors[1], -factors[2]))
         yield level.correcting(coarse, scale, projected=projected, rows=rows)
         yield CONVERT.bind(ours, a=level.x, b=near)
     for low, high in beside_cuts(s, BESIDE):
         yield CONVERT.bind(Rows.part(s.padding, s.device, low, high), a=level.x, b=near)
-        yield level.correcting(coarse, scale, projected=projected, rows=_finer_part(level, coarse, low, high), x=near)
+        yield level.correcting(
+            coarse, scale, projected=projected, rows=_finer_part(level, coarse, low, high), x=near
+        )
     yield from _sweeps_beside(level, level.t, near, 2, projected=projected)
     # the ring takes that for what is above the last plane, too
     yield passes.CLEAR.bind(Rows.beyond(s.padding, s.device, 2, 0), x=near)
     yield from level.filling("t")
     correcting = level.correcting(coarse, scale, projected=projected)
-    yield Leg(passes.ASCEND, (correcting, *level.ring_pair(level.settings.weights[::-1], projected=projected, ring=near)))
+    yield Leg(
+        passes.ASCEND,
+        (
+            correcting,
+            *level.ring_pair(level.settings.weights[::-1], projected=projected, ring=near),
+        ),
+    )
     yield from _sweeps_beside(level, level.x, level.t, 1, projected=projected)
 
 
-def _sweeps_beside(level: StencilLevel, y: Any, x: Any, depth: int, *, projected: bool) -> Iterator[Bound]:
+def _sweeps_beside(
+    level: StencilLevel, y: Any, x: Any, depth: int, *, projected: bool
+) -> Iterator[Bound]:
     """Yield one of a leg's sweeps, from x to y, in cells within `depth` of others'."""
     for low, high in beside_cuts(level.stencil, depth):
         rows = Rows.part(level.stencil.padding, level.stencil.device, low, high)
-        yield level.sweeping(y, x, level.settings.weights[depth - 1], projected=projected, rows=rows)
+        yield level.sweeping(
+            y, x, level.settings.weights[depth - 1], projected=projected, rows=rows
+        )
 
 
 def _coarser_part(level: StencilLevel, coarse: StencilLevel, low: Corner, high: Corner) -> Rows:

@@ -13,7 +13,15 @@ import warp as wp
 from warp_lcp.multigrid import cycle_passes as passes
 from warp_lcp.multigrid import halo_levels
 from warp_lcp.multigrid.compact_levels import coarser_pattern, weights_block
-from warp_lcp.multigrid.cycle import CoarsestSolver, Cycle, CycleStage, GatheredLevel, Launches, Leg, recorded
+from warp_lcp.multigrid.cycle import (
+    CoarsestSolver,
+    Cycle,
+    CycleStage,
+    GatheredLevel,
+    Launches,
+    Leg,
+    recorded,
+)
 from warp_lcp.multigrid.cycle_passes import UNBOUNDED
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.dense_inverse import DenseInverse
@@ -31,32 +39,48 @@ from warp_lcp.rows.vectors import convert
 class Hierarchy:
     """Multigrid for (P A P + P D P) e = r on a grid.
 
-    The finest level shares A's weights; its diagonal is the caller's to fill (0 takes a cell out), followed by `rebuild`. `cycle` and
-    `monotone_cycle` are programs that read the right-hand side from the finest `b` and write its `x`; they allocate nothing and read
-    nothing back.
+    The finest level shares A's weights; its diagonal is the caller's to fill (0 takes a cell out),
+    followed by `rebuild`. `cycle` and `monotone_cycle` are programs that read the right-hand side
+    from the finest `b` and write its `x`; they allocate nothing and read nothing back.
 
     Args:
         stencil: the operator on all unknowns.
         real: type of the corrections.
         bounded: whether projected cycles are wanted; they need bounds on every level.
         settings: of the cycles.
-        shifted: whether the finest diagonal is a number of type `real` even where the operator only counts faces, so that a shift fits.
-        bounds: memory of the finest level's bounds, where the caller has fields that a projected cycle may overwrite; an empty upper one if
-            corrections have no upper bounds.
-        shrunk: by how much the cells of the finest level are fewer than those of the last level above it that cycles visit more than once,
-            where it is a level of a larger hierarchy.
-        strength: weights along x, y and z that decide which axes are coarsened first; None: the mean ones.
+        shifted: whether the finest diagonal is a number of type `real` even where the operator only
+            counts faces, so that a shift fits.
+        bounds: memory of the finest level's bounds, where the caller has fields that a projected
+            cycle may overwrite; an empty upper one if corrections have no upper bounds.
+        shrunk: by how much the cells of the finest level are fewer than those of the last level
+            above it that cycles visit more than once, where it is a level of a larger hierarchy.
+        strength: weights along x, y and z that decide which axes are coarsened first; None: the
+            mean ones.
         finest: another hierarchy's finest level of this stencil, where this one shares it.
     """
 
     def __init__(
-        self, stencil: PaddedStencil, real: Any, *, bounded: bool, settings: CycleSettings | None = None, bounds: Pair | None = None,
-        shifted: bool = False, shrunk: float = 1.0, strength: list[float] | None = None, finest: StencilLevel | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        stencil: PaddedStencil,
+        real: Any,
+        *,
+        bounded: bool,
+        settings: CycleSettings | None = None,
+        bounds: Pair | None = None,
+        shifted: bool = False,
+        shrunk: float = 1.0,
+        strength: list[float] | None = None,
+        finest: StencilLevel | None = None,
+    ) -> None:
         self.settings, self.real, self._source = settings or CycleSettings(), real, stencil
         self.device = stencil.device
         self._strength = strength or stencil.mean_weights
-        self.levels = [finest or _finest_level(stencil, real, self.settings, bounded=bounded, bounds=bounds, shifted=shifted)]
+        self.levels = [
+            finest
+            or _finest_level(
+                stencil, real, self.settings, bounded=bounded, bounds=bounds, shifted=shifted
+            )
+        ]
         self.finest.shrunk = shrunk
         while not self._is_coarsest(self.levels[-1]):
             self.levels.append(self._coarser(self.levels[-1], bounded=bounded))
@@ -64,31 +88,46 @@ class Hierarchy:
         self._small: FusedCoarseLevels | None = None
         self._gathered: Hierarchy | None = None
         solve = self._coarsest_solver() if stencil.ghosts is None else self._gather(bounded=bounded)
-        self.cycles = {projected: Cycle(self.levels[: self._first_small + 1], solve, projected) for projected in (False, True)}
+        self.cycles = {
+            projected: Cycle(self.levels[: self._first_small + 1], solve, projected)
+            for projected in (False, True)
+        }
         s = self.finest.stencil
         signed = s.weights is not None and s.spans is not None and s.pattern is None
-        self._signs = zeros(s.padding.counts[:2], wp.uint64, self.device) if signed else None  # of rows of weights
+        # of rows of weights
+        self._signs = zeros(s.padding.counts[:2], wp.uint64, self.device) if signed else None
         self.refresh()
 
     def _is_coarsest(self, level: StencilLevel) -> bool:
         """Whether a dense inverse of a level is cheap; on several processes, whether it is gathered."""
         ghosts, counts = level.stencil.ghosts, whole_counts(level.stencil)
         if ghosts is not None:
-            return math.prod(counts) <= halo_levels.GATHERED or ghosts.coarser(self._factors(counts)) is None
-        return math.prod(counts) <= (self.settings.coarsest_cuda if self.device.is_cuda else self.settings.coarsest_cpu)
+            return (
+                math.prod(counts) <= halo_levels.GATHERED
+                or ghosts.coarser(self._factors(counts)) is None
+            )
+        return math.prod(counts) <= (
+            self.settings.coarsest_cuda if self.device.is_cuda else self.settings.coarsest_cpu
+        )
 
     def _coarsest_solver(self) -> CoarsestSolver:
         """Return what solves on the coarsest levels: small ones in one launch, the last one by its dense inverse."""
         self._dense = dense = DenseInverse(self.levels[-1])
-        cells = self.settings.one_launch_cuda if self.device.is_cuda else self.settings.one_launch_cpu
-        self._first_small = first_small(self.levels, 0 if self.finest.stencil.pattern is not None else cells)
+        cells = (
+            self.settings.one_launch_cuda if self.device.is_cuda else self.settings.one_launch_cpu
+        )
+        self._first_small = first_small(
+            self.levels, 0 if self.finest.stencil.pattern is not None else cells
+        )
         if self._first_small < len(self.levels):
             self._small = FusedCoarseLevels(self.levels[self._first_small :], dense.solve)
             return self._small.solve
         sweeps = FusedCoarseLevels(self.levels[-1:], dense.solve)  # in one launch
 
         def solve(visits: int, *, projected: bool, from_zero: bool) -> Iterable[CycleStage]:
-            return (sweeps.solve if projected else dense.solve)(visits, projected=projected, from_zero=from_zero)
+            return (sweeps.solve if projected else dense.solve)(
+                visits, projected=projected, from_zero=from_zero
+            )
 
         return solve
 
@@ -103,10 +142,20 @@ class Hierarchy:
             bounds = wp.zeros(stencil.padding.size, dtype=self.real, device=self.device), last.upper
         shifted = last.stencil.d.dtype is not wp.uint8
         whole = self._gathered = Hierarchy(
-            stencil, self.real, bounded=bounded, settings=self.settings, bounds=bounds, shifted=shifted, shrunk=last.shrunk
-        )  # fmt: skip
+            stencil,
+            self.real,
+            bounded=bounded,
+            settings=self.settings,
+            bounds=bounds,
+            shifted=shifted,
+            shrunk=last.shrunk,
+        )
         last.gathered, finest = True, whole.finest
-        sides = [(last.lower, finest.lower), (last.upper, finest.upper)][: 1 + bool(last.upper.size)] if bounded else []
+        sides = (
+            [(last.lower, finest.lower), (last.upper, finest.upper)][: 1 + bool(last.upper.size)]
+            if bounded
+            else []
+        )
         return GatheredLevel(
             whole=whole.cycles.__getitem__,
             gather=[gathering.collecting(last.b, finest.b)],
@@ -122,15 +171,17 @@ class Hierarchy:
     @property
     def nbytes(self) -> int:
         """Memory of all levels [bytes], without shared weights of the finest one."""
-        return sum(level.nbytes for level in self.levels) + (0 if self._gathered is None else self._gathered.nbytes)
+        return sum(level.nbytes for level in self.levels) + (
+            0 if self._gathered is None else self._gathered.nbytes
+        )
 
     def refresh(self) -> None:
         """Read rows and weights of the operator again after in-place changes.
 
         Also clears what lies outside the new rows.
 
-        Rows whose span or weights are not what they were are marked in the finest level's `changed`. Weights are compared by 64 bits a
-        row that they hash to.
+        Rows whose span or weights are not what they were are marked in the finest level's
+        `changed`. Weights are compared by 64 bits a row that they hash to.
         """
         ours, theirs = self.finest.stencil.weights, self._source.weights
         for w, source in zip(ours or (), theirs or (), strict=True):
@@ -156,7 +207,9 @@ class Hierarchy:
             f, c, (fx, fy, fz) = fine.stencil, coarse.stencil, coarse.factors
             if f.spans is not None:
                 inputs = [f.spans, wp.vec3i(fz, fy, fx), c.padding.counts[2], c.spans]
-                program.launch(coarsen_spans_kernel, c.padding.counts[:2], inputs, device=self.device)
+                program.launch(
+                    coarsen_spans_kernel, c.padding.counts[:2], inputs, device=self.device
+                )
         for level in self.levels if self.finest.stencil.spans is not None else []:
             level.renewing(keeps_weights=level is self.finest).launch(program.launch)
         if self._signs is not None:
@@ -181,7 +234,8 @@ class Hierarchy:
 
         Those marked in its `changed`, and the coarse rows that depend on them.
 
-        Code that writes the finest diagonal must mark the rows, as `hold` does. The result is bitwise that of a complete rebuild.
+        Code that writes the finest diagonal must mark the rows, as `hold` does. The result is
+        bitwise that of a complete rebuild.
         """
         self.rebuilding.run()
 
@@ -212,7 +266,9 @@ class Hierarchy:
         ours, finest = self.levels[-1].stencil, self._gathered.finest
         gathering: Any = ours.ghosts.gathering  # type: ignore[union-attr]
         theirs = finest.stencil
-        for mine, whole in zip((ours.d, *(ours.weights or ())), (theirs.d, *(theirs.weights or ())), strict=True):
+        for mine, whole in zip(
+            (ours.d, *(ours.weights or ())), (theirs.d, *(theirs.weights or ())), strict=True
+        ):
             gathering.collecting(mine, whole).launch(program.launch)
         with recording(program):
             copy(finest.changed, wp.full_like(finest.changed, 1))
@@ -229,7 +285,8 @@ class Hierarchy:
 
         Every sweep is clipped, and coarse bounds keep the finer iterate within its own.
 
-        It moves whole aggregates on and off their bounds, where an active-set method moves the boundary by about a layer of cells a step.
+        It moves whole aggregates on and off their bounds, where an active-set method moves the
+        boundary by about a layer of cells a step.
         """
         return recorded(self.device, self._stages(projected=True))
 
@@ -237,7 +294,9 @@ class Hierarchy:
     def projected_sweep(self) -> Program:
         """Projected Jacobi sweep of the finest level; it never increases the energy."""
         program, L = Program(self.device), self.finest
-        L.sweeping(L.x, L.t, min(self.settings.weights), projected=True, from_zero=True).launch(program.launch)
+        L.sweeping(L.x, L.t, min(self.settings.weights), projected=True, from_zero=True).launch(
+            program.launch
+        )
         return program
 
     @property
@@ -256,7 +315,9 @@ class Hierarchy:
             more: those, bound.
         """
         leg = self._last_leg()
-        longer = [Leg(wave, (*stage.passes, *more)) if isinstance(stage, Leg) else stage for stage in leg]
+        longer = [
+            Leg(wave, (*stage.passes, *more)) if isinstance(stage, Leg) else stage for stage in leg
+        ]
         return recorded(self.device, [*list(self._stages(projected=False))[: -len(leg)], *longer])
 
     def _last_leg(self) -> tuple[CycleStage, ...]:
@@ -274,23 +335,35 @@ class Hierarchy:
         factors = self._factors(whole)
         fewer: Any = tuple(-(-n // f) for n, f in zip(counts, reversed(factors), strict=True))
         padding = Padding(fewer, s.padding.small_pages)
-        for axis in range(3):  # a coarse face is as many finer ones as the other axes were aggregated by
+        # a coarse face is as many finer ones as the other axes were aggregated by
+        for axis in range(3):
             self._strength[axis] *= math.prod(factors) / factors[axis]
         pattern = coarser_pattern(s.pattern, factors) if s.pattern else None
-        block, weights = weights_block(pattern, padding, self.real, self.device) if pattern else (None, None)
+        block, weights = (
+            weights_block(pattern, padding, self.real, self.device) if pattern else (None, None)
+        )
         new = [padding.zeros(self.real, self.device) for _ in range(1 if pattern else 4)]
-        periodic = tuple(p and n > 1 for p, n in zip(s.periodic, reversed(padding.counts), strict=True))
+        periodic = tuple(
+            p and n > 1 for p, n in zip(s.periodic, reversed(padding.counts), strict=True)
+        )
         spans = None if s.spans is None else zeros(padding.counts[:2], wp.vec2i, self.device)
         weights = weights or (new[1], new[2], new[3])
         ghosts = None if s.ghosts is None else s.ghosts.coarser(factors)
         numbers = () if pattern else (0.0, 0.0, 0.0)
-        stencil = PaddedStencil(padding, new[0], weights, numbers, 1.0, periodic, spans, ghosts=ghosts, pattern=pattern)  # type: ignore[arg-type]
-        level = StencilLevel(stencil, self.real, self.settings, bounded=bounded, upper=fine.upper.size > 0)
+        stencil = PaddedStencil(
+            padding, new[0], weights, numbers, 1.0, periodic, spans, ghosts=ghosts, pattern=pattern
+        )  # type: ignore[arg-type]
+        level = StencilLevel(
+            stencil, self.real, self.settings, bounded=bounded, upper=fine.upper.size > 0
+        )
         level.factors, level.block = factors, block
-        # visiting levels of half the cells twice would cost as much on each of them: only every second one is
+        # visiting levels of half the cells twice would cost as much on each of them: only every
+        # second one is
         level.shrunk = fine.shrunk * math.prod(whole) / math.prod(whole_counts(stencil))
         if level.shrunk >= 3:
-            most = self.settings.revisited_cuda if self.device.is_cuda else self.settings.revisited_cpu
+            most = (
+                self.settings.revisited_cuda if self.device.is_cuda else self.settings.revisited_cpu
+            )
             again = sum(above.visits > 1 for above in self.levels) < most
             level.visits, level.shrunk = self.settings.gamma if again else 1, 1.0
         return level
@@ -299,14 +372,24 @@ class Hierarchy:
         """Return by how many cells x, y and z are aggregated."""
         long = [n > 1 for n in reversed(counts)]
         strongest = max(w for w, more in zip(self._strength, long, strict=True) if more)
-        chosen = [more and w >= self.settings.semicoarsening_threshold * strongest for w, more in zip(self._strength, long, strict=True)]
-        # an axis of one cell may be aggregated with its ghost: it changes nothing, and keeps isotropic grids in one form
+        chosen = [
+            more and w >= self.settings.semicoarsening_threshold * strongest
+            for w, more in zip(self._strength, long, strict=True)
+        ]
+        # an axis of one cell may be aggregated with its ghost: it changes nothing, and keeps
+        # isotropic grids in one form
         return tuple(1 if more and not take else 2 for more, take in zip(long, chosen, strict=True))  # type: ignore[return-value]
 
 
 def _finest_level(
-    stencil: PaddedStencil, real: Any, settings: CycleSettings, *, bounded: bool, bounds: Pair | None, shifted: bool
-) -> StencilLevel:  # fmt: skip
+    stencil: PaddedStencil,
+    real: Any,
+    settings: CycleSettings,
+    *,
+    bounded: bool,
+    bounds: Pair | None,
+    shifted: bool,
+) -> StencilLevel:
     """Return the level of an operator's stencil: its weights, and a diagonal of its own, 0 so far."""
     d_type = wp.uint8 if stencil.d.dtype is wp.uint8 and not shifted else real
     weights = stencil.weights
@@ -318,7 +401,9 @@ def _finest_level(
     return StencilLevel(finest, real, settings, bounded=bounded, bounds=bounds)
 
 
-def _whole_stencil(part: PaddedStencil, counts: tuple[int, int, int], strength: tuple[float, float, float]) -> PaddedStencil:
+def _whole_stencil(
+    part: PaddedStencil, counts: tuple[int, int, int], strength: tuple[float, float, float]
+) -> PaddedStencil:
     """Return a stencil like a process's of the whole grid, still empty."""
     padding = Padding(counts)
 
@@ -326,7 +411,9 @@ def _whole_stencil(part: PaddedStencil, counts: tuple[int, int, int], strength: 
         return wp.zeros(padding.size, dtype=field.dtype, device=field.device)
 
     weights = None if part.weights is None else tuple(map(like, part.weights))
-    return PaddedStencil(padding, like(part.d), weights, part.coefficients, part.unit, strength=strength)
+    return PaddedStencil(
+        padding, like(part.d), weights, part.coefficients, part.unit, strength=strength
+    )
 
 
 __all__ = ["UNBOUNDED", "Hierarchy", "StencilLevel"]

@@ -1,10 +1,12 @@
 """Multigrid for compact stencils in 2-D that point sweeps do not smooth: operator-dependent transfers, relaxation of lines.
 
-Coarse cells are every second one along an axis. A cell between two of them shares in each by its row's weights (Dendy's black-box
-multigrid): the prolongation by those of (A + A')/2, the restriction by those of A' (as de Zeeuw has it), so that coarse matrices R A P of
-convection keep the wind's direction. They are compact again. Rows of one color after those of the other are solved for as tridiagonal
-systems, then columns; on the way up in the reverse order. With W-cycles a Krylov method takes about ten iterations from 128 to 1024 cells a
-side, for winds at Peclet numbers up to 1e4 that turn, for anisotropy of 1 : 100 at any angle, and for coefficients over seven decades.
+Coarse cells are every second one along an axis. A cell between two of them shares in each by its
+row's weights (Dendy's black-box multigrid): the prolongation by those of (A + A')/2, the
+restriction by those of A' (as de Zeeuw has it), so that coarse matrices R A P of convection keep
+the wind's direction. They are compact again. Rows of one color after those of the other are solved
+for as tridiagonal systems, then columns; on the way up in the reverse order. With W-cycles a Krylov
+method takes about ten iterations from 128 to 1024 cells a side, for winds at Peclet numbers up to
+1e4 that turn, for anisotropy of 1 : 100 at any angle, and for coefficients over seven decades.
 """
 
 from __future__ import annotations
@@ -40,7 +42,9 @@ DOWN = KERNELS["lines.down"]
 UP = KERNELS["lines.up"]
 ZERO = KERNELS["lines.zero"]
 SHORT = 3  # cells of an axis that is not coarsened any more
-COLUMNS = 256  # that one thread of a CPU solves for together: their cells of a row are vectors, and the rows stay in its cache
+# that one thread of a CPU solves for together: their cells of a row are vectors, and the rows stay
+# in its cache
+COLUMNS = 256
 EVEN = 0.5  # least ratio of weights along the two axes for point sweeps
 
 
@@ -81,7 +85,9 @@ class LineLevel:
         x, b, t: iterate, right-hand side and residual.
     """
 
-    def __init__(self, padding: Padding, real: Any, device: wp.Device, *, symmetric: bool, visits: int = 1) -> None:
+    def __init__(
+        self, padding: Padding, real: Any, device: wp.Device, *, symmetric: bool, visits: int = 1
+    ) -> None:
         self.padding, self.device, self.visits, n = padding, device, visits, padding.size
         self._legs: dict[tuple[str, bool], list[CycleStage]] = {}
         self.factors = 2 if padding.counts[2] > SHORT else 1, 2 if padding.counts[1] > SHORT else 1
@@ -90,12 +96,17 @@ class LineLevel:
         self.restricts = self.shares if symmetric else make(4)
         self.x, self.b, self.t, self.d = (padding.zeros(real, device) for _ in range(4))
         self.fields = LineFields(self.x, self.b, self.t, self.d, self.weights, n, padding.counts[2])
-        self.lines = [(make(1), make(1)) for _ in range(2)]  # one over pivots and multiples, along x and along y
+        # one over pivots and multiples, along x and along y
+        self.lines = [(make(1), make(1)) for _ in range(2)]
         each = tuple(self.weights[i * n : (i + 1) * n] for i in range(8))
         self.stencil = PaddedStencil(padding, self.d, each, (), pattern=AROUND)
         self.rows = Rows.of(padding, device, whole=True)
         self.columns = Rows.strided(
-            n, device, (self.rows.single.base, padding.plane, padding.row), (1, 1, padding.counts[2]), cells=COLUMNS if device.is_cpu else 2
+            n,
+            device,
+            (self.rows.single.base, padding.plane, padding.row),
+            (1, 1, padding.counts[2]),
+            cells=COLUMNS if device.is_cpu else 2,
         )
 
     def transferring(self) -> list[Bound]:
@@ -103,9 +114,21 @@ class LineLevel:
         fx, fy = self.factors
         same = int(self.restricts is self.shares)
         passes = []
-        for restriction, shares in enumerate([self.shares] if same else [self.shares, self.restricts]):
+        for restriction, shares in enumerate(
+            [self.shares] if same else [self.shares, self.restricts]
+        ):
             for kernel in (EDGES, CORNERS) if self.factors == (2, 2) else (EDGES,):
-                passes.append(kernel.bind(self.rows, self.fields, shares=shares, fx=fx, fy=fy, SAME=same, RESTRICTION=restriction))
+                passes.append(
+                    kernel.bind(
+                        self.rows,
+                        self.fields,
+                        shares=shares,
+                        fx=fx,
+                        fy=fy,
+                        SAME=same,
+                        RESTRICTION=restriction,
+                    )
+                )
         return passes
 
     def factoring(self) -> list[Bound]:
@@ -116,7 +139,16 @@ class LineLevel:
             (self.rows, self.columns), self.lines, (1, self.padding.row), (nx, ny), strict=True
         ):
             made.append(
-                FACTOR.bind(rows, self.fields, unused=self.d, diagonals=self.d, pivots=pivots, multiples=multiples, step=step, count=count)
+                FACTOR.bind(
+                    rows,
+                    self.fields,
+                    unused=self.d,
+                    diagonals=self.d,
+                    pivots=pivots,
+                    multiples=multiples,
+                    step=step,
+                    count=count,
+                )
             )
         return made
 
@@ -125,18 +157,40 @@ class LineLevel:
         fx, fy = self.factors
         rows = coarse.rows.beside(self.rows, (*self.factors, 1))
         return GALERKIN.bind(
-            rows, self.fields, unused=self.t, diagonals=self.d, shares=self.shares, restricts=self.restricts,
-            coarse_weights=coarse.weights, coarse_d=coarse.d, coarse_size=coarse.padding.size, FX=fx, FY=fy,
-        )  # fmt: skip
+            rows,
+            self.fields,
+            unused=self.t,
+            diagonals=self.d,
+            shares=self.shares,
+            restricts=self.restricts,
+            coarse_weights=coarse.weights,
+            coarse_d=coarse.d,
+            coarse_size=coarse.padding.size,
+            FX=fx,
+            FY=fy,
+        )
 
     @cached_property
     def _zebras(self) -> tuple[list[Bound], list[Bound]]:
         """Sweeps of rows and of columns, each of both colors."""
         (px, mx), (py, my) = self.lines
         fields, s, step, count = self.fields, self.stencil, self.padding.row, self.padding.counts[1]
-        across = [ZEBRA_X.bind(self.rows, fields, stencil=s, pivots=px, multiples=mx, color=color) for color in (0, 1)]
+        across = [
+            ZEBRA_X.bind(self.rows, fields, stencil=s, pivots=px, multiples=mx, color=color)
+            for color in (0, 1)
+        ]
         along = [
-            ZEBRA_Y.bind(self.columns, fields, stencil=s, pivots=py, multiples=my, color=color, step=step, count=count) for color in (0, 1)
+            ZEBRA_Y.bind(
+                self.columns,
+                fields,
+                stencil=s,
+                pivots=py,
+                multiples=my,
+                color=color,
+                step=step,
+                count=count,
+            )
+            for color in (0, 1)
         ]
         return across, along
 
@@ -156,7 +210,10 @@ class LineLevel:
 
     def restricting(self, coarse: LineLevel) -> list[Bound]:
         """Return what hands the residual on."""
-        return [RESIDUAL.bind(self.rows, self.fields, stencil=self.stencil), self.handing_down(coarse)]
+        return [
+            RESIDUAL.bind(self.rows, self.fields, stencil=self.stencil),
+            self.handing_down(coarse),
+        ]
 
     def coarsen_bounds(self, coarse: LineLevel) -> tuple[()]:
         """Return nothing: there are no bounds."""
@@ -173,7 +230,14 @@ class LineLevel:
         """Return what makes t the coarse right-hand side."""
         fx, fy = self.factors
         rows = coarse.rows.beside(self.rows, (*self.factors, 1))
-        return DOWN.bind(rows, self.fields, shares=self.restricts[: self.padding.size], coarse=coarse.b, fx=fx, fy=fy)
+        return DOWN.bind(
+            rows,
+            self.fields,
+            shares=self.restricts[: self.padding.size],
+            coarse=coarse.b,
+            fx=fx,
+            fy=fy,
+        )
 
     def correcting(self, coarse: LineLevel, *, add: bool = True) -> Bound:
         """Return what adds the coarse correction, or takes it."""
@@ -193,15 +257,33 @@ class BlackBoxMultigrid:
         settings: how cycles go: `gamma`, and the size of the coarsest level.
     """
 
-    def __init__(self, stencil: PaddedStencil, real: Any, *, symmetric: bool, settings: CycleSettings | None = None) -> None:
-        self._source, self.settings, self.device = stencil, settings or CycleSettings(), stencil.device
+    def __init__(
+        self,
+        stencil: PaddedStencil,
+        real: Any,
+        *,
+        symmetric: bool,
+        settings: CycleSettings | None = None,
+    ) -> None:
+        self._source, self.settings, self.device = (
+            stencil,
+            settings or CycleSettings(),
+            stencil.device,
+        )
         self.levels = [LineLevel(stencil.padding, real, self.device, symmetric=symmetric)]
         most = self.settings.coarsest_cuda if self.device.is_cuda else self.settings.coarsest_cpu
-        while math.prod(self.levels[-1].padding.counts) > most and self.levels[-1].factors != (1, 1):
+        while math.prod(self.levels[-1].padding.counts) > most and self.levels[-1].factors != (
+            1,
+            1,
+        ):
             fine = self.levels[-1]
             _, ny, nx = fine.padding.counts
             padding = Padding((1, -(-ny // fine.factors[1]), -(-nx // fine.factors[0])))
-            self.levels.append(LineLevel(padding, real, self.device, symmetric=symmetric, visits=self.settings.gamma))
+            self.levels.append(
+                LineLevel(
+                    padding, real, self.device, symmetric=symmetric, visits=self.settings.gamma
+                )
+            )
         self._dense = DenseInverse(self.levels[-1])
 
     @property
@@ -209,7 +291,12 @@ class BlackBoxMultigrid:
         """The level of the operator itself."""
         return self.levels[0]
 
-    def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None, weight: wp.array[Any] | None = None) -> None:
+    def restrict(
+        self,
+        free: wp.array[Any],
+        shift: wp.array[Any] | None = None,
+        weight: wp.array[Any] | None = None,
+    ) -> None:
         """Take another free set (stored uint8 field) and shift (float64), write one over the diagonal to `weight`, and coarsen."""
         self._fill(free, shift, weight)
         self._building.run()
@@ -220,9 +307,19 @@ class BlackBoxMultigrid:
         for made in self.finest.transferring():
             made.launch()
 
-    def _fill(self, free: wp.array[Any], shift: wp.array[Any] | None, weight: wp.array[Any] | None) -> None:
+    def _fill(
+        self, free: wp.array[Any], shift: wp.array[Any] | None, weight: wp.array[Any] | None
+    ) -> None:
         finest = self.finest
-        FILL.bind(finest.rows, finest.fields, stencil=self._source, free=free, shift=shift, weight=weight, made=finest.d).launch()
+        FILL.bind(
+            finest.rows,
+            finest.fields,
+            stencil=self._source,
+            free=free,
+            shift=shift,
+            weight=weight,
+            made=finest.d,
+        ).launch()
 
     @cached_property
     def _building(self) -> Program:

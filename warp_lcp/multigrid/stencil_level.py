@@ -43,21 +43,36 @@ class StencilLevel:
     gathered, in_one_launch = False, False
 
     def __init__(
-        self, stencil: PaddedStencil, real: Any, settings: CycleSettings, *, bounded: bool, upper: bool = True, bounds: Pair | None = None
-    ) -> None:  # fmt: skip
+        self,
+        stencil: PaddedStencil,
+        real: Any,
+        settings: CycleSettings,
+        *,
+        bounded: bool,
+        upper: bool = True,
+        bounds: Pair | None = None,
+    ) -> None:
         self.stencil, self.real, self.settings = stencil, real, settings
         field: Callable[[], wp.array[Any]] = lambda: stencil.padding.zeros(real, stencil.device)  # noqa: E731
         self.x, self.b, self.t = field(), field(), field()
-        self.lower, self.upper = (bounds or (field(), field() if upper else nothing(real, stencil.device))) if bounded else (self.x, self.x)
+        self.lower, self.upper = (
+            (bounds or (field(), field() if upper else nothing(real, stencil.device)))
+            if bounded
+            else (self.x, self.x)
+        )
         self.form = stencil.weights is not None, stencil.d.dtype, real, stencil.pattern
-        self.block: wp.array[Any] | None = None  # weights of a compact level, one field after another
+        # weights of a compact level, one field after another
+        self.block: wp.array[Any] | None = None
         self.factors = 1, 1, 1
-        self._bound: dict[Any, Any] = {}  # passes by what tells them apart: a W-cycle repeats few of them many times
-        self.visits, self.shrunk = 1, 1.0  # by a cycle of the next finer level; by how much since a level that was visited more
+        # passes by what tells them apart: a W-cycle repeats few of them many times
+        self._bound: dict[Any, Any] = {}
+        # by a cycle of the next finer level; by how much since a level that was visited more
+        self.visits, self.shrunk = 1, 1.0
         rows = stencil.padding.counts[:2]
         self.changed = zeros(rows, wp.uint8, stencil.device)  # rows, since the last rebuild
         self.changed.fill_(1)
-        self._spans = None if stencil.spans is None else zeros(rows, wp.vec2i, stencil.device)  # of the fields' contents
+        # of the fields' contents
+        self._spans = None if stencil.spans is None else zeros(rows, wp.vec2i, stencil.device)
 
     def renewing(self, *, keeps_weights: bool) -> Bound:
         """Return the pass that clears the fields outside the rows' new spans and marks rows whose span has changed.
@@ -66,12 +81,23 @@ class StencilLevel:
             keeps_weights: whether the weights are not the level's own to clear.
         """
         s = self.stencil
-        lower_x, lower_y, lower_z = (None if keeps_weights or s.pattern else s.weights) or (None,) * 3
+        lower_x, lower_y, lower_z = (None if keeps_weights or s.pattern else s.weights) or (
+            None,
+        ) * 3
         rows = Rows.of(s.padding, s.device, whole=True)
         return passes.RENEW.bind(
-            rows, x=self.x, b=self.b, t=self.t, diagonals=s.d, lower_x=lower_x, lower_y=lower_y, lower_z=lower_z, spans=s.spans,
-            known=self._spans, changed=self.changed,
-        )  # fmt: skip
+            rows,
+            x=self.x,
+            b=self.b,
+            t=self.t,
+            diagonals=s.d,
+            lower_x=lower_x,
+            lower_y=lower_y,
+            lower_z=lower_z,
+            spans=s.spans,
+            known=self._spans,
+            changed=self.changed,
+        )
 
     def signing(self, signs: wp.array[Any]) -> Bound:
         """Return the pass that marks rows whose weights hash to other 64 bits than before."""
@@ -79,37 +105,66 @@ class StencilLevel:
         assert s.weights is not None
         weight_x, weight_y, weight_z = s.weights
         rows = Rows.of(s.padding, s.device, s.spans, whole=True)
-        return passes.SIGN.bind(rows, weight_x=weight_x, weight_y=weight_y, weight_z=weight_z, signs=signs, changed=self.changed)
+        return passes.SIGN.bind(
+            rows,
+            weight_x=weight_x,
+            weight_y=weight_y,
+            weight_z=weight_z,
+            signs=signs,
+            changed=self.changed,
+        )
 
     def coarsening(self, coarse: StencilLevel, stiffen: float, held: float) -> Bound:
         """Return the pass that makes those of the coarser level's rows that depend on rows of this level that have changed."""
         s, c = self.stencil, coarse.stencil
-        shared = Coarsening(self.changed, coarse.changed, c.d, s.padding.counts[2], *s.periodic, stiffen, held)
+        shared = Coarsening(
+            self.changed, coarse.changed, c.d, s.padding.counts[2], *s.periodic, stiffen, held
+        )
         if coarse.block is not None and c.pattern is not None:
             return passes.COARSEN_COMPACT.bind(
-                self._coarser_rows(coarse), shared, stencil=s, coarse_weights=coarse.block, coarse_size=c.padding.size,
+                self._coarser_rows(coarse),
+                shared,
+                stencil=s,
+                coarse_weights=coarse.block,
+                coarse_size=c.padding.size,
                 MASK=mask(c.pattern),
-            )  # fmt: skip
+            )
         assert c.weights is not None
         wx, wy, wz = c.weights
-        return passes.COARSEN.bind(self._coarser_rows(coarse), shared, stencil=s, coarse_wx=wx, coarse_wy=wy, coarse_wz=wz)
+        return passes.COARSEN.bind(
+            self._coarser_rows(coarse), shared, stencil=s, coarse_wx=wx, coarse_wy=wy, coarse_wz=wz
+        )
 
     def restricting(self, coarse: StencilLevel, rows: Rows | None = None) -> Bound:
         """Return the pass that sums the residual over aggregates, all unless told."""
         there = rows or self._coarser_rows(coarse)
-        make = lambda: passes.RESTRICT.bind(there, stencil=self.stencil, x=self.x, b=self.b, coarse=coarse.b)  # noqa: E731
+        make = lambda: passes.RESTRICT.bind(
+            there, stencil=self.stencil, x=self.x, b=self.b, coarse=coarse.b
+        )  # noqa: E731
         return self._once(("restrict", coarse, id(rows)), make)
 
     def correcting(
-        self, coarse: StencilLevel, scale: float, *, projected: bool, rows: Rows | None = None, x: wp.array[Any] | None = None
+        self,
+        coarse: StencilLevel,
+        scale: float,
+        *,
+        projected: bool,
+        rows: Rows | None = None,
+        x: wp.array[Any] | None = None,
     ) -> Bound:
         """Return the pass that adds `scale` times the coarse correction to x, or another field, clipped if projected."""
         there = rows or self._finer_rows(coarse)
         lower, upper = self._sides(projected)
         make = lambda: passes.CORRECT.bind(  # noqa: E731
-            there, stencil=self.stencil, scale=scale, projected=projected, x=self.x if x is None else x, coarse=coarse.x,
-            lower=lower, upper=upper,
-        )  # fmt: skip
+            there,
+            stencil=self.stencil,
+            scale=scale,
+            projected=projected,
+            x=self.x if x is None else x,
+            coarse=coarse.x,
+            lower=lower,
+            upper=upper,
+        )
         return self._once((coarse, projected, id(rows)), make)  # which keeps the rows
 
     def filling(self, name: str) -> list[Bound | Task]:
@@ -124,10 +179,19 @@ class StencilLevel:
     @property
     def nbytes(self) -> int:
         """Memory of the fields [bytes], without the stencil's."""
-        fields = [self.x, self.b, self.t, self.lower, self.upper, *([self.near] if "near" in self.__dict__ else [])]
+        fields = [
+            self.x,
+            self.b,
+            self.t,
+            self.lower,
+            self.upper,
+            *([self.near] if "near" in self.__dict__ else []),
+        ]
         return sum(array.capacity for array in {id(field): field for field in fields}.values())
 
-    def pair(self, weights: tuple[float, float], *, projected: bool, from_zero: bool = False) -> Iterator[Bound | Task]:
+    def pair(
+        self, weights: tuple[float, float], *, projected: bool, from_zero: bool = False
+    ) -> Iterator[Bound | Task]:
         """Yield two sweeps, x to t and back; x is taken for 0 if from_zero."""
         yield from () if from_zero else self.filling("x")
         yield self.sweeping(self.t, self.x, weights[0], projected=projected, from_zero=from_zero)
@@ -135,30 +199,48 @@ class StencilLevel:
         yield self.sweeping(self.x, self.t, weights[1], projected=projected)
 
     def ring_pair(
-        self, weights: tuple[float, float], *, projected: bool, from_zero: bool = False, ring: wp.array[Any] | None = None
+        self,
+        weights: tuple[float, float],
+        *,
+        projected: bool,
+        from_zero: bool = False,
+        ring: wp.array[Any] | None = None,
     ) -> tuple[Bound, Bound]:
         """Return the same for one wave: what is between the sweeps lies in a ring of planes, of t unless told."""
         between = self.t if ring is None else ring
-        into = self.sweeping(between, self.x, weights[0], projected=projected, from_zero=from_zero, kind=passes.SWEEP_INTO_RING)
-        return into, self.sweeping(self.x, between, weights[1], projected=projected, kind=passes.SWEEP_OUT_OF_RING)
+        into = self.sweeping(
+            between,
+            self.x,
+            weights[0],
+            projected=projected,
+            from_zero=from_zero,
+            kind=passes.SWEEP_INTO_RING,
+        )
+        return into, self.sweeping(
+            self.x, between, weights[1], projected=projected, kind=passes.SWEEP_OUT_OF_RING
+        )
 
     @property
     def fuses(self) -> bool:
         """Whether a leg of the cycle is one pass through memory.
 
-        It is on the CPU, in three planes at a time, unless periodic ghost cells must be filled between sweeps; those of other
-        processes' cells are computed.
+        It is on the CPU, in three planes at a time, unless periodic ghost cells must be filled
+        between sweeps; those of other processes' cells are computed.
         """
         s = self.stencil
         streams = s.device.is_cpu and not any(s.periodic) and not self.in_one_launch
         return streams and (s.ghosts is None or s.padding.counts[0] >= 3)
 
-    def descend(self, coarse: StencilLevel, *, projected: bool, from_zero: bool) -> tuple[CycleStage, ...]:
+    def descend(
+        self, coarse: StencilLevel, *, projected: bool, from_zero: bool
+    ) -> tuple[CycleStage, ...]:
         """Return steps 1 and 2 of a cycle: a pair of Chebyshev-Jacobi sweeps, and the residual on the next level."""
         make = lambda: tuple(self._descent(coarse, projected=projected, from_zero=from_zero))  # noqa: E731
         return self._once(("descend", coarse, projected, from_zero), make)
 
-    def _descent(self, coarse: StencilLevel, *, projected: bool, from_zero: bool) -> Iterator[CycleStage]:
+    def _descent(
+        self, coarse: StencilLevel, *, projected: bool, from_zero: bool
+    ) -> Iterator[CycleStage]:
         weights, across = self.settings.weights, self.stencil.ghosts is not None
         if not self.fuses or (across and not from_zero):
             yield from self.pair(weights, projected=projected, from_zero=from_zero)
@@ -173,14 +255,22 @@ class StencilLevel:
     def coarsen_bounds(self, coarse: StencilLevel) -> tuple[Bound]:
         """Return step 3: the member nearest to its bound limits its aggregate."""
         make = lambda: passes.COARSE_BOUNDS.bind(  # noqa: E731
-            self._coarser_rows(coarse), stencil=self.stencil, scale=self.settings.over_correction, x=self.x, lower=self.lower,
-            upper=self.upper, coarse_lower=coarse.lower, coarse_upper=coarse.upper,
-        )  # fmt: skip
+            self._coarser_rows(coarse),
+            stencil=self.stencil,
+            scale=self.settings.over_correction,
+            x=self.x,
+            lower=self.lower,
+            upper=self.upper,
+            coarse_lower=coarse.lower,
+            coarse_upper=coarse.upper,
+        )
         return (self._once(("bounds", coarse), make),)
 
     def ascend(self, coarse: StencilLevel, *, projected: bool) -> tuple[CycleStage, ...]:
         """Return steps 5 and 6: the correction and the reverse pair, which keeps the cycle symmetric."""
-        return self._once(("ascend", coarse, projected), lambda: tuple(self._ascent(coarse, projected=projected)))
+        return self._once(
+            ("ascend", coarse, projected), lambda: tuple(self._ascent(coarse, projected=projected))
+        )
 
     def _ascent(self, coarse: StencilLevel, *, projected: bool) -> Iterator[CycleStage]:
         weights = self.settings.weights[::-1]
@@ -196,7 +286,9 @@ class StencilLevel:
 
     def coarsened(self, coarse: StencilLevel) -> Iterator[Bound | Task]:
         """Yield the making of the next level."""
-        yield self.coarsening(coarse, self.settings.over_correction, self.settings.dirichlet_scaling)
+        yield self.coarsening(
+            coarse, self.settings.over_correction, self.settings.dirichlet_scaling
+        )
         for w in coarse.stencil.weights or ():
             yield from coarse.stencil.fillings(w)
 
@@ -218,9 +310,16 @@ class StencilLevel:
         return self.stencil.rows.beside(coarse.stencil.rows, (-fx, -fy, -fz))
 
     def sweeping(
-        self, y: wp.array[Any], x: wp.array[Any], omega: float, *, projected: bool, from_zero: bool = False,
-        kind: RowPass = passes.SWEEP, rows: Rows | None = None,
-    ) -> Bound:  # fmt: skip
+        self,
+        y: wp.array[Any],
+        x: wp.array[Any],
+        omega: float,
+        *,
+        projected: bool,
+        from_zero: bool = False,
+        kind: RowPass = passes.SWEEP,
+        rows: Rows | None = None,
+    ) -> Bound:
         """Return the pass y = x + omega D^-1 (b - A x), clipped to the bounds if projected; x is taken for 0 if from_zero.
 
         `kind` may be one that goes into or out of a ring; `rows` are all unless told.
@@ -228,7 +327,15 @@ class StencilLevel:
         lower, upper = self._sides(projected)
         start: dict[str, Any] = {"from_zero": from_zero} if "from_zero" in kind.numbers else {}
         make = lambda: kind.bind(  # noqa: E731
-            rows or self.stencil.rows, stencil=self.stencil, x=x, y=y, b=self.b, lower=lower, upper=upper, omega=omega,
-            projected=projected, **start,
-        )  # fmt: skip
+            rows or self.stencil.rows,
+            stencil=self.stencil,
+            x=x,
+            y=y,
+            b=self.b,
+            lower=lower,
+            upper=upper,
+            omega=omega,
+            projected=projected,
+            **start,
+        )
         return self._once((kind, id(rows), y is self.x, omega, projected, from_zero), make)

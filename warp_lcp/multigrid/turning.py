@@ -17,32 +17,44 @@ from warp_lcp.rows import Rows
 
 Strength = list[float]  # mean weights along x, y and z, in units of the largest
 
-TURN = 10.0  # ratios of weights that differ by this factor between places, or from the mean weights', ask for a hierarchy of their own
+# ratios of weights that differ by this factor between places, or from the mean weights', ask for a
+# hierarchy of their own
+TURN = 10.0
 SHARE = 0.01  # of the sampled blocks that must do so
 LEAST = 1e-6  # of a block's largest weight: what smaller ones count as
-EDGES = {2: 8, 3: 4}  # cells of a block along each long axis: 64 faces an axis, whose mean noise does not turn
-SAMPLES = {2: 24, 3: 8}  # the most blocks that are sampled along each axis: 2 ms in all, whatever the grid
+# cells of a block along each long axis: 64 faces an axis, whose mean noise does not turn
+EDGES = {2: 8, 3: 4}
+# the most blocks that are sampled along each axis: 2 ms in all, whatever the grid
+SAMPLES = {2: 24, 3: 8}
 
 
 class MultipleSemicoarsening(Hierarchy):
     """`Hierarchy` and companions that coarsen other axes first; cycles visit them one after another, forth and back.
 
-    Point sweeps smooth along strong couplings only, so levels must coarsen there; where the strong axis differs from place to place no
-    order of coarsening suits all of them. Each hierarchy deals with the places that it suits, and
-    each cycle starts from what the one before has left, so that they share the finest level and need no residuals between them.
+    Point sweeps smooth along strong couplings only, so levels must coarsen there; where the strong
+    axis differs from place to place no order of coarsening suits all of them. Each hierarchy deals
+    with the places that it suits, and each cycle starts from what the one before has left, so that
+    they share the finest level and need no residuals between them.
 
     Args:
         strengths: of each companion.
     """
 
-    def __init__(self, stencil: PaddedStencil, real: Any, strengths: list[Strength], **options: Any) -> None:
+    def __init__(
+        self, stencil: PaddedStencil, real: Any, strengths: list[Strength], **options: Any
+    ) -> None:
         settings = options.pop("settings", None) or CycleSettings()
-        fewer = math.prod(stencil.padding.counts) - 1  # a launch of all levels starts from x = 0: the finest one stays out of it
+        # a launch of all levels starts from x = 0: the finest one stays out of it
+        fewer = math.prod(stencil.padding.counts) - 1
         cpu, cuda = (min(n, fewer) for n in (settings.one_launch_cpu, settings.one_launch_cuda))
         settings = replace(settings, one_launch_cpu=cpu, one_launch_cuda=cuda)
         super().__init__(stencil, real, **options, settings=settings)
-        options["settings"] = replace(settings, gamma=1)  # W-cycles save a step in ten and cost two to four times as much
-        self.companions = [Hierarchy(stencil, real, **options, strength=strength, finest=self.finest) for strength in strengths]
+        # W-cycles save a step in ten and cost two to four times as much
+        options["settings"] = replace(settings, gamma=1)
+        self.companions = [
+            Hierarchy(stencil, real, **options, strength=strength, finest=self.finest)
+            for strength in strengths
+        ]
         self._marks = wp.zeros_like(self.finest.changed)
 
     @property
@@ -77,20 +89,28 @@ class MultipleSemicoarsening(Hierarchy):
 def make_hierarchy(stencil: PaddedStencil, real: Any, **options: Any) -> Hierarchy:
     """Return the hierarchy of a stencil; options as of `Hierarchy`."""
     strengths = turns(stencil) if stencil.ghosts is None else []
-    return MultipleSemicoarsening(stencil, real, strengths, **options) if strengths else Hierarchy(stencil, real, **options)
+    return (
+        MultipleSemicoarsening(stencil, real, strengths, **options)
+        if strengths
+        else Hierarchy(stencil, real, **options)
+    )
 
 
 def turns(stencil: PaddedStencil) -> list[Strength]:
     """Return the ways in which cells are coupled that the mean weights do not tell; none where the strong axes are the same everywhere.
 
-    Blocks are sampled. The mean logarithm of 64 faces knows neither random coefficients, nor surfaces and cut cells, which are few in a
-    block, from equal ones; where a block's ratios of weights along the axes differ from the median block's by `TURN`, the direction turns.
+    Blocks are sampled. The mean logarithm of 64 faces knows neither random coefficients, nor
+    surfaces and cut cells, which are few in a block, from equal ones; where a block's ratios of
+    weights along the axes differ from the median block's by `TURN`, the direction turns.
     """
     if stencil.weights is None or stencil.pattern is not None:
         return []
     logs = _sampled(stencil)
     centered = logs - logs.mean(axis=1, keepdims=True)
-    if len(logs) == 0 or (_mismatch(centered, np.median(centered, axis=0)) > math.log(TURN)).mean() < SHARE:
+    if (
+        len(logs) == 0
+        or (_mismatch(centered, np.median(centered, axis=0)) > math.log(TURN)).mean() < SHARE
+    ):
         return []
     long = _long(stencil)
     relative = logs - logs.max(axis=1, keepdims=True)
@@ -127,14 +147,18 @@ def _sampled(stencil: PaddedStencil) -> np.ndarray:
     samples = [min(n, SAMPLES[dimension]) for n in blocks]
     shape, sides = stencil.padding.shape, (math.prod(samples), math.prod(edges))
     along = [
-        (np.arange(m) * n // m * edge + 1)[:, None] + np.arange(edge)  # samples are spread evenly over the blocks
+        # samples are spread evenly over the blocks
+        (np.arange(m) * n // m * edge + 1)[:, None] + np.arange(edge)
         for m, n, edge in zip(samples, blocks, edges, strict=True)
     ]
     places = np.ravel_multi_index(np.ix_(*(at.ravel() for at in along)), shape)
-    places = places.reshape([n for pair in zip(samples, edges, strict=True) for n in pair]).transpose(0, 2, 4, 1, 3, 5)
+    places = places.reshape(
+        [n for pair in zip(samples, edges, strict=True) for n in pair]
+    ).transpose(0, 2, 4, 1, 3, 5)
     order = wp.array(places.ravel(), dtype=wp.int32, device=device)
     assert stencil.weights is not None
-    faces = np.stack([_gathered(w, order).reshape(sides) for w in stencil.weights], axis=1)  # by block, axis, face
+    # by block, axis, face
+    faces = np.stack([_gathered(w, order).reshape(sides) for w in stencil.weights], axis=1)
     least = LEAST * faces.max(axis=(1, 2), keepdims=True)
     totals = np.log(np.where(faces > 0, np.maximum(faces, least), 1.0)).sum(axis=2)
     counts = np.count_nonzero(faces, axis=2)
@@ -144,5 +168,7 @@ def _sampled(stencil: PaddedStencil) -> np.ndarray:
 
 def _gathered(weights: wp.array[Any], order: wp.array[Any]) -> np.ndarray:
     taken = wp.empty(order.size, dtype=weights.dtype, device=order.device)
-    GATHER.bind(Rows.flat(order.size, order.device), source=weights, order=order, taken=taken).launch()
+    GATHER.bind(
+        Rows.flat(order.size, order.device), source=weights, order=order, taken=taken
+    ).launch()
     return taken.numpy().astype(np.float64)

@@ -26,16 +26,21 @@ class WorldBodies(RigidBodies):
 
     Attributes:
         indices: their numbers in the model.
-        force: what acts on them besides gravity and liquid [N, N m], about their centers of mass, shape (n, 6).
+        force: what acts on them besides gravity and liquid [N, N m], about their centers of mass,
+            shape (n, 6).
         impulses: what the liquid has given them since this was zeroed [N s, N m s], shape (n, 6).
     """
 
-    def __init__(self, model: Any, origin: np.ndarray, shapes: Mapping[int, Geometry], *, first: int) -> None:
+    def __init__(
+        self, model: Any, origin: np.ndarray, shapes: Mapping[int, Geometry], *, first: int
+    ) -> None:
         self.indices, self.dimension = np.array(list(shapes), dtype=int), 3
         self._origin, self._geometries = origin, list(shapes.values())
         self._placed = model.body_q.numpy()[self.indices].astype(np.float64)
         self._turned = [rotation_of(q[3:]) for q in self._placed]
-        self.bodies = BodyStates([RigidBody(p, name=model.body_label[body]) for body, p in self._properties(model)])
+        self.bodies = BodyStates(
+            [RigidBody(p, name=model.body_label[body]) for body, p in self._properties(model)]
+        )
         self.numbers = list(range(first, first + len(self.bodies)))
         self.motions = [BodyMotion(body) for body in self.bodies]
         self.refresh(model)
@@ -54,17 +59,25 @@ class WorldBodies(RigidBodies):
         self.bodies = BodyStates(self.bodies)  # with the masses
         self._com = model.body_com.numpy()[self.indices].astype(np.float64)
 
-    def asked(self, poses: np.ndarray, velocities: np.ndarray, forces: np.ndarray | None, dt: float) -> np.ndarray:
+    def asked(
+        self, poses: np.ndarray, velocities: np.ndarray, forces: np.ndarray | None, dt: float
+    ) -> np.ndarray:
         """Return what a step of dt [s] depends on: poses, and velocities with what the forces give; arguments as of `take`."""
         placed, moved = (array[self.indices].astype(np.float64) for array in (poses, velocities))
-        given = np.zeros_like(moved) if forces is None else dt * forces[self.indices].astype(np.float64)
-        for body, turned, q, v, impulse in zip(self.bodies, self._turned, placed, moved, given, strict=True):
+        given = (
+            np.zeros_like(moved) if forces is None else dt * forces[self.indices].astype(np.float64)
+        )
+        for body, turned, q, v, impulse in zip(
+            self.bodies, self._turned, placed, moved, given, strict=True
+        ):
             rotation = rotation_of(q[3:]) @ turned.T
             v[:3] += impulse[:3] / body.properties.mass
             v[3:] += rotation @ body.properties.inverse_inertia @ rotation.T @ impulse[3:]
         return np.concatenate([placed, moved], axis=1)
 
-    def take(self, poses: np.ndarray, velocities: np.ndarray, forces: np.ndarray | None, time: float) -> bool:
+    def take(
+        self, poses: np.ndarray, velocities: np.ndarray, forces: np.ndarray | None, time: float
+    ) -> bool:
         """Take the state of the world; return whether a body lies elsewhere than the last step left it.
 
         Args:
@@ -74,14 +87,26 @@ class WorldBodies(RigidBodies):
             time: of the liquid [s].
         """
         moved = False
-        self.force = np.zeros((len(self.bodies), 6)) if forces is None else forces[self.indices].astype(np.float64)
+        self.force = (
+            np.zeros((len(self.bodies), 6))
+            if forces is None
+            else forces[self.indices].astype(np.float64)
+        )
         given = poses[self.indices].astype(np.float64), velocities[self.indices].astype(np.float64)
-        for body, turned, com, q, v in zip(self.bodies, self._turned, self._com, *given, strict=True):
+        for body, turned, com, q, v in zip(
+            self.bodies, self._turned, self._com, *given, strict=True
+        ):
             R = rotation_of(q[3:])
             position, rotation = q[:3] + R @ com - self._origin, R @ turned.T
-            moved |= not (np.allclose(position, body.position, rtol=0.0, atol=SAME) and np.allclose(rotation, body.rotation, atol=SAME))
+            moved |= not (
+                np.allclose(position, body.position, rtol=0.0, atol=SAME)
+                and np.allclose(rotation, body.rotation, atol=SAME)
+            )
             body.position, body.rotation, body.time = position, rotation, time
-            body.momentum, body.angular_momentum = body.properties.mass * v[:3], body.inertia @ v[3:]
+            body.momentum, body.angular_momentum = (
+                body.properties.mass * v[:3],
+                body.inertia @ v[3:],
+            )
         return moved
 
     def give(self, poses: np.ndarray, velocities: np.ndarray) -> None:
@@ -140,13 +165,25 @@ class WorldBodies(RigidBodies):
 
     def _properties(self, model: Any) -> list[tuple[int, MassProperties]]:
         """Return mass, center and inertia of each body as the model places it, those of a unit ball where it has none."""
-        masses, centers, inertias = (getattr(model, f"body_{name}").numpy()[self.indices] for name in ("mass", "com", "inertia"))
+        masses, centers, inertias = (
+            getattr(model, f"body_{name}").numpy()[self.indices]
+            for name in ("mass", "com", "inertia")
+        )
         found = []
-        for index, R, q, mass, com, inertia in zip(self.indices, self._turned, self._placed, masses, centers, inertias, strict=True):
+        for index, R, q, mass, com, inertia in zip(
+            self.indices, self._turned, self._placed, masses, centers, inertias, strict=True
+        ):
             own = inertia.astype(np.float64) if mass > 0.0 else np.eye(3)
             turned = R @ (0.5 * (own + own.T)) @ R.T
             center = q[:3] + R @ com - self._origin
-            found.append((int(index), MassProperties(mass=float(mass) or 1.0, center=center, inertia=0.5 * (turned + turned.T))))
+            found.append(
+                (
+                    int(index),
+                    MassProperties(
+                        mass=float(mass) or 1.0, center=center, inertia=0.5 * (turned + turned.T)
+                    ),
+                )
+            )
         return found
 
 

@@ -10,7 +10,16 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from warp_lcp.grid.motion import Pose
-from warp_lcp.grid.solids import Box, Capsule, Geometry, Placement, Plane, Sphere, TriangleMesh, Union
+from warp_lcp.grid.solids import (
+    Box,
+    Capsule,
+    Geometry,
+    Placement,
+    Plane,
+    Sphere,
+    TriangleMesh,
+    Union,
+)
 from warp_lcp.grid.triangle_mesh import close_surface
 
 SEGMENTS = 64  # around what is round and made of triangles: its volume is 0.2 % too small
@@ -39,7 +48,10 @@ def geometries(model: Any, origin: np.ndarray) -> dict[int, list[Geometry]]:
     Raises:
         ValueError: a shape has no inside, or none that a liquid can tell.
     """
-    arrays = {name: getattr(model, f"shape_{name}").numpy() for name in ("body", "flags", "type", "scale", "transform")}
+    arrays = {
+        name: getattr(model, f"shape_{name}").numpy()
+        for name in ("body", "flags", "type", "scale", "transform")
+    }
     placed = model.body_q.numpy() if model.body_count else np.zeros((0, 7))
     found: dict[int, list[Geometry]] = {}
     for shape in range(model.shape_count):
@@ -51,7 +63,9 @@ def geometries(model: Any, origin: np.ndarray) -> dict[int, list[Geometry]]:
         if body >= 0:
             pose = pose_of(placed[body]).after(pose)
         geometry = _geometry(row, model.shape_source[shape], model.shape_label[shape])
-        found.setdefault(body, []).append(geometry.moved(Pose(pose.rotation, pose.translation - origin)))
+        found.setdefault(body, []).append(
+            geometry.moved(Pose(pose.rotation, pose.translation - origin))
+        )
     return found
 
 
@@ -69,7 +83,9 @@ def reaches_into(geometry: Geometry, size: np.ndarray) -> bool:
     if not isinstance(geometry, Plane):
         return True
     corners = np.stack(np.meshgrid(*([0.0, side] for side in size)), axis=-1).reshape(-1, 3)
-    above = (corners - geometry.placement.apply(np.array([geometry.point]))[0]) @ (geometry.placement.rotation @ geometry.normal)
+    above = (corners - geometry.placement.apply(np.array([geometry.point]))[0]) @ (
+        geometry.placement.rotation @ geometry.normal
+    )
     return bool(above.min() < -slack)
 
 
@@ -89,20 +105,37 @@ def _geometry(row: Mapping[str, Any], source: Any, name: str) -> Geometry:
         return Plane(point=[0.0, 0.0, 0.0], normal=[0.0, 0.0, 1.0])
     made = {"compute_normals": False, "compute_uvs": False, "compute_inertia": False}
     if kind == kinds.ELLIPSOID:
-        return _mesh(newton.Mesh.create_ellipsoid(x, y, z, num_latitudes=SEGMENTS // 2, num_longitudes=SEGMENTS, **made), name)
+        return _mesh(
+            newton.Mesh.create_ellipsoid(
+                x, y, z, num_latitudes=SEGMENTS // 2, num_longitudes=SEGMENTS, **made
+            ),
+            name,
+        )
     if kind == kinds.CYLINDER:
-        mesh = newton.Mesh.create_cylinder(x, y, up_axis=newton.Axis.Z, barrel_radius=z, segments=SEGMENTS, **made)
+        mesh = newton.Mesh.create_cylinder(
+            x, y, up_axis=newton.Axis.Z, barrel_radius=z, segments=SEGMENTS, **made
+        )
         return _mesh(mesh, name)
     if kind == kinds.CONE:
-        return _mesh(newton.Mesh.create_cone(x, y, up_axis=newton.Axis.Z, segments=SEGMENTS, **made), name)
+        return _mesh(
+            newton.Mesh.create_cone(x, y, up_axis=newton.Axis.Z, segments=SEGMENTS, **made), name
+        )
     if kind == kinds.MESH:
         return _mesh(source, name, row["scale"])
     if kind == kinds.CONVEX_MESH:
         vertices = np.asarray(source.vertices, dtype=np.float64) * row["scale"]
-        return TriangleMesh(surface=close_surface(vertices, ConvexHull(vertices).simplices, name), placement=Placement())
-    raise ValueError(f"{name}: a shape of type {kinds(kind).name} encloses no volume, which a liquid needs")
+        return TriangleMesh(
+            surface=close_surface(vertices, ConvexHull(vertices).simplices, name),
+            placement=Placement(),
+        )
+    raise ValueError(
+        f"{name}: a shape of type {kinds(kind).name} encloses no volume, which a liquid needs"
+    )
 
 
 def _mesh(mesh: Any, name: str, scale: np.ndarray | float = 1.0) -> TriangleMesh:
     vertices = np.asarray(mesh.vertices, dtype=np.float64) * scale
-    return TriangleMesh(surface=close_surface(vertices, np.asarray(mesh.indices).reshape(-1, 3), name), placement=Placement())
+    return TriangleMesh(
+        surface=close_surface(vertices, np.asarray(mesh.indices).reshape(-1, 3), name),
+        placement=Placement(),
+    )

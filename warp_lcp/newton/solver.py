@@ -27,22 +27,31 @@ from warp_lcp.simulation import StepFailed
 RETRIES = 6  # halvings of a step that fails
 DEFAULTS: dict[str, Any] = {"scene": {"simulator": "fluids"}, "time": {"duration": 1.0}}
 WHOLE = 1e-9  # of a step: what rounding leaves of it
-ALIKE = 1e-2  # of cells and radians, and of what gravity gives in a step: bodies that differ by less move alike
-ROUNDING = 1e-5  # [m/s, rad/s]: what float32 leaves of a velocity from which impulses have been taken back
-MOVES, POSED = ("body_q", "body_qd", "particle_q", "particle_qd", "joint_q", "joint_qd"), newton.StateFlags.BODY_Q
+# of cells and radians, and of what gravity gives in a step: bodies that differ by less move alike
+ALIKE = 1e-2
+# [m/s, rad/s]: what float32 leaves of a velocity from which impulses have been taken back
+ROUNDING = 1e-5
+MOVES, POSED = (
+    ("body_q", "body_qd", "particle_q", "particle_qd", "joint_q", "joint_qd"),
+    newton.StateFlags.BODY_Q,
+)
 
 
 class SolverLiquid(SolverBase, CouplingInterface):
     """Liquid in a box of a newton world; its bodies displace it, and its pressure moves them.
 
-    Pressure and bodies are one problem, see `warp_lcp.fluids.coupling`: it knows the bodies' masses, so that added mass makes nothing
-    unstable. Alone, `step` lets bodies move by gravity, `body_f` and the liquid, without contacts and joints. `coupled` returns newton's
-    `SolverCoupledProxy` of it and of a solver for these: the liquid starts from the velocities that contacts and joints leave.
+    Pressure and bodies are one problem, see `warp_lcp.fluids.coupling`: it knows the bodies'
+    masses, so that added mass makes nothing unstable. Alone, `step` lets bodies move by gravity,
+    `body_f` and the liquid, without contacts and joints. `coupled` returns newton's
+    `SolverCoupledProxy` of it and of a solver for these: the liquid starts from the velocities that
+    contacts and joints leave.
 
     Args:
-        model: of newton. Shapes that collide with shapes displace the liquid: those of bodies, and what stands in the box.
-        scene: the liquid, as tables, a file or a name: its domain from 0 to `domain.size` in 3-D, `[[liquid]]`, and whatever else a scene
-            may have but rigid bodies. Gravity is the model's; `scene` and `time` may be left out of tables.
+        model: of newton. Shapes that collide with shapes displace the liquid: those of bodies, and
+            what stands in the box.
+        scene: the liquid, as tables, a file or a name: its domain from 0 to `domain.size` in 3-D,
+            `[[liquid]]`, and whatever else a scene may have but rigid bodies. Gravity is the
+            model's; `scene` and `time` may be left out of tables.
         origin: where in the world the domain's low corner is [m].
         bodies: numbers of those that the liquid holds; all that have shapes unless given.
 
@@ -56,17 +65,25 @@ class SolverLiquid(SolverBase, CouplingInterface):
     """
 
     def __init__(
-        self, model: Any, scene: SceneSource, *, origin: Sequence[float] = (0.0, 0.0, 0.0), bodies: Sequence[int] | None = None
+        self,
+        model: Any,
+        scene: SceneSource,
+        *,
+        origin: Sequence[float] = (0.0, 0.0, 0.0),
+        bodies: Sequence[int] | None = None,
     ) -> None:
         super().__init__(model)
         if model.world_count > 1:
             raise ValueError(f"the model has {model.world_count} worlds: expected one")
         gravity = f"physics.gravity={self._gravity().tolist()}"
-        self.scene = load_scene({**DEFAULTS, **scene} if isinstance(scene, Mapping) else scene, [gravity])
+        self.scene = load_scene(
+            {**DEFAULTS, **scene} if isinstance(scene, Mapping) else scene, [gravity]
+        )
         self._origin, self._chosen = np.asarray(origin, dtype=np.float64), bodies
         self.row: Row = {}
         self._coupled = self._restarts = self._again = False
-        self._begins = True  # whether the next step is the first since the coupler has set the bodies' poses
+        # whether the next step is the first since the coupler has set the bodies' poses
+        self._begins = True
         self._kept: dict[str, np.ndarray] = {}
         self._asked: np.ndarray | None = None
         self.simulation, self.bodies = self._create()
@@ -88,23 +105,39 @@ class SolverLiquid(SolverBase, CouplingInterface):
             rigid: makes the bodies' solver of a view of the model, say `SolverXPBD`.
             scene: as of the class, like the rest.
             origin: likewise.
-            iterations: how often both take a step; the first time the bodies' solver only guesses what the liquid gives. 1 is cheaper, and
-                bodies far lighter than the liquid then swing for some steps after a jolt.
+            iterations: how often both take a step; the first time the bodies' solver only guesses
+                what the liquid gives. 1 is cheaper, and bodies far lighter than the liquid then
+                swing for some steps after a jolt.
         """
-        bodies, joints, particles = (list(range(count)) for count in (model.body_count, model.joint_count, model.particle_count))
+        bodies, joints, particles = (
+            list(range(count))
+            for count in (model.body_count, model.joint_count, model.particle_count)
+        )
         held = sorted(body for body in geometries(model, np.zeros(3)) if body >= 0)
         entries = [
             SolverCoupled.Entry("rigid", rigid, bodies=bodies, joints=joints, particles=particles),
             SolverCoupled.Entry("liquid", lambda view: cls(view, scene, origin=origin)),
         ]
         proxies = [SolverCoupledProxy.Proxy("rigid", "liquid", bodies=held)]
-        return SolverCoupledProxy(model, entries, SolverCoupledProxy.Config(proxies, iterations=iterations))
+        return SolverCoupledProxy(
+            model, entries, SolverCoupledProxy.Config(proxies, iterations=iterations)
+        )
 
-    def step(self, state_in: Any, state_out: Any, control: Any, contacts: Any, dt: float, *, observables: Any = None) -> None:
+    def step(
+        self,
+        state_in: Any,
+        state_out: Any,
+        control: Any,
+        contacts: Any,
+        dt: float,
+        *,
+        observables: Any = None,
+    ) -> None:
         """Advance liquid and bodies by dt [s], in as many steps of the liquid as its CFL number asks for.
 
-        `state_in.body_f` acts besides gravity; `control` and `contacts` are of no meaning. Kinematic bodies move as their velocities say,
-        and keep their poses. The liquid's own state is this solver's, not `state_in`'s.
+        `state_in.body_f` acts besides gravity; `control` and `contacts` are of no meaning.
+        Kinematic bodies move as their velocities say, and keep their poses. The liquid's own state
+        is this solver's, not `state_in`'s.
 
         Raises:
             RuntimeError: a graph is being captured.
@@ -114,7 +147,10 @@ class SolverLiquid(SolverBase, CouplingInterface):
         if not (math.isfinite(dt) and dt > 0.0):
             raise ValueError(f"dt = {dt}: must be a positive time [s]")
         if wp.get_device(str(self.model.device)).is_capturing:
-            raise RuntimeError("a step of liquid copies data from the device and cannot run inside a captured graph, `wp.ScopedCapture`")
+            raise RuntimeError(
+                "a step of liquid copies data from the device and cannot run inside a captured "
+                "graph, `wp.ScopedCapture`"
+            )
         simulation, bodies = self.simulation, self.bodies
         for name in MOVES:
             here, there = getattr(state_in, name, None), getattr(state_out, name, None)
@@ -144,7 +180,9 @@ class SolverLiquid(SolverBase, CouplingInterface):
     def notify_model_changed(self, flags: int) -> None:
         """Take other masses or gravity from the model; shapes stay what they were."""
         changes = newton.ModelFlags
-        if self.bodies is not None and flags & (changes.BODY_INERTIAL_PROPERTIES | changes.BODY_PROPERTIES):
+        if self.bodies is not None and flags & (
+            changes.BODY_INERTIAL_PROPERTIES | changes.BODY_PROPERTIES
+        ):
             self.bodies.refresh(self.model)
         if flags & changes.MODEL_PROPERTIES:
             self.simulation.gravity[:] = self._gravity()
@@ -160,18 +198,31 @@ class SolverLiquid(SolverBase, CouplingInterface):
         """Learn that a coupler steps this solver, and whether it repeats steps."""
         self._coupled, self._restarts = True, enabled
 
-    def coupling_notify_input_state_update(self, state: Any, flags: Any, *, iteration_restart: bool = False, dt: float = 0.0) -> None:
+    def coupling_notify_input_state_update(
+        self, state: Any, flags: Any, *, iteration_restart: bool = False, dt: float = 0.0
+    ) -> None:
         """Learn that bodies have new poses, and whether the coupler repeats the step."""
         self._begins |= bool(int(flags) & POSED)
         self._again |= iteration_restart and dt > 0.0
 
     def coupling_harvest_proxy_wrenches(
-        self, body_local_to_proxy_global: Any, out_body_f: Any, *, body_qd_before: Any, state: Any, state_out: Any, contacts: Any, dt: float
+        self,
+        body_local_to_proxy_global: Any,
+        out_body_f: Any,
+        *,
+        body_qd_before: Any,
+        state: Any,
+        state_out: Any,
+        contacts: Any,
+        dt: float,
     ) -> None:
         """Return the liquid's impulses of the step as forces: what it gave is what the bodies' own solver takes."""
         if self.bodies is None:
             return
-        forces, proxies = out_body_f.numpy().copy(), body_local_to_proxy_global.numpy()[self.bodies.indices]
+        forces, proxies = (
+            out_body_f.numpy().copy(),
+            body_local_to_proxy_global.numpy()[self.bodies.indices],
+        )
         forces[proxies[proxies >= 0]] = (self.bodies.impulses / dt)[proxies >= 0]
         out_body_f.assign(forces)
 
@@ -181,25 +232,47 @@ class SolverLiquid(SolverBase, CouplingInterface):
         if not isinstance(scene, LiquidScene) or scene.dimension != 3:
             raise ValueError("scene: must be a 3-D scene of liquid")
         if scene.domain.solids != "cut-cell" or scene.solver.method not in COUPLED_METHODS:
-            raise ValueError(f'scene: bodies need domain.solids = "cut-cell" and one of {", ".join(COUPLED_METHODS)} as solver.method')
+            raise ValueError(
+                'scene: bodies need domain.solids = "cut-cell" and one of '
+                f"{', '.join(COUPLED_METHODS)} as solver.method"
+            )
         if any(solid.is_body for solid in scene.solid):
-            raise ValueError("scene.solid: rigid bodies come from the model; solids of the scene must have no mass or density")
+            raise ValueError(
+                "scene.solid: rigid bodies come from the model; solids of the scene must have no "
+                "mass or density"
+            )
         shapes = geometries(model, origin)
-        standing = [shape for shape in shapes.pop(-1, []) if reaches_into(shape, np.array(scene.domain.size))]
+        standing = [
+            shape
+            for shape in shapes.pop(-1, [])
+            if reaches_into(shape, np.array(scene.domain.size))
+        ]
         chosen = sorted(shapes) if self._chosen is None else [int(body) for body in self._chosen]
         if missing := [body for body in chosen if body not in shapes]:
             raise ValueError(f"bodies: {missing} have no shapes that collide with shapes")
         held = {body: united(shapes[body]) for body in chosen}
         placed, separating = placed_solids(scene, Path()), scene.domain.wall == "separating"
-        placed += [PlacedSolid(geometry=shape, separating=separating, name=f"shape {n} of the world") for n, shape in enumerate(standing)]
+        placed += [
+            PlacedSolid(geometry=shape, separating=separating, name=f"shape {n} of the world")
+            for n, shape in enumerate(standing)
+        ]
         bodies = WorldBodies(model, origin, held, first=1 + len(placed)) if held else None
         if bodies is not None:
             movers = zip(bodies.bodies, held.values(), bodies.motions, strict=True)
-            placed += [PlacedSolid(geometry=shape, separating=separating, name=body.name, motion=motion) for body, shape, motion in movers]
-        stand, move = (SolidSphere(shape="sphere", center=[0.0] * 3, radius=1.0, mass=mass) for mass in (None, 1.0))  # their walls matter
+            placed += [
+                PlacedSolid(geometry=shape, separating=separating, name=body.name, motion=motion)
+                for body, shape, motion in movers
+            ]
+        # their walls matter
+        stand, move = (
+            SolidSphere(shape="sphere", center=[0.0] * 3, radius=1.0, mass=mass)
+            for mass in (None, 1.0)
+        )
         solids = [*scene.solid, *[stand] * len(standing), *[move] * len(held)]
         whole = scene.model_copy(update={"solid": solids})
-        return SIMULATOR.assemble(whole, placed, bodies, device=str(model.device), folder=Path()), bodies
+        return SIMULATOR.assemble(
+            whole, placed, bodies, device=str(model.device), folder=Path()
+        ), bodies
 
     def _begin(self, asked: np.ndarray | None, dt: float) -> bool:
         """Be where the step begins; return whether it is to be taken, not repeated with bodies that move as they did, contacts or not.
@@ -213,7 +286,11 @@ class SolverLiquid(SolverBase, CouplingInterface):
                 self._again = self._begins = False
                 falls = ROUNDING + ALIKE * dt * float(np.linalg.norm(self.simulation.gravity))
                 alike = np.repeat([ALIKE * self.scene.spacing, ALIKE, falls], [3, 4, 6])
-                if asked is not None and self._asked is not None and (np.abs(asked - self._asked) < alike).all():
+                if (
+                    asked is not None
+                    and self._asked is not None
+                    and (np.abs(asked - self._asked) < alike).all()
+                ):
                     return False
                 self.simulation.restore(self._kept)
             elif self._restarts:
@@ -233,7 +310,8 @@ class SolverLiquid(SolverBase, CouplingInterface):
             step = min(simulation.stable_dt(), self.scene.time.dt_max, 2.0 * step)
             count = math.ceil(remaining / step * (1.0 - WHOLE))
             while True:
-                simulation.last_dt = remaining / count  # forces act for as long as bodies move, as newton has it
+                # forces act for as long as bodies move, as newton has it
+                simulation.last_dt = remaining / count
                 try:
                     self.row = simulation.step(remaining / count)
                     break
@@ -246,4 +324,6 @@ class SolverLiquid(SolverBase, CouplingInterface):
     def _gravity(self) -> np.ndarray:
         """Return the gravity of the model's bodies [m/s^2], shape (3,)."""
         worlds = self.model.body_world.numpy() if self.model.body_count else []
-        return np.asarray(self.model.gravity.numpy()[worlds[0] if len(worlds) else 0], dtype=np.float64)
+        return np.asarray(
+            self.model.gravity.numpy()[worlds[0] if len(worlds) else 0], dtype=np.float64
+        )

@@ -10,6 +10,15 @@ from warp_lcp.operators.sum import SumOperator
 from warp_lcp.problem.protocol import Operator
 
 __all__ = [
-    "AIR", "FLUID", "SOLID", "DenseOperator", "GridPoisson", "LinearOperator", "LowRankOperator", "Operator", "SparseOperator", "Stencil",
+    "AIR",
+    "FLUID",
+    "SOLID",
+    "DenseOperator",
+    "GridPoisson",
+    "LinearOperator",
+    "LowRankOperator",
+    "Operator",
+    "SparseOperator",
+    "Stencil",
     "SumOperator",
-]  # fmt: skip
+]

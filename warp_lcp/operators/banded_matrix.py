@@ -9,7 +9,9 @@ import scipy.sparse
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.sparse import SparseOperator
 
-NARROW = 3  # bandwidth up to which LAPACK's band factors cost less than launches of kernels, whatever the number of unknowns
+# bandwidth up to which LAPACK's band factors cost less than launches of kernels, whatever the
+# number of unknowns
+NARROW = 3
 SINGULAR = 1e-13  # of the largest column sum: a pivot below it is rounding
 
 
@@ -40,7 +42,9 @@ class BandedMatrix:
         n, k = len(x), self.width
         return scipy.linalg.blas.dgbmv(n, n, k, k, 1.0, self._by_columns, x)
 
-    def solve(self, free: np.ndarray, r: np.ndarray, shift: np.ndarray | float = 0.0) -> np.ndarray | None:
+    def solve(
+        self, free: np.ndarray, r: np.ndarray, shift: np.ndarray | float = 0.0
+    ) -> np.ndarray | None:
         """Return e with (A + D)_FF e_F = r_F and 0 elsewhere; None where a pivot shows that the block is singular.
 
         Held rows and columns, those off F, keep a diagonal entry of the column's size.
@@ -59,9 +63,13 @@ class BandedMatrix:
             pivots, info = masked[0], 0
             e = right / np.where(pivots == 0, 1.0, pivots)
         elif k == 1:
-            _, pivots, _, e, info = scipy.linalg.lapack.dgtsv(masked[2, :-1], masked[1], masked[0, 1:], right)
+            _, pivots, _, e, info = scipy.linalg.lapack.dgtsv(
+                masked[2, :-1], masked[1], masked[0, 1:], right
+            )
         else:
-            factors, _, e, info = scipy.linalg.lapack.dgbsv(k, k, np.vstack([np.zeros((k, n)), masked]), right)
+            factors, _, e, info = scipy.linalg.lapack.dgbsv(
+                k, k, np.vstack([np.zeros((k, n)), masked]), right
+            )
             pivots = factors[2 * k]
         return None if info != 0 or np.abs(pivots).min() <= SINGULAR * self.size else e
 
@@ -79,7 +87,9 @@ def bands_of(A: DenseOperator | SparseOperator, width: int) -> np.ndarray:
     bands = np.zeros((2 * width + 1, n))
     if isinstance(A, SparseOperator):
         columns = A.indices.numpy()
-        bands[width + np.repeat(np.arange(n), np.diff(A.indptr.numpy())) - columns, columns] = A.values.numpy()
+        bands[width + np.repeat(np.arange(n), np.diff(A.indptr.numpy())) - columns, columns] = (
+            A.values.numpy()
+        )
         return bands
     host = A.matrix.numpy()
     for o in range(-width, width + 1):
@@ -108,7 +118,9 @@ class BandedFactors:
         self._p = p
         chosen = by_z.copy()
         chosen[p] = False
-        self._lu, self._pivots, info = scipy.linalg.lapack.dgbtrf(np.where(chosen, self._bands, self._unit), self.k, self.k)
+        self._lu, self._pivots, info = scipy.linalg.lapack.dgbtrf(
+            np.where(chosen, self._bands, self._unit), self.k, self.k
+        )
         u = -self._d.copy()
         u[p] -= 1.0
         self._update = self._back(u)
@@ -134,4 +146,6 @@ class BandedFactors:
         return t[:-1] - np.multiply.outer(self._update[indices] / self._denominator, t[-1])
 
     def _back(self, r: np.ndarray, *, transposed: bool = False) -> np.ndarray:
-        return scipy.linalg.lapack.dgbtrs(self._lu, self.k, self.k, r, self._pivots, trans=int(transposed))[0]
+        return scipy.linalg.lapack.dgbtrs(
+            self._lu, self.k, self.k, r, self._pivots, trans=int(transposed)
+        )[0]

@@ -24,7 +24,9 @@ F64, I32 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int32)
 
 @no_type_check
 @forward_kernel(**options)
-def component_sums_kernel(label: I32, free: wp.array(dtype=wp.uint8), r: wp.array(dtype=Any), sums: F64, held: I32):
+def component_sums_kernel(
+    label: I32, free: wp.array(dtype=wp.uint8), r: wp.array(dtype=Any), sums: F64, held: I32
+):
     """Sum r over each component, and note which have an unknown that is not free."""
     i = wp.tid()
     c = label[i]
@@ -69,7 +71,9 @@ def shift_components_kernel(label: I32, held: I32, constant: F64, lower: F64, up
 
 
 for _T in (wp.float32, wp.float64):
-    wp.overload(component_sums_kernel, [I32, wp.array(dtype=wp.uint8), wp.array(dtype=_T), F64, I32])
+    wp.overload(
+        component_sums_kernel, [I32, wp.array(dtype=wp.uint8), wp.array(dtype=_T), F64, I32]
+    )
     wp.overload(remove_means_kernel, [I32, F64, I32, F64, wp.array(dtype=_T)])
 
 
@@ -113,9 +117,10 @@ COUNT = KERNELS["components.count"]
 class FloatingComponents:
     """The floating components of an operator, numbered from 0, and what keeps a solve on them well posed.
 
-    Summing y = A x + b over such a component leaves the sum of b: without bounds a solution exists only if that is 0, with lower bounds
-    alone only if it is >= 0, with upper bounds alone only if it is <= 0. Where A is not symmetric, sums are weighted by w > 0 with
-    w'A = 0, and A v = 0 with v > 0 in place of the constants; both by components, on the host.
+    Summing y = A x + b over such a component leaves the sum of b: without bounds a solution exists
+    only if that is 0, with lower bounds alone only if it is >= 0, with upper bounds alone only if
+    it is <= 0. Where A is not symmetric, sums are weighted by w > 0 with w'A = 0, and A v = 0 with
+    v > 0 in place of the constants; both by components, on the host.
 
     Args:
         label: component of each stored cell, -1 where there is none.
@@ -126,13 +131,20 @@ class FloatingComponents:
     """
 
     def __init__(
-        self, label: np.ndarray, device: wp.Device, across: Across | None = None, *, left: np.ndarray | None = None,
+        self,
+        label: np.ndarray,
+        device: wp.Device,
+        across: Across | None = None,
+        *,
+        left: np.ndarray | None = None,
         right: np.ndarray | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.device, self.label, self._across = device, label, across
         self.left, self.right = left, right
         self.count = int(self._largest(label.max())) + 1
-        self.sizes = self._total(np.bincount(label[label >= 0], minlength=self.count).astype(np.float64))
+        self.sizes = self._total(
+            np.bincount(label[label >= 0], minlength=self.count).astype(np.float64)
+        )
         self._label = wp.array(label, dtype=wp.int32, device=device)
         self._sizes = wp.array(self.sizes, dtype=wp.float64, device=device)
         self._sums = wp.zeros(self.count, dtype=wp.float64, device=device)
@@ -159,13 +171,17 @@ class FloatingComponents:
             return None
         number = np.where(gone, -1, np.cumsum(~gone) - 1).astype(np.int32)
         label = np.where(self.label >= 0, number[self.label], -1).astype(np.int32)
-        return FloatingComponents(label, self.device, self._across, left=self.left, right=self.right)
+        return FloatingComponents(
+            label, self.device, self._across, left=self.left, right=self.right
+        )
 
     def transposed(self) -> FloatingComponents:
         """Return those of A'."""
         if self.left is None and self.right is None:
             return self
-        return FloatingComponents(self.label, self.device, self._across, left=self.right, right=self.left)
+        return FloatingComponents(
+            self.label, self.device, self._across, left=self.right, right=self.left
+        )
 
     def unattainable(self, b: wp.array[Any], lower: wp.array[Any], upper: wp.array[Any]) -> float:
         """Return a norm that the natural residual cannot go below; 0 if b is compatible everywhere.
@@ -179,8 +195,13 @@ class FloatingComponents:
         label = self.label[inside]
         w = np.ones(1) if self.left is None else self.left[inside]
         terms = w * b.numpy()[inside]
-        values = terms, np.abs(terms), *(np.isfinite(bound.numpy()[inside]) for bound in (lower, upper))
-        mine = np.stack([np.bincount(label, v, self.count) for v in values])  # of nothing NumPy 1 makes integers
+        values = (
+            terms,
+            np.abs(terms),
+            *(np.isfinite(bound.numpy()[inside]) for bound in (lower, upper)),
+        )
+        # of nothing NumPy 1 makes integers
+        mine = np.stack([np.bincount(label, v, self.count) for v in values])
         sums = self._total(mine.astype(np.float64))
         rest, scale, below, above = sums[0], sums[1], sums[2] > 0, sums[3] > 0
         self._net = rest.copy()
@@ -198,11 +219,21 @@ class FloatingComponents:
         self._sums.zero_()
         self._held.zero_()
         n = r.size
-        wp.launch(component_sums_kernel, n, [self._label, free, r, self._sums, self._held], device=self.device)
+        wp.launch(
+            component_sums_kernel,
+            n,
+            [self._label, free, r, self._sums, self._held],
+            device=self.device,
+        )
         if self._across is not None:
             self._sums.assign(self._across.sum(self._sums.numpy()))
             self._held.assign(self._across.max(self._held.numpy()))
-        wp.launch(remove_means_kernel, n, [self._label, self._sums, self._held, self._sizes, r], device=self.device)
+        wp.launch(
+            remove_means_kernel,
+            n,
+            [self._label, self._sums, self._held, self._sizes, r],
+            device=self.device,
+        )
 
     def _project_weighted(self, w: np.ndarray, r: wp.array[Any], free: wp.array[Any]) -> None:
         """Take w (w'r)/(w'w) off r on every component whose unknowns are all free."""
@@ -210,12 +241,16 @@ class FloatingComponents:
         label, weights, host = self.label[inside], w[inside], r.numpy()
         held = np.bincount(label, free.numpy()[inside] == 0, self.count) > 0
         self._held.assign(held.astype(np.int32))
-        shares = np.bincount(label, weights * host[inside], self.count) / np.bincount(label, weights**2, self.count)
+        shares = np.bincount(label, weights * host[inside], self.count) / np.bincount(
+            label, weights**2, self.count
+        )
         changed = host.copy()
         changed[inside] -= (np.where(held, 0.0, shares)[label] * weights).astype(host.dtype)
         r.assign(changed)
 
-    def _settle_weighted(self, v: np.ndarray, x: wp.array[Any], lower: wp.array[Any], upper: wp.array[Any]) -> None:
+    def _settle_weighted(
+        self, v: np.ndarray, x: wp.array[Any], lower: wp.array[Any], upper: wp.array[Any]
+    ) -> None:
         """As `settle`, with multiples of v in place of the constants."""
         inside, moved = self.label >= 0, x.numpy().copy()
         label, weights, held = self.label[inside], v[inside], self._held.numpy() != 0
@@ -223,14 +258,17 @@ class FloatingComponents:
         below, above = (np.full(self.count, np.inf) for _ in range(2))
         np.minimum.at(below, label, (here - low) / weights)
         np.minimum.at(above, label, (high - here) / weights)
-        mean = np.bincount(label, weights * here, self.count) / np.bincount(label, weights**2, self.count)
+        mean = np.bincount(label, weights * here, self.count) / np.bincount(
+            label, weights**2, self.count
+        )
         constants = np.where(held, 0.0, self._constants(below, above, mean))
         moved[inside] = np.clip(here + constants[label] * weights, low, high)
         x.assign(moved)
 
     def _constants(self, below: np.ndarray, above: np.ndarray, mean: np.ndarray) -> np.ndarray:
         """Return what is added to each component, whose distance to its bounds is `below` and `above`."""
-        # what is left of b pushes x down where it is positive, up where it is negative: the bound on that side is the one to touch
+        # what is left of b pushes x down where it is positive, up where it is negative: the bound
+        # on that side is the one to touch
         up = np.isfinite(above) & ((self._net < 0) | ~np.isfinite(below))
         found: np.ndarray = np.where(up, above, np.where(np.isfinite(below), -below, -mean))
         return found
@@ -238,19 +276,35 @@ class FloatingComponents:
     def settle(self, x: wp.array[Any], lower: wp.array[Any], upper: wp.array[Any]) -> None:
         """Choose the constants that the last `project` left open.
 
-        The mean is 0 without bounds; else x touches the bound that the sum of b pushes it to. Only components that were free as a
-        whole move.
+        The mean is 0 without bounds; else x touches the bound that the sum of b pushes it to. Only
+        components that were free as a whole move.
         """
         if self.right is not None:
             self._settle_weighted(self.right, x, lower, upper)
             return
-        below, above = (wp.full(self.count, np.inf, dtype=wp.float64, device=self.device) for _ in range(2))
-        wp.launch(smallest_gap_kernel, x.size, [self._label, x, lower, upper, below, above], device=self.device)
+        below, above = (
+            wp.full(self.count, np.inf, dtype=wp.float64, device=self.device) for _ in range(2)
+        )
+        wp.launch(
+            smallest_gap_kernel,
+            x.size,
+            [self._label, x, lower, upper, below, above],
+            device=self.device,
+        )
         gap_below, gap_above = -self._largest(-below.numpy()), -self._largest(-above.numpy())
         inside = self.label >= 0
-        mean = self._total(np.bincount(self.label[inside], x.numpy()[inside], self.count)) / self.sizes
-        constants = wp.array(self._constants(gap_below, gap_above, mean), dtype=wp.float64, device=self.device)
-        wp.launch(shift_components_kernel, x.size, [self._label, self._held, constants, lower, upper, x], device=self.device)
+        mean = (
+            self._total(np.bincount(self.label[inside], x.numpy()[inside], self.count)) / self.sizes
+        )
+        constants = wp.array(
+            self._constants(gap_below, gap_above, mean), dtype=wp.float64, device=self.device
+        )
+        wp.launch(
+            shift_components_kernel,
+            x.size,
+            [self._label, self._held, constants, lower, upper, x],
+            device=self.device,
+        )
 
 
 class ComponentFinder:
@@ -275,7 +329,10 @@ class ComponentFinder:
                 return None
             number = self._numbers(parent.numpy(), grounded.numpy())
             held = (A.cells.numpy() == FLUID).ravel() & (number < 0)
-            faces = [face.numpy() if face.size else one for face, one in zip(A.faces, A.uniform, strict=True)]
+            faces = [
+                face.numpy() if face.size else one
+                for face, one in zip(A.faces, A.uniform, strict=True)
+            ]
             label = A._ghosts.join_components(number, held, faces)
             return None if label is None else FloatingComponents(label, A.device, across)
         tell = self.look(scratch)
@@ -354,8 +411,12 @@ class ComponentFinder:
         cells, faces = A.cells_around.flatten(), A.face_coefficients
         SINGLETONS.bind(rows, parent=parent, grounded=grounded).launch(launch)
         UNITE.bind(rows, faces, cells=joined.flatten(), parent=parent).launch(launch)
-        GROUND.bind(rows, faces, cells=cells, shift=A.shift.flatten(), parent=parent, grounded=grounded).launch(launch)
-        COUNT.bind(rows, cells=cells, parent=parent, grounded=grounded, count=self._count.array).launch(launch)
+        GROUND.bind(
+            rows, faces, cells=cells, shift=A.shift.flatten(), parent=parent, grounded=grounded
+        ).launch(launch)
+        COUNT.bind(
+            rows, cells=cells, parent=parent, grounded=grounded, count=self._count.array
+        ).launch(launch)
         return parent, grounded
 
     def _label(self, parent: np.ndarray, grounded: np.ndarray) -> FloatingComponents:
@@ -384,7 +445,12 @@ def _roots(parent: np.ndarray) -> np.ndarray:
 
 
 def numbered_components(
-    number: np.ndarray, held: np.ndarray, device: wp.Device, *, left: np.ndarray | None = None, right: np.ndarray | None = None
+    number: np.ndarray,
+    held: np.ndarray,
+    device: wp.Device,
+    *,
+    left: np.ndarray | None = None,
+    right: np.ndarray | None = None,
 ) -> FloatingComponents | None:
     """Return those of numbered components that nothing holds, None if there are none.
 
@@ -411,17 +477,21 @@ class NullVectors(NamedTuple):
     right: np.ndarray
 
 
-def null_vectors(matrix: scipy.sparse.csr_array, rows: np.ndarray, columns: np.ndarray, *, most: int) -> NullVectors:
+def null_vectors(
+    matrix: scipy.sparse.csr_array, rows: np.ndarray, columns: np.ndarray, *, most: int
+) -> NullVectors:
     """Find null vectors of components of a matrix whose rows or columns sum to 0.
 
-    Where both do, they are the constants. Where one does, the other vector is computed if the component is an irreducible M-matrix, for
-    then it is unique and positive (Berman & Plemmons 1994, theorem 6.4.16).
+    Where both do, they are the constants. Where one does, the other vector is computed if the
+    component is an irreducible M-matrix, for then it is unique and positive
+    (Berman & Plemmons 1994, theorem 6.4.16).
 
     Args:
         matrix: of which rows and columns are known to sum to 0:
         rows: bool, one for each.
         columns: likewise.
-        most: unknowns of a component for which a vector is computed; 0 where off-diagonal entries may be positive.
+        most: unknowns of a component for which a vector is computed; 0 where off-diagonal entries
+            may be positive.
     """
     count, number = scipy.sparse.csgraph.connected_components(matrix, directed=False)
     of_rows, of_columns = (np.bincount(number, ~vanish, count) == 0 for vanish in (rows, columns))
@@ -429,7 +499,10 @@ def null_vectors(matrix: scipy.sparse.csr_array, rows: np.ndarray, columns: np.n
     for c in np.flatnonzero(of_rows != of_columns) if most else ():
         places = np.flatnonzero(number == c)
         block = matrix[places][:, places]
-        if len(places) <= most and scipy.sparse.csgraph.connected_components(block, connection="strong")[0] == 1:
+        if (
+            len(places) <= most
+            and scipy.sparse.csgraph.connected_components(block, connection="strong")[0] == 1
+        ):
             vector = _null_vector(block.T if of_rows[c] else block)
             (left if of_rows[c] else right)[places], held[c] = vector, not (vector > 0).all()
     return NullVectors(number, held, left, right)
@@ -441,5 +514,7 @@ def _null_vector(block: scipy.sparse.csr_array) -> np.ndarray:
     exact = (away - scipy.sparse.diags_array(np.asarray(away.sum(axis=0)).ravel())).tocsc()
     v = np.ones(block.shape[0])
     if len(v) > 1:
-        v[1:] = scipy.sparse.linalg.splu(exact[1:, 1:].tocsc()).solve(-exact[1:, [0]].toarray().ravel())
+        v[1:] = scipy.sparse.linalg.splu(exact[1:, 1:].tocsc()).solve(
+            -exact[1:, [0]].toarray().ravel()
+        )
     return v / v.mean()

@@ -16,7 +16,11 @@ from warp_lcp.rows.layout import make_struct
 @functools.cache
 def matrix_rows(a_type: Any) -> Any:
     """Return the struct of a matrix in compressed rows; `col` may be empty: full rows."""
-    members = {"ptr": wp.array(dtype=wp.int32), "col": wp.array(dtype=wp.int32), "a": wp.array(dtype=a_type)}
+    members = {
+        "ptr": wp.array(dtype=wp.int32),
+        "col": wp.array(dtype=wp.int32),
+        "a": wp.array(dtype=a_type),
+    }
     return make_struct(f"MatrixRows_{a_type.__name__}", members)
 
 
@@ -64,4 +68,6 @@ class CompressedRows:
         n, values = self.indptr.size - 1, self.values.numpy()
         if self.indices.size == 0 and values.size:
             return values.reshape(n, n).astype(np.float64, copy=False)
-        return scipy.sparse.csr_array((values.astype(np.float64), self.indices.numpy(), self.indptr.numpy()), shape=(n, n))
+        return scipy.sparse.csr_array(
+            (values.astype(np.float64), self.indices.numpy(), self.indptr.numpy()), shape=(n, n)
+        )

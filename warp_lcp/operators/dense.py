@@ -14,7 +14,14 @@ from warp_lcp.problem.lcp import as_operator
 from warp_lcp.problem.pickling import Pickled, made_again
 from warp_lcp.problem.scale import scale_of_matrix
 from warp_lcp.rows import KernelFile, Rows
-from warp_lcp.rows.fields import Layout, check_kept, check_storable, checked_device, real_array, relative_rounding
+from warp_lcp.rows.fields import (
+    Layout,
+    check_kept,
+    check_storable,
+    checked_device,
+    real_array,
+    relative_rounding,
+)
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/dense.h")
 PRODUCT = KERNELS["dense.product"]
@@ -43,7 +50,8 @@ class DenseOperator(Pickled):
         dtype: storage of A, wp.float64 or wp.float32.
 
     Attributes:
-        row_sizes: the largest magnitude of each row, shape (n,), wp.float64; None where no row is empty.
+        row_sizes: the largest magnitude of each row, shape (n,), wp.float64; None where no row is
+            empty.
 
     Raises:
         ValueError: the matrix is not square, empty or not finite.
@@ -63,7 +71,9 @@ class DenseOperator(Pickled):
         self.matrix = wp.array(host, dtype=dtype, device=self.device)
         largest = np.abs(host).max(axis=1)
         check_kept(largest, dtype, "matrix, the largest entries of its rows")
-        self.row_sizes = None if largest.all() else wp.array(largest, dtype=wp.float64, device=self.device)
+        self.row_sizes = (
+            None if largest.all() else wp.array(largest, dtype=wp.float64, device=self.device)
+        )
         self._rounding = relative_rounding(host, dtype)
         self.symmetric = is_rounding(host - host.T, largest[:, None], largest)
 
@@ -106,8 +116,12 @@ class DenseOperator(Pickled):
 
     def rows(self) -> CompressedRows:
         """Return the rows, the operator's own memory."""
-        starts = wp.array(np.arange(self.unknowns + 1) * self.unknowns, dtype=wp.int32, device=self.device)
-        return CompressedRows(starts, wp.empty(0, dtype=wp.int32, device=self.device), self.matrix.flatten())
+        starts = wp.array(
+            np.arange(self.unknowns + 1) * self.unknowns, dtype=wp.int32, device=self.device
+        )
+        return CompressedRows(
+            starts, wp.empty(0, dtype=wp.int32, device=self.device), self.matrix.flatten()
+        )
 
     def scale(self) -> np.ndarray:
         """Return the natural residual's d, shape (n,), of the entries as they are now."""
@@ -118,7 +132,11 @@ class DenseOperator(Pickled):
 
         Shape (n, n), float64.
         """
-        return {"matrix": wp.array(np.outer(multiplier.numpy(), x.numpy()), dtype=wp.float64, device=self.device)}
+        return {
+            "matrix": wp.array(
+                np.outer(multiplier.numpy(), x.numpy()), dtype=wp.float64, device=self.device
+            )
+        }
 
     def masked(self, free: Any, shift: Any = None) -> DenseOperator:
         """Return P A P + P D P with P the restriction to `free` and D = diag(shift).
@@ -131,21 +149,31 @@ class DenseOperator(Pickled):
             matrix = matrix + np.diag(self.layout.load(shift, self.dtype, "shift").numpy() * p)
         return DenseOperator(matrix, device=self.device, dtype=self.dtype)
 
-    def relax(self, x: Any, b: Any, lower: Any, upper: Any, omega: float, *, forward: bool = True) -> None:
+    def relax(
+        self, x: Any, b: Any, lower: Any, upper: Any, omega: float, *, forward: bool = True
+    ) -> None:
         """Sweep x once in row order, forward or backward, projected onto the bounds."""
         rows, matrix = Rows.flat(x.size, self.device, serial=True), self.matrix.flatten()
-        RELAX.bind(rows, a=matrix, b=b, lower=lower, upper=upper, x=x, omega=omega, forward=forward).launch()
+        RELAX.bind(
+            rows, a=matrix, b=b, lower=lower, upper=upper, x=x, omega=omega, forward=forward
+        ).launch()
 
-    def _product(self, x: wp.array[Any], out: wp.array[Any] | None, *, transposed: bool) -> wp.array[Any]:
+    def _product(
+        self, x: wp.array[Any], out: wp.array[Any] | None, *, transposed: bool
+    ) -> wp.array[Any]:
         if tuple(x.shape) != self.shape:
             raise ValueError(f"x has shape {tuple(x.shape)}: expected {self.shape}")
         out = wp.zeros_like(x) if out is None else out
         rows = Rows.flat(self.unknowns, self.device)
-        PRODUCT.bind(rows, a=self.matrix.flatten(), x=x, y=out, size=self.unknowns, transposed=transposed).launch()
+        PRODUCT.bind(
+            rows, a=self.matrix.flatten(), x=x, y=out, size=self.unknowns, transposed=transposed
+        ).launch()
         return out
 
 
 @as_operator.register(np.ndarray)
 @as_operator.register(wp.array)
 def _dense(A: Any, device: Any = None, dtype: Any = wp.float64) -> DenseOperator:
-    return DenseOperator(A, device=A.device if device is None and isinstance(A, wp.array) else device, dtype=dtype)
+    return DenseOperator(
+        A, device=A.device if device is None and isinstance(A, wp.array) else device, dtype=dtype
+    )

@@ -31,17 +31,27 @@ def grid_matrix(A: HasStencil) -> scipy.sparse.csr_array:
             lines = np.moveaxis(around, 2 - axis, 0)
             lines[0], lines[-1] = lines[-2], lines[1]
     cells = np.flatnonzero(fluid)
-    rows, columns, entries = [index[cells]], [index[cells]], [s.d.numpy()[cells].astype(np.float64) * s.unit]
+    rows, columns, entries = (
+        [index[cells]],
+        [index[cells]],
+        [s.d.numpy()[cells].astype(np.float64) * s.unit],
+    )
     for step, weight, mirrored in _weights(A):
         offset = step[0] + step[1] * padding.row + step[2] * padding.plane
         joined = cells[index[cells + offset] >= 0]
-        entries_here = weight[joined].astype(np.float64) if isinstance(weight, np.ndarray) else np.full(len(joined), weight)
+        entries_here = (
+            weight[joined].astype(np.float64)
+            if isinstance(weight, np.ndarray)
+            else np.full(len(joined), weight)
+        )
         i, j = index[joined], index[joined + offset]
         rows += [i, j] if mirrored else [i]
         columns += [j, i] if mirrored else [j]
         entries += [-entries_here] * (1 + mirrored)
     n = len(cells)
-    matrix = scipy.sparse.coo_array((np.concatenate(entries), (np.concatenate(rows), np.concatenate(columns))), shape=(n, n)).tocsr()
+    matrix = scipy.sparse.coo_array(
+        (np.concatenate(entries), (np.concatenate(rows), np.concatenate(columns))), shape=(n, n)
+    ).tocsr()
     matrix.eliminate_zeros()
     return matrix
 
@@ -49,10 +59,16 @@ def grid_matrix(A: HasStencil) -> scipy.sparse.csr_array:
 def _weights(A: HasStencil) -> Iterator[tuple[tuple[int, int, int], Any, bool]]:
     """Yield the steps (x, y, z) to a neighbor, its weight for each stored cell or everywhere, and whether that counts for both cells."""
     s = A.stencil
-    pattern = s.pattern or Pattern(((-1, 0, 0), (0, -1, 0), (0, 0, -1)), True, "numbers" if s.weights is None else "arrays")
+    pattern = s.pattern or Pattern(
+        ((-1, 0, 0), (0, -1, 0), (0, 0, -1)), True, "numbers" if s.weights is None else "arrays"
+    )
     for place, step in enumerate(pattern.offsets):
         if pattern.functions:
             function = pattern.functions[place]
             yield step, -A.evaluated(function) if callable(function) else -function, False  # type: ignore[attr-defined]
         else:
-            yield step, s.coefficients[place] if s.weights is None else s.weights[place].numpy(), pattern.symmetric
+            yield (
+                step,
+                s.coefficients[place] if s.weights is None else s.weights[place].numpy(),
+                pattern.symmetric,
+            )

@@ -33,16 +33,20 @@ from warp_lcp.rows.vectors import Across
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/grid_poisson.h")
 COPY_CELLS = KERNELS["grid_poisson.copy_cells"]
-FIND_SPANS = KERNELS.kernel("grid_operator.find_spans", constants={"CHUNK": CPU_CHUNK, "SPAN_CELLS": int(SPAN_CELLS)})
+FIND_SPANS = KERNELS.kernel(
+    "grid_operator.find_spans", constants={"CHUNK": CPU_CHUNK, "SPAN_CELLS": int(SPAN_CELLS)}
+)
 
 
 class GridOperator(Pickled):
     """Matrix-free operator on the FLUID cells of a grid; what its rows are is for classes to say.
 
-    They set what `_fill_stencil` reads in `_take_coefficients`, return the memory of `stencil` from `_empty_stencil`, and fill that.
+    They set what `_fill_stencil` reads in `_take_coefficients`, return the memory of `stencil` from
+    `_empty_stencil`, and fill that.
 
     Args:
-        cells: integers AIR = 0, FLUID = 1, SOLID = 2, shape (nz, ny, nx) or (ny, nx); numpy or wp.array.
+        cells: integers AIR = 0, FLUID = 1, SOLID = 2, shape (nz, ny, nx) or (ny, nx); numpy or
+            wp.array.
         coefficients: what `_take_coefficients` is given.
         periodic: whether x, y, z wrap around.
         device: Warp device; that of `cells` or the default device if None.
@@ -50,9 +54,11 @@ class GridOperator(Pickled):
 
     Attributes:
         cells: cell types with one layer of SOLID ghost cells, shape (nz + 2, ny + 2, nx + 2).
-        cells_around: the same with ghost cells of periodic axes filled; `cells` itself where no axis is periodic.
+        cells_around: the same with ghost cells of periodic axes filled; `cells` itself where no
+            axis is periodic.
         stencil: the diagonal and the weights on that padded grid.
-        version: how often the cells have been taken; memory that holds something outside the rows' spans is cleared when it changes.
+        version: how often the cells have been taken; memory that holds something outside the rows'
+            spans is cleared when it changes.
     """
 
     symmetric = True
@@ -62,25 +68,46 @@ class GridOperator(Pickled):
     _finder: Any = None  # of floating components
     _rounding = 0.0  # the largest relative one of coefficients that were given as arrays
     outside = SOLID  # what lies beyond the array
-    records = False  # whether taking cells reads nothing from the device, so that it is recorded once
+    # whether taking cells reads nothing from the device, so that it is recorded once
+    records = False
 
-    def __init__(self, cells: Any, coefficients: dict[str, Any], periodic: tuple[bool, ...], device: Any, dtype: Any) -> None:
+    def __init__(
+        self,
+        cells: Any,
+        coefficients: dict[str, Any],
+        periodic: tuple[bool, ...],
+        device: Any,
+        dtype: Any,
+    ) -> None:
         if dtype not in (wp.float32, wp.float64):
             raise ValueError(f"dtype = {dtype}: must be wp.float32 or wp.float64")
         host = _checked_cells(cells)
-        self.device = checked_device(device if device is not None else cells.device if isinstance(cells, wp.array) else None)
+        self.device = checked_device(
+            device if device is not None else cells.device if isinstance(cells, wp.array) else None
+        )
         self.dtype, self.shape = dtype, host.shape
         self.layout = PaddedLayout(host.shape, self.device, self._across)
         counts = self.layout.padding.counts
-        self._wraps = flags = (*(bool(p) for p in periodic), False, False, False)[:3]  # axes of one cell, too
-        self.periodic = (flags[0] and counts[2] > 1, flags[1] and counts[1] > 1, flags[2] and counts[0] > 1)
+        # axes of one cell, too
+        self._wraps = flags = (*(bool(p) for p in periodic), False, False, False)[:3]
+        self.periodic = (
+            flags[0] and counts[2] > 1,
+            flags[1] and counts[1] > 1,
+            flags[2] and counts[0] > 1,
+        )
         self._take_coefficients(host, **coefficients)
         padded = np.full(self.layout.stored_shape, self.outside, dtype=np.int8)
         padded[1:-1, 1:-1, 1:-1] = host.reshape(counts)
         self.cells = wp.array(padded, device=self.device, copy=self.device.is_cuda)
-        self.cells_around = wp.zeros_like(self.cells) if any(self.periodic) or self._ghosts is not None else self.cells
+        self.cells_around = (
+            wp.zeros_like(self.cells)
+            if any(self.periodic) or self._ghosts is not None
+            else self.cells
+        )
         self._spans, self._reach = (zeros(counts[:2], wp.vec2i, self.device) for _ in range(2))
-        whole = self.device.is_cuda or self.cells_around is not self.cells or self.layout.size < LARGE
+        whole = (
+            self.device.is_cuda or self.cells_around is not self.cells or self.layout.size < LARGE
+        )
         chunks = 0 if whole else -(-self.layout.size // CPU_CHUNK)
         self._chunks = zeros((chunks, 1), wp.vec2i, self.device)
         self.layout.chunks = self._chunks if chunks else None
@@ -98,13 +125,15 @@ class GridOperator(Pickled):
 
         Args:
             shape: cells along each axis, (nz, ny, nx) or (ny, nx).
-            fluid: indices of FLUID cells, integers of shape (n, 3), a row (k, j, i) a cell as it is found in fields, or (n, 2) in 2-D;
-                numpy or wp.array. The order of the cells does not matter; lists in the order of memory are taken fastest.
+            fluid: indices of FLUID cells, integers of shape (n, 3), a row (k, j, i) a cell as it is
+                found in fields, or (n, 2) in 2-D; numpy or wp.array. The order of the cells does
+                not matter; lists in the order of memory are taken fastest.
             solid: likewise of SOLID cells.
             options: all that the class takes beside `cells`.
 
         Raises:
-            ValueError: a list has another shape or type, a cell is not in the grid, is listed twice or in both lists; the message names it.
+            ValueError: a list has another shape or type, a cell is not in the grid, is listed twice
+                or in both lists; the message names it.
 
         Example:
             >>> import warp_lcp as wl
@@ -118,34 +147,43 @@ class GridOperator(Pickled):
         """Take new cell types, and what face coefficients and shift in padded arrays have become, in place and without allocating.
 
         Args:
-            cells: wp.int8 array on the operator's device, of its shape (3-D) or of the padded shape (nz + 2, ny + 2, nx + 2), whose
-                outer layer is ignored.
+            cells: wp.int8 array on the operator's device, of its shape (3-D) or of the padded shape
+                (nz + 2, ny + 2, nx + 2), whose outer layer is ignored.
 
         Raises:
             ValueError: type, device or shape differ.
         """
         padded, counts = self.layout.stored_shape, self.layout.padding.counts
-        if not isinstance(cells, wp.array) or cells.dtype is not wp.int8 or cells.device != self.device:
+        if (
+            not isinstance(cells, wp.array)
+            or cells.dtype is not wp.int8
+            or cells.device != self.device
+        ):
             raise ValueError(f"cells: expected a wp.int8 array on {self.device}")
         if tuple(cells.shape) == self.shape != padded:
             wp.copy(self.cells[1:-1, 1:-1, 1:-1], cells.reshape(counts))
             cells = self.cells
         elif tuple(cells.shape) != padded:
-            raise ValueError(f"cells has shape {tuple(cells.shape)}: expected {self.shape} or {padded}")
+            raise ValueError(
+                f"cells has shape {tuple(cells.shape)}: expected {self.shape} or {padded}"
+            )
         self._refill(cells)
 
     def apply(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
         """Return A x.
 
         Args:
-            x: field of type wp.float32 or wp.float64, of the operator's shape or stored (padded, flat or not, 0 off the FLUID cells).
+            x: field of type wp.float32 or wp.float64, of the operator's shape or stored (padded,
+                flat or not, 0 off the FLUID cells).
             out: field like x that receives the product; made if None.
         """
         return self._applied(x, out)
 
     apply_transpose = apply  # A is symmetric
 
-    def _applied(self, x: wp.array[Any], out: wp.array[Any] | None, *, transposed: bool = False) -> wp.array[Any]:
+    def _applied(
+        self, x: wp.array[Any], out: wp.array[Any] | None, *, transposed: bool = False
+    ) -> wp.array[Any]:
         if x.size == self.layout.size:
             if out is None:
                 out = wp.zeros_like(x)
@@ -154,7 +192,9 @@ class GridOperator(Pickled):
             self._product(x.flatten(), out.flatten(), transposed=transposed)
             return out
         stored = self.layout.load(x, x.dtype, "x")
-        inside = self.cells.numpy().ravel() == FLUID if self._mask is None else self._mask.numpy() != 0
+        inside = (
+            self.cells.numpy().ravel() == FLUID if self._mask is None else self._mask.numpy() != 0
+        )
         stored = wp.array(np.where(inside, stored.numpy(), 0), dtype=x.dtype, device=self.device)
         product = self.layout.unload(self._applied(stored, None, transposed=transposed))
         if out is None:
@@ -170,7 +210,9 @@ class GridOperator(Pickled):
         """out = A x + b in one pass; stored fields of one type."""
         self.stencil.product(x, out, plus=b)
 
-    def relax(self, x: Any, b: Any, lower: Any, upper: Any, omega: float, *, forward: bool = True) -> None:
+    def relax(
+        self, x: Any, b: Any, lower: Any, upper: Any, omega: float, *, forward: bool = True
+    ) -> None:
         """Sweep stored fields once, red cells then black ones (forward) or the reverse, each unknown projected onto its bounds."""
         self.stencil.relax(x, b, lower, upper, omega, forward=forward)
 
@@ -187,14 +229,19 @@ class GridOperator(Pickled):
 
     def masked(self, free: Any, shift: Any = None) -> Self:
         """Return the principal system P A P + P D P, P the restriction to `free` (non-zero entries) and D = diag(shift), shift >= 0."""
-        mask = (self.layout.load(free, wp.uint8, "free").numpy() != 0) & (self.cells.numpy().ravel() == FLUID)
+        mask = (self.layout.load(free, wp.uint8, "free").numpy() != 0) & (
+            self.cells.numpy().ravel() == FLUID
+        )
         twin = copy.copy(self)
         twin._refills = {}
         twin._mask, twin._finder = wp.array(mask.astype(np.uint8), device=self.device), None
         d, kind = self.stencil.d.numpy(), self.stencil.d.dtype
         if shift is not None:
             kind = self.dtype
-            d = self.stencil.unit * d.astype(np.float64) + self.layout.load(shift, kind, "shift").numpy()
+            d = (
+                self.stencil.unit * d.astype(np.float64)
+                + self.layout.load(shift, kind, "shift").numpy()
+            )
         new = wp.array(np.where(mask, d, 0), dtype=kind, device=self.device)
         twin.stencil = self.stencil.with_diagonal(new)
         return twin
@@ -202,7 +249,9 @@ class GridOperator(Pickled):
     def on_cells(self, cells: np.ndarray) -> Self:
         """Return the operator of other cells, padded as `cells` is, with the same coefficients, its arrays in place."""
         inner = cells.reshape(self.layout.stored_shape)[1:-1, 1:-1, 1:-1].reshape(self.shape)
-        return type(self)(inner, periodic=self._wraps, device=self.device, dtype=self.dtype, **self._arguments())
+        return type(self)(
+            inner, periodic=self._wraps, device=self.device, dtype=self.dtype, **self._arguments()
+        )
 
     def _arguments(self) -> dict[str, Any]:
         """Return the coefficients as arguments of the class."""
@@ -211,7 +260,10 @@ class GridOperator(Pickled):
     def _check_own(self) -> None:
         """Refuse a principal system where coefficients are asked for."""
         if self._mask is not None:
-            raise ValueError("a masked operator has no coefficients of its own: use the operator it was made from")
+            raise ValueError(
+                "a masked operator has no coefficients of its own: use the operator it was made "
+                "from"
+            )
 
     def _pickled(self) -> tuple[np.ndarray, dict[str, Any]]:
         """Return the cells and the options that every class has, as `__reduce__` needs them.
@@ -221,16 +273,29 @@ class GridOperator(Pickled):
         """
         if self.layout.across is not None:
             raise TypeError(
-                f"{type(self).__name__} is distributed over ranks and cannot be pickled: pickle its cells and coefficients on each rank"
+                f"{type(self).__name__} is distributed over ranks and cannot be pickled: pickle "
+                "its cells and coefficients on each rank"
             )
         if self._mask is not None:
-            raise TypeError("a masked operator cannot be pickled: pickle the operator it was made from, and mask it again")
-        return self.cells.numpy()[1:-1, 1:-1, 1:-1].reshape(self.shape).copy(), {"periodic": self._wraps, "dtype": self.dtype}
+            raise TypeError(
+                "a masked operator cannot be pickled: pickle the operator it was made from, and "
+                "mask it again"
+            )
+        return self.cells.numpy()[1:-1, 1:-1, 1:-1].reshape(self.shape).copy(), {
+            "periodic": self._wraps,
+            "dtype": self.dtype,
+        }
 
     @property
     def unknowns(self) -> int:
         """Number of FLUID cells, those of ghosts not counted; of all ranks, collective."""
-        count, across = sum(int(np.count_nonzero(plane == FLUID)) for plane in self.cells.numpy()[1:-1, 1:-1, 1:-1]), self.layout.across
+        count, across = (
+            sum(
+                int(np.count_nonzero(plane == FLUID))
+                for plane in self.cells.numpy()[1:-1, 1:-1, 1:-1]
+            ),
+            self.layout.across,
+        )
         return count if across is None else int(across.sum(count))
 
     def _take_coefficients(self, cells: np.ndarray, *args: Any, **given: Any) -> None:
@@ -257,16 +322,26 @@ class GridOperator(Pickled):
 
     def _take_cells(self, cells: wp.array[Any]) -> None:
         if cells is not self.cells:
-            COPY_CELLS.bind(Rows.of(self.layout.padding, self.device), source=cells.flatten(), to=self.cells.flatten()).launch()
+            COPY_CELLS.bind(
+                Rows.of(self.layout.padding, self.device),
+                source=cells.flatten(),
+                to=self.cells.flatten(),
+            ).launch()
         self._find_rows()
         self._fill_stencil()
 
     def _in_place(self, field: Any, name: str) -> bool:
         """Return whether a coefficient field is the caller's padded array, after checking it."""
-        if not isinstance(field, wp.array) or tuple(field.shape) != self.layout.stored_shape or self.layout.stored_shape == self.shape:
+        if (
+            not isinstance(field, wp.array)
+            or tuple(field.shape) != self.layout.stored_shape
+            or self.layout.stored_shape == self.shape
+        ):
             return False
         if field.dtype is not self.dtype or field.device != self.device:
-            raise ValueError(f"{name} in the padded shape must be of type {self.dtype.__name__} on {self.device}")
+            raise ValueError(
+                f"{name} in the padded shape must be of type {self.dtype.__name__} on {self.device}"
+            )
         check_coefficients(field.numpy(), self.dtype, name)
         return True
 
@@ -281,7 +356,11 @@ class GridOperator(Pickled):
             raise ValueError(f"shift has shape {host.shape}: expected {self.shape}")
         check_coefficients(host, self.dtype, "shift")
         self._note_rounding(host)
-        return wp.array(np.pad(host.reshape(self.layout.padding.counts), 1), dtype=self.dtype, device=self.device)
+        return wp.array(
+            np.pad(host.reshape(self.layout.padding.counts), 1),
+            dtype=self.dtype,
+            device=self.device,
+        )
 
     def _note_rounding(self, values: np.ndarray) -> None:
         """Take note of what storing coefficients changes."""
@@ -296,9 +375,14 @@ class GridOperator(Pickled):
         """Find the spans of `cells`; the arrays are always these."""
         rows = Rows.of(self.layout.padding, self.device, whole=True)
         return FIND_SPANS.bind(
-            rows, cells=self.cells.flatten(), spans=self._spans.flatten(), reach=self._reach.flatten(),
-            chunks=self._chunks.flatten(), chunk_count=len(self._chunks), size=self.layout.size,
-        )  # fmt: skip
+            rows,
+            cells=self.cells.flatten(),
+            spans=self._spans.flatten(),
+            reach=self._reach.flatten(),
+            chunks=self._chunks.flatten(),
+            chunk_count=len(self._chunks),
+            size=self.layout.size,
+        )
 
     def _wrap_cells(self) -> None:
         """Fill ghost cells of periodic axes in `cells_around`."""
@@ -315,11 +399,20 @@ def _checked_cells(cells: Any) -> np.ndarray:
     """Return cell types as a host array."""
     host = real_array(cells, "cells")
     if host.ndim not in (2, 3) or host.size == 0:
-        raise ValueError(f"cells has shape {host.shape}: expected (nz, ny, nx) or (ny, nx) with at least one cell")
+        raise ValueError(
+            f"cells has shape {host.shape}: expected (nz, ny, nx) or (ny, nx) with at least one "
+            "cell"
+        )
     if not np.issubdtype(host.dtype, np.integer):
-        raise ValueError(f"cells has type {host.dtype}: expected integers AIR = {AIR}, FLUID = {FLUID}, SOLID = {SOLID}")
+        raise ValueError(
+            f"cells has type {host.dtype}: expected integers AIR = {AIR}, FLUID = {FLUID}, SOLID = "
+            f"{SOLID}"
+        )
     if host.min() < AIR or host.max() > SOLID:
-        raise ValueError(f"cells has values from {host.min()} to {host.max()}: allowed are AIR = {AIR}, FLUID = {FLUID}, SOLID = {SOLID}")
+        raise ValueError(
+            f"cells has values from {host.min()} to {host.max()}: allowed are AIR = {AIR}, FLUID = "
+            f"{FLUID}, SOLID = {SOLID}"
+        )
     return host
 
 
@@ -328,4 +421,6 @@ def check_coefficients(values: np.ndarray, dtype: Any, name: str) -> None:
     check_storable(values, dtype, name)
     check_kept(values, dtype, name)
     if (values < 0).any():
-        raise ValueError(f"{name} holds a negative value ({values.min()}): coefficients must be >= 0")
+        raise ValueError(
+            f"{name} holds a negative value ({values.min()}): coefficients must be >= 0"
+        )

@@ -11,7 +11,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.operators.components import ComponentFinder, FaceCoefficients, FloatingComponents, Scratch
+from warp_lcp.operators.components import (
+    ComponentFinder,
+    FaceCoefficients,
+    FloatingComponents,
+    Scratch,
+)
 from warp_lcp.operators.grid_operator import GridOperator, check_coefficients
 from warp_lcp.operators.padded_stencil import CellDecomposition, PaddedStencil
 from warp_lcp.problem.pickling import OnHost, made_again
@@ -38,31 +43,40 @@ class GridPoisson(GridOperator):
 
     [Book] 1.3.1.
 
-    (A x)_i = sum over i's open faces of c_f (x_i - x_neighbor) + shift_i x_i, with x = 0 in AIR and in SOLID. A face with SOLID on a side
-    is closed; outside the array is SOLID unless the axis is periodic. Numbers as coefficients keep the fast kernels: equal ones and no
-    shift need one byte a cell.
+    (A x)_i = sum over i's open faces of c_f (x_i - x_neighbor) + shift_i x_i, with x = 0 in AIR and
+    in SOLID. A face with SOLID on a side is closed; outside the array is SOLID unless the axis is
+    periodic. Numbers as coefficients keep the fast kernels: equal ones and no shift need one byte a
+    cell.
 
     Args:
-        cells: integers AIR = 0, FLUID = 1, SOLID = 2, shape (nz, ny, nx) or (ny, nx); numpy or wp.array. Unknowns live on FLUID cells,
-            fields have the shape of `cells`, but on the CPU their memory is taken only near rows that have held FLUID cells.
-        face_x: c_f >= 0 of the faces normal to x: a number or an array (nz, ny, nx + 1), or (ny, nx + 1) in 2-D.
+        cells: integers AIR = 0, FLUID = 1, SOLID = 2, shape (nz, ny, nx) or (ny, nx); numpy or
+            wp.array. Unknowns live on FLUID cells, fields have the shape of `cells`, but on the CPU
+            their memory is taken only near rows that have held FLUID cells.
+        face_x: c_f >= 0 of the faces normal to x: a number or an array (nz, ny, nx + 1), or (ny, nx
+            + 1) in 2-D.
         face_y: likewise, (nz, ny + 1, nx).
         face_z: likewise, (nz + 1, ny, nx); 2-D has none.
-        shift: None, a number or an array of the shape of `cells`, >= 0.
-            Face coefficients and shift may also be given in the padded shape (nz + 2, ny + 2, nx + 2), as wp.array of type `dtype` on
-            the operator's device, a face's coefficient with the cell above it: they are then used in place and read again by `update`.
+        shift: None, a number or an array of the shape of `cells`, >= 0. Face coefficients and shift
+            may also be given in the padded shape (nz + 2, ny + 2, nx + 2), as wp.array of type
+            `dtype` on the operator's device, a face's coefficient with the cell above it: they are
+            then used in place and read again by `update`.
         periodic: whether x, y, z wrap around.
-        decomposition: boxes of cells, one a rank (`warp_lcp.distributed.Decomposition`). All arguments and fields are then those of this
-            rank's box, coefficients of its upper faces included. An `LCP` with the operator is one problem of all ranks, and making it
-            and `wl.solve` are collective: each rank gets its box of x, and status, residual and history of the whole.
+        decomposition: boxes of cells, one a rank (`warp_lcp.distributed.Decomposition`). All
+            arguments and fields are then those of this rank's box, coefficients of its upper faces
+            included. An `LCP` with the operator is one problem of all ranks, and making it and
+            `wl.solve` are collective: each rank gets its box of x, and status, residual and history
+            of the whole.
         device: Warp device; that of `cells` or the default device if None.
-        dtype: storage of coefficients, wp.float32 or wp.float64. In float32 unequal coefficients and their sums are rounded, so that the
-            problem solved is another one by about 1e-7 of the diagonal: for closed domains with such coefficients take wp.float64, and
-            for tolerances below the rounding, where the status is FLOOR. Equal coefficients without a shift are not rounded.
+        dtype: storage of coefficients, wp.float32 or wp.float64. In float32 unequal coefficients
+            and their sums are rounded, so that the problem solved is another one by about 1e-7 of
+            the diagonal: for closed domains with such coefficients take wp.float64, and for
+            tolerances below the rounding, where the status is FLOOR. Equal coefficients without a
+            shift are not rounded.
 
     Raises:
-        ValueError: an argument has a wrong shape, type or sign, or is not finite; the message names it. With a decomposition, on all
-            ranks, also if the kinds of arguments differ, an axis is periodic, or a box is one cell thin at a cut.
+        ValueError: an argument has a wrong shape, type or sign, or is not finite; the message names
+            it. With a decomposition, on all ranks, also if the kinds of arguments differ, an axis
+            is periodic, or a box is one cell thin at a cut.
 
     Example:
         >>> import numpy as np, warp_lcp as wl
@@ -74,11 +88,22 @@ class GridPoisson(GridOperator):
     """
 
     def __init__(
-        self, cells: Any, *, face_x: Face = 1.0, face_y: Face = 1.0, face_z: Face = 1.0, shift: Any = None,
-        periodic: tuple[bool, ...] = (False, False, False), device: Any = None, dtype: Any = wp.float32,
+        self,
+        cells: Any,
+        *,
+        face_x: Face = 1.0,
+        face_y: Face = 1.0,
+        face_z: Face = 1.0,
+        shift: Any = None,
+        periodic: tuple[bool, ...] = (False, False, False),
+        device: Any = None,
+        dtype: Any = wp.float32,
         decomposition: CellDecomposition | None = None,
-    ) -> None:  # fmt: skip
-        coefficients, self.decomposition = {"face_x": face_x, "face_y": face_y, "face_z": face_z, "shift": shift}, decomposition
+    ) -> None:
+        coefficients, self.decomposition = (
+            {"face_x": face_x, "face_y": face_y, "face_z": face_z, "shift": shift},
+            decomposition,
+        )
         if decomposition is None:
             super().__init__(cells, coefficients, periodic, device, dtype)
             return
@@ -87,9 +112,14 @@ class GridPoisson(GridOperator):
         with decomposition.together():
             super().__init__(cells, coefficients, periodic, device, dtype)
 
-    def _take_coefficients(self, cells: np.ndarray, *, face_x: Face, face_y: Face, face_z: Face, shift: Any) -> None:
+    def _take_coefficients(
+        self, cells: np.ndarray, *, face_x: Face, face_y: Face, face_z: Face, shift: Any
+    ) -> None:
         given = (face_x, face_y, face_z if cells.ndim == 3 else 1.0)
-        faces = [f if isinstance(f, wp.array) else real_array(f, f"face_{axis}") for f, axis in zip(given, AXES, strict=True)]
+        faces = [
+            f if isinstance(f, wp.array) else real_array(f, f"face_{axis}")
+            for f, axis in zip(given, AXES, strict=True)
+        ]
         numbers = [float(f) if f.ndim == 0 else 0.0 for f in faces]
         self.uniform = (numbers[0], numbers[1], numbers[2])
         self._given = {f"face_{axis}": tuple(f.shape) for axis, f in zip(AXES, faces, strict=True)}
@@ -103,7 +133,8 @@ class GridPoisson(GridOperator):
 
         (mu_i - mu_j) (x_i - x_j) of each face and mu_i x_i of the shift.
 
-        0 on closed faces; x = mu = 0 in AIR. The first and the last faces of a periodic axis, which are one, have half of it each.
+        0 on closed faces; x = mu = 0 in AIR. The first and the last faces of a periodic axis, which
+        are one, have half of it each.
         """
         self._check_own()
         s, arrays = self.stencil, {name: shape for name, shape in self._given.items() if shape}
@@ -114,21 +145,48 @@ class GridPoisson(GridOperator):
         if len(arrays) < len(self._given):
             totals = Sums(Rows.of(self.layout.padding, self.device), 4)
             values = totals.of(
-                FACE_GRADIENT, cells=cells, multiplier=multiplier, x=x, face_x=None, face_y=None, face_z=None, shift=None
+                FACE_GRADIENT,
+                cells=cells,
+                multiplier=multiplier,
+                x=x,
+                face_x=None,
+                face_y=None,
+                face_z=None,
+                shift=None,
             ).tolist()
             found = dict(zip(FACE_GRADIENT.writes, values, strict=True))
         if arrays:
             rows = Rows.of(self.layout.padding, self.device, more=1)
-            written = {name: self.layout.zeros(wp.float64) if name in arrays else None for name in FACE_GRADIENT.writes}
+            written = {
+                name: self.layout.zeros(wp.float64) if name in arrays else None
+                for name in FACE_GRADIENT.writes
+            }
             partials = wp.empty(4 * rows.places, dtype=wp.float64, device=self.device)
-            face_x, face_y, face_z, shift = (written[name] for name in ("face_x", "face_y", "face_z", "shift"))
+            face_x, face_y, face_z, shift = (
+                written[name] for name in ("face_x", "face_y", "face_z", "shift")
+            )
             FACE_GRADIENT.bind(
-                rows, cells=cells, multiplier=multiplier, x=x, face_x=face_x, face_y=face_y, face_z=face_z, shift=shift, out=partials
+                rows,
+                cells=cells,
+                multiplier=multiplier,
+                x=x,
+                face_x=face_x,
+                face_y=face_y,
+                face_z=face_z,
+                shift=shift,
+                out=partials,
             ).launch()
-            found |= {name: self._coefficient_field(name, written[name], shape) for name, shape in arrays.items()}
-        return {name: found.get(name) if name in self._given else None for name in FACE_GRADIENT.writes}
+            found |= {
+                name: self._coefficient_field(name, written[name], shape)
+                for name, shape in arrays.items()
+            }
+        return {
+            name: found.get(name) if name in self._given else None for name in FACE_GRADIENT.writes
+        }
 
-    def _coefficient_field(self, name: str, stored: wp.array[Any], shape: tuple[int, ...]) -> wp.array[Any]:
+    def _coefficient_field(
+        self, name: str, stored: wp.array[Any], shape: tuple[int, ...]
+    ) -> wp.array[Any]:
         """Return a stored field of coefficients, lower faces' ones, in the shape that was given."""
         values = stored.numpy().reshape(self.layout.stored_shape)
         inner, axis = [slice(1, -1)] * 3, -1 if name == "shift" else AXES.index(name[-1])
@@ -141,13 +199,19 @@ class GridPoisson(GridOperator):
             kept = np.zeros(shape)
             kept[tuple(inner)] = part
             part = kept
-        return wp.array(np.ascontiguousarray(part).reshape(shape), dtype=wp.float64, device=self.device, copy=self.device.is_cuda)
+        return wp.array(
+            np.ascontiguousarray(part).reshape(shape),
+            dtype=wp.float64,
+            device=self.device,
+            copy=self.device.is_cuda,
+        )
 
     def floating_components(self, scratch: Scratch | None = None) -> FloatingComponents | None:
         """Return the components on which A is singular, or None if there are none.
 
         Args:
-            scratch: stored fields, of 4-byte elements and of bytes, that may be overwritten on the rows' spans; saves as much memory.
+            scratch: stored fields, of 4-byte elements and of bytes, that may be overwritten on the
+                rows' spans; saves as much memory.
         """
         return self.component_finder.find(scratch)
 
@@ -162,9 +226,15 @@ class GridPoisson(GridOperator):
     def form(self) -> Hashable | None:
         """Sizes, types and numbers of operators that can `take` each other's data.
 
-        None if the operator has no copies: subclasses, principal systems, GPUs, ranks and large grids.
+        None if the operator has no copies: subclasses, principal systems, GPUs, ranks and large
+        grids.
         """
-        plain = type(self) is GridPoisson and self._mask is None and self._ghosts is None and self.layout.across is None
+        plain = (
+            type(self) is GridPoisson
+            and self._mask is None
+            and self._ghosts is None
+            and self.layout.across is None
+        )
         if not plain or self.device.is_cuda or self.layout.chunks is not None:
             return None
         s = self.stencil
@@ -175,7 +245,15 @@ class GridPoisson(GridOperator):
     def _held(self) -> list[wp.array[Any]]:
         """Return all that a solve reads of it."""
         s = self.stencil
-        return [self.cells, self.cells_around, self._spans, s.d, *(s.weights or ()), *self.faces, self.shift]
+        return [
+            self.cells,
+            self.cells_around,
+            self._spans,
+            s.d,
+            *(s.weights or ()),
+            *self.faces,
+            self.shift,
+        ]
 
     def replica(self) -> GridPoisson:
         """Return the same operator in memory of its own."""
@@ -185,8 +263,13 @@ class GridPoisson(GridOperator):
             twin.__dict__.pop(cached, None)
         s, kept = self.stencil, {id(field): wp.clone(field) for field in self._held()}
         own: Any = lambda field: kept[id(field)]  # noqa: E731
-        twin.cells, twin.cells_around, twin._spans, twin.shift = map(own, (self.cells, self.cells_around, self._spans, self.shift))
-        twin.faces, weights = list(map(own, self.faces)), None if s.weights is None else tuple(map(own, s.weights))
+        twin.cells, twin.cells_around, twin._spans, twin.shift = map(
+            own, (self.cells, self.cells_around, self._spans, self.shift)
+        )
+        twin.faces, weights = (
+            list(map(own, self.faces)),
+            None if s.weights is None else tuple(map(own, s.weights)),
+        )
         twin.stencil = replace(s, d=own(s.d), weights=weights, spans=twin._spans)
         return twin
 
@@ -199,11 +282,17 @@ class GridPoisson(GridOperator):
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle cells and coefficients; these come back in the padded shape."""
         cells, options = self._pickled()
-        given = {name: OnHost(v) if isinstance(v, wp.array) else v for name, v in self._arguments().items()}
+        given = {
+            name: OnHost(v) if isinstance(v, wp.array) else v
+            for name, v in self._arguments().items()
+        }
         return made_again(GridPoisson, cells, device=self.device, **given, **options)
 
     def _arguments(self) -> dict[str, Any]:
-        faces = {f"face_{axis}": f if f.size else c for axis, f, c in zip(AXES, self.faces, self.uniform, strict=True)}
+        faces = {
+            f"face_{axis}": f if f.size else c
+            for axis, f, c in zip(AXES, self.faces, self.uniform, strict=True)
+        }
         return faces | {"shift": self.shift if self.shift.size else None}
 
     def _stored_face(self, face: Face, axis: int) -> wp.array[Any]:
@@ -218,11 +307,19 @@ class GridPoisson(GridOperator):
         expected = list(self.shape)
         expected[-1 - axis] += 1
         if host.shape != tuple(expected):
-            raise ValueError(f"{name} has shape {host.shape}: expected {tuple(expected)} for cells of shape {self.shape}")
+            raise ValueError(
+                f"{name} has shape {host.shape}: expected {tuple(expected)} for cells of shape "
+                f"{self.shape}"
+            )
         check_coefficients(host, self.dtype, name)
         self._note_rounding(host)
-        if self.periodic[axis] and not np.array_equal(host.take(0, -1 - axis), host.take(-1, -1 - axis)):
-            raise ValueError(f"{name}: the first and the last faces of a periodic axis are the same faces, but their coefficients differ")
+        if self.periodic[axis] and not np.array_equal(
+            host.take(0, -1 - axis), host.take(-1, -1 - axis)
+        ):
+            raise ValueError(
+                f"{name}: the first and the last faces of a periodic axis are the same faces, but "
+                "their coefficients differ"
+            )
         counts = [*self.layout.padding.counts]
         counts[2 - axis] += 1
         padding = [(1, 0) if a == 2 - axis else (1, 1) for a in range(3)]
@@ -234,12 +331,19 @@ class GridPoisson(GridOperator):
         *faces, shift = (float(f.numpy().max()) if f.size else number for f, number in parts)
         most, name = 2 * sum(faces) + shift, self.dtype.__name__
         if most > float(np.finfo(wp.dtype_to_numpy(self.dtype)).max):
-            raise ValueError(f"face_x, face_y, face_z and shift add up to {most:.1e}, too large for {name}: pass dtype=wp.float64")
+            raise ValueError(
+                f"face_x, face_y, face_z and shift add up to {most:.1e}, too large for {name}: "
+                "pass dtype=wp.float64"
+            )
 
     @property
     def _counts_faces(self) -> bool:
         """Whether the diagonal is a number of open faces times one coefficient."""
-        used = [c for c, n in zip(self.uniform, reversed(self.layout.padding.counts), strict=True) if c > 0 and n > 1]
+        used = [
+            c
+            for c, n in zip(self.uniform, reversed(self.layout.padding.counts), strict=True)
+            if c > 0 and n > 1
+        ]
         return not self._has_arrays and self.shift.size == 0 and len(set(used)) <= 1
 
     @property
@@ -250,10 +354,22 @@ class GridPoisson(GridOperator):
         layout, counts = self.layout, self._counts_faces
         strength: Any = tuple(map(self._mean_coefficient, self.faces, self.uniform))
         weights: Any = tuple(layout.zeros(self.dtype) for _ in AXES) if self._has_arrays else None
-        used = [c for c, n in zip(self.uniform, reversed(layout.padding.counts), strict=True) if n > 1]
+        used = [
+            c for c, n in zip(self.uniform, reversed(layout.padding.counts), strict=True) if n > 1
+        ]
         unit = (max(used, default=1.0) or 1.0) if counts else 1.0
         d = layout.zeros(wp.uint8 if counts else self.dtype)
-        return PaddedStencil(layout.padding, d, weights, self.uniform, unit, self.periodic, self._spans, strength, self._ghosts)
+        return PaddedStencil(
+            layout.padding,
+            d,
+            weights,
+            self.uniform,
+            unit,
+            self.periodic,
+            self._spans,
+            strength,
+            self._ghosts,
+        )
 
     def _mean_coefficient(self, face: wp.array[Any], uniform: float) -> float:
         """Return the mean of the coefficients that are not 0."""
@@ -279,14 +395,26 @@ class GridPoisson(GridOperator):
         cells = self.cells_around.flatten()
         if self._counts_faces:
             x, y, z = (c > 0 for c in self.uniform)
-            COUNT_FACES.bind(reach, cells=cells, diagonal=s.d, around_x=x, around_y=y, around_z=z).launch()
+            COUNT_FACES.bind(
+                reach, cells=cells, diagonal=s.d, around_x=x, around_y=y, around_z=z
+            ).launch()
             return
         faces = self.face_coefficients
         x, y, z = (f.size > 0 for f in self.faces)
         shift = self.shift.flatten() if self.shift.size else None
         DIAGONAL.bind(
-            reach, faces, cells=cells, shift=shift, diagonal=s.d, FIELD_X=x, FIELD_Y=y, FIELD_Z=z, SHIFTED=self.shift.size > 0
+            reach,
+            faces,
+            cells=cells,
+            shift=shift,
+            diagonal=s.d,
+            FIELD_X=x,
+            FIELD_Y=y,
+            FIELD_Z=z,
+            SHIFTED=self.shift.size > 0,
         ).launch()
         if s.weights is not None:
             rows, (wx, wy, wz) = Rows.of(padding, self.device, more=1), s.weights
-            WEIGHTS.bind(rows, faces, cells=cells, wx=wx, wy=wy, wz=wz, FIELD_X=x, FIELD_Y=y, FIELD_Z=z).launch()
+            WEIGHTS.bind(
+                rows, faces, cells=cells, wx=wx, wy=wy, wz=wz, FIELD_X=x, FIELD_Y=y, FIELD_Z=z
+            ).launch()

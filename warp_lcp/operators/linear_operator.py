@@ -25,24 +25,26 @@ class LinearOperator(Pickled, Operator):
 
     A x comes from the function, or from `A @ x`; rows and entries are not available.
 
-    Products are made on the host, from copies of x in float64, whatever the device. Every method that needs products only takes it
-    (docs "Operators of your own"); `MinimumMapNewton` is the default. Two products check the arguments, two more that A is symmetric
-    where it is said to be.
+    Products are made on the host, from copies of x in float64, whatever the device. Every method
+    that needs products only takes it (docs "Operators of your own"); `MinimumMapNewton` is the
+    default. Two products check the arguments, two more that A is symmetric where it is said to be.
 
     Args:
-        A: function of a float64 array of shape `shape` that returns A x in that shape; or an object of shape (n, n) with products by `@`.
+        A: function of a float64 array of shape `shape` that returns A x in that shape; or an object
+            of shape (n, n) with products by `@`.
         shape: of the fields; (n,) if None, which a function does not allow.
-        symmetric: whether A equals its transpose, which halves the cost of Newton's systems (conjugate gradients, else GMRES) and some
-            methods need. None: not, unless A is its own adjoint, `A.H is A`, as SciPy's special arrays are.
-        diagonal: of A, a number or a field. None: row and column norms, estimated from 16 products, are used instead; the natural
-            residual's scale never depends on it alone.
-        transpose: function that returns A'x; None: `A.rmatvec` where that is defined. An unsymmetric A without it is refused by what
-            needs A' (GradientDescent).
+        symmetric: whether A equals its transpose, which halves the cost of Newton's systems
+            (conjugate gradients, else GMRES) and some methods need. None: not, unless A is its own
+            adjoint, `A.H is A`, as SciPy's special arrays are.
+        diagonal: of A, a number or a field. None: row and column norms, estimated from 16 products,
+            are used instead; the natural residual's scale never depends on it alone.
+        transpose: function that returns A'x; None: `A.rmatvec` where that is defined. An
+            unsymmetric A without it is refused by what needs A' (GradientDescent).
         device: Warp device of the fields; the CPU if None.
 
     Raises:
-        ValueError: A is of another kind, not square or not real; a product has another shape, is not real or not finite; A is said to be
-            symmetric and is not.
+        ValueError: A is of another kind, not square or not real; a product has another shape, is
+            not real or not finite; A is said to be symmetric and is not.
 
     Example:
         >>> import numpy as np, warp_lcp as wl
@@ -52,9 +54,15 @@ class LinearOperator(Pickled, Operator):
     """
 
     def __init__(
-        self, A: Any, shape: tuple[int, ...] | None = None, *, symmetric: bool | None = None, diagonal: Any = None,
-        transpose: Product | None = None, device: Any = None,
-    ) -> None:  # fmt: skip
+        self,
+        A: Any,
+        shape: tuple[int, ...] | None = None,
+        *,
+        symmetric: bool | None = None,
+        diagonal: Any = None,
+        transpose: Product | None = None,
+        device: Any = None,
+    ) -> None:
         self._given = (A, shape, symmetric, diagonal, transpose)
         self.shape = _shape_of(A, shape)
         self.device = checked_device("cpu" if device is None else device)
@@ -65,10 +73,21 @@ class LinearOperator(Pickled, Operator):
         images = [self._image(z, self._product) for z in probes]
         if not all(np.isfinite(image).all() for image in images):
             raise ValueError("the product of A with normally distributed numbers is not finite")
-        self.symmetric = isinstance(A, scipy.sparse.linalg.LinearOperator) and A.H is A if symmetric is None else bool(symmetric)
-        one, other = (float(np.vdot(z, image)) for z, image in zip(probes, images[::-1], strict=True))
-        if symmetric and abs(one - other) > ASYMMETRY * math.sqrt(self.layout.size) * max(float(np.linalg.norm(v)) for v in images):
-            raise ValueError(f"symmetric: A is not, u'Av is {one:.6g} and v'Au {other:.6g} for some u and v; pass symmetric=False")
+        self.symmetric = (
+            isinstance(A, scipy.sparse.linalg.LinearOperator) and A.H is A
+            if symmetric is None
+            else bool(symmetric)
+        )
+        one, other = (
+            float(np.vdot(z, image)) for z, image in zip(probes, images[::-1], strict=True)
+        )
+        if symmetric and abs(one - other) > ASYMMETRY * math.sqrt(self.layout.size) * max(
+            float(np.linalg.norm(v)) for v in images
+        ):
+            raise ValueError(
+                f"symmetric: A is not, u'Av is {one:.6g} and v'Au {other:.6g} for some u and v; "
+                "pass symmetric=False"
+            )
         self._scale: np.ndarray | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -87,9 +106,12 @@ class LinearOperator(Pickled, Operator):
         """
         if self._transpose is None and not self.symmetric:
             raise NoTranspose(
-                "A has no products with its transpose: give wl.LinearOperator a transpose, or choose a method that needs none"
+                "A has no products with its transpose: give wl.LinearOperator a transpose, or "
+                "choose a method that needs none"
             )
-        return self._applied(self._product if self.symmetric or self._transpose is None else self._transpose, x, out)
+        return self._applied(
+            self._product if self.symmetric or self._transpose is None else self._transpose, x, out
+        )
 
     def diagonal(self) -> wp.array[Any]:
         """Return the diagonal of A or its estimate, of `shape`."""
@@ -102,7 +124,9 @@ class LinearOperator(Pickled, Operator):
         The estimate is made at the first call.
         """
         if self._scale is None:
-            self._scale = estimated_scale(self, self.layout, np.ones(self.layout.size, dtype=bool), self._diagonal)
+            self._scale = estimated_scale(
+                self, self.layout, np.ones(self.layout.size, dtype=bool), self._diagonal
+            )
         return self._scale
 
     def _field(self, diagonal: Any) -> np.ndarray:
@@ -113,7 +137,9 @@ class LinearOperator(Pickled, Operator):
         check_storable(host, wp.float64, "diagonal")
         return np.broadcast_to(host, self.shape).ravel().copy()
 
-    def _applied(self, product: Product, x: wp.array[Any], out: wp.array[Any] | None) -> wp.array[Any]:
+    def _applied(
+        self, product: Product, x: wp.array[Any], out: wp.array[Any] | None
+    ) -> wp.array[Any]:
         if x.size != self.layout.size:
             raise ValueError(f"x has shape {tuple(x.shape)}: expected {self.shape}")
         image = self._image(np.array(x.numpy(), dtype=np.float64).reshape(self.shape), product)
@@ -128,9 +154,12 @@ class LinearOperator(Pickled, Operator):
             ValueError: it is none, not real or has another shape.
         """
         try:
-            image = np.array(product(x))  # a copy: A may hand out its own buffer, and write to it next time
+            # a copy: A may hand out its own buffer, and write to it next time
+            image = np.array(product(x))
         except ValueError as reason:  # SciPy's, of a matvec that returns another shape
-            raise ValueError(f"A fails to multiply an array of shape {self.shape}: {reason}") from reason
+            raise ValueError(
+                f"A fails to multiply an array of shape {self.shape}: {reason}"
+            ) from reason
         if image.dtype.kind not in "biuf":
             raise ValueError(f"A gives a product of type {image.dtype}: expected real numbers")
         if image.shape != self.shape:
@@ -142,7 +171,10 @@ def _shape_of(A: Any, shape: Any) -> tuple[int, ...]:
     """Return the shape of A's fields, which is checked against that of A where it has one."""
     own: Any = getattr(A, "shape", None)
     if isinstance(A, Operator) or not (callable(A) or hasattr(A, "__matmul__")):
-        raise ValueError(f"A is a {type(A).__name__}: expected a function, or a scipy.sparse.linalg.LinearOperator")
+        raise ValueError(
+            f"A is a {type(A).__name__}: expected a function, or a "
+            "scipy.sparse.linalg.LinearOperator"
+        )
     if not hasattr(A, "__matmul__"):
         own = None
     elif own is None or len(own) != 2 or own[0] != own[1] or own[0] == 0:
@@ -150,17 +182,26 @@ def _shape_of(A: Any, shape: Any) -> tuple[int, ...]:
     if own is None and shape is None:
         raise ValueError("shape: must be given if A is a function")
     try:
-        wanted = (int(own[0]),) if shape is None else tuple(int(n) for n in (shape if np.ndim(shape) else (shape,)))
+        wanted = (
+            (int(own[0]),)
+            if shape is None
+            else tuple(int(n) for n in (shape if np.ndim(shape) else (shape,)))
+        )
     except (TypeError, ValueError):
         raise ValueError(f"shape = {shape!r}: expected a tuple of integers") from None
     if not wanted or min(wanted) < 1 or (own is not None and math.prod(wanted) != own[0]):
-        raise ValueError(f"shape = {shape!r}: expected integers >= 1" + ("" if own is None else f" whose product is {own[0]}"))
+        raise ValueError(
+            f"shape = {shape!r}: expected integers >= 1"
+            + ("" if own is None else f" whose product is {own[0]}")
+        )
     if np.dtype(getattr(A, "dtype", None) or np.float64).kind not in "biuf":
         raise ValueError(f"A has type {A.dtype}: expected real numbers")
     return wanted
 
 
-def _products_of(A: Any, shape: tuple[int, ...], transpose: Product | None) -> tuple[Product, Product | None]:
+def _products_of(
+    A: Any, shape: tuple[int, ...], transpose: Product | None
+) -> tuple[Product, Product | None]:
     """Return x -> A x and x -> A'x on fields of a shape, None in its place where that is not defined."""
     if not (transpose is None or callable(transpose)):
         raise ValueError(f"transpose is a {type(transpose).__name__}: expected a function")
@@ -174,7 +215,9 @@ def _products_of(A: Any, shape: tuple[int, ...], transpose: Product | None) -> t
         return np.asarray(A.rmatvec(x.ravel())).reshape(shape)
 
     if transpose is not None or not hasattr(A, "rmatvec"):
-        return product, (lambda x: np.asarray(A.T @ x.ravel()).reshape(shape)) if transpose is None and hasattr(A, "T") else transpose
+        return product, (
+            lambda x: np.asarray(A.T @ x.ravel()).reshape(shape)
+        ) if transpose is None and hasattr(A, "T") else transpose
     try:
         adjoint(np.zeros(shape))
     except NotImplementedError:  # SciPy's way to say that there is none
@@ -182,8 +225,12 @@ def _products_of(A: Any, shape: tuple[int, ...], transpose: Product | None) -> t
     return product, adjoint
 
 
-def _made(A: Any, shape: Any, symmetric: Any, diagonal: Any, transpose: Any, device: Any) -> LinearOperator:
-    return LinearOperator(A, shape, symmetric=symmetric, diagonal=diagonal, transpose=transpose, device=device)
+def _made(
+    A: Any, shape: Any, symmetric: Any, diagonal: Any, transpose: Any, device: Any
+) -> LinearOperator:
+    return LinearOperator(
+        A, shape, symmetric=symmetric, diagonal=diagonal, transpose=transpose, device=device
+    )
 
 
 @as_operator.register(scipy.sparse.linalg.LinearOperator)

@@ -22,7 +22,11 @@ from warp_lcp.rows.vectors import Across, Reduction, add_across
 
 
 @forward_kernel(module="warp_lcp.low_rank")
-def weigh_kernel(weights: wp.array2d(dtype=wp.float64), c: wp.array(dtype=wp.float64), out: wp.array(dtype=wp.float64)):
+def weigh_kernel(
+    weights: wp.array2d(dtype=wp.float64),
+    c: wp.array(dtype=wp.float64),
+    out: wp.array(dtype=wp.float64),
+):
     """out = W c, c's first entries."""
     i = wp.tid()
     s = wp.float64(0.0)
@@ -60,8 +64,9 @@ CUDA_THREADS = 1024  # of a gather; each keeps sums for all columns
 class BlockColumns:
     """Columns of a matrix U by their non-zero rows, in blocks of columns: a row of a block is an entry.
 
-    Bodies in a liquid have a block each, and a cell that touches one has an entry in its block. Entries can be written on the device:
-    in the order of their rows, those of a row in the order of their blocks, and their number into `count`.
+    Bodies in a liquid have a block each, and a cell that touches one has an entry in its block.
+    Entries can be written on the device: in the order of their rows, those of a row in the order of
+    their blocks, and their number into `count`.
 
     Args:
         size: elements of a stored field, the rows of U.
@@ -82,7 +87,13 @@ class BlockColumns:
     across: Across | None = None
 
     def __init__(self, size: int, blocks: int, width: int, dtype: Any, device: wp.Device) -> None:
-        self.size, self.width, self.rank, self.dtype, self.device = size, width, blocks * width, dtype, device
+        self.size, self.width, self.rank, self.dtype, self.device = (
+            size,
+            width,
+            blocks * width,
+            dtype,
+            device,
+        )
         self._count, self._sums = Reading(device, 2, wp.int32), Reading(device, self.rank)
         self.count, self.sums = self._count.array, self._sums.array
         self.reserve(0)
@@ -90,12 +101,18 @@ class BlockColumns:
     def reserve(self, entries: int) -> None:
         """Make room for so many entries and forget those there are; the arrays are others then."""
         self.capacity = max(entries, 1)
-        self.rows, self.blocks = (wp.zeros(self.capacity, dtype=wp.int32, device=self.device) for _ in range(2))
+        self.rows, self.blocks = (
+            wp.zeros(self.capacity, dtype=wp.int32, device=self.device) for _ in range(2)
+        )
         self.values = wp.zeros(self.capacity * self.width, dtype=self.dtype, device=self.device)
         self.count.zero_()
         on_cuda = self.device.is_cuda
         self._each = Rows.flat(self.capacity, self.device, serial=not on_cuda)
-        self._all = Rows.by_turns(self.capacity, self.device, min(self.capacity, CUDA_THREADS)) if on_cuda else self._each
+        self._all = (
+            Rows.by_turns(self.capacity, self.device, min(self.capacity, CUDA_THREADS))
+            if on_cuda
+            else self._each
+        )
         self._reduction = self.reduction(self.sums, self.rank) if on_cuda else None
 
     @property
@@ -121,7 +138,9 @@ class BlockColumns:
         if n:
             self.rows[:n].assign(rows.astype(np.int32))
             self.blocks[:n].assign(blocks.astype(np.int32))
-            self.values[: n * self.width].assign(values.astype(wp.dtype_to_numpy(self.dtype)).ravel())
+            self.values[: n * self.width].assign(
+                values.astype(wp.dtype_to_numpy(self.dtype)).ravel()
+            )
         self.count.fill_(n)
 
     def counted(self) -> int:
@@ -148,14 +167,25 @@ class BlockColumns:
     def entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return rows, blocks and values as host arrays, as `assign` takes them."""
         n = self.counted()
-        return self.rows.numpy()[:n], self.blocks.numpy()[:n], self.values.numpy()[: n * self.width].reshape(n, self.width)
+        return (
+            self.rows.numpy()[:n],
+            self.blocks.numpy()[:n],
+            self.values.numpy()[: n * self.width].reshape(n, self.width),
+        )
 
     def gather(
-        self, x: wp.array[Any], *, mask: wp.array[Any] | None = None, fused: bool = True, launch: Launch = launch_now,
-    ) -> wp.array[Any]:  # fmt: skip
+        self,
+        x: wp.array[Any],
+        *,
+        mask: wp.array[Any] | None = None,
+        fused: bool = True,
+        launch: Launch = launch_now,
+    ) -> wp.array[Any]:
         """Write U'x to `sums`, and return that; x is a flat stored field, taken for 0 where `mask` is; `fused` as of `scatter`."""
         out = self.sums if self._reduction is None else self._reduction.partials
-        GATHER.bind(self._all, self.entry_fields, rank=self.rank, x=x, mask=mask, out=out, FUSED=fused).launch(launch)
+        GATHER.bind(
+            self._all, self.entry_fields, rank=self.rank, x=x, mask=mask, out=out, FUSED=fused
+        ).launch(launch)
         if self._reduction is not None:
             self._reduction.add_up(0, columns=self.rank, launch=launch)
         if self.across is not None:
@@ -163,20 +193,36 @@ class BlockColumns:
         return self.sums
 
     def scatter(
-        self, factors: wp.array[Any], base: wp.array[Any], out: wp.array[Any], *, mask: wp.array[Any] | None = None,
-        sign: float = 1.0, fused: bool = True, launch: Launch = launch_now,
-    ) -> None:  # fmt: skip
+        self,
+        factors: wp.array[Any],
+        base: wp.array[Any],
+        out: wp.array[Any],
+        *,
+        mask: wp.array[Any] | None = None,
+        sign: float = 1.0,
+        fused: bool = True,
+        launch: Launch = launch_now,
+    ) -> None:
         """out = base + sign U f on U's rows; other rows of `out` stay as they are, and so do those where `mask` is 0.
 
         `fused`: products are rounded with the sums that they are added to.
         """
-        SCATTER.bind(self._each, self.entry_fields, factors=factors, mask=mask, base=base, result=out, sign=sign, FUSED=fused).launch(
-            launch
-        )
+        SCATTER.bind(
+            self._each,
+            self.entry_fields,
+            factors=factors,
+            mask=mask,
+            base=base,
+            result=out,
+            sign=sign,
+            FUSED=fused,
+        ).launch(launch)
 
     def add_diagonal(self, weights: wp.array[Any], out: wp.array[Any]) -> None:
         """out += the diagonal of U W U', W of shape (rank * rank,)."""
-        DIAGONAL.bind(self._each, self.entry_fields, rank=self.rank, weights=weights, result=out).launch()
+        DIAGONAL.bind(
+            self._each, self.entry_fields, rank=self.rank, weights=weights, result=out
+        ).launch()
 
     @property
     def entry_fields(self) -> ColumnEntries:
@@ -189,11 +235,12 @@ class LowRankOperator(Pickled):
 
     Usually a term of a SumOperator, A + U W U'.
 
-    Only the rows of U that are not 0 are stored, and a product costs no more than they do. Where ranks share the fields each has its rows
-    of U, and products are collective.
+    Only the rows of U that are not 0 are stored, and a product costs no more than they do. Where
+    ranks share the fields each has its rows of U, and products are collective.
 
     Args:
-        columns: U; its first axes are a field's, its last one counts the columns: (n, k) for vectors, (nz, ny, nx, k) for grids.
+        columns: U; its first axes are a field's, its last one counts the columns: (n, k) for
+            vectors, (nz, ny, nx, k) for grids.
         weights: W, shape (k, k), or (k,) for a diagonal one.
         device: Warp device; the default device if None.
         dtype: storage of the columns, wp.float64 or wp.float32.
@@ -205,18 +252,24 @@ class LowRankOperator(Pickled):
         weights: W, float64, shape (k, k); `update` changes it.
         version: how often columns and weights have been taken.
         weighed: W U'x of the last product, float64, shape (k,).
-        products: where a solve keeps U'x of its iterate as last evaluated; `products_of` is that iterate, None: no solve does.
+        products: where a solve keeps U'x of its iterate as last evaluated; `products_of` is that
+            iterate, None: no solve does.
 
     Raises:
         ValueError: shapes do not match, there is no column, or a value is not finite.
     """
 
-    def __init__(self, columns: Any, weights: Any, *, device: Any = None, dtype: Any = wp.float64) -> None:
+    def __init__(
+        self, columns: Any, weights: Any, *, device: Any = None, dtype: Any = wp.float64
+    ) -> None:
         if dtype not in (wp.float32, wp.float64):
             raise ValueError(f"dtype = {dtype}: must be wp.float32 or wp.float64")
         U = np.asarray(real_array(columns, "columns"), dtype=np.float64)
         if U.ndim < 2 or U.size == 0:
-            raise ValueError(f"columns has shape {U.shape}: expected a field's shape and the number of columns, both positive")
+            raise ValueError(
+                f"columns has shape {U.shape}: expected a field's shape and the number of columns, "
+                "both positive"
+            )
         check_storable(U, dtype, "columns")
         layout = Layout(U.shape[:-1], checked_device(device))
         U = U.reshape(layout.size, -1)
@@ -232,11 +285,14 @@ class LowRankOperator(Pickled):
         Its entries may be rewritten in place; `update` says so.
 
         Raises:
-            ValueError: the columns' size is not that of A's stored fields, or the weights do not fit.
+            ValueError: the columns' size is not that of A's stored fields, or the weights do not
+                fit.
         """
         layout = layout_of(A)
         if columns.size != layout.size:
-            raise ValueError(f"columns are for fields of {columns.size} elements: A stores {layout.size}")
+            raise ValueError(
+                f"columns are for fields of {columns.size} elements: A stores {layout.size}"
+            )
         return cls._of(layout, columns, weights)
 
     @classmethod
@@ -252,7 +308,9 @@ class LowRankOperator(Pickled):
         user[self.layout.places()] = np.arange(int(np.prod(self.shape)))
         entries = (user[rows], blocks.copy(), values.copy())
         sizes = (self.shape, self.columns.rank // self.columns.width, self.columns.width)
-        return made_again(_of_entries, sizes, entries, self.weights.numpy(), device=self.device, dtype=self.dtype)
+        return made_again(
+            _of_entries, sizes, entries, self.weights.numpy(), device=self.device, dtype=self.dtype
+        )
 
     @property
     def host_weights(self) -> np.ndarray:
@@ -305,15 +363,26 @@ class LowRankOperator(Pickled):
         return self._product(x, out, self._transposed)
 
     def add(
-        self, x: wp.array[Any], base: wp.array[Any], out: wp.array[Any], *, mask: wp.array[Any] | None = None, transposed: bool = False,
+        self,
+        x: wp.array[Any],
+        base: wp.array[Any],
+        out: wp.array[Any],
+        *,
+        mask: wp.array[Any] | None = None,
+        transposed: bool = False,
         launch: Launch = launch_now,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Evaluate out = base + U W U' x on U's rows where `mask` is not 0.
 
         Other rows of `out` keep their values. `mask` is uint8; all are flat stored fields.
         """
         W = self._transposed if transposed else self.weights
-        launch(weigh_kernel, self.rank, [W, self.columns.gather(x, launch=launch), self.weighed], device=self.device)
+        launch(
+            weigh_kernel,
+            self.rank,
+            [W, self.columns.gather(x, launch=launch), self.weighed],
+            device=self.device,
+        )
         self.columns.scatter(self.weighed, base, out, mask=mask, launch=launch)
 
     def stored_diagonal(self, out: wp.array[Any]) -> None:
@@ -325,16 +394,23 @@ class LowRankOperator(Pickled):
         stored = self.layout.zeros(wp.float64)
         self.stored_diagonal(stored)
         field = self.layout.unload(stored)
-        return field if self.dtype is wp.float64 else wp.array(field.numpy(), dtype=self.dtype, device=self.device)
+        return (
+            field
+            if self.dtype is wp.float64
+            else wp.array(field.numpy(), dtype=self.dtype, device=self.device)
+        )
 
     def masked(self, free: Any, shift: Any = None) -> LowRankOperator:
         """Return P U W U' P, P the restriction to `free` (non-zero entries).
 
         Raises:
-            ValueError: a shift: the result would not be of low rank. Put the operator into a SumOperator.
+            ValueError: a shift: the result would not be of low rank. Put the operator into a
+                SumOperator.
         """
         if shift is not None:
-            raise ValueError("shift: U W U' + D is not of low rank; mask SumOperator(A, this) instead")
+            raise ValueError(
+                "shift: U W U' + D is not of low rank; mask SumOperator(A, this) instead"
+            )
         inside = self.layout.load(free, wp.uint8, "free").numpy() != 0
         old = self.columns
         rows, blocks, values = old.entries()
@@ -345,10 +421,18 @@ class LowRankOperator(Pickled):
 
     def _make(self, layout: Layout, columns: BlockColumns, weights: Any) -> None:
         self.layout, self.columns, columns.across = layout, columns, layout.across
-        self.shape, self.device, self.dtype, self.rank, self.version = layout.shape, layout.device, columns.dtype, columns.rank, 0
+        self.shape, self.device, self.dtype, self.rank, self.version = (
+            layout.shape,
+            layout.device,
+            columns.dtype,
+            columns.rank,
+            0,
+        )
         W = self._checked_weights(weights)
         self.symmetric = _is_symmetric(W)
-        self._weights, self._turned = (HostArray(W.shape, wp.float64, self.device) for _ in range(2))
+        self._weights, self._turned = (
+            HostArray(W.shape, wp.float64, self.device) for _ in range(2)
+        )
         self.weights, self._transposed = self._weights.array, self._turned.array
         self._weights.host[:], self._turned.host[:] = W, W.T
         self._weights.send()
@@ -361,7 +445,10 @@ class LowRankOperator(Pickled):
         W, k = np.asarray(real_array(weights, "weights"), dtype=np.float64), self.rank
         W = np.diag(W) if W.ndim == 1 else W
         if W.shape != (k, k):
-            raise ValueError(f"weights has shape {np.shape(weights)}: expected {(k,)} or {(k, k)} for {k} columns")
+            raise ValueError(
+                f"weights has shape {np.shape(weights)}: expected {(k,)} or {(k, k)} for {k} "
+                "columns"
+            )
         if not np.isfinite(W).all():
             raise ValueError("weights holds a value that is not finite")
         return W
@@ -371,9 +458,15 @@ class LowRankOperator(Pickled):
 
         Not to be written to; None where no solve has kept it.
         """
-        return self.products.numpy() if self.products_of is not None and self.products_of.ptr == x.ptr else None
+        return (
+            self.products.numpy()
+            if self.products_of is not None and self.products_of.ptr == x.ptr
+            else None
+        )
 
-    def _product(self, x: wp.array[Any], out: wp.array[Any] | None, W: wp.array[Any]) -> wp.array[Any]:
+    def _product(
+        self, x: wp.array[Any], out: wp.array[Any] | None, W: wp.array[Any]
+    ) -> wp.array[Any]:
         if x.size != self.layout.size:
             if tuple(x.shape) != self.shape:
                 raise ValueError(f"x has shape {tuple(x.shape)}: expected {self.shape}")
@@ -388,7 +481,9 @@ class LowRankOperator(Pickled):
         return out
 
 
-def _of_entries(sizes: Any, entries: Any, weights: np.ndarray, *, device: Any, dtype: Any) -> LowRankOperator:
+def _of_entries(
+    sizes: Any, entries: Any, weights: np.ndarray, *, device: Any, dtype: Any
+) -> LowRankOperator:
     """Return an operator from what it was pickled as."""
     shape, blocks, width = sizes
     layout = Layout(shape, checked_device(device))

@@ -23,13 +23,16 @@ KERNELS = KernelFile(Path(__file__).parent / "headers/stencil_operator.h")
 RECOGNIZE = KERNELS["matrix_stencil.recognize"]
 LEAST = 3  # cells of an axis: with fewer, offsets along it and across it are the same
 LOWER = ((-1, 0, 0), (0, -1, 0), (0, 0, -1))  # neighbors of lower faces
-SAMPLED = 8  # rows from the middle one on whose offsets tell the box: side by side, for most are not on its border then
+# rows from the middle one on whose offsets tell the box: side by side, for most are not on its
+# border then
+SAMPLED = 8
 
 
 def stencil_of(A: SparseOperator) -> StoredStencil | None:
     """Return the same operator as a stencil on a box, to the last bit; None where the matrix is none, or not stored in float64.
 
-    It takes one pass over the entries, and a second one where they have to be kept because they are not the same everywhere.
+    It takes one pass over the entries, and a second one where they have to be kept because they are
+    not the same everywhere.
     """
     if A.dtype is not wp.float64:
         return None
@@ -66,7 +69,9 @@ def _boxes(rows: CompressedRows) -> Iterator[tuple[int, int, int]]:
                 yield n // int(plane), int(plane // nx), int(nx)
 
 
-def _as_stencil(A: SparseOperator, rows: CompressedRows, shape: tuple[int, int, int]) -> StoredStencil | None:
+def _as_stencil(
+    A: SparseOperator, rows: CompressedRows, shape: tuple[int, int, int]
+) -> StoredStencil | None:
     nz, ny, nx = shape
     if ny < LEAST or (nz > 1 and nz < LEAST):
         return None
@@ -81,17 +86,33 @@ def _as_stencil(A: SparseOperator, rows: CompressedRows, shape: tuple[int, int, 
             return None
         full |= 1 << offsets[offset]
     entries = slice(starts[row], starts[row + 1])
-    for column, value in zip(rows.indices.numpy()[entries].tolist(), rows.values.numpy()[entries], strict=True):
+    for column, value in zip(
+        rows.indices.numpy()[entries].tolist(), rows.values.numpy()[entries], strict=True
+    ):
         if column - row not in offsets:
             return None
         middle[offsets[column - row]] += value
     kept = full & ((1 << 13) - 1) if A.symmetric else full & ~(1 << 13)
     where, d = Rows.of(padding, device), padding.zeros(wp.float64, device)
-    sums, matrix, on_device = Sums(where, 4), RowEntries(rows.indptr, rows.indices, rows.values), wp.array(middle, device=device)
+    sums, matrix, on_device = (
+        Sums(where, 4),
+        RowEntries(rows.indptr, rows.indices, rows.values),
+        wp.array(middle, device=device),
+    )
 
     def recognize(block: wp.array[Any] | None) -> np.ndarray:
         return sums.of(
-            RECOGNIZE, matrix, middle=on_device, made=d, nx=nx, ny=ny, nz=nz, full=full, kept=kept, size=padding.size, weights=block
+            RECOGNIZE,
+            matrix,
+            middle=on_device,
+            made=d,
+            nx=nx,
+            ny=ny,
+            nz=nz,
+            full=full,
+            kept=kept,
+            size=padding.size,
+            weights=block,
         )
 
     wrong, centers, differ, positive = recognize(None)
@@ -103,14 +124,22 @@ def _as_stencil(A: SparseOperator, rows: CompressedRows, shape: tuple[int, int, 
     if differ:
         block = zeros(len(places) * padding.size, wp.float64, device)
         recognize(block)
-        weights = tuple(block[i * padding.size : (i + 1) * padding.size] for i in range(len(places)))
+        weights = tuple(
+            block[i * padding.size : (i + 1) * padding.size] for i in range(len(places))
+        )
     sizes = [float(np.abs(w.numpy()).sum()) / A.unknowns if differ else abs(w) for w in weights]
-    strength = tuple(sum(s for s, o in zip(sizes, neighbors, strict=True) if o[axis]) / (1 if A.symmetric else 2) for axis in range(3))
+    strength = tuple(
+        sum(s for s, o in zip(sizes, neighbors, strict=True) if o[axis]) / (1 if A.symmetric else 2)
+        for axis in range(3)
+    )
     cells = np.full(shape if nz > 1 else shape[1:], FLUID, dtype=np.int8)
     pattern: Pattern | None = Pattern(neighbors, A.symmetric, "arrays" if differ else "numbers")
     faces = 1.0  # of a cell
     if A.symmetric and not positive and set(neighbors) <= set(LOWER):  # as of a GridPoisson
-        none, along = padding.zeros(wp.float64, device) if differ else 0.0, dict(zip(neighbors, weights, strict=True))
+        none, along = (
+            padding.zeros(wp.float64, device) if differ else 0.0,
+            dict(zip(neighbors, weights, strict=True)),
+        )
         pattern, weights = None, tuple(along.get(o, none) for o in LOWER)
         used = {w for w in weights if w} if not differ else set()
         faces = float(middle[13]) / used.pop() if len(used) == 1 else 0.0
@@ -118,4 +147,13 @@ def _as_stencil(A: SparseOperator, rows: CompressedRows, shape: tuple[int, int, 
     if not centers and faces in range(1, 256):  # a byte a cell
         unit = float(middle[13]) / faces
         d = wp.array(np.where(d.numpy() != 0, faces, 0).astype(np.uint8), device=device)
-    return StoredStencil(cells, d, weights, pattern, unit=unit, symmetric=A.symmetric, monotone=not positive, strength=strength)  # type: ignore[arg-type]
+    return StoredStencil(
+        cells,
+        d,
+        weights,
+        pattern,
+        unit=unit,
+        symmetric=A.symmetric,
+        monotone=not positive,
+        strength=strength,
+    )  # type: ignore[arg-type]

@@ -1,9 +1,10 @@
 """The stencil on a padded grid: arrays, sizes and launches. An operator and each level of its multigrid are one of these.
 
-(A x)_i = d_i x_i - sum of w_f x_neighbor, for d_i != 0; rows with d_i = 0 are no unknowns and give 0. Fields are 0 in cells that are no
-unknowns, so a neighbor needs no test. Forms of one source: of 7 points `uniform`, with a weight an axis (and d may be a count of open
-faces in one byte, d_scale its unit), or `variable`, with an array of lower faces an axis; or compact ones, of up to 27 points, symmetric or
-not, whose `Pattern` says what neighbors there are.
+(A x)_i = d_i x_i - sum of w_f x_neighbor, for d_i != 0; rows with d_i = 0 are no unknowns and give
+0. Fields are 0 in cells that are no unknowns, so a neighbor needs no test. Forms of one source: of
+7 points `uniform`, with a weight an axis (and d may be a count of open faces in one byte, d_scale
+its unit), or `variable`, with an array of lower faces an axis; or compact ones, of up to 27 points,
+symmetric or not, whose `Pattern` says what neighbors there are.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ KERNELS = KernelFile(Path(__file__).parent / "headers/stencil_operator.h")
 PRODUCT = KERNELS["stencil.product"]
 RELAX = KERNELS["stencil.relax"]
 WRAP = KERNELS["stencil.wrap"]
-SPAN_CELLS = wp.constant(16)  # spans begin at multiples of this, so that rows stay whole vectors and aggregates whole
+# spans begin at multiples of this, so that rows stay whole vectors and aggregates whole
+SPAN_CELLS = wp.constant(16)
 
 
 @no_type_check
@@ -46,7 +48,9 @@ def whole_span(first: int, last: int, n: int):
 
 @no_type_check
 @forward_kernel(module="warp_lcp.stencil")
-def coarsen_spans_kernel(fine: wp.array2d(dtype=wp.vec2i), factors: wp.vec3i, n: int, spans: wp.array2d(dtype=wp.vec2i)):
+def coarsen_spans_kernel(
+    fine: wp.array2d(dtype=wp.vec2i), factors: wp.vec3i, n: int, spans: wp.array2d(dtype=wp.vec2i)
+):
     """A coarse row's span covers those of its rows; factors = cells an aggregate along z, y, x."""
     k, j = wp.tid()
     first = int(n)
@@ -67,7 +71,8 @@ class Ghosts(Protocol):
 
     Attributes:
         whole: cells (nz, ny, nx) of the grid that this process has a box of.
-        cuts: sides with ghost cells that others have: the axis, 0, 1, 2 for x, y, z, and 0 for the lower, 1 for the upper side.
+        cuts: sides with ghost cells that others have: the axis, 0, 1, 2 for x, y, z, and 0 for the
+            lower, 1 for the upper side.
         gathering: collects fields of all processes' boxes on every process.
     """
 
@@ -87,16 +92,20 @@ class Ghosts(Protocol):
     def coarser(self, factors: tuple[int, int, int]) -> Ghosts | None:
         """Return what fills those of aggregates of so many cells along x, y, z; None if aggregates would be cut."""
 
-    def join_components(self, number: np.ndarray, held: np.ndarray, faces: Sequence[np.ndarray | float]) -> np.ndarray | None:
+    def join_components(
+        self, number: np.ndarray, held: np.ndarray, faces: Sequence[np.ndarray | float]
+    ) -> np.ndarray | None:
         """Join components of this process's cells with those of others; collective.
 
         Args:
-            number: of the component of each stored cell, flat, from 0; -1: none, or something holds it.
+            number: of the component of each stored cell, flat, from 0; -1: none, or something holds
+                it.
             held: which stored cells belong to components that something holds, bool.
             faces: coefficients of the lower faces along x, y, z, stored or one number; 0: closed.
 
         Returns:
-            The numbers of the joined components that nothing holds on any process, int32, flat, from 0, -1 elsewhere; None: there are none.
+            The numbers of the joined components that nothing holds on any process, int32, flat,
+            from 0, -1 elsewhere; None: there are none.
         """
 
 
@@ -116,7 +125,9 @@ class CellDecomposition(Protocol):
     def together(self) -> AbstractContextManager[Any]:
         """Return a block in which an exception of one process is raised on all."""
 
-    def check_operator(self, shape: tuple[int, ...], periodic: Sequence[bool], coefficients: Mapping[str, Any]) -> None:
+    def check_operator(
+        self, shape: tuple[int, ...], periodic: Sequence[bool], coefficients: Mapping[str, Any]
+    ) -> None:
         """Refuse an operator that does not fit the box, or is not of the same kind on all processes; collective."""
 
 
@@ -126,16 +137,21 @@ class PaddedStencil:
 
     Args:
         padding: counts of cells and of stored cells.
-        d: diagonal in units of `unit`, flat stored field; 0 where there is no unknown. A count of faces (wp.uint8) or a float.
-        weights: weight of the lower face of each cell along x, y, z (flat stored fields), or None for one weight an axis. Of a compact
-            stencil the weights of the pattern's neighbors, in its order, if it has arrays.
-        coefficients: the weights along x, y, z where `weights` is None; of a compact stencil those of the pattern, if they are numbers.
+        d: diagonal in units of `unit`, flat stored field; 0 where there is no unknown. A count of
+            faces (wp.uint8) or a float.
+        weights: weight of the lower face of each cell along x, y, z (flat stored fields), or None
+            for one weight an axis. Of a compact stencil the weights of the pattern's neighbors, in
+            its order, if it has arrays.
+        coefficients: the weights along x, y, z where `weights` is None; of a compact stencil those
+            of the pattern, if they are numbers.
         unit: value of one unit of d.
         periodic: whether x, y, z wrap around; ghost cells are then filled before each product.
-        spans: first and one past the last cell of each row that may hold unknowns, shape (nz, ny), wp.vec2i; fields must be 0 outside.
-            None: whole rows.
-        strength: mean coefficient of all faces along x, y, z; None: that of the weights as they are.
-        ghosts: fills ghost cells where another process has the neighbors, before each product; None: nobody has.
+        spans: first and one past the last cell of each row that may hold unknowns, shape (nz, ny),
+            wp.vec2i; fields must be 0 outside. None: whole rows.
+        strength: mean coefficient of all faces along x, y, z; None: that of the weights as they
+            are.
+        ghosts: fills ghost cells where another process has the neighbors, before each product;
+            None: nobody has.
         pattern: of a compact stencil; None: 7 points.
     """
 
@@ -163,7 +179,11 @@ class PaddedStencil:
     def struct(self) -> Any:
         """What passes take of it."""
         variable, d, w = self.storage
-        fields, names = (("wx", "wy", "wz"), ("cx", "cy", "cz")) if self.pattern is None else (self.pattern.names, self.pattern.numbers)
+        fields, names = (
+            (("wx", "wy", "wz"), ("cx", "cy", "cz"))
+            if self.pattern is None
+            else (self.pattern.names, self.pattern.numbers)
+        )
         numbers = {"unit": self.unit, **dict(zip(names, self.coefficients, strict=True))}
         weights = dict(zip(fields, self.weights or (), strict=False)) if variable else {}
         for name, array in weights.items():
@@ -173,7 +193,11 @@ class PaddedStencil:
     @property
     def storage(self) -> tuple[bool, Any, Any]:
         """Form and types that choose the kernels: variable weights?, type of d, type of the weights."""
-        return self.weights is not None, self.d.dtype, self.weights[0].dtype if self.weights else wp.float32
+        return (
+            self.weights is not None,
+            self.d.dtype,
+            self.weights[0].dtype if self.weights else wp.float32,
+        )
 
     @property
     def mean_weights(self) -> list[float]:
@@ -200,7 +224,9 @@ class PaddedStencil:
         """Return what `wrap` launches."""
         strides, counts = (1, self.padding.row, self.padding.plane), self.padding.counts[::-1]
         axes = [axis for axis, periodic in enumerate(self.periodic) if periodic]
-        made: list[Bound | Task] = [WRAP.bind(self._edges[a], x=x, cells=counts[a], step=strides[a]) for a in axes]
+        made: list[Bound | Task] = [
+            WRAP.bind(self._edges[a], x=x, cells=counts[a], step=strides[a]) for a in axes
+        ]
         return made if self.ghosts is None else [*made, self.ghosts.filling(x)]
 
     @cached_property
@@ -208,13 +234,27 @@ class PaddedStencil:
         """The ghost cells before the first of each axis."""
         return [Rows.edge(self.padding, self.device, axis) for axis in range(3)]
 
-    def product(self, x: wp.array[Any], out: wp.array[Any], plus: wp.array[Any] | None = None, *, launch: Launch = launch_now) -> None:
+    def product(
+        self,
+        x: wp.array[Any],
+        out: wp.array[Any],
+        plus: wp.array[Any] | None = None,
+        *,
+        launch: Launch = launch_now,
+    ) -> None:
         """out = A x, or A x + plus. All of one float type; rows that are no unknowns give 0 (or plus)."""
         self.wrap(x, launch=launch)
         PRODUCT.bind(self.rows, stencil=self, x=x, b=plus, y=out).launch(launch)
 
     def relax(
-        self, x: wp.array[Any], b: wp.array[Any], lower: wp.array[Any], upper: wp.array[Any], omega: float, *, forward: bool = True
+        self,
+        x: wp.array[Any],
+        b: wp.array[Any],
+        lower: wp.array[Any],
+        upper: wp.array[Any],
+        omega: float,
+        *,
+        forward: bool = True,
     ) -> None:
         """Sweep x once, red cells then black ones (forward) or black then red, each cell projected onto its bounds.
 
@@ -223,4 +263,13 @@ class PaddedStencil:
         colors = 2 if self.pattern is None else 1 << sum(n > 1 for n in self.padding.counts)
         for color in range(colors) if forward else reversed(range(colors)):
             self.wrap(x)
-            RELAX.bind(self.rows, stencil=self, x=x, b=b, lower=lower, upper=upper, omega=omega, color=color).launch()
+            RELAX.bind(
+                self.rows,
+                stencil=self,
+                x=x,
+                b=b,
+                lower=lower,
+                upper=upper,
+                omega=omega,
+                color=color,
+            ).launch()

@@ -1,7 +1,8 @@
 """Another numbering of a sparse matrix's unknowns, in which neighbors lie together in memory.
 
-Where unknowns are numbered at random, each entry of a product reads x from another line of memory: at a million unknowns a product takes
-three to five times as long, and a solve three times, as in an order that follows the matrix.
+Where unknowns are numbered at random, each entry of a product reads x from another line of memory:
+at a million unknowns a product takes three to five times as long, and a solve three times, as in an
+order that follows the matrix.
 """
 
 from __future__ import annotations
@@ -14,8 +15,12 @@ import scipy.sparse
 import scipy.sparse.csgraph
 
 SMALLEST = 1 << 16  # unknowns from which fields do not fit a core's own caches
-SCATTERED = 0.05  # mean distance of entries from the diagonal, as a share of n, from which an order pays; a random one has a third
-GAIN = 0.5  # the largest share of that distance that an order may leave: graphs that are small worlds have no good one
+# mean distance of entries from the diagonal, as a share of n, from which an order pays; a random
+# one has a third
+SCATTERED = 0.05
+# the largest share of that distance that an order may leave: graphs that are small worlds have no
+# good one
+GAIN = 0.5
 SAMPLE = 1 << 16  # entries that tell the mean distance
 
 
@@ -29,7 +34,9 @@ class Renumbering:
     def matrix(self, host: scipy.sparse.csr_array) -> scipy.sparse.csr_array:
         """Return a matrix in the new numbering, columns sorted."""
         moved = host[self.order]
-        moved = scipy.sparse.csr_array((moved.data, self.place[moved.indices], moved.indptr), shape=host.shape)
+        moved = scipy.sparse.csr_array(
+            (moved.data, self.place[moved.indices], moved.indptr), shape=host.shape
+        )
         moved.sort_indices()
         return moved
 
@@ -46,8 +53,11 @@ def renumbering(host: scipy.sparse.csr_array, block: int = 1) -> Renumbering | N
     if n < SMALLEST or before < SCATTERED * n:
         return None
     graph: Any = host if block == 1 else _blocks(host, block)
-    # breadth first by rows alone: on an unsymmetric pattern still an order, without the price of A + A'
-    nodes = scipy.sparse.csgraph.reverse_cuthill_mckee(scipy.sparse.csr_matrix(graph), symmetric_mode=True)
+    # breadth first by rows alone: on an unsymmetric pattern still an order, without the price of A
+    # + A'
+    nodes = scipy.sparse.csgraph.reverse_cuthill_mckee(
+        scipy.sparse.csr_matrix(graph), symmetric_mode=True
+    )
     order = (block * nodes[:, None] + np.arange(block, dtype=nodes.dtype)).ravel()
     place = np.empty_like(order)
     place[order] = np.arange(n, dtype=order.dtype)
@@ -58,7 +68,8 @@ def _blocks(host: scipy.sparse.csr_array, block: int) -> scipy.sparse.csr_array:
     """Return the pattern of the blocks of a matrix."""
     blocks = host.tobsr((block, block))
     return scipy.sparse.csr_array(
-        (np.ones(len(blocks.indices), dtype=np.int8), blocks.indices, blocks.indptr), shape=(host.shape[0] // block,) * 2
+        (np.ones(len(blocks.indices), dtype=np.int8), blocks.indices, blocks.indptr),
+        shape=(host.shape[0] // block,) * 2,
     )
 
 

@@ -30,7 +30,8 @@ class RestatedProblem:
         given: the problem as it was given.
         problem: the same in another form.
         grid: shape of the grid that the matrix is a stencil of; None: it is no grid's.
-        order: unknown i of `problem` is unknown order[i] of `given`, shape (n,); None: they are in the same order.
+        order: unknown i of `problem` is unknown order[i] of `given`, shape (n,); None: they are in
+            the same order.
         place: the inverse, shape (n,).
     """
 
@@ -70,7 +71,13 @@ class RestatedProblem:
         if self.is_given:
             return found
         grid = found.grid if self.grid is None else self.grid
-        return replace(found, x=self.field(found.x), grid=grid, problem=self.given, version=version_of(self.given.A))
+        return replace(
+            found,
+            x=self.field(found.x),
+            grid=grid,
+            problem=self.given,
+            version=version_of(self.given.A),
+        )
 
 
 Form = Callable[[LCP], RestatedProblem | None]
@@ -82,12 +89,19 @@ def as_grid(problem: LCP) -> RestatedProblem | None:
     None if it is no stencil, or has fewer than 2,000 unknowns.
     """
     A = problem.A
-    if not isinstance(A, SparseOperator) or A.unknowns < LEAST_GRID or problem.in_place or problem.preconditioner is not None:
+    if (
+        not isinstance(A, SparseOperator)
+        or A.unknowns < LEAST_GRID
+        or problem.in_place
+        or problem.preconditioner is not None
+    ):
         return None
     stencil = None if problem.bounds.affine is not None else stencil_of(A)
     if stencil is None:
         return None
-    fields = (field.numpy().reshape(stencil.shape) for field in (problem.b, problem.lower, problem.upper))
+    fields = (
+        field.numpy().reshape(stencil.shape) for field in (problem.b, problem.lower, problem.upper)
+    )
     return RestatedProblem(problem, LCP(stencil, *fields), grid=stencil.shape)
 
 
@@ -96,32 +110,53 @@ def as_sparse(problem: LCP) -> RestatedProblem | None:
     A = problem.A
     if not isinstance(A, DenseOperator):
         return None
-    return _with_matrix(problem, SparseOperator(scipy.sparse.csr_array(A.matrix.numpy()), device=A.device, dtype=A.dtype))
+    return _with_matrix(
+        problem,
+        SparseOperator(scipy.sparse.csr_array(A.matrix.numpy()), device=A.device, dtype=A.dtype),
+    )
 
 
 def as_dense(problem: LCP) -> RestatedProblem | None:
     """Return a problem of at most 600 unknowns with its sparse matrix stored as a dense one; None if it has no such matrix."""
     A = problem.A
-    if not isinstance(A, SparseOperator) or A.unknowns > MOST_DENSE or problem.preconditioner is not None:
+    if (
+        not isinstance(A, SparseOperator)
+        or A.unknowns > MOST_DENSE
+        or problem.preconditioner is not None
+    ):
         return None
-    return _with_matrix(problem, DenseOperator(A.matrix().toarray(), device=A.device, dtype=A.dtype))
+    return _with_matrix(
+        problem, DenseOperator(A.matrix().toarray(), device=A.device, dtype=A.dtype)
+    )
 
 
 def renumbered(problem: LCP) -> RestatedProblem | None:
     """Return a sparse problem in the order of Cuthill and McKee; None where the given order is as good."""
     A = problem.A
-    if not isinstance(A, SparseOperator) or problem.bounds.affine is not None or problem.preconditioner is not None:
+    if (
+        not isinstance(A, SparseOperator)
+        or problem.bounds.affine is not None
+        or problem.preconditioner is not None
+    ):
         return None
     found = A.renumbered()
     if found is None:
         return None
     numbering, B = found
     order, bounds = numbering.order, problem.bounds
-    sides = (bounds.host(side)[order] if bounds.varying[side] else bounds.values[side] for side in (0, 1))
-    return RestatedProblem(problem, LCP(B, problem.b.numpy()[order], *sides), order=order, place=numbering.place)
+    sides = (
+        bounds.host(side)[order] if bounds.varying[side] else bounds.values[side] for side in (0, 1)
+    )
+    return RestatedProblem(
+        problem, LCP(B, problem.b.numpy()[order], *sides), order=order, place=numbering.place
+    )
 
 
 def _with_matrix(problem: LCP, A: DenseOperator | SparseOperator) -> RestatedProblem:
     bounds = problem.bounds
-    sides = (problem.lower.numpy(), problem.upper.numpy()) if bounds.affine is None else bounds.affine.sides
+    sides = (
+        (problem.lower.numpy(), problem.upper.numpy())
+        if bounds.affine is None
+        else bounds.affine.sides
+    )
     return RestatedProblem(problem, LCP(A, problem.b.numpy(), *sides))

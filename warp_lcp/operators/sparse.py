@@ -19,7 +19,17 @@ from warp_lcp.problem.pickling import Pickled, made_again
 from warp_lcp.problem.scale import scale_of_matrix
 from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.compiler import forward_kernel
-from warp_lcp.rows.fields import Layout, check_kept, check_storable, checked_device, kept, real_array, relative_rounding, zeros, zeros_like
+from warp_lcp.rows.fields import (
+    Layout,
+    check_kept,
+    check_storable,
+    checked_device,
+    kept,
+    real_array,
+    relative_rounding,
+    zeros,
+    zeros_like,
+)
 from warp_lcp.rows.program import Launch, launch_now
 from warp_lcp.rows.vectors import Sums
 
@@ -45,7 +55,8 @@ KERNELS = KernelFile(Path(__file__).parent / "headers/sparse.h")
 PRODUCT = KERNELS["sparse.product"]
 RELAX = KERNELS["sparse.relax"]
 SURVEY = KERNELS["sparse.survey"]
-BLOCKS, FILL = (6, 5, 4, 3, 2), 1.2  # sizes of nodes' blocks, and the most entries that these may have in units of A's
+# sizes of nodes' blocks, and the most entries that these may have in units of A's
+BLOCKS, FILL = (6, 5, 4, 3, 2), 1.2
 GATHER = KERNELS["sparse.gather"]
 
 
@@ -81,29 +92,33 @@ class MatrixSweep:
 class SparseOperator(Pickled):
     """Sparse square matrix as an operator.
 
-    Duplicate entries are summed and columns sorted, as `matrix.tocsr().sum_duplicates()` does; explicit zeros are kept, so that
-    `update` may fill them.
+    Duplicate entries are summed and columns sorted, as `matrix.tocsr().sum_duplicates()` does;
+    explicit zeros are kept, so that `update` may fill them.
 
     Args:
-        matrix: A, any scipy.sparse matrix or array of shape (n, n), real and finite. Rows may be empty.
+        matrix: A, any scipy.sparse matrix or array of shape (n, n), real and finite. Rows may be
+            empty.
         device: Warp device; the default device if None.
         dtype: storage of A's entries, wp.float64 or wp.float32.
-        near_null_space: fields that A nearly maps to 0, shape (n, k), k <= 12: the rigid body motions of elasticity, three in 2-D,
-            six in 3-D, which coarse levels then have too. None: the constants. Where unknowns come node by node (all of a node's
-            displacements in turn) whole nodes are aggregated.
+        near_null_space: fields that A nearly maps to 0, shape (n, k), k <= 12: the rigid body
+            motions of elasticity, three in 2-D, six in 3-D, which coarse levels then have too.
+            None: the constants. Where unknowns come node by node (all of a node's displacements in
+            turn) whole nodes are aggregated.
 
     Attributes:
-        block: unknowns of a node, 1 to 6: A consists of full blocks of as many rows and columns; looked for if there is a near_null_space.
+        block: unknowns of a node, 1 to 6: A consists of full blocks of as many rows and columns;
+            looked for if there is a near_null_space.
         indptr: where each row begins, shape (n + 1,), wp.int32.
         indices: column of each entry, shape (nnz,), wp.int32, ascending in each row.
         values: the entries, shape (nnz,), `dtype`.
         symmetric: whether A equals its transpose, to rounding.
-        row_sizes: the largest magnitude of each row, shape (n,), wp.float64; None where no row is empty.
+        row_sizes: the largest magnitude of each row, shape (n,), wp.float64; None where no row is
+            empty.
         version: how often the entries have been taken.
 
     Raises:
-        ValueError: the matrix is not square, empty, complex, not finite, or has more than 2^31 - 1 entries; or near_null_space has
-            another shape, vanishes or is not finite.
+        ValueError: the matrix is not square, empty, complex, not finite, or has more than 2^31 - 1
+            entries; or near_null_space has another shape, vanishes or is not finite.
 
     Example:
         >>> import scipy.sparse, warp as wp, warp_lcp as wl
@@ -112,16 +127,27 @@ class SparseOperator(Pickled):
         [ 0. -1.  6.] True
     """
 
-    def __init__(self, matrix: Any, *, device: Any = None, dtype: Any = wp.float64, near_null_space: Any = None) -> None:
+    def __init__(
+        self,
+        matrix: Any,
+        *,
+        device: Any = None,
+        dtype: Any = wp.float64,
+        near_null_space: Any = None,
+    ) -> None:
         if dtype not in (wp.float32, wp.float64):
             raise ValueError(f"dtype = {dtype}: must be wp.float32 or wp.float64")
         host = _checked(matrix)
         check_storable(host.data, dtype, "matrix")
-        self.near_null_space = None if near_null_space is None else _near_null_space(near_null_space, host.shape[0])
+        self.near_null_space = (
+            None if near_null_space is None else _near_null_space(near_null_space, host.shape[0])
+        )
         self.device, self.dtype, self.shape = checked_device(device), dtype, (host.shape[0],)
         self.layout = Layout(self.shape, self.device)
         parts = (host.indptr, wp.int32), (host.indices, wp.int32), (host.data, dtype)
-        self.indptr, self.indices, self.values = (wp.array(v, dtype=t, device=self.device, copy=self.device.is_cuda) for v, t in parts)
+        self.indptr, self.indices, self.values = (
+            wp.array(v, dtype=t, device=self.device, copy=self.device.is_cuda) for v, t in parts
+        )
         self._indptr, self._indices = host.indptr, host.indices
         self._diagonal = zeros(self.unknowns, dtype, self.device)
         self._transpose_values: wp.array[Any] | None = None
@@ -133,7 +159,13 @@ class SparseOperator(Pickled):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the matrix as it is now."""
-        return made_again(SparseOperator, self.matrix(), device=self.device, dtype=self.dtype, near_null_space=self.near_null_space)
+        return made_again(
+            SparseOperator,
+            self.matrix(),
+            device=self.device,
+            dtype=self.dtype,
+            near_null_space=self.near_null_space,
+        )
 
     @property
     def unknowns(self) -> int:
@@ -161,15 +193,21 @@ class SparseOperator(Pickled):
         """Replace the entries; the sparsity pattern is fixed.
 
         Args:
-            values: entries in the order of `indices`, shape (nnz,), numpy or wp.array; or a scipy.sparse matrix with the same pattern.
+            values: entries in the order of `indices`, shape (nnz,), numpy or wp.array; or a
+                scipy.sparse matrix with the same pattern.
 
         Raises:
             ValueError: shape or pattern differ, or a value is not finite.
         """
         if scipy.sparse.issparse(values):
             host = _checked(values)
-            if not (np.array_equal(host.indptr, self._indptr) and np.array_equal(host.indices, self._indices)):
-                raise ValueError("values has a different sparsity pattern: make a new SparseOperator")
+            if not (
+                np.array_equal(host.indptr, self._indptr)
+                and np.array_equal(host.indices, self._indices)
+            ):
+                raise ValueError(
+                    "values has a different sparsity pattern: make a new SparseOperator"
+                )
         else:
             array = real_array(values, "values")
             if array.shape != (self.nnz,):
@@ -197,16 +235,33 @@ class SparseOperator(Pickled):
         if self._transpose_values is None:
             self._transpose_values = zeros_like(self.values)
             self._gather(order)
-        PRODUCT.bind(Rows.flat(x.size, self.device), ptr=indptr, col=indices, a=self._transpose_values, x=x, plus=None, y=out).launch()
+        PRODUCT.bind(
+            Rows.flat(x.size, self.device),
+            ptr=indptr,
+            col=indices,
+            a=self._transpose_values,
+            x=x,
+            plus=None,
+            y=out,
+        ).launch()
         return out
 
     def apply_plus(self, x: wp.array[Any], b: wp.array[Any], out: wp.array[Any]) -> None:
         """Evaluate out = A x + b in one pass; fields of one type."""
         self.product(x, out, plus=b)
 
-    def product(self, x: wp.array[Any], out: wp.array[Any], plus: wp.array[Any] | None = None, *, launch: Launch = launch_now) -> None:
+    def product(
+        self,
+        x: wp.array[Any],
+        out: wp.array[Any],
+        plus: wp.array[Any] | None = None,
+        *,
+        launch: Launch = launch_now,
+    ) -> None:
         """Evaluate out = A x, or A x + plus; launches kernels only."""
-        PRODUCT.bind(Rows.flat(x.size, self.device), self._rows, x=x, plus=plus, y=out).launch(launch)
+        PRODUCT.bind(Rows.flat(x.size, self.device), self._rows, x=x, plus=plus, y=out).launch(
+            launch
+        )
 
     def diagonal(self) -> wp.array[Any]:
         """Return the diagonal of A, shape (n,).
@@ -239,7 +294,9 @@ class SparseOperator(Pickled):
             return None
         if self._turned is None or self._turned_from != self.version:
             B = None if self.near_null_space is None else self.near_null_space[found.order]
-            self._turned = SparseOperator(found.matrix(self.matrix()), device=self.device, dtype=self.dtype, near_null_space=B)
+            self._turned = SparseOperator(
+                found.matrix(self.matrix()), device=self.device, dtype=self.dtype, near_null_space=B
+            )
             self._turned._rounding, self._turned_from = self._rounding, self.version
         return found, self._turned
 
@@ -253,7 +310,15 @@ class SparseOperator(Pickled):
         if self.near_null_space is None:
             return 1
         pattern = _ones(self._indptr, self._indices)
-        return next((size for size in BLOCKS if self.unknowns % size == 0 and pattern.tobsr((size, size)).data.size <= FILL * self.nnz), 1)
+        return next(
+            (
+                size
+                for size in BLOCKS
+                if self.unknowns % size == 0
+                and pattern.tobsr((size, size)).data.size <= FILL * self.nnz
+            ),
+            1,
+        )
 
     def coefficient_gradient(self, multiplier: wp.array[Any], x: wp.array[Any]) -> dict[str, Any]:
         """Return the derivatives of mu'A x by the entries, mu_i x_j as `matrix`.
@@ -270,16 +335,28 @@ class SparseOperator(Pickled):
 
         `free` has non-zero entries on the rows that stay.
         """
-        p = scipy.sparse.diags_array((self.layout.load(free, wp.uint8, "free").numpy() != 0).astype(np.float64))
+        p = scipy.sparse.diags_array(
+            (self.layout.load(free, wp.uint8, "free").numpy() != 0).astype(np.float64)
+        )
         matrix = p @ self.matrix() @ p
         if shift is not None:
-            matrix = matrix + p @ scipy.sparse.diags_array(self.layout.load(shift, wp.float64, "shift").numpy())
+            matrix = matrix + p @ scipy.sparse.diags_array(
+                self.layout.load(shift, wp.float64, "shift").numpy()
+            )
         return SparseOperator(matrix, device=self.device, dtype=self.dtype)
 
     def relax(
-        self, x: Any, b: Any, lower: Any, upper: Any, omega: float, *, forward: bool = True, colored: bool | None = None,
+        self,
+        x: Any,
+        b: Any,
+        lower: Any,
+        upper: Any,
+        omega: float,
+        *,
+        forward: bool = True,
+        colored: bool | None = None,
         launch: Launch = launch_now,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Sweep x once, each unknown projected onto its bounds.
 
         Rows with a zero diagonal are skipped.
@@ -291,12 +368,26 @@ class SparseOperator(Pickled):
             upper: field like x.
             omega: relaxation factor.
             forward: rows, or colors, in ascending order; else descending.
-            colored: color by color, all rows of a color at once, instead of row by row by one thread; on CUDA if None.
+            colored: color by color, all rows of a color at once, instead of row by row by one
+                thread; on CUDA if None.
             launch: launches or records.
         """
-        sweep = MatrixSweep(self.indptr, self.indices, self.values, self._diagonal, b, lower, upper, x, omega, forward)
+        sweep = MatrixSweep(
+            self.indptr,
+            self.indices,
+            self.values,
+            self._diagonal,
+            b,
+            lower,
+            upper,
+            x,
+            omega,
+            forward,
+        )
         if not (self.device.is_cuda if colored is None else colored):
-            RELAX.bind(Rows.flat(x.size, self.device, serial=True), sweep, list=None, first=0).launch(launch)
+            RELAX.bind(
+                Rows.flat(x.size, self.device, serial=True), sweep, list=None, first=0
+            ).launch(launch)
             return
         rows, starts = self.colors
         colors = range(len(starts) - 1)
@@ -326,7 +417,9 @@ class SparseOperator(Pickled):
         largest, diagonal, same = _survey(host)
         self.symmetric = same or _is_symmetric(host, largest)
         check_kept(largest, self.dtype, "matrix, the largest entries of its rows")
-        self.row_sizes = None if largest.all() else wp.array(largest, dtype=wp.float64, device=self.device)
+        self.row_sizes = (
+            None if largest.all() else wp.array(largest, dtype=wp.float64, device=self.device)
+        )
         self._diagonal.assign(diagonal.astype(wp.dtype_to_numpy(self.dtype)))
         if self._transpose_values is not None:
             self._gather(self._transpose[2])
@@ -334,14 +427,23 @@ class SparseOperator(Pickled):
         self.version += 1
 
     def _gather(self, order: wp.array[Any]) -> None:
-        GATHER.bind(Rows.flat(order.size, self.device), source=self.values, order=order, taken=self._transpose_values).launch()
+        GATHER.bind(
+            Rows.flat(order.size, self.device),
+            source=self.values,
+            order=order,
+            taken=self._transpose_values,
+        ).launch()
 
     @cached_property
     def _transpose(self) -> tuple[wp.array[Any], wp.array[Any], wp.array[Any]]:
         """Rows and columns of A', and which of A's entries each of its entries is."""
-        numbered = scipy.sparse.csr_array((np.arange(self.nnz), self._indices, self._indptr), shape=self.shape * 2)
+        numbered = scipy.sparse.csr_array(
+            (np.arange(self.nnz), self._indices, self._indptr), shape=self.shape * 2
+        )
         turned = numbered.T.tocsr()
-        parts = [kept(v, wp.int32, self.device) for v in (turned.indptr, turned.indices, turned.data)]
+        parts = [
+            kept(v, wp.int32, self.device) for v in (turned.indptr, turned.indices, turned.data)
+        ]
         return parts[0], parts[1], parts[2]
 
     @property
@@ -349,7 +451,9 @@ class SparseOperator(Pickled):
         return RowEntries(self.indptr, self.indices, self.values)
 
     def _matrix_of(self, values: np.ndarray) -> scipy.sparse.csr_array:
-        return scipy.sparse.csr_array((values.astype(np.float64), self._indices, self._indptr), shape=self.shape * 2)
+        return scipy.sparse.csr_array(
+            (values.astype(np.float64), self._indices, self._indptr), shape=self.shape * 2
+        )
 
     def _result(self, x: wp.array[Any], out: wp.array[Any] | None) -> wp.array[Any]:
         if tuple(x.shape) != self.shape:
@@ -370,7 +474,10 @@ def greedy_colors(pattern: scipy.sparse.csr_array) -> np.ndarray:
 def _checked(matrix: Any) -> scipy.sparse.csr_array:
     """Return a matrix in compressed rows, sorted, without duplicates, in float64."""
     if not scipy.sparse.issparse(matrix):
-        raise ValueError(f"matrix is a {type(matrix).__name__}: expected a scipy.sparse matrix (DenseOperator takes numpy arrays)")
+        raise ValueError(
+            f"matrix is a {type(matrix).__name__}: expected a scipy.sparse matrix (DenseOperator "
+            "takes numpy arrays)"
+        )
     if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1] or matrix.shape[0] == 0:
         raise ValueError(f"matrix has shape {matrix.shape}: expected (n, n) with n >= 1")
     if matrix.dtype.kind not in "fiub":
@@ -389,11 +496,19 @@ def _check_indices(matrix: Any) -> None:
         if matrix.format in ("csr", "csc", "bsr"):
             matrix.check_format(full_check=True)
         elif matrix.format == "coo":
-            for name, index, n in zip(("row", "column"), (matrix.row, matrix.col), matrix.shape, strict=True):
-                if len(index) != matrix.nnz or (len(index) and not 0 <= int(index.min()) <= int(index.max()) < n):
-                    raise ValueError(f"{name} indices must be from 0 to {n - 1}, one for each entry")
+            for name, index, n in zip(
+                ("row", "column"), (matrix.row, matrix.col), matrix.shape, strict=True
+            ):
+                if len(index) != matrix.nnz or (
+                    len(index) and not 0 <= int(index.min()) <= int(index.max()) < n
+                ):
+                    raise ValueError(
+                        f"{name} indices must be from 0 to {n - 1}, one for each entry"
+                    )
     except ValueError as reason:
-        raise ValueError(f"matrix is not a valid sparse matrix of shape {matrix.shape}: {reason}") from reason
+        raise ValueError(
+            f"matrix is not a valid sparse matrix of shape {matrix.shape}: {reason}"
+        ) from reason
 
 
 def _near_null_space(given: Any, n: int) -> np.ndarray:
@@ -401,7 +516,9 @@ def _near_null_space(given: Any, n: int) -> np.ndarray:
     B = real_array(given, "near_null_space").astype(np.float64)
     B = B[:, None] if B.ndim == 1 else B
     if B.ndim != 2 or B.shape[0] != n or not 1 <= B.shape[1] <= 12:
-        raise ValueError(f"near_null_space has shape {B.shape}: expected ({n}, k) with k from 1 to 12")
+        raise ValueError(
+            f"near_null_space has shape {B.shape}: expected ({n}, k) with k from 1 to 12"
+        )
     if not np.isfinite(B).all() or not (B != 0).any(axis=0).all():
         raise ValueError("near_null_space holds fields that vanish or are not finite")
     return B
@@ -409,7 +526,9 @@ def _near_null_space(given: Any, n: int) -> np.ndarray:
 
 def _ones(indptr: np.ndarray, indices: np.ndarray) -> scipy.sparse.csr_array:
     n = len(indptr) - 1
-    return scipy.sparse.csr_array((np.ones(len(indices), dtype=np.float32), indices, indptr), shape=(n, n))
+    return scipy.sparse.csr_array(
+        (np.ones(len(indices), dtype=np.float32), indices, indptr), shape=(n, n)
+    )
 
 
 def _survey(host: scipy.sparse.csr_array) -> tuple[np.ndarray, np.ndarray, bool]:
@@ -417,7 +536,9 @@ def _survey(host: scipy.sparse.csr_array) -> tuple[np.ndarray, np.ndarray, bool]
     parts = (host.indptr, wp.int32), (host.indices, wp.int32), (host.data, wp.float64)
     ptr, col, a = (wp.array(v, dtype=t, device="cpu", copy=False) for v, t in parts)
     largest, diagonal = (zeros(host.shape[0], wp.float64, wp.get_device("cpu")) for _ in range(2))
-    found = Sums(Rows.flat(largest.size, largest.device), 2).of(SURVEY, ptr=ptr, col=col, a=a, largest=largest, diagonal=diagonal)
+    found = Sums(Rows.flat(largest.size, largest.device), 2).of(
+        SURVEY, ptr=ptr, col=col, a=a, largest=largest, diagonal=diagonal
+    )
     return largest.numpy(), diagonal.numpy(), not found.any()
 
 

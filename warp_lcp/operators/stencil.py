@@ -28,9 +28,15 @@ KERNELS = KernelFile(Path(__file__).parent / "headers/stencil_operator.h")
 DIAGONAL = KERNELS["stencil.diagonal"]
 TRANSPOSED = KERNELS["stencil.transposed"]
 GRADIENT = KERNELS["stencil.gradient"]
-MOST_IN_PLANE, MOST_IN_SPACE = 1 << 17, 1 << 14  # unknowns of a component whose null vectors are had by sparse factors, in a second or two
+# unknowns of a component whose null vectors are had by sparse factors, in a second or two
+MOST_IN_PLANE, MOST_IN_SPACE = 1 << 17, 1 << 14
 CENTER = (0, 0, 0)
-AROUND = Pattern(tuple((x, y, 0) for y in (-1, 0, 1) for x in (-1, 0, 1) if x or y), symmetric=False, kind="arrays")  # all neighbors in 2-D
+# all neighbors in 2-D
+AROUND = Pattern(
+    tuple((x, y, 0) for y in (-1, 0, 1) for x in (-1, 0, 1) if x or y),
+    symmetric=False,
+    kind="arrays",
+)
 Offset = tuple[int, int, int]  # along x, y, z
 
 __all__ = ["Stencil"]
@@ -41,31 +47,38 @@ class Stencil(GridOperator):
 
     Finite differences, finite volumes or finite elements of your own.
 
-    (A x)_i = sum over offsets o of a_o(i) x_(i + o) + shift_i x_i, with x = 0 in AIR, and x_(i + o) = x_i where i + o is SOLID (a closed
-    side: no flux). With other values in AIR cells, see `boundary_term`. Nothing is assembled: numbers are numbers in
-    the kernels, Warp functions are evaluated where a row is needed, arrays are read.
+    (A x)_i = sum over offsets o of a_o(i) x_(i + o) + shift_i x_i, with x = 0 in AIR, and x_(i + o)
+    = x_i where i + o is SOLID (a closed side: no flux). With other values in AIR cells, see
+    `boundary_term`. Nothing is assembled: numbers are numbers in the kernels, Warp functions are
+    evaluated where a row is needed, arrays are read.
 
     Args:
-        cells: integers AIR = 0, FLUID = 1, SOLID = 2, shape (nz, ny, nx) or (ny, nx); numpy or wp.array. Unknowns live on FLUID cells,
-            fields have the shape of `cells`.
-        coefficients: a_o by offset, (dz, dy, dx) or (dy, dx), each -1, 0 or 1, the center included; absent ones are 0. Each is a number,
-            an array of the shape of `cells`, or a Warp function of the cell's indices, (k, j, i) or (j, i), that returns a float; functions
-            and arrays cannot be combined. Or an array of numbers of shape (3, 3) or (3, 3, 3), the center in the middle.
+        cells: integers AIR = 0, FLUID = 1, SOLID = 2, shape (nz, ny, nx) or (ny, nx); numpy or
+            wp.array. Unknowns live on FLUID cells, fields have the shape of `cells`.
+        coefficients: a_o by offset, (dz, dy, dx) or (dy, dx), each -1, 0 or 1, the center included;
+            absent ones are 0. Each is a number, an array of the shape of `cells`, or a Warp
+            function of the cell's indices, (k, j, i) or (j, i), that returns a float; functions and
+            arrays cannot be combined. Or an array of numbers of shape (3, 3) or (3, 3, 3), the
+            center in the middle.
         shift: None, a number or an array of the shape of `cells`, >= 0.
-        periodic: whether x, y, z wrap around; the cells of an axis of one cell are then their own neighbors.
-        outside: kind of cells outside the array along axes that are not periodic: SOLID, as for `wl.GridPoisson`, or AIR.
+        periodic: whether x, y, z wrap around; the cells of an axis of one cell are then their own
+            neighbors.
+        outside: kind of cells outside the array along axes that are not periodic: SOLID, as for
+            `wl.GridPoisson`, or AIR.
         device: Warp device; that of `cells` or the default device if None.
-        dtype: storage of coefficients, wp.float32 or wp.float64. In float32 coefficients are rounded, so that the problem solved is another
-            one by about 1e-7 of the diagonal, and tolerances below the rounding end with FLOOR.
+        dtype: storage of coefficients, wp.float32 or wp.float64. In float32 coefficients are
+            rounded, so that the problem solved is another one by about 1e-7 of the diagonal, and
+            tolerances below the rounding end with FLOOR.
 
     Attributes:
-        symmetric: whether a_o(i) = a_-o(i + o) between all unknowns, to the last bit; coefficients toward SOLID, AIR and what lies outside
-            do not matter. Once other cells in place have made A unsymmetric, it stays False.
+        symmetric: whether a_o(i) = a_-o(i + o) between all unknowns, to the last bit; coefficients
+            toward SOLID, AIR and what lies outside do not matter. Once other cells in place have
+            made A unsymmetric, it stays False.
         monotone: whether all a_o but the center's are <= 0, as in an M-matrix.
 
     Raises:
-        ValueError: an argument has a wrong shape or type or is not finite, an offset is not compact, or a row's diagonal is not positive;
-            the message names it.
+        ValueError: an argument has a wrong shape or type or is not finite, an offset is not
+            compact, or a row's diagonal is not positive; the message names it.
 
     Example:
         >>> import numpy as np, warp_lcp as wl
@@ -75,53 +88,102 @@ class Stencil(GridOperator):
     """
 
     def __init__(
-        self, cells: Any, coefficients: Mapping[tuple[int, ...], Any] | Any, *, shift: Any = None,
-        periodic: tuple[bool, ...] = (False, False, False), outside: int = SOLID, device: Any = None, dtype: Any = wp.float32,
-    ) -> None:  # fmt: skip
+        self,
+        cells: Any,
+        coefficients: Mapping[tuple[int, ...], Any] | Any,
+        *,
+        shift: Any = None,
+        periodic: tuple[bool, ...] = (False, False, False),
+        outside: int = SOLID,
+        device: Any = None,
+        dtype: Any = wp.float32,
+    ) -> None:
         if outside not in (AIR, SOLID):
-            raise ValueError(f"outside = {outside}: allowed are wl.AIR = {AIR} and wl.SOLID = {SOLID}")
+            raise ValueError(
+                f"outside = {outside}: allowed are wl.AIR = {AIR} and wl.SOLID = {SOLID}"
+            )
         self.outside = outside
-        super().__init__(cells, {"coefficients": coefficients, "shift": shift}, periodic, device, dtype)
+        super().__init__(
+            cells, {"coefficients": coefficients, "shift": shift}, periodic, device, dtype
+        )
 
     def _take_coefficients(self, cells: np.ndarray, *, coefficients: Any, shift: Any) -> None:
         self._given = given = _by_offset(coefficients, cells.ndim)
-        self.shift, self._shift_given = self._stored_shift(shift), None if shift is None else tuple(np.shape(shift))
-        functions = {o: _of_three(f, cells.ndim) for o, f in given.items() if isinstance(f, wp.Function)}
-        values = {o: real_array(f, f"coefficients[{_named(o, cells.ndim)}]") for o, f in given.items() if o not in functions}
+        self.shift, self._shift_given = (
+            self._stored_shift(shift),
+            None if shift is None else tuple(np.shape(shift)),
+        )
+        functions = {
+            o: _of_three(f, cells.ndim) for o, f in given.items() if isinstance(f, wp.Function)
+        }
+        values = {
+            o: real_array(f, f"coefficients[{_named(o, cells.ndim)}]")
+            for o, f in given.items()
+            if o not in functions
+        }
         for o, f in values.items():
             if f.ndim and f.shape != cells.shape:
-                raise ValueError(f"coefficients[{_named(o, cells.ndim)}] has shape {f.shape}: expected a number or {cells.shape}")
+                raise ValueError(
+                    f"coefficients[{_named(o, cells.ndim)}] has shape {f.shape}: expected a number "
+                    f"or {cells.shape}"
+                )
             check_storable(f, self.dtype, f"coefficients[{_named(o, cells.ndim)}]")
             check_kept(f, self.dtype, f"coefficients[{_named(o, cells.ndim)}]")
             if f.ndim:  # numbers are not stored, but added up
                 self._note_rounding(f)
         if functions and any(f.ndim for f in values.values()):
             raise ValueError(
-                "coefficients: arrays and Warp functions cannot be combined: evaluate the functions or make the arrays functions"
+                "coefficients: arrays and Warp functions cannot be combined: evaluate the "
+                "functions or make the arrays functions"
             )
         fluid = cells.reshape(self.layout.padding.counts) == FLUID
         self._around_itself = [
             a for a in range(cells.ndim) if self._wraps[a] and fluid.shape[2 - a] == 1
         ]  # its cells are their own neighbors
-        if functions and (any(self.periodic) or self._around_itself):  # ghost cells, and sums, are had of arrays
+        # ghost cells, and sums, are had of arrays
+        if functions and (any(self.periodic) or self._around_itself):
             values, functions = values | {o: self._evaluated(f) for o, f in functions.items()}, {}
-        values = _folded({o: f.reshape(fluid.shape) if f.ndim else f for o, f in values.items()}, self._around_itself)
+        values = _folded(
+            {o: f.reshape(fluid.shape) if f.ndim else f for o, f in values.items()},
+            self._around_itself,
+        )
         evaluated = {o: self._evaluated(f) for o, f in functions.items()}  # to look at, not to keep
         full = {o: np.broadcast_to(f, fluid.shape) for o, f in values.items()} | evaluated
-        self._center = self._stored(full[CENTER]) if evaluated.keys() & {CENTER} or values[CENTER].ndim else None
+        self._center = (
+            self._stored(full[CENTER])
+            if evaluated.keys() & {CENTER} or values[CENTER].ndim
+            else None
+        )
         self._number = 0.0 if self._center is not None else float(values[CENTER])
         around = [o for o in sorted(full, key=lambda o: o[::-1]) if o != CENTER and full[o].any()]
         halves = self._pair_up(full, around) and not functions
-        halves = halves and not any(values[o].ndim == values[_opposite(o)].ndim == 0 and values[o] != values[_opposite(o)] for o in around)
+        halves = halves and not any(
+            values[o].ndim == values[_opposite(o)].ndim == 0 and values[o] != values[_opposite(o)]
+            for o in around
+        )
         stored = any(values[o].ndim for o in around if o in values)
-        kind = "arrays" if stored else "functions" if any(o in functions for o in around) else "numbers"
+        kind = (
+            "arrays"
+            if stored
+            else "functions"
+            if any(o in functions for o in around)
+            else "numbers"
+        )
         offsets = tuple(o for o in around if not halves or o[::-1] < CENTER)
-        kept = tuple(functions.get(o, float(values[o]) if o in values else 0.0) for o in offsets) if kind == "functions" else ()
+        kept = (
+            tuple(functions.get(o, float(values[o]) if o in values else 0.0) for o in offsets)
+            if kind == "functions"
+            else ()
+        )
         self._pattern = Pattern(offsets, halves, kind, kept)
-        self._weights = tuple(self._stored_weight(full, o, halves) for o in offsets) if stored else None
+        self._weights = (
+            tuple(self._stored_weight(full, o, halves) for o in offsets) if stored else None
+        )
         self._numbers = tuple(-float(values[o]) for o in offsets) if kind == "numbers" else ()
         sizes = {o: float(np.abs(full[o][fluid]).mean()) if fluid.any() else 0.0 for o in around}
-        self._strength: Any = tuple(sum(size for o, size in sizes.items() if o[axis]) / 2 for axis in range(3))
+        self._strength: Any = tuple(
+            sum(size for o, size in sizes.items() if o[axis]) / 2 for axis in range(3)
+        )
 
     @property
     def given(self) -> dict[tuple[int, ...], Any]:
@@ -129,7 +191,11 @@ class Stencil(GridOperator):
         return {_named(offset, len(self.shape)): value for offset, value in self._given.items()}
 
     def _arguments(self) -> dict[str, Any]:
-        return {"coefficients": self.given, "shift": self.shift if self.shift.size else None, "outside": self.outside}
+        return {
+            "coefficients": self.given,
+            "shift": self.shift if self.shift.size else None,
+            "outside": self.outside,
+        }
 
     def coefficient_gradient(self, multiplier: wp.array[Any], x: wp.array[Any]) -> dict[str, Any]:
         """Return the derivatives by each offset's coefficients and by the shift.
@@ -145,11 +211,31 @@ class Stencil(GridOperator):
 
         def of(offset: Offset, shape: tuple[int, ...]) -> Any:
             part = self.layout.zeros(wp.float64) if shape else None
-            step, row, plane = (0 if axis in self._around_itself else step for axis, step in enumerate(offset))
-            total = Sums(rows, 1).of(GRADIENT, cells=cells, multiplier=multiplier, x=x, part=part, step=step, row=row, plane=plane)
-            return total.item() if part is None else part.reshape(shape) if part.size == math.prod(shape) else self.layout.unload(part)
+            step, row, plane = (
+                0 if axis in self._around_itself else step for axis, step in enumerate(offset)
+            )
+            total = Sums(rows, 1).of(
+                GRADIENT,
+                cells=cells,
+                multiplier=multiplier,
+                x=x,
+                part=part,
+                step=step,
+                row=row,
+                plane=plane,
+            )
+            return (
+                total.item()
+                if part is None
+                else part.reshape(shape)
+                if part.size == math.prod(shape)
+                else self.layout.unload(part)
+            )
 
-        shapes = {o: self.shape if isinstance(f, wp.Function) else tuple(np.shape(f)) for o, f in self._given.items()}
+        shapes = {
+            o: self.shape if isinstance(f, wp.Function) else tuple(np.shape(f))
+            for o, f in self._given.items()
+        }
         given = self._shift_given
         found = {_named(o, len(self.shape)): of(o, shape) for o, shape in shapes.items()}
         return {"coefficients": found, "shift": None if given is None else of(CENTER, given)}
@@ -160,23 +246,43 @@ class Stencil(GridOperator):
         Its diagonal includes the contributions of closed sides.
         """
         fluid = self.cells.numpy()[1:-1, 1:-1, 1:-1] == FLUID
-        found: dict[tuple[int, ...], Any] = {(0,) * len(self.shape): np.where(fluid.reshape(self.shape), self.diagonal().numpy(), 1.0)}
+        found: dict[tuple[int, ...], Any] = {
+            (0,) * len(self.shape): np.where(
+                fluid.reshape(self.shape), self.diagonal().numpy(), 1.0
+            )
+        }
         for offset, here in self._full().items():
-            if offset != CENTER:  # a_o(i) is the neighbor's coefficient for i; between FLUID cells, so that any of them may be left out
+            # a_o(i) is the neighbor's coefficient for i; between FLUID cells, so that any of them
+            # may be left out
+            if offset != CENTER:
                 there = self._beside(np.where(fluid, here, 0.0), _opposite(offset))
-                found[_named(_opposite(offset), len(self.shape))] = np.where(fluid, there, 0.0).reshape(self.shape)
+                found[_named(_opposite(offset), len(self.shape))] = np.where(
+                    fluid, there, 0.0
+                ).reshape(self.shape)
         cells = np.where(fluid, FLUID, AIR).reshape(self.shape)
-        return Stencil(cells, found, periodic=self.periodic, outside=AIR, device=self.device, dtype=self.dtype)
+        return Stencil(
+            cells, found, periodic=self.periodic, outside=AIR, device=self.device, dtype=self.dtype
+        )
 
     def _pair_up(self, full: dict[Offset, np.ndarray], around: list[Offset]) -> bool:
         """Find where a_o(i) is not a_-o(i + o), and where it is positive; return whether all sides between cells have one coefficient."""
         differing = [(o, self._beside(np.ones_like(full[o], dtype=bool), o)) for o in around]
         differing = [
-            (o, between & (full[o] != self._beside(full[_opposite(o)], o) if _opposite(o) in full else full[o] != 0))
+            (
+                o,
+                between
+                & (
+                    full[o] != self._beside(full[_opposite(o)], o)
+                    if _opposite(o) in full
+                    else full[o] != 0
+                ),
+            )
             for o, between in differing
         ]
         self._differing = [(o, where) for o, where in differing if where.any()]
-        positive = functools.reduce(np.logical_or, [full[o] > 0 for o in around], np.zeros_like(full[CENTER], dtype=bool))
+        positive = functools.reduce(
+            np.logical_or, [full[o] > 0 for o in around], np.zeros_like(full[CENTER], dtype=bool)
+        )
         self._positive = positive if positive.any() else None
         self.symmetric = self.monotone = True  # until `_fill_stencil` has seen the cells
         return not self._differing and all(_opposite(o) in around for o in around)
@@ -185,7 +291,9 @@ class Stencil(GridOperator):
         """Find whether A is symmetric and monotone on the FLUID cells that there are."""
         if self._differing or self._positive is not None:
             fluid = self.cells.numpy()[1:-1, 1:-1, 1:-1] == FLUID
-            self.symmetric = self.symmetric and not any((where & fluid & self._beside(fluid, o)).any() for o, where in self._differing)
+            self.symmetric = self.symmetric and not any(
+                (where & fluid & self._beside(fluid, o)).any() for o, where in self._differing
+            )
             self._differing = self._differing if self.symmetric else []
             self.monotone = self._positive is None or not (self._positive & fluid).any()
 
@@ -201,10 +309,14 @@ class Stencil(GridOperator):
         """Return the coefficients of all cells by offset, (nz, ny, nx)."""
         n, counts = len(self.shape), self.layout.padding.counts
         values = {
-            o: self._evaluated(_of_three(f, n)) if isinstance(f, wp.Function) else real_array(f, "coefficients")
+            o: self._evaluated(_of_three(f, n))
+            if isinstance(f, wp.Function)
+            else real_array(f, "coefficients")
             for o, f in self._given.items()
         }
-        folded = _folded({o: f.reshape(counts) if f.ndim else f for o, f in values.items()}, self._around_itself)
+        folded = _folded(
+            {o: f.reshape(counts) if f.ndim else f for o, f in values.items()}, self._around_itself
+        )
         return {o: np.broadcast_to(f, counts) for o, f in folded.items()}
 
     def _evaluated(self, function: Any) -> np.ndarray:
@@ -223,16 +335,20 @@ class Stencil(GridOperator):
         """Return coefficients of all cells as a stored field."""
         return wp.array(np.pad(values, 1).ravel(), dtype=self.dtype, device=self.device)
 
-    def _stored_weight(self, full: dict[Offset, np.ndarray], offset: Offset, halves: bool) -> wp.array[Any]:
+    def _stored_weight(
+        self, full: dict[Offset, np.ndarray], offset: Offset, halves: bool
+    ) -> wp.array[Any]:
         """Return an offset's weights as a stored field.
 
-        Ghost cells of periodic axes have those of the cells they stand for. A weight that serves two cells is stored at the upper one:
-        ghost cells beyond the array have those of the cells' upper sides there.
+        Ghost cells of periodic axes have those of the cells they stand for. A weight that serves
+        two cells is stored at the upper one: ghost cells beyond the array have those of the cells'
+        upper sides there.
         """
         padded = self._wrapped(-full[offset])
         if halves:
             steps = tuple(-step for step in offset[::-1])
-            lower = np.roll(self._wrapped(-full[_opposite(offset)]), steps, (0, 1, 2))  # of the cell below, seen from the upper one
+            # of the cell below, seen from the upper one
+            lower = np.roll(self._wrapped(-full[_opposite(offset)]), steps, (0, 1, 2))
             for axis in (a for a in range(3) if offset[2 - a] and not self.periodic[2 - a]):
                 ghosts = (slice(None),) * axis + (-1 if offset[2 - axis] < 0 else 0,)
                 padded[ghosts] = lower[ghosts]
@@ -248,8 +364,15 @@ class Stencil(GridOperator):
 
     def _empty_stencil(self) -> PaddedStencil:
         layout = self.layout
-        options: dict[str, Any] = {"periodic": self.periodic, "spans": self._spans, "strength": self._strength, "pattern": self._pattern}
-        return PaddedStencil(layout.padding, layout.zeros(self.dtype), self._weights, self._numbers, **options)
+        options: dict[str, Any] = {
+            "periodic": self.periodic,
+            "spans": self._spans,
+            "strength": self._strength,
+            "pattern": self._pattern,
+        }
+        return PaddedStencil(
+            layout.padding, layout.zeros(self.dtype), self._weights, self._numbers, **options
+        )
 
     def _fill_stencil(self) -> None:
         s = self.stencil
@@ -257,13 +380,23 @@ class Stencil(GridOperator):
         self._find_signs()
         shift = self.shift.flatten() if self.shift.size else None
         DIAGONAL.bind(
-            self._rows_in_reach, stencil=s, cells=self.cells_around.flatten(), center=self._center, shift=shift,
-            number=self._number, made=s.d,
-        ).launch()  # fmt: skip
+            self._rows_in_reach,
+            stencil=s,
+            cells=self.cells_around.flatten(),
+            center=self._center,
+            shift=shift,
+            number=self._number,
+            made=s.d,
+        ).launch()
         d, fluid = s.d.numpy(), self.cells.numpy().ravel() == FLUID
         if not (d[fluid] > 0).all():
-            where = tuple(map(int, np.argwhere((fluid & (d <= 0)).reshape(self.layout.stored_shape))[0] - 1))[-len(self.shape) :]
-            raise ValueError(f"coefficients: the diagonal of cell {where} is {d[fluid].min():.3g}, with its closed sides: must be > 0")
+            where = tuple(
+                map(int, np.argwhere((fluid & (d <= 0)).reshape(self.layout.stored_shape))[0] - 1)
+            )[-len(self.shape) :]
+            raise ValueError(
+                f"coefficients: the diagonal of cell {where} is {d[fluid].min():.3g}, with its "
+                "closed sides: must be > 0"
+            )
 
     def apply_transpose(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
         """Return A' x, as `apply` does A x."""
@@ -282,8 +415,9 @@ class Stencil(GridOperator):
         The sums of a_o(i) value_(i + o), float64, shape of `cells`.
 
         Args:
-            values: field of the shape of `cells`, or padded, (nz + 2, ny + 2, nx + 2) or (ny + 2, nx + 2), with the values outside; values
-                of FLUID and SOLID cells and of the padding along a periodic axis are ignored.
+            values: field of the shape of `cells`, or padded, (nz + 2, ny + 2, nx + 2) or (ny + 2,
+                nx + 2), with the values outside; values of FLUID and SOLID cells and of the padding
+                along a periodic axis are ignored.
         """
         host = real_array(values, "values")
         padded = np.zeros(self.layout.stored_shape)
@@ -292,9 +426,16 @@ class Stencil(GridOperator):
         elif host.shape == tuple(n + 2 for n in self.shape):
             padded[(slice(None),) * 3 if host.ndim == 3 else 1] = host
         else:
-            raise ValueError(f"values has shape {host.shape}: expected {self.shape} or {tuple(n + 2 for n in self.shape)}")
+            raise ValueError(
+                f"values has shape {host.shape}: expected {self.shape} or "
+                f"{tuple(n + 2 for n in self.shape)}"
+            )
         check_storable(padded, wp.float64, "values")
-        given = wp.array(np.where(self.cells.numpy() == AIR, padded, 0).ravel(), dtype=wp.float64, device=self.device)
+        given = wp.array(
+            np.where(self.cells.numpy() == AIR, padded, 0).ravel(),
+            dtype=wp.float64,
+            device=self.device,
+        )
         out = self.layout.zeros(wp.float64)
         self.stencil.product(given, out)
         return self.layout.unload(out)
@@ -311,36 +452,56 @@ class Stencil(GridOperator):
 
     def _find_floating(self) -> FloatingComponents | None:
         """Look for components on which all rows sum to 0, or all columns: on the host."""
-        fluid = (self.cells.numpy() == FLUID) & (self.stencil.d.numpy().reshape(self.layout.stored_shape) != 0)
+        fluid = (self.cells.numpy() == FLUID) & (
+            self.stencil.d.numpy().reshape(self.layout.stored_shape) != 0
+        )
         inside = fluid.ravel()
         rows = self._sums_vanish(inside, transposed=False)
         columns = rows if self.symmetric else self._sums_vanish(inside, transposed=True)
         if not (rows[inside].any() or columns[inside].any()):
             return None
         places = np.flatnonzero(inside)
-        if self.symmetric and not any(self.periodic) and all((w.numpy()[places] != 0).all() for w in self.stencil.weights or ()):
+        if (
+            self.symmetric
+            and not any(self.periodic)
+            and all((w.numpy()[places] != 0).all() for w in self.stencil.weights or ())
+        ):
             structure = np.zeros((3, 3, 3), dtype=bool)  # of all neighbors that are coupled
-            for offset in (o for kept in self._pattern.offsets for o in (kept, CENTER, _opposite(kept))):
+            for offset in (
+                o for kept in self._pattern.offsets for o in (kept, CENTER, _opposite(kept))
+            ):
                 structure[tuple(step + 1 for step in offset[::-1])] = True
             number, count = scipy.ndimage.label(fluid, structure)
             number = number.ravel()
-            return numbered_components(number, np.bincount(number, inside & ~rows, count + 1) > 0, self.device)
+            return numbered_components(
+                number, np.bincount(number, inside & ~rows, count + 1) > 0, self.device
+            )
         matrix = grid_matrix(self)
         if len(places) < matrix.shape[0]:  # a principal system
             kept = inside[self.cells.numpy().ravel() == FLUID]
             matrix = matrix[kept][:, kept]
         most = MOST_IN_SPACE if self.layout.padding.counts[0] > 1 else MOST_IN_PLANE
-        found = null_vectors(matrix, rows[places], columns[places], most=most if self.monotone else 0)
-        number, fields = np.zeros(inside.size, dtype=np.int32), [np.ones(inside.size) for _ in range(2)]
+        found = null_vectors(
+            matrix, rows[places], columns[places], most=most if self.monotone else 0
+        )
+        number, fields = (
+            np.zeros(inside.size, dtype=np.int32),
+            [np.ones(inside.size) for _ in range(2)],
+        )
         number[places] = found.number + 1
         for field, vector in zip(fields, (found.left, found.right), strict=True):
             field[places] = vector
         left, right = (None if (field == 1).all() else field for field in fields)
-        return numbered_components(number, np.r_[True, found.held], self.device, left=left, right=right)
+        return numbered_components(
+            number, np.r_[True, found.held], self.device, left=left, right=right
+        )
 
     def _sums_vanish(self, inside: np.ndarray, *, transposed: bool) -> np.ndarray:
         """Return which rows, or columns, of a flat stored field sum to 0 but for rounding."""
-        x, sums = wp.array(np.where(inside, 1.0, 0.0), dtype=wp.float64, device=self.device), self.layout.zeros(wp.float64)
+        x, sums = (
+            wp.array(np.where(inside, 1.0, 0.0), dtype=wp.float64, device=self.device),
+            self.layout.zeros(wp.float64),
+        )
         self._product(x, sums, transposed=transposed)
         rounding = 8 * float(np.finfo(wp.dtype_to_numpy(self.dtype)).eps)
         center = np.abs(self._number) if self._center is None else np.abs(self._center.numpy())
@@ -351,10 +512,22 @@ class Stencil(GridOperator):
         """Pickle cells and coefficients; those that are Warp functions as arrays."""
         cells, options = self._pickled()
         n = cells.ndim
-        given = {o: self._evaluated(_of_three(f, n)).reshape(cells.shape) if isinstance(f, wp.Function) else
-                 f.numpy() if isinstance(f, wp.array) else f for o, f in self.given.items()}  # fmt: skip
+        given = {
+            o: self._evaluated(_of_three(f, n)).reshape(cells.shape)
+            if isinstance(f, wp.Function)
+            else f.numpy()
+            if isinstance(f, wp.array)
+            else f
+            for o, f in self.given.items()
+        }
         shift = OnHost(self.shift) if self.shift.size else None
-        return made_again(Stencil, cells, **self._arguments() | {"coefficients": given, "shift": shift}, device=self.device, **options)
+        return made_again(
+            Stencil,
+            cells,
+            **self._arguments() | {"coefficients": given, "shift": shift},
+            device=self.device,
+            **options,
+        )
 
 
 class StoredStencil(GridOperator):
@@ -364,7 +537,8 @@ class StoredStencil(GridOperator):
         cells: as of `Stencil`; beyond the array there is AIR.
         d: diagonal in units of `unit`, stored; 0 off the FLUID cells.
         weights: of the pattern's neighbors, stored, or numbers.
-        pattern: which neighbors, and how their weights are had; None: weights along x, y, z of 5 or 7 points, as `PaddedStencil` has them.
+        pattern: which neighbors, and how their weights are had; None: weights along x, y, z of 5 or
+            7 points, as `PaddedStencil` has them.
         symmetric: whether A is.
         unit: of the diagonal.
         monotone: whether all weights are >= 0.
@@ -374,9 +548,17 @@ class StoredStencil(GridOperator):
     outside = AIR
 
     def __init__(
-        self, cells: np.ndarray, d: wp.array[Any], weights: tuple[Any, ...], pattern: Pattern | None, *, symmetric: bool, unit: float = 1.0,
-        monotone: bool = False, strength: tuple[float, float, float] = (1.0, 1.0, 1.0),
-    ) -> None:  # fmt: skip
+        self,
+        cells: np.ndarray,
+        d: wp.array[Any],
+        weights: tuple[Any, ...],
+        pattern: Pattern | None,
+        *,
+        symmetric: bool,
+        unit: float = 1.0,
+        monotone: bool = False,
+        strength: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    ) -> None:
         self.symmetric, self.monotone = symmetric, monotone
         self._made, self._unit = (d, weights, pattern, strength), unit
         super().__init__(cells, {}, (), d.device, wp.float64 if d.dtype is wp.uint8 else d.dtype)
@@ -397,7 +579,16 @@ class StoredStencil(GridOperator):
     def _empty_stencil(self) -> PaddedStencil:
         d, weights, pattern, strength = self._made
         fields, numbers = (None, weights) if isinstance(weights[0], float) else (weights, ())
-        return PaddedStencil(self.layout.padding, d, fields, numbers, self._unit, spans=self._spans, strength=strength, pattern=pattern)
+        return PaddedStencil(
+            self.layout.padding,
+            d,
+            fields,
+            numbers,
+            self._unit,
+            spans=self._spans,
+            strength=strength,
+            pattern=pattern,
+        )
 
     def _fill_stencil(self) -> None:
         self._wrap_cells()
@@ -427,15 +618,25 @@ def _by_offset(coefficients: Any, dimension: int) -> dict[Offset, Any]:
     if not isinstance(coefficients, Mapping):
         host = real_array(coefficients, "coefficients")
         if host.shape != (3,) * dimension:
-            raise ValueError(f"coefficients has shape {host.shape}: expected {(3,) * dimension}, or a mapping by offset")
+            raise ValueError(
+                f"coefficients has shape {host.shape}: expected {(3,) * dimension}, or a mapping "
+                "by offset"
+            )
         places = itertools.product(range(3), repeat=dimension)
-        coefficients = {tuple(i - 1 for i in place): float(host[place]) for place in places if host[place]}
+        coefficients = {
+            tuple(i - 1 for i in place): float(host[place]) for place in places if host[place]
+        }
     given: dict[Offset, Any] = {}
     for offset, value in coefficients.items():
         steps = tuple(offset) if isinstance(offset, tuple) else (offset,)
-        if len(steps) != dimension or not all(isinstance(s, (int, np.integer)) and -1 <= s <= 1 for s in steps):
+        if len(steps) != dimension or not all(
+            isinstance(s, (int, np.integer)) and -1 <= s <= 1 for s in steps
+        ):
             form = ("(dy, dx)", "(dz, dy, dx)")[dimension - 2]
-            raise ValueError(f"coefficients: offset {offset}: expected {form}, each -1, 0 or 1: wider stencils need a wl.SparseOperator")
+            raise ValueError(
+                f"coefficients: offset {offset}: expected {form}, each -1, 0 or 1: wider stencils "
+                "need a wl.SparseOperator"
+            )
         given[tuple(map(int, reversed((0,) * (3 - dimension) + steps)))] = value  # type: ignore[index]
     if CENTER not in given:
         raise ValueError(f"coefficients: the center, offset {(0,) * dimension}, is missing")
@@ -447,7 +648,10 @@ def _of_three(function: Any, dimension: int) -> Any:
     """Return a Warp function of (k, j, i) in float64 from one of a cell's indices."""
     count = len(function.input_types)
     if count != dimension:
-        raise ValueError(f"coefficients: {function.key} takes {count} arguments: expected the {dimension} indices of a cell, integers")
+        raise ValueError(
+            f"coefficients: {function.key} takes {count} arguments: expected the {dimension} "
+            "indices of a cell, integers"
+        )
     if dimension == 3:
 
         @no_type_check

@@ -30,8 +30,9 @@ FELT = 1e-5  # of the sum of a column's sizes over a component: open fractions a
 class SumOperator(Pickled):
     """Sum of two operators: (A + B) x = A x + B x.
 
-    It has no sweep: use methods that need only products (Newton types, gradient methods). With a grid
-    operator and a LowRankOperator as its terms, principal systems are preconditioned by the grid's multigrid.
+    It has no sweep: use methods that need only products (Newton types, gradient methods). With a
+    grid operator and a LowRankOperator as its terms, principal systems are preconditioned by the
+    grid's multigrid.
 
     Args:
         A: an operator, numpy array or scipy.sparse matrix.
@@ -50,7 +51,9 @@ class SumOperator(Pickled):
     def __init__(self, A: Any, B: Any) -> None:
         first, second = as_operator(A), as_operator(B)
         if tuple(first.shape) != tuple(second.shape):
-            raise ValueError(f"B has shape {tuple(second.shape)}: expected A's, {tuple(first.shape)}")
+            raise ValueError(
+                f"B has shape {tuple(second.shape)}: expected A's, {tuple(first.shape)}"
+            )
         if first.device != second.device:
             raise ValueError(f"B is on {second.device}: expected A's device, {first.device}")
         if isinstance(first, LowRankOperator):
@@ -59,13 +62,18 @@ class SumOperator(Pickled):
             second = second.stored_like(first)
         self.layout = layout_of(first)
         if self.layout.stored_shape != layout_of(second).stored_shape:
-            raise ValueError("A and B store their fields differently (a grid's are padded): they cannot be summed")
+            raise ValueError(
+                "A and B store their fields differently (a grid's are padded): they cannot be "
+                "summed"
+            )
         self.first: Operator = first
         self.second: Operator = second
         self.shape, self.device = tuple(first.shape), first.device
         self.dtype = wp.float64 if wp.float64 in (first.dtype, second.dtype) else wp.float32
         self._scratch: dict[Any, wp.array[Any]] = {}
-        terms: tuple[Operator, Operator] = (second, first) if isinstance(first, LowRankOperator) else (first, second)
+        terms: tuple[Operator, Operator] = (
+            (second, first) if isinstance(first, LowRankOperator) else (first, second)
+        )
         self._plain, self._low = terms
         for term in (second, first):
             if has(term, HasCells):
@@ -105,7 +113,11 @@ class SumOperator(Pickled):
 
         The diagonal of a grid and a symmetric term of low rank; None for other sums.
         """
-        return None if grid_and_low_rank(self) is None else self.layout.load(self.diagonal(), self.dtype).numpy()
+        return (
+            None
+            if grid_and_low_rank(self) is None
+            else self.layout.load(self.diagonal(), self.dtype).numpy()
+        )
 
     def apply_plus(self, x: wp.array[Any], b: wp.array[Any], out: wp.array[Any]) -> None:
         """Evaluate out = A x + B x + b; flat stored fields of one type."""
@@ -123,8 +135,8 @@ class SumOperator(Pickled):
 
         Also None if a term does not provide its own.
 
-        The constants of a component are a null space unless a column of a LowRankOperator acts on them: a body that closes off a
-        chamber as a piston does is moved by the pressure in it.
+        The constants of a component are a null space unless a column of a LowRankOperator acts on
+        them: a body that closes off a chamber as a piston does is moved by the pressure in it.
         """
         plain, low = self._plain, self._low
         if not (isinstance(low, LowRankOperator) and has(plain, NamesComponents)):
@@ -133,12 +145,22 @@ class SumOperator(Pickled):
         return (
             None
             if found is None
-            else found.without(_felt(found.label, found.count, low, weighted=found.left is not None or found.right is not None))
+            else found.without(
+                _felt(
+                    found.label,
+                    found.count,
+                    low,
+                    weighted=found.left is not None or found.right is not None,
+                )
+            )
         )
 
     def storage_rounding(self) -> float:
         """Return the larger relative rounding of the terms."""
-        return max((A.storage_rounding() for A in (self.first, self.second) if has(A, StoresRounded)), default=0.0)
+        return max(
+            (A.storage_rounding() for A in (self.first, self.second) if has(A, StoresRounded)),
+            default=0.0,
+        )
 
     def masked(self, free: Any, shift: Any = None) -> SumOperator:
         """Return P (A + B) P + P D P with P the restriction to `free`, D = diag(shift).
@@ -151,7 +173,9 @@ class SumOperator(Pickled):
             return SumOperator(self.first.masked(free), second.masked(free, shift))
         return SumOperator(first.masked(free, shift), second.masked(free))
 
-    def _add(self, x: wp.array[Any], out: wp.array[Any] | None, *, transposed: bool) -> wp.array[Any]:
+    def _add(
+        self, x: wp.array[Any], out: wp.array[Any] | None, *, transposed: bool
+    ) -> wp.array[Any]:
         if x.size not in (self.layout.size, int(np.prod(self.shape))):
             raise ValueError(f"x has shape {tuple(x.shape)}: expected {self.shape}")
         out = wp.zeros_like(x) if out is None else out

@@ -52,12 +52,15 @@ class AffineBounds:
 
     Where index_i = -1 the bound is the constant c_i.
 
-    Given to `LCP` as `lower` or `upper`. The unknown x_j that a bound depends on must itself have constant bounds. Methods that evaluate
-    their bounds at the iterate take such problems (sweeps, NNCG, SubspaceMinimization, Staggering); others refuse.
-    With them the problem is a quasi-variational inequality, which may have no solution or several, and no convergence proof covers it.
+    Given to `LCP` as `lower` or `upper`. The unknown x_j that a bound depends on must itself have
+    constant bounds. Methods that evaluate their bounds at the iterate take such problems (sweeps,
+    NNCG, SubspaceMinimization, Staggering); others refuse. With them the problem is a
+    quasi-variational inequality, which may have no solution or several, and no convergence proof
+    covers it.
 
     Args:
-        constant: a number or a field of the problem's shape; -inf or inf where there is no bound (with index -1).
+        constant: a number or a field of the problem's shape; -inf or inf where there is no bound
+            (with index -1).
         index: flat index into a field of the problem's shape, or -1; integers, that shape.
         coefficient: a number or a field of that shape, finite.
 
@@ -75,20 +78,29 @@ class AffineBounds:
         if not np.issubdtype(index.dtype, np.integer):
             raise ValueError(f"index has type {index.dtype}: expected integers")
         if index.size and (index.min() < -1 or index.max() >= index.size):
-            raise ValueError(f"index has values from {index.min()} to {index.max()}: expected -1 ... {index.size - 1}")
+            raise ValueError(
+                f"index has values from {index.min()} to {index.max()}: expected -1 ... "
+                f"{index.size - 1}"
+            )
         object.__setattr__(self, "index", index)
         for name in ("constant", "coefficient"):
             value = np.asarray(real_array(getattr(self, name), name), dtype=np.float64)
             if value.shape not in ((), index.shape):
-                raise ValueError(f"{name} has shape {value.shape}: expected a number or {index.shape}")
+                raise ValueError(
+                    f"{name} has shape {value.shape}: expected a number or {index.shape}"
+                )
             object.__setattr__(self, name, np.array(np.broadcast_to(value, index.shape)))
         if not np.isfinite(self.coefficient[index >= 0]).all():
             raise ValueError("coefficient holds a value that is not finite")
         if not np.isfinite(self.constant[index >= 0]).all():
-            raise ValueError("constant holds a value that is not finite where the bound depends on x")
+            raise ValueError(
+                "constant holds a value that is not finite where the bound depends on x"
+            )
 
     @classmethod
-    def friction(cls, normal: Any, mu: Any, lower: Any = 0.0, upper: Any = np.inf) -> tuple[AffineBounds, AffineBounds]:
+    def friction(
+        cls, normal: Any, mu: Any, lower: Any = 0.0, upper: Any = np.inf
+    ) -> tuple[AffineBounds, AffineBounds]:
         """Return the bounds of a friction box: |x_i| <= mu_i x_j with j = normal_i.
 
         Where normal_i = -1 they are [lower_i, upper_i].
@@ -113,12 +125,17 @@ class AffineBounds:
             raise ValueError("mu holds a negative value or NaN: friction coefficients are >= 0")
         slope = np.where(tangential, mu, 0.0)
         sides = (np.where(tangential, 0.0, side) for side in (lower, upper))
-        low, high = (cls(constant, index, sign * slope) for constant, sign in zip(sides, (-1.0, 1.0), strict=True))
+        low, high = (
+            cls(constant, index, sign * slope)
+            for constant, sign in zip(sides, (-1.0, 1.0), strict=True)
+        )
         return low, high
 
     def at(self, x: np.ndarray) -> np.ndarray:
         """Return the bounds at x (numpy, the field's shape)."""
-        values = self.constant + self.coefficient * np.where(self.index >= 0, x.ravel()[self.index], 0.0)
+        values = self.constant + self.coefficient * np.where(
+            self.index >= 0, x.ravel()[self.index], 0.0
+        )
         return np.where(self.index >= 0, values, self.constant)
 
 
@@ -129,7 +146,8 @@ class AffineFields:
         constant: stored fields (lower, upper), float64.
         index: stored int32 fields of stored indices, -1 where the bound is the constant.
         coefficient: stored fields, float64.
-        values: stored fields, the bounds at the x of the last `evaluate`; at clip(0, l, u) before that.
+        values: stored fields, the bounds at the x of the last `evaluate`; at clip(0, l, u) before
+            that.
         sides: both sides as AffineBounds.
     """
 
@@ -140,19 +158,33 @@ class AffineFields:
         ]
         for side, name in zip(sides, SIDES, strict=True):
             if not layout.fits(side.index):
-                raise ValueError(f"{name}: index has shape {side.index.shape}: expected {layout.shape}")
+                raise ValueError(
+                    f"{name}: index has shape {side.index.shape}: expected {layout.shape}"
+                )
         self.sides = (sides[0], sides[1])
         indices = [np.where(s.index >= 0, layout.places(s.index)[s.index], -1) for s in sides]
-        self.constant = [layout.load(s.constant, wp.float64, name) for s, name in zip(sides, SIDES, strict=True)]
-        self.coefficient = [layout.load(s.coefficient, wp.float64, name) for s, name in zip(sides, SIDES, strict=True)]
+        self.constant = [
+            layout.load(s.constant, wp.float64, name) for s, name in zip(sides, SIDES, strict=True)
+        ]
+        self.coefficient = [
+            layout.load(s.coefficient, wp.float64, name)
+            for s, name in zip(sides, SIDES, strict=True)
+        ]
         # ghost cells become 0 by loading, so that -1 is stored as 0 and the others one too large
-        shifted = [layout.load(i + 1, wp.int32, name) for i, name in zip(indices, SIDES, strict=True)]
-        self.index = [wp.array(s.numpy() - 1, dtype=wp.int32, device=layout.device) for s in shifted]
+        shifted = [
+            layout.load(i + 1, wp.int32, name) for i, name in zip(indices, SIDES, strict=True)
+        ]
+        self.index = [
+            wp.array(s.numpy() - 1, dtype=wp.int32, device=layout.device) for s in shifted
+        ]
         dependent = [i.numpy() >= 0 for i in self.index]
         for number, name in enumerate(SIDES):
             needed = self.index[number].numpy()[dependent[number]]
             if (dependent[0] | dependent[1])[needed].any():
-                raise ValueError(f"{name} depends on an unknown whose own bounds are affine: these must be constant")
+                raise ValueError(
+                    f"{name} depends on an unknown whose own bounds are affine: these must be "
+                    "constant"
+                )
         self.values = [wp.clone(c) for c in self.constant]
         self._check()
 
@@ -164,15 +196,23 @@ class AffineFields:
     @cached_property
     def operands(self) -> list[AffineSide]:
         """Lower and upper bounds as kernels take them."""
-        return [affine_side(*of) for of in zip(self.constant, self.index, self.coefficient, strict=True)]
+        return [
+            affine_side(*of) for of in zip(self.constant, self.index, self.coefficient, strict=True)
+        ]
 
     def _check(self) -> None:
         """Refuse boxes that are empty where the unknown which decides them is at one of its own bounds; evaluate at clip(0, l, u)."""
         low, high = (c.numpy() for c in self.constant)
         for x in (np.clip(0.0, low, high), low, high):
-            at = [self._host(side, np.where(np.isfinite(x), x, np.clip(0.0, low, high))) for side in (0, 1)]
+            at = [
+                self._host(side, np.where(np.isfinite(x), x, np.clip(0.0, low, high)))
+                for side in (0, 1)
+            ]
             if (at[0] > at[1]).any():
-                raise ValueError(f"lower > upper in {np.count_nonzero(at[0] > at[1])} unknowns if those they depend on are at a bound")
+                raise ValueError(
+                    f"lower > upper in {np.count_nonzero(at[0] > at[1])} unknowns if those they "
+                    "depend on are at a bound"
+                )
         start = np.clip(0.0, low, high)
         for side in (0, 1):
             self.values[side].assign(self._host(side, start))
@@ -180,7 +220,11 @@ class AffineFields:
     def _host(self, side: int, x: np.ndarray) -> np.ndarray:
         index, coefficient = self.index[side].numpy(), self.coefficient[side].numpy()
         with np.errstate(invalid="ignore"):
-            return np.where(index >= 0, self.constant[side].numpy() + coefficient * x[index], self.constant[side].numpy())
+            return np.where(
+                index >= 0,
+                self.constant[side].numpy() + coefficient * x[index],
+                self.constant[side].numpy(),
+            )
 
 
 def affine_side(constant: wp.array[Any], index: Any = None, coefficient: Any = None) -> AffineSide:

@@ -19,8 +19,11 @@ from warp_lcp.rows.program import Launch, launch_now
 from warp_lcp.rows.vectors import Sums
 
 NAMES, INFINITE = ("lower", "upper"), (-np.inf, np.inf)
-INFINITY = 1e20  # a bound of this magnitude is infinite in files and to SciPy's and qpsolvers' users, as OSQP and CPLEX take it
-LAUNCHED = 4096  # elements from which a kernel looks at fields on the CPU: below, NumPy takes less than the launch
+# a bound of this magnitude is infinite in files and to SciPy's and qpsolvers' users, as OSQP and
+# CPLEX take it
+INFINITY = 1e20
+# elements from which a kernel looks at fields on the CPU: below, NumPy takes less than the launch
+LAUNCHED = 4096
 BITS = (1, 2)  # of a code: the lower bound is finite, the upper one is
 KERNELS = KernelFile(Path(__file__).parent / "headers/bound_codes.h")
 ENCODE = KERNELS["bounds.encode"]
@@ -31,8 +34,9 @@ DECODE = KERNELS["bounds.decode"]
 class Bounds:
     """Lower and upper bounds, each a number or a field.
 
-    A pressure is bounded by 0 on wall cells and not at all elsewhere: such bounds are coded, one byte a cell with a bit for each side.
-    Fields from the host are not kept then. Fields on the device, which the caller may change, are; `refresh` codes them again.
+    A pressure is bounded by 0 on wall cells and not at all elsewhere: such bounds are coded, one
+    byte a cell with a bit for each side. Fields from the host are not kept then. Fields on the
+    device, which the caller may change, are; `refresh` codes them again.
 
     Args:
         layout: of the problem's fields.
@@ -40,22 +44,37 @@ class Bounds:
         upper: likewise.
 
     Attributes:
-        affine: where bounds depend on x: what they are made of; `fields` then hold them at the x of the last `follow`.
+        affine: where bounds depend on x: what they are made of; `fields` then hold them at the x of
+            the last `follow`.
         fields: stored float64 fields; empty where a number or the code counts.
-        values: the numbers that count where there is no field; where bounds are coded, the value of the finite ones.
-        code: stored uint8 field, bit 1 where the lower bound is finite, bit 2 where the upper one is; empty if bounds are not coded.
+        values: the numbers that count where there is no field; where bounds are coded, the value of
+            the finite ones.
+        code: stored uint8 field, bit 1 where the lower bound is finite, bit 2 where the upper one
+            is; empty if bounds are not coded.
     """
 
     def __init__(self, layout: Layout, lower: Any, upper: Any) -> None:
         self.layout, self.device = layout, layout.device
         self._none, self._no_code = nothing(wp.float64, self.device), nothing(wp.uint8, self.device)
-        self.fields, self.values, self.code = [self._none, self._none], list(INFINITE), self._no_code
+        self.fields, self.values, self.code = (
+            [self._none, self._none],
+            list(INFINITE),
+            self._no_code,
+        )
         self._memory: wp.array[Any] | None = None
         self.affine = affine_fields(layout, lower, upper)
         if self.affine is not None:
-            self.fields, self.values, self.varying, self.in_place = list(self.affine.values), [0.0, 0.0], (True, True), False
+            self.fields, self.values, self.varying, self.in_place = (
+                list(self.affine.values),
+                [0.0, 0.0],
+                (True, True),
+                False,
+            )
             return
-        low, high = (v if isinstance(v, wp.array) else real_array(v, name) for v, name in zip((lower, upper), NAMES, strict=True))
+        low, high = (
+            v if isinstance(v, wp.array) else real_array(v, name)
+            for v, name in zip((lower, upper), NAMES, strict=True)
+        )
         sides = (low, high)
         varies = [v.ndim > 0 for v in sides]
         self.varying = (varies[0], varies[1])
@@ -75,7 +94,9 @@ class Bounds:
     @property
     def may_bind(self) -> tuple[bool, bool]:
         """Whether a lower and an upper bound may be finite, now or after the caller changed a field."""
-        below, above = (self.varying[side] or bool(np.isfinite(self.values[side])) for side in (0, 1))
+        below, above = (
+            self.varying[side] or bool(np.isfinite(self.values[side])) for side in (0, 1)
+        )
         return below, above
 
     @property
@@ -86,7 +107,11 @@ class Bounds:
         """
         if self.affine is not None or self.in_place:
             return None
-        return tuple(field.size for field in (*self.fields, self.code)), self.varying, *map(float.hex, self.values)
+        return (
+            tuple(field.size for field in (*self.fields, self.code)),
+            self.varying,
+            *map(float.hex, self.values),
+        )
 
     def replica(self) -> Bounds:
         """Return the same bounds in memory of their own."""
@@ -120,7 +145,13 @@ class Bounds:
         for side in (0, 1):
             held = self.fields[side].size and self.in_place
             field = self.as_field(side) if self.varying[side] else None
-            sides.append(self.values[side] if field is None else OnHost(field) if held else field.numpy().copy())
+            sides.append(
+                self.values[side]
+                if field is None
+                else OnHost(field)
+                if held
+                else field.numpy().copy()
+            )
         return sides[0], sides[1]
 
     def refresh(self) -> None:
@@ -136,9 +167,19 @@ class Bounds:
         if self._memory is None:
             self._memory = self.layout.zeros(wp.uint8)
             self._others = Sums(Rows.of_fields(self.layout))
-        least, most = (0.0 if field.size else v for field, v in zip(self.fields, self.values, strict=True))
+        least, most = (
+            0.0 if field.size else v for field, v in zip(self.fields, self.values, strict=True)
+        )
         lower, upper = self.fields
-        self._others.launch(ENCODE, launch=launch, lower=lower, upper=upper, least=least, most=most, code=self._memory)
+        self._others.launch(
+            ENCODE,
+            launch=launch,
+            lower=lower,
+            upper=upper,
+            least=least,
+            most=most,
+            code=self._memory,
+        )
 
     def changed(self) -> None:
         """Say that a recorded `encode` has run."""
@@ -171,7 +212,14 @@ class Bounds:
         field = wp.full(self.layout.size, self.values[side], dtype=wp.float64, device=self.device)
         if self.code.size and not self.in_place:
             rows, value = Rows.flat(self.layout.size, self.device), self.values[side]
-            DECODE.bind(rows, code=self.code, field=field, bit=BITS[side], value=value, infinite=INFINITE[side]).launch()
+            DECODE.bind(
+                rows,
+                code=self.code,
+                field=field,
+                bit=BITS[side],
+                value=value,
+                infinite=INFINITE[side],
+            ).launch()
         return field
 
     def host(self, side: int) -> np.ndarray:
@@ -188,7 +236,11 @@ class Bounds:
 
         Where ranks share the problem all code, or none.
         """
-        code, values, across = self.layout.host_zeros(wp.uint8), list(self.values), self.layout.across
+        code, values, across = (
+            self.layout.host_zeros(wp.uint8),
+            list(self.values),
+            self.layout.across,
+        )
         for side in (0, 1):
             host = real_array(sides[side], NAMES[side])
             if not self.varying[side]:
@@ -198,12 +250,16 @@ class Bounds:
             value = float(host.max() if side == 0 else host.min()) if takes else math.nan
             if across is not None:
                 value = float(across.max(value) if side == 0 else across.min(value))
-            coded = not (value == -INFINITE[side] or np.isnan(value)) and self._code_rows(side, host, value, code)
+            coded = not (value == -INFINITE[side] or np.isnan(value)) and self._code_rows(
+                side, host, value, code
+            )
             if not coded if across is None else across.any(not coded):
                 return False
             values[side] = value
         self.values = values
-        self.code = wp.array(code.ravel(), dtype=wp.uint8, device=self.device, copy=self.device.is_cuda)
+        self.code = wp.array(
+            code.ravel(), dtype=wp.uint8, device=self.device, copy=self.device.is_cuda
+        )
         return True
 
     def _code_rows(self, side: int, host: np.ndarray, value: float, code: np.ndarray) -> bool:
@@ -215,17 +271,34 @@ class Bounds:
             return not (finite & (host != value)).any()
         target = target if target.ndim == 3 else target.reshape(1, 1, -1)
         host = host.reshape(target.shape)
-        at_once = len(host) if host.dtype == np.float64 else -(-LARGE // host[0].size)  # else a copy is made
+        # else a copy is made
+        at_once = len(host) if host.dtype == np.float64 else -(-LARGE // host[0].size)
         parts = [slice(k, k + at_once) for k in range(0, len(host), at_once)]
         return all(self._code_part(side, host[part], value, code, target[part]) for part in parts)
 
-    def _code_part(self, side: int, host: np.ndarray, value: float, code: np.ndarray, target: np.ndarray) -> bool:
+    def _code_part(
+        self, side: int, host: np.ndarray, value: float, code: np.ndarray, target: np.ndarray
+    ) -> bool:
         """Do that for some planes of the code."""
         first = target.__array_interface__["data"][0] - code.__array_interface__["data"][0]
-        rows = Rows.strided(code.size, wp.get_device("cpu"), (first, *target.strides[:2]), target.shape)
-        arrays = (np.ascontiguousarray(host, dtype=np.float64).ravel(), code.ravel(), np.zeros(rows.places))
+        rows = Rows.strided(
+            code.size, wp.get_device("cpu"), (first, *target.strides[:2]), target.shape
+        )
+        arrays = (
+            np.ascontiguousarray(host, dtype=np.float64).ravel(),
+            code.ravel(),
+            np.zeros(rows.places),
+        )
         source, bits, out = (wp.array(a, device="cpu", copy=False) for a in arrays)
-        CODE_ROWS.bind(rows, source=source, code=bits, value=value, infinite=INFINITE[side], bit=BITS[side], out=out).launch()
+        CODE_ROWS.bind(
+            rows,
+            source=source,
+            code=bits,
+            value=value,
+            infinite=INFINITE[side],
+            bit=BITS[side],
+            out=out,
+        ).launch()
         return not out.numpy().any()
 
 

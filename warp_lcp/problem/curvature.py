@@ -14,9 +14,10 @@ NEGATIVE = 1e-8  # of ||z|| ||A z||: z'Az below minus this is no rounding of pro
 def has_negative_curvature(problem: LCP) -> bool:
     """Return whether A is surely neither positive semi-definite nor a P-matrix on the unknowns F that have an infinite bound.
 
-    A_ii < 0 shows that, for i in F; it counts where no A_ii > 0, for Newton's method solves with some negative entries, as convection
-    makes them. Of an operator without rows one product A z tells, z pointing away from the bounds of F: z'Az < 0 if
-    A is symmetric, of a random z; else z_i (A z)_i < 0 for all i in F, of a z of ones and minus ones (a P-matrix reverses the sign of no
+    A_ii < 0 shows that, for i in F; it counts where no A_ii > 0, for Newton's method solves with
+    some negative entries, as convection makes them. Of an operator without rows one product A z
+    tells, z pointing away from the bounds of F: z'Az < 0 if A is symmetric, of a random z; else z_i
+    (A z)_i < 0 for all i in F, of a z of ones and minus ones (a P-matrix reverses the sign of no
     vector). A flipped sign shows itself so: -A of a positive definite or a diagonally dominant A.
     """
     A = problem.A
@@ -24,7 +25,9 @@ def has_negative_curvature(problem: LCP) -> bool:
         return False
     by_rows = has(A, HasRows)
     if by_rows:
-        diagonal = A.host_diagonal() if hasattr(A, "host_diagonal") else A.diagonal().numpy().ravel()
+        diagonal = (
+            A.host_diagonal() if hasattr(A, "host_diagonal") else A.diagonal().numpy().ravel()
+        )
         if not (diagonal < 0).any():  # as a rule, and quickly seen
             return False
     lower, upper = problem.bounds.host(0), problem.bounds.host(1)

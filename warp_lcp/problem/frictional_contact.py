@@ -15,32 +15,38 @@ from warp_lcp.problem.solve import VariationalInequality
 class FrictionalContact(VariationalInequality):
     """Contact problem of rigid bodies with Coulomb's circular friction cone.
 
-    Find impulses r at k contacts so that Coulomb's law holds for the velocities u = J J' r + e r + b that they leave.
+    Find impulses r at k contacts so that Coulomb's law holds for the velocities u = J J' r + e r +
+    b that they leave.
 
-    A contact's rows are its normal and `dim` - 1 tangents. With K = {|r_t| <= mu r_n} and its dual cone K* = {u_n >= mu |u_t|} the law is
+    A contact's rows are its normal and `dim` - 1 tangents. With K = {|r_t| <= mu r_n} and its dual
+    cone K* = {u_n >= mu |u_t|} the law is
 
         K contains r, K* contains u^ = (u_n + mu |u_t|, u_t), and r'u^ = 0
 
-    [De Saxce & Feng 1998; Acary & Brogliato 2008, 3.9]: an open contact has no impulse, a sticking one does not slip, a slipping one has
-    friction mu r_n against the slip, and slip causes no normal velocity. r is a solution if r = P_K(r - u^ / d), for any d > 0.
-    As u^ is not a gradient there may be several solutions or, with mu > 0 and velocities b that no r can stop, none.
+    [De Saxce & Feng 1998; Acary & Brogliato 2008, 3.9]: an open contact has no impulse, a sticking
+    one does not slip, a slipping one has friction mu r_n against the slip, and slip causes no
+    normal velocity. r is a solution if r = P_K(r - u^ / d), for any d > 0. As u^ is not a gradient
+    there may be several solutions or, with mu > 0 and velocities b that no r can stop, none.
 
-    J is given by the bodies of each contact and its rows for either: velocities of bodies are M^-1 J' r where the rows have a factor of the
-    inverse masses in them, J M^-1/2. A product then costs the entries of J, and J J' is never made.
+    J is given by the bodies of each contact and its rows for either: velocities of bodies are M^-1
+    J' r where the rows have a factor of the inverse masses in them, J M^-1/2. A product then costs
+    the entries of J, and J J' is never made.
 
     Args:
         first: body that each contact pushes, from 0, shape (k,).
         second: the other one, `bodies` where that is none, shape (k,).
         one: rows of J for the first body, shape (k, dim, q).
         other: for the second, shape (k, dim, q); taken as 0 where it is none.
-        b: velocities without impulses [m/s], less those that are the least along normals, shape (k, dim).
+        b: velocities without impulses [m/s], less those that are the least along normals, shape (k,
+            dim).
         friction: Coulomb's coefficient mu >= 0, shape (k,).
         bodies: their number.
         yields: e >= 0, how much contacts give way [1/kg], shape (k, dim); 0 if None.
         device: Warp device that methods use; the CPU if None.
 
     Raises:
-        ValueError: shapes do not fit, a number is not finite or has a wrong sign, or a contact has a row that moves nothing.
+        ValueError: shapes do not fit, a number is not finite or has a wrong sign, or a contact has
+            a row that moves nothing.
 
     Example:
         >>> down = FrictionalContact([0], [1], np.eye(3)[None], np.zeros((1, 3, 3)), [[-1.0, 3.0, 4.0]], [0.5], 1)
@@ -49,22 +55,51 @@ class FrictionalContact(VariationalInequality):
     """
 
     def __init__(
-        self, first: Any, second: Any, one: Any, other: Any, b: Any, friction: Any, bodies: int, *, yields: Any = None, device: Any = None
-    ) -> None:  # fmt: skip
+        self,
+        first: Any,
+        second: Any,
+        one: Any,
+        other: Any,
+        b: Any,
+        friction: Any,
+        bodies: int,
+        *,
+        yields: Any = None,
+        device: Any = None,
+    ) -> None:
         self.first, self.second = (np.asarray(side, dtype=np.int64) for side in (first, second))
-        self.one, self.b, self.friction = (np.asarray(values, dtype=np.float64) for values in (one, b, friction))
+        self.one, self.b, self.friction = (
+            np.asarray(values, dtype=np.float64) for values in (one, b, friction)
+        )
         self.bodies, self.device = int(bodies), wp.get_device(device or "cpu")
         self.other = np.array(other, dtype=np.float64)
-        self.yields = np.zeros_like(self.b) if yields is None else np.asarray(yields, dtype=np.float64)
+        self.yields = (
+            np.zeros_like(self.b) if yields is None else np.asarray(yields, dtype=np.float64)
+        )
         self._check()
         self.other[self.second == self.bodies] = 0.0
 
     def _check(self) -> None:
-        shapes = {"one": self.one, "other": self.other, "b": self.b, "yields": self.yields, "friction": self.friction}
+        shapes = {
+            "one": self.one,
+            "other": self.other,
+            "b": self.b,
+            "yields": self.yields,
+            "friction": self.friction,
+        }
         if self.one.ndim != 3 or not 1 <= self.one.shape[1] <= 3 or self.one.shape[2] < 1:
-            raise ValueError(f"one has shape {self.one.shape}: expected (k, dim, q) with dim = 1, 2 or 3")
+            raise ValueError(
+                f"one has shape {self.one.shape}: expected (k, dim, q) with dim = 1, 2 or 3"
+            )
         k, dim, q = self.one.shape
-        expected = {"other": (k, dim, q), "b": (k, dim), "yields": (k, dim), "friction": (k,), "first": (k,), "second": (k,)}
+        expected = {
+            "other": (k, dim, q),
+            "b": (k, dim),
+            "yields": (k, dim),
+            "friction": (k,),
+            "first": (k,),
+            "second": (k,),
+        }
         for name, shape in expected.items():
             if getattr(self, name).shape != shape:
                 raise ValueError(f"{name} has shape {getattr(self, name).shape}: expected {shape}")
@@ -73,12 +108,19 @@ class FrictionalContact(VariationalInequality):
                 raise ValueError(f"{name} holds values that are not finite")
             if name in ("yields", "friction") and (values < 0).any():
                 raise ValueError(f"{name} holds a negative value")
-        if ((self.first < 0) | (self.first >= self.bodies)).any() or ((self.second < 0) | (self.second > self.bodies)).any():
-            raise ValueError(f"first, second: expected numbers of {self.bodies} bodies, in second {self.bodies} for none")
+        if ((self.first < 0) | (self.first >= self.bodies)).any() or (
+            (self.second < 0) | (self.second > self.bodies)
+        ).any():
+            raise ValueError(
+                f"first, second: expected numbers of {self.bodies} bodies, in second {self.bodies} "
+                "for none"
+            )
         if (same := self.first == self.second).any():
             raise ValueError(f"contact {int(same.argmax())} joins a body to itself")
         if (still := ~(self.diagonal > 0)).any():
-            raise ValueError(f"contact {int(still.any(axis=1).argmax())} has a zero row, which moves no body")
+            raise ValueError(
+                f"contact {int(still.any(axis=1).argmax())} has a zero row, which moves no body"
+            )
 
     @property
     def dim(self) -> int:
@@ -93,14 +135,21 @@ class FrictionalContact(VariationalInequality):
     def diagonal(self) -> np.ndarray:
         """Diagonal of J J' + diag(e) [1/kg], shape (k, dim)."""
         other = np.where((self.second < self.bodies)[:, None, None], self.other, 0.0)
-        return np.asarray(np.square(self.one).sum(axis=2) + np.square(other).sum(axis=2) + self.yields)
+        return np.asarray(
+            np.square(self.one).sum(axis=2) + np.square(other).sum(axis=2) + self.yields
+        )
 
     @cached_property
     def jacobian(self) -> csr_array:
         """J, shape (k dim, bodies q)."""
         k, dim, q = self.one.shape
-        blocks, places = np.stack([self.one, self.other], axis=1).reshape(2 * k, dim, q), np.stack([self.first, self.second], axis=1)
-        made = bsr_array((blocks, places.ravel(), 2 * np.arange(k + 1)), shape=(k * dim, (self.bodies + 1) * q))
+        blocks, places = (
+            np.stack([self.one, self.other], axis=1).reshape(2 * k, dim, q),
+            np.stack([self.first, self.second], axis=1),
+        )
+        made = bsr_array(
+            (blocks, places.ravel(), 2 * np.arange(k + 1)), shape=(k * dim, (self.bodies + 1) * q)
+        )
         return csr_array(made.tocsr()[:, : self.bodies * q])
 
     def velocities(self, r: np.ndarray) -> np.ndarray:
@@ -128,5 +177,7 @@ def onto_cones(z: np.ndarray, friction: np.ndarray) -> np.ndarray:
     normal, length = z[:, 0], np.linalg.norm(z[:, 1:], axis=1)
     inside, polar = length <= friction * normal, friction * length <= -normal
     side = (normal + friction * length) / (1.0 + friction**2)
-    onto = np.column_stack([side, (friction * side / np.maximum(length, 1e-300))[:, None] * z[:, 1:]])
+    onto = np.column_stack(
+        [side, (friction * side / np.maximum(length, 1e-300))[:, None] * z[:, 1:]]
+    )
     return np.where(inside[:, None], z, np.where(polar[:, None], 0.0, onto))

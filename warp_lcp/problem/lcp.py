@@ -23,7 +23,8 @@ from warp_lcp.rows.vectors import ADD, Sums, rows_of
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/residual.h")
 CHECK = KERNELS["problem.check"]
-CHECKED_BY_NUMPY = 12_000  # most elements of fields of the CPU that NumPy checks in less time than a launch takes: 45 of 75 us
+# most elements of fields of the CPU that NumPy checks in less time than a launch takes: 45 of 75 us
+CHECKED_BY_NUMPY = 12_000
 
 
 @singledispatch
@@ -47,36 +48,48 @@ def as_operator(A: Any, device: Any = None, dtype: Any = wp.float64) -> Operator
         return as_operator(real_array(A, "A"), device, dtype)
     if hasattr(A, "apply"):
         without = f"A is a {type(A).__name__} without {', '.join(missing)}"
-        raise ValueError(f"{without}: an operator needs them; a subclass of wl.Operator must define only shape, device and apply")
+        raise ValueError(
+            f"{without}: an operator needs them; a subclass of wl.Operator must define only shape, "
+            "device and apply"
+        )
     if hasattr(A, "__matmul__") or callable(A):
-        raise ValueError(f"A is a {type(A).__name__}: pass wl.LinearOperator(A, ...), which needs only products")
-    raise ValueError(f"A is a {type(A).__name__}: expected an operator, a numpy array or a scipy.sparse matrix")
+        raise ValueError(
+            f"A is a {type(A).__name__}: pass wl.LinearOperator(A, ...), which needs only products"
+        )
+    raise ValueError(
+        f"A is a {type(A).__name__}: expected an operator, a numpy array or a scipy.sparse matrix"
+    )
 
 
 class LCP(Pickled):
     """A linear complementarity problem ([Book] 1.2).
 
-    y = A x + b, l <= x <= u, and for every i: y_i > 0 => x_i = l_i; y_i < 0 => x_i = u_i; y_i = 0 otherwise. `lower=0`, `upper=inf` is
-    the LCP; a row with bounds -inf and inf is an equation; without finite bounds the problem is a linear system.
+    y = A x + b, l <= x <= u, and for every i: y_i > 0 => x_i = l_i; y_i < 0 => x_i = u_i; y_i = 0
+    otherwise. `lower=0`, `upper=inf` is the LCP; a row with bounds -inf and inf is an equation;
+    without finite bounds the problem is a linear system.
 
-    Fields that are device arrays of type wp.float64 in the operator's stored layout already (for a grid: padded by one cell, shape
-    (nz + 2, ny + 2, nx + 2)) are used in place, so that a time-stepping code can change them between solves; results then come back in
-    that layout too.
+    Fields that are device arrays of type wp.float64 in the operator's stored layout already (for a
+    grid: padded by one cell, shape (nz + 2, ny + 2, nx + 2)) are used in place, so that a
+    time-stepping code can change them between solves; results then come back in that layout too.
 
     Args:
-        A: an Operator, or an array (numpy, Warp) or scipy.sparse matrix of shape (n, n), which becomes one on b's device.
+        A: an Operator, or an array (numpy, Warp) or scipy.sparse matrix of shape (n, n), which
+            becomes one on b's device.
         b: field of A's shape, units of y.
         lower: l, a number or a field; -inf where there is none; or AffineBounds, which depend on x.
         upper: u, a number or a field; inf where there is none; or AffineBounds.
-        preconditioner: M, an approximation of A's inverse, for methods that solve linear systems with A on the free unknowns F by a Krylov
-            method (MinimumMapNewton, PrimalDualActiveSet, SubspaceMinimization): M_FF stands for the inverse of A_FF. Anything of shape
-            (n, n) with products by `@`: a matrix, a scipy.sparse.linalg.LinearOperator, PyAMG's `ml.aspreconditioner()`. It is applied on
-            the host, in float64. Conjugate gradients take it where A is symmetric and M seems symmetric positive definite, by two
-            products; GMRES takes any. None: the operator's own.
+        preconditioner: M, an approximation of A's inverse, for methods that solve linear systems
+            with A on the free unknowns F by a Krylov method (MinimumMapNewton, PrimalDualActiveSet,
+            SubspaceMinimization): M_FF stands for the inverse of A_FF. Anything of shape (n, n)
+            with products by `@`: a matrix, a scipy.sparse.linalg.LinearOperator, PyAMG's
+            `ml.aspreconditioner()`. It is applied on the host, in float64. Conjugate gradients take
+            it where A is symmetric and M seems symmetric positive definite, by two products; GMRES
+            takes any. None: the operator's own.
 
     Raises:
-        ValueError: a NaN, a wrong shape, l > u, l = inf, u = -inf, or no unknown; a preconditioner of another kind or shape, or for a grid,
-            whose multigrid it would replace. The message names the argument.
+        ValueError: a NaN, a wrong shape, l > u, l = inf, u = -inf, or no unknown; a preconditioner
+            of another kind or shape, or for a grid, whose multigrid it would replace. The message
+            names the argument.
 
     Example:
         >>> import numpy as np, warp_lcp as wl
@@ -88,21 +101,39 @@ class LCP(Pickled):
         [0.  1.5]
     """
 
-    def __init__(self, A: Operator | Array, b: Array, lower: Any = 0.0, upper: Any = np.inf, *, preconditioner: Any = None) -> None:
+    def __init__(
+        self,
+        A: Operator | Array,
+        b: Array,
+        lower: Any = 0.0,
+        upper: Any = np.inf,
+        *,
+        preconditioner: Any = None,
+    ) -> None:
         A = as_operator(A, b.device if isinstance(b, wp.array) else None)
         self.A, self.layout = A, layout_of(A)
         self.unknown = _unknown(A, self.layout)
         if has(A, HasCells) and self._totals(np.array([_count(self.unknown.numpy())])) == [0]:
             raise ValueError("A has no unknowns: the problem is empty")
-        self.in_place = isinstance(b, wp.array) and self.layout.holds(b, wp.float64) and tuple(b.shape) != tuple(A.shape)
+        self.in_place = (
+            isinstance(b, wp.array)
+            and self.layout.holds(b, wp.float64)
+            and tuple(b.shape) != tuple(A.shape)
+        )
         self.b = self.layout.load(b, wp.float64, "b")
         self.bounds = Bounds(self.layout, lower, upper)
         self._check()
-        self.preconditioner = None if preconditioner is None else Preconditioner(preconditioner, self.layout)
+        self.preconditioner = (
+            None if preconditioner is None else Preconditioner(preconditioner, self.layout)
+        )
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the operator, b and the bounds as they are now; fields that are used in place come back as device arrays."""
-        b = OnHost(self.b.reshape(self.layout.stored_shape)) if self.in_place else self.b.numpy().copy()
+        b = (
+            OnHost(self.b.reshape(self.layout.stored_shape))
+            if self.in_place
+            else self.b.numpy().copy()
+        )
         M = None if self.preconditioner is None else self.preconditioner.given
         return _made, (self.A, b, *self.bounds.given_again(), M)
 
@@ -130,10 +161,17 @@ class LCP(Pickled):
     def form(self) -> Hashable | None:
         """Sizes, types and numbers of problems that can `take` each other's data.
 
-        None if the problem has no copies: only problems of a `GridPoisson` on the CPU have, whose fields are not used in place.
+        None if the problem has no copies: only problems of a `GridPoisson` on the CPU have, whose
+        fields are not used in place.
         """
         form = getattr(self.A, "form", None)
-        if form is None or self.bounds.form is None or self.in_place or self.preconditioner is not None or type(self) is not LCP:
+        if (
+            form is None
+            or self.bounds.form is None
+            or self.in_place
+            or self.preconditioner is not None
+            or type(self) is not LCP
+        ):
             return None
         return form, self.bounds.form
 
@@ -175,7 +213,13 @@ class LCP(Pickled):
 
         Its first number counts the values that are not finite. For a problem in one process.
         """
-        self._counts.launch(CHECK, launch=launch, bounds=Bounds(self.layout, *INFINITE).operands, b=field, unknown=self.unknown)
+        self._counts.launch(
+            CHECK,
+            launch=launch,
+            bounds=Bounds(self.layout, *INFINITE).operands,
+            b=field,
+            unknown=self.unknown,
+        )
         return self._counts.reading
 
     def _faults(self, field: wp.array[Any], bounds: Bounds) -> list[int]:
@@ -183,16 +227,27 @@ class LCP(Pickled):
         if self.device.is_cpu and self.layout.size <= CHECKED_BY_NUMPY:
             inside = self.unknown.numpy() == 1
             b, lower, upper = field.numpy()[inside], bounds.host(0)[inside], bounds.host(1)[inside]
-            faults = (~np.isfinite(b), np.isnan(lower), np.isnan(upper), lower > upper, lower == np.inf, upper == -np.inf)
+            faults = (
+                ~np.isfinite(b),
+                np.isnan(lower),
+                np.isnan(upper),
+                lower > upper,
+                lower == np.inf,
+                upper == -np.inf,
+            )
             return self._totals(np.array([np.count_nonzero(fault) for fault in faults]))
-        return self._totals(self._counts.of(CHECK, bounds=bounds.operands, b=field, unknown=self.unknown))
+        return self._totals(
+            self._counts.of(CHECK, bounds=bounds.operands, b=field, unknown=self.unknown)
+        )
 
     @cached_property
     def _counts(self) -> Sums:
         return Sums(Rows.of_fields(self.layout), len(CHECK.sums))
 
     def _totals(self, found: np.ndarray) -> list[int]:
-        return [int(n) for n in (found if self.layout.across is None else self.layout.across.sum(found))]
+        return [
+            int(n) for n in (found if self.layout.across is None else self.layout.across.sum(found))
+        ]
 
     def _check(self) -> None:
         """Refuse data that no method could use."""
@@ -215,7 +270,10 @@ def _made(A: Operator, b: Array, lower: Any, upper: Any, preconditioner: Any) ->
 
 def _count(unknown: np.ndarray) -> int:
     """Return how many entries are 1."""
-    return sum(int(np.count_nonzero(part == 1)) for part in np.array_split(unknown, 1 + unknown.size // LARGE))
+    return sum(
+        int(np.count_nonzero(part == 1))
+        for part in np.array_split(unknown, 1 + unknown.size // LARGE)
+    )
 
 
 def _unknown(A: Operator, layout: Layout) -> wp.array[Any]:

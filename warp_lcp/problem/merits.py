@@ -15,13 +15,15 @@ from warp_lcp.problem.lcp import LCP
 class Merits:
     """Merit functions of an iterate.
 
-    They are stated for x >= 0. In a box x_i is the distance to the bound that y_i's sign asks for, u_i - x_i with -y_i where that is the
-    upper one; rows without bounds count as they are.
+    They are stated for x >= 0. In a box x_i is the distance to the bound that y_i's sign asks for,
+    u_i - x_i with -y_i where that is the upper one; rows without bounds count as they are.
 
     Attributes:
         largest: max |x_i|, units of x ([Book] eq. 2.55).
-        complementarity: |x'(A x + b)|, units of x y ([Book] eq. 2.56); 0 at solutions, but at x = 0, too, whatever b is.
-        absolute: x'|A x + b|, units of x y ([Book] eq. 2.200); the same, without terms that cancel: >= 0 within the bounds.
+        complementarity: |x'(A x + b)|, units of x y ([Book] eq. 2.56); 0 at solutions, but at x =
+            0, too, whatever b is.
+        absolute: x'|A x + b|, units of x y ([Book] eq. 2.200); the same, without terms that cancel:
+            >= 0 within the bounds.
     """
 
     largest: float

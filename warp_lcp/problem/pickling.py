@@ -18,7 +18,11 @@ class OnHost:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle a copy on the host."""
-        return _on_device, (self._array.numpy().copy(), wp.dtype_to_numpy(self._array.dtype).__name__, self._array.device.alias)
+        return _on_device, (
+            self._array.numpy().copy(),
+            wp.dtype_to_numpy(self._array.dtype).__name__,
+            self._array.device.alias,
+        )
 
 
 class Pickled:
@@ -37,20 +41,30 @@ class FieldsOnHost(Pickled):
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the fields in their order, as arguments; None for one whose metadata say that it is not pickled."""
         fields = dataclasses.fields(self)  # type: ignore[arg-type]
-        values = [getattr(self, field.name) if field.metadata.get("pickled", True) else None for field in fields]
+        values = [
+            getattr(self, field.name) if field.metadata.get("pickled", True) else None
+            for field in fields
+        ]
         return type(self), tuple(OnHost(v) if isinstance(v, wp.array) else v for v in values)
 
 
-def made_again(make: Callable[..., Any], *arguments: Any, device: wp.Device, **options: Any) -> tuple[Any, ...]:
+def made_again(
+    make: Callable[..., Any], *arguments: Any, device: wp.Device, **options: Any
+) -> tuple[Any, ...]:
     """Return what `__reduce__` of an operator returns: `make(*arguments, device=..., **options)`, where that device is.
 
     Types (wp.float32) go by their names.
     """
-    named = {name: value.__name__ if isinstance(value, type) else value for name, value in options.items()}
+    named = {
+        name: value.__name__ if isinstance(value, type) else value
+        for name, value in options.items()
+    }
     return _made, (make, arguments, device.alias, named)
 
 
-def _made(make: Callable[..., Any], arguments: tuple[Any, ...], device: str, options: dict[str, Any]) -> Any:
+def _made(
+    make: Callable[..., Any], arguments: tuple[Any, ...], device: str, options: dict[str, Any]
+) -> Any:
     if "dtype" in options:
         options = {**options, "dtype": getattr(wp, options["dtype"])}
     return make(*arguments, device=_present(device), **options)
@@ -62,4 +76,6 @@ def _on_device(host: np.ndarray, dtype: str, device: str) -> wp.array[Any]:
 
 def _present(device: str) -> wp.Device:
     """Return a device by its name, the CPU where there is none of that name."""
-    return next((found for found in wp.get_devices() if found.alias == device), wp.get_device("cpu"))
+    return next(
+        (found for found in wp.get_devices() if found.alias == device), wp.get_device("cpu")
+    )

@@ -8,7 +8,9 @@ import numpy as np
 
 from warp_lcp.rows.fields import Layout
 
-SYMMETRIC = 1e-6  # of ||u|| ||M v||: asymmetry above what rounding leaves, which conjugate gradients do not bear for long
+# of ||u|| ||M v||: asymmetry above what rounding leaves, which conjugate gradients do not bear for
+# long
+SYMMETRIC = 1e-6
 
 
 class Preconditioner:
@@ -20,19 +22,26 @@ class Preconditioner:
 
     Attributes:
         given: M.
-        definite: whether two products say that M is symmetric and positive definite; more would be needed to be sure.
+        definite: whether two products say that M is symmetric and positive definite; more would be
+            needed to be sure.
 
     Raises:
-        ValueError: M is of another kind or shape, not real, or gives products that are not finite; or fields are stored with ghost cells.
+        ValueError: M is of another kind or shape, not real, or gives products that are not finite;
+            or fields are stored with ghost cells.
     """
 
     def __init__(self, M: Any, layout: Layout) -> None:
         n, shape = layout.size, getattr(M, "shape", None)
         if not hasattr(M, "__matmul__"):
             hint = ": PyAMG's is ml.aspreconditioner()" if hasattr(M, "aspreconditioner") else ""
-            raise ValueError(f"preconditioner is a {type(M).__name__}: expected an object with products M @ r{hint}")
+            raise ValueError(
+                f"preconditioner is a {type(M).__name__}: expected an object with products M @ "
+                f"r{hint}"
+            )
         if layout.stored_shape != layout.shape:
-            raise ValueError("preconditioner: cannot be given for systems on grids, which use multigrid")
+            raise ValueError(
+                "preconditioner: cannot be given for systems on grids, which use multigrid"
+            )
         if shape != (n, n):
             raise ValueError(f"preconditioner has shape {shape}: expected {(n, n)}")
         self.given = M
@@ -40,7 +49,10 @@ class Preconditioner:
         Mu, Mv = self(u), self(v)
         if not (np.isfinite(Mu).all() and np.isfinite(Mv).all()):
             raise ValueError("preconditioner gives products that are not finite")
-        size = max(float(np.linalg.norm(u) * np.linalg.norm(Mv)), float(np.linalg.norm(v) * np.linalg.norm(Mu)))
+        size = max(
+            float(np.linalg.norm(u) * np.linalg.norm(Mv)),
+            float(np.linalg.norm(v) * np.linalg.norm(Mu)),
+        )
         self.definite = bool(abs(u @ Mv - v @ Mu) <= SYMMETRIC * size and u @ Mu > 0 and v @ Mv > 0)
 
     def __call__(self, r: np.ndarray) -> np.ndarray:
@@ -51,5 +63,8 @@ class Preconditioner:
         """
         z = np.asarray(self.given @ r)
         if z.shape != r.shape or z.dtype.kind not in "biuf":
-            raise ValueError(f"preconditioner gives products of shape {z.shape} and type {z.dtype}: expected {r.shape}, real numbers")
+            raise ValueError(
+                f"preconditioner gives products of shape {z.shape} and type {z.dtype}: expected "
+                f"{r.shape}, real numbers"
+            )
         return z

@@ -22,11 +22,14 @@ from warp_lcp.problem.scale import scaled
 SMALL = 400  # unknowns and rows up to which matrices are dense, whatever the caller's are
 SWEEPS = 20  # of Ruiz's iteration, each of which halves the logarithms of rows that differ
 CANCELED = 1e-10  # terms of a row below this part of ||a_i|| ||x|| count as rounding
-PROXIMAL = 1e-8  # shift of the conditions' matrix, which dependent rows make singular; refinement takes its effect off
+# shift of the conditions' matrix, which dependent rows make singular; refinement takes its effect
+# off
+PROXIMAL = 1e-8
 REFINEMENTS = 12
 CHANGES = 30  # of the active set
 EXACT = 1e-13  # relative residual below which there is nothing to improve
-PROVED = 1e-7  # value of a certificate, relative to its terms, beyond rounding and HiGHS's tolerances
+# value of a certificate, relative to its terms, beyond rounding and HiGHS's tolerances
+PROVED = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +57,9 @@ class ProgramUnits:
     def of_caller(self, point: ProgramPoint) -> ProgramPoint:
         """Return a point of the equilibrated program in the units of the program it was made of."""
         with np.errstate(over="ignore"):  # a multiplier may be beyond all numbers in those
-            return ProgramPoint(self.x * point.x, self.inequalities * point.z, self.equations * point.y)
+            return ProgramPoint(
+                self.x * point.x, self.inequalities * point.z, self.equations * point.y
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +116,9 @@ def equilibrated(program: ProgramWithRows) -> tuple[ProgramWithRows, ProgramUnit
     D = np.ones(n)
     for _ in range(SWEEPS):
         rows = scaled(B, E, D)
-        D = D / np.sqrt(_nonzero(np.maximum(_largest(scaled(curvature, D, D), 0), _largest(rows, 0))))
+        D = D / np.sqrt(
+            _nonzero(np.maximum(_largest(scaled(curvature, D, D), 0), _largest(rows, 0)))
+        )
         E = E / np.sqrt(_nonzero(_largest(rows, 1)))
     D, E = _power_of_two(D), _power_of_two(E)
     right = np.r_[E * np.r_[program.h, program.d], program.lower / D, program.upper / D]
@@ -123,9 +130,15 @@ def equilibrated(program: ProgramWithRows) -> tuple[ProgramWithRows, ProgramUnit
     sigma = _power_of_two(sigma)
     cost = _power_of_two(1 / (max(sigma * bend, slope) or 1.0))  # times sigma: of sigma D (Q x + c)
     made = ProgramWithRows(
-        scaled(Q, cost * sigma * D, D), cost * D * program.c, program.lower / (sigma * D), program.upper / (sigma * D),
-        scaled(program.G, E[:m], D), E[:m] * program.h / sigma, scaled(program.C, E[m:], D), E[m:] * program.d / sigma,
-    )  # fmt: skip
+        scaled(Q, cost * sigma * D, D),
+        cost * D * program.c,
+        program.lower / (sigma * D),
+        program.upper / (sigma * D),
+        scaled(program.G, E[:m], D),
+        E[:m] * program.h / sigma,
+        scaled(program.C, E[m:], D),
+        E[m:] * program.d / sigma,
+    )
     with np.errstate(over="ignore"):
         return made, ProgramUnits(sigma * D, E[:m] / cost, E[m:] / cost)
 
@@ -133,7 +146,11 @@ def equilibrated(program: ProgramWithRows) -> tuple[ProgramWithRows, ProgramUnit
 def settled(program: ProgramWithRows, point: ProgramPoint) -> ProgramPoint:
     """Return the point with complementary pairs: x on a bound or z = 0, the nearer of the two."""
     at, slope = np.clip(point.x, program.lower, program.upper), _gradient(program, point)
-    x = np.where(at - program.lower <= slope, program.lower, np.where(program.upper - at <= -slope, program.upper, at))
+    x = np.where(
+        at - program.lower <= slope,
+        program.lower,
+        np.where(program.upper - at <= -slope, program.upper, at),
+    )
     x = np.where(np.isfinite(x), x, at)
     slack = program.G @ at - program.h
     return ProgramPoint(x, np.where(slack <= point.z, np.maximum(point.z, 0.0), 0.0), point.y)
@@ -156,15 +173,29 @@ def relative_residuals(program: ProgramWithRows, point: ProgramPoint) -> tuple[f
     p, x, z, y = program, point.x, point.z, point.y
     slack, miss = p.G @ x - p.h, p.C @ x - p.d
     rows = _stacked(p.G, p.C)
-    right, missed = np.abs(np.r_[p.h, p.d]), np.r_[np.where(z > 0, np.abs(slack), np.maximum(-slack, 0.0)), np.abs(miss)]
-    primal = _relative(missed, abs(rows) @ np.abs(x) + right, _largest(abs(rows), 1) * np.abs(x).max(initial=0.0) + right)
+    right, missed = (
+        np.abs(np.r_[p.h, p.d]),
+        np.r_[np.where(z > 0, np.abs(slack), np.maximum(-slack, 0.0)), np.abs(miss)],
+    )
+    primal = _relative(
+        missed,
+        abs(rows) @ np.abs(x) + right,
+        _largest(abs(rows), 1) * np.abs(x).max(initial=0.0) + right,
+    )
     g, multipliers = _gradient(p, point), np.abs(np.r_[z, y])
-    wrong = np.where(x <= p.lower, np.maximum(-g, 0.0), np.where(x >= p.upper, np.maximum(g, 0.0), np.abs(g)))
+    wrong = np.where(
+        x <= p.lower, np.maximum(-g, 0.0), np.where(x >= p.upper, np.maximum(g, 0.0), np.abs(g))
+    )
     wrong = np.where(p.lower == p.upper, 0.0, wrong)
     terms = abs(p.Q) @ np.abs(x) + np.abs(p.c) + abs(rows).T @ multipliers
-    # without ||multipliers||: a bound and an equation that cancel may have any, and would hide the other rows
+    # without ||multipliers||: a bound and an equation that cancel may have any, and would hide the
+    # other rows
     least = np.abs(p.c[p.c != 0]).min(initial=np.inf)
-    sizes = _largest(abs(p.Q), 1) * np.abs(x).max(initial=0.0) + terms + (least if np.isfinite(least) else 1.0)
+    sizes = (
+        _largest(abs(p.Q), 1) * np.abs(x).max(initial=0.0)
+        + terms
+        + (least if np.isfinite(least) else 1.0)
+    )
     dual = _relative(wrong, terms, sizes)
     held = np.where((x <= p.lower) | (x >= p.upper), g * x, 0.0)
     parts = np.r_[x * (p.Q @ x), p.c * x, -p.h * z, -p.d * y, -held]
@@ -196,13 +227,22 @@ def polished(program: ProgramWithRows, point: ProgramPoint) -> ProgramPoint:
         if found is None:
             break
         inside = ProgramPoint(np.clip(found.x, p.lower, p.upper), np.maximum(found.z, 0.0), found.y)
-        for tried in (inside, replace(inside, x=np.where(np.abs(inside.x) > CANCELED, inside.x, np.clip(0.0, p.lower, p.upper)))):
+        for tried in (
+            inside,
+            replace(
+                inside,
+                x=np.where(np.abs(inside.x) > CANCELED, inside.x, np.clip(0.0, p.lower, p.upper)),
+            ),
+        ):
             worth = max(relative_residuals(p, tried))
             if worth < error:
                 best, error = tried, worth
         slope, slack = _gradient(p, found), p.G @ found.x - p.h
         fixed = p.lower == p.upper
-        low, high = fixed | np.where(low, slope > 0, found.x < p.lower), ~fixed & np.where(high, slope < 0, found.x > p.upper)
+        low, high = (
+            fixed | np.where(low, slope > 0, found.x < p.lower),
+            ~fixed & np.where(high, slope < 0, found.x > p.upper),
+        )
         tight, now = np.where(tight, found.z > 0, slack < 0), found
     return best
 
@@ -222,14 +262,18 @@ def has_no_solution(program: ProgramWithRows) -> str:
     p, n = program, len(program.c)
     low, high = np.flatnonzero(np.isfinite(p.lower)), np.flatnonzero(np.isfinite(p.upper))
     unit = scipy.sparse.eye_array(n, format="csr")
-    rows = scipy.sparse.vstack([scipy.sparse.csr_array(p.G), scipy.sparse.csr_array(p.C), unit[low], -unit[high]]).tocsr()
+    rows = scipy.sparse.vstack(
+        [scipy.sparse.csr_array(p.G), scipy.sparse.csr_array(p.C), unit[low], -unit[high]]
+    ).tocsr()
     worth = np.r_[p.h, p.d, p.lower[low], -p.upper[high]]
     if len(worth):
         size = _nonzero(np.abs(worth))  # each row in its own size: a far bound is no proof
         rows_of_one, worth_of_one = scaled(rows, 1 / size, np.ones(n)), worth / size
         limits = np.repeat([[0.0, 1.0]], len(worth), axis=0)
         limits[len(p.h) : len(p.h) + len(p.d), 0] = -1.0
-        found = linprog(-worth_of_one, A_eq=rows_of_one.T, b_eq=np.zeros(n), bounds=limits, method="highs")
+        found = linprog(
+            -worth_of_one, A_eq=rows_of_one.T, b_eq=np.zeros(n), bounds=limits, method="highs"
+        )
         if found.status == 0:
             v = _without_rounding(np.clip(found.x, limits[:, 0], limits[:, 1]))
             gain, terms = float(worth_of_one @ v), float(np.abs(worth_of_one) @ np.abs(v))
@@ -238,16 +282,23 @@ def has_no_solution(program: ProgramWithRows) -> str:
                 return "infeasible"
     if not p.c.any():
         return ""
-    sides = np.stack([np.where(np.isfinite(p.lower), 0.0, -1.0), np.where(np.isfinite(p.upper), 0.0, 1.0)], axis=1)
+    sides = np.stack(
+        [np.where(np.isfinite(p.lower), 0.0, -1.0), np.where(np.isfinite(p.upper), 0.0, 1.0)],
+        axis=1,
+    )
     still = _stacked(p.Q, p.C)
     more = {"A_ub": -p.G, "b_ub": np.zeros(len(p.h))} if len(p.h) else {}
-    found = linprog(p.c, A_eq=still, b_eq=np.zeros(still.shape[0]), bounds=sides, method="highs", **more)
+    found = linprog(
+        p.c, A_eq=still, b_eq=np.zeros(still.shape[0]), bounds=sides, method="highs", **more
+    )
     if found.status != 0:
         return ""
     e = _without_rounding(np.clip(found.x, sides[:, 0], sides[:, 1]))
     moved, up = np.abs(still @ e), p.G @ e
     small = 1e-2 * PROVED
-    flat = (moved <= small * (abs(still) @ np.abs(e)) + 1e-300).all() and (up >= -small * (abs(p.G) @ np.abs(e))).all()
+    flat = (moved <= small * (abs(still) @ np.abs(e)) + 1e-300).all() and (
+        up >= -small * (abs(p.G) @ np.abs(e))
+    ).all()
     return "unbounded" if flat and -float(p.c @ e) > PROVED * float(np.abs(p.c) @ np.abs(e)) else ""
 
 
@@ -255,7 +306,9 @@ def _without_rounding(values: np.ndarray) -> np.ndarray:
     return np.where(np.abs(values) > 1e-2 * PROVED * np.abs(values).max(initial=0.0), values, 0.0)
 
 
-def _newton(p: ProgramWithRows, now: ProgramPoint, low: Any, high: Any, tight: Any) -> ProgramPoint | None:
+def _newton(
+    p: ProgramWithRows, now: ProgramPoint, low: Any, high: Any, tight: Any
+) -> ProgramPoint | None:
     """Return the solution of the equations of an active set; None where it is not finite.
 
     [[Q_FF + s, -B_F'], [B_F, s]] is factored, s > 0 small, and the step refined: of rows that
@@ -283,13 +336,17 @@ def _factored(Q: Any, B: Any) -> Callable[[np.ndarray], np.ndarray] | None:
     """Return what solves [[Q + s, -B'], [B, s]] v = r, s = PROXIMAL; None where the factors are singular."""
     n, k = Q.shape[0], B.shape[0]
     if scipy.sparse.issparse(Q):
-        M = scipy.sparse.block_array([[Q, -B.T], [B, scipy.sparse.csr_array((k, k))]]) + PROXIMAL * scipy.sparse.eye_array(n + k)
+        M = scipy.sparse.block_array(
+            [[Q, -B.T], [B, scipy.sparse.csr_array((k, k))]]
+        ) + PROXIMAL * scipy.sparse.eye_array(n + k)
         try:
             solve: Callable[[np.ndarray], np.ndarray] = scipy.sparse.linalg.splu(M.tocsc()).solve
         except RuntimeError:
             return None
         return solve
-    factors, pivots, info = scipy.linalg.lapack.dgetrf(np.block([[Q, -B.T], [B, np.zeros((k, k))]]) + PROXIMAL * np.eye(n + k))
+    factors, pivots, info = scipy.linalg.lapack.dgetrf(
+        np.block([[Q, -B.T], [B, np.zeros((k, k))]]) + PROXIMAL * np.eye(n + k)
+    )
     return None if info else lambda r: scipy.linalg.lapack.dgetrs(factors, pivots, r)[0]
 
 
@@ -305,13 +362,19 @@ def _relative(values: np.ndarray, terms: np.ndarray, sizes: np.ndarray) -> float
 
 
 def _stacked(*parts: Any) -> Any:
-    return scipy.sparse.vstack(parts).tocsr() if scipy.sparse.issparse(parts[0]) else np.vstack(parts)
+    return (
+        scipy.sparse.vstack(parts).tocsr() if scipy.sparse.issparse(parts[0]) else np.vstack(parts)
+    )
 
 
 def _largest(M: Any, axis: int) -> np.ndarray:
     if not min(M.shape):
         return np.zeros(M.shape[1 - axis])
-    return abs(M).max(axis=axis).toarray().ravel() if scipy.sparse.issparse(M) else abs(M).max(axis=axis)
+    return (
+        abs(M).max(axis=axis).toarray().ravel()
+        if scipy.sparse.issparse(M)
+        else abs(M).max(axis=axis)
+    )
 
 
 def _nonzero(values: np.ndarray) -> np.ndarray:

@@ -1,7 +1,7 @@
 """What solvers ask of an operator: the members that each has, and capabilities that some methods need and others make use of.
 
-An operator has a capability if it has the members; `has` says so, and is the only place that looks for them by name. A method lists in
-`supports` the capabilities of which it needs one.
+An operator has a capability if it has the members; `has` says so, and is the only place that looks
+for them by name. A method lists in `supports` the capabilities of which it needs one.
 """
 
 from __future__ import annotations
@@ -29,9 +29,11 @@ Capability = TypeVar("Capability", bound="Operator")
 class Operator(Protocol):
     """Protocol of square linear operators A on fields of shape `shape`.
 
-    Define your own by inheriting from this protocol (write `shape`, `device` and `apply`), or by defining all its members; a
-    product of NumPy arrays makes one by `wl.LinearOperator`. Docs "Operators of your own" shows both. Fields are plain contiguous arrays of
-    that shape. Optional features are capabilities (`warp_lcp.problem.protocol`): an operator has one if it has its members.
+    Define your own by inheriting from this protocol (write `shape`, `device` and `apply`), or by
+    defining all its members; a product of NumPy arrays makes one by `wl.LinearOperator`. Docs
+    "Operators of your own" shows both. Fields are plain contiguous arrays of that shape. Optional
+    features are capabilities (`warp_lcp.problem.protocol`): an operator has one if it has its
+    members.
 
     Attributes:
         shape: shape of the fields that A maps to each other.
@@ -56,17 +58,25 @@ class Operator(Protocol):
             NoTranspose: A is not symmetric, and has no transpose of its own. It is a ValueError.
         """
         if not self.symmetric:
-            raise NoTranspose(f"{type(self).__name__} has no apply_transpose and is not symmetric: define it, or use MinimumMapNewton")
+            raise NoTranspose(
+                f"{type(self).__name__} has no apply_transpose and is not symmetric: define it, or "
+                "use MinimumMapNewton"
+            )
         return self.apply(x, out)
 
     def diagonal(self) -> wp.array[Any]:
         """Return the diagonal of A as a field of type `dtype`.
 
-        By default row and column norms, estimated from 16 products at each call, are used instead: positive, and for a
-        dominant diagonal of about the same size. Preconditioners and step lengths are then nearly as good as with the diagonal.
+        By default row and column norms, estimated from 16 products at each call, are used instead:
+        positive, and for a dominant diagonal of about the same size. Preconditioners and step
+        lengths are then nearly as good as with the diagonal.
         """
         layout = layout_of(self)
-        unknown = self.cells.numpy().ravel() == 1 if has(self, HasCells) else np.ones(layout.size, dtype=bool)
+        unknown = (
+            self.cells.numpy().ravel() == 1
+            if has(self, HasCells)
+            else np.ones(layout.size, dtype=bool)
+        )
         sizes = estimated_scale(self, layout, unknown) * unknown
         return wp.array(sizes.reshape(layout.stored_shape), dtype=self.dtype, device=self.device)
 
@@ -77,8 +87,8 @@ class HasRows(Operator, Protocol):
     For sweeps in any order, blocks, and proofs that there is no solution.
 
     Attributes:
-        row_sizes: the largest magnitude of each row, shape (n,), wp.float64; None where no row is empty. The unknown of an empty row goes
-            to the bound that b's sign asks for.
+        row_sizes: the largest magnitude of each row, shape (n,), wp.float64; None where no row is
+            empty. The unknown of an empty row goes to the bound that b's sign asks for.
     """
 
     row_sizes: wp.array[Any] | None
@@ -90,12 +100,15 @@ class HasRows(Operator, Protocol):
 class Relaxes(Operator, Protocol):
     """Sweep in the operator's own order."""
 
-    def relax(self, x: Any, b: Any, lower: Any, upper: Any, omega: float, *, forward: bool = True) -> None:
+    def relax(
+        self, x: Any, b: Any, lower: Any, upper: Any, omega: float, *, forward: bool = True
+    ) -> None:
         """Sweep once: x_i = clip(x_i - omega (A x + b)_i / A_ii, l_i, u_i) in turn.
 
         In the reverse order if not `forward`.
 
-        All are flat stored fields of one type; x is moved in place. Rows with a zero diagonal are passed over.
+        All are flat stored fields of one type; x is moved in place. Rows with a zero diagonal are
+        passed over.
         """
 
 
@@ -103,7 +116,8 @@ class HasLayout(Operator, Protocol):
     """Storage layout of fields that are not plain arrays.
 
     Attributes:
-        layout: loads and unloads them. `apply` and `apply_transpose` take stored fields too, flat or of `layout.stored_shape`.
+        layout: loads and unloads them. `apply` and `apply_transpose` take stored fields too, flat
+            or of `layout.stored_shape`.
     """
 
     layout: Layout
@@ -113,7 +127,8 @@ class Versioned(Operator, Protocol):
     """Counter of in-place changes of the entries.
 
     Attributes:
-        version: another number after each change; methods update data derived from A when the next solve starts.
+        version: another number after each change; methods update data derived from A when the next
+            solve starts.
     """
 
     version: int
@@ -123,7 +138,8 @@ class HasCells(Operator, Protocol):
     """Mask of the elements of a field that are unknowns.
 
     Attributes:
-        cells: wp.int8, one for each element of a stored field, 1 (FLUID) where it is an unknown; others stay 0.
+        cells: wp.int8, one for each element of a stored field, 1 (FLUID) where it is an unknown;
+            others stay 0.
     """
 
     cells: wp.array[Any]
@@ -135,7 +151,8 @@ class HasStencil(HasCells, HasLayout, Versioned, Protocol):
     For multigrid and for kernels that compute A x on the way.
 
     Attributes:
-        stencil: the diagonal and the weights of neighbors; of 5 and 7 points A is symmetric with weights >= 0 and weakly dominant rows.
+        stencil: the diagonal and the weights of neighbors; of 5 and 7 points A is symmetric with
+            weights >= 0 and weakly dominant rows.
         periodic: whether x, y, z wrap around.
         layout: with a ghost cell on each side.
     """
@@ -199,7 +216,8 @@ class NamesComponents(Operator, Protocol):
         See `warp_lcp.operators.components.FloatingComponents`.
 
         Args:
-            scratch: stored fields, of 4-byte elements and of bytes, that may be overwritten; None: there are none.
+            scratch: stored fields, of 4-byte elements and of bytes, that may be overwritten; None:
+                there are none.
         """
 
 
@@ -222,8 +240,8 @@ class HasCoefficients(Operator, Protocol):
     def coefficient_gradient(self, multiplier: wp.array[Any], x: wp.array[Any]) -> dict[str, Any]:
         """Return the derivatives of mu'A x by the constructor's arguments, by name.
 
-        Each has the shape that was given, as a wp.float64 array on A's device, or is a number where a number was given; None where nothing
-        was. Those of a matrix are on its pattern.
+        Each has the shape that was given, as a wp.float64 array on A's device, or is a number where
+        a number was given; None where nothing was. Those of a matrix are on its pattern.
 
         Args:
             multiplier: mu, stored field, wp.float64, 0 off the unknowns.
@@ -232,7 +250,8 @@ class HasCoefficients(Operator, Protocol):
 
 
 FAMILIES = {"dense": "wl.DenseOperator", "sparse": "wl.SparseOperator", "grid": "wl.GridPoisson"}
-CAPABILITIES: dict[type[Operator], tuple[str, tuple[str, ...]]] = {  # what to call each, and which of our own families have it
+# what to call each, and which of our own families have it
+CAPABILITIES: dict[type[Operator], tuple[str, tuple[str, ...]]] = {
     HasRows: ("rows", ("dense", "sparse")),
     Relaxes: ("a sweep", ("dense", "sparse", "grid")),
     HasStencil: ("a stencil", ("grid",)),
@@ -252,9 +271,18 @@ CAPABILITIES: dict[type[Operator], tuple[str, tuple[str, ...]]] = {  # what to c
 @cache
 def members(capability: type[Operator]) -> tuple[str, ...]:
     """Return the names of a capability's members beside those of `Operator`; of `Operator`, its own."""
-    bases = [base for base in reversed(capability.__mro__) if base not in (object, Generic, Protocol)]
+    bases = [
+        base for base in reversed(capability.__mro__) if base not in (object, Generic, Protocol)
+    ]
     own = [base for base in bases if base is not Operator] or bases
-    return tuple(dict.fromkeys(name for base in own for name in (*base.__annotations__, *vars(base)) if not name.startswith("_")))
+    return tuple(
+        dict.fromkeys(
+            name
+            for base in own
+            for name in (*base.__annotations__, *vars(base))
+            if not name.startswith("_")
+        )
+    )
 
 
 def has(A: object, capability: type[Capability]) -> TypeGuard[Capability]:
@@ -280,7 +308,9 @@ def layout_of(A: Operator) -> Layout:
 def takes(method: Any, A: Operator) -> bool:
     """Return whether a method, or its class, takes an operator: A has one of the capabilities in `supports`, if that names any."""
     asked = getattr(method, "supports", ())
-    return not hasattr(method, "problems") and (not asked or any(has(A, capability) for capability in asked))
+    return not hasattr(method, "problems") and (
+        not asked or any(has(A, capability) for capability in asked)
+    )
 
 
 def families(method: Any) -> set[str]:
@@ -288,7 +318,11 @@ def families(method: Any) -> set[str]:
     if hasattr(method, "problems"):
         return set()
     asked = getattr(method, "supports", ())
-    return {family for capability in asked for family in CAPABILITIES[capability][1]} if asked else set(FAMILIES)
+    return (
+        {family for capability in asked for family in CAPABILITIES[capability][1]}
+        if asked
+        else set(FAMILIES)
+    )
 
 
 def described(*capabilities: type[Operator]) -> str:
@@ -303,10 +337,15 @@ def check_taken(method: Any, A: Operator) -> None:
     """Check that a method takes an operator.
 
     Raises:
-        ValueError: it does not; the message names what is missing, and methods that ask for nothing.
+        ValueError: it does not; the message names what is missing, and methods that ask for
+            nothing.
     """
     if not takes(method, A):
-        others = "use MinimumMapNewton, or ProjectedJacobi where bounds are affine in x, which need only products"
+        others = (
+            "use MinimumMapNewton, or ProjectedJacobi where bounds are affine in x, which "
+            "need only products"
+        )
         raise ValueError(
-            f"{type(method).__name__} needs an operator with {described(*method.supports)}; {type(A).__name__} has none: {others}"
+            f"{type(method).__name__} needs an operator with {described(*method.supports)}; "
+            f"{type(A).__name__} has none: {others}"
         )

@@ -2,9 +2,10 @@
 
 [Book] 1.1-1.2, table 3.4.
 
-Problems are given and returned with matrices on the host (numpy or scipy.sparse); `LCP` holds the first four, which differ by their
-bounds alone: 0 and inf (LCP), -inf and inf on equations (mixed), any (boxed). Where the unknowns change, a `Reformulation` maps solutions
-back. y = A x + b, l <= x <= u, and K is the box [l, u] throughout.
+Problems are given and returned with matrices on the host (numpy or scipy.sparse); `LCP` holds the
+first four, which differ by their bounds alone: 0 and inf (LCP), -inf and inf on equations (mixed),
+any (boxed). Where the unknowns change, a `Reformulation` maps solutions back. y = A x + b, l <= x
+<= u, and K is the box [l, u] throughout.
 """
 
 from __future__ import annotations
@@ -164,7 +165,9 @@ def mixed_to_boxed(A: Any, b: Vector, equations: Vector, *, device: Any = None) 
     Raises:
         ValueError: equations has another shape or type.
     """
-    return _same(A, b, np.where(_marked(equations, len(b)), -np.inf, 0.0), np.full(len(b), np.inf), device)
+    return _same(
+        A, b, np.where(_marked(equations, len(b)), -np.inf, 0.0), np.full(len(b), np.inf), device
+    )
 
 
 def mixed_to_lcp(A: Any, b: Vector, equations: Vector, *, device: Any = None) -> Reformulation:
@@ -181,18 +184,26 @@ def mixed_to_lcp(A: Any, b: Vector, equations: Vector, *, device: Any = None) ->
         device: Warp device of the problem.
 
     Raises:
-        ValueError: A_EE is singular, every row is an equation, or equations has another shape or type.
+        ValueError: A_EE is singular, every row is an equation, or equations has another shape or
+            type.
     """
     mask = _marked(equations, len(b))
     E, N = np.flatnonzero(mask), np.flatnonzero(~mask)
     if N.size == 0:
-        raise ValueError("equations selects every row: this is a linear system, see linear_equations_to_boxed")
+        raise ValueError(
+            "equations selects every row: this is a linear system, see linear_equations_to_boxed"
+        )
     M = A.toarray() if scipy.sparse.issparse(A) else np.asarray(A, dtype=np.float64)
     try:
         solved = np.linalg.solve(M[np.ix_(E, E)], np.column_stack([M[np.ix_(E, N)], b[E]]))
     except np.linalg.LinAlgError:
-        raise ValueError("A is singular on the equations: they cannot be eliminated; use mixed_to_boxed") from None
-    schur, rest = M[np.ix_(N, N)] - M[np.ix_(N, E)] @ solved[:, :-1], b[N] - M[np.ix_(N, E)] @ solved[:, -1]
+        raise ValueError(
+            "A is singular on the equations: they cannot be eliminated; use mixed_to_boxed"
+        ) from None
+    schur, rest = (
+        M[np.ix_(N, N)] - M[np.ix_(N, E)] @ solved[:, :-1],
+        b[N] - M[np.ix_(N, E)] @ solved[:, -1],
+    )
 
     def back(p: Vector) -> Vector:
         x = np.empty(len(b))
@@ -202,14 +213,17 @@ def mixed_to_lcp(A: Any, b: Vector, equations: Vector, *, device: Any = None) ->
     return _made(schur, rest, np.zeros(N.size), np.full(N.size, np.inf), back, device)
 
 
-def boxed_to_lcp(A: Any, b: Vector, lower: Vector, upper: Vector, *, device: Any = None) -> Reformulation:
+def boxed_to_lcp(
+    A: Any, b: Vector, lower: Vector, upper: Vector, *, device: Any = None
+) -> Reformulation:
     """Return a boxed LCP as an LCP in x - l (or u - x) and multipliers.
 
     p >= 0, and one multiplier q >= 0 for each row with both bounds.
 
-    The book's form with four unknowns a row (eq. 1.68) after elimination of beta and gamma: x = l + p where l is finite, x = u - p where
-    only u is, y = y+ - q with 0 <= q complementary to u - l - p >= 0. It is not symmetric and has a zero block, so that no QP belongs to
-    it and no sweep solves it: take Lemke, FischerNewton or InteriorPoint.
+    The book's form with four unknowns a row (eq. 1.68) after elimination of beta and gamma: x = l +
+    p where l is finite, x = u - p where only u is, y = y+ - q with 0 <= q complementary to u - l -
+    p >= 0. It is not symmetric and has a zero block, so that no QP belongs to it and no sweep
+    solves it: take Lemke, FischerNewton or InteriorPoint.
 
     Args:
         A: matrix (n, n).
@@ -221,22 +235,42 @@ def boxed_to_lcp(A: Any, b: Vector, lower: Vector, upper: Vector, *, device: Any
     Raises:
         ValueError: a row is an equation, without bounds: eliminate these by mixed_to_lcp first.
     """
-    lower, upper = (np.broadcast_to(np.asarray(side, dtype=np.float64), b.shape) for side in (lower, upper))
+    lower, upper = (
+        np.broadcast_to(np.asarray(side, dtype=np.float64), b.shape) for side in (lower, upper)
+    )
     below, above = np.isfinite(lower), np.isfinite(upper)
     if not (below | above).all():
-        raise ValueError(f"lower and upper leave {np.count_nonzero(~(below | above))} rows without bounds: eliminate equations first")
+        raise ValueError(
+            f"lower and upper leave {np.count_nonzero(~(below | above))} rows without bounds: "
+            "eliminate equations first"
+        )
     n, both = len(b), np.flatnonzero(below & above)
     sign, origin = np.where(below, 1.0, -1.0), np.where(below, lower, upper)
     S = scipy.sparse.diags_array(sign)
-    P = scipy.sparse.csr_array((np.ones(len(both)), (both, np.arange(len(both)))), shape=(n, len(both)))
+    P = scipy.sparse.csr_array(
+        (np.ones(len(both)), (both, np.arange(len(both)))), shape=(n, len(both))
+    )
     core = S @ scipy.sparse.csr_array(A) @ S
-    M = scipy.sparse.block_array([[core, P], [-P.T, None]], format="csr") if len(both) else core.tocsr()
+    M = (
+        scipy.sparse.block_array([[core, P], [-P.T, None]], format="csr")
+        if len(both)
+        else core.tocsr()
+    )
     r = np.concatenate([sign * (A @ origin + b), (upper - lower)[both]])
     matrix = M if scipy.sparse.issparse(A) else M.toarray()
-    return _made(matrix, r, np.zeros(len(r)), np.full(len(r), np.inf), lambda z: origin + sign * z[:n], device)
+    return _made(
+        matrix,
+        r,
+        np.zeros(len(r)),
+        np.full(len(r), np.inf),
+        lambda z: origin + sign * z[:n],
+        device,
+    )
 
 
-def boxed_to_quadratic_program(A: Any, b: Vector, lower: Vector, upper: Vector) -> QuadraticProgramData:
+def boxed_to_quadratic_program(
+    A: Any, b: Vector, lower: Vector, upper: Vector
+) -> QuadraticProgramData:
     """Return the quadratic program of a boxed LCP ([Book] eq. 1.58, 1.78).
 
     min 1/2 x'Ax + b'x on the box; its first-order conditions are the boxed LCP.
@@ -252,18 +286,25 @@ def boxed_to_quadratic_program(A: Any, b: Vector, lower: Vector, upper: Vector) 
     return QuadraticProgramData(A, b, lower, upper)
 
 
-def quadratic_program_to_boxed(program: QuadraticProgramData, *, device: Any = None) -> Reformulation:
+def quadratic_program_to_boxed(
+    program: QuadraticProgramData, *, device: Any = None
+) -> Reformulation:
     """Return the KKT conditions of a quadratic program as a boxed LCP.
 
     In (x, lambda, nu).
 
-    y_x = Q x + c - G' lambda - C' nu within x's box, 0 <= lambda complementary to G x - h >= 0, nu free with C x - d = 0. Without general
-    constraints it is the program's own box. `back` returns x.
+    y_x = Q x + c - G' lambda - C' nu within x's box, 0 <= lambda complementary to G x - h >= 0, nu
+    free with C x - d = 0. Without general constraints it is the program's own box. `back` returns
+    x.
 
     Raises:
         ValueError: G comes without h, or C without d.
     """
-    n, zero, parts = len(program.c), scipy.sparse.csr_array, [(program.G, program.h, 0.0, "h"), (program.C, program.d, -np.inf, "d")]
+    n, zero, parts = (
+        len(program.c),
+        scipy.sparse.csr_array,
+        [(program.G, program.h, 0.0, "h"), (program.C, program.d, -np.inf, "d")],
+    )
     constraints, r, lower = [], [program.c], [program.lower]
     for matrix, right, least, name in parts:
         if matrix is None:
@@ -282,7 +323,9 @@ def quadratic_program_to_boxed(program: QuadraticProgramData, *, device: Any = N
     return _made(matrix, np.concatenate(r), np.concatenate(lower), upper, lambda z: z[:n], device)
 
 
-def boxed_to_variational_inequality(A: Any, b: Vector, lower: Vector, upper: Vector) -> BoxVariationalInequality:
+def boxed_to_variational_inequality(
+    A: Any, b: Vector, lower: Vector, upper: Vector
+) -> BoxVariationalInequality:
     """Return a boxed LCP as a variational inequality ([Book] 1.1.4).
 
     The two have the same solutions.
@@ -290,7 +333,9 @@ def boxed_to_variational_inequality(A: Any, b: Vector, lower: Vector, upper: Vec
     return BoxVariationalInequality(lambda x: A @ x + b, lower, upper)
 
 
-def boxed_to_proximal(A: Any, b: Vector, lower: Vector, upper: Vector, *, r: float | Vector | None = None) -> ProximalFixedPoint:
+def boxed_to_proximal(
+    A: Any, b: Vector, lower: Vector, upper: Vector, *, r: float | Vector | None = None
+) -> ProximalFixedPoint:
     """Return the proximal fixed-point form of a boxed LCP ([Book] eq. 1.52-1.53).
 
     Args:
@@ -298,13 +343,17 @@ def boxed_to_proximal(A: Any, b: Vector, lower: Vector, upper: Vector, *, r: flo
         b: shape (n,).
         lower: l, shape (n,).
         upper: u, shape (n,).
-        r: r > 0; 1 / d_i of the natural residual (of semi-definite matrices 1 / A_ii) if None. With r < 2 / ||A||_2 and a symmetric
-            positive definite A repeated application converges.
+        r: r > 0; 1 / d_i of the natural residual (of semi-definite matrices 1 / A_ii) if None. With
+            r < 2 / ||A||_2 and a symmetric positive definite A repeated application converges.
 
     Raises:
         ValueError: r is not positive.
     """
-    r = 1 / scale_of_matrix(A) if r is None else np.broadcast_to(np.asarray(r, dtype=np.float64), b.shape)
+    r = (
+        1 / scale_of_matrix(A)
+        if r is None
+        else np.broadcast_to(np.asarray(r, dtype=np.float64), b.shape)
+    )
     if not (r > 0).all():
         raise ValueError("r holds a value that is not positive")
     return ProximalFixedPoint(lambda x: A @ x + b, r, lower, upper)
@@ -323,7 +372,8 @@ def boxed_to_fischer_burmeister(A: Any, b: Vector, lower: Vector, upper: Vector)
 
     phi(x - l, phi(u - x, -y)) with phi(s, t) = sqrt(s^2 + t^2) - s - t ([Book] eq. 1.48, 1.62).
 
-    phi(inf, t) = -t: an infinite upper bound leaves phi(x - l, y), an infinite lower one -phi(u - x, -y).
+    phi(inf, t) = -t: an infinite upper bound leaves phi(x - l, y), an infinite lower one -phi(u -
+    x, -y).
     """
 
     def fischer(s: Vector, t: Vector) -> Vector:
@@ -338,7 +388,9 @@ def _marked(equations: Any, n: int) -> np.ndarray:
     """Return which rows are equations; row numbers and 0/1 integers are refused, for each could be taken for the other."""
     mask = np.asarray(equations)
     if mask.shape != (n,) or mask.dtype != bool:
-        raise ValueError(f"equations has shape {mask.shape} and type {mask.dtype}: expected ({n},) and bool")
+        raise ValueError(
+            f"equations has shape {mask.shape} and type {mask.dtype}: expected ({n},) and bool"
+        )
     return mask
 
 

@@ -1,8 +1,9 @@
 """The natural residual, the one number in which all methods are compared; always evaluated from x in float64.
 
-r_i = d_i (x_i - clip(x_i - y_i / d_i, l_i, u_i)) with d_i = 1 / (r_i c_i) where diag(r) A diag(c) is equilibrated: |A_ii| for positive
-semi-definite matrices and on grids (`warp_lcp.problem.scale`; 1 where a row and a column are empty). r has the units of y and does not
-change when x is rescaled; it vanishes exactly at solutions.
+r_i = d_i (x_i - clip(x_i - y_i / d_i, l_i, u_i)) with d_i = 1 / (r_i c_i) where diag(r) A diag(c)
+is equilibrated: |A_ii| for positive semi-definite matrices and on grids (`warp_lcp.problem.scale`;
+1 where a row and a column are empty). r has the units of y and does not change when x is rescaled;
+it vanishes exactly at solutions.
 """
 
 from __future__ import annotations
@@ -37,8 +38,10 @@ class NaturalResidual:
     Attributes:
         y: stored field, A x + b at the x of the last evaluation.
         norm: the residual's norm there, units of y.
-        diagonal: d / unit, stored field: on grids the stencil's own diagonal, with its sign, and 0 where no unknown or an empty row is.
-        current: whether `y` and `norm` belong to the iterate as it is; a method that moves x sets it to False.
+        diagonal: d / unit, stored field: on grids the stencil's own diagonal, with its sign, and 0
+            where no unknown or an empty row is.
+        current: whether `y` and `norm` belong to the iterate as it is; a method that moves x sets
+            it to False.
     """
 
     def __init__(self, problem: LCP) -> None:
@@ -46,9 +49,14 @@ class NaturalResidual:
         layout = problem.layout
         self.norm, self.current = 0.0, False
         stencil = problem.A.stencil if has(problem.A, HasStencil) else None
-        self.diagonal = stencil.d if stencil else wp.zeros(layout.size, dtype=problem.A.dtype, device=layout.device)
+        self.diagonal = (
+            stencil.d
+            if stencil
+            else wp.zeros(layout.size, dtype=problem.A.dtype, device=layout.device)
+        )
         self.unit = float(stencil.unit) if stencil else 1.0
-        self._diagonal_of = None if stencil else version_of(problem.A)  # of an operator whose scale is a copy
+        # of an operator whose scale is a copy
+        self._diagonal_of = None if stencil else version_of(problem.A)
         self._sums = Sums(Rows.of_fields(layout), across=layout.across)
         if not stencil:
             self.rescale()
@@ -68,7 +76,15 @@ class NaturalResidual:
         p = self.problem
         p.bounds.follow(x)
         self.affine(x)
-        square = self._sums.of(NATURAL, bounds=p.bounds.operands, x=x, y=self.y, d=self.diagonal, unknown=p.unknown, unit=self.unit)[0]
+        square = self._sums.of(
+            NATURAL,
+            bounds=p.bounds.operands,
+            x=x,
+            y=self.y,
+            d=self.diagonal,
+            unknown=p.unknown,
+            unit=self.unit,
+        )[0]
         self.norm, self.current = float(np.sqrt(square)), True
         return self.norm
 
@@ -89,9 +105,16 @@ class NaturalResidual:
     def project(self, x: wp.array[Any], *, keep: bool, launch: Launch = launch_now) -> None:
         """Launch the projection of x onto the bounds, or of 0, as `start` does."""
         p = self.problem
-        for _ in range(1 if p.bounds.affine is None else 2):  # bounds that depend on x: at x as it is, then at x within its bounds
+        # bounds that depend on x: at x as it is, then at x within its bounds
+        for _ in range(1 if p.bounds.affine is None else 2):
             p.bounds.follow(x)
-            WITHIN.bind(Rows.of_fields(p.layout), bounds=p.bounds.operands, x=x, unknown=p.unknown, keep=keep).launch(launch)
+            WITHIN.bind(
+                Rows.of_fields(p.layout),
+                bounds=p.bounds.operands,
+                x=x,
+                unknown=p.unknown,
+                keep=keep,
+            ).launch(launch)
         self.current = False
 
     def rescale(self) -> None:
@@ -104,7 +127,9 @@ class NaturalResidual:
     def _estimated_scale(self) -> np.ndarray:
         """Return d of an operator that does not know it, a flat stored field."""
         p, layout = self.problem, self.problem.layout
-        return estimated_scale(p.A, layout, p.unknown.numpy() == 1, layout.load(p.A.diagonal(), wp.float64).numpy())
+        return estimated_scale(
+            p.A, layout, p.unknown.numpy() == 1, layout.load(p.A.diagonal(), wp.float64).numpy()
+        )
 
     @property
     def row_sizes(self) -> wp.array[Any] | None:
@@ -117,9 +142,12 @@ class NaturalResidual:
         There y = b. Methods move coupled unknowns only.
         """
         p, sizes = self.problem, self.row_sizes
-        zero_if_empty = self.diagonal if sizes is None else sizes  # of grids, only an empty row has a zero diagonal
+        # of grids, only an empty row has a zero diagonal
+        zero_if_empty = self.diagonal if sizes is None else sizes
         rows, bounds = Rows.of_fields(p.layout), p.bounds.operands
-        SETTLE_ISOLATED.bind(rows, bounds=bounds, d=zero_if_empty, b=p.b, unknown=p.unknown, x=x).launch()
+        SETTLE_ISOLATED.bind(
+            rows, bounds=bounds, d=zero_if_empty, b=p.b, unknown=p.unknown, x=x
+        ).launch()
         self.current = False
 
     def unattainable(self) -> float:
@@ -131,7 +159,11 @@ class NaturalResidual:
         if sizes is None:
             return 0.0
         b = np.where(sizes.numpy() == 0, p.b.numpy(), 0.0)
-        return float(np.linalg.norm(b[np.where(b > 0, np.isneginf(p.lower.numpy()), np.isposinf(p.upper.numpy()))]))
+        return float(
+            np.linalg.norm(
+                b[np.where(b > 0, np.isneginf(p.lower.numpy()), np.isposinf(p.upper.numpy()))]
+            )
+        )
 
     def norm_of_b(self) -> float:
         """Return ||b|| over the unknowns."""
@@ -145,16 +177,19 @@ class NaturalResidual:
 
     def launch_square_of_b(self, launch: Launch = launch_now) -> None:
         """Launch the evaluation of `square_of_b`."""
-        self._sums.launch(UNKNOWN_SQUARE, launch=launch, b=self.problem.b, unknown=self.problem.unknown)
+        self._sums.launch(
+            UNKNOWN_SQUARE, launch=launch, b=self.problem.b, unknown=self.problem.unknown
+        )
 
     def rounding_floor(self, x: wp.array[Any], epsilon: float) -> float:
         """Return an estimate of the residual that rounding x to `epsilon` leaves.
 
         In the units of y.
 
-        r_i = min(max(y_i, d_i (x_i - u_i)), d_i (x_i - l_i)) has the error e_i = epsilon (2 |d_i x_i| + |b_i|) of y_i where it is y_i
-        or could be y_i within that error, and only the error epsilon |d_i x_i| of x_i where a bound decides: the size of b in a row that
-        is held says nothing of the others.
+        r_i = min(max(y_i, d_i (x_i - u_i)), d_i (x_i - l_i)) has the error e_i = epsilon (2 |d_i
+        x_i| + |b_i|) of y_i where it is y_i or could be y_i within that error, and only the error
+        epsilon |d_i x_i| of x_i where a bound decides: the size of b in a row that is held says
+        nothing of the others.
         """
         y, r, d, b, at = self._rows_at(x)
         own = epsilon * np.abs(d * at)
@@ -185,7 +220,9 @@ class NaturalResidual:
         inside = p.unknown.numpy() == 1
         d = np.abs(self.diagonal.numpy()[inside].astype(np.float64)) * self.unit
         d = np.where(d == 0, 1.0, d)
-        y, at, b, lower, upper = (f.numpy()[inside] for f in (field, x, p.b, p.bounds.as_field(0), p.bounds.as_field(1)))
+        y, at, b, lower, upper = (
+            f.numpy()[inside] for f in (field, x, p.b, p.bounds.as_field(0), p.bounds.as_field(1))
+        )
         with np.errstate(over="ignore"):  # bounds of 1e308 are infinite then
             return y, np.maximum(np.minimum(y, d * (at - lower)), d * (at - upper)), d, b, at
 

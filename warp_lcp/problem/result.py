@@ -22,31 +22,46 @@ class SolveStatus(Enum):
 
     CONVERGED = "the recomputed residual meets the criteria"
     MAX_ITERATIONS = (
-        "the iteration limit was reached: raise max_iterations, start from a better x0, or use a faster method; "
+        "the iteration limit was reached: raise max_iterations, start from a better x0, or use a "
+        "faster method; "
         "where coefficients differ by more than 1e5, precision='double'"
     )
     TIME_LIMIT = (
-        "`max_seconds` was reached: raise it, start from this x, or use a faster method, as chosen by wl.solve(problem) or wl.recommend"
+        "`max_seconds` was reached: raise it, start from this x, or use a faster method, "
+        "as chosen by wl.solve(problem) or wl.recommend"
     )
     STOPPED = "the callback raised StopIteration: continue from this x"
-    STAGNATED = "no smaller residual in the last `patience` steps: use another method or precision='double'"
-    FLOOR = (
-        "the precision's floor is reached before the tolerance: loosen rtol or use precision='double'; "
-        "where A is stored in float32 and its entries are rounded, rtol below 1e-7 needs dtype=wp.float64"
+    STAGNATED = (
+        "no smaller residual in the last `patience` steps: use another method or precision='double'"
     )
-    LOCAL_MINIMUM = "the merit function has a stationary point that is no solution: start from another x0 or use another method"
+    FLOOR = (
+        "the precision's floor is reached before the tolerance: loosen rtol or use "
+        "precision='double'; "
+        "where A is stored in float32 and its entries are rounded, rtol below 1e-7 needs "
+        "dtype=wp.float64"
+    )
+    LOCAL_MINIMUM = (
+        "the merit function has a stationary point that is no solution: start from "
+        "another x0 or use another method"
+    )
     NON_DESCENT = "no step reduces the merit function: use another method, for example ProjectedSOR"
-    DIVERGED = "the residual grew beyond `divergence` times the first one: the method's assumptions on A do not hold"
+    DIVERGED = (
+        "the residual grew beyond `divergence` times the first one: the method's "
+        "assumptions on A do not hold"
+    )
     NON_FINITE = (
-        "a NaN or an infinity appeared: check b, the bounds and the coefficients; where these are beyond 1e36 or below 1e-36, "
+        "a NaN or an infinity appeared: check b, the bounds and the coefficients; where these are "
+        "beyond 1e36 or below 1e-36, "
         "scale A and b, or use precision='double'"
     )
     INFEASIBLE = (
-        "the problem has no solution: b is incompatible with a singular component, or the method has proved it; "
+        "the problem has no solution: b is incompatible with a singular component, or the method "
+        "has proved it; "
         "if you expected one, check the signs: y = A x + b needs A, not -A"
     )
     NEGATIVE_CURVATURE = (
-        "A's diagonal entries are negative, or x'Ax < 0, where bounds are infinite: it is neither positive semi-definite nor a P-matrix; "
+        "A's diagonal entries are negative, or x'Ax < 0, where bounds are infinite: it is neither "
+        "positive semi-definite nor a P-matrix; "
         "check the sign of A: y = A x + b needs A, not -A; where the sign is right, try wl.Lemke()"
     )
 
@@ -87,15 +102,16 @@ class SolveResult(FieldsOnHost):
     """Result of `wl.solve`; true if the recomputed residual meets the criteria.
 
     Attributes:
-        x: the best iterate found, shape of the problem's fields, float64 unless the solver's precision is "single".
+        x: the best iterate found, shape of the problem's fields, float64 unless the solver's
+            precision is "single".
         status: how the solve ended.
         iterations: steps of the method.
         linear_iterations: linear iterations on the finest grid, monotone cycles included.
         residual: norm of the natural residual at x, recomputed in float64, units of y.
         relative_residual: residual over the one at clip(0, l, u); 0 where both vanish.
         history: a Record for the start and one for each step.
-        grid: cells (nz, ny, nx) or (ny, nx), if a sparse matrix was recognized as a compact stencil and solved on its grid;
-            else None.
+        grid: cells (nz, ny, nx) or (ny, nx), if a sparse matrix was recognized as a compact stencil
+            and solved on its grid; else None.
         method: name in `wl.METHODS` of the method that found x.
         problem: the problem solved, for `wl.vjp`; None in a pickled result.
         version: of the problem's operator then, None where it has none.

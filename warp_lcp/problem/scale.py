@@ -1,15 +1,18 @@
 """The scale d of the natural residual: what y_i a unit of x_i is worth, from A alone.
 
-d_i = 1 / (r_i c_i), where diag(r) A diag(c) has 1 as the largest magnitude of each row and column (Ruiz 2001). Such r and c are not
-unique:
+d_i = 1 / (r_i c_i), where diag(r) A diag(c) has 1 as the largest magnitude of each row and column
+(Ruiz 2001). Such r and c are not unique:
 
-- Where some r and c make every diagonal entry 1, and no entry larger, d_i = |A_ii|: no cycle of entries has a product above that of its
-  diagonal entries. That holds for symmetric positive semi-definite matrices with a positive diagonal, for M- and H-matrices, and for any of
-  them with rows and columns scaled: as A becomes diag(R) A diag(C), d_i becomes R_i C_i d_i.
-- Elsewhere Ruiz's iteration starts from the matrix whose columns are scaled, from where its limit has a closed form: c_j = 1 / q_j with
-  q_j = max_k |a_kj|, and 1 / r_i = max_j |a_ij| / q_j. It does not depend on the units of x. On those of rows it does, and must: the
-  residual's norm adds rows up in the units of y, and [[e, -1], [1, 0]] is [[1, -1], [1, 0]] in other units of rows and columns whatever
-  e > 0, so that a scale that followed both would be of size e in row 1 and hide y_1.
+- Where some r and c make every diagonal entry 1, and no entry larger, d_i = |A_ii|: no cycle of
+  entries has a product above that of its diagonal entries. That holds for symmetric positive
+  semi-definite matrices with a positive diagonal, for M- and H-matrices, and for any of them with
+  rows and columns scaled: as A becomes diag(R) A diag(C), d_i becomes R_i C_i d_i.
+- Elsewhere Ruiz's iteration starts from the matrix whose columns are scaled, from where its limit
+  has a closed form: c_j = 1 / q_j with q_j = max_k |a_kj|, and 1 / r_i = max_j |a_ij| / q_j. It
+  does not depend on the units of x. On those of rows it does, and must: the residual's norm adds
+  rows up in the units of y, and [[e, -1], [1, 0]] is [[1, -1], [1, 0]] in other units of rows and
+  columns whatever e > 0, so that a scale that followed both would be of size e in row 1 and hide
+  y_1.
 """
 
 from __future__ import annotations
@@ -23,8 +26,12 @@ import warp as wp
 
 from warp_lcp.rows.fields import Layout
 
-SLACK = 1e-6  # of entries above the diagonal's: what storage in float32 leaves of semi-definite matrices of low rank
-PASSES = 50  # over the entries in search of r and c that make the diagonal 1: chains of rows that differ are seldom longer
+# of entries above the diagonal's: what storage in float32 leaves of semi-definite matrices of low
+# rank
+SLACK = 1e-6
+# over the entries in search of r and c that make the diagonal 1: chains of rows that differ are
+# seldom longer
+PASSES = 50
 PROBES = 8  # vectors of signs with which the sizes of rows and columns are estimated
 TRUSTED = 10.0  # times |A_ii|: an operator's rows and columns that are larger have another scale
 
@@ -54,7 +61,9 @@ def sizes_of_matrix(A: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def scale_by_products(
-    diagonal: np.ndarray, product: Callable[[np.ndarray], np.ndarray], transposed: Callable[[np.ndarray], np.ndarray]
+    diagonal: np.ndarray,
+    product: Callable[[np.ndarray], np.ndarray],
+    transposed: Callable[[np.ndarray], np.ndarray],
 ) -> np.ndarray:
     """Return d > 0 of an operator that knows its diagonal and products only.
 
@@ -78,7 +87,9 @@ def scale_by_products(
     return np.where((d > 0) & (found <= TRUSTED * d), d, found)
 
 
-def estimated_scale(A: Any, layout: Layout, unknown: np.ndarray, diagonal: np.ndarray | None = None) -> np.ndarray:
+def estimated_scale(
+    A: Any, layout: Layout, unknown: np.ndarray, diagonal: np.ndarray | None = None
+) -> np.ndarray:
     """Return `scale_by_products` of an operator, a flat stored field, after 16 products.
 
     Args:
@@ -98,14 +109,17 @@ def estimated_scale(A: Any, layout: Layout, unknown: np.ndarray, diagonal: np.nd
         return product
 
     d = np.zeros(layout.size) if diagonal is None else diagonal * unknown
-    return scale_by_products(d, images(A.apply), images(A.apply if A.symmetric else A.apply_transpose))
+    return scale_by_products(
+        d, images(A.apply), images(A.apply if A.symmetric else A.apply_transpose)
+    )
 
 
 def _diagonal_leads(size: Any, d: np.ndarray) -> bool:
     """Return whether some r and c make the diagonal of |A| 1 and no entry larger; rows that are empty with their columns aside.
 
-    With r_i = g_i / sqrt(d_i) and c_i = 1 / (g_i sqrt(d_i)) these are difference constraints on log g, which Bellman and Ford's iteration
-    solves; g = 1 does for semi-definite matrices. A pair of entries across the diagonal that allows no g is seen at once.
+    With r_i = g_i / sqrt(d_i) and c_i = 1 / (g_i sqrt(d_i)) these are difference constraints on log
+    g, which Bellman and Ford's iteration solves; g = 1 does for semi-definite matrices. A pair of
+    entries across the diagonal that allows no g is seen at once.
     """
     zero = np.flatnonzero(d == 0)
     if zero.size and (_largest(size[zero], 1).any() or _largest(size[:, zero], 0).any()):

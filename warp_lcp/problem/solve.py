@@ -27,8 +27,10 @@ from warp_lcp.rows.fields import Array
 from warp_lcp.rows.program import Launch, launch_now
 from warp_lcp.rows.vectors import convert
 
-SMALLEST = 1e-138  # a norm from which on residuals 16 digits smaller have squares that float64 holds
-FLOOR_MARGIN = 8.0  # a stagnated residual within this multiple of the rounding estimate is called the precision's floor
+# a norm from which on residuals 16 digits smaller have squares that float64 holds
+SMALLEST = 1e-138
+# a stagnated residual within this multiple of the rounding estimate is called the precision's floor
+FLOOR_MARGIN = 8.0
 
 
 class Precision(StrEnum):
@@ -69,10 +71,13 @@ class Step:
         linear_iterations: iterations on the finest grid.
         active: unknowns held at a bound, None where the method has no active set.
         failure: the status with which the method gives up, None to go on.
-        interim: the residual need not fall (a pivot on the way, or a step that lowers the energy): patience and divergence do not apply.
+        interim: the residual need not fall (a pivot on the way, or a step that lowers the energy):
+            patience and divergence do not apply.
         iterations: steps that it stands for, of a method that takes several at once.
-        due: the residual is worth recomputing; else nothing is recorded and the solve goes on, unless a limit has come.
-        final: the iterate is the result so far, though an earlier one may have had a smaller residual.
+        due: the residual is worth recomputing; else nothing is recorded and the solve goes on,
+            unless a limit has come.
+        final: the iterate is the result so far, though an earlier one may have had a smaller
+            residual.
         method: name of the method that has taken it; None: that of the solve.
     """
 
@@ -92,14 +97,17 @@ class VariationalInequality:
 
     Find x in K with y(x)'(z - x) >= 0 for all z in K.
 
-    Equivalently, x = P_K(x - y/d) for any d > 0, where P_K is the projection onto K. The natural residual is the
-    distance from x to that projection. For a box K = [l, u] and y = A x + b use `LCP`. K may depend on x.
+    Equivalently, x = P_K(x - y/d) for any d > 0, where P_K is the projection onto K. The natural
+    residual is the distance from x to that projection. For a box K = [l, u] and y = A x + b use
+    `LCP`. K may depend on x.
 
-    A subclass holds the data of y and K. `wl.solve` needs only the residual: a method and its workspace evaluate y
-    and P_K, together in one kernel if they can. The stresses of sand (`granular.stress.Stress`) are such a problem.
+    A subclass holds the data of y and K. `wl.solve` needs only the residual: a method and its
+    workspace evaluate y and P_K, together in one kernel if they can. The stresses of sand
+    (`granular.stress.Stress`) are such a problem.
 
-    The workspace holds the iterate and a `Residual`. The iterate starts as it is unless `x0` is given, and the result's x
-    is that array. A method names the class of problems that it solves as `problems`.
+    The workspace holds the iterate and a `Residual`. The iterate starts as it is unless `x0` is
+    given, and the result's x is that array. A method names the class of problems that it solves as
+    `problems`.
     """
 
 
@@ -132,7 +140,8 @@ class Workspace(Protocol):
     def start(self, *, warm: bool, tolerance: float) -> bool | None:
         """Forget the last solve; return True where steps are wanted even if the start meets the tolerance.
 
-        A workspace that needs the operator's floating components (None if there are none) takes them as an argument `floating`, too.
+        A workspace that needs the operator's floating components (None if there are none) takes
+        them as an argument `floating`, too.
 
         Args:
             warm: x is a guess better than clip(0, l, u).
@@ -152,7 +161,9 @@ class Workspace(Protocol):
 class BeginsAhead(Protocol):
     """A workspace whose device may begin a solve, and go on, before the host knows of it."""
 
-    def begin_ahead(self, guess: wp.array[Any] | None, criteria: StoppingCriteria | MeanCriteria, steps: int) -> float | None:
+    def begin_ahead(
+        self, guess: wp.array[Any] | None, criteria: StoppingCriteria | MeanCriteria, steps: int
+    ) -> float | None:
         """Begin a solve; return the residual that tolerances refer to, None where nothing has begun. `start` comes next, then steps.
 
         Args:
@@ -177,12 +188,19 @@ class IterateMemory:
     _solution: wp.array[Any] | None = None
 
     def __init__(
-        self, problem: LCP, precision: str = Precision.DOUBLE, *, x: wp.array[Any] | None = None, residual: NaturalResidual | None = None
+        self,
+        problem: LCP,
+        precision: str = Precision.DOUBLE,
+        *,
+        x: wp.array[Any] | None = None,
+        residual: NaturalResidual | None = None,
     ) -> None:
         self.problem, self.precision = problem, Precision(precision)
         self.x = problem.layout.zeros(wp.float64) if x is None else x
         self.residual = NaturalResidual(problem) if residual is None else residual
-        self._rounded = problem.layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
+        self._rounded = (
+            problem.layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
+        )
 
     def keep(self) -> None:
         """Remember x as the best iterate."""
@@ -271,27 +289,44 @@ class KeepsWorkspace(Protocol):
 
 def spare_of(solver: Solver, problem: Any) -> Spare | None:
     """Return the workspace of an earlier solve that a method has kept, with a problem's data; None if there is none."""
-    lend = getattr(solver, "spare", None)  # of `KeepsWorkspace`; to look a protocol up takes a twentieth of a small solve
+    # of `KeepsWorkspace`; to look a protocol up takes a twentieth of a small solve
+    lend = getattr(solver, "spare", None)
     return None if lend is None else lend(problem)
 
 
 def solve(
-    problem: LCP | VariationalInequality, solver: Solver, *, stopping: StoppingCriteria | MeanCriteria | None = None,
-    x0: Array | None = None, workspace: Workspace | None = None, callback: Callable[[Record], None] | None = None,
-) -> SolveResult:  # fmt: skip
+    problem: LCP | VariationalInequality,
+    solver: Solver,
+    *,
+    stopping: StoppingCriteria | MeanCriteria | None = None,
+    x0: Array | None = None,
+    workspace: Workspace | None = None,
+    callback: Callable[[Record], None] | None = None,
+) -> SolveResult:
     """Solve a problem by a method; what `wl.solve` documents, for callers that bring the method themselves."""
     if not isinstance(problem, (LCP, VariationalInequality)):
         raise ValueError(f"problem is a {type(problem).__name__}: expected an LCP")
     if isinstance(solver, type) or not (hasattr(solver, "init") and hasattr(solver, "step")):
-        kind = f"the class {solver.__name__}" if isinstance(solver, type) else f"a {type(solver).__name__}"
-        raise ValueError(f"solver is {kind}: expected a name in wl.METHODS or a method with its settings, such as wl.MinimumMapNewton()")
+        kind = (
+            f"the class {solver.__name__}"
+            if isinstance(solver, type)
+            else f"a {type(solver).__name__}"
+        )
+        raise ValueError(
+            f"solver is {kind}: expected a name in wl.METHODS or a method with its settings, such "
+            "as wl.MinimumMapNewton()"
+        )
     check_criteria(stopping)
     reason = refusal(problem, solver)
     if reason is not None:
         raise ValueError(reason)
-    across, loop = (problem.layout.across, _LoopInBox) if isinstance(problem, LCP) else (None, _Loop)
+    across, loop = (
+        (problem.layout.across, _LoopInBox) if isinstance(problem, LCP) else (None, _Loop)
+    )
     stopping = stopping or StoppingCriteria()
-    deadline = Deadline(stopping.max_seconds if isinstance(stopping, StoppingCriteria) else math.inf, across)
+    deadline = Deadline(
+        stopping.max_seconds if isinstance(stopping, StoppingCriteria) else math.inf, across
+    )
     if workspace is None and (spare := spare_of(solver, problem)) is not None:
         result = loop(problem, solver, stopping, deadline, spare.work, callback).run(x0)
         spare.give_back(result)
@@ -300,7 +335,9 @@ def solve(
     return loop(problem, solver, stopping, deadline, work, callback).run(x0)
 
 
-def refusal(problem: LCP | VariationalInequality, solver: Solver, *, preconditioned: bool = True) -> str | None:
+def refusal(
+    problem: LCP | VariationalInequality, solver: Solver, *, preconditioned: bool = True
+) -> str | None:
     """Return why a method does not take a problem, whatever its operator; None if it does.
 
     Args:
@@ -310,13 +347,25 @@ def refusal(problem: LCP | VariationalInequality, solver: Solver, *, preconditio
     """
     kind, taken = type(solver).__name__, getattr(solver, "problems", LCP)
     if not isinstance(problem, taken):
-        return f"{kind} takes problems of the class {taken.__name__}: this is a {type(problem).__name__}"
+        return (
+            f"{kind} takes problems of the class {taken.__name__}: this is a "
+            f"{type(problem).__name__}"
+        )
     if not isinstance(problem, LCP):
         return None
     if problem.bounds.affine is not None and not getattr(solver, "affine_bounds", False):
-        return f"{kind} cannot use bounds that are affine in x: use ProjectedSOR or another sweeping method"
-    if preconditioned and problem.preconditioner is not None and not getattr(solver, "preconditioned", False):
-        return f"preconditioner: {kind} does not use one: use MinimumMapNewton or PrimalDualActiveSet"
+        return (
+            f"{kind} cannot use bounds that are affine in x: use ProjectedSOR or another "
+            "sweeping method"
+        )
+    if (
+        preconditioned
+        and problem.preconditioner is not None
+        and not getattr(solver, "preconditioned", False)
+    ):
+        return (
+            f"preconditioner: {kind} does not use one: use MinimumMapNewton or PrimalDualActiveSet"
+        )
     if problem.layout.across is not None and not getattr(solver, "distributed", False):
         return f"{kind} does not work on several ranks: use ProjectedMultigrid or MinimumMapNewton"
     return None
@@ -325,14 +374,24 @@ def refusal(problem: LCP | VariationalInequality, solver: Solver, *, preconditio
 def _checked(work: Any, problem: Any, solver: Solver) -> Workspace:
     """Return a workspace that a caller brought, if it is one, and that of this problem and method."""
     name = type(solver).__name__
-    if isinstance(work, type) or not all(hasattr(work, part) for part in ("problem", "x", "residual", "start")):
-        kind = f"the class {work.__name__}" if isinstance(work, type) else f"a {type(work).__name__}"
+    if isinstance(work, type) or not all(
+        hasattr(work, part) for part in ("problem", "x", "residual", "start")
+    ):
+        kind = (
+            f"the class {work.__name__}" if isinstance(work, type) else f"a {type(work).__name__}"
+        )
         raise ValueError(f"workspace is {kind}: expected what {name}.init(problem) returned")
     made = _workspaces_of(type(solver))
     if made and type(work) not in made:
-        raise ValueError(f"workspace is a {type(work).__name__}, made by another method: expected what {name}.init(problem) returned")
+        raise ValueError(
+            f"workspace is a {type(work).__name__}, made by another method: expected what "
+            f"{name}.init(problem) returned"
+        )
     if work.problem is not problem:
-        raise ValueError("workspace was made for another problem; it fits only the problem that it was made for, changed in place or not")
+        raise ValueError(
+            "workspace was made for another problem; it fits only the problem that it was made "
+            "for, changed in place or not"
+        )
     return work
 
 
@@ -343,7 +402,11 @@ def _workspaces_of(method: type) -> tuple[type, ...]:
         hint = get_type_hints(method.init).get("return")  # type: ignore[attr-defined]
     except NameError:  # a user's method, with names that are there for type checkers only
         return ()
-    return tuple(kind for kind in get_args(hint) or (hint,) if isinstance(kind, type) and kind is not type(None))
+    return tuple(
+        kind
+        for kind in get_args(hint) or (hint,)
+        if isinstance(kind, type) and kind is not type(None)
+    )
 
 
 def takes_floating(workspace: Workspace) -> bool:
@@ -360,11 +423,26 @@ class _Loop:
     """The state of one solve."""
 
     def __init__(
-        self, problem: Any, solver: Solver, stopping: StoppingCriteria | MeanCriteria, deadline: Deadline, work: Workspace,
+        self,
+        problem: Any,
+        solver: Solver,
+        stopping: StoppingCriteria | MeanCriteria,
+        deadline: Deadline,
+        work: Workspace,
         callback: Callable[[Record], None] | None,
-    ) -> None:  # fmt: skip
-        self.problem, self.solver, self.criteria, self.work, self.callback = problem, solver, stopping, work, callback
-        self.stopping = stopping if isinstance(stopping, StoppingCriteria) else limit_of_steps(stopping.max_iterations)
+    ) -> None:
+        self.problem, self.solver, self.criteria, self.work, self.callback = (
+            problem,
+            solver,
+            stopping,
+            work,
+            callback,
+        )
+        self.stopping = (
+            stopping
+            if isinstance(stopping, StoppingCriteria)
+            else limit_of_steps(stopping.max_iterations)
+        )
         self.deadline = deadline
         self.residual, self.history = work.residual, list[Record]()
         self.begun = time.perf_counter()
@@ -382,11 +460,16 @@ class _Loop:
         try:
             with self.deadline:
                 given = {"floating": self.floating} if takes_floating(self.work) else {}
-                wanted = self.work.start(warm=self.warm, tolerance=self.tolerance, **given) and self.stopping.max_iterations > 0
+                wanted = (
+                    self.work.start(warm=self.warm, tolerance=self.tolerance, **given)
+                    and self.stopping.max_iterations > 0
+                )
                 return self._iterate(None if wanted and not self.stopped else self._status(0, None))
         except TimeIsUp:  # within a step, of which nothing is left
             self._restore()
-            ended = self._solved() if self.residual.norm <= self.tolerance else SolveStatus.TIME_LIMIT
+            ended = (
+                self._solved() if self.residual.norm <= self.tolerance else SolveStatus.TIME_LIMIT
+            )
             return self._finish(ended, self.history[-1].iteration)
 
     def _begin(self, x0: Array | None) -> SolveStatus | None:
@@ -411,9 +494,13 @@ class _Loop:
         work: Any = self.work
         if not hasattr(work, "begin_ahead"):
             return None
-        watched = self.callback is not None or self.stopping.merits or self.deadline.ends != math.inf
+        watched = (
+            self.callback is not None or self.stopping.merits or self.deadline.ends != math.inf
+        )
         guess = None if x0 is None or watched else self.problem.layout.load(x0, wp.float64, "x0")
-        return work.begin_ahead(guess, self.criteria, 0 if watched else self.stopping.max_iterations)
+        return work.begin_ahead(
+            guess, self.criteria, 0 if watched else self.stopping.max_iterations
+        )
 
     def _refer(self, reference: float | None = None) -> None:
         """Take the residual at the start that tolerances refer to; None: that of the iterate."""
@@ -429,7 +516,11 @@ class _Loop:
             step = self.solver.step(self.problem, self.work, self.work.x)
             iteration += step.iterations
             self.linear += step.linear_iterations
-            if not step.due and iteration < self.stopping.max_iterations and self.deadline.left() > 0:
+            if (
+                not step.due
+                and iteration < self.stopping.max_iterations
+                and self.deadline.left() > 0
+            ):
                 continue
             if not self.residual.current:
                 self.residual.evaluate(self.work.x)
@@ -441,7 +532,9 @@ class _Loop:
             status = self._status(iteration, step.failure, interim=step.interim)
         return self._finish(status, iteration)
 
-    def _status(self, iteration: int, failure: SolveStatus | None, *, interim: bool = False) -> SolveStatus | None:
+    def _status(
+        self, iteration: int, failure: SolveStatus | None, *, interim: bool = False
+    ) -> SolveStatus | None:
         """Return how the solve ends now, None if it goes on."""
         norm, first = self.residual.norm, max(self.history[0].residual, self.reference)
         if self.stopped and self.tolerance < norm < math.inf:
@@ -457,23 +550,42 @@ class _Loop:
 
     def _solved(self) -> SolveStatus:
         """Return CONVERGED, or FLOOR where the tolerance is below what storing A in float32 has changed."""
-        A, share = getattr(self.problem, "A", None), self.tolerance / max(self.reference, self.tolerance, SMALLEST)
+        A, share = (
+            getattr(self.problem, "A", None),
+            self.tolerance / max(self.reference, self.tolerance, SMALLEST),
+        )
         return SolveStatus.FLOOR if asks_beyond_storage(A, share) else SolveStatus.CONVERGED
 
     def _floor_or(self, status: SolveStatus) -> SolveStatus:
         """Return FLOOR where the best iterate's residual is what rounding leaves, else the status: the solve ends with it.
 
-        A proof that there is no solution stays one: iterates that leave for infinity have any rounding.
+        A proof that there is no solution stays one: iterates that leave for infinity have any
+        rounding.
         """
         if self.best_iteration != self.history[-1].iteration:
             self.work.restore()
-        floor = FLOOR_MARGIN * self.residual.rounding_floor(self.work.x, self.work.precision.epsilon)
-        return SolveStatus.FLOOR if self.best_norm <= floor and status is not SolveStatus.INFEASIBLE else status
+        floor = FLOOR_MARGIN * self.residual.rounding_floor(
+            self.work.x, self.work.precision.epsilon
+        )
+        return (
+            SolveStatus.FLOOR
+            if self.best_norm <= floor and status is not SolveStatus.INFEASIBLE
+            else status
+        )
 
     def _record(self, iteration: int, step: Step) -> None:
         seconds = time.perf_counter() - self.begun
         method = step.method or self.name
-        record = Record(iteration, self.residual.norm, self.linear, step.active, step.name, seconds, self._merits(), method)
+        record = Record(
+            iteration,
+            self.residual.norm,
+            self.linear,
+            step.active,
+            step.name,
+            seconds,
+            self._merits(),
+            method,
+        )
         self.history.append(record)
         if self.callback is not None:
             try:
@@ -503,7 +615,17 @@ class _Loop:
         relative = norm / self.reference if self.reference > 0 else 0.0
         of: dict[str, Any] = {"method": self.best_method, "problem": self.problem}
         version = version_of(self.problem.A) if isinstance(self.problem, LCP) else None
-        return SolveResult(self._found(), status, iterations, self.linear, norm, relative, self.history, **of, version=version)
+        return SolveResult(
+            self._found(),
+            status,
+            iterations,
+            self.linear,
+            norm,
+            relative,
+            self.history,
+            **of,
+            version=version,
+        )
 
     def _found(self) -> wp.array[Any]:
         """Return x as the result has it: in place."""
@@ -542,9 +664,17 @@ class _LoopInBox(_Loop):
             self._keep(0)
             return SolveStatus.NEGATIVE_CURVATURE
         A = self.problem.A
-        floating = A.floating_components(getattr(self.work, "scratch", None)) if has(A, NamesComponents) else None
+        floating = (
+            A.floating_components(getattr(self.work, "scratch", None))
+            if has(A, NamesComponents)
+            else None
+        )
         self.floating = floating
-        lost = floating.unattainable(self.problem.b, self.problem.lower, self.problem.upper) if floating else residual.unattainable()
+        lost = (
+            floating.unattainable(self.problem.b, self.problem.lower, self.problem.upper)
+            if floating
+            else residual.unattainable()
+        )
         if guess is not None:
             self._take(guess)
         if floating is not None or residual.row_sizes is not None:
@@ -568,7 +698,8 @@ class _LoopInBox(_Loop):
             self._refuse_unrepresentable()
             return SolveStatus.NON_FINITE
         self._refuse_vanishing()
-        small = self.reference <= 4 * EPS * self.residual.norm_of_b()  # implied by the rule for rows where x = 0, and cheap
+        # implied by the rule for rows where x = 0, and cheap
+        small = self.reference <= 4 * EPS * self.residual.norm_of_b()
         return SolveStatus.CONVERGED if small and self.residual.is_rounding(self.work.x) else None
 
     def _refuse_unrepresentable(self) -> None:
@@ -577,26 +708,38 @@ class _LoopInBox(_Loop):
         for name, side, sign in (("lower", p.lower, 1), ("upper", p.upper, -1)):
             least = float((sign * side.numpy()).max())  # x must be as large, in this direction
             if float(np.finfo(wp.dtype_to_numpy(iterate)).max) < least < math.inf:
-                raise ValueError(f"{name}: x must be {sign * least:.1e}, too large for precision='single': use 'mixed'")
+                raise ValueError(
+                    f"{name}: x must be {sign * least:.1e}, too large for precision='single': use "
+                    "'mixed'"
+                )
 
     def _refuse_vanishing(self) -> None:
         """Refuse data so small that squares of residuals are 0: anything would look like a solution."""
-        if max(self.reference, self.stopping.atol) >= SMALLEST or self.residual.norm_of_b() >= SMALLEST:
+        if (
+            max(self.reference, self.stopping.atol) >= SMALLEST
+            or self.residual.norm_of_b() >= SMALLEST
+        ):
             return
         inside = self.problem.unknown.numpy() == 1
         for name, field in (("b", self.problem.b), ("lower, upper", self.work.x)):
-            largest, across = float(np.abs(field.numpy()[inside]).max(initial=0.0)), self.problem.layout.across
+            largest, across = (
+                float(np.abs(field.numpy()[inside]).max(initial=0.0)),
+                self.problem.layout.across,
+            )
             largest = largest if across is None else across.max(largest)
             if 0.0 < largest < SMALLEST:
                 raise ValueError(
-                    f"{name}: largest value {largest:.1e}, whose square underflows in float64; scale b and the bounds by one factor"
+                    f"{name}: largest value {largest:.1e}, whose square underflows in float64; "
+                    "scale b and the bounds by one factor"
                 )
 
     def _guess(self, x0: Array) -> wp.array[Any]:
         """Return a guess as a stored field that is not the iterate itself."""
         stored = self.problem.layout.load(x0, wp.float64, "x0")
         if self.problem.not_finite(stored):
-            raise ValueError(f"x0 holds {self.problem.not_finite(stored)} values that are not finite")
+            raise ValueError(
+                f"x0 holds {self.problem.not_finite(stored)} values that are not finite"
+            )
         return wp.clone(stored) if stored.ptr == self.work.x.ptr else stored
 
     def _take(self, guess: wp.array[Any]) -> None:

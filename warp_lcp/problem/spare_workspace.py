@@ -12,7 +12,9 @@ from warp_lcp.problem.result import SolveResult, SolveStatus
 from warp_lcp.problem.solve import Solver
 from warp_lcp.rows.team import get_threads, team
 
-MOST_CELLS = 3 << 17  # of a workspace that is kept, with ghost cells: 45 bytes each, 140 in float64 with fields of faces and bounds
+# of a workspace that is kept, with ghost cells: 45 bytes each, 140 in float64 with fields of faces
+# and bounds
+MOST_CELLS = 3 << 17
 
 
 @dataclass(frozen=True)
@@ -61,8 +63,8 @@ KEPT = Kept()
 def lend(problem: LCP, solver: Solver) -> SpareWorkspace | None:
     """Return a workspace with a problem's data: the one that is kept, or at the second solve in succession of a form a new one.
 
-    Results have the bits of a new workspace. None: a problem of this form has no copies (GPUs, ranks, fields that are used in place,
-    large grids), or is the first.
+    Results have the bits of a new workspace. None: a problem of this form has no copies (GPUs,
+    ranks, fields that are used in place, large grids), or is the first.
 
     Args:
         problem: whose data it takes.
@@ -82,10 +84,11 @@ def lend(problem: LCP, solver: Solver) -> SpareWorkspace | None:
 def release_workspace() -> None:
     """Free the workspace that `wl.solve` keeps.
 
-    `wl.solve` with `ProjectedMultigrid` and without a `workspace` keeps its workspace from the second solve in succession on of a form:
-    the same shape, types, settings, threads and kinds of bounds and coefficients. The next solve of this form copies its data there, which
-    at 16^3 takes half the time of a new workspace, and returns the same bits. One workspace is kept, of at most 393,216 cells on the CPU:
-    16 MiB, 52 MiB at most.
+    `wl.solve` with `ProjectedMultigrid` and without a `workspace` keeps its workspace from the
+    second solve in succession on of a form: the same shape, types, settings, threads and kinds of
+    bounds and coefficients. The next solve of this form copies its data there, which at 16^3 takes
+    half the time of a new workspace, and returns the same bits. One workspace is kept, of at most
+    393,216 cells on the CPU: 16 MiB, 52 MiB at most.
 
     Example:
         >>> import warp_lcp as wl

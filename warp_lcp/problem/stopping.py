@@ -24,13 +24,17 @@ class StoppingCriteria(Settings):
     Args:
         rtol: relative tolerance, in [0, 1).
         atol: absolute tolerance >= 0, in the units of y.
-        max_iterations: maximum number of steps of the method, >= 0; the limit is honored exactly, by sand's after the ten it takes at once.
+        max_iterations: maximum number of steps of the method, >= 0; the limit is honored exactly,
+            by sand's after the ten it takes at once.
         patience: steps without a new smallest residual after which the solve has stagnated, >= 1.
-        divergence: the solve has diverged when the residual exceeds this multiple of the first one, > 1.
-        max_seconds: wall time after which the solve ends with TIME_LIMIT, > 0; inf: never. A method's set-up counts. What cannot be
-            interrupted is finished first: a pivot, a sweep, an iteration of a linear solve, a factorization, PIQP's one call, and on CUDA a
-            whole linear solve. On ranks all stop as soon as the time is up on one.
-        merits: record the book's merit functions in the history as well (`Record.merits`), by one more product with A a step; no criteria.
+        divergence: the solve has diverged when the residual exceeds this multiple of the first one,
+            > 1.
+        max_seconds: wall time after which the solve ends with TIME_LIMIT, > 0; inf: never. A
+            method's set-up counts. What cannot be interrupted is finished first: a pivot, a sweep,
+            an iteration of a linear solve, a factorization, PIQP's one call, and on CUDA a whole
+            linear solve. On ranks all stop as soon as the time is up on one.
+        merits: record the book's merit functions in the history as well (`Record.merits`), by one
+            more product with A a step; no criteria.
 
     Example:
         >>> StoppingCriteria(rtol=1e-3, atol=1e-2).tolerance(5.0)
@@ -53,7 +57,16 @@ class StoppingCriteria(Settings):
         """Return the absolute tolerance for a reference residual norm."""
         return max(self.atol, self.rtol * reference)
 
-    def status(self, norm: float, tolerance: float, first: float, steps: int, idle: int, *, interim: bool = False) -> SolveStatus | None:
+    def status(
+        self,
+        norm: float,
+        tolerance: float,
+        first: float,
+        steps: int,
+        idle: int,
+        *,
+        interim: bool = False,
+    ) -> SolveStatus | None:
         """Return the status of an iteration, None while it continues.
 
         Args:
@@ -99,7 +112,9 @@ class MeanCriteria:
 
     @cached_property
     def _known(self) -> StoppingCriteria:
-        return StoppingCriteria(rtol=self.rtol, atol=self.atol * self.count() ** 0.5, max_iterations=self.max_iterations)
+        return StoppingCriteria(
+            rtol=self.rtol, atol=self.atol * self.count() ** 0.5, max_iterations=self.max_iterations
+        )
 
 
 @cache
@@ -111,4 +126,6 @@ def limit_of_steps(max_iterations: int) -> StoppingCriteria:
 def check_criteria(stopping: object) -> None:
     """Raise ValueError for stopping criteria of another kind, say a bare tolerance."""
     if not (stopping is None or isinstance(stopping, (StoppingCriteria, MeanCriteria))):
-        raise ValueError(f"stopping is a {type(stopping).__name__}: expected StoppingCriteria(rtol=...)")
+        raise ValueError(
+            f"stopping is a {type(stopping).__name__}: expected StoppingCriteria(rtol=...)"
+        )

@@ -18,8 +18,28 @@ DIVIDE = KERNELS["principal_system.divide"]
 
 
 def projected_move(
-    rows: Rows, bounds: list[Any], x: Any, along: Any, length: float, to: Any, *, z: Any = None, beta: float = 0.0, kept: Any = None,
+    rows: Rows,
+    bounds: list[Any],
+    x: Any,
+    along: Any,
+    length: float,
+    to: Any,
+    *,
+    z: Any = None,
+    beta: float = 0.0,
+    kept: Any = None,
     guarded: bool = True,
-) -> None:  # fmt: skip
+) -> None:
     """Set `to` = clip(x + length along, l, u) where the direction is not 0; see `active_set.h`."""
-    STEP.bind(rows, bounds=bounds, x=x, z=z, along=along, to=to, kept=kept, beta=beta, step=length, guarded=guarded).launch()
+    STEP.bind(
+        rows,
+        bounds=bounds,
+        x=x,
+        z=z,
+        along=along,
+        to=to,
+        kept=kept,
+        beta=beta,
+        step=length,
+        guarded=guarded,
+    ).launch()

@@ -10,7 +10,8 @@ import warp as wp
 from warp_lcp.operators.banded_matrix import BandedMatrix, bands_of
 from warp_lcp.operators.sparse import SparseOperator
 
-NUDGES = (0.0, 1e-12, 1e-9, 1e-6)  # shifts of a singular banded block, in units of the matrix's largest column sum
+# shifts of a singular banded block, in units of the matrix's largest column sum
+NUDGES = (0.0, 1e-12, 1e-9, 1e-6)
 
 
 class BandedSystem:
@@ -24,7 +25,10 @@ class BandedSystem:
     def refresh(self) -> None:
         """Copy the entries to the host if they have changed."""
         if self._version != self._A.version:
-            self._version, self._matrix = self._A.version, BandedMatrix(bands_of(self._A, self._A.bandwidth))
+            self._version, self._matrix = (
+                self._A.version,
+                BandedMatrix(bands_of(self._A, self._A.bandwidth)),
+            )
 
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
         """Take another free set and shift."""
@@ -42,6 +46,8 @@ class BandedSystem:
             e = A.solve(free, r, self._shift + nudge * A.size)
             if e is not None and np.isfinite(e).all():
                 self.e.assign(e)
-                return 1, float(np.linalg.norm(np.where(free, A.product(e) + self._shift * e - r, 0.0)))
+                return 1, float(
+                    np.linalg.norm(np.where(free, A.product(e) + self._shift * e - r, 0.0))
+                )
         self.e.zero_()
         return 1, self.norm()

@@ -1,6 +1,7 @@
 """Problems on coarse points and grids that move the active set of Newton's method on the minimum map.
 
-Full approximation corrections (Brandt and Cryer 1983): the coarse problem has the bounds that x leaves to its points.
+Full approximation corrections (Brandt and Cryer 1983): the coarse problem has the bounds that x
+leaves to its points.
 """
 
 from __future__ import annotations
@@ -21,9 +22,10 @@ from warp_lcp.problem.solve import solve
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.reduced.line_system import LineSystem
 
-ROUGH = partial(StoppingCriteria, rtol=1e-2, max_iterations=30)  # of a correction that interpolation blurs by a layer or two anyway
-# a set creeps while more than this share of what the last step moved moves again: at that rate a dozen steps or more are still to
-# come, and a first correction costs as much as those
+# of a correction that interpolation blurs by a layer or two anyway
+ROUGH = partial(StoppingCriteria, rtol=1e-2, max_iterations=30)
+# a set creeps while more than this share of what the last step moved moves again: at that rate a
+# dozen steps or more are still to come, and a first correction costs as much as those
 CREEP = 0.92
 STEPS = 3  # of creeping before the correction
 
@@ -31,9 +33,10 @@ STEPS = 3  # of creeping before the correction
 class CoarseProblem:
     """Solves for the correction P e of an x: P'A P e + P'(A x + b), with the bounds that x leaves to the coarse points.
 
-    Those are unknowns of the fine problem, so that an obstacle's corners stay where they are, and unknowns at their bounds stay there until
-    the correction says otherwise: the contact's boundary moves as far as it must at once, where Newton's own step moves it by a layer of
-    unknowns. The coarse problem is solved by Newton's method too, which begins with a coarse problem of its own.
+    Those are unknowns of the fine problem, so that an obstacle's corners stay where they are, and
+    unknowns at their bounds stay there until the correction says otherwise: the contact's boundary
+    moves as far as it must at once, where Newton's own step moves it by a layer of unknowns. The
+    coarse problem is solved by Newton's method too, which begins with a coarse problem of its own.
 
     Args:
         A: the matrix.
@@ -63,12 +66,21 @@ class CoarseProblem:
     def correction(self, problem: LCP, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Return P e for the problem at x, where A x + b = y."""
         points = self._points
-        return self._P @ self._solved(self._R @ y, (problem.lower.numpy() - x)[points], (problem.upper.numpy() - x)[points]).numpy()
+        return (
+            self._P
+            @ self._solved(
+                self._R @ y,
+                (problem.lower.numpy() - x)[points],
+                (problem.upper.numpy() - x)[points],
+            ).numpy()
+        )
 
     def _solved(self, *fields: np.ndarray) -> wp.array[Any]:
         """Return the coarse problem's rough solution for this b, lower and upper."""
         work = self._work
-        for field, values in zip((work.problem.b, work.problem.lower, work.problem.upper), fields, strict=True):
+        for field, values in zip(
+            (work.problem.b, work.problem.lower, work.problem.upper), fields, strict=True
+        ):
             field.assign(values)
         return solve(work.problem, self._settings, stopping=ROUGH(), workspace=work).x
 
@@ -92,8 +104,9 @@ class CoarseProblem:
 class CoarseStencilProblem(CoarseProblem):
     """The same on every second cell of a compact stencil's grid, with the transfers of its hierarchy; each solve begins with a correction.
 
-    With coarse problems on all levels that is nested iteration: Newton's steps then start with a contact that is right but for a layer or
-    two of cells, cold or from another time step's solution, and come to the end in as many as a linear solve takes.
+    With coarse problems on all levels that is nested iteration: Newton's steps then start with a
+    contact that is right but for a layer or two of cells, cold or from another time step's
+    solution, and come to the end in as many as a linear solve takes.
 
     Args:
         A: the operator.
@@ -123,8 +136,14 @@ class CoarseStencilProblem(CoarseProblem):
         fine, coarse, size = hierarchy.finest, hierarchy.levels[1], float(np.abs(y).max()) or 1.0
         fine.t.assign((y / size).astype(wp.dtype_to_numpy(kind)))
         fine.handing_down(coarse).launch()
-        held = (self._points((bound.numpy() - x) / size) for bound in (problem.lower, problem.upper))
-        coarse.x.assign(self._solved(coarse.b.numpy().astype(np.float64), *held).numpy().astype(wp.dtype_to_numpy(kind)))
+        held = (
+            self._points((bound.numpy() - x) / size) for bound in (problem.lower, problem.upper)
+        )
+        coarse.x.assign(
+            self._solved(coarse.b.numpy().astype(np.float64), *held)
+            .numpy()
+            .astype(wp.dtype_to_numpy(kind))
+        )
         fine.correcting(coarse, add=False).launch()
         return size * fine.x.numpy().astype(np.float64)
 

@@ -15,11 +15,13 @@ from warp_lcp.reduced.grid_system import GridSystem, projected_cycle
 from warp_lcp.rows.vectors import Sums
 
 LARGE = 1000  # unknowns from which a cold start on a sparse matrix takes projected cycles
-# unknowns from which that is six cycles for each on a grid: one costs a fifth of a Newton step, which moves the set by a row, and rows are
-# many. With 4, 8, 16 and 32 cycles a membrane on 600,000 nodes takes 16, 15, 12 and 6 Newton steps, 7.0, 5.4, 4.8 and 4.4 s
+# unknowns from which that is six cycles for each on a grid: one costs a fifth of a Newton step,
+# which moves the set by a row, and rows are many. With 4, 8, 16 and 32 cycles a membrane on 600,000
+# nodes takes 16, 15, 12 and 6 Newton steps, 7.0, 5.4, 4.8 and 4.4 s
 HUGE = 1 << 16
-# growth of the residual by which a projected cycle on an operator that is not symmetric is undone, on a grid over the last one's, on a
-# matrix over the start's: torsion with wind on 250^2 nodes takes it to 11 times that, and the more nodes the more, to good effect
+# growth of the residual by which a projected cycle on an operator that is not symmetric is undone,
+# on a grid over the last one's, on a matrix over the start's: torsion with wind on 250^2 nodes
+# takes it to 11 times that, and the more nodes the more, to good effect
 RISEN, RISEN_ON_MATRIX = 10.0, 1000.0
 
 
@@ -42,7 +44,9 @@ class GridCycles:
         """Return how many cycles a cold start takes."""
         return self._count
 
-    def run(self, x: wp.array[Any], residual: NaturalResidual, free: wp.array[Any], *, restrict: bool) -> float:
+    def run(
+        self, x: wp.array[Any], residual: NaturalResidual, free: wp.array[Any], *, restrict: bool
+    ) -> float:
         """Move x by a cycle on all unknowns; return up to which residual it may stand.
 
         Args:
@@ -69,7 +73,12 @@ class AggregateCycles:
 
     def __init__(self, problem: LCP, count: int) -> None:
         A: Any = problem.A
-        self._problem, self._count, self._aggregation, self._at_start = problem, count, MonotoneAggregation(A), 0.0
+        self._problem, self._count, self._aggregation, self._at_start = (
+            problem,
+            count,
+            MonotoneAggregation(A),
+            0.0,
+        )
 
     def begin(self) -> int:
         """Return how many cycles a cold start takes, 0 if A is another matrix."""
@@ -78,7 +87,9 @@ class AggregateCycles:
             return 0
         return (2 if self._problem.A.shape[0] < HUGE else 6) * self._count
 
-    def run(self, x: wp.array[Any], residual: NaturalResidual, free: wp.array[Any], *, restrict: bool) -> float:
+    def run(
+        self, x: wp.array[Any], residual: NaturalResidual, free: wp.array[Any], *, restrict: bool
+    ) -> float:
         """Move x by a cycle on all unknowns; return up to which residual it may stand."""
         p = self._problem
         self._at_start = self._at_start or residual.norm
@@ -86,7 +97,9 @@ class AggregateCycles:
         return RISEN_ON_MATRIX * self._at_start
 
 
-def cold_cycles(problem: LCP, system: Any, sums: Sums, count: int) -> GridCycles | AggregateCycles | None:
+def cold_cycles(
+    problem: LCP, system: Any, sums: Sums, count: int
+) -> GridCycles | AggregateCycles | None:
     """Return the cycles for a problem with bounds; None where its operator has none."""
     if not problem.bounded:
         return None

@@ -28,7 +28,8 @@ from warp_lcp.rows.vectors import Sums, rows_of
 class CorrectionSystem:
     """Newton's equations by a principal system, see `ReducedSystem`: of a grid, a matrix, a sum with a term of low rank, products only.
 
-    Fields of one size: the equations are divided by the residual's norm, so that corrections in float32 neither overflow nor vanish.
+    Fields of one size: the equations are divided by the residual's norm, so that corrections in
+    float32 neither overflow nor vanish.
 
     Args:
         problem: the problem.
@@ -41,9 +42,11 @@ class CorrectionSystem:
         active: unknowns held.
         moved: unknowns by which the free set differs from the last one.
         size: what the equations are divided by: the residual's norm where the step begins.
-        start_of_step: stored field; x with held unknowns on their bounds, once `move` has been called.
+        start_of_step: stored field; x with held unknowns on their bounds, once `move` has been
+            called.
         cycles: projected cycles of a cold start; None: there are none.
-        coarse: problem on coarse unknowns that moves an active set which creeps; None: there is none.
+        coarse: problem on coarse unknowns that moves an active set which creeps; None: there is
+            none.
         damped: Levenberg-Marquardt steps of dense problems; None: there are none.
     """
 
@@ -54,17 +57,25 @@ class CorrectionSystem:
         self.iterate = IterateMemory(problem, settings.precision) if iterate is None else iterate
         real, x = self.iterate.precision.correction, self.iterate.x
         self.start_of_step = layout.zeros(wp.float64)
-        self.principal = principal_system(problem, real, bounded=problem.bounded, settings=settings.cycle)
+        self.principal = principal_system(
+            problem, real, bounded=problem.bounded, settings=settings.cycle
+        )
         self.free = layout.zeros(wp.uint8)
         self.sums = Sums(rows_of(x), 4, slots=SLOTS, across=layout.across)
         helped = problem.bounded and settings.safeguard
-        self.cycles = cold_cycles(problem, self.principal, self.sums, settings.monotone_cycles) if helped else None
+        self.cycles = (
+            cold_cycles(problem, self.principal, self.sums, settings.monotone_cycles)
+            if helped
+            else None
+        )
         self.coarse = _coarse_problem(problem, self.principal, settings) if helped else None
         self.damped = DampedSteps(problem) if isinstance(self.principal, DenseSystem) else None
         self.floating: FloatingComponents | None = None
         self.active, self.moved, self.size, self._square, self._cycles_left = 0, 0.0, 1.0, 0.0, 0
 
-    def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
+    def start(
+        self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
+    ) -> None:
         """Forget the active set; the operator may have changed."""
         self.floating, self._target = floating, tolerance
         self._cycles_left = self.cycles.begin() if self.cycles is not None and not warm else 0
@@ -73,9 +84,15 @@ class CorrectionSystem:
                 part.start()
         self.free.zero_()
         self._stale = True  # whether the principal system has another free set
-        # with an M-matrix each active set of whole steps is part of the one before, whatever the residual does
-        self._monotone = isinstance(self.principal, SparseSystem) and self.principal.cycled and not self._problem.A.symmetric
-        self._shrinks, self._last_active = False, math.inf  # whether the active set has become smaller; unknowns in the last one
+        # with an M-matrix each active set of whole steps is part of the one before, whatever the
+        # residual does
+        self._monotone = (
+            isinstance(self.principal, SparseSystem)
+            and self.principal.cycled
+            and not self._problem.A.symmetric
+        )
+        # whether the active set has become smaller; unknowns in the last one
+        self._shrinks, self._last_active = False, math.inf
         self.principal.refresh()
 
     def monotone_cycle(self) -> Step | None:
@@ -96,7 +113,8 @@ class CorrectionSystem:
         if not symmetric and not residual.evaluate(x) <= most:  # no energy falls there
             wp.copy(x, self.start_of_step)
             self._cycles_left, residual.current = 0, False
-        # A grid's system keeps all unknowns from cycle to cycle; Newton's step takes some out again.
+        # A grid's system keeps all unknowns from cycle to cycle; Newton's step takes some out
+        # again.
         self._stale = not (self.cycles.repairs and self._cycles_left > 0)
         return Step("monotone cycle", 1, None, interim=True)
 
@@ -107,19 +125,39 @@ class CorrectionSystem:
             return Step("newton", 0, 0, SolveStatus.INFEASIBLE)
         self.size = residual.norm
         moved, active, shifted, square = self.sums.of(
-            CLASSIFY, stencil=residual.known, bounds=p.bounds.operands, x=self.iterate.x, unknown=p.unknown, free=self.free,
-            g=self.principal.r, scale=1 / self.size,
-        )  # fmt: skip
-        self.moved, self.active, self._shifted, self._square = float(moved), int(active), bool(shifted), float(square)
-        self._shrinks, self._last_active = self._monotone and self.active < self._last_active, self.active
-        return self._coarse_step() if self.coarse is not None and self.coarse.is_due(self.moved) else None
+            CLASSIFY,
+            stencil=residual.known,
+            bounds=p.bounds.operands,
+            x=self.iterate.x,
+            unknown=p.unknown,
+            free=self.free,
+            g=self.principal.r,
+            scale=1 / self.size,
+        )
+        self.moved, self.active, self._shifted, self._square = (
+            float(moved),
+            int(active),
+            bool(shifted),
+            float(square),
+        )
+        self._shrinks, self._last_active = (
+            self._monotone and self.active < self._last_active,
+            self.active,
+        )
+        return (
+            self._coarse_step()
+            if self.coarse is not None and self.coarse.is_due(self.moved)
+            else None
+        )
 
     def _coarse_step(self) -> Step:
         """Correct x, with held unknowns at their bounds, by the coarse problem."""
         x, residual = self.iterate.x, self.iterate.residual
         assert self.coarse is not None
         residual.affine(x)
-        self.start_of_step.assign(self.coarse.correction(self._problem, x.numpy(), residual.y.numpy()))
+        self.start_of_step.assign(
+            self.coarse.correction(self._problem, x.numpy(), residual.y.numpy())
+        )
         self._set(x, self.start_of_step, 1.0)
         self._stale = True
         return Step("coarse problem", 1, self.active, interim=True)
@@ -132,7 +170,11 @@ class CorrectionSystem:
             self._stale = False
         if self._shifted:
             residual.affine(self.iterate.x)
-            self._square = float(self.sums.of(ON_FREE, y=residual.y, free=self.free, g=self.principal.r, scale=1 / self.size)[0])
+            self._square = float(
+                self.sums.of(
+                    ON_FREE, y=residual.y, free=self.free, g=self.principal.r, scale=1 / self.size
+                )[0]
+            )
         self._shrinks = self._shrinks and self._square != 0
         return self._square != 0
 
@@ -142,13 +184,20 @@ class CorrectionSystem:
         if self.floating is not None:
             self.floating.project(r, self.free)
         norm, target = math.sqrt(self._square) / self.size, 0.3 * self._target / self.size
-        return self.principal.solve(max((s.eta if self.moved else s.eta**2) * norm, target), s.max_linear_iterations)[0]
+        return self.principal.solve(
+            max((s.eta if self.moved else s.eta**2) * norm, target), s.max_linear_iterations
+        )[0]
 
     def move(self, length: float) -> float:
         """Set x this part of the correction from where the step began."""
         check_time()
         x, whole = self.iterate.x, length == 1.0
-        self._set(x if whole else self.start_of_step, self.principal.e, length * self.size, kept=self.start_of_step if whole else None)
+        self._set(
+            x if whole else self.start_of_step,
+            self.principal.e,
+            length * self.size,
+            kept=self.start_of_step if whole else None,
+        )
         self.settle()
         return self.iterate.residual.evaluate(x)
 
@@ -182,7 +231,9 @@ class CorrectionSystem:
         residual.evaluate(x)
         if lower:
             norms.clear()
-        return self._step("regularized", iterations, self.damped.status if lower else SolveStatus.NON_DESCENT)
+        return self._step(
+            "regularized", iterations, self.damped.status if lower else SolveStatus.NON_DESCENT
+        )
 
     def _take_back(self, iterations: int, name: str = "newton") -> Step:
         """Go back to where the step began, and fail."""
@@ -193,9 +244,20 @@ class CorrectionSystem:
     def _step(self, name: str, iterations: int, failure: SolveStatus | None = None) -> Step:
         return Step(name, iterations, self.active, failure, interim=self._shrinks)
 
-    def _set(self, base: wp.array[Any], e: wp.array[Any], scale: float, kept: wp.array[Any] | None = None) -> None:
+    def _set(
+        self, base: wp.array[Any], e: wp.array[Any], scale: float, kept: wp.array[Any] | None = None
+    ) -> None:
         """Set x = clip(base + scale e), rounded, where e is not 0; remember base if `kept` is given."""
-        projected_move(self.sums.rows, self._problem.bounds.operands, base, e, scale, self.iterate.x, kept=kept, guarded=False)
+        projected_move(
+            self.sums.rows,
+            self._problem.bounds.operands,
+            base,
+            e,
+            scale,
+            self.iterate.x,
+            kept=kept,
+            guarded=False,
+        )
         self.iterate.round_iterate()
 
 
@@ -204,4 +266,8 @@ def _coarse_problem(problem: LCP, system: Any, settings: Any) -> CoarseProblem |
     A: Any = problem.A
     if isinstance(system, LineSystem):
         return CoarseStencilProblem(A, system, settings)
-    return CoarseProblem(A, settings) if isinstance(A, SparseOperator) and A.unknowns >= LARGE else None
+    return (
+        CoarseProblem(A, settings)
+        if isinstance(A, SparseOperator) and A.unknowns >= LARGE
+        else None
+    )

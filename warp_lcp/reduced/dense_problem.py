@@ -20,22 +20,30 @@ from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.scale import scale_of_matrix, scaled, sizes_of_matrix
 from warp_lcp.problem.solve import EPS, IterateMemory, Precision, Step
 
-SEMIDEFINITE = 1e-10  # shift with which an equilibrated semi-definite matrix must have a Cholesky factor
+# shift with which an equilibrated semi-definite matrix must have a Cholesky factor
+SEMIDEFINITE = 1e-10
 SIDE = 4096  # unknowns of a dense matrix up to which it is looked at
-# entries of A up to which a linear program is asked whether there is a solution: seconds; with 84,000
-# and costs from 1e-4 to 1e12 HiGHS (SciPy 1.17) recurses until the process crashes, with 31,000 in none of 20
+# entries of A up to which a linear program is asked whether there is a solution: seconds; with
+# 84,000 and costs from 1e-4 to 1e12 HiGHS (SciPy 1.17) recurses until the process crashes, with
+# 31,000 in none of 20
 PROVABLE = 40_000
 PROOF_SECONDS = 10.0  # of such a program: one that takes longer proves nothing
-TOLERANCE = 1e-10  # of such a program, the least that HiGHS takes; its optimum is a vertex, whose equations hold to rounding
+# of such a program, the least that HiGHS takes; its optimum is a vertex, whose equations hold to
+# rounding
+TOLERANCE = 1e-10
 ROUNDING = 8.0  # times sqrt(k) eps of its terms: a sum of k of them below that may be 0
 LARGEST = float(np.finfo(np.float64).max)  # its costs are finite, whatever the bounds
 REFINEMENTS = 2  # of its optimum
-VERTEX = 1e-8  # of the terms of such an equation, and of the largest multiplier: what its solver leaves of zeros
+# of the terms of such an equation, and of the largest multiplier: what its solver leaves of zeros
+VERTEX = 1e-8
 NULL = 1e-11  # of the terms of A z: below that, rounding of A and of a factorization has made it
-SHARE = 1e-8  # of the terms of a contradiction, that it must exceed: b = y - A x is rounded where A x cancels
+# of the terms of a contradiction, that it must exceed: b = y - A x is rounded where A x cancels
+SHARE = 1e-8
 EQUILIBRATIONS = 8  # sweeps of Ruiz's iteration, which halves the logarithms of rows that differ
 SINGULAR = 1e-13  # of the matrix's largest row sum: a pivot below it is rounding
-RANK = 1e-12  # singular values below this part of the largest are zero to least-squares solutions (methods.md: all solved with it)
+# singular values below this part of the largest are zero to least-squares solutions (methods.md:
+# all solved with it)
+RANK = 1e-12
 
 
 @dataclass(frozen=True)
@@ -63,9 +71,19 @@ class DenseProblem:
         """Copy a problem's data as they are now to the host."""
         problem.bounds.refresh()
         rows = np.flatnonzero(problem.unknown.numpy() == 1)
-        b, lower, upper = (f.numpy()[rows].astype(np.float64) for f in (problem.b, *(problem.bounds.as_field(k) for k in (0, 1))))
+        b, lower, upper = (
+            f.numpy()[rows].astype(np.float64)
+            for f in (problem.b, *(problem.bounds.as_field(k) for k in (0, 1)))
+        )
         sparse = sparse_matrix(problem) if keep_sparse else None
-        return cls(rows, assemble(problem, rows) if sparse is None else sparse, b, lower, upper, problem.A.symmetric)
+        return cls(
+            rows,
+            assemble(problem, rows) if sparse is None else sparse,
+            b,
+            lower,
+            upper,
+            problem.A.symmetric,
+        )
 
     def affine(self, x: np.ndarray) -> np.ndarray:
         """Return y = A x + b."""
@@ -74,8 +92,9 @@ class DenseProblem:
     def scaled(self) -> tuple[DenseProblem, np.ndarray]:
         """Return the problem in units in which A's rows and columns have entries near 1, and b too, and those units of x.
 
-        With x = beta C x', y = beta R^-1 y' it is R A C, R b / beta and l / (beta C), u / (beta C), of which methods that pivot choose the
-        same pivots but for ties; R = C where A is symmetric. The units are powers of 2, so that nothing is rounded.
+        With x = beta C x', y = beta R^-1 y' it is R A C, R b / beta and l / (beta C), u / (beta C),
+        of which methods that pivot choose the same pivots but for ties; R = C where A is symmetric.
+        The units are powers of 2, so that nothing is rounded.
         """
         R, C = self._units()
         b, start = R * self.b, R * (self.A @ np.clip(0.0, self.lower, self.upper))
@@ -83,7 +102,9 @@ class DenseProblem:
         units = beta * C
         with np.errstate(over="ignore"):  # a bound beyond all numbers in these units is infinite
             sides = self.lower / units, self.upper / units
-        return DenseProblem(self.rows, scaled(self.A, R, C), b / beta, *sides, self.symmetric), units
+        return DenseProblem(
+            self.rows, scaled(self.A, R, C), b / beta, *sides, self.symmetric
+        ), units
 
     def _units(self) -> tuple[np.ndarray, np.ndarray]:
         """Return R and C of `scaled`, powers of 2."""
@@ -99,7 +120,9 @@ class DenseProblem:
     def residual(self, x: np.ndarray) -> float:
         """Return the norm of the natural residual."""
         d = self._scale
-        return float(np.linalg.norm(d * (x - np.clip(x - self.affine(x) / d, self.lower, self.upper))))
+        return float(
+            np.linalg.norm(d * (x - np.clip(x - self.affine(x) / d, self.lower, self.upper)))
+        )
 
     def polished(self, x: np.ndarray, free: np.ndarray) -> np.ndarray:
         """Return x after two Newton steps on the unknowns `free` for y = 0 there; x itself where that is no improvement.
@@ -112,7 +135,11 @@ class DenseProblem:
         block: Any = self.A[np.ix_(rows, rows)] if len(rows) else None
         for _ in range(2 if len(rows) else 0):
             y = self.affine(out)[rows]
-            out[rows] -= scipy.sparse.linalg.lsmr(block, y, atol=0.0, btol=0.0)[0] if scipy.sparse.issparse(block) else _solved(block, y)
+            out[rows] -= (
+                scipy.sparse.linalg.lsmr(block, y, atol=0.0, btol=0.0)[0]
+                if scipy.sparse.issparse(block)
+                else _solved(block, y)
+            )
         out = np.clip(out, self.lower, self.upper)
         return out if np.isfinite(out).all() and self.residual(out) < self.residual(x) else x
 
@@ -158,9 +185,17 @@ def equilibration(A: Any) -> np.ndarray:
     sparse = scipy.sparse.issparse(A)
     for _ in range(EQUILIBRATIONS):
         check_time()
-        scaled = magnitude.multiply(S[:, None]).multiply(S).tocsr() if sparse else S[:, None] * magnitude * S
-        rows, columns = (scaled.max(axis=k).toarray().ravel() if sparse else scaled.max(axis=k) for k in (1, 0))
-        S = S * power_of_two(1 / np.sqrt(np.where(np.maximum(rows, columns) > 0, np.maximum(rows, columns), 1.0)))
+        scaled = (
+            magnitude.multiply(S[:, None]).multiply(S).tocsr()
+            if sparse
+            else S[:, None] * magnitude * S
+        )
+        rows, columns = (
+            scaled.max(axis=k).toarray().ravel() if sparse else scaled.max(axis=k) for k in (1, 0)
+        )
+        S = S * power_of_two(
+            1 / np.sqrt(np.where(np.maximum(rows, columns) > 0, np.maximum(rows, columns), 1.0))
+        )
     return S
 
 
@@ -194,7 +229,11 @@ def semidefinite(A: np.ndarray) -> bool:
     S = equilibration(A)
     scaled = S[:, None] * A * S
     try:
-        scipy.linalg.cholesky((scaled + scaled.T) / 2 + SEMIDEFINITE * np.eye(len(A)), overwrite_a=True, check_finite=False)
+        scipy.linalg.cholesky(
+            (scaled + scaled.T) / 2 + SEMIDEFINITE * np.eye(len(A)),
+            overwrite_a=True,
+            check_finite=False,
+        )
     except np.linalg.LinAlgError:
         return False
     return True
@@ -203,21 +242,27 @@ def semidefinite(A: np.ndarray) -> bool:
 def certifies(data: DenseProblem, z: np.ndarray) -> bool:
     """Return whether z proves that no x within its bounds gives every y a sign that its bounds allow (Farkas' lemma).
 
-    A solution has y_i >= 0 where l_i alone is finite, y_i <= 0 where u_i alone is, and y_i = 0 where neither is. With z_i >= 0, z_i <= 0
-    and z_i of any sign there, and z_i = 0 where both are finite, it has z'y >= 0. With g = A'z, for every x in [l, u],
+    A solution has y_i >= 0 where l_i alone is finite, y_i <= 0 where u_i alone is, and y_i = 0
+    where neither is. With z_i >= 0, z_i <= 0 and z_i of any sign there, and z_i = 0 where both are
+    finite, it has z'y >= 0. With g = A'z, for every x in [l, u],
 
         z'y = b'z + g'x <= b'z + sum_j max(g_j l_j, g_j u_j),
 
-    where g_j <= 0 if u_j is infinite, and g_j >= 0 if l_j is: if the right side is negative, there is no solution. A g_j that rounding
-    makes, of the terms a_ij z_i, counts as 0. The right side must be negative by `SHARE` of its terms, so that a solution that rounding
-    of A or b hides has terms a_ij x_j that are some 1e8 times as large as b.
+    where g_j <= 0 if u_j is infinite, and g_j >= 0 if l_j is: if the right side is negative, there
+    is no solution. A g_j that rounding makes, of the terms a_ij z_i, counts as 0. The right side
+    must be negative by `SHARE` of its terms, so that a solution that rounding of A or b hides has
+    terms a_ij x_j that are some 1e8 times as large as b.
 
     Args:
         data: the problem, in any units of rows and columns.
         z: multipliers, shape (n,), of those signs or another vector.
     """
     below, above = np.isfinite(data.lower), np.isfinite(data.upper)
-    z = np.where(below & above, 0.0, np.where(below, np.maximum(z, 0.0), np.where(above, np.minimum(z, 0.0), z)))
+    z = np.where(
+        below & above,
+        0.0,
+        np.where(below, np.maximum(z, 0.0), np.where(above, np.minimum(z, 0.0), z)),
+    )
     magnitude = abs(data.A)
     with np.errstate(over="ignore", invalid="ignore"):
         g, terms = data.A.T @ z, magnitude.T @ np.abs(z)
@@ -226,15 +271,18 @@ def certifies(data: DenseProblem, z: np.ndarray) -> bool:
             return False
         low, high = np.where(below, data.lower, 0.0), np.where(above, data.upper, 0.0)
         gains = np.maximum(g, 0.0) * high + np.minimum(g, 0.0) * low
-        doubt = SHARE * (np.abs(data.b) @ np.abs(z) + np.abs(gains).sum()) + noise @ np.maximum(np.abs(low), np.abs(high))
+        doubt = SHARE * (np.abs(data.b) @ np.abs(z) + np.abs(gains).sum()) + noise @ np.maximum(
+            np.abs(low), np.abs(high)
+        )
         return bool(data.b @ z + gains.sum() < -doubt)
 
 
 def diagonally_dominant(A: Any) -> bool:
     """Return whether A is diagonally dominant, with a positive diagonal, and every row leads to a strictly dominant one.
 
-    Such a matrix is nonsingular, and a P-matrix: its problem has a solution, whatever b and the bounds are (Cottle, Pang and Stone
-    1992, section 3.3). Row i leads to row j if a_ij is not 0. Sums of rows are known to rounding; strictly: by `SHARE` of a_ii.
+    Such a matrix is nonsingular, and a P-matrix: its problem has a solution, whatever b and the
+    bounds are (Cottle, Pang and Stone 1992, section 3.3). Row i leads to row j if a_ij is not 0.
+    Sums of rows are known to rounding; strictly: by `SHARE` of a_ii.
 
     Args:
         A: dense or sparse, shape (n, n).
@@ -246,24 +294,33 @@ def diagonally_dominant(A: Any) -> bool:
     if not ((diagonal > 0) & (diagonal * (1.0 + noise) >= beside)).all():
         return False
     strict = np.flatnonzero(diagonal - beside > SHARE * diagonal)
-    # Search from a node n that leads to all strictly dominant rows, against the direction of the entries.
-    start = scipy.sparse.csr_array((np.ones(len(strict)), (np.full(len(strict), n), strict)), shape=(n + 1, n + 1))
+    # Search from a node n that leads to all strictly dominant rows, against the direction of the
+    # entries.
+    start = scipy.sparse.csr_array(
+        (np.ones(len(strict)), (np.full(len(strict), n), strict)), shape=(n + 1, n + 1)
+    )
     entries = scipy.sparse.coo_array(abs(matrix))
-    backward = scipy.sparse.coo_array((entries.data, (entries.col, entries.row)), shape=(n + 1, n + 1))
-    reached = scipy.sparse.csgraph.breadth_first_order((start + backward).tocsr(), n, return_predecessors=False)
+    backward = scipy.sparse.coo_array(
+        (entries.data, (entries.col, entries.row)), shape=(n + 1, n + 1)
+    )
+    reached = scipy.sparse.csgraph.breadth_first_order(
+        (start + backward).tocsr(), n, return_predecessors=False
+    )
     return len(reached) == n + 1
 
 
 def inconsistent(data: DenseProblem) -> bool:
     """Return whether it is proved that no solution exists: `certifies` accepts multipliers that a linear program suggests.
 
-    A problem with a positive semi-definite A, symmetric or not, has a solution wherever there is no such proof. The program minimizes the
-    bound of `certifies`, with g = p - q, p, q >= 0, of which p_j is 0 where u_j is infinite, and q_j where l_j is:
+    A problem with a positive semi-definite A, symmetric or not, has a solution wherever there is no
+    such proof. The program minimizes the bound of `certifies`, with g = p - q, p, q >= 0, of which
+    p_j is 0 where u_j is infinite, and q_j where l_j is:
 
         minimize b'z + u'p - l'q   where A'z = p - q, |z_i| <= 1.
 
-    It is posed in units in which the rows of [A b] have entries near 1, so that a large row hides no other. That a linear program's solver
-    calls the problem infeasible is no proof: its tolerances are absolute.
+    It is posed in units in which the rows of [A b] have entries near 1, so that a large row hides
+    no other. That a linear program's solver calls the problem infeasible is no proof: its
+    tolerances are absolute.
     """
     from scipy.optimize import linprog  # a fifth of a second to import, and seldom needed
 
@@ -275,15 +332,25 @@ def inconsistent(data: DenseProblem) -> bool:
     R, C, beta = _units_with_right_side(A, b)
     up, low = np.flatnonzero(above), np.flatnonzero(below)
     identity = scipy.sparse.eye_array(len(data.b), format="csc")
-    system = scipy.sparse.hstack([scipy.sparse.csc_array(scaled(A, R, C).T), -identity[:, up], identity[:, low]], format="csc")
+    system = scipy.sparse.hstack(
+        [scipy.sparse.csc_array(scaled(A, R, C).T), -identity[:, up], identity[:, low]],
+        format="csc",
+    )
     with np.errstate(over="ignore"):  # of bounds near 1e308
         cost = np.concatenate([R * b, data.upper[up] / C[up], -data.lower[low] / C[low]]) / beta
     cost = np.clip(cost, -LARGEST, LARGEST)
-    cost = cost * 2.0 ** -np.ceil(np.log2(max(np.abs(cost).max(), 1.0)))  # HiGHS warns of costs beyond 1e6, and may crash
-    signs = [(-float(not below[i]), float(not above[i])) for i in rows] + [(0.0, None)] * (len(up) + len(low))
-    options = dict.fromkeys(("primal_feasibility_tolerance", "dual_feasibility_tolerance"), TOLERANCE)
+    # HiGHS warns of costs beyond 1e6, and may crash
+    cost = cost * 2.0 ** -np.ceil(np.log2(max(np.abs(cost).max(), 1.0)))
+    signs = [(-float(not below[i]), float(not above[i])) for i in rows] + [(0.0, None)] * (
+        len(up) + len(low)
+    )
+    options = dict.fromkeys(
+        ("primal_feasibility_tolerance", "dual_feasibility_tolerance"), TOLERANCE
+    )
     options["time_limit"] = min(seconds_left(), PROOF_SECONDS)
-    found = linprog(cost, A_eq=system, b_eq=np.zeros(len(data.b)), bounds=signs, method="highs", options=options)
+    found = linprog(
+        cost, A_eq=system, b_eq=np.zeros(len(data.b)), bounds=signs, method="highs", options=options
+    )
     check_time()
     if found.x is None or not found.fun < 0:
         return False
@@ -299,15 +366,20 @@ def inconsistent(data: DenseProblem) -> bool:
 def incompatible(problem: LCP) -> bool:
     """Return whether it is proved that the equations A x + b = 0 of a dense problem without bounds have no solution.
 
-    The part y of b in the null space of A', b less the least d with A'd = A'b, has b'y = y'y: -y are multipliers for `certifies`. It is
-    computed in units in which A has entries near 1.
+    The part y of b in the null space of A', b less the least d with A'd = A'b, has b'y = y'y: -y
+    are multipliers for `certifies`. It is computed in units in which A has entries near 1.
     """
     data = DenseProblem.read(problem)
     R, C = unit_rows_and_columns(data.A)
     transpose, y = scaled(data.A, R, C).T, R * data.b
     for _ in range(1 + REFINEMENTS):
         check_time()
-        y = y - scipy.linalg.lstsq(transpose, transpose @ y, cond=RANK, lapack_driver="gelsy", check_finite=False)[0]
+        y = (
+            y
+            - scipy.linalg.lstsq(
+                transpose, transpose @ y, cond=RANK, lapack_driver="gelsy", check_finite=False
+            )[0]
+        )
         if certifies(data, -R * y):
             return True
     return False
@@ -321,7 +393,10 @@ def _refined(transpose: Any, z: np.ndarray) -> np.ndarray:
     g, terms = transpose @ z, abs(transpose) @ np.abs(z)
     zero, support = np.flatnonzero(np.abs(g) <= VERTEX * terms), np.flatnonzero(np.abs(z) > VERTEX)
     block, out = transpose[zero][:, support], np.zeros(len(z))
-    out[support] = z[support] - scipy.sparse.linalg.lsmr(block, block @ z[support], atol=0.0, btol=0.0, conlim=0.0)[0]
+    out[support] = (
+        z[support]
+        - scipy.sparse.linalg.lsmr(block, block @ z[support], atol=0.0, btol=0.0, conlim=0.0)[0]
+    )
     return out
 
 
@@ -333,27 +408,38 @@ def _units_with_right_side(A: Any, b: np.ndarray) -> tuple[np.ndarray, np.ndarra
     for _ in range(EQUILIBRATIONS):
         check_time()
         now, right = scaled(magnitude, R, C), R * size / beta
-        rows, columns = (now.max(axis=k).toarray().ravel() if sparse else now.max(axis=k) for k in (1, 0))
-        R, C = R / power_of_two(np.sqrt(np.maximum(rows, right))), C / power_of_two(np.sqrt(columns))
+        rows, columns = (
+            now.max(axis=k).toarray().ravel() if sparse else now.max(axis=k) for k in (1, 0)
+        )
+        R, C = (
+            R / power_of_two(np.sqrt(np.maximum(rows, right))),
+            C / power_of_two(np.sqrt(columns)),
+        )
         beta *= float(power_of_two(np.sqrt(right.max())))
     return R, C, beta
 
 
 def entries_of_columns(A: Any) -> np.ndarray:
     """Return how many entries other than 0 each column has."""
-    return np.bincount(A.indices, minlength=A.shape[1]) if scipy.sparse.issparse(A) else np.count_nonzero(A, axis=0)
+    return (
+        np.bincount(A.indices, minlength=A.shape[1])
+        if scipy.sparse.issparse(A)
+        else np.count_nonzero(A, axis=0)
+    )
 
 
 def without_contact(data: DenseProblem, x: np.ndarray) -> np.ndarray:
     """Return x with y = 0 on each connected component on which A is singular and that has such a solution within the bounds.
 
-    Where z'A = 0 with z > 0 and b'z = 0, as of a Laplacian that nothing holds and a b that sums to 0, z'y = 0 makes y >= 0 vanish: no
-    point is strictly feasible, and neither active sets nor a central path lead there. With one unknown of each component held at 0 and the
-    others R, x_R = -A_RR^-1 b_R solves it; z, with A z = 0 and 1 at the unknown held, moves it within the bounds.
+    Where z'A = 0 with z > 0 and b'z = 0, as of a Laplacian that nothing holds and a b that sums to
+    0, z'y = 0 makes y >= 0 vanish: no point is strictly feasible, and neither active sets nor a
+    central path lead there. With one unknown of each component held at 0 and the others R, x_R =
+    -A_RR^-1 b_R solves it; z, with A z = 0 and 1 at the unknown held, moves it within the bounds.
     """
     A = scipy.sparse.csr_array(data.A)
     count, label = scipy.sparse.csgraph.connected_components(A, directed=False)
-    order = np.lexsort((-np.abs(A.diagonal()), label))  # the largest diagonal entry of each component first
+    # the largest diagonal entry of each component first
+    order = np.lexsort((-np.abs(A.diagonal()), label))
     held = order[np.searchsorted(label[order], np.arange(count))]
     rest = np.setdiff1d(np.arange(len(x)), held)
     sides = np.stack([-data.b[rest], -np.asarray(A[rest][:, held].sum(axis=1)).ravel()], axis=1)
@@ -385,7 +471,11 @@ def within_reach(problem: LCP) -> bool:
     sparse = sparse_matrix(problem)
     if sparse is None and problem.layout.size > SIDE:
         return False
-    entries = np.count_nonzero(assemble(problem, np.arange(problem.layout.size))) if sparse is None else sparse.nnz
+    entries = (
+        np.count_nonzero(assemble(problem, np.arange(problem.layout.size)))
+        if sparse is None
+        else sparse.nnz
+    )
     return int(entries) <= PROVABLE
 
 
@@ -397,7 +487,10 @@ def check_size(problem: LCP, method: str, most: int) -> int:
     """
     n = int(np.count_nonzero(problem.unknown.numpy() == 1))
     if n > most:
-        raise ValueError(f"A has {n} unknowns: {method} is a dense method for at most {most}; larger problems need an iterative method")
+        raise ValueError(
+            f"A has {n} unknowns: {method} is a dense method for at most {most}; larger problems "
+            "need an iterative method"
+        )
     return n
 
 
@@ -406,7 +499,8 @@ class DenseWorkspace(IterateMemory):
 
     Attributes:
         data: the problem on the host, read when a solve starts.
-        ended: the status with which the method gives up if the iterate does not meet the criteria; None while it goes on.
+        ended: the status with which the method gives up if the iterate does not meet the criteria;
+            None while it goes on.
     """
 
     def __init__(self, problem: LCP, precision: str = Precision.DOUBLE) -> None:

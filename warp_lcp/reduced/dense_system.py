@@ -51,8 +51,11 @@ class DenseSystem:
             block, scale = self._matrix[np.ix_(free, free)], np.ones(free.size)
             if self._shift is not None:
                 block = block + np.diag(self._shift)
-                scale = 1 / np.sqrt(1 + self._shift)  # rows with a large shift make no others look singular
-            e[free] = scale * _solve_or_least_squares(block * np.outer(scale, scale), scale * r[free])
+                # rows with a large shift make no others look singular
+                scale = 1 / np.sqrt(1 + self._shift)
+            e[free] = scale * _solve_or_least_squares(
+                block * np.outer(scale, scale), scale * r[free]
+            )
             norm = float(np.linalg.norm(block @ e[free] - r[free]))
         self.e.assign(e)
         return 1, norm
@@ -65,14 +68,19 @@ def _solve_or_least_squares(block: np.ndarray, r: np.ndarray) -> np.ndarray:
         S = equilibration(block)
         block, r = S[:, None] * block * S, S * r
         solution = factored(block, r)
-        solution = S * (scipy.linalg.lstsq(block, r, cond=1e-12, lapack_driver="gelsy")[0] if solution is None else solution)
+        solution = S * (
+            scipy.linalg.lstsq(block, r, cond=1e-12, lapack_driver="gelsy")[0]
+            if solution is None
+            else solution
+        )
     return solution
 
 
 class DampedSteps:
     """Levenberg-Marquardt steps of the minimum map of a dense problem, and when it is time to ask whether there is a solution.
 
-    Where Newton's steps cycle, and where the free block is singular, (J'J + nu I)^-1 J'r is still a descent direction.
+    Where Newton's steps cycle, and where the free block is singular, (J'J + nu I)^-1 J'r is still a
+    descent direction.
 
     Args:
         problem: with a dense matrix.
@@ -85,7 +93,8 @@ class DampedSteps:
     def start(self) -> None:
         """Forget the last solve."""
         self._least, self._waited = math.inf, 0  # smallest residual; steps without progress
-        # equations, of which it is not known yet whether they have a solution; whether a damped step has reduced the residual
+        # equations, of which it is not known yet whether they have a solution; whether a damped
+        # step has reduced the residual
         self._asks, self._damped = not self._problem.bounded, False
 
     @property

@@ -10,22 +10,31 @@ from dataclasses import dataclass, field
 from warp_lcp.deadline import check_time
 
 NOISE = 500.0  # rounding units of the iterate, in parts of the energy: what rounding may pretend
-LEAP = 1e3  # times the least residual: a step that ends there, and sets no new least energy, was wrong
-CREEP = 0.5  # a step that moves the free set and lowers the energy by more than this share of what the last one did: the set creeps
-STALL = 0.7  # a step that moves the free set and leaves more than this share of the residual was spoiled by its projection
-WORTH = 2.0  # a projected cycle against creeping is worth it if it lowers the energy by this many times what the step before did
+# times the least residual: a step that ends there, and sets no new least energy, was wrong
+LEAP = 1e3
+# a step that moves the free set and lowers the energy by more than this share of what the last one
+# did: the set creeps
+CREEP = 0.5
+# a step that moves the free set and leaves more than this share of the residual was spoiled by its
+# projection
+STALL = 0.7
+# a projected cycle against creeping is worth it if it lowers the energy by this many times what the
+# step before did
+WORTH = 2.0
 
 
 class Descent:
     """Judges steps by the energy x'Ax/2 + b'x, which only falls on the way to a solution where A is symmetric and semi-definite.
 
-    The natural residual does not: it may rise thirtyfold in the best of steps, where the set of held unknowns grows. It counts only
-    where the energy says nothing, within rounding.
+    The natural residual does not: it may rise thirtyfold in the best of steps, where the set of
+    held unknowns grows. It counts only where the energy says nothing, within rounding.
 
-    Why solves end, in outline: between runs of projected steps that are `due`, twice as many each time, at most `patience` steps in a row
-    set no new least energy, and new ones, a margin apart, are finitely many above the minimum. Once a projected cycle of such a run has
-    raised the energy (`safe` is set), runs are plain projected Jacobi sweeps with a factor below 2 / lambda_max(D^-1 A), which converge
-    linearly from anywhere. What this does not cover are runs of cycles that neither raise the energy nor lower it beyond rounding.
+    Why solves end, in outline: between runs of projected steps that are `due`, twice as many each
+    time, at most `patience` steps in a row set no new least energy, and new ones, a margin apart,
+    are finitely many above the minimum. Once a projected cycle of such a run has raised the energy
+    (`safe` is set), runs are plain projected Jacobi sweeps with a factor below 2 / lambda_max(D^-1
+    A), which converge linearly from anywhere. What this does not cover are runs of cycles that
+    neither raise the energy nor lower it beyond rounding.
 
     Args:
         epsilon: rounding unit of the iterate.
@@ -58,7 +67,13 @@ class Descent:
         fell, left = self._energy - energy, norm / self._norm if self._norm > 0 else 0.0
         margin = self.noise * (abs(self._energy) + abs(energy))
         above = energy - self._lowest
-        self._left, self._energy, self._norm, self.sinks, self._least = left, energy, norm, above < -margin, min(norm, self._least)
+        self._left, self._energy, self._norm, self.sinks, self._least = (
+            left,
+            energy,
+            norm,
+            above < -margin,
+            min(norm, self._least),
+        )
         if self.sinks:
             self._lowest, self._vain = energy, 0
         elif norm > LEAP * self._least:
@@ -80,8 +95,9 @@ class Descent:
     def creeps(self, fell: float, *, moved: bool) -> bool:
         """Return whether a projected cycle should follow a step that has lowered the energy by `fell`, and moved the free set or not.
 
-        Truncated steps that lower the energy evenly while the set moves are those in which a contact's boundary comes back by a layer of
-        cells a step. It begins with a step whose projection overshoots the contact: the energy rises, or the residual hardly falls.
+        Truncated steps that lower the energy evenly while the set moves are those in which a
+        contact's boundary comes back by a layer of cells a step. It begins with a step whose
+        projection overshoots the contact: the energy rises, or the residual hardly falls.
         """
         slow = moved and fell != 0 and (fell < 0 or fell > CREEP * self._fell or self._left > STALL)
         called = slow and self._pause == 0
@@ -93,12 +109,16 @@ class Descent:
     def weigh(self, fell: float) -> None:
         """Judge a projected cycle that has lowered the energy by `fell`.
 
-        If it was called against creeping and in vain, steps were slow, but not because the set crept: the next call waits longer.
+        If it was called against creeping and in vain, steps were slow, but not because the set
+        crept: the next call waits longer.
         """
-        self.safe = self.safe or (fell < 0 and self.runs > 0)  # what a cold start's first cycles do is no matter
+        # what a cold start's first cycles do is no matter
+        self.safe = self.safe or (fell < 0 and self.runs > 0)
         if self._owed > 0:
             vain = fell < WORTH * self._owed
-            self._pause, self._wait, self._owed = (self._wait, 2 * self._wait, 0.0) if vain else (0, 1, 0.0)
+            self._pause, self._wait, self._owed = (
+                (self._wait, 2 * self._wait, 0.0) if vain else (0, 1, 0.0)
+            )
 
 
 DECREASE = 1e-4  # share of the slope that a step must gain: Armijo's constant
@@ -130,7 +150,9 @@ class NonmonotoneSearch:
         """The largest of the remembered merits, which a step may not exceed."""
         return max(self.merits)
 
-    def search(self, trial: Callable[[float], float], slope: float, *, first: float = 1.0) -> tuple[float, float]:
+    def search(
+        self, trial: Callable[[float], float], slope: float, *, first: float = 1.0
+    ) -> tuple[float, float]:
         """Return the first of the halved steps that the merits allow, and its merit; step 0 if none down to `least` is.
 
         Args:

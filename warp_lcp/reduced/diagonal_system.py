@@ -25,7 +25,10 @@ class DiagonalSystem(KrylovSystem):
     def __init__(self, problem: LCP, *, shifted: bool = False) -> None:
         self._A, self._layout = problem.A, problem.layout
         self.r, self.z = self._layout.zeros(wp.float64), self._layout.zeros(wp.float64)
-        self._diagonal, self._inverse = self._layout.zeros(wp.float64), self._layout.zeros(wp.float64)
+        self._diagonal, self._inverse = (
+            self._layout.zeros(wp.float64),
+            self._layout.zeros(wp.float64),
+        )
         weight = self._inverse if shifted else None
         self._shift: wp.array[Any] | None = None
         method = ConjugateGradient if self._A.symmetric and self._definite else GMRES
@@ -40,7 +43,15 @@ class DiagonalSystem(KrylovSystem):
         """Remember the free set and the shift, and shift the diagonal."""
         self._free, self._shift = free, shift
         rows, weight = rows_of(self.r), self._inverse
-        SHIFT.bind(rows, free=free, shift=shift, d=self._own, unit=1.0, diagonal=self._diagonal, weight=weight).launch()
+        SHIFT.bind(
+            rows,
+            free=free,
+            shift=shift,
+            d=self._own,
+            unit=1.0,
+            diagonal=self._diagonal,
+            weight=weight,
+        ).launch()
 
     def apply(self) -> None:
         """Precondition: z = r / d."""

@@ -11,20 +11,26 @@ from warp_lcp.rows.compiler import forward_kernel
 
 EXACT = 64.0  # units of rounding: a candidate whose measure is below needs no better one
 RANK = 1e3  # units of rounding: pivots below, relative to A's largest entry, are zero
-EQUILIBRATIONS = 8  # sweeps of Ruiz's iteration at most; the first changes nothing where rows are alike
+# sweeps of Ruiz's iteration at most; the first changes nothing where rows are alike
+EQUILIBRATIONS = 8
 
 
 @functools.cache
 def enumeration_kernels(n: int, dtype: type) -> SimpleNamespace:
     """Return the kernels `batch` (a problem a thread) and `each` (a set a thread of one problem) for n unknowns.
 
-    `enumerate_sets(A, b, low, high)` is the function behind `batch`, for kernels that have a small problem at hand: it returns x, its
-    measure and its set. It works in units in which A is equilibrated, S A S with S powers of 2: what counts as a zero pivot does not
-    depend on the units of the rows. `each` takes a problem that is so.
+    `enumerate_sets(A, b, low, high)` is the function behind `batch`, for kernels that have a small
+    problem at hand: it returns x, its measure and its set. It works in units in which A is
+    equilibrated, S A S with S powers of 2: what counts as a zero pivot does not depend on the units
+    of the rows. `each` takes a problem that is so.
     """
     module = wp.get_module(f"warp_lcp.direct_enumeration_{n}_{dtype.__name__}")
     real, count, sets = dtype, n, 3**n
-    mat, vec, flags = wp.types.matrix((n, n), dtype), wp.types.vector(n, dtype), wp.types.vector(n, wp.int32)
+    mat, vec, flags = (
+        wp.types.matrix((n, n), dtype),
+        wp.types.vector(n, dtype),
+        wp.types.vector(n, wp.int32),
+    )
     eps = float(np.finfo(wp.dtype_to_numpy(dtype)).eps)
     exact, rank, zero, one = dtype(EXACT * eps), dtype(RANK * eps), dtype(0.0), dtype(1.0)
     half, two = dtype(0.5), dtype(2.0)
@@ -78,12 +84,18 @@ def enumeration_kernels(n: int, dtype: type) -> SimpleNamespace:
                 size = wp.max(size, wp.abs(A[i, j]))
                 if free[j] == 0:
                     r[i] = r[i] - A[i, j] * x[j]
-        # Gauss-Jordan elimination with complete pivoting; a column without a pivot keeps its x (a basic solution)
+        # Gauss-Jordan elimination with complete pivoting; a column without a pivot keeps its x (a
+        # basic solution)
         for _k in range(count):
             p, q, most = int(-1), int(-1), real(rank * size)
             for i in range(count):
                 for j in range(count):
-                    if row_open[i] == 1 and free[j] == 1 and pivot_row[j] < 0 and wp.abs(M[i, j]) > most:
+                    if (
+                        row_open[i] == 1
+                        and free[j] == 1
+                        and pivot_row[j] < 0
+                        and wp.abs(M[i, j]) > most
+                    ):
                         p, q, most = i, j, wp.abs(M[i, j])
             if p < 0:
                 break
@@ -120,7 +132,10 @@ def enumeration_kernels(n: int, dtype: type) -> SimpleNamespace:
                 for i in range(count):
                     largest = real(zero)
                     for j in range(count):
-                        largest = wp.max(largest, wp.max(S[i] * wp.abs(A[i, j]) * S[j], S[j] * wp.abs(A[j, i]) * S[i]))
+                        largest = wp.max(
+                            largest,
+                            wp.max(S[i] * wp.abs(A[i, j]) * S[j], S[j] * wp.abs(A[j, i]) * S[i]),
+                        )
                     T[i] = S[i]
                     if largest > zero:
                         power = wp.round(-half * wp.log2(largest))
@@ -152,9 +167,14 @@ def enumeration_kernels(n: int, dtype: type) -> SimpleNamespace:
 
     @forward_kernel(module=module)
     def batch(
-        A: wp.array3d(dtype=dtype), b: wp.array2d(dtype=dtype), lower: wp.array2d(dtype=dtype), upper: wp.array2d(dtype=dtype),
-        accepted: dtype, x: wp.array2d(dtype=dtype), chosen: wp.array(dtype=wp.int32),
-    ):  # fmt: skip
+        A: wp.array3d(dtype=dtype),
+        b: wp.array2d(dtype=dtype),
+        lower: wp.array2d(dtype=dtype),
+        upper: wp.array2d(dtype=dtype),
+        accepted: dtype,
+        x: wp.array2d(dtype=dtype),
+        chosen: wp.array(dtype=wp.int32),
+    ):
         """Solve a problem a thread; bounds of one row serve all problems."""
         t = wp.tid()
         M, q, low, high = mat(), vec(), vec(), vec()
@@ -174,9 +194,13 @@ def enumeration_kernels(n: int, dtype: type) -> SimpleNamespace:
 
     @forward_kernel(module=module)
     def each(
-        A: wp.array2d(dtype=dtype), b: wp.array(dtype=dtype), lower: wp.array(dtype=dtype), upper: wp.array(dtype=dtype),
-        x: wp.array2d(dtype=dtype), measures: wp.array(dtype=dtype),
-    ):  # fmt: skip
+        A: wp.array2d(dtype=dtype),
+        b: wp.array(dtype=dtype),
+        lower: wp.array(dtype=dtype),
+        upper: wp.array(dtype=dtype),
+        x: wp.array2d(dtype=dtype),
+        measures: wp.array(dtype=dtype),
+    ):
         """Try a set a thread; measure 2 where the set has no x."""
         code = wp.tid()
         M, q, low, high = mat(), vec(), vec(), vec()
@@ -193,4 +217,6 @@ def enumeration_kernels(n: int, dtype: type) -> SimpleNamespace:
         for i in range(count):
             x[code, i] = candidate[i]
 
-    return SimpleNamespace(batch=batch, each=each, enumerate_sets=enumerate_sets, matrix=mat, vector=vec)
+    return SimpleNamespace(
+        batch=batch, each=each, enumerate_sets=enumerate_sets, matrix=mat, vector=vec
+    )

@@ -31,9 +31,12 @@ from warp_lcp.rows.vectors import rows_of
 KERNELS = KernelFile(Path(__file__).parent / "headers/active_set.h")
 UNITS = KERNELS["equilibrated.units"]
 ALIKE = 4.0  # rows whose units differ by no more stay as they are
-WAIT = 6  # steps without a residual below FALL times the smallest after which it is asked whether there is a solution
+# steps without a residual below FALL times the smallest after which it is asked whether there is a
+# solution
+WAIT = 6
 FALL = 0.9
-HALF = 0.5  # of the residual, below which that of equations on singular components is worth another start
+# of the residual, below which that of equations on singular components is worth another start
+HALF = 0.5
 GROWN = 1e4  # growth of the residual after which it is
 EARLY = 10  # steps before which a residual says little: a path is joined far from the start
 
@@ -41,9 +44,10 @@ EARLY = 10  # steps before which a residual says little: a path is joined far fr
 class EquilibratedWorkspace(IterateMemory):
     """A method's workspace for R A C x' + R b, bounds l / C and u / C, and the problem's own iterate x = C x'.
 
-    R and C are powers of 2 with R_i C_i near 1 / d_i of the natural residual, equal where A is symmetric (of semi-definite matrices:
-    Jacobi's scaling). A step whose x is not
-    finite is not taken: it ends the solve, with INFEASIBLE if a linear program proves that there is no solution, else with STAGNATED.
+    R and C are powers of 2 with R_i C_i near 1 / d_i of the natural residual, equal where A is
+    symmetric (of semi-definite matrices: Jacobi's scaling). A step whose x is not finite is not
+    taken: it ends the solve, with INFEASIBLE if a linear program proves that there is no solution,
+    else with STAGNATED.
 
     Args:
         problem: with a dense or sparse operator.
@@ -58,7 +62,12 @@ class EquilibratedWorkspace(IterateMemory):
         super().__init__(problem, precision)
         layout, bounds = problem.layout, problem.bounds
         self._rows, self._units = layout.zeros(wp.float64), layout.zeros(wp.float64)
-        sides = [layout.zeros(wp.float64) if bounds.varying[k] or bounds.values[k] not in (0.0, -np.inf, np.inf) else None for k in (0, 1)]
+        sides = [
+            layout.zeros(wp.float64)
+            if bounds.varying[k] or bounds.values[k] not in (0.0, -np.inf, np.inf)
+            else None
+            for k in (0, 1)
+        ]
         self._sides = sides
         self._operator: Any = as_operator(self._scaled(), problem.device, problem.A.dtype)
         limits = [bounds.values[k] if side is None else side for k, side in enumerate(sides)]
@@ -82,7 +91,9 @@ class EquilibratedWorkspace(IterateMemory):
             self._operator.update(self._scaled())
             if isinstance(self._operator, DenseOperator):
                 self.inner.residual.rescale()
-        UNITS.bind(rows_of(inner.b), x=self.problem.b, units=self._rows, inverse=False, scaled=inner.b).launch()
+        UNITS.bind(
+            rows_of(inner.b), x=self.problem.b, units=self._rows, inverse=False, scaled=inner.b
+        ).launch()
         for k, side in enumerate(self._sides):
             if side is not None:
                 self._multiply(self.problem.bounds.as_field(k), side, inverse=True)
@@ -150,7 +161,11 @@ class EquilibratedWorkspace(IterateMemory):
         """Set R and C, and return R A C on the host."""
         A: Any = self.problem.A
         matrix = A.rows().matrix()
-        R, C = (power_of_two(1 / np.sqrt(A.scale())),) * 2 if A.symmetric else unit_rows_and_columns(matrix)
+        R, C = (
+            (power_of_two(1 / np.sqrt(A.scale())),) * 2
+            if A.symmetric
+            else unit_rows_and_columns(matrix)
+        )
         if max(R.max() / R.min(), C.max() / C.min()) <= ALIKE:
             R = C = np.ones(len(R))
         sizes = abs(matrix)

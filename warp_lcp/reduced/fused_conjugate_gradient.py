@@ -18,14 +18,19 @@ from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.program import Launch, launch
 from warp_lcp.rows.vectors import Reduction
 
-SQUARE = wp.constant(STEP_SLOTS)  # slots of the device scalars after those of a step: from the carried residual's square on
+# slots of the device scalars after those of a step: from the carried residual's square on
+SQUARE = wp.constant(STEP_SLOTS)
 ITERATIONS = wp.constant(STEP_SLOTS + 3)
 SLOTS = STEP_SLOTS + 5
 
-KERNELS = KernelFile(Path(__file__).parent / "headers/fused_conjugate_gradient.h", {"BETA": BETA, "STEP": STEP, "ITERATIONS": ITERATIONS})
+KERNELS = KernelFile(
+    Path(__file__).parent / "headers/fused_conjugate_gradient.h",
+    {"BETA": BETA, "STEP": STEP, "ITERATIONS": ITERATIONS},
+)
 DIRECT = KERNELS["grid_conjugate_gradient.direct"]
 STEP_ALONG = KERNELS["grid_conjugate_gradient.step"]
-ADVANCE = Wave("grid_conjugate_gradient.advance", (DIRECT, 0), (STEP_ALONG, 1))  # both planes are in the cache
+# both planes are in the cache
+ADVANCE = Wave("grid_conjugate_gradient.advance", (DIRECT, 0), (STEP_ALONG, 1))
 
 f64 = wp.array(dtype=wp.float64)
 
@@ -51,13 +56,15 @@ def end_grid_kernel(scalars: f64, going: wp.array(dtype=int)):
 class FusedConjugateGradient(ConjugateGradient):
     """`ConjugateGradient` in fused passes, for one CPU thread and a grid without periodic axes, preconditioned by a multigrid cycle.
 
-    Two passes over the finest level besides the way down the cycle: the cycle's last leg sums the products of z = M r that beta and alpha
-    need; a second pass makes the direction, moves the solution and takes alpha A p off the residual, one plane behind. Beta comes from
-    z'A p, so that no product of residuals is carried on; the norm of the residual decides when to stop.
+    Two passes over the finest level besides the way down the cycle: the cycle's last leg sums the
+    products of z = M r that beta and alpha need; a second pass makes the direction, moves the
+    solution and takes alpha A p off the residual, one plane behind. Beta comes from z'A p, so that
+    no product of residuals is carried on; the norm of the residual decides when to stop.
 
     Args:
         source: the operator's stencil.
-        hierarchy: preconditioner; its finest `b` is the right-hand side, which becomes the residual.
+        hierarchy: preconditioner; its finest `b` is the right-hand side, which becomes the
+            residual.
         weighted: residuals are measured as ||d^(-1/2) r||, d the finest diagonal, else as ||r||.
     """
 
@@ -68,11 +75,24 @@ class FusedConjugateGradient(ConjugateGradient):
         r, s = finest.b, finest.stencil
         self._allocate(r, SLOTS, int(SQUARE))
         scalars = self._scalars.array
-        sums = self._reduction = Reduction(r.size, r.device, scalars, columns=4, threads=s.rows.places)
+        sums = self._reduction = Reduction(
+            r.size, r.device, scalars, columns=4, threads=s.rows.places
+        )
         direct = DIRECT.bind(s.rows, z=finest.x, q=self._p, scalars=scalars)
-        step = STEP_ALONG.bind(s.rows, stencil=s, q=self._p, x=self.x, r=r, scalars=scalars, weighted=weighted, out=sums.partials)
+        step = STEP_ALONG.bind(
+            s.rows,
+            stencil=s,
+            q=self._p,
+            x=self.x,
+            r=r,
+            scalars=scalars,
+            weighted=weighted,
+            out=sums.partials,
+        )
         self._passes = direct, step
-        self._program = hierarchy.cycle_with(engine.CLIMB, engine.measuring(finest, self._p, sums.partials))
+        self._program = hierarchy.cycle_with(
+            engine.CLIMB, engine.measuring(finest, self._p, sums.partials)
+        )
         self._advance(self._program.launch)
 
     def clear(self) -> None:
@@ -82,7 +102,12 @@ class FusedConjugateGradient(ConjugateGradient):
 
     def _launch_beginning(self) -> None:
         """Launch the start: the first iteration writes x and p."""
-        launch(begin_grid_kernel, 1, [self._scalars.array, self._going, *self._goal[:2]], device=self.device)
+        launch(
+            begin_grid_kernel,
+            1,
+            [self._scalars.array, self._going, *self._goal[:2]],
+            device=self.device,
+        )
 
     def _turn(self, launch: Launch) -> None:
         """Beta and alpha, of the sums z'A z, z'A p, r'z and r'p that the cycle has left."""

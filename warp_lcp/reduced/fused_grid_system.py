@@ -35,7 +35,8 @@ class MinimumMapResidual(AssessedResidual):
     def __init__(self, problem: LCP, A: HasStencil, hierarchy: Hierarchy, *, rounded: bool) -> None:
         super().__init__(problem, A, hierarchy, rounded=rounded)
         planes, rows, _ = A.stencil.padding.counts
-        self._away = wp.zeros(planes * rows, dtype=wp.uint8, device=A.device)  # rows with such unknowns
+        # rows with such unknowns
+        self._away = wp.zeros(planes * rows, dtype=wp.uint8, device=A.device)
 
     @property
     def away(self) -> bool:
@@ -46,24 +47,41 @@ class MinimumMapResidual(AssessedResidual):
     def hold(self, x: wp.array[Any]) -> None:
         """Move held unknowns onto their bounds, and the right-hand side with them."""
         p, s, finest = self.problem, self._A.stencil, self._finest
-        engine.HOLD.bind(s.rows, bounds=p.bounds.operands, x=x, g=finest.b, away=self._away, ROUNDED=self._rounded).launch(wp.launch)
+        engine.HOLD.bind(
+            s.rows,
+            bounds=p.bounds.operands,
+            x=x,
+            g=finest.b,
+            away=self._away,
+            ROUNDED=self._rounded,
+        ).launch(wp.launch)
         s.wrap(x)
         if s.ghosts is not None:
             self._away.fill_(1)  # which rows beside a cut have moved, others know
         _, around_y, around_z = s.periodic
         engine.RIGHT_SIDE.bind(
-            s.rows, stencil=s, around_y=around_y, around_z=around_z, x=x, b=p.b, free=finest.stencil.d, g=finest.b, away=self._away,
+            s.rows,
+            stencil=s,
+            around_y=around_y,
+            around_z=around_z,
+            x=x,
+            b=p.b,
+            free=finest.stencil.d,
+            g=finest.b,
+            away=self._away,
             scalars=self.scalars,
-        ).launch(wp.launch)  # fmt: skip
+        ).launch(wp.launch)
         self._away.zero_()
 
 
 class FusedGridSystem:
     """Newton's equations on a grid without a correction in memory, see `ReducedSystem`.
 
-    Each iteration of conjugate gradients, preconditioned by a multigrid cycle, moves x itself, projected, and evaluates the residual and
-    the free set there. The linear solve ends when the residual is small enough, or as soon as an iterate calls other unknowns free: what
-    it was to solve is not the system any more. Conjugate gradients carry their direction on to the next system.
+    Each iteration of conjugate gradients, preconditioned by a multigrid cycle, moves x itself,
+    projected, and evaluates the residual and the free set there. The linear solve ends when the
+    residual is small enough, or as soon as an iterate calls other unknowns free: what it was to
+    solve is not the system any more. Conjugate gradients carry their direction on to the next
+    system.
 
     Args:
         problem: of a grid.
@@ -71,7 +89,8 @@ class FusedGridSystem:
 
     Attributes:
         iterate: the multigrid passes, with their iterate and hierarchy.
-        whole: the energy has fallen to a new least, so that the residual may rise; or there are no bounds, or x is not finite.
+        whole: the energy has fallen to a new least, so that the residual may rise; or there are no
+            bounds, or x is not finite.
     """
 
     iterate: MultigridWorkspace
@@ -79,14 +98,19 @@ class FusedGridSystem:
 
     def __init__(self, problem: LCP, settings: Any) -> None:
         self._settings = settings
-        self.iterate = passes = MultigridWorkspace(problem, problem.A, settings, residual=MinimumMapResidual, ahead=False)  # type: ignore[arg-type]
+        self.iterate = passes = MultigridWorkspace(
+            problem, problem.A, settings, residual=MinimumMapResidual, ahead=False
+        )  # type: ignore[arg-type]
         self._exact = passes.precision is not Precision.SINGLE
-        # Where x is rounded to float32 the energy says little of a step, and Newton's own safeguard decides.
+        # Where x is rounded to float32 the energy says little of a step, and Newton's own safeguard
+        # decides.
         passes.cycles_against_creeping = self._exact
         self._target, self._active, self._length, self._step = 0.0, 0, 1.0, 0.0
         self._sinks = False  # whether the energy has fallen to a new least
 
-    def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
+    def start(
+        self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
+    ) -> None:
         """Forget the search direction; the operator may have changed."""
         self._target = tolerance
         self.iterate.start(warm=warm, tolerance=tolerance, floating=floating)
@@ -112,11 +136,21 @@ class FusedGridSystem:
     def solve(self) -> int:
         """Move x by conjugate gradients until its residual is small enough, or its free set another one."""
         passes, residual, s = self.iterate, self.iterate.residual, self._settings
-        wanted, least, iterations, idle = max(s.eta * residual.norm, self._target), residual.norm, 0, 0
+        wanted, least, iterations, idle = (
+            max(s.eta * residual.norm, self._target),
+            residual.norm,
+            0,
+            0,
+        )
         while True:
             passes.truncated_step()
             iterations += 1
-            if passes.stale or not residual.norm > wanted or iterations >= s.max_linear_iterations or time_is_up():
+            if (
+                passes.stale
+                or not residual.norm > wanted
+                or iterations >= s.max_linear_iterations
+                or time_is_up()
+            ):
                 break
             least, idle = (residual.norm, 0) if residual.norm < least else (least, idle + 1)
             if idle >= IDLE and not self._exact:  # what rounding x to float32 leaves
@@ -154,4 +188,6 @@ class FusedGridSystem:
         passes = self.iterate
         self._prepare_shortening()
         passes.begin_cycles(passes.descent.due(0))
-        return Step("monotone cycle", iterations + passes.monotone_step().linear_iterations, self._active)
+        return Step(
+            "monotone cycle", iterations + passes.monotone_step().linear_iterations, self._active
+        )

@@ -25,9 +25,11 @@ SIZE = wp.constant(9)  # corrections are computed for a right-hand side divided 
 BETA = wp.constant(10)
 STEP = wp.constant(11)  # x moved by this multiple of the direction
 CARRY = wp.constant(12)  # 0: forget the search direction
-PER_SIZE = wp.constant(13)  # 1 / SIZE: a division takes a GPU as long as the residual does, which each cell would make
+# 1 / SIZE: a division takes a GPU as long as the residual does, which each cell would make
+PER_SIZE = wp.constant(13)
 SLOTS = 14
-LEAST_REST = wp.constant(wp.float64(1e-3))  # of a correction's energy that must not lie along the last direction: else cancellation
+# of a correction's energy that must not lie along the last direction: else cancellation
+LEAST_REST = wp.constant(wp.float64(1e-3))
 
 f64 = wp.array(dtype=wp.float64)
 
@@ -36,10 +38,12 @@ SLOT = {"SIZE": SIZE, "BETA": BETA, "STEP": STEP, "PER_SIZE": PER_SIZE}
 KERNELS = KernelFile(Path(__file__).parent / "headers/grid_step.h", SLOT)
 UPDATE = KERNELS["projected_multigrid.update"]
 ASSESS = KERNELS["projected_multigrid.assess"]
-ADVANCE = Wave("projected_multigrid.advance", (UPDATE, 0), (ASSESS, 1))  # a plane is assessed when the one above it has moved
+# a plane is assessed when the one above it has moved
+ADVANCE = Wave("projected_multigrid.advance", (UPDATE, 0), (ASSESS, 1))
 MEASURE = KERNELS["projected_multigrid.measure"]
 MEASURE_AGAIN = KERNELS["projected_multigrid.measure_again"]
-CLIMB = Wave("projected_multigrid.climb", *ASCEND.stages, (MEASURE, 3))  # the last leg of a cycle: z is still in the cache
+# the last leg of a cycle: z is still in the cache
+CLIMB = Wave("projected_multigrid.climb", *ASCEND.stages, (MEASURE, 3))
 HOLD = KERNELS["projected_multigrid.hold"]
 RIGHT_SIDE = KERNELS["projected_multigrid.right_side"]
 GAPS = KERNELS["projected_multigrid.gaps"]
@@ -49,11 +53,20 @@ UNDO = KERNELS["projected_multigrid.undo"]
 
 def measuring(finest: StencilLevel, direction: Any, out: Any) -> Bound:
     """Return the measuring of a cycle's correction along a direction."""
-    return MEASURE.bind(finest.stencil.rows, stencil=finest.stencil, z=finest.x, q=direction, g=finest.b, out=out)
+    return MEASURE.bind(
+        finest.stencil.rows, stencil=finest.stencil, z=finest.x, q=direction, g=finest.b, out=out
+    )
 
 
 @wp.func
-def conjugate(zaz: wp.float64, zap: wp.float64, gz: wp.float64, gp: wp.float64, pap: wp.float64, least: wp.float64):
+def conjugate(
+    zaz: wp.float64,
+    zap: wp.float64,
+    gz: wp.float64,
+    gp: wp.float64,
+    pap: wp.float64,
+    least: wp.float64,
+):
     """Beta that makes z + beta p conjugate to p, 0 where z is nearly p, and of the sum the curvature and the gain; the host's too."""
     ratio = -zap / pap
     rest = zaz + ratio * (zap + zap + ratio * pap)
@@ -69,10 +82,14 @@ def plan_step_kernel(scalars: f64):
     beta = zero
     curvature = scalars[ZAZ]
     gain = scalars[GZ]
-    if scalars[CARRY] != zero and scalars[PAP] > zero:  # without a direction to carry, p and its products are meaningless
-        beta, curvature, gain = conjugate(curvature, scalars[ZAP], gain, scalars[GP], scalars[PAP], LEAST_REST)
+    # without a direction to carry, p and its products are meaningless
+    if scalars[CARRY] != zero and scalars[PAP] > zero:
+        beta, curvature, gain = conjugate(
+            curvature, scalars[ZAP], gain, scalars[GP], scalars[PAP], LEAST_REST
+        )
     length = zero
-    if curvature > zero or not wp.isfinite(curvature):  # a step that is not finite is not taken, and is reported
+    # a step that is not finite is not taken, and is reported
+    if curvature > zero or not wp.isfinite(curvature):
         length = gain / curvature
     scalars[PAP] = curvature
     scalars[BETA] = beta

@@ -28,12 +28,20 @@ class GridSystem(GuardedSystem):
     """Conjugate gradients on a grid, preconditioned by a linear multigrid cycle on the free set; of `hierarchy` where there is one."""
 
     def __init__(
-        self, A: HasStencil, real: Any, *, bounded: bool, settings: CycleSettings | None = None, shifted: bool = False,
+        self,
+        A: HasStencil,
+        real: Any,
+        *,
+        bounded: bool,
+        settings: CycleSettings | None = None,
+        shifted: bool = False,
         hierarchy: Hierarchy | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._A = A
         self._version = A.version
-        self.hierarchy = hierarchy or make_hierarchy(A.stencil, real, bounded=bounded, settings=settings, shifted=shifted)
+        self.hierarchy = hierarchy or make_hierarchy(
+            A.stencil, real, bounded=bounded, settings=settings, shifted=shifted
+        )
         self.r, self.z = self.hierarchy.finest.b, self.hierarchy.finest.x
         self._weight = zeros_like(self.r) if shifted else None
         # one CPU thread, no ghost cells to fill
@@ -41,7 +49,9 @@ class GridSystem(GuardedSystem):
         if self.fused:
             method: Any = FusedConjugateGradient(A.stencil, self.hierarchy, weighted=shifted)
         else:
-            method = (ConjugateGradient if A.symmetric else GMRES)(self.hierarchy.finest.stencil.product, self, weight=self._weight)
+            method = (ConjugateGradient if A.symmetric else GMRES)(
+                self.hierarchy.finest.stencil.product, self, weight=self._weight
+            )
         self._iterate_by(method, self._weight)
         if not A.symmetric and A.stencil.ghosts is None:
             self._guard(partial(MatrixSystem, A, shifted=shifted))
@@ -69,7 +79,15 @@ class GridSystem(GuardedSystem):
             self.hierarchy.rebuild_changed()
         else:
             rows, weight = rows_of(target), self._weight
-            SHIFT.bind(rows, free=free, shift=shift, d=source.d, unit=source.unit, diagonal=target, weight=weight).launch()
+            SHIFT.bind(
+                rows,
+                free=free,
+                shift=shift,
+                d=source.d,
+                unit=source.unit,
+                diagonal=target,
+                weight=weight,
+            ).launch()
             self.hierarchy.rebuild()
 
     @property
@@ -87,9 +105,16 @@ class GridSystem(GuardedSystem):
 
 
 def projected_cycle(
-    problem: LCP, system: GridSystem, x: wp.array[Any], y: wp.array[Any], size: float, free: wp.array[Any], sums: Reduction, *,
+    problem: LCP,
+    system: GridSystem,
+    x: wp.array[Any],
+    y: wp.array[Any],
+    size: float,
+    free: wp.array[Any],
+    sums: Reduction,
+    *,
     restrict: bool = True,
-) -> None:  # fmt: skip
+) -> None:
     """Run one from x: the correction is `system.z` times `size`.
 
     Args:
@@ -109,5 +134,7 @@ def projected_cycle(
     ON_FREE.bind(rows, y=y, free=free, g=system.r, scale=1 / size, out=sums.partials).launch()
     sums.scalars[int(SIZE) : int(SIZE) + 1].fill_(size)
     bounds, lo, hi = problem.bounds.operands, finest.lower, finest.upper
-    GAPS.bind(rows, bounds=bounds, x=x, unknown=problem.unknown, lo=lo, hi=hi, scalars=sums.scalars).launch()
+    GAPS.bind(
+        rows, bounds=bounds, x=x, unknown=problem.unknown, lo=lo, hi=hi, scalars=sums.scalars
+    ).launch()
     system.monotone_cycle()

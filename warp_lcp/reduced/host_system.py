@@ -21,11 +21,17 @@ from warp_lcp.reduced.correction_system import CorrectionSystem
 from warp_lcp.reduced.dense_problem import factored
 from warp_lcp.reduced.nested_iteration import nested_iteration
 
-MOST = 200  # unknowns up to which LAPACK on the host costs less than launches of kernels, whatever the bandwidth
+# unknowns up to which LAPACK on the host costs less than launches of kernels, whatever the
+# bandwidth
+MOST = 200
 FEW = 30  # unknowns up to which dense factors cost no more than banded ones, whatever the bandwidth
-NARROW_STEPS = 20  # whole steps after nested iteration: M-matrices take 2 to 5, and beams, whose sets may wander, seldom more
-IDLE = 30  # steps without a smaller residual, the loop's patience, after which safeguarded steps take over
-PLAIN = 4  # steps before nested iteration, which costs about 20: many active sets are found in fewer
+# whole steps after nested iteration: M-matrices take 2 to 5, and beams, whose sets may wander,
+# seldom more
+NARROW_STEPS = 20
+# steps without a smaller residual, the loop's patience, after which safeguarded steps take over
+IDLE = 30
+# steps before nested iteration, which costs about 20: many active sets are found in fewer
+PLAIN = 4
 
 
 class SmallMatrix:
@@ -40,7 +46,11 @@ class SmallMatrix:
     def refresh(self) -> None:
         """Take the entries as they are now."""
         A = self._A
-        self._host = A.matrix().toarray() if isinstance(A, SparseOperator) else A.matrix.numpy().astype(np.float64, copy=False)
+        self._host = (
+            A.matrix().toarray()
+            if isinstance(A, SparseOperator)
+            else A.matrix.numpy().astype(np.float64, copy=False)
+        )
 
     def product(self, x: np.ndarray) -> np.ndarray:
         """Return A x, shape (n,), on the host."""
@@ -88,7 +98,11 @@ class NarrowMatrix:
 
 def suits(A: Any) -> bool:
     """Return whether an operator's systems are solved directly on the host: a matrix that is small or narrow."""
-    return isinstance(A, (DenseOperator, SparseOperator)) and A.layout.across is None and (A.unknowns <= MOST or bandwidth(A) <= NARROW)
+    return (
+        isinstance(A, (DenseOperator, SparseOperator))
+        and A.layout.across is None
+        and (A.unknowns <= MOST or bandwidth(A) <= NARROW)
+    )
 
 
 class HostResidual(NaturalResidual):
@@ -171,7 +185,9 @@ class HostIterate(IterateMemory):
     def __init__(self, problem: LCP, precision: str, matrix: SmallMatrix | NarrowMatrix) -> None:
         self._on_cpu = problem.device.is_cpu
         by_numpy = self._on_cpu and problem.bounds.affine is None
-        super().__init__(problem, precision, residual=HostResidual(problem, matrix) if by_numpy else None)
+        super().__init__(
+            problem, precision, residual=HostResidual(problem, matrix) if by_numpy else None
+        )
 
     def keep(self) -> None:
         """Remember x, on the host."""
@@ -202,9 +218,10 @@ class HostIterate(IterateMemory):
 class HostSystem:
     """Whole Newton steps solved by LAPACK on the host, see `ReducedSystem`; a `CorrectionSystem` takes over where these lead nowhere.
 
-    On an M-matrix whole steps end at the solution, but an end of a contact set may move by one unknown a step. A narrow problem
-    therefore takes nested iteration after `PLAIN` steps, which finds the ends to within a few unknowns. A set that comes again, a
-    singular block, or `IDLE` steps without gain: searched steps go on from the best iterate.
+    On an M-matrix whole steps end at the solution, but an end of a contact set may move by one
+    unknown a step. A narrow problem therefore takes nested iteration after `PLAIN` steps, which
+    finds the ends to within a few unknowns. A set that comes again, a singular block, or `IDLE`
+    steps without gain: searched steps go on from the best iterate.
 
     Args:
         problem: with a small or a narrow matrix.
@@ -217,17 +234,28 @@ class HostSystem:
     def __init__(self, problem: LCP, settings: Any) -> None:
         A: Any = problem.A
         if not suits(A):
-            raise ValueError(f"A: direct = True is for dense and sparse matrices of at most {MOST} unknowns or a bandwidth up to {NARROW}")
+            raise ValueError(
+                f"A: direct = True is for dense and sparse matrices of at most {MOST} unknowns or "
+                f"a bandwidth up to {NARROW}"
+            )
         width = bandwidth(A) if A.unknowns > FEW else NARROW + 1
-        self._matrix: SmallMatrix | NarrowMatrix = NarrowMatrix(A, width) if width <= NARROW else SmallMatrix(A)
+        self._matrix: SmallMatrix | NarrowMatrix = (
+            NarrowMatrix(A, width) if width <= NARROW else SmallMatrix(A)
+        )
         self._problem, self._settings = problem, settings
         self.iterate = HostIterate(problem, settings.precision, self._matrix)
         self._rounds = self.iterate.precision is Precision.SINGLE
 
-    def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
+    def start(
+        self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
+    ) -> None:
         """Forget the sets, and read the bounds as they are now."""
         self._warm, self._target, self._floating = warm, tolerance, floating
-        residual, bounds, self._b = self.iterate.residual, self._problem.bounds, self._problem.b.numpy()
+        residual, bounds, self._b = (
+            self.iterate.residual,
+            self._problem.bounds,
+            self._problem.b.numpy(),
+        )
         if isinstance(residual, HostResidual):
             self._d, self._lower, self._upper = residual.scale, residual.lower, residual.upper
         else:
@@ -257,7 +285,9 @@ class HostSystem:
                 self._go(coarse)
                 return Step("nested iteration", 1, None, interim=True)
         if self._begun:  # the start's residual says nothing of the steps to come
-            self._least, self._idle = (residual.norm, 0) if residual.norm < self._least else (self._least, self._idle + 1)
+            self._least, self._idle = (
+                (residual.norm, 0) if residual.norm < self._least else (self._least, self._idle + 1)
+            )
         self._x = self.iterate.read()
         target = self._x - self.iterate.y() / self._d
         self._below, self._above = target < self._lower, target > self._upper
@@ -290,7 +320,8 @@ class HostSystem:
         """Set x, within its bounds once the residual meets the tolerance."""
         iterate, residual, self._begun = self.iterate, self.iterate.residual, True
         iterate.write(values)
-        if residual.evaluate(iterate.x) <= self._target:  # x may miss its bounds by what the criteria allow
+        # x may miss its bounds by what the criteria allow
+        if residual.evaluate(iterate.x) <= self._target:
             iterate.write(np.clip(values, self._lower, self._upper))
             residual.current = False
         if self._rounds:
@@ -301,7 +332,9 @@ class HostSystem:
         """Return the step; whole steps may first take the residual up."""
         return Step("active set", iterations, int(np.count_nonzero(self._held)), interim=True)
 
-    def fall_back(self, iterations: int, norms: deque[float], best: float, length: float) -> CorrectionSystem:
+    def fall_back(
+        self, iterations: int, norms: deque[float], best: float, length: float
+    ) -> CorrectionSystem:
         """Return the system of searched steps, at the best iterate."""
         iterate, residual = self.iterate, self.iterate.residual
         iterate.restore()

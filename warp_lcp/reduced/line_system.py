@@ -20,9 +20,18 @@ from warp_lcp.rows.program import Program
 class LineSystem(GuardedSystem):
     """Conjugate gradients on a compact stencil in 2-D, or GMRES if A is not symmetric, preconditioned by cycles over lines."""
 
-    def __init__(self, A: HasStencil, real: Any, *, settings: CycleSettings | None = None, shifted: bool = False) -> None:
+    def __init__(
+        self,
+        A: HasStencil,
+        real: Any,
+        *,
+        settings: CycleSettings | None = None,
+        shifted: bool = False,
+    ) -> None:
         self._A = A
-        self.hierarchy = BlackBoxMultigrid(A.stencil, real, symmetric=A.symmetric, settings=settings)
+        self.hierarchy = BlackBoxMultigrid(
+            A.stencil, real, symmetric=A.symmetric, settings=settings
+        )
         finest = self.hierarchy.finest
         self.r, self.z = finest.b, finest.x
         self._weight = zeros_like(self.r) if shifted else None

@@ -19,14 +19,18 @@ from warp_lcp.rows.program import launch as launch_recorded
 from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import Reduction
 
-STRONG = 2.0  # added over own inertia, as estimated, from which a column is corrected for: others move eigenvalues by a small factor
-SPREAD = 0.115  # U_q' A^-1 U_q / (U_q' U_q) over rows^(1 / (dimension - 1)): of a disc and of a sphere
+# added over own inertia, as estimated, from which a column is corrected for: others move
+# eigenvalues by a small factor
+STRONG = 2.0
+# U_q' A^-1 U_q / (U_q' U_q) over rows^(1 / (dimension - 1)): of a disc and of a sphere
+SPREAD = 0.115
 FELT = 0.3  # added over own inertia of a mode of the columns corrected for, from which it counts
 CHANGED = 2.0  # factor by which a column's square may change before its potential is renewed
 MOST_READ = 1024  # products that are read with other numbers
 SKEW = 0.3  # the most that potentials may be unsymmetric
 SPREADING, STRONGEST = wp.constant(wp.float64(SPREAD)), wp.constant(wp.float64(STRONG))
-SAFELY = wp.constant(wp.float64(1.0 + 1e-9))  # what the host computes again must not come out the other way
+# what the host computes again must not come out the other way
+SAFELY = wp.constant(wp.float64(1.0 + 1e-9))
 I32, F64 = wp.array(dtype=wp.int32), wp.array(dtype=wp.float64)
 
 
@@ -91,7 +95,14 @@ def unit_kernel(columns: I32, slot: int, force: F64):
 
 @no_type_check
 @forward_kernel(module="warp_lcp.low_rank_correction")
-def calm_kernel(W: wp.array2d(dtype=wp.float64), squares: F64, rank: int, width: int, power: wp.float64, calm: I32):
+def calm_kernel(
+    W: wp.array2d(dtype=wp.float64),
+    squares: F64,
+    rank: int,
+    width: int,
+    power: wp.float64,
+    calm: I32,
+):
     """Find whether no column is strong, with a margin; one thread."""
     calm[0] = 1
     for q in range(rank):
@@ -114,14 +125,17 @@ class LowRankCorrection:
 
         M = P B P' + Z E^-1 Z',   P = I - Z S^-1 U',
 
-    is the inverse of B^-1 + U W U' (Woodbury): what the cycle leaves of the condition number of A it then leaves of that of A + U W U',
-    whatever W is. Conjugate gradients without it meet an eigenvalue 1 + W_qq U_q' A^-1 U_q a column: the mass of liquid that a body
-    moves with it over its own mass, 1000 for the lightest.
+    is the inverse of B^-1 + U W U' (Woodbury): what the cycle leaves of the condition number of A
+    it then leaves of that of A + U W U', whatever W is. Conjugate gradients without it meet an
+    eigenvalue 1 + W_qq U_q' A^-1 U_q a column: the mass of liquid that a body moves with it over
+    its own mass, 1000 for the lightest.
 
-    In this form M is symmetric and positive definite for any Z with an S like that: Z is made when a solve begins, a cycle a column, and
-    again only where the free set has changed much. Columns with a small ratio are left alone, they cost nothing. Those corrected for may
-    depend on each other, where few cells touch a body: the inverses are those on the modes of W^(1/2) S W^(1/2) that are felt. Nothing is
-    kept from one solve to the next, so that results do not depend on what was solved before.
+    In this form M is symmetric and positive definite for any Z with an S like that: Z is made when
+    a solve begins, a cycle a column, and again only where the free set has changed much. Columns
+    with a small ratio are left alone, they cost nothing. Those corrected for may depend on each
+    other, where few cells touch a body: the inverses are those on the modes of W^(1/2) S W^(1/2)
+    that are felt. Nothing is kept from one solve to the next, so that results do not depend on what
+    was solved before.
 
     Args:
         low: U W U'.
@@ -138,11 +152,16 @@ class LowRankCorrection:
         n, device = low.rank, hierarchy.device
         self._inverses = HostArray((2, n * n), wp.float64, device)  # of S and E
         self._S, self._E = self._inverses.array[0], self._inverses.array[1]
-        self._sums, self._kept, self._force, self._t = (wp.zeros(n, dtype=wp.float64, device=device) for _ in range(4))
+        self._sums, self._kept, self._force, self._t = (
+            wp.zeros(n, dtype=wp.float64, device=device) for _ in range(4)
+        )
         self.noted = Reading(device, n + n // low.columns.width)
         self.calm = wp.zeros(1, dtype=wp.int32, device=device) if device.is_cuda else None
-        self._power = wp.float64(1.0 / max(sum(n > 1 for n in hierarchy.finest.stencil.padding.counts) - 1, 1))
-        self._adding: tuple[Any, Reduction] | None = None  # of the sums on a GPU, and the entries that it is for
+        self._power = wp.float64(
+            1.0 / max(sum(n > 1 for n in hierarchy.finest.stencil.padding.counts) - 1, 1)
+        )
+        # of the sums on a GPU, and the entries that it is for
+        self._adding: tuple[Any, Reduction] | None = None
         self._columns_of_slots = HostArray(n, wp.int32, device)
         self._of_slot = self._columns_of_slots.array
         self._size = hierarchy.finest.x.size
@@ -154,11 +173,20 @@ class LowRankCorrection:
         self._seen = np.zeros(n)  # U_q' U_q when a potential was made
         few = n * n <= MOST_READ  # U'Z, a slot after another
         self._read_products = Reading(device, n * n) if few else None
-        self._products = self._read_products.array if self._read_products is not None else wp.zeros(0, dtype=wp.float64, device=device)
+        self._products = (
+            self._read_products.array
+            if self._read_products is not None
+            else wp.zeros(0, dtype=wp.float64, device=device)
+        )
         at_once = low.layout.across is not None
         self._squaring, self._exciting, self._multiplying, self._filling = (
             LaunchGraph(device, record, at_once=at_once)
-            for record in (self._launch_squares, self._launch_unit_force, self._launch_products, self._launch_potential)
+            for record in (
+                self._launch_squares,
+                self._launch_unit_force,
+                self._launch_products,
+                self._launch_potential,
+            )
         )
 
     @property
@@ -197,11 +225,15 @@ class LowRankCorrection:
         columns, low, d = self._columns, self._low, self._hierarchy.finest.stencil.d
         if self.calm is None:
             one = Rows.flat(1, low.device)
-            SQUARES.bind(one, columns.entry_fields, rank=low.rank, d=d, squares=self.noted.array).launch(launch)
+            SQUARES.bind(
+                one, columns.entry_fields, rank=low.rank, d=d, squares=self.noted.array
+            ).launch(launch)
             return
         assert self._adding is not None, "prepare comes first"
         found, adding = self.noted.array, self._adding[1]
-        BY_TURNS.bind(columns.turns, columns.entry_fields, rank=low.rank, d=d, out=adding.partials).launch(launch)
+        BY_TURNS.bind(
+            columns.turns, columns.entry_fields, rank=low.rank, d=d, out=adding.partials
+        ).launch(launch)
         adding.add_up(0, columns=found.size, launch=launch)
         inputs = [low.weights, found, low.rank, columns.width, self._power, self.calm]
         launch(calm_kernel, 1, inputs, device=low.device)
@@ -211,7 +243,8 @@ class LowRankCorrection:
 
         Args:
             begins: whether a solve begins.
-            noted: whether `note` has been launched for this free set, `note_products` too, and their readings have changed since.
+            noted: whether `note` has been launched for this free set, `note_products` too, and
+                their readings have changed since.
             made: whether `make_potentials` has.
 
         Returns:
@@ -225,7 +258,9 @@ class LowRankCorrection:
         found, width, across = self.noted.numpy().copy(), self._columns.width, low.layout.across
         found = found if across is None else across.sum(found)
         squares, rows = found[: low.rank], np.repeat(found[low.rank :], width)
-        strong = np.flatnonzero(W.diagonal() * SPREAD * rows ** float(self._power.value) * squares >= STRONG).tolist()
+        strong = np.flatnonzero(
+            W.diagonal() * SPREAD * rows ** float(self._power.value) * squares >= STRONG
+        ).tolist()
         if begins:
             self._seen[:] = 0.0
         chosen = strong != self._slot_columns
@@ -238,7 +273,11 @@ class LowRankCorrection:
             self._seen[stale] = squares[stale]
         else:
             self._fill(stale, squares)
-        lost, known = bool(stale), self._read_products is not None and (made or (noted and not begins and not chosen and not stale))
+        lost, known = (
+            bool(stale),
+            self._read_products is not None
+            and (made or (noted and not begins and not chosen and not stale)),
+        )
         if strong and not self._invert(W, known=known) and len(stale) < len(strong):
             self._fill([q for q in strong if q not in stale], squares)
             self._invert(W)
@@ -263,7 +302,9 @@ class LowRankCorrection:
         low, finest, m = self._low, self._hierarchy.finest, self.slots
         self._spread(1.0, launch)
         u = self._columns.gather(finest.x, launch=launch)
-        launch(join_kernel, m, [self._S, self._of_slot, u, m, self._kept, self._t], device=low.device)
+        launch(
+            join_kernel, m, [self._S, self._of_slot, u, m, self._kept, self._t], device=low.device
+        )
         self._subtract.launch(launch)
 
     def _choose(self, strong: list[int]) -> None:
@@ -290,15 +331,36 @@ class LowRankCorrection:
                 self._bound[len(strong)] = self._bind(len(strong))
             self._dots, self._multiply, self._subtract = self._bound[len(strong)]
         for q in kept:
-            wp.copy(self._Z, before, dest_offset=strong.index(q) * n, src_offset=old[q] * n, count=n)
+            wp.copy(
+                self._Z, before, dest_offset=strong.index(q) * n, src_offset=old[q] * n, count=n
+            )
         self._seen[[q for q in range(low.rank) if q not in kept]] = 0.0
 
     def _bind(self, slots: int) -> tuple[Reduction, Any, Any]:
         """Return the sums Z'r of so many slots, what multiplies them, and what subtracts Z t."""
-        finest, rows, n, across = self._hierarchy.finest, self._hierarchy.finest.stencil.rows, self._size, self._low.layout.across
-        dots = Reduction(n, self._low.device, self._sums, columns=slots, threads=rows.places, across=across)
+        finest, rows, n, across = (
+            self._hierarchy.finest,
+            self._hierarchy.finest.stencil.rows,
+            self._size,
+            self._low.layout.across,
+        )
+        dots = Reduction(
+            n, self._low.device, self._sums, columns=slots, threads=rows.places, across=across
+        )
         multiply = DOTS.bind(rows, r=finest.b, out=dots.partials, Z=self._Z, slots=slots, size=n)
-        return dots, multiply, SUBTRACT.bind(rows, factors=self._t, z=finest.x, d=finest.stencil.d, Z=self._Z, slots=slots, size=n)
+        return (
+            dots,
+            multiply,
+            SUBTRACT.bind(
+                rows,
+                factors=self._t,
+                z=finest.x,
+                d=finest.stencil.d,
+                Z=self._Z,
+                slots=slots,
+                size=n,
+            ),
+        )
 
     def _fill(self, columns: list[int], squares: np.ndarray) -> None:
         """Make the potentials B U_q of columns."""
@@ -369,7 +431,9 @@ class LowRankCorrection:
 
     def _launch_potential(self, slot: int) -> None:
         """Launch on a GPU the potential of a slot's column, a cycle."""
-        launch_recorded(unit_kernel, self._low.rank, [self._of_slot, slot, self._force], device=self._low.device)
+        launch_recorded(
+            unit_kernel, self._low.rank, [self._of_slot, slot, self._force], device=self._low.device
+        )
         self._launch_unit_force()
         self._hierarchy.cycle.run()
         copy(self._Z[slot * self._size : (slot + 1) * self._size], self._hierarchy.finest.x)
@@ -379,10 +443,20 @@ class LowRankCorrection:
         clear(self._force)
         d, rank, n = self._hierarchy.finest.stencil.d, self._low.rank, self._size
         for s in range(self.slots):
-            along = self._columns.gather(self._Z[s * n : (s + 1) * n], mask=d, fused=False, launch=launch_recorded)
+            along = self._columns.gather(
+                self._Z[s * n : (s + 1) * n], mask=d, fused=False, launch=launch_recorded
+            )
             copy(products[s * rank : (s + 1) * rank], along)
 
     def _spread(self, sign: float, launch: Launch) -> None:
         """Add U f to the finest right-hand side."""
         finest = self._hierarchy.finest
-        self._columns.scatter(self._force, finest.b, finest.b, mask=finest.stencil.d, sign=sign, fused=False, launch=launch)
+        self._columns.scatter(
+            self._force,
+            finest.b,
+            finest.b,
+            mask=finest.stencil.d,
+            sign=sign,
+            fused=False,
+            launch=launch,
+        )

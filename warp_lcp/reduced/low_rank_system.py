@@ -24,17 +24,34 @@ class CoupledGridSystem(KrylovSystem):
     """Conjugate gradients on a grid operator plus one of low rank, preconditioned by the grid's multigrid, corrected for the columns."""
 
     def __init__(
-        self, A: SumOperator, grid: HasStencil, low: LowRankOperator, real: Any, *, settings: CycleSettings | None, shifted: bool
+        self,
+        A: SumOperator,
+        grid: HasStencil,
+        low: LowRankOperator,
+        real: Any,
+        *,
+        settings: CycleSettings | None,
+        shifted: bool,
     ) -> None:
-        self._grid, self._low, self._A = GridSystem(grid, real, bounded=False, settings=settings, shifted=shifted), low, A
+        self._grid, self._low, self._A = (
+            GridSystem(grid, real, bounded=False, settings=settings, shifted=shifted),
+            low,
+            A,
+        )
         self.r, self.z = self._grid.r, self._grid.z
         self._correction, self._begins = LowRankCorrection(low, self._grid.hierarchy), True
         self._extra = zeros_like(self.r)
         self._free: wp.array[Any] | None = None
         self._weight = zeros_like(self.r) if shifted else None
         across = A.layout.across
-        rows = None if across is None else grid.stencil.rows  # without ghost cells, which others sum
-        self._iterate_by(ConjugateGradient(self._product, self, weight=self._weight, rows=rows, across=across), self._weight, rows, across)
+        # without ghost cells, which others sum
+        rows = None if across is None else grid.stencil.rows
+        self._iterate_by(
+            ConjugateGradient(self._product, self, weight=self._weight, rows=rows, across=across),
+            self._weight,
+            rows,
+            across,
+        )
         self._take_diagonal()
 
     def refresh(self) -> None:
@@ -49,7 +66,15 @@ class CoupledGridSystem(KrylovSystem):
         self._grid.restrict(free, shift)
         if self._weight is not None:
             rows, weight = rows_of(self.r), self._weight
-            SHIFT.bind(rows, free=free, shift=shift, d=self._own, unit=1.0, diagonal=self._extra, weight=weight).launch()
+            SHIFT.bind(
+                rows,
+                free=free,
+                shift=shift,
+                d=self._own,
+                unit=1.0,
+                diagonal=self._extra,
+                weight=weight,
+            ).launch()
         wp.copy(self._extra, self.r)
         self._correction.renew(begins=self._begins)
         wp.copy(self.r, self._extra)

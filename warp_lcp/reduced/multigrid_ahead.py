@@ -21,7 +21,15 @@ from warp_lcp.rows import Rows
 from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.fields import zeros
 from warp_lcp.rows.memory import Scalar
-from warp_lcp.rows.program import Conditional, Launch, LaunchGraph, Program, copy, launch, loops_on_device
+from warp_lcp.rows.program import (
+    Conditional,
+    Launch,
+    LaunchGraph,
+    Program,
+    copy,
+    launch,
+    loops_on_device,
+)
 from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import CONVERT, add_across
 
@@ -29,8 +37,11 @@ if TYPE_CHECKING:
     from warp_lcp.reduced.multigrid_workspace import MultigridWorkspace
 
 EPS = float(np.finfo(np.float64).eps)
-ORDINARY = 1e-100  # the least residual that is taken for one: the squares of smaller ones vanish, which the loop looks into
-RATIOS = 1e-6, 1e6  # of a guess's residual to b within which corrections in float32 neither overflow nor vanish
+# the least residual that is taken for one: the squares of smaller ones vanish, which the loop looks
+# into
+ORDINARY = 1e-100
+# of a guess's residual to b within which corrections in float32 neither overflow nor vanish
+RATIOS = 1e-6, 1e6
 ROWS = 32  # at most
 
 
@@ -50,7 +61,8 @@ FELL = wp.constant(7)  # by how much the last step lowered it
 NOISE = wp.constant(8)  # of the energy, relative
 JUDGED = 9
 CREEPS, STALLS = wp.constant(wp.float64(CREEP)), wp.constant(wp.float64(STALL))
-SAFELY = wp.constant(wp.float64(1.0 + 1e-9))  # what the host computes again must not come out the other way
+# what the host computes again must not come out the other way
+SAFELY = wp.constant(wp.float64(1.0 + 1e-9))
 LEAST_RATIO, MOST_RATIO = wp.constant(wp.float64(1e-6)), wp.constant(wp.float64(1e6))
 
 
@@ -97,12 +109,23 @@ def join_unusual_kernel(floating: wp.array(dtype=wp.int32), faults: f64, others:
 @forward_kernel(module="warp_lcp.projected_multigrid.ahead")
 @no_type_check
 def begin_kernel(
-    scalars: f64, rows: f64, judged: f64, going: wp.array(dtype=wp.int32), stale: wp.array(dtype=wp.int32), was_stale: int, most: int,
-    rtol: wp.float64, atol: wp.float64, counted: f64, noise: wp.float64, calm: wp.array(dtype=wp.int32),
-):  # fmt: skip
+    scalars: f64,
+    rows: f64,
+    judged: f64,
+    going: wp.array(dtype=wp.int32),
+    stale: wp.array(dtype=wp.int32),
+    was_stale: int,
+    most: int,
+    rtol: wp.float64,
+    atol: wp.float64,
+    counted: f64,
+    noise: wp.float64,
+    calm: wp.array(dtype=wp.int32),
+):
     """Begin with the guess that has been evaluated, if it misses the tolerance and is as large as b; row 0 has the reference.
 
-    The tolerance is absolute, or of the root mean square if unknowns are counted. `calm`: whether the host need not prepare the steps.
+    The tolerance is absolute, or of the root mean square if unknowns are counted. `calm`: whether
+    the host need not prepare the steps.
     """
     keep_row(scalars, rows, 1)
     norm = wp.sqrt(scalars[NORM])
@@ -120,7 +143,12 @@ def begin_kernel(
     judged[FELL] = wp.float64(wp.inf)
     judged[NOISE] = noise
     ratio = norm / scalars[SIZE]
-    go = norm > judged[TOLERANCE] * SAFELY and ratio > LEAST_RATIO and ratio < MOST_RATIO and most > 2
+    go = (
+        norm > judged[TOLERANCE] * SAFELY
+        and ratio > LEAST_RATIO
+        and ratio < MOST_RATIO
+        and most > 2
+    )
     if counted:
         go = go and counted[0] > wp.float64(0.0)
     if calm:
@@ -133,9 +161,19 @@ def begin_kernel(
 @forward_kernel(module="warp_lcp.projected_multigrid")
 @no_type_check
 def resume_kernel(
-    judged: f64, going: wp.array(dtype=wp.int32), stale: wp.array(dtype=wp.int32), was_stale: int, most: int, tolerance: wp.float64,
-    norm: wp.float64, best: wp.float64, energy: wp.float64, lowest: wp.float64, fell: wp.float64, noise: wp.float64,
-):  # fmt: skip
+    judged: f64,
+    going: wp.array(dtype=wp.int32),
+    stale: wp.array(dtype=wp.int32),
+    was_stale: int,
+    most: int,
+    tolerance: wp.float64,
+    norm: wp.float64,
+    best: wp.float64,
+    energy: wp.float64,
+    lowest: wp.float64,
+    fell: wp.float64,
+    noise: wp.float64,
+):
     """Begin with a step, from where the host has judged."""
     judged[TAKEN] = wp.float64(0.0)
     judged[MOST] = wp.float64(most)
@@ -153,13 +191,20 @@ def resume_kernel(
 @forward_kernel(module="warp_lcp.projected_multigrid")
 @no_type_check
 def judge_kernel(
-    scalars: f64, rows: f64, judged: f64, going: wp.array(dtype=wp.int32), stale: wp.array(dtype=wp.int32), rebuilds: bool,
-    bounded: bool, calm: wp.array(dtype=wp.int32),
-):  # fmt: skip
+    scalars: f64,
+    rows: f64,
+    judged: f64,
+    going: wp.array(dtype=wp.int32),
+    stale: wp.array(dtype=wp.int32),
+    rebuilds: bool,
+    bounded: bool,
+    calm: wp.array(dtype=wp.int32),
+):
     """Keep what a truncated step has led to; go on if the host would take another one without a thought.
 
-    That is where the residual and, with bounds, the energy are the least yet, the tolerance is missed, and the free set does not creep;
-    nor changes, unless the device rebuilds what depends on it: `calm`, whether that is all.
+    That is where the residual and, with bounds, the energy are the least yet, the tolerance is
+    missed, and the free set does not creep; nor changes, unless the device rebuilds what depends on
+    it: `calm`, whether that is all.
     """
     zero = wp.float64(0.0)
     n = int(judged[TAKEN])
@@ -173,7 +218,12 @@ def judge_kernel(
     if bounded:  # without bounds there is no energy
         go = go and judged[LOWEST] - energy > margin * SAFELY
     if scalars[MOVED] > zero:
-        go = go and rebuilds and fell * SAFELY < CREEPS * judged[FELL] and norm * SAFELY < STALLS * judged[LAST_NORM]
+        go = (
+            go
+            and rebuilds
+            and fell * SAFELY < CREEPS * judged[FELL]
+            and norm * SAFELY < STALLS * judged[LAST_NORM]
+        )
         if calm:
             go = go and calm[0] != 0
     judged[TAKEN] = wp.float64(n + 1)
@@ -189,13 +239,15 @@ def judge_kernel(
 class RunAhead:
     """What the device does without its host, and what the host has not looked at of it yet.
 
-    A step follows a step where residual and energy are the least so far, the tolerance is missed and the free set does not creep: then the
-    host, which judges all of that again when it comes, would have taken the same one. Everything else is left to it. On the CPU the team
-    works through the beginning of a solve as one table, and through the steps as a table that it repeats.
+    A step follows a step where residual and energy are the least so far, the tolerance is missed
+    and the free set does not creep: then the host, which judges all of that again when it comes,
+    would have taken the same one. Everything else is left to it. On the CPU the team works through
+    the beginning of a solve as one table, and through the steps as a table that it repeats.
 
     Args:
         work: whose steps they are; its operator is a grid's, in one process.
-        rebuilds: whether the device follows the free set, too; else steps end where that changes, and the host rebuilds.
+        rebuilds: whether the device follows the free set, too; else steps end where that changes,
+            and the host rebuilds.
 
     Attributes:
         rows: evaluations that the host has not looked at, see `keep_row`.
@@ -207,9 +259,11 @@ class RunAhead:
         self.rows = deque[np.ndarray]()
         self._found, self._judged = Reading(device, ROWS * int(ROW)), Reading(device, JUDGED)
         self._going, self._stale = (zeros(1, wp.int32, device) for _ in range(2))
-        self._numbers = [Scalar() for _ in range(5)]  # of the kernel that begins: stale, most, both tolerances, noise
+        # of the kernel that begins: stale, most, both tolerances, noise
+        self._numbers = [Scalar() for _ in range(5)]
         self._standing = [Scalar() for _ in range(9)]  # of the kernel that resumes
-        self._loops: dict[tuple[int, bool], Program] = {}  # by the step's program, and whether the device rebuilds
+        # by the step's program, and whether the device rebuilds
+        self._loops: dict[tuple[int, bool], Program] = {}
         self._resuming = LaunchGraph(device, self._launch_resumption)
         self._beginning: Beginning | None = None
 
@@ -233,7 +287,13 @@ class RunAhead:
         loop = self._loop(rebuilds=self._may_rebuild())
         if loop is None:
             return False
-        given = [int(work.stale), min(left, ROWS), tolerance, *work.descent.standing, work.descent.noise]
+        given = [
+            int(work.stale),
+            min(left, ROWS),
+            tolerance,
+            *work.descent.standing,
+            work.descent.noise,
+        ]
         for number, value in zip(self._standing, given, strict=True):
             number.value = value
         self._resuming.run(loop, variant=work.program_key())
@@ -253,7 +313,9 @@ class RunAhead:
         correction = self._work.correction
         return self._rebuilds or (correction is not None and correction.is_calm)
 
-    def begin(self, guess: wp.array[Any], criteria: StoppingCriteria | MeanCriteria, left: int) -> float | None:
+    def begin(
+        self, guess: wp.array[Any], criteria: StoppingCriteria | MeanCriteria, left: int
+    ) -> float | None:
         """Begin a solve from a guess, and take steps; return the residual at clip(0, l, u), None where the loop has to begin again.
 
         Without unknowns that count, nothing is done, and the residual is 0.
@@ -273,7 +335,13 @@ class RunAhead:
             hierarchy.refresh()
             renewed = False
         counted = criteria.counted if isinstance(criteria, MeanCriteria) else None
-        numbers = int(work.stale), min(left + 2, ROWS), criteria.rtol, criteria.atol, work.descent.noise
+        numbers = (
+            int(work.stale),
+            min(left + 2, ROWS),
+            criteria.rtol,
+            criteria.atol,
+            work.descent.noise,
+        )
         if self._beginning is None or not self._beginning.fits(guess, counted):
             self._beginning = Beginning(work, guess, counted, self._found, self._judge_first)
         for number, value in zip(self._numbers, numbers, strict=True):
@@ -285,14 +353,19 @@ class RunAhead:
             if loop is not None:
                 loop.run_while(self._going)
         self._take_rows()
-        if isinstance(criteria, MeanCriteria) and criteria.count() == 0:  # no unknown counts: there is nothing to solve
+        # no unknown counts: there is nothing to solve
+        if isinstance(criteria, MeanCriteria) and criteria.count() == 0:
             self.rows.clear()
             work.distrust_hierarchy()  # the free set is unknown
             r.norm = 0.0
             return 0.0
         reference, first = (math.sqrt(row[int(NORM)]) for row in (self.rows[0], self.rows[1]))
         size = math.sqrt(r.square_of_b.numpy()[0])
-        usual = self._beginning.is_plain() and math.isfinite(size) and 4 * EPS * size < reference < math.inf
+        usual = (
+            self._beginning.is_plain()
+            and math.isfinite(size)
+            and 4 * EPS * size < reference < math.inf
+        )
         if not (usual and reference > ORDINARY and RATIOS[0] * size < first < RATIOS[1] * size):
             self.rows.clear()
             work.distrust_hierarchy()  # it may be of any free set now
@@ -309,8 +382,19 @@ class RunAhead:
     def _judge_first(self, counted: wp.array[Any] | None, launch: Launch) -> None:
         """Record the kernel that decides whether the guess is good enough."""
         *given, noise = self._numbers
-        memory = [self._work.residual.scalars, self._found.array, self._judged.array, self._going, self._stale]
-        launch(begin_kernel, 1, [*memory, *given, counted, noise, self._calm], device=self._work.A.device)
+        memory = [
+            self._work.residual.scalars,
+            self._found.array,
+            self._judged.array,
+            self._going,
+            self._stale,
+        ]
+        launch(
+            begin_kernel,
+            1,
+            [*memory, *given, counted, noise, self._calm],
+            device=self._work.A.device,
+        )
 
     def _launch_resumption(self, loop: Program) -> None:
         """Launch the kernel that resumes, and on CUDA the steps."""
@@ -342,15 +426,26 @@ class RunAhead:
             loop = self._loops[key] = Program(work.A.device)
             if rebuilds:
                 loop.record(Conditional(self._stale, rebuild))
-            if work.precision is Precision.SINGLE:  # rounding cannot be taken back: x, the best iterate, is stored before each step
-                CONVERT.bind(Rows.of_fields(work.problem.layout), a=work.x, b=work.best()).launch(loop.launch)
+            # rounding cannot be taken back: x, the best iterate, is stored before each step
+            if work.precision is Precision.SINGLE:
+                CONVERT.bind(Rows.of_fields(work.problem.layout), a=work.x, b=work.best()).launch(
+                    loop.launch
+                )
             loop.extend(step)
             calm = self._calm if rebuilds else None
             if calm is not None:
                 assert work.correction is not None
                 work.correction.note(loop.launch)
-            memory = [work.residual.scalars, self._found.array, self._judged.array, self._going, self._stale]
-            loop.launch(judge_kernel, 1, [*memory, rebuilds, work.bounded, calm], device=work.A.device)
+            memory = [
+                work.residual.scalars,
+                self._found.array,
+                self._judged.array,
+                self._going,
+                self._stale,
+            ]
+            loop.launch(
+                judge_kernel, 1, [*memory, rebuilds, work.bounded, calm], device=work.A.device
+            )
         return self._loops[key]
 
 
@@ -366,10 +461,20 @@ class Beginning:
     """
 
     def __init__(
-        self, work: MultigridWorkspace, guess: wp.array[Any], counted: wp.array[Any] | None, found: Reading,
+        self,
+        work: MultigridWorkspace,
+        guess: wp.array[Any],
+        counted: wp.array[Any] | None,
+        found: Reading,
         judge: Callable[[wp.array[Any] | None, Launch], None],
-    ) -> None:  # fmt: skip
-        self._work, self._guess, self._counted, self._found, device = work, guess, counted, found, work.A.device
+    ) -> None:
+        self._work, self._guess, self._counted, self._found, device = (
+            work,
+            guess,
+            counted,
+            found,
+            work.A.device,
+        )
         self._key, self._finder = work.program_key(), work.A.component_finder  # type: ignore[attr-defined]  # of a GridPoisson
         self._judge, self._graph = judge, LaunchGraph(device, self._launch)  # on CUDA
         self._unusual = Reading(device, 3)  # of ranks
@@ -382,7 +487,11 @@ class Beginning:
 
     def fits(self, guess: wp.array[Any], counted: wp.array[Any] | None) -> bool:
         """Return whether the launches are of this guess and count, and of the bounds as they are."""
-        return self._guess.ptr == guess.ptr and self._counted is counted and self._key == self._work.program_key()
+        return (
+            self._guess.ptr == guess.ptr
+            and self._counted is counted
+            and self._key == self._work.program_key()
+        )
 
     def run(self) -> None:
         """Launch everything, on the CPU."""
@@ -403,7 +512,9 @@ class Beginning:
         for changed in (p.bounds, r.square_of_b, self._finder, self._faults):
             changed.changed()
 
-    def _launch(self, loop: Program | None, going: wp.array[Any], renewed: bool, searches: bool) -> None:
+    def _launch(
+        self, loop: Program | None, going: wp.array[Any], renewed: bool, searches: bool
+    ) -> None:
         """Launch or record everything, with arguments as of `run_with`; `searches`: for floating components."""
         if renewed:
             self._work.hierarchy.refresh()
@@ -428,7 +539,8 @@ class Beginning:
 
         Args:
             launch: launches or records.
-            search: of floating components: on the CPU a part of the program, on CUDA what launches it; None: it is not due.
+            search: of floating components: on the CPU a part of the program, on CUDA what launches
+                it; None: it is not due.
         """
         work, r, x = self._work, self._work.residual, self._work.x
         p, device = work.problem, work.A.device
@@ -447,7 +559,12 @@ class Beginning:
             search(work.scratch)
         self._faults = p.look_at(self._guess, launch)
         if p.layout.across is not None:
-            memory = [self._finder.held_here, self._faults.array, p.bounds.others_here, self._unusual.array]
+            memory = [
+                self._finder.held_here,
+                self._faults.array,
+                p.bounds.others_here,
+                self._unusual.array,
+            ]
             launch(join_unusual_kernel, 1, memory, device=device)
             add_across(p.layout.across, self._unusual.array, slice(0, 3), launch)
         if device.is_cuda:

@@ -33,7 +33,15 @@ class CoupledResidual(AssessedResidual):
     Its d_i are the diagonal of A alone, which is no larger.
     """
 
-    def __init__(self, problem: LCP, A: HasStencil, hierarchy: Hierarchy, *, low: LowRankOperator, rounded: bool) -> None:
+    def __init__(
+        self,
+        problem: LCP,
+        A: HasStencil,
+        hierarchy: Hierarchy,
+        *,
+        low: LowRankOperator,
+        rounded: bool,
+    ) -> None:
         super().__init__(problem, A, hierarchy, rounded=rounded)
         self.diagonal, self.unit, self._diagonal_of = A.stencil.d, float(A.stencil.unit), None
         self._low, self._b = low, wp.zeros_like(problem.b)  # in the place of the problem's
@@ -63,7 +71,14 @@ class CoupledResidual(AssessedResidual):
         self._low.products.changed()
         return super().read(classified=classified)
 
-    def advance(self, x: wp.array[Any], direction: wp.array[Any], *, classify: bool, launch: Launch = launch_now) -> None:
+    def advance(
+        self,
+        x: wp.array[Any],
+        direction: wp.array[Any],
+        *,
+        classify: bool,
+        launch: Launch = launch_now,
+    ) -> None:
         """Launch the step and the evaluation where it ends; U'x is needed between them."""
         self.update(x, direction, launch=launch)
         self.assess(x, classify=classify, launch=launch)
@@ -74,29 +89,41 @@ class CoupledWorkspace(MultigridWorkspace):
 
     residual: CoupledResidual
     correction: LowRankCorrection
-    # What a projection does to the force on a body that weighs next to nothing is a leap each time, and the energy
-    # of grid and bodies lets projected cycles of the grid hardly move.
+    # What a projection does to the force on a body that weighs next to nothing is a leap each time,
+    # and the energy of grid and bodies lets projected cycles of the grid hardly move.
     most_runs = 3
 
-    def __init__(self, problem: LCP, A: HasStencil, low: LowRankOperator, settings: ProjectedMultigrid) -> None:
-        super().__init__(problem, A, settings, residual=partial(CoupledResidual, low=low), ahead=False)
+    def __init__(
+        self, problem: LCP, A: HasStencil, low: LowRankOperator, settings: ProjectedMultigrid
+    ) -> None:
+        super().__init__(
+            problem, A, settings, residual=partial(CoupledResidual, low=low), ahead=False
+        )
         self._low = low
         self.correction = LowRankCorrection(low, self.hierarchy)
         self._ahead = RunAhead(self, rebuilds=False) if RunAhead.suits(self) else None
-        self._evaluation = LaunchGraph(problem.device, self._launch_evaluation, at_once=problem.layout.across is not None)
-        self._monotone = LaunchGraph(problem.device, self._launch_monotone, at_once=problem.layout.across is not None)
+        self._evaluation = LaunchGraph(
+            problem.device, self._launch_evaluation, at_once=problem.layout.across is not None
+        )
+        self._monotone = LaunchGraph(
+            problem.device, self._launch_monotone, at_once=problem.layout.across is not None
+        )
         self._along = wp.zeros(low.rank, dtype=wp.float64, device=problem.device)  # U'p
         self._fresh = True  # whether the correction is still that of the last solve
         self.readings = (low.products, *self.correction.readings)
         self._prepared = False  # whether potentials have been made as the solve began
         low.products_of = self.x if problem.layout.across is None else None
 
-    def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
+    def start(
+        self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
+    ) -> None:
         """Forget the search direction; operator and bodies may have changed."""
         super().start(warm=warm, tolerance=tolerance, floating=floating)
         self._fresh = True
 
-    def begin_ahead(self, guess: wp.array[Any] | None, criteria: StoppingCriteria | MeanCriteria, steps: int) -> float | None:
+    def begin_ahead(
+        self, guess: wp.array[Any] | None, criteria: StoppingCriteria | MeanCriteria, steps: int
+    ) -> float | None:
         """Begin a solve, and take steps, without the host, see `MultigridWorkspace`."""
         if guess is not None:
             self.correction.prepare()
@@ -116,7 +143,8 @@ class CoupledWorkspace(MultigridWorkspace):
         if not self.exact:
             super()._move_monotonely(safe, classify, launch)
             return
-        assert self.hierarchy.projected_sweep if safe else self.hierarchy.monotone_cycle  # made now, not among recorded launches
+        # made now, not among recorded launches
+        assert self.hierarchy.projected_sweep if safe else self.hierarchy.monotone_cycle
         self._monotone.run(safe, classify, variant=self.problem_key())
 
     def _launch_monotone(self, safe: bool, classify: bool) -> None:
@@ -124,7 +152,12 @@ class CoupledWorkspace(MultigridWorkspace):
 
     def _plan_monotone_step(self, launch: Launch) -> None:
         self._sum_products(launch=launch)
-        launch(kernels.plan_whole_step_kernel, 1, [self.residual.scalars, True], device=self.problem.device)
+        launch(
+            kernels.plan_whole_step_kernel,
+            1,
+            [self.residual.scalars, True],
+            device=self.problem.device,
+        )
 
     def rebuild(self, *, classify: bool) -> None:
         """Follow the free set, with the correction too."""
@@ -135,7 +168,8 @@ class CoupledWorkspace(MultigridWorkspace):
         begins, self._fresh = self._fresh, False
         noted, self.free_set_noted = self.free_set_noted, False
         made, self._prepared = self._prepared, False  # which has overwritten the right-hand side
-        if self.correction.renew(begins=begins, noted=noted, made=noted and made) or made:  # so has this
+        # so has this
+        if self.correction.renew(begins=begins, noted=noted, made=noted and made) or made:
             self._evaluation.run(self.x, classify, variant=self.problem_key())
             if self.floating is not None:
                 self._project()
@@ -170,10 +204,23 @@ class CoupledWorkspace(MultigridWorkspace):
 
     def _sum_products(self, *, launch: Launch = launch_now) -> None:
         """Sum the products that beta and the step need, with A + U W U'."""
-        residual, finest, device, columns = self.residual, self.hierarchy.finest, self.A.device, self._low.columns
+        residual, finest, device, columns = (
+            self.residual,
+            self.hierarchy.finest,
+            self.A.device,
+            self._low.columns,
+        )
         finest.stencil.wrap(finest.x, launch=launch)
         kernels.measuring(finest, self._p, residual.sums.partials).launch(launch)
         residual.sums.add_up(int(kernels.ZAZ), columns=4, launch=launch)
-        CONVERT.bind(rows_of(self._along), a=columns.gather(self._p, launch=launch), b=self._along).launch(launch)
-        inputs = [self._low.weights.flatten(), columns.gather(finest.x, launch=launch), self._along, self._low.rank, residual.scalars]
+        CONVERT.bind(
+            rows_of(self._along), a=columns.gather(self._p, launch=launch), b=self._along
+        ).launch(launch)
+        inputs = [
+            self._low.weights.flatten(),
+            columns.gather(finest.x, launch=launch),
+            self._along,
+            self._low.rank,
+            residual.scalars,
+        ]
         launch(coupling.add_products_kernel, 1, inputs, device=device)

@@ -25,7 +25,8 @@ class AssessedResidual(NaturalResidual):
     """The natural residual, evaluated together with the free set and the right-hand side on it.
 
     Attributes:
-        classified: whether the last evaluation let unknowns at a bound leave the free set; after `start`, whether the next one will.
+        classified: whether the last evaluation let unknowns at a bound leave the free set; after
+            `start`, whether the next one will.
         free_set: version of the free set and of the operator: it grows when one of them changes.
         active: unknowns held.
         energy: x'Ax/2 + b'x.
@@ -35,14 +36,32 @@ class AssessedResidual(NaturalResidual):
 
     def __init__(self, problem: LCP, A: HasStencil, hierarchy: Hierarchy, *, rounded: bool) -> None:
         super().__init__(problem)
-        self._A, self._finest, self._hierarchy, self._version = A, hierarchy.finest, hierarchy, A.version
+        self._A, self._finest, self._hierarchy, self._version = (
+            A,
+            hierarchy.finest,
+            hierarchy,
+            A.version,
+        )
         self._rounded, self._b = rounded, problem.b
         self._away: wp.array[Any] | None = None
         self._reading = Reading(A.device, kernels.SLOTS)
         self.scalars = self._reading.array
         places = A.stencil.rows.places
-        self.sums = Reduction(problem.layout.size, A.device, self.scalars, columns=4, threads=places, across=problem.layout.across)
-        self.classified, self.free_set, self.active, self.energy, self._norm_of_b = False, 1, 0, 0.0, 0.0
+        self.sums = Reduction(
+            problem.layout.size,
+            A.device,
+            self.scalars,
+            columns=4,
+            threads=places,
+            across=problem.layout.across,
+        )
+        self.classified, self.free_set, self.active, self.energy, self._norm_of_b = (
+            False,
+            1,
+            0,
+            0.0,
+            0.0,
+        )
         self.size = 1.0  # what the right-hand side is divided by
 
     def start(self, x: wp.array[Any], *, keep: bool) -> None:
@@ -87,7 +106,8 @@ class AssessedResidual(NaturalResidual):
 
         Args:
             x: stored field.
-            classify: whether unknowns at a bound leave the free set; None: as in the last evaluation.
+            classify: whether unknowns at a bound leave the free set; None: as in the last
+                evaluation.
         """
         classify = self.classified if classify is None else classify
         plain = type(self).assess is AssessedResidual.assess  # others may launch by Warp alone
@@ -101,14 +121,24 @@ class AssessedResidual(NaturalResidual):
         kernels.ADVANCE.launch(None, self._assessing(x, classify), launch=launch)
         self.sums.add_up(int(kernels.NORM), columns=4, launch=launch)
 
-    def update(self, x: wp.array[Any], direction: wp.array[Any], *, launch: Launch = launch_now) -> None:
+    def update(
+        self, x: wp.array[Any], direction: wp.array[Any], *, launch: Launch = launch_now
+    ) -> None:
         """Launch the step from x along the direction that the cycle's correction gives."""
         self._updating(self._A.stencil.rows, x, direction).launch(launch)
 
-    def advance(self, x: wp.array[Any], direction: wp.array[Any], *, classify: bool, launch: Launch = launch_now) -> None:
+    def advance(
+        self,
+        x: wp.array[Any],
+        direction: wp.array[Any],
+        *,
+        classify: bool,
+        launch: Launch = launch_now,
+    ) -> None:
         """Launch the step and the evaluation where it ends: one launch on the CPU, unless periodic ghost cells must be filled between.
 
-        Ghost cells that stand for cells of others take the step by themselves; x's and the correction's are filled.
+        Ghost cells that stand for cells of others take the step by themselves; x's and the
+        correction's are filled.
         """
         p, s = self.problem, self._A.stencil
         if p.device.is_cuda or any(s.periodic):
@@ -117,20 +147,36 @@ class AssessedResidual(NaturalResidual):
             return
         for axis, end in s.ghosts.cuts if s.ghosts is not None else ():
             self._updating(Rows.beyond(s.padding, p.device, axis, end), x, direction).launch(launch)
-        kernels.ADVANCE.launch(self._updating(s.rows, x, direction), self._assessing(x, classify), launch=launch)
+        kernels.ADVANCE.launch(
+            self._updating(s.rows, x, direction), self._assessing(x, classify), launch=launch
+        )
         self.sums.add_up(int(kernels.NORM), columns=4, launch=launch)
 
     def _updating(self, rows: Rows, x: wp.array[Any], direction: wp.array[Any]) -> Bound:
         bounds = self.problem.bounds.operands
-        return kernels.UPDATE.bind(rows, bounds=bounds, x=x, z=self._finest.x, q=direction, scalars=self.scalars)
+        return kernels.UPDATE.bind(
+            rows, bounds=bounds, x=x, z=self._finest.x, q=direction, scalars=self.scalars
+        )
 
     def _assessing(self, x: wp.array[Any], classify: bool) -> Bound:
         p, finest = self.problem, self._finest
         return kernels.ASSESS.bind(
-            self._A.stencil.rows, stencil=self._A.stencil, bounds=p.bounds.operands, x=x, b=self._b, unknown=p.unknown,
-            free=finest.stencil.d, g=finest.b, changed=finest.changed.flatten(), away=self._away, scalars=self.scalars,
-            classify=classify, out=self.sums.partials, MINIMUM_MAP=self._minimum_map, ROUNDED=self._rounded,
-        )  # fmt: skip
+            self._A.stencil.rows,
+            stencil=self._A.stencil,
+            bounds=p.bounds.operands,
+            x=x,
+            b=self._b,
+            unknown=p.unknown,
+            free=finest.stencil.d,
+            g=finest.b,
+            changed=finest.changed.flatten(),
+            away=self._away,
+            scalars=self.scalars,
+            classify=classify,
+            out=self.sums.partials,
+            MINIMUM_MAP=self._minimum_map,
+            ROUNDED=self._rounded,
+        )
 
     def read(self, *, classified: bool) -> float:
         """Read what the evaluation found; a step that is not finite was not taken, and its residual is no number.
@@ -140,9 +186,14 @@ class AssessedResidual(NaturalResidual):
         """
         self._reading.changed()
         scalars = self._reading.numpy()
-        return self.take([*scalars[:4], scalars[int(kernels.STEP)], scalars[int(kernels.SIZE)]], classified=classified)
+        return self.take(
+            [*scalars[:4], scalars[int(kernels.STEP)], scalars[int(kernels.SIZE)]],
+            classified=classified,
+        )
 
-    def take(self, row: Iterable[float], norm_of_b: float | None = None, *, classified: bool) -> float:
+    def take(
+        self, row: Iterable[float], norm_of_b: float | None = None, *, classified: bool
+    ) -> float:
         """Take what an evaluation has found, see `multigrid_ahead.keep_row`; return the norm."""
         self.classified = classified
         square, moved, active, twice, step, size = map(float, row)

@@ -36,8 +36,8 @@ AHEAD = 20  # steps that the device may take without the host: then their pace i
 class MultigridWorkspace(IterateMemory):
     """Memory of `ProjectedMultigrid` for one problem; its cycles also serve other methods on grids.
 
-    x is moved in place. The best iterate is not stored while it is x, nor when x is one step past it, for a step can be taken back; it
-    is when the residual has risen and goes on from there.
+    x is moved in place. The best iterate is not stored while it is x, nor when x is one step past
+    it, for a step can be taken back; it is when the residual has risen and goes on from there.
 
     Args:
         problem: the problem.
@@ -49,39 +49,67 @@ class MultigridWorkspace(IterateMemory):
 
     Attributes:
         cycles_left: projected cycles that come next.
-        cycles_against_creeping: whether a projected cycle follows a step in which the free set creeps.
+        cycles_against_creeping: whether a projected cycle follows a step in which the free set
+            creeps.
     """
 
     residual: AssessedResidual
     readings: tuple[Reading, ...] = ()  # that evaluations leave besides the residual's
     correction: LowRankCorrection | None = None  # of the cycle, for bodies
-    most_runs: float = math.inf  # of projected cycles that were due: after those, the free set goes round in circles
+    # of projected cycles that were due: after those, the free set goes round in circles
+    most_runs: float = math.inf
     cycles_against_creeping = True
-    free_set_noted = False  # whether `LowRankCorrection.note` has been launched for the free set as it is
+    # whether `LowRankCorrection.note` has been launched for the free set as it is
+    free_set_noted = False
 
     def __init__(
-        self, problem: LCP, A: HasStencil, settings: Any, *, residual: Callable[..., AssessedResidual] = AssessedResidual,
-        shifted: bool = False, ahead: bool = True,
-    ) -> None:  # fmt: skip
+        self,
+        problem: LCP,
+        A: HasStencil,
+        settings: Any,
+        *,
+        residual: Callable[..., AssessedResidual] = AssessedResidual,
+        shifted: bool = False,
+        ahead: bool = True,
+    ) -> None:
         precision = Precision(settings.precision)
-        real, self.A, self.settings, self.bounded = precision.correction, A, settings, problem.bounded
+        real, self.A, self.settings, self.bounded = (
+            precision.correction,
+            A,
+            settings,
+            problem.bounded,
+        )
         self._p = problem.layout.zeros(real)
-        # a projected cycle forgets the search direction, so its lower bounds may lie in that memory: finite numbers, and 0 off the unknowns
-        upper = problem.layout.zeros(real) if problem.bounds.may_bind[1] else nothing(real, A.device)
-        options: dict[str, Any] = {"bounded": self.bounded, "settings": settings.cycle, "bounds": (self._p, upper), "shifted": shifted}
+        # a projected cycle forgets the search direction, so its lower bounds may lie in that
+        # memory: finite numbers, and 0 off the unknowns
+        upper = (
+            problem.layout.zeros(real) if problem.bounds.may_bind[1] else nothing(real, A.device)
+        )
+        options: dict[str, Any] = {
+            "bounded": self.bounded,
+            "settings": settings.cycle,
+            "bounds": (self._p, upper),
+            "shifted": shifted,
+        }
         self.hierarchy = make_hierarchy(A.stencil, real, **options)
-        super().__init__(problem, precision, residual=residual(problem, A, self.hierarchy, rounded=precision is Precision.SINGLE))
+        super().__init__(
+            problem,
+            precision,
+            residual=residual(problem, A, self.hierarchy, rounded=precision is Precision.SINGLE),
+        )
         self.flat = Rows.of_fields(problem.layout)
         self._programs: dict[tuple[Any, ...], Program] = {}  # truncated cycles
         self._mask: wp.array[Any] | None = None
         self.scratch = self._scratch() if real is wp.float32 else None
-        self._past, self._stored = 0, False  # steps since the best iterate; whether it is in memory of its own
+        # steps since the best iterate; whether it is in memory of its own
+        self._past, self._stored = 0, False
         self.cycles_left, self.descent = 0, Descent(self.precision.epsilon)
         self._tolerance, self._taken = 0.0, 0  # steps of this solve
         self._ahead = RunAhead(self) if ahead and RunAhead.suits(self) else None
         self._one_table = self._ahead is not None  # whether nothing is read on the way of a step
         self._built = 0  # the version of the free set that the hierarchy has
-        self._budget, self._begun = 0, False  # steps that the device may take without the host; whether it has begun the solve
+        # steps that the device may take without the host; whether it has begun the solve
+        self._budget, self._begun = 0, False
 
     @property
     def stale(self) -> bool:
@@ -99,7 +127,9 @@ class MultigridWorkspace(IterateMemory):
         if self._ahead is not None:
             self._ahead.forget_guess()
 
-    def begin_ahead(self, guess: wp.array[Any] | None, criteria: StoppingCriteria | MeanCriteria, steps: int) -> float | None:
+    def begin_ahead(
+        self, guess: wp.array[Any] | None, criteria: StoppingCriteria | MeanCriteria, steps: int
+    ) -> float | None:
         """Begin a solve, and take steps, without the host; return the residual at clip(0, l, u), None where nothing has begun.
 
         Args:
@@ -174,9 +204,15 @@ class MultigridWorkspace(IterateMemory):
     def _undo(self, out: wp.array[Any]) -> None:
         """Write where the last step began."""
         p, scalars = self.problem, self.residual.scalars
-        kernels.UNDO.bind(self.flat, bounds=p.bounds.operands, scalars=scalars, x=self.x, q=self._p, unknown=p.unknown, before=out).launch(
-            wp.launch
-        )
+        kernels.UNDO.bind(
+            self.flat,
+            bounds=p.bounds.operands,
+            scalars=scalars,
+            x=self.x,
+            q=self._p,
+            unknown=p.unknown,
+            before=out,
+        ).launch(wp.launch)
 
     def shorten_step(self, before: float, now: float, whole: float) -> None:
         """Change how far x has moved along the last direction.
@@ -191,7 +227,9 @@ class MultigridWorkspace(IterateMemory):
         self._round(self.x)
         self.residual.set(kernels.STEP, now * whole)
 
-    def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
+    def start(
+        self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
+    ) -> None:
         """Forget the search direction; the operator may have changed."""
         self.floating = floating
         self.cycles_left = self.settings.monotone_cycles if self.bounded and not warm else 0
@@ -203,7 +241,8 @@ class MultigridWorkspace(IterateMemory):
         self.forget_direction()
         if self.scratch is not None:
             CLEAR.bind(self.flat, x=self.scratch[1]).launch()
-        rescale = not 1e-6 < self.residual.norm / self.residual.size < 1e6  # corrections in float32 would overflow, or vanish
+        # corrections in float32 would overflow, or vanish
+        rescale = not 1e-6 < self.residual.norm / self.residual.size < 1e6
         if rescale:
             self.residual.set(kernels.SIZE, self.residual.norm)
         # unknowns at their bounds leave the free set unless a projected cycle comes next
@@ -245,7 +284,11 @@ class MultigridWorkspace(IterateMemory):
         self._budget -= 1
         self._taken += 1
         classify = self.cycles_left == 1  # truncated cycles come next
-        with as_one_table(self.problem.device, self.problem.layout.across) if self._one_table else nullcontext():
+        with (
+            as_one_table(self.problem.device, self.problem.layout.across)
+            if self._one_table
+            else nullcontext()
+        ):
             self.rebuild(classify=self.residual.classified)
             self.cycles_left -= 1
             self._move_monotonely(descent.safe, classify, launch_recorded)
@@ -258,8 +301,15 @@ class MultigridWorkspace(IterateMemory):
     def _move_monotonely(self, safe: bool, classify: bool, launch: Launch) -> None:
         """Launch a projected cycle, or a sweep if `safe`, its step, and the evaluation where that ends."""
         p, finest = self.problem, self.hierarchy.finest
-        lo, hi, bounds, scalars = finest.lower, finest.upper, p.bounds.operands, self.residual.scalars
-        kernels.GAPS.bind(self.flat, bounds=bounds, x=self.x, unknown=p.unknown, lo=lo, hi=hi, scalars=scalars).launch(launch)
+        lo, hi, bounds, scalars = (
+            finest.lower,
+            finest.upper,
+            p.bounds.operands,
+            self.residual.scalars,
+        )
+        kernels.GAPS.bind(
+            self.flat, bounds=bounds, x=self.x, unknown=p.unknown, lo=lo, hi=hi, scalars=scalars
+        ).launch(launch)
         (self.hierarchy.projected_sweep if safe else self.hierarchy.monotone_cycle).run()
         self._plan_monotone_step(launch)
         self._advance(classify=classify, launch=launch)
@@ -268,7 +318,12 @@ class MultigridWorkspace(IterateMemory):
         """Take the projected cycle's correction as it is."""
         finest = self.hierarchy.finest
         finest.stencil.wrap(finest.x, launch=launch)
-        launch(kernels.plan_whole_step_kernel, 1, [self.residual.scalars, False], device=self.problem.device)
+        launch(
+            kernels.plan_whole_step_kernel,
+            1,
+            [self.residual.scalars, False],
+            device=self.problem.device,
+        )
 
     def truncated_step(self) -> Step:
         """One linear cycle on the free unknowns, made conjugate to the last direction, projected."""
@@ -298,7 +353,8 @@ class MultigridWorkspace(IterateMemory):
         ahead, left = self._ahead, min(self._budget + 1, AHEAD - self._taken)
         if ahead is None or self.floating is not None:
             return False
-        starts = left > 0 and (self._rounded is None or self._past == 1)  # from the best iterate, where steps cannot be taken back
+        # from the best iterate, where steps cannot be taken back
+        starts = left > 0 and (self._rounded is None or self._past == 1)
         if not (ahead.rows or (starts and ahead.steps(self._tolerance, left))):
             return False
         self._built = self.residual.free_set
@@ -359,7 +415,15 @@ class MultigridWorkspace(IterateMemory):
             rows = Rows.part(s.padding, self.A.device, (k0, j0, 0), (k1, j1, cells))
             place, places = k0 * lines + j0, s.rows.places
             kernels.MEASURE_AGAIN.bind(
-                rows, stencil=s, z=finest.x, q=self._p, g=finest.b, sums=sums, place=place, lines=lines, places=places
+                rows,
+                stencil=s,
+                z=finest.x,
+                q=self._p,
+                g=finest.b,
+                sums=sums,
+                place=place,
+                lines=lines,
+                places=places,
             ).launch(launch)
 
     def _measure(self, *, launch: Launch = launch_now) -> None:
@@ -387,7 +451,8 @@ class MultigridWorkspace(IterateMemory):
         """Let the hierarchy follow the free set, if that has changed.
 
         Args:
-            classify: as of the residual's `evaluate`, where the right-hand side has to be made again.
+            classify: as of the residual's `evaluate`, where the right-hand side has to be made
+                again.
         """
         if self.stale:
             self.hierarchy.rebuild_changed()
@@ -409,7 +474,8 @@ class MultigridWorkspace(IterateMemory):
 class ColdStart(MultigridWorkspace):
     """Memory of the cycles, whose iterate, residual and hierarchy the method shares.
 
-    The finest diagonal of the hierarchy takes the method's shifts, and the method keeps the best iterate.
+    The finest diagonal of the hierarchy takes the method's shifts, and the method keeps the best
+    iterate.
 
     Args:
         problem: the problem.
@@ -421,7 +487,9 @@ class ColdStart(MultigridWorkspace):
         super().__init__(problem, A, settings, shifted=True, ahead=False)
         self._stored = True  # elsewhere
 
-    def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
+    def start(
+        self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
+    ) -> None:
         """Begin; the method may have written the finest diagonal since it was coarsened."""
         self.hierarchy.finest.changed.fill_(1)
         self.distrust_hierarchy()

@@ -1,14 +1,17 @@
 """Nested iteration on banded matrices: active sets from coarse to fine, by cyclic reduction.
 
-The unknowns are cut into blocks of the bandwidth k, so that A is block tridiagonal. The blocks with odd numbers, F, are coupled to those
-with even numbers, C, alone: A_FF is block diagonal. With y_F = 0 they follow from their neighbors,
+The unknowns are cut into blocks of the bandwidth k, so that A is block tridiagonal. The blocks with
+odd numbers, F, are coupled to those with even numbers, C, alone: A_FF is block diagonal. With y_F =
+0 they follow from their neighbors,
 
     x_F = -A_FF^-1 (A_FC x_C + b_F),
 
-and what is left is the complementarity problem of the Schur complement S = A_CC - A_CF A_FF^-1 A_FC with b_C - A_CF A_FF^-1 b_F and the
-bounds of C: block tridiagonal again, of half the size, and an M-, P- or semi-definite matrix if A is.
-Only the bounds of F are left out. A contact set of many unknowns in a row therefore has the right ends but for a block or two, whatever
-the coefficients, and Newton's steps on the finer level have only those to move, where from a cold start they move an end by a block a step.
+and what is left is the complementarity problem of the Schur complement S = A_CC - A_CF A_FF^-1 A_FC
+with b_C - A_CF A_FF^-1 b_F and the bounds of C: block tridiagonal again, of half the size, and an
+M-, P- or semi-definite matrix if A is. Only the bounds of F are left out. A contact set of many
+unknowns in a row therefore has the right ends but for a block or two, whatever the coefficients,
+and Newton's steps on the finer level have only those to move, where from a cold start they move an
+end by a block a step.
 """
 
 from __future__ import annotations
@@ -45,7 +48,9 @@ class BlockTridiagonalProblem:
     upper: np.ndarray
 
     @classmethod
-    def of(cls, A: BandedMatrix, b: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> BlockTridiagonalProblem:
+    def of(
+        cls, A: BandedMatrix, b: np.ndarray, lower: np.ndarray, upper: np.ndarray
+    ) -> BlockTridiagonalProblem:
         """Cut a problem into blocks; the last one is filled up with equations x_i = 0."""
         k, n = max(A.width, 1), len(b)
         m = -(-n // k)
@@ -56,9 +61,16 @@ class BlockTridiagonalProblem:
             column = row - row % k + block * k + np.arange(k)
             band = A.width + row - column
             inside = (band >= 0) & (band <= 2 * A.width) & (column >= 0) & (column < n) & (row < n)
-            parts.append(np.where(inside, A.bands[np.where(inside, band, 0), np.where(inside, column, 0)], 0.0))
+            parts.append(
+                np.where(
+                    inside, A.bands[np.where(inside, band, 0), np.where(inside, column, 0)], 0.0
+                )
+            )
         parts[1][-1] += np.diag(place[-k:] >= n).astype(np.float64)
-        fields = (np.r_[f, np.full(m * k - n, end)].reshape(m, k) for f, end in ((b, 0.0), (lower, -np.inf), (upper, np.inf)))
+        fields = (
+            np.r_[f, np.full(m * k - n, end)].reshape(m, k)
+            for f, end in ((b, 0.0), (lower, -np.inf), (upper, np.inf))
+        )
         return cls(*parts, *fields)
 
     def coarse(self) -> tuple[BlockTridiagonalProblem, np.ndarray]:
@@ -71,7 +83,8 @@ class BlockTridiagonalProblem:
         inverse = _inverse(self.own[odd])
         own, b = self.own[even].copy(), self.b[even].copy()
         left, right = np.zeros_like(own), np.zeros_like(own)
-        before = _times(self.left[2::2], inverse[: len(own) - 1])  # A_CF A_FF^-1, of the odd block before an even one
+        # A_CF A_FF^-1, of the odd block before an even one
+        before = _times(self.left[2::2], inverse[: len(own) - 1])
         after = _times(self.right[even][: len(inverse)], inverse)  # and after it
         count = len(before)
         own[1:] -= _times(before, self.right[odd][:count])
@@ -80,7 +93,9 @@ class BlockTridiagonalProblem:
         right[: len(after)] = -_times(after, self.right[odd])
         b[1:] -= _applied(before, self.b[odd][:count])
         b[: len(after)] -= _applied(after, self.b[odd])
-        return BlockTridiagonalProblem(left, own, right, b, self.lower[even], self.upper[even]), inverse
+        return BlockTridiagonalProblem(
+            left, own, right, b, self.lower[even], self.upper[even]
+        ), inverse
 
     def interpolated(self, coarse: np.ndarray, inverse: np.ndarray) -> np.ndarray:
         """Return x, shape (m, k), of its even blocks: y = 0 on the odd ones."""
@@ -108,7 +123,8 @@ class BlockTridiagonalProblem:
         """Return x after whole Newton steps, until the active set does not change or comes again.
 
         Raises:
-            np.linalg.LinAlgError: a free block is singular, or the matrix has a diagonal entry that is not positive.
+            np.linalg.LinAlgError: a free block is singular, or the matrix has a diagonal entry that
+                is not positive.
         """
         A, shape = self.matrix(), x.shape
         x, b, lower, upper = (field.ravel() for field in (x, self.b, self.lower, self.upper))
@@ -131,7 +147,9 @@ class BlockTridiagonalProblem:
         return x.reshape(shape)
 
 
-def nested_iteration(A: BandedMatrix, b: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray | None:
+def nested_iteration(
+    A: BandedMatrix, b: np.ndarray, lower: np.ndarray, upper: np.ndarray
+) -> np.ndarray | None:
     """Return x near the solution of a boxed problem, with y = 0 on odd blocks; None where a block is singular.
 
     x may miss the bounds of odd blocks: Newton's next step holds such unknowns.

@@ -1,9 +1,10 @@
 """An LCP as a system of nonsmooth equations f(x) = 0 on the device: the maps that Newton-type and gradient methods descend on.
 
-With a = d (x - l), c = d (u - x) and psi(a, b) = a + b - sqrt(a^2 + b^2): h = -psi(-y, c) stands for y where there is an upper bound, and
-f = psi(a, h) where there is a lower one, else f = h; penalized: f <- lambda f + (1 - lambda) (a+ y+ - c+ (-y)+) / scale. A generalized
-Jacobian is diag(p d) + diag(q) A with p, q >= 0. FUSED passes go over the rows of a grid, whose system is condensed where the step ends, in
-the type of corrections, the others over flat fields.
+With a = d (x - l), c = d (u - x) and psi(a, b) = a + b - sqrt(a^2 + b^2): h = -psi(-y, c) stands
+for y where there is an upper bound, and f = psi(a, h) where there is a lower one, else f = h;
+penalized: f <- lambda f + (1 - lambda) (a+ y+ - c+ (-y)+) / scale. A generalized Jacobian is diag(p
+d) + diag(q) A with p, q >= 0. FUSED passes go over the rows of a grid, whose system is condensed
+where the step ends, in the type of corrections, the others over flat fields.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ from warp_lcp.rows.host_kernel import HostKernel
 from warp_lcp.rows.program import Launch, launch_now
 from warp_lcp.rows.vectors import Sums, convert, rows_of
 
-LEAST_Q = 1e-6  # of q where it divides: measured; less makes D needlessly large, more slows convergence
+# of q where it divides: measured; less makes D needlessly large, more slows convergence
+LEAST_Q = 1e-6
 
 f64 = wp.float64
 
@@ -44,10 +46,12 @@ ADVANCE = KERNELS["nonsmooth_map.advance"]
 MOVE = KERNELS["nonsmooth_map.move"]
 CONDENSE_AT_ROWS = KERNELS["nonsmooth_map.condense_at_rows"]
 HOST = HostKernel(KERNELS["nonsmooth_map.host"])
-STEP = Wave("nonsmooth_map.step", (MOVE, 0), (CONDENSE_AT_ROWS, 1))  # a plane is condensed when the one above it has moved
+# a plane is condensed when the one above it has moved
+STEP = Wave("nonsmooth_map.step", (MOVE, 0), (CONDENSE_AT_ROWS, 1))
 DIFFERENCE = KERNELS["finite_difference.difference"]
 SCALE = KERNELS["finite_difference.scale"]
-APART = 1e-7  # distance of two points of a difference, relative to ||x|| / ||p||: half the digits of float64
+# distance of two points of a difference, relative to ||x|| / ||p||: half the digits of float64
+APART = 1e-7
 
 
 KINK = 1e-14  # times the size of b: a point this near to both sides of a kink is on it
@@ -64,9 +68,10 @@ class MapForm(StrEnum):
 class Kink(StrEnum):
     """What stands for the derivative at a kink ([Book] 2.4.2).
 
-    There any (p, q) = (1 - alpha, 1 - beta) with alpha^2 + beta^2 <= 1 is one: a random one; (0, 1), that of a point moved a little off the
-    bound; or the unknown does not move in this step (zero). With an approximation it does not either, and the products with the Jacobian
-    are finite differences of the map.
+    There any (p, q) = (1 - alpha, 1 - beta) with alpha^2 + beta^2 <= 1 is one: a random one; (0,
+    1), that of a point moved a little off the bound; or the unknown does not move in this step
+    (zero). With an approximation it does not either, and the products with the Jacobian are finite
+    differences of the map.
     """
 
     RANDOM = "random"
@@ -152,10 +157,11 @@ class MapWeights:
 class NonsmoothMap:
     """f, the merit f.f / 2 and its gradient, at the point where a residual was evaluated last.
 
-    With the natural residual's d, a = d (x - l), c = d (u - x) and psi(a, b) = a + b - sqrt(a^2 + b^2), the Fischer map of a boxed
-    row is psi(a, -psi(-y, c)) ([Book] eq. 1.48, signs turned so that f > 0 where y > 0), of one without upper bound psi(a, y), of an
-    equation y; penalized: lambda times that plus (1 - lambda) (a+ y+ - c+ (-y)+) / scale with `scale` the root mean square of b. The
-    factor d makes f's units those of y, so that a change of x's units changes nothing.
+    With the natural residual's d, a = d (x - l), c = d (u - x) and psi(a, b) = a + b - sqrt(a^2 +
+    b^2), the Fischer map of a boxed row is psi(a, -psi(-y, c)) ([Book] eq. 1.48, signs turned so
+    that f > 0 where y > 0), of one without upper bound psi(a, y), of an equation y; penalized:
+    lambda times that plus (1 - lambda) (a+ y+ - c+ (-y)+) / scale with `scale` the root mean square
+    of b. The factor d makes f's units those of y, so that a change of x's units changes nothing.
 
     Args:
         problem: the problem.
@@ -170,19 +176,33 @@ class NonsmoothMap:
     """
 
     def __init__(
-        self, problem: LCP, residual: NaturalResidual, map: MapForm, share: float, kink: Kink = Kink.PERTURBATION, *,
+        self,
+        problem: LCP,
+        residual: NaturalResidual,
+        map: MapForm,
+        share: float,
+        kink: Kink = Kink.PERTURBATION,
+        *,
         scaled: bool = True,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.problem, self.residual, self.map = problem, residual, map
         self._d, self._unit = residual.diagonal, residual.unit
         if not scaled:
-            self._d, self._unit = wp.full(self._d.shape, 1, dtype=self._d.dtype, device=problem.device), 1.0
+            self._d, self._unit = (
+                wp.full(self._d.shape, 1, dtype=self._d.dtype, device=problem.device),
+                1.0,
+            )
         layout, self._share = problem.layout, share if map is MapForm.PENALIZED else 1.0
         natural, self._random = map is MapForm.NATURAL, kink is Kink.RANDOM
-        self._natural, self._upper, self._penalized = natural, problem.bounds.may_bind[1], self._share < 1
+        self._natural, self._upper, self._penalized = (
+            natural,
+            problem.bounds.may_bind[1],
+            self._share < 1,
+        )
         self._draws = self._random and not natural
         self._sums, self.norm = Sums(Rows.flat(layout.size, problem.device), 2), 0.0
-        self._by_rows: Sums | None = None  # made when first asked for, as is this one and the last gradient, the product, the weights
+        # made when first asked for, as is this one and the last gradient, the product, the weights
+        self._by_rows: Sums | None = None
         self._gradients: list[wp.array[Any]] = []
         self._drops = kink in (Kink.ZERO, Kink.APPROXIMATION)
         self.begin()
@@ -200,11 +220,26 @@ class NonsmoothMap:
     def values(self, x: wp.array[Any], out: wp.array[Any]) -> None:
         """Write f to a stored field."""
         VALUES.bind(
-            self._sums.rows, self._numbers, self._fields(x), values=out, bounds=self.problem.bounds.operands, NATURAL=self._natural,
-            UPPER=self._upper, PENALIZED=self._penalized, RANDOM=self._draws,
-        ).launch()  # fmt: skip
+            self._sums.rows,
+            self._numbers,
+            self._fields(x),
+            values=out,
+            bounds=self.problem.bounds.operands,
+            NATURAL=self._natural,
+            UPPER=self._upper,
+            PENALIZED=self._penalized,
+            RANDOM=self._draws,
+        ).launch()
 
-    def condense(self, x: wp.array[Any], shift: wp.array[Any], r: wp.array[Any], free: wp.array[Any], scale: float, turn: int) -> float:
+    def condense(
+        self,
+        x: wp.array[Any],
+        shift: wp.array[Any],
+        r: wp.array[Any],
+        free: wp.array[Any],
+        scale: float,
+        turn: int,
+    ) -> float:
         """Write Newton's system divided by q: (A + D) dx = -f / q with D = d p / q, q at least 1e-6; return the merit.
 
         Args:
@@ -217,12 +252,27 @@ class NonsmoothMap:
         """
         return self._half_sum(CONDENSE, x, self._system(shift, r, free, scale, turn))
 
-    def _system(self, D: wp.array[Any], r: wp.array[Any], free: wp.array[Any] | None, scale: float, turn: int) -> MapSystem:
+    def _system(
+        self,
+        D: wp.array[Any],
+        r: wp.array[Any],
+        free: wp.array[Any] | None,
+        scale: float,
+        turn: int,
+    ) -> MapSystem:
         seed = turn * self.problem.layout.size  # other random elements than in the last step
         self._numbers = replace(self._numbers, seed=seed)
         return MapSystem(D, r, free, scale, LEAST_Q, self._drops)
 
-    def step(self, x: wp.array[Any], e: wp.array[Any], length: float, finest: StencilLevel, scale: float, turn: int) -> float:
+    def step(
+        self,
+        x: wp.array[Any],
+        e: wp.array[Any],
+        length: float,
+        finest: StencilLevel,
+        scale: float,
+        turn: int,
+    ) -> float:
         """Move x by length e, set the residual's norm, and condense the next system there, for one CPU thread and no periodic axes.
 
         Args:
@@ -242,13 +292,28 @@ class NonsmoothMap:
         moving = MOVE.bind(stencil.rows, e=e, x=x, step=length) if length else None
         system = self._system(finest.stencil.d, finest.b, None, scale, turn)
         condensing = CONDENSE_AT_ROWS.bind(
-            stencil.rows, self._numbers, system, stencil=stencil, bounds=p.bounds.operands, x=x, b=p.b, unknown=p.unknown,
-            out=self._by_rows.partials, NATURAL=self._natural, UPPER=self._upper, PENALIZED=self._penalized, RANDOM=self._draws,
-        )  # fmt: skip
+            stencil.rows,
+            self._numbers,
+            system,
+            stencil=stencil,
+            bounds=p.bounds.operands,
+            x=x,
+            b=p.b,
+            unknown=p.unknown,
+            out=self._by_rows.partials,
+            NATURAL=self._natural,
+            UPPER=self._upper,
+            PENALIZED=self._penalized,
+            RANDOM=self._draws,
+        )
         STEP.launch(moving, condensing)
         self._by_rows.add_up(0, columns=3)
         square, merit, weighted = self._by_rows.scalars.numpy()
-        self.residual.norm, self.residual.current, self.norm = float(np.sqrt(square)), True, float(np.sqrt(weighted))
+        self.residual.norm, self.residual.current, self.norm = (
+            float(np.sqrt(square)),
+            True,
+            float(np.sqrt(weighted)),
+        )
         return 0.5 * float(merit) / scale**2
 
     def descend(self, x: wp.array[Any]) -> tuple[float, float]:
@@ -263,9 +328,18 @@ class NonsmoothMap:
         last, new, product, weights = self._gradients
         self._gradients = [new, last, product, weights]
         self._half_sum(WEIGHTED, x, MapWeights(new, weights))
-        shape = (p.layout.size,) if isinstance(p.layout, PaddedLayout) else p.layout.stored_shape  # grids take stored fields flat
+        # grids take stored fields flat
+        shape = (p.layout.size,) if isinstance(p.layout, PaddedLayout) else p.layout.stored_shape
         p.A.apply_transpose(weights.reshape(shape), product.reshape(shape))
-        square, inner = self._sums.of(GRADIENT, gradient=new, product=product, last=last, unknown=p.unknown, d=self._d, unit=self._unit)
+        square, inner = self._sums.of(
+            GRADIENT,
+            gradient=new,
+            product=product,
+            last=last,
+            unknown=p.unknown,
+            d=self._d,
+            unit=self._unit,
+        )
         return float(square), float(inner)
 
     @property
@@ -278,7 +352,8 @@ class NonsmoothMap:
         p, layout = self.problem, self.problem.layout
         along, product, by_x, by_y = (layout.zeros(wp.float64) for _ in range(4))
         convert(e, along)
-        shape = (layout.size,) if isinstance(layout, PaddedLayout) else layout.stored_shape  # grids take stored fields flat
+        # grids take stored fields flat
+        shape = (layout.size,) if isinstance(layout, PaddedLayout) else layout.stored_shape
         p.A.apply(along.reshape(shape), product.reshape(shape))
         self._half_sum(WEIGHTED, x, MapWeights(by_x, by_y))
         for slot, (weights, moved) in enumerate(((by_x, along), (by_y, product))):
@@ -296,22 +371,50 @@ class NonsmoothMap:
         p, inside = self.problem, self.problem.unknown.numpy() == 1
         merit = self.merit(x)
         self.descend(x)
-        at, step, lower, upper = (v.numpy()[inside] for v in (x, self.direction, *(p.bounds.as_field(k) for k in (0, 1))))
+        at, step, lower, upper = (
+            v.numpy()[inside] for v in (x, self.direction, *(p.bounds.as_field(k) for k in (0, 1)))
+        )
         d = np.abs(self._d.numpy()[inside].astype(np.float64) * self._unit)
         projected = np.where(d == 0, 1.0, d) * (at - np.clip(at - step, lower, upper))
         return float(np.linalg.norm(projected)) <= share * math.sqrt(2 * merit)
 
-    def advance(self, base: wp.array[Any], e: wp.array[Any], scale: float, x: wp.array[Any], *, projected: bool) -> None:
+    def advance(
+        self,
+        base: wp.array[Any],
+        e: wp.array[Any],
+        scale: float,
+        x: wp.array[Any],
+        *,
+        projected: bool,
+    ) -> None:
         """Set x = base + scale e, projected onto the bounds or not; base and x may be one field."""
         p = self.problem
         rows, bounds = self._sums.rows, p.bounds.operands
-        ADVANCE.bind(rows, bounds=bounds, base=base, e=e, unknown=p.unknown, x=x, scale=scale, projected=projected).launch()
+        ADVANCE.bind(
+            rows,
+            bounds=bounds,
+            base=base,
+            e=e,
+            unknown=p.unknown,
+            x=x,
+            scale=scale,
+            projected=projected,
+        ).launch()
 
-    def _half_sum(self, declared: RowPass, x: wp.array[Any], *more: MapSystem | MapWeights) -> float:
+    def _half_sum(
+        self, declared: RowPass, x: wp.array[Any], *more: MapSystem | MapWeights
+    ) -> float:
         sums = self._sums.of(
-            declared, self._numbers, self._fields(x), *more, bounds=self.problem.bounds.operands, NATURAL=self._natural,
-            UPPER=self._upper, PENALIZED=self._penalized, RANDOM=self._draws,
-        )  # fmt: skip
+            declared,
+            self._numbers,
+            self._fields(x),
+            *more,
+            bounds=self.problem.bounds.operands,
+            NATURAL=self._natural,
+            UPPER=self._upper,
+            PENALIZED=self._penalized,
+            RANDOM=self._draws,
+        )
         return 0.5 * float(sums[0])
 
     def _fields(self, x: wp.array[Any]) -> MapFields:
@@ -331,7 +434,15 @@ class FiniteDifferenceSystem(KrylovSystem):
         scaled: False: d = 1 in the map.
     """
 
-    def __init__(self, problem: LCP, residual: NaturalResidual, map: MapForm, share: float, *, scaled: bool = True) -> None:
+    def __init__(
+        self,
+        problem: LCP,
+        residual: NaturalResidual,
+        map: MapForm,
+        share: float,
+        *,
+        scaled: bool = True,
+    ) -> None:
         layout, self._problem, self._residual = problem.layout, problem, residual
         self.r, self.z, self._f, self._moved = (layout.zeros(wp.float64) for _ in range(4))
         self._map = NonsmoothMap(problem, residual, map, share, Kink.APPROXIMATION, scaled=scaled)
@@ -379,7 +490,15 @@ class HostMap:
         scaled: False: d = 1.
     """
 
-    def __init__(self, data: DenseProblem, share: float, kink: Kink, rng: np.random.Generator, *, scaled: bool = True) -> None:
+    def __init__(
+        self,
+        data: DenseProblem,
+        share: float,
+        kink: Kink,
+        rng: np.random.Generator,
+        *,
+        scaled: bool = True,
+    ) -> None:
         self.data, self.share, self.kink, self._rng = data, share, kink, rng
         d = np.abs(np.diag(data.A))
         self.d = np.where(d == 0, 1.0, d) if scaled else np.ones_like(d)
@@ -391,11 +510,16 @@ class HostMap:
         """Return f; smoothing mu > 0: of the smoothed map, with psi(a, b) = a + b - sqrt(a^2 + b^2 + 2 mu), without penalty."""
         return self._rows(x, y, smoothing)[0].copy()
 
-    def linearized(self, x: np.ndarray, y: np.ndarray | None = None, smoothing: float = 0.0) -> tuple[np.ndarray, ...]:
+    def linearized(
+        self, x: np.ndarray, y: np.ndarray | None = None, smoothing: float = 0.0
+    ) -> tuple[np.ndarray, ...]:
         """Return f, p and q of an element of the generalized Jacobian, and which rows are at a kink; y = A x + b unless given."""
         if self.kink is Kink.RANDOM:
             self._element = tuple(1 - np.sqrt(0.5) * self._rng.random(len(x)) for _ in range(2))
-        f, p, q, kinks = (field.copy() for field in self._rows(x, self.data.affine(x) if y is None else y, smoothing))
+        f, p, q, kinks = (
+            field.copy()
+            for field in self._rows(x, self.data.affine(x) if y is None else y, smoothing)
+        )
         return f, p, q, kinks != 0
 
     def jacobian(self, p: np.ndarray, q: np.ndarray) -> np.ndarray:
@@ -407,6 +531,12 @@ class HostMap:
         n, data = len(x), self.data
         reals = (x, y, self.d, data.lower, data.upper, *self._element)
         return HOST.run(
-            reals, (), tasks=n, count=n, share=1.0 if smoothing else self.share, over=1 / self.scale, kinks=KINK * self.scale,
+            reals,
+            (),
+            tasks=n,
+            count=n,
+            share=1.0 if smoothing else self.share,
+            over=1 / self.scale,
+            kinks=KINK * self.scale,
             twice_mu=2 * smoothing,
-        )[1]  # fmt: skip
+        )[1]

@@ -1,8 +1,9 @@
 """The system on the free unknowns that Newton-type methods share: (P A P + P D P) e = r with a free set P and a shift D >= 0.
 
-Grids take multigrid-preconditioned conjugate gradients, dense and narrow matrices a factorization, other sparse ones algebraic multigrid
-or incomplete factors, other operators Krylov methods preconditioned by the diagonal: conjugate gradients where A is symmetric, else GMRES.
-Where a problem brings a preconditioner, that is taken instead. Each kind of system is a file.
+Grids take multigrid-preconditioned conjugate gradients, dense and narrow matrices a factorization,
+other sparse ones algebraic multigrid or incomplete factors, other operators Krylov methods
+preconditioned by the diagonal: conjugate gradients where A is symmetric, else GMRES. Where a
+problem brings a preconditioner, that is taken instead. Each kind of system is a file.
 """
 
 from __future__ import annotations
@@ -32,8 +33,9 @@ from warp_lcp.reduced.sparse_system import SparseSystem
 class PrincipalSystem(Protocol):
     """The system on a free set.
 
-    A system made with `shifted=True` measures residuals as ||d^(-1/2) r||, d the diagonal of A + D, in `norm` and in `solve`: rows that
-    a large D makes stiff would else decide when to stop. Without it they are ||r||. Dense systems, solved directly, always take ||r||.
+    A system made with `shifted=True` measures residuals as ||d^(-1/2) r||, d the diagonal of A + D,
+    in `norm` and in `solve`: rows that a large D makes stiff would else decide when to stop.
+    Without it they are ||r||. Dense systems, solved directly, always take ||r||.
 
     Attributes:
         r: stored field; the right-hand side, zero off the free set, overwritten by `solve`.
@@ -57,9 +59,14 @@ class PrincipalSystem(Protocol):
 
 
 def principal_system(
-    problem: LCP, real: Any, *, bounded: bool, settings: CycleSettings | None = None, shifted: bool = False,
+    problem: LCP,
+    real: Any,
+    *,
+    bounded: bool,
+    settings: CycleSettings | None = None,
+    shifted: bool = False,
     hierarchy: Hierarchy | None = None,
-) -> PrincipalSystem:  # fmt: skip
+) -> PrincipalSystem:
     """Return the system for a problem's operator.
 
     Args:
@@ -76,7 +83,9 @@ def principal_system(
     if has(A, HasStencil):
         if needs_lines(A):
             return LineSystem(A, real, settings=settings, shifted=shifted)
-        return GridSystem(A, real, bounded=bounded, settings=settings, shifted=shifted, hierarchy=hierarchy)
+        return GridSystem(
+            A, real, bounded=bounded, settings=settings, shifted=shifted, hierarchy=hierarchy
+        )
     if isinstance(A, DenseOperator):
         return DenseSystem(A)
     if isinstance(A, SparseOperator):

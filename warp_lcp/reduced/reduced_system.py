@@ -29,7 +29,9 @@ class ReducedSystem(Protocol):
     def iterate(self) -> IterateMemory:
         """x, which `move` changes in place, its residual, and the best x so far."""
 
-    def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
+    def start(
+        self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
+    ) -> None:
         """Forget the last solve; the operator may have changed."""
 
     def monotone_cycle(self) -> Step | None:
@@ -50,12 +52,15 @@ class ReducedSystem(Protocol):
     def accept(self, iterations: int) -> Step:
         """Return the step that ends at x, with the linear iterations that it took."""
 
-    def fall_back(self, iterations: int, norms: deque[float], best: float, length: float) -> Step | ReducedSystem:
+    def fall_back(
+        self, iterations: int, norms: deque[float], best: float, length: float
+    ) -> Step | ReducedSystem:
         """Go on where `solve` finds no step, or the search no length; return the step taken, or a system that takes over.
 
         Args:
             iterations: linear iterations so far.
-            norms: last residual norms, whose maximum no length has kept to; to be cleared if no later step may undo this one.
+            norms: last residual norms, whose maximum no length has kept to; to be cleared if no
+                later step may undo this one.
             best: the smallest residual norm of the search, inf if there was none.
             length: where it was.
         """
@@ -69,7 +74,8 @@ def reduced_system(problem: LCP, settings: Any) -> ReducedSystem:
         settings: of Newton's method, a `MinimumMapNewton`.
 
     Raises:
-        ValueError: A is neither a grid operator, dense nor symmetric; or `direct`, and A is neither small nor narrow.
+        ValueError: A is neither a grid operator, dense nor symmetric; or `direct`, and A is neither
+            small nor narrow.
     """
     if settings.direct:
         return HostSystem(problem, settings)

@@ -16,7 +16,8 @@ class NewtonSettings(Settings):
     A method that needs other defaults declares the field again.
 
     Args:
-        precision: "mixed": iterate float64, corrections float32 on grids; "double"; or "single": the iterate rounded to float32 too.
+        precision: "mixed": iterate float64, corrections float32 on grids; "double"; or "single":
+            the iterate rounded to float32 too.
         monotone_cycles: projected multigrid cycles of a cold start on a grid.
         eta: each linear solve reduces its residual by this factor.
         max_linear_iterations: maximum number of iterations of one linear solve.

@@ -24,15 +24,20 @@ from warp_lcp.problem.protocol import FLUID, HasStencil
 from warp_lcp.rows.fields import zeros, zeros_like
 from warp_lcp.rows.program import Launch, launch_now
 
-# symmetric matrices far from M-matrices: on plates of 60^2 and 120^2 0.55 times the iterations of the usual settings, .8 on elastic blocks
+# symmetric matrices far from M-matrices: on plates of 60^2 and 120^2 0.55 times the iterations of
+# the usual settings, .8 on elastic blocks
 FAR_FROM_M = partial(AlgebraicSettings, strength=0.08, interval=(0.05, 1.0))
-DROP, FILL = 1e-4, 10.0  # share of a column below which entries of the factors go, and the most of them in units of A's
-NUDGE, GOLDEN = 1e-14, (math.sqrt(5) - 1) / 2  # share of a row's largest entry; its multiples modulo 1 are all different
-DIRECT = 2000  # unknowns up to which factors are complete: that costs less than the iterations it saves
+# share of a column below which entries of the factors go, and the most of them in units of A's
+DROP, FILL = 1e-4, 10.0
+# share of a row's largest entry; its multiples modulo 1 are all different
+NUDGE, GOLDEN = 1e-14, (math.sqrt(5) - 1) / 2
+# unknowns up to which factors are complete: that costs less than the iterations it saves
+DIRECT = 2000
 # unknowns of a grid up to which factors are complete where cycles fail: a second or two
 FACTORED_IN_PLANE, FACTORED_IN_SPACE = 1 << 17, 1 << 14
 RAISED = 1e-13  # share by which diagonals are raised then
-REDUCED = 1e-2  # of a right-hand side: what any preconditioner worth its name comes to, whatever rounding leaves
+# of a right-hand side: what any preconditioner worth its name comes to, whatever rounding leaves
+REDUCED = 1e-2
 ENOUGH = 60  # iterations by which it should
 
 
@@ -42,20 +47,23 @@ class Substitute(Protocol):
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None) -> None:
         """Take another free set and shift."""
 
-    def solve_for(self, r: wp.array[Any], e: wp.array[Any], tolerance: float, max_iterations: int) -> tuple[int, float]:
+    def solve_for(
+        self, r: wp.array[Any], e: wp.array[Any], tolerance: float, max_iterations: int
+    ) -> tuple[int, float]:
         """Solve for e; return iterations and the norm reached."""
 
 
 class GuardedSystem(KrylovSystem):
     """A Krylov method with a preconditioner, and where that fails by another system.
 
-    A preconditioner fails if its solve stalls, or is cut off after `ENOUGH` iterations, before the residual is at the tolerance or
-    `REDUCED`. What takes over stays until the operator changes.
+    A preconditioner fails if its solve stalls, or is cut off after `ENOUGH` iterations, before the
+    residual is at the tolerance or `REDUCED`. What takes over stays until the operator changes.
     """
 
     _substitute: Substitute | None = None
     _make_substitute: Callable[[], Substitute] | None = None  # None: nothing takes over
-    _restriction: tuple[wp.array[Any], wp.array[Any] | None] | None = None  # the free set and the shift there are
+    # the free set and the shift there are
+    _restriction: tuple[wp.array[Any], wp.array[Any] | None] | None = None
 
     def _guard(self, substitute: Callable[[], Substitute]) -> None:
         """Take over where needed, from now on, by a system that is made then."""
@@ -99,26 +107,35 @@ class SparsePreconditioner(Preconditioner, Protocol):
 class SparseSystem(GuardedSystem):
     """(P A P + P D P) e = r with a sparse A.
 
-    Symmetric matrices whose diagonal is not negative take conjugate gradients with algebraic multigrid, which falls back on sweeps where
-    nothing aggregates. Others take GMRES: with algebraic multigrid if most rows are diagonally dominant and nearly all off-diagonal
-    entries negative (convection-diffusion), else with incomplete factors that SciPy makes anew and applies, on the host for any device.
-    On directed cycles, I - S with S nearly a permutation, multigrid fails, and factors take over.
+    Symmetric matrices whose diagonal is not negative take conjugate gradients with algebraic
+    multigrid, which falls back on sweeps where nothing aggregates. Others take GMRES: with
+    algebraic multigrid if most rows are diagonally dominant and nearly all off-diagonal entries
+    negative (convection-diffusion), else with incomplete factors that SciPy makes anew and applies,
+    on the host for any device. On directed cycles, I - S with S nearly a permutation, multigrid
+    fails, and factors take over.
 
     Args:
         A: the matrix.
         real: type of the corrections.
         shifted: as of `PrincipalSystem`.
         settings: of the hierarchy.
-        substitute: makes what takes over where the hierarchy fails; None: factors, if A is not symmetric.
+        substitute: makes what takes over where the hierarchy fails; None: factors, if A is not
+            symmetric.
 
     Attributes:
-        cycled: whether the preconditioner is algebraic multigrid: A is symmetric, or nearly an M-matrix.
+        cycled: whether the preconditioner is algebraic multigrid: A is symmetric, or nearly an
+            M-matrix.
     """
 
     def __init__(
-        self, A: SparseOperator, real: Any, *, shifted: bool = False, settings: AlgebraicSettings | None = None,
+        self,
+        A: SparseOperator,
+        real: Any,
+        *,
+        shifted: bool = False,
+        settings: AlgebraicSettings | None = None,
         substitute: Callable[[], FactoredSystem] | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         host = A.matrix()
         self._A, self._version, self._symmetric = A, A.version, A.symmetric
         positive = bool((host.diagonal() >= 0).all())
@@ -143,12 +160,15 @@ class SparseSystem(GuardedSystem):
         """Choose again where an update of A has changed whether it is symmetric; `restrict` takes the entries.
 
         Raises:
-            ValueError: A was symmetric and is not any more: this system's fields serve conjugate gradients.
+            ValueError: A was symmetric and is not any more: this system's fields serve conjugate
+                gradients.
         """
         if self._version != self._A.version:
             self._version, self._substitute = self._A.version, None
             if self._symmetric and not self._A.symmetric:
-                raise ValueError("A was updated from a symmetric to an unsymmetric matrix: make a new workspace")
+                raise ValueError(
+                    "A was updated from a symmetric to an unsymmetric matrix: make a new workspace"
+                )
 
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
         """Take another free set and shift, and compute the preconditioner anew."""
@@ -180,9 +200,14 @@ class IncompleteFactors:
         mask = scipy.sparse.diags_array((free.numpy() != 0).astype(np.float64))
         self._M = (mask @ matrix @ mask).tocsr()
         diagonal = np.abs(self._M.diagonal())
-        with np.errstate(over="ignore"):  # of a tiny entry in float32: the method sees that its iterate is not finite
-            self.weight.assign(np.where(free.numpy() != 0, 1 / np.where(diagonal > 0, diagonal, 1.0), 0.0))
-        self._solve = self._factor(matrix[self._free][:, self._free].tocsc()) if self._free.size else None
+        # of a tiny entry in float32: the method sees that its iterate is not finite
+        with np.errstate(over="ignore"):
+            self.weight.assign(
+                np.where(free.numpy() != 0, 1 / np.where(diagonal > 0, diagonal, 1.0), 0.0)
+            )
+        self._solve = (
+            self._factor(matrix[self._free][:, self._free].tocsc()) if self._free.size else None
+        )
 
     def product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = launch_now) -> None:
         """q = M p, on the host."""
@@ -201,7 +226,9 @@ class IncompleteFactors:
         try:
             if block.shape[0] <= DIRECT:
                 return scipy.sparse.linalg.splu(nudged(block, NUDGE)).solve
-            return scipy.sparse.linalg.spilu(nudged(block, NUDGE, small=100 * DROP), drop_tol=DROP, fill_factor=FILL).solve
+            return scipy.sparse.linalg.spilu(
+                nudged(block, NUDGE, small=100 * DROP), drop_tol=DROP, fill_factor=FILL
+            ).solve
         except RuntimeError:  # a factor is exactly singular after all
             return np.asarray
 
@@ -209,13 +236,15 @@ class IncompleteFactors:
 def nudged(block: Any, share: float, *, small: float = 0.0) -> Any:
     """Return a block without exactly singular factors: SuperLU, given those, writes to stderr, and may crash the process.
 
-    A strictly diagonally dominant block is regular and stays as it is. Of others the diagonal grows by a share of each row's largest entry,
-    another one in each row, so that no two rows become alike.
+    A strictly diagonally dominant block is regular and stays as it is. Of others the diagonal grows
+    by a share of each row's largest entry, another one in each row, so that no two rows become
+    alike.
 
     Args:
         block: square, in compressed columns.
         share: of a row's largest entry.
-        small: the share where the diagonal entry itself is less than that: incomplete factors drop smaller ones.
+        small: the share where the diagonal entry itself is less than that: incomplete factors drop
+            smaller ones.
     """
     magnitude, diagonal = abs(block), block.diagonal()
     off = np.asarray(magnitude.sum(axis=1)).ravel() - np.abs(diagonal)
@@ -223,8 +252,12 @@ def nudged(block: Any, share: float, *, small: float = 0.0) -> Any:
         return block
     largest = magnitude.max(axis=1).toarray().ravel()
     largest = np.where(largest > 0, largest, 1.0)
-    shares = np.where(np.abs(diagonal) <= small * largest, max(share, small), share) * (1 + np.arange(len(off)) * GOLDEN % 1)
-    return (block + scipy.sparse.diags_array(np.where(diagonal < 0, -1.0, 1.0) * shares * largest)).tocsc()
+    shares = np.where(np.abs(diagonal) <= small * largest, max(share, small), share) * (
+        1 + np.arange(len(off)) * GOLDEN % 1
+    )
+    return (
+        block + scipy.sparse.diags_array(np.where(diagonal < 0, -1.0, 1.0) * shares * largest)
+    ).tocsc()
 
 
 class CompleteFactors(IncompleteFactors):
@@ -232,7 +265,9 @@ class CompleteFactors(IncompleteFactors):
 
     def _factor(self, block: Any) -> Any:
         try:
-            return scipy.sparse.linalg.splu((block + RAISED * scipy.sparse.diags_array(np.abs(block.diagonal()))).tocsc()).solve
+            return scipy.sparse.linalg.splu(
+                (block + RAISED * scipy.sparse.diags_array(np.abs(block.diagonal()))).tocsc()
+            ).solve
         except RuntimeError:
             return super()._factor(block)
 
@@ -259,7 +294,9 @@ class FactoredSystem(KrylovSystem):
         """Take another free set and shift, and factor."""
         self._factors.restrict(free, shift)
 
-    def solve_for(self, r: wp.array[Any], e: wp.array[Any], tolerance: float, max_iterations: int) -> tuple[int, float]:
+    def solve_for(
+        self, r: wp.array[Any], e: wp.array[Any], tolerance: float, max_iterations: int
+    ) -> tuple[int, float]:
         """Solve for e, a field like r of any precision."""
         self.r.assign(r.numpy().astype(np.float64))
         iterations, norm = self.solve(tolerance, max_iterations)
@@ -280,15 +317,25 @@ class MatrixSystem:
         most = FACTORED_IN_SPACE if A.stencil.padding.counts[0] > 1 else FACTORED_IN_PLANE
         self._operator = SparseOperator(grid_matrix(A), device=A.device, dtype=wp.float64)
         factored = partial(FactoredSystem.of, self._operator, weighted=shifted, complete=most)
-        self._system = SparseSystem(self._operator, wp.float64, shifted=shifted, substitute=factored)
+        self._system = SparseSystem(
+            self._operator, wp.float64, shifted=shifted, substitute=factored
+        )
 
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None) -> None:
         """Take another free set and shift, stored fields of the grid."""
         device = self._operator.device
-        of_rows = None if shift is None else wp.array(shift.numpy()[self._rows], dtype=wp.float64, device=device)
-        self._system.restrict(wp.array(free.numpy()[self._rows], dtype=wp.uint8, device=device), of_rows)
+        of_rows = (
+            None
+            if shift is None
+            else wp.array(shift.numpy()[self._rows], dtype=wp.float64, device=device)
+        )
+        self._system.restrict(
+            wp.array(free.numpy()[self._rows], dtype=wp.uint8, device=device), of_rows
+        )
 
-    def solve_for(self, r: wp.array[Any], e: wp.array[Any], tolerance: float, max_iterations: int) -> tuple[int, float]:
+    def solve_for(
+        self, r: wp.array[Any], e: wp.array[Any], tolerance: float, max_iterations: int
+    ) -> tuple[int, float]:
         """Solve for e; fields of the grid."""
         self._system.r.assign(r.numpy()[self._rows].astype(np.float64))
         iterations, norm = self._system.solve(tolerance, max_iterations)

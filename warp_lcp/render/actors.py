@@ -14,22 +14,42 @@ from warp_lcp.render.sunlight import LIGHT
 from warp_lcp.scene.camera import THREE_QUARTERS
 from warp_lcp.simulation import Surface
 
-BODY_COLORS = ["#e07a3f", "#d9b23c", "#7fa650", "#b9586b", "#8d6fb0", "#4d9a94", "#c98f63", "#6f7f95"]
+BODY_COLORS = [
+    "#e07a3f",
+    "#d9b23c",
+    "#7fa650",
+    "#b9586b",
+    "#8d6fb0",
+    "#4d9a94",
+    "#c98f63",
+    "#6f7f95",
+]
 BODY_EDGE = "#4a3b33"
 LIGHTER = 0.5  # of the way to white: every other eighth of a ball
 BOX_POINTS = 8
 ROUND = 1e-3  # how much the distances from the middle of what is round may differ, relative
 SURFACES: dict[str, dict[str, Any]] = {  # in 3-D, by `Scene.palette`
-    "water": {"color": "#4aa9ee", "opacity": 0.5, "specular": 0.8, "specular_power": 30.0, "ambient": 0.3, "diffuse": 1.0},
+    "water": {
+        "color": "#4aa9ee",
+        "opacity": 0.5,
+        "specular": 0.8,
+        "specular_power": 30.0,
+        "ambient": 0.3,
+        "diffuse": 1.0,
+    },
     "sand": {"color": "#c9a15f", "specular": 0.0, "ambient": 0.4},
 }
-FILLS = {"water": ["#1254a2", "#78c4ee"], "sand": ["#aa7c46", "#deb87a"]}  # in 2-D, at the domain's bottom and at its top
+# in 2-D, at the domain's bottom and at its top
+FILLS = {"water": ["#1254a2", "#78c4ee"], "sand": ["#aa7c46", "#deb87a"]}
 OUTLINES = {"water": "#0c3e80", "sand": "#78522a"}
 
-SHADES = {"water": np.array([1.4, 1.0, 0.7]), "sand": np.array([1.1, 1.3, 1.5])}  # shadows of water are blue, of sand brown
+# shadows of water are blue, of sand brown
+SHADES = {"water": np.array([1.4, 1.0, 0.7]), "sand": np.array([1.1, 1.3, 1.5])}
 SHEENS = {"water": 0.35, "sand": 0.0}  # how bright the lamp's mirror image is: sand has none
-GLINT = (LIGHT + THREE_QUARTERS) / np.linalg.norm(LIGHT + THREE_QUARTERS)  # the normal that mirrors the light into the camera
-HIDDEN_SLOPE, HIDDEN_DENSITY = 0.6, 6.0  # of the density in particles a cell: flatter and denser is deeper inside than two cells
+# the normal that mirrors the light into the camera
+GLINT = (LIGHT + THREE_QUARTERS) / np.linalg.norm(LIGHT + THREE_QUARTERS)
+# of the density in particles a cell: flatter and denser is deeper inside than two cells
+HIDDEN_SLOPE, HIDDEN_DENSITY = 0.6, 6.0
 SHADING_CELLS = 4e6  # of the density that shades a liquid, to bound its memory
 
 FLUSH = 1e-5  # of the domain's longest side: how far from a side a point on it may lie
@@ -51,12 +71,21 @@ class Actors:
         drawn = [(mesh, looks) for mesh, looks in meshes if mesh.n_points]
         self._counts[group] = len(drawn)
         return [
-            self.plotter.add_mesh(mesh, name=f"{group} {number}", reset_camera=False, render=False, show_scalar_bar=False, **looks)
+            self.plotter.add_mesh(
+                mesh,
+                name=f"{group} {number}",
+                reset_camera=False,
+                render=False,
+                show_scalar_bar=False,
+                **looks,
+            )
             for number, (mesh, looks) in enumerate(drawn)
         ]
 
 
-def surface_meshes(surface: Surface, palette: str, size: Sequence[float], line_width: float) -> list[Drawn]:
+def surface_meshes(
+    surface: Surface, palette: str, size: Sequence[float], line_width: float
+) -> list[Drawn]:
     """Return the surface of a material, the part on each of the domain's sides by itself.
 
     In 2-D it is the inside, deeper in color toward the bottom, and the outline, behind the solids.
@@ -73,8 +102,12 @@ def surface_meshes(surface: Surface, palette: str, size: Sequence[float], line_w
         ends = np.abs(surface.points - np.stack([np.zeros(3), size])[:, None]) < FLUSH * max(size)
         on_side = ends[:, surface.corners].all(axis=2).transpose(1, 0, 2).reshape(-1, 6)
         side = np.where(on_side.any(axis=1), on_side.argmax(axis=1), 6)
-        parts = [surface.corners[side == number] for number in np.unique(side)]  # each with its own normals: their edges are sharp
-        return [(poly_data(surface.points, part), {"smooth_shading": True, **SURFACES[palette]}) for part in parts]
+        # each with its own normals: their edges are sharp
+        parts = [surface.corners[side == number] for number in np.unique(side)]
+        return [
+            (poly_data(surface.points, part), {"smooth_shading": True, **SURFACES[palette]})
+            for part in parts
+        ]
     mesh = poly_data(surface.points, surface.corners)
     from matplotlib.colors import LinearSegmentedColormap
 
@@ -82,12 +115,22 @@ def surface_meshes(surface: Surface, palette: str, size: Sequence[float], line_w
     outline = mesh.clean()
     inside = outline.triangulate_contours()
     colors = LinearSegmentedColormap.from_list(palette, FILLS[palette])
-    depth = {"scalars": inside.points[:, 1], "cmap": colors, "clim": [0.0, size[1]], "lighting": False}
+    depth = {
+        "scalars": inside.points[:, 1],
+        "cmap": colors,
+        "clim": [0.0, size[1]],
+        "lighting": False,
+    }
     line = {"color": OUTLINES[palette], "line_width": line_width, "lighting": False}
-    return [(inside.translate((0.0, 0.0, behind)), depth), (outline.translate((0.0, 0.0, 0.95 * behind)), line)]
+    return [
+        (inside.translate((0.0, 0.0, behind)), depth),
+        (outline.translate((0.0, 0.0, 0.95 * behind)), line),
+    ]
 
 
-def body_meshes(bodies: Surface | None, at_first: Surface | None, line_width: float, front: float) -> list[Drawn]:
+def body_meshes(
+    bodies: Surface | None, at_first: Surface | None, line_width: float, front: float
+) -> list[Drawn]:
     """Return rigid bodies where they are, each in a color of its own.
 
     Args:
@@ -109,28 +152,52 @@ def body_meshes(bodies: Surface | None, at_first: Surface | None, line_width: fl
     return meshes
 
 
-def _solid_body(points: np.ndarray, corners: np.ndarray, color: str, at_first: Surface | None) -> Drawn:
+def _solid_body(
+    points: np.ndarray, corners: np.ndarray, color: str, at_first: Surface | None
+) -> Drawn:
     """Return a body; a ball in eighths of two shades, which show how it turns."""
     from matplotlib.colors import to_hex, to_rgb
 
     mesh = poly_data(points, corners)
-    looks: dict[str, Any] = {"smooth_shading": True, "ambient": 0.45, "specular": 0.25, "specular_power": 30.0}
+    looks: dict[str, Any] = {
+        "smooth_shading": True,
+        "ambient": 0.45,
+        "specular": 0.25,
+        "specular_power": 30.0,
+    }
     if at_first is None or len(at_first.points) != len(points) or not is_round(points, corners):
         return mesh, {"color": color, "split_sharp_edges": True, **looks}
     own = at_first.points[np.unique(corners)]
-    side = np.prod(own - 0.5 * (own.min(axis=0) + own.max(axis=0)), axis=1)  # changes its sign between eighths
+    # changes its sign between eighths
+    side = np.prod(own - 0.5 * (own.min(axis=0) + own.max(axis=0)), axis=1)
     pale = to_hex(LIGHTER + (1.0 - LIGHTER) * np.array(to_rgb(color)))
-    return mesh, {"scalars": side, "cmap": [color, pale], "n_colors": 2, "clim": np.abs(side).max() * np.array([-1.0, 1.0]), **looks}
+    return mesh, {
+        "scalars": side,
+        "cmap": [color, pale],
+        "n_colors": 2,
+        "clim": np.abs(side).max() * np.array([-1.0, 1.0]),
+        **looks,
+    }
 
 
-def _flat_body(points: np.ndarray, corners: np.ndarray, color: str, line_width: float, front: float) -> list[Drawn]:
+def _flat_body(
+    points: np.ndarray, corners: np.ndarray, color: str, line_width: float, front: float
+) -> list[Drawn]:
     """Return the inside and the outline of a body, a little before the particles and the walls."""
     outline = poly_data(points, corners).clean()
     inside = outline.triangulate_contours().translate((0.0, 0.0, front))
     if is_round(points, corners):  # a radius, which shows how the disc turns
-        outline = outline.merge(poly_data(np.stack([points[corners[:, 0]].mean(axis=0), points[corners[0, 0]]]), np.array([[0, 1]])))
+        outline = outline.merge(
+            poly_data(
+                np.stack([points[corners[:, 0]].mean(axis=0), points[corners[0, 0]]]),
+                np.array([[0, 1]]),
+            )
+        )
     line = {"color": BODY_EDGE, "line_width": line_width, "lighting": False}
-    return [(inside, {"color": color, "lighting": False}), (outline.translate((0.0, 0.0, 1.2 * front)), line)]
+    return [
+        (inside, {"color": color, "lighting": False}),
+        (outline.translate((0.0, 0.0, 1.2 * front)), line),
+    ]
 
 
 def poly_data(points: np.ndarray, corners: np.ndarray) -> Any:
@@ -141,7 +208,9 @@ def poly_data(points: np.ndarray, corners: np.ndarray) -> Any:
     own = own.reshape(corners.shape)
     if corners.shape[1] == 3:
         return pyvista.PolyData.from_regular_faces(points[used], own)
-    return pyvista.PolyData(points[used], lines=np.column_stack([np.full(len(own), 2), own]).ravel())
+    return pyvista.PolyData(
+        points[used], lines=np.column_stack([np.full(len(own), 2), own]).ravel()
+    )
 
 
 def is_round(points: np.ndarray, corners: np.ndarray) -> bool:
@@ -151,7 +220,9 @@ def is_round(points: np.ndarray, corners: np.ndarray) -> bool:
     return len(own) > BOX_POINTS and bool(np.ptp(distance) < ROUND * distance.max())
 
 
-def shaded(points: np.ndarray, colors: np.ndarray, spacing: float, palette: str) -> tuple[np.ndarray, np.ndarray]:
+def shaded(
+    points: np.ndarray, colors: np.ndarray, spacing: float, palette: str
+) -> tuple[np.ndarray, np.ndarray]:
     """Light particles as the smooth surface of the liquid that they make up, whose normals point down the gradient of their density.
 
     Particles inside the liquid, and single drops, keep their color.
@@ -163,15 +234,21 @@ def shaded(points: np.ndarray, colors: np.ndarray, spacing: float, palette: str)
         palette: of the material, a key of SHADES.
 
     Returns:
-        Colors as `colors`, and which particles are not hidden deep inside by the others, shape (n,).
+        Colors as `colors`, and which particles are not hidden deep inside by the others, shape
+        (n,).
     """
     low, extent = points.min(axis=0), np.ptp(points, axis=0)
     spacing = max(spacing, (float(np.prod(extent + 6 * spacing)) / SHADING_CELLS) ** (1 / 3))
-    at = (points - low) / spacing + 3.25  # a lattice of two particles a cell then lies well inside the bins
-    density, _ = np.histogramdd(at, bins=[range(math.ceil(side) + 1) for side in at.max(axis=0) + 3.0])
+    # a lattice of two particles a cell then lies well inside the bins
+    at = (points - low) / spacing + 3.25
+    density, _ = np.histogramdd(
+        at, bins=[range(math.ceil(side) + 1) for side in at.max(axis=0) + 3.0]
+    )
     density = gaussian_filter(np.minimum(density, 8.0), 1.2)
     slopes = np.gradient(density)
-    slope = np.stack([map_coordinates(-component, at.T - 0.5, order=1) for component in slopes], axis=-1)
+    slope = np.stack(
+        [map_coordinates(-component, at.T - 0.5, order=1) for component in slopes], axis=-1
+    )
     steepness = np.linalg.norm(slope, axis=1, keepdims=True)
     normal = slope / np.maximum(steepness, 1e-9)
     flatness = np.clip(steepness / 0.8, 0.0, 1.0)  # 0 inside and for drops, 1 at a surface
@@ -179,5 +256,7 @@ def shaded(points: np.ndarray, colors: np.ndarray, spacing: float, palette: str)
     light = 0.72 + 0.22 * facing + 0.14 * np.maximum(facing, 0.0)
     glint = SHEENS[palette] * np.maximum(normal @ GLINT, 0.0)[:, None] ** 40
     lit = np.clip(colors * (1.0 - flatness * SHADES[palette] * (1.0 - light)), 0.0, 255.0)
-    outer = (steepness[:, 0] > HIDDEN_SLOPE) | (map_coordinates(density, at.T - 0.5, order=1) < HIDDEN_DENSITY)
+    outer = (steepness[:, 0] > HIDDEN_SLOPE) | (
+        map_coordinates(density, at.T - 0.5, order=1) < HIDDEN_DENSITY
+    )
     return lit + flatness * glint * (255.0 - lit), outer

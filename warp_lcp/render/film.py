@@ -18,10 +18,19 @@ INSTALL_ENCODER = "pip install 'imageio-ffmpeg>=0.6'"
 SLOWEST, FASTEST = 0.1, 240.0  # frames a second of a film
 GIF_FASTEST = 50.0  # frames a second: viewers slow down what changes every hundredth of a second
 QUALITY = "18"  # of x264, from 0 (no loss) to 51: flat colors and thin lines stay clean
-OWN_COLORS = "split[a][b];[a]palettegen=stats_mode=single[p];[b][p]paletteuse=new=1:dither=none"  # for each image of a GIF
+# for each image of a GIF
+OWN_COLORS = "split[a][b];[a]palettegen=stats_mode=single[p];[b][p]paletteuse=new=1:dither=none"
 ENCODERS: dict[str, dict[str, Any]] = {  # H.264 in MP4; a GIF repeats for ever
-    ".mp4": {"codec": "libx264", "pix_fmt_out": "yuv420p", "output_params": ["-crf", QUALITY, "-movflags", "+faststart", "-f", "mp4"]},
-    ".gif": {"codec": "gif", "pix_fmt_out": "pal8", "output_params": ["-filter_complex", OWN_COLORS, "-loop", "0", "-f", "gif"]},
+    ".mp4": {
+        "codec": "libx264",
+        "pix_fmt_out": "yuv420p",
+        "output_params": ["-crf", QUALITY, "-movflags", "+faststart", "-f", "mp4"],
+    },
+    ".gif": {
+        "codec": "gif",
+        "pix_fmt_out": "pal8",
+        "output_params": ["-filter_complex", OWN_COLORS, "-loop", "0", "-f", "gif"],
+    },
 }
 
 
@@ -29,7 +38,8 @@ class Film:
     """A film in the making; its file appears when the `with` block ends without an error.
 
     Args:
-        file: of the film, `.mp4` or `.gif`; a GIF leaves images out whose rate is above what viewers play.
+        file: of the film, `.mp4` or `.gif`; a GIF leaves images out whose rate is above what
+            viewers play.
         size: width and height of its images [pixels].
         rate: frames a second [1/s].
 
@@ -39,7 +49,9 @@ class Film:
 
     def __init__(self, file: Path, size: tuple[int, int], rate: float) -> None:
         self.file, self.size, self.suffix = file, size, film_suffix(file)
-        self._every = max(1, math.ceil(rate / GIF_FASTEST * (1.0 - 1e-9))) if self.suffix == ".gif" else 1
+        self._every = (
+            max(1, math.ceil(rate / GIF_FASTEST * (1.0 - 1e-9))) if self.suffix == ".gif" else 1
+        )
         self._rate, self._offered = rate / self._every, 0
 
     def add(self, draw: Callable[[], np.ndarray]) -> None:
@@ -52,7 +64,11 @@ class Film:
         if (self._offered - 1) % self._every:
             return
         pixels = np.asarray(draw())
-        padding = [(0, self._even[1] - pixels.shape[0]), (0, self._even[0] - pixels.shape[1]), (0, 0)]
+        padding = [
+            (0, self._even[1] - pixels.shape[0]),
+            (0, self._even[0] - pixels.shape[1]),
+            (0, 0),
+        ]
         try:
             self._writer.send(np.ascontiguousarray(np.pad(pixels, padding, mode="edge")))
         except OSError as error:
@@ -73,7 +89,12 @@ class Film:
             self._stack = stack.pop_all()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
         """Bring the film to disk, or leave nothing of it."""
         try:
             self._stack.__exit__(kind, error, trace)
@@ -85,16 +106,27 @@ class Film:
         try:
             import imageio_ffmpeg
         except ImportError as error:
-            raise RenderError(f"a film needs imageio-ffmpeg, which cannot be loaded ({error}): {INSTALL_ENCODER}") from error
+            raise RenderError(
+                f"a film needs imageio-ffmpeg, which cannot be loaded ({error}): {INSTALL_ENCODER}"
+            ) from error
         width, height = self.size
         whole = 2 if self.suffix == ".mp4" else 1  # its chroma has half the resolution
         self._even = width + -width % whole, height + -height % whole
         return imageio_ffmpeg.write_frames(
-            str(temporary), self._even, fps=self._rate, macro_block_size=1, quality=None, ffmpeg_log_level="error", **ENCODERS[self.suffix]
+            str(temporary),
+            self._even,
+            fps=self._rate,
+            macro_block_size=1,
+            quality=None,
+            ffmpeg_log_level="error",
+            **ENCODERS[self.suffix],
         )
 
     def _failure(self, error: OSError) -> RenderError:
-        return RenderError(f"{self.file}: cannot be written: {error.strerror or str(error).strip().splitlines()[-1]}")
+        return RenderError(
+            f"{self.file}: cannot be written: "
+            f"{error.strerror or str(error).strip().splitlines()[-1]}"
+        )
 
 
 def film_suffix(file: Path) -> str:

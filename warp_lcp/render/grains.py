@@ -8,14 +8,17 @@ import numpy as np
 
 GRAINS = 250_000  # in an image, at the most about
 A_PARTICLE = 6  # grains, where there are not that many particles
-SIZES = {2: 1.2, 3: 0.62}  # radius of one alone in its particle's room, over the distance of particles: nothing shows through
+# radius of one alone in its particle's room, over the distance of particles: nothing shows through
+SIZES = {2: 1.2, 3: 0.62}
 APART = 0.7  # from its particle, over the distance of particles, along each axis at the most
 VARIETY = 0.16  # of a grain's brightness, either way
 PATTERNS = 4096
 PATTERN = np.random.default_rng(2281).uniform(-1.0, 1.0, (PATTERNS, A_PARTICLE, 4))
 
 
-def grains(points: np.ndarray, colors: np.ndarray, spacing: float, size: Sequence[float]) -> tuple[np.ndarray, np.ndarray, float]:
+def grains(
+    points: np.ndarray, colors: np.ndarray, spacing: float, size: Sequence[float]
+) -> tuple[np.ndarray, np.ndarray, float]:
     """Return grains in place of particles.
 
     Args:
@@ -32,11 +35,13 @@ def grains(points: np.ndarray, colors: np.ndarray, spacing: float, size: Sequenc
     return at.reshape(-1, 3), np.clip(shades, 0.0, 255.0).reshape(-1, 3), radius
 
 
-def placed_grains(points: np.ndarray, spacing: float, size: Sequence[float]) -> tuple[np.ndarray, np.ndarray, float]:
+def placed_grains(
+    points: np.ndarray, spacing: float, size: Sequence[float]
+) -> tuple[np.ndarray, np.ndarray, float]:
     """Return the grains of particles: points [m], shape (n, k, 3), numbers in `PATTERN`, shape (n, k), and radius [m].
 
-    The offsets of grains depend on the position of the particle, not on its number. Runs reorder particles, and sand at rest
-    must not flicker.
+    The offsets of grains depend on the position of the particle, not on its number. Runs reorder
+    particles, and sand at rest must not flicker.
 
     Args:
         points: of the particles [m], shape (n, 3).
@@ -50,5 +55,7 @@ def placed_grains(points: np.ndarray, spacing: float, size: Sequence[float]) -> 
     number = A_PARTICLE * (where % PATTERNS)[:, None] + np.arange(count)
     at = np.repeat(points[:, None], count, axis=1)
     at[..., :dimension] += APART * spacing * PATTERN.reshape(-1, 4)[number, :dimension]
-    at[..., :dimension] = np.clip(at[..., :dimension], radius, np.maximum(np.array(size) - radius, radius))
+    at[..., :dimension] = np.clip(
+        at[..., :dimension], radius, np.maximum(np.array(size) - radius, radius)
+    )
     return at, number, radius

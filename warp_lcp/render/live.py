@@ -32,15 +32,21 @@ from warp_lcp.simulation import InputError
 
 LOOPBACK = "127.0.0.1"
 PORT = 8765  # unless told
-HOST = re.compile(r"(?:127\.0\.0\.1|localhost)(?::\d{1,5})?")  # that a browser may have asked for, at a port that may be forwarded here:
+# that a browser may have asked for, at a port that may be forwarded here:
+HOST = re.compile(r"(?:127\.0\.0\.1|localhost)(?::\d{1,5})?")
 # refuse other host names that resolve to this machine (DNS rebinding)
 PATIENCE = 10.0  # seconds without a byte after which a connection is closed
 MOST_CONNECTIONS = 16  # of which the oldest gives way to a new one, and
-MOST_ANSWERED = 64  # requests at a time, those of connections that are gone included; more are turned away
+# requests at a time, those of connections that are gone included; more are turned away
+MOST_ANSWERED = 64
 SHORTAGE = 0.2  # seconds
 MOST_POINTS = 300_000  # of a frame's particles; of more every second, third ... goes to the page
-SOLID_POINTS = {2: 512, 3: 96}  # along the longest side of the lattice whose points near a solid's surface are drawn
-SAFE = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; connect-src 'self'; img-src data:"
+# along the longest side of the lattice whose points near a solid's surface are drawn
+SOLID_POINTS = {2: 512, 3: 96}
+SAFE = (
+    "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; connect-src "
+    "'self'; img-src data:"
+)
 
 
 class QueryError(ValueError):
@@ -66,13 +72,18 @@ class Live:
     def _recording(self) -> Recording:
         recording = Recording(self.folder, show=self.show)
         output, liquid = recording.scene.output, recording.scene.palette != "sand"
-        late = self.show is None and liquid and getattr(output, "surface", False)  # a frame's surface comes after its particles
+        # a frame's surface comes after its particles
+        late = self.show is None and liquid and getattr(output, "surface", False)
         return Recording(self.folder, show=Show.SURFACE) if late else recording
 
     def state(self) -> dict[str, Any]:
         """Return what there is: the numbers of the frames and, once there is one, what the page needs to draw them."""
         record = read_record(self.folder)
-        state: dict[str, Any] = {"status": record.get("status", "not begun"), "reason": record.get("reason", ""), "frames": []}
+        state: dict[str, Any] = {
+            "status": record.get("status", "not begun"),
+            "reason": record.get("reason", ""),
+            "frames": [],
+        }
         with self._lock:
             try:
                 numbers = self._recording.look_again()
@@ -81,10 +92,20 @@ class Live:
         scene = self._recording.scene
         view = viewpoint(scene, 1.0)
         return state | {
-            "frames": numbers, "name": scene.scene.name, "dimension": scene.dimension, "size": [*scene.domain.size, 0.0][:3],
-            "camera": {"position": list(view.position), "focus": list(view.focus), "up": list(view.up), "angle": view.angle},
-            "rate": scene.time.frames_per_second, "palette": PALETTES[scene.palette], "spacing": self._spacing,
-        }  # fmt: skip
+            "frames": numbers,
+            "name": scene.scene.name,
+            "dimension": scene.dimension,
+            "size": [*scene.domain.size, 0.0][:3],
+            "camera": {
+                "position": list(view.position),
+                "focus": list(view.focus),
+                "up": list(view.up),
+                "angle": view.angle,
+            },
+            "rate": scene.time.frames_per_second,
+            "palette": PALETTES[scene.palette],
+            "spacing": self._spacing,
+        }
 
     def frame(self, number: int) -> bytes:
         """Return a frame: a line of JSON, filled up with spaces to whole words, then its arrays, 32 bits a value, in the line's order.
@@ -99,12 +120,21 @@ class Live:
             frame = recording.frame(number)
             solids = self._solid_points(frame.time)
         few = slice(None, None, len(frame.points) // MOST_POINTS + 1)
-        arrays: dict[str, np.ndarray] = {"points": frame.points[few], "values": frame.values[few], "solids": solids}
+        arrays: dict[str, np.ndarray] = {
+            "points": frame.points[few],
+            "values": frame.values[few],
+            "solids": solids,
+        }
         for name, surface in (("surface", frame.surface), ("bodies", frame.bodies)):
             if surface is not None:
                 arrays |= {name: surface.points, f"{name}_corners": surface.corners}
-        flat = {name: array.astype("<u4" if name.endswith("_corners") else "<f4").ravel() for name, array in arrays.items()}
-        head = json.dumps({"time": frame.time, "arrays": {name: len(array) for name, array in flat.items()}}).encode()
+        flat = {
+            name: array.astype("<u4" if name.endswith("_corners") else "<f4").ravel()
+            for name, array in arrays.items()
+        }
+        head = json.dumps(
+            {"time": frame.time, "arrays": {name: len(array) for name, array in flat.items()}}
+        ).encode()
         head += b" " * (-(len(head) + 1) % 4) + b"\n"
         return head + b"".join(array.tobytes() for array in flat.values())
 
@@ -130,7 +160,10 @@ class Live:
     def _solids(self) -> list[tuple[Any, Any]]:
         scene = self._recording.scene
         return [
-            (solid.to_geometry(Path(), scene.dimension), solid.motion.to_motion(scene.dimension) if solid.motion else None)
+            (
+                solid.to_geometry(Path(), scene.dimension),
+                solid.motion.to_motion(scene.dimension) if solid.motion else None,
+            )
             for solid in prescribed_solids(scene)
         ]
 
@@ -142,7 +175,10 @@ class Live:
         step = max(scene.domain.size) / SOLID_POINTS[scene.dimension]
         axes = [np.arange(0.5 * step, side, step) for side in scene.domain.size]
         lattice = np.stack(np.meshgrid(*axes, *[[0.0]] * (3 - len(axes))), axis=-1).reshape(-1, 3)
-        poses = [(geometry, motion.pose(time) if motion else Pose.identity()) for geometry, motion in self._solids]
+        poses = [
+            (geometry, motion.pose(time) if motion else Pose.identity())
+            for geometry, motion in self._solids
+        ]
         distance = nearest_distance(poses, wp.array(lattice, dtype=wp.vec3, device="cpu"))
         return np.asarray(lattice[np.abs(distance) < 0.6 * step])
 
@@ -192,12 +228,17 @@ class Answers(BaseHTTPRequestHandler):
             return live.log(_number(words, "from")), "text/csv; charset=utf-8"
         raise RenderError("no such page")
 
-    def _tell(self, status: HTTPStatus, body: bytes, kind: str = "text/plain; charset=utf-8") -> None:
+    def _tell(
+        self, status: HTTPStatus, body: bytes, kind: str = "text/plain; charset=utf-8"
+    ) -> None:
         self.send_response(status)
         for name, value in (
-            ("Content-Type", kind), ("Content-Length", str(len(body))), ("Cache-Control", "no-store"), ("Content-Security-Policy", SAFE),
+            ("Content-Type", kind),
+            ("Content-Length", str(len(body))),
+            ("Cache-Control", "no-store"),
+            ("Content-Security-Policy", SAFE),
             ("X-Content-Type-Options", "nosniff"),
-        ):  # fmt: skip
+        ):
             self.send_header(name, value)
         self.end_headers()
         self.wfile.write(body)
@@ -268,7 +309,9 @@ def live_server(folder: Path, *, port: int = PORT, show: Show | None = None) -> 
     try:
         return LiveServer(Live(folder, show), port)
     except OSError as error:
-        raise RenderError(f"--port {port}: cannot be used: {error.strerror}; 0: any free port") from error
+        raise RenderError(
+            f"--port {port}: cannot be used: {error.strerror}; 0: any free port"
+        ) from error
 
 
 @contextmanager

@@ -34,24 +34,35 @@ class Page:
         recording: what is drawn.
         size: width and height [pixels].
         pictures: how many.
-        painter: makes what draws the pictures, given the recording and their width and height [pixels].
+        painter: makes what draws the pictures, given the recording and their width and height
+            [pixels].
 
     Raises:
         RenderError: the image is too small for them.
     """
 
     def __init__(
-        self, recording: Recording, size: tuple[int, int], pictures: int, painter: Callable[[Recording, tuple[int, int]], Painter]
+        self,
+        recording: Recording,
+        size: tuple[int, int],
+        pictures: int,
+        painter: Callable[[Recording, tuple[int, int]], Painter],
     ) -> None:
         self.recording, self.size = recording, size
         self.line = max(20, round(0.065 * min(size)))  # heights [pixels]
         self.caption = round(0.8 * self.line) if pictures > 1 else 0
         sides = recording.scene.domain.size
-        aspect = sides[0] / sides[1] if len(sides) == 2 else 1.5  # of a picture; a room is seen at an angle
+        # of a picture; a room is seen at an angle
+        aspect = sides[0] / sides[1] if len(sides) == 2 else 1.5
         tiles = {columns: self._tile(columns, pictures) for columns in range(1, pictures + 1)}
-        self.columns, (width, height) = max(tiles.items(), key=lambda item: min(item[1][0], aspect * item[1][1]))
+        self.columns, (width, height) = max(
+            tiles.items(), key=lambda item: min(item[1][0], aspect * item[1][1])
+        )
         if min(width, height) < SMALLEST_PICTURE:
-            raise RenderError(f"--size {size[0]}x{size[1]}: is too small for {pictures} pictures; enlarge it or choose fewer frames")
+            raise RenderError(
+                f"--size {size[0]}x{size[1]}: is too small for {pictures} pictures; enlarge it or "
+                "choose fewer frames"
+            )
         if pictures > 1:  # a sheet is only as high as its pictures
             height = min(height, round(width / aspect))
             self.size = size[0], self.line + -(-pictures // self.columns) * (height + self.caption)
@@ -63,13 +74,19 @@ class Page:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
-        figure = Figure(figsize=(self.size[0] / DOTS_AN_INCH, self.size[1] / DOTS_AN_INCH), dpi=DOTS_AN_INCH)
+        figure = Figure(
+            figsize=(self.size[0] / DOTS_AN_INCH, self.size[1] / DOTS_AN_INCH), dpi=DOTS_AN_INCH
+        )
         canvas = FigureCanvasAgg(figure)
         width, height = self.tile
         clock = self.recording.scene.time
         digits = 2 if clock.frames_per_second <= 100 else 3
         corners = [
-            (place % self.columns * width, self.line + place // self.columns * (height + self.caption)) for place in range(len(numbers))
+            (
+                place % self.columns * width,
+                self.line + place // self.columns * (height + self.caption),
+            )
+            for place in range(len(numbers))
         ]
         for number, (left, top) in zip(numbers, corners, strict=True):
             time = f"t = {clock.frame_time(number):.{digits}f} s"
@@ -78,18 +95,23 @@ class Page:
             else:
                 self._write(figure, time, 0.5 * self.line, 0.55 * self.line, "left")
         if self.caption:
-            self._write(figure, self.recording.scene.scene.name, 0.5 * self.line, 0.55 * self.line, "left")
+            self._write(
+                figure, self.recording.scene.scene.name, 0.5 * self.line, 0.55 * self.line, "left"
+            )
         self._draw_legend(figure)
         canvas.draw()
         image = np.array(canvas.buffer_rgba())[..., :3]
-        for number, (left, top) in zip(numbers, corners, strict=True):  # Matplotlib would take as long as drawing them does
+        # Matplotlib would take as long as drawing them does
+        for number, (left, top) in zip(numbers, corners, strict=True):
             picture = image[top + self.caption : top + self.caption + height, left : left + width]
             picture[:] = self.painter.draw(self.recording.frame(number))
         return image
 
     def _tile(self, columns: int, pictures: int) -> tuple[int, int]:
         """Return the width and height of a picture when so many stand side by side."""
-        return self.size[0] // columns, (self.size[1] - self.line) // -(-pictures // columns) - self.caption
+        return self.size[0] // columns, (self.size[1] - self.line) // -(
+            -pictures // columns
+        ) - self.caption
 
     def _draw_legend(self, figure: Figure) -> None:
         """Draw `speed [m/s]  0 [colors] 3` at the right of the first line."""
@@ -98,8 +120,15 @@ class Page:
             return
         width, height, middle = 0.16 * self.size[0], 0.3 * self.line, 0.55 * self.line
         left, gap = self.size[0] - width - 2.0 * self.line, 0.25 * self.line
-        place = (left / self.size[0], 1.0 - (middle + height / 2) / self.size[1], width / self.size[0], height / self.size[1])
-        bar = figure.colorbar(scale.mappable, cax=figure.add_axes(place), orientation="horizontal", ticks=[])
+        place = (
+            left / self.size[0],
+            1.0 - (middle + height / 2) / self.size[1],
+            width / self.size[0],
+            height / self.size[1],
+        )
+        bar = figure.colorbar(
+            scale.mappable, cax=figure.add_axes(place), orientation="horizontal", ticks=[]
+        )
         bar.outline.set_visible(False)
         self._write(figure, f"{scale.label}  {scale.low:g}", left - gap, middle, "right")
         self._write(figure, f"{scale.high:g}", left + width + gap, middle, "left")
@@ -107,4 +136,12 @@ class Page:
     def _write(self, figure: Figure, text: str, x: float, y: float, anchor: str) -> None:
         """Write beside a point, x and y down from the upper left corner [pixels]."""
         size = 0.45 * self.line * POINTS_AN_INCH / DOTS_AN_INCH
-        figure.text(x / self.size[0], 1.0 - y / self.size[1], text, fontsize=size, color=INK, ha=anchor, va="center")
+        figure.text(
+            x / self.size[0],
+            1.0 - y / self.size[1],
+            text,
+            fontsize=size,
+            color=INK,
+            ha=anchor,
+            va="center",
+        )

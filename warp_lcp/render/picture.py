@@ -16,17 +16,27 @@ from warp_lcp.render.solid_meshes import FlatSolids, RoomSolids, apart, prescrib
 from warp_lcp.render.sunlight import LIGHT, SHADE, Sunlight, scattered
 from warp_lcp.scene.camera import Viewpoint, viewpoint
 
-SAMPLES = 2  # per pixel and direction: images are drawn larger and averaged down, since splats have no other anti-aliasing
-FRONT, TILT = 1e-3, 0.3  # how far walls stand before 2-D particles, over the longest side, and over a disc's radius: discs face the camera
+# per pixel and direction: images are drawn larger and averaged down, since splats have no other
+# anti-aliasing
+SAMPLES = 2
+# how far walls stand before 2-D particles, over the longest side, and over a disc's radius: discs
+# face the camera
+FRONT, TILT = 1e-3, 0.3
 SMALL = 0.25  # radius of particles that a surface is shown around, over their spacing
-BACKDROPS = {"water": "#c9d5df", "other": "#e3e2df"}  # of rooms at the bottom, fading into white, which would hide water
+# of rooms at the bottom, fading into white, which would hide water
+BACKDROPS = {"water": "#c9d5df", "other": "#e3e2df"}
 
 DISC = """//VTK::Color::Impl
 float distance2 = dot(offsetVCVSOutput.xy, offsetVCVSOutput.xy);
 if (distance2 > 1.0) discard;
 """
-BALL = DISC + "ambientColor *= 0.8 + 0.2 * sqrt(1.0 - distance2);\ndiffuseColor *= 0.8 + 0.2 * sqrt(1.0 - distance2);\n"
-GRAIN = (  # lit from above and before: where the lamp is, seen as cameras look unless told otherwise
+BALL = (
+    DISC
+    + "ambientColor *= 0.8 + 0.2 * sqrt(1.0 - distance2);\ndiffuseColor *= 0.8 + 0.2 * sqrt(1.0 - "
+    "distance2);\n"
+)
+# lit from above and before: where the lamp is, seen as cameras look unless told otherwise
+GRAIN = (
     DISC
     + """vec3 normal = vec3(offsetVCVSOutput.xy, sqrt(1.0 - distance2));
 float light = 0.62 + 0.42 * max(dot(normal, vec3(0.0, 0.6, 0.8)), 0.0);
@@ -54,24 +64,48 @@ class Picture:
         share = SMALL if recording.show is Show.BOTH else 0.6 if self.flat else 0.8
         self.spacing = recording.particle_spacing()
         self.radius = share * self.spacing
-        self.grainy = scene.palette == "sand" and recording.show is Show.PARTICLES and recording.color in (Color.SPEED, Color.PLAIN)
+        self.grainy = (
+            scene.palette == "sand"
+            and recording.show is Show.PARTICLES
+            and recording.color in (Color.SPEED, Color.PLAIN)
+        )
         self.samples = 1 if plotter else SAMPLES
-        self.plotter = plotter or pyvista.Plotter(off_screen=True, window_size=[SAMPLES * side for side in size], lighting="none")
-        self.plotter.render_window.SetMultiSamples(0 if plotter is None else 8)  # 0 is three times as fast in software; SAMPLES smooths too
+        self.plotter = plotter or pyvista.Plotter(
+            off_screen=True, window_size=[SAMPLES * side for side in size], lighting="none"
+        )
+        # 0 is three times as fast in software; SAMPLES smooths too
+        self.plotter.render_window.SetMultiSamples(0 if plotter is None else 8)
         water = recording.show in WITH_SURFACE and scene.palette == "water"
-        self.plotter.set_background("white" if self.flat else BACKDROPS["water"] if water else BACKDROPS["other"], top="white")
-        for position, kind, intensity in [(LIGHT, "scene light", 0.45), (np.array([0.0, 0.0, 1.0]), "headlight", 0.25)]:
-            light = pyvista.Light(position=tuple(position), focal_point=(0, 0, 0), light_type=kind, intensity=intensity)
+        self.plotter.set_background(
+            "white" if self.flat else BACKDROPS["water"] if water else BACKDROPS["other"],
+            top="white",
+        )
+        for position, kind, intensity in [
+            (LIGHT, "scene light", 0.45),
+            (np.array([0.0, 0.0, 1.0]), "headlight", 0.25),
+        ]:
+            light = pyvista.Light(
+                position=tuple(position),
+                focal_point=(0, 0, 0),
+                light_type=kind,
+                intensity=intensity,
+            )
             self.plotter.add_light(light)
         view = viewpoint(scene, size[0] / size[1])
-        outside = None if plotter or recording.show not in WITH_PARTICLES else self._outside(view, size)
+        outside = (
+            None if plotter or recording.show not in WITH_PARTICLES else self._outside(view, size)
+        )
         self._blank = None if outside is None else (outside, self._pixels()[outside])
         self.actors = Actors(self.plotter)
         self.front = max(FRONT * max(scene.domain.size), TILT * self.radius)
         self._place_standing()
         self.bodies_at_first = recording.bodies(recording.numbers[0])
         camera = self.plotter.camera
-        camera.position, camera.focal_point, camera.up = tuple(view.position), tuple(view.focus), tuple(view.up)
+        camera.position, camera.focal_point, camera.up = (
+            tuple(view.position),
+            tuple(view.focus),
+            tuple(view.up),
+        )
         camera.view_angle = view.angle
 
     def place(self, frame: Frame) -> None:
@@ -82,7 +116,10 @@ class Picture:
         self.actors.exchange("moving", solids)
         shown = frame.surface
         if shown is not None and self._wet:
-            poses = [(geometry, motion.pose(frame.time) if motion else Pose.identity()) for geometry, motion in self._wet]
+            poses = [
+                (geometry, motion.pose(frame.time) if motion else Pose.identity())
+                for geometry, motion in self._wet
+            ]
             shown = apart(shown, poses, self.scene.spacing)
         surface = [] if shown is None else surface_meshes(shown, self.scene.palette, size, width)
         self.actors.exchange("surface", surface)
@@ -91,7 +128,10 @@ class Picture:
         sun = None
         if not self.flat:
             surface_points = [mesh.points for mesh, _ in surface]
-            sun = Sunlight([self._shading, frame.points, *surface_points, self._casters([*solids, *bodies])], self.spacing)
+            sun = Sunlight(
+                [self._shading, frame.points, *surface_points, self._casters([*solids, *bodies])],
+                self.spacing,
+            )
             self.actors.exchange("floor", [sun.floor(size)])
         particles, radius = self._particles(frame, sun)
         for actor in self.actors.exchange("particles", particles):
@@ -105,7 +145,8 @@ class Picture:
         self.place(frame)
         self.plotter.renderer.reset_camera_clipping_range()
         pixels = self._pixels()
-        if self._blank is not None:  # balls that reach beyond the domain's walls would make its edges a row of beads
+        # balls that reach beyond the domain's walls would make its edges a row of beads
+        if self._blank is not None:
             outside, background = self._blank
             pixels[outside] = background
         return np.asarray(Image.fromarray(pixels).reduce(SAMPLES))
@@ -125,35 +166,62 @@ class Picture:
 
         if self.flat:
             return None
-        corners = np.stack(np.meshgrid(*((0.0, side) for side in self.scene.domain.size)), axis=-1).reshape(-1, 3)
+        corners = np.stack(
+            np.meshgrid(*((0.0, side) for side in self.scene.domain.size)), axis=-1
+        ).reshape(-1, 3)
         x, y, depth = ((corners - view.position) @ view.axes.T).T
         if depth.min() <= 0.0:
             return None
         width, height = (self.samples * side for side in size)
         focal = 0.5 * height / math.tan(math.radians(view.angle / 2.0))  # of a pinhole [pixels]
-        hull = ConvexHull(np.stack([0.5 * width + focal * x / depth, 0.5 * height - focal * y / depth], axis=-1))
+        hull = ConvexHull(
+            np.stack([0.5 * width + focal * x / depth, 0.5 * height - focal * y / depth], axis=-1)
+        )
         column, row = np.arange(width) + 0.5, np.arange(height)[:, None] + 0.5
-        beyond = [a * column + b * row + c > self.samples for a, b, c in hull.equations]  # the lines of the box are drawn on its outline
+        # the lines of the box are drawn on its outline
+        beyond = [a * column + b * row + c > self.samples for a, b, c in hull.equations]
         return np.any(beyond, axis=0)
 
     def _place_standing(self) -> None:
         """Draw the domain and the solids that stand, and prepare those that move."""
         solids = prescribed_solids(self.scene)
         sides, width = self.scene.domain.size, 2 * self.samples
-        drawer: Any = FlatSolids(sides, width, self.front) if self.flat else RoomSolids(sides, width)
+        drawer: Any = (
+            FlatSolids(sides, width, self.front) if self.flat else RoomSolids(sides, width)
+        )
         self._solids = drawer
-        standing = [(self._solids.prepared(solid), Pose.identity()) for solid in solids if not solid.motion]
+        standing = [
+            (self._solids.prepared(solid), Pose.identity()) for solid in solids if not solid.motion
+        ]
         meshes = self._solids.meshes(standing)
         self.actors.exchange("standing", [*self._solids.domain(), *meshes])
         self._shading = np.zeros((0, 3)) if self.flat else self._casters(meshes)
-        hidden = [] if self.flat or self.scene.palette != "water" else [solid for solid in solids if not solid.invert]
-        self._wet = [(solid.to_geometry(Path(), 3), solid.motion.to_motion(3) if solid.motion else None) for solid in hidden]
-        self._moving = [(self._solids.prepared(solid), solid.motion.to_motion(self.scene.dimension)) for solid in solids if solid.motion]
+        hidden = (
+            []
+            if self.flat or self.scene.palette != "water"
+            else [solid for solid in solids if not solid.invert]
+        )
+        self._wet = [
+            (solid.to_geometry(Path(), 3), solid.motion.to_motion(3) if solid.motion else None)
+            for solid in hidden
+        ]
+        self._moving = [
+            (self._solids.prepared(solid), solid.motion.to_motion(self.scene.dimension))
+            for solid in solids
+            if solid.motion
+        ]
 
     def _casters(self, meshes: list[Drawn]) -> np.ndarray:
         """Return points [m] on what casts shadows: not on lines, and not on containers, through which one sees."""
         return np.concatenate(
-            [np.zeros((0, 3)), *(scattered(mesh, self.spacing) for mesh, looks in meshes if not {"opacity", "line_width"} & looks.keys())]
+            [
+                np.zeros((0, 3)),
+                *(
+                    scattered(mesh, self.spacing)
+                    for mesh, looks in meshes
+                    if not {"opacity", "line_width"} & looks.keys()
+                ),
+            ]
         )
 
     def _particles(self, frame: Frame, sun: Sunlight | None) -> tuple[list[Drawn], float]:
@@ -168,8 +236,17 @@ class Picture:
             colors, outer = shaded(points, colors, self.scene.spacing, self.scene.palette)
             points, colors = points[outer], colors[outer]
             if self.grainy:
-                colors *= 1.0 - SHADE * SHADES[self.scene.palette] * (1.0 - sun.reaches(points)[:, None])
+                colors *= 1.0 - SHADE * SHADES[self.scene.palette] * (
+                    1.0 - sun.reaches(points)[:, None]
+                )
         if self.grainy:
             points, colors, radius = grains(points, colors, self.spacing, self.scene.domain.size)
-        looks = {"style": "points_gaussian", "emissive": False, "render_points_as_spheres": True, "lighting": False}
-        return [(pyvista.PolyData(points), {"scalars": colors.astype(np.uint8), "rgb": True, **looks})], radius
+        looks = {
+            "style": "points_gaussian",
+            "emissive": False,
+            "render_points_as_spheres": True,
+            "lighting": False,
+        }
+        return [
+            (pyvista.PolyData(points), {"scalars": colors.astype(np.uint8), "rgb": True, **looks})
+        ], radius

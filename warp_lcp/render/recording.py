@@ -53,8 +53,10 @@ class Show(StrEnum):
 WITH_PARTICLES, WITH_SURFACE = (Show.PARTICLES, Show.BOTH), (Show.SURFACE, Show.BOTH)
 
 
-PARTS = {Show.PARTICLES: "particles", Show.SURFACE: "surface", Show.BODIES: "bodies"}  # that frames must have
-LABELS = {Color.FRACTION: "fraction of grains", Color.YIELD_RATIO: "yield ratio"}  # what sand's particles know besides
+# that frames must have
+PARTS = {Show.PARTICLES: "particles", Show.SURFACE: "surface", Show.BODIES: "bodies"}
+# what sand's particles know besides
+LABELS = {Color.FRACTION: "fraction of grains", Color.YIELD_RATIO: "yield ratio"}
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,8 @@ class Frame:
         points: of the particles [m], shape (n, 3).
         values: that color them, shape (n,).
         surface: of the material; None: not shown.
-        bodies: the surfaces of rigid bodies where they are, with the field `body`; None: the scene has none.
+        bodies: the surfaces of rigid bodies where they are, with the field `body`; None: the scene
+            has none.
         cells: with what fills them; None: not shown.
     """
 
@@ -100,7 +103,11 @@ class Scale:
         from matplotlib.cm import ScalarMappable
         from matplotlib.colors import LinearSegmentedColormap, Normalize
 
-        colors = LinearSegmentedColormap.from_list("palette", self.palette) if self.palette else "viridis"
+        colors = (
+            LinearSegmentedColormap.from_list("palette", self.palette)
+            if self.palette
+            else "viridis"
+        )
         return ScalarMappable(Normalize(self.low, self.high), colors)
 
     def colors(self, values: np.ndarray) -> np.ndarray:
@@ -114,11 +121,11 @@ class Recording:
     Args:
         folder: of the run.
         color: what is to be read besides the positions; speed unless given.
-        show: what is to be read; particles if a color is given, of sand, or where there is no surface, else the surface; bodies where the
-            run writes nothing but them.
+        show: what is to be read; particles if a color is given, of sand, or where there is no
+            surface, else the surface; bodies where the run writes nothing but them.
         overrides: of the scene's table [camera], such as `camera.position=[1, 2, 3]`.
-        cells: read the cells too, where the run wrote them; then their pressure is the color unless another is given, or the surface is all
-            that there is of the material.
+        cells: read the cells too, where the run wrote them; then their pressure is the color unless
+            another is given, or the surface is all that there is of the material.
 
     Raises:
         RenderError: the folder is no run's, or has no such frames.
@@ -126,7 +133,13 @@ class Recording:
     """
 
     def __init__(
-        self, folder: Path, color: Color | None = None, show: Show | None = None, overrides: Sequence[str] = (), *, cells: bool = False
+        self,
+        folder: Path,
+        color: Color | None = None,
+        show: Show | None = None,
+        overrides: Sequence[str] = (),
+        *,
+        cells: bool = False,
     ) -> None:
         """Look which frames there are."""
         if not (folder / "scene.toml").is_file():
@@ -134,25 +147,46 @@ class Recording:
             raise RenderError(f"{folder}: is not the folder of a run: {why}")
         for override in overrides:
             if not override.startswith("camera."):
-                raise RenderError(f"--set {override}: only keys of [camera] can be set for images of a run")
+                raise RenderError(
+                    f"--set {override}: only keys of [camera] can be set for images of a run"
+                )
         self.folder = folder
         self.scene: Scene = load_scene(folder / "scene.toml", overrides)
         check_shapes(self.scene, str(folder / "scene.toml"))
         self.cells = cells
         output = self.scene.output
         surface_alone = bool(self._numbers("surface")) and not self._numbers("particles")
-        if cells and color is None and show in (None, *WITH_PARTICLES) and not surface_alone and self._numbers("particles"):
+        if (
+            cells
+            and color is None
+            and show in (None, *WITH_PARTICLES)
+            and not surface_alone
+            and self._numbers("particles")
+        ):
             color = Color.PRESSURE if self._numbers("grid") else Color.SPEED
-        grains = self.scene.palette == "sand" and bool(self._numbers("particles"))  # a heap's surface is lace where it is thin, else clay
+        # a heap's surface is lace where it is thin, else clay
+        grains = self.scene.palette == "sand" and bool(self._numbers("particles"))
         smooth = color is None and not grains and bool(self._numbers("surface"))
-        bodies_alone = color in (None, Color.PLAIN) and not (output.particles or output.surface) and bool(self._numbers("bodies"))
-        self.show = show or (Show.BODIES if bodies_alone else Show.SURFACE if smooth else Show.PARTICLES)
+        bodies_alone = (
+            color in (None, Color.PLAIN)
+            and not (output.particles or output.surface)
+            and bool(self._numbers("bodies"))
+        )
+        self.show = show or (
+            Show.BODIES if bodies_alone else Show.SURFACE if smooth else Show.PARTICLES
+        )
         if self.show not in WITH_PARTICLES and color not in (None, Color.PLAIN):
-            raise RenderError(f"--color {color} is for particles, which --show {self.show} leaves out; choose both or particles")
+            raise RenderError(
+                f"--color {color} is for particles, which --show {self.show} leaves out; choose "
+                "both or particles"
+            )
         self.color = Color.PLAIN if self.show not in WITH_PARTICLES else color or Color.SPEED
         self.look_again()
         if self.color is Color.PRESSURE and not set(self.numbers) <= set(self._numbers("grid")):
-            raise RenderError(f"{folder}: --color pressure needs a frame of cells for each frame of particles; choose speed or plain")
+            raise RenderError(
+                f"{folder}: --color pressure needs a frame of cells for each frame of particles; "
+                "choose speed or plain"
+            )
 
     def chosen(self, frames: Sequence[int]) -> list[int]:
         """Return the numbers of the frames asked for, each once, in order; all if none is asked for. Negative ones count from the end.
@@ -164,7 +198,10 @@ class Recording:
         for frame in frames:
             number = self.numbers[frame] if -len(self.numbers) <= frame < 0 else frame
             if number not in self.numbers:
-                raise RenderError(f"--frame {frame}: there is no such frame; the run has {self.numbers[0]} to {self.numbers[-1]}")
+                raise RenderError(
+                    f"--frame {frame}: there is no such frame; the run has {self.numbers[0]} to "
+                    f"{self.numbers[-1]}"
+                )
             found.add(number)
         return sorted(found) or self.numbers
 
@@ -174,10 +211,18 @@ class Recording:
         Raises:
             RenderError: a file cannot be read, or lacks a field.
         """
-        points, values = (np.zeros((0, 3)), np.zeros(0)) if self.show not in WITH_PARTICLES else self.read(number)
+        points, values = (
+            (np.zeros((0, 3)), np.zeros(0))
+            if self.show not in WITH_PARTICLES
+            else self.read(number)
+        )
         surface = self.surface(number) if self.show in WITH_SURFACE else None
-        filled = self._cells(number) if self.cells and self._file("grid", number).is_file() else None
-        return Frame(self.scene.time.frame_time(number), points, values, surface, self.bodies(number), filled)
+        filled = (
+            self._cells(number) if self.cells and self._file("grid", number).is_file() else None
+        )
+        return Frame(
+            self.scene.time.frame_time(number), points, values, surface, self.bodies(number), filled
+        )
 
     def surface(self, number: int) -> Surface:
         """Return the surface of the material in a frame.
@@ -195,7 +240,11 @@ class Recording:
         """
         mesh = _read(self._file("particles", number))
         finite = np.isfinite(mesh.points).all(axis=1)
-        return Points("particles", mesh.points[finite], {name: values[finite] for name, values in mesh.fields.items()})
+        return Points(
+            "particles",
+            mesh.points[finite],
+            {name: values[finite] for name, values in mesh.fields.items()},
+        )
 
     def bodies(self, number: int) -> Surface | None:
         """Return the surfaces of the rigid bodies in a frame; None if the run has none.
@@ -231,29 +280,51 @@ class Recording:
         if self.color is Color.PLAIN or not self._numbers("particles"):
             return Scale("", -1.0, 1.0, PALETTES[self.scene.palette])
         samples = [self.read(number)[1] for number in spread(self.numbers, SCALE_FRAMES)]
-        low, high = np.percentile(np.concatenate([[0.0], *(values[:: len(values) // SCALE_VALUES + 1] for values in samples)]), [2.0, 98.0])
+        low, high = np.percentile(
+            np.concatenate(
+                [[0.0], *(values[:: len(values) // SCALE_VALUES + 1] for values in samples)]
+            ),
+            [2.0, 98.0],
+        )
         high = _round_up(high)
-        low = -_round_up(-low) if low < -0.01 * high else 0.0  # liquid that a wall holds has pressure below 0
+        # liquid that a wall holds has pressure below 0
+        low = -_round_up(-low) if low < -0.01 * high else 0.0
         if self.color is Color.SPEED:
             return Scale("speed [m/s]", low, high, PALETTES[self.scene.palette])
         return Scale(LABELS.get(self.color, "pressure [Pa]"), low, high)
 
     def particle_spacing(self) -> float:
         """Return how far apart neighbors are at the start [m], from the number of particles in the cells that hold some."""
-        points = self.particles(self.numbers[0]).points if self.show in WITH_PARTICLES else np.zeros((0, 3))
+        points = (
+            self.particles(self.numbers[0]).points
+            if self.show in WITH_PARTICLES
+            else np.zeros((0, 3))
+        )
         if not len(points):
             return self.scene.spacing
         cells = np.unique(np.floor(points / self.scene.spacing), axis=0)
-        return float(self.scene.spacing * (len(cells) / len(points)) ** (1.0 / self.scene.dimension))
+        return float(
+            self.scene.spacing * (len(cells) / len(points)) ** (1.0 / self.scene.dimension)
+        )
 
     def _numbers(self, name: str) -> list[int]:
-        matches = [FRAME_FILE.fullmatch(file.name) for file in (self.folder / "frames").glob(f"{name}_*")]
-        return sorted({int(match["index"]) for match in matches if match and match["name"] == name and match["format"] in self._readable})
+        matches = [
+            FRAME_FILE.fullmatch(file.name) for file in (self.folder / "frames").glob(f"{name}_*")
+        ]
+        return sorted(
+            {
+                int(match["index"])
+                for match in matches
+                if match and match["name"] == name and match["format"] in self._readable
+            }
+        )
 
     @cached_property
     def _readable(self) -> list[str]:
         """Return the suffixes of a part's file; a PLY file of a surface, beside one of another format, is not the run's frame."""
-        return [suffix for suffix in READABLE if suffix != "ply" or self.scene.output.format == "ply"]
+        return [
+            suffix for suffix in READABLE if suffix != "ply" or self.scene.output.format == "ply"
+        ]
 
     def look_again(self) -> list[int]:
         """Look which frames there are by now, and return the numbers of those that have all that is shown.
@@ -268,8 +339,14 @@ class Recording:
                 output = self.scene.output
                 why = "" if getattr(output, part, True) else f"; the scene's output.{part} is false"
                 if output.format in WRITTEN_ONLY:
-                    why = f'; output.format = "{output.format}" is for other programs and not read back'
-                raise RenderError(f"{self.folder}: holds no frames of {'a surface' if part == 'surface' else part}{why}")
+                    why = (
+                        f'; output.format = "{output.format}" is for other programs and not read '
+                        "back"
+                    )
+                raise RenderError(
+                    f"{self.folder}: holds no frames of "
+                    f"{'a surface' if part == 'surface' else part}{why}"
+                )
         numbers = sorted(set.intersection(*map(set, found.values())))
         if not numbers:
             raise RenderError(f"{self.folder}: holds no frame of both {' and '.join(parts)}")
@@ -281,12 +358,23 @@ class Recording:
         """Return a surface, those of its triangles or segments whose points are finite."""
         file = self._file(name, number)
         mesh = _read(file)
-        corners = mesh.corners if len(mesh.corners) else np.zeros((0, self.scene.dimension), dtype=np.int32)
+        corners = (
+            mesh.corners
+            if len(mesh.corners)
+            else np.zeros((0, self.scene.dimension), dtype=np.int32)
+        )
         if corners.shape[1] != self.scene.dimension:
-            raise RenderError(f"{file}: has no {'triangles' if self.scene.dimension == 3 else 'segments'}")
+            raise RenderError(
+                f"{file}: has no {'triangles' if self.scene.dimension == 3 else 'segments'}"
+            )
         points = np.asarray(mesh.points, dtype=np.float64)
         finite = np.isfinite(points[corners]).all(axis=(1, 2))
-        return Surface(name, np.where(np.isfinite(points), points, 0.0), np.asarray(corners[finite], dtype=np.int32), mesh.fields)
+        return Surface(
+            name,
+            np.where(np.isfinite(points), points, 0.0),
+            np.asarray(corners[finite], dtype=np.int32),
+            mesh.fields,
+        )
 
     def _cells(self, number: int) -> Cells | None:
         """Return the cells of a frame with their fields."""
@@ -296,18 +384,30 @@ class Recording:
         elif not len((mesh := _read(file)).corners):
             return None
         else:
-            low = np.nan_to_num(mesh.points[mesh.corners].mean(axis=1) / self.scene.spacing, nan=-1.0)
+            low = np.nan_to_num(
+                mesh.points[mesh.corners].mean(axis=1) / self.scene.spacing, nan=-1.0
+            )
             index = np.floor(np.clip(low, -1.0, max(self.scene.cell_counts))).astype(int)
             cells = Cells("grid", index, self.scene.spacing, self.scene.dimension, mesh.fields)
         if not ((cells.index >= 0) & (cells.index < self.scene.cell_counts)).all():
-            raise RenderError(f"{file}: is not a readable frame: a cell lies outside the scene's domain")
+            raise RenderError(
+                f"{file}: is not a readable frame: a cell lies outside the scene's domain"
+            )
         return cells
 
     def files(self, number: int) -> list[Path]:
         """Return the files that tell what a frame shows: of particles or surface, and of bodies."""
-        parts = {Show.PARTICLES: ["particles"], Show.SURFACE: ["surface"], Show.BOTH: ["particles", "surface"], Show.BODIES: []}
+        parts = {
+            Show.PARTICLES: ["particles"],
+            Show.SURFACE: ["surface"],
+            Show.BOTH: ["particles", "surface"],
+            Show.BODIES: [],
+        }
         files = [self._file(part, number) for part in [*parts[self.show], "bodies"]]
-        pieces = [piece for file in files for piece in sorted(file.parent.glob(f"rank_*/{file.stem}.*"))]  # of ranks
+        # of ranks
+        pieces = [
+            piece for file in files for piece in sorted(file.parent.glob(f"rank_*/{file.stem}.*"))
+        ]
         return [file for file in files if file.is_file()] + pieces
 
     def _file(self, name: str, number: int) -> Path:
@@ -317,7 +417,10 @@ class Recording:
 
     def _field(self, fields: dict[str, Any], name: str, components: int = 1) -> np.ndarray:
         if name not in fields or fields[name].shape[1:] != (components,)[: components - 1]:
-            raise RenderError(f"{self.folder}: the frames have no {name}, which --color {self.color} needs; choose plain")
+            raise RenderError(
+                f"{self.folder}: the frames have no {name}, which --color {self.color} needs; "
+                "choose plain"
+            )
         return np.asarray(fields[name], dtype=np.float64)
 
     def _pressure(self, number: int, points: np.ndarray) -> np.ndarray:
@@ -327,7 +430,9 @@ class Recording:
         table = np.zeros(counts)
         if cells is not None:
             table[tuple(cells.index.T)] = self._field(cells.fields, "pressure")
-        cell = np.clip(np.floor(np.nan_to_num(points) / self.scene.spacing), 0, counts - 1).astype(int)
+        cell = np.clip(np.floor(np.nan_to_num(points) / self.scene.spacing), 0, counts - 1).astype(
+            int
+        )
         return cast(np.ndarray, table[tuple(cell.T)])
 
 
@@ -349,7 +454,9 @@ def _read(file: Path) -> Any:
         raise RenderError(f"{error.filename or file}: cannot be read: {error.strerror}") from error
     except ValueError as error:
         known = "is not a readable frame" in str(error)
-        raise RenderError(str(error) if known else f"{file}: is not a readable frame: {error}") from error
+        raise RenderError(
+            str(error) if known else f"{file}: is not a readable frame: {error}"
+        ) from error
 
 
 def _round_up(value: float) -> float:
@@ -357,4 +464,6 @@ def _round_up(value: float) -> float:
     if value <= 0.0:
         return 1.0
     power = 10.0 ** np.floor(np.log10(value))
-    return float(ROUND_NUMBERS[np.searchsorted(ROUND_NUMBERS, value / power * (1.0 - 1e-9))] * power)
+    return float(
+        ROUND_NUMBERS[np.searchsorted(ROUND_NUMBERS, value / power * (1.0 - 1e-9))] * power
+    )

@@ -21,8 +21,9 @@ INSTALL = "pip install 'pyvista>=0.45'"
 INSTALL_MATPLOTLIB = "pip install 'matplotlib>=3.9'"
 SMALLEST, LARGEST = 240, 4096  # pixels along a side of an image
 SHEET_FRAMES = 6
-# Seconds of a core that an image takes, a megapixel and a million points of particles and surface: 2-D, 3-D, a section.
-# Measured on 3,000 to 650,000 particles at 640 x 360 and 1280 x 720; within a factor of 2.
+# Seconds of a core that an image takes, a megapixel and a million points of particles and surface:
+# 2-D, 3-D, a section. Measured on 3,000 to 650,000 particles at 640 x 360 and 1280 x 720; within a
+# factor of 2.
 FLAT_SECONDS, ROOM_SECONDS, SECTION_SECONDS = (0.03, 0.15, 2.0), (0.1, 0.65, 2.0), (0.08, 0.03, 2.0)
 PACKING = 1  # of PNGs, from 1 to 9: a quarter of what PIL's own, 6, takes, and files a third larger
 
@@ -62,12 +63,14 @@ def render_run(
 
     Args:
         folder: of the run.
-        frames: numbers of frames, negative ones counted from the end; all (for a sheet, some evenly spaced) unless given.
+        frames: numbers of frames, negative ones counted from the end; all (for a sheet, some evenly
+            spaced) unless given.
         looks: how the images look.
         out: where the images go; `folder / "images"` unless given.
         sheet: draw the frames side by side into one image, `sheet.png`.
         told: is called with how many images are drawn, and how many there will be.
-        estimated: is called with about how many seconds of a core drawing will take, before it begins, where there are several frames.
+        estimated: is called with about how many seconds of a core drawing will take, before it
+            begins, where there are several frames.
 
     Raises:
         RenderError: what draws is missing, there are no such frames, or an image cannot be written.
@@ -81,7 +84,11 @@ def render_run(
         if sheet and not frames:
             numbers = spread(numbers, SHEET_FRAMES)
         name = "slice" if looks.cut else "frame"
-        groups = {"sheet.png": numbers} if sheet else {f"{name}_{number:06d}.png": [number] for number in numbers}
+        groups = (
+            {"sheet.png": numbers}
+            if sheet
+            else {f"{name}_{number:06d}.png": [number] for number in numbers}
+        )
         out = out or folder / "images"
         page = Page(recording, looks.size, len(numbers) if sheet else 1, painter)
         stack.enter_context(closing(page.painter))
@@ -109,12 +116,15 @@ def film_run(
         folder: of the run.
         film: the file; `.mp4` or `.gif`.
         looks: how the images look.
-        rate: frames a second of the film; those of the scene, so that time goes by as it does, unless given [1/s].
+        rate: frames a second of the film; those of the scene, so that time goes by as it does,
+            unless given [1/s].
         told: is called with how many images are drawn, and how many there will be.
-        estimated: is called with about how many seconds of a core drawing will take, before it begins, where there are several frames.
+        estimated: is called with about how many seconds of a core drawing will take, before it
+            begins, where there are several frames.
 
     Raises:
-        RenderError: what draws or encodes is missing, there are no frames, or the film cannot be written.
+        RenderError: what draws or encodes is missing, there are no frames, or the film cannot be
+            written.
         SceneError: the run's scene cannot be read.
     """
     looks = looks or Looks()
@@ -124,7 +134,9 @@ def film_run(
         recording = Recording(folder, looks.color, looks.show, looks.overrides, cells=looks.cut)
         page = Page(recording, looks.size, 1, painter)
         stack.enter_context(closing(page.painter))
-        reel = stack.enter_context(Film(film, page.size, rate or recording.scene.time.frames_per_second))
+        reel = stack.enter_context(
+            Film(film, page.size, rate or recording.scene.time.frames_per_second)
+        )
         if len(recording.numbers) > 1:
             estimated(expected_seconds(recording, recording.numbers, looks))
         told(0, len(recording.numbers))
@@ -142,7 +154,13 @@ def expected_seconds(recording: Recording, numbers: Sequence[int], looks: Looks)
     """
     frame = recording.frame(numbers[len(numbers) // 2])
     points = len(frame.points) + (0 if frame.surface is None else len(frame.surface.points))
-    each, pixels, held = SECTION_SECONDS if looks.cut else FLAT_SECONDS if recording.scene.dimension == 2 else ROOM_SECONDS
+    each, pixels, held = (
+        SECTION_SECONDS
+        if looks.cut
+        else FLAT_SECONDS
+        if recording.scene.dimension == 2
+        else ROOM_SECONDS
+    )
     return len(numbers) * (each + 1e-6 * (pixels * math.prod(looks.size) + held * points))
 
 
@@ -156,7 +174,9 @@ def _painter(looks: Looks, stack: ExitStack) -> Callable[[Recording, tuple[int, 
         try:
             import matplotlib as _  # noqa: F401
         except ImportError as error:
-            raise RenderError(f"--slice needs Matplotlib, which cannot be loaded ({error}): {INSTALL_MATPLOTLIB}") from error
+            raise RenderError(
+                f"--slice needs Matplotlib, which cannot be loaded ({error}): {INSTALL_MATPLOTLIB}"
+            ) from error
         from warp_lcp.render.section import Section
 
         return partial(Section, at=looks.at)
@@ -166,11 +186,13 @@ def _painter(looks: Looks, stack: ExitStack) -> Callable[[Recording, tuple[int, 
         import pyvista
     except ImportError as error:
         raise RenderError(
-            f"images need pyvista, which cannot be loaded ({error}): {INSTALL}; --slice draws a section without it"
+            f"images need pyvista, which cannot be loaded ({error}): {INSTALL}; --slice draws a "
+            "section without it"
         ) from error
     from warp_lcp.render.picture import Picture
 
-    stack.enter_context(pyvista.vtk_verbosity("off"))  # VTK warns where there is no display, and draws all the same
+    # VTK warns where there is no display, and draws all the same
+    stack.enter_context(pyvista.vtk_verbosity("off"))
     return Picture
 
 
@@ -183,7 +205,10 @@ def parse_size(text: str) -> tuple[int, int]:
     match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
     width, height = (int(match[1]), int(match[2])) if match else (0, 0)
     if not (SMALLEST <= width <= LARGEST and SMALLEST <= height <= LARGEST):
-        raise RenderError(f"--size {text}: must be a width and a height of {SMALLEST} to {LARGEST} pixels, such as 1280x720")
+        raise RenderError(
+            f"--size {text}: must be a width and a height of {SMALLEST} to {LARGEST} pixels, such "
+            "as 1280x720"
+        )
     return width, height
 
 

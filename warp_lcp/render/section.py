@@ -33,7 +33,9 @@ class Section:
         RenderError: the cut is not in the domain.
     """
 
-    def __init__(self, recording: Recording, size: tuple[int, int], at: float | None = None) -> None:
+    def __init__(
+        self, recording: Recording, size: tuple[int, int], at: float | None = None
+    ) -> None:
         """Choose the cut and prepare the solids."""
         self.recording, self.size, self.scene = recording, size, recording.scene
         flat = self.scene.dimension == 2
@@ -54,7 +56,11 @@ class Section:
         from matplotlib.figure import Figure
 
         width, height = self.size
-        figure = Figure(figsize=(width / DOTS_AN_INCH, height / DOTS_AN_INCH), dpi=DOTS_AN_INCH, layout="constrained")
+        figure = Figure(
+            figsize=(width / DOTS_AN_INCH, height / DOTS_AN_INCH),
+            dpi=DOTS_AN_INCH,
+            layout="constrained",
+        )
         canvas = FigureCanvasAgg(figure)
         axes = figure.add_subplot()
         self._draw_cells(axes, frame)
@@ -67,7 +73,13 @@ class Section:
         camera = self.scene.camera
         seen = [corner.tolist() for corner in self.scene.seen]
         low, high = camera.low or seen[0], camera.high or seen[1]
-        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xlabel="x [m]", ylabel="y [m]")
+        axes.set(
+            xlim=(low[0], high[0]),
+            ylim=(low[1], high[1]),
+            aspect="equal",
+            xlabel="x [m]",
+            ylabel="y [m]",
+        )
         if self.at is not None:
             axes.set_title(f"z = {self.at:g} m", fontsize="medium")
         canvas.draw()
@@ -84,26 +96,48 @@ class Section:
             return
         cells, h = frame.cells, self.scene.spacing
         across, up, through = self.scene.cell_counts
-        here = np.ones(len(cells.index), dtype=bool) if self.at is None else cells.index[:, 2] == min(int(self.at / h), through - 1)
+        here = (
+            np.ones(len(cells.index), dtype=bool)
+            if self.at is None
+            else cells.index[:, 2] == min(int(self.at / h), through - 1)
+        )
         table = np.full((up, across), np.nan)
         column, row = cells.index[here, 0], cells.index[here, 1]
         colored = self.recording.color is Color.PRESSURE
         table[row, column] = np.asarray(cells.fields["pressure"])[here] if colored else 0.0
         scale = self.recording.scale
-        looks = {"cmap": scale.mappable.cmap, "norm": scale.mappable.norm} if colored else {"cmap": ListedColormap([CELL])}
-        axes.imshow(table, origin="lower", extent=(0.0, across * h, 0.0, up * h), interpolation="nearest", zorder=1, **looks)
+        looks = (
+            {"cmap": scale.mappable.cmap, "norm": scale.mappable.norm}
+            if colored
+            else {"cmap": ListedColormap([CELL])}
+        )
+        axes.imshow(
+            table,
+            origin="lower",
+            extent=(0.0, across * h, 0.0, up * h),
+            interpolation="nearest",
+            zorder=1,
+            **looks,
+        )
 
     def _draw_solids(self, axes: Any, time: float) -> None:
         """Fill where the distance to the nearest solid is negative."""
         if not self._solids:
             return
         x, y = (
-            np.linspace(0.0, side, max(2, round(OUTLINE_POINTS * side / max(self.scene.domain.size))))
+            np.linspace(
+                0.0, side, max(2, round(OUTLINE_POINTS * side / max(self.scene.domain.size)))
+            )
             for side in self.scene.domain.size[:2]
         )
         plane = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), self.at or 0.0)], axis=-1)
-        poses = [(geometry, motion.pose(time) if motion else Pose.identity()) for geometry, motion in self._solids]
-        nearest = nearest_distance(poses, wp.array(plane.reshape(-1, 3), dtype=wp.vec3, device="cpu"))
+        poses = [
+            (geometry, motion.pose(time) if motion else Pose.identity())
+            for geometry, motion in self._solids
+        ]
+        nearest = nearest_distance(
+            poses, wp.array(plane.reshape(-1, 3), dtype=wp.vec3, device="cpu")
+        )
         if nearest.min() < 0.0 < nearest.max():
             level = nearest.reshape(len(y), len(x))
             axes.contourf(x, y, level, levels=[-math.inf, 0.0], colors=[SOLID], zorder=3.5)
@@ -115,7 +149,9 @@ class Section:
         """Draw the outline of a surface in the plane."""
         from matplotlib.collections import LineCollection
 
-        axes.add_collection(LineCollection(list(self._segments(surface)), colors=color, linewidths=1.5, zorder=4))
+        axes.add_collection(
+            LineCollection(list(self._segments(surface)), colors=color, linewidths=1.5, zorder=4)
+        )
 
     def _fill_bodies(self, axes: Any, bodies: Surface) -> None:
         """Fill the outlines of the bodies in the plane: triangles from the origin to each segment, which wind about what is inside."""
@@ -126,7 +162,9 @@ class Section:
         origin = np.zeros((len(ends), 1, 2))
         triangles = np.concatenate([origin, ends, origin], axis=1).reshape(-1, 2)
         codes = np.tile([Path.MOVETO, Path.LINETO, Path.LINETO, Path.CLOSEPOLY], len(ends))
-        axes.add_patch(PathPatch(Path(triangles, codes), facecolor=BODY_COLORS[0], linewidth=0.0, zorder=5))
+        axes.add_patch(
+            PathPatch(Path(triangles, codes), facecolor=BODY_COLORS[0], linewidth=0.0, zorder=5)
+        )
         self._draw_lines(axes, bodies, BODY_EDGE)
 
     def _segments(self, surface: Surface) -> np.ndarray:
@@ -139,13 +177,30 @@ class Section:
         h = self.scene.spacing
         near = slice(None) if self.at is None else np.abs(frame.points[:, 2] - self.at) < 0.5 * h
         points, values = frame.points[near], frame.values[near]
-        inches = self.size[0] / DOTS_AN_INCH / self.scene.domain.size[0]  # an upper bound of those that a meter takes
-        marker = min(max(SMALLEST_DOT, 0.35 * self.recording.particle_spacing() * 72.0 * inches), LARGEST_DOT)
+        # an upper bound of those that a meter takes
+        inches = self.size[0] / DOTS_AN_INCH / self.scene.domain.size[0]
+        marker = min(
+            max(SMALLEST_DOT, 0.35 * self.recording.particle_spacing() * 72.0 * inches), LARGEST_DOT
+        )
         if self.recording.color is Color.PRESSURE and frame.cells is not None:
-            axes.scatter(points[:, 0], points[:, 1], s=(0.5 * marker) ** 2, color=DOT, linewidths=0.0, zorder=3)
+            axes.scatter(
+                points[:, 0],
+                points[:, 1],
+                s=(0.5 * marker) ** 2,
+                color=DOT,
+                linewidths=0.0,
+                zorder=3,
+            )
         else:
             colors = self.recording.scale.colors(values) / 255.0
-            axes.scatter(points[:, 0], points[:, 1], s=(2.0 * marker) ** 2, c=colors, linewidths=0.0, zorder=3)
+            axes.scatter(
+                points[:, 0],
+                points[:, 1],
+                s=(2.0 * marker) ** 2,
+                c=colors,
+                linewidths=0.0,
+                zorder=3,
+            )
 
 
 def cut(triangles: np.ndarray, z: float) -> np.ndarray:
@@ -161,7 +216,8 @@ def cut(triangles: np.ndarray, z: float) -> np.ndarray:
     above = triangles[..., 2] >= z
     crossing = above.any(axis=1) & ~above.all(axis=1)
     triangles, above = triangles[crossing], above[crossing]
-    alone = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), (~above).argmax(axis=1))  # the corner on a side of its own
+    # the corner on a side of its own
+    alone = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), (~above).argmax(axis=1))
     own = np.arange(len(triangles))
     tip = triangles[own, alone]
     ends = []

@@ -20,14 +20,16 @@ from warp_lcp.simulation import Surface
 
 OUTLINE_POINTS = 1500  # along the longest side, where 2-D solids are sampled: about a drawn pixel
 TOUCHING = 0.75
-AROUND, LINE_FRONT = 20.0, 1.2  # of the longest side: how far the white reaches; of `front`: where lines stand
+# of the longest side: how far the white reaches; of `front`: where lines stand
+AROUND, LINE_FRONT = 20.0, 1.2
 FLAT_SOLID, SOLID, EDGE = "#bfc3c8", "#cdd1d5", "#6b7075"
 
 
 class FlatSolids:
     """A rectangle with white around it; solids are filled where the signed distance to them is negative.
 
-    Both stand before the particles and hide what of their discs reaches across a wall, which would look like a saw.
+    Both stand before the particles and hide what of their discs reaches across a wall, which would
+    look like a saw.
 
     Args:
         size: of the domain [m].
@@ -51,12 +53,24 @@ class FlatSolids:
         import pyvista
 
         (right, top), far, z = self.size, AROUND * max(self.size), self.front
-        boxes = [(-far, 0.0, -far, far), (right, far, -far, far), (0.0, right, -far, 0.0), (0.0, right, top, far)]
+        boxes = [
+            (-far, 0.0, -far, far),
+            (right, far, -far, far),
+            (0.0, right, -far, 0.0),
+            (0.0, right, top, far),
+        ]
         corners = [np.array([[a, c, z], [b, c, z], [b, d, z], [a, d, z]]) for a, b, c, d in boxes]
-        around = pyvista.PolyData.from_regular_faces(np.concatenate(corners), np.arange(16).reshape(4, 4))
+        around = pyvista.PolyData.from_regular_faces(
+            np.concatenate(corners), np.arange(16).reshape(4, 4)
+        )
         z *= LINE_FRONT
-        edges = pyvista.Rectangle([(0.0, 0.0, z), (right, 0.0, z), (right, top, z)]).extract_all_edges()
-        return [(around, {"color": "white", "lighting": False}), (edges, {"color": EDGE, "line_width": self.line_width, "lighting": False})]
+        edges = pyvista.Rectangle(
+            [(0.0, 0.0, z), (right, 0.0, z), (right, top, z)]
+        ).extract_all_edges()
+        return [
+            (around, {"color": "white", "lighting": False}),
+            (edges, {"color": EDGE, "line_width": self.line_width, "lighting": False}),
+        ]
 
     def prepared(self, solid: Shape) -> Geometry:
         """Return what is needed to draw a solid."""
@@ -68,8 +82,12 @@ class FlatSolids:
         if nearest.min() >= 0.0:
             return []
         self._plane["distance"] = np.minimum(nearest, 1e3 * self._step)
-        inside = self._plane.clip_scalar(scalars="distance", value=0.0).translate((0.0, 0.0, self.front))
-        line = self._plane.contour([0.0], scalars="distance").translate((0.0, 0.0, LINE_FRONT * self.front))
+        inside = self._plane.clip_scalar(scalars="distance", value=0.0).translate(
+            (0.0, 0.0, self.front)
+        )
+        line = self._plane.contour([0.0], scalars="distance").translate(
+            (0.0, 0.0, LINE_FRONT * self.front)
+        )
         edge = {"color": EDGE, "line_width": 0.75 * self.line_width, "lighting": False}
         return [(inside, {"color": FLAT_SOLID, "lighting": False}), (line, edge)]
 
@@ -105,9 +123,13 @@ class RoomSolids:
             mesh = outline.inside(self.size, pose)
             looks = {"color": SOLID, "smooth_shading": True, "split_sharp_edges": True}
             if outline.shape.invert and not isinstance(outline.shape, PlaneTable):
-                mesh = _clipped(mesh, self.size, closed=False)  # beyond the walls of the domain there is nothing to contain
+                # beyond the walls of the domain there is nothing to contain
+                mesh = _clipped(mesh, self.size, closed=False)
                 line = {"color": EDGE, "line_width": 0.5 * self.line_width, "lighting": False}
-                meshes += [(mesh, {"ambient": 0.3, "opacity": 0.3, "culling": "front", **looks}), (mesh.extract_feature_edges(30.0), line)]
+                meshes += [
+                    (mesh, {"ambient": 0.3, "opacity": 0.3, "culling": "front", **looks}),
+                    (mesh.extract_feature_edges(30.0), line),
+                ]
             else:
                 meshes.append((mesh, {"ambient": 0.5, **looks}))
         return meshes
@@ -134,13 +156,18 @@ class Outline:
             case BoxTable():
                 mesh = pyvista.Box(np.stack([shape.min, shape.max], axis=-1).ravel())
             case SphereTable():
-                mesh = pyvista.Sphere(radius=shape.radius, center=shape.center, theta_resolution=96, phi_resolution=64)
+                mesh = pyvista.Sphere(
+                    radius=shape.radius, center=shape.center, theta_resolution=96, phi_resolution=64
+                )
             case CapsuleTable():
                 start, end = np.array(shape.start), np.array(shape.end)
                 mesh = pyvista.Capsule(
-                    center=0.5 * (start + end), direction=end - start, radius=shape.radius,
-                    cylinder_length=float(np.linalg.norm(end - start)), resolution=64,
-                )  # fmt: skip
+                    center=0.5 * (start + end),
+                    direction=end - start,
+                    radius=shape.radius,
+                    cylinder_length=float(np.linalg.norm(end - start)),
+                    resolution=64,
+                )
             case MeshTable():
                 solid = cast(Any, shape.to_geometry(Path(), 3)).surface
                 mesh = pyvista.PolyData.from_regular_faces(solid.vertices, solid.triangles)
@@ -159,9 +186,15 @@ class Outline:
 
         placement = self.shape.placement(3).moved(pose)
         if isinstance(self.shape, PlaneTable):
-            normal = placement.rotation @ np.array(self.shape.normal) * (-1.0 if self.shape.invert else 1.0)
+            normal = (
+                placement.rotation
+                @ np.array(self.shape.normal)
+                * (-1.0 if self.shape.invert else 1.0)
+            )
             domain = pyvista.Box(np.stack([np.zeros(3), size], axis=-1).ravel()).clean()
-            return domain.clip_closed_surface(normal=-normal, origin=placement.apply(np.array(self.shape.point)))
+            return domain.clip_closed_surface(
+                normal=-normal, origin=placement.apply(np.array(self.shape.point))
+            )
         mesh = self.mesh.copy()
         mesh.points = placement.apply(mesh.points)
         return mesh if self.shape.invert else _clipped(mesh, size)
@@ -188,14 +221,18 @@ def apart(surface: Surface, solids: Sequence[tuple[Geometry, Pose]], spacing: fl
     Args:
         surface: closed triangles, whose normals point out of the liquid.
         solids: and where they are.
-        spacing: a cell's edge [m]; the surface lies within `TOUCHING` of it at the solids that it touches.
+        spacing: a cell's edge [m]; the surface lies within `TOUCHING` of it at the solids that it
+            touches.
     """
     corners = surface.points[surface.corners]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
     middle = corners.mean(axis=1)
     here, ahead = (
-        nearest_distance(solids, wp.array(middle + step * spacing * normal, dtype=wp.vec3, device="cpu")) for step in (0.0, TOUCHING)
+        nearest_distance(
+            solids, wp.array(middle + step * spacing * normal, dtype=wp.vec3, device="cpu")
+        )
+        for step in (0.0, TOUCHING)
     )
     touches = (here < TOUCHING * spacing) & (ahead < here - 0.5 * TOUCHING * spacing)
     return replace(surface, corners=surface.corners[~touches])
@@ -207,5 +244,9 @@ def _clipped(mesh: Any, size: np.ndarray, *, closed: bool = True) -> Any:
         for end, sign in ((0.0, 1.0), (size[axis], -1.0)):
             if mesh.n_points and (sign * (mesh.points[:, axis] - end)).min() < -1e-6 * size[axis]:
                 normal, origin = sign * np.eye(3)[axis], end * np.eye(3)[axis]
-                mesh = mesh.clip_closed_surface(normal=normal, origin=origin) if closed else mesh.clip(-normal, origin=origin)
+                mesh = (
+                    mesh.clip_closed_surface(normal=normal, origin=origin)
+                    if closed
+                    else mesh.clip(-normal, origin=origin)
+                )
     return mesh

@@ -8,12 +8,15 @@ from typing import Any, cast
 import numpy as np
 from scipy.ndimage import gaussian_filter, maximum_filter
 
-LIGHT = np.array([0.25, 0.9, 0.45]) / np.linalg.norm([0.25, 0.9, 0.45])  # from the domain to the lamp
+# from the domain to the lamp
+LIGHT = np.array([0.25, 0.9, 0.45]) / np.linalg.norm([0.25, 0.9, 0.45])
 ACROSS = np.linalg.svd(LIGHT[None])[2][1:]  # two directions at right angles to it
-BEHIND = 5.0  # widths of the map that something lies behind what shades it: less would be its own roughness
+# widths of the map that something lies behind what shades it: less would be its own roughness
+BEHIND = 5.0
 POINTS = 300_000  # of the map, at the most
 SOFT = 1.5  # widths, of the edge of a shadow on the floor
-FLOOR, SHADE = np.array([240.0, 240.0, 240.0]), 0.35  # the floor's color, and how much darker a shadow is
+# the floor's color, and how much darker a shadow is
+FLOOR, SHADE = np.array([240.0, 240.0, 240.0]), 0.35
 FLOOR_POINTS = 160  # along its longest side
 
 
@@ -28,8 +31,12 @@ class Sunlight:
     def __init__(self, casters: Sequence[np.ndarray], width: float) -> None:
         points = np.concatenate([np.zeros((1, 3)), *casters])
         place = points @ ACROSS.T
-        self._width, self._low = max(width, float(np.sqrt(np.ptp(place, axis=0).prod() / POINTS))), place.min(axis=0)
-        order = np.argsort(height := points @ LIGHT)[1:]  # of two at one place the higher comes last, and stays
+        self._width, self._low = (
+            max(width, float(np.sqrt(np.ptp(place, axis=0).prod() / POINTS))),
+            place.min(axis=0),
+        )
+        # of two at one place the higher comes last, and stays
+        order = np.argsort(height := points @ LIGHT)[1:]
         place = self._places(points[order])
         nearest = np.full(place.max(axis=0, initial=0) + 1, -np.inf)
         nearest[tuple(place.T)] = height[order]
@@ -40,7 +47,9 @@ class Sunlight:
         place, height = self._places(points) + 1, points @ LIGHT + BEHIND * self._width
         last, free = np.array(self._nearest.shape) - 1, np.zeros(len(points))
         for shift in np.ndindex(3, 3):
-            free += self._nearest[tuple(np.clip(place + shift - np.array([1, 1]), 0, last).T)] <= height
+            free += (
+                self._nearest[tuple(np.clip(place + shift - np.array([1, 1]), 0, last).T)] <= height
+            )
         return cast(np.ndarray, free / 9.0)
 
     def floor(self, size: Sequence[float]) -> tuple[Any, dict[str, Any]]:
@@ -66,7 +75,9 @@ def scattered(mesh: Any, width: float) -> np.ndarray:
     if not mesh.n_cells:
         return np.zeros((0, 3))
     corners = np.asarray(mesh.points, dtype=float)[mesh.triangulate().regular_faces]
-    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    area = 0.5 * np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    )
     rng = np.random.default_rng(4711)
     count = min(POINTS, 2 * int(area.sum() / width**2) + 1)
     own = corners[rng.choice(len(area), count, p=area / area.sum())]

@@ -36,7 +36,8 @@ def export_run(
 ) -> Iterator[int]:
     """Write frames of a run into a USD file, one after the other; yield the number of each when it is written.
 
-    A time code is the number of a frame; y is up, lengths are in meters, velocities in meters per second. The file appears when whole.
+    A time code is the number of a frame; y is up, lengths are in meters, velocities in meters per
+    second. The file appears when whole.
 
     Args:
         folder: of the run.
@@ -54,12 +55,25 @@ def export_run(
     try:
         from pxr import Tf, Usd, UsdGeom  # noqa: F401
     except ImportError as error:
-        raise RenderError(f"export needs USD, which cannot be loaded ({error}): {INSTALL}") from error
+        raise RenderError(
+            f"export needs USD, which cannot be loaded ({error}): {INSTALL}"
+        ) from error
     recording = Recording(folder, show=show)
-    numbers = [number for number in recording.numbers if (first is None or first <= number) and (last is None or number <= last)]
+    numbers = [
+        number
+        for number in recording.numbers
+        if (first is None or first <= number) and (last is None or number <= last)
+    ]
     if not numbers:
-        asked = " ".join(f"--{name} {number}" for name, number in (("first", first), ("last", last)) if number is not None)
-        raise RenderError(f"{asked}: there are no such frames; the run has {recording.numbers[0]} to {recording.numbers[-1]}")
+        asked = " ".join(
+            f"--{name} {number}"
+            for name, number in (("first", first), ("last", last))
+            if number is not None
+        )
+        raise RenderError(
+            f"{asked}: there are no such frames; the run has {recording.numbers[0]} to "
+            f"{recording.numbers[-1]}"
+        )
     try:
         make_folder(file.parent)
         with TemporaryDirectory(prefix=f".{file.name}.", dir=file.parent) as scratch:
@@ -73,7 +87,8 @@ def export_run(
             with replacing_by_name(file) as temporary:
                 whole.replace(temporary)
     except (OSError, Tf.ErrorException) as error:
-        why = error.strerror if isinstance(error, OSError) else error.args[0].commentary  # of the first thing that went wrong
+        # of the first thing that went wrong
+        why = error.strerror if isinstance(error, OSError) else error.args[0].commentary
         raise RenderError(f"{file}: cannot be written: {why}") from error
 
 
@@ -106,7 +121,11 @@ class Stage:
 
         scene = recording.scene
         self._crate, self._recording, self._dimension = crate, recording, scene.dimension
-        self._time, self._rate, self._always = scene.time, scene.time.frames_per_second, Usd.TimeCode.Default()
+        self._time, self._rate, self._always = (
+            scene.time,
+            scene.time.frames_per_second,
+            Usd.TimeCode.Default(),
+        )
         self._stage = stage = Usd.Stage.CreateNew(str(crate))
         UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
         UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -135,12 +154,20 @@ class Stage:
         code = self._code(number)
         if self._surface is not None:
             surface = self._recording.surface(number)
-            self._set_shape(self._surface, surface.points, surface.corners, code, surface.fields.get("velocity"))
+            self._set_shape(
+                self._surface, surface.points, surface.corners, code, surface.fields.get("velocity")
+            )
             if self._dimension == 3:
                 self._surface.GetNormalsAttr().Set(_vectors(vertex_normals(surface)), code)
         if self._particles is not None:
             particles = self._recording.particles(number)
-            _set_points(self._particles, particles.points, code, particles.fields.get("velocity"), self._spacing)
+            _set_points(
+                self._particles,
+                particles.points,
+                code,
+                particles.fields.get("velocity"),
+                self._spacing,
+            )
         if (bodies := self._recording.bodies(number)) is not None:
             self._set_bodies(bodies, code)
         for motion, place in self._moving:
@@ -189,7 +216,9 @@ class Stage:
                 self._set_shape(shape, points, (np.cumsum(own) - 1)[corners], self._always)
                 self._bodies[body] = points, shape.AddTransformOp()
             at_first, place = self._bodies[body]
-            place.Set(_matrix(Rotation.align_vectors(points, at_first)[0].as_matrix(), middle), code)
+            place.Set(
+                _matrix(Rotation.align_vectors(points, at_first)[0].as_matrix(), middle), code
+            )
 
     def _shape(self, name: str, color: str) -> Any:
         """Define what has triangles, in 2-D segments, each a curve."""
@@ -215,7 +244,14 @@ class Stage:
         points.CreateDisplayColorAttr(_color(color))
         return points
 
-    def _set_shape(self, shape: Any, points: np.ndarray, corners: np.ndarray, when: Any, velocity: np.ndarray | None = None) -> None:
+    def _set_shape(
+        self,
+        shape: Any,
+        points: np.ndarray,
+        corners: np.ndarray,
+        when: Any,
+        velocity: np.ndarray | None = None,
+    ) -> None:
         counts = _integers(np.full(len(corners), corners.shape[1]))
         if self._dimension == 3:
             shape.GetFaceVertexCountsAttr().Set(counts, when)
@@ -231,17 +267,28 @@ def vertex_normals(surface: Surface) -> np.ndarray:
     """Return unit normals of a surface of triangles at its points, shape (n, 3): means of those around, weighed by area."""
     a, b, c = np.moveaxis(surface.points[surface.corners], 1, 0)
     twice_area = np.repeat(np.cross(b - a, c - a), 3, axis=0)
-    sums = [np.bincount(surface.corners.ravel(), weights=of, minlength=len(surface.points)) for of in twice_area.T]
+    sums = [
+        np.bincount(surface.corners.ravel(), weights=of, minlength=len(surface.points))
+        for of in twice_area.T
+    ]
     normals = np.stack(sums, axis=-1)
-    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny))
+    return np.asarray(
+        normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny)
+    )
 
 
-def _set_points(prim: Any, points: np.ndarray, when: Any, velocity: np.ndarray | None, width: float) -> None:
+def _set_points(
+    prim: Any, points: np.ndarray, when: Any, velocity: np.ndarray | None, width: float
+) -> None:
     """Give a prim its points [m], their velocities [m/s] and the box around them, at a time code."""
     prim.GetPointsAttr().Set(_vectors(points), when)
     if velocity is not None:
         prim.GetVelocitiesAttr().Set(_vectors(velocity), when)
-    extent = [points.min(axis=0) - 0.5 * width, points.max(axis=0) + 0.5 * width] if len(points) else np.zeros((2, 3))
+    extent = (
+        [points.min(axis=0) - 0.5 * width, points.max(axis=0) + 0.5 * width]
+        if len(points)
+        else np.zeros((2, 3))
+    )
     prim.GetExtentAttr().Set(_vectors(np.asarray(extent)), when)
 
 

@@ -33,7 +33,9 @@ class Viewer:
         clock: tells seconds, for playing.
     """
 
-    def __init__(self, recording: Recording, plotter: Any, clock: Callable[[], float] = time.perf_counter) -> None:
+    def __init__(
+        self, recording: Recording, plotter: Any, clock: Callable[[], float] = time.perf_counter
+    ) -> None:
         from warp_lcp.render.picture import Picture
 
         self.recording, self.plotter, self.clock = recording, plotter, clock
@@ -50,7 +52,14 @@ class Viewer:
         self.place = min(max(place, 0), len(self.recording.numbers) - 1)
         frame = self.recording.frame(self.recording.numbers[self.place])
         self.picture.place(frame)
-        self.plotter.add_text(f"t = {frame.time:.3f} s", position="upper_left", font_size=12, color=INK, name="time", render=False)
+        self.plotter.add_text(
+            f"t = {frame.time:.3f} s",
+            position="upper_left",
+            font_size=12,
+            color=INK,
+            name="time",
+            render=False,
+        )
         if self._slider is not None:
             self._slider.GetRepresentation().SetValue(self.place)
         self.plotter.render()
@@ -94,17 +103,32 @@ class Viewer:
 
     def _add_controls(self) -> None:
         last = max(len(self.recording.numbers) - 1, 1)
-        self.plotter.add_text(KEYS, position="upper_right", font_size=9, color=EDGE, name="keys", render=False)
+        self.plotter.add_text(
+            KEYS, position="upper_right", font_size=9, color=EDGE, name="keys", render=False
+        )
         if self.plotter.iren is None:
             return
         self._slider = self.plotter.add_slider_widget(
-            lambda value: None if round(value) == self.place else self.step(round(value) - self.place), rng=[0, last], value=0,
-            pointa=(0.25, 0.05), pointb=(0.75, 0.05), fmt="%.0f", color=INK, style="modern", slider_width=0.015, tube_width=0.004,
-        )  # fmt: skip
+            lambda value: (
+                None if round(value) == self.place else self.step(round(value) - self.place)
+            ),
+            rng=[0, last],
+            value=0,
+            pointa=(0.25, 0.05),
+            pointb=(0.75, 0.05),
+            fmt="%.0f",
+            color=INK,
+            style="modern",
+            slider_width=0.015,
+            tube_width=0.004,
+        )
         for key, action in (
-            ("space", self.play), ("Right", lambda: self.step(1)), ("Left", lambda: self.step(-1)),
-            ("Home", lambda: self.step(-self.place)), ("End", lambda: self.step(len(self.recording.numbers))),
-        ):  # fmt: skip
+            ("space", self.play),
+            ("Right", lambda: self.step(1)),
+            ("Left", lambda: self.step(-1)),
+            ("Home", lambda: self.step(-self.place)),
+            ("End", lambda: self.step(len(self.recording.numbers))),
+        ):
             self.plotter.add_key_event(key, action)
         self.plotter.add_timer_event(FOREVER, TICK, self.tick)
 
@@ -118,7 +142,9 @@ def check_window(folder: Path) -> None:
     try:
         import pyvista  # noqa: F401
     except ImportError as error:
-        raise RenderError(f"a window needs pyvista, which cannot be loaded ({error}): {INSTALL}") from error
+        raise RenderError(
+            f"a window needs pyvista, which cannot be loaded ({error}): {INSTALL}"
+        ) from error
     if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
         raise RenderError(_no_display("DISPLAY is not set", folder))
 
@@ -137,7 +163,9 @@ def view_run(folder: Path, looks: Looks | None = None) -> None:
     check_window(folder)
     import pyvista
 
-    plotter = pyvista.Plotter(window_size=list(WINDOW), lighting="none", title=f"{recording.scene.scene.name}: {folder}")
+    plotter = pyvista.Plotter(
+        window_size=list(WINDOW), lighting="none", title=f"{recording.scene.scene.name}: {folder}"
+    )
     with closing(plotter):
         if plotter.off_screen or plotter.render_window.GetClassName() in WITHOUT_SCREEN:
             raise RenderError(_no_display("no window can be opened", folder))
@@ -146,4 +174,7 @@ def view_run(folder: Path, looks: Looks | None = None) -> None:
 
 
 def _no_display(why: str, folder: Path) -> str:
-    return f"a window needs a display, and there is none ({why}); `warp-lcp render {folder} --film film.mp4` draws a film without one"
+    return (
+        f"a window needs a display, and there is none ({why}); `warp-lcp render {folder} --film "
+        "film.mp4` draws a film without one"
+    )

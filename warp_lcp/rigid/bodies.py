@@ -51,9 +51,11 @@ class _Begun:
 class RigidBodies:
     """Rigid bodies of a scene, pushed by material, walls and each other.
 
-    A step is `begin_step`, the material's solve with `RigidBody.apply_impulse`, and `end_step`; `restore_step` in its place if the solve
-    fails. `begin_step` leaves the velocities V* that contacts allow before the material pushes. `end_step` starts again from gravity and
-    the material's impulses and solves for the contacts once more, since the loads on walls have changed.
+    A step is `begin_step`, the material's solve with `RigidBody.apply_impulse`, and `end_step`;
+    `restore_step` in its place if the solve fails. `begin_step` leaves the velocities V* that
+    contacts allow before the material pushes. `end_step` starts again from gravity and the
+    material's impulses and solves for the contacts once more, since the loads on walls have
+    changed.
 
     Args:
         bodies: in the order of their solids.
@@ -63,8 +65,9 @@ class RigidBodies:
         dimension: 2 or 3.
         solver: solves for the impulses of contacts and joints; the default handles only contacts.
         joints: between the bodies, numbered as in `bodies`; restitution must be 0 with them.
-        ranks: processes that share the bodies, see `warp_lcp.distributed.ranks.Ranks`. Each has all of them and takes the same steps from
-            the same numbers; `begin_step`, `solve_contacts` and `end_step` are collective.
+        ranks: processes that share the bodies, see `warp_lcp.distributed.ranks.Ranks`. Each has all
+            of them and takes the same steps from the same numbers; `begin_step`, `solve_contacts`
+            and `end_step` are collective.
 
     Attributes:
         motions: a `BodyMotion` of each, for the solids.
@@ -72,9 +75,11 @@ class RigidBodies:
         contacts: points where bodies touched in the last step.
         contact_residual: of the last problem of contacts, relative to that of no impulses.
         contact_iterations: of its solve.
-        exits: sides of the domain that bodies leave by: its size [m], and bits of `warp_lcp.grid.sides.side_bits`. A body whose center of
-            mass has crossed one is out of the simulation for good: at rest outside, touched by nothing, in no frame.
-        material: whether a material may push the bodies; else contacts that hold them are not tracked.
+        exits: sides of the domain that bodies leave by: its size [m], and bits of
+            `warp_lcp.grid.sides.side_bits`. A body whose center of mass has crossed one is out of
+            the simulation for good: at rest outside, touched by nothing, in no frame.
+        material: whether a material may push the bodies; else contacts that hold them are not
+            tracked.
 
     Raises:
         ValueError: a body is not wholly inside the domain, or overlaps another body or a solid.
@@ -99,7 +104,9 @@ class RigidBodies:
         self.motions = [BodyMotion(body) for body in self.bodies]
         self._geometries = list(geometries)
         self.shapes = [ContactShape.of(geometry, dimension) for geometry in geometries]
-        self._solve = ContactSolve(ContactDetection(self.bodies, self.shapes, obstacles, dimension), solver, joints)
+        self._solve = ContactSolve(
+            ContactDetection(self.bodies, self.shapes, obstacles, dimension), solver, joints
+        )
         self.joints = self._solve.joints
         self._surfaces: list[BodySurface] | None = None
         self._begun: _Begun | None = None
@@ -118,8 +125,9 @@ class RigidBodies:
 
         Against the domain's walls, moving solids and fixed solids.
 
-        Held directions answer to no impulse of the material (see `RigidBody.inverse_mass`): it meets a body on the floor as it meets the
-        floor. `solve_contacts` updates which contacts bear.
+        Held directions answer to no impulse of the material (see `RigidBody.inverse_mass`): it
+        meets a body on the floor as it meets the floor. `solve_contacts` updates which contacts
+        bear.
 
         Args:
             time: of the state [s].
@@ -140,8 +148,19 @@ class RigidBodies:
         impulses = self._solve.push_apart(contacts, dt=dt, kick_dt=kick_dt)
         if self.material:
             self._solve.hold(contacts, impulses)
-        self.contact_residual, self.contact_iterations = self._solve.residual, self._solve.iterations
-        self._begun = _Begun(states, free, contacts, impulses, self._solve.detour(contacts, before, impulses), dt, kick_dt)
+        self.contact_residual, self.contact_iterations = (
+            self._solve.residual,
+            self._solve.iterations,
+        )
+        self._begun = _Begun(
+            states,
+            free,
+            contacts,
+            impulses,
+            self._solve.detour(contacts, before, impulses),
+            dt,
+            kick_dt,
+        )
         self._agree()
 
     def solve_contacts(self) -> None:
@@ -156,10 +175,27 @@ class RigidBodies:
         impulses = begun.impulses
         if self.bodies.given.any():
             momenta = begun.free + self.bodies.given
-            self.bodies.momentum[:], self.bodies.angular_momentum[:] = momenta[:, :3], momenta[:, 3:]
-            impulses = self._solve.push_apart(begun.contacts, begun.impulses, dt=begun.dt, kick_dt=begun.kick_dt)
-            self.contact_residual, self.contact_iterations = self._solve.residual, self._solve.iterations
-        self._begun = _Begun(begun.states, begun.free, begun.contacts, impulses, begun.detour, begun.dt, begun.kick_dt, True)
+            self.bodies.momentum[:], self.bodies.angular_momentum[:] = (
+                momenta[:, :3],
+                momenta[:, 3:],
+            )
+            impulses = self._solve.push_apart(
+                begun.contacts, begun.impulses, dt=begun.dt, kick_dt=begun.kick_dt
+            )
+            self.contact_residual, self.contact_iterations = (
+                self._solve.residual,
+                self._solve.iterations,
+            )
+        self._begun = _Begun(
+            begun.states,
+            begun.free,
+            begun.contacts,
+            impulses,
+            begun.detour,
+            begun.dt,
+            begun.kick_dt,
+            True,
+        )
         self.contact_residual = self._ranks.share(self.contact_residual)
 
     def end_step(self, dt: float) -> None:
@@ -189,11 +225,17 @@ class RigidBodies:
     def _agree(self) -> None:
         """Take the bodies, what holds them and the memory of contacts from the root rank.
 
-        Processors of another kind may round otherwise, and ranks that disagree by a bit would in time disagree on a contact.
+        Processors of another kind may round otherwise, and ranks that disagree by a bit would in
+        time disagree on a contact.
         """
         if self._ranks.size == 1:
             return
-        mine = self.state(), [body.hold for body in self.bodies], self.contacts, self.contact_residual
+        mine = (
+            self.state(),
+            [body.hold for body in self.bodies],
+            self.contacts,
+            self.contact_residual,
+        )
         state, holds, self.contacts, self.contact_residual = self._ranks.share(mine)
         self._take(state)
         for body, hold in zip(self.bodies, holds, strict=True):
@@ -205,7 +247,9 @@ class RigidBodies:
         beyond = np.zeros(len(self.bodies), dtype=bool)
         for axis, length in enumerate(size if sides else ()):
             at = self.bodies.position[:, axis]
-            beyond |= bool(sides >> 2 * axis & 1) & (at < 0.0) | bool(sides >> 2 * axis + 1 & 1) & (at > length)
+            beyond |= bool(sides >> 2 * axis & 1) & (at < 0.0) | bool(sides >> 2 * axis + 1 & 1) & (
+                at > length
+            )
         return beyond
 
     def leave(self) -> None:
@@ -238,11 +282,19 @@ class RigidBodies:
         finite = np.isfinite(self.bodies.values[:, :STATE]).all(axis=1)
         if not finite.all():
             return f"{self.bodies[int(finite.argmin())].name} has a velocity that is not finite"
-        for body, shape, motion in zip(self.bodies, self.shapes, self.motions, strict=True) if len(endless) else ():
+        for body, shape, motion in (
+            zip(self.bodies, self.shapes, self.motions, strict=True) if len(endless) else ()
+        ):
             points = motion.pose(body.time).apply(shape.points)
             for axis in endless:
-                if points[:, axis].min() - shape.radius < 0.0 or points[:, axis].max() + shape.radius > size[axis]:
-                    return f"{body.name} has reached a side of the periodic {'xyz'[axis]} axis, which rigid bodies cannot cross"
+                if (
+                    points[:, axis].min() - shape.radius < 0.0
+                    or points[:, axis].max() + shape.radius > size[axis]
+                ):
+                    return (
+                        f"{body.name} has reached a side of the periodic {'xyz'[axis]} axis, "
+                        "which rigid bodies cannot cross"
+                    )
         return None
 
     def top_speed(self, span: float, gravity: float = 0.0) -> float:
@@ -259,7 +311,10 @@ class RigidBodies:
     def kinetic_energy(self) -> float:
         """Return the kinetic energy [J; J/m in 2-D]."""
         six = self.bodies.velocities()
-        return 0.5 * float((self.bodies.momentum * six[:, :3]).sum() + (self.bodies.angular_momentum * six[:, 3:]).sum())
+        return 0.5 * float(
+            (self.bodies.momentum * six[:, :3]).sum()
+            + (self.bodies.angular_momentum * six[:, 3:]).sum()
+        )
 
     def potential_energy(self, gravity: np.ndarray) -> float:
         """Return the potential energy [J; J/m in 2-D], 0 at the origin."""
@@ -278,23 +333,30 @@ class RigidBodies:
         """
         states = np.asarray(state["bodies"], dtype=np.float64)
         if states.shape != (len(self.bodies), STATE):
-            raise ValueError(f"the state's bodies have shape {states.shape}: this scene has {(len(self.bodies), STATE)}")
+            raise ValueError(
+                f"the state's bodies have shape {states.shape}: this scene has "
+                f"{(len(self.bodies), STATE)}"
+            )
         self._begun = None
         self._take(state)
 
     def _take(self, state: Mapping[str, np.ndarray]) -> None:
         self._solve.memory.restore(state.get("body_contacts", np.zeros((0, 8))))
-        self._solve.joint_impulses = np.array(state.get("joint_impulses", 0.0 * self._solve.joint_impulses), dtype=np.float64)
+        self._solve.joint_impulses = np.array(
+            state.get("joint_impulses", 0.0 * self._solve.joint_impulses), dtype=np.float64
+        )
         self.bodies.restore(np.asarray(state["bodies"], dtype=np.float64))
 
     def columns(self) -> tuple[str, ...]:
         """Return the log columns: position, velocity and rotation of each body.
 
-        x, y, z: the center of mass [m]; vx, vy, vz: its velocity [m/s]; 2-D: angle and spin, how far it has turned [degrees] and how fast
-        it turns [degrees/s]; 3-D: wx, wy, wz, the angular velocity [degrees/s]. contacts: points where bodies touch or nearly do;
-        contact_residual: how well the problem of their impulses was solved, relative to that of no impulses. With open sides:
-        bodies_gone, how many bodies have left by them. With joints: joint_error, the largest distance of anchors [m] or angle between what
-        is held [rad]; of each hinge, numbered among the joints, joint0_angle [degrees], and joint0_torque of its motor [N m].
+        x, y, z: the center of mass [m]; vx, vy, vz: its velocity [m/s]; 2-D: angle and spin, how
+        far it has turned [degrees] and how fast it turns [degrees/s]; 3-D: wx, wy, wz, the angular
+        velocity [degrees/s]. contacts: points where bodies touch or nearly do; contact_residual:
+        how well the problem of their impulses was solved, relative to that of no impulses. With
+        open sides: bodies_gone, how many bodies have left by them. With joints: joint_error, the
+        largest distance of anchors [m] or angle between what is held [rad]; of each hinge, numbered
+        among the joints, joint0_angle [degrees], and joint0_torque of its motor [N m].
         """
         names = IN_PLANE if self.dimension == 2 else IN_SPACE
         return (
@@ -302,13 +364,26 @@ class RigidBodies:
             "contacts",
             "contact_residual",
             *(("bodies_gone",) if self.exits[1] else ()),
-            *(("joint_error", *(f"joint{number}_{name}" for number, name in self._joint_columns())) if self.joints else ()),
+            *(
+                (
+                    "joint_error",
+                    *(f"joint{number}_{name}" for number, name in self._joint_columns()),
+                )
+                if self.joints
+                else ()
+            ),
         )
 
     def _joint_columns(self) -> list[tuple[int, str]]:
         """Return what the log has of each joint."""
-        hinges = [(number, joint) for number, joint in enumerate(self.joints) if joint.kind == "hinge"]
-        return [(number, name) for number, j in hinges for name in ("angle", *(("torque",) if j.motor_torque > 0.0 else ()))]
+        hinges = [
+            (number, joint) for number, joint in enumerate(self.joints) if joint.kind == "hinge"
+        ]
+        return [
+            (number, name)
+            for number, j in hinges
+            for name in ("angle", *(("torque",) if j.motor_torque > 0.0 else ()))
+        ]
 
     def _joint_row(self) -> list[float]:
         """Return the entries of the columns of joints."""
@@ -318,7 +393,10 @@ class RigidBodies:
         for joint in self.joints:
             rows = joint.rows(self.bodies, 1.0, self.dimension)
             errors.append(float(np.abs(rows.error[rows.equations]).max()))
-        values = {"angle": lambda number: float(np.degrees(self.joints[number].angle(self.bodies))), "torque": torques.__getitem__}
+        values = {
+            "angle": lambda number: float(np.degrees(self.joints[number].angle(self.bodies))),
+            "torque": torques.__getitem__,
+        }
         return [max(errors), *(values[name](number) for number, name in self._joint_columns())]
 
     def row(self) -> dict[str, float | int]:
@@ -327,12 +405,23 @@ class RigidBodies:
         six[:, 3:] = np.degrees(six[:, 3:])
         columns = [bodies.position, six]
         if self.dimension == 2:
-            columns = [bodies.position[:, :2], six[:, :2], np.degrees(bodies.angle)[:, None], six[:, 5:]]
+            columns = [
+                bodies.position[:, :2],
+                six[:, :2],
+                np.degrees(bodies.angle)[:, None],
+                six[:, 5:],
+            ]
         numbers = np.concatenate(columns, axis=1).ravel().tolist()
         gone = [int(self.gone().sum())] if self.exits[1] else []
         if self._columns is None:
             self._columns = self.columns()
-        return dict(zip(self._columns, [*numbers, self.contacts, float(self.contact_residual), *gone, *self._joint_row()], strict=True))
+        return dict(
+            zip(
+                self._columns,
+                [*numbers, self.contacts, float(self.contact_residual), *gone, *self._joint_row()],
+                strict=True,
+            )
+        )
 
     def surfaces(self) -> BodySurface:
         """Return the surfaces of all bodies for a frame.
@@ -340,15 +429,28 @@ class RigidBodies:
         Fields: `body`, counted from 0, and `velocity` [m/s].
         """
         if self._surfaces is None:
-            self._surfaces = [body_surface(geometry, self.dimension) for geometry in self._geometries]
+            self._surfaces = [
+                body_surface(geometry, self.dimension) for geometry in self._geometries
+            ]
         placed, gone = [], self.gone()
-        for number, (body, motion, surface) in enumerate(zip(self.bodies, self.motions, self._surfaces, strict=True)):
+        for number, (body, motion, surface) in enumerate(
+            zip(self.bodies, self.motions, self._surfaces, strict=True)
+        ):
             points = motion.pose(body.time).apply(surface.points)
             velocity = body.velocity + np.cross(body.angular_velocity, points - body.position)
-            fields = {"body": np.full(len(points), number, dtype=np.int32), "velocity": velocity.astype(np.float32)}
+            fields = {
+                "body": np.full(len(points), number, dtype=np.int32),
+                "velocity": velocity.astype(np.float32),
+            }
             shown = surface.corners[:0] if gone[number] else surface.corners
             kept = slice(0, 0 if gone[number] else None)
-            placed.append(BodySurface(points[kept].astype(np.float32), shown, {name: values[kept] for name, values in fields.items()}))
+            placed.append(
+                BodySurface(
+                    points[kept].astype(np.float32),
+                    shown,
+                    {name: values[kept] for name, values in fields.items()},
+                )
+            )
         return BodySurface.joined(placed)
 
     def _states(self) -> np.ndarray:

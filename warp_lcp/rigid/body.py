@@ -16,17 +16,23 @@ from warp_lcp.rows import KernelFile
 from warp_lcp.rows.host_kernel import HostKernel
 from warp_lcp.settings import NonNegative, Part, checked
 
-MOST_ROUNDS = 60  # of the fixed point; a step turns a body by far less than a radian, and each round by a factor of that less
+# of the fixed point; a step turns a body by far less than a radian, and each round by a factor of
+# that less
+MOST_ROUNDS = 60
 STATE, VALUES = 20, 26  # numbers of a body's state, and with the impulses given
-POSITION, ROTATION, MOMENTUM, SPINNING = slice(0, 3), slice(3, 12), slice(12, 15), slice(15, 18)  # where in the state
+# where in the state
+POSITION, ROTATION, MOMENTUM, SPINNING = slice(0, 3), slice(3, 12), slice(12, 15), slice(15, 18)
 ANGLE, TIME, GIVEN = 18, 19, slice(20, 26)
 UNIT, EPSILON = np.eye(3), float(np.finfo(np.float64).eps)
-CROSS = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(0, 2, 1).reshape(3, 9)  # v @ CROSS: entries of the matrix of v x
+# v @ CROSS: entries of the matrix of v x
+CROSS = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(0, 2, 1).reshape(3, 9)
 NO_TIMES = np.zeros(0)
 AXES = [0, 1, 2]
 PLANAR = [0, 1, 5]  # vx, vy, wz among the six
 KERNELS = KernelFile(Path(__file__).parent / "headers/motion.h", {"MOST_ROUNDS": MOST_ROUNDS})
-ADVANCE, POSES = (HostKernel(KERNELS[f"warp_lcp.rigid.motion.{name}"]) for name in ("advance", "poses"))
+ADVANCE, POSES = (
+    HostKernel(KERNELS[f"warp_lcp.rigid.motion.{name}"]) for name in ("advance", "poses")
+)
 
 
 def _part(columns: slice, shape: tuple[int, ...] = (-1,)) -> property:
@@ -66,15 +72,18 @@ class RigidBody:
         angular_velocity: at the start [rad/s], shape (3,).
 
     Attributes:
-        values: everything that changes but `hold`, shape (26,); a row of `BodyStates` for a body of several. What the attributes below
-            return is a copy, not to be written to; assign a new value.
+        values: everything that changes but `hold`, shape (26,); a row of `BodyStates` for a body of
+            several. What the attributes below return is a copy, not to be written to; assign a new
+            value.
         position: of the center of mass [m], shape (3,).
         rotation: from where the scene placed it, shape (3, 3).
         momentum: [kg m/s], shape (3,).
         angular_momentum: about the center of mass, in the world's axes [kg m^2/s], shape (3,).
-        angle: by how much it has turned about z [rad], as many turns as they are; of meaning in 2-D.
+        angle: by how much it has turned about z [rad], as many turns as they are; of meaning in
+            2-D.
         time: of the state [s].
-        hold: matrix from an impulse to the part left by contacts, shape (k, k); None: identity. See `RigidBodies.begin_step`.
+        hold: matrix from an impulse to the part left by contacts, shape (k, k); None: identity. See
+            `RigidBodies.begin_step`.
         given: impulses since `hold` was set, as they were given, shape (6,): force and torque.
 
     Raises:
@@ -92,7 +101,10 @@ class RigidBody:
         angular_velocity: np.ndarray | None = None,
     ) -> None:
         """Place the body where the scene does."""
-        self.friction, self.restitution = checked("friction", friction, NonNegative), checked("restitution", restitution, Part)
+        self.friction, self.restitution = (
+            checked("friction", friction, NonNegative),
+            checked("restitution", restitution, Part),
+        )
         self.properties, self.name = properties, name
         self.values = np.zeros(VALUES)
         self.states: BodyStates | None = None  # that `values` are a row of
@@ -130,7 +142,9 @@ class RigidBody:
     @property
     def kinetic_energy(self) -> float:
         """Kinetic energy of translation and rotation [J]."""
-        return 0.5 * float(self.momentum @ self.velocity + self.angular_momentum @ self.angular_velocity)
+        return 0.5 * float(
+            self.momentum @ self.velocity + self.angular_momentum @ self.angular_velocity
+        )
 
     def potential_energy(self, gravity: np.ndarray) -> float:
         """Return the potential energy [J], 0 at the origin.
@@ -155,8 +169,9 @@ class RigidBody:
 
         Symmetric.
 
-        That is block diag(1/m, I^-1), less what contacts with walls take while they hold the body (between `RigidBodies.begin_step` and
-        `end_step`): 0 along directions in which it cannot move.
+        That is block diag(1/m, I^-1), less what contacts with walls take while they hold the body
+        (between `RigidBodies.begin_step` and `end_step`): 0 along directions in which it cannot
+        move.
         """
         free = self.free_inverse_mass(dimension)
         if self.hold is None:
@@ -171,7 +186,9 @@ class RigidBody:
 
     def accelerate(self, gravity: np.ndarray, dt: float) -> None:
         """Apply gravity [m/s^2], shape (3,), for dt [s]."""
-        self.momentum = self.momentum + self.properties.mass * dt * np.asarray(gravity, dtype=np.float64)
+        self.momentum = self.momentum + self.properties.mass * dt * np.asarray(
+            gravity, dtype=np.float64
+        )
 
     def apply_impulse(self, impulse: np.ndarray) -> None:
         """Apply an impulse and an angular impulse, less the part that walls take.
@@ -193,7 +210,9 @@ class RigidBody:
 
     def advance(self, dt: float) -> None:
         """Move along the velocities for dt [s]; momenta are constant."""
-        advance_states(self.values[None], np.array([self.properties.mass]), self.properties.inverse_inertia, dt)
+        advance_states(
+            self.values[None], np.array([self.properties.mass]), self.properties.inverse_inertia, dt
+        )
 
     def shift(self, way: np.ndarray) -> None:
         """Move by a small displacement (m, rad), shape (k,), without velocity."""
@@ -232,10 +251,12 @@ class BodyStates(Sequence[RigidBody]):
     """Several bodies with their states in one array.
 
     Args:
-        bodies: whose states become rows of the array, so that a body belongs to one `BodyStates`, the last one made of it.
+        bodies: whose states become rows of the array, so that a body belongs to one `BodyStates`,
+            the last one made of it.
 
     Attributes:
-        values: of all bodies, shape (n, 26); the views of it below have shapes (n, 3), (n, 3, 3), (n,) and (n, 6).
+        values: of all bodies, shape (n, 26); the views of it below have shapes (n, 3), (n, 3, 3),
+            (n,) and (n, 6).
         mass: [kg], shape (n,), as the bodies have it when this is made.
         center: centers of mass as the scene places them [m], shape (n, 3).
         inverse_inertia: as the scene places them [1/(kg m^2)], shape (n, 3, 3).
@@ -249,9 +270,16 @@ class BodyStates(Sequence[RigidBody]):
         each = [body.properties for body in bodies]
         self.mass = np.array([properties.mass for properties in each])
         self.center = np.array([properties.center for properties in each]).reshape(-1, 3)
-        self.inverse_inertia = np.array([properties.inverse_inertia for properties in each]).reshape(-1, 3, 3)
-        self.position, self.momentum, self.angular_momentum = (self.values[:, part] for part in (POSITION, MOMENTUM, SPINNING))
-        self.rotation, self.given = self.values[:, ROTATION].reshape(-1, 3, 3), self.values[:, GIVEN]
+        self.inverse_inertia = np.array(
+            [properties.inverse_inertia for properties in each]
+        ).reshape(-1, 3, 3)
+        self.position, self.momentum, self.angular_momentum = (
+            self.values[:, part] for part in (POSITION, MOMENTUM, SPINNING)
+        )
+        self.rotation, self.given = (
+            self.values[:, ROTATION].reshape(-1, 3, 3),
+            self.values[:, GIVEN],
+        )
         self.angle, self.time = self.values[:, ANGLE], self.values[:, TIME]
 
     @classmethod
@@ -285,7 +313,8 @@ class BodyStates(Sequence[RigidBody]):
     def inverse_masses(self, dimension: int) -> np.ndarray:
         """Return `RigidBody.inverse_mass` of all, shape (n, k, k)."""
         if dimension == 2:
-            across = self.rotation[:, 2:]  # the last row of R I^-1 R', as far as it counts in the plane
+            # the last row of R I^-1 R', as far as it counts in the plane
+            across = self.rotation[:, 2:]
             result = np.zeros((len(self), 3, 3))
             result[:, 0, 0] = result[:, 1, 1] = 1.0 / self.mass
             result[:, 2, 2] = (across @ self.inverse_inertia @ across.swapaxes(-1, -2))[:, 0, 0]
@@ -309,7 +338,10 @@ class BodyStates(Sequence[RigidBody]):
         if all(body.hold is None for body in self._bodies):
             self.push(impulses)
             return
-        held = [impulse if body.hold is None else body.hold @ impulse for body, impulse in zip(self, impulses, strict=True)]
+        held = [
+            impulse if body.hold is None else body.hold @ impulse
+            for body, impulse in zip(self, impulses, strict=True)
+        ]
         self.push(np.array(held).reshape(impulses.shape))
 
     def push(self, impulses: np.ndarray) -> None:
@@ -354,7 +386,9 @@ class BodyMotion:
         At the time of the body's state its pose, later the one after the present velocities.
         """
         body = self.body
-        position, rotation = (body.position, body.rotation) if time == body.time else body.after(time - body.time)
+        position, rotation = (
+            (body.position, body.rotation) if time == body.time else body.after(time - body.time)
+        )
         center = body.properties.center
         return Pose.about(center, rotation, position - center)
 
@@ -367,7 +401,9 @@ class BodyMotion:
         n, m = len(motions), len(times)
         reals = _moved(motions, times)
         begin, middle, end = 39 * n + m, 39 * n + m + 9 * m * n, 39 * n + m + 12 * m * n
-        return reals[begin:middle].reshape(m, n, 3, 3).copy(), reals[middle:end].reshape(m, n, 3).copy()
+        return reals[begin:middle].reshape(m, n, 3, 3).copy(), reals[middle:end].reshape(
+            m, n, 3
+        ).copy()
 
     @staticmethod
     def velocity_fields_of(motions: Sequence[BodyMotion]) -> tuple[np.ndarray, np.ndarray]:
@@ -377,13 +413,17 @@ class BodyMotion:
         """
         n = len(motions)
         reals = _moved(motions, NO_TIMES)
-        return reals[39 * n : 48 * n].reshape(n, 3, 3).copy(), reals[48 * n : 51 * n].reshape(n, 3).copy()
+        return reals[39 * n : 48 * n].reshape(n, 3, 3).copy(), reals[48 * n : 51 * n].reshape(
+            n, 3
+        ).copy()
 
 
 def _moved(motions: Sequence[BodyMotion], times: np.ndarray) -> np.ndarray:
     """Return memory of the kernel `poses`: rotations and translations at m times are from 39 n + m on, turns and shifts after them."""
     n, m = len(motions), len(times)
-    reals, _ = POSES.run((*_held(motions), times), (), tasks=n, work=12 * n * (m + 1), count=n, times=m)
+    reals, _ = POSES.run(
+        (*_held(motions), times), (), tasks=n, work=12 * n * (m + 1), count=n, times=m
+    )
     return reals
 
 
@@ -393,7 +433,10 @@ def _held(motions: Sequence[BodyMotion]) -> tuple[np.ndarray, ...]:
     if states is not None and len(states) == len(bodies) and all(map(is_, bodies, states)):
         return states.values, states.mass, states.inverse_inertia, states.center
     each, values = [body.properties for body in bodies], np.array([body.values for body in bodies])
-    return values, *(np.array([getattr(of, name) for of in each]) for name in ("mass", "inverse_inertia", "center"))
+    return values, *(
+        np.array([getattr(of, name) for of in each])
+        for name in ("mass", "inverse_inertia", "center")
+    )
 
 
 def in_space(values: np.ndarray) -> np.ndarray:
@@ -408,15 +451,20 @@ def in_space(values: np.ndarray) -> np.ndarray:
 
 def spins(rotation: np.ndarray, inverse_inertia: np.ndarray, momentum: np.ndarray) -> np.ndarray:
     """Return angular velocities R I^-1 R' L [rad/s], shape (..., 3)."""
-    return np.asarray(rotation @ (inverse_inertia @ (rotation.swapaxes(-1, -2) @ momentum[..., None])))[..., 0]
+    return np.asarray(
+        rotation @ (inverse_inertia @ (rotation.swapaxes(-1, -2) @ momentum[..., None]))
+    )[..., 0]
 
 
-def advance_states(values: np.ndarray, mass: np.ndarray, inverse_inertia: np.ndarray, dt: float | np.ndarray) -> None:
+def advance_states(
+    values: np.ndarray, mass: np.ndarray, inverse_inertia: np.ndarray, dt: float | np.ndarray
+) -> None:
     """Move bodies along their velocities for dt [s]; `values` are updated.
 
-    A turn is about the angular velocity in the middle of the step, whose inertia is that of half the turn (the implicit midpoint
-    rule on rotations): angular momentum is kept exactly, and the energy of a free rotation does not drift, as the rule is its own
-    inverse backwards in time. With w = R I^-1 R' L it is the fixed point of h <- dt/2 w(exp(h) R), found for each body by itself.
+    A turn is about the angular velocity in the middle of the step, whose inertia is that of half
+    the turn (the implicit midpoint rule on rotations): angular momentum is kept exactly, and the
+    energy of a free rotation does not drift, as the rule is its own inverse backwards in time. With
+    w = R I^-1 R' L it is the fixed point of h <- dt/2 w(exp(h) R), found for each body by itself.
 
     Args:
         values: rows of `RigidBody.values`, shape (n, 26).
@@ -425,7 +473,11 @@ def advance_states(values: np.ndarray, mass: np.ndarray, inverse_inertia: np.nda
         dt: time [s], or one for each, shape (n,).
     """
     count = len(values)
-    inverse = inverse_inertia if inverse_inertia.ndim == 3 else np.broadcast_to(inverse_inertia, (count, 3, 3))
+    inverse = (
+        inverse_inertia
+        if inverse_inertia.ndim == 3
+        else np.broadcast_to(inverse_inertia, (count, 3, 3))
+    )
     each = dt if isinstance(dt, np.ndarray) else np.full(count, dt)
     reals, _ = ADVANCE.run((values, mass, inverse, each), (), tasks=count, count=count)
     values[:] = reals[: values.size].reshape(values.shape)
@@ -434,7 +486,9 @@ def advance_states(values: np.ndarray, mass: np.ndarray, inverse_inertia: np.nda
 def shift_states(values: np.ndarray, ways: np.ndarray) -> None:
     """Move bodies by small displacements (m, rad), shape (n, 6), without velocity."""
     values[:, POSITION] += ways[:, :3]
-    values[:, ROTATION] = (rotation_by(ways[:, 3:]) @ values[:, ROTATION].reshape(-1, 3, 3)).reshape(-1, 9)
+    values[:, ROTATION] = (
+        rotation_by(ways[:, 3:]) @ values[:, ROTATION].reshape(-1, 3, 3)
+    ).reshape(-1, 9)
     values[:, ANGLE] += ways[:, 5]
 
 

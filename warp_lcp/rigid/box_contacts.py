@@ -9,7 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-FACE_FIRST = 1e-2  # of a half side: an edge axis must separate by so much more than the faces, as faces give more points
+# of a half side: an edge axis must separate by so much more than the faces, as faces give more
+# points
+FACE_FIRST = 1e-2
 PARALLEL = 1e-6  # squared sine of two edges below which their cross product is no axis
 
 
@@ -23,7 +25,9 @@ class OrientedBox:
 
     def corners(self) -> np.ndarray:
         """Return the corners [m], shape (8, 3)."""
-        signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)], dtype=np.float64)
+        signs = np.array(
+            [[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)], dtype=np.float64
+        )
         return self.center + (signs * self.half) @ self.rotation.T
 
     def reach(self, axes: np.ndarray) -> np.ndarray:
@@ -31,14 +35,17 @@ class OrientedBox:
         return np.abs(axes @ self.rotation) @ self.half
 
 
-def box_box(a: OrientedBox, b: OrientedBox, margin: float) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+def box_box(
+    a: OrientedBox, b: OrientedBox, margin: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Return contact points, unit normal and gaps of two boxes.
 
     Points [m], shape (k, 3); normal from b to a; gaps [m], shape (k,), negative where they overlap.
 
-    Of 15 axes (3 face normals of each, 9 cross products of edges) the one along which the boxes are farthest apart, or overlap least, is
-    the normal. For a face, the face of the other box that looks at it is clipped against its sides (Sutherland and Hodgman), and points
-    within the margin are kept; for edges there is one point, halfway between them.
+    Of 15 axes (3 face normals of each, 9 cross products of edges) the one along which the boxes are
+    farthest apart, or overlap least, is the normal. For a face, the face of the other box that
+    looks at it is clipped against its sides (Sutherland and Hodgman), and points within the margin
+    are kept; for edges there is one point, halfway between them.
 
     Args:
         a: one box.
@@ -73,7 +80,9 @@ def box_box(a: OrientedBox, b: OrientedBox, margin: float) -> tuple[np.ndarray, 
     return points[near] - 0.5 * gaps[near, None] * outward, sign * outward, gaps[near]
 
 
-def _edges(a: OrientedBox, b: OrientedBox, first: int, second: int, normal: np.ndarray) -> tuple[np.ndarray, float]:
+def _edges(
+    a: OrientedBox, b: OrientedBox, first: int, second: int, normal: np.ndarray
+) -> tuple[np.ndarray, float]:
     """Return the point halfway between the supporting edges of a (axis `first`) and b, and the gap along the normal."""
     ends = []
     for box, axis, toward in ((a, first, -normal), (b, second, normal)):
@@ -88,7 +97,9 @@ def _edges(a: OrientedBox, b: OrientedBox, first: int, second: int, normal: np.n
     return 0.5 * (p + q), float((p - q) @ normal)
 
 
-def _clip(reference: OrientedBox, incident: OrientedBox, axis: int, outward: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _clip(
+    reference: OrientedBox, incident: OrientedBox, axis: int, outward: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the corners of the incident face clipped by the sides of the reference face, and their heights above it [m]."""
     facing = incident.rotation.T @ outward
     k = int(np.abs(facing).argmax())
@@ -110,7 +121,11 @@ def _cut(polygon: list[np.ndarray], normal: np.ndarray, offset: float) -> list[n
     heights = [float(normal @ p) - offset for p in polygon]
     tiny = 1e-12 * (1 + abs(offset))
     for n, p in enumerate(polygon):
-        q, h, next_height = polygon[(n + 1) % len(polygon)], heights[n], heights[(n + 1) % len(polygon)]
+        q, h, next_height = (
+            polygon[(n + 1) % len(polygon)],
+            heights[n],
+            heights[(n + 1) % len(polygon)],
+        )
         if h <= tiny:
             kept.append(p)
         if (h > tiny and next_height < -tiny) or (h < -tiny and next_height > tiny):

@@ -18,8 +18,11 @@ FLAT = {2: 2, 3: 4}  # contacts of a pair with about one normal: a flat rest nee
 MOST = {2: 4, 3: 8}  # contacts of a pair
 OTHER_SIDE = 0.1  # of normals' difference: contacts of sides that differ by less count as of one
 SAME = 1e-6  # of a shape's size: points of contact this close are one
-LOWER = 20.0  # so many times the gap must a point be farther from the others to count more than one with less
-MUCH_LOWER = 200.0  # for those that come on top where others lie lower: what a round rim rests on is not what it may tip over
+# so many times the gap must a point be farther from the others to count more than one with less
+LOWER = 20.0
+# for those that come on top where others lie lower: what a round rim rests on is not what it may
+# tip over
+MUCH_LOWER = 200.0
 MORE = 2  # of these, at most
 NONE = -1  # in the place of an obstacle: it is a body
 LEVEL = 1e-4  # of the smaller shape's size: gaps that differ by less are of one height
@@ -56,9 +59,18 @@ class ContactPoints:
         """Return the points of several pairs as one."""
         some = [points for points in several if len(points.gap)]
         if len(some) < 2:
-            point, normal, gap = (some[0].point, some[0].normal, some[0].gap) if some else (np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+            point, normal, gap = (
+                (some[0].point, some[0].normal, some[0].gap)
+                if some
+                else (np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+            )
             return cls(np.ascontiguousarray(point), np.ascontiguousarray(normal), gap)
-        return cls(*(np.concatenate([getattr(points, name) for points in some]) for name in ("point", "normal", "gap")))
+        return cls(
+            *(
+                np.concatenate([getattr(points, name) for points in some])
+                for name in ("point", "normal", "gap")
+            )
+        )
 
 
 class Place(NamedTuple):
@@ -75,7 +87,9 @@ class Place(NamedTuple):
         return np.asarray(points @ self.rotation.T + self.translation)
 
 
-def on_plane(shape: ContactShape, pose: Pose | Place, point: np.ndarray, normal: np.ndarray, margin: float) -> ContactPoints:
+def on_plane(
+    shape: ContactShape, pose: Pose | Place, point: np.ndarray, normal: np.ndarray, margin: float
+) -> ContactPoints:
     """Return the contact points of a shape with a plane.
 
     Args:
@@ -92,11 +106,18 @@ def on_plane(shape: ContactShape, pose: Pose | Place, point: np.ndarray, normal:
     return ContactPoints(places, np.broadcast_to(normal, places.shape), gap[near])
 
 
-def between(one: ContactShape, at: Pose | Place, other: ContactShape, there: Pose | Place, margin: float, dimension: int) -> ContactPoints:
+def between(
+    one: ContactShape,
+    at: Pose | Place,
+    other: ContactShape,
+    there: Pose | Place,
+    margin: float,
+    dimension: int,
+) -> ContactPoints:
     """Return the contact points of two shapes; normals point to the first.
 
-    Boxes by the axis along which they overlap least; others by points of either surface, and in space those of either's edges that are
-    nearest to the other, and the distance to the other one.
+    Boxes by the axis along which they overlap least; others by points of either surface, and in
+    space those of either's edges that are nearest to the other, and the distance to the other one.
 
     Args:
         one: a shape, as placed.
@@ -107,7 +128,13 @@ def between(one: ContactShape, at: Pose | Place, other: ContactShape, there: Pos
         dimension: 2 or 3.
     """
     if one.boxes and other.boxes:
-        return ContactPoints.joined([_boxes(_moved(a, at), _moved(b, there), margin, dimension) for a in one.boxes for b in other.boxes])
+        return ContactPoints.joined(
+            [
+                _boxes(_moved(a, at), _moved(b, there), margin, dimension)
+                for a in one.boxes
+                for b in other.boxes
+            ]
+        )
     single = [len(shape.points) == 1 for shape in (one, other)]  # the center of a ball says all
     found = []
     if not single[1] or single[0]:
@@ -115,12 +142,20 @@ def between(one: ContactShape, at: Pose | Place, other: ContactShape, there: Pos
     if not single[0] and len(other.points):
         found.append(_points_of(other, there, one, at, margin, other.points).turned())
     if dimension == 3:
-        found.append(_points_of(one, at, other, there, margin, _nearest_of(one, at, other, there, margin)))
-        found.append(_points_of(other, there, one, at, margin, _nearest_of(other, there, one, at, margin)).turned())
+        found.append(
+            _points_of(one, at, other, there, margin, _nearest_of(one, at, other, there, margin))
+        )
+        found.append(
+            _points_of(
+                other, there, one, at, margin, _nearest_of(other, there, one, at, margin)
+            ).turned()
+        )
     return ContactPoints.joined(found)
 
 
-def _nearest_of(one: ContactShape, at: Pose | Place, other: ContactShape, there: Pose | Place, margin: float) -> np.ndarray:
+def _nearest_of(
+    one: ContactShape, at: Pose | Place, other: ContactShape, there: Pose | Place, margin: float
+) -> np.ndarray:
     """Return the points of one shape's edges that are nearest to the other, where that has a surface between its own points."""
     if not len(one.edges) or len(other.points) == 1:
         return np.zeros((0, 3))
@@ -130,7 +165,12 @@ def _nearest_of(one: ContactShape, at: Pose | Place, other: ContactShape, there:
 
 
 def _points_of(
-    one: ContactShape, at: Pose | Place, other: ContactShape, there: Pose | Place, margin: float, points: np.ndarray
+    one: ContactShape,
+    at: Pose | Place,
+    other: ContactShape,
+    there: Pose | Place,
+    margin: float,
+    points: np.ndarray,
 ) -> ContactPoints:
     """Return which of some points of one shape, in the axes in which it is placed, are near the other."""
     centers = at.apply(points)
@@ -145,7 +185,9 @@ def _points_of(
     gap = distance - one.radius
     near = gap <= margin
     normal = direction[near] @ there.rotation.T
-    return ContactPoints(centers[near] - (one.radius + 0.5 * gap[near])[:, None] * normal, normal, gap[near])
+    return ContactPoints(
+        centers[near] - (one.radius + 0.5 * gap[near])[:, None] * normal, normal, gap[near]
+    )
 
 
 def _moved(box: OrientedBox, pose: Pose | Place) -> OrientedBox:
@@ -156,7 +198,9 @@ def _boxes(a: OrientedBox, b: OrientedBox, margin: float, dimension: int) -> Con
     """Return where two boxes touch; in 2-D they are thick, and of their contacts those of one face count."""
     if dimension == 2:
         deep = max(a.half[2], b.half[2])
-        a, b = (OrientedBox(box.center, box.rotation, np.array([*box.half[:2], deep])) for box in (a, b))
+        a, b = (
+            OrientedBox(box.center, box.rotation, np.array([*box.half[:2], deep])) for box in (a, b)
+        )
     hit = box_box(a, b, margin)
     if hit is None:
         return ContactPoints.joined([])
@@ -170,7 +214,8 @@ def _boxes(a: OrientedBox, b: OrientedBox, margin: float, dimension: int) -> Con
 def spread(points: ContactPoints, size: float, dimension: int) -> ContactPoints:
     """Return the deepest point and others far from it, enough to support a body.
 
-    Where all have about one normal that is two points in 2-D and four in 3-D, and up to two more if some of these are higher than others.
+    Where all have about one normal that is two points in 2-D and four in 3-D, and up to two more if
+    some of these are higher than others.
 
     Args:
         points: the points.
@@ -208,7 +253,8 @@ def close_pairs(middle: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.nd
     low, high = middle - half, middle + half
     first, *others = np.argsort(-np.ptp(middle, axis=0), kind="stable").tolist()
     order = np.argsort(low[:, first], kind="stable")
-    ends = np.searchsorted(low[order, first], high[order, first], side="right")  # who begins before a box ends, after itself
+    # who begins before a box ends, after itself
+    ends = np.searchsorted(low[order, first], high[order, first], side="right")
     after = ends - np.arange(len(order)) - 1
     one = np.repeat(np.arange(len(order)), after)
     other = one + 1 + np.arange(len(one)) - np.repeat(np.cumsum(after) - after, after)
@@ -244,7 +290,12 @@ class FoundContacts:
 
     def where(self, chosen: np.ndarray) -> FoundContacts:
         """Return the contacts that are chosen, by a mask or their places."""
-        return FoundContacts(self.first[chosen], self.second[chosen], self.obstacle[chosen], self.points.where(chosen))
+        return FoundContacts(
+            self.first[chosen],
+            self.second[chosen],
+            self.obstacle[chosen],
+            self.points.where(chosen),
+        )
 
     def without(self, pairs: Collection[tuple[int, int]]) -> FoundContacts:
         """Return the contacts of other pairs than these, the smaller number first."""
@@ -255,10 +306,14 @@ class FoundContacts:
         return self.where(~np.isin(self.second * count + self.first, keys))
 
     @classmethod
-    def of(cls, first: Any, second: Any, obstacle: int, points: Sequence[ContactPoints]) -> FoundContacts:
+    def of(
+        cls, first: Any, second: Any, obstacle: int, points: Sequence[ContactPoints]
+    ) -> FoundContacts:
         """Join the contact points of pairs; first, second: shape (pairs,)."""
         counts = [len(each) for each in points]
-        one, other = (np.repeat(np.asarray(side, dtype=np.int64), counts) for side in (first, second))
+        one, other = (
+            np.repeat(np.asarray(side, dtype=np.int64), counts) for side in (first, second)
+        )
         return cls(one, other, np.full(len(one), obstacle), ContactPoints.joined(points))
 
     @classmethod
@@ -267,7 +322,10 @@ class FoundContacts:
         some = [found for found in several if len(found.first)]
         if len(some) < 2:
             return some[0] if some else several[0]
-        first, second, obstacle = (np.concatenate([getattr(f, name) for f in some]) for name in ("first", "second", "obstacle"))
+        first, second, obstacle = (
+            np.concatenate([getattr(f, name) for f in some])
+            for name in ("first", "second", "obstacle")
+        )
         return cls(first, second, obstacle, ContactPoints.joined([found.points for found in some]))
 
 
@@ -291,13 +349,22 @@ class ContactDetection:
         every: bool = False,
     ) -> None:
         self.bodies = BodyStates.of(bodies)
-        self.shapes, self.obstacles, self.dimension, self.every = shapes, obstacles, dimension, every
+        self.shapes, self.obstacles, self.dimension, self.every = (
+            shapes,
+            obstacles,
+            dimension,
+            every,
+        )
         self._middle = np.array([0.5 * (shape.low + shape.high) for shape in shapes])
         self._half = np.array([0.5 * (shape.high - shape.low) - shape.radius for shape in shapes])
         self._radius = np.array([shape.radius for shape in shapes])
-        self._ball = np.array([shape.closed and len(shape.points) == 1 and not shape.boxes for shape in shapes])
+        self._ball = np.array(
+            [shape.closed and len(shape.points) == 1 and not shape.boxes for shape in shapes]
+        )
 
-    def find(self, time: float, ways: np.ndarray, brought: np.ndarray, near: float = 0.0) -> FoundContacts:
+    def find(
+        self, time: float, ways: np.ndarray, brought: np.ndarray, near: float = 0.0
+    ) -> FoundContacts:
         """Return the contacts: obstacle by obstacle, then between bodies, pairs in order.
 
         Args:
@@ -324,12 +391,21 @@ class ContactDetection:
             first, second, margins, points = first[~balls], second[~balls], margins[~balls], []
             for i, j, margin in zip(first.tolist(), second.tolist(), margins.tolist(), strict=True):
                 one, other = self.shapes[i], self.shapes[j]
-                points.append(self._kept(between(one, poses[i], other, poses[j], margin, self.dimension), min(one.size, other.size)))
-            touching = FoundContacts.joined([touching, FoundContacts.of(first, second, NONE, points)])
+                points.append(
+                    self._kept(
+                        between(one, poses[i], other, poses[j], margin, self.dimension),
+                        min(one.size, other.size),
+                    )
+                )
+            touching = FoundContacts.joined(
+                [touching, FoundContacts.of(first, second, NONE, points)]
+            )
             touching = touching.where(np.lexsort((touching.second, touching.first)))
         return FoundContacts.joined([*found, touching])
 
-    def _balls(self, i: np.ndarray, j: np.ndarray, centers: np.ndarray, margins: np.ndarray) -> FoundContacts:
+    def _balls(
+        self, i: np.ndarray, j: np.ndarray, centers: np.ndarray, margins: np.ndarray
+    ) -> FoundContacts:
         """Return the contacts of balls i with balls j: the points between them on the lines of their centers."""
         way = centers[i] - centers[j]
         length = lengths(way)
@@ -344,7 +420,13 @@ class ContactDetection:
         return points if self.every else spread(points, size, self.dimension)
 
     def _with_obstacle(
-        self, number: int, there: Pose, poses: list[Place], middle: np.ndarray, half: np.ndarray, margins: np.ndarray
+        self,
+        number: int,
+        there: Pose,
+        poses: list[Place],
+        middle: np.ndarray,
+        half: np.ndarray,
+        margins: np.ndarray,
     ) -> FoundContacts:
         """Return where bodies touch an obstacle."""
         shape, n = self.obstacles[number].shape, len(poses)
@@ -352,16 +434,27 @@ class ContactDetection:
             return self._with_planes(number, there, poses, middle, half, margins)
         near = np.ones(n, dtype=bool)
         if shape.closed:
-            center, reach = there.apply(0.5 * (shape.low + shape.high)), np.abs(there.rotation) @ (0.5 * (shape.high - shape.low))
+            center, reach = (
+                there.apply(0.5 * (shape.low + shape.high)),
+                np.abs(there.rotation) @ (0.5 * (shape.high - shape.low)),
+            )
             near = (np.abs(middle - center) - half - reach).max(axis=1) <= margins
         first, points = np.flatnonzero(near), []
         for i in first.tolist():
-            touch = between(self.shapes[i], poses[i], shape, there, float(margins[i]), self.dimension)
+            touch = between(
+                self.shapes[i], poses[i], shape, there, float(margins[i]), self.dimension
+            )
             points.append(self._kept(touch, min(self.shapes[i].size, shape.size)))
         return FoundContacts.of(first, np.full(len(first), n), number, points)
 
     def _with_planes(
-        self, number: int, there: Pose, poses: list[Place], middle: np.ndarray, half: np.ndarray, margins: np.ndarray
+        self,
+        number: int,
+        there: Pose,
+        poses: list[Place],
+        middle: np.ndarray,
+        half: np.ndarray,
+        margins: np.ndarray,
     ) -> FoundContacts:
         """Return where bodies touch the planes of an obstacle: balls, each at one point, all at once."""
         obstacle, n = self.obstacles[number], len(poses)
@@ -372,13 +465,18 @@ class ContactDetection:
         gap = heights[i, m] - self._radius[i]
         near = balls & (gap <= margins[i])
         ball, gap, normal = i[near], gap[near], normals[m[near]]
-        touch = ContactPoints(middle[ball] - (self._radius[ball] + 0.5 * gap)[:, None] * normal, normal, gap)
+        touch = ContactPoints(
+            middle[ball] - (self._radius[ball] + 0.5 * gap)[:, None] * normal, normal, gap
+        )
         found = FoundContacts(ball, np.full(len(ball), n), np.full(len(ball), number), touch)
         if balls.all():
             return found
         i, m = i[~balls], m[~balls]
         each = [
-            self._kept(on_plane(self.shapes[a], poses[a], points[b], normals[b], margins[a]), self.shapes[a].size)
+            self._kept(
+                on_plane(self.shapes[a], poses[a], points[b], normals[b], margins[a]),
+                self.shapes[a].size,
+            )
             for a, b in zip(i.tolist(), m.tolist(), strict=True)
         ]
         found = FoundContacts.joined([found, FoundContacts.of(i, np.full(len(i), n), number, each)])

@@ -1,8 +1,9 @@
 """Newton's methods for contacts that sweeps leave unsolved: few costly steps, whatever the ratio of masses and the height of a stack.
 
-Both solve systems of bodies and contacts together, [I, -J'; W J, C], which are sparse and well scaled where B = J J' is full and is not:
-a light body between two heavy ones makes eigenvalues of B as far apart as the masses. The package's `PrimalDualActiveSet` and
-`InteriorPoint` take neither bounds that depend on x nor J.
+Both solve systems of bodies and contacts together, [I, -J'; W J, C], which are sparse and well
+scaled where B = J J' is full and is not: a light body between two heavy ones makes eigenvalues of B
+as far apart as the masses. The package's `PrimalDualActiveSet` and `InteriorPoint` take neither
+bounds that depend on x nor J.
 """
 
 from __future__ import annotations
@@ -19,8 +20,12 @@ from warp_lcp.rigid.contacts import jacobian
 if TYPE_CHECKING:
     from warp_lcp.rigid.contact_problem import ContactProblem
 
-SHIFT = 1e-11  # of B's diagonal, added in a step's matrix: four corners of a box bear its weight in many ways, and B is singular
-STARTS = (1e4, 1e2)  # times the largest velocity: where the interior point starts, and again where it jams, as friction is not monotone
+# of B's diagonal, added in a step's matrix: four corners of a box bear its weight in many ways, and
+# B is singular
+SHIFT = 1e-11
+# times the largest velocity: where the interior point starts, and again where it jams, as friction
+# is not monotone
+STARTS = (1e4, 1e2)
 MOST_SETS = 20  # steps of the active set: near its solution it needs 1 to 10
 MOST_STEPS = 80  # of the interior point: it needs 10 to 60
 JAMMED = 20  # steps without a smaller residual
@@ -58,8 +63,12 @@ class _Pairs:
 
     def length(self, step: _Pairs, normals: np.ndarray) -> float:
         """Return the part of a step, at most 1, after which something is 0."""
-        mine = np.concatenate([self.x[normals], self.normal, self.low, self.up, self.below, self.above])
-        change = np.concatenate([step.x[normals], step.normal, step.low, step.up, step.below, step.above])
+        mine = np.concatenate(
+            [self.x[normals], self.normal, self.low, self.up, self.below, self.above]
+        )
+        change = np.concatenate(
+            [step.x[normals], step.normal, step.low, step.up, step.below, step.above]
+        )
         falls = change < 0.0
         return float(min(1.0, (-mine[falls] / change[falls]).min(initial=np.inf)))
 
@@ -79,10 +88,15 @@ class ContactNewton:
 
     def __init__(self, problem: ContactProblem, x: np.ndarray) -> None:
         k, rows, _ = problem.one.shape
-        self._J = jacobian(problem.first, problem.second, problem.one, problem.other, problem.bodies)
+        self._J = jacobian(
+            problem.first, problem.second, problem.one, problem.other, problem.bodies
+        )
         self._small = self._J.toarray() if sum(self._J.shape) <= SMALL else None
         self._diagonal, self._yields = problem.yields()
-        self._b, self._reference = problem.b.ravel(), float(np.linalg.norm(np.minimum(problem.b[:, 0], 0.0)))
+        self._b, self._reference = (
+            problem.b.ravel(),
+            float(np.linalg.norm(np.minimum(problem.b[:, 0], 0.0))),
+        )
         self._normals = rows * np.arange(k)
         self._tangents = (self._normals[:, None] + np.arange(1, rows)).ravel()
         self._own = np.repeat(self._normals, rows - 1)  # the normal of each tangent
@@ -105,11 +119,14 @@ class ContactNewton:
             wanted = x - self._y(x) / d
             at_low, at_up = wanted <= low, wanted >= up
             free = ~(at_low | at_up)
-            # free: J w + (yields + SHIFT d) x = -b + SHIFT d x_before; at a bound: d (x -+ mu x_n) = 0
+            # free: J w + (yields + SHIFT d) x = -b + SHIFT d x_before; at a bound: d (x -+ mu x_n)
+            # = 0
             found = self._solved(
                 free.astype(float),
                 np.where(free, SHIFT * d + self._yields, d),
-                d[self._tangents] * self._friction * (at_low[self._tangents].astype(float) - at_up[self._tangents]),
+                d[self._tangents]
+                * self._friction
+                * (at_low[self._tangents].astype(float) - at_up[self._tangents]),
                 np.where(free, SHIFT * d * x - self._b, 0.0),
             )
             if found is None:
@@ -147,14 +164,17 @@ class ContactNewton:
             if self.residual <= rtol or since == JAMMED:
                 return
             products = now.products(self._normals)
-            step = self._direction(now, [-product for product in products])  # predictor: to the bounds
+            # predictor: to the bounds
+            step = self._direction(now, [-product for product in products])
             if step is None:
                 return
             after = now.moved(step, now.length(step, self._normals)).products(self._normals)
             mean, reached = (float(np.concatenate(values).mean()) for values in (products, after))
             center = (reached / mean) ** 3 * mean
             second = step.products(self._normals)
-            step = self._direction(now, [center - p - s for p, s in zip(products, second, strict=True)])
+            step = self._direction(
+                now, [center - p - s for p, s in zip(products, second, strict=True)]
+            )
             if step is None:
                 return
             now = now.moved(step, TO_BOUNDARY * now.length(step, self._normals))
@@ -173,17 +193,29 @@ class ContactNewton:
         diagonal[tangents] += stiff_low + stiff_up
         right = np.zeros(len(now.x))
         right[normals] = to_normal / x_n - gap_normal
-        right[tangents] = to_low / now.below - stiff_low * gap_below - to_up / now.above + stiff_up * gap_above - gap_slip
+        right[tangents] = (
+            to_low / now.below
+            - stiff_low * gap_below
+            - to_up / now.above
+            + stiff_up * gap_above
+            - gap_slip
+        )
         x = self._solved(np.ones(len(now.x)), diagonal, mu * (stiff_low - stiff_up), right)
         if x is None:
             return None
         below, above = mu * x[own] + x[tangents] + gap_below, mu * x[own] - x[tangents] + gap_above
         return _Pairs(
-            x, (to_normal - now.normal * x[normals]) / x_n, (to_low - now.low * below) / now.below,
-            (to_up - now.up * above) / now.above, below, above,
-        )  # fmt: skip
+            x,
+            (to_normal - now.normal * x[normals]) / x_n,
+            (to_low - now.low * below) / now.below,
+            (to_up - now.up * above) / now.above,
+            below,
+            above,
+        )
 
-    def _solved(self, weights: np.ndarray, diagonal: np.ndarray, coupling: np.ndarray, right: np.ndarray) -> np.ndarray | None:
+    def _solved(
+        self, weights: np.ndarray, diagonal: np.ndarray, coupling: np.ndarray, right: np.ndarray
+    ) -> np.ndarray | None:
         """Return x of [I, -J'; W J, C] [w; x] = [0; right]; None where the matrix is singular.
 
         Args:
@@ -195,8 +227,13 @@ class ContactNewton:
         self.steps += 1
         bodies, n, scale = self._J.shape[1], len(diagonal), self._scale
         J = self._small if self._small is not None else self._J
-        values, rows = np.concatenate([diagonal, coupling]), np.concatenate([np.arange(n), self._tangents])
-        C = sparse.csr_array((values, (rows, np.concatenate([np.arange(n), self._own]))), shape=(n, n))
+        values, rows = (
+            np.concatenate([diagonal, coupling]),
+            np.concatenate([np.arange(n), self._tangents]),
+        )
+        C = sparse.csr_array(
+            (values, (rows, np.concatenate([np.arange(n), self._own]))), shape=(n, n)
+        )
         sides = scale * np.concatenate([np.zeros(bodies), right])
         try:
             if self._small is not None:
@@ -205,7 +242,9 @@ class ContactNewton:
             else:
                 blocks = [[sparse.eye_array(bodies), -J.T], [sparse.diags_array(weights) @ J, C]]
                 scaling = sparse.diags_array(scale)
-                found = scale * splu((scaling @ sparse.block_array(blocks) @ scaling).tocsc()).solve(sides)
+                found = scale * splu(
+                    (scaling @ sparse.block_array(blocks) @ scaling).tocsc()
+                ).solve(sides)
         except (RuntimeError, np.linalg.LinAlgError):  # SuperLU: exactly singular; LAPACK
             return None
         return found[bodies:] if np.isfinite(found).all() else None
@@ -223,7 +262,10 @@ class ContactNewton:
         """Return the relative residual of x within its bounds, and keep x if it is the least."""
         x = np.clip(x, *self._bounds(x))
         d = self._diagonal
-        found = float(np.linalg.norm(d * (x - np.clip(x - self._y(x) / d, *self._bounds(x))))) / self._reference
+        found = (
+            float(np.linalg.norm(d * (x - np.clip(x - self._y(x) / d, *self._bounds(x)))))
+            / self._reference
+        )
         if found < self.residual:
             self.x, self.residual = x, found
         return found

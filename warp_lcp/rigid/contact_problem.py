@@ -2,12 +2,14 @@
 
 The bounds are affine in the normal impulses.
 
-It is solved by the method of `warp_lcp.solvers.nncg` on B = J J' + diag(e), in a loop of its own (`headers/contact_nncg.h`), which shares
-the formula of beta (`snippets.h`). It differs in three ways: rows are products with J at bodies, so that a sweep costs the entries of J,
-not those of B; contacts are swept in their order, not by colors; and an island of bodies is solved by one thread in one launch, which looks
-at the residual each 8 sweeps. `wl.NNCG` on the assembled B takes 390, 510 and 890 us an iteration with 20, 200 and 1,000 contacts, this
-loop 2.6, 26 and 110 us. Sweeps need about as many iterations as the ratio of masses that touch, times the
-square of a stack's height; the rest is solved by sparse systems in `contact_newton`.
+It is solved by the method of `warp_lcp.solvers.nncg` on B = J J' + diag(e), in a loop of its own
+(`headers/contact_nncg.h`), which shares the formula of beta (`snippets.h`). It differs in three
+ways: rows are products with J at bodies, so that a sweep costs the entries of J, not those of B;
+contacts are swept in their order, not by colors; and an island of bodies is solved by one thread in
+one launch, which looks at the residual each 8 sweeps. `wl.NNCG` on the assembled B takes 390, 510
+and 890 us an iteration with 20, 200 and 1,000 contacts, this loop 2.6, 26 and 110 us. Sweeps need
+about as many iterations as the ratio of masses that touch, times the square of a stack's height;
+the rest is solved by sparse systems in `contact_newton`.
 """
 
 from __future__ import annotations
@@ -27,7 +29,9 @@ from warp_lcp.rows.host_kernel import HostKernel
 if TYPE_CHECKING:
     from warp_lcp.rigid.joints import JointRows
 
-YIELDS = 1e-6  # of B, along tangents: how friction is shared between contacts then is unique, and rest creeps by 1e-7 m/s at most
+# of B, along tangents: how friction is shared between contacts then is unique, and rest creeps by
+# 1e-7 m/s at most
+YIELDS = 1e-6
 MANY = 20_000  # sweeps, where nothing else helps
 KERNELS = KernelFile(Path(__file__).parent / "headers/contact_nncg.h")
 NNCG = KERNELS["warp_lcp.rigid.contacts.nncg"]
@@ -37,7 +41,8 @@ class ContactImpulses(NamedTuple):
     """Result of a contact solve.
 
     Attributes:
-        impulses: [N s], shape (k, rows); where there are joints, these flat and then those of joints [N s, N m s], shape (k rows + m,).
+        impulses: [N s], shape (k, rows); where there are joints, these flat and then those of
+            joints [N s, N m s], shape (k rows + m,).
         residual: the largest of an island, relative to that of no impulses.
         iterations: the most of an island: sweeps, and steps of Newton's methods.
     """
@@ -66,7 +71,8 @@ class ContactProblem:
 
     The rows of each of the k contacts are its normal and its tangents.
 
-    B = J J' + YIELDS diag(J J') along tangents, J = what velocities of bodies make at contacts, times a factor of the inverse masses.
+    B = J J' + YIELDS diag(J J') along tangents, J = what velocities of bodies make at contacts,
+    times a factor of the inverse masses.
 
     Args:
         first: body of each contact, shape (k,).
@@ -101,7 +107,8 @@ class ContactProblem:
     def sorted_rows(self) -> tuple[np.ndarray, ...]:
         """Rows of the contacts, sorted by islands.
 
-        Order and starts as of `islands`; in that order J of both bodies, the diagonal of B besides J J', that of B, and the friction.
+        Order and starts as of `islands`; in that order J of both bodies, the diagonal of B besides
+        J J', that of B, and the friction.
         """
         k, rows, _ = self.one.shape
         order, starts = self.islands()
@@ -121,10 +128,13 @@ class ContactProblem:
         pairs = self.second < self.bodies
         group = self.first
         if pairs.any():
-            group = _components(self.first[pairs].tolist(), self.second[pairs].tolist(), self.bodies)[group]
+            group = _components(
+                self.first[pairs].tolist(), self.second[pairs].tolist(), self.bodies
+            )[group]
         order = np.argsort(group, kind="stable")
         group = group[order]
-        starts = np.flatnonzero(np.concatenate([group[:1] >= 0, group[1:] != group[:-1]]))  # where a group begins
+        # where a group begins
+        starts = np.flatnonzero(np.concatenate([group[:1] >= 0, group[1:] != group[:-1]]))
         return order, np.append(starts, len(order))
 
     def part(self, contacts: np.ndarray) -> ContactProblem:
@@ -133,10 +143,17 @@ class ContactProblem:
         bodies = np.unique(np.concatenate([first, second[second < self.bodies]]))
         number = np.full(self.bodies + 1, len(bodies))
         number[bodies] = np.arange(len(bodies))
-        fields = (self.one[contacts], self.other[contacts], self.b[contacts], self.friction[contacts])
+        fields = (
+            self.one[contacts],
+            self.other[contacts],
+            self.b[contacts],
+            self.friction[contacts],
+        )
         return ContactProblem(number[first], number[second], *fields, len(bodies))
 
-    def solve(self, stopping: StoppingCriteria, start: np.ndarray | None = None, unsolved: float = np.inf) -> ContactImpulses:
+    def solve(
+        self, stopping: StoppingCriteria, start: np.ndarray | None = None, unsolved: float = np.inf
+    ) -> ContactImpulses:
         """Return impulses, residual and number of iterations.
 
         An island that does not reach the tolerance is taken at its least residual, which says so.
@@ -150,35 +167,51 @@ class ContactProblem:
             ValueError: there are joints.
         """
         if self.joints is not None:
-            raise ValueError("joints: the default solver (NNCG sweeps and Newton) handles only contacts; give RigidBodies another solver")
+            raise ValueError(
+                "joints: the default solver (NNCG sweeps and Newton) handles only contacts; give "
+                "RigidBodies another solver"
+            )
         k, rows, q = self.one.shape
         order, starts, J, *others = self.sorted_rows
         x = np.zeros((k, rows)) if start is None else start[order]
         fields = (x, J, self.b[order], *others)
-        work, indices = np.zeros(3 * k * rows + (self.bodies + 1) * q), (self.first[order], self.second[order], starts)
+        work, indices = (
+            np.zeros(3 * k * rows + (self.bodies + 1) * q),
+            (self.first[order], self.second[order], starts),
+        )
         sizes = {"tasks": len(starts) - 1, "q": q, "dim": rows, "contacts": k}
-        reals, found = SWEEPS.run((*fields, work), indices, **sizes, rtol=stopping.rtol, most=stopping.max_iterations)
-        x, residual, rounds = reals[: k * rows].reshape(k, rows).copy(), *(field.copy() for field in found)
+        reals, found = SWEEPS.run(
+            (*fields, work), indices, **sizes, rtol=stopping.rtol, most=stopping.max_iterations
+        )
+        x, residual, rounds = (
+            reals[: k * rows].reshape(k, rows).copy(),
+            *(field.copy() for field in found),
+        )
         for island in np.flatnonzero(residual > unsolved):
             mine = slice(starts[island], starts[island + 1])
             x[mine], residual[island], more = self.part(order[mine])._go_on(stopping.rtol, x[mine])
             rounds[island] += more
         result = np.empty((k, rows))
         result[order] = x
-        return ContactImpulses(result, float(residual.max(initial=0.0)), int(rounds.max(initial=0.0)))
+        return ContactImpulses(
+            result, float(residual.max(initial=0.0)), int(rounds.max(initial=0.0))
+        )
 
     def _go_on(self, rtol: float, x: np.ndarray) -> ContactImpulses:
         """Return better impulses than those that sweeps have found, their residual, and the iterations that they took.
 
-        Active sets solve what rests, from what sweeps have left, in a few steps, interior points what they start too far from. Where a
-        column topples and bodies hit each other these jam, and many sweeps come near enough for active sets.
+        Active sets solve what rests, from what sweeps have left, in a few steps, interior points
+        what they start too far from. Where a column topples and bodies hit each other these jam,
+        and many sweeps come near enough for active sets.
         """
         newton = ContactNewton(self, x)
         newton.active_set(rtol)
         newton.interior_point(rtol)
         sweeps = 0
         if newton.residual > rtol:
-            swept = self.solve(StoppingCriteria(rtol=rtol, max_iterations=MANY), newton.x.reshape(x.shape))
+            swept = self.solve(
+                StoppingCriteria(rtol=rtol, max_iterations=MANY), newton.x.reshape(x.shape)
+            )
             newton.take(swept.impulses.ravel())
             newton.active_set(rtol)
             sweeps = swept.iterations

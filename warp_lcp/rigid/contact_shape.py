@@ -15,7 +15,8 @@ from warp_lcp.rigid.body import lengths
 from warp_lcp.rigid.box_contacts import OrientedBox
 from warp_lcp.rigid.outline import mesh_outline
 
-Distance = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]  # of points [m], shape (n, 3): distances [m] and directions outward
+# of points [m], shape (n, 3): distances [m] and directions outward
+Distance = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 ALONG = np.linspace(0.0, 1.0, 9)  # points along an edge of a box or the axis of a capsule
 MOST_POINTS = 1500  # of a mesh
@@ -38,7 +39,8 @@ class ContactShape:
         size: about half its extent [m].
         closed: whether the inside has an end; contacts with others than such need points of theirs.
         signed: the signed distance alone, where that takes less time.
-        edges: in space, segments that may be nearer to another surface between their ends than at `points`: shape (m, 2, 3) [m].
+        edges: in space, segments that may be nearer to another surface between their ends than at
+            `points`: shape (m, 2, 3) [m].
         own: of discs, capsules and boxes of a plane, what `distance` knows; see `numbers`.
 
     Attributes:
@@ -81,7 +83,10 @@ class ContactShape:
         elif isinstance(geometry, TriangleMesh):
             shape = _polygon(geometry) if dimension == 2 else _surface(geometry)
         else:
-            raise ValueError(f"{type(geometry).__name__.lower()}: contacts are available for boxes, spheres, capsules, meshes and planes")
+            raise ValueError(
+                f"{type(geometry).__name__.lower()}: contacts are available for boxes, spheres, "
+                "capsules, meshes and planes"
+            )
         if not getattr(geometry, "invert", False):
             return shape
 
@@ -89,7 +94,9 @@ class ContactShape:
             distance, direction = shape.distance(points)
             return -distance, -direction
 
-        return cls(points=np.zeros((0, 3)), radius=0.0, distance=outside, size=shape.size, closed=False)
+        return cls(
+            points=np.zeros((0, 3)), radius=0.0, distance=outside, size=shape.size, closed=False
+        )
 
     @classmethod
     def united(cls, boxes: Sequence[Box]) -> ContactShape:
@@ -100,13 +107,21 @@ class ContactShape:
         parts = [_box(box, 3) for box in boxes]
 
         def nearest(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            distances, directions = (np.array(of) for of in zip(*(part.distance(points) for part in parts), strict=True))
+            distances, directions = (
+                np.array(of) for of in zip(*(part.distance(points) for part in parts), strict=True)
+            )
             which, each = distances.argmin(axis=0), np.arange(len(points))
             return distances[which, each], directions[which, each]
 
         made = tuple(box for part in parts for box in part.boxes)
         corners = np.concatenate([box.corners() for box in made])
-        return cls(points=corners, radius=0.0, distance=nearest, size=max(part.size for part in parts), boxes=made)
+        return cls(
+            points=corners,
+            radius=0.0,
+            distance=nearest,
+            size=max(part.size for part in parts),
+            boxes=made,
+        )
 
     @cached_property
     def numbers(self) -> np.ndarray | None:
@@ -120,14 +135,17 @@ class ContactShape:
         points[: len(self.points)] = self.points
         kind, ball = float(bool(self.boxes)), float(len(self.points) == 1 and not self.boxes)
         first = [kind, self.radius, self.size, len(self.points), ball, 1.0]
-        return np.concatenate([first, self.low, self.high, points.ravel(), self.own, np.zeros(16 - len(self.own))])
+        return np.concatenate(
+            [first, self.low, self.high, points.ravel(), self.own, np.zeros(16 - len(self.own))]
+        )
 
     def nearest_on(self, edges: np.ndarray, margin: float) -> np.ndarray:
         """Return the point of each edge nearest to this shape, shape (n, 3).
 
         Or deepest in it; only those that may be within a margin.
 
-        The distance to a convex shape has one minimum along a segment; near others it is the one beside the nearest of nine points.
+        The distance to a convex shape has one minimum along a segment; near others it is the one
+        beside the nearest of nine points.
 
         Args:
             edges: in the axes in which this shape is placed, shape (m, 2, 3) [m].
@@ -142,7 +160,10 @@ class ContactShape:
             shares = low[:, None] + (high - low)[:, None] * ALONG
             points = start[:, None] + shares[..., None] * way[:, None]
             k = signed(points.reshape(-1, 3)).reshape(shares.shape).argmin(axis=1)
-            low, high = shares[each, np.maximum(k - 1, 0)], shares[each, np.minimum(k + 1, len(ALONG) - 1)]
+            low, high = (
+                shares[each, np.maximum(k - 1, 0)],
+                shares[each, np.minimum(k + 1, len(ALONG) - 1)],
+            )
         return np.asarray(start + (0.5 * (low + high))[:, None] * way)
 
     def reach(self, center: np.ndarray) -> float:
@@ -153,9 +174,20 @@ class ContactShape:
 def _box(shape: Box, dimension: int) -> ContactShape:
     place = shape.placement
     lower, upper = (np.array([*corner, 0.0][:3]) for corner in (shape.lower, shape.upper))
-    center, half = place.apply((0.5 * (lower + upper))[None])[0], 0.5 * place.scale * (upper - lower)
+    center, half = (
+        place.apply((0.5 * (lower + upper))[None])[0],
+        0.5 * place.scale * (upper - lower),
+    )
     R = place.rotation
-    signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in ((-1, 1) if dimension == 3 else (0,))], dtype=np.float64)
+    signs = np.array(
+        [
+            [i, j, k]
+            for i in (-1, 1)
+            for j in (-1, 1)
+            for k in ((-1, 1) if dimension == 3 else (0,))
+        ],
+        dtype=np.float64,
+    )
     corners = signs * half
     points, edges = [corners], []
     if dimension == 3:
@@ -172,18 +204,27 @@ def _box(shape: Box, dimension: int) -> ContactShape:
         length = lengths(out)
         inside = length <= ON_SURFACE * flat.max()
         each = np.arange(len(local))
-        direction = np.where(inside[:, None], np.eye(dimension)[deepest], out / np.where(inside, 1.0, length)[:, None])
+        direction = np.where(
+            inside[:, None],
+            np.eye(dimension)[deepest],
+            out / np.where(inside, 1.0, length)[:, None],
+        )
         direction *= np.where(local < 0.0, -1.0, 1.0)
         signed = np.where(inside, beyond[each, deepest], length)
         return signed, direction @ R[:, :dimension].T
 
     thick = np.array([*flat, THICK * flat.max()][:3])
     return ContactShape(
-        points=center + np.concatenate(points) @ R.T, radius=0.0, distance=distance, size=float(flat.max()),
+        points=center + np.concatenate(points) @ R.T,
+        radius=0.0,
+        distance=distance,
+        size=float(flat.max()),
         boxes=(OrientedBox(center, R.copy(), thick),),
         edges=center + np.concatenate(edges) @ R.T if edges else np.zeros((0, 2, 3)),
-        own=np.concatenate([center, R.ravel(), thick, [ON_SURFACE * flat.max()]]) if dimension == 2 else None,
-    )  # fmt: skip
+        own=np.concatenate([center, R.ravel(), thick, [ON_SURFACE * flat.max()]])
+        if dimension == 2
+        else None,
+    )
 
 
 def _sphere(shape: Sphere) -> ContactShape:
@@ -200,21 +241,37 @@ def _around(start: np.ndarray, end: np.ndarray, along: np.ndarray, radius: float
     """Return all points within a radius of a segment."""
     axis = (end - start)[0]
     square = float(axis @ axis)
-    other = np.array([0.0, 1.0, 0.0]) if not square else np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+    other = (
+        np.array([0.0, 1.0, 0.0])
+        if not square
+        else np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+    )
 
     def distance(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        share = np.clip((points - start) @ axis / square, 0.0, 1.0) if square else np.zeros(len(points))
+        share = (
+            np.clip((points - start) @ axis / square, 0.0, 1.0) if square else np.zeros(len(points))
+        )
         way = points - start - share[:, None] * axis
         length = lengths(way)
         middle = length <= ON_SURFACE * radius
-        direction = np.where(middle[:, None], other / np.linalg.norm(other), way / np.where(middle, 1.0, length)[:, None])
+        direction = np.where(
+            middle[:, None],
+            other / np.linalg.norm(other),
+            way / np.where(middle, 1.0, length)[:, None],
+        )
         return length - radius, direction
 
     edges = np.stack([start, end], axis=1) if square and len(along) > 1 else np.zeros((0, 2, 3))
     return ContactShape(
-        points=start + along[:, None] * axis, radius=radius, distance=distance, size=radius + 0.5 * float(np.sqrt(square)), edges=edges,
-        own=np.concatenate([start[0], axis, [square], other / np.linalg.norm(other), [ON_SURFACE * radius]]),
-    )  # fmt: skip
+        points=start + along[:, None] * axis,
+        radius=radius,
+        distance=distance,
+        size=radius + 0.5 * float(np.sqrt(square)),
+        edges=edges,
+        own=np.concatenate(
+            [start[0], axis, [square], other / np.linalg.norm(other), [ON_SURFACE * radius]]
+        ),
+    )
 
 
 def _polygon(shape: TriangleMesh) -> ContactShape:
@@ -236,15 +293,26 @@ def _polygon(shape: TriangleMesh) -> ContactShape:
         away = np.linalg.norm(ways, axis=2)
         each, nearest = np.arange(len(points)), away.argmin(axis=1)
         a, b = from_start, from_start - way  # the outline winds around the points inside by 2 pi
-        turns = np.arctan2(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0], (a * b).sum(axis=2)).sum(axis=1)
+        turns = np.arctan2(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0], (a * b).sum(axis=2)).sum(
+            axis=1
+        )
         length, sign = away[each, nearest], np.where(np.abs(turns) > np.pi, -1.0, 1.0)
         on = length <= ON_SURFACE * size
-        direction = np.where(on[:, None], normals[nearest], sign[:, None] * ways[each, nearest] / np.where(on, 1.0, length)[:, None])
+        direction = np.where(
+            on[:, None],
+            normals[nearest],
+            sign[:, None] * ways[each, nearest] / np.where(on, 1.0, length)[:, None],
+        )
         return sign * length, np.column_stack([direction, np.zeros(len(points))])
 
     middles = start + 0.5 * way
     points = np.concatenate([start, middles]) if len(start) < 8 else start
-    return ContactShape(points=np.column_stack([points, np.zeros(len(points))]), radius=0.0, distance=distance, size=size)
+    return ContactShape(
+        points=np.column_stack([points, np.zeros(len(points))]),
+        radius=0.0,
+        distance=distance,
+        size=size,
+    )
 
 
 def _surface(shape: TriangleMesh) -> ContactShape:
@@ -263,7 +331,9 @@ def _surface(shape: TriangleMesh) -> ContactShape:
     def distance(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         if not len(points):
             return np.zeros(0), np.zeros((0, 3))
-        around = points[None] + step * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])[:, None]
+        around = (
+            points[None] + step * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])[:, None]
+        )
         values = signed(around.reshape(-1, 3)).reshape(7, -1)
         slope = (values[1:4] - values[4:]).T
         length = lengths(slope)
@@ -271,7 +341,14 @@ def _surface(shape: TriangleMesh) -> ContactShape:
 
     ends = vertices[_edges_of(triangles)]
     long = lengths(ends[:, 1] - ends[:, 0]) > LONG * size
-    return ContactShape(points=_spread(vertices, triangles), radius=0.0, distance=distance, size=size, signed=signed, edges=ends[long])
+    return ContactShape(
+        points=_spread(vertices, triangles),
+        radius=0.0,
+        distance=distance,
+        size=size,
+        signed=signed,
+        edges=ends[long],
+    )
 
 
 def _edges_of(triangles: np.ndarray) -> np.ndarray:
@@ -289,7 +366,12 @@ def _spread(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     if len(points) > MOST_POINTS:
         kept = min(len(hull), MOST_POINTS // 2)
         others = points[len(hull) :]
-        return np.concatenate([points[: len(hull)][:: -(-len(hull) // kept)], others[:: max(1, -(-len(others) // (MOST_POINTS - kept)))]])
+        return np.concatenate(
+            [
+                points[: len(hull)][:: -(-len(hull) // kept)],
+                others[:: max(1, -(-len(others) // (MOST_POINTS - kept)))],
+            ]
+        )
     pieces = max(1, min(len(ALONG) - 1, (MOST_POINTS - len(points)) // len(edges) + 1))
     a, b = vertices[edges[:, 0]], vertices[edges[:, 1]]
     return np.concatenate([points, *(a + n / pieces * (b - a) for n in range(1, pieces))])

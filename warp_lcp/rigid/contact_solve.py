@@ -19,20 +19,27 @@ from warp_lcp.rigid.firm import SINGULAR, Firm
 from warp_lcp.rigid.joints import Joint, JointRows, joined_pairs
 from warp_lcp.rigid.planar_contacts import AHEAD, RATE, ROUGH, SLOP, PlanarContacts, PlanarImpulses
 
-NEAR = 1e-2  # of the smallest body's size: gaps up to it are contacts, besides those that speeds may close in a step
+# of the smallest body's size: gaps up to it are contacts, besides those that speeds may close in a
+# step
+NEAR = 1e-2
 START_OVERLAP = 1e-3  # of a body's size, with which it may start: files round their numbers
-BOUNCE = 2.0  # of gravity's speed in a step: slower impacts do not bounce, so that bodies come to rest
-FALL = 1.5  # times gravity: what falls beside what rests is not faster, and more is another impact's
-EXACT = StoppingCriteria(rtol=1e-7, max_iterations=600)  # a stack then drifts by 1e-7 of its size in a second
+# of gravity's speed in a step: slower impacts do not bounce, so that bodies come to rest
+BOUNCE = 2.0
+# times gravity: what falls beside what rests is not faster, and more is another impact's
+FALL = 1.5
+# a stack then drifts by 1e-7 of its size in a second
+EXACT = StoppingCriteria(rtol=1e-7, max_iterations=600)
 UNSOLVED = 1e-5  # residual of sweeps from which on Newton's methods are worth their time
 TINY = 1e-6  # of a step: what is left of it after an impact at its end
 ALONG_SLIP = 1e-6  # of gravity's speed in a step: a slower slip has no direction
 SIDEWAYS = 1e-6  # of gravity, along a contact's plane
-JOINED = 1e-9  # of the smallest body's size, and in rad: errors of joints at the end of a step that are none
+# of the smallest body's size, and in rad: errors of joints at the end of a step that are none
+JOINED = 1e-9
 ROUNDS = 8  # solves of a step, at most, until its joints are where they ought to be at its end
 
 
-ImpulseSolver = Callable[[ContactProblem, np.ndarray], ContactImpulses]  # of a problem and the impulses to start from
+# of a problem and the impulses to start from
+ImpulseSolver = Callable[[ContactProblem, np.ndarray], ContactImpulses]
 
 
 def sweeps_and_newton(problem: ContactProblem, start: np.ndarray) -> ContactImpulses:
@@ -48,11 +55,14 @@ class ContactSolve:
 
     Args:
         detection: of the bodies.
-        solver: solves for the impulses of a step; overlaps, and what rests while others bounce, have their own.
-        joints: between the bodies; the bodies of one do not collide, nor do those that fixed ones make one piece of.
+        solver: solves for the impulses of a step; overlaps, and what rests while others bounce,
+            have their own.
+        joints: between the bodies; the bodies of one do not collide, nor do those that fixed ones
+            make one piece of.
 
     Attributes:
-        residual: of the last problem, relative to that of no impulses; 0 without contacts and joints.
+        residual: of the last problem, relative to that of no impulses; 0 without contacts and
+            joints.
         iterations: of the last step; 0 without contacts and joints.
         memory: impulses of the last step.
         joint_rows: of the last step; None: there are no joints, or there was no step.
@@ -60,22 +70,45 @@ class ContactSolve:
         reach: of each body's points from its center of mass [m], shape (n,).
     """
 
-    def __init__(self, detection: ContactDetection, solver: ImpulseSolver = sweeps_and_newton, joints: Sequence[Joint] = ()) -> None:
-        self.detection, self.bodies, self.dimension = detection, detection.bodies, detection.dimension
-        self.residual, self.iterations, self.memory, self._solver = 0.0, 0, ContactMemory(len(self.bodies)), solver
+    def __init__(
+        self,
+        detection: ContactDetection,
+        solver: ImpulseSolver = sweeps_and_newton,
+        joints: Sequence[Joint] = (),
+    ) -> None:
+        self.detection, self.bodies, self.dimension = (
+            detection,
+            detection.bodies,
+            detection.dimension,
+        )
+        self.residual, self.iterations, self.memory, self._solver = (
+            0.0,
+            0,
+            ContactMemory(len(self.bodies)),
+            solver,
+        )
         self.joints, self._joined = tuple(joints), joined_pairs(joints, len(self.bodies))
         self.joint_rows: JointRows | None = None
         self.joint_impulses = np.zeros(sum(joint.row_count(self.dimension) for joint in joints))
         bodies, shapes = self.bodies, detection.shapes
-        self.reach = np.array([shape.reach(body.properties.center) for body, shape in zip(bodies, shapes, strict=True)])
+        self.reach = np.array(
+            [
+                shape.reach(body.properties.center)
+                for body, shape in zip(bodies, shapes, strict=True)
+            ]
+        )
         self._size = np.array([shape.size for shape in shapes])
         self._near = NEAR * float(self._size.min(initial=np.inf))
         self._friction = np.array([body.friction for body in bodies])
         self._bounce = np.array([body.restitution for body in bodies])
-        self._found_roots: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None  # and the rotations that they are of
-        self._last: tuple[Contacts, np.ndarray, ContactProblem] | None = None  # contacts, roots and problem of `push_apart`
+        # and the rotations that they are of
+        self._found_roots: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+        # contacts, roots and problem of `push_apart`
+        self._last: tuple[Contacts, np.ndarray, ContactProblem] | None = None
         self._pushed: PlanarImpulses | None = None  # by the last `push_apart`
-        self._planar = PlanarContacts(detection, self.reach) if PlanarContacts.holds(detection) else None
+        self._planar = (
+            PlanarContacts(detection, self.reach) if PlanarContacts.holds(detection) else None
+        )
         self._roots_of_inertias = np.linalg.cholesky(bodies.inverse_inertia)
 
     def check_start(self, time: float) -> None:
@@ -85,7 +118,9 @@ class ContactSolve:
             ValueError: which, and with what.
         """
         nothing = np.zeros(len(self.bodies))
-        found = self._apart(self.detection.find(time, nothing, np.zeros(len(self.detection.obstacles))))
+        found = self._apart(
+            self.detection.find(time, nothing, np.zeros(len(self.detection.obstacles)))
+        )
         overlapping = -found.points.gap > START_OVERLAP * self._size[found.first]
         if not overlapping.any():
             return
@@ -94,10 +129,18 @@ class ContactSolve:
         of_pair = (found.first == number) & (found.second == other) & (found.obstacle == which)
         name, deep = self.bodies[number].name, -float(found.points.gap[of_pair].min())
         if which != NONE:
-            raise ValueError(f"{name} reaches {deep:.3g} m into {self.detection.obstacles[which].name} at the start: they must lie apart")
-        raise ValueError(f"{name} overlaps {self.bodies[other].name} by {deep:.3g} m at the start: bodies must lie apart")
+            raise ValueError(
+                f"{name} reaches {deep:.3g} m into {self.detection.obstacles[which].name} at the "
+                "start: they must lie apart"
+            )
+        raise ValueError(
+            f"{name} overlaps {self.bodies[other].name} by {deep:.3g} m at the start: bodies must "
+            "lie apart"
+        )
 
-    def find(self, time: float, dt: float, gravity: np.ndarray, gone: np.ndarray | None = None) -> Contacts:
+    def find(
+        self, time: float, dt: float, gravity: np.ndarray, gone: np.ndarray | None = None
+    ) -> Contacts:
         """Return current contacts and those possible within the step.
 
         Args:
@@ -107,12 +150,22 @@ class ContactSolve:
             gone: bodies that touch nothing, shape (n,); None: there are none.
         """
         falls, near = math.sqrt(gravity @ gravity) * dt, self._near
-        brought = [AHEAD * self._obstacle_way(obstacle.motion, time, dt) for obstacle in self.detection.obstacles]
+        brought = [
+            AHEAD * self._obstacle_way(obstacle.motion, time, dt)
+            for obstacle in self.detection.obstacles
+        ]
         everywhere = gone is None or not gone.any()
         planar = self._planar if everywhere else None
-        if planar is not None and (touching := planar.find(time, dt, falls, near, brought)) is not None:
+        if (
+            planar is not None
+            and (touching := planar.find(time, dt, falls, near, brought)) is not None
+        ):
             found, contacts = touching
-            return contacts if planar.still and not self._joined else self.assembled(self._apart(found), time, dt, gravity)
+            return (
+                contacts
+                if planar.still and not self._joined
+                else self.assembled(self._apart(found), time, dt, gravity)
+            )
         six = self.bodies.velocities()
         speeds, spins = lengths(six[:, :3]), lengths(six[:, 3:])
         ways = AHEAD * dt * (speeds + spins * self.reach + falls)
@@ -130,13 +183,22 @@ class ContactSolve:
         bounces = contacts.restitution.any()  # else `bounce` does nothing
         return contacts.velocities(self._velocities())[:, 0] if bounces else np.zeros(len(contacts))
 
-    def bounce(self, contacts: Contacts, approach: np.ndarray, dt: float, kick_dt: float, gravity: np.ndarray) -> np.ndarray:
+    def bounce(
+        self,
+        contacts: Contacts,
+        approach: np.ndarray,
+        dt: float,
+        kick_dt: float,
+        gravity: np.ndarray,
+    ) -> np.ndarray:
         """Set the rebound velocity and time of impacts (updates the contacts).
 
-        The bodies' velocities are those after gravity has acted on them for `kick_dt`, which are of the middle of the step. A gap closes by
-        v t + a t^2 / 2 with v at the step's beginning; where it is 0, at t = `when`, the speed v_i = v + a t becomes -e v_i. At the end
-        of the step it is -e v_i + a (dt - t), so in the middle of a step without an impact -e v_i + a (dt / 2 - t): the target. Bodies have
-        gone by then as before the impact until t, and as after it later, see `detour`.
+        The bodies' velocities are those after gravity has acted on them for `kick_dt`, which are of
+        the middle of the step. A gap closes by v t + a t^2 / 2 with v at the step's beginning;
+        where it is 0, at t = `when`, the speed v_i = v + a t becomes -e v_i. At the end of the step
+        it is -e v_i + a (dt - t), so in the middle of a step without an impact -e v_i + a (dt / 2 -
+        t): the target. Bodies have gone by then as before the impact until t, and as after it
+        later, see `detour`.
 
         Args:
             contacts: those of the step.
@@ -152,13 +214,21 @@ class ContactSolve:
         if not contacts.restitution.any():
             return before
         g, gap, e = float(np.linalg.norm(gravity)), contacts.gap, contacts.restitution
-        may = (e > 0.0) & (approach < -BOUNCE * g * dt) & (gap + dt * (approach - FALL * g * kick_dt) < 0.0)
+        may = (
+            (e > 0.0)
+            & (approach < -BOUNCE * g * dt)
+            & (gap + dt * (approach - FALL * g * kick_dt) < 0.0)
+        )
         if not may.any():
             return before
         b = contacts.velocities(self._velocities())
         free = b[:, 0].copy()
         b[:, 0] -= contacts.target
-        problem, others, V = self._problem(contacts, b, contacts.friction), np.flatnonzero(~may), self._velocities()
+        problem, others, V = (
+            self._problem(contacts, b, contacts.friction),
+            np.flatnonzero(~may),
+            self._velocities(),
+        )
         if len(others):  # what rests on them does not fall
             before[others] = problem.part(others).solve(EXACT).impulses
             V = V + self._answer(contacts.on_bodies(before, len(self.bodies)))
@@ -174,27 +244,39 @@ class ContactSolve:
             self._meet(contacts, k, float(t[k]), V)
         free[met] = contacts.velocities(V)[met, 0]
         after, rest = -e * (free + a * (t - 0.5 * dt)), dt - t
-        met &= (after > 0.0) & (after + 0.5 * a * rest >= 0.0)  # and apart at the end of the step: smaller bounces are none
+        # and apart at the end of the step: smaller bounces are none
+        met &= (after > 0.0) & (after + 0.5 * a * rest >= 0.0)
         contacts.target[met] = (after + a * (0.5 * dt - t))[met]
         order, starts = problem.islands()
         for begin, end in pairwise(starts):  # what bears an impact does so when it happens
             mine = order[begin:end]
             if met[mine].any():
                 contacts.when[mine] = np.where(met[mine], t[mine], t[mine][met[mine]].mean())
-        along = ~met & (contacts.when > 0.0)  # what an impact elsewhere moves: gaps close from then on
-        left = np.maximum(contacts.gap + contacts.when * free, 0.0)[along] / np.maximum(dt - contacts.when[along], TINY * dt)
-        # and what parts before does not part less after, or r (u before + u after) / 2 would be energy gained
+        # what an impact elsewhere moves: gaps close from then on
+        along = ~met & (contacts.when > 0.0)
+        left = np.maximum(contacts.gap + contacts.when * free, 0.0)[along] / np.maximum(
+            dt - contacts.when[along], TINY * dt
+        )
+        # and what parts before does not part less after, or r (u before + u after) / 2 would be
+        # energy gained
         contacts.target[along] = np.where(free[along] > 0.0, np.minimum(-left, -free[along]), -left)
         return before
 
     def _meet(self, contacts: Contacts, k: int, t: float, V: np.ndarray) -> None:
         """Let contact k of two bodies act where they meet at time t of the step, at velocities V, shape (n, q) (updates its rows).
 
-        Both get the impulse at one point, so that angular momentum is kept: points of either that meet then are apart now.
+        Both get the impulse at one point, so that angular momentum is kept: points of either that
+        meet then are apart now.
         """
         pair = [int(contacts.first[k]), int(contacts.second[k])]
-        bodies, shapes = [self.bodies[number] for number in pair], [self.detection.shapes[number] for number in pair]
-        six, now = np.array([in_space(V[number]) for number in pair]), np.array([body.position for body in bodies])
+        bodies, shapes = (
+            [self.bodies[number] for number in pair],
+            [self.detection.shapes[number] for number in pair],
+        )
+        six, now = (
+            np.array([in_space(V[number]) for number in pair]),
+            np.array([body.position for body in bodies]),
+        )
         at = now + t * six[:, :3]
         places = []
         for body, velocity, position in zip(bodies, six, at, strict=True):
@@ -212,14 +294,17 @@ class ContactSolve:
         contacts.frames[k], contacts.one[k] = frames[0], _rows(arms[:1], frames, self.dimension)[0]
         contacts.other[k] = -_rows(arms[1:], frames, self.dimension)[0]
 
-    def detour(self, contacts: Contacts, before: np.ndarray, impulses: np.ndarray) -> np.ndarray | None:
+    def detour(
+        self, contacts: Contacts, before: np.ndarray, impulses: np.ndarray
+    ) -> np.ndarray | None:
         """Return displacement errors of bodies due to impacts within the step.
 
         The difference to where velocities after impacts would move them (m, rad), shape (n, q);
         None: zero.
 
-        An impact at time t of the step has changed velocities by M^-1 J' r, and bodies have gone without it until then. With the target of
-        `bounce` that is exact for what flies along parabolas before and after.
+        An impact at time t of the step has changed velocities by M^-1 J' r, and bodies have gone
+        without it until then. With the target of `bounce` that is exact for what flies along
+        parabolas before and after.
 
         Args:
             contacts: those of the step.
@@ -228,9 +313,18 @@ class ContactSolve:
         """
         if not contacts.when.any():
             return None
-        return -self._answer(contacts.on_bodies(contacts.when[:, None] * (impulses - before), len(self.bodies)))
+        return -self._answer(
+            contacts.on_bodies(contacts.when[:, None] * (impulses - before), len(self.bodies))
+        )
 
-    def push_apart(self, contacts: Contacts, start: np.ndarray | None = None, *, dt: float = 0.0, kick_dt: float = 0.0) -> np.ndarray:
+    def push_apart(
+        self,
+        contacts: Contacts,
+        start: np.ndarray | None = None,
+        *,
+        dt: float = 0.0,
+        kick_dt: float = 0.0,
+    ) -> np.ndarray:
         """Solve for contact and joint impulses and apply them to the bodies.
 
         Returns those of contacts [N s], shape (k, dimension).
@@ -246,7 +340,9 @@ class ContactSolve:
             return np.zeros((0, self.dimension))
         if self._planar is not None and not self.joints and self._solver is sweeps_and_newton:
             before = self.memory.values if start is None else start
-            self._pushed = solved = self._planar.push(contacts, before, start is not None, EXACT, UNSOLVED, dt)
+            self._pushed = solved = self._planar.push(
+                contacts, before, start is not None, EXACT, UNSOLVED, dt
+            )
             if solved is not None:
                 self.residual, self.iterations = solved.residual, solved.iterations
                 return solved.impulses
@@ -263,25 +359,38 @@ class ContactSolve:
         return impulses
 
     def _hold_joints(
-        self, problem: ContactProblem, contacts: Contacts, start: np.ndarray, dt: float, kick_dt: float
+        self,
+        problem: ContactProblem,
+        contacts: Contacts,
+        start: np.ndarray,
+        dt: float,
+        kick_dt: float,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the impulses of contacts, and what these and those of joints add up to at each body, shape (n, q).
 
-        Impulses of joints act along the rows J of the step's beginning, and are such that errors e are 0 at its end (the SHAKE method:
-        second order, energy does not drift). e is not linear in velocities: the problem is solved again with c = e / dt - J v' of the v'
-        that it gave, where y = J v' + c; limits likewise with what is left up to them.
+        Impulses of joints act along the rows J of the step's beginning, and are such that errors e
+        are 0 at its end (the SHAKE method: second order, energy does not drift). e is not linear in
+        velocities: the problem is solved again with c = e / dt - J v' of the v' that it gave, where
+        y = J v' + c; limits likewise with what is left up to them.
         """
         n, q = len(self.bodies), self._roots().shape[1]
-        rows = JointRows.joined([joint.rows(self.bodies, kick_dt, self.dimension) for joint in self.joints])
+        rows = JointRows.joined(
+            [joint.rows(self.bodies, kick_dt, self.dimension) for joint in self.joints]
+        )
         J, V, motors = rows.jacobian(n), self._velocities(), rows.motors
         bias, free = rows.bias(dt), J @ V.ravel()
         x = np.concatenate([start.ravel(), self.joint_impulses])
         for _ in range(ROUNDS):
-            found = self._solver(replace(problem, joints=JointPart(self._weighted(rows), free + bias)), x)
+            found = self._solver(
+                replace(problem, joints=JointPart(self._weighted(rows), free + bias)), x
+            )
             x = found.impulses
             impulses, held = x[: start.size].reshape(start.shape), x[start.size :]
             pushes = contacts.on_bodies(impulses, n) + (J.T @ held).reshape(n, q)
-            after = rows.errors(self._moved(pushes, dt), self.dimension) / dt - J @ (V + self._answer(pushes)).ravel()
+            after = (
+                rows.errors(self._moved(pushes, dt), self.dimension) / dt
+                - J @ (V + self._answer(pushes)).ravel()
+            )
             after[motors] = bias[motors]
             off = dt * float(np.abs(after - bias).max())
             bias = after
@@ -298,10 +407,15 @@ class ContactSolve:
         """
         found, rows = dict.fromkeys(range(len(self.joints)), 0.0), self.joint_rows
         if rows is not None:
-            owners = np.repeat(np.arange(len(self.joints)), [joint.row_count(self.dimension) for joint in self.joints])
+            owners = np.repeat(
+                np.arange(len(self.joints)),
+                [joint.row_count(self.dimension) for joint in self.joints],
+            )
             for row in np.flatnonzero(rows.motors).tolist():
                 joint = int(owners[row])
-                found[joint] = self.joints[joint].motor_torque * float(self.joint_impulses[row] / rows.upper[row])
+                found[joint] = self.joints[joint].motor_torque * float(
+                    self.joint_impulses[row] / rows.upper[row]
+                )
         return found
 
     def _moved(self, pushes: np.ndarray, dt: float) -> BodyStates:
@@ -318,12 +432,15 @@ class ContactSolve:
         else:
             self.memory.keep(contacts, impulses, self.bodies)
 
-    def separation(self, contacts: Contacts, dt: float, detour: np.ndarray | None = None) -> np.ndarray | None:
+    def separation(
+        self, contacts: Contacts, dt: float, detour: np.ndarray | None = None
+    ) -> np.ndarray | None:
         """Return the smallest displacements that reduce overlaps at the end of a step.
 
         (m, rad), in the metric of the bodies' masses.
 
-        They give no velocity, so no energy of motion; a frictionless problem like that of the impulses. Shape (n, q); None: no ways.
+        They give no velocity, so no energy of motion; a frictionless problem like that of the
+        impulses. Shape (n, q); None: no ways.
 
         Args:
             contacts: those of the step.
@@ -333,7 +450,12 @@ class ContactSolve:
         pushed, bodies = self._pushed, self.bodies
         if not len(contacts):
             return None
-        if pushed is not None and pushed.contacts is contacts and pushed.dt == dt and detour is None:
+        if (
+            pushed is not None
+            and pushed.contacts is contacts
+            and pushed.dt == dt
+            and detour is None
+        ):
             if np.array_equal(pushed.values, bodies.values):  # nothing has pushed them since
                 return pushed.ways
         velocities = self._velocities() if detour is None else self._velocities() + detour / dt
@@ -353,7 +475,10 @@ class ContactSolve:
         rows = JointRows.joined([joint.rows(moved, dt, self.dimension) for joint in self.joints])
         rows = rows.where(rows.equations)
         gaps = np.column_stack([b, np.zeros((len(b), self.dimension - 1))])
-        problem = replace(self._problem(contacts, gaps, np.zeros(len(b))), joints=JointPart(self._weighted(rows), rows.error))
+        problem = replace(
+            self._problem(contacts, gaps, np.zeros(len(b))),
+            joints=JointPart(self._weighted(rows), rows.error),
+        )
         x, n = self._solver(problem, np.zeros(gaps.size + len(rows))).impulses, len(self.bodies)
         apart = contacts.on_bodies(x[: gaps.size].reshape(gaps.shape), n)
         return self._answer(apart + (rows.jacobian(n).T @ x[gaps.size :]).reshape(n, -1))
@@ -363,7 +488,8 @@ class ContactSolve:
 
         For each body by itself.
 
-        A body that is held holds what bears against it where it cannot move itself: a stack on the floor is held up to its top.
+        A body that is held holds what bears against it where it cannot move itself: a stack on the
+        floor is held up to its top.
         """
         pushed = self._pushed
         if pushed is not None and pushed.impulses is impulses and pushed.squares is not None:
@@ -379,10 +505,15 @@ class ContactSolve:
                 number = waiting.pop(0)
                 body, G = self.bodies[number], roots[number]
                 squares, V = np.linalg.eigh(firm.square(contacts, number, G))
-                V = V[:, squares > SINGULAR * squares.max()]  # what contacts take, in the metric of the mass
+                # what contacts take, in the metric of the mass
+                V = V[:, squares > SINGULAR * squares.max()]
                 body.hold = np.eye(len(G)) - np.linalg.inv(G).T @ V @ V.T @ G.T
                 reached = firm.spread(contacts, number, G, G - G @ V @ V.T)
-                waiting += [other for other in reached if other not in waiting and self.bodies[other].hold is None]
+                waiting += [
+                    other
+                    for other in reached
+                    if other not in waiting and self.bodies[other].hold is None
+                ]
 
     def _problem_of_step(self, contacts: Contacts, b: np.ndarray) -> ContactProblem:
         """Return the problem of the contacts of a step, which is solved twice: before and after the material's impulses."""
@@ -397,23 +528,33 @@ class ContactSolve:
         one, other = (rows[:, : b.shape[1]] for rows in (contacts.one, contacts.other))
         first, second = contacts.first, contacts.second
         roots = self._all_roots()[1]
-        return ContactProblem(first, second, one @ roots[first], other @ roots[second], b, friction, len(self.bodies))
+        return ContactProblem(
+            first, second, one @ roots[first], other @ roots[second], b, friction, len(self.bodies)
+        )
 
     def _weighted(self, rows: JointRows) -> JointRows:
         """Return joints' rows as those of a problem."""
         roots = self._all_roots()[1]
-        return replace(rows, one=rows.one @ roots[rows.first], other=rows.other @ roots[rows.second])
+        return replace(
+            rows, one=rows.one @ roots[rows.first], other=rows.other @ roots[rows.second]
+        )
 
     def _apart(self, found: FoundContacts) -> FoundContacts:
         """Return the contacts of pairs that no joint holds together."""
         return found.without(self._joined)
 
-    def assembled(self, found: FoundContacts, time: float, dt: float, gravity: np.ndarray | None) -> Contacts:
+    def assembled(
+        self, found: FoundContacts, time: float, dt: float, gravity: np.ndarray | None
+    ) -> Contacts:
         """Return the contacts with their rows.
 
         Tangents are along the slip, or along gravity if that is given.
         """
-        falls, n, dim = 0.0 if gravity is None else float(np.linalg.norm(gravity)) * dt, len(self.bodies), self.dimension
+        falls, n, dim = (
+            0.0 if gravity is None else float(np.linalg.norm(gravity)) * dt,
+            len(self.bodies),
+            self.dimension,
+        )
         first, second = found.first, found.second
         point, normal, gap = found.points.point, found.points.normal, found.points.gap
         moved = np.zeros_like(point)
@@ -425,18 +566,44 @@ class ContactSolve:
         ways: tuple[tuple[np.ndarray, float], ...] = ()
         if gravity is not None and dim == 3:  # there is one tangent in a plane
             six = np.concatenate([self.bodies.velocities(), np.zeros((1, 6))])
-            slip = six[first, :3] + cross(six[first, 3:], mine) - six[second, :3] - cross(six[second, 3:], others) - moved
-            ways = ((gravity, SIDEWAYS * float(np.linalg.norm(gravity))), (slip, ALONG_SLIP * falls))
+            slip = (
+                six[first, :3]
+                + cross(six[first, 3:], mine)
+                - six[second, :3]
+                - cross(six[second, 3:], others)
+                - moved
+            )
+            ways = (
+                (gravity, SIDEWAYS * float(np.linalg.norm(gravity))),
+                (slip, ALONG_SLIP * falls),
+            )
         frames = contact_frames(normal, dim, ways)
         one, other = _rows(mine, frames, dim), -_rows(others, frames, dim)
         standing = second == n
         other[standing] = 0.0
         wall = -(frames @ moved[:, :, None])[:, :, 0]
         partner = np.where(standing, first, second)
-        size, bounce = (pick(values[first], values[partner]) for pick, values in ((np.minimum, self._size), (np.maximum, self._bounce)))
+        size, bounce = (
+            pick(values[first], values[partner])
+            for pick, values in ((np.minimum, self._size), (np.maximum, self._bounce))
+        )
         friction = np.sqrt(self._friction[first] * self._friction[partner])
         target = -np.maximum(gap, 0.0) / dt
-        return Contacts(first, second, point, frames, gap, size, friction, one, other, wall, target, bounce, np.zeros(len(gap)))
+        return Contacts(
+            first,
+            second,
+            point,
+            frames,
+            gap,
+            size,
+            friction,
+            one,
+            other,
+            wall,
+            target,
+            bounce,
+            np.zeros(len(gap)),
+        )
 
     def _obstacle_way(self, motion: Motion | None, time: float, dt: float) -> float:
         """Return how far points near the bodies go with an obstacle in a step [m]."""
@@ -461,7 +628,11 @@ class ContactSolve:
             roots[:, AXES, AXES] = 1.0 / np.sqrt(self.bodies.mass)[:, None]
             roots[:, 3:, 3:] = rotation @ self._roots_of_inertias
             roots = roots if self.dimension == 3 else roots[:, PLANAR][:, :, PLANAR]
-            self._found_roots = rotation.copy(), roots, np.concatenate([roots, np.zeros((1, *roots.shape[1:]))])
+            self._found_roots = (
+                rotation.copy(),
+                roots,
+                np.concatenate([roots, np.zeros((1, *roots.shape[1:]))]),
+            )
         return self._found_roots[1:]
 
     def _velocities(self) -> np.ndarray:

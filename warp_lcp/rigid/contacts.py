@@ -10,7 +10,8 @@ from scipy.sparse import bsr_array, csr_array
 
 from warp_lcp.rigid.body import BodyStates, cross, lengths
 
-SAME_PLACE = 0.05  # of a body's size: a contact this close to one of the last step starts from its impulse
+# of a body's size: a contact this close to one of the last step starts from its impulse
+SAME_PLACE = 0.05
 KEPT = 32  # contacts remembered for each body, at most
 
 
@@ -31,10 +32,11 @@ class Contacts:
         one: relative velocities of the first body's velocities, shape (k, dimension, q).
         other: of the second's, 0 where that is none.
         wall: velocity of moving obstacles [m/s], shape (k, dimension).
-        target: smallest allowed normal velocity [m/s], which closes the gap or rebounds, shape (k,).
+        target: smallest allowed normal velocity [m/s], which closes the gap or rebounds, shape
+            (k,).
         restitution: the part of the speed of an impact that comes back, shape (k,).
-        when: time from the step's beginning to the impact that bounces, there or elsewhere among bodies that touch [s], shape (k,);
-            0: none does.
+        when: time from the step's beginning to the impact that bounces, there or elsewhere among
+            bodies that touch [s], shape (k,); 0: none does.
     """
 
     first: np.ndarray
@@ -65,7 +67,9 @@ class Contacts:
         From those of the bodies, shape (n, q).
         """
         V = np.vstack([of_bodies, np.zeros(of_bodies.shape[1])])
-        both = (self.one @ V[self.first][:, :, None] + self.other @ V[self.second][:, :, None])[:, :, 0]
+        both = (self.one @ V[self.first][:, :, None] + self.other @ V[self.second][:, :, None])[
+            :, :, 0
+        ]
         return np.asarray(both + self.wall)
 
     def on_bodies(self, impulses: np.ndarray, count: int) -> np.ndarray:
@@ -84,7 +88,8 @@ class ContactMemory:
     """Impulses of the last step's contacts, to start the next solve from.
 
     Attributes:
-        values: first and second body, place in the first body's own axes [m], impulse in the world's [N s]; shape (k, 8).
+        values: first and second body, place in the first body's own axes [m], impulse in the
+            world's [N s]; shape (k, 8).
     """
 
     def __init__(self, bodies: int) -> None:
@@ -102,7 +107,9 @@ class ContactMemory:
     def keep(self, contacts: Contacts, impulses: np.ndarray, bodies: BodyStates) -> None:
         """Remember impulses, shape (k, dimension)."""
         world = (impulses[:, None] @ contacts.frames)[:, 0]
-        self.take(np.column_stack([contacts.first, contacts.second, _places(contacts, bodies), world]))
+        self.take(
+            np.column_stack([contacts.first, contacts.second, _places(contacts, bodies), world])
+        )
 
     def take(self, values: np.ndarray) -> None:
         """Take values, shape (k, 8), as many as are kept."""
@@ -117,10 +124,14 @@ class ContactMemory:
         if not len(old) or not len(contacts):
             return start
         places, pairs = _places(contacts, bodies), len(bodies) + 1
-        keys, before = contacts.first * pairs + contacts.second, (old[:, 0] * pairs + old[:, 1]).astype(np.int64)
+        keys, before = (
+            contacts.first * pairs + contacts.second,
+            (old[:, 0] * pairs + old[:, 1]).astype(np.int64),
+        )
         order = np.argsort(before, kind="stable")
         low, high = (np.searchsorted(before[order], keys, side=side) for side in ("left", "right"))
-        fresh = np.repeat(np.arange(len(keys)), high - low)  # each contact beside each old one of the same two
+        # each contact beside each old one of the same two
+        fresh = np.repeat(np.arange(len(keys)), high - low)
         known = order[np.arange(len(fresh)) - np.repeat(np.cumsum(high - low) - high, high - low)]
         way = lengths(places[fresh] - old[known, 2:5])
         mine, theirs = _least(fresh, known, way), _least(known, fresh, way)
@@ -144,7 +155,9 @@ def _places(contacts: Contacts, bodies: BodyStates) -> np.ndarray:
     return np.asarray((arms[:, None] @ bodies.rotation[contacts.first])[:, 0])
 
 
-def jacobian(first: np.ndarray, second: np.ndarray, one: np.ndarray, other: np.ndarray, bodies: int) -> csr_array:
+def jacobian(
+    first: np.ndarray, second: np.ndarray, one: np.ndarray, other: np.ndarray, bodies: int
+) -> csr_array:
     """Return the Jacobian J of pairs, shape (k rows, q bodies).
 
     Args:
@@ -155,20 +168,31 @@ def jacobian(first: np.ndarray, second: np.ndarray, one: np.ndarray, other: np.n
         bodies: their number.
     """
     k, rows, q = one.shape
-    blocks, places = np.stack([one, other], axis=1).reshape(2 * k, rows, q), np.stack([first, second], axis=1).ravel()
-    return csr_array(bsr_array((blocks, places, 2 * np.arange(k + 1)), shape=(k * rows, (bodies + 1) * q)).tocsr()[:, : bodies * q])
+    blocks, places = (
+        np.stack([one, other], axis=1).reshape(2 * k, rows, q),
+        np.stack([first, second], axis=1).ravel(),
+    )
+    return csr_array(
+        bsr_array(
+            (blocks, places, 2 * np.arange(k + 1)), shape=(k * rows, (bodies + 1) * q)
+        ).tocsr()[:, : bodies * q]
+    )
 
 
-def contact_frames(normal: np.ndarray, dimension: int, ways: Sequence[tuple[np.ndarray, float]] = ()) -> np.ndarray:
+def contact_frames(
+    normal: np.ndarray, dimension: int, ways: Sequence[tuple[np.ndarray, float]] = ()
+) -> np.ndarray:
     """Return normal and tangents of contacts, shape (k, dimension, 3).
 
     Right-handed in space.
 
-    There the first tangent is along the last of some ways that is longer than its least: boxes of friction then are as wide as the cone
-    where it counts.
+    There the first tangent is along the last of some ways that is longer than its least: boxes of
+    friction then are as wide as the cone where it counts.
     """
     if dimension == 2:
-        return np.stack([normal, np.stack([-normal[:, 1], normal[:, 0], np.zeros(len(normal))], axis=1)], axis=1)
+        return np.stack(
+            [normal, np.stack([-normal[:, 1], normal[:, 0], np.zeros(len(normal))], axis=1)], axis=1
+        )
     u = cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])
     for way, least in ways:
         along = way - (way * normal).sum(axis=1)[:, None] * normal

@@ -45,10 +45,17 @@ class Firm:
     def square(self, contacts: Contacts, number: int, root: np.ndarray) -> np.ndarray:
         """Return G' J' J G of the rows J that hold a body, shape (q, q); G: `root` of its inverse mass, shape (q, q)."""
         one, other = contacts.first == number, contacts.second == number
-        J = np.concatenate([contacts.one[one][self.first[one]], contacts.other[other][self.second[other]]]) @ root
+        J = (
+            np.concatenate(
+                [contacts.one[one][self.first[one]], contacts.other[other][self.second[other]]]
+            )
+            @ root
+        )
         return np.asarray(J.T @ J)
 
-    def spread(self, contacts: Contacts, number: int, free: np.ndarray, left: np.ndarray) -> list[int]:
+    def spread(
+        self, contacts: Contacts, number: int, free: np.ndarray, left: np.ndarray
+    ) -> list[int]:
         """Let a body that is held hold others; return which.
 
         Args:

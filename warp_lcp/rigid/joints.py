@@ -22,22 +22,24 @@ MOST_ANGLE = np.pi  # [rad]: angles are known up to a whole turn
 class Joint:
     """Joint of two bodies at a point.
 
-    A ball joint allows rotation about the point, a hinge about an axis, a fixed joint none. A hinge's angle is that of `first` relative to
-    `second`, 0 in the initial pose. In the plane the axis is z, and a hinge takes the place of a ball joint.
+    A ball joint allows rotation about the point, a hinge about an axis, a fixed joint none. A
+    hinge's angle is that of `first` relative to `second`, 0 in the initial pose. In the plane the
+    axis is z, and a hinge takes the place of a ball joint.
 
     Args:
         first: a body.
         second: another one, or WORLD.
         anchor: the point as the scene places it [m], shape (3,).
         axis: of a hinge, of any length, shape (3,).
-        limits: of a hinge, least and largest angle [rad]; infinite for none, else within half a turn.
+        limits: of a hinge, least and largest angle [rad]; infinite for none, else within half a
+            turn.
         motor_speed: target angular velocity of a hinge's motor [rad/s].
         motor_torque: largest torque of the motor [N m]; 0: no motor.
         kind: "ball", "hinge" or "fixed".
 
     Raises:
-        ValueError: the bodies are the same, limits are crossed or too wide, the torque is negative or infinite, there is no axis, or a
-            joint other than a hinge has limits or a motor.
+        ValueError: the bodies are the same, limits are crossed or too wide, the torque is negative
+            or infinite, there is no axis, or a joint other than a hinge has limits or a motor.
     """
 
     first: int
@@ -52,12 +54,21 @@ class Joint:
     def __post_init__(self) -> None:
         """Check, and give the axis unit length."""
         if self.first == self.second or self.first < 0:
-            raise ValueError(f"first = {self.first}, second = {self.second}: must be two bodies, or a body and WORLD")
+            raise ValueError(
+                f"first = {self.first}, second = {self.second}: must be two bodies, or a body and "
+                "WORLD"
+            )
         if self.kind not in get_args(JointKind):
-            raise ValueError(f"kind = {self.kind!r}: must be one of {', '.join(get_args(JointKind))}")
+            raise ValueError(
+                f"kind = {self.kind!r}: must be one of {', '.join(get_args(JointKind))}"
+            )
         low, high = self.limits
-        if not low <= high or any(np.isfinite(side) and abs(side) > MOST_ANGLE for side in self.limits):
-            raise ValueError(f"limits = {self.limits}: must be in order and within half a turn, in rad")
+        if not low <= high or any(
+            np.isfinite(side) and abs(side) > MOST_ANGLE for side in self.limits
+        ):
+            raise ValueError(
+                f"limits = {self.limits}: must be in order and within half a turn, in rad"
+            )
         if not 0.0 <= self.motor_torque < np.inf:
             raise ValueError(f"motor_torque = {self.motor_torque}: must be >= 0 and finite, in N m")
         if self.kind != "hinge" and (self.motor_torque > 0.0 or np.isfinite(self.limits).any()):
@@ -74,10 +85,21 @@ class Joint:
 
     def row_count(self, dimension: int) -> int:
         """Return the number of rows."""
-        turns = {"ball": 0, "hinge": 2, "fixed": 3} if dimension == 3 else {"ball": 0, "hinge": 0, "fixed": 1}
-        return dimension + turns[self.kind] + int(np.isfinite(self.limits).sum()) + int(self.motor_torque > 0.0)
+        turns = (
+            {"ball": 0, "hinge": 2, "fixed": 3}
+            if dimension == 3
+            else {"ball": 0, "hinge": 0, "fixed": 1}
+        )
+        return (
+            dimension
+            + turns[self.kind]
+            + int(np.isfinite(self.limits).sum())
+            + int(self.motor_torque > 0.0)
+        )
 
-    def side(self, bodies: Sequence[RigidBody], number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def side(
+        self, bodies: Sequence[RigidBody], number: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the joint on a body or WORLD: arm [m], anchor [m] and rotation."""
         if number == WORLD:
             return self.anchor, self.anchor, np.eye(3)
@@ -91,7 +113,8 @@ class Joint:
         About the axis of the hinge.
         """
         R, S = (self.side(bodies, number)[2] for number in (self.first, self.second))
-        zero = contact_frames(np.asarray(self.axis)[None], 3)[0, 1]  # a direction across the axis that is the same for both at angle 0
+        # a direction across the axis that is the same for both at angle 0
+        zero = contact_frames(np.asarray(self.axis)[None], 3)[0, 1]
         mine, other = R @ zero, S @ zero
         return float(np.arctan2(np.cross(other, mine) @ (R @ self.axis), other @ mine))
 
@@ -114,15 +137,30 @@ class Joint:
             held: directions of `held` that stay, from when the rows were made.
             dimension: 2 or 3.
         """
-        (_, anchor, R), (_, other_anchor, S) = (self.side(bodies, number) for number in (self.first, self.second))
+        (_, anchor, R), (_, other_anchor, S) = (
+            self.side(bodies, number) for number in (self.first, self.second)
+        )
         if self.kind == "fixed":  # R S' = 1 + [e]x for a small relative turn e
             T = R @ S.T
-            turned = held @ (0.5 * np.array([T[2, 1] - T[1, 2], T[0, 2] - T[2, 0], T[1, 0] - T[0, 1]]))
+            turned = held @ (
+                0.5 * np.array([T[2, 1] - T[1, 2], T[0, 2] - T[2, 0], T[1, 0] - T[0, 1]])
+            )
         else:
             turned = -held @ np.cross(R @ self.axis, S @ self.axis)
         angle = self.angle(bodies) if np.isfinite(self.limits).any() else 0.0
-        distances = [side * (angle - limit) for side, limit in zip((1.0, -1.0), self.limits, strict=True) if np.isfinite(limit)]
-        return np.concatenate([(anchor - other_anchor)[:dimension], turned, distances, [0.0] if self.motor_torque > 0.0 else []])
+        distances = [
+            side * (angle - limit)
+            for side, limit in zip((1.0, -1.0), self.limits, strict=True)
+            if np.isfinite(limit)
+        ]
+        return np.concatenate(
+            [
+                (anchor - other_anchor)[:dimension],
+                turned,
+                distances,
+                [0.0] if self.motor_torque > 0.0 else [],
+            ]
+        )
 
     def rows(self, bodies: Sequence[RigidBody], dt: float, dimension: int = 3) -> JointRows:
         """Return the rows for the impulses over a time [s].
@@ -131,13 +169,24 @@ class Joint:
         angle's rate plus its distance to a limit over the step is >= 0 where x > 0; the motor's y is the rate less the wanted one,
         |x| <= torque dt.
         """
-        (arm, anchor, R), (other_arm, other_anchor, _) = (self.side(bodies, number) for number in (self.first, self.second))
+        (arm, anchor, R), (other_arm, other_anchor, _) = (
+            self.side(bodies, number) for number in (self.first, self.second)
+        )
         apart, held, axis = anchor - other_anchor, self.held(bodies, dimension), R @ self.axis
-        arm, other_arm = arm - 0.5 * apart, other_arm + 0.5 * apart  # one point for both impulses: they keep the angular momentum
-        linear = [np.concatenate([e, np.cross(arm, e), -e, -np.cross(other_arm, e)]) for e in np.eye(3)[:dimension]]
-        sides = [side for side, limit in zip((1.0, -1.0), self.limits, strict=True) if np.isfinite(limit)]
+        # one point for both impulses: they keep the angular momentum
+        arm, other_arm = arm - 0.5 * apart, other_arm + 0.5 * apart
+        linear = [
+            np.concatenate([e, np.cross(arm, e), -e, -np.cross(other_arm, e)])
+            for e in np.eye(3)[:dimension]
+        ]
+        sides = [
+            side for side, limit in zip((1.0, -1.0), self.limits, strict=True) if np.isfinite(limit)
+        ]
         motor = [axis] if self.motor_torque > 0.0 else []
-        turns = [np.concatenate([np.zeros(3), d, np.zeros(3), -d]) for d in (*held, *(side * axis for side in sides), *motor)]
+        turns = [
+            np.concatenate([np.zeros(3), d, np.zeros(3), -d])
+            for d in (*held, *(side * axis for side in sides), *motor)
+        ]
         each, equations = np.array([*linear, *turns])[:, None], len(linear) + len(held)
         columns = np.arange(6) if dimension == 3 else np.array(PLANAR)
         torque = [self.motor_torque * dt] * len(motor)
@@ -150,7 +199,9 @@ class Joint:
             other=each[..., 6 + columns],
             error=self.errors(bodies, held, dimension),
             wanted=np.array([0.0] * (m - len(motor)) + [self.motor_speed] * len(motor)),
-            lower=np.array([-np.inf] * equations + [0.0] * len(sides) + [-value for value in torque]),
+            lower=np.array(
+                [-np.inf] * equations + [0.0] * len(sides) + [-value for value in torque]
+            ),
             upper=np.array([np.inf] * (equations + len(sides)) + torque),
         )
 
@@ -227,7 +278,9 @@ class JointRows:
 
     def errors(self, bodies: Sequence[RigidBody], dimension: int) -> np.ndarray:
         """Return the current errors of the rows, shape (m,)."""
-        return np.concatenate([joint.errors(bodies, held, dimension) for joint, held in self.sources])
+        return np.concatenate(
+            [joint.errors(bodies, held, dimension) for joint, held in self.sources]
+        )
 
 
 def joined_pairs(joints: Sequence[Joint], bodies: int) -> frozenset[tuple[int, int]]:
@@ -235,14 +288,19 @@ def joined_pairs(joints: Sequence[Joint], bodies: int) -> frozenset[tuple[int, i
 
     Bodies of a joint, and bodies rigidly connected by fixed joints.
 
-    A piece is what fixed joints hold together; fixed in space, or joined to a body of a piece, says nothing about the others of it.
+    A piece is what fixed joints hold together; fixed in space, or joined to a body of a piece, says
+    nothing about the others of it.
 
     Args:
         joints: all.
         bodies: their number.
     """
     firm = [joint.pair for joint in joints if joint.kind == "fixed" and joint.second != WORLD]
-    links = coo_array((np.ones(len(firm)), np.array(firm, dtype=int).reshape(-1, 2).T), shape=(bodies, bodies))
+    links = coo_array(
+        (np.ones(len(firm)), np.array(firm, dtype=int).reshape(-1, 2).T), shape=(bodies, bodies)
+    )
     piece = connected_components(links, directed=False)[1]
     i, j = np.nonzero(np.triu(piece[:, None] == piece, 1))
-    return frozenset(joint.pair for joint in joints) | frozenset(zip(i.tolist(), j.tolist(), strict=True))
+    return frozenset(joint.pair for joint in joints) | frozenset(
+        zip(i.tolist(), j.tolist(), strict=True)
+    )

@@ -12,7 +12,8 @@ from warp_lcp.grid.solids import Box, Capsule, Geometry, Placement, Sphere, Tria
 from warp_lcp.rigid.outline import mesh_outline
 
 ROUND = 1e-9  # relative: an inertia that is less symmetric is none
-TWICE = 0.01  # of a mesh's surface, from which what lies inside the mesh itself would weigh too much
+# of a mesh's surface, from which what lies inside the mesh itself would weigh too much
+TWICE = 0.01
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -22,10 +23,12 @@ class MassProperties:
     Args:
         mass: [kg]; 2-D: [kg/m], per meter of depth.
         center: of mass [m], shape (3,), z = 0 in 2-D.
-        inertia: about the center [kg m^2], shape (3, 3), symmetric positive definite; 2-D: [kg m], and only its zz counts.
+        inertia: about the center [kg m^2], shape (3, 3), symmetric positive definite; 2-D: [kg m],
+            and only its zz counts.
 
     Raises:
-        ValueError: a value is not finite, the mass is not positive or the inertia is not symmetric positive definite.
+        ValueError: a value is not finite, the mass is not positive or the inertia is not symmetric
+            positive definite.
     """
 
     mass: float
@@ -39,25 +42,34 @@ class MassProperties:
 
     def __post_init__(self) -> None:
         """Check the values and store them as float64."""
-        center, inertia = np.array(self.center, dtype=np.float64), np.array(self.inertia, dtype=np.float64)
+        center, inertia = (
+            np.array(self.center, dtype=np.float64),
+            np.array(self.inertia, dtype=np.float64),
+        )
         if not (math.isfinite(self.mass) and self.mass > 0.0):
             raise ValueError(f"mass = {self.mass}: must be positive and finite")
         if center.shape != (3,) or not np.isfinite(center).all():
             raise ValueError(f"center must be 3 finite numbers, not {center.tolist()}")
         if inertia.shape != (3, 3) or not np.isfinite(inertia).all():
             raise ValueError("inertia must be a finite 3 x 3 matrix")
-        if np.abs(inertia - inertia.T).max() > ROUND * np.abs(inertia).max() or np.linalg.eigvalsh(inertia)[0] <= 0.0:
+        if (
+            np.abs(inertia - inertia.T).max() > ROUND * np.abs(inertia).max()
+            or np.linalg.eigvalsh(inertia)[0] <= 0.0
+        ):
             raise ValueError("inertia must be symmetric positive definite")
         for name, array in (("center", center), ("inertia", inertia)):
             array.flags.writeable = False
             object.__setattr__(self, name, array)
 
 
-def mass_properties(geometry: Geometry, dimension: int, *, mass: float | None = None, density: float | None = None) -> MassProperties:
+def mass_properties(
+    geometry: Geometry, dimension: int, *, mass: float | None = None, density: float | None = None
+) -> MassProperties:
     """Return the mass properties of a placed shape of uniform density.
 
-    Boxes, spheres and capsules by their closed forms; meshes by the integrals of 1, x and x x' over the tetrahedra between the origin and
-    their triangles, in 2-D over the triangles between the origin and the segments of their cut by z = 0, which are exact.
+    Boxes, spheres and capsules by their closed forms; meshes by the integrals of 1, x and x x' over
+    the tetrahedra between the origin and their triangles, in 2-D over the triangles between the
+    origin and the segments of their cut by z = 0, which are exact.
 
     Args:
         geometry: a box, sphere, capsule or mesh, not inverted.
@@ -66,23 +78,34 @@ def mass_properties(geometry: Geometry, dimension: int, *, mass: float | None = 
         density: [kg/m^3]; one of mass and density.
 
     Raises:
-        ValueError: both or none of mass and density, a shape without a volume of its own, or a mesh whose parts overlap.
+        ValueError: both or none of mass and density, a shape without a volume of its own, or a mesh
+            whose parts overlap.
     """
     if (mass is None) == (density is None):
         raise ValueError("give either mass or density")
-    if getattr(geometry, "invert", False) or not isinstance(geometry, (Box, Sphere, Capsule, TriangleMesh)):
+    if getattr(geometry, "invert", False) or not isinstance(
+        geometry, (Box, Sphere, Capsule, TriangleMesh)
+    ):
         raise ValueError(f"{type(geometry).__name__.lower()}: an unbounded shape has no mass")
     if isinstance(geometry, TriangleMesh):
         volume, center, inertia = _mesh(geometry, dimension)
     else:
-        volume, center, inertia = _placed(geometry.placement, dimension, *_closed_form(geometry, dimension))
+        volume, center, inertia = _placed(
+            geometry.placement, dimension, *_closed_form(geometry, dimension)
+        )
     if not volume > 0.0:
-        raise ValueError("the shape has no volume in the plane z = 0" if dimension == 2 else "the shape has no volume")
+        raise ValueError(
+            "the shape has no volume in the plane z = 0"
+            if dimension == 2
+            else "the shape has no volume"
+        )
     uniform = density if density is not None else (mass or 0.0) / volume
     return MassProperties(mass=uniform * volume, center=center, inertia=uniform * inertia)
 
 
-def _closed_form(shape: Box | Sphere | Capsule, dimension: int) -> tuple[float, np.ndarray, np.ndarray]:
+def _closed_form(
+    shape: Box | Sphere | Capsule, dimension: int
+) -> tuple[float, np.ndarray, np.ndarray]:
     """Return volume, center and inertia at density 1 in the shape's own coordinates."""
     if isinstance(shape, Box):
         lower, upper = (np.array([*corner, 0.0][:3]) for corner in (shape.lower, shape.upper))
@@ -93,15 +116,23 @@ def _closed_form(shape: Box | Sphere | Capsule, dimension: int) -> tuple[float, 
     if isinstance(shape, Sphere):
         r = shape.radius
         volume = math.pi * r**2 if dimension == 2 else 4.0 / 3.0 * math.pi * r**3
-        return volume, np.array([*shape.center, 0.0][:3]), np.eye(3) * volume * r**2 * (0.5 if dimension == 2 else 0.4)
+        return (
+            volume,
+            np.array([*shape.center, 0.0][:3]),
+            np.eye(3) * volume * r**2 * (0.5 if dimension == 2 else 0.4),
+        )
     start, end = (np.array([*point, 0.0][:3]) for point in (shape.start, shape.end))
     length, r, center = float(np.linalg.norm(end - start)), shape.radius, 0.5 * (start + end)
     h = 0.5 * length
-    if dimension == 2:  # a rectangle and two half discs, whose centers of mass are 4 r / (3 pi) from their diameters
+    # a rectangle and two half discs, whose centers of mass are 4 r / (3 pi) from their diameters
+    if dimension == 2:
         middle, caps = 2.0 * r * length, math.pi * r**2
-        about = middle * (length**2 + 4.0 * r**2) / 12.0 + caps * (0.5 * r**2 + h**2 + 8.0 * h * r / (3.0 * math.pi))
+        about = middle * (length**2 + 4.0 * r**2) / 12.0 + caps * (
+            0.5 * r**2 + h**2 + 8.0 * h * r / (3.0 * math.pi)
+        )
         return middle + caps, center, about * np.eye(3)
-    middle, caps = math.pi * r**2 * length, 4.0 / 3.0 * math.pi * r**3  # half balls: 3 r / 8 from the plane that cuts them
+    # half balls: 3 r / 8 from the plane that cuts them
+    middle, caps = math.pi * r**2 * length, 4.0 / 3.0 * math.pi * r**3
     along = 0.5 * middle * r**2 + 0.4 * caps * r**2
     across = middle * (length**2 / 12.0 + 0.25 * r**2) + caps * (0.4 * r**2 + h**2 + 0.75 * h * r)
     axis = (end - start) / length
@@ -113,14 +144,19 @@ def _placed(
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """Return volume, center and inertia at density 1 after a placement."""
     scale, R = placement.scale, placement.rotation
-    return volume * scale**dimension, placement.apply(center[None])[0], scale ** (dimension + 2) * R @ inertia @ R.T
+    return (
+        volume * scale**dimension,
+        placement.apply(center[None])[0],
+        scale ** (dimension + 2) * R @ inertia @ R.T,
+    )
 
 
 def _mesh(mesh: TriangleMesh, dimension: int) -> tuple[float, np.ndarray, np.ndarray]:
     """Return volume, center and inertia at density 1 of a mesh as placed, or of its cut by z = 0."""
     if mesh.surface.crossings.doubled > TWICE:
         raise ValueError(
-            f"{mesh.surface.name}: about {mesh.surface.crossings.doubled:.0%} of its surface lies inside itself and would count twice; "
+            f"{mesh.surface.name}: about {mesh.surface.crossings.doubled:.0%} of its surface lies "
+            "inside itself and would count twice; "
             "unite its parts (in Blender: Boolean, Union)"
         )
     vertices = mesh.placement.apply(mesh.surface.vertices)
@@ -131,7 +167,8 @@ def _mesh(mesh: TriangleMesh, dimension: int) -> tuple[float, np.ndarray, np.nda
         corners = segments
     else:
         corners = vertices[mesh.surface.triangles]
-    origin = corners.reshape(-1, 3).mean(axis=0)  # near the shape: far from it the terms would cancel
+    # near the shape: far from it the terms would cancel
+    origin = corners.reshape(-1, 3).mean(axis=0)
     corners = corners - origin
     total = corners.sum(axis=1)
     if dimension == 2:
@@ -143,8 +180,11 @@ def _mesh(mesh: TriangleMesh, dimension: int) -> tuple[float, np.ndarray, np.nda
     if not volume > 0.0:
         return 0.0, origin, np.eye(3)
     center = parts @ total / ((dimension + 1) * volume)
-    # of a simplex with a corner at the origin: its volume times (sum of v v' + (sum of v)(sum of v)') over (d + 1)(d + 2)
-    squares = np.einsum("i,ikj,ikl->jl", parts, corners, corners) + np.einsum("i,ij,il->jl", parts, total, total)
+    # of a simplex with a corner at the origin: its volume times (sum of v v' + (sum of v)(sum of
+    # v)') over (d + 1)(d + 2)
+    squares = np.einsum("i,ikj,ikl->jl", parts, corners, corners) + np.einsum(
+        "i,ij,il->jl", parts, total, total
+    )
     second = squares / ((dimension + 1) * (dimension + 2)) - volume * np.outer(center, center)
     inertia = np.trace(second) * np.eye(3) - (second if dimension == 3 else 0.0)
     return volume, origin + center, 0.5 * (inertia + inertia.T)

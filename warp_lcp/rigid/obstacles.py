@@ -38,7 +38,9 @@ class Obstacle:
         return PLACED if self.motion is None else self.motion.pose(time)
 
 
-def domain_walls(size: Sequence[float], *, open_sides: int = 0, endless: Sequence[int] = ()) -> Obstacle:
+def domain_walls(
+    size: Sequence[float], *, open_sides: int = 0, endless: Sequence[int] = ()
+) -> Obstacle:
     """Return the walls of the domain, a box from the origin to `size` [m].
 
     Args:
@@ -56,7 +58,11 @@ def domain_walls(size: Sequence[float], *, open_sides: int = 0, endless: Sequenc
             points.append(point)
             normals.append(normal)
     shape = (-1, 3)
-    return Obstacle(name="the domain's wall", points=np.reshape(points, shape), normals=np.reshape(normals, shape))
+    return Obstacle(
+        name="the domain's wall",
+        points=np.reshape(points, shape),
+        normals=np.reshape(normals, shape),
+    )
 
 
 def obstacle(solid: PlacedSolid, dimension: int) -> Obstacle:
@@ -74,5 +80,10 @@ def obstacle(solid: PlacedSolid, dimension: int) -> Obstacle:
         corners = np.array([[*corner, 0.0][:3] for corner in (shape.lower, shape.upper)])
         normals = np.concatenate([np.eye(3)[:dimension], -np.eye(3)[:dimension]])
         points = shape.placement.apply(np.repeat(corners, dimension, axis=0))
-        return Obstacle(name=solid.name, points=points, normals=normals @ shape.placement.rotation.T, motion=solid.motion)
+        return Obstacle(
+            name=solid.name,
+            points=points,
+            normals=normals @ shape.placement.rotation.T,
+            motion=solid.motion,
+        )
     return Obstacle(name=solid.name, shape=ContactShape.of(shape, dimension), motion=solid.motion)

@@ -18,7 +18,8 @@ def mesh_outline(mesh: TriangleMesh) -> np.ndarray:
 
     The inside is on the left.
 
-    Corners on the plane count as above it, so that each triangle that reaches below gives one segment or none.
+    Corners on the plane count as above it, so that each triangle that reaches below gives one
+    segment or none.
     """
     corners = mesh.placement.apply(mesh.surface.vertices)[mesh.surface.triangles]
     above = corners[..., 2] >= 0.0
@@ -27,7 +28,8 @@ def mesh_outline(mesh: TriangleMesh) -> np.ndarray:
     corners, above, count = corners[crossing], above[crossing], count[crossing]
     if not len(corners):
         return np.zeros((0, 2, 3))
-    alone = np.where(count == 1, above.argmax(axis=1), above.argmin(axis=1))  # the corner on the other side than the two others
+    # the corner on the other side than the two others
+    alone = np.where(count == 1, above.argmax(axis=1), above.argmin(axis=1))
     order = (alone[:, None] + np.arange(3)) % 3
     a, b, c = np.moveaxis(np.take_along_axis(corners, order[..., None], axis=1), 1, 0)
 
@@ -38,12 +40,13 @@ def mesh_outline(mesh: TriangleMesh) -> np.ndarray:
         return point
 
     ends = np.stack([cut(a, b), cut(a, c)], axis=1)
-    # seen from outside a triangle is counterclockwise: with one corner above, the way from its left side to its right one leaves the inside
-    # on the left
+    # seen from outside a triangle is counterclockwise: with one corner above, the way from its left
+    # side to its right one leaves the inside on the left
     swap = count == 2
     ends[swap] = ends[swap][:, ::-1]
     length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
-    return ends[length > NO_LENGTH * mesh.placement.scale * mesh.surface.size]  # a triangle that only touches the plane gives a point
+    # a triangle that only touches the plane gives a point
+    return ends[length > NO_LENGTH * mesh.placement.scale * mesh.surface.size]
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +57,8 @@ class BodySurface:
 
     Args:
         points: [m], shape (n, 3).
-        corners: of triangles, shape (m, 3), counterclockwise seen from outside, or of segments, shape (m, 2), the inside on the left.
+        corners: of triangles, shape (m, 3), counterclockwise seen from outside, or of segments,
+            shape (m, 2), the inside on the left.
         fields: at the points.
     """
 
@@ -66,9 +70,18 @@ class BodySurface:
     def joined(cls, surfaces: Sequence[BodySurface]) -> BodySurface:
         """Return several surfaces as one."""
         first = np.cumsum([0, *(len(surface.points) for surface in surfaces)])
-        corners = np.concatenate([surface.corners + start for surface, start in zip(surfaces, first, strict=False)])
-        fields = {name: np.concatenate([surface.fields[name] for surface in surfaces]) for name in surfaces[0].fields}
-        return cls(np.concatenate([surface.points for surface in surfaces]), corners.astype(np.int32), fields)
+        corners = np.concatenate(
+            [surface.corners + start for surface, start in zip(surfaces, first, strict=False)]
+        )
+        fields = {
+            name: np.concatenate([surface.fields[name] for surface in surfaces])
+            for name in surfaces[0].fields
+        }
+        return cls(
+            np.concatenate([surface.points for surface in surfaces]),
+            corners.astype(np.int32),
+            fields,
+        )
 
 
 def body_surface(geometry: Geometry, dimension: int) -> BodySurface:
@@ -81,14 +94,20 @@ def body_surface(geometry: Geometry, dimension: int) -> BodySurface:
         return BodySurface.joined([body_surface(part, dimension) for part in geometry.parts])
     if isinstance(geometry, TriangleMesh):
         if dimension == 3:
-            return BodySurface(geometry.placement.apply(geometry.surface.vertices), geometry.surface.triangles)
+            return BodySurface(
+                geometry.placement.apply(geometry.surface.vertices), geometry.surface.triangles
+            )
         segments = mesh_outline(geometry)
         points, corners = np.unique(segments.reshape(-1, 3).round(12), axis=0, return_inverse=True)
         return BodySurface(points, corners.reshape(-1, 2))
     if isinstance(geometry, Box):
         points, corners = _box(geometry, dimension)
     elif isinstance(geometry, (Sphere, Capsule)):
-        ends = (geometry.center, geometry.center) if isinstance(geometry, Sphere) else (geometry.start, geometry.end)
+        ends = (
+            (geometry.center, geometry.center)
+            if isinstance(geometry, Sphere)
+            else (geometry.start, geometry.end)
+        )
         start, end = (np.array([*point, 0.0][:3]) for point in ends)
         points, corners = _round(start, end, geometry.radius, dimension)
     else:
@@ -102,11 +121,17 @@ def _box(box: Box, dimension: int) -> tuple[np.ndarray, np.ndarray]:
         unit = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
         return lower + unit * (upper - lower), np.array([[0, 1], [1, 2], [2, 3], [3, 0]])
     unit = np.array([[i, j, k] for k in (0, 1) for j in (0, 1) for i in (0, 1)])
-    sides = np.array([[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]])
-    return lower + unit * (upper - lower), np.concatenate([sides[:, [0, 1, 2]], sides[:, [0, 2, 3]]])
+    sides = np.array(
+        [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]]
+    )
+    return lower + unit * (upper - lower), np.concatenate(
+        [sides[:, [0, 1, 2]], sides[:, [0, 2, 3]]]
+    )
 
 
-def _round(start: np.ndarray, end: np.ndarray, radius: float, dimension: int) -> tuple[np.ndarray, np.ndarray]:
+def _round(
+    start: np.ndarray, end: np.ndarray, radius: float, dimension: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Return a stadium or capsule, a disc or ball where the ends coincide."""
     axis = end - start
     length = float(np.linalg.norm(axis))
@@ -120,10 +145,14 @@ def _round(start: np.ndarray, end: np.ndarray, radius: float, dimension: int) ->
     u = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
     u /= np.linalg.norm(u)
     v = np.cross(axis, u)
-    down = np.pi * (np.arange(AROUND // 2) + 0.5) / (AROUND // 2)  # from the tip at the end to that at the start
+    # from the tip at the end to that at the start
+    down = np.pi * (np.arange(AROUND // 2) + 0.5) / (AROUND // 2)
     angle = 2.0 * np.pi * np.arange(AROUND) / AROUND
     ring = np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * v
-    rings = [(end if np.cos(a) > 0.0 else start) + radius * (np.cos(a) * axis + np.sin(a) * ring) for a in down]
+    rings = [
+        (end if np.cos(a) > 0.0 else start) + radius * (np.cos(a) * axis + np.sin(a) * ring)
+        for a in down
+    ]
     points = np.concatenate([*rings, (end + radius * axis)[None], (start - radius * axis)[None]])
     i, j = np.meshgrid(np.arange(len(down) - 1), np.arange(AROUND), indexing="ij")
     a, b = (i * AROUND + j).ravel(), (i * AROUND + (j + 1) % AROUND).ravel()

@@ -33,21 +33,44 @@ from warp_lcp.rigid.obstacles import Obstacle
 from warp_lcp.rows import KernelFile
 from warp_lcp.rows.host_kernel import HostKernel
 
-AHEAD = 2.0  # of the way that speeds and gravity make in a step: what a material gives a body is not known before it is solved for
+# of the way that speeds and gravity make in a step: what a material gives a body is not known
+# before it is solved for
+AHEAD = 2.0
 FEW = 64  # bodies: with more, pairs are sorted
 WIDTHS = (1, 1, 1, 3, 3, 1, 6, 6, 6, 2, 1, 1, 1, 1)  # numbers of a contact, field by field
 FIND = HostKernel(
-    KernelFile(Path(__file__).parent / "headers/planar_contacts.h")["warp_lcp.rigid.planar_contacts.find"],
-    AHEAD=AHEAD, ON_SURFACE=ON_SURFACE, PARALLEL=PARALLEL, FACE_FIRST=FACE_FIRST, LOWER=LOWER, MUCH_LOWER=MUCH_LOWER,
-    LEVEL=LEVEL, SAME=SAME, OTHER_SIDE=OTHER_SIDE, FLAT=FLAT[2], MORE=MORE, MOST_OF_PAIR=MOST[2],
-)  # fmt: skip
+    KernelFile(Path(__file__).parent / "headers/planar_contacts.h")[
+        "warp_lcp.rigid.planar_contacts.find"
+    ],
+    AHEAD=AHEAD,
+    ON_SURFACE=ON_SURFACE,
+    PARALLEL=PARALLEL,
+    FACE_FIRST=FACE_FIRST,
+    LOWER=LOWER,
+    MUCH_LOWER=MUCH_LOWER,
+    LEVEL=LEVEL,
+    SAME=SAME,
+    OTHER_SIDE=OTHER_SIDE,
+    FLAT=FLAT[2],
+    MORE=MORE,
+    MOST_OF_PAIR=MOST[2],
+)
 SLOP = 1e-5  # of a body's size: overlap that is left alone
 RATE = 0.3  # part of a larger overlap that a step removes
-ROUGH = StoppingCriteria(rtol=1e-2, max_iterations=30)  # for overlaps, which take several steps anyway
+# for overlaps, which take several steps anyway
+ROUGH = StoppingCriteria(rtol=1e-2, max_iterations=30)
 PUSH = HostKernel(
-    KernelFile(Path(__file__).parent / "headers/planar_impulses.h")["warp_lcp.rigid.planar_impulses.push"],
-    YIELDS=YIELDS, SAME_PLACE=SAME_PLACE, SLOP=SLOP, BEARS=BEARS, RATE=RATE, ROUGH_RTOL=ROUGH.rtol, ROUGH_MOST=ROUGH.max_iterations,
-)  # fmt: skip
+    KernelFile(Path(__file__).parent / "headers/planar_impulses.h")[
+        "warp_lcp.rigid.planar_impulses.push"
+    ],
+    YIELDS=YIELDS,
+    SAME_PLACE=SAME_PLACE,
+    SLOP=SLOP,
+    BEARS=BEARS,
+    RATE=RATE,
+    ROUGH_RTOL=ROUGH.rtol,
+    ROUGH_MOST=ROUGH.max_iterations,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,11 +84,11 @@ class PlanarImpulses:
         iterations: the most of an island.
         dt: of the step [s].
         values: of the bodies after it.
-        ways: displacements that reduce overlaps at the end of the step (m, rad), shape (n, 3); None: no contact will overlap by more
-            than `SLOP`.
+        ways: displacements that reduce overlaps at the end of the step (m, rad), shape (n, 3);
+            None: no contact will overlap by more than `SLOP`.
         memory: what a `ContactMemory` keeps of the contacts, shape (k, 8).
-        squares: G'J'JG of the rows J that hold a body against walls and solids, and the diagonal of the root G of its inverse mass,
-            by body; None: bodies that are held touch others.
+        squares: G'J'JG of the rows J that hold a body against walls and solids, and the diagonal of
+            the root G of its inverse mass, by body; None: bodies that are held touch others.
     """
 
     contacts: Contacts
@@ -94,23 +117,52 @@ class PlanarContacts:
         half = [0.5 * (shape.high - shape.low) - shape.radius for shape in shapes]
         of_bodies = [[body.friction for body in bodies], [body.restitution for body in bodies]]
         of_shapes = [shape.numbers for shape in shapes]
-        fixed: tuple[Any, ...] = (bodies.mass, bodies.inverse_inertia, bodies.center, middle, half, reach, *of_bodies, of_shapes)
+        fixed: tuple[Any, ...] = (
+            bodies.mass,
+            bodies.inverse_inertia,
+            bodies.center,
+            middle,
+            half,
+            reach,
+            *of_bodies,
+            of_shapes,
+        )
         self._fixed = np.concatenate([np.ravel(of) for of in fixed])
-        self._planes = np.array([len(obstacle.points) if obstacle.shape is None else -1 for obstacle in self.obstacles], dtype=np.int32)
+        self._planes = np.array(
+            [len(obstacle.points) if obstacle.shape is None else -1 for obstacle in self.obstacles],
+            dtype=np.int32,
+        )
         self.still = all(obstacle.motion is None for obstacle in self.obstacles)
-        self._standing = [self._placed(obstacle, 0.0) if obstacle.motion is None else None for obstacle in self.obstacles]
-        self._around: tuple[float, np.ndarray] | None = None  # obstacles that all stand, and the margin around them
+        self._standing = [
+            self._placed(obstacle, 0.0) if obstacle.motion is None else None
+            for obstacle in self.obstacles
+        ]
+        # obstacles that all stand, and the margin around them
+        self._around: tuple[float, np.ndarray] | None = None
         self._capacity = 8 * (len(shapes) + 8)  # contacts
         self._masses = np.concatenate(
-            [np.ravel(of) for of in (bodies.mass, bodies.inverse_inertia, np.linalg.cholesky(bodies.inverse_inertia))]
+            [
+                np.ravel(of)
+                for of in (
+                    bodies.mass,
+                    bodies.inverse_inertia,
+                    np.linalg.cholesky(bodies.inverse_inertia),
+                )
+            ]
         )
 
     @staticmethod
     def holds(detection: ContactDetection) -> bool:
         """Return whether it finds the contacts of these bodies and obstacles."""
-        shapes = (*detection.shapes, *(obstacle.shape for obstacle in detection.obstacles if obstacle.shape is not None))
+        shapes = (
+            *detection.shapes,
+            *(obstacle.shape for obstacle in detection.obstacles if obstacle.shape is not None),
+        )
         return (
-            detection.dimension == 2 and not detection.every and len(detection.shapes) <= FEW and all(s.numbers is not None for s in shapes)
+            detection.dimension == 2
+            and not detection.every
+            and len(detection.shapes) <= FEW
+            and all(s.numbers is not None for s in shapes)
         )
 
     @staticmethod
@@ -118,22 +170,37 @@ class PlanarContacts:
         """Return what the kernel has of an obstacle, but for its margin."""
         pose, shape = obstacle.pose(time), obstacle.shape
         if shape is None:
-            return np.concatenate([pose.apply(obstacle.points).ravel(), (obstacle.normals @ pose.rotation.T).ravel()])
+            return np.concatenate(
+                [pose.apply(obstacle.points).ravel(), (obstacle.normals @ pose.rotation.T).ravel()]
+            )
         reach = np.abs(pose.rotation) @ (0.5 * (shape.high - shape.low))
-        of_pose = [pose.rotation.ravel(), pose.translation, pose.apply(0.5 * (shape.low + shape.high)), reach]
+        of_pose = [
+            pose.rotation.ravel(),
+            pose.translation,
+            pose.apply(0.5 * (shape.low + shape.high)),
+            reach,
+        ]
         return np.concatenate([shape.numbers, *of_pose])
 
     def _obstacles(self, time: float, margins: Sequence[float]) -> np.ndarray:
         """Return the kernel's obstacles, each with the gap up to which a body that rests touches it [m]."""
         if self.still and self._around is not None and self._around[0] == margins[0]:
             return self._around[1]
-        placed = [self._placed(o, time) if of is None else of for o, of in zip(self.obstacles, self._standing, strict=True)]
-        found = np.concatenate([part for margin, of in zip(margins, placed, strict=True) for part in ((margin,), of)] or [np.zeros(0)])
+        placed = [
+            self._placed(o, time) if of is None else of
+            for o, of in zip(self.obstacles, self._standing, strict=True)
+        ]
+        found = np.concatenate(
+            [part for margin, of in zip(margins, placed, strict=True) for part in ((margin,), of)]
+            or [np.zeros(0)]
+        )
         if self.still and len(margins):
             self._around = margins[0], found
         return found
 
-    def find(self, time: float, dt: float, falls: float, near: float, brought: Sequence[float]) -> tuple[FoundContacts, Contacts] | None:
+    def find(
+        self, time: float, dt: float, falls: float, near: float, brought: Sequence[float]
+    ) -> tuple[FoundContacts, Contacts] | None:
         """Return the contacts, and these with rows for obstacles that stand.
 
         Args:
@@ -149,8 +216,21 @@ class PlanarContacts:
         n, capacity = len(self.bodies), self._capacity
         obstacles = self._obstacles(time, [near + way for way in brought])
         given = (self.bodies.values, self._fixed, obstacles)
-        sizes = {"count": n, "obstacles": len(self.obstacles), "length_of_obstacles": len(obstacles), "capacity": capacity}
-        reals, (total,) = FIND.run(given, (self._planes,), work=10 * n + sum(WIDTHS) * capacity, dt=dt, falls=falls, near=near, **sizes)
+        sizes = {
+            "count": n,
+            "obstacles": len(self.obstacles),
+            "length_of_obstacles": len(obstacles),
+            "capacity": capacity,
+        }
+        reals, (total,) = FIND.run(
+            given,
+            (self._planes,),
+            work=10 * n + sum(WIDTHS) * capacity,
+            dt=dt,
+            falls=falls,
+            near=near,
+            **sizes,
+        )
         k, begin = int(total[0]), 103 * n + len(obstacles) + 10 * n
         if k < 0:
             return None
@@ -161,20 +241,45 @@ class PlanarContacts:
         first, second, which = (field.astype(np.int64) for field in fields[:3])
         point, normal, gap = fields[3].reshape(k, 3), fields[4].reshape(k, 3), fields[5]
         frames = fields[6].reshape(k, 2, 3)
-        # in the order in which `ContactSolve.assembled` leaves them, by which BLAS chooses how it adds up
-        one, other = (np.ascontiguousarray(rows.reshape(k, 2, 3).transpose(2, 0, 1)).transpose(1, 2, 0) for rows in fields[7:9])
+        # in the order in which `ContactSolve.assembled` leaves them, by which BLAS chooses how it
+        # adds up
+        one, other = (
+            np.ascontiguousarray(rows.reshape(k, 2, 3).transpose(2, 0, 1)).transpose(1, 2, 0)
+            for rows in fields[7:9]
+        )
         wall, target, friction, restitution, size = fields[9].reshape(k, 2), *fields[10:]
         found = FoundContacts(first, second, which, ContactPoints(point, normal, gap))
-        return found, Contacts(first, second, point, frames, gap, size, friction, one, other, wall, target, restitution, np.zeros(k))
+        return found, Contacts(
+            first,
+            second,
+            point,
+            frames,
+            gap,
+            size,
+            friction,
+            one,
+            other,
+            wall,
+            target,
+            restitution,
+            np.zeros(k),
+        )
 
     def push(
-        self, contacts: Contacts, before: np.ndarray, resumed: bool, stopping: StoppingCriteria, unsolved: float, dt: float
+        self,
+        contacts: Contacts,
+        before: np.ndarray,
+        resumed: bool,
+        stopping: StoppingCriteria,
+        unsolved: float,
+        dt: float,
     ) -> PlanarImpulses | None:
         """Push the bodies apart by nonlinear conjugate gradients on sweeps.
 
         Args:
             contacts: of the step.
-            before: impulses to start from [N s], shape (k, 2), if `resumed`; else those of a `ContactMemory`, shape (m, 8).
+            before: impulses to start from [N s], shape (k, 2), if `resumed`; else those of a
+                `ContactMemory`, shape (m, 8).
             resumed: see `before`.
             stopping: of NNCG.
             unsolved: largest residual with which the bodies are pushed.
@@ -184,21 +289,53 @@ class PlanarContacts:
             None: they are not solved for, and the bodies are as before.
         """
         c, n, k = contacts, len(self.bodies), len(contacts)
-        of_contacts = (c.point, c.frames, c.size, c.one, c.other, c.wall, c.target, c.friction, c.gap)
-        given, work = (self.bodies.values, self._masses, *of_contacts, before), 45 * k + 26 * (n + 1)
+        of_contacts = (
+            c.point,
+            c.frames,
+            c.size,
+            c.one,
+            c.other,
+            c.wall,
+            c.target,
+            c.friction,
+            c.gap,
+        )
+        given, work = (
+            (self.bodies.values, self._masses, *of_contacts, before),
+            45 * k + 26 * (n + 1),
+        )
         reals, (worst, iterations, deep, stacked) = PUSH.run(
-            given, (c.first, c.second), work=work, places=5 * k + n + 2, count=n, contacts=k, old=0 if resumed else len(before),
-            resumed=resumed, rtol=stopping.rtol, most=stopping.max_iterations, unsolved=unsolved, dt=dt,
-        )  # fmt: skip
+            given,
+            (c.first, c.second),
+            work=work,
+            places=5 * k + n + 2,
+            count=n,
+            contacts=k,
+            old=0 if resumed else len(before),
+            resumed=resumed,
+            rtol=stopping.rtol,
+            most=stopping.max_iterations,
+            unsolved=unsolved,
+            dt=dt,
+        )
         if not worst[0] <= unsolved:
             return None
         values = reals[: 26 * n].reshape(n, 26).copy()
         self.bodies.values[:] = values
         begin = 45 * n + 27 * k + before.size
         ends = list(accumulate((begin, 2 * k, 8 * k, 9 * n, 3 * (n + 1), 3 * n, n)))
-        impulses, memory, squares, roots, ways, holding = (reals[start:end].copy() for start, end in pairwise(ends))
+        impulses, memory, squares, roots, ways, holding = (
+            reals[start:end].copy() for start, end in pairwise(ends)
+        )
         held = np.flatnonzero(holding).tolist() if not stacked[0] else None
-        of_body = None if held is None else {i: (squares[9 * i : 9 * i + 9].reshape(3, 3), roots[3 * i : 3 * i + 3]) for i in held}
+        of_body = (
+            None
+            if held is None
+            else {
+                i: (squares[9 * i : 9 * i + 9].reshape(3, 3), roots[3 * i : 3 * i + 3])
+                for i in held
+            }
+        )
         apart = ways.reshape(n, 3) if deep[0] else None
         solved = impulses.reshape(k, 2), float(worst[0]), int(iterations[0])
         return PlanarImpulses(contacts, *solved, dt, values, apart, memory.reshape(k, 8), of_body)

@@ -1,11 +1,12 @@
 # mypy: ignore-errors
 """CUDA graphs of a step's launches: captured once, their arguments are read from memory of the device.
 
-What changes from run to run (windows, list lengths, replaced arrays, `Scalar`s) stands in memory of the host, see `memory.py`.
-The arguments of all kernels of a graph lie one after another in one array of the device, the *image*. Each run gathers the
-changed numbers in one pinned buffer. The graph copies it to the device, writes its bytes to their places in the image (one
-kernel), and launches the kernels, each of which reads its arguments from there. Launch dimensions are those of the largest
-rows; threads beyond the present ones return at once.
+What changes from run to run (windows, list lengths, replaced arrays, `Scalar`s) stands in memory of
+the host, see `memory.py`. The arguments of all kernels of a graph lie one after another in one
+array of the device, the *image*. Each run gathers the changed numbers in one pinned buffer. The
+graph copies it to the device, writes its bytes to their places in the image (one kernel), and
+launches the kernels, each of which reads its arguments from there. Launch dimensions are those of
+the largest rows; threads beyond the present ones return at once.
 """
 
 import ast
@@ -40,7 +41,12 @@ if wp.int64((plane_ * given_[0].{{0}}.rows + row_) * given_[0].{{0}}.chunks + ch
 
 
 @forward_kernel(module="warp_lcp.device_graph")
-def patch_kernel(cells: wp.array(dtype=wp.uint8), source: wp.array(dtype=int), place: wp.array(dtype=int), image: wp.array(dtype=wp.uint8)):
+def patch_kernel(
+    cells: wp.array(dtype=wp.uint8),
+    source: wp.array(dtype=int),
+    place: wp.array(dtype=int),
+    image: wp.array(dtype=wp.uint8),
+):
     """Write a byte that changes from run to run to its place in the arguments."""
     t = wp.tid()
     image[place[t]] = cells[source[t]]
@@ -83,7 +89,8 @@ def kernel_from_memory(kernel: Any, sized: int) -> Any:
 
     Args:
         kernel: the kernel.
-        sized: dimensions of a launch whose threads beyond the number of tasks return at once, see `launch_ranges`; 0: none do.
+        sized: dimensions of a launch whose threads beyond the number of tasks return at once, see
+            `launch_ranges`; 0: none do.
     """
     if (kernel, sized) not in _KERNELS:
         _KERNELS[kernel, sized] = _made_from_memory(kernel, sized)
@@ -105,10 +112,14 @@ def _made_from_memory(kernel: Any, sized: int) -> Any:
     function = types.FunctionType(old.__code__, old.__globals__, old.__name__, (), old.__closure__)
     function.__qualname__, function.__module__ = old.__qualname__, old.__module__
     kind = wp.array(dtype=Given)
-    function.__signature__ = inspect.Signature([inspect.Parameter("given_", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=kind)])
+    function.__signature__ = inspect.Signature(
+        [inspect.Parameter("given_", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=kind)]
+    )
     function.__annotations__ = {"given_": kind}
     module = wp.get_module(f"{kernel.module.name}.memory.{name}{'_sized' * bool(sized)}")
-    return Given, wp.Kernel(function, kernel.key, module, {"enable_backward": False}, source=ast.unparse(tree))
+    return Given, wp.Kernel(
+        function, kernel.key, module, {"enable_backward": False}, source=ast.unparse(tree)
+    )
 
 
 class DeviceProgram(Program):
@@ -120,10 +131,12 @@ class DeviceProgram(Program):
 
     def __init__(self, device: wp.Device) -> None:
         super().__init__(device)
-        self._pieces: list[tuple[int, Any, Any, tuple[int, ...], bytes, int, int]] = []  # of `_add`, each with its command and its place
+        # of `_add`, each with its command and its place
+        self._pieces: list[tuple[int, Any, Any, tuple[int, ...], bytes, int, int]] = []
         self._patches: list[tuple[int, int, int]] = []
         self._bytes = 0
-        self._extents: list[tuple[Any, tuple[int, ...]]] = []  # memory of rows, and the launch dimensions that have been captured
+        # memory of rows, and the launch dimensions that have been captured
+        self._extents: list[tuple[Any, tuple[int, ...]]] = []
         self._buffer: np.ndarray | None = None
         self._copied: Any = None  # event after which the buffer may be written
 
@@ -136,7 +149,9 @@ class DeviceProgram(Program):
         if isinstance(what, DeviceCopy):
             if any(hasattr(array, "slot") for array in (what.to, what.source)):
                 raise NotRecordable("a copy of an array that is replaced")
-        elif isinstance(what, Task) or not (isinstance(what, Conditional) or hasattr(what, "launch")):
+        elif isinstance(what, Task) or not (
+            isinstance(what, Conditional) or hasattr(what, "launch")
+        ):
             raise NotRecordable("a task of the host")
         super().record(what)
 
@@ -146,28 +161,47 @@ class DeviceProgram(Program):
             self.record(command)
         self._arguments += other._arguments
 
-    def launch(self, kernel: Any, dim: Any, inputs: Any, *, device: Any, block_dim: int = 256) -> None:
+    def launch(
+        self, kernel: Any, dim: Any, inputs: Any, *, device: Any, block_dim: int = 256
+    ) -> None:
         """Record a launch; numbers may be `Scalar`."""
         dims = tuple(dim) if hasattr(dim, "__len__") else (dim,)
         self._record_kernel(kernel, dims, inputs, (), 0, sized=0, block_dim=block_dim)
 
-    def record_tasks(self, kernel: Any, dim: tuple[int, ...], inputs: list[Any], first: Any, sized: int, extent: Any) -> None:
+    def record_tasks(
+        self,
+        kernel: Any,
+        dim: tuple[int, ...],
+        inputs: list[Any],
+        first: Any,
+        sized: int,
+        extent: Any,
+    ) -> None:
         """Record a launch of a kernel with ranges of tasks; arguments as of `launch_ranges`."""
         if extent is None or not sized:
             self._record_kernel(kernel, dim, inputs, (), 0, sized=0)
             return
         room = self._hold(extent)
-        self._record_kernel(kernel, room[-len(dim) :], inputs, (first,) if first else (), sized, sized=len(dim))
+        self._record_kernel(
+            kernel, room[-len(dim) :], inputs, (first,) if first else (), sized, sized=len(dim)
+        )
 
     def record_pass(self, bound: Any) -> None:
         """Record the launch of a pass."""
         patches, layout = bound.patches(), bound.layout
         if not patches:
             if 0 not in threads(layout):
-                super().launch(bound.form.kernel, bound.form.dim(layout), [layout, bound.fields], device=self.device)
+                super().launch(
+                    bound.form.kernel,
+                    bound.form.dim(layout),
+                    [layout, bound.fields],
+                    device=self.device,
+                )
             return
         struct, kernel = pass_from_memory(bound.form)
-        room = bound.form.dim(layout) if bound.rows.memory is None else self._hold(bound.rows.memory)
+        room = (
+            bound.form.dim(layout) if bound.rows.memory is None else self._hold(bound.rows.memory)
+        )
         memory = bytes(layout.__ctype__()).ljust(LAYOUT_BYTES, b"\0") + bound.arguments
         self._add(kernel, struct, room, memory, patches, bound)
 
@@ -177,7 +211,15 @@ class DeviceProgram(Program):
         return memory.room
 
     def _record_kernel(
-        self, kernel: Any, dim: tuple[int, ...], inputs: Any, first: Any, tasks: int, *, sized: int, block_dim: int = 256
+        self,
+        kernel: Any,
+        dim: tuple[int, ...],
+        inputs: Any,
+        first: Any,
+        tasks: int,
+        *,
+        sized: int,
+        block_dim: int = 256,
     ) -> None:
         changing = any(type(v) is Scalar or hasattr(v, "slot") for v in inputs)
         if not (changing or first or sized):
@@ -190,7 +232,9 @@ class DeviceProgram(Program):
         native, patches = type(given.__ctype__()), []
         if first:
             offset, address, size = first[0]
-            patches.append((getattr(native, kernel.adj.args[0].label).offset + offset, address, size))
+            patches.append(
+                (getattr(native, kernel.adj.args[0].label).offset + offset, address, size)
+            )
         if sized:
             patches.append((getattr(native, FIRST).offset, tasks, 8))
         for arg, value in zip(kernel.adj.args, inputs, strict=True):
@@ -201,12 +245,23 @@ class DeviceProgram(Program):
                 patches.append((offset, slot.address, ARRAY_BYTES))
         self._add(made, struct, dim, bytes(given.__ctype__()), patches, (given, inputs), block_dim)
 
-    def _add(self, kernel: Any, struct: Any, dim: Any, memory: bytes, patches: Any, kept: Any, block_dim: int = 256) -> None:
+    def _add(
+        self,
+        kernel: Any,
+        struct: Any,
+        dim: Any,
+        memory: bytes,
+        patches: Any,
+        kept: Any,
+        block_dim: int = 256,
+    ) -> None:
         at = self._bytes
         self._bytes += -(-len(memory) // ALIGNED) * ALIGNED
         self._patches += [(at + offset, address, size) for offset, address, size in patches]
         self._arguments.append(kept)
-        self._pieces.append((len(self._commands), kernel, struct, tuple(dim), memory, at, block_dim))
+        self._pieces.append(
+            (len(self._commands), kernel, struct, tuple(dim), memory, at, block_dim)
+        )
         self._commands.append(None)
 
     def finish(self) -> None:
@@ -221,7 +276,9 @@ class DeviceProgram(Program):
         for which, kernel, struct, dim, _, at, block_dim in self._pieces:
             given = wp.array(ptr=image.ptr + at, dtype=struct, shape=1, device=self.device)
             self._arguments.append(given)
-            made = wp.launch(kernel, dim, [given], device=self.device, block_dim=block_dim, record_cmd=True)
+            made = wp.launch(
+                kernel, dim, [given], device=self.device, block_dim=block_dim, record_cmd=True
+            )
             self._commands[which] = made
         self._prepare_patches(image)
 
@@ -240,7 +297,10 @@ class DeviceProgram(Program):
         pinned = wp.zeros(size, dtype=wp.uint8, device="cpu", pinned=wp.is_cuda_available())
         cells = wp.zeros(size, dtype=wp.uint8, device=self.device)
         self._pinned, self._buffer = pinned, np.zeros(size, dtype=np.uint8)
-        lists = [wp.array(np.concatenate(numbers).astype(np.int32), dtype=wp.int32, device=self.device) for numbers in (source, place)]
+        lists = [
+            wp.array(np.concatenate(numbers).astype(np.int32), dtype=wp.int32, device=self.device)
+            for numbers in (source, place)
+        ]
         inputs = [cells, *lists, image]
         self._arguments += [inputs, pinned]
         made = wp.launch(patch_kernel, len(lists[0]), inputs, device=self.device, record_cmd=True)
@@ -248,7 +308,11 @@ class DeviceProgram(Program):
 
     def fits(self) -> bool:
         """Return whether all rows have no more threads now than were captured."""
-        return all(e <= r for memory, room in self._extents for e, r in zip(memory.extent, room, strict=True))
+        return all(
+            e <= r
+            for memory, room in self._extents
+            for e, r in zip(memory.extent, room, strict=True)
+        )
 
     @property
     def commands(self) -> list[Any]:
@@ -328,7 +392,10 @@ class Upload(DeviceProgram):
     def run(self) -> None:
         """Launch the copy, or have it wait for others; do nothing if the host's array is as it was."""
         address = self._sources[0][1]
-        if self._sent and np.array_equal(self._buffer, np.frombuffer((ctypes.c_uint8 * len(self._buffer)).from_address(address), np.uint8)):
+        if self._sent and np.array_equal(
+            self._buffer,
+            np.frombuffer((ctypes.c_uint8 * len(self._buffer)).from_address(address), np.uint8),
+        ):
             return
         self._sent = True
         super().run()

@@ -1,6 +1,7 @@
 """How an operator stores its fields while a solver works on them: flat, with ghost cells where its stencil wants them.
 
-A user's field has the operator's shape; a *stored* field is a flat array of `size` elements. Solvers see stored fields only.
+A user's field has the operator's shape; a *stored* field is a flat array of `size` elements.
+Solvers see stored fields only.
 """
 
 from __future__ import annotations
@@ -18,9 +19,11 @@ import warp as wp
 from warp_lcp.rows.kernel_messages import start_warp
 
 Array = Any  # a numpy array or a wp.array
-CPU_CHUNK = 8192  # elements of a flat field a CPU thread takes: its operands stay in the L2 cache between fused loops
+# elements of a flat field a CPU thread takes: its operands stay in the L2 cache between fused loops
+CPU_CHUNK = 8192
 LARGE = 1 << 20  # elements from which a field of the CPU is looked through for what of it is in use
-HUGE_PAGE, SMALL_PAGE = 1 << 21, 1 << 12  # bytes that the system gives memory by, when something in them is first written
+# bytes that the system gives memory by, when something in them is first written
+HUGE_PAGE, SMALL_PAGE = 1 << 21, 1 << 12
 
 
 def checked_device(device: Any) -> wp.Device:
@@ -34,22 +37,29 @@ def checked_device(device: Any) -> wp.Device:
         return wp.get_device(device)
     except (ValueError, RuntimeError) as reason:
         there = ", ".join(str(d) for d in wp.get_devices())
-        raise ValueError(f"device = {device!r}: there is no such device, expected one of {there}") from reason
+        raise ValueError(
+            f"device = {device!r}: there is no such device, expected one of {there}"
+        ) from reason
 
 
-def zeros(n: int | tuple[int, ...], dtype: Any, device: wp.Device, *, small_pages: bool = False) -> wp.array[Any]:
+def zeros(
+    n: int | tuple[int, ...], dtype: Any, device: wp.Device, *, small_pages: bool = False
+) -> wp.array[Any]:
     """Return a field of zeros, flat or of a shape, whose memory on the CPU is taken when it is first written.
 
-    On the CPU it is NumPy's memory: NumPy asks for huge pages, Warp does not. At 128^3 that makes a workspace in 5 instead of 20 ms, and
-    solves 10 % faster, for a pass over many fields misses in the table of small pages. `small_pages` are for fields of which so little is
-    written, here and there, that huge ones would be taken for all of it.
+    On the CPU it is NumPy's memory: NumPy asks for huge pages, Warp does not. At 128^3 that makes a
+    workspace in 5 instead of 20 ms, and solves 10 % faster, for a pass over many fields misses in
+    the table of small pages. `small_pages` are for fields of which so little is written, here and
+    there, that huge ones would be taken for all of it.
     """
     if not device.is_cpu:
         return wp.zeros(n, dtype=dtype, device=device)
     shape = n if isinstance(n, tuple) else (n,)
     size = math.prod(shape) * _width(dtype)
     if not size:
-        return nothing(dtype, device) if shape == (0,) else wp.empty(shape, dtype=dtype, device=device)
+        return (
+            nothing(dtype, device) if shape == (0,) else wp.empty(shape, dtype=dtype, device=device)
+        )
     if small_pages and size > HUGE_PAGE and hasattr(mmap, "MAP_ANONYMOUS"):
         memory = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
         if hasattr(mmap, "MADV_NOHUGEPAGE"):
@@ -57,7 +67,13 @@ def zeros(n: int | tuple[int, ...], dtype: Any, device: wp.Device, *, small_page
         host: np.ndarray = np.frombuffer(memory, dtype=np.uint8)
     else:
         host = np.zeros(size, dtype=np.uint8)
-    return wp.array(ptr=host.__array_interface__["data"][0], dtype=dtype, shape=shape, device=device, deleter=partial(_release, host))
+    return wp.array(
+        ptr=host.__array_interface__["data"][0],
+        dtype=dtype,
+        shape=shape,
+        device=device,
+        deleter=partial(_release, host),
+    )
 
 
 def _release(host: np.ndarray, pointer: int, size: int) -> None:
@@ -87,7 +103,12 @@ def zeros_like(field: wp.array[Any]) -> wp.array[Any]:
 
 def kept(host: np.ndarray, dtype: Any, device: wp.Device) -> wp.array[Any]:
     """Return a copy of an array of the host on a device; on the CPU in NumPy's memory, as `zeros`."""
-    return wp.array(np.array(host, dtype=wp.dtype_to_numpy(dtype)), dtype=dtype, device=device, copy=not device.is_cpu)
+    return wp.array(
+        np.array(host, dtype=wp.dtype_to_numpy(dtype)),
+        dtype=dtype,
+        device=device,
+        copy=not device.is_cpu,
+    )
 
 
 def real_array(values: Any, name: str) -> np.ndarray:
@@ -96,9 +117,16 @@ def real_array(values: Any, name: str) -> np.ndarray:
     Raises:
         ValueError: it holds something else, or masked entries; the message names it.
     """
-    masked = int(np.count_nonzero(np.ma.getmaskarray(values))) if isinstance(values, np.ma.MaskedArray) else 0
+    masked = (
+        int(np.count_nonzero(np.ma.getmaskarray(values)))
+        if isinstance(values, np.ma.MaskedArray)
+        else 0
+    )
     if masked:
-        raise ValueError(f"{name} is a masked array with {masked} masked entries: replace them, {name}.filled(...)")
+        raise ValueError(
+            f"{name} is a masked array with {masked} masked entries: replace them, "
+            f"{name}.filled(...)"
+        )
     try:
         host = values.numpy() if isinstance(values, wp.array) else np.asarray(values)
         if host.dtype.kind == "O" and hasattr(values, "to_numpy"):
@@ -106,7 +134,9 @@ def real_array(values: Any, name: str) -> np.ndarray:
     except ValueError:
         raise ValueError(f"{name}: its rows differ in length") from None
     if host.dtype.kind not in "biuf":
-        raise ValueError(f"{name} is a {type(values).__name__} of type {host.dtype}: expected real numbers")
+        raise ValueError(
+            f"{name} is a {type(values).__name__} of type {host.dtype}: expected real numbers"
+        )
     return host
 
 
@@ -126,7 +156,10 @@ def check_storable(values: np.ndarray, dtype: Any, name: str) -> None:
     if not np.isfinite(largest):
         raise ValueError(f"{name} holds a value that is not finite")
     if largest > float(np.finfo(wp.dtype_to_numpy(dtype)).max):
-        raise ValueError(f"{name} holds values up to {largest:.1e}, too large for {dtype.__name__}: pass dtype=wp.float64")
+        raise ValueError(
+            f"{name} holds values up to {largest:.1e}, too large for {dtype.__name__}: pass "
+            "dtype=wp.float64"
+        )
 
 
 def check_kept(values: np.ndarray, dtype: Any, name: str) -> None:
@@ -137,7 +170,10 @@ def check_kept(values: np.ndarray, dtype: Any, name: str) -> None:
     """
     lost = np.count_nonzero(values) - np.count_nonzero(values.astype(wp.dtype_to_numpy(dtype)))
     if lost:
-        raise ValueError(f"{name}: {lost} are not 0, but {dtype.__name__} takes them for it: pass dtype=wp.float64")
+        raise ValueError(
+            f"{name}: {lost} are not 0, but {dtype.__name__} takes them for it: pass "
+            "dtype=wp.float64"
+        )
 
 
 def relative_rounding(values: np.ndarray, dtype: Any) -> float:
@@ -145,7 +181,9 @@ def relative_rounding(values: np.ndarray, dtype: Any) -> float:
     if dtype is wp.float64 or values.dtype == wp.dtype_to_numpy(dtype):
         return 0.0
     with np.errstate(invalid="ignore"):  # 0 / 0, which fmax passes over
-        ratio = np.asarray(np.divide(values.astype(wp.dtype_to_numpy(dtype)), values, dtype=np.float64))
+        ratio = np.asarray(
+            np.divide(values.astype(wp.dtype_to_numpy(dtype)), values, dtype=np.float64)
+        )
     ratio -= 1.0
     return float(np.fmax.reduce(np.abs(ratio, out=ratio), axis=None, initial=0.0))
 
@@ -154,9 +192,11 @@ class Layout:
     """Fields stored as they are.
 
     Attributes:
-        across: who stores the other parts of the fields, see `warp_lcp.rows.vectors.Across`; None: nobody.
-        chunks: (0, its elements) of each chunk of `CPU_CHUNK` elements that has ever been in use, (0, 0) of others, where fields are 0
-            and stay untouched: wp.vec2i, shape (chunks, 1); None: all are in use.
+        across: who stores the other parts of the fields, see `warp_lcp.rows.vectors.Across`; None:
+            nobody.
+        chunks: (0, its elements) of each chunk of `CPU_CHUNK` elements that has ever been in use,
+            (0, 0) of others, where fields are 0 and stay untouched: wp.vec2i, shape (chunks, 1);
+            None: all are in use.
         rows: what `warp_lcp.rows.Rows.of_fields` has made of that.
         inside: index of the part of a stored field that the operator's shape stands for.
     """
@@ -193,7 +233,8 @@ class Layout:
         """Return `field` as a stored field; no copy is made if it is one already.
 
         Raises:
-            ValueError: its shape is neither the operator's nor the stored one, or it does not hold real numbers.
+            ValueError: its shape is neither the operator's nor the stored one, or it does not hold
+                real numbers.
         """
         if self.holds(field, dtype):
             return field.flatten()
@@ -227,7 +268,10 @@ class Layout:
 
     def places(self, like: np.ndarray | None = None) -> np.ndarray:
         """Return where the elements of an array that fits, of the operator's shape unless one is given, are in a stored field."""
-        return self.target(np.arange(self.size).reshape(self.stored_shape), np.empty(self.shape) if like is None else like).ravel()
+        return self.target(
+            np.arange(self.size).reshape(self.stored_shape),
+            np.empty(self.shape) if like is None else like,
+        ).ravel()
 
     def unload(self, stored: wp.array[Any]) -> wp.array[Any]:
         """Return a stored field as a contiguous field of the operator's shape; a copy unless both are the same."""
@@ -283,7 +327,8 @@ class PaddedLayout(Layout):
         nz, ny, nx = shape if len(shape) == 3 else (1, *shape)
         self.padding = Padding((nz, ny, nx))
         self.stored_shape = self.padding.shape
-        self.sparse = False  # whether so little is in use that zeros elsewhere are better not written
+        # whether so little is in use that zeros elsewhere are better not written
+        self.sparse = False
 
     def find_use(self, used: np.ndarray) -> None:
         """Choose how fields take their memory, from which rows are in use at first.
@@ -295,7 +340,8 @@ class PaddedLayout(Layout):
         if self.chunks is None or not k.size:
             return
         self.sparse = 4 * int(np.count_nonzero(self.chunks.numpy()[:, 0, 1])) < 3 * len(self.chunks)
-        begin = 4 * ((k + 1) * self.padding.plane + (j + 1) * self.padding.row)  # bytes, of a field of four each
+        # bytes, of a field of four each
+        begin = 4 * ((k + 1) * self.padding.plane + (j + 1) * self.padding.row)
 
         def taken(page: int) -> int:
             first, last = begin // page, (begin + 4 * self.padding.row - 1) // page
@@ -324,8 +370,13 @@ class PaddedLayout(Layout):
     def _runs(self) -> list[tuple[int, int]]:
         """Return the elements that are in use, as few ranges."""
         assert self.chunks is not None
-        edges = np.flatnonzero(np.diff(self.chunks.numpy()[:, 0, 1] > 0, prepend=False, append=False))
-        return [(int(a) * CPU_CHUNK, min(int(b) * CPU_CHUNK, self.size)) for a, b in edges.reshape(-1, 2)]
+        edges = np.flatnonzero(
+            np.diff(self.chunks.numpy()[:, 0, 1] > 0, prepend=False, append=False)
+        )
+        return [
+            (int(a) * CPU_CHUNK, min(int(b) * CPU_CHUNK, self.size))
+            for a, b in edges.reshape(-1, 2)
+        ]
 
     def _fill(self, target: np.ndarray, host: np.ndarray) -> None:
         if not self.sparse:
@@ -342,14 +393,29 @@ class PaddedLayout(Layout):
         inner = stored.reshape(self.stored_shape)[1:-1, 1:-1, 1:-1]
         if self.sparse:
             inside, padding = inner.numpy(), self.padding
-            field = zeros(math.prod(padding.counts), stored.dtype, self.device, small_pages=padding.small_pages)
+            field = zeros(
+                math.prod(padding.counts),
+                stored.dtype,
+                self.device,
+                small_pages=padding.small_pages,
+            )
             out = field.numpy().reshape(padding.counts)
             for begin, end in self._runs():
-                for k in range(max(begin // padding.plane - 1, 0), min(-(-end // padding.plane) - 1, len(out))):
+                for k in range(
+                    max(begin // padding.plane - 1, 0), min(-(-end // padding.plane) - 1, len(out))
+                ):
                     first = (k + 1) * padding.plane
-                    low, high = max(begin - first, padding.row) // padding.row - 1, max(-(-(end - first) // padding.row) - 1, 0)
+                    low, high = (
+                        max(begin - first, padding.row) // padding.row - 1,
+                        max(-(-(end - first) // padding.row) - 1, 0),
+                    )
                     out[k, low:high] = inside[k, low:high]
             return field.reshape(self.shape)
         if self.device.is_cpu:  # NumPy copies strided rows four times as fast
-            return wp.array(np.ascontiguousarray(inner.numpy()).reshape(self.shape), dtype=stored.dtype, device=self.device, copy=False)
+            return wp.array(
+                np.ascontiguousarray(inner.numpy()).reshape(self.shape),
+                dtype=stored.dtype,
+                device=self.device,
+                copy=False,
+            )
         return inner.contiguous().reshape(self.shape)

@@ -21,16 +21,26 @@ class HostKernel(threading.local):
     """Memory and recorded launch of a kernel for loops too small for NumPy; each Python thread has its own.
 
     Args:
-        kernel: has `reals` (float64) and `indices` (int32) as `whole`, float64 fields of its tasks as `box`, and numbers.
+        kernel: has `reals` (float64) and `indices` (int32) as `whole`, float64 fields of its tasks
+            as `box`, and numbers.
         numbers: of the kernel that are the same in all runs.
     """
 
     def __init__(self, kernel: RowPass, **numbers: float) -> None:
         self._kernel, self._room, self._tasks = kernel, [0, 0, 0], 0
-        self._numbers: dict[str, Any] = {name: Scalar(numbers.get(name, 0)) for name in kernel.numbers if name not in PLACE}
+        self._numbers: dict[str, Any] = {
+            name: Scalar(numbers.get(name, 0)) for name in kernel.numbers if name not in PLACE
+        }
 
     def run(
-        self, reals: Sequence[np.ndarray], indices: Sequence[Any], *, tasks: int = 1, work: int = 0, places: int = 0, **numbers: float
+        self,
+        reals: Sequence[np.ndarray],
+        indices: Sequence[Any],
+        *,
+        tasks: int = 1,
+        work: int = 0,
+        places: int = 0,
+        **numbers: float,
     ) -> tuple[np.ndarray, list[np.ndarray]]:
         """Run the kernel.
 
@@ -71,16 +81,26 @@ class HostKernel(threading.local):
 
     def _reserve(self, *sizes: int) -> None:
         """Allocate at least so many reals, indices and tasks, twice those asked for."""
-        reals, indices, tasks = self._room = [max(2 * size, room, 1) for size, room in zip(sizes, self._room, strict=True)]
+        reals, indices, tasks = self._room = [
+            max(2 * size, room, 1) for size, room in zip(sizes, self._room, strict=True)
+        ]
         self._reals, self._indices = np.zeros(reals), np.zeros(indices, dtype=np.int32)
         self._fields = [np.zeros(tasks) for _ in self._kernel.box]
-        self._arrays: dict[str, Any] = {name: _warp(values) for name, values in zip(self._kernel.box, self._fields, strict=True)}
+        self._arrays: dict[str, Any] = {
+            name: _warp(values) for name, values in zip(self._kernel.box, self._fields, strict=True)
+        }
         self._arrays |= {"reals": _warp(self._reals), "indices": _warp(self._indices)}
         self._device = wp.get_device("cpu")
-        self._rows, self._tasks = rows_memory(self._device), 0  # not before: an import must not start Warp
+        # not before: an import must not start Warp
+        self._rows, self._tasks = rows_memory(self._device), 0
         self._graph = LaunchGraph(self._device, self._launch)
 
 
 def _warp(values: np.ndarray) -> wp.array[Any]:
     """Return contiguous values as Warp sees them, in the same memory."""
-    return wp.array(values, dtype=wp.float64 if values.dtype == np.float64 else wp.int32, device="cpu", copy=False)
+    return wp.array(
+        values,
+        dtype=wp.float64 if values.dtype == np.float64 else wp.int32,
+        device="cpu",
+        copy=False,
+    )

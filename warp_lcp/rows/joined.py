@@ -1,12 +1,14 @@
 """CUDA graphs of neighboring stretches of a step, joined into one graph.
 
-Within `joined` a recorded stretch is not launched at once. It waits, with the numbers that it reads in this run, until the host or Warp
-needs the device: for a readback, a launch or copy that is not recorded, the end of the step. All that wait are then launched as one
-graph, which is captured when their sequence comes for the second time. A stretch that finds the device idle, after a readback, is
+Within `joined` a recorded stretch is not launched at once. It waits, with the numbers that it reads
+in this run, until the host or Warp needs the device: for a readback, a launch or copy that is not
+recorded, the end of the step. All that wait are then launched as one graph, which is captured when
+their sequence comes for the second time. A stretch that finds the device idle, after a readback, is
 launched at once, so that the host prepares the next ones while the device works.
 
-Nothing is reordered: the functions of Warp by which anything else reaches the device (`SETTLING`) launch first what waits. So a profile,
-which synchronizes at the end of each stage, still has the time of each stage alone.
+Nothing is reordered: the functions of Warp by which anything else reaches the device (`SETTLING`)
+launch first what waits. So a profile, which synchronizes at the end of each stage, still has the
+time of each stage alone.
 """
 
 from __future__ import annotations
@@ -26,14 +28,37 @@ if TYPE_CHECKING:
     from warp_lcp.rows.device_graph import DeviceProgram
 
 MOST_SEQUENCES = 64  # that are remembered
-WAITING_FOR = ("synchronize", "synchronize_device", "synchronize_stream", "numpy")  # after these the device is idle
+# after these the device is idle
+WAITING_FOR = ("synchronize", "synchronize_device", "synchronize_stream", "numpy")
 # Functions of Warp that give work to a device or wait for it, and where callers look them up.
 SETTLING: tuple[tuple[Any, tuple[str, ...]], ...] = (
-    (wp, ("launch", "launch_tiled", "copy", "clone", "capture_launch", "capture_while", "capture_if", "record_event")),
+    (
+        wp,
+        (
+            "launch",
+            "launch_tiled",
+            "copy",
+            "clone",
+            "capture_launch",
+            "capture_while",
+            "capture_if",
+            "record_event",
+        ),
+    ),
     (wp, ("synchronize", "synchronize_device", "synchronize_stream")),
     (wp.Launch, ("launch",)),
     (wp.array, ("assign", "zero_", "fill_", "to", "list", "numpy")),
-    (wp.utils, ("radix_sort_pairs", "segmented_sort_pairs", "array_scan", "array_sum", "array_inner", "runlength_encode")),
+    (
+        wp.utils,
+        (
+            "radix_sort_pairs",
+            "segmented_sort_pairs",
+            "array_scan",
+            "array_sum",
+            "array_inner",
+            "runlength_encode",
+        ),
+    ),
 )
 
 
@@ -48,7 +73,8 @@ class _Waiting(threading.local):
 
 
 WAITING = _Waiting()
-_sequences: dict[tuple[int, ...], tuple[tuple[Any, ...], Any]] = {}  # weak references to the stretches, and their graph once there is one
+# weak references to the stretches, and their graph once there is one
+_sequences: dict[tuple[int, ...], tuple[tuple[Any, ...], Any]] = {}
 
 
 @contextmanager
@@ -95,14 +121,18 @@ def _graph_of(programs: list[DeviceProgram]) -> Any:
     """Return the graph of a sequence of stretches; None where the sequence has come for the first time."""
     key = tuple(map(id, programs))
     references, graph = _sequences.get(key, ((), None))
-    if len(references) != len(programs) or any(of() is not program for of, program in zip(references, programs, strict=True)):
+    if len(references) != len(programs) or any(
+        of() is not program for of, program in zip(references, programs, strict=True)
+    ):
         if len(_sequences) >= MOST_SEQUENCES:
             _sequences.clear()
         forget = functools.partial(_forget, key)
         _sequences[key] = tuple(weakref.ref(program, forget) for program in programs), None
         return None
     if graph is None:
-        graph = programs[0].captured([command for program in programs for command in program.commands])
+        graph = programs[0].captured(
+            [command for program in programs for command in program.commands]
+        )
         _sequences[key] = references, graph
     return graph
 

@@ -1,6 +1,7 @@
 """Kernels of a header: their roles stand above their row functions, and Python takes the kernels by name.
 
-A declaration is a comment of a description and of lines with three blanks, a role and what has it; more blanks continue a line:
+A declaration is a comment of a description and of lines with three blanks, a role and what has it;
+more blanks continue a line:
 
     // kernel cycle.sweep: a Jacobi sweep, y = x + omega (b - A x) / d, clipped to the bounds
     //   compute    S
@@ -10,10 +11,12 @@ A declaration is a comment of a description and of lines with three blanks, a ro
     //   numbers    S omega; bool from_zero, projected
     SIMD for (int k = 0; k < n; ++k) ...
 
-Roles are the words of `RowPass`, except that `name?` marks an array that may be None. Fields and numbers stand as in C: a type, then names.
-A type is Warp's (`float32`, `int8`, `vec3`), `int` or `bool` of Python, a capital letter for the type of the arrays given, `T` for the type
-of computations, or `vec3<T>`. `compute float32 | float64` leaves the choice to Python. `constants AXIS, ROUNDED = 0`: Python computes
-the first, the second has a usual value. `module multigrid`: compiled in one Warp module with others that have the line.
+Roles are the words of `RowPass`, except that `name?` marks an array that may be None. Fields and
+numbers stand as in C: a type, then names. A type is Warp's (`float32`, `int8`, `vec3`), `int` or
+`bool` of Python, a capital letter for the type of the arrays given, `T` for the type of
+computations, or `vec3<T>`. `compute float32 | float64` leaves the choice to Python.
+`constants AXIS, ROUNDED = 0`: Python computes the first, the second has a usual value.
+`module multigrid`: compiled in one Warp module with others that have the line.
 """
 
 from __future__ import annotations
@@ -30,8 +33,11 @@ from warp_lcp.rows.row_pass import RowPass
 
 _INTEGERS = (wp.int8, wp.uint8, wp.int16, wp.uint16, wp.int32, wp.uint32, wp.int64, wp.uint64)
 TYPES = {kind.__name__: kind for kind in (*_INTEGERS, wp.float32, wp.float64, int, bool)} | {
-    "vec3": wp.vec3, "vec3d": wp.vec3d, "vec2i": wp.vec2i, "mat33": wp.mat33,
-}  # fmt: skip
+    "vec3": wp.vec3,
+    "vec3d": wp.vec3d,
+    "vec2i": wp.vec2i,
+    "mat33": wp.mat33,
+}
 VECTORS = {wp.float32: wp.vec3, wp.float64: wp.vec3d}
 FIELDS = ("reads", "writes", "other", "by_row", "whole", "box", "numbers")
 NAMES, FLAGS = ("ring", "sums", "largest"), ("bounds", "finer", "ordered", "by_cell")
@@ -44,7 +50,8 @@ class KernelFile:
 
     Args:
         path: of the header.
-        constants: a table of values by name, for constants that kernels in it declare; it may have more.
+        constants: a table of values by name, for constants that kernels in it declare; it may have
+            more.
 
     Raises:
         ValueError: a declaration is wrong; names the file and the line.
@@ -52,7 +59,9 @@ class KernelFile:
 
     def __init__(self, path: Path, constants: Mapping[str, float] = NONE) -> None:
         self.path, self._constants = path, dict(constants)
-        self._kernels = {s.name: _Declaration(path, s) for s in sections(path).values() if s.kind == "kernel"}
+        self._kernels = {
+            s.name: _Declaration(path, s) for s in sections(path).values() if s.kind == "kernel"
+        }
 
     def __iter__(self) -> Iterator[str]:
         """Names of the kernels."""
@@ -62,7 +71,14 @@ class KernelFile:
         """Return a kernel that leaves nothing to choose."""
         return self.kernel(name)
 
-    def kernel(self, name: str, *, module: str = "", compute: Any = None, constants: Mapping[str, float] = NONE) -> RowPass:
+    def kernel(
+        self,
+        name: str,
+        *,
+        module: str = "",
+        compute: Any = None,
+        constants: Mapping[str, float] = NONE,
+    ) -> RowPass:
         """Return a kernel, or a variant of it.
 
         Args:
@@ -72,11 +88,14 @@ class KernelFile:
             constants: those of the variant, beside those of the file.
 
         Raises:
-            ValueError: there is no such kernel; a constant has no value, or no kernel declares it; the type is none of the kernel's.
+            ValueError: there is no such kernel; a constant has no value, or no kernel declares it;
+                the type is none of the kernel's.
         """
         if name not in self._kernels:
             raise ValueError(f"{self.path}: has no kernel {name}, but {', '.join(self._kernels)}")
-        if unknown := sorted(constants.keys() - {n for d in self._kernels.values() for n in d.constants}):
+        if unknown := sorted(
+            constants.keys() - {n for d in self._kernels.values() for n in d.constants}
+        ):
             raise ValueError(f"{self.path}: no kernel declares the constants {', '.join(unknown)}")
         return self._kernels[name].make(module, compute, self._constants | dict(constants))
 
@@ -85,7 +104,12 @@ class _Declaration:
     """A kernel's declaration: parsed, but for types and constants that Python chooses."""
 
     def __init__(self, path: Path, section: Section) -> None:
-        self.path, self.name, self.line, self.where = path, section.name, section.line, f"{path}:{section.line}"
+        self.path, self.name, self.line, self.where = (
+            path,
+            section.name,
+            section.line,
+            f"{path}:{section.line}",
+        )
         self.lines = _lines_of_roles(path, section)
         self._compute = [word.strip() for word in self._content("compute").split("|")]
         if not self._compute[0]:
@@ -99,9 +123,17 @@ class _Declaration:
         choices = [self._type("compute", word) for word in self._compute]
         compute = choices[0] if compute is None and len(choices) == 1 else compute
         if compute not in choices:
-            raise ValueError(f"{self.where}: {self.name}: compute is one of {', '.join(self._compute)}, not {compute}")
-        if missing := [n for n, usual in self.constants.items() if usual is None and n not in constants]:
-            raise ValueError(f"{self.where}: {self.name}: Python gives no value for the constants {', '.join(missing)}")
+            raise ValueError(
+                f"{self.where}: {self.name}: compute is one of {', '.join(self._compute)}, not "
+                f"{compute}"
+            )
+        if missing := [
+            n for n, usual in self.constants.items() if usual is None and n not in constants
+        ]:
+            raise ValueError(
+                f"{self.where}: {self.name}: Python gives no value for the constants "
+                f"{', '.join(missing)}"
+            )
         values: dict[str, Any] = {n: constants.get(n, usual) for n, usual in self.constants.items()}
         stem, _, last = self.name.rpartition(".")
         return RowPass(
@@ -118,7 +150,9 @@ class _Declaration:
         """Return the roles as `RowPass` takes them."""
         optional: list[str] = []
         roles: dict[str, Any] = {role: self._fields(role, compute, optional) for role in FIELDS}
-        roles |= {role: tuple(self._words(role)) for role in NAMES} | {role: role in self.lines for role in FLAGS}
+        roles |= {role: tuple(self._words(role)) for role in NAMES} | {
+            role: role in self.lines for role in FLAGS
+        }
         stencil = tuple(self._type("stencil", word, compute) for word in self._words("stencil"))
         if stencil and len(stencil) != 2:
             raise self._wrong("stencil", "needs the types of the diagonal and of the weights")
@@ -127,7 +161,9 @@ class _Declaration:
         return {**roles, "optional": tuple(optional), "stencil": stencil or None, "listed": listed}
 
     def _wrong(self, role: str, why: str) -> ValueError:
-        return ValueError(f"{self.path}:{self.lines.get(role, (self.line, ''))[0]}: {self.name}: {role} {why}")
+        return ValueError(
+            f"{self.path}:{self.lines.get(role, (self.line, ''))[0]}: {self.name}: {role} {why}"
+        )
 
     def _content(self, role: str) -> str:
         return self.lines.get(role, (0, ""))[1]
@@ -155,8 +191,16 @@ class _Declaration:
             of_group = self._type(role, kind, compute)
             for word in names.split(","):
                 name = word.strip().removesuffix("?")
-                if not name.isidentifier() or name in fields or (role == "numbers" and word.endswith("?")):
-                    raise self._wrong(role, f"has {word.strip()!r} in `{group.strip()}`: expected `type name, name?; type name`")
+                if (
+                    not name.isidentifier()
+                    or name in fields
+                    or (role == "numbers" and word.endswith("?"))
+                ):
+                    raise self._wrong(
+                        role,
+                        f"has {word.strip()!r} in `{group.strip()}`: expected `type name, name?; "
+                        "type name`",
+                    )
                 fields[name] = of_group
                 optional += [name] * word.endswith("?")
         return fields
@@ -170,7 +214,10 @@ class _Declaration:
             return VECTORS[compute]
         if re.fullmatch("[A-Z]", word) and word != "T":
             return word
-        raise self._wrong(role, f"has the type {word!r}: expected {', '.join(TYPES)}, T, vec3<T> or a capital letter")
+        raise self._wrong(
+            role,
+            f"has the type {word!r}: expected {', '.join(TYPES)}, T, vec3<T> or a capital letter",
+        )
 
 
 def _lines_of_roles(path: Path, section: Section) -> dict[str, tuple[int, str]]:
@@ -196,5 +243,8 @@ def _lines_of_roles(path: Path, section: Section) -> dict[str, tuple[int, str]]:
         roles[role] = (number, content.strip())
     for role, (number, content) in roles.items():
         if bool(content) == (role in FLAGS):
-            raise ValueError(f"{path}:{number}: {section.name}: {role} takes {'nothing' if role in FLAGS else 'names'}")
+            raise ValueError(
+                f"{path}:{number}: {section.name}: {role} takes "
+                f"{'nothing' if role in FLAGS else 'names'}"
+            )
     return roles

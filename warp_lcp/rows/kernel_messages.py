@@ -12,7 +12,8 @@ from typing import TextIO
 
 import warp as wp
 
-OURS = ("warp_lcp", "fluids", "granular", "benchmarks", "warp")  # whose modules of kernels are not worth a line each
+# whose modules of kernels are not worth a line each
+OURS = ("warp_lcp", "fluids", "granular", "benchmarks", "warp")
 BANNER = re.compile(r"Warp \S+ initialized:")
 LOADED = re.compile(r"\s*Module (\w+)\S* .*load on device '(\S+)'.* took [0-9.]+ ms +\((\w+)\)")
 
@@ -20,9 +21,10 @@ LOADED = re.compile(r"\s*Module (\w+)\S* .*load on device '(\S+)'.* took [0-9.]+
 class KernelMessages:
     """A logger for Warp that says once for each device that kernels are being compiled, when the first of them has been.
 
-    It drops Warp's banner and what Warp says of each module of this library; all else goes where it went. `wp.config.log_level` has its
-    usual meaning: above `wp.LOG_INFO` there is no line either, at `wp.LOG_DEBUG` Warp says all that it says without this library, and so
-    it does after `wp.set_logger(None)`.
+    It drops Warp's banner and what Warp says of each module of this library; all else goes where it
+    went. `wp.config.log_level` has its usual meaning: above `wp.LOG_INFO` there is no line either,
+    at `wp.LOG_DEBUG` Warp says all that it says without this library, and so it does after
+    `wp.set_logger(None)`.
 
     Args:
         logger: takes the rest.
@@ -43,11 +45,15 @@ class KernelMessages:
         elif found and found[3] == "compiled" and found[2] not in self._told:
             self._told.add(found[2])
             print(
-                f"compiling kernels for {found[2]}, which takes seconds and is done once; cache: {wp.config.kernel_cache_dir}",
-                file=self._stream or sys.stderr, flush=True,
-            )  # fmt: skip
+                f"compiling kernels for {found[2]}, which takes seconds and is done once; cache: "
+                f"{wp.config.kernel_cache_dir}",
+                file=self._stream or sys.stderr,
+                flush=True,
+            )
 
-    def warning(self, message: str, category: type[Warning] | None = None, stacklevel: int = 1) -> None:
+    def warning(
+        self, message: str, category: type[Warning] | None = None, stacklevel: int = 1
+    ) -> None:
         """Pass a warning on, at its caller's place."""
         self._logger.warning(message, category, stacklevel=stacklevel + 1)
 

@@ -1,7 +1,8 @@
 """Memory that recorded launches read when they run: numbers, windows, lists, and where arrays lie.
 
-A launch that is recorded once holds its arguments as bytes. What changes from run to run stands in memory of its owner,
-and a patch of the launch, (offset in the arguments, address, bytes), has it copied into them each time.
+A launch that is recorded once holds its arguments as bytes. What changes from run to run stands in
+memory of its owner, and a patch of the launch, (offset in the arguments, address, bytes), has it
+copied into them each time.
 """
 
 from __future__ import annotations
@@ -19,17 +20,25 @@ LAYOUT = type(_BLANK.__ctype__())
 LAYOUT_BYTES = ctypes.sizeof(LAYOUT)
 _ARRAY: Any = type(wp.array(dtype=wp.uint8).__ctype__())
 ARRAY_BYTES, SHAPE_OFFSET = ctypes.sizeof(_ARRAY), _ARRAY.shape.offset
-BOX, PLACE = struct.Struct("6i"), struct.Struct("3i")  # members of a RowLayout from `nx` to `slab`; first (k, j, i)
+# members of a RowLayout from `nx` to `slab`; first (k, j, i)
+BOX, PLACE = struct.Struct("6i"), struct.Struct("3i")
 FORMATS: dict[Any, Any] = {
-    wp.float32: ctypes.c_float, wp.float64: ctypes.c_double, wp.int32: ctypes.c_int32, wp.int64: ctypes.c_int64, wp.bool: ctypes.c_bool,
-    float: ctypes.c_float, int: ctypes.c_int32, bool: ctypes.c_bool,
-}  # fmt: skip
+    wp.float32: ctypes.c_float,
+    wp.float64: ctypes.c_double,
+    wp.int32: ctypes.c_int32,
+    wp.int64: ctypes.c_int64,
+    wp.bool: ctypes.c_bool,
+    float: ctypes.c_float,
+    int: ctypes.c_int32,
+    bool: ctypes.c_bool,
+}
 
 
 class Scalar:
     """A number that changes between the runs of recorded launches.
 
-    Pass it where a kernel takes a number: a launch that is recorded reads `value` each time it runs, another takes it as it is.
+    Pass it where a kernel takes a number: a launch that is recorded reads `value` each time it
+    runs, another takes it as it is.
     """
 
     __slots__ = ("_cells", "_scaled", "_value")
@@ -119,14 +128,20 @@ class RowsMemory:
     def patches(self, place: int | None) -> list[tuple[int, int, int]]:
         """Return what a launch reads; `place`: offset of `k0` in its arguments, None: it has none."""
         found = [(0, ctypes.addressof(self.layout), LAYOUT_BYTES)]
-        return found if place is None else [*found, (place, ctypes.addressof(self.place), ctypes.sizeof(self.place))]
+        return (
+            found
+            if place is None
+            else [*found, (place, ctypes.addressof(self.place), ctypes.sizeof(self.place))]
+        )
 
     @property
     def sized(self) -> int:
         """Address of the number of tasks."""
         return ctypes.addressof(self.tasks)
 
-    def take_box(self, nx: int, rows: int, planes: int, grain: int, chunks: int, place: tuple[int, int, int]) -> None:
+    def take_box(
+        self, nx: int, rows: int, planes: int, grain: int, chunks: int, place: tuple[int, int, int]
+    ) -> None:
         """Take whole rows of a box over, see `RowLayout`."""
         ctypes.memset(ctypes.addressof(self.layout), 0, LAYOUT_BYTES)
         BOX.pack_into(self.layout, LAYOUT.nx.offset, nx, rows, planes, grain, chunks, 1)
@@ -146,7 +161,9 @@ class RowsMemory:
             layout: a RowLayout.
             place: first (k, j, i).
         """
-        ctypes.memmove(ctypes.addressof(self.layout), ctypes.addressof(layout.__ctype__()), LAYOUT_BYTES)
+        ctypes.memmove(
+            ctypes.addressof(self.layout), ctypes.addressof(layout.__ctype__()), LAYOUT_BYTES
+        )
         self.place[:] = list(place)
         self.tasks.value = -(-layout.planes // max(layout.slab, 1)) * layout.rows * layout.chunks
 
@@ -156,7 +173,8 @@ class DeviceRows(RowsMemory):
 
     Attributes:
         extent: threads of a launch (slabs, rows, chunks) now.
-        room: those of a captured launch: the largest that have been asked for, those beyond the rows return at once.
+        room: those of a captured launch: the largest that have been asked for, those beyond the
+            rows return at once.
         places: number of threads, of which each has a place for its sums.
     """
 

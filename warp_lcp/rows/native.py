@@ -1,9 +1,10 @@
 """C++ of headers as text: so Warp sees changes, which it does not through `#include`, and errors name file and line.
 
-A header of an area has sections: kernels, which `kernel_file.py` reads, and snippets that several of them include. A section begins with
-a line `// kernel NAME: description` or `// snippet NAME: description` and ends where the next one begins. `#include "NAME"` stands for the
-body of a section of the same file, `#include "FILE.h:NAME"` for one of a file beside it or in `warp_lcp/rows/headers`, `#include "FILE.h"`
-for the whole file.
+A header of an area has sections: kernels, which `kernel_file.py` reads, and snippets that several
+of them include. A section begins with a line `// kernel NAME: description` or
+`// snippet NAME: description` and ends where the next one begins. `#include "NAME"` stands for the
+body of a section of the same file, `#include "FILE.h:NAME"` for one of a file beside it or in
+`warp_lcp/rows/headers`, `#include "FILE.h"` for the whole file.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ class Section:
         kind: "kernel" or "snippet".
         name: after which others include it.
         line: its first line in the file, from 1.
-        declaration: lines of its comment: the description, then lines of roles, which are indented by three blanks.
+        declaration: lines of its comment: the description, then lines of roles, which are indented
+            by three blanks.
         body: its lines of C++.
     """
 
@@ -41,7 +43,8 @@ def sections(path: Path) -> dict[str, Section]:
     """Return the sections of a header by name.
 
     Raises:
-        ValueError: there is code before the first one, a name is used twice, a first line lacks its description, or a body is missing.
+        ValueError: there is code before the first one, a name is used twice, a first line lacks its
+            description, or a body is missing.
     """
     return _sections(path, path.read_text())
 
@@ -49,7 +52,9 @@ def sections(path: Path) -> dict[str, Section]:
 @functools.cache
 def _sections(path: Path, source: str) -> dict[str, Section]:
     lines = source.splitlines()
-    starts = [n for n, line in enumerate(lines) if re.match(r"//\s*(kernel|snippet) [\w.]+(:|$)", line)]
+    starts = [
+        n for n, line in enumerate(lines) if re.match(r"//\s*(kernel|snippet) [\w.]+(:|$)", line)
+    ]
     for number, line in enumerate(lines[: starts[0] if starts else None], 1):
         if line and not line.startswith("//"):
             raise ValueError(f"{path}:{number}: expected comments before the first kernel")
@@ -57,18 +62,25 @@ def _sections(path: Path, source: str) -> dict[str, Section]:
     for start, end in zip(starts, [*starts[1:], len(lines)], strict=True):
         first = _BEGIN.fullmatch(lines[start])
         if not first:
-            raise ValueError(f"{path}:{start + 1}: expected `// kernel NAME: description`, not {lines[start]!r}")
+            raise ValueError(
+                f"{path}:{start + 1}: expected `// kernel NAME: description`, not {lines[start]!r}"
+            )
         kind, name = first[1], first[2]
         if name in found:
-            raise ValueError(f"{path}:{start + 1}: {name} is declared in line {found[name].line}, too")
+            raise ValueError(
+                f"{path}:{start + 1}: {name} is declared in line {found[name].line}, too"
+            )
         begin = start + 1
-        while kind == "kernel" and begin < end and re.match("// [^ ]", lines[begin]):  # more of the description
+        # more of the description
+        while kind == "kernel" and begin < end and re.match("// [^ ]", lines[begin]):
             begin += 1
         while kind == "kernel" and begin < end and lines[begin].startswith("//   "):
             begin += 1
         if not any(line and not line.startswith("//") for line in lines[begin:end]):
             raise ValueError(f"{path}:{start + 1}: {name} has no body")
-        found[name] = Section(kind, name, start + 1, tuple(lines[start:begin]), tuple(lines[begin:end]))
+        found[name] = Section(
+            kind, name, start + 1, tuple(lines[start:begin]), tuple(lines[begin:end])
+        )
     return found
 
 
@@ -83,7 +95,9 @@ def text(path: Path, name: str = "") -> str:
     section = sections(path)[name] if name else None
     begin = section.line + len(section.declaration) if section else 1
     lines = [f'#line {begin} "{path.name}"']
-    for number, line in enumerate(section.body if section else path.read_text().splitlines(), begin):
+    for number, line in enumerate(
+        section.body if section else path.read_text().splitlines(), begin
+    ):
         included = _included(path, number, line)
         lines += [line] if included is None else [included, f'#line {number + 1} "{path.name}"']
     return "\n".join(lines)

@@ -11,7 +11,15 @@ from typing import TYPE_CHECKING, Any
 import warp as wp
 
 from warp_lcp.rows.compiler import forward_kernel
-from warp_lcp.rows.layout import BoundFields, Pattern, RowLayout, make_struct, packed, stencil_struct, threads
+from warp_lcp.rows.layout import (
+    BoundFields,
+    Pattern,
+    RowLayout,
+    make_struct,
+    packed,
+    stencil_struct,
+    threads,
+)
 from warp_lcp.rows.memory import value_of
 from warp_lcp.rows.native import HEADERS, shared, text
 from warp_lcp.rows.team import Entry
@@ -21,7 +29,8 @@ if TYPE_CHECKING:
 
 C_TYPES = {wp.uint8: "unsigned char", wp.float32: "float", wp.float64: "double"}
 C = {**C_TYPES, wp.int8: "signed char", wp.int32: "int", wp.bool: "bool"}
-LOADED = (wp.uint8, wp.int8, wp.int32, wp.float32, wp.float64)  # types of fields that quads keep in registers
+# types of fields that quads keep in registers
+LOADED = (wp.uint8, wp.int8, wp.int32, wp.float32, wp.float64)
 POINTERS = "const auto in_ = [](auto* q, auto first) { return q + first; };"
 QUADS = "quads"
 PLACE = ("k0", "j0", "i0")  # first stored cell of a box
@@ -29,11 +38,20 @@ INTEGERS = {wp.int32: "i", int: "i", wp.int64: "q", wp.bool: "?", bool: "?"}
 PACKED = {wp.float32: "f", wp.float64: "d", **INTEGERS}  # numbers, as `struct` calls them
 SIDES = struct.Struct("dd")  # the two numbers that end the struct of bounds
 NUMBERS = "numbers"  # that are the same everywhere, infinite ones too; else "coded", "fields"
-UNIFORM, VARIABLE, KNOWN = "uniform", "variable", "known"  # stencils: with a weight an axis, with arrays of them, with a product in place
+# stencils: with a weight an axis, with arrays of them, with a product in place
+UNIFORM, VARIABLE, KNOWN = "uniform", "variable", "known"
 
 
 @functools.cache
-def form_of(declared: "RowPass", letters: Any, constants: Any, shape: str | Pattern, bounds: str, *, quads: bool = False) -> "Form":
+def form_of(
+    declared: "RowPass",
+    letters: Any,
+    constants: Any,
+    shape: str | Pattern,
+    bounds: str,
+    *,
+    quads: bool = False,
+) -> "Form":
     """Return the form of a pass with these types, constants, stencil and bounds, by `quads` of cells if told."""
     return Form(declared, dict(letters), dict(constants), shape, bounds, quads=quads)
 
@@ -47,8 +65,14 @@ def make_kernels_of_module(form: "Form", letters: Any, shape: str | Pattern, bou
         return
     for other in TOGETHER[form.declared.module]:
         words = other.words(dict(letters), other.constants, shape, bounds) + [QUADS] * form.quads
-        if other.letters == form.declared.letters and words == form.words and (other.quads or not form.quads):
-            assert form_of(other, letters, tuple(other.constants.items()), shape, bounds, quads=form.quads).kernel
+        if (
+            other.letters == form.declared.letters
+            and words == form.words
+            and (other.quads or not form.quads)
+        ):
+            assert form_of(
+                other, letters, tuple(other.constants.items()), shape, bounds, quads=form.quads
+            ).kernel
 
 
 class Form:
@@ -57,7 +81,8 @@ class Form:
     Attributes:
         words: what tells it from other forms.
         joins: whether it is compiled with other passes.
-        quads: whether a thread takes four cells of a row at a time, on CUDA only; see `headers/quad.h`.
+        quads: whether a thread takes four cells of a row at a time, on CUDA only; see
+            `headers/quad.h`.
         name: of its kernel.
         fields: struct of its arguments.
         native: that struct in C.
@@ -74,20 +99,34 @@ class Form:
         *,
         quads: bool = False,
     ) -> None:
-        self.declared, self.letters, self.bounds, self.quads, d = declared, letters, bounds, quads, declared
+        self.declared, self.letters, self.bounds, self.quads, d = (
+            declared,
+            letters,
+            bounds,
+            quads,
+            declared,
+        )
         self._chosen = tuple(sorted(letters.items())), tuple(constants.items()), shape, bounds
         self.pattern = pattern = shape if isinstance(shape, Pattern) else None
         self.joins = bool(d.module) and pattern is None  # the module of other passes
         shape = pattern.word if pattern else shape
         of = lambda kind: letters[kind] if isinstance(kind, str) else kind  # noqa: E731
         self.words = d.words(letters, constants, shape, bounds) + [QUADS] * quads
-        weights = of(d.stencil[1]) if d.stencil and (shape == VARIABLE or (pattern and pattern.names)) else wp.float32
+        weights = (
+            of(d.stencil[1])
+            if d.stencil and (shape == VARIABLE or (pattern and pattern.names))
+            else wp.float32
+        )
         parts = {"stencil": stencil_struct(of(d.stencil[0]), weights, pattern)} if d.stencil else {}
         parts |= {"bounds": BoundFields} if d.bounds else {}
         self.types = {name: of(kind) for name, kind in d.arrays.items()}
-        members = {n: wp.array(dtype=t) for n, t in self.types.items()} | {n: of(t) for n, t in d.numbers.items()}
+        members = {n: wp.array(dtype=t) for n, t in self.types.items()} | {
+            n: of(t) for n, t in d.numbers.items()
+        }
         self._numbers = struct.Struct("".join(PACKED[of(t)] for t in d.numbers.values()))
-        self.fields = Fields = make_struct(f"{d.name.replace('.', '_')}_{'_'.join(self.words)}", parts | members)
+        self.fields = Fields = make_struct(
+            f"{d.name.replace('.', '_')}_{'_'.join(self.words)}", parts | members
+        )
 
         def run(L: RowLayout, given: Fields, slab_: int, row_: int, chunk_: int, count_: int): ...
 
@@ -95,33 +134,67 @@ class Form:
         self._struct, self.native, self._entry = type(blank), type(blank.__ctype__()), None
         self._size = ctypes.sizeof(self.native)
         area, _, last = d.name.rpartition(".")
-        variant = ".".join(["warp_lcp", *([d.module] if self.joins else d.name.split(".")), "_".join(self.words)])
-        run.__module__ = area if d.box else variant  # apart from other forms, which Warp would take for overloads
+        variant = ".".join(
+            ["warp_lcp", *([d.module] if self.joins else d.name.split(".")), "_".join(self.words)]
+        )
+        # apart from other forms, which Warp would take for overloads
+        run.__module__ = area if d.box else variant
         self.name = d.name.replace(".", "_") if self.joins else last
         run.__qualname__ = f"{self.name}_rows"
         self.run = wp.func_native(self._source(letters, constants, ord(shape[0]), of))(run)
 
-    def _source(self, letters: dict[str, Any], constants: dict[str, int], stencil: int, of: Any) -> str:
+    def _source(
+        self, letters: dict[str, Any], constants: dict[str, int], stencil: int, of: Any
+    ) -> str:
         """Return the body: a loop over pieces, in it pointers by name, the shared functions, the row function, the sums."""
         d, pattern = self.declared, self.pattern
         assert not (self.quads and (pattern or not d.quads)), d.label
         into = not {*d.ring}.isdisjoint(d.writes)
         levels = d.finer or bool(d.other)
         switches = {"RINGS": bool(d.ring), "INTO_RING": into, "LEVELS": levels, "BOX": bool(d.box)}
-        switches |= {"BOUNDS": ord(self.bounds[0]), "STENCIL": stencil, "FOUND": len(d.found), "SUMS": len(d.sums)}
+        switches |= {
+            "BOUNDS": ord(self.bounds[0]),
+            "STENCIL": stencil,
+            "FOUND": len(d.found),
+            "SUMS": len(d.sums),
+        }
         macros = {n: v for n, v in constants.items() if hasattr(v, "__index__")}
-        head = [f"typedef {C[t]} {n};" for n, t in letters.items()] + [f"typedef {C[of(d.compute)]} T;"] * ("T" not in letters)
-        head += [f"constexpr int {n} = {int(v)};" for n, v in switches.items()] + [f"#define {n} {int(v)}" for n, v in macros.items()]
-        head += [f"constexpr double {n} = {float(v)!r};" for n, v in constants.items() if n not in macros]
+        head = [f"typedef {C[t]} {n};" for n, t in letters.items()] + [
+            f"typedef {C[of(d.compute)]} T;"
+        ] * ("T" not in letters)
+        head += [f"constexpr int {n} = {int(v)};" for n, v in switches.items()] + [
+            f"#define {n} {int(v)}" for n, v in macros.items()
+        ]
+        head += [
+            f"constexpr double {n} = {float(v)!r};" for n, v in constants.items() if n not in macros
+        ]
         if self.quads:
             return self._source_of_quads(head, macros, of)
-        at = {n: " + p + P.ring" if n in d.ring else " + p" for n in (*d.reads, *d.writes)} | dict.fromkeys(d.other, " + P.q")
-        each = ["const Piece P = piece(k_i, j_i, c_, ring_); const int n = P.n; const long long p = P.p;"]
-        each += [f"const long long yp = {'L.o2' if d.finer else 'P.yp'}, zp = {'L.o1' if d.finer else 'P.zp'};"]
-        each += [f"const long long ym = {'-yp' if d.finer else 'P.ym'}, zm = {'-zp' if d.finer else 'P.zm'};"]
-        each += ["const long long down = P.down, up = P.up;" if d.ring and not into else "const long long down = zm, up = zp;"]
+        at = {
+            n: " + p + P.ring" if n in d.ring else " + p" for n in (*d.reads, *d.writes)
+        } | dict.fromkeys(d.other, " + P.q")
+        each = [
+            "const Piece P = piece(k_i, j_i, c_, ring_); const int n = P.n; const long long p = "
+            "P.p;"
+        ]
+        each += [
+            f"const long long yp = {'L.o2' if d.finer else 'P.yp'}, zp = "
+            f"{'L.o1' if d.finer else 'P.zp'};"
+        ]
+        each += [
+            f"const long long ym = {'-yp' if d.finer else 'P.ym'}, zm = "
+            f"{'-zp' if d.finer else 'P.zm'};"
+        ]
+        each += [
+            "const long long down = P.down, up = P.up;"
+            if d.ring and not into
+            else "const long long down = zm, up = zp;"
+        ]
         if levels:
-            each += ["const bool pairs = L.fx > 1 || L.fx < -1; const int deep = L.fz == 1 || 2*P.k + 2 > L.n1 ? 1 : 2;"]
+            each += [
+                "const bool pairs = L.fx > 1 || L.fx < -1; const int deep = L.fz == 1 || 2*P.k + 2 "
+                "> L.n1 ? 1 : 2;"
+            ]
             each += ["const int wide = L.fy == 1 || 2*P.j + 2 > L.n2 ? 1 : 2;"]
         for n in (n for n in d.arrays if n not in d.box and not (d.found and n == "out")):
             pointer = f"given.{n}.data{at.get(n, '')}"
@@ -130,46 +203,135 @@ class Form:
         each += [f"const auto {n} = given.{n};" for n in d.numbers]
         if d.box:
             each += [f"double {n} = 0;" for n in d.found]
-            each += [f"const long long s2 = given.{next(iter(d.box))}.shape[2], s1 = s2*given.{next(iter(d.box))}.shape[1];"]
-            listed = [f"for (int m_ = P.first; m_ < P.first + n; ++m_) {{ const int at_ = {d.listed}[m_], k = at_ / (int)s1;"]
-            listed += ["const int j = (at_ - k*(int)s1) / (int)s2, first = at_ % (int)s2, last = first + 1;"]
-            each += listed if d.listed else ["const int k = P.k + k0, j = P.j + j0, first = P.first + i0, last = first + n;"]
-            each += [f"auto* {n} = given.{n}.data ? given.{n}.data + k*s1 + j*s2 : nullptr;" for n in d.box]
+            each += [
+                f"const long long s2 = given.{next(iter(d.box))}.shape[2], s1 = "
+                f"s2*given.{next(iter(d.box))}.shape[1];"
+            ]
+            listed = [
+                f"for (int m_ = P.first; m_ < P.first + n; ++m_) {{ const int at_ = "
+                f"{d.listed}[m_], k = at_ / (int)s1;"
+            ]
+            listed += [
+                "const int j = (at_ - k*(int)s1) / (int)s2, first = at_ % (int)s2, last = first + "
+                "1;"
+            ]
+            each += (
+                listed
+                if d.listed
+                else [
+                    "const int k = P.k + k0, j = P.j + j0, first = P.first + i0, last = first + n;"
+                ]
+            )
+            each += [
+                f"auto* {n} = given.{n}.data ? given.{n}.data + k*s1 + j*s2 : nullptr;"
+                for n in d.box
+            ]
         if d.stencil:
-            fields, numbers = (pattern.names, pattern.numbers) if pattern else (("wx", "wy", "wz"), ("cx", "cy", "cz"))
+            fields, numbers = (
+                (pattern.names, pattern.numbers)
+                if pattern
+                else (("wx", "wy", "wz"), ("cx", "cy", "cz"))
+            )
             first = "P.q" if d.finer else "p"
-            each += [f"const auto* {n} = given.stencil.{n}.data + {first};" for n in ("d", *fields, "known")]
+            each += [
+                f"const auto* {n} = given.stencil.{n}.data + {first};"
+                for n in ("d", *fields, "known")
+            ]
             each += [f"const T {n} = (T)given.stencil.{n};" for n in ("unit", *numbers)]
             if pattern:
-                at = f"const long long e = k + {first} - {'L.o0' if d.finer else 'L.base'}, a = yp, b = zp;"
+                at = (
+                    f"const long long e = k + {first} - {'L.o0' if d.finer else 'L.base'}, a = "
+                    "yp, b = zp;"
+                )
                 each += [
                     f"const auto place = [&](long long k) {{ {at}",
                     "return wp::vec3i((int)(e / b), (int)(e % b / a), (int)(e % a)); };",
                 ]
                 each += pattern.source()
-        sums = [f"#define EACH_FOUND(DO) {' '.join(f'DO({s}, {name})' for s, name in enumerate(d.found))}", text(HEADERS / "sums.h")]
+        sums = [
+            "#define EACH_FOUND(DO) "
+            f"{' '.join(f'DO({s}, {name})' for s, name in enumerate(d.found))}",
+            text(HEADERS / "sums.h"),
+        ]
         sums += ["#undef EACH_FOUND"]
-        common = [shared(h) for h, used in (("stencil.h", d.stencil), ("bounds.h", d.bounds)) if used]
-        before = [shared("native.h"), '#line 1 "types"', *head, shared("piece.h"), shared("tasks.h"), '#line 1 "fields"', POINTERS, *each]
-        body = ["{", text(d.header, d.declared), "}"] if d.box else [text(d.header, d.declared)]  # there names may be those of the pass
+        common = [
+            shared(h) for h, used in (("stencil.h", d.stencil), ("bounds.h", d.bounds)) if used
+        ]
+        before = [
+            shared("native.h"),
+            '#line 1 "types"',
+            *head,
+            shared("piece.h"),
+            shared("tasks.h"),
+            '#line 1 "fields"',
+            POINTERS,
+            *each,
+        ]
+        # there names may be those of the pass
+        body = ["{", text(d.header, d.declared), "}"] if d.box else [text(d.header, d.declared)]
         closed = ["}"] * bool(d.listed)
         macros |= {"EACH_WEIGHT": 0} if pattern and d.stencil else {}
         tail = ['#line 1 "end"', "}}}", *(f"#undef {n}" for n in macros), ""]
-        return "\n".join(["", *before, *common, *body, *closed, '#line 1 "sums"', *(sums if d.found else []), *tail])
+        return "\n".join(
+            [
+                "",
+                *before,
+                *common,
+                *body,
+                *closed,
+                '#line 1 "sums"',
+                *(sums if d.found else []),
+                *tail,
+            ]
+        )
 
     def _source_of_quads(self, head: list[str], macros: dict[str, Any], of: Any) -> str:
         """Return the body for quads: a loop over planes, in it the row function twice, for four cells and for fewer."""
         d = self.declared
         found = " ".join(f"DO({s}, {name})" for s, name in enumerate(d.found))
-        sums = [f"#define EACH_FOUND(DO) {found}", text(HEADERS / "sums.h"), "#undef EACH_FOUND"] if d.found else []
-        common = [shared(h) for h, used in (("stencil.h", d.stencil), ("bounds.h", d.bounds)) if used]
+        sums = (
+            [f"#define EACH_FOUND(DO) {found}", text(HEADERS / "sums.h"), "#undef EACH_FOUND"]
+            if d.found
+            else []
+        )
+        common = [
+            shared(h) for h, used in (("stencil.h", d.stencil), ("bounds.h", d.bounds)) if used
+        ]
         function = [*common, text(d.header, d.declared), '#line 1 "sums"', *sums]
         head = [*head, f"constexpr bool FINER = {str(d.finer).lower()};"]
-        before = ["#define QUADS", shared("native.h"), '#line 1 "types"', *head, shared("quad.h"), '#line 1 "fields"']
-        whole = ["if (P.n == 4) {", "constexpr int n = 4;", *self._fields_of_quad(of, kept=True), *function, "}"]
-        rest = ["else if (FOUND || P.n > 0) {", "const int n = P.n;", POINTERS, *self._fields_of_quad(of, kept=False), *function, "}"]
-        once = ["#undef VECTORS", '#define VECTORS(WIDTH) _Pragma("unroll 1")']  # cells fewer than four: their loops are not unrolled
-        after = ['#line 1 "end"', "}", "#undef QUADS", "#undef METHOD", *(f"#undef {n}" for n in macros), ""]
+        before = [
+            "#define QUADS",
+            shared("native.h"),
+            '#line 1 "types"',
+            *head,
+            shared("quad.h"),
+            '#line 1 "fields"',
+        ]
+        whole = [
+            "if (P.n == 4) {",
+            "constexpr int n = 4;",
+            *self._fields_of_quad(of, kept=True),
+            *function,
+            "}",
+        ]
+        rest = [
+            "else if (FOUND || P.n > 0) {",
+            "const int n = P.n;",
+            POINTERS,
+            *self._fields_of_quad(of, kept=False),
+            *function,
+            "}",
+        ]
+        # cells fewer than four: their loops are not unrolled
+        once = ["#undef VECTORS", '#define VECTORS(WIDTH) _Pragma("unroll 1")']
+        after = [
+            '#line 1 "end"',
+            "}",
+            "#undef QUADS",
+            "#undef METHOD",
+            *(f"#undef {n}" for n in macros),
+            "",
+        ]
         return "\n".join(["", *before, *whole, *once, *rest, *after])
 
     def _fields_of_quad(self, of: Any, *, kept: bool) -> list[str]:
@@ -177,21 +339,39 @@ class Form:
         d = self.declared
         made = []
         for n in (n for n in d.arrays if not (d.found and n == "out")):
-            if kept and self.types[n] in LOADED and (n in d.reads or n in d.writes or (d.finer and n in d.other)):
+            if (
+                kept
+                and self.types[n] in LOADED
+                and (n in d.reads or n in d.writes or (d.finer and n in d.other))
+            ):
                 way = (
-                    "auto {n} = out_({data}, p);" if n in d.writes else f"const auto {{n}} = in_({{data}}, {'q' if n in d.other else 'p'});"
+                    "auto {n} = out_({data}, p);"
+                    if n in d.writes
+                    else f"const auto {{n}} = in_({{data}}, {'q' if n in d.other else 'p'});"
                 )
                 made.append(way.format(n=n, data=f"given.{n}.data"))
                 continue
-            pointer = f"given.{n}.data" + (" + p" if n in d.reads or n in d.writes else " + q" * (n in d.other))
+            pointer = f"given.{n}.data" + (
+                " + p" if n in d.reads or n in d.writes else " + q" * (n in d.other)
+            )
             pointer = f"given.{n}.data ? {pointer} : nullptr" if n in d.optional else pointer
             made.append(f"{'const ' * (n in d.reads)}auto* {n} = {pointer};")
         made += ["const bool pairs = L.fx > 1 || L.fx < -1;"] if d.other or d.finer else []
-        made += ["const int deep = L.fz == 1 || 2*P.k + 2 > L.n1 ? 1 : 2, wide = L.fy == 1 || 2*P.j + 2 > L.n2 ? 1 : 2;"] if d.finer else []
+        made += (
+            [
+                "const int deep = L.fz == 1 || 2*P.k + 2 > L.n1 ? 1 : 2, wide = L.fy == 1 || 2*P.j "
+                "+ 2 > L.n2 ? 1 : 2;"
+            ]
+            if d.finer
+            else []
+        )
         made += [f"const auto {n} = given.{n};" for n in d.numbers]
         if d.stencil:
             fields, numbers = ("d", "wx", "wy", "wz", "known"), ("unit", "cx", "cy", "cz")
-            made += [f"const auto {n} = in_(given.stencil.{n}.data, {'q' if d.finer else 'p'});" for n in fields]
+            made += [
+                f"const auto {n} = in_(given.stencil.{n}.data, {'q' if d.finer else 'p'});"
+                for n in fields
+            ]
             made += [f"const T {n} = (T)given.stencil.{n};" for n in numbers]
         return made
 
@@ -207,7 +387,9 @@ class Form:
             parts.append(self._numbers.pack(*values))
         except struct.error as error:
             named = zip(self.declared.numbers, values, strict=True)
-            raise TypeError(f"{self.declared.label}: {', '.join(f'{n} = {v!r}' for n, v in named)}: {error}") from None
+            raise TypeError(
+                f"{self.declared.label}: {', '.join(f'{n} = {v!r}' for n, v in named)}: {error}"
+            ) from None
         return b"".join(parts).ljust(self._size, b"\0")
 
     def struct_of(self, bound: "Bound") -> Any:
@@ -219,7 +401,9 @@ class Form:
         if bounds is not None:
             members["bounds"] = SimpleNamespace(lower=bounds[0], upper=bounds[2], code=bounds[4])
         made = object.__new__(self._struct)
-        made.__dict__.update(members, _kept=bound, _ctype=self.native.from_buffer_copy(bound.arguments))
+        made.__dict__.update(
+            members, _kept=bound, _ctype=self.native.from_buffer_copy(bound.arguments)
+        )
         return made
 
     @functools.cached_property
@@ -259,7 +443,11 @@ class Form:
     @property
     def by_quads(self) -> "Form | None":
         """The same of quads, as CUDA launches it on grids; None where there is none."""
-        return form_of(self.declared, *self._chosen, quads=True) if self.declared.quads and self.pattern is None else None
+        return (
+            form_of(self.declared, *self._chosen, quads=True)
+            if self.declared.quads and self.pattern is None
+            else None
+        )
 
     def dim(self, layout: Any) -> tuple[int, ...]:
         """Return the dimensions of a launch of the kernel: by quads one, for three would be divided in 64 bits."""
@@ -268,7 +456,15 @@ class Form:
     def entry(self, bound: "Bound") -> Entry:
         """Return the kernel as the team calls it."""
         if self._entry is None:
-            self._entry = Entry(wp.launch(self.kernel, (1, 1, 1), [bound.layout, bound.fields], device="cpu", record_cmd=True))
+            self._entry = Entry(
+                wp.launch(
+                    self.kernel,
+                    (1, 1, 1),
+                    [bound.layout, bound.fields],
+                    device="cpu",
+                    record_cmd=True,
+                )
+            )
         return self._entry
 
 

@@ -16,7 +16,19 @@ import warp as wp
 
 from warp_lcp.deadline import check_time, is_collective
 from warp_lcp.rows.memory import ARRAY_BYTES, Scalar, value_of
-from warp_lcp.rows.team import ALONE, CELLS, Operation, Patch, Stage, Table, copied, get_threads, prepared, ranges, team
+from warp_lcp.rows.team import (
+    ALONE,
+    CELLS,
+    Operation,
+    Patch,
+    Stage,
+    Table,
+    copied,
+    get_threads,
+    prepared,
+    ranges,
+    team,
+)
 
 
 class _Recording(threading.local):
@@ -51,7 +63,11 @@ def loops_on_device(device: wp.Device) -> bool:
 def device_program(launch: Any = None) -> Any:
     """Return the `DeviceProgram` that records what this thread launches; None: there is none, or `launch` records."""
     program = RECORDING.program
-    if program is None or not program.device.is_cuda or isinstance(getattr(launch, "__self__", None), Program):
+    if (
+        program is None
+        or not program.device.is_cuda
+        or isinstance(getattr(launch, "__self__", None), Program)
+    ):
         return None
     return program
 
@@ -59,7 +75,9 @@ def device_program(launch: Any = None) -> Any:
 class Launch(Protocol):
     """Launches a kernel now, as `wp.launch` does, or records it, as `Program.launch` does."""
 
-    def __call__(self, kernel: Any, dim: Any, inputs: Any, *, device: Any, block_dim: int = ...) -> Any:
+    def __call__(
+        self, kernel: Any, dim: Any, inputs: Any, *, device: Any, block_dim: int = ...
+    ) -> Any:
         """Launch the kernel now, or record its launch."""
 
 
@@ -87,7 +105,9 @@ class Task:
 
     def launch(self, launch: Launch = launch_now) -> None:
         """Do it now, or record it between the launches."""
-        recorded = (is_recording() or isinstance(getattr(launch, "__self__", None), Program)) and team() is not None
+        recorded = (
+            is_recording() or isinstance(getattr(launch, "__self__", None), Program)
+        ) and team() is not None
         perform(self.operation() if recorded and self.operation else self.function, launch)
 
 
@@ -168,9 +188,18 @@ def _run_while(condition: Any, table: Table) -> None:
 
 
 def launch_ranges(
-    kernel: Any, dim: tuple[int, ...], cells: int, inputs: list[Any], *, device: Any, launch: Launch | None, ordered: bool,
-    first: Patch | None = None, sized: int = 0, extent: Any = None,
-) -> None:  # fmt: skip
+    kernel: Any,
+    dim: tuple[int, ...],
+    cells: int,
+    inputs: list[Any],
+    *,
+    device: Any,
+    launch: Launch | None,
+    ordered: bool,
+    first: Patch | None = None,
+    sized: int = 0,
+    extent: Any = None,
+) -> None:
     """Launch a kernel whose first argument begins with the range of tasks that a thread takes, or record it.
 
     Args:
@@ -183,19 +212,36 @@ def launch_ranges(
         ordered: whether tasks write what others read or write.
         first: what of the first argument recorded launches read from memory.
         sized: address of the number of tasks then; 0: that of `dim`.
-        extent: memory whose `room` bounds the launch dimensions on CUDA; None: they are always `dim`.
+        extent: memory whose `room` bounds the launch dimensions on CUDA; None: they are always
+            `dim`.
     """
     if device.is_cuda and (program := device_program(launch)) is not None:
         program.record_tasks(kernel, dim, inputs, first, sized, extent)
         return
     tasks, recorded = math.prod(dim), launch is None and is_recording()
-    if device.is_cuda or team() is None or (launch is None and not recorded and tasks * cells < 4 * CELLS):
+    if (
+        device.is_cuda
+        or team() is None
+        or (launch is None and not recorded and tasks * cells < 4 * CELLS)
+    ):
         (launch or wp.launch)(kernel, dim, [value_of(v) for v in inputs], device=device)
     elif tasks or (recorded and sized):
         entry, arguments, native = prepared(kernel, (1,) * len(dim), [value_of(v) for v in inputs])
-        patches = [*([first] if first else ()), *_patches(inputs, kernel, native)] if recorded else ()
-        stage = Stage(entry, arguments, (inputs, extent), tasks // dim[0] if dim[0] else 0, dim[0], patches=patches)
-        perform(ranges(stage, cells, ordered=ordered, sized=sized if recorded else 0), launch or wp.launch)
+        patches = (
+            [*([first] if first else ()), *_patches(inputs, kernel, native)] if recorded else ()
+        )
+        stage = Stage(
+            entry,
+            arguments,
+            (inputs, extent),
+            tasks // dim[0] if dim[0] else 0,
+            dim[0],
+            patches=patches,
+        )
+        perform(
+            ranges(stage, cells, ordered=ordered, sized=sized if recorded else 0),
+            launch or wp.launch,
+        )
 
 
 def _patches(inputs: Sequence[Any], kernel: Any, native: Any) -> Iterator[Patch]:
@@ -210,7 +256,9 @@ def _patches(inputs: Sequence[Any], kernel: Any, native: Any) -> Iterator[Patch]
 def _alone(kernel: Any, dim: Any, inputs: Sequence[Any]) -> Operation:
     """Return the launch of a kernel on the CPU as an operation that is not cut."""
     entry, arguments, native = prepared(kernel, dim, [value_of(v) for v in inputs])
-    return Operation(ALONE, [Stage(entry, arguments, inputs, patches=list(_patches(inputs, kernel, native)))])
+    return Operation(
+        ALONE, [Stage(entry, arguments, inputs, patches=list(_patches(inputs, kernel, native)))]
+    )
 
 
 def launch(kernel: Any, dim: Any, inputs: Any, *, device: Any, block_dim: int = 256) -> None:
@@ -286,9 +334,10 @@ def _bytes_of(array: wp.array[Any]) -> int:
 class Program:
     """A sequence of kernel launches with fixed arguments.
 
-    Functions that launch take `launch: Launch = launch_now`; given `program.launch`, they record instead. On the CPU the team works through
-    a table of them, on CUDA a graph is captured once the first run has loaded every kernel. Where the host has tasks between launches, see
-    `perform`, there is a table or a graph for each stretch without one.
+    Functions that launch take `launch: Launch = launch_now`; given `program.launch`, they record
+    instead. On the CPU the team works through a table of them, on CUDA a graph is captured once the
+    first run has loaded every kernel. Where the host has tasks between launches, see `perform`,
+    there is a table or a graph for each stretch without one.
 
     Args:
         device: where the kernels run.
@@ -300,19 +349,24 @@ class Program:
         self._arguments: list[Any] = []  # a recorded launch holds addresses only
         self._runs = 0
         self._stretches: list[Callable[[], object]] | None = None
-        self._loops: dict[int, Callable[[], object]] = {}  # what launches their graph, by the address of their condition
+        # what launches their graph, by the address of their condition
+        self._loops: dict[int, Callable[[], object]] = {}
         self._native: bool | None = None  # None: not known
 
     def __len__(self) -> int:
         """Return the number of launches."""
         return len(self._commands)
 
-    def launch(self, kernel: Any, dim: Any, inputs: Any, *, device: Any, block_dim: int = 256) -> None:
+    def launch(
+        self, kernel: Any, dim: Any, inputs: Any, *, device: Any, block_dim: int = 256
+    ) -> None:
         """Record a launch, and keep its arguments alive; numbers may be `Scalar` on the CPU."""
         self._arguments.append(inputs)
         if self.device.is_cuda or team() is None:
             listed = [value_of(v) for v in inputs]
-            self.record(wp.launch(kernel, dim, listed, device=device, block_dim=block_dim, record_cmd=True))
+            self.record(
+                wp.launch(kernel, dim, listed, device=device, block_dim=block_dim, record_cmd=True)
+            )
         else:
             self.record(_alone(kernel, dim, inputs))
 
@@ -320,7 +374,9 @@ class Program:
         """Record a recorded launch, an operation of the team, a task of the host or, where loops run on the device, a conditional."""
         if isinstance(what, Conditional) and not self.device.is_cuda:
             self._arguments.append(what)
-            self._commands += [operation.only_if(what.condition) for operation in what.program._commands]
+            self._commands += [
+                operation.only_if(what.condition) for operation in what.program._commands
+            ]
         else:
             self._commands.append(Task(what) if callable(what) else what)
         self._forget_prepared()
@@ -369,9 +425,10 @@ class Program:
     def run_while(self, condition: wp.array[Any]) -> None:
         """Launch everything again and again while the condition is not 0; the launches update it.
 
-        Where loops run on the device, they do not come back to the host: on CUDA, all but the first call are one graph, and return
-        before it has ended; on the CPU, the team looks after signals and the deadline. Ranks must find the same condition; they repeat the
-        launches without the host unless they have a deadline, which they look at together.
+        Where loops run on the device, they do not come back to the host: on CUDA, all but the first
+        call are one graph, and return before it has ended; on the CPU, the team looks after signals
+        and the deadline. Ranks must find the same condition; they repeat the launches without the
+        host unless they have a deadline, which they look at together.
 
         Args:
             condition: shape (1,), wp.int32.
@@ -448,7 +505,11 @@ class Program:
         if len(self._commands) != len(other._commands):
             return f"{len(self._commands)} operations, {len(other._commands)} before"
         for at, (mine, its) in enumerate(zip(self._commands, other._commands, strict=True)):
-            if isinstance(mine, Operation) and isinstance(its, Operation) and mine.content() != its.content():
+            if (
+                isinstance(mine, Operation)
+                and isinstance(its, Operation)
+                and mine.content() != its.content()
+            ):
                 return f"operation {at}: {mine.name()}, {its.name()} before"
         return ""
 
@@ -475,21 +536,27 @@ class NotRecordable(Exception):
 class LaunchGraph:
     """What a step launches between two decisions of the host: recorded at the first run, on the CPU then one native call.
 
-    On CUDA it is one graph, see `device_graph.py`, if `on_device` is set. Otherwise, and where launches must go through Warp, `record`
-    is called in each run.
+    On CUDA it is one graph, see `device_graph.py`, if `on_device` is set. Otherwise, and where
+    launches must go through Warp, `record` is called in each run.
 
     Args:
         device: where the kernels run.
-        record: launches by `warp_lcp.rows` what is to be recorded: kernels, `copy`, `clear`. It must not read from the device, nor
-            decide anything by what changes from run to run: `Scalar`, `ActiveWindow` and lists stand for that.
+        record: launches by `warp_lcp.rows` what is to be recorded: kernels, `copy`, `clear`. It
+            must not read from the device, nor decide anything by what changes from run to run:
+            `Scalar`, `ActiveWindow` and lists stand for that.
         at_once: whether to launch in each run instead.
     """
 
-    on_device: ClassVar[bool] = os.environ.get("WARP_LCP_STEP_GRAPHS") == "1"  # whether CUDA graphs are captured: not yet run on a GPU
-    device_program: ClassVar[Any]  # makes the recording of a device: `device_graph.DeviceProgram`, set by `warp_lcp.rows`
-    verify: ClassVar[bool] = False  # whether each run records again and compares with the first recording, for tests
+    # whether CUDA graphs are captured: not yet run on a GPU
+    on_device: ClassVar[bool] = os.environ.get("WARP_LCP_STEP_GRAPHS") == "1"
+    # makes the recording of a device: `device_graph.DeviceProgram`, set by `warp_lcp.rows`
+    device_program: ClassVar[Any]
+    # whether each run records again and compares with the first recording, for tests
+    verify: ClassVar[bool] = False
 
-    def __init__(self, device: wp.Device, record: Callable[..., None], *, at_once: bool = False) -> None:
+    def __init__(
+        self, device: wp.Device, record: Callable[..., None], *, at_once: bool = False
+    ) -> None:
         self.device, self._record, self.at_once = device, record, at_once
         self._programs: dict[Hashable, Program] = {}
         self._threads = 0
@@ -499,9 +566,14 @@ class LaunchGraph:
 
         Args:
             arguments: of `record`. Other arrays or objects are recorded for themselves.
-            variant: by what else `record` decides which of several sequences it launches; each is recorded once.
+            variant: by what else `record` decides which of several sequences it launches; each is
+                recorded once.
         """
-        if self.at_once or RECORDING.program is not None or not (self.on_device if self.device.is_cuda else team()):
+        if (
+            self.at_once
+            or RECORDING.program is not None
+            or not (self.on_device if self.device.is_cuda else team())
+        ):
             self._record(*arguments)
             return
         if not self.device.is_cuda and self._threads != get_threads():

@@ -18,7 +18,8 @@ LINE = 64  # bytes that no two readings share
 class Reading:
     """An array of a few numbers, written by kernels and read by the host.
 
-    Whoever has launched what writes to `array` says so by `changed`; `numpy` then waits for the device, once for all readings of it.
+    Whoever has launched what writes to `array` says so by `changed`; `numpy` then waits for the
+    device, once for all readings of it.
 
     Args:
         device: where it is.
@@ -38,7 +39,9 @@ class Reading:
             return
         size = count * wp.types.type_size_in_bytes(dtype)
         self._board, place = place_of(device, size)
-        self.array = wp.array(ptr=self._board.memory.ptr + place, dtype=dtype, shape=count, device=device)
+        self.array = wp.array(
+            ptr=self._board.memory.ptr + place, dtype=dtype, shape=count, device=device
+        )
         self.array.zero_()
         self._slice, self._kind = slice(place, place + size), wp.dtype_to_numpy(dtype)
         weakref.finalize(self, self._board.give_back, place, size)

@@ -13,7 +13,8 @@ from warp_lcp.rows.pass_form import Form
 from warp_lcp.rows.program import Launch, launch_now, perform
 from warp_lcp.rows.row_pass import Bound
 
-CUDA_THREADS = 512  # of the block: with 1024 a thread has 64 registers, and passes spill up to 2 kB of what it holds
+# of the block: with 1024 a thread has 64 registers, and passes spill up to 2 kB of what it holds
+CUDA_THREADS = 512
 MOST = 5  # forms
 
 
@@ -34,7 +35,8 @@ class Sequence:
 
     Args:
         name: of the kernel, as a pass has one.
-        stages: the passes in order, of five forms at most, without sums. Those that are the same object are kept once.
+        stages: the passes in order, of five forms at most, without sums. Those that are the same
+            object are kept once.
 
     Raises:
         ValueError: no pass, too many forms, a pass that sums, or passes on several devices.
@@ -46,7 +48,9 @@ class Sequence:
         if not stages or any(stage.rows.device is not stages[0].rows.device for stage in stages):
             raise ValueError(f"{name}: takes passes, all on one device")
         if len(forms) > MOST:
-            raise ValueError(f"{name}: {', '.join(names)} are {len(forms)} forms: a sequence takes {MOST}")
+            raise ValueError(
+                f"{name}: {', '.join(names)} are {len(forms)} forms: a sequence takes {MOST}"
+            )
         if summing := [form.declared.name for form in forms if form.declared.sums]:
             raise ValueError(f"{name}: {summing[0]} sums, which passes of a sequence cannot")
         self.device, self._stages, self._forms = stages[0].rows.device, tuple(stages), forms
@@ -62,11 +66,14 @@ class Sequence:
             places[id(bound)] = which, len(kept[which])
             kept[which].append(bytes(bound.layout.__ctype__()) + bound.arguments)
         made = self._Tables()
-        made.order = wp.array([places[id(stage)] for stage in self._stages], dtype=wp.vec2i, device=self.device)
+        made.order = wp.array(
+            [places[id(stage)] for stage in self._stages], dtype=wp.vec2i, device=self.device
+        )
         for table, struct, pieces in zip(TABLES, self._structs, kept, strict=False):
             stored = wp.array(np.frombuffer(b"".join(pieces), dtype=np.uint8), device=self.device)
             typed = wp.array(ptr=stored.ptr, dtype=struct, shape=len(pieces), device=self.device)
-            typed.kept = stored, self._stages  # a recorded launch keeps the tables alone, and they what they have the addresses of
+            # a recorded launch keeps the tables alone, and they what they have the addresses of
+            typed.kept = stored, self._stages
             setattr(made, table, typed)
         return made
 
@@ -127,7 +134,9 @@ def _sequence_kernel(name: str, forms: tuple[Form, ...]) -> Any:
     kinds = [form.declared.name.rpartition(".")[2] for form in forms]
     variant = f"{'_'.join(kinds)}.{'_'.join(dict.fromkeys(word for form in forms for word in form.words))}"
     structs = (One, Two, Three, Four, Five)
-    members = {"order": wp.array(dtype=wp.vec2i)} | {n: wp.array(dtype=s) for n, s in zip(TABLES, structs, strict=True)}
+    members = {"order": wp.array(dtype=wp.vec2i)} | {
+        n: wp.array(dtype=s) for n, s in zip(TABLES, structs, strict=True)
+    }
     Tables = make_struct(f"{name.replace('.', '_')}_{variant.replace('.', '_')}", members)
 
     def sequence(T: Tables, begin: int, end: int, threads: int):
@@ -148,5 +157,7 @@ def _sequence_kernel(name: str, forms: tuple[Form, ...]) -> Any:
             meet()
 
     sequence.__name__ = sequence.__qualname__ = name.rpartition(".")[2]
-    kernel = forward_kernel(module=f"warp_lcp.{name}.{variant}", launch_bounds=CUDA_THREADS)(sequence)
+    kernel = forward_kernel(module=f"warp_lcp.{name}.{variant}", launch_bounds=CUDA_THREADS)(
+        sequence
+    )
     return kernel, Tables, structs

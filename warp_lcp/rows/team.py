@@ -1,8 +1,9 @@
 # mypy: ignore-errors
 """A team of threads that runs tables of CPU launches in native code: all cores of a machine in one process, with the bits of one.
 
-A pass is cut into ranges of tasks, a wave of passes into slabs of planes, and whoever is free takes the next: `headers/team.h` says how.
-What is computed depends neither on who does it nor on how it is cut.
+A pass is cut into ranges of tasks, a wave of passes into slabs of planes, and whoever is free takes
+the next: `headers/team.h` says how. What is computed depends neither on who does it nor on how it
+is cut.
 """
 
 from __future__ import annotations
@@ -27,29 +28,58 @@ from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.native import shared
 
 VARIABLE = "WARP_LCP_THREADS"
-RANKS = ("OMPI_COMM_WORLD_LOCAL_SIZE", "MPI_LOCALNRANKS")  # where launchers of ranks tell how many are on this machine
+# where launchers of ranks tell how many are on this machine
+RANKS = ("OMPI_COMM_WORLD_LOCAL_SIZE", "MPI_LOCALNRANKS")
 MOST_THREADS = 1024
-PATIENCE = 50_000_000  # nanoseconds in native code after which the interpreter is asked whether there is a signal
-CELLS = 4096  # of a usual pass that a piece has at least: a microsecond or more; to take a piece costs 0.1
+# nanoseconds in native code after which the interpreter is asked whether there is a signal
+PATIENCE = 50_000_000
+# of a usual pass that a piece has at least: a microsecond or more; to take a piece costs 0.1
+CELLS = 4096
 PIECES = 12  # that a thread's share of a pass is cut into, so that none waits long for another
-SPINS = 10000, 2000  # of an idle thread before it lets others have its core, 25 ns each: with a core of its own, without
+# of an idle thread before it lets others have its core, 25 ns each: with a core of its own, without
+SPINS = 10000, 2000
 COPIED = 1 << 18  # bytes that a thread copies at least
 ROOM = 4096  # bytes of the arguments of what can be cut
 RUN, SERVE, CANCEL, QUIT = range(4)  # as in team.h, like all that follows
 ALONE, TASKS, SLABS, COPY = range(4)
 DONE_ALONE, SHARED, RESUMED = 0, 1, 2
-TABLE, IDLE_SPINS, CALLS, THREADS, TABLE_WORDS, OPERATION_WORDS, LANE_WORDS = 1, 2, 56, 64, 24, 13, 8
+TABLE, IDLE_SPINS, CALLS, THREADS, TABLE_WORDS, OPERATION_WORDS, LANE_WORDS = (
+    1,
+    2,
+    56,
+    64,
+    24,
+    13,
+    8,
+)
 COUNT, TOTAL, OPERATIONS, SHARED_TIME, UNFINISHED, AGAIN = range(16, 22)
 WITHIN, BETWEEN = 1, 2  # where a table is unfinished: within a run, between two
 MOST_ENTRIES = 64  # launch dimensions of a kernel whose entries are kept
-FORMATS = {wp.float32: "f", wp.float64: "d", float: "f", wp.int32: "i", int: "i", wp.int64: "q", wp.bool: "?", bool: "?"}  # of `struct`
+# of `struct`
+FORMATS = {
+    wp.float32: "f",
+    wp.float64: "d",
+    float: "f",
+    wp.int32: "i",
+    int: "i",
+    wp.int64: "q",
+    wp.bool: "?",
+    bool: "?",
+}
 MADE = {"pthread_mutex_init": 24, "pthread_cond_init": 40}  # words of a team that these make
-LOCKS = ("pthread_mutex_lock", "pthread_mutex_unlock", "pthread_cond_wait", "pthread_cond_broadcast")
+LOCKS = (
+    "pthread_mutex_lock",
+    "pthread_mutex_unlock",
+    "pthread_cond_wait",
+    "pthread_cond_broadcast",
+)
 SYSTEM = ("sched_yield", "clock_gettime", "nanosleep", *LOCKS)
 
 
 @wp.func_native("\n".join(["", shared("team.h"), ""]))
-def work_through(team_: wp.uint64, table_: wp.uint64, mode: int, me: int, share: int, limit_: wp.int64):
+def work_through(
+    team_: wp.uint64, table_: wp.uint64, mode: int, me: int, share: int, limit_: wp.int64
+):
     """Do what `mode` asks of thread `me`."""
 
 
@@ -59,16 +89,21 @@ def team_kernel(team: wp.uint64, table: wp.uint64, mode: int, me: int, share: in
     work_through(team, table, mode, me, share, limit)
 
 
-Patch = tuple[int, int, int]  # a part of a kernel's arguments that is read from memory: offset in them, address, bytes
+# a part of a kernel's arguments that is read from memory: offset in them, address, bytes
+Patch = tuple[int, int, int]
 
 
 class Arguments(ctypes.Structure):
     """Arguments of `team_kernel`."""
 
     _fields_ = (
-        ("team", ctypes.c_uint64), ("table", ctypes.c_uint64), ("mode", ctypes.c_int32), ("me", ctypes.c_int32), ("share", ctypes.c_int32),
+        ("team", ctypes.c_uint64),
+        ("table", ctypes.c_uint64),
+        ("mode", ctypes.c_int32),
+        ("me", ctypes.c_int32),
+        ("share", ctypes.c_int32),
         ("limit", ctypes.c_int64),
-    )  # fmt: skip
+    )
 
 
 class Entry:
@@ -80,7 +115,8 @@ class Entry:
 
     def __init__(self, launch: Any) -> None:
         self.kernel, self.function = launch.kernel, launch.hooks.forward
-        self._kept = launch.module_exec, launch.bounds  # the module stays loaded; the launch would keep arrays
+        # the module stays loaded; the launch would keep arrays
+        self._kept = launch.module_exec, launch.bounds
         self.call = ctypes.cast(self.function, ctypes.c_void_p).value
         self.bounds = ctypes.addressof(launch.bounds)
 
@@ -97,21 +133,49 @@ class Stage:
         lag: planes that it is behind the first stage of a wave.
         finer: planes of the finer level that one of its planes stands for.
         finer_planes: their number.
-        patches: parts of the arguments that are read from memory in each run: offset, address, bytes.
+        patches: parts of the arguments that are read from memory in each run: offset, address,
+            bytes.
     """
 
     def __init__(
-        self, entry: Entry, arguments: bytes, kept: Any, plane_tasks: int = 1, planes: int = 1, lag: int = 0, finer: int = 1,
-        finer_planes: int = 0, patches: Sequence[Patch] = (),
-    ) -> None:  # fmt: skip
+        self,
+        entry: Entry,
+        arguments: bytes,
+        kept: Any,
+        plane_tasks: int = 1,
+        planes: int = 1,
+        lag: int = 0,
+        finer: int = 1,
+        finer_planes: int = 0,
+        patches: Sequence[Patch] = (),
+    ) -> None:
         memory, size = array("B", arguments), len(arguments)
-        listed = array("Q", [len(patches), *(word for patch in patches for word in patch)]) if patches else None
-        self.kept, self.tasks, self.planes = (entry, memory, kept, listed), plane_tasks * planes, planes
+        listed = (
+            array("Q", [len(patches), *(word for patch in patches for word in patch)])
+            if patches
+            else None
+        )
+        self.kept, self.tasks, self.planes = (
+            (entry, memory, kept, listed),
+            plane_tasks * planes,
+            planes,
+        )
         self.patches = tuple(patches)
         if size > ROOM:
             raise ValueError(f"a kernel's arguments take {size} bytes: expected at most {ROOM}")
         where = 0 if listed is None else listed.buffer_info()[0]
-        self.words = entry.call, entry.bounds, memory.buffer_info()[0], size, plane_tasks, planes, lag, finer, finer_planes, where
+        self.words = (
+            entry.call,
+            entry.bounds,
+            memory.buffer_info()[0],
+            size,
+            plane_tasks,
+            planes,
+            lag,
+            finer,
+            finer_planes,
+            where,
+        )
 
     def content(self) -> tuple[Any, ...]:
         """Return what it does: the kernel, its arguments but for what is patched, and the patches; of a copy, its words."""
@@ -128,7 +192,8 @@ class Operation:
 
     Attributes:
         check: raises what has failed in it, once the table is done; None: nothing can.
-        condition: address of an int32 number; the operation is skipped where it is 0. 0: it is never skipped.
+        condition: address of an int32 number; the operation is skipped where it is 0. 0: it is
+            never skipped.
 
     Args:
         kind: ALONE for a launch as it is; TASKS, SLABS for what is cut; COPY for memory.
@@ -137,26 +202,55 @@ class Operation:
         each: tasks, or planes, of a piece.
         everything: tasks, or planes, in all.
         margin: planes that the last stage of a wave is behind the first.
-        sized: address of the number of tasks, which may differ from run to run; 0: it is `everything`.
+        sized: address of the number of tasks, which may differ from run to run; 0: it is
+            `everything`.
     """
 
     __slots__ = ("_kept", "_stages", "check", "chunks", "condition", "sized", "words")
 
     def __init__(
-        self, kind: int, stages: list[Stage], chunks: int = 1, each: int = 0, everything: int = 0, margin: int = 0, sized: int = 0
+        self,
+        kind: int,
+        stages: list[Stage],
+        chunks: int = 1,
+        each: int = 0,
+        everything: int = 0,
+        margin: int = 0,
+        sized: int = 0,
     ) -> None:
-        self._stages, self._kept, self.chunks = array("Q", [word for stage in stages for word in stage.words]), stages, chunks
+        self._stages, self._kept, self.chunks = (
+            array("Q", [word for stage in stages for word in stage.words]),
+            stages,
+            chunks,
+        )
         self.check: Callable[[], object] | None = None
         self.condition, self.sized = 0, sized
-        self.words = kind, self._stages.buffer_info()[0], len(stages), each, everything, margin, chunks
+        self.words = (
+            kind,
+            self._stages.buffer_info()[0],
+            len(stages),
+            each,
+            everything,
+            margin,
+            chunks,
+        )
 
     def content(self) -> tuple[Any, ...]:
         """Return what it does, but for what it reads from memory in each run."""
-        return (self.words[0], self.sized, self.condition, *(stage.content() for stage in self._kept if isinstance(stage, Stage)))
+        return (
+            self.words[0],
+            self.sized,
+            self.condition,
+            *(stage.content() for stage in self._kept if isinstance(stage, Stage)),
+        )
 
     def name(self) -> str:
         """Return the names of its kernels."""
-        return "copy" if self.words[0] == COPY else ", ".join(s.kept[0].kernel.key for s in self._kept if isinstance(s, Stage))
+        return (
+            "copy"
+            if self.words[0] == COPY
+            else ", ".join(s.kept[0].kernel.key for s in self._kept if isinstance(s, Stage))
+        )
 
     def only_if(self, condition: wp.array[Any]) -> Operation:
         """Return the same operation, skipped where a number, shape (1,), wp.int32, is 0."""
@@ -176,10 +270,18 @@ def ranges(stage: Stage, cells: int, *, ordered: bool = False, sized: int = 0) -
     """
     each, threads = stage.tasks, 1 if ordered else get_threads()
     if sized:
-        return Operation(TASKS, [stage], PIECES * threads if threads > 1 else 1, -(-CELLS // max(cells, 1)), stage.tasks, sized=sized)
+        return Operation(
+            TASKS,
+            [stage],
+            PIECES * threads if threads > 1 else 1,
+            -(-CELLS // max(cells, 1)),
+            stage.tasks,
+            sized=sized,
+        )
     if threads > 1:
         count = max(min(PIECES * threads, stage.tasks * cells // CELLS), 1)
-        count -= count % threads if count > threads else 0  # as many for each thread: 5 equal pieces take two threads as long as 6
+        # as many for each thread: 5 equal pieces take two threads as long as 6
+        count -= count % threads if count > threads else 0
         each = -(-stage.tasks // count)
     return Operation(TASKS, [stage], -(-stage.tasks // each), each, stage.tasks)
 
@@ -208,14 +310,19 @@ class Table:
 
     Args:
         operations: in order.
-        again: number on the host, shape (1,), wp.int32, that operations write: the table is run until it is 0. None: once.
+        again: number on the host, shape (1,), wp.int32, that operations write: the table is run
+            until it is 0. None: once.
     """
 
     def __init__(self, operations: Iterable[Operation], again: wp.array[Any] | None = None) -> None:
         self._kept = tuple(operations)
         self.checks = {operation.check for operation in self._kept} - {None}
         lanes = [min(get_threads(), operation.chunks) for operation in self._kept]
-        sizes = [LANE_WORDS * n + operation.chunks for n, operation in zip(lanes, self._kept, strict=True)]  # what is left, and the cuts
+        # what is left, and the cuts
+        sizes = [
+            LANE_WORDS * n + operation.chunks
+            for n, operation in zip(lanes, self._kept, strict=True)
+        ]
         at = TABLE_WORDS + OPERATION_WORDS * len(self._kept)
         self.words = array("Q", bytes(8 * (at + sum(sizes))))
         self.address = self.words.buffer_info()[0]
@@ -225,8 +332,13 @@ class Table:
             places = self.address + 8 * at, self.address + 8 * (at + LANE_WORDS * count)
             made += [total, *operation.words, count, *places, operation.sized, operation.condition]
             at += size
-        self.words[TABLE_WORDS : TABLE_WORDS + len(made)] = array("Q", made)  # of the same length, so it stays where it is
-        self.words[COUNT], self.words[TOTAL], self.words[OPERATIONS] = len(self._kept), total, self.address + 8 * TABLE_WORDS
+        # of the same length, so it stays where it is
+        self.words[TABLE_WORDS : TABLE_WORDS + len(made)] = array("Q", made)
+        self.words[COUNT], self.words[TOTAL], self.words[OPERATIONS] = (
+            len(self._kept),
+            total,
+            self.address + 8 * TABLE_WORDS,
+        )
         self.again, self.words[AGAIN] = again, 0 if again is None else again.ptr
         self.cut = total > len(self._kept)
         self.asked: Arguments | None = None  # of the last team of one thread
@@ -253,7 +365,9 @@ class Team:
         self._lock, self._inside = threading.Lock(), 0
         self._posted, self._retired = None, []
         self.shared_time = 0.0  # seconds that callers have spent in what the team shared
-        self._workers = [threading.Thread(target=self._serve, args=(me,), daemon=True) for me in range(1, size)]
+        self._workers = [
+            threading.Thread(target=self._serve, args=(me,), daemon=True) for me in range(1, size)
+        ]
         for worker in self._workers:
             worker.start()
 
@@ -294,7 +408,9 @@ class Team:
         """Work through a table with the caller's thread."""
         asked = table.asked
         if asked is None or asked.team != self.address:  # of another team, which is gone
-            asked = table.asked = Arguments(self.address, table.address, RUN, 0, DONE_ALONE, PATIENCE)
+            asked = table.asked = Arguments(
+                self.address, table.address, RUN, 0, DONE_ALONE, PATIENCE
+            )
         try:
             self._do(asked)
             while table.words[UNFINISHED]:  # the interpreter has looked after signals
@@ -340,7 +456,11 @@ def arguments_of(launch: Any) -> Any:
 
 @functools.cache
 def _arguments(*types: Any) -> Any:
-    return type("LaunchArguments", (ctypes.Structure,), {"_fields_": [(f"p{i}", kind) for i, kind in enumerate(types)]})
+    return type(
+        "LaunchArguments",
+        (ctypes.Structure,),
+        {"_fields_": [(f"p{i}", kind) for i, kind in enumerate(types)]},
+    )
 
 
 ALIGNED = {1: "B", 2: "H", 4: "I", 8: "Q"}  # formats of `struct` by their alignment
@@ -379,7 +499,12 @@ class Signature:
             if kind in FORMATS:
                 plain = type(value) in (int, float, bool)
             elif type(value) is wp.array:
-                plain = isinstance(kind, wp.array) and value.dtype is kind.dtype and value.ndim == kind.ndim and value.device.is_cpu
+                plain = (
+                    isinstance(kind, wp.array)
+                    and value.dtype is kind.dtype
+                    and value.ndim == kind.ndim
+                    and value.device.is_cpu
+                )
                 value = bytes(value.__ctype__())
             elif kind in self._structs:
                 plain = type(value) is self._structs[kind]
@@ -404,7 +529,8 @@ def _format(kind: Any) -> str:
         return f"0Q{ctypes.sizeof(kind.__ctype__())}s"
     if isinstance(getattr(kind, "ctype", None), type):  # a struct
         return f"0{ALIGNED[ctypes.alignment(kind.ctype)]}{ctypes.sizeof(kind.ctype)}s"
-    of = kind._type_ if isinstance(kind, type) and issubclass(kind, ctypes.Array) else None  # a vector's or a matrix's numbers
+    # a vector's or a matrix's numbers
+    of = kind._type_ if isinstance(kind, type) and issubclass(kind, ctypes.Array) else None
     of = getattr(of, "_type_", "")
     return f"0{of}{ctypes.sizeof(kind)}s" if isinstance(of, str) and of else ""
 
@@ -418,7 +544,9 @@ def signature_of(kernel: Any) -> Signature:
 def prepared(kernel: Any, dim: Any, inputs: Sequence[Any]) -> tuple[Entry, bytes, Any]:
     """Return a Warp kernel on the CPU as C calls it, its arguments, and the struct of them."""
     signature = signature_of(kernel)
-    if (known := signature.entries.get(dim)) is not None and (arguments := signature.pack(inputs)) is not None:
+    if (known := signature.entries.get(dim)) is not None and (
+        arguments := signature.pack(inputs)
+    ) is not None:
         return known[0], arguments, known[1]
     launch = wp.launch(kernel, dim, inputs, device="cpu", record_cmd=True)
     memory = arguments_of(launch)
@@ -463,14 +591,20 @@ def _entry() -> Entry | None:
         if a.numpy().tolist() != [0, 0, 3, 4, 5, 6, 7, 0]:
             raise RuntimeError("a test launch gave a wrong result")
     except Exception as error:
-        warnings.warn(f"one CPU thread: Warp {wp.__version__} records launches in an unknown format ({error})", stacklevel=2)
+        warnings.warn(
+            f"one CPU thread: Warp {wp.__version__} records launches in an unknown format "
+            f"({error})",
+            stacklevel=2,
+        )
         return None
     return made
 
 
 def available_threads() -> int:
     """Return the cores that this process may use, shared among the ranks on this machine."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = (
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    )
     ranks = next((int(os.environ[name]) for name in RANKS if os.environ.get(name, "").isdigit()), 1)
     return min(max(cores // max(ranks, 1), 1), MOST_THREADS)
 
@@ -488,7 +622,9 @@ def _checked(value: Any, name: str) -> int:
     except (TypeError, ValueError):
         count = 0
     if not 1 <= count <= MOST_THREADS or isinstance(value, float):
-        raise ValueError(f"{name}: {value!r}: expected a number of threads from 1 to {MOST_THREADS}")
+        raise ValueError(
+            f"{name}: {value!r}: expected a number of threads from 1 to {MOST_THREADS}"
+        )
     return count
 
 

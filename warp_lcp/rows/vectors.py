@@ -1,6 +1,7 @@
 """Flat fields: conversions, inner products, deterministic sums. The only vector primitives that the solvers use.
 
-Every operator stores its fields as flat arrays (see `warp_lcp.rows.fields`), so that these serve all of them.
+Every operator stores its fields as flat arrays (see `warp_lcp.rows.fields`), so that these serve
+all of them.
 """
 
 from __future__ import annotations
@@ -37,15 +38,23 @@ CONVERT = KERNELS["vectors.convert"]
 
 
 @wp.func_native("\n".join(["", text(HEADERS / "native.h"), text(KERNELS.path, "add_up"), ""]))
-def add_up_span(partials: wp.array(dtype=wp.float64), offset: int, start: int, n: int, stride: int) -> wp.float64:
+def add_up_span(
+    partials: wp.array(dtype=wp.float64), offset: int, start: int, n: int, stride: int
+) -> wp.float64:
     """The sum of every stride-th of the partial sums from `offset` + `start` on."""
 
 
 @no_type_check
 @forward_kernel(module="warp_lcp.vectors")
 def add_up_kernel(
-    partials: wp.array(dtype=wp.float64), before: int, n: int, threads: int, segments: int, out: wp.array(dtype=wp.float64), slot: int
-):  # fmt: skip
+    partials: wp.array(dtype=wp.float64),
+    before: int,
+    n: int,
+    threads: int,
+    segments: int,
+    out: wp.array(dtype=wp.float64),
+    slot: int,
+):
     """out[slot + column * segments + segment] = the sum of every `segments`-th block of a column of n partials, by one block of threads.
 
     Columns are counted from the one after `before` others.
@@ -56,7 +65,13 @@ def add_up_kernel(
     block = t // threads
     column = block // segments
     segment = block - column * segments
-    s = add_up_span(partials, (before + column) * n, segment * threads + t - block * threads, n, threads * segments)
+    s = add_up_span(
+        partials,
+        (before + column) * n,
+        segment * threads + t - block * threads,
+        n,
+        threads * segments,
+    )
     total = wp.tile_sum(wp.tile(s))
     if t == block * threads:
         out[slot + block] = total[0]
@@ -65,8 +80,14 @@ def add_up_kernel(
 @no_type_check
 @forward_kernel(module="warp_lcp.vectors")
 def largest_kernel(
-    partials: wp.array(dtype=wp.float64), before: int, n: int, threads: int, segments: int, out: wp.array(dtype=wp.float64), slot: int
-):  # fmt: skip
+    partials: wp.array(dtype=wp.float64),
+    before: int,
+    n: int,
+    threads: int,
+    segments: int,
+    out: wp.array(dtype=wp.float64),
+    slot: int,
+):
     """The same for the largest of them."""
     t = wp.tid()
     block = t // threads
@@ -105,9 +126,17 @@ def segments_of(n: int) -> int:
 
 
 def fold(
-    kernel: wp.Kernel, partials: wp.array[wp.float64], n: Any, columns: int, out: wp.array[wp.float64], slot: int,
-    between: wp.array[wp.float64], launch: Launch = launch_now, most: int | None = None, before: int = 0,
-) -> None:  # fmt: skip
+    kernel: wp.Kernel,
+    partials: wp.array[wp.float64],
+    n: Any,
+    columns: int,
+    out: wp.array[wp.float64],
+    slot: int,
+    between: wp.array[wp.float64],
+    launch: Launch = launch_now,
+    most: int | None = None,
+    before: int = 0,
+) -> None:
     """Write to out[slot], out[slot + 1], ... what `add_up_kernel` or `largest_kernel` makes of columns of n partial results, on CUDA.
 
     Args:
@@ -126,9 +155,21 @@ def fold(
     launch = launch_recorded if is_recording() and not hasattr(launch, "__self__") else launch
     if segments > 1:
         blocks = columns * segments * CUDA_BLOCK
-        launch(kernel, blocks, [partials, before, n, CUDA_BLOCK, segments, between, 0], device=device, block_dim=CUDA_BLOCK)
+        launch(
+            kernel,
+            blocks,
+            [partials, before, n, CUDA_BLOCK, segments, between, 0],
+            device=device,
+            block_dim=CUDA_BLOCK,
+        )
         partials, before, n = between, 0, segments
-    launch(kernel, columns * CUDA_BLOCK, [partials, before, n, CUDA_BLOCK, 1, out, slot], device=device, block_dim=CUDA_BLOCK)
+    launch(
+        kernel,
+        columns * CUDA_BLOCK,
+        [partials, before, n, CUDA_BLOCK, 1, out, slot],
+        device=device,
+        block_dim=CUDA_BLOCK,
+    )
 
 
 class Reduction:
@@ -144,26 +185,53 @@ class Reduction:
     """
 
     def __init__(
-        self, n: int, device: wp.Device, scalars: wp.array[wp.float64], *, columns: int = 1, threads: int | None = None,
+        self,
+        n: int,
+        device: wp.Device,
+        scalars: wp.array[wp.float64],
+        *,
+        columns: int = 1,
+        threads: int | None = None,
         across: Across | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.scalars, self.columns, self._across = scalars, columns, across
         self.threads = threads or Rows.flat(n, device).places
         self.partials = zeros(columns * self.threads, wp.float64, device)
-        self._folded = zeros(columns * segments_of(self.threads) if device.is_cuda else 0, wp.float64, device)
+        self._folded = zeros(
+            columns * segments_of(self.threads) if device.is_cuda else 0, wp.float64, device
+        )
 
     def add_up(self, slot: int, columns: int = 1, *, launch: Launch = launch_now) -> None:
         """Write the sums of the first columns of partial sums to scalars[slot], scalars[slot + 1], ..."""
         device = self.partials.device
         if device.is_cpu:  # Warp's tiles are not for several threads at a time
             rows = Rows.flat(columns, device)
-            ADD_UP.bind(rows, partials=self.partials, count=self.threads, scalars=self.scalars, slot=slot).launch(launch)
+            ADD_UP.bind(
+                rows, partials=self.partials, count=self.threads, scalars=self.scalars, slot=slot
+            ).launch(launch)
         else:
-            fold(add_up_kernel, self.partials, self.threads, columns, self.scalars, slot, self._folded, launch)
+            fold(
+                add_up_kernel,
+                self.partials,
+                self.threads,
+                columns,
+                self.scalars,
+                slot,
+                self._folded,
+                launch,
+            )
         if self._across is not None:
             add_across(self._across, self.scalars, slice(slot, slot + columns), launch)
 
-    def dot(self, a: wp.array[Any], b: wp.array[Any], slot: int, *, rows: Rows | None = None, launch: Launch = launch_now) -> None:
+    def dot(
+        self,
+        a: wp.array[Any],
+        b: wp.array[Any],
+        slot: int,
+        *,
+        rows: Rows | None = None,
+        launch: Launch = launch_now,
+    ) -> None:
         """Write the inner product a.b, over some rows if told, to scalars[slot]."""
         DOT.bind(rows or rows_of(a), a=a, b=b, out=self.partials).launch(launch)
         self.add_up(slot, launch=launch)
@@ -179,21 +247,46 @@ class Sums(Reduction):
         across: who has the other parts of the fields; None: nobody.
     """
 
-    def __init__(self, rows: Rows, columns: int = 1, *, slots: int = 0, across: Across | None = None) -> None:
+    def __init__(
+        self, rows: Rows, columns: int = 1, *, slots: int = 0, across: Across | None = None
+    ) -> None:
         self.rows, self.reading = rows, Reading(rows.device, max(columns, slots))
-        super().__init__(rows.size, rows.device, self.reading.array, columns=columns, threads=rows.places, across=across)
+        super().__init__(
+            rows.size,
+            rows.device,
+            self.reading.array,
+            columns=columns,
+            threads=rows.places,
+            across=across,
+        )
 
-    def of(self, declared: RowPass, *structs: DataclassInstance, slot: int = 0, **given: Any) -> np.ndarray:
+    def of(
+        self, declared: RowPass, *structs: DataclassInstance, slot: int = 0, **given: Any
+    ) -> np.ndarray:
         """Launch a pass, bound as by `RowPass.bind`; return its sums, which are in `scalars` from a slot on."""
         with as_one_table(self.rows.device, self._across):
             self._launch(declared, structs, given, slot, wp.launch)
         return self.reading.numpy()[slot : slot + len(declared.sums)]
 
-    def launch(self, declared: RowPass, *structs: DataclassInstance, slot: int = 0, launch: Launch = launch_now, **given: Any) -> None:
+    def launch(
+        self,
+        declared: RowPass,
+        *structs: DataclassInstance,
+        slot: int = 0,
+        launch: Launch = launch_now,
+        **given: Any,
+    ) -> None:
         """Launch a pass, whose sums `reading` will have from a slot on, or record it."""
         self._launch(declared, structs, given, slot, launch)
 
-    def _launch(self, declared: RowPass, structs: tuple[DataclassInstance, ...], given: dict[str, Any], slot: int, launch: Launch) -> None:
+    def _launch(
+        self,
+        declared: RowPass,
+        structs: tuple[DataclassInstance, ...],
+        given: dict[str, Any],
+        slot: int,
+        launch: Launch,
+    ) -> None:
         stencil, bounds = given.pop("stencil", None), given.pop("bounds", None)
         given["out"] = self.partials
         declared.bind_arguments(self.rows, structs, given, stencil, bounds).launch(launch)
@@ -214,7 +307,9 @@ class Tally:
         self._declared, self._columns = declared, len(declared.found)
         self._reading = Reading(device, self._columns) if device.is_cuda else None
         self._partials = wp.empty(self._columns * places, dtype=wp.float64, device=device)
-        self._between = wp.empty(self._columns * CUDA_SEGMENTS if device.is_cuda else 0, dtype=wp.float64, device=device)
+        self._between = wp.empty(
+            self._columns * CUDA_SEGMENTS if device.is_cuda else 0, dtype=wp.float64, device=device
+        )
         self._places = 0
 
     @property
@@ -222,14 +317,25 @@ class Tally:
         """What is found, a number a column, where it is on a GPU; None on the CPU."""
         return None if self._reading is None else self._reading.array
 
-    def take(self, rows: Rows, *structs: DataclassInstance, stencil: Any = None, bounds: list[Any] | None = None, **given: Any) -> None:
+    def take(
+        self,
+        rows: Rows,
+        *structs: DataclassInstance,
+        stencil: Any = None,
+        bounds: list[Any] | None = None,
+        **given: Any,
+    ) -> None:
         """Launch the pass, bound as by `RowPass.bind`, over rows; what it finds replaces what was found."""
         self.launch(rows, structs, given, stencil, bounds)
 
     def launch(
-        self, rows: Rows, structs: tuple[DataclassInstance, ...], given: dict[str, Any], stencil: Any = None,
+        self,
+        rows: Rows,
+        structs: tuple[DataclassInstance, ...],
+        given: dict[str, Any],
+        stencil: Any = None,
         bounds: list[Any] | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Do what `take` does, with arguments as of `RowPass.bind_arguments`."""
         self._places, device = rows.places, rows.device
         if is_recording() and device.is_cuda:
@@ -245,12 +351,36 @@ class Tally:
         if not self._places:
             self._reading.array.zero_()
         elif sums:
-            fold(add_up_kernel, self._partials, self._places, sums, self._reading.array, 0, self._between)
+            fold(
+                add_up_kernel,
+                self._partials,
+                self._places,
+                sums,
+                self._reading.array,
+                0,
+                self._between,
+            )
         if self._places and largest:
-            fold(largest_kernel, self._partials, self._places, largest, self._reading.array, sums, self._between, before=sums)
+            fold(
+                largest_kernel,
+                self._partials,
+                self._places,
+                largest,
+                self._reading.array,
+                sums,
+                self._between,
+                before=sums,
+            )
         self._reading.changed()
 
-    def _record(self, rows: Rows, structs: tuple[DataclassInstance, ...], given: dict[str, Any], stencil: Any, bounds: Any) -> None:
+    def _record(
+        self,
+        rows: Rows,
+        structs: tuple[DataclassInstance, ...],
+        given: dict[str, Any],
+        stencil: Any,
+        bounds: Any,
+    ) -> None:
         """Record the pass on CUDA, for as many places as the rows have in a run."""
         assert self._reading is not None
         memory, sums, largest = rows.memory, len(self._declared.sums), len(self._declared.largest)
@@ -262,7 +392,17 @@ class Tally:
         self._declared.bind_arguments(rows, structs, given, stencil, bounds).launch()
         for kernel, count, before in ((add_up_kernel, sums, 0), (largest_kernel, largest, sums)):
             if count:
-                fold(kernel, self._partials, places, count, self._reading.array, before, self._between, most=most, before=before)
+                fold(
+                    kernel,
+                    self._partials,
+                    places,
+                    count,
+                    self._reading.array,
+                    before,
+                    self._between,
+                    most=most,
+                    before=before,
+                )
 
     def changed(self) -> None:
         """Say that a recorded `take` has run."""
@@ -273,17 +413,28 @@ class Tally:
         """Return what was found, a number a column.
 
         Args:
-            arrange: gives what threads have found, shape (columns, threads), the shape in which the host adds it up, columns first.
+            arrange: gives what threads have found, shape (columns, threads), the shape in which the
+                host adds it up, columns first.
         """
         if self._reading is not None:
             return self._reading.numpy()
-        parts = arrange(self._partials.numpy()[: self._columns * self._places].reshape(self._columns, self._places))
+        parts = arrange(
+            self._partials.numpy()[: self._columns * self._places].reshape(
+                self._columns, self._places
+            )
+        )
         sums = len(self._declared.sums)
-        return np.array([part.sum() if c < sums else part.max(initial=-np.inf) for c, part in enumerate(parts)])
+        return np.array(
+            [part.sum() if c < sums else part.max(initial=-np.inf) for c, part in enumerate(parts)]
+        )
 
 
 def add_across(
-    across: Across, scalars: wp.array[wp.float64], slots: slice, launch: Launch = launch_now, condition: wp.array[wp.int32] | None = None
+    across: Across,
+    scalars: wp.array[wp.float64],
+    slots: slice,
+    launch: Launch = launch_now,
+    condition: wp.array[wp.int32] | None = None,
 ) -> None:
     """Add what the others have summed, now or among the launches of a program.
 
@@ -292,17 +443,26 @@ def add_across(
         scalars: sums of this process, which are replaced.
         slots: of them, those that are added up.
         launch: of a program.
-        condition: number, shape (1,), the same in all processes; where it is 0 nothing is done. None: always.
+        condition: number, shape (1,), the same in all processes; where it is 0 nothing is done.
+            None: always.
     """
 
     def operation() -> Operation:
         adding = across.adding(scalars.numpy()[slots])
         return adding if condition is None else adding.only_if(condition)
 
-    Task(partial(_add_across, across, scalars, slots, condition), operation if scalars.device.is_cpu else None).launch(launch)
+    Task(
+        partial(_add_across, across, scalars, slots, condition),
+        operation if scalars.device.is_cpu else None,
+    ).launch(launch)
 
 
-def _add_across(across: Across, scalars: wp.array[wp.float64], slots: slice, condition: wp.array[wp.int32] | None) -> None:
+def _add_across(
+    across: Across,
+    scalars: wp.array[wp.float64],
+    slots: slice,
+    condition: wp.array[wp.int32] | None,
+) -> None:
     if condition is not None and not condition.numpy()[0]:
         return
     if scalars.device.is_cpu:

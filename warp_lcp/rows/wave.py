@@ -9,7 +9,8 @@ from warp_lcp.rows.row_pass import Bound, RowPass
 from warp_lcp.rows.team import CELLS, SLABS, Operation, get_threads, team
 
 LARGEST = 4  # passes of a wave
-SLAB_PIECES, SLAB_PLANES = 4, 8  # of waves: their pieces beside each other have work to finish together
+# of waves: their pieces beside each other have work to finish together
+SLAB_PIECES, SLAB_PLANES = 4, 8
 
 
 def slabs_of(planes: int, least: int, threads: int) -> tuple[int, int]:
@@ -20,8 +21,12 @@ def slabs_of(planes: int, least: int, threads: int) -> tuple[int, int]:
         least: planes that a slab has at least.
         threads: that take them.
     """
-    cuts = [(count, planes // count // 2 * 2) for count in range(2, min(planes // least, SLAB_PIECES * threads) + 1)]
-    shares = [-(-count // threads) * each + planes - count * each for count, each in cuts]  # of the thread that has the last slab, and most
+    cuts = [
+        (count, planes // count // 2 * 2)
+        for count in range(2, min(planes // least, SLAB_PIECES * threads) + 1)
+    ]
+    # of the thread that has the last slab, and most
+    shares = [-(-count // threads) * each + planes - count * each for count, each in cuts]
     return max(cut for cut, share in zip(cuts, shares, strict=True) if share <= 1.1 * min(shares))
 
 
@@ -38,7 +43,9 @@ class Wave:
 
     def __init__(self, name: str, *stages: tuple[RowPass, int]) -> None:
         if not 0 < len(stages) <= LARGEST or stages[0][1] or min(lag for _, lag in stages) < 0:
-            raise ValueError(f"{name}: expected 1 to {LARGEST} passes, 0 and more planes behind the first")
+            raise ValueError(
+                f"{name}: expected 1 to {LARGEST} passes, 0 and more planes behind the first"
+            )
         self.name, self.stages = name, stages
 
     def launch(self, *passes: Bound | None, launch: Any = launch_now) -> None:
@@ -49,9 +56,15 @@ class Wave:
             ValueError: threads share the rows of one out, as those of a flat field.
         """
         declared = tuple(stage for stage, _ in self.stages)
-        given = [(b, lag) for b, (_, lag) in zip(passes, self.stages, strict=False) if b is not None]
-        if len(passes) != len(declared) or any(b and b.form.declared is not stage for b, stage in zip(passes, declared, strict=True)):
-            raise TypeError(f"{self.name}: takes {', '.join(stage.name for stage in declared)}, in this order")
+        given = [
+            (b, lag) for b, (_, lag) in zip(passes, self.stages, strict=False) if b is not None
+        ]
+        if len(passes) != len(declared) or any(
+            b and b.form.declared is not stage for b, stage in zip(passes, declared, strict=True)
+        ):
+            raise TypeError(
+                f"{self.name}: takes {', '.join(stage.name for stage in declared)}, in this order"
+            )
         if not given:
             return
         if given[0][0].rows.device.is_cuda or max(b.layout.slab for b, _ in given) > 1:
@@ -70,19 +83,33 @@ class Wave:
         for turn in range(max(b.layout.planes for b, _ in given) + max(lag for _, lag in given)):
             for bound, lag in given:
                 L, i = bound.layout, turn - lag
-                finer = max(L.fz, 1)  # planes that one of a coarser level stands for, whose turn comes with the last of them
+                # planes that one of a coarser level stands for, whose turn comes with the last of
+                # them
+                finer = max(L.fz, 1)
                 whole = finer == 1 or (i < L.n1 and ((i + 1) % finer == 0 or i == L.n1 - 1))
                 if 0 <= (k := i // finer) < L.planes and whole:
                     there = put(copy_of(L), {"begin": k * L.rows, "end": (k + 1) * L.rows})
-                    launch(bound.form.kernel, (1, 1, 1), [there, bound.fields], device=bound.rows.device)
+                    launch(
+                        bound.form.kernel,
+                        (1, 1, 1),
+                        [there, bound.fields],
+                        device=bound.rows.device,
+                    )
 
     def _operation(self, given: list[tuple[Bound, int]]) -> Operation:
         """Return the wave for the team, cut into slabs of planes."""
         layouts = [b.layout for b, _ in given]
         planes, most = max(L.planes for L in layouts), max(lag for _, lag in given)
-        least = 2 * (max(SLAB_PLANES, 2 * most + 5) // 2 + 1)  # so that the gaps lie apart, and three planes between those that are kept
-        alone = get_threads() == 1 or any(L.turn or L.lift for L in layouts) or planes * max(L.rows * L.nx for L in layouts) < 2 * CELLS
-        slabs, each = (1, planes) if alone or planes < 2 * least else slabs_of(planes, least, get_threads())
+        # so that the gaps lie apart, and three planes between those that are kept
+        least = 2 * (max(SLAB_PLANES, 2 * most + 5) // 2 + 1)
+        alone = (
+            get_threads() == 1
+            or any(L.turn or L.lift for L in layouts)
+            or planes * max(L.rows * L.nx for L in layouts) < 2 * CELLS
+        )
+        slabs, each = (
+            (1, planes) if alone or planes < 2 * least else slabs_of(planes, least, get_threads())
+        )
         members = {}
         if slabs > 1:
             apart = max([lag for b, lag in given if b.form.declared.ring], default=0) + 1

@@ -19,7 +19,9 @@ from warp_lcp.simulation import Cells, Points, Simulation, Surface
 EVERYTHING = ("vtu", "xdmf", "vtk", "gmsh")  # formats that hold all parts with their fields
 
 
-def check_scene(path_or_name: str, overrides: Sequence[str] = ()) -> tuple[Scene, list[tuple[str, str]]]:
+def check_scene(
+    path_or_name: str, overrides: Sequence[str] = ()
+) -> tuple[Scene, list[tuple[str, str]]]:
     """Return a scene, with its shapes built once, and a summary of its run.
 
     The summary has pairs of a word and a line.
@@ -43,21 +45,29 @@ def check_memory(scene: Scene, device: str, *, share: float = 1.0) -> None:
 
     Args:
         scene: what would run.
-        device: a Warp device's name; on a GPU, the making of the particles, on the host, does not count.
+        device: a Warp device's name; on a GPU, the making of the particles, on the host, does not
+            count.
         share: of the run that is on this device.
 
     Raises:
         SceneError: naming both amounts.
     """
-    needed = int(share * (scene.memory_estimate() if device == "cpu" else sum(scene.memory_parts().values())))
+    needed = int(
+        share * (scene.memory_estimate() if device == "cpu" else sum(scene.memory_parts().values()))
+    )
     free = free_memory(device) if needed else None
     if free is not None and needed > free:
-        largest = ", ".join(sorted(scene.memory_parts(), key=scene.memory_parts().__getitem__, reverse=True)[:2])
+        largest = ", ".join(
+            sorted(scene.memory_parts(), key=scene.memory_parts().__getitem__, reverse=True)[:2]
+        )
         message = (
-            f"the run needs about {needed / 2**20:,.0f} MB of memory, most of it for {largest}, and {free / 2**20:,.0f} MB are free on "
+            f"the run needs about {needed / 2**20:,.0f} MB of memory, most of it for {largest}, "
+            f"and {free / 2**20:,.0f} MB are free on "
             f"{device}; lower domain.resolution, or run it anyway with --force-memory"
         )
-        raise SceneError(scene.scene.name, [KeyFault("domain.resolution", message, str(scene.domain.resolution))])
+        raise SceneError(
+            scene.scene.name, [KeyFault("domain.resolution", message, str(scene.domain.resolution))]
+        )
 
 
 def check_ranks(scene: Scene) -> None:
@@ -69,11 +79,27 @@ def check_ranks(scene: Scene) -> None:
     name = scene.scene.simulator
     problems = []
     if not runs_on_ranks(simulators()[name]):
-        problems.append(KeyFault("scene.simulator", "runs on one process only; leave out --engine petsc", written(name)))
+        problems.append(
+            KeyFault(
+                "scene.simulator",
+                "runs on one process only; leave out --engine petsc",
+                written(name),
+            )
+        )
     if scene.output.format != "vtu":
-        problems.append(KeyFault("output.format", "--engine petsc writes only .vtu pieces", written(scene.output.format)))
+        problems.append(
+            KeyFault(
+                "output.format",
+                "--engine petsc writes only .vtu pieces",
+                written(scene.output.format),
+            )
+        )
     if scene.output.surface_ply:
-        problems.append(KeyFault("output.surface_ply", "--engine petsc writes surfaces only as .vtu pieces", "true"))
+        problems.append(
+            KeyFault(
+                "output.surface_ply", "--engine petsc writes surfaces only as .vtu pieces", "true"
+            )
+        )
     if problems:
         raise SceneError(scene.scene.name, problems)
 
@@ -92,7 +118,14 @@ def check_output(scene: Scene) -> list[str]:
     if output.format == "ply" and output.surface_ply:
         raise SceneError(
             scene.scene.name,
-            [KeyFault("output.surface_ply", 'is redundant: output.format = "ply" writes surfaces as PLY, too; leave one out', "true")],
+            [
+                KeyFault(
+                    "output.surface_ply",
+                    'is redundant: output.format = "ply" writes surfaces as PLY, too; leave one '
+                    "out",
+                    "true",
+                )
+            ],
         )
     has_bodies, cells = any(solid.is_body for solid in scene.solid), output.grid_format == "vtu"
     kinds: dict[str, tuple[bool, type, int]] = {
@@ -101,7 +134,11 @@ def check_output(scene: Scene) -> list[str]:
         "surface": (output.surface, Surface, scene.dimension),
         "the surfaces of bodies": (has_bodies, Surface, scene.dimension),
     }
-    found = {name: holds(output.format, kind, dimension) for name, (wanted, kind, dimension) in kinds.items() if wanted}
+    found = {
+        name: holds(output.format, kind, dimension)
+        for name, (wanted, kind, dimension) in kinds.items()
+        if wanted
+    }
     refused = {name: held.why for name, held in found.items() if held.dress is None}
     if refused:
         what = f"cannot store {' and '.join(refused)}"
@@ -112,12 +149,21 @@ def check_output(scene: Scene) -> list[str]:
             scene.scene.name,
             [
                 KeyFault(
-                    "output.format", f"{what}{why}; " + ", ".join([*off, f"or choose {others}, which hold all"]), written(output.format)
+                    "output.format",
+                    f"{what}{why}; " + ", ".join([*off, f"or choose {others}, which hold all"]),
+                    written(output.format),
                 )
             ],
         )
     bare = [name for name, held in found.items() if held.dress is Dress.BARE]
-    return [f'output.format = "{output.format}" writes the geometry of {" and ".join(bare)}, without fields'] if bare else []
+    return (
+        [
+            f'output.format = "{output.format}" writes the geometry of {" and ".join(bare)}, '
+            "without fields"
+        ]
+        if bare
+        else []
+    )
 
 
 def start(scene: Scene, device: str, ranks: Ranks | None = None) -> Simulation:
@@ -135,7 +181,9 @@ def start(scene: Scene, device: str, ranks: Ranks | None = None) -> Simulation:
     """
     simulator = simulators()[scene.scene.simulator]
     try:
-        shared: dict[str, Any] = {"ranks": ranks} if ranks is not None and runs_on_ranks(simulator) else {}
+        shared: dict[str, Any] = (
+            {"ranks": ranks} if ranks is not None and runs_on_ranks(simulator) else {}
+        )
         return simulator.create(scene, device=device, folder=Path.cwd(), **shared)
     except ValueError as error:
         check_shapes(scene, scene.scene.name)  # whose message names the shape

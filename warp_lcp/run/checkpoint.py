@@ -21,10 +21,12 @@ from warp_lcp.frames.pieces import in_ranks, rank_folder
 
 FORMAT = 2
 CHECKPOINT_FILE = re.compile(r"step_(?P<step>[0-9]{6,})\.npz")
-REFUSED_FILE = re.compile(r"refused_[0-9]{6,}\.npz")  # set aside when a run continued from an earlier one
+# set aside when a run continued from an earlier one
+REFUSED_FILE = re.compile(r"refused_[0-9]{6,}\.npz")
 STATE = "state/"
 META = "meta"
-PIECES = "pieces_of_ranks"  # the only array of a checkpoint whose state is in the files of ranks: a checksum of each
+# the only array of a checkpoint whose state is in the files of ranks: a checksum of each
+PIECES = "pieces_of_ranks"
 
 
 class CheckpointError(ValueError):
@@ -63,7 +65,9 @@ class StoredPiece(Mapping[str, np.ndarray]):
     def __init__(self, path: Path) -> None:
         self.path = path
         with Archive(path) as archive:
-            self._names = [name.removeprefix(STATE) for name in archive.headers if name.startswith(STATE)]
+            self._names = [
+                name.removeprefix(STATE) for name in archive.headers if name.startswith(STATE)
+            ]
 
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self._names:
@@ -83,22 +87,37 @@ class StoredPiece(Mapping[str, np.ndarray]):
 class CheckpointFolder:
     """The checkpoints of one run, `step_<number>.npz`.
 
-    Those of a run on several ranks have their states in pieces, `rank_0003/step_<number>.npz`; `step_<number>.npz` has their checksums.
+    Those of a run on several ranks have their states in pieces, `rank_0003/step_<number>.npz`;
+    `step_<number>.npz` has their checksums.
 
     Args:
         folder: made when the first checkpoint is written.
         fingerprint: tells the run's scene from others, whatever may change when it goes on.
         keys: of the scene, with their values, written with each checkpoint.
-        collective: of the ranks that share the run, whose checkpoints are in pieces; `write`, `complete` and `prune` are collective then.
+        collective: of the ranks that share the run, whose checkpoints are in pieces; `write`,
+            `complete` and `prune` are collective then.
 
     Attributes:
-        spared: steps whose checkpoints `prune` leaves, as something that is missing can be made again from them.
+        spared: steps whose checkpoints `prune` leaves, as something that is missing can be made
+            again from them.
     """
 
-    def __init__(self, folder: Path, fingerprint: str, keys: Mapping[str, Any] | None = None, collective: Collective | None = None) -> None:
-        self.folder, self.collective, self._in_pieces = folder, collective or Collective.of_one(), collective is not None
-        self._refused: dict[int, str] = {}  # why the pieces of a step cannot be used, as its ranks have found
-        self._continued: int | None = None  # the step that ranks go on from, whose pieces are not to be replaced
+    def __init__(
+        self,
+        folder: Path,
+        fingerprint: str,
+        keys: Mapping[str, Any] | None = None,
+        collective: Collective | None = None,
+    ) -> None:
+        self.folder, self.collective, self._in_pieces = (
+            folder,
+            collective or Collective.of_one(),
+            collective is not None,
+        )
+        # why the pieces of a step cannot be used, as its ranks have found
+        self._refused: dict[int, str] = {}
+        # the step that ranks go on from, whose pieces are not to be replaced
+        self._continued: int | None = None
         self.fingerprint = fingerprint
         self.keys = dict(keys or {})
         self.spared: set[int] = set()
@@ -110,7 +129,14 @@ class CheckpointFolder:
     def steps(self) -> list[int]:
         """Return the steps that there are files of, newest first."""
         files = self.folder.iterdir() if self.folder.is_dir() else ()
-        return sorted((int(match["step"]) for file in files if (match := CHECKPOINT_FILE.fullmatch(file.name))), reverse=True)
+        return sorted(
+            (
+                int(match["step"])
+                for file in files
+                if (match := CHECKPOINT_FILE.fullmatch(file.name))
+            ),
+            reverse=True,
+        )
 
     def write(self, checkpoint: Checkpoint) -> Path:
         """Write a checkpoint atomically.
@@ -134,13 +160,17 @@ class CheckpointFolder:
         checksums = self.collective.exchange(checkpoint.checksum)
         with self.collective.led():
             if self.collective.ranks.is_root:
-                self._write(Checkpoint(checkpoint.step, checkpoint.time, {PIECES: np.array(checksums)}))
+                self._write(
+                    Checkpoint(checkpoint.step, checkpoint.time, {PIECES: np.array(checksums)})
+                )
         return file
 
     def _write(self, checkpoint: Checkpoint) -> Path:
         pickled = [name for name, array in checkpoint.state.items() if array.dtype.hasobject]
         if pickled:
-            raise ValueError(f"these arrays hold Python objects, which would need a pickle: {', '.join(pickled)}")
+            raise ValueError(
+                f"these arrays hold Python objects, which would need a pickle: {', '.join(pickled)}"
+            )
         make_folder(self.folder, within=self.folder.parent)
         meta = {
             "format": FORMAT,
@@ -184,28 +214,42 @@ class CheckpointFolder:
         for step, piece in self._all_pieces():
             if step > after:
                 piece.replace(piece.with_name(f"refused_{step:06d}.npz"))
-        return [self.path(step).replace(self.folder / f"refused_{step:06d}.npz") for step in self.steps() if step > after]
+        return [
+            self.path(step).replace(self.folder / f"refused_{step:06d}.npz")
+            for step in self.steps()
+            if step > after
+        ]
 
     def read(self, step: int) -> Checkpoint:
         """Read and verify a checkpoint.
 
         Raises:
-            CheckpointError: the file is cut short or damaged, of another version or of another scene.
+            CheckpointError: the file is cut short or damaged, of another version or of another
+                scene.
         """
         path = self.path(step)
         try:
             with Archive(path) as archive:
                 meta = _meta(archive)
                 if meta["format"] != FORMAT:
-                    raise CheckpointError(f"{path}: written in format {meta['format']!r}, this version reads format {FORMAT}")
+                    raise CheckpointError(
+                        f"{path}: written in format {meta['format']!r}, this version reads format "
+                        f"{FORMAT}"
+                    )
                 if meta["scene"] != self.fingerprint:
                     raise CheckpointError(f"{path}: belongs to another scene")
-                foreign = [name for name in archive.headers if name != META and not name.startswith(STATE)]
+                foreign = [
+                    name for name in archive.headers if name != META and not name.startswith(STATE)
+                ]
                 if foreign:
-                    raise CheckpointError(f"{path}: holds unexpected arrays: {', '.join(map(repr, foreign))}")
+                    raise CheckpointError(
+                        f"{path}: holds unexpected arrays: {', '.join(map(repr, foreign))}"
+                    )
                 arrays = archive.read([name for name in archive.headers if name != META])
         except ArchiveError as error:
-            raise CheckpointError(f"{path}: cut short, damaged or not a checkpoint ({error})") from error
+            raise CheckpointError(
+                f"{path}: cut short, damaged or not a checkpoint ({error})"
+            ) from error
         state = {name.removeprefix(STATE): array for name, array in arrays.items()}
         checkpoint = Checkpoint(step, float(meta["time"]), state, meta["keys"])
         if meta["checksum"] != checkpoint.checksum or np.ndim(state.get(PIECES, [])) != 1:
@@ -261,7 +305,10 @@ class CheckpointFolder:
         Raises:
             OSError: a file cannot be read.
         """
-        return [StoredPiece(self.of_rank(rank).path(checkpoint.step)) for rank in range(len(checkpoint.state[PIECES]))]
+        return [
+            StoredPiece(self.of_rank(rank).path(checkpoint.step))
+            for rank in range(len(checkpoint.state[PIECES]))
+        ]
 
     def of_rank(self, rank: int) -> CheckpointFolder:
         """Return the folder of a rank's pieces."""
@@ -269,7 +316,11 @@ class CheckpointFolder:
 
     def _all_pieces(self) -> list[tuple[int, Path]]:
         """Return the pieces of all ranks with their steps."""
-        matches = [(CHECKPOINT_FILE.fullmatch(file.name), file) for file in in_ranks(self.folder) if file.parent != self.folder]
+        matches = [
+            (CHECKPOINT_FILE.fullmatch(file.name), file)
+            for file in in_ranks(self.folder)
+            if file.parent != self.folder
+        ]
         return [(int(match["step"]), file) for match, file in matches if match]
 
     def newest(self) -> tuple[Checkpoint | None, list[str]]:

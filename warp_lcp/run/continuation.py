@@ -17,7 +17,8 @@ from warp_lcp.scene.table import KeyFault, SceneError, written
 
 RESOLUTION = "domain.resolution"
 MAY_CHANGE = (
-    "scene.name, scene.description, time.duration, time.cfl, time.dt_max, time.dt_min, [solver], [output], [camera], domain.follow and "
+    "scene.name, scene.description, time.duration, time.cfl, time.dt_max, time.dt_min, [solver], "
+    "[output], [camera], domain.follow and "
     "domain.resolution"
 )
 
@@ -32,7 +33,10 @@ class Change(Enum):
 
 
 RULES = (
-    (re.compile(r"scene\.(name|description)|time\.duration|(output|camera)\..*"), Change.SAME_STEPS),
+    (
+        re.compile(r"scene\.(name|description)|time\.duration|(output|camera)\..*"),
+        Change.SAME_STEPS,
+    ),
     (re.compile(r"solver\..*|time\.(cfl|dt_max|dt_min)|domain\.follow"), Change.OTHER_STEPS),
     (re.compile(re.escape(RESOLUTION)), Change.RESAMPLED),
 )
@@ -56,9 +60,14 @@ def mesh_digests(scene: Scene) -> dict[str, str]:
             continue
         try:
             with open(Path(value), "rb") as file:
-                digests[key] = hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
+                digests[key] = hashlib.file_digest(
+                    file, lambda: hashlib.blake2b(digest_size=16)
+                ).hexdigest()
         except OSError as error:
-            raise SceneError(scene.scene.name, [KeyFault(key, f"cannot be read: {error.strerror}", written(value))]) from error
+            raise SceneError(
+                scene.scene.name,
+                [KeyFault(key, f"cannot be read: {error.strerror}", written(value))],
+            ) from error
     return digests
 
 
@@ -67,10 +76,15 @@ def fingerprint(scene: Scene, digests: Mapping[str, str] | None = None) -> str:
 
     Args:
         scene: the scene.
-        digests: of its mesh files, which count by what is in them and not by where they are; None: read them.
+        digests: of its mesh files, which count by what is in them and not by where they are; None:
+            read them.
     """
     files = mesh_digests(scene) if digests is None else digests
-    fixed = {key: files.get(key, value) for key, value in keys(scene).items() if change_of(key) is Change.REFUSED}
+    fixed = {
+        key: files.get(key, value)
+        for key, value in keys(scene).items()
+        if change_of(key) is Change.REFUSED
+    }
     return hashlib.blake2b(json.dumps(fixed, sort_keys=True).encode(), digest_size=16).hexdigest()
 
 

@@ -55,7 +55,9 @@ def choose_device(name: str | None) -> str:
         return next(iter(there))
     alias = "cuda:0" if name == "cuda" else name
     if alias not in there:
-        raise DeviceError(f"--device {name}: there is no such device; choose from {', '.join(there)}")
+        raise DeviceError(
+            f"--device {name}: there is no such device; choose from {', '.join(there)}"
+        )
     return alias
 
 
@@ -76,7 +78,10 @@ def cuda_driver() -> str:
 
 def _describe(device: wp.Device) -> str:
     if device.is_cuda:
-        return f"{device.name}, {device.total_memory / 2**30:.1f} GiB, compute capability {device.arch / 10:.1f}"
+        return (
+            f"{device.name}, {device.total_memory / 2**30:.1f} GiB, compute capability "
+            f"{device.arch / 10:.1f}"
+        )
     return str(device.name)
 
 

@@ -91,8 +91,9 @@ class Frame:
 
         Points [m], cells, and the fields as point data or cell data.
 
-        The parts are `particles`, `grid` (its cells are quadrilaterals or hexahedra), and `surface`, `bodies`, `level_set` and `density`
-        where the scene has them. Of volumes the cells are those within the level set's band, and where the density is not 0.
+        The parts are `particles`, `grid` (its cells are quadrilaterals or hexahedra), and
+        `surface`, `bodies`, `level_set` and `density` where the scene has them. Of volumes the
+        cells are those within the level set's band, and where the density is not 0.
         """
         return {part.name: to_meshio(part) for part in self.parts()}
 
@@ -109,9 +110,10 @@ class Run:
 
     `for frame in run` takes the steps from one frame to the next.
 
-    The steps are those of `warp-lcp run`, and with a `folder` so are log, frames and checkpoints, bit for bit. Once the loop is left, with
-    `break`, by an error in it or by Ctrl-C, the run is stopped with a checkpoint, from which `Run.resume` continues. Ctrl-C
-    waits for the end of the current step and is then raised as usual; a second one does not wait.
+    The steps are those of `warp-lcp run`, and with a `folder` so are log, frames and checkpoints,
+    bit for bit. Once the loop is left, with `break`, by an error in it or by Ctrl-C, the run is
+    stopped with a checkpoint, from which `Run.resume` continues. Ctrl-C waits for the end of the
+    current step and is then raised as usual; a second one does not wait.
 
     Args:
         scene: a scene file, the name of a built-in scene, its tables as a dict, or a Scene.
@@ -120,8 +122,10 @@ class Run:
         frames: stop after this frame; default: the last one of the scene.
         force: delete the run that is in the folder.
         on_step: called after each step, as by `on_step`.
-        overrides: keys of the scene with other values, such as {"domain.resolution": 96, "liquid.0.max": [1, 1]}.
-        keys: the same, without the name of the table, for keys that only one table has: `resolution=96`.
+        overrides: keys of the scene with other values, such as {"domain.resolution": 96,
+            "liquid.0.max": [1, 1]}.
+        keys: the same, without the name of the table, for keys that only one table has:
+            `resolution=96`.
 
     Attributes:
         scene: the scene.
@@ -147,7 +151,13 @@ class Run:
     ) -> None:
         """Load the scene; nothing is built and nothing written before the first frame is asked for."""
         given = given_scene(scene, _overrides(scene, overrides, keys))
-        self._set_up(given, RunRequest(scene=given.scene, out=_folder(folder), force=force), device, frames, on_step)
+        self._set_up(
+            given,
+            RunRequest(scene=given.scene, out=_folder(folder), force=force),
+            device,
+            frames,
+            on_step,
+        )
 
     @classmethod
     def resume(
@@ -173,19 +183,32 @@ class Run:
         if path is None:
             raise RunError("folder: must be the folder of a run, not None")
         scene = path / "scene.toml"
-        given = scene_to_resume(path, None, _overrides(scene, overrides, keys) if overrides or keys else ())
-        run._set_up(given, RunRequest(scene=given.scene, out=path, resume=True), device, frames, on_step)
+        given = scene_to_resume(
+            path, None, _overrides(scene, overrides, keys) if overrides or keys else ()
+        )
+        run._set_up(
+            given, RunRequest(scene=given.scene, out=path, resume=True), device, frames, on_step
+        )
         return run
 
     def _set_up(
-        self, given: GivenScene, request: RunRequest, device: str | None, frames: int | None, on_step: Callable[[Run], object] | None
+        self,
+        given: GivenScene,
+        request: RunRequest,
+        device: str | None,
+        frames: int | None,
+        on_step: Callable[[Run], object] | None,
     ) -> None:
-        if frames is not None and (not isinstance(frames, int) or isinstance(frames, bool) or frames < 0):
+        if frames is not None and (
+            not isinstance(frames, int) or isinstance(frames, bool) or frames < 0
+        ):
             raise RunError(f"frames = {frames!r}: must be a whole number of at least 0, or None")
         self.scene: Scene = given.scene
         self.row: Mapping[str, Value] = {}
         self.notes: list[str] = []
-        self._request = replace(request, device=choose_device(device), overrides=given.overrides, last_frame=frames)
+        self._request = replace(
+            request, device=choose_device(device), overrides=given.overrides, last_frame=frames
+        )
         self._callbacks: list[Callable[[Run], object]] = []
         self._stopped, self._used, self._loop, self._index = "", False, None, -1
         self.record: RunRecord | None = None
@@ -200,8 +223,9 @@ class Run:
         It is called before the frame and the checkpoint of that time are written. It may be used as
         a decorator.
 
-        It may read `run.row`, `run.time` and `run.simulation`, `push` a body, change `gravity`, `add` material and `stop` the run. An error
-        that it raises ends the run with a checkpoint of the step; `Run.resume` continues, first with the frame if the step ends one.
+        It may read `run.row`, `run.time` and `run.simulation`, `push` a body, change `gravity`,
+        `add` material and `stop` the run. An error that it raises ends the run with a checkpoint of
+        the step; `Run.resume` continues, first with the frame if the step ends one.
 
         Raises:
             RunError: it cannot be called.
@@ -221,10 +245,15 @@ class Run:
             KeyboardInterrupt: Ctrl-C was pressed; the run has been stopped, with a checkpoint.
         """
         if self._used:
-            raise RunError("this run was iterated already; use Run.resume(folder) to continue, or a new Run to start again")
+            raise RunError(
+                "this run was iterated already; use Run.resume(folder) to continue, or a new Run "
+                "to start again"
+            )
         self._used = True
         interruption = Interruption(self.notes.append, signals=[signal.SIGINT])
-        running = running_scene(self._request, observer=_Ears(self), stop=lambda: interruption() or self._stopped)
+        running = running_scene(
+            self._request, observer=_Ears(self), stop=lambda: interruption() or self._stopped
+        )
         try:
             self._loop = next(running)
             self.record = self._loop.record
@@ -242,7 +271,8 @@ class Run:
         is_main = threading.current_thread() is threading.main_thread()
         with interruption if is_main else nullcontext():
             goes_on = next(running, None) is not None
-            while goes_on and interruption.name:  # the step ended a frame, too; the loop asks whether to stop behind that
+            # the step ended a frame, too; the loop asks whether to stop behind that
+            while goes_on and interruption.name:
                 goes_on = next(running, None) is not None
             return goes_on
 
@@ -279,7 +309,8 @@ class Run:
 
         Set it with as many numbers as the scene has dimensions.
 
-        Limits that the pressure of liquids derives from gravity are still computed from the scene's gravity.
+        Limits that the pressure of liquids derives from gravity are still computed from the scene's
+        gravity.
         """
         return _of_particles(self.simulation).gravity.copy()
 
@@ -287,7 +318,9 @@ class Run:
     def gravity(self, value: Sequence[float]) -> None:
         _of_particles(self.simulation).gravity[:] = self._vector("gravity", value)
 
-    def push(self, body: int, impulse: Sequence[float], *, at: Sequence[float] | None = None) -> None:
+    def push(
+        self, body: int, impulse: Sequence[float], *, at: Sequence[float] | None = None
+    ) -> None:
         """Apply an impulse to a rigid body.
 
         Args:
@@ -301,7 +334,14 @@ class Run:
         bodies = _of_particles(self.simulation).bodies
         there = bodies.bodies if bodies is not None else []
         if not isinstance(body, (int, np.integer)) or not 0 <= body < len(there):
-            raise RunError(f"body = {body!r}: " + (f"must be from 0 to {len(there) - 1}" if there else "the scene has no rigid bodies"))
+            raise RunError(
+                f"body = {body!r}: "
+                + (
+                    f"must be from 0 to {len(there) - 1}"
+                    if there
+                    else "the scene has no rigid bodies"
+                )
+            )
         pushed, given = there[body], self._vector("impulse", impulse)
         arm = np.zeros(3) if at is None else self._vector("at", at) - pushed.position
         pushed.push(np.concatenate([given, np.cross(arm, given)]))
@@ -312,7 +352,8 @@ class Run:
         Return the number of new particles.
 
         Args:
-            shape: the keys of an entry of the scene's `[[liquid]]` or `[[sand]]`, such as shape="box", min=[0, 1], max=[1, 2].
+            shape: the keys of an entry of the scene's `[[liquid]]` or `[[sand]]`, such as
+                shape="box", min=[0, 1], max=[1, 2].
 
         Raises:
             SceneError: a key is wrong.
@@ -324,7 +365,9 @@ class Run:
         data[table] = [*data.get(table, []), shape]
         entries = load_scene(data).materials()[1]
         try:
-            return pour(simulation, entries[-1], f"{table}[{len(entries) - 1}] ({entries[-1].shape})")
+            return pour(
+                simulation, entries[-1], f"{table}[{len(entries) - 1}] ({entries[-1].shape})"
+            )
         except ValueError as error:
             raise RunError(f"add: {error}") from error
 
@@ -373,7 +416,9 @@ class _Ears:
 
 def _of_particles(simulation: Simulation) -> ParticleSimulation:
     if not isinstance(simulation, ParticleSimulation):
-        raise RunError(f"{type(simulation).__name__} has no particles; use its `state()` or `frame()`")
+        raise RunError(
+            f"{type(simulation).__name__} has no particles; use its `state()` or `frame()`"
+        )
     return simulation
 
 
@@ -384,7 +429,9 @@ def _folder(folder: str | PathLike[str] | None) -> Path | None:
         raise RunError(f"folder = {folder!r}: must be a path, or None for none") from error
 
 
-def _overrides(scene: SceneSource, overrides: Mapping[str, Any] | None, keys: Mapping[str, Any]) -> list[str]:
+def _overrides(
+    scene: SceneSource, overrides: Mapping[str, Any] | None, keys: Mapping[str, Any]
+) -> list[str]:
     """Return overrides as `load_scene` has them, those of `keys` with their tables found."""
     tables = single_tables(scene) if keys else {}
     given = dict(overrides or {})
@@ -393,7 +440,9 @@ def _overrides(scene: SceneSource, overrides: Mapping[str, Any] | None, keys: Ma
         if len(owners) != 1:
             known = [name for names in tables.values() for name in names]
             which = (
-                f"is a key of {', '.join(owners)}: write TABLE.{key} in `overrides`" if owners else f"no such key; {nearest(key, known)}"
+                f"is a key of {', '.join(owners)}: write TABLE.{key} in `overrides`"
+                if owners
+                else f"no such key; {nearest(key, known)}"
             )
             raise SceneError("Run", [KeyFault(key, which)])
         given[f"{owners[0]}.{key}"] = value
@@ -402,8 +451,17 @@ def _overrides(scene: SceneSource, overrides: Mapping[str, Any] | None, keys: Ma
 
 def _written(key: str, value: Any) -> str:
     """Return a value as TOML."""
-    plain = value.tolist() if isinstance(value, (np.ndarray, np.generic)) else str(value) if isinstance(value, Path) else value
+    plain = (
+        value.tolist()
+        if isinstance(value, (np.ndarray, np.generic))
+        else str(value)
+        if isinstance(value, Path)
+        else value
+    )
     try:
         return json.dumps(plain, ensure_ascii=False)
     except TypeError as error:
-        raise RunError(f"{key}: must be a number, a string, true, false or a list of them, not {type(value).__name__}") from error
+        raise RunError(
+            f"{key}: must be a number, a string, true, false or a list of them, not "
+            f"{type(value).__name__}"
+        ) from error

@@ -19,12 +19,33 @@ from pydantic import TypeAdapter
 
 from warp_lcp.distributed.collective import Collective, on_root
 from warp_lcp.distributed.watchdog import POST
-from warp_lcp.files.atomic import SPARE, SUFFIX, TEMPORARY, make_folder, reserve, sync_folder, write_text
+from warp_lcp.files.atomic import (
+    SPARE,
+    SUFFIX,
+    TEMPORARY,
+    make_folder,
+    reserve,
+    sync_folder,
+    write_text,
+)
 from warp_lcp.files.claims import one_line
 from warp_lcp.frames.frames import FRAME_FILE, FrameFolder, FrameWriter
 from warp_lcp.frames.pieces import in_ranks, remove_empty_ranks
-from warp_lcp.run.checkpoint import CHECKPOINT_FILE, PIECES, REFUSED_FILE, Checkpoint, CheckpointFolder
-from warp_lcp.run.continuation import MAY_CHANGE, RESOLUTION, Change, differences, fingerprint, mesh_digests
+from warp_lcp.run.checkpoint import (
+    CHECKPOINT_FILE,
+    PIECES,
+    REFUSED_FILE,
+    Checkpoint,
+    CheckpointFolder,
+)
+from warp_lcp.run.continuation import (
+    MAY_CHANGE,
+    RESOLUTION,
+    Change,
+    differences,
+    fingerprint,
+    mesh_digests,
+)
 from warp_lcp.run.devices import versions
 from warp_lcp.run.folder_lock import LOCK, FolderBusyError, locked
 from warp_lcp.run.gaps import gaps
@@ -41,8 +62,11 @@ RECORD = "run.json"
 SCENE = "scene.toml"
 ROUNDING = 1e-9
 BEFORE = "during the first step"
-LAST_WORDS = 8192  # bytes that run.json may grow by until the run ends, with the reason and warnings
-OWN_FILES = re.compile(rf"scene\.toml|run\.json(?:{re.escape(SPARE)})?|profile\.json|(?:log|probes|forces)\.csv|[a-z][a-z_]*\.pvd|{POST}")
+# bytes that run.json may grow by until the run ends, with the reason and warnings
+LAST_WORDS = 8192
+OWN_FILES = re.compile(
+    rf"scene\.toml|run\.json(?:{re.escape(SPARE)})?|profile\.json|(?:log|probes|forces)\.csv|[a-z][a-z_]*\.pvd|{POST}"
+)
 IMAGE_FILE = re.compile(r"(?:(?:frame|slice)_\d{6,}|sheet)\.png")
 CHECKPOINTS = "checkpoints"
 STORED_STATE = re.compile(f"{CHECKPOINT_FILE.pattern}|{REFUSED_FILE.pattern}")
@@ -64,11 +88,14 @@ class RunRecord:
         steps: taken since the scene's start.
         time: reached [s].
         frames: the number of the newest frame.
-        resumed_from_step: the checkpoint that this part of the run continued, if it did; 0 if there was none and it began anew.
+        resumed_from_step: the checkpoint that this part of the run continued, if it did; 0 if there
+            was none and it began anew.
         changed: the scene's keys that have other values than in the part before, with both.
-        resampled_from_resolution: domain.resolution of the checkpoint, if the state was brought to another grid.
+        resampled_from_resolution: domain.resolution of the checkpoint, if the state was brought to
+            another grid.
         mesh_files: a digest of what is in each mesh file, by its key.
-        overrides: what `--set` was given for this run, with the values of the scene's file, see `warp_lcp.run.given_scene`.
+        overrides: what `--set` was given for this run, with the values of the scene's file, see
+            `warp_lcp.run.given_scene`.
         seconds: that this part of the run took.
         warnings: what the user should know about the results.
         versions: of the software.
@@ -101,7 +128,8 @@ class Continuation:
     Args:
         checkpoint: to continue from; None: nothing was computed yet.
         remarks: what the user should know, such as newer checkpoints that cannot be used.
-        changed: a line for each key of the scene that has another value than when the checkpoint was written.
+        changed: a line for each key of the scene that has another value than when the checkpoint
+            was written.
         resampled_from: domain.resolution of the checkpoint, if the scene has another one.
     """
 
@@ -114,8 +142,8 @@ class Continuation:
 class RunFolder:
     """scene.toml, run.json, log.csv, frames and checkpoints of one run.
 
-    Of several ranks the root rank owns the folder and each adds its pieces; methods are collective, but for `write_record`, and raise on
-    all ranks what fails on any.
+    Of several ranks the root rank owns the folder and each adds its pieces; methods are collective,
+    but for `write_record`, and raise on all ranks what fails on any.
 
     Args:
         path: of the folder, which all ranks see.
@@ -135,9 +163,13 @@ class RunFolder:
         with self.collective.together():
             self.mesh_files = mesh_digests(scene)
         output = scene.output
-        whole = FrameFolder(path, output.grid_format, surface_ply=output.surface_ply, frame_format=output.format)
+        whole = FrameFolder(
+            path, output.grid_format, surface_ply=output.surface_ply, frame_format=output.format
+        )
         self.frames = RankFrames(whole, collective) if collective else whole
-        self.checkpoints = CheckpointFolder(path / CHECKPOINTS, fingerprint(scene, self.mesh_files), keys(scene), collective)
+        self.checkpoints = CheckpointFolder(
+            path / CHECKPOINTS, fingerprint(scene, self.mesh_files), keys(scene), collective
+        )
 
     @contextmanager
     def held(self, *, resume: bool) -> Iterator[list[str]]:
@@ -147,7 +179,8 @@ class RunFolder:
             resume: there must be a run.
 
         Raises:
-            OutputError: the folder cannot be made or written, another process runs there, or there is no run to resume.
+            OutputError: the folder cannot be made or written, another process runs there, or there
+                is no run to resume.
         """
         with ExitStack() as stack:
             yield self._lock(stack, resume) or []
@@ -165,7 +198,9 @@ class RunFolder:
         except FolderBusyError as error:
             raise OutputError(str(error)) from error
         except OSError as error:
-            raise OutputError(f"{error.filename or self.path}: cannot be written: {error.strerror}") from error
+            raise OutputError(
+                f"{error.filename or self.path}: cannot be written: {error.strerror}"
+            ) from error
 
     @on_root
     def check_new(self, *, force: bool) -> None:
@@ -181,16 +216,21 @@ class RunFolder:
             raise OutputError(f"{self.path}: is not a folder")
         _probe(self.path)
         own, foreign = self._contents()
-        if not foreign and all(path.name.startswith(f".{RECORD}") for path in own):  # nothing, or killed with its first files
+        # nothing, or killed with its first files
+        if not foreign and all(path.name.startswith(f".{RECORD}") for path in own):
             return
         if foreign or not holds_run(self.path):
-            shown = ", ".join(one_line(str(path.relative_to(self.path))) for path in [*foreign, *own][:3])
+            shown = ", ".join(
+                one_line(str(path.relative_to(self.path))) for path in [*foreign, *own][:3]
+            )
             raise OutputError(
-                f"{self.path}: holds files that do not belong to a run ({shown}), which --force does not delete; choose another folder"
+                f"{self.path}: holds files that do not belong to a run ({shown}), which --force "
+                "does not delete; choose another folder"
             )
         if not force:
             raise OutputError(
-                f"{self.path}: holds a run already; use --resume to continue it, --force to delete it, or --out for another folder"
+                f"{self.path}: holds a run already; use --resume to continue it, --force to delete "
+                "it, or --out for another folder"
             )
 
     def start(self, record: RunRecord) -> None:
@@ -206,13 +246,15 @@ class RunFolder:
     @on_root
     def _start(self, record: RunRecord) -> None:
         own, _ = self._contents()
-        own.sort(key=lambda file: file.parent.name != CHECKPOINTS)  # first, so that a half-deleted run is not continued
+        # first, so that a half-deleted run is not continued
+        own.sort(key=lambda file: file.parent.name != CHECKPOINTS)
         for file in own:
             if file.name != RECORD:  # replaced below: at every moment the folder is a run's
                 file.unlink()
         for name in OWN_FOLDERS:
             if (self.path / name).is_dir():
-                sync_folder(self.path / name)  # before there is a run that could take what was in it for its own
+                # before there is a run that could take what was in it for its own
+                sync_folder(self.path / name)
             remove_empty_ranks(self.path / name)
         self.write_record(record)
         write_text(self.path / SCENE, dump_scene(self.scene))
@@ -228,15 +270,23 @@ class RunFolder:
             if not self._shared:
                 return found
             whole: Mapping[str, np.ndarray] = {}
-            if found and found.checkpoint and PIECES not in found.checkpoint.state:  # too much for a message
-                whole, found = found.checkpoint.state, replace(found, checkpoint=replace(found.checkpoint, state={}))
+            # too much for a message
+            if found and found.checkpoint and PIECES not in found.checkpoint.state:
+                whole, found = (
+                    found.checkpoint.state,
+                    replace(found, checkpoint=replace(found.checkpoint, state={})),
+                )
             continued: Continuation = self.collective.share(found)
             checkpoint = continued.checkpoint
             if checkpoint is None or (checkpoint.state and self.checkpoints.complete(checkpoint)):
                 return continued
             if not checkpoint.state:
                 with self.collective.together():
-                    state = whole if self.collective.ranks.is_root else self.checkpoints.read(checkpoint.step).state
+                    state = (
+                        whole
+                        if self.collective.ranks.is_root
+                        else self.checkpoints.read(checkpoint.step).state
+                    )
                 return replace(continued, checkpoint=replace(checkpoint, state=state))
 
     @on_root
@@ -245,32 +295,65 @@ class RunFolder:
         self._check_same_scene()
         checkpoint, refused = self.checkpoints.newest()
         if checkpoint is None and not refused and not self._has_steps():
-            return Continuation(None, [f"{self.path}: the interrupted run had no checkpoint; it starts again"])
+            return Continuation(
+                None, [f"{self.path}: the interrupted run had no checkpoint; it starts again"]
+            )
         if checkpoint is None:
             reasons = refused or ["none was written"]
-            raise OutputError("\n  ".join([f"{self.path}: no checkpoint to resume from; --force starts again", *reasons]))
+            raise OutputError(
+                "\n  ".join(
+                    [f"{self.path}: no checkpoint to resume from; --force starts again", *reasons]
+                )
+            )
         end = self.scene.time.frame_time(self.scene.time.frame_count)
         if checkpoint.time > end * (1.0 + ROUNDING):
             raise OutputError(
-                f"{self.path}: time.duration = {self.scene.time.duration:g} s is less than the checkpoint's time, {checkpoint.time:.6g} s: "
+                f"{self.path}: time.duration = {self.scene.time.duration:g} s is less than the "
+                f"checkpoint's time, {checkpoint.time:.6g} s: "
                 "frames would be lost; choose a longer duration"
             )
-        lost = [name for name, found in ((RECORD, read_record(self.path)), (SCENE, recorded_keys(self.path / SCENE))) if not found]
-        remarks = [*refused, *self._other_versions(), *(f"{name}: was missing or damaged; rewritten" for name in lost)]
+        lost = [
+            name
+            for name, found in (
+                (RECORD, read_record(self.path)),
+                (SCENE, recorded_keys(self.path / SCENE)),
+            )
+            if not found
+        ]
+        remarks = [
+            *refused,
+            *self._other_versions(),
+            *(f"{name}: was missing or damaged; rewritten" for name in lost),
+        ]
         if RECORD in lost:
-            remarks.append("earlier --set values are unknown: pass them again, else those of the scene are used")
+            remarks.append(
+                "earlier --set values are unknown: pass them again, else those of the scene are "
+                "used"
+            )
         if refused:
-            remarks.append(f"continuing from step {checkpoint.step} instead; refused checkpoints stay as checkpoints/refused_*.npz")
+            remarks.append(
+                f"continuing from step {checkpoint.step} instead; refused checkpoints stay as "
+                "checkpoints/refused_*.npz"
+            )
         now = keys(self.scene)
         before = checkpoint.keys or now
         steps = differences(before, now, Change.OTHER_STEPS)
         if steps:
-            remarks.append(f"from step {checkpoint.step} on, steps differ from those of the original run: {'; '.join(steps)}")
+            remarks.append(
+                f"from step {checkpoint.step} on, steps differ from those of the original run: "
+                f"{'; '.join(steps)}"
+            )
         old = int(before.get(RESOLUTION, now[RESOLUTION]))
         changed = differences(before, now, Change.SAME_STEPS, Change.OTHER_STEPS, Change.RESAMPLED)
         return Continuation(checkpoint, remarks, changed, None if old == now[RESOLUTION] else old)
 
-    def gaps(self, tables: Mapping[str, tuple[str, ...]], step: int, times: list[float], frame: list[Part]) -> list[str]:
+    def gaps(
+        self,
+        tables: Mapping[str, tuple[str, ...]],
+        step: int,
+        times: list[float],
+        frame: list[Part],
+    ) -> list[str]:
         """Return a line for each gap in the files up to a step; see `warp_lcp.run.gaps`.
 
         Raises:
@@ -280,7 +363,13 @@ class RunFolder:
         return self._gaps(tables, step, times, frame) or []
 
     @on_root
-    def _gaps(self, tables: Mapping[str, tuple[str, ...]], step: int, times: list[float], frame: list[Part]) -> list[str]:
+    def _gaps(
+        self,
+        tables: Mapping[str, tuple[str, ...]],
+        step: int,
+        times: list[float],
+        frame: list[Part],
+    ) -> list[str]:
         whole = self.frames.whole if isinstance(self.frames, RankFrames) else self.frames
         logs = {self.log.with_stem(name): columns for name, columns in tables.items()}
         return gaps(logs, whole, self.checkpoints, step=step, times=times, frame=frame)
@@ -317,13 +406,21 @@ class RunFolder:
                 file.unlink()
         self.checkpoints.set_aside(step)
 
-    def open_log(self, columns: tuple[str, ...], *, after_step: int | None = None, table: str = "log") -> Log:
+    def open_log(
+        self, columns: tuple[str, ...], *, after_step: int | None = None, table: str = "log"
+    ) -> Log:
         """Begin the log or continue it, see `Log`; or another table."""
-        return Log(self.log.with_stem(table), columns, after_step=after_step, collective=self.collective)
+        return Log(
+            self.log.with_stem(table), columns, after_step=after_step, collective=self.collective
+        )
 
     def frame_writer(self, watch: Stopwatch) -> FrameWriter | RankFrameWriter:
         """Return the frame writer, which works while the simulation continues."""
-        return RankFrameWriter(self.frames, watch) if isinstance(self.frames, RankFrames) else FrameWriter(self.frames, watch)
+        return (
+            RankFrameWriter(self.frames, watch)
+            if isinstance(self.frames, RankFrames)
+            else FrameWriter(self.frames, watch)
+        )
 
     def write_record(self, record: RunRecord) -> None:
         """Write run.json.
@@ -332,7 +429,8 @@ class RunFolder:
         disk.
 
         Raises:
-            OSError: the disk is full before the run begins, or cannot be written at all; on the root rank.
+            OSError: the disk is full before the run begins, or cannot be written at all; on the
+                root rank.
         """
         if not self.collective.ranks.is_root:
             return
@@ -357,29 +455,50 @@ class RunFolder:
         free = shutil.disk_usage(self.path).free
         if free < needed:
             raise OutputError(
-                f"{self.path}: the run needs about {needed / 1e9:.3g} GB and {free / 1e9:.3g} GB are free; "
-                "make room, choose another --out, or write less (time.frames_per_second, output.particles, output.grid)"
+                f"{self.path}: the run needs about {needed / 1e9:.3g} GB and {free / 1e9:.3g} GB "
+                "are free; "
+                "make room, choose another --out, or write less (time.frames_per_second, "
+                "output.particles, output.grid)"
             )
 
     def _check_shared(self) -> None:
         """Refuse a folder that the root rank has begun to write and that others do not see."""
         with self.collective.together():
             if not (self.path / RECORD).is_file():
-                raise OutputError(f"{self.path}: is not the folder that rank 0 writes; choose one that all machines share")
+                raise OutputError(
+                    f"{self.path}: is not the folder that rank 0 writes; choose one that all "
+                    "machines share"
+                )
             if self.collective.watchdog:
                 self.collective.watchdog.post_in(self.path)
 
     def _check_run(self) -> None:
         if not holds_run(self.path):
             raise OutputError(f"{self.path}: there is no run to resume")
-        wrong = [self.path / name for name in OWN_FOLDERS if (self.path / name).exists() and not (self.path / name).is_dir()]
-        wrong += [path for path in (self.path / RECORD, self.path / SCENE, self.log) if path.is_dir()]
+        wrong = [
+            self.path / name
+            for name in OWN_FOLDERS
+            if (self.path / name).exists() and not (self.path / name).is_dir()
+        ]
+        wrong += [
+            path for path in (self.path / RECORD, self.path / SCENE, self.log) if path.is_dir()
+        ]
         if wrong:
-            kind = "is a folder, expected a file" if wrong[0].is_dir() else "is a file, expected a folder"
+            kind = (
+                "is a folder, expected a file"
+                if wrong[0].is_dir()
+                else "is a file, expected a folder"
+            )
             raise OutputError(f"{wrong[0]}: {kind}; move it away")
-        links = [path for path, pattern in _walk(self.path) if path.is_symlink() and _is_of_run(path, self.path, pattern)]
+        links = [
+            path
+            for path, pattern in _walk(self.path)
+            if path.is_symlink() and _is_of_run(path, self.path, pattern)
+        ]
         if links:
-            raise OutputError(f"{links[0]}: is a link: a run writes only into its own folder; move it away")
+            raise OutputError(
+                f"{links[0]}: is a link: a run writes only into its own folder; move it away"
+            )
 
     def _check_same_scene(self) -> None:
         """Refuse other values of keys that must not change, and mesh files that hold something else."""
@@ -392,7 +511,8 @@ class RunFolder:
                 before[key] = now[key]  # the same mesh in another place
             elif key in files and before.get(key) == now[key]:
                 raise OutputError(
-                    f"{self.path}: {key} = {now[key]!r}: the content of the file has changed since the run began; restore it, or "
+                    f"{self.path}: {key} = {now[key]!r}: the content of the file has changed since "
+                    "the run began; restore it, or "
                     "start again with --force"
                 )
         changes = differences(before, now, Change.REFUSED)
@@ -404,7 +524,10 @@ class RunFolder:
         """Return whether the log has a row, or a frame or the record tells of a step."""
         rows = self.log.read_bytes().count(b"\n") if self.log.is_file() else 0
         later = any(
-            match and int(match["index"]) for match in map(FRAME_FILE.fullmatch, (file.name for file in in_ranks(self.frames.frames)))
+            match and int(match["index"])
+            for match in map(
+                FRAME_FILE.fullmatch, (file.name for file in in_ranks(self.frames.frames))
+            )
         )
         return rows > 1 or later or bool(read_record(self.path).get("steps"))
 
@@ -412,22 +535,39 @@ class RunFolder:
         """Return a remark if the run began with other software, which need not give the same bits."""
         before, now = read_record(self.path).get("versions", {}), versions()
         now.pop("platform", None)  # its name tells the kernel, not the processor
-        other = [f"{name} {before[name]}, now {now[name]}" for name in sorted(before.keys() & now.keys()) if before[name] != now[name]]
-        return [f"written with other software ({'; '.join(other)}): results may not be bitwise identical"] if other else []
+        other = [
+            f"{name} {before[name]}, now {now[name]}"
+            for name in sorted(before.keys() & now.keys())
+            if before[name] != now[name]
+        ]
+        return (
+            [
+                f"written with other software ({'; '.join(other)}): results may not be bitwise "
+                "identical"
+            ]
+            if other
+            else []
+        )
 
     def _contents(self) -> tuple[list[Path], list[Path]]:
         """Return the files that a run makes, and everything else."""
         own: list[Path] = []
         foreign: list[Path] = []
         for path, pattern in _walk(self.path):
-            is_own = path.is_file() and not path.is_symlink() and pattern.fullmatch(_written_as(path.name))
+            is_own = (
+                path.is_file()
+                and not path.is_symlink()
+                and pattern.fullmatch(_written_as(path.name))
+            )
             (own if is_own else foreign).append(path)
         return own, foreign
 
 
 def holds_run(folder: Path) -> bool:
     """Return whether a folder holds a run: its record, or a checkpoint."""
-    return (folder / RECORD).is_file() or any(CHECKPOINT_FILE.fullmatch(file.name) for file in folder.glob(f"{CHECKPOINTS}/*"))
+    return (folder / RECORD).is_file() or any(
+        CHECKPOINT_FILE.fullmatch(file.name) for file in folder.glob(f"{CHECKPOINTS}/*")
+    )
 
 
 def mark_ended(folder: Path, status: Status, reason: str) -> None:
@@ -435,7 +575,11 @@ def mark_ended(folder: Path, status: Status, reason: str) -> None:
     with suppress(OSError):
         record = read_record(folder)
         if record.get("status") == "running":
-            write_text(folder / RECORD, json.dumps({**record, "status": status, "reason": reason}, indent=2) + "\n", spare=True)
+            write_text(
+                folder / RECORD,
+                json.dumps({**record, "status": status, "reason": reason}, indent=2) + "\n",
+                spare=True,
+            )
 
 
 def read_record(folder: Path) -> dict[str, Any]:
@@ -481,7 +625,11 @@ def _walk(folder: Path) -> Iterator[tuple[Path, re.Pattern[str]]]:
 
 def _is_of_run(path: Path, folder: Path, pattern: re.Pattern[str]) -> bool:
     """Return whether a run would write or read what lies in its folder: every file in the folders of its own, known names beside them."""
-    return path.parent != folder or path.name in OWN_FOLDERS or pattern.fullmatch(_written_as(path.name)) is not None
+    return (
+        path.parent != folder
+        or path.name in OWN_FOLDERS
+        or pattern.fullmatch(_written_as(path.name)) is not None
+    )
 
 
 def _written_as(name: str) -> str:

@@ -32,14 +32,15 @@ class FolderBusyError(RuntimeError):
 def locked(folder: Path) -> Iterator[list[str]]:
     """Hold a folder; others are refused until the block, or the process, ends.
 
-    The system's lock on the file run.lock counts, not the file: one that a killed process left is taken over. The file tells people
-    who holds the folder.
+    The system's lock on the file run.lock counts, not the file: one that a killed process left is
+    taken over. The file tells people who holds the folder.
 
     Args:
         folder: must exist.
 
     Yields:
-        Remarks: a lock that was taken over, or a file system without locks, where two runs are not kept apart.
+        Remarks: a lock that was taken over, or a file system without locks, where two runs are not
+        kept apart.
 
     Raises:
         FolderBusyError: another process holds it.
@@ -53,14 +54,21 @@ def locked(folder: Path) -> Iterator[list[str]]:
     try:
         left = os.read(descriptor, 4096)
         if left and not remarks:
-            remarks.append(f"{path}: left by {_describe(left)}, which did not end cleanly; taken over")
-        holder = {"pid": os.getpid(), "host": socket.gethostname(), "since": datetime.now().astimezone().isoformat(timespec="seconds")}
+            remarks.append(
+                f"{path}: left by {_describe(left)}, which did not end cleanly; taken over"
+            )
+        holder = {
+            "pid": os.getpid(),
+            "host": socket.gethostname(),
+            "since": datetime.now().astimezone().isoformat(timespec="seconds"),
+        }
         os.ftruncate(descriptor, 0)
         os.pwrite(descriptor, json.dumps(holder).encode(), 0)
         yield remarks
     finally:
         with suppress(OSError):  # already gone, or a disk that has become read-only
-            path.unlink()  # while it is still locked: whoever opened it before sees that it is not there any more
+            # while it is still locked: whoever opened it before sees that it is not there any more
+            path.unlink()
         os.close(descriptor)
 
 
@@ -74,9 +82,15 @@ def _acquire(path: Path) -> tuple[int, list[str]]:
             held = os.read(descriptor, 4096)
             if error.errno in BUSY:
                 os.close(descriptor)
-                message = f"{path.parent}: another run writes there ({_describe(held)}); wait for it, stop it, or choose another folder"
+                message = (
+                    f"{path.parent}: another run writes there ({_describe(held)}); wait for "
+                    "it, stop it, or choose another folder"
+                )
                 raise FolderBusyError(message) from error
-            return descriptor, [f"{path}: the file system has no locks ({error.strerror}): make sure that no other run writes there"]
+            return descriptor, [
+                f"{path}: the file system has no locks ({error.strerror}): make sure that no other "
+                "run writes there"
+            ]
         if _is_at(descriptor, path):
             return descriptor, []
         os.close(descriptor)  # its holder ended, and removed it, between the two calls
@@ -93,6 +107,8 @@ def _describe(text: bytes) -> str:
     """Return who wrote a lock file."""
     try:
         holder: Any = json.loads(text)
-        return one_line(f"process {int(holder['pid'])} on {holder['host']}, since {holder['since']}")
+        return one_line(
+            f"process {int(holder['pid'])} on {holder['host']}, since {holder['since']}"
+        )
     except (ValueError, KeyError, TypeError):
         return "an unknown process"

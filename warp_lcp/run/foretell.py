@@ -30,7 +30,9 @@ BYTE_SECONDS = 2.5e-9  # of a core
 ROW_SECONDS = 0.8e-3  # beside a step: how long it may be, its row of the log
 
 
-def foretold(scene: Scene, simulation: Simulation, seconds: float | None = None) -> list[tuple[str, str]]:
+def foretold(
+    scene: Scene, simulation: Simulation, seconds: float | None = None
+) -> list[tuple[str, str]]:
     """Return estimates of steps, run time and disk use, as pairs of a word and a line.
 
     Args:
@@ -52,7 +54,11 @@ def foretold(scene: Scene, simulation: Simulation, seconds: float | None = None)
     whole = steps * (seconds + ROW_SECONDS) + frames
     lasts = timedelta(seconds=round(whole)) if whole >= 10.0 else f"{whole:.2g} s"
     spent = f"about {lasts} {where}, {1e3 * seconds:.3g} ms a step, {frames:.2g} s for frames"
-    return [("steps", f"about {steps:,}"), *([("whole run", spent)] if seconds > 0.0 else []), ("disk", f"about {in_words(size)}")]
+    return [
+        ("steps", f"about {steps:,}"),
+        *([("whole run", spent)] if seconds > 0.0 else []),
+        ("disk", f"about {in_words(size)}"),
+    ]
 
 
 def in_words(size: float) -> str:
@@ -67,8 +73,12 @@ def expected_step(scene: ParticleScene, simulation: ParticleSimulation) -> float
     For the mean amount of material in the run.
     """
     growth = expected_growth(scene)
-    cells = min(round(math.prod(simulation.grid.counts) * growth), math.prod(scene.cell_counts))  # a grid that follows grows, too
-    listed, particles = prices(scene.scene.simulator, scene.dimension), round(simulation.particles.count * growth)
+    # a grid that follows grows, too
+    cells = min(round(math.prod(simulation.grid.counts) * growth), math.prod(scene.cell_counts))
+    listed, particles = (
+        prices(scene.scene.simulator, scene.dimension),
+        round(simulation.particles.count * growth),
+    )
     return scene.stirred * predicted_seconds(scene.models(), listed, cells, particles)
 
 
@@ -90,9 +100,17 @@ def expected_speed(scene: ParticleScene, simulation: ParticleSimulation) -> floa
     totals, g = simulation.particles.totals(), float(np.linalg.norm(simulation.gravity))
     parts, end = (simulation.boundary, simulation.sources), scene.time.duration
     solids, sources = (0.0 if part is None else part.top_speed(0.0, end) for part in parts)
-    falls = [float(bounds[0][1]) for source in scene.source if (bounds := source.bounds(scene.dimension)) is not None]  # to the floor
+    # to the floor
+    falls = [
+        float(bounds[0][1])
+        for source in scene.source
+        if (bounds := source.bounds(scene.dimension)) is not None
+    ]
     fallen = max(_fall(scene, simulation), g * max(falls, default=0.0))
-    return max(solids, math.hypot(max(totals.max_speed, sources), scene.fall_speed * math.sqrt(2.0 * fallen)))
+    return max(
+        solids,
+        math.hypot(max(totals.max_speed, sources), scene.fall_speed * math.sqrt(2.0 * fallen)),
+    )
 
 
 def _fall(scene: ParticleScene, simulation: ParticleSimulation) -> float:
@@ -105,7 +123,9 @@ def _fall(scene: ParticleScene, simulation: ParticleSimulation) -> float:
     level = volume / float(np.prod([side for axis, side in enumerate(size) if axis != 1]))
     work = abs(gravity[1]) * max(float(totals.high[1]) - level, 0.0)
     for axis in {0, 2} & set(range(len(size))) - set(scene.endless):
-        work += gravity[axis] * (size[axis] - totals.low[axis] if gravity[axis] > 0.0 else -totals.high[axis])
+        work += gravity[axis] * (
+            size[axis] - totals.low[axis] if gravity[axis] > 0.0 else -totals.high[axis]
+        )
     return float(work)
 
 
@@ -113,9 +133,11 @@ def expected_steps(scene: ParticleScene, simulation: ParticleSimulation) -> int:
     """Return about how many steps a run will take."""
     time, dx, g = scene.time, simulation.grid.spacing, float(np.linalg.norm(simulation.gravity))
     speed = expected_speed(scene, simulation) + math.sqrt(time.cfl * g * dx)
-    stable = min(time.cfl * dx / speed if speed > 0.0 else math.inf, simulation.stable_dt())  # which surface tension may bound
+    # which surface tension may bound
+    stable = min(time.cfl * dx / speed if speed > 0.0 else math.inf, simulation.stable_dt())
     longest = min(max(stable, time.dt_min), time.dt_max)
-    a_frame = time.duration / time.frame_count / longest  # whole steps: at one speed the next number, over a run's speeds half a step more
+    # whole steps: at one speed the next number, over a run's speeds half a step more
+    a_frame = time.duration / time.frame_count / longest
     return round(time.frame_count * max(a_frame + PIECE * min(a_frame, 1.0), 1.0))
 
 
@@ -131,7 +153,9 @@ def expected_bytes(scene: Scene, simulation: Simulation, steps: int) -> int:
     output, wanted = scene.output, {"particles": scene.output.particles, "grid": scene.output.grid}
     growth = expected_growth(scene) if isinstance(scene, ParticleScene) else 1.0
     frame = [_grown(part, growth) for part in simulation.frame() if wanted.get(part.name, True)]
-    each = frame_bytes(frame, output.grid_format, surface_ply=output.surface_ply, frame_format=output.format)
+    each = frame_bytes(
+        frame, output.grid_format, surface_ply=output.surface_ply, frame_format=output.format
+    )
     state = sum(array.nbytes for array in simulation.state().values())
     log = steps * LOG_BYTES * (len(simulation.columns()) + 5)
     return round(each * (scene.time.frame_count + 1) + output.checkpoints_kept * state + log)
@@ -157,7 +181,10 @@ def doubts(scene: Scene, simulation: Simulation) -> Iterator[str]:
     yield from check_output(scene)
     frames, rate = scene.time.frame_count, scene.time.frames_per_second
     if frames > MANY_FRAMES:
-        yield f"{frames:,} frames: time.duration {scene.time.duration:g} s at time.frames_per_second {rate:g}; is this intended?"
+        yield (
+            f"{frames:,} frames: time.duration {scene.time.duration:g} s at "
+            f"time.frames_per_second {rate:g}; is this intended?"
+        )
     if not (isinstance(scene, ParticleScene) and isinstance(simulation, ParticleSimulation)):
         return
     if not scene.solid:
@@ -167,9 +194,17 @@ def doubts(scene: Scene, simulation: Simulation) -> Iterator[str]:
     points = np.concatenate([lattice(grid, 1, 0.0, 0, plane) for plane in planes])  # one a cell
     free = simulation.admits(points)
     if free.mean() < 1.0 - FULL:
-        yield f"solids fill {100.0 - 100.0 * free.mean():.4g} % of the domain; with invert = true, the outside of a shape is solid"
+        yield (
+            f"solids fill {100.0 - 100.0 * free.mean():.4g} % of the domain; with invert = true, "
+            "the outside of a shape is solid"
+        )
     for number, material in enumerate(materials):
-        mine = inside([material.to_geometry(Path.cwd(), scene.dimension)], points, device=grid.device)
+        mine = inside(
+            [material.to_geometry(Path.cwd(), scene.dimension)], points, device=grid.device
+        )
         covered = 1.0 - float(np.mean(free[mine])) if mine.any() else 0.0
         if covered > BURIED:
-            yield f"{key}[{number}] ({material.shape}): {100.0 * covered:.0f} % of it lies inside solids and is left out"
+            yield (
+                f"{key}[{number}] ({material.shape}): {100.0 * covered:.0f} % of it lies inside "
+                "solids and is left out"
+            )

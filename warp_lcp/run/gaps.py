@@ -14,9 +14,14 @@ from warp_lcp.simulation import Part
 
 
 def gaps(
-    logs: Mapping[Path, Sequence[str]], frames: FrameFolder, checkpoints: CheckpointFolder, *, step: int, times: Sequence[float],
+    logs: Mapping[Path, Sequence[str]],
+    frames: FrameFolder,
+    checkpoints: CheckpointFolder,
+    *,
+    step: int,
+    times: Sequence[float],
     frame: Sequence[Part],
-) -> list[str]:  # fmt: skip
+) -> list[str]:
     """Return a line for each kind of files with gaps, with a remedy.
 
     Checkpoints that the remedy needs are spared.
@@ -39,13 +44,27 @@ def gaps(
         if steps:
             again = _again(checkpoints, partial(_precedes, steps[0]))
             lines.append(f"{log.name}: rows of steps {spans(steps)} are missing; {again}")
-    missing = {name: numbers for name in frames.kinds(frame) if (numbers := frames.missing(name, len(times)))}
+    missing = {
+        name: numbers
+        for name in frames.kinds(frame)
+        if (numbers := frames.missing(name, len(times)))
+    }
     if missing:
         first = times[min(min(numbers) for numbers in missing.values())]
         listed = ", ".join(f"{name} {spans(numbers)}" for name, numbers in missing.items())
-        lines.append(f"{frames.frames.name}: {listed} are missing or truncated; {_again(checkpoints, lambda _, time: time < first)}")
-    lost = [part.name for part in frame if frames.has_collection(part) and not (frames.folder / f"{part.name}.pvd").is_file()]
-    return [*lines, *(f"{name}.pvd: was missing; rebuilt from the existing frames" for name in lost)]
+        lines.append(
+            f"{frames.frames.name}: {listed} are missing or truncated; "
+            f"{_again(checkpoints, lambda _, time: time < first)}"
+        )
+    lost = [
+        part.name
+        for part in frame
+        if frames.has_collection(part) and not (frames.folder / f"{part.name}.pvd").is_file()
+    ]
+    return [
+        *lines,
+        *(f"{name}.pvd: was missing; rebuilt from the existing frames" for name in lost),
+    ]
 
 
 def spans(numbers: Iterable[int]) -> str:
@@ -71,8 +90,14 @@ def _again(checkpoints: CheckpointFolder, is_before: Callable[[int, float], bool
         try:
             if is_before(step, checkpoints.read(step).time):
                 checkpoints.spared.add(step)
-                away = f" of step {newer}" if newer == steps[0] else f"s of steps {newer} to {steps[0]}"
-                return f"to recompute them, move the checkpoint{away} away and resume from step {step}"
+                away = (
+                    f" of step {newer}"
+                    if newer == steps[0]
+                    else f"s of steps {newer} to {steps[0]}"
+                )
+                return (
+                    f"to recompute them, move the checkpoint{away} away and resume from step {step}"
+                )
         except CheckpointError:
             continue
     return "no earlier checkpoint exists: only --force (start again) recomputes them"

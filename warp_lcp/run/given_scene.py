@@ -9,9 +9,17 @@ from pathlib import Path
 from warp_lcp.run.continuation import RESOLUTION
 from warp_lcp.run.folder import SCENE, OutputError, holds_run, read_record, recorded_keys
 from warp_lcp.scene.scene import Scene
-from warp_lcp.scene.scene_file import SceneSource, keys, load_scene, override_key, override_value, scene_value
+from warp_lcp.scene.scene_file import (
+    SceneSource,
+    keys,
+    load_scene,
+    override_key,
+    override_value,
+    scene_value,
+)
 
-Overrides = list[dict[str, str]]  # `set`: what was given, `file`: the value that the scene's file had, if that was looked at
+# `set`: what was given, `file`: the value that the scene's file had, if that was looked at
+Overrides = list[dict[str, str]]
 
 
 @dataclass(frozen=True)
@@ -45,8 +53,9 @@ def given_scene(source: SceneSource, overrides: Sequence[str]) -> GivenScene:
 def scene_to_resume(folder: Path, source: str | None, overrides: Sequence[str]) -> GivenScene:
     """Return the scene of a run that goes on.
 
-    It is the folder's own one, or `source` as it is now with what `--set` has changed since the run began; where the file has a value that
-    it did not have then, somebody has edited it, and that counts. `overrides` count last.
+    It is the folder's own one, or `source` as it is now with what `--set` has changed since the run
+    began; where the file has a value that it did not have then, somebody has edited it, and that
+    counts. `overrides` count last.
 
     Args:
         folder: of the run.
@@ -62,14 +71,17 @@ def scene_to_resume(folder: Path, source: str | None, overrides: Sequence[str]) 
     own, asked = folder / SCENE, [override_key(override) for override in overrides]
     before = [entry for entry in _recorded(folder) if override_key(entry["set"]) not in asked]
     if source is None or (own.is_file() and Path(source).is_file() and own.samefile(source)):
-        return GivenScene(load_scene(own, overrides), [*before, *({"set": override} for override in overrides)])
+        return GivenScene(
+            load_scene(own, overrides), [*before, *({"set": override} for override in overrides)]
+        )
 
     kept = [entry["set"] for entry in before if not _edited(entry, source)]
     scene = load_scene(source, [*kept, *overrides])
     ran, now = (recorded_keys(own) or {}).get(RESOLUTION), keys(scene)[RESOLUTION]
     if ran not in (None, now) and RESOLUTION not in asked:
         raise OutputError(
-            f"{folder}: {RESOLUTION} is {ran}, but {now} in {source}: use --set {RESOLUTION}={now} to resample to the other grid, "
+            f"{folder}: {RESOLUTION} is {ran}, but {now} in {source}: use --set {RESOLUTION}={now} "
+            "to resample to the other grid, "
             f"or --set {RESOLUTION}={ran} to keep the grid"
         )
     return GivenScene(scene, _noted(source, [*kept, *overrides]), kept)
@@ -77,7 +89,10 @@ def scene_to_resume(folder: Path, source: str | None, overrides: Sequence[str]) 
 
 def _edited(entry: Mapping[str, str], source: str) -> bool:
     """Return whether the scene's file has another value than when it was overridden, and not the one that it was overridden by."""
-    return "file" in entry and scene_value(source, entry["set"]) not in (entry["file"], override_value(entry["set"]))
+    return "file" in entry and scene_value(source, entry["set"]) not in (
+        entry["file"],
+        override_value(entry["set"]),
+    )
 
 
 def _noted(source: SceneSource, overrides: Sequence[str]) -> Overrides:

@@ -12,7 +12,8 @@ from collections.abc import Callable, Sequence
 from types import FrameType, TracebackType
 from typing import Any, Self
 
-ENDING = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGUSR1", "SIGUSR2", "SIGXCPU")  # batch systems send those of the user's, too
+# batch systems send those of the user's, too
+ENDING = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGUSR1", "SIGUSR2", "SIGXCPU")
 SIGNALS = tuple(number for number in signal.Signals if number.name in ENDING)
 OVER = b"\0"
 GRACE = 1.0  # seconds that native code may take before a process that has nothing to lose is ended
@@ -28,15 +29,17 @@ class Interruption:
 
     Called after each step, it returns the name of the signal, "" if none.
 
-    Until it is called first there is nothing to lose, and much to wait for, as kernels are compiled: there a signal raises `Interrupted`.
-    Python hands a signal on only once the compiler is back, which may take many seconds, so a thread of its own says at once that it has
-    come, and ends the process, if asked to, when it is not handed on soon. What ignores a signal, as nohup does SIGHUP, goes on ignoring
-    it. A second Ctrl-C does not wait for the step's end.
+    Until it is called first there is nothing to lose, and much to wait for, as kernels are
+    compiled: there a signal raises `Interrupted`. Python hands a signal on only once the compiler
+    is back, which may take many seconds, so a thread of its own says at once that it has come, and
+    ends the process, if asked to, when it is not handed on soon. What ignores a signal, as nohup
+    does SIGHUP, goes on ignoring it. A second Ctrl-C does not wait for the step's end.
 
     Args:
         say: takes a line for the user.
         at_once: raise before the first step has ended; ranks, which wait for each other, do not.
-        last: called with the signal's name before a process that compiles is ended; None: it is not ended.
+        last: called with the signal's name before a process that compiles is ended; None: it is not
+            ended.
         signals: which of them.
     """
 
@@ -68,11 +71,17 @@ class Interruption:
         self._thread = threading.Thread(target=self._announce, name="signals", daemon=True)
         self._thread.start()
         for number in self._signals:
-            if signal.getsignal(number) not in (signal.SIG_IGN, None):  # None: a handler that Python has not installed and cannot restore
+            # None: a handler that Python has not installed and cannot restore
+            if signal.getsignal(number) not in (signal.SIG_IGN, None):
                 self._previous[number] = signal.signal(number, self._take)
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
         for number, handler in self._previous.items():
             signal.signal(number, handler)
         signal.set_wakeup_fd(self._wakeup)
@@ -83,7 +92,8 @@ class Interruption:
 
     def _take(self, given: int, frame: FrameType | None) -> None:
         number = signal.Signals(given)
-        if number == signal.SIGINT:  # SIGTERM may come several times, to the process and to its group
+        # SIGTERM may come several times, to the process and to its group
+        if number == signal.SIGINT:
             signal.signal(number, self._previous[number])
         self._taken.set()
         if not self.name:
@@ -99,10 +109,15 @@ class Interruption:
                 continue
             again = "; press Ctrl-C again to end now" if number == signal.SIGINT else ""
             early = self._early
-            self._say(f"{number.name}: stopping {'before the first step has ended' if early else f'after this step{again}'}")
+            self._say(
+                f"{number.name}: stopping "
+                f"{'before the first step has ended' if early else f'after this step{again}'}"
+            )
             if early and self._last is not None and not self._taken.wait(GRACE):
                 self._last(number.name)
-                os._exit(FAILED)  # nothing less ends a compiler; no step is lost, and no file that counts is half-written
+                # nothing less ends a compiler; no step is lost, and no file that counts is
+                # half-written
+                os._exit(FAILED)
             while os.read(self._read, 1) != OVER:
                 pass
             return

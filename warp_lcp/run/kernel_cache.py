@@ -30,11 +30,16 @@ def watch_loads() -> None:
         return
 
     @functools.wraps(load)
-    def checked(module: wp.Module, device: Any, block_dim: int | None = None, *more: Any, **options: Any) -> Any:
+    def checked(
+        module: wp.Module, device: Any, block_dim: int | None = None, *more: Any, **options: Any
+    ) -> Any:
         if module.execs:  # as at every launch but the first
             return load(module, device, block_dim, *more, **options)
         try:
-            mend(Path(wp.config.kernel_cache_dir) / module.get_module_identifier(block_dim or module.options["block_dim"]))
+            mend(
+                Path(wp.config.kernel_cache_dir)
+                / module.get_module_identifier(block_dim or module.options["block_dim"])
+            )
             return load(module, device, block_dim, *more, **options)
         except OSError as error:
             raise cache_error(error) from error
@@ -46,7 +51,10 @@ def cache_error(error: OSError) -> KernelCacheError:
     """Return the error message for the kernel cache."""
     where = f" {wp.config.kernel_cache_dir}" if wp.config.kernel_cache_dir else ""
     file = f" ({error.filename})" if error.filename and f" {error.filename}" != where else ""
-    text = f"the folder of compiled kernels{where} cannot be used{file}; repair or delete it, or have WARP_CACHE_PATH name another one"
+    text = (
+        f"the folder of compiled kernels{where} cannot be used{file}; repair or delete it, or "
+        "have WARP_CACHE_PATH name another one"
+    )
     return KernelCacheError(error.errno, f"{error.strerror or error}: {text}")
 
 

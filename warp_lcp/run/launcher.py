@@ -45,7 +45,9 @@ class Launcher:
         """MPI ranks; None for a single process."""
         return self.collective.ranks if self.collective else None
 
-    def load(self, scene: str | None, overrides: Sequence[str], options: Mapping[str, Any]) -> GivenScene:
+    def load(
+        self, scene: str | None, overrides: Sequence[str], options: Mapping[str, Any]
+    ) -> GivenScene:
         """Return the scene of a run, or of one that goes on.
 
         Args:
@@ -60,11 +62,16 @@ class Launcher:
         out = options.get("--out")
         if not options.get("--resume"):
             if scene is None:
-                raise OutputError("SCENE is missing: give a scene file or the name of a built-in scene; only --resume --out DIR needs none")
+                raise OutputError(
+                    "SCENE is missing: give a scene file or the name of a built-in scene; only "
+                    "--resume --out DIR needs none"
+                )
             return given_scene(scene, overrides)
         if out is None and scene is None:
             raise OutputError("--resume: needs SCENE or --out DIR, the folder of the run")
-        return scene_to_resume(out or default_folder(load_scene(scene or "", overrides)), scene, overrides)
+        return scene_to_resume(
+            out or default_folder(load_scene(scene or "", overrides)), scene, overrides
+        )
 
     def agree(self, given: Mapping[str, Any]) -> None:
         """Check that all were given the same values, by their names.
@@ -89,14 +96,23 @@ class Launcher:
         """
         return device
 
-    def run(self, request: RunRequest, *, observer: Observer, stop: Callable[[], bool | str], profile: Profile | None) -> RunRecord:
+    def run(
+        self,
+        request: RunRequest,
+        *,
+        observer: Observer,
+        stop: Callable[[], bool | str],
+        profile: Profile | None,
+    ) -> RunRecord:
         """Simulate a scene that `load` returned, as `run_scene` does.
 
         Raises:
             OutputError: the folder cannot take the run.
             SceneError: the scene cannot be simulated.
         """
-        return run_scene(request, observer=observer, stop=stop, profile=profile, collective=self.collective)
+        return run_scene(
+            request, observer=observer, stop=stop, profile=profile, collective=self.collective
+        )
 
 
 def default_folder(scene: Scene) -> Path:

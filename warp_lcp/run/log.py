@@ -29,14 +29,20 @@ class Log:
     """
 
     def __init__(
-        self, path: Path, columns: tuple[str, ...], *, after_step: int | None = None, collective: Collective | None = None
+        self,
+        path: Path,
+        columns: tuple[str, ...],
+        *,
+        after_step: int | None = None,
+        collective: Collective | None = None,
     ) -> None:
         """Begin a log, or continue one.
 
         Args:
             path: the file.
             columns: all of its columns; the first is `step`.
-            after_step: continue an existing file behind this step; later rows, and a last row cut short, are dropped.
+            after_step: continue an existing file behind this step; later rows, and a last row cut
+                short, are dropped.
             collective: of the ranks that share the run.
 
         Raises:
@@ -85,7 +91,8 @@ def _cell(value: Value) -> Value:
     if isinstance(value, bool):
         return int(value)
     if isinstance(value, float):
-        return float(value) if math.isfinite(value) else None  # float(): NumPy's scalars write themselves otherwise
+        # float(): NumPy's scalars write themselves otherwise
+        return float(value) if math.isfinite(value) else None
     return value
 
 
@@ -109,7 +116,11 @@ def rows_until(path: Path, header: str, step: int) -> list[str]:
     kept, last = [header], 0
     for row in rows:
         number = row.split(",", 1)[0]
-        if row.count(",") >= header.count(",") and number.isdecimal() and last < int(number) <= step:
+        if (
+            row.count(",") >= header.count(",")
+            and number.isdecimal()
+            and last < int(number) <= step
+        ):
             kept.append(row)
             last = int(number)
     return kept

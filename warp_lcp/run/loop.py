@@ -47,7 +47,8 @@ from warp_lcp.simulation import (
     Volume,
 )
 
-SAME_TIME = 1e-9  # of a frame's interval: what rounding leaves between a step's end and the frame it was cut for
+# of a frame's interval: what rounding leaves between a step's end and the frame it was cut for
+SAME_TIME = 1e-9
 SPACE_MARGIN = 1.1
 
 
@@ -59,12 +60,14 @@ class RunRequest:
         scene: what to simulate, the same on all ranks.
         out: the run's folder, which all ranks see; None: nothing is written.
         device: a Warp device, such as `cuda:0`; of this rank.
-        overrides: by which the scene differs from its file, for run.json, see `warp_lcp.run.given_scene`.
+        overrides: by which the scene differs from its file, for run.json, see
+            `warp_lcp.run.given_scene`.
         last_frame: end after this frame; the scene's last one without it.
         resume: continue the run in the folder, which may have had another number of ranks.
         force: delete the run in the folder.
         force_memory: run even what will not fit into the device's free memory.
-        record_problems: folder that takes the problem of each step, see `warp_lcp.gallery.recorded`; not on ranks.
+        record_problems: folder that takes the problem of each step, see
+            `warp_lcp.gallery.recorded`; not on ranks.
     """
 
     scene: Scene
@@ -90,7 +93,9 @@ def run_scene(
 
     Arguments, what it returns and what it raises are those of `running_scene`.
     """
-    running = running_scene(request, observer=observer, stop=stop, profile=profile, collective=collective)
+    running = running_scene(
+        request, observer=observer, stop=stop, profile=profile, collective=collective
+    )
     while True:
         try:
             next(running)
@@ -108,17 +113,20 @@ def running_scene(
 ) -> Generator[RunLoop, None, RunRecord]:
     """Simulate a scene as far as frames are requested; collective on ranks.
 
-    Between frames the caller may change the simulation. Once the generator is closed, the run ends as one that was stopped.
+    Between frames the caller may change the simulation. Once the generator is closed, the run ends
+    as one that was stopped.
 
     Args:
         request: what is asked for.
         observer: learns of every step.
-        stop: asked after every step; True, or what it is interrupted by, ends the run with a checkpoint, on any rank.
+        stop: asked after every step; True, or what it is interrupted by, ends the run with a
+            checkpoint, on any rank.
         profile: measures the run's stages; written to profile.json at the end.
         collective: of the ranks that share the run; None: this process has it alone.
 
     Yields:
-        The loop before it begins, and again at each frame of this run, with the simulation as the frame shows it.
+        The loop before it begins, and again at each frame of this run, with the simulation as the
+        frame shows it.
 
     Returns:
         How the run ended, as in run.json.
@@ -129,7 +137,10 @@ def running_scene(
     """
     scene, everyone = request.scene, collective or Collective.of_one()
     if collective is not None and request.record_problems is not None:
-        raise OutputError("--record-problems cannot be combined with --engine petsc: each rank has only a part of the problem")
+        raise OutputError(
+            "--record-problems cannot be combined with --engine petsc: each rank has only a part "
+            "of the problem"
+        )
     share = everyone.share_of_device(request.device)
     with everyone.together():
         if collective is not None:
@@ -137,8 +148,12 @@ def running_scene(
         output_notes = check_output(scene) if request.out is not None else []
         if not request.force_memory:
             check_memory(scene, request.device, share=share)
-    folder: RunFolder = NoFolder(scene) if request.out is None else RunFolder(request.out, scene, collective)
-    record = RunRecord(scene.scene.name, scene.scene.simulator, request.device, overrides=list(request.overrides))
+    folder: RunFolder = (
+        NoFolder(scene) if request.out is None else RunFolder(request.out, scene, collective)
+    )
+    record = RunRecord(
+        scene.scene.name, scene.scene.simulator, request.device, overrides=list(request.overrides)
+    )
     if collective is not None:
         record.engine, record.ranks = Engine.PETSC.value, collective.ranks.size
     with folder.held(resume=request.resume) as remarks:
@@ -148,7 +163,10 @@ def running_scene(
             continued = folder.resume()
             record.overrides = record.overrides or read_record(folder.path).get("overrides", [])
             record.warnings += continued.remarks
-            record.changed, record.resampled_from_resolution = continued.changed, continued.resampled_from
+            record.changed, record.resampled_from_resolution = (
+                continued.changed,
+                continued.resampled_from,
+            )
             record.resumed_from_step = continued.checkpoint.step if continued.checkpoint else 0
         else:
             folder.check_new(force=request.force)
@@ -163,11 +181,16 @@ def running_scene(
         run = RunLoop(simulation, folder, record, observer, profile)
         with profile.kernels_apart() if profile else nullcontext():
             yield run
-            return (yield from run.execute(request.last_frame, stop, resumed=checkpoint is not None))
+            return (
+                yield from run.execute(request.last_frame, stop, resumed=checkpoint is not None)
+            )
 
 
 def _simulation(
-    request: RunRequest, folder: RunFolder, collective: Collective | None, continued: Continuation | None
+    request: RunRequest,
+    folder: RunFolder,
+    collective: Collective | None,
+    continued: Continuation | None,
 ) -> tuple[Simulation, list[str]]:
     """Return the simulation where the run begins or goes on, or this rank's part of it, and what it has to say."""
     scene, notes = request.scene, list[str]()
@@ -185,19 +208,32 @@ def _simulation(
     return RankSimulation(cast(Joined, simulation), collective), notes
 
 
-def _go_on(simulation: Simulation, folder: RunFolder, continued: Continuation, *, on_ranks: bool) -> list[str]:
+def _go_on(
+    simulation: Simulation, folder: RunFolder, continued: Continuation, *, on_ranks: bool
+) -> list[str]:
     """Continue from a checkpoint; return what the user should know of it.
 
     Raises:
         ValueError: the simulation cannot.
     """
     assert continued.checkpoint is not None
-    state, name, other_grid = continued.checkpoint.state, folder.scene.scene.simulator, continued.resampled_from is not None
+    state, name, other_grid = (
+        continued.checkpoint.state,
+        folder.scene.scene.simulator,
+        continued.resampled_from is not None,
+    )
     if PIECES in state and not isinstance(simulation, Joined):
-        raise ValueError("the checkpoint was written on several ranks: continue with --engine petsc, on any number of ranks")
+        raise ValueError(
+            "the checkpoint was written on several ranks: continue with --engine petsc, on any "
+            "number of ranks"
+        )
     if other_grid and (on_ranks or PIECES in state or not isinstance(simulation, Resampled)):
         who = "--engine petsc" if on_ranks else name
-        why = "the checkpoint was written on several ranks" if PIECES in state and not on_ranks else f"{who} cannot change grids"
+        why = (
+            "the checkpoint was written on several ranks"
+            if PIECES in state and not on_ranks
+            else f"{who} cannot change grids"
+        )
         raise ValueError(f"domain.resolution: must stay {continued.resampled_from}: {why}")
     if PIECES in state and isinstance(simulation, Joined):
         simulation.restore_pieces(folder.checkpoints.pieces(continued.checkpoint))
@@ -211,9 +247,14 @@ def _go_on(simulation: Simulation, folder: RunFolder, continued: Continuation, *
 def _record_problems(simulation: Simulation, scene: Scene, folder: Path, *, more: bool) -> None:
     """Have a simulation write the problem of each step into a folder."""
     if not isinstance(simulation, Recorded):
-        raise OutputError(f"--record-problems: the simulator {scene.scene.simulator} has no problems to record")
+        raise OutputError(
+            f"--record-problems: the simulator {scene.scene.simulator} has no problems to record"
+        )
     if any(solid.is_body for solid in scene.solid):
-        raise OutputError("--record-problems cannot be combined with rigid bodies, whose part of the matrix cannot be stored")
+        raise OutputError(
+            "--record-problems cannot be combined with rigid bodies, whose part of the matrix "
+            "cannot be stored"
+        )
     simulation.record = ProblemFolder(folder, more=more).write
 
 
@@ -228,7 +269,14 @@ class RunLoop:
         profile: measures the stages.
     """
 
-    def __init__(self, simulation: Simulation, folder: RunFolder, record: RunRecord, observer: Observer, profile: Profile | None) -> None:
+    def __init__(
+        self,
+        simulation: Simulation,
+        folder: RunFolder,
+        record: RunRecord,
+        observer: Observer,
+        profile: Profile | None,
+    ) -> None:
         """Take over a simulation; nothing is written yet."""
         scene = folder.scene
         self.time = scene.time
@@ -242,33 +290,43 @@ class RunLoop:
         if isinstance(simulation, Profiled):
             simulation.watch = self.watch
         self.writer = folder.frame_writer(self.watch)
-        self._somewhere = folder.collective.ranks.any  # what only this process knows holds for the run if it does on some rank
-        self._has_bodies = any(solid.is_body for solid in scene.solid)  # whose surfaces are part of every frame
+        # what only this process knows holds for the run if it does on some rank
+        self._somewhere = folder.collective.ranks.any
+        # whose surfaces are part of every frame
+        self._has_bodies = any(solid.is_body for solid in scene.solid)
         self._begun = clock.perf_counter()
         self._first_step = 0
         self._below_dt_min = False
-        self._owes = False  # the frame of the time that a resumed run goes on from, which is not there
-        self._missed: list[tuple[float, int]] = []  # what solves left that missed their tolerance, and in which step
+        # the frame of the time that a resumed run goes on from, which is not there
+        self._owes = False
+        # what solves left that missed their tolerance, and in which step
+        self._missed: list[tuple[float, int]] = []
         self._tolerance = scene.solver.tolerance
         self._tables: dict[str, Log] = {}  # beside the log
         self._checkpointed: int | None = None  # the newest checkpoint's step
         self._checkpoint_time = clock.monotonic()
 
-    def execute(self, last_frame: int | None, stop: Callable[[], bool | str], *, resumed: bool) -> Generator[RunLoop, None, RunRecord]:
+    def execute(
+        self, last_frame: int | None, stop: Callable[[], bool | str], *, resumed: bool
+    ) -> Generator[RunLoop, None, RunRecord]:
         """Run to the last frame and write the exit status into run.json."""
         count = self.time.frame_count
         last = count if last_frame is None else min(last_frame, count)
         start = self._frame()
         self._check_space(last, start)
         try:
-            with self.folder.collective.together(), ExitStack() as stack:  # what is caught here was raised on all ranks
+            # what is caught here was raised on all ranks
+            with self.folder.collective.together(), ExitStack() as stack:
                 stack.enter_context(self.writer)
-                log = stack.enter_context(closing(self._resume(last, start) if resumed else self._start(last, start)))
+                log = stack.enter_context(
+                    closing(self._resume(last, start) if resumed else self._start(last, start))
+                )
                 self._open_tables(stack, self._first_step if resumed else None)
                 self.observer.start(self.simulation.time, self.time.frame_time(last))
                 try:
                     stopped = yield from self._advance(log, last, stop, resumed=resumed)
-                except GeneratorExit:  # nobody asks for more frames; the state is that of the last one
+                except GeneratorExit:
+                    # nobody asks for more frames; the state is that of the last one
                     stopped = f"stopped by the program after frame {self._frames_done()}"
                 self._write_checkpoint(log)
             self.record.status = "stopped" if stopped else "finished"
@@ -284,7 +342,9 @@ class RunLoop:
             full = "the disk is full: " if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
             self._fail(f"{full}{error}; files written before are intact")
         except Exception as error:  # it is raised again
-            self._fail(str(error) if isinstance(error, RankFailed) else f"{type(error).__name__}: {error}")
+            self._fail(
+                str(error) if isinstance(error, RankFailed) else f"{type(error).__name__}: {error}"
+            )
             raise
         finally:
             if self.record.status == "running":
@@ -302,7 +362,9 @@ class RunLoop:
         state = sum(array.nbytes for array in self.simulation.state().values())
         states = self.output.checkpoints_kept + 1  # the one being written too
         output = self.output
-        each = frame_bytes(frame, output.grid_format, surface_ply=output.surface_ply, frame_format=output.format)
+        each = frame_bytes(
+            frame, output.grid_format, surface_ply=output.surface_ply, frame_format=output.format
+        )
         self.folder.check_space(int(SPACE_MARGIN * (each * frames + states * state)))
 
     def _start(self, last: int, frame: list[Part]) -> Log:
@@ -318,8 +380,8 @@ class RunLoop:
     def _resume(self, last: int, frame: list[Part]) -> Log:
         """Take back what an interrupted run wrote after its checkpoint, and tell what is missing of what it wrote before.
 
-        A run that failed between a step and the frame at its end, in a callback for instance, still owes that frame: the checkpoint is of
-        its time, so it is written now.
+        A run that failed between a step and the frame at its end, in a callback for instance, still
+        owes that frame: the checkpoint is of its time, so it is written now.
         """
         self.record.frames = done = self._frames_done()
         self._first_step = self.simulation.step_count
@@ -328,12 +390,16 @@ class RunLoop:
         self._owes = self._is_frame_time(done) and done <= last and self.folder.lacks(done, frame)
         if self._owes:
             times.pop()
-        for gap in self.folder.gaps({"log": self._columns(), **self._table_columns()}, self._first_step, times, frame):
+        for gap in self.folder.gaps(
+            {"log": self._columns(), **self._table_columns()}, self._first_step, times, frame
+        ):
             self._warn(gap)
         self.folder.go_on(self.record, self._first_step)
         self.folder.frames.resume(times)
         with ExitStack() as stack:
-            log = stack.enter_context(closing(self.folder.open_log(self._columns(), after_step=self._first_step)))
+            log = stack.enter_context(
+                closing(self.folder.open_log(self._columns(), after_step=self._first_step))
+            )
             if self._owes:
                 self._write_frame(done, last, frame)
             stack.pop_all()
@@ -342,7 +408,9 @@ class RunLoop:
     def _open_tables(self, stack: ExitStack, after_step: int | None) -> None:
         """Begin or continue the tables beside the log, to be closed by a stack."""
         for name, columns in self._table_columns().items():
-            self._tables[name] = stack.enter_context(closing(self.folder.open_log(columns, after_step=after_step, table=name)))
+            self._tables[name] = stack.enter_context(
+                closing(self.folder.open_log(columns, after_step=after_step, table=name))
+            )
 
     def _table_columns(self) -> Mapping[str, tuple[str, ...]]:
         return self.simulation.tables() if isinstance(self.simulation, Measured) else {}
@@ -350,7 +418,9 @@ class RunLoop:
     def _columns(self) -> tuple[str, ...]:
         return ("step", "time", "dt", *self.simulation.columns(), "retries", "seconds")
 
-    def _advance(self, log: Log, last: int, stop: Callable[[], bool | str], *, resumed: bool) -> Generator[RunLoop, None, str]:
+    def _advance(
+        self, log: Log, last: int, stop: Callable[[], bool | str], *, resumed: bool
+    ) -> Generator[RunLoop, None, str]:
         """Step until the last frame is written; return why the run stopped before, "" if it did not."""
         frame = self._frames_done() + 1
         if not resumed or self._owes:
@@ -387,14 +457,23 @@ class RunLoop:
         except (Exception, KeyboardInterrupt) as error:  # it is raised again
             self._try_to(partial(self._write_checkpoint, log))
             if isinstance(error, KeyboardInterrupt):
-                self.record.status, self.record.reason = "stopped", f"interrupted after step {self.simulation.step_count}"
+                self.record.status, self.record.reason = (
+                    "stopped",
+                    f"interrupted after step {self.simulation.step_count}",
+                )
             raise
 
     def _interrupted(self, asked: bool | str) -> str:
         """Return by what some rank was asked to stop."""
-        names = [name if isinstance(name, str) else "" for name in self.folder.collective.exchange(asked)]
+        names = [
+            name if isinstance(name, str) else "" for name in self.folder.collective.exchange(asked)
+        ]
         rank = next((rank for rank, name in enumerate(names) if name), 0)
-        return f"interrupted by {names[rank]}{f' on rank {rank}' if rank else ''}" if names[rank] else "interrupted"
+        return (
+            f"interrupted by {names[rank]}{f' on rank {rank}' if rank else ''}"
+            if names[rank]
+            else "interrupted"
+        )
 
     def _step(self, end: float) -> dict[str, Value]:
         """Take a step towards a time [s] and return its row of the log."""
@@ -402,7 +481,10 @@ class RunLoop:
         stable, number = stable_dt(self.simulation), self.simulation.step_count + 1
         if stable < self.time.dt_min and not self._below_dt_min:
             self._below_dt_min = True  # once is enough: the log's column cfl has the rest
-            self._warn(f"step {number}: the longest stable step is {stable:.3g} s, less than time.dt_min; steps may be unstable")
+            self._warn(
+                f"step {number}: the longest stable step is {stable:.3g} s, less than time.dt_min; "
+                "steps may be unstable"
+            )
         dt, retries, values = take_step(self.simulation, stable, end, self.time)
         seconds = clock.perf_counter() - begun
         return {
@@ -416,7 +498,10 @@ class RunLoop:
 
     def _is_frame_time(self, index: int) -> bool:
         """Return whether the simulation is at the time of a frame, so that it shows what the frame does."""
-        return abs(self.simulation.time - self.time.frame_time(index)) <= SAME_TIME / self.time.frames_per_second
+        return (
+            abs(self.simulation.time - self.time.frame_time(index))
+            <= SAME_TIME / self.time.frames_per_second
+        )
 
     def _frames_done(self) -> int:
         """Return the number of the newest frame whose time is reached; it follows from the time alone."""
@@ -432,7 +517,9 @@ class RunLoop:
     def _frame(self) -> list[Part]:
         """Return what the scene wants to see of the simulation now."""
         output = self.output
-        if not self.folder.keeps or not (output.particles or output.grid or output.surface or output.volume or self._has_bodies):
+        if not self.folder.keeps or not (
+            output.particles or output.grid or output.surface or output.volume or self._has_bodies
+        ):
             return []
         wanted = {Points: output.particles, Cells: output.grid, Surface: True, Volume: True}
         with self.watch.stage("frames"):
@@ -447,7 +534,9 @@ class RunLoop:
         every, minutes = self.output.checkpoint_every, self.output.checkpoint_minutes
         if every and self.simulation.step_count % every == 0:
             return True
-        return minutes is not None and self._somewhere(clock.monotonic() - self._checkpoint_time >= 60.0 * minutes)
+        return minutes is not None and self._somewhere(
+            clock.monotonic() - self._checkpoint_time >= 60.0 * minutes
+        )
 
     def _write_checkpoint(self, log: Log | None = None, *, beside: bool = False) -> None:
         """Write a checkpoint unless there is one of this step; what a run that continues from it expects is on the disk before.
@@ -466,7 +555,10 @@ class RunLoop:
                     file.sync()
             if beside and isinstance(self.writer, FrameWriter):  # ranks write together
                 state = {name: np.array(array) for name, array in self.simulation.state().items()}
-                self.writer.then("checkpoints, written", partial(self._store, Checkpoint(step, self.simulation.time, state)))
+                self.writer.then(
+                    "checkpoints, written",
+                    partial(self._store, Checkpoint(step, self.simulation.time, state)),
+                )
             else:
                 self.writer.flush()
                 files = self._store(Checkpoint(step, self.simulation.time, self.simulation.state()))
@@ -480,7 +572,9 @@ class RunLoop:
 
     def _write_profile(self) -> None:
         assert self.profile is not None
-        self.profile.write(self.folder.path, self.simulation.step_count - self._first_step, self.record.seconds)
+        self.profile.write(
+            self.folder.path, self.simulation.step_count - self._first_step, self.record.seconds
+        )
 
     def _count(self) -> None:
         """Bring the record up to date."""
@@ -498,7 +592,10 @@ class RunLoop:
         if self._missed:
             (worst, step), steps = max(self._missed), self.simulation.step_count - self._first_step
             left = f": the worst, step {step}, left a residual of {worst:.1e}" * (worst > 0.0)
-            self._warn(f"{len(self._missed)} of {steps} steps missed solver.tolerance = {self._tolerance}{left}")
+            self._warn(
+                f"{len(self._missed)} of {steps} steps missed solver.tolerance = "
+                f"{self._tolerance}{left}"
+            )
 
     def _fail(self, reason: str) -> None:
         self.record.status = "failed"

@@ -67,7 +67,9 @@ class NoFolder(RunFolder):
     def start(self, record: RunRecord) -> None:
         """Do nothing."""
 
-    def open_log(self, columns: tuple[str, ...], *, after_step: int | None = None, table: str = "log") -> NoLog:
+    def open_log(
+        self, columns: tuple[str, ...], *, after_step: int | None = None, table: str = "log"
+    ) -> NoLog:
         """Return a log that discards its rows."""
         return NoLog(columns)
 

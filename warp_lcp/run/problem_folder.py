@@ -37,7 +37,9 @@ class ProblemFolder:
         """Make the folder and describe what will be in it."""
         self.folder = folder
         if not more and files(folder):
-            raise OutputError(f"--record-problems {folder}: holds recorded problems already; name another folder")
+            raise OutputError(
+                f"--record-problems {folder}: holds recorded problems already; name another folder"
+            )
         try:
             make_folder(folder)
             write_text(folder / README, DESCRIPTION)

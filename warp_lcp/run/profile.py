@@ -30,7 +30,8 @@ class Stage:
         calls: how often it was entered.
         seconds: in all.
         first_seconds: of the first call, which may allocate.
-        bytes: what it had to read or write at least: its arrays, each counted once a call, or its files.
+        bytes: what it had to read or write at least: its arrays, each counted once a call, or its
+            files.
         shared: seconds of it that all CPU threads worked on.
     """
 
@@ -73,7 +74,9 @@ class LoadedKernels:
         if self._level <= wp.LOG_INFO:
             self._logger.info(message)
 
-    def warning(self, message: str, category: type[Warning] | None = None, stacklevel: int = 1) -> None:
+    def warning(
+        self, message: str, category: type[Warning] | None = None, stacklevel: int = 1
+    ) -> None:
         """Pass a message on to the logger that was there before."""
         if self._level <= wp.LOG_WARNING:
             self._logger.warning(message, category, stacklevel=stacklevel + 1)
@@ -118,7 +121,11 @@ class Profile:
             stage = self.stages.setdefault(name, Stage())
             stage.add(time.perf_counter() - begun - (self._loads.seconds - loading))
             stage.shared += shared_seconds() - shared
-            stage.bytes += sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in arrays if array is not None)
+            stage.bytes += sum(
+                array.size * wp.types.type_size_in_bytes(array.dtype)
+                for array in arrays
+                if array is not None
+            )
 
     @contextmanager
     def beside(self, name: str) -> Iterator[None]:
@@ -144,12 +151,37 @@ class Profile:
         """
         rows = []
         for name, stage in self.stages.items():
-            share = f"{stage.shared / stage.seconds:.0%}" if stage.seconds > 0.0 and get_threads() > 1 and not stage.beside else ""
-            rows.append((f"({name})" if stage.beside else name, *_figures(stage.seconds, stage.bytes, steps, seconds), share))
+            share = (
+                f"{stage.shared / stage.seconds:.0%}"
+                if stage.seconds > 0.0 and get_threads() > 1 and not stage.beside
+                else ""
+            )
+            rows.append(
+                (
+                    f"({name})" if stage.beside else name,
+                    *_figures(stage.seconds, stage.bytes, steps, seconds),
+                    share,
+                )
+            )
         rest = seconds - sum(stage.seconds for stage in self.stages.values() if not stage.beside)
-        rows += [("rest", *_figures(rest, 0, steps, seconds), ""), ("all", *_figures(seconds, 0, steps, seconds), "")]
-        heads = ("stage", "seconds", "share", "ms a step", "MB a step", "GB/s", f"on {get_threads()} threads")
-        return table_lines(heads, rows) if get_threads() > 1 else table_lines(heads[:-1], [row[:-1] for row in rows])
+        rows += [
+            ("rest", *_figures(rest, 0, steps, seconds), ""),
+            ("all", *_figures(seconds, 0, steps, seconds), ""),
+        ]
+        heads = (
+            "stage",
+            "seconds",
+            "share",
+            "ms a step",
+            "MB a step",
+            "GB/s",
+            f"on {get_threads()} threads",
+        )
+        return (
+            table_lines(heads, rows)
+            if get_threads() > 1
+            else table_lines(heads[:-1], [row[:-1] for row in rows])
+        )
 
     def write(self, folder: Path, steps: int, seconds: float) -> None:
         """Write profile.json.
@@ -163,7 +195,13 @@ class Profile:
             OSError: the file cannot be written.
         """
         stages = [{"stage": name, **vars(stage)} for name, stage in self.stages.items()]
-        data = {"device": self._device.alias, "threads": get_threads(), "steps": steps, "seconds": seconds, "stages": stages}
+        data = {
+            "device": self._device.alias,
+            "threads": get_threads(),
+            "steps": steps,
+            "seconds": seconds,
+            "stages": stages,
+        }
         write_text(folder / PROFILE, json.dumps(data, indent=2) + "\n")
 
     def _wait(self) -> None:
@@ -171,8 +209,16 @@ class Profile:
             wp.synchronize_device(self._device)
 
 
-def _figures(seconds: float, moved: int, steps: int, total: float) -> tuple[str, str, str, str, str]:
+def _figures(
+    seconds: float, moved: int, steps: int, total: float
+) -> tuple[str, str, str, str, str]:
     each = max(steps, 1)
     speed = f"{moved / seconds / 1e9:.2f}" if moved and seconds > 0.0 else ""
     share = f"{seconds / total:.1%}" if total > 0.0 else ""
-    return f"{seconds:.3f}", share, f"{seconds / each * 1e3:.3f}", f"{moved / each / 1e6:.2f}" if moved else "", speed
+    return (
+        f"{seconds:.3f}",
+        share,
+        f"{seconds / each * 1e3:.3f}",
+        f"{moved / each / 1e6:.2f}" if moved else "",
+        speed,
+    )

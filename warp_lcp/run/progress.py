@@ -18,7 +18,8 @@ from warp_lcp.problem.result import SolveStatus
 from warp_lcp.run.log import Value
 from warp_lcp.run.terminal import say
 
-RESIDUALS = "coupled_residual", "solve_residual"  # the first that a log has is the one that the scene's tolerance is of
+# the first that a log has is the one that the scene's tolerance is of
+RESIDUALS = "coupled_residual", "solve_residual"
 CONVERGED = SolveStatus.CONVERGED.name
 LINE_EVERY = 5.0  # seconds between two lines of a count
 WINDOW = 20.0  # seconds of the recent past that the time left is judged by
@@ -61,7 +62,12 @@ class Lines:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
         """Do nothing."""
 
     def note(self, text: str) -> None:
@@ -80,7 +86,8 @@ class Lines:
     def frame(self, index: int, last: int) -> None:
         """Write a line with the frame, its time and the last step's numbers."""
         self._write(
-            f"frame {index}/{last}  t {_number(self._row, 'time'):.4g} s  {describe(self._row)}  {time_left(self._progress)}"
+            f"frame {index}/{last}  t {_number(self._row, 'time'):.4g} s  {describe(self._row)}  "
+            f"{time_left(self._progress)}"
             if self._row
             else f"frame {index}/{last}"
         )
@@ -94,17 +101,31 @@ class Bar:
 
     def __init__(self, console: Console) -> None:
         text = TextColumn("{task.description}", table_column=Column(no_wrap=True))
-        bar = BarColumn(bar_width=None, table_column=Column(ratio=1))  # what the text leaves of the line
+        # what the text leaves of the line
+        bar = BarColumn(bar_width=None, table_column=Column(ratio=1))
         percent = TaskProgressColumn(table_column=Column(no_wrap=True, width=4))
         self._console = console
-        self._progress = Progress(bar, percent, text, console=console, refresh_per_second=4, expand=True, speed_estimate_period=WINDOW)
+        self._progress = Progress(
+            bar,
+            percent,
+            text,
+            console=console,
+            refresh_per_second=4,
+            expand=True,
+            speed_estimate_period=WINDOW,
+        )
         self._task = self._progress.add_task("first step: loading kernels", total=None)
 
     def __enter__(self) -> Self:
         self._progress.start()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
         """Leave the last state of the bar on the terminal."""
         self._progress.stop()
 
@@ -119,7 +140,9 @@ class Bar:
     def step(self, row: Mapping[str, Value]) -> None:
         """Show a step's numbers and the time left beside the bar."""
         self._progress.update(self._task, completed=_number(row, "time"))
-        self._progress.update(self._task, description=escape(f"{time_left(self._progress)}  {describe(row)}"))
+        self._progress.update(
+            self._task, description=escape(f"{time_left(self._progress)}  {describe(row)}")
+        )
 
     def frame(self, index: int, last: int) -> None:
         """Do nothing: the bar shows the time."""
@@ -137,10 +160,13 @@ class Count:
         clock: tells seconds.
     """
 
-    def __init__(self, console: Console, doing: str, things: str, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, console: Console, doing: str, things: str, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         self._console, self._doing, self._things, self._clock = console, doing, things, clock
         self._status = console.status(doing)
-        self._progress = Progress(console=console, get_time=clock, speed_estimate_period=WINDOW)  # never shown
+        # never shown
+        self._progress = Progress(console=console, get_time=clock, speed_estimate_period=WINDOW)
         self._task = self._progress.add_task("", total=None)
 
     def __enter__(self) -> Self:
@@ -148,7 +174,12 @@ class Count:
             self._status.start()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
         """Leave nothing of the line that changes."""
         self._status.stop()
 

@@ -50,7 +50,10 @@ class RankFrames:
         """
         make_folder(self.pieces, within=self.whole.folder)
         folders = [self.frames if isinstance(part, Volume) else self.pieces for part in frame]
-        return [self.whole.write_part(folder / f"{part.name}_{index:06d}", part) for folder, part in zip(folders, frame, strict=True)]
+        return [
+            self.whole.write_part(folder / f"{part.name}_{index:06d}", part)
+            for folder, part in zip(folders, frame, strict=True)
+        ]
 
     @on_root
     def resume(self, times: list[float]) -> None:
@@ -64,7 +67,11 @@ class RankFrames:
             ValueError: a field has another length than its points or cells.
         """
         images: Kind = self.whole.grid_format
-        return {part.name: describe(part, images if isinstance(part, Cells) else "vtu") for part in frame if not isinstance(part, Volume)}
+        return {
+            part.name: describe(part, images if isinstance(part, Cells) else "vtu")
+            for part in frame
+            if not isinstance(part, Volume)
+        }
 
     @on_root
     def publish(self, index: int, time: float, pieces: list[Pieces]) -> None:
@@ -79,8 +86,14 @@ class RankFrames:
             OSError: a file cannot be written.
         """
         for name in dict.fromkeys(name for those in pieces for name in those):
-            of_ranks = [(rank_folder(rank), those[name]) for rank, those in enumerate(pieces) if name in those]
-            found = [(f"{folder}/{name}_{index:06d}.{piece.kind}", piece) for folder, piece in of_ranks]
+            of_ranks = [
+                (rank_folder(rank), those[name])
+                for rank, those in enumerate(pieces)
+                if name in those
+            ]
+            found = [
+                (f"{folder}/{name}_{index:06d}.{piece.kind}", piece) for folder, piece in of_ranks
+            ]
             file = self.frames / f"{name}_{index:06d}.{WHOLE[found[0][1].kind]}"
             write_whole(file, found)
             self.whole.collect(name, time, file)
@@ -103,7 +116,11 @@ class RankFrameWriter:
 
     def __init__(self, frames: RankFrames, watch: Stopwatch) -> None:
         self.newest: int | None = None
-        self._frames, self._collective, self._mine = frames, frames.collective, FrameWriter(frames, watch)
+        self._frames, self._collective, self._mine = (
+            frames,
+            frames.collective,
+            FrameWriter(frames, watch),
+        )
         self._waiting: deque[tuple[int, float, list[Pieces]]] = deque()
 
     def put(self, index: int, time: float, frame: list[Part]) -> None:
@@ -142,14 +159,22 @@ class RankFrameWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
         """End the thread, as `FrameWriter` does."""
         self._mine.end()
         if kind is None:
             self.flush()
 
     def _publish(self) -> None:
-        done = min(-1 if written is None else written for written in self._collective.exchange(self._mine.newest))
+        done = min(
+            -1 if written is None else written
+            for written in self._collective.exchange(self._mine.newest)
+        )
         while self._waiting and self._waiting[0][0] <= done:
             index, time, pieces = self._waiting.popleft()
             self._frames.publish(index, time, pieces)

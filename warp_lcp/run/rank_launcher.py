@@ -33,9 +33,12 @@ from warp_lcp.scene.table import written
 from warp_lcp.simulation import InputError, SimulationFailed, StepFailed
 
 PLANNED = (OSError, InputError, StepFailed, SimulationFailed)
-SIZES = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "SLURM_STEP_NUM_TASKS")  # how many processes mpiexec or srun has started, as it tells them
+# how many processes mpiexec or srun has started, as it tells them
+SIZES = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "SLURM_STEP_NUM_TASKS")
 SHOWN = 4  # differences in one message
-PARTING = 60  # seconds in which a process that has done its part ends, while PETSc and MPI meet the others for the last time
+# seconds in which a process that has done its part ends, while PETSc and MPI meet the others for
+# the last time
+PARTING = 60
 
 
 class RankLauncher(Launcher):
@@ -52,19 +55,26 @@ class RankLauncher(Launcher):
         if not ranks.is_root:
             wp.config.log_level = wp.LOG_ERROR
         self.collective: Collective = Collective(ranks, PLANNED, self._last_words)
-        self.watchdog = self.collective.watchdog = Watchdog(ranks, rank_timeout, self.collective.end_all)
+        self.watchdog = self.collective.watchdog = Watchdog(
+            ranks, rank_timeout, self.collective.end_all
+        )
         self._folder: Path | None = None
 
-    def load(self, scene: str | None, overrides: Sequence[str], options: Mapping[str, Any]) -> GivenScene:
+    def load(
+        self, scene: str | None, overrides: Sequence[str], options: Mapping[str, Any]
+    ) -> GivenScene:
         """Return a scene that is the same on all ranks.
 
         Raises:
             SceneError: listing everything that is wrong.
-            OutputError: ranks were started with different scenes or options; the message names what differs.
+            OutputError: ranks were started with different scenes or options; the message names what
+                differs.
         """
         with self.collective.together():
             given = super().load(scene, overrides, options)
-            meshes = {f"the content of {key}": value for key, value in mesh_digests(given.scene).items()}
+            meshes = {
+                f"the content of {key}": value for key, value in mesh_digests(given.scene).items()
+            }
         self.agree({**options, **keys(given.scene), **meshes})
         return given
 
@@ -79,14 +89,24 @@ class RankLauncher(Launcher):
             try:
                 return device_of_rank(self.collective.ranks, name)
             except ValueError as error:
-                raise DeviceError(str(error).removesuffix(f" (rank {self.collective.ranks.rank})")) from error  # the collective names it
+                # the collective names it
+                raise DeviceError(
+                    str(error).removesuffix(f" (rank {self.collective.ranks.rank})")
+                ) from error
 
     def place(self, device: str) -> str:
         """Return where the ranks work, in words."""
         size = self.collective.ranks.size
         return f"{size} rank{'s' if size > 1 else ''} ({device})"
 
-    def run(self, request: RunRequest, *, observer: Observer, stop: Callable[[], bool | str], profile: Profile | None) -> RunRecord:
+    def run(
+        self,
+        request: RunRequest,
+        *,
+        observer: Observer,
+        stop: Callable[[], bool | str],
+        profile: Profile | None,
+    ) -> RunRecord:
         """Simulate a scene on all ranks, as `run_scene` does.
 
         If MPI aborts, run.json records it.
@@ -100,18 +120,34 @@ class RankLauncher(Launcher):
         Raises:
             OutputError: they were not; the message names what differs.
         """
-        digests = self.collective.exchange(hashlib.blake2b(pickle.dumps(sorted(given.items(), key=lambda item: item[0]))).digest())
+        digests = self.collective.exchange(
+            hashlib.blake2b(pickle.dumps(sorted(given.items(), key=lambda item: item[0]))).digest()
+        )
         if digests.count(digests[0]) == len(digests):
             return
         everyone = self.collective.exchange(dict(given))
-        names = sorted({name for values in everyone for name in values if any(other.get(name) != values[name] for other in everyone)})
+        names = sorted(
+            {
+                name
+                for values in everyone
+                for name in values
+                if any(other.get(name) != values[name] for other in everyone)
+            }
+        )
         lines = []
         for name in names[:SHOWN]:
-            rank = next(r for r, values in enumerate(everyone) if values.get(name) != everyone[0].get(name))
-            lines.append(f"{name}: {_shown(everyone[0].get(name))} on rank 0, {_shown(everyone[rank].get(name))} on rank {rank}")
+            rank = next(
+                r for r, values in enumerate(everyone) if values.get(name) != everyone[0].get(name)
+            )
+            lines.append(
+                f"{name}: {_shown(everyone[0].get(name))} on rank 0, "
+                f"{_shown(everyone[rank].get(name))} on rank {rank}"
+            )
         if len(names) > SHOWN:
             lines.append(f"and {len(names) - SHOWN} more")
-        raise OutputError("\n  ".join(["the ranks were started with different scenes or options", *lines]))
+        raise OutputError(
+            "\n  ".join(["the ranks were started with different scenes or options", *lines])
+        )
 
     def _last_words(self, text: str) -> None:
         """Say why all processes end now, and write it into run.json, which the root rank cannot do from inside MPI."""
@@ -119,7 +155,11 @@ class RankLauncher(Launcher):
         if self._folder is not None:
             lines = text.splitlines()
             who = f"rank {self.collective.ranks.rank}"
-            mark_ended(self._folder, "failed", f"{who}: {lines[-2]}" if "Traceback" in lines[0] else lines[0])
+            mark_ended(
+                self._folder,
+                "failed",
+                f"{who}: {lines[-2]}" if "Traceback" in lines[0] else lines[0],
+            )
 
 
 @contextmanager
@@ -144,11 +184,13 @@ def ranks_together(rank_timeout: float) -> Iterator[RankLauncher]:
     started = next((os.environ[name] for name in SIZES if name in os.environ), "1")
     if started != "1" and ranks.size == 1:
         raise EngineError(
-            f"--engine petsc: {started} processes were started, but mpi4py sees only one: the MPI libraries differ; use the mpiexec "
+            f"--engine petsc: {started} processes were started, but mpi4py sees only one: the MPI "
+            "libraries differ; use the mpiexec "
             "of the MPI that mpi4py was built with, or the matching --mpi option of srun"
         )
     if ranks.size > 1:
-        atexit.register(signal.alarm, PARTING)  # Python's threads have ended by then: the system's own clock ends what does not
+        # Python's threads have ended by then: the system's own clock ends what does not
+        atexit.register(signal.alarm, PARTING)
     try:
         launcher = RankLauncher(ranks, rank_timeout)
         with launcher.watchdog, launcher.collective.together():

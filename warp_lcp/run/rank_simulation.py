@@ -10,7 +10,18 @@ import numpy as np
 
 from warp_lcp.distributed.collective import Collective, RankFailed
 from warp_lcp.run.log import Value
-from warp_lcp.simulation import Cells, Joined, Measured, NoStopwatch, Part, Profiled, Scheduled, SimulationFailed, StepFailed, Stopwatch
+from warp_lcp.simulation import (
+    Cells,
+    Joined,
+    Measured,
+    NoStopwatch,
+    Part,
+    Profiled,
+    Scheduled,
+    SimulationFailed,
+    StepFailed,
+    Stopwatch,
+)
 
 Corners = tuple[tuple[int, int, int], tuple[int, int, int]]
 
@@ -75,7 +86,8 @@ class RankSimulation:
         except RankFailed as error:
             raise self._collective.told_as(SimulationFailed(str(error))) from error
         except StepFailed as error:
-            if len(self._collective.failed) < self._collective.ranks.size:  # the others have gone on: there is no state to try again from
+            # the others have gone on: there is no state to try again from
+            if len(self._collective.failed) < self._collective.ranks.size:
                 raise SimulationFailed(f"{error} (but not on all ranks)") from error
             raise
         self.time, self.step_count = self._simulation.time, self._simulation.step_count
@@ -88,7 +100,10 @@ class RankSimulation:
     def frame(self) -> list[Part]:
         """Return this rank's pieces of a frame, with their place in the grid."""
         with self._collective.together():
-            return [replace(part, box=part.box or self._box) if isinstance(part, Cells) else part for part in self._simulation.frame()]
+            return [
+                replace(part, box=part.box or self._box) if isinstance(part, Cells) else part
+                for part in self._simulation.frame()
+            ]
 
     def state(self) -> dict[str, np.ndarray]:
         """Return this rank's piece of the state."""

@@ -9,8 +9,10 @@ from warp_lcp.run.log import Value
 from warp_lcp.scene.scene import Time
 from warp_lcp.simulation import Scheduled, Simulation, SimulationFailed, StepFailed
 
-RETRIES = 6  # halvings of dt: a step 64 times shorter that still fails has another cause than its length
-SHARE = 0.25  # of a step: what starts or stops closer to a step's end than that makes no step of its own
+# halvings of dt: a step 64 times shorter that still fails has another cause than its length
+RETRIES = 6
+# of a step: what starts or stops closer to a step's end than that makes no step of its own
+SHARE = 0.25
 
 
 def stable_dt(simulation: Simulation) -> float:
@@ -21,7 +23,9 @@ def stable_dt(simulation: Simulation) -> float:
     """
     stable = simulation.stable_dt()
     if math.isnan(stable):
-        raise SimulationFailed(f"step {simulation.step_count + 1}: the stable time step is not a number")
+        raise SimulationFailed(
+            f"step {simulation.step_count + 1}: the stable time step is not a number"
+        )
     return stable
 
 
@@ -30,9 +34,10 @@ def plan_dt(stable: float, remaining: float, time: Time, events: Sequence[float]
 
     It ends on the frame's time and never leaves a sliver before it.
 
-    It depends on nothing but the state, so a run that was interrupted takes the same steps. The last two steps before a frame or an event
-    are equal; they may be shorter than dt_min. Steps run across events that are closer than SHARE dt to now or to the frame, and of several
-    within dt across all but the last.
+    It depends on nothing but the state, so a run that was interrupted takes the same steps. The
+    last two steps before a frame or an event are equal; they may be shorter than dt_min. Steps run
+    across events that are closer than SHARE dt to now or to the frame, and of several within dt
+    across all but the last.
 
     Args:
         stable: what the CFL number allows [s].
@@ -48,7 +53,9 @@ def plan_dt(stable: float, remaining: float, time: Time, events: Sequence[float]
     return ahead / 2 if ahead < 2 * dt else dt
 
 
-def take_step(simulation: Simulation, stable: float, end: float, time: Time) -> tuple[float, int, dict[str, Value]]:
+def take_step(
+    simulation: Simulation, stable: float, end: float, time: Time
+) -> tuple[float, int, dict[str, Value]]:
     """Take a step, with half its length if it fails.
 
     Returns its length [s], the number of halvings and the log columns.
@@ -72,5 +79,7 @@ def take_step(simulation: Simulation, stable: float, end: float, time: Time) -> 
         except StepFailed as error:
             if retries == RETRIES or dt / 2 < time.dt_min:
                 number = simulation.step_count + 1
-                raise StepFailed(f"step {number} at t = {now:.6g} s, dt = {dt:.3g} s, retries {retries}: {error}") from error
+                raise StepFailed(
+                    f"step {number} at t = {now:.6g} s, dt = {dt:.3g} s, retries {retries}: {error}"
+                ) from error
             retries, dt = retries + 1, dt / 2

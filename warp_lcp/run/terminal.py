@@ -18,7 +18,8 @@ from warp_lcp.files.claims import one_line, visible
 from warp_lcp.run.kernel_cache import KernelCacheError
 
 FREE_TEXT = "--set"  # its values may be arrays of several lines
-Refusal: Any = typer.BadParameter.__mro__[2]  # click's ClickException, which new versions of typer have inside them
+# click's ClickException, which new versions of typer have inside them
+Refusal: Any = typer.BadParameter.__mro__[2]
 
 
 class Terminal(Console):
@@ -39,8 +40,14 @@ class Commands(TyperGroup):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Refuse control characters in arguments."""
         for before, argument in zip(["", *args], args, strict=False):
-            if before != FREE_TEXT and not argument.startswith(f"{FREE_TEXT}=") and any(c < " " or c == "\x7f" for c in argument):
-                raise typer.BadParameter(f"{one_line(argument)}: holds control characters; choose another name", ctx)
+            if (
+                before != FREE_TEXT
+                and not argument.startswith(f"{FREE_TEXT}=")
+                and any(c < " " or c == "\x7f" for c in argument)
+            ):
+                raise typer.BadParameter(
+                    f"{one_line(argument)}: holds control characters; choose another name", ctx
+                )
         return super().parse_args(ctx, args)
 
     def main(self, *arguments: Any, **options: Any) -> Any:
@@ -66,7 +73,9 @@ class Commands(TyperGroup):
             error.message = visible(error.message)
             raise
         except (KernelCacheError, KeyboardInterrupt) as error:
-            tell(error if isinstance(error, KernelCacheError) else "stopped: interrupted", error=True)
+            tell(
+                error if isinstance(error, KernelCacheError) else "stopped: interrupted", error=True
+            )
             raise typer.Exit(1) from error
 
 
@@ -82,9 +91,15 @@ def tell(text: object, *, error: bool = False) -> None:
         typer.echo(visible(str(text)), err=error)
 
 
-def table_lines(header: Iterable[str], rows: Iterable[Iterable[str]], *, left: Iterable[int] = (0,)) -> str:
+def table_lines(
+    header: Iterable[str], rows: Iterable[Iterable[str]], *, left: Iterable[int] = (0,)
+) -> str:
     """Return a table as text with aligned columns; those of `left` are left-aligned."""
-    table = Table(*(Column(name, justify="left" if i in left else "right") for i, name in enumerate(header)), box=None, pad_edge=False)
+    table = Table(
+        *(Column(name, justify="left" if i in left else "right") for i, name in enumerate(header)),
+        box=None,
+        pad_edge=False,
+    )
     for row in rows:
         table.add_row(*(Text(cell) for cell in row))
     with (console := Console(width=1000)).capture() as text:

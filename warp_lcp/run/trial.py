@@ -23,7 +23,9 @@ FRONT = 99.0  # percentile of the particles that the front is of
 LEAST, MOST = 3, 30  # steps that `step_seconds` measures
 ENOUGH = 2.0  # seconds of them, LEAST apart
 LOOKS = 6  # at the most: frames that are compared
-BIN = 2.0  # cells: the edge of the boxes that densities are compared in, so that particles' own noise averages out
+# cells: the edge of the boxes that densities are compared in, so that particles' own noise averages
+# out
+BIN = 2.0
 
 
 @dataclass(frozen=True)
@@ -48,15 +50,19 @@ class Trial:
     """Time and results of the first frames of a run.
 
     Attributes:
-        seconds: of the steps, frames not counted. On the CPU those of the process, which other programs disturb least.
+        seconds: of the steps, frames not counted. On the CPU those of the process, which other
+            programs disturb least.
         steps: taken.
         iterations: of the method, in all steps.
         linear_iterations: on the finest grid, in all steps.
         looks: at the start and then at equal distances in time.
         residual: the largest relative residual of a step, coupled residual of sand.
-        volume: at the start of the first step and of the last [m^3; 2-D: m^2]; None: the log has no volume.
-        packing: the most of a cell at the start of a step, in units of the densest packing; None: the log does not say.
-        penetration: share of the particles that have ended inside solids or walls; None: the simulation does not tell.
+        volume: at the start of the first step and of the last [m^3; 2-D: m^2]; None: the log has no
+            volume.
+        packing: the most of a cell at the start of a step, in units of the densest packing; None:
+            the log does not say.
+        penetration: share of the particles that have ended inside solids or walls; None: the
+            simulation does not tell.
     """
 
     seconds: float
@@ -72,7 +78,11 @@ class Trial:
     @property
     def volume_drift(self) -> float | None:
         """Return by how much the volume has grown, relative; None: it is not known."""
-        return None if self.volume is None or self.volume[0] == 0.0 else self.volume[1] / self.volume[0] - 1.0
+        return (
+            None
+            if self.volume is None or self.volume[0] == 0.0
+            else self.volume[1] / self.volume[0] - 1.0
+        )
 
     def distance(self, reference: Trial) -> float:
         """Return the displaced fraction of the mass relative to a reference run.
@@ -85,20 +95,29 @@ class Trial:
         shares = []
         for own, other in zip(self.looks[1:], reference.looks[1:], strict=True):
             if own.mass.shape != other.mass.shape or abs(own.time - other.time) > SAME_TIME:
-                raise ValueError("the two runs were sampled in different boxes or at different times")
+                raise ValueError(
+                    "the two runs were sampled in different boxes or at different times"
+                )
             total = float(other.mass.sum())
-            shares.append(0.5 * float(np.abs(own.mass - other.mass).sum()) / total if total > 0.0 else 0.0)
+            shares.append(
+                0.5 * float(np.abs(own.mass - other.mass).sum()) / total if total > 0.0 else 0.0
+            )
         return float(np.mean(shares))
 
     def energy_error(self, reference: Trial) -> float:
         """Return the largest energy difference over the reference's largest energy."""
         scale = max(abs(look.energy) for look in reference.looks)
-        differences = [abs(a.energy - b.energy) for a, b in zip(self.looks, reference.looks, strict=True)]
+        differences = [
+            abs(a.energy - b.energy) for a, b in zip(self.looks, reference.looks, strict=True)
+        ]
         return max(differences) / scale if scale > 0.0 else 0.0
 
     def volume_error(self, reference: Trial) -> float:
         """Return the difference of volume growth or packing to a reference; 0: unknown."""
-        for own, other in ((self.volume_drift, reference.volume_drift), (self.packing, reference.packing)):
+        for own, other in (
+            (self.volume_drift, reference.volume_drift),
+            (self.packing, reference.packing),
+        ):
             if own is not None and other is not None:
                 return abs(own - other)
         return 0.0
@@ -116,7 +135,12 @@ def look_times(scene: Scene, frames: int) -> list[float]:
 
 
 def trial(
-    scene: Scene, *, device: str, frames: int, box: float | None = None, inspect: Callable[[Simulation], object] | None = None
+    scene: Scene,
+    *,
+    device: str,
+    frames: int,
+    box: float | None = None,
+    inspect: Callable[[Simulation], object] | None = None,
 ) -> Trial:
     """Run a scene's first frames.
 
@@ -161,17 +185,27 @@ class _Trial:
                 looks.append(self._look())
         volumes = self._known("volume")
         return Trial(
-            self.seconds, len(self.rows), self._sum("solve_iterations"), self._sum("linear_iterations"), tuple(looks),
+            self.seconds,
+            len(self.rows),
+            self._sum("solve_iterations"),
+            self._sum("linear_iterations"),
+            tuple(looks),
             volume=(volumes[0], volumes[-1]) if volumes else None,
-            residual=self._most("coupled_residual" if "coupled_residual" in self.rows[-1] else "solve_residual") or 0.0,
-            packing=self._most("max_fraction"), penetration=self._penetration(),
-        )  # fmt: skip
+            residual=self._most(
+                "coupled_residual" if "coupled_residual" in self.rows[-1] else "solve_residual"
+            )
+            or 0.0,
+            packing=self._most("max_fraction"),
+            penetration=self._penetration(),
+        )
 
     def _step(self, end: float) -> None:
         """Take a step towards a time [s], as a run does."""
         clock_of = clock.perf_counter if wp.get_device(self.device).is_cuda else clock.process_time
         begun = clock_of()
-        self.rows.append(take_step(self.simulation, stable_dt(self.simulation), end, self.scene.time)[2])
+        self.rows.append(
+            take_step(self.simulation, stable_dt(self.simulation), end, self.scene.time)[2]
+        )
         wp.synchronize_device(self.device)
         self.seconds += clock_of() - begun
 
@@ -180,18 +214,36 @@ class _Trial:
         energy = float(row.get("kinetic_energy") or 0.0) + float(row.get("potential_energy") or 0.0)
         front = float(np.percentile(points[:, 0], FRONT)) if len(points) else 0.0
         dimension, size = self.scene.dimension, self.scene.domain.size
-        return Look(self.simulation.time, float(row.get("mass") or 0.0) * spread(points[:, :dimension], size, self.box), energy, front)
+        return Look(
+            self.simulation.time,
+            float(row.get("mass") or 0.0) * spread(points[:, :dimension], size, self.box),
+            energy,
+            front,
+        )
 
     def _points(self) -> np.ndarray:
-        points = next((part.points for part in self.simulation.frame() if isinstance(part, Points)), None)
+        points = next(
+            (part.points for part in self.simulation.frame() if isinstance(part, Points)), None
+        )
         if points is None:
-            raise SceneError(self.scene.scene.name, [KeyFault("scene.simulator", "has no particles, which the comparison of runs needs")])
+            raise SceneError(
+                self.scene.scene.name,
+                [
+                    KeyFault(
+                        "scene.simulator", "has no particles, which the comparison of runs needs"
+                    )
+                ],
+            )
         return points
 
     def _penetration(self) -> float | None:
         boundary = getattr(self.simulation, "boundary", None)
         points = self._points()
-        return None if boundary is None or not len(points) else 1.0 - float(np.mean(boundary.admits(points)))
+        return (
+            None
+            if boundary is None or not len(points)
+            else 1.0 - float(np.mean(boundary.admits(points)))
+        )
 
     def _sum(self, name: str) -> int:
         return sum(int(row.get(name) or 0) for row in self.rows)
@@ -224,9 +276,14 @@ def spread(points: np.ndarray, size: Sequence[float], box: float) -> np.ndarray:
     upper = at - low
     for corner in range(2**dimension):
         ends = [corner >> axis & 1 for axis in range(dimension)]
-        weight = np.prod([upper[:, axis] if end else 1.0 - upper[:, axis] for axis, end in enumerate(ends)], axis=0)
+        weight = np.prod(
+            [upper[:, axis] if end else 1.0 - upper[:, axis] for axis, end in enumerate(ends)],
+            axis=0,
+        )
         where = [np.clip(low[:, axis] + end, 0, counts[axis] - 1) for axis, end in enumerate(ends)]
-        shares += np.bincount(np.ravel_multi_index(where, counts), weights=weight, minlength=shares.size).reshape(counts)
+        shares += np.bincount(
+            np.ravel_multi_index(where, counts), weights=weight, minlength=shares.size
+        ).reshape(counts)
     return shares / len(points)
 
 
@@ -244,16 +301,21 @@ class Differences:
 
     def miss(self, own: Trial, reference: Trial) -> float:
         """Return the larger ratio of a difference to its bound: at most 1 within both."""
-        return max(own.distance(reference) / self.distance, own.volume_error(reference) / self.volume)
+        return max(
+            own.distance(reference) / self.distance, own.volume_error(reference) / self.volume
+        )
 
     def beside(self, noise: Differences) -> Differences:
         """Return the bounds for a difference plus an independent noise.
 
         Both add in quadrature.
 
-        Their squares do: a run that lies a bound from the mean of runs as good as the reference lies so far from one of them.
+        Their squares do: a run that lies a bound from the mean of runs as good as the reference
+        lies so far from one of them.
         """
-        return Differences(math.hypot(self.distance, noise.distance), math.hypot(self.volume, noise.volume))
+        return Differences(
+            math.hypot(self.distance, noise.distance), math.hypot(self.volume, noise.volume)
+        )
 
 
 def spread_of(references: Sequence[Trial]) -> Differences:
@@ -262,7 +324,10 @@ def spread_of(references: Sequence[Trial]) -> Differences:
     Nothing can be shown to be nearer to one of them.
     """
     pairs = list(itertools.combinations(references, 2))
-    distance, volume = (max((of(b, a) for a, b in pairs), default=0.0) for of in (Trial.distance, Trial.volume_error))
+    distance, volume = (
+        max((of(b, a) for a, b in pairs), default=0.0)
+        for of in (Trial.distance, Trial.volume_error)
+    )
     return Differences(distance, volume)
 
 
@@ -271,9 +336,10 @@ def step_seconds(scene: Scene, *, device: str) -> tuple[float, int]:
 
     Of the first steps except the very first.
 
-    They are those of a run: a step that fails is tried again with a shorter dt, and none follows the last frame's but the second.
-    Later steps depend on where the liquid goes. Measured on a CPU for dam-break-2d, dam-break, mesh-obstacle and splash-in-circle:
-    9 % above to 16 % below the mean of all steps of a run, 10 to 24 % below its time a step with frames and checkpoints.
+    They are those of a run: a step that fails is tried again with a shorter dt, and none follows
+    the last frame's but the second. Later steps depend on where the liquid goes. Measured on a CPU
+    for dam-break-2d, dam-break, mesh-obstacle and splash-in-circle: 9 % above to 16 % below the
+    mean of all steps of a run, 10 to 24 % below its time a step with frames and checkpoints.
 
     Raises:
         SceneError: the scene cannot be simulated.

@@ -18,11 +18,16 @@ from warp_lcp.scene.scene_file import HEADER, dump_scene
 from warp_lcp.scene.table import KeyFault, SceneError
 from warp_lcp.simulation import SimulationFailed, StepFailed
 
-FRAMES = 18  # of the calibration, unless asked for otherwise: that many `warp-lcp bench tradeoff` compares
+# of the calibration, unless asked for otherwise: that many `warp-lcp bench tradeoff` compares
+FRAMES = 18
 CLOSE = 1.25  # settings that take at most so many times the shortest time are timed again, in turns
-SAME = 1.05  # times the shortest, or the nearest: noise of what was measured; among such times the nearer to the reference is taken
+# times the shortest, or the nearest: noise of what was measured; among such times the nearer to the
+# reference is taken
+SAME = 1.05
 ROUNDS = 2  # more timings of those
-TWINS = (0.9, 0.8)  # times the steps of the reference: runs as good as it, whose distances from each other say how sure it is
+# times the steps of the reference: runs as good as it, whose distances from each other say how sure
+# it is
+TWINS = (0.9, 0.8)
 TWICE = 1.7  # times the steps, about: the steps of a frame are whole numbers
 CORRECTED_EVERY = (4, 2, 1)  # steps between two density corrections, where the scene has them
 
@@ -56,9 +61,12 @@ class Tuning:
         scene: with the settings chosen.
         chosen: those settings and what they take.
         preset: whose bounds the accuracy is.
-        bounds: what runs were held to: those of the preset, or, with an unsure reference, of what is measured beside its noise.
-        limit: how many times those a run may differ: 1, or, where nothing tried is within them, hardly more than the nearest does.
-        noise: what runs as good as the reference differ by; None: it was not asked, for some settings are within the preset's own bounds.
+        bounds: what runs were held to: those of the preset, or, with an unsure reference, of what
+            is measured beside its noise.
+        limit: how many times those a run may differ: 1, or, where nothing tried is within them,
+            hardly more than the nearest does.
+        noise: what runs as good as the reference differ by; None: it was not asked, for some
+            settings are within the preset's own bounds.
         reference: the run that the others were compared with.
         tried: all settings that ran, in the order of the trials.
         failed: settings whose run ended, and why.
@@ -83,22 +91,45 @@ class Tuning:
 
     def verdict(self, accuracy: str) -> list[str]:
         """Return the result in words: settings, accuracy, missed bounds and a remedy."""
-        best, asked, volume = self.chosen, self.preset, self.chosen.trial.volume_error(self.reference)
+        best, asked, volume = (
+            self.chosen,
+            self.preset,
+            self.chosen.trial.volume_error(self.reference),
+        )
         words = f"{best.words()}: {best.seconds:.3g} s"
-        found = f"distance {best.distance:.4f} (at most {asked.distance:g}), volume or packing {volume:.3f} (at most {asked.volume:g})"
+        found = (
+            f"distance {best.distance:.4f} (at most {asked.distance:g}), volume or packing "
+            f"{volume:.3f} (at most {asked.volume:g})"
+        )
         if self.noise is None:
             return [f"{accuracy}: {words}", found]
-        differences = (("distance", best.distance, asked.distance), ("volume or packing", volume, asked.volume))
-        missed = ", ".join(f"{name} by a factor of {own / most:.2g}" for name, own, most in differences if own > most)
-        unsure = f"runs as accurate as the reference differ by {self.noise.distance:.4f} and {self.noise.volume:.3f}"
+        differences = (
+            ("distance", best.distance, asked.distance),
+            ("volume or packing", volume, asked.volume),
+        )
+        missed = ", ".join(
+            f"{name} by a factor of {own / most:.2g}"
+            for name, own, most in differences
+            if own > most
+        )
+        unsure = (
+            f"runs as accurate as the reference differ by {self.noise.distance:.4f} and "
+            f"{self.noise.volume:.3f}"
+        )
         if self.met:
             return [
                 f"within the noise of the reference, but not {accuracy}: {words}",
                 found,
                 f"bounds missed: {missed}; but {unsure}: smaller errors cannot be measured",
-                "runs diverge this far with any settings in these frames: use fewer --frames to compare earlier times",
+                "runs diverge this far with any settings in these frames: use fewer --frames to "
+                "compare earlier times",
             ]
-        return [f"nearest of the settings tried, but not {accuracy}: {words}", found, f"bounds missed: {missed}; {unsure}", self._remedy()]
+        return [
+            f"nearest of the settings tried, but not {accuracy}: {words}",
+            found,
+            f"bounds missed: {missed}; {unsure}",
+            self._remedy(),
+        ]
 
     def _remedy(self) -> str:
         """Return what would help, by what shorter steps brought at the fine end of those tried."""
@@ -107,43 +138,79 @@ class Tuning:
         if not coarser:
             return "shorter steps than those tried, or a higher domain.resolution, may help"
         next_one = max(coarser, key=lambda c: c.trial.steps)
-        times, nearer = finest.trial.steps / next_one.trial.steps, finest.distance / next_one.distance
+        times, nearer = (
+            finest.trial.steps / next_one.trial.steps,
+            finest.distance / next_one.distance,
+        )
         if nearer * TWICE <= 1.0:
             return "the distance decreases with the step: shorter steps than those tried would help"
         return (
-            f"{times:.2g} times as many steps left {100.0 * nearer:.0f} % of the distance; if the step were the cause, it would be "
+            f"{times:.2g} times as many steps left {100.0 * nearer:.0f} % of the distance; if the "
+            "step were the cause, it would be "
             "half or less: increase domain.resolution instead"
         )
 
     def rows(self) -> list[tuple[str, ...]]:
         """Return a table of what was tried: settings, seconds, steps and distance.
 
-        Also the differences of energy (relative) and front from the reference, the growth of the volume, or how densely sand was packed.
+        Also the differences of energy (relative) and front from the reference, the growth of the
+        volume, or how densely sand was packed.
         """
         packed = self.reference.packing is not None
         rows: list[tuple[str, ...]] = [
-            ("seconds", "steps", "distance", "energy", "front [m]", "packing" if packed else "volume", "settings")
+            (
+                "seconds",
+                "steps",
+                "distance",
+                "energy",
+                "front [m]",
+                "packing" if packed else "volume",
+                "settings",
+            )
         ]
         for c in self.tried:
-            energy, front = c.trial.energy_error(self.reference), c.trial.front_error(self.reference)
-            last = f"{c.trial.packing or 0.0:.3f}" if packed else f"{c.trial.volume_drift or 0.0:+.3f}"
-            rows.append((f"{c.seconds:.3g}", str(c.trial.steps), f"{c.distance:.4f}", f"{energy:.3f}", f"{front:+.3f}", last, c.words()))
+            energy, front = (
+                c.trial.energy_error(self.reference),
+                c.trial.front_error(self.reference),
+            )
+            last = (
+                f"{c.trial.packing or 0.0:.3f}" if packed else f"{c.trial.volume_drift or 0.0:+.3f}"
+            )
+            rows.append(
+                (
+                    f"{c.seconds:.3g}",
+                    str(c.trial.steps),
+                    f"{c.distance:.4f}",
+                    f"{energy:.3f}",
+                    f"{front:+.3f}",
+                    last,
+                    c.words(),
+                )
+            )
         return rows
 
 
 def tune(
-    scene: Scene, *, accuracy: PresetName, device: str, frames: int = FRAMES, say: Callable[[str], object] = lambda text: None
+    scene: Scene,
+    *,
+    accuracy: PresetName,
+    device: str,
+    frames: int = FRAMES,
+    say: Callable[[str], object] = lambda text: None,
 ) -> Tuning:
     """Measure which settings take the least time for an accuracy.
 
-    An accuracy bounds the distance from a reference run at the same resolution, and the volume's difference from it: those of the preset of
-    its name, see `warp_lcp.scene.presets`. Longer time steps take less time and lie further away, so the longest that meets the bounds
-    is found by bisection, with the preset's tolerance; then the loosest tolerance, and the rarest density correction, that keep them. The
-    fastest few are timed again in turns.
+    An accuracy bounds the distance from a reference run at the same resolution, and the volume's
+    difference from it: those of the preset of its name, see `warp_lcp.scene.presets`. Longer time
+    steps take less time and lie further away, so the longest that meets the bounds is found by
+    bisection, with the preset's tolerance; then the loosest tolerance, and the rarest density
+    correction, that keep them. The fastest few are timed again in turns.
 
-    Where none of the steps meets the bounds, runs as good as the reference, of slightly shorter steps, say how far the reference itself can
-    be trusted: at a coarse resolution a splash amplifies whatever it is given. Nothing can be shown to be nearer than they are to each
-    other, so the bounds then count beside that noise. What does not meet them even so ends with the fastest of the nearest settings.
+    Where none of the steps meets the bounds, runs as good as the reference, of slightly shorter
+    steps, say how far the reference itself can be trusted: at a coarse resolution a splash
+    amplifies whatever it is given. Nothing can be shown to be nearer than they are to each other,
+    so the bounds then count beside that noise. What does not meet them even so ends with the
+    fastest of the nearest settings.
 
     Args:
         scene: whose first frames are run, with everything that it says but for those settings.
@@ -160,7 +227,9 @@ def tune(
     prices = price_table().get(scene.scene.simulator)
     if prices is None:
         raise SceneError(scene.scene.name, [KeyFault("scene.simulator", "has no settings to tune")])
-    return _Search(scene, prices, prices.presets[accuracy], device, min(frames, scene.time.frame_count), say).run()
+    return _Search(
+        scene, prices, prices.presets[accuracy], device, min(frames, scene.time.frame_count), say
+    ).run()
 
 
 def write_tuned(path: Path, tuning: Tuning, accuracy: str, device: str) -> None:
@@ -196,11 +265,17 @@ class _Search:
         """Find the fastest settings within the bounds, or, where there are none, the fastest of the nearest."""
         self.reference = self._reference_run()
         self.say(f"reference: {self.reference.seconds:.3g} s, {self.reference.steps} steps")
-        self.bounds, self.limit, noise = Differences(self.preset.distance, self.preset.volume), 1.0, None
+        self.bounds, self.limit, noise = (
+            Differences(self.preset.distance, self.preset.volume),
+            1.0,
+            None,
+        )
         start = {key: value for key, value in self.preset.settings.items() if self._has(key)}
         step = self._longest_step(start)
         if not self.tried:
-            raise SimulationFailed(f"no settings ran to the end of frame {self.frames}: {self.failed[-1]}")
+            raise SimulationFailed(
+                f"no settings ran to the end of frame {self.frames}: {self.failed[-1]}"
+            )
         if step is None:
             noise = self._noise()
             self.bounds = self.bounds.beside(noise)
@@ -210,13 +285,25 @@ class _Search:
             self.limit, settings = SAME * self._miss(nearest), nearest.settings
         else:
             settings = {**start, **_step_settings(self.prices.steps[step])}
-        for key, values in (("solver.tolerance", self.prices.tolerances), ("density_correction.every", CORRECTED_EVERY)):
+        for key, values in (
+            ("solver.tolerance", self.prices.tolerances),
+            ("density_correction.every", CORRECTED_EVERY),
+        ):
             settings = self._loosest(settings, key, values)
         chosen = self._fastest([c for c in self.tried if self._miss(c) <= self.limit])
         tuned = changed(self.scene, chosen.settings)
         return Tuning(
-            tuned, chosen, self.preset, self.bounds, self.limit, noise, self.reference, self.tried, self.failed, self.frames
-        )  # fmt: skip
+            tuned,
+            chosen,
+            self.preset,
+            self.bounds,
+            self.limit,
+            noise,
+            self.reference,
+            self.tried,
+            self.failed,
+            self.frames,
+        )
 
     def _fastest(self, near: list[Candidate]) -> Candidate:
         """Return the fastest, once those close to it were timed again in turns."""
@@ -224,7 +311,9 @@ class _Search:
         close = [c for c in near if c.seconds <= CLOSE * shortest]
         for _ in range(ROUNDS if len(close) > 1 else 0):
             for c in close:
-                again = trial(changed(self.scene, c.settings), device=self.device, frames=self.frames)
+                again = trial(
+                    changed(self.scene, c.settings), device=self.device, frames=self.frames
+                )
                 c.seconds = min(c.seconds, again.seconds)
         shortest = min(c.seconds for c in close)
         return min((c for c in close if c.seconds <= SAME * shortest), key=lambda c: c.distance)
@@ -246,7 +335,10 @@ class _Search:
                 self.failed.append(f"reference with {part:g} times its steps: {error}")
                 self.say(self.failed[-1])
         noise = spread_of(references)
-        self.say(f"equally accurate runs differ by: distance {noise.distance:.4f}, volume or packing {noise.volume:.3f}")
+        self.say(
+            f"equally accurate runs differ by: distance {noise.distance:.4f}, volume or packing "
+            f"{noise.volume:.3f}"
+        )
         return noise
 
     def _miss(self, candidate: Candidate) -> float:
@@ -267,7 +359,9 @@ class _Search:
                 low = middle + 1
         return low if low < len(steps) else None
 
-    def _loosest(self, settings: dict[str, Any], key: str, values: tuple[float, ...]) -> dict[str, Any]:
+    def _loosest(
+        self, settings: dict[str, Any], key: str, values: tuple[float, ...]
+    ) -> dict[str, Any]:
         """Return the settings with the loosest of the values, loose ones first, that meets the bounds; as they are where none does."""
         for value in values:
             if not self._has(key) or value == settings.get(key):
@@ -294,7 +388,9 @@ class _Search:
             return None
         candidate = Candidate(settings, ran, ran.distance(self.reference), ran.seconds)
         self.tried.append(candidate)
-        self.say(f"{words}: {ran.seconds:.3g} s, {ran.steps} steps, distance {candidate.distance:.4f}")
+        self.say(
+            f"{words}: {ran.seconds:.3g} s, {ran.steps} steps, distance {candidate.distance:.4f}"
+        )
         return candidate
 
 

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 
 VIEW_ANGLE = 25.0  # degrees, over the height of an image
 MARGIN = 1.08  # of the image, over what is shown
-THREE_QUARTERS = np.array([0.55, 0.5, 1.0]) / np.linalg.norm([0.55, 0.5, 1.0])  # from the domain to the camera
+# from the domain to the camera
+THREE_QUARTERS = np.array([0.55, 0.5, 1.0]) / np.linalg.norm([0.55, 0.5, 1.0])
 Y_AXIS, Z_AXIS = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
 ROOM_KEYS, WINDOW_KEYS = ("position", "look_at", "up", "field_of_view"), ("low", "high")
 
@@ -24,14 +25,31 @@ ROOM_KEYS, WINDOW_KEYS = ("position", "look_at", "up", "field_of_view"), ("low",
 class Camera(Table):
     """[camera]: view of images; default: the whole domain."""
 
-    position: Vector | None = Field(default=None, description="position [m], 3-D; default: a view of the whole domain")
-    look_at: Vector | None = Field(default=None, description="center of the image [m], 3-D; default: the domain's center")
-    up: Vector | None = Field(default=None, description="up direction of the image, 3-D; default: y")
-    field_of_view: float | None = Field(
-        default=None, ge=1, le=120, description=f"vertical field of view [degrees], 3-D; default: {VIEW_ANGLE:g}"
+    position: Vector | None = Field(
+        default=None, description="position [m], 3-D; default: a view of the whole domain"
     )
-    low: Vector | None = Field(default=None, alias="min", description="lower corner of the image [m], 2-D; default: the domain's")
-    high: Vector | None = Field(default=None, alias="max", description="upper corner of the image [m], 2-D; default: the domain's")
+    look_at: Vector | None = Field(
+        default=None, description="center of the image [m], 3-D; default: the domain's center"
+    )
+    up: Vector | None = Field(
+        default=None, description="up direction of the image, 3-D; default: y"
+    )
+    field_of_view: float | None = Field(
+        default=None,
+        ge=1,
+        le=120,
+        description=f"vertical field of view [degrees], 3-D; default: {VIEW_ANGLE:g}",
+    )
+    low: Vector | None = Field(
+        default=None,
+        alias="min",
+        description="lower corner of the image [m], 2-D; default: the domain's",
+    )
+    high: Vector | None = Field(
+        default=None,
+        alias="max",
+        description="upper corner of the image [m], 2-D; default: the domain's",
+    )
 
     def complaints(self, dimension: int, size: list[float]) -> list[Complaint]:
         """Return errors of the camera in a domain of two or three sides [m]."""
@@ -41,11 +59,21 @@ class Camera(Table):
             if getattr(self, key) is not None:
                 allowed = ", ".join(type(self).model_fields[name].alias or name for name in right)
                 message = f"cannot be used in {dimension}-D; allowed are {allowed}"
-                found.append(Complaint((type(self).model_fields[key].alias or key,), getattr(self, key), message))
+                found.append(
+                    Complaint(
+                        (type(self).model_fields[key].alias or key,), getattr(self, key), message
+                    )
+                )
         for key in right:
             value = getattr(self, key)
             if isinstance(value, list) and len(value) != dimension:
-                found.append(Complaint((type(self).model_fields[key].alias or key,), value, f"must have {dimension} entries"))
+                found.append(
+                    Complaint(
+                        (type(self).model_fields[key].alias or key,),
+                        value,
+                        f"must have {dimension} entries",
+                    )
+                )
         if found:
             return found
         return self._window_complaints(size) if dimension == 2 else self._room_complaints(size)
@@ -56,7 +84,9 @@ class Camera(Table):
             return []
         return [
             Complaint(
-                ("max",) if self.high else ("min",), self.high or self.low, f"min = {low} must be less than max = {high} along both axes"
+                ("max",) if self.high else ("min",),
+                self.high or self.low,
+                f"min = {low} must be less than max = {high} along both axes",
             )
         ]
 
@@ -67,11 +97,22 @@ class Camera(Table):
         toward = np.subtract(self.position, self.look_at or np.multiply(size, 0.5))
         far = np.linalg.norm(toward)
         if far < 1e-6 * max(size):
-            return [Complaint(("position",), self.position, "must not be the point that the camera looks at")]
+            return [
+                Complaint(
+                    ("position",), self.position, "must not be the point that the camera looks at"
+                )
+            ]
         up = np.array(self.up or Y_AXIS)
         if np.linalg.norm(np.cross(up, toward)) <= 1e-3 * np.linalg.norm(up) * far:
-            return [Complaint(("up",), self.up, "must be given, and not be the direction that the camera looks in" if self.up is None else
-                              "must not be zero or the direction that the camera looks in")]  # fmt: skip
+            return [
+                Complaint(
+                    ("up",),
+                    self.up,
+                    "must be given, and not be the direction that the camera looks in"
+                    if self.up is None
+                    else "must not be zero or the direction that the camera looks in",
+                )
+            ]
         return []
 
 
@@ -118,17 +159,29 @@ def viewpoint(scene: Scene, aspect: float) -> Viewpoint:
     angle = camera.field_of_view or VIEW_ANGLE
     if camera.position is None:
         return view_around(low, high, THREE_QUARTERS, angle, aspect)
-    position, focus = np.array(camera.position), np.array(camera.look_at) if camera.look_at else 0.5 * (low + high)
+    position, focus = (
+        np.array(camera.position),
+        np.array(camera.look_at) if camera.look_at else 0.5 * (low + high),
+    )
     plain = Viewpoint(position, focus, np.array(camera.up or Y_AXIS), angle, aspect)
     return Viewpoint(position, focus, plain.axes[1], angle, aspect)
 
 
-def view_around(low: np.ndarray, high: np.ndarray, toward: np.ndarray, angle: float, aspect: float) -> Viewpoint:
+def view_around(
+    low: np.ndarray, high: np.ndarray, toward: np.ndarray, angle: float, aspect: float
+) -> Viewpoint:
     """Return the nearest viewpoint in a direction that shows all of a box [m]."""
-    return view_of_points(np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, 3), toward, angle, aspect)
+    return view_of_points(
+        np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, 3),
+        toward,
+        angle,
+        aspect,
+    )
 
 
-def view_of_points(points: np.ndarray, toward: np.ndarray, angle: float, aspect: float) -> Viewpoint:
+def view_of_points(
+    points: np.ndarray, toward: np.ndarray, angle: float, aspect: float
+) -> Viewpoint:
     """Return the nearest viewpoint in a direction that shows all points.
 
     Args:
@@ -143,7 +196,8 @@ def view_of_points(points: np.ndarray, toward: np.ndarray, angle: float, aspect:
     corners = points @ axes.T
     focus = corners.mean(axis=0)
     slope = math.tan(math.radians(angle / 2)) / MARGIN
-    for _ in range(5):  # what is near looks larger, so the middle of the image is not that of the points
+    # what is near looks larger, so the middle of the image is not that of the points
+    for _ in range(5):
         x, y, z = (corners - focus).T
         distance = max((z + np.abs(x) / (slope * aspect)).max(), (z + np.abs(y) / slope).max())
         seen = np.stack([x, y]) / (distance - z)

@@ -62,17 +62,36 @@ def prices(simulator: str, dimension: int) -> Mapping[str, Price]:
     Empty if nothing was measured.
     """
     read = tomllib.loads((files("warp_lcp.scene") / TABLE).read_text(encoding="utf-8"))
-    return {name: Price(**price) for name, price in read.get(simulator, {}).get(f"{dimension}d", {}).items()}
+    return {
+        name: Price(**price)
+        for name, price in read.get(simulator, {}).get(f"{dimension}d", {}).items()
+    }
 
 
-def predicted_seconds(models: Iterable[Model], listed: Mapping[str, Price], cells: int, particles: int) -> float:
+def predicted_seconds(
+    models: Iterable[Model], listed: Mapping[str, Price], cells: int, particles: int
+) -> float:
     """Return the estimated time of a step from the cost table [s]; 0: unknown."""
     counts = {"base": 1, **{model.name: model.count for model in models if model.built}}
-    return sum(n * listed[name].seconds(cells, particles) for name, n in counts.items() if name in listed) if "base" in listed else 0.0
+    return (
+        sum(
+            n * listed[name].seconds(cells, particles)
+            for name, n in counts.items()
+            if name in listed
+        )
+        if "base" in listed
+        else 0.0
+    )
 
 
 def model_lines(
-    models: Sequence[Model], listed: Mapping[str, Price], cells: int, particles: int, *, memory: int, measured: float | None = None
+    models: Sequence[Model],
+    listed: Mapping[str, Price],
+    cells: int,
+    particles: int,
+    *,
+    memory: int,
+    measured: float | None = None,
 ) -> list[tuple[str, str]]:
     """Return a line per model: reason, share of memory and of a step.
 
@@ -84,7 +103,8 @@ def model_lines(
         cells: of the domain.
         particles: at most.
         memory: of the whole run [bytes].
-        measured: how long a step takes here [s], which scales the list; None: as where it was measured.
+        measured: how long a step takes here [s], which scales the list; None: as where it was
+            measured.
     """
     predicted = predicted_seconds(models, listed, cells, particles)
     scale = measured / predicted if measured is not None and predicted > 0.0 else 1.0
@@ -96,9 +116,13 @@ def model_lines(
             share = 100.0 * model.count * price.bytes(cells, particles) / memory if memory else 0.0
             seconds = max(model.count * price.seconds(cells, particles), 0.0)
             part = 100.0 * seconds / predicted if predicted > 0.0 else 0.0
-            text += f"; {share:.0f} % of memory, {1e3 * scale * seconds:.2g} ms a step ({part:.0f} %)"
+            text += (
+                f"; {share:.0f} % of memory, {1e3 * scale * seconds:.2g} ms a step ({part:.0f} %)"
+            )
         lines.append(("model" if model.built else "not built", text))
     if predicted > 0.0:
         where = "here" if measured is not None else "by the cost table, on one core"
-        lines.append(("step", f"about {1e3 * scale * predicted:.3g} ms {where}, all models together"))
+        lines.append(
+            ("step", f"about {1e3 * scale * predicted:.3g} ms {where}, all models together")
+        )
     return lines

@@ -52,7 +52,9 @@ class PrescribedMotion(Table):
         return [
             Complaint((name,), value, f"must have {dimension} entries in {dimension}-D")
             for name, value in self
-            if name in ("velocity", "center", "amplitude") and value is not None and len(value) != dimension
+            if name in ("velocity", "center", "amplitude")
+            and value is not None
+            and len(value) != dimension
         ]
 
 
@@ -68,7 +70,9 @@ class TranslationMotion(PrescribedMotion):
         """Return the shift over time."""
         from warp_lcp.grid import motion
 
-        return motion.Translation(velocity=self.velocity, start=self.start, stop=_or_never(self.stop))
+        return motion.Translation(
+            velocity=self.velocity, start=self.start, stop=_or_never(self.stop)
+        )
 
 
 class RotationMotion(PrescribedMotion):
@@ -86,8 +90,12 @@ class RotationMotion(PrescribedMotion):
         from warp_lcp.grid import motion
 
         return motion.Rotation(
-            rate=self.rate, center=self.center, axis=_or_z(self.axis), start=self.start, stop=_or_never(self.stop)
-        )  # fmt: skip
+            rate=self.rate,
+            center=self.center,
+            axis=_or_z(self.axis),
+            start=self.start,
+            stop=_or_never(self.stop),
+        )
 
     def _size_complaints(self, dimension: int) -> list[Complaint]:
         return super()._size_complaints(dimension) + _axis_complaints(self.axis, dimension)
@@ -98,8 +106,12 @@ class SinusoidMotion(PrescribedMotion):
 
     kind: Literal["sinusoid"] = "sinusoid"
     period: Positive = Field(description="period [s]")
-    amplitude: Vector | None = Field(default=None, description="amplitude of the translation along each axis [m]")
-    phase: float = Field(default=0.0, description="[degrees]; at time 0, 0 is the middle, -90 an end")
+    amplitude: Vector | None = Field(
+        default=None, description="amplitude of the translation along each axis [m]"
+    )
+    phase: float = Field(
+        default=0.0, description="[degrees]; at time 0, 0 is the middle, -90 an end"
+    )
     angle: float | None = Field(default=None, description="amplitude of the rotation [degrees]")
     center: Vector | None = Field(default=None, description=CENTER)
     axis: Axis | None = Field(default=None, description=AXIS)
@@ -110,14 +122,20 @@ class SinusoidMotion(PrescribedMotion):
 
         zeros = [0.0] * dimension
         return motion.Sinusoid(
-            period=self.period, amplitude=self.amplitude or zeros, phase=self.phase,
-            angle=self.angle or 0.0, center=self.center or zeros, axis=_or_z(self.axis),
-        )  # fmt: skip
+            period=self.period,
+            amplitude=self.amplitude or zeros,
+            phase=self.phase,
+            angle=self.angle or 0.0,
+            center=self.center or zeros,
+            axis=_or_z(self.axis),
+        )
 
     def _size_complaints(self, dimension: int) -> list[Complaint]:
         found = super()._size_complaints(dimension)
         if self.angle is not None:
-            found += _center_complaints(self.center, "angle") + _axis_complaints(self.axis, dimension)
+            found += _center_complaints(self.center, "angle") + _axis_complaints(
+                self.axis, dimension
+            )
         elif self.amplitude is None:
             found.append(Complaint((), None, "a sinusoid needs amplitude, angle or both"))
         else:
@@ -135,19 +153,33 @@ class KeyframesMotion(PrescribedMotion):
     kind: Literal["keyframes"] = "keyframes"
     times: list[float] = Field(min_length=2, description="increasing times [s]")
     translate: list[Vector] | None = Field(default=None, description="translation at each time [m]")
-    rotate: list[Angles] | None = Field(default=None, description="rotation at each time [degrees]: a number in 2-D, [x, y, z] in 3-D")
+    rotate: list[Angles] | None = Field(
+        default=None,
+        description="rotation at each time [degrees]: a number in 2-D, [x, y, z] in 3-D",
+    )
     center: Vector | None = Field(default=None, description="fixed point of the rotation [m]")
-    interpolation: Literal["linear", "smooth"] = Field(default="linear", description="linear, or smooth: no jumps of velocity")
+    interpolation: Literal["linear", "smooth"] = Field(
+        default="linear", description="linear, or smooth: no jumps of velocity"
+    )
 
     def to_motion(self, dimension: int) -> motion.Motion:
         """Return shift and turn over time."""
         from warp_lcp.grid import motion
 
-        rotate = None if self.rotate is None else [angles[0] for angles in self.rotate] if dimension == 2 else self.rotate
+        rotate = (
+            None
+            if self.rotate is None
+            else [angles[0] for angles in self.rotate]
+            if dimension == 2
+            else self.rotate
+        )
         return motion.Keyframes(
-            times=self.times, translate=self.translate, rotate=rotate, center=self.center or [0.0] * dimension,
+            times=self.times,
+            translate=self.translate,
+            rotate=rotate,
+            center=self.center or [0.0] * dimension,
             smooth=self.interpolation == "smooth",
-        )  # fmt: skip
+        )
 
     def _size_complaints(self, dimension: int) -> list[Complaint]:
         found = super()._size_complaints(dimension)
@@ -159,9 +191,16 @@ class KeyframesMotion(PrescribedMotion):
             found += _center_complaints(self.center, "rotate")
         elif self.center is not None:
             found.append(Complaint(("center",), self.center, "has no effect without rotate"))
-        for name, rows, width in (("translate", self.translate, dimension), ("rotate", self.rotate, 1 if dimension == 2 else 3)):
+        for name, rows, width in (
+            ("translate", self.translate, dimension),
+            ("rotate", self.rotate, 1 if dimension == 2 else 3),
+        ):
             if rows is not None and len(rows) != len(self.times):
-                found.append(Complaint((name,), rows, f"must have {len(self.times)} entries, one for each time"))
+                found.append(
+                    Complaint(
+                        (name,), rows, f"must have {len(self.times)} entries, one for each time"
+                    )
+                )
             found += [
                 Complaint((name, index), row, f"must {counted(width)} in {dimension}-D")
                 for index, row in enumerate(rows or ())
@@ -170,7 +209,10 @@ class KeyframesMotion(PrescribedMotion):
         return found
 
 
-Motion = Annotated[TranslationMotion | RotationMotion | SinusoidMotion | KeyframesMotion, Field(discriminator="kind")]
+Motion = Annotated[
+    TranslationMotion | RotationMotion | SinusoidMotion | KeyframesMotion,
+    Field(discriminator="kind"),
+]
 
 
 def _or_never(stop: float | None) -> float:
@@ -183,9 +225,29 @@ def _or_z(axis: list[float] | None) -> list[float]:
 
 def _axis_complaints(axis: list[float] | None, dimension: int) -> list[Complaint]:
     if dimension == 2:
-        return [] if axis is None else [Complaint(("axis",), axis, "must be left out in 2-D, where solids turn about z")]
-    return [Complaint(("axis",), None, "is missing: the direction to turn about, such as [0.0, 1.0, 0.0]")] if axis is None else []
+        return (
+            []
+            if axis is None
+            else [Complaint(("axis",), axis, "must be left out in 2-D, where solids turn about z")]
+        )
+    return (
+        [
+            Complaint(
+                ("axis",), None, "is missing: the direction to turn about, such as [0.0, 1.0, 0.0]"
+            )
+        ]
+        if axis is None
+        else []
+    )
 
 
 def _center_complaints(center: list[float] | None, key: str) -> list[Complaint]:
-    return [Complaint(("center",), None, f"is missing: the point [m] to turn about, since there is {key}")] if center is None else []
+    return (
+        [
+            Complaint(
+                ("center",), None, f"is missing: the point [m] to turn about, since there is {key}"
+            )
+        ]
+        if center is None
+        else []
+    )

@@ -24,8 +24,10 @@ class Preset:
     """Accuracy and settings of a preset.
 
     Attributes:
-        distance: the largest share of the mass that may be elsewhere than in the simulator's reference run.
-        volume: the largest difference from that run in the growth of a liquid's volume, or in how densely sand is packed.
+        distance: the largest share of the mass that may be elsewhere than in the simulator's
+            reference run.
+        volume: the largest difference from that run in the growth of a liquid's volume, or in how
+            densely sand is packed.
         settings: the scene's keys that it gives values to, by `section.key`.
     """
 
@@ -57,9 +59,14 @@ def price_table() -> Mapping[str, Prices]:
     read = tomllib.loads((files("warp_lcp.scene") / TABLE).read_text(encoding="utf-8"))
     found = {}
     for simulator, part in read.items():
-        presets: dict[str, Preset] = {name: Preset(part[name]["distance"], part[name]["volume"], _flat(part[name])) for name in PRESETS}
+        presets: dict[str, Preset] = {
+            name: Preset(part[name]["distance"], part[name]["volume"], _flat(part[name]))
+            for name in PRESETS
+        }
         steps = tuple((cfl, dt_max) for cfl, dt_max in part["steps"])
-        found[simulator] = Prices(presets, _flat(part["reference"]), steps, tuple(part["tolerances"]))
+        found[simulator] = Prices(
+            presets, _flat(part["reference"]), steps, tuple(part["tolerances"])
+        )
     return found
 
 
@@ -88,7 +95,11 @@ def fill_in(model: type[Scene], data: Mapping[str, Any]) -> Mapping[str, Any]:
 def preset_values(scene: Scene, table: str) -> dict[str, Any]:
     """Return the values of a scene's preset for a table; empty without a preset."""
     prices, name = price_table().get(scene.scene.simulator), scene.solver.preset
-    return _nested(prices.presets[name].settings).get(table, {}) if prices is not None and name is not None else {}
+    return (
+        _nested(prices.presets[name].settings).get(table, {})
+        if prices is not None and name is not None
+        else {}
+    )
 
 
 def preset_line(scene: Scene) -> str | None:
@@ -100,11 +111,21 @@ def preset_line(scene: Scene) -> str | None:
     prices = price_table().get(scene.scene.simulator)
     if name is None or prices is None:
         return None
-    given = {key: (value, value_of(scene, key)) for key, value in prices.presets[name].settings.items()}
+    given = {
+        key: (value, value_of(scene, key)) for key, value in prices.presets[name].settings.items()
+    }
     taken = [f"{key} {value:g}" for key, (value, is_now) in given.items() if is_now == value]
-    own = [f"{key} {is_now:g}" if isinstance(is_now, float | int) else f"{key} {is_now}"
-           for key, (value, is_now) in given.items() if is_now not in (value, None)]  # fmt: skip
-    return f"{name}: " + "; ".join([*([", ".join(taken)] if taken else []), *([f"the scene's own: {', '.join(own)}"] if own else [])])
+    own = [
+        f"{key} {is_now:g}" if isinstance(is_now, float | int) else f"{key} {is_now}"
+        for key, (value, is_now) in given.items()
+        if is_now not in (value, None)
+    ]
+    return f"{name}: " + "; ".join(
+        [
+            *([", ".join(taken)] if taken else []),
+            *([f"the scene's own: {', '.join(own)}"] if own else []),
+        ]
+    )
 
 
 def value_of(scene: Scene, key: str) -> Any:
@@ -141,4 +162,9 @@ def _nested(settings: Settings) -> dict[str, dict[str, Any]]:
 
 def _flat(part: Mapping[str, Any]) -> Settings:
     """Return tables of a scene as settings."""
-    return {f"{table}.{key}": value for table, keys in part.items() if isinstance(keys, Mapping) for key, value in keys.items()}
+    return {
+        f"{table}.{key}": value
+        for table, keys in part.items()
+        if isinstance(keys, Mapping)
+        for key, value in keys.items()
+    }

@@ -29,7 +29,9 @@ def rename_keys(tables: MutableMapping[str, Any], model: type[Table], source: st
     """
     for place, old, new in _rename(tables, model, source):
         fix = f"; `warp-lcp check --fix {source}` rewrites it" if Path(source).is_file() else ""
-        warnings.warn(f"{source}: {place}{old} is now {place}{new}{fix}", RenamedKeyWarning, stacklevel=3)
+        warnings.warn(
+            f"{source}: {place}{old} is now {place}{new}{fix}", RenamedKeyWarning, stacklevel=3
+        )
 
 
 def fix_text(text: str, model: type[Table], source: str) -> tuple[str, list[str]]:
@@ -43,25 +45,47 @@ def fix_text(text: str, model: type[Table], source: str) -> tuple[str, list[str]
         source: the file, for messages.
 
     Raises:
-        SceneError: a table has a key by both names, or an old name stands in other text too, such as a description.
+        SceneError: a table has a key by both names, or an old name stands in other text too, such
+            as a description.
     """
     expected = tomllib.loads(text)
     renamed = list(_rename(expected, model, source))
     for old, new in {(old, new) for _, old, new in renamed}:
-        text = re.sub(rf"(?<![\w-]){old}(?=[\"']?\s*=)", new, text)  # `old = value`, also quoted, dotted or in an inline table
+        # `old = value`, also quoted, dotted or in an inline table
+        text = re.sub(rf"(?<![\w-]){old}(?=[\"']?\s*=)", new, text)
     if tomllib.loads(text) != expected:
-        raise SceneError(source, [KeyFault("", f"rename by hand: {'; '.join(f'{at}{old} to {at}{new}' for at, old, new in renamed)}")])
+        raise SceneError(
+            source,
+            [
+                KeyFault(
+                    "",
+                    "rename by hand: "
+                    f"{'; '.join(f'{at}{old} to {at}{new}' for at, old, new in renamed)}",
+                )
+            ],
+        )
     return text, [f"{place}{old} is now {place}{new}" for place, old, new in renamed]
 
 
-def _rename(tables: Any, model: type[Table], source: str, place: str = "") -> Iterator[tuple[str, str, str]]:
+def _rename(
+    tables: Any, model: type[Table], source: str, place: str = ""
+) -> Iterator[tuple[str, str, str]]:
     """Rename keys of a table and the tables in it; yield the table's place, the old and the new name."""
     for old, new in model.renamed.items():
         if old not in tables:
             continue
         if new in tables:
-            raise SceneError(source, [KeyFault(f"{place}{old}", f"is the old name of {place}{new}, which is there too: delete one")])
-        entries = {new if key == old else key: value for key, value in tables.items()}  # in their order
+            raise SceneError(
+                source,
+                [
+                    KeyFault(
+                        f"{place}{old}",
+                        f"is the old name of {place}{new}, which is there too: delete one",
+                    )
+                ],
+            )
+        # in their order
+        entries = {new if key == old else key: value for key, value in tables.items()}
         tables.clear()
         tables.update(entries)
         yield place, old, new
@@ -70,7 +94,9 @@ def _rename(tables: Any, model: type[Table], source: str, place: str = "") -> It
         rows = entry if isinstance(entry, list) else [entry]
         for number, row in enumerate(rows):
             if isinstance(row, dict):
-                where = f"{place}{field.alias or name}" + (f"[{number}]." if isinstance(entry, list) else ".")
+                where = f"{place}{field.alias or name}" + (
+                    f"[{number}]." if isinstance(entry, list) else "."
+                )
                 for inner in _table_classes(field.annotation):
                     yield from _rename(row, inner, source, where)
 

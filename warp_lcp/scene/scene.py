@@ -20,7 +20,15 @@ from warp_lcp.grid.voxelize import STRAY
 from warp_lcp.problem.solve import PrecisionName
 from warp_lcp.scene.camera import Camera
 from warp_lcp.scene.presets import PresetName, fill_in, preset_line
-from warp_lcp.scene.shapes import BODY_FRICTION, STICKS, Liquid, MaterialProperties, Shape, Solid, Wall
+from warp_lcp.scene.shapes import (
+    BODY_FRICTION,
+    STICKS,
+    Liquid,
+    MaterialProperties,
+    Shape,
+    Solid,
+    Wall,
+)
 from warp_lcp.scene.table import Complaint, KeyFault, SceneError, Table, Vector, refuse, validate
 from warp_lcp.scene.unusual import scene_notes
 from warp_lcp.settings import Count, CountOrZero, Positive, Share, adapter
@@ -32,7 +40,19 @@ if TYPE_CHECKING:
 MOST_CELLS = 8192  # along an axis: float32 positions there are rounded to a thousandth of a cell
 FAR_SIDES = ("right", "top", "front")
 
-__all__ = ["Complaint", "KeyFault", "Liquid", "Scene", "SceneError", "Shape", "Solid", "Table", "Vector", "Wall", "validate"]
+__all__ = [
+    "Complaint",
+    "KeyFault",
+    "Liquid",
+    "Scene",
+    "SceneError",
+    "Shape",
+    "Solid",
+    "Table",
+    "Vector",
+    "Wall",
+    "validate",
+]
 
 GridMethod = Literal[grid_methods()]
 
@@ -42,12 +62,18 @@ def _tolerance(value: Any) -> Any:
     return value if value == "auto" else adapter(Share).validate_python(value)
 
 
-Tolerance = Annotated[Share | Literal["auto"], BeforeValidator(_tolerance, json_schema_input_type=Share | Literal["auto"])]
+Tolerance = Annotated[
+    Share | Literal["auto"],
+    BeforeValidator(_tolerance, json_schema_input_type=Share | Literal["auto"]),
+]
 
 PRESET_KEY = "set of defaults by accuracy"
 
 LONGEST_NAME = 60  # characters; file systems take 255 bytes, and a letter has up to four
-NAME_RULE = f'must be a name of at most {LONGEST_NAME} letters, digits, "-", "_", "." and spaces, without a dot or space at its ends'
+NAME_RULE = (
+    f'must be a name of at most {LONGEST_NAME} letters, digits, "-", "_", "." and spaces, '
+    "without a dot or space at its ends"
+)
 
 WHOLE_CELLS = 1e-6  # how far a side may be from a whole number of cells, relative
 
@@ -61,7 +87,9 @@ def _name(text: str) -> str:
 
 def file_name(text: str) -> str:
     """Return a text as a valid `scene.name`; "scene" if nothing is left of it."""
-    kept = "".join(c if c.isalnum() or c in "-_. " else "-" for c in normalize("NFC", text))[:LONGEST_NAME].strip(". ")
+    kept = "".join(c if c.isalnum() or c in "-_. " else "-" for c in normalize("NFC", text))[
+        :LONGEST_NAME
+    ].strip(". ")
     return kept or "scene"
 
 
@@ -69,7 +97,9 @@ class About(Table):
     """[scene]: simulator, name and description."""
 
     simulator: str = Field(description="fluids, granular, contacts or another plug-in")
-    name: Annotated[str, AfterValidator(_name)] = Field(default="", description="short name; default: the file's")
+    name: Annotated[str, AfterValidator(_name)] = Field(
+        default="", description="short name; default: the file's"
+    )
     description: str = Field(default="", description="sentence about the scene")
 
 
@@ -103,27 +133,56 @@ class Domain(Table):
 
     later: ClassVar = {"periodic": frozenset({True})}
     elsewhere: ClassVar = {"friction": "granular", "periodic": "granular"}
-    size: list[Positive] = Field(min_length=2, max_length=3, description="sides [m]: [x, y] or [x, y, z]; omitted with spacing")
-    resolution: int = Field(ge=2, le=MOST_CELLS, description="cells along the longest side; omitted with spacing")
-    spacing: Positive | None = Field(default=None, description="cell size [m] of an unbounded domain, instead of size and resolution")
-    dimension: Literal[2, 3] | None = Field(default=None, description="number of axes, with spacing; default: 3")
+    size: list[Positive] = Field(
+        min_length=2,
+        max_length=3,
+        description="sides [m]: [x, y] or [x, y, z]; omitted with spacing",
+    )
+    resolution: int = Field(
+        ge=2, le=MOST_CELLS, description="cells along the longest side; omitted with spacing"
+    )
+    spacing: Positive | None = Field(
+        default=None,
+        description="cell size [m] of an unbounded domain, instead of size and resolution",
+    )
+    dimension: Literal[2, 3] | None = Field(
+        default=None, description="number of axes, with spacing; default: 3"
+    )
     wall: Wall = Field(default="separating", description="boundary condition")
     solids: Literal["cut-cell", "voxel"] = Field(
-        default="cut-cell", description="cut-cell: surfaces cut cells; voxel: solids fill whole cells and cannot move"
+        default="cut-cell",
+        description="cut-cell: surfaces cut cells; voxel: solids fill whole cells and cannot move",
     )
-    open: list[Literal[SIDES]] = Field(default_factory=list, description="sides where material leaves")
-    follow: bool = Field(default=True, description="grid around the material only; false: the whole domain")
-    periodic: list[Literal[False]] | None = Field(default=None, description="false along every axis")
+    open: list[Literal[SIDES]] = Field(
+        default_factory=list, description="sides where material leaves"
+    )
+    follow: bool = Field(
+        default=True, description="grid around the material only; false: the whole domain"
+    )
+    periodic: list[Literal[False]] | None = Field(
+        default=None, description="false along every axis"
+    )
 
     @model_validator(mode="before")
     @classmethod
     def _without_ends(cls, data: Any) -> Any:
         """Give a domain of a spacing sides that are farther than anything gets."""
-        if not isinstance(data, dict) or not isinstance(data.get("spacing"), int | float) or isinstance(data.get("open", []), str):
+        if (
+            not isinstance(data, dict)
+            or not isinstance(data.get("spacing"), int | float)
+            or isinstance(data.get("open", []), str)
+        ):
             return data
         axes = 2 if data.get("dimension") == 2 else 3
-        sides = [*data.get("open", []), *(side for side in FAR_SIDES[:axes] if side not in data.get("open", []))]
-        return {"size": [MOST_CELLS * data["spacing"]] * axes, "resolution": MOST_CELLS, "dimension": axes} | {**data, "open": sides}
+        sides = [
+            *data.get("open", []),
+            *(side for side in FAR_SIDES[:axes] if side not in data.get("open", [])),
+        ]
+        return {
+            "size": [MOST_CELLS * data["spacing"]] * axes,
+            "resolution": MOST_CELLS,
+            "dimension": axes,
+        } | {**data, "open": sides}
 
     @property
     def boundless(self) -> bool:
@@ -134,11 +193,35 @@ class Domain(Table):
         """Return errors of `spacing` and `dimension`."""
         place, axes = ("domain", "spacing"), int(self.dimension or 0)
         if self.spacing is None:
-            return [Complaint(("domain", "dimension"), axes, "is only for a domain with spacing; otherwise size gives it")] if axes else []
+            return (
+                [
+                    Complaint(
+                        ("domain", "dimension"),
+                        axes,
+                        "is only for a domain with spacing; otherwise size gives it",
+                    )
+                ]
+                if axes
+                else []
+            )
         if (self.size, self.resolution) != ([MOST_CELLS * self.spacing] * axes, MOST_CELLS):
-            return [Complaint(place, self.spacing, "replaces size and resolution: give either spacing or these")]
+            return [
+                Complaint(
+                    place,
+                    self.spacing,
+                    "replaces size and resolution: give either spacing or these",
+                )
+            ]
         return (
-            [] if self.follow else [Complaint(("domain", "follow"), False, "must be true with spacing: no grid covers an unbounded domain")]
+            []
+            if self.follow
+            else [
+                Complaint(
+                    ("domain", "follow"),
+                    False,
+                    "must be true with spacing: no grid covers an unbounded domain",
+                )
+            ]
         )
 
 
@@ -146,15 +229,21 @@ class Physics(Table):
     """[physics]: gravity and density."""
 
     gravity: Vector = Field(description="acceleration of gravity [m/s^2]; default: 9.81 down")
-    density: Positive = Field(default=1000.0, description="density of the liquid [kg/m^3]; of sand: material.density")
+    density: Positive = Field(
+        default=1000.0, description="density of the liquid [kg/m^3]; of sand: material.density"
+    )
 
 
 class Solver(Table):
     """[solver]: solution of the complementarity problem of each step."""
 
     preset: PresetName | None = Field(default=None, description=PRESET_KEY)
-    method: GridMethod = Field(default="projected-multigrid", description="the default is the fastest")
-    tolerance: Tolerance = Field(default=1e-4, description='relative residual; "auto": follows the time step')
+    method: GridMethod = Field(
+        default="projected-multigrid", description="the default is the fastest"
+    )
+    tolerance: Tolerance = Field(
+        default=1e-4, description='relative residual; "auto": follows the time step'
+    )
     precision: PrecisionName = Field(default="mixed", description="precision")
     max_iterations: Count = Field(default=100, description="iterations before the step fails")
 
@@ -166,17 +255,30 @@ class Output(Table):
     grid: bool = Field(default=True, description="frames of cells")
     surface: bool = Field(default=False, description="frames of the surface")
     surface_resolution: int | None = Field(
-        default=None, ge=1, le=8, description="surface points per cell edge; default: particles.per_axis"
+        default=None,
+        ge=1,
+        le=8,
+        description="surface points per cell edge; default: particles.per_axis",
     )
-    surface_smoothing: float = Field(default=1.5, ge=0.5, le=10, description="kernel width of the surface [particle distances]")
+    surface_smoothing: float = Field(
+        default=1.5, ge=0.5, le=10, description="kernel width of the surface [particle distances]"
+    )
     surface_ply: bool = Field(default=False, description="surfaces also as PLY files")
     format: FrameFormat = Field(default="vtu", description="format of frames")
     grid_format: Literal["vtu", "vti"] = Field(default="vtu", description="format of cells")
     volume: bool = Field(default=False, description="level set and density as NanoVDB files, 3-D")
-    diagnostics: bool = Field(default=True, description="log volume and divergence; sand: yielding and dissipation")
-    forces: bool = Field(default=False, description="forces.csv: force and torque of a liquid on each solid")
-    checkpoint_every: CountOrZero = Field(default=50, description="steps between checkpoints; 0: unlimited")
-    checkpoint_minutes: Positive | None = Field(default=None, description="real time between checkpoints [min]")
+    diagnostics: bool = Field(
+        default=True, description="log volume and divergence; sand: yielding and dissipation"
+    )
+    forces: bool = Field(
+        default=False, description="forces.csv: force and torque of a liquid on each solid"
+    )
+    checkpoint_every: CountOrZero = Field(
+        default=50, description="steps between checkpoints; 0: unlimited"
+    )
+    checkpoint_minutes: Positive | None = Field(
+        default=None, description="real time between checkpoints [min]"
+    )
     checkpoints_kept: Count = Field(default=3, description="number of checkpoints kept")
 
 
@@ -201,11 +303,24 @@ class Scene(Table):
     @classmethod
     def _gravity_is_down(cls, data: Any) -> Any:
         """Fill in gravity, whose default needs the number of dimensions."""
-        domain, physics = (data.get("domain"), data.get("physics", {})) if isinstance(data, dict) else (None, None)
+        domain, physics = (
+            (data.get("domain"), data.get("physics", {}))
+            if isinstance(data, dict)
+            else (None, None)
+        )
         size = domain.get("size") if isinstance(domain, dict) else None
-        boundless = isinstance(domain, dict) and size is None and domain.get("spacing") is not None and domain.get("dimension") != 2
+        boundless = (
+            isinstance(domain, dict)
+            and size is None
+            and domain.get("spacing") is not None
+            and domain.get("dimension") != 2
+        )
         if isinstance(physics, dict):
-            gravity = [0.0, -9.81, 0.0] if boundless or (isinstance(size, list) and len(size) == 3) else [0.0, -9.81]
+            gravity = (
+                [0.0, -9.81, 0.0]
+                if boundless or (isinstance(size, list) and len(size) == 3)
+                else [0.0, -9.81]
+            )
             return {**data, "physics": {"gravity": gravity, **physics}}
         return data
 
@@ -237,11 +352,18 @@ class Scene(Table):
         The domain; if unbounded, the region of the shapes.
         """
         size = np.array([*self.domain.size, 0.0][:3])
-        boxes = [shape.bounds(self.dimension) for _, shape in self.shapes()] if self.domain.boundless else []
+        boxes = (
+            [shape.bounds(self.dimension) for _, shape in self.shapes()]
+            if self.domain.boundless
+            else []
+        )
         near = [np.clip(box, 0.0, size) for box in boxes if box is not None]
         if not near:
             return np.zeros(3), size
-        low, high = np.min([box[0] for box in near], axis=0), np.max([box[1] for box in near], axis=0)
+        low, high = (
+            np.min([box[0] for box in near], axis=0),
+            np.max([box[1] for box in near], axis=0),
+        )
         return low, np.maximum(high, low + self.spacing * (size > 0.0))
 
     @property
@@ -271,7 +393,9 @@ class Scene(Table):
 
     def body_frictions(self) -> list[float]:
         """Return Coulomb's coefficient of each solid's surface against bodies and walls."""
-        given = [BODY_FRICTION if solid.friction is None else solid.friction for solid in self.solid]
+        given = [
+            BODY_FRICTION if solid.friction is None else solid.friction for solid in self.solid
+        ]
         return [STICKS if friction == "stick" else float(friction) for friction in given]
 
     def complaints(self) -> list[Complaint]:
@@ -284,14 +408,33 @@ class Scene(Table):
             message = f"must have {self.dimension} entries, as domain.size has"
             found.append(Complaint(("physics", "gravity"), self.physics.gravity, message))
         if self.time.dt_min > self.time.dt_max:
-            found.append(Complaint(("time", "dt_min"), self.time.dt_min, f"must not exceed time.dt_max = {self.time.dt_max}"))
-        found += [Complaint(("camera", *c.place), c.value, c.message) for c in self.camera.complaints(self.dimension, self.domain.size)]
+            found.append(
+                Complaint(
+                    ("time", "dt_min"),
+                    self.time.dt_min,
+                    f"must not exceed time.dt_max = {self.time.dt_max}",
+                )
+            )
+        found += [
+            Complaint(("camera", *c.place), c.value, c.message)
+            for c in self.camera.complaints(self.dimension, self.domain.size)
+        ]
         if self.output.volume and self.dimension == 2:
-            found.append(Complaint(("output", "volume"), True, "needs a 3-D domain; domain.size has 2 entries"))
-        found += self.shape_complaints("solid", self.solid) + self._motion_complaints() + self._side_complaints()
+            found.append(
+                Complaint(
+                    ("output", "volume"), True, "needs a 3-D domain; domain.size has 2 entries"
+                )
+            )
+        found += (
+            self.shape_complaints("solid", self.solid)
+            + self._motion_complaints()
+            + self._side_complaints()
+        )
         return found + self._outside_complaints()
 
-    def shape_complaints(self, key: str, shapes: Sequence[Shape], *, inside: bool = False) -> list[Complaint]:
+    def shape_complaints(
+        self, key: str, shapes: Sequence[Shape], *, inside: bool = False
+    ) -> list[Complaint]:
         """Return errors of an array of shapes.
 
         Args:
@@ -303,8 +446,18 @@ class Scene(Table):
         for index, shape in enumerate(shapes):
             own = shape.complaints(self.dimension)
             if inside and not own and self.enclosed_volume(shape) == 0.0:
-                own = [Complaint((), None, f"lies outside the domain, which extends from the origin to {self.domain.size} m")]
-            found += [Complaint((key, index, *complaint.place), complaint.value, complaint.message) for complaint in own]
+                own = [
+                    Complaint(
+                        (),
+                        None,
+                        "lies outside the domain, which extends from the origin to "
+                        f"{self.domain.size} m",
+                    )
+                ]
+            found += [
+                Complaint((key, index, *complaint.place), complaint.value, complaint.message)
+                for complaint in own
+            ]
         return found
 
     def enclosed_volume(self, shape: Shape) -> float:
@@ -337,7 +490,8 @@ class Scene(Table):
             if turned is not None and turned[0] > STRAY * self.spacing:
                 center = [float(f"{coordinate:.6g}") for coordinate in turned[1]]
                 found.append(
-                    f"{place} ({shape.shape}): rotate about the origin moves it {turned[0]:.4g} m out of the domain; to rotate it "
+                    f"{place} ({shape.shape}): rotate about the origin moves it {turned[0]:.4g} m "
+                    "out of the domain; to rotate it "
                     f"about its center, set about = {center}"
                 )
         return [*found, *scene_notes(self)]
@@ -363,19 +517,49 @@ class Scene(Table):
         """
         cells, spacing = self.cell_counts[: self.dimension], f"{self.spacing:.6g} m"
         extent = f"{' x '.join(map(str, cells))} = {math.prod(cells):,} cells of {spacing}"
-        moving = ", ".join(f"solid {index} {solid.motion.kind}" for index, solid in enumerate(self.solid) if solid.motion)
-        bodies = ", ".join(self._body_line(index, solid) for index, solid in enumerate(self.solid) if solid.is_body)
+        moving = ", ".join(
+            f"solid {index} {solid.motion.kind}"
+            for index, solid in enumerate(self.solid)
+            if solid.motion
+        )
+        bodies = ", ".join(
+            self._body_line(index, solid) for index, solid in enumerate(self.solid) if solid.is_body
+        )
         preset = preset_line(self)
         return [
             *([("preset", preset)] if preset else []),
-            ("grid", f"unbounded, cells of {spacing}, at most {MOST_CELLS} along an axis" if self.domain.boundless else extent),
-            ("walls", ", ".join([self.domain.wall, *(f"solid {i} {s.wall}" for i, s in enumerate(self.solid) if s.wall)])),
+            (
+                "grid",
+                f"unbounded, cells of {spacing}, at most {MOST_CELLS} along an axis"
+                if self.domain.boundless
+                else extent,
+            ),
+            (
+                "walls",
+                ", ".join(
+                    [
+                        self.domain.wall,
+                        *(f"solid {i} {s.wall}" for i, s in enumerate(self.solid) if s.wall),
+                    ]
+                ),
+            ),
             *([("open", ", ".join(self.domain.open))] if self.domain.open else []),
             *([("moving", moving)] if moving else []),
             *([("bodies", bodies)] if bodies else []),
-            ("time", f"{self.time.duration:g} s in steps of at most {self.time.dt_max:g} s, CFL {self.time.cfl:g}"),
-            ("frames", f"{self.time.frame_count + 1} at {self.time.frames_per_second:g} per second"),
-            ("solver", f"{self.solver.method} to {_shown(self.solver.tolerance)}, {self.solver.precision} precision"),
+            (
+                "time",
+                f"{self.time.duration:g} s in steps of at most {self.time.dt_max:g} s, CFL "
+                f"{self.time.cfl:g}",
+            ),
+            (
+                "frames",
+                f"{self.time.frame_count + 1} at {self.time.frames_per_second:g} per second",
+            ),
+            (
+                "solver",
+                f"{self.solver.method} to {_shown(self.solver.tolerance)}, {self.solver.precision} "
+                "precision",
+            ),
         ]
 
     def _side_complaints(self) -> list[Complaint]:
@@ -384,15 +568,27 @@ class Scene(Table):
             if side in self.domain.open[:index]:
                 found.append(Complaint(("domain", "open", index), side, "is named twice"))
             if side in SIDES[2 * self.dimension :]:
-                found.append(Complaint(("domain", "open", index), side, "is a side of a 3-D domain; domain.size has 2 entries"))
+                found.append(
+                    Complaint(
+                        ("domain", "open", index),
+                        side,
+                        "is a side of a 3-D domain; domain.size has 2 entries",
+                    )
+                )
         return found
 
     def _outside_complaints(self) -> list[Complaint]:
         """Return which rigid bodies lie wholly outside the domain, as far as their keys tell."""
         return [
-            Complaint(("solid", index), None, f"lies outside the domain, which extends from the origin to {self.domain.size} m")
+            Complaint(
+                ("solid", index),
+                None,
+                f"lies outside the domain, which extends from the origin to {self.domain.size} m",
+            )
             for index, solid in enumerate(self.solid)
-            if solid.is_body and not solid.complaints(self.dimension) and self.enclosed_volume(solid) == 0.0
+            if solid.is_body
+            and not solid.complaints(self.dimension)
+            and self.enclosed_volume(solid) == 0.0
         ]
 
     def _motion_complaints(self) -> list[Complaint]:
@@ -409,18 +605,33 @@ class Scene(Table):
     def _body_line(self, index: int, solid: Solid) -> str:
         """Return what a rigid body is, for the plan."""
         unit = "kg" if self.dimension == 3 else "kg/m"
-        return f"solid {index} {solid.shape} of " + (f"{solid.mass:g} {unit}" if solid.mass is not None else f"{solid.density:g} kg/m^3")
+        return f"solid {index} {solid.shape} of " + (
+            f"{solid.mass:g} {unit}" if solid.mass is not None else f"{solid.density:g} kg/m^3"
+        )
 
     def _grid_complaints(self) -> list[Complaint]:
         found = self.domain.spacing_complaints()
         for axis, side in enumerate(self.domain.size if not found else ()):
             cells = side / self.spacing
             if round(cells) < 1 or abs(cells - round(cells)) > WHOLE_CELLS * cells:
-                sides = [f"{n * self.spacing:.8g}" for n in (math.floor(cells), math.ceil(cells)) if n > 0]
-                message = f"must be a whole number of cells of {self.spacing:.6g} m; the nearest: {' and '.join(sides)}"
+                sides = [
+                    f"{n * self.spacing:.8g}"
+                    for n in (math.floor(cells), math.ceil(cells))
+                    if n > 0
+                ]
+                message = (
+                    f"must be a whole number of cells of {self.spacing:.6g} m; the nearest: "
+                    f"{' and '.join(sides)}"
+                )
                 found.append(Complaint(("domain", "size", axis), side, message))
         if self.domain.periodic is not None and len(self.domain.periodic) != self.dimension:
-            found.append(Complaint(("domain", "periodic"), self.domain.periodic, f"must have {self.dimension} entries"))
+            found.append(
+                Complaint(
+                    ("domain", "periodic"),
+                    self.domain.periodic,
+                    f"must have {self.dimension} entries",
+                )
+            )
         return found
 
 

@@ -23,18 +23,24 @@ from warp_lcp.scene.table import KeyFault, SceneError, Table, validate, written
 from warp_lcp.settings import nearest
 
 DEEPEST = 16  # tables and arrays in each other; a scene needs six
-MOST_TABLES = 10_000  # in an array of them, such as [[liquid]]: each is a shape whose distances are taken by itself
+# in an array of them, such as [[liquid]]: each is a shape whose distances are taken by itself
+MOST_TABLES = 10_000
 GIVEN = "the scene given"  # to Python as tables
 LARGEST = 1e18  # of a number: its square is a float32, and sums of cubes are float64
 
-SceneSource = str | Path | Mapping[str, Any] | Scene  # a file, the name of a built-in scene, the tables of a file, a scene
+# a file, the name of a built-in scene, the tables of a file, a scene
+SceneSource = str | Path | Mapping[str, Any] | Scene
 
 HEADER = "# The scene as it ran: defaults filled in, overrides applied, paths absolute.\n"
 
 
 def built_in_scenes() -> dict[str, Traversable]:
     """Return the scenes that come with the package, by name."""
-    found = {entry.name.removesuffix(".toml"): entry for entry in files("warp_lcp.scene.scenes").iterdir() if entry.name.endswith(".toml")}
+    found = {
+        entry.name.removesuffix(".toml"): entry
+        for entry in files("warp_lcp.scene.scenes").iterdir()
+        if entry.name.endswith(".toml")
+    }
     return dict(sorted(found.items()))
 
 
@@ -42,12 +48,17 @@ def installed_simulators() -> dict[str, Simulator]:
     """Return the simulators by name.
 
     Raises:
-        SceneError: one of them cannot be loaded, perhaps because another distribution installed a package of its name.
+        SceneError: one of them cannot be loaded, perhaps because another distribution installed a
+            package of its name.
     """
     try:
         return simulators()
     except (AttributeError, ImportError, TypeError) as error:
-        problem = KeyFault("", f"a simulator cannot be loaded: {error}; `warp-lcp info` shows whether another package has its name")
+        problem = KeyFault(
+            "",
+            f"a simulator cannot be loaded: {error}; `warp-lcp info` shows whether another package "
+            "has its name",
+        )
         raise SceneError("warp-lcp", [problem]) from error
 
 
@@ -57,8 +68,10 @@ def load_scene(source: SceneSource, overrides: Sequence[str] = ()) -> Scene:
     Its class is the `scene_model` of its simulator.
 
     Args:
-        source: a TOML file, the name of a built-in scene, tables as such a file has them, or a scene.
-        overrides: `section.key=value` with values as in TOML (bare words are text); `liquid.0.max=[1, 1]` reaches into an array of tables.
+        source: a TOML file, the name of a built-in scene, tables as such a file has them, or a
+            scene.
+        overrides: `section.key=value` with values as in TOML (bare words are text);
+            `liquid.0.max=[1, 1]` reaches into an array of tables.
 
     Raises:
         SceneError: listing everything that is wrong.
@@ -84,7 +97,9 @@ def _raw(source: SceneSource) -> tuple[dict[str, Any], str, Path, str]:
     if isinstance(source, Mapping):
         return _plain(source), GIVEN, Path.cwd(), "scene"
     if not isinstance(source, (str, Path)):
-        message = "must be a scene file, the name of a built-in scene, a dict of its tables or a Scene"
+        message = (
+            "must be a scene file, the name of a built-in scene, a dict of its tables or a Scene"
+        )
         raise SceneError(GIVEN, [KeyFault("", message, type(source).__name__)])
     label = str(source)
     file = _find(label)
@@ -139,7 +154,11 @@ def single_tables(source: SceneSource) -> dict[str, set[str]]:
     data, label, _, _ = _raw(source)
     found = {}
     for name, field in _scene_model(data, label).model_fields.items():
-        kinds = [kind for kind in (field.annotation, *get_args(field.annotation)) if isinstance(kind, type) and issubclass(kind, Table)]
+        kinds = [
+            kind
+            for kind in (field.annotation, *get_args(field.annotation))
+            if isinstance(kind, type) and issubclass(kind, Table)
+        ]
         if kinds and get_origin(field.annotation) is not list:
             found[name] = {inner.alias or key for key, inner in kinds[0].model_fields.items()}
     return found
@@ -157,7 +176,9 @@ def fix_file(source: str) -> list[str]:
     if not file.is_file() or source in built_in_scenes():
         raise SceneError(source, [KeyFault("", "--fix needs a scene file")])
     model = _scene_model(_parse(file, source), source)
-    text, renamed = fix_text(file.read_bytes().decode("utf-8-sig").replace("\r\n", "\n"), model, source)
+    text, renamed = fix_text(
+        file.read_bytes().decode("utf-8-sig").replace("\r\n", "\n"), model, source
+    )
     if renamed:
         write_text(file, text)
     return renamed
@@ -219,17 +240,35 @@ def _find(text: str) -> Path | Traversable:
     near = _near_file(path, () if named else scenes)
     if named:
         raise SceneError(text, [KeyFault("", f"there is no such file{near and f'; {near}'}")])
-    raise SceneError(text, [KeyFault("", f"no such file, and no such built-in scene; {near or nearest(text, scenes)}")])
+    raise SceneError(
+        text,
+        [
+            KeyFault(
+                "", f"no such file, and no such built-in scene; {near or nearest(text, scenes)}"
+            )
+        ],
+    )
 
 
 def _near_file(path: Path, others: Iterable[str]) -> str:
     """Return `did you mean ...?` for a scene file that is not there but nearly, unless another name is nearer; "" where there is none."""
     try:
-        files = {file.stem: str(path.parent / file.name) for file in path.parent.iterdir() if file.suffix == ".toml" and file.is_file()}
+        files = {
+            file.stem: str(path.parent / file.name)
+            for file in path.parent.iterdir()
+            if file.suffix == ".toml" and file.is_file()
+        }
     except OSError:
         return ""
     said = nearest(path.name.removesuffix(".toml"), {*files, *others})
-    return next((f"did you mean {file!r}?" for name, file in files.items() if said == f"did you mean {name!r}?"), "")
+    return next(
+        (
+            f"did you mean {file!r}?"
+            for name, file in files.items()
+            if said == f"did you mean {name!r}?"
+        ),
+        "",
+    )
 
 
 def _parse(file: Path | Traversable, source: str) -> dict[str, Any]:
@@ -238,13 +277,17 @@ def _parse(file: Path | Traversable, source: str) -> dict[str, Any]:
     except OSError as error:
         raise SceneError(source, [KeyFault("", f"cannot be read: {error.strerror}")]) from error
     except UnicodeDecodeError as error:
-        raise SceneError(source, [KeyFault("", f"is not UTF-8 text (byte {error.start})")]) from error
+        raise SceneError(
+            source, [KeyFault("", f"is not UTF-8 text (byte {error.start})")]
+        ) from error
     except tomllib.TOMLDecodeError as error:
         raise SceneError(source, [KeyFault("", f"is not valid TOML: {error}")]) from error
     except RecursionError as error:
         raise SceneError(source, [KeyFault("", "is not valid TOML: nested too deeply")]) from error
     except ValueError as error:  # Python refuses to convert thousands of digits
-        raise SceneError(source, [KeyFault("", "is not valid TOML: a number has too many digits")]) from error
+        raise SceneError(
+            source, [KeyFault("", "is not valid TOML: a number has too many digits")]
+        ) from error
 
 
 def _refuse_extremes(data: dict[str, Any], source: str) -> None:
@@ -258,7 +301,10 @@ def _refuse_extremes(data: dict[str, Any], source: str) -> None:
         if isinstance(value, dict):
             waiting += [(f"{path}.{key}", entry, depth + 1) for key, entry in value.items()]
         elif isinstance(value, list) and len(value) > MOST_TABLES and isinstance(value[0], dict):
-            message = f"has {len(value):,} entries: at most {MOST_TABLES:,} are allowed; combine shapes in a mesh"
+            message = (
+                f"has {len(value):,} entries: at most {MOST_TABLES:,} are allowed; combine "
+                "shapes in a mesh"
+            )
             problems.append(KeyFault(path, message))
         elif isinstance(value, list):
             waiting += [(f"{path}[{index}]", entry, depth + 1) for index, entry in enumerate(value)]
@@ -275,7 +321,14 @@ def _override(data: dict[str, Any], override: str, source: str) -> None:
     name, equals, text = override.partition("=")
     keys = name.strip().split(".")
     if not equals or len(keys) < 2 or not all(keys):
-        raise SceneError(source, [KeyFault(f"--set {override}", "must read section.key=value, such as time.duration=0.5")])
+        raise SceneError(
+            source,
+            [
+                KeyFault(
+                    f"--set {override}", "must read section.key=value, such as time.duration=0.5"
+                )
+            ],
+        )
     value = _value(text.strip())
     table: Any = data
     for depth in range(len(keys) - 1):
@@ -290,10 +343,14 @@ def _place(table: object, keys: list[str], depth: int, source: str) -> str | int
     if isinstance(table, dict):
         return key
     if not isinstance(table, list):
-        raise SceneError(source, [KeyFault(f"--set {path}", f"{parent} has no keys: it is {written(table)}")])
+        raise SceneError(
+            source, [KeyFault(f"--set {path}", f"{parent} has no keys: it is {written(table)}")]
+        )
     if not key.isdecimal() or int(key) >= len(table):
         allowed = f"there are entries 0 to {len(table) - 1}" if table else "the array is empty"
-        raise SceneError(source, [KeyFault(f"--set {path}", f"is not an entry of {parent}; {allowed}")])
+        raise SceneError(
+            source, [KeyFault(f"--set {path}", f"is not an entry of {parent}; {allowed}")]
+        )
     return int(key)
 
 
@@ -319,9 +376,25 @@ def _scene_model(data: dict[str, Any], source: str) -> type[Scene]:
     name = about.get("simulator") if isinstance(about, dict) else None
     installed = installed_simulators()
     if name is None:
-        raise SceneError(source, [KeyFault("scene.simulator", f"is missing; choose from {', '.join(sorted(installed))}")])
+        raise SceneError(
+            source,
+            [
+                KeyFault(
+                    "scene.simulator", f"is missing; choose from {', '.join(sorted(installed))}"
+                )
+            ],
+        )
     if not isinstance(name, str) or name not in installed:
-        raise SceneError(source, [KeyFault("scene.simulator", f"no such simulator; {nearest(str(name), installed)}", written(name))])
+        raise SceneError(
+            source,
+            [
+                KeyFault(
+                    "scene.simulator",
+                    f"no such simulator; {nearest(str(name), installed)}",
+                    written(name),
+                )
+            ],
+        )
     return installed[name].scene_model
 
 

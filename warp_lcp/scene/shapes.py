@@ -28,15 +28,20 @@ def _wall_friction(value: Any, handler: ValidatorFunctionWrapHandler) -> float |
     try:
         friction: float | str = handler(value)
     except ValidationError as error:
-        raise PydanticCustomError("friction", 'must be a number from 0 to 10, or "stick"') from error
+        raise PydanticCustomError(
+            "friction", 'must be a number from 0 to 10, or "stick"'
+        ) from error
     return friction
 
 
 WallFriction = Annotated[
-    Annotated[float, Field(ge=0, le=10)] | Literal["stick"], WrapValidator(_wall_friction, json_schema_input_type=float | Literal["stick"])
+    Annotated[float, Field(ge=0, le=10)] | Literal["stick"],
+    WrapValidator(_wall_friction, json_schema_input_type=float | Literal["stick"]),
 ]
 FRICTIONS = "0 (free slip) to 10, or stick"
-STICKS = 1e6  # Coulomb's coefficient of a wall that holds what presses against it: sand, as far as that holds itself
+# Coulomb's coefficient of a wall that holds what presses against it: sand, as far as that holds
+# itself
+STICKS = 1e6
 BODY_FRICTION = 0.5  # of a rigid body unless its scene says otherwise
 
 
@@ -52,14 +57,19 @@ class Shape(Table):
 
     `about` is the origin by default.
 
-    `rotate` is in degrees: one angle in 2-D, angles about the fixed axes x, y, z (in that order) in 3-D. `invert` swaps inside and outside.
+    `rotate` is in degrees: one angle in 2-D, angles about the fixed axes x, y, z (in that order) in
+    3-D. `invert` swaps inside and outside.
     """
 
     if TYPE_CHECKING:
         shape: str  # of the file's key; each kind of shape has a value of its own
     translate: Vector | None = Field(default=None, description="translation [m]")
-    rotate: Angles | None = Field(default=None, description="rotation [degrees]: a number in 2-D, [x, y, z] in 3-D")
-    about: Vector | None = Field(default=None, description="fixed point of scale and rotate [m]; default: the origin")
+    rotate: Angles | None = Field(
+        default=None, description="rotation [degrees]: a number in 2-D, [x, y, z] in 3-D"
+    )
+    about: Vector | None = Field(
+        default=None, description="fixed point of scale and rotate [m]; default: the origin"
+    )
     scale: Positive = Field(default=1.0, description="scale factor")
     invert: bool = Field(default=False, description="fill the outside")
 
@@ -80,7 +90,12 @@ class Shape(Table):
         from warp_lcp.grid.solids import Placement
 
         zeros = [0.0] * dimension
-        placed = Placement.from_degrees(self.scale, self.rotate or zeros[: 1 if dimension == 2 else 3], self.translate or zeros, dimension)
+        placed = Placement.from_degrees(
+            self.scale,
+            self.rotate or zeros[: 1 if dimension == 2 else 3],
+            self.translate or zeros,
+            dimension,
+        )
         return placed if self.about is None else placed.about(self.about)
 
     def turned_out(self, domain: list[float]) -> tuple[float, list[float]] | None:
@@ -97,7 +112,9 @@ class Shape(Table):
         if placed[0] is None or placed[1] is None:
             return None
         corners = [box[:, :dimension] for box in placed if box is not None]
-        before, now = (max(float(-low.min()), float((high - domain).max()), 0.0) for low, high in corners)
+        before, now = (
+            max(float(-low.min()), float((high - domain).max()), 0.0) for low, high in corners
+        )
         return (now, corners[0].mean(axis=0).tolist()) if now > before else None
 
     def bounds(self, dimension: int) -> np.ndarray | None:
@@ -117,12 +134,24 @@ class Shape(Table):
     def complaints(self, dimension: int) -> list[Complaint]:
         """Return errors of the shape in a scene of 2 or 3 dimensions."""
         wanted = {name: dimension for name, value in self if isinstance(value, list)}
-        wanted |= {name: 1 if dimension == 2 else 3 for name in ("rotate", "angular_velocity") if name in wanted}
+        wanted |= {
+            name: 1 if dimension == 2 else 3
+            for name in ("rotate", "angular_velocity")
+            if name in wanted
+        }
         return [
-            Complaint((type(self).model_fields[name].alias or name,), value, f"must {counted(count)} in {dimension}-D")
+            Complaint(
+                (type(self).model_fields[name].alias or name,),
+                value,
+                f"must {counted(count)} in {dimension}-D",
+            )
             for name, count in wanted.items()
             if len(value := getattr(self, name)) != count
-        ] + ([Complaint(("about",), self.about, "has no effect without rotate or scale")] if self._about_idles else [])
+        ] + (
+            [Complaint(("about",), self.about, "has no effect without rotate or scale")]
+            if self._about_idles
+            else []
+        )
 
     @property
     def _about_idles(self) -> bool:
@@ -140,13 +169,19 @@ class BoxTable(Shape):
         """Return the box; in 2-D it extends along z without limit."""
         from warp_lcp.grid import solids
 
-        return solids.Box(lower=self.min, upper=self.max, placement=self.placement(dimension), invert=self.invert)
+        return solids.Box(
+            lower=self.min, upper=self.max, placement=self.placement(dimension), invert=self.invert
+        )
 
     def complaints(self, dimension: int) -> list[Complaint]:
         """Return errors of the box in a scene of 2 or 3 dimensions."""
         found = super().complaints(dimension)
         if not found and any(low >= high for low, high in zip(self.min, self.max, strict=True)):
-            found.append(Complaint(("max",), self.max, f"must be greater than min = {self.min} along every axis"))
+            found.append(
+                Complaint(
+                    ("max",), self.max, f"must be greater than min = {self.min} along every axis"
+                )
+            )
         return found
 
 
@@ -161,7 +196,12 @@ class SphereTable(Shape):
         """Return the ball, a disk in 2-D."""
         from warp_lcp.grid import solids
 
-        return solids.Sphere(center=self.center, radius=self.radius, placement=self.placement(dimension), invert=self.invert)
+        return solids.Sphere(
+            center=self.center,
+            radius=self.radius,
+            placement=self.placement(dimension),
+            invert=self.invert,
+        )
 
 
 class CapsuleTable(Shape):
@@ -176,13 +216,21 @@ class CapsuleTable(Shape):
         """Return the capsule around its axis."""
         from warp_lcp.grid import solids
 
-        return solids.Capsule(start=self.start, end=self.end, radius=self.radius, placement=self.placement(dimension), invert=self.invert)
+        return solids.Capsule(
+            start=self.start,
+            end=self.end,
+            radius=self.radius,
+            placement=self.placement(dimension),
+            invert=self.invert,
+        )
 
     def complaints(self, dimension: int) -> list[Complaint]:
         """Return errors of the capsule in a scene of 2 or 3 dimensions."""
         found = super().complaints(dimension)
         if self.start == self.end:
-            found.append(Complaint(("to",), self.end, 'must differ from "from"; use a sphere otherwise'))
+            found.append(
+                Complaint(("to",), self.end, 'must differ from "from"; use a sphere otherwise')
+            )
         return found
 
 
@@ -197,7 +245,12 @@ class PlaneTable(Shape):
         """Return the half space that the normal points away from."""
         from warp_lcp.grid import solids
 
-        return solids.Plane(point=self.point, normal=self.normal, placement=self.placement(dimension), invert=self.invert)
+        return solids.Plane(
+            point=self.point,
+            normal=self.normal,
+            placement=self.placement(dimension),
+            invert=self.invert,
+        )
 
     def complaints(self, dimension: int) -> list[Complaint]:
         """Return errors of the plane in a scene of 2 or 3 dimensions."""
@@ -211,13 +264,17 @@ class MeshTable(Shape):
     """Interior of a closed triangle surface; in 2-D its cut by the plane z = 0."""
 
     shape: Literal["mesh"] = "mesh"
-    file: str = Field(min_length=1, description=f"OBJ, STL or PLY file, or built-in, such as {BUILTIN}torus")
+    file: str = Field(
+        min_length=1, description=f"OBJ, STL or PLY file, or built-in, such as {BUILTIN}torus"
+    )
 
     def to_geometry(self, folder: Path, dimension: int) -> Geometry:
         """Return the inside of the mesh."""
         from warp_lcp.grid import solids
 
-        return solids.TriangleMesh.from_file(self.file, folder=folder, placement=self.placement(dimension), invert=self.invert)
+        return solids.TriangleMesh.from_file(
+            self.file, folder=folder, placement=self.placement(dimension), invert=self.invert
+        )
 
     def bounds(self, dimension: int) -> np.ndarray | None:
         """Return None: only the file knows."""
@@ -236,20 +293,32 @@ class SolidProperties(Shape):
         default=None,
         ge=0,
         allow_inf_nan=True,
-        description="slip length of viscous liquid [m]; inf: free slip; default: viscosity.slip_length",
+        description="slip length of viscous liquid [m]; inf: free slip; default: "
+        "viscosity.slip_length",
     )
     motion: Motion | None = Field(default=None, description="prescribed motion; default: at rest")
-    mass: float | None = Field(default=None, ge=1e-18, description="mass of a rigid body [kg; kg/m in 2-D]")
-    density: float | None = Field(default=None, ge=1e-18, description="density of a rigid body, instead of mass [kg/m^3]")
-    velocity: Vector | None = Field(default=None, description="initial velocity of a body [m/s]; default: 0")
-    angular_velocity: Angles | None = Field(default=None, description="initial [degrees/s]: a number in 2-D, [x, y, z] in 3-D; default: 0")
+    mass: float | None = Field(
+        default=None, ge=1e-18, description="mass of a rigid body [kg; kg/m in 2-D]"
+    )
+    density: float | None = Field(
+        default=None, ge=1e-18, description="density of a rigid body, instead of mass [kg/m^3]"
+    )
+    velocity: Vector | None = Field(
+        default=None, description="initial velocity of a body [m/s]; default: 0"
+    )
+    angular_velocity: Angles | None = Field(
+        default=None,
+        description="initial [degrees/s]: a number in 2-D, [x, y, z] in 3-D; default: 0",
+    )
     friction: WallFriction | None = Field(
         default=None,
         description=f"friction coefficient against sand, bodies and walls: {FRICTIONS}; "
         f"default: domain.friction, in liquids {BODY_FRICTION:g}",
     )
     restitution: Part = Field(default=0.0, description="coefficient of restitution")
-    drag: NonNegative | None = Field(default=None, description="drag coefficient c_f in a liquid; default: wall_drag.coefficient")
+    drag: NonNegative | None = Field(
+        default=None, description="drag coefficient c_f in a liquid; default: wall_drag.coefficient"
+    )
 
     @property
     def is_body(self) -> bool:
@@ -264,7 +333,9 @@ class SolidProperties(Shape):
     def complaints(self, dimension: int) -> list[Complaint]:
         """Return errors of the solid in a scene of 2 or 3 dimensions."""
         moves = self.motion.complaints(dimension) if self.motion else []
-        found = super().complaints(dimension) + [Complaint(("motion", *c.place), c.value, c.message) for c in moves]
+        found = super().complaints(dimension) + [
+            Complaint(("motion", *c.place), c.value, c.message) for c in moves
+        ]
         if self.drag is not None and self.rubs:
             found.append(Complaint(("drag",), self.drag, "is for liquids; sand uses friction"))
         return found + (self._body_complaints() if self.is_body else self._still_complaints())
@@ -274,13 +345,31 @@ class SolidProperties(Shape):
         key = "mass" if self.mass is not None else "density"
         found = []
         if self.mass is not None and self.density is not None:
-            found.append(Complaint(("density",), self.density, "cannot be combined with mass: give one of them"))
+            found.append(
+                Complaint(
+                    ("density",), self.density, "cannot be combined with mass: give one of them"
+                )
+            )
         if self.motion is not None:
-            found.append(Complaint(("motion",), None, f"cannot be combined with {key}: a rigid body is moved by forces"))
+            found.append(
+                Complaint(
+                    ("motion",),
+                    None,
+                    f"cannot be combined with {key}: a rigid body is moved by forces",
+                )
+            )
         if self.invert:
-            found.append(Complaint(("invert",), True, f"cannot be combined with {key}: the outside of a shape has no mass"))
+            found.append(
+                Complaint(
+                    ("invert",),
+                    True,
+                    f"cannot be combined with {key}: the outside of a shape has no mass",
+                )
+            )
         if self.shape == "plane":
-            found.append(Complaint((key,), getattr(self, key), "not for a plane: a half space has no mass"))
+            found.append(
+                Complaint((key,), getattr(self, key), "not for a plane: a half space has no mass")
+            )
         return found
 
     def _still_complaints(self) -> list[Complaint]:
@@ -291,9 +380,15 @@ class SolidProperties(Shape):
             "restitution": self.restitution or None,
         }
         message = "needs mass or density, which make the solid a rigid body"
-        found = [Complaint((name,), value, message) for name, value in given.items() if value is not None]
+        found = [
+            Complaint((name,), value, message) for name, value in given.items() if value is not None
+        ]
         if self.friction is not None and not self.rubs:
-            found.append(Complaint(("friction",), self.friction, f"{message}: a liquid has no friction with solids"))
+            found.append(
+                Complaint(
+                    ("friction",), self.friction, f"{message}: a liquid has no friction with solids"
+                )
+            )
         return found
 
 
@@ -307,7 +402,11 @@ class LiquidProperties(MaterialProperties):
     """Properties of a liquid besides its shape."""
 
     viscosity: float | None = Field(
-        default=None, gt=0, le=1e9, allow_inf_nan=False, description="viscosity [Pa s]; default: viscosity.value"
+        default=None,
+        gt=0,
+        le=1e9,
+        allow_inf_nan=False,
+        description="viscosity [Pa s]; default: viscosity.value",
     )
 
 
@@ -369,14 +468,20 @@ class SourceProperties(Schedule, Shape):
 
     velocity: Vector = Field(description="inflow velocity [m/s]")
     viscosity: float | None = Field(
-        default=None, gt=0, le=1e9, allow_inf_nan=False, description="viscosity [Pa s]; default: viscosity.value"
+        default=None,
+        gt=0,
+        le=1e9,
+        allow_inf_nan=False,
+        description="viscosity [Pa s]; default: viscosity.value",
     )
 
     def complaints(self, dimension: int) -> list[Complaint]:
         """Return errors of the source in a scene of 2 or 3 dimensions."""
         found = super().complaints(dimension) + self.schedule_complaints()
         if not any(self.velocity):
-            found.append(Complaint(("velocity",), self.velocity, "must not be zero: nothing would come out"))
+            found.append(
+                Complaint(("velocity",), self.velocity, "must not be zero: nothing would come out")
+            )
         return found
 
 
@@ -428,7 +533,17 @@ class DrainMesh(DrainProperties, MeshTable):
     """A surface of triangles that swallows material."""
 
 
-Solid = Annotated[SolidBox | SolidSphere | SolidCapsule | SolidPlane | SolidMesh, Field(discriminator="shape")]
-Liquid = Annotated[LiquidBox | LiquidSphere | LiquidCapsule | LiquidPlane | LiquidMesh, Field(discriminator="shape")]
-Source = Annotated[SourceBox | SourceSphere | SourceCapsule | SourcePlane | SourceMesh, Field(discriminator="shape")]
-Drain = Annotated[DrainBox | DrainSphere | DrainCapsule | DrainPlane | DrainMesh, Field(discriminator="shape")]
+Solid = Annotated[
+    SolidBox | SolidSphere | SolidCapsule | SolidPlane | SolidMesh, Field(discriminator="shape")
+]
+Liquid = Annotated[
+    LiquidBox | LiquidSphere | LiquidCapsule | LiquidPlane | LiquidMesh,
+    Field(discriminator="shape"),
+]
+Source = Annotated[
+    SourceBox | SourceSphere | SourceCapsule | SourcePlane | SourceMesh,
+    Field(discriminator="shape"),
+]
+Drain = Annotated[
+    DrainBox | DrainSphere | DrainCapsule | DrainPlane | DrainMesh, Field(discriminator="shape")
+]

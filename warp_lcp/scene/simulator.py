@@ -28,7 +28,8 @@ class Simulator(Protocol):
         Files that the scene names are relative to `folder`.
 
         Raises:
-            ValueError: the scene cannot be simulated; the message names the key and what is allowed.
+            ValueError: the scene cannot be simulated; the message names the key and what is
+                allowed.
         """
 
 
@@ -37,7 +38,8 @@ def runs_on_ranks(simulator: Simulator) -> bool:
 
     Then its `create` takes `ranks`.
 
-    They are then `warp_lcp.simulation.Joined`. `create` is collective, with the same scene on all ranks, and returns this rank's part.
+    They are then `warp_lcp.simulation.Joined`. `create` is collective, with the same scene on all
+    ranks, and returns this rank's part.
     """
     return "ranks" in inspect.signature(simulator.create).parameters
 
@@ -63,5 +65,7 @@ def plug_ins(group: str, kind: type[Any], what: str) -> dict[str, Any]:
     for entry in entry_points(group=group):
         found[entry.name] = entry.load()
         if not isinstance(found[entry.name], kind):
-            raise TypeError(f"entry point {entry.name!r} of {group} is not {what}: {found[entry.name]!r}")
+            raise TypeError(
+                f"entry point {entry.name!r} of {group} is not {what}: {found[entry.name]!r}"
+            )
     return found

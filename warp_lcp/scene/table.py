@@ -50,7 +50,11 @@ def _as_list(value: object) -> object:
 
 
 Vector = Annotated[list[float], Field(min_length=2, max_length=3)]
-Angles = Annotated[list[float], Field(min_length=1, max_length=3), BeforeValidator(_as_list, json_schema_input_type=float | list[float])]
+Angles = Annotated[
+    list[float],
+    Field(min_length=1, max_length=3),
+    BeforeValidator(_as_list, json_schema_input_type=float | list[float]),
+]
 
 
 class Table(BaseModel):
@@ -95,7 +99,9 @@ class SceneError(InputError):
         if len(self.problems) == 1:
             text = f"{one_line(source)}: {self.problems[0]}"
         else:
-            text = "\n  ".join([f"{one_line(source)}: {len(self.problems)} errors", *map(str, self.problems)])
+            text = "\n  ".join(
+                [f"{one_line(source)}: {len(self.problems)} errors", *map(str, self.problems)]
+            )
         super().__init__(text)
 
 
@@ -118,7 +124,11 @@ def refuse(title: str, complaints: Iterable[Complaint]) -> None:
         pydantic.ValidationError: there is a complaint.
     """
     errors = [
-        InitErrorDetails(type=PydanticCustomError("cross_check", "{message}", {"message": c.message}), loc=c.place, input=c.value)
+        InitErrorDetails(
+            type=PydanticCustomError("cross_check", "{message}", {"message": c.message}),
+            loc=c.place,
+            input=c.value,
+        )
         for c in complaints
     ]
     if errors:
@@ -179,7 +189,12 @@ def _problem(model: type[Table], error: ErrorDetails) -> KeyFault:
         return _unknown_variant(place, context["discriminator"].strip("'"), context.get("tag"))
     if kind == "extra_forbidden":
         known = _keys(place.owner) if place.owner else {}
-        return KeyFault(place.path, refusal if simulator or place.key in later else f"unknown key; {nearest(place.key, known)}")
+        return KeyFault(
+            place.path,
+            refusal
+            if simulator or place.key in later
+            else f"unknown key; {nearest(place.key, known)}",
+        )
     value = "" if kind == "missing" or error["input"] is None else written(error["input"])
     if kind == "literal_error" and error["input"] in tuple(later.get(place.key, ANY_VALUE)):
         return KeyFault(place.path, refusal, value)
@@ -193,8 +208,12 @@ def _problem(model: type[Table], error: ErrorDetails) -> KeyFault:
 def _unknown_variant(place: _Place, key: str, tag: object) -> KeyFault:
     known = _variants(place.below)
     if tag is None:
-        return KeyFault(f"{place.path}.{key}", f"is missing; choose from {', '.join(sorted(known))}")
-    return KeyFault(f"{place.path}.{key}", f"unknown {key}; {nearest(str(tag), known)}", written(tag))
+        return KeyFault(
+            f"{place.path}.{key}", f"is missing; choose from {', '.join(sorted(known))}"
+        )
+    return KeyFault(
+        f"{place.path}.{key}", f"unknown {key}; {nearest(str(tag), known)}", written(tag)
+    )
 
 
 def _keys(table: type[Table]) -> dict[str, FieldInfo]:
@@ -213,7 +232,12 @@ def _variants(tables: tuple[type[Table], ...]) -> dict[str, type[Table]]:
     """Return the tables that one key, such as `shape`, chooses from, by its value; none when there is nothing to choose."""
     if len(tables) < 2:
         return {}
-    return {table.model_fields[key].default: table for table in tables for key in VARIANT_KEYS if key in table.model_fields}
+    return {
+        table.model_fields[key].default: table
+        for table in tables
+        for key in VARIANT_KEYS
+        if key in table.model_fields
+    }
 
 
 def counted(count: int) -> str:

@@ -31,10 +31,12 @@ class AcceleratedProjectedGradient(Settings):
 
     It iterates the proximal map x = prox_K(x - r (A x + b)) of the box K ([Book] 1.1.4).
 
-    With the diagonal D of A as metric and L = lambda_max(D^-1/2 A D^-1/2): x+ = clip(z - D^-1 (A z + b) / L, l, u), where z = x + beta
-    (x - x before) with Nesterov's beta. The momentum is reset where (z - x+)' D (x+ - x) > 0. L comes from Lanczos' method and grows
-    where a step's curvature exceeds it; where by far, the step is taken back. One product a step, since A z + b is extrapolated as z is.
-    Converges for symmetric positive semidefinite A; the error of the energy falls as 1/k^2, faster in the end.
+    With the diagonal D of A as metric and L = lambda_max(D^-1/2 A D^-1/2): x+ = clip(z - D^-1 (A z
+    + b) / L, l, u), where z = x + beta (x - x before) with Nesterov's beta. The momentum is reset
+    where (z - x+)' D (x+ - x) > 0. L comes from Lanczos' method and grows where a step's curvature
+    exceeds it; where by far, the step is taken back. One product a step, since A z + b is
+    extrapolated as z is. Converges for symmetric positive semidefinite A; the error of the energy
+    falls as 1/k^2, faster in the end.
 
     Args:
         lipschitz: L > 0 in the metric D; estimated if None.
@@ -55,7 +57,9 @@ class AcceleratedProjectedGradient(Settings):
             ValueError: A is not symmetric, or a diagonal entry is negative.
         """
         if not problem.A.symmetric:
-            raise ValueError(f"{type(problem.A).__name__} is not symmetric: A x + b is not a gradient")
+            raise ValueError(
+                f"{type(problem.A).__name__} is not symmetric: A x + b is not a gradient"
+            )
         positive_diagonal(problem)
         return AcceleratedWorkspace(problem, self)
 
@@ -112,7 +116,8 @@ class AcceleratedWorkspace(IterateMemory):
             self._d.assign(positive_diagonal(self.problem))
             if self.settings.lipschitz is None:
                 greatest = scaled_spectrum(self.problem, self.settings.estimate_steps)[1]
-                self.lipschitz = MARGIN * greatest if greatest > 0 else 1.0  # any L will do for a zero matrix
+                # any L will do for a zero matrix
+                self.lipschitz = MARGIN * greatest if greatest > 0 else 1.0
             self._version = version  # last: time may be up before
 
     def advance(self, x: wp.array[Any]) -> None:
@@ -121,7 +126,12 @@ class AcceleratedWorkspace(IterateMemory):
         if self._momentum == 0:
             self._momentum = 1.0
         EXTRAPOLATE.bind(
-            self._sums.rows, self._momenta(x), bounds=p.bounds.operands, y_old=self._y_old, beta=beta, lipschitz=self.lipschitz
+            self._sums.rows,
+            self._momenta(x),
+            bounds=p.bounds.operands,
+            y_old=self._y_old,
+            beta=beta,
+            lipschitz=self.lipschitz,
         ).launch()
         self.round_iterate()
 
@@ -144,4 +154,6 @@ class AcceleratedWorkspace(IterateMemory):
 
     def _momenta(self, x: wp.array[Any]) -> MomentumFields:
         """Return what both kernels take."""
-        return MomentumFields(x, self._x_old, self.residual.y, self._z, self._y_z, self._d, self.problem.unknown)
+        return MomentumFields(
+            x, self._x_old, self.residual.y, self._z, self._y_z, self._d, self.problem.unknown
+        )

@@ -21,10 +21,11 @@ from warp_lcp.settings import Settings
 class AssembledMatrix(Settings):
     """Another method, on the assembled float64 matrix of a grid.
 
-    For domains on which aggregates of whole blocks fail: channels and walls a cell wide, spirals and mazes share blocks that are not
-    joined inside; so do cells whose coefficients are random over many decades. Cycles of a geometric hierarchy are slow there, without
-    bounds too, while algebraic aggregates follow the coefficients (Vanek, Mandel and Brezina). The unknowns are the fluid cells, in
-    their order. Steps are those of `inner`, with its cold start.
+    For domains on which aggregates of whole blocks fail: channels and walls a cell wide, spirals
+    and mazes share blocks that are not joined inside; so do cells whose coefficients are random
+    over many decades. Cycles of a geometric hierarchy are slow there, without bounds too, while
+    algebraic aggregates follow the coefficients (Vanek, Mandel and Brezina). The unknowns are the
+    fluid cells, in their order. Steps are those of `inner`, with its cold start.
 
     Args:
         inner: a method that takes sparse matrices.
@@ -68,7 +69,9 @@ class AssembledWorkspace(IterateMemory):
         """Assemble the problem as it is now, and begin at x."""
         p = self.problem
         self._rows = np.flatnonzero(p.unknown.numpy() == 1)
-        b, lower, upper, x = (field.numpy()[self._rows] for field in (p.b, p.lower, p.upper, self.x))
+        b, lower, upper, x = (
+            field.numpy()[self._rows] for field in (p.b, p.lower, p.upper, self.x)
+        )
         matrix = SparseOperator(grid_matrix(self._A), device=p.device, dtype=wp.float64)
         self._inner = LCP(matrix, b, lower, upper)
         work = self._work = self._method.init(self._inner)

@@ -19,7 +19,13 @@ from warp_lcp.rows.layout import put
 from warp_lcp.settings import Count, Relaxation, Settings, Share
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.psor import DIRECTIONS, Direction, SweepWorkspace
-from warp_lcp.solvers.staggering import Blocks, StaggeringWorkspace, blocks_of_size, color_blocks, given_blocks
+from warp_lcp.solvers.staggering import (
+    Blocks,
+    StaggeringWorkspace,
+    blocks_of_size,
+    color_blocks,
+    given_blocks,
+)
 from warp_lcp.sweeps.block_kernels import BlockLists, block_sweep_kernel
 from warp_lcp.sweeps.sweep import bound_operands, check_colors
 from warp_lcp.sweeps.sweep_kernels import KERNELS
@@ -47,23 +53,29 @@ class GridLines(Enum):
 class BlockedGaussSeidel(Settings):
     """Blocked Gauss-Seidel: solve blocks of unknowns in turn ([Book] 2.2.3).
 
-    With blocks of one unknown it is projected Gauss-Seidel, with one block its solver. Strong coupling within a block, as of a contact's
-    normal and tangential forces, then costs no sweeps. Converges for symmetric positive definite A. Blocks of at most 6 unknowns are
-    solved exactly by a kernel: active sets changed until none is wrong, all sets if that does not end; bounds affine in x, also in
-    unknowns of the block, are part of that system. On CUDA blocks that are not coupled are solved at once. Larger blocks, and all if
-    `sub_solver` is given, are problems of their own, solved one by one from the host.
+    With blocks of one unknown it is projected Gauss-Seidel, with one block its solver. Strong
+    coupling within a block, as of a contact's normal and tangential forces, then costs no sweeps.
+    Converges for symmetric positive definite A. Blocks of at most 6 unknowns are solved exactly by
+    a kernel: active sets changed until none is wrong, all sets if that does not end; bounds affine
+    in x, also in unknowns of the block, are part of that system. On CUDA blocks that are not
+    coupled are solved at once. Larger blocks, and all if `sub_solver` is given, are problems of
+    their own, solved one by one from the host.
 
-    On grids blocks are lines of cells, in two colors: lines along an axis whose coefficients are many times the others' make sweeps as
-    good as if all were equal. Or give blocks as lists and a `sub_solver`; each block then costs passes over the whole grid, so that a few
-    large blocks only make sense.
+    On grids blocks are lines of cells, in two colors: lines along an axis whose coefficients are
+    many times the others' make sweeps as good as if all were equal. Or give blocks as lists and a
+    `sub_solver`; each block then costs passes over the whole grid, so that a few large blocks only
+    make sense.
 
     Args:
-        blocks: unknowns of a block, consecutive ones; or `GridLines`; or for each block flat indices into a field of the problem's shape,
-            together all unknowns, each once. If None, 3 unknowns, on grids lines along x.
-        sub_solver: a method for the blocks; None: the kernel for blocks of at most 6 unknowns, MinimumMapNewton for larger ones.
+        blocks: unknowns of a block, consecutive ones; or `GridLines`; or for each block flat
+            indices into a field of the problem's shape, together all unknowns, each once. If None,
+            3 unknowns, on grids lines along x.
+        sub_solver: a method for the blocks; None: the kernel for blocks of at most 6 unknowns,
+            MinimumMapNewton for larger ones.
         omega: relaxation factor in (0, 2) of blocks that the kernel solves; 1 for others.
         direction: "forward", "backward" or "symmetric".
-        eta: each solve of a block by a `sub_solver` reduces its residual by this factor, or to the accuracy that the whole problem needs.
+        eta: each solve of a block by a `sub_solver` reduces its residual by this factor, or to the
+            accuracy that the whole problem needs.
         precision: "mixed" or "double" keep the iterate in float64, "single" rounds it to float32.
     """
 
@@ -87,7 +99,8 @@ class BlockedGaussSeidel(Settings):
         """Return a workspace.
 
         Raises:
-            ValueError: the blocks are no partition of the unknowns, A cannot be taken apart, or the method does not take its blocks.
+            ValueError: the blocks are no partition of the unknowns, A cannot be taken apart, or the
+                method does not take its blocks.
         """
         check_taken(self, problem.A)
         A, given, kind = problem.A, self.blocks, type(problem.A).__name__
@@ -96,19 +109,37 @@ class BlockedGaussSeidel(Settings):
             given = GridLines.X if has(A, HasStencil) else CONSECUTIVE
         if isinstance(given, GridLines):
             if not has(A, HasStencil) or self.sub_solver is not None:
-                raise ValueError(f"blocks = {given}: only for GridPoisson without a sub_solver; A is a {kind}")
+                raise ValueError(
+                    f"blocks = {given}: only for GridPoisson without a sub_solver; A is a {kind}"
+                )
             return LineWorkspace(problem, given, self)
         if rows is None and (isinstance(given, int) or self.sub_solver is None):
-            raise ValueError(f"{kind} gives no access to rows: give BlockedGaussSeidel GridLines, or lists as blocks and a sub_solver")
-        blocks = blocks_of_size(problem, given) if isinstance(given, int) else given_blocks(problem, given)
+            raise ValueError(
+                f"{kind} gives no access to rows: give BlockedGaussSeidel GridLines, or lists as "
+                "blocks and a sub_solver"
+            )
+        blocks = (
+            blocks_of_size(problem, given)
+            if isinstance(given, int)
+            else given_blocks(problem, given)
+        )
         if rows is not None and self.sub_solver is None and max(map(len, blocks)) <= MOST:
             return BlockWorkspace(problem, rows, blocks, self)
         if self.omega != 1:
-            raise ValueError(f"omega = {self.omega}: must be 1 for blocks of more than {MOST} unknowns")
+            raise ValueError(
+                f"omega = {self.omega}: must be 1 for blocks of more than {MOST} unknowns"
+            )
         solver: Solver = self.sub_solver or MinimumMapNewton()
-        return StaggeringWorkspace(problem, blocks, [solver] * len(blocks), eta=self.eta, max_iterations=100)
+        return StaggeringWorkspace(
+            problem, blocks, [solver] * len(blocks), eta=self.eta, max_iterations=100
+        )
 
-    def step(self, problem: LCP, work: BlockWorkspace | LineWorkspace | StaggeringWorkspace, x: wp.array[Any]) -> Step:
+    def step(
+        self,
+        problem: LCP,
+        work: BlockWorkspace | LineWorkspace | StaggeringWorkspace,
+        x: wp.array[Any],
+    ) -> Step:
         """Solve each block once, or forward and backward if symmetric."""
         linear = 0
         for forward in DIRECTIONS[self.direction]:
@@ -124,7 +155,13 @@ class BlockedGaussSeidel(Settings):
 class BlockWorkspace(SweepWorkspace):
     """Memory of sweeps over small blocks."""
 
-    def __init__(self, problem: LCP, rows: CompressedRows, blocks: list[np.ndarray], settings: BlockedGaussSeidel) -> None:
+    def __init__(
+        self,
+        problem: LCP,
+        rows: CompressedRows,
+        blocks: list[np.ndarray],
+        settings: BlockedGaussSeidel,
+    ) -> None:
         super().__init__(problem, settings.precision)
         device, n, sizes = problem.device, problem.layout.size, [len(block) for block in blocks]
         members = np.concatenate(blocks)
@@ -132,14 +169,36 @@ class BlockWorkspace(SweepWorkspace):
         owner[members] = np.repeat(np.arange(len(blocks)), sizes)
         place[members] = np.concatenate([np.arange(size) for size in sizes])
         colors = [np.arange(len(blocks))]
-        self._parallel = device.is_cuda and isinstance(problem.A, SparseOperator) and problem.bounds.affine is None
+        self._parallel = (
+            device.is_cuda
+            and isinstance(problem.A, SparseOperator)
+            and problem.bounds.affine is None
+        )
         if self._parallel:
             colors = color_blocks(problem.A.matrix(), owner, len(blocks))  # type: ignore[attr-defined]
         self._starts = [0, *np.cumsum([len(color) for color in colors]).tolist()]
-        arrays = [np.concatenate([[0], np.cumsum(sizes)]), members, owner, place, np.concatenate(colors)]
+        arrays = [
+            np.concatenate([[0], np.cumsum(sizes)]),
+            members,
+            owner,
+            place,
+            np.concatenate(colors),
+        ]
         names = ("first", "rows", "owner", "place", "order")
-        given = put(BlockLists(), {name: wp.array(v, dtype=wp.int32, device=device) for name, v in zip(names, arrays, strict=True)})
-        self._operands = [rows.operand, problem.b, *bound_operands(problem), wp.float64(settings.omega), given]
+        given = put(
+            BlockLists(),
+            {
+                name: wp.array(v, dtype=wp.int32, device=device)
+                for name, v in zip(names, arrays, strict=True)
+            },
+        )
+        self._operands = [
+            rows.operand,
+            problem.b,
+            *bound_operands(problem),
+            wp.float64(settings.omega),
+            given,
+        ]
         self._kernel = block_sweep_kernel(rows.values.dtype, max(sizes))
 
     def run(self, x: wp.array[Any], *, forward: bool) -> None:
@@ -148,7 +207,12 @@ class BlockWorkspace(SweepWorkspace):
         for c in colors if forward else reversed(colors):
             count = self._starts[c + 1] - self._starts[c]
             threads, each = (count, 1) if self._parallel else (1, count)
-            wp.launch(self._kernel, threads, [*self._operands, self._starts[c], each, forward, x], device=x.device)
+            wp.launch(
+                self._kernel,
+                threads,
+                [*self._operands, self._starts[c], each, forward, x],
+                device=x.device,
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,7 +245,8 @@ class LineMemory:
 class LineWorkspace(SweepWorkspace):
     """Memory of sweeps over a grid's lines, those of one color of a checkerboard after those of the other.
 
-    A line is a tridiagonal M-matrix with bounds; its active set is changed until none is wrong, each change a tridiagonal solve.
+    A line is a tridiagonal M-matrix with bounds; its active set is changed until none is wrong,
+    each change a tridiagonal solve.
 
     Args:
         problem: on a grid.
@@ -197,15 +262,32 @@ class LineWorkspace(SweepWorkspace):
         A = problem.A
         assert has(A, HasStencil)
         if A.periodic[axis.value]:
-            raise ValueError(f"blocks = {axis}: lines cannot run along a periodic axis; choose another axis")
+            raise ValueError(
+                f"blocks = {axis}: lines cannot run along a periodic axis; choose another axis"
+            )
         check_colors(problem)
         padding = A.layout.padding
         strides, counts = (1, padding.row, padding.plane), tuple(reversed(padding.counts))
         a, b = (other for other in (2, 1, 0) if other != axis.value)
-        self._lines = Rows.strided(padding.size, problem.device, (sum(strides), strides[a], strides[b]), (counts[a], counts[b], 1))
+        self._lines = Rows.strided(
+            padding.size,
+            problem.device,
+            (sum(strides), strides[a], strides[b]),
+            (counts[a], counts[b], 1),
+        )
         zeros, self._axis = problem.layout.zeros, axis.value
         c, q, z = (zeros(f64) for _ in range(3))
-        self._memory = LineMemory(c, q, z, zeros(wp.uint8), padding.plane, padding.row, counts[axis.value], CHANGES, settings.omega)
+        self._memory = LineMemory(
+            c,
+            q,
+            z,
+            zeros(wp.uint8),
+            padding.plane,
+            padding.row,
+            counts[axis.value],
+            CHANGES,
+            settings.omega,
+        )
 
     def run(self, x: wp.array[Any], *, forward: bool) -> None:
         """Solve the lines of one color, then those of the other."""
@@ -216,5 +298,13 @@ class LineWorkspace(SweepWorkspace):
         for color in range(colors) if forward else reversed(range(colors)):
             stencil.wrap(x)
             SOLVE_LINE.bind(
-                self._lines, self._memory, stencil=stencil, x=x, b=p.b, l=p.lower, u=p.upper, color=color, AXIS=self._axis
+                self._lines,
+                self._memory,
+                stencil=stencil,
+                x=x,
+                b=p.b,
+                l=p.lower,
+                u=p.upper,
+                color=color,
+                AXIS=self._axis,
             ).launch()

@@ -17,8 +17,11 @@ from warp_lcp.reduced.enumeration_kernels import enumeration_kernels
 from warp_lcp.rows.fields import Array, checked_device, real_array
 
 MOST = 4  # unknowns: 3^4 = 81 sets
-ACCEPTED = {wp.float64: 1e-10, wp.float32: 3e-5}  # measure of a solution: natural residual over the terms of y, of cond(A) < 1e5
-CLEAR = 1e-3  # measure of all sets above which there surely is no solution: rounding in systems of cond(A) = 1e12 makes less
+# measure of a solution: natural residual over the terms of y, of cond(A) < 1e5
+ACCEPTED = {wp.float64: 1e-10, wp.float32: 3e-5}
+# measure of all sets above which there surely is no solution: rounding in systems of cond(A) = 1e12
+# makes less
+CLEAR = 1e-3
 SAME = 1e-9  # relative difference below which two solutions are one
 
 
@@ -28,10 +31,11 @@ class DirectEnumeration:
 
     [Book] 2.1.1, eqs. 2.10-2.12, algorithm 1.
 
-    Each unknown is at l, at u or free with y = 0, which makes 2^n complementarity cones for the LCP and 3^n for a box; the set that solves
-    the problem most exactly wins. A may be anything: unsymmetric, indefinite, singular. A free block that is singular contributes its basic
-    solution. Where no set solves the problem, by far or as multipliers
-    prove, there is no solution: INFEASIBLE. x0 is not used; `linear_iterations` counts sets.
+    Each unknown is at l, at u or free with y = 0, which makes 2^n complementarity cones for the LCP
+    and 3^n for a box; the set that solves the problem most exactly wins. A may be anything:
+    unsymmetric, indefinite, singular. A free block that is singular contributes its basic solution.
+    Where no set solves the problem, by far or as multipliers prove, there is no solution:
+    INFEASIBLE. x0 is not used; `linear_iterations` counts sets.
 
     For many problems at once see `enumerate_batch`.
     """
@@ -56,7 +60,11 @@ class DirectEnumeration:
             work.write_iterate(candidates[best])
             work.ended = SolveStatus.STAGNATED
         else:
-            work.ended = SolveStatus.INFEASIBLE if measures[best] > CLEAR or inconsistent(work.data) else SolveStatus.STAGNATED
+            work.ended = (
+                SolveStatus.INFEASIBLE
+                if measures[best] > CLEAR or inconsistent(work.data)
+                else SolveStatus.STAGNATED
+            )
             if work.ended is SolveStatus.STAGNATED:
                 work.write_iterate(candidates[best])
         return work.result("sets", int(np.count_nonzero(measures <= 1)))
@@ -83,7 +91,9 @@ class DirectEnumeration:
         candidates, measures = _candidates(DenseProblem.read(problem))
         found: list[np.ndarray] = []
         for x in candidates[measures <= ACCEPTED[wp.float64]]:
-            if not any(np.abs(x - other).max() <= SAME * max(1.0, np.abs(x).max()) for other in found):
+            if not any(
+                np.abs(x - other).max() <= SAME * max(1.0, np.abs(x).max()) for other in found
+            ):
                 found.append(x)
         return np.array(found).reshape(-1, n)
 
@@ -94,8 +104,9 @@ class BatchResult(FieldsOnHost):
 
     Attributes:
         x: solutions, shape (m, n), type of A; the best candidate where there is no solution.
-        sets: the active set that solves each problem, shape (m,), int32: digit i to base 3 is 0 where x_i = l_i, 1 where y_i = 0, 2 where
-            x_i = u_i; -1 where no set does, so that the problem has no solution.
+        sets: the active set that solves each problem, shape (m,), int32: digit i to base 3 is 0
+            where x_i = l_i, 1 where y_i = 0, 2 where x_i = u_i; -1 where no set does, so that the
+            problem has no solution.
     """
 
     x: wp.array[Any]
@@ -103,17 +114,25 @@ class BatchResult(FieldsOnHost):
 
 
 def enumerate_batch(
-    A: Array, b: Array, lower: Any = 0.0, upper: Any = np.inf, *, device: Any = None, out: BatchResult | None = None
+    A: Array,
+    b: Array,
+    lower: Any = 0.0,
+    upper: Any = np.inf,
+    *,
+    device: Any = None,
+    out: BatchResult | None = None,
 ) -> BatchResult:
     """Solve many LCPs of at most 4 unknowns in one launch, one per thread.
 
     [Book] 2.1.1.
 
-    Rows may be in units of their own: each problem is equilibrated symmetrically first, exactly, by powers of 2. Device arrays of one type
-    are used without a copy, and nothing is allocated if `out` is given besides.
+    Rows may be in units of their own: each problem is equilibrated symmetrically first, exactly, by
+    powers of 2. Device arrays of one type are used without a copy, and nothing is allocated if
+    `out` is given besides.
 
     Args:
-        A: matrices, shape (m, n, n), n <= 4; numpy or wp.array, float64 unless a wp.array of wp.float32.
+        A: matrices, shape (m, n, n), n <= 4; numpy or wp.array, float64 unless a wp.array of
+            wp.float32.
         b: shape (m, n), units of y.
         lower: l, a number, or shape (n,) for all problems, or (m, n).
         upper: u, likewise.
@@ -124,7 +143,8 @@ def enumerate_batch(
         The solutions and their active sets.
 
     Raises:
-        ValueError: a wrong shape, n > 4, a NaN, or bounds that cross (host arrays are checked; device arrays are not read back).
+        ValueError: a wrong shape, n > 4, a NaN, or bounds that cross (host arrays are checked;
+            device arrays are not read back).
 
     Example:
         >>> result = enumerate_batch(np.array([[[2.0, 1.0], [1.0, 2.0]]] * 2), np.array([[-3.0, -3.0], [-2.0, 5.0]]), device="cpu")
@@ -132,10 +152,15 @@ def enumerate_batch(
         [[1. 1.]
          [1. 0.]] [4 1]
     """
-    A, b = (value if isinstance(value, wp.array) else real_array(value, name) for value, name in ((A, "A"), (b, "b")))
+    A, b = (
+        value if isinstance(value, wp.array) else real_array(value, name)
+        for value, name in ((A, "A"), (b, "b"))
+    )
     shape = tuple(A.shape)
     if len(shape) != 3 or shape[1] != shape[2] or not 1 <= shape[1] <= MOST or shape[0] == 0:
-        raise ValueError(f"A has shape {shape}: expected (m, n, n) with m >= 1 and 1 <= n <= {MOST}")
+        raise ValueError(
+            f"A has shape {shape}: expected (m, n, n) with m >= 1 and 1 <= n <= {MOST}"
+        )
     m, n = shape[:2]
     dtype = A.dtype if isinstance(A, wp.array) else wp.float64
     if dtype not in ACCEPTED:
@@ -143,15 +168,39 @@ def enumerate_batch(
     device = A.device if device is None and isinstance(A, wp.array) else checked_device(device)
     matrices = _on_device(A, (m, n, n), dtype, device, "A")
     right = _on_device(b, (m, n), dtype, device, "b")
-    bounds = [_bounds(value, m, n, dtype, device, name) for value, name in ((lower, "lower"), (upper, "upper"))]
+    bounds = [
+        _bounds(value, m, n, dtype, device, name)
+        for value, name in ((lower, "lower"), (upper, "upper"))
+    ]
     if not any(isinstance(v, wp.array) for v in (lower, upper)):
-        low, high = (np.asarray(real_array(v, name), dtype=np.float64) for v, name in ((lower, "lower"), (upper, "upper")))
-        if np.isnan(low).any() or np.isnan(high).any() or (low > high).any() or (low == np.inf).any() or (high == -np.inf).any():
-            raise ValueError("lower, upper: need lower <= upper without NaN, lower < inf and upper > -inf")
+        low, high = (
+            np.asarray(real_array(v, name), dtype=np.float64)
+            for v, name in ((lower, "lower"), (upper, "upper"))
+        )
+        if (
+            np.isnan(low).any()
+            or np.isnan(high).any()
+            or (low > high).any()
+            or (low == np.inf).any()
+            or (high == -np.inf).any()
+        ):
+            raise ValueError(
+                "lower, upper: need lower <= upper without NaN, lower < inf and upper > -inf"
+            )
     if out is None:
-        out = BatchResult(wp.empty((m, n), dtype=dtype, device=device), wp.empty(m, dtype=wp.int32, device=device))
-    if tuple(out.x.shape) != (m, n) or tuple(out.sets.shape) != (m,) or out.x.dtype is not dtype or out.x.device != device:
-        raise ValueError(f"out holds x of shape {tuple(out.x.shape)} and type {out.x.dtype}: expected {(m, n)} and {dtype} on {device}")
+        out = BatchResult(
+            wp.empty((m, n), dtype=dtype, device=device), wp.empty(m, dtype=wp.int32, device=device)
+        )
+    if (
+        tuple(out.x.shape) != (m, n)
+        or tuple(out.sets.shape) != (m,)
+        or out.x.dtype is not dtype
+        or out.x.device != device
+    ):
+        raise ValueError(
+            f"out holds x of shape {tuple(out.x.shape)} and type {out.x.dtype}: expected {(m, n)} "
+            f"and {dtype} on {device}"
+        )
     inputs = [matrices, right, *bounds, dtype(ACCEPTED[dtype]), out.x, out.sets]
     wp.launch(enumeration_kernels(n, dtype).batch, m, inputs, device=device)
     return out
@@ -160,17 +209,26 @@ def enumerate_batch(
 def _candidates(data: DenseProblem) -> tuple[np.ndarray, np.ndarray]:
     """Return the x of every set, shape (3^n, n), and its measure: 2 where the set has none, at most 1 elsewhere.
 
-    The sets are tried in units in which A is equilibrated: what counts as a zero pivot does not depend on the units of the rows.
+    The sets are tried in units in which A is equilibrated: what counts as a zero pivot does not
+    depend on the units of the rows.
     """
     n, (scaled, units) = len(data.b), data.scaled()
-    inputs = [wp.array(field, dtype=wp.float64, device="cpu") for field in (scaled.A, scaled.b, scaled.lower, scaled.upper)]
-    x, measures = wp.empty((3**n, n), dtype=wp.float64, device="cpu"), wp.empty(3**n, dtype=wp.float64, device="cpu")
+    inputs = [
+        wp.array(field, dtype=wp.float64, device="cpu")
+        for field in (scaled.A, scaled.b, scaled.lower, scaled.upper)
+    ]
+    x, measures = (
+        wp.empty((3**n, n), dtype=wp.float64, device="cpu"),
+        wp.empty(3**n, dtype=wp.float64, device="cpu"),
+    )
     wp.launch(enumeration_kernels(n, wp.float64).each, 3**n, [*inputs, x, measures], device="cpu")
     with np.errstate(over="ignore"):  # of sets that hold an unknown at a bound beyond all numbers
         return x.numpy() * units, measures.numpy()
 
 
-def _on_device(field: Array, shape: tuple[int, ...], dtype: Any, device: wp.Device, name: str) -> wp.array[Any]:
+def _on_device(
+    field: Array, shape: tuple[int, ...], dtype: Any, device: wp.Device, name: str
+) -> wp.array[Any]:
     """Return a field as a device array; NaN and infinities in host arrays are refused."""
     if tuple(field.shape) != shape:
         raise ValueError(f"{name} has shape {tuple(field.shape)}: expected {shape}")
@@ -187,8 +245,15 @@ def _on_device(field: Array, shape: tuple[int, ...], dtype: Any, device: wp.Devi
 def _bounds(value: Any, m: int, n: int, dtype: Any, device: wp.Device, name: str) -> wp.array[Any]:
     """Return a bound as an array of one row for all problems, or of a row each."""
     if isinstance(value, wp.array):
-        if tuple(value.shape) not in ((n,), (1, n), (m, n)) or value.dtype is not dtype or value.device != device:
-            raise ValueError(f"{name} is of shape {tuple(value.shape)}: expected ({n},) or ({m}, {n}) of A's type and device")
+        if (
+            tuple(value.shape) not in ((n,), (1, n), (m, n))
+            or value.dtype is not dtype
+            or value.device != device
+        ):
+            raise ValueError(
+                f"{name} is of shape {tuple(value.shape)}: expected ({n},) or ({m}, {n}) of A's "
+                "type and device"
+            )
         return value.reshape((1, n)) if value.ndim == 1 else value
     host = np.asarray(real_array(value, name), dtype=np.float64)
     if host.shape not in ((), (n,), (1, n), (m, n)):

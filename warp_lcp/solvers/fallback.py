@@ -15,7 +15,17 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import takes
 from warp_lcp.problem.residual import EPS
 from warp_lcp.problem.result import SolveResult, SolveStatus
-from warp_lcp.problem.solve import FLOOR_MARGIN, Precision, Solver, Spare, Step, method_name, refusal, spare_of, takes_floating
+from warp_lcp.problem.solve import (
+    FLOOR_MARGIN,
+    Precision,
+    Solver,
+    Spare,
+    Step,
+    method_name,
+    refusal,
+    spare_of,
+    takes_floating,
+)
 from warp_lcp.problem.stopping import StoppingCriteria
 
 WINDOW = 10  # steps over which the fall of the residual is measured
@@ -26,8 +36,10 @@ PROGRESS = 0.999  # a residual above this part of the smallest so far is no prog
 WEAK = 30  # iterations of a linear solve that tell of a weak preconditioner
 GRACE = StoppingCriteria.patience  # steps after a hand-over in which the residual need not fall
 BATCH = 0.1  # factor by which a batch of steps reduces the residual
-LASTING = ("begin_ahead", "scratch", "solution")  # attributes of a workspace that stay, and that the outer loop asks for
-PROVED = (SolveStatus.INFEASIBLE, SolveStatus.NEGATIVE_CURVATURE)  # failures that no other method mends
+# attributes of a workspace that stay, and that the outer loop asks for
+LASTING = ("begin_ahead", "scratch", "solution")
+# failures that no other method mends
+PROVED = (SolveStatus.INFEASIBLE, SolveStatus.NEGATIVE_CURVATURE)
 
 
 class Progress:
@@ -39,7 +51,8 @@ class Progress:
         least: smallest residual norm so far, at the start of each step.
         norms: residual norms there.
         step: the last step; None before the first.
-        waited: steps in succession, none of them interim, that have left the smallest residual where it was.
+        waited: steps in succession, none of them interim, that have left the smallest residual
+            where it was.
     """
 
     def __init__(self, problem: Any, tolerance: float) -> None:
@@ -78,18 +91,23 @@ def fails(progress: Progress) -> bool:
 
 def stalls(progress: Progress) -> bool:
     """Return whether the last step has failed, or 10 steps brought no progress."""
-    return progress.waited >= STALLED or (progress.step is not None and progress.step.failure is not None)
+    return progress.waited >= STALLED or (
+        progress.step is not None and progress.step.failure is not None
+    )
 
 
 def crawls(progress: Progress) -> bool:
     """Return whether the tolerance is more than 30 steps away at the present pace.
 
-    By the last 10 steps, and not before 20. A tolerance below float64's rounding of the first residual counts as that.
+    By the last 10 steps, and not before 20. A tolerance below float64's rounding of the first
+    residual counts as that.
     """
     if len(progress.least) <= FIRST:
         return False
     least, target = progress.least[-1], max(progress.tolerance, EPS * progress.least[0])
-    return least > target and math.log(least / target) > MOST / WINDOW * math.log(progress.least[-1 - WINDOW] / least)
+    return least > target and math.log(least / target) > MOST / WINDOW * math.log(
+        progress.least[-1 - WINDOW] / least
+    )
 
 
 def slow_linear_solves(progress: Progress) -> bool:
@@ -121,8 +139,8 @@ class FallbackEntry:
         method: with its settings.
         when: condition under which it takes over; not asked of the first one.
         restart: begin at clip(0, l, u) instead of where the method before has ended.
-        batch: steps of the method, at most, that count as one step of the chain, which ends earlier where the residual
-            has fallen to a tenth. For methods whose steps are cheap.
+        batch: steps of the method, at most, that count as one step of the chain, which ends earlier
+            where the residual has fallen to a tenth. For methods whose steps are cheap.
     """
 
     method: Solver
@@ -134,16 +152,17 @@ class FallbackEntry:
 class Fallback:
     """Chain of methods, each of which takes over as soon as its condition holds.
 
-    Before each step the condition of the next method that takes the problem is asked; others, and one equal to the method at work,
-    are skipped. If it holds, the next method gets the iterate (the best one if the last step has failed; the one that a restarted
-    method was given, after that method), the tolerance, floating components, and what its `init_after` takes from the workspace
-    before. Nothing is handed over where the residual is what rounding leaves (FLOOR), but by a restarted method, or where the last
-    step has proved that there is no solution. The residual of the first workspace judges all iterates. Each `Record` names the
-    method that made it.
+    Before each step the condition of the next method that takes the problem is asked; others, and
+    one equal to the method at work, are skipped. If it holds, the next method gets the iterate (the
+    best one if the last step has failed; the one that a restarted method was given, after that
+    method), the tolerance, floating components, and what its `init_after` takes from the workspace
+    before. Nothing is handed over where the residual is what rounding leaves (FLOOR), but by a
+    restarted method, or where the last step has proved that there is no solution. The residual of
+    the first workspace judges all iterates. Each `Record` names the method that made it.
 
     Args:
-        entries: a method, then pairs (method, condition) or `FallbackEntry` objects. Conditions: `fails`, `stalls`, `crawls`,
-            `slow_linear_solves`, or your own function of a `Progress`.
+        entries: a method, then pairs (method, condition) or `FallbackEntry` objects. Conditions:
+            `fails`, `stalls`, `crawls`, `slow_linear_solves`, or your own function of a `Progress`.
 
     Raises:
         ValueError: there is no method, or an entry is of another kind.
@@ -159,7 +178,9 @@ class Fallback:
     def __init__(self, *entries: Any) -> None:
         if not entries:
             raise ValueError("Fallback: give at least one method")
-        object.__setattr__(self, "entries", tuple(_entry(given, first=k == 0) for k, given in enumerate(entries)))
+        object.__setattr__(
+            self, "entries", tuple(_entry(given, first=k == 0) for k, given in enumerate(entries))
+        )
 
     entries: tuple[FallbackEntry, ...]
 
@@ -178,7 +199,12 @@ class Fallback:
     def __str__(self) -> str:
         """Return the methods in order, each with its condition."""
         first, *others = self.entries
-        return ", then ".join([_named(first.method), *(f"{_named(entry.method)} ({_condition(entry)})" for entry in others)])
+        return ", then ".join(
+            [
+                _named(first.method),
+                *(f"{_named(entry.method)} ({_condition(entry)})" for entry in others),
+            ]
+        )
 
     def __reduce__(self) -> tuple[Any, ...]:
         return Fallback, self.entries
@@ -211,7 +237,11 @@ class Fallback:
         """Return the workspace of an earlier solve, if the first method keeps one."""
         first = self.entries[0].method
         lent = spare_of(first, problem)
-        return None if lent is None else SpareChain(lent, FallbackWorkspace(problem, self.entries, lent.work))
+        return (
+            None
+            if lent is None
+            else SpareChain(lent, FallbackWorkspace(problem, self.entries, lent.work))
+        )
 
     def step(self, problem: Any, work: FallbackWorkspace, x: wp.array[Any]) -> Step:
         """Take a step of the method at work, after a hand-over where one is due."""
@@ -238,8 +268,9 @@ class SpareChain:
 class FallbackWorkspace:
     """Memory of a chain for one problem.
 
-    Attributes that are not its own are those of the first method's workspace. As long as that method is at work, a step costs little more
-    than its own: residuals are noted, and conditions asked.
+    Attributes that are not its own are those of the first method's workspace. As long as that
+    method is at work, a step costs little more than its own: residuals are noted, and conditions
+    asked.
 
     Attributes:
         x: the iterate, a stored field.
@@ -249,21 +280,32 @@ class FallbackWorkspace:
     Args:
         problem: the problem.
         entries: the chain.
-        first: workspace of the first method; it has the iterate and the residual of the whole solve.
+        first: workspace of the first method; it has the iterate and the residual of the whole
+            solve.
     """
 
     def __init__(self, problem: Any, entries: tuple[FallbackEntry, ...], first: Any) -> None:
         self.problem, self._entries, self._first = problem, entries, first
         self.x, self.residual, self.round_iterate = first.x, first.residual, first.round_iterate
-        self.precision = first.precision if isinstance(first.precision, Precision) else Precision(first.precision)
-        self._may_be_ahead = hasattr(first, "is_ahead")  # whether its device may take steps without the host
-        self._works: dict[int, Any] = {0: first}  # by place in the chain; None: the method does not take the problem
-        self._suited: dict[int, bool] = {}  # by place: whether a method takes such a problem, before it has a workspace
+        self.precision = (
+            first.precision
+            if isinstance(first.precision, Precision)
+            else Precision(first.precision)
+        )
+        # whether its device may take steps without the host
+        self._may_be_ahead = hasattr(first, "is_ahead")
+        # by place in the chain; None: the method does not take the problem
+        self._works: dict[int, Any] = {0: first}
+        # by place: whether a method takes such a problem, before it has a workspace
+        self._suited: dict[int, bool] = {}
         self._best: wp.array[Any] | None = None
         self._place = 0
-        self._begun: wp.array[Any] | None = None  # the iterate that the restarted method at work was given
-        self._floored = False  # whether only the rounding floor keeps the method at work from handing over
-        self._left_first = False  # whether the best iterate is kept here and no longer by the first workspace
+        # the iterate that the restarted method at work was given
+        self._begun: wp.array[Any] | None = None
+        # whether only the rounding floor keeps the method at work from handing over
+        self._floored = False
+        # whether the best iterate is kept here and no longer by the first workspace
+        self._left_first = False
         self._at_best, self._best_norm = False, math.inf
 
     def __getattr__(self, name: str) -> Any:
@@ -275,7 +317,9 @@ class FallbackWorkspace:
             self.__dict__[name] = found  # for later look-ups
         return found
 
-    def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> bool | None:
+    def start(
+        self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
+    ) -> bool | None:
         """Begin with the first method, at an iterate that `keep` has been told of; the operator may have changed."""
         self._place, self._since, self._floating = 0, 0, floating
         if self._left_first:
@@ -308,7 +352,8 @@ class FallbackWorkspace:
         """Hand over if that is due, then take a step."""
         progress, first, at_first = self._progress, self._first, self._place == 0
         progress.record(self.residual.norm)
-        ahead = at_first and self._may_be_ahead and first.is_ahead  # nothing is handed over: the device has taken the step
+        # nothing is handed over: the device has taken the step
+        ahead = at_first and self._may_be_ahead and first.is_ahead
         if not ahead and (place := self._due()) is not None:
             self._hand_over(place)
             at_first = False
@@ -319,7 +364,9 @@ class FallbackWorkspace:
                 return done
         else:
             done = progress.step = self._advance()
-            patient = self._since <= GRACE or (self._place + 1 < len(self._entries) and not self._floored)
+            patient = self._since <= GRACE or (
+                self._place + 1 < len(self._entries) and not self._floored
+            )
             name = done.method or method_name(self._entries[self._place].method)
             done = replace(done, interim=done.interim or patient, method=name)
         if done.failure is not None and done.failure not in PROVED:
@@ -343,7 +390,8 @@ class FallbackWorkspace:
                 continue
             if not entry.when(self._progress):
                 return None
-            # a path joined far from the start reaches large x, where rounding leaves much: the method before it was not at its floor
+            # a path joined far from the start reaches large x, where rounding leaves much: the
+            # method before it was not at its floor
             if not self._entries[self._place].restart and self._at_floor():
                 self._floored = True
                 return None
@@ -371,21 +419,40 @@ class FallbackWorkspace:
         if place not in self._works:
             self._works[place] = self._made(self._entries[place].method)
         work = self._works[place]
-        return None if work is None or (self._floating is not None and not takes_floating(work)) else work
+        return (
+            None
+            if work is None or (self._floating is not None and not takes_floating(work))
+            else work
+        )
 
     def _made(self, method: Solver) -> Any:
-        same = next((k for k, work in self._works.items() if work is not None and self._entries[k].method == method), None)
+        same = next(
+            (
+                k
+                for k, work in self._works.items()
+                if work is not None and self._entries[k].method == method
+            ),
+            None,
+        )
         if same is not None:
             return self._works[same]
         before = self._works[self._place]
         try:
-            return method.init_after(self.problem, before) if isinstance(method, StartsAfter) else method.init(self.problem)
+            return (
+                method.init_after(self.problem, before)
+                if isinstance(method, StartsAfter)
+                else method.init(self.problem)
+            )
         except ValueError:
             return None
 
     def _hand_over(self, place: int) -> None:
         """Start the method at a place of the chain, from the iterate or from clip(0, l, u)."""
-        entry, before, work = self._entries[place], self._entries[self._place], self._workspace(place)
+        entry, before, work = (
+            self._entries[place],
+            self._entries[self._place],
+            self._workspace(place),
+        )
         failed = fails(self._progress)
         if not self._left_first:
             self._leave_first()
@@ -486,18 +553,30 @@ def _entry(given: Any, *, first: bool) -> FallbackEntry:
     elif first:
         entry = FallbackEntry(given)
     else:
-        raise ValueError(f"Fallback: {given!r} must be a pair (method, condition) or an FallbackEntry")
+        raise ValueError(
+            f"Fallback: {given!r} must be a pair (method, condition) or an FallbackEntry"
+        )
     method = entry.method
     if isinstance(method, type) or not (hasattr(method, "init") and hasattr(method, "step")):
-        raise ValueError(f"Fallback: {method!r} must be a method with its settings, such as wl.MinimumMapNewton()")
+        raise ValueError(
+            f"Fallback: {method!r} must be a method with its settings, such as "
+            "wl.MinimumMapNewton()"
+        )
     if not callable(entry.when):
-        raise ValueError(f"Fallback: {entry.when!r} must be a condition, a function of a Progress, such as wl.stalls")
+        raise ValueError(
+            f"Fallback: {entry.when!r} must be a condition, a function of a Progress, such as "
+            "wl.stalls"
+        )
     return entry
 
 
 def _described(entry: FallbackEntry, *, first: bool) -> str:
     """Return an entry in words."""
-    return method_name(entry.method) if first else f"({method_name(entry.method)}, {_condition(entry)})"
+    return (
+        method_name(entry.method)
+        if first
+        else f"({method_name(entry.method)}, {_condition(entry)})"
+    )
 
 
 def _named(method: Any) -> str:

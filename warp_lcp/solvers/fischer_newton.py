@@ -23,7 +23,14 @@ from warp_lcp.reduced.dense_problem import DenseWorkspace
 from warp_lcp.reduced.descent import DECREASE, NonmonotoneSearch
 from warp_lcp.reduced.grid_system import GridSystem
 from warp_lcp.reduced.multigrid_workspace import ColdStart
-from warp_lcp.reduced.nonsmooth_map import FiniteDifferenceSystem, HostMap, Kink, KinkName, MapForm, NonsmoothMap
+from warp_lcp.reduced.nonsmooth_map import (
+    FiniteDifferenceSystem,
+    HostMap,
+    Kink,
+    KinkName,
+    MapForm,
+    NonsmoothMap,
+)
 from warp_lcp.reduced.principal_system import principal_system
 from warp_lcp.reduced.settings import NewtonSettings
 from warp_lcp.settings import Count, CountOrZero, ShareOrAll, renamed
@@ -31,10 +38,14 @@ from warp_lcp.solvers.gradient_descent import DescentWorkspace, GradientDescent
 
 SHARE = 0.95  # lambda of the penalized map for dense problems: measured on frictional contacts
 FIRST_STEPS = 30  # of the regularized stage: those that succeed need 5 to 27
-REGULARIZATION = 1e-6  # nu is this times min(1, ||f||), A's entries being near 1: J'J + nu I has a factorization whatever J is
-HOMOTOPIES = ((None, 1.0, 0.3, 40), (10.0, 1.0, 0.5, 60))  # start of x (None: as the solve began), first mu, its factor, steps
-# projected gradient, in parts of ||f||, up to which a point where a search has failed is stationary: the shortest steps, 1e-8, leave up to
-# that of a local minimum's gradient; where searches fail on contacts for other reasons it is 1 to 4
+# nu is this times min(1, ||f||), A's entries being near 1: J'J + nu I has a factorization whatever
+# J is
+REGULARIZATION = 1e-6
+# start of x (None: as the solve began), first mu, its factor, steps
+HOMOTOPIES = ((None, 1.0, 0.3, 40), (10.0, 1.0, 0.5, 60))
+# projected gradient, in parts of ||f||, up to which a point where a search has failed is
+# stationary: the shortest steps, 1e-8, leave up to that of a local minimum's gradient; where
+# searches fail on contacts for other reasons it is 1 to 4
 STATIONARY = 1e-4
 DESCENT = 1e-10  # a direction whose slope is less than this times ||dx||^2.1 is no descent
 
@@ -46,29 +57,37 @@ class FischerNewton(NewtonSettings):
 
     It solves f(x) = 0 ([Book] 2.4.2-3, algorithm 12).
 
-    f_i = lambda psi(a_i, y_i) + (1 - lambda) a_i+ y_i+ / scale, psi(a, b) = a + b - sqrt(a^2 + b^2), a = d (x - l) with d of the
-    natural residual; two-sided rows take psi(a, -psi(-y, d (u - x))) ([Book] eq. 1.48), rows without bounds y. The step solves
-    J dx = -f with J = diag(p d) +
-    diag(q) A: divided by q it is the shifted system (A + D) dx = -f / q, D = d p / q, which multigrid preconditions on grids. The merit
-    f.f / 2 may not exceed the largest of the last ones. Iterates may violate the bounds; a converged result does not.
+    f_i = lambda psi(a_i, y_i) + (1 - lambda) a_i+ y_i+ / scale, psi(a, b) = a + b - sqrt(a^2 +
+    b^2), a = d (x - l) with d of the natural residual; two-sided rows take psi(a, -psi(-y, d (u -
+    x))) ([Book] eq. 1.48), rows without bounds y. The step solves J dx = -f with J = diag(p d) +
+    diag(q) A: divided by q it is the shifted system (A + D) dx = -f / q, D = d p / q, which
+    multigrid preconditions on grids. The merit f.f / 2 may not exceed the largest of the last ones.
+    Iterates may violate the bounds; a converged result does not.
 
-    Dense problems (frictional contact, semi-definite A) are solved with factors of J on the host, in units in which A is equilibrated
-    symmetrically and b is near 1, and the result is within the bounds. `safeguard` makes them a chain: at most 30 steps
-    (J'J + nu I)^-1 J'f with nu = 1e-6 min(1, ||f||) on the penalized map, searched nonmonotonically, the gradient where that is no
-    descent; then two homotopies on the smoothed map x + y - sqrt(x^2 + y^2 + 2 mu), mu -> 0. There is no pivoting method inside.
+    Dense problems (frictional contact, semi-definite A) are solved with factors of J on the host,
+    in units in which A is equilibrated symmetrically and b is near 1, and the result is within the
+    bounds. `safeguard` makes them a chain: at most 30 steps (J'J + nu I)^-1 J'f with nu = 1e-6
+    min(1, ||f||) on the penalized map, searched nonmonotonically, the gradient where that is no
+    descent; then two homotopies on the smoothed map x + y - sqrt(x^2 + y^2 + 2 mu), mu -> 0. There
+    is no pivoting method inside.
 
-    `linear_iterations` counts preconditioned iterations on the finest grid, factorizations where A is dense.
+    `linear_iterations` counts preconditioned iterations on the finest grid, factorizations where A
+    is dense.
 
     Args:
-        kink: derivative at a kink: "random", "zero", "perturbation" or "approximation" (see `Kink`).
-        fischer_weight: lambda, the weight of the Fischer-Burmeister function in the penalized map, in
-            (0, 1]; 1 is the plain map. None: 0.95 for dense matrices, 1 for others, where the penalty made the steps
-            grow with the grid (ball obstacle, 65^2 to 1025^2: 6 to 11 steps with 0.95, 6 to 7 with 1).
-        safeguard: False: monotone Armijo search along the projected path, and an end with NON_DESCENT or LOCAL_MINIMUM where that
-            fails: the book's method. True: as described above.
-        scaled: False: d = 1 in the map, and no equilibration of dense problems, as in the book; needs safeguard = False. Steps
-            then depend on the units of x.
-        precision: "mixed": iterate float64, corrections float32 on grids; "double"; or "single": the iterate rounded to float32 too.
+        kink: derivative at a kink: "random", "zero", "perturbation" or "approximation" (see
+            `Kink`).
+        fischer_weight: lambda, the weight of the Fischer-Burmeister function in the penalized map,
+            in (0, 1]; 1 is the plain map. None: 0.95 for dense matrices, 1 for others, where the
+            penalty made the steps grow with the grid (ball obstacle, 65^2 to 1025^2: 6 to 11 steps
+            with 0.95, 6 to 7 with 1).
+        safeguard: False: monotone Armijo search along the projected path, and an end with
+            NON_DESCENT or LOCAL_MINIMUM where that fails: the book's method. True: as described
+            above.
+        scaled: False: d = 1 in the map, and no equilibration of dense problems, as in the book;
+            needs safeguard = False. Steps then depend on the units of x.
+        precision: "mixed": iterate float64, corrections float32 on grids; "double"; or "single":
+            the iterate rounded to float32 too.
         warm_start: steps of gradient descent on the same map before the first Newton step.
         monotone_cycles: projected multigrid cycles of a cold start on a grid.
         eta: each linear solve reduces its residual by this factor.
@@ -84,7 +103,9 @@ class FischerNewton(NewtonSettings):
         CONVERGED [0.  1.5]
     """
 
-    needs: ClassVar[str] = "a P0-matrix for plain steps; the safeguarded chain also solves copositive contact problems"
+    needs: ClassVar[str] = (
+        "a P0-matrix for plain steps; the safeguarded chain also solves copositive contact problems"
+    )
 
     kink: KinkName = "perturbation"
     fischer_weight: ShareOrAll | None = None
@@ -96,17 +117,28 @@ class FischerNewton(NewtonSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.safeguard and not self.scaled:
-            raise ValueError("scaled = False: needs safeguard = False: the safeguards have thresholds for scaled maps")
+            raise ValueError(
+                "scaled = False: needs safeguard = False: the safeguards have thresholds for "
+                "scaled maps"
+            )
 
     def descent(self, problem: LCP) -> GradientDescent:
         """Return the gradient descent on this method's map for a problem.
 
         No other gradient descent is consistent with the method as a warm start.
         """
-        weight = self.fischer_weight if self.fischer_weight is not None else SHARE if isinstance(problem.A, DenseOperator) else 1.0
+        weight = (
+            self.fischer_weight
+            if self.fischer_weight is not None
+            else SHARE
+            if isinstance(problem.A, DenseOperator)
+            else 1.0
+        )
         map_ = MapForm.FISCHER if weight == 1 else MapForm.PENALIZED
         precision: PrecisionName = "single" if self.precision == "single" else "double"
-        return GradientDescent(map=map_.value, fischer_weight=weight, precision=precision, scaled=self.scaled)
+        return GradientDescent(
+            map=map_.value, fischer_weight=weight, precision=precision, scaled=self.scaled
+        )
 
     def init(self, problem: LCP) -> FischerWorkspace | FischerDenseWorkspace:
         """Return a workspace, on the host for dense matrices.
@@ -140,7 +172,11 @@ class FischerWorkspace(IterateMemory):
         if takes_points(problem.A) and self.kink is not Kink.APPROXIMATION:
             self.cold_start = ColdStart(problem, problem.A, settings)
             self.scratch = self.cold_start.scratch
-        shared: dict[str, Any] = {"x": self.cold_start.x, "residual": self.cold_start.residual} if self.cold_start else {}
+        shared: dict[str, Any] = (
+            {"x": self.cold_start.x, "residual": self.cold_start.residual}
+            if self.cold_start
+            else {}
+        )
         super().__init__(problem, settings.precision, **shared)
         self._from, self._shift = layout.zeros(wp.float64), layout.zeros(wp.float64)
         self.free = layout.zeros(wp.uint8)
@@ -150,11 +186,17 @@ class FischerWorkspace(IterateMemory):
             FiniteDifferenceSystem(problem, self.residual, map_, share, scaled=settings.scaled)
             if self.kink is Kink.APPROXIMATION
             else principal_system(
-                problem, self.precision.correction, bounded=False, settings=settings.cycle, shifted=True,
+                problem,
+                self.precision.correction,
+                bounded=False,
+                settings=settings.cycle,
+                shifted=True,
                 hierarchy=self.cold_start.hierarchy if self.cold_start else None,
             )
-        )  # fmt: skip
-        self.map = NonsmoothMap(problem, self.residual, map_, share, self.kink, scaled=settings.scaled)
+        )
+        self.map = NonsmoothMap(
+            problem, self.residual, map_, share, self.kink, scaled=settings.scaled
+        )
         grid = isinstance(self.system, GridSystem) and self.system.fused
         self._fusable = grid and settings.safeguard and self.precision is not Precision.SINGLE
         self._search = NonmonotoneSearch(memory=settings.memory if settings.safeguard else 1)
@@ -162,11 +204,17 @@ class FischerWorkspace(IterateMemory):
         self.cycles_left = self.descents_left = self.steps = 0
         self.target = self._scale = self._merit = self._gone = 0.0
 
-    def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
+    def start(
+        self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
+    ) -> None:
         """Forget the last solve; the operator may have changed."""
         self.floating = floating
         s = self.settings
-        self.cycles_left = s.monotone_cycles if self.cold_start is not None and self.problem.bounded and not warm else 0
+        self.cycles_left = (
+            s.monotone_cycles
+            if self.cold_start is not None and self.problem.bounded and not warm
+            else 0
+        )
         self.descents_left, self.steps, self.target = s.warm_start, 0, tolerance
         self._scale = self._merit = self._gone = 0.0
         self._search.forget()
@@ -174,7 +222,8 @@ class FischerWorkspace(IterateMemory):
         self.system.refresh()
         if self.cold_start is not None:
             self.cold_start.start(warm=warm, tolerance=tolerance, floating=floating)
-        if self.floating is not None:  # what is singular: components none of whose unknowns is bounded
+        # what is singular: components none of whose unknowns is bounded
+        if self.floating is not None:
             p = self.problem
             free = (p.unknown.numpy() == 1) & np.isinf(p.lower.numpy()) & np.isinf(p.upper.numpy())
             self._without_bounds = wp.array(free.astype(np.uint8), device=p.device)
@@ -248,9 +297,13 @@ class FischerWorkspace(IterateMemory):
         self.steps += 1
         self._scale = 1 / max(self.residual.norm, 1e-300)
         if self._fused:
-            self._merit = self.map.step(x, self.system.e, move, self.system.hierarchy.finest, self._scale, self.steps)
+            self._merit = self.map.step(
+                x, self.system.e, move, self.system.hierarchy.finest, self._scale, self.steps
+            )
             return self._merit
-        self._merit = self.map.condense(x, self._shift, self.system.r, self.free, self._scale, self.steps)
+        self._merit = self.map.condense(
+            x, self._shift, self.system.r, self.free, self._scale, self.steps
+        )
         return self._merit
 
     def _fall_back(self, x: wp.array[Any], iterations: int) -> Step:
@@ -258,7 +311,12 @@ class FischerWorkspace(IterateMemory):
         try:
             if not self.settings.safeguard:
                 stationary = self.map.is_stationary(x, STATIONARY)
-                return Step("fischer", iterations, None, SolveStatus.LOCAL_MINIMUM if stationary else SolveStatus.NON_DESCENT)
+                return Step(
+                    "fischer",
+                    iterations,
+                    None,
+                    SolveStatus.LOCAL_MINIMUM if stationary else SolveStatus.NON_DESCENT,
+                )
             step = self.descend(x)
         except NoTranspose:  # of an operator that has products only
             return Step("fischer", iterations, None, SolveStatus.NON_DESCENT)
@@ -268,7 +326,11 @@ class FischerWorkspace(IterateMemory):
         """Go down the gradient of the same map once."""
         shared = self.cold_start is None  # a grid's own residual does not keep y
         if self._gradient is None:
-            self._gradient = DescentWorkspace(self.problem, self._descent, self.residual if shared else NaturalResidual(self.problem))
+            self._gradient = DescentWorkspace(
+                self.problem,
+                self._descent,
+                self.residual if shared else NaturalResidual(self.problem),
+            )
             self._gradient.start(warm=True, tolerance=self.target)
         if shared:
             return self._gradient.descend(x)
@@ -298,7 +360,8 @@ class FischerWorkspace(IterateMemory):
 class FischerDenseWorkspace(DenseWorkspace):
     """Memory of the method for one dense problem.
 
-    Steps are taken in units in which A is equilibrated, and may leave the bounds; x is the projection of where they are.
+    Steps are taken in units in which A is equilibrated, and may leave the bounds; x is the
+    projection of where they are.
 
     Attributes:
         stage: 0 while steps are Newton's on the map itself, k in the k-th homotopy.
@@ -321,9 +384,16 @@ class FischerDenseWorkspace(DenseWorkspace):
         data, self.units = self.data, np.ones(len(self.data.b), dtype=np.float64)
         if s.scaled:
             data, self.units = self.data.scaled()
-        lower, upper = without_far(data.lower, data.upper, INFINITY)  # squares of what is larger overflow
+        # squares of what is larger overflow
+        lower, upper = without_far(data.lower, data.upper, INFINITY)
         data = replace(data, lower=lower, upper=upper)
-        self.map = HostMap(data, self._descent.fischer_weight, Kink(s.kink), np.random.default_rng(2015), scaled=s.scaled)
+        self.map = HostMap(
+            data,
+            self._descent.fischer_weight,
+            Kink(s.kink),
+            np.random.default_rng(2015),
+            scaled=s.scaled,
+        )
         self._identity = np.eye(len(data.b))
         self._search.forget()
         self.descents_left, self.stage, self.steps, self.target = s.warm_start, 0, 0, tolerance
@@ -367,7 +437,11 @@ class FischerDenseWorkspace(DenseWorkspace):
             return SolveStatus.LOCAL_MINIMUM
         failure = self._searched(x, dx, float(gradient @ dx), 0.5 * float(f @ f), projected=True)
         inside = map_.d * (x - np.clip(x - gradient / map_.d**2, map_.data.lower, map_.data.upper))
-        return SolveStatus.LOCAL_MINIMUM if failure and np.linalg.norm(inside) <= STATIONARY * np.linalg.norm(f) else failure
+        return (
+            SolveStatus.LOCAL_MINIMUM
+            if failure and np.linalg.norm(inside) <= STATIONARY * np.linalg.norm(f)
+            else failure
+        )
 
     def _regularized(self) -> SolveStatus | None:
         """Take a step of the safeguarded method, along the gradient if that of Newton's is no descent."""
@@ -383,7 +457,9 @@ class FischerDenseWorkspace(DenseWorkspace):
             dx, slope = -gradient, -float(gradient @ gradient)
         return self._searched(x, dx, slope, 0.5 * float(f @ f), projected=False)
 
-    def _searched(self, x: np.ndarray, dx: np.ndarray, slope: float, merit: float, *, projected: bool) -> SolveStatus | None:
+    def _searched(
+        self, x: np.ndarray, dx: np.ndarray, slope: float, merit: float, *, projected: bool
+    ) -> SolveStatus | None:
         """Move along a direction; return how that fails."""
         if not (np.isfinite(slope) and slope < 0):
             return SolveStatus.NON_DESCENT
@@ -409,7 +485,11 @@ class FischerDenseWorkspace(DenseWorkspace):
         start, self._mu, self._factor, self._steps_left = HOMOTOPIES[self.stage]
         self.stage += 1
         data = self.map.data
-        x = self._begun if start is None else np.clip(np.full(len(self._begun), start), data.lower, data.upper)
+        x = (
+            self._begun
+            if start is None
+            else np.clip(np.full(len(self._begun), start), data.lower, data.upper)
+        )
         y = data.affine(x)
         one_sided = np.isfinite(data.lower) & ~np.isfinite(data.upper)
         self._iterate, self._y = x, np.where(one_sided, np.maximum(y, 1.0), y)
@@ -421,10 +501,17 @@ class FischerDenseWorkspace(DenseWorkspace):
         dx = _solve(map_.jacobian(p, q), -f - q * gap)
         if not np.isfinite(dx).all():
             dx, self._steps_left = np.zeros(len(x)), 1
-        dy, size, length = A @ dx + gap, float(np.hypot(np.linalg.norm(gap), np.linalg.norm(f))), 1.0
+        dy, size, length = (
+            A @ dx + gap,
+            float(np.hypot(np.linalg.norm(gap), np.linalg.norm(f))),
+            1.0,
+        )
         while length > 1e-6:
             after = map_.value(x + length * dx, y + length * dy, self._mu)
-            if np.hypot((1 - length) * np.linalg.norm(gap), np.linalg.norm(after)) <= (1 - 1e-4 * length) * size:
+            if (
+                np.hypot((1 - length) * np.linalg.norm(gap), np.linalg.norm(after))
+                <= (1 - 1e-4 * length) * size
+            ):
                 break
             length *= 0.5
         self._iterate, self._y = x + length * dx, y + length * dy
@@ -443,7 +530,10 @@ def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     if not right.size:
         return right
     factors, pivots, info = scipy.linalg.lapack.dgetrf(matrix)
-    if not (np.isfinite(factors).all() or np.isfinite(matrix).all()) or not np.isfinite(right).all():
+    if (
+        not (np.isfinite(factors).all() or np.isfinite(matrix).all())
+        or not np.isfinite(right).all()
+    ):
         return np.full(right.shape, np.nan)  # LAPACK's least squares would raise or not return
     if info != 0 or not np.isfinite(factors).all():
         return np.linalg.lstsq(matrix, right, rcond=1e-12)[0]

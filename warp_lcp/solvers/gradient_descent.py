@@ -28,18 +28,22 @@ class GradientDescent(Settings):
 
     [Book] 2.4.4, eq. 2.199, algorithm 13.
 
-    x <- clip(x - t d^-2 J'f, l, u) with an element J = diag(p d) + diag(q) A of the generalized Jacobian and the natural residual's
-    d, which makes the direction independent of x's units. t comes from a backtracking search along the projected path that starts at
-    Barzilai and Borwein's length; the merit may not exceed the largest of the last ones. Needs products with A' as well, and nothing
-    else of A: it is slow, with a rate that the square of A's condition decides.
+    x <- clip(x - t d^-2 J'f, l, u) with an element J = diag(p d) + diag(q) A of the generalized
+    Jacobian and the natural residual's d, which makes the direction independent of x's units. t
+    comes from a backtracking search along the projected path that starts at Barzilai and Borwein's
+    length; the merit may not exceed the largest of the last ones. Needs products with A' as well,
+    and nothing else of A: it is slow, with a rate that the square of A's condition decides.
 
-    The book's tests end it: the absolute one is the criteria of every method (CONVERGED); the relative one (eq. 2.202), a merit that
-    changes by less than `relative` of itself, and the stagnation test (eq. 2.203), an x that changes by less than `stagnation` of its
-    largest entry, give STAGNATED; a gradient below `gradient` ||f|| gives LOCAL_MINIMUM; a search without success gives NON_DESCENT.
+    The book's tests end it: the absolute one is the criteria of every method (CONVERGED); the
+    relative one (eq. 2.202), a merit that changes by less than `relative` of itself, and the
+    stagnation test (eq. 2.203), an x that changes by less than `stagnation` of its largest entry,
+    give STAGNATED; a gradient below `gradient` ||f|| gives LOCAL_MINIMUM; a search without success
+    gives NON_DESCENT.
 
     Args:
         map: "natural", "fischer" or "penalized".
-        fischer_weight: lambda of the penalized map, the weight of the Fischer-Burmeister function, in (0, 1].
+        fischer_weight: lambda of the penalized map, the weight of the Fischer-Burmeister function,
+            in (0, 1].
         relative: of the relative test, >= 0.
         stagnation: of the stagnation test, >= 0.
         gradient: of the test for a local minimum, >= 0.
@@ -77,12 +81,20 @@ class DescentWorkspace(IterateMemory):
         residual: shared with the method that this one serves; its own if None.
     """
 
-    def __init__(self, problem: LCP, settings: GradientDescent, residual: NaturalResidual | None = None) -> None:
+    def __init__(
+        self, problem: LCP, settings: GradientDescent, residual: NaturalResidual | None = None
+    ) -> None:
         x = None if residual is None else wp.empty(0, dtype=wp.float64, device=problem.device)
         super().__init__(problem, settings.precision, x=x, residual=residual)
         self.settings = settings
         self._from = problem.layout.zeros(wp.float64)
-        self._map = NonsmoothMap(problem, self.residual, MapForm(settings.map), settings.fischer_weight, scaled=settings.scaled)
+        self._map = NonsmoothMap(
+            problem,
+            self.residual,
+            MapForm(settings.map),
+            settings.fischer_weight,
+            scaled=settings.scaled,
+        )
         self._search = NonmonotoneSearch(memory=settings.memory, least=1e-18)
         self.length, self._square = 1.0, 0.0
 
@@ -104,8 +116,11 @@ class DescentWorkspace(IterateMemory):
             self.length = self.length / change if change > 1e-6 else 10 * self.length
         self._square = square
         wp.copy(self._from, x)
-        self._search.remember(merit * (1 - LEAST))  # a projected step promises less than Armijo asks of a free one
-        length, reached = self._search.search(lambda t: self._trial(x, t), 0.0, first=min(self.length, LONGEST))
+        # a projected step promises less than Armijo asks of a free one
+        self._search.remember(merit * (1 - LEAST))
+        length, reached = self._search.search(
+            lambda t: self._trial(x, t), 0.0, first=min(self.length, LONGEST)
+        )
         if length == 0.0:
             wp.copy(x, self._from)
             self.residual.evaluate(x)
@@ -126,4 +141,8 @@ class DescentWorkspace(IterateMemory):
         if abs(before - after) <= s.relative * before:
             return SolveStatus.STAGNATED
         moved = float(np.abs(x.numpy() - self._from.numpy()).max())
-        return SolveStatus.STAGNATED if moved <= s.stagnation * float(np.abs(x.numpy()).max()) else None
+        return (
+            SolveStatus.STAGNATED
+            if moved <= s.stagnation * float(np.abs(x.numpy()).max())
+            else None
+        )

@@ -13,11 +13,23 @@ from warp_lcp.deadline import time_is_up
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import EPS, Step
-from warp_lcp.reduced.dense_problem import RANK, DenseWorkspace, assemble, certifies, check_size, inconsistent, pivots_of, semidefinite
+from warp_lcp.reduced.dense_problem import (
+    RANK,
+    DenseWorkspace,
+    assemble,
+    certifies,
+    check_size,
+    inconsistent,
+    pivots_of,
+    semidefinite,
+)
 from warp_lcp.settings import Count, Settings
 
-ZERO = 1e-11  # a rate below this part of the terms that it is a sum of is rounding: nothing changes there
-CLEAR = 1e-8  # of the largest sum that a row's terms can make: a y beyond it is no rounding, whatever x has gone through
+# a rate below this part of the terms that it is a sum of is rounding: nothing changes there
+ZERO = 1e-11
+# of the largest sum that a row's terms can make: a y beyond it is no rounding, whatever x has gone
+# through
+CLEAR = 1e-8
 CORRECTED = 32  # rows driven after which y is computed afresh
 RESTARTS = 3  # times that the last check may send rows back that rounding has undone
 OPEN, FREE, LOW, HIGH = 0, 1, 2, 3  # not held yet; y = 0; x = l and y >= 0; x = u and y <= 0
@@ -31,17 +43,20 @@ class IncrementalPivoting(Settings):
 
     [Book] 2.1.2, algorithm 2; eqs. 2.20-2.27.
 
-    The most violated row j is driven to y_j = 0 or to its bound while all rows that hold keep holding: dx_F = -A_FF^-1 A_Fj, dy = A dx, and
-    the longest step is taken that keeps x_F within its bounds and the signs of y at bounds; what blocks it changes sides. Each change
-    of F updates the inverse of A_FF in O(n^2). Boxed bounds and equations are driven from either side. A positive semi-definite A needs
-    no care: whatever joins F leaves A_FF regular; where y_j cannot change and nothing blocks, no solution exists: INFEASIBLE if multipliers
-    prove it beyond rounding (`certifies`), else STAGNATED.
+    The most violated row j is driven to y_j = 0 or to its bound while all rows that hold keep
+    holding: dx_F = -A_FF^-1 A_Fj, dy = A dx, and the longest step is taken that keeps x_F within
+    its bounds and the signs of y at bounds; what blocks it changes sides. Each change of F updates
+    the inverse of A_FF in O(n^2). Boxed bounds and equations are driven from either side. A
+    positive semi-definite A needs no care: whatever joins F leaves A_FF regular; where y_j cannot
+    change and nothing blocks, no solution exists: INFEASIBLE if multipliers prove it beyond
+    rounding (`certifies`), else STAGNATED.
 
-    A warm start begins with the rows of x0 that are violated. The last step solves A_FF x_F = -(b + A x_bound)_F afresh. A step is a block
-    of pivots; `linear_iterations` counts pivots.
+    A warm start begins with the rows of x0 that are violated. The last step solves A_FF x_F = -(b +
+    A x_bound)_F afresh. A step is a block of pivots; `linear_iterations` counts pivots.
 
     Args:
-        pivots_per_step: pivots in a step of the solve loop, which checks, records and counts steps; max(2, n / 8) if None.
+        pivots_per_step: pivots in a step of the solve loop, which checks, records and counts steps;
+            max(2, n / 8) if None.
     """
 
     needs: ClassVar[str] = "symmetric, positive semi-definite, n <= 4096"
@@ -57,10 +72,15 @@ class IncrementalPivoting(Settings):
         """
         check_size(problem, "IncrementalPivoting", self.most_unknowns)
         if not problem.A.symmetric:
-            raise ValueError("A is not symmetric: IncrementalPivoting needs it to be; Lemke does not")
+            raise ValueError(
+                "A is not symmetric: IncrementalPivoting needs it to be; Lemke does not"
+            )
         A = assemble(problem, np.flatnonzero(problem.unknown.numpy() == 1))
         if not semidefinite(A):
-            raise ValueError("A is not positive semi-definite: IncrementalPivoting needs it to be; Lemke does not")
+            raise ValueError(
+                "A is not positive semi-definite: IncrementalPivoting needs it to be; Lemke does "
+                "not"
+            )
         return PivotingWorkspace(problem)
 
     def step(self, problem: LCP, work: PivotingWorkspace, x: wp.array[Any]) -> Step:
@@ -143,19 +163,22 @@ class PivotingWorkspace(DenseWorkspace):
         noise = self._noise(dx, dy)
         rate = self.sign * dy[j]
         if rate < -1e3 * noise[j]:
-            self.ended = SolveStatus.NON_DESCENT  # negative curvature: A, changed since init, is not positive semi-definite
+            # negative curvature: A, changed since init, is not positive semi-definite
+            self.ended = SolveStatus.NON_DESCENT
             return
         steps = self._steps(dx, dy, noise)
         length = steps.min()
         if not np.isfinite(length):
-            z = np.where(np.abs(dx) > ZERO * np.abs(dx).max(), dx, 0.0)  # A z = 0 and b'z < 0: a proof, if no rounding has made it
+            # A z = 0 and b'z < 0: a proof, if no rounding has made it
+            z = np.where(np.abs(dx) > ZERO * np.abs(dx).max(), dx, 0.0)
             proved = certifies(data, z) or inconsistent(data)
             self.ended = SolveStatus.INFEASIBLE if proved else SolveStatus.STAGNATED
             return
         self.idle = self.idle + 1 if length <= EPS * np.abs(self.values).max() else 0
         ties = np.flatnonzero(steps <= length * (1 + 4 * EPS))
         strength = np.where(self.kind[ties] == FREE, np.abs(dx[ties]), np.abs(dy[ties]))
-        # the strongest of equals is the most accurate pivot; after many steps of length 0 the least index ends a cycle (Bland)
+        # the strongest of equals is the most accurate pivot; after many steps of length 0 the least
+        # index ends a cycle (Bland)
         q = int(ties[strength.argmax()] if self.idle < len(steps) else ties[0])
         self.values += length * dx
         self.y += length * dy
@@ -231,9 +254,10 @@ class PivotingWorkspace(DenseWorkspace):
 class PrincipalInverse:
     """Solves A_FF z = r for a growing and shrinking set F of a symmetric positive semi-definite A.
 
-    The inverse is bordered when an index joins and deflated when one leaves. A is kept with the rows and columns of F first, in the order
-    of `members`, so that a product with A's columns F tells the solution's residual too. An inverse that has lost its accuracy is
-    computed afresh; where the block itself is singular the minimum-norm least-squares solution takes over.
+    The inverse is bordered when an index joins and deflated when one leaves. A is kept with the
+    rows and columns of F first, in the order of `members`, so that a product with A's columns F
+    tells the solution's residual too. An inverse that has lost its accuracy is computed afresh;
+    where the block itself is singular the minimum-norm least-squares solution takes over.
 
     Args:
         A: symmetric, shape (n, n).
@@ -248,7 +272,8 @@ class PrincipalInverse:
         self.count, self.refactorizations, self.singular = 0, 0, False
         self._order, self._place, self._permuted = np.arange(n), np.arange(n), A.copy()
         self._inverse, self._padded = np.zeros((n, n), order="F"), np.zeros(n)
-        self._last: tuple[int, np.ndarray] | None = None  # index and solution of the last direction, while F has not changed
+        # index and solution of the last direction, while F has not changed
+        self._last: tuple[int, np.ndarray] | None = None
 
     @property
     def members(self) -> np.ndarray:

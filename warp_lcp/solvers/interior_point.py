@@ -1,9 +1,10 @@
 """The interior-point method: Newton's method on the Kojima map, with Mehrotra's predictor and corrector.
 
-w = x - l and v = u - x, infinite where there is no bound; s and t are their multipliers, 0 there. With dx known,
-ds = (tau - w s - second dx_a ds_a) / w - (s / w) dx and dt = (tau - v t + second dx_a dt_a) / v + (t / v) dx, where dx_a is the
-predictor's step; `joined` is 1 where the correction e comes on top of that. FUSED passes go over the rows of a grid whose system is
-condensed where the step ends, the others over flat fields.
+w = x - l and v = u - x, infinite where there is no bound; s and t are their multipliers, 0 there.
+With dx known, ds = (tau - w s - second dx_a ds_a) / w - (s / w) dx and dt = (tau - v t + second
+dx_a dt_a) / v + (t / v) dx, where dx_a is the predictor's step; `joined` is 1 where the correction
+e comes on top of that. FUSED passes go over the rows of a grid whose system is condensed where the
+step ends, the others over flat fields.
 """
 
 from __future__ import annotations
@@ -40,10 +41,13 @@ CONDENSE = KERNELS["interior_point.condense"]
 MOVE = KERNELS["interior_point.move"]
 RATIOS = KERNELS["interior_point.ratios"]
 CENTER = KERNELS["interior_point.center"]
-ADVANCE = Wave("interior_point.advance", (MOVE, 0), (CONDENSE, 1))  # a plane is condensed when the one above it has moved
+# a plane is condensed when the one above it has moved
+ADVANCE = Wave("interior_point.advance", (MOVE, 0), (CONDENSE, 1))
 
 
-NEAR = 10.0  # a near start has w A_ii and s at least this multiple of the residual's root mean square; 3 to 50 measured
+# a near start has w A_ii and s at least this multiple of the residual's root mean square; 3 to 50
+# measured
+NEAR = 10.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,27 +56,33 @@ class InteriorPoint(NewtonSettings):
 
     [Book] 2.3, eq. 2.105-2.114, algorithm 9; by default Mehrotra's predictor-corrector (1992).
 
-    With w = x - l, v = u - x and multipliers s, t >= 0, the solution has A x + b = s - t, W s = 0, V t = 0. A step is Newton's for
-    W s = V t = tau: (A + D) dx = -(A x + b) + tau / w - tau / v with D = s / w + t / v, so that dx, ds and dt keep all of w, v, s and t
-    positive; equations have D = 0, unknowns with l = u are held. Mehrotra's rule solves with tau = 0 first (the predictor), takes
-    sigma = (mu_after / mu)^3 and solves again with tau = sigma mu and the predictor's second-order terms. The book's rule solves once with
-    tau = mu / k and goes the share k / (N + 1) of the way to the boundary in step k. All variables take one common step, without which
-    the method does not converge for LCPs that are no quadratic programs.
+    With w = x - l, v = u - x and multipliers s, t >= 0, the solution has A x + b = s - t, W s = 0,
+    V t = 0. A step is Newton's for W s = V t = tau: (A + D) dx = -(A x + b) + tau / w - tau / v
+    with D = s / w + t / v, so that dx, ds and dt keep all of w, v, s and t positive; equations have
+    D = 0, unknowns with l = u are held. Mehrotra's rule solves with tau = 0 first (the predictor),
+    takes sigma = (mu_after / mu)^3 and solves again with tau = sigma mu and the predictor's
+    second-order terms. The book's rule solves once with tau = mu / k and goes the share k / (N + 1)
+    of the way to the boundary in step k. All variables take one common step, without which the
+    method does not converge for LCPs that are no quadratic programs.
 
-    A must be positive semi-definite (x'Ax >= 0; it need not be symmetric), else steps may become arbitrarily short. Dense and sparse
-    problems are solved in units in which rows are alike; where there is no solution, iterates leave for infinity: then, if A has at most
-    40,000 entries, a linear program is asked, and INFEASIBLE is proved. A float32 correction
-    carries D up to 1e30: nothing is clamped. On grids the shifted systems are solved by conjugate gradients with multigrid, stopped on
-    the norm of d^(-1/2) r, d the diagonal of A + D. `linear_iterations` counts their iterations.
+    A must be positive semi-definite (x'Ax >= 0; it need not be symmetric), else steps may become
+    arbitrarily short. Dense and sparse problems are solved in units in which rows are alike; where
+    there is no solution, iterates leave for infinity: then, if A has at most 40,000 entries, a
+    linear program is asked, and INFEASIBLE is proved. A float32 correction carries D up to 1e30:
+    nothing is clamped. On grids the shifted systems are solved by conjugate gradients with
+    multigrid, stopped on the norm of d^(-1/2) r, d the diagonal of A + D. `linear_iterations`
+    counts their iterations.
 
     Args:
-        precision: "mixed": iterate and multipliers float64, corrections float32 on grids; "double"; or "single": x rounded as well.
+        precision: "mixed": iterate and multipliers float64, corrections float32 on grids; "double";
+            or "single": x rounded as well.
         mehrotra: predictor and corrector; False: the book's step rule.
         horizon: N of the book's rule, the number of steps in which it reaches the boundary.
         backoff: share of the longest step that is taken, in (0, 1).
-        start: a cold start has w A_ii and s at least this multiple of the root mean square of b, or of the residual at clip(0, l, u) if
-            that is larger.
-        monotone_cycles: projected multigrid cycles of a cold start on a grid, from which the path is joined where it is near.
+        start: a cold start has w A_ii and s at least this multiple of the root mean square of b, or
+            of the residual at clip(0, l, u) if that is larger.
+        monotone_cycles: projected multigrid cycles of a cold start on a grid, from which the path
+            is joined where it is near.
         predictor_eta: the predictor's linear solve reduces its residual by this factor.
         eta: the same of the corrector, and of the book's step.
         max_linear_iterations: maximum number of iterations of one linear solve.
@@ -99,7 +109,9 @@ class InteriorPoint(NewtonSettings):
     def init(self, problem: LCP) -> InteriorPointWorkspace | EquilibratedWorkspace:
         """Return a workspace: for dense and sparse problems one that equilibrates them."""
         if EquilibratedWorkspace.suits(problem):
-            return EquilibratedWorkspace(problem, self.precision, lambda scaled: InteriorPointWorkspace(scaled, self))
+            return EquilibratedWorkspace(
+                problem, self.precision, lambda scaled: InteriorPointWorkspace(scaled, self)
+            )
         return InteriorPointWorkspace(problem, self)
 
     def step(self, problem: LCP, work: Any, x: wp.array[Any]) -> Step:
@@ -196,23 +208,39 @@ class InteriorPointWorkspace(IterateMemory):
         else:
             super().__init__(problem, settings.precision)
         self.system: Any = principal_system(
-            problem, self.precision.correction, bounded=False, settings=settings.cycle, shifted=problem.bounded, hierarchy=shared
+            problem,
+            self.precision.correction,
+            bounded=False,
+            settings=settings.cycle,
+            shifted=problem.bounded,
+            hierarchy=shared,
         )
         upper = problem.bounds.may_bind[1]
         self._w, self._s = layout.zeros(wp.float64), layout.zeros(wp.float64)
-        self._v, self._t = (layout.zeros(wp.float64), layout.zeros(wp.float64)) if upper else (self._w, self._s)
+        self._v, self._t = (
+            (layout.zeros(wp.float64), layout.zeros(wp.float64)) if upper else (self._w, self._s)
+        )
         self._D, self.free = layout.zeros(wp.float64), layout.zeros(wp.uint8)
         self._predicted = zeros_like(self.system.e)
-        self._carries = isinstance(self.system, GridSystem) and problem.A.symmetric  # conjugate gradients leave the residual in r
+        # conjugate gradients leave the residual in r
+        self._carries = isinstance(self.system, GridSystem) and problem.A.symmetric
         fused = isinstance(self.system, GridSystem) and self.system.fused
-        self._upper, self._fusable = upper, fused and problem.bounded and settings.mehrotra and self._rounded is None
-        self._sums, self._longest = Sums(rows_of(self.x), 3), wp.zeros(1, dtype=wp.float64, device=problem.device)
+        self._upper, self._fusable = (
+            upper,
+            fused and problem.bounded and settings.mehrotra and self._rounded is None,
+        )
+        self._sums, self._longest = (
+            Sums(rows_of(self.x), 3),
+            wp.zeros(1, dtype=wp.float64, device=problem.device),
+        )
         self._grid_sums = Sums(problem.A.stencil.rows, 3) if self._fusable else self._sums  # type: ignore[attr-defined]
         self.cycles_left = self.steps = self.count = 0
         self.near = self.begun = False
         self.mu = self.target = self.size = 0.0
 
-    def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
+    def start(
+        self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
+    ) -> None:
         """Forget the path; the operator may have changed."""
         self.floating = floating
         s = self.settings
@@ -250,8 +278,12 @@ class InteriorPointWorkspace(IterateMemory):
                 least = NEAR * self.residual.norm / math.sqrt(self.count)
             else:
                 unknowns = max(int(np.count_nonzero(p.unknown.numpy() == 1)), 1)
-                # b may be 0 where bounds are not, and have a row that is held, which says nothing of the others
-                size = max(min(self.residual.norm_of_b(), LARGEST_START * self.residual.norm), self.residual.norm)
+                # b may be 0 where bounds are not, and have a row that is held, which says nothing
+                # of the others
+                size = max(
+                    min(self.residual.norm_of_b(), LARGEST_START * self.residual.norm),
+                    self.residual.norm,
+                )
                 least = self.settings.start * size / math.sqrt(unknowns)
             self._inside(x, least)
             self.residual.affine(x)
@@ -259,9 +291,12 @@ class InteriorPointWorkspace(IterateMemory):
         elif self.is_grid:
             self.residual.affine(x)
         self.begun, self.condensed = True, False
-        if self.floating is not None:  # what is singular: components none of whose unknowns is bounded
+        # what is singular: components none of whose unknowns is bounded
+        if self.floating is not None:
             free, w, v = self.free.numpy() != 0, self._w.numpy(), self._v.numpy()
-            self._without_bounds = wp.array((free & np.isinf(w) & np.isinf(v)).astype(np.uint8), device=p.device)
+            self._without_bounds = wp.array(
+                (free & np.isinf(w) & np.isinf(v)).astype(np.uint8), device=p.device
+            )
 
     def path_step(self, x: wp.array[Any]) -> Step:
         """Solve for the direction, and go nearly as far along it as w, v, s and t stay positive."""
@@ -272,9 +307,14 @@ class InteriorPointWorkspace(IterateMemory):
         tau = 0.0 if s.mehrotra else self.mu / self.steps
         second = 0.0
         self._sums.of(
-            CONDENSE, self._pairs, self._condensing(x, self._D, tau), stencil=self._stencil, bounds=self.problem.bounds.operands,
-            UPPER=self._upper, FUSED=False,
-        )  # fmt: skip
+            CONDENSE,
+            self._pairs,
+            self._condensing(x, self._D, tau),
+            stencil=self._stencil,
+            bounds=self.problem.bounds.operands,
+            UPPER=self._upper,
+            FUSED=False,
+        )
         self.system.restrict(self.free, self._D if self.problem.bounded else None)
         self._project()
         iterations = self._solve(s.predictor_eta if s.mehrotra and self.count else s.eta)
@@ -310,7 +350,8 @@ class InteriorPointWorkspace(IterateMemory):
 
     def _center(self, longest: float, products: float) -> float:
         """Return Mehrotra's tau: mu times the cube of what the predictor would leave of it."""
-        if not self.mu > 0:  # products that vanish: rounding, or coefficients beyond what corrections hold
+        # products that vanish: rounding, or coefficients beyond what corrections hold
+        if not self.mu > 0:
             return 0.0
         length = min(1.0, 1 / longest) if longest > 0 else 1.0
         after = (1 - length) * self.mu + length**2 * products / self.count
@@ -340,17 +381,36 @@ class InteriorPointWorkspace(IterateMemory):
 
     def _advance(self, x: wp.array[Any], tau: float, length: float) -> None:
         """Move, unless the length is 0, and set the residual's norm and the next system there."""
-        sums, rows, bounds, upper = self._grid_sums, self._grid_sums.rows, self.problem.bounds.operands, self._upper
+        sums, rows, bounds, upper = (
+            self._grid_sums,
+            self._grid_sums.rows,
+            self.problem.bounds.operands,
+            self._upper,
+        )
         direction, moving = self._direction(1.0, tau), None
         self.size = max(self.residual.norm, 1e-300)
         if length:
             moving = MOVE.bind(
-                rows, self._pairs, direction, bounds=bounds, x=x, length=length, out=sums.partials[2 * rows.places :], UPPER=upper,
+                rows,
+                self._pairs,
+                direction,
+                bounds=bounds,
+                x=x,
+                length=length,
+                out=sums.partials[2 * rows.places :],
+                UPPER=upper,
                 FUSED=True,
-            )  # fmt: skip
+            )
         system = self._condensing(x, self.system.hierarchy.finest.stencil.d, 0.0)
         condensing = CONDENSE.bind(
-            rows, self._pairs, system, stencil=self._stencil, bounds=bounds, out=sums.partials, UPPER=upper, FUSED=True
+            rows,
+            self._pairs,
+            system,
+            stencil=self._stencil,
+            bounds=bounds,
+            out=sums.partials,
+            UPPER=upper,
+            FUSED=True,
         )
         ADVANCE.launch(moving, condensing)
         sums.add_up(0, columns=3)
@@ -366,7 +426,12 @@ class InteriorPointWorkspace(IterateMemory):
         """Return the reciprocal of the longest step, 0 if there is none, and the sum of dw ds + dv dt."""
         self._longest.zero_()
         found = self._pass_sums.of(
-            RATIOS, self._pairs, self._direction(second, tau), longest=self._longest, UPPER=self._upper, FUSED=self._fused
+            RATIOS,
+            self._pairs,
+            self._direction(second, tau),
+            longest=self._longest,
+            UPPER=self._upper,
+            FUSED=self._fused,
         )
         products = float(found[0])
         return float(self._longest.numpy()[0]), products
@@ -374,16 +439,33 @@ class InteriorPointWorkspace(IterateMemory):
     def _correct(self, tau: float, *, y: wp.array[Any] | None, D: wp.array[Any] | None) -> None:
         """Write the corrector's right-hand side."""
         self._pass_sums.of(
-            CENTER, self._pairs, e=self.system.e, free=self.free, a=self._predicted, r=self.system.r, y=y, D=D, scale=self.size,
-            tau=tau, carried=self._carries, UPPER=self._upper, FUSED=self._fused,
-        )  # fmt: skip
+            CENTER,
+            self._pairs,
+            e=self.system.e,
+            free=self.free,
+            a=self._predicted,
+            r=self.system.r,
+            y=y,
+            D=D,
+            scale=self.size,
+            tau=tau,
+            carried=self._carries,
+            UPPER=self._upper,
+            FUSED=self._fused,
+        )
 
     def _move(self, x: wp.array[Any], second: float, tau: float, length: float) -> None:
         """Take the step, and remember mu."""
         found = self._sums.of(
-            MOVE, self._pairs, self._direction(second, tau), bounds=self.problem.bounds.operands, x=x, length=length,
-            UPPER=self._upper, FUSED=False,
-        )  # fmt: skip
+            MOVE,
+            self._pairs,
+            self._direction(second, tau),
+            bounds=self.problem.bounds.operands,
+            x=x,
+            length=length,
+            UPPER=self._upper,
+            FUSED=False,
+        )
         self.mu = float(found[0]) / max(self.count, 1)
         self._finish_move(x)
 
@@ -391,13 +473,24 @@ class InteriorPointWorkspace(IterateMemory):
         """Set w and v to at least width / d, and x accordingly."""
         p, r = self.problem, self.residual
         INSIDE.bind(
-            self._sums.rows, self._pairs, bounds=p.bounds.operands, x=x, unknown=p.unknown, free=self.free, d=r.diagonal,
-            unit=r.unit, width=width, UPPER=self._upper, FUSED=False,
-        ).launch()  # fmt: skip
+            self._sums.rows,
+            self._pairs,
+            bounds=p.bounds.operands,
+            x=x,
+            unknown=p.unknown,
+            free=self.free,
+            d=r.diagonal,
+            unit=r.unit,
+            width=width,
+            UPPER=self._upper,
+            FUSED=False,
+        ).launch()
 
     def _multipliers(self, least: float) -> tuple[float, float]:
         """Set s and t to y's sides, at least `least`; return the sum of products and how many bounds are finite."""
-        total, count = self._sums.of(MULTIPLIERS, self._pairs, y=self.residual.y, least=least, UPPER=self._upper, FUSED=False)
+        total, count = self._sums.of(
+            MULTIPLIERS, self._pairs, y=self.residual.y, least=least, UPPER=self._upper, FUSED=False
+        )
         return float(total), float(count)
 
     def _solve(self, eta: float) -> int:
@@ -405,7 +498,9 @@ class InteriorPointWorkspace(IterateMemory):
         target = eta
         if not self.count:
             target = max(eta, 0.3 * self.target / self.size)
-        return self.system.solve(target * self.system.norm(), self.settings.max_linear_iterations)[0]
+        return self.system.solve(target * self.system.norm(), self.settings.max_linear_iterations)[
+            0
+        ]
 
     def _project(self) -> None:
         """Take off what a singular component without bounds cannot meet."""

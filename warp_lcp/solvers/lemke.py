@@ -18,7 +18,13 @@ from warp_lcp.problem.bounds import without_far
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import EPS, Step
-from warp_lcp.reduced.dense_problem import DenseProblem, DenseWorkspace, check_size, inconsistent, pivots_of
+from warp_lcp.reduced.dense_problem import (
+    DenseProblem,
+    DenseWorkspace,
+    check_size,
+    inconsistent,
+    pivots_of,
+)
 from warp_lcp.settings import Count, Settings
 
 REGULAR = 1e-10  # reciprocal condition number above which the equations' block is eliminated
@@ -30,9 +36,11 @@ class LemkeForm:
 
     - l = u: x is known; its row asks nothing.
     - a finite l: x = l + z; only u finite: x = u - z, and the row changes its sign.
-    - both finite: one more pair, s = u - l - z >= 0 with v >= 0 and y = w - v: M = [[A, I], [-I, 0]], positive semi-definite if A is.
-    - equations: x_E = -A_EE^-1 (b_E + A_EI x_I) is eliminated where A_EE is regular (M is then the Schur complement); otherwise x = x+ - x-
-      with M = [[A, -A], [-A, A]], positive semi-definite if A is.
+    - both finite: one more pair, s = u - l - z >= 0 with v >= 0 and y = w - v: M = [[A, I], [-I,
+      0]], positive semi-definite if A is.
+    - equations: x_E = -A_EE^-1 (b_E + A_EI x_I) is eliminated where A_EE is regular (M is then the
+      Schur complement); otherwise x = x+ - x- with M = [[A, -A], [-A, A]], positive semi-definite
+      if A is.
 
     Attributes:
         M: shape (m, m); sparse, like `map`, where the problem is.
@@ -75,7 +83,9 @@ class LemkeForm:
                 M, q = tests @ (A @ columns)[sided], tests @ (A @ base + data.b)[sided]
             else:
                 split = np.zeros((n, 2 * len(equations)))
-                split[np.r_[equations, equations], np.arange(2 * len(equations))] = np.repeat([1.0, -1.0], len(equations))
+                split[np.r_[equations, equations], np.arange(2 * len(equations))] = np.repeat(
+                    [1.0, -1.0], len(equations)
+                )
                 columns = np.hstack([columns, split])
                 M, q = columns.T @ A @ columns, columns.T @ (A @ base + data.b)
         else:  # a choice of rows and columns with signs, no product of matrices
@@ -94,11 +104,15 @@ class LemkeForm:
     def _of_narrow(cls, data: DenseProblem) -> LemkeForm:
         """Reformulate a sparse problem all of whose rows have a finite bound.
 
-        The row s = u - l - z follows that of its z at once, so that a matrix of bandwidth k becomes one of 2 k + 1 at most.
+        The row s = u - l - z follows that of its z at once, so that a matrix of bandwidth k becomes
+        one of 2 k + 1 at most.
         """
         below, n = np.isfinite(data.lower), len(data.b)
         both = np.flatnonzero(below & np.isfinite(data.upper))
-        S, base = scipy.sparse.diags_array(np.where(below, 1.0, -1.0)), np.where(below, data.lower, data.upper)
+        S, base = (
+            scipy.sparse.diags_array(np.where(below, 1.0, -1.0)),
+            np.where(below, data.lower, data.upper),
+        )
         M, q, columns = S @ data.A @ S, S @ data.affine(base), S
         k = len(both)
         if k:
@@ -107,14 +121,21 @@ class LemkeForm:
             q = np.r_[q, (data.upper - data.lower)[both]]
             columns = scipy.sparse.hstack([S, scipy.sparse.csr_array((n, k))])
         order = np.argsort(np.r_[np.arange(n), both], kind="stable")
-        return cls(M.tocsr()[order][:, order], q[order], base, columns.tocsr()[:, order], np.flatnonzero(order >= n))
+        return cls(
+            M.tocsr()[order][:, order],
+            q[order],
+            base,
+            columns.tocsr()[:, order],
+            np.flatnonzero(order >= n),
+        )
 
     def solution(self, z: np.ndarray) -> np.ndarray:
         """Return x, shape (n,), for z of shape (m,)."""
         return self.base + self.map @ z
 
 
-WIDEST, FEW = 3, 30  # bandwidth that is called narrow, and unknowns up to which a dense inverse costs no more
+# bandwidth that is called narrow, and unknowns up to which a dense inverse costs no more
+WIDEST, FEW = 3, 30
 
 
 def narrow_problem(problem: LCP) -> DenseProblem | None:
@@ -127,13 +148,22 @@ def narrow_problem(problem: LCP) -> DenseProblem | None:
     return data if sided.all() else None
 
 
-PIVOT = 1e-10  # entries of the entering column below this part of its largest are no pivots (methods.md: 200 of 200 with it)
-TIE = 1e-12  # relative difference of ratios that counts as a tie, which the lexicographic rule breaks
-NOISE = 1e-6  # residual, relative to that of clip(0, l, u), beyond which an end of the path is no solution
-PERIOD = 20  # pivots, or an eighth of the rows if that is more, after which the inverse is computed afresh; columns are refined between
-FAR = 1e8  # bounds of this size, in units in which A and b are near 1, are left out at first: beside them ratios that differ tie
+# entries of the entering column below this part of its largest are no pivots (methods.md: 200 of
+# 200 with it)
+PIVOT = 1e-10
+# relative difference of ratios that counts as a tie, which the lexicographic rule breaks
+TIE = 1e-12
+# residual, relative to that of clip(0, l, u), beyond which an end of the path is no solution
+NOISE = 1e-6
+# pivots, or an eighth of the rows if that is more, after which the inverse is computed afresh;
+# columns are refined between
+PERIOD = 20
+# bounds of this size, in units in which A and b are near 1, are left out at first: beside them
+# ratios that differ tie
+FAR = 1e8
 BEYOND = 1e100  # those of this size always are: products overflow
-ACCEPTED = 1e-9  # relative error of the entering column after refinement with which the inverse stays in use
+# relative error of the entering column after refinement with which the inverse stays in use
+ACCEPTED = 1e-9
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,15 +172,19 @@ class Lemke(Settings):
 
     [Book] 2.1, appendix C; LCP of w - M z - d z0 = q.
 
-    z0 and the covering vector d > 0 make the start feasible; complements enter until z0 leaves. It processes every problem with a
-    copositive-plus matrix, positive semi-definite ones among them, symmetric or not, and every P-matrix; for others it may end in a ray.
-    A ray is believed only when further covering vectors, random in [.5, 1.5], end in one too; the status is then INFEASIBLE if multipliers
-    prove that no x meets the inequalities (`certifies`), which they do where A is positive semi-definite, else STAGNATED. On a bimatrix
-    game, M = [[0, E], [F', 0]] with E, F > 0 and q < 0, where every such d ends in a ray, it begins as Lemke and Howson's method does.
+    z0 and the covering vector d > 0 make the start feasible; complements enter until z0 leaves. It
+    processes every problem with a copositive-plus matrix, positive semi-definite ones among them,
+    symmetric or not, and every P-matrix; for others it may end in a ray. A ray is believed only
+    when further covering vectors, random in [.5, 1.5], end in one too; the status is then
+    INFEASIBLE if multipliers prove that no x meets the inequalities (`certifies`), which they do
+    where A is positive semi-definite, else STAGNATED. On a bimatrix game, M = [[0, E], [F', 0]]
+    with E, F > 0 and q < 0, where every such d ends in a ray, it begins as Lemke and Howson's
+    method does.
 
-    Where all bounds are finite, there is a solution whatever A is, and after a ray d = 0 in the rows s = u - l - z leads to one: on another
-    ray (z', s', z0') those rows ask for z' = -s' = 0, so that w' = v' + d z0'; where w' > 0, z = 0, so that s = u - l and v' = 0, which
-    leaves w' = d z0', the start's ray alone.
+    Where all bounds are finite, there is a solution whatever A is, and after a ray d = 0 in the
+    rows s = u - l - z leads to one: on another ray (z', s', z0') those rows ask for z' = -s' = 0,
+    so that w' = v' + d z0'; where w' > 0, z = 0, so that s = u - l and v' = 0, which leaves w' = d
+    z0', the start's ray alone.
 
     Bounds far beyond the sizes of A and b count as infinite at first, and as they are if that leads
     nowhere. Boxes add a pair of variables, equations are eliminated or, where their block is
@@ -159,12 +193,14 @@ class Lemke(Settings):
     block of pivots; `linear_iterations` counts pivots.
 
     Args:
-        pivots_per_step: pivots in a step of the solve loop, which checks, records and counts steps; max(2, n / 8) if None.
+        pivots_per_step: pivots in a step of the solve loop, which checks, records and counts steps;
+            max(2, n / 8) if None.
         covering_vectors: random covering vectors tried after a ray, >= 1.
     """
 
     needs: ClassVar[str] = "n <= 4096; terminates for copositive-plus and P-matrices"
-    most_unknowns: ClassVar[int] = 4096  # the basis and its inverse take 134 MB each, four times that with boxes everywhere
+    # the basis and its inverse take 134 MB each, four times that with boxes everywhere
+    most_unknowns: ClassVar[int] = 4096
 
     pivots_per_step: Count | None = None
     covering_vectors: Count = 3
@@ -207,10 +243,12 @@ class Basis:
         m = len(q)
         self.M, self.q, self.d, self.m = M, q, d, m
         self.variables, self.values = np.arange(m), q.copy()
-        # the lexicographic minimum of (q_i, e_i) / d_i leaves: of equal ratios the last, whose row has the later 1
+        # the lexicographic minimum of (q_i, e_i) / d_i leaves: of equal ratios the last, whose row
+        # has the later 1
         ratios = np.divide(q, d, out=np.full(m, np.inf), where=d > 0)
         self.row = int(np.flatnonzero(ratios <= ratios.min() + TIE * abs(ratios.min()))[-1])
-        self.entering, self.ends = 2 * m, (2 * m, 2 * m)  # variables with which the path ends when they leave
+        # variables with which the path ends when they leave
+        self.entering, self.ends = 2 * m, (2 * m, 2 * m)
 
     def pivot(self) -> bool | None:
         """Let the entering variable in; True when z0 has left, False on a ray, None to go on."""
@@ -270,7 +308,10 @@ class Basis:
     def _direction(self) -> np.ndarray:
         column = self._column()
         direction = self._solve(column)
-        if self.age >= max(PERIOD, self.m // 8) or np.abs(self.matrix @ direction - column).max() > ACCEPTED * np.abs(column).max():
+        if (
+            self.age >= max(PERIOD, self.m // 8)
+            or np.abs(self.matrix @ direction - column).max() > ACCEPTED * np.abs(column).max()
+        ):
             self.refresh()
             direction = self._solve(column)
         return direction
@@ -312,7 +353,8 @@ class BandedBasis(Basis):
     def __init__(self, M: Any, q: np.ndarray, d: np.ndarray) -> None:
         self._start(M, q, d)
         self.factors = BandedFactors(M, d)
-        self.missing, self.regular = -1, True  # the pair both of whose variables are out, once z0 is in
+        # the pair both of whose variables are out, once z0 is in
+        self.missing, self.regular = -1, True
 
     def refresh(self) -> None:
         """Nothing to do: factors are made at each pivot."""
@@ -354,7 +396,13 @@ def strategies(M: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray] | 
     first, second = np.flatnonzero(own), np.flatnonzero(~own)
     within = [M[np.ix_(player, player)] for player in (first, second)]
     across = [M[np.ix_(*players)] for players in ((first, second), (second, first))]
-    return (first, second) if all((A == 0).all() for A in within) and len(second) and all((A > 0).all() for A in across) else None
+    return (
+        (first, second)
+        if all((A == 0).all() for A in within)
+        and len(second)
+        and all((A > 0).all() for A in across)
+        else None
+    )
 
 
 def start_game(basis: Basis) -> bool:
@@ -410,8 +458,12 @@ class LemkeWorkspace(DenseWorkspace):
         scaled, self.units = self.data.scaled()
         lower, upper = without_far(scaled.lower, scaled.upper, BEYOND if self._keeps_far else FAR)
         given = (self.data.lower, self.data.upper)
-        self._has_far = any((np.isfinite(one) & np.isinf(other)).any() for one, other in zip(given, (lower, upper), strict=True))
-        if scipy.sparse.issparse(scaled.A) and not (np.isfinite(lower) | np.isfinite(upper)).all():  # which a narrow form needs
+        self._has_far = any(
+            (np.isfinite(one) & np.isinf(other)).any()
+            for one, other in zip(given, (lower, upper), strict=True)
+        )
+        # which a narrow form needs
+        if scipy.sparse.issparse(scaled.A) and not (np.isfinite(lower) | np.isfinite(upper)).all():
             if self._keeps_far:
                 self._widen()
             else:
@@ -421,7 +473,10 @@ class LemkeWorkspace(DenseWorkspace):
         scaled = replace(scaled, lower=lower, upper=upper)
         self.form = LemkeForm.of(scaled)
         m = len(self.form.q)
-        self._sizes = (float(abs(self.form.M).max() if m else 0.0) or 1.0, float(np.abs(self.form.q).max(initial=0.0)) or 1.0)
+        self._sizes = (
+            float(abs(self.form.M).max() if m else 0.0) or 1.0,
+            float(np.abs(self.form.q).max(initial=0.0)) or 1.0,
+        )
         self._cover(np.ones(m))
 
     def pivot(self, count: int) -> int:
@@ -463,7 +518,9 @@ class LemkeWorkspace(DenseWorkspace):
         size = 16 * EPS * self.units * np.abs(x / self.units).max()
         if self._keeps_far or not isinstance(self.basis, BandedBasis):  # whose factors are fresh
             x = data.polished(x, (x - data.lower > size) & (data.upper - x > size))
-        if self.basis is not None and not data.residual(x) <= NOISE * data.residual(np.clip(0.0, data.lower, data.upper)):
+        if self.basis is not None and not data.residual(x) <= NOISE * data.residual(
+            np.clip(0.0, data.lower, data.upper)
+        ):
             self._ray()
             return
         self.write_iterate(x)

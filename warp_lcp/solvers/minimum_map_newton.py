@@ -26,30 +26,39 @@ class MinimumMapNewton(NewtonSettings):
     It solves the linear system on the unknowns that the minimum map calls free and holds the others
     at their bounds ([Book] 2.4.1).
 
-    Unknown i is held where x_i - y_i / d_i, with the natural residual's d, is outside [l_i, u_i]. Cold, the first steps on a grid are
-    projected multigrid cycles, which find the active set to within a few cells; a Newton step alone moves its boundary by about a layer a
-    step. Each Newton correction is solved inexactly in the corrections' precision, and the step is shortened along its projection onto the
-    bounds if the residual would exceed the largest of the last `memory` ones (Grippo, Lampariello, Lucidi 1986). On a large sparse matrix,
-    an active set that creeps all the same is moved by a problem on coarse points (Brandt and Cryer 1983) if A is nearly a diagonally
-    dominant M-matrix. Converges on a grid in a few steps; on other matrices A should be a P-matrix. Where it is not, free blocks may be
-    singular and steps fail: dense problems try Levenberg-Marquardt steps of the minimum map and end with STAGNATED after 10 steps
-    without progress, others end with NON_DESCENT, or STAGNATED where steps repeat themselves; INFEASIBLE if equations have no solution.
-    `wl.solve` without a method goes on by other methods (`wl.default_chain`).
+    Unknown i is held where x_i - y_i / d_i, with the natural residual's d, is outside [l_i, u_i].
+    Cold, the first steps on a grid are projected multigrid cycles, which find the active set to
+    within a few cells; a Newton step alone moves its boundary by about a layer a step. Each Newton
+    correction is solved inexactly in the corrections' precision, and the step is shortened along
+    its projection onto the bounds if the residual would exceed the largest of the last `memory`
+    ones (Grippo, Lampariello, Lucidi 1986). On a large sparse matrix, an active set that creeps all
+    the same is moved by a problem on coarse points (Brandt and Cryer 1983) if A is nearly a
+    diagonally dominant M-matrix. Converges on a grid in a few steps; on other matrices A should be
+    a P-matrix. Where it is not, free blocks may be singular and steps fail: dense problems try
+    Levenberg-Marquardt steps of the minimum map and end with STAGNATED after 10 steps without
+    progress, others end with NON_DESCENT, or STAGNATED where steps repeat themselves; INFEASIBLE if
+    equations have no solution. `wl.solve` without a method goes on by other methods
+    (`wl.default_chain`).
 
     Args:
-        precision: "mixed": iterate float64, corrections float32; "double"; or "single": the iterate rounded to float32 as well.
-        monotone_cycles: projected cycles of a cold start on a grid; twice as many, on aggregates, where a large sparse matrix is nearly a
-            diagonally dominant M-matrix, six times from 65,536 unknowns on.
-        eta: each linear solve reduces its residual by this factor, or to the accuracy still needed. On a grid it ends earlier if
-            the free set of an iterate changes; elsewhere it continues to the factor's square once the active set has settled.
+        precision: "mixed": iterate float64, corrections float32; "double"; or "single": the iterate
+            rounded to float32 as well.
+        monotone_cycles: projected cycles of a cold start on a grid; twice as many, on aggregates,
+            where a large sparse matrix is nearly a diagonally dominant M-matrix, six times from
+            65,536 unknowns on.
+        eta: each linear solve reduces its residual by this factor, or to the accuracy still needed.
+            On a grid it ends earlier if the free set of an iterate changes; elsewhere it continues
+            to the factor's square once the active set has settled.
         max_linear_iterations: maximum number of conjugate-gradient iterations of one step.
         backtracks: maximum number of halvings of a step.
         memory: number of last residuals whose maximum a step may not exceed (nonmonotone search).
         cycle: settings of multigrid cycles.
-        direct: begin with whole steps that LAPACK solves on the host, for matrices of at most 200 unknowns or a bandwidth up to 3: what
-            `default_method` chooses there. The steps above take over where these lead nowhere.
-        safeguard: True: as described above. False: the book's method alone, its Newton steps with Armijo's monotone search from the
-            first to the last, and NON_DESCENT where no share of a step lowers the residual, as on some contacts ([Book] fig. C.2b).
+        direct: begin with whole steps that LAPACK solves on the host, for matrices of at most 200
+            unknowns or a bandwidth up to 3: what `default_method` chooses there. The steps above
+            take over where these lead nowhere.
+        safeguard: True: as described above. False: the book's method alone, its Newton steps with
+            Armijo's monotone search from the first to the last, and NON_DESCENT where no share of a
+            step lowers the residual, as on some contacts ([Book] fig. C.2b).
     """
 
     needs: ClassVar[str] = "positive definite or P-matrix"
@@ -66,13 +75,17 @@ class MinimumMapNewton(NewtonSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.direct and not self.safeguard:
-            raise ValueError("direct = True: needs safeguarded steps and cannot be combined with safeguard = False")
+            raise ValueError(
+                "direct = True: needs safeguarded steps and cannot be combined with safeguard = "
+                "False"
+            )
 
     def init(self, problem: LCP) -> NewtonWorkspace:
         """Return a workspace.
 
         Raises:
-            ValueError: A is neither a grid operator, dense nor symmetric; or `direct`, and A is neither small nor narrow.
+            ValueError: A is neither a grid operator, dense nor symmetric; or `direct`, and A is
+                neither small nor narrow.
         """
         return NewtonWorkspace(problem, self, reduced_system(problem, self))
 
@@ -102,9 +115,12 @@ class NewtonWorkspace:
         self.scratch = getattr(iterate, "scratch", None)
         self.keep, self.restore = iterate.keep, iterate.restore
         self.round_iterate, self.solution = iterate.round_iterate, iterate.solution
-        self.norms = deque[float](maxlen=settings.memory if settings.safeguard else 1)  # 1 is Armijo's monotone search
+        # 1 is Armijo's monotone search
+        self.norms = deque[float](maxlen=settings.memory if settings.safeguard else 1)
 
-    def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
+    def start(
+        self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
+    ) -> None:
         """Forget the last solve; the operator may have changed."""
         self.system = self._first
         self.norms.clear()
@@ -119,7 +135,8 @@ class NewtonWorkspace:
         """Classify, restrict, solve on the free set, move with a safeguard."""
         system = self.system
         self.norms.append(self.residual.norm)
-        other = system.classify()  # unknown i is held where x_i - y_i / d_i is outside [l_i, u_i]; F are the others
+        # unknown i is held where x_i - y_i / d_i is outside [l_i, u_i]; F are the others
+        other = system.classify()
         if other is not None:
             self.norms.clear()
             return other

@@ -42,7 +42,9 @@ RELEASE = KERNELS["mprgp.release"]
 GAIN = KERNELS["mprgp.gain"]
 SINGLE_SLACK = 1.2e-7  # a bound that float32 rounds is met within this part of it
 ENERGY_ROUNDING = 1e-12  # rises of the energy within this part of it are rounding
-NOISE = 1e-14  # of the energy: falls of less, over as many steps as patience lasts, are what rounding its sum may pretend
+# of the energy: falls of less, over as many steps as patience lasts, are what rounding its sum may
+# pretend
+NOISE = 1e-14
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,21 +53,24 @@ class MPRGP(Settings):
 
     It minimizes 1/2 x'Ax + b'x within the bounds (Dostal; Takahashi and Batty 2023).
 
-    Unknowns at a bound are held. While the part of the residual on them, the chopped gradient, is small against the free part
-    (||beta||^2 <= Gamma^2 phi~'phi), a step of conjugate gradients on the free set, preconditioned there by one multigrid cycle, is
-    projected: x = clip(x - alpha p). If that meets no bound it was plain conjugate gradients and the direction is carried on; else the
-    preconditioner is rebuilt for the new set and the direction is reset. When the chopped gradient is large, a step along it releases
-    unknowns. Dostal's expansion by a half step and a fixed step is replaced by the projected step: it needed over 8 times the work of a
-    linear solve, this one 1.5. Cold, the first steps on a grid are projected multigrid cycles.
+    Unknowns at a bound are held. While the part of the residual on them, the chopped gradient, is
+    small against the free part (||beta||^2 <= Gamma^2 phi~'phi), a step of conjugate gradients on
+    the free set, preconditioned there by one multigrid cycle, is projected: x = clip(x - alpha p).
+    If that meets no bound it was plain conjugate gradients and the direction is carried on; else
+    the preconditioner is rebuilt for the new set and the direction is reset. When the chopped
+    gradient is large, a step along it releases unknowns. Dostal's expansion by a half step and a
+    fixed step is replaced by the projected step: it needed over 8 times the work of a linear solve,
+    this one 1.5. Cold, the first steps on a grid are projected multigrid cycles.
 
-    On grids a projected cycle follows a step that its projection has spoiled, and `patience` steps without a new least energy, as in
-    `ProjectedMultigrid`; elsewhere a projected step that raises the energy is halved. While steps lower the energy the stopping criteria's
-    own patience does not run out.
-    `linear_iterations` counts monotone cycles and products with A: one a step, two if it releases unknowns.
+    On grids a projected cycle follows a step that its projection has spoiled, and `patience` steps
+    without a new least energy, as in `ProjectedMultigrid`; elsewhere a projected step that raises
+    the energy is halved. While steps lower the energy the stopping criteria's own patience does not
+    run out. `linear_iterations` counts monotone cycles and products with A: one a step, two if it
+    releases unknowns.
 
     Args:
-        precision: "mixed": iterate float64, corrections float32; "double"; or "single": the iterate rounded to float32 as well. Dense
-            and user-made operators take float64 corrections.
+        precision: "mixed": iterate float64, corrections float32; "double"; or "single": the iterate
+            rounded to float32 as well. Dense and user-made operators take float64 corrections.
         monotone_cycles: projected cycles of a cold start on a grid.
         gamma: Gamma > 0, how large the chopped gradient may be; larger: bounds are left later.
         patience: steps without a new least energy before monotone cycles are taken on a grid.
@@ -99,12 +104,16 @@ class MPRGP(Settings):
     def _checked(self, problem: LCP, system: SparseSystem | None) -> MPRGPWorkspace:
         if not problem.A.symmetric:
             raise ValueError(
-                "A is not symmetric: MPRGP minimizes an energy that exists only for a symmetric A; use MinimumMapNewton or Lemke"
+                "A is not symmetric: MPRGP minimizes an energy that exists only for a symmetric A; "
+                "use MinimumMapNewton or Lemke"
             )
         work = MPRGPWorkspace(problem, self, system)
         negative = np.count_nonzero(Diagonal(problem, work.residual).values() < 0)
         if negative:
-            raise ValueError(f"A has {negative} negative diagonal entries: MPRGP needs a positive semi-definite A")
+            raise ValueError(
+                f"A has {negative} negative diagonal entries: MPRGP needs a positive semi-definite "
+                "A"
+            )
         return work
 
     def step(self, problem: LCP, work: MPRGPWorkspace, x: wp.array[Any]) -> Step:
@@ -119,7 +128,12 @@ class MPRGP(Settings):
         release = work.residual.chopped > self.gamma**2 * work.residual.reduced
         if (release and not work.proportion()) or not work.conjugate():
             return Step("unbounded", 1, held, SolveStatus.DIVERGED)
-        return Step("proportioning" if release else "conjugate gradient", 2 if release else 1, held, interim=work.sinks())
+        return Step(
+            "proportioning" if release else "conjugate gradient",
+            2 if release else 1,
+            held,
+            interim=work.sinks(),
+        )
 
 
 class SplitResidual(NaturalResidual):
@@ -142,11 +156,26 @@ class SplitResidual(NaturalResidual):
         energy: 1/2 x'Ax + b'x.
     """
 
-    def __init__(self, problem: LCP, r: wp.array[Any], chopped_step: wp.array[Any], *, slack: float) -> None:
+    def __init__(
+        self, problem: LCP, r: wp.array[Any], chopped_step: wp.array[Any], *, slack: float
+    ) -> None:
         super().__init__(problem)
-        self.free, self._r, self._chopped_step, self._slack = problem.layout.zeros(wp.uint8), r, chopped_step, slack
+        self.free, self._r, self._chopped_step, self._slack = (
+            problem.layout.zeros(wp.uint8),
+            r,
+            chopped_step,
+            slack,
+        )
         self.rows = Rows.flat(problem.layout.size, problem.device)
-        self.size, self.moved, self.chopped, self.reduced, self.release, self.active, self.energy = 1.0, True, 0.0, 0.0, 0.0, 0, 0.0
+        (
+            self.size,
+            self.moved,
+            self.chopped,
+            self.reduced,
+            self.release,
+            self.active,
+            self.energy,
+        ) = 1.0, True, 0.0, 0.0, 0.0, 0, 0.0
         self._norm_of_b = 0.0
         self._stencil = problem.A.stencil if has(problem.A, HasStencil) else None
         self.sums = Sums(self.rows, 2, slots=engine.SLOTS)
@@ -168,17 +197,35 @@ class SplitResidual(NaturalResidual):
         p = self.problem
         if 0 < self.norm < math.inf:
             self.size = self.norm
-        kernel, stencil = (SPLIT_KNOWN, self.known) if self._stencil is None else (SPLIT, self._stencil)
+        kernel, stencil = (
+            (SPLIT_KNOWN, self.known) if self._stencil is None else (SPLIT, self._stencil)
+        )
         if self._stencil is None:
             self.affine(x)
         else:
             self._stencil.wrap(x)
         found = self._split.of(
-            kernel, stencil=stencil, bounds=p.bounds.operands, x=x, b=p.b, unknown=p.unknown, free=self.free, g=self._r,
-            step=self._chopped_step, inverse=1 / self.size, slack=self._slack,
-        )  # fmt: skip
-        square, self.chopped, self.reduced, self.release, moved, active, self.energy = (float(v) for v in found)
-        self.norm, self.current, self.active, self.moved = float(np.sqrt(square)), True, int(active), self.moved or moved > 0
+            kernel,
+            stencil=stencil,
+            bounds=p.bounds.operands,
+            x=x,
+            b=p.b,
+            unknown=p.unknown,
+            free=self.free,
+            g=self._r,
+            step=self._chopped_step,
+            inverse=1 / self.size,
+            slack=self._slack,
+        )
+        square, self.chopped, self.reduced, self.release, moved, active, self.energy = (
+            float(v) for v in found
+        )
+        self.norm, self.current, self.active, self.moved = (
+            float(np.sqrt(square)),
+            True,
+            int(active),
+            self.moved or moved > 0,
+        )
         return self.norm
 
     def measure(self, finest: StencilLevel, p: wp.array[Any]) -> list[float]:
@@ -207,23 +254,41 @@ class MPRGPWorkspace(IterateMemory):
     def __init__(self, problem: LCP, settings: MPRGP, system: SparseSystem | None = None) -> None:
         precision, self.settings = Precision(settings.precision), settings
         self.bounded, self.is_grid = problem.bounded, takes_points(problem.A)
-        self.system, self.preconditioner = _preconditioner(problem, precision.correction, settings.cycle, system)
+        self.system, self.preconditioner = _preconditioner(
+            problem, precision.correction, settings.cycle, system
+        )
         z = self.preconditioner.z
         self._fields = [problem.layout.zeros(wp.float64) for _ in range(2 if self.is_grid else 3)]
         self._best: wp.array[Any] = self._fields[0]
         self._p, self._q = zeros_like(z), zeros_like(z)
-        self._chopped = z if self.is_grid else zeros_like(z)  # a multigrid cycle leaves nothing of what was in z
+        # a multigrid cycle leaves nothing of what was in z
+        self._chopped = z if self.is_grid else zeros_like(z)
         slack = SINGLE_SLACK if precision is Precision.SINGLE else 0.0
         residual = SplitResidual(problem, self.preconditioner.r, self._chopped, slack=slack)
         super().__init__(problem, precision, x=self._best, residual=residual)
-        self._cycles_left, self._cycled, self._released, self._carry, self._curvature = 0, False, False, False, 0.0
+        self._cycles_left, self._cycled, self._released, self._carry, self._curvature = (
+            0,
+            False,
+            False,
+            False,
+            0.0,
+        )
         self._descent = Descent(self.precision.epsilon)
 
-    def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
+    def start(
+        self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
+    ) -> None:
         """Forget the direction; the operator may have changed."""
         self.floating = floating
-        self._cycles_left = self.settings.monotone_cycles if self.is_grid and self.bounded and not warm else 0
-        self._cycled, self._released, self._carry, self._lowest = False, False, False, self.residual.energy
+        self._cycles_left = (
+            self.settings.monotone_cycles if self.is_grid and self.bounded and not warm else 0
+        )
+        self._cycled, self._released, self._carry, self._lowest = (
+            False,
+            False,
+            False,
+            self.residual.energy,
+        )
         self._descent.start(self.residual.energy, self.residual.norm)
         self.residual.moved = True
         self.system.refresh()
@@ -243,7 +308,9 @@ class MPRGPWorkspace(IterateMemory):
         fell = self._descent.record(self.residual.energy, self.residual.norm)
         if self._cycled:
             self._descent.weigh(fell)
-        elif self._cycles_left == 0 and self._descent.creeps(fell, moved=self.residual.moved or self._released):
+        elif self._cycles_left == 0 and self._descent.creeps(
+            fell, moved=self.residual.moved or self._released
+        ):
             self._cycles_left = 1
         self._cycles_left = self._cycles_left or self._descent.due(self.settings.patience)
         self._cycled, self._released = self._cycles_left > 0, False
@@ -255,7 +322,9 @@ class MPRGPWorkspace(IterateMemory):
         self._cycles_left -= 1
         residual.moved, self._carry = True, False
         residual.affine(x)
-        projected_cycle(self.problem, self.system, x, residual.y, residual.size, residual.free, residual.sums)
+        projected_cycle(
+            self.problem, self.system, x, residual.y, residual.size, residual.free, residual.sums
+        )
         self._move(self.system.z, residual.size)
         return Step("monotone cycle", 1, None)
 
@@ -266,14 +335,24 @@ class MPRGPWorkspace(IterateMemory):
         self._product(direction)
         curvature = residual.dot(direction, self._q)
         if not (self.is_grid and curvature > 0):
-            wp.copy(self._p, direction)  # where a step ends the residual writes another chopped step, and it may be taken again
+            # where a step ends the residual writes another chopped step, and it may be taken again
+            wp.copy(self._p, direction)
             return self._projected_step(self._p, residual.release, curvature)
         factor, target, p = residual.release / curvature, self._target(), self.problem
         stencil = p.A.stencil  # type: ignore[attr-defined]
         RELEASE.bind(
-            residual.rows, stencil=stencil, bounds=p.bounds.operands, x=self.x, step=direction, q=self._q, to=target,
-            free=residual.free, g=self.preconditioner.r, part=factor, length=factor * residual.size,
-        ).launch()  # fmt: skip
+            residual.rows,
+            stencil=stencil,
+            bounds=p.bounds.operands,
+            x=self.x,
+            step=direction,
+            q=self._q,
+            to=target,
+            free=residual.free,
+            g=self.preconditioner.r,
+            part=factor,
+            length=factor * residual.size,
+        ).launch()
         self._settle(target)
         residual.moved = True
         return True
@@ -301,7 +380,9 @@ class MPRGPWorkspace(IterateMemory):
         bounds, beta = self.problem.bounds.operands, beta if math.isfinite(beta) else 0.0
         projected_move(residual.rows, bounds, None, self._p, 0.0, None, z=M.z, beta=beta)
         self._product(self._p)
-        gain, curvature = (float(v) for v in residual.sums.of(GAIN, along=self._p, q=self._q, g=M.r))
+        gain, curvature = (
+            float(v) for v in residual.sums.of(GAIN, along=self._p, q=self._q, g=M.r)
+        )
         self._carry, self._curvature = curvature > 0, curvature
         return self._projected_step(self._p, gain, curvature)
 
@@ -312,14 +393,22 @@ class MPRGPWorkspace(IterateMemory):
         zaz, zap, gz, gp = residual.measure(finest, self._p)
         beta, curvature, gain = 0.0, zaz, gz
         if self._carry:
-            beta, curvature, gain = engine.conjugate.func(zaz, zap, gz, gp, self._curvature, engine.LEAST_REST.value)
+            beta, curvature, gain = engine.conjugate.func(
+                zaz, zap, gz, gp, self._curvature, engine.LEAST_REST.value
+            )
         if not curvature > 0:
             wp.copy(self._p, finest.x)
             self._carry = False
             return self._projected_step(self._p, gz, zaz)
         self._carry, self._curvature = True, curvature
-        target, bounds, length = self._target(), self.problem.bounds.operands, gain / curvature * residual.size
-        projected_move(residual.rows, bounds, self.x, self._p, length, target, z=finest.x, beta=beta)
+        target, bounds, length = (
+            self._target(),
+            self.problem.bounds.operands,
+            gain / curvature * residual.size,
+        )
+        projected_move(
+            residual.rows, bounds, self.x, self._p, length, target, z=finest.x, beta=beta
+        )
         self._settle(target)
         return True
 
@@ -355,9 +444,13 @@ class MPRGPWorkspace(IterateMemory):
             return self.x
         return next(f for f in self._fields if f is not self._best and f is not self.x)
 
-    def _advance(self, origin: wp.array[Any], direction: wp.array[Any], length: float, target: wp.array[Any]) -> None:
+    def _advance(
+        self, origin: wp.array[Any], direction: wp.array[Any], length: float, target: wp.array[Any]
+    ) -> None:
         """x = clip(origin + length direction, l, u)."""
-        projected_move(self.residual.rows, self.problem.bounds.operands, origin, direction, length, target)
+        projected_move(
+            self.residual.rows, self.problem.bounds.operands, origin, direction, length, target
+        )
         self._settle(target)
 
     def _settle(self, target: wp.array[Any]) -> None:
@@ -393,9 +486,11 @@ class MPRGPWorkspace(IterateMemory):
 
 def _preconditioner(problem: LCP, real: Any, cycle: CycleSettings, system: Any) -> tuple[Any, Any]:
     """Return the principal system and what preconditions it."""
-    if system is None and isinstance(problem.A, DenseOperator):  # its own system is solved directly: that would be an active-set method
+    # its own system is solved directly: that would be an active-set method
+    if system is None and isinstance(problem.A, DenseOperator):
         system = DiagonalSystem(problem)
-    elif system is None and isinstance(problem.A, SparseOperator):  # narrow ones too, for the same reason
+    elif system is None and isinstance(problem.A, SparseOperator):
+        # narrow ones too, for the same reason
         system = SparseSystem(problem.A, real)
     elif system is None:
         system = principal_system(problem, real, bounded=problem.bounded, settings=cycle)

@@ -30,12 +30,15 @@ class NNCG(Settings):
 
     [Book] 2.2.6, algorithm 8; Silcowitz-Hansen et al. 2010.
 
-    The change of a sweep is taken for the negative gradient, g = x - PGS(x), of a function whose minimum is the sweep's fixed point. With
-    beta = |g|^2 / |g before|^2: x <- PGS(x) + beta p and p <- beta p - g without a line search; where beta > 1, p <- 0 and x <- PGS(x).
-    Unlike algorithm 8, x is projected onto the bounds after the move along p, so that iterates stay feasible; where bounds are affine in
-    x, the unknowns that they depend on first: friction held at its limit by bounds before the move costs most of the acceleration (a box
-    on others a thousand times lighter, 5,000 sweeps: 3e-3 of the first residual in place of 4e-11). No proof of convergence. On
-    64^3 cells to 1e-6 it took 250 sweeps where omega = 1 took 3,900, and the best omega, 1.9, 150 to 200.
+    The change of a sweep is taken for the negative gradient, g = x - PGS(x), of a function whose
+    minimum is the sweep's fixed point. With beta = |g|^2 / |g before|^2: x <- PGS(x) + beta p and p
+    <- beta p - g without a line search; where beta > 1, p <- 0 and x <- PGS(x). Unlike algorithm 8,
+    x is projected onto the bounds after the move along p, so that iterates stay feasible; where
+    bounds are affine in x, the unknowns that they depend on first: friction held at its limit by
+    bounds before the move costs most of the acceleration (a box on others a thousand times lighter,
+    5,000 sweeps: 3e-3 of the first residual in place of 4e-11). No proof of convergence. On 64^3
+    cells to 1e-6 it took 250 sweeps where omega = 1 took 3,900, and the best omega, 1.9, 150 to
+    200.
 
     Args:
         direction: of its sweeps, "forward", "backward" or "symmetric".
@@ -101,14 +104,28 @@ class NNCGWorkspace(SweepWorkspace):
         p, sums, unknown = self.problem, self._sums, self.problem.unknown
         sums.of(TAKEN, x=x, g=self.g, unknown=unknown)
         bounds = p.bounds.operands if p.bounds.affine is None else self._constant
-        CARRY_ON.bind(sums.rows, bounds=bounds, x=x, g=self.g, unknown=unknown, along=self.p, squares=sums.scalars).launch()
+        CARRY_ON.bind(
+            sums.rows,
+            bounds=bounds,
+            x=x,
+            g=self.g,
+            unknown=unknown,
+            along=self.p,
+            squares=sums.scalars,
+        ).launch()
         if p.bounds.affine is not None:
             p.bounds.follow(x)
-            WITHIN.bind(sums.rows, bounds=p.bounds.operands, x=x, unknown=p.unknown, keep=True).launch()
+            WITHIN.bind(
+                sums.rows, bounds=p.bounds.operands, x=x, unknown=p.unknown, keep=True
+            ).launch()
         wp.copy(sums.scalars, sums.scalars, dest_offset=1, src_offset=0, count=1)
         self.round_iterate()
 
 
 def _where_constant(constant: wp.array[Any], index: wp.array[Any], none: float) -> wp.array[Any]:
     """Return a bound as a field that is `none` where it depends on x."""
-    return wp.array(np.where(index.numpy() < 0, constant.numpy(), none), dtype=wp.float64, device=constant.device)
+    return wp.array(
+        np.where(index.numpy() < 0, constant.numpy(), none),
+        dtype=wp.float64,
+        device=constant.device,
+    )

@@ -25,10 +25,13 @@ from warp_lcp.settings import Positive, Share
 KERNELS = KernelFile(Path(__file__).parent / "headers/penalty.h")
 MOVE = KERNELS["penalty.move"]
 SORT = KERNELS["penalty.sort"]
-DOMINANT = 4.0  # residual over the springs' error from which on something else is to be mended; |A D^-1| <= 2 on grids
+# residual over the springs' error from which on something else is to be mended; |A D^-1| <= 2 on
+# grids
+DOMINANT = 4.0
 SHARE = 0.1  # of the tolerance that the penalty's own error may take
 LEAST_RAISE = 10.0  # factor by which rho grows at least
-LARGEST = 1e12  # rho, beyond which float64 does not see the violation of an unknown of its bound's size
+# rho, beyond which float64 does not see the violation of an unknown of its bound's size
+LARGEST = 1e12
 EARLY = 10  # steps in which the set may wander while the residual rises
 
 
@@ -38,24 +41,31 @@ class Penalty(NewtonSettings):
 
     It replaces the bounds by springs and solves the piecewise linear equations.
 
-    The equations are A z + b + rho D (min(z - l, 0) + max(z - u, 0)) = 0, D the diagonal of the natural residual's d. With V the unknowns
-    beyond a bound, a step is Newton's: (A + rho D_V) z+ = -b + rho D_V g, g the bound that is passed. It depends on V alone, so it starts
-    from x = clip(z, l, u), where its right-hand side is -(A x + b): nothing cancels however large rho is. On grids it is solved by
-    conjugate gradients with a multigrid cycle on A + rho D_V. With an M-matrix and bounds on one side the equations are
-    concave or convex: from the second step on z moves off the bounds, V shrinks, and is found after finitely many steps. Elsewhere V may
-    cycle, and the solve ends with STAGNATED or MAX_ITERATIONS.
+    The equations are A z + b + rho D (min(z - l, 0) + max(z - u, 0)) = 0, D the diagonal of the
+    natural residual's d. With V the unknowns beyond a bound, a step is Newton's: (A + rho D_V) z+ =
+    -b + rho D_V g, g the bound that is passed. It depends on V alone, so it starts from x = clip(z,
+    l, u), where its right-hand side is -(A x + b): nothing cancels however large rho is. On grids
+    it is solved by conjugate gradients with a multigrid cycle on A + rho D_V. With an M-matrix and
+    bounds on one side the equations are concave or convex: from the second step on z moves off the
+    bounds, V shrinks, and is found after finitely many steps. Elsewhere V may cycle, and the solve
+    ends with STAGNATED or MAX_ITERATIONS.
 
-    The error: where y > 0, z is below its bound by y / (rho d), and neighbors solve their equations with that z. What is returned is
-    x = clip(z, l, u), whose natural residual is O(1 / rho): about |A D^-1 y_V| / rho. The solve is judged by it. Where V stays, or that
-    error is most of the residual, and it is more than a tenth of the tolerance, rho grows in proportion, once as a rule, up to 1e12.
+    The error: where y > 0, z is below its bound by y / (rho d), and neighbors solve their equations
+    with that z. What is returned is x = clip(z, l, u), whose natural residual is O(1 / rho): about
+    |A D^-1 y_V| / rho. The solve is judged by it. Where V stays, or that error is most of the
+    residual, and it is more than a tenth of the tolerance, rho grows in proportion, once as a rule,
+    up to 1e12.
 
     `linear_iterations` counts iterations on the finest grid, factorizations where A is dense.
 
     Args:
-        rho: stiffness of the springs in units of d, without units; 1e6 suffices for tolerances down to about 1e-6 of the residual.
-        precision: "mixed": x float64, corrections float32 on grids; "double"; or "single": x rounded to float32 as well.
+        rho: stiffness of the springs in units of d, without units; 1e6 suffices for tolerances down
+            to about 1e-6 of the residual.
+        precision: "mixed": x float64, corrections float32 on grids; "double"; or "single": x
+            rounded to float32 as well.
         monotone_cycles: projected multigrid cycles of a cold start on a grid.
-        eta: each linear solve reduces its residual by this factor, its square where V has stayed, or to the accuracy still needed.
+        eta: each linear solve reduces its residual by this factor, its square where V has stayed,
+            or to the accuracy still needed.
         max_linear_iterations: maximum number of iterations of one linear solve.
         cycle: settings of multigrid cycles.
 
@@ -90,7 +100,8 @@ class PenaltyWorkspace(IterateMemory):
 
     Attributes:
         rho: stiffness as it is now, in units of d.
-        side: stored int8 field; the bound that each unknown is beyond, -1 the lower and 1 the upper one, else 0.
+        side: stored int8 field; the bound that each unknown is beyond, -1 the lower and 1 the upper
+            one, else 0.
     """
 
     def __init__(self, problem: LCP, settings: Penalty) -> None:
@@ -99,22 +110,36 @@ class PenaltyWorkspace(IterateMemory):
         if takes_points(problem.A):
             self.cold_start = ColdStart(problem, problem.A, settings)
             self.scratch = self.cold_start.scratch
-        shared: dict[str, Any] = {"x": self.cold_start.x, "residual": self.cold_start.residual} if self.cold_start else {}
+        shared: dict[str, Any] = (
+            {"x": self.cold_start.x, "residual": self.cold_start.residual}
+            if self.cold_start
+            else {}
+        )
         super().__init__(problem, settings.precision, **shared)
         self.system: Any = principal_system(
-            problem, self.precision.correction, bounded=False, settings=settings.cycle, shifted=True,
+            problem,
+            self.precision.correction,
+            bounded=False,
+            settings=settings.cycle,
+            shifted=True,
             hierarchy=self.cold_start.hierarchy if self.cold_start else None,
-        )  # fmt: skip
+        )
         self.side, self._shift = layout.zeros(wp.int8), layout.zeros(wp.float64)
         self._free, self._inside = layout.zeros(wp.uint8), layout.zeros(wp.uint8)
         self._sums = Sums(rows_of(self.x), 3)
         self.rho, self.cycles_left, self.steps, self.target = settings.rho, 0, 0, 0.0
 
-    def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
+    def start(
+        self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
+    ) -> None:
         """Forget the set and the last stiffness; the operator may have changed."""
         self.floating = floating
         s = self.settings
-        self.cycles_left = s.monotone_cycles if self.cold_start is not None and self.problem.bounded and not warm else 0
+        self.cycles_left = (
+            s.monotone_cycles
+            if self.cold_start is not None and self.problem.bounded and not warm
+            else 0
+        )
         self.rho, self.steps, self.target = s.rho, 0, tolerance
         self._excess, self._moved, self._stale = 0.0, math.inf, True
         self.side.zero_()
@@ -147,11 +172,14 @@ class PenaltyWorkspace(IterateMemory):
         factor = max(s.eta**2 if settled else s.eta, 0.3 * SHARE * self.target / size)
         norm = self.system.norm()
         iterations = self.system.solve(factor * norm, s.max_linear_iterations)[0] if norm > 0 else 0
-        MOVE.bind(self._sums.rows, x=x, e=self.system.e, unknown=p.unknown, side=self.side, size=size).launch()
+        MOVE.bind(
+            self._sums.rows, x=x, e=self.system.e, unknown=p.unknown, side=self.side, size=size
+        ).launch()
         self.residual.affine(x)
         active = self._sort(x)
         self._finish_move(x)
-        NaturalResidual.evaluate(self.residual, x)  # which writes y; the grid's own evaluation leaves it out
+        # which writes y; the grid's own evaluation leaves it out
+        NaturalResidual.evaluate(self.residual, x)
         self._stale = self._moved > 0
         return Step("policy", iterations, active, interim=self._stale and self.steps <= EARLY)
 
@@ -167,13 +195,26 @@ class PenaltyWorkspace(IterateMemory):
     def _sort(self, x: wp.array[Any], *, first: bool = False, keep: bool = False) -> int:
         """Find the springs of the next step at z, project it onto the bounds, and return how many springs there are.
 
-        A spring stays if z is still beyond its bound. Its row of the step says z - g = -y / (rho d), so that y has the sign that matters;
-        the solution of the linear solve has not, which knows no sizes below its tolerance.
+        A spring stays if z is still beyond its bound. Its row of the step says z - g = -y / (rho
+        d), so that y has the sign that matters; the solution of the linear solve has not, which
+        knows no sizes below its tolerance.
         """
         p, r = self.problem, self.residual
         moved, active, square = self._sums.of(
-            SORT, bounds=p.bounds.operands, x=x, y=r.y, d=r.diagonal, unknown=p.unknown, side=self.side, shift=self._shift,
-            free=self._free, inside=self._inside, rho=self.rho, unit=r.unit, first=first, keep=keep,
-        )  # fmt: skip
+            SORT,
+            bounds=p.bounds.operands,
+            x=x,
+            y=r.y,
+            d=r.diagonal,
+            unknown=p.unknown,
+            side=self.side,
+            shift=self._shift,
+            free=self._free,
+            inside=self._inside,
+            rho=self.rho,
+            unit=r.unit,
+            first=first,
+            keep=keep,
+        )
         self._moved, self._excess = float(moved), math.sqrt(float(square)) / self.rho
         return int(active)

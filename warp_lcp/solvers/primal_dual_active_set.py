@@ -27,7 +27,8 @@ from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspac
 LOWER, FREE, UPPER = -1, 0, 1  # where least-index pivoting has an unknown
 STUCK = 2  # steps on one set that leave the residual where it is: its free block is singular
 PIVOTS = 50  # least-index pivots, in units of the unknowns, after which A is taken for no P-matrix
-BLOWN = 1e7  # growth of the residual beyond what whole steps on regular blocks cause (5e5 on a grid of 1000^2)
+# growth of the residual beyond what whole steps on regular blocks cause (5e5 on a grid of 1000^2)
+BLOWN = 1e7
 SLACK = 1e-12  # of the largest magnitudes of x and y: violations below it are rounding
 
 
@@ -37,25 +38,29 @@ class PrimalDualActiveSet(NewtonSettings):
 
     It guesses the active set from x and y, solves for the rest, and repeats until the guess stays.
 
-    With the natural residual's d, unknown i is held at l_i if x_i - y_i / d_i < l_i, at u_i if it is above, else free: y_i = 0 there. This
-    is MinimumMapNewton's step without search or projection, and shares its implementation. Started anywhere it ends after finitely many
-    steps if A is an M-matrix; on other P-matrices it may cycle. If a set recurs without a smaller residual, dense problems continue by
-    least-index principal pivoting (Murty 1974; with bounds Judice and Pires), which is finite for every P-matrix but may be slow;
-    others end with STAGNATED. So does a solve that meets a singular free block (never in a P-matrix): its set stays while the residual
-    does not fall, the residual grows by 1e7, or the block's condition number exceeds 1e12. Cold, the first steps on a grid are
-    projected multigrid cycles.
+    With the natural residual's d, unknown i is held at l_i if x_i - y_i / d_i < l_i, at u_i if it
+    is above, else free: y_i = 0 there. This is MinimumMapNewton's step without search or
+    projection, and shares its implementation. Started anywhere it ends after finitely many steps if
+    A is an M-matrix; on other P-matrices it may cycle. If a set recurs without a smaller residual,
+    dense problems continue by least-index principal pivoting (Murty 1974; with bounds Judice and
+    Pires), which is finite for every P-matrix but may be slow; others end with STAGNATED. So does a
+    solve that meets a singular free block (never in a P-matrix): its set stays while the residual
+    does not fall, the residual grows by 1e7, or the block's condition number exceeds 1e12. Cold,
+    the first steps on a grid are projected multigrid cycles.
 
     `linear_iterations` counts as in MinimumMapNewton; a least-index pivot counts one.
 
     Args:
-        precision: "mixed": iterate float64, corrections float32; "double"; or "single": the iterate rounded to float32 as well. Dense
-            problems are solved in float64.
-        monotone_cycles: projected cycles of a cold start on a grid; see MinimumMapNewton for sparse matrices.
-        eta: each linear solve reduces its residual by this factor, or to the accuracy that the whole solve still needs.
+        precision: "mixed": iterate float64, corrections float32; "double"; or "single": the iterate
+            rounded to float32 as well. Dense problems are solved in float64.
+        monotone_cycles: projected cycles of a cold start on a grid; see MinimumMapNewton for sparse
+            matrices.
+        eta: each linear solve reduces its residual by this factor, or to the accuracy that the
+            whole solve still needs.
         max_linear_iterations: maximum number of conjugate-gradient iterations of one step.
         cycle: settings of multigrid cycles.
-        stop_if_singular: end with STAGNATED where a free block is singular; False: pivot on by least squares, for matrices that are
-            regular but for rounding.
+        stop_if_singular: end with STAGNATED where a free block is singular; False: pivot on by
+            least squares, for matrices that are regular but for rounding.
     """
 
     needs: ClassVar[str] = "M-matrix, or P-matrix where dense"
@@ -67,7 +72,9 @@ class PrimalDualActiveSet(NewtonSettings):
 
     def as_newton(self) -> MinimumMapNewton:
         """Return the MinimumMapNewton method for operators that are not dense."""
-        return MinimumMapNewton(**{f.name: getattr(self, f.name) for f in fields(self) if f.name != "stop_if_singular"})
+        return MinimumMapNewton(
+            **{f.name: getattr(self, f.name) for f in fields(self) if f.name != "stop_if_singular"}
+        )
 
     def init(self, problem: LCP) -> ActiveSetWorkspace:
         """Return a workspace.
@@ -89,7 +96,8 @@ class ActiveSetWorkspace(NewtonWorkspace):
     """Memory of the method for one problem.
 
     Attributes:
-        places: where least-index pivoting has each unknown (LOWER, FREE, UPPER); None before a cycle is met.
+        places: where least-index pivoting has each unknown (LOWER, FREE, UPPER); None before a
+            cycle is met.
         cycled: whether a set has come again.
         first: the residual's norm before the first step.
     """
@@ -99,9 +107,14 @@ class ActiveSetWorkspace(NewtonWorkspace):
 
     def __init__(self, problem: LCP, settings: MinimumMapNewton, *, stop_if_singular: bool) -> None:
         super().__init__(problem, settings, CorrectionSystem(problem, settings))
-        self._stops, self._watched = stop_if_singular, stop_if_singular and has(problem.A, HasRows) and has(problem.A, HasScale)
+        self._stops, self._watched = (
+            stop_if_singular,
+            stop_if_singular and has(problem.A, HasRows) and has(problem.A, HasScale),
+        )
 
-    def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
+    def start(
+        self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
+    ) -> None:
         """Forget the sets; the operator may have changed."""
         super().start(warm=warm, tolerance=tolerance, floating=floating)
         self._target = tolerance
@@ -132,7 +145,8 @@ class ActiveSetWorkspace(NewtonWorkspace):
             return replace(step, failure=SolveStatus.STAGNATED)
         if self._watched:
             wp.copy(system.start_of_step, x)
-        bounds = self._unbounded if self._moved else p.bounds.operands  # within rounding of the bounds at the end
+        # within rounding of the bounds at the end
+        bounds = self._unbounded if self._moved else p.bounds.operands
         projected_move(system.sums.rows, bounds, x, system.principal.e, system.size, x)
         system.settle()
         self.round_iterate()
@@ -144,7 +158,8 @@ class ActiveSetWorkspace(NewtonWorkspace):
         if norm <= self._target:  # x may miss its bounds by what the criteria allow
             self.residual.start(x, keep=True)
             self.round_iterate()
-        return replace(step, interim=step.interim or (self._watched and self._moved))  # whole steps may first take the residual up
+        # whole steps may first take the residual up
+        return replace(step, interim=step.interim or (self._watched and self._moved))
 
     def _cycles(self, x: wp.array[Any]) -> bool:
         """Return whether the set has come again, now or before, without a residual much smaller than then."""
@@ -152,7 +167,9 @@ class ActiveSetWorkspace(NewtonWorkspace):
         self.first = self.first or norm
         self._moved, self._last = key != self._last, key
         self._stuck = self._stuck + 1 if not self._moved and norm > 0.9 * self._seen[key] else 0
-        self.cycled = self.cycled or (self._moved and key in self._seen and norm > 0.5 * self._seen[key])
+        self.cycled = self.cycled or (
+            self._moved and key in self._seen and norm > 0.5 * self._seen[key]
+        )
         self._seen[key] = norm
         return self.cycled
 
@@ -160,7 +177,9 @@ class ActiveSetWorkspace(NewtonWorkspace):
         """Return what tells a set, with its bounds, from others."""
         free = self.system.free.numpy() != 0
         at_upper = ~free & (x.numpy() == self.problem.upper.numpy())
-        return hashlib.blake2b(np.packbits(free).tobytes() + np.packbits(at_upper).tobytes(), digest_size=16).digest()
+        return hashlib.blake2b(
+            np.packbits(free).tobytes() + np.packbits(at_upper).tobytes(), digest_size=16
+        ).digest()
 
     def least_index_step(self, x: wp.array[Any]) -> Step:
         """Some pivots of the first unknown that violates its condition; interim until none does."""
@@ -171,7 +190,9 @@ class ActiveSetWorkspace(NewtonWorkspace):
             self.places = np.where(free, FREE, np.where(at == own.upper, UPPER, LOWER))
         pivots, most = 0, pivots_of(None, len(data.b)) * 8
         values, violated, singular = _basic_solution(data, self.places)
-        while violated.size and pivots < most and not (singular and self._stops) and not time_is_up():
+        while (
+            violated.size and pivots < most and not (singular and self._stops) and not time_is_up()
+        ):
             self.places[violated[0]] = _other_place(data, self.places, values, int(violated[0]))
             values, violated, singular = _basic_solution(data, self.places)
             pivots += 1
@@ -183,8 +204,15 @@ class ActiveSetWorkspace(NewtonWorkspace):
         stored[own.rows] = units * np.clip(values, data.lower, data.upper)
         x.assign(stored)
         self.round_iterate()
-        failure = None if violated.size else SolveStatus.STAGNATED  # counts only if the criteria are not met by rounding
-        return Step("least index", pivots, int(np.count_nonzero(self.places != FREE)), failure, interim=bool(violated.size))
+        # counts only if the criteria are not met by rounding
+        failure = None if violated.size else SolveStatus.STAGNATED
+        return Step(
+            "least index",
+            pivots,
+            int(np.count_nonzero(self.places != FREE)),
+            failure,
+            interim=bool(violated.size),
+        )
 
 
 def _basic_solution(data: DenseProblem, places: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
@@ -196,10 +224,17 @@ def _basic_solution(data: DenseProblem, places: np.ndarray) -> tuple[np.ndarray,
         y = data.affine(x)[free]
         block = data.A[np.ix_(free, free)]
         singular = bool(np.linalg.cond(block) > 1e12)
-        x[free] = -np.linalg.lstsq(block, y, rcond=1e-12)[0] if singular else -np.linalg.solve(block, y)
+        x[free] = (
+            -np.linalg.lstsq(block, y, rcond=1e-12)[0] if singular else -np.linalg.solve(block, y)
+        )
     y = data.affine(x)
-    tiny_x, tiny_y = SLACK * max(1.0, np.abs(x).max(initial=0.0)), SLACK * np.abs(data.b).max(initial=0.0)
-    wrong = np.where(places == FREE, (x < data.lower - tiny_x) | (x > data.upper + tiny_x), places * y > tiny_y)
+    tiny_x, tiny_y = (
+        SLACK * max(1.0, np.abs(x).max(initial=0.0)),
+        SLACK * np.abs(data.b).max(initial=0.0),
+    )
+    wrong = np.where(
+        places == FREE, (x < data.lower - tiny_x) | (x > data.upper + tiny_x), places * y > tiny_y
+    )
     return x, np.flatnonzero(wrong), singular
 
 

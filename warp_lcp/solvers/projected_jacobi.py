@@ -16,7 +16,9 @@ from warp_lcp.sweeps.spectrum import scaled_spectrum
 from warp_lcp.sweeps.sweep_kernels import jacobi_kernel
 
 STEPS = 20  # of Lanczos' method
-SHARE = 1.8  # of the 2 / lambda_max at which Jacobi's method stops converging; Lanczos sees lambda_max from below
+# of the 2 / lambda_max at which Jacobi's method stops converging; Lanczos sees lambda_max from
+# below
+SHARE = 1.8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,18 +27,23 @@ class ProjectedJacobi(Settings):
 
     [Book] 2.2.1, table 2.1 and eq. 2.63 with M = D / omega.
 
-    x <- clip(x - omega D^-1 (A x + b), l, u). Converges for symmetric positive definite A and 0 < omega < 2 / lambda_max(D^-1 A), which
-    the book's omega = 1 exceeds for many matrices; the test of algorithm 4 then says DIVERGED (see `Contraction`). About half as fast as
-    projected Gauss-Seidel, but the same in every order, and no slower on a GPU. Zero and negative diagonals as in ProjectedSOR. Works
-    with any operator, and with bounds affine in x, which are those at the last x.
+    x <- clip(x - omega D^-1 (A x + b), l, u). Converges for symmetric positive definite A and 0 <
+    omega < 2 / lambda_max(D^-1 A), which the book's omega = 1 exceeds for many matrices; the test
+    of algorithm 4 then says DIVERGED (see `Contraction`). About half as fast as projected
+    Gauss-Seidel, but the same in every order, and no slower on a GPU. Zero and negative diagonals
+    as in ProjectedSOR. Works with any operator, and with bounds affine in x, which are those at the
+    last x.
 
     Args:
-        omega: damping > 0; min(1, 1.8 / lambda_max), estimated, if None. Without symmetry, lambda_max is that of A's symmetric part, which
-            promises nothing; with a negative diagonal entry, 1.
+        omega: damping > 0; min(1, 1.8 / lambda_max), estimated, if None. Without symmetry,
+            lambda_max is that of A's symmetric part, which promises nothing; with a negative
+            diagonal entry, 1.
         precision: "mixed" or "double" keep the iterate in float64, "single" rounds it to float32.
     """
 
-    needs: ClassVar[str] = "symmetric positive (semi-)definite A for a proof of convergence; A_ii <= 0 case by case"
+    needs: ClassVar[str] = (
+        "symmetric positive (semi-)definite A for a proof of convergence; A_ii <= 0 case by case"
+    )
     affine_bounds: ClassVar[bool] = True
 
     omega: Positive | None = None
@@ -46,7 +53,8 @@ class ProjectedJacobi(Settings):
         """Return a workspace.
 
         Raises:
-            ValueError: a zero or negative diagonal entry with a right-hand side that no bound meets.
+            ValueError: a zero or negative diagonal entry with a right-hand side that no bound
+                meets.
         """
         work = JacobiWorkspace(problem, self)
         work.diagonal.check()

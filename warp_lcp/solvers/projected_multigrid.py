@@ -25,18 +25,23 @@ class ProjectedMultigrid(Settings):
 
     It takes about as many cycles as multigrid for the linear system.
 
-    Cold, the first step is a projected (monotone) cycle, which moves whole aggregates on and off their bounds. Then each step evaluates
-    y = A x + b in float64, takes the unknowns that sit at a bound with y of the right sign out of the hierarchy (they are *truncated*),
-    preconditions -y by one linear cycle on the rest, makes the correction conjugate to the remainder of the last direction, and projects
-    the step onto the bounds. There are no inner tolerances: without bounds this is preconditioned conjugate gradients with a true
-    residual, and the same code is the linear solver. Steps are judged by the energy x'Ax/2 + b'x (`descent.Descent`): where it falls evenly
-    while the free set moves, a contact's boundary creeps by a layer of cells a step, and a monotone cycle follows; where `patience` steps
-    set no new least energy, monotone cycles follow, twice as many each time; beside rigid bodies the third run of them ends the solve with
-    STAGNATED. Cycles are slow in channels a cell wide and where coefficients are random over decades: `wl.solve` without a method then
-    goes on by `MinimumMapNewton` on the assembled matrix (`wl.default_chain`).
+    Cold, the first step is a projected (monotone) cycle, which moves whole aggregates on and off
+    their bounds. Then each step evaluates y = A x + b in float64, takes the unknowns that sit at a
+    bound with y of the right sign out of the hierarchy (they are *truncated*), preconditions -y by
+    one linear cycle on the rest, makes the correction conjugate to the remainder of the last
+    direction, and projects the step onto the bounds. There are no inner tolerances: without bounds
+    this is preconditioned conjugate gradients with a true residual, and the same code is the linear
+    solver. Steps are judged by the energy x'Ax/2 + b'x (`descent.Descent`): where it falls evenly
+    while the free set moves, a contact's boundary creeps by a layer of cells a step, and a monotone
+    cycle follows; where `patience` steps set no new least energy, monotone cycles follow, twice as
+    many each time; beside rigid bodies the third run of them ends the solve with STAGNATED. Cycles
+    are slow in channels a cell wide and where coefficients are random over decades: `wl.solve`
+    without a method then goes on by `MinimumMapNewton` on the assembled matrix
+    (`wl.default_chain`).
 
     Args:
-        precision: "mixed": iterate float64, corrections float32; "double"; or "single": the iterate rounded to float32 as well.
+        precision: "mixed": iterate float64, corrections float32; "double"; or "single": the iterate
+            rounded to float32 as well.
         monotone_cycles: projected cycles of a cold start.
         patience: steps without a new least energy before monotone cycles are taken.
         cycle: settings of multigrid cycles.
@@ -47,7 +52,8 @@ class ProjectedMultigrid(Settings):
     distributed: ClassVar[bool] = True
 
     precision: PrecisionName = "mixed"
-    # without one the set creeps; nested iteration from the coarsest level saves a step of ten, and takes as long
+    # without one the set creeps; nested iteration from the coarsest level saves a step of ten, and
+    # takes as long
     monotone_cycles: CountOrZero = 1
     patience: Count = 3
     cycle: CycleSettings = field(default_factory=CycleSettings)
@@ -62,18 +68,23 @@ class ProjectedMultigrid(Settings):
         if has(problem.A, HasStencil):
             if not problem.A.symmetric:
                 raise ValueError(
-                    "A is not symmetric: ProjectedMultigrid minimizes an energy, which exists only for a symmetric A; use MinimumMapNewton"
+                    "A is not symmetric: ProjectedMultigrid minimizes an energy, which exists only "
+                    "for a symmetric A; use MinimumMapNewton"
                 )
             return MultigridWorkspace(problem, problem.A, self)
         terms = grid_and_low_rank(problem.A)
         if terms is None:
-            raise ValueError("A is not symmetric: ProjectedMultigrid needs a symmetric low-rank part; use MinimumMapNewton")
+            raise ValueError(
+                "A is not symmetric: ProjectedMultigrid needs a symmetric low-rank part; use "
+                "MinimumMapNewton"
+            )
         return CoupledWorkspace(problem, *terms, self)
 
     def spare(self, problem: LCP) -> SpareWorkspace | None:
         """Return the workspace of an earlier solve with a problem's data.
 
-        None if `init` has to make one. From the second solve of a form in succession on one workspace is kept, see `wl.release_workspace`.
+        None if `init` has to make one. From the second solve of a form in succession on one
+        workspace is kept, see `wl.release_workspace`.
         """
         return lend(problem, self) if type(self) is ProjectedMultigrid else None
 

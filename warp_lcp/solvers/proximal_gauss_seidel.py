@@ -20,8 +20,10 @@ from warp_lcp.settings import Count, Settings, Share
 
 f64, i32 = wp.float64, wp.int32
 KERNELS = KernelFile(Path(__file__).parent / "headers/proximal_gauss_seidel.h")
-GRAIN, COST = 32, 128  # contacts of a task on the CPU, and how many cells of a usual pass one costs as much as
-FACTOR, LEFT, STATE = 2, 3, 4  # of the state: two squared changes, what multiplies all r-factors, the squared residual
+# contacts of a task on the CPU, and how many cells of a usual pass one costs as much as
+GRAIN, COST = 32, 128
+# of the state: two squared changes, what multiplies all r-factors, the squared residual
+FACTOR, LEFT, STATE = 2, 3, 4
 BETTER = 0.9  # of the least residual: progress
 LEAST = 0.05  # of the first r-factors
 
@@ -29,10 +31,18 @@ LEAST = 0.05  # of the first r-factors
 @cache
 def passes(dim: int, q: int) -> SimpleNamespace:
     """Return the passes over contacts of `dim` rows between bodies of q velocities."""
-    module, constants = f"warp_lcp.proximal_gauss_seidel_{dim}_{q}", {"DIM": dim, "Q": q, "FACTOR": FACTOR}
+    module, constants = (
+        f"warp_lcp.proximal_gauss_seidel_{dim}_{q}",
+        {"DIM": dim, "Q": q, "FACTOR": FACTOR},
+    )
     names = ("sweep", "residual", "gather")
     return SimpleNamespace(
-        **{name: KERNELS.kernel(f"warp_lcp.proximal_gauss_seidel.{name}", module=module, constants=constants) for name in names}
+        **{
+            name: KERNELS.kernel(
+                f"warp_lcp.proximal_gauss_seidel.{name}", module=module, constants=constants
+            )
+            for name in names
+        }
     )
 
 
@@ -48,20 +58,27 @@ class ProximalGaussSeidel(Settings):
 
     A sweep takes each contact once, at the velocities that those before it have left:
 
-        r_n <- max(0, r_n - rho_n u_n), then r_t <- the nearest point of |r_t| <= mu r_n to r_t - rho_t u_t
+        r_n <- max(0, r_n - rho_n u_n), then r_t <- the nearest point of |r_t| <= mu r_n to r_t -
+        rho_t u_t
 
-    with r-factors rho_n = 1 / B_nn and rho_t = 1 / (the largest eigenvalue of B_tt) of the contact's own block of B = J J' + diag(e); for
-    spheres that solves it exactly. B is not made: bodies keep w = J'r, and a contact touches those of its two. Contacts that share no body
-    have one color and are swept at once, by all threads or a GPU; their order, and every bit, depends on the contacts alone.
+    with r-factors rho_n = 1 / B_nn and rho_t = 1 / (the largest eigenvalue of B_tt) of the
+    contact's own block of B = J J' + diag(e); for spheres that solves it exactly. B is not made:
+    bodies keep w = J'r, and a contact touches those of its two. Contacts that share no body have
+    one color and are swept at once, by all threads or a GPU; their order, and every bit, depends on
+    the contacts alone.
 
-    Sweeps are accelerated as `NNCG` accelerates them, by g = r - sweep(r), beta = |g|^2 / |g before|^2, r <- r + beta p, p <- beta p - g,
-    and p <- 0 where beta > 1 [Silcowitz-Hansen et al. 2010]; the residual is that after a sweep, where r is in its cones. Where it has
-    stayed above 0.9 of its least for `wait` sweeps, as sweeps that go round in circles do, all r-factors shrink, down to a twentieth. No
-    theorem promises convergence for mu > 0. The residual, recomputed in float64 from r alone, is that of `FrictionalContact.residual`.
+    Sweeps are accelerated as `NNCG` accelerates them, by g = r - sweep(r), beta = |g|^2 / |g
+    before|^2, r <- r + beta p, p <- beta p - g, and p <- 0 where beta > 1
+    [Silcowitz-Hansen et al. 2010]; the residual is that after a sweep, where r is in its cones.
+    Where it has stayed above 0.9 of its least for `wait` sweeps, as sweeps that go round in circles
+    do, all r-factors shrink, down to a twentieth. No theorem promises convergence for mu > 0. The
+    residual, recomputed in float64 from r alone, is that of `FrictionalContact.residual`.
 
     Args:
-        accelerate: whether sweeps are accelerated; plain ones took more than three times as many for 1,000 spheres in a box.
-        check_every: sweeps from one look at the residual to the next; a step of the method, so that limits are met in multiples of it.
+        accelerate: whether sweeps are accelerated; plain ones took more than three times as many
+            for 1,000 spheres in a box.
+        check_every: sweeps from one look at the residual to the next; a step of the method, so that
+            limits are met in multiples of it.
         wait: sweeps without progress after which r-factors shrink.
         shrink: factor by which they shrink.
     """
@@ -134,7 +151,9 @@ class ContactWorkspace:
         self.order, self.starts = colors(problem.first, problem.second, problem.bodies)
         self.x, self._best = (wp.zeros((k, dim), dtype=f64, device=device) for _ in range(2))
         self._g, self._way = (wp.zeros(k * dim, dtype=f64, device=device) for _ in range(2))
-        self._w, self._before, self._turn = (wp.zeros((problem.bodies + 1) * q, dtype=f64, device=device) for _ in range(3))
+        self._w, self._before, self._turn = (
+            wp.zeros((problem.bodies + 1) * q, dtype=f64, device=device) for _ in range(3)
+        )
         self._state = wp.zeros(STATE, dtype=f64, device=device)
         self._fields, self._passes = self._contacts(), passes(dim, q)
         self._changes = Reduction(k * dim, device, self._state)
@@ -154,11 +173,17 @@ class ContactWorkspace:
         J, diagonal = np.concatenate([p.one[order], p.other[order]], axis=2), p.diagonal[order]
         own = J[:, 1:] @ J[:, 1:].swapaxes(1, 2) + p.yields[order][:, 1:, None] * np.eye(dim - 1)
         largest = np.linalg.eigvalsh(own)[:, -1] if dim > 1 else np.ones(k)
-        laws = np.column_stack([p.friction[order], 1.0 / diagonal[:, 0], 1.0 / largest, diagonal.mean(axis=1)])
+        laws = np.column_stack(
+            [p.friction[order], 1.0 / diagonal[:, 0], 1.0 / largest, diagonal.mean(axis=1)]
+        )
         reals = J, p.b[order], p.yields[order], laws
-        rows, b, e, laws_ = (wp.array(np.ascontiguousarray(v).ravel(), dtype=f64, device=p.device) for v in reals)
+        rows, b, e, laws_ = (
+            wp.array(np.ascontiguousarray(v).ravel(), dtype=f64, device=p.device) for v in reals
+        )
         numbers = order, p.first[order], p.second[order]
-        contact, one, other = (wp.array(v.astype(np.int32), dtype=i32, device=p.device) for v in numbers)
+        contact, one, other = (
+            wp.array(v.astype(np.int32), dtype=i32, device=p.device) for v in numbers
+        )
         return ContactFields(rows, b, e, laws_, contact, one, other, self._w, self.x.flatten())
 
     def _gathering(self) -> Any:
@@ -167,7 +192,9 @@ class ContactWorkspace:
         both = np.stack([p.first[self.order], p.second[self.order]], axis=1).ravel()
         sides = np.argsort(both, kind="stable")[: np.count_nonzero(both < p.bodies)]
         starts = np.searchsorted(both[sides], np.arange(p.bodies + 1))
-        first, listed = (wp.array(v.astype(np.int32), dtype=i32, device=p.device) for v in (starts, sides))
+        first, listed = (
+            wp.array(v.astype(np.int32), dtype=i32, device=p.device) for v in (starts, sides)
+        )
         return self._passes.gather.bind(self._rows(0, p.bodies), fields, starts=first, sides=listed)
 
     def _rows(self, begin: int, end: int) -> Rows:
@@ -180,11 +207,22 @@ class ContactWorkspace:
         """Record a sweep, after a move along the last direction; `now` and 1 - now: which squared change is the last and which before."""
         launch, fields, state = self._program.launch, self._fields, self._state
         if self.method.accelerate:
-            CARRY.bind(rows_of(self._g), g=self._g, r=fields.r, way=self._way, state=state, now=now).launch(launch)
-            FOLLOW.bind(rows_of(self._w), w=self._w, before=self._before, way=self._turn, state=state, now=now).launch(launch)
+            CARRY.bind(
+                rows_of(self._g), g=self._g, r=fields.r, way=self._way, state=state, now=now
+            ).launch(launch)
+            FOLLOW.bind(
+                rows_of(self._w),
+                w=self._w,
+                before=self._before,
+                way=self._turn,
+                state=state,
+                now=now,
+            ).launch(launch)
         for begin, end in zip(self.starts[:-1].tolist(), self.starts[1:].tolist(), strict=True):
             rows, bodies = self._rows(begin, end), self.problem.bodies
-            self._passes.sweep.bind(rows, fields, g=self._g, state=state, bodies=bodies).launch(launch)
+            self._passes.sweep.bind(rows, fields, g=self._g, state=state, bodies=bodies).launch(
+                launch
+            )
         if self.method.accelerate:
             self._changes.dot(self._g, self._g, 1 - now, launch=launch)
 
@@ -212,7 +250,8 @@ class ContactWorkspace:
 
     def sweep(self) -> None:
         """Sweep, look at the residual, and shrink r-factors where it makes no progress."""
-        if self.method.accelerate and self.method.check_every % 2:  # the program takes the last squared change from the same place
+        # the program takes the last squared change from the same place
+        if self.method.accelerate and self.method.check_every % 2:
             self._swap()
         self._program.run()
         if self._read() < BETTER * self._least:

@@ -21,11 +21,17 @@ from warp_lcp.solvers.fallback import Fallback, fails
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.primal_dual_active_set import PrimalDualActiveSet
 
-CENTER, FACTOR, LEAST = 1e-4, 0.1, 1e-10  # eps of the first center, its factor from center to center, and the smallest
-RAISED, LARGEST = 100.0, 1.0  # factor of eps where a regularized problem is not solved, and the largest eps: larger ones are easier
-NEAR = 1e-3  # of a center's residual: what the regularized problem's may be when the next center is taken
+# eps of the first center, its factor from center to center, and the smallest
+CENTER, FACTOR, LEAST = 1e-4, 0.1, 1e-10
+# factor of eps where a regularized problem is not solved, and the largest eps: larger ones are
+# easier
+RAISED, LARGEST = 100.0, 1.0
+# of a center's residual: what the regularized problem's may be when the next center is taken
+NEAR = 1e-3
 TRIED, FEWER = 30, 15  # steps for one center, before and after eps had to be raised
-SMALL = 1000  # unknowns up to which a sparse matrix is taken as a dense one, for which least-index pivoting is there
+# unknowns up to which a sparse matrix is taken as a dense one, for which least-index pivoting is
+# there
+SMALL = 1000
 FALL = 0.9  # a center whose residual is above this part of the smallest so far is no progress
 IDLE = 4  # centers without progress before the end
 
@@ -34,20 +40,22 @@ IDLE = 4  # centers without progress before the end
 class ProximalPoint(Settings):
     """Proximal-point method: solve regularized problems around moving centers.
 
-    (Martinet 1970, Rockafellar 1976.) Solve A x + b + eps D (x - c) = y with the same bounds, take clip(x, l, u) for the center c,
-    lower eps, repeat. D is the natural residual's d. A + eps D is a P-matrix wherever A is a P0-matrix (positive semi-definite ones,
-    skew ones), so that free blocks are regular and least-index pivoting is finite. Its solutions tend to one of the problem's own if A
-    is monotone and there is one. Each regularized problem is solved to 1e-3 of its center's residual, by an inner method; where that
-    fails, eps is raised, and does not fall below that again. Failure with eps = 1 ends the solve with NON_DESCENT, centers without
-    progress with STAGNATED, a proof by a linear program (at most 40,000 entries) with INFEASIBLE. A step is one of the inner method;
-    `linear_iterations` counts as there.
+    (Martinet 1970, Rockafellar 1976.) Solve A x + b + eps D (x - c) = y with the same bounds, take
+    clip(x, l, u) for the center c, lower eps, repeat. D is the natural residual's d. A + eps D is a
+    P-matrix wherever A is a P0-matrix (positive semi-definite ones, skew ones), so that free blocks
+    are regular and least-index pivoting is finite. Its solutions tend to one of the problem's own
+    if A is monotone and there is one. Each regularized problem is solved to 1e-3 of its center's
+    residual, by an inner method; where that fails, eps is raised, and does not fall below that
+    again. Failure with eps = 1 ends the solve with NON_DESCENT, centers without progress with
+    STAGNATED, a proof by a linear program (at most 40,000 entries) with INFEASIBLE. A step is one
+    of the inner method; `linear_iterations` counts as there.
 
-    Made for a singular block here and there. Linear programs (A skew) of more than some dozens of unknowns come to residuals of 1e-2 or
-    end with NON_DESCENT: they are InteriorPoint's.
+    Made for a singular block here and there. Linear programs (A skew) of more than some dozens of
+    unknowns come to residuals of 1e-2 or end with NON_DESCENT: they are InteriorPoint's.
 
     Args:
-        inner: method for regularized problems; None: PrimalDualActiveSet; on sparse matrices of more than 1000 unknowns
-            then MinimumMapNewton, where a set recurs.
+        inner: method for regularized problems; None: PrimalDualActiveSet; on sparse matrices of
+            more than 1000 unknowns then MinimumMapNewton, where a set recurs.
 
     Example:
         >>> import numpy as np, warp_lcp as wl
@@ -98,7 +106,13 @@ class ProximalWorkspace(IterateMemory):
         self._inner = LCP(self._operator, self._b, self._lower, self._upper)
         self._method = self._given or _inner_method(scipy.sparse.issparse(self._matrix))
         self._work: Any = self._method.init(self._inner)
-        self._smallest, self._idle, self._steps, self._near, self._least = self.residual.norm, 0, 0, 0.0, LEAST
+        self._smallest, self._idle, self._steps, self._near, self._least = (
+            self.residual.norm,
+            0,
+            0,
+            0.0,
+            LEAST,
+        )
 
     def step(self, x: wp.array[Any]) -> Step:
         """Take one step for the regularized problem."""
@@ -112,10 +126,16 @@ class ProximalWorkspace(IterateMemory):
             work.residual.evaluate(work.x)
         wp.copy(x, work.x)
         near = work.residual.norm <= self._near
-        if near or done.failure is not None or self._steps >= (TRIED if self._least == LEAST else FEWER):
+        if (
+            near
+            or done.failure is not None
+            or self._steps >= (TRIED if self._least == LEAST else FEWER)
+        ):
             failure = self._assess(x, solved=near)
         self.residual.current = False
-        return Step("proximal point", done.linear_iterations, done.active, failure, interim=failure is None)
+        return Step(
+            "proximal point", done.linear_iterations, done.active, failure, interim=failure is None
+        )
 
     def _take_center(self, x: wp.array[Any]) -> None:
         """Write the regularized problem around clip(x, l, u), and begin there."""
@@ -160,7 +180,9 @@ class ProximalWorkspace(IterateMemory):
         entries, i = self._matrix.tocoo(), np.arange(len(self._D))
         places = np.r_[entries.row, i], np.r_[entries.col, i]
         # duplicates are summed and sums of 0 stay entries: the pattern is the same for all eps
-        return scipy.sparse.csr_array((np.r_[entries.data, self._eps * self._D], places), shape=self._matrix.shape)
+        return scipy.sparse.csr_array(
+            (np.r_[entries.data, self._eps * self._D], places), shape=self._matrix.shape
+        )
 
 
 @cache

@@ -27,38 +27,47 @@ class ProjectedSOR(Settings):
 
     [Book] 2.2.1, eq. 2.52.
 
-    x_i <- clip(x_i - omega (A x + b)_i / A_ii, l_i, u_i), red-black order on grids, row order otherwise. Converges for symmetric positive
-    definite A and 0 < omega < 2 ([Book] 2.2.2). The iteration count grows with the grid: on 64^3 cells to 1e-3 and 1e-6 about 1,750 and
-    4,000 sweeps with omega = 1, 110 and 200 with the best omega, 1.9, where ProjectedMultigrid takes 5 and 8
-    cycles; a splash of 20^3 and 32^3 cells takes 210 and 497 with 1.4, 73 and 102 with `advised_omega`,
-    the default on grids. A time step of an American put, 2,000 nodes on a line, takes 2,031 sweeps
-    with omega = 1, 851 with 1.4, 124 with `advised_omega`: more than the 100 that StoppingCriteria
-    allows unless told otherwise.
+    x_i <- clip(x_i - omega (A x + b)_i / A_ii, l_i, u_i), red-black order on grids, row order
+    otherwise. Converges for symmetric positive definite A and 0 < omega < 2 ([Book] 2.2.2). The
+    iteration count grows with the grid: on 64^3 cells to 1e-3 and 1e-6 about 1,750 and 4,000 sweeps
+    with omega = 1, 110 and 200 with the best omega, 1.9, where ProjectedMultigrid takes 5 and 8
+    cycles; a splash of 20^3 and 32^3 cells takes 210 and 497 with 1.4, 73 and 102 with
+    `advised_omega`, the default on grids. A time step of an American put, 2,000 nodes on a line,
+    takes 2,031 sweeps with omega = 1, 851 with 1.4, 124 with `advised_omega`: more than the 100
+    that StoppingCriteria allows unless told otherwise.
 
-    Where A_ii = 0, x_i goes to the bound that the sign of y_i asks for, and stays where y_i = 0 or there is no such bound; where A_ii < 0
-    it goes to the bound that solves the scalar problem, of two the one of lesser energy ([Book] 2.2.2, fig. 2.4). Bounds may be affine in
-    x: they follow each change of x in dense and sparse matrices, each sweep on grids.
+    Where A_ii = 0, x_i goes to the bound that the sign of y_i asks for, and stays where y_i = 0 or
+    there is no such bound; where A_ii < 0 it goes to the bound that solves the scalar problem, of
+    two the one of lesser energy ([Book] 2.2.2, fig. 2.4). Bounds may be affine in x: they follow
+    each change of x in dense and sparse matrices, each sweep on grids.
 
-    Each sweep is tested for contraction ([Book] algorithm 4, see `Contraction`): DIVERGED, or NON_DESCENT where a sweep changes nothing.
+    Each sweep is tested for contraction ([Book] algorithm 4, see `Contraction`): DIVERGED, or
+    NON_DESCENT where a sweep changes nothing.
 
-    The orders of the book's figure 2.3, in matrices: "impulse" is order = "magnitude", "greedy" is "greedy", "coordinate" and "staggered"
-    are permutations that the caller makes, by height, or normals before tangentials; "extreme staggered" is the method `Staggering`. The
-    book names these without defining them; the definitions are ours. Sweeps in another than the operator's order are made by one thread.
+    The orders of the book's figure 2.3, in matrices: "impulse" is order = "magnitude", "greedy" is
+    "greedy", "coordinate" and "staggered" are permutations that the caller makes, by height, or
+    normals before tangentials; "extreme staggered" is the method `Staggering`. The book names these
+    without defining them; the definitions are ours. Sweeps in another than the operator's order are
+    made by one thread.
 
     Args:
-        omega: relaxation factor in (0, 2); 1 is projected Gauss-Seidel. None: `advised_omega`
-            on grids with a symmetric stencil and constant bounds, at the price of 60 products
-            whenever the operator has changed; 1.4 elsewhere, the best of the book's parameter study.
-        direction: "forward", "backward", or "symmetric", which follows every forward sweep with a backward one.
-        order: "natural"; for sparse matrices "multicolor", whose colors are swept at once (the default on CUDA); for dense and sparse ones
-            "magnitude", the largest |x_i| first, or "greedy", in which a sweep is n times the row that would change most, O(n^2).
+        omega: relaxation factor in (0, 2); 1 is projected Gauss-Seidel. None: `advised_omega` on
+            grids with a symmetric stencil and constant bounds, at the price of 60 products whenever
+            the operator has changed; 1.4 elsewhere, the best of the book's parameter study.
+        direction: "forward", "backward", or "symmetric", which follows every forward sweep with a
+            backward one.
+        order: "natural"; for sparse matrices "multicolor", whose colors are swept at once (the
+            default on CUDA); for dense and sparse ones "magnitude", the largest |x_i| first, or
+            "greedy", in which a sweep is n times the row that would change most, O(n^2).
         permutation: rows of a matrix in the order of a sweep.
         precision: "mixed" or "double" keep the iterate in float64, "single" rounds it to float32.
     """
 
     name: ClassVar[str] = "psor"
     supports: ClassVar = (Relaxes, HasRows)
-    needs: ClassVar[str] = "symmetric positive (semi-)definite A for a proof of convergence; A_ii <= 0 case by case"
+    needs: ClassVar[str] = (
+        "symmetric positive (semi-)definite A for a proof of convergence; A_ii <= 0 case by case"
+    )
     affine_bounds: ClassVar[bool] = True
 
     omega: Relaxation | None = None
@@ -79,8 +88,8 @@ class ProjectedSOR(Settings):
         """Return a workspace.
 
         Raises:
-            ValueError: A cannot be swept (in this order), has a zero or negative diagonal entry with a right-hand side that no bound
-                meets, or an odd periodic side.
+            ValueError: A cannot be swept (in this order), has a zero or negative diagonal entry
+                with a right-hand side that no bound meets, or an odd periodic side.
         """
         check_taken(self, problem.A)
         work = SORWorkspace(problem, self)
@@ -127,7 +136,9 @@ class SORWorkspace(SweepWorkspace):
         self._advised = settings.omega is None and has_advised_omega(problem)
         self._relax_by(BOOK if settings.omega is None else settings.omega)
 
-    def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
+    def start(
+        self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
+    ) -> None:
         """Look at the operator again; of a grid that has changed find omega."""
         version = version_of(self.problem.A)
         if self._advised and self._version != version:
@@ -137,7 +148,9 @@ class SORWorkspace(SweepWorkspace):
 
     def _relax_by(self, omega: float) -> None:
         s = self._settings
-        self.sweep = sweep_for(self.problem, self.diagonal, omega, SweepOrder(s.order), s.permutation)
+        self.sweep = sweep_for(
+            self.problem, self.diagonal, omega, SweepOrder(s.order), s.permutation
+        )
 
 
 def has_advised_omega(problem: LCP) -> bool:
@@ -164,14 +177,16 @@ def advised_omega(problem: LCP, steps: int = 60, free: Any = None) -> float:
 
     2 / (1 + sqrt(1 - rho^2)).
 
-    rho = 1 - lambda_min(D^-1 A) is the spectral radius of Jacobi's method, estimated by Lanczos' method. The formula is exact for
-    equations in two colors (grids), and a guide elsewhere. Only the free unknowns count in the end: where many are held at bounds, the
-    whole matrix advises too much, and a second look with the free set of an earlier solution pays.
+    rho = 1 - lambda_min(D^-1 A) is the spectral radius of Jacobi's method, estimated by Lanczos'
+    method. The formula is exact for equations in two colors (grids), and a guide elsewhere. Only
+    the free unknowns count in the end: where many are held at bounds, the whole matrix advises too
+    much, and a second look with the free set of an earlier solution pays.
 
     Args:
         problem: with a symmetric A and a positive diagonal.
         steps: products with A.
-        free: field of the problem's shape, non-zero where x is thought to be off its bounds; everywhere if None.
+        free: field of the problem's shape, non-zero where x is thought to be off its bounds;
+            everywhere if None.
 
     Raises:
         ValueError: a diagonal entry is negative, or `free` is empty.

@@ -14,7 +14,15 @@ import warp as wp
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import Step
-from warp_lcp.reduced.dense_problem import SEMIDEFINITE, DenseProblem, DenseWorkspace, check_size, inconsistent, semidefinite, sparse_matrix
+from warp_lcp.reduced.dense_problem import (
+    SEMIDEFINITE,
+    DenseProblem,
+    DenseWorkspace,
+    check_size,
+    inconsistent,
+    semidefinite,
+    sparse_matrix,
+)
 from warp_lcp.settings import Count, Positive, Settings
 
 
@@ -24,19 +32,24 @@ class QuadraticProgram(Settings):
 
     It minimizes x'Ax / 2 + b'x over l <= x <= u ([Book] 2.2.2, eq. 2.56; extra `peers`).
 
-    The minimizers are the solutions of the problem, because A is symmetric and positive semi-definite and the gradient is y = A x + b.
-    Sparse operators stay sparse; others are taken as dense matrices. x0 is not used; one step solves, and `linear_iterations` counts
-    PIQP's iterations, a factorization each. What PIQP's multipliers hold is then set on its bound, and y = 0 solved for in the others, if
-    that is better. An objective that is unbounded below is INFEASIBLE: no x solves the problem.
+    The minimizers are the solutions of the problem, because A is symmetric and positive
+    semi-definite and the gradient is y = A x + b. Sparse operators stay sparse; others are taken as
+    dense matrices. x0 is not used; one step solves, and `linear_iterations` counts PIQP's
+    iterations, a factorization each. What PIQP's multipliers hold is then set on its bound, and y =
+    0 solved for in the others, if that is better. An objective that is unbounded below is
+    INFEASIBLE: no x solves the problem.
 
     Args:
-        tolerance: PIQP's absolute and relative tolerance, on the equilibrated problem; > 0. The loop's criteria are checked on
-            the natural residual whatever PIQP says.
+        tolerance: PIQP's absolute and relative tolerance, on the equilibrated problem; > 0. The
+            loop's criteria are checked on the natural residual whatever PIQP says.
         max_iterations: maximum number of iterations of PIQP, >= 1.
     """
 
-    needs: ClassVar[str] = "symmetric, positive semi-definite, n <= 4096 unless sparse; the extra `peers`"
-    most_unknowns: ClassVar[int] = 4096  # a dense n x n float64 array of 134 MB, and its factor; sparse operators have no limit
+    needs: ClassVar[str] = (
+        "symmetric, positive semi-definite, n <= 4096 unless sparse; the extra `peers`"
+    )
+    # a dense n x n float64 array of 134 MB, and its factor; sparse operators have no limit
+    most_unknowns: ClassVar[int] = 4096
 
     tolerance: Positive = 1e-12
     max_iterations: Count = 250
@@ -49,10 +62,13 @@ class QuadraticProgram(Settings):
             ImportError: PIQP is not installed.
         """
         if importlib.util.find_spec("piqp") is None:
-            raise ImportError("QuadraticProgram needs PIQP: pip install 'warp-lcp[peers]' (or pip install piqp)")
+            raise ImportError(
+                "QuadraticProgram needs PIQP: pip install 'warp-lcp[peers]' (or pip install piqp)"
+            )
         if not problem.A.symmetric:
             raise ValueError(
-                "A is not symmetric: QuadraticProgram needs it to be; otherwise y = A x + b is not the gradient of a quadratic function"
+                "A is not symmetric: QuadraticProgram needs it to be; otherwise y = A x + b is not "
+                "the gradient of a quadratic function"
             )
         if sparse_matrix(problem) is None:
             check_size(problem, "QuadraticProgram", self.most_unknowns)
@@ -79,7 +95,10 @@ class QuadraticProgramWorkspace(DenseWorkspace):
             ValueError: A is not positive semi-definite.
         """
         if not is_convex(self.read().scaled()[0].A):
-            raise ValueError("A is not positive semi-definite: QuadraticProgram needs a convex objective; Lemke does not")
+            raise ValueError(
+                "A is not positive semi-definite: QuadraticProgram needs a convex objective; Lemke "
+                "does not"
+            )
 
     def minimize(self, tolerance: float, max_iterations: int) -> int:
         """Run PIQP; returns its iterations."""
@@ -89,23 +108,34 @@ class QuadraticProgramWorkspace(DenseWorkspace):
         sparse = scipy.sparse.issparse(data.A)
         solver = piqp.SparseSolver() if sparse else piqp.DenseSolver()
         solver.settings.eps_abs = solver.settings.eps_rel = tolerance
-        solver.settings.eps_duality_gap_abs = solver.settings.eps_duality_gap_rel = tolerance**1.1  # bounds hold to its root
+        # bounds hold to its root
+        solver.settings.eps_duality_gap_abs = solver.settings.eps_duality_gap_rel = tolerance**1.1
         solver.settings.max_iter = max_iterations
         A = scipy.sparse.csc_matrix(scaled.A) if sparse else np.asfortranarray(scaled.A)
         solver.setup(A, scaled.b, x_l=scaled.lower, x_u=scaled.upper)
         status = solver.solve()
         iterations, x = int(solver.result.info.iter), np.asarray(solver.result.x)
         solved = status == piqp.PIQP_SOLVED
-        # PIQP often runs along an unbounded direction to its iteration limit without saying so: a linear program decides
+        # PIQP often runs along an unbounded direction to its iteration limit without saying so: a
+        # linear program decides
         if not solved and len(data.b) <= QuadraticProgram.most_unknowns and inconsistent(data):
             self.ended = SolveStatus.INFEASIBLE
             return iterations
         if np.isfinite(x).all():
-            low, high = x - scaled.lower < np.asarray(solver.result.z_bl), scaled.upper - x < np.asarray(solver.result.z_bu)
+            low, high = (
+                x - scaled.lower < np.asarray(solver.result.z_bl),
+                scaled.upper - x < np.asarray(solver.result.z_bu),
+            )
             x = np.clip(units * x, data.lower, data.upper)
-            settled = data.polished(np.where(low, data.lower, np.where(high, data.upper, x)), ~(low | high))
+            settled = data.polished(
+                np.where(low, data.lower, np.where(high, data.upper, x)), ~(low | high)
+            )
             self.write_iterate(min((x, settled), key=data.residual))
-        self.ended = SolveStatus.STAGNATED if solved or iterations < max_iterations else SolveStatus.MAX_ITERATIONS
+        self.ended = (
+            SolveStatus.STAGNATED
+            if solved or iterations < max_iterations
+            else SolveStatus.MAX_ITERATIONS
+        )
         return iterations
 
 
@@ -114,7 +144,11 @@ def is_convex(A: Any) -> bool:
     if not scipy.sparse.issparse(A):
         return semidefinite(A)
     shifted = (A + SEMIDEFINITE * scipy.sparse.eye_array(A.shape[0])).tocsc()
-    settings = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
+    settings = {
+        "permc_spec": "MMD_AT_PLUS_A",
+        "diag_pivot_thresh": 0.0,
+        "options": {"SymmetricMode": True},
+    }
     try:  # without row exchanges the signs of U's diagonal are A's inertia
         return bool((scipy.sparse.linalg.splu(shifted, **settings).U.diagonal() > 0).all())
     except RuntimeError:

@@ -1,10 +1,12 @@
 """The methods by name: the one table that scenes, the command line, the tests and the documentation read.
 
-A new method is one file and one line here. Each class says in `supports` which capabilities it asks of an operator, any one of them (see
-`warp_lcp.problem.protocol`; nothing where every operator will do), and in `needs` what must hold of A ("symmetric", ...). A class that
-takes small problems only has `most_unknowns`; one whose problems are no `LCP` names their class as `problems` and takes no operators, so
-that `families` of it are none; one that takes no upper bounds and no equations has `boxed = False`; one that ends with NEGATIVE_CURVATURE
-where A is surely no P- and no semi-definite matrix has `definite = True`.
+A new method is one file and one line here. Each class says in `supports` which capabilities it asks
+of an operator, any one of them (see `warp_lcp.problem.protocol`; nothing where every operator will
+do), and in `needs` what must hold of A ("symmetric", ...). A class that takes small problems only
+has `most_unknowns`; one whose problems are no `LCP` names their class as `problems` and takes no
+operators, so that `families` of it are none; one that takes no upper bounds and no equations has
+`boxed = False`; one that ends with NEGATIVE_CURVATURE where A is surely no P- and no semi-definite
+matrix has `definite = True`.
 """
 
 from __future__ import annotations
@@ -58,7 +60,9 @@ class Methods(dict[str, type[Any]]):
         word = str(name).lower().replace("_", "-").replace(" ", "-")
         for known, kind in self.items():
             initials = "".join(part[0] for part in known.split("-"))
-            if ALSO.get(word, known) == known and (word in ALSO or word in (initials, kind.__name__.lower())):
+            if ALSO.get(word, known) == known and (
+                word in ALSO or word in (initials, kind.__name__.lower())
+            ):
                 return f"did you mean {known!r}?"
         return nearest(word, self)
 
@@ -104,11 +108,18 @@ def method_of(method: Any, name: str = "method") -> Any:
         return method
     if method not in METHODS:
         meant = f"; {METHODS.nearest(method)}" if "did you mean" in METHODS.nearest(method) else ""
-        raise ValueError(f"{name} = {method!r}: must be one of {', '.join(METHODS)}, a method with its settings or None{meant}")
+        raise ValueError(
+            f"{name} = {method!r}: must be one of {', '.join(METHODS)}, a method with its settings "
+            f"or None{meant}"
+        )
     return METHODS[method]()
 
 
 def grid_methods() -> tuple[str, ...]:
     """Return the names of the methods that take a grid of any size and a precision: what a scene may name."""
-    grids = [(name, method) for name, method in METHODS.items() if "grid" in families(method) and not hasattr(method, "most_unknowns")]
+    grids = [
+        (name, method)
+        for name, method in METHODS.items()
+        if "grid" in families(method) and not hasattr(method, "most_unknowns")
+    ]
     return tuple(name for name, method in grids if "precision" in method.__dataclass_fields__)

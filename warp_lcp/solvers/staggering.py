@@ -38,15 +38,18 @@ class Staggering(Settings):
 
     The other blocks are held fixed ([Book] 2.2.4).
 
-    Block k solves A_kk x_k + (b_k + sum_{j != k} A_kj x_j) within its bounds: a block Gauss-Seidel method, which converges for symmetric
-    positive definite A. Bounds affine in x are constants of the block while it is solved, so that any method may solve it: normal
-    forces and friction in turn.
+    Block k solves A_kk x_k + (b_k + sum_{j != k} A_kj x_j) within its bounds: a block Gauss-Seidel
+    method, which converges for symmetric positive definite A. Bounds affine in x are constants of
+    the block while it is solved, so that any method may solve it: normal forces and friction in
+    turn.
 
     Args:
-        blocks: for each block flat indices into a field of the problem's shape, together all unknowns, each once; or a number of blocks
-            of consecutive unknowns.
-        solvers: a method for each block; MinimumMapNewton for all if empty, one for all if it is a single one, in a list or not.
-        eta: each solve of a block reduces its residual by this factor, or to the accuracy that the whole problem needs.
+        blocks: for each block flat indices into a field of the problem's shape, together all
+            unknowns, each once; or a number of blocks of consecutive unknowns.
+        solvers: a method for each block; MinimumMapNewton for all if empty, one for all if it is a
+            single one, in a list or not.
+        eta: each solve of a block reduces its residual by this factor, or to the accuracy that the
+            whole problem needs.
         max_block_iterations: maximum number of steps in a block.
     """
 
@@ -63,7 +66,8 @@ class Staggering(Settings):
         """Return a workspace.
 
         Raises:
-            ValueError: the blocks are no partition of the unknowns, A cannot be taken apart, or a method does not take its block.
+            ValueError: the blocks are no partition of the unknowns, A cannot be taken apart, or a
+                method does not take its block.
         """
         check_taken(self, problem.A)
         if isinstance(self.blocks, int):
@@ -71,10 +75,14 @@ class Staggering(Settings):
             rows = [block for block in rows if block.size]
         else:
             rows = given_blocks(problem, self.blocks)
-        solvers: list[Solver] = list(self.solvers) if isinstance(self.solvers, Sequence) else [self.solvers]
+        solvers: list[Solver] = (
+            list(self.solvers) if isinstance(self.solvers, Sequence) else [self.solvers]
+        )
         solvers = solvers or [MinimumMapNewton()]
         solvers = solvers * len(rows) if len(solvers) == 1 else solvers
-        return StaggeringWorkspace(problem, rows, solvers, eta=self.eta, max_iterations=self.max_block_iterations)
+        return StaggeringWorkspace(
+            problem, rows, solvers, eta=self.eta, max_iterations=self.max_block_iterations
+        )
 
     def step(self, problem: LCP, work: StaggeringWorkspace, x: wp.array[Any]) -> Step:
         """Solve each block once, the others held."""
@@ -91,7 +99,15 @@ class StaggeringWorkspace(IterateMemory):
         target: the residual that is asked for.
     """
 
-    def __init__(self, problem: LCP, rows: list[np.ndarray], solvers: list[Solver], *, eta: float, max_iterations: int) -> None:
+    def __init__(
+        self,
+        problem: LCP,
+        rows: list[np.ndarray],
+        solvers: list[Solver],
+        *,
+        eta: float,
+        max_iterations: int,
+    ) -> None:
         super().__init__(problem)
         self.blocks: list[Block] = [block_problem(problem, self.x, block) for block in rows]
         self.rounds = StaggeredRound(self.blocks, solvers, eta=eta, max_iterations=max_iterations)
@@ -112,15 +128,28 @@ class StaggeredRound:
     Args:
         blocks: in their order.
         solvers: one for each.
-        eta: a block's residual is reduced by this factor, or to the accuracy that the whole problem needs.
+        eta: a block's residual is reduced by this factor, or to the accuracy that the whole problem
+            needs.
         max_iterations: maximum number of steps in a block.
     """
 
-    def __init__(self, blocks: Sequence[Block], solvers: Sequence[Solver], *, eta: float, max_iterations: int) -> None:
+    def __init__(
+        self, blocks: Sequence[Block], solvers: Sequence[Solver], *, eta: float, max_iterations: int
+    ) -> None:
         if len(blocks) != len(solvers):
-            raise ValueError(f"solvers: {len(solvers)} for {len(blocks)} blocks, expected one for each")
-        self.blocks, self.solvers, self._eta, self._max = list(blocks), list(solvers), eta, max_iterations
-        self._works = [solver.init(block.problem) for block, solver in zip(self.blocks, self.solvers, strict=True)]
+            raise ValueError(
+                f"solvers: {len(solvers)} for {len(blocks)} blocks, expected one for each"
+            )
+        self.blocks, self.solvers, self._eta, self._max = (
+            list(blocks),
+            list(solvers),
+            eta,
+            max_iterations,
+        )
+        self._works = [
+            solver.init(block.problem)
+            for block, solver in zip(self.blocks, self.solvers, strict=True)
+        ]
 
     def residuals(self) -> tuple[float, ...]:
         """Return the residual of each block at the current state."""
@@ -138,8 +167,17 @@ class StaggeredRound:
             goal = max(self._eta * norm, SHARE * target / math.sqrt(count))
             if not math.isfinite(norm) or norm <= goal:
                 continue
-            block, stopping = self.blocks[k], StoppingCriteria(rtol=0.0, atol=goal, max_iterations=self._max)
-            result = solve(block.problem, self.solvers[k], stopping=stopping, x0=block.guess(), workspace=self._works[k])
+            block, stopping = (
+                self.blocks[k],
+                StoppingCriteria(rtol=0.0, atol=goal, max_iterations=self._max),
+            )
+            result = solve(
+                block.problem,
+                self.solvers[k],
+                stopping=stopping,
+                x0=block.guess(),
+                workspace=self._works[k],
+            )
             linear += result.linear_iterations
             block.accept(result)
         return linear
@@ -163,13 +201,18 @@ def given_blocks(problem: LCP, blocks: Blocks) -> list[np.ndarray]:
 
     Args:
         problem: whose unknowns they are.
-        blocks: for each block flat indices into a field of the problem's shape; together all unknowns, each once.
+        blocks: for each block flat indices into a field of the problem's shape; together all
+            unknowns, each once.
 
     Raises:
-        ValueError: an index is out of range, an unknown is missing or in two blocks, or a block is empty.
+        ValueError: an index is out of range, an unknown is missing or in two blocks, or a block is
+            empty.
     """
     if isinstance(blocks, str) or not hasattr(blocks, "__iter__"):
-        raise ValueError(f"blocks = {blocks!r}: expected a number of unknowns, or for each block a list of indices")
+        raise ValueError(
+            f"blocks = {blocks!r}: expected a number of unknowns, or for each block a list of "
+            "indices"
+        )
     layout = problem.layout
     place = layout.places()
     found = []
@@ -178,13 +221,23 @@ def given_blocks(problem: LCP, blocks: Blocks) -> list[np.ndarray]:
         if index.size == 0:
             raise ValueError(f"blocks[{k}] is empty")
         if index.min() < 0 or index.max() >= len(place):
-            raise ValueError(f"blocks[{k}] has indices from {index.min()} to {index.max()}: expected 0 ... {len(place) - 1}")
+            raise ValueError(
+                f"blocks[{k}] has indices from {index.min()} to {index.max()}: expected 0 ... "
+                f"{len(place) - 1}"
+            )
         found.append(place[index])
-    count = np.bincount(np.concatenate(found), minlength=layout.size) if found else np.zeros(layout.size, dtype=int)
+    count = (
+        np.bincount(np.concatenate(found), minlength=layout.size)
+        if found
+        else np.zeros(layout.size, dtype=int)
+    )
     wrong = count != (problem.unknown.numpy() == 1)
     if wrong.any():
         at = int(np.flatnonzero(wrong[place])[0])
-        raise ValueError(f"blocks hold index {at} {count[place[at]]} times, expected {int(problem.unknown.numpy()[place[at]] == 1)}")
+        raise ValueError(
+            f"blocks hold index {at} {count[place[at]]} times, expected "
+            f"{int(problem.unknown.numpy()[place[at]] == 1)}"
+        )
     return found
 
 
@@ -196,8 +249,12 @@ def color_blocks(matrix: scipy.sparse.csr_array, owner: np.ndarray, count: int) 
         owner: block of each row.
         count: number of blocks.
     """
-    members = scipy.sparse.csr_array((np.ones(len(owner)), (np.arange(len(owner)), owner)), shape=(len(owner), count))
-    pattern = scipy.sparse.csr_array((np.ones(matrix.nnz), matrix.indices, matrix.indptr), shape=matrix.shape)
+    members = scipy.sparse.csr_array(
+        (np.ones(len(owner)), (np.arange(len(owner)), owner)), shape=(len(owner), count)
+    )
+    pattern = scipy.sparse.csr_array(
+        (np.ones(matrix.nnz), matrix.indices, matrix.indptr), shape=matrix.shape
+    )
     color = greedy_colors((members.T @ pattern @ members).tocsr())
     return [np.flatnonzero(color == c) for c in range(int(color.max()) + 1)]
 
@@ -278,7 +335,9 @@ class GridBlock:
         sub = A.on_cells(self._cells())
         self._b, self._y, self._z, self._guess = (layout.zeros(wp.float64) for _ in range(4))
         stored = layout.stored_shape
-        self.problem = LCP(sub, self._b.reshape(stored), whole.lower.reshape(stored), whole.upper.reshape(stored))
+        self.problem = LCP(
+            sub, self._b.reshape(stored), whole.lower.reshape(stored), whole.upper.reshape(stored)
+        )
         self._version = A.version
 
     def refresh(self) -> None:
@@ -295,9 +354,13 @@ class GridBlock:
         whole, member = self._whole, self._member
         whole.bounds.follow(self._x)
         whole.apply_plus(self._x, whole.b, self._y)
-        SELECT.bind(rows_of(self._x), x=self._x, less=None, target=self._guess, member=member, kept=False).launch()
+        SELECT.bind(
+            rows_of(self._x), x=self._x, less=None, target=self._guess, member=member, kept=False
+        ).launch()
         self.problem.A.apply(self._guess, self._z)
-        SELECT.bind(rows_of(self._x), x=self._y, less=self._z, target=self._b, member=member, kept=False).launch()
+        SELECT.bind(
+            rows_of(self._x), x=self._y, less=self._z, target=self._b, member=member, kept=False
+        ).launch()
 
     def guess(self) -> wp.array[Any]:
         """Return x_B as `couple` found it."""
@@ -305,7 +368,14 @@ class GridBlock:
 
     def accept(self, result: SolveResult) -> None:
         """Write a block's x_B to the common iterate."""
-        SELECT.bind(rows_of(self._x), x=result.x.flatten(), less=None, member=self._member, target=self._x, kept=True).launch()
+        SELECT.bind(
+            rows_of(self._x),
+            x=result.x.flatten(),
+            less=None,
+            member=self._member,
+            target=self._x,
+            kept=True,
+        ).launch()
 
     def _cells(self) -> np.ndarray:
         """Return the padded cell types with AIR in place of the other unknowns."""
@@ -331,4 +401,7 @@ def block_problem(whole: LCP, x: wp.array[Any], rows: np.ndarray) -> Block:
         return GridBlock(whole, x, rows)
     if has(whole.A, HasRows):
         return MatrixBlock(whole, x, rows)
-    raise ValueError(f"{type(whole.A).__name__} cannot be split into blocks, which need {described(HasRows, HasBlocks)}")
+    raise ValueError(
+        f"{type(whole.A).__name__} cannot be split into blocks, which need "
+        f"{described(HasRows, HasBlocks)}"
+    )

@@ -36,14 +36,17 @@ class SubspaceMinimization(Settings):
     It sweeps, then solves A_FF x_F = -(b_F + A_FH x_H) on the unknowns off their bounds and
     projects ([Book] 2.2.5, algorithm 7, eq. 2.95).
 
-    A step is `sweeps` projected Gauss-Seidel sweeps and up to `solves` such solves, until the free set stays ([Book] eq. 2.98). Each solve
-    is inexact, as far as the whole one still needs. Its projected correction is halved until the energy x'A x / 2 + b'x or the residual
-    falls, up to `backtracks` times; if neither falls, x is left as after the sweeps. The book takes full steps, whose "jaggyness"
-    (fig. 2.10) this avoids; `backtracks = -1` takes full steps as the book does.
+    A step is `sweeps` projected Gauss-Seidel sweeps and up to `solves` such solves, until the free
+    set stays ([Book] eq. 2.98). Each solve is inexact, as far as the whole one still needs. Its
+    projected correction is halved until the energy x'A x / 2 + b'x or the residual falls, up to
+    `backtracks` times; if neither falls, x is left as after the sweeps. The book takes full steps,
+    whose "jaggyness" (fig. 2.10) this avoids; `backtracks = -1` takes full steps as the book does.
 
-    Bounds may be affine in x: they are constants of each linear solve; held unknowns then move with their bounds, and only the residual
-    judges the step, as there is no energy. With friction the residual may have to rise first: `backtracks = -1` solves a stack of 10 boxes
-    to 1e-13 in 13 steps where 200 safeguarded ones end at 5e-4 (`benchmarks.contacts`), and diverges in the time steps of a brick wall.
+    Bounds may be affine in x: they are constants of each linear solve; held unknowns then move with
+    their bounds, and only the residual judges the step, as there is no energy. With friction the
+    residual may have to rise first: `backtracks = -1` solves a stack of 10 boxes to 1e-13 in 13
+    steps where 200 safeguarded ones end at 5e-4 (`benchmarks.contacts`), and diverges in the time
+    steps of a brick wall.
 
     `linear_iterations` counts sweeps and preconditioned iterations.
 
@@ -51,15 +54,19 @@ class SubspaceMinimization(Settings):
         sweeps: of each step, >= 1.
         solves: on the free set, of each step, at most; >= 1.
         omega: relaxation factor of the sweeps, in (0, 2).
-        eta: each linear solve reduces its residual by this factor, or to the accuracy that the whole solve still needs.
+        eta: each linear solve reduces its residual by this factor, or to the accuracy that the
+            whole solve still needs.
         max_linear_iterations: maximum number of iterations of one linear solve.
         backtracks: halvings of a correction; -1 takes all corrections as they come.
-        precision: "mixed": iterate float64, corrections float32; "double"; or "single": the iterate rounded to float32 as well.
+        precision: "mixed": iterate float64, corrections float32; "double"; or "single": the iterate
+            rounded to float32 as well.
         cycle: settings of multigrid cycles.
     """
 
     supports: ClassVar = (Relaxes, HasRows)
-    needs: ClassVar[str] = "as for ProjectedSOR; regular principal blocks (dense: least squares otherwise)"
+    needs: ClassVar[str] = (
+        "as for ProjectedSOR; regular principal blocks (dense: least squares otherwise)"
+    )
     preconditioned: ClassVar[bool] = True
     affine_bounds: ClassVar[bool] = True
 
@@ -105,14 +112,18 @@ class SubspaceWorkspace(SweepWorkspace):
         super().__init__(problem, settings.precision)
         self.settings, layout = settings, problem.layout
         self.sweep = sweep_for(problem, self.diagonal, settings.omega)
-        self.system = principal_system(problem, self.precision.correction, bounded=False, settings=settings.cycle)
+        self.system = principal_system(
+            problem, self.precision.correction, bounded=False, settings=settings.cycle
+        )
         self.free, self._before = layout.zeros(wp.uint8), layout.zeros(wp.float64)
         affine = problem.bounds.affine is not None
         self._old_bounds = [layout.zeros(wp.float64) for _ in range(2)] if affine else []
         self._sums = Sums(rows_of(self.x), 2)
         self._stale, self._target = True, 0.0
 
-    def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
+    def start(
+        self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
+    ) -> None:
         """Forget the free set; the operator may have changed."""
         super().start(warm=warm, tolerance=tolerance)
         self.floating = floating
@@ -123,7 +134,9 @@ class SubspaceWorkspace(SweepWorkspace):
         """Find the free set; return how many unknowns entered or left it, and how many are held."""
         p = self.problem
         p.bounds.follow(x)
-        found = self._sums.of(BETWEEN, bounds=p.bounds.operands, x=x, unknown=p.unknown, free=self.free)
+        found = self._sums.of(
+            BETWEEN, bounds=p.bounds.operands, x=x, unknown=p.unknown, free=self.free
+        )
         moved, held = (int(v) for v in found)
         if moved or self._stale:
             self.system.restrict(self.free)
@@ -140,12 +153,18 @@ class SubspaceWorkspace(SweepWorkspace):
         self._right_side(1 / size)
         if self.floating is not None:
             self.floating.project(self.system.r, self.free)
-        iterations = self.system.solve(max(s.eta, 0.3 * self._target / size), s.max_linear_iterations)[0]
+        iterations = self.system.solve(
+            max(s.eta, 0.3 * self._target / size), s.max_linear_iterations
+        )[0]
         wp.copy(self._before, x)
         for halving in range(max(s.backtracks, 0) + 1):
             check_time()
             self._correct(x, size * 0.5**halving)
-            if s.backtracks < 0 or residual.evaluate(x) < norm or self._energy(x) < energy - ROUNDING * abs(energy):
+            if (
+                s.backtracks < 0
+                or residual.evaluate(x) < norm
+                or self._energy(x) < energy - ROUNDING * abs(energy)
+            ):
                 residual.current = s.backtracks >= 0
                 return iterations
         wp.copy(x, self._before)
@@ -155,13 +174,21 @@ class SubspaceWorkspace(SweepWorkspace):
     def _correct(self, x: wp.array[Any], scale: float) -> None:
         p = self.problem
         p.bounds.follow(self._before)
-        projected_move(self._sums.rows, p.bounds.operands, self._before, self.system.e, scale, x, guarded=False)
+        projected_move(
+            self._sums.rows, p.bounds.operands, self._before, self.system.e, scale, x, guarded=False
+        )
         if self._old_bounds:
             for old, bound in zip(self._old_bounds, (p.lower, p.upper), strict=True):
                 wp.copy(old, bound)
             p.bounds.follow(x)
             old_lower, old_upper = self._old_bounds
-            FOLLOW.bind(self._sums.rows, bounds=p.bounds.operands, x=x, old_lower=old_lower, old_upper=old_upper).launch()
+            FOLLOW.bind(
+                self._sums.rows,
+                bounds=p.bounds.operands,
+                x=x,
+                old_lower=old_lower,
+                old_upper=old_upper,
+            ).launch()
         self._finish_move(x)
 
     def _energy(self, x: wp.array[Any]) -> float:
@@ -174,4 +201,10 @@ class SubspaceWorkspace(SweepWorkspace):
 
     def _right_side(self, scale: float) -> float:
         """Set the system's right-hand side to -scale y on the free set; return y's norm there."""
-        return float(np.sqrt(self._sums.of(ON_FREE, y=self.residual.y, free=self.free, g=self.system.r, scale=scale)[0]))
+        return float(
+            np.sqrt(
+                self._sums.of(
+                    ON_FREE, y=self.residual.y, free=self.free, g=self.system.r, scale=scale
+                )[0]
+            )
+        )

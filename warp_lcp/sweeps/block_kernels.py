@@ -13,7 +13,8 @@ from warp_lcp.sweeps.sweep_kernels import INFINITE, ZERO, scalar_solution
 
 f64, i32 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int32)
 AT_LOWER, FREE, AT_UPPER = wp.constant(0), wp.constant(1), wp.constant(2)
-ROUNDING = wp.constant(wp.float64(1e-12))  # of the terms of y and of |x|: what elimination in a small block leaves
+# of the terms of y and of |x|: what elimination in a small block leaves
+ROUNDING = wp.constant(wp.float64(1e-12))
 SINGULAR = wp.constant(wp.float64(1e-13))  # of the largest entry
 
 
@@ -167,7 +168,9 @@ def block_sweep_kernel(a_type: Any, m: int) -> Any:
         sets = int(1)
         for _ in range(n):
             sets = sets * 3
-        code = int(-1)  # of the set; below 0: the one that the last asked for. One place solves, or CUDA keeps what it takes twice
+        # of the set; below 0: the one that the last asked for. One place solves, or CUDA keeps what
+        # it takes twice
+        code = int(-1)
         count = int(0)
         while code < sets:
             possible = int(1)
@@ -213,14 +216,24 @@ def block_sweep_kernel(a_type: Any, m: int) -> Any:
                 y = a[p, m]
                 for q in range(n):
                     y += a[p, q] * out[q]
-                out[p] = scalar_solution(out[p], y, a[p, p], side_at(low, out, p), side_at(high, out, p), wp.float64(1.0))
+                out[p] = scalar_solution(
+                    out[p], y, a[p, p], side_at(low, out, p), side_at(high, out, p), wp.float64(1.0)
+                )
         return out
 
     @forward_kernel(module=name)
     def sweep(
-        A: Rows, b: f64, lowers: AffineSide, uppers: AffineSide, omega: wp.float64, B: BlockLists, begin: int, each: int, forward: bool,
+        A: Rows,
+        b: f64,
+        lowers: AffineSide,
+        uppers: AffineSide,
+        omega: wp.float64,
+        B: BlockLists,
+        begin: int,
+        each: int,
+        forward: bool,
         x: f64,
-    ):  # fmt: skip
+    ):
         """Solve `each` blocks a thread, from place begin of their order."""
         thread = wp.tid()
         for step in range(each):
@@ -255,7 +268,9 @@ def block_sweep_kernel(a_type: Any, m: int) -> Any:
             new = solve_block(a, low, high, old, n)
             for p in range(n):
                 new[p] = old[p] + omega * (new[p] - old[p])
-            for p in range(n):  # unknowns that others' bounds depend on have constant ones, so that their order does not matter
+            # unknowns that others' bounds depend on have constant ones, so that their order does
+            # not matter
+            for p in range(n):
                 if low.at[p] < 0 and high.at[p] < 0:
                     new[p] = wp.clamp(new[p], low.constant[p], high.constant[p])
             for p in range(n):

@@ -19,15 +19,18 @@ def scaled_spectrum(problem: LCP, steps: int, free: Any = None) -> tuple[float, 
 
     Where A is not symmetric, of its symmetric part.
 
-    The greatest is estimated from below, mostly to a percent in 20 steps; the least from above, and slowly. The vectors are on the host.
+    The greatest is estimated from below, mostly to a percent in 20 steps; the least from above, and
+    slowly. The vectors are on the host.
 
     Args:
         problem: its bounds and b do not matter.
         steps: products with A.
-        free: rows and columns that count, field of the problem's shape, non-zero there; all if None.
+        free: rows and columns that count, field of the problem's shape, non-zero there; all if
+            None.
 
     Raises:
-        ValueError: a diagonal entry of an unknown is negative, or `free` is empty. Zero entries are taken as 1.
+        ValueError: a diagonal entry of an unknown is negative, or `free` is empty. Zero entries are
+            taken as 1.
     """
     layout, A = problem.layout, problem.A
     scale = 1 / np.sqrt(positive_diagonal(problem))
@@ -43,12 +46,16 @@ def scaled_spectrum(problem: LCP, steps: int, free: Any = None) -> tuple[float, 
         problem.apply_plus(field, nothing, image)
         if not A.symmetric:
             straight = image.numpy().copy()
-            A.apply_transpose(field.reshape(layout.stored_shape), image.reshape(layout.stored_shape))
+            A.apply_transpose(
+                field.reshape(layout.stored_shape), image.reshape(layout.stored_shape)
+            )
             image.assign((straight + image.numpy()) / 2)
         return np.where(unknown, scale * image.numpy(), 0.0)
 
     start = np.where(unknown, np.random.default_rng(SEED).standard_normal(layout.size), 0.0)
-    return _lanczos(product, start / np.linalg.norm(start), min(steps, int(np.count_nonzero(unknown))))
+    return _lanczos(
+        product, start / np.linalg.norm(start), min(steps, int(np.count_nonzero(unknown)))
+    )
 
 
 def positive_diagonal(problem: LCP) -> np.ndarray:
@@ -60,7 +67,10 @@ def positive_diagonal(problem: LCP) -> np.ndarray:
     d = problem.layout.load(problem.A.diagonal(), wp.float64).numpy()
     negative = (d < 0) & (problem.unknown.numpy() == 1)
     if negative.any():
-        raise ValueError(f"A has {np.count_nonzero(negative)} negative diagonal entries: this method needs them positive")
+        raise ValueError(
+            f"A has {np.count_nonzero(negative)} negative diagonal entries: this method needs them "
+            "positive"
+        )
     return np.where(d > 0, d, 1.0)
 
 

@@ -44,7 +44,9 @@ class Sweep:
 class OperatorSweep(Sweep):
     """The operator's own sweep: red-black on grids, by rows or by colors on sparse matrices. Affine bounds are evaluated once a sweep."""
 
-    def __init__(self, problem: LCP, A: Relaxes, omega: float, *, colored: bool | None = None) -> None:
+    def __init__(
+        self, problem: LCP, A: Relaxes, omega: float, *, colored: bool | None = None
+    ) -> None:
         self.problem, self._A, self.omega = problem, A, omega
         self._options: dict[str, bool] = {} if colored is None else {"colored": colored}
 
@@ -68,15 +70,27 @@ class RowSweep(Sweep):
         problem: the problem.
         rows: its operator's rows.
         omega: relaxation factor.
-        order: NATURAL, MAGNITUDE (largest |x| first, sorted anew before each sweep) or GREEDY (always the row that would change most).
+        order: NATURAL, MAGNITUDE (largest |x| first, sorted anew before each sweep) or GREEDY
+            (always the row that would change most).
         permutation: rows in the order of a sweep; all of them by number if None.
     """
 
-    def __init__(self, problem: LCP, rows: CompressedRows, omega: float, order: SweepOrder, permutation: tuple[int, ...] | None) -> None:
+    def __init__(
+        self,
+        problem: LCP,
+        rows: CompressedRows,
+        omega: float,
+        order: SweepOrder,
+        permutation: tuple[int, ...] | None,
+    ) -> None:
         self.problem, self._rows, self._omega, self._order = problem, rows, wp.float64(omega), order
         n = problem.layout.size
         self._n = n if permutation is None else len(permutation)
-        given = np.zeros(n if order is SweepOrder.MAGNITUDE else 0) if permutation is None else permutation
+        given = (
+            np.zeros(n if order is SweepOrder.MAGNITUDE else 0)
+            if permutation is None
+            else permutation
+        )
         self._places = wp.array(given, dtype=wp.int32, device=problem.device)
         self._matrix = rows.operand
         self._bounds = bound_operands(problem)
@@ -106,7 +120,9 @@ class DiagonalSweep(Sweep):
 
     def start(self) -> None:
         """Look at the diagonal, which decides how to sweep."""
-        self._current = self._own if self._by_rows is None or self._diagonal.positive() else self._by_rows
+        self._current = (
+            self._own if self._by_rows is None or self._diagonal.positive() else self._by_rows
+        )
 
     def run(self, x: wp.array[Any], *, forward: bool) -> None:
         """Sweep in the way that the diagonal allows."""
@@ -136,32 +152,46 @@ class Diagonal:
         """Refuse rows without a minimizer in their own direction ([Book] 2.2.2, fig. 2.4).
 
         Raises:
-            ValueError: A_ii = 0 with a b_i that asks for a move without a bound in its way, or A_ii < 0 where no bound solves the row.
+            ValueError: A_ii = 0 with a b_i that asks for a move without a bound in its way, or A_ii
+                < 0 where no bound solves the row.
         """
         p, d = self.problem, self.values()
-        b, lower, upper, inside = p.b.numpy(), p.lower.numpy(), p.upper.numpy(), p.unknown.numpy() == 1
+        b, lower, upper, inside = (
+            p.b.numpy(),
+            p.lower.numpy(),
+            p.upper.numpy(),
+            p.unknown.numpy() == 1,
+        )
         with np.errstate(invalid="ignore", over="ignore"):
-            below = np.isinf(lower) | (b + d * lower < 0)  # neither the lower bound solves the scalar problem with the others at 0,
+            # neither the lower bound solves the scalar problem with the others at 0,
+            below = np.isinf(lower) | (b + d * lower < 0)
             above = np.isinf(upper) | (b + d * upper > 0)  # nor the upper one
         concave = inside & (d < 0) & below & above
         if concave.any():
             row = int(np.flatnonzero(concave)[0])
             raise ValueError(
-                f"A has {np.count_nonzero(concave)} negative diagonal entries where no bound solves the row (the first is row {row}, "
+                f"A has {np.count_nonzero(concave)} negative diagonal entries where no bound "
+                f"solves the row (the first is row {row}, "
                 f"b = {b[row]}): no sweep can solve them"
             )
         if has(p.A, NamesComponents):
-            return  # a grid's zero diagonals are isolated cells, which the loop settles or calls INFEASIBLE
+            # a grid's zero diagonals are isolated cells, which the loop settles or calls INFEASIBLE
+            return
         stuck = inside & (d == 0) & (((b < 0) & np.isinf(upper)) | ((b > 0) & np.isinf(lower)))
         if stuck.any():
             row = int(np.flatnonzero(stuck)[0])
             raise ValueError(
-                f"A has a zero on the diagonal where b asks for an unbounded move (row {row}, b = {b[row]}): no sweep can solve it"
+                f"A has a zero on the diagonal where b asks for an unbounded move (row {row}, b = "
+                f"{b[row]}): no sweep can solve it"
             )
 
 
 def sweep_for(
-    problem: LCP, diagonal: Diagonal, omega: float, order: SweepOrder = SweepOrder.NATURAL, permutation: tuple[int, ...] | None = None
+    problem: LCP,
+    diagonal: Diagonal,
+    omega: float,
+    order: SweepOrder = SweepOrder.NATURAL,
+    permutation: tuple[int, ...] | None = None,
 ) -> Sweep:
     """Return the sweep for a problem.
 
@@ -173,19 +203,33 @@ def sweep_for(
     kind = type(A).__name__
     if order is SweepOrder.MULTICOLOR:
         if not isinstance(A, SparseOperator):
-            raise ValueError(f"order 'multicolor' is for sparse matrices; {kind} has its own order (grids: red-black)")
+            raise ValueError(
+                f"order 'multicolor' is for sparse matrices; {kind} has its own order (grids: "
+                "red-black)"
+            )
         if problem.bounds.affine is not None or not diagonal.positive():
             raise ValueError("order 'multicolor' needs constant bounds and a positive diagonal")
         return OperatorSweep(problem, A, omega, colored=True)
-    if permutation is not None and rows is not None and sorted(permutation) != list(range(problem.layout.size)):
-        raise ValueError(f"permutation: must hold every row from 0 to {problem.layout.size - 1} once")
+    if (
+        permutation is not None
+        and rows is not None
+        and sorted(permutation) != list(range(problem.layout.size))
+    ):
+        raise ValueError(
+            f"permutation: must hold every row from 0 to {problem.layout.size - 1} once"
+        )
     special = permutation is not None or order is not SweepOrder.NATURAL
     if special and rows is None:
-        raise ValueError(f"{kind} has its own order of sweeps: only dense and sparse matrices can be swept in another one")
+        raise ValueError(
+            f"{kind} has its own order of sweeps: only dense and sparse matrices can be swept in "
+            "another one"
+        )
     if order is SweepOrder.GREEDY and not A.symmetric:
         raise ValueError("order 'greedy' updates y by rows of A, which must be symmetric")
     by_rows = None if rows is None else RowSweep(problem, rows, omega, order, permutation)
-    if by_rows is not None and (special or problem.bounds.affine is not None or not has(A, Relaxes)):
+    if by_rows is not None and (
+        special or problem.bounds.affine is not None or not has(A, Relaxes)
+    ):
         return by_rows
     assert has(A, Relaxes)
     check_colors(problem)
@@ -198,22 +242,29 @@ def check_colors(problem: LCP) -> None:
     Raises:
         ValueError: a periodic side has an odd number of cells.
     """
-    for axis, periodic in zip("xyz", problem.A.periodic if has(problem.A, HasStencil) else (), strict=False):
+    for axis, periodic in zip(
+        "xyz", problem.A.periodic if has(problem.A, HasStencil) else (), strict=False
+    ):
         count = problem.layout.shape["xyz".index(axis) * -1 - 1] if periodic else 0
         if count % 2:
-            raise ValueError(f"the periodic {axis} axis has {count} cells: red-black sweeps need an even number")
+            raise ValueError(
+                f"the periodic {axis} axis has {count} cells: red-black sweeps need an even number"
+            )
 
 
 class Contraction:
     """Tests sweeps for contraction and divergence ([Book] 2.2.1, algorithm 4).
 
-    The book compares max |x_i| of successive sweeps, and calls any growth divergence. From x = 0 that stops every solve at its second
-    sweep, so the change delta = max |x_i - x_i before| is compared, which a contraction shrinks: divergence is a delta that has grown in
-    RISES sweeps in a row and is GROWTH times the least one. Bounds can hide divergence: iterates then jump between bounds, delta stays as
-    it is, and the solve ends as stagnated. A delta of 0 is a sweep that changes nothing.
+    The book compares max |x_i| of successive sweeps, and calls any growth divergence. From x = 0
+    that stops every solve at its second sweep, so the change delta = max |x_i - x_i before| is
+    compared, which a contraction shrinks: divergence is a delta that has grown in RISES sweeps in a
+    row and is GROWTH times the least one. Bounds can hide divergence: iterates then jump between
+    bounds, delta stays as it is, and the solve ends as stagnated. A delta of 0 is a sweep that
+    changes nothing.
 
     Attributes:
-        factor: delta over the one before; estimates the rate of convergence once it has settled. NaN before the second sweep.
+        factor: delta over the one before; estimates the rate of convergence once it has settled.
+            NaN before the second sweep.
     """
 
     RISES, GROWTH = 10, 100.0
@@ -238,4 +289,8 @@ class Contraction:
         self.factor = delta / self._last
         self._rises = self._rises + 1 if delta > self._last else 0
         self._last, self._least = delta, min(self._least, delta)
-        return SolveStatus.DIVERGED if self._rises >= self.RISES and delta > self.GROWTH * self._least else None
+        return (
+            SolveStatus.DIVERGED
+            if self._rises >= self.RISES and delta > self.GROWTH * self._least
+            else None
+        )

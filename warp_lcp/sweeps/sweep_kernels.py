@@ -42,7 +42,9 @@ def bound_for_concave(x: wp.float64, y: wp.float64, d: wp.float64, l: wp.float64
 
 
 @wp.func
-def scalar_solution(x: wp.float64, y: wp.float64, d: wp.float64, l: wp.float64, u: wp.float64, omega: wp.float64):
+def scalar_solution(
+    x: wp.float64, y: wp.float64, d: wp.float64, l: wp.float64, u: wp.float64, omega: wp.float64
+):
     """What x becomes, case by case on the sign of the diagonal d ([Book] 2.2.2, fig. 2.4)."""
     v = x
     if d > ZERO:
@@ -67,7 +69,17 @@ def row_kernels(a_type: Any) -> SimpleNamespace:
     entries, Rows = wp.array(dtype=a_type), matrix_rows(a_type)
 
     @forward_kernel(module=name)
-    def sweep(A: Rows, b: f64, lowers: AffineSide, uppers: AffineSide, omega: wp.float64, order: i32, forward: bool, n: int, x: f64):
+    def sweep(
+        A: Rows,
+        b: f64,
+        lowers: AffineSide,
+        uppers: AffineSide,
+        omega: wp.float64,
+        order: i32,
+        forward: bool,
+        n: int,
+        x: f64,
+    ):
         """Relax the rows of `order` (empty: all, by number) one after the other, by one thread."""
         for place in range(n):
             r = place
@@ -92,7 +104,16 @@ def row_kernels(a_type: Any) -> SimpleNamespace:
             x[i] = scalar_solution(x[i], y, d, lower, upper, omega)
 
     @forward_kernel(module=name)
-    def greedy(A: Rows, diagonal: entries, lowers: AffineSide, uppers: AffineSide, omega: wp.float64, n: int, y: f64, x: f64):
+    def greedy(
+        A: Rows,
+        diagonal: entries,
+        lowers: AffineSide,
+        uppers: AffineSide,
+        omega: wp.float64,
+        n: int,
+        y: f64,
+        x: f64,
+    ):
         """Relax n times the row whose x would change most, measured by |d| |change|; A is symmetric, so that its column is its row."""
         for _ in range(n):
             chosen = int(-1)
@@ -104,7 +125,9 @@ def row_kernels(a_type: Any) -> SimpleNamespace:
                 weight = wp.abs(d)
                 if weight == ZERO:
                     weight = wp.float64(1.0)
-                size = weight * wp.abs(scalar_solution(x[i], y[i], d, lower, upper, wp.float64(1.0)) - x[i])
+                size = weight * wp.abs(
+                    scalar_solution(x[i], y[i], d, lower, upper, wp.float64(1.0)) - x[i]
+                )
                 if size > most:
                     most = size
                     chosen = i
@@ -130,7 +153,16 @@ def jacobi_kernel(d_type: Any) -> Any:
     """Return the kernel of Jacobi's pass for a diagonal of type d_type."""
 
     @forward_kernel(module=f"warp_lcp.jacobi.{d_type.__name__}")
-    def jacobi(d: wp.array(dtype=d_type), unit: wp.float64, y: f64, lower: f64, upper: f64, unknown: i8, omega: wp.float64, x: f64):
+    def jacobi(
+        d: wp.array(dtype=d_type),
+        unit: wp.float64,
+        y: f64,
+        lower: f64,
+        upper: f64,
+        unknown: i8,
+        omega: wp.float64,
+        x: f64,
+    ):
         """Solve each scalar problem from the same x."""
         i = wp.tid()
         if unknown[i] == wp.int8(1):

@@ -1,6 +1,7 @@
 """Random problems of many kinds, by kind and seed: what no method was tuned on. `problem(kind, seed)` is the same for ever.
 
-Seeds 0 to 9,999 are for tests and for development, 10,000 to 19,999 are kept unseen for acceptance, a run draws from 20,000 on.
+Seeds 0 to 9,999 are for tests and for development, 10,000 to 19,999 are kept unseen for acceptance,
+a run draws from 20,000 on.
 """
 
 from __future__ import annotations
@@ -21,7 +22,11 @@ def _named(kinds: Iterable[Make]) -> dict[str, Make]:
     return {make.__name__.replace("_", "-"): make for make in kinds}
 
 
-GRIDS, SURE_MATRICES, HARD_MATRICES = _named(grids.KINDS), _named(matrices.SURE), _named(matrices.HARD)
+GRIDS, SURE_MATRICES, HARD_MATRICES = (
+    _named(grids.KINDS),
+    _named(matrices.SURE),
+    _named(matrices.HARD),
+)
 KINDS = {**GRIDS, **SURE_MATRICES, **HARD_MATRICES}
 ALLOWANCE = {"lognormal": 1.5}
 WARM_EVERY = 3  # of how many seeds one is solved once more with b changed by 1 %
@@ -44,4 +49,8 @@ def problem(kind: str, seed: int, *, small: bool = False) -> Unseen:
     if not isinstance(made, GridProblem):
         return Unseen(made)
     made = solvable(made)
-    return Unseen(made, changed(made, seed) if seed % WARM_EVERY == 0 and not small else None, ALLOWANCE.get(kind, 1.0))
+    return Unseen(
+        made,
+        changed(made, seed) if seed % WARM_EVERY == 0 and not small else None,
+        ALLOWANCE.get(kind, 1.0),
+    )

@@ -17,7 +17,8 @@ from warp_lcp.benchmarks.extremes.problem import GridProblem, Problem, solvable
 AIR, FLUID, SOLID = wl.AIR, wl.FLUID, wl.SOLID
 SIDES = {2: (30, 300), 3: (12, 48)}  # cells, by dimensions
 SMALL_SIDES = {2: (3, 14), 3: (2, 6)}  # where every method takes part
-LARGER, LONGER = 0.03, {2: 2.0, 3: 1.4}  # share of grids with more cells along a side, and how many times as many at most
+# share of grids with more cells along a side, and how many times as many at most
+LARGER, LONGER = 0.03, {2: 2.0, 3: 1.4}
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,8 @@ class Unseen:
     """What a kind and a seed come to."""
 
     problem: Problem  # what is to be solved
-    then: GridProblem | None = None  # one that differs a little, to be solved from the solution of `problem`; None for none
+    # one that differs a little, to be solved from the solution of `problem`; None for none
+    then: GridProblem | None = None
     allowance: float = 1.0  # factor of the iterations that it may take
 
 
@@ -83,7 +85,9 @@ class Draw:
 
     def smooth(self, shape: Sequence[int], width: float) -> np.ndarray:
         """Return noise smoothed over `width` cells, at most 1 in magnitude."""
-        field = scipy.ndimage.gaussian_filter(self.noise(shape), [min(width, n / 3) for n in shape], mode="nearest")
+        field = scipy.ndimage.gaussian_filter(
+            self.noise(shape), [min(width, n / 3) for n in shape], mode="nearest"
+        )
         largest = np.abs(field).max()
         return field / largest if largest > 0 else np.ones(shape)
 
@@ -113,4 +117,6 @@ def changed(problem: GridProblem, seed: int, share: float = 0.01) -> GridProblem
     field = draw.smooth(b.shape, 5) * (problem.cells == FLUID)
     exact, largest = problem.exact(), np.linalg.norm(field)
     size = np.linalg.norm(exact.b) or exact.residual(exact.start)
-    return solvable(replace(problem, b=b + share * size / (largest if largest > 0 else 1.0) * field))
+    return solvable(
+        replace(problem, b=b + share * size / (largest if largest > 0 else 1.0) * field)
+    )

@@ -20,13 +20,17 @@ def some_bounds(draw: Draw, shape: tuple[int, ...]) -> dict[str, Any]:
     if kind == "some":
         return {"lower": np.where(draw.rng.random(shape) < draw.between(0.05, 0.9), 0.0, -np.inf)}
     if kind == "layer":
-        return {"lower": np.where(np.indices(shape)[draw.rng.integers(len(shape))] == 0, 0.0, -np.inf)}
+        return {
+            "lower": np.where(np.indices(shape)[draw.rng.integers(len(shape))] == 0, 0.0, -np.inf)
+        }
     return {"upper": draw.decades(0.1, 100)}
 
 
 def loaded(draw: Draw, cells: np.ndarray, **more: Any) -> GridProblem:
     """Return any right-hand side and some bounds on these cells."""
-    return GridProblem(cells=cells, b=draw.load(cells.shape), **more, **some_bounds(draw, cells.shape))
+    return GridProblem(
+        cells=cells, b=draw.load(cells.shape), **more, **some_bounds(draw, cells.shape)
+    )
 
 
 def strip(draw: Draw) -> GridProblem:
@@ -39,7 +43,11 @@ def strip(draw: Draw) -> GridProblem:
         cells[..., 0] = AIR
     b = draw.load(cells.shape)
     turn = draw.rng.permutation(cells.ndim)
-    return GridProblem(cells=cells.transpose(turn), b=b.transpose(turn), upper=draw.decades(1, 1e4) if draw.chance(0.3) else np.inf)
+    return GridProblem(
+        cells=cells.transpose(turn),
+        b=b.transpose(turn),
+        upper=draw.decades(1, 1e4) if draw.chance(0.3) else np.inf,
+    )
 
 
 def vent(draw: Draw) -> GridProblem:
@@ -54,7 +62,9 @@ def voxels(draw: Draw) -> GridProblem:
     shape = draw.shape(draw.of(2, 3))
     width = draw.decades(1, 8)
     air, solid = draw.smooth(shape, width), draw.smooth(shape, width)
-    cells = np.where(air > draw.between(0.2, 0.7), AIR, np.where(solid > draw.between(0.2, 0.7), SOLID, FLUID))
+    cells = np.where(
+        air > draw.between(0.2, 0.7), AIR, np.where(solid > draw.between(0.2, 0.7), SOLID, FLUID)
+    )
     cells.flat[0], cells.flat[-1] = AIR, FLUID
     return loaded(draw, cells)
 
@@ -63,7 +73,9 @@ def liquid(draw: Draw) -> GridProblem:
     """Return a body of liquid with a rough surface in a box, b the divergence of noise and of a fall, p >= 0 at walls or everywhere."""
     dimensions = draw.of(2, 3)
     shape = draw.shape(dimensions)
-    surface = shape[0] * (draw.between(0.3, 0.8) + 0.2 * draw.smooth(shape[1:], draw.decades(2, 20)))
+    surface = shape[0] * (
+        draw.between(0.3, 0.8) + 0.2 * draw.smooth(shape[1:], draw.decades(2, 20))
+    )
     height = np.arange(shape[0]).reshape(-1, *(1,) * (dimensions - 1))
     cells = np.where(height < surface, FLUID, AIR)
     cells[0].flat[0], cells[-1] = FLUID, AIR
@@ -89,7 +101,13 @@ def periodic(draw: Draw) -> GridProblem:
     (upper if sign < 0 else lower).flat[first] = draw.of(-1, 1) * draw.decades(1, 1e5)
     if draw.chance(0.5) and second != first:
         lower.flat[second] = min(-draw.decades(1, 1e5), float(upper.flat[second]))
-    return GridProblem(cells=np.full(shape, FLUID), b=b - b.mean() + sign * draw.decades(1e-3, 1), lower=lower, upper=upper, periodic=wraps)
+    return GridProblem(
+        cells=np.full(shape, FLUID),
+        b=b - b.mean() + sign * draw.decades(1e-3, 1),
+        lower=lower,
+        upper=upper,
+        periodic=wraps,
+    )
 
 
 def handful(draw: Draw) -> GridProblem:
@@ -126,7 +144,11 @@ def torsion(draw: Draw) -> GridProblem:
     cells = framed(section(draw, n))
     distance = scipy.ndimage.distance_transform_edt(cells == FLUID) / (n + 1)
     load = draw.decades(2, 30) * draw.of(-1, -1, 1)
-    b = load * (draw.smooth(cells.shape, n / 8) if draw.chance(0.2) else np.ones(cells.shape)) / (n + 1) ** 2
+    b = (
+        load
+        * (draw.smooth(cells.shape, n / 8) if draw.chance(0.2) else np.ones(cells.shape))
+        / (n + 1) ** 2
+    )
     return GridProblem(cells=cells, b=b, lower=-distance, upper=distance)
 
 
@@ -137,7 +159,10 @@ def rough(draw: Draw) -> GridProblem:
     cells[0] = 0
     b = draw.noise(shape) * draw.between(0.1, 1) - 0.02
     size = draw.decades(0.5, 50)
-    low, high = -(draw.smooth(shape, draw.decades(2, 12)) ** 2) * size, draw.smooth(shape, draw.decades(2, 16)) ** 2 * size
+    low, high = (
+        -(draw.smooth(shape, draw.decades(2, 12)) ** 2) * size,
+        draw.smooth(shape, draw.decades(2, 16)) ** 2 * size,
+    )
     return GridProblem(cells=cells, b=b, lower=low, upper=high + draw.between(0, 1))
 
 
@@ -147,8 +172,14 @@ def dam(draw: Draw) -> GridProblem:
     ny = max(5, int(nx * draw.between(0.6, 2)))
     width, high = draw.between(8, 32), draw.between(16, 32)
     flat = high * (nx - 1) / width / (ny - 1)
-    made = gallery.dam(nx, ny, width=width, high=high, low=high * draw.between(0, 0.6), device="cpu")
-    return GridProblem(cells=framed(np.ones((ny - 2, nx - 2))), b=made.b, faces={"face_x": flat, "face_y": 1 / flat})
+    made = gallery.dam(
+        nx, ny, width=width, high=high, low=high * draw.between(0, 0.6), device="cpu"
+    )
+    return GridProblem(
+        cells=framed(np.ones((ny - 2, nx - 2))),
+        b=made.b,
+        faces={"face_x": flat, "face_y": 1 / flat},
+    )
 
 
 def bearing(draw: Draw) -> GridProblem:
@@ -161,7 +192,10 @@ def bearing(draw: Draw) -> GridProblem:
     cells = np.full((ny + 2, nx), FLUID)
     cells[[0, -1]] = 0
     b = np.broadcast_to(angle * np.diff(height), cells.shape)
-    faces = {"face_x": np.tile(height**3, (ny + 2, 1)), "face_y": np.tile(middle**3 * slender**2, (ny + 3, 1))}
+    faces = {
+        "face_x": np.tile(height**3, (ny + 2, 1)),
+        "face_y": np.tile(middle**3 * slender**2, (ny + 3, 1)),
+    }
     faces["face_x"][:, -1] = faces["face_x"][:, 0]
     return GridProblem(cells=cells, b=b, faces=faces, periodic=(True, False, False))
 
@@ -173,7 +207,10 @@ def rows(draw: Draw) -> GridProblem:
     kind = draw.rng.choice(5, cells.shape, p=draw.rng.dirichlet(np.ones(5)))
     scale = draw.decades(0.1, 100)
     low, high = -scale * draw.rng.random(cells.shape), scale * draw.rng.random(cells.shape)
-    lower, upper = np.choose(kind, [-np.inf, low, -np.inf, low, low]), np.choose(kind, [np.inf, np.inf, high, high, low])
+    lower, upper = (
+        np.choose(kind, [-np.inf, low, -np.inf, low, low]),
+        np.choose(kind, [np.inf, np.inf, high, high, low]),
+    )
     return GridProblem(cells=cells, b=draw.load(cells.shape), lower=lower, upper=upper)
 
 
@@ -182,7 +219,11 @@ def degenerate(draw: Draw) -> GridProblem:
     shape = draw.shape(draw.of(2, 3))
     cells = framed(np.ones(shape))
     inside = cells == FLUID
-    field = draw.smooth(cells.shape, draw.decades(1, 8)) if draw.chance(0.6) else draw.noise(cells.shape)
+    field = (
+        draw.smooth(cells.shape, draw.decades(1, 8))
+        if draw.chance(0.6)
+        else draw.noise(cells.shape)
+    )
     x = np.where(inside, np.maximum(field - draw.between(-0.2, 0.4), 0), 0.0)
     x.flat[np.flatnonzero(inside)[0]] = 1.0
     push = np.maximum(draw.smooth(cells.shape, 4), 0) if draw.chance(0.7) else 0.0 * field
@@ -192,14 +233,23 @@ def degenerate(draw: Draw) -> GridProblem:
 def lognormal(draw: Draw) -> GridProblem:
     """Return coefficients exp(sigma N), sigma 1 to 3, of white noise or noise with a length, AIR all around."""
     shape = draw.shape(draw.of(2, 2, 3))
-    cells, sigma, length = framed(np.ones(shape)), draw.between(1, 3), draw.of(0.0, 0.0, draw.decades(1, 10))
+    cells, sigma, length = (
+        framed(np.ones(shape)),
+        draw.between(1, 3),
+        draw.of(0.0, 0.0, draw.decades(1, 10)),
+    )
 
     def field(counts: tuple[int, ...]) -> np.ndarray:
         noise = draw.smooth(counts, length) if length else draw.noise(counts)
         return np.asarray(np.exp(sigma * noise / noise.std()))
 
     b = draw.noise(cells.shape) - 0.1 if draw.chance(0.7) else draw.load(cells.shape)
-    return GridProblem(cells=cells, b=b, faces=faces_of(cells.shape, field), upper=draw.of(np.inf, np.inf, draw.decades(0.1, 100)))
+    return GridProblem(
+        cells=cells,
+        b=b,
+        faces=faces_of(cells.shape, field),
+        upper=draw.of(np.inf, np.inf, draw.decades(0.1, 100)),
+    )
 
 
 def cut_cells(draw: Draw) -> GridProblem:
@@ -212,11 +262,15 @@ def cut_cells(draw: Draw) -> GridProblem:
         solid = np.minimum(solid, far - draw.between(0.02, 0.25) * min(shape))
 
     def opened(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        return np.asarray((np.maximum(a, 0) + np.maximum(b, 0)) / np.maximum(np.abs(a) + np.abs(b), 1e-30)).clip(0, 1)
+        return np.asarray(
+            (np.maximum(a, 0) + np.maximum(b, 0)) / np.maximum(np.abs(a) + np.abs(b), 1e-30)
+        ).clip(0, 1)
 
     face_x, face_y = opened(solid[:-1], solid[1:]), opened(solid[:, :-1], solid[:, 1:])
     within = (face_x[:, :-1] + face_x[:, 1:] + face_y[:-1] + face_y[1:]) > 0
-    surface = shape[0] * draw.between(0.4, 0.9) + draw.between(0, 0.1) * shape[0] * draw.smooth((shape[1],), 6)
+    surface = shape[0] * draw.between(0.4, 0.9) + draw.between(0, 0.1) * shape[0] * draw.smooth(
+        (shape[1],), 6
+    )
     height = np.arange(shape[0])[:, None] + 0.5
     cells = np.where(~within, SOLID, np.where(height < surface, FLUID, AIR))
     cells[-1] = np.where(within[-1], AIR, SOLID)
@@ -241,5 +295,19 @@ def shifted(draw: Draw) -> GridProblem:
 
 
 KINDS = (
-    strip, vent, voxels, liquid, periodic, handful, torsion, rough, dam, bearing, rows, degenerate, lognormal, cut_cells, shifted,
-)  # fmt: skip
+    strip,
+    vent,
+    voxels,
+    liquid,
+    periodic,
+    handful,
+    torsion,
+    rough,
+    dam,
+    bearing,
+    rows,
+    degenerate,
+    lognormal,
+    cut_cells,
+    shifted,
+)

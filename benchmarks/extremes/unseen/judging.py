@@ -13,19 +13,32 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.benchmarks.extremes import case, unseen
-from warp_lcp.benchmarks.extremes.case import HONEST, REFUSED, SOLVED, Attempt, Case, Expected, Promise, SolveCase, Verdict, checked
+from warp_lcp.benchmarks.extremes.case import (
+    HONEST,
+    REFUSED,
+    SOLVED,
+    Attempt,
+    Case,
+    Expected,
+    Promise,
+    SolveCase,
+    Verdict,
+    checked,
+)
 from warp_lcp.benchmarks.extremes.problem import GridProblem, Problem, equality
 from warp_lcp.benchmarks.harness.record import Table
 from warp_lcp.problem.protocol import families
 
 FAMILY, METHODS_FAMILY = FAMILIES = ("unseen", "unseen, every method")
-CRITERIA: dict[str, Any] = {"rtol": 1e-6, "max_iterations": 400}  # more than the default, so that the count is known
+# more than the default, so that the count is known
+CRITERIA: dict[str, Any] = {"rtol": 1e-6, "max_iterations": 400}
 OFTEN = (2.0, 6)  # iterations are at most 2 e + 6, e those of the equations,
 OFTEN_SHARE = 0.95  # on this share of the grids,
 ALWAYS = (3.0, 6)  # and never more than 3 e + 6
 WITHOUT_EQUATIONS = 100  # iterations where they have no solution: what a user gets by default
-# iterations on the finest grid that a warm start may take beyond a cold one's c, on OFTEN_SHARE of the grids, and never more than 2 c + 6;
-# steps are no measure: a cold start that has gone on by Newton's method on the grid's matrix takes fewer and longer ones
+# iterations on the finest grid that a warm start may take beyond a cold one's c, on OFTEN_SHARE of
+# the grids, and never more than 2 c + 6; steps are no measure: a cold start that has gone on by
+# Newton's method on the grid's matrix takes fewer and longer ones
 WARM_MORE = 1
 NO_END = (case.OUT_OF_TIME, "INFEASIBLE", "NON_FINITE")  # of a small problem that has a solution
 GAVE_UP = Promise(Expected.EITHER, HONEST | {"LOCAL_MINIMUM", "DIVERGED"})
@@ -34,10 +47,14 @@ GRIDS_A_KIND, MATRICES_A_KIND = 18, 10
 Solve = Callable[..., wl.SolveResult]
 
 
-def solved(problem: Problem, solve: Solve, device: str, **more: Any) -> tuple[wl.SolveResult, Attempt]:
+def solved(
+    problem: Problem, solve: Solve, device: str, **more: Any
+) -> tuple[wl.SolveResult, Attempt]:
     """Solve by the default method; return the result and what an independent residual says of it."""
     begun = time.perf_counter()
-    result = solve(problem.lcp(device, wp.float64), None, stopping=wl.StoppingCriteria(**CRITERIA), **more)
+    result = solve(
+        problem.lcp(device, wp.float64), None, stopping=wl.StoppingCriteria(**CRITERIA), **more
+    )
     wp.synchronize_device(device)
     return result, checked(problem, result, CRITERIA, time.perf_counter() - begun, "mixed")
 
@@ -58,20 +75,34 @@ class UnseenCase(Drawn):
 
     def __init__(self, kind: str, seed: int, solve: Solve = wl.solve) -> None:
         expected = GAVE_UP if kind in unseen.HARD_MATRICES else SOLVED
-        super().__init__(FAMILY, f"{kind} {seed}", kind, seed, solve=solve, expected=expected, budget=30.0)
+        super().__init__(
+            FAMILY, f"{kind} {seed}", kind, seed, solve=solve, expected=expected, budget=30.0
+        )
 
     def tried(self, precision: str, device: str) -> Attempt:
         """Solve, cold and warm, and the equations."""
         drawn = unseen.problem(self.kind, self.seed)
         result, attempt = solved(drawn.problem, self.solve, device)
-        attempt.facts = {"kind": self.kind, "seed": self.seed, "unknowns": len(drawn.problem.exact().b), "iterations": result.iterations}
+        attempt.facts = {
+            "kind": self.kind,
+            "seed": self.seed,
+            "unknowns": len(drawn.problem.exact().b),
+            "iterations": result.iterations,
+        }
         if isinstance(drawn.problem, GridProblem):
             self._against_equations(drawn.problem, drawn.allowance, result, attempt, device)
         if drawn.then is not None and result:
             self._warm(drawn.then, result, attempt, device)
         return attempt
 
-    def _against_equations(self, problem: GridProblem, allowance: float, result: wl.SolveResult, attempt: Attempt, device: str) -> None:
+    def _against_equations(
+        self,
+        problem: GridProblem,
+        allowance: float,
+        result: wl.SolveResult,
+        attempt: Attempt,
+        device: str,
+    ) -> None:
         free, count = equality(problem), None
         if free is not None:
             of_equations, _ = solved(free, self.solve, device)
@@ -81,14 +112,21 @@ class UnseenCase(Drawn):
         most = limit(count, ALWAYS, allowance)
         attempt.facts |= {"equality": count, "limit": most, "often": limit(count, OFTEN, allowance)}
         if result and result.iterations > most:
-            attempt.faults.append(f"{result.iterations} iterations, at most {most:g} are allowed (equality {count})")
+            attempt.faults.append(
+                f"{result.iterations} iterations, at most {most:g} are allowed (equality {count})"
+            )
 
-    def _warm(self, then: GridProblem, before: wl.SolveResult, attempt: Attempt, device: str) -> None:
+    def _warm(
+        self, then: GridProblem, before: wl.SolveResult, attempt: Attempt, device: str
+    ) -> None:
         taken = {}
         for how, guess in (("cold", {}), ("warm", {"x0": before.x})):
             result, found = solved(then, self.solve, device, **guess)
             taken[how] = result.linear_iterations
-            attempt.faults += [f"changed, {how}: {fault}" for fault in [*found.faults, *([] if result else [result.status.name])]]
+            attempt.faults += [
+                f"changed, {how}: {fault}"
+                for fault in [*found.faults, *([] if result else [result.status.name])]
+            ]
         attempt.facts |= taken
         if taken["warm"] > limit(taken["cold"], OFTEN, 1.0):
             attempt.faults.append(f"{taken['warm']} iterations warm, {taken['cold']} cold")
@@ -96,40 +134,74 @@ class UnseenCase(Drawn):
 
 def limit(equations: int | None, of: tuple[float, int], allowance: float) -> float:
     """Return how many iterations are allowed for those of the equations; None where these have no solution."""
-    return float(WITHOUT_EQUATIONS) if equations is None else allowance * (of[0] * equations + of[1])
+    return (
+        float(WITHOUT_EQUATIONS) if equations is None else allowance * (of[0] * equations + of[1])
+    )
 
 
 class EveryMethodCase(Drawn):
     """A small random problem given to every method that takes it: none may call something a solution that is none, or fail otherwise."""
 
     def __init__(self, kind: str, seed: int) -> None:
-        super().__init__(METHODS_FAMILY, f"{kind} {seed} small", kind, seed, expected=Promise(Expected.DONE), budget=180.0)
+        super().__init__(
+            METHODS_FAMILY,
+            f"{kind} {seed} small",
+            kind,
+            seed,
+            expected=Promise(Expected.DONE),
+            budget=180.0,
+        )
 
     def tried(self, precision: str, device: str) -> Attempt:
         """Try all methods."""
-        problem, begun = unseen.problem(self.kind, self.seed, small=True).problem, time.perf_counter()
+        problem, begun = (
+            unseen.problem(self.kind, self.seed, small=True).problem,
+            time.perf_counter(),
+        )
         found = {name: by_method(name, problem, device) for name in wl.METHODS}
-        faults, ends = [f"{name}: {fault}" for name, (_, own) in found.items() for fault in own], {n: end for n, (end, _) in found.items()}
-        facts = {"kind": self.kind, "seed": self.seed, "ends": ends, "converged": sum(end == "CONVERGED" for end in ends.values())}
+        faults, ends = (
+            [f"{name}: {fault}" for name, (_, own) in found.items() for fault in own],
+            {n: end for n, (end, _) in found.items()},
+        )
+        facts = {
+            "kind": self.kind,
+            "seed": self.seed,
+            "ends": ends,
+            "converged": sum(end == "CONVERGED" for end in ends.values()),
+        }
         return Attempt("done", None, time.perf_counter() - begun, faults=faults, facts=facts)
 
 
-def by_method(name: str, problem: Problem, device: str, solve: Solve = wl.solve) -> tuple[str, list[str]]:
+def by_method(
+    name: str, problem: Problem, device: str, solve: Solve = wl.solve
+) -> tuple[str, list[str]]:
     """Return how a method ends on a small problem that has a solution, and what is wrong with that."""
     method, unknowns = wl.METHODS[name], len(problem.exact().b)
-    operator = "grid" if isinstance(problem, GridProblem) else "sparse" if scipy.sparse.issparse(problem.matrix) else "dense"
+    operator = (
+        "grid"
+        if isinstance(problem, GridProblem)
+        else "sparse"
+        if scipy.sparse.issparse(problem.matrix)
+        else "dense"
+    )
     if operator not in families(method) or unknowns > getattr(method, "most_unknowns", np.inf):
         return "not for it", []
-    asked = SolveCase(METHODS_FAMILY, name, lambda: problem, name, stopping=CRITERIA, solve=solve, alone=True)
+    asked = SolveCase(
+        METHODS_FAMILY, name, lambda: problem, name, stopping=CRITERIA, solve=solve, alone=True
+    )
     attempt = case.in_time(asked, getattr(method, "precision", "mixed"), device)
     if attempt.status == REFUSED:
         return REFUSED, [] if attempt.message else ["refused without a message"]
     wrong = [f"{attempt.status}: {attempt.message}"] if attempt.message else []
-    wrong += [f"{attempt.status} of a problem that has a solution"] if attempt.status in NO_END else []
+    wrong += (
+        [f"{attempt.status} of a problem that has a solution"] if attempt.status in NO_END else []
+    )
     return attempt.status, attempt.faults + wrong
 
 
-def cases(first: int, grids: int = GRIDS_A_KIND, matrices: int = MATRICES_A_KIND) -> Iterator[Drawn]:
+def cases(
+    first: int, grids: int = GRIDS_A_KIND, matrices: int = MATRICES_A_KIND
+) -> Iterator[Drawn]:
     """Yield problems of all kinds, seeds from `first` on; of each kind the first is given to every method too, small."""
     for kind in unseen.KINDS:
         for seed in range(first, first + (grids if kind in unseen.GRIDS else matrices)):
@@ -141,21 +213,48 @@ def cases(first: int, grids: int = GRIDS_A_KIND, matrices: int = MATRICES_A_KIND
 def summary(verdicts: Sequence[Verdict], first: int) -> tuple[Table, list[str]]:
     """Return a row a kind, and what is wrong with all together."""
     own = [v for v in verdicts if v.case.family == FAMILY]
-    rows = [_row(kind, [v for v in own if isinstance(v.case, Drawn) and v.case.kind == kind]) for kind in unseen.KINDS]
+    rows = [
+        _row(kind, [v for v in own if isinstance(v.case, Drawn) and v.case.kind == kind])
+        for kind in unseen.KINDS
+    ]
     counted = [v.attempt for v in own if v.attempt.facts.get("equality") is not None]
-    often = [a for a in counted if a.status == "CONVERGED" and a.facts["iterations"] <= a.facts["often"]]
+    often = [
+        a for a in counted if a.status == "CONVERGED" and a.facts["iterations"] <= a.facts["often"]
+    ]
     share = len(often) / max(len(counted), 1)
     factor, more = OFTEN
-    within = f"{share:.1%} of {len(counted)} grids take at most {factor:g} times the equality's iterations and {more}"
-    beyond = [v.attempt.facts["warm"] - v.attempt.facts["cold"] for v in own if "warm" in v.attempt.facts]
+    within = (
+        f"{share:.1%} of {len(counted)} grids take at most {factor:g} times the equality's "
+        f"iterations and {more}"
+    )
+    beyond = [
+        v.attempt.facts["warm"] - v.attempt.facts["cold"] for v in own if "warm" in v.attempt.facts
+    ]
     warm_share = sum(more <= WARM_MORE for more in beyond) / max(len(beyond), 1)
-    warm = f"{warm_share:.1%} of {len(beyond)} warm starts take at most {WARM_MORE} iteration more than cold ones"
-    remark = f"Seeds from {first} on, {len(own)} problems; {within}, {warm}; the limit of both is {OFTEN_SHARE:.0%}. "
+    warm = (
+        f"{warm_share:.1%} of {len(beyond)} warm starts take at most {WARM_MORE} iteration more "
+        "than cold ones"
+    )
+    remark = (
+        f"Seeds from {first} on, {len(own)} problems; {within}, {warm}; the limit of both is "
+        f"{OFTEN_SHARE:.0%}. "
+    )
     remark += f"`--seed {first}` runs them again."
-    columns = ["kind", "number", "failures", "iterations, mean", "most", "equality, mean", "worst ratio", "warm beyond cold, most"]
+    columns = [
+        "kind",
+        "number",
+        "failures",
+        "iterations, mean",
+        "most",
+        "equality, mean",
+        "worst ratio",
+        "warm beyond cold, most",
+    ]
     wrong = [f"{FAMILY}: only {within}"] if counted and share < OFTEN_SHARE else []
     wrong += [f"{FAMILY}: only {warm}"] if beyond and warm_share < OFTEN_SHARE else []
-    return Table("Unseen problems", [*columns, "slowest [s]"], [row for row in rows if row], remark), wrong
+    return Table(
+        "Unseen problems", [*columns, "slowest [s]"], [row for row in rows if row], remark
+    ), wrong
 
 
 def _row(kind: str, own: Sequence[Verdict]) -> list[str]:
@@ -165,6 +264,17 @@ def _row(kind: str, own: Sequence[Verdict]) -> list[str]:
     counts = [f["iterations"] for f in facts if "iterations" in f] or [0]
     pairs = [(f["iterations"], f["equality"]) for f in facts if f.get("equality") is not None]
     warm = [f["warm"] - f["cold"] for f in facts if "warm" in f]
-    of_equations = [f"{np.mean([e for _, e in pairs]):.1f}", f"{max(i / max(e, 1) for i, e in pairs):.1f}"] if pairs else ["-", "-"]
-    row = [kind, str(len(own)), str(sum(bool(v.wrong) for v in own)), f"{np.mean(counts):.1f}", str(max(counts)), *of_equations]
+    of_equations = (
+        [f"{np.mean([e for _, e in pairs]):.1f}", f"{max(i / max(e, 1) for i, e in pairs):.1f}"]
+        if pairs
+        else ["-", "-"]
+    )
+    row = [
+        kind,
+        str(len(own)),
+        str(sum(bool(v.wrong) for v in own)),
+        f"{np.mean(counts):.1f}",
+        str(max(counts)),
+        *of_equations,
+    ]
     return [*row, f"{max(warm):+d}" if warm else "-", f"{max(v.attempt.seconds for v in own):.1f}"]

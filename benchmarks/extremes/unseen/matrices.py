@@ -31,10 +31,16 @@ def assembled(of_elements: np.ndarray, at: np.ndarray, n: int) -> scipy.sparse.c
 
 def stiffness(poisson: float) -> np.ndarray:
     """Return the stiffness of a bilinear unit square in plane strain, E = 1; nodes (0,0), (1,0), (0,1), (1,1), x before y."""
-    D = np.array([[1 - poisson, poisson, 0], [poisson, 1 - poisson, 0], [0, 0, 0.5 - poisson]]) / ((1 + poisson) * (1 - 2 * poisson))
+    D = np.array([[1 - poisson, poisson, 0], [poisson, 1 - poisson, 0], [0, 0, 0.5 - poisson]]) / (
+        (1 + poisson) * (1 - 2 * poisson)
+    )
     K = np.zeros((8, 8))
     for s, t in itertools.product((0.5 - 0.5 / np.sqrt(3), 0.5 + 0.5 / np.sqrt(3)), repeat=2):
-        dx, dy, B = np.array([t - 1, 1 - t, -t, t]), np.array([s - 1, -s, 1 - s, s]), np.zeros((3, 8))
+        dx, dy, B = (
+            np.array([t - 1, 1 - t, -t, t]),
+            np.array([s - 1, -s, 1 - s, s]),
+            np.zeros((3, 8)),
+        )
         B[0, ::2], B[1, 1::2], B[2, ::2], B[2, 1::2] = dx, dy, dy, dx
         K += B.T @ D @ B / 4
     return K
@@ -44,16 +50,24 @@ def elastic(draw: Draw) -> MatrixProblem:
     """Return a block of elastic squares held at its top and pressed on a foundation: gaps bound the bottom's displacements."""
     nx, ny = draw.whole(6, 80), draw.whole(4, 50)
     node = np.arange((nx + 1) * (ny + 1)).reshape(ny + 1, nx + 1)
-    corners = np.stack([node[:-1, :-1], node[:-1, 1:], node[1:, :-1], node[1:, 1:]], axis=-1).reshape(-1, 4)
+    corners = np.stack(
+        [node[:-1, :-1], node[:-1, 1:], node[1:, :-1], node[1:, 1:]], axis=-1
+    ).reshape(-1, 4)
     dofs = (2 * corners[:, :, None] + np.arange(2)).reshape(-1, 8)
     K = stiffness(draw.between(0, 0.45))
-    stiff = np.exp(draw.between(0, 2) * draw.smooth((nx * ny,), 1)) if draw.chance(0.3) else np.ones(len(dofs))
+    stiff = (
+        np.exp(draw.between(0, 2) * draw.smooth((nx * ny,), 1))
+        if draw.chance(0.3)
+        else np.ones(len(dofs))
+    )
     A = assembled(stiff[:, None, None] * K, dofs, 2 * node.size)
     free = np.ones(2 * node.size, dtype=bool)
     free[2 * node[-1]], free[2 * node[-1] + 1] = False, False
     lower = np.full(2 * node.size, -np.inf)
     x = np.linspace(-1, 1, nx + 1)
-    lower[2 * node[0] + 1] = draw.of(0.02 * x**2, 0.01 * np.abs(x), 0.01 * draw.smooth((nx + 1,), 3)) - draw.between(0, 0.01)
+    lower[2 * node[0] + 1] = draw.of(
+        0.02 * x**2, 0.01 * np.abs(x), 0.01 * draw.smooth((nx + 1,), 3)
+    ) - draw.between(0, 0.01)
     pressed = np.zeros(2 * node.size)
     pressed[2 * node[-1] + 1] = -draw.decades(1e-3, 1e-1)
     b = A @ pressed + draw.decades(1e-6, 1e-3) * np.tile([0.0, 1.0], node.size)
@@ -63,7 +77,9 @@ def elastic(draw: Draw) -> MatrixProblem:
 def triangles(draw: Draw) -> MatrixProblem:
     """Return a membrane over an obstacle on an irregular mesh of linear triangles."""
     n = draw.whole(12, 12000)
-    points = np.vstack([draw.rng.random((n, 2)) ** draw.of(1.0, 2.0), [[0, 0], [0, 1], [1, 0], [1, 1]]])
+    points = np.vstack(
+        [draw.rng.random((n, 2)) ** draw.of(1.0, 2.0), [[0, 0], [0, 1], [1, 0], [1, 1]]]
+    )
     mesh = scipy.spatial.Delaunay(points)
     p = points[mesh.simplices]
     edges = np.roll(p, -1, axis=1) - np.roll(p, -2, axis=1)
@@ -90,8 +106,13 @@ def option(draw: Draw) -> MatrixProblem:
     s = 3 * strike * i / n
     down, up = 0.5 * dt * (sigma**2 * i**2 - rate * i), 0.5 * dt * (sigma**2 * i**2 + rate * i)
     wind = down < 0  # there differences against the wind keep it an M-matrix
-    down, up = np.where(wind, 0.5 * dt * sigma**2 * i**2, down), np.where(wind, up + 0.5 * dt * rate * i, up)
-    A = scipy.sparse.diags_array([-down[1:], 1 + down + up + rate * dt, -up[:-1]], offsets=[-1, 0, 1])
+    down, up = (
+        np.where(wind, 0.5 * dt * sigma**2 * i**2, down),
+        np.where(wind, up + 0.5 * dt * rate * i, up),
+    )
+    A = scipy.sparse.diags_array(
+        [-down[1:], 1 + down + up + rate * dt, -up[:-1]], offsets=[-1, 0, 1]
+    )
     payoff = np.maximum(strike - s, 0.0)
     b = -payoff.copy()
     b[0] -= down[0] * strike
@@ -123,7 +144,9 @@ def linear_program(draw: Draw) -> MatrixProblem:
     m, n = draw.whole(1, 100), draw.whole(1, 100)
     A = draw.noise((m, n)) * (draw.rng.random((m, n)) < draw.between(0.2, 1))
     A = A * 10.0 ** draw.rng.uniform(-draw.of(0, 0, 2), 0, (m, 1))
-    M = np.block([[np.zeros((n, n)), -A.T], [A, np.zeros((m, m))]]) + small_diagonal(draw) * np.eye(m + n)
+    M = np.block([[np.zeros((n, n)), -A.T], [A, np.zeros((m, m))]]) + small_diagonal(draw) * np.eye(
+        m + n
+    )
     return held(draw, as_kind(draw, M))
 
 
@@ -137,7 +160,9 @@ def skew(draw: Draw) -> MatrixProblem:
 def least_squares(draw: Draw) -> MatrixProblem:
     """Return nonnegative least squares: B'B of full or lower rank, columns of any length."""
     n = draw.whole(2, 150)
-    B = draw.noise((max(1, int(n * draw.between(0.4, 3))), n)) * 10.0 ** draw.rng.uniform(-draw.of(0, 1, 3), 0, n)
+    B = draw.noise((max(1, int(n * draw.between(0.4, 3))), n)) * 10.0 ** draw.rng.uniform(
+        -draw.of(0, 1, 3), 0, n
+    )
     return MatrixProblem(matrix=B.T @ B, b=-B.T @ (draw.noise((len(B),)) + draw.between(0, 2)))
 
 

@@ -17,7 +17,8 @@ TOUCHING = 0.6  # distance of a liquid's points that touch a solid [cells]
 PROTOTYPES = 64  # of grains
 FINE_GRAINS = 60_000  # up to so many have 80 triangles, more have 20
 
-Distance = Callable[[np.ndarray], np.ndarray]  # signed distance [m] of points [m], negative inside solids
+# signed distance [m] of points [m], negative inside solids
+Distance = Callable[[np.ndarray], np.ndarray]
 
 
 def face_normals(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
@@ -26,10 +27,13 @@ def face_normals(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
     return np.cross(b - a, c - a)
 
 
-def creased(points: np.ndarray, corners: np.ndarray, angle: float = CREASE) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def creased(
+    points: np.ndarray, corners: np.ndarray, angle: float = CREASE
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return points, corners and unit normals of a mesh that is smooth except at edges sharper than an angle [degrees].
 
-    Each corner of a triangle averages the triangles around its point whose normals are within the angle of its own.
+    Each corner of a triangle averages the triangles around its point whose normals are within the
+    angle of its own.
     """
     normal = face_normals(points, corners)
     unit = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
@@ -63,8 +67,10 @@ def closed_liquid(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return points, corners, normals and velocities of a liquid's surface, closed against the domain's walls and solids.
 
-    - Triangles in a wall are flat, with points of their own, so that the free surface meets them at a sharp edge.
-    - The liquid reaches below the floor y = 0 and into solids by `OVERLAP`: no film of air remains between them, which would reflect.
+    - Triangles in a wall are flat, with points of their own, so that the free surface meets them at
+      a sharp edge.
+    - The liquid reaches below the floor y = 0 and into solids by `OVERLAP`: no film of air remains
+      between them, which would reflect.
 
     Args:
         surface: closed triangles, with the field `velocity` or without.
@@ -84,7 +90,9 @@ def closed_liquid(
         points = pressed_against(points, corners[free], distance, spacing)
     points[at_wall[2], 1] = -OVERLAP * spacing
     pieces = [(corners[free], None)] + [
-        (corners[at], (np.eye(3)[axis] * (1.0 if end else -1.0))) for (axis, end), at in zip(sides, flat, strict=True) if at.any()
+        (corners[at], (np.eye(3)[axis] * (1.0 if end else -1.0)))
+        for (axis, end), at in zip(sides, flat, strict=True)
+        if at.any()
     ]
     out: list[tuple[np.ndarray, ...]] = []
     start = 0
@@ -99,10 +107,13 @@ def closed_liquid(
     return joined[0], joined[1], joined[2], joined[3]
 
 
-def pressed_against(points: np.ndarray, corners: np.ndarray, distance: Distance, spacing: float) -> np.ndarray:
+def pressed_against(
+    points: np.ndarray, corners: np.ndarray, distance: Distance, spacing: float
+) -> np.ndarray:
     """Return points of a surface, those that touch a solid and face it moved to `OVERLAP` inside it.
 
-    A point at signed distance d moves by (d + overlap) against the distance's gradient, which points out of the solid.
+    A point at signed distance d moves by (d + overlap) against the distance's gradient, which
+    points out of the solid.
     """
     points, overlap = points.copy(), OVERLAP * spacing
     normal = np.zeros_like(points)
@@ -115,7 +126,9 @@ def pressed_against(points: np.ndarray, corners: np.ndarray, distance: Distance,
         at = points[near]
         step = 1e-2 * spacing
         shifts = step * np.eye(3)
-        gradient = np.stack([distance(at + shift) - distance(at - shift) for shift in shifts], axis=1) / (2.0 * step)
+        gradient = np.stack(
+            [distance(at + shift) - distance(at - shift) for shift in shifts], axis=1
+        ) / (2.0 * step)
         gradient /= np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-12)
         facing = np.einsum("ij,ij->i", normal[near], gradient) < -0.3
         d = distance(at)
@@ -132,7 +145,11 @@ def icosphere(rounds: int) -> tuple[np.ndarray, np.ndarray]:
     points /= np.linalg.norm(points[0])
     corners = outward_hull(points)
     for _ in range(rounds):
-        middles = points[np.stack([corners, np.roll(corners, -1, axis=1)], axis=-1)].mean(axis=2).reshape(-1, 3)
+        middles = (
+            points[np.stack([corners, np.roll(corners, -1, axis=1)], axis=-1)]
+            .mean(axis=2)
+            .reshape(-1, 3)
+        )
         middles /= np.linalg.norm(middles, axis=1, keepdims=True)
         points = np.unique(np.concatenate([points, middles]).round(9), axis=0)
         corners = outward_hull(points)
@@ -148,7 +165,9 @@ def outward_hull(points: np.ndarray) -> np.ndarray:
     return corners
 
 
-def clipped_convex(halfspaces: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+def clipped_convex(
+    halfspaces: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the triangles of the convex solid n x + d <= 0 inside a box, or None if they have no common inside.
 
     Args:
@@ -168,7 +187,10 @@ def clipped_convex(halfspaces: np.ndarray, low: np.ndarray, high: np.ndarray) ->
 def _inner_ball(rows: np.ndarray) -> tuple[np.ndarray, float]:
     """Return center and radius of the largest ball in halfspaces: max r, n x + r <= -d."""
     found = linprog(
-        [0.0, 0.0, 0.0, -1.0], A_ub=np.column_stack([rows[:, :3], np.ones(len(rows))]), b_ub=-rows[:, 3], bounds=[(None, None)] * 4
+        [0.0, 0.0, 0.0, -1.0],
+        A_ub=np.column_stack([rows[:, :3], np.ones(len(rows))]),
+        b_ub=-rows[:, 3],
+        bounds=[(None, None)] * 4,
     )
     return (found.x[:3], float(found.x[3])) if found.success else (np.zeros(3), 0.0)
 
@@ -180,7 +202,9 @@ def grain_prototypes(rounds: int) -> tuple[np.ndarray, np.ndarray]:
     shapes = []
     for _ in range(PROTOTYPES):
         waves = np.sin(2.2 * points @ rng.normal(size=(3, 3)) + rng.uniform(0.0, 2.0 * np.pi, 3))
-        shapes.append(points * (1.0 + 0.13 * waves).prod(axis=1)[:, None] * rng.uniform(0.8, 1.15, 3))
+        shapes.append(
+            points * (1.0 + 0.13 * waves).prod(axis=1)[:, None] * rng.uniform(0.8, 1.15, 3)
+        )
     return np.stack(shapes), corners
 
 
@@ -192,12 +216,23 @@ def grain_poses(seeds: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, 
     """
     rng = np.random.default_rng(6151)
     count = 1 << 14
-    rotations, scales, tones = Rotation.random(count, random_state=71).as_matrix(), np.exp(rng.normal(0.0, 0.16, count)), rng.random(count)
+    rotations, scales, tones = (
+        Rotation.random(count, random_state=71).as_matrix(),
+        np.exp(rng.normal(0.0, 0.16, count)),
+        rng.random(count),
+    )
     place = np.asarray(seeds, dtype=np.int64) % count
-    return place % PROTOTYPES, rotations[place].astype(np.float32), np.clip(scales, 0.65, 1.5)[place], tones[place]
+    return (
+        place % PROTOTYPES,
+        rotations[place].astype(np.float32),
+        np.clip(scales, 0.65, 1.5)[place],
+        tones[place],
+    )
 
 
-def grain_mesh(centers: np.ndarray, radius: float, seeds: np.ndarray, rounds: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def grain_mesh(
+    centers: np.ndarray, radius: float, seeds: np.ndarray, rounds: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return one mesh of all grains, in float32: points, triangles, and the grain's index of each point.
 
     Args:
@@ -214,5 +249,7 @@ def grain_mesh(centers: np.ndarray, radius: float, seeds: np.ndarray, rounds: in
         own = slice(start, start + 100_000)
         turned = np.einsum("nij,nkj->nki", rotation[own], shapes.astype(np.float32)[prototype[own]])
         points[own] = centers[own, None] + (radius * scale[own])[:, None, None] * turned
-    triangles = (np.arange(len(centers), dtype=np.uint32)[:, None, None] * each + corners.astype(np.uint32)).reshape(-1, 3)
+    triangles = (
+        np.arange(len(centers), dtype=np.uint32)[:, None, None] * each + corners.astype(np.uint32)
+    ).reshape(-1, 3)
     return points.reshape(-1, 3), triangles, np.repeat(np.arange(len(centers)), each)

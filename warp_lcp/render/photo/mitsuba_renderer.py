@@ -19,9 +19,17 @@ from warp_lcp.render.recording import RenderError
 from warp_lcp.scene.camera import Viewpoint
 
 INSTALL = "pip install 'warp-lcp[photo]'"
-SCALAR, LLVM = "scalar_rgb", "llvm_ad_rgb"  # compiled ahead of time; twice as fast, compiled at run time by LLVM
+# compiled ahead of time; twice as fast, compiled at run time by LLVM
+SCALAR, LLVM = "scalar_rgb", "llvm_ad_rgb"
 OLDEST_LLVM = 16  # Dr.Jit 1.5 crashes on 14 and 15
-LLVM_FOLDERS = ["/usr/lib/*-linux-gnu", "/usr/lib64", "/usr/lib", "/usr/lib/llvm-*/lib", "/usr/local/lib", "/opt/homebrew/opt/llvm*/lib"]
+LLVM_FOLDERS = [
+    "/usr/lib/*-linux-gnu",
+    "/usr/lib64",
+    "/usr/lib",
+    "/usr/lib/llvm-*/lib",
+    "/usr/local/lib",
+    "/opt/homebrew/opt/llvm*/lib",
+]
 LLVM_FILE = re.compile(r"libLLVM(?:-|\.so\.|\.)?(\d+)?.*")
 TRIAL = """
 import mitsuba
@@ -69,7 +77,9 @@ def load_renderer(variant: str = SCALAR) -> Any:
         import PIL  # noqa: F401
         import pyoidn  # noqa: F401
     except (ImportError, OSError) as error:
-        raise RenderError(f"--look photo needs the extra `photo`, which cannot be loaded ({error}): {INSTALL}") from error
+        raise RenderError(
+            f"--look photo needs the extra `photo`, which cannot be loaded ({error}): {INSTALL}"
+        ) from error
     mitsuba.set_variant(variant)
     return mitsuba
 
@@ -82,7 +92,13 @@ def choose_variant() -> str:
         return SCALAR
     environment = os.environ | {"DRJIT_LIBLLVM_PATH": path}
     try:
-        trial = subprocess.run([sys.executable, "-c", TRIAL], env=environment, capture_output=True, timeout=120, check=False)
+        trial = subprocess.run(
+            [sys.executable, "-c", TRIAL],
+            env=environment,
+            capture_output=True,
+            timeout=120,
+            check=False,
+        )
     except (OSError, subprocess.TimeoutExpired):
         return SCALAR
     if trial.returncode:
@@ -102,10 +118,13 @@ def find_llvm() -> str | None:
     return found[max(found)] if found else None
 
 
-def render_radiance(scene: PhotoScene, quality: Quality, seed: int, variant: str = SCALAR) -> np.ndarray:
+def render_radiance(
+    scene: PhotoScene, quality: Quality, seed: int, variant: str = SCALAR
+) -> np.ndarray:
     """Return the denoised scene-linear radiance of a picture, shape (height, width, 3).
 
-    Motion blur is the mean over instants of the shutter interval, each rendered with its share of the samples.
+    Motion blur is the mean over instants of the shutter interval, each rendered with its share of
+    the samples.
 
     Args:
         scene: what it shows.
@@ -122,7 +141,11 @@ def render_radiance(scene: PhotoScene, quality: Quality, seed: int, variant: str
         shift = quality.shutter * ((instant + 0.5) / instants - 0.5)
         loaded = mitsuba.load_dict(scene_plugins(mitsuba, displaced(scene, shift), quality.size))
         for number, samples in enumerate(shares):
-            layers = np.array(mitsuba.render(loaded, spp=samples, seed=(seed * SUBFRAMES + instant) * len(shares) + number))
+            layers = np.array(
+                mitsuba.render(
+                    loaded, spp=samples, seed=(seed * SUBFRAMES + instant) * len(shares) + number
+                )
+            )
             layers = np.nan_to_num(layers, posinf=LARGEST_SAMPLE)
             layers[..., :3] = np.clip(layers[..., :3], 0.0, LARGEST_SAMPLE)
             total += samples / (instants * sum(shares)) * layers
@@ -141,15 +164,25 @@ def denoised(layers: np.ndarray) -> np.ndarray:
     """Return radiance without noise, of layers (radiance, albedo, normal), shape (height, width, 9)."""
     import pyoidn
 
-    radiance, albedo, normal = (np.ascontiguousarray(layers[..., start : start + 3], dtype=np.float32) for start in (0, 3, 6))
-    return np.asarray(pyoidn.denoise(radiance, albedo=np.clip(albedo, 0.0, 1.0), normal=np.clip(normal, -1.0, 1.0), hdr=True))
+    radiance, albedo, normal = (
+        np.ascontiguousarray(layers[..., start : start + 3], dtype=np.float32)
+        for start in (0, 3, 6)
+    )
+    return np.asarray(
+        pyoidn.denoise(
+            radiance, albedo=np.clip(albedo, 0.0, 1.0), normal=np.clip(normal, -1.0, 1.0), hdr=True
+        )
+    )
 
 
 def displaced(scene: PhotoScene, time: float) -> PhotoScene:
     """Return a scene in which all that moves has moved on by a time [s] at its velocity."""
     if not time:
         return scene
-    meshes = [mesh if mesh.velocity is None else replace(mesh, points=mesh.points + time * mesh.velocity) for mesh in scene.meshes]
+    meshes = [
+        mesh if mesh.velocity is None else replace(mesh, points=mesh.points + time * mesh.velocity)
+        for mesh in scene.meshes
+    ]
     return replace(scene, meshes=meshes)
 
 
@@ -160,13 +193,22 @@ def scene_plugins(mitsuba: Any, scene: PhotoScene, size: tuple[int, int]) -> dic
     middle = 0.5 * scene.size
     absorbing = any(mesh.finish is Finish.LIQUID for mesh in scene.meshes)
     path = {"type": "volpath" if absorbing else "path", "max_depth": DEPTH, "rr_depth": ROULETTE}
-    lying = transform().translate([middle[0], scene.ground, middle[2]]).rotate([1, 0, 0], -90).scale(reach)
+    lying = (
+        transform()
+        .translate([middle[0], scene.ground, middle[2]])
+        .rotate([1, 0, 0], -90)
+        .scale(reach)
+    )
     plugins = {
         "type": "scene",
         "integrator": {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal", "image": path},
         "sensor": sensor_plugin(transform, scene.view, size),
         "sky": {"type": "envmap", "bitmap": mitsuba.Bitmap(sky())},
-        "ground": {"type": "rectangle", "to_world": lying, "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": GROUND}}},
+        "ground": {
+            "type": "rectangle",
+            "to_world": lying,
+            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": GROUND}},
+        },
     }
     for mesh in scene.meshes:
         plugins[mesh.name] = mesh_plugin(mitsuba, mesh)
@@ -181,8 +223,16 @@ def sensor_plugin(transform: Any, view: Viewpoint, size: tuple[int, int]) -> dic
         "fov_axis": "y",
         "near_clip": 1e-3 * float(np.linalg.norm(view.focus - view.position)),
         "far_clip": 1e4 * float(np.linalg.norm(view.focus - view.position)),
-        "to_world": transform().look_at(view.position.tolist(), view.focus.tolist(), view.up.tolist()),
-        "film": {"type": "hdrfilm", "width": size[0], "height": size[1], "rfilter": {"type": "box"}, "pixel_format": "rgb"},
+        "to_world": transform().look_at(
+            view.position.tolist(), view.focus.tolist(), view.up.tolist()
+        ),
+        "film": {
+            "type": "hdrfilm",
+            "width": size[0],
+            "height": size[1],
+            "rfilter": {"type": "box"},
+            "pixel_format": "rgb",
+        },
         "sampler": {"type": "independent"},  # patterns of stratified ones survive the denoiser
     }
 
@@ -193,14 +243,25 @@ def mesh_plugin(mitsuba: Any, mesh: PhotoMesh) -> Any:
     colored = mesh.color.ndim == 2
     properties["surface"] = mitsuba.load_dict(surface_plugin(mesh, colored))
     if mesh.finish is Finish.LIQUID:
-        most = max(float(mesh.color.max()), 1e-9)  # colors of plugins are at most 1, `scale` is free
+        # colors of plugins are at most 1, `scale` is free
+        most = max(float(mesh.color.max()), 1e-9)
         color = {"type": "rgb", "value": (mesh.color / most).tolist()}
-        properties["interior"] = mitsuba.load_dict({"type": "homogeneous", "albedo": 0.0, "scale": most, "sigma_t": color})
+        properties["interior"] = mitsuba.load_dict(
+            {"type": "homogeneous", "albedo": 0.0, "scale": most, "sigma_t": color}
+        )
     if mesh.normals is None:
         properties["face_normals"] = True
-    made = mitsuba.Mesh(mesh.name, len(mesh.points), len(mesh.corners), props=properties, has_vertex_normals=mesh.normals is not None)
+    made = mitsuba.Mesh(
+        mesh.name,
+        len(mesh.points),
+        len(mesh.corners),
+        props=properties,
+        has_vertex_normals=mesh.normals is not None,
+    )
     if colored:
-        made.add_attribute("vertex_color", 3, np.ascontiguousarray(mesh.color, dtype=np.float32).ravel())
+        made.add_attribute(
+            "vertex_color", 3, np.ascontiguousarray(mesh.color, dtype=np.float32).ravel()
+        )
     data = mitsuba.traverse(made)
     data["vertex_positions"] = np.ascontiguousarray(mesh.points, dtype=np.float32).ravel()
     data["faces"] = np.ascontiguousarray(mesh.corners, dtype=np.uint32).ravel()
@@ -214,9 +275,21 @@ def surface_plugin(mesh: PhotoMesh, colored: bool) -> dict[str, Any]:
     """Return what scatters light at a surface."""
     if mesh.finish is Finish.LIQUID:
         return {"type": "dielectric", "int_ior": WATER_INDEX, "ext_ior": 1.0}
-    color = {"type": "mesh_attribute", "name": "vertex_color"} if colored else {"type": "rgb", "value": np.asarray(mesh.color).tolist()}
+    color = (
+        {"type": "mesh_attribute", "name": "vertex_color"}
+        if colored
+        else {"type": "rgb", "value": np.asarray(mesh.color).tolist()}
+    )
     if mesh.finish is Finish.SATIN:
-        return {"type": "twosided", "inner": {"type": "principled", "base_color": color, "roughness": ROUGHNESS, "specular": 0.5}}
+        return {
+            "type": "twosided",
+            "inner": {
+                "type": "principled",
+                "base_color": color,
+                "roughness": ROUGHNESS,
+                "specular": 0.5,
+            },
+        }
     return {"type": "twosided", "inner": {"type": "diffuse", "reflectance": color}}
 
 
@@ -226,16 +299,22 @@ def sky() -> np.ndarray:
     around = (np.arange(2 * SKY_ROWS) + 0.5) / SKY_ROWS * math.pi
     polar, around = np.meshgrid(polar, around, indexing="ij")
     # Mitsuba's map: d = (sin phi sin theta, cos theta, -cos phi sin theta)
-    direction = np.stack([np.sin(around) * np.sin(polar), np.cos(polar), -np.cos(around) * np.sin(polar)], axis=-1)
+    direction = np.stack(
+        [np.sin(around) * np.sin(polar), np.cos(polar), -np.cos(around) * np.sin(polar)], axis=-1
+    )
     height = np.clip(direction[..., 1:2], 0.0, 1.0) ** 0.6
     radiance = (1.0 - height) * np.array([0.80, 0.84, 0.90]) + height * np.array([0.14, 0.24, 0.46])
     radiance = np.where(direction[..., 1:2] < 0.0, np.array([0.30, 0.30, 0.31]), radiance)
-    radiance += _lamp(direction, [-0.75, 1.0, -0.1], 13.0, 3.0, [28.0, 25.8, 22.5])  # key, from the left
-    radiance += _lamp(direction, [1.0, 0.45, -0.9], 18.0, 8.0, [2.0, 2.3, 2.8])  # rim, from behind on the right
+    # key, from the left
+    radiance += _lamp(direction, [-0.75, 1.0, -0.1], 13.0, 3.0, [28.0, 25.8, 22.5])
+    # rim, from behind on the right
+    radiance += _lamp(direction, [1.0, 0.45, -0.9], 18.0, 8.0, [2.0, 2.3, 2.8])
     return radiance.astype(np.float32)
 
 
-def _lamp(direction: np.ndarray, toward: list[float], radius: float, edge: float, color: list[float]) -> np.ndarray:
+def _lamp(
+    direction: np.ndarray, toward: list[float], radius: float, edge: float, color: list[float]
+) -> np.ndarray:
     """Return the radiance of a round lamp with a soft edge [degrees]."""
     axis = np.array(toward) / np.linalg.norm(toward)
     angle = np.degrees(np.arccos(np.clip(direction @ axis, -1.0, 1.0)))

@@ -16,16 +16,25 @@ import numpy as np
 
 from warp_lcp.files.atomic import make_folder, replacing
 from warp_lcp.render.film import Film, film_suffix
-from warp_lcp.render.photo.mitsuba_renderer import VERSION, Quality, choose_variant, load_renderer, render_radiance
+from warp_lcp.render.photo.mitsuba_renderer import (
+    VERSION,
+    Quality,
+    choose_variant,
+    load_renderer,
+    render_radiance,
+)
 from warp_lcp.render.photo.photo_scene import PhotoScenes
 from warp_lcp.render.photo.view_transform import agx
 from warp_lcp.render.recording import Recording, RenderError, Show
 
 EXPOSURE = 1.55  # of radiance, before AgX
 CONTRAST, SATURATION = 1.6, 1.35  # the look, after AgX's sigmoid
-# CPU seconds of a million paths through liquid, and through grains, bodies and sky; of a frame's geometry. Measured on an
-# Intel Xeon; within a factor of 2.
-LIQUID_SECONDS, OPAQUE_SECONDS = {"scalar_rgb": 9.0, "llvm_ad_rgb": 4.6}, {"scalar_rgb": 9.0, "llvm_ad_rgb": 4.2}
+# CPU seconds of a million paths through liquid, and through grains, bodies and sky; of a frame's
+# geometry. Measured on an Intel Xeon; within a factor of 2.
+LIQUID_SECONDS, OPAQUE_SECONDS = (
+    {"scalar_rgb": 9.0, "llvm_ad_rgb": 4.6},
+    {"scalar_rgb": 9.0, "llvm_ad_rgb": 4.2},
+)
 GEOMETRY_SECONDS = 8.0
 SETTINGS_KEY = "warp-lcp photo"  # of a PNG's text chunk
 SAMPLES, MOST_SAMPLES = 64, 65536  # paths through a pixel
@@ -73,7 +82,8 @@ def photograph_run(
 ) -> Iterator[Path]:
     """Render frames of a 3-D run as PNG images; yield each file when it is there.
 
-    A picture holds its settings. One that is there with the same settings is kept; one with others is rendered again.
+    A picture holds its settings. One that is there with the same settings is kept; one with others
+    is rendered again.
 
     Args:
         folder: of the run.
@@ -81,18 +91,22 @@ def photograph_run(
         settings: how pictures are made.
         out: where they go; `folder / "photo"` unless given.
         told: is called with how many pictures are there, and how many there will be.
-        estimated: is called with about how many seconds rendering will take on this machine's cores, before it begins.
+        estimated: is called with about how many seconds rendering will take on this machine's
+            cores, before it begins.
         noted: is called with what was kept and what is rendered again.
 
     Raises:
-        RenderError: the extra `photo` is missing, the run is 2-D, there are no such frames, or a picture cannot be written.
+        RenderError: the extra `photo` is missing, the run is 2-D, there are no such frames, or a
+            picture cannot be written.
         SceneError: the run's scene cannot be read.
     """
     settings = settings or PhotoSettings()
     load_renderer()
     recording = Recording(folder, None, settings.show, settings.overrides)
     numbers, out = recording.chosen(frames), out or folder / "photo"
-    scenes = PhotoScenes(recording, settings.size[0] / settings.size[1], beads=settings.show is Show.PARTICLES)
+    scenes = PhotoScenes(
+        recording, settings.size[0] / settings.size[1], beads=settings.show is Show.PARTICLES
+    )
     files = {number: out / f"photo_{number:06d}.png" for number in numbers}
     wanted = {number: picture_settings(scenes, number, settings) for number in numbers}
     held = {number: read_settings(file) for number, file in files.items()}
@@ -105,14 +119,20 @@ def photograph_run(
     told(0, len(numbers))
     for done, number in enumerate(numbers, 1):
         if number in missing:
-            quality = Quality(settings.size, settings.samples, settings.shutter / recording.scene.time.frames_per_second)
+            quality = Quality(
+                settings.size,
+                settings.samples,
+                settings.shutter / recording.scene.time.frames_per_second,
+            )
             radiance = render_radiance(scenes.frame(number), quality, number, variant)
             _save(developed(radiance), wanted[number], files[number], folder)
         told(done, len(numbers))
         yield files[number]
 
 
-def photograph_film(folder: Path, film: Path, *, rate: float | None = None, **given: Any) -> Iterator[Path]:
+def photograph_film(
+    folder: Path, film: Path, *, rate: float | None = None, **given: Any
+) -> Iterator[Path]:
     """Render frames as `photograph_run` does, then encode them into a film; yield each picture when it is there.
 
     Args:
@@ -148,11 +168,21 @@ def frame_range(text: str, numbers: Sequence[int]) -> list[int]:
     except ValueError:
         ends = []
     if len(ends) != 2:
-        raise RenderError(f"--frames {text}: must be A:B, the first and the last frame, such as 10:40")
-    first, last = (None if end is None else numbers[end] if -len(numbers) <= end < 0 else end for end in ends)
-    chosen = [number for number in numbers if (first is None or first <= number) and (last is None or number <= last)]
+        raise RenderError(
+            f"--frames {text}: must be A:B, the first and the last frame, such as 10:40"
+        )
+    first, last = (
+        None if end is None else numbers[end] if -len(numbers) <= end < 0 else end for end in ends
+    )
+    chosen = [
+        number
+        for number in numbers
+        if (first is None or first <= number) and (last is None or number <= last)
+    ]
     if not chosen:
-        raise RenderError(f"--frames {text}: there are no such frames; the run has {numbers[0]} to {numbers[-1]}")
+        raise RenderError(
+            f"--frames {text}: there are no such frames; the run has {numbers[0]} to {numbers[-1]}"
+        )
     return chosen
 
 
@@ -165,7 +195,9 @@ def expected_seconds(settings: PhotoSettings, variant: str, *, liquid: bool) -> 
         liquid: whether light passes through liquid.
     """
     rate = (LIQUID_SECONDS if liquid else OPAQUE_SECONDS)[variant]
-    return (1e-6 * math.prod(settings.size) * settings.samples * rate + GEOMETRY_SECONDS) / core_count()
+    return (
+        1e-6 * math.prod(settings.size) * settings.samples * rate + GEOMETRY_SECONDS
+    ) / core_count()
 
 
 def core_count() -> int:
@@ -175,14 +207,18 @@ def core_count() -> int:
 
 def developed(radiance: np.ndarray) -> np.ndarray:
     """Return 8-bit pixels of scene-linear radiance."""
-    return (255.0 * agx(EXPOSURE * radiance, contrast=CONTRAST, saturation=SATURATION) + 0.5).astype(np.uint8)
+    return (
+        255.0 * agx(EXPOSURE * radiance, contrast=CONTRAST, saturation=SATURATION) + 0.5
+    ).astype(np.uint8)
 
 
 def picture_settings(scenes: PhotoScenes, number: int, settings: PhotoSettings) -> dict[str, Any]:
     """Return all that a picture depends on: the renderer's version, settings, camera, and checksums of the frame's files."""
     view = scenes.view
     camera = [*view.position, *view.focus, *view.up, view.angle]
-    checksums = {file.name: zlib.crc32(file.read_bytes()) for file in scenes.recording.files(number)}
+    checksums = {
+        file.name: zlib.crc32(file.read_bytes()) for file in scenes.recording.files(number)
+    }
     return {
         "version": VERSION,
         "size": list(settings.size),
@@ -207,13 +243,25 @@ def read_settings(file: Path) -> dict[str, Any] | None:
     return held if isinstance(held, dict) else None
 
 
-def _report(noted: Callable[[str], None], held: dict[int, Any], wanted: dict[int, Any], missing: Sequence[int]) -> None:
+def _report(
+    noted: Callable[[str], None],
+    held: dict[int, Any],
+    wanted: dict[int, Any],
+    missing: Sequence[int],
+) -> None:
     """Tell which pictures are kept, and which are rendered again because of which settings."""
     if kept := len(wanted) - len(missing):
         noted(f"{kept} of {len(wanted)} pictures are there with these settings and are kept")
     again = [number for number in missing if held[number] is not None]
     if again:
-        keys = sorted({key for number in again for key in wanted[number] if held[number].get(key) != wanted[number][key]})
+        keys = sorted(
+            {
+                key
+                for number in again
+                for key in wanted[number]
+                if held[number].get(key) != wanted[number][key]
+            }
+        )
         noted(f"{len(again)} pictures have another {', '.join(keys)} and are rendered again")
 
 

@@ -40,11 +40,12 @@ FRAMING_SHARE = 0.5  # percent of a frame's points that may leave the picture at
 FRAMING_POINTS = 4000  # of a frame, about
 TOWARD = np.array([0.5, 0.42, 1.0]) / np.linalg.norm([0.5, 0.42, 1.0])  # to the camera
 
-# Absorption over the domain's longest side, for red, green and blue: exp(-a) of the light is left. The real one, 0.35/m and less,
-# would leave a tank of one meter without color.
+# Absorption over the domain's longest side, for red, green and blue: exp(-a) of the light is left.
+# The real one, 0.35/m and less, would leave a tank of one meter without color.
 ABSORPTION = {"water": np.array([2.6, 0.75, 0.42]), "syrup": np.array([2.0, 12.0, 60.0])}
 SYRUP = 1.0  # viscosity [Pa s] from which a liquid has the color of honey
-SANDS = np.array([[0.62, 0.45, 0.27], [0.72, 0.58, 0.40], [0.45, 0.31, 0.19], [0.80, 0.72, 0.60]])  # reflectances of grains
+# reflectances of grains
+SANDS = np.array([[0.62, 0.45, 0.27], [0.72, 0.58, 0.40], [0.45, 0.31, 0.19], [0.80, 0.72, 0.60]])
 SAND_SHARES = np.array([0.45, 0.30, 0.15, 0.10])
 SOLID = np.array([0.36, 0.38, 0.41])
 PALE = np.array([0.82, 0.80, 0.76])  # wedges of balls
@@ -68,7 +69,8 @@ class PhotoMesh:
         points: [m], shape (n, 3).
         corners: of the triangles, shape (m, 3), counterclockwise seen from outside.
         finish: of the surface.
-        color: reflectance, of a liquid its absorption [1/m]; linear Rec. 709, shape (3,), or reflectances at the points, shape (n, 3).
+        color: reflectance, of a liquid its absorption [1/m]; linear Rec. 709, shape (3,), or
+            reflectances at the points, shape (n, 3).
         normals: at the points, of unit length, shape (n, 3); None: flat triangles.
         velocity: at the points [m/s], shape (n, 3); None: at rest.
     """
@@ -102,7 +104,8 @@ class PhotoScene:
 class PhotoScenes:
     """The picture's description of each frame of a run.
 
-    A liquid whose frames have particles alone gets a surface around them, unless particles are asked for.
+    A liquid whose frames have particles alone gets a surface around them, unless particles are
+    asked for.
 
     Args:
         recording: of a 3-D run.
@@ -110,24 +113,37 @@ class PhotoScenes:
         beads: show a liquid's particles as beads where the frames have no surface.
 
     Raises:
-        RenderError: the run is 2-D, or has no frame that can be read; or its particles are only near a surface that is not there.
+        RenderError: the run is 2-D, or has no frame that can be read; or its particles are only
+            near a surface that is not there.
     """
 
     def __init__(self, recording: Recording, aspect: float, *, beads: bool = False) -> None:
         scene: Any = recording.scene
         if scene.dimension != 3:
-            raise RenderError("--look photo: draws 3-D runs; this one is 2-D, which --look quick draws")
+            raise RenderError(
+                "--look photo: draws 3-D runs; this one is 2-D, which --look quick draws"
+            )
         self.recording, self._scene = recording, scene
         particles = getattr(scene, "particles", None)  # settings of what the particles stand for
         self._wrapped = scene.palette == "water" and particles is not None and not beads
-        if self._wrapped and recording.show is Show.PARTICLES and getattr(particles, "narrow_band", None) is not None:
+        if (
+            self._wrapped
+            and recording.show is Show.PARTICLES
+            and getattr(particles, "narrow_band", None) is not None
+        ):
             raise RenderError(
-                "--look photo: a run with a narrow band of particles needs output.surface = true; --show particles draws beads"
+                "--look photo: a run with a narrow band of particles needs output.surface = true; "
+                "--show particles draws beads"
             )
         self._spacing = recording.particle_spacing()
         self.view = framed(recording, aspect)
         self._prescribed = [
-            (solid, solid.to_geometry(Path(), 3), solid.motion.to_motion(3) if solid.motion else None) for solid in prescribed_solids(scene)
+            (
+                solid,
+                solid.to_geometry(Path(), 3),
+                solid.motion.to_motion(3) if solid.motion else None,
+            )
+            for solid in prescribed_solids(scene)
         ]
         self._bodies = [solid.to_geometry(Path(), 3) for solid in scene.solid if solid.is_body]
 
@@ -141,11 +157,16 @@ class PhotoScenes:
         bodies = self.recording.bodies(number)
         meshes = self._solid_meshes(time)
         if bodies is not None:
-            meshes += body_meshes(bodies, [body_surface(geometry, 3).points for geometry in self._bodies])
+            meshes += body_meshes(
+                bodies, [body_surface(geometry, 3).points for geometry in self._bodies]
+            )
         if self.recording.show in (Show.SURFACE, Show.BOTH):
             meshes += self._material(self.recording.surface(number), self._distance(time, bodies))
         elif self.recording.show is Show.PARTICLES and self._wrapped:
-            meshes += self._material(particle_surface(self._scene, self.recording.particles(number)), self._distance(time, bodies))
+            meshes += self._material(
+                particle_surface(self._scene, self.recording.particles(number)),
+                self._distance(time, bodies),
+            )
         elif self.recording.show is Show.PARTICLES:
             meshes += self._grains(number)
         return PhotoScene(meshes, self.view, 0.0, np.array(self._scene.domain.size))
@@ -156,23 +177,49 @@ class PhotoScenes:
             return []
         if self._scene.palette == "sand":
             normals = smooth_normals(surface.points, surface.corners)
-            return [PhotoMesh("sand", surface.points, surface.corners, Finish.MATTE, SANDS[0], normals, surface.fields.get("velocity"))]
-        points, corners, normals, velocity = closed_liquid(surface, self._scene.domain.size, self._scene.spacing, distance)
+            return [
+                PhotoMesh(
+                    "sand",
+                    surface.points,
+                    surface.corners,
+                    Finish.MATTE,
+                    SANDS[0],
+                    normals,
+                    surface.fields.get("velocity"),
+                )
+            ]
+        points, corners, normals, velocity = closed_liquid(
+            surface, self._scene.domain.size, self._scene.spacing, distance
+        )
         absorption = liquid_absorption(self._scene)
-        return [PhotoMesh("liquid", points, corners, Finish.LIQUID, absorption, normals, velocity if velocity.any() else None)]
+        return [
+            PhotoMesh(
+                "liquid",
+                points,
+                corners,
+                Finish.LIQUID,
+                absorption,
+                normals,
+                velocity if velocity.any() else None,
+            )
+        ]
 
     def _grains(self, number: int) -> list[PhotoMesh]:
         """Return particles as grains, one mesh of all."""
         particles = self.recording.particles(number)
         if not len(particles.points):
             return []
-        centers, seeds, radius = placed_grains(np.asarray(particles.points, dtype=np.float64), self._spacing, self._scene.domain.size)
+        centers, seeds, radius = placed_grains(
+            np.asarray(particles.points, dtype=np.float64), self._spacing, self._scene.domain.size
+        )
         each, seeds = centers.shape[1], seeds.ravel()
         fine = len(seeds) <= FINE_GRAINS
         points, corners, own = grain_mesh(centers.reshape(-1, 3), radius, seeds, 1 if fine else 0)
         velocity = particles.fields.get("velocity")
         moved = None if velocity is None else np.asarray(velocity, dtype=np.float32)[own // each]
-        color = grain_colors(seeds)[own] if self._scene.palette == "sand" else liquid_beads(self._scene)
+        color = (
+            grain_colors(seeds)[own] if self._scene.palette == "sand" else liquid_beads(self._scene)
+        )
         normals = smooth_normals(points, corners).astype(np.float32) if fine else None
         return [PhotoMesh("grains", points, corners, Finish.MATTE, color, normals, moved)]
 
@@ -195,12 +242,17 @@ class PhotoScenes:
                 outline = body_surface(geometry.moved(pose), 3)
                 points, corners = outline.points, outline.corners
             points, corners, normals = creased(points, corners)
-            meshes.append(PhotoMesh(f"solid_{number}", points, corners, Finish.MATTE, SOLID, normals))
+            meshes.append(
+                PhotoMesh(f"solid_{number}", points, corners, Finish.MATTE, SOLID, normals)
+            )
         return meshes
 
     def _distance(self, time: float, bodies: Surface | None) -> Distance | None:
         """Return the signed distance to solids and bodies that a liquid may touch; None: there are none."""
-        placed = [(geometry, motion.pose(time) if motion else Pose.identity()) for _, geometry, motion in self._prescribed]
+        placed = [
+            (geometry, motion.pose(time) if motion else Pose.identity())
+            for _, geometry, motion in self._prescribed
+        ]
         if bodies is not None:
             of_point = np.asarray(bodies.fields["body"]).ravel()
             for number, geometry in enumerate(self._bodies):
@@ -209,7 +261,9 @@ class PhotoScenes:
                     placed.append((geometry, rigid_pose(first, now)))
         if not placed:
             return None
-        return lambda points: nearest_distance(placed, wp.array(points, dtype=wp.vec3, device="cpu"))
+        return lambda points: nearest_distance(
+            placed, wp.array(points, dtype=wp.vec3, device="cpu")
+        )
 
 
 def particle_surface(scene: Any, particles: Points) -> Surface:
@@ -218,11 +272,18 @@ def particle_surface(scene: Any, particles: Points) -> Surface:
     at = np.asarray(particles.points, dtype=np.float64)
     at = at[((at >= 0.0) & (at <= scene.domain.size)).all(axis=1)]
     output = scene.output
-    wrap = SurfaceMesh(grid, per_axis=scene.particles.per_axis, resolution=output.surface_resolution, smoothing=output.surface_smoothing)
+    wrap = SurfaceMesh(
+        grid,
+        per_axis=scene.particles.per_axis,
+        resolution=output.surface_resolution,
+        smoothing=output.surface_smoothing,
+    )
     mesh = wrap.find(wp.array(at, dtype=wp.vec3, device="cpu"))
     points, corners, fields = mesh.points.numpy(), mesh.corners.numpy(), {}
     if len(points) and "velocity" in particles.fields:
-        fields["velocity"] = particles.fields["velocity"][cKDTree(particles.points).query(points)[1]]
+        fields["velocity"] = particles.fields["velocity"][
+            cKDTree(particles.points).query(points)[1]
+        ]
     return Surface("surface", points, corners, fields)
 
 
@@ -240,8 +301,12 @@ def framed(recording: Recording, aspect: float) -> Viewpoint:
             groups.append(recording.surface(number).points)
         if (bodies := recording.bodies(number)) is not None:
             groups.append(bodies.points)
-    points = np.concatenate([main_part(points) for points in groups if len(points)] or [np.stack([low, high])])
-    return view_of_points(np.clip(points, low, high), TOWARD, scene.camera.field_of_view or VIEW_ANGLE, aspect)
+    points = np.concatenate(
+        [main_part(points) for points in groups if len(points)] or [np.stack([low, high])]
+    )
+    return view_of_points(
+        np.clip(points, low, high), TOWARD, scene.camera.field_of_view or VIEW_ANGLE, aspect
+    )
 
 
 def main_part(points: np.ndarray) -> np.ndarray:
@@ -264,15 +329,24 @@ def body_meshes(bodies: Surface, at_first: Sequence[np.ndarray]) -> list[PhotoMe
         own = np.flatnonzero(of_point == body)
         corners = bodies.corners[of_point[bodies.corners[:, 0]] == body]
         local = np.searchsorted(own, corners)
-        points, triangles, normals = creased(np.asarray(bodies.points[own], dtype=np.float64), local)
+        points, triangles, normals = creased(
+            np.asarray(bodies.points[own], dtype=np.float64), local
+        )
         color = linear_color(BODY_COLORS[body % len(BODY_COLORS)])
         first = at_first[body] if body < len(at_first) else points[:0]
         if len(first) == len(own) and is_round(first, local):
             middle = first[local].mean(axis=1) - 0.5 * (first.min(axis=0) + first.max(axis=0))
-            wedge = np.floor(np.arctan2(middle[:, 2], middle[:, 1]) / (2.0 * np.pi) * WEDGES).astype(int) % 2
+            wedge = (
+                np.floor(np.arctan2(middle[:, 2], middle[:, 1]) / (2.0 * np.pi) * WEDGES).astype(
+                    int
+                )
+                % 2
+            )
             color = np.repeat(np.where(wedge[:, None] == 0, color, PALE), 3, axis=0)
         moved = None if velocity is None else np.asarray(velocity)[own][local].reshape(-1, 3)
-        meshes.append(PhotoMesh(f"body_{body}", points, triangles, Finish.SATIN, color, normals, moved))
+        meshes.append(
+            PhotoMesh(f"body_{body}", points, triangles, Finish.SATIN, color, normals, moved)
+        )
     return meshes
 
 
@@ -313,10 +387,17 @@ def _halfspaces(solid: Any, pose: Pose) -> np.ndarray | None:
     """Return a box or a half-space as rows (n, d) of n x + d <= 0; None: the solid is another shape."""
     placement = solid.placement(3).moved(pose)
     if isinstance(solid, PlaneTable):
-        normal = placement.rotation @ np.array(solid.normal) / np.linalg.norm(solid.normal) * (-1.0 if solid.invert else 1.0)
+        normal = (
+            placement.rotation
+            @ np.array(solid.normal)
+            / np.linalg.norm(solid.normal)
+            * (-1.0 if solid.invert else 1.0)
+        )
         return np.append(normal, -normal @ placement.apply(np.array(solid.point)))[None]
     if isinstance(solid, BoxTable):
         normals = np.concatenate([placement.rotation.T, -placement.rotation.T])
         low, high = placement.apply(np.array([solid.min, solid.max], dtype=np.float64))
-        return np.column_stack([normals, -np.concatenate([placement.rotation.T @ high, -placement.rotation.T @ low])])
+        return np.column_stack(
+            [normals, -np.concatenate([placement.rotation.T @ high, -placement.rotation.T @ low])]
+        )
     return None

@@ -1,8 +1,9 @@
 """AgX: from scene-linear radiance to display code values, with a log2 encoding and a sigmoid per channel.
 
-Sobotka's AgX (2022) in the constants of Wrensch, "Minimal AgX implementation" (2023). Rec. 709 colors are mixed by an inset matrix, so
-that bright saturated light turns white instead of clipping to a primary; encoded as log2 over 16.5 stops around middle grey 0.18; and
-bent by a sigmoid, linear about middle grey, with a power toe and a power shoulder.
+Sobotka's AgX (2022) in the constants of Wrensch, "Minimal AgX implementation" (2023). Rec. 709
+colors are mixed by an inset matrix, so that bright saturated light turns white instead of clipping
+to a primary; encoded as log2 over 16.5 stops around middle grey 0.18; and bent by a sigmoid, linear
+about middle grey, with a power toe and a power shoulder.
 """
 
 from __future__ import annotations
