@@ -74,10 +74,8 @@ def main() -> None:
         if python is None:
             sys.exit(f"{line}; {missing()}")
         peer = theirs(python, given.levels)
-        line += (
-            f"; PETSc {peer['version']} {peer['seconds']:.2f} s, {peer['steps'][-1][2:4]}, |w| "
-            f"{peer['norm']:.9g}"
-        )  # type: ignore[index]
+        last = peer["steps"][-1][2:4]  # type: ignore[index]
+        line += f"; PETSc {peer['version']} {peer['seconds']:.2f} s, {last}, |w| {peer['norm']:.9g}"
         sys.stdout.write(f"{line}; ratio {peer['seconds'] / seconds:.1f}\n")  # type: ignore[operator]
         sys.stdout.flush()
 

@@ -155,9 +155,11 @@ def test_coefficients_of_stencils():
     with contextlib.suppress(ImportError):
         jax = importlib.import_module("jax")
         with jax.enable_x64(True):
-            loss = lambda *given: (
-                g * with_jax.solve(make, *sides, coefficients=stencil(given), **OPTIONS)
-            ).sum()  # noqa: E731
+
+            def loss(*given):
+                x = with_jax.solve(make, *sides, coefficients=stencil(given), **OPTIONS)
+                return (g * x).sum()
+
             np.testing.assert_allclose(
                 jax.grad(loss, argnums=(0, 1))(*values), expected, atol=1e-10
             )

@@ -138,9 +138,11 @@ def test_a_grids_iterations_stay_few_for_any_shift(device):
 
 def test_the_methods_suit_the_matrices():
     found = families("cpu")
-    of = lambda name: principal_system(
-        wl.LCP(found[name][0], np.zeros(found[name][0].shape)), wp.float64, bounded=False
-    )  # noqa: E731
+
+    def of(name):
+        problem = wl.LCP(found[name][0], np.zeros(found[name][0].shape))
+        return principal_system(problem, wp.float64, bounded=False)
+
     assert isinstance(of("grid and body"), CoupledGridSystem)
     assert isinstance(of("sum unsymmetric"), DiagonalSystem)
     assert isinstance(of("sparse wild").preconditioner, IncompleteFactors)

@@ -119,9 +119,9 @@ def solve_recorded(
         method or str(result.method),
         result,
         shape,
-        problem.A.unknowns,
+        problem.A.unknowns,  # type: ignore[attr-defined]
         decomposition,
-    )  # type: ignore[attr-defined]
+    )
 
 
 def check_recorded(

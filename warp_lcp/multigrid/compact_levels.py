@@ -24,10 +24,10 @@ def coarser_pattern(pattern: Pattern, factors: Counts) -> Pattern:
         found |= {tuple(place) for place in itertools.product(*steps)}
     offsets = sorted(found - {(0, 0, 0)}, key=lambda o: o[::-1])
     return Pattern(
-        tuple(o for o in offsets if not pattern.symmetric or o[::-1] < (0, 0, 0)),
+        tuple(o for o in offsets if not pattern.symmetric or o[::-1] < (0, 0, 0)),  # type: ignore[misc]
         pattern.symmetric,
         "arrays",
-    )  # type: ignore[misc]
+    )
 
 
 def weights_block(

@@ -351,8 +351,16 @@ class Hierarchy:
         ghosts = None if s.ghosts is None else s.ghosts.coarser(factors)
         numbers = () if pattern else (0.0, 0.0, 0.0)
         stencil = PaddedStencil(
-            padding, new[0], weights, numbers, 1.0, periodic, spans, ghosts=ghosts, pattern=pattern
-        )  # type: ignore[arg-type]
+            padding,
+            new[0],
+            weights,
+            numbers,
+            1.0,
+            periodic,  # type: ignore[arg-type]
+            spans,
+            ghosts=ghosts,
+            pattern=pattern,
+        )
         level = StencilLevel(
             stencil, self.real, self.settings, bounded=bounded, upper=fine.upper.size > 0
         )

@@ -138,9 +138,12 @@ class StencilLevel:
     def restricting(self, coarse: StencilLevel, rows: Rows | None = None) -> Bound:
         """Return the pass that sums the residual over aggregates, all unless told."""
         there = rows or self._coarser_rows(coarse)
-        make = lambda: passes.RESTRICT.bind(
-            there, stencil=self.stencil, x=self.x, b=self.b, coarse=coarse.b
-        )  # noqa: E731
+
+        def make() -> Any:
+            return passes.RESTRICT.bind(
+                there, stencil=self.stencil, x=self.x, b=self.b, coarse=coarse.b
+            )
+
         return self._once(("restrict", coarse, id(rows)), make)
 
     def correcting(

@@ -155,5 +155,5 @@ def _as_stencil(
         unit=unit,
         symmetric=A.symmetric,
         monotone=not positive,
-        strength=strength,
-    )  # type: ignore[arg-type]
+        strength=strength,  # type: ignore[arg-type]
+    )

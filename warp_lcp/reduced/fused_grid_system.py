@@ -99,8 +99,12 @@ class FusedGridSystem:
     def __init__(self, problem: LCP, settings: Any) -> None:
         self._settings = settings
         self.iterate = passes = MultigridWorkspace(
-            problem, problem.A, settings, residual=MinimumMapResidual, ahead=False
-        )  # type: ignore[arg-type]
+            problem,
+            problem.A,  # type: ignore[arg-type]
+            settings,
+            residual=MinimumMapResidual,
+            ahead=False,
+        )
         self._exact = passes.precision is not Precision.SINGLE
         # Where x is rounded to float32 the energy says little of a step, and Newton's own safeguard
         # decides.
