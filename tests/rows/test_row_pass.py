@@ -288,7 +288,7 @@ def test_the_examples_of_a_new_pass_and_a_new_method_run_and_compile_for_cuda(
 ):
     page = Path(__file__).parents[2] / "CONTRIBUTING.md"
     source, code = blocks(page, "cpp")[example], blocks(page, "python")[example]
-    assert len([line for line in (source + code).splitlines() if line]) < 40
+    assert len([line for line in (source + code).splitlines() if line]) <= 55
     (tmp_path / f"{header}.h").write_text(source)
     monkeypatch.chdir(tmp_path)
     run(code, page)
