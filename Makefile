@@ -19,6 +19,7 @@ test: check
 check: $(VENV)/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/clang-format --dry-run --Werror $$(git ls-files '*.h')
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
