@@ -14,8 +14,8 @@ const auto beyond = [&](long long i, long long q, float slip) {
     return 1.0f / (length > (float)THETA ? length : (float)THETA);
 };
 // Where such a link ends [cells from face i]: at most at face q, where the products of its edge
-// take the wall's velocity. Liquid and wall that
-// turn as one then have no rate of strain, as weight times length is that of the whole link.
+// take the wall's velocity. Liquid and wall that turn as one then have no rate of strain, as weight
+// times length is that of the whole link.
 const auto end_of = [&](long long i, long long q) {
     const float length = h[q] < INFINITY ? (d[i] + h[q]) / (d[i] - d[q]) : 1.0f;
     return length < 1.0f ? (length > (float)THETA ? length : (float)THETA) : 1.0f;

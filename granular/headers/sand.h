@@ -9,22 +9,20 @@
 #ifdef __CUDA_ARCH__
 #define INLINE
 #define UNROLL
-#define FIELD(NAME) auto* NAME = given.NAME.data;
+#define FIELD(NAME) auto* NAME = given.NAME.data
 #define FIELDS(NAME) {given.NAME##_x.data, given.NAME##_y.data, given.NAME##_z.data}
 #define ROW (int)(k * s1 + j * s2)
 #define END (begin + 1)
 #define AGAIN(KEEP, CELL) ((KEEP) < (T)0 ? (CELL) + 1 : (CELL))
 #else
-#define FIELD(NAME)
+#define FIELD(NAME) static_assert(true)
 #define FIELDS(NAME) XYZ(NAME)
 #define ROW 0
 #define END end
 #define AGAIN(KEEP, CELL) (CELL)
-#define INLINE      \
-    __attribute__(( \
-        // vectorized loops may call nothing: small functions inside them must vanish
-        always_inline))
-#define UNROLL PRAGMA(clang loop unroll(full))  // nor may they have other loops inside
+// Vectorized loops may call no function and have no loops inside: these vanish.
+#define INLINE __attribute__((always_inline))
+#define UNROLL PRAGMA(clang loop unroll(full))
 #endif
 #define XYZ(FIELD) {FIELD##_x, FIELD##_y, FIELD##_z}
 enum { NORMALS = DIM == 3 ? 3 : 1, SHEARS = DIM == 3 ? 3 : 1, FIRST = 1 + NORMALS };
@@ -51,8 +49,8 @@ auto light = [&](int d, long long o) {
 auto open = [&](int axis, long long i) INLINE { return (T)openings[axis * layer + i]; };
 auto counted = [&](int axis, long long i) INLINE { return (T)openings[(DIM + axis) * layer + i]; };
 #else
-        auto open = [](int, long long) INLINE { return (T)1; };
-        auto counted = open;
+auto open = [](int, long long) INLINE { return (T)1; };
+auto counted = open;
 #endif
 
 // snippet rate_bound: Friction that grows with the rate of shear [Jop, Forterre & Pouliquen 2006]:
@@ -66,9 +64,8 @@ auto gained = [](T e, T gain, T half) INLINE { return e > (T)0 ? gain * e / (e +
 // there.
 #include "openings"
 // What passes a face counts by the face's mass: div(m u). A full cell cannot be compressed: it
-// counts volume, div u, or else a block that
-// falls would be squeezed at its front, where lighter faces let less out than comes in from behind.
-// `passes` goes from one to the other.
+// counts volume, div u, or else a block that falls would be squeezed at its front, where lighter
+// faces let less out than comes in from behind. `passes` goes from one to the other.
 auto passes = [](T mass, T full) INLINE { return mass + full * ((T)1 - mass); };
 auto fullness = [](T free) INLINE {
     const T c = (T)1 - free * (T)(1.0 / NEARLY);

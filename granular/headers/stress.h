@@ -119,14 +119,16 @@ const float* mass[3] = FIELDS(mass);
 const float* inverse[3] = FIELDS(inverse);
 const T* rate[3] = FIELDS(edge);
 const T* u[3] = FIELDS(u);
-FIELD(flags)
-FIELD(now)
-FIELD(before)
-FIELD(point)
-FIELD(drive) FIELD(stiff) FIELD(openings)
+FIELD(flags);
+FIELD(now);
+FIELD(before);
+FIELD(point);
+FIELD(drive);
+FIELD(stiff);
+FIELD(openings);
 #include "sand.h:divergence"
-    const T beta_x = RESIDUAL ? (T)0 : (T)momentum[NOW_X],
-            beta_s = RESIDUAL ? (T)0 : (T)momentum[NOW_S];
+const T beta_x = RESIDUAL ? (T)0 : (T)momentum[NOW_X],
+        beta_s = RESIDUAL ? (T)0 : (T)momentum[NOW_S];
 const T ahead_x = (T)momentum[NEXT_X] * (T)numbers[LOOKAHEAD],
         ahead_s = (T)momentum[NEXT_S] * (T)numbers[LOOKAHEAD];
 const T k_yield = (T)numbers[FRICTION], cohesion = (T)numbers[COHESION];

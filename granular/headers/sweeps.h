@@ -53,7 +53,10 @@ for (int i = first; i < last; ++i) {
 #include "sand.h:rate_bound"
 #include "sand.h:yield"
 #include "sand.h:edges"
-FIELD(flags) FIELD(now) FIELD(stiff) for (int i = first + ROW; i < last + ROW; ++i) {
+FIELD(flags);
+FIELD(now);
+FIELD(stiff);
+for (int i = first + ROW; i < last + ROW; ++i) {
     if (!(flags[i] & SHEARS_HERE) || !(stiff[i] > 0.0f)) continue;
     float* stress = now + i;
     const T x = (T)stress[0],

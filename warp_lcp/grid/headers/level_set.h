@@ -38,8 +38,7 @@
                     T* row = density + ((k + c - 1) * s1 + (j + b - 1) * s2 + i);
 #ifndef __CUDA_ARCH__
                     // four at once, of which the last gets nothing: a third of the stores, 9 ns a
-                    // particle
-                    // in 3-D instead of 15
+                    // particle in 3-D instead of 15
                     if (i < nx) {
                         Four sum;
                         __builtin_memcpy(&sum, row - 1, sizeof(Four));

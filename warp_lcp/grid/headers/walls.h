@@ -138,8 +138,7 @@ auto search = [&](T* x, T first_length, T limit) {
     return false;
 };
 // Put a point that is too near or inside at the distance `aim`; n becomes the normal there. 0: no
-// way out within the limit, 2: it was
-// the gradient that led nowhere.
+// way out within the limit, 2: it was the gradient that led nowhere.
 auto project = [&](T* x, T* n, T limit) {
     const T start[3] = {x[0], x[1], x[2]};
     T s = measure(x, n), far = 0;

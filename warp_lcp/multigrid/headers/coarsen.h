@@ -88,12 +88,9 @@ if (make) {
         const int m = n - begin < M ? n - begin : (int)M, last = cells - 1 - fx * (P.first + begin);
         const long long p = fx * begin;
         // Cell i of row y in one plane or both: what it adds to the aggregate's excess and to the
-        // outer
-        // faces below and above it. Rows go one after another, for memory is fetched ahead best
-        // along
-        // them; planes together, which halves the passes. One loop serves both rows: this kernel
-        // takes
-        // longest to compile.
+        // outer faces below and above it. Rows go one after another, for memory is fetched ahead
+        // best along them; planes together, which halves the passes. One loop serves both rows:
+        // this kernel takes longest to compile.
         const auto row = [&](auto both, int y, int begin, int end, long long left,
                              long long right) {
             enum { BOTH = decltype(both)::value };

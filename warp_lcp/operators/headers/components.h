@@ -52,8 +52,8 @@ const auto unite = [&](int i, int j) {
     }
 };
 // what to join is found in bytes, many cells at a time: 1 the cell to the left, 2 the one below
-// along y, 4 along z; the cell to the
-// left has been joined to its own lower neighbors, and those joined to ours need no more
+// along y, 4 along z; the cell to the left has been joined to its own lower neighbors, and those
+// joined to ours need no more
 const unsigned char ax = nx > 0, ay = ny > 0, az = nz > 0;
 unsigned char join[M];
 for (int begin = 0; begin < n; begin += M) {

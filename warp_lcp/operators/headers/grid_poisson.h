@@ -106,11 +106,10 @@ SIMD for (int k = 0; k < n; ++k) to[k] = source[k];
 
 // kernel grid_operator.find_spans: Find the span of a row: what lies between its first and its last
 // FLUID cell, both included, grown to whole vectors of 16 cells, so that aggregates stay whole,
-// too.
-// Rows that have one are marked in `reach`, the chunks of flat fields that they lie in in `chunks`;
-// what is marked stays so. On the CPU eight cells at a time: a byte of v is 0 where a cell is
-// FLUID,
-// and there alone v - 1 sets a highest bit that ~v has, but for bytes behind one of them.
+// too. Rows that have one are marked in `reach`, the chunks of flat fields that they lie in in
+// `chunks`; what is marked stays so. On the CPU eight cells at a time: a byte of v is 0 where a
+// cell is FLUID, and there alone v - 1 sets a highest bit that ~v has, but for bytes behind one of
+// them.
 //   compute    float32
 //   reads      int8 cells
 //   by_row     vec2i spans, reach

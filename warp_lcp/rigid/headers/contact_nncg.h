@@ -95,13 +95,11 @@ for (;;) {
 
 // kernel warp_lcp.rigid.contacts.nncg: Solve the islands first <= t < last, whose contacts follow
 // each other, by nonlinear conjugate gradients on projected sweeps. `reals` holds x, J, b, e, d,
-// mu,
-// then room for g, way, best and w. J: rows, 2 q entries each, for the first and the second body of
-// the row's contact; w = J' x, q entries a body. `indices` holds a contact's bodies, and an
-// island's
-// first contact. `residual` and `rounds` are of each island: relative to the residual of x = 0, and
-// iterations taken. EACH iterations lie between looks at the residual, which costs as much as a
-// sweep.
+// mu, then room for g, way, best and w. J: rows, 2 q entries each, for the first and the second
+// body of the row's contact; w = J' x, q entries a body. `indices` holds a contact's bodies, and an
+// island's first contact. `residual` and `rounds` are of each island: relative to the residual of x
+// = 0, and iterations taken. EACH iterations lie between looks at the residual, which costs as much
+// as a sweep.
 //   compute    float64
 //   whole      float64 reals; int32 indices
 //   box        float64 residual, rounds

@@ -1,7 +1,6 @@
 // Bounds of x. body(lower, upper) is called with functions of the cell, so that a loop over them
-// tests none: numbers, a code of two bits, or
-// fields and numbers, see `warp_lcp.problem.bounds`. What there is, BOUNDS, is known when the
-// kernel is made: the rest is not compiled.
+// tests none: numbers, a code of two bits, or fields and numbers, see `warp_lcp.problem.bounds`.
+// What there is, BOUNDS, is known when the kernel is made: the rest is not compiled.
 const auto with_bounds = [&](auto body) {
     const auto l = in_(given.bounds.lower.data, p), u = in_(given.bounds.upper.data, p);
     const auto code = in_(given.bounds.code.data, p);

@@ -1,7 +1,6 @@
 // How loops are written. SIMD: 16 elements at a time; SIMD8 where most are doubles; SIMD64 for
-// bytes. Sums may be taken in any order.
-// clang vectorizes a loop only if it is told that arrays do not alias and if conditionals select
-// values that are computed anyway.
+// bytes. Sums may be taken in any order. clang vectorizes a loop only if it is told that arrays do
+// not alias and if conditionals select values that are computed anyway.
 #ifdef __CUDA_ARCH__
 #define FAST_MATH
 #define EXACT_MATH
@@ -37,9 +36,8 @@ FAST_MATH  // comes before the first declaration
         M = BUFFERED
     };  // cells that a row function buffers at a time
 // Ask for the cache lines that cells begin ... end of fields will need 512 elements later: the
-// processor's own prefetching does not keep up
-// with a pass over seven fields or more whose rows are short. So far ahead made such passes 20 to
-// 25 % faster at 128^3 and 256^3.
+// processor's own prefetching does not keep up with a pass over seven fields or more whose rows are
+// short. So far ahead made such passes 20 to 25 % faster at 128^3 and 256^3.
 #ifdef __CUDA_ARCH__
 const auto fetch = [](int begin, int end, const auto&... fields) {};
 #else
@@ -104,8 +102,7 @@ const auto with_pairs = [](bool pairs, auto body) {
 const auto with_pairs = [](bool pairs, auto body) { body(pairs ? 2 : 1); };
 #endif
 // a / e. In quads a division of float32 has no branch, for loads do not merge across branches: it
-// is rounded as IEEE division is, but
-// where e or the quotient is not a normal number.
+// is rounded as IEEE division is, but where e or the quotient is not a normal number.
 #if defined(QUADS) && defined(__CUDACC__)
 const auto quotient = [](auto a, auto e) {
     if constexpr (sizeof(a) == 4 && sizeof(e) == 4) {

@@ -2,8 +2,8 @@
 // bits, and done once a thread.
 //
 // Fields that are read are loaded once, however often the row function reads them: `__ldg` tells
-// the compiler that nothing in this launch
-// changes them. Fields that are written are kept in registers until the row function ends.
+// the compiler that nothing in this launch changes them. Fields that are written are kept in
+// registers until the row function ends.
 #ifdef __CUDACC__
 const auto load_ = [](const auto* q) { return __ldg(q); };
 #else

@@ -1,6 +1,5 @@
 // A stencil at cell k of the piece, of 7 points or a compact one: e x - sum of w x_neighbor where e
-// != 0, else 0; `affine`: plus b, or as
-// computed before.
+// != 0, else 0; `affine`: plus b, or as computed before.
 const auto diagonal = [&](int k) -> T { return unit * (T)d[k]; };
 // how far elements of other rows lie from ours
 const auto beside = [&](int rows, int planes, auto down, auto up) {

@@ -1,6 +1,5 @@
 // What a piece has found joins that of the thread's piece in the plane below: on CUDA, where it has
-// one in each, in registers until its last.
-// Whole numbers are added as such there: float64 is slow.
+// one in each, in registers until its last. Whole numbers are added as such there: float64 is slow.
 double* sums_ = given.out.data + P.t;
 const auto joined_ = [](int s, auto a, auto b) { return s < SUMS ? a + b : b > a ? b : a; };
 #ifdef __CUDA_ARCH__

@@ -1,6 +1,5 @@
 // Tasks, a row's chunk each in a slab of planes, from (i_, j_, c_) on: one a thread on CUDA, as
-// many as a team's thread takes on the CPU.
-// The body that follows ends with three braces.
+// many as a team's thread takes on the CPU. The body that follows ends with three braces.
 const int per_plane_ = L.rows * L.chunks;
 int i_ = slab_, at_ = row_ * L.chunks + chunk_;
 #ifdef __CUDA_ARCH__

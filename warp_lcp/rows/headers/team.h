@@ -2,17 +2,14 @@
 // here, and are asleep when idle.
 //
 // Operations are cut into chunks, which lie in lanes: a thread takes those of its own lane from the
-// front, so that it meets again what its
-// core has at hand, then those of others from the back. An operation begins when all chunks before
-// it are done, so nobody waits for a
-// thread that holds none, as one whose core another process has. Who takes a chunk changes no
-// result. What is taken of a lane is said with
-// the table's number of runs, so that a thread that comes late takes nothing, and nothing is set
-// back.
+// front, so that it meets again what its core has at hand, then those of others from the back. An
+// operation begins when all chunks before it are done, so nobody waits for a thread that holds
+// none, as one whose core another process has. Who takes a chunk changes no result. What is taken
+// of a lane is said with the table's number of runs, so that a thread that comes late takes
+// nothing, and nothing is set back.
 #ifndef __CUDA_ARCH__
-#define APART       \
-    __attribute__(( \
-        noinline))  // not copied to where it is called: the compiler would take twice as long
+// not copied to where it is called: the compiler would take twice as long
+#define APART __attribute__((noinline))
 typedef unsigned long long Word;
 typedef long long Long;
 typedef void (*Call)(void*, void*);
@@ -181,9 +178,8 @@ const auto take_next = [=](const Word* op, Word runs, Word chunk) {  // whether 
 };
 
 // A wave streams through memory once: each stage follows some planes behind the one before. Who
-// takes slab after slab goes on; else there
-// is a gap beside the cut, as wide as a stage lags: what it would need is the neighbor's. Who is
-// done last with the two beside it fills it.
+// takes slab after slab goes on; else there is a gap beside the cut, as wide as a stage lags: what
+// it would need is the neighbor's. Who is done last with the two beside it fills it.
 const auto stream = [=](const Word* op, Word runs, Long c, const Word** stages,
                         char (*room)[ROOM]) -> Word {
     const int count = (int)op[STAGE_COUNT];
@@ -219,9 +215,8 @@ const auto work = [=](const Word* op, Word runs, Long c) -> Word {
     // the condition changes between operations only
     if (op[WHEN] && !*(const volatile int*)op[WHEN]) return 1;
     // Tasks whose number is known when they run: as many pieces as they fill, up to the chunks, as
-    // many for each lane; piece q is of
-    // the chunk c with c*pieces/chunks <= q < (c + 1)*pieces/chunks, so that pieces lie in all
-    // lanes.
+    // many for each lane; piece q is of the chunk c with c*pieces/chunks <= q < (c +
+    // 1)*pieces/chunks, so that pieces lie in all lanes.
     Long all = (Long)op[ALL], each = (Long)op[EACH], first = c;
     if (op[SIZED]) {
         all = *(const Long*)op[SIZED];
