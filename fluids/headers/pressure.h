@@ -5,22 +5,25 @@
 const long long sz = planes == 2 ? s1 : 0;
 const float* a[3] = {open_x, open_y, planes == 2 ? open_z : open_x};
 const float* solid[3] = {solid_x, solid_y, planes == 2 ? solid_z : solid_x};
-// the open fraction of a cell's lower face, what the solid adds to what passes it, and the reciprocal of theta between two cells
+// the open fraction of a cell's lower face, what the solid adds to what passes it, and the
+// reciprocal of theta between two cells
 auto fraction = [&](int axis, long long i, long long s) {
-    return CUT ? a[axis][CUT ? i : 0] : (((kind[i] == SOLID) | (kind[i - s] == SOLID)) ? 0.0f : 1.0f);
+    return CUT ? a[axis][CUT ? i : 0]
+               : (((kind[i] == SOLID) | (kind[i - s] == SOLID)) ? 0.0f : 1.0f);
 };
 auto passes = [&](const float* u, int axis, long long i, long long s) {
     const double open = fraction(axis, i, s);
-    return open*u[i] + (MOVING ? (1.0 - open)*solid[axis][MOVING ? i : 0] : 0.0);
+    return open * u[i] + (MOVING ? (1.0 - open) * solid[axis][MOVING ? i : 0] : 0.0);
 };
 auto inverse_theta = [&](long long i, long long n) {  // FLUID i, AIR n
-    const float inverse = GHOST ? 1.0f - phi[GHOST ? n : 0]/phi[GHOST ? i : 0] : 1.0f;
-    const float least = inverse > 1.0f ? inverse : 1.0f;  // beyond an open side there is air whatever phi says
-    return least < (float)(1.0/THETA_MIN) ? least : (float)(1.0/THETA_MIN);
+    const float inverse = GHOST ? 1.0f - phi[GHOST ? n : 0] / phi[GHOST ? i : 0] : 1.0f;
+    // beyond an open side there is air whatever phi says
+    const float least = inverse > 1.0f ? inverse : 1.0f;
+    return least < (float)(1.0 / THETA_MIN) ? least : (float)(1.0 / THETA_MIN);
 };
 auto outflow = [&](const float* u, const float* v, const float* w, long long i) {
-    return passes(u, 0, i + 1, 1) - passes(u, 0, i, 1) + passes(v, 1, i + s2, s2) - passes(v, 1, i, s2)
-        + passes(w, 2, i + sz, sz) - passes(w, 2, i, sz);
+    return passes(u, 0, i + 1, 1) - passes(u, 0, i, 1) + passes(v, 1, i + s2, s2) -
+           passes(v, 1, i, s2) + passes(w, 2, i + sz, sz) - passes(w, 2, i, sz);
 };
 
 // kernel fluids.pressure.prepare: Right-hand side b, lower bound, first guess and what the free
@@ -34,38 +37,46 @@ auto outflow = [&](const float* u, const float* v, const float* w, long long i) 
 if (planes != 2) w = u;
 SIMD8 for (int i = first; i < last; ++i) {
     const int fluid = kind[i] == FLUID;
-    const double y = outflow(u, v, w, i), bound = BOUNDED && (touch[i] & LETS_GO) ? 0.0 - adhesion : -INFINITY, x = previous[i]*ratio;
+    const double y = outflow(u, v, w, i),
+                 bound = BOUNDED && (touch[i] & LETS_GO) ? 0.0 - adhesion : -INFINITY,
+                 x = previous[i] * ratio;
     b[i] = fluid ? y : 0.0;
     if (BOUNDED) lower[i] = fluid ? bound : -INFINITY;
     start[i] = fluid ? (x < bound ? bound : x) : 0.0;
 }
-// Where the surface itself pulls by more, with a pressure below that of the air, no air gets to the wall before the pressure is below that.
+// Where the surface itself pulls by more, with a pressure below that of the air, no air gets to the
+// wall before the pressure is below that.
 if (BOUNDED && jump) {
     const long long steps[6] = {-1, 1, -s2, s2, -sz, sz};
     for (int i = first; i < last; ++i) {
         if (lower[i] == -INFINITY) continue;
         double least = lower[i];
-        for (int n = 0; n < 2*planes + 2; ++n) {
+        for (int n = 0; n < 2 * planes + 2; ++n) {
             const long long air = i + steps[n];
             if (kind[air] != AIR) continue;
             const float pull = jump[i] < jump[air] ? jump[i] : jump[air];
             least = pull < least ? pull : least;
         }
-        const double x = previous[i]*ratio;
+        const double x = previous[i] * ratio;
         lower[i] = least;
         start[i] = x < least ? least : x;
     }
 }
-// What the diagonal of a FLUID cell has more than the operator knows: air nearer than a cell away, and the air beyond open sides.
+// What the diagonal of a FLUID cell has more than the operator knows: air nearer than a cell away,
+// and the air beyond open sides.
 if (shift) {
-    const int nx = given.kind.shape[2] - 2, ny = given.kind.shape[1] - 2, nz = given.kind.shape[0] - 2;
+    const int nx = given.kind.shape[2] - 2, ny = given.kind.shape[1] - 2,
+              nz = given.kind.shape[0] - 2;
     auto nearer = [&](int axis, long long face, long long s, long long i, long long n, bool side) {
-        return kind[n] == AIR ? fraction(axis, face, s)*(inverse_theta(i, n) - (side ? 0.0f : 1.0f)) : 0.0f;
+        return kind[n] == AIR
+                   ? fraction(axis, face, s) * (inverse_theta(i, n) - (side ? 0.0f : 1.0f))
+                   : 0.0f;
     };
     SIMD for (int i = first; i < last; ++i) {
-        const float more = nearer(0, i + 1, 1, i, i + 1, i == nx) + nearer(0, i, 1, i, i - 1, i == 1)
-            + nearer(1, i + s2, s2, i, i + s2, j == ny) + nearer(1, i, s2, i, i - s2, j == 1)
-            + nearer(2, i + sz, sz, i, i + sz, k == nz) + nearer(2, i, sz, i, i - sz, k == 1);
+        const float more =
+            nearer(0, i + 1, 1, i, i + 1, i == nx) + nearer(0, i, 1, i, i - 1, i == 1) +
+            nearer(1, i + s2, s2, i, i + s2, j == ny) + nearer(1, i, s2, i, i - s2, j == 1) +
+            nearer(2, i + sz, sz, i, i + sz, k == nz) + nearer(2, i, sz, i, i - sz, k == 1);
         shift[i] = kind[i] == FLUID ? more : 0.0f;
     }
 }
@@ -79,14 +90,18 @@ if (shift) {
 //   constants  FLUID, SOLID, AIR, CUT, MOVING, GHOST, THETA_MIN
 #include "pressure_face"
 const long long s = axis == 0 ? 1 : (axis == 1 ? s2 : s1);
-const int edge = (axis == 1 && j == 0) || (axis == 2 && k == 0) ? last : (axis == 0 && first == 0 ? 1 : first);
+const int edge =
+    (axis == 1 && j == 0) || (axis == 2 && k == 0) ? last : (axis == 0 && first == 0 ? 1 : first);
 for (int i = first; i < edge; ++i) known[i] = -1;  // the ring's own lower faces lie in the wall
 SIMD8 for (int i = edge; i < last; ++i) {
     const int here = kind[i], below = kind[i - s], wet = (here == FLUID) | (below == FLUID);
     const float open = fraction(axis, i, s);
-    const float inverse = !GHOST ? 1.0f : (here == AIR ? inverse_theta(i - s, i) : (below == AIR ? inverse_theta(i, i - s) : 1.0f));
-    const int projected = wet & (open > 0.0f) & (here != SOLID) & (below != SOLID);  // a source's cells are SOLID, their faces open
-    field[i] -= projected ? (float)(x[i] - x[i - s])*inverse : 0.0f;
+    const float inverse = !GHOST ? 1.0f
+                                 : (here == AIR ? inverse_theta(i - s, i)
+                                                : (below == AIR ? inverse_theta(i, i - s) : 1.0f));
+    // a source's cells are SOLID, their faces open
+    const int projected = wet & (open > 0.0f) & (here != SOLID) & (below != SOLID);
+    field[i] -= projected ? (float)(x[i] - x[i - s]) * inverse : 0.0f;
     const int hidden = CUT ? 0 : (here == SOLID) & (below == SOLID);
     known[i] = projected ? 1 : (hidden ? -1 : 0);
 }
@@ -103,28 +118,39 @@ SIMD8 for (int i = edge; i < last; ++i) {
 #include "pressure_face"
 const int nx = given.kind.shape[2], ny = given.kind.shape[1], nz = given.kind.shape[0];
 const long long s = axis == 0 ? 1 : (axis == 1 ? s2 : s1), steps[6] = {-1, 1, -s2, s2, -s1, s1};
-auto over = [&](long long liquid, long long air) {  // of the jump of surface tension, see `fluids.surface_tension.push`
-    return jump[liquid]*(inverse_theta(liquid, air) - 1.0f) + jump[air];
+// of the jump of surface tension, see `fluids.surface_tension.push`
+auto over = [&](long long liquid, long long air) {
+    return jump[liquid] * (inverse_theta(liquid, air) - 1.0f) + jump[air];
 };
-const bool inside_y = j > 0 && j < (axis == 1 ? ny : ny - 1), inside_z = planes != 2 || (k > 0 && k < (axis == 2 ? nz : nz - 1));
-const int low = first > 1 ? first : 1, end = axis == 0 ? nx : nx - 1, high = last < end ? last : end;
+const bool inside_y = j > 0 && j < (axis == 1 ? ny : ny - 1),
+           inside_z = planes != 2 || (k > 0 && k < (axis == 2 ? nz : nz - 1));
+const int low = first > 1 ? first : 1, end = axis == 0 ? nx : nx - 1,
+          high = last < end ? last : end;
 for (int i = low; i < high && inside_y && inside_z; ++i) {
     if (known[i] != 0 || !(weight[i] > (float)TINY_WEIGHT)) continue;
     if (kind[i] == SOLID || kind[i - s] == SOLID || !(fraction(axis, i, s) > 0.0f)) continue;
-    const bool there[6] = {true, i + 1 < nx, true, j + 1 < ny, planes == 2, planes == 2 && k + 1 < nz};
-    float change = 0.0f, velocity = 0.0f; int found = 0;
+    const bool there[6] = {true,       i + 1 < nx,  true,
+                           j + 1 < ny, planes == 2, planes == 2 && k + 1 < nz};
+    float change = 0.0f, velocity = 0.0f;
+    int found = 0;
     for (int n = 0; n < 6; ++n) {
         const long long e = there[n] ? i + steps[n] : i;
         if (known[e] != 1) continue;
-        const float inverse = kind[e] == AIR ? inverse_theta(e - s, e) : (kind[e - s] == AIR ? inverse_theta(e, e - s) : 1.0f);
-        change -= (float)(x[e] - x[e - s])*inverse;
-        if (jump && kind[e] != kind[e - s]) change += kind[e] == AIR ? -over(e - s, e) : over(e, e - s);
-        velocity += field[e]; ++found;
+        const float inverse = kind[e] == AIR
+                                  ? inverse_theta(e - s, e)
+                                  : (kind[e - s] == AIR ? inverse_theta(e, e - s) : 1.0f);
+        change -= (float)(x[e] - x[e - s]) * inverse;
+        if (jump && kind[e] != kind[e - s])
+            change += kind[e] == AIR ? -over(e - s, e) : over(e, e - s);
+        velocity += field[e];
+        ++found;
     }
     if (found == 0) continue;
     change /= (float)found;
-    const float gap = velocity/(float)found - field[i], size = change < 0.0f ? -change : change, most = gap < 0.0f ? -gap : gap;
-    const float nearer = change*gap > 0.0f ? (size < most ? change : gap) : 0.0f, low = nearer > -limit ? nearer : -limit;
+    const float gap = velocity / (float)found - field[i], size = change < 0.0f ? -change : change,
+                most = gap < 0.0f ? -gap : gap;
+    const float nearer = change * gap > 0.0f ? (size < most ? change : gap) : 0.0f,
+                low = nearer > -limit ? nearer : -limit;
     field[i] += low < limit ? low : limit;
     known[i] = 2;
 }
@@ -141,18 +167,24 @@ for (int i = low; i < high && inside_y && inside_z; ++i) {
 //              THETA_MIN
 #include "pressure_face"
 if (planes != 2) w = u;
-int found = 0; double rest[M]; unsigned char leaves[M];
+int found = 0;
+double rest[M];
+unsigned char leaves[M];
 for (int from = first; from < last; from += M) {
     const int n = last - from < M ? last - from : M;
     SIMD8 for (int m = 0; m < n; ++m) {
         const int i = from + m, fluid = kind[i] == FLUID;
         const double y = outflow(u, v, w, i), size = y < 0.0 ? -y : y;
-        const int leaving = BOUNDED & fluid & ((touch[i] & LETS_GO) != 0) & (x[i] <= 0.0) & (y > threshold);
+        const int leaving =
+            BOUNDED & fluid & ((touch[i] & LETS_GO) != 0) & (x[i] <= 0.0) & (y > threshold);
         contact[i] = leaving ? RELEASED : ((fluid & (touch[i] & TOUCHES)) ? HELD : 0);
         leaves[m] = leaving;
         rest[m] = (fluid & !leaving) ? size : 0.0;
     }
-    for (int m = 0; m < n; ++m) { found += leaves[m]; worst = rest[m] > worst ? rest[m] : worst; }
+    for (int m = 0; m < n; ++m) {
+        found += leaves[m];
+        worst = rest[m] > worst ? rest[m] : worst;
+    }
 }
 released = found;
 

@@ -4,12 +4,12 @@
 // snippet smooth_share: The smooth share of liquid, 2 once - twice, and the distance to its
 // surface [cells], > 0 outside, that it means on a plane: with it central differences are those of
 // lines, where a share's own would miss a fiftieth of the slope and add as much to the curvature.
-auto share = [&](long long n) { return (float)2*once[n] - twice[n]; };
+auto share = [&](long long n) { return (float)2 * once[n] - twice[n]; };
 auto distance = [&](long long n) {
     const float t = 0.5f - share(n), within = t < -0.45f ? -0.45f : (t > 0.45f ? 0.45f : t);
-    return within*(linear + cubic*within*within);
+    return within * (linear + cubic * within * within);
 };
-auto slope = [&](long long i, long long s) { return 0.5f*(distance(i + s) - distance(i - s)); };
+auto slope = [&](long long i, long long s) { return 0.5f * (distance(i + s) - distance(i - s)); };
 
 // kernel fluids.surface_tension.curvature: bend = the curvature of the contours of the distance
 // [1/cells], > 0 where the liquid bulges, in cells near the surface; else 0
@@ -25,15 +25,19 @@ for (int i = first; i < last; ++i) {
     bend[i] = 0;
     const T f = share(i);
     if (!inside || i == 0 || i + 1 == nx || f < (T)BAND || f > (T)(1 - BAND)) continue;
-    const T here = (T)2*distance(i), x = slope(i, 1), y = slope(i, s2), z = slope(i, sz);
-    const T xx = distance(i + 1) + distance(i - 1) - here, yy = distance(i + s2) + distance(i - s2) - here;
+    const T here = (T)2 * distance(i), x = slope(i, 1), y = slope(i, s2), z = slope(i, sz);
+    const T xx = distance(i + 1) + distance(i - 1) - here,
+            yy = distance(i + s2) + distance(i - s2) - here;
     const T zz = distance(i + sz) + distance(i - sz) - here;
     auto mixed = [&](long long p, long long q) {
-        return (T)0.25*(distance(i + p + q) - distance(i + p - q) - distance(i - p + q) + distance(i - p - q));
+        return (T)0.25 * (distance(i + p + q) - distance(i + p - q) - distance(i - p + q) +
+                          distance(i - p - q));
     };
-    T sum = xx*(y*y + z*z) + yy*(x*x + z*z) + zz*(x*x + y*y) - (T)2*x*y*mixed(1, s2);
-    if (planes == 2) sum -= (T)2*(x*z*mixed(1, sz) + y*z*mixed(s2, sz));
-    const T steep = x*x + y*y + z*z, most = limit, curvature = steep > (T)1e-4 ? sum/(steep*sqrtf(steep)) : (T)0;
+    T sum = xx * (y * y + z * z) + yy * (x * x + z * z) + zz * (x * x + y * y) -
+            (T)2 * x * y * mixed(1, s2);
+    if (planes == 2) sum -= (T)2 * (x * z * mixed(1, sz) + y * z * mixed(s2, sz));
+    const T steep = x * x + y * y + z * z, most = limit,
+            curvature = steep > (T)1e-4 ? sum / (steep * sqrtf(steep)) : (T)0;
     bend[i] = curvature > most ? most : (curvature < -most ? -most : curvature);
 }
 
@@ -51,21 +55,27 @@ for (int i = first; i < last; ++i) {
     jump[i] = 0;
     if (!inside || i == 0 || i + 1 == nx || kind[i] == SOLID) continue;
     const signed char other = kind[i] == FLUID ? AIR : FLUID;
-    if (kind[i - 1] != other && kind[i + 1] != other && kind[i - s2] != other && kind[i + s2] != other && kind[i - sz] != other
-        && kind[i + sz] != other) continue;
-    const T x = slope(i, 1), y = slope(i, s2), z = slope(i, sz), steep = x*x + y*y + z*z, most = (T)FARTHEST;
-    T way = steep > (T)1e-4 ? -distance(i)/steep : (T)0;
+    if (kind[i - 1] != other && kind[i + 1] != other && kind[i - s2] != other &&
+        kind[i + s2] != other && kind[i - sz] != other && kind[i + sz] != other)
+        continue;
+    const T x = slope(i, 1), y = slope(i, s2), z = slope(i, sz), steep = x * x + y * y + z * z,
+            most = (T)FARTHEST;
+    T way = steep > (T)1e-4 ? -distance(i) / steep : (T)0;
     way = way > most ? most : (way < -most ? -most : way);
-    T p[3] = {(T)i + way*x, (T)j + way*y, (T)k + way*z};
+    T p[3] = {(T)i + way * x, (T)j + way * y, (T)k + way * z};
     const int ends[3] = {nx - 2, ny - 2, nz - 2};
     int c[3];
     for (int e = 0; e < 3; ++e) {
         p[e] = p[e] < 1 ? (T)1 : (p[e] > (T)ends[e] ? (T)ends[e] : p[e]);
-        c[e] = (int)p[e]; p[e] -= (T)c[e];
+        c[e] = (int)p[e];
+        p[e] -= (T)c[e];
     }
-    const T* q = bend + ((c[0]) + (c[1] - j)*s2 + (planes == 2 ? (c[2] - k)*s1 : 0));
-    auto plane = [&](const T* r) { return (1 - p[1])*((1 - p[0])*r[0] + p[0]*r[1]) + p[1]*((1 - p[0])*r[s2] + p[0]*r[s2 + 1]); };
-    jump[i] = scale*(planes == 2 ? (1 - p[2])*plane(q) + p[2]*plane(q + s1) : plane(q));
+    const T* q = bend + ((c[0]) + (c[1] - j) * s2 + (planes == 2 ? (c[2] - k) * s1 : 0));
+    auto plane = [&](const T* r) {
+        return (1 - p[1]) * ((1 - p[0]) * r[0] + p[0] * r[1]) +
+               p[1] * ((1 - p[0]) * r[s2] + p[0] * r[s2 + 1]);
+    };
+    jump[i] = scale * (planes == 2 ? (1 - p[2]) * plane(q) + p[2] * plane(q + s1) : plane(q));
 }
 
 // kernel fluids.surface_tension.push: Push the faces that the surface crosses by the pressure's
@@ -78,14 +88,17 @@ for (int i = first; i < last; ++i) {
 #include "pressure.h:pressure_face"
 const int nx = given.kind.shape[2], ny = given.kind.shape[1], nz = given.kind.shape[0];
 const long long s = axis == 0 ? 1 : (axis == 1 ? s2 : s1);
-const int lowest[3] = {axis == 0 ? 2 : 1, axis == 1 ? 2 : 1, planes != 2 ? 0 : (axis == 2 ? 2 : 1)};  // no cell of the ring has a surface
+// no cell of the ring has a surface
+const int lowest[3] = {axis == 0 ? 2 : 1, axis == 1 ? 2 : 1, planes != 2 ? 0 : (axis == 2 ? 2 : 1)};
 const bool inside = j >= lowest[1] && j + 1 < ny && k >= lowest[2] && (planes != 2 || k + 1 < nz);
 const int low = first > lowest[0] ? first : lowest[0], high = last < nx - 1 ? last : nx - 1;
 for (int i = low; i < high && inside; ++i) {
-    const bool wet = kind[i] == FLUID && kind[i - s] == AIR, dry = kind[i] == AIR && kind[i - s] == FLUID;
+    const bool wet = kind[i] == FLUID && kind[i - s] == AIR,
+               dry = kind[i] == AIR && kind[i - s] == FLUID;
     if (!wet && !dry) continue;
     const long long liquid = wet ? i : i - s, air = wet ? i - s : i;
-    const float over = jump[liquid]*(inverse_theta(liquid, air) - 1.0f) + jump[air];  // of linear interpolation, over theta
+    // of linear interpolation, over theta
+    const float over = jump[liquid] * (inverse_theta(liquid, air) - 1.0f) + jump[air];
     field[i] += wet ? over : -over;
 }
 
@@ -102,11 +115,15 @@ for (int i = low; i < high && inside; ++i) {
 #include "smooth_share"
 const int nx = given.kind.shape[2];
 for (int i = first; i < last; ++i) {
-    const float raw = share(i), f = raw < 1.0f ? raw : 1.0f, t = f - 0.5f, u = t*t/(float)(HALF*HALF);
+    const float raw = share(i), f = raw < 1.0f ? raw : 1.0f, t = f - 0.5f,
+                u = t * t / (float)(HALF * HALF);
     if (kind[i] == SOLID || i == 0 || i + 1 == nx || f <= 0.0f) continue;
     const float x = slope(i, 1), y = slope(i, s2), z = slope(i, sz);
-    area += (double)(u < 1.0f ? 0.75f/(float)HALF*(1.0f - u)*sqrtf(x*x + y*y + z*z)/(linear + 3.0f*cubic*t*t) : 0.0f);
-    const float ax = fraction(0, i + 1, 1) - fraction(0, i, 1), ay = fraction(1, i + s2, s2) - fraction(1, i, s2);
+    area += (double)(u < 1.0f ? 0.75f / (float)HALF * (1.0f - u) * sqrtf(x * x + y * y + z * z) /
+                                    (linear + 3.0f * cubic * t * t)
+                              : 0.0f);
+    const float ax = fraction(0, i + 1, 1) - fraction(0, i, 1),
+                ay = fraction(1, i + s2, s2) - fraction(1, i, s2);
     const float az = fraction(2, i + sz, sz) - fraction(2, i, sz);
-    wetted += (double)(f*sqrtf(ax*ax + ay*ay + az*az));
+    wetted += (double)(f * sqrtf(ax * ax + ay * ay + az * az));
 }

@@ -4,28 +4,33 @@
 // distance, `h` the slip length of a face in a wall, `y`, `z` of the two other components; a link
 // to a wall ends at it, or behind it by the slip length.
 const bool deep = planes == 2;
-const long long step[3] = {1, s2, s1}, sa = step[axis], sb = step[axis == 0 ? 1 : 0], sc = step[axis == 2 ? 1 : 2];
+const long long step[3] = {1, s2, s1}, sa = step[axis], sb = step[axis == 0 ? 1 : 0],
+                sc = step[axis == 2 ? 1 : 2];
 const int first_other = axis == 0 ? 1 : 0, last_other = axis == 2 ? 1 : 2;
 const auto solid = [&](const float* distance, long long i) { return distance[i] <= (float)CLOSE; };
-const auto beyond = [&](long long i, long long q, float slip) {  // the reciprocal length of a link from i to the wall before q
-    const float length = (d[i] + slip)/(d[i] - d[q]);
-    return 1.0f/(length > (float)THETA ? length : (float)THETA);
+// the reciprocal length of a link from i to the wall before q
+const auto beyond = [&](long long i, long long q, float slip) {
+    const float length = (d[i] + slip) / (d[i] - d[q]);
+    return 1.0f / (length > (float)THETA ? length : (float)THETA);
 };
-// Where such a link ends [cells from face i]: at most at face q, where the products of its edge take the wall's velocity. Liquid and wall that
-// turn as one then have no rate of strain, as weight times length is that of the whole link.
+// Where such a link ends [cells from face i]: at most at face q, where the products of its edge
+// take the wall's velocity. Liquid and wall that turn as one then have no rate of strain, as weight
+// times length is that of the whole link.
 const auto end_of = [&](long long i, long long q) {
-    const float length = h[q] < INFINITY ? (d[i] + h[q])/(d[i] - d[q]) : 1.0f;
+    const float length = h[q] < INFINITY ? (d[i] + h[q]) / (d[i] - d[q]) : 1.0f;
     return length < 1.0f ? (length > (float)THETA ? length : (float)THETA) : 1.0f;
 };
-const auto head_on = [&](long long i, long long q, long long c) {  // along the component's own axis through cell c
+// along the component's own axis through cell c
+const auto head_on = [&](long long i, long long q, long long c) {
     const bool held = (kind[c] == FLUID) & (contact[c] != RELEASED);
     const bool along = !CUT || d[i] - d[q] >= (float)ALONG;  // no slip across a wall
     const float slip = along ? 0.0f : h[q];
-    return held && slip < INFINITY ? cell[c]*beyond(i, q, slip) : 0.0f;
+    return held && slip < INFINITY ? cell[c] * beyond(i, q, slip) : 0.0f;
 };
-const auto beside = [&](long long i, long long q, float weight) {  // which knows already of a length above 1
+// which knows already of a length above 1
+const auto beside = [&](long long i, long long q, float weight) {
     const float inverse = h[q] < INFINITY ? beyond(i, q, h[q]) : 0.0f;
-    return weight*(inverse > 1.0f ? inverse : (h[q] < INFINITY ? 1.0f : 0.0f));
+    return weight * (inverse > 1.0f ? inverse : (h[q] < INFINITY ? 1.0f : 0.0f));
 };
 
 // kernel fluids.viscosity.distance: Signed distance of a component's faces from walls that liquid
@@ -36,16 +41,19 @@ const auto beside = [&](long long i, long long q, float weight) {  // which know
 //   numbers    int axis, planes, walls
 //   constants  SOLID, CLOSE, CUT
 const int nx = given.out.shape[2], ny = given.out.shape[1], nz = given.out.shape[0];
-const long long step[3] = {1, s2, s1}, sa = step[axis], sb = step[axis == 0 ? 1 : 0], sc = step[axis == 2 ? 1 : 2];
+const long long step[3] = {1, s2, s1}, sa = step[axis], sb = step[axis == 0 ? 1 : 0],
+                sc = step[axis == 2 ? 1 : 2];
 for (int i = first; i < last; ++i) {
     const int at[3] = {i, j, k}, size[3] = {nx, ny, nz};
     const bool edge = at[axis] == 0;  // below it nothing is stored
     const long long below = edge ? i : i - sa;
-    int owner = 0; float distance;
+    int owner = 0;
+    float distance;
     if (CUT) {
-        const bool end_b = at[axis == 0 ? 1 : 0] + 1 == size[axis == 0 ? 1 : 0], end_c = planes == 2 && at[axis == 2 ? 1 : 2] + 1 == size[axis == 2 ? 1 : 2];
+        const bool end_b = at[axis == 0 ? 1 : 0] + 1 == size[axis == 0 ? 1 : 0],
+                   end_c = planes == 2 && at[axis == 2 ? 1 : 2] + 1 == size[axis == 2 ? 1 : 2];
         const long long up = end_b ? 0 : sb, far = planes == 2 && !end_c ? sc : 0;
-        distance = 0.25f*(nodes[i] + nodes[i + up] + nodes[i + far] + nodes[i + up + far]);
+        distance = 0.25f * (nodes[i] + nodes[i + up] + nodes[i + far] + nodes[i + up + far]);
         owner = wall[i];
     } else {
         distance = 0.5f;
@@ -55,9 +63,16 @@ for (int i = first; i < last; ++i) {
     const float whole = here && there ? -0.5f : (here || there ? 0.0f : distance);
     distance = whole < distance ? whole : distance;
     for (int other = 0; other <= planes; ++other) {
-        const float x = (float)at[other] - (other == axis ? 1.0f : 0.5f), high = (float)(size[other] - 2) - x;
-        if ((walls >> 2*other & 1) && x < distance) { distance = x; owner = x > 0.0f ? owner : 0; }
-        if ((walls >> (2*other + 1) & 1) && high < distance) { distance = high; owner = high > 0.0f ? owner : 0; }
+        const float x = (float)at[other] - (other == axis ? 1.0f : 0.5f),
+                    high = (float)(size[other] - 2) - x;
+        if ((walls >> 2 * other & 1) && x < distance) {
+            distance = x;
+            owner = x > 0.0f ? owner : 0;
+        }
+        if ((walls >> (2 * other + 1) & 1) && high < distance) {
+            distance = high;
+            owner = high > 0.0f ? owner : 0;
+        }
     }
     const bool solid = distance <= (float)CLOSE;
     out[i] = distance;
@@ -82,19 +97,32 @@ const auto filled = [&](const long long* cells, int n) {  // the mean over some 
     if (GHOST) {
         float sum = 0.0f;
         for (int c = 0; c < n; ++c) sum += phi[GHOST ? cells[c] : 0];
-        return clipped(0.5f - sum/(float)n, 0.0f, 1.0f);
+        return clipped(0.5f - sum / (float)n, 0.0f, 1.0f);
     }
     int open = 0, wet = 0;
-    for (int c = 0; c < n; ++c) { open += kind[cells[c]] != SOLID; wet += kind[cells[c]] == FLUID; }
-    return open ? (float)wet/(float)open : 0.0f;
+    for (int c = 0; c < n; ++c) {
+        open += kind[cells[c]] != SOLID;
+        wet += kind[cells[c]] == FLUID;
+    }
+    return open ? (float)wet / (float)open : 0.0f;
 };
-// The liquid's viscosity, in units of that which `scale` has: the mean over faces that have some, and the least of them where it differs.
+// The liquid's viscosity, in units of that which `scale` has: the mean over faces that have some,
+// and the least of them where it differs.
 const float* m[3] = {VARIES ? mx : dx, VARIES ? my : dx, VARIES && deep ? mz : dx};
-struct Thick { float sum, least, most; int n; };
+struct Thick {
+    float sum, least, most;
+    int n;
+};
 const auto add = [&](Thick& t, int axis, long long f) {
     const float v = m[axis][f];
-    if (v > 0.0f) { t.sum += v; t.least = v < t.least ? v : t.least; t.most = v > t.most ? v : t.most; ++t.n; } };
-const auto mean = [](const Thick& t) { return t.n ? t.sum/(float)t.n : 1.0f; };
+    if (v > 0.0f) {
+        t.sum += v;
+        t.least = v < t.least ? v : t.least;
+        t.most = v > t.most ? v : t.most;
+        ++t.n;
+    }
+};
+const auto mean = [](const Thick& t) { return t.n ? t.sum / (float)t.n : 1.0f; };
 const auto let_go = [&](long long c) { return (kind[c] == FLUID) & (contact[c] == RELEASED); };
 const auto holds = [&](long long c) { return (kind[c] == FLUID) & (contact[c] != RELEASED); };
 for (int i = first; i < last; ++i) {
@@ -103,48 +131,72 @@ for (int i = first; i < last; ++i) {
     float share = inside ? filled(here, 1) : 0.0f, walled = 0.0f;
     bool solid = false, sticks = share == 1.0f && holds(i);
     Thick own = {0.0f, 1e30f, 0.0f, 0};
-    if (VARIES && inside) for (int axis = 0; axis <= planes; ++axis) for (int side = 0; side < 2; ++side) add(own, axis, i + side*step[axis]);
+    if (VARIES && inside)
+        for (int axis = 0; axis <= planes; ++axis)
+            for (int side = 0; side < 2; ++side) add(own, axis, i + side * step[axis]);
     const float thick = mean(own);
-    if (inside) for (int axis = 0; axis <= planes; ++axis) for (int side = 0; side < 2; ++side) {
-        const long long f = i + side*step[axis];
-        if (d[axis][f] <= (float)CLOSE) { solid = true; sticks = sticks && h[axis][f] == 0.0f; }
-    }
+    if (inside)
+        for (int axis = 0; axis <= planes; ++axis)
+            for (int side = 0; side < 2; ++side) {
+                const long long f = i + side * step[axis];
+                if (d[axis][f] <= (float)CLOSE) {
+                    solid = true;
+                    sticks = sticks && h[axis][f] == 0.0f;
+                }
+            }
     if (solid && sticks) {  // and no edge reaches the surface
         walled = 1.0f;
-        for (int e = 0; e < 2*planes - 1; ++e) for (int corner = 0; corner < 4; ++corner) {
-            const long long A = step[e < 2 ? 0 : 1], B = step[e < 1 ? 1 : 2], o = i + (corner & 1)*A + (corner >> 1)*B;
-            const long long cells[4] = {o - A - B, o - A, o - B, o};
-            if (filled(cells, 4) < 1.0f) walled = 0.0f;
-            if (VARIES) for (int f = 0; f < 4; ++f) add(own, f < 2 ? (e < 2 ? 0 : 1) : (e < 1 ? 1 : 2), f < 2 ? o - (f & 1)*B : o - (f & 1)*A);
-        }
-        if (VARIES && own.n) walled = own.most > (float)ALIKE*own.least ? 0.0f : walled*own.least;
+        for (int e = 0; e < 2 * planes - 1; ++e)
+            for (int corner = 0; corner < 4; ++corner) {
+                const long long A = step[e < 2 ? 0 : 1], B = step[e < 1 ? 1 : 2],
+                                o = i + (corner & 1) * A + (corner >> 1) * B;
+                const long long cells[4] = {o - A - B, o - A, o - B, o};
+                if (filled(cells, 4) < 1.0f) walled = 0.0f;
+                if (VARIES)
+                    for (int f = 0; f < 4; ++f)
+                        add(own, f < 2 ? (e < 2 ? 0 : 1) : (e < 1 ? 1 : 2),
+                            f < 2 ? o - (f & 1) * B : o - (f & 1) * A);
+            }
+        if (VARIES && own.n)
+            walled = own.most > (float)ALIKE * own.least ? 0.0f : walled * own.least;
     }
-    cell[i] = scale*(2.0f*share*thick - walled);
-    mixed[i] = scale*walled;
+    cell[i] = scale * (2.0f * share * thick - walled);
+    mixed[i] = scale * walled;
     for (int axis = 0; axis <= planes; ++axis) {
         const long long cells[2] = {i - step[axis], i};
         const int at = axis == 0 ? i : (axis == 1 ? j : k);
-        const bool airy = kind[cells[0]] == AIR && kind[i] == AIR;  // no projection gave it a velocity of its own
+        // no projection gave it a velocity of its own
+        const bool airy = kind[cells[0]] == AIR && kind[i] == AIR;
         volume[axis][i] = inside && at > 1 && !airy ? filled(cells, 2) : 0.0f;
     }
-    for (int e = 0; e < 2*planes - 1; ++e) {
+    for (int e = 0; e < 2 * planes - 1; ++e) {
         const int a = e < 2 ? 0 : 1, b = e < 1 ? 1 : 2;
         const long long A = step[a], B = step[b], cells[4] = {i - A - B, i - A, i - B, i};
         const long long faces[4] = {i, i - B, i, i - A};  // two of a, two of b
         Thick around = {0.0f, 1e30f, 0.0f, 0};
-        if (VARIES) for (int f = 0; f < 4; ++f) add(around, f < 2 ? a : b, faces[f]);
-        float factor = 1.0f; bool wall = false, released = false, held = false;
-        for (int c = 0; c < 4; ++c) { released = released || let_go(cells[c]); held = held || holds(cells[c]); }
+        if (VARIES)
+            for (int f = 0; f < 4; ++f) add(around, f < 2 ? a : b, faces[f]);
+        float factor = 1.0f;
+        bool wall = false, released = false, held = false;
+        for (int c = 0; c < 4; ++c) {
+            released = released || let_go(cells[c]);
+            held = held || holds(cells[c]);
+        }
         for (int f = 0; f < 4; ++f) {
             const int axis = f < 2 ? a : b;
             const long long q = faces[f], p = faces[f ^ 1];  // of one component
             if (!(d[axis][q] <= (float)CLOSE)) continue;
             wall = true;
-            // a link that slip makes longer than 1 pulls less, and so do its products: what is left is a square
-            const float length = d[axis][p] > (float)CLOSE ? (d[axis][p] + h[axis][q])/(d[axis][p] - d[axis][q]) : 1.0f;
-            factor = !(h[axis][q] < INFINITY) ? 0.0f : (length*factor > 1.0f ? 1.0f/length : factor);
+            // a link that slip makes longer than 1 pulls less, and so do its products: what is left
+            // is a square
+            const float length = d[axis][p] > (float)CLOSE
+                                     ? (d[axis][p] + h[axis][q]) / (d[axis][p] - d[axis][q])
+                                     : 1.0f;
+            factor =
+                !(h[axis][q] < INFINITY) ? 0.0f : (length * factor > 1.0f ? 1.0f / length : factor);
         }
-        edge[e][i] = wall && (released || !held) ? 0.0f : factor*scale*mean(around)*filled(cells, 4);
+        edge[e][i] =
+            wall && (released || !held) ? 0.0f : factor * scale * mean(around) * filled(cells, 4);
     }
 }
 
@@ -162,16 +214,33 @@ for (int i = first; i < last; ++i) {
     held[i] = -1.0f;
     if (solid(d, i)) {  // head on where a cell beside it is liquid
         const bool here = kind[i] == FLUID, below = kind[i - sa] == FLUID;
-        const bool holds = (here && contact[i] != RELEASED) || (below && contact[i - sa] != RELEASED) || (!here && !below && h[i] < INFINITY);
+        const bool holds = (here && contact[i] != RELEASED) ||
+                           (below && contact[i - sa] != RELEASED) ||
+                           (!here && !below && h[i] < INFINITY);
         held[i] = holds ? 1.0f : 0.0f;
     }
     if (at == 1 || solid(d, i) || i > nx || j > ny || (deep && k > nz)) continue;
     float free = volume[i], wall = 0.0f;
-    const auto link = [&](long long q, long long c) { if (solid(d, q)) wall += head_on(i, q, c); else free += cell[c]; };
-    const auto side = [&](long long q, float weight) { if (solid(d, q)) wall += beside(i, q, weight); else free += weight; };
-    link(i + sa, i); link(i - sa, i - sa);
-    side(i + sb, xb[i + sb]); side(i - sb, xb[i]);
-    if (deep) { side(i + sc, xc[i + sc]); side(i - sc, xc[i]); }
+    const auto link = [&](long long q, long long c) {
+        if (solid(d, q))
+            wall += head_on(i, q, c);
+        else
+            free += cell[c];
+    };
+    const auto side = [&](long long q, float weight) {
+        if (solid(d, q))
+            wall += beside(i, q, weight);
+        else
+            free += weight;
+    };
+    link(i + sa, i);
+    link(i - sa, i - sa);
+    side(i + sb, xb[i + sb]);
+    side(i - sb, xb[i]);
+    if (deep) {
+        side(i + sc, xc[i + sc]);
+        side(i - sc, xc[i]);
+    }
     drag[i] = wall;
     diagonal[i] = free + wall;
 }
@@ -187,42 +256,81 @@ for (int i = first; i < last; ++i) {
 //   constants  FLUID, SOLID, RELEASED, CLOSE, THETA, ALONG, CUT, MOVING
 #include "viscous_walls"
 double lost = 0, driven = 0, square = 0, large = 0;
-const auto wall_speed = [&](const float* of, long long i) { return MOVING ? (double)of[MOVING ? i : 0] : 0.0; };
-const auto source = [&](long long q, long long s) {  // whether a face is a source's, by the step along its component's axis
-    return ((kind[q] == SOLID) & (base[q] != SOLID)) | ((kind[q - s] == SOLID) & (base[q - s] != SOLID));
+const auto wall_speed = [&](const float* of, long long i) {
+    return MOVING ? (double)of[MOVING ? i : 0] : 0.0;
 };
-const auto met = [&](int i, long long q, int other, int side) {  // the wall's velocity at the end of the link from i to q along an axis
+// whether a face is a source's, by the step along its component's axis
+const auto source = [&](long long q, long long s) {
+    return ((kind[q] == SOLID) & (base[q] != SOLID)) |
+           ((kind[q - s] == SOLID) & (base[q - s] != SOLID));
+};
+// the wall's velocity at the end of the link from i to q along an axis
+const auto met = [&](int i, long long q, int other, int side) {
     if (source(q, sa)) return (double)u[q];
     if (!MOVING || !turn) return wall_speed(own, q);
     double x[3] = {i + before_x - 0.5, j + before_y - 0.5, planes == 2 ? k + before_z - 0.5 : 0.0};
-    x[axis] -= 0.5; x[other] += side*(double)end_of(i, q);
+    x[axis] -= 0.5;
+    x[other] += side * (double)end_of(i, q);
     const int solid = wall[q] > 0 ? wall[q] : 0;
-    const float* row = turn + 9*solid + 3*axis;
-    return dx*(row[0]*x[0] + row[1]*x[1] + row[2]*x[2]) + shift[3*solid + axis];
+    const float* row = turn + 9 * solid + 3 * axis;
+    return dx * (row[0] * x[0] + row[1] * x[1] + row[2] * x[2]) + shift[3 * solid + axis];
 };
-const auto velocity = [&](const float* u, const float* distance, const float* of, long long i, long long s) {
+const auto velocity = [&](const float* u, const float* distance, const float* of, long long i,
+                          long long s) {
     return distance[i] <= (float)CLOSE && !source(i, s) ? wall_speed(of, i) : (double)u[i];
 };
 for (int i = first; i < last; ++i) {
-    if (!(diagonal[i] > 0.0f)) { r[i] = 0.0f; continue; }
+    if (!(diagonal[i] > 0.0f)) {
+        r[i] = 0.0f;
+        continue;
+    }
     const double here = u[i];
     double force = 0.0, power = 0.0;
-    const auto pull = [&](long long q, double weight, int other, int side) { const double w = met(i, q, other, side); force += weight*(w - here); power += weight*(w - here)*w; };
-    const auto link = [&](long long q, long long c, int to) { if (solid(d, q)) pull(q, head_on(i, q, c), axis, to); else force += cell[c]*(u[q] - here); };
-    const auto side = [&](long long q, float weight, int other, int to) { if (solid(d, q)) pull(q, beside(i, q, weight), other, to); else force += weight*(u[q] - here); };
-    const auto mix = [&](const float* v, const float* distance, const float* of, const float* x, long long s) {
-        force -= (x[i] - mixed[i])*velocity(v, distance, of, i, s) - (x[i] - mixed[i - sa])*velocity(v, distance, of, i - sa, s)
-            - (x[i + s] - mixed[i])*velocity(v, distance, of, i + s, s) + (x[i + s] - mixed[i - sa])*velocity(v, distance, of, i + s - sa, s);
+    const auto pull = [&](long long q, double weight, int other, int side) {
+        const double w = met(i, q, other, side);
+        force += weight * (w - here);
+        power += weight * (w - here) * w;
     };
-    link(i + sa, i, 1); link(i - sa, i - sa, -1);
-    side(i + sb, xb[i + sb], first_other, 1); side(i - sb, xb[i], first_other, -1);
+    const auto link = [&](long long q, long long c, int to) {
+        if (solid(d, q))
+            pull(q, head_on(i, q, c), axis, to);
+        else
+            force += cell[c] * (u[q] - here);
+    };
+    const auto side = [&](long long q, float weight, int other, int to) {
+        if (solid(d, q))
+            pull(q, beside(i, q, weight), other, to);
+        else
+            force += weight * (u[q] - here);
+    };
+    const auto mix = [&](const float* v, const float* distance, const float* of, const float* x,
+                         long long s) {
+        force -= (x[i] - mixed[i]) * velocity(v, distance, of, i, s) -
+                 (x[i] - mixed[i - sa]) * velocity(v, distance, of, i - sa, s) -
+                 (x[i + s] - mixed[i]) * velocity(v, distance, of, i + s, s) +
+                 (x[i + s] - mixed[i - sa]) * velocity(v, distance, of, i + s - sa, s);
+    };
+    link(i + sa, i, 1);
+    link(i - sa, i - sa, -1);
+    side(i + sb, xb[i + sb], first_other, 1);
+    side(i - sb, xb[i], first_other, -1);
     mix(ub, db, solid_b, xb, sb);
-    if (deep) { side(i + sc, xc[i + sc], last_other, 1); side(i - sc, xc[i], last_other, -1); mix(uc, dc, solid_c, xc, sc); }
-    const double rest = force - (change ? (double)volume[i]*change[i] : 0.0);
+    if (deep) {
+        side(i + sc, xc[i + sc], last_other, 1);
+        side(i - sc, xc[i], last_other, -1);
+        mix(uc, dc, solid_c, xc, sc);
+    }
+    const double rest = force - (change ? (double)volume[i] * change[i] : 0.0);
     r[i] = (float)rest;
-    square += rest*rest; large += (double)diagonal[i]*diagonal[i]; lost -= here*force; driven += power;
+    square += rest * rest;
+    large += (double)diagonal[i] * diagonal[i];
+    lost -= here * force;
+    driven += power;
 }
-residual = square; taken = lost; given_by_walls = driven; stiff = large;
+residual = square;
+taken = lost;
+given_by_walls = driven;
+stiff = large;
 
 // kernel fluids.viscosity.links: What pulls a component's faces towards solids: each link's
 // weight, or that of a product with a face in the solid, times the velocities of the solid's unit
@@ -234,53 +342,67 @@ residual = square; taken = lost; given_by_walls = driven; stiff = large;
 //   numbers    int axis, planes, before_x, before_y, before_z; float32 dx; int width, from_
 //   constants  FLUID, RELEASED, CLOSE, THETA, ALONG, CUT
 #include "viscous_walls"
-const int begin = entry_rows ? offsets[k*(int)(s1/s2) + j] : 0;
+const int begin = entry_rows ? offsets[k * (int)(s1 / s2) + j] : 0;
 int e = begin;
 const auto owner = [&](const short* walls, long long q, long long s) {  // of a face
-    const int solid = CUT ? walls[CUT ? q : 0] : (index[CUT ? 0 : q] > index[CUT ? 0 : q - s] ? index[CUT ? 0 : q] : index[CUT ? 0 : q - s]);
+    const int solid = CUT ? walls[CUT ? q : 0]
+                          : (index[CUT ? 0 : q] > index[CUT ? 0 : q - s] ? index[CUT ? 0 : q]
+                                                                         : index[CUT ? 0 : q - s]);
     return solid >= 0 ? body[solid] : -1;
 };
 const auto enter = [&](int i, int number, double weight, int along, double x, double y, double z) {
     if (entry_rows) {
-        const double* o = center + 3*number;
-        const double r[3] = {dx*x - o[0], dx*y - o[1], planes == 2 ? dx*z - o[2] : 0.0};
-        double* moves = values + (long long)e*width;
+        const double* o = center + 3 * number;
+        const double r[3] = {dx * x - o[0], dx * y - o[1], planes == 2 ? dx * z - o[2] : 0.0};
+        double* moves = values + (long long)e * width;
         for (int m = 0; m < width; ++m) moves[m] = 0.0;
         moves[along] = weight;
-        const int a1 = (along + 1) % 3, a2 = (along + 2) % 3;  // (w x r) along the axis is w[a1] r[a2] - w[a2] r[a1]
-        if (planes == 1) moves[2] = weight*(along == 0 ? -r[1] : r[0]);
-        else { moves[3 + a1] = weight*r[a2]; moves[3 + a2] = -weight*r[a1]; }
-        entry_rows[e] = from_ + (int)((k*(s1/s2) + j)*s2) + i; blocks[e] = number;
+        // (w x r) along the axis is w[a1] r[a2] - w[a2] r[a1]
+        const int a1 = (along + 1) % 3, a2 = (along + 2) % 3;
+        if (planes == 1)
+            moves[2] = weight * (along == 0 ? -r[1] : r[0]);
+        else {
+            moves[3 + a1] = weight * r[a2];
+            moves[3 + a2] = -weight * r[a1];
+        }
+        entry_rows[e] = from_ + (int)((k * (s1 / s2) + j) * s2) + i;
+        blocks[e] = number;
     }
     ++e;
 };
 for (int i = first; i < last; ++i) {
     if (!(diagonal[i] > 0.0f)) continue;
     const double low[3] = {i + before_x - 0.5, j + before_y - 0.5, k + before_z - 0.5};
-    for (int n = 0; n < 2*planes + 2; ++n) {
-        const int other = n >> 1, to = 2*(n & 1) - 1;
-        const long long q = i + to*step[other];
+    for (int n = 0; n < 2 * planes + 2; ++n) {
+        const int other = n >> 1, to = 2 * (n & 1) - 1;
+        const long long q = i + to * step[other];
         const int number = solid(d, q) ? owner(wall, q, sa) : -1;
         if (number < 0) continue;
         const float* across = other == first_other ? xb : xc;
-        const double weight = other == axis ? head_on(i, q, to > 0 ? i : i - sa) : beside(i, q, across[to > 0 ? i + step[other] : i]);
+        const double weight = other == axis ? head_on(i, q, to > 0 ? i : i - sa)
+                                            : beside(i, q, across[to > 0 ? i + step[other] : i]);
         double x[3] = {low[0], low[1], low[2]};
-        x[axis] -= 0.5; x[other] += to*(double)end_of(i, q);
+        x[axis] -= 0.5;
+        x[other] += to * (double)end_of(i, q);
         if (weight > 0.0) enter(i, number, weight, axis, x[0], x[1], x[2]);
     }
-    for (int n = 0; n < 4*planes; ++n) {
+    for (int n = 0; n < 4 * planes; ++n) {
         const int other = n < 4 ? first_other : last_other, up = n >> 1 & 1, back = n & 1;
-        const float* distance = n < 4 ? db : dc; const short* walls = n < 4 ? wall_b : wall_c; const float* x_ = n < 4 ? xb : xc;
-        const long long q = i + up*step[other] - back*sa;
+        const float* distance = n < 4 ? db : dc;
+        const short* walls = n < 4 ? wall_b : wall_c;
+        const float* x_ = n < 4 ? xb : xc;
+        const long long q = i + up * step[other] - back * sa;
         const int number = distance[q] <= (float)CLOSE ? owner(walls, q, step[other]) : -1;
-        const double weight = (up ? 1.0 : -1.0)*(back ? -1.0 : 1.0)*(x_[i + up*step[other]] - mixed[back ? i - sa : i]);
+        const double weight = (up ? 1.0 : -1.0) * (back ? -1.0 : 1.0) *
+                              (x_[i + up * step[other]] - mixed[back ? i - sa : i]);
         if (number < 0 || weight == 0.0) continue;
         double x[3] = {low[0], low[1], low[2]};
-        x[axis] -= back; x[other] += up - 0.5;
+        x[axis] -= back;
+        x[other] += up - 0.5;
         enter(i, number, weight, other, x[0], x[1], x[2]);
     }
 }
-counts[k*(int)(s1/s2) + j] = e - begin;
+counts[k * (int)(s1 / s2) + j] = e - begin;
 
 // kernel fluids.viscosity.cover: Faces in a wall that the pressure has moved, as a part of them is
 // open, take the velocity of the wall that holds them
@@ -291,7 +413,8 @@ counts[k*(int)(s1/s2) + j] = e - begin;
 const long long step = axis == 0 ? 1 : (axis == 1 ? s2 : s1);
 SIMD for (int i = first; i < last; ++i) {
     const float speed = MOVING ? own[MOVING ? i : 0] : 0.0f;
-    const bool source = ((kind[i] == SOLID) & (base[i] != SOLID)) | ((kind[i - step] == SOLID) & (base[i - step] != SOLID));
+    const bool source = ((kind[i] == SOLID) & (base[i] != SOLID)) |
+                        ((kind[i - step] == SOLID) & (base[i - step] != SOLID));
     const bool stays = (hold[i] > 0.0f) & (h[i] < INFINITY) & !source;
     total[i] = stays ? speed - u[i] : total[i];
 }
@@ -299,7 +422,10 @@ SIMD for (int i = first; i < last; ++i) {
 // kernel fluids.viscosity.add: What a solve has found changes a component; the total of it
 //   compute    float32
 //   box        float32 u, total, more
-SIMD for (int i = first; i < last; ++i) { u[i] += more[i]; total[i] += more[i]; }
+SIMD for (int i = first; i < last; ++i) {
+    u[i] += more[i];
+    total[i] += more[i];
+}
 
 // kernel fluids.viscosity.sum: A kept velocity and what viscosity has changed
 //   compute    float32

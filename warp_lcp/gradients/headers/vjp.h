@@ -11,9 +11,14 @@
 T square = 0, most = 0;
 with_bounds([&](auto lower, auto upper) {
     for (int k = 0; k < n; ++k) {  // a largest one is not vectorized
-        const T a = unit*(T)d[k], b = a < 0 ? -a : a, e = b == 0 ? (T)1 : b;
-        const T r0 = natural_residual(y[k], e*(x[k] - lower(k)), e*(x[k] - upper(k))), r = unknown[k] == 1 ? r0 : (T)0;
-        const T size = r < 0 ? -r : r; square += r*r; most = most < size ? size : most; } });
+        const T a = unit * (T)d[k], b = a < 0 ? -a : a, e = b == 0 ? (T)1 : b;
+        const T r0 = natural_residual(y[k], e * (x[k] - lower(k)), e * (x[k] - upper(k))),
+                r = unknown[k] == 1 ? r0 : (T)0;
+        const T size = r < 0 ? -r : r;
+        square += r * r;
+        most = most < size ? size : most;
+    }
+});
 
 // kernel gradients.sets: Free unknowns: those that are off their bounds by more than the tolerance
 // and what rounding leaves. `cells`, a copy of `unknown`, is 0 where one is held, by the `side` 1,
@@ -28,13 +33,21 @@ with_bounds([&](auto lower, auto upper) {
 T free = 0, degenerate = 0, wrong = 0;
 with_bounds([&](auto lower, auto upper) {
     SIMD for (int k = 0; k < n; ++k) {
-        const T a = unit*(T)d[k], f = a < 0 ? -a : a, e = f == 0 ? (T)1 : f, moved = e*x[k], below = x[k] - lower(k), above = upper(k) - x[k];
-        const T t = tolerance + rounding*((moved < 0 ? -moved : moved)*2 + (b[k] < 0 ? -b[k] : b[k])), size = y[k] < 0 ? -y[k] : y[k];
-        const bool inside = unknown[k] == 1, held = inside & ((e*below <= t) | (e*above <= t)), now = inside & !held;
+        const T a = unit * (T)d[k], f = a < 0 ? -a : a, e = f == 0 ? (T)1 : f, moved = e * x[k],
+                below = x[k] - lower(k), above = upper(k) - x[k];
+        const T t = tolerance +
+                    rounding * ((moved < 0 ? -moved : moved) * 2 + (b[k] < 0 ? -b[k] : b[k])),
+                size = y[k] < 0 ? -y[k] : y[k];
+        const bool inside = unknown[k] == 1, held = inside & ((e * below <= t) | (e * above <= t)),
+                   now = inside & !held;
         const bool low = (below < above) | ((below == above) & (y[k] >= 0));
-        free += now ? (T)1 : (T)0; degenerate += (held & (size <= t) & (lower(k) < upper(k))) ? (T)1 : (T)0;
+        free += now ? (T)1 : (T)0;
+        degenerate += (held & (size <= t) & (lower(k) < upper(k))) ? (T)1 : (T)0;
         wrong += (inside & !(g[k] - g[k] == 0)) ? (T)1 : (T)0;
-        side[k] = held ? (low ? (signed char)1 : (signed char)2) : (signed char)0; cells[k] = held ? (signed char)0 : unknown[k]; } });
+        side[k] = held ? (low ? (signed char)1 : (signed char)2) : (signed char)0;
+        cells[k] = held ? (signed char)0 : unknown[k];
+    }
+});
 
 // kernel gradients.held: Where the lower bound holds an unknown, z stays, for an upper bound it
 // goes to `upper`; the rest is 0. And both sums
@@ -45,6 +58,8 @@ with_bounds([&](auto lower, auto upper) {
 T of_lower = 0, of_upper = 0;
 SIMD for (int k = 0; k < n; ++k) {
     const T at_l = side[k] == 1 ? z[k] : (T)0, at_u = side[k] == 2 ? z[k] : (T)0;
-    of_lower += at_l; of_upper += at_u;
+    of_lower += at_l;
+    of_upper += at_u;
     if (upper) upper[k] = at_u;
-    z[k] = at_l; }
+    z[k] = at_l;
+}

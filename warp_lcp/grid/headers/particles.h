@@ -3,33 +3,51 @@
 // snippet origin: cells of a larger grid before the first one of this, and a particle's grid
 // coordinate
 #include "snippets.h:grid_coordinate"
-const int origin[3] = {before_x, before_y, before_z};  // cells of a larger grid before the first one of this
+// cells of a larger grid before the first one of this
+const int origin[3] = {before_x, before_y, before_z};
 
 // snippet floor: The cell that a coordinate along an axis lies in, also where those of a part of a
 // larger grid are below 0.
-auto floor_of = [=](T x, int axis) { const int from = axis == 0 ? before_x : axis == 1 ? before_y : before_z; return (int)(x - (T)from) + from; };
+auto floor_of = [=](T x, int axis) {
+    const int from = axis == 0 ? before_x : axis == 1 ? before_y : before_z;
+    return (int)(x - (T)from) + from;
+};
 
 // snippet nodes: i, j, k: the lowest of the nodes around a particle; f: how far it lies beyond
 // them, in cells
 #include "snippets.h:grid_coordinate"
-const T hx = axis == 0 ? (T)0 : (T)0.5, hy = axis == 1 ? (T)0 : (T)0.5, hz = axis == 2 ? (T)0 : (T)0.5;
-const T lx = axis == 0 ? (T)EDGE : (T)0, ly = axis == 1 ? (T)EDGE : (T)0, lz = axis == 2 ? (T)EDGE : (T)0;
+const T hx = axis == 0 ? (T)0 : (T)0.5, hy = axis == 1 ? (T)0 : (T)0.5,
+        hz = axis == 2 ? (T)0 : (T)0.5;
+const T lx = axis == 0 ? (T)EDGE : (T)0, ly = axis == 1 ? (T)EDGE : (T)0,
+        lz = axis == 2 ? (T)EDGE : (T)0;
 auto nodes = [&](long long p, int& i, int& j, int& k, T& fx, T& fy, T& fz) {
     EXACT_MATH
-    const T x = grid_coordinate(position[3*p], before_x) - hx, y = grid_coordinate(position[3*p + 1], before_y) - hy;
-    const T z = planes == 2 ? grid_coordinate(position[3*p + 2], before_z) - hz : (T)1;
-    i = (int)x; j = (int)y; k = (int)z;
-    fx = x - (T)i; fy = y - (T)j; fz = z - (T)k;
-    fx = fx < lx ? lx : fx; fy = fy < ly ? ly : fy; fz = fz < lz ? lz : fz;
-    fx = fx > 1 - lx ? 1 - lx : fx; fy = fy > 1 - ly ? 1 - ly : fy; fz = fz > 1 - lz ? 1 - lz : fz;
+    const T x = grid_coordinate(position[3 * p], before_x) - hx,
+            y = grid_coordinate(position[3 * p + 1], before_y) - hy;
+    const T z = planes == 2 ? grid_coordinate(position[3 * p + 2], before_z) - hz : (T)1;
+    i = (int)x;
+    j = (int)y;
+    k = (int)z;
+    fx = x - (T)i;
+    fy = y - (T)j;
+    fz = z - (T)k;
+    fx = fx < lx ? lx : fx;
+    fy = fy < ly ? ly : fy;
+    fz = fz < lz ? lz : fz;
+    fx = fx > 1 - lx ? 1 - lx : fx;
+    fy = fy > 1 - ly ? 1 - ly : fy;
+    fz = fz > 1 - lz ? 1 - lz : fz;
 };
 
 // snippet weigh: The cell c of a coordinate and the weights of cells c - 1, c, c + 1.
 auto weigh = [&](T x, int count, T* w) {
     EXACT_MATH
-    const T from = x > 1 ? x : (T)1, e = count; const int c = (int)(from < e ? from : e);
+    const T from = x > 1 ? x : (T)1, e = count;
+    const int c = (int)(from < e ? from : e);
     const T f = from - (T)c - (T)0.5, a = (T)0.5 - f, b = (T)0.5 + f;
-    w[0] = (T)0.5*a*a; w[1] = fused(-f, f, (T)0.75); w[2] = (T)0.5*b*b;
+    w[0] = (T)0.5 * a * a;
+    w[1] = fused(-f, f, (T)0.75);
+    w[2] = (T)0.5 * b * b;
     return c;
 };
 
@@ -44,7 +62,7 @@ auto add = [](auto& element, auto value) {
 };
 auto add_product = [&](auto& element, auto a, auto b) {
 #ifdef __CUDA_ARCH__
-    atomicAdd(&element, a*b);
+    atomicAdd(&element, a * b);
 #else
     element = fused(a, b, element);
 #endif
@@ -64,20 +82,35 @@ const auto each_share = [&](auto visit) {
     visit((long long)P.first, (long long)P.first + n, all);
 #else
     const auto cut = [&](int share) {
-        const long long all = (count + chunk - 1)/chunk; int at = 0;
+        const long long all = (count + chunk - 1) / chunk;
+        int at = 0;
         for (int s = 1; touched && s <= share; ++s) {
-            const long long c = s*all/shares; const int middle = (touched[2*c] + touched[2*c + 1])/2;
-            at = at < middle ? middle : at; }
-        return at; };
+            const long long c = s * all / shares;
+            const int middle = (touched[2 * c] + touched[2 * c + 1]) / 2;
+            at = at < middle ? middle : at;
+        }
+        return at;
+    };
     const int from = cut(P.first), to = P.first + n < shares ? cut(P.first + n) : 1 << 30;
     const auto ours = [=](int plane) { return plane >= from && plane < to; };
-    const int whole[2] = {0, (int)count}, *run = runs ? runs : whole, *end = run + (runs ? given.runs.shape[0] : 2);
-    if (!touched) { for (; run < end; run += 2) visit((long long)run[0], (long long)run[1], all); return; }
-    if (runs) { for (; run < end; run += 2) visit((long long)run[0], (long long)run[1], ours); return; }
-    for (long long c = 0; c*chunk < count; ++c) {
-        const int low = touched[2*c], high = touched[2*c + 1]; const long long begin = c*chunk, end = begin + chunk < count ? begin + chunk : count;
-        if (low >= from && high <= to) visit(begin, end, all);
-        else if (low < to && high > from) visit(begin, end, ours); }
+    const int whole[2] = {0, (int)count}, *run = runs ? runs : whole,
+              *end = run + (runs ? given.runs.shape[0] : 2);
+    if (!touched) {
+        for (; run < end; run += 2) visit((long long)run[0], (long long)run[1], all);
+        return;
+    }
+    if (runs) {
+        for (; run < end; run += 2) visit((long long)run[0], (long long)run[1], ours);
+        return;
+    }
+    for (long long c = 0; c * chunk < count; ++c) {
+        const int low = touched[2 * c], high = touched[2 * c + 1];
+        const long long begin = c * chunk, end = begin + chunk < count ? begin + chunk : count;
+        if (low >= from && high <= to)
+            visit(begin, end, all);
+        else if (low < to && high > from)
+            visit(begin, end, ours);
+    }
 #endif
 };
 
@@ -85,8 +118,10 @@ const auto each_share = [&](auto visit) {
 // this is a part of one, from `first_cell` to `nx`, `ny`, `nz`; a stored field begins `back`
 // elements before the first one of the larger grid's. So coordinates are rounded alike in all
 // parts.
-const int nx = SHAPE[2] - 2 + origin[0], ny = SHAPE[1] - 2 + origin[1], nz = SHAPE[0] - 2 + origin[2];
-const long long s2 = SHAPE[2], s1 = s2*SHAPE[1], up = planes == 2 ? s1 : 0, back = origin[2]*s1 + origin[1]*s2 + origin[0];
+const int nx = SHAPE[2] - 2 + origin[0], ny = SHAPE[1] - 2 + origin[1],
+          nz = SHAPE[0] - 2 + origin[2];
+const long long s2 = SHAPE[2], s1 = s2 * SHAPE[1], up = planes == 2 ? s1 : 0,
+                back = origin[2] * s1 + origin[1] * s2 + origin[0];
 const int first_cell[3] = {1 + origin[0], 1 + origin[1], 1 + origin[2]};
 #include "floor"
 const T lx = first_cell[0], ly = first_cell[1], lz = first_cell[2];
@@ -108,21 +143,36 @@ auto sample = [&](const Block& at, Block& result, int n) {
     const T ex = nx + 1, ey = ny + 1, ez = nz + 1;
     for (int axis = 0; axis <= planes; ++axis) {
         const T* g = (axis == 0 ? given.u.data : (axis == 1 ? given.v.data : given.w.data)) - back;
-        const T hx = axis == 0 ? (T)0 : (T)0.5, hy = axis == 1 ? (T)0 : (T)0.5, hz = axis == 2 ? (T)0 : (T)0.5;
+        const T hx = axis == 0 ? (T)0 : (T)0.5, hy = axis == 1 ? (T)0 : (T)0.5,
+                hz = axis == 2 ? (T)0 : (T)0.5;
         SIMD for (int m = 0; m < n; ++m) {
             T x = at[0][m], y = at[1][m], z = at[2][m];
-            if (ENDLESS & 1) { x = x < 1 ? x + (T)nx : x; x = x < ex ? x : x - (T)nx; }
-            if (ENDLESS & 4) { z = z < 1 ? z + (T)nz : z; z = z < ez ? z : z - (T)nz; }
-            x = x > lx ? x : lx; y = y > ly ? y : ly; z = z > lz ? z : lz;
-            x = (x < ex ? x : ex) - hx; y = (y < ey ? y : ey) - hy; z = planes == 2 ? (z < ez ? z : ez) - hz : (T)1;
+            if (ENDLESS & 1) {
+                x = x < 1 ? x + (T)nx : x;
+                x = x < ex ? x : x - (T)nx;
+            }
+            if (ENDLESS & 4) {
+                z = z < 1 ? z + (T)nz : z;
+                z = z < ez ? z : z - (T)nz;
+            }
+            x = x > lx ? x : lx;
+            y = y > ly ? y : ly;
+            z = z > lz ? z : lz;
+            x = (x < ex ? x : ex) - hx;
+            y = (y < ey ? y : ey) - hy;
+            z = planes == 2 ? (z < ez ? z : ez) - hz : (T)1;
             int i = floor_of(x, 0), j = floor_of(y, 1), k = floor_of(z, 2);
-            i = i < nx ? i : nx; j = j < ny ? j : ny; k = k < nz ? k : nz;  // the next node is stored, too
+            // the next node is stored, too
+            i = i < nx ? i : nx;
+            j = j < ny ? j : ny;
+            k = k < nz ? k : nz;
             const T fx = x - (T)i, fy = y - (T)j, fz = z - (T)k;
-            const T* a = g + (k*s1 + j*s2 + i); const T* b = a + up;
-            const T a0 = a[0] + fx*(a[1] - a[0]), a1 = a[s2] + fx*(a[s2 + 1] - a[s2]);
-            const T b0 = b[0] + fx*(b[1] - b[0]), b1 = b[s2] + fx*(b[s2 + 1] - b[s2]);
-            const T low = a0 + fy*(a1 - a0), high = b0 + fy*(b1 - b0);
-            result[axis][m] = low + fz*(high - low);
+            const T* a = g + (k * s1 + j * s2 + i);
+            const T* b = a + up;
+            const T a0 = a[0] + fx * (a[1] - a[0]), a1 = a[s2] + fx * (a[s2 + 1] - a[s2]);
+            const T b0 = b[0] + fx * (b[1] - b[0]), b1 = b[s2] + fx * (b[s2 + 1] - b[s2]);
+            const T low = a0 + fy * (a1 - a0), high = b0 + fy * (b1 - b0);
+            result[axis][m] = low + fz * (high - low);
         }
     }
 };
@@ -138,10 +188,13 @@ const T* position = (const T*)given.position.data + (planes == 2 ? 2 : 1);
 const int before = planes == 2 ? before_z : before_y;
 T low = (T)1e9, high = (T)-1e9;
 SIMD for (int p = first; p < last; ++p) {
-    const T x = grid_coordinate(position[3*(long long)p], before), from = x > (T)-1e6 ? x : (T)-1e6, at = from < (T)1e6 ? from : (T)1e6;
-    low = at < low ? at : low; high = at > high ? at : high;
+    const T x = grid_coordinate(position[3 * (long long)p], before),
+            from = x > (T)-1e6 ? x : (T)-1e6, at = from < (T)1e6 ? from : (T)1e6;
+    low = at < low ? at : low;
+    high = at > high ? at : high;
 }
-touched[2*c_] = (int)low - 1; touched[2*c_ + 1] = (int)high + 2;
+touched[2 * c_] = (int)low - 1;
+touched[2 * c_ + 1] = (int)high + 2;
 
 // kernel warp_lcp.grid.particles.number: Number the stored cell that each particle lies in; in 2-D
 // its plane is k = 1 whatever z is
@@ -151,12 +204,17 @@ touched[2*c_] = (int)low - 1; touched[2*c_ + 1] = (int)high + 2;
 //   numbers    int planes; float32 dx, inverse_dx; int before_x, before_y, before_z, nx, ny, nz
 #include "origin"
 const T* position = (const T*)given.position.data;
-auto cell_of = [](T x, int count) { x = x > 1 ? x : (T)1; const T e = count; return (int)(x < e ? x : e); };
+auto cell_of = [](T x, int count) {
+    x = x > 1 ? x : (T)1;
+    const T e = count;
+    return (int)(x < e ? x : e);
+};
 SIMD for (int p = first; p < last; ++p) {
-    const long long q = 3*(long long)p;
-    const int i = cell_of(grid_coordinate(position[q], origin[0]), nx), j = cell_of(grid_coordinate(position[q + 1], origin[1]), ny);
+    const long long q = 3 * (long long)p;
+    const int i = cell_of(grid_coordinate(position[q], origin[0]), nx),
+              j = cell_of(grid_coordinate(position[q + 1], origin[1]), ny);
     const int k = planes == 2 ? cell_of(grid_coordinate(position[q + 2], origin[2]), nz) : 1;
-    key[p] = (k*(ny + 2) + j)*(nx + 2) + i;
+    key[p] = (k * (ny + 2) + j) * (nx + 2) + i;
 }
 
 // kernel warp_lcp.grid.particles.total: Add up particles: |v|^2, x, bad x and v, v; the largest
@@ -172,45 +230,82 @@ enum { LANES = 1 };
 #else
 enum { LANES = 16 };
 #endif
-const T* position = (const T*)given.position.data; const T* velocity = (const T*)given.velocity.data;
+const T* position = (const T*)given.position.data;
+const T* velocity = (const T*)given.velocity.data;
 #ifdef __CUDA_ARCH__
 const int begin = c_, end = L.nx, stride = L.chunks;
 #else
 const int begin = first, end = last, stride = LANES;
 #endif
-double squares[LANES], sum[3][LANES], way[3][LANES]; T low[3][LANES], high[3][LANES], fastest[LANES]; int bad_x[LANES], bad_v[LANES];
+double squares[LANES], sum[3][LANES], way[3][LANES];
+T low[3][LANES], high[3][LANES], fastest[LANES];
+int bad_x[LANES], bad_v[LANES];
 for (int m = 0; m < LANES; ++m) {
-    squares[m] = 0; fastest[m] = 0; bad_x[m] = 0; bad_v[m] = 0;
-    for (int d = 0; d < 3; ++d) { sum[d][m] = way[d][m] = 0; low[d][m] = high[d][m] = position[3*(long long)begin + d]; }
+    squares[m] = 0;
+    fastest[m] = 0;
+    bad_x[m] = 0;
+    bad_v[m] = 0;
+    for (int d = 0; d < 3; ++d) {
+        sum[d][m] = way[d][m] = 0;
+        low[d][m] = high[d][m] = position[3 * (long long)begin + d];
+    }
 }
 for (int start = begin; start < end; start += stride) {
     const int n = end - start < LANES ? end - start : (int)LANES;
-    const T* X = position + 3*(long long)start; const T* V = velocity + 3*(long long)start;
+    const T* X = position + 3 * (long long)start;
+    const T* V = velocity + 3 * (long long)start;
     SIMD for (int m = 0; m < n; ++m) {
-        const T x = X[3*m], y = X[3*m + 1], z = X[3*m + 2], u = V[3*m], v = V[3*m + 1], w = V[3*m + 2];
-        const T speed = u*u + v*v + w*w, most = (T)3.4028234e38;
-        squares[m] += (double)speed; sum[0][m] += (double)x; sum[1][m] += (double)y; sum[2][m] += (double)z;
-        way[0][m] += (double)u; way[1][m] += (double)v; way[2][m] += (double)w;
-        low[0][m] = x < low[0][m] ? x : low[0][m]; high[0][m] = x > high[0][m] ? x : high[0][m];
-        low[1][m] = y < low[1][m] ? y : low[1][m]; high[1][m] = y > high[1][m] ? y : high[1][m];
-        low[2][m] = z < low[2][m] ? z : low[2][m]; high[2][m] = z > high[2][m] ? z : high[2][m];
+        const T x = X[3 * m], y = X[3 * m + 1], z = X[3 * m + 2], u = V[3 * m], v = V[3 * m + 1],
+                w = V[3 * m + 2];
+        const T speed = u * u + v * v + w * w, most = (T)3.4028234e38;
+        squares[m] += (double)speed;
+        sum[0][m] += (double)x;
+        sum[1][m] += (double)y;
+        sum[2][m] += (double)z;
+        way[0][m] += (double)u;
+        way[1][m] += (double)v;
+        way[2][m] += (double)w;
+        low[0][m] = x < low[0][m] ? x : low[0][m];
+        high[0][m] = x > high[0][m] ? x : high[0][m];
+        low[1][m] = y < low[1][m] ? y : low[1][m];
+        high[1][m] = y > high[1][m] ? y : high[1][m];
+        low[2][m] = z < low[2][m] ? z : low[2][m];
+        high[2][m] = z > high[2][m] ? z : high[2][m];
         fastest[m] = speed > fastest[m] ? speed : fastest[m];
         bad_v[m] += !(speed <= most);
-        const int fine = (int)(x <= most) & (int)(x >= -most) & (int)(y <= most) & (int)(y >= -most);
+        const int fine =
+            (int)(x <= most) & (int)(x >= -most) & (int)(y <= most) & (int)(y >= -most);
         bad_x[m] += !(fine & (int)(z <= most) & (int)(z >= -most));
     }
 }
 for (int m = 1; m < LANES; ++m) {
-    squares[0] += squares[m]; bad_x[0] += bad_x[m]; bad_v[0] += bad_v[m];
+    squares[0] += squares[m];
+    bad_x[0] += bad_x[m];
+    bad_v[0] += bad_v[m];
     fastest[0] = fastest[m] > fastest[0] ? fastest[m] : fastest[0];
     for (int d = 0; d < 3; ++d) {
-        sum[d][0] += sum[d][m]; way[d][0] += way[d][m];
-        low[d][0] = low[d][m] < low[d][0] ? low[d][m] : low[d][0]; high[d][0] = high[d][m] > high[d][0] ? high[d][m] : high[d][0];
+        sum[d][0] += sum[d][m];
+        way[d][0] += way[d][m];
+        low[d][0] = low[d][m] < low[d][0] ? low[d][m] : low[d][0];
+        high[d][0] = high[d][m] > high[d][0] ? high[d][m] : high[d][0];
     }
 }
-energy = squares[0]; top = fastest[0]; lost = bad_x[0]; wild = bad_v[0];
-x = sum[0][0]; y = sum[1][0]; z = sum[2][0]; u = way[0][0]; v = way[1][0]; w = way[2][0];
-high_x = high[0][0]; high_y = high[1][0]; high_z = high[2][0]; low_x = -low[0][0]; low_y = -low[1][0]; low_z = -low[2][0];
+energy = squares[0];
+top = fastest[0];
+lost = bad_x[0];
+wild = bad_v[0];
+x = sum[0][0];
+y = sum[1][0];
+z = sum[2][0];
+u = way[0][0];
+v = way[1][0];
+w = way[2][0];
+high_x = high[0][0];
+high_y = high[1][0];
+high_z = high[2][0];
+low_x = -low[0][0];
+low_y = -low[1][0];
+low_z = -low[2][0];
 
 // kernel warp_lcp.grid.particles.add_in_order: Add up the sums of threads in the order of the
 // threads, a column each; of the last columns take the largest
@@ -219,11 +314,16 @@ high_x = high[0][0]; high_y = high[1][0]; high_z = high[2][0]; low_x = -low[0][0
 //   numbers    int places_of_sums, sums_
 for (int column = P.first; column < P.first + n; ++column) {
     EXACT_MATH
-    const double* found = partials + column*(long long)places_of_sums; double s = found[0];
+    const double* found = partials + column * (long long)places_of_sums;
+    double s = found[0];
     for (int t = 1; t < places_of_sums; ++t) {
-        if (column < sums_) s += found[t];
-        else s = found[t] > s || found[t] != found[t] ? found[t] : s; }
-    results[column] = s; }
+        if (column < sums_)
+            s += found[t];
+        else
+            s = found[t] > s || found[t] != found[t] ? found[t] : s;
+    }
+    results[column] = s;
+}
 
 // kernel warp_lcp.grid.particles.close_ranks: Remove the particles with a mark, in place; the
 // others keep their order. Count those with the mark 1, and those with another
@@ -231,16 +331,24 @@ for (int column = P.first; column < P.first + n; ++column) {
 //   whole      int32 marks; vec3 position, velocity, affine_0?, affine_1?, affine_2?, kept?
 //   box        int32 removed
 //   numbers    int count
-float* const columns[] = {(float*)given.position.data, (float*)given.velocity.data, (float*)given.affine_0.data,
-                          (float*)given.affine_1.data, (float*)given.affine_2.data, (float*)given.kept.data};
+float* const columns[] = {(float*)given.position.data, (float*)given.velocity.data,
+                          (float*)given.affine_0.data, (float*)given.affine_1.data,
+                          (float*)given.affine_2.data, (float*)given.kept.data};
 int counts[2] = {0, 0}, to = 0;
 while (to < count && marks[to] == 0) ++to;  // nothing moves before the first that goes
 for (int p = to; p < count; ++p) {
-    if (marks[p] != 0) { ++counts[marks[p] != 1]; continue; }
+    if (marks[p] != 0) {
+        ++counts[marks[p] != 1];
+        continue;
+    }
     for (float* column : columns)
-        if (column) for (int d = 0; d < 3; ++d) column[3*(long long)to + d] = column[3*(long long)p + d];
-    ++to; }
-removed[0] = counts[0]; removed[1] = counts[1];
+        if (column)
+            for (int d = 0; d < 3; ++d)
+                column[3 * (long long)to + d] = column[3 * (long long)p + d];
+    ++to;
+}
+removed[0] = counts[0];
+removed[1] = counts[1];
 
 // kernel warp_lcp.grid.particles.sort_count: Count how many keys of a piece have each digit
 //   compute    float32
@@ -248,9 +356,9 @@ removed[0] = counts[0]; removed[1] = counts[1];
 //   box        int32 key
 //   numbers    int shift, digits
 //   constants  APART
-int* mine = counts + (long long)c_*(digits + APART);
+int* mine = counts + (long long)c_ * (digits + APART);
 for (int d = 0; d < digits; ++d) mine[d] = 0;
-for (int p = first; p < last; ++p) ++mine[key[p] >> shift & (digits - 1)];
+for (int p = first; p < last; ++p) ++mine[key[p] >> shift&(digits - 1)];
 
 // kernel warp_lcp.grid.particles.sort_begin: Find where the keys of each digit and piece begin:
 // those of smaller digits are before them, and those of the pieces before
@@ -261,8 +369,11 @@ for (int p = first; p < last; ++p) ++mine[key[p] >> shift & (digits - 1)];
 int at = 0;
 for (int d = 0; d < digits; ++d)
     for (int c = 0; c < pieces; ++c) {
-        int* here = counts + (long long)c*(digits + APART) + d; const int many = *here;
-        *here = at; at += many; }
+        int* here = counts + (long long)c * (digits + APART) + d;
+        const int many = *here;
+        *here = at;
+        at += many;
+    }
 
 // kernel warp_lcp.grid.particles.sort_place: Put the keys of a piece, and where they were at first,
 // to the place of their digit; those of one digit keep their order
@@ -271,7 +382,9 @@ for (int d = 0; d < digits; ++d)
 //   box        int32 key
 //   numbers    int shift, digits
 //   constants  APART
-int* next = counts + (long long)c_*(digits + APART);
+int* next = counts + (long long)c_ * (digits + APART);
 for (int p = first; p < last; ++p) {
     const int to = next[key[p] >> shift & (digits - 1)]++;
-    sorted[to] = key[p]; moved[to] = order ? order[p] : p; }
+    sorted[to] = key[p];
+    moved[to] = order ? order[p] : p;
+}

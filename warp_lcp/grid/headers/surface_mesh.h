@@ -7,21 +7,25 @@
 //   box        float32 out
 //   numbers    int planes, parts
 const int ny = given.distance.shape[1], nx = given.distance.shape[2];
-const long long s2 = nx, s1 = s2*ny;
-const float scale = (float)parts, step = 1.0f/scale;
-auto cell = [&](int fine, float& f) {  // the stored cell that a lattice cell's center lies in, and where in it
-    const float x = ((float)fine - 0.5f)*step + 1.0f; const int c = (int)x;
+const long long s2 = nx, s1 = s2 * ny;
+const float scale = (float)parts, step = 1.0f / scale;
+// the stored cell that a lattice cell's center lies in, and where in it
+auto cell = [&](int fine, float& f) {
+    const float x = ((float)fine - 0.5f) * step + 1.0f;
+    const int c = (int)x;
     f = x - (float)c;
     return c;
 };
 float fx, fy, fz = 0;
 const int cy = cell(j, fy), cz = planes == 2 ? cell(k, fz) : 1;
-const float* d = distance + cz*s1 + cy*s2; const long long up = planes == 2 ? s1 : 0;
+const float* d = distance + cz * s1 + cy * s2;
+const long long up = planes == 2 ? s1 : 0;
 for (int i = first; i < last; ++i) {
     const int c = cell(i, fx);
-    auto along = [&](const float* row) { return row[c] + fx*(row[c + 1] - row[c]); };
-    const float low = along(d) + fy*(along(d + s2) - along(d)), high = along(d + up) + fy*(along(d + up + s2) - along(d + up));
-    out[i] = scale*(low + fz*(high - low));
+    auto along = [&](const float* row) { return row[c] + fx * (row[c + 1] - row[c]); };
+    const float low = along(d) + fy * (along(d + s2) - along(d)),
+                high = along(d + up) + fy * (along(d + up + s2) - along(d + up));
+    out[i] = scale * (low + fz * (high - low));
 }
 
 // kernel warp_lcp.grid.surface_mesh.boost: Add the kernels of particles that have few others
@@ -39,24 +43,28 @@ for (int i = first; i < last; ++i) {
 #include "particles.h:add"
 const T* position = (const T*)given.position.data;
 const int nx = given.thin.shape[2] - 2, ny = given.thin.shape[1] - 2, nz = given.thin.shape[0] - 2;
-const long long s2 = nx + 2, s1 = s2*(ny + 2);
+const long long s2 = nx + 2, s1 = s2 * (ny + 2);
 for (long long p = first; p < last; ++p) {
     auto cell = [&](int axis, int n) {
-        const T x = grid_coordinate(position[3*p + axis], origin[axis]), from = x > 1 ? x : (T)1, e = n; return (int)(from < e ? from : e);
+        const T x = grid_coordinate(position[3 * p + axis], origin[axis]), from = x > 1 ? x : (T)1,
+                e = n;
+        return (int)(from < e ? from : e);
     };
     const int i = cell(0, nx), j = cell(1, ny), k = planes == 2 ? cell(2, nz) : 1;
-    const long long at = k*s1 + j*s2 + i;
+    const long long at = k * s1 + j * s2 + i;
     T share = smooth[at];
     if (capacity) share /= capacity[at] > (T)LEAST_OPEN ? capacity[at] : (T)LEAST_OPEN;
     if (share >= (T)THIN) continue;
-    const T wanted = gain*((T)pow((T)THIN/(share > (T)1e-3 ? share : (T)1e-3), (T)POWER) - 1);
-    const T boost = each*(wanted < most ? wanted : most);
+    const T wanted = gain * ((T)pow((T)THIN / (share > (T)1e-3 ? share : (T)1e-3), (T)POWER) - 1);
+    const T boost = each * (wanted < most ? wanted : most);
     T wx[3], wy[3], wz[3] = {0, 1, 0};
-    weigh(grid_coordinate(position[3*p], origin[0]), nx, wx);
-    weigh(grid_coordinate(position[3*p + 1], origin[1]), ny, wy);
-    if (planes == 2) weigh(grid_coordinate(position[3*p + 2], origin[2]), nz, wz);
-    for (int c = 2 - planes; c <= planes; ++c) for (int b = 0; b < 3; ++b) for (int a = 0; a < 3; ++a)
-        add(thin[at + (c - 1)*s1 + (b - 1)*s2 + a - 1], boost*wz[c]*wy[b]*wx[a]);
+    weigh(grid_coordinate(position[3 * p], origin[0]), nx, wx);
+    weigh(grid_coordinate(position[3 * p + 1], origin[1]), ny, wy);
+    if (planes == 2) weigh(grid_coordinate(position[3 * p + 2], origin[2]), nz, wz);
+    for (int c = 2 - planes; c <= planes; ++c)
+        for (int b = 0; b < 3; ++b)
+            for (int a = 0; a < 3; ++a)
+                add(thin[at + (c - 1) * s1 + (b - 1) * s2 + a - 1], boost * wz[c] * wy[b] * wx[a]);
 }
 
 // kernel warp_lcp.grid.surface_mesh.carve: Take what lies inside solids away from the liquid
@@ -73,7 +81,7 @@ SIMD for (int i = first; i < last; ++i) phi[i] = phi[i] > -room[i] ? phi[i] : -r
 //   numbers    int planes; float32 spread
 //   constants  LEAST_OPEN
 const int nx = given.phi.shape[2] - 2, ny = given.phi.shape[1] - 2, nz = given.phi.shape[0] - 2;
-const float scale = -1.2533141f*spread;  // sqrt(pi / 2)
+const float scale = -1.2533141f * spread;  // sqrt(pi / 2)
 const bool beyond = j == 0 || j > ny || (planes == 2 && (k == 0 || k > nz));
 float share[M];
 for (int start = first; start < last; start += M) {
@@ -81,14 +89,15 @@ for (int start = first; start < last; start += M) {
     SIMD for (int m = 0; m < n; ++m) share[m] = smooth[start + m] + thin[start + m];
     if (capacity) {
         SIMD for (int m = 0; m < n; ++m) {
-            const float c = capacity[start + m] > (float)LEAST_OPEN ? capacity[start + m] : (float)LEAST_OPEN;
+            const float c =
+                capacity[start + m] > (float)LEAST_OPEN ? capacity[start + m] : (float)LEAST_OPEN;
             known[start + m] = capacity[start + m] > (float)LEAST_OPEN;
             share[m] /= c;
         }
     }
     SIMD for (int m = 0; m < n; ++m) {
-        const float f = share[m] < 1 ? share[m] : 1.0f, z = 2*f - 1, q = z*z;
-        const float d = scale*z*(1 + q*(0.26179939f + q*(0.14393173f + q*0.097663620f)));
+        const float f = share[m] < 1 ? share[m] : 1.0f, z = 2 * f - 1, q = z * z;
+        const float d = scale * z * (1 + q * (0.26179939f + q * (0.14393173f + q * 0.097663620f)));
         phi[start + m] = (beyond | (start + m == 0) | (start + m > nx)) ? 1.0f : d;
     }
 }
@@ -104,13 +113,16 @@ for (int start = first; start < last; start += M) {
 const int size = given.corners.shape[1];
 const float* points = (const float*)given.points.data;
 auto see = [&](long long here, long long there) {
-    for (int a = 0; a < 3; ++a) add(sums[4*here + a], points[3*there + a]);
-    add(sums[4*here + 3], 1.0f);
+    for (int a = 0; a < 3; ++a) add(sums[4 * here + a], points[3 * there + a]);
+    add(sums[4 * here + 3], 1.0f);
 };
 for (long long t = first; t < last; ++t) {
-    const int* c = corners + size*t;
+    const int* c = corners + size * t;
     see(c[0], c[1]);
-    if (size == 2) { see(c[1], c[0]); continue; }
+    if (size == 2) {
+        see(c[1], c[0]);
+        continue;
+    }
     see(c[1], c[2]);
     see(c[2], c[0]);
 }
@@ -122,16 +134,22 @@ auto each = [&](auto visit) {
     unsigned char cases[M];
     for (int start = first; start < last; start += M) {
         const int n = last - start < M ? last - start : (int)M;
-        const float* a = phi + start; const float* b = a + s2; const float* c = a + up; const float* d = b + up;
+        const float* a = phi + start;
+        const float* b = a + s2;
+        const float* c = a + up;
+        const float* d = b + up;
         unsigned char any = 0;
         SIMD for (int m = 0; m < n; ++m) {
-            const unsigned char code = (unsigned char)((a[m] < 0) | (a[m + 1] < 0) << 1 | (b[m] < 0) << 2 | (b[m + 1] < 0) << 3
-                | (c[m] < 0) << 4 | (c[m + 1] < 0) << 5 | (d[m] < 0) << 6 | (d[m + 1] < 0) << 7);
+            const unsigned char code =
+                (unsigned char)((a[m] < 0) | (a[m + 1] < 0) << 1 | (b[m] < 0) << 2 |
+                                (b[m + 1] < 0) << 3 | (c[m] < 0) << 4 | (c[m + 1] < 0) << 5 |
+                                (d[m] < 0) << 6 | (d[m + 1] < 0) << 7);
             cases[m] = code;
             any |= (unsigned char)((code != 0) & (code != 255));
         }
         if (!any) continue;
-        for (int m = 0; m < n; ++m) if (cases[m] != 0 && cases[m] != 255) visit(start + m, (int)cases[m]);
+        for (int m = 0; m < n; ++m)
+            if (cases[m] != 0 && cases[m] != 255) visit(start + m, (int)cases[m]);
     }
 };
 const long long wide = planes == 2 ? 16 : 5;
@@ -149,7 +167,7 @@ int points = 0, elements = 0;
 each([&](int i, int code) {
     const int here = code & 1;
     points += (here ^ (code >> 1 & 1)) + (here ^ (code >> 2 & 1)) + (here ^ (code >> 4 & 1));
-    elements += table[(code & mask)*wide];
+    elements += table[(code & mask) * wide];
 });
 owned[P.row] = points;
 made[P.row] = elements;
@@ -166,7 +184,8 @@ made[P.row] = elements;
 //   numbers    int planes; float32 dx; int before_x, before_y, before_z, most_x, most_y, most_z
 //   constants  CLOSEST
 #include "cube_cases"
-float* to = (float*)into; int next = ends[P.row] - counts[P.row];
+float* to = (float*)into;
+int next = ends[P.row] - counts[P.row];
 const int most[3] = {most_x, most_y, most_z};  // cells of the domain, whose numbers nodes have
 auto place = [&](int axis, int c, float inset) {
     const int n = most[axis];
@@ -175,7 +194,8 @@ auto place = [&](int axis, int c, float inset) {
 };
 each([&](int i, int code) {
     const int here = code & 1;
-    const int cut[3] = {here ^ (code >> 1 & 1), here ^ (code >> 2 & 1), here ^ (code >> 4 & 1)}, at_node[3] = {i + before_x, j + before_y, k + before_z};
+    const int cut[3] = {here ^ (code >> 1 & 1), here ^ (code >> 2 & 1), here ^ (code >> 4 & 1)},
+              at_node[3] = {i + before_x, j + before_y, k + before_z};
     const long long step[3] = {1, s2, up}, node = i;
     number[node] = next;
     for (int axis = 0; axis < 3; ++axis) {
@@ -183,11 +203,12 @@ each([&](int i, int code) {
         const int c = at_node[axis], n = most[axis];
         const bool side = c == 0 || c == n;
         const float a = phi[node], b = phi[node + step[axis]];
-        float t = a/(a - b), x[3];
-        t = t > (float)CLOSEST ? (t < (float)(1 - CLOSEST) ? t : (float)(1 - CLOSEST)) : (float)CLOSEST;
+        float t = a / (a - b), x[3];
+        t = t > (float)CLOSEST ? (t < (float)(1 - CLOSEST) ? t : (float)(1 - CLOSEST))
+                               : (float)CLOSEST;
         for (int d = 0; d < 3; ++d) x[d] = place(d, at_node[d], side ? (float)CLOSEST : 0.0f);
         x[axis] = side ? (c == 0 ? 0.0f : (float)n) : (float)c - 0.5f + t;
-        for (int d = 0; d < 3; ++d) to[3*next + d] = d == 2 && planes == 1 ? 0.0f : dx*x[d];
+        for (int d = 0; d < 3; ++d) to[3 * next + d] = d == 2 && planes == 1 ? 0.0f : dx * x[d];
         ++next;
     }
 });
@@ -200,16 +221,18 @@ each([&](int i, int code) {
 //   numbers    int planes
 #include "cube_cases"
 const int size = planes + 1;
-long long next = (long long)size*(ends[P.row] - counts[P.row]);
+long long next = (long long)size * (ends[P.row] - counts[P.row]);
 each([&](int i, int code) {
-    const signed char* row = table + (code & mask)*wide;
-    for (int n = 0; n < size*row[0]; ++n) {
-        const int edge = row[1 + n], axis = edge/4, b = edge%4;
+    const signed char* row = table + (code & mask) * wide;
+    for (int n = 0; n < size * row[0]; ++n) {
+        const int edge = row[1 + n], axis = edge / 4, b = edge % 4;
         // the low end of the edge: b's two bits are the other two axes, the lower first
-        const int x = axis == 0 ? 0 : b & 1, y = axis == 0 ? b & 1 : (axis == 1 ? 0 : b >> 1), z = axis == 2 ? 0 : b >> 1;
-        const long long node = i + x + y*s2 + z*up;
+        const int x = axis == 0 ? 0 : b & 1, y = axis == 0 ? b & 1 : (axis == 1 ? 0 : b >> 1),
+                  z = axis == 2 ? 0 : b >> 1;
+        const long long node = i + x + y * s2 + z * up;
         const float* at = phi + node;
         const bool here = at[0] < 0;
-        into[next++] = number[node] + (axis > 0 && here != (at[1] < 0)) + (axis > 1 && here != (at[s2] < 0));
+        into[next++] =
+            number[node] + (axis > 0 && here != (at[1] < 0)) + (axis > 1 && here != (at[s2] < 0));
     }
 });

@@ -5,8 +5,11 @@
 //   reads      S r, w?
 //   sums       rr
 double rr = 0;
-if (w) { SIMD for (int k = 0; k < n; ++k) rr += (double)w[k]*r[k]*r[k]; }
-else { SIMD for (int k = 0; k < n; ++k) rr += (double)r[k]*(double)r[k]; }
+if (w) {
+    SIMD for (int k = 0; k < n; ++k) rr += (double)w[k] * r[k] * r[k];
+} else {
+    SIMD for (int k = 0; k < n; ++k) rr += (double)r[k] * (double)r[k];
+}
 
 // kernel conjugate_gradient.direction: direction = z + beta direction, beta = r'z / (r'z)_old
 //   compute    S
@@ -14,8 +17,8 @@ else { SIMD for (int k = 0; k < n; ++k) rr += (double)r[k]*(double)r[k]; }
 //   writes     S direction
 //   whole      float64 scalars
 //   constants  RZ, RZ_OLD, PQ
-const T beta = scalars[RZ_OLD] > 0 ? (T)(scalars[RZ]/scalars[RZ_OLD]) : (T)0;
-SIMD for (int k = 0; k < n; ++k) direction[k] = z[k] + beta*direction[k];
+const T beta = scalars[RZ_OLD] > 0 ? (T)(scalars[RZ] / scalars[RZ_OLD]) : (T)0;
+SIMD for (int k = 0; k < n; ++k) direction[k] = z[k] + beta * direction[k];
 
 // kernel conjugate_gradient.update: x += alpha direction, r -= alpha q, and r'r, weighted where
 // there are weights
@@ -25,27 +28,41 @@ SIMD for (int k = 0; k < n; ++k) direction[k] = z[k] + beta*direction[k];
 //   whole      float64 scalars
 //   sums       rr
 //   constants  RZ, RZ_OLD, PQ
-const T alpha = scalars[PQ] > 0 ? (T)(scalars[RZ]/scalars[PQ]) : (T)0;
+const T alpha = scalars[PQ] > 0 ? (T)(scalars[RZ] / scalars[PQ]) : (T)0;
 double rr = 0;
 const auto update = [&](auto weight) {
     SIMD for (int k = 0; k < n; ++k) {
-        const T v = r[k] - alpha*q[k]; x[k] += alpha*direction[k]; r[k] = v; rr += weight(k)*v*v; } };
-if (w) update([&](int k) { return (double)w[k]; }); else update([](int) { return 1.0; });
+        const T v = r[k] - alpha * q[k];
+        x[k] += alpha * direction[k];
+        r[k] = v;
+        rr += weight(k) * v * v;
+    }
+};
+if (w)
+    update([&](int k) { return (double)w[k]; });
+else
+    update([](int) { return 1.0; });
 
 // kernel gmres.residual: q = w^(1/2) (b - q); without weights they are 1
 //   compute    S
 //   reads      S b, w?
 //   writes     S q
-if (w) { SIMD for (int k = 0; k < n; ++k) q[k] = sqrt(w[k])*(b[k] - q[k]); }
-else { SIMD for (int k = 0; k < n; ++k) q[k] = b[k] - q[k]; }
+if (w) {
+    SIMD for (int k = 0; k < n; ++k) q[k] = sqrt(w[k]) * (b[k] - q[k]);
+} else {
+    SIMD for (int k = 0; k < n; ++k) q[k] = b[k] - q[k];
+}
 
 // kernel gmres.weigh: q = w^(1/2) q, or w^(-1/2) q
 //   compute    S
 //   reads      S w
 //   writes     S q
 //   numbers    bool inverse
-if (inverse) { SIMD for (int k = 0; k < n; ++k) q[k] = w[k] > 0 ? q[k]/sqrt(w[k]) : 0; }
-else { SIMD for (int k = 0; k < n; ++k) q[k] *= sqrt(w[k]); }
+if (inverse) {
+    SIMD for (int k = 0; k < n; ++k) q[k] = w[k] > 0 ? q[k] / sqrt(w[k]) : 0;
+} else {
+    SIMD for (int k = 0; k < n; ++k) q[k] *= sqrt(w[k]);
+}
 
 // kernel gmres.dots: Products of the first fields of a basis with x, a column of sums each
 //   compute    S
@@ -56,9 +73,14 @@ else { SIMD for (int k = 0; k < n; ++k) q[k] *= sqrt(w[k]); }
 //   by_cell
 double first = 0;
 for (int j = 0; j < count; ++j) {
-    const auto* v = basis + j*size + p; double vx = 0, *sum = given.out.data + j*places + P.t;
-    SIMD for (int k = 0; k < n; ++k) vx += (double)v[k]*x[k];
-    if (j == 0) first = vx; else *sum = P.more ? *sum + vx : vx; }
+    const auto* v = basis + j * size + p;
+    double vx = 0, *sum = given.out.data + j * places + P.t;
+    SIMD for (int k = 0; k < n; ++k) vx += (double)v[k] * x[k];
+    if (j == 0)
+        first = vx;
+    else
+        *sum = P.more ? *sum + vx : vx;
+}
 
 // kernel gmres.combine: x += sign times the sum of factors_j v_j, and x'x
 //   compute    S
@@ -68,10 +90,12 @@ for (int j = 0; j < count; ++j) {
 //   sums       xx
 //   by_cell
 for (int j = 0; j < count; ++j) {
-    const auto* v = basis + j*size + p; const T c = (T)(sign*factors[j]);
-    SIMD for (int k = 0; k < n; ++k) x[k] += c*v[k]; }
+    const auto* v = basis + j * size + p;
+    const T c = (T)(sign * factors[j]);
+    SIMD for (int k = 0; k < n; ++k) x[k] += c * v[k];
+}
 double xx = 0;
-SIMD for (int k = 0; k < n; ++k) xx += (double)x[k]*x[k];
+SIMD for (int k = 0; k < n; ++k) xx += (double)x[k] * x[k];
 
 // kernel gmres.store: A field of a basis = x over the root of x'x; 0 where that is 0
 //   compute    S
@@ -79,5 +103,6 @@ SIMD for (int k = 0; k < n; ++k) xx += (double)x[k]*x[k];
 //   whole      S basis; float64 sums
 //   numbers    int64 size, place; int last
 //   by_cell
-auto* v = basis + place*size + p; const double xx = sums[last], scale = xx > 0 ? 1.0/sqrt(xx) : 0.0;
-SIMD for (int k = 0; k < n; ++k) v[k] = scale*x[k];
+auto* v = basis + place * size + p;
+const double xx = sums[last], scale = xx > 0 ? 1.0 / sqrt(xx) : 0.0;
+SIMD for (int k = 0; k < n; ++k) v[k] = scale * x[k];

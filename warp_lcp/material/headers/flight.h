@@ -3,15 +3,24 @@
 // snippet trees: Parents have the smaller numbers, so that trees are the same whatever the order
 // of the threads. A lost race is seen in what the atomic minimum returns, and tried again. Rows in
 // native form take a third of the time: they know most roots from the cell before.
-int* P = parent; const long long q = k*s1 + j*s2;
-auto find = [&](int i) { while (P[i] != i) i = P[i]; return i; };
+int* P = parent;
+const long long q = k * s1 + j * s2;
+auto find = [&](int i) {
+    while (P[i] != i) i = P[i];
+    return i;
+};
 auto unite = [&](int i, int j) {
     int a = find(i), b = find(j);
     while (a != b) {
-        if (a < b) { const int t = a; a = b; b = t; }
+        if (a < b) {
+            const int t = a;
+            a = b;
+            b = t;
+        }
         const int old = wp::atomic_min(P + a, b);
         if (old == a) return;
-        a = find(old); b = find(b);
+        a = find(old);
+        b = find(b);
     }
 };
 
@@ -24,13 +33,16 @@ auto unite = [&](int i, int j) {
 //   ordered
 #include "trees"
 auto weighs = [](float weight) { return weight > (float)TINY_WEIGHT; };
-for (int i = first; i < last; ++i) {  // a face with weight is none of the array's edge: the cell below it is there
+// a face with weight is none of the array's edge: the cell below it is there
+for (int i = first; i < last; ++i) {
     const int c = (int)(q + i), x = weighs(u[i]);
     if (x) {
 #ifndef __CUDA_ARCH__
-        if (P[c] == c) P[c] = P[c - 1]; else
+        if (P[c] == c)
+            P[c] = P[c - 1];
+        else
 #endif
-        unite(c, c - 1);
+            unite(c, c - 1);
     }
     // where the cells to the left of both are joined to them, and to each other, there is no need
     if (weighs(v[i]) && !(x && weighs(v[i - 1]) && weighs(u[i - s2]))) unite(c, c - s2);
@@ -42,8 +54,11 @@ for (int i = first; i < last; ++i) {  // a face with weight is none of the array
 //   whole      int32 parent; uint8 held, several
 //   box        int8 kind
 for (int i = first; i < last; ++i) {
-    const long long c = k*s1 + j*s2 + i;
-    parent[c] = (int)c; held[c] = 0; several[c] = 0; }
+    const long long c = k * s1 + j * s2 + i;
+    parent[c] = (int)c;
+    held[c] = 0;
+    several[c] = 0;
+}
 
 // kernel warp_lcp.material.flight.number: Number the trees of several cells that nothing holds;
 // other cells get -1
@@ -52,8 +67,9 @@ for (int i = first; i < last; ++i) {
 //   box        int8 kind
 //   ordered
 for (int i = first; i < last; ++i) {
-    const long long c = k*s1 + j*s2 + i;
-    number[c] = parent[c] == c && !held[c] && several[c] ? wp::atomic_add(count, 1) : -1; }
+    const long long c = k * s1 + j * s2 + i;
+    number[c] = parent[c] == c && !held[c] && several[c] ? wp::atomic_add(count, 1) : -1;
+}
 
 // kernel warp_lcp.material.flight.hold: Tell which trees reach a wall, and which have several
 // cells: those without weight stay alone
@@ -64,9 +80,13 @@ for (int i = first; i < last; ++i) {
 #include "trees"
 int parent_of = -1, root = -1;
 for (int i = first; i < last; ++i) {
-    const int c = (int)(q + i), joined = P[c] != c, wall = (kind[i] == SOLID) | (touch[i] & TOUCHES);
+    const int c = (int)(q + i), joined = P[c] != c,
+              wall = (kind[i] == SOLID) | (touch[i] & TOUCHES);
     if (!(joined | wall)) continue;
-    if (P[c] != parent_of) { parent_of = P[c]; root = find(c); }
+    if (P[c] != parent_of) {
+        parent_of = P[c];
+        root = find(c);
+    }
     if (wall) held[root] = 1;
     if (joined) several[root] = 1;
 }

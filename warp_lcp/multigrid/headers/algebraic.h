@@ -9,16 +9,24 @@
 //   by_cell
 #include "snippets.h:entries"
 ROWS {
-    const bool own = free[i]; const double extra = own && shift ? shift[k] : 0.0; double sum = 0, mid = 0;
+    const bool own = free[i];
+    const double extra = own && shift ? shift[k] : 0.0;
+    double sum = 0, mid = 0;
     ENTRIES {
         const int j = col[e], from = order ? order[e] : e;
         double v = (own && free[j] && from >= 0) ? (double)a[from] : 0.0;
-        if (j == i) { v += extra; mid = v; }
-        m[e] = (T)v; sum += v < 0 ? -v : v; }
+        if (j == i) {
+            v += extra;
+            mid = v;
+        }
+        m[e] = (T)v;
+        sum += v < 0 ? -v : v;
+    }
     const double size = (double)d[k] < 0 ? -(double)d[k] : (double)d[k];
-    inverse[k] = sum > 0 ? (T)(1.0/sum) : (T)0;
-    scale[k] = own ? (extra > 0 ? (T)(size/(size + extra)) : (T)1) : (T)0;
-    weight[k] = mid > 0 ? (T)(1.0/mid) : (mid < 0 ? (T)(-1.0/mid) : (T)(own ? 1 : 0)); }
+    inverse[k] = sum > 0 ? (T)(1.0 / sum) : (T)0;
+    scale[k] = own ? (extra > 0 ? (T)(size / (size + extra)) : (T)1) : (T)0;
+    weight[k] = mid > 0 ? (T)(1.0 / mid) : (mid < 0 ? (T)(-1.0 / mid) : (T)(own ? 1 : 0));
+}
 
 // kernel algebraic.scale_rows: the rows of a matrix, each times its scale
 //   compute    S
@@ -26,7 +34,10 @@ ROWS {
 //   whole      int32 ptr; S a, scaled
 //   by_cell
 #include "snippets.h:entries"
-ROWS { const T f = scale[k]; ENTRIES scaled[e] = f*a[e]; }
+ROWS {
+    const T f = scale[k];
+    ENTRIES scaled[e] = f * a[e];
+}
 
 // kernel algebraic.multiply: A row of A B into a known pattern: `place` says where in it each
 // product of an entry of A and one of B is added
@@ -36,12 +47,18 @@ ROWS { const T f = scale[k]; ENTRIES scaled[e] = f*a[e]; }
 //   by_cell
 #include "snippets.h:entries"
 ROWS {
-    T* o = result + starts[i]; const int entries = starts[i + 1] - starts[i]; long long c = begins[k];
+    T* o = result + starts[i];
+    const int entries = starts[i + 1] - starts[i];
+    long long c = begins[k];
     for (int q = 0; q < entries; ++q) o[q] = 0;
     ENTRIES {
-        const T v = a[e]; const int begin = right[col[e]], length = right[col[e] + 1] - begin;
-        if (v != 0) for (int q = 0; q < length; ++q) o[place[c + q]] += v*b[begin + q];
-        c += length; } }
+        const T v = a[e];
+        const int begin = right[col[e]], length = right[col[e] + 1] - begin;
+        if (v != 0)
+            for (int q = 0; q < length; ++q) o[place[c + q]] += v * b[begin + q];
+        c += length;
+    }
+}
 
 // kernel algebraic.inverse: one over the sum of the magnitudes of each row; 0 for rows of zeros
 //   compute    S
@@ -49,7 +66,11 @@ ROWS {
 //   whole      int32 ptr; S a
 //   by_cell
 #include "snippets.h:entries"
-ROWS { T s = 0; ENTRIES s += a[e] < 0 ? -a[e] : a[e]; inverse[k] = s > 0 ? (T)1/s : (T)0; }
+ROWS {
+    T s = 0;
+    ENTRIES s += a[e] < 0 ? -a[e] : a[e];
+    inverse[k] = s > 0 ? (T)1 / s : (T)0;
+}
 
 // kernel algebraic.smooth: y = x + omega (b - A x) over the rows' l1 norms, x taken for 0 if
 // from_zero
@@ -60,8 +81,15 @@ ROWS { T s = 0; ENTRIES s += a[e] < 0 ? -a[e] : a[e]; inverse[k] = s > 0 ? (T)1/
 //   numbers    S omega; bool from_zero
 //   by_cell
 #include "snippets.h:entries"
-if (from_zero) { for (int k = 0; k < n; ++k) y[k] = omega*inverse[k]*b[k]; }
-else { ROWS { T s = b[k]; ENTRIES s -= a[e]*x[col[e]]; y[k] = x[i] + omega*inverse[k]*s; } }
+if (from_zero) {
+    for (int k = 0; k < n; ++k) y[k] = omega * inverse[k] * b[k];
+} else {
+    ROWS {
+        T s = b[k];
+        ENTRIES s -= a[e] * x[col[e]];
+        y[k] = x[i] + omega * inverse[k] * s;
+    }
+}
 
 // kernel algebraic.remainder: y = b - A x
 //   compute    S
@@ -70,4 +98,8 @@ else { ROWS { T s = b[k]; ENTRIES s -= a[e]*x[col[e]]; y[k] = x[i] + omega*inver
 //   whole      int32 ptr, col; S a, x
 //   by_cell
 #include "snippets.h:entries"
-ROWS { T s = b[k]; ENTRIES s -= a[e]*x[col[e]]; y[k] = s; }
+ROWS {
+    T s = b[k];
+    ENTRIES s -= a[e] * x[col[e]];
+    y[k] = s;
+}

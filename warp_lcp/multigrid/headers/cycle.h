@@ -2,18 +2,30 @@
 
 // snippet relax: x + weight (b - A x) / diagonal at cell k, of what x is there, and what it is
 // around.
-const auto relaxed = [&](T x, T sum_around, T weight, int k, T e) -> T { return x + weight*(quotient(b[k] + sum_around, e) - x); };
+const auto relaxed = [&](T x, T sum_around, T weight, int k, T e) -> T {
+    return x + weight * (quotient(b[k] + sum_around, e) - x);
+};
 
 // snippet sweep: y = a value clipped to the bounds if projected, 0 where there is no unknown
 #include "relax"
-const auto from_b = [&](int k, T e) -> T { return quotient(omega*b[k], e); };
-const auto from_x = [&](int k, T e) -> T { return relaxed(x[k], around(x, k, down, up), omega, k, e); };
+const auto from_b = [&](int k, T e) -> T { return quotient(omega * b[k], e); };
+const auto from_x = [&](int k, T e) -> T {
+    return relaxed(x[k], around(x, k, down, up), omega, k, e);
+};
 const auto sweep = [&](auto value, auto clip) {
-    SIMD for (int k = 0; k < n; ++k) { const T e = diagonal(k), u = value(k, e != 0 ? e : (T)1), v = e != 0 ? u : (T)0; y[k] = clip(k, v); } };
+    SIMD for (int k = 0; k < n; ++k) {
+        const T e = diagonal(k), u = value(k, e != 0 ? e : (T)1), v = e != 0 ? u : (T)0;
+        y[k] = clip(k, v);
+    }
+};
 const auto clips = [&](auto value) {
-    if (!projected) sweep(value, [](int, T v) { return v; });
-    else if (upper) sweep(value, [&](int k, T v) { return clipped(v, lower[k], upper[k]); });
-    else sweep(value, [&](int k, T v) { return v < lower[k] ? lower[k] : v; }); };
+    if (!projected)
+        sweep(value, [](int, T v) { return v; });
+    else if (upper)
+        sweep(value, [&](int k, T v) { return clipped(v, lower[k], upper[k]); });
+    else
+        sweep(value, [&](int k, T v) { return v < lower[k] ? lower[k] : v; });
+};
 
 // kernel cycle.sweep: y = x + omega (b - A x) / diagonal, clipped to the bounds if projected;
 // from_zero: as if x were 0
@@ -23,7 +35,10 @@ const auto clips = [&](auto value) {
 //   writes     S y
 //   numbers    S omega; bool from_zero, projected
 #include "sweep"
-if (from_zero) clips(from_b); else clips(from_x);
+if (from_zero)
+    clips(from_b);
+else
+    clips(from_x);
 
 // kernel cycle.out_of_ring: As cycle.sweep, out of a ring of planes, never from zero
 //   compute    S
@@ -36,8 +51,8 @@ if (from_zero) clips(from_b); else clips(from_x);
 #include "sweep"
 clips(from_x);
 
-// kernel cycle.into_ring: As cycle.sweep, into a ring of planes: what the plane that was here before had
-// may be wider, where rows beside this one look
+// kernel cycle.into_ring: As cycle.sweep, into a ring of planes: what the plane that was here
+// before had may be wider, where rows beside this one look
 //   compute    S
 //   stencil    F, S
 //   reads      S x, b, lower?, upper?
@@ -48,11 +63,19 @@ clips(from_x);
 if (L.spans.data) {
     int from = P.first, to = P.first + n;
     const auto look = [&](int k, int j) {
-        const auto span = L.spans.data[(k + L.planes) % L.planes*L.rows + (j + L.rows) % L.rows];
-        if (span[1] > span[0]) { from = span[0] < from ? span[0] : from; to = span[1] > to ? span[1] : to; } };
-    look(P.k - 1, P.j); look(P.k + 1, P.j); look(P.k, P.j - 1); look(P.k, P.j + 1);
+        const auto span = L.spans.data[(k + L.planes) % L.planes * L.rows + (j + L.rows) % L.rows];
+        if (span[1] > span[0]) {
+            from = span[0] < from ? span[0] : from;
+            to = span[1] > to ? span[1] : to;
+        }
+    };
+    look(P.k - 1, P.j);
+    look(P.k + 1, P.j);
+    look(P.k, P.j - 1);
+    look(P.k, P.j + 1);
     for (int k = (from > 0 ? from - 1 : 0) - P.first; k < 0; ++k) y[k] = 0;
-    for (int k = n; k < (to < L.nx ? to + 1 : L.nx) - P.first; ++k) y[k] = 0; }
+    for (int k = n; k < (to < L.nx ? to + 1 : L.nx) - P.first; ++k) y[k] = 0;
+}
 #include "cycle.sweep"
 
 // kernel cycle.restrict: The sums of b - A x over the cells of aggregates: pairs along x or single
@@ -63,17 +86,27 @@ if (L.spans.data) {
 //   other      S x, b
 //   finer
 //   module     multigrid
-T r[2*M];
+T r[2 * M];
 with_pairs(pairs, [&](auto fx) {
-for (int begin = 0; begin < n; begin += M) {
-    const int m = n - begin < M ? n - begin : (int)M;
-    SIMD for (int k = 0; k < fx*m; ++k) r[k] = 0;
-    for (int z = 0; z < deep; ++z) for (int y = 0; y < wide; ++y) {
-        const long long at = z*zp + y*yp + fx*begin;
-        SIMD for (int k = 0; k < fx*m; ++k) {
-            const int i = (int)at + k; const T e = diagonal(i), v = b[i] - e*x[i] + neighbors(x, i); r[k] += e != 0 ? v : (T)0; } }
-    if (fx == 2) { SIMD for (int k = 0; k < m; ++k) coarse[begin + k] = r[2*k] + r[2*k+1]; }
-    else { SIMD for (int k = 0; k < m; ++k) coarse[begin + k] = r[k]; } } });
+    for (int begin = 0; begin < n; begin += M) {
+        const int m = n - begin < M ? n - begin : (int)M;
+        SIMD for (int k = 0; k < fx * m; ++k) r[k] = 0;
+        for (int z = 0; z < deep; ++z)
+            for (int y = 0; y < wide; ++y) {
+                const long long at = z * zp + y * yp + fx * begin;
+                SIMD for (int k = 0; k < fx * m; ++k) {
+                    const int i = (int)at + k;
+                    const T e = diagonal(i), v = b[i] - e * x[i] + neighbors(x, i);
+                    r[k] += e != 0 ? v : (T)0;
+                }
+            }
+        if (fx == 2) {
+            SIMD for (int k = 0; k < m; ++k) coarse[begin + k] = r[2 * k] + r[2 * k + 1];
+        } else {
+            SIMD for (int k = 0; k < m; ++k) coarse[begin + k] = r[k];
+        }
+    }
+});
 
 // kernel cycle.correct: x += scale times the correction of its aggregate, clipped to the bounds if
 // projected
@@ -85,22 +118,40 @@ for (int begin = 0; begin < n; begin += M) {
 //   numbers    S scale; bool projected
 //   module     multigrid
 if (projected) {
-    T e[2*M];  // the correction of each cell, so that what follows reads all fields in steps of one
-    for (int begin = 0; begin < n; begin += 2*M) {
-        const int m = n - begin < 2*M ? n - begin : (int)(2*M); const auto* c = coarse + (pairs ? begin/2 : begin);
-        if (!pairs) { SIMD for (int k = 0; k < m; ++k) e[k] = scale*c[k]; }
-        else {
-            SIMD for (int k = 0; k < m / 2; ++k) { const T v = scale*c[k]; e[2*k] = v; e[2*k+1] = v; }
-            if (m % 2) e[m-1] = scale*c[m/2]; }
+    T e[2 *
+        M];  // the correction of each cell, so that what follows reads all fields in steps of one
+    for (int begin = 0; begin < n; begin += 2 * M) {
+        const int m = n - begin < 2 * M ? n - begin : (int)(2 * M);
+        const auto* c = coarse + (pairs ? begin / 2 : begin);
+        if (!pairs) {
+            SIMD for (int k = 0; k < m; ++k) e[k] = scale * c[k];
+        } else {
+            SIMD for (int k = 0; k < m / 2; ++k) {
+                const T v = scale * c[k];
+                e[2 * k] = v;
+                e[2 * k + 1] = v;
+            }
+            if (m % 2) e[m - 1] = scale * c[m / 2];
+        }
         const auto moved = [&](int k) { return d[begin + k] != 0 ? x[begin + k] + e[k] : (T)0; };
-        if (upper) SIMD for (int k = 0; k < m; ++k) x[begin + k] = clipped(moved(k), lower[begin + k], upper[begin + k]);
-        else SIMD for (int k = 0; k < m; ++k) { const T v = moved(k), l = lower[begin + k]; x[begin + k] = v < l ? l : v; } }
+        if (upper)
+            SIMD for (int k = 0; k < m; ++k) x[begin + k] =
+                clipped(moved(k), lower[begin + k], upper[begin + k]);
+        else
+            SIMD for (int k = 0; k < m; ++k) {
+                const T v = moved(k), l = lower[begin + k];
+                x[begin + k] = v < l ? l : v;
+            }
+    }
 } else if (!pairs) {
-    SIMD for (int k = 0; k < n; ++k) x[k] += d[k] != 0 ? scale*coarse[k] : (T)0;
+    SIMD for (int k = 0; k < n; ++k) x[k] += d[k] != 0 ? scale * coarse[k] : (T)0;
 } else {
     SIMD for (int k = 0; k < n / 2; ++k) {
-        const T v = scale*coarse[k]; x[2*k] += d[2*k] != 0 ? v : (T)0; x[2*k+1] += d[2*k+1] != 0 ? v : (T)0; }
-    if (n % 2) x[n-1] += d[n-1] != 0 ? scale*coarse[n/2] : (T)0;
+        const T v = scale * coarse[k];
+        x[2 * k] += d[2 * k] != 0 ? v : (T)0;
+        x[2 * k + 1] += d[2 * k + 1] != 0 ? v : (T)0;
+    }
+    if (n % 2) x[n - 1] += d[n - 1] != 0 ? scale * coarse[n / 2] : (T)0;
 }
 
 // kernel cycle.bounds: Bounds of a coarse correction: the tightest of its cells' gaps, divided by
@@ -112,23 +163,39 @@ if (projected) {
 //   finer
 //   numbers    S scale
 //   module     multigrid
-T low[2*M], high[2*M]; const T big = (T)1e30, inverse = reciprocal(scale);
+T low[2 * M], high[2 * M];
+const T big = (T)1e30, inverse = reciprocal(scale);
 with_pairs(pairs, [&](auto fx) {
-for (int begin = 0; begin < n; begin += M) {
-    const int m = n - begin < M ? n - begin : (int)M;
-    SIMD for (int k = 0; k < fx*m; ++k) { low[k] = -big; high[k] = big; }
-    for (int z = 0; z < deep; ++z) for (int y = 0; y < wide; ++y) {
-        const long long at = z*zp + y*yp + fx*begin;
-        const auto e = d + at; const auto to = x + at, l = lower + at, u = upper ? upper + at : l;
-        SIMD for (int k = 0; k < fx*m; ++k) {
-            const T a0 = (l[k] - to[k])*inverse, b0 = (u[k] - to[k])*inverse, a1 = a0 > 0 ? (T)0 : a0, b1 = b0 < 0 ? (T)0 : b0;
-            const T a = e[k] != 0 ? a1 : -big, b = e[k] != 0 ? b1 : big;
-            low[k] = a > low[k] ? a : low[k]; high[k] = b < high[k] ? b : high[k]; } }
-    const auto tightest = [&](auto& coarse, const T* v, auto better) {
-        if (fx == 2) { SIMD for (int k = 0; k < m; ++k) coarse[begin + k] = better(v[2*k], v[2*k+1]); }
-        else { SIMD for (int k = 0; k < m; ++k) coarse[begin + k] = v[k]; } };
-    tightest(coarse_lower, low, [](T a, T b) { return a > b ? a : b; });
-    if (coarse_upper) tightest(coarse_upper, high, [](T a, T b) { return a < b ? a : b; }); } });
+    for (int begin = 0; begin < n; begin += M) {
+        const int m = n - begin < M ? n - begin : (int)M;
+        SIMD for (int k = 0; k < fx * m; ++k) {
+            low[k] = -big;
+            high[k] = big;
+        }
+        for (int z = 0; z < deep; ++z)
+            for (int y = 0; y < wide; ++y) {
+                const long long at = z * zp + y * yp + fx * begin;
+                const auto e = d + at;
+                const auto to = x + at, l = lower + at, u = upper ? upper + at : l;
+                SIMD for (int k = 0; k < fx * m; ++k) {
+                    const T a0 = (l[k] - to[k]) * inverse, b0 = (u[k] - to[k]) * inverse,
+                            a1 = a0 > 0 ? (T)0 : a0, b1 = b0 < 0 ? (T)0 : b0;
+                    const T a = e[k] != 0 ? a1 : -big, b = e[k] != 0 ? b1 : big;
+                    low[k] = a > low[k] ? a : low[k];
+                    high[k] = b < high[k] ? b : high[k];
+                }
+            }
+        const auto tightest = [&](auto& coarse, const T* v, auto better) {
+            if (fx == 2) {
+                SIMD for (int k = 0; k < m; ++k) coarse[begin + k] = better(v[2 * k], v[2 * k + 1]);
+            } else {
+                SIMD for (int k = 0; k < m; ++k) coarse[begin + k] = v[k];
+            }
+        };
+        tightest(coarse_lower, low, [](T a, T b) { return a > b ? a : b; });
+        if (coarse_upper) tightest(coarse_upper, high, [](T a, T b) { return a < b ? a : b; });
+    }
+});
 
 // kernel cycle.clear: x = 0
 //   compute    S

@@ -7,9 +7,12 @@
 //   numbers    int64 size; bool transposed
 //   by_cell
 for (int k = 0; k < n; ++k) {
-    EXACT_MATH const auto* row = a + (transposed ? p + k : (p + k)*size); const long long step = transposed ? size : 1; T s = 0;
-    for (long long j = 0; j < size; ++j) s += (T)row[j*step]*x[j];
-    y[k] = s; }
+    EXACT_MATH const auto* row = a + (transposed ? p + k : (p + k) * size);
+    const long long step = transposed ? size : 1;
+    T s = 0;
+    for (long long j = 0; j < size; ++j) s += (T)row[j * step] * x[j];
+    y[k] = s;
+}
 
 // kernel dense.relax: x = clip(x - omega (A x + b) / d, lower, upper), row after row forward or
 // backwards, so that each sees those before it
@@ -20,13 +23,22 @@ for (int k = 0; k < n; ++k) {
 //   numbers    float64 omega; bool forward
 //   by_cell
 for (int k = 0; k < n; ++k) {
-    EXACT_MATH const long long i = forward ? k : n - 1 - k; const auto* row = a + i*n; T s = b[i];
+    EXACT_MATH const long long i = forward ? k : n - 1 - k;
+    const auto* row = a + i * n;
+    T s = b[i];
     if (row[i] == 0) continue;
-    for (int j = 0; j < n; ++j) s += (T)row[j]*x[j];
-    x[i] = wp::clamp(x[i] - (T)omega*s/(T)row[i], lower[i], upper[i]); }
+    for (int j = 0; j < n; ++j) s += (T)row[j] * x[j];
+    x[i] = wp::clamp(x[i] - (T)omega * s / (T)row[i], lower[i], upper[i]);
+}
 
 // snippet times: a product that is rounded with the sum that it is added to, or not
-const auto times = [](double u, double f) { if constexpr (FUSED) return u*f; else { EXACT_MATH return u*f; } };
+const auto times = [](double u, double f) {
+    if constexpr (FUSED)
+        return u * f;
+    else {
+        EXACT_MATH return u * f;
+    }
+};
 
 // kernel low_rank.gather: U'x over the columns' entries, a column of sums each; rows whose mask is
 // 0 count for nothing
@@ -37,11 +49,16 @@ const auto times = [](double u, double f) { if constexpr (FUSED) return u*f; els
 //   constants  FUSED = 1
 //   by_cell
 #include "times"
-double* sums = given.out.data + P.t; const int last = count[0];
-if (!P.more) for (int q = 0; q < rank; ++q) sums[q*places] = 0;
+double* sums = given.out.data + P.t;
+const int last = count[0];
+if (!P.more)
+    for (int q = 0; q < rank; ++q) sums[q * places] = 0;
 for (int k = 0; k < n && p + k < last; ++k) {
-    const long long e = p + k, column = (long long)blocks[e]*width; const double v = mask && mask[entry_rows[e]] == 0 ? 0.0 : (double)x[entry_rows[e]];
-    for (int q = 0; q < width; ++q) sums[(column + q)*places] += times((double)values[e*width + q], v); }
+    const long long e = p + k, column = (long long)blocks[e] * width;
+    const double v = mask && mask[entry_rows[e]] == 0 ? 0.0 : (double)x[entry_rows[e]];
+    for (int q = 0; q < width; ++q)
+        sums[(column + q) * places] += times((double)values[e * width + q], v);
+}
 const double first = P.more ? 0 : sums[0];
 
 // kernel low_rank.scatter: result = base + sign U f on U's rows where the mask is not 0; the first
@@ -55,12 +72,17 @@ const double first = P.more ? 0 : sums[0];
 #include "times"
 const int last = count[0];
 for (int k = 0; k < n && p + k < last; ++k) {
-    const long long e = p + k; const int row = entry_rows[e]; double s = 0;
+    const long long e = p + k;
+    const int row = entry_rows[e];
+    double s = 0;
     if ((e > 0 && entry_rows[e - 1] == row) || (mask && mask[row] == 0)) continue;
     for (long long m = e; m < last && entry_rows[m] == row; ++m) {
-        const auto* u = values + m*width; const double* f = factors + (long long)blocks[m]*width;
-        for (int q = 0; q < width; ++q) s += times((double)u[q], f[q]); }
-    result[row] = sign > 0 ? base[row] + s : base[row] - s; }
+        const auto* u = values + m * width;
+        const double* f = factors + (long long)blocks[m] * width;
+        for (int q = 0; q < width; ++q) s += times((double)u[q], f[q]);
+    }
+    result[row] = sign > 0 ? base[row] + s : base[row] - s;
+}
 
 // kernel low_rank.diagonal: result += the diagonal of U W U'
 //   compute    float64
@@ -69,12 +91,16 @@ for (int k = 0; k < n && p + k < last; ++k) {
 //   by_cell
 const int last = count[0];
 for (int k = 0; k < n && p + k < last; ++k) {
-    EXACT_MATH const long long e = p + k; const int row = entry_rows[e]; double s = 0;
+    EXACT_MATH const long long e = p + k;
+    const int row = entry_rows[e];
+    double s = 0;
     if (e > 0 && entry_rows[e - 1] == row) continue;
     for (long long m = e; m < last && entry_rows[m] == row; ++m)
         for (long long o = e; o < last && entry_rows[o] == row; ++o)
             for (int i = 0; i < width; ++i)
                 for (int j = 0; j < width; ++j)
-                    s += (double)values[m*width + i]*(double)values[o*width + j]
-                        *weights[((long long)blocks[m]*width + i)*rank + (long long)blocks[o]*width + j];
-    result[row] += s; }
+                    s += (double)values[m * width + i] * (double)values[o * width + j] *
+                         weights[((long long)blocks[m] * width + i) * rank +
+                                 (long long)blocks[o] * width + j];
+    result[row] += s;
+}

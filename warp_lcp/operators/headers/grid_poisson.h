@@ -2,9 +2,24 @@
 // fields.
 
 // snippet coefficients: Coefficients of lower faces: fields or numbers.
-const auto face_x = [&](long long k) -> T { if constexpr (FIELD_X) return fx[k]; else return nx; };
-const auto face_y = [&](long long k) -> T { if constexpr (FIELD_Y) return fy[k]; else return ny; };
-const auto face_z = [&](long long k) -> T { if constexpr (FIELD_Z) return fz[k]; else return nz; };
+const auto face_x = [&](long long k) -> T {
+    if constexpr (FIELD_X)
+        return fx[k];
+    else
+        return nx;
+};
+const auto face_y = [&](long long k) -> T {
+    if constexpr (FIELD_Y)
+        return fy[k];
+    else
+        return ny;
+};
+const auto face_z = [&](long long k) -> T {
+    if constexpr (FIELD_Z)
+        return fz[k];
+    else
+        return nz;
+};
 
 // kernel grid_poisson.count_faces: Diagonal of unit coefficients: the number of open faces of a
 // FLUID cell along the axes that count
@@ -15,16 +30,21 @@ const auto face_z = [&](long long k) -> T { if constexpr (FIELD_Z) return fz[k];
 //   module     grid
 #include "snippets.h:bytes"
 const unsigned char along_x = around_x, along_y = around_y, along_z = around_z;
-const auto open = [&](long long k, unsigned char axis) -> unsigned char { return cells[k] != 2 ? axis : (unsigned char)0; };
+const auto open = [&](long long k, unsigned char axis) -> unsigned char {
+    return cells[k] != 2 ? axis : (unsigned char)0;
+};
 const auto count = [&](int k) {
-    const unsigned char v = open(k - 1, along_x) + open(k + 1, along_x) + open(k + ym, along_y) + open(k + yp, along_y)
-        + open(k + zm, along_z) + open(k + zp, along_z);
-    diagonal[k] = cells[k] == 1 ? v : (unsigned char)0; };
-const int whole = n/64*64;
-if (MASKED_BYTES) { MASKED64 for (int k = 0; k < n; ++k) count(k); }
-else {
+    const unsigned char v = open(k - 1, along_x) + open(k + 1, along_x) + open(k + ym, along_y) +
+                            open(k + yp, along_y) + open(k + zm, along_z) + open(k + zp, along_z);
+    diagonal[k] = cells[k] == 1 ? v : (unsigned char)0;
+};
+const int whole = n / 64 * 64;
+if (MASKED_BYTES) {
+    MASKED64 for (int k = 0; k < n; ++k) count(k);
+} else {
     SIMD64 for (int k = 0; k < whole; ++k) count(k);
-    SIMD for (int k = whole; k < n; ++k) count(k); }
+    SIMD for (int k = whole; k < n; ++k) count(k);
+}
 
 // kernel grid_poisson.diagonal: The sum of the coefficients over a FLUID cell's open faces, plus
 // the shift
@@ -35,10 +55,12 @@ else {
 //   constants  FIELD_X = 0, FIELD_Y = 0, FIELD_Z = 0, SHIFTED = 0
 #include "coefficients"
 SIMD for (int k = 0; k < n; ++k) {
-    T v = (cells[k-1] != 2 ? face_x(k) : (T)0) + (cells[k+1] != 2 ? face_x(k+1) : (T)0) + (cells[k+ym] != 2 ? face_y(k) : (T)0)
-        + (cells[k+yp] != 2 ? face_y(k+yp) : (T)0) + (cells[k+zm] != 2 ? face_z(k) : (T)0) + (cells[k+zp] != 2 ? face_z(k+zp) : (T)0);
+    T v = (cells[k - 1] != 2 ? face_x(k) : (T)0) + (cells[k + 1] != 2 ? face_x(k + 1) : (T)0) +
+          (cells[k + ym] != 2 ? face_y(k) : (T)0) + (cells[k + yp] != 2 ? face_y(k + yp) : (T)0) +
+          (cells[k + zm] != 2 ? face_z(k) : (T)0) + (cells[k + zp] != 2 ? face_z(k + zp) : (T)0);
     if constexpr (SHIFTED) v = v + shift[k];
-    diagonal[k] = cells[k] == 1 ? v : (T)0; }
+    diagonal[k] = cells[k] == 1 ? v : (T)0;
+}
 
 // kernel grid_poisson.weights: The weight of a lower face is its coefficient where it joins two
 // FLUID cells, else 0; ghost cells above the last ones have them too
@@ -49,8 +71,10 @@ SIMD for (int k = 0; k < n; ++k) {
 //   constants  FIELD_X = 0, FIELD_Y = 0, FIELD_Z = 0
 #include "coefficients"
 SIMD for (int k = 0; k < n; ++k) {
-    wx[k] = ((cells[k] == 1) & (cells[k-1] == 1)) ? face_x(k) : (T)0; wy[k] = ((cells[k] == 1) & (cells[k+ym] == 1)) ? face_y(k) : (T)0;
-    wz[k] = ((cells[k] == 1) & (cells[k+zm] == 1)) ? face_z(k) : (T)0; }
+    wx[k] = ((cells[k] == 1) & (cells[k - 1] == 1)) ? face_x(k) : (T)0;
+    wy[k] = ((cells[k] == 1) & (cells[k + ym] == 1)) ? face_y(k) : (T)0;
+    wz[k] = ((cells[k] == 1) & (cells[k + zm] == 1)) ? face_z(k) : (T)0;
+}
 
 // kernel grid_poisson.face_gradient: (mu_i - mu_j) (x_i - x_j) of lower faces, 0 where one of the
 // two cells is SOLID, and mu_i x_i; and their sums
@@ -60,14 +84,19 @@ SIMD for (int k = 0; k < n; ++k) {
 //   sums       sum_x, sum_y, sum_z, sum_shift
 const auto across = [&](int k, long long to) -> T {
     const bool open = (cells[k] != 2) & (cells[k + to] != 2);
-    return open ? (multiplier[k] - multiplier[k + to])*(x[k] - x[k + to]) : (T)0; };
+    return open ? (multiplier[k] - multiplier[k + to]) * (x[k] - x[k + to]) : (T)0;
+};
 T sum_x = 0, sum_y = 0, sum_z = 0, sum_shift = 0;
 SIMD for (int k = 0; k < n; ++k) {
-    sum_x += across(k, -1); sum_y += across(k, ym); sum_z += across(k, zm); sum_shift += cells[k] == 1 ? multiplier[k]*x[k] : (T)0; }
+    sum_x += across(k, -1);
+    sum_y += across(k, ym);
+    sum_z += across(k, zm);
+    sum_shift += cells[k] == 1 ? multiplier[k] * x[k] : (T)0;
+}
 if (face_x) SIMD for (int k = 0; k < n; ++k) face_x[k] = across(k, -1);
 if (face_y) SIMD for (int k = 0; k < n; ++k) face_y[k] = across(k, ym);
 if (face_z) SIMD for (int k = 0; k < n; ++k) face_z[k] = across(k, zm);
-if (shift) SIMD for (int k = 0; k < n; ++k) shift[k] = cells[k] == 1 ? multiplier[k]*x[k] : (T)0;
+if (shift) SIMD for (int k = 0; k < n; ++k) shift[k] = cells[k] == 1 ? multiplier[k] * x[k] : (T)0;
 
 // kernel grid_poisson.copy_cells: a copy of the cells' labels
 //   compute    int8
@@ -76,10 +105,11 @@ if (shift) SIMD for (int k = 0; k < n; ++k) shift[k] = cells[k] == 1 ? multiplie
 SIMD for (int k = 0; k < n; ++k) to[k] = source[k];
 
 // kernel grid_operator.find_spans: Find the span of a row: what lies between its first and its last
-// FLUID cell, both included, grown to whole vectors of 16 cells, so that aggregates stay whole, too.
-// Rows that have one are marked in `reach`, the chunks of flat fields that they lie in in `chunks`;
-// what is marked stays so. On the CPU eight cells at a time: a byte of v is 0 where a cell is FLUID,
-// and there alone v - 1 sets a highest bit that ~v has, but for bytes behind one of them.
+// FLUID cell, both included, grown to whole vectors of 16 cells, so that aggregates stay whole,
+// too. Rows that have one are marked in `reach`, the chunks of flat fields that they lie in in
+// `chunks`; what is marked stays so. On the CPU eight cells at a time: a byte of v is 0 where a
+// cell is FLUID, and there alone v - 1 sets a highest bit that ~v has, but for bytes behind one of
+// them.
 //   compute    float32
 //   reads      int8 cells
 //   by_row     vec2i spans, reach
@@ -92,7 +122,8 @@ const auto none = [&](int k) {
     return false;
 #else
     unsigned long long v, ones = 0x0101010101010101ull;
-    __builtin_memcpy(&v, cells + k, 8); v ^= ones;
+    __builtin_memcpy(&v, cells + k, 8);
+    v ^= ones;
     return ((v - ones) & ~v & ones << 7) == 0;
 #endif
 };
@@ -101,11 +132,15 @@ while (first + 8 <= n && none(first)) first += 8;
 while (first < n && cells[first] != 1) ++first;
 while (last - 8 >= first && none(last - 8)) last -= 8;
 while (last > first && cells[last - 1] != 1) --last;
-const bool any = last > first; const int end = (last + SPAN_CELLS - 1) / SPAN_CELLS * SPAN_CELLS;
-spans[P.row] = any ? wp::vec2i(first / SPAN_CELLS * SPAN_CELLS, end < n ? end : n) : wp::vec2i(0, 0);
+const bool any = last > first;
+const int end = (last + SPAN_CELLS - 1) / SPAN_CELLS * SPAN_CELLS;
+spans[P.row] =
+    any ? wp::vec2i(first / SPAN_CELLS * SPAN_CELLS, end < n ? end : n) : wp::vec2i(0, 0);
 if (any) {
     reach[P.row] = wp::vec2i(0, n);
     const long long begin = p - 1, row = yp;  // of the stored row, with its ghosts
     for (long long c = begin / CHUNK; c < chunk_count && c <= (begin + row - 1) / CHUNK; ++c) {
-        const long long left = size - c*CHUNK;
-        chunks[c] = wp::vec2i(0, (int)(left < CHUNK ? left : CHUNK)); } }
+        const long long left = size - c * CHUNK;
+        chunks[c] = wp::vec2i(0, (int)(left < CHUNK ? left : CHUNK));
+    }
+}

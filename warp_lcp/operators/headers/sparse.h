@@ -8,7 +8,11 @@
 //   whole      int32 ptr, col; A a; S x
 //   by_cell
 #include "snippets.h:entries"
-ROWS { T s = plus ? plus[k] : (T)0; ENTRIES s += (T)a[e]*x[col[e]]; y[k] = s; }
+ROWS {
+    T s = plus ? plus[k] : (T)0;
+    ENTRIES s += (T)a[e] * x[col[e]];
+    y[k] = s;
+}
 
 // kernel sparse.relax: x = clip(x - omega (A x + b) / d, lower, upper), row after row: all forward
 // or backwards, or those listed from place `first` on
@@ -19,10 +23,13 @@ ROWS { T s = plus ? plus[k] : (T)0; ENTRIES s += (T)a[e]*x[col[e]]; y[k] = s; }
 #include "snippets.h:entries"
 const auto relax = [&](long long i) {
     if (d[i] == 0) return;
-    T s = b[i]; ENTRIES s += (T)a[e]*x[col[e]];
-    const T v = x[i] - (T)omega*s/(T)d[i], w = v < lower[i] ? lower[i] : v;
-    x[i] = w > upper[i] ? upper[i] : w; };
-for (int k = 0; k < n; ++k) relax(list ? (long long)list[first + p + k] : forward ? p + k : p + n - 1 - k);
+    T s = b[i];
+    ENTRIES s += (T)a[e] * x[col[e]];
+    const T v = x[i] - (T)omega * s / (T)d[i], w = v < lower[i] ? lower[i] : v;
+    x[i] = w > upper[i] ? upper[i] : w;
+};
+for (int k = 0; k < n; ++k)
+    relax(list ? (long long)list[first + p + k] : forward ? p + k : p + n - 1 - k);
 
 // kernel sparse.survey: Each row's largest magnitude and diagonal; entries below the diagonal
 // without an equal one above it, and how many more lie on one side
@@ -32,19 +39,38 @@ for (int k = 0; k < n; ++k) relax(list ? (long long)list[first + p + k] : forwar
 //   sums       differ, more
 //   by_cell
 #include "snippets.h:entries"
-const auto across = [&](int i, int j) {  // a_ij, of row i, whose columns ascend; beyond the last one, where there is none
+// a_ij, of row i, whose columns ascend; beyond the last one, where there is none
+const auto across = [&](int i, int j) {
     int first = ptr[i], last = ptr[i + 1];
-    while (first < last) { const int middle = first + (last - first)/2; if (col[middle] < j) first = middle + 1; else last = middle; }
-    return first; };
+    while (first < last) {
+        const int middle = first + (last - first) / 2;
+        if (col[middle] < j)
+            first = middle + 1;
+        else
+            last = middle;
+    }
+    return first;
+};
 double differ = 0, more = 0;
 ROWS {
     T most = 0, own = 0;
     ENTRIES {
-        const T v = a[e], size = v < 0 ? -v : v; const int j = col[e]; most = most < size ? size : most;
-        if (j == i) own = v;
-        else if (j > i) more += 1;
-        else { const int f = across(j, (int)i); more -= 1; differ += f == ptr[j + 1] || col[f] != i || a[f] != v; } }
-    largest[k] = most; diagonal[k] = own; }
+        const T v = a[e], size = v < 0 ? -v : v;
+        const int j = col[e];
+        most = most < size ? size : most;
+        if (j == i)
+            own = v;
+        else if (j > i)
+            more += 1;
+        else {
+            const int f = across(j, (int)i);
+            more -= 1;
+            differ += f == ptr[j + 1] || col[f] != i || a[f] != v;
+        }
+    }
+    largest[k] = most;
+    diagonal[k] = own;
+}
 
 // kernel sparse.gather: entries in another order; 0 for an index below 0
 //   compute    S

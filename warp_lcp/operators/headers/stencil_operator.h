@@ -5,8 +5,10 @@
 //   stencil    D, W
 //   reads      S x, b?
 //   writes     S y
-if (b) SIMD for (int k = 0; k < n; ++k) y[k] = affine(x, b, k);
-else SIMD for (int k = 0; k < n; ++k) y[k] = product(x, k);
+if (b)
+    SIMD for (int k = 0; k < n; ++k) y[k] = affine(x, b, k);
+else
+    SIMD for (int k = 0; k < n; ++k) y[k] = product(x, k);
 
 // kernel stencil.transposed: y = A' x of a compact stencil: a neighbor's weight for this cell
 // times the neighbor
@@ -15,8 +17,12 @@ else SIMD for (int k = 0; k < n; ++k) y[k] = product(x, k);
 //   reads      S x
 //   writes     S y
 //   by_cell
-#define ADD(W, X, Y, Z) + W(k - (X) + beside(-(Y), -(Z), zm, zp))*x[k - (X) + beside(-(Y), -(Z), zm, zp)]
-for (int k = 0; k < n; ++k) { const T e = diagonal(k); y[k] = e != 0 ? e*x[k] - ((T)0 EACH_WEIGHT(ADD)) : (T)0; }
+#define ADD(W, X, Y, Z) \
+    +W(k - (X) + beside(-(Y), -(Z), zm, zp)) * x[k - (X) + beside(-(Y), -(Z), zm, zp)]
+for (int k = 0; k < n; ++k) {
+    const T e = diagonal(k);
+    y[k] = e != 0 ? e * x[k] - ((T)0 EACH_WEIGHT(ADD)) : (T)0;
+}
 #undef ADD
 
 // kernel stencil.relax: The cells of one color of a sweep of projected SOR: red or black, of a
@@ -27,14 +33,18 @@ for (int k = 0; k < n; ++k) { const T e = diagonal(k); y[k] = e != 0 ? e*x[k] - 
 //   writes     S x
 //   numbers    S omega; int color
 //   by_cell
-const bool compact = STENCIL == 'c'; const int bits = compact ? color : 0;
+const bool compact = STENCIL == 'c';
+const int bits = compact ? color : 0;
 const int start = compact ? (P.first + bits) % 2 : (P.k + P.j + P.first + color) % 2;
 const bool ours = !compact || (P.j % 2 == bits / 2 % 2 && P.k % 2 == bits / 4);
 for (int k = ours ? start : n; k < n; k += 2) {
     const T e = diagonal(k);
     if (e != 0) {
-        T v = x[k] - omega*(b[k] + e*x[k] - neighbors(x, k)) / e;
-        v = v > lower[k] ? v : lower[k]; x[k] = v < upper[k] ? v : upper[k]; } }
+        T v = x[k] - omega * (b[k] + e * x[k] - neighbors(x, k)) / e;
+        v = v > lower[k] ? v : lower[k];
+        x[k] = v < upper[k] ? v : upper[k];
+    }
+}
 
 // kernel stencil.gradient: mu_i x_(i + o), or mu_i x_i where that neighbor is SOLID: what its
 // coefficient counts for, and their sum
@@ -43,8 +53,16 @@ for (int k = ours ? start : n; k < n; k += 2) {
 //   writes     float64 part?
 //   numbers    int step, row, plane
 //   sums       sum
-const long long to = step + (row < 0 ? ym : row > 0 ? yp : 0) + (plane < 0 ? zm : plane > 0 ? zp : 0);
-const auto value = [&](int k) -> T { return cells[k] == 1 ? multiplier[k]*(cells[k + to] == 2 ? x[k] : x[k + to]) : (T)0; };
+const long long to = step +
+                     (row < 0   ? ym
+                      : row > 0 ? yp
+                                : 0) +
+                     (plane < 0   ? zm
+                      : plane > 0 ? zp
+                                  : 0);
+const auto value = [&](int k) -> T {
+    return cells[k] == 1 ? multiplier[k] * (cells[k + to] == 2 ? x[k] : x[k + to]) : (T)0;
+};
 T sum = 0;
 SIMD for (int k = 0; k < n; ++k) sum += value(k);
 if (part) SIMD for (int k = 0; k < n; ++k) part[k] = value(k);
@@ -57,10 +75,14 @@ if (part) SIMD for (int k = 0; k < n; ++k) part[k] = value(k);
 //   writes     S made
 //   numbers    S number
 for (int k = 0; k < n; ++k) {
-    const T closed = around_of([&](int i, int rows, int planes) { return (T)(cells[i + beside(rows, planes, zm, zp)] == 2); }, k);
+    const T closed =
+        around_of([&](int i, int rows,
+                      int planes) { return (T)(cells[i + beside(rows, planes, zm, zp)] == 2); },
+                  k);
     T v = (center ? (T)center[k] : number) - closed;
     if (shift) v += (T)shift[k];
-    made[k] = cells[k] == 1 ? v : (T)0; }
+    made[k] = cells[k] == 1 ? v : (T)0;
+}
 
 // kernel stencil.wrap: Ghost cells before the first and after the last of `cells`, which are
 // `step` elements apart, along a periodic axis
@@ -68,7 +90,10 @@ for (int k = 0; k < n; ++k) {
 //   writes     S x
 //   numbers    int cells; int64 step
 //   by_cell
-for (int k = 0; k < n; ++k) { x[k] = x[k + cells*step]; x[k + (cells + 1)*step] = x[k + step]; }
+for (int k = 0; k < n; ++k) {
+    x[k] = x[k + cells * step];
+    x[k + (cells + 1) * step] = x[k + step];
+}
 
 // kernel matrix_stencil.recognize: Rows of a sparse matrix as those of a compact stencil on a box
 // of cells: how many are none, differ from the middle one, or are no M-matrix's
@@ -78,30 +103,65 @@ for (int k = 0; k < n; ++k) { x[k] = x[k + cells*step]; x[k + (cells + 1)*step] 
 //   numbers    int nx, ny, nz, full, kept; int64 size
 //   sums       wrong, centers, differ, positive
 //   by_cell
-int wrong = 0, centers = 0, differ = 0, positive = 0, count = 0, reached = 0; const int plane = nx*ny; double row[27], usual[27];
-int places[27], columns[27], steps[27];  // neighbors that there are, and their fields; what the middle row's entries would be
+int wrong = 0, centers = 0, differ = 0, positive = 0, count = 0, reached = 0;
+const int plane = nx * ny;
+double row[27], usual[27];
+// neighbors that there are, and their fields; what the middle row's entries would be
+int places[27], columns[27], steps[27];
 bool rises = false, within = true;
 for (int o = 0, field = 0; o < 27; ++o) {
     row[o] = 0;
     if (!(full >> o & 1)) continue;
-    const int Y = P.j + o / 3 % 3 - 1, Z = P.k + o / 9 - 1; within &= Y >= 0 && Y < ny && Z >= 0 && Z < nz;
-    steps[reached] = o % 3 - 1 + (o / 3 % 3 - 1)*nx + (o / 9 - 1)*plane; usual[reached++] = middle[o];
-    if (o != 13) { rises |= middle[o] > 0; columns[count] = kept >> o & 1 ? field++ : -1; places[count++] = o; } }
+    const int Y = P.j + o / 3 % 3 - 1, Z = P.k + o / 9 - 1;
+    within &= Y >= 0 && Y < ny && Z >= 0 && Z < nz;
+    steps[reached] = o % 3 - 1 + (o / 3 % 3 - 1) * nx + (o / 9 - 1) * plane;
+    usual[reached++] = middle[o];
+    if (o != 13) {
+        rises |= middle[o] > 0;
+        columns[count] = kept >> o & 1 ? field++ : -1;
+        places[count++] = o;
+    }
+}
 const auto inside = [&](int o, int x) {
-    const int X = x + o % 3 - 1, Y = P.j + o / 3 % 3 - 1, Z = P.k + o / 9 - 1; return X >= 0 && X < nx && Y >= 0 && Y < ny && Z >= 0 && Z < nz; };
+    const int X = x + o % 3 - 1, Y = P.j + o / 3 % 3 - 1, Z = P.k + o / 9 - 1;
+    return X >= 0 && X < nx && Y >= 0 && Y < ny && Z >= 0 && Z < nz;
+};
 for (int k = 0; k < n; ++k) {
-    const int x = P.first + k, i = (P.k*ny + P.j)*nx + x, begin = ptr[i];
-    if (within && !weights && x > 0 && x < nx - 1 && ptr[i + 1] - begin == reached) {  // most rows are the middle one
+    const int x = P.first + k, i = (P.k * ny + P.j) * nx + x, begin = ptr[i];
+    // most rows are the middle one
+    if (within && !weights && x > 0 && x < nx - 1 && ptr[i + 1] - begin == reached) {
         bool same = true;
-        for (int q = 0; q < reached; ++q) same &= col[begin + q] == i + steps[q] && a[begin + q] == usual[q];
-        if (same) { made[k] = middle[13]; wrong += !(middle[13] > 0); positive += rises; continue; } }
+        for (int q = 0; q < reached; ++q)
+            same &= col[begin + q] == i + steps[q] && a[begin + q] == usual[q];
+        if (same) {
+            made[k] = middle[13];
+            wrong += !(middle[13] > 0);
+            positive += rises;
+            continue;
+        }
+    }
     for (int e = begin; e < ptr[i + 1]; ++e) {
-        const double v = a[e]; int step = col[e] - i;
-        const int Z = nz == 1 ? 0 : (2*step > plane) - (2*step < -plane); step -= Z*plane;
-        const int Y = (2*step > nx) - (2*step < -nx), X = step - Y*nx, o = 13 + X + 3*Y + 9*Z;
-        if (X < -1 || X > 1 || !(full >> o & 1) || !inside(o, x)) wrong += v != 0; else row[o] += v; }
-    wrong += !(row[13] > 0); centers += row[13] != middle[13]; made[k] = row[13]; row[13] = 0;
+        const double v = a[e];
+        int step = col[e] - i;
+        const int Z = nz == 1 ? 0 : (2 * step > plane) - (2 * step < -plane);
+        step -= Z * plane;
+        const int Y = (2 * step > nx) - (2 * step < -nx), X = step - Y * nx,
+                  o = 13 + X + 3 * Y + 9 * Z;
+        if (X < -1 || X > 1 || !(full >> o & 1) || !inside(o, x))
+            wrong += v != 0;
+        else
+            row[o] += v;
+    }
+    wrong += !(row[13] > 0);
+    centers += row[13] != middle[13];
+    made[k] = row[13];
+    row[13] = 0;
     for (int q = 0; q < count; ++q) {
-        const int o = places[q]; const double v = row[o]; row[o] = 0;
-        positive += v > 0; differ += v != middle[o] && inside(o, x);
-        if (weights && columns[q] >= 0) weights[columns[q]*size + p + k] = -v; } }
+        const int o = places[q];
+        const double v = row[o];
+        row[o] = 0;
+        positive += v > 0;
+        differ += v != middle[o] && inside(o, x);
+        if (weights && columns[q] >= 0) weights[columns[q] * size + p + k] = -v;
+    }
+}

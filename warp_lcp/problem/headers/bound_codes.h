@@ -7,14 +7,28 @@
 //   writes     uint8 code
 //   numbers    float64 least, most
 //   sums       others
-const double inf = (double)INFINITY; const unsigned char below = least > -inf, above = most < inf ? 2 : 0; double others = 0;
-if (lower && upper) { SIMD for (int k = 0; k < n; ++k) {
-    const bool a = lower[k] == least, b = upper[k] == most;
-    others += ((a | (lower[k] == -inf)) & (b | (upper[k] == inf))) ? 0.0 : 1.0; code[k] = (a ? 1 : 0) | (b ? 2 : 0); }
-} else if (lower) { SIMD for (int k = 0; k < n; ++k) {
-    const bool a = lower[k] == least; others += (a | (lower[k] == -inf)) ? 0.0 : 1.0; code[k] = (a ? 1 : 0) | above; }
-} else { SIMD for (int k = 0; k < n; ++k) {
-    const bool b = upper[k] == most; others += (b | (upper[k] == inf)) ? 0.0 : 1.0; code[k] = below | (b ? 2 : 0); } }
+const double inf = (double)INFINITY;
+const unsigned char below = least > -inf, above = most < inf ? 2 : 0;
+double others = 0;
+if (lower && upper) {
+    SIMD for (int k = 0; k < n; ++k) {
+        const bool a = lower[k] == least, b = upper[k] == most;
+        others += ((a | (lower[k] == -inf)) & (b | (upper[k] == inf))) ? 0.0 : 1.0;
+        code[k] = (a ? 1 : 0) | (b ? 2 : 0);
+    }
+} else if (lower) {
+    SIMD for (int k = 0; k < n; ++k) {
+        const bool a = lower[k] == least;
+        others += (a | (lower[k] == -inf)) ? 0.0 : 1.0;
+        code[k] = (a ? 1 : 0) | above;
+    }
+} else {
+    SIMD for (int k = 0; k < n; ++k) {
+        const bool b = upper[k] == most;
+        others += (b | (upper[k] == inf)) ? 0.0 : 1.0;
+        code[k] = below | (b ? 2 : 0);
+    }
+}
 
 // kernel bounds.code_rows: Bits of a side whose field has no ghost cells, and how many of its
 // finite values are others
@@ -23,9 +37,13 @@ if (lower && upper) { SIMD for (int k = 0; k < n; ++k) {
 //   whole      float64 source
 //   numbers    float64 value, infinite; int bit
 //   sums       others
-const double* v = source + (long long)P.row*L.nx + P.first; double others = 0;
+const double* v = source + (long long)P.row * L.nx + P.first;
+double others = 0;
 SIMD for (int k = 0; k < n; ++k) {
-    const bool a = v[k] == value, none = v[k] == infinite; others += (a | none) ? 0.0 : 1.0; code[k] += (a & !none) ? bit : 0; }
+    const bool a = v[k] == value, none = v[k] == infinite;
+    others += (a | none) ? 0.0 : 1.0;
+    code[k] += (a & !none) ? bit : 0;
+}
 
 // kernel bounds.decode: The field of bounds that a code stands for
 //   compute    float64

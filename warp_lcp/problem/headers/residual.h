@@ -11,9 +11,12 @@
 double square = 0;
 with_bounds([&](auto lower, auto upper) {
     SIMD for (int i = 0; i < n; ++i) {
-        const double a = unit*(double)d[i], b = a < 0 ? -a : a, e = b == 0 ? 1.0 : b;
-        const double r0 = natural_residual(y[i], e*(x[i] - lower(i)), e*(x[i] - upper(i))), r = unknown[i] == 1 ? r0 + 0.0*x[i] : 0.0;
-        square += r*r; } });
+        const double a = unit * (double)d[i], b = a < 0 ? -a : a, e = b == 0 ? 1.0 : b;
+        const double r0 = natural_residual(y[i], e * (x[i] - lower(i)), e * (x[i] - upper(i))),
+                     r = unknown[i] == 1 ? r0 + 0.0 * x[i] : 0.0;
+        square += r * r;
+    }
+});
 
 // kernel residual.unknown_square: The square of a field over the unknowns
 //   compute    float64
@@ -21,7 +24,7 @@ with_bounds([&](auto lower, auto upper) {
 //   sums       square
 //   module     problem
 double square = 0;
-SIMD for (int i = 0; i < n; ++i) square += unknown[i] == 1 ? b[i]*b[i] : 0.0;
+SIMD for (int i = 0; i < n; ++i) square += unknown[i] == 1 ? b[i] * b[i] : 0.0;
 
 // kernel residual.within: clip(x, l, u), or clip(0, l, u), on the unknowns; 0 elsewhere
 //   compute    float64
@@ -32,7 +35,10 @@ SIMD for (int i = 0; i < n; ++i) square += unknown[i] == 1 ? b[i]*b[i] : 0.0;
 //   module     problem
 with_bounds([&](auto lower, auto upper) {
     SIMD for (int i = 0; i < n; ++i) {
-        const double v = keep ? x[i] : 0.0, c = clipped(v, lower(i), upper(i)); x[i] = unknown[i] == 1 ? c : 0.0; } });
+        const double v = keep ? x[i] : 0.0, c = clipped(v, lower(i), upper(i));
+        x[i] = unknown[i] == 1 ? c : 0.0;
+    }
+});
 
 // kernel residual.settle_isolated: Where A's row is empty, y = b: x is the bound that b's sign
 // asks for
@@ -43,7 +49,10 @@ with_bounds([&](auto lower, auto upper) {
 with_bounds([&](auto lower, auto upper) {
     for (int i = 0; i < n; ++i) {
         const double bound = b[i] < 0 ? upper(i) : lower(i);
-        if (unknown[i] == 1 && d[i] == 0 && b[i] != 0 && bound > -1e300 && bound < 1e300) x[i] = bound; } });
+        if (unknown[i] == 1 && d[i] == 0 && b[i] != 0 && bound > -1e300 && bound < 1e300)
+            x[i] = bound;
+    }
+});
 
 // kernel problem.check: Of the unknowns: values that are not finite, NaN among the bounds, crossed
 // bounds, bounds that no x can meet
@@ -51,9 +60,16 @@ with_bounds([&](auto lower, auto upper) {
 //   bounds
 //   reads      float64 b; int8 unknown
 //   sums       bad, nan_lower, nan_upper, crossed, no_lower, no_upper
-double bad = 0, nan_lower = 0, nan_upper = 0, crossed = 0, no_lower = 0, no_upper = 0; const double inf = (double)INFINITY;
+double bad = 0, nan_lower = 0, nan_upper = 0, crossed = 0, no_lower = 0, no_upper = 0;
+const double inf = (double)INFINITY;
 with_bounds([&](auto lower, auto upper) {
     SIMD for (int k = 0; k < n; ++k) {
         const double l = lower(k), u = upper(k), one = unknown[k] == 1 ? 1.0 : 0.0, v = b[k] - b[k];
-        bad += v == 0 ? 0.0 : one; nan_lower += l == l ? 0.0 : one; nan_upper += u == u ? 0.0 : one;
-        crossed += l > u ? one : 0.0; no_lower += l == inf ? one : 0.0; no_upper += u == -inf ? one : 0.0; } });
+        bad += v == 0 ? 0.0 : one;
+        nan_lower += l == l ? 0.0 : one;
+        nan_upper += u == u ? 0.0 : one;
+        crossed += l > u ? one : 0.0;
+        no_lower += l == inf ? one : 0.0;
+        no_upper += u == -inf ? one : 0.0;
+    }
+});

@@ -12,11 +12,20 @@
 T moved = 0, active = 0, shifted = 0, square = 0;
 with_bounds([&](auto lower, auto upper) {
     SIMD for (int k = 0; k < n; ++k) {
-        const T a = diagonal(k), f = a < 0 ? -a : a, e = f == 0 ? (T)1 : f, v = x[k] - known[k]/e, l = lower(k), u = upper(k);
-        const bool low = v < l, high = v > u, inside = unknown[k] == 1, held = inside & (low | high);
-        const unsigned char now = inside & !held; const T at = held ? (low ? l : u) : x[k], y = now ? known[k] : (T)0;
-        shifted += at != x[k] ? (T)1 : (T)0; x[k] = at; g[k] = (S)(-y*scale); square += y*y;
-        moved += now != free[k] ? (T)1 : (T)0; active += held ? (T)1 : (T)0; free[k] = now; } });
+        const T a = diagonal(k), f = a < 0 ? -a : a, e = f == 0 ? (T)1 : f, v = x[k] - known[k] / e,
+                l = lower(k), u = upper(k);
+        const bool low = v<l, high = v> u, inside = unknown[k] == 1, held = inside & (low | high);
+        const unsigned char now = inside & !held;
+        const T at = held ? (low ? l : u) : x[k], y = now ? known[k] : (T)0;
+        shifted += at != x[k] ? (T)1 : (T)0;
+        x[k] = at;
+        g[k] = (S)(-y * scale);
+        square += y * y;
+        moved += now != free[k] ? (T)1 : (T)0;
+        active += held ? (T)1 : (T)0;
+        free[k] = now;
+    }
+});
 
 // kernel active_set.all_free: Every unknown is free
 //   compute    float64
@@ -31,7 +40,11 @@ SIMD64 for (int k = 0; k < n; ++k) free[k] = unknown[k] == 1;
 //   numbers    float64 scale
 //   sums       square
 T square = 0;
-SIMD for (int k = 0; k < n; ++k) { const T v = free[k] ? y[k] : (T)0; g[k] = (S)(free[k] ? -y[k]*scale : (T)0); square += v*v; }
+SIMD for (int k = 0; k < n; ++k) {
+    const T v = free[k] ? y[k] : (T)0;
+    g[k] = (S)(free[k] ? -y[k] * scale : (T)0);
+    square += v * v;
+}
 
 // kernel active_set.step: The direction z + beta `along` in the place of `along`, where there is a
 // z, and `to` = x + step `along`, onto the bounds where that is not 0. An x that is `guarded`
@@ -41,14 +54,21 @@ SIMD for (int k = 0; k < n; ++k) { const T v = free[k] ? y[k] : (T)0; g[k] = (S)
 //   reads      float64 x?; S z?
 //   writes     S along; float64 to?, kept?
 //   numbers    float64 beta, step; bool guarded
-const S part = (S)beta; const bool fresh = part == 0, open = !guarded;
-if (z && (to || fresh)) SIMD for (int k = 0; k < n; ++k) along[k] = fresh ? z[k] : z[k] + part*along[k];  // rounded twice: a selection
-else if (z) SIMD for (int k = 0; k < n; ++k) along[k] = z[k] + part*along[k];  // rounded once
+const S part = (S)beta;
+const bool fresh = part == 0, open = !guarded;
+// rounded twice: a selection
+if (z && (to || fresh))
+    SIMD for (int k = 0; k < n; ++k) along[k] = fresh ? z[k] : z[k] + part * along[k];
+else if (z)
+    SIMD for (int k = 0; k < n; ++k) along[k] = z[k] + part * along[k];  // rounded once
 if (kept) SIMD8 for (int k = 0; k < n; ++k) kept[k] = x[k];
-if (to) with_bounds([&](auto lower, auto upper) {
-    SIMD8 for (int k = 0; k < n; ++k) {
-        const T v = x[k] + step*(T)along[k], c = clipped(v, lower(k), upper(k));
-        to[k] = ((along[k] != 0) & (open | (v - v == 0))) ? c : x[k]; } });
+if (to)
+    with_bounds([&](auto lower, auto upper) {
+        SIMD8 for (int k = 0; k < n; ++k) {
+            const T v = x[k] + step * (T)along[k], c = clipped(v, lower(k), upper(k));
+            to[k] = ((along[k] != 0) & (open | (v - v == 0))) ? c : x[k];
+        }
+    });
 
 // kernel principal_system.shift: diagonal = unit d + shift on the free set, 0 elsewhere; weight =
 // 1 / |diagonal|, 1 where that is 0, 0 off the free set
@@ -56,22 +76,38 @@ if (to) with_bounds([&](auto lower, auto upper) {
 //   reads      D d; uint8 free; float64 shift?
 //   writes     S diagonal, weight
 //   numbers    float64 unit
-if (shift) { SIMD for (int k = 0; k < n; ++k) diagonal[k] = free[k] ? (T)(unit*(double)d[k] + shift[k]) : (T)0; }
-else { SIMD for (int k = 0; k < n; ++k) diagonal[k] = free[k] ? (T)(unit*(double)d[k]) : (T)0; }
-SIMD for (int k = 0; k < n; ++k) { const T a = diagonal[k] < 0 ? -diagonal[k] : diagonal[k]; weight[k] = a > 0 ? (T)1/a : (T)(free[k] != 0); }
+if (shift) {
+    SIMD for (int k = 0; k < n; ++k) diagonal[k] =
+        free[k] ? (T)(unit * (double)d[k] + shift[k]) : (T)0;
+} else {
+    SIMD for (int k = 0; k < n; ++k) diagonal[k] = free[k] ? (T)(unit * (double)d[k]) : (T)0;
+}
+SIMD for (int k = 0; k < n; ++k) {
+    const T a = diagonal[k] < 0 ? -diagonal[k] : diagonal[k];
+    weight[k] = a > 0 ? (T)1 / a : (T)(free[k] != 0);
+}
 
 // kernel principal_system.mask: q + D direction on the free set, 0 off it
 //   compute    float64
 //   reads      float64 direction; uint8 free; float64 shift?
 //   writes     float64 q
-if (shift) { SIMD for (int k = 0; k < n; ++k) { EXACT_MATH const double v = shift[k]*direction[k], s = q[k] + v; q[k] = free[k] ? s : 0.0; } }
-else { SIMD for (int k = 0; k < n; ++k) q[k] = free[k] ? q[k] : 0.0; }
+if (shift) {
+    SIMD for (int k = 0; k < n; ++k) {
+        EXACT_MATH const double v = shift[k] * direction[k], s = q[k] + v;
+        q[k] = free[k] ? s : 0.0;
+    }
+} else {
+    SIMD for (int k = 0; k < n; ++k) q[k] = free[k] ? q[k] : 0.0;
+}
 
 // kernel principal_system.divide: z = r / d, r where d is 0
 //   compute    float64
 //   reads      float64 r, d
 //   writes     float64 z
-SIMD for (int k = 0; k < n; ++k) { const double v = r[k]/d[k]; z[k] = d[k] != 0 ? v : r[k]; }
+SIMD for (int k = 0; k < n; ++k) {
+    const double v = r[k] / d[k];
+    z[k] = d[k] != 0 ? v : r[k];
+}
 
 // kernel equilibrated.units: A field times units, or over them: powers of 2, so that nothing is
 // rounded, and infinities stay what they are
@@ -79,4 +115,7 @@ SIMD for (int k = 0; k < n; ++k) { const double v = r[k]/d[k]; z[k] = d[k] != 0 
 //   reads      float64 x, units
 //   writes     float64 scaled
 //   numbers    bool inverse
-SIMD for (int k = 0; k < n; ++k) { const double times = x[k]*units[k], over_ = x[k]/units[k]; scaled[k] = inverse ? over_ : times; }
+SIMD for (int k = 0; k < n; ++k) {
+    const double times = x[k] * units[k], over_ = x[k] / units[k];
+    scaled[k] = inverse ? over_ : times;
+}

@@ -9,19 +9,27 @@
 //   whole      float64 scalars
 //   constants  SIZE, BETA, STEP, PER_SIZE
 //   module     projected_multigrid.steps
-const S beta = (S)scalars[BETA]; const T step = scalars[STEP], inverse = step != 0 ? reciprocal(step) : 0;
+const S beta = (S)scalars[BETA];
+const T step = scalars[STEP], inverse = step != 0 ? reciprocal(step) : 0;
 const bool fresh = beta == 0;  // then q may hold anything, a NaN too
 fetch(0, n, x, z, q);
 with_bounds([&](auto lower, auto upper) {
     SIMD8 for (int k = 0; k < n; ++k) {
-        const auto s = (fresh | (z[k] == 0)) ? z[k] : z[k] + beta*q[k];  // held unknowns leave the direction
-        const T v = x[k] + step*(T)s, c = clipped(v, lower(k), upper(k));
-        const bool moves = (s != 0) & (v - v == 0), cut = moves & (c != v);  // a NaN or infinite step leaves x as it was
-        const T left = (c - x[k])*inverse;
-        q[k] = cut ? left : (T)s; x[k] = moves ? c : x[k]; } });
+        // held unknowns leave the direction
+        const auto s = (fresh | (z[k] == 0)) ? z[k] : z[k] + beta * q[k];
+        const T v = x[k] + step * (T)s, c = clipped(v, lower(k), upper(k));
+        // a NaN or infinite step leaves x as it was
+        const bool moves = (s != 0) & (v - v == 0), cut = moves & (c != v);
+        const T left = (c - x[k]) * inverse;
+        q[k] = cut ? left : (T)s;
+        x[k] = moves ? c : x[k];
+    }
+});
 
 // snippet mark: what stands in place of a right-hand side where an unknown is held
-const S mark = (S)1e30f;  // in place of a right-hand side, of order one: a held unknown that is not at its bound, below 0 for the lower one
+// in place of a right-hand side, of order one: a held unknown that is not at its bound, below 0 for
+// the lower one
+const S mark = (S)1e30f;
 
 // kernel projected_multigrid.assess: y = A x + b: the natural residual, the energy, the free set,
 // and g = -y / SIZE on it, a right-hand side. An unknown is held if it sits at a bound with y of
@@ -39,40 +47,72 @@ const S mark = (S)1e30f;  // in place of a right-hand side, of order one: a held
 //   constants  SIZE, BETA, STEP, PER_SIZE, MINIMUM_MAP = 0, ROUNDED = 0
 #include "mark"
 const auto near = [](T v) -> T { return ROUNDED ? (T)(float)v : v; };  // a bound as x can hold it
-const auto stored = [&](int k) -> F { return sizeof(F) > sizeof(*d) ? (F)diagonal(k) : (F)d[k]; };  // a count of faces, or what it is worth
+// a count of faces, or what it is worth
+const auto stored = [&](int k) -> F { return sizeof(F) > sizeof(*d) ? (F)diagonal(k) : (F)d[k]; };
 const T inverse = scalars[PER_SIZE];
-T norm = 0, energy = 0; int moved = 0, active = 0, off = 0; unsigned char hold[M];
+T norm = 0, energy = 0;
+int moved = 0, active = 0, off = 0;
+unsigned char hold[M];
 for (int begin = 0; begin < n; begin += M) {
-    const int end = n - begin < M ? n : begin + (int)M; T y[M]; unsigned char any = 0, count = 0, far = 0;
+    const int end = n - begin < M ? n : begin + (int)M;
+    T y[M];
+    unsigned char any = 0, count = 0, far = 0;
     fetch(begin, end, x + zp, b, g, d, unknown, free);
     SIMD8 for (int k = begin; k < end; ++k) y[k - begin] = affine(x, b, k);
     if (unbounded) {
         SIMD8 for (int k = begin; k < end; ++k) {
-            const T v = y[k - begin], r = unknown[k] == 1 ? v : (T)0; norm += r*r; g[k] = d[k] != 0 ? -v*inverse : (T)0; }
-        SIMD for (int k = begin; k < end; ++k) { const F now = stored(k); any |= (unsigned char)(free[k] != now); free[k] = now; }
+            const T v = y[k - begin], r = unknown[k] == 1 ? v : (T)0;
+            norm += r * r;
+            g[k] = d[k] != 0 ? -v * inverse : (T)0;
+        }
+        SIMD for (int k = begin; k < end; ++k) {
+            const F now = stored(k);
+            any |= (unsigned char)(free[k] != now);
+            free[k] = now;
+        }
         moved += any;
         continue;
     }
     with_bounds([&](auto lower, auto upper) {
         SIMD8 for (int k = begin; k < end; ++k) {
-            const T e = diagonal(k), f = e != 0 ? e : (T)1, l = lower(k), u = upper(k), v = y[k - begin];
-            const T below = f*(x[k] - l), above = f*(x[k] - u), r0 = natural_residual(v, below, above), r = unknown[k] == 1 ? r0 : (T)0;
-            norm += r*r; energy += unknown[k] == 1 ? x[k]*(v + b[k]) : (T)0;
+            const T e = diagonal(k), f = e != 0 ? e : (T)1, l = lower(k), u = upper(k),
+                    v = y[k - begin];
+            const T below = f * (x[k] - l), above = f * (x[k] - u),
+                    r0 = natural_residual(v, below, above), r = unknown[k] == 1 ? r0 : (T)0;
+            norm += r * r;
+            energy += unknown[k] == 1 ? x[k] * (v + b[k]) : (T)0;
             if constexpr (MINIMUM_MAP) {
-                const bool low = below < v, high = above > v, held = classify & (unknown[k] == 1) & (low | high);
+                const bool low = below<v, high = above> v,
+                           held = classify & (unknown[k] == 1) & (low | high);
                 const bool there = x[k] == (low ? near(l) : near(u));
-                const S at = ((e != 0) & !held) ? (S)(-v*inverse) : (S)0;
-                hold[k - begin] = held ? (there ? 1 : 3) : 0; g[k] = (held & !there) ? (low ? -mark : mark) : at;
+                const S at = ((e != 0) & !held) ? (S)(-v * inverse) : (S)0;
+                hold[k - begin] = held ? (there ? 1 : 3) : 0;
+                g[k] = (held & !there) ? (low ? -mark : mark) : at;
             } else {
-                const bool held = classify & (((x[k] <= near(l)) & (v >= 0)) | ((x[k] >= near(u)) & (v <= 0)));
-                hold[k - begin] = held; g[k] = ((e != 0) & !held) ? -v*inverse : (T)0;
-            } } });
+                const bool held =
+                    classify & (((x[k] <= near(l)) & (v >= 0)) | ((x[k] >= near(u)) & (v <= 0)));
+                hold[k - begin] = held;
+                g[k] = ((e != 0) & !held) ? -v * inverse : (T)0;
+            }
+        }
+    });
     SIMD for (int k = begin; k < end; ++k) {  // bytes only, where the diagonal is one
-        const unsigned char h = hold[k - begin]; const F now = h ? (F)0 : stored(k); const unsigned char one = free[k] != now, two = h & unknown[k];
-        any |= one; count += two; free[k] = now; if constexpr (MINIMUM_MAP) far |= h; }
-    moved += any; active += count; off |= far & 2; }
+        const unsigned char h = hold[k - begin];
+        const F now = h ? (F)0 : stored(k);
+        const unsigned char one = free[k] != now, two = h & unknown[k];
+        any |= one;
+        count += two;
+        free[k] = now;
+        if constexpr (MINIMUM_MAP) far |= h;
+    }
+    moved += any;
+    active += count;
+    off |= far & 2;
+}
 if (moved) changed[P.row] = 1;
-if constexpr (MINIMUM_MAP) { if (off) away[P.row] = 1; }
+if constexpr (MINIMUM_MAP) {
+    if (off) away[P.row] = 1;
+}
 
 // kernel projected_multigrid.measure: The products of a correction z that beta and the step need
 //   compute    S
@@ -82,7 +122,12 @@ if constexpr (MINIMUM_MAP) { if (off) away[P.row] = 1; }
 T zaz = 0, zap = 0, gz = 0, gp = 0;
 fetch(0, n, z + zp, q, g);
 SIMD for (int k = 0; k < n; ++k) {
-    const T w = product(z, k); zaz += z[k]*w; zap += q[k]*w; gz += g[k]*z[k]; gp += g[k]*q[k]; }
+    const T w = product(z, k);
+    zaz += z[k] * w;
+    zap += q[k] * w;
+    gz += g[k] * z[k];
+    gp += g[k] * q[k];
+}
 
 // kernel projected_multigrid.measure_again: As measure, in the places of some rows among those
 // of all
@@ -93,8 +138,11 @@ SIMD for (int k = 0; k < n; ++k) {
 //   numbers    int place, lines, places
 //   by_cell
 #include "projected_multigrid.measure"
-double* sum = sums + place + P.k*lines + P.j;
-sum[0] = (double)zaz; sum[places] = (double)zap; sum[2*places] = (double)gz; sum[3*places] = (double)gp;
+double* sum = sums + place + P.k * lines + P.j;
+sum[0] = (double)zaz;
+sum[places] = (double)zap;
+sum[2 * places] = (double)gz;
+sum[3 * places] = (double)gp;
 
 // kernel projected_multigrid.hold: Marked unknowns of flagged rows go onto their bounds
 //   compute    float64
@@ -107,8 +155,11 @@ sum[0] = (double)zaz; sum[places] = (double)zap; sum[2*places] = (double)gz; sum
 if (!away[P.row]) continue;
 with_bounds([&](auto lower, auto upper) {
     SIMD8 for (int k = 0; k < n; ++k) {
-        const T l = lower(k), u = upper(k); const bool low = g[k] <= -mark, high = g[k] >= mark;
-        x[k] = low ? (ROUNDED ? (T)(float)l : l) : high ? (ROUNDED ? (T)(float)u : u) : x[k]; } });
+        const T l = lower(k), u = upper(k);
+        const bool low = g[k] <= -mark, high = g[k] >= mark;
+        x[k] = low ? (ROUNDED ? (T)(float)l : l) : high ? (ROUNDED ? (T)(float)u : u) : x[k];
+    }
+});
 
 // kernel projected_multigrid.right_side: g = -(A x + b) / SIZE on the free set, in flagged rows
 // and those beside them
@@ -123,13 +174,21 @@ with_bounds([&](auto lower, auto upper) {
 const auto flagged = [&](int k, int j) -> bool {
     if (around_z) k = (k + L.planes) % L.planes;
     if (around_y) j = (j + L.rows) % L.rows;
-    return k >= 0 && k < L.planes && j >= 0 && j < L.rows && away[k*L.rows + j]; };
-if (!(flagged(P.k, P.j) || flagged(P.k - 1, P.j) || flagged(P.k + 1, P.j) || flagged(P.k, P.j - 1) || flagged(P.k, P.j + 1))) continue;
+    return k >= 0 && k < L.planes && j >= 0 && j < L.rows && away[k * L.rows + j];
+};
+if (!(flagged(P.k, P.j) || flagged(P.k - 1, P.j) || flagged(P.k + 1, P.j) ||
+      flagged(P.k, P.j - 1) || flagged(P.k, P.j + 1)))
+    continue;
 const T inverse = reciprocal(scalars[SIZE]);
 for (int begin = 0; begin < n; begin += M) {
-    const int end = n - begin < M ? n : begin + (int)M; T y[M];
+    const int end = n - begin < M ? n : begin + (int)M;
+    T y[M];
     SIMD8 for (int k = begin; k < end; ++k) y[k - begin] = affine(x, b, k);
-    SIMD8 for (int k = begin; k < end; ++k) { const T v = y[k - begin]*inverse; g[k] = free[k] != 0 ? -v : (T)0; } }
+    SIMD8 for (int k = begin; k < end; ++k) {
+        const T v = y[k - begin] * inverse;
+        g[k] = free[k] != 0 ? -v : (T)0;
+    }
+}
 
 // kernel projected_multigrid.gaps: Bounds of a correction in units of SIZE; finite, and 0 off the
 // unknowns
@@ -143,9 +202,14 @@ for (int begin = 0; begin < n; begin += M) {
 const T inverse = reciprocal(scalars[SIZE]), big = 1e30;
 with_bounds([&](auto lower, auto upper) {
     SIMD for (int k = 0; k < n; ++k) {
-        const T a = (lower(k) - x[k])*inverse, l = a < -big ? -big : (a > 0 ? (T)0 : a); lo[k] = unknown[k] == 1 ? l : (T)0; }
+        const T a = (lower(k) - x[k]) * inverse, l = a < -big ? -big : (a > 0 ? (T)0 : a);
+        lo[k] = unknown[k] == 1 ? l : (T)0;
+    }
     if (hi) SIMD for (int k = 0; k < n; ++k) {
-        const T c = (upper(k) - x[k])*inverse, u = c > big ? big : (c < 0 ? (T)0 : c); hi[k] = unknown[k] == 1 ? u : (T)0; } });
+            const T c = (upper(k) - x[k]) * inverse, u = c > big ? big : (c < 0 ? (T)0 : c);
+            hi[k] = unknown[k] == 1 ? u : (T)0;
+        }
+});
 
 // kernel projected_multigrid.mask: 1 where the masked diagonal is not 0
 //   compute    uint8
@@ -163,5 +227,7 @@ SIMD for (int k = 0; k < n; ++k) mask[k] = free[k] != 0;
 const T step = scalars[STEP];
 with_bounds([&](auto lower, auto upper) {
     SIMD for (int k = 0; k < n; ++k) {
-        const T v = x[k] - step*(T)q[k], c = clipped(v, lower(k), upper(k));
-        before[k] = ((unknown[k] == 1) & (q[k] != 0) & (v - v == 0)) ? c : x[k]; } });
+        const T v = x[k] - step * (T)q[k], c = clipped(v, lower(k), upper(k));
+        before[k] = ((unknown[k] == 1) & (q[k] != 0) & (v - v == 0)) ? c : x[k];
+    }
+});

@@ -20,114 +20,132 @@
 EXACT_MATH
 #include "algebra.h:algebra"
 #include "motion.h:spins"
-const int n = count, q = 3, dim = 2, m = 6, size = dim*contacts;
-double *values = reals;
-const double *mass = values + 26*n, *inverse = mass + n, *inertias = inverse + 9*n,
-    *points = inertias + 9*n, *frames = points + 3*contacts;
-const double *sizes = frames + 6*contacts, *ones = sizes + contacts, *others = ones + 6*contacts,
-    *walls = others + 6*contacts;
-const double *targets = walls + 2*contacts, *frictions = targets + contacts,
-    *gaps = frictions + contacts, *before = gaps + contacts;
-double *impulses = reals + 45*n + 27*contacts + (resumed ? size : 8*old),
-    *memory = impulses + size, *squares = memory + 8*contacts;
-double *roots = squares + 9*n, *ways = roots + 3*(n + 1),
-    *holding = ways + 3*n, *largest = holding + n,
-    *V = largest + n + 1, *start = V + 3*(n + 1), *x = start + size, *J = x + size,
-    *b = J + size*m, *e = b + size, *d = e + size, *mu = d + size;
+const int n = count, q = 3, dim = 2, m = 6, size = dim * contacts;
+double* values = reals;
+const double *mass = values + 26 * n, *inverse = mass + n, *inertias = inverse + 9 * n,
+             *points = inertias + 9 * n, *frames = points + 3 * contacts;
+const double *sizes = frames + 6 * contacts, *ones = sizes + contacts,
+             *others = ones + 6 * contacts, *walls = others + 6 * contacts;
+const double *targets = walls + 2 * contacts, *frictions = targets + contacts,
+             *gaps = frictions + contacts, *before = gaps + contacts;
+double *impulses = reals + 45 * n + 27 * contacts + (resumed ? size : 8 * old),
+       *memory = impulses + size, *squares = memory + 8 * contacts;
+double *roots = squares + 9 * n, *ways = roots + 3 * (n + 1), *holding = ways + 3 * n,
+       *largest = holding + n, *V = largest + n + 1, *start = V + 3 * (n + 1), *x = start + size,
+       *J = x + size, *b = J + size * m, *e = b + size, *d = e + size, *mu = d + size;
 double *g = mu + contacts, *way = g + size, *best = way + size, *w = best + size,
-    *places = w + q*(n + 1), *pushes = places + 3*contacts;
-double *far = pushes + 3*(n + 1), *residual = far + contacts, *rounds = residual + contacts;
+       *places = w + q * (n + 1), *pushes = places + 3 * contacts;
+double *far = pushes + 3 * (n + 1), *residual = far + contacts, *rounds = residual + contacts;
 const int *first_of = indices, *second_of = first_of + contacts;
-int *order = indices + 2*contacts, *starts = order + contacts, *one = starts + contacts + 1,
+int *order = indices + 2 * contacts, *starts = order + contacts, *one = starts + contacts + 1,
     *other = one + contacts;
 int *least = other + contacts, *nearest = least + n + 1;
-const auto both = [&](const double *x, const double *rows)
-    { return fused(x[0], rows[0], x[1]*rows[3]) + 0.0; };
-for (int i = 0; i <= n; ++i) for (int a = 0; a < 3; ++a)
-    V[3*i + a] = roots[3*i + a] = pushes[3*i + a] = 0.0;
+const auto both = [&](const double* x, const double* rows) {
+    return fused(x[0], rows[0], x[1] * rows[3]) + 0.0;
+};
+for (int i = 0; i <= n; ++i)
+    for (int a = 0; a < 3; ++a) V[3 * i + a] = roots[3 * i + a] = pushes[3 * i + a] = 0.0;
 const auto find_velocity = [&](int i) {
     double spin[3];
-    spin_of(values + 26*i + 3, inverse + 9*i, values + 26*i + 15, spin);
-    V[3*i] = values[26*i + 12]/mass[i]; V[3*i + 1] = values[26*i + 13]/mass[i];
-        V[3*i + 2] = spin[2];
+    spin_of(values + 26 * i + 3, inverse + 9 * i, values + 26 * i + 15, spin);
+    V[3 * i] = values[26 * i + 12] / mass[i];
+    V[3 * i + 1] = values[26 * i + 13] / mass[i];
+    V[3 * i + 2] = spin[2];
 };
 const auto velocity_of = [&](int k, int r) {
-    const double *u = ones + 6*k + 3*r, *v = others + 6*k + 3*r;
-    return (along(u, 1, V + 3*first_of[k], 1) + along(v, 1, V + 3*second_of[k], 1))
-        + walls[dim*k + r];
+    const double *u = ones + 6 * k + 3 * r, *v = others + 6 * k + 3 * r;
+    return (along(u, 1, V + 3 * first_of[k], 1) + along(v, 1, V + 3 * second_of[k], 1)) +
+           walls[dim * k + r];
 };
 for (int i = 0; i < n; ++i) {
     find_velocity(i);
-    roots[3*i] = roots[3*i + 1] = 1.0/sqrt(mass[i]);
-    roots[3*i + 2] = along(values + 26*i + 9, 1, inertias + 9*i + 2, 3);
+    roots[3 * i] = roots[3 * i + 1] = 1.0 / sqrt(mass[i]);
+    roots[3 * i + 2] = along(values + 26 * i + 9, 1, inertias + 9 * i + 2, 3);
     least[i] = i;
 }
 // impulses to start from: those of the nearest contact of the same pair, each used once
 for (int k = 0; k < contacts; ++k) {
     const int i = first_of[k];
     double arm[3];
-    for (int a = 0; a < 3; ++a) arm[a] = points[3*k + a] - values[26*i + a];
-    for (int a = 0; a < 3; ++a) places[3*k + a] = along(arm, 1, values + 26*i + 3 + a, 3);
-    for (int r = 0; r < dim; ++r) start[dim*k + r] = resumed ? before[dim*k + r] : 0.0;
+    for (int a = 0; a < 3; ++a) arm[a] = points[3 * k + a] - values[26 * i + a];
+    for (int a = 0; a < 3; ++a) places[3 * k + a] = along(arm, 1, values + 26 * i + 3 + a, 3);
+    for (int r = 0; r < dim; ++r) start[dim * k + r] = resumed ? before[dim * k + r] : 0.0;
 }
 const auto distance_to = [&](int k, int o) {
     double c[3];
-    for (int a = 0; a < 3; ++a) c[a] = places[3*k + a] - before[8*o + 2 + a];
+    for (int a = 0; a < 3; ++a) c[a] = places[3 * k + a] - before[8 * o + 2 + a];
     return length(c);
 };
-const auto same_pair = [&](int k, int o)
-    { return before[8*o] == first_of[k] && before[8*o + 1] == second_of[k]; };
+const auto same_pair = [&](int k, int o) {
+    return before[8 * o] == first_of[k] && before[8 * o + 1] == second_of[k];
+};
 for (int k = 0; k < contacts && !resumed; ++k) {
     nearest[k] = -1;
-    for (int o = 0; o < old; ++o) if (same_pair(k, o)) {
-        const double c = distance_to(k, o);
-        if (nearest[k] < 0 || c < far[k]) { nearest[k] = o; far[k] = c; }
-    }
+    for (int o = 0; o < old; ++o)
+        if (same_pair(k, o)) {
+            const double c = distance_to(k, o);
+            if (nearest[k] < 0 || c < far[k]) {
+                nearest[k] = o;
+                far[k] = c;
+            }
+        }
 }
 for (int k = 0; k < contacts && !resumed; ++k) {
     const int o = nearest[k];
-    if (o < 0 || !(far[k] < SAME_PLACE*sizes[k])) continue;
+    if (o < 0 || !(far[k] < SAME_PLACE * sizes[k])) continue;
     bool mine = true;
-    for (int c = 0; c < contacts; ++c) if (c != k && same_pair(c, o)) {
-        const double its = distance_to(c, o);
-        mine &= !(its < far[k] || (its == far[k] && c < k));
-    }
+    for (int c = 0; c < contacts; ++c)
+        if (c != k && same_pair(c, o)) {
+            const double its = distance_to(c, o);
+            mine &= !(its < far[k] || (its == far[k] && c < k));
+        }
     for (int r = 0; r < dim && mine; ++r)
-        start[dim*k + r] = across(frames + 6*k + 3*r, before + 8*o + 5);
+        start[dim * k + r] = across(frames + 6 * k + 3 * r, before + 8 * o + 5);
 }
 // contacts sorted by islands, of which each has the number of its least body
-const auto root = [&](int i) { while (least[i] != i) i = least[i]; return i; };
-for (int k = 0; k < contacts; ++k) if (second_of[k] < n) {
-    const int p = root(first_of[k]), s = root(second_of[k]);
-    if (p < s) least[s] = p; else least[p] = s;
-}
+const auto root = [&](int i) {
+    while (least[i] != i) i = least[i];
+    return i;
+};
+for (int k = 0; k < contacts; ++k)
+    if (second_of[k] < n) {
+        const int p = root(first_of[k]), s = root(second_of[k]);
+        if (p < s)
+            least[s] = p;
+        else
+            least[p] = s;
+    }
 int islands = 0, placed = 0;
 for (int i = 0; i < n; ++i) {
     const int begin = placed;
-    for (int k = 0; k < contacts; ++k) if (root(first_of[k]) == i) order[placed++] = k;
+    for (int k = 0; k < contacts; ++k)
+        if (root(first_of[k]) == i) order[placed++] = k;
     if (placed > begin) starts[islands++] = begin;
 }
 starts[islands] = placed;
 for (int p = 0; p < contacts; ++p) {
     const int k = order[p];
-    one[p] = first_of[k]; other[p] = second_of[k]; mu[p] = frictions[k];
+    one[p] = first_of[k];
+    other[p] = second_of[k];
+    mu[p] = frictions[k];
     for (int r = 0; r < dim; ++r) {
-        const double *u = ones + 6*k + 3*r, *v = others + 6*k + 3*r;
-        double *row = J + m*(dim*p + r);
-        for (int a = 0; a < 3; ++a)
-            { row[a] = u[a]*roots[3*one[p] + a] + 0.0;
-            row[3 + a] = v[a]*roots[3*other[p] + a] + 0.0; }
-        const int i = dim*p + r;
-        x[i] = start[dim*k + r];
+        const double *u = ones + 6 * k + 3 * r, *v = others + 6 * k + 3 * r;
+        double* row = J + m * (dim * p + r);
+        for (int a = 0; a < 3; ++a) {
+            row[a] = u[a] * roots[3 * one[p] + a] + 0.0;
+            row[3 + a] = v[a] * roots[3 * other[p] + a] + 0.0;
+        }
+        const int i = dim * p + r;
+        x[i] = start[dim * k + r];
         b[i] = velocity_of(k, r);
         if (r == 0) b[i] -= targets[k];
-        const double own = ((row[0]*row[0] + row[1]*row[1]) + row[2]*row[2])
-            + ((row[3]*row[3] + row[4]*row[4]) + row[5]*row[5]);
-        e[i] = r == 0 ? 0.0 : YIELDS*own;
+        const double own = ((row[0] * row[0] + row[1] * row[1]) + row[2] * row[2]) +
+                           ((row[3] * row[3] + row[4] * row[4]) + row[5] * row[5]);
+        e[i] = r == 0 ? 0.0 : YIELDS * own;
         d[i] = own + e[i];
     }
 }
-for (int i = 0; i < q*(n + 1); ++i) w[i] = 0.0;
+for (int i = 0; i < q * (n + 1); ++i) w[i] = 0.0;
 for (int t = 0; t < islands; ++t) {
 #include "contact_nncg.h:island"
 }
@@ -135,78 +153,91 @@ for (int t = 0; t < islands; ++t) {
     worst[0] = residual[t] > worst[0] ? residual[t] : worst[0];
     iterations[0] = rounds[t] > iterations[0] ? rounds[t] : iterations[0];
 }
-for (int p = 0; p < contacts; ++p) for (int r = 0; r < dim; ++r)
-    impulses[dim*order[p] + r] = x[dim*p + r];
-for (int k = 0; k < contacts; ++k) for (int a = 0; a < 3; ++a)
-    pushes[3*first_of[k] + a] += both(impulses + dim*k, ones + 6*k + a);
-for (int k = 0; k < contacts; ++k) for (int a = 0; a < 3; ++a)
-    pushes[3*second_of[k] + a] += both(impulses + dim*k, others + 6*k + a);
-if (worst[0] <= unsolved) for (int i = 0; i < n; ++i) {
-    double *momentum = values + 26*i + 12;
-    momentum[0] += pushes[3*i]; momentum[1] += pushes[3*i + 1]; momentum[2] += 0.0;
-    momentum[3] += 0.0; momentum[4] += 0.0; momentum[5] += pushes[3*i + 2];
-    find_velocity(i);
-}
+for (int p = 0; p < contacts; ++p)
+    for (int r = 0; r < dim; ++r) impulses[dim * order[p] + r] = x[dim * p + r];
+for (int k = 0; k < contacts; ++k)
+    for (int a = 0; a < 3; ++a)
+        pushes[3 * first_of[k] + a] += both(impulses + dim * k, ones + 6 * k + a);
+for (int k = 0; k < contacts; ++k)
+    for (int a = 0; a < 3; ++a)
+        pushes[3 * second_of[k] + a] += both(impulses + dim * k, others + 6 * k + a);
+if (worst[0] <= unsolved)
+    for (int i = 0; i < n; ++i) {
+        double* momentum = values + 26 * i + 12;
+        momentum[0] += pushes[3 * i];
+        momentum[1] += pushes[3 * i + 1];
+        momentum[2] += 0.0;
+        momentum[3] += 0.0;
+        momentum[4] += 0.0;
+        momentum[5] += pushes[3 * i + 2];
+        find_velocity(i);
+    }
 // what the end of the step asks for: overlaps, and what to remember
 for (int k = 0; k < contacts; ++k) {
-    double *kept = memory + 8*k;
-    kept[0] = first_of[k]; kept[1] = second_of[k];
+    double* kept = memory + 8 * k;
+    kept[0] = first_of[k];
+    kept[1] = second_of[k];
     for (int a = 0; a < 3; ++a) {
-        kept[2 + a] = places[3*k + a];
-        kept[5 + a] = fused(impulses[dim*k + 1], frames[6*k + 3 + a],
-            impulses[dim*k]*frames[6*k + a]) + 0.0;
+        kept[2 + a] = places[3 * k + a];
+        kept[5 + a] = fused(impulses[dim * k + 1], frames[6 * k + 3 + a],
+                            impulses[dim * k] * frames[6 * k + a]) +
+                      0.0;
     }
-    deep[0] += gaps[k] + dt*velocity_of(k, 0) < -SLOP*sizes[k];
+    deep[0] += gaps[k] + dt * velocity_of(k, 0) < -SLOP * sizes[k];
 }
 // the smallest ways that reduce these overlaps, see `ContactSolve.separation`: no friction
-for (int i = 0; i < 3*n; ++i) ways[i] = 0.0;
+for (int i = 0; i < 3 * n; ++i) ways[i] = 0.0;
 if (deep[0] > 0.0) {
     const int dim = 1, most = ROUGH_MOST;
     const double rtol = ROUGH_RTOL;
     for (int p = 0; p < contacts; ++p) {
         const int k = order[p];
-        const double gap = gaps[k] + dt*velocity_of(k, 0);
-        for (int a = 0; a < m; ++a) J[m*p + a] = J[m*2*p + a];  // the normals' rows
-        const double *row = J + m*p;
-        b[p] = gap < -SLOP*sizes[k] ? RATE*gap : (gap > 0.0 ? gap : 0.0);
+        const double gap = gaps[k] + dt * velocity_of(k, 0);
+        for (int a = 0; a < m; ++a) J[m * p + a] = J[m * 2 * p + a];  // the normals' rows
+        const double* row = J + m * p;
+        b[p] = gap < -SLOP * sizes[k] ? RATE * gap : (gap > 0.0 ? gap : 0.0);
         x[p] = e[p] = mu[p] = 0.0;
-        d[p] = ((row[0]*row[0] + row[1]*row[1]) + row[2]*row[2])
-            + ((row[3]*row[3] + row[4]*row[4]) + row[5]*row[5]);
+        d[p] = ((row[0] * row[0] + row[1] * row[1]) + row[2] * row[2]) +
+               ((row[3] * row[3] + row[4] * row[4]) + row[5] * row[5]);
     }
     for (int t = 0; t < islands; ++t) {
 #include "contact_nncg.h:island"
     }
-    for (int i = 0; i < 3*(n + 1); ++i) pushes[i] = 0.0;
+    for (int i = 0; i < 3 * (n + 1); ++i) pushes[i] = 0.0;
     for (int p = 0; p < contacts; ++p) far[order[p]] = x[p];
     for (int k = 0; k < contacts; ++k)
-        for (int a = 0; a < 3; ++a) pushes[3*first_of[k] + a] += far[k]*ones[6*k + a] + 0.0;
+        for (int a = 0; a < 3; ++a) pushes[3 * first_of[k] + a] += far[k] * ones[6 * k + a] + 0.0;
     for (int k = 0; k < contacts; ++k)
-        for (int a = 0; a < 3; ++a) pushes[3*second_of[k] + a] += far[k]*others[6*k + a] + 0.0;
-    for (int i = 0; i < 3*n; ++i) ways[i] = roots[i]*(roots[i]*pushes[i] + 0.0) + 0.0;
+        for (int a = 0; a < 3; ++a)
+            pushes[3 * second_of[k] + a] += far[k] * others[6 * k + a] + 0.0;
+    for (int i = 0; i < 3 * n; ++i) ways[i] = roots[i] * (roots[i] * pushes[i] + 0.0) + 0.0;
 }
 // what walls and other solids hold, see `Firm`: G' J' J G of its rows
 for (int i = 0; i <= n; ++i) largest[i] = 0.0;
-for (int i = 0; i < n; ++i)
-    { holding[i] = 0.0; for (int a = 0; a < 9; ++a) squares[9*i + a] = 0.0; }
+for (int i = 0; i < n; ++i) {
+    holding[i] = 0.0;
+    for (int a = 0; a < 9; ++a) squares[9 * i + a] = 0.0;
+}
 for (int k = 0; k < contacts; ++k) {
-    const double normal = impulses[dim*k];
+    const double normal = impulses[dim * k];
     double &mine = largest[first_of[k]], &its = largest[second_of[k]];
     mine = normal > mine ? normal : mine;
     its = normal > its ? normal : its;
 }
 largest[n] = INFINITY;
-for (int k = 0; k < contacts; ++k) if (second_of[k] == n) {
-    const int i = first_of[k];
-    const double normal = impulses[dim*k], *g = roots + 3*i;
-    if (!(normal > BEARS*(largest[i] < largest[n] ? largest[i] : largest[n]))) continue;
-    const bool sticks = fabs(impulses[dim*k + 1]) < frictions[k]*normal*(1.0 - BEARS);
-    holding[i] = 1.0;
-    for (int r = 0; r < 1 + sticks; ++r) {
-        double row[3];
-        for (int a = 0; a < 3; ++a) row[a] = ones[6*k + 3*r + a]*g[a];
-        for (int a = 0; a < 9; ++a)
-            squares[9*i + a] = fused(row[a/3], row[a % 3], squares[9*i + a]);
+for (int k = 0; k < contacts; ++k)
+    if (second_of[k] == n) {
+        const int i = first_of[k];
+        const double normal = impulses[dim * k], *g = roots + 3 * i;
+        if (!(normal > BEARS * (largest[i] < largest[n] ? largest[i] : largest[n]))) continue;
+        const bool sticks = fabs(impulses[dim * k + 1]) < frictions[k] * normal * (1.0 - BEARS);
+        holding[i] = 1.0;
+        for (int r = 0; r < 1 + sticks; ++r) {
+            double row[3];
+            for (int a = 0; a < 3; ++a) row[a] = ones[6 * k + 3 * r + a] * g[a];
+            for (int a = 0; a < 9; ++a)
+                squares[9 * i + a] = fused(row[a / 3], row[a % 3], squares[9 * i + a]);
+        }
     }
-}
 for (int k = 0; k < contacts; ++k)
     stacked[0] += second_of[k] < n && (holding[first_of[k]] > 0.0 || holding[second_of[k]] > 0.0);

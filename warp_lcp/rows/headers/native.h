@@ -1,5 +1,6 @@
-// How loops are written. SIMD: 16 elements at a time; SIMD8 where most are doubles; SIMD64 for bytes. Sums may be taken in any order.
-// clang vectorizes a loop only if it is told that arrays do not alias and if conditionals select values that are computed anyway.
+// How loops are written. SIMD: 16 elements at a time; SIMD8 where most are doubles; SIMD64 for
+// bytes. Sums may be taken in any order. clang vectorizes a loop only if it is told that arrays do
+// not alias and if conditionals select values that are computed anyway.
 #ifdef __CUDA_ARCH__
 #define FAST_MATH
 #define EXACT_MATH
@@ -15,12 +16,14 @@
 #define PRAGMA(TEXT) _Pragma(#TEXT)
 #define FAST_MATH PRAGMA(clang fp reassociate(on) contract(fast))
 #define EXACT_MATH PRAGMA(clang fp reassociate(off) contract(off))
-#define VECTORS(WIDTH) PRAGMA(clang loop vectorize(assume_safety) vectorize_width(WIDTH) interleave_count(1))
+#define VECTORS(WIDTH) \
+    PRAGMA(clang loop vectorize(assume_safety) vectorize_width(WIDTH) interleave_count(1))
 #define UNROLLED
 #define BUFFERED 128
 #endif
 #define SIMD VECTORS(16)
-// MASKED: what is left of a row after its last whole vector as a vector with a mask, where the processor has masks
+// MASKED: what is left of a row after its last whole vector as a vector with a mask, where the
+// processor has masks
 #if !defined(__CUDA_ARCH__) && defined(__AVX512BW__) && defined(__AVX512VL__)
 #define MASKED PRAGMA(clang loop vectorize_predicate(enable)) SIMD
 #else
@@ -29,14 +32,19 @@
 #define SIMD8 VECTORS(8)
 #define SIMD64 VECTORS(64)
 FAST_MATH  // comes before the first declaration
-enum { M = BUFFERED };  // cells that a row function buffers at a time
-// Ask for the cache lines that cells begin ... end of fields will need 512 elements later: the processor's own prefetching does not keep up
-// with a pass over seven fields or more whose rows are short. So far ahead made such passes 20 to 25 % faster at 128^3 and 256^3.
+    enum {
+        M = BUFFERED
+    };  // cells that a row function buffers at a time
+// Ask for the cache lines that cells begin ... end of fields will need 512 elements later: the
+// processor's own prefetching does not keep up with a pass over seven fields or more whose rows are
+// short. So far ahead made such passes 20 to 25 % faster at 128^3 and 256^3.
 #ifdef __CUDA_ARCH__
 const auto fetch = [](int begin, int end, const auto&... fields) {};
 #else
 const auto fetch = [](int begin, int end, const auto*... fields) {
-    const auto one = [&](const auto* q) { for (int i = begin; i < end; i += 64 / (int)sizeof(*q)) __builtin_prefetch(q + i + 512); };
+    const auto one = [&](const auto* q) {
+        for (int i = begin; i < end; i += 64 / (int)sizeof(*q)) __builtin_prefetch(q + i + 512);
+    };
     (one(fields), ...);
 };
 #endif
@@ -53,7 +61,9 @@ const auto make_at_least = [](double* to, double v) {
     wp::atomic_max(to, v);
 #else
     double was;
-    for (__atomic_load(to, &was, __ATOMIC_RELAXED); was < v && !__atomic_compare_exchange(to, &was, &v, false, __ATOMIC_RELAXED, __ATOMIC_RELAXED);) {}
+    for (__atomic_load(to, &was, __ATOMIC_RELAXED);
+         was < v &&
+         !__atomic_compare_exchange(to, &was, &v, false, __ATOMIC_RELAXED, __ATOMIC_RELAXED);) {}
 #endif
 };
 // a*b + c rounded once, of numbers or of vectors, whatever the compiler may do elsewhere
@@ -62,8 +72,12 @@ const auto fused = [](auto a, auto b, auto c) { return fma(a, b, c); };
 #else
 const auto fused = [](auto a, auto b, auto c) { return __builtin_elementwise_fma(a, b, c); };
 #endif
-const auto clipped = [](auto v, auto l, auto u) { const auto w = v < l ? l : v; return w > u ? u : w; };
-const auto reciprocal = [](auto v) { EXACT_MATH return 1/v; };  // else clang may divide each cell by v where it is used once
+const auto clipped = [](auto v, auto l, auto u) {
+    const auto w = v < l ? l : v;
+    return w > u ? u : w;
+};
+// else clang may divide each cell by v where it is used once
+const auto reciprocal = [](auto v) { EXACT_MATH return 1 / v; };
 // body(2) if `pairs`, else body(1): a loop over so many cells is unrolled in quads
 #ifdef QUADS
 #ifdef __CUDACC__
@@ -72,22 +86,34 @@ const auto reciprocal = [](auto v) { EXACT_MATH return 1/v; };  // else clang ma
 #define METHOD
 #endif
 typedef int Whole;  // Warp has a macro of the name of a conversion to int
-struct One { METHOD constexpr operator Whole() const { return 1; } };
-struct Two { METHOD constexpr operator Whole() const { return 2; } };
-const auto with_pairs = [](bool pairs, auto body) { if (pairs) body(Two()); else body(One()); };
+struct One {
+    METHOD constexpr operator Whole() const { return 1; }
+};
+struct Two {
+    METHOD constexpr operator Whole() const { return 2; }
+};
+const auto with_pairs = [](bool pairs, auto body) {
+    if (pairs)
+        body(Two());
+    else
+        body(One());
+};
 #else
 const auto with_pairs = [](bool pairs, auto body) { body(pairs ? 2 : 1); };
 #endif
-// a / e. In quads a division of float32 has no branch, for loads do not merge across branches: it is rounded as IEEE division is, but
-// where e or the quotient is not a normal number.
+// a / e. In quads a division of float32 has no branch, for loads do not merge across branches: it
+// is rounded as IEEE division is, but where e or the quotient is not a normal number.
 #if defined(QUADS) && defined(__CUDACC__)
 const auto quotient = [](auto a, auto e) {
     if constexpr (sizeof(a) == 4 && sizeof(e) == 4) {
-        float r; asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(e));
+        float r;
+        asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(e));
         r = fmaf(fmaf(-e, r, 1.0f), r, r);
-        const float q = a*r;
+        const float q = a * r;
         return fmaf(fmaf(-e, q, a), r, q);
-    } else return a / e; };
+    } else
+        return a / e;
+};
 #else
 const auto quotient = [](auto a, auto e) { return a / e; };
 #endif

@@ -30,11 +30,12 @@
 // before a part of a grid is exact, as they are a whole number below the coordinate.
 auto grid_coordinate = [=](T x, int before = 0) -> T {
 #ifdef __CUDA_ARCH__
-    if (sizeof(T) == 4) return (T)__fsub_rn(__fadd_rn(__fmul_rn((float)x, (float)inverse_dx), 1.0f), (float)before);
+    if (sizeof(T) == 4)
+        return (T)__fsub_rn(__fadd_rn(__fmul_rn((float)x, (float)inverse_dx), 1.0f), (float)before);
     return (T)__dsub_rn(__dadd_rn(__dmul_rn((double)x, (double)inverse_dx), 1.0), (double)before);
 #else
-    #pragma clang fp contract(off) reassociate(off)
-    const T scaled = x*inverse_dx;
+#pragma clang fp contract(off) reassociate(off)
+    const T scaled = x * inverse_dx;
     const T coordinate = scaled + (T)1;
     return coordinate - (T)before;
 #endif
@@ -43,4 +44,5 @@ auto grid_coordinate = [=](T x, int before = 0) -> T {
 // snippet fletcher_reeves: beta = |g|^2 / |g before|^2 of the squares `fresh` and `old` (0: none
 // before), and keep = 1, for x <- x + beta p, p <- beta p - keep g. Where beta > 1 both are 0: p
 // is forgotten ([Book] algorithm 8).
-const double ratio = old > 0.0 ? fresh/old : 0.0, beta = ratio > 1.0 ? 0.0 : ratio, keep = ratio > 1.0 ? 0.0 : 1.0;
+const double ratio = old > 0.0 ? fresh / old : 0.0, beta = ratio > 1.0 ? 0.0 : ratio,
+             keep = ratio > 1.0 ? 0.0 : 1.0;

@@ -1,23 +1,47 @@
-// A stencil at cell k of the piece, of 7 points or a compact one: e x - sum of w x_neighbor where e != 0, else 0; `affine`: plus b, or as
-// computed before.
-const auto diagonal = [&](int k) -> T { return unit*(T)d[k]; };
-const auto beside = [&](int rows, int planes, auto down, auto up) {  // how far elements of other rows lie from ours
-    return (rows < 0 ? ym : rows > 0 ? yp : 0) + (planes < 0 ? down : planes > 0 ? up : 0); };
-// x(k, rows beside ours, planes above ours) summed over the neighbors, of what need not be stored; unrounded
+// A stencil at cell k of the piece, of 7 points or a compact one: e x - sum of w x_neighbor where e
+// != 0, else 0; `affine`: plus b, or as computed before.
+const auto diagonal = [&](int k) -> T { return unit * (T)d[k]; };
+// how far elements of other rows lie from ours
+const auto beside = [&](int rows, int planes, auto down, auto up) {
+    return (rows < 0 ? ym : rows > 0 ? yp : 0) + (planes < 0 ? down : planes > 0 ? up : 0);
+};
+// x(k, rows beside ours, planes above ours) summed over the neighbors, of what need not be stored;
+// unrounded
 #ifdef EACH_WEIGHT
-#define BEFORE(W, X, Y, Z) + W(k)*(T)x(k + (X), Y, Z)
-#define AND_AFTER(W, X, Y, Z) BEFORE(W, X, Y, Z) + W(k - (X) + beside(-(Y), -(Z), zm, zp))*(T)x(k - (X), -(Y), -(Z))
+#define BEFORE(W, X, Y, Z) +W(k) * (T)x(k + (X), Y, Z)
+#define AND_AFTER(W, X, Y, Z) \
+    BEFORE(W, X, Y, Z) + W(k - (X) + beside(-(Y), -(Z), zm, zp)) * (T)x(k - (X), -(Y), -(Z))
 const auto around_of = [&](auto x, int k) -> T {
-    if constexpr (SYMMETRIC) return (T)0 EACH_WEIGHT(AND_AFTER); else return (T)0 EACH_WEIGHT(BEFORE); };
+    if constexpr (SYMMETRIC)
+        return (T)0 EACH_WEIGHT(AND_AFTER);
+    else
+        return (T)0 EACH_WEIGHT(BEFORE);
+};
 #undef BEFORE
 #undef AND_AFTER
 #else
 const auto around_of = [&](auto x, int k) {
-    if constexpr (STENCIL == 'v') return wx[k]*x(k-1, 0, 0) + wx[k+1]*x(k+1, 0, 0) + wy[k]*x(k, -1, 0) + (wy + yp)[k]*x(k, 1, 0) + wz[k]*x(k, 0, -1) + (wz + zp)[k]*x(k, 0, 1);
-    else return cx*(x(k-1, 0, 0) + x(k+1, 0, 0)) + cy*(x(k, -1, 0) + x(k, 1, 0)) + cz*(x(k, 0, -1) + x(k, 0, 1)); };
+    if constexpr (STENCIL == 'v')
+        return wx[k] * x(k - 1, 0, 0) + wx[k + 1] * x(k + 1, 0, 0) + wy[k] * x(k, -1, 0) +
+               (wy + yp)[k] * x(k, 1, 0) + wz[k] * x(k, 0, -1) + (wz + zp)[k] * x(k, 0, 1);
+    else
+        return cx * (x(k - 1, 0, 0) + x(k + 1, 0, 0)) + cy * (x(k, -1, 0) + x(k, 1, 0)) +
+               cz * (x(k, 0, -1) + x(k, 0, 1));
+};
 #endif
-const auto around = [&](const auto& x, int k, auto down, auto up) {  // of a field with other planes around it
-    return around_of([&](int i, int rows, int planes) { return (x + beside(rows, planes, down, up))[i]; }, k); };
+// of a field with other planes around it
+const auto around = [&](const auto& x, int k, auto down, auto up) {
+    return around_of(
+        [&](int i, int rows, int planes) { return (x + beside(rows, planes, down, up))[i]; }, k);
+};
 const auto neighbors = [&](const auto& x, int k) { return around(x, k, zm, zp); };
-const auto product = [&](const auto& x, int k) -> T { const T e = diagonal(k), v = e*x[k] - neighbors(x, k); return e != 0 ? v : (T)0; };
-const auto affine = [&](const auto& x, const auto& b, int k) -> T { if constexpr (STENCIL == 'k') return known[k]; else return product(x, k) + b[k]; };
+const auto product = [&](const auto& x, int k) -> T {
+    const T e = diagonal(k), v = e * x[k] - neighbors(x, k);
+    return e != 0 ? v : (T)0;
+};
+const auto affine = [&](const auto& x, const auto& b, int k) -> T {
+    if constexpr (STENCIL == 'k')
+        return known[k];
+    else
+        return product(x, k) + b[k];
+};

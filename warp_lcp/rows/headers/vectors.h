@@ -5,7 +5,7 @@
 //   reads      A a; B b
 //   sums       ab
 double ab = 0;
-SIMD for (int k = 0; k < n; ++k) ab += (double)a[k]*(double)b[k];
+SIMD for (int k = 0; k < n; ++k) ab += (double)a[k] * (double)b[k];
 
 // kernel vectors.add: x += z
 //   compute    S
@@ -14,9 +14,12 @@ SIMD for (int k = 0; k < n; ++k) ab += (double)a[k]*(double)b[k];
 SIMD for (int k = 0; k < n; ++k) x[k] += z[k];
 
 // snippet add_up: The sum of every stride-th of n partials from `start` on.
-const double* v = partials.data + offset; double s = 0;
-if (stride == 1) { SIMD8 for (int i = start; i < n; ++i) s += v[i]; }
-else for (int i = start; i < n; i += stride) s += v[i];
+const double* v = partials.data + offset;
+double s = 0;
+if (stride == 1) {
+    SIMD8 for (int i = start; i < n; ++i) s += v[i];
+} else
+    for (int i = start; i < n; i += stride) s += v[i];
 return s;
 
 // kernel vectors.add_up: Sums of columns of partial sums
@@ -26,9 +29,11 @@ return s;
 //   module     problem
 //   by_cell
 for (int k = 0; k < n; ++k) {
-    const double* v = partials + (P.first + k)*(long long)count; double s = 0;
+    const double* v = partials + (P.first + k) * (long long)count;
+    double s = 0;
     SIMD8 for (int i = 0; i < count; ++i) s += v[i];
-    scalars[slot + P.first + k] = s; }
+    scalars[slot + P.first + k] = s;
+}
 
 // kernel vectors.convert: b = a, in another type
 //   compute    B

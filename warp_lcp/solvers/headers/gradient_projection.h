@@ -10,25 +10,46 @@
 //   writes     uint8 free; S g, step
 //   numbers    float64 inverse, slack
 //   sums       norm, chopped, reduced, release, moved, active, energy
-const auto reach = [&](T v) -> T { return slack*(v < 0 ? -v : v); };
-T norm = 0, chopped = 0, reduced = 0, release = 0, energy = 0; int moved = 0, active = 0; unsigned char now[M];
+const auto reach = [&](T v) -> T { return slack * (v < 0 ? -v : v); };
+T norm = 0, chopped = 0, reduced = 0, release = 0, energy = 0;
+int moved = 0, active = 0;
+unsigned char now[M];
 for (int begin = 0; begin < n; begin += M) {
-    const int end = n - begin < M ? n : begin + (int)M; T y[M]; unsigned char any = 0, count = 0;
+    const int end = n - begin < M ? n : begin + (int)M;
+    T y[M];
+    unsigned char any = 0, count = 0;
     fetch(begin, end, x + zp, b, g, step, d, unknown, free);
     SIMD8 for (int k = begin; k < end; ++k) y[k - begin] = affine(x, b, k);
     with_bounds([&](auto lower, auto upper) {
         SIMD8 for (int k = begin; k < end; ++k) {
-            const T e = diagonal(k), f = e != 0 ? e : (T)1, l = lower(k), u = upper(k), v = y[k - begin];
-            const bool in = unknown[k] == 1, held = in & ((x[k] <= l + reach(l)) | (x[k] >= u - reach(u)));
-            const T r0 = natural_residual(v, f*(x[k] - l), f*(x[k] - u)), r = in ? r0 : (T)0, h = held ? r : (T)0;
-            const S w = (S)(-h*inverse)/(S)f;  // division is what would take longest in double precision
-            norm += r*r; chopped += h*h; reduced += held ? (T)0 : r*v; release -= (held ? v : (T)0)*inverse*(T)w;
-            energy += in ? (T)0.5*x[k]*(v + b[k]) : (T)0;
-            now[k - begin] = in & !held; g[k] = (S)((in & !held) ? -v*inverse : (T)0); step[k] = w; } });
+            const T e = diagonal(k), f = e != 0 ? e : (T)1, l = lower(k), u = upper(k),
+                    v = y[k - begin];
+            const bool in = unknown[k] == 1,
+                       held = in & ((x[k] <= l + reach(l)) | (x[k] >= u - reach(u)));
+            const T r0 = natural_residual(v, f * (x[k] - l), f * (x[k] - u)), r = in ? r0 : (T)0,
+                    h = held ? r : (T)0;
+            // division is what would take longest in double precision
+            const S w = (S)(-h * inverse) / (S)f;
+            norm += r * r;
+            chopped += h * h;
+            reduced += held ? (T)0 : r * v;
+            release -= (held ? v : (T)0) * inverse * (T)w;
+            energy += in ? (T)0.5 * x[k] * (v + b[k]) : (T)0;
+            now[k - begin] = in & !held;
+            g[k] = (S)((in & !held) ? -v * inverse : (T)0);
+            step[k] = w;
+        }
+    });
     SIMD64 for (int k = begin; k < end; ++k) {
-        const unsigned char one = now[k - begin] != free[k], two = (unknown[k] == 1) & !now[k - begin];
-        any |= one; count += two; free[k] = now[k - begin]; }
-    moved += any; active += count; }
+        const unsigned char one = now[k - begin] != free[k],
+                            two = (unknown[k] == 1) & !now[k - begin];
+        any |= one;
+        count += two;
+        free[k] = now[k - begin];
+    }
+    moved += any;
+    active += count;
+}
 
 // kernel mprgp.split_known: What `mprgp.split` finds, where y is known; the chopped step is not
 // rounded before it is summed
@@ -39,18 +60,30 @@ for (int begin = 0; begin < n; begin += M) {
 //   writes     uint8 free; S g, step
 //   numbers    float64 inverse, slack
 //   sums       norm, chopped, reduced, release, moved, active, energy
-const auto reach = [&](T v) -> T { return slack*(v < 0 ? -v : v); };
+const auto reach = [&](T v) -> T { return slack * (v < 0 ? -v : v); };
 T norm = 0, chopped = 0, reduced = 0, release = 0, moved = 0, active = 0, energy = 0;
 with_bounds([&](auto lower, auto upper) {
     SIMD for (int k = 0; k < n; ++k) {
-        const T a = diagonal(k), f = a < 0 ? -a : a, e = f == 0 ? (T)1 : f, v = known[k], l = lower(k), u = upper(k);
-        const bool in = unknown[k] == 1, held = in & ((x[k] <= l + reach(l)) | (x[k] >= u - reach(u)));
-        const T r0 = natural_residual(v, e*(x[k] - l), e*(x[k] - u)), r = in ? r0 + (T)0*x[k] : (T)0, h = held ? r : (T)0;
+        const T a = diagonal(k), f = a < 0 ? -a : a, e = f == 0 ? (T)1 : f, v = known[k],
+                l = lower(k), u = upper(k);
+        const bool in = unknown[k] == 1,
+                   held = in & ((x[k] <= l + reach(l)) | (x[k] >= u - reach(u)));
+        const T r0 = natural_residual(v, e * (x[k] - l), e * (x[k] - u)),
+                r = in ? r0 + (T)0 * x[k] : (T)0, h = held ? r : (T)0;
         const unsigned char now = in & !held;
-        norm += r*r; chopped += h*h; reduced += held ? (T)0 : r*v; release += (held ? v : (T)0)*h/e*inverse*inverse;
-        moved += now != free[k] ? (T)1 : (T)0; active += held ? (T)1 : (T)0;
-        free[k] = now; g[k] = now ? (S)(-v*inverse) : (S)0; step[k] = (S)(-h/e*inverse); } });
-SIMD for (int k = 0; k < n; ++k) energy += unknown[k] == 1 ? (T)0.5*x[k]*(known[k] + b[k]) : (T)0;
+        norm += r * r;
+        chopped += h * h;
+        reduced += held ? (T)0 : r * v;
+        release += (held ? v : (T)0) * h / e * inverse * inverse;
+        moved += now != free[k] ? (T)1 : (T)0;
+        active += held ? (T)1 : (T)0;
+        free[k] = now;
+        g[k] = now ? (S)(-v * inverse) : (S)0;
+        step[k] = (S)(-h / e * inverse);
+    }
+});
+SIMD for (int k = 0; k < n; ++k) energy +=
+    unknown[k] == 1 ? (T)0.5 * x[k] * (known[k] + b[k]) : (T)0;
 
 // kernel mprgp.release: x moved along the chopped step, onto the bounds; what moves is free. The
 // right-hand side g loses `part` q and gains rows: e step = -y / size
@@ -63,9 +96,14 @@ SIMD for (int k = 0; k < n; ++k) energy += unknown[k] == 1 ? (T)0.5*x[k]*(known[
 const S share = (S)part;
 with_bounds([&](auto lower, auto upper) {
     SIMD8 for (int k = 0; k < n; ++k) {
-        const T a = diagonal(k), e = a == 0 ? (T)1 : a, v = x[k] + length*(T)step[k], c = clipped(v, lower(k), upper(k));
-        const S s = step[k], own = (S)(e*(T)s), before = s != 0 ? own : g[k]; const bool now = (s != 0) | (free[k] != 0);
-        to[k] = ((s != 0) & (v - v == 0)) ? c : x[k]; g[k] = now ? before - share*q[k] : (S)0; } });
+        const T a = diagonal(k), e = a == 0 ? (T)1 : a, v = x[k] + length * (T)step[k],
+                c = clipped(v, lower(k), upper(k));
+        const S s = step[k], own = (S)(e * (T)s), before = s != 0 ? own : g[k];
+        const bool now = (s != 0) | (free[k] != 0);
+        to[k] = ((s != 0) & (v - v == 0)) ? c : x[k];
+        g[k] = now ? before - share * q[k] : (S)0;
+    }
+});
 SIMD64 for (int k = 0; k < n; ++k) free[k] = free[k] | (unsigned char)(step[k] != 0);
 
 // kernel mprgp.gain: What a direction gains, g'p, and its curvature p'q, q = A p
@@ -73,7 +111,10 @@ SIMD64 for (int k = 0; k < n; ++k) free[k] = free[k] | (unsigned char)(step[k] !
 //   reads      S along, q, g
 //   sums       gain, curvature
 T gain = 0, curvature = 0;
-SIMD for (int k = 0; k < n; ++k) { gain += (T)g[k]*(T)along[k]; curvature += (T)q[k]*(T)along[k]; }
+SIMD for (int k = 0; k < n; ++k) {
+    gain += (T)g[k] * (T)along[k];
+    curvature += (T)q[k] * (T)along[k];
+}
 
 // kernel nncg.taken: g holds x before a sweep; it becomes the gradient, what the sweep took away.
 // Its square
@@ -82,7 +123,11 @@ SIMD for (int k = 0; k < n; ++k) { gain += (T)g[k]*(T)along[k]; curvature += (T)
 //   writes     float64 g
 //   sums       square
 T square = 0;
-SIMD for (int k = 0; k < n; ++k) { const T v = unknown[k] == 1 ? g[k] - x[k] : (T)0; g[k] = v; square += v*v; }
+SIMD for (int k = 0; k < n; ++k) {
+    const T v = unknown[k] == 1 ? g[k] - x[k] : (T)0;
+    g[k] = v;
+    square += v * v;
+}
 
 // kernel nncg.carry_on: Restart where the gradient has grown, else x += beta p and p = beta p - g;
 // `squares`: of the gradient now, before (0: none)
@@ -96,8 +141,12 @@ const double fresh = squares[0], old = squares[1];
 #include "snippets.h:fletcher_reeves"
 with_bounds([&](auto lower, auto upper) {
     SIMD for (int k = 0; k < n; ++k) {
-        const T q = beta*along[k], c = clipped(x[k] + q, lower(k), upper(k)); const bool in = unknown[k] == 1;
-        x[k] = in ? c : x[k]; along[k] = in ? q - keep*g[k] : (T)0; } });
+        const T q = beta * along[k], c = clipped(x[k] + q, lower(k), upper(k));
+        const bool in = unknown[k] == 1;
+        x[k] = in ? c : x[k];
+        along[k] = in ? q - keep * g[k] : (T)0;
+    }
+});
 
 // kernel subspace.between: Free is what lies between its bounds ([Book] eq. 2.92): how many
 // unknowns moved, and how many are held
@@ -110,7 +159,11 @@ T moved = 0, held = 0;
 with_bounds([&](auto lower, auto upper) {
     SIMD for (int k = 0; k < n; ++k) {
         const bool inside = unknown[k] == 1, now = inside & (x[k] > lower(k)) & (x[k] < upper(k));
-        moved += now != (free[k] != 0) ? (T)1 : (T)0; held += (inside & !now) ? (T)1 : (T)0; free[k] = now; } });
+        moved += now != (free[k] != 0) ? (T)1 : (T)0;
+        held += (inside & !now) ? (T)1 : (T)0;
+        free[k] = now;
+    }
+});
 
 // kernel subspace.follow: x moved with bounds that have moved: what was at one stays at it, the
 // rest is projected
@@ -120,8 +173,12 @@ with_bounds([&](auto lower, auto upper) {
 //   writes     float64 x
 with_bounds([&](auto lower, auto upper) {
     SIMD8 for (int k = 0; k < n; ++k) {
-        const T l = lower(k), u = upper(k), was_l = old_lower[k], was_u = old_upper[k], v = x[k], c = clipped(v, l, u);
-        const T low = ((was_l != l) & (v <= was_l)) ? l : c; x[k] = ((was_u != u) & (v >= was_u)) ? u : low; } });
+        const T l = lower(k), u = upper(k), was_l = old_lower[k], was_u = old_upper[k], v = x[k],
+                c = clipped(v, l, u);
+        const T low = ((was_l != l) & (v <= was_l)) ? l : c;
+        x[k] = ((was_u != u) & (v >= was_u)) ? u : low;
+    }
+});
 
 // kernel accelerated.progress: s'(y - y_z), s'D s, -s'D (x - x_old) and x'D x with s = x - z
 //   compute    float64
@@ -129,8 +186,12 @@ with_bounds([&](auto lower, auto upper) {
 //   sums       curvature, metric, turned, size
 T curvature = 0, metric = 0, turned = 0, size = 0;
 SIMD for (int k = 0; k < n; ++k) {
-    const T one = unknown[k] == 1 ? (T)1 : (T)0, s = one*(x[k] - z[k]);
-    curvature += s*(y[k] - y_z[k]); metric += d[k]*s*s; turned -= d[k]*s*(x[k] - x_old[k]); size += one*d[k]*x[k]*x[k]; }
+    const T one = unknown[k] == 1 ? (T)1 : (T)0, s = one * (x[k] - z[k]);
+    curvature += s * (y[k] - y_z[k]);
+    metric += d[k] * s * s;
+    turned -= d[k] * s * (x[k] - x_old[k]);
+    size += one * d[k] * x[k] * x[k];
+}
 
 // kernel accelerated.extrapolate: x and y extrapolated to z and y_z, and the projected gradient
 // step from there
@@ -141,9 +202,15 @@ SIMD for (int k = 0; k < n; ++k) {
 //   numbers    float64 beta, lipschitz
 with_bounds([&](auto lower, auto upper) {
     SIMD for (int k = 0; k < n; ++k) {
-        const T a = x[k] + beta*(x[k] - x_old[k]), s = y[k] + beta*(y[k] - y_old[k]);
-        const T c = clipped(a - s/(lipschitz*d[k]), lower(k), upper(k));
-        x_old[k] = x[k]; y_old[k] = y[k]; z[k] = a; y_z[k] = s; x[k] = unknown[k] == 1 ? c : x[k]; } });
+        const T a = x[k] + beta * (x[k] - x_old[k]), s = y[k] + beta * (y[k] - y_old[k]);
+        const T c = clipped(a - s / (lipschitz * d[k]), lower(k), upper(k));
+        x_old[k] = x[k];
+        y_old[k] = y[k];
+        z[k] = a;
+        y_z[k] = s;
+        x[k] = unknown[k] == 1 ? c : x[k];
+    }
+});
 
 // kernel partition.select: x, less what is to be left out, on the members; elsewhere what was
 // there, or 0
@@ -153,5 +220,12 @@ with_bounds([&](auto lower, auto upper) {
 //   numbers    bool kept
 //   by_cell
 const auto select = [&](auto value) {
-    SIMD for (int k = 0; k < n; ++k) { const double v = value(k), rest = kept ? target[k] : 0.0; target[k] = member[k] ? v : rest; } };
-if (less) select([&](int k) { return x[k] - less[k]; }); else select([&](int k) { return x[k]; });
+    SIMD for (int k = 0; k < n; ++k) {
+        const double v = value(k), rest = kept ? target[k] : 0.0;
+        target[k] = member[k] ? v : rest;
+    }
+};
+if (less)
+    select([&](int k) { return x[k] - less[k]; });
+else
+    select([&](int k) { return x[k]; });

@@ -10,27 +10,44 @@
 //   constants  DIM, Q, FACTOR
 const double factor = state[FACTOR];
 for (int s = first; s < last; ++s) {
-    const double *j = J + (long long)s*DIM*2*Q, *law = laws + 4*s;
-    double *x = r + DIM*contact[s], *taken = g + DIM*contact[s], *mine = w + Q*one[s], *theirs = w + Q*other[s];
-    double v[2*Q], u[DIM], change[DIM];
-    for (int c = 0; c < Q; ++c) { v[c] = mine[c]; v[Q + c] = theirs[c]; }
+    const double *j = J + (long long)s * DIM * 2 * Q, *law = laws + 4 * s;
+    double *x = r + DIM * contact[s], *taken = g + DIM * contact[s], *mine = w + Q * one[s],
+           *theirs = w + Q * other[s];
+    double v[2 * Q], u[DIM], change[DIM];
+    for (int c = 0; c < Q; ++c) {
+        v[c] = mine[c];
+        v[Q + c] = theirs[c];
+    }
     const auto velocity = [&](int i) {
-        double sum = b[DIM*s + i] + e[DIM*s + i]*x[i];
-        for (int c = 0; c < 2*Q; ++c) sum += j[2*Q*i + c]*v[c];
+        double sum = b[DIM * s + i] + e[DIM * s + i] * x[i];
+        for (int c = 0; c < 2 * Q; ++c) sum += j[2 * Q * i + c] * v[c];
         return sum;
     };
-    const auto push = [&](int i) { for (int c = 0; c < 2*Q; ++c) v[c] += change[i]*j[2*Q*i + c]; };
-    const double wanted = x[0] - factor*law[1]*velocity(0), normal = wanted > 0.0 ? wanted : 0.0, radius = law[0]*normal;
+    const auto push = [&](int i) {
+        for (int c = 0; c < 2 * Q; ++c) v[c] += change[i] * j[2 * Q * i + c];
+    };
+    const double wanted = x[0] - factor * law[1] * velocity(0),
+                 normal = wanted > 0.0 ? wanted : 0.0, radius = law[0] * normal;
     change[0] = normal - x[0];
     push(0);
     double square = 0.0;
-    for (int i = 1; i < DIM; ++i) { u[i] = x[i] - factor*law[2]*velocity(i); square += u[i]*u[i]; }
-    const double length = sqrt(square), share = length > radius ? radius/length : 1.0;
-    for (int i = 1; i < DIM; ++i) { change[i] = share*u[i] - x[i]; push(i); }
-    for (int i = 0; i < DIM; ++i) { x[i] += change[i]; taken[i] = -change[i]; }
+    for (int i = 1; i < DIM; ++i) {
+        u[i] = x[i] - factor * law[2] * velocity(i);
+        square += u[i] * u[i];
+    }
+    const double length = sqrt(square), share = length > radius ? radius / length : 1.0;
+    for (int i = 1; i < DIM; ++i) {
+        change[i] = share * u[i] - x[i];
+        push(i);
+    }
+    for (int i = 0; i < DIM; ++i) {
+        x[i] += change[i];
+        taken[i] = -change[i];
+    }
     x[0] = normal;
     for (int c = 0; c < Q; ++c) mine[c] = v[c];
-    if (other[s] < bodies) for (int c = 0; c < Q; ++c) theirs[c] = v[Q + c];
+    if (other[s] < bodies)
+        for (int c = 0; c < Q; ++c) theirs[c] = v[Q + c];
 }
 
 // kernel warp_lcp.proximal_gauss_seidel.residual: |d (r - P(r - u^/d))|^2 with u^ = (u_n + mu
@@ -41,24 +58,29 @@ for (int s = first; s < last; ++s) {
 //   sums       square
 //   constants  DIM, Q
 for (int s = first; s < last; ++s) {
-    const double *j = J + (long long)s*DIM*2*Q, *law = laws + 4*s, *x = r + DIM*contact[s], mu = law[0], d = law[3];
-    const double *mine = w + Q*one[s], *theirs = w + Q*other[s];
+    const double *j = J + (long long)s * DIM * 2 * Q, *law = laws + 4 * s,
+                 *x = r + DIM * contact[s], mu = law[0], d = law[3];
+    const double *mine = w + Q * one[s], *theirs = w + Q * other[s];
     double z[DIM], slip = 0.0, length = 0.0;
     for (int i = 0; i < DIM; ++i) {
-        double u = b[DIM*s + i] + e[DIM*s + i]*x[i];
-        for (int c = 0; c < Q; ++c) u += j[2*Q*i + c]*mine[c] + j[2*Q*i + Q + c]*theirs[c];
+        double u = b[DIM * s + i] + e[DIM * s + i] * x[i];
+        for (int c = 0; c < Q; ++c)
+            u += j[2 * Q * i + c] * mine[c] + j[2 * Q * i + Q + c] * theirs[c];
         z[i] = u;
-        if (i > 0) slip += u*u;
+        if (i > 0) slip += u * u;
     }
-    z[0] += mu*sqrt(slip);
-    for (int i = 0; i < DIM; ++i) z[i] = x[i] - z[i]/d;
-    for (int i = 1; i < DIM; ++i) length += z[i]*z[i];
+    z[0] += mu * sqrt(slip);
+    for (int i = 0; i < DIM; ++i) z[i] = x[i] - z[i] / d;
+    for (int i = 1; i < DIM; ++i) length += z[i] * z[i];
     length = sqrt(length);
-    const bool inside = length <= mu*z[0], polar = mu*length <= -z[0];
-    const double side = (z[0] + mu*length)/(1.0 + mu*mu);
+    const bool inside = length <= mu * z[0], polar = mu * length <= -z[0];
+    const double side = (z[0] + mu * length) / (1.0 + mu * mu);
     for (int i = 0; i < DIM; ++i) {
-        const double onto = i ? mu*side*z[i]/(length > 0.0 ? length : 1.0) : side, off = d*(x[i] - (inside ? z[i] : polar ? 0.0 : onto));
-        square += off*off;
+        const double onto = i ? mu * side * z[i] / (length > 0.0 ? length : 1.0) : side,
+                     off = d * (x[i] - (inside  ? z[i]
+                                        : polar ? 0.0
+                                                : onto));
+        square += off * off;
     }
 }
 
@@ -72,10 +94,11 @@ for (int t = first; t < last; ++t) {
     double sum[Q] = {};
     for (int at = starts[t]; at < starts[t + 1]; ++at) {
         const int s = sides[at] / 2, side = sides[at] % 2;
-        const double *j = J + (long long)s*DIM*2*Q + side*Q, *x = r + DIM*contact[s];
-        for (int i = 0; i < DIM; ++i) for (int c = 0; c < Q; ++c) sum[c] += x[i]*j[2*Q*i + c];
+        const double *j = J + (long long)s * DIM * 2 * Q + side * Q, *x = r + DIM * contact[s];
+        for (int i = 0; i < DIM; ++i)
+            for (int c = 0; c < Q; ++c) sum[c] += x[i] * j[2 * Q * i + c];
     }
-    for (int c = 0; c < Q; ++c) w[Q*t + c] = sum[c];
+    for (int c = 0; c < Q; ++c) w[Q * t + c] = sum[c];
 }
 
 // kernel proximal_gauss_seidel.carry: r <- r + beta p, p <- beta p - g with beta = |g|^2 / |g
@@ -90,8 +113,8 @@ const double fresh = state[now], old = state[1 - now];
 #include "snippets.h:fletcher_reeves"
 SIMD8 for (int k = 0; k < n; ++k) {
     const double along = way[k], back = g[k];
-    r[k] += beta*along;
-    way[k] = beta*along - keep*back;
+    r[k] += beta * along;
+    way[k] = beta * along - keep * back;
 }
 
 // kernel proximal_gauss_seidel.follow: the same of w = J'r, whose change by the last sweep is w -
@@ -104,8 +127,8 @@ SIMD8 for (int k = 0; k < n; ++k) {
 const double fresh = state[now], old = state[1 - now];
 #include "snippets.h:fletcher_reeves"
 SIMD8 for (int k = 0; k < n; ++k) {
-    const double along = way[k], at = w[k], moved = at + beta*along;
-    way[k] = beta*along + keep*(at - before[k]);
+    const double along = way[k], at = w[k], moved = at + beta * along;
+    way[k] = beta * along + keep * (at - before[k]);
     w[k] = moved;
     before[k] = moved;
 }
