@@ -1,0 +1,61 @@
+"""Layout of the source: line width, one class per name, the formatter's exemptions, untyped annotations."""
+
+import ast
+import re
+import subprocess
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PRODUCT = ("warp_lcp", "fluids", "granular")
+WIDTH = 100
+TEXTS = re.compile(r"noqa|type: ignore|https?://|^\s*\|")  # lines that may be longer
+
+
+def sources(*patterns: str) -> list[Path]:
+    """Return the tracked files, or those of a source archive without a repository."""
+    listed = subprocess.run(
+        ["git", "ls-files", *patterns], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    names = listed.stdout.split()
+    if not names:
+        names = [
+            str(path.relative_to(ROOT))
+            for pattern in patterns
+            for folder in (*PRODUCT, "benchmarks", "tests", "docs")
+            for path in (ROOT / folder).rglob(pattern)
+        ]
+    return [ROOT / name for name in names if not (ROOT / name).is_symlink()]
+
+
+@pytest.mark.parametrize("kind", ["*.py", "*.h"])
+def test_lines_have_at_most_100_columns(kind):
+    longer = [
+        f"{path.relative_to(ROOT)}:{number}"
+        for path in sources(kind)
+        for number, line in enumerate(path.read_text().splitlines(), 1)
+        if len(line) > WIDTH and not TEXTS.search(line)
+    ]
+    assert longer == []
+
+
+def test_the_formatter_has_no_exemptions():
+    exempted = [
+        str(path.relative_to(ROOT))
+        for path in sources("*.py")
+        if re.search(r"#\s*fmt: (skip|off)", path.read_text())
+    ]
+    assert exempted == []
+
+
+def test_a_class_name_is_defined_once():
+    defined = Counter(
+        node.name
+        for path in sources("*.py")
+        if path.relative_to(ROOT).parts[0] in (*PRODUCT, "benchmarks")
+        for node in ast.parse(path.read_text()).body
+        if isinstance(node, ast.ClassDef)
+    )
+    assert [name for name, count in defined.items() if count > 1] == []
