@@ -1,4 +1,4 @@
-"""`wl.solve`: a given method, or the recommended one and then its alternatives."""
+"""`wl.solve`: solve by a given method or the recommended one."""
 
 from __future__ import annotations
 
@@ -22,8 +22,7 @@ from warp_lcp.rules import Attempt, method_for, steps_allowed
 from warp_lcp.solvers.registry import method_of
 
 LEAST = 1e-9  # seconds that are left to a solve whose set-up has taken them all
-# one step of four is kept for the alternatives of a method for matrices, of limits from FEW steps
-# on
+# Of a limit of at least FEW steps, a method for matrices leaves 1/RESERVED to its alternatives.
 RESERVED, FEW = 4, 40
 ENDED = (
     SolveStatus.CONVERGED,
@@ -55,7 +54,7 @@ def solve(
     fallback: bool = True,
     **misplaced: Never,
 ) -> SolveResult:
-    """Solve a problem by a method.
+    """Solve a problem with a given or the recommended method.
 
     Args:
         problem: the LCP, or a problem over another convex set than a box.
@@ -127,7 +126,7 @@ def solve_restated(
     x0: Array | None,
     callback: Watch | None,
 ) -> SolveResult:
-    """Solve a problem in another form; return the result for the given one."""
+    """Solve a problem in another form; return the result in the original form."""
     found = solve_by(
         restated.problem, method, stopping=stopping, x0=restated.start(x0), callback=callback
     )
@@ -144,7 +143,7 @@ def solve_by_attempts(
     run: Run = solve_restated,
     reserve: bool = True,
 ) -> SolveResult:
-    """Solve by the attempts of `recommend`, until one ends the solve; return the best x.
+    """Solve by the attempts of `recommend` in order; return the best result.
 
     Args:
         problem: the problem.
@@ -200,7 +199,7 @@ def solve_by_attempts(
 
 @dataclass(frozen=True)
 class _Planned:
-    """A solve to make.
+    """A planned solve: a method and the form of the problem that it works on.
 
     Args:
         name: of the method.
@@ -222,7 +221,7 @@ class _Planned:
 def _planned(
     attempt: Attempt, problem: LCP, advice: Recommendation, accuracy: float, *, given: bool
 ) -> _Planned | None:
-    """Return the solve that an attempt asks for, None if the problem does not suit it.
+    """Return the solve of an attempt, None if the attempt does not suit the problem.
 
     Args:
         attempt: of the recommendation.
@@ -302,7 +301,7 @@ def _best(results: list[SolveResult]) -> SolveResult:
 def left(
     stopping: Criteria, begun: float, results: Sequence[SolveResult] = (), *, reserve: bool = False
 ) -> Criteria:
-    """Return criteria with the steps and the time that are left.
+    """Return criteria with the remaining steps and time.
 
     Args:
         stopping: criteria for all.

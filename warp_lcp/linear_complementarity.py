@@ -1,4 +1,4 @@
-"""Complementarity problems in the manner of scipy.optimize: arrays in, an OptimizeResult out."""
+"""SciPy-style interface: arrays in, an OptimizeResult out."""
 
 from __future__ import annotations
 
@@ -102,7 +102,8 @@ def linear_complementarity(
 
     Example:
         >>> import numpy as np, warp_lcp as wl
-        >>> found = wl.linear_complementarity(np.array([[2.0, -1.0], [-1.0, 2.0]]), np.array([2.0, -3.0]))
+        >>> A = np.array([[2.0, -1.0], [-1.0, 2.0]])
+        >>> found = wl.linear_complementarity(A, np.array([2.0, -3.0]))
         >>> print(found.success, found.x, found.slack, found.active_mask)
         True [0.  1.5] [0.5 0. ] [-1  0]
     """
@@ -172,13 +173,13 @@ def linear_complementarity(
 
 
 class _Fields:
-    """Arrays of b's shape, as fields of the operator's and back."""
+    """Convert arrays between b's shape and the operator's shape."""
 
     def __init__(self, b: np.ndarray, shape: tuple[int, ...]) -> None:
         self.given, self._shape = b.shape, shape
 
     def load(self, values: Any, name: str) -> Any:
-        """Return an array in the operator's shape if it has b's, else as it is."""
+        """Return an array in the operator's shape if it has b's shape, else unchanged."""
         if np.ndim(values) == 0 or isinstance(values, (AffineBounds, wp.array)):
             return values
         host = real_array(values, name)
@@ -189,7 +190,7 @@ class _Fields:
         return host
 
     def unload(self, field: wp.array[Any], dtype: Any = np.float64) -> np.ndarray:
-        """Return a field as an array of b's shape, where that has as many elements."""
+        """Return a field in b's shape if the sizes agree, else in its own shape."""
         host = np.array(field.numpy(), dtype=dtype)
         return host.reshape(self.given if host.size == int(np.prod(self.given)) else host.shape)
 
@@ -246,7 +247,7 @@ def _is_pairs(bounds: Any, n: int) -> bool:
 
 
 def _is_pair(one: Any) -> bool:
-    """Return whether this is a sequence of two numbers or None."""
+    """Return whether a value is a sequence of two numbers or None."""
     if isinstance(one, np.ndarray):
         return one.shape == (2,)
     return (
@@ -257,7 +258,7 @@ def _is_pair(one: Any) -> bool:
 
 
 def _bound(values: Any, name: str, wrong: float) -> Any:
-    """Return a bound, with infinity for 1e20 and more.
+    """Return a bound in which magnitudes of 1e20 and more are infinite.
 
     Raises:
         ValueError: it is infinite on the wrong side.
@@ -282,7 +283,7 @@ def _bound(values: Any, name: str, wrong: float) -> Any:
 
 
 def _method(method: Any) -> Solver:
-    """Return the method that a name stands for, or the one given."""
+    """Return the method for a name, or a method instance unchanged."""
     method = method_of(method)
     if isinstance(method, type) or not isinstance(method, Solver):
         kind = (
@@ -298,7 +299,7 @@ def _method(method: Any) -> Solver:
 
 
 def _told(callback: Any) -> Callable[[OptimizeResult], Any] | None:
-    """Return what calls a callback in the way that its signature asks for, SciPy's two."""
+    """Return a function that calls a callback with either of SciPy's signatures."""
     if callback is None:
         return None
     if not callable(callback):
@@ -315,7 +316,11 @@ def _told(callback: Any) -> Callable[[OptimizeResult], Any] | None:
 
 
 def _sides(problem: LCP, x: wp.array[Any]) -> tuple[wp.array[Any], wp.array[Any]]:
-    """Return y at x and on which side of its bounds each unknown is held, fields of the operator's shape; 0 where there is no unknown."""
+    """Return y = A x + b and the active bound of each unknown.
+
+    Both are fields of the operator's shape, 0 in cells without an unknown. The mask is -1 where x
+    is at the lower bound, 1 at the upper bound, and 0 where y = 0.
+    """
     layout = problem.layout
     stored, y = layout.load(x, wp.float64), layout.zeros(wp.float64)
     problem.bounds.follow(stored)

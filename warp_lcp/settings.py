@@ -1,4 +1,7 @@
-"""Settings: dataclasses whose annotations say what a field may hold; checks and the words of a refusal are drawn from there."""
+"""Settings: frozen dataclasses that check their fields by annotations.
+
+Checks and error messages are derived from the annotations.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,7 @@ from annotated_types import Ge, Gt, Le, Lt
 
 
 class _OrInfinite:
-    """Lets a range without an end hold inf."""
+    """Marker of a range that may hold inf."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Callable[[Any], Any]) -> Any:
         """Return the schema of the range, inf included."""
@@ -67,21 +70,21 @@ class SettingError(ValueError):
 
 
 class Settings:
-    """Base of a frozen dataclass that checks its fields by their annotations, once it is made. Numbers are stored as Python's.
+    """Base of a frozen dataclass that checks its fields by their annotations.
 
-    Whole floats are integers, NumPy's numbers are those of their values, members of a `StrEnum`
-    their words; a bool or a text is no number. Numbers are finite, unless the range says
-    `OrInfinite`. What several fields must be together is checked in a `__post_init__` that calls
-    this one first.
+    Numbers are stored as Python numbers: whole floats as integers, NumPy numbers by their values.
+    Members of a `StrEnum` are stored as their text. A bool or a text is not a number. Numbers are
+    finite, unless the range has `OrInfinite`. A condition on several fields is checked in a
+    `__post_init__` that calls this one first.
 
     Example:
-        >>> @dataclasses.dataclass(frozen=True, kw_only=True)
-        ... class Damped(Settings):
-        ...     omega: Relaxation = 0.8
-        >>> Damped(omega=2)
-        Traceback (most recent call last):
-        ...
-        warp_lcp.settings.SettingError: omega = 2: must be in (0, 2)
+        |    >>> @dataclasses.dataclass(frozen=True, kw_only=True)
+        |    ... class Damped(Settings):
+        |    ...     omega: Relaxation = 0.8
+        |    >>> Damped(omega=2)
+        |    Traceback (most recent call last):
+        |    ...
+        |    warp_lcp.settings.SettingError: omega = 2: must be in (0, 2)
     """
 
     def __post_init__(self) -> None:
@@ -101,7 +104,9 @@ class Settings:
 
 
 def renamed(**names: str) -> Callable[[type[Kind]], type[Kind]]:
-    """Let a dataclass take old names of its fields, with a DeprecationWarning that gives the new name.
+    """Accept old names of a dataclass's fields, with a DeprecationWarning.
+
+    The warning gives the new name.
 
     Args:
         names: old="new".
@@ -174,7 +179,7 @@ def renamed_method(old: str, method: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def checked(name: str, given: object, annotation: Any) -> Any:
-    """Return a value as the type that its annotation says.
+    """Return a value converted to the type of its annotation.
 
     Args:
         name: of the value, for the message.
@@ -204,7 +209,10 @@ def checked(name: str, given: object, annotation: Any) -> Any:
 
 @cache
 def checked_defaults(settings: type[Any]) -> dict[str, tuple[Any, Any]]:
-    """Return the default of each field of a dataclass that has one, as it is written and as the field's type."""
+    """Return the default of each field of a dataclass that has one.
+
+    Each is a pair: as written, and converted to the field's type.
+    """
     hints = ranges(settings)  # type: ignore[arg-type]
     defaults = {field.name: field.default for field in dataclasses.fields(settings)}
     return {
@@ -222,7 +230,7 @@ def ranges(settings: type[Any]) -> dict[str, Any]:
 
 
 def rule(annotation: Any) -> str:
-    """Return in words what an annotation allows.
+    """Describe in words what an annotation allows.
 
     Example:
         >>> rule(Count), rule(Share), rule(Positive | None), rule(Literal["forward", "backward"])
@@ -233,7 +241,7 @@ def rule(annotation: Any) -> str:
         case None:
             return KINDS.get(annotation) or f"a {getattr(annotation, '__name__', annotation)}"
         case kind if kind is Annotated:
-            # words of the annotation's own
+            # The annotation's own words come first.
             said = [part for part in parts if isinstance(part, str)]
             return said[0] if said else _range(*parts)
         case kind if kind in (Literal, Union, UnionType):
@@ -244,7 +252,7 @@ def rule(annotation: Any) -> str:
 
 
 def _range(kind: type, *limits: Any) -> str:
-    """Return a range of numbers in words."""
+    """Describe a range of numbers in words."""
     found = {
         name: getattr(limit, name) for limit in limits for name in ENDS if hasattr(limit, name)
     }
@@ -264,7 +272,10 @@ def _range(kind: type, *limits: Any) -> str:
 
 @cache
 def adapter(annotation: Any) -> Any:
-    """Return what validates a value; pydantic is imported here, for the import of the package not to wait for it."""
+    """Return the pydantic validator of an annotation.
+
+    pydantic is imported here, so that the import of the package does not wait for it.
+    """
     from pydantic import ConfigDict, InstanceOf, TypeAdapter
 
     if dataclasses.is_dataclass(annotation):
@@ -276,7 +287,10 @@ def adapter(annotation: Any) -> Any:
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
-    """Return `did you mean ...?` for a word that is near a known one, or its initials, and the list of known ones otherwise."""
+    """Return `did you mean ...?` for the known word nearest to a word.
+
+    A word may be the initials of a known one. Without a near word, the known ones are listed.
+    """
     known = sorted(known)
     initials = {"".join(part[:1] for part in re.split("[_-]", name)): name for name in known}
     match = (
