@@ -102,7 +102,10 @@ class Measured(Protocol):
     measured: Mapping[str, Mapping[str, float | int | str | None]]
 
     def tables(self) -> Mapping[str, tuple[str, ...]]:
-        """Return the columns of each table, the first of which is `step`, by the name of its file."""
+        """Return the columns of each table by the name of its file.
+
+        The first column is `step`.
+        """
 
 
 @dataclass(frozen=True)

@@ -245,7 +245,9 @@ class Traits:
         A = self._problem.A
         if isinstance(A, DenseOperator):
             return A.matrix.numpy()
-        return A.matrix() if isinstance(A, SparseOperator) else A.rows().matrix()  # type: ignore[attr-defined]
+        return (
+            A.matrix() if isinstance(A, SparseOperator) else A.rows().matrix()  # type: ignore[attr-defined]
+        )
 
 
 @cache

@@ -1,4 +1,7 @@
-"""Blocked Gauss-Seidel: blocks of unknowns in turn, each solved exactly or by any method."""
+"""Blocked Gauss-Seidel: solve blocks of unknowns in turn.
+
+A block is solved exactly by a kernel, or by any method.
+"""
 
 from __future__ import annotations
 
@@ -30,9 +33,9 @@ from warp_lcp.sweeps.block_kernels import BlockLists, block_sweep_kernel
 from warp_lcp.sweeps.sweep import bound_operands, check_colors
 from warp_lcp.sweeps.sweep_kernels import KERNELS
 
-CONSECUTIVE = 3  # unknowns of a block unless given: a contact in space
-MOST = 6  # unknowns of a block that a thread solves by active sets
-CHANGES = 60  # of a line's set; few are needed, and what is left is projected
+CONSECUTIVE = 3  # default number of unknowns of a block: a contact in space
+MOST = 6  # largest number of unknowns of a block that a thread solves by active sets
+CHANGES = 60  # limit of changes of a line's active set; the rest is projected, few are needed
 
 f64 = wp.float64
 SOLVE_LINE = KERNELS["grid_lines.solve"]
@@ -41,7 +44,7 @@ SOLVE_LINE = KERNELS["grid_lines.solve"]
 class GridLines(Enum):
     """Blocks of cells along one axis of a grid, for `BlockedGaussSeidel`.
 
-    The axis of the strongest coefficients is the one that pays.
+    Lines along the axis of the largest coefficients converge fastest.
     """
 
     X = 0
@@ -53,21 +56,21 @@ class GridLines(Enum):
 class BlockedGaussSeidel(Settings):
     """Blocked Gauss-Seidel: solve blocks of unknowns in turn ([Book] 2.2.3).
 
-    With blocks of one unknown it is projected Gauss-Seidel, with one block its solver. Strong
-    coupling within a block, as of a contact's normal and tangential forces, then costs no sweeps.
-    Converges for symmetric positive definite A. Blocks of at most 6 unknowns are solved exactly by
-    a kernel: active sets changed until none is wrong, all sets if that does not end; bounds affine
-    in x, also in unknowns of the block, are part of that system. On CUDA blocks that are not
-    coupled are solved at once. Larger blocks, and all if `sub_solver` is given, are problems of
-    their own, solved one by one from the host.
+    With blocks of one unknown it is projected Gauss-Seidel, with one block it is the solver of that
+    block. Strong coupling within a block, such as between a contact's normal and tangential forces,
+    then costs no sweeps. Converges for symmetric positive definite A. A kernel solves blocks of at
+    most 6 unknowns exactly: it changes the active set until no condition is violated, and tries all
+    sets if that does not end. Bounds that are affine in x, also in unknowns of the block, are part
+    of that system. On CUDA, blocks that are not coupled are solved in parallel. Larger blocks, and
+    all blocks if `sub_solver` is given, are problems of their own, solved one by one from the host.
 
-    On grids blocks are lines of cells, in two colors: lines along an axis whose coefficients are
-    many times the others' make sweeps as good as if all were equal. Or give blocks as lists and a
-    `sub_solver`; each block then costs passes over the whole grid, so that a few large blocks only
-    make sense.
+    On grids the default blocks are lines of cells, in two colors. Lines along an axis whose
+    coefficients are many times the others' make sweeps converge as if all coefficients were equal.
+    Blocks may also be lists with a `sub_solver`; each block then costs passes over the whole grid,
+    so that only a few large blocks are practical.
 
     Args:
-        blocks: unknowns of a block, consecutive ones; or `GridLines`; or for each block flat
+        blocks: number of consecutive unknowns of a block; or `GridLines`; or for each block flat
             indices into a field of the problem's shape, together all unknowns, each once. If None,
             3 unknowns, on grids lines along x.
         sub_solver: a method for the blocks; None: the kernel for blocks of at most 6 unknowns,
@@ -153,7 +156,7 @@ class BlockedGaussSeidel(Settings):
 
 
 class BlockWorkspace(SweepWorkspace):
-    """Memory of sweeps over small blocks."""
+    """Workspace of sweeps over small blocks."""
 
     def __init__(
         self,
@@ -175,7 +178,11 @@ class BlockWorkspace(SweepWorkspace):
             and problem.bounds.affine is None
         )
         if self._parallel:
-            colors = color_blocks(problem.A.matrix(), owner, len(blocks))  # type: ignore[attr-defined]
+            colors = color_blocks(
+                problem.A.matrix(),  # type: ignore[attr-defined]
+                owner,
+                len(blocks),
+            )
         self._starts = [0, *np.cumsum([len(color) for color in colors]).tolist()]
         arrays = [
             np.concatenate([[0], np.cumsum(sizes)]),
@@ -202,7 +209,7 @@ class BlockWorkspace(SweepWorkspace):
         self._kernel = block_sweep_kernel(rows.values.dtype, max(sizes))
 
     def run(self, x: wp.array[Any], *, forward: bool) -> None:
-        """Solve each block once: by one thread, or color by color."""
+        """Solve each block once: by one thread, or color by color in parallel."""
         colors = range(len(self._starts) - 1)
         for c in colors if forward else reversed(colors):
             count = self._starts[c + 1] - self._starts[c]
@@ -217,17 +224,17 @@ class BlockWorkspace(SweepWorkspace):
 
 @dataclass(frozen=True, slots=True)
 class LineMemory:
-    """Memory and sizes of solves of lines of cells.
+    """Fields and sizes for the solves of lines of cells.
 
     Attributes:
-        c: multiples of the elimination, a stored field.
+        c: multiples of the elimination (Thomas algorithm), a stored field.
         q: its right-hand side.
         z: solution of a line's system.
         s: states of the unknowns, uint8.
-        s1: elements from plane to plane.
-        s2: elements from row to row.
-        cells: of a line.
-        most: changes of a line's active set.
+        s1: stride from plane to plane, in elements.
+        s2: stride from row to row, in elements.
+        cells: number of cells of a line.
+        most: limit of changes of a line's active set.
         omega: relaxation factor.
     """
 
@@ -243,10 +250,11 @@ class LineMemory:
 
 
 class LineWorkspace(SweepWorkspace):
-    """Memory of sweeps over a grid's lines, those of one color of a checkerboard after those of the other.
+    """Workspace of sweeps over the lines of a grid, in checkerboard colors.
 
-    A line is a tridiagonal M-matrix with bounds; its active set is changed until none is wrong,
-    each change a tridiagonal solve.
+    The lines of one color are solved before those of the other. A line is a tridiagonal M-matrix
+    with bounds. Its active set is changed until no condition is violated; each change is a
+    tridiagonal solve.
 
     Args:
         problem: on a grid.

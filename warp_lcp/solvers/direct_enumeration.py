@@ -1,4 +1,4 @@
-"""Direct enumeration of the active sets of tiny problems, one at a time or in batches."""
+"""Direct enumeration of the active sets of tiny problems, singly or in batches."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from warp_lcp.reduced.dense_problem import DenseProblem, DenseWorkspace, check_s
 from warp_lcp.reduced.enumeration_kernels import enumeration_kernels
 from warp_lcp.rows.fields import Array, checked_device, real_array
 
-MOST = 4  # unknowns: 3^4 = 81 sets
-# measure of a solution: natural residual over the terms of y, of cond(A) < 1e5
+MOST = 4  # largest number of unknowns: 3^4 = 81 sets
+# Largest measure of a solution: natural residual over the terms of y, for cond(A) < 1e5.
 ACCEPTED = {wp.float64: 1e-10, wp.float32: 3e-5}
-# measure of all sets above which there surely is no solution: rounding in systems of cond(A) = 1e12
-# makes less
+# If the measure of all sets is larger, there is surely no solution: rounding in systems of cond(A)
+# = 1e12 causes less.
 CLEAR = 1e-3
-SAME = 1e-9  # relative difference below which two solutions are one
+SAME = 1e-9  # relative difference below which two solutions count as one
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,8 +81,10 @@ class DirectEnumeration:
 
         Example:
             >>> import numpy as np, warp_lcp as wl
-            >>> A = wl.DenseOperator(np.array([[1.0, 2.0], [2.0, 1.0]]), device="cpu")  # the book's figure 2.1: not a P-matrix
-            >>> print(np.round(DirectEnumeration().solutions(wl.LCP(A, np.array([-1.0, -1.0]))), 3))
+            >>> # The book's figure 2.1: not a P-matrix.
+            >>> A = wl.DenseOperator(np.array([[1.0, 2.0], [2.0, 1.0]]), device="cpu")
+            >>> problem = wl.LCP(A, np.array([-1.0, -1.0]))
+            >>> print(np.round(DirectEnumeration().solutions(problem), 3))
             [[1.    0.   ]
              [0.    1.   ]
              [0.333 0.333]]
@@ -147,7 +149,9 @@ def enumerate_batch(
             device arrays are not read back).
 
     Example:
-        >>> result = enumerate_batch(np.array([[[2.0, 1.0], [1.0, 2.0]]] * 2), np.array([[-3.0, -3.0], [-2.0, 5.0]]), device="cpu")
+        >>> A = np.array([[[2.0, 1.0], [1.0, 2.0]]] * 2)
+        >>> b = np.array([[-3.0, -3.0], [-2.0, 5.0]])
+        >>> result = enumerate_batch(A, b, device="cpu")
         >>> print(result.x.numpy(), result.sets.numpy())
         [[1. 1.]
          [1. 0.]] [4 1]
@@ -207,9 +211,10 @@ def enumerate_batch(
 
 
 def _candidates(data: DenseProblem) -> tuple[np.ndarray, np.ndarray]:
-    """Return the x of every set, shape (3^n, n), and its measure: 2 where the set has none, at most 1 elsewhere.
+    """Return the x of each active set and its measure.
 
-    The sets are tried in units in which A is equilibrated: what counts as a zero pivot does not
+    x has shape (3^n, n). The measure has shape (3^n,): at most 1, or 2 where the set has no x. The
+    sets are tried in units in which A is equilibrated, so that the test for a zero pivot does not
     depend on the units of the rows.
     """
     n, (scaled, units) = len(data.b), data.scaled()
@@ -243,7 +248,7 @@ def _on_device(
 
 
 def _bounds(value: Any, m: int, n: int, dtype: Any, device: wp.Device, name: str) -> wp.array[Any]:
-    """Return a bound as an array of one row for all problems, or of a row each."""
+    """Return a bound as an array with one row for all problems, or a row for each."""
     if isinstance(value, wp.array):
         if (
             tuple(value.shape) not in ((n,), (1, n), (m, n))

@@ -1,10 +1,12 @@
-"""The interior-point method: Newton's method on the Kojima map, with Mehrotra's predictor and corrector.
+"""Interior-point method: Newton's method on the Kojima map.
+
+By default with Mehrotra's predictor and corrector.
 
 w = x - l and v = u - x, infinite where there is no bound; s and t are their multipliers, 0 there.
 With dx known, ds = (tau - w s - second dx_a ds_a) / w - (s / w) dx and dt = (tau - v t + second
 dx_a dt_a) / v + (t / v) dx, where dx_a is the predictor's step; `joined` is 1 where the correction
-e comes on top of that. FUSED passes go over the rows of a grid whose system is condensed where the
-step ends, the others over flat fields.
+e is added to it. FUSED passes go over the rows of a grid whose system is condensed at the end of
+the step, the others over flat fields.
 """
 
 from __future__ import annotations
@@ -32,7 +34,7 @@ from warp_lcp.rows.fields import zeros_like
 from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, Positive, Share
 
-LARGEST_START = 1e6  # of the residual's norm: ||b|| up to which it gives the start's size
+LARGEST_START = 1e6  # times the residual's norm: largest ||b|| that sets the size of the start
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/interior_point.h")
 INSIDE = KERNELS["interior_point.inside"]
@@ -41,12 +43,12 @@ CONDENSE = KERNELS["interior_point.condense"]
 MOVE = KERNELS["interior_point.move"]
 RATIOS = KERNELS["interior_point.ratios"]
 CENTER = KERNELS["interior_point.center"]
-# a plane is condensed when the one above it has moved
+# A plane is condensed when the one above it has moved.
 ADVANCE = Wave("interior_point.advance", (MOVE, 0), (CONDENSE, 1))
 
 
-# a near start has w A_ii and s at least this multiple of the residual's root mean square; 3 to 50
-# measured
+# A near start has w A_ii and s at least this multiple of the residual's root mean square; 3 to 50
+# were measured.
 NEAR = 10.0
 
 
@@ -115,7 +117,7 @@ class InteriorPoint(NewtonSettings):
         return InteriorPointWorkspace(problem, self)
 
     def step(self, problem: LCP, work: Any, x: wp.array[Any]) -> Step:
-        """Take a monotone cycle while the start is cold, else a path-following step."""
+        """Take a monotone cycle after a cold start, then path-following steps."""
         if isinstance(work, EquilibratedWorkspace):
             return work.step(self.step)
         if work.cycles_left > 0:
@@ -128,7 +130,9 @@ class InteriorPoint(NewtonSettings):
 
 @dataclass(frozen=True, slots=True)
 class ComplementaryPairs:
-    """Distances of x to its bounds and their multipliers, stored float64 fields: w s = v t = mu on the central path.
+    """Distances of x to its bounds and their multipliers.
+
+    Stored float64 fields; w s = v t = mu on the central path.
 
     Attributes:
         w: x - l; infinite without a lower bound.
@@ -145,7 +149,7 @@ class ComplementaryPairs:
 
 @dataclass(frozen=True, slots=True)
 class PathDirection:
-    """A direction along the central path: ds and dt follow from that of x.
+    """A direction along the central path: ds and dt follow from dx.
 
     Attributes:
         a: the predictor's direction of x.
@@ -190,7 +194,7 @@ class PathSystem:
 
 
 class InteriorPointWorkspace(IterateMemory):
-    """Memory of the method for one problem.
+    """Workspace of the method for one problem.
 
     Attributes:
         mu: mean of the products w s and v t, units of x y.
@@ -222,7 +226,7 @@ class InteriorPointWorkspace(IterateMemory):
         )
         self._D, self.free = layout.zeros(wp.float64), layout.zeros(wp.uint8)
         self._predicted = zeros_like(self.system.e)
-        # conjugate gradients leave the residual in r
+        # Conjugate gradients leave the residual in r.
         self._carries = isinstance(self.system, GridSystem) and problem.A.symmetric
         fused = isinstance(self.system, GridSystem) and self.system.fused
         self._upper, self._fusable = (
@@ -233,7 +237,11 @@ class InteriorPointWorkspace(IterateMemory):
             Sums(rows_of(self.x), 3),
             wp.zeros(1, dtype=wp.float64, device=problem.device),
         )
-        self._grid_sums = Sums(problem.A.stencil.rows, 3) if self._fusable else self._sums  # type: ignore[attr-defined]
+        self._grid_sums = (
+            Sums(problem.A.stencil.rows, 3)  # type: ignore[attr-defined]
+            if self._fusable
+            else self._sums
+        )
         self.cycles_left = self.steps = self.count = 0
         self.near = self.begun = False
         self.mu = self.target = self.size = 0.0
@@ -241,7 +249,7 @@ class InteriorPointWorkspace(IterateMemory):
     def start(
         self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
     ) -> None:
-        """Forget the path; the operator may have changed."""
+        """Reset the path; the operator may have changed."""
         self.floating = floating
         s = self.settings
         cold_grid = self.problem.bounded and self._carries and not warm
@@ -254,22 +262,29 @@ class InteriorPointWorkspace(IterateMemory):
             self.cold_start.start(warm=not cold_grid, tolerance=tolerance, floating=floating)
 
     def monotone_step(self, x: wp.array[Any]) -> Step:
-        """Projected multigrid cycle on all unknowns."""
+        """Take a projected multigrid cycle on all unknowns."""
         assert self.cold_start is not None
         return self.cold_start.monotone_step()
 
     @property
     def is_grid(self) -> bool:
-        """Whether the residual is a grid's own, which does not keep y."""
+        """Whether the residual is a grid's own, which does not store y."""
         return self.cold_start is not None
 
     @property
     def _fused(self) -> bool:
-        """Whether what moves is evaluated and condensed in the same pass over memory: by one CPU thread, without periodic axes."""
+        """Whether the pass that moves x also evaluates and condenses there.
+
+        Used by one CPU thread, without periodic axes.
+        """
         return self._fusable and self.floating is None and self.count > 0
 
     def begin(self, x: wp.array[Any]) -> None:
-        """Move x inside its bounds, and choose multipliers: by b and the residual far from the path, by the residual near it."""
+        """Move x inside its bounds, and choose the multipliers.
+
+        Far from the path their size follows from b and the residual, near it from the residual
+        alone: s and t are at least `least`, and so are w A_ii and v A_ii.
+        """
         p = self.problem
         self._inside(x, 0.0)
         self.count = int(self._multipliers(0.0)[1])
@@ -278,8 +293,8 @@ class InteriorPointWorkspace(IterateMemory):
                 least = NEAR * self.residual.norm / math.sqrt(self.count)
             else:
                 unknowns = max(int(np.count_nonzero(p.unknown.numpy() == 1)), 1)
-                # b may be 0 where bounds are not, and have a row that is held, which says nothing
-                # of the others
+                # b may be 0 where the bounds are not, and one held row of b may be far larger than
+                # the others.
                 size = max(
                     min(self.residual.norm_of_b(), LARGEST_START * self.residual.norm),
                     self.residual.norm,
@@ -291,7 +306,7 @@ class InteriorPointWorkspace(IterateMemory):
         elif self.is_grid:
             self.residual.affine(x)
         self.begun, self.condensed = True, False
-        # what is singular: components none of whose unknowns is bounded
+        # The singular part: components none of whose unknowns has a bound.
         if self.floating is not None:
             free, w, v = self.free.numpy() != 0, self._w.numpy(), self._v.numpy()
             self._without_bounds = wp.array(
@@ -299,7 +314,14 @@ class InteriorPointWorkspace(IterateMemory):
             )
 
     def path_step(self, x: wp.array[Any]) -> Step:
-        """Solve for the direction, and go nearly as far along it as w, v, s and t stay positive."""
+        """Solve for the direction; move nearly as far as w, v, s and t stay positive.
+
+        The predictor solves (A + D) dx = -(A x + b) with tau = 0, D = s / w + t / v. Mehrotra's
+        corrector solves again with tau = sigma mu and the second-order terms. The book's rule
+        solves once with tau = mu / k. The step is `share` of the longest one; all variables take
+        the same length. The system is scaled by 1 / size, the norm of the residual, so that float32
+        can hold it.
+        """
         s, self.steps = self.settings, self.steps + 1
         if self._fused:
             return self._fused_step(x)
@@ -334,7 +356,10 @@ class InteriorPointWorkspace(IterateMemory):
         return Step(name, iterations, None, interim=not s.mehrotra and self.steps <= s.horizon)
 
     def _fused_step(self, x: wp.array[Any]) -> Step:
-        """Do what `path_step` does by Mehrotra's rule in four passes over memory."""
+        """Take Mehrotra's step of `path_step` in four passes over memory.
+
+        The pass that moves x also condenses the system of the next step.
+        """
         s, finest = self.settings, self.system.hierarchy.finest
         if not self.condensed:
             self.condensed = True
@@ -349,8 +374,12 @@ class InteriorPointWorkspace(IterateMemory):
         return Step("predictor-corrector", iterations, None)
 
     def _center(self, longest: float, products: float) -> float:
-        """Return Mehrotra's tau: mu times the cube of what the predictor would leave of it."""
-        # products that vanish: rounding, or coefficients beyond what corrections hold
+        """Return Mehrotra's tau = sigma mu with sigma = (mu_after / mu)^3.
+
+        mu_after is that of the longest predictor step of length a: (1 - a) mu + a^2 (dw ds + dv dt)
+        / count.
+        """
+        # The products vanish by rounding, or by coefficients that corrections cannot represent.
         if not self.mu > 0:
             return 0.0
         length = min(1.0, 1 / longest) if longest > 0 else 1.0
@@ -363,7 +392,7 @@ class InteriorPointWorkspace(IterateMemory):
 
     @property
     def _pass_sums(self) -> Sums:
-        """Sums of the kernels that run over a grid's rows where passes are fused."""
+        """Sums of the kernels: over a grid's rows where passes are fused."""
         return self._grid_sums if self._fused else self._sums
 
     def _direction(self, second: float, tau: float) -> PathDirection:
@@ -373,14 +402,21 @@ class InteriorPointWorkspace(IterateMemory):
     @property
     def _stencil(self) -> Any:
         r = self.residual
-        return self.problem.A.stencil if self._fused else Known(r.diagonal, r.unit, r.y)  # type: ignore[attr-defined]
+        return (
+            self.problem.A.stencil  # type: ignore[attr-defined]
+            if self._fused
+            else Known(r.diagonal, r.unit, r.y)
+        )
 
     def _condensing(self, x: wp.array[Any], D: wp.array[Any], tau: float) -> PathSystem:
         p = self.problem
         return PathSystem(x, p.b, p.unknown, self.free, D, self.system.r, 1 / self.size, tau)
 
     def _advance(self, x: wp.array[Any], tau: float, length: float) -> None:
-        """Move, unless the length is 0, and set the residual's norm and the next system there."""
+        """Move, unless the length is 0, and condense the next system there.
+
+        The same pass sums the square of the residual's norm at the new x.
+        """
         sums, rows, bounds, upper = (
             self._grid_sums,
             self._grid_sums.rows,
@@ -423,7 +459,11 @@ class InteriorPointWorkspace(IterateMemory):
         return float(np.sqrt(self._grid_sums.scalars.numpy()[slot]))
 
     def _ratios(self, second: float, tau: float) -> tuple[float, float]:
-        """Return the reciprocal of the longest step, 0 if there is none, and the sum of dw ds + dv dt."""
+        """Return the reciprocal of the longest step, and sum(dw ds + dv dt).
+
+        The reciprocal is 0 if the step is not limited. It is the largest of -dw / w, -dv / v, -ds /
+        s and -dt / t.
+        """
         self._longest.zero_()
         found = self._pass_sums.of(
             RATIOS,
@@ -455,7 +495,7 @@ class InteriorPointWorkspace(IterateMemory):
         )
 
     def _move(self, x: wp.array[Any], second: float, tau: float, length: float) -> None:
-        """Take the step, and remember mu."""
+        """Take the step, and store mu."""
         found = self._sums.of(
             MOVE,
             self._pairs,
@@ -487,7 +527,10 @@ class InteriorPointWorkspace(IterateMemory):
         ).launch()
 
     def _multipliers(self, least: float) -> tuple[float, float]:
-        """Set s and t to y's sides, at least `least`; return the sum of products and how many bounds are finite."""
+        """Set s and t to the parts of y of each sign, at least `least`.
+
+        Returns the sum of the products w s and v t, and the number of finite bounds.
+        """
         total, count = self._sums.of(
             MULTIPLIERS, self._pairs, y=self.residual.y, least=least, UPPER=self._upper, FUSED=False
         )
@@ -503,6 +546,6 @@ class InteriorPointWorkspace(IterateMemory):
         ]
 
     def _project(self) -> None:
-        """Take off what a singular component without bounds cannot meet."""
+        """Remove the part that a singular component without bounds cannot meet."""
         if self.floating is not None:
             self.floating.project(self.system.r, self._without_bounds)

@@ -1,4 +1,4 @@
-"""Projected Jacobi: all unknowns at once, from the same iterate."""
+"""Projected Jacobi method: update all unknowns from the same iterate."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from warp_lcp.sweeps.spectrum import scaled_spectrum
 from warp_lcp.sweeps.sweep_kernels import jacobi_kernel
 
 STEPS = 20  # of Lanczos' method
-# of the 2 / lambda_max at which Jacobi's method stops converging; Lanczos sees lambda_max from
-# below
+# Part of 2 / lambda_max, the limit of convergence of Jacobi's method; Lanczos' method estimates
+# lambda_max from below.
 SHARE = 1.8
 
 
@@ -61,7 +61,7 @@ class ProjectedJacobi(Settings):
         return work
 
     def step(self, problem: LCP, work: JacobiWorkspace, x: wp.array[Any]) -> Step:
-        """Pass once over the unknowns; y is that of the residual."""
+        """Update all unknowns once; y is that of the residual."""
         r = work.residual
         inputs = [work.d, r.unit, r.y, problem.lower, problem.upper, problem.unknown, work.omega, x]
         wp.launch(jacobi_kernel(work.d.dtype), x.size, inputs, device=problem.device)
@@ -70,7 +70,7 @@ class ProjectedJacobi(Settings):
 
 
 class JacobiWorkspace(SweepWorkspace):
-    """Memory of the method.
+    """Workspace of the method.
 
     Attributes:
         omega: the damping in use.
@@ -85,11 +85,11 @@ class JacobiWorkspace(SweepWorkspace):
         self.omega = settings.omega or 1.0
 
     def start(self, *, warm: bool, tolerance: float) -> None:
-        """Estimate the damping where the operator is new."""
+        """Estimate the damping if the operator is new."""
         self.d, version = self.diagonal.field(), version_of(self.problem.A)
         if self._given is None and version != self._version:
             self.omega = self._estimate()
-            self._version = version  # last: time may be up before
+            self._version = version  # last: the time limit may end the estimate before
         self.contraction.start(self.x)
 
     def _estimate(self) -> float:

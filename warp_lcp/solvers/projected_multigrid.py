@@ -1,4 +1,7 @@
-"""Multigrid for grid LCPs at the price of a linear solve: monotone cycles, then truncated cycles with a carried CG direction."""
+"""Projected multigrid for the LCP of a grid, at the cost of a linear solve.
+
+Monotone cycles, then truncated cycles with a carried conjugate-gradient direction.
+"""
 
 from __future__ import annotations
 
@@ -52,8 +55,8 @@ class ProjectedMultigrid(Settings):
     distributed: ClassVar[bool] = True
 
     precision: PrecisionName = "mixed"
-    # without one the set creeps; nested iteration from the coarsest level saves a step of ten, and
-    # takes as long
+    # Without one the active set advances slowly. Nested iteration from the coarsest level saves one
+    # step in ten, and takes as long.
     monotone_cycles: CountOrZero = 1
     patience: Count = 3
     cycle: CycleSettings = field(default_factory=CycleSettings)
@@ -81,18 +84,18 @@ class ProjectedMultigrid(Settings):
         return CoupledWorkspace(problem, *terms, self)
 
     def spare(self, problem: LCP) -> SpareWorkspace | None:
-        """Return the workspace of an earlier solve with a problem's data.
+        """Return a kept workspace of an earlier solve with the problem's data.
 
-        None if `init` has to make one. From the second solve of a form in succession on one
-        workspace is kept, see `wl.release_workspace`.
+        Returns None if `init` has to create one. From the second consecutive solve of a form on,
+        one workspace is kept, see `wl.release_workspace`.
         """
         return lend(problem, self) if type(self) is ProjectedMultigrid else None
 
     def step(self, problem: LCP, work: MultigridWorkspace, x: wp.array[Any]) -> Step:
         """Take a monotone cycle or a truncated one.
 
-        Monotone cycles come while the start is cold and where steps do not lower the energy;
-        truncated ones otherwise.
+        Monotone cycles come after a cold start and where steps do not lower the energy; truncated
+        ones otherwise.
         """
         if work.goes_in_circles:
             work.residual.current = True

@@ -1,4 +1,4 @@
-"""Projected successive over-relaxation; projected Gauss-Seidel is omega = 1."""
+"""Projected successive over-relaxation; omega = 1 is projected Gauss-Seidel."""
 
 from __future__ import annotations
 
@@ -106,11 +106,11 @@ class ProjectedSOR(Settings):
 
 
 class SweepWorkspace(IterateMemory):
-    """Memory of a method that sweeps.
+    """Workspace of a method that sweeps.
 
     Attributes:
-        sweep: how.
-        diagonal: A's.
+        sweep: the sweep over the unknowns.
+        diagonal: of A.
         contraction: the test of its sweeps.
     """
 
@@ -122,13 +122,16 @@ class SweepWorkspace(IterateMemory):
         self.contraction = Contraction(problem)
 
     def start(self, *, warm: bool, tolerance: float) -> None:
-        """Look at the operator again; nothing else is carried from solve to solve."""
+        """Read the operator again; nothing else is carried from solve to solve."""
         self.sweep.start()
         self.contraction.start(self.x)
 
 
 class SORWorkspace(SweepWorkspace):
-    """Memory of the method; on grids it finds omega when a solve begins, unless that is given."""
+    """Workspace of the method; on grids a solve estimates omega at its start.
+
+    If the settings have an omega, that is used.
+    """
 
     def __init__(self, problem: LCP, settings: ProjectedSOR) -> None:
         super().__init__(problem, settings.precision)
@@ -139,11 +142,11 @@ class SORWorkspace(SweepWorkspace):
     def start(
         self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
     ) -> None:
-        """Look at the operator again; of a grid that has changed find omega."""
+        """Read the operator again; estimate omega for a grid that has changed."""
         version = version_of(self.problem.A)
         if self._advised and self._version != version:
             self._relax_by(grid_omega(self.problem, singular=floating is not None))
-            self._version = version  # last: time may be up before
+            self._version = version  # last: the time limit may end the estimate before
         super().start(warm=warm, tolerance=tolerance)
 
     def _relax_by(self, omega: float) -> None:
@@ -161,41 +164,41 @@ def has_advised_omega(problem: LCP) -> bool:
 def grid_omega(problem: LCP, *, singular: bool) -> float:
     """Return the advised relaxation factor of a grid.
 
-    On a singular grid lambda_min = 0 would advise 2: at most what a quarter of a wave along its
-    longest side asks for. There lambda_min = 1 - cos(pi / (2 (n + 1))), so that Young's formula is
-    2 / (1 + sin(pi / (2 (n + 1)))).
+    On a singular grid lambda_min = 0 would advise omega = 2. There omega is at most that for a
+    quarter of a wave along the longest side, lambda_min = 1 - cos(pi / (2 (n + 1))), so that
+    Young's formula is 2 / (1 + sin(pi / (2 (n + 1)))).
     """
     most = 2 / (1 + math.sin(math.pi / (2 * (max(problem.layout.shape) + 1)))) if singular else 2.0
     try:
         return min(advised_omega(problem), most)
-    except ValueError:  # a negative diagonal, as a negative shift makes it
+    except ValueError:  # a negative diagonal, for example by a negative shift
         return BOOK
 
 
 def advised_omega(problem: LCP, steps: int = 60, free: Any = None) -> float:
-    """Return an estimate of the best relaxation factor omega (Young).
+    """Estimate the best relaxation factor omega (Young).
 
-    2 / (1 + sqrt(1 - rho^2)).
+    omega = 2 / (1 + sqrt(1 - rho^2)).
 
     rho = 1 - lambda_min(D^-1 A) is the spectral radius of Jacobi's method, estimated by Lanczos'
     method. The formula is exact for equations in two colors (grids), and a guide elsewhere. Only
-    the free unknowns count in the end: where many are held at bounds, the whole matrix advises too
-    much, and a second look with the free set of an earlier solution pays.
+    the free unknowns count in the end: where many are held at bounds, the value for the whole
+    matrix is too large, and a second estimate with the free set of an earlier solution pays.
 
     Args:
         problem: with a symmetric A and a positive diagonal.
         steps: products with A.
-        free: field of the problem's shape, non-zero where x is thought to be off its bounds;
+        free: field of the problem's shape, non-zero where x is expected to be off its bounds;
             everywhere if None.
 
     Raises:
         ValueError: a diagonal entry is negative, or `free` is empty.
 
     Example:
-        >>> import numpy as np, warp_lcp as wl
-        >>> A = wl.GridPoisson(np.array([[wl.AIR] + 20 * [wl.FLUID] + [wl.AIR]]), device="cpu")
-        >>> round(advised_omega(wl.LCP(A, np.zeros((1, 22)))), 3)  # 2 / (1 + sin(pi / 21))
-        1.741
+        |    >>> import numpy as np, warp_lcp as wl
+        |    >>> A = wl.GridPoisson(np.array([[wl.AIR] + 20 * [wl.FLUID] + [wl.AIR]]), device="cpu")
+        |    >>> round(advised_omega(wl.LCP(A, np.zeros((1, 22)))), 3)  # 2 / (1 + sin(pi / 21))
+        |    1.741
     """
     least, _ = scaled_spectrum(problem, steps, free)
     rho = min(max(1 - least, 0.0), 1.0)

@@ -26,7 +26,7 @@ from warp_lcp.settings import Count, Settings, Share
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.sweeps.sweep import Contraction
 
-SHARE = 0.3  # of the whole tolerance, which a block need not be solved beyond
+SHARE = 0.3  # of the whole tolerance, beyond which a block need not be solved
 Blocks = Annotated[Sequence[Any] | np.ndarray, "for each block a list of indices"]
 KERNELS = KernelFile(Path(__file__).parent / "headers/gradient_projection.h")
 SELECT = KERNELS["partition.select"]
@@ -85,18 +85,18 @@ class Staggering(Settings):
         )
 
     def step(self, problem: LCP, work: StaggeringWorkspace, x: wp.array[Any]) -> Step:
-        """Solve each block once, the others held."""
+        """Solve each block once, with the others held fixed."""
         linear = work.rounds.run(work.target)
         return Step("round", linear, failure=work.contraction.test(x))
 
 
 class StaggeringWorkspace(IterateMemory):
-    """Memory of a problem in blocks that are solved in turn.
+    """Workspace of a problem in blocks that are solved in turn.
 
     Attributes:
         rounds: the blocks with their methods.
         contraction: the test of rounds for contraction.
-        target: the residual that is asked for.
+        target: the required residual.
     """
 
     def __init__(
@@ -115,7 +115,7 @@ class StaggeringWorkspace(IterateMemory):
         self.target = 0.0
 
     def start(self, *, warm: bool, tolerance: float) -> None:
-        """Take A again where it has changed."""
+        """Read A again where it has changed."""
         self.target = tolerance
         for block in self.blocks:
             block.refresh()
@@ -158,6 +158,8 @@ class StaggeredRound:
     def run(self, target: float, *, forward: bool = True) -> int:
         """Solve each block once, forward or backward; return linear iterations.
 
+        `target` is the residual required of all blocks together.
+
         `target` is the residual asked for of all blocks.
         """
         count, linear = len(self.blocks), 0
@@ -191,7 +193,10 @@ class StaggeredRound:
 
 
 def blocks_of_size(problem: LCP, size: int) -> list[np.ndarray]:
-    """Return stored indices of the unknowns, `size` consecutive ones a block; the last block may be smaller."""
+    """Return stored indices of the unknowns, in blocks of `size` consecutive ones.
+
+    The last block may be smaller.
+    """
     unknowns = np.flatnonzero(problem.unknown.numpy() == 1)
     return [unknowns[i : i + size] for i in range(0, len(unknowns), size)]
 
@@ -242,7 +247,9 @@ def given_blocks(problem: LCP, blocks: Blocks) -> list[np.ndarray]:
 
 
 def color_blocks(matrix: scipy.sparse.csr_array, owner: np.ndarray, count: int) -> list[np.ndarray]:
-    """Return the blocks of each color, in order: no row of a block has an entry in a column of another block of its color.
+    """Return the blocks of each color, in order.
+
+    No row of a block has an entry in a column of another block of its color.
 
     Args:
         matrix: A.
@@ -260,10 +267,12 @@ def color_blocks(matrix: scipy.sparse.csr_array, owner: np.ndarray, count: int) 
 
 
 class MatrixBlock:
-    """A block of a dense or sparse problem: A_BB x_B + (b_B + A_BC x_C), C the other unknowns. Products with A_BC are made on the host.
+    """A block of a dense or sparse problem: A_BB x_B + (b_B + A_BC x_C).
+
+    C are the other unknowns. Products with A_BC are computed on the host.
 
     Attributes:
-        problem: the block's own; b and bounds are written by `couple`.
+        problem: the block's own; `couple` writes b and bounds.
     """
 
     def __init__(self, whole: LCP, x: wp.array[Any], rows: np.ndarray) -> None:
@@ -276,7 +285,7 @@ class MatrixBlock:
         self._version = version_of(whole.A)
 
     def refresh(self) -> None:
-        """Take A's entries again where they have changed."""
+        """Read A's entries again where they have changed."""
         A, version = cast(Any, self.problem.A), version_of(self._whole.A)
         if isinstance(A, SparseOperator) and version == self._version:
             return
@@ -297,13 +306,13 @@ class MatrixBlock:
         return wp.array(self._x.numpy()[self._rows], dtype=wp.float64, device=self._whole.device)
 
     def accept(self, result: SolveResult) -> None:
-        """Write a block's x_B to the common iterate."""
+        """Write the block's x_B to the common iterate."""
         values = self._x.numpy()
         values[self._rows] = result.x.numpy()
         self._x.assign(values)
 
     def _entries(self) -> tuple[Any, Any]:
-        """Return A_BB, and the block's rows of A with 0 in place of it."""
+        """Return A_BB, and the block's rows of A with 0 in its place."""
         A, rows = self._whole.A, self._rows
         assert has(A, HasRows)
         slab = A.rows().matrix()[rows]
@@ -318,7 +327,9 @@ class MatrixBlock:
 
 
 class GridBlock:
-    """A block of a grid problem: the same grid with AIR, x = 0, in place of the other unknowns, whose part is in b.
+    """A block of a grid problem, on the same grid.
+
+    The other unknowns are AIR, x = 0; their contribution is in b.
 
     Attributes:
         problem: the block's own, in the layout of the whole; bounds are shared with it.
@@ -341,16 +352,21 @@ class GridBlock:
         self._version = A.version
 
     def refresh(self) -> None:
-        """Take A's coefficients again; cells that are no longer FLUID leave the block, new ones belong to none."""
+        """Read A's coefficients again.
+
+        Cells that are no longer FLUID leave the block; new ones belong to no block.
+        """
         A = self._whole.A
         assert has(A, HasBlocks)
         if A.version != self._version:
             self._version = A.version
             cells = self._cells().reshape(self._whole.layout.stored_shape)
-            self.problem.A.update(wp.array(cells, dtype=wp.int8, device=self._whole.device))  # type: ignore[attr-defined]
+            self.problem.A.update(  # type: ignore[attr-defined]
+                wp.array(cells, dtype=wp.int8, device=self._whole.device)
+            )
 
     def couple(self) -> None:
-        """Write what A x + b leaves of b when the block's own part is taken out."""
+        """Write the block's b: A x + b without the block's own part of A x."""
         whole, member = self._whole, self._member
         whole.bounds.follow(self._x)
         whole.apply_plus(self._x, whole.b, self._y)
@@ -363,11 +379,11 @@ class GridBlock:
         ).launch()
 
     def guess(self) -> wp.array[Any]:
-        """Return x_B as `couple` found it."""
+        """Return x_B as `couple` wrote it."""
         return self._guess
 
     def accept(self, result: SolveResult) -> None:
-        """Write a block's x_B to the common iterate."""
+        """Write the block's x_B to the common iterate."""
         SELECT.bind(
             rows_of(self._x),
             x=result.x.flatten(),
@@ -379,7 +395,10 @@ class GridBlock:
 
     def _cells(self) -> np.ndarray:
         """Return the padded cell types with AIR in place of the other unknowns."""
-        cells, member = self._whole.A.cells.numpy().ravel(), self._member.numpy()  # type: ignore[attr-defined]
+        cells, member = (
+            self._whole.A.cells.numpy().ravel(),  # type: ignore[attr-defined]
+            self._member.numpy(),
+        )
         return np.where((cells == FLUID) & (member == 0), AIR, cells).astype(np.int8)
 
 

@@ -1,4 +1,7 @@
-"""Projected Gauss-Seidel subspace minimization: sweeps find the free set, a linear solve finds x on it."""
+"""Subspace minimization after projected Gauss-Seidel sweeps.
+
+Sweeps find the free set, a linear solve finds x on it.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,7 @@ from warp_lcp.sweeps.sweep import sweep_for
 KERNELS = KernelFile(Path(__file__).parent / "headers/gradient_projection.h")
 BETWEEN = KERNELS["subspace.between"]
 FOLLOW = KERNELS["subspace.follow"]
-ROUNDING = 1e-14  # relative change of the energy that is none
+ROUNDING = 1e-14  # a smaller relative change of the energy counts as none
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,7 +109,7 @@ class SubspaceMinimization(Settings):
 
 
 class SubspaceWorkspace(SweepWorkspace):
-    """Memory of the method for one problem."""
+    """Workspace of the method for one problem."""
 
     def __init__(self, problem: LCP, settings: SubspaceMinimization) -> None:
         super().__init__(problem, settings.precision)
@@ -124,14 +127,17 @@ class SubspaceWorkspace(SweepWorkspace):
     def start(
         self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
     ) -> None:
-        """Forget the free set; the operator may have changed."""
+        """Reset the free set; the operator may have changed."""
         super().start(warm=warm, tolerance=tolerance)
         self.floating = floating
         self._stale, self._target = True, tolerance
         self.system.refresh()
 
     def classify(self, x: wp.array[Any]) -> tuple[int, int]:
-        """Find the free set; return how many unknowns entered or left it, and how many are held."""
+        """Find the free set; return how many unknowns changed sides and are held.
+
+        An unknown is free where l < x < u ([Book] eq. 2.92).
+        """
         p = self.problem
         p.bounds.follow(x)
         found = self._sums.of(
@@ -144,7 +150,11 @@ class SubspaceWorkspace(SweepWorkspace):
         return moved, held
 
     def minimize(self, x: wp.array[Any]) -> int:
-        """Solve on the free set and move x along the projected correction; returns linear iterations."""
+        """Solve on the free set and move x along the projected correction.
+
+        It solves A_FF e_F = -y_F / size, then x <- clip(x + size e, l, u) with the correction
+        halved until the residual or the energy falls. Returns the number of linear iterations.
+        """
         s, residual = self.settings, self.residual
         norm, energy = residual.evaluate(x), self._energy(x)
         size = self._right_side(1.0)
@@ -192,7 +202,10 @@ class SubspaceWorkspace(SweepWorkspace):
         self._finish_move(x)
 
     def _energy(self, x: wp.array[Any]) -> float:
-        """Return x'A x / 2 + b'x = x'(y + b) / 2, y being that of x; infinite where there is none: A not symmetric, bounds affine."""
+        """Return the energy x'A x / 2 + b'x = x'(y + b) / 2, y being that of x.
+
+        Infinite where it does not exist: A is not symmetric, or bounds are affine.
+        """
         if not self.problem.A.symmetric or self._old_bounds:
             return np.inf
         for slot, other in enumerate((self.residual.y, self.problem.b)):
@@ -200,7 +213,7 @@ class SubspaceWorkspace(SweepWorkspace):
         return 0.5 * float(self._sums.scalars.numpy().sum())
 
     def _right_side(self, scale: float) -> float:
-        """Set the system's right-hand side to -scale y on the free set; return y's norm there."""
+        """Set the right-hand side to -scale y on the free set; return y's norm there."""
         return float(
             np.sqrt(
                 self._sums.of(
