@@ -78,13 +78,13 @@ class Settings:
     `__post_init__` that calls this one first.
 
     Example:
-        |    >>> @dataclasses.dataclass(frozen=True, kw_only=True)
-        |    ... class Damped(Settings):
-        |    ...     omega: Relaxation = 0.8
-        |    >>> Damped(omega=2)
-        |    Traceback (most recent call last):
-        |    ...
-        |    warp_lcp.settings.SettingError: omega = 2: must be in (0, 2)
+        >>> @dataclasses.dataclass(frozen=True, kw_only=True)
+        ... class Damped(Settings):
+        ...     omega: Relaxation = 0.8
+        >>> Damped(omega=2)
+        Traceback (most recent call last):
+        ...
+        warp_lcp.settings.SettingError: omega = 2: must be in (0, 2)
     """
 
     def __post_init__(self) -> None:

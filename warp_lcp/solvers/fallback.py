@@ -172,12 +172,12 @@ class Fallback:
         ValueError: there is no method, or an entry is of another kind.
 
     Example:
-        |    >>> import numpy as np, warp_lcp as wl
-        |    >>> chain = wl.Fallback(wl.ProjectedSOR(), (wl.Lemke(), wl.stalls))
-        |    >>> A = np.array([[0.0, 1.0], [-1.0, 0.0]]) + 0.01 * np.eye(2)
-        |    >>> problem = wl.LCP(A, np.array([-1.0, 1.0]))
-        |    >>> print(wl.solve(problem, chain).method)
-        |    lemke
+        >>> import numpy as np, warp_lcp as wl
+        >>> chain = wl.Fallback(wl.ProjectedSOR(), (wl.Lemke(), wl.stalls))
+        >>> A = np.array([[0.0, 1.0], [-1.0, 0.0]]) + 0.01 * np.eye(2)
+        >>> problem = wl.LCP(A, np.array([-1.0, 1.0]))
+        >>> print(wl.solve(problem, chain).method)
+        lemke
     """
 
     def __init__(self, *entries: Any) -> None:

@@ -61,9 +61,8 @@ class ProximalGaussSeidel(Settings):
 
     A sweep updates each contact once, with the velocities after the updates before it:
 
-        |    r_n <- max(0, r_n - rho_n u_n), then r_t <- the nearest point of |r_t| <= mu r_n to r_t
-        -
-        |    rho_t u_t
+        r_n <- max(0, r_n - rho_n u_n),
+        r_t <- the nearest point of |r_t| <= mu r_n to r_t - rho_t u_t,
 
     with r-factors rho_n = 1 / B_nn and rho_t = 1 / (the largest eigenvalue of B_tt) of the
     contact's own block of B = J J' + diag(e); for spheres that solves it exactly. B is not

@@ -59,11 +59,11 @@ class ProximalPoint(Settings):
             more than 1000 unknowns MinimumMapNewton follows where a set recurs.
 
     Example:
-        |    >>> import numpy as np, warp_lcp as wl
-        |    >>> A = wl.DenseOperator(np.array([[0.0, 1.0], [-1.0, 0.0]]), device="cpu")
-        |    >>> result = wl.solve(wl.LCP(A, np.array([-1.0, 1.0])), wl.ProximalPoint())
-        |    >>> print(result.status.name, result.x.numpy().round(4))
-        |    CONVERGED [1. 1.]
+        >>> import numpy as np, warp_lcp as wl
+        >>> A = wl.DenseOperator(np.array([[0.0, 1.0], [-1.0, 0.0]]), device="cpu")
+        >>> result = wl.solve(wl.LCP(A, np.array([-1.0, 1.0])), wl.ProximalPoint())
+        >>> print(result.status.name, result.x.numpy().round(4))
+        CONVERGED [1. 1.]
     """
 
     supports: ClassVar = (HasRows,)

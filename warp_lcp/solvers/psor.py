@@ -195,10 +195,10 @@ def advised_omega(problem: LCP, steps: int = 60, free: Any = None) -> float:
         ValueError: a diagonal entry is negative, or `free` is empty.
 
     Example:
-        |    >>> import numpy as np, warp_lcp as wl
-        |    >>> A = wl.GridPoisson(np.array([[wl.AIR] + 20 * [wl.FLUID] + [wl.AIR]]), device="cpu")
-        |    >>> round(advised_omega(wl.LCP(A, np.zeros((1, 22)))), 3)  # 2 / (1 + sin(pi / 21))
-        |    1.741
+        >>> import numpy as np, warp_lcp as wl
+        >>> A = wl.GridPoisson(np.array([[wl.AIR] + 20 * [wl.FLUID] + [wl.AIR]]), device="cpu")
+        >>> round(advised_omega(wl.LCP(A, np.zeros((1, 22)))), 3)  # 2 / (1 + sin(pi / 21))
+        1.741
     """
     least, _ = scaled_spectrum(problem, steps, free)
     rho = min(max(1 - least, 0.0), 1.0)
