@@ -1,4 +1,7 @@
-"""Names of what has gradients: what a mapping among the coefficients holds goes by pairs, `("coefficients", (0, 1))`."""
+"""Names of the arguments that have gradients.
+
+Entries of a mapping among the coefficients have pairs as names, `("coefficients", (0, 1))`.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,7 @@ def flat(values: Mapping[str, Any]) -> dict[Any, Any]:
 
 
 def nested(names: Iterable[Any], values: Iterable[Any]) -> dict[str, Any]:
-    """Return what `flat` has made from."""
+    """Return the nested values for the names of `flat`."""
     found: dict[str, Any] = {}
     for name, value in zip(names, values, strict=True):
         if isinstance(name, tuple):

@@ -1,4 +1,7 @@
-"""Solutions as PyTorch functions, with gradients by `wl.vjp`; tensors share memory with Warp. Needs PyTorch, the extra `torch`."""
+"""Solutions as PyTorch functions, with gradients by `wl.vjp` (extra `torch`).
+
+Tensors share memory with Warp arrays.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,7 @@ def solve(
     adjoint: StoppingCriteria | None = None,
     **options: Any,
 ) -> Any:
-    """Return the solution x as a PyTorch tensor with gradients to all tensors given.
+    """Return the solution x as a PyTorch tensor with gradients to all given tensors.
 
     x solves y = A x + b with bounds; it has the type of b.
 
@@ -50,7 +53,7 @@ def solve(
 
 @cache
 def _solution() -> Any:
-    """Return the function, made when it is first asked for."""
+    """Return the autograd function, created at the first call."""
     import torch
 
     class Solution(torch.autograd.Function):
@@ -95,5 +98,5 @@ def _solution() -> Any:
 
 
 def _shared(tensor: Any) -> Any:
-    """Return a tensor's memory as an array of Warp's; a number where it has no axes."""
+    """Return a tensor's memory as a Warp array, a number if it has no axes."""
     return wp.from_torch(tensor.detach().contiguous()) if tensor.ndim else float(tensor)

@@ -1,4 +1,4 @@
-"""Solves on a tape of Warp's: `Tape.backward` goes through them by `wl.vjp`."""
+"""Solves on a Warp tape; `Tape.backward` differentiates them by `wl.vjp`."""
 
 from __future__ import annotations
 
@@ -32,10 +32,11 @@ def solve(
 
     `tape.backward` then adds to the gradients of all arrays that have one.
 
-    Call it outside of the tape's `with`, which would record, and keep, each launch of the solve.
+    Call it outside of the tape's `with` block, which would record, and keep, each launch of the
+    solve.
 
     Args:
-        tape: continued by what follows the solve.
+        tape: the operations after the solve continue it.
         A: an operator, or a function of `coefficients` that returns one, such as
             `functools.partial(wl.GridPoisson, cells)`.
         b: as of `wl.LCP`; like bounds and coefficients an array with `requires_grad=True` if its
@@ -50,7 +51,7 @@ def solve(
         The result, whose x has a gradient.
 
     Raises:
-        ValueError: as of `wl.LCP` and `wl.solve`, and while going back as of `wl.vjp`.
+        ValueError: as of `wl.LCP` and `wl.solve`, and in the backward pass as of `wl.vjp`.
     """
     given = flat({"b": b, "lower": lower, "upper": upper, **(coefficients or {})})
     result = solve_problem(

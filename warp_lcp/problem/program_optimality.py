@@ -19,22 +19,22 @@ import scipy.sparse.linalg
 from warp_lcp.problem.reformulate import QuadraticProgramData
 from warp_lcp.problem.scale import scaled
 
-SMALL = 400  # unknowns and rows up to which matrices are dense, whatever the caller's are
-SWEEPS = 20  # of Ruiz's iteration, each of which halves the logarithms of rows that differ
+SMALL = 400  # up to so many unknowns and rows matrices are dense, for any type of the caller's
+SWEEPS = 20  # sweeps of Ruiz's iteration, each of which halves the logarithms of rows that differ
 CANCELED = 1e-10  # terms of a row below this part of ||a_i|| ||x|| count as rounding
-# shift of the conditions' matrix, which dependent rows make singular; refinement takes its effect
-# off
+# Shift of the conditions' matrix, which dependent rows make singular; refinement removes its
+# effect.
 PROXIMAL = 1e-8
 REFINEMENTS = 12
-CHANGES = 30  # of the active set
+CHANGES = 30  # changes of the active set
 EXACT = 1e-13  # relative residual below which there is nothing to improve
-# value of a certificate, relative to its terms, beyond rounding and HiGHS's tolerances
+# Value of a certificate relative to its terms, beyond rounding and HiGHS's tolerances.
 PROVED = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
 class ProgramWithRows(QuadraticProgramData):
-    """A program that has G, h, C and d, without rows where there are none."""
+    """A program with G, h, C and d, which are empty if it has no such rows."""
 
     h: np.ndarray = field(default_factory=lambda: np.zeros(0))
     d: np.ndarray = field(default_factory=lambda: np.zeros(0))
@@ -45,9 +45,9 @@ class ProgramUnits:
     """Units of an equilibrated program.
 
     Attributes:
-        x: what 1 in x' is in x, shape (n,).
-        inequalities: what 1 in a multiplier of G x >= h is, shape (m,).
-        equations: what 1 in a multiplier of C x = d is, shape (k,).
+        x: unit of x' in x, shape (n,).
+        inequalities: unit of the multipliers of G x >= h, shape (m,).
+        equations: unit of the multipliers of C x = d, shape (k,).
     """
 
     x: np.ndarray
@@ -55,8 +55,8 @@ class ProgramUnits:
     equations: np.ndarray
 
     def of_caller(self, point: ProgramPoint) -> ProgramPoint:
-        """Return a point of the equilibrated program in the units of the program it was made of."""
-        with np.errstate(over="ignore"):  # a multiplier may be beyond all numbers in those
+        """Return a point of the equilibrated program in the original units."""
+        with np.errstate(over="ignore"):  # multipliers may overflow in those
             return ProgramPoint(
                 self.x * point.x, self.inequalities * point.z, self.equations * point.y
             )
@@ -64,7 +64,9 @@ class ProgramUnits:
 
 @dataclass(frozen=True, eq=False)
 class ProgramPoint:
-    """A point and its multipliers: Q x + c - G' z - C' y is >= 0 at lower bounds, <= 0 at upper ones and 0 elsewhere.
+    """A point of a program and its multipliers.
+
+    At a solution Q x + c - G' z - C' y is >= 0 at lower bounds, <= 0 at upper ones and 0 elsewhere.
 
     Attributes:
         x: shape (n,).
@@ -78,12 +80,15 @@ class ProgramPoint:
 
     @property
     def is_finite(self) -> bool:
-        """Whether all numbers are."""
+        """Whether all numbers are finite."""
         return all(np.isfinite(part).all() for part in (self.x, self.z, self.y))
 
 
 def with_rows(program: QuadraticProgramData) -> ProgramWithRows:
-    """Return a program with rows, its matrices all sparse, or all dense if small or dense."""
+    """Return a program with rows.
+
+    Its matrices are all sparse, or all dense if small or dense.
+    """
     matrices, n = (program.Q, program.G, program.C), len(program.c)
     h, d = (np.zeros(0) if v is None else v for v in (program.h, program.d))
     dense = n + len(h) + len(d) <= SMALL or not any(scipy.sparse.issparse(M) for M in matrices)
@@ -144,7 +149,10 @@ def equilibrated(program: ProgramWithRows) -> tuple[ProgramWithRows, ProgramUnit
 
 
 def settled(program: ProgramWithRows, point: ProgramPoint) -> ProgramPoint:
-    """Return the point with complementary pairs: x on a bound or z = 0, the nearer of the two."""
+    """Return the point with complementary pairs.
+
+    Of each pair the smaller becomes 0: x is set on a bound, or z = 0.
+    """
     at, slope = np.clip(point.x, program.lower, program.upper), _gradient(program, point)
     x = np.where(
         at - program.lower <= slope,
@@ -158,13 +166,13 @@ def settled(program: ProgramWithRows, point: ProgramPoint) -> ProgramPoint:
 
 @np.errstate(over="ignore", invalid="ignore")  # of multipliers beyond all numbers: inf is returned
 def relative_residuals(program: ProgramWithRows, point: ProgramPoint) -> tuple[float, float, float]:
-    """Return the primal residual, the dual residual and the duality gap, relative to their terms.
+    """Return the primal residual, the dual residual and the duality gap.
 
-    For row i of a x - b that is |a_i x - b_i| / (sum_j |a_ij x_j| + |b_i|), the componentwise
-    backward error, which does not depend on the units of rows; where all terms are rounding,
-    ||a_i|| ||x|| is added. An inequality with a multiplier counts as
-    an equation. The duality gap is x'Qx + c'x - h'z - d'y less what the bounds pay, relative to the
-    sum of its parts.
+    All are relative to their terms. For row i of a x - b that is |a_i x - b_i| / (sum_j |a_ij x_j|
+    + |b_i|), the componentwise backward error, which does not depend on the units of rows; where
+    all terms are rounding, ||a_i|| ||x|| is added. An inequality with a multiplier counts as an
+    equation. The duality gap is x'Qx + c'x - h'z - d'y minus the contribution of the bounds,
+    relative to the sum of its parts.
 
     Args:
         program: with rows.
@@ -188,8 +196,8 @@ def relative_residuals(program: ProgramWithRows, point: ProgramPoint) -> tuple[f
     )
     wrong = np.where(p.lower == p.upper, 0.0, wrong)
     terms = abs(p.Q) @ np.abs(x) + np.abs(p.c) + abs(rows).T @ multipliers
-    # without ||multipliers||: a bound and an equation that cancel may have any, and would hide the
-    # other rows
+    # Without ||multipliers||: those of a bound and an equation that cancel may have any size, and
+    # would hide the other rows.
     least = np.abs(p.c[p.c != 0]).min(initial=np.inf)
     sizes = (
         _largest(abs(p.Q), 1) * np.abs(x).max(initial=0.0)
@@ -251,8 +259,8 @@ def has_no_solution(program: ProgramWithRows) -> str:
     """Return "infeasible" or "unbounded" where a certificate proves it, else "".
 
     Infeasible: z >= 0, y and bound multipliers with G'z + C'y + v - w = 0 and h'z + d'y + l'v - u'w
-        > 0 (Farkas). Unbounded: a direction e
-    with Q e = 0, C e = 0, G e >= 0, within the cone of the bounds, and c'e < 0.
+    > 0 (Farkas). Unbounded: a direction e with Q e = 0, C e = 0, G e >= 0, within the cone of the
+    bounds, and c'e < 0.
 
     Args:
         program: with rows.
@@ -309,10 +317,10 @@ def _without_rounding(values: np.ndarray) -> np.ndarray:
 def _newton(
     p: ProgramWithRows, now: ProgramPoint, low: Any, high: Any, tight: Any
 ) -> ProgramPoint | None:
-    """Return the solution of the equations of an active set; None where it is not finite.
+    """Return the solution of the equations of an active set, None if not finite.
 
-    [[Q_FF + s, -B_F'], [B_F, s]] is factored, s > 0 small, and the step refined: of rows that
-    depend on each other the least change.
+    [[Q_FF + s, -B_F'], [B_F, s]] is factored, s > 0 small, and the step is refined. For dependent
+    rows that gives the least change.
     """
     free, active = np.flatnonzero(~low & ~high), np.flatnonzero(tight)
     x = np.where(low, p.lower, np.where(high, p.upper, now.x))
@@ -333,7 +341,10 @@ def _newton(
 
 
 def _factored(Q: Any, B: Any) -> Callable[[np.ndarray], np.ndarray] | None:
-    """Return what solves [[Q + s, -B'], [B, s]] v = r, s = PROXIMAL; None where the factors are singular."""
+    """Return a solver of [[Q + s, -B'], [B, s]] v = r, s = PROXIMAL.
+
+    None where the factors are singular.
+    """
     n, k = Q.shape[0], B.shape[0]
     if scipy.sparse.issparse(Q):
         M = scipy.sparse.block_array(
@@ -356,7 +367,7 @@ def _gradient(p: ProgramWithRows, point: ProgramPoint) -> np.ndarray:
 
 
 def _relative(values: np.ndarray, terms: np.ndarray, sizes: np.ndarray) -> float:
-    """Return the largest of values relative to the terms they are left of."""
+    """Return the largest of values relative to the terms of their sums."""
     whole = np.where(terms > CANCELED * sizes, terms, terms + sizes)
     return float((values / np.where(whole > 0, whole, 1.0)).max(initial=0.0))
 
