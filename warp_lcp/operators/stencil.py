@@ -1,4 +1,7 @@
-"""Compact stencils of a user's own on a grid of cells, matrix-free: up to 9 points in 2-D, 27 in 3-D, symmetric or not."""
+"""User-defined compact stencils on a grid of cells, matrix-free.
+
+Up to 9 points in 2-D, 27 in 3-D, symmetric or not.
+"""
 
 from __future__ import annotations
 
@@ -28,10 +31,10 @@ KERNELS = KernelFile(Path(__file__).parent / "headers/stencil_operator.h")
 DIAGONAL = KERNELS["stencil.diagonal"]
 TRANSPOSED = KERNELS["stencil.transposed"]
 GRADIENT = KERNELS["stencil.gradient"]
-# unknowns of a component whose null vectors are had by sparse factors, in a second or two
+# Unknowns of a component whose null vectors are computed by sparse factors, in a second or two.
 MOST_IN_PLANE, MOST_IN_SPACE = 1 << 17, 1 << 14
 CENTER = (0, 0, 0)
-# all neighbors in 2-D
+# All neighbors in 2-D.
 AROUND = Pattern(
     tuple((x, y, 0) for y in (-1, 0, 1) for x in (-1, 0, 1) if x or y),
     symmetric=False,
@@ -45,16 +48,16 @@ __all__ = ["Stencil"]
 class Stencil(GridOperator):
     """Operator of a compact stencil on the FLUID cells of a grid.
 
-    Finite differences, finite volumes or finite elements of your own.
+    For your own finite differences, finite volumes or finite elements.
 
     (A x)_i = sum over offsets o of a_o(i) x_(i + o) + shift_i x_i, with x = 0 in AIR, and x_(i + o)
     = x_i where i + o is SOLID (a closed side: no flux). With other values in AIR cells, see
-    `boundary_term`. Nothing is assembled: numbers are numbers in the kernels, Warp functions are
+    `boundary_term`. Nothing is assembled: numbers are constants in the kernels, Warp functions are
     evaluated where a row is needed, arrays are read.
 
     Args:
         cells: integers AIR = 0, FLUID = 1, SOLID = 2, shape (nz, ny, nx) or (ny, nx); numpy or
-            wp.array. Unknowns live on FLUID cells, fields have the shape of `cells`.
+            wp.array. Unknowns are on FLUID cells, fields have the shape of `cells`.
         coefficients: a_o by offset, (dz, dy, dx) or (dy, dx), each -1, 0 or 1, the center included;
             absent ones are 0. Each is a number, an array of the shape of `cells`, or a Warp
             function of the cell's indices, (k, j, i) or (j, i), that returns a float; functions and
@@ -63,17 +66,17 @@ class Stencil(GridOperator):
         shift: None, a number or an array of the shape of `cells`, >= 0.
         periodic: whether x, y, z wrap around; the cells of an axis of one cell are then their own
             neighbors.
-        outside: kind of cells outside the array along axes that are not periodic: SOLID, as for
+        outside: type of the cells outside the array along axes that are not periodic: SOLID, as for
             `wl.GridPoisson`, or AIR.
         device: Warp device; that of `cells` or the default device if None.
         dtype: storage of coefficients, wp.float32 or wp.float64. In float32 coefficients are
-            rounded, so that the problem solved is another one by about 1e-7 of the diagonal, and
-            tolerances below the rounding end with FLOOR.
+            rounded, which changes the problem by about 1e-7 of the diagonal; tolerances below the
+            rounding end with FLOOR.
 
     Attributes:
         symmetric: whether a_o(i) = a_-o(i + o) between all unknowns, to the last bit; coefficients
-            toward SOLID, AIR and what lies outside do not matter. Once other cells in place have
-            made A unsymmetric, it stays False.
+            toward SOLID, AIR and cells outside do not matter. Once other cells in place have made A
+            unsymmetric, it stays False.
         monotone: whether all a_o but the center's are <= 0, as in an M-matrix.
 
     Raises:
@@ -82,8 +85,10 @@ class Stencil(GridOperator):
 
     Example:
         >>> import numpy as np, warp_lcp as wl
-        >>> A = wl.Stencil(np.full((1, 3), wl.FLUID), {(0, 0): 3.0, (0, -1): -2.0, (0, 1): -1.0}, outside=wl.AIR, device="cpu")
-        >>> print(A.apply(wp.array([[1.0, 1.0, 1.0]], dtype=wp.float64, device="cpu")).numpy(), A.symmetric)
+        >>> coefficients = {(0, 0): 3.0, (0, -1): -2.0, (0, 1): -1.0}
+        >>> A = wl.Stencil(np.full((1, 3), wl.FLUID), coefficients, outside=wl.AIR, device="cpu")
+        >>> x = wp.array([[1.0, 1.0, 1.0]], dtype=wp.float64, device="cpu")
+        >>> print(A.apply(x).numpy(), A.symmetric)
         [[2. 0. 1.]] False
     """
 
@@ -129,7 +134,7 @@ class Stencil(GridOperator):
                 )
             check_storable(f, self.dtype, f"coefficients[{_named(o, cells.ndim)}]")
             check_kept(f, self.dtype, f"coefficients[{_named(o, cells.ndim)}]")
-            if f.ndim:  # numbers are not stored, but added up
+            if f.ndim:  # numbers are not stored, but added
                 self._note_rounding(f)
         if functions and any(f.ndim for f in values.values()):
             raise ValueError(
@@ -140,14 +145,14 @@ class Stencil(GridOperator):
         self._around_itself = [
             a for a in range(cells.ndim) if self._wraps[a] and fluid.shape[2 - a] == 1
         ]  # its cells are their own neighbors
-        # ghost cells, and sums, are had of arrays
+        # Ghost cells, and sums, exist for arrays only.
         if functions and (any(self.periodic) or self._around_itself):
             values, functions = values | {o: self._evaluated(f) for o, f in functions.items()}, {}
         values = _folded(
             {o: f.reshape(fluid.shape) if f.ndim else f for o, f in values.items()},
             self._around_itself,
         )
-        evaluated = {o: self._evaluated(f) for o, f in functions.items()}  # to look at, not to keep
+        evaluated = {o: self._evaluated(f) for o, f in functions.items()}  # for tests, not stored
         full = {o: np.broadcast_to(f, fluid.shape) for o, f in values.items()} | evaluated
         self._center = (
             self._stored(full[CENTER])
@@ -200,10 +205,9 @@ class Stencil(GridOperator):
     def coefficient_gradient(self, multiplier: wp.array[Any], x: wp.array[Any]) -> dict[str, Any]:
         """Return the derivatives by each offset's coefficients and by the shift.
 
-        mu_i x_(i + o) of each offset, under `coefficients`, and mu_i x_i of the shift; of
-        functions, too, by their values.
-
-        Where the neighbor is SOLID, that is mu_i x_i; x = 0 in AIR.
+        mu_i x_(i + o) of each offset, under `coefficients`, and mu_i x_i of the shift; for
+        functions the derivatives by their values. Where the neighbor is SOLID, it is mu_i x_i; x =
+        0 in AIR.
         """
         self._check_own()
         self.stencil.wrap(x)
@@ -252,8 +256,8 @@ class Stencil(GridOperator):
             )
         }
         for offset, here in self._full().items():
-            # a_o(i) is the neighbor's coefficient for i; between FLUID cells, so that any of them
-            # may be left out
+            # a_o(i) is the neighbor's coefficient for i; between FLUID cells, so that each of them
+            # may be removed later.
             if offset != CENTER:
                 there = self._beside(np.where(fluid, here, 0.0), _opposite(offset))
                 found[_named(_opposite(offset), len(self.shape))] = np.where(
@@ -265,7 +269,10 @@ class Stencil(GridOperator):
         )
 
     def _pair_up(self, full: dict[Offset, np.ndarray], around: list[Offset]) -> bool:
-        """Find where a_o(i) is not a_-o(i + o), and where it is positive; return whether all sides between cells have one coefficient."""
+        """Find the sides with a_o(i) != a_-o(i + o), and those with positive coefficients.
+
+        Returns whether all sides between cells have one coefficient.
+        """
         differing = [(o, self._beside(np.ones_like(full[o], dtype=bool), o)) for o in around]
         differing = [
             (
@@ -288,7 +295,7 @@ class Stencil(GridOperator):
         return not self._differing and all(_opposite(o) in around for o in around)
 
     def _find_signs(self) -> None:
-        """Find whether A is symmetric and monotone on the FLUID cells that there are."""
+        """Find whether A is symmetric and monotone on the current FLUID cells."""
         if self._differing or self._positive is not None:
             fluid = self.cells.numpy()[1:-1, 1:-1, 1:-1] == FLUID
             self.symmetric = self.symmetric and not any(
@@ -298,7 +305,7 @@ class Stencil(GridOperator):
             self.monotone = self._positive is None or not (self._positive & fluid).any()
 
     def _beside(self, values: np.ndarray, offset: Offset) -> np.ndarray:
-        """Return what each cell's neighbor has, 0 where it is beyond the array."""
+        """Return the values of each cell's neighbor, 0 beyond the array."""
         moved: np.ndarray = np.roll(values, tuple(-step for step in offset[::-1]), (0, 1, 2))
         for axis, step in enumerate(offset[::-1]):
             if step and not self.periodic[2 - axis]:
@@ -340,14 +347,14 @@ class Stencil(GridOperator):
     ) -> wp.array[Any]:
         """Return an offset's weights as a stored field.
 
-        Ghost cells of periodic axes have those of the cells they stand for. A weight that serves
-        two cells is stored at the upper one: ghost cells beyond the array have those of the cells'
-        upper sides there.
+        Ghost cells of periodic axes have those of the cells that they represent. A weight that
+        serves two cells is stored at the upper one: ghost cells beyond the array have those of the
+        cells' upper sides there.
         """
         padded = self._wrapped(-full[offset])
         if halves:
             steps = tuple(-step for step in offset[::-1])
-            # of the cell below, seen from the upper one
+            # Of the cell below, seen from the upper one.
             lower = np.roll(self._wrapped(-full[_opposite(offset)]), steps, (0, 1, 2))
             for axis in (a for a in range(3) if offset[2 - a] and not self.periodic[2 - a]):
                 ghosts = (slice(None),) * axis + (-1 if offset[2 - axis] < 0 else 0,)
@@ -355,7 +362,7 @@ class Stencil(GridOperator):
         return wp.array(padded.ravel(), dtype=self.dtype, device=self.device)
 
     def _wrapped(self, values: np.ndarray) -> np.ndarray:
-        """Return a padded field whose ghost cells of periodic axes have what the cells that they stand for have."""
+        """Return a padded field with filled ghost cells along periodic axes."""
         padded = np.pad(values, 1)
         for axis in (a for a in range(3) if self.periodic[2 - a]):
             lines = np.moveaxis(padded, axis, 0)
@@ -410,7 +417,7 @@ class Stencil(GridOperator):
         TRANSPOSED.bind(self.stencil.rows, stencil=self.stencil, x=x, y=out).launch()
 
     def boundary_term(self, values: Any) -> wp.array[Any]:
-        """Return the contribution to b of given values in AIR cells, in place of 0.
+        """Return the contribution to b of given values in AIR cells, instead of 0.
 
         The sums of a_o(i) value_(i + o), float64, shape of `cells`.
 
@@ -451,7 +458,7 @@ class Stencil(GridOperator):
         return found
 
     def _find_floating(self) -> FloatingComponents | None:
-        """Look for components on which all rows sum to 0, or all columns: on the host."""
+        """Find components on which all rows sum to 0, or all columns; on the host."""
         fluid = (self.cells.numpy() == FLUID) & (
             self.stencil.d.numpy().reshape(self.layout.stored_shape) != 0
         )
@@ -477,7 +484,7 @@ class Stencil(GridOperator):
                 number, np.bincount(number, inside & ~rows, count + 1) > 0, self.device
             )
         matrix = grid_matrix(self)
-        if len(places) < matrix.shape[0]:  # a principal system
+        if len(places) < matrix.shape[0]:  # A principal system
             kept = inside[self.cells.numpy().ravel() == FLUID]
             matrix = matrix[kept][:, kept]
         most = MOST_IN_SPACE if self.layout.padding.counts[0] > 1 else MOST_IN_PLANE
@@ -497,7 +504,7 @@ class Stencil(GridOperator):
         )
 
     def _sums_vanish(self, inside: np.ndarray, *, transposed: bool) -> np.ndarray:
-        """Return which rows, or columns, of a flat stored field sum to 0 but for rounding."""
+        """Return which rows, or columns, sum to 0 up to rounding, as a flat stored field."""
         x, sums = (
             wp.array(np.where(inside, 1.0, 0.0), dtype=wp.float64, device=self.device),
             self.layout.zeros(wp.float64),
@@ -509,7 +516,7 @@ class Stencil(GridOperator):
         return inside & (np.abs(sums.numpy()) <= rounding * size)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle cells and coefficients; those that are Warp functions as arrays."""
+        """Pickle cells and coefficients; Warp functions are pickled as arrays."""
         cells, options = self._pickled()
         n = cells.ndim
         given = {
@@ -531,15 +538,17 @@ class Stencil(GridOperator):
 
 
 class StoredStencil(GridOperator):
-    """A compact stencil whose diagonal and weights are there, as fields of a padded grid that it takes over.
+    """A compact stencil with existing diagonal and weights.
+
+    They are fields of a padded grid, which the stencil takes over.
 
     Args:
         cells: as of `Stencil`; beyond the array there is AIR.
         d: diagonal in units of `unit`, stored; 0 off the FLUID cells.
         weights: of the pattern's neighbors, stored, or numbers.
-        pattern: which neighbors, and how their weights are had; None: weights along x, y, z of 5 or
-            7 points, as `PaddedStencil` has them.
-        symmetric: whether A is.
+        pattern: the neighbors, and the kind of their weights; None: weights along x, y, z of 5 or 7
+            points, as in `PaddedStencil`.
+        symmetric: whether A is symmetric.
         unit: of the diagonal.
         monotone: whether all weights are >= 0.
         strength: mean weights along x, y, z.
@@ -564,7 +573,10 @@ class StoredStencil(GridOperator):
         super().__init__(cells, {}, (), d.device, wp.float64 if d.dtype is wp.uint8 else d.dtype)
 
     def take(self, cells: np.ndarray, d: np.ndarray, weights: wp.array[Any]) -> None:
-        """Take other cells of the same shape, another diagonal, and weights, one field after another, in place."""
+        """Set other cells of the same shape, another diagonal, and weights, in place.
+
+        `weights` has one field after another.
+        """
         own, fields, _, _ = self._made
         own.assign(d)
         for place, field in enumerate(fields):
@@ -595,12 +607,15 @@ class StoredStencil(GridOperator):
 
 
 def _opposite(offset: Offset) -> Offset:
-    """Return the offset by which a neighbor sees a cell."""
+    """Return the offset of a cell as seen from its neighbor."""
     return -offset[0], -offset[1], -offset[2]
 
 
 def _folded(values: dict[Offset, np.ndarray], axes: list[int]) -> dict[Offset, np.ndarray]:
-    """Return coefficients without steps along axes of one cell that wrap around: such a neighbor is the one without that step."""
+    """Return coefficients without steps along periodic axes of one cell.
+
+    Such a neighbor is the one without that step.
+    """
     found: dict[Offset, np.ndarray] = {}
     for offset, value in values.items():
         place = tuple(0 if axis in axes else step for axis, step in enumerate(offset))
@@ -609,12 +624,12 @@ def _folded(values: dict[Offset, np.ndarray], axes: list[int]) -> dict[Offset, n
 
 
 def _named(offset: Offset, dimension: int) -> tuple[int, ...]:
-    """Return an offset as users write it."""
+    """Return an offset in the user's order of axes."""
     return offset[::-1][3 - dimension :]
 
 
 def _by_offset(coefficients: Any, dimension: int) -> dict[Offset, Any]:
-    """Return coefficients by offset along x, y, z, the center among them."""
+    """Return coefficients by offset along x, y, z, the center included."""
     if not isinstance(coefficients, Mapping):
         host = real_array(coefficients, "coefficients")
         if host.shape != (3,) * dimension:
@@ -645,7 +660,7 @@ def _by_offset(coefficients: Any, dimension: int) -> dict[Offset, Any]:
 
 @functools.cache
 def _of_three(function: Any, dimension: int) -> Any:
-    """Return a Warp function of (k, j, i) in float64 from one of a cell's indices."""
+    """Return a Warp function of (k, j, i) in float64 for a function of the cell."""
     count = len(function.input_types)
     if count != dimension:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""The sum of two operators, for methods that need products only."""
+"""Sum of two operators, for methods that need products only."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from warp_lcp.problem.protocol import (
 )
 from warp_lcp.rows.vectors import ADD, rows_of
 
-FELT = 1e-5  # of the sum of a column's sizes over a component: open fractions are of float32
+FELT = 1e-5  # relative to a column's sizes over a component: open fractions are float32
 
 
 class SumOperator(Pickled):
@@ -82,7 +82,7 @@ class SumOperator(Pickled):
             self.grid, self.low = self._plain, self._low
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the terms as they are now."""
+        """Pickle the current terms."""
         return SumOperator, (self.first, self.second)
 
     @property
@@ -200,12 +200,19 @@ class SumOperator(Pickled):
 
 
 def grid_and_low_rank(A: Any) -> tuple[HasStencil, LowRankOperator] | None:
-    """Return the terms of a symmetric sum of an operator with a stencil and one of low rank, None if A is something else."""
+    """Return the terms of a symmetric sum of a stencil and a low-rank operator.
+
+    None if A is another operator.
+    """
     return (A.grid, A.low) if has(A, HasColumns) and A.symmetric else None
 
 
 def _felt(label: np.ndarray, count: int, low: LowRankOperator, *, weighted: bool) -> np.ndarray:
-    """Return for each component whether a column's sum over it is more than what rounding leaves; of weighted ones, if any."""
+    """Return for each component whether a column's sum over it is nonzero.
+
+    Nonzero means larger than rounding. For weighted components: whether a column has an entry
+    there.
+    """
     rows, blocks, values = low.columns.entries()
     at, k = label[rows], low.columns.width
     found = np.zeros((2, count, low.rank))
