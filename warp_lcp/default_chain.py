@@ -154,7 +154,10 @@ def _of_newton(method: MinimumMapNewton, problem: LCP | None) -> Solver:
 
 @cache
 def _on_matrix(method: MinimumMapNewton, minimizes: bool, steps: int) -> Fallback:
-    """Return the chain of Newton's method on a matrix; with MPRGP if that has an energy."""
+    """Return the chain of Newton's method on a matrix; with MPRGP if possible.
+
+    MPRGP needs an energy.
+    """
     if not minimizes:
         return Fallback(method, *_last(steps))
     first = replace(method, max_linear_iterations=min(WEAK, method.max_linear_iterations))

@@ -184,7 +184,11 @@ def criteria(rtol: float, most: int) -> StoppingCriteria:
 
 
 def _within(found: Recommendation, budget: Budget, problem: LCP) -> Recommendation:
-    """Return a recommendation within a budget, or the reason why none fits."""
+    """Return a recommendation within a budget, or the reason why none fits.
+
+    A method that needs too much memory is replaced by one that holds fields only, sweeps that need
+    too many steps by another rule, and a method whose first step takes too long by sweeps.
+    """
     t = found.traits
     if budget.bytes is not None and (needs := memory_of(found.name, t)) > budget.bytes:
         lean = next(

@@ -1,4 +1,4 @@
-"""Restarted, right-preconditioned GMRES with its vectors on the device (Saad & Schultz 1986)."""
+"""Restarted, right-preconditioned GMRES on the device (Saad & Schultz 1986)."""
 
 from __future__ import annotations
 

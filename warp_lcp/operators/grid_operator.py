@@ -359,7 +359,7 @@ class GridOperator(Pickled):
         self._fill_stencil()
 
     def _in_place(self, field: Any, name: str) -> bool:
-        """Return whether a coefficient field is the caller's padded array, after checking it."""
+        """Return whether a coefficient field is the caller's padded array; check it."""
         if (
             not isinstance(field, wp.array)
             or tuple(field.shape) != self.layout.stored_shape

@@ -397,7 +397,11 @@ class GridPoisson(GridOperator):
     records = True
 
     def _fill_stencil(self) -> None:
-        """Compute diagonal and weights on the current and former rows in use."""
+        """Compute diagonal and weights on the current and former rows in use.
+
+        The diagonal is the number of open faces times one coefficient, if possible; else the sum of
+        the coefficients of open faces and the shift.
+        """
         s, padding, reach = self.stencil, self.layout.padding, self._rows_in_reach
         self._wrap_cells()
         cells = self.cells_around.flatten()

@@ -229,7 +229,10 @@ class PaddedStencil:
         return [s / n for s, n in zip(sums, faces, strict=True)]
 
     def with_diagonal(self, d: wp.array[Any]) -> PaddedStencil:
-        """Return the stencil with another diagonal (a mask makes it 0) and the same weights."""
+        """Return the stencil with another diagonal and the same weights.
+
+        A mask makes the diagonal 0.
+        """
         unit = self.unit if d.dtype is self.d.dtype else 1.0
         return replace(self, d=d, unit=unit)
 

@@ -458,7 +458,11 @@ class Stencil(GridOperator):
         return found
 
     def _find_floating(self) -> FloatingComponents | None:
-        """Find components on which all rows sum to 0, or all columns; on the host."""
+        """Find components on which all rows sum to 0, or all columns; on the host.
+
+        If A is symmetric and all coupled neighbors have nonzero weights, the components follow from
+        the cells alone, else from the assembled matrix.
+        """
         fluid = (self.cells.numpy() == FLUID) & (
             self.stencil.d.numpy().reshape(self.layout.stored_shape) != 0
         )

@@ -329,11 +329,17 @@ class Bounds:
 
 
 def huge_as_infinite(values: np.ndarray) -> np.ndarray:
-    """Replace magnitudes of INFINITY and more by infinities, in bounds and right-hand sides."""
+    """Replace magnitudes of INFINITY and more by infinities.
+
+    In bounds and right-hand sides.
+    """
     huge = np.abs(values) >= INFINITY
     return np.where(huge, np.copysign(np.inf, values), values) if huge.any() else values
 
 
 def without_far(lower: np.ndarray, upper: np.ndarray, far: float) -> tuple[np.ndarray, np.ndarray]:
-    """Replace lower bounds of at most -far and upper ones of at least far by infinities."""
+    """Replace bounds of at least `far` in magnitude by infinities.
+
+    Lower bounds of at most -far, and upper ones of at least far.
+    """
     return np.where(lower <= -far, -np.inf, lower), np.where(upper >= far, np.inf, upper)

@@ -1,4 +1,4 @@
-"""Quadratic programs: equilibration, residuals row by row, polishing, certificates.
+"""Optimality of quadratic programs: units, residuals, polishing, certificates.
 
 Points are in the units of `equilibrated`: x = sigma D x', multipliers of rows E z' / (c sigma),
 P' = c sigma^2 D P D and so on.

@@ -507,7 +507,10 @@ class _Loop:
             return self._finish(ended, self.history[-1].iteration)
 
     def _begin(self, x0: Array | None) -> SolveStatus | None:
-        """Evaluate the residual at the start; return the status if there is nothing to solve."""
+        """Evaluate the residual at the start.
+
+        Returns the status if there is nothing to solve, else None.
+        """
         if x0 is not None:
             self.work.x.assign(x0)
         self.warm = True

@@ -111,7 +111,11 @@ class EquilibratedWorkspace(IterateMemory):
         self._tried = False
 
     def step(self, advance: Callable[[LCP, Any, wp.array[Any]], Step]) -> Step:
-        """Take a step of the method on the scaled problem."""
+        """Take a step of the method on the scaled problem.
+
+        x = C x' is evaluated in the problem's own units. Where the residual does not fall for some
+        steps, a solution without contact is tried, then a proof of infeasibility.
+        """
         inner = self.inner
         inner.residual.evaluate(inner.x)
         inner.residual.current = False

@@ -50,7 +50,10 @@ class MinimumMapResidual(AssessedResidual):
         return found if across is None else across.any(found)
 
     def hold(self, x: wp.array[Any]) -> None:
-        """Move held unknowns onto their bounds, and update the right-hand side."""
+        """Move held unknowns onto their bounds, and update the right-hand side.
+
+        Only in flagged rows and those beside them: g = -(A x + b) / size on the free set.
+        """
         p, s, finest = self.problem, self._A.stencil, self._finest
         engine.HOLD.bind(
             s.rows,

@@ -434,7 +434,11 @@ class RunAhead:
         self.rows.extend(self._found.numpy()[: count * int(ROW)].reshape(count, -1).copy())
 
     def _loop(self, *, rebuilds: bool) -> Program | None:
-        """Return the program of a step, None while parts of it have not run."""
+        """Return the program of a step, None while parts of it have not run.
+
+        A step is a rebuild of the hierarchy if the free set is stale, the truncated cycle, and the
+        decision whether another step follows.
+        """
         work = self._work
         step, rebuild = work.step_program(), work.hierarchy.rebuilding
         if not (step.has_run and rebuild.has_run):

@@ -1,4 +1,4 @@
-"""Natural residual of a grid problem, with the free set there and the right-hand side on it."""
+"""Natural residual of a grid problem, with free set and right-hand side."""
 
 from __future__ import annotations
 
@@ -97,14 +97,17 @@ class AssessedResidual(NaturalResidual):
             self._hierarchy.refresh()
 
     def has_new_operator(self) -> bool:
-        """Return whether the operator has changed; the caller then refreshes the hierarchy."""
+        """Return whether the operator has changed.
+
+        The caller then refreshes the hierarchy.
+        """
         if self._version == self._A.version:
             return False
         self._version, self.free_set = self._A.version, self.free_set + 1
         return True
 
     def norm_of_b(self) -> float:
-        """Return ||b|| over the unknowns."""
+        """Compute the norm of the natural residual, free set and right-hand side at x."""
         return self._norm_of_b
 
     def evaluate(self, x: wp.array[Any], classify: bool | None = None) -> float:

@@ -374,9 +374,9 @@ class NonsmoothMap:
         return float(self._sums.scalars.numpy()[:2].sum())
 
     def is_stationary(self, x: wp.array[Any], share: float) -> bool:
-        """Return whether no direction within the bounds lowers the merit at x to first order.
+        """Return whether x is a stationary point of the merit within the bounds.
 
-        That is the projected gradient d (x - clip(x - d^-2 J'f)), of at most `share` times ||f||.
+        The norm of the projected gradient d (x - clip(x - d^-2 J'f)) must be at most `share` ||f||.
 
         Raises:
             NoTranspose: A has no products with A'.
@@ -400,7 +400,10 @@ class NonsmoothMap:
         *,
         projected: bool,
     ) -> None:
-        """Set x = base + scale e, projected onto the bounds or not; base and x may be one field."""
+        """Set x = base + scale e, projected onto the bounds or not.
+
+        base and x may be one field.
+        """
         p = self.problem
         rows, bounds = self._sums.rows, p.bounds.operands
         ADVANCE.bind(

@@ -215,7 +215,7 @@ class Fallback:
         return Fallback, self.entries
 
     def __getattr__(self, name: str) -> Any:
-        """Return an attribute of the first method: `supports`, `distributed`, `precision`, ..."""
+        """Return an attribute of the first method: `supports`, `precision`, ..."""
         if name.startswith("__") or name == "entries":
             raise AttributeError(name)
         return getattr(self.entries[0].method, name)
@@ -357,7 +357,11 @@ class FallbackWorkspace:
         self._at_best = True
 
     def step(self) -> Step:
-        """Hand over if a condition holds, then take a step."""
+        """Hand over if a condition holds, then take a step.
+
+        A failure with which a condition holds is replaced by an interim step: the next step then
+        hands over.
+        """
         progress, first, at_first = self._progress, self._first, self._place == 0
         progress.record(self.residual.norm)
         # No hand-over while the device has already taken the step.

@@ -101,7 +101,12 @@ class QuadraticProgramWorkspace(DenseWorkspace):
             )
 
     def minimize(self, tolerance: float, max_iterations: int) -> int:
-        """Run PIQP; return its number of iterations."""
+        """Run PIQP; return its number of iterations.
+
+        It solves the equilibrated problem. Where the distance to a bound is less than its
+        multiplier, x is set on the bound, and y = 0 is solved for in the other rows; the better of
+        both x is the iterate.
+        """
         import piqp  # an extra
 
         data, (scaled, units) = self.data, self.data.scaled()

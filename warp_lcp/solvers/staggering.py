@@ -1,4 +1,7 @@
-"""Staggering: a problem in a few blocks, each solved by its own method in turn ([Book] 2.2.4)."""
+"""Staggering: solve a few blocks of a problem in turn ([Book] 2.2.4).
+
+Each block has its own method.
+"""
 
 from __future__ import annotations
 

@@ -38,7 +38,11 @@ class BlockLists:
 
 @functools.cache
 def block_sweep_kernel(a_type: Any, m: int) -> Any:
-    """Return the kernel for entries of type a_type and blocks of at most m unknowns."""
+    """Return the kernel for entries of type a_type and blocks of at most m unknowns.
+
+    A block is the boxed problem of A_BB and c = b_B + A_BC x_C; its unknowns have the states
+    AT_LOWER, FREE and AT_UPPER.
+    """
     name = f"warp_lcp.blocked_gauss_seidel.{a_type.__name__}_{m}"
     Rows = matrix_rows(a_type)
     vector = wp.types.vector(length=m, dtype=wp.float64)
