@@ -21,7 +21,7 @@ from warp_lcp.rows.fields import Array
 from warp_lcp.rules import Attempt, method_for, steps_allowed
 from warp_lcp.solvers.registry import method_of
 
-LEAST = 1e-9  # seconds that are left to a solve whose set-up has taken them all
+LEAST = 1e-9  # seconds for a solve whose set-up has used up its time
 # Of a limit of at least FEW steps, a method for matrices leaves 1/RESERVED to its alternatives.
 RESERVED, FEW = 4, 40
 ENDED = (
@@ -60,16 +60,16 @@ def solve(
         problem: the LCP, or a problem over another convex set than a box.
         solver: the method, such as `wl.MinimumMapNewton()`, or its name in `wl.METHODS` for its
             default settings, such as "psor": it alone is used. None: the method of `wl.recommend`;
-            where it stops, the methods of its chain (`wl.default_chain`) go on from its iterate,
-            and if these fail, its alternatives begin from the same start. `stopping` limits the sum
-            of their steps; the history has all of them, each record names its method, and the
-            result's `method` names the one that found x. Sparse matrices that are a compact stencil
-            on a box of cells in its natural order, x first, are then solved as a grid problem; the
-            result's `grid` has its shape.
+            where it stalls, the methods of its chain (`wl.default_chain`) continue from its
+            iterate, and if these fail, its alternatives begin from the same start. `stopping`
+            limits the sum of their steps; the history has all of them, each record names its
+            method, and the result's `method` names the one that found x. Sparse matrices that are a
+            compact stencil on a box of cells in its natural order, x first, are then solved as a
+            grid problem; the result's `grid` has its shape.
         stopping: the criteria; `StoppingCriteria()` if None, with the limit of steps that
             `wl.recommend` gives if there is no solver.
         x0: a guess, field of the problem's shape, projected onto the bounds; clip(0, l, u) if None
-            (over other sets: x as it is).
+            (over other sets: the current x).
         workspace: result of `solver.init(problem)`, to reuse its memory. Without it, one of a grid
             may be kept for later solves, see `wl.release_workspace`.
         callback: called with each Record, such as `wl.print_progress`; if it raises StopIteration,
@@ -204,8 +204,8 @@ class _Planned:
     Args:
         name: of the method.
         method: with its settings.
-        restated: what it works on.
-        chained: the same before its unknowns are renumbered, which tells who takes over.
+        restated: the problem that it works on.
+        chained: the same before its unknowns are renumbered; it determines the default chain.
         stopping: criteria where none are given.
         alternative: whether the method is not the recommended one, or is tried again.
     """
@@ -305,9 +305,9 @@ def left(
 
     Args:
         stopping: criteria for all.
-        begun: when the solve began, as `time.perf_counter` tells it [s].
+        begun: start of the solve by `time.perf_counter` [s].
         results: of earlier attempts.
-        reserve: keep a quarter of the steps for others.
+        reserve: keep a quarter of the steps for later attempts.
     """
     most = stopping.max_iterations - (results[-1].history[-1].iteration if results else 0)
     most -= most // RESERVED if reserve and most >= FEW else 0

@@ -92,7 +92,7 @@ class PathCreeps(Settings):
         """Return whether the condition holds."""
         if fails(progress):
             return True
-        after = progress.norms[1:]  # the start of a path says nothing
+        after = progress.norms[1:]  # the residual at the start of a path is arbitrary
         if len(after) <= PATH_IDLE or not after[-1] > CREEPS * after[-1 - PATH_IDLE]:
             return False
         smallest, idle = math.inf, 0

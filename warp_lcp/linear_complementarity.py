@@ -25,7 +25,7 @@ from warp_lcp.solvers.registry import method_of
 if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult
 
-STATUSES = {  # in the manner of SciPy: 0 is success, 99 that a callback has ended it
+STATUSES = {  # SciPy's convention: 0 is success, 99 a solve that a callback ended
     SolveStatus.CONVERGED: 0,
     SolveStatus.MAX_ITERATIONS: 1,
     SolveStatus.INFEASIBLE: 2,
@@ -39,7 +39,7 @@ STATUSES = {  # in the manner of SciPy: 0 is success, 99 that a callback has end
     SolveStatus.NEGATIVE_CURVATURE: 10,
     SolveStatus.STOPPED: 99,
 }
-WORDS = {"max_iterations": "maxiter", "rtol": "tol"}  # what criteria are called here
+WORDS = {"max_iterations": "maxiter", "rtol": "tol"}  # names of the criteria here
 
 
 def linear_complementarity(
@@ -70,8 +70,8 @@ def linear_complementarity(
             scipy.sparse.linalg.LinearOperator, or an operator of warp_lcp.
         b: n numbers in any shape, or a field of the operator's shape.
         bounds: a tuple (lo, hi) or a scipy.optimize.Bounds, of numbers or arrays like b, or None
-            where there is none; or SciPy's list of pairs (lo, hi), one for each unknown, of numbers
-            or None; None: (0, inf). For two unknowns a list of two tuples is pairs, a tuple of two
+            for no bound; or SciPy's list of pairs (lo, hi), one for each unknown, of numbers or
+            None; None: (0, inf). For two unknowns a list of two tuples is pairs, a tuple of two
             lists or arrays is (lo, hi), and ambiguous forms are refused. Magnitudes of 1e20 and
             more are infinite.
         x0: a guess, of b's shape.
@@ -91,10 +91,10 @@ def linear_complementarity(
     Returns:
         `x`, a float64 array of b's shape; `success`, whether the residual, recomputed in float64,
         meets a tolerance; `status`, 0 for success, 1 where maxiter was reached, 2 where there is no
-        solution, others as `STATUSES` of this module has them; `message`, which says what to try
+        solution, others as `STATUSES` of this module has them; `message`, with a hint what to try
         next; `nit`; `residual`, the norm of the natural residual, and `relative_residual`; `slack`,
         y; `active_mask`, as scipy.optimize.lsq_linear has it, -1 where x is held at lo, 1 at hi, 0
-        where y = 0 is asked for; `result`, what `wl.solve` returned.
+        where y must be 0; `result`, the result of `wl.solve`.
 
     Raises:
         ValueError: an argument is of another kind, shape or range, or the method cannot take this

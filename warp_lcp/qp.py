@@ -89,7 +89,7 @@ def solve_problem(
         verbose: print how the solve ended.
         method: of `linear_complementarity`. None: its default for a box; with other
             constraints, or if that fails, InteriorPoint, then Lemke.
-        tol: relative tolerance, in [0, 1), of the natural residual; what is found has primal and
+        tol: relative tolerance, in [0, 1), of the natural residual; the solution has primal and
             dual residuals below 10 tol in every row, relative to the terms of that row, and such a
             duality gap, relative to its terms.
         maxiter: maximum number of iterations of a method.
@@ -134,7 +134,7 @@ class _Solve:
     """Try methods in order until the point of one is optimal.
 
     Attributes:
-        point: what is optimal, in the program's units; None: nothing yet.
+        point: the optimal point in the program's units; None before it is found.
         result: of the last method.
         figures: relative primal residual, dual residual and gap of the last point.
     """

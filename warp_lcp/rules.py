@@ -45,7 +45,7 @@ class Attempt:
     Args:
         method: its name in METHODS; None: that of the rules for the problem in `form`, left out
             where the problem has no such form.
-        form: of the matrix; None, or where the problem has no such form: as it is given.
+        form: of the matrix; None, or where the problem has no such form: its original form.
         when: condition under which the attempt is made; None: always.
         steps: limit of steps, where the caller gives none; None: `steps_allowed`.
         again: the method has been tried before with fewer steps: no attempt where the caller's own

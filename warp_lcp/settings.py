@@ -56,8 +56,8 @@ class SettingError(ValueError):
 
     Args:
         name: the setting's.
-        value: what was given.
-        rule: what it must be.
+        value: the invalid value.
+        rule: description of valid values.
     """
 
     def __init__(self, name: str, value: object, rule: str) -> None:
@@ -184,7 +184,7 @@ def checked(name: str, given: object, annotation: Any) -> Any:
     Args:
         name: of the value, for the message.
         given: the value.
-        annotation: what is allowed.
+        annotation: the valid types and ranges.
 
     Raises:
         SettingError: it is not.

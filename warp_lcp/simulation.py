@@ -24,7 +24,7 @@ class Stopwatch(Protocol):
 
         Args:
             name: of the stage, which may have several parts.
-            arrays: what it must read or write.
+            arrays: arrays that it reads or writes.
         """
 
     def beside(self, name: str) -> AbstractContextManager[None]:
@@ -76,7 +76,7 @@ def missed_by_far(
         status: status of the solve.
         iterations: number of iterations.
         residual: final residual, with its unit and the required one, in words.
-        advice: what may help.
+        advice: settings that may help.
     """
     return StepFailed(
         f"the {solve} solve ended with {status.name} after {iterations} iterations at a "

@@ -44,7 +44,7 @@ def solve(
         options: of `wl.solve`.
 
     Raises:
-        ArithmeticError: a solve does not converge; the message says how it ended.
+        ArithmeticError: a solve does not converge; the message gives its status.
         ValueError: as of `wl.LCP`, `wl.solve` and `wl.vjp`.
     """
     given = flat({"b": b, "lower": lower, "upper": upper, **(coefficients or {})})

@@ -40,7 +40,7 @@ def solve(
         A: an operator, or a function of `coefficients` that returns one, such as
             `functools.partial(wl.GridPoisson, cells)`.
         b: as of `wl.LCP`; like bounds and coefficients an array with `requires_grad=True` if its
-            gradient is wanted.
+            gradient is needed.
         lower: likewise.
         upper: likewise.
         coefficients: arguments of A by name.

@@ -65,10 +65,10 @@ class Gradients:
             `face_z`, `shift` of a grid, arrays or numbers as they were given; `coefficients` of a
             stencil, by offset, and `shift`. Empty for operators without `coefficient_gradient`.
         free: unknowns off their bounds.
-        degenerate: unknowns at a bound where y is 0, too, as far as the residual tells: the
+        degenerate: unknowns at a bound where y is also 0, within the residual: the
             solution has derivatives to one side only, and these gradients are those of the side on
             which the bound holds.
-        status: how the linear solve ended, whose solution is b.
+        status: of the linear solve for b.
         linear_iterations: of it.
         relative_residual: ||g_F + A_FF'mu_F|| over ||g_F||, recomputed in float64.
     """

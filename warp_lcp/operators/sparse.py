@@ -559,8 +559,8 @@ def _survey(host: scipy.sparse.csr_array) -> tuple[np.ndarray, np.ndarray, bool]
 def _is_symmetric(host: scipy.sparse.csr_array, largest: np.ndarray) -> bool:
     """Return whether A is symmetric up to rounding.
 
-    |a_ij - a_ji| must be rounding of the smaller one of the largest entries of rows i and j, for all
-    i, j.
+    |a_ij - a_ji| must be rounding of the smaller one of the largest entries of rows i and j, for
+    all i, j.
     """
     turned = host.T.tocsr()
     if np.array_equal(turned.indptr, host.indptr) and np.array_equal(turned.indices, host.indices):

@@ -82,11 +82,11 @@ class LCP(Pickled):
         A: an Operator, or an array (numpy, Warp) or scipy.sparse matrix of shape (n, n), which
             becomes one on b's device.
         b: field of A's shape, units of y.
-        lower: l, a number or a field; -inf where there is none; or AffineBounds, which depend on x.
-        upper: u, a number or a field; inf where there is none; or AffineBounds.
+        lower: l, a number or a field; -inf for no bound; or AffineBounds, which depend on x.
+        upper: u, a number or a field; inf for no bound; or AffineBounds.
         preconditioner: M, an approximation of A's inverse, for methods that solve linear systems
             with A on the free unknowns F by a Krylov method (MinimumMapNewton, PrimalDualActiveSet,
-            SubspaceMinimization): M_FF stands for the inverse of A_FF. Anything of shape (n, n)
+            SubspaceMinimization): M_FF replaces the inverse of A_FF. Anything of shape (n, n)
             with products by `@`: a matrix, a scipy.sparse.linalg.LinearOperator, PyAMG's
             `ml.aspreconditioner()`. It is applied on the host, in float64. Conjugate gradients take
             it where A is symmetric and M seems symmetric positive definite, by two products; GMRES

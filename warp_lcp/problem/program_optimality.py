@@ -109,7 +109,7 @@ def equilibrated(program: ProgramWithRows) -> tuple[ProgramWithRows, ProgramUnit
 
     D and E make the largest entry of each row of diag(D, E) [[Q, B'], [B, 0]] diag(D, E) 1, B the
     rows of G and C (Ruiz 2001, as OSQP does it), with Q in a unit of its own. sigma is a unit of x
-    after the sizes of bounds and right-hand sides, the cost's unit follows.
+    chosen by the sizes of bounds and right-hand sides; the cost's unit follows.
 
     Args:
         program: with rows (`with_rows`).
@@ -164,7 +164,7 @@ def settled(program: ProgramWithRows, point: ProgramPoint) -> ProgramPoint:
     return ProgramPoint(x, np.where(slack <= point.z, np.maximum(point.z, 0.0), 0.0), point.y)
 
 
-@np.errstate(over="ignore", invalid="ignore")  # of multipliers beyond all numbers: inf is returned
+@np.errstate(over="ignore", invalid="ignore")  # multipliers may overflow: inf is returned
 def relative_residuals(program: ProgramWithRows, point: ProgramPoint) -> tuple[float, float, float]:
     """Return the primal residual, the dual residual and the duality gap.
 

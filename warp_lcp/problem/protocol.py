@@ -89,7 +89,7 @@ class HasRows(Operator, Protocol):
 
     Attributes:
         row_sizes: the largest magnitude of each row, shape (n,), wp.float64; None where no row is
-            empty. The unknown of an empty row goes to the bound that b's sign asks for.
+            empty. The unknown of an empty row goes to the bound that b's sign selects.
     """
 
     row_sizes: wp.array[Any] | None
@@ -356,8 +356,8 @@ def check_taken(method: Any, A: Operator) -> None:
     """Check that a method takes an operator.
 
     Raises:
-        ValueError: it does not; the message names what is missing, and methods that ask for
-            nothing.
+        ValueError: it does not; the message names the missing capabilities, and methods
+            without requirements.
     """
     if not takes(method, A):
         others = (

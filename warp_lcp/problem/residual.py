@@ -155,7 +155,7 @@ class NaturalResidual:
     def unattainable(self) -> float:
         """Return the norm of b on empty rows whose solution would be infinite.
 
-        There the sign of b asks for an infinite bound, so no x solves the problem.
+        There the sign of b selects an infinite bound, so no x solves the problem.
         """
         p, sizes = self.problem, self.row_sizes
         if sizes is None:

@@ -108,9 +108,9 @@ class VariationalInequality:
     workspace evaluate y and P_K, together in one kernel if they can. The stresses of sand
     (`granular.stress.Stress`) are such a problem.
 
-    The workspace holds the iterate and a `Residual`. The iterate starts as it is unless `x0` is
-    given, and the result's x is that array. A method names the class of problems that it solves as
-    `problems`.
+    The workspace holds the iterate and a `Residual`. The iterate starts with its current values
+    unless `x0` is given, and the result's x is that array. A method names the class of problems
+    that it solves as `problems`.
     """
 
 

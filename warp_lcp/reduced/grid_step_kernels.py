@@ -28,7 +28,7 @@ PAP = wp.constant(8)  # of the search direction, carried from step to step
 SIZE = wp.constant(9)  # corrections are computed for a right-hand side divided by this
 BETA = wp.constant(10)
 STEP = wp.constant(11)  # x moved by this multiple of the direction
-CARRY = wp.constant(12)  # 0: forget the search direction
+CARRY = wp.constant(12)  # 0: reset the search direction
 # 1 / SIZE: a division in each cell takes a GPU as long as the residual.
 PER_SIZE = wp.constant(13)
 SLOTS = 14

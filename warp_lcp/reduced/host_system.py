@@ -120,7 +120,7 @@ class HostResidual(NaturalResidual):
     A launch costs more than the product of a small problem.
 
     Args:
-        problem: on the CPU, its fields stored as they are.
+        problem: on the CPU, its fields stored without padding.
         matrix: its A.
     """
 

@@ -213,7 +213,7 @@ def judge_kernel(
 
     It goes on if the residual and, with bounds, the energy are the least so far, the tolerance is
     missed, and the free set does not creep. The free set must not change either, unless the device
-    rebuilds what depends on it; `calm` says whether that is sufficient.
+    rebuilds what depends on it; `calm`: whether that is sufficient.
     """
     zero = wp.float64(0.0)
     n = int(judged[TAKEN])

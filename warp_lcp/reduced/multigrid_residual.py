@@ -107,11 +107,11 @@ class AssessedResidual(NaturalResidual):
         return True
 
     def norm_of_b(self) -> float:
-        """Compute the norm of the natural residual, free set and right-hand side at x."""
+        """Return ||b|| over the unknowns."""
         return self._norm_of_b
 
     def evaluate(self, x: wp.array[Any], classify: bool | None = None) -> float:
-        """Compute the norm of the natural residual at x, the free set and the right-hand side.
+        """Compute the norm of the natural residual, free set and right-hand side at x.
 
         Args:
             x: stored field.

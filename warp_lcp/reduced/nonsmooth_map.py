@@ -170,7 +170,7 @@ class NonsmoothMap:
 
     Args:
         problem: the problem.
-        residual: whose y is used.
+        residual: its y is used.
         map: which of the three.
         share: lambda of the penalized map.
         kink: choice of the derivative at a kink.
@@ -330,7 +330,7 @@ class NonsmoothMap:
         """Write the gradient J'f, scaled by d^-2, to `direction`.
 
         Returns:
-            ||d^-1 J'f||^2, and the inner product of d^-1 J'f with what it was the last time.
+            ||d^-1 J'f||^2, and the inner product of d^-1 J'f with that of the last call.
         """
         p = self.problem
         if not self._gradients:

@@ -81,9 +81,9 @@ def principal_system(
     Args:
         problem: the problem.
         real: type of the corrections, where the operator leaves a choice.
-        bounded: whether projected cycles are wanted on grids.
+        bounded: whether projected cycles are needed on grids.
         settings: how a grid's cycles go.
-        shifted: whether `restrict` gets a shift; see `PrincipalSystem` for what it does to norms.
+        shifted: whether `restrict` gets a shift; it changes norms, see `PrincipalSystem`.
         hierarchy: of a grid's stencil, where another method has made one.
     """
     A = problem.A

@@ -227,7 +227,7 @@ def _candidates(data: DenseProblem) -> tuple[np.ndarray, np.ndarray]:
         wp.empty(3**n, dtype=wp.float64, device="cpu"),
     )
     wp.launch(enumeration_kernels(n, wp.float64).each, 3**n, [*inputs, x, measures], device="cpu")
-    with np.errstate(over="ignore"):  # of sets that hold an unknown at a bound beyond all numbers
+    with np.errstate(over="ignore"):  # in sets with an unknown at a huge bound
         return x.numpy() * units, measures.numpy()
 
 

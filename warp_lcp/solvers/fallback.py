@@ -47,12 +47,12 @@ class Progress:
 
     Attributes:
         problem: the problem.
-        tolerance: residual norm that is asked for.
+        tolerance: required residual norm.
         least: smallest residual norm so far, at the start of each step.
         norms: residual norms there.
         step: the last step; None before the first.
-        waited: steps in succession, none of them interim, that have left the smallest residual
-            where it was.
+        waited: number of consecutive steps, none of them interim, that have not reduced the
+            smallest residual.
     """
 
     def __init__(self, problem: Any, tolerance: float) -> None:
@@ -140,7 +140,7 @@ class FallbackEntry:
 
     Args:
         method: with its settings.
-        when: condition under which it takes over; not asked of the first one.
+        when: condition under which it takes over; not used for the first one.
         restart: begin at clip(0, l, u) instead of where the method before has ended.
         batch: steps of the method, at most, that count as one step of the chain, which ends earlier
             where the residual has fallen to a tenth. For methods whose steps are cheap.
@@ -395,7 +395,7 @@ class FallbackWorkspace:
             if entry.when(self._progress):
                 break
         else:
-            return None  # conditions cost less than what follows
+            return None  # conditions cost less than the tests below
         for place in range(self._place + 1, len(self._entries)):
             entry = self._entries[place]
             if entry.method == self._entries[self._place].method or not self._may_take(place):

@@ -94,7 +94,7 @@ class FischerNewton(NewtonSettings):
         monotone_cycles: projected multigrid cycles of a cold start on a grid.
         eta: each linear solve reduces its residual by this factor.
         max_linear_iterations: maximum number of iterations of one linear solve.
-        memory: merits that a safeguarded search remembers.
+        memory: number of merits that a safeguarded search stores.
         cycle: settings of multigrid cycles.
 
     Example:

@@ -50,7 +50,7 @@ class GradientDescent(Settings):
         relative: of the relative test, >= 0.
         stagnation: of the stagnation test, >= 0.
         gradient: of the test for a local minimum, >= 0.
-        memory: merits that the search remembers, >= 1; 1 is the book's monotone search.
+        memory: number of stored merits of the search, >= 1; 1 is the book's monotone search.
         precision: "mixed" and "double" are the same here; "single" rounds x to float32.
         scaled: False: d = 1 in the map and in the step, as in the book.
     """

@@ -70,7 +70,7 @@ class InteriorPoint(NewtonSettings):
     A must be positive semi-definite (x'Ax >= 0; it need not be symmetric), else steps may become
     arbitrarily short. Dense and sparse problems are solved in units in which rows are alike; where
     there is no solution, iterates leave for infinity: then, if A has at most 40,000 entries, a
-    linear program is asked, and INFEASIBLE is proved. A float32 correction carries D up to 1e30:
+    linear program decides, and INFEASIBLE is proved. A float32 correction carries D up to 1e30:
     nothing is clamped. On grids the shifted systems are solved by conjugate gradients with
     multigrid, stopped on the norm of d^(-1/2) r, d the diagonal of A + D. `linear_iterations`
     counts their iterations.

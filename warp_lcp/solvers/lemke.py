@@ -553,7 +553,7 @@ class LemkeWorkspace(DenseWorkspace):
         data = self.data
         x = np.clip(self.units * self.form.solution(z), data.lower, data.upper)
         size = 16 * EPS * self.units * np.abs(x / self.units).max()
-        if self._keeps_far or not isinstance(self.basis, BandedBasis):  # whose factors are fresh
+        if self._keeps_far or not isinstance(self.basis, BandedBasis):  # banded factors are fresh
             x = data.polished(x, (x - data.lower > size) & (data.upper - x > size))
         if self.basis is not None and not data.residual(x) <= NOISE * data.residual(
             np.clip(0.0, data.lower, data.upper)

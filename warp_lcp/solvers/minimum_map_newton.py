@@ -40,7 +40,7 @@ class MinimumMapNewton(NewtonSettings):
     a P-matrix. Where it is not, free blocks may be singular and steps fail: dense problems try
     Levenberg-Marquardt steps of the minimum map and end with STAGNATED after 10 steps without
     progress, others end with NON_DESCENT, or STAGNATED where steps repeat themselves; INFEASIBLE if
-    equations have no solution. `wl.solve` without a method goes on by other methods
+    equations have no solution. `wl.solve` without a method continues with other methods
     (`wl.default_chain`).
 
     Args:
@@ -57,8 +57,8 @@ class MinimumMapNewton(NewtonSettings):
         memory: number of last residuals whose maximum a step may not exceed (nonmonotone search).
         cycle: settings of multigrid cycles.
         direct: begin with whole steps that LAPACK solves on the host, for matrices of at most 200
-            unknowns or a bandwidth up to 3: what `default_method` chooses there. The steps above
-            take over where these lead nowhere.
+            unknowns or a bandwidth up to 3: chosen by `default_method` there. The steps above
+            take over where these fail.
         safeguard: True: as described above. False: the book's method alone, its Newton steps with
             Armijo's monotone search from the first to the last, and NON_DESCENT where no share of a
             step lowers the residual, as on some contacts ([Book] fig. C.2b).

@@ -47,14 +47,14 @@ class Penalty(NewtonSettings):
     The equations are A z + b + rho D (min(z - l, 0) + max(z - u, 0)) = 0, D the diagonal of the
     natural residual's d. With V the unknowns beyond a bound, a step is Newton's: (A + rho D_V) z+ =
     -b + rho D_V g, g the bound that is passed. It depends on V alone, so it starts from x = clip(z,
-    l, u), where its right-hand side is -(A x + b): nothing cancels however large rho is. On grids
+    l, u), where its right-hand side is -(A x + b): no terms cancel for any rho. On grids
     it is solved by conjugate gradients with a multigrid cycle on A + rho D_V. With an M-matrix and
     bounds on one side the equations are concave or convex: from the second step on z moves off the
     bounds, V shrinks, and is found after finitely many steps. Elsewhere V may cycle, and the solve
     ends with STAGNATED or MAX_ITERATIONS.
 
     The error: where y > 0, z is below its bound by y / (rho d), and neighbors solve their equations
-    with that z. What is returned is x = clip(z, l, u), whose natural residual is O(1 / rho): about
+    with that z. The result is x = clip(z, l, u), whose natural residual is O(1 / rho): about
     |A D^-1 y_V| / rho. The solve is judged by it. Where V stays, or that error is most of the
     residual, and it is more than a tenth of the tolerance, rho grows in proportion, once as a rule,
     up to 1e12.
@@ -174,7 +174,7 @@ class PenaltyWorkspace(IterateMemory):
             self.system.restrict(self._free, self._shift)
         settled, size = self._moved == 0, max(self.residual.norm, 1e-300)
         self._sums.of(ON_FREE, y=self.residual.y, free=self._free, g=self.system.r, scale=1 / size)
-        if self.floating is not None:  # what is singular: components without springs
+        if self.floating is not None:  # the singular part: components without springs
             self.floating.project(self.system.r, self._inside)
         factor = max(s.eta**2 if settled else s.eta, 0.3 * SHARE * self.target / size)
         norm = self.system.norm()

@@ -63,7 +63,7 @@ class PrimalDualActiveSet(NewtonSettings):
         max_linear_iterations: maximum number of conjugate-gradient iterations of one step.
         cycle: settings of multigrid cycles.
         stop_if_singular: end with STAGNATED where a free block is singular; False: pivot on by
-            least squares, for matrices that are regular but for rounding.
+            least squares, for matrices that only rounding makes singular.
     """
 
     needs: ClassVar[str] = "M-matrix, or P-matrix where dense"

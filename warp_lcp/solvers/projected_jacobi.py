@@ -29,14 +29,14 @@ class ProjectedJacobi(Settings):
 
     x <- clip(x - omega D^-1 (A x + b), l, u). Converges for symmetric positive definite A and 0 <
     omega < 2 / lambda_max(D^-1 A), which the book's omega = 1 exceeds for many matrices; the test
-    of algorithm 4 then says DIVERGED (see `Contraction`). About half as fast as projected
+    of algorithm 4 then returns DIVERGED (see `Contraction`). About half as fast as projected
     Gauss-Seidel, but the same in every order, and no slower on a GPU. Zero and negative diagonals
     as in ProjectedSOR. Works with any operator, and with bounds affine in x, which are those at the
     last x.
 
     Args:
         omega: damping > 0; min(1, 1.8 / lambda_max), estimated, if None. Without symmetry,
-            lambda_max is that of A's symmetric part, which promises nothing; with a negative
+            lambda_max is that of A's symmetric part, which guarantees nothing; with a negative
             diagonal entry, 1.
         precision: "mixed" or "double" keep the iterate in float64, "single" rounds it to float32.
     """

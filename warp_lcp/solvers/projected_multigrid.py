@@ -39,7 +39,7 @@ class ProjectedMultigrid(Settings):
     cycle follows; where `patience` steps set no new least energy, monotone cycles follow, twice as
     many each time; beside rigid bodies the third run of them ends the solve with STAGNATED. Cycles
     are slow in channels a cell wide and where coefficients are random over decades: `wl.solve`
-    without a method then goes on by `MinimumMapNewton` on the assembled matrix
+    without a method then continues with `MinimumMapNewton` on the assembled matrix
     (`wl.default_chain`).
 
     Args:

@@ -34,9 +34,9 @@ class ProjectedSOR(Settings):
     cycles; a splash of 20^3 and 32^3 cells takes 210 and 497 with 1.4, 73 and 102 with
     `advised_omega`, the default on grids. A time step of an American put, 2,000 nodes on a line,
     takes 2,031 sweeps with omega = 1, 851 with 1.4, 124 with `advised_omega`: more than the 100
-    that StoppingCriteria allows unless told otherwise.
+    that StoppingCriteria allows by default.
 
-    Where A_ii = 0, x_i goes to the bound that the sign of y_i asks for, and stays where y_i = 0 or
+    Where A_ii = 0, x_i goes to the bound that the sign of y_i selects, and stays where y_i = 0 or
     there is no such bound; where A_ii < 0 it goes to the bound that solves the scalar problem, of
     two the one of lesser energy ([Book] 2.2.2, fig. 2.4). Bounds may be affine in x: they follow
     each change of x in dense and sparse matrices, each sweep on grids.
@@ -52,7 +52,7 @@ class ProjectedSOR(Settings):
 
     Args:
         omega: relaxation factor in (0, 2); 1 is projected Gauss-Seidel. None: `advised_omega` on
-            grids with a symmetric stencil and constant bounds, at the price of 60 products whenever
+            grids with a symmetric stencil and constant bounds, at the cost of 60 products whenever
             the operator has changed; 1.4 elsewhere, the best of the book's parameter study.
         direction: "forward", "backward", or "symmetric", which follows every forward sweep with a
             backward one.

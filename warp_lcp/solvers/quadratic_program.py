@@ -35,13 +35,13 @@ class QuadraticProgram(Settings):
     The minimizers are the solutions of the problem, because A is symmetric and positive
     semi-definite and the gradient is y = A x + b. Sparse operators stay sparse; others are taken as
     dense matrices. x0 is not used; one step solves, and `linear_iterations` counts PIQP's
-    iterations, a factorization each. What PIQP's multipliers hold is then set on its bound, and y =
-    0 solved for in the others, if that is better. An objective that is unbounded below is
-    INFEASIBLE: no x solves the problem.
+    iterations, a factorization each. Unknowns that PIQP's multipliers hold are then set on their
+    bounds, and y = 0 is solved for in the others, if that is better. An objective that is unbounded
+    below is INFEASIBLE: no x solves the problem.
 
     Args:
         tolerance: PIQP's absolute and relative tolerance, on the equilibrated problem; > 0. The
-            loop's criteria are checked on the natural residual whatever PIQP says.
+            loop's criteria are checked on the natural residual, independent of PIQP's status.
         max_iterations: maximum number of iterations of PIQP, >= 1.
     """
 

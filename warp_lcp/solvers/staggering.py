@@ -208,7 +208,7 @@ def given_blocks(problem: LCP, blocks: Blocks) -> list[np.ndarray]:
     """Return stored indices of each block.
 
     Args:
-        problem: whose unknowns they are.
+        problem: the problem.
         blocks: for each block flat indices into a field of the problem's shape; together all
             unknowns, each once.
 
