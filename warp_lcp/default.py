@@ -165,7 +165,7 @@ def solve_by_attempts(
         planned = _planned(attempt, problem, advice, accuracy, given=stopping is not None)
         if planned is None or (planned.alternative and isinstance(stopping, MeanCriteria)):
             continue
-        kept = (
+        reserves = (
             reserve
             and not planned.alternative
             and (attempt.method is None or bool(advice.alternatives))
@@ -174,7 +174,7 @@ def solve_by_attempts(
             stopping or planned.stopping,
             begun,
             results if stopping is not None else [],
-            reserve=kept,
+            reserve=reserves,
         )
         if results and criteria.max_iterations == 0:
             break

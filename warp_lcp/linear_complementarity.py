@@ -114,7 +114,7 @@ def linear_complementarity(
         checked(name, given, criteria[name])
         for name, given in (("tol", tol), ("atol", atol), ("maxiter", maxiter))
     )
-    tell = _told(callback)
+    report = _told(callback)
     operator = as_operator(A, b.device if isinstance(b, wp.array) else None)
     fields = _Fields(real_array(b, "b"), tuple(operator.shape))
     lower, upper = _sides_of(bounds, fields.given)
@@ -130,17 +130,17 @@ def linear_complementarity(
     at_work = list[tuple[RestatedProblem, Workspace]]()  # the last one has the iterate
 
     def told(record: Record) -> None:
-        if tell is not None and not record.step.startswith("start"):
+        if report is not None and not record.step.startswith("start"):
             restated, work = at_work[-1]
             x = fields.unload(restated.field(restated.problem.layout.unload(work.x)))
-            tell(OptimizeResult(x=x, nit=record.iteration, residual=record.residual))
+            report(OptimizeResult(x=x, nit=record.iteration, residual=record.residual))
 
     def run(
         restated: RestatedProblem, solver: Solver, stopping: Any, x0: Any, callback: Any
     ) -> SolveResult:
         work = solver.init(restated.problem)
         at_work.append((restated, work))
-        found = solve(
+        solution = solve(
             restated.problem,
             solver,
             stopping=stopping,
@@ -148,7 +148,7 @@ def linear_complementarity(
             workspace=work,
             callback=callback,
         )
-        return restated.result(found)
+        return restated.result(solution)
 
     if method is None:
         result = solve_by_attempts(problem, stopping, guess, told, run=run, reserve=False)
@@ -266,19 +266,19 @@ def _bound(values: Any, name: str, wrong: float) -> Any:
     if isinstance(values, AffineBounds):
         return values
     host = real_array(values, f"bounds, {name}").astype(np.float64)
-    found = huge_as_infinite(host)
-    if (found == wrong).any():
-        count, sign = np.count_nonzero(found == wrong), "-" if wrong < 0 else ""
+    bound = huge_as_infinite(host)
+    if (bound == wrong).any():
+        count, sign = np.count_nonzero(bound == wrong), "-" if wrong < 0 else ""
         raise ValueError(
             f"bounds, {name} holds {count} values of {sign}1e20 or beyond, which is infinite: no x "
             "could meet it"
         )
-    if found is host:
+    if bound is host:
         return values
     return (
-        wp.array(found, dtype=values.dtype, device=values.device)
+        wp.array(bound, dtype=values.dtype, device=values.device)
         if isinstance(values, wp.array)
-        else found
+        else bound
     )
 
 

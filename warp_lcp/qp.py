@@ -208,19 +208,19 @@ class _Solve:
 
     def _by(self, method: Any) -> None:
         """Solve the equilibrated optimality conditions by a method."""
-        p, units, made = self._scaled, self._units, self._conditions
+        p, units, conditions = self._scaled, self._units, self._conditions
         n, m = len(p.c), len(p.h)
-        x0 = None if self.x0 is None else np.r_[self.x0 / units.x, np.zeros(len(made.b) - n)]
-        sides = {"bounds": (made.lower, made.upper), "x0": x0, "method": method}
-        self.result = found = linear_complementarity(
-            made.A, made.b, tol=self.tol, maxiter=self.maxiter, **sides
+        x0 = None if self.x0 is None else np.r_[self.x0 / units.x, np.zeros(len(conditions.b) - n)]
+        sides = {"bounds": (conditions.lower, conditions.upper), "x0": x0, "method": method}
+        self.result = result = linear_complementarity(
+            conditions.A, conditions.b, tol=self.tol, maxiter=self.maxiter, **sides
         )
-        point = ProgramPoint(found.x[:n], found.x[n : n + m], found.x[n + m :])
-        if not np.isfinite(found.x).all():
+        point = ProgramPoint(result.x[:n], result.x[n : n + m], result.x[n + m :])
+        if not np.isfinite(result.x).all():
             return
         self._judge(
             p,
-            polished(p, point) if found.success or self.method is None else settled(p, point),
+            polished(p, point) if result.success or self.method is None else settled(p, point),
             units,
         )
 

@@ -253,14 +253,14 @@ def rule(annotation: Any) -> str:
 
 def _range(kind: type, *limits: Any) -> str:
     """Describe a range of numbers in words."""
-    found = {
+    limits_by_end = {
         name: getattr(limit, name) for limit in limits for name in ENDS if hasattr(limit, name)
     }
-    if len(found) == 2:
-        (low, a), (high, b) = found.items()
+    if len(limits_by_end) == 2:
+        (low, a), (high, b) = limits_by_end.items()
         ends = f"in {'[' if low == 'ge' else '('}{a:g}, {b:g}{']' if high == 'le' else ')'}"
         return f"an integer {ends}" if kind is int else ends
-    ends = " ".join(f"{ENDS[name]} {limit:g}" for name, limit in found.items())
+    ends = " ".join(f"{ENDS[name]} {limit:g}" for name, limit in limits_by_end.items())
     return (
         f"an integer {ends}"
         if kind is int

@@ -211,12 +211,14 @@ class Traits:
             method, "most_unknowns", self.unknowns
         ):
             return False
-        asked = {
+        abilities = {
             "preconditioned": problem.preconditioner is not None,
             "affine_bounds": self.affine,
             "distributed": self.ranks,
         }
-        return all(getattr(method, ability, False) for ability, needed in asked.items() if needed)
+        return all(
+            getattr(method, ability, False) for ability, needed in abilities.items() if needed
+        )
 
     @property
     def pivotable(self) -> bool:
@@ -245,9 +247,9 @@ class Traits:
         A = self._problem.A
         if isinstance(A, DenseOperator):
             return A.matrix.numpy()
-        return (
-            A.matrix() if isinstance(A, SparseOperator) else A.rows().matrix()  # type: ignore[attr-defined]
-        )
+        if isinstance(A, SparseOperator):
+            return A.matrix()
+        return A.rows().matrix()  # type: ignore[attr-defined]
 
 
 @cache

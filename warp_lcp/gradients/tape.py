@@ -53,19 +53,21 @@ def solve(
     Raises:
         ValueError: as of `wl.LCP` and `wl.solve`, and in the backward pass as of `wl.vjp`.
     """
-    given = flat({"b": b, "lower": lower, "upper": upper, **(coefficients or {})})
+    arguments = flat({"b": b, "lower": lower, "upper": upper, **(coefficients or {})})
     result = solve_problem(
         LCP(A(**coefficients) if coefficients else A, b, lower, upper), **options
     )
     result.x.requires_grad = True
-    wanted = {name: v for name, v in given.items() if isinstance(v, wp.array) and v.requires_grad}
+    differentiable = {
+        name: v for name, v in arguments.items() if isinstance(v, wp.array) and v.requires_grad
+    }
 
     def backward() -> None:
         found = vjp(result, result.x.grad, stopping=adjoint).by_name
-        for name, array in wanted.items():
+        for name, array in differentiable.items():
             part = wp.empty_like(array.grad.flatten())
             convert(found[name].flatten(), part)
             ADD.bind(rows_of(part), z=part, x=array.grad.flatten()).launch()
 
-    tape.record_func(backward, [result.x, *wanted.values()])
+    tape.record_func(backward, [result.x, *differentiable.values()])
     return result

@@ -154,7 +154,7 @@ def vjp(
         )
     A, varying, z = problem.A, problem.bounds.varying, y
     _gather(problem, multiplier, g, z)
-    found = A.coefficient_gradient(multiplier, x) if has(A, HasCoefficients) else {}
+    by_coefficient = A.coefficient_gradient(multiplier, x) if has(A, HasCoefficients) else {}
     at_upper = layout.zeros(f64) if varying[1] else None
     sums = Sums(_rows(problem), 2).of(HELD, side=side, z=z, upper=at_upper).tolist()
     lower, upper = (
@@ -163,7 +163,7 @@ def vjp(
     )
     numbers = adjoint.status, adjoint.linear_iterations, adjoint.relative_residual
     return Gradients(
-        _as_given(problem, multiplier), lower, upper, found, free, degenerate, *numbers
+        _as_given(problem, multiplier), lower, upper, by_coefficient, free, degenerate, *numbers
     )
 
 

@@ -268,15 +268,15 @@ class FloatingComponents:
         """Choose multiples of v instead of constants, otherwise like `settle`."""
         inside, moved = self.label >= 0, x.numpy().copy()
         label, weights, held = self.label[inside], v[inside], self._held.numpy() != 0
-        low, here, high = lower.numpy()[inside], moved[inside], upper.numpy()[inside]
+        low, values, high = lower.numpy()[inside], moved[inside], upper.numpy()[inside]
         below, above = (np.full(self.count, np.inf) for _ in range(2))
-        np.minimum.at(below, label, (here - low) / weights)
-        np.minimum.at(above, label, (high - here) / weights)
-        mean = np.bincount(label, weights * here, self.count) / np.bincount(
+        np.minimum.at(below, label, (values - low) / weights)
+        np.minimum.at(above, label, (high - values) / weights)
+        mean = np.bincount(label, weights * values, self.count) / np.bincount(
             label, weights**2, self.count
         )
         constants = np.where(held, 0.0, self._constants(below, above, mean))
-        moved[inside] = np.clip(here + constants[label] * weights, low, high)
+        moved[inside] = np.clip(values + constants[label] * weights, low, high)
         x.assign(moved)
 
     def _constants(self, below: np.ndarray, above: np.ndarray, mean: np.ndarray) -> np.ndarray:

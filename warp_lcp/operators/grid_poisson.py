@@ -143,7 +143,7 @@ class GridPoisson(GridOperator):
         for field in (multiplier, x):
             s.wrap(field)
         cells = self.cells_around.flatten()
-        found: dict[str, Any] = {}
+        derivatives: dict[str, Any] = {}
         if len(arrays) < len(self._given):
             totals = Sums(Rows.of(self.layout.padding, self.device), 4)
             values = totals.of(
@@ -156,7 +156,7 @@ class GridPoisson(GridOperator):
                 face_z=None,
                 shift=None,
             ).tolist()
-            found = dict(zip(FACE_GRADIENT.writes, values, strict=True))
+            derivatives = dict(zip(FACE_GRADIENT.writes, values, strict=True))
         if arrays:
             rows = Rows.of(self.layout.padding, self.device, more=1)
             written = {
@@ -178,12 +178,13 @@ class GridPoisson(GridOperator):
                 shift=shift,
                 out=partials,
             ).launch()
-            found |= {
+            derivatives |= {
                 name: self._coefficient_field(name, written[name], shape)
                 for name, shape in arrays.items()
             }
         return {
-            name: found.get(name) if name in self._given else None for name in FACE_GRADIENT.writes
+            name: derivatives.get(name) if name in self._given else None
+            for name in FACE_GRADIENT.writes
         }
 
     def _coefficient_field(
@@ -267,15 +268,15 @@ class GridPoisson(GridOperator):
         for cached in ("_search", "_rows_in_reach"):
             twin.__dict__.pop(cached, None)
         s, kept = self.stencil, {id(field): wp.clone(field) for field in self._held()}
-        own: Any = lambda field: kept[id(field)]  # noqa: E731
+        copy_of: Any = lambda field: kept[id(field)]  # noqa: E731
         twin.cells, twin.cells_around, twin._spans, twin.shift = map(
-            own, (self.cells, self.cells_around, self._spans, self.shift)
+            copy_of, (self.cells, self.cells_around, self._spans, self.shift)
         )
         twin.faces, weights = (
-            list(map(own, self.faces)),
-            None if s.weights is None else tuple(map(own, s.weights)),
+            list(map(copy_of, self.faces)),
+            None if s.weights is None else tuple(map(copy_of, s.weights)),
         )
-        twin.stencil = replace(s, d=own(s.d), weights=weights, spans=twin._spans)
+        twin.stencil = replace(s, d=copy_of(s.d), weights=weights, spans=twin._spans)
         return twin
 
     def take(self, other: GridPoisson) -> None:

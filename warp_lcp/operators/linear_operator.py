@@ -175,34 +175,43 @@ class LinearOperator(Pickled, Operator):
 
 def _shape_of(A: Any, shape: Any) -> tuple[int, ...]:
     """Return the shape of A's fields, checked against A's own shape."""
-    own: Any = getattr(A, "shape", None)
+    matrix_shape: Any = getattr(A, "shape", None)
     if isinstance(A, Operator) or not (callable(A) or hasattr(A, "__matmul__")):
         raise ValueError(
             f"A is a {type(A).__name__}: expected a function, or a "
             "scipy.sparse.linalg.LinearOperator"
         )
     if not hasattr(A, "__matmul__"):
-        own = None
-    elif own is None or len(own) != 2 or own[0] != own[1] or own[0] == 0:
-        raise ValueError(f"A has shape {own}: expected (n, n) with n >= 1")
-    if own is None and shape is None:
+        matrix_shape = None
+    elif (
+        matrix_shape is None
+        or len(matrix_shape) != 2
+        or matrix_shape[0] != matrix_shape[1]
+        or matrix_shape[0] == 0
+    ):
+        raise ValueError(f"A has shape {matrix_shape}: expected (n, n) with n >= 1")
+    if matrix_shape is None and shape is None:
         raise ValueError("shape: must be given if A is a function")
     try:
-        wanted = (
-            (int(own[0]),)
+        field_shape = (
+            (int(matrix_shape[0]),)
             if shape is None
             else tuple(int(n) for n in (shape if np.ndim(shape) else (shape,)))
         )
     except (TypeError, ValueError):
         raise ValueError(f"shape = {shape!r}: expected a tuple of integers") from None
-    if not wanted or min(wanted) < 1 or (own is not None and math.prod(wanted) != own[0]):
+    if (
+        not field_shape
+        or min(field_shape) < 1
+        or (matrix_shape is not None and math.prod(field_shape) != matrix_shape[0])
+    ):
         raise ValueError(
             f"shape = {shape!r}: expected integers >= 1"
-            + ("" if own is None else f" whose product is {own[0]}")
+            + ("" if matrix_shape is None else f" whose product is {matrix_shape[0]}")
         )
     if np.dtype(getattr(A, "dtype", None) or np.float64).kind not in "biuf":
         raise ValueError(f"A has type {A.dtype}: expected real numbers")
-    return wanted
+    return field_shape
 
 
 def _products_of(

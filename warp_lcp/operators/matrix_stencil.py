@@ -95,7 +95,7 @@ def _as_stencil(
         if column - row not in offsets:
             return None
         middle[offsets[column - row]] += value
-    kept = full & ((1 << 13) - 1) if A.symmetric else full & ~(1 << 13)
+    stored_offsets = full & ((1 << 13) - 1) if A.symmetric else full & ~(1 << 13)
     where, d = Rows.of(padding, device), padding.zeros(wp.float64, device)
     sums, matrix, on_device = (
         Sums(where, 4),
@@ -113,7 +113,7 @@ def _as_stencil(
             ny=ny,
             nz=nz,
             full=full,
-            kept=kept,
+            kept=stored_offsets,
             size=padding.size,
             weights=block,
         )
@@ -121,7 +121,7 @@ def _as_stencil(
     wrong, centers, differ, positive = recognize(None)
     if wrong:
         return None
-    places = [o for o in range(27) if kept >> o & 1]
+    places = [o for o in range(27) if stored_offsets >> o & 1]
     neighbors = tuple((o % 3 - 1, o // 3 % 3 - 1, o // 9 - 1) for o in places)
     weights: tuple[Any, ...] = tuple(-middle[o] for o in places)
     if differ:

@@ -295,16 +295,19 @@ class SparseOperator(Pickled):
 
         None where its own numbering is as good, and on CUDA.
         """
-        found = self._numbering
-        if found is None:
+        numbering = self._numbering
+        if numbering is None:
             return None
         if self._turned is None or self._turned_from != self.version:
-            B = None if self.near_null_space is None else self.near_null_space[found.order]
+            B = None if self.near_null_space is None else self.near_null_space[numbering.order]
             self._turned = SparseOperator(
-                found.matrix(self.matrix()), device=self.device, dtype=self.dtype, near_null_space=B
+                numbering.matrix(self.matrix()),
+                device=self.device,
+                dtype=self.dtype,
+                near_null_space=B,
             )
             self._turned._rounding, self._turned_from = self._rounding, self.version
-        return found, self._turned
+        return numbering, self._turned
 
     @cached_property
     def _numbering(self) -> Renumbering | None:

@@ -113,17 +113,17 @@ class Stencil(GridOperator):
         )
 
     def _take_coefficients(self, cells: np.ndarray, *, coefficients: Any, shift: Any) -> None:
-        self._given = given = _by_offset(coefficients, cells.ndim)
+        self._given = by_offset = _by_offset(coefficients, cells.ndim)
         self.shift, self._shift_given = (
             self._stored_shift(shift),
             None if shift is None else tuple(np.shape(shift)),
         )
         functions = {
-            o: _of_three(f, cells.ndim) for o, f in given.items() if isinstance(f, wp.Function)
+            o: _of_three(f, cells.ndim) for o, f in by_offset.items() if isinstance(f, wp.Function)
         }
         values = {
             o: real_array(f, f"coefficients[{_named(o, cells.ndim)}]")
-            for o, f in given.items()
+            for o, f in by_offset.items()
             if o not in functions
         }
         for o, f in values.items():
@@ -175,12 +175,12 @@ class Stencil(GridOperator):
             else "numbers"
         )
         offsets = tuple(o for o in around if not halves or o[::-1] < CENTER)
-        kept = (
+        pattern_functions = (
             tuple(functions.get(o, float(values[o]) if o in values else 0.0) for o in offsets)
             if kind == "functions"
             else ()
         )
-        self._pattern = Pattern(offsets, halves, kind, kept)
+        self._pattern = Pattern(offsets, halves, kind, pattern_functions)
         self._weights = (
             tuple(self._stored_weight(full, o, halves) for o in offsets) if stored else None
         )
@@ -250,7 +250,7 @@ class Stencil(GridOperator):
         Its diagonal includes the contributions of closed sides.
         """
         fluid = self.cells.numpy()[1:-1, 1:-1, 1:-1] == FLUID
-        found: dict[tuple[int, ...], Any] = {
+        transposed: dict[tuple[int, ...], Any] = {
             (0,) * len(self.shape): np.where(
                 fluid.reshape(self.shape), self.diagonal().numpy(), 1.0
             )
@@ -260,12 +260,17 @@ class Stencil(GridOperator):
             # may be removed later.
             if offset != CENTER:
                 there = self._beside(np.where(fluid, here, 0.0), _opposite(offset))
-                found[_named(_opposite(offset), len(self.shape))] = np.where(
+                transposed[_named(_opposite(offset), len(self.shape))] = np.where(
                     fluid, there, 0.0
                 ).reshape(self.shape)
         cells = np.where(fluid, FLUID, AIR).reshape(self.shape)
         return Stencil(
-            cells, found, periodic=self.periodic, outside=AIR, device=self.device, dtype=self.dtype
+            cells,
+            transposed,
+            periodic=self.periodic,
+            outside=AIR,
+            device=self.device,
+            dtype=self.dtype,
         )
 
     def _pair_up(self, full: dict[Offset, np.ndarray], around: list[Offset]) -> bool:
@@ -438,13 +443,13 @@ class Stencil(GridOperator):
                 f"{tuple(n + 2 for n in self.shape)}"
             )
         check_storable(padded, wp.float64, "values")
-        given = wp.array(
+        boundary = wp.array(
             np.where(self.cells.numpy() == AIR, padded, 0).ravel(),
             dtype=wp.float64,
             device=self.device,
         )
         out = self.layout.zeros(wp.float64)
-        self.stencil.product(given, out)
+        self.stencil.product(boundary, out)
         return self.layout.unload(out)
 
     def floating_components(self, scratch: Any = None) -> FloatingComponents | None:
@@ -492,19 +497,19 @@ class Stencil(GridOperator):
             kept = inside[self.cells.numpy().ravel() == FLUID]
             matrix = matrix[kept][:, kept]
         most = MOST_IN_SPACE if self.layout.padding.counts[0] > 1 else MOST_IN_PLANE
-        found = null_vectors(
+        vectors = null_vectors(
             matrix, rows[places], columns[places], most=most if self.monotone else 0
         )
         number, fields = (
             np.zeros(inside.size, dtype=np.int32),
             [np.ones(inside.size) for _ in range(2)],
         )
-        number[places] = found.number + 1
-        for field, vector in zip(fields, (found.left, found.right), strict=True):
+        number[places] = vectors.number + 1
+        for field, vector in zip(fields, (vectors.left, vectors.right), strict=True):
             field[places] = vector
         left, right = (None if (field == 1).all() else field for field in fields)
         return numbered_components(
-            number, np.r_[True, found.held], self.device, left=left, right=right
+            number, np.r_[True, vectors.held], self.device, left=left, right=right
         )
 
     def _sums_vanish(self, inside: np.ndarray, *, transposed: bool) -> np.ndarray:
@@ -523,7 +528,7 @@ class Stencil(GridOperator):
         """Pickle cells and coefficients; Warp functions are pickled as arrays."""
         cells, options = self._pickled()
         n = cells.ndim
-        given = {
+        coefficients = {
             o: self._evaluated(_of_three(f, n)).reshape(cells.shape)
             if isinstance(f, wp.Function)
             else f.numpy()
@@ -535,7 +540,7 @@ class Stencil(GridOperator):
         return made_again(
             Stencil,
             cells,
-            **self._arguments() | {"coefficients": given, "shift": shift},
+            **self._arguments() | {"coefficients": coefficients, "shift": shift},
             device=self.device,
             **options,
         )
@@ -645,7 +650,7 @@ def _by_offset(coefficients: Any, dimension: int) -> dict[Offset, Any]:
         coefficients = {
             tuple(i - 1 for i in place): float(host[place]) for place in places if host[place]
         }
-    given: dict[Offset, Any] = {}
+    by_offset: dict[Offset, Any] = {}
     for offset, value in coefficients.items():
         steps = tuple(offset) if isinstance(offset, tuple) else (offset,)
         if len(steps) != dimension or not all(
@@ -656,10 +661,11 @@ def _by_offset(coefficients: Any, dimension: int) -> dict[Offset, Any]:
                 f"coefficients: offset {offset}: expected {form}, each -1, 0 or 1: wider stencils "
                 "need a wl.SparseOperator"
             )
-        given[tuple(map(int, reversed((0,) * (3 - dimension) + steps)))] = value  # type: ignore[index]
-    if CENTER not in given:
+        along_xyz = tuple(map(int, reversed((0,) * (3 - dimension) + steps)))
+        by_offset[along_xyz] = value  # type: ignore[index]
+    if CENTER not in by_offset:
         raise ValueError(f"coefficients: the center, offset {(0,) * dimension}, is missing")
-    return given
+    return by_offset
 
 
 @functools.cache

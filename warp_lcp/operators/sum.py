@@ -141,16 +141,16 @@ class SumOperator(Pickled):
         plain, low = self._plain, self._low
         if not (isinstance(low, LowRankOperator) and has(plain, NamesComponents)):
             return None
-        found = plain.floating_components(scratch)
+        floating = plain.floating_components(scratch)
         return (
             None
-            if found is None
-            else found.without(
+            if floating is None
+            else floating.without(
                 _felt(
-                    found.label,
-                    found.count,
+                    floating.label,
+                    floating.count,
                     low,
-                    weighted=found.left is not None or found.right is not None,
+                    weighted=floating.left is not None or floating.right is not None,
                 )
             )
         )
@@ -215,12 +215,14 @@ def _felt(label: np.ndarray, count: int, low: LowRankOperator, *, weighted: bool
     """
     rows, blocks, values = low.columns.entries()
     at, k = label[rows], low.columns.width
-    found = np.zeros((2, count, low.rank))
+    sums_and_sizes = np.zeros((2, count, low.rank))
     inside = at >= 0
     if weighted:
         return np.bincount(at[inside], minlength=count) > 0
     columns = (blocks[inside, None] * k + np.arange(k)).astype(np.int64)
-    np.add.at(found[0], (at[inside, None], columns), values[inside])
-    np.add.at(found[1], (at[inside, None], columns), np.abs(values[inside]))
-    sums, sizes = found if low.layout.across is None else low.layout.across.sum(found)
+    np.add.at(sums_and_sizes[0], (at[inside, None], columns), values[inside])
+    np.add.at(sums_and_sizes[1], (at[inside, None], columns), np.abs(values[inside]))
+    sums, sizes = (
+        sums_and_sizes if low.layout.across is None else low.layout.across.sum(sums_and_sizes)
+    )
     return np.asarray((np.abs(sums) > FELT * sizes).any(axis=1))

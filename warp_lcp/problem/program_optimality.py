@@ -134,7 +134,7 @@ def equilibrated(program: ProgramWithRows) -> tuple[ProgramWithRows, ProgramUnit
     sigma = float(np.median(sizes)) if len(sizes) else slope / bend if bend and slope else 1.0
     sigma = _power_of_two(sigma)
     cost = _power_of_two(1 / (max(sigma * bend, slope) or 1.0))  # times sigma: of sigma D (Q x + c)
-    made = ProgramWithRows(
+    scaled_program = ProgramWithRows(
         scaled(Q, cost * sigma * D, D),
         cost * D * program.c,
         program.lower / (sigma * D),
@@ -145,7 +145,7 @@ def equilibrated(program: ProgramWithRows) -> tuple[ProgramWithRows, ProgramUnit
         E[m:] * program.d / sigma,
     )
     with np.errstate(over="ignore"):
-        return made, ProgramUnits(sigma * D, E[:m] / cost, E[m:] / cost)
+        return scaled_program, ProgramUnits(sigma * D, E[:m] / cost, E[m:] / cost)
 
 
 def settled(program: ProgramWithRows, point: ProgramPoint) -> ProgramPoint:
@@ -231,10 +231,14 @@ def polished(program: ProgramWithRows, point: ProgramPoint) -> ProgramPoint:
         if error <= EXACT or key in seen:
             break
         seen.add(key)
-        found = _newton(p, now, low, high, tight)
-        if found is None:
+        newton_point = _newton(p, now, low, high, tight)
+        if newton_point is None:
             break
-        inside = ProgramPoint(np.clip(found.x, p.lower, p.upper), np.maximum(found.z, 0.0), found.y)
+        inside = ProgramPoint(
+            np.clip(newton_point.x, p.lower, p.upper),
+            np.maximum(newton_point.z, 0.0),
+            newton_point.y,
+        )
         for tried in (
             inside,
             replace(
@@ -245,13 +249,13 @@ def polished(program: ProgramWithRows, point: ProgramPoint) -> ProgramPoint:
             worth = max(relative_residuals(p, tried))
             if worth < error:
                 best, error = tried, worth
-        slope, slack = _gradient(p, found), p.G @ found.x - p.h
+        slope, slack = _gradient(p, newton_point), p.G @ newton_point.x - p.h
         fixed = p.lower == p.upper
         low, high = (
-            fixed | np.where(low, slope > 0, found.x < p.lower),
-            ~fixed & np.where(high, slope < 0, found.x > p.upper),
+            fixed | np.where(low, slope > 0, newton_point.x < p.lower),
+            ~fixed & np.where(high, slope < 0, newton_point.x > p.upper),
         )
-        tight, now = np.where(tight, found.z > 0, slack < 0), found
+        tight, now = np.where(tight, newton_point.z > 0, slack < 0), newton_point
     return best
 
 
@@ -279,11 +283,11 @@ def has_no_solution(program: ProgramWithRows) -> str:
         rows_of_one, worth_of_one = scaled(rows, 1 / size, np.ones(n)), worth / size
         limits = np.repeat([[0.0, 1.0]], len(worth), axis=0)
         limits[len(p.h) : len(p.h) + len(p.d), 0] = -1.0
-        found = linprog(
+        program_result = linprog(
             -worth_of_one, A_eq=rows_of_one.T, b_eq=np.zeros(n), bounds=limits, method="highs"
         )
-        if found.status == 0:
-            v = _without_rounding(np.clip(found.x, limits[:, 0], limits[:, 1]))
+        if program_result.status == 0:
+            v = _without_rounding(np.clip(program_result.x, limits[:, 0], limits[:, 1]))
             gain, terms = float(worth_of_one @ v), float(np.abs(worth_of_one) @ np.abs(v))
             rest, left = np.abs(rows_of_one.T @ v), abs(rows_of_one).T @ np.abs(v)
             if gain > PROVED * terms and (rest <= 1e-2 * PROVED * left + 1e-300).all():
@@ -296,12 +300,12 @@ def has_no_solution(program: ProgramWithRows) -> str:
     )
     still = _stacked(p.Q, p.C)
     more = {"A_ub": -p.G, "b_ub": np.zeros(len(p.h))} if len(p.h) else {}
-    found = linprog(
+    program_result = linprog(
         p.c, A_eq=still, b_eq=np.zeros(still.shape[0]), bounds=sides, method="highs", **more
     )
-    if found.status != 0:
+    if program_result.status != 0:
         return ""
-    e = _without_rounding(np.clip(found.x, sides[:, 0], sides[:, 1]))
+    e = _without_rounding(np.clip(program_result.x, sides[:, 0], sides[:, 1]))
     moved, up = np.abs(still @ e), p.G @ e
     small = 1e-2 * PROVED
     flat = (moved <= small * (abs(still) @ np.abs(e)) + 1e-300).all() and (

@@ -360,11 +360,11 @@ def check_taken(method: Any, A: Operator) -> None:
             without requirements.
     """
     if not takes(method, A):
-        others = (
+        advice = (
             "use MinimumMapNewton, or ProjectedJacobi where bounds are affine in x, which "
             "need only products"
         )
         raise ValueError(
             f"{type(method).__name__} needs an operator with {described(*method.supports)}; "
-            f"{type(A).__name__} has none: {others}"
+            f"{type(A).__name__} has none: {advice}"
         )

@@ -654,7 +654,7 @@ class _Loop:
             self._restore()
         norm = self.residual.norm
         relative = norm / self.reference if self.reference > 0 else 0.0
-        of: dict[str, Any] = {"method": self.best_method, "problem": self.problem}
+        origin: dict[str, Any] = {"method": self.best_method, "problem": self.problem}
         version = version_of(self.problem.A) if isinstance(self.problem, LCP) else None
         return SolveResult(
             self._found(),
@@ -664,7 +664,7 @@ class _Loop:
             norm,
             relative,
             self.history,
-            **of,
+            **origin,
             version=version,
         )
 
@@ -714,7 +714,7 @@ class _LoopInBox(_Loop):
             else None
         )
         self.floating = floating
-        lost = (
+        unattainable = (
             floating.unattainable(self.problem.b, self.problem.lower, self.problem.upper)
             if floating
             else residual.unattainable()
@@ -726,7 +726,7 @@ class _LoopInBox(_Loop):
             residual.evaluate(self.work.x)
         self._record(0, Step("start", 0))
         self._keep(0)
-        return SolveStatus.INFEASIBLE if lost > self.tolerance else None
+        return SolveStatus.INFEASIBLE if unattainable > self.tolerance else None
 
     def _merits(self) -> Merits | None:
         """Return the merit functions at the iterate, None if they are not requested."""

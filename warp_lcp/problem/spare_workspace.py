@@ -58,12 +58,12 @@ class Kept:
         Also returns whether the last solve had the same form.
         """
         with self.lock:
-            found, again = self.workspace, self.last == form
+            workspace, again = self.workspace, self.last == form
             self.last = form
-            if found is None or (found.form != form and not again):
+            if workspace is None or (workspace.form != form and not again):
                 return None, again
             self.workspace = None
-            return (found if found.form == form else None), again
+            return (workspace if workspace.form == form else None), again
 
 
 KEPT = Kept()

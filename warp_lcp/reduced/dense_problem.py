@@ -373,13 +373,13 @@ def inconsistent(data: DenseProblem) -> bool:
         ("primal_feasibility_tolerance", "dual_feasibility_tolerance"), TOLERANCE
     )
     options["time_limit"] = min(seconds_left(), PROOF_SECONDS)
-    found = linprog(
+    program = linprog(
         cost, A_eq=system, b_eq=np.zeros(len(data.b)), bounds=signs, method="highs", options=options
     )
     check_time()
-    if found.x is None or not found.fun < 0:
+    if program.x is None or not program.fun < 0:
         return False
-    z, multipliers = np.zeros(len(data.b)), found.x[: len(rows)]
+    z, multipliers = np.zeros(len(data.b)), program.x[: len(rows)]
     for _ in range(1 + REFINEMENTS):
         z[rows] = R * multipliers
         if certifies(data, z):
@@ -475,21 +475,21 @@ def without_contact(data: DenseProblem, x: np.ndarray) -> np.ndarray:
     held = order[np.searchsorted(label[order], np.arange(count))]
     rest = np.setdiff1d(np.arange(len(x)), held)
     sides = np.stack([-data.b[rest], -np.asarray(A[rest][:, held].sum(axis=1)).ravel()], axis=1)
-    found, z = np.zeros(len(x)), np.zeros(len(x))
+    particular, z = np.zeros(len(x)), np.zeros(len(x))
     solved = solved_or_none(A[rest][:, rest], sides) if len(rest) else sides
     if solved is None:
         return x
-    found[rest], z[rest], z[held] = solved[:, 0], solved[:, 1], 1.0
+    particular[rest], z[rest], z[held] = solved[:, 0], solved[:, 1], 1.0
     zero = np.abs(A @ z) <= NULL * (abs(A) @ np.abs(z))
     with np.errstate(divide="ignore", invalid="ignore"):
-        ends = np.sort([(bound - found) / z for bound in (data.lower, data.upper)], axis=0)
+        ends = np.sort([(bound - particular) / z for bound in (data.lower, data.upper)], axis=0)
     low, high = np.full(count, -np.inf), np.full(count, np.inf)
     np.maximum.at(low, label, np.where(z == 0, -np.inf, ends[0]))
     np.minimum.at(high, label, np.where(z == 0, np.inf, ends[1]))
     works = low <= high
     works[label[~zero]] = False
     shift = np.clip(0.0, low, np.maximum(low, high))
-    moved = np.where(works[label], found + np.where(works[label], shift[label], 0.0) * z, x)
+    moved = np.where(works[label], particular + np.where(works[label], shift[label], 0.0) * z, x)
     return np.clip(moved, data.lower, data.upper)
 
 

@@ -172,15 +172,15 @@ def enumeration_kernels(n: int, dtype: type) -> SimpleNamespace:
             u[i] = high[i] / S[i]
             for j in range(count):
                 M[i, j] = S[i] * A[i, j] * S[j]
-        best, least, found = vec(), real(one), int(-1)
+        best, least, best_code = vec(), real(one), int(-1)
         for code in range(sets):
             if least > exact:
                 x, possible = assign(M, q, l, u, code)
                 if possible:
                     m = measure(M, q, l, u, x)
-                    if m < least or found < 0:
-                        best, least, found = x, m, code
-        return wp.cw_mul(S, best), least, found
+                    if m < least or best_code < 0:
+                        best, least, best_code = x, m, code
+        return wp.cw_mul(S, best), least, best_code
 
     @forward_kernel(module=module)
     def batch(
@@ -202,12 +202,12 @@ def enumeration_kernels(n: int, dtype: type) -> SimpleNamespace:
             high[i] = upper[tu, i]
             for j in range(count):
                 M[i, j] = A[t, i, j]
-        best, least, found = enumerate_sets(M, q, low, high)
+        best, least, code = enumerate_sets(M, q, low, high)
         for i in range(count):
             x[t, i] = best[i]
         if least > accepted:
-            found = -1
-        chosen[t] = found
+            code = -1
+        chosen[t] = code
 
     @forward_kernel(module=module)
     def each(

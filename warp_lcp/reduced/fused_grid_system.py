@@ -155,7 +155,7 @@ class FusedGridSystem:
         They end when the residual is small enough, or the free set changes.
         """
         passes, residual, s = self.iterate, self.iterate.residual, self._settings
-        wanted, least, iterations, idle = (
+        target, least, iterations, idle = (
             max(s.eta * residual.norm, self._target),
             residual.norm,
             0,
@@ -166,7 +166,7 @@ class FusedGridSystem:
             iterations += 1
             if (
                 passes.stale
-                or not residual.norm > wanted
+                or not residual.norm > target
                 or iterations >= s.max_linear_iterations
                 or time_is_up()
             ):

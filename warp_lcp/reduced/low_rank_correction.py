@@ -261,12 +261,12 @@ class LowRankCorrection:
             ).launch(launch)
             return
         assert self._adding is not None, "prepare comes first"
-        found, adding = self.noted.array, self._adding[1]
+        squares, adding = self.noted.array, self._adding[1]
         BY_TURNS.bind(
             columns.turns, columns.entry_fields, rank=low.rank, d=d, out=adding.partials
         ).launch(launch)
-        adding.add_up(0, columns=found.size, launch=launch)
-        inputs = [low.weights, found, low.rank, columns.width, self._power, self.calm]
+        adding.add_up(0, columns=squares.size, launch=launch)
+        inputs = [low.weights, squares, low.rank, columns.width, self._power, self.calm]
         launch(calm_kernel, 1, inputs, device=low.device)
 
     def renew(self, *, begins: bool, noted: bool = False, made: bool = False) -> bool:
@@ -306,16 +306,16 @@ class LowRankCorrection:
             self._seen[stale] = squares[stale]
         else:
             self._fill(stale, squares)
-        lost, known = (
+        overwritten, products_known = (
             bool(stale),
             self._read_products is not None
             and (made or (noted and not begins and not chosen and not stale)),
         )
-        if strong and not self._invert(W, known=known) and len(stale) < len(strong):
+        if strong and not self._invert(W, known=products_known) and len(stale) < len(strong):
             self._fill([q for q in strong if q not in stale], squares)
             self._invert(W)
-            lost = True
-        return lost
+            overwritten = True
+        return overwritten
 
     def begin(self, *, launch: Launch = launch_now) -> None:
         """Subtract U S'^-1 Z'r from the finest right-hand side r, before a cycle.
@@ -352,9 +352,9 @@ class LowRankCorrection:
         Columns that have a slot keep their potentials; the others' must be computed.
         """
         old, low, n = {q: slot for slot, q in enumerate(self._slot_columns)}, self._low, self._size
-        kept = [q for q in strong if q in old and self._seen[q] > 0.0]
+        with_potentials = [q for q in strong if q in old and self._seen[q] > 0.0]
         before = self._Z
-        if kept:
+        if with_potentials:
             if self._spare.size < before.size:
                 self._spare = wp.empty_like(before)
             wp.copy(self._spare, before, count=before.size)
@@ -372,11 +372,11 @@ class LowRankCorrection:
             if len(strong) not in self._bound:
                 self._bound[len(strong)] = self._bind(len(strong))
             self._dots, self._multiply, self._subtract = self._bound[len(strong)]
-        for q in kept:
+        for q in with_potentials:
             wp.copy(
                 self._Z, before, dest_offset=strong.index(q) * n, src_offset=old[q] * n, count=n
             )
-        self._seen[[q for q in range(low.rank) if q not in kept]] = 0.0
+        self._seen[[q for q in range(low.rank) if q not in with_potentials]] = 0.0
 
     def _bind(self, slots: int) -> tuple[Reduction, Any, Any]:
         """Return the launches for a number of slots: sums Z'r, products, z -= Z t."""

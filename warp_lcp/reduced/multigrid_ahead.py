@@ -301,14 +301,14 @@ class RunAhead:
         loop = self._loop(rebuilds=self._may_rebuild())
         if loop is None:
             return False
-        given = [
+        arguments = [
             int(work.stale),
             min(left, ROWS),
             tolerance,
             *work.descent.standing,
             work.descent.noise,
         ]
-        for number, value in zip(self._standing, given, strict=True):
+        for number, value in zip(self._standing, arguments, strict=True):
             number.value = value
         self._resuming.run(loop, variant=work.program_key())
         if not work.A.device.is_cuda:
@@ -399,7 +399,7 @@ class RunAhead:
 
     def _judge_first(self, counted: wp.array[Any] | None, launch: Launch) -> None:
         """Record the kernel that decides whether the guess is good enough."""
-        *given, noise = self._numbers
+        *arguments, noise = self._numbers
         memory = [
             self._work.residual.scalars,
             self._found.array,
@@ -410,7 +410,7 @@ class RunAhead:
         launch(
             begin_kernel,
             1,
-            [*memory, *given, counted, noise, self._calm],
+            [*memory, *arguments, counted, noise, self._calm],
             device=self._work.A.device,
         )
 

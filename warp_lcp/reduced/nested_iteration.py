@@ -83,20 +83,20 @@ class BlockTridiagonalProblem:
         """
         odd, even = slice(1, None, 2), slice(0, None, 2)
         inverse = _inverse(self.own[odd])
-        own, b = self.own[even].copy(), self.b[even].copy()
-        left, right = np.zeros_like(own), np.zeros_like(own)
+        diagonal, b = self.own[even].copy(), self.b[even].copy()
+        left, right = np.zeros_like(diagonal), np.zeros_like(diagonal)
         # A_CF A_FF^-1 for the odd block before an even one.
-        before = _times(self.left[2::2], inverse[: len(own) - 1])
+        before = _times(self.left[2::2], inverse[: len(diagonal) - 1])
         after = _times(self.right[even][: len(inverse)], inverse)  # the same for the one after it
         count = len(before)
-        own[1:] -= _times(before, self.right[odd][:count])
-        own[: len(after)] -= _times(after, self.left[odd])
+        diagonal[1:] -= _times(before, self.right[odd][:count])
+        diagonal[: len(after)] -= _times(after, self.left[odd])
         left[1:] = -_times(before, self.left[odd][:count])
         right[: len(after)] = -_times(after, self.right[odd])
         b[1:] -= _applied(before, self.b[odd][:count])
         b[: len(after)] -= _applied(after, self.b[odd])
         return BlockTridiagonalProblem(
-            left, own, right, b, self.lower[even], self.upper[even]
+            left, diagonal, right, b, self.lower[even], self.upper[even]
         ), inverse
 
     def interpolated(self, coarse: np.ndarray, inverse: np.ndarray) -> np.ndarray:

@@ -106,25 +106,26 @@ class BlockedGaussSeidel(Settings):
                 method does not take its blocks.
         """
         check_taken(self, problem.A)
-        A, given, kind = problem.A, self.blocks, type(problem.A).__name__
+        A, blocks_setting, kind = problem.A, self.blocks, type(problem.A).__name__
         rows = A.rows() if has(A, HasRows) else None
-        if given is None:
-            given = GridLines.X if has(A, HasStencil) else CONSECUTIVE
-        if isinstance(given, GridLines):
+        if blocks_setting is None:
+            blocks_setting = GridLines.X if has(A, HasStencil) else CONSECUTIVE
+        if isinstance(blocks_setting, GridLines):
             if not has(A, HasStencil) or self.sub_solver is not None:
                 raise ValueError(
-                    f"blocks = {given}: only for GridPoisson without a sub_solver; A is a {kind}"
+                    f"blocks = {blocks_setting}: only for GridPoisson without a sub_solver; A is a "
+                    f"{kind}"
                 )
-            return LineWorkspace(problem, given, self)
-        if rows is None and (isinstance(given, int) or self.sub_solver is None):
+            return LineWorkspace(problem, blocks_setting, self)
+        if rows is None and (isinstance(blocks_setting, int) or self.sub_solver is None):
             raise ValueError(
                 f"{kind} gives no access to rows: give BlockedGaussSeidel GridLines, or lists as "
                 "blocks and a sub_solver"
             )
         blocks = (
-            blocks_of_size(problem, given)
-            if isinstance(given, int)
-            else given_blocks(problem, given)
+            blocks_of_size(problem, blocks_setting)
+            if isinstance(blocks_setting, int)
+            else given_blocks(problem, blocks_setting)
         )
         if rows is not None and self.sub_solver is None and max(map(len, blocks)) <= MOST:
             return BlockWorkspace(problem, rows, blocks, self)
@@ -192,7 +193,7 @@ class BlockWorkspace(SweepWorkspace):
             np.concatenate(colors),
         ]
         names = ("first", "rows", "owner", "place", "order")
-        given = put(
+        block_lists = put(
             BlockLists(),
             {
                 name: wp.array(v, dtype=wp.int32, device=device)
@@ -204,7 +205,7 @@ class BlockWorkspace(SweepWorkspace):
             problem.b,
             *bound_operands(problem),
             wp.float64(settings.omega),
-            given,
+            block_lists,
         ]
         self._kernel = block_sweep_kernel(rows.values.dtype, max(sizes))
 

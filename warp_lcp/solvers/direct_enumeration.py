@@ -91,13 +91,13 @@ class DirectEnumeration:
         """
         n = check_size(problem, "DirectEnumeration", self.most_unknowns)
         candidates, measures = _candidates(DenseProblem.read(problem))
-        found: list[np.ndarray] = []
+        solutions: list[np.ndarray] = []
         for x in candidates[measures <= ACCEPTED[wp.float64]]:
             if not any(
-                np.abs(x - other).max() <= SAME * max(1.0, np.abs(x).max()) for other in found
+                np.abs(x - other).max() <= SAME * max(1.0, np.abs(x).max()) for other in solutions
             ):
-                found.append(x)
-        return np.array(found).reshape(-1, n)
+                solutions.append(x)
+        return np.array(solutions).reshape(-1, n)
 
 
 @dataclass(frozen=True)

@@ -199,7 +199,8 @@ class Fallback:
         return hash(self.entries)
 
     def __repr__(self) -> str:
-        return f"Fallback({', '.join(_described(entry, first=k == 0) for k, entry in enumerate(self.entries))})"
+        entries = (_described(entry, first=k == 0) for k, entry in enumerate(self.entries))
+        return f"Fallback({', '.join(entries)})"
 
     def __str__(self) -> str:
         """Return the methods in order, each with its condition."""

@@ -506,21 +506,21 @@ class FischerDenseWorkspace(DenseWorkspace):
         """Search along a direction; return the failure, None if the merit falls."""
         if not (np.isfinite(slope) and slope < 0):
             return SolveStatus.NON_DESCENT
-        data, found = self.map.data, x
+        data, moved = self.map.data, x
 
         def trial(length: float) -> float:
-            nonlocal found
-            found = x + length * dx
+            nonlocal moved
+            moved = x + length * dx
             if projected:
-                found = np.clip(found, data.lower, data.upper)
-            f = self.map.value(found, data.affine(found))
+                moved = np.clip(moved, data.lower, data.upper)
+            f = self.map.value(moved, data.affine(moved))
             return 0.5 * float(f @ f)
 
         self._search.remember(merit)
         length, _ = self._search.search(trial, slope)
         if length == 0.0:
             return SolveStatus.NON_DESCENT
-        self._iterate = found
+        self._iterate = moved
         return None
 
     def _next_stage(self) -> None:

@@ -465,7 +465,7 @@ class InteriorPointWorkspace(IterateMemory):
         s and -dt / t.
         """
         self._longest.zero_()
-        found = self._pass_sums.of(
+        sums = self._pass_sums.of(
             RATIOS,
             self._pairs,
             self._direction(second, tau),
@@ -473,7 +473,7 @@ class InteriorPointWorkspace(IterateMemory):
             UPPER=self._upper,
             FUSED=self._fused,
         )
-        products = float(found[0])
+        products = float(sums[0])
         return float(self._longest.numpy()[0]), products
 
     def _correct(self, tau: float, *, y: wp.array[Any] | None, D: wp.array[Any] | None) -> None:
@@ -496,7 +496,7 @@ class InteriorPointWorkspace(IterateMemory):
 
     def _move(self, x: wp.array[Any], second: float, tau: float, length: float) -> None:
         """Take the step, and store mu."""
-        found = self._sums.of(
+        sums = self._sums.of(
             MOVE,
             self._pairs,
             self._direction(second, tau),
@@ -506,7 +506,7 @@ class InteriorPointWorkspace(IterateMemory):
             UPPER=self._upper,
             FUSED=False,
         )
-        self.mu = float(found[0]) / max(self.count, 1)
+        self.mu = float(sums[0]) / max(self.count, 1)
         self._finish_move(x)
 
     def _inside(self, x: wp.array[Any], width: float) -> None:

@@ -213,7 +213,7 @@ class SplitResidual(NaturalResidual):
             self.affine(x)
         else:
             self._stencil.wrap(x)
-        found = self._split.of(
+        sums = self._split.of(
             kernel,
             stencil=stencil,
             bounds=p.bounds.operands,
@@ -227,7 +227,7 @@ class SplitResidual(NaturalResidual):
             slack=self._slack,
         )
         square, self.chopped, self.reduced, self.release, moved, active, self.energy = (
-            float(v) for v in found
+            float(v) for v in sums
         )
         self.norm, self.current, self.active, self.moved = (
             float(np.sqrt(square)),

@@ -198,11 +198,11 @@ class ActiveSetWorkspace(NewtonWorkspace):
 
         The step is interim until no condition is violated.
         """
-        own = DenseProblem.read(self.problem)
-        data, units = own.scaled()
+        problem = DenseProblem.read(self.problem)
+        data, units = problem.scaled()
         if self.places is None:
-            free, at = self.system.free.numpy()[own.rows] != 0, x.numpy()[own.rows]
-            self.places = np.where(free, FREE, np.where(at == own.upper, UPPER, LOWER))
+            free, at = self.system.free.numpy()[problem.rows] != 0, x.numpy()[problem.rows]
+            self.places = np.where(free, FREE, np.where(at == problem.upper, UPPER, LOWER))
         pivots, most = 0, pivots_of(None, len(data.b)) * 8
         values, violated, singular = _basic_solution(data, self.places)
         while (
@@ -216,7 +216,7 @@ class ActiveSetWorkspace(NewtonWorkspace):
         if not np.isfinite(values).all() or (lost and violated.size):  # A is no P-matrix
             return Step("least index", pivots, None, SolveStatus.STAGNATED)
         stored = x.numpy().copy()
-        stored[own.rows] = units * np.clip(values, data.lower, data.upper)
+        stored[problem.rows] = units * np.clip(values, data.lower, data.upper)
         x.assign(stored)
         self.round_iterate()
         # Counts only if rounding keeps the criteria from being met.

@@ -304,13 +304,13 @@ def colors(first: np.ndarray, second: np.ndarray, bodies: int) -> tuple[np.ndarr
         second: the other body, `bodies` if there is none.
         bodies: their number.
     """
-    taken, color = [0] * (bodies + 1), np.empty(len(first), dtype=np.int64)
+    colors_of_body, color = [0] * (bodies + 1), np.empty(len(first), dtype=np.int64)
     for k, (i, j) in enumerate(zip(first.tolist(), second.tolist(), strict=True)):
-        both = taken[i] | taken[j]
+        both = colors_of_body[i] | colors_of_body[j]
         free = ~both & (both + 1)  # the lowest bit that neither has
         color[k] = free.bit_length() - 1
-        taken[i] |= free
+        colors_of_body[i] |= free
         if j < bodies:
-            taken[j] |= free
+            colors_of_body[j] |= free
     order = np.argsort(color, kind="stable")
     return order, np.searchsorted(color[order], np.arange(color.max(initial=-1) + 2))

@@ -62,12 +62,12 @@ class Methods(dict[str, type[Any]]):
         For other names the result is that of `settings.nearest`.
         """
         word = str(name).lower().replace("_", "-").replace(" ", "-")
-        for known, kind in self.items():
-            initials = "".join(part[0] for part in known.split("-"))
-            if ALSO.get(word, known) == known and (
+        for name_of_method, kind in self.items():
+            initials = "".join(part[0] for part in name_of_method.split("-"))
+            if ALSO.get(word, name_of_method) == name_of_method and (
                 word in ALSO or word in (initials, kind.__name__.lower())
             ):
-                return f"did you mean {known!r}?"
+                return f"did you mean {name_of_method!r}?"
         return nearest(word, self)
 
 

@@ -223,7 +223,7 @@ def given_blocks(problem: LCP, blocks: Blocks) -> list[np.ndarray]:
         )
     layout = problem.layout
     place = layout.places()
-    found = []
+    stored_blocks = []
     for k, block in enumerate(blocks):
         index = np.asarray(block, dtype=np.int64).ravel()
         if index.size == 0:
@@ -233,10 +233,10 @@ def given_blocks(problem: LCP, blocks: Blocks) -> list[np.ndarray]:
                 f"blocks[{k}] has indices from {index.min()} to {index.max()}: expected 0 ... "
                 f"{len(place) - 1}"
             )
-        found.append(place[index])
+        stored_blocks.append(place[index])
     count = (
-        np.bincount(np.concatenate(found), minlength=layout.size)
-        if found
+        np.bincount(np.concatenate(stored_blocks), minlength=layout.size)
+        if stored_blocks
         else np.zeros(layout.size, dtype=int)
     )
     wrong = count != (problem.unknown.numpy() == 1)
@@ -246,7 +246,7 @@ def given_blocks(problem: LCP, blocks: Blocks) -> list[np.ndarray]:
             f"blocks hold index {at} {count[place[at]]} times, expected "
             f"{int(problem.unknown.numpy()[place[at]] == 1)}"
         )
-    return found
+    return stored_blocks
 
 
 def color_blocks(matrix: scipy.sparse.csr_array, owner: np.ndarray, count: int) -> list[np.ndarray]:

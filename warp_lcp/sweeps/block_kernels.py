@@ -76,17 +76,17 @@ def block_sweep_kernel(a_type: Any, m: int) -> Any:
 
         The bound is affine in an unknown of the block, or constant while the block is solved.
         """
-        made = side
-        made.constant[p] = bound_at(S, x, i)
-        made.at[p] = -1
+        updated = side
+        updated.constant[p] = bound_at(S, x, i)
+        updated.at[p] = -1
         if S.index.shape[0] > 0:
             j = S.index[i]
             if j >= 0:
                 if B.owner[j] == block:
-                    made.constant[p] = S.constant[i]
-                    made.slope[p] = S.coefficient[i]
-                    made.at[p] = B.place[j]
-        return made
+                    updated.constant[p] = S.constant[i]
+                    updated.slope[p] = S.coefficient[i]
+                    updated.at[p] = B.place[j]
+        return updated
 
     @wp.func
     def solve_set(a: table, low: BlockSide, high: BlockSide, state: places, n: int):

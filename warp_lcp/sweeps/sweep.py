@@ -95,12 +95,12 @@ class RowSweep(Sweep):
         self.problem, self._rows, self._omega, self._order = problem, rows, wp.float64(omega), order
         n = problem.layout.size
         self._n = n if permutation is None else len(permutation)
-        given = (
+        places = (
             np.zeros(n if order is SweepOrder.MAGNITUDE else 0)
             if permutation is None
             else permutation
         )
-        self._places = wp.array(given, dtype=wp.int32, device=problem.device)
+        self._places = wp.array(places, dtype=wp.int32, device=problem.device)
         self._matrix = rows.operand
         self._bounds = bound_operands(problem)
         self._kernels = row_kernels(rows.values.dtype)
