@@ -137,6 +137,7 @@ def _of_multigrid(method: ProjectedMultigrid) -> Solver:
 
 
 def _of_newton(method: MinimumMapNewton, problem: LCP | None) -> Solver:
+    """Return the chain of Newton's method for the problem's operator."""
     A = None if problem is None else problem.A
     if problem is None or has(A, HasColumns):
         return method
@@ -166,6 +167,7 @@ def _on_matrix(method: MinimumMapNewton, minimizes: bool, steps: int) -> Fallbac
 
 
 def _of_active_set(method: PrimalDualActiveSet, problem: LCP | None) -> Solver:
+    """Return the chain of the active set method for the problem's operator."""
     newton = method.as_newton()
     if problem is None or has(problem.A, HasStencil):
         return Fallback(method, (newton, fails), (_on_assembled(), stalls_or_crawls))

@@ -138,6 +138,7 @@ def linear_complementarity(
     def run(
         restated: RestatedProblem, solver: Solver, stopping: Any, x0: Any, callback: Any
     ) -> SolveResult:
+        """Solve by a method, and store its workspace for the callback."""
         work = solver.init(restated.problem)
         at_work.append((restated, work))
         solution = solve(

@@ -113,10 +113,12 @@ def renamed(**names: str) -> Callable[[type[Kind]], type[Kind]]:
     """
 
     def wrap(kind: type[Kind]) -> type[Kind]:
+        """Return the class with an `__init__` that accepts old names."""
         init: Any = kind.__init__
 
         @wraps(init)
         def init_by_either_name(self: Any, *args: Any, **settings: Any) -> None:
+            """Replace old names by new ones, with a warning."""
             for old, new in names.items():
                 if old in settings:
                     if new in settings:

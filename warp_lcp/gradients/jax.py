@@ -56,6 +56,7 @@ def solve(
     names, values = tuple(given), tuple(map(jax.numpy.asarray, given.values()))
 
     def solved(data: Sequence[Any], x0: Any = None) -> SolveResult:
+        """Solve the problem of host arrays."""
         host = [np.asarray(v) for v in data]
         parts = nested(names[3:], host[3:])
         result = solve_problem(

@@ -59,6 +59,7 @@ def _solution() -> Any:
     class Solution(torch.autograd.Function):
         @staticmethod
         def forward(ctx: Any, how: Any, *values: Any) -> Any:
+            """Solve, and keep the result for the backward pass."""
             A, options, ctx.adjoint, ctx.names = how
             ctx.kinds = [
                 (v.dtype, v.device) if isinstance(v, torch.Tensor) else None for v in values
@@ -76,6 +77,7 @@ def _solution() -> Any:
         @staticmethod
         @torch.autograd.function.once_differentiable
         def backward(ctx: Any, cotangent: Any) -> Any:
+            """Return the gradients of all tensors by `wl.vjp`."""
             found = vjp(ctx.result, _shared(cotangent), stopping=ctx.adjoint).by_name
             values = [
                 found[name] if kind else None

@@ -164,6 +164,7 @@ class DenseOperator(Pickled):
     def _product(
         self, x: wp.array[Any], out: wp.array[Any] | None, *, transposed: bool
     ) -> wp.array[Any]:
+        """Return A x or A' x, in `out` if given."""
         if tuple(x.shape) != self.shape:
             raise ValueError(f"x has shape {tuple(x.shape)}: expected {self.shape}")
         out = wp.zeros_like(x) if out is None else out

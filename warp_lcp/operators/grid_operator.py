@@ -191,6 +191,7 @@ class GridOperator(Pickled):
     def _applied(
         self, x: wp.array[Any], out: wp.array[Any] | None, *, transposed: bool = False
     ) -> wp.array[Any]:
+        """Return A x or A' x for a stored field, or for one of the operator's shape."""
         if x.size == self.layout.size:
             if out is None:
                 out = wp.zeros_like(x)
@@ -349,6 +350,7 @@ class GridOperator(Pickled):
         self._refills[cells.ptr].run()
 
     def _take_cells(self, cells: wp.array[Any]) -> None:
+        """Set padded cell types, and update rows in use, diagonal and weights."""
         if cells is not self.cells:
             COPY_CELLS.bind(
                 Rows.of(self.layout.padding, self.device),
@@ -374,6 +376,7 @@ class GridOperator(Pickled):
         return True
 
     def _stored_shift(self, shift: Any) -> wp.array[Any]:
+        """Return the shift as a padded array; empty if there is none."""
         if shift is None:
             return wp.empty((0, 0, 0), dtype=self.dtype, device=self.device)
         if self._in_place(shift, "shift"):

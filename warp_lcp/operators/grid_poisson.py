@@ -117,6 +117,7 @@ class GridPoisson(GridOperator):
     def _take_coefficients(
         self, cells: np.ndarray, *, face_x: Face, face_y: Face, face_z: Face, shift: Any
     ) -> None:
+        """Store face coefficients and shift, numbers as numbers."""
         given = (face_x, face_y, face_z if cells.ndim == 3 else 1.0)
         faces = [
             f if isinstance(f, wp.array) else real_array(f, f"face_{axis}")
@@ -360,6 +361,7 @@ class GridPoisson(GridOperator):
         return any(f.size > 0 for f in self.faces)
 
     def _empty_stencil(self) -> PaddedStencil:
+        """Allocate the stencil: a count of faces in one byte if coefficients allow it."""
         layout, counts = self.layout, self._counts_faces
         strength: Any = tuple(map(self._mean_coefficient, self.faces, self.uniform))
         weights: Any = tuple(layout.zeros(self.dtype) for _ in AXES) if self._has_arrays else None

@@ -433,6 +433,7 @@ class LowRankOperator(Pickled):
         return LowRankOperator.of_blocks(self, columns, self.weights.numpy())
 
     def _make(self, layout: Layout, columns: BlockColumns, weights: Any) -> None:
+        """Set all attributes from stored columns and weights."""
         self.layout, self.columns, columns.across = layout, columns, layout.across
         self.shape, self.device, self.dtype, self.rank, self.version = (
             layout.shape,
@@ -480,6 +481,7 @@ class LowRankOperator(Pickled):
     def _product(
         self, x: wp.array[Any], out: wp.array[Any] | None, W: wp.array[Any]
     ) -> wp.array[Any]:
+        """Return U W U' x for a stored field, or for one of the operator's shape."""
         if x.size != self.layout.size:
             if tuple(x.shape) != self.shape:
                 raise ValueError(f"x has shape {tuple(x.shape)}: expected {self.shape}")

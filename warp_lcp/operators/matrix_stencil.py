@@ -75,6 +75,12 @@ def _boxes(rows: CompressedRows) -> Iterator[tuple[int, int, int]]:
 def _as_stencil(
     A: SparseOperator, rows: CompressedRows, shape: tuple[int, int, int]
 ) -> StoredStencil | None:
+    """Return the operator as a stencil on a box of a given shape, or None.
+
+    The row in the middle of the box defines the expected entries. A pass over all rows tests the
+    pattern, and whether entries differ from those. Of symmetric matrices half of the neighbors are
+    stored. If the diagonal is a small multiple of one weight, it is stored as a byte.
+    """
     nz, ny, nx = shape
     if ny < LEAST or (nz > 1 and nz < LEAST):
         return None
@@ -104,6 +110,7 @@ def _as_stencil(
     )
 
     def recognize(block: wp.array[Any] | None) -> np.ndarray:
+        """Compare all rows with the middle one, and copy entries to `block` if given."""
         return sums.of(
             RECOGNIZE,
             matrix,

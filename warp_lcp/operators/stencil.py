@@ -113,6 +113,12 @@ class Stencil(GridOperator):
         )
 
     def _take_coefficients(self, cells: np.ndarray, *, coefficients: Any, shift: Any) -> None:
+        """Check the coefficients, and store them in the form that kernels use.
+
+        The forms are numbers, Warp functions, or arrays. Of symmetric coefficients half of the
+        neighbors are stored. The weights of the kernels are -a_o, because A x = d x - sum of
+        weights times neighbors.
+        """
         self._given = by_offset = _by_offset(coefficients, cells.ndim)
         self.shift, self._shift_given = (
             self._stored_shift(shift),
@@ -214,6 +220,7 @@ class Stencil(GridOperator):
         rows, cells = Rows.of(self.layout.padding, self.device), self.cells_around.flatten()
 
         def of(offset: Offset, shape: tuple[int, ...]) -> Any:
+            """Return the derivative by the coefficients of an offset, of a given shape."""
             part = self.layout.zeros(wp.float64) if shape else None
             step, row, plane = (
                 0 if axis in self._around_itself else step for axis, step in enumerate(offset)
@@ -375,6 +382,7 @@ class Stencil(GridOperator):
         return padded
 
     def _empty_stencil(self) -> PaddedStencil:
+        """Return the stencil with an allocated diagonal."""
         layout = self.layout
         options: dict[str, Any] = {
             "periodic": self.periodic,
@@ -387,6 +395,7 @@ class Stencil(GridOperator):
         )
 
     def _fill_stencil(self) -> None:
+        """Compute the diagonal, and refuse one that is not positive."""
         s = self.stencil
         self._wrap_cells()
         self._find_signs()
@@ -598,6 +607,7 @@ class StoredStencil(GridOperator):
         pass
 
     def _empty_stencil(self) -> PaddedStencil:
+        """Return the stencil of the given fields."""
         d, weights, pattern, strength = self._made
         fields, numbers = (None, weights) if isinstance(weights[0], float) else (weights, ())
         return PaddedStencil(

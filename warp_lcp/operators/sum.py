@@ -176,6 +176,7 @@ class SumOperator(Pickled):
     def _add(
         self, x: wp.array[Any], out: wp.array[Any] | None, *, transposed: bool
     ) -> wp.array[Any]:
+        """Return (A + B) x or its transpose, stored or of the operator's shape."""
         if x.size not in (self.layout.size, int(np.prod(self.shape))):
             raise ValueError(f"x has shape {tuple(x.shape)}: expected {self.shape}")
         out = wp.zeros_like(x) if out is None else out
@@ -186,6 +187,7 @@ class SumOperator(Pickled):
         return out
 
     def _add_fields(self, x: wp.array[Any], out: wp.array[Any], *, transposed: bool) -> None:
+        """Compute (A + B) x or its transpose on fields of one form."""
         plain, low = self._plain, self._low
         (plain.apply_transpose if transposed else plain.apply)(x, out)
         if isinstance(low, LowRankOperator) and x.size == low.layout.size:

@@ -82,6 +82,7 @@ class FrictionalContact(VariationalInequality):
         self.other[self.second == self.bodies] = 0.0
 
     def _check(self) -> None:
+        """Raise ValueError for wrong shapes, values or body numbers."""
         shapes = {
             "one": self.one,
             "other": self.other,

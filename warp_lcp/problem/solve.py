@@ -551,6 +551,7 @@ class _Loop:
         self.tolerance = self.stopping.tolerance(self.reference)
 
     def _iterate(self, status: SolveStatus | None) -> SolveResult:
+        """Take steps until a status ends the solve."""
         iteration = 0
         while status is None:
             self.residual.current = False
@@ -615,6 +616,7 @@ class _Loop:
         )
 
     def _record(self, iteration: int, step: Step) -> None:
+        """Append a record to the history and call the callback."""
         seconds = time.perf_counter() - self.begun
         method = step.method or self.name
         record = Record(
@@ -650,6 +652,7 @@ class _Loop:
         self.residual.evaluate(self.work.x)
 
     def _finish(self, status: SolveStatus, iterations: int) -> SolveResult:
+        """Return the result, at the best iterate."""
         if self.best_iteration != iterations or not math.isfinite(self.residual.norm):
             self._restore()
         norm = self.residual.norm

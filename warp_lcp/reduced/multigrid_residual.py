@@ -169,6 +169,7 @@ class AssessedResidual(NaturalResidual):
         )
 
     def _assessing(self, x: wp.array[Any], classify: bool) -> Bound:
+        """Return the kernel that evaluates the residual at x, with its arguments."""
         p, finest = self.problem, self._finest
         return kernels.ASSESS.bind(
             self._A.stencil.rows,

@@ -420,6 +420,7 @@ class NonsmoothMap:
     def _half_sum(
         self, declared: RowPass, x: wp.array[Any], *more: MapSystem | MapWeights
     ) -> float:
+        """Run a kernel of the map at x; return half of its first sum."""
         sums = self._sums.of(
             declared,
             self._numbers,
@@ -488,6 +489,7 @@ class FiniteDifferenceSystem(KrylovSystem):
         SCALE.bind(rows_of(self.r), r=self.r, d=self._diagonal, z=self.z).launch()
 
     def _product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = launch_now) -> None:
+        """Compute q = J p by a difference of the map, on the free unknowns."""
         norm = self.norm(p)
         if norm == 0:
             q.zero_()

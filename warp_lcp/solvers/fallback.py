@@ -442,6 +442,10 @@ class FallbackWorkspace:
         )
 
     def _made(self, method: Solver) -> Any:
+        """Return a workspace of a method, None if it does not take the problem.
+
+        An equal method of the chain shares its workspace.
+        """
         same = next(
             (
                 k

@@ -322,6 +322,10 @@ class Basis:
         return z + self.inverse @ (r - self.matrix @ z)
 
     def _direction(self) -> np.ndarray:
+        """Return the entering column in the current basis, B^-1 c.
+
+        The inverse is recomputed if it is old, or if the residual of the result is too large.
+        """
         column = self._column()
         direction = self._solve(column)
         if (

@@ -102,6 +102,7 @@ class MPRGP(Settings):
         return self._checked(problem, system if isinstance(system, SparseSystem) else None)
 
     def _checked(self, problem: LCP, system: SparseSystem | None) -> MPRGPWorkspace:
+        """Return a workspace if A is symmetric without negative diagonal entries."""
         if not problem.A.symmetric:
             raise ValueError(
                 "A is not symmetric: MPRGP minimizes an energy that exists only for a symmetric A; "

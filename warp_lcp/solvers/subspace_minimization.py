@@ -182,6 +182,10 @@ class SubspaceWorkspace(SweepWorkspace):
         return iterations
 
     def _correct(self, x: wp.array[Any], scale: float) -> None:
+        """Set x = clip(x0 + scale e, l, u) from the x0 before the correction.
+
+        Held unknowns then follow bounds that are affine in x.
+        """
         p = self.problem
         p.bounds.follow(self._before)
         projected_move(

@@ -44,6 +44,7 @@ def scaled_spectrum(problem: LCP, steps: int, free: Any = None) -> tuple[float, 
     field, image, nothing = (layout.zeros(wp.float64) for _ in range(3))
 
     def product(v: np.ndarray) -> np.ndarray:
+        """Return D^-1/2 A D^-1/2 v, or that of the symmetric part of A."""
         field.assign(scale * v)
         problem.apply_plus(field, nothing, image)
         if not A.symmetric:
