@@ -140,6 +140,7 @@ def vjp(
     layout = problem.layout
     x, g = layout.load(result.x, f64, "result.x"), layout.load(cotangent, f64, "cotangent")
     y, cells, side, free, degenerate = _classified(problem, result, x, g)
+    # A_FF' mu_F = -g_F.
     adjoint, multiplier = _adjoint(
         problem, cells, g, free, result.grid is not None, stopping or StoppingCriteria()
     )
@@ -153,6 +154,7 @@ def vjp(
             "gradient"
         )
     A, varying, z = problem.A, problem.bounds.varying, y
+    # z = g + A'mu, the gradient by bounds that hold their unknowns.
     _gather(problem, multiplier, g, z)
     by_coefficient = A.coefficient_gradient(multiplier, x) if has(A, HasCoefficients) else {}
     at_upper = layout.zeros(f64) if varying[1] else None
@@ -228,6 +230,7 @@ def _classified(
         residual.y,
         residual.diagonal,
     )
+    # The result must still belong to the problem; its largest residual entry bounds the error of x.
     tally.take(rows, bounds=bounds, x=x, y=y, d=d, unknown=problem.unknown, unit=residual.unit)
     square, largest = tally.read()
     norm, allowed = float(square) ** 0.5, CHANGED * result.residual
@@ -291,6 +294,7 @@ def _adjoint(
         multiplier[free] = result.x.numpy()
         return result, wp.array(multiplier, dtype=f64, device=problem.device)
     floating = _floating(A)
+    # Unknowns off F are held at 0 by equal bounds; mu_F solves the rest.
     b = _projected(None if floating is None else floating.transposed(), g, cells).numpy()
     # Not 0, or the row would seem to be free.
     held = np.where(free, b, np.abs(b[free]).max() or 1.0).reshape(layout.stored_shape)

@@ -113,6 +113,7 @@ class GMRES:
         g[0] = norm
         for k in range(most):
             check_time()
+            # z = M W^(-1/2) v_k: the basis has weighted residuals.
             wp.copy(
                 self._preconditioner.r, self._basis, src_offset=k * self._q.size, count=self._q.size
             )
@@ -127,6 +128,7 @@ class GMRES:
                 )
             self._product(self._preconditioner.z, self._q)
             self._weigh(self._q)
+            # Arnoldi: w = W^(1/2) A z, orthogonalized, is column k of H.
             H[: k + 2, k] = self._orthogonalize(k + 1)
             self._rotate(k)
             if not abs(g[k + 1]) > tolerance:  # also if it is NaN
@@ -217,6 +219,7 @@ class GMRES:
         Columns of H that are singular to rounding are omitted. For few columns the stored images M
         v_j are used.
         """
+        # Back substitution with the triangle H.
         H, g = self._H[:columns, :columns], self._g
         y = np.zeros(self._restart + 1)
         largest = float(np.abs(np.diag(H)).max(initial=0.0))
@@ -227,6 +230,7 @@ class GMRES:
         if columns <= KEPT:
             self._combine(self._factors, self.x, columns, of=self._images)
             return
+        # x += M (V y), with one more application of M.
         r = self._preconditioner.r
         r.zero_()
         self._combine(self._factors, r, columns)

@@ -212,10 +212,12 @@ class FloatingComponents:
             *(np.isfinite(bound.numpy()[inside]) for bound in (lower, upper)),
         )
         # For empty input NumPy 1 returns integers.
+        # Sums over each component: w'b, its absolute terms, and whether a bound is finite.
         mine = np.stack([np.bincount(label, v, self.count) for v in values])
         sums = self._total(mine.astype(np.float64))
         rest, scale, below, above = sums[0], sums[1], sums[2] > 0, sums[3] > 0
         self._net = rest.copy()
+        # Bounds absorb a sum of the right sign.
         rest[(below & (rest > 0)) | (above & (rest < 0))] = 0
         rounding = 4 * np.finfo(np.float64).eps if self.left is None else ROUNDED
         rest[np.abs(rest) <= rounding * scale * np.sqrt(self.sizes)] = 0  # rounding of a sum
@@ -552,6 +554,7 @@ def _null_vector(block: scipy.sparse.csr_array) -> np.ndarray:
     A is an irreducible M-matrix whose columns sum to 0. One entry is set to 1, and the others are
     the solution of the remaining equations.
     """
+    # The diagonal that makes the sums of columns exactly 0.
     away = scipy.sparse.csc_array(block - scipy.sparse.diags_array(block.diagonal()))
     exact = (away - scipy.sparse.diags_array(np.asarray(away.sum(axis=0)).ravel())).tocsc()
     v = np.ones(block.shape[0])

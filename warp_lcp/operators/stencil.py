@@ -502,7 +502,7 @@ class Stencil(GridOperator):
                 number, np.bincount(number, inside & ~rows, count + 1) > 0, self.device
             )
         matrix = grid_matrix(self)
-        if len(places) < matrix.shape[0]:  # A principal system
+        if len(places) < matrix.shape[0]:  # a principal system
             kept = inside[self.cells.numpy().ravel() == FLUID]
             matrix = matrix[kept][:, kept]
         most = MOST_IN_SPACE if self.layout.padding.counts[0] > 1 else MOST_IN_PLANE

@@ -119,6 +119,7 @@ def equilibrated(program: ProgramWithRows) -> tuple[ProgramWithRows, ProgramUnit
     E = 1 / _nonzero(_largest(B, 1))
     curvature = abs(Q) / _nonzero(_largest(Q, 0).max(initial=0.0))
     D = np.ones(n)
+    # Ruiz's iteration on diag(D, E) [[Q, B'], [B, 0]] diag(D, E).
     for _ in range(SWEEPS):
         rows = scaled(B, E, D)
         D = D / np.sqrt(
@@ -126,6 +127,8 @@ def equilibrated(program: ProgramWithRows) -> tuple[ProgramWithRows, ProgramUnit
         )
         E = E / np.sqrt(_nonzero(_largest(rows, 1)))
     D, E = _power_of_two(D), _power_of_two(E)
+    # sigma: median of the nonzero bounds and right-hand sides; cost: 1 over the size of the
+    # gradient sigma D (Q x + c).
     right = np.r_[E * np.r_[program.h, program.d], program.lower / D, program.upper / D]
     sizes = np.abs(right[np.isfinite(right) & (right != 0)])
     bend = float(_largest(scaled(Q, D, D), 0).max(initial=0.0))
@@ -185,11 +188,13 @@ def relative_residuals(program: ProgramWithRows, point: ProgramPoint) -> tuple[f
         np.abs(np.r_[p.h, p.d]),
         np.r_[np.where(z > 0, np.abs(slack), np.maximum(-slack, 0.0)), np.abs(miss)],
     )
+    # Primal residual: equations and inequalities with a multiplier must hold exactly.
     primal = _relative(
         missed,
         abs(rows) @ np.abs(x) + right,
         _largest(abs(rows), 1) * np.abs(x).max(initial=0.0) + right,
     )
+    # Dual residual: g must be >= 0 at lower bounds, <= 0 at upper bounds, and 0 elsewhere.
     g, multipliers = _gradient(p, point), np.abs(np.r_[z, y])
     wrong = np.where(
         x <= p.lower, np.maximum(-g, 0.0), np.where(x >= p.upper, np.maximum(g, 0.0), np.abs(g))
@@ -205,6 +210,7 @@ def relative_residuals(program: ProgramWithRows, point: ProgramPoint) -> tuple[f
         + (least if np.isfinite(least) else 1.0)
     )
     dual = _relative(wrong, terms, sizes)
+    # Duality gap x'Qx + c'x - h'z - d'y - (g'x at bounds).
     held = np.where((x <= p.lower) | (x >= p.upper), g * x, 0.0)
     parts = np.r_[x * (p.Q @ x), p.c * x, -p.h * z, -p.d * y, -held]
     sides = np.r_[x * (p.G.T @ z), x * (p.C.T @ y)]  # of the same size, where h and d are 0
@@ -234,6 +240,7 @@ def polished(program: ProgramWithRows, point: ProgramPoint) -> ProgramPoint:
         newton_point = _newton(p, now, low, high, tight)
         if newton_point is None:
             break
+        # The Newton point, projected, and the same with canceled entries of x set to 0.
         inside = ProgramPoint(
             np.clip(newton_point.x, p.lower, p.upper),
             np.maximum(newton_point.z, 0.0),
@@ -249,6 +256,8 @@ def polished(program: ProgramWithRows, point: ProgramPoint) -> ProgramPoint:
             worth = max(relative_residuals(p, tried))
             if worth < error:
                 best, error = tried, worth
+        # The next active set: a held row is released if its multiplier has the wrong sign, a free
+        # row is held if it is violated.
         slope, slack = _gradient(p, newton_point), p.G @ newton_point.x - p.h
         fixed = p.lower == p.upper
         low, high = (
@@ -278,6 +287,8 @@ def has_no_solution(program: ProgramWithRows) -> str:
         [scipy.sparse.csr_array(p.G), scipy.sparse.csr_array(p.C), unit[low], -unit[high]]
     ).tocsr()
     worth = np.r_[p.h, p.d, p.lower[low], -p.upper[high]]
+    # Farkas: find v with [G; C; I; -I]'v = 0, v >= 0 except for equations, and h'z + d'y + l'v -
+    # u'w > 0.
     if len(worth):
         size = _nonzero(np.abs(worth))  # each row in its own size: a far bound is no proof
         rows_of_one, worth_of_one = scaled(rows, 1 / size, np.ones(n)), worth / size
@@ -294,6 +305,8 @@ def has_no_solution(program: ProgramWithRows) -> str:
                 return "infeasible"
     if not p.c.any():
         return ""
+    # Unboundedness: find e with Q e = 0, C e = 0, G e >= 0 and the signs of infinite bounds, and
+    # c'e < 0.
     sides = np.stack(
         [np.where(np.isfinite(p.lower), 0.0, -1.0), np.where(np.isfinite(p.upper), 0.0, 1.0)],
         axis=1,
@@ -333,6 +346,8 @@ def _newton(
     if len(free) + len(right):
         solve = _factored(p.Q[free][:, free], B[:, free])
         for _ in range(REFINEMENTS if solve else 0):
+            # Step of the equations of the active set; the right-hand side is recomputed, which
+            # refines the solution.
             slope = (p.Q @ x + p.c - B.T @ multipliers)[free]
             step = -solve(np.r_[slope, B @ x - right])  # type: ignore[misc]
             x[free] += step[: len(free)]

@@ -56,6 +56,7 @@ def sizes_of_matrix(A: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         if _diagonal_leads(size, d):
             d = np.where(d > 0, d, 1.0)
             return d, np.sqrt(d), np.sqrt(d)
+    # Columns are scaled by q, then rows by t.
     q = _largest(size, 0)
     q = np.where(q > 0, q, 1.0)
     t = _largest(scaled(size, np.ones_like(q), 1 / q), 1)
@@ -131,13 +132,16 @@ def _diagonal_leads(size: Any, d: np.ndarray) -> bool:
     zero = np.flatnonzero(d == 0)
     if zero.size and (_largest(size[zero], 1).any() or _largest(size[:, zero], 0).any()):
         return False
+    # w_ij = |a_ij| / sqrt(d_i d_j) must satisfy g_i w_ij / g_j <= 1 for some g > 0.
     root = np.sqrt(np.where(d > 0, d, 1.0))
     w = scaled(size, 1 / root, 1 / root)
     if w.max() <= 1 + SLACK:
         return True
+    # g cannot exist if w_ij w_ji > 1.
     if (w.multiply(w.T) if scipy.sparse.issparse(w) else w * w.T).max() > 1 + 2 * SLACK:
         return False
     g = np.ones_like(d)
+    # Bellman-Ford: reduce g_i until no constraint is violated.
     for _ in range(PASSES):
         most = _largest(scaled(w, g, 1 / g), 1)
         if most.max() <= 1 + SLACK:

@@ -434,7 +434,7 @@ def _workspaces_of(method: type) -> tuple[type, ...]:
     """
     try:
         hint = get_type_hints(method.init).get("return")  # type: ignore[attr-defined]
-    except NameError:  # A user's method, with names that exist for type checkers only
+    except NameError:  # a user's method, with names that exist for type checkers only
         return ()
     return tuple(
         kind

@@ -105,7 +105,7 @@ class DenseProblem:
         b, start = R * self.b, R * (self.A @ np.clip(0.0, self.lower, self.upper))
         beta = power_of_two(max(np.abs(b).max(), np.abs(start).max()) or 1.0)
         units = beta * C
-        with np.errstate(over="ignore"):  # A bound that overflows in these units is infinite
+        with np.errstate(over="ignore"):  # a bound that overflows in these units is infinite
             sides = self.lower / units, self.upper / units
         return DenseProblem(
             self.rows, scaled(self.A, R, C), b / beta, *sides, self.symmetric
@@ -280,6 +280,7 @@ def certifies(data: DenseProblem, z: np.ndarray) -> bool:
         z: multipliers, shape (n,), of those signs or another vector.
     """
     below, above = np.isfinite(data.lower), np.isfinite(data.upper)
+    # The signs that the multipliers need; other components are set to 0.
     z = np.where(
         below & above,
         0.0,
@@ -287,11 +288,13 @@ def certifies(data: DenseProblem, z: np.ndarray) -> bool:
     )
     magnitude = abs(data.A)
     with np.errstate(over="ignore", invalid="ignore"):
+        # g = A'z; noise is the bound of its rounding error.
         g, terms = data.A.T @ z, magnitude.T @ np.abs(z)
         noise = ROUNDING * np.sqrt(entries_of_columns(data.A)) * EPS * terms
         if (g > noise)[~above].any() or (g < -noise)[~below].any():
             return False
         low, high = np.where(below, data.lower, 0.0), np.where(above, data.upper, 0.0)
+        # sum_j max(g_j l_j, g_j u_j), where g_j has the sign of a finite bound.
         gains = np.maximum(g, 0.0) * high + np.minimum(g, 0.0) * low
         doubt = SHARE * (np.abs(data.b) @ np.abs(z) + np.abs(gains).sum()) + noise @ np.maximum(
             np.abs(low), np.abs(high)
@@ -356,6 +359,7 @@ def inconsistent(data: DenseProblem) -> bool:
         return False
     R, C, beta = _units_with_right_side(A, b)
     up, low = np.flatnonzero(above), np.flatnonzero(below)
+    # The variables are (z, p, q), p where u is finite and q where l is: A'z - p + q = 0.
     identity = scipy.sparse.eye_array(len(data.b), format="csc")
     system = scipy.sparse.hstack(
         [scipy.sparse.csc_array(scaled(A, R, C).T), -identity[:, up], identity[:, low]],
@@ -418,6 +422,8 @@ def _refined(transpose: Any, z: np.ndarray) -> np.ndarray:
     vertex of the linear program has 0, its solver leaves at most 1e-10 of the terms.
     """
     g, terms = transpose @ z, abs(transpose) @ np.abs(z)
+    # The equations (A'z)_j = 0 of the vertex, on the nonzero multipliers: z minus its least-squares
+    # projection onto the row space solves them exactly.
     zero, support = np.flatnonzero(np.abs(g) <= VERTEX * terms), np.flatnonzero(np.abs(z) > VERTEX)
     block, out = transpose[zero][:, support], np.zeros(len(z))
     out[support] = (
@@ -441,6 +447,7 @@ def _units_with_right_side(A: Any, b: np.ndarray) -> tuple[np.ndarray, np.ndarra
         rows, columns = (
             now.max(axis=k).toarray().ravel() if sparse else now.max(axis=k) for k in (1, 0)
         )
+        # Half of the logarithm of each row, column and right-hand side is removed (Ruiz).
         R, C = (
             R / power_of_two(np.sqrt(np.maximum(rows, right))),
             C / power_of_two(np.sqrt(columns)),
@@ -474,6 +481,7 @@ def without_contact(data: DenseProblem, x: np.ndarray) -> np.ndarray:
     order = np.lexsort((-np.abs(A.diagonal()), label))
     held = order[np.searchsorted(label[order], np.arange(count))]
     rest = np.setdiff1d(np.arange(len(x)), held)
+    # Right-hand sides for x_R (with x = 0 at the held unknowns) and for z_R (with z = 1 there).
     sides = np.stack([-data.b[rest], -np.asarray(A[rest][:, held].sum(axis=1)).ravel()], axis=1)
     particular, z = np.zeros(len(x)), np.zeros(len(x))
     solved = solved_or_none(A[rest][:, rest], sides) if len(rest) else sides
@@ -482,6 +490,8 @@ def without_contact(data: DenseProblem, x: np.ndarray) -> np.ndarray:
     particular[rest], z[rest], z[held] = solved[:, 0], solved[:, 1], 1.0
     zero = np.abs(A @ z) <= NULL * (abs(A) @ np.abs(z))
     with np.errstate(divide="ignore", invalid="ignore"):
+        # Shifts t with l <= particular + t z <= u: an interval for each unknown, intersected for
+        # each component.
         ends = np.sort([(bound - particular) / z for bound in (data.lower, data.upper)], axis=0)
     low, high = np.full(count, -np.inf), np.full(count, np.inf)
     np.maximum.at(low, label, np.where(z == 0, -np.inf, ends[0]))

@@ -19,7 +19,7 @@ from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.reduced.dense_problem import equilibration, factored, incompatible
 
-PROGRESS = 0.999  # A residual above this part of the smallest so far is no progress
+PROGRESS = 0.999  # a residual above this part of the smallest so far is no progress
 STALLED = 10  # steps without progress after which damped steps end
 REGULARIZATIONS = (1e-8, 1e-4, 1e-2, 0.1, 1.0, 10.0, 100.0)  # of J'J, times its mean diagonal
 
@@ -139,6 +139,8 @@ class DampedSteps:
             p.upper.numpy(),
             p.A.matrix.numpy().astype(np.float64),  # type: ignore[attr-defined]
         )
+        # Natural residual r and its Jacobian J: row i is d_i e_i' where x_i is held, and row i of A
+        # elsewhere.
         r = d * (start - np.clip(start - y / d, lower, upper))
         held = (start - y / d < lower) | (start - y / d > upper)
         J = np.where(held[:, None], np.diag(d), A)

@@ -72,6 +72,7 @@ class Descent:
         Returns 0 if the decrease is within rounding.
         """
         fell, left = self._energy - energy, norm / self._norm if self._norm > 0 else 0.0
+        # Changes of the energy below `margin` may be rounding.
         margin = self.noise * (abs(self._energy) + abs(energy))
         above = energy - self._lowest
         self._left, self._energy, self._norm, self.sinks, self._least = (
@@ -108,6 +109,8 @@ class Descent:
         boundary returns by one layer of cells a step. That begins with a step whose projection
         overshoots the contact: the energy rises, or the residual hardly falls.
         """
+        # Slow: the energy rises, falls nearly as little as in the step before, or the residual
+        # hardly falls.
         slow = moved and fell != 0 and (fell < 0 or fell > CREEP * self._fell or self._left > STALL)
         called = slow and self._pause == 0
         self._fell, self._pause = math.inf if called else fell, max(self._pause - 1, 0)

@@ -160,7 +160,7 @@ class HostResidual(NaturalResidual):
 
     def evaluate(self, x: wp.array[Any]) -> float:
         """Compute y and return the norm of the natural residual at x."""
-        if not self._taken:  # A block among others is evaluated before it is solved
+        if not self._taken:  # a block among others is evaluated before it is solved
             self._take()
         values, y, d = self.values(x), self._y, self.scale
         np.add(self.matrix.product(values), self.b, out=y)
@@ -304,6 +304,7 @@ class HostSystem:
                 (residual.norm, 0) if residual.norm < self._least else (self._least, self._idle + 1)
             )
         self._x = self.iterate.read()
+        # Unknown i is held at l or u where x_i - y_i / d_i is outside [l_i, u_i].
         target = self._x - self.iterate.y() / self._d
         self._below, self._above = target < self._lower, target > self._upper
         self._left -= 1
@@ -319,6 +320,7 @@ class HostSystem:
         if self._left < 0 or self._idle >= IDLE or self._comes_again(below, above):
             return None
         self._held = below | above
+        # Held unknowns at their bounds; A_FF e_F = -(A start + b)_F.
         start = np.where(below, self._lower, np.where(above, self._upper, self._x))
         e = self._matrix.solve(~self._held, -(self._matrix.product(start) + self._b))
         if e is None or not np.isfinite(e).all():

@@ -291,6 +291,8 @@ class LowRankCorrection:
         found, width, across = self.noted.numpy().copy(), self._columns.width, low.layout.across
         found = found if across is None else across.sum(found)
         squares, rows = found[: low.rank], np.repeat(found[low.rank :], width)
+        # Ratio of added to own inertia of column q: W_qq U_q'A^-1 U_q, estimated from the rows that
+        # it touches.
         strong = np.flatnonzero(
             W.diagonal() * SPREAD * rows ** float(self._power.value) * squares >= STRONG
         ).tolist()
@@ -450,13 +452,16 @@ class LowRankCorrection:
             if self._read_products is not None:
                 self._read_products.changed()
         products = self._products if self._read_products is None else self._read_products
+        # G = U'Z, of which S has the rows of the corrected columns; its symmetric and skew parts.
         G = np.ascontiguousarray(products.numpy()[: m * self._low.rank].reshape(m, -1).T)
         S = G[self._slot_columns]
         even, odd = 0.5 * (S + S.T), 0.5 * (S - S.T)
+        # W^(1/2) on the corrected columns, from the eigenvectors of W.
         values, vectors = np.linalg.eigh(W[np.ix_(self._slot_columns, self._slot_columns)])
         root = vectors * np.sqrt(np.maximum(values, 0.0))
         ratios, modes = np.linalg.eigh(root.T @ even @ root)
         felt = ratios > FELT
+        # V spans the modes with a ratio above FELT; V (V'M V)^-1 V' is the inverse of M on them.
         V = root @ modes[:, felt]
         scale = 1.0 / np.sqrt(ratios[felt])
         skew = np.abs(scale[:, None] * (V.T @ odd @ V) * scale).max(initial=0.0)

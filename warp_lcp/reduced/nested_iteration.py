@@ -58,6 +58,8 @@ class BlockTridiagonalProblem:
         parts = []
         for block in (-1, 0, 1):
             row = place.reshape(m, k, 1)
+            # Columns of the blocks before, at and after the diagonal; entries beyond the band or
+            # the matrix are 0.
             column = row - row % k + block * k + np.arange(k)
             band = A.width + row - column
             inside = (band >= 0) & (band <= 2 * A.width) & (column >= 0) & (column < n) & (row < n)
@@ -66,6 +68,7 @@ class BlockTridiagonalProblem:
                     inside, A.bands[np.where(inside, band, 0), np.where(inside, column, 0)], 0.0
                 )
             )
+        # Equations x_i = 0 in the rows that complete the last block.
         parts[1][-1] += np.diag(place[-k:] >= n).astype(np.float64)
         fields = (
             np.r_[f, np.full(m * k - n, end)].reshape(m, k)
@@ -89,6 +92,8 @@ class BlockTridiagonalProblem:
         before = _times(self.left[2::2], inverse[: len(diagonal) - 1])
         after = _times(self.right[even][: len(inverse)], inverse)  # the same for the one after it
         count = len(before)
+        # S = A_CC - A_CF A_FF^-1 A_FC is block tridiagonal: an even block is coupled to the even
+        # blocks on either side through the odd block between.
         diagonal[1:] -= _times(before, self.right[odd][:count])
         diagonal[: len(after)] -= _times(after, self.left[odd])
         left[1:] = -_times(before, self.left[odd][:count])
@@ -103,6 +108,7 @@ class BlockTridiagonalProblem:
         """Return x, shape (m, k), from its even blocks: y = 0 on the odd ones."""
         x = np.zeros_like(self.b)
         x[::2] = coarse
+        # r_F = b_F + A_FC x_C.
         r = self.b[1::2] + _applied(self.left[1::2], x[:-1:2])
         following = x[2::2]
         r[: len(following)] += _applied(self.right[1::2][: len(following)], following)

@@ -243,7 +243,7 @@ class IncompleteFactors:
             return scipy.sparse.linalg.spilu(
                 nudged(block, NUDGE, small=100 * DROP), drop_tol=DROP, fill_factor=FILL
             ).solve
-        except RuntimeError:  # A factor is exactly singular after all
+        except RuntimeError:  # a factor is exactly singular after all
             return np.asarray
 
 

@@ -260,6 +260,8 @@ class FischerWorkspace(IterateMemory):
             if not fused and self.cold_start is not None:
                 self.residual.affine(x)
             self._condense(x)
+        # From here on all is in units of the residual's norm, `size`: r is -f / (q size), and the
+        # step is size e.
         size, merit = 1 / self._scale, self._merit
         self._scale = 0.0
         if isinstance(self.system, FiniteDifferenceSystem):
@@ -472,10 +474,12 @@ class FischerDenseWorkspace(DenseWorkspace):
         J = map_.jacobian(p, q)
         dx = np.zeros(len(x))
         dx[move] = _solve(J[np.ix_(move, move)], -f[move])
+        # A stationary point of f'f / 2 that is no solution.
         gradient = J.T @ f
         if np.linalg.norm(gradient / map_.d) <= 1e-12 * np.linalg.norm(f):
             return SolveStatus.LOCAL_MINIMUM
         failure = self._searched(x, dx, float(gradient @ dx), 0.5 * float(f @ f), projected=True)
+        # Projected gradient of the merit.
         inside = map_.d * (x - np.clip(x - gradient / map_.d**2, map_.data.lower, map_.data.upper))
         return (
             SolveStatus.LOCAL_MINIMUM
@@ -490,6 +494,7 @@ class FischerDenseWorkspace(DenseWorkspace):
         """
         x, map_ = self._iterate, self.map
         f, p, q, kinks = map_.linearized(x)
+        # At a kink the row of J is d e_i'.
         if map_.kink is Kink.ZERO:
             p, q = np.where(kinks, 1.0, p), np.where(kinks, 0.0, q)
         J = map_.jacobian(p, q)
@@ -557,6 +562,7 @@ class FischerDenseWorkspace(DenseWorkspace):
             float(np.hypot(np.linalg.norm(gap), np.linalg.norm(f))),
             1.0,
         )
+        # Armijo's condition on hypot(||gap||, ||f||); the gap is linear in the step length.
         while length > 1e-6:
             after = map_.value(x + length * dx, y + length * dy, self._mu)
             if (

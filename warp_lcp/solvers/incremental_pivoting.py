@@ -130,6 +130,7 @@ class PivotingWorkspace(DenseWorkspace):
         `surely`: only violations beyond every rounding error, without the cost of a product.
         """
         x, y, data = self.values, self.y, self.data
+        # A negative y must be raised, or x must be at its upper bound, and vice versa.
         wrong = np.where(y < 0, x < data.upper, x > data.lower)
         if surely:
             noise = CLEAR * (self.sizes * np.abs(x).sum() + np.abs(data.b))
@@ -172,6 +173,7 @@ class PivotingWorkspace(DenseWorkspace):
         """
         j, F, data = self.driven, self.inverse.members, self.data
         dx = np.zeros(len(data.b))
+        # dx_F = -A_FF^-1 A_Fj and dy = A dx, in the direction that reduces |y_j|.
         z, dy = self.inverse.direction(j)
         dx[F], dx[j], dy = self.sign * z, self.sign, self.sign * dy
         dy[F] = 0.0
@@ -181,6 +183,7 @@ class PivotingWorkspace(DenseWorkspace):
             # Negative curvature: A has changed since `init` and is not positive semi-definite.
             self.ended = SolveStatus.NON_DESCENT
             return
+        # The longest step that keeps all fulfilled conditions.
         steps = self._steps(dx, dy, noise)
         length = steps.min()
         if not np.isfinite(length):
@@ -218,15 +221,18 @@ class PivotingWorkspace(DenseWorkspace):
         """Return the step length at which each row blocks ([Book] eqs. 2.26-2.27)."""
         x, y, kind, data, j = self.values, self.y, self.kind, self.data, self.driven
         steps = np.full(len(x), np.inf)
+        # Free rows: x reaches a bound.
         free = (kind == FREE) & (np.abs(dx) > ZERO * np.abs(dx).max())
         free[j] = True
         room = np.where(dx > 0, data.upper - x, x - data.lower)
-        with np.errstate(over="ignore"):  # A bound that is practically infinite
+        with np.errstate(over="ignore"):  # a bound that is practically infinite
             steps[free] = np.maximum(room[free], 0.0) / np.abs(dx[free])
+        # Rows at a bound: y reaches 0 from its sign.
         leaving = ((kind == LOW) & (dy < -noise)) | ((kind == HIGH) & (dy > noise))
         leaving &= data.lower < data.upper
         slack = np.where(kind == LOW, y, -y)
         steps[leaving] = np.maximum(slack[leaving], 0.0) / np.abs(dy[leaving])
+        # The driven row: y_j reaches 0.
         to_zero = abs(y[j]) / abs(dy[j]) if self.sign * dy[j] > noise[j] else np.inf
         self._vanishes = to_zero <= steps[j]  # y_j reaches 0 before x_j reaches its bound
         steps[j] = min(steps[j], to_zero)
@@ -313,6 +319,7 @@ class PrincipalInverse:
         z has shape (k,). The rate of y = A x, shape (n,), is that for x_F moving by z and x_j by 1.
         """
         k, row = self.count, self._permuted[self._place[j]]
+        # z = -A_FF^-1 A_Fj by the inverse; refined if the residual in the rows F is too large.
         z = np.zeros(k) if self.singular else -(self._inverse[:k, :k] @ row[:k])
         rate = self._permuted[:, :k] @ z + row
         if k and (self.singular or not np.abs(rate[:k]).max() <= CLOSE * np.abs(row[:k]).max()):

@@ -291,6 +291,7 @@ class InteriorPointWorkspace(IterateMemory):
         if self.count:
             if self.near:
                 least = NEAR * self.residual.norm / math.sqrt(self.count)
+            # A far start: the size of b, or of the residual if that is larger.
             else:
                 unknowns = max(int(np.count_nonzero(p.unknown.numpy() == 1)), 1)
                 # b may be 0 where the bounds are not, and one held row of b may be far larger than
@@ -328,6 +329,7 @@ class InteriorPointWorkspace(IterateMemory):
         self.size = max(self.residual.norm, 1e-300)
         tau = 0.0 if s.mehrotra else self.mu / self.steps
         second = 0.0
+        # D = s / w + t / v and r = -(A x + b) + tau / w - tau / v, over `size`.
         self._sums.of(
             CONDENSE,
             self._pairs,
@@ -342,11 +344,13 @@ class InteriorPointWorkspace(IterateMemory):
         iterations = self._solve(s.predictor_eta if s.mehrotra and self.count else s.eta)
         longest, products = self._ratios(second, tau)
         if s.mehrotra and self.count:
+            # Mehrotra's corrector, from the predictor's ratios.
             tau, second = self._center(longest, products), 1.0
             self._correct(tau, y=self.residual.y, D=None)
             self._project()
             iterations += self._solve(s.eta)
             longest, _ = self._ratios(second, tau)
+        # The same length for x, w, v, s and t.
         share = s.backoff if s.mehrotra else min(s.backoff, self.steps / (s.horizon + 1))
         length = min(1.0, share / longest) if longest > 0 else 1.0
         self._move(x, second, tau, length)

@@ -70,6 +70,7 @@ class LemkeForm:
         if scipy.sparse.issparse(data.A):
             return cls._of_narrow(data)
         A, lower, upper, n = data.A, data.lower, data.upper, len(data.b)
+        # x = base + columns z: `sign` is 1 for x = l + z and -1 for x = u - z.
         fixed = lower == upper
         below, above = np.isfinite(lower) & ~fixed, np.isfinite(upper) & ~fixed
         equations = np.flatnonzero(~below & ~above & ~fixed)
@@ -82,6 +83,8 @@ class LemkeForm:
         if len(sided) == n:
             M, q = sign[:, None] * A * sign, sign * (A @ base + data.b)
         elif len(equations):
+            # Eliminate the equations: x_E = -A_EE^-1 (b_E + A_EI x_I), which changes base and
+            # columns.
             block = A[np.ix_(equations, equations)]
             if 1 / np.linalg.cond(block) > REGULAR:
                 base[equations] = 0.0
@@ -90,6 +93,7 @@ class LemkeForm:
                 tests = columns[sided].T
                 M, q = tests @ (A @ columns)[sided], tests @ (A @ base + data.b)[sided]
             else:
+                # The block is singular: x_E = x+ - x- with both parts >= 0.
                 split = np.zeros((n, 2 * len(equations)))
                 split[np.r_[equations, equations], np.arange(2 * len(equations))] = np.repeat(
                     [1.0, -1.0], len(equations)
@@ -99,6 +103,7 @@ class LemkeForm:
         else:  # a choice of rows and columns with signs, no product of matrices
             M, q = sign[:, None] * A[np.ix_(sided, sided)] * sign, sign * (A @ base + data.b)[sided]
         both, m = np.flatnonzero((below & above)[sided]), len(q)
+        # Boxes: one more pair s = u - l - z >= 0.
         if len(both):
             k = len(both)
             pick = np.zeros((k, m))
@@ -344,11 +349,13 @@ class Basis:
         rows = np.flatnonzero(direction > PIVOT * np.abs(direction).max())
         if not len(rows):
             return None
+        # Minimum ratio test with a tolerance for ties.
         ratios = np.maximum(self.values[rows], 0.0) / direction[rows]
         rows = rows[ratios <= ratios.min() + TIE * max(ratios.min(), np.abs(self.q).max())]
         ends = (self.variables[rows] == self.ends[0]) | (self.variables[rows] == self.ends[1])
         if ends.any():
             return int(rows[ends][0])
+        # Lexicographic rule: of tied rows those with the least B^-1 row, column by column.
         inverse = self._rows_of_inverse(rows) if len(rows) > 1 else None
         for column in range(self.m):
             if inverse is None or len(rows) == 1:

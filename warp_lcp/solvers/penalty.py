@@ -166,12 +166,14 @@ class PenaltyWorkspace(IterateMemory):
         if first:
             self.residual.affine(x)
         if first or self._raise():
+            # Larger rho: springs keep their sides, and z moves toward its bounds.
             self._sort(x, first=first, keep=not first)
             self.residual.affine(x)  # unknowns within y / (rho d) of a bound are on it now
             self._stale = True
         self.steps += 1
         if self._stale:
             self.system.restrict(self._free, self._shift)
+        # (A + rho D_V) e = -(A x + b) / size; the solve is more accurate once V has stayed.
         settled, size = self._moved == 0, max(self.residual.norm, 1e-300)
         self._sums.of(ON_FREE, y=self.residual.y, free=self._free, g=self.system.r, scale=1 / size)
         if self.floating is not None:  # the singular part: components without springs
@@ -179,6 +181,7 @@ class PenaltyWorkspace(IterateMemory):
         factor = max(s.eta**2 if settled else s.eta, 0.3 * SHARE * self.target / size)
         norm = self.system.norm()
         iterations = self.system.solve(factor * norm, s.max_linear_iterations)[0] if norm > 0 else 0
+        # z = x + size e; then y at z, the springs of the next step, and x = clip(z, l, u).
         MOVE.bind(
             self._sums.rows, x=x, e=self.system.e, unknown=p.unknown, side=self.side, size=size
         ).launch()

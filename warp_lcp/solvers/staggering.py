@@ -169,6 +169,7 @@ class StaggeredRound:
         for k in range(count) if forward else reversed(range(count)):
             check_time()
             norm = self._residual(k)
+            # A block is solved to eta times its residual, or to its share of the tolerance.
             goal = max(self._eta * norm, SHARE * target / math.sqrt(count))
             if not math.isfinite(norm) or norm <= goal:
                 continue
@@ -265,6 +266,7 @@ def color_blocks(matrix: scipy.sparse.csr_array, owner: np.ndarray, count: int) 
     pattern = scipy.sparse.csr_array(
         (np.ones(matrix.nnz), matrix.indices, matrix.indptr), shape=matrix.shape
     )
+    # The graph of blocks: two are neighbors if A has an entry between them.
     color = greedy_colors((members.T @ pattern @ members).tocsr())
     return [np.flatnonzero(color == c) for c in range(int(color.max()) + 1)]
 
@@ -372,6 +374,7 @@ class GridBlock:
         """Write the block's b: A x + b without the block's own part of A x."""
         whole, member = self._whole, self._member
         whole.bounds.follow(self._x)
+        # b_B = A x + b - A_BB x_B on the block's cells.
         whole.apply_plus(self._x, whole.b, self._y)
         SELECT.bind(
             rows_of(self._x), x=self._x, less=None, target=self._guess, member=member, kept=False

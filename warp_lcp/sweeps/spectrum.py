@@ -88,12 +88,15 @@ def _lanczos(product: Any, v: np.ndarray, steps: int) -> tuple[float, float]:
     old = np.zeros_like(v)
     for _ in range(steps):
         check_time()
+        # w = A v - beta v_old - alpha v; alpha and beta are the tridiagonal matrix of the Ritz
+        # values.
         w = product(v)
         if beta:
             w -= beta[-1] * old
         alpha.append(float(v @ w))
         w -= alpha[-1] * v
         size = float(np.linalg.norm(w))
+        # The Krylov space is exhausted.
         if size <= 1e-10 * max(map(abs, alpha)):
             break
         beta.append(size)
