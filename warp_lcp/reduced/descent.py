@@ -109,8 +109,7 @@ class Descent:
         boundary returns by one layer of cells a step. That begins with a step whose projection
         overshoots the contact: the energy rises, or the residual hardly falls.
         """
-        # Slow: the energy rises, falls nearly as little as in the step before, or the residual
-        # hardly falls.
+        # Slow: the energy rises or falls evenly, or the residual hardly falls.
         slow = moved and fell != 0 and (fell < 0 or fell > CREEP * self._fell or self._left > STALL)
         called = slow and self._pause == 0
         self._fell, self._pause = math.inf if called else fell, max(self._pause - 1, 0)
