@@ -309,7 +309,7 @@ def _told(callback: Any) -> Callable[[OptimizeResult], Any] | None:
         )
     try:
         names = set(inspect.signature(callback).parameters)
-    except ValueError:  # of a function written in C
+    except ValueError:  # a function written in C
         names = set()
     if names == {"intermediate_result"}:
         return lambda found: callback(intermediate_result=found)

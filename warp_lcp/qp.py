@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     from qpsolvers import Problem, Solution
 
 NAME = "warp_lcp"
-LOOSER = 10.0  # times tol: residuals row by row, where a method has met tol in the norm of all rows
-LEAST = 1e-12  # the least tolerance of rows, which rounding leaves
+LOOSER = 10.0  # times tol: limit of each row's residual; methods meet tol in the norm of all rows
+LEAST = 1e-12  # least tolerance of a row: rounding errors
 WORDS = {
     "infeasible": "no x meets the constraints",
     "unbounded": "the objective is unbounded below",

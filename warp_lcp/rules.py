@@ -25,7 +25,7 @@ FEW_SWEEPS = {"grid": 25, "sparse": 60}
 PIVOTED = 1000
 # Largest number of unknowns for which Lemke's method may take LONG_PATHS steps: ten seconds.
 SURE, LONG_PATHS = 100, 2000
-LONGEST = 5000  # steps of a method that sweeps: a prediction may be too low
+LONGEST = 5000  # limit of steps of a method that sweeps: a prediction may be too low
 SWEEPING = (
     "psor",
     "nncg",
@@ -33,7 +33,7 @@ SWEEPING = (
     "projected-jacobi",
     "accelerated-projected-gradient",
 )
-OTHERS = 100  # steps of other methods
+OTHERS = 100  # limit of steps of other methods
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ Count = Annotated[int, Ge(1)]
 CountOrZero = Annotated[int, Ge(0)]
 Positive = Annotated[float, Gt(0)]
 NonNegative = Annotated[float, Ge(0)]
-Share = Annotated[float, Gt(0), Lt(1)]  # neither nothing nor all
+Share = Annotated[float, Gt(0), Lt(1)]  # neither 0 nor 1
 ShareOrZero = Annotated[float, Ge(0), Lt(1)]
 ShareOrAll = Annotated[float, Gt(0), Le(1)]
 Part = Annotated[float, Ge(0), Le(1)]
@@ -205,7 +205,7 @@ def checked(name: str, given: object, annotation: Any) -> Any:
     )
     try:
         return adapter(annotation).validate_python(plain)
-    except ValueError:  # pydantic's words name one end of a range
+    except ValueError:  # pydantic's message names only one end of a range
         raise SettingError(name, value, rule(annotation)) from None
 
 

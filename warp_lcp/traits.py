@@ -24,7 +24,7 @@ from warp_lcp.reduced.host_system import suits
 from warp_lcp.solvers.psor import ProjectedSOR, grid_omega, has_advised_omega
 from warp_lcp.solvers.registry import METHODS
 
-MOST_FACTORED = 500  # unknowns of a matrix whose Cholesky factorization is tried: 4 ms
+MOST_FACTORED = 500  # largest number of unknowns for a Cholesky factorization: 4 ms
 # Of a larger dense matrix every second row and column is factored, up to MOST_SAMPLED: 0.2 s.
 SHARE_FACTORED, MOST_SAMPLED = 2, 2048
 # Number of trial sweeps, and the last ones that define the rate: the first sweeps remove the rough
@@ -128,7 +128,7 @@ class Traits:
         or for at most MOST_FACTORED unknowns from one or two Cholesky factorizations.
         """
         if self.kind == "grid":
-            return "definite"  # closed components apart, which are settled before the first step
+            return "definite"  # except closed components, which are settled before the first step
         if self.diagonal == "negative":
             return "indefinite"
         return (

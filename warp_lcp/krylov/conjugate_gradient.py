@@ -24,7 +24,7 @@ from warp_lcp.rows.vectors import Across, Reduction, rows_of
 RZ, PQ, RZ_OLD = wp.constant(0), wp.constant(1), wp.constant(2)  # slots of the device scalars
 # The slots of the decision to continue begin here, with the square of the residual.
 RR = wp.constant(3)
-# Least norm so far, iterations done, and their limit after the tolerance.
+# The tolerance, the least norm so far, the iterations done, and their limit.
 TOLERANCE, BEST, ITERATIONS, LIMIT = (wp.constant(int(RR) + i) for i in range(1, 5))
 BY_ERROR = wp.constant(8)
 SLOTS = 9

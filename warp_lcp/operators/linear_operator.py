@@ -162,7 +162,7 @@ class LinearOperator(Pickled, Operator):
         try:
             # The result is copied, because A may return its own buffer and write to it next time.
             image = np.array(product(x))
-        except ValueError as reason:  # sciPy's, for a matvec that returns another shape
+        except ValueError as reason:  # SciPy's, for a matvec that returns another shape
             raise ValueError(
                 f"A fails to multiply an array of shape {self.shape}: {reason}"
             ) from reason
@@ -238,7 +238,7 @@ def _products_of(
         ) if transpose is None and hasattr(A, "T") else transpose
     try:
         adjoint(np.zeros(shape))
-    except NotImplementedError:  # sciPy's error if there is no adjoint
+    except NotImplementedError:  # SciPy's error if there is no adjoint
         return product, None
     return product, adjoint
 

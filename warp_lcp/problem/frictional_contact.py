@@ -183,8 +183,8 @@ def onto_cones(z: np.ndarray, friction: np.ndarray) -> np.ndarray:
     """
     normal, length = z[:, 0], np.linalg.norm(z[:, 1:], axis=1)
     inside, polar = length <= friction * normal, friction * length <= -normal
-    # On the surface r_t = mu r_n z_t / |z_t|, the nearest point has r_n = (z_n + mu |z_t|) / (1 +
-    # mu^2).
+    # On the surface r_t = mu r_n z_t / |z_t| the nearest point has
+    # r_n = (z_n + mu |z_t|) / (1 + mu^2).
     side = (normal + friction * length) / (1.0 + friction**2)
     onto = np.column_stack(
         [side, (friction * side / np.maximum(length, 1e-300))[:, None] * z[:, 1:]]

@@ -136,7 +136,9 @@ def equilibrated(program: ProgramWithRows) -> tuple[ProgramWithRows, ProgramUnit
     slope = float(np.median(costs)) if len(costs) else 0.0
     sigma = float(np.median(sizes)) if len(sizes) else slope / bend if bend and slope else 1.0
     sigma = _power_of_two(sigma)
-    cost = _power_of_two(1 / (max(sigma * bend, slope) or 1.0))  # times sigma: of sigma D (Q x + c)
+    cost = _power_of_two(
+        1 / (max(sigma * bend, slope) or 1.0)
+    )  # times sigma: scale of the gradient sigma D (Q x + c)
     scaled_program = ProgramWithRows(
         scaled(Q, cost * sigma * D, D),
         cost * D * program.c,

@@ -181,13 +181,13 @@ class LowRankCorrection:
         self._power = wp.float64(
             1.0 / max(sum(n > 1 for n in hierarchy.finest.stencil.padding.counts) - 1, 1)
         )
-        # of the sums on a GPU, and the entries that it is for
+        # The reduction of the sums on a GPU, with the memory of its entries.
         self._adding: tuple[Any, Reduction] | None = None
         self._columns_of_slots = HostArray(n, wp.int32, device)
         self._of_slot = self._columns_of_slots.array
         self._size = hierarchy.finest.x.size
         self._Z = wp.zeros(0, dtype=hierarchy.real, device=device)
-        self._spare = self._Z  # in which potentials lie that get other slots
+        self._spare = self._Z  # memory for potentials that change slots
         self._bound: dict[int, tuple[Reduction, Any, Any]] = {}  # by the number of slots
         self._dots: Reduction | None = None
         self._slot_columns = list[int]()

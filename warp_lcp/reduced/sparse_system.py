@@ -39,10 +39,10 @@ NUDGE, GOLDEN = 1e-14, (math.sqrt(5) - 1) / 2
 DIRECT = 2000
 # Unknowns of a grid up to which factors are complete where cycles fail: a second or two.
 FACTORED_IN_PLANE, FACTORED_IN_SPACE = 1 << 17, 1 << 14
-RAISED = 1e-13  # share by which diagonals are raised then
+RAISED = 1e-13  # relative increase of the diagonals of complete factors
 # Of a right-hand side: any useful preconditioner reaches it, whatever rounding leaves.
 REDUCED = 1e-2
-ENOUGH = 60  # iterations within which it should
+ENOUGH = 60  # iterations within which it should reach that
 
 
 class Substitute(Protocol):

@@ -118,7 +118,7 @@ class AcceleratedWorkspace(IterateMemory):
                 greatest = scaled_spectrum(self.problem, self.settings.estimate_steps)[1]
                 # any L will do for a zero matrix
                 self.lipschitz = MARGIN * greatest if greatest > 0 else 1.0
-            self._version = version  # last: time may be up before
+            self._version = version  # last: the time limit may end the estimate before
 
     def advance(self, x: wp.array[Any]) -> None:
         """Take one step; `residual.y` is A x + b at x.

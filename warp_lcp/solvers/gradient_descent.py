@@ -121,7 +121,7 @@ class DescentWorkspace(IterateMemory):
         square, inner = map_.descend(x)
         if math.sqrt(square) <= s.gradient * math.sqrt(2 * merit):
             return Step("gradient", 1, None, SolveStatus.LOCAL_MINIMUM)
-        if self._square > 0:  # Barzilai and Borwein's length, of a step that no bound cut short
+        if self._square > 0:  # Barzilai and Borwein's length of a step without bounds
             change = 1 - inner / self._square
             self.length = self.length / change if change > 1e-6 else 10 * self.length
         self._square = square

@@ -80,7 +80,7 @@ class MPRGP(Settings):
     needs: ClassVar[str] = "A symmetric, positive semi-definite"
 
     precision: PrecisionName = "mixed"
-    monotone_cycles: CountOrZero = 1  # two cost as much as they save on splashes of 64^3 and 128^3
+    monotone_cycles: CountOrZero = 1  # on splashes of 64^3 and 128^3 two save no time
     gamma: Positive = 1.0
     patience: Count = 3
     cycle: CycleSettings = field(default_factory=CycleSettings)

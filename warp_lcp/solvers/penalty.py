@@ -166,7 +166,7 @@ class PenaltyWorkspace(IterateMemory):
         if first:
             self.residual.affine(x)
         if first or self._raise():
-            # Larger rho: springs keep their sides, and z moves toward its bounds.
+            # The first step finds the springs at x; a larger rho keeps them.
             self._sort(x, first=first, keep=not first)
             self.residual.affine(x)  # unknowns within y / (rho d) of a bound are on it now
             self._stale = True
