@@ -35,8 +35,9 @@ class AcceleratedProjectedGradient(Settings):
     + b) / L, l, u), where z = x + beta (x - x_old) with Nesterov's beta. The momentum is reset
     where (z - x+)' D (x+ - x) > 0. L comes from Lanczos' method and is raised where the curvature
     of a step exceeds it; where the curvature exceeds 1.5 L, the step is rejected. A step needs one
-    product with A, since A z + b is extrapolated in the same way as z. Converges for symmetric
-    positive semidefinite A; the error of the energy falls as 1/k^2, and faster in the end.
+    product with A, since A z + b is extrapolated in the same way as z. The method converges for
+    symmetric positive semidefinite A; the error of the energy falls as 1/k^2, and faster near the
+    solution.
 
     Args:
         lipschitz: L > 0 in the metric D; estimated if None.

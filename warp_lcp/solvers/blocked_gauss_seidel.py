@@ -58,11 +58,12 @@ class BlockedGaussSeidel(Settings):
 
     With blocks of one unknown it is projected Gauss-Seidel, with one block it is the solver of that
     block. Strong coupling within a block, such as between a contact's normal and tangential forces,
-    then costs no sweeps. Converges for symmetric positive definite A. A kernel solves blocks of at
-    most 6 unknowns exactly: it changes the active set until no condition is violated, and tries all
-    sets if that does not end. Bounds that are affine in x, also in unknowns of the block, are part
-    of that system. On CUDA, blocks that are not coupled are solved in parallel. Larger blocks, and
-    all blocks if `sub_solver` is given, are problems of their own, solved one by one from the host.
+    does not slow the sweeps down. The method converges for symmetric positive definite A. A kernel
+    solves blocks of at most 6 unknowns exactly: it changes the active set until no condition is
+    violated, and tries all sets if that does not end. Bounds that are affine in x, also in unknowns
+    of the block, are part of that system. On CUDA, blocks that are not coupled are solved in
+    parallel. Larger blocks, and all blocks if `sub_solver` is given, are solved one after the other
+    from the host, each as a problem of its own.
 
     On grids the default blocks are lines of cells, in two colors. Lines along an axis whose
     coefficients are many times the others' make sweeps converge as if all coefficients were equal.

@@ -32,10 +32,10 @@ class DirectEnumeration:
     [Book] 2.1.1, eqs. 2.10-2.12, algorithm 1.
 
     Each unknown is at l, at u or free with y = 0, which makes 2^n complementarity cones for the LCP
-    and 3^n for a box; the set that solves the problem most exactly wins. A may be anything:
-    unsymmetric, indefinite, singular. A free block that is singular contributes its basic solution.
-    Where no set solves the problem, by far or as multipliers prove, there is no solution:
-    INFEASIBLE. x0 is not used; `linear_iterations` counts sets.
+    and 3^n for a box. The result is the set with the smallest residual. A may be unsymmetric,
+    indefinite or singular. For a singular free block the basic solution is taken. The status is
+    INFEASIBLE where no set comes near a solution, or where multipliers prove that there is none. x0
+    is not used; `linear_iterations` counts sets.
 
     For many problems at once see `enumerate_batch`.
     """
@@ -128,9 +128,9 @@ def enumerate_batch(
 
     [Book] 2.1.1.
 
-    Rows may be in units of their own: each problem is equilibrated symmetrically first, exactly, by
-    powers of 2. Device arrays of one type are used without a copy, and nothing is allocated if
-    `out` is given besides.
+    The rows may have different units: each problem is first equilibrated symmetrically by powers of
+    2, which is exact. Device arrays of one type are used without a copy, and if `out` is given as
+    well, nothing is allocated.
 
     Args:
         A: matrices, shape (m, n, n), n <= 4; numpy or wp.array, float64 unless a wp.array of

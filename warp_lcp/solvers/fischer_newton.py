@@ -68,10 +68,11 @@ class FischerNewton(NewtonSettings):
 
     Dense problems (frictional contact, semi-definite A) are solved with factors of J on the host,
     in units in which A is equilibrated symmetrically and b is near 1, and the result is within the
-    bounds. `safeguard` makes them a chain: at most 30 steps (J'J + nu I)^-1 J'f with nu = 1e-6
-    min(1, ||f||) on the penalized map, searched nonmonotonically, the gradient where that is no
-    descent; then two homotopies on the smoothed map x + y - sqrt(x^2 + y^2 + 2 mu), mu -> 0. There
-    is no pivoting method inside.
+    bounds. With `safeguard` such a solve is a sequence of methods. First come at most 30 steps (J'J
+    + nu I)^-1 J'f with nu = 1e-6 min(1, ||f||) on the penalized map, with a nonmonotone line
+    search, or steps along the gradient where that direction is no descent direction. Then two
+    homotopies follow, on the smoothed map x + y - sqrt(x^2 + y^2 + 2 mu), mu -> 0. No pivoting
+    method is part of the sequence.
 
     `linear_iterations` counts preconditioned iterations on the finest grid, factorizations where A
     is dense.

@@ -34,14 +34,14 @@ class GradientDescent(Settings):
     x <- clip(x - t d^-2 J'f, l, u) with an element J = diag(p d) + diag(q) A of the generalized
     Jacobian and the natural residual's d, which makes the direction independent of x's units. t
     comes from a backtracking search along the projected path that starts at Barzilai and Borwein's
-    length; the merit may not exceed the largest of the last ones. Needs products with A' as well,
-    and nothing else of A: it is slow, with a rate that the square of A's condition decides.
+    length; the merit may not exceed the largest of the last ones. The method needs only products
+    with A and with A'. It is slow: its rate depends on the square of A's condition number.
 
-    The book's tests end it: the absolute one is the criteria of every method (CONVERGED); the
-    relative one (eq. 2.202), a merit that changes by less than `relative` of itself, and the
+    It ends by the book's tests. The absolute test is the criteria of every method (CONVERGED). The
+    relative test (eq. 2.202), a merit that changes by less than `relative` of itself, and the
     stagnation test (eq. 2.203), an x that changes by less than `stagnation` of its largest entry,
-    give STAGNATED; a gradient below `gradient` ||f|| gives LOCAL_MINIMUM; a search without success
-    gives NON_DESCENT.
+    give STAGNATED. A gradient below `gradient` ||f|| gives LOCAL_MINIMUM, and a search without
+    success NON_DESCENT.
 
     Args:
         map: "natural", "fischer" or "penalized".

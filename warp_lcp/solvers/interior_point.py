@@ -60,20 +60,20 @@ class InteriorPoint(NewtonSettings):
 
     With w = x - l, v = u - x and multipliers s, t >= 0, the solution has A x + b = s - t, W s = 0,
     V t = 0. A step is Newton's for W s = V t = tau: (A + D) dx = -(A x + b) + tau / w - tau / v
-    with D = s / w + t / v, so that dx, ds and dt keep all of w, v, s and t positive; equations have
-    D = 0, unknowns with l = u are held. Mehrotra's rule solves with tau = 0 first (the predictor),
-    takes sigma = (mu_after / mu)^3 and solves again with tau = sigma mu and the predictor's
-    second-order terms. The book's rule solves once with tau = mu / k and goes the share k / (N + 1)
-    of the way to the boundary in step k. All variables take one common step, without which the
-    method does not converge for LCPs that are no quadratic programs.
+    with D = s / w + t / v, and it is shortened so that w, v, s and t all stay positive. Equations
+    have D = 0, unknowns with l = u are held. Mehrotra's rule solves with tau = 0 first (the
+    predictor), sets sigma = (mu_after / mu)^3 and solves again with tau = sigma mu and the
+    predictor's second-order terms. The book's rule solves once with tau = mu / k and goes the share
+    k / (N + 1) of the way to the boundary in step k. All variables take one common step, without
+    which the method does not converge for LCPs that are no quadratic programs.
 
     A must be positive semi-definite (x'Ax >= 0; it need not be symmetric), else steps may become
-    arbitrarily short. Dense and sparse problems are solved in units in which rows are alike; where
-    there is no solution, iterates leave for infinity: then, if A has at most 40,000 entries, a
-    linear program decides, and INFEASIBLE is proved. A float32 correction carries D up to 1e30:
-    nothing is clamped. On grids the shifted systems are solved by conjugate gradients with
-    multigrid, stopped on the norm of d^(-1/2) r, d the diagonal of A + D. `linear_iterations`
-    counts their iterations.
+    arbitrarily short. Dense and sparse problems are solved in units in which all rows have similar
+    sizes. Where there is no solution, the iterates diverge. If A then has at most 40,000 entries, a
+    linear program decides whether INFEASIBLE is proved. float32 can represent D up to 1e30, so D is
+    not limited. On grids the shifted systems are solved by conjugate gradients with multigrid,
+    stopped on the norm of d^(-1/2) r, d the diagonal of A + D. `linear_iterations` counts their
+    iterations.
 
     Args:
         precision: "mixed": iterate and multipliers float64, corrections float32 on grids; "double";

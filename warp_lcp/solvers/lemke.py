@@ -190,24 +190,23 @@ class Lemke(Settings):
     [Book] 2.1, appendix C; LCP of w - M z - d z0 = q.
 
     z0 and the covering vector d > 0 make the start feasible; complements enter until z0 leaves. The
-    method solves every problem with a copositive-plus matrix, positive semi-definite ones among
-    them, symmetric or not, and every P-matrix; for others it may end in a ray. A ray ends the solve
-    only if further covering vectors, random in [.5, 1.5], also end in one. The status is then
-    INFEASIBLE if multipliers prove that no x meets the inequalities (`certifies`), which they do
-    where A is positive semi-definite, else STAGNATED. On a bimatrix game, M = [[0, E], [F', 0]]
-    with E, F > 0 and q < 0, every such d ends in a ray; there it begins as Lemke and Howson's
-    method does.
+    method solves every problem with a P-matrix or a copositive-plus matrix, such as a positive
+    semi-definite one, symmetric or not. For others it may end in a ray. A ray ends the solve only
+    if further covering vectors, random in [.5, 1.5], also end in one. The status is then INFEASIBLE
+    if multipliers prove that no x meets the inequalities (`certifies`), which they do where A is
+    positive semi-definite, else STAGNATED. On a bimatrix game, M = [[0, E], [F', 0]] with E, F > 0
+    and q < 0, every such d ends in a ray; there the start is that of Lemke and Howson's method.
 
     Where all bounds are finite, there is a solution for every A, and after a ray d = 0 in the rows
     s = u - l - z leads to one. On another ray (z', s', z0') those rows require z' = -s' = 0, so
     that w' = v' + d z0'. Where w' > 0, z = 0, so that s = u - l and v' = 0, which leaves w' = d
     z0', the ray of the start alone.
 
-    Bounds far beyond the sizes of A and b count as infinite at first, and with their values if that
-    fails. Boxes add a pair of variables; equations are eliminated or, where their block is
-    singular, split (see LemkeForm). x0 is not used. A pivot costs O(m^2), m <= 2n, or O(m) with a
-    matrix of bandwidth <= 3 whose rows all have a finite bound. A step is a block of pivots;
-    `linear_iterations` counts pivots.
+    Bounds that are very large compared with A and b are treated as infinite at first, and with
+    their values if that fails. Boxes add a pair of variables; equations are eliminated or, where
+    their block is singular, split (see LemkeForm). x0 is not used. A pivot costs O(m^2), m <= 2n,
+    or O(m) with a matrix of bandwidth <= 3 whose rows all have a finite bound. A step is a block of
+    pivots; `linear_iterations` counts pivots.
 
     Args:
         pivots_per_step: pivots in a step of the solve loop, which checks, records and counts steps;

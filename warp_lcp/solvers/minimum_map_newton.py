@@ -30,18 +30,20 @@ class MinimumMapNewton(NewtonSettings):
     at their bounds ([Book] 2.4.1).
 
     Unknown i is held where x_i - y_i / d_i, with the natural residual's d, is outside [l_i, u_i].
-    Cold, the first steps on a grid are projected multigrid cycles, which find the active set to
-    within a few cells; a Newton step alone moves its boundary by about a layer a step. Each Newton
-    correction is solved inexactly in the corrections' precision, and the step is shortened along
-    its projection onto the bounds if the residual would exceed the largest of the last `memory`
-    ones (Grippo, Lampariello, Lucidi 1986). On a large sparse matrix, an active set that creeps all
-    the same is moved by a problem on coarse points (Brandt and Cryer 1983) if A is nearly a
-    diagonally dominant M-matrix. Converges on a grid in a few steps; on other matrices A should be
-    a P-matrix. Where it is not, free blocks may be singular and steps fail: dense problems try
+    After a cold start on a grid, the first steps are projected multigrid cycles, which find the
+    active set to within a few cells; a Newton step alone moves its boundary by about one layer.
+    Each Newton correction is solved inexactly in the corrections' precision, and the step is
+    shortened along its projection onto the bounds if the residual would exceed the largest of the
+    last `memory` ones (Grippo, Lampariello, Lucidi 1986). If the active set of a large sparse
+    matrix still moves slowly and A is nearly a diagonally dominant M-matrix, a problem on coarse
+    points moves it (Brandt and Cryer 1983).
+
+    On a grid the method converges in a few steps; on other matrices A should be a P-matrix. Where
+    it is not, free blocks may be singular and steps may fail. Dense problems then try
     Levenberg-Marquardt steps of the minimum map and end with STAGNATED after 10 steps without
-    progress, others end with NON_DESCENT, or STAGNATED where steps repeat themselves; INFEASIBLE if
-    equations have no solution. `wl.solve` without a method continues with other methods
-    (`wl.default_chain`).
+    progress. Others end with NON_DESCENT, or with STAGNATED where steps repeat themselves. The
+    status is INFEASIBLE if equations have no solution. `wl.solve` without a method continues with
+    other methods (`wl.default_chain`).
 
     Args:
         precision: "mixed": iterate float64, corrections float32; "double"; or "single": the iterate

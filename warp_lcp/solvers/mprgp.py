@@ -53,20 +53,21 @@ class MPRGP(Settings):
 
     It minimizes 1/2 x'Ax + b'x within the bounds (Dostal; Takahashi and Batty 2023).
 
-    Unknowns at a bound are held. While the part of the residual on them, the chopped gradient, is
-    small against the free part (||beta||^2 <= Gamma^2 phi~'phi), a step of conjugate gradients on
-    the free set, preconditioned there by one multigrid cycle, is projected: x = clip(x - alpha p).
-    If that meets no bound it was plain conjugate gradients and the direction is carried on; else
-    the preconditioner is rebuilt for the new set and the direction is reset. When the chopped
-    gradient is large, a step along it releases unknowns. Dostal's expansion by a half step and a
-    fixed step is replaced by the projected step: it needed over 8 times the work of a linear solve,
-    this one 1.5. Cold, the first steps on a grid are projected multigrid cycles.
+    Unknowns at a bound are held. The chopped gradient is the part of the residual on them. While it
+    is small compared with the free part (||beta||^2 <= Gamma^2 phi~'phi), a step is one of
+    conjugate gradients on the free set, preconditioned there by one multigrid cycle, and then
+    projected: x = clip(x - alpha p). If the projection meets no bound, the direction is kept for
+    the next step; otherwise the preconditioner is rebuilt for the new set and the direction is
+    reset. When the chopped gradient is large, a step along it releases unknowns. The projected step
+    replaces Dostal's expansion by a half step and a fixed step, which needed over 8 times the work
+    of a linear solve; the projected step needs 1.5 times. After a cold start on a grid, the first
+    steps are projected multigrid cycles.
 
-    On grids a projected cycle follows a step that its projection has spoiled, and `patience` steps
-    without a new least energy, as in `ProjectedMultigrid`; elsewhere a projected step that raises
-    the energy is halved. While steps lower the energy the stopping criteria's own patience does not
-    run out. `linear_iterations` counts monotone cycles and products with A: one a step, two if it
-    releases unknowns.
+    On grids a projected cycle follows a step that its projection has made worse, and also
+    `patience` steps without a new least energy, as in `ProjectedMultigrid`; elsewhere a projected
+    step that raises the energy is halved. While steps lower the energy, the patience of the
+    stopping criteria does not run out. `linear_iterations` counts monotone cycles and products with
+    A: one for each step, two if the step releases unknowns.
 
     Args:
         precision: "mixed": iterate float64, corrections float32; "double"; or "single": the iterate

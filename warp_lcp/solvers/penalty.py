@@ -45,19 +45,19 @@ class Penalty(NewtonSettings):
     It replaces the bounds by springs and solves the piecewise linear equations.
 
     The equations are A z + b + rho D (min(z - l, 0) + max(z - u, 0)) = 0, D the diagonal of the
-    natural residual's d. With V the unknowns beyond a bound, a step is Newton's: (A + rho D_V) z+ =
-    -b + rho D_V g, g the bound that is passed. It depends on V alone, so it starts from x = clip(z,
-    l, u), where its right-hand side is -(A x + b): no terms cancel for any rho. On grids
-    it is solved by conjugate gradients with a multigrid cycle on A + rho D_V. With an M-matrix and
+    natural residual's d. With V the unknowns that violate a bound, a step is Newton's: (A + rho
+    D_V) z+ = -b + rho D_V g, g the violated bound. It depends on V alone, so it starts from x =
+    clip(z, l, u), where its right-hand side is -(A x + b): no terms cancel for any rho. On grids it
+    is solved by conjugate gradients with a multigrid cycle on A + rho D_V. With an M-matrix and
     bounds on one side the equations are concave or convex: from the second step on z moves off the
     bounds, V shrinks, and is found after finitely many steps. Elsewhere V may cycle, and the solve
     ends with STAGNATED or MAX_ITERATIONS.
 
-    The error: where y > 0, z is below its bound by y / (rho d), and neighbors solve their equations
-    with that z. The result is x = clip(z, l, u), whose natural residual is O(1 / rho): about
-    |A D^-1 y_V| / rho. The solve is judged by it. Where V stays, or that error is most of the
-    residual, and it is more than a tenth of the tolerance, rho grows in proportion, once as a rule,
-    up to 1e12.
+    The error of the method: where y > 0, z is below its bound by y / (rho d), and neighbors solve
+    their equations with that z. The result is x = clip(z, l, u), and the criteria are checked on
+    its natural residual, which is O(1 / rho): about |A D^-1 y_V| / rho. rho is raised in
+    proportion, as a rule once, up to 1e12, where V stays or that error is most of the residual, and
+    the error is more than a tenth of the tolerance.
 
     `linear_iterations` counts iterations on the finest grid, factorizations where A is dense.
 

@@ -42,14 +42,17 @@ class PrimalDualActiveSet(NewtonSettings):
     It guesses the active set from x and y, solves for the rest, and repeats until the guess stays.
 
     With the natural residual's d, unknown i is held at l_i if x_i - y_i / d_i < l_i, at u_i if it
-    is above, else free: y_i = 0 there. This is MinimumMapNewton's step without search or
-    projection, and shares its implementation. Started anywhere it ends after finitely many steps if
-    A is an M-matrix; on other P-matrices it may cycle. If a set recurs without a smaller residual,
-    dense problems continue by least-index principal pivoting (Murty 1974; with bounds Judice and
-    Pires), which is finite for every P-matrix but may be slow; others end with STAGNATED. So does a
-    solve that meets a singular free block (never in a P-matrix): its set stays while the residual
-    does not fall, the residual grows by 1e7, or the block's condition number exceeds 1e12. Cold,
-    the first steps on a grid are projected multigrid cycles.
+    is above u_i, else it is free: y_i = 0. This is MinimumMapNewton's step without search or
+    projection, and shares its implementation. If A is an M-matrix, the method ends after finitely
+    many steps from any start; on other P-matrices it may cycle. If a set recurs without a smaller
+    residual, dense problems continue by least-index principal pivoting (Murty 1974; with bounds
+    Judice and Pires), which is finite for every P-matrix but may be slow; others end with
+    STAGNATED.
+
+    A solve also ends with STAGNATED where a free block is singular, which never occurs in a
+    P-matrix: the set stays while the residual does not fall, the residual grows by 1e7, or the
+    block's condition number exceeds 1e12. After a cold start on a grid, the first steps are
+    projected multigrid cycles.
 
     `linear_iterations` counts as in MinimumMapNewton; a least-index pivot counts one.
 

@@ -27,12 +27,12 @@ class ProjectedJacobi(Settings):
 
     [Book] 2.2.1, table 2.1 and eq. 2.63 with M = D / omega.
 
-    x <- clip(x - omega D^-1 (A x + b), l, u). Converges for symmetric positive definite A and 0 <
-    omega < 2 / lambda_max(D^-1 A), which the book's omega = 1 exceeds for many matrices; the test
-    of algorithm 4 then returns DIVERGED (see `Contraction`). About half as fast as projected
-    Gauss-Seidel, but the same in every order, and no slower on a GPU. Zero and negative diagonals
-    as in ProjectedSOR. Works with any operator, and with bounds affine in x, which are those at the
-    last x.
+    x <- clip(x - omega D^-1 (A x + b), l, u). The method converges for symmetric positive definite
+    A and 0 < omega < 2 / lambda_max(D^-1 A). The book's omega = 1 is too large for many matrices;
+    the test of algorithm 4 then returns DIVERGED (see `Contraction`). It is about half as fast as
+    projected Gauss-Seidel, but its result does not depend on the order of the unknowns, so that it
+    is no slower on a GPU. Zero and negative diagonals are treated as in ProjectedSOR. It works with
+    any operator, and with bounds affine in x, which are evaluated at the last x.
 
     Args:
         omega: damping > 0; min(1, 1.8 / lambda_max), estimated, if None. Without symmetry,

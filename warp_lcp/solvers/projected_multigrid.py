@@ -28,17 +28,19 @@ class ProjectedMultigrid(Settings):
 
     It takes about as many cycles as multigrid for the linear system.
 
-    Cold, the first step is a projected (monotone) cycle, which moves whole aggregates on and off
-    their bounds. Then each step evaluates y = A x + b in float64, takes the unknowns that sit at a
-    bound with y of the right sign out of the hierarchy (they are *truncated*), preconditions -y by
-    one linear cycle on the rest, makes the correction conjugate to the remainder of the last
-    direction, and projects the step onto the bounds. There are no inner tolerances: without bounds
-    this is preconditioned conjugate gradients with a true residual, and the same code is the linear
-    solver. Steps are judged by the energy x'Ax/2 + b'x (`descent.Descent`): where it falls evenly
-    while the free set moves, a contact's boundary creeps by a layer of cells a step, and a monotone
-    cycle follows; where `patience` steps set no new least energy, monotone cycles follow, twice as
-    many each time; beside rigid bodies the third run of them ends the solve with STAGNATED. Cycles
-    are slow in channels a cell wide and where coefficients are random over decades: `wl.solve`
+    After a cold start, the first step is a projected (monotone) cycle, which moves whole aggregates
+    on and off their bounds. Each later step evaluates y = A x + b in float64 and removes the
+    unknowns that are at a bound with y of the right sign from the hierarchy (they are *truncated*).
+    It preconditions -y by one linear cycle on the others, makes the correction conjugate to what is
+    left of the last direction, and projects the step onto the bounds. There are no inner
+    tolerances: without bounds this is the method of preconditioned conjugate gradients with a true
+    residual, and the same code is the linear solver.
+
+    Steps are judged by the energy x'Ax/2 + b'x (`descent.Descent`). If it falls evenly while the
+    free set changes, a contact's boundary moves by only one layer of cells per step, and a monotone
+    cycle follows. If `patience` steps reach no new least energy, monotone cycles follow, twice as
+    many each time; with rigid bodies the third run of them ends the solve with STAGNATED. Cycles
+    are slow in channels one cell wide and where coefficients are random over decades: `wl.solve`
     without a method then continues with `MinimumMapNewton` on the assembled matrix
     (`wl.default_chain`).
 

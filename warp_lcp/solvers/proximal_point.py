@@ -42,13 +42,15 @@ class ProximalPoint(Settings):
 
     (Martinet 1970, Rockafellar 1976.) Solve A x + b + eps D (x - c) = y with the same bounds, use
     clip(x, l, u) as the next center c, lower eps, repeat. D is the natural residual's d. A + eps D
-    is a P-matrix wherever A is a P0-matrix (positive semi-definite or skew ones, for example), so
-    that free blocks are regular and least-index pivoting is finite. Its solutions tend to one of
-    the problem if A is monotone and a solution exists. An inner method solves each regularized
-    problem to 1e-3 of its center's residual. If it fails, eps is raised, and does not fall below
-    that value again. Failure with eps = 1 ends the solve with NON_DESCENT, centers without progress
-    with STAGNATED, a proof by a linear program (at most 40,000 entries) with INFEASIBLE. A step is
-    one of the inner method; `linear_iterations` counts as there.
+    is a P-matrix wherever A is a P0-matrix (for example a positive semi-definite or a skew one), so
+    that free blocks are regular and least-index pivoting is finite. The solutions tend to one of
+    the problem if A is monotone and a solution exists.
+
+    An inner method solves each regularized problem to 1e-3 of the residual at its center. If it
+    fails, eps is raised, and does not fall below that value again. The solve ends with NON_DESCENT
+    if it fails at eps = 1, with STAGNATED if the centers make no progress, and with INFEASIBLE if a
+    linear program (at most 40,000 entries) proves it. A step is one of the inner method;
+    `linear_iterations` counts as there.
 
     The method is meant for problems with a few singular blocks. Linear programs (A skew) of more
     than some dozens of unknowns reach residuals of 1e-2 or end with NON_DESCENT: use InteriorPoint

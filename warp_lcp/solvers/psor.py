@@ -27,22 +27,22 @@ class ProjectedSOR(Settings):
 
     [Book] 2.2.1, eq. 2.52.
 
-    x_i <- clip(x_i - omega (A x + b)_i / A_ii, l_i, u_i), red-black order on grids, row order
-    otherwise. Converges for symmetric positive definite A and 0 < omega < 2 ([Book] 2.2.2). The
-    iteration count grows with the grid: on 64^3 cells to 1e-3 and 1e-6 about 1,750 and 4,000 sweeps
-    with omega = 1, 110 and 200 with the best omega, 1.9, where ProjectedMultigrid takes 5 and 8
-    cycles; a splash of 20^3 and 32^3 cells takes 210 and 497 with 1.4, 73 and 102 with
-    `advised_omega`, the default on grids. A time step of an American put, 2,000 nodes on a line,
-    takes 2,031 sweeps with omega = 1, 851 with 1.4, 124 with `advised_omega`: more than the 100
-    that StoppingCriteria allows by default.
+    x_i <- clip(x_i - omega (A x + b)_i / A_ii, l_i, u_i), in red-black order on grids, in row order
+    otherwise. The method converges for symmetric positive definite A and 0 < omega < 2 ([Book]
+    2.2.2). The number of sweeps grows with the grid. 64^3 cells take about 1,750 sweeps to 1e-3 and
+    4,000 to 1e-6 with omega = 1, 110 and 200 with the best omega, 1.9; ProjectedMultigrid takes 5
+    and 8 cycles. A splash of 20^3 and 32^3 cells takes 210 and 497 sweeps with omega = 1.4, 73 and
+    102 with `advised_omega`, the default on grids. A time step of an American put, 2,000 nodes on a
+    line, takes 2,031 sweeps with omega = 1, 851 with 1.4, 124 with `advised_omega`: more than the
+    100 that StoppingCriteria allows by default.
 
     Where A_ii = 0, x_i goes to the bound that the sign of y_i selects, and stays where y_i = 0 or
-    there is no such bound; where A_ii < 0 it goes to the bound that solves the scalar problem, of
-    two the one of lesser energy ([Book] 2.2.2, fig. 2.4). Bounds may be affine in x: they follow
-    each change of x in dense and sparse matrices, each sweep on grids.
+    there is no such bound. Where A_ii < 0, it goes to the bound that solves the scalar problem; if
+    both do, to the one of lesser energy ([Book] 2.2.2, fig. 2.4). Bounds may be affine in x: in
+    dense and sparse matrices they are updated after each change of x, on grids after each sweep.
 
-    Each sweep is tested for contraction ([Book] algorithm 4, see `Contraction`): DIVERGED, or
-    NON_DESCENT where a sweep changes nothing.
+    After each sweep the contraction is tested ([Book] algorithm 4, see `Contraction`); the status
+    is DIVERGED if the test fails, or NON_DESCENT if a sweep changes nothing.
 
     The orders of the book's figure 2.3, in matrices: "impulse" is order = "magnitude", "greedy" is
     "greedy", "coordinate" and "staggered" are permutations that the caller makes, by height, or

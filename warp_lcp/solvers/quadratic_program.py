@@ -33,11 +33,11 @@ class QuadraticProgram(Settings):
     It minimizes x'Ax / 2 + b'x over l <= x <= u ([Book] 2.2.2, eq. 2.56; extra `peers`).
 
     The minimizers are the solutions of the problem, because A is symmetric and positive
-    semi-definite and the gradient is y = A x + b. Sparse operators stay sparse; others are taken as
-    dense matrices. x0 is not used; one step solves, and `linear_iterations` counts PIQP's
-    iterations, a factorization each. Unknowns that PIQP's multipliers hold are then set on their
-    bounds, and y = 0 is solved for in the others, if that is better. An objective that is unbounded
-    below is INFEASIBLE: no x solves the problem.
+    semi-definite and the gradient is y = A x + b. Sparse operators stay sparse; others are
+    converted to dense matrices. x0 is not used. There is one step, and `linear_iterations` counts
+    PIQP's iterations, a factorization each. Afterwards unknowns that PIQP's multipliers hold are
+    set to their bounds, and y = 0 is solved for the others; that result is used if it is better. An
+    objective that is unbounded below is INFEASIBLE: no x solves the problem.
 
     Args:
         tolerance: PIQP's absolute and relative tolerance, on the equilibrated problem; > 0. The

@@ -41,10 +41,10 @@ class Staggering(Settings):
 
     The other blocks are held fixed ([Book] 2.2.4).
 
-    Block k solves A_kk x_k + (b_k + sum_{j != k} A_kj x_j) within its bounds: a block Gauss-Seidel
-    method, which converges for symmetric positive definite A. Bounds affine in x are constants of
-    the block while it is solved, so that any method may solve it: normal forces and friction in
-    turn.
+    Block k solves A_kk x_k + (b_k + sum_{j != k} A_kj x_j) within its bounds: this is a block
+    Gauss-Seidel method, which converges for symmetric positive definite A. Bounds affine in x are
+    constants of the block while it is solved, so that any method may solve it, for example the
+    normal forces and the friction in turn.
 
     Args:
         blocks: for each block flat indices into a field of the problem's shape, together all

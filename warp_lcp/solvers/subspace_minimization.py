@@ -36,20 +36,21 @@ ROUNDING = 1e-14  # a smaller relative change of the energy counts as none
 class SubspaceMinimization(Settings):
     """Subspace minimization after projected Gauss-Seidel sweeps.
 
-    It sweeps, then solves A_FF x_F = -(b_F + A_FH x_H) on the unknowns off their bounds and
+    It does sweeps, then solves A_FF x_F = -(b_F + A_FH x_H) for the unknowns off their bounds, and
     projects ([Book] 2.2.5, algorithm 7, eq. 2.95).
 
-    A step is `sweeps` projected Gauss-Seidel sweeps and up to `solves` such solves, until the free
-    set stays ([Book] eq. 2.98). Each solve is inexact, as far as the whole one still needs. Its
-    projected correction is halved until the energy x'A x / 2 + b'x or the residual falls, up to
-    `backtracks` times; if neither falls, x is left as after the sweeps. The book takes full steps,
-    whose "jaggyness" (fig. 2.10) this avoids; `backtracks = -1` takes full steps as the book does.
+    A step consists of `sweeps` projected Gauss-Seidel sweeps and up to `solves` such solves, until
+    the free set stays ([Book] eq. 2.98). Each solve is inexact: it is as accurate as the whole
+    solve still needs. Its projected correction is halved until the energy x'A x / 2 + b'x or the
+    residual falls, up to `backtracks` times; if neither falls, x is left as after the sweeps. The
+    book takes full steps, whose "jaggyness" (fig. 2.10) this avoids; `backtracks = -1` takes full
+    steps as the book does.
 
-    Bounds may be affine in x: they are constants of each linear solve; held unknowns then move with
+    Bounds may be affine in x: they are constants of each linear solve. Held unknowns then move with
     their bounds, and only the residual judges the step, as there is no energy. With friction the
     residual may have to rise first: `backtracks = -1` solves a stack of 10 boxes to 1e-13 in 13
-    steps where 200 safeguarded ones end at 5e-4 (`benchmarks.contacts`), and diverges in the time
-    steps of a brick wall.
+    steps, where 200 safeguarded steps end at 5e-4 (`benchmarks.contacts`), but it diverges in the
+    time steps of a brick wall.
 
     `linear_iterations` counts sweeps and preconditioned iterations.
 
