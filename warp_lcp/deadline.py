@@ -2,8 +2,8 @@
 
 The outer loop (`warp_lcp.problem.solve`) sets the deadline. The inner loops of a method call
 `check_time`, or end early where `time_is_up` returns True. The deadline is a context variable, not
-an argument: Krylov methods, principal systems and the solves of blocks do not know the loop around
-them, and a solve within a solve must end with the outer one.
+an argument, because Krylov methods, principal systems and the solves of blocks have no access to
+the outer loop, and a nested solve must end with the outer one.
 """
 
 from __future__ import annotations

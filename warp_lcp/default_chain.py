@@ -48,18 +48,21 @@ BATCH = 200  # steps of MPRGP that count as one: together they cost about as muc
 
 
 def default_chain(method: Solver, problem: LCP | None = None) -> Solver:
-    """Return a method with those that take over where it stops.
+    """Return a chain of a method and the methods that continue where it fails.
 
-    The method itself if none does.
+    It is the method itself where no other continues. The others are:
 
-    - `ProjectedMultigrid`: where cycles crawl, `MinimumMapNewton` on the assembled matrix, unless
-      in single precision, on ranks or with floating components; beside rigid bodies
-      `MinimumMapNewton`, where cycles crawl or the free set goes round in circles.
-    - `MinimumMapNewton` on matrices: `MPRGP` where linear solves of a large symmetric matrix that
-      is no M-matrix are slow, or its near null space is known; `InteriorPoint` where steps stall or
-      fail; then `ProximalPoint`. With negative diagonal entries `FischerNewton` instead of these
-      two. On grids that need line relaxation or are not symmetric: on the assembled matrix.
-    - `PrimalDualActiveSet`: `MinimumMapNewton` (not on dense matrices), then as above.
+    - After `ProjectedMultigrid`, `MinimumMapNewton` on the assembled matrix where cycles crawl. In
+      single precision, on several ranks or with floating components there is none. Beside rigid
+      bodies it is `MinimumMapNewton`, where cycles crawl or free sets recur.
+    - After `MinimumMapNewton` on matrices, `MPRGP` where linear solves of a large symmetric matrix
+      that is no M-matrix are slow, or its near null space is known; `InteriorPoint` where steps
+      stall or fail; then `ProximalPoint`. With negative diagonal entries `FischerNewton` replaces
+      the last two. On grids that need line relaxation or are not symmetric, the assembled matrix is
+      used instead.
+    - After `PrimalDualActiveSet`, `MinimumMapNewton` (not on dense matrices), then as above.
+    - `Staggering` without methods for its blocks gets `MinimumMapNewton` for each block, with
+      `InteriorPoint` and `ProximalPoint` after it as above.
     - `Staggering` without methods for its blocks: `MinimumMapNewton` in each block, then
       `InteriorPoint` and `ProximalPoint` as above.
 

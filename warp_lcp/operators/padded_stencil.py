@@ -2,10 +2,12 @@
 
 An operator and each level of its multigrid are one of these. (A x)_i = d_i x_i - sum of w_f
 x_neighbor, for d_i != 0; rows with d_i = 0 are no unknowns and give 0. Fields are 0 in cells that
-are no unknowns, so a neighbor needs no test. Forms of one source: of 5 or 7 points `uniform`, with
-one weight for each axis (and d may be a count of open faces in one byte, d_scale its unit), or
-`variable`, with an array of lower faces for each axis; or compact ones, of up to 27 points,
-symmetric or not, whose `Pattern` defines the neighbors.
+are no unknowns, so a neighbor needs no test.
+
+All forms share one source. Stencils of 5 or 7 points are `uniform`, with one weight for each axis,
+or `variable`, with an array of lower faces for each axis; d of a uniform one may be a count of open
+faces in one byte, in units of d_scale. Compact stencils have up to 27 points, symmetric or not, and
+their `Pattern` defines the neighbors.
 """
 
 from __future__ import annotations

@@ -15,8 +15,8 @@ import scipy.sparse
 import scipy.sparse.csgraph
 
 SMALLEST = 1 << 16  # number of unknowns from which fields exceed a core's own caches
-# Mean distance of entries from the diagonal, as a share of n, from which renumbering pays; it is a
-# third for a random numbering.
+# Mean distance of entries from the diagonal, as a share of n, above which renumbering is faster;
+# the share is one third for a random numbering.
 SCATTERED = 0.05
 # Largest share of that distance that an order may leave: small-world graphs have no good order.
 GAIN = 0.5

@@ -22,7 +22,7 @@ from warp_lcp.problem.result import SolveResult
 from warp_lcp.rows.fields import Array
 
 MOST_DENSE = 600  # up to so many unknowns LAPACK factors a dense matrix in 10 ms
-LEAST_GRID = 2000  # from so many unknowns on it pays to test whether a matrix is a grid's
+LEAST_GRID = 2000  # number of unknowns from which a matrix is tested for being a grid's
 
 
 @dataclass(frozen=True)

@@ -74,9 +74,9 @@ class LCP(Pickled):
     otherwise. `lower=0`, `upper=inf` is the LCP; a row with bounds -inf and inf is an equation;
     without finite bounds the problem is a linear system.
 
-    Fields that are device arrays of type wp.float64 in the operator's stored layout already (for a
-    grid: padded by one cell, shape (nz + 2, ny + 2, nx + 2)) are used in place, so that a
-    time-stepping code can change them between solves; results then come back in that layout too.
+    Fields are used in place if they are device arrays of type wp.float64 in the operator's stored
+    layout (for a grid: padded by one cell, shape (nz + 2, ny + 2, nx + 2)). A time-stepping code
+    can then change them between solves, and results come back in that layout too.
 
     Args:
         A: an Operator, or an array (numpy, Warp) or scipy.sparse matrix of shape (n, n), which

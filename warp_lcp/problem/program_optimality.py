@@ -107,9 +107,9 @@ def with_rows(program: QuadraticProgramData) -> ProgramWithRows:
 def equilibrated(program: ProgramWithRows) -> tuple[ProgramWithRows, ProgramUnits]:
     """Return an equilibrated program and its units, which are powers of 2.
 
-    D and E make the largest entry of each row of diag(D, E) [[Q, B'], [B, 0]] diag(D, E) 1, B the
-    rows of G and C (Ruiz 2001, as OSQP does it), with Q in a unit of its own. sigma is a unit of x
-    chosen by the sizes of bounds and right-hand sides; the cost's unit follows.
+    With B the rows of G and C, D and E scale diag(D, E) [[Q, B'], [B, 0]] diag(D, E) so that the
+    largest entry of each row is 1 (Ruiz 2001, as in OSQP); Q has its own unit. sigma is a unit of x
+    chosen by the sizes of bounds and right-hand sides; the unit of the cost follows from these.
 
     Args:
         program: with rows (`with_rows`).

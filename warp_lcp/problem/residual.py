@@ -186,10 +186,10 @@ class NaturalResidual:
     def rounding_floor(self, x: wp.array[Any], epsilon: float) -> float:
         """Estimate the residual that rounding x to `epsilon` leaves, in units of y.
 
-        r_i = min(max(y_i, d_i (x_i - u_i)), d_i (x_i - l_i)) has the error e_i = epsilon (2 |d_i
-        x_i| + |b_i|) of y_i where it is y_i or could be y_i within that error, and only the error
-        epsilon |d_i x_i| of x_i where a bound decides: the size of b in a held row has no effect on
-        the other rows.
+        r_i = min(max(y_i, d_i (x_i - u_i)), d_i (x_i - l_i)) has an error e_i. Where r_i is y_i, or
+        could be y_i within that error, e_i is the error of y_i, epsilon (2 |d_i x_i| + |b_i|).
+        Where a bound decides, e_i is that of x_i alone, epsilon |d_i x_i|: the size of b in a held
+        row has no effect on the other rows.
         """
         y, r, d, b, at = self._rows_at(x)
         own = epsilon * np.abs(d * at)

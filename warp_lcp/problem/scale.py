@@ -9,10 +9,10 @@ largest magnitude of each row and column (Ruiz 2001). Such r and c are not uniqu
   rows and columns scaled: as A becomes diag(R) A diag(C), d_i becomes R_i C_i d_i.
 - Elsewhere Ruiz's iteration starts from the matrix whose columns are scaled. From there its limit
   has a closed form: c_j = 1 / q_j with q_j = max_k |a_kj|, and 1 / r_i = max_j |a_ij| / q_j. It
-  does not depend on the units of x. It must depend on those of the rows: the residual's norm adds
-  rows in the units of y, and [[e, -1], [1, 0]] is [[1, -1], [1, 0]] in other units of rows and
-  columns for every e > 0, so that a scale that followed both would be of size e in row 1 and hide
-  y_1.
+  does not depend on the units of x. It must depend on those of the rows, because the residual's
+  norm adds rows in the units of y. For example [[e, -1], [1, 0]] is [[1, -1], [1, 0]] in other
+  units of rows and columns for every e > 0. A scale that changed with both kinds of units would be
+  of size e in row 1 and hide y_1.
 """
 
 from __future__ import annotations

@@ -111,9 +111,9 @@ class CoarseStencilProblem(CoarseProblem):
     """Coarse problem on every second cell of a compact stencil's grid.
 
     It uses the transfers of the stencil's hierarchy; each solve begins with a correction. With
-    coarse problems on all levels that is nested iteration: Newton's steps then start with a contact
-    that is right except for one or two layers of cells, from a cold start or from another time
-    step's solution, and need no more steps than a linear solve.
+    coarse problems on all levels the method is a nested iteration. Newton's steps then start with a
+    contact that is right except for one or two layers of cells, also from a cold start or from
+    another time step's solution. They need no more steps than a linear solve.
 
     Args:
         A: the operator.

@@ -18,8 +18,8 @@ CREEP = 0.5
 # A step that moves the free set and leaves more than this share of the residual was spoiled by its
 # projection.
 STALL = 0.7
-# A projected cycle against creeping pays if it lowers the energy by this many times the decrease of
-# the step before.
+# A projected cycle against creeping is useful if it lowers the energy by this many times the
+# decrease of the step before.
 WORTH = 2.0
 
 
@@ -30,12 +30,13 @@ class Descent:
     natural residual may rise: thirtyfold in the best of steps, where the set of held unknowns
     grows. It counts only where the change of the energy is within rounding.
 
-    Why solves end, in outline: between runs of projected steps that are `due`, twice as many each
-    time, at most `patience` steps in a row set no new least energy, and new ones, a margin apart,
-    are finitely many above the minimum. Once a projected cycle of such a run has raised the energy
-    (`safe` is set), runs are plain projected Jacobi sweeps with a factor below 2 / lambda_max(D^-1
-    A), which converge linearly from any start. Not covered are runs of cycles that neither raise
-    the energy nor lower it beyond rounding.
+    Why solves end, in outline: runs of projected steps that are `due` become twice as long each
+    time. Between them, at most `patience` steps in a row set no new least energy. A new least
+    energy differs from the last by a margin, so that there are finitely many above the minimum.
+    Once a projected cycle of such a run has raised the energy (`safe` is set), runs are plain
+    projected Jacobi sweeps with a factor below 2 / lambda_max(D^-1 A), which converge linearly from
+    any start. Not covered are runs of cycles that neither raise the energy nor lower it beyond
+    rounding.
 
     Args:
         epsilon: rounding unit of the iterate.

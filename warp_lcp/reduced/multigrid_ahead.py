@@ -248,9 +248,9 @@ def judge_kernel(
 class RunAhead:
     """Steps that the device takes without the host, and their unread results.
 
-    Another step follows where residual and energy are the least so far, the tolerance is missed and
-    the free set does not creep: the host, which repeats all these decisions later, would have taken
-    the same step. All other cases are left to the host. On the CPU the threads execute the
+    Another step follows while residual and energy are the least so far, the tolerance is missed and
+    the free set does not creep. There the host, which repeats all these decisions later, would have
+    taken the same step. All other cases are left to the host. On the CPU the threads execute the
     beginning of a solve as one table of launches, and the steps as a table that is repeated.
 
     Args:

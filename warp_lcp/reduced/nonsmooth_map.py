@@ -164,9 +164,10 @@ class NonsmoothMap:
 
     With the natural residual's d, a = d (x - l), c = d (u - x) and psi(a, b) = a + b - sqrt(a^2 +
     b^2), the Fischer map of a boxed row is psi(a, -psi(-y, c)) ([Book] eq. 1.48, with the signs
-    changed so that f > 0 where y > 0), of one without upper bound psi(a, y), of an equation y;
-    penalized: lambda times that plus (1 - lambda) (a+ y+ - c+ (-y)+) / scale with `scale` the root
-    mean square of b. The factor d gives f the units of y, so that f does not depend on x's units.
+    changed so that f > 0 where y > 0). It is psi(a, y) in a row without upper bound, and y in an
+    equation. The penalized map is lambda times that plus (1 - lambda) (a+ y+ - c+ (-y)+) / scale
+    with `scale` the root mean square of b. The factor d gives f the units of y, so that f does not
+    depend on x's units.
 
     Args:
         problem: the problem.

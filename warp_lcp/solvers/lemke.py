@@ -446,12 +446,12 @@ def strategies(M: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray] | 
 def start_game(basis: Basis) -> bool:
     """Begin with the first player's first strategy; return False if this is no game.
 
-    w = q + M z. Lemke's z0, with d > 0, makes all w >= 0; the first complement that enters then
-    meets no row, as its block of M is 0: a ray. Lemke and Howson's method begins with z_k alone, so
+    w = q + M z. Lemke's z0, with d > 0, makes all w >= 0. No row blocks the first complement that
+    then enters, as its block of M is 0: a ray. Lemke and Howson's method begins with z_k alone, so
     large that w >= 0 for the other player, w_s = 0 there; then z_s, so large that w >= 0 for the
     first one, w_r = 0 there. That is a feasible basis, complementary except for pair k: the
     solution if r = k. Else z_r enters, and the path ends where a variable of pair k leaves; as E, F
-    > 0, it meets no ray.
+    > 0, it does not end in a ray.
     """
     players = strategies(basis.M, basis.q)
     if players is None:

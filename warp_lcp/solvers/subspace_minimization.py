@@ -61,7 +61,7 @@ class SubspaceMinimization(Settings):
         eta: each linear solve reduces its residual by this factor, or to the accuracy that the
             whole solve still needs.
         max_linear_iterations: maximum number of iterations of one linear solve.
-        backtracks: halvings of a correction; -1 takes all corrections as they come.
+        backtracks: halvings of a correction; -1 takes each correction in full.
         precision: "mixed": iterate float64, corrections float32; "double"; or "single": the iterate
             rounded to float32 as well.
         cycle: settings of multigrid cycles.
