@@ -129,7 +129,7 @@ def linear_complementarity(
     guess = None if x0 is None else fields.load(x0, "x0")
     at_work = list[tuple[RestatedProblem, Workspace]]()  # the last one has the iterate
 
-    def told(record: Record) -> None:
+    def report_record(record: Record) -> None:
         if report is not None and not record.step.startswith("start"):
             restated, work = at_work[-1]
             x = fields.unload(restated.field(restated.problem.layout.unload(work.x)))
@@ -152,9 +152,11 @@ def linear_complementarity(
         return restated.result(solution)
 
     if method is None:
-        result = solve_by_attempts(problem, stopping, guess, told, run=run, reserve=False)
+        result = solve_by_attempts(problem, stopping, guess, report_record, run=run, reserve=False)
     else:
-        result = run(RestatedProblem(problem, problem), _method(method), stopping, guess, told)
+        result = run(
+            RestatedProblem(problem, problem), _method(method), stopping, guess, report_record
+        )
     message = f"{result.status.name}: {result.status.value}"
     for word, here in WORDS.items():
         message = message.replace(word, here)
