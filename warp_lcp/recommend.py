@@ -186,8 +186,9 @@ def criteria(rtol: float, most: int) -> StoppingCriteria:
 def _within(found: Recommendation, budget: Budget, problem: LCP) -> Recommendation:
     """Return a recommendation within a budget, or the reason why none fits.
 
-    A method that needs too much memory is replaced by one that holds fields only, sweeps that need
-    too many steps by another rule, and a method whose first step takes too long by sweeps.
+    A method that needs too much memory is replaced by one that holds fields only. Sweeps that need
+    too many steps are replaced by another rule's method, and a method whose first step takes too
+    long is replaced by sweeps.
     """
     t = found.traits
     if budget.bytes is not None and (needs := memory_of(found.name, t)) > budget.bytes:

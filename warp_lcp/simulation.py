@@ -112,7 +112,10 @@ class Measured(Protocol):
 class Points:
     """A frame of vertices.
 
-    `points` [m], shape (n, 3); `fields` of shape (n,) or (n, 3).
+    Args:
+        name: first part of the names of its files.
+        points: positions [m], shape (n, 3).
+        fields: values at the points, shape (n,) or (n, 3) each.
     """
 
     name: str
@@ -124,11 +127,16 @@ class Points:
 class Cells:
     """A frame of equal axis-aligned cells.
 
-    `index`, shape (n, 3): integer x, y, z of each cell, whose low corner lies at index * spacing
-    [m]. `dimension` 2 makes quadrilaterals in the plane z = 0, 3 makes voxels. `fields` have shape
-    (n,) or (n, 3). `counts`: numbers of cells of the whole grid along x, y and z, which an image of
-    it has in every frame. `box`: the first cell, and the one behind the last, of the part of the
-    grid that these cells come from, if other ranks have the rest; then an image shows that part.
+    Args:
+        name: first part of the names of its files.
+        index: integer x, y, z of each cell, shape (n, 3); its low corner is at index * spacing.
+        spacing: of the cells [m].
+        dimension: 2 makes quadrilaterals in the plane z = 0, 3 makes voxels.
+        fields: values of the cells, shape (n,) or (n, 3) each.
+        counts: numbers of cells of the whole grid along x, y and z; its image has them in every
+            frame.
+        box: the part of the grid that these cells come from, if other ranks have the rest: its
+            first cell and the one behind its last. An image then shows that part.
     """
 
     name: str
@@ -144,9 +152,12 @@ class Cells:
 class Surface:
     """A frame of a surface: triangles, in 2-D the segments of an outline.
 
-    `points` [m], shape (n, 3); `corners` of the triangles among them, shape (m, 3),
-    counterclockwise seen from outside, or of the segments, shape (m, 2), with the inside on the
-    left; `fields` at the points, of shape (n,) or (n, 3).
+    Args:
+        name: first part of the names of its files.
+        points: positions [m], shape (n, 3).
+        corners: indices of points: of triangles, shape (m, 3), counterclockwise seen from outside,
+            or of segments, shape (m, 2), with the inside on the left.
+        fields: values at the points, shape (n,) or (n, 3) each.
     """
 
     name: str
@@ -159,9 +170,13 @@ class Surface:
 class Volume:
     """A frame of values at the centers of a 3-D grid's cells.
 
-    `values`: float32, shape (nz, ny, nx); `spacing` of the cells [m]; `band`: of a signed distance
-    [m], < 0 inside, how far from the surface it is known; None: a density, >= 0; `origin`: how many
-    cells (x, y, z) lie between the first one and the domain's low corner.
+    Args:
+        name: first part of the names of its files.
+        values: float32, shape (nz, ny, nx).
+        spacing: of the cells [m].
+        band: for a signed distance, < 0 inside: distance from the surface up to which it is known
+            [m]. None for a density, >= 0.
+        origin: numbers of cells (x, y, z) between the domain's low corner and the first cell.
     """
 
     name: str
@@ -286,8 +301,8 @@ class Joined(Simulation, Protocol):
     `stable_dt`, `step`, `frame`, `restore` (the state of one process) and `restore_pieces` are
     collective. Times, rows of the log and columns are those of the whole simulation, the same on
     all ranks, which also raise the same kind of error. `frame` returns the part of this rank, in
-    coordinates of the whole domain; `state` returns this rank's part of the state, whose `box`, int
-    (2, 3), is its first cell and the one behind the last.
+    coordinates of the whole domain. `state` returns this rank's part of the state; `box` in it, int
+    (2, 3), has the first cell of the part and the one behind the last.
     """
 
     def restore_pieces(self, pieces: Sequence[Mapping[str, np.ndarray]]) -> None:

@@ -21,10 +21,10 @@ def has_negative_curvature(problem: LCP) -> bool:
 
     A_ii < 0 proves it, for i in F. It counts only if no A_ii > 0 there, because Newton's method can
     solve problems with some negative entries, which convection causes. For an operator without rows
-    one product A z decides, z pointing away from the bounds of F: z'Az < 0 if A is symmetric, with
-    a random z; else z_i (A z)_i < 0 for all i in F, with a z of ones and minus ones (a P-matrix
-    reverses the sign of no vector). Both detect a wrong sign: -A of a positive definite or a
-    diagonally dominant A.
+    one product A z decides, z pointing away from the bounds of F. If A is symmetric, z is random
+    and the test is z'Az < 0. Otherwise z has entries 1 and -1 and the test is z_i (A z)_i < 0 for
+    all i in F, because a P-matrix reverses the sign of no vector. Both detect a wrong sign: -A of a
+    positive definite or a diagonally dominant A.
     """
     A = problem.A
     if has(A, HasStencil) or has(A, HasColumns):  # these have positive diagonals

@@ -418,8 +418,8 @@ def incompatible(problem: LCP) -> bool:
 def _refined(transpose: Any, z: np.ndarray) -> np.ndarray:
     """Return refined multipliers near z that satisfy the equations of a vertex.
 
-    They are 0 where z is, and (A'z)_j = 0 wherever the vertex has it except for errors: where a
-    vertex of the linear program has 0, its solver leaves at most 1e-10 of the terms.
+    The refined multipliers are 0 where z is. (A'z)_j is 0 where it is 0 at the vertex; the solver
+    of the linear program leaves at most 1e-10 of the terms there.
     """
     g, terms = transpose @ z, abs(transpose) @ np.abs(z)
     # The equations (A'z)_j = 0 of the vertex, on the nonzero multipliers: z minus its least-squares
@@ -469,11 +469,11 @@ def without_contact(data: DenseProblem, x: np.ndarray) -> np.ndarray:
     """Return x with y = 0 on each singular component where that is a solution.
 
     The components are connected parts on which A is singular and which have a solution with y = 0
-    within the bounds. Where z'A = 0 with z > 0 and b'z = 0, such as for a Laplacian without
-    boundary condition and a b that sums to 0, z'y = 0 makes y >= 0 vanish: no point is strictly
-    feasible, so that neither active sets nor a central path lead there. With one unknown of each
-    component held at 0 and the others R, x_R = -A_RR^-1 b_R is a solution; z, with A z = 0 and 1 at
-    the held unknown, shifts it within the bounds.
+    within the bounds. An example is a Laplacian without boundary condition and a b that sums to 0.
+    Where z'A = 0 with z > 0 and b'z = 0, z'y = 0, so that y >= 0 must be 0. No point is strictly
+    feasible, and neither active sets nor a central path lead to the solution. With one unknown of
+    each component held at 0 and the others R, x_R = -A_RR^-1 b_R is a solution; z, with A z = 0 and
+    1 at the held unknown, shifts it within the bounds.
     """
     A = scipy.sparse.csr_array(data.A)
     count, label = scipy.sparse.csgraph.connected_components(A, directed=False)

@@ -114,12 +114,12 @@ class SparsePreconditioner(Preconditioner, Protocol):
 class SparseSystem(GuardedSystem):
     """Principal system (P A P + P D P) e = r of a sparse A.
 
-    Symmetric matrices whose diagonal is not negative take conjugate gradients with algebraic
-    multigrid, which falls back on sweeps where nothing aggregates. Others take GMRES: with
-    algebraic multigrid if most rows are diagonally dominant and nearly all off-diagonal entries
-    negative (convection-diffusion), else with incomplete factors that SciPy computes and applies
-    for each free set, on the host for any device. On directed cycles, I - S with S nearly a
-    permutation, multigrid fails, and factors take over.
+    Symmetric matrices whose diagonal is not negative are solved by conjugate gradients with
+    algebraic multigrid, which falls back on sweeps where nothing aggregates. Others are solved by
+    GMRES. Its preconditioner is algebraic multigrid if most rows are diagonally dominant and nearly
+    all off-diagonal entries are negative (convection-diffusion). Otherwise it is incomplete
+    factors, which SciPy computes and applies on the host for each free set, for any device. On
+    directed cycles, I - S with S nearly a permutation, multigrid fails, and factors take over.
 
     Args:
         A: the matrix.

@@ -181,9 +181,10 @@ def advised_omega(problem: LCP, steps: int = 60, free: Any = None) -> float:
     omega = 2 / (1 + sqrt(1 - rho^2)).
 
     rho = 1 - lambda_min(D^-1 A) is the spectral radius of Jacobi's method, estimated by Lanczos'
-    method. The formula is exact for equations in two colors (grids), and a guide elsewhere. Only
-    the free unknowns count in the end: where many are held at bounds, the value for the whole
-    matrix is too large, and a second estimate with the free set of an earlier solution pays.
+    method. The formula is exact for equations in two colors (grids), and a guide elsewhere. Near
+    the solution only the free unknowns matter. Where many unknowns are held at bounds, the value
+    for the whole matrix is too large, and a second estimate with the free set of an earlier
+    solution is better.
 
     Args:
         problem: with a symmetric A and a positive diagonal.
