@@ -1,4 +1,7 @@
-"""Matrix-free solvers for large linear complementarity problems, as NVIDIA Warp kernels on CPU and CUDA."""
+"""Solvers for large linear complementarity problems on CPU and CUDA.
+
+Matrix-free methods as NVIDIA Warp kernels.
+"""
 
 import warnings
 from importlib import import_module
@@ -79,7 +82,10 @@ except PackageNotFoundError:  # a source tree that was never installed
 
 
 def __getattr__(name: str) -> Any:
-    """Import what drives simulations when it is asked for: who solves problems needs none of it."""
+    """Import the modules of simulations on first access.
+
+    Programs that only solve problems do not load them.
+    """
     if name == "read_frame":
         return import_module("warp_lcp.frames.read_frame").read_frame
     if name == "Run":

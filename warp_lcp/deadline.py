@@ -1,9 +1,9 @@
-"""How long solves may take: the deadline of the solve under way, which everything inside it may ask about.
+"""Deadline of the current solve: a time limit that nested loops can query.
 
-The outer loop (`warp_lcp.problem.solve`) sets it; a method's inner loops call `check_time`, or end
-early by `time_is_up`. It reaches them by a context variable, not as an argument: Krylov methods,
-principal systems and the solves of blocks know nothing of the loop they are in, and a solve within
-a solve must end with the outer one.
+The outer loop (`warp_lcp.problem.solve`) sets the deadline. The inner loops of a method call
+`check_time`, or end early where `time_is_up` returns True. The deadline is a context variable, not
+an argument, because Krylov methods, principal systems and the solves of blocks have no access to
+the outer loop, and a nested solve must end with the outer one.
 """
 
 from __future__ import annotations
@@ -21,13 +21,15 @@ class TimeIsUp(Exception):
 
 
 class Deadline:
-    """When a solve must end; a context within which `check_time` and `time_is_up` ask it.
+    """Context that limits the wall time of the solves within it.
+
+    `check_time` and `time_is_up` read the innermost deadline.
 
     Args:
-        seconds: from now; inf: no limit of its own. It never ends later than the solve that it is
-            part of.
-        across: who solves together, see `warp_lcp.rows.vectors.Across`: time is up for all as soon
-            as it is for one. None: nobody else.
+        seconds: time limit from now; inf: no limit of its own. A deadline never ends later than
+            that of the enclosing solve.
+        across: communicator of a distributed solve, see `warp_lcp.rows.vectors.Across`: time is up
+            on all ranks as soon as it is up on one. None if serial.
     """
 
     def __init__(self, seconds: float = math.inf, across: Any = None) -> None:
@@ -45,12 +47,12 @@ class Deadline:
         return left if self._across is None else -float(self._across.max(-left))
 
     def __enter__(self) -> Deadline:
-        """Ask this one from here on."""
+        """Make this the current deadline."""
         self._token = _running.set(self)
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Ask the outer one again."""
+        """Restore the enclosing deadline."""
         assert self._token is not None
         _running.reset(self._token)
 
@@ -59,27 +61,35 @@ _running: ContextVar[Deadline | None] = ContextVar("deadline", default=None)
 
 
 def seconds_left() -> float:
-    """Return the seconds left to the solve under way, >= 0; inf without a limit."""
+    """Return the seconds left to the current solve, >= 0; inf without a limit."""
     running = _running.get()
     return math.inf if running is None else running.left()
 
 
 def is_collective() -> bool:
-    """Return whether ranks must look at the deadline of the solve under way together, so as often as each other."""
+    """Return whether ranks must query the deadline together.
+
+    Then each rank must call these functions equally often.
+    """
     running = _running.get()
     return running is not None and running.ends != math.inf and running._across is not None
 
 
 def time_is_up() -> bool:
-    """Return whether the solve under way has no time left: for loops that have something to return when they end early."""
+    """Return whether the current solve has no time left.
+
+    For loops that have a result to return when they end early.
+    """
     return seconds_left() == 0
 
 
 def check_time() -> None:
-    """Raise TimeIsUp if the solve under way has no time left: what the step has done so far is dropped.
+    """Raise TimeIsUp if the current solve has no time left.
+
+    The work of the current step is discarded.
 
     Raises:
-        TimeIsUp: it has none.
+        TimeIsUp: the time limit is reached.
     """
     if time_is_up():
         raise TimeIsUp

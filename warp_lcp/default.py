@@ -1,4 +1,4 @@
-"""`wl.solve`: a given method, or the recommended one and then its alternatives."""
+"""`wl.solve`: solve by a given method or the recommended one."""
 
 from __future__ import annotations
 
@@ -21,9 +21,8 @@ from warp_lcp.rows.fields import Array
 from warp_lcp.rules import Attempt, method_for, steps_allowed
 from warp_lcp.solvers.registry import method_of
 
-LEAST = 1e-9  # seconds that are left to a solve whose set-up has taken them all
-# one step of four is kept for the alternatives of a method for matrices, of limits from FEW steps
-# on
+LEAST = 1e-9  # seconds for a solve whose set-up has used up its time
+# Of a limit of at least FEW steps, a method for matrices leaves 1/RESERVED to its alternatives.
 RESERVED, FEW = 4, 40
 ENDED = (
     SolveStatus.CONVERGED,
@@ -55,22 +54,22 @@ def solve(
     fallback: bool = True,
     **misplaced: Never,
 ) -> SolveResult:
-    """Solve a problem by a method.
+    """Solve a problem with a given or the recommended method.
 
     Args:
         problem: the LCP, or a problem over another convex set than a box.
         solver: the method, such as `wl.MinimumMapNewton()`, or its name in `wl.METHODS` for its
             default settings, such as "psor": it alone is used. None: the method of `wl.recommend`;
-            where it stops, the methods of its chain (`wl.default_chain`) go on from its iterate,
-            and if these fail, its alternatives begin from the same start. `stopping` limits the sum
-            of their steps; the history has all of them, each record names its method, and the
-            result's `method` names the one that found x. Sparse matrices that are a compact stencil
-            on a box of cells in its natural order, x first, are then solved as a grid problem; the
-            result's `grid` has its shape.
+            where it stalls, the methods of its chain (`wl.default_chain`) continue from its
+            iterate, and if these fail, its alternatives begin from the same start. `stopping`
+            limits the sum of their steps; the history has all of them, each record names its
+            method, and the result's `method` names the one that found x. Sparse matrices that are a
+            compact stencil on a box of cells in its natural order, x first, are then solved as a
+            grid problem; the result's `grid` has its shape.
         stopping: the criteria; `StoppingCriteria()` if None, with the limit of steps that
             `wl.recommend` gives if there is no solver.
         x0: a guess, field of the problem's shape, projected onto the bounds; clip(0, l, u) if None
-            (over other sets: x as it is).
+            (over other sets: the current x).
         workspace: result of `solver.init(problem)`, to reuse its memory. Without it, one of a grid
             may be kept for later solves, see `wl.release_workspace`.
         callback: called with each Record, such as `wl.print_progress`; if it raises StopIteration,
@@ -127,7 +126,7 @@ def solve_restated(
     x0: Array | None,
     callback: Watch | None,
 ) -> SolveResult:
-    """Solve a problem in another form; return the result for the given one."""
+    """Solve a problem in another form; return the result in the original form."""
     found = solve_by(
         restated.problem, method, stopping=stopping, x0=restated.start(x0), callback=callback
     )
@@ -144,7 +143,7 @@ def solve_by_attempts(
     run: Run = solve_restated,
     reserve: bool = True,
 ) -> SolveResult:
-    """Solve by the attempts of `recommend`, until one ends the solve; return the best x.
+    """Solve by the attempts of `recommend` in order; return the best result.
 
     Args:
         problem: the problem.
@@ -166,7 +165,7 @@ def solve_by_attempts(
         planned = _planned(attempt, problem, advice, accuracy, given=stopping is not None)
         if planned is None or (planned.alternative and isinstance(stopping, MeanCriteria)):
             continue
-        kept = (
+        reserves = (
             reserve
             and not planned.alternative
             and (attempt.method is None or bool(advice.alternatives))
@@ -175,7 +174,7 @@ def solve_by_attempts(
             stopping or planned.stopping,
             begun,
             results if stopping is not None else [],
-            reserve=kept,
+            reserve=reserves,
         )
         if results and criteria.max_iterations == 0:
             break
@@ -200,13 +199,13 @@ def solve_by_attempts(
 
 @dataclass(frozen=True)
 class _Planned:
-    """A solve to make.
+    """A planned solve: a method and the form of the problem that it works on.
 
     Args:
         name: of the method.
         method: with its settings.
-        restated: what it works on.
-        chained: the same before its unknowns are renumbered, which tells who takes over.
+        restated: the problem that it works on.
+        chained: the same before its unknowns are renumbered; it determines the default chain.
         stopping: criteria where none are given.
         alternative: whether the method is not the recommended one, or is tried again.
     """
@@ -222,7 +221,7 @@ class _Planned:
 def _planned(
     attempt: Attempt, problem: LCP, advice: Recommendation, accuracy: float, *, given: bool
 ) -> _Planned | None:
-    """Return the solve that an attempt asks for, None if the problem does not suit it.
+    """Return the solve of an attempt, None if the attempt does not suit the problem.
 
     Args:
         attempt: of the recommendation.
@@ -302,13 +301,13 @@ def _best(results: list[SolveResult]) -> SolveResult:
 def left(
     stopping: Criteria, begun: float, results: Sequence[SolveResult] = (), *, reserve: bool = False
 ) -> Criteria:
-    """Return criteria with the steps and the time that are left.
+    """Return criteria with the remaining steps and time.
 
     Args:
         stopping: criteria for all.
-        begun: when the solve began, as `time.perf_counter` tells it [s].
+        begun: start of the solve by `time.perf_counter` [s].
         results: of earlier attempts.
-        reserve: keep a quarter of the steps for others.
+        reserve: keep a quarter of the steps for later attempts.
     """
     most = stopping.max_iterations - (results[-1].history[-1].iteration if results else 0)
     most -= most // RESERVED if reserve and most >= FEW else 0

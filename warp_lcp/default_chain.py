@@ -1,4 +1,4 @@
-"""Default chains: the methods that take over where one stops."""
+"""Default chains: the methods that take over where one stalls."""
 
 from __future__ import annotations
 
@@ -38,27 +38,31 @@ from warp_lcp.solvers.proximal_point import ProximalPoint
 from warp_lcp.solvers.staggering import Staggering
 
 FALL = 0.9  # a residual above this part of the smallest so far is no progress of a path
-# steps without progress before the proximal-point method: a path is joined far from the start
+# Steps without progress before the proximal-point method takes over: the central path is joined far
+# from the start, where the residual need not fall.
 PATH_IDLE = 10
-# of the residual PATH_IDLE steps ago: above it, a path that was joined far from the start leads
-# nowhere
+# Ratio to the residual PATH_IDLE steps ago: above it, a path that was joined far from the start
+# makes no progress.
 CREEPS = 0.97
 BATCH = 200  # steps of MPRGP that count as one: together they cost about as much as a linear solve
 
 
 def default_chain(method: Solver, problem: LCP | None = None) -> Solver:
-    """Return a method with those that take over where it stops.
+    """Return a chain of a method and the methods that continue where it fails.
 
-    The method itself if none does.
+    It is the method itself where no other continues. The others are:
 
-    - `ProjectedMultigrid`: where cycles crawl, `MinimumMapNewton` on the assembled matrix, unless
-      in single precision, on ranks or with floating components; beside rigid bodies
-      `MinimumMapNewton`, where cycles crawl or the free set goes round in circles.
-    - `MinimumMapNewton` on matrices: `MPRGP` where linear solves of a large symmetric matrix that
-      is no M-matrix are slow, or its near null space is known; `InteriorPoint` where steps stall or
-      fail; then `ProximalPoint`. With negative diagonal entries `FischerNewton` instead of these
-      two. On grids that need line relaxation or are not symmetric: on the assembled matrix.
-    - `PrimalDualActiveSet`: `MinimumMapNewton` (not on dense matrices), then as above.
+    - After `ProjectedMultigrid`, `MinimumMapNewton` on the assembled matrix where cycles crawl. In
+      single precision, on several ranks or with floating components there is none. Beside rigid
+      bodies it is `MinimumMapNewton`, where cycles crawl or free sets recur.
+    - After `MinimumMapNewton` on matrices, `MPRGP` where linear solves of a large symmetric matrix
+      that is no M-matrix are slow, or its near null space is known; `InteriorPoint` where steps
+      stall or fail; then `ProximalPoint`. With negative diagonal entries `FischerNewton` replaces
+      the last two. On grids that need line relaxation or are not symmetric, the assembled matrix is
+      used instead.
+    - After `PrimalDualActiveSet`, `MinimumMapNewton` (not on dense matrices), then as above.
+    - `Staggering` without methods for its blocks gets `MinimumMapNewton` for each block, with
+      `InteriorPoint` and `ProximalPoint` after it as above.
     - `Staggering` without methods for its blocks: `MinimumMapNewton` in each block, then
       `InteriorPoint` and `ProximalPoint` as above.
 
@@ -79,19 +83,19 @@ def default_chain(method: Solver, problem: LCP | None = None) -> Solver:
 
 @dataclass(frozen=True, kw_only=True)
 class PathCreeps(Settings):
-    """Condition: the last step has failed, or the path leads nowhere.
+    """Condition: the last step has failed, or the central path makes no progress.
 
     Args:
-        steps: without a residual below 0.9 of the smallest so far.
+        steps: number of steps without a residual below 0.9 of the smallest so far.
     """
 
     steps: Count = PATH_IDLE
 
     def __call__(self, progress: Progress) -> bool:
-        """Return whether that is so."""
+        """Return whether the condition holds."""
         if fails(progress):
             return True
-        after = progress.norms[1:]  # the start of a path says nothing
+        after = progress.norms[1:]  # the residual at the start of a path is arbitrary
         if len(after) <= PATH_IDLE or not after[-1] > CREEPS * after[-1 - PATH_IDLE]:
             return False
         smallest, idle = math.inf, 0
@@ -107,15 +111,17 @@ def cycles_fail_beside_bodies(progress: Progress) -> bool:
 
 
 def stalls_or_crawls(progress: Progress) -> bool:
-    """Return whether either is so."""
+    """Return whether steps stall or cycles crawl."""
     return stalls(progress) or crawls(progress)
 
 
 def weak_preconditioner(progress: Progress) -> bool:
-    """Return whether steps stall, linear solves are slow, or a near null space is known.
+    """Return whether MPRGP should take over from Newton's method.
 
-    With that, cycles are so good that MPRGP as a whole takes about as many iterations as a linear
-    solve.
+    It should if steps stall, linear solves are slow, or a near null space is known.
+
+    With a near null space cycles converge so fast that MPRGP as a whole takes about as many
+    iterations as one linear solve.
     """
     return (
         stalls(progress)
@@ -134,6 +140,7 @@ def _of_multigrid(method: ProjectedMultigrid) -> Solver:
 
 
 def _of_newton(method: MinimumMapNewton, problem: LCP | None) -> Solver:
+    """Return the chain of Newton's method for the problem's operator."""
     A = None if problem is None else problem.A
     if problem is None or has(A, HasColumns):
         return method
@@ -151,7 +158,10 @@ def _of_newton(method: MinimumMapNewton, problem: LCP | None) -> Solver:
 
 @cache
 def _on_matrix(method: MinimumMapNewton, minimizes: bool, steps: int) -> Fallback:
-    """Return the chain of Newton's method on a matrix; with MPRGP if that has an energy."""
+    """Return the chain of Newton's method on a matrix; with MPRGP if possible.
+
+    MPRGP needs an energy.
+    """
     if not minimizes:
         return Fallback(method, *_last(steps))
     first = replace(method, max_linear_iterations=min(WEAK, method.max_linear_iterations))
@@ -160,6 +170,7 @@ def _on_matrix(method: MinimumMapNewton, minimizes: bool, steps: int) -> Fallbac
 
 
 def _of_active_set(method: PrimalDualActiveSet, problem: LCP | None) -> Solver:
+    """Return the chain of the active set method for the problem's operator."""
     newton = method.as_newton()
     if problem is None or has(problem.A, HasStencil):
         return Fallback(method, (newton, fails), (_on_assembled(), stalls_or_crawls))
@@ -172,12 +183,12 @@ def _of_active_set(method: PrimalDualActiveSet, problem: LCP | None) -> Solver:
 
 @cache
 def _last(steps: int = PATH_IDLE) -> tuple[FallbackEntry, FallbackEntry]:
-    """Return what follows Newton's steps on matrices.
+    """Return the methods that follow Newton's method on matrices.
 
-    Linear programs and other saddle points, A skew but for a block or a small shift, have free
-    blocks that are singular or nearly so on the way to the solution's own; so have matrices of low
-    rank, and Laplacians that nothing holds, whose active set creeps by a layer of unknowns a step.
-    The central path exists for every positive semi-definite A, and needs no free blocks.
+    Linear programs and other saddle points (A skew except for a block or a small shift) have free
+    blocks that are singular or nearly so on the way to the solution. So have matrices of low rank,
+    and Laplacians without a boundary condition, whose active set advances by one layer of unknowns
+    a step. The central path exists for every positive semi-definite A, and needs no free blocks.
     """
     return FallbackEntry(InteriorPoint(precision="double"), stalls, restart=True), FallbackEntry(
         ProximalPoint(), PathCreeps(steps=steps)
@@ -186,7 +197,10 @@ def _last(steps: int = PATH_IDLE) -> tuple[FallbackEntry, FallbackEntry]:
 
 @cache
 def _without_path(method: MinimumMapNewton) -> Fallback:
-    """Return the chain of Newton's method on a matrix with negative diagonal entries, of which there need be no central path."""
+    """Return the chain of Newton's method for negative diagonal entries.
+
+    A matrix with negative diagonal entries need not have a central path.
+    """
     return Fallback(method, FallbackEntry(FischerNewton(), stalls, restart=True))
 
 
@@ -197,7 +211,10 @@ def _has_negative_diagonal(problem: LCP) -> bool:
 
 
 def _minimizes(problem: LCP) -> bool:
-    """Return whether A has an energy, and is no matrix for problems on coarse points."""
+    """Return whether MPRGP can minimize the problem's energy on a large sparse A.
+
+    False for matrices that suit problems on coarse points.
+    """
     A = problem.A
     if (
         not isinstance(A, SparseOperator)
@@ -214,5 +231,5 @@ def _minimizes(problem: LCP) -> bool:
 
 @cache
 def _on_assembled() -> AssembledMatrix:
-    """Return Newton's method, and what follows it on matrices, at work on the assembled matrix of a grid."""
+    """Return Newton's method and its followers on the assembled matrix of a grid."""
     return AssembledMatrix(Fallback(MinimumMapNewton(precision="double"), *_last()))

@@ -1,4 +1,4 @@
-"""Complementarity problems in the manner of scipy.optimize: arrays in, an OptimizeResult out."""
+"""SciPy-style interface: arrays in, an OptimizeResult out."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from warp_lcp.solvers.registry import method_of
 if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult
 
-STATUSES = {  # in the manner of SciPy: 0 is success, 99 that a callback has ended it
+STATUSES = {  # SciPy's convention: 0 is success, 99 a solve that a callback ended
     SolveStatus.CONVERGED: 0,
     SolveStatus.MAX_ITERATIONS: 1,
     SolveStatus.INFEASIBLE: 2,
@@ -39,7 +39,7 @@ STATUSES = {  # in the manner of SciPy: 0 is success, 99 that a callback has end
     SolveStatus.NEGATIVE_CURVATURE: 10,
     SolveStatus.STOPPED: 99,
 }
-WORDS = {"max_iterations": "maxiter", "rtol": "tol"}  # what criteria are called here
+WORDS = {"max_iterations": "maxiter", "rtol": "tol"}  # names of the criteria here
 
 
 def linear_complementarity(
@@ -70,8 +70,8 @@ def linear_complementarity(
             scipy.sparse.linalg.LinearOperator, or an operator of warp_lcp.
         b: n numbers in any shape, or a field of the operator's shape.
         bounds: a tuple (lo, hi) or a scipy.optimize.Bounds, of numbers or arrays like b, or None
-            where there is none; or SciPy's list of pairs (lo, hi), one for each unknown, of numbers
-            or None; None: (0, inf). For two unknowns a list of two tuples is pairs, a tuple of two
+            for no bound; or SciPy's list of pairs (lo, hi), one for each unknown, of numbers or
+            None; None: (0, inf). For two unknowns a list of two tuples is pairs, a tuple of two
             lists or arrays is (lo, hi), and ambiguous forms are refused. Magnitudes of 1e20 and
             more are infinite.
         x0: a guess, of b's shape.
@@ -91,10 +91,10 @@ def linear_complementarity(
     Returns:
         `x`, a float64 array of b's shape; `success`, whether the residual, recomputed in float64,
         meets a tolerance; `status`, 0 for success, 1 where maxiter was reached, 2 where there is no
-        solution, others as `STATUSES` of this module has them; `message`, which says what to try
+        solution, others as `STATUSES` of this module has them; `message`, with a hint what to try
         next; `nit`; `residual`, the norm of the natural residual, and `relative_residual`; `slack`,
         y; `active_mask`, as scipy.optimize.lsq_linear has it, -1 where x is held at lo, 1 at hi, 0
-        where y = 0 is asked for; `result`, what `wl.solve` returned.
+        where y must be 0; `result`, the result of `wl.solve`.
 
     Raises:
         ValueError: an argument is of another kind, shape or range, or the method cannot take this
@@ -102,7 +102,8 @@ def linear_complementarity(
 
     Example:
         >>> import numpy as np, warp_lcp as wl
-        >>> found = wl.linear_complementarity(np.array([[2.0, -1.0], [-1.0, 2.0]]), np.array([2.0, -3.0]))
+        >>> A = np.array([[2.0, -1.0], [-1.0, 2.0]])
+        >>> found = wl.linear_complementarity(A, np.array([2.0, -3.0]))
         >>> print(found.success, found.x, found.slack, found.active_mask)
         True [0.  1.5] [0.5 0. ] [-1  0]
     """
@@ -113,7 +114,7 @@ def linear_complementarity(
         checked(name, given, criteria[name])
         for name, given in (("tol", tol), ("atol", atol), ("maxiter", maxiter))
     )
-    tell = _told(callback)
+    report = _told(callback)
     operator = as_operator(A, b.device if isinstance(b, wp.array) else None)
     fields = _Fields(real_array(b, "b"), tuple(operator.shape))
     lower, upper = _sides_of(bounds, fields.given)
@@ -128,18 +129,19 @@ def linear_complementarity(
     guess = None if x0 is None else fields.load(x0, "x0")
     at_work = list[tuple[RestatedProblem, Workspace]]()  # the last one has the iterate
 
-    def told(record: Record) -> None:
-        if tell is not None and not record.step.startswith("start"):
+    def report_record(record: Record) -> None:
+        if report is not None and not record.step.startswith("start"):
             restated, work = at_work[-1]
             x = fields.unload(restated.field(restated.problem.layout.unload(work.x)))
-            tell(OptimizeResult(x=x, nit=record.iteration, residual=record.residual))
+            report(OptimizeResult(x=x, nit=record.iteration, residual=record.residual))
 
     def run(
         restated: RestatedProblem, solver: Solver, stopping: Any, x0: Any, callback: Any
     ) -> SolveResult:
+        """Solve by a method, and store its workspace for the callback."""
         work = solver.init(restated.problem)
         at_work.append((restated, work))
-        found = solve(
+        solution = solve(
             restated.problem,
             solver,
             stopping=stopping,
@@ -147,12 +149,14 @@ def linear_complementarity(
             workspace=work,
             callback=callback,
         )
-        return restated.result(found)
+        return restated.result(solution)
 
     if method is None:
-        result = solve_by_attempts(problem, stopping, guess, told, run=run, reserve=False)
+        result = solve_by_attempts(problem, stopping, guess, report_record, run=run, reserve=False)
     else:
-        result = run(RestatedProblem(problem, problem), _method(method), stopping, guess, told)
+        result = run(
+            RestatedProblem(problem, problem), _method(method), stopping, guess, report_record
+        )
     message = f"{result.status.name}: {result.status.value}"
     for word, here in WORDS.items():
         message = message.replace(word, here)
@@ -172,13 +176,13 @@ def linear_complementarity(
 
 
 class _Fields:
-    """Arrays of b's shape, as fields of the operator's and back."""
+    """Convert arrays between b's shape and the operator's shape."""
 
     def __init__(self, b: np.ndarray, shape: tuple[int, ...]) -> None:
         self.given, self._shape = b.shape, shape
 
     def load(self, values: Any, name: str) -> Any:
-        """Return an array in the operator's shape if it has b's, else as it is."""
+        """Return an array in the operator's shape if it has b's shape, else unchanged."""
         if np.ndim(values) == 0 or isinstance(values, (AffineBounds, wp.array)):
             return values
         host = real_array(values, name)
@@ -189,7 +193,7 @@ class _Fields:
         return host
 
     def unload(self, field: wp.array[Any], dtype: Any = np.float64) -> np.ndarray:
-        """Return a field as an array of b's shape, where that has as many elements."""
+        """Return a field in b's shape if the sizes agree, else in its own shape."""
         host = np.array(field.numpy(), dtype=dtype)
         return host.reshape(self.given if host.size == int(np.prod(self.given)) else host.shape)
 
@@ -246,7 +250,7 @@ def _is_pairs(bounds: Any, n: int) -> bool:
 
 
 def _is_pair(one: Any) -> bool:
-    """Return whether this is a sequence of two numbers or None."""
+    """Return whether a value is a sequence of two numbers or None."""
     if isinstance(one, np.ndarray):
         return one.shape == (2,)
     return (
@@ -257,7 +261,7 @@ def _is_pair(one: Any) -> bool:
 
 
 def _bound(values: Any, name: str, wrong: float) -> Any:
-    """Return a bound, with infinity for 1e20 and more.
+    """Return a bound in which magnitudes of 1e20 and more are infinite.
 
     Raises:
         ValueError: it is infinite on the wrong side.
@@ -265,24 +269,24 @@ def _bound(values: Any, name: str, wrong: float) -> Any:
     if isinstance(values, AffineBounds):
         return values
     host = real_array(values, f"bounds, {name}").astype(np.float64)
-    found = huge_as_infinite(host)
-    if (found == wrong).any():
-        count, sign = np.count_nonzero(found == wrong), "-" if wrong < 0 else ""
+    bound = huge_as_infinite(host)
+    if (bound == wrong).any():
+        count, sign = np.count_nonzero(bound == wrong), "-" if wrong < 0 else ""
         raise ValueError(
             f"bounds, {name} holds {count} values of {sign}1e20 or beyond, which is infinite: no x "
             "could meet it"
         )
-    if found is host:
+    if bound is host:
         return values
     return (
-        wp.array(found, dtype=values.dtype, device=values.device)
+        wp.array(bound, dtype=values.dtype, device=values.device)
         if isinstance(values, wp.array)
-        else found
+        else bound
     )
 
 
 def _method(method: Any) -> Solver:
-    """Return the method that a name stands for, or the one given."""
+    """Return the method for a name, or a method instance unchanged."""
     method = method_of(method)
     if isinstance(method, type) or not isinstance(method, Solver):
         kind = (
@@ -298,7 +302,7 @@ def _method(method: Any) -> Solver:
 
 
 def _told(callback: Any) -> Callable[[OptimizeResult], Any] | None:
-    """Return what calls a callback in the way that its signature asks for, SciPy's two."""
+    """Return a function that calls a callback with either of SciPy's signatures."""
     if callback is None:
         return None
     if not callable(callback):
@@ -307,7 +311,7 @@ def _told(callback: Any) -> Callable[[OptimizeResult], Any] | None:
         )
     try:
         names = set(inspect.signature(callback).parameters)
-    except ValueError:  # of a function written in C
+    except ValueError:  # a function written in C
         names = set()
     if names == {"intermediate_result"}:
         return lambda found: callback(intermediate_result=found)
@@ -315,7 +319,11 @@ def _told(callback: Any) -> Callable[[OptimizeResult], Any] | None:
 
 
 def _sides(problem: LCP, x: wp.array[Any]) -> tuple[wp.array[Any], wp.array[Any]]:
-    """Return y at x and on which side of its bounds each unknown is held, fields of the operator's shape; 0 where there is no unknown."""
+    """Return y = A x + b and the active bound of each unknown.
+
+    Both are fields of the operator's shape, 0 in cells without an unknown. The mask is -1 where x
+    is at the lower bound, 1 at the upper bound, and 0 where y = 0.
+    """
     layout = problem.layout
     stored, y = layout.load(x, wp.float64), layout.zeros(wp.float64)
     problem.bounds.follow(stored)

@@ -1,4 +1,4 @@
-"""Watch a solve: print its progress, plot how residuals fall."""
+"""Watch a solve: print its progress, plot its residuals."""
 
 from __future__ import annotations
 
@@ -110,7 +110,10 @@ def _labeled(results: Any) -> list[tuple[str, SolveResult]]:
 
 
 def _reference(result: SolveResult) -> float:
-    """Return the norm of the natural residual at clip(0, l, u), which relative residuals are divided by."""
+    """Return the norm of the natural residual at clip(0, l, u).
+
+    Relative residuals are divided by it.
+    """
     return (
         result.residual / result.relative_residual
         if result.relative_residual > 0.0

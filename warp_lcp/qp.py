@@ -1,4 +1,7 @@
-"""Convex quadratic programs for qpsolvers: `register()` adds the solver "warp_lcp" to those of that package (extra `qpsolvers`)."""
+"""Convex quadratic programs for qpsolvers (extra `qpsolvers`).
+
+`register()` adds the solver "warp_lcp" to those of that package.
+"""
 
 from __future__ import annotations
 
@@ -33,8 +36,8 @@ if TYPE_CHECKING:
     from qpsolvers import Problem, Solution
 
 NAME = "warp_lcp"
-LOOSER = 10.0  # times tol: residuals row by row, where a method has met tol in the norm of all rows
-LEAST = 1e-12  # the least tolerance of rows, which rounding leaves
+LOOSER = 10.0  # times tol: limit of each row's residual; methods meet tol in the norm of all rows
+LEAST = 1e-12  # least tolerance of a row: rounding errors
 WORDS = {
     "infeasible": "no x meets the constraints",
     "unbounded": "the objective is unbounded below",
@@ -86,7 +89,7 @@ def solve_problem(
         verbose: print how the solve ended.
         method: of `linear_complementarity`. None: its default for a box; with other
             constraints, or if that fails, InteriorPoint, then Lemke.
-        tol: relative tolerance, in [0, 1), of the natural residual; what is found has primal and
+        tol: relative tolerance, in [0, 1), of the natural residual; the solution has primal and
             dual residuals below 10 tol in every row, relative to the terms of that row, and such a
             duality gap, relative to its terms.
         maxiter: maximum number of iterations of a method.
@@ -128,10 +131,10 @@ def solve_problem(
 
 
 class _Solve:
-    """Methods one after the other, until the point of one is optimal.
+    """Try methods in order until the point of one is optimal.
 
     Attributes:
-        point: what is optimal, in the program's units; None: nothing yet.
+        point: the optimal point in the program's units; None before it is found.
         result: of the last method.
         figures: relative primal residual, dual residual and gap of the last point.
     """
@@ -156,7 +159,7 @@ class _Solve:
         self.result: Any = None
 
     def run(self) -> None:
-        """Solve a box as it is, and the conditions of what is no box or where that fails."""
+        """Solve a box directly; else, or if that fails, the optimality conditions."""
         p = self.program
         if p.h is None and p.d is None:
             self._box()
@@ -181,7 +184,7 @@ class _Solve:
                 )
 
     def end(self, status: SolveStatus, message: str) -> None:
-        """Say how the program ended."""
+        """Record the status and the message of the program."""
         message = f"{status.name}: {message}"
         if self.result is None:
             from scipy.optimize import OptimizeResult
@@ -204,25 +207,25 @@ class _Solve:
         self._judge(with_rows(p), ProgramPoint(x, np.zeros(0), np.zeros(0)), None)
 
     def _by(self, method: Any) -> None:
-        """Solve the equilibrated conditions by a method."""
-        p, units, made = self._scaled, self._units, self._conditions
+        """Solve the equilibrated optimality conditions by a method."""
+        p, units, conditions = self._scaled, self._units, self._conditions
         n, m = len(p.c), len(p.h)
-        x0 = None if self.x0 is None else np.r_[self.x0 / units.x, np.zeros(len(made.b) - n)]
-        sides = {"bounds": (made.lower, made.upper), "x0": x0, "method": method}
-        self.result = found = linear_complementarity(
-            made.A, made.b, tol=self.tol, maxiter=self.maxiter, **sides
+        x0 = None if self.x0 is None else np.r_[self.x0 / units.x, np.zeros(len(conditions.b) - n)]
+        sides = {"bounds": (conditions.lower, conditions.upper), "x0": x0, "method": method}
+        self.result = result = linear_complementarity(
+            conditions.A, conditions.b, tol=self.tol, maxiter=self.maxiter, **sides
         )
-        point = ProgramPoint(found.x[:n], found.x[n : n + m], found.x[n + m :])
-        if not np.isfinite(found.x).all():
+        point = ProgramPoint(result.x[:n], result.x[n : n + m], result.x[n + m :])
+        if not np.isfinite(result.x).all():
             return
         self._judge(
             p,
-            polished(p, point) if found.success or self.method is None else settled(p, point),
+            polished(p, point) if result.success or self.method is None else settled(p, point),
             units,
         )
 
     def _judge(self, p: ProgramWithRows, point: ProgramPoint, units: ProgramUnits | None) -> None:
-        """Take a point that is optimal, or say that it is not."""
+        """Accept a point that is optimal, or record that it is not."""
         self.figures = relative_residuals(p, point)
         found = point if units is None else units.of_caller(point)
         if max(self.figures) <= max(LOOSER * self.tol, LEAST) and found.is_finite:
@@ -263,7 +266,10 @@ def _write(
 
 
 def _read(problem: Problem) -> tuple[QuadraticProgramData, np.ndarray]:
-    """Return the program without its infinite rows, with the sign of G and h changed, and the mask of its rows."""
+    """Return the program without its infinite rows, and the mask of its rows.
+
+    The signs of G and h are changed: qpsolvers has G x <= h, the program has G x >= h.
+    """
     P, q, lower, upper = _objective(problem)
     n = len(q)
     G, h = _rows(problem.G, problem.h, "G", "h", n)
@@ -283,7 +289,7 @@ def _read(problem: Problem) -> tuple[QuadraticProgramData, np.ndarray]:
 
 
 def _entries(M: Any) -> int:
-    """Return how many entries of a matrix are not 0."""
+    """Return the number of nonzero entries of a matrix."""
     return int(M.nnz if scipy.sparse.issparse(M) else np.count_nonzero(M))
 
 
@@ -321,7 +327,7 @@ def _objective(problem: Problem) -> tuple[Any, np.ndarray, np.ndarray, np.ndarra
 def _rows(
     matrix: Any, right: Any, name: str, name_of_right: str, n: int
 ) -> tuple[Any, np.ndarray | None]:
-    """Return a constraint's matrix and right-hand side, None where there is none."""
+    """Return a constraint's matrix and right-hand side, None if it does not exist."""
     if matrix is None or right is None:
         if matrix is not None or right is not None:
             raise ValueError(f"{name} and {name_of_right}: one is missing")
@@ -333,7 +339,7 @@ def _rows(
 
 
 def _matrix(values: Any, name: str) -> Any:
-    """Return a matrix, sparse or dense, of float64."""
+    """Return a sparse or dense matrix of float64."""
     if scipy.sparse.issparse(values):
         return scipy.sparse.csr_array(values, dtype=np.float64)
     host = np.atleast_2d(real_array(values, name).astype(np.float64))
@@ -353,7 +359,10 @@ def _vector(values: Any, name: str, n: int) -> np.ndarray:
 
 
 def _check_convex(P: Any, q: np.ndarray) -> None:
-    """Refuse a program whose first-order conditions are met by more than its minimizers."""
+    """Raise ValueError unless the program is convex.
+
+    Only then do the first-order conditions hold at minimizers alone.
+    """
     problem = LCP(as_operator(P, "cpu"), np.zeros_like(q), -np.inf)
     if not is_convex(DenseProblem.read(problem, keep_sparse=True).scaled()[0].A):
         raise ValueError("P is not positive semi-definite: the program is not convex")

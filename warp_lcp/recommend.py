@@ -1,4 +1,4 @@
-"""Which method to take for a problem, and why."""
+"""Recommend a method for a problem, with reasons."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from warp_lcp.solvers.registry import METHODS
 from warp_lcp.traits import TRIAL, Traits
 
 ACCURACIES = {"rough": 1e-2, "usual": 1e-6, "exact": 1e-10}
-# numbers of 8 bytes besides A that methods hold for an entry of a matrix and for an unknown,
-# rounded up from measured workspaces
+# Numbers of 8 bytes that methods hold besides A, for each entry of a matrix and for each unknown;
+# rounded up from measured workspaces.
 FIELDS_ONLY, SYSTEMS = (0, 18), (4, 40)
-# hold fields only and take matrices
+# Methods that hold fields only and accept matrices.
 LEAN = ("psor", "accelerated-projected-gradient", "projected-jacobi")
 
 
@@ -57,7 +57,7 @@ class Budget(Settings):
 
 @dataclass(frozen=True)
 class Recommendation:
-    """A method for a problem.
+    """The recommended method for a problem, with criteria and reasons.
 
     Args:
         name: of the method in METHODS.
@@ -79,7 +79,7 @@ class Recommendation:
     traits: Traits
 
     def __str__(self) -> str:
-        """Return the methods in order, and the reasons."""
+        """Return the methods in order, and the reasons, as text."""
         chain = self.chain
         lines = [str(chain) if isinstance(chain, Fallback) else self.name, *self.reasons]
         if self.expected is not None:
@@ -124,9 +124,11 @@ def recommend(
 
     Example:
         >>> import numpy as np, warp_lcp as wl
-        >>> problem = wl.LCP(wl.DenseOperator(np.diag([2.0] * 8) - np.eye(8, k=1), device="cpu"), -np.ones(8))
+        >>> A = wl.DenseOperator(np.diag([2.0] * 8) - np.eye(8, k=1), device="cpu")
+        >>> problem = wl.LCP(A, -np.ones(8))
         >>> advice = recommend(problem, accuracy=1e-8)
-        >>> print(advice.name, wl.solve(problem, advice.method, stopping=advice.stopping).status.name)
+        >>> result = wl.solve(problem, advice.method, stopping=advice.stopping)
+        >>> print(advice.name, result.status.name)
         minimum-map-newton CONVERGED
     """
     if not isinstance(problem, LCP):
@@ -144,13 +146,13 @@ def recommend(
 
 
 def memory_of(name: str, t: Traits) -> int:
-    """Return about how many bytes a method holds besides the problem's own arrays."""
+    """Estimate the bytes that a method holds besides the problem's own arrays."""
     square, fields = FIELDS_ONLY if name in (*LEAN, "nncg", "projected-multigrid") else SYSTEMS
     return 8 * (square * (t.entries if t.kind in ("dense", "sparse") else 0) + fields * t.unknowns)
 
 
 def _from_rule(rule: Rule, t: Traits, rtol: float) -> Recommendation:
-    """Return what a rule says."""
+    """Return the recommendation of a rule."""
     expected = None
     if rule.steps is not None:
         expected = f"{rule.steps} steps or fewer"
@@ -182,7 +184,12 @@ def criteria(rtol: float, most: int) -> StoppingCriteria:
 
 
 def _within(found: Recommendation, budget: Budget, problem: LCP) -> Recommendation:
-    """Return a recommendation that respects a budget, or says that it cannot."""
+    """Return a recommendation within a budget, or the reason why none fits.
+
+    A method that needs too much memory is replaced by one that holds fields only. Sweeps that need
+    too many steps are replaced by another rule's method, and a method whose first step takes too
+    long is replaced by sweeps.
+    """
     t = found.traits
     if budget.bytes is not None and (needs := memory_of(found.name, t)) > budget.bytes:
         lean = next(
@@ -225,7 +232,10 @@ def _within(found: Recommendation, budget: Budget, problem: LCP) -> Recommendati
 
 
 def _in_time(found: Recommendation, seconds: float, problem: LCP) -> Recommendation:
-    """Return a recommendation whose first step ends in time: sweeps improve x from the first one on."""
+    """Return a recommendation whose first step ends in time.
+
+    If the first step is too slow, sweeps replace the method: they improve x from the first one on.
+    """
     begun = time.perf_counter()
     taken = _takes(found.name, problem, steps=1)
     took = time.perf_counter() - begun
@@ -255,7 +265,7 @@ def _in_time(found: Recommendation, seconds: float, problem: LCP) -> Recommendat
 
 
 def _takes(name: str, problem: LCP, *, steps: int = 0) -> bool:
-    """Make some steps and return whether the method takes the problem."""
+    """Make some steps and return whether the method accepts the problem."""
     try:
         solve(problem, METHODS[name](), stopping=StoppingCriteria(max_iterations=steps))
     except ValueError:
@@ -268,7 +278,10 @@ def _said(found: Recommendation, reason: str) -> Recommendation:
 
 
 def _instead(found: Recommendation, name: str, reason: str) -> Recommendation:
-    """Return another method for the same criteria, with the limit of steps of a method that sweeps."""
+    """Return the recommendation with another method for the same criteria.
+
+    The limit of steps is that of a method that sweeps.
+    """
     stopping = replace(found.stopping, max_iterations=LONGEST, patience=LONGEST // 10)
     attempts = (Attempt(name), *(attempt for attempt in found.attempts if attempt.method != name))
     changed = replace(

@@ -1,8 +1,8 @@
-"""The rules by which `wl.solve` and `wl.recommend` choose: a table whose rows are tried in order.
+"""Decision table of `wl.solve` and `wl.recommend`; rows are tried in order.
 
-A row says when it applies, and which solves are attempted then: each a method, the form of the
-matrix that it works on, and a limit of steps. `default_chain` lists the methods that take over
-within a solve. `warp_lcp.benchmarks.choose` measures every row against all methods.
+Each row has a condition and the solves to attempt: a method, the form of the matrix that it works
+on, and a limit of steps. `default_chain` lists the methods that take over within a solve.
+`warp_lcp.benchmarks.choose` measures every row against all methods.
 """
 
 from __future__ import annotations
@@ -18,13 +18,14 @@ from warp_lcp.solvers.registry import METHODS
 from warp_lcp.solvers.subspace_minimization import SubspaceMinimization
 from warp_lcp.traits import Traits
 
-# fewer are faster than a multigrid hierarchy's set-up and some cycles, or than systems
+# Below these numbers of sweeps, sweeps are faster than linear systems, or than the set-up of a
+# multigrid hierarchy and some cycles.
 FEW_SWEEPS = {"grid": 25, "sparse": 60}
-# unknowns up to which a method that fails is followed by Lemke's: it takes seconds there
+# Largest number of unknowns for which Lemke's method follows one that fails: it takes seconds.
 PIVOTED = 1000
-# unknowns up to which Lemke's paths may take so many steps: ten seconds
+# Largest number of unknowns for which Lemke's method may take LONG_PATHS steps: ten seconds.
 SURE, LONG_PATHS = 100, 2000
-LONGEST = 5000  # steps of a method that sweeps: a prediction may be too low
+LONGEST = 5000  # limit of steps of a method that sweeps: a prediction may be too low
 SWEEPING = (
     "psor",
     "nncg",
@@ -32,20 +33,22 @@ SWEEPING = (
     "projected-jacobi",
     "accelerated-projected-gradient",
 )
-OTHERS = 100  # steps of other methods
+OTHERS = 100  # limit of steps of other methods
 
 
 @dataclass(frozen=True)
 class Attempt:
-    """One of the solves that `wl.solve` makes without a method, from the same start, until one succeeds.
+    """One solve of the sequence that `wl.solve` makes without a given method.
+
+    All attempts begin from the same start; the first that succeeds ends the sequence.
 
     Args:
         method: its name in METHODS; None: that of the rules for the problem in `form`, left out
             where the problem has no such form.
-        form: of the matrix; None, or where the problem has no such form: as it is given.
+        form: of the matrix; None, or where the problem has no such form: its original form.
         when: condition under which the attempt is made; None: always.
         steps: limit of steps, where the caller gives none; None: `steps_allowed`.
-        again: the method has been tried before, with fewer steps: no attempt where the caller's own
+        again: the method has been tried before with fewer steps: no attempt where the caller's own
             limits would make it the same.
     """
 
@@ -61,19 +64,22 @@ class Attempt:
 
 
 def is_concave(t: Traits) -> bool:
-    """Return whether a symmetric matrix has a negative diagonal entry: mostly a sign error, of which pivots may find the solution."""
+    """Return whether a symmetric matrix has a negative diagonal entry.
+
+    Usually that is a sign error in A; pivoting may still find a solution.
+    """
     return t.kind in ("dense", "sparse") and t.symmetric and t.diagonal == "negative"
 
 
 # A large sparse matrix that is a stencil in its natural order is solved on that grid.
 ON_GRID = Attempt(None, form=as_grid)
 LEMKE = Attempt("lemke", when=lambda t: t.unknowns <= PIVOTED)
-# Singular blocks are seen by LAPACK, which is faster there than GMRES, too.
+# LAPACK detects singular blocks, and is faster there than GMRES.
 FISCHER = Attempt("fischer-newton", form=as_dense)
-# Free blocks of contacts are singular, and heavy bodies on light ones leave eigenvalues of 1 over
-# the ratio of masses: on a free set that is not the solution's the exact step of a dense matrix is
-# as much too long, where conjugate gradients stop early. With ratios to 1e7 the residual rises and
-# falls over hundreds of steps.
+# Free blocks of contacts are singular, and heavy bodies on light ones leave eigenvalues of 1 /
+# (ratio of masses). On a free set other than the solution's, the exact step of a dense matrix is
+# too long by that ratio, where conjugate gradients stop early. With ratios up to 1e7 the residual
+# rises and falls over hundreds of steps.
 INEXACT = Attempt(
     "subspace-minimization",
     form=as_sparse,
@@ -90,7 +96,7 @@ def unless_concave(name: str) -> Attempt:
 
 @dataclass(frozen=True)
 class Rule:
-    """A row of the table.
+    """A row of the decision table: a condition and the attempts that it selects.
 
     Args:
         reason: a sentence without its full stop.
@@ -107,7 +113,10 @@ class Rule:
 
     @property
     def method(self) -> str:
-        """Name of the method that is recommended: the first attempt's that works on the problem as it is given."""
+        """Name of the recommended method.
+
+        It is that of the first attempt that works on the problem in its given form.
+        """
         return next(attempt.method for attempt in self.attempts if attempt.method is not None)
 
     @property
@@ -120,90 +129,168 @@ class Rule:
 
 
 def attempts(*given: Attempt | str) -> tuple[Attempt, ...]:
-    """Return attempts; a name is one by that method in its plain form."""
+    """Return attempts; a name stands for an attempt by that method."""
     return tuple(one if isinstance(one, Attempt) else Attempt(one) for one in given)
 
 
-# fmt: off
 RULES: tuple[Rule, ...] = (
-    Rule("Affine bounds, as for friction, depend on x and need sweeps; solves on the free unknowns "
-         "speed these up",
-         lambda t: t.affine, 18,
-         attempts("subspace-minimization", INEXACT, "nncg", "blocked-gauss-seidel", "psor", "staggering")),
-    Rule("Affine bounds without access to rows leave one method",
-         lambda t: t.affine, None,
-         attempts("projected-jacobi")),
-    Rule("Negative diagonal entries with infinite bounds are usually a sign error in A; pivoting "
-         "still works",
-         lambda t: t.curved and t.unknowns <= PIVOTED, 5,
-         attempts("lemke", unless_concave("minimum-map-newton"))),
-    Rule("Larger problems with such entries end with NEGATIVE_CURVATURE: check the sign of A",
-         lambda t: t.curved, None,
-         attempts(ON_GRID, "minimum-map-newton")),
-    Rule("With a few negative diagonal entries Newton's method often converges; where it stalls, "
-         "the Fischer-Burmeister function goes on",
-         lambda t: t.diagonal == "negative" and t.kind in ("dense", "sparse") and t.unbounded, 20,
-         attempts(ON_GRID, "minimum-map-newton", LEMKE, unless_concave("interior-point"))),
-    Rule("In a box, sweeps set an unknown with a negative diagonal entry to a bound; solves on the "
-         "free unknowns speed up dense ones",
-         lambda t: t.diagonal == "negative" and t.kind == "dense", 40,
-         attempts("subspace-minimization", "fischer-newton", LEMKE, "psor", unless_concave("minimum-map-newton"),
-                  unless_concave("interior-point"))),
-    Rule("In a box, a sweep sets an unknown with a negative diagonal entry to one of its bounds",
-         lambda t: t.diagonal == "negative" and t.kind == "sparse", None,
-         attempts("psor", LEMKE, Attempt("fischer-newton", as_dense, lambda t: not is_concave(t)), unless_concave("minimum-map-newton"),
-                  unless_concave("interior-point"))),
-    Rule("Without access to rows there are no sweeps, and Newton's method needs the fewest "
-         "products",
-         lambda t: t.kind == "operator", 8,
-         attempts("minimum-map-newton", "mprgp", "primal-dual-active-set", "interior-point", "fischer-newton")),
-    Rule("If a few sweeps solve a grid or a sparse matrix, multigrid and linear systems cost more",
-         lambda t: t.kind in FEW_SWEEPS and not t.direct and t.diagonal == "positive" and t.sweeps <= FEW_SWEEPS[t.kind], None,
-         attempts("psor", "nncg", "minimum-map-newton")),
-    Rule("On a grid the number of multigrid cycles hardly depends on the size",
-         lambda t: t.kind == "grid" and t.points, 8,
-         attempts("projected-multigrid", "minimum-map-newton", "mprgp")),
-    Rule("A stencil that is unsymmetric or needs line relaxation has a multigrid hierarchy for "
-         "Newton's systems",
-         lambda t: t.kind == "grid", 9,
-         attempts("minimum-map-newton", "primal-dual-active-set", "interior-point", "mprgp")),
-    Rule("With few unknowns, pivoting handles zeros on the diagonal (friction cones, linear "
-         "programs, games)",
-         lambda t: t.pivotable and t.unknowns <= 400, 5,
-         attempts("lemke", "interior-point", FISCHER, "minimum-map-newton")),
-    Rule("Interior-point systems are shifted, so that zeros on the diagonal do no harm",
-         lambda t: t.pivotable, 14,
-         attempts(ON_GRID, "interior-point", FISCHER, "minimum-map-newton", LEMKE)),
-    Rule("PIQP solves the convex quadratic program of a dense symmetric matrix of low rank or with "
-         "a small ridge",
-         lambda t: t.low_rank, 1,
-         attempts("quadratic-program", "interior-point", LEMKE, "minimum-map-newton", "mprgp")),
-    Rule("A symmetric matrix of low rank has singular free blocks, which interior-point systems "
-         "shift",
-         lambda t: t.low_rank, 14,
-         attempts("interior-point", LEMKE, FISCHER, "minimum-map-newton", "mprgp")),
-    Rule("Any other matrix needs a few systems on the free unknowns, solved directly if small or "
-         "narrow",
-         lambda t: True, 9,
-         attempts(ON_GRID, "minimum-map-newton", "quadratic-program", "interior-point", LEMKE, FISCHER, "primal-dual-active-set", "mprgp")),
+    Rule(
+        "Affine bounds, as for friction, depend on x and need sweeps; solves on the free unknowns "
+        "speed these up",
+        lambda t: t.affine,
+        18,
+        attempts(
+            "subspace-minimization", INEXACT, "nncg", "blocked-gauss-seidel", "psor", "staggering"
+        ),
+    ),
+    Rule(
+        "Affine bounds without access to rows leave one method",
+        lambda t: t.affine,
+        None,
+        attempts("projected-jacobi"),
+    ),
+    Rule(
+        "Negative diagonal entries with infinite bounds are usually a sign error in A; pivoting "
+        "still works",
+        lambda t: t.curved and t.unknowns <= PIVOTED,
+        5,
+        attempts("lemke", unless_concave("minimum-map-newton")),
+    ),
+    Rule(
+        "Larger problems with such entries end with NEGATIVE_CURVATURE: check the sign of A",
+        lambda t: t.curved,
+        None,
+        attempts(ON_GRID, "minimum-map-newton"),
+    ),
+    Rule(
+        "With a few negative diagonal entries Newton's method often converges; where it stalls, "
+        "the Fischer-Burmeister function goes on",
+        lambda t: t.diagonal == "negative" and t.kind in ("dense", "sparse") and t.unbounded,
+        20,
+        attempts(ON_GRID, "minimum-map-newton", LEMKE, unless_concave("interior-point")),
+    ),
+    Rule(
+        "In a box, sweeps set an unknown with a negative diagonal entry to a bound; solves on the "
+        "free unknowns speed up dense ones",
+        lambda t: t.diagonal == "negative" and t.kind == "dense",
+        40,
+        attempts(
+            "subspace-minimization",
+            "fischer-newton",
+            LEMKE,
+            "psor",
+            unless_concave("minimum-map-newton"),
+            unless_concave("interior-point"),
+        ),
+    ),
+    Rule(
+        "In a box, a sweep sets an unknown with a negative diagonal entry to one of its bounds",
+        lambda t: t.diagonal == "negative" and t.kind == "sparse",
+        None,
+        attempts(
+            "psor",
+            LEMKE,
+            Attempt("fischer-newton", as_dense, lambda t: not is_concave(t)),
+            unless_concave("minimum-map-newton"),
+            unless_concave("interior-point"),
+        ),
+    ),
+    Rule(
+        "Without access to rows there are no sweeps, and Newton's method needs the fewest products",
+        lambda t: t.kind == "operator",
+        8,
+        attempts(
+            "minimum-map-newton",
+            "mprgp",
+            "primal-dual-active-set",
+            "interior-point",
+            "fischer-newton",
+        ),
+    ),
+    Rule(
+        "If a few sweeps solve a grid or a sparse matrix, multigrid and linear systems cost more",
+        lambda t: (
+            t.kind in FEW_SWEEPS
+            and not t.direct
+            and t.diagonal == "positive"
+            and t.sweeps <= FEW_SWEEPS[t.kind]
+        ),
+        None,
+        attempts("psor", "nncg", "minimum-map-newton"),
+    ),
+    Rule(
+        "On a grid the number of multigrid cycles hardly depends on the size",
+        lambda t: t.kind == "grid" and t.points,
+        8,
+        attempts("projected-multigrid", "minimum-map-newton", "mprgp"),
+    ),
+    Rule(
+        "A stencil that is unsymmetric or needs line relaxation has a multigrid hierarchy for "
+        "Newton's systems",
+        lambda t: t.kind == "grid",
+        9,
+        attempts("minimum-map-newton", "primal-dual-active-set", "interior-point", "mprgp"),
+    ),
+    Rule(
+        "With few unknowns, pivoting handles zeros on the diagonal (friction cones, linear "
+        "programs, games)",
+        lambda t: t.pivotable and t.unknowns <= 400,
+        5,
+        attempts("lemke", "interior-point", FISCHER, "minimum-map-newton"),
+    ),
+    Rule(
+        "Interior-point systems are shifted, so that zeros on the diagonal do no harm",
+        lambda t: t.pivotable,
+        14,
+        attempts(ON_GRID, "interior-point", FISCHER, "minimum-map-newton", LEMKE),
+    ),
+    Rule(
+        "PIQP solves the convex quadratic program of a dense symmetric matrix of low rank or with "
+        "a small ridge",
+        lambda t: t.low_rank,
+        1,
+        attempts("quadratic-program", "interior-point", LEMKE, "minimum-map-newton", "mprgp"),
+    ),
+    Rule(
+        "A symmetric matrix of low rank has singular free blocks, which interior-point systems "
+        "shift",
+        lambda t: t.low_rank,
+        14,
+        attempts("interior-point", LEMKE, FISCHER, "minimum-map-newton", "mprgp"),
+    ),
+    Rule(
+        "Any other matrix needs a few systems on the free unknowns, solved directly if small or "
+        "narrow",
+        lambda t: True,
+        9,
+        attempts(
+            ON_GRID,
+            "minimum-map-newton",
+            "quadratic-program",
+            "interior-point",
+            LEMKE,
+            FISCHER,
+            "primal-dual-active-set",
+            "mprgp",
+        ),
+    ),
 )
-# fmt: on
 
 
 def rules_for(t: Traits) -> Iterator[Rule]:
-    """Return the rules that apply, of the methods that take such a problem."""
+    """Return the rules that apply and whose methods accept such a problem."""
     return (rule for rule in RULES if rule.applies(t) and t.takes(rule.method))
 
 
 def steps_allowed(name: str, unknowns: int) -> int:
-    """Return a limit of steps of a method that nothing else is known of."""
+    """Return the default limit of steps of a method."""
     if name == "lemke" and unknowns <= SURE:
         return LONG_PATHS
     return LONGEST if name in SWEEPING else OTHERS
 
 
 def method_for(name: str, t: Traits) -> Solver:
-    """Return a method with the settings that a problem asks for."""
+    """Return a method with the settings that suit a problem."""
     return _method(name, t.direct, t.affine)
 
 
@@ -211,7 +298,7 @@ def method_for(name: str, t: Traits) -> Solver:
 def _method(name: str, direct: bool, affine: bool) -> Solver:
     if name == "minimum-map-newton" and direct:
         return MinimumMapNewton(direct=True)
-    # where the residual may not rise first, 4 of 11 scenes of contacts do not converge
+    # If the residual may not rise first, 4 of 11 scenes of contacts do not converge.
     if name == "subspace-minimization" and affine:
         return SubspaceMinimization(precision="double", backtracks=-1)
     return METHODS[name]()

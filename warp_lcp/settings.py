@@ -1,4 +1,7 @@
-"""Settings: dataclasses whose annotations say what a field may hold; checks and the words of a refusal are drawn from there."""
+"""Settings: frozen dataclasses that check their fields by annotations.
+
+Checks and error messages are derived from the annotations.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,7 @@ from annotated_types import Ge, Gt, Le, Lt
 
 
 class _OrInfinite:
-    """Lets a range without an end hold inf."""
+    """Marker of a range that may hold inf."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Callable[[Any], Any]) -> Any:
         """Return the schema of the range, inf included."""
@@ -31,7 +34,7 @@ Count = Annotated[int, Ge(1)]
 CountOrZero = Annotated[int, Ge(0)]
 Positive = Annotated[float, Gt(0)]
 NonNegative = Annotated[float, Ge(0)]
-Share = Annotated[float, Gt(0), Lt(1)]  # neither nothing nor all
+Share = Annotated[float, Gt(0), Lt(1)]  # neither 0 nor 1
 ShareOrZero = Annotated[float, Ge(0), Lt(1)]
 ShareOrAll = Annotated[float, Gt(0), Le(1)]
 Part = Annotated[float, Ge(0), Le(1)]
@@ -53,8 +56,8 @@ class SettingError(ValueError):
 
     Args:
         name: the setting's.
-        value: what was given.
-        rule: what it must be.
+        value: the invalid value.
+        rule: description of valid values.
     """
 
     def __init__(self, name: str, value: object, rule: str) -> None:
@@ -67,12 +70,12 @@ class SettingError(ValueError):
 
 
 class Settings:
-    """Base of a frozen dataclass that checks its fields by their annotations, once it is made. Numbers are stored as Python's.
+    """Base of a frozen dataclass that checks its fields by their annotations.
 
-    Whole floats are integers, NumPy's numbers are those of their values, members of a `StrEnum`
-    their words; a bool or a text is no number. Numbers are finite, unless the range says
-    `OrInfinite`. What several fields must be together is checked in a `__post_init__` that calls
-    this one first.
+    Numbers are stored as Python numbers: whole floats as integers, NumPy numbers by their values.
+    Members of a `StrEnum` are stored as their text. A bool or a text is not a number. Numbers are
+    finite, unless the range has `OrInfinite`. A condition on several fields is checked in a
+    `__post_init__` that calls this one first.
 
     Example:
         >>> @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -101,17 +104,21 @@ class Settings:
 
 
 def renamed(**names: str) -> Callable[[type[Kind]], type[Kind]]:
-    """Let a dataclass take old names of its fields, with a DeprecationWarning that gives the new name.
+    """Accept old names of a dataclass's fields, with a DeprecationWarning.
+
+    The warning gives the new name.
 
     Args:
         names: old="new".
     """
 
     def wrap(kind: type[Kind]) -> type[Kind]:
+        """Return the class with an `__init__` that accepts old names."""
         init: Any = kind.__init__
 
         @wraps(init)
         def init_by_either_name(self: Any, *args: Any, **settings: Any) -> None:
+            """Replace old names by new ones, with a warning."""
             for old, new in names.items():
                 if old in settings:
                     if new in settings:
@@ -174,12 +181,12 @@ def renamed_method(old: str, method: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def checked(name: str, given: object, annotation: Any) -> Any:
-    """Return a value as the type that its annotation says.
+    """Return a value converted to the type of its annotation.
 
     Args:
         name: of the value, for the message.
         given: the value.
-        annotation: what is allowed.
+        annotation: the valid types and ranges.
 
     Raises:
         SettingError: it is not.
@@ -198,13 +205,16 @@ def checked(name: str, given: object, annotation: Any) -> Any:
     )
     try:
         return adapter(annotation).validate_python(plain)
-    except ValueError:  # pydantic's words name one end of a range
+    except ValueError:  # pydantic's message names only one end of a range
         raise SettingError(name, value, rule(annotation)) from None
 
 
 @cache
 def checked_defaults(settings: type[Any]) -> dict[str, tuple[Any, Any]]:
-    """Return the default of each field of a dataclass that has one, as it is written and as the field's type."""
+    """Return the default of each field of a dataclass that has one.
+
+    Each is a pair: as written, and converted to the field's type.
+    """
     hints = ranges(settings)  # type: ignore[arg-type]
     defaults = {field.name: field.default for field in dataclasses.fields(settings)}
     return {
@@ -222,7 +232,7 @@ def ranges(settings: type[Any]) -> dict[str, Any]:
 
 
 def rule(annotation: Any) -> str:
-    """Return in words what an annotation allows.
+    """Describe in words what an annotation allows.
 
     Example:
         >>> rule(Count), rule(Share), rule(Positive | None), rule(Literal["forward", "backward"])
@@ -233,7 +243,7 @@ def rule(annotation: Any) -> str:
         case None:
             return KINDS.get(annotation) or f"a {getattr(annotation, '__name__', annotation)}"
         case kind if kind is Annotated:
-            # words of the annotation's own
+            # The annotation's own words come first.
             said = [part for part in parts if isinstance(part, str)]
             return said[0] if said else _range(*parts)
         case kind if kind in (Literal, Union, UnionType):
@@ -244,15 +254,15 @@ def rule(annotation: Any) -> str:
 
 
 def _range(kind: type, *limits: Any) -> str:
-    """Return a range of numbers in words."""
-    found = {
+    """Describe a range of numbers in words."""
+    limits_by_end = {
         name: getattr(limit, name) for limit in limits for name in ENDS if hasattr(limit, name)
     }
-    if len(found) == 2:
-        (low, a), (high, b) = found.items()
+    if len(limits_by_end) == 2:
+        (low, a), (high, b) = limits_by_end.items()
         ends = f"in {'[' if low == 'ge' else '('}{a:g}, {b:g}{']' if high == 'le' else ')'}"
         return f"an integer {ends}" if kind is int else ends
-    ends = " ".join(f"{ENDS[name]} {limit:g}" for name, limit in found.items())
+    ends = " ".join(f"{ENDS[name]} {limit:g}" for name, limit in limits_by_end.items())
     return (
         f"an integer {ends}"
         if kind is int
@@ -264,7 +274,10 @@ def _range(kind: type, *limits: Any) -> str:
 
 @cache
 def adapter(annotation: Any) -> Any:
-    """Return what validates a value; pydantic is imported here, for the import of the package not to wait for it."""
+    """Return the pydantic validator of an annotation.
+
+    pydantic is imported here, so that the import of the package does not wait for it.
+    """
     from pydantic import ConfigDict, InstanceOf, TypeAdapter
 
     if dataclasses.is_dataclass(annotation):
@@ -276,7 +289,10 @@ def adapter(annotation: Any) -> Any:
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
-    """Return `did you mean ...?` for a word that is near a known one, or its initials, and the list of known ones otherwise."""
+    """Return `did you mean ...?` for the known word nearest to a word.
+
+    A word may be the initials of a known one. Without a near word, the known ones are listed.
+    """
     known = sorted(known)
     initials = {"".join(part[:1] for part in re.split("[_-]", name)): name for name in known}
     match = (

@@ -1,4 +1,4 @@
-"""A simulation as a run sees it: its steps, its state, the parts of its frames, its errors and its stages."""
+"""Interface of a simulation to a run: steps, state, frames, errors, stages."""
 
 from __future__ import annotations
 
@@ -17,25 +17,28 @@ NOTHING = nullcontext()
 
 
 class Stopwatch(Protocol):
-    """What a run and its simulation mark their stages with."""
+    """Interface by which a run and its simulation time their stages."""
 
     def stage(self, name: str, *arrays: wp.array | None) -> AbstractContextManager[None]:
         """Return the context of a stage; the stages of a thread do not overlap.
 
         Args:
             name: of the stage, which may have several parts.
-            arrays: what it must read or write.
+            arrays: arrays that it reads or writes.
         """
 
     def beside(self, name: str) -> AbstractContextManager[None]:
-        """Return the context of what another thread does meanwhile."""
+        """Return the context of work that another thread does at the same time."""
 
     def wrote(self, name: str, *files: Path) -> None:
         """Add the sizes of files to a stage."""
 
 
 class NoStopwatch:
-    """Measure nothing: no clock is read, nothing waits for the device."""
+    """Stopwatch that measures nothing.
+
+    It reads no clock and does not wait for the device.
+    """
 
     def stage(self, name: str, *arrays: wp.array | None) -> AbstractContextManager[None]:
         """Return a context that does nothing."""
@@ -50,24 +53,30 @@ class NoStopwatch:
 
 
 class InputError(ValueError):
-    """What the user gave is wrong. The message names it and says what is allowed; the command line ends with exit code 2."""
+    """Invalid user input.
+
+    The message names the input and says what is allowed; the command line ends with exit code 2.
+    """
 
 
 class StepFailed(RuntimeError):
-    """The step's solve missed its criteria. The state is as before the step, so a smaller dt may be tried."""
+    """The solve of a step missed its criteria.
+
+    The state is as before the step, so a smaller dt may be tried.
+    """
 
 
 def missed_by_far(
     solve: str, status: SolveStatus, iterations: int, residual: str, advice: str
 ) -> StepFailed:
-    """Return what to raise where a solve has ended too far from its tolerance for the step to be taken.
+    """Return the exception for a solve that ended too far from its tolerance.
 
     Args:
-        solve: what was solved for, in a word.
-        status: how it ended.
-        iterations: how many it took.
-        residual: what it left, with its unit and what was asked for, in words.
-        advice: what may help.
+        solve: name of the quantity that is solved for.
+        status: status of the solve.
+        iterations: number of iterations.
+        residual: final residual, with its unit and the required one, in words.
+        advice: settings that may help.
     """
     return StepFailed(
         f"the {solve} solve ended with {status.name} after {iterations} iterations at a "
@@ -76,7 +85,10 @@ def missed_by_far(
 
 
 class SimulationFailed(RuntimeError):
-    """The run cannot go on, for example because a field is not finite. The message names step, field and cell."""
+    """The run cannot go on, for example because a field is not finite.
+
+    The message names step, field and cell.
+    """
 
 
 @runtime_checkable
@@ -90,12 +102,21 @@ class Measured(Protocol):
     measured: Mapping[str, Mapping[str, float | int | str | None]]
 
     def tables(self) -> Mapping[str, tuple[str, ...]]:
-        """Return the columns of each table, the first of which is `step`, by the name of its file."""
+        """Return the columns of each table by the name of its file.
+
+        The first column is `step`.
+        """
 
 
 @dataclass(frozen=True)
 class Points:
-    """A frame of vertices. `points` [m], shape (n, 3); `fields` of shape (n,) or (n, 3)."""
+    """A frame of vertices.
+
+    Args:
+        name: first part of the names of its files.
+        points: positions [m], shape (n, 3).
+        fields: values at the points, shape (n,) or (n, 3) each.
+    """
 
     name: str
     points: np.ndarray
@@ -104,12 +125,18 @@ class Points:
 
 @dataclass(frozen=True)
 class Cells:
-    """A frame of equal axis-aligned cells. `index` (n, 3): integer x, y, z of each cell, whose low corner lies at index * spacing [m].
+    """A frame of equal axis-aligned cells.
 
-    `dimension` 2 makes quadrilaterals in the plane z = 0, 3 makes voxels. `fields` have shape (n,)
-    or (n, 3). `counts`: cells of the whole grid along x, y and z, which an image of it has in every
-    frame. `box`: the first cell, and the one behind the last, of the part of the grid that these
-    cells come from, if others have the rest; then an image is one of that part.
+    Args:
+        name: first part of the names of its files.
+        index: integer x, y, z of each cell, shape (n, 3); its low corner is at index * spacing.
+        spacing: of the cells [m].
+        dimension: 2 makes quadrilaterals in the plane z = 0, 3 makes voxels.
+        fields: values of the cells, shape (n,) or (n, 3) each.
+        counts: numbers of cells of the whole grid along x, y and z; its image has them in every
+            frame.
+        box: the part of the grid that these cells come from, if other ranks have the rest: its
+            first cell and the one behind its last. An image then shows that part.
     """
 
     name: str
@@ -125,9 +152,12 @@ class Cells:
 class Surface:
     """A frame of a surface: triangles, in 2-D the segments of an outline.
 
-    `points` [m], shape (n, 3); `corners` of the triangles among them, shape (m, 3),
-    counterclockwise seen from outside, or of the segments, shape (m, 2), with the inside on the
-    left; `fields` at the points, of shape (n,) or (n, 3).
+    Args:
+        name: first part of the names of its files.
+        points: positions [m], shape (n, 3).
+        corners: indices of points: of triangles, shape (m, 3), counterclockwise seen from outside,
+            or of segments, shape (m, 2), with the inside on the left.
+        fields: values at the points, shape (n,) or (n, 3) each.
     """
 
     name: str
@@ -140,9 +170,13 @@ class Surface:
 class Volume:
     """A frame of values at the centers of a 3-D grid's cells.
 
-    `values`: float32, shape (nz, ny, nx); `spacing` of the cells [m]; `band`: of a signed distance
-    [m], < 0 inside, how far from the surface it is known; None: a density, >= 0; `origin`: how many
-    cells (x, y, z) lie between the first one and the domain's low corner.
+    Args:
+        name: first part of the names of its files.
+        values: float32, shape (nz, ny, nx).
+        spacing: of the cells [m].
+        band: for a signed distance, < 0 inside: distance from the surface up to which it is known
+            [m]. None for a density, >= 0.
+        origin: numbers of cells (x, y, z) between the domain's low corner and the first cell.
     """
 
     name: str
@@ -162,9 +196,10 @@ class Simulation(Protocol):
     step_count: int
 
     def stable_dt(self) -> float:
-        """Return the largest time step [s] that the scene's CFL number allows now, not yet clipped to dt_min, dt_max or a frame's time.
+        """Return the largest time step [s] that the scene's CFL number allows now.
 
-        It is a function of the state alone.
+        It is a function of the state alone, and not yet clipped to dt_min, dt_max or a frame's
+        time.
         """
 
     def step(self, dt: float) -> dict[str, float | int | str | None]:
@@ -176,13 +211,22 @@ class Simulation(Protocol):
         """
 
     def columns(self) -> tuple[str, ...]:
-        """Return the names of the log's columns that `step` fills, in order, after `step`, `time`, `dt` and before `seconds`."""
+        """Return the names of the log's columns that `step` fills, in order.
+
+        They stand after `step`, `time` and `dt` and before `seconds`.
+        """
 
     def frame(self) -> list[Part]:
-        """Return what a frame shows, as host arrays that no later step changes: they are written while the simulation goes on."""
+        """Return the parts of a frame, as host arrays that no later step changes.
+
+        The arrays are written while the simulation goes on.
+        """
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return everything that `restore` needs to continue bit for bit on the CPU, as host arrays without pickles."""
+        """Return the state that `restore` needs to continue bit for bit on the CPU.
+
+        Host arrays, without pickled objects.
+        """
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Continue from `state`.
@@ -192,24 +236,27 @@ class Simulation(Protocol):
         """
 
     def notes(self) -> list[str]:
-        """Return warnings and facts worth a line at the start of a run (say, a mesh outside the domain)."""
+        """Return warnings and facts for the start of a run.
+
+        For example: a mesh lies outside the domain.
+        """
 
 
 @runtime_checkable
 class Scheduled(Protocol):
-    """What a Simulation may also be: one in which something starts or stops at times known before.
+    """Optional interface of a simulation with events at known times.
 
-    Steps end there where that takes no step that is much shorter than its neighbors. The others run
-    across: the simulation must be right then too.
+    Something starts or stops at these times. Steps end there where that takes no step much shorter
+    than its neighbors. Other steps run across an event: the simulation must be right then too.
     """
 
     def events(self, until: float) -> list[float]:
-        """Return these times [s] as far as they are later than now and not later than `until` [s], in any order."""
+        """Return the times [s] of events after now and up to `until` [s], in any order."""
 
 
 @runtime_checkable
 class Profiled(Protocol):
-    """What a Simulation may also be: one that says what its step spends its time on.
+    """Optional interface of a simulation that times the stages of its step.
 
     It wraps the stages of its step in `with self.watch.stage(name, *arrays)`. A run that is
     profiled sets `watch` before the first step; until then it is a `NoStopwatch`.
@@ -220,11 +267,11 @@ class Profiled(Protocol):
 
 @runtime_checkable
 class Recorded(Protocol):
-    """What a Simulation may also be: one that shows the problems it solves.
+    """Optional interface of a simulation that records the problems it solves.
 
     Until a run sets `record`, it is None and costs nothing. Then each step calls it before its
-    solve, once an attempt, with the arrays of a file as `warp_lcp.gallery.recorded` describes them;
-    problems that no method solves are recorded too.
+    solve, once an attempt, with the arrays of a file as `warp_lcp.gallery.recorded` describes them.
+    Problems that no method solves are recorded too.
     """
 
     record: Callable[[Mapping[str, np.ndarray]], object] | None
@@ -232,10 +279,13 @@ class Recorded(Protocol):
 
 @runtime_checkable
 class Resampled(Protocol):
-    """What a Simulation may also be: one that can go on on another grid than the one its state was made on."""
+    """Optional interface of a simulation that can continue a state of another grid."""
 
     def resample(self, state: Mapping[str, np.ndarray]) -> list[str]:
-        """Continue from the state of a simulation that differs in `domain.resolution` alone; return what the user should know of it.
+        """Continue from a state that differs in `domain.resolution` alone.
+
+        Returns:
+            Messages about the change for the user.
 
         Raises:
             ValueError: the state does not belong to this scene on any grid, or cannot be brought to
@@ -245,18 +295,20 @@ class Resampled(Protocol):
 
 @runtime_checkable
 class Joined(Simulation, Protocol):
-    """What a Simulation may also be: one that several MPI ranks share, or that can go on where several ended.
+    """Optional interface of a simulation that is distributed over MPI ranks.
 
-    On several ranks it is a rank's part: `stable_dt`, `step`, `frame`, `restore` (the state of one
-    process) and `restore_pieces` are collective. Times, rows of the log and columns are those of
-    the whole simulation, the same on all ranks, which also raise the same kind of error. `frame`
-    returns what this rank has, in coordinates of the whole domain; `state` returns this rank's
-    piece of the state, whose `box`, int (2, 3), is its part's first cell and the one behind the
-    last.
+    It can also be resumed from a run on several ranks. On several ranks it is a rank's part:
+    `stable_dt`, `step`, `frame`, `restore` (the state of one process) and `restore_pieces` are
+    collective. Times, rows of the log and columns are those of the whole simulation, the same on
+    all ranks, which also raise the same kind of error. `frame` returns the part of this rank, in
+    coordinates of the whole domain. `state` returns this rank's part of the state; `box` in it, int
+    (2, 3), has the first cell of the part and the one behind the last.
     """
 
     def restore_pieces(self, pieces: Sequence[Mapping[str, np.ndarray]]) -> None:
-        """Continue from the pieces of all ranks of a run, which need not have been as many. An array is read when it is asked for.
+        """Continue from the state parts of all ranks of a run.
+
+        The number of those ranks may differ. An array is read when it is accessed.
 
         Raises:
             ValueError: the pieces do not belong to this scene.

@@ -1,4 +1,4 @@
-"""Traits of a problem's matrix and bounds, by which `warp_lcp.recommend` decides."""
+"""Properties of a problem's matrix and bounds, on which `recommend` decides."""
 
 from __future__ import annotations
 
@@ -24,16 +24,18 @@ from warp_lcp.reduced.host_system import suits
 from warp_lcp.solvers.psor import ProjectedSOR, grid_omega, has_advised_omega
 from warp_lcp.solvers.registry import METHODS
 
-MOST_FACTORED = 500  # unknowns of a matrix whose Cholesky factorization is tried: 4 ms
-# of more unknowns of a dense matrix every second one, up to MOST_SAMPLED: 0.2 s
+MOST_FACTORED = 500  # largest number of unknowns for a Cholesky factorization: 4 ms
+# Of a larger dense matrix every second row and column is factored, up to MOST_SAMPLED: 0.2 s.
 SHARE_FACTORED, MOST_SAMPLED = 2, 2048
-# sweeps on trial, and how many of the last tell the rate: the first ones remove what is rough in
-# the error
+# Number of trial sweeps, and the last ones that define the rate: the first sweeps remove the rough
+# part of the error.
 TRIAL, TRIAL_RATE = 8, 4
-# of the largest diagonal entry: semi-definite matrices in float64 leave squared pivots of that size
+# Relative to the largest diagonal entry: squared pivots that semi-definite matrices leave in
+# float64.
 PIVOT = 1e-11
-# of a diagonal entry: where most pivots are smaller, Newton's method cycles or PIQP is faster (17
-# kernels and 39 dense matrices tried); the second where systems are not solved on the host
+# Relative to a diagonal entry: where most pivots are smaller, Newton's method cycles or PIQP is
+# faster (measured on 17 kernels and 39 dense matrices). The second value is for systems that are
+# not solved on the host.
 LOW_RANK, LOW_RANK_ITERATIVE = 0.1, 0.3
 
 
@@ -122,12 +124,11 @@ class Traits:
     def definiteness(self) -> str:
         """Return the definiteness of the symmetric part of A.
 
-        "definite", "semidefinite", "indefinite" or "unknown".
-
-        By dominance, or of at most MOST_FACTORED unknowns by a Cholesky factorization or two.
+        "definite", "semidefinite", "indefinite" or "unknown". It follows from diagonal dominance,
+        or for at most MOST_FACTORED unknowns from one or two Cholesky factorizations.
         """
         if self.kind == "grid":
-            return "definite"  # closed components apart, which are settled before the first step
+            return "definite"  # except closed components, which are settled before the first step
         if self.diagonal == "negative":
             return "indefinite"
         return (
@@ -140,8 +141,8 @@ class Traits:
     def low_rank(self) -> bool:
         """Return whether A is dense, symmetric and close to low rank.
 
-        By whether most pivots of a Cholesky factorization are small beside the diagonal entries;
-        beyond MOST_FACTORED unknowns those of every second row and column.
+        It is if most pivots of a Cholesky factorization are small beside the diagonal entries.
+        Beyond MOST_FACTORED unknowns every second row and column is factored.
         """
         n = self.unknowns
         if self.kind != "dense" or not self.symmetric or self.diagonal != "positive":
@@ -176,10 +177,9 @@ class Traits:
     def sweeps(self) -> float:
         """Return the expected number of `ProjectedSOR` sweeps for the accuracy.
 
-        On grids by the rate omega - 1 of the advised omega, else extrapolated from the rate of
-        TRIAL sweeps, which are made.
-
-        inf where they do not converge, are not possible or are not tried.
+        On grids it follows from the rate omega - 1 of the advised omega, elsewhere from the rate of
+        TRIAL sweeps, which are made. Returns inf where sweeps do not converge, are not possible or
+        are not tried.
         """
         tried = self._trial or (self.kind == "sparse" and not self.symmetric)
         return sweeps_to(self._problem, self._accuracy) if tried else float("inf")
@@ -200,7 +200,7 @@ class Traits:
         return tuple(name for name in METHODS if self.takes(name))
 
     def takes(self, name: str) -> bool:
-        """Return whether a method can solve the problem.
+        """Return whether a method accepts the problem: its operator, size and bounds.
 
         It must accept the operator, its size and the bounds.
         """
@@ -211,20 +211,21 @@ class Traits:
             method, "most_unknowns", self.unknowns
         ):
             return False
-        asked = {
+        abilities = {
             "preconditioned": problem.preconditioner is not None,
             "affine_bounds": self.affine,
             "distributed": self.ranks,
         }
-        return all(getattr(method, ability, False) for ability, needed in asked.items() if needed)
+        return all(
+            getattr(method, ability, False) for ability, needed in abilities.items() if needed
+        )
 
     @property
     def pivotable(self) -> bool:
         """Return whether pivoting is suitable: A is not a convex Hessian.
 
-        And has an entry <= 0 on its diagonal.
-
-        That is unsymmetric, as with friction cones, or with a zero and indefinite, as in games.
+        A has an entry <= 0 on its diagonal, and is unsymmetric, as with friction cones, or
+        symmetric indefinite with a zero on its diagonal, as in games.
         """
         if not self.symmetric:
             return self.diagonal != "positive"
@@ -246,7 +247,9 @@ class Traits:
         A = self._problem.A
         if isinstance(A, DenseOperator):
             return A.matrix.numpy()
-        return A.matrix() if isinstance(A, SparseOperator) else A.rows().matrix()  # type: ignore[attr-defined]
+        if isinstance(A, SparseOperator):
+            return A.matrix()
+        return A.rows().matrix()  # type: ignore[attr-defined]
 
 
 @cache
@@ -256,7 +259,7 @@ def has_piqp() -> bool:
 
 
 def traits_of(problem: LCP, accuracy: float) -> Traits:
-    """Return what is known of a problem, without changing it.
+    """Return the traits of a problem, without changing it.
 
     Args:
         problem: the LCP.
@@ -266,7 +269,12 @@ def traits_of(problem: LCP, accuracy: float) -> Traits:
 
 
 def sweeps_to(problem: LCP, accuracy: float) -> float:
-    """Return how many sweeps would reach a relative residual, inf if they get nowhere."""
+    """Estimate the sweeps to a relative residual; inf if they do not converge.
+
+    With the rate r of the last TRIAL_RATE trial sweeps and the relative residual rho after them, it
+    is TRIAL + log(accuracy / rho) / log(r). On grids the rate is that of the advised omega: omega -
+    1.
+    """
     if has_advised_omega(problem):
         return math.log(accuracy) / math.log(grid_omega(problem, singular=False) - 1)
     try:
@@ -289,13 +297,17 @@ def _dense(A: Any) -> np.ndarray:
 
 
 def _pivots(A: np.ndarray) -> np.ndarray | None:
-    """Return the squared diagonal of a Cholesky factor, None where there is none."""
+    """Return the squared diagonal of a Cholesky factor, None if it does not exist."""
     factor, info = scipy.linalg.lapack.dpotrf(A, lower=True)
     return factor.diagonal() ** 2 if info == 0 else None
 
 
 def _definiteness(A: Any, symmetric: bool, d: np.ndarray) -> str:
-    """Return what a matrix's symmetric part is, by dominance or by Cholesky factorizations; its diagonal is nowhere negative."""
+    """Return the definiteness of a matrix with a nonnegative diagonal.
+
+    It is that of the symmetric part: Gershgorin's circles decide first, then Cholesky
+    factorizations of the part shifted by -PIVOT and +PIVOT times the largest diagonal entry.
+    """
     rows, columns = (np.asarray(abs(A).sum(axis=axis)).ravel() - d for axis in (1, 0))
     beyond, slack = d - (rows + columns) / 2, 1e-9 * d
     if (beyond >= -slack).all():  # Gershgorin's circles

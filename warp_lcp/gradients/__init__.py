@@ -1,1 +1,1 @@
-"""Derivatives of solutions: vector-Jacobian products, and what hands them to a tape of Warp's, PyTorch and JAX."""
+"""Derivatives of solutions, for Warp tapes, PyTorch and JAX."""

@@ -1,4 +1,7 @@
-"""Solutions as JAX functions of the host, with gradients by `wl.vjp`; they can be traced. Needs JAX, the extra `jax`."""
+"""Solutions as JAX functions, with gradients by `wl.vjp` (extra `jax`).
+
+The functions run on the host and can be traced.
+"""
 
 from __future__ import annotations
 
@@ -30,8 +33,8 @@ def solve(
 
     x solves y = A x + b with bounds; it has the type of b.
 
-    Callbacks are pure: going back begins with a solve from x, which takes no step where x has not
-    been rounded to float32.
+    Callbacks are pure: the backward pass begins with a solve from x, which takes no step where x
+    has not been rounded to float32.
 
     Args:
         A: an operator, or a function of `coefficients` that returns one, such as
@@ -53,6 +56,7 @@ def solve(
     names, values = tuple(given), tuple(map(jax.numpy.asarray, given.values()))
 
     def solved(data: Sequence[Any], x0: Any = None) -> SolveResult:
+        """Solve the problem of host arrays."""
         host = [np.asarray(v) for v in data]
         parts = nested(names[3:], host[3:])
         result = solve_problem(

@@ -1,4 +1,7 @@
-"""Solutions as PyTorch functions, with gradients by `wl.vjp`; tensors share memory with Warp. Needs PyTorch, the extra `torch`."""
+"""Solutions as PyTorch functions, with gradients by `wl.vjp` (extra `torch`).
+
+Tensors share memory with Warp arrays.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,7 @@ def solve(
     adjoint: StoppingCriteria | None = None,
     **options: Any,
 ) -> Any:
-    """Return the solution x as a PyTorch tensor with gradients to all tensors given.
+    """Return the solution x as a PyTorch tensor with gradients to all given tensors.
 
     x solves y = A x + b with bounds; it has the type of b.
 
@@ -41,7 +44,7 @@ def solve(
         options: of `wl.solve`.
 
     Raises:
-        ArithmeticError: a solve does not converge; the message says how it ended.
+        ArithmeticError: a solve does not converge; the message gives its status.
         ValueError: as of `wl.LCP`, `wl.solve` and `wl.vjp`.
     """
     given = flat({"b": b, "lower": lower, "upper": upper, **(coefficients or {})})
@@ -50,12 +53,13 @@ def solve(
 
 @cache
 def _solution() -> Any:
-    """Return the function, made when it is first asked for."""
+    """Return the autograd function, created at the first call."""
     import torch
 
     class Solution(torch.autograd.Function):
         @staticmethod
         def forward(ctx: Any, how: Any, *values: Any) -> Any:
+            """Solve, and keep the result for the backward pass."""
             A, options, ctx.adjoint, ctx.names = how
             ctx.kinds = [
                 (v.dtype, v.device) if isinstance(v, torch.Tensor) else None for v in values
@@ -73,6 +77,7 @@ def _solution() -> Any:
         @staticmethod
         @torch.autograd.function.once_differentiable
         def backward(ctx: Any, cotangent: Any) -> Any:
+            """Return the gradients of all tensors by `wl.vjp`."""
             found = vjp(ctx.result, _shared(cotangent), stopping=ctx.adjoint).by_name
             values = [
                 found[name] if kind else None
@@ -95,5 +100,5 @@ def _solution() -> Any:
 
 
 def _shared(tensor: Any) -> Any:
-    """Return a tensor's memory as an array of Warp's; a number where it has no axes."""
+    """Return a tensor's memory as a Warp array, a number if it has no axes."""
     return wp.from_torch(tensor.detach().contiguous()) if tensor.ndim else float(tensor)

@@ -1,4 +1,4 @@
-"""Solves on a tape of Warp's: `Tape.backward` goes through them by `wl.vjp`."""
+"""Solves on a Warp tape; `Tape.backward` differentiates them by `wl.vjp`."""
 
 from __future__ import annotations
 
@@ -32,14 +32,15 @@ def solve(
 
     `tape.backward` then adds to the gradients of all arrays that have one.
 
-    Call it outside of the tape's `with`, which would record, and keep, each launch of the solve.
+    Call it outside of the tape's `with` block, which would record, and keep, each launch of the
+    solve.
 
     Args:
-        tape: continued by what follows the solve.
+        tape: the operations after the solve continue it.
         A: an operator, or a function of `coefficients` that returns one, such as
             `functools.partial(wl.GridPoisson, cells)`.
         b: as of `wl.LCP`; like bounds and coefficients an array with `requires_grad=True` if its
-            gradient is wanted.
+            gradient is needed.
         lower: likewise.
         upper: likewise.
         coefficients: arguments of A by name.
@@ -50,21 +51,23 @@ def solve(
         The result, whose x has a gradient.
 
     Raises:
-        ValueError: as of `wl.LCP` and `wl.solve`, and while going back as of `wl.vjp`.
+        ValueError: as of `wl.LCP` and `wl.solve`, and in the backward pass as of `wl.vjp`.
     """
-    given = flat({"b": b, "lower": lower, "upper": upper, **(coefficients or {})})
+    arguments = flat({"b": b, "lower": lower, "upper": upper, **(coefficients or {})})
     result = solve_problem(
         LCP(A(**coefficients) if coefficients else A, b, lower, upper), **options
     )
     result.x.requires_grad = True
-    wanted = {name: v for name, v in given.items() if isinstance(v, wp.array) and v.requires_grad}
+    differentiable = {
+        name: v for name, v in arguments.items() if isinstance(v, wp.array) and v.requires_grad
+    }
 
     def backward() -> None:
         found = vjp(result, result.x.grad, stopping=adjoint).by_name
-        for name, array in wanted.items():
+        for name, array in differentiable.items():
             part = wp.empty_like(array.grad.flatten())
             convert(found[name].flatten(), part)
             ADD.bind(rows_of(part), z=part, x=array.grad.flatten()).launch()
 
-    tape.record_func(backward, [result.x, *wanted.values()])
+    tape.record_func(backward, [result.x, *differentiable.values()])
     return result

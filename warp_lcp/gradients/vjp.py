@@ -1,9 +1,10 @@
-"""Gradients through the solution of an LCP: one linear solve with A' on the free unknowns, whatever the method and its iterations were.
+"""Gradients through the solution of an LCP, by one linear solve.
 
-With y = A x + b, the free set F = {l < x < u, y = 0} and the unknowns L and U held at their bounds,
-the solution map has the derivative A_FF dx_F = -(db_F + (dA x)_F + A_FL dl_L + A_FU du_U), dx_L =
-dl_L, dx_U = du_U, wherever y is not 0 on L and U. So with g = dL/dx and A_FF' mu_F = -g_F, mu = 0
-elsewhere, the gradients are mu for b, g + A'mu on L and U for the bounds, and mu_i x_j for a_ij.
+The solve with A' on the free unknowns does not depend on the method that found x. With y = A x + b,
+the free set F = {l < x < u, y = 0} and the unknowns L and U held at their bounds, the solution map
+has the derivative A_FF dx_F = -(db_F + (dA x)_F + A_FL dl_L + A_FU du_U), dx_L = dl_L, dx_U = du_U,
+wherever y is not 0 on L and U. So with g = dL/dx and A_FF' mu_F = -g_F, mu = 0 elsewhere, the
+gradients are mu for b, g + A'mu on L and U for the bounds, and mu_i x_j for a_ij.
 """
 
 from __future__ import annotations
@@ -43,9 +44,9 @@ KERNELS = KernelFile(Path(__file__).parent / "headers/vjp.h")
 LARGEST = KERNELS["gradients.largest"]
 SETS = KERNELS["gradients.sets"]
 HELD = KERNELS["gradients.held"]
-# of 2 |d x| + |b|, as of the residual's floor: what a sum of a few terms leaves
+# Relative to 2 |d x| + |b|, as in the residual's floor: rounding error of a sum of a few terms.
 ROUNDING = 8 * float(np.finfo(np.float64).eps)
-CHANGED = 2.0  # times the result's residual: a larger one is that of another problem
+CHANGED = 2.0  # times the result's residual: a larger one belongs to another problem
 
 
 @dataclass(frozen=True)
@@ -64,10 +65,10 @@ class Gradients:
             `face_z`, `shift` of a grid, arrays or numbers as they were given; `coefficients` of a
             stencil, by offset, and `shift`. Empty for operators without `coefficient_gradient`.
         free: unknowns off their bounds.
-        degenerate: unknowns at a bound where y is 0, too, as far as the residual tells: the
+        degenerate: unknowns at a bound where y is also 0, within the residual: the
             solution has derivatives to one side only, and these gradients are those of the side on
             which the bound holds.
-        status: how the linear solve ended, whose solution is b.
+        status: of the linear solve for b.
         linear_iterations: of it.
         relative_residual: ||g_F + A_FF'mu_F|| over ||g_F||, recomputed in float64.
     """
@@ -104,29 +105,28 @@ def vjp(
 ) -> Gradients:
     """Return the gradients of a scalar L(x) of the solution x of a problem.
 
-    Vector-Jacobian product of the solution map.
-
-    They cost one linear solve on the free unknowns.
+    Vector-Jacobian product of the solution map, at the cost of one linear solve on the free
+    unknowns.
 
     An unknown is free if it is off its bounds by more than the largest entry of the natural
-    residual, in units of y, and what rounding leaves; the others are held. Where y is 0 at a bound
+    residual, in units of y, and its rounding error; the others are held. Where y is 0 at a bound
     too, that is a choice: an element of the B-subdifferential of the solution map, if A is a
     P-matrix, and `Gradients.degenerate` counts such unknowns. Where a grid's component is free as a
-    whole and neither AIR nor a shift holds it, x is defined but for a constant, and the mean of
-    `cotangent` over it counts for nothing.
+    whole and neither AIR nor a shift fixes it, x is defined up to a constant, and the mean of
+    `cotangent` over it has no effect.
 
     Args:
         result: of `wl.solve` on an LCP that has not changed since.
-        cotangent: dL/dx, field of the problem's shape; entries off the unknowns do not count.
+        cotangent: dL/dx, field of the problem's shape; entries off the unknowns have no effect.
         stopping: of the linear solve; defaults to `StoppingCriteria()`.
-        allow_inexact: take a result that did not converge, and return gradients whose linear solve
-            did not.
+        allow_inexact: accept a result that did not converge, and return gradients whose linear
+            solve did not.
 
     Raises:
         ValueError: an argument is of another kind or shape or not finite, the result did not
             converge or has no problem, its operator or other data have changed since, or the
             problem has bounds that are affine in x or is shared by ranks.
-        ArithmeticError: the linear solve did not converge; the message says how it ended.
+        ArithmeticError: the linear solve did not converge; the message gives its status.
 
     Example:
         >>> import numpy as np, warp_lcp as wl
@@ -140,6 +140,7 @@ def vjp(
     layout = problem.layout
     x, g = layout.load(result.x, f64, "result.x"), layout.load(cotangent, f64, "cotangent")
     y, cells, side, free, degenerate = _classified(problem, result, x, g)
+    # A_FF' mu_F = -g_F.
     adjoint, multiplier = _adjoint(
         problem, cells, g, free, result.grid is not None, stopping or StoppingCriteria()
     )
@@ -153,8 +154,9 @@ def vjp(
             "gradient"
         )
     A, varying, z = problem.A, problem.bounds.varying, y
+    # z = g + A'mu, the gradient by bounds that hold their unknowns.
     _gather(problem, multiplier, g, z)
-    found = A.coefficient_gradient(multiplier, x) if has(A, HasCoefficients) else {}
+    by_coefficient = A.coefficient_gradient(multiplier, x) if has(A, HasCoefficients) else {}
     at_upper = layout.zeros(f64) if varying[1] else None
     sums = Sums(_rows(problem), 2).of(HELD, side=side, z=z, upper=at_upper).tolist()
     lower, upper = (
@@ -163,12 +165,12 @@ def vjp(
     )
     numbers = adjoint.status, adjoint.linear_iterations, adjoint.relative_residual
     return Gradients(
-        _as_given(problem, multiplier), lower, upper, found, free, degenerate, *numbers
+        _as_given(problem, multiplier), lower, upper, by_coefficient, free, degenerate, *numbers
     )
 
 
 def _rows(problem: LCP) -> Rows:
-    """Return the rows that have unknowns: elsewhere fields are 0."""
+    """Return the rows that have unknowns; elsewhere fields are 0."""
     return problem.A.stencil.rows if has(problem.A, HasStencil) else Rows.of_fields(problem.layout)
 
 
@@ -182,7 +184,7 @@ def _as_given(problem: LCP, stored: wp.array[Any]) -> wp.array[Any]:
 
 
 def _checked(result: Any, allow_inexact: bool) -> LCP:
-    """Return the problem of a result that has gradients."""
+    """Return the problem of a result, if the result has gradients."""
     if not isinstance(result, SolveResult):
         raise ValueError(f"result is a {type(result).__name__}: expected what wl.solve returned")
     problem = result.problem
@@ -214,7 +216,11 @@ def _checked(result: Any, allow_inexact: bool) -> LCP:
 def _classified(
     problem: LCP, result: SolveResult, x: Any, g: Any
 ) -> tuple[Any, Any, Any, int, int]:
-    """Return y, the cell types with 0 where an unknown is held, which bound holds it, and how many are free and degenerate."""
+    """Classify the unknowns of a result as free or held.
+
+    Returns y, the cell types with 0 where an unknown is held, the bound that holds it, and the
+    numbers of free and of degenerate unknowns.
+    """
     residual, rows, layout = NaturalResidual(problem), _rows(problem), problem.layout
     problem.bounds.refresh()
     residual.affine(x)
@@ -224,6 +230,7 @@ def _classified(
         residual.y,
         residual.diagonal,
     )
+    # The result must still belong to the problem; its largest residual entry bounds the error of x.
     tally.take(rows, bounds=bounds, x=x, y=y, d=d, unknown=problem.unknown, unit=residual.unit)
     square, largest = tally.read()
     norm, allowed = float(square) ** 0.5, CHANGED * result.residual
@@ -256,20 +263,25 @@ def _classified(
 def _adjoint(
     problem: LCP, cells: Any, g: Any, count: int, on_grid: bool, stopping: StoppingCriteria
 ) -> tuple[SolveResult, wp.array[Any]]:
-    """Solve A_FF' mu_F = -g_F; return how that went, and mu as a stored field, 0 elsewhere."""
+    """Solve A_FF' mu_F = -g_F.
+
+    Returns the result of the solve, and mu as a stored field, 0 elsewhere. Operators with blocks
+    are restricted to F; matrices are indexed; for other operators the unknowns off F are held by
+    bounds at 0.
+    """
     A, layout = problem.A, problem.layout
-    if count == 0:  # what is solved is 1 x = 0
+    if count == 0:  # the system solved is 1 x = 0
         return solve(LCP(np.ones((1, 1)), np.zeros(1), -np.inf)), layout.zeros(f64)
     if has(A, HasBlocks):
         block = _transposed(A).on_cells(cells.numpy())
-        right = _projected(_floating(block), g, cells)  # what it has in AIR does not count
+        right = _projected(_floating(block), g, cells)  # its value in AIR has no effect
         result = solve(
             LCP(block, right.reshape(layout.stored_shape), -np.inf, np.inf), stopping=stopping
         )
         return result, result.x.flatten()
     free = cells.numpy() == 1
     if has(A, HasRows) and not on_grid:
-        # mu of an empty row is anything: 0
+        # mu of an empty row is arbitrary: 0.
         free = free if A.row_sizes is None else free & (A.row_sizes.numpy() > 0)
         matrix, near = A.rows().matrix()[free][:, free].T, getattr(A, "near_null_space", None)
         block = (
@@ -282,8 +294,9 @@ def _adjoint(
         multiplier[free] = result.x.numpy()
         return result, wp.array(multiplier, dtype=f64, device=problem.device)
     floating = _floating(A)
+    # Unknowns off F are held at 0 by equal bounds; mu_F solves the rest.
     b = _projected(None if floating is None else floating.transposed(), g, cells).numpy()
-    # not 0, or it would seem to be free
+    # Not 0, or the row would seem to be free.
     held = np.where(free, b, np.abs(b[free]).max() or 1.0).reshape(layout.stored_shape)
     sides = (np.where(free, side, 0.0).reshape(layout.stored_shape) for side in (-np.inf, np.inf))
     result = solve(LCP(_transposed(A), held, *sides), stopping=stopping)
@@ -291,7 +304,7 @@ def _adjoint(
 
 
 def _gather(problem: LCP, multiplier: wp.array[Any], g: wp.array[Any], z: wp.array[Any]) -> None:
-    """Set z = g + A'mu."""
+    """Compute z = g + A'mu."""
     A, shape = problem.A, problem.layout.stored_shape
     if A.symmetric:
         problem.apply_plus(multiplier, g, z)
@@ -301,12 +314,16 @@ def _gather(problem: LCP, multiplier: wp.array[Any], g: wp.array[Any], z: wp.arr
 
 
 def _floating(A: Operator) -> Any:
-    """Return the components on which an operator is singular, None if it knows of none."""
+    """Return the components on which an operator is singular, None if unknown."""
     return A.floating_components() if has(A, NamesComponents) else None
 
 
 def _projected(floating: Any, g: wp.array[Any], cells: wp.array[Any]) -> wp.array[Any]:
-    """Return g without what A' cannot meet on its singular components that are free as a whole: its mean where those are the constants."""
+    """Return g without the part that A' cannot meet.
+
+    On singular components that are free as a whole: the mean of g if their null space is the
+    constants.
+    """
     if floating is not None:
         g = wp.clone(g)
         floating.project(g, cells.view(wp.uint8))
@@ -327,7 +344,7 @@ def _transposed(A: Operator) -> Any:
 
 
 class Transpose(Operator):
-    """A' of an operator that knows products only."""
+    """Transpose A' of an operator that has products only."""
 
     symmetric = False
 
@@ -339,7 +356,7 @@ class Transpose(Operator):
             A.device,
             layout_of(A),
         )
-        # ghost cells, which products fill along periodic axes, are no unknowns
+        # Ghost cells, which products fill along periodic axes, are no unknowns.
         if has(A, HasCells):
             self.cells = A.cells
 

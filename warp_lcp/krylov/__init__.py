@@ -1,4 +1,4 @@
-"""Krylov methods over operators: conjugate gradients and GMRES, with their vectors on the device."""
+"""Krylov methods with vectors on the device: conjugate gradients and GMRES."""
 
 from warp_lcp.krylov.conjugate_gradient import ConjugateGradient
 from warp_lcp.krylov.gmres import GMRES

@@ -1,4 +1,7 @@
-"""Preconditioned conjugate gradients with scalars, and the decision to go on, on the device; one program an iteration."""
+"""Preconditioned conjugate gradients on the device.
+
+The scalars and the decision to continue are on the device; an iteration is one program.
+"""
 
 from __future__ import annotations
 
@@ -19,14 +22,14 @@ from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import Across, Reduction, rows_of
 
 RZ, PQ, RZ_OLD = wp.constant(0), wp.constant(1), wp.constant(2)  # slots of the device scalars
-# those of the decision to go on begin here, as elsewhere at the residual's square
+# The slots of the decision to continue begin here, with the square of the residual.
 RR = wp.constant(3)
-# the least norm so far; done, and the most allowed
+# The tolerance, the least norm so far, the iterations done, and their limit.
 TOLERANCE, BEST, ITERATIONS, LIMIT = (wp.constant(int(RR) + i) for i in range(1, 5))
 BY_ERROR = wp.constant(8)
 SLOTS = 9
 
-# of the carried residual over its least: A or M is not positive definite to this precision
+# Growth of the carried residual over its least: A or M is not positive definite to this precision.
 GROWTH = wp.constant(wp.float64(1e3))
 
 
@@ -35,7 +38,10 @@ GROWTH = wp.constant(wp.float64(1e3))
 def first_iteration(
     scalars: wp.array(dtype=wp.float64), rr: int, tolerance: wp.float64, limit: int
 ):
-    """Prepare the slots from the residual's square on: no norm yet. Return whether an iteration follows."""
+    """Initialize the slots from the residual's square on.
+
+    Returns whether an iteration follows.
+    """
     scalars[rr] = wp.float64(wp.inf)
     scalars[rr + 1] = tolerance
     scalars[rr + 2] = wp.float64(wp.inf)
@@ -47,7 +53,11 @@ def first_iteration(
 @no_type_check
 @wp.func
 def next_iteration(scalars: wp.array(dtype=wp.float64), rr: int):
-    """Count an iteration; return whether another one follows."""
+    """Count an iteration; return whether another one follows.
+
+    None follows if the norm is at most the tolerance, has grown GROWTH times over its least, or is
+    not finite, or if the limit is reached.
+    """
     scalars[rr + 3] += wp.float64(1.0)
     norm = wp.sqrt(scalars[rr])
     best = scalars[rr + 2]
@@ -65,7 +75,7 @@ def begin_kernel(
     limit: int,
     by_error: int,
 ):
-    """Before the first iteration: no old direction."""
+    """Initialize before the first iteration: no old direction."""
     scalars[BY_ERROR] = wp.float64(by_error)
     scalars[RZ_OLD] = wp.float64(0.0)
     going[0] = first_iteration(scalars, RR, tolerance, limit)
@@ -74,7 +84,10 @@ def begin_kernel(
 @no_type_check
 @forward_kernel(module="warp_lcp.conjugate_gradient")
 def end_kernel(scalars: wp.array(dtype=wp.float64), going: wp.array(dtype=int)):
-    """After an iteration: remember r.z for beta, and decide whether to go on; by r.z of the iteration's start if that was asked for."""
+    """Store r'z for beta after an iteration; decide whether another one follows.
+
+    If `by_error`, the decision uses r'z of the start of the iteration.
+    """
     if scalars[BY_ERROR] > wp.float64(0.0):
         if scalars[ITERATIONS] == wp.float64(0.0):
             scalars[TOLERANCE] = scalars[TOLERANCE] * wp.sqrt(scalars[RZ])
@@ -90,14 +103,20 @@ UPDATE = KERNELS["conjugate_gradient.update"]
 
 
 class LinearMap(Protocol):
-    """q = A p on stored fields, launched through `launch` if it is kernel launches only."""
+    """Linear map q = A p on stored fields.
+
+    It uses `launch` if it consists of kernel launches only.
+    """
 
     def __call__(self, p: wp.array[Any], q: wp.array[Any], /, *, launch: Launch = ...) -> None:
         """Write q = A p."""
 
 
 class Preconditioner(Protocol):
-    """z = M r, M symmetric positive definite: reads its own field `r`, writes its own field `z`."""
+    """Preconditioner z = M r, M symmetric positive definite.
+
+    It reads its own field `r` and writes its own field `z`.
+    """
 
     r: wp.array[Any]
     z: wp.array[Any]
@@ -117,15 +136,16 @@ class ConjugateGradient:
     with beta such that p is conjugate to the last direction, and alpha such that x minimizes along
     p. This class launches a pass for each operation; a subclass overrides `_turn` and `_move` by
     fused passes. The device decides after each iteration whether another one follows. Where graphs
-    have loops the host waits once a solve, else it reads that decision every time.
+    have loops the host waits once a solve, otherwise it reads that decision in each iteration.
 
     Args:
         product: A.
         preconditioner: M. If it is recorded (has a `program`), so must A be, and an iteration is
             one program.
-        weight: residuals are measured as ||weight^(1/2) r||, field like r >= 0; None: all 1. Rows
-            that a large shift makes stiff would else decide when to stop.
-        rows: of the unknowns, where fields hold others, such as ghost cells; None: all of a field.
+        weight: residuals are measured as ||weight^(1/2) r||, field like r >= 0; None: all 1.
+            Otherwise rows that a large shift makes stiff would decide when to stop.
+        rows: of the unknowns, where fields contain other cells, such as ghost cells; None: all of a
+            field.
         across: communicator; None if serial.
     """
 
@@ -171,10 +191,13 @@ class ConjugateGradient:
         )
 
     def _allocate(self, r: wp.array[Any], slots: int, square: int) -> None:
-        """Allocate x, p and device scalars; from slot `square` on they are r'r and what `next_iteration` decides by."""
+        """Allocate x, p and device scalars.
+
+        From slot `square` on these are r'r and the numbers of `next_iteration`.
+        """
         self.device, self.x, self._p = r.device, zeros_like(r), zeros_like(r)
         self._scalars, self._square, self._shared = Reading(r.device, slots), square, False
-        # tolerance, iterations at most, whether the error decides
+        # Tolerance, limit of iterations, whether the error decides.
         self._goal = [Scalar() for _ in range(3)]
         self._beginning = LaunchGraph(r.device, self._launch_beginning)
         self._going = wp.zeros(1, dtype=wp.int32, device=r.device)
@@ -230,7 +253,10 @@ class ConjugateGradient:
         return self.device.is_cuda and self._program is not None and not self._shared
 
     def _launch_beginning(self) -> None:
-        """Launch the start: x = 0, and the decision whether to iterate; on a GPU the iterations, too."""
+        """Launch the start: x = 0, and the decision whether to iterate.
+
+        On a GPU the iterations, too.
+        """
         clear(self.x, self._p, self._q)  # A writes its own rows only
         inputs = [self._scalars.array, self._going, *self._goal]
         launch_recorded(begin_kernel, 1, inputs, device=self.device)
@@ -248,19 +274,22 @@ class ConjugateGradient:
         return program
 
     def _iterate(self) -> None:
-        """Launch an iteration whose preconditioner is no program."""
+        """Launch an iteration whose preconditioner is not recorded."""
         check_time()
         self._preconditioner.apply()
         self._advance(wp.launch)
 
     def _advance(self, launch: Launch) -> None:
-        """Launch what follows z = M r."""
+        """Launch the part of an iteration after z = M r."""
         self._turn(launch)
         self._move(launch)
         launch(self._end_kernel, 1, [self._scalars.array, self._going], device=self.device)
 
     def _turn(self, launch: Launch) -> None:
-        """p = z + beta p, beta = r'z / (r'z)_old; and q = A p with p'q, of which alpha = r'z / p'q."""
+        """Compute p = z + beta p and q = A p.
+
+        beta = r'z / (r'z)_old; the product p'q gives alpha = r'z / p'q.
+        """
         self._reduction.dot(
             self._preconditioner.r, self._preconditioner.z, int(RZ), rows=self._rows, launch=launch
         )
@@ -269,6 +298,6 @@ class ConjugateGradient:
         self._reduction.dot(self._p, self._q, int(PQ), rows=self._rows, launch=launch)
 
     def _move(self, launch: Launch) -> None:
-        """x += alpha p, r -= alpha q; and r'r."""
+        """Update x += alpha p and r -= alpha q; sum r'r."""
         self._update.launch(launch)
         self._reduction.add_up(int(RR), launch=launch)

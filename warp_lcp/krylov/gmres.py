@@ -1,4 +1,4 @@
-"""Restarted, right-preconditioned GMRES with its vectors on the device (Saad & Schultz 1986)."""
+"""Restarted, right-preconditioned GMRES on the device (Saad & Schultz 1986)."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ WEIGH = KERNELS["gmres.weigh"]
 DOTS = KERNELS["gmres.dots"]
 COMBINE = KERNELS["gmres.combine"]
 STORE = KERNELS["gmres.store"]
-# vectors of whom the preconditioned ones are kept: solves that take no more of them need no last
-# preconditioning
+# Number of vectors whose preconditioned images are stored: solves that take no more of them need no
+# last preconditioning.
 KEPT = 8
-# a restart that leaves more than this share of the residual gains nothing that another one would
-# not
+# A restart that leaves more than this share of the residual makes no progress, and another one
+# would not either.
 STALLED = 0.99
 
 
@@ -33,8 +33,8 @@ class GMRES:
     """Restarted, right-preconditioned GMRES for any A.
 
     The right-hand side is the preconditioner's field `r`, which is overwritten; the solution is
-    `x`. Preconditioned from the right, the residual that is minimized is the true one; it is
-    computed from x after every restart, and only that one is ever reported.
+    `x`. With preconditioning from the right the minimized residual is the true one. It is computed
+    from x after every restart, and only that one is reported.
 
     Args:
         product: A.
@@ -57,9 +57,9 @@ class GMRES:
         self._b, self._q = zeros_like(r), zeros_like(r)
         self._weight = weight
         self._basis = zeros((restart + 1) * r.size, r.dtype, r.device)  # fields, one after another
-        # the first ones, preconditioned
+        # The first ones, preconditioned.
         self._images = zeros(min(KEPT, restart) * r.size, r.dtype, r.device)
-        # products with them, and a square at last
+        # Products with them, and a square in the last slot.
         self._sums = Sums(rows_of(r), restart + 1, slots=restart + 2)
         self._factors = wp.zeros(restart + 1, dtype=wp.float64, device=r.device)
         self._residual = RESIDUAL.bind(rows_of(r), b=self._b, w=weight, q=self._q)
@@ -94,18 +94,26 @@ class GMRES:
         return done, norm
 
     def _start(self) -> float:
-        """Make the residual the first vector; return its norm. `_q` is A x."""
+        """Store the normalized residual as the first vector; return its norm.
+
+        `_q` is A x.
+        """
         self._residual.launch()
         self._combine(self._factors, self._q, 0)
         return float(np.sqrt(self._stored(0)[-1]))
 
     def _expand(self, norm: float, tolerance: float, most: int) -> int:
-        """Add vectors until the residual's estimate is small enough; return their number."""
+        """Add vectors until the residual's estimate is small enough; return their number.
+
+        Arnoldi's process: v_k+1 is A M v_k, orthogonalized and normalized. Givens rotations keep H
+        upper triangular; |g_k+1| is the norm of the residual.
+        """
         H, g = self._H, self._g
         g[:] = 0.0
         g[0] = norm
         for k in range(most):
             check_time()
+            # z = M W^(-1/2) v_k: the basis has weighted residuals.
             wp.copy(
                 self._preconditioner.r, self._basis, src_offset=k * self._q.size, count=self._q.size
             )
@@ -120,19 +128,26 @@ class GMRES:
                 )
             self._product(self._preconditioner.z, self._q)
             self._weigh(self._q)
+            # Arnoldi: w = W^(1/2) A z, orthogonalized, is column k of H.
             H[: k + 2, k] = self._orthogonalize(k + 1)
             self._rotate(k)
-            if not abs(g[k + 1]) > tolerance:  # also where it is no number
+            if not abs(g[k + 1]) > tolerance:  # also if it is NaN
                 return k + 1
         return most
 
     def _weigh(self, q: wp.array[Any], *, inverse: bool = False) -> None:
-        """Take a residual to the vectors of the basis, or back."""
+        """Multiply a residual by w^(1/2), or by w^(-1/2) if `inverse`.
+
+        The vectors of the basis are weighted residuals.
+        """
         if self._weight is not None:
             WEIGH.bind(rows_of(q), w=self._weight, q=q, inverse=inverse).launch()
 
     def _orthogonalize(self, count: int) -> np.ndarray:
-        """Take the first vectors out of `_q`, twice, and store the rest as the next one; return the column of H."""
+        """Orthogonalize `_q` against the first vectors, twice, and store it.
+
+        It is stored as the next vector, normalized. Returns the column of H.
+        """
         column = np.zeros(count)
         for _ in range(2):
             DOTS.bind(
@@ -157,7 +172,10 @@ class GMRES:
         sign: float = 1.0,
         of: wp.array[Any] | None = None,
     ) -> None:
-        """x += sign times the sum of factors_j v_j over the first `count` vectors; the last of the sums becomes x'x."""
+        """Compute x += sign times the sum of factors_j v_j.
+
+        Over the first `count` vectors; the last of the sums becomes x'x.
+        """
         basis = self._basis if of is None else of
         self._sums.of(
             COMBINE,
@@ -196,7 +214,12 @@ class GMRES:
         g[k], g[k + 1] = c * g[k], -s * g[k]
 
     def _correct(self, columns: int) -> None:
-        """x += M V y with y from the triangle; columns that are singular to rounding count for nothing."""
+        """Compute x += M V y with H y = g.
+
+        Columns of H that are singular to rounding are omitted. For few columns the stored images M
+        v_j are used.
+        """
+        # Back substitution with the triangle H.
         H, g = self._H[:columns, :columns], self._g
         y = np.zeros(self._restart + 1)
         largest = float(np.abs(np.diag(H)).max(initial=0.0))
@@ -207,6 +230,7 @@ class GMRES:
         if columns <= KEPT:
             self._combine(self._factors, self.x, columns, of=self._images)
             return
+        # x += M (V y), with one more application of M.
         r = self._preconditioner.r
         r.zero_()
         self._combine(self._factors, r, columns)

@@ -1,4 +1,4 @@
-"""Systems that a Krylov method solves, and the norm in which they measure residuals."""
+"""Base of the linear systems that a Krylov method solves, with their norm."""
 
 from __future__ import annotations
 
@@ -27,7 +27,11 @@ class KrylovSystem:
         rows: Rows | None = None,
         across: Across | None = None,
     ) -> None:
-        """Take what iterates: it has `solve`, and the solution in `x`. Norms are weighted like its own, over the same rows."""
+        """Set the Krylov method.
+
+        It has `solve`, and the solution in `x`. Norms are weighted like its own, over the same
+        rows.
+        """
         self._krylov, self.e, self._norms, self._weighted_by = (
             method,
             method.x,
@@ -44,5 +48,8 @@ class KrylovSystem:
         )
 
     def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
-        """Iterate from e = 0 until the norm is at most the tolerance; return iterations and the norm reached."""
+        """Iterate from e = 0 until the norm is at most the tolerance.
+
+        Returns the number of iterations and the norm reached.
+        """
         return self._krylov.solve(tolerance, max_iterations)

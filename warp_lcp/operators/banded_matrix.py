@@ -9,10 +9,10 @@ import scipy.sparse
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.sparse import SparseOperator
 
-# bandwidth up to which LAPACK's band factors cost less than launches of kernels, whatever the
-# number of unknowns
+# Bandwidth up to which LAPACK's band factors cost less than kernel launches, for every number of
+# unknowns.
 NARROW = 3
-SINGULAR = 1e-13  # of the largest column sum: a pivot below it is rounding
+SINGULAR = 1e-13  # relative to the largest column sum: a smaller pivot is rounding
 
 
 class BandedMatrix:
@@ -45,9 +45,10 @@ class BandedMatrix:
     def solve(
         self, free: np.ndarray, r: np.ndarray, shift: np.ndarray | float = 0.0
     ) -> np.ndarray | None:
-        """Return e with (A + D)_FF e_F = r_F and 0 elsewhere; None where a pivot shows that the block is singular.
+        """Return e with (A + D)_FF e_F = r_F and 0 elsewhere.
 
-        Held rows and columns, those off F, keep a diagonal entry of the column's size.
+        None where a pivot shows that the block is singular. Held rows and columns, those off F,
+        keep a diagonal entry of the column's size.
 
         Args:
             free: F, bool, shape (n,).
@@ -82,7 +83,10 @@ def bandwidth(A: DenseOperator | SparseOperator) -> int:
 
 
 def bands_of(A: DenseOperator | SparseOperator, width: int) -> np.ndarray:
-    """Return the entries of an operator as the bands of a `BandedMatrix`, shape (2 width + 1, n)."""
+    """Return the entries of an operator in banded form.
+
+    Shape (2 width + 1, n), as `BandedMatrix` takes them.
+    """
     n = A.unknowns
     bands = np.zeros((2 * width + 1, n))
     if isinstance(A, SparseOperator):
@@ -98,11 +102,15 @@ def bands_of(A: DenseOperator | SparseOperator, width: int) -> np.ndarray:
 
 
 class BandedFactors:
-    """C = T + u e_p' and its factors: column i of T is e_i or -M_i, that of the pair p, both of whose variables are out, is e_p.
+    """Factors of a complementary basis C = T + u e_p' of small bandwidth.
+
+    Column i of the banded matrix T is e_i or -M_i. Column p, of the pair both of whose variables
+    are nonbasic, is e_p; C has -d there, so that u = -d - e_p. C^-1 follows from the factors of T
+    by the Sherman-Morrison formula.
 
     Args:
         M: sparse, shape (m, m).
-        d: covering vector: z0's column is -d, and stands in place p.
+        d: covering vector: z0's column is -d, in place p.
     """
 
     def __init__(self, M: scipy.sparse.csr_array, d: np.ndarray) -> None:

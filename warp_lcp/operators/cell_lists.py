@@ -1,4 +1,7 @@
-"""Cell types from lists of cells, for scenes of which most is empty: nothing is made that is as large as the grid but the types."""
+"""Cell types from lists of cells, for scenes that are mostly empty.
+
+Only the array of types is as large as the grid.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +13,11 @@ import numpy as np
 from warp_lcp.problem.protocol import AIR, FLUID, SOLID
 from warp_lcp.rows.fields import real_array
 
-TOGETHER = 1 << 20  # cells of a list that are looked at together
+TOGETHER = 1 << 20  # cells of a list that are processed together
 
 
 def cells_of(shape: Sequence[int], fluid: Any, solid: Any) -> np.ndarray:
-    """Return cell types of a shape, int8; what `GridPoisson.from_cells` documents."""
+    """Return cell types of a shape, int8; see `GridPoisson.from_cells`."""
     counts = tuple(shape)
     if len(counts) not in (2, 3) or not all(
         isinstance(n, (int, np.integer)) and n > 0 for n in counts
@@ -41,7 +44,7 @@ def cells_of(shape: Sequence[int], fluid: Any, solid: Any) -> np.ndarray:
 
 
 def _write(cells: np.ndarray, rows: np.ndarray, kind: int, name: str, first: int) -> None:
-    """Write some cells of a list that are AIR so far."""
+    """Write the types of some listed cells, which must be AIR so far."""
     outside = ((rows < 0) | (rows >= cells.shape)).any(axis=1)
     if outside.any():
         n = int(outside.argmax())
@@ -51,7 +54,7 @@ def _write(cells: np.ndarray, rows: np.ndarray, kind: int, name: str, first: int
         )
     places, flat = np.ravel_multi_index(tuple(rows.T), cells.shape), cells.reshape(-1)
     again = flat[places] != AIR
-    if not (np.diff(places) > 0).all():  # in order, a list has none twice
+    if not (np.diff(places) > 0).all():  # an ascending list has no cell twice
         once = np.unique(places, return_index=True)[1]
         again[np.setdiff1d(np.arange(len(places)), once)] = True
     if again.any():

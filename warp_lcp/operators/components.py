@@ -1,4 +1,7 @@
-"""Floating components: FLUID cells that neither AIR nor a shift holds, on which A is singular with the constants as null space."""
+"""Floating components: connected FLUID cells on which A is singular.
+
+They have neither AIR neighbors nor a shift; their null space is the constants.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,7 @@ F64, I32 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int32)
 def component_sums_kernel(
     label: I32, free: wp.array(dtype=wp.uint8), r: wp.array(dtype=Any), sums: F64, held: I32
 ):
-    """Sum r over each component, and note which have an unknown that is not free."""
+    """Sum r over each component; mark those with an unknown that is not free."""
     i = wp.tid()
     c = label[i]
     if c >= 0:
@@ -40,7 +43,7 @@ def component_sums_kernel(
 @no_type_check
 @forward_kernel(**options)
 def remove_means_kernel(label: I32, sums: F64, held: I32, sizes: F64, r: wp.array(dtype=Any)):
-    """Take the mean off every component that is free as a whole."""
+    """Subtract the mean of r from every component that is free as a whole."""
     i = wp.tid()
     c = label[i]
     if c >= 0:
@@ -51,7 +54,10 @@ def remove_means_kernel(label: I32, sums: F64, held: I32, sizes: F64, r: wp.arra
 @no_type_check
 @forward_kernel(**options)
 def smallest_gap_kernel(label: I32, x: F64, lower: F64, upper: F64, below: F64, above: F64):
-    """Smallest distance to the lower and to the upper bounds over each component."""
+    """Compute the smallest distances to the bounds over each component.
+
+    `below` is that to the lower, `above` that to the upper bounds.
+    """
     i = wp.tid()
     c = label[i]
     if c >= 0:
@@ -62,7 +68,10 @@ def smallest_gap_kernel(label: I32, x: F64, lower: F64, upper: F64, below: F64, 
 @no_type_check
 @forward_kernel(**options)
 def shift_components_kernel(label: I32, held: I32, constant: F64, lower: F64, upper: F64, x: F64):
-    """Add each component's constant, where the component is free as a whole; the sum's rounding stays within the bounds."""
+    """Add each component's constant, where the component is free as a whole.
+
+    The result is projected onto the bounds, because the sum is rounded.
+    """
     i = wp.tid()
     c = label[i]
     if c >= 0:
@@ -83,7 +92,7 @@ if TYPE_CHECKING:
 
 
 Scratch = tuple[wp.array[Any], wp.array[Any]]
-ROUNDED = 1e-10  # of the terms of a sum whose weights were computed
+ROUNDED = 1e-10  # relative to the terms of a sum whose weights were computed
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +103,7 @@ class FaceCoefficients:
         fx: along x, a stored field; None: `nx` everywhere.
         fy: along y; None: `ny`.
         fz: along z; None: `nz`.
-        nx: the same along x for all faces.
+        nx: number for all faces along x.
         ny: likewise along y.
         nz: likewise along z.
     """
@@ -115,17 +124,17 @@ COUNT = KERNELS["components.count"]
 
 
 class FloatingComponents:
-    """The floating components of an operator, numbered from 0, and what keeps a solve on them well posed.
+    """The floating components of an operator, numbered from 0.
 
-    Summing y = A x + b over such a component leaves the sum of b: without bounds a solution exists
-    only if that is 0, with lower bounds alone only if it is >= 0, with upper bounds alone only if
-    it is <= 0. Where A is not symmetric, sums are weighted by w > 0 with w'A = 0, and A v = 0 with
-    v > 0 in place of the constants; both by components, on the host.
+    They make solves well posed. Summing y = A x + b over such a component leaves the sum of b:
+    without bounds a solution exists only if that is 0, with lower bounds alone only if it is >= 0,
+    with upper bounds alone only if it is <= 0. Where A is not symmetric, sums are weighted by w > 0
+    with w'A = 0, and A v = 0 with v > 0 replaces the constants; both by components, on the host.
 
     Args:
         label: component of each stored cell, -1 where there is none.
-        device: where fields live.
-        across: who has other parts of the components; None: nobody.
+        device: of the fields.
+        across: communicator if components reach over several ranks; None if serial.
         left: w, a flat stored field; None: 1.
         right: v, likewise.
     """
@@ -152,18 +161,20 @@ class FloatingComponents:
         self._net: np.ndarray = np.zeros(self.count)
 
     def _total(self, sums: np.ndarray) -> np.ndarray:
-        """Return sums over all parts of the components."""
+        """Return sums over all ranks."""
         return sums if self._across is None else self._across.sum(sums)
 
     def _largest(self, values: Any) -> Any:
-        """Return the largest in any part of the components."""
+        """Return the largest values over all ranks."""
         return values if self._across is None else self._across.max(values)
 
     def without(self, gone: np.ndarray) -> FloatingComponents | None:
-        """Return the components but for those that something holds after all, None if none is left.
+        """Return the components except some that are not floating.
+
+        None if none is left.
 
         Args:
-            gone: bool of shape (count,).
+            gone: mask of the components to remove, bool of shape (count,).
         """
         if not gone.any():
             return self
@@ -176,7 +187,7 @@ class FloatingComponents:
         )
 
     def transposed(self) -> FloatingComponents:
-        """Return those of A'."""
+        """Return the floating components of A'."""
         if self.left is None and self.right is None:
             return self
         return FloatingComponents(
@@ -184,7 +195,7 @@ class FloatingComponents:
         )
 
     def unattainable(self, b: wp.array[Any], lower: wp.array[Any], upper: wp.array[Any]) -> float:
-        """Return a norm that the natural residual cannot go below; 0 if b is compatible everywhere.
+        """Return a lower bound of the natural residual's norm; 0 if b is compatible.
 
         Args:
             b: stored field, float64, units of y.
@@ -200,19 +211,24 @@ class FloatingComponents:
             np.abs(terms),
             *(np.isfinite(bound.numpy()[inside]) for bound in (lower, upper)),
         )
-        # of nothing NumPy 1 makes integers
+        # For empty input NumPy 1 returns integers.
+        # Sums over each component: w'b, its absolute terms, and whether a bound is finite.
         mine = np.stack([np.bincount(label, v, self.count) for v in values])
         sums = self._total(mine.astype(np.float64))
         rest, scale, below, above = sums[0], sums[1], sums[2] > 0, sums[3] > 0
         self._net = rest.copy()
+        # Bounds absorb a sum of the right sign.
         rest[(below & (rest > 0)) | (above & (rest < 0))] = 0
         rounding = 4 * np.finfo(np.float64).eps if self.left is None else ROUNDED
-        rest[np.abs(rest) <= rounding * scale * np.sqrt(self.sizes)] = 0  # the rounding of a sum
+        rest[np.abs(rest) <= rounding * scale * np.sqrt(self.sizes)] = 0  # rounding of a sum
         squares = self.sizes if self.left is None else np.bincount(label, w**2, self.count)
         return float(np.sqrt(np.sum(rest**2 / squares)))
 
     def project(self, r: wp.array[Any], free: wp.array[Any]) -> None:
-        """Take the mean off r on every component whose unknowns are all free: the right-hand sides a singular block can meet."""
+        """Subtract the mean of r from every component whose unknowns are all free.
+
+        The result is a right-hand side that a singular block can meet.
+        """
         if self.left is not None:
             self._project_weighted(self.left, r, free)
             return
@@ -236,7 +252,7 @@ class FloatingComponents:
         )
 
     def _project_weighted(self, w: np.ndarray, r: wp.array[Any], free: wp.array[Any]) -> None:
-        """Take w (w'r)/(w'w) off r on every component whose unknowns are all free."""
+        """Subtract w (w'r)/(w'w) from r on components whose unknowns are all free."""
         inside = self.label >= 0
         label, weights, host = self.label[inside], w[inside], r.numpy()
         held = np.bincount(label, free.numpy()[inside] == 0, self.count) > 0
@@ -251,24 +267,27 @@ class FloatingComponents:
     def _settle_weighted(
         self, v: np.ndarray, x: wp.array[Any], lower: wp.array[Any], upper: wp.array[Any]
     ) -> None:
-        """As `settle`, with multiples of v in place of the constants."""
+        """Choose multiples of v instead of constants, otherwise like `settle`."""
         inside, moved = self.label >= 0, x.numpy().copy()
         label, weights, held = self.label[inside], v[inside], self._held.numpy() != 0
-        low, here, high = lower.numpy()[inside], moved[inside], upper.numpy()[inside]
+        low, values, high = lower.numpy()[inside], moved[inside], upper.numpy()[inside]
         below, above = (np.full(self.count, np.inf) for _ in range(2))
-        np.minimum.at(below, label, (here - low) / weights)
-        np.minimum.at(above, label, (high - here) / weights)
-        mean = np.bincount(label, weights * here, self.count) / np.bincount(
+        np.minimum.at(below, label, (values - low) / weights)
+        np.minimum.at(above, label, (high - values) / weights)
+        mean = np.bincount(label, weights * values, self.count) / np.bincount(
             label, weights**2, self.count
         )
         constants = np.where(held, 0.0, self._constants(below, above, mean))
-        moved[inside] = np.clip(here + constants[label] * weights, low, high)
+        moved[inside] = np.clip(values + constants[label] * weights, low, high)
         x.assign(moved)
 
     def _constants(self, below: np.ndarray, above: np.ndarray, mean: np.ndarray) -> np.ndarray:
-        """Return what is added to each component, whose distance to its bounds is `below` and `above`."""
-        # what is left of b pushes x down where it is positive, up where it is negative: the bound
-        # on that side is the one to touch
+        """Return the constant to add to each component.
+
+        `below` and `above` are the distances to the component's bounds.
+        """
+        # The sum of b pushes x down where it is positive, up where it is negative: x must touch the
+        # bound on that side.
         up = np.isfinite(above) & ((self._net < 0) | ~np.isfinite(below))
         found: np.ndarray = np.where(up, above, np.where(np.isfinite(below), -below, -mean))
         return found
@@ -276,8 +295,8 @@ class FloatingComponents:
     def settle(self, x: wp.array[Any], lower: wp.array[Any], upper: wp.array[Any]) -> None:
         """Choose the constants that the last `project` left open.
 
-        The mean is 0 without bounds; else x touches the bound that the sum of b pushes it to. Only
-        components that were free as a whole move.
+        The mean is 0 without bounds; otherwise x touches the bound toward which the sum of b pushes
+        it. Only components that were free as a whole move.
         """
         if self.right is not None:
             self._settle_weighted(self.right, x, lower, upper)
@@ -321,7 +340,10 @@ class ComponentFinder:
         self._count = Reading(device, dtype=wp.int32)
 
     def find(self, scratch: Scratch | None = None) -> FloatingComponents | None:
-        """Return the floating components, or None if there are none; `scratch` as in GridPoisson.floating_components."""
+        """Return the floating components, None if there are none.
+
+        `scratch` as in GridPoisson.floating_components.
+        """
         A, across = self._A, self._A.layout.across
         if A._ghosts is not None and across is not None:
             parent, grounded = self._grow(scratch, A.cells)
@@ -342,21 +364,27 @@ class ComponentFinder:
         return self._label(parent.numpy(), grounded.numpy())
 
     def look(self, scratch: Scratch | None = None) -> Callable[[], bool]:
-        """Launch the search; return what tells whether there are none, and waits for the device; `scratch` as of `find`."""
+        """Launch the search; return a function that says whether there are none.
+
+        That function waits for the device; `scratch` as of `find`.
+        """
         if self.wanted():
             self.search(scratch)
         return self.none
 
     def search(self, scratch: Scratch | None) -> None:
-        """Launch a search, which is `wanted`; `scratch` as of `find`."""
+        """Launch a search if it is `wanted`; `scratch` as of `find`."""
         self._scratch = self._grow(scratch, self._A.cells_around)
 
     def changed(self) -> None:
-        """Say that a recorded `search` has run."""
+        """Mark the result of a recorded `search` as changed."""
         self._count.changed()
 
     def wanted(self) -> bool:
-        """Return whether there must be a search: the cells have changed since there were none. It counts from 0 then."""
+        """Return whether a search is needed, and reset its count.
+
+        It is needed if the cells have changed since there were no floating components.
+        """
         if self._none_at == self._A.version:
             return False
         if self._A.device.is_cpu:  # else `search` does
@@ -364,27 +392,30 @@ class ComponentFinder:
         return True
 
     def none(self) -> bool:
-        """Return whether there are none, once the search is launched; waits for the device."""
+        """Return whether the launched search has found none; waits for the device."""
         version = self._A.version
         if self._none_at != version and not self._count.numpy()[0]:
             self._none_at = version
         return self._none_at == version
 
     def record(self, scratch: Scratch | None, launch: Launch) -> None:
-        """Record the launches of a search, which are for when it is `wanted`; `scratch` as of `find`.
+        """Record the launches of a search, to be run if it is `wanted`.
 
-        On ranks it is one of this rank's cells alone, see `held_here`.
+        `scratch` as of `find`. On ranks it searches this rank's cells alone, see `held_here`.
         """
         shared = self._A.layout.across is not None
         self._search(scratch, self._A.cells if shared else self._A.cells_around, launch)
 
     @property
     def held_here(self) -> wp.array[wp.int32]:
-        """The number of cells of the last search in components that nothing on this rank holds, shape (1,)."""
+        """Number of cells in components that are not grounded on this rank, shape (1,).
+
+        Of the last search.
+        """
         return self._count.array
 
     def _grow(self, scratch: Scratch | None, joined: wp.array[Any]) -> Scratch:
-        """Search now; returns what `_search` does."""
+        """Search now; return the result of `_search`."""
         clear(self._count.array)
         with together(self._A.device) as launch:
             found = self._search(scratch, joined, launch)
@@ -392,7 +423,9 @@ class ComponentFinder:
         return found
 
     def _search(self, scratch: Scratch | None, joined: wp.array[Any], launch: Launch) -> Scratch:
-        """Return each cell's parent in the tree of its component, and which roots something holds; their number is `_count`.
+        """Return the component trees: each cell's parent, and the grounded roots.
+
+        The number of cells without a grounded root is in `_count`.
 
         Args:
             scratch: memory, or None.
@@ -420,11 +453,14 @@ class ComponentFinder:
         return parent, grounded
 
     def _label(self, parent: np.ndarray, grounded: np.ndarray) -> FloatingComponents:
-        """Number the components that nothing holds; rare, so on the host."""
+        """Number the floating components, on the host because they are rare."""
         return FloatingComponents(self._numbers(parent, grounded), self._A.device)
 
     def _numbers(self, parent: np.ndarray, grounded: np.ndarray) -> np.ndarray:
-        """Return the number of each stored cell's component, from 0, of those that nothing holds; -1 elsewhere."""
+        """Return the number of each stored cell's floating component, from 0.
+
+        -1 elsewhere.
+        """
         A = self._A
         interior = np.zeros(A.layout.stored_shape, dtype=bool)
         interior[1:-1, 1:-1, 1:-1] = A.cells.numpy()[1:-1, 1:-1, 1:-1] == FLUID
@@ -452,12 +488,12 @@ def numbered_components(
     left: np.ndarray | None = None,
     right: np.ndarray | None = None,
 ) -> FloatingComponents | None:
-    """Return those of numbered components that nothing holds, None if there are none.
+    """Return the floating ones of numbered components, None if there are none.
 
     Args:
-        number: of each stored cell, 0 where there is none.
-        held: of each number, 0 included, whether something does.
-        device: where fields live.
+        number: of each stored cell, 0 where there is no component.
+        held: for each number, 0 included, whether the component is not floating.
+        device: of the fields.
         left: as of `FloatingComponents`.
         right: likewise.
     """
@@ -469,7 +505,11 @@ def numbered_components(
 
 
 class NullVectors(NamedTuple):
-    """Connected components of a matrix: the number of each row, which are not known to be singular, and w'A = 0, A v = 0 on the others."""
+    """Connected components of a matrix and their null vectors.
+
+    The number of each row, which components are not known to be singular, and w'A = 0, A v = 0 on
+    the others.
+    """
 
     number: np.ndarray
     held: np.ndarray
@@ -483,15 +523,15 @@ def null_vectors(
     """Find null vectors of components of a matrix whose rows or columns sum to 0.
 
     Where both do, they are the constants. Where one does, the other vector is computed if the
-    component is an irreducible M-matrix, for then it is unique and positive
-    (Berman & Plemmons 1994, theorem 6.4.16).
+    component is an irreducible M-matrix, because it is then unique and positive (Berman & Plemmons
+    1994, theorem 6.4.16).
 
     Args:
-        matrix: of which rows and columns are known to sum to 0:
-        rows: bool, one for each.
-        columns: likewise.
-        most: unknowns of a component for which a vector is computed; 0 where off-diagonal entries
-            may be positive.
+        matrix: the matrix.
+        rows: whether each row is known to sum to 0, bool.
+        columns: likewise for each column.
+        most: largest number of unknowns of a component for which a vector is computed; 0 where
+            off-diagonal entries may be positive.
     """
     count, number = scipy.sparse.csgraph.connected_components(matrix, directed=False)
     of_rows, of_columns = (np.bincount(number, ~vanish, count) == 0 for vanish in (rows, columns))
@@ -509,7 +549,12 @@ def null_vectors(
 
 
 def _null_vector(block: scipy.sparse.csr_array) -> np.ndarray:
-    """Return v with A v = 0 and a mean of 1, of an irreducible M-matrix whose columns sum to 0: one entry is given, the others follow."""
+    """Return v with A v = 0 and a mean of 1.
+
+    A is an irreducible M-matrix whose columns sum to 0. One entry is set to 1, and the others are
+    the solution of the remaining equations.
+    """
+    # The diagonal that makes the sums of columns exactly 0.
     away = scipy.sparse.csc_array(block - scipy.sparse.diags_array(block.diagonal()))
     exact = (away - scipy.sparse.diags_array(np.asarray(away.sum(axis=0)).ravel())).tocsc()
     v = np.ones(block.shape[0])

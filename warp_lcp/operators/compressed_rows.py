@@ -1,4 +1,4 @@
-"""The entries of a matrix by rows, on its device."""
+"""Entries of a matrix by rows, on its device."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def matrix_rows(a_type: Any) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class RowEntries:
-    """Entries of a sparse matrix by rows, as kernels take them.
+    """Entries of a sparse matrix by rows, as a kernel argument.
 
     Attributes:
         ptr: first entry of each row and the end, int32, shape (n + 1,).

@@ -1,4 +1,4 @@
-"""A dense matrix as an operator: small problems, oracles and tests."""
+"""A dense matrix as an operator, for small problems, oracles and tests."""
 
 from __future__ import annotations
 
@@ -26,16 +26,19 @@ from warp_lcp.rows.fields import (
 KERNELS = KernelFile(Path(__file__).parent / "headers/dense.h")
 PRODUCT = KERNELS["dense.product"]
 RELAX = KERNELS["dense.relax"]
-# of the largest entries of two rows: what J M^-1 J' and assembly in float64 leave of symmetry
+# Relative to the largest entries of two rows: asymmetry from rounding of J M^-1 J' and of assembly
+# in float64.
 SYMMETRIC = 64 * float(np.finfo(np.float64).eps)
 
 
 def is_rounding(difference: np.ndarray, one: np.ndarray, other: np.ndarray) -> bool:
-    """Return whether each a_ij - a_ji is rounding of the smaller one of the largest entries of rows i and j.
+    """Return whether each a_ij - a_ji is rounding.
+
+    That is relative to the smaller one of the largest entries of rows i and j.
 
     Args:
         difference: a_ij - a_ji.
-        one: the largest magnitude of row i, of a shape that goes with the difference.
+        one: the largest magnitude of row i, of a shape that broadcasts with the difference.
         other: that of row j.
     """
     return bool((np.abs(difference) <= SYMMETRIC * np.minimum(one, other)).all())
@@ -78,7 +81,7 @@ class DenseOperator(Pickled):
         self.symmetric = is_rounding(host - host.T, largest[:, None], largest)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the matrix as it is now."""
+        """Pickle the current matrix."""
         return made_again(DenseOperator, self.matrix.numpy(), device=self.device, dtype=self.dtype)
 
     @property
@@ -115,7 +118,7 @@ class DenseOperator(Pickled):
         return self.matrix.numpy().diagonal()
 
     def rows(self) -> CompressedRows:
-        """Return the rows, the operator's own memory."""
+        """Return the rows, in the operator's own memory."""
         starts = wp.array(
             np.arange(self.unknowns + 1) * self.unknowns, dtype=wp.int32, device=self.device
         )
@@ -124,7 +127,7 @@ class DenseOperator(Pickled):
         )
 
     def scale(self) -> np.ndarray:
-        """Return the natural residual's d, shape (n,), of the entries as they are now."""
+        """Return the natural residual's d, shape (n,), for the current entries."""
         return scale_of_matrix(self.matrix.numpy().astype(np.float64))
 
     def coefficient_gradient(self, multiplier: wp.array[Any], x: wp.array[Any]) -> dict[str, Any]:
@@ -161,6 +164,7 @@ class DenseOperator(Pickled):
     def _product(
         self, x: wp.array[Any], out: wp.array[Any] | None, *, transposed: bool
     ) -> wp.array[Any]:
+        """Return A x or A' x, in `out` if given."""
         if tuple(x.shape) != self.shape:
             raise ValueError(f"x has shape {tuple(x.shape)}: expected {self.shape}")
         out = wp.zeros_like(x) if out is None else out

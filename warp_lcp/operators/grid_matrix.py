@@ -1,4 +1,4 @@
-"""The matrix of a grid operator, for what needs its rows."""
+"""Assemble the matrix of a grid operator."""
 
 from __future__ import annotations
 
@@ -14,10 +14,12 @@ from warp_lcp.rows.layout import Pattern
 
 
 def grid_matrix(A: HasStencil) -> scipy.sparse.csr_array:
-    """Assemble a grid operator on its FLUID cells, in their order, from its diagonal and lower-face weights.
+    """Assemble a grid operator on its FLUID cells, in their order.
+
+    From its diagonal and its weights of neighbors.
 
     Args:
-        A: an operator that no other process has a part of.
+        A: an operator in one process.
 
     Returns:
         The matrix, float64.
@@ -57,7 +59,11 @@ def grid_matrix(A: HasStencil) -> scipy.sparse.csr_array:
 
 
 def _weights(A: HasStencil) -> Iterator[tuple[tuple[int, int, int], Any, bool]]:
-    """Yield the steps (x, y, z) to a neighbor, its weight for each stored cell or everywhere, and whether that counts for both cells."""
+    """Yield the neighbors of a cell and their weights.
+
+    Each item is a step (x, y, z), its weight for each stored cell or everywhere, and whether the
+    weight counts for both cells.
+    """
     s = A.stencil
     pattern = s.pattern or Pattern(
         ((-1, 0, 0), (0, -1, 0), (0, 0, -1)), True, "numbers" if s.weights is None else "arrays"
@@ -65,7 +71,13 @@ def _weights(A: HasStencil) -> Iterator[tuple[tuple[int, int, int], Any, bool]]:
     for place, step in enumerate(pattern.offsets):
         if pattern.functions:
             function = pattern.functions[place]
-            yield step, -A.evaluated(function) if callable(function) else -function, False  # type: ignore[attr-defined]
+            yield (
+                step,
+                -A.evaluated(function)  # type: ignore[attr-defined]
+                if callable(function)
+                else -function,
+                False,
+            )
         else:
             yield (
                 step,

@@ -1,4 +1,7 @@
-"""What operators on the FLUID cells of a grid share: cell types, padded storage, rows in use, products and sweeps."""
+"""Base of the operators on the FLUID cells of a grid.
+
+Cell types, padded storage, rows in use, products and sweeps.
+"""
 
 from __future__ import annotations
 
@@ -39,15 +42,15 @@ FIND_SPANS = KERNELS.kernel(
 
 
 class GridOperator(Pickled):
-    """Matrix-free operator on the FLUID cells of a grid; what its rows are is for classes to say.
+    """Matrix-free operator on the FLUID cells of a grid; subclasses define its rows.
 
-    They set what `_fill_stencil` reads in `_take_coefficients`, return the memory of `stencil` from
-    `_empty_stencil`, and fill that.
+    They store the coefficients for `_fill_stencil` in `_take_coefficients`, return the memory of
+    `stencil` from `_empty_stencil`, and fill that.
 
     Args:
         cells: integers AIR = 0, FLUID = 1, SOLID = 2, shape (nz, ny, nx) or (ny, nx); numpy or
             wp.array.
-        coefficients: what `_take_coefficients` is given.
+        coefficients: arguments of `_take_coefficients`.
         periodic: whether x, y, z wrap around.
         device: Warp device; that of `cells` or the default device if None.
         dtype: storage of coefficients, wp.float32 or wp.float64.
@@ -57,7 +60,7 @@ class GridOperator(Pickled):
         cells_around: the same with ghost cells of periodic axes filled; `cells` itself where no
             axis is periodic.
         stencil: the diagonal and the weights on that padded grid.
-        version: how often the cells have been taken; memory that holds something outside the rows'
+        version: number of times that the cells have been set; memory with values outside the rows'
             spans is cleared when it changes.
     """
 
@@ -66,9 +69,9 @@ class GridOperator(Pickled):
     _ghosts: Ghosts | None = None  # of a box of cells among others
     _across: Across | None = None
     _finder: Any = None  # of floating components
-    _rounding = 0.0  # the largest relative one of coefficients that were given as arrays
-    outside = SOLID  # what lies beyond the array
-    # whether taking cells reads nothing from the device, so that it is recorded once
+    _rounding = 0.0  # largest relative rounding of coefficients that were given as arrays
+    outside = SOLID  # cell type beyond the array
+    # Whether setting cells reads nothing from the device, so that it is recorded once.
     records = False
 
     def __init__(
@@ -88,7 +91,7 @@ class GridOperator(Pickled):
         self.dtype, self.shape = dtype, host.shape
         self.layout = PaddedLayout(host.shape, self.device, self._across)
         counts = self.layout.padding.counts
-        # axes of one cell, too
+        # Axes of one cell, too.
         self._wraps = flags = (*(bool(p) for p in periodic), False, False, False)[:3]
         self.periodic = (
             flags[0] and counts[2] > 1,
@@ -121,15 +124,17 @@ class GridOperator(Pickled):
 
     @classmethod
     def from_cells(cls, shape: Sequence[int], fluid: Any, solid: Any = (), **options: Any) -> Self:
-        """Make the operator of a grid from lists of its FLUID and SOLID cells, the others being AIR.
+        """Create the operator of a grid from lists of its FLUID and SOLID cells.
+
+        The other cells are AIR.
 
         Args:
             shape: cells along each axis, (nz, ny, nx) or (ny, nx).
-            fluid: indices of FLUID cells, integers of shape (n, 3), a row (k, j, i) a cell as it is
-                found in fields, or (n, 2) in 2-D; numpy or wp.array. The order of the cells does
-                not matter; lists in the order of memory are taken fastest.
+            fluid: indices of FLUID cells, integers of shape (n, 3), a row (k, j, i) for each cell
+                as in fields, or (n, 2) in 2-D; numpy or wp.array. The order of the cells does not
+                matter; lists in the order of memory are fastest.
             solid: likewise of SOLID cells.
-            options: all that the class takes beside `cells`.
+            options: all arguments of the class besides `cells`.
 
         Raises:
             ValueError: a list has another shape or type, a cell is not in the grid, is listed twice
@@ -144,7 +149,9 @@ class GridOperator(Pickled):
         return cls(cells=cells_of(shape, fluid, solid), **options)
 
     def update(self, cells: wp.array[Any]) -> None:
-        """Take new cell types, and what face coefficients and shift in padded arrays have become, in place and without allocating.
+        """Set new cell types, in place and without allocation.
+
+        Face coefficients and shift in padded arrays are read again.
 
         Args:
             cells: wp.int8 array on the operator's device, of its shape (3-D) or of the padded shape
@@ -184,6 +191,7 @@ class GridOperator(Pickled):
     def _applied(
         self, x: wp.array[Any], out: wp.array[Any] | None, *, transposed: bool = False
     ) -> wp.array[Any]:
+        """Return A x or A' x for a stored field, or for one of the operator's shape."""
         if x.size == self.layout.size:
             if out is None:
                 out = wp.zeros_like(x)
@@ -203,32 +211,44 @@ class GridOperator(Pickled):
         return out
 
     def _product(self, x: wp.array[Any], out: wp.array[Any], *, transposed: bool) -> None:
-        """out = A x, or A' x; flat stored fields."""
+        """Compute out = A x, or A' x; flat stored fields."""
         self.stencil.product(x, out)
 
     def apply_plus(self, x: wp.array[Any], b: wp.array[Any], out: wp.array[Any]) -> None:
-        """out = A x + b in one pass; stored fields of one type."""
+        """Compute out = A x + b in one pass; stored fields of one type."""
         self.stencil.product(x, out, plus=b)
 
     def relax(
         self, x: Any, b: Any, lower: Any, upper: Any, omega: float, *, forward: bool = True
     ) -> None:
-        """Sweep stored fields once, red cells then black ones (forward) or the reverse, each unknown projected onto its bounds."""
+        """Sweep stored fields once, each unknown projected onto its bounds.
+
+        Red cells then black ones (forward), or the reverse.
+        """
         self.stencil.relax(x, b, lower, upper, omega, forward=forward)
 
     def diagonal(self) -> wp.array[Any]:
-        """Return the diagonal of A, a field of the operator's shape and type; 0 off the FLUID cells."""
+        """Return the diagonal of A, a field of the operator's shape and type.
+
+        0 off the FLUID cells.
+        """
         d = self.stencil.d.numpy().astype(np.float64) * self.stencil.unit
         inner = d.reshape(self.layout.stored_shape)[1:-1, 1:-1, 1:-1]
         return wp.array(inner.reshape(self.shape), dtype=self.dtype, device=self.device)
 
     def storage_rounding(self) -> float:
-        """Return the largest relative rounding, on any rank, of coefficients given in float64; sums on the diagonal do not count."""
+        """Return the largest relative rounding of coefficients, on any rank.
+
+        Of those given in float64; sums on the diagonal do not count.
+        """
         across = self.layout.across
         return self._rounding if across is None else float(across.max(self._rounding))
 
     def masked(self, free: Any, shift: Any = None) -> Self:
-        """Return the principal system P A P + P D P, P the restriction to `free` (non-zero entries) and D = diag(shift), shift >= 0."""
+        """Return the principal system P A P + P D P.
+
+        P is the restriction to `free` (non-zero entries) and D = diag(shift), shift >= 0.
+        """
         mask = (self.layout.load(free, wp.uint8, "free").numpy() != 0) & (
             self.cells.numpy().ravel() == FLUID
         )
@@ -247,7 +267,10 @@ class GridOperator(Pickled):
         return twin
 
     def on_cells(self, cells: np.ndarray) -> Self:
-        """Return the operator of other cells, padded as `cells` is, with the same coefficients, its arrays in place."""
+        """Return the operator of other cells with the same coefficients.
+
+        The cells are padded as `cells` is; arrays of coefficients are used in place.
+        """
         inner = cells.reshape(self.layout.stored_shape)[1:-1, 1:-1, 1:-1].reshape(self.shape)
         return type(self)(
             inner, periodic=self._wraps, device=self.device, dtype=self.dtype, **self._arguments()
@@ -258,7 +281,10 @@ class GridOperator(Pickled):
         raise NotImplementedError
 
     def _check_own(self) -> None:
-        """Refuse a principal system where coefficients are asked for."""
+        """Raise ValueError if the operator is a principal system.
+
+        It has no coefficients of its own.
+        """
         if self._mask is not None:
             raise ValueError(
                 "a masked operator has no coefficients of its own: use the operator it was made "
@@ -266,7 +292,7 @@ class GridOperator(Pickled):
             )
 
     def _pickled(self) -> tuple[np.ndarray, dict[str, Any]]:
-        """Return the cells and the options that every class has, as `__reduce__` needs them.
+        """Return the cells and the options of every class for `__reduce__`.
 
         Raises:
             TypeError: it is a part of a grid that ranks share, or a principal system.
@@ -288,7 +314,10 @@ class GridOperator(Pickled):
 
     @property
     def unknowns(self) -> int:
-        """Number of FLUID cells, those of ghosts not counted; of all ranks, collective."""
+        """Number of FLUID cells without ghost cells.
+
+        Of all ranks; collective.
+        """
         count, across = (
             sum(
                 int(np.count_nonzero(plane == FLUID))
@@ -299,7 +328,7 @@ class GridOperator(Pickled):
         return count if across is None else int(across.sum(count))
 
     def _take_coefficients(self, cells: np.ndarray, *args: Any, **given: Any) -> None:
-        """Check and store what the rows are made from."""
+        """Check and store the data of the rows."""
         raise NotImplementedError
 
     def _empty_stencil(self) -> PaddedStencil:
@@ -307,11 +336,11 @@ class GridOperator(Pickled):
         raise NotImplementedError
 
     def _fill_stencil(self) -> None:
-        """Compute diagonal and weights, on rows that are in use or have been."""
+        """Compute diagonal and weights on the current and former rows in use."""
         raise NotImplementedError
 
     def _refill(self, cells: wp.array[Any]) -> None:
-        """Take padded cell types and compute diagonal and weights."""
+        """Set padded cell types and compute diagonal and weights."""
         self.version += 1
         if not self.records:
             self._take_cells(cells)
@@ -321,6 +350,7 @@ class GridOperator(Pickled):
         self._refills[cells.ptr].run()
 
     def _take_cells(self, cells: wp.array[Any]) -> None:
+        """Set padded cell types, and update rows in use, diagonal and weights."""
         if cells is not self.cells:
             COPY_CELLS.bind(
                 Rows.of(self.layout.padding, self.device),
@@ -331,7 +361,7 @@ class GridOperator(Pickled):
         self._fill_stencil()
 
     def _in_place(self, field: Any, name: str) -> bool:
-        """Return whether a coefficient field is the caller's padded array, after checking it."""
+        """Return whether a coefficient field is the caller's padded array; check it."""
         if (
             not isinstance(field, wp.array)
             or tuple(field.shape) != self.layout.stored_shape
@@ -346,6 +376,7 @@ class GridOperator(Pickled):
         return True
 
     def _stored_shift(self, shift: Any) -> wp.array[Any]:
+        """Return the shift as a padded array; empty if there is none."""
         if shift is None:
             return wp.empty((0, 0, 0), dtype=self.dtype, device=self.device)
         if self._in_place(shift, "shift"):
@@ -363,16 +394,16 @@ class GridOperator(Pickled):
         )
 
     def _note_rounding(self, values: np.ndarray) -> None:
-        """Take note of what storing coefficients changes."""
+        """Record the relative rounding of stored coefficients."""
         self._rounding = max(self._rounding, relative_rounding(values, self.dtype))
 
     def _find_rows(self) -> None:
-        """Find what of each row is in use."""
+        """Find the part of each row that is in use."""
         self._search.launch()
 
     @cached_property
     def _search(self) -> Bound:
-        """Find the spans of `cells`; the arrays are always these."""
+        """Kernel that finds the spans of `cells`; its arrays do not change."""
         rows = Rows.of(self.layout.padding, self.device, whole=True)
         return FIND_SPANS.bind(
             rows,
@@ -417,7 +448,7 @@ def _checked_cells(cells: Any) -> np.ndarray:
 
 
 def check_coefficients(values: np.ndarray, dtype: Any, name: str) -> None:
-    """Check that values are >= 0 and kept by their type."""
+    """Check that values are >= 0 and that their type can store them."""
     check_storable(values, dtype, name)
     check_kept(values, dtype, name)
     if (values < 0).any():

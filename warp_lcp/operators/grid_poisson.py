@@ -1,4 +1,7 @@
-"""The Poisson operator of a grid of cells, matrix-free: what pressure solves, obstacle problems and density corrections share."""
+"""Matrix-free Poisson operator of a grid of cells.
+
+For pressure solves, obstacle problems and density corrections.
+"""
 
 from __future__ import annotations
 
@@ -45,13 +48,13 @@ class GridPoisson(GridOperator):
 
     (A x)_i = sum over i's open faces of c_f (x_i - x_neighbor) + shift_i x_i, with x = 0 in AIR and
     in SOLID. A face with SOLID on a side is closed; outside the array is SOLID unless the axis is
-    periodic. Numbers as coefficients keep the fast kernels: equal ones and no shift need one byte a
-    cell.
+    periodic. Coefficients that are numbers keep the fast kernels: equal ones and no shift need one
+    byte a cell.
 
     Args:
         cells: integers AIR = 0, FLUID = 1, SOLID = 2, shape (nz, ny, nx) or (ny, nx); numpy or
-            wp.array. Unknowns live on FLUID cells, fields have the shape of `cells`, but on the CPU
-            their memory is taken only near rows that have held FLUID cells.
+            wp.array. Unknowns are on FLUID cells, fields have the shape of `cells`, but on the CPU
+            their memory is used only near rows that have had FLUID cells.
         face_x: c_f >= 0 of the faces normal to x: a number or an array (nz, ny, nx + 1), or (ny, nx
             + 1) in 2-D.
         face_y: likewise, (nz, ny + 1, nx).
@@ -61,17 +64,16 @@ class GridPoisson(GridOperator):
             `dtype` on the operator's device, a face's coefficient with the cell above it: they are
             then used in place and read again by `update`.
         periodic: whether x, y, z wrap around.
-        decomposition: boxes of cells, one a rank (`warp_lcp.distributed.Decomposition`). All
+        decomposition: boxes of cells, one for each rank (`warp_lcp.distributed.Decomposition`). All
             arguments and fields are then those of this rank's box, coefficients of its upper faces
-            included. An `LCP` with the operator is one problem of all ranks, and making it and
+            included. An `LCP` with the operator is one problem of all ranks. Its construction and
             `wl.solve` are collective: each rank gets its box of x, and status, residual and history
             of the whole.
         device: Warp device; that of `cells` or the default device if None.
         dtype: storage of coefficients, wp.float32 or wp.float64. In float32 unequal coefficients
-            and their sums are rounded, so that the problem solved is another one by about 1e-7 of
-            the diagonal: for closed domains with such coefficients take wp.float64, and for
-            tolerances below the rounding, where the status is FLOOR. Equal coefficients without a
-            shift are not rounded.
+            and their sums are rounded, which changes the problem by about 1e-7 of the diagonal: use
+            wp.float64 for closed domains with such coefficients, and for tolerances below the
+            rounding, where the status is FLOOR. Equal coefficients without a shift are not rounded.
 
     Raises:
         ValueError: an argument has a wrong shape, type or sign, or is not finite; the message names
@@ -115,6 +117,7 @@ class GridPoisson(GridOperator):
     def _take_coefficients(
         self, cells: np.ndarray, *, face_x: Face, face_y: Face, face_z: Face, shift: Any
     ) -> None:
+        """Store face coefficients and shift, numbers as numbers."""
         given = (face_x, face_y, face_z if cells.ndim == 3 else 1.0)
         faces = [
             f if isinstance(f, wp.array) else real_array(f, f"face_{axis}")
@@ -133,15 +136,15 @@ class GridPoisson(GridOperator):
 
         (mu_i - mu_j) (x_i - x_j) of each face and mu_i x_i of the shift.
 
-        0 on closed faces; x = mu = 0 in AIR. The first and the last faces of a periodic axis, which
-        are one, have half of it each.
+        0 on closed faces; x = mu = 0 in AIR. The first and the last faces of a periodic axis are
+        the same faces, and each has half of the derivative.
         """
         self._check_own()
         s, arrays = self.stencil, {name: shape for name, shape in self._given.items() if shape}
         for field in (multiplier, x):
             s.wrap(field)
         cells = self.cells_around.flatten()
-        found: dict[str, Any] = {}
+        derivatives: dict[str, Any] = {}
         if len(arrays) < len(self._given):
             totals = Sums(Rows.of(self.layout.padding, self.device), 4)
             values = totals.of(
@@ -154,7 +157,7 @@ class GridPoisson(GridOperator):
                 face_z=None,
                 shift=None,
             ).tolist()
-            found = dict(zip(FACE_GRADIENT.writes, values, strict=True))
+            derivatives = dict(zip(FACE_GRADIENT.writes, values, strict=True))
         if arrays:
             rows = Rows.of(self.layout.padding, self.device, more=1)
             written = {
@@ -176,18 +179,22 @@ class GridPoisson(GridOperator):
                 shift=shift,
                 out=partials,
             ).launch()
-            found |= {
+            derivatives |= {
                 name: self._coefficient_field(name, written[name], shape)
                 for name, shape in arrays.items()
             }
         return {
-            name: found.get(name) if name in self._given else None for name in FACE_GRADIENT.writes
+            name: derivatives.get(name) if name in self._given else None
+            for name in FACE_GRADIENT.writes
         }
 
     def _coefficient_field(
         self, name: str, stored: wp.array[Any], shape: tuple[int, ...]
     ) -> wp.array[Any]:
-        """Return a stored field of coefficients, lower faces' ones, in the shape that was given."""
+        """Return a stored field of coefficients in the shape that was given.
+
+        The field has those of lower faces.
+        """
         values = stored.numpy().reshape(self.layout.stored_shape)
         inner, axis = [slice(1, -1)] * 3, -1 if name == "shift" else AXES.index(name[-1])
         if axis >= 0:
@@ -195,7 +202,7 @@ class GridPoisson(GridOperator):
         part = values[tuple(inner)]
         if axis >= 0 and self.periodic[axis]:
             np.moveaxis(part, 2 - axis, 0)[[0, -1]] *= 0.5
-        if shape == self.layout.stored_shape:  # padded: of other ghost cells nothing was asked
+        if shape == self.layout.stored_shape:  # padded: other ghost cells are 0
             kept = np.zeros(shape)
             kept[tuple(inner)] = part
             part = kept
@@ -243,7 +250,7 @@ class GridPoisson(GridOperator):
         return self.shape, self.periodic, self.dtype, s.d.dtype, sizes, *numbers
 
     def _held(self) -> list[wp.array[Any]]:
-        """Return all that a solve reads of it."""
+        """Return all arrays that a solve reads of the operator."""
         s = self.stencil
         return [
             self.cells,
@@ -256,21 +263,21 @@ class GridPoisson(GridOperator):
         ]
 
     def replica(self) -> GridPoisson:
-        """Return the same operator in memory of its own."""
+        """Return a copy of the operator in its own memory."""
         twin = copy.copy(self)
         twin._refills, twin._finder = {}, None
         for cached in ("_search", "_rows_in_reach"):
             twin.__dict__.pop(cached, None)
         s, kept = self.stencil, {id(field): wp.clone(field) for field in self._held()}
-        own: Any = lambda field: kept[id(field)]  # noqa: E731
+        copy_of: Any = lambda field: kept[id(field)]  # noqa: E731
         twin.cells, twin.cells_around, twin._spans, twin.shift = map(
-            own, (self.cells, self.cells_around, self._spans, self.shift)
+            copy_of, (self.cells, self.cells_around, self._spans, self.shift)
         )
         twin.faces, weights = (
-            list(map(own, self.faces)),
-            None if s.weights is None else tuple(map(own, s.weights)),
+            list(map(copy_of, self.faces)),
+            None if s.weights is None else tuple(map(copy_of, s.weights)),
         )
-        twin.stencil = replace(s, d=own(s.d), weights=weights, spans=twin._spans)
+        twin.stencil = replace(s, d=copy_of(s.d), weights=weights, spans=twin._spans)
         return twin
 
     def take(self, other: GridPoisson) -> None:
@@ -280,7 +287,7 @@ class GridPoisson(GridOperator):
         self.version += 1
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle cells and coefficients; these come back in the padded shape."""
+        """Pickle cells and coefficients; arrays are restored in the padded shape."""
         cells, options = self._pickled()
         given = {
             name: OnHost(v) if isinstance(v, wp.array) else v
@@ -296,7 +303,10 @@ class GridPoisson(GridOperator):
         return faces | {"shift": self.shift if self.shift.size else None}
 
     def _stored_face(self, face: Face, axis: int) -> wp.array[Any]:
-        """Return the coefficients of lower faces as a padded array, or an empty array for a number."""
+        """Return the coefficients of lower faces as a padded array.
+
+        Empty for a number.
+        """
         name = f"face_{AXES[axis]}"
         if face.ndim == 0:
             check_coefficients(face, self.dtype, name)
@@ -326,7 +336,7 @@ class GridPoisson(GridOperator):
         return wp.array(np.pad(host.reshape(counts), padding), dtype=self.dtype, device=self.device)
 
     def _check_sums(self) -> None:
-        """Refuse coefficients that the type holds, but perhaps not their sums, which are the diagonal."""
+        """Refuse coefficients whose sums, the diagonal, may overflow their type."""
         parts = zip([*self.faces, self.shift], [*self.uniform, 0.0], strict=True)
         *faces, shift = (float(f.numpy().max()) if f.size else number for f, number in parts)
         most, name = 2 * sum(faces) + shift, self.dtype.__name__
@@ -351,6 +361,7 @@ class GridPoisson(GridOperator):
         return any(f.size > 0 for f in self.faces)
 
     def _empty_stencil(self) -> PaddedStencil:
+        """Allocate the stencil: a count of faces in one byte if coefficients allow it."""
         layout, counts = self.layout, self._counts_faces
         strength: Any = tuple(map(self._mean_coefficient, self.faces, self.uniform))
         weights: Any = tuple(layout.zeros(self.dtype) for _ in AXES) if self._has_arrays else None
@@ -382,14 +393,18 @@ class GridPoisson(GridOperator):
 
     @property
     def face_coefficients(self) -> FaceCoefficients:
-        """Coefficients of the faces as kernels take them."""
+        """Coefficients of the faces as kernel arguments."""
         fx, fy, fz = (f.flatten() if f.size else None for f in self.faces)
         return FaceCoefficients(fx, fy, fz, *self.uniform)
 
     records = True
 
     def _fill_stencil(self) -> None:
-        """Compute diagonal and weights, on rows that are in use or have been."""
+        """Compute diagonal and weights on the current and former rows in use.
+
+        The diagonal is the number of open faces times one coefficient, if possible; else the sum of
+        the coefficients of open faces and the shift.
+        """
         s, padding, reach = self.stencil, self.layout.padding, self._rows_in_reach
         self._wrap_cells()
         cells = self.cells_around.flatten()

@@ -1,4 +1,7 @@
-"""An operator that is known by its products on the host: a function of NumPy arrays, SciPy's LinearOperator, or what else has `@`."""
+"""Operator given by its products on the host.
+
+A function of NumPy arrays, SciPy's LinearOperator, or another object with `@`.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,7 @@ from warp_lcp.problem.scale import NoTranspose, estimated_scale
 from warp_lcp.rows.fields import Layout, check_storable, checked_device, real_array
 
 Product = Callable[[np.ndarray], Any]
-ASYMMETRY = 1e-5  # of ||u|| ||A v||: above what products in float32 leave of u'Av = v'Au
+ASYMMETRY = 1e-5  # relative to ||u|| ||A v||: larger than float32 products leave of u'Av = v'Au
 
 
 class LinearOperator(Pickled, Operator):
@@ -25,30 +28,33 @@ class LinearOperator(Pickled, Operator):
 
     A x comes from the function, or from `A @ x`; rows and entries are not available.
 
-    Products are made on the host, from copies of x in float64, whatever the device. Every method
-    that needs products only takes it (docs "Operators of your own"); `MinimumMapNewton` is the
-    default. Two products check the arguments, two more that A is symmetric where it is said to be.
+    Products are computed on the host, from copies of x in float64, on any device. Every method that
+    needs products only accepts it (docs "Operators of your own"); `MinimumMapNewton` is the
+    default. Two products check the arguments, two more check the symmetry of A if `symmetric` is
+    set.
 
     Args:
         A: function of a float64 array of shape `shape` that returns A x in that shape; or an object
             of shape (n, n) with products by `@`.
-        shape: of the fields; (n,) if None, which a function does not allow.
+        shape: of the fields; (n,) if None, which is not allowed for a function.
         symmetric: whether A equals its transpose, which halves the cost of Newton's systems
-            (conjugate gradients, else GMRES) and some methods need. None: not, unless A is its own
-            adjoint, `A.H is A`, as SciPy's special arrays are.
+            (conjugate gradients, else GMRES) and which some methods need. None: False, unless A is
+            its own adjoint, `A.H is A`, as SciPy's special arrays are.
         diagonal: of A, a number or a field. None: row and column norms, estimated from 16 products,
             are used instead; the natural residual's scale never depends on it alone.
-        transpose: function that returns A'x; None: `A.rmatvec` where that is defined. An
-            unsymmetric A without it is refused by what needs A' (GradientDescent).
+        transpose: function that returns A'x; None: `A.rmatvec` where that is defined. Methods that
+            need A' (GradientDescent) refuse an unsymmetric A without it.
         device: Warp device of the fields; the CPU if None.
 
     Raises:
         ValueError: A is of another kind, not square or not real; a product has another shape, is
-            not real or not finite; A is said to be symmetric and is not.
+            not real or not finite; `symmetric` is set and A is not symmetric.
 
     Example:
         >>> import numpy as np, warp_lcp as wl
-        >>> A = wl.LinearOperator(lambda x: 3 * x - np.roll(x, 1) - np.roll(x, -1), (5,), symmetric=True, diagonal=3.0)
+        >>> def product(x):
+        ...     return 3 * x - np.roll(x, 1) - np.roll(x, -1)
+        >>> A = wl.LinearOperator(product, (5,), symmetric=True, diagonal=3.0)
         >>> print(wl.solve(wl.LCP(A, np.array([1.0, -2.0, 1.0, 1.0, 1.0]))).x.numpy().round(3))
         [0.    0.667 0.    0.    0.   ]
     """
@@ -91,7 +97,7 @@ class LinearOperator(Pickled, Operator):
         self._scale: np.ndarray | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle what the operator was made of."""
+        """Pickle the constructor's arguments."""
         return made_again(_made, *self._given, device=self.device)
 
     def apply(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
@@ -151,12 +157,12 @@ class LinearOperator(Pickled, Operator):
         """Return a product with an array that it may keep.
 
         Raises:
-            ValueError: it is none, not real or has another shape.
+            ValueError: it returns nothing, is not real or has another shape.
         """
         try:
-            # a copy: A may hand out its own buffer, and write to it next time
+            # The result is copied, because A may return its own buffer and write to it next time.
             image = np.array(product(x))
-        except ValueError as reason:  # SciPy's, of a matvec that returns another shape
+        except ValueError as reason:  # SciPy's, for a matvec that returns another shape
             raise ValueError(
                 f"A fails to multiply an array of shape {self.shape}: {reason}"
             ) from reason
@@ -168,41 +174,53 @@ class LinearOperator(Pickled, Operator):
 
 
 def _shape_of(A: Any, shape: Any) -> tuple[int, ...]:
-    """Return the shape of A's fields, which is checked against that of A where it has one."""
-    own: Any = getattr(A, "shape", None)
+    """Return the shape of A's fields, checked against A's own shape."""
+    matrix_shape: Any = getattr(A, "shape", None)
     if isinstance(A, Operator) or not (callable(A) or hasattr(A, "__matmul__")):
         raise ValueError(
             f"A is a {type(A).__name__}: expected a function, or a "
             "scipy.sparse.linalg.LinearOperator"
         )
     if not hasattr(A, "__matmul__"):
-        own = None
-    elif own is None or len(own) != 2 or own[0] != own[1] or own[0] == 0:
-        raise ValueError(f"A has shape {own}: expected (n, n) with n >= 1")
-    if own is None and shape is None:
+        matrix_shape = None
+    elif (
+        matrix_shape is None
+        or len(matrix_shape) != 2
+        or matrix_shape[0] != matrix_shape[1]
+        or matrix_shape[0] == 0
+    ):
+        raise ValueError(f"A has shape {matrix_shape}: expected (n, n) with n >= 1")
+    if matrix_shape is None and shape is None:
         raise ValueError("shape: must be given if A is a function")
     try:
-        wanted = (
-            (int(own[0]),)
+        field_shape = (
+            (int(matrix_shape[0]),)
             if shape is None
             else tuple(int(n) for n in (shape if np.ndim(shape) else (shape,)))
         )
     except (TypeError, ValueError):
         raise ValueError(f"shape = {shape!r}: expected a tuple of integers") from None
-    if not wanted or min(wanted) < 1 or (own is not None and math.prod(wanted) != own[0]):
+    if (
+        not field_shape
+        or min(field_shape) < 1
+        or (matrix_shape is not None and math.prod(field_shape) != matrix_shape[0])
+    ):
         raise ValueError(
             f"shape = {shape!r}: expected integers >= 1"
-            + ("" if own is None else f" whose product is {own[0]}")
+            + ("" if matrix_shape is None else f" whose product is {matrix_shape[0]}")
         )
     if np.dtype(getattr(A, "dtype", None) or np.float64).kind not in "biuf":
         raise ValueError(f"A has type {A.dtype}: expected real numbers")
-    return wanted
+    return field_shape
 
 
 def _products_of(
     A: Any, shape: tuple[int, ...], transpose: Product | None
 ) -> tuple[Product, Product | None]:
-    """Return x -> A x and x -> A'x on fields of a shape, None in its place where that is not defined."""
+    """Return the functions x -> A x and x -> A'x on fields of a shape.
+
+    The second is None if it is not defined.
+    """
     if not (transpose is None or callable(transpose)):
         raise ValueError(f"transpose is a {type(transpose).__name__}: expected a function")
     if not hasattr(A, "__matmul__"):
@@ -220,7 +238,7 @@ def _products_of(
         ) if transpose is None and hasattr(A, "T") else transpose
     try:
         adjoint(np.zeros(shape))
-    except NotImplementedError:  # SciPy's way to say that there is none
+    except NotImplementedError:  # SciPy's error if there is no adjoint
         return product, None
     return product, adjoint
 

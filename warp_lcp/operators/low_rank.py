@@ -1,4 +1,7 @@
-"""An operator of low rank: what rigid bodies add to the unknowns that they touch."""
+"""Operator of low rank, U W U'.
+
+For example the term that rigid bodies add to the unknowns that they touch.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,7 @@ def weigh_kernel(
     c: wp.array(dtype=wp.float64),
     out: wp.array(dtype=wp.float64),
 ):
-    """out = W c, c's first entries."""
+    """Compute out = W c with the first entries of c."""
     i = wp.tid()
     s = wp.float64(0.0)
     for j in range(weights.shape[1]):
@@ -37,13 +40,13 @@ def weigh_kernel(
 
 @dataclass(frozen=True, slots=True)
 class ColumnEntries:
-    """Rows of low-rank columns U that are not 0, as kernels take them.
+    """Nonzero rows of low-rank columns U, as kernel arguments.
 
     Attributes:
         entry_rows: row of each entry, int32, ascending.
         blocks: block of columns of each entry, int32.
         values: the entry's values, `width` of them.
-        count: of the entries, int32, its first number.
+        count: number of entries, int32, its first element.
         width: columns of a block.
     """
 
@@ -62,26 +65,26 @@ CUDA_THREADS = 1024  # of a gather; each keeps sums for all columns
 
 
 class BlockColumns:
-    """Columns of a matrix U by their non-zero rows, in blocks of columns: a row of a block is an entry.
+    """Columns of a matrix U by their nonzero rows, in blocks of columns.
 
-    Bodies in a liquid have a block each, and a cell that touches one has an entry in its block.
-    Entries can be written on the device: in the order of their rows, those of a row in the order of
-    their blocks, and their number into `count`.
+    A row of a block is an entry. Each body in a liquid has a block, and a cell that touches it has
+    an entry in the block. Entries can be written on the device: in the order of their rows, those
+    of a row in the order of their blocks, and their number into `count`.
 
     Args:
         size: elements of a stored field, the rows of U.
         blocks: number of blocks.
         width: columns of a block.
         dtype: type of the values.
-        device: where they live.
+        device: of the arrays.
 
     Attributes:
         rows: row of each entry, int32, shape (capacity,).
         blocks: block of each entry, int32, shape (capacity,).
-        values: of type dtype, shape (capacity * width,), an entry's one after another.
-        count: number of entries, and that of those that there were to write, int32, shape (2,).
-        sums: what `gather` writes, float64, shape (rank,).
-        across: who has other rows of U; None: nobody.
+        values: of type dtype, shape (capacity * width,), entry by entry.
+        count: number of entries, and number of entries to be written, int32, shape (2,).
+        sums: result of `gather`, float64, shape (rank,).
+        across: communicator if other ranks have rows of U; None if serial.
     """
 
     across: Across | None = None
@@ -99,7 +102,10 @@ class BlockColumns:
         self.reserve(0)
 
     def reserve(self, entries: int) -> None:
-        """Make room for so many entries and forget those there are; the arrays are others then."""
+        """Allocate memory for a number of entries, and delete the current ones.
+
+        The arrays are replaced.
+        """
         self.capacity = max(entries, 1)
         self.rows, self.blocks = (
             wp.zeros(self.capacity, dtype=wp.int32, device=self.device) for _ in range(2)
@@ -117,15 +123,15 @@ class BlockColumns:
 
     @property
     def turns(self) -> Rows:
-        """The entries, by turns of threads, for sums on a GPU."""
+        """The entries, distributed over threads in turn, for sums on a GPU."""
         return self._all
 
     def reduction(self, found: wp.array[Any], columns: int) -> Reduction:
-        """Return what adds up columns of sums over `turns` to `found`."""
+        """Return the reduction that adds columns of sums over `turns` to `found`."""
         return Reduction(self.size, self.device, found, columns=columns, threads=self._all.places)
 
     def assign(self, rows: np.ndarray, blocks: np.ndarray, values: np.ndarray) -> None:
-        """Take entries from the host.
+        """Set entries from the host.
 
         Args:
             rows: shape (n,), in ascending order.
@@ -144,23 +150,26 @@ class BlockColumns:
         self.count.fill_(n)
 
     def counted(self) -> int:
-        """Return how many entries a kernel has written; waits for the device."""
+        """Return the number of entries that a kernel has written; waits for the device."""
         self.counting()
         return int(self._count.numpy()[0])
 
     def counting(self) -> None:
-        """Say that a kernel writes entries."""
+        """Mark the count as changed: a kernel writes entries."""
         self._count.changed()
 
     def wanted(self) -> int:
-        """Return the number of entries to write; waits for the device.
+        """Return the number of entries to be written; waits for the device.
 
-        As of the last `counting`; there may be room for less.
+        Of the last `counting`; the capacity may be smaller.
         """
         return int(self._count.numpy()[1])
 
     def summed(self) -> np.ndarray:
-        """Return what the last `gather` has written, not to be written to, shape (rank,); waits for the device."""
+        """Return the result of the last `gather`, shape (rank,).
+
+        It must not be written to. Waits for the device.
+        """
         self._sums.changed()
         return self._sums.numpy()
 
@@ -181,7 +190,10 @@ class BlockColumns:
         fused: bool = True,
         launch: Launch = launch_now,
     ) -> wp.array[Any]:
-        """Write U'x to `sums`, and return that; x is a flat stored field, taken for 0 where `mask` is; `fused` as of `scatter`."""
+        """Write U'x to `sums`, and return that.
+
+        x is a flat stored field; it counts as 0 where `mask` is 0. `fused` as of `scatter`.
+        """
         out = self.sums if self._reduction is None else self._reduction.partials
         GATHER.bind(
             self._all, self.entry_fields, rank=self.rank, x=x, mask=mask, out=out, FUSED=fused
@@ -203,9 +215,10 @@ class BlockColumns:
         fused: bool = True,
         launch: Launch = launch_now,
     ) -> None:
-        """out = base + sign U f on U's rows; other rows of `out` stay as they are, and so do those where `mask` is 0.
+        """Compute out = base + sign U f on U's rows where `mask` is not 0.
 
-        `fused`: products are rounded with the sums that they are added to.
+        Other rows of `out` do not change. `fused`: products are rounded together with the sums to
+        which they are added.
         """
         SCATTER.bind(
             self._each,
@@ -219,14 +232,14 @@ class BlockColumns:
         ).launch(launch)
 
     def add_diagonal(self, weights: wp.array[Any], out: wp.array[Any]) -> None:
-        """out += the diagonal of U W U', W of shape (rank * rank,)."""
+        """Add the diagonal of U W U' to `out`, W of shape (rank * rank,)."""
         DIAGONAL.bind(
             self._each, self.entry_fields, rank=self.rank, weights=weights, result=out
         ).launch()
 
     @property
     def entry_fields(self) -> ColumnEntries:
-        """The entries, as kernels take them."""
+        """The entries as kernel arguments."""
         return ColumnEntries(self.rows, self.blocks, self.values, self.count, self.width)
 
 
@@ -235,7 +248,7 @@ class LowRankOperator(Pickled):
 
     Usually a term of a SumOperator, A + U W U'.
 
-    Only the rows of U that are not 0 are stored, and a product costs no more than they do. Where
+    Only the nonzero rows of U are stored, and the cost of a product is proportional to them. Where
     ranks share the fields each has its rows of U, and products are collective.
 
     Args:
@@ -246,14 +259,14 @@ class LowRankOperator(Pickled):
         dtype: storage of the columns, wp.float64 or wp.float32.
 
     Attributes:
-        symmetric: whether W equals its transpose but for rounding of its rows' largest entries.
+        symmetric: whether W equals its transpose, up to rounding of its rows' largest entries.
         rank: number of columns.
-        columns: the rows of U that are not 0, `warp_lcp.operators.low_rank.BlockColumns`.
+        columns: the nonzero rows of U, `warp_lcp.operators.low_rank.BlockColumns`.
         weights: W, float64, shape (k, k); `update` changes it.
-        version: how often columns and weights have been taken.
+        version: number of times that columns and weights have been set.
         weighed: W U'x of the last product, float64, shape (k,).
-        products: where a solve keeps U'x of its iterate as last evaluated; `products_of` is that
-            iterate, None: no solve does.
+        products: memory in which a solve stores U'x of its iterate as last evaluated; `products_of`
+            is that iterate, None if no solve does.
 
     Raises:
         ValueError: shapes do not match, there is no column, or a value is not finite.
@@ -282,7 +295,7 @@ class LowRankOperator(Pickled):
     def of_blocks(cls, A: Any, columns: BlockColumns, weights: Any) -> LowRankOperator:
         """Return the operator of columns stored like the fields of A.
 
-        Its entries may be rewritten in place; `update` says so.
+        Its entries may be rewritten in place; call `update` after that.
 
         Raises:
             ValueError: the columns' size is not that of A's stored fields, or the weights do not
@@ -302,7 +315,7 @@ class LowRankOperator(Pickled):
         return made
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the rows of U that are not 0, by the field's elements that they belong to."""
+        """Pickle the nonzero rows of U, by the elements of the user's fields."""
         rows, blocks, values = self.columns.entries()
         user = np.full(self.layout.size, -1)
         user[self.layout.places()] = np.arange(int(np.prod(self.shape)))
@@ -314,15 +327,15 @@ class LowRankOperator(Pickled):
 
     @property
     def host_weights(self) -> np.ndarray:
-        """W on the host, not to be written to, shape (k, k)."""
+        """W on the host, shape (k, k); it must not be written to."""
         return np.asarray(self._weights.host)
 
     def update(self, weights: Any = None, *, symmetric: bool | None = None) -> None:
         """Replace the weights, and read columns that have changed in place.
 
         Args:
-            weights: as of the constructor; None: they stay.
-            symmetric: whether the weights are; None: it is looked at.
+            weights: as of the constructor; None: no change.
+            symmetric: whether the weights are symmetric; None: it is tested.
 
         Raises:
             ValueError: they have another shape, or are not finite.
@@ -338,7 +351,7 @@ class LowRankOperator(Pickled):
     def stored_like(self, A: Any) -> LowRankOperator:
         """Return the same operator for fields stored like those of A.
 
-        It is the operator itself if its fields are stored so already.
+        It is the operator itself if its fields are stored in the same way.
 
         Raises:
             ValueError: A's fields have another shape.
@@ -420,6 +433,7 @@ class LowRankOperator(Pickled):
         return LowRankOperator.of_blocks(self, columns, self.weights.numpy())
 
     def _make(self, layout: Layout, columns: BlockColumns, weights: Any) -> None:
+        """Set all attributes from stored columns and weights."""
         self.layout, self.columns, columns.across = layout, columns, layout.across
         self.shape, self.device, self.dtype, self.rank, self.version = (
             layout.shape,
@@ -456,7 +470,7 @@ class LowRankOperator(Pickled):
     def products_at(self, x: wp.array[Any]) -> np.ndarray | None:
         """Return U'x of the last solve's solution; waits for the device.
 
-        Not to be written to; None where no solve has kept it.
+        It must not be written to. None if no solve has stored it.
         """
         return (
             self.products.numpy()
@@ -467,6 +481,7 @@ class LowRankOperator(Pickled):
     def _product(
         self, x: wp.array[Any], out: wp.array[Any] | None, W: wp.array[Any]
     ) -> wp.array[Any]:
+        """Return U W U' x for a stored field, or for one of the operator's shape."""
         if x.size != self.layout.size:
             if tuple(x.shape) != self.shape:
                 raise ValueError(f"x has shape {tuple(x.shape)}: expected {self.shape}")
@@ -484,7 +499,7 @@ class LowRankOperator(Pickled):
 def _of_entries(
     sizes: Any, entries: Any, weights: np.ndarray, *, device: Any, dtype: Any
 ) -> LowRankOperator:
-    """Return an operator from what it was pickled as."""
+    """Return an operator from its pickled entries."""
     shape, blocks, width = sizes
     layout = Layout(shape, checked_device(device))
     columns = BlockColumns(layout.size, blocks, width, dtype, layout.device)

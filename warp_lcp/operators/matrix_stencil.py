@@ -1,4 +1,7 @@
-"""Sparse matrices that are stencils: those of a box of cells in its natural order, x first, whose rows reach compact neighbors only."""
+"""Recognize sparse matrices that are compact stencils on a box of cells.
+
+The unknowns must be in the natural order, x first, and the rows must reach compact neighbors only.
+"""
 
 from __future__ import annotations
 
@@ -21,18 +24,18 @@ from warp_lcp.rows.vectors import Sums
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/stencil_operator.h")
 RECOGNIZE = KERNELS["matrix_stencil.recognize"]
-LEAST = 3  # cells of an axis: with fewer, offsets along it and across it are the same
+LEAST = 3  # least number of cells of an axis: with fewer, offsets along it and across it coincide
 LOWER = ((-1, 0, 0), (0, -1, 0), (0, 0, -1))  # neighbors of lower faces
-# rows from the middle one on whose offsets tell the box: side by side, for most are not on its
-# border then
+# Number of consecutive rows from the middle one on whose offsets determine the box: most of them
+# are not on its border.
 SAMPLED = 8
 
 
 def stencil_of(A: SparseOperator) -> StoredStencil | None:
-    """Return the same operator as a stencil on a box, to the last bit; None where the matrix is none, or not stored in float64.
+    """Return the operator as a stencil on a box, with the same bits, or None.
 
-    It takes one pass over the entries, and a second one where they have to be kept because they are
-    not the same everywhere.
+    None where the matrix is no stencil, or is not stored in float64. It takes one pass over the
+    entries, and a second one if they differ from row to row and must be stored.
     """
     if A.dtype is not wp.float64:
         return None
@@ -53,7 +56,7 @@ def _offsets(rows: CompressedRows) -> np.ndarray:
 
 
 def _boxes(rows: CompressedRows) -> Iterator[tuple[int, int, int]]:
-    """Yield the boxes (nz, ny, nx) that the offsets allow."""
+    """Yield the boxes (nz, ny, nx) that are compatible with the offsets."""
     n, found = rows.indptr.size - 1, _offsets(rows)
     far = np.unique(np.abs(found[np.abs(found) > 1]))
     if len(far) == 0 or len(found) > 27:
@@ -72,6 +75,12 @@ def _boxes(rows: CompressedRows) -> Iterator[tuple[int, int, int]]:
 def _as_stencil(
     A: SparseOperator, rows: CompressedRows, shape: tuple[int, int, int]
 ) -> StoredStencil | None:
+    """Return the operator as a stencil on a box of a given shape, or None.
+
+    The row in the middle of the box defines the expected entries. A pass over all rows tests the
+    pattern, and whether entries differ from those. Of symmetric matrices half of the neighbors are
+    stored. If the diagonal is a small multiple of one weight, it is stored as a byte.
+    """
     nz, ny, nx = shape
     if ny < LEAST or (nz > 1 and nz < LEAST):
         return None
@@ -92,7 +101,7 @@ def _as_stencil(
         if column - row not in offsets:
             return None
         middle[offsets[column - row]] += value
-    kept = full & ((1 << 13) - 1) if A.symmetric else full & ~(1 << 13)
+    stored_offsets = full & ((1 << 13) - 1) if A.symmetric else full & ~(1 << 13)
     where, d = Rows.of(padding, device), padding.zeros(wp.float64, device)
     sums, matrix, on_device = (
         Sums(where, 4),
@@ -101,6 +110,7 @@ def _as_stencil(
     )
 
     def recognize(block: wp.array[Any] | None) -> np.ndarray:
+        """Compare all rows with the middle one, and copy entries to `block` if given."""
         return sums.of(
             RECOGNIZE,
             matrix,
@@ -110,7 +120,7 @@ def _as_stencil(
             ny=ny,
             nz=nz,
             full=full,
-            kept=kept,
+            kept=stored_offsets,
             size=padding.size,
             weights=block,
         )
@@ -118,7 +128,7 @@ def _as_stencil(
     wrong, centers, differ, positive = recognize(None)
     if wrong:
         return None
-    places = [o for o in range(27) if kept >> o & 1]
+    places = [o for o in range(27) if stored_offsets >> o & 1]
     neighbors = tuple((o % 3 - 1, o // 3 % 3 - 1, o // 9 - 1) for o in places)
     weights: tuple[Any, ...] = tuple(-middle[o] for o in places)
     if differ:
@@ -135,7 +145,7 @@ def _as_stencil(
     cells = np.full(shape if nz > 1 else shape[1:], FLUID, dtype=np.int8)
     pattern: Pattern | None = Pattern(neighbors, A.symmetric, "arrays" if differ else "numbers")
     faces = 1.0  # of a cell
-    if A.symmetric and not positive and set(neighbors) <= set(LOWER):  # as of a GridPoisson
+    if A.symmetric and not positive and set(neighbors) <= set(LOWER):  # as for a GridPoisson
         none, along = (
             padding.zeros(wp.float64, device) if differ else 0.0,
             dict(zip(neighbors, weights, strict=True)),

@@ -1,10 +1,13 @@
-"""The stencil on a padded grid: arrays, sizes and launches. An operator and each level of its multigrid are one of these.
+"""Stencil on a padded grid: arrays, sizes and launches.
 
-(A x)_i = d_i x_i - sum of w_f x_neighbor, for d_i != 0; rows with d_i = 0 are no unknowns and give
-0. Fields are 0 in cells that are no unknowns, so a neighbor needs no test. Forms of one source: of
-7 points `uniform`, with a weight an axis (and d may be a count of open faces in one byte, d_scale
-its unit), or `variable`, with an array of lower faces an axis; or compact ones, of up to 27 points,
-symmetric or not, whose `Pattern` says what neighbors there are.
+An operator and each level of its multigrid are one of these. (A x)_i = d_i x_i - sum of w_f
+x_neighbor, for d_i != 0; rows with d_i = 0 are no unknowns and give 0. Fields are 0 in cells that
+are no unknowns, so a neighbor needs no test.
+
+All forms share one source. Stencils of 5 or 7 points are `uniform`, with one weight for each axis,
+or `variable`, with an array of lower faces for each axis; d of a uniform one may be a count of open
+faces in one byte, in units of d_scale. Compact stencils have up to 27 points, symmetric or not, and
+their `Pattern` defines the neighbors.
 """
 
 from __future__ import annotations
@@ -30,14 +33,18 @@ KERNELS = KernelFile(Path(__file__).parent / "headers/stencil_operator.h")
 PRODUCT = KERNELS["stencil.product"]
 RELAX = KERNELS["stencil.relax"]
 WRAP = KERNELS["stencil.wrap"]
-# spans begin at multiples of this, so that rows stay whole vectors and aggregates whole
+# Spans begin at multiples of this, so that rows consist of whole vectors and aggregates are not
+# cut.
 SPAN_CELLS = wp.constant(16)
 
 
 @no_type_check
 @wp.func
 def whole_span(first: int, last: int, n: int):
-    """A span of whole vectors around first ... last of n cells; an empty one where there are none."""
+    """Return a span of whole vectors around first ... last of n cells.
+
+    Empty if there are no cells.
+    """
     begin = first // SPAN_CELLS * SPAN_CELLS
     end = last
     if last <= first:
@@ -51,7 +58,10 @@ def whole_span(first: int, last: int, n: int):
 def coarsen_spans_kernel(
     fine: wp.array2d(dtype=wp.vec2i), factors: wp.vec3i, n: int, spans: wp.array2d(dtype=wp.vec2i)
 ):
-    """A coarse row's span covers those of its rows; factors = cells an aggregate along z, y, x."""
+    """Compute the span of a coarse row: it covers those of its fine rows.
+
+    factors = cells of an aggregate along z, y, x.
+    """
     k, j = wp.tid()
     first = int(n)
     last = int(0)
@@ -67,12 +77,12 @@ def coarsen_spans_kernel(
 
 
 class Ghosts(Protocol):
-    """Fills the ghost cells that stand for cells stored elsewhere, by another process.
+    """Fills the ghost cells that represent cells of another process.
 
     Attributes:
-        whole: cells (nz, ny, nx) of the grid that this process has a box of.
-        cuts: sides with ghost cells that others have: the axis, 0, 1, 2 for x, y, z, and 0 for the
-            lower, 1 for the upper side.
+        whole: cells (nz, ny, nx) of the grid of which this process has a box.
+        cuts: sides with ghost cells of other processes: the axis, 0, 1, 2 for x, y, z, and 0 for
+            the lower, 1 for the upper side.
         gathering: collects fields of all processes' boxes on every process.
     """
 
@@ -84,13 +94,16 @@ class Ghosts(Protocol):
     def gathering(self) -> Any: ...  # noqa: D102
 
     def fill(self, field: wp.array[Any]) -> None:
-        """Fill those of a stored field."""
+        """Fill the ghost cells of a stored field."""
 
     def filling(self, field: wp.array[Any]) -> Task:
-        """Return what does, now or among the launches of a program."""
+        """Return the task that fills ghost cells, now or in a program."""
 
     def coarser(self, factors: tuple[int, int, int]) -> Ghosts | None:
-        """Return what fills those of aggregates of so many cells along x, y, z; None if aggregates would be cut."""
+        """Return the ghost cells of aggregates, None if aggregates would be cut.
+
+        `factors` are cells of an aggregate along x, y, z.
+        """
 
     def join_components(
         self, number: np.ndarray, held: np.ndarray, faces: Sequence[np.ndarray | float]
@@ -98,23 +111,22 @@ class Ghosts(Protocol):
         """Join components of this process's cells with those of others; collective.
 
         Args:
-            number: of the component of each stored cell, flat, from 0; -1: none, or something holds
-                it.
-            held: which stored cells belong to components that something holds, bool.
+            number: of the component of each stored cell, flat, from 0; -1: none, or it is grounded.
+            held: which stored cells belong to grounded components, bool.
             faces: coefficients of the lower faces along x, y, z, stored or one number; 0: closed.
 
         Returns:
-            The numbers of the joined components that nothing holds on any process, int32, flat,
-            from 0, -1 elsewhere; None: there are none.
+            The numbers of the joined components that are not grounded on any process, int32, flat,
+            from 0, -1 elsewhere; None if there are none.
         """
 
 
 class CellDecomposition(Protocol):
-    """Boxes of cells, of which each process has one: `warp_lcp.distributed.Decomposition`.
+    """Boxes of cells, one for each process: `warp_lcp.distributed.Decomposition`.
 
     Attributes:
         ghosts: fills ghost cells; None: there is one process.
-        across: the other processes; None: there are none.
+        across: communicator; None if serial.
     """
 
     @property
@@ -123,35 +135,37 @@ class CellDecomposition(Protocol):
     def across(self) -> Across | None: ...  # noqa: D102
 
     def together(self) -> AbstractContextManager[Any]:
-        """Return a block in which an exception of one process is raised on all."""
+        """Return a block that raises an exception of one process on all processes."""
 
     def check_operator(
         self, shape: tuple[int, ...], periodic: Sequence[bool], coefficients: Mapping[str, Any]
     ) -> None:
-        """Refuse an operator that does not fit the box, or is not of the same kind on all processes; collective."""
+        """Refuse an operator that does not fit the box; collective.
+
+        It must be of the same kind on all processes.
+        """
 
 
 @dataclass
 class PaddedStencil:
-    """A x = unit d x - sum of w x_neighbor on the cells with d != 0.
+    """Stencil A x = unit d x - sum of w x_neighbor on the cells with d != 0.
 
     Args:
         padding: counts of cells and of stored cells.
         d: diagonal in units of `unit`, flat stored field; 0 where there is no unknown. A count of
             faces (wp.uint8) or a float.
         weights: weight of the lower face of each cell along x, y, z (flat stored fields), or None
-            for one weight an axis. Of a compact stencil the weights of the pattern's neighbors, in
-            its order, if it has arrays.
-        coefficients: the weights along x, y, z where `weights` is None; of a compact stencil those
+            for one weight for each axis. For a compact stencil the weights of the pattern's
+            neighbors, in its order, if it has arrays.
+        coefficients: the weights along x, y, z where `weights` is None; for a compact stencil those
             of the pattern, if they are numbers.
         unit: value of one unit of d.
         periodic: whether x, y, z wrap around; ghost cells are then filled before each product.
-        spans: first and one past the last cell of each row that may hold unknowns, shape (nz, ny),
+        spans: first and one past the last cell of each row that may have unknowns, shape (nz, ny),
             wp.vec2i; fields must be 0 outside. None: whole rows.
-        strength: mean coefficient of all faces along x, y, z; None: that of the weights as they
-            are.
-        ghosts: fills ghost cells where another process has the neighbors, before each product;
-            None: nobody has.
+        strength: mean coefficient of all faces along x, y, z; None: that of the current weights.
+        ghosts: fills ghost cells where another process has the neighbors, before each product; None
+            if serial.
         pattern: of a compact stencil; None: 7 points.
     """
 
@@ -167,17 +181,17 @@ class PaddedStencil:
     pattern: Pattern | None = None
 
     def __post_init__(self) -> None:
-        """Take the device of the diagonal."""
+        """Set the device of the diagonal."""
         self.device = self.d.device
 
     @cached_property
     def rows(self) -> Rows:
-        """The rows that passes visit."""
+        """The rows that kernels process."""
         return Rows.of(self.padding, self.device, self.spans)
 
     @cached_property
     def struct(self) -> Any:
-        """What passes take of it."""
+        """Struct of the stencil for kernels."""
         variable, d, w = self.storage
         fields, names = (
             (("wx", "wy", "wz"), ("cx", "cy", "cz"))
@@ -192,7 +206,10 @@ class PaddedStencil:
 
     @property
     def storage(self) -> tuple[bool, Any, Any]:
-        """Form and types that choose the kernels: variable weights?, type of d, type of the weights."""
+        """Form and types that select the kernels.
+
+        Whether weights are variable, the type of d, the type of the weights.
+        """
         return (
             self.weights is not None,
             self.d.dtype,
@@ -201,7 +218,10 @@ class PaddedStencil:
 
     @property
     def mean_weights(self) -> list[float]:
-        """The mean weight of the faces along x, y and z; of all faces where the operator knows it, whatever cells there are now."""
+        """The mean weight of the faces along x, y and z.
+
+        Of all faces if `strength` is known, independent of the current cells.
+        """
         if self.strength is not None:
             return list(self.strength)
         if self.weights is None:
@@ -211,17 +231,20 @@ class PaddedStencil:
         return [s / n for s, n in zip(sums, faces, strict=True)]
 
     def with_diagonal(self, d: wp.array[Any]) -> PaddedStencil:
-        """Return the stencil with another diagonal (a mask makes it 0) and the same weights."""
+        """Return the stencil with another diagonal and the same weights.
+
+        A mask makes the diagonal 0.
+        """
         unit = self.unit if d.dtype is self.d.dtype else 1.0
         return replace(self, d=d, unit=unit)
 
     def wrap(self, x: wp.array[Any], *, launch: Launch = launch_now) -> None:
-        """Fill x's ghost cells along periodic axes, and those that stand for cells of others."""
+        """Fill x's ghost cells along periodic axes, and those of other ranks."""
         for filling in self.fillings(x):
             filling.launch(launch)
 
     def fillings(self, x: wp.array[Any]) -> list[Bound | Task]:
-        """Return what `wrap` launches."""
+        """Return the launches of `wrap`."""
         strides, counts = (1, self.padding.row, self.padding.plane), self.padding.counts[::-1]
         axes = [axis for axis, periodic in enumerate(self.periodic) if periodic]
         made: list[Bound | Task] = [
@@ -231,7 +254,7 @@ class PaddedStencil:
 
     @cached_property
     def _edges(self) -> list[Rows]:
-        """The ghost cells before the first of each axis."""
+        """The ghost cells before the first cell of each axis."""
         return [Rows.edge(self.padding, self.device, axis) for axis in range(3)]
 
     def product(
@@ -242,7 +265,10 @@ class PaddedStencil:
         *,
         launch: Launch = launch_now,
     ) -> None:
-        """out = A x, or A x + plus. All of one float type; rows that are no unknowns give 0 (or plus)."""
+        """Compute out = A x, or A x + plus.
+
+        All are of one float type; rows that are no unknowns give 0 (or plus).
+        """
         self.wrap(x, launch=launch)
         PRODUCT.bind(self.rows, stencil=self, x=x, b=plus, y=out).launch(launch)
 
@@ -256,9 +282,10 @@ class PaddedStencil:
         *,
         forward: bool = True,
     ) -> None:
-        """Sweep x once, red cells then black ones (forward) or black then red, each cell projected onto its bounds.
+        """Sweep x once, each cell projected onto its bounds.
 
-        Where cells touch diagonally, there are four colors, or eight in 3-D.
+        Red cells then black ones (forward) or black then red. Where cells touch diagonally, there
+        are four colors, or eight in 3-D.
         """
         colors = 2 if self.pattern is None else 1 << sum(n > 1 for n in self.padding.counts)
         for color in range(colors) if forward else reversed(range(colors)):

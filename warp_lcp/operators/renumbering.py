@@ -1,8 +1,8 @@
-"""Another numbering of a sparse matrix's unknowns, in which neighbors lie together in memory.
+"""Renumbering of a sparse matrix's unknowns for memory locality.
 
-Where unknowns are numbered at random, each entry of a product reads x from another line of memory:
-at a million unknowns a product takes three to five times as long, and a solve three times, as in an
-order that follows the matrix.
+If unknowns are numbered at random, each entry of a product reads x from another line of memory. At
+a million unknowns a product then takes three to five times as long, and a solve three times, as in
+an order that follows the matrix.
 """
 
 from __future__ import annotations
@@ -14,19 +14,22 @@ import numpy as np
 import scipy.sparse
 import scipy.sparse.csgraph
 
-SMALLEST = 1 << 16  # unknowns from which fields do not fit a core's own caches
-# mean distance of entries from the diagonal, as a share of n, from which an order pays; a random
-# one has a third
+SMALLEST = 1 << 16  # number of unknowns from which fields exceed a core's own caches
+# Mean distance of entries from the diagonal, as a share of n, above which renumbering is faster;
+# the share is one third for a random numbering.
 SCATTERED = 0.05
-# the largest share of that distance that an order may leave: graphs that are small worlds have no
-# good one
+# Largest share of that distance that an order may leave: small-world graphs have no good order.
 GAIN = 0.5
-SAMPLE = 1 << 16  # entries that tell the mean distance
+SAMPLE = 1 << 16  # number of entries in the sample of the mean distance
 
 
 @dataclass(frozen=True)
 class Renumbering:
-    """Unknown i of the new numbering is unknown `order[i]` of the old one; `place` is the inverse, both of shape (n,)."""
+    """A renumbering of unknowns.
+
+    Unknown i of the new numbering is unknown `order[i]` of the old one; `place` is the inverse,
+    both of shape (n,).
+    """
 
     order: np.ndarray
     place: np.ndarray
@@ -42,19 +45,21 @@ class Renumbering:
 
 
 def renumbering(host: scipy.sparse.csr_array, block: int = 1) -> Renumbering | None:
-    """Return the reverse Cuthill-McKee order (SciPy), None where the numbering is a good one or that order is no better.
+    """Return the reverse Cuthill-McKee order (SciPy), or None.
+
+    None where the numbering is a good one or that order is no better.
 
     Args:
         host: the matrix, shape (n, n), columns sorted.
-        block: unknowns that stay together, as the displacements of a node do; divides n.
+        block: unknowns that stay together, such as the displacements of a node; divides n.
     """
     n = host.shape[0]
     before = _mean_distance(host)
     if n < SMALLEST or before < SCATTERED * n:
         return None
     graph: Any = host if block == 1 else _blocks(host, block)
-    # breadth first by rows alone: on an unsymmetric pattern still an order, without the price of A
-    # + A'
+    # Breadth first by rows alone: on an unsymmetric pattern this is still an order, without the
+    # cost of A + A'.
     nodes = scipy.sparse.csgraph.reverse_cuthill_mckee(
         scipy.sparse.csr_matrix(graph), symmetric_mode=True
     )

@@ -1,4 +1,7 @@
-"""A problem whose matrix is stored in another form: as a grid's stencil, sparse, dense, or with its unknowns in another order."""
+"""Problems whose matrix is stored in another form.
+
+As a grid's stencil, sparse, dense, or with its unknowns in another order.
+"""
 
 from __future__ import annotations
 
@@ -18,18 +21,18 @@ from warp_lcp.problem.protocol import version_of
 from warp_lcp.problem.result import SolveResult
 from warp_lcp.rows.fields import Array
 
-MOST_DENSE = 600  # unknowns up to which LAPACK factors a dense matrix in a hundredth of a second
-LEAST_GRID = 2000  # unknowns from which it pays to look whether a matrix is a grid's
+MOST_DENSE = 600  # up to so many unknowns LAPACK factors a dense matrix in 10 ms
+LEAST_GRID = 2000  # number of unknowns from which a matrix is tested for being a grid's
 
 
 @dataclass(frozen=True)
 class RestatedProblem:
-    """A problem in another form; its solutions are those of the given one.
+    """A problem in another form, with the same solutions.
 
     Args:
-        given: the problem as it was given.
+        given: the original problem.
         problem: the same in another form.
-        grid: shape of the grid that the matrix is a stencil of; None: it is no grid's.
+        grid: shape of the grid on which the matrix is a stencil; None: no grid.
         order: unknown i of `problem` is unknown order[i] of `given`, shape (n,); None: they are in
             the same order.
         place: the inverse, shape (n,).
@@ -43,14 +46,14 @@ class RestatedProblem:
 
     @property
     def is_given(self) -> bool:
-        """Whether the problem is as it was given."""
+        """Whether the problem has its original form."""
         return self.problem is self.given
 
     def start(self, x0: Array | None) -> Array | None:
         """Return a guess for the problem in this form.
 
         Args:
-            x0: a guess for the given problem; None: there is none.
+            x0: a guess for the given problem, or None.
 
         Raises:
             ValueError: it has a wrong shape.
@@ -61,13 +64,13 @@ class RestatedProblem:
         return host.reshape(self.grid) if self.order is None else host[self.order]
 
     def field(self, x: wp.array[Any]) -> wp.array[Any]:
-        """Return a field of the problem in this form as one of the given problem."""
+        """Convert a field of the problem in this form to the original problem's form."""
         if self.place is not None:
             return wp.array(x.numpy()[self.place], dtype=x.dtype, device=self.given.device)
         return x if self.grid is None else x.flatten()
 
     def result(self, found: SolveResult) -> SolveResult:
-        """Return the result for the given problem."""
+        """Convert a result to the original problem."""
         if self.is_given:
             return found
         grid = found.grid if self.grid is None else self.grid
@@ -106,7 +109,10 @@ def as_grid(problem: LCP) -> RestatedProblem | None:
 
 
 def as_sparse(problem: LCP) -> RestatedProblem | None:
-    """Return a problem with its dense matrix stored as a sparse one; None if it has no dense matrix."""
+    """Return a problem with its dense matrix stored as a sparse one.
+
+    None if it has no dense matrix.
+    """
     A = problem.A
     if not isinstance(A, DenseOperator):
         return None
@@ -117,7 +123,10 @@ def as_sparse(problem: LCP) -> RestatedProblem | None:
 
 
 def as_dense(problem: LCP) -> RestatedProblem | None:
-    """Return a problem of at most 600 unknowns with its sparse matrix stored as a dense one; None if it has no such matrix."""
+    """Return a problem with its sparse matrix stored as a dense one.
+
+    None if it has more than 600 unknowns or no sparse matrix.
+    """
     A = problem.A
     if (
         not isinstance(A, SparseOperator)
@@ -131,7 +140,10 @@ def as_dense(problem: LCP) -> RestatedProblem | None:
 
 
 def renumbered(problem: LCP) -> RestatedProblem | None:
-    """Return a sparse problem in the order of Cuthill and McKee; None where the given order is as good."""
+    """Return a sparse problem in Cuthill-McKee order.
+
+    None where the given order is as good.
+    """
     A = problem.A
     if (
         not isinstance(A, SparseOperator)

@@ -39,7 +39,11 @@ INDICES = wp.array(dtype=wp.int32)
 @no_type_check
 @forward_kernel(module="warp_lcp.sparse.color")
 def color_kernel(ptr: INDICES, col: INDICES, taken: INDICES, color: INDICES, n: int):
-    """Greedy coloring in row order by one thread: the least color that no neighbor has. `taken[c]` is the last row that saw c, plus one."""
+    """Color rows greedily in row order, by one thread.
+
+    Each row gets the least color that no neighbor has. `taken[c]` is the last row that has seen
+    color c, plus one.
+    """
     for i in range(n):
         for k in range(ptr[i], ptr[i + 1]):
             j = col[k]
@@ -55,7 +59,7 @@ KERNELS = KernelFile(Path(__file__).parent / "headers/sparse.h")
 PRODUCT = KERNELS["sparse.product"]
 RELAX = KERNELS["sparse.relax"]
 SURVEY = KERNELS["sparse.survey"]
-# sizes of nodes' blocks, and the most entries that these may have in units of A's
+# Sizes of nodes' blocks, and the largest number of entries of the blocks in units of A's.
 BLOCKS, FILL = (6, 5, 4, 3, 2), 1.2
 GATHER = KERNELS["sparse.gather"]
 
@@ -93,7 +97,7 @@ class SparseOperator(Pickled):
     """Sparse square matrix as an operator.
 
     Duplicate entries are summed and columns sorted, as `matrix.tocsr().sum_duplicates()` does;
-    explicit zeros are kept, so that `update` may fill them.
+    explicit zeros are kept, so that `update` may replace them.
 
     Args:
         matrix: A, any scipy.sparse matrix or array of shape (n, n), real and finite. Rows may be
@@ -101,20 +105,20 @@ class SparseOperator(Pickled):
         device: Warp device; the default device if None.
         dtype: storage of A's entries, wp.float64 or wp.float32.
         near_null_space: fields that A nearly maps to 0, shape (n, k), k <= 12: the rigid body
-            motions of elasticity, three in 2-D, six in 3-D, which coarse levels then have too.
-            None: the constants. Where unknowns come node by node (all of a node's displacements in
-            turn) whole nodes are aggregated.
+            motions of elasticity, three in 2-D, six in 3-D, which coarse levels then represent too.
+            None: the constants. Where unknowns are ordered node by node (all of a node's
+            displacements in turn) whole nodes are aggregated.
 
     Attributes:
-        block: unknowns of a node, 1 to 6: A consists of full blocks of as many rows and columns;
-            looked for if there is a near_null_space.
+        block: number of unknowns of a node, 1 to 6: A consists of full blocks of as many rows and
+            columns; determined if there is a near_null_space.
         indptr: where each row begins, shape (n + 1,), wp.int32.
         indices: column of each entry, shape (nnz,), wp.int32, ascending in each row.
         values: the entries, shape (nnz,), `dtype`.
         symmetric: whether A equals its transpose, to rounding.
         row_sizes: the largest magnitude of each row, shape (n,), wp.float64; None where no row is
             empty.
-        version: how often the entries have been taken.
+        version: number of times that the entries have been set.
 
     Raises:
         ValueError: the matrix is not square, empty, complex, not finite, or has more than 2^31 - 1
@@ -122,8 +126,10 @@ class SparseOperator(Pickled):
 
     Example:
         >>> import scipy.sparse, warp as wp, warp_lcp as wl
-        >>> A = wl.SparseOperator(scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(3, 3)), device="cpu")
-        >>> print(A.apply(wp.array([1.0, 2.0, 4.0], dtype=wp.float64, device="cpu")).numpy(), A.symmetric)
+        >>> T = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(3, 3))
+        >>> A = wl.SparseOperator(T, device="cpu")
+        >>> x = wp.array([1.0, 2.0, 4.0], dtype=wp.float64, device="cpu")
+        >>> print(A.apply(x).numpy(), A.symmetric)
         [ 0. -1.  6.] True
     """
 
@@ -158,7 +164,7 @@ class SparseOperator(Pickled):
         self._take(host)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the matrix as it is now."""
+        """Pickle the current matrix."""
         return made_again(
             SparseOperator,
             self.matrix(),
@@ -186,7 +192,7 @@ class SparseOperator(Pickled):
         return int(np.abs(ends - rows).max(initial=0))
 
     def matrix(self) -> scipy.sparse.csr_array:
-        """Return A as it is now, on the host, in float64."""
+        """Return the current A on the host, in float64."""
         return self._matrix_of(self.values.numpy())
 
     def update(self, values: Any) -> None:
@@ -271,7 +277,7 @@ class SparseOperator(Pickled):
         return self._diagonal
 
     def rows(self) -> CompressedRows:
-        """Return the compressed rows, the operator's own memory."""
+        """Return the compressed rows, in the operator's own memory."""
         return CompressedRows(self.indptr, self.indices, self.values)
 
     def scale(self) -> np.ndarray:
@@ -289,16 +295,19 @@ class SparseOperator(Pickled):
 
         None where its own numbering is as good, and on CUDA.
         """
-        found = self._numbering
-        if found is None:
+        numbering = self._numbering
+        if numbering is None:
             return None
         if self._turned is None or self._turned_from != self.version:
-            B = None if self.near_null_space is None else self.near_null_space[found.order]
+            B = None if self.near_null_space is None else self.near_null_space[numbering.order]
             self._turned = SparseOperator(
-                found.matrix(self.matrix()), device=self.device, dtype=self.dtype, near_null_space=B
+                numbering.matrix(self.matrix()),
+                device=self.device,
+                dtype=self.dtype,
+                near_null_space=B,
             )
             self._turned._rounding, self._turned_from = self._rounding, self.version
-        return found, self._turned
+        return numbering, self._turned
 
     @cached_property
     def _numbering(self) -> Renumbering | None:
@@ -368,7 +377,7 @@ class SparseOperator(Pickled):
             upper: field like x.
             omega: relaxation factor.
             forward: rows, or colors, in ascending order; else descending.
-            colored: color by color, all rows of a color at once, instead of row by row by one
+            colored: color by color, all rows of a color in parallel, instead of row by row by one
                 thread; on CUDA if None.
             launch: launches or records.
         """
@@ -399,9 +408,8 @@ class SparseOperator(Pickled):
     def colors(self) -> tuple[wp.array[Any], list[int]]:
         """Rows grouped by color, and the start of each color (and the end).
 
-        On the device. No row has an entry in another row of its color.
-
-        Greedy in row order, so the same on every run: red-black on the 5- and the 7-point stencil.
+        On the device. No row has an entry in another row of its color. The coloring is greedy in
+        row order, so the same on every run: red-black on the 5- and the 7-point stencil.
         """
         color = self.coloring()
         counts = np.bincount(color)
@@ -413,7 +421,7 @@ class SparseOperator(Pickled):
         return greedy_colors(_ones(self._indptr, self._indices))
 
     def _take(self, host: scipy.sparse.csr_array) -> None:
-        """Derive what follows from the entries."""
+        """Update the data that depend on the entries."""
         largest, diagonal, same = _survey(host)
         self.symmetric = same or _is_symmetric(host, largest)
         check_kept(largest, self.dtype, "matrix, the largest entries of its rows")
@@ -436,7 +444,7 @@ class SparseOperator(Pickled):
 
     @cached_property
     def _transpose(self) -> tuple[wp.array[Any], wp.array[Any], wp.array[Any]]:
-        """Rows and columns of A', and which of A's entries each of its entries is."""
+        """Rows and columns of A', and the index in A of each of its entries."""
         numbered = scipy.sparse.csr_array(
             (np.arange(self.nnz), self._indices, self._indptr), shape=self.shape * 2
         )
@@ -462,7 +470,10 @@ class SparseOperator(Pickled):
 
 
 def greedy_colors(pattern: scipy.sparse.csr_array) -> np.ndarray:
-    """Return a color of each row, from 0: rows of one color have no entries in each other's columns."""
+    """Return a color of each row, from 0.
+
+    Rows of one color have no entries in each other's columns.
+    """
     both = (pattern + pattern.T).tocsr()
     inputs = [wp.array(v, dtype=wp.int32, device="cpu") for v in (both.indptr, both.indices)]
     taken = wp.zeros(int(np.diff(both.indptr).max(initial=0)) + 2, dtype=wp.int32, device="cpu")
@@ -491,7 +502,10 @@ def _checked(matrix: Any) -> scipy.sparse.csr_array:
 
 
 def _check_indices(matrix: Any) -> None:
-    """Refuse indices out of range, which SciPy's conversions and our kernels would follow to memory of others."""
+    """Refuse indices out of range.
+
+    SciPy's conversions and the kernels would access other memory with them.
+    """
     try:
         if matrix.format in ("csr", "csc", "bsr"):
             matrix.check_format(full_check=True)
@@ -532,7 +546,10 @@ def _ones(indptr: np.ndarray, indices: np.ndarray) -> scipy.sparse.csr_array:
 
 
 def _survey(host: scipy.sparse.csr_array) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Return the largest magnitude of each row, the diagonal, and whether all entries equal those across it."""
+    """Return the largest magnitude of each row, the diagonal, and exact symmetry.
+
+    The last is whether all entries equal those across the diagonal.
+    """
     parts = (host.indptr, wp.int32), (host.indices, wp.int32), (host.data, wp.float64)
     ptr, col, a = (wp.array(v, dtype=t, device="cpu", copy=False) for v, t in parts)
     largest, diagonal = (zeros(host.shape[0], wp.float64, wp.get_device("cpu")) for _ in range(2))
@@ -543,7 +560,11 @@ def _survey(host: scipy.sparse.csr_array) -> tuple[np.ndarray, np.ndarray, bool]
 
 
 def _is_symmetric(host: scipy.sparse.csr_array, largest: np.ndarray) -> bool:
-    """Return whether |a_ij - a_ji| is rounding of the smaller one of the largest entries of rows i and j, for all i, j."""
+    """Return whether A is symmetric up to rounding.
+
+    |a_ij - a_ji| must be rounding of the smaller one of the largest entries of rows i and j, for
+    all i, j.
+    """
     turned = host.T.tocsr()
     if np.array_equal(turned.indptr, host.indptr) and np.array_equal(turned.indices, host.indices):
         largest_here = np.repeat(largest, np.diff(host.indptr))

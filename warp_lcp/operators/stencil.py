@@ -1,4 +1,7 @@
-"""Compact stencils of a user's own on a grid of cells, matrix-free: up to 9 points in 2-D, 27 in 3-D, symmetric or not."""
+"""User-defined compact stencils on a grid of cells, matrix-free.
+
+Up to 9 points in 2-D, 27 in 3-D, symmetric or not.
+"""
 
 from __future__ import annotations
 
@@ -28,10 +31,10 @@ KERNELS = KernelFile(Path(__file__).parent / "headers/stencil_operator.h")
 DIAGONAL = KERNELS["stencil.diagonal"]
 TRANSPOSED = KERNELS["stencil.transposed"]
 GRADIENT = KERNELS["stencil.gradient"]
-# unknowns of a component whose null vectors are had by sparse factors, in a second or two
+# Unknowns of a component whose null vectors are computed by sparse factors, in a second or two.
 MOST_IN_PLANE, MOST_IN_SPACE = 1 << 17, 1 << 14
 CENTER = (0, 0, 0)
-# all neighbors in 2-D
+# All neighbors in 2-D.
 AROUND = Pattern(
     tuple((x, y, 0) for y in (-1, 0, 1) for x in (-1, 0, 1) if x or y),
     symmetric=False,
@@ -45,16 +48,16 @@ __all__ = ["Stencil"]
 class Stencil(GridOperator):
     """Operator of a compact stencil on the FLUID cells of a grid.
 
-    Finite differences, finite volumes or finite elements of your own.
+    For your own finite differences, finite volumes or finite elements.
 
     (A x)_i = sum over offsets o of a_o(i) x_(i + o) + shift_i x_i, with x = 0 in AIR, and x_(i + o)
     = x_i where i + o is SOLID (a closed side: no flux). With other values in AIR cells, see
-    `boundary_term`. Nothing is assembled: numbers are numbers in the kernels, Warp functions are
+    `boundary_term`. Nothing is assembled: numbers are constants in the kernels, Warp functions are
     evaluated where a row is needed, arrays are read.
 
     Args:
         cells: integers AIR = 0, FLUID = 1, SOLID = 2, shape (nz, ny, nx) or (ny, nx); numpy or
-            wp.array. Unknowns live on FLUID cells, fields have the shape of `cells`.
+            wp.array. Unknowns are on FLUID cells, fields have the shape of `cells`.
         coefficients: a_o by offset, (dz, dy, dx) or (dy, dx), each -1, 0 or 1, the center included;
             absent ones are 0. Each is a number, an array of the shape of `cells`, or a Warp
             function of the cell's indices, (k, j, i) or (j, i), that returns a float; functions and
@@ -63,17 +66,17 @@ class Stencil(GridOperator):
         shift: None, a number or an array of the shape of `cells`, >= 0.
         periodic: whether x, y, z wrap around; the cells of an axis of one cell are then their own
             neighbors.
-        outside: kind of cells outside the array along axes that are not periodic: SOLID, as for
+        outside: type of the cells outside the array along axes that are not periodic: SOLID, as for
             `wl.GridPoisson`, or AIR.
         device: Warp device; that of `cells` or the default device if None.
         dtype: storage of coefficients, wp.float32 or wp.float64. In float32 coefficients are
-            rounded, so that the problem solved is another one by about 1e-7 of the diagonal, and
-            tolerances below the rounding end with FLOOR.
+            rounded, which changes the problem by about 1e-7 of the diagonal; tolerances below the
+            rounding end with FLOOR.
 
     Attributes:
         symmetric: whether a_o(i) = a_-o(i + o) between all unknowns, to the last bit; coefficients
-            toward SOLID, AIR and what lies outside do not matter. Once other cells in place have
-            made A unsymmetric, it stays False.
+            toward SOLID, AIR and cells outside do not matter. Once other cells in place have made A
+            unsymmetric, it stays False.
         monotone: whether all a_o but the center's are <= 0, as in an M-matrix.
 
     Raises:
@@ -82,8 +85,10 @@ class Stencil(GridOperator):
 
     Example:
         >>> import numpy as np, warp_lcp as wl
-        >>> A = wl.Stencil(np.full((1, 3), wl.FLUID), {(0, 0): 3.0, (0, -1): -2.0, (0, 1): -1.0}, outside=wl.AIR, device="cpu")
-        >>> print(A.apply(wp.array([[1.0, 1.0, 1.0]], dtype=wp.float64, device="cpu")).numpy(), A.symmetric)
+        >>> coefficients = {(0, 0): 3.0, (0, -1): -2.0, (0, 1): -1.0}
+        >>> A = wl.Stencil(np.full((1, 3), wl.FLUID), coefficients, outside=wl.AIR, device="cpu")
+        >>> x = wp.array([[1.0, 1.0, 1.0]], dtype=wp.float64, device="cpu")
+        >>> print(A.apply(x).numpy(), A.symmetric)
         [[2. 0. 1.]] False
     """
 
@@ -108,17 +113,23 @@ class Stencil(GridOperator):
         )
 
     def _take_coefficients(self, cells: np.ndarray, *, coefficients: Any, shift: Any) -> None:
-        self._given = given = _by_offset(coefficients, cells.ndim)
+        """Check the coefficients, and store them in the form that kernels use.
+
+        The forms are numbers, Warp functions, or arrays. Of symmetric coefficients half of the
+        neighbors are stored. The weights of the kernels are -a_o, because A x = d x - sum of
+        weights times neighbors.
+        """
+        self._given = by_offset = _by_offset(coefficients, cells.ndim)
         self.shift, self._shift_given = (
             self._stored_shift(shift),
             None if shift is None else tuple(np.shape(shift)),
         )
         functions = {
-            o: _of_three(f, cells.ndim) for o, f in given.items() if isinstance(f, wp.Function)
+            o: _of_three(f, cells.ndim) for o, f in by_offset.items() if isinstance(f, wp.Function)
         }
         values = {
             o: real_array(f, f"coefficients[{_named(o, cells.ndim)}]")
-            for o, f in given.items()
+            for o, f in by_offset.items()
             if o not in functions
         }
         for o, f in values.items():
@@ -129,7 +140,7 @@ class Stencil(GridOperator):
                 )
             check_storable(f, self.dtype, f"coefficients[{_named(o, cells.ndim)}]")
             check_kept(f, self.dtype, f"coefficients[{_named(o, cells.ndim)}]")
-            if f.ndim:  # numbers are not stored, but added up
+            if f.ndim:  # numbers are not stored, but added
                 self._note_rounding(f)
         if functions and any(f.ndim for f in values.values()):
             raise ValueError(
@@ -140,14 +151,14 @@ class Stencil(GridOperator):
         self._around_itself = [
             a for a in range(cells.ndim) if self._wraps[a] and fluid.shape[2 - a] == 1
         ]  # its cells are their own neighbors
-        # ghost cells, and sums, are had of arrays
+        # Ghost cells, and sums, exist for arrays only.
         if functions and (any(self.periodic) or self._around_itself):
             values, functions = values | {o: self._evaluated(f) for o, f in functions.items()}, {}
         values = _folded(
             {o: f.reshape(fluid.shape) if f.ndim else f for o, f in values.items()},
             self._around_itself,
         )
-        evaluated = {o: self._evaluated(f) for o, f in functions.items()}  # to look at, not to keep
+        evaluated = {o: self._evaluated(f) for o, f in functions.items()}  # for tests, not stored
         full = {o: np.broadcast_to(f, fluid.shape) for o, f in values.items()} | evaluated
         self._center = (
             self._stored(full[CENTER])
@@ -170,12 +181,12 @@ class Stencil(GridOperator):
             else "numbers"
         )
         offsets = tuple(o for o in around if not halves or o[::-1] < CENTER)
-        kept = (
+        pattern_functions = (
             tuple(functions.get(o, float(values[o]) if o in values else 0.0) for o in offsets)
             if kind == "functions"
             else ()
         )
-        self._pattern = Pattern(offsets, halves, kind, kept)
+        self._pattern = Pattern(offsets, halves, kind, pattern_functions)
         self._weights = (
             tuple(self._stored_weight(full, o, halves) for o in offsets) if stored else None
         )
@@ -200,16 +211,16 @@ class Stencil(GridOperator):
     def coefficient_gradient(self, multiplier: wp.array[Any], x: wp.array[Any]) -> dict[str, Any]:
         """Return the derivatives by each offset's coefficients and by the shift.
 
-        mu_i x_(i + o) of each offset, under `coefficients`, and mu_i x_i of the shift; of
-        functions, too, by their values.
-
-        Where the neighbor is SOLID, that is mu_i x_i; x = 0 in AIR.
+        mu_i x_(i + o) of each offset, under `coefficients`, and mu_i x_i of the shift; for
+        functions the derivatives by their values. Where the neighbor is SOLID, it is mu_i x_i; x =
+        0 in AIR.
         """
         self._check_own()
         self.stencil.wrap(x)
         rows, cells = Rows.of(self.layout.padding, self.device), self.cells_around.flatten()
 
         def of(offset: Offset, shape: tuple[int, ...]) -> Any:
+            """Return the derivative by the coefficients of an offset, of a given shape."""
             part = self.layout.zeros(wp.float64) if shape else None
             step, row, plane = (
                 0 if axis in self._around_itself else step for axis, step in enumerate(offset)
@@ -246,26 +257,34 @@ class Stencil(GridOperator):
         Its diagonal includes the contributions of closed sides.
         """
         fluid = self.cells.numpy()[1:-1, 1:-1, 1:-1] == FLUID
-        found: dict[tuple[int, ...], Any] = {
+        transposed: dict[tuple[int, ...], Any] = {
             (0,) * len(self.shape): np.where(
                 fluid.reshape(self.shape), self.diagonal().numpy(), 1.0
             )
         }
         for offset, here in self._full().items():
-            # a_o(i) is the neighbor's coefficient for i; between FLUID cells, so that any of them
-            # may be left out
+            # a_o(i) is the neighbor's coefficient for i; between FLUID cells, so that each of them
+            # may be removed later.
             if offset != CENTER:
                 there = self._beside(np.where(fluid, here, 0.0), _opposite(offset))
-                found[_named(_opposite(offset), len(self.shape))] = np.where(
+                transposed[_named(_opposite(offset), len(self.shape))] = np.where(
                     fluid, there, 0.0
                 ).reshape(self.shape)
         cells = np.where(fluid, FLUID, AIR).reshape(self.shape)
         return Stencil(
-            cells, found, periodic=self.periodic, outside=AIR, device=self.device, dtype=self.dtype
+            cells,
+            transposed,
+            periodic=self.periodic,
+            outside=AIR,
+            device=self.device,
+            dtype=self.dtype,
         )
 
     def _pair_up(self, full: dict[Offset, np.ndarray], around: list[Offset]) -> bool:
-        """Find where a_o(i) is not a_-o(i + o), and where it is positive; return whether all sides between cells have one coefficient."""
+        """Find the sides with a_o(i) != a_-o(i + o), and those with positive coefficients.
+
+        Returns whether all sides between cells have one coefficient.
+        """
         differing = [(o, self._beside(np.ones_like(full[o], dtype=bool), o)) for o in around]
         differing = [
             (
@@ -288,7 +307,7 @@ class Stencil(GridOperator):
         return not self._differing and all(_opposite(o) in around for o in around)
 
     def _find_signs(self) -> None:
-        """Find whether A is symmetric and monotone on the FLUID cells that there are."""
+        """Find whether A is symmetric and monotone on the current FLUID cells."""
         if self._differing or self._positive is not None:
             fluid = self.cells.numpy()[1:-1, 1:-1, 1:-1] == FLUID
             self.symmetric = self.symmetric and not any(
@@ -298,7 +317,7 @@ class Stencil(GridOperator):
             self.monotone = self._positive is None or not (self._positive & fluid).any()
 
     def _beside(self, values: np.ndarray, offset: Offset) -> np.ndarray:
-        """Return what each cell's neighbor has, 0 where it is beyond the array."""
+        """Return the values of each cell's neighbor, 0 beyond the array."""
         moved: np.ndarray = np.roll(values, tuple(-step for step in offset[::-1]), (0, 1, 2))
         for axis, step in enumerate(offset[::-1]):
             if step and not self.periodic[2 - axis]:
@@ -340,14 +359,14 @@ class Stencil(GridOperator):
     ) -> wp.array[Any]:
         """Return an offset's weights as a stored field.
 
-        Ghost cells of periodic axes have those of the cells they stand for. A weight that serves
-        two cells is stored at the upper one: ghost cells beyond the array have those of the cells'
-        upper sides there.
+        Ghost cells of periodic axes have those of the cells that they represent. A weight that
+        serves two cells is stored at the upper one: ghost cells beyond the array have those of the
+        cells' upper sides there.
         """
         padded = self._wrapped(-full[offset])
         if halves:
             steps = tuple(-step for step in offset[::-1])
-            # of the cell below, seen from the upper one
+            # Of the cell below, seen from the upper one.
             lower = np.roll(self._wrapped(-full[_opposite(offset)]), steps, (0, 1, 2))
             for axis in (a for a in range(3) if offset[2 - a] and not self.periodic[2 - a]):
                 ghosts = (slice(None),) * axis + (-1 if offset[2 - axis] < 0 else 0,)
@@ -355,7 +374,7 @@ class Stencil(GridOperator):
         return wp.array(padded.ravel(), dtype=self.dtype, device=self.device)
 
     def _wrapped(self, values: np.ndarray) -> np.ndarray:
-        """Return a padded field whose ghost cells of periodic axes have what the cells that they stand for have."""
+        """Return a padded field with filled ghost cells along periodic axes."""
         padded = np.pad(values, 1)
         for axis in (a for a in range(3) if self.periodic[2 - a]):
             lines = np.moveaxis(padded, axis, 0)
@@ -363,6 +382,7 @@ class Stencil(GridOperator):
         return padded
 
     def _empty_stencil(self) -> PaddedStencil:
+        """Return the stencil with an allocated diagonal."""
         layout = self.layout
         options: dict[str, Any] = {
             "periodic": self.periodic,
@@ -375,6 +395,7 @@ class Stencil(GridOperator):
         )
 
     def _fill_stencil(self) -> None:
+        """Compute the diagonal, and refuse one that is not positive."""
         s = self.stencil
         self._wrap_cells()
         self._find_signs()
@@ -410,7 +431,7 @@ class Stencil(GridOperator):
         TRANSPOSED.bind(self.stencil.rows, stencil=self.stencil, x=x, y=out).launch()
 
     def boundary_term(self, values: Any) -> wp.array[Any]:
-        """Return the contribution to b of given values in AIR cells, in place of 0.
+        """Return the contribution to b of given values in AIR cells, instead of 0.
 
         The sums of a_o(i) value_(i + o), float64, shape of `cells`.
 
@@ -431,13 +452,13 @@ class Stencil(GridOperator):
                 f"{tuple(n + 2 for n in self.shape)}"
             )
         check_storable(padded, wp.float64, "values")
-        given = wp.array(
+        boundary = wp.array(
             np.where(self.cells.numpy() == AIR, padded, 0).ravel(),
             dtype=wp.float64,
             device=self.device,
         )
         out = self.layout.zeros(wp.float64)
-        self.stencil.product(given, out)
+        self.stencil.product(boundary, out)
         return self.layout.unload(out)
 
     def floating_components(self, scratch: Any = None) -> FloatingComponents | None:
@@ -451,7 +472,11 @@ class Stencil(GridOperator):
         return found
 
     def _find_floating(self) -> FloatingComponents | None:
-        """Look for components on which all rows sum to 0, or all columns: on the host."""
+        """Find components on which all rows sum to 0, or all columns; on the host.
+
+        If A is symmetric and all coupled neighbors have nonzero weights, the components follow from
+        the cells alone, else from the assembled matrix.
+        """
         fluid = (self.cells.numpy() == FLUID) & (
             self.stencil.d.numpy().reshape(self.layout.stored_shape) != 0
         )
@@ -481,23 +506,23 @@ class Stencil(GridOperator):
             kept = inside[self.cells.numpy().ravel() == FLUID]
             matrix = matrix[kept][:, kept]
         most = MOST_IN_SPACE if self.layout.padding.counts[0] > 1 else MOST_IN_PLANE
-        found = null_vectors(
+        vectors = null_vectors(
             matrix, rows[places], columns[places], most=most if self.monotone else 0
         )
         number, fields = (
             np.zeros(inside.size, dtype=np.int32),
             [np.ones(inside.size) for _ in range(2)],
         )
-        number[places] = found.number + 1
-        for field, vector in zip(fields, (found.left, found.right), strict=True):
+        number[places] = vectors.number + 1
+        for field, vector in zip(fields, (vectors.left, vectors.right), strict=True):
             field[places] = vector
         left, right = (None if (field == 1).all() else field for field in fields)
         return numbered_components(
-            number, np.r_[True, found.held], self.device, left=left, right=right
+            number, np.r_[True, vectors.held], self.device, left=left, right=right
         )
 
     def _sums_vanish(self, inside: np.ndarray, *, transposed: bool) -> np.ndarray:
-        """Return which rows, or columns, of a flat stored field sum to 0 but for rounding."""
+        """Return which rows, or columns, sum to 0 up to rounding, as a flat stored field."""
         x, sums = (
             wp.array(np.where(inside, 1.0, 0.0), dtype=wp.float64, device=self.device),
             self.layout.zeros(wp.float64),
@@ -509,10 +534,10 @@ class Stencil(GridOperator):
         return inside & (np.abs(sums.numpy()) <= rounding * size)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle cells and coefficients; those that are Warp functions as arrays."""
+        """Pickle cells and coefficients; Warp functions are pickled as arrays."""
         cells, options = self._pickled()
         n = cells.ndim
-        given = {
+        coefficients = {
             o: self._evaluated(_of_three(f, n)).reshape(cells.shape)
             if isinstance(f, wp.Function)
             else f.numpy()
@@ -524,22 +549,24 @@ class Stencil(GridOperator):
         return made_again(
             Stencil,
             cells,
-            **self._arguments() | {"coefficients": given, "shift": shift},
+            **self._arguments() | {"coefficients": coefficients, "shift": shift},
             device=self.device,
             **options,
         )
 
 
 class StoredStencil(GridOperator):
-    """A compact stencil whose diagonal and weights are there, as fields of a padded grid that it takes over.
+    """A compact stencil with existing diagonal and weights.
+
+    They are fields of a padded grid, which the stencil takes over.
 
     Args:
         cells: as of `Stencil`; beyond the array there is AIR.
         d: diagonal in units of `unit`, stored; 0 off the FLUID cells.
         weights: of the pattern's neighbors, stored, or numbers.
-        pattern: which neighbors, and how their weights are had; None: weights along x, y, z of 5 or
-            7 points, as `PaddedStencil` has them.
-        symmetric: whether A is.
+        pattern: the neighbors, and the kind of their weights; None: weights along x, y, z of 5 or 7
+            points, as in `PaddedStencil`.
+        symmetric: whether A is symmetric.
         unit: of the diagonal.
         monotone: whether all weights are >= 0.
         strength: mean weights along x, y, z.
@@ -564,7 +591,10 @@ class StoredStencil(GridOperator):
         super().__init__(cells, {}, (), d.device, wp.float64 if d.dtype is wp.uint8 else d.dtype)
 
     def take(self, cells: np.ndarray, d: np.ndarray, weights: wp.array[Any]) -> None:
-        """Take other cells of the same shape, another diagonal, and weights, one field after another, in place."""
+        """Set other cells of the same shape, another diagonal, and weights, in place.
+
+        `weights` has one field after another.
+        """
         own, fields, _, _ = self._made
         own.assign(d)
         for place, field in enumerate(fields):
@@ -577,6 +607,7 @@ class StoredStencil(GridOperator):
         pass
 
     def _empty_stencil(self) -> PaddedStencil:
+        """Return the stencil of the given fields."""
         d, weights, pattern, strength = self._made
         fields, numbers = (None, weights) if isinstance(weights[0], float) else (weights, ())
         return PaddedStencil(
@@ -595,12 +626,15 @@ class StoredStencil(GridOperator):
 
 
 def _opposite(offset: Offset) -> Offset:
-    """Return the offset by which a neighbor sees a cell."""
+    """Return the offset of a cell as seen from its neighbor."""
     return -offset[0], -offset[1], -offset[2]
 
 
 def _folded(values: dict[Offset, np.ndarray], axes: list[int]) -> dict[Offset, np.ndarray]:
-    """Return coefficients without steps along axes of one cell that wrap around: such a neighbor is the one without that step."""
+    """Return coefficients without steps along periodic axes of one cell.
+
+    Such a neighbor is the one without that step.
+    """
     found: dict[Offset, np.ndarray] = {}
     for offset, value in values.items():
         place = tuple(0 if axis in axes else step for axis, step in enumerate(offset))
@@ -609,12 +643,12 @@ def _folded(values: dict[Offset, np.ndarray], axes: list[int]) -> dict[Offset, n
 
 
 def _named(offset: Offset, dimension: int) -> tuple[int, ...]:
-    """Return an offset as users write it."""
+    """Return an offset in the user's order of axes."""
     return offset[::-1][3 - dimension :]
 
 
 def _by_offset(coefficients: Any, dimension: int) -> dict[Offset, Any]:
-    """Return coefficients by offset along x, y, z, the center among them."""
+    """Return coefficients by offset along x, y, z, the center included."""
     if not isinstance(coefficients, Mapping):
         host = real_array(coefficients, "coefficients")
         if host.shape != (3,) * dimension:
@@ -626,7 +660,7 @@ def _by_offset(coefficients: Any, dimension: int) -> dict[Offset, Any]:
         coefficients = {
             tuple(i - 1 for i in place): float(host[place]) for place in places if host[place]
         }
-    given: dict[Offset, Any] = {}
+    by_offset: dict[Offset, Any] = {}
     for offset, value in coefficients.items():
         steps = tuple(offset) if isinstance(offset, tuple) else (offset,)
         if len(steps) != dimension or not all(
@@ -637,15 +671,16 @@ def _by_offset(coefficients: Any, dimension: int) -> dict[Offset, Any]:
                 f"coefficients: offset {offset}: expected {form}, each -1, 0 or 1: wider stencils "
                 "need a wl.SparseOperator"
             )
-        given[tuple(map(int, reversed((0,) * (3 - dimension) + steps)))] = value  # type: ignore[index]
-    if CENTER not in given:
+        along_xyz = tuple(map(int, reversed((0,) * (3 - dimension) + steps)))
+        by_offset[along_xyz] = value  # type: ignore[index]
+    if CENTER not in by_offset:
         raise ValueError(f"coefficients: the center, offset {(0,) * dimension}, is missing")
-    return given
+    return by_offset
 
 
 @functools.cache
 def _of_three(function: Any, dimension: int) -> Any:
-    """Return a Warp function of (k, j, i) in float64 from one of a cell's indices."""
+    """Return a Warp function of (k, j, i) in float64 for a function of the cell."""
     count = len(function.input_types)
     if count != dimension:
         raise ValueError(

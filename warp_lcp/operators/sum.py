@@ -1,4 +1,4 @@
-"""The sum of two operators, for methods that need products only."""
+"""Sum of two operators, for methods that need products only."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from warp_lcp.problem.protocol import (
 )
 from warp_lcp.rows.vectors import ADD, rows_of
 
-FELT = 1e-5  # of the sum of a column's sizes over a component: open fractions are of float32
+FELT = 1e-5  # relative to a column's sizes over a component: open fractions are float32
 
 
 class SumOperator(Pickled):
@@ -82,7 +82,7 @@ class SumOperator(Pickled):
             self.grid, self.low = self._plain, self._low
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the terms as they are now."""
+        """Pickle the current terms."""
         return SumOperator, (self.first, self.second)
 
     @property
@@ -141,16 +141,16 @@ class SumOperator(Pickled):
         plain, low = self._plain, self._low
         if not (isinstance(low, LowRankOperator) and has(plain, NamesComponents)):
             return None
-        found = plain.floating_components(scratch)
+        floating = plain.floating_components(scratch)
         return (
             None
-            if found is None
-            else found.without(
+            if floating is None
+            else floating.without(
                 _felt(
-                    found.label,
-                    found.count,
+                    floating.label,
+                    floating.count,
                     low,
-                    weighted=found.left is not None or found.right is not None,
+                    weighted=floating.left is not None or floating.right is not None,
                 )
             )
         )
@@ -176,6 +176,7 @@ class SumOperator(Pickled):
     def _add(
         self, x: wp.array[Any], out: wp.array[Any] | None, *, transposed: bool
     ) -> wp.array[Any]:
+        """Return (A + B) x or its transpose, stored or of the operator's shape."""
         if x.size not in (self.layout.size, int(np.prod(self.shape))):
             raise ValueError(f"x has shape {tuple(x.shape)}: expected {self.shape}")
         out = wp.zeros_like(x) if out is None else out
@@ -186,6 +187,7 @@ class SumOperator(Pickled):
         return out
 
     def _add_fields(self, x: wp.array[Any], out: wp.array[Any], *, transposed: bool) -> None:
+        """Compute (A + B) x or its transpose on fields of one form."""
         plain, low = self._plain, self._low
         (plain.apply_transpose if transposed else plain.apply)(x, out)
         if isinstance(low, LowRankOperator) and x.size == low.layout.size:
@@ -200,20 +202,29 @@ class SumOperator(Pickled):
 
 
 def grid_and_low_rank(A: Any) -> tuple[HasStencil, LowRankOperator] | None:
-    """Return the terms of a symmetric sum of an operator with a stencil and one of low rank, None if A is something else."""
+    """Return the terms of a symmetric sum of a stencil and a low-rank operator.
+
+    None if A is another operator.
+    """
     return (A.grid, A.low) if has(A, HasColumns) and A.symmetric else None
 
 
 def _felt(label: np.ndarray, count: int, low: LowRankOperator, *, weighted: bool) -> np.ndarray:
-    """Return for each component whether a column's sum over it is more than what rounding leaves; of weighted ones, if any."""
+    """Return for each component whether a column's sum over it is nonzero.
+
+    Nonzero means larger than rounding. For weighted components: whether a column has an entry
+    there.
+    """
     rows, blocks, values = low.columns.entries()
     at, k = label[rows], low.columns.width
-    found = np.zeros((2, count, low.rank))
+    sums_and_sizes = np.zeros((2, count, low.rank))
     inside = at >= 0
     if weighted:
         return np.bincount(at[inside], minlength=count) > 0
     columns = (blocks[inside, None] * k + np.arange(k)).astype(np.int64)
-    np.add.at(found[0], (at[inside, None], columns), values[inside])
-    np.add.at(found[1], (at[inside, None], columns), np.abs(values[inside]))
-    sums, sizes = found if low.layout.across is None else low.layout.across.sum(found)
+    np.add.at(sums_and_sizes[0], (at[inside, None], columns), values[inside])
+    np.add.at(sums_and_sizes[1], (at[inside, None], columns), np.abs(values[inside]))
+    sums, sizes = (
+        sums_and_sizes if low.layout.across is None else low.layout.across.sum(sums_and_sizes)
+    )
     return np.asarray((np.abs(sums) > FELT * sizes).any(axis=1))

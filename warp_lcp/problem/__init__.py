@@ -1,1 +1,1 @@
-"""The problem, what it is solved to, and the one loop that solves it."""
+"""The problem, the stopping criteria, and the loop that solves it."""

@@ -1,4 +1,7 @@
-"""Bounds that are affine in x: friction, |x_t| <= mu x_n, is a box whose size another unknown decides ([Book] 1.3.5, 2.2.1)."""
+"""Bounds that are affine in x ([Book] 1.3.5, 2.2.1).
+
+For example friction, |x_t| <= mu x_n: a box whose size depends on another unknown.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,10 @@ f64, i32 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int32)
 
 @wp.struct
 class AffineSide:
-    """Lower or upper bounds, constant + coefficient x[index] where index >= 0; the constant where `index` is empty."""
+    """Lower or upper bounds: constant + coefficient x[index] where index >= 0.
+
+    The constant alone where `index` is -1 or empty.
+    """
 
     constant: f64
     index: i32
@@ -27,7 +33,7 @@ class AffineSide:
 @no_type_check
 @wp.func
 def bound_at(S: AffineSide, x: f64, i: int):
-    """The bound of unknown i at x."""
+    """Return the bound of unknown i at x."""
     value = S.constant[i]
     if S.index.shape[0] > 0:
         if S.index[i] >= 0:
@@ -38,7 +44,7 @@ def bound_at(S: AffineSide, x: f64, i: int):
 @no_type_check
 @forward_kernel(module="warp_lcp.affine_bounds")
 def evaluate_kernel(S: AffineSide, x: f64, out: f64):
-    """Write the bounds at x, an unknown a thread."""
+    """Write the bounds at x, one unknown per thread."""
     i = wp.tid()
     out[i] = bound_at(S, x, i)
 
@@ -195,13 +201,16 @@ class AffineFields:
 
     @cached_property
     def operands(self) -> list[AffineSide]:
-        """Lower and upper bounds as kernels take them."""
+        """Lower and upper bounds as kernel arguments."""
         return [
             affine_side(*of) for of in zip(self.constant, self.index, self.coefficient, strict=True)
         ]
 
     def _check(self) -> None:
-        """Refuse boxes that are empty where the unknown which decides them is at one of its own bounds; evaluate at clip(0, l, u)."""
+        """Refuse empty boxes; evaluate the bounds at clip(0, l, u).
+
+        Boxes are tested with the unknown on which they depend at each of its own bounds.
+        """
         low, high = (c.numpy() for c in self.constant)
         for x in (np.clip(0.0, low, high), low, high):
             at = [
@@ -228,7 +237,7 @@ class AffineFields:
 
 
 def affine_side(constant: wp.array[Any], index: Any = None, coefficient: Any = None) -> AffineSide:
-    """Return bounds as kernels take them; constant ones without the rest."""
+    """Return bounds as a kernel argument; constant ones without index."""
     side = AffineSide()
     side.constant = constant
     if index is not None:
@@ -237,7 +246,7 @@ def affine_side(constant: wp.array[Any], index: Any = None, coefficient: Any = N
 
 
 def affine_fields(layout: Layout, lower: Any, upper: Any) -> AffineFields | None:
-    """Return the fields of bounds of which a side is affine, None if neither is."""
+    """Return the fields of bounds if a side is affine, None if neither is."""
     affine = isinstance(lower, AffineBounds) or isinstance(upper, AffineBounds)
     return AffineFields(layout, lower, upper) if affine else None
 

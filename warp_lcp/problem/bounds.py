@@ -1,4 +1,7 @@
-"""Bounds of a problem: numbers, fields, or, where all finite ones are equal, a byte a cell instead of eight."""
+"""Bounds of a problem: numbers, fields, or codes.
+
+Where all finite bounds are equal, a byte for each cell replaces eight.
+"""
 
 from __future__ import annotations
 
@@ -19,12 +22,13 @@ from warp_lcp.rows.program import Launch, launch_now
 from warp_lcp.rows.vectors import Sums
 
 NAMES, INFINITE = ("lower", "upper"), (-np.inf, np.inf)
-# a bound of this magnitude is infinite in files and to SciPy's and qpsolvers' users, as OSQP and
-# CPLEX take it
+# A bound of this magnitude is infinite in files and for users of SciPy and qpsolvers, as in OSQP
+# and CPLEX.
 INFINITY = 1e20
-# elements from which a kernel looks at fields on the CPU: below, NumPy takes less than the launch
+# From this number of elements on a kernel reads fields on the CPU; for fewer NumPy takes less time
+# than the launch.
 LAUNCHED = 4096
-BITS = (1, 2)  # of a code: the lower bound is finite, the upper one is
+BITS = (1, 2)  # bits of a code: the lower bound is finite, the upper one is
 KERNELS = KernelFile(Path(__file__).parent / "headers/bound_codes.h")
 ENCODE = KERNELS["bounds.encode"]
 CODE_ROWS = KERNELS["bounds.code_rows"]
@@ -34,9 +38,9 @@ DECODE = KERNELS["bounds.decode"]
 class Bounds:
     """Lower and upper bounds, each a number or a field.
 
-    A pressure is bounded by 0 on wall cells and not at all elsewhere: such bounds are coded, one
-    byte a cell with a bit for each side. Fields from the host are not kept then. Fields on the
-    device, which the caller may change, are; `refresh` codes them again.
+    A pressure is bounded by 0 on wall cells and not at all elsewhere. Such bounds are coded, one
+    byte a cell with a bit for each side. Fields from the host are not stored then. Fields on the
+    device, which the caller may change, are stored; `refresh` codes them again.
 
     Args:
         layout: of the problem's fields.
@@ -44,11 +48,11 @@ class Bounds:
         upper: likewise.
 
     Attributes:
-        affine: where bounds depend on x: what they are made of; `fields` then hold them at the x of
-            the last `follow`.
-        fields: stored float64 fields; empty where a number or the code counts.
-        values: the numbers that count where there is no field; where bounds are coded, the value of
-            the finite ones.
+        affine: the fields of bounds that depend on x, else None; `fields` then hold the bounds at
+            the x of the last `follow`.
+        fields: stored float64 fields; empty where a number or the code is used.
+        values: the numbers that are used where there is no field; where bounds are coded, the value
+            of the finite ones.
         code: stored uint8 field, bit 1 where the lower bound is finite, bit 2 where the upper one
             is; empty if bounds are not coded.
     """
@@ -93,7 +97,10 @@ class Bounds:
 
     @property
     def may_bind(self) -> tuple[bool, bool]:
-        """Whether a lower and an upper bound may be finite, now or after the caller changed a field."""
+        """Whether a lower and an upper bound may be finite.
+
+        Now, or after the caller has changed a field.
+        """
         below, above = (
             self.varying[side] or bool(np.isfinite(self.values[side])) for side in (0, 1)
         )
@@ -114,7 +121,7 @@ class Bounds:
         )
 
     def replica(self) -> Bounds:
-        """Return the same bounds in memory of their own."""
+        """Return a copy of the bounds in its own memory."""
         twin = copy.copy(self)
         twin.fields, twin.code = [wp.clone(field) for field in self.fields], wp.clone(self.code)
         return twin
@@ -126,7 +133,10 @@ class Bounds:
 
     @property
     def operands(self) -> list[Any]:
-        """As kernels that know the code take them: a field or an empty array and the number that then counts, for each; the code."""
+        """The bounds as arguments of kernels that support codes.
+
+        For each side a field, or an empty array and the number that is then used; last the code.
+        """
         numbers = [wp.float64(v) for v in self.values]
         if self.code.size:
             return [self._none, numbers[0], self._none, numbers[1], self.code]
@@ -138,7 +148,7 @@ class Bounds:
             self.affine.evaluate(x)
 
     def given_again(self) -> tuple[Any, Any]:
-        """Return both sides as they are now, for a pickle."""
+        """Return the current values of both sides, for a pickle."""
         if self.affine is not None:
             return self.affine.sides
         sides = []
@@ -155,13 +165,19 @@ class Bounds:
         return sides[0], sides[1]
 
     def refresh(self) -> None:
-        """Code fields again that the caller may have changed, where all their finite values are 0."""
+        """Code fields again that the caller may have changed.
+
+        They are coded if all their finite values are 0.
+        """
         if self.in_place:
             self.encode()
             self.code = self._no_code if self._other_values() else self._memory
 
     def encode(self, launch: Launch = launch_now) -> None:
-        """Launch the coding of fields that are in place; `stays` then tells, and waits for the device."""
+        """Launch the coding of fields that are in place.
+
+        `stays` then returns its outcome, and waits for the device.
+        """
         if not self.in_place:
             return
         if self._memory is None:
@@ -182,26 +198,29 @@ class Bounds:
         )
 
     def changed(self) -> None:
-        """Say that a recorded `encode` has run."""
+        """Mark the results of a recorded `encode` as changed."""
         if self.in_place and self._memory is not None:
             self._others.reading.changed()
 
     @property
     def stays(self) -> bool:
-        """Whether there is a code now if there was one before, and none if there was none."""
+        """Whether bounds are still coded, or still not coded."""
         return not self.in_place or self.stays_with(self._other_values())
 
     def stays_with(self, others: float) -> bool:
-        """Return `stays`, given how many finite values other than 0 there are on all ranks."""
+        """Return `stays` for a number of finite nonzero values on all ranks."""
         return not self.in_place or bool(others) == (self.code is not self._memory)
 
     @property
     def others_here(self) -> wp.array[wp.float64] | None:
-        """The number of finite values other than 0 that the last coding has met on this rank, shape (1,); None: nothing is coded."""
+        """Number of finite nonzero values in the last coding on this rank.
+
+        Shape (1,); None if nothing is coded.
+        """
         return self._others.reading.array if self.in_place and self._memory is not None else None
 
     def _other_values(self) -> float:
-        """Return how many finite values other than 0 the last coding has met, on all ranks."""
+        """Return the number of finite nonzero values in the last coding, on all ranks."""
         found, across = float(self._others.reading.numpy()[0]), self.layout.across
         return found if across is None else float(across.sum(found))
 
@@ -223,7 +242,10 @@ class Bounds:
         return field
 
     def host(self, side: int) -> np.ndarray:
-        """Return `as_field` on the host, without a launch: the caller's memory where there is a field on the CPU."""
+        """Return `as_field` on the host, without a launch.
+
+        It is the caller's memory if there is a field on the CPU.
+        """
         if self.fields[side].size:
             return self.fields[side].numpy()
         field = np.full(self.layout.size, self.values[side])
@@ -232,9 +254,10 @@ class Bounds:
         return field
 
     def _code_from_host(self, sides: tuple[Array, Array]) -> bool:
-        """Code fields that are not stored yet; returns False, with nothing done, if their finite values differ or one is a NaN.
+        """Code fields that are not stored yet.
 
-        Where ranks share the problem all code, or none.
+        Returns False, with nothing done, if their finite values differ or one is NaN. On ranks
+        either all code their fields, or none.
         """
         code, values, across = (
             self.layout.host_zeros(wp.uint8),
@@ -263,7 +286,10 @@ class Bounds:
         return True
 
     def _code_rows(self, side: int, host: np.ndarray, value: float, code: np.ndarray) -> bool:
-        """Add a side's bits to a code on the host; returns False if there are other finite values."""
+        """Add a side's bits to a code on the host.
+
+        Returns False if there are other finite values.
+        """
         target = self.layout.target(code, host)
         if host.size <= LAUNCHED:
             finite = host != INFINITE[side]
@@ -271,7 +297,7 @@ class Bounds:
             return not (finite & (host != value)).any()
         target = target if target.ndim == 3 else target.reshape(1, 1, -1)
         host = host.reshape(target.shape)
-        # else a copy is made
+        # Other types are copied
         at_once = len(host) if host.dtype == np.float64 else -(-LARGE // host[0].size)
         parts = [slice(k, k + at_once) for k in range(0, len(host), at_once)]
         return all(self._code_part(side, host[part], value, code, target[part]) for part in parts)
@@ -279,7 +305,7 @@ class Bounds:
     def _code_part(
         self, side: int, host: np.ndarray, value: float, code: np.ndarray, target: np.ndarray
     ) -> bool:
-        """Do that for some planes of the code."""
+        """Add a side's bits for some planes of the code."""
         first = target.__array_interface__["data"][0] - code.__array_interface__["data"][0]
         rows = Rows.strided(
             code.size, wp.get_device("cpu"), (first, *target.strides[:2]), target.shape
@@ -303,11 +329,17 @@ class Bounds:
 
 
 def huge_as_infinite(values: np.ndarray) -> np.ndarray:
-    """Replace magnitudes of INFINITY and more by infinities, in bounds and right-hand sides."""
+    """Replace magnitudes of INFINITY and more by infinities.
+
+    In bounds and right-hand sides.
+    """
     huge = np.abs(values) >= INFINITY
     return np.where(huge, np.copysign(np.inf, values), values) if huge.any() else values
 
 
 def without_far(lower: np.ndarray, upper: np.ndarray, far: float) -> tuple[np.ndarray, np.ndarray]:
-    """Replace lower bounds of at most -far and upper ones of at least far by infinities."""
+    """Replace bounds of at least `far` in magnitude by infinities.
+
+    Lower bounds of at most -far, and upper ones of at least far.
+    """
     return np.where(lower <= -far, -np.inf, lower), np.where(upper >= far, np.inf, upper)

@@ -1,4 +1,7 @@
-"""Negative curvature along unknowns without bounds: matrices for which definite methods cannot work."""
+"""Negative curvature along unknowns with infinite bounds.
+
+Methods for definite matrices cannot solve such problems.
+"""
 
 from __future__ import annotations
 
@@ -8,27 +11,30 @@ import warp as wp
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasColumns, HasRows, HasStencil, has
 
-NEGATIVE = 1e-8  # of ||z|| ||A z||: z'Az below minus this is no rounding of products
+NEGATIVE = 1e-8  # of ||z|| ||A z||: z'Az below minus this is not rounding of products
 
 
 def has_negative_curvature(problem: LCP) -> bool:
-    """Return whether A is surely neither positive semi-definite nor a P-matrix on the unknowns F that have an infinite bound.
+    """Return whether A is surely neither positive semi-definite nor a P-matrix.
 
-    A_ii < 0 shows that, for i in F; it counts where no A_ii > 0, for Newton's method solves with
-    some negative entries, as convection makes them. Of an operator without rows one product A z
-    tells, z pointing away from the bounds of F: z'Az < 0 if A is symmetric, of a random z; else z_i
-    (A z)_i < 0 for all i in F, of a z of ones and minus ones (a P-matrix reverses the sign of no
-    vector). A flipped sign shows itself so: -A of a positive definite or a diagonally dominant A.
+    On the unknowns F that have an infinite bound.
+
+    A_ii < 0 proves it, for i in F. It counts only if no A_ii > 0 there, because Newton's method can
+    solve problems with some negative entries, which convection causes. For an operator without rows
+    one product A z decides, z pointing away from the bounds of F. If A is symmetric, z is random
+    and the test is z'Az < 0. Otherwise z has entries 1 and -1 and the test is z_i (A z)_i < 0 for
+    all i in F, because a P-matrix reverses the sign of no vector. Both detect a wrong sign: -A of a
+    positive definite or a diagonally dominant A.
     """
     A = problem.A
-    if has(A, HasStencil) or has(A, HasColumns):  # which have positive diagonals
+    if has(A, HasStencil) or has(A, HasColumns):  # these have positive diagonals
         return False
     by_rows = has(A, HasRows)
     if by_rows:
         diagonal = (
             A.host_diagonal() if hasattr(A, "host_diagonal") else A.diagonal().numpy().ravel()
         )
-        if not (diagonal < 0).any():  # as a rule, and quickly seen
+        if not (diagonal < 0).any():  # the usual case, decided quickly
             return False
     lower, upper = problem.bounds.host(0), problem.bounds.host(1)
     free = (np.isinf(lower) | np.isinf(upper)) & (problem.unknown.numpy() == 1)

@@ -15,8 +15,8 @@ from warp_lcp.problem.solve import VariationalInequality
 class FrictionalContact(VariationalInequality):
     """Contact problem of rigid bodies with Coulomb's circular friction cone.
 
-    Find impulses r at k contacts so that Coulomb's law holds for the velocities u = J J' r + e r +
-    b that they leave.
+    Find impulses r at k contacts so that Coulomb's law holds for the resulting velocities u = J J'
+    r + e r + b.
 
     A contact's rows are its normal and `dim` - 1 tangents. With K = {|r_t| <= mu r_n} and its dual
     cone K* = {u_n >= mu |u_t|} the law is
@@ -25,23 +25,23 @@ class FrictionalContact(VariationalInequality):
 
     [De Saxce & Feng 1998; Acary & Brogliato 2008, 3.9]: an open contact has no impulse, a sticking
     one does not slip, a slipping one has friction mu r_n against the slip, and slip causes no
-    normal velocity. r is a solution if r = P_K(r - u^ / d), for any d > 0. As u^ is not a gradient
-    there may be several solutions or, with mu > 0 and velocities b that no r can stop, none.
+    normal velocity. r is a solution if r = P_K(r - u^ / d), for any d > 0. Since u^ is not a
+    gradient there may be several solutions, or none if mu > 0 and no r can stop the velocities b.
 
-    J is given by the bodies of each contact and its rows for either: velocities of bodies are M^-1
-    J' r where the rows have a factor of the inverse masses in them, J M^-1/2. A product then costs
-    the entries of J, and J J' is never made.
+    J is given by the bodies of each contact and its rows for each of them. The velocities of bodies
+    are M^-1 J' r if the rows include a factor of the inverse masses, J M^-1/2. A product then costs
+    the entries of J, and J J' is never assembled.
 
     Args:
         first: body that each contact pushes, from 0, shape (k,).
-        second: the other one, `bodies` where that is none, shape (k,).
+        second: the other body, `bodies` if there is none, shape (k,).
         one: rows of J for the first body, shape (k, dim, q).
-        other: for the second, shape (k, dim, q); taken as 0 where it is none.
-        b: velocities without impulses [m/s], less those that are the least along normals, shape (k,
+        other: for the second, shape (k, dim, q); 0 is used if there is none.
+        b: velocities without impulses [m/s], minus the least allowed ones along normals, shape (k,
             dim).
         friction: Coulomb's coefficient mu >= 0, shape (k,).
         bodies: their number.
-        yields: e >= 0, how much contacts give way [1/kg], shape (k, dim); 0 if None.
+        yields: e >= 0, compliance of the contacts [1/kg], shape (k, dim); 0 if None.
         device: Warp device that methods use; the CPU if None.
 
     Raises:
@@ -49,8 +49,10 @@ class FrictionalContact(VariationalInequality):
             a row that moves nothing.
 
     Example:
-        >>> down = FrictionalContact([0], [1], np.eye(3)[None], np.zeros((1, 3, 3)), [[-1.0, 3.0, 4.0]], [0.5], 1)
-        >>> print(f"{down.residual(np.array([[1.0, -0.3, -0.4]])):.1f}")  # held by mu r_n against the slip
+        >>> one, other = np.eye(3)[None], np.zeros((1, 3, 3))
+        >>> down = FrictionalContact([0], [1], one, other, [[-1.0, 3.0, 4.0]], [0.5], 1)
+        >>> # Friction mu r_n acts against the slip.
+        >>> print(f"{down.residual(np.array([[1.0, -0.3, -0.4]])):.1f}")
         0.0
     """
 
@@ -80,6 +82,7 @@ class FrictionalContact(VariationalInequality):
         self.other[self.second == self.bodies] = 0.0
 
     def _check(self) -> None:
+        """Raise ValueError for wrong shapes, values or body numbers."""
         shapes = {
             "one": self.one,
             "other": self.other,
@@ -124,7 +127,7 @@ class FrictionalContact(VariationalInequality):
 
     @property
     def dim(self) -> int:
-        """Rows of a contact."""
+        """Number of rows of a contact."""
         return int(self.one.shape[1])
 
     def __len__(self) -> int:
@@ -173,9 +176,15 @@ class FrictionalContact(VariationalInequality):
 
 
 def onto_cones(z: np.ndarray, friction: np.ndarray) -> np.ndarray:
-    """Return the nearest points of |r_t| <= mu r_n to z, row by row, shape (k, dim)."""
+    """Return the projections of z onto the cones |r_t| <= mu r_n, row by row.
+
+    z has shape (k, dim). A point inside stays; one in the polar cone, mu |z_t| <= -z_n, goes to 0;
+    any other goes to the nearest point of the cone's surface.
+    """
     normal, length = z[:, 0], np.linalg.norm(z[:, 1:], axis=1)
     inside, polar = length <= friction * normal, friction * length <= -normal
+    # On the surface r_t = mu r_n z_t / |z_t| the nearest point has
+    # r_n = (z_n + mu |z_t|) / (1 + mu^2).
     side = (normal + friction * length) / (1.0 + friction**2)
     onto = np.column_stack(
         [side, (friction * side / np.maximum(length, 1e-300))[:, None] * z[:, 1:]]

@@ -1,4 +1,7 @@
-"""The problem: y = A x + b with bounds l <= x <= u. LCP, mixed LCP, boxed LCP and linear system are one class."""
+"""The problem: y = A x + b with bounds l <= x <= u.
+
+LCP, mixed LCP, boxed LCP and linear system are one class.
+"""
 
 from __future__ import annotations
 
@@ -23,18 +26,21 @@ from warp_lcp.rows.vectors import ADD, Sums, rows_of
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/residual.h")
 CHECK = KERNELS["problem.check"]
-# most elements of fields of the CPU that NumPy checks in less time than a launch takes: 45 of 75 us
+# Largest number of elements of CPU fields that NumPy checks in less time than a launch: 45 of 75
+# us.
 CHECKED_BY_NUMPY = 12_000
 
 
 @singledispatch
 def as_operator(A: Any, device: Any = None, dtype: Any = wp.float64) -> Operator:
-    """Return A as an operator; operators register here which arrays they take (numpy arrays, scipy.sparse matrices).
+    """Return A as an operator.
 
-    What converts to an array, by `__array__` or `to_numpy` (a data frame), is taken as one.
+    Operators register here the arrays from which they are made (numpy arrays, scipy.sparse
+    matrices). An object that converts to an array, by `__array__` or `to_numpy` (a data frame), is
+    used as that array.
 
     Args:
-        A: an operator, or what one is made of.
+        A: an operator, or the data of one.
         device: where an operator is made; the default device if None.
         dtype: storage of its entries.
 
@@ -68,19 +74,19 @@ class LCP(Pickled):
     otherwise. `lower=0`, `upper=inf` is the LCP; a row with bounds -inf and inf is an equation;
     without finite bounds the problem is a linear system.
 
-    Fields that are device arrays of type wp.float64 in the operator's stored layout already (for a
-    grid: padded by one cell, shape (nz + 2, ny + 2, nx + 2)) are used in place, so that a
-    time-stepping code can change them between solves; results then come back in that layout too.
+    Fields are used in place if they are device arrays of type wp.float64 in the operator's stored
+    layout (for a grid: padded by one cell, shape (nz + 2, ny + 2, nx + 2)). A time-stepping code
+    can then change them between solves, and results come back in that layout too.
 
     Args:
         A: an Operator, or an array (numpy, Warp) or scipy.sparse matrix of shape (n, n), which
             becomes one on b's device.
         b: field of A's shape, units of y.
-        lower: l, a number or a field; -inf where there is none; or AffineBounds, which depend on x.
-        upper: u, a number or a field; inf where there is none; or AffineBounds.
+        lower: l, a number or a field; -inf for no bound; or AffineBounds, which depend on x.
+        upper: u, a number or a field; inf for no bound; or AffineBounds.
         preconditioner: M, an approximation of A's inverse, for methods that solve linear systems
             with A on the free unknowns F by a Krylov method (MinimumMapNewton, PrimalDualActiveSet,
-            SubspaceMinimization): M_FF stands for the inverse of A_FF. Anything of shape (n, n)
+            SubspaceMinimization): M_FF replaces the inverse of A_FF. Anything of shape (n, n)
             with products by `@`: a matrix, a scipy.sparse.linalg.LinearOperator, PyAMG's
             `ml.aspreconditioner()`. It is applied on the host, in float64. Conjugate gradients take
             it where A is symmetric and M seems symmetric positive definite, by two products; GMRES
@@ -128,7 +134,10 @@ class LCP(Pickled):
         )
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the operator, b and the bounds as they are now; fields that are used in place come back as device arrays."""
+        """Pickle the operator, b and the bounds with their current values.
+
+        Fields that are used in place are restored as device arrays.
+        """
         b = (
             OnHost(self.b.reshape(self.layout.stored_shape))
             if self.in_place
@@ -176,11 +185,11 @@ class LCP(Pickled):
         return form, self.bounds.form
 
     def replica(self) -> LCP:
-        """Return the same problem in memory of its own."""
+        """Return a copy of the problem in its own memory."""
         twin = copy.copy(self)
         for cached in ("lower", "upper", "_counts"):
             twin.__dict__.pop(cached, None)
-        operator: Any = self.A  # which has a form
+        operator: Any = self.A  # its form exists
         twin.A, twin.b, twin.bounds = operator.replica(), wp.clone(self.b), self.bounds.replica()
         twin.unknown = _unknown(twin.A, twin.layout)
         return twin
@@ -223,7 +232,10 @@ class LCP(Pickled):
         return self._counts.reading
 
     def _faults(self, field: wp.array[Any], bounds: Bounds) -> list[int]:
-        """Count values of a stored field that are not finite, NaN in l and in u, crossed bounds, l = inf, u = -inf."""
+        """Count the faults of b and of the bounds.
+
+        Values of b that are not finite, NaN in l and in u, crossed bounds, l = inf, u = -inf.
+        """
         if self.device.is_cpu and self.layout.size <= CHECKED_BY_NUMPY:
             inside = self.unknown.numpy() == 1
             b, lower, upper = field.numpy()[inside], bounds.host(0)[inside], bounds.host(1)[inside]
@@ -250,7 +262,7 @@ class LCP(Pickled):
         ]
 
     def _check(self) -> None:
-        """Refuse data that no method could use."""
+        """Refuse data that no method can use."""
         bad_b, nan_lower, nan_upper, crossed, no_lower, no_upper = self._faults(self.b, self.bounds)
         if bad_b:
             raise ValueError(f"b holds {bad_b} values that are not finite")
@@ -269,7 +281,7 @@ def _made(A: Operator, b: Array, lower: Any, upper: Any, preconditioner: Any) ->
 
 
 def _count(unknown: np.ndarray) -> int:
-    """Return how many entries are 1."""
+    """Return the number of entries that are 1."""
     return sum(
         int(np.count_nonzero(part == 1))
         for part in np.array_split(unknown, 1 + unknown.size // LARGE)
@@ -277,7 +289,10 @@ def _count(unknown: np.ndarray) -> int:
 
 
 def _unknown(A: Operator, layout: Layout) -> wp.array[Any]:
-    """Return a stored int8 field that is 1 on unknowns: a grid's cell types serve as they are."""
+    """Return a stored int8 field that is 1 on unknowns.
+
+    A grid's cell types are used without a copy.
+    """
     if has(A, HasCells):
         return A.cells.flatten()
     return wp.full(layout.size, 1, dtype=wp.int8, device=layout.device)

@@ -1,4 +1,7 @@
-"""The book's merit functions beside the natural residual, for those who plot or compare convergence."""
+"""The book's merit functions besides the natural residual.
+
+For plots and comparisons of convergence.
+"""
 
 from __future__ import annotations
 
@@ -15,13 +18,13 @@ from warp_lcp.problem.lcp import LCP
 class Merits:
     """Merit functions of an iterate.
 
-    They are stated for x >= 0. In a box x_i is the distance to the bound that y_i's sign asks for,
-    u_i - x_i with -y_i where that is the upper one; rows without bounds count as they are.
+    They are defined for x >= 0. In a box x_i is the distance to the bound that the sign of y_i
+    selects, u_i - x_i with -y_i if that is the upper one; rows without bounds are unchanged.
 
     Attributes:
         largest: max |x_i|, units of x ([Book] eq. 2.55).
-        complementarity: |x'(A x + b)|, units of x y ([Book] eq. 2.56); 0 at solutions, but at x =
-            0, too, whatever b is.
+        complementarity: |x'(A x + b)|, units of x y ([Book] eq. 2.56); 0 at solutions, but also at
+            x = 0 for every b.
         absolute: x'|A x + b|, units of x y ([Book] eq. 2.200); the same, without terms that cancel:
             >= 0 within the bounds.
     """
@@ -36,7 +39,7 @@ def merits_at(problem: LCP, x: wp.array[Any], y: wp.array[Any]) -> Merits:
 
     Args:
         problem: the problem.
-        x: where.
+        x: the iterate.
         y: stored float64 field that receives A x + b.
     """
     problem.apply_plus(x, problem.b, y)

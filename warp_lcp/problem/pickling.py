@@ -1,4 +1,7 @@
-"""How problems and results are pickled and copied: as host arrays, made again on their device, or on the CPU where that is missing."""
+"""Pickling and copying of problems and results.
+
+Arrays are pickled on the host, and restored on their device, or on the CPU if that is missing.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,10 @@ import warp as wp
 
 
 class OnHost:
-    """Stands for a device array in the arguments of `__reduce__`: what comes out is a wp.array again."""
+    """Wrapper of a device array in the arguments of `__reduce__`.
+
+    It is restored as a wp.array.
+    """
 
     def __init__(self, array: wp.array[Any]) -> None:
         self._array = array
@@ -26,7 +32,10 @@ class OnHost:
 
 
 class Pickled:
-    """Has a `__reduce__` with host arrays, for pickles and `copy.deepcopy`; `copy.copy` shares all there is."""
+    """Base of classes with a `__reduce__` of host arrays.
+
+    For pickles and `copy.deepcopy`; `copy.copy` shares all attributes.
+    """
 
     def __copy__(self) -> Any:
         """Return an object with the same attributes."""
@@ -39,7 +48,10 @@ class FieldsOnHost(Pickled):
     """A dataclass that pickles its fields, device arrays as host arrays."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the fields in their order, as arguments; None for one whose metadata say that it is not pickled."""
+        """Pickle the fields in their order, as arguments.
+
+        None replaces a field whose metadata exclude it.
+        """
         fields = dataclasses.fields(self)  # type: ignore[arg-type]
         values = [
             getattr(self, field.name) if field.metadata.get("pickled", True) else None
@@ -51,9 +63,10 @@ class FieldsOnHost(Pickled):
 def made_again(
     make: Callable[..., Any], *arguments: Any, device: wp.Device, **options: Any
 ) -> tuple[Any, ...]:
-    """Return what `__reduce__` of an operator returns: `make(*arguments, device=..., **options)`, where that device is.
+    """Return the value of an operator's `__reduce__`.
 
-    Types (wp.float32) go by their names.
+    It restores `make(*arguments, device=..., **options)` on that device. Types (wp.float32) are
+    pickled by name.
     """
     named = {
         name: value.__name__ if isinstance(value, type) else value
@@ -75,7 +88,7 @@ def _on_device(host: np.ndarray, dtype: str, device: str) -> wp.array[Any]:
 
 
 def _present(device: str) -> wp.Device:
-    """Return a device by its name, the CPU where there is none of that name."""
+    """Return the device of a name, the CPU if there is none."""
     return next(
         (found for found in wp.get_devices() if found.alias == device), wp.get_device("cpu")
     )

@@ -1,4 +1,4 @@
-"""An approximate inverse of A that a user brings, checked once."""
+"""A user's approximate inverse of A, checked once."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import numpy as np
 
 from warp_lcp.rows.fields import Layout
 
-# of ||u|| ||M v||: asymmetry above what rounding leaves, which conjugate gradients do not bear for
-# long
+# Relative to ||u|| ||M v||: a larger asymmetry than rounding leaves, with which conjugate gradients
+# fail sooner or later.
 SYMMETRIC = 1e-6
 
 
 class Preconditioner:
-    """z = M r on the host, in float64.
+    """Preconditioner z = M r on the host, in float64.
 
     Args:
         M: of shape (n, n), with products by `@`.
@@ -22,8 +22,8 @@ class Preconditioner:
 
     Attributes:
         given: M.
-        definite: whether two products say that M is symmetric and positive definite; more would be
-            needed to be sure.
+        definite: whether M is symmetric and positive definite in two products; certainty would need
+            more.
 
     Raises:
         ValueError: M is of another kind or shape, not real, or gives products that are not finite;

@@ -1,4 +1,4 @@
-"""Quadratic programs: equilibration, residuals row by row, polishing, certificates.
+"""Optimality of quadratic programs: units, residuals, polishing, certificates.
 
 Points are in the units of `equilibrated`: x = sigma D x', multipliers of rows E z' / (c sigma),
 P' = c sigma^2 D P D and so on.
@@ -19,22 +19,22 @@ import scipy.sparse.linalg
 from warp_lcp.problem.reformulate import QuadraticProgramData
 from warp_lcp.problem.scale import scaled
 
-SMALL = 400  # unknowns and rows up to which matrices are dense, whatever the caller's are
-SWEEPS = 20  # of Ruiz's iteration, each of which halves the logarithms of rows that differ
+SMALL = 400  # up to so many unknowns and rows matrices are dense, for any type of the caller's
+SWEEPS = 20  # sweeps of Ruiz's iteration, each of which halves the logarithms of rows that differ
 CANCELED = 1e-10  # terms of a row below this part of ||a_i|| ||x|| count as rounding
-# shift of the conditions' matrix, which dependent rows make singular; refinement takes its effect
-# off
+# Shift of the conditions' matrix, which dependent rows make singular; refinement removes its
+# effect.
 PROXIMAL = 1e-8
 REFINEMENTS = 12
-CHANGES = 30  # of the active set
+CHANGES = 30  # changes of the active set
 EXACT = 1e-13  # relative residual below which there is nothing to improve
-# value of a certificate, relative to its terms, beyond rounding and HiGHS's tolerances
+# Value of a certificate relative to its terms, beyond rounding and HiGHS's tolerances.
 PROVED = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
 class ProgramWithRows(QuadraticProgramData):
-    """A program that has G, h, C and d, without rows where there are none."""
+    """A program with G, h, C and d, which are empty if it has no such rows."""
 
     h: np.ndarray = field(default_factory=lambda: np.zeros(0))
     d: np.ndarray = field(default_factory=lambda: np.zeros(0))
@@ -45,9 +45,9 @@ class ProgramUnits:
     """Units of an equilibrated program.
 
     Attributes:
-        x: what 1 in x' is in x, shape (n,).
-        inequalities: what 1 in a multiplier of G x >= h is, shape (m,).
-        equations: what 1 in a multiplier of C x = d is, shape (k,).
+        x: unit of x' in x, shape (n,).
+        inequalities: unit of the multipliers of G x >= h, shape (m,).
+        equations: unit of the multipliers of C x = d, shape (k,).
     """
 
     x: np.ndarray
@@ -55,8 +55,8 @@ class ProgramUnits:
     equations: np.ndarray
 
     def of_caller(self, point: ProgramPoint) -> ProgramPoint:
-        """Return a point of the equilibrated program in the units of the program it was made of."""
-        with np.errstate(over="ignore"):  # a multiplier may be beyond all numbers in those
+        """Return a point of the equilibrated program in the original units."""
+        with np.errstate(over="ignore"):  # multipliers may overflow in those
             return ProgramPoint(
                 self.x * point.x, self.inequalities * point.z, self.equations * point.y
             )
@@ -64,7 +64,9 @@ class ProgramUnits:
 
 @dataclass(frozen=True, eq=False)
 class ProgramPoint:
-    """A point and its multipliers: Q x + c - G' z - C' y is >= 0 at lower bounds, <= 0 at upper ones and 0 elsewhere.
+    """A point of a program and its multipliers.
+
+    At a solution Q x + c - G' z - C' y is >= 0 at lower bounds, <= 0 at upper ones and 0 elsewhere.
 
     Attributes:
         x: shape (n,).
@@ -78,12 +80,15 @@ class ProgramPoint:
 
     @property
     def is_finite(self) -> bool:
-        """Whether all numbers are."""
+        """Whether all numbers are finite."""
         return all(np.isfinite(part).all() for part in (self.x, self.z, self.y))
 
 
 def with_rows(program: QuadraticProgramData) -> ProgramWithRows:
-    """Return a program with rows, its matrices all sparse, or all dense if small or dense."""
+    """Return a program with rows.
+
+    Its matrices are all sparse, or all dense if small or dense.
+    """
     matrices, n = (program.Q, program.G, program.C), len(program.c)
     h, d = (np.zeros(0) if v is None else v for v in (program.h, program.d))
     dense = n + len(h) + len(d) <= SMALL or not any(scipy.sparse.issparse(M) for M in matrices)
@@ -102,9 +107,9 @@ def with_rows(program: QuadraticProgramData) -> ProgramWithRows:
 def equilibrated(program: ProgramWithRows) -> tuple[ProgramWithRows, ProgramUnits]:
     """Return an equilibrated program and its units, which are powers of 2.
 
-    D and E make the largest entry of each row of diag(D, E) [[Q, B'], [B, 0]] diag(D, E) 1, B the
-    rows of G and C (Ruiz 2001, as OSQP does it), with Q in a unit of its own. sigma is a unit of x
-    after the sizes of bounds and right-hand sides, the cost's unit follows.
+    With B the rows of G and C, D and E scale diag(D, E) [[Q, B'], [B, 0]] diag(D, E) so that the
+    largest entry of each row is 1 (Ruiz 2001, as in OSQP); Q has its own unit. sigma is a unit of x
+    chosen by the sizes of bounds and right-hand sides; the unit of the cost follows from these.
 
     Args:
         program: with rows (`with_rows`).
@@ -114,6 +119,7 @@ def equilibrated(program: ProgramWithRows) -> tuple[ProgramWithRows, ProgramUnit
     E = 1 / _nonzero(_largest(B, 1))
     curvature = abs(Q) / _nonzero(_largest(Q, 0).max(initial=0.0))
     D = np.ones(n)
+    # Ruiz's iteration on diag(D, E) [[Q, B'], [B, 0]] diag(D, E).
     for _ in range(SWEEPS):
         rows = scaled(B, E, D)
         D = D / np.sqrt(
@@ -121,6 +127,8 @@ def equilibrated(program: ProgramWithRows) -> tuple[ProgramWithRows, ProgramUnit
         )
         E = E / np.sqrt(_nonzero(_largest(rows, 1)))
     D, E = _power_of_two(D), _power_of_two(E)
+    # sigma: median of the nonzero bounds and right-hand sides; cost: 1 over the size of the
+    # gradient sigma D (Q x + c).
     right = np.r_[E * np.r_[program.h, program.d], program.lower / D, program.upper / D]
     sizes = np.abs(right[np.isfinite(right) & (right != 0)])
     bend = float(_largest(scaled(Q, D, D), 0).max(initial=0.0))
@@ -128,8 +136,10 @@ def equilibrated(program: ProgramWithRows) -> tuple[ProgramWithRows, ProgramUnit
     slope = float(np.median(costs)) if len(costs) else 0.0
     sigma = float(np.median(sizes)) if len(sizes) else slope / bend if bend and slope else 1.0
     sigma = _power_of_two(sigma)
-    cost = _power_of_two(1 / (max(sigma * bend, slope) or 1.0))  # times sigma: of sigma D (Q x + c)
-    made = ProgramWithRows(
+    cost = _power_of_two(
+        1 / (max(sigma * bend, slope) or 1.0)
+    )  # times sigma: scale of the gradient sigma D (Q x + c)
+    scaled_program = ProgramWithRows(
         scaled(Q, cost * sigma * D, D),
         cost * D * program.c,
         program.lower / (sigma * D),
@@ -140,11 +150,14 @@ def equilibrated(program: ProgramWithRows) -> tuple[ProgramWithRows, ProgramUnit
         E[m:] * program.d / sigma,
     )
     with np.errstate(over="ignore"):
-        return made, ProgramUnits(sigma * D, E[:m] / cost, E[m:] / cost)
+        return scaled_program, ProgramUnits(sigma * D, E[:m] / cost, E[m:] / cost)
 
 
 def settled(program: ProgramWithRows, point: ProgramPoint) -> ProgramPoint:
-    """Return the point with complementary pairs: x on a bound or z = 0, the nearer of the two."""
+    """Return the point with complementary pairs.
+
+    Of each pair the smaller becomes 0: x is set on a bound, or z = 0.
+    """
     at, slope = np.clip(point.x, program.lower, program.upper), _gradient(program, point)
     x = np.where(
         at - program.lower <= slope,
@@ -156,15 +169,15 @@ def settled(program: ProgramWithRows, point: ProgramPoint) -> ProgramPoint:
     return ProgramPoint(x, np.where(slack <= point.z, np.maximum(point.z, 0.0), 0.0), point.y)
 
 
-@np.errstate(over="ignore", invalid="ignore")  # of multipliers beyond all numbers: inf is returned
+@np.errstate(over="ignore", invalid="ignore")  # multipliers may overflow: inf is returned
 def relative_residuals(program: ProgramWithRows, point: ProgramPoint) -> tuple[float, float, float]:
-    """Return the primal residual, the dual residual and the duality gap, relative to their terms.
+    """Return the primal residual, the dual residual and the duality gap.
 
-    For row i of a x - b that is |a_i x - b_i| / (sum_j |a_ij x_j| + |b_i|), the componentwise
-    backward error, which does not depend on the units of rows; where all terms are rounding,
-    ||a_i|| ||x|| is added. An inequality with a multiplier counts as
-    an equation. The duality gap is x'Qx + c'x - h'z - d'y less what the bounds pay, relative to the
-    sum of its parts.
+    All are relative to their terms. For row i of a x - b that is |a_i x - b_i| / (sum_j |a_ij x_j|
+    + |b_i|), the componentwise backward error, which does not depend on the units of rows; where
+    all terms are rounding, ||a_i|| ||x|| is added. An inequality with a multiplier counts as an
+    equation. The duality gap is x'Qx + c'x - h'z - d'y minus the contribution of the bounds,
+    relative to the sum of its parts.
 
     Args:
         program: with rows.
@@ -177,19 +190,21 @@ def relative_residuals(program: ProgramWithRows, point: ProgramPoint) -> tuple[f
         np.abs(np.r_[p.h, p.d]),
         np.r_[np.where(z > 0, np.abs(slack), np.maximum(-slack, 0.0)), np.abs(miss)],
     )
+    # Primal residual: equations and inequalities with a multiplier must hold exactly.
     primal = _relative(
         missed,
         abs(rows) @ np.abs(x) + right,
         _largest(abs(rows), 1) * np.abs(x).max(initial=0.0) + right,
     )
+    # Dual residual: g must be >= 0 at lower bounds, <= 0 at upper bounds, and 0 elsewhere.
     g, multipliers = _gradient(p, point), np.abs(np.r_[z, y])
     wrong = np.where(
         x <= p.lower, np.maximum(-g, 0.0), np.where(x >= p.upper, np.maximum(g, 0.0), np.abs(g))
     )
     wrong = np.where(p.lower == p.upper, 0.0, wrong)
     terms = abs(p.Q) @ np.abs(x) + np.abs(p.c) + abs(rows).T @ multipliers
-    # without ||multipliers||: a bound and an equation that cancel may have any, and would hide the
-    # other rows
+    # Without ||multipliers||: those of a bound and an equation that cancel may have any size, and
+    # would hide the other rows.
     least = np.abs(p.c[p.c != 0]).min(initial=np.inf)
     sizes = (
         _largest(abs(p.Q), 1) * np.abs(x).max(initial=0.0)
@@ -197,6 +212,7 @@ def relative_residuals(program: ProgramWithRows, point: ProgramPoint) -> tuple[f
         + (least if np.isfinite(least) else 1.0)
     )
     dual = _relative(wrong, terms, sizes)
+    # Duality gap x'Qx + c'x - h'z - d'y - (g'x at bounds).
     held = np.where((x <= p.lower) | (x >= p.upper), g * x, 0.0)
     parts = np.r_[x * (p.Q @ x), p.c * x, -p.h * z, -p.d * y, -held]
     sides = np.r_[x * (p.G.T @ z), x * (p.C.T @ y)]  # of the same size, where h and d are 0
@@ -223,10 +239,15 @@ def polished(program: ProgramWithRows, point: ProgramPoint) -> ProgramPoint:
         if error <= EXACT or key in seen:
             break
         seen.add(key)
-        found = _newton(p, now, low, high, tight)
-        if found is None:
+        newton_point = _newton(p, now, low, high, tight)
+        if newton_point is None:
             break
-        inside = ProgramPoint(np.clip(found.x, p.lower, p.upper), np.maximum(found.z, 0.0), found.y)
+        # The Newton point, projected, and the same with canceled entries of x set to 0.
+        inside = ProgramPoint(
+            np.clip(newton_point.x, p.lower, p.upper),
+            np.maximum(newton_point.z, 0.0),
+            newton_point.y,
+        )
         for tried in (
             inside,
             replace(
@@ -237,13 +258,15 @@ def polished(program: ProgramWithRows, point: ProgramPoint) -> ProgramPoint:
             worth = max(relative_residuals(p, tried))
             if worth < error:
                 best, error = tried, worth
-        slope, slack = _gradient(p, found), p.G @ found.x - p.h
+        # The next active set: a held row is released if its multiplier has the wrong sign, a free
+        # row is held if it is violated.
+        slope, slack = _gradient(p, newton_point), p.G @ newton_point.x - p.h
         fixed = p.lower == p.upper
         low, high = (
-            fixed | np.where(low, slope > 0, found.x < p.lower),
-            ~fixed & np.where(high, slope < 0, found.x > p.upper),
+            fixed | np.where(low, slope > 0, newton_point.x < p.lower),
+            ~fixed & np.where(high, slope < 0, newton_point.x > p.upper),
         )
-        tight, now = np.where(tight, found.z > 0, slack < 0), found
+        tight, now = np.where(tight, newton_point.z > 0, slack < 0), newton_point
     return best
 
 
@@ -251,8 +274,8 @@ def has_no_solution(program: ProgramWithRows) -> str:
     """Return "infeasible" or "unbounded" where a certificate proves it, else "".
 
     Infeasible: z >= 0, y and bound multipliers with G'z + C'y + v - w = 0 and h'z + d'y + l'v - u'w
-        > 0 (Farkas). Unbounded: a direction e
-    with Q e = 0, C e = 0, G e >= 0, within the cone of the bounds, and c'e < 0.
+    > 0 (Farkas). Unbounded: a direction e with Q e = 0, C e = 0, G e >= 0, within the cone of the
+    bounds, and c'e < 0.
 
     Args:
         program: with rows.
@@ -266,34 +289,38 @@ def has_no_solution(program: ProgramWithRows) -> str:
         [scipy.sparse.csr_array(p.G), scipy.sparse.csr_array(p.C), unit[low], -unit[high]]
     ).tocsr()
     worth = np.r_[p.h, p.d, p.lower[low], -p.upper[high]]
+    # Farkas: find v with [G; C; I; -I]'v = 0, v >= 0 except for equations, and h'z + d'y + l'v -
+    # u'w > 0.
     if len(worth):
         size = _nonzero(np.abs(worth))  # each row in its own size: a far bound is no proof
         rows_of_one, worth_of_one = scaled(rows, 1 / size, np.ones(n)), worth / size
         limits = np.repeat([[0.0, 1.0]], len(worth), axis=0)
         limits[len(p.h) : len(p.h) + len(p.d), 0] = -1.0
-        found = linprog(
+        program_result = linprog(
             -worth_of_one, A_eq=rows_of_one.T, b_eq=np.zeros(n), bounds=limits, method="highs"
         )
-        if found.status == 0:
-            v = _without_rounding(np.clip(found.x, limits[:, 0], limits[:, 1]))
+        if program_result.status == 0:
+            v = _without_rounding(np.clip(program_result.x, limits[:, 0], limits[:, 1]))
             gain, terms = float(worth_of_one @ v), float(np.abs(worth_of_one) @ np.abs(v))
             rest, left = np.abs(rows_of_one.T @ v), abs(rows_of_one).T @ np.abs(v)
             if gain > PROVED * terms and (rest <= 1e-2 * PROVED * left + 1e-300).all():
                 return "infeasible"
     if not p.c.any():
         return ""
+    # Unboundedness: find e with Q e = 0, C e = 0, G e >= 0 and the signs of infinite bounds, and
+    # c'e < 0.
     sides = np.stack(
         [np.where(np.isfinite(p.lower), 0.0, -1.0), np.where(np.isfinite(p.upper), 0.0, 1.0)],
         axis=1,
     )
     still = _stacked(p.Q, p.C)
     more = {"A_ub": -p.G, "b_ub": np.zeros(len(p.h))} if len(p.h) else {}
-    found = linprog(
+    program_result = linprog(
         p.c, A_eq=still, b_eq=np.zeros(still.shape[0]), bounds=sides, method="highs", **more
     )
-    if found.status != 0:
+    if program_result.status != 0:
         return ""
-    e = _without_rounding(np.clip(found.x, sides[:, 0], sides[:, 1]))
+    e = _without_rounding(np.clip(program_result.x, sides[:, 0], sides[:, 1]))
     moved, up = np.abs(still @ e), p.G @ e
     small = 1e-2 * PROVED
     flat = (moved <= small * (abs(still) @ np.abs(e)) + 1e-300).all() and (
@@ -309,10 +336,10 @@ def _without_rounding(values: np.ndarray) -> np.ndarray:
 def _newton(
     p: ProgramWithRows, now: ProgramPoint, low: Any, high: Any, tight: Any
 ) -> ProgramPoint | None:
-    """Return the solution of the equations of an active set; None where it is not finite.
+    """Return the solution of the equations of an active set, None if not finite.
 
-    [[Q_FF + s, -B_F'], [B_F, s]] is factored, s > 0 small, and the step refined: of rows that
-    depend on each other the least change.
+    [[Q_FF + s, -B_F'], [B_F, s]] is factored, s > 0 small, and the step is refined. For dependent
+    rows that gives the least change.
     """
     free, active = np.flatnonzero(~low & ~high), np.flatnonzero(tight)
     x = np.where(low, p.lower, np.where(high, p.upper, now.x))
@@ -321,6 +348,8 @@ def _newton(
     if len(free) + len(right):
         solve = _factored(p.Q[free][:, free], B[:, free])
         for _ in range(REFINEMENTS if solve else 0):
+            # Step of the equations of the active set; the right-hand side is recomputed, which
+            # refines the solution.
             slope = (p.Q @ x + p.c - B.T @ multipliers)[free]
             step = -solve(np.r_[slope, B @ x - right])  # type: ignore[misc]
             x[free] += step[: len(free)]
@@ -333,7 +362,10 @@ def _newton(
 
 
 def _factored(Q: Any, B: Any) -> Callable[[np.ndarray], np.ndarray] | None:
-    """Return what solves [[Q + s, -B'], [B, s]] v = r, s = PROXIMAL; None where the factors are singular."""
+    """Return a solver of [[Q + s, -B'], [B, s]] v = r, s = PROXIMAL.
+
+    None where the factors are singular.
+    """
     n, k = Q.shape[0], B.shape[0]
     if scipy.sparse.issparse(Q):
         M = scipy.sparse.block_array(
@@ -356,7 +388,7 @@ def _gradient(p: ProgramWithRows, point: ProgramPoint) -> np.ndarray:
 
 
 def _relative(values: np.ndarray, terms: np.ndarray, sizes: np.ndarray) -> float:
-    """Return the largest of values relative to the terms they are left of."""
+    """Return the largest of values relative to the terms of their sums."""
     whole = np.where(terms > CANCELED * sizes, terms, terms + sizes)
     return float((values / np.where(whole > 0, whole, 1.0)).max(initial=0.0))
 

@@ -1,7 +1,8 @@
-"""What solvers ask of an operator: the members that each has, and capabilities that some methods need and others make use of.
+"""Interface of operators: members of each, and optional capabilities.
 
-An operator has a capability if it has the members; `has` says so, and is the only place that looks
-for them by name. A method lists in `supports` the capabilities of which it needs one.
+Some methods need capabilities, others use them if present. An operator has a capability if it has
+the members; `has` decides that, and is the only function that looks for them by name. A method
+lists in `supports` the capabilities of which it needs one.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from warp_lcp.rows.fields import PaddedLayout
 
 AIR, FLUID, SOLID = 0, 1, 2  # types of a grid's cells
-FLOAT32_ROUNDING = 2.0**-24  # the largest relative one of a number that float32 holds
+FLOAT32_ROUNDING = 2.0**-24  # largest relative rounding of a number in float32
 Capability = TypeVar("Capability", bound="Operator")
 
 
@@ -88,7 +89,7 @@ class HasRows(Operator, Protocol):
 
     Attributes:
         row_sizes: the largest magnitude of each row, shape (n,), wp.float64; None where no row is
-            empty. The unknown of an empty row goes to the bound that b's sign asks for.
+            empty. The unknown of an empty row goes to the bound that b's sign selects.
     """
 
     row_sizes: wp.array[Any] | None
@@ -250,7 +251,7 @@ class HasCoefficients(Operator, Protocol):
 
 
 FAMILIES = {"dense": "wl.DenseOperator", "sparse": "wl.SparseOperator", "grid": "wl.GridPoisson"}
-# what to call each, and which of our own families have it
+# Name of each, and our own families that have it.
 CAPABILITIES: dict[type[Operator], tuple[str, tuple[str, ...]]] = {
     HasRows: ("rows", ("dense", "sparse")),
     Relaxes: ("a sweep", ("dense", "sparse", "grid")),
@@ -270,7 +271,10 @@ CAPABILITIES: dict[type[Operator], tuple[str, tuple[str, ...]]] = {
 
 @cache
 def members(capability: type[Operator]) -> tuple[str, ...]:
-    """Return the names of a capability's members beside those of `Operator`; of `Operator`, its own."""
+    """Return the names of a capability's members besides those of `Operator`.
+
+    For `Operator` its own members.
+    """
     bases = [
         base for base in reversed(capability.__mro__) if base not in (object, Generic, Protocol)
     ]
@@ -286,27 +290,36 @@ def members(capability: type[Operator]) -> tuple[str, ...]:
 
 
 def has(A: object, capability: type[Capability]) -> TypeGuard[Capability]:
-    """Return whether an operator has a capability: all of its members. `isinstance` of protocols would take 10 us."""
+    """Return whether an operator has a capability: all of its members.
+
+    `isinstance` of protocols would take 10 us.
+    """
     return all(hasattr(A, name) for name in members(capability))
 
 
 def version_of(A: Operator) -> int | None:
-    """Return the version of an operator, None of one that does not say when it changes."""
+    """Return the version of an operator, None if it has no version."""
     return A.version if has(A, Versioned) else None
 
 
 def asks_beyond_storage(A: Any, share: float) -> bool:
-    """Return whether a relative tolerance is below the rounding that storage in float32 makes of A's entries."""
+    """Return whether a tolerance is below the storage rounding of A's entries.
+
+    `share` is a relative tolerance; entries stored in float32 are rounded.
+    """
     return share < FLOAT32_ROUNDING and has(A, StoresRounded) and share < A.storage_rounding()
 
 
 def layout_of(A: Operator) -> Layout:
-    """Return the layout of an operator's fields; plain arrays unless it says otherwise."""
+    """Return the layout of an operator's fields; plain arrays without a layout."""
     return A.layout if has(A, HasLayout) else Layout(A.shape, A.device)
 
 
 def takes(method: Any, A: Operator) -> bool:
-    """Return whether a method, or its class, takes an operator: A has one of the capabilities in `supports`, if that names any."""
+    """Return whether a method, or its class, takes an operator.
+
+    A must have one of the capabilities in `supports`, if that names any.
+    """
     asked = getattr(method, "supports", ())
     return not hasattr(method, "problems") and (
         not asked or any(has(A, capability) for capability in asked)
@@ -314,7 +327,10 @@ def takes(method: Any, A: Operator) -> bool:
 
 
 def families(method: Any) -> set[str]:
-    """Return which of our own families of operators a method, or its class, takes: "dense", "sparse", "grid"; none of other problems."""
+    """Return the families of our own operators that a method, or its class, takes.
+
+    "dense", "sparse", "grid"; empty for methods of other problems.
+    """
     if hasattr(method, "problems"):
         return set()
     asked = getattr(method, "supports", ())
@@ -326,7 +342,10 @@ def families(method: Any) -> set[str]:
 
 
 def described(*capabilities: type[Operator]) -> str:
-    """Return what capabilities are called, and which of our own operators have them, for messages."""
+    """Return the names of capabilities, and the operators that have them.
+
+    For messages.
+    """
     return " or ".join(
         name + (f" ({', '.join(FAMILIES[family] for family in having)})" if having else "")
         for name, having in (CAPABILITIES[capability] for capability in capabilities)
@@ -337,15 +356,15 @@ def check_taken(method: Any, A: Operator) -> None:
     """Check that a method takes an operator.
 
     Raises:
-        ValueError: it does not; the message names what is missing, and methods that ask for
-            nothing.
+        ValueError: it does not; the message names the missing capabilities, and methods
+            without requirements.
     """
     if not takes(method, A):
-        others = (
+        advice = (
             "use MinimumMapNewton, or ProjectedJacobi where bounds are affine in x, which "
             "need only products"
         )
         raise ValueError(
             f"{type(method).__name__} needs an operator with {described(*method.supports)}; "
-            f"{type(A).__name__} has none: {others}"
+            f"{type(A).__name__} has none: {advice}"
         )

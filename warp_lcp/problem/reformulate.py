@@ -27,7 +27,7 @@ Map = Callable[[Vector], Vector]
 
 @dataclass(frozen=True, eq=False)
 class Reformulation:
-    """Equivalent problem, and the map back to the first one.
+    """An equivalent problem, and the map back to the original one.
 
     Args:
         problem: the new problem.
@@ -35,7 +35,7 @@ class Reformulation:
         b: its vector.
         lower: its lower bounds.
         upper: its upper bounds.
-        back: maps its solutions to solutions of the first problem.
+        back: maps its solutions to solutions of the original problem.
     """
 
     problem: LCP
@@ -291,11 +291,9 @@ def quadratic_program_to_boxed(
 ) -> Reformulation:
     """Return the KKT conditions of a quadratic program as a boxed LCP.
 
-    In (x, lambda, nu).
-
-    y_x = Q x + c - G' lambda - C' nu within x's box, 0 <= lambda complementary to G x - h >= 0, nu
-    free with C x - d = 0. Without general constraints it is the program's own box. `back` returns
-    x.
+    The unknowns are (x, lambda, nu): y_x = Q x + c - G' lambda - C' nu within x's box, 0 <= lambda
+    complementary to G x - h >= 0, nu free with C x - d = 0. Without general constraints it is the
+    program's own box. `back` returns x.
 
     Raises:
         ValueError: G comes without h, or C without d.
@@ -385,7 +383,10 @@ def boxed_to_fischer_burmeister(A: Any, b: Vector, lower: Vector, upper: Vector)
 
 
 def _marked(equations: Any, n: int) -> np.ndarray:
-    """Return which rows are equations; row numbers and 0/1 integers are refused, for each could be taken for the other."""
+    """Return the mask of the rows that are equations.
+
+    Row numbers and 0/1 integers are refused, because each could be read as the other.
+    """
     mask = np.asarray(equations)
     if mask.shape != (n,) or mask.dtype != bool:
         raise ValueError(

@@ -1,9 +1,9 @@
-"""The natural residual, the one number in which all methods are compared; always evaluated from x in float64.
+"""Natural residual, the measure of convergence of all methods.
 
-r_i = d_i (x_i - clip(x_i - y_i / d_i, l_i, u_i)) with d_i = 1 / (r_i c_i) where diag(r) A diag(c)
-is equilibrated: |A_ii| for positive semi-definite matrices and on grids (`warp_lcp.problem.scale`;
-1 where a row and a column are empty). r has the units of y and does not change when x is rescaled;
-it vanishes exactly at solutions.
+It is always evaluated from x in float64: r_i = d_i (x_i - clip(x_i - y_i / d_i, l_i, u_i)) with d_i
+= 1 / (r_i c_i) where diag(r) A diag(c) is equilibrated: |A_ii| for positive semi-definite matrices
+and on grids (`warp_lcp.problem.scale`; 1 where a row and a column are empty). r has the units of y
+and does not change when x is rescaled; it vanishes exactly at solutions.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ class NaturalResidual:
         y: stored field, A x + b at the x of the last evaluation.
         norm: the residual's norm there, units of y.
         diagonal: d / unit, stored field: on grids the stencil's own diagonal, with its sign, and 0
-            where no unknown or an empty row is.
-        current: whether `y` and `norm` belong to the iterate as it is; a method that moves x sets
-            it to False.
+            at empty rows and where there is no unknown.
+        current: whether `y` and `norm` belong to the current iterate; a method that moves x sets it
+            to False.
     """
 
     def __init__(self, problem: LCP) -> None:
@@ -55,7 +55,7 @@ class NaturalResidual:
             else wp.zeros(layout.size, dtype=problem.A.dtype, device=layout.device)
         )
         self.unit = float(stencil.unit) if stencil else 1.0
-        # of an operator whose scale is a copy
+        # Of an operator whose scale is a copy.
         self._diagonal_of = None if stencil else version_of(problem.A)
         self._sums = Sums(Rows.of_fields(layout), across=layout.across)
         if not stencil:
@@ -95,6 +95,8 @@ class NaturalResidual:
     def start(self, x: wp.array[Any], *, keep: bool) -> None:
         """Project x onto the bounds, or set it to clip(0, l, u).
 
+        It is 0 where there is no unknown.
+
         0 where there is no unknown.
         """
         if self._diagonal_of is not None and self._diagonal_of != version_of(self.problem.A):
@@ -105,7 +107,7 @@ class NaturalResidual:
     def project(self, x: wp.array[Any], *, keep: bool, launch: Launch = launch_now) -> None:
         """Launch the projection of x onto the bounds, or of 0, as `start` does."""
         p = self.problem
-        # bounds that depend on x: at x as it is, then at x within its bounds
+        # Bounds that depend on x are evaluated at the given x, then at x within its bounds.
         for _ in range(1 if p.bounds.affine is None else 2):
             p.bounds.follow(x)
             WITHIN.bind(
@@ -125,7 +127,7 @@ class NaturalResidual:
         self.diagonal.assign(np.maximum(d, np.finfo(wp.dtype_to_numpy(self.diagonal.dtype)).tiny))
 
     def _estimated_scale(self) -> np.ndarray:
-        """Return d of an operator that does not know it, a flat stored field."""
+        """Return d of an operator without a scale, a flat stored field."""
         p, layout = self.problem, self.problem.layout
         return estimated_scale(
             p.A, layout, p.unknown.numpy() == 1, layout.load(p.A.diagonal(), wp.float64).numpy()
@@ -142,7 +144,7 @@ class NaturalResidual:
         There y = b. Methods move coupled unknowns only.
         """
         p, sizes = self.problem, self.row_sizes
-        # of grids, only an empty row has a zero diagonal
+        # On grids only an empty row has a zero diagonal.
         zero_if_empty = self.diagonal if sizes is None else sizes
         rows, bounds = Rows.of_fields(p.layout), p.bounds.operands
         SETTLE_ISOLATED.bind(
@@ -153,7 +155,7 @@ class NaturalResidual:
     def unattainable(self) -> float:
         """Return the norm of b on empty rows whose solution would be infinite.
 
-        There the sign of b asks for an infinite bound, so no x solves the problem.
+        There the sign of b selects an infinite bound, so no x solves the problem.
         """
         p, sizes = self.problem, self.row_sizes
         if sizes is None:
@@ -182,14 +184,12 @@ class NaturalResidual:
         )
 
     def rounding_floor(self, x: wp.array[Any], epsilon: float) -> float:
-        """Return an estimate of the residual that rounding x to `epsilon` leaves.
+        """Estimate the residual that rounding x to `epsilon` leaves, in units of y.
 
-        In the units of y.
-
-        r_i = min(max(y_i, d_i (x_i - u_i)), d_i (x_i - l_i)) has the error e_i = epsilon (2 |d_i
-        x_i| + |b_i|) of y_i where it is y_i or could be y_i within that error, and only the error
-        epsilon |d_i x_i| of x_i where a bound decides: the size of b in a row that is held says
-        nothing of the others.
+        r_i = min(max(y_i, d_i (x_i - u_i)), d_i (x_i - l_i)) has an error e_i. Where r_i is y_i, or
+        could be y_i within that error, e_i is the error of y_i, epsilon (2 |d_i x_i| + |b_i|).
+        Where a bound decides, e_i is that of x_i alone, epsilon |d_i x_i|: the size of b in a held
+        row has no effect on the other rows.
         """
         y, r, d, b, at = self._rows_at(x)
         own = epsilon * np.abs(d * at)
@@ -201,9 +201,7 @@ class NaturalResidual:
         """Return whether the residual of every row is rounding error.
 
         |r_i| <= 4 eps (|b_i| + sum_j |a_ij x_j|): x then solves the problem as well as float64 can
-        tell.
-
-        Where an operator shows no rows, |d_i x_i| stands for the sum, which is no larger.
+        represent. For an operator without rows, |d_i x_i| replaces the sum, which is no smaller.
         """
         _, r, d, b, at = self._rows_at(x)
         sizes = np.abs(d * at)
@@ -213,7 +211,7 @@ class NaturalResidual:
         return self._total(beyond) == 0
 
     def _rows_at(self, x: wp.array[Any]) -> tuple[np.ndarray, ...]:
-        """Return y, r, d, b and x at x, of the unknowns alone, on the host."""
+        """Return y, r, d, b and x of the unknowns at x, on the host."""
         p, field = self.problem, self.problem.layout.zeros(wp.float64)
         p.bounds.follow(x)
         p.apply_plus(x, p.b, field)
@@ -223,7 +221,7 @@ class NaturalResidual:
         y, at, b, lower, upper = (
             f.numpy()[inside] for f in (field, x, p.b, p.bounds.as_field(0), p.bounds.as_field(1))
         )
-        with np.errstate(over="ignore"):  # bounds of 1e308 are infinite then
+        with np.errstate(over="ignore"):  # bounds of 1e308 become infinite
             return y, np.maximum(np.minimum(y, d * (at - lower)), d * (at - upper)), d, b, at
 
     def _total(self, value: float) -> float:

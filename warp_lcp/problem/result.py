@@ -1,4 +1,4 @@
-"""What a solve returns: status, iterate, residuals and history."""
+"""Result of a solve: status, iterate, residuals and history."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class SolveStatus(Enum):
     )
 
     def __reduce_ex__(self, protocol: Any) -> tuple[Any, ...]:
-        """Pickle the name: what the value says may change."""
+        """Pickle the name: the message may change."""
         return getattr, (SolveStatus, self.name)
 
 
@@ -77,10 +77,11 @@ class Record:
     The last line is taken at the end.
 
     Args:
-        iteration: steps done.
+        iteration: number of steps done.
         residual: norm of the natural residual, recomputed in float64, units of y.
-        linear_iterations: iterations on the finest grid so far.
-        active: unknowns held at a bound in the last step; None where the method has no active set.
+        linear_iterations: number of iterations on the finest grid so far.
+        active: number of unknowns held at a bound in the last step; None where the method has no
+            active set.
         step: kind of the last step ("newton", "monotone cycle", "sweep", ...).
         seconds: wall time since the start of the solve.
         merits: the book's merit functions, with `StoppingCriteria(merits=True)`.

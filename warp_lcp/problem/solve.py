@@ -1,4 +1,7 @@
-"""The one outer loop: start, criteria, status, history, best iterate. Methods only step."""
+"""The outer loop of all solves: start, criteria, status, history, best iterate.
+
+Methods only take steps.
+"""
 
 from __future__ import annotations
 
@@ -27,9 +30,9 @@ from warp_lcp.rows.fields import Array
 from warp_lcp.rows.program import Launch, launch_now
 from warp_lcp.rows.vectors import convert
 
-# a norm from which on residuals 16 digits smaller have squares that float64 holds
+# Least norm for which residuals 16 digits smaller have squares that float64 can hold.
 SMALLEST = 1e-138
-# a stagnated residual within this multiple of the rounding estimate is called the precision's floor
+# A stagnated residual within this multiple of the rounding estimate is at the precision's floor.
 FLOOR_MARGIN = 8.0
 
 
@@ -68,14 +71,14 @@ class Step:
 
     Args:
         name: a word of the method.
-        linear_iterations: iterations on the finest grid.
-        active: unknowns held at a bound, None where the method has no active set.
-        failure: the status with which the method gives up, None to go on.
-        interim: the residual need not fall (a pivot on the way, or a step that lowers the energy):
-            patience and divergence do not apply.
-        iterations: steps that it stands for, of a method that takes several at once.
-        due: the residual is worth recomputing; else nothing is recorded and the solve goes on,
-            unless a limit has come.
+        linear_iterations: number of iterations on the finest grid.
+        active: number of unknowns held at a bound, None where the method has no active set.
+        failure: the status with which the method ends, None to go on.
+        interim: the residual need not fall (an intermediate pivot, or a step that lowers the
+            energy): patience and divergence do not apply.
+        iterations: number of steps that it represents, for a method that takes several at once.
+        due: the residual should be recomputed; otherwise nothing is recorded and the solve goes on,
+            unless a limit is reached.
         final: the iterate is the result so far, though an earlier one may have had a smaller
             residual.
         method: name of the method that has taken it; None: that of the solve.
@@ -105,18 +108,18 @@ class VariationalInequality:
     workspace evaluate y and P_K, together in one kernel if they can. The stresses of sand
     (`granular.stress.Stress`) are such a problem.
 
-    The workspace holds the iterate and a `Residual`. The iterate starts as it is unless `x0` is
-    given, and the result's x is that array. A method names the class of problems that it solves as
-    `problems`.
+    The workspace holds the iterate and a `Residual`. The iterate starts with its current values
+    unless `x0` is given, and the result's x is that array. A method names the class of problems
+    that it solves as `problems`.
     """
 
 
 class Residual(Protocol):
-    """What the loop asks of a natural residual.
+    """Interface of a natural residual to the loop.
 
     Attributes:
         norm: at the x of the last evaluation, in units of y or of d x.
-        current: whether that is the iterate as it is; the loop sets it to False before each step.
+        current: whether that is the current iterate; the loop sets it to False before each step.
     """
 
     norm: float
@@ -126,11 +129,14 @@ class Residual(Protocol):
         """Return the norm at x, recomputed in float64."""
 
     def rounding_floor(self, x: wp.array[Any], epsilon: float) -> float:
-        """Return an estimate of the norm that rounding x to `epsilon` leaves; 0 where there is none."""
+        """Estimate the norm that rounding x to `epsilon` leaves; 0 if there is none."""
 
 
 class Workspace(Protocol):
-    """What a method allocates once for a problem; can be used again when b, the bounds or the cells change in place."""
+    """Memory that a method allocates once for a problem.
+
+    It can be used again when b, the bounds or the cells change in place.
+    """
 
     problem: Any
     x: wp.array[Any]
@@ -138,43 +144,49 @@ class Workspace(Protocol):
     precision: Precision
 
     def start(self, *, warm: bool, tolerance: float) -> bool | None:
-        """Forget the last solve; return True where steps are wanted even if the start meets the tolerance.
+        """Begin a solve.
 
-        A workspace that needs the operator's floating components (None if there are none) takes
-        them as an argument `floating`, too.
+        Returns True if steps are wanted even where the start meets the tolerance. A workspace that
+        needs the operator's floating components (None if there are none) has another argument
+        `floating`.
 
         Args:
             warm: x is a guess better than clip(0, l, u).
-            tolerance: the residual norm that is asked for.
+            tolerance: the required residual norm.
         """
 
     def round_iterate(self) -> None:
         """Round x to its precision."""
 
     def keep(self) -> None:
-        """Remember x as the best iterate."""
+        """Store x as the best iterate."""
 
     def restore(self) -> None:
-        """Make x the best iterate again."""
+        """Set x to the best iterate."""
 
 
 class BeginsAhead(Protocol):
-    """A workspace whose device may begin a solve, and go on, before the host knows of it."""
+    """A workspace whose device can begin a solve without the host."""
 
     def begin_ahead(
         self, guess: wp.array[Any] | None, criteria: StoppingCriteria | MeanCriteria, steps: int
     ) -> float | None:
-        """Begin a solve; return the residual that tolerances refer to, None where nothing has begun. `start` comes next, then steps.
+        """Begin a solve on the device, and take steps.
+
+        `start` comes next, then the steps. Returns the residual that tolerances refer to, None
+        where nothing has begun.
 
         Args:
-            guess: stored field; None: there is none.
+            guess: stored field, or None.
             criteria: of the solve.
-            steps: of this solve that may be taken without the host.
+            steps: largest number of steps of this solve without the host.
         """
 
 
 class IterateMemory:
-    """What workspaces have in common: x, moved in place and rounded to its precision, the residual there, the best iterate by a copy.
+    """Base of workspaces: x, its residual, and the best iterate.
+
+    x is moved in place and rounded to its precision; the best iterate is a copy.
 
     Args:
         problem: the problem.
@@ -203,13 +215,13 @@ class IterateMemory:
         )
 
     def keep(self) -> None:
-        """Remember x as the best iterate."""
+        """Store x as the best iterate."""
         if self._best is None:
             self._best = self.problem.layout.zeros(wp.float64)
         self.problem.layout.copy(self._best, self.x)
 
     def restore(self) -> None:
-        """Make x the best iterate again."""
+        """Set x to the best iterate."""
         if self._best is not None:
             self.problem.layout.copy(self.x, self._best)
 
@@ -218,7 +230,7 @@ class IterateMemory:
         self._round(self.x, launch=launch)
 
     def solution(self) -> wp.array[Any]:
-        """Return x in its precision and of the stored shape: the same array after each solve."""
+        """Return x in its precision and stored shape: the same array after each solve."""
         single = self._rounded is not None
         if self._solution is None:
             memory = self.problem.layout.zeros(wp.float32) if single else self.x
@@ -230,7 +242,7 @@ class IterateMemory:
         return self._solution
 
     def _finish_move(self, x: wp.array[Any]) -> None:
-        """Choose the constants that a move of x left open on floating components, and round."""
+        """Choose the constants of floating components after a move of x, and round."""
         if self.floating is not None:
             self.floating.settle(x, self.problem.lower, self.problem.upper)
         self._round(x)
@@ -243,7 +255,7 @@ class IterateMemory:
 
 @runtime_checkable
 class Solver(Protocol):
-    """A method is its settings; its memory is a Workspace."""
+    """A method: its settings; its memory is a Workspace."""
 
     def init(self, problem: Any) -> Any:
         """Return a workspace for the problem.
@@ -253,7 +265,11 @@ class Solver(Protocol):
         """
 
     def step(self, problem: Any, work: Any, x: wp.array[Any]) -> Step:
-        """Move x once. `work.residual` is current at x; leave `work.residual.current` False unless it is at the new x."""
+        """Move x once.
+
+        `work.residual` is current at x; leave `work.residual.current` False unless it is at the new
+        x.
+        """
 
 
 @cache
@@ -262,7 +278,10 @@ def _name_of_class(name: str) -> str:
 
 
 def method_name(method: Any) -> str:
-    """Return a method's name: its `name` if it has one, else the words of its class, joined by hyphens."""
+    """Return a method's name.
+
+    Its `name` if it has one, else the words of its class, joined by hyphens.
+    """
     return getattr(method, "name", None) or _name_of_class(type(method).__name__)
 
 
@@ -276,7 +295,7 @@ class Spare(Protocol):
     work: Any
 
     def give_back(self, result: SolveResult) -> None:
-        """Keep the workspace for later solves, if nothing of the result lies in it."""
+        """Keep the workspace for later solves, if the result does not share its memory."""
 
 
 @runtime_checkable
@@ -284,12 +303,15 @@ class KeepsWorkspace(Protocol):
     """A method that keeps the workspace of a solve for later ones."""
 
     def spare(self, problem: Any) -> Spare | None:
-        """Return a workspace for the problem, None if `init` has to make one."""
+        """Return a workspace for the problem, None if `init` has to create one."""
 
 
 def spare_of(solver: Solver, problem: Any) -> Spare | None:
-    """Return the workspace of an earlier solve that a method has kept, with a problem's data; None if there is none."""
-    # of `KeepsWorkspace`; to look a protocol up takes a twentieth of a small solve
+    """Return a workspace of an earlier solve with a problem's data, or None.
+
+    The method must have kept one.
+    """
+    # A test for the protocol `KeepsWorkspace` would take a twentieth of a small solve.
     lend = getattr(solver, "spare", None)
     return None if lend is None else lend(problem)
 
@@ -303,7 +325,10 @@ def solve(
     workspace: Workspace | None = None,
     callback: Callable[[Record], None] | None = None,
 ) -> SolveResult:
-    """Solve a problem by a method; what `wl.solve` documents, for callers that bring the method themselves."""
+    """Solve a problem by a given method.
+
+    See `wl.solve`; this function is for callers that choose the method themselves.
+    """
     if not isinstance(problem, (LCP, VariationalInequality)):
         raise ValueError(f"problem is a {type(problem).__name__}: expected an LCP")
     if isinstance(solver, type) or not (hasattr(solver, "init") and hasattr(solver, "step")):
@@ -338,7 +363,9 @@ def solve(
 def refusal(
     problem: LCP | VariationalInequality, solver: Solver, *, preconditioned: bool = True
 ) -> str | None:
-    """Return why a method does not take a problem, whatever its operator; None if it does.
+    """Return the reason why a method does not take a problem, None if it does.
+
+    The operator is not examined.
 
     Args:
         problem: the problem.
@@ -372,7 +399,11 @@ def refusal(
 
 
 def _checked(work: Any, problem: Any, solver: Solver) -> Workspace:
-    """Return a workspace that a caller brought, if it is one, and that of this problem and method."""
+    """Return a caller's workspace if it fits the problem and the method.
+
+    Raises:
+        ValueError: it does not.
+    """
     name = type(solver).__name__
     if isinstance(work, type) or not all(
         hasattr(work, part) for part in ("problem", "x", "residual", "start")
@@ -397,10 +428,13 @@ def _checked(work: Any, problem: Any, solver: Solver) -> Workspace:
 
 @cache
 def _workspaces_of(method: type) -> tuple[type, ...]:
-    """Return the kinds of workspace that a method's `init` says it returns, none where it does not say."""
+    """Return the types of workspace in the annotation of a method's `init`.
+
+    Empty if there is no annotation.
+    """
     try:
         hint = get_type_hints(method.init).get("return")  # type: ignore[attr-defined]
-    except NameError:  # a user's method, with names that are there for type checkers only
+    except NameError:  # a user's method, with names that exist for type checkers only
         return ()
     return tuple(
         kind
@@ -410,7 +444,7 @@ def _workspaces_of(method: type) -> tuple[type, ...]:
 
 
 def takes_floating(workspace: Workspace) -> bool:
-    """Return whether `start` of a workspace takes the operator's floating components."""
+    """Return whether a workspace's `start` accepts floating components."""
     return _takes_floating(type(workspace))
 
 
@@ -420,7 +454,7 @@ def _takes_floating(workspace: type) -> bool:
 
 
 class _Loop:
-    """The state of one solve."""
+    """State of one solve."""
 
     def __init__(
         self,
@@ -453,7 +487,7 @@ class _Loop:
         self.best_method = self.name
 
     def run(self, x0: Array | None) -> SolveResult:
-        """Solve from where the workspace's iterate is, from x0 or, in a box, from clip(0, l, u)."""
+        """Solve from the current iterate, from x0 or, in a box, from clip(0, l, u)."""
         ended = self._begin(x0)
         if ended is not None:
             return self._finish(ended, 0)
@@ -465,7 +499,7 @@ class _Loop:
                     and self.stopping.max_iterations > 0
                 )
                 return self._iterate(None if wanted and not self.stopped else self._status(0, None))
-        except TimeIsUp:  # within a step, of which nothing is left
+        except TimeIsUp:  # the current step is discarded
             self._restore()
             ended = (
                 self._solved() if self.residual.norm <= self.tolerance else SolveStatus.TIME_LIMIT
@@ -473,7 +507,10 @@ class _Loop:
             return self._finish(ended, self.history[-1].iteration)
 
     def _begin(self, x0: Array | None) -> SolveStatus | None:
-        """Evaluate the residual at the start; return the status if there is nothing to solve."""
+        """Evaluate the residual at the start.
+
+        Returns the status if there is nothing to solve, else None.
+        """
         if x0 is not None:
             self.work.x.assign(x0)
         self.warm = True
@@ -483,13 +520,17 @@ class _Loop:
         return None if math.isfinite(self.reference) else SolveStatus.NON_FINITE
 
     def _begun_in_place(self) -> float | None:
-        """Begin on the device where the iterate is; return the residual there, None where it has not begun."""
+        """Begin on the device at the current iterate.
+
+        Returns the residual there, None if the device has not begun.
+        """
         return self._begin_ahead(None)
 
     def _begin_ahead(self, x0: Array | None) -> float | None:
-        """Let the device begin, where a workspace lets it take steps without the host; return as `BeginsAhead.begin_ahead`.
+        """Begin a solve on the device if the workspace supports that.
 
-        With a callback, merits or a deadline the host takes each step.
+        Returns the value of `BeginsAhead.begin_ahead`. With a callback, merits or a deadline the
+        host takes each step.
         """
         work: Any = self.work
         if not hasattr(work, "begin_ahead"):
@@ -503,13 +544,14 @@ class _Loop:
         )
 
     def _refer(self, reference: float | None = None) -> None:
-        """Take the residual at the start that tolerances refer to; None: that of the iterate."""
+        """Set the residual that tolerances refer to; None: that of the iterate."""
         self.reference = self.residual.evaluate(self.work.x) if reference is None else reference
         if isinstance(self.criteria, MeanCriteria):
             self.stopping = self.criteria.known()
         self.tolerance = self.stopping.tolerance(self.reference)
 
     def _iterate(self, status: SolveStatus | None) -> SolveResult:
+        """Take steps until a status ends the solve."""
         iteration = 0
         while status is None:
             self.residual.current = False
@@ -535,7 +577,7 @@ class _Loop:
     def _status(
         self, iteration: int, failure: SolveStatus | None, *, interim: bool = False
     ) -> SolveStatus | None:
-        """Return how the solve ends now, None if it goes on."""
+        """Return the status with which the solve ends now, None if it goes on."""
         norm, first = self.residual.norm, max(self.history[0].residual, self.reference)
         if self.stopped and self.tolerance < norm < math.inf:
             return SolveStatus.STOPPED
@@ -549,7 +591,7 @@ class _Loop:
         return self._solved() if status is SolveStatus.CONVERGED else late
 
     def _solved(self) -> SolveStatus:
-        """Return CONVERGED, or FLOOR where the tolerance is below what storing A in float32 has changed."""
+        """Return CONVERGED, or FLOOR for a tolerance below the storage rounding of A."""
         A, share = (
             getattr(self.problem, "A", None),
             self.tolerance / max(self.reference, self.tolerance, SMALLEST),
@@ -557,10 +599,10 @@ class _Loop:
         return SolveStatus.FLOOR if asks_beyond_storage(A, share) else SolveStatus.CONVERGED
 
     def _floor_or(self, status: SolveStatus) -> SolveStatus:
-        """Return FLOOR where the best iterate's residual is what rounding leaves, else the status: the solve ends with it.
+        """Return FLOOR if the best residual is at its rounding floor, else the status.
 
-        A proof that there is no solution stays one: iterates that leave for infinity have any
-        rounding.
+        The solve ends with it. A proof that there is no solution is kept: the rounding errors of
+        divergent iterates are arbitrary.
         """
         if self.best_iteration != self.history[-1].iteration:
             self.work.restore()
@@ -574,6 +616,7 @@ class _Loop:
         )
 
     def _record(self, iteration: int, step: Step) -> None:
+        """Append a record to the history and call the callback."""
         seconds = time.perf_counter() - self.begun
         method = step.method or self.name
         record = Record(
@@ -594,26 +637,27 @@ class _Loop:
                 self.stopped = True
 
     def _merits(self) -> Merits | None:
-        """Return the merit functions at the iterate, if they are asked for."""
+        """Return the merit functions at the iterate, None if they are not requested."""
         return None
 
     def _keep(self, iteration: int) -> None:
-        """Remember the iterate as the best one."""
+        """Store the iterate as the best one."""
         self.work.keep()
         self.best_iteration, self.best_norm = iteration, self.residual.norm
         self.best_method = self.history[-1].method or self.name
 
     def _restore(self) -> None:
-        """Take the best iterate back."""
+        """Set the iterate to the best one."""
         self.work.restore()
         self.residual.evaluate(self.work.x)
 
     def _finish(self, status: SolveStatus, iterations: int) -> SolveResult:
+        """Return the result, at the best iterate."""
         if self.best_iteration != iterations or not math.isfinite(self.residual.norm):
             self._restore()
         norm = self.residual.norm
         relative = norm / self.reference if self.reference > 0 else 0.0
-        of: dict[str, Any] = {"method": self.best_method, "problem": self.problem}
+        origin: dict[str, Any] = {"method": self.best_method, "problem": self.problem}
         version = version_of(self.problem.A) if isinstance(self.problem, LCP) else None
         return SolveResult(
             self._found(),
@@ -623,23 +667,26 @@ class _Loop:
             norm,
             relative,
             self.history,
-            **of,
+            **origin,
             version=version,
         )
 
     def _found(self) -> wp.array[Any]:
-        """Return x as the result has it: in place."""
+        """Return the x of the result: the iterate in place."""
         return self.work.x
 
 
 class _LoopInBox(_Loop):
-    """The state of a solve of an LCP."""
+    """State of a solve of an LCP."""
 
     problem: LCP
-    _y: wp.array[Any] | None = None  # of merit functions
+    _y: wp.array[Any] | None = None  # A x + b for merit functions
 
     def _begin(self, x0: Array | None) -> SolveStatus | None:
-        """Start from clip(0, l, u), whose residual is what a tolerance is relative to, and go on from x0."""
+        """Start from clip(0, l, u), and go on from x0.
+
+        A relative tolerance refers to the residual at clip(0, l, u).
+        """
         reference = self._begin_ahead(x0)
         if reference is not None:
             self.warm = True
@@ -670,7 +717,7 @@ class _LoopInBox(_Loop):
             else None
         )
         self.floating = floating
-        lost = (
+        unattainable = (
             floating.unattainable(self.problem.b, self.problem.lower, self.problem.upper)
             if floating
             else residual.unattainable()
@@ -682,10 +729,10 @@ class _LoopInBox(_Loop):
             residual.evaluate(self.work.x)
         self._record(0, Step("start", 0))
         self._keep(0)
-        return SolveStatus.INFEASIBLE if lost > self.tolerance else None
+        return SolveStatus.INFEASIBLE if unattainable > self.tolerance else None
 
     def _merits(self) -> Merits | None:
-        """Return the merit functions at the iterate, if they are asked for."""
+        """Return the merit functions at the iterate, None if they are not requested."""
         if not self.stopping.merits:
             return None
         if self._y is None:
@@ -693,12 +740,16 @@ class _LoopInBox(_Loop):
         return merits_at(self.problem, self.work.x, self._y)
 
     def _trivial(self) -> SolveStatus | None:
-        """Return how a solve ends whose data are not finite or solved by the start; refuse what would seem so."""
+        """Return the status of a solve that ends at its start, None if it goes on.
+
+        Data that are not finite, or that the start solves. Refuses data so small that every x would
+        seem to be a solution.
+        """
         if not math.isfinite(self.reference) or not math.isfinite(self.residual.norm_of_b()):
             self._refuse_unrepresentable()
             return SolveStatus.NON_FINITE
         self._refuse_vanishing()
-        # implied by the rule for rows where x = 0, and cheap
+        # The rule for rows implies this where x = 0, and it is cheap.
         small = self.reference <= 4 * EPS * self.residual.norm_of_b()
         return SolveStatus.CONVERGED if small and self.residual.is_rounding(self.work.x) else None
 
@@ -714,7 +765,10 @@ class _LoopInBox(_Loop):
                 )
 
     def _refuse_vanishing(self) -> None:
-        """Refuse data so small that squares of residuals are 0: anything would look like a solution."""
+        """Refuse data so small that squares of residuals underflow.
+
+        Every x would then seem to be a solution.
+        """
         if (
             max(self.reference, self.stopping.atol) >= SMALLEST
             or self.residual.norm_of_b() >= SMALLEST
@@ -750,7 +804,7 @@ class _LoopInBox(_Loop):
             raise ValueError("x0 gives a residual that is not finite")
 
     def _found(self) -> wp.array[Any]:
-        """Return x in the layout that the problem was given in, rounded to its precision."""
+        """Return x in the problem's original layout, rounded to its precision."""
         layout, x = self.problem.layout, self.work.x
         if self.problem.in_place and hasattr(self.work, "solution"):
             return self.work.solution()

@@ -1,4 +1,7 @@
-"""Workspace that is kept between solves: cold solves of problems of one form allocate and record their launches once."""
+"""Workspace that is kept between solves.
+
+Cold solves of problems of one form allocate memory and record their launches only once.
+"""
 
 from __future__ import annotations
 
@@ -12,14 +15,14 @@ from warp_lcp.problem.result import SolveResult, SolveStatus
 from warp_lcp.problem.solve import Solver
 from warp_lcp.rows.team import get_threads, team
 
-# of a workspace that is kept, with ghost cells: 45 bytes each, 140 in float64 with fields of faces
-# and bounds
+# Largest workspace that is kept, in cells with ghost cells: 45 bytes each, 140 in float64 with
+# fields of faces and bounds.
 MOST_CELLS = 3 << 17
 
 
 @dataclass(frozen=True)
 class SpareWorkspace:
-    """A workspace with a problem of its own, a copy that takes the data of others.
+    """A workspace with its own problem, into which other problems are copied.
 
     Args:
         form: of problems and settings that it serves.
@@ -30,7 +33,10 @@ class SpareWorkspace:
     work: Any
 
     def give_back(self, result: SolveResult) -> None:
-        """Keep it for the next solve, unless the solve has failed or the result's x lies in its memory."""
+        """Keep the workspace for the next solve.
+
+        Not if the solve has failed, or the result's x lies in the workspace's memory.
+        """
         x = self.work.x
         within = x.ptr <= result.x.ptr < x.ptr + x.capacity
         if result.status is SolveStatus.CONVERGED and not within:
@@ -39,7 +45,7 @@ class SpareWorkspace:
 
 
 class Kept:
-    """The one workspace that is kept, and the form of the last cold solve."""
+    """Storage of the one kept workspace, and of the form of the last cold solve."""
 
     def __init__(self) -> None:
         self.lock = threading.Lock()
@@ -47,27 +53,31 @@ class Kept:
         self.last: Hashable = None
 
     def take(self, form: Hashable) -> tuple[SpareWorkspace | None, bool]:
-        """Return the workspace of a form, which is no longer kept, and whether the last solve had that form, too."""
+        """Remove and return the workspace of a form, None if another is kept.
+
+        Also returns whether the last solve had the same form.
+        """
         with self.lock:
-            found, again = self.workspace, self.last == form
+            workspace, again = self.workspace, self.last == form
             self.last = form
-            if found is None or (found.form != form and not again):
+            if workspace is None or (workspace.form != form and not again):
                 return None, again
             self.workspace = None
-            return (found if found.form == form else None), again
+            return (workspace if workspace.form == form else None), again
 
 
 KEPT = Kept()
 
 
 def lend(problem: LCP, solver: Solver) -> SpareWorkspace | None:
-    """Return a workspace with a problem's data: the one that is kept, or at the second solve in succession of a form a new one.
+    """Return a kept or new workspace with a problem's data, or None.
 
-    Results have the bits of a new workspace. None: a problem of this form has no copies (GPUs,
-    ranks, fields that are used in place, large grids), or is the first.
+    The kept one, or at the second consecutive solve of a form a new one. Results have the same bits
+    as with a new workspace. None: a problem of this form has no copies (GPUs, ranks, fields that
+    are used in place, large grids), or it is the first solve of its form.
 
     Args:
-        problem: whose data it takes.
+        problem: whose data are copied.
         solver: the method, with its settings.
     """
     form = problem.form if problem.layout.size <= MOST_CELLS else None
@@ -85,10 +95,10 @@ def release_workspace() -> None:
     """Free the workspace that `wl.solve` keeps.
 
     `wl.solve` with `ProjectedMultigrid` and without a `workspace` keeps its workspace from the
-    second solve in succession on of a form: the same shape, types, settings, threads and kinds of
-    bounds and coefficients. The next solve of this form copies its data there, which at 16^3 takes
-    half the time of a new workspace, and returns the same bits. One workspace is kept, of at most
-    393,216 cells on the CPU: 16 MiB, 52 MiB at most.
+    second consecutive solve of a form on. A form is the shape, types, settings, threads and kinds
+    of bounds and coefficients. The next solve of this form copies its data there, which at 16^3
+    takes half the time of a new workspace, and returns the same bits. One workspace is kept, of at
+    most 393,216 cells on the CPU: 16 MiB, at most 52 MiB.
 
     Example:
         >>> import warp_lcp as wl

@@ -1,4 +1,4 @@
-"""When an iteration may stop."""
+"""Stopping criteria of solves."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ class StoppingCriteria(Settings):
     Args:
         rtol: relative tolerance, in [0, 1).
         atol: absolute tolerance >= 0, in the units of y.
-        max_iterations: maximum number of steps of the method, >= 0; the limit is honored exactly,
-            by sand's after the ten it takes at once.
+        max_iterations: maximum number of steps of the method, >= 0. The limit is exact; sand checks
+            it after its first ten steps, which it takes at once.
         patience: steps without a new smallest residual after which the solve has stagnated, >= 1.
         divergence: the solve has diverged when the residual exceeds this multiple of the first one,
             > 1.
-        max_seconds: wall time after which the solve ends with TIME_LIMIT, > 0; inf: never. A
-            method's set-up counts. What cannot be interrupted is finished first: a pivot, a sweep,
-            an iteration of a linear solve, a factorization, PIQP's one call, and on CUDA a whole
-            linear solve. On ranks all stop as soon as the time is up on one.
+        max_seconds: wall time after which the solve ends with TIME_LIMIT, > 0; inf: never. The
+            set-up of a method counts. Operations that cannot be interrupted are finished first: a
+            pivot, a sweep, an iteration of a linear solve, a factorization, PIQP's one call, and on
+            CUDA a whole linear solve. On ranks all stop as soon as the time is up on one.
         merits: record the book's merit functions in the history as well (`Record.merits`), by one
-            more product with A a step; no criteria.
+            more product with A a step; they are no criteria.
 
     Example:
         >>> StoppingCriteria(rtol=1e-3, atol=1e-2).tolerance(5.0)
@@ -90,14 +90,16 @@ class StoppingCriteria(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class MeanCriteria:
-    """Criteria by the root mean square over the unknowns, which a device may still be counting when the solve begins.
+    """Criteria by the root mean square over the unknowns.
+
+    A device may still be counting the unknowns when the solve begins.
 
     Args:
         rtol: as of `StoppingCriteria`.
         atol: of the root mean square of the residual over the unknowns, units of y.
         max_iterations: as of `StoppingCriteria`.
         count: returns the number of unknowns, and waits for the device.
-        counted: where it will be on the device, shape (1,), float64.
+        counted: that number on the device, shape (1,), float64.
     """
 
     rtol: float
@@ -107,7 +109,7 @@ class MeanCriteria:
     counted: wp.array[Any] | None = None
 
     def known(self) -> StoppingCriteria:
-        """Return the criteria for the unknowns as counted, once."""
+        """Return the criteria for the counted unknowns, computed once."""
         return self._known
 
     @cached_property
@@ -119,12 +121,12 @@ class MeanCriteria:
 
 @cache
 def limit_of_steps(max_iterations: int) -> StoppingCriteria:
-    """Return criteria that say only how many steps are allowed."""
+    """Return criteria with a limit of steps alone."""
     return StoppingCriteria(max_iterations=max_iterations)
 
 
 def check_criteria(stopping: object) -> None:
-    """Raise ValueError for stopping criteria of another kind, say a bare tolerance."""
+    """Raise ValueError for stopping criteria of another kind, for example a number."""
     if not (stopping is None or isinstance(stopping, (StoppingCriteria, MeanCriteria))):
         raise ValueError(
             f"stopping is a {type(stopping).__name__}: expected StoppingCriteria(rtol=...)"

@@ -1,1 +1,4 @@
-"""What Newton-type and pivoting methods solve within a step: systems on the free unknowns, dense problems, nonsmooth maps."""
+"""Subproblems of Newton-type and pivoting methods.
+
+Systems on the free unknowns, dense problems, nonsmooth maps.
+"""

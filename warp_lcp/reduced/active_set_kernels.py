@@ -1,4 +1,4 @@
-"""Kernels that find free sets, make right-hand sides on them, and move along projected steps."""
+"""Kernels of active sets: classification, right-hand sides, projected steps."""
 
 from __future__ import annotations
 
@@ -30,7 +30,11 @@ def projected_move(
     kept: Any = None,
     guarded: bool = True,
 ) -> None:
-    """Set `to` = clip(x + length along, l, u) where the direction is not 0; see `active_set.h`."""
+    """Set `to` = clip(x + length along, l, u) where the direction is not 0.
+
+    With `z`, the direction z + beta along first replaces `along`. `kept` receives x. If `guarded`,
+    an x whose step is not finite stays unchanged. See `active_set.h`.
+    """
     STEP.bind(
         rows,
         bounds=bounds,

@@ -1,4 +1,4 @@
-"""Principal system of a narrow sparse matrix: band factors of the free block, on the host."""
+"""Principal system of a narrow sparse matrix: band factors on the host."""
 
 from __future__ import annotations
 
@@ -10,12 +10,15 @@ import warp as wp
 from warp_lcp.operators.banded_matrix import BandedMatrix, bands_of
 from warp_lcp.operators.sparse import SparseOperator
 
-# shifts of a singular banded block, in units of the matrix's largest column sum
+# Shifts of a singular banded block, in units of the matrix's largest column sum.
 NUDGES = (0.0, 1e-12, 1e-9, 1e-6)
 
 
 class BandedSystem:
-    """Band LU factors of the free block of a narrow sparse matrix, on the host; slightly shifted where it is singular."""
+    """Band LU factors of the free block of a narrow sparse matrix, on the host.
+
+    A singular block is slightly shifted.
+    """
 
     def __init__(self, A: SparseOperator) -> None:
         self._A, self._version = A, -1
@@ -31,16 +34,16 @@ class BandedSystem:
             )
 
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
-        """Take another free set and shift."""
+        """Set another free set and shift."""
         self._free = free.numpy() != 0
         self._shift = 0.0 if shift is None else np.where(self._free, shift.numpy(), 0.0)
 
     def norm(self) -> float:
-        """Return ||r||, plain for matrices solved directly."""
+        """Return ||r||, unweighted for matrices that are solved directly."""
         return float(np.linalg.norm(self.r.numpy()))
 
     def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
-        """Factor the free block and solve, whatever the tolerance."""
+        """Factor the free block and solve; the tolerance is not used."""
         A, r, free = self._matrix, self.r.numpy(), self._free
         for nudge in NUDGES:
             e = A.solve(free, r, self._shift + nudge * A.size)

@@ -1,7 +1,7 @@
-"""Problems on coarse points and grids that move the active set of Newton's method on the minimum map.
+"""Coarse problems that move the active set of Newton's method.
 
-Full approximation corrections (Brandt and Cryer 1983): the coarse problem has the bounds that x
-leaves to its points.
+For the minimum map, on coarse points or grids. Full approximation corrections (Brandt and Cryer
+1983): the bounds of the coarse problem are the distances of x to its bounds at the coarse points.
 """
 
 from __future__ import annotations
@@ -22,21 +22,23 @@ from warp_lcp.problem.solve import solve
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.reduced.line_system import LineSystem
 
-# of a correction that interpolation blurs by a layer or two anyway
+# Accuracy of a correction; interpolation blurs it by one or two layers anyway.
 ROUGH = partial(StoppingCriteria, rtol=1e-2, max_iterations=30)
-# a set creeps while more than this share of what the last step moved moves again: at that rate a
-# dozen steps or more are still to come, and a first correction costs as much as those
+# The active set creeps while a step moves more than this share of the unknowns that the last step
+# moved. At that rate a dozen steps or more are still to come, and a first correction costs as much
+# as those.
 CREEP = 0.92
-STEPS = 3  # of creeping before the correction
+STEPS = 3  # creeping steps before the correction
 
 
 class CoarseProblem:
-    """Solves for the correction P e of an x: P'A P e + P'(A x + b), with the bounds that x leaves to the coarse points.
+    """Solve for a correction P e of x on coarse points: P'A P e + P'(A x + b).
 
-    Those are unknowns of the fine problem, so that an obstacle's corners stay where they are, and
-    unknowns at their bounds stay there until the correction says otherwise: the contact's boundary
-    moves as far as it must at once, where Newton's own step moves it by a layer of unknowns. The
-    coarse problem is solved by Newton's method too, which begins with a coarse problem of its own.
+    The bounds of e are those that x leaves at the coarse points. These are unknowns of the fine
+    problem, so that an obstacle's corners stay where they are, and unknowns at their bounds stay
+    there unless the correction moves them. The boundary of the contact moves as far as it must at
+    once, where Newton's own step moves it by one layer of unknowns. The coarse problem is solved by
+    Newton's method too, which begins with a coarse problem of its own.
 
     Args:
         A: the matrix.
@@ -51,11 +53,15 @@ class CoarseProblem:
         self.start()
 
     def start(self) -> None:
-        """Forget how the set has moved."""
+        """Reset the record of the set's movement."""
         self._moved, self._crept, self._wait = 0.0, STEPS if self._coarse else 0, STEPS
 
     def is_due(self, moved: float) -> bool:
-        """Return whether a correction should come now that another part of the unknowns has moved on or off the active set."""
+        """Return whether a correction should come now.
+
+        `moved` is the number of unknowns that entered or left the active set. A correction comes
+        after several steps in which the set creeps; the wait doubles after each.
+        """
         creeps = self._coarse or moved > CREEP * self._moved > 0
         self._moved, self._crept = moved, self._crept + 1 if creeps else 0
         if self._crept < self._wait or not self._refresh():
@@ -76,7 +82,7 @@ class CoarseProblem:
         )
 
     def _solved(self, *fields: np.ndarray) -> wp.array[Any]:
-        """Return the coarse problem's rough solution for this b, lower and upper."""
+        """Return a rough solution of the coarse problem for this b, lower and upper."""
         work = self._work
         for field, values in zip(
             (work.problem.b, work.problem.lower, work.problem.upper), fields, strict=True
@@ -85,7 +91,7 @@ class CoarseProblem:
         return solve(work.problem, self._settings, stopping=ROUGH(), workspace=work).x
 
     def _refresh(self) -> bool:
-        """Choose points of A as it is now, if it has changed since; return whether there are any."""
+        """Choose coarse points if A has changed; return whether there are any."""
         if self._version == self._A.version:
             return self._work is not None
         self._version, self._work, host = self._A.version, None, self._A.matrix()
@@ -102,11 +108,12 @@ class CoarseProblem:
 
 
 class CoarseStencilProblem(CoarseProblem):
-    """The same on every second cell of a compact stencil's grid, with the transfers of its hierarchy; each solve begins with a correction.
+    """Coarse problem on every second cell of a compact stencil's grid.
 
-    With coarse problems on all levels that is nested iteration: Newton's steps then start with a
-    contact that is right but for a layer or two of cells, cold or from another time step's
-    solution, and come to the end in as many as a linear solve takes.
+    It uses the transfers of the stencil's hierarchy; each solve begins with a correction. With
+    coarse problems on all levels the method is a nested iteration. Newton's steps then start with a
+    contact that is right except for one or two layers of cells, also from a cold start or from
+    another time step's solution. They need no more steps than a linear solve.
 
     Args:
         A: the operator.
@@ -119,7 +126,7 @@ class CoarseStencilProblem(CoarseProblem):
         super().__init__(A, settings)
 
     def start(self) -> None:
-        """A correction is due at once, others where the set creeps."""
+        """Reset: a correction is due at once, others where the set creeps."""
         self._moved, self._crept, self._wait, self._begins = 0.0, 0, STEPS, True
 
     def is_due(self, moved: float) -> bool:
@@ -130,7 +137,11 @@ class CoarseStencilProblem(CoarseProblem):
         return self._refresh()
 
     def correction(self, problem: LCP, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return P e for the problem at x, where A x + b = y."""
+        """Return P e for the problem at x, where A x + b = y.
+
+        The residual is restricted to the coarse grid in units of its largest entry, which float32
+        can hold; the solution is interpolated back.
+        """
         hierarchy, kind = self._hierarchy, self._hierarchy.finest.t.dtype
         hierarchy.take_all(self._free)
         fine, coarse, size = hierarchy.finest, hierarchy.levels[1], float(np.abs(y).max()) or 1.0
@@ -148,14 +159,14 @@ class CoarseStencilProblem(CoarseProblem):
         return size * fine.x.numpy().astype(np.float64)
 
     def _points(self, field: np.ndarray) -> np.ndarray:  # type: ignore[override]
-        """Return the coarse cells' values of a stored field, as a stored field."""
+        """Return the values of a stored field at the coarse cells, as a stored field."""
         fine, coarse = self._hierarchy.levels[:2]
         values, (fx, fy) = np.zeros(coarse.padding.shape), fine.factors
         values[1:-1, 1:-1, 1:-1] = field.reshape(fine.padding.shape)[1:-1, 1:-1:fy, 1:-1:fx]
         return values.ravel()
 
     def _refresh(self) -> bool:
-        """Make the coarse problem of A as it is now, if it has changed since; return whether there is one."""
+        """Create the coarse problem if A has changed; return whether there is one."""
         if self._version == self._A.version or len(self._hierarchy.levels) < 2:
             return self._work is not None
         self._version, hierarchy = self._A.version, self._hierarchy

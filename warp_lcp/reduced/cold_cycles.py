@@ -1,4 +1,7 @@
-"""Projected multigrid cycles with which Newton's method begins a cold start, on a grid or on the aggregates of a sparse matrix."""
+"""Projected multigrid cycles of a cold start of Newton's method.
+
+On a grid, or on the aggregates of a sparse matrix.
+"""
 
 from __future__ import annotations
 
@@ -14,19 +17,19 @@ from warp_lcp.reduced.active_set_kernels import projected_move
 from warp_lcp.reduced.grid_system import GridSystem, projected_cycle
 from warp_lcp.rows.vectors import Sums
 
-LARGE = 1000  # unknowns from which a cold start on a sparse matrix takes projected cycles
-# unknowns from which that is six cycles for each on a grid: one costs a fifth of a Newton step,
-# which moves the set by a row, and rows are many. With 4, 8, 16 and 32 cycles a membrane on 600,000
-# nodes takes 16, 15, 12 and 6 Newton steps, 7.0, 5.4, 4.8 and 4.4 s
+LARGE = 1000  # least number of unknowns of a sparse matrix for projected cycles at a cold start
+# From this number of unknowns on, six cycles replace each cycle on a grid. One costs a fifth of a
+# Newton step, which moves the set by one of many rows. With 4, 8, 16 and 32 cycles a membrane on
+# 600,000 nodes takes 16, 15, 12 and 6 Newton steps, 7.0, 5.4, 4.8 and 4.4 s.
 HUGE = 1 << 16
-# growth of the residual by which a projected cycle on an operator that is not symmetric is undone,
-# on a grid over the last one's, on a matrix over the start's: torsion with wind on 250^2 nodes
-# takes it to 11 times that, and the more nodes the more, to good effect
+# Growth of the residual from which a projected cycle on an unsymmetric operator is undone: on a
+# grid relative to the residual before the cycle, on a matrix to that at the start. Torsion with
+# wind on 250^2 nodes raises it to 11 times that, and more with more nodes, which still helps.
 RISEN, RISEN_ON_MATRIX = 10.0, 1000.0
 
 
 class GridCycles:
-    """Cycles of a grid's hierarchy.
+    """Projected cycles of a grid's hierarchy.
 
     Args:
         problem: of a grid.
@@ -41,19 +44,19 @@ class GridCycles:
         self._problem, self._system, self._sums, self._count = problem, system, sums, count
 
     def begin(self) -> int:
-        """Return how many cycles a cold start takes."""
+        """Return the number of cycles of a cold start."""
         return self._count
 
     def run(
         self, x: wp.array[Any], residual: NaturalResidual, free: wp.array[Any], *, restrict: bool
     ) -> float:
-        """Move x by a cycle on all unknowns; return up to which residual it may stand.
+        """Move x by a cycle on all unknowns; return the largest acceptable residual.
 
         Args:
             x: the iterate.
-            residual: there.
+            residual: at x.
             free: becomes the set of all unknowns.
-            restrict: whether the system does not have all unknowns yet.
+            restrict: whether the system must be restricted to all unknowns first.
         """
         p, system, sums, size = self._problem, self._system, self._sums, residual.norm
         projected_cycle(p, system, x, residual.y, size, free, sums, restrict=restrict)
@@ -62,7 +65,9 @@ class GridCycles:
 
 
 class AggregateCycles:
-    """Cycles on the aggregates of a large sparse matrix that is nearly a diagonally dominant M-matrix.
+    """Projected cycles on the aggregates of a large sparse matrix.
+
+    The matrix must be nearly a diagonally dominant M-matrix.
 
     Args:
         problem: with a sparse matrix.
@@ -81,7 +86,7 @@ class AggregateCycles:
         )
 
     def begin(self) -> int:
-        """Return how many cycles a cold start takes, 0 if A is another matrix."""
+        """Return the number of cycles of a cold start, 0 if A is unsuitable."""
         self._at_start = 0.0
         if not (self._count > 0 and self._aggregation.refresh()):
             return 0
@@ -90,7 +95,7 @@ class AggregateCycles:
     def run(
         self, x: wp.array[Any], residual: NaturalResidual, free: wp.array[Any], *, restrict: bool
     ) -> float:
-        """Move x by a cycle on all unknowns; return up to which residual it may stand."""
+        """Move x by a cycle on all unknowns; return the largest acceptable residual."""
         p = self._problem
         self._at_start = self._at_start or residual.norm
         self._aggregation.cycle(x, p.b, p.lower, p.upper)
@@ -100,7 +105,7 @@ class AggregateCycles:
 def cold_cycles(
     problem: LCP, system: Any, sums: Sums, count: int
 ) -> GridCycles | AggregateCycles | None:
-    """Return the cycles for a problem with bounds; None where its operator has none."""
+    """Return the cycles for a bounded problem, None for unsuitable operators."""
     if not problem.bounded:
         return None
     if isinstance(system, GridSystem):

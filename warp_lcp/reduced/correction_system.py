@@ -1,4 +1,7 @@
-"""Reduced system of any operator: a principal system gives a correction, along which the iterate moves."""
+"""Reduced system of any operator, with a stored correction.
+
+A principal system is solved for the correction, along which the iterate moves.
+"""
 
 from __future__ import annotations
 
@@ -26,10 +29,11 @@ from warp_lcp.rows.vectors import Sums, rows_of
 
 
 class CorrectionSystem:
-    """Newton's equations by a principal system, see `ReducedSystem`: of a grid, a matrix, a sum with a term of low rank, products only.
+    """Newton's equations solved by a principal system, see `ReducedSystem`.
 
-    Fields of one size: the equations are divided by the residual's norm, so that corrections in
-    float32 neither overflow nor vanish.
+    For grids, matrices, sums with a term of low rank, and operators with products only. The
+    equations are divided by the residual's norm, so that corrections in float32 neither overflow
+    nor vanish.
 
     Args:
         problem: the problem.
@@ -39,15 +43,14 @@ class CorrectionSystem:
     Attributes:
         principal: solves on free sets, for the correction `e`.
         free: the free set, stored uint8 field.
-        active: unknowns held.
-        moved: unknowns by which the free set differs from the last one.
-        size: what the equations are divided by: the residual's norm where the step begins.
+        active: number of held unknowns.
+        moved: number of unknowns by which the free set differs from the last one.
+        size: divisor of the equations: the residual's norm at the start of the step.
         start_of_step: stored field; x with held unknowns on their bounds, once `move` has been
             called.
-        cycles: projected cycles of a cold start; None: there are none.
-        coarse: problem on coarse unknowns that moves an active set which creeps; None: there is
-            none.
-        damped: Levenberg-Marquardt steps of dense problems; None: there are none.
+        cycles: projected cycles of a cold start; None if not available.
+        coarse: problem on coarse unknowns that moves a creeping active set; None if not available.
+        damped: Levenberg-Marquardt steps of dense problems; None for other problems.
     """
 
     whole = False
@@ -76,7 +79,7 @@ class CorrectionSystem:
     def start(
         self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
     ) -> None:
-        """Forget the active set; the operator may have changed."""
+        """Reset the active set; the operator may have changed."""
         self.floating, self._target = floating, tolerance
         self._cycles_left = self.cycles.begin() if self.cycles is not None and not warm else 0
         for part in (self.coarse, self.damped):
@@ -84,26 +87,29 @@ class CorrectionSystem:
                 part.start()
         self.free.zero_()
         self._stale = True  # whether the principal system has another free set
-        # with an M-matrix each active set of whole steps is part of the one before, whatever the
-        # residual does
+        # With an M-matrix, the active set of each whole step is part of the one before, whether the
+        # residual rises or falls.
         self._monotone = (
             isinstance(self.principal, SparseSystem)
             and self.principal.cycled
             and not self._problem.A.symmetric
         )
-        # whether the active set has become smaller; unknowns in the last one
+        # Whether the active set has become smaller; number of unknowns in the last one.
         self._shrinks, self._last_active = False, math.inf
         self.principal.refresh()
 
     def monotone_cycle(self) -> Step | None:
-        """Take a projected cycle while the start is cold."""
+        """Take a projected cycle after a cold start, else return None."""
         if self._cycles_left == 0:
             return None
         self._cycles_left -= 1
         return self._cycle()
 
     def _cycle(self) -> Step:
-        """Projected cycle on all unknowns; undone where it takes the residual far up, as it may where A is not symmetric."""
+        """Take a projected cycle on all unknowns.
+
+        It is undone if it raises the residual far, as it may where A is not symmetric.
+        """
         x, residual, symmetric = self.iterate.x, self.iterate.residual, self._problem.A.symmetric
         assert self.cycles is not None
         if not symmetric:
@@ -113,13 +119,17 @@ class CorrectionSystem:
         if not symmetric and not residual.evaluate(x) <= most:  # no energy falls there
             wp.copy(x, self.start_of_step)
             self._cycles_left, residual.current = 0, False
-        # A grid's system keeps all unknowns from cycle to cycle; Newton's step takes some out
+        # A grid's system keeps all unknowns from cycle to cycle; Newton's step removes some of them
         # again.
         self._stale = not (self.cycles.repairs and self._cycles_left > 0)
         return Step("monotone cycle", 1, None, interim=True)
 
     def classify(self) -> Step | None:
-        """Find the free set; correct x on coarse unknowns if the active set creeps; end with a proof that equations have no solution."""
+        """Find the free set; return a step that replaces Newton's, or None.
+
+        The step is a correction of x on coarse unknowns if the active set creeps, or the proof that
+        equations have no solution. The pass also writes g = -y / size on the free set.
+        """
         p, residual = self._problem, self.iterate.residual
         if self.damped is not None and self.damped.proves_infeasible(residual.norm, self._target):
             return Step("newton", 0, 0, SolveStatus.INFEASIBLE)
@@ -151,7 +161,10 @@ class CorrectionSystem:
         )
 
     def _coarse_step(self) -> Step:
-        """Correct x, with held unknowns at their bounds, by the coarse problem."""
+        """Correct x by the coarse problem, with held unknowns at their bounds.
+
+        x <- clip(x + P e, l, u).
+        """
         x, residual = self.iterate.x, self.iterate.residual
         assert self.coarse is not None
         residual.affine(x)
@@ -163,7 +176,11 @@ class CorrectionSystem:
         return Step("coarse problem", 1, self.active, interim=True)
 
     def restrict(self) -> bool:
-        """Give the principal system the free set, and the right-hand side with held unknowns on their bounds, where `classify` put them."""
+        """Restrict the principal system to the free set; write its right-hand side.
+
+        Held unknowns are on their bounds, where `classify` has put them. Returns whether the
+        right-hand side is nonzero.
+        """
         residual = self.iterate.residual
         if self.moved or self._stale:
             self.principal.restrict(self.free)
@@ -189,7 +206,7 @@ class CorrectionSystem:
         )[0]
 
     def move(self, length: float) -> float:
-        """Set x this part of the correction from where the step began."""
+        """Set x to clip(x0 + length size e) from the start x0 of the step."""
         check_time()
         x, whole = self.iterate.x, length == 1.0
         self._set(
@@ -202,17 +219,24 @@ class CorrectionSystem:
         return self.iterate.residual.evaluate(x)
 
     def settle(self) -> None:
-        """Choose the constants that a move of x has left open on floating components."""
+        """Choose the constants of floating components, which a move leaves open."""
         if self.floating is not None:
             self.floating.settle(self.iterate.x, self._problem.lower, self._problem.upper)
             self.iterate.round_iterate()
 
     def accept(self, iterations: int) -> Step:
-        """Return the step; on an M-matrix the residual need not fall while the active set shrinks."""
+        """Return the accepted step.
+
+        On an M-matrix the residual need not fall while the active set shrinks.
+        """
         return Step("newton", iterations, self.active, interim=self._shrinks)
 
     def fall_back(self, iterations: int, norms: deque[float], best: float, length: float) -> Step:
-        """Take the best length, and on a grid a projected cycle from there; on dense problems a damped step; or fail."""
+        """Continue after a failed search.
+
+        Takes the best length, and on a grid a projected cycle from there; on dense problems a
+        damped step; else the step fails.
+        """
         x, residual = self.iterate.x, self.iterate.residual
         if not self._settings.safeguard:
             return self._take_back(iterations)
@@ -236,7 +260,7 @@ class CorrectionSystem:
         )
 
     def _take_back(self, iterations: int, name: str = "newton") -> Step:
-        """Go back to where the step began, and fail."""
+        """Return x to the start of the step, and fail."""
         wp.copy(self.iterate.x, self.start_of_step)
         self.iterate.residual.evaluate(self.iterate.x)
         return self._step(name, iterations, SolveStatus.NON_DESCENT)
@@ -247,7 +271,10 @@ class CorrectionSystem:
     def _set(
         self, base: wp.array[Any], e: wp.array[Any], scale: float, kept: wp.array[Any] | None = None
     ) -> None:
-        """Set x = clip(base + scale e), rounded, where e is not 0; remember base if `kept` is given."""
+        """Set x = clip(base + scale e), rounded, where e is not 0.
+
+        If `kept` is given, it receives base.
+        """
         projected_move(
             self.sums.rows,
             self._problem.bounds.operands,
@@ -262,7 +289,10 @@ class CorrectionSystem:
 
 
 def _coarse_problem(problem: LCP, system: Any, settings: Any) -> CoarseProblem | None:
-    """Return the problem on coarse unknowns of a large sparse matrix or a stencil that needs lines, None for other operators."""
+    """Return the coarse problem of an operator, None if it has none.
+
+    A large sparse matrix has one, and a stencil that needs lines.
+    """
     A: Any = problem.A
     if isinstance(system, LineSystem):
         return CoarseStencilProblem(A, system, settings)

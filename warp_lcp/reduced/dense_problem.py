@@ -1,4 +1,7 @@
-"""A small problem as arrays on the host: what the direct methods, which factorize blocks of A, work on."""
+"""A small problem as arrays on the host.
+
+The direct methods, which factorize blocks of A, use it.
+"""
 
 from __future__ import annotations
 
@@ -20,35 +23,36 @@ from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.scale import scale_of_matrix, scaled, sizes_of_matrix
 from warp_lcp.problem.solve import EPS, IterateMemory, Precision, Step
 
-# shift with which an equilibrated semi-definite matrix must have a Cholesky factor
+# Shift with which an equilibrated semi-definite matrix must have a Cholesky factor.
 SEMIDEFINITE = 1e-10
-SIDE = 4096  # unknowns of a dense matrix up to which it is looked at
-# entries of A up to which a linear program is asked whether there is a solution: seconds; with
-# 84,000 and costs from 1e-4 to 1e12 HiGHS (SciPy 1.17) recurses until the process crashes, with
-# 31,000 in none of 20
+SIDE = 4096  # largest number of unknowns of a dense matrix that is examined
+# Largest number of entries of A for a linear program that looks for a proof of infeasibility: it
+# takes seconds. With 84,000 entries and costs from 1e-4 to 1e12 HiGHS (SciPy 1.17) recurses until
+# the process crashes, with 31,000 in none of 20 cases.
 PROVABLE = 40_000
-PROOF_SECONDS = 10.0  # of such a program: one that takes longer proves nothing
-# of such a program, the least that HiGHS takes; its optimum is a vertex, whose equations hold to
-# rounding
+PROOF_SECONDS = 10.0  # time limit of such a program: a longer one proves nothing
+# Tolerance of such a program, the least that HiGHS accepts; its optimum is a vertex, whose
+# equations hold to rounding.
 TOLERANCE = 1e-10
-ROUNDING = 8.0  # times sqrt(k) eps of its terms: a sum of k of them below that may be 0
-LARGEST = float(np.finfo(np.float64).max)  # its costs are finite, whatever the bounds
-REFINEMENTS = 2  # of its optimum
-# of the terms of such an equation, and of the largest multiplier: what its solver leaves of zeros
+ROUNDING = 8.0  # times sqrt(k) eps of its terms: a smaller sum of k terms may be 0
+LARGEST = float(np.finfo(np.float64).max)  # its costs are finite for all bounds
+REFINEMENTS = 2  # refinement steps of its optimum
+# Relative to the terms of such an equation, and to the largest multiplier: residue that the solver
+# leaves of zeros.
 VERTEX = 1e-8
-NULL = 1e-11  # of the terms of A z: below that, rounding of A and of a factorization has made it
-# of the terms of a contradiction, that it must exceed: b = y - A x is rounded where A x cancels
+NULL = 1e-11  # relative to the terms of A z: smaller values are rounding errors
+# Least size of a contradiction relative to its terms: b = y - A x is rounded where A x cancels.
 SHARE = 1e-8
 EQUILIBRATIONS = 8  # sweeps of Ruiz's iteration, which halves the logarithms of rows that differ
-SINGULAR = 1e-13  # of the matrix's largest row sum: a pivot below it is rounding
-# singular values below this part of the largest are zero to least-squares solutions (methods.md:
-# all solved with it)
+SINGULAR = 1e-13  # relative to the matrix's largest row sum: a smaller pivot is rounding
+# Singular values below this part of the largest are zero in least-squares solutions (all measured
+# problems are solved with it).
 RANK = 1e-12
 
 
 @dataclass(frozen=True)
 class DenseProblem:
-    """A problem's unknowns alone, float64.
+    """The unknowns of a problem as float64 arrays on the host.
 
     Attributes:
         rows: index of each unknown in a stored field, shape (n,).
@@ -56,7 +60,7 @@ class DenseProblem:
         b: shape (n,), units of y.
         lower: l, shape (n,).
         upper: u, shape (n,).
-        symmetric: whether A is, and is to stay so in other units.
+        symmetric: whether A is symmetric, and must stay so in other units.
     """
 
     rows: np.ndarray
@@ -68,7 +72,7 @@ class DenseProblem:
 
     @classmethod
     def read(cls, problem: LCP, *, keep_sparse: bool = False) -> DenseProblem:
-        """Copy a problem's data as they are now to the host."""
+        """Copy a problem's current data to the host."""
         problem.bounds.refresh()
         rows = np.flatnonzero(problem.unknown.numpy() == 1)
         b, lower, upper = (
@@ -90,17 +94,18 @@ class DenseProblem:
         return self.A @ x + self.b
 
     def scaled(self) -> tuple[DenseProblem, np.ndarray]:
-        """Return the problem in units in which A's rows and columns have entries near 1, and b too, and those units of x.
+        """Return the problem in units in which A and b have entries near 1.
 
-        With x = beta C x', y = beta R^-1 y' it is R A C, R b / beta and l / (beta C), u / (beta C),
-        of which methods that pivot choose the same pivots but for ties; R = C where A is symmetric.
-        The units are powers of 2, so that nothing is rounded.
+        Returns those units of x, too. With x = beta C x', y = beta R^-1 y' the problem is R A C, R
+        b / beta and l / (beta C), u / (beta C); pivoting methods choose the same pivots for it,
+        except in ties. R = C where A is symmetric. The units are powers of 2, so that nothing is
+        rounded.
         """
         R, C = self._units()
         b, start = R * self.b, R * (self.A @ np.clip(0.0, self.lower, self.upper))
         beta = power_of_two(max(np.abs(b).max(), np.abs(start).max()) or 1.0)
         units = beta * C
-        with np.errstate(over="ignore"):  # a bound beyond all numbers in these units is infinite
+        with np.errstate(over="ignore"):  # a bound that overflows in these units is infinite
             sides = self.lower / units, self.upper / units
         return DenseProblem(
             self.rows, scaled(self.A, R, C), b / beta, *sides, self.symmetric
@@ -118,14 +123,16 @@ class DenseProblem:
         return scale_of_matrix(self.A)
 
     def residual(self, x: np.ndarray) -> float:
-        """Return the norm of the natural residual."""
+        """Return the norm of the natural residual at x."""
         d = self._scale
         return float(
             np.linalg.norm(d * (x - np.clip(x - self.affine(x) / d, self.lower, self.upper)))
         )
 
     def polished(self, x: np.ndarray, free: np.ndarray) -> np.ndarray:
-        """Return x after two Newton steps on the unknowns `free` for y = 0 there; x itself where that is no improvement.
+        """Return x after two Newton steps on the unknowns `free` for y = 0 there.
+
+        Returns x itself if that is no improvement.
 
         Args:
             x: within the bounds, shape (n,).
@@ -145,13 +152,16 @@ class DenseProblem:
 
 
 def sparse_matrix(problem: LCP) -> scipy.sparse.csr_array | None:
-    """Return the matrix of an operator that has sparse rows, None for other operators."""
+    """Return the matrix of an operator with sparse rows, None for other operators."""
     matrix = problem.A.rows().matrix() if has(problem.A, HasRows) else None
     return matrix if scipy.sparse.issparse(matrix) else None
 
 
 def assemble(problem: LCP, rows: np.ndarray) -> np.ndarray:
-    """Return A between the unknowns `rows`, shape (n, n), float64: copied where there are rows, else column by column."""
+    """Return A between the unknowns `rows`, shape (n, n), float64.
+
+    It is copied if the operator gives access to rows, else computed column by column.
+    """
     if has(problem.A, HasRows):
         whole = problem.A.rows().matrix()
         return (whole.toarray() if scipy.sparse.issparse(whole) else whole)[np.ix_(rows, rows)]
@@ -174,13 +184,20 @@ def power_of_two(value: Any) -> Any:
 
 
 def unit_rows_and_columns(A: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return R and C > 0, powers of 2, so that R A C has a largest entry near 1 in each row and in each column, or its diagonal near 1."""
+    """Return R and C > 0, powers of 2, that scale A by rows and columns.
+
+    R A C has a largest entry near 1 in each row and in each column, or its diagonal near 1.
+    """
     _, rows, columns = sizes_of_matrix(A)
     return power_of_two(1 / rows), power_of_two(1 / columns)
 
 
 def equilibration(A: Any) -> np.ndarray:
-    """Return S > 0 so that S A S has a largest entry near 1 in each row and column together (Ruiz's iteration, kept symmetric)."""
+    """Return S > 0 that scales A symmetrically.
+
+    S A S has a largest entry near 1 in each row and column together (Ruiz's iteration, kept
+    symmetric).
+    """
     magnitude, S = abs(A), np.ones(A.shape[0])
     sparse = scipy.sparse.issparse(A)
     for _ in range(EQUILIBRATIONS):
@@ -200,7 +217,7 @@ def equilibration(A: Any) -> np.ndarray:
 
 
 def factored(block: np.ndarray, r: np.ndarray) -> np.ndarray | None:
-    """Return block^-1 r, None where a pivot is so small that the block looks singular."""
+    """Return block^-1 r, None where a small pivot shows that the block is singular."""
     factors, pivots, info = scipy.linalg.lapack.dgetrf(block)
     if info != 0 or np.abs(factors.diagonal()).min() <= SINGULAR * np.abs(block).sum(axis=1).max():
         return None
@@ -217,7 +234,7 @@ def solved_or_none(A: Any, r: np.ndarray) -> np.ndarray | None:
 
 
 def _solved(A: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """Return A^-1 r, the least-squares solution where A is singular."""
+    """Return A^-1 r, or the least-squares solution where A is singular."""
     try:
         return np.linalg.solve(A, r)
     except np.linalg.LinAlgError:
@@ -225,7 +242,10 @@ def _solved(A: np.ndarray, r: np.ndarray) -> np.ndarray:
 
 
 def semidefinite(A: np.ndarray) -> bool:
-    """Return whether A + A' is positive semi-definite, by the Cholesky factor of A slightly shifted."""
+    """Return whether A + A' is positive semi-definite.
+
+    Decided by the Cholesky factor of the equilibrated (A + A') / 2, slightly shifted.
+    """
     S = equilibration(A)
     scaled = S[:, None] * A * S
     try:
@@ -240,7 +260,9 @@ def semidefinite(A: np.ndarray) -> bool:
 
 
 def certifies(data: DenseProblem, z: np.ndarray) -> bool:
-    """Return whether z proves that no x within its bounds gives every y a sign that its bounds allow (Farkas' lemma).
+    """Return whether z proves that the problem has no solution (Farkas' lemma).
+
+    That is: no x within its bounds gives every y a sign that its bounds allow.
 
     A solution has y_i >= 0 where l_i alone is finite, y_i <= 0 where u_i alone is, and y_i = 0
     where neither is. With z_i >= 0, z_i <= 0 and z_i of any sign there, and z_i = 0 where both are
@@ -249,8 +271,8 @@ def certifies(data: DenseProblem, z: np.ndarray) -> bool:
         z'y = b'z + g'x <= b'z + sum_j max(g_j l_j, g_j u_j),
 
     where g_j <= 0 if u_j is infinite, and g_j >= 0 if l_j is: if the right side is negative, there
-    is no solution. A g_j that rounding makes, of the terms a_ij z_i, counts as 0. The right side
-    must be negative by `SHARE` of its terms, so that a solution that rounding of A or b hides has
+    is no solution. A g_j within rounding of its terms a_ij z_i counts as 0. The right side must be
+    negative by `SHARE` of its terms. A solution that is hidden by rounding of A or b therefore has
     terms a_ij x_j that are some 1e8 times as large as b.
 
     Args:
@@ -258,6 +280,7 @@ def certifies(data: DenseProblem, z: np.ndarray) -> bool:
         z: multipliers, shape (n,), of those signs or another vector.
     """
     below, above = np.isfinite(data.lower), np.isfinite(data.upper)
+    # The signs that the multipliers need; other components are set to 0.
     z = np.where(
         below & above,
         0.0,
@@ -265,11 +288,13 @@ def certifies(data: DenseProblem, z: np.ndarray) -> bool:
     )
     magnitude = abs(data.A)
     with np.errstate(over="ignore", invalid="ignore"):
+        # g = A'z; noise is the bound of its rounding error.
         g, terms = data.A.T @ z, magnitude.T @ np.abs(z)
         noise = ROUNDING * np.sqrt(entries_of_columns(data.A)) * EPS * terms
         if (g > noise)[~above].any() or (g < -noise)[~below].any():
             return False
         low, high = np.where(below, data.lower, 0.0), np.where(above, data.upper, 0.0)
+        # sum_j max(g_j l_j, g_j u_j), where g_j has the sign of a finite bound.
         gains = np.maximum(g, 0.0) * high + np.minimum(g, 0.0) * low
         doubt = SHARE * (np.abs(data.b) @ np.abs(z) + np.abs(gains).sum()) + noise @ np.maximum(
             np.abs(low), np.abs(high)
@@ -278,11 +303,12 @@ def certifies(data: DenseProblem, z: np.ndarray) -> bool:
 
 
 def diagonally_dominant(A: Any) -> bool:
-    """Return whether A is diagonally dominant, with a positive diagonal, and every row leads to a strictly dominant one.
+    """Return whether A is diagonally dominant, with a positive diagonal.
 
-    Such a matrix is nonsingular, and a P-matrix: its problem has a solution, whatever b and the
-    bounds are (Cottle, Pang and Stone 1992, section 3.3). Row i leads to row j if a_ij is not 0.
-    Sums of rows are known to rounding; strictly: by `SHARE` of a_ii.
+    Every row must also lead to a strictly dominant one. Such a matrix is nonsingular, and a
+    P-matrix: its problem has a solution for all b and bounds (Cottle, Pang and Stone 1992, section
+    3.3). Row i leads to row j if a_ij is not 0. Sums of rows are known to rounding; strictly: by
+    `SHARE` of a_ii.
 
     Args:
         A: dense or sparse, shape (n, n).
@@ -310,17 +336,19 @@ def diagonally_dominant(A: Any) -> bool:
 
 
 def inconsistent(data: DenseProblem) -> bool:
-    """Return whether it is proved that no solution exists: `certifies` accepts multipliers that a linear program suggests.
+    """Return whether it is proved that no solution exists.
+
+    `certifies` must accept the multipliers of a linear program.
 
     A problem with a positive semi-definite A, symmetric or not, has a solution wherever there is no
-    such proof. The program minimizes the bound of `certifies`, with g = p - q, p, q >= 0, of which
-    p_j is 0 where u_j is infinite, and q_j where l_j is:
+    such proof. The program minimizes the bound of `certifies`, with g = p - q, p, q >= 0, where p_j
+    is 0 if u_j is infinite, and q_j if l_j is:
 
         minimize b'z + u'p - l'q   where A'z = p - q, |z_i| <= 1.
 
-    It is posed in units in which the rows of [A b] have entries near 1, so that a large row hides
-    no other. That a linear program's solver calls the problem infeasible is no proof: its
-    tolerances are absolute.
+    It is stated in units in which the rows of [A b] have entries near 1, so that a large row hides
+    no other. The solver's own verdict that a program is infeasible is no proof: its tolerances are
+    absolute.
     """
     from scipy.optimize import linprog  # a fifth of a second to import, and seldom needed
 
@@ -331,6 +359,7 @@ def inconsistent(data: DenseProblem) -> bool:
         return False
     R, C, beta = _units_with_right_side(A, b)
     up, low = np.flatnonzero(above), np.flatnonzero(below)
+    # The variables are (z, p, q), p where u is finite and q where l is: A'z - p + q = 0.
     identity = scipy.sparse.eye_array(len(data.b), format="csc")
     system = scipy.sparse.hstack(
         [scipy.sparse.csc_array(scaled(A, R, C).T), -identity[:, up], identity[:, low]],
@@ -339,7 +368,7 @@ def inconsistent(data: DenseProblem) -> bool:
     with np.errstate(over="ignore"):  # of bounds near 1e308
         cost = np.concatenate([R * b, data.upper[up] / C[up], -data.lower[low] / C[low]]) / beta
     cost = np.clip(cost, -LARGEST, LARGEST)
-    # HiGHS warns of costs beyond 1e6, and may crash
+    # HiGHS warns of costs beyond 1e6, and may crash.
     cost = cost * 2.0 ** -np.ceil(np.log2(max(np.abs(cost).max(), 1.0)))
     signs = [(-float(not below[i]), float(not above[i])) for i in rows] + [(0.0, None)] * (
         len(up) + len(low)
@@ -348,13 +377,13 @@ def inconsistent(data: DenseProblem) -> bool:
         ("primal_feasibility_tolerance", "dual_feasibility_tolerance"), TOLERANCE
     )
     options["time_limit"] = min(seconds_left(), PROOF_SECONDS)
-    found = linprog(
+    program = linprog(
         cost, A_eq=system, b_eq=np.zeros(len(data.b)), bounds=signs, method="highs", options=options
     )
     check_time()
-    if found.x is None or not found.fun < 0:
+    if program.x is None or not program.fun < 0:
         return False
-    z, multipliers = np.zeros(len(data.b)), found.x[: len(rows)]
+    z, multipliers = np.zeros(len(data.b)), program.x[: len(rows)]
     for _ in range(1 + REFINEMENTS):
         z[rows] = R * multipliers
         if certifies(data, z):
@@ -364,10 +393,11 @@ def inconsistent(data: DenseProblem) -> bool:
 
 
 def incompatible(problem: LCP) -> bool:
-    """Return whether it is proved that the equations A x + b = 0 of a dense problem without bounds have no solution.
+    """Return whether it is proved that equations A x + b = 0 have no solution.
 
-    The part y of b in the null space of A', b less the least d with A'd = A'b, has b'y = y'y: -y
-    are multipliers for `certifies`. It is computed in units in which A has entries near 1.
+    For a dense problem without bounds. The part y of b in the null space of A', which is b minus
+    the least d with A'd = A'b, has b'y = y'y: -y are multipliers for `certifies`. It is computed in
+    units in which A has entries near 1.
     """
     data = DenseProblem.read(problem)
     R, C = unit_rows_and_columns(data.A)
@@ -386,11 +416,14 @@ def incompatible(problem: LCP) -> bool:
 
 
 def _refined(transpose: Any, z: np.ndarray) -> np.ndarray:
-    """Return the multipliers nearest to z, among those that are 0 where z is, with (A'z)_j = 0 where a vertex has it but for errors.
+    """Return refined multipliers near z that satisfy the equations of a vertex.
 
-    Where a vertex of the linear program has 0, its solver leaves 1e-10 of the terms at most.
+    The refined multipliers are 0 where z is. (A'z)_j is 0 where it is 0 at the vertex; the solver
+    of the linear program leaves at most 1e-10 of the terms there.
     """
     g, terms = transpose @ z, abs(transpose) @ np.abs(z)
+    # The equations (A'z)_j = 0 of the vertex, on the nonzero multipliers: z minus its least-squares
+    # projection onto the row space solves them exactly.
     zero, support = np.flatnonzero(np.abs(g) <= VERTEX * terms), np.flatnonzero(np.abs(z) > VERTEX)
     block, out = transpose[zero][:, support], np.zeros(len(z))
     out[support] = (
@@ -401,7 +434,10 @@ def _refined(transpose: Any, z: np.ndarray) -> np.ndarray:
 
 
 def _units_with_right_side(A: Any, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return R, C and beta > 0, powers of 2, so that the rows and columns of R [A b] diag(C, 1 / beta) have largest entries near 1."""
+    """Return powers of 2 R, C and beta > 0 that scale [A b].
+
+    The rows and columns of R [A b] diag(C, 1 / beta) have largest entries near 1.
+    """
     magnitude, R, C = abs(A), np.ones(A.shape[0]), np.ones(A.shape[1])
     size, beta = np.abs(b), 1.0
     sparse = scipy.sparse.issparse(A)
@@ -411,6 +447,7 @@ def _units_with_right_side(A: Any, b: np.ndarray) -> tuple[np.ndarray, np.ndarra
         rows, columns = (
             now.max(axis=k).toarray().ravel() if sparse else now.max(axis=k) for k in (1, 0)
         )
+        # Half of the logarithm of each row, column and right-hand side is removed (Ruiz).
         R, C = (
             R / power_of_two(np.sqrt(np.maximum(rows, right))),
             C / power_of_two(np.sqrt(columns)),
@@ -420,7 +457,7 @@ def _units_with_right_side(A: Any, b: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def entries_of_columns(A: Any) -> np.ndarray:
-    """Return how many entries other than 0 each column has."""
+    """Return the number of nonzero entries of each column."""
     return (
         np.bincount(A.indices, minlength=A.shape[1])
         if scipy.sparse.issparse(A)
@@ -429,45 +466,56 @@ def entries_of_columns(A: Any) -> np.ndarray:
 
 
 def without_contact(data: DenseProblem, x: np.ndarray) -> np.ndarray:
-    """Return x with y = 0 on each connected component on which A is singular and that has such a solution within the bounds.
+    """Return x with y = 0 on each singular component where that is a solution.
 
-    Where z'A = 0 with z > 0 and b'z = 0, as of a Laplacian that nothing holds and a b that sums to
-    0, z'y = 0 makes y >= 0 vanish: no point is strictly feasible, and neither active sets nor a
-    central path lead there. With one unknown of each component held at 0 and the others R, x_R =
-    -A_RR^-1 b_R solves it; z, with A z = 0 and 1 at the unknown held, moves it within the bounds.
+    The components are connected parts on which A is singular and which have a solution with y = 0
+    within the bounds. An example is a Laplacian without boundary condition and a b that sums to 0.
+    Where z'A = 0 with z > 0 and b'z = 0, z'y = 0, so that y >= 0 must be 0. No point is strictly
+    feasible, and neither active sets nor a central path lead to the solution. With one unknown of
+    each component held at 0 and the others R, x_R = -A_RR^-1 b_R is a solution; z, with A z = 0 and
+    1 at the held unknown, shifts it within the bounds.
     """
     A = scipy.sparse.csr_array(data.A)
     count, label = scipy.sparse.csgraph.connected_components(A, directed=False)
-    # the largest diagonal entry of each component first
+    # The largest diagonal entry of each component comes first.
     order = np.lexsort((-np.abs(A.diagonal()), label))
     held = order[np.searchsorted(label[order], np.arange(count))]
     rest = np.setdiff1d(np.arange(len(x)), held)
+    # Right-hand sides for x_R (with x = 0 at the held unknowns) and for z_R (with z = 1 there).
     sides = np.stack([-data.b[rest], -np.asarray(A[rest][:, held].sum(axis=1)).ravel()], axis=1)
-    found, z = np.zeros(len(x)), np.zeros(len(x))
+    particular, z = np.zeros(len(x)), np.zeros(len(x))
     solved = solved_or_none(A[rest][:, rest], sides) if len(rest) else sides
     if solved is None:
         return x
-    found[rest], z[rest], z[held] = solved[:, 0], solved[:, 1], 1.0
+    particular[rest], z[rest], z[held] = solved[:, 0], solved[:, 1], 1.0
     zero = np.abs(A @ z) <= NULL * (abs(A) @ np.abs(z))
     with np.errstate(divide="ignore", invalid="ignore"):
-        ends = np.sort([(bound - found) / z for bound in (data.lower, data.upper)], axis=0)
+        # Shifts t with l <= particular + t z <= u: an interval for each unknown, intersected for
+        # each component.
+        ends = np.sort([(bound - particular) / z for bound in (data.lower, data.upper)], axis=0)
     low, high = np.full(count, -np.inf), np.full(count, np.inf)
     np.maximum.at(low, label, np.where(z == 0, -np.inf, ends[0]))
     np.minimum.at(high, label, np.where(z == 0, np.inf, ends[1]))
     works = low <= high
     works[label[~zero]] = False
     shift = np.clip(0.0, low, np.maximum(low, high))
-    moved = np.where(works[label], found + np.where(works[label], shift[label], 0.0) * z, x)
+    moved = np.where(works[label], particular + np.where(works[label], shift[label], 0.0) * z, x)
     return np.clip(moved, data.lower, data.upper)
 
 
 def proved_infeasible(problem: LCP) -> bool:
-    """Return whether `inconsistent` proves it of a dense or sparse problem; False where that would take long."""
+    """Return whether `inconsistent` proves a dense or sparse problem infeasible.
+
+    False where the proof would take long.
+    """
     return within_reach(problem) and inconsistent(DenseProblem.read(problem, keep_sparse=True))
 
 
 def within_reach(problem: LCP) -> bool:
-    """Return whether a dense or sparse matrix has so few entries other than 0 that a linear program, or a factorization, takes seconds."""
+    """Return whether a dense or sparse matrix has at most PROVABLE nonzero entries.
+
+    A linear program, or a factorization, then takes seconds.
+    """
     sparse = sparse_matrix(problem)
     if sparse is None and problem.layout.size > SIDE:
         return False
@@ -495,12 +543,12 @@ def check_size(problem: LCP, method: str, most: int) -> int:
 
 
 class DenseWorkspace(IterateMemory):
-    """Memory of a method that works on a DenseProblem and writes its iterate back.
+    """Workspace of a method that works on a DenseProblem and writes x back.
 
     Attributes:
         data: the problem on the host, read when a solve starts.
-        ended: the status with which the method gives up if the iterate does not meet the criteria;
-            None while it goes on.
+        ended: the status with which the method ends if the iterate does not meet the criteria; None
+            while it goes on.
     """
 
     def __init__(self, problem: LCP, precision: str = Precision.DOUBLE) -> None:
@@ -509,7 +557,7 @@ class DenseWorkspace(IterateMemory):
         self.ended: SolveStatus | None = None
 
     def start(self, *, warm: bool, tolerance: float) -> None:
-        """Read the problem as it is now."""
+        """Read the current problem."""
         self.data, self.ended = self.read(), None
 
     def read(self) -> DenseProblem:
@@ -533,10 +581,13 @@ class DenseWorkspace(IterateMemory):
         return int(np.count_nonzero((x <= self.data.lower) | (x >= self.data.upper)))
 
     def result(self, name: str, pivots: int) -> Step:
-        """Return what a step did: interim while the method goes on."""
+        """Return the record of a step: interim while the method goes on."""
         return Step(name, pivots, self.held, self.ended, interim=self.ended is None)
 
 
 def pivots_of(setting: int | None, n: int) -> int:
-    """Return how many pivots a step makes: the setting, or n / 8, so that 100 steps are 12 n pivots, and never less than 2."""
+    """Return the number of pivots of a step.
+
+    It is the setting, or n / 8, so that 100 steps are 12 n pivots, and at least 2.
+    """
     return setting if setting is not None else max(2, n // 8)

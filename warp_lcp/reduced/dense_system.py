@@ -1,4 +1,7 @@
-"""Principal system of a dense matrix: factors of the free block, on the host; and damped steps where Newton's lead nowhere."""
+"""Principal system of a dense matrix: factors of the free block on the host.
+
+Levenberg-Marquardt steps replace Newton's where these fail.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,10 @@ REGULARIZATIONS = (1e-8, 1e-4, 1e-2, 0.1, 1.0, 10.0, 100.0)  # of J'J, times its
 
 
 class DenseSystem:
-    """LU factors of the free block, on the host; the minimum-norm least-squares step where the block is singular."""
+    """LU factors of the free block, on the host.
+
+    The minimum-norm least-squares solution where the block is singular.
+    """
 
     def __init__(self, A: DenseOperator) -> None:
         self._A = A
@@ -35,23 +41,23 @@ class DenseSystem:
         self._matrix = self._A.matrix.numpy().astype(np.float64)
 
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
-        """Remember the free set and the shift."""
+        """Store the free set and the shift."""
         self._free = np.flatnonzero(free.numpy())
         self._shift = None if shift is None else shift.numpy()[self._free].astype(np.float64)
 
     def norm(self) -> float:
-        """Return ||r||, plain for matrices solved directly."""
+        """Return ||r||, unweighted for matrices that are solved directly."""
         return float(np.linalg.norm(self.r.numpy()))
 
     def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
-        """Factor the free block and solve, whatever the tolerance."""
+        """Factor the free block and solve; the tolerance is not used."""
         free, r, e = self._free, self.r.numpy(), np.zeros(self.e.size)
         norm = 0.0
         if free.size:
             block, scale = self._matrix[np.ix_(free, free)], np.ones(free.size)
             if self._shift is not None:
                 block = block + np.diag(self._shift)
-                # rows with a large shift make no others look singular
+                # With this scaling rows with a large shift do not make others look singular.
                 scale = 1 / np.sqrt(1 + self._shift)
             e[free] = scale * _solve_or_least_squares(
                 block * np.outer(scale, scale), scale * r[free]
@@ -62,7 +68,10 @@ class DenseSystem:
 
 
 def _solve_or_least_squares(block: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """Return block^-1 r, or the least-squares solution of the equilibrated block if that is singular."""
+    """Return block^-1 r, or a least-squares solution if the block is singular.
+
+    The least-squares solution is that of the equilibrated block.
+    """
     solution = factored(block, r)
     if solution is None:
         S = equilibration(block)
@@ -77,10 +86,10 @@ def _solve_or_least_squares(block: np.ndarray, r: np.ndarray) -> np.ndarray:
 
 
 class DampedSteps:
-    """Levenberg-Marquardt steps of the minimum map of a dense problem, and when it is time to ask whether there is a solution.
+    """Levenberg-Marquardt steps of the minimum map of a dense problem.
 
     Where Newton's steps cycle, and where the free block is singular, (J'J + nu I)^-1 J'r is still a
-    descent direction.
+    descent direction. It also decides when to look for a proof of infeasibility.
 
     Args:
         problem: with a dense matrix.
@@ -91,21 +100,22 @@ class DampedSteps:
         self.start()
 
     def start(self) -> None:
-        """Forget the last solve."""
+        """Reset the state of the last solve."""
         self._least, self._waited = math.inf, 0  # smallest residual; steps without progress
-        # equations, of which it is not known yet whether they have a solution; whether a damped
-        # step has reduced the residual
+        # Whether a proof for equations is still to be tried; whether a damped step has reduced the
+        # residual.
         self._asks, self._damped = not self._problem.bounded, False
 
     @property
     def status(self) -> SolveStatus | None:
-        """How the solve ends after a damped step: STAGNATED after ten steps without progress, None as long as it goes on."""
+        """STAGNATED after ten steps without progress, None before."""
         return SolveStatus.STAGNATED if self._waited >= STALLED else None
 
     def proves_infeasible(self, norm: float, target: float) -> bool:
-        """Note the residual norm where a step begins; return whether it is proved that there is no solution.
+        """Record the residual norm; return whether infeasibility is proved.
 
-        It is asked of equations alone, once, when a step has not reduced the residual.
+        The norm is that at the start of a step. The proof is tried for equations alone, once, when
+        a step has not reduced the residual.
         """
         falls = norm <= PROGRESS * self._least
         if self._asks and (self._damped or not falls) and norm > target:
@@ -116,11 +126,21 @@ class DampedSteps:
         return False
 
     def take(self, x: wp.array[Any], residual: NaturalResidual) -> bool:
-        """Take the shortest of some steps that reduces the residual's norm; return whether one does."""
+        """Take the shortest of some steps that reduces the residual's norm.
+
+        With r = d (x - clip(x - y / d, l, u)) and its Jacobian J, d on held rows and A elsewhere,
+        dx = -(J'J + nu I)^-1 J'r for growing nu. Returns whether a step reduces the norm.
+        """
         p, start = self._problem, x.numpy().copy()
         norm, y = residual.evaluate(x), residual.y.numpy()
         d = residual.diagonal.numpy().astype(np.float64)
-        lower, upper, A = p.lower.numpy(), p.upper.numpy(), p.A.matrix.numpy().astype(np.float64)  # type: ignore[attr-defined]
+        lower, upper, A = (
+            p.lower.numpy(),
+            p.upper.numpy(),
+            p.A.matrix.numpy().astype(np.float64),  # type: ignore[attr-defined]
+        )
+        # Natural residual r and its Jacobian J: row i is d_i e_i' where x_i is held, and row i of A
+        # elsewhere.
         r = d * (start - np.clip(start - y / d, lower, upper))
         held = (start - y / d < lower) | (start - y / d > upper)
         J = np.where(held[:, None], np.diag(d), A)

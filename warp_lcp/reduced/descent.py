@@ -1,4 +1,4 @@
-"""What the energy says about the steps of a solve: whether they lead down, creep, or go round in a circle."""
+"""Judge the steps of a solve by the energy: descent, creeping, cycling."""
 
 from __future__ import annotations
 
@@ -9,38 +9,40 @@ from dataclasses import dataclass, field
 
 from warp_lcp.deadline import check_time
 
-NOISE = 500.0  # rounding units of the iterate, in parts of the energy: what rounding may pretend
-# times the least residual: a step that ends there, and sets no new least energy, was wrong
+NOISE = 500.0  # rounding units, relative to the energy: changes that rounding may cause
+# Times the least residual: a step that ends above it, and sets no new least energy, was wrong.
 LEAP = 1e3
-# a step that moves the free set and lowers the energy by more than this share of what the last one
-# did: the set creeps
+# The set creeps if a step moves the free set and lowers the energy by more than this share of the
+# decrease of the last step.
 CREEP = 0.5
-# a step that moves the free set and leaves more than this share of the residual was spoiled by its
-# projection
+# A step that moves the free set and leaves more than this share of the residual was spoiled by its
+# projection.
 STALL = 0.7
-# a projected cycle against creeping is worth it if it lowers the energy by this many times what the
-# step before did
+# A projected cycle against creeping is useful if it lowers the energy by this many times the
+# decrease of the step before.
 WORTH = 2.0
 
 
 class Descent:
-    """Judges steps by the energy x'Ax/2 + b'x, which only falls on the way to a solution where A is symmetric and semi-definite.
+    """Judge steps by the energy x'Ax/2 + b'x.
 
-    The natural residual does not: it may rise thirtyfold in the best of steps, where the set of
-    held unknowns grows. It counts only where the energy says nothing, within rounding.
+    On the way to a solution the energy only falls where A is symmetric and semi-definite. The
+    natural residual may rise: thirtyfold in the best of steps, where the set of held unknowns
+    grows. It counts only where the change of the energy is within rounding.
 
-    Why solves end, in outline: between runs of projected steps that are `due`, twice as many each
-    time, at most `patience` steps in a row set no new least energy, and new ones, a margin apart,
-    are finitely many above the minimum. Once a projected cycle of such a run has raised the energy
-    (`safe` is set), runs are plain projected Jacobi sweeps with a factor below 2 / lambda_max(D^-1
-    A), which converge linearly from anywhere. What this does not cover are runs of cycles that
-    neither raise the energy nor lower it beyond rounding.
+    Why solves end, in outline: runs of projected steps that are `due` become twice as long each
+    time. Between them, at most `patience` steps in a row set no new least energy. A new least
+    energy differs from the last by a margin, so that there are finitely many above the minimum.
+    Once a projected cycle of such a run has raised the energy (`safe` is set), runs are plain
+    projected Jacobi sweeps with a factor below 2 / lambda_max(D^-1 A), which converge linearly from
+    any start. Not covered are runs of cycles that neither raise the energy nor lower it beyond
+    rounding.
 
     Args:
         epsilon: rounding unit of the iterate.
 
     Attributes:
-        noise: what rounding may pretend, in parts of the energy.
+        noise: changes that rounding may cause, relative to the energy.
         sinks: whether the last step set a new least energy.
         safe: whether a projected cycle that was due has raised the energy.
         runs: runs of projected steps that were due.
@@ -51,7 +53,7 @@ class Descent:
         self.start(0.0, 0.0)
 
     def start(self, energy: float, norm: float) -> None:
-        """Forget the last solve; energy and residual norm are those of the start."""
+        """Reset; energy and residual norm are those of the start."""
         self._energy, self._lowest, self._norm, self._least = energy, energy, norm, norm
         self.sinks, self.safe = False, False
         self._vain, self.runs, self._left = 0, 0, 1.0
@@ -59,12 +61,19 @@ class Descent:
 
     @property
     def standing(self) -> tuple[float, float, float, float, float]:
-        """Residual norm, the least one, energy and the least one, and by how much the last step lowered it."""
+        """State for the device's judgment.
+
+        Residual norm, the least one, energy, the least one, and the last decrease of the energy.
+        """
         return self._norm, self._least, self._energy, self._lowest, self._fell
 
     def record(self, energy: float, norm: float) -> float:
-        """Take note of where a step ends; return by how much it has lowered the energy, 0 if that is within rounding."""
+        """Record the end of a step; return the decrease of the energy.
+
+        Returns 0 if the decrease is within rounding.
+        """
         fell, left = self._energy - energy, norm / self._norm if self._norm > 0 else 0.0
+        # Changes of the energy below `margin` may be rounding.
         margin = self.noise * (abs(self._energy) + abs(energy))
         above = energy - self._lowest
         self._left, self._energy, self._norm, self.sinks, self._least = (
@@ -83,9 +92,10 @@ class Descent:
         return fell if abs(fell) > margin else 0.0
 
     def due(self, patience: int) -> int:
-        """Return how many projected steps are to come now: 0 until `patience` steps set no new least energy, twice as many each time.
+        """Return the number of projected steps that should come now.
 
-        The residual of one of them may have leapt instead.
+        0 until `patience` steps set no new least energy, or the residual of one of them has leapt;
+        then twice as many each time.
         """
         if self._vain < patience:
             return 0
@@ -93,12 +103,14 @@ class Descent:
         return 2 ** (self.runs - 1)
 
     def creeps(self, fell: float, *, moved: bool) -> bool:
-        """Return whether a projected cycle should follow a step that has lowered the energy by `fell`, and moved the free set or not.
+        """Return whether a projected cycle should follow a truncated step.
 
-        Truncated steps that lower the energy evenly while the set moves are those in which a
-        contact's boundary comes back by a layer of cells a step. It begins with a step whose
-        projection overshoots the contact: the energy rises, or the residual hardly falls.
+        The step has lowered the energy by `fell`; `moved`: it has moved the free set. Truncated
+        steps that lower the energy evenly while the set moves are those in which a contact's
+        boundary returns by one layer of cells a step. That begins with a step whose projection
+        overshoots the contact: the energy rises, or the residual hardly falls.
         """
+        # Slow: the energy rises or falls evenly, or the residual hardly falls.
         slow = moved and fell != 0 and (fell < 0 or fell > CREEP * self._fell or self._left > STALL)
         called = slow and self._pause == 0
         self._fell, self._pause = math.inf if called else fell, max(self._pause - 1, 0)
@@ -109,10 +121,10 @@ class Descent:
     def weigh(self, fell: float) -> None:
         """Judge a projected cycle that has lowered the energy by `fell`.
 
-        If it was called against creeping and in vain, steps were slow, but not because the set
-        crept: the next call waits longer.
+        If it was called against creeping without success, steps were slow for another reason: the
+        next call waits longer.
         """
-        # what a cold start's first cycles do is no matter
+        # The first cycles of a cold start do not count.
         self.safe = self.safe or (fell < 0 and self.runs > 0)
         if self._owed > 0:
             vain = fell < WORTH * self._owed
@@ -126,10 +138,10 @@ DECREASE = 1e-4  # share of the slope that a step must gain: Armijo's constant
 
 @dataclass
 class NonmonotoneSearch:
-    """Backtracking from the full step against the largest of the last merits.
+    """Backtracking line search against the largest of the last merits.
 
     Args:
-        memory: merits remembered; 1 is Armijo's monotone search.
+        memory: number of stored merits; 1 is Armijo's monotone search.
         least: the shortest step tried.
     """
 
@@ -138,22 +150,25 @@ class NonmonotoneSearch:
     merits: list[float] = field(default_factory=list)
 
     def forget(self) -> None:
-        """Forget the merits of the last solve."""
+        """Delete the merits of the last solve."""
         self.merits.clear()
 
     def remember(self, merit: float) -> None:
-        """Note the merit where a step starts."""
+        """Store the merit at the start of a step."""
         self.merits = [*self.merits, merit][-self.memory :]
 
     @property
     def limit(self) -> float:
-        """The largest of the remembered merits, which a step may not exceed."""
+        """The largest of the stored merits, which a step may not exceed."""
         return max(self.merits)
 
     def search(
         self, trial: Callable[[float], float], slope: float, *, first: float = 1.0
     ) -> tuple[float, float]:
-        """Return the first of the halved steps that the merits allow, and its merit; step 0 if none down to `least` is.
+        """Return the first of the halved step lengths that is accepted, and its merit.
+
+        A length t is accepted if the merit is at most limit + DECREASE t slope. Returns length 0 if
+        none down to `least` is accepted.
 
         Args:
             trial: moves to a step length and returns the merit there.

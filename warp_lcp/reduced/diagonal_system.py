@@ -1,4 +1,7 @@
-"""Principal system of an operator with products only: a Krylov method with its diagonal, or the problem's preconditioner."""
+"""Principal system of an operator with products only.
+
+A Krylov method with the operator's diagonal, or the problem's preconditioner.
+"""
 
 from __future__ import annotations
 
@@ -18,9 +21,12 @@ from warp_lcp.rows.vectors import rows_of
 
 
 class DiagonalSystem(KrylovSystem):
-    """A Krylov method preconditioned by the diagonal, for any operator, in float64: conjugate gradients if A is symmetric, else GMRES."""
+    """Krylov method preconditioned by the diagonal, for any operator, in float64.
 
-    _definite = True  # whether conjugate gradients can take the preconditioner
+    Conjugate gradients if A is symmetric, else GMRES.
+    """
+
+    _definite = True  # whether conjugate gradients can use the preconditioner
 
     def __init__(self, problem: LCP, *, shifted: bool = False) -> None:
         self._A, self._layout = problem.A, problem.layout
@@ -36,11 +42,11 @@ class DiagonalSystem(KrylovSystem):
         self.refresh()
 
     def refresh(self) -> None:
-        """Take the diagonal of A again; entries may have changed."""
+        """Read the diagonal of A again; entries may have changed."""
         self._own = self._layout.load(self._A.diagonal().numpy(), wp.float64)
 
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
-        """Remember the free set and the shift, and shift the diagonal."""
+        """Store the free set and the shift, and shift the diagonal."""
         self._free, self._shift = free, shift
         rows, weight = rows_of(self.r), self._inverse
         SHIFT.bind(
@@ -54,7 +60,7 @@ class DiagonalSystem(KrylovSystem):
         ).launch()
 
     def apply(self) -> None:
-        """Precondition: z = r / d."""
+        """Apply the preconditioner: z = r / d."""
         DIVIDE.bind(rows_of(self.r), r=self.r, d=self._diagonal, z=self.z).launch()
 
     def _product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = launch_now) -> None:
@@ -64,12 +70,15 @@ class DiagonalSystem(KrylovSystem):
 
 
 class PreconditionedSystem(DiagonalSystem):
-    """The same, preconditioned by P M P with the problem's own M, on the host; conjugate gradients if M seems definite, too."""
+    """Krylov method preconditioned by P M P with the problem's own M, on the host.
+
+    Conjugate gradients if A is symmetric and M seems definite.
+    """
 
     def __init__(self, problem: LCP, M: Preconditioner) -> None:
         self._M, self._definite = M, M.definite
         super().__init__(problem)
 
     def apply(self) -> None:
-        """Precondition: z = P M r; r is 0 off the free set."""
+        """Apply the preconditioner: z = P M r; r is 0 off the free set."""
         self.z.assign(np.where(self._free.numpy() != 0, self._M(np.array(self.r.numpy())), 0.0))

@@ -1,5 +1,8 @@
 # mypy: ignore-errors
-"""Kernels that try the active sets of tiny boxed problems; a module for each size and type."""
+"""Kernels that enumerate the active sets of tiny boxed problems.
+
+There is a module for each size and type.
+"""
 
 import functools
 from types import SimpleNamespace
@@ -9,20 +12,21 @@ import warp as wp
 
 from warp_lcp.rows.compiler import forward_kernel
 
-EXACT = 64.0  # units of rounding: a candidate whose measure is below needs no better one
-RANK = 1e3  # units of rounding: pivots below, relative to A's largest entry, are zero
-# sweeps of Ruiz's iteration at most; the first changes nothing where rows are alike
+EXACT = 64.0  # units of rounding: a candidate with a smaller measure is accepted at once
+RANK = 1e3  # units of rounding: smaller pivots, relative to A's largest entry, are zero
+# Largest number of sweeps of Ruiz's iteration; the first changes nothing where rows are alike.
 EQUILIBRATIONS = 8
 
 
 @functools.cache
 def enumeration_kernels(n: int, dtype: type) -> SimpleNamespace:
-    """Return the kernels `batch` (a problem a thread) and `each` (a set a thread of one problem) for n unknowns.
+    """Return the enumeration kernels for n unknowns.
 
-    `enumerate_sets(A, b, low, high)` is the function behind `batch`, for kernels that have a small
-    problem at hand: it returns x, its measure and its set. It works in units in which A is
-    equilibrated, S A S with S powers of 2: what counts as a zero pivot does not depend on the units
-    of the rows. `each` takes a problem that is so.
+    `batch` solves one problem per thread, `each` tries one set per thread of one problem.
+    `enumerate_sets(A, b, low, high)` is the function of `batch`, for kernels that have a small
+    problem: it returns x, its measure and its set. It works in units in which A is equilibrated, S
+    A S with S powers of 2, so that the test for a zero pivot does not depend on the units of the
+    rows. `each` expects an equilibrated problem.
     """
     module = wp.get_module(f"warp_lcp.direct_enumeration_{n}_{dtype.__name__}")
     real, count, sets = dtype, n, 3**n
@@ -37,7 +41,11 @@ def enumeration_kernels(n: int, dtype: type) -> SimpleNamespace:
 
     @wp.func(module=module)
     def measure(A: mat, b: vec, low: vec, high: vec, x: vec):
-        """Return the largest natural residual of a row, in units of the terms that its y is a sum of."""
+        """Return the largest natural residual of a row, relative to the terms of y.
+
+        For row i, r = |d (x_i - clip(x_i - y_i / d, l_i, u_i))| with d = |a_ii|, divided by max(r,
+        |b_i| + sum_j |a_ij x_j|).
+        """
         worst = real(zero)
         for i in range(count):
             y = b[i]
@@ -55,7 +63,10 @@ def enumeration_kernels(n: int, dtype: type) -> SimpleNamespace:
 
     @wp.func(module=module)
     def assign(A: mat, b: vec, low: vec, high: vec, code: int):
-        """Return the x of a set, whose digits mean 0: x = l, 1: y = 0, 2: x = u, and whether such an x exists."""
+        """Return the x of a set, and whether it exists.
+
+        The digits of the set to base 3 mean 0: x = l, 1: y = 0, 2: x = u.
+        """
         x, r, M = vec(), vec(), mat()
         free, row_open, pivot_row = flags(), flags(), flags()
         rest, possible, size = int(code), bool(True), real(zero)
@@ -85,7 +96,7 @@ def enumeration_kernels(n: int, dtype: type) -> SimpleNamespace:
                 if free[j] == 0:
                     r[i] = r[i] - A[i, j] * x[j]
         # Gauss-Jordan elimination with complete pivoting; a column without a pivot keeps its x (a
-        # basic solution)
+        # basic solution).
         for _k in range(count):
             p, q, most = int(-1), int(-1), real(rank * size)
             for i in range(count):
@@ -120,7 +131,10 @@ def enumeration_kernels(n: int, dtype: type) -> SimpleNamespace:
 
     @wp.func(module=module)
     def equilibration(A: mat):
-        """Return S, powers of 2 with which S A S has a largest entry near 1 in each row and column together."""
+        """Return S, powers of 2, that scales A symmetrically.
+
+        S A S has a largest entry near 1 in each row and column together.
+        """
         S = vec()
         for i in range(count):
             S[i] = one
@@ -147,7 +161,10 @@ def enumeration_kernels(n: int, dtype: type) -> SimpleNamespace:
 
     @wp.func(module=module)
     def enumerate_sets(A: mat, b: vec, low: vec, high: vec):
-        """Return the first x that solves to rounding, or the best one; its measure (1 at most); its set, -1 if there is none."""
+        """Return the first x that solves to rounding, or the best one.
+
+        Returns its measure (1 at most) and its set, too; the set is -1 if none has an x.
+        """
         S, M, q, l, u = equilibration(A), mat(), vec(), vec(), vec()
         for i in range(count):
             q[i] = S[i] * b[i]
@@ -155,15 +172,15 @@ def enumeration_kernels(n: int, dtype: type) -> SimpleNamespace:
             u[i] = high[i] / S[i]
             for j in range(count):
                 M[i, j] = S[i] * A[i, j] * S[j]
-        best, least, found = vec(), real(one), int(-1)
+        best, least, best_code = vec(), real(one), int(-1)
         for code in range(sets):
             if least > exact:
                 x, possible = assign(M, q, l, u, code)
                 if possible:
                     m = measure(M, q, l, u, x)
-                    if m < least or found < 0:
-                        best, least, found = x, m, code
-        return wp.cw_mul(S, best), least, found
+                    if m < least or best_code < 0:
+                        best, least, best_code = x, m, code
+        return wp.cw_mul(S, best), least, best_code
 
     @forward_kernel(module=module)
     def batch(
@@ -175,7 +192,7 @@ def enumeration_kernels(n: int, dtype: type) -> SimpleNamespace:
         x: wp.array2d(dtype=dtype),
         chosen: wp.array(dtype=wp.int32),
     ):
-        """Solve a problem a thread; bounds of one row serve all problems."""
+        """Solve one problem per thread; bounds of one row serve all problems."""
         t = wp.tid()
         M, q, low, high = mat(), vec(), vec(), vec()
         tl, tu = wp.min(t, lower.shape[0] - 1), wp.min(t, upper.shape[0] - 1)
@@ -185,12 +202,12 @@ def enumeration_kernels(n: int, dtype: type) -> SimpleNamespace:
             high[i] = upper[tu, i]
             for j in range(count):
                 M[i, j] = A[t, i, j]
-        best, least, found = enumerate_sets(M, q, low, high)
+        best, least, code = enumerate_sets(M, q, low, high)
         for i in range(count):
             x[t, i] = best[i]
         if least > accepted:
-            found = -1
-        chosen[t] = found
+            code = -1
+        chosen[t] = code
 
     @forward_kernel(module=module)
     def each(
@@ -201,7 +218,7 @@ def enumeration_kernels(n: int, dtype: type) -> SimpleNamespace:
         x: wp.array2d(dtype=dtype),
         measures: wp.array(dtype=dtype),
     ):
-        """Try a set a thread; measure 2 where the set has no x."""
+        """Try one set per thread; the measure is 2 where the set has no x."""
         code = wp.tid()
         M, q, low, high = mat(), vec(), vec(), vec()
         for i in range(count):

@@ -1,4 +1,7 @@
-"""A dense or sparse problem in units in which its rows are alike, for methods that start from one size of all rows."""
+"""Row and column scaling of dense and sparse problems.
+
+For methods whose start depends on one size of all rows.
+"""
 
 from __future__ import annotations
 
@@ -30,24 +33,26 @@ from warp_lcp.rows.vectors import rows_of
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/active_set.h")
 UNITS = KERNELS["equilibrated.units"]
-ALIKE = 4.0  # rows whose units differ by no more stay as they are
-# steps without a residual below FALL times the smallest after which it is asked whether there is a
-# solution
+ALIKE = 4.0  # rows whose units differ by at most this factor are not scaled
+# Steps without a residual below FALL times the smallest after which a proof of infeasibility is
+# tried.
 WAIT = 6
 FALL = 0.9
-# of the residual, below which that of equations on singular components is worth another start
+# Share of the residual below which the solution of the equations on singular components is worth a
+# new start.
 HALF = 0.5
-GROWN = 1e4  # growth of the residual after which it is
-EARLY = 10  # steps before which a residual says little: a path is joined far from the start
+GROWN = 1e4  # growth of the residual after which the proof is tried too
+EARLY = 10  # steps in which the residual may rise: a path is joined far from the start
 
 
 class EquilibratedWorkspace(IterateMemory):
-    """A method's workspace for R A C x' + R b, bounds l / C and u / C, and the problem's own iterate x = C x'.
+    """Workspace of a method for the scaled problem.
 
-    R and C are powers of 2 with R_i C_i near 1 / d_i of the natural residual, equal where A is
-    symmetric (of semi-definite matrices: Jacobi's scaling). A step whose x is not finite is not
-    taken: it ends the solve, with INFEASIBLE if a linear program proves that there is no solution,
-    else with STAGNATED.
+    The scaled problem is R A C x' + R b with bounds l / C and u / C; the problem's own iterate is x
+    = C x'. R and C are powers of 2 with R_i C_i near 1 / d_i of the natural residual, equal where A
+    is symmetric (for semi-definite matrices: Jacobi's scaling). A step with an x that is not finite
+    is rejected and ends the solve, with INFEASIBLE if a linear program proves that there is no
+    solution, else with STAGNATED.
 
     Args:
         problem: with a dense or sparse operator.
@@ -80,11 +85,11 @@ class EquilibratedWorkspace(IterateMemory):
 
     @staticmethod
     def suits(problem: LCP) -> bool:
-        """Return whether the problem's rows are at hand."""
+        """Return whether the problem's operator has rows and a scale."""
         return has(problem.A, HasRows) and has(problem.A, HasScale)
 
     def start(self, *, warm: bool, tolerance: float) -> None:
-        """Take A, b and the bounds as they are now."""
+        """Read the current A, b and bounds, and scale them."""
         inner, version = self._inner, version_of(self.problem.A)
         if version is None or version != self._version:
             self._version = version
@@ -106,15 +111,19 @@ class EquilibratedWorkspace(IterateMemory):
         self._tried = False
 
     def step(self, advance: Callable[[LCP, Any, wp.array[Any]], Step]) -> Step:
-        """Take a step of the method on the scaled problem."""
+        """Take a step of the method on the scaled problem.
+
+        x = C x' is evaluated in the problem's own units. Where the residual does not fall for some
+        steps, a solution without contact is tried, then a proof of infeasibility.
+        """
         inner = self.inner
         inner.residual.evaluate(inner.x)
         inner.residual.current = False
-        with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is seen below
+        with np.errstate(over="ignore", invalid="ignore"):  # detected below
             step = advance(self._inner, inner, inner.x)
         alone = self.x.numpy()[self._alone] if self._alone.size else None
         self._multiply(inner.x, self.x)
-        if alone is not None:  # any x will do where row and column are empty and b = 0: it stays
+        if alone is not None:  # x of an empty row and column with b = 0 is arbitrary
             x = self.x.numpy().copy()
             x[self._alone] = alone
             self.x.assign(x)
@@ -136,7 +145,10 @@ class EquilibratedWorkspace(IterateMemory):
         return replace(step, interim=True) if self._steps <= EARLY else step
 
     def _take_without_contact(self) -> bool:
-        """Take the solution with y = 0 where A is singular, if the residual falls; return whether it does."""
+        """Set x to the solution with y = 0 where A is singular.
+
+        Only if the residual falls; returns whether it does.
+        """
         self._tried = True
         if not within_reach(self.problem):
             return False
@@ -154,11 +166,11 @@ class EquilibratedWorkspace(IterateMemory):
         return True
 
     def _ended(self) -> SolveStatus:
-        """Return how a solve ends that leads nowhere."""
+        """Return the status of a solve that makes no progress."""
         return SolveStatus.INFEASIBLE if proved_infeasible(self.problem) else SolveStatus.STAGNATED
 
     def _scaled(self) -> Any:
-        """Set R and C, and return R A C on the host."""
+        """Compute R and C, and return R A C on the host."""
         A: Any = self.problem.A
         matrix = A.rows().matrix()
         R, C = (

@@ -1,4 +1,4 @@
-"""Conjugate gradients on a grid in fused passes, with a multigrid cycle as preconditioner."""
+"""Conjugate gradients on a grid in fused passes, preconditioned by multigrid."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.program import Launch, launch
 from warp_lcp.rows.vectors import Reduction
 
-# slots of the device scalars after those of a step: from the carried residual's square on
+# Slots of the device scalars after those of a step, from the square of the residual on.
 SQUARE = wp.constant(STEP_SLOTS)
 ITERATIONS = wp.constant(STEP_SLOTS + 3)
 SLOTS = STEP_SLOTS + 5
@@ -29,7 +29,7 @@ KERNELS = KernelFile(
 )
 DIRECT = KERNELS["grid_conjugate_gradient.direct"]
 STEP_ALONG = KERNELS["grid_conjugate_gradient.step"]
-# both planes are in the cache
+# Both planes are in the cache.
 ADVANCE = Wave("grid_conjugate_gradient.advance", (DIRECT, 0), (STEP_ALONG, 1))
 
 f64 = wp.array(dtype=wp.float64)
@@ -38,7 +38,7 @@ f64 = wp.array(dtype=wp.float64)
 @no_type_check
 @forward_kernel(module="warp_lcp.grid_conjugate_gradient")
 def begin_grid_kernel(scalars: f64, going: wp.array(dtype=int), tolerance: wp.float64, limit: int):
-    """Before the first iteration: no old direction, no norm yet."""
+    """Initialize: no old direction, no norm yet."""
     scalars[CARRY] = wp.float64(0.0)
     scalars[NORM] = wp.float64(0.0)
     scalars[SIZE] = wp.float64(1.0)
@@ -48,18 +48,19 @@ def begin_grid_kernel(scalars: f64, going: wp.array(dtype=int), tolerance: wp.fl
 @no_type_check
 @forward_kernel(module="warp_lcp.grid_conjugate_gradient")
 def end_grid_kernel(scalars: f64, going: wp.array(dtype=int)):
-    """After an iteration: decide whether to go on."""
+    """Decide after an iteration whether to go on."""
     more = next_iteration(scalars, SQUARE)
     going[0] = wp.where(scalars[STEP] == wp.float64(0.0), 0, more)
 
 
 class FusedConjugateGradient(ConjugateGradient):
-    """`ConjugateGradient` in fused passes, for one CPU thread and a grid without periodic axes, preconditioned by a multigrid cycle.
+    """Conjugate gradients in fused passes, preconditioned by a multigrid cycle.
 
-    Two passes over the finest level besides the way down the cycle: the cycle's last leg sums the
-    products of z = M r that beta and alpha need; a second pass makes the direction, moves the
-    solution and takes alpha A p off the residual, one plane behind. Beta comes from z'A p, so that
-    no product of residuals is carried on; the norm of the residual decides when to stop.
+    For one CPU thread and a grid without periodic axes. Besides the descent of the cycle there are
+    two passes over the finest level. The last part of the cycle sums the products of z = M r for
+    beta and alpha. A second pass computes the direction, moves the solution and subtracts alpha A p
+    from the residual, one plane behind. Beta comes from z'A p, so that no product of residuals is
+    carried over; the norm of the residual decides when to stop.
 
     Args:
         source: the operator's stencil.
@@ -96,12 +97,12 @@ class FusedConjugateGradient(ConjugateGradient):
         self._advance(self._program.launch)
 
     def clear(self) -> None:
-        """Forget what lies outside the rows that the operator has now."""
+        """Clear values outside the current rows of the operator."""
         self.x.zero_()
         self._p.zero_()
 
     def _launch_beginning(self) -> None:
-        """Launch the start: the first iteration writes x and p."""
+        """Launch the start; the first iteration writes x and p."""
         launch(
             begin_grid_kernel,
             1,
@@ -110,11 +111,11 @@ class FusedConjugateGradient(ConjugateGradient):
         )
 
     def _turn(self, launch: Launch) -> None:
-        """Beta and alpha, of the sums z'A z, z'A p, r'z and r'p that the cycle has left."""
+        """Compute beta and alpha from the cycle's sums z'A z, z'A p, r'z and r'p."""
         self._reduction.add_up(int(engine.ZAZ), columns=4, launch=launch)
         launch(engine.plan_step_kernel, 1, [self._scalars.array], device=self.device)
 
     def _move(self, launch: Launch) -> None:
-        """p = z + beta p, x += alpha p, r -= alpha A p; and r'r."""
+        """Update p = z + beta p, x += alpha p and r -= alpha A p; sum r'r."""
         ADVANCE.launch(*self._passes, launch=launch)
         self._reduction.add_up(int(SQUARE), launch=launch)

@@ -1,4 +1,7 @@
-"""Reduced system of a grid: conjugate gradients that move x itself, by the fused passes of projected multigrid."""
+"""Reduced system of a grid in fused passes.
+
+Conjugate gradients move x itself, by the passes of projected multigrid.
+"""
 
 from __future__ import annotations
 
@@ -23,10 +26,12 @@ IDLE = StoppingCriteria.patience  # iterations of one linear solve without a sma
 
 
 class MinimumMapResidual(AssessedResidual):
-    """The natural residual, with the free set that the minimum map has there: unknowns with x - y / A_ii within their bounds.
+    """Natural residual with the free set of the minimum map.
+
+    Free are the unknowns with x - y / A_ii within their bounds.
 
     Attributes:
-        away: whether unknowns that are held are not at their bounds yet.
+        away: whether held unknowns are not at their bounds yet.
     """
 
     _away: wp.array[Any]
@@ -35,7 +40,7 @@ class MinimumMapResidual(AssessedResidual):
     def __init__(self, problem: LCP, A: HasStencil, hierarchy: Hierarchy, *, rounded: bool) -> None:
         super().__init__(problem, A, hierarchy, rounded=rounded)
         planes, rows, _ = A.stencil.padding.counts
-        # rows with such unknowns
+        # Rows with such unknowns.
         self._away = wp.zeros(planes * rows, dtype=wp.uint8, device=A.device)
 
     @property
@@ -45,7 +50,10 @@ class MinimumMapResidual(AssessedResidual):
         return found if across is None else across.any(found)
 
     def hold(self, x: wp.array[Any]) -> None:
-        """Move held unknowns onto their bounds, and the right-hand side with them."""
+        """Move held unknowns onto their bounds, and update the right-hand side.
+
+        Only in flagged rows and those beside them: g = -(A x + b) / size on the free set.
+        """
         p, s, finest = self.problem, self._A.stencil, self._finest
         engine.HOLD.bind(
             s.rows,
@@ -57,7 +65,7 @@ class MinimumMapResidual(AssessedResidual):
         ).launch(wp.launch)
         s.wrap(x)
         if s.ghosts is not None:
-            self._away.fill_(1)  # which rows beside a cut have moved, others know
+            self._away.fill_(1)  # rows beside a cut may have moved on another rank
         _, around_y, around_z = s.periodic
         engine.RIGHT_SIDE.bind(
             s.rows,
@@ -75,13 +83,12 @@ class MinimumMapResidual(AssessedResidual):
 
 
 class FusedGridSystem:
-    """Newton's equations on a grid without a correction in memory, see `ReducedSystem`.
+    """Newton's equations on a grid without a stored correction, see `ReducedSystem`.
 
     Each iteration of conjugate gradients, preconditioned by a multigrid cycle, moves x itself,
     projected, and evaluates the residual and the free set there. The linear solve ends when the
-    residual is small enough, or as soon as an iterate calls other unknowns free: what it was to
-    solve is not the system any more. Conjugate gradients carry their direction on to the next
-    system.
+    residual is small enough, or as soon as the free set of an iterate differs, because the system
+    has then changed. Conjugate gradients keep their direction for the next system.
 
     Args:
         problem: of a grid.
@@ -106,8 +113,7 @@ class FusedGridSystem:
             ahead=False,
         )
         self._exact = passes.precision is not Precision.SINGLE
-        # Where x is rounded to float32 the energy says little of a step, and Newton's own safeguard
-        # decides.
+        # If x is rounded to float32, the energy is too noisy, and Newton's own safeguard decides.
         passes.cycles_against_creeping = self._exact
         self._target, self._active, self._length, self._step = 0.0, 0, 1.0, 0.0
         self._sinks = False  # whether the energy has fallen to a new least
@@ -115,21 +121,27 @@ class FusedGridSystem:
     def start(
         self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
     ) -> None:
-        """Forget the search direction; the operator may have changed."""
+        """Reset the search direction; the operator may have changed."""
         self._target = tolerance
         self.iterate.start(warm=warm, tolerance=tolerance, floating=floating)
 
     def monotone_cycle(self) -> Step | None:
-        """Take a projected cycle while the start is cold, or the free set creeps, or Newton's steps have failed."""
+        """Take a projected cycle if one is due.
+
+        That is after a cold start, if the free set creeps, or if Newton's steps have failed.
+        """
         return self.iterate.monotone_step() if self.iterate.cycles_left > 0 else None
 
     def classify(self) -> Step | None:
-        """Do nothing more: the evaluation of the residual at x has found the free set."""
+        """Do nothing more: the evaluation of the residual has found the free set."""
         self._active, self._length = self.iterate.residual.active, 1.0
         return None
 
     def restrict(self) -> bool:
-        """Move held unknowns onto their bounds; the hierarchy follows the free set before its next cycle."""
+        """Move held unknowns onto their bounds.
+
+        The hierarchy is updated for the free set before its next cycle.
+        """
         passes, residual = self.iterate, self.iterate.residual
         assert isinstance(residual, MinimumMapResidual)
         if residual.away:
@@ -138,9 +150,12 @@ class FusedGridSystem:
         return True
 
     def solve(self) -> int:
-        """Move x by conjugate gradients until its residual is small enough, or its free set another one."""
+        """Move x by conjugate gradients; return the number of iterations.
+
+        They end when the residual is small enough, or the free set changes.
+        """
         passes, residual, s = self.iterate, self.iterate.residual, self._settings
-        wanted, least, iterations, idle = (
+        target, least, iterations, idle = (
             max(s.eta * residual.norm, self._target),
             residual.norm,
             0,
@@ -151,20 +166,23 @@ class FusedGridSystem:
             iterations += 1
             if (
                 passes.stale
-                or not residual.norm > wanted
+                or not residual.norm > target
                 or iterations >= s.max_linear_iterations
                 or time_is_up()
             ):
                 break
             least, idle = (residual.norm, 0) if residual.norm < least else (least, idle + 1)
-            if idle >= IDLE and not self._exact:  # what rounding x to float32 leaves
+            if idle >= IDLE and not self._exact:  # the rounding of x to float32 limits the residual
                 break
         self._sinks = passes.descent.sinks and self._exact
         self.whole = self._sinks or not math.isfinite(residual.norm) or not passes.bounded
         return iterations
 
     def move(self, length: float) -> float:
-        """Let x go only this part of the last iteration's step; with length 1 it is there."""
+        """Shorten the last iteration's step to this part of it; return the residual.
+
+        With length 1 x is already there.
+        """
         passes = self.iterate
         if length == 1.0:
             return passes.residual.norm
@@ -174,21 +192,24 @@ class FusedGridSystem:
         return passes.residual.evaluate(passes.x)
 
     def _prepare_shortening(self) -> None:
-        """Note the whole step before the first part of it is taken back."""
+        """Store the whole step before it is shortened."""
         if self._length == 1.0:
             self._step = float(self.iterate.residual.scalars.numpy()[int(engine.STEP)])
             self.iterate.store_best()
             self.iterate.forget_direction()
 
     def accept(self, iterations: int) -> Step:
-        """Return the step; the energy judges a shortened one now, iterations of the solve have been judged."""
+        """Return the accepted step.
+
+        The energy judges a shortened step here; the iterations of the solve have been judged.
+        """
         if self._length < 1.0:
             self.iterate.judge()
             self._sinks = self.iterate.descent.sinks
         return Step("newton", iterations, self._active, interim=self._sinks)
 
     def fall_back(self, iterations: int, norms: deque[float], best: float, length: float) -> Step:
-        """Take projected cycles from where the search has ended."""
+        """Take projected cycles from the end of the search."""
         passes = self.iterate
         self._prepare_shortening()
         passes.begin_cycles(passes.descent.due(0))

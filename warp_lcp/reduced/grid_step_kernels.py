@@ -1,5 +1,9 @@
 # mypy: ignore-errors
-"""Passes of the projected multigrid method: a CG step, and the residual, active set and right-hand side after it; plans of the step."""
+"""Kernels of the projected multigrid method.
+
+A conjugate-gradient step; the residual, active set and right-hand side after it; the choice of the
+step.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -11,7 +15,7 @@ from warp_lcp.multigrid.stencil_level import StencilLevel
 from warp_lcp.rows import Bound, KernelFile, Wave
 from warp_lcp.rows.compiler import forward_kernel
 
-# Slots of the device scalars. NORM, MOVED and ACTIVE are sums of one pass, and so are ZAZ ... GP.
+# Slots of the device scalars. NORM, MOVED and ACTIVE are sums of one pass, as are ZAZ ... GP.
 NORM = wp.constant(0)  # squared norm of the natural residual
 MOVED = wp.constant(1)  # not 0 if the free set has changed
 ACTIVE = wp.constant(2)  # unknowns held at a bound
@@ -24,11 +28,11 @@ PAP = wp.constant(8)  # of the search direction, carried from step to step
 SIZE = wp.constant(9)  # corrections are computed for a right-hand side divided by this
 BETA = wp.constant(10)
 STEP = wp.constant(11)  # x moved by this multiple of the direction
-CARRY = wp.constant(12)  # 0: forget the search direction
-# 1 / SIZE: a division takes a GPU as long as the residual does, which each cell would make
+CARRY = wp.constant(12)  # 0: reset the search direction
+# 1 / SIZE: a division in each cell takes a GPU as long as the residual.
 PER_SIZE = wp.constant(13)
 SLOTS = 14
-# of a correction's energy that must not lie along the last direction: else cancellation
+# Least share of a correction's energy that is not along the last direction: less is cancellation.
 LEAST_REST = wp.constant(wp.float64(1e-3))
 
 f64 = wp.array(dtype=wp.float64)
@@ -38,11 +42,11 @@ SLOT = {"SIZE": SIZE, "BETA": BETA, "STEP": STEP, "PER_SIZE": PER_SIZE}
 KERNELS = KernelFile(Path(__file__).parent / "headers/grid_step.h", SLOT)
 UPDATE = KERNELS["projected_multigrid.update"]
 ASSESS = KERNELS["projected_multigrid.assess"]
-# a plane is assessed when the one above it has moved
+# A plane is evaluated when the one above it has moved.
 ADVANCE = Wave("projected_multigrid.advance", (UPDATE, 0), (ASSESS, 1))
 MEASURE = KERNELS["projected_multigrid.measure"]
 MEASURE_AGAIN = KERNELS["projected_multigrid.measure_again"]
-# the last leg of a cycle: z is still in the cache
+# The last part of a cycle: z is still in the cache.
 CLIMB = Wave("projected_multigrid.climb", *ASCEND.stages, (MEASURE, 3))
 HOLD = KERNELS["projected_multigrid.hold"]
 RIGHT_SIDE = KERNELS["projected_multigrid.right_side"]
@@ -52,7 +56,7 @@ UNDO = KERNELS["projected_multigrid.undo"]
 
 
 def measuring(finest: StencilLevel, direction: Any, out: Any) -> Bound:
-    """Return the measuring of a cycle's correction along a direction."""
+    """Return the kernel that sums the products of a cycle's correction."""
     return MEASURE.bind(
         finest.stencil.rows, stencil=finest.stencil, z=finest.x, q=direction, g=finest.b, out=out
     )
@@ -67,7 +71,12 @@ def conjugate(
     pap: wp.float64,
     least: wp.float64,
 ):
-    """Beta that makes z + beta p conjugate to p, 0 where z is nearly p, and of the sum the curvature and the gain; the host's too."""
+    """Return beta, curvature and gain of the direction z + beta p.
+
+    beta = -z'Ap / p'Ap makes the direction conjugate to p. Its curvature is z'Az + 2 beta z'Ap +
+    beta^2 p'Ap and its gain g'z + beta g'p. Returns beta = 0 where z is nearly parallel to p. The
+    host uses it too.
+    """
     ratio = -zap / pap
     rest = zaz + ratio * (zap + zap + ratio * pap)
     if rest > least * zaz:
@@ -77,18 +86,22 @@ def conjugate(
 
 @forward_kernel(module="warp_lcp.projected_multigrid")
 def plan_step_kernel(scalars: f64):
-    """Beta and the step length from the measured products: the new direction is conjugate to the last one, the step minimizes along it."""
+    """Compute beta and the step length from the measured products.
+
+    The new direction is conjugate to the last one, and the step, gain / curvature, minimizes the
+    energy along it.
+    """
     zero = wp.float64(0.0)
     beta = zero
     curvature = scalars[ZAZ]
     gain = scalars[GZ]
-    # without a direction to carry, p and its products are meaningless
+    # Without a stored direction, p and its products are meaningless.
     if scalars[CARRY] != zero and scalars[PAP] > zero:
         beta, curvature, gain = conjugate(
             curvature, scalars[ZAP], gain, scalars[GP], scalars[PAP], LEAST_REST
         )
     length = zero
-    # a step that is not finite is not taken, and is reported
+    # A step that is not finite is not taken, and is reported.
     if curvature > zero or not wp.isfinite(curvature):
         length = gain / curvature
     scalars[PAP] = curvature
@@ -100,7 +113,7 @@ def plan_step_kernel(scalars: f64):
 
 @wp.func
 def rescale(scalars: f64):
-    """Take the norm of the residual as the next right-hand side's unit."""
+    """Use the norm of the residual as the unit of the next right-hand side."""
     if scalars[NORM] > wp.float64(0.0):
         scalars[SIZE] = wp.sqrt(scalars[NORM])
         scalars[PER_SIZE] = wp.float64(1.0) / scalars[SIZE]
@@ -108,9 +121,10 @@ def rescale(scalars: f64):
 
 @forward_kernel(module="warp_lcp.projected_multigrid")
 def plan_whole_step_kernel(scalars: f64, searched: bool):
-    """Take a projected cycle's correction z as it is, or as much of it as lowers the energy most; both keep to the bounds.
+    """Take a projected cycle's correction z, whole or shortened.
 
-    The direction is forgotten.
+    If `searched`, as much of z is taken as lowers the energy most, g'z / z'Az. Both keep the
+    bounds. The direction is reset.
     """
     share = wp.float64(1.0)
     if searched:

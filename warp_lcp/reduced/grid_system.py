@@ -1,4 +1,7 @@
-"""Principal system of a grid: conjugate gradients, or GMRES if A is not symmetric, with a multigrid cycle."""
+"""Principal system of a grid: a Krylov method preconditioned by multigrid.
+
+Conjugate gradients, or GMRES if A is not symmetric.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,10 @@ from warp_lcp.rows.vectors import Reduction, rows_of
 
 
 class GridSystem(GuardedSystem):
-    """Conjugate gradients on a grid, preconditioned by a linear multigrid cycle on the free set; of `hierarchy` where there is one."""
+    """Conjugate gradients on a grid, preconditioned by a multigrid cycle.
+
+    The cycle is linear, on the free set, and of `hierarchy` if that is given.
+    """
 
     def __init__(
         self,
@@ -44,7 +50,7 @@ class GridSystem(GuardedSystem):
         )
         self.r, self.z = self.hierarchy.finest.b, self.hierarchy.finest.x
         self._weight = zeros_like(self.r) if shifted else None
-        # one CPU thread, no ghost cells to fill
+        # One CPU thread, no ghost cells to fill.
         self.fused = self.hierarchy.ends_in_wave and A.symmetric and A.stencil.ghosts is None
         if self.fused:
             method: Any = FusedConjugateGradient(A.stencil, self.hierarchy, weighted=shifted)
@@ -57,7 +63,7 @@ class GridSystem(GuardedSystem):
             self._guard(partial(MatrixSystem, A, shifted=shifted))
 
     def refresh(self) -> None:
-        """Take the rows and the weights again if the operator has changed."""
+        """Read the rows and the weights again if the operator has changed."""
         if self._version != self._A.version:
             self._version, self._substitute = self._A.version, None
             self.hierarchy.refresh()
@@ -92,15 +98,15 @@ class GridSystem(GuardedSystem):
 
     @property
     def program(self) -> Program:
-        """Precondition: z = one cycle on r."""
+        """The preconditioner: z = one cycle on r."""
         return self.hierarchy.cycle
 
     def apply(self) -> None:
-        """Precondition: run `program`."""
+        """Apply the preconditioner: run `program`."""
         self.program.run()
 
     def monotone_cycle(self) -> None:
-        """One projected cycle on r within the finest level's bounds; the correction is `z`."""
+        """Run a projected cycle on r within the finest bounds; the correction is `z`."""
         self.hierarchy.monotone_cycle.run()
 
 
@@ -115,17 +121,17 @@ def projected_cycle(
     *,
     restrict: bool = True,
 ) -> None:
-    """Run one from x: the correction is `system.z` times `size`.
+    """Run a projected cycle from x: the correction is `system.z` times `size`.
 
     Args:
-        problem: a grid's.
+        problem: on a grid.
         system: of its corrections.
-        x: where to begin, a stored field like y and free.
+        x: the start, a stored field like y and free.
         y: A x + b.
-        size: what the right-hand side is divided by.
-        free: every unknown's, when this is done.
+        size: divisor of the right-hand side.
+        free: set to all unknowns.
         sums: memory; `SIZE` of its scalars is written.
-        restrict: whether the system does not have all unknowns yet.
+        restrict: whether the system must be restricted to all unknowns first.
     """
     rows, finest = Rows.flat(problem.layout.size, problem.device), system.hierarchy.finest
     ALL_FREE.bind(rows, unknown=problem.unknown, free=free).launch()

@@ -1,4 +1,7 @@
-"""Reduced system of a small or narrow matrix on the host: whole Newton steps by LAPACK, no kernel launches."""
+"""Reduced system of a small or narrow matrix on the host.
+
+Whole Newton steps by LAPACK, without kernel launches.
+"""
 
 from __future__ import annotations
 
@@ -21,30 +24,33 @@ from warp_lcp.reduced.correction_system import CorrectionSystem
 from warp_lcp.reduced.dense_problem import factored
 from warp_lcp.reduced.nested_iteration import nested_iteration
 
-# unknowns up to which LAPACK on the host costs less than launches of kernels, whatever the
-# bandwidth
+# Largest number of unknowns for which LAPACK on the host costs less than kernel launches, for every
+# bandwidth.
 MOST = 200
-FEW = 30  # unknowns up to which dense factors cost no more than banded ones, whatever the bandwidth
-# whole steps after nested iteration: M-matrices take 2 to 5, and beams, whose sets may wander,
-# seldom more
+FEW = 30  # up to so many unknowns dense factors cost no more than banded ones
+# Whole steps after nested iteration: M-matrices take 2 to 5, and beams, whose sets may wander,
+# seldom more.
 NARROW_STEPS = 20
-# steps without a smaller residual, the loop's patience, after which safeguarded steps take over
+# Steps without a smaller residual, the loop's patience, after which safeguarded steps take over.
 IDLE = 30
-# steps before nested iteration, which costs about 20: many active sets are found in fewer
+# Steps before nested iteration, which costs about 20: many active sets are found in fewer.
 PLAIN = 4
 
 
 class SmallMatrix:
-    """A dense copy of at most `MOST` unknowns on the host, float64; of a dense operator on the CPU the operator's own memory."""
+    """A dense float64 copy of at most `MOST` unknowns on the host.
 
-    width = 0  # how far unknowns are coupled; 0: no order of the unknowns is known to matter
+    For a dense operator on the CPU it is the operator's own memory.
+    """
+
+    width = 0  # bandwidth; 0: the order of the unknowns is not known to matter
 
     def __init__(self, A: DenseOperator | SparseOperator) -> None:
         self._A = A
         self.refresh()
 
     def refresh(self) -> None:
-        """Take the entries as they are now."""
+        """Read the current entries."""
         A = self._A
         self._host = (
             A.matrix().toarray()
@@ -57,7 +63,7 @@ class SmallMatrix:
         return self._host @ x
 
     def solve(self, free: np.ndarray, r: np.ndarray) -> np.ndarray | None:
-        """Return e with A_FF e_F = r_F and 0 elsewhere, None where A_FF looks singular."""
+        """Return e with A_FF e_F = r_F and 0 elsewhere, None where A_FF is singular."""
         rows = free.nonzero()[0]
         if not len(rows):
             return np.zeros(len(r))
@@ -82,7 +88,7 @@ class NarrowMatrix:
         self.refresh()
 
     def refresh(self) -> None:
-        """Take the entries as they are now."""
+        """Read the current entries."""
         version = self._A.version if isinstance(self._A, SparseOperator) else self._version + 1
         if version != self._version:
             self._version, self.banded = version, BandedMatrix(bands_of(self._A, self.width))
@@ -92,12 +98,15 @@ class NarrowMatrix:
         return self.banded.product(x)
 
     def solve(self, free: np.ndarray, r: np.ndarray) -> np.ndarray | None:
-        """Return e with A_FF e_F = r_F and 0 elsewhere, None where A_FF looks singular."""
+        """Return e with A_FF e_F = r_F and 0 elsewhere, None where A_FF is singular."""
         return self.banded.solve(free, r)
 
 
 def suits(A: Any) -> bool:
-    """Return whether an operator's systems are solved directly on the host: a matrix that is small or narrow."""
+    """Return whether systems of an operator are solved directly on the host.
+
+    The matrix must be small or narrow.
+    """
     return (
         isinstance(A, (DenseOperator, SparseOperator))
         and A.layout.across is None
@@ -106,14 +115,16 @@ def suits(A: Any) -> bool:
 
 
 class HostResidual(NaturalResidual):
-    """The natural residual of a problem on the CPU, by NumPy: a launch costs more than a small problem's product.
+    """The natural residual of a problem on the CPU, by NumPy.
+
+    A launch costs more than the product of a small problem.
 
     Args:
-        problem: on the CPU, its fields stored as they are.
+        problem: on the CPU, its fields stored without padding.
         matrix: its A.
     """
 
-    _taken = False  # whether A, b and the bounds are at hand
+    _taken = False  # whether A, b and the bounds have been read
 
     def __init__(self, problem: LCP, matrix: SmallMatrix | NarrowMatrix) -> None:
         self.problem, self.matrix = problem, matrix
@@ -123,16 +134,16 @@ class HostResidual(NaturalResidual):
 
     @cached_property
     def diagonal(self) -> wp.array[Any]:
-        """The scale, for what goes on by kernels."""
+        """The scale as a device array, for kernels."""
         return wp.array(self.scale, dtype=self.problem.A.dtype, device=self.problem.device)
 
     @cached_property
     def y(self) -> wp.array[Any]:
-        """What `evaluate` computes y in, likewise."""
+        """The memory in which `evaluate` computes y, as a device array."""
         return wp.array(self._y, dtype=wp.float64, device=self.problem.device, copy=False)
 
     def _take(self) -> None:
-        """Take A, b and the bounds as they are now."""
+        """Read the current A, b and bounds."""
         self.matrix.refresh()
         bounds = self.problem.bounds
         self.lower, self.upper, self.b = bounds.host(0), bounds.host(1), self.problem.b.numpy()
@@ -149,7 +160,7 @@ class HostResidual(NaturalResidual):
 
     def evaluate(self, x: wp.array[Any]) -> float:
         """Compute y and return the norm of the natural residual at x."""
-        if not self._taken:  # a block among others is looked at before it is solved
+        if not self._taken:  # a block among others is evaluated before it is solved
             self._take()
         values, y, d = self.values(x), self._y, self.scale
         np.add(self.matrix.product(values), self.b, out=y)
@@ -159,7 +170,7 @@ class HostResidual(NaturalResidual):
         return self.norm
 
     def values(self, x: wp.array[Any]) -> np.ndarray:
-        """Return x's memory; a view takes a tenth of a small solve each time it is made."""
+        """Return x's memory; creating a view takes a tenth of a small solve."""
         if x is not self._field:
             self._field, self._values = x, x.numpy()
         return self._values
@@ -174,7 +185,7 @@ class HostResidual(NaturalResidual):
 
 
 class HostIterate(IterateMemory):
-    """An iterate whose residual is evaluated, and whose best values are kept, on the host.
+    """An iterate whose residual and best values are computed on the host.
 
     Args:
         problem: the problem.
@@ -190,11 +201,11 @@ class HostIterate(IterateMemory):
         )
 
     def keep(self) -> None:
-        """Remember x, on the host."""
+        """Store x on the host."""
         self._kept = self.read().copy()
 
     def restore(self) -> None:
-        """Make x the best iterate again."""
+        """Set x to the best iterate."""
         self.write(self._kept)
 
     def read(self) -> np.ndarray:
@@ -216,12 +227,13 @@ class HostIterate(IterateMemory):
 
 
 class HostSystem:
-    """Whole Newton steps solved by LAPACK on the host, see `ReducedSystem`; a `CorrectionSystem` takes over where these lead nowhere.
+    """Whole Newton steps solved by LAPACK on the host, see `ReducedSystem`.
 
-    On an M-matrix whole steps end at the solution, but an end of a contact set may move by one
-    unknown a step. A narrow problem therefore takes nested iteration after `PLAIN` steps, which
-    finds the ends to within a few unknowns. A set that comes again, a singular block, or `IDLE`
-    steps without gain: searched steps go on from the best iterate.
+    A `CorrectionSystem` takes over where these fail. On an M-matrix whole steps end at the
+    solution, but an end of a contact set may move by one unknown a step. A narrow problem therefore
+    uses nested iteration after `PLAIN` steps, which finds the ends to within a few unknowns. After
+    a recurring set, a singular block, or `IDLE` steps without progress, steps with a search
+    continue from the best iterate.
 
     Args:
         problem: with a small or a narrow matrix.
@@ -249,7 +261,7 @@ class HostSystem:
     def start(
         self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
     ) -> None:
-        """Forget the sets, and read the bounds as they are now."""
+        """Reset the sets, and read the current bounds."""
         self._warm, self._target, self._floating = warm, tolerance, floating
         residual, bounds, self._b = (
             self.iterate.residual,
@@ -273,7 +285,10 @@ class HostSystem:
         return None
 
     def classify(self) -> Step | None:
-        """Find which unknowns are held at l and which at u; take nested iteration instead where it is due."""
+        """Find which unknowns are held at l and which at u.
+
+        Nested iteration replaces the step where it is due.
+        """
         residual = self.iterate.residual
         self._wait -= 1
         if self._wait < 0 and isinstance(self._matrix, NarrowMatrix) and not self._nested:
@@ -284,26 +299,28 @@ class HostSystem:
                 self._left = NARROW_STEPS
                 self._go(coarse)
                 return Step("nested iteration", 1, None, interim=True)
-        if self._begun:  # the start's residual says nothing of the steps to come
+        if self._begun:  # the residual of the start says nothing about later steps
             self._least, self._idle = (
                 (residual.norm, 0) if residual.norm < self._least else (self._least, self._idle + 1)
             )
         self._x = self.iterate.read()
+        # Unknown i is held at l or u where x_i - y_i / d_i is outside [l_i, u_i].
         target = self._x - self.iterate.y() / self._d
         self._below, self._above = target < self._lower, target > self._upper
         self._left -= 1
         return None
 
     def restrict(self) -> bool:
-        """Do nothing: `solve` takes the rows of the free unknowns."""
+        """Do nothing: `solve` selects the rows of the free unknowns."""
         return True
 
     def solve(self) -> int | None:
-        """Factor A_FF and solve; None where steps lead nowhere."""
+        """Factor A_FF and solve; None where steps make no progress."""
         below, above = self._below, self._above
         if self._left < 0 or self._idle >= IDLE or self._comes_again(below, above):
             return None
         self._held = below | above
+        # Held unknowns at their bounds; A_FF e_F = -(A start + b)_F.
         start = np.where(below, self._lower, np.where(above, self._upper, self._x))
         e = self._matrix.solve(~self._held, -(self._matrix.product(start) + self._b))
         if e is None or not np.isfinite(e).all():
@@ -320,7 +337,7 @@ class HostSystem:
         """Set x, within its bounds once the residual meets the tolerance."""
         iterate, residual, self._begun = self.iterate, self.iterate.residual, True
         iterate.write(values)
-        # x may miss its bounds by what the criteria allow
+        # x may violate its bounds by what the criteria allow.
         if residual.evaluate(iterate.x) <= self._target:
             iterate.write(np.clip(values, self._lower, self._upper))
             residual.current = False
@@ -329,13 +346,13 @@ class HostSystem:
             residual.current = False
 
     def accept(self, iterations: int) -> Step:
-        """Return the step; whole steps may first take the residual up."""
+        """Return the accepted step; whole steps may first raise the residual."""
         return Step("active set", iterations, int(np.count_nonzero(self._held)), interim=True)
 
     def fall_back(
         self, iterations: int, norms: deque[float], best: float, length: float
     ) -> CorrectionSystem:
-        """Return the system of searched steps, at the best iterate."""
+        """Return the system of steps with a search, at the best iterate."""
         iterate, residual = self.iterate, self.iterate.residual
         iterate.restore()
         residual.evaluate(iterate.x)
@@ -345,7 +362,7 @@ class HostSystem:
         return searched
 
     def _comes_again(self, below: np.ndarray, above: np.ndarray) -> bool:
-        """Return whether an active set has come again: whole steps would repeat themselves."""
+        """Return whether an active set has recurred: whole steps would cycle."""
         key = below.tobytes() + above.tobytes()
         if key in self._seen:
             return True

@@ -1,4 +1,4 @@
-"""Principal system of a compact stencil in 2-D: a Krylov method with multigrid cycles over lines."""
+"""Principal system of a compact stencil in 2-D, preconditioned by line multigrid."""
 
 from __future__ import annotations
 
@@ -18,7 +18,10 @@ from warp_lcp.rows.program import Program
 
 
 class LineSystem(GuardedSystem):
-    """Conjugate gradients on a compact stencil in 2-D, or GMRES if A is not symmetric, preconditioned by cycles over lines."""
+    """Krylov method on a compact stencil in 2-D, preconditioned by line cycles.
+
+    Conjugate gradients, or GMRES if A is not symmetric.
+    """
 
     def __init__(
         self,
@@ -42,20 +45,20 @@ class LineSystem(GuardedSystem):
         self._version = A.version
 
     def refresh(self) -> None:
-        """Try cycles over lines again if the operator has changed; `restrict` takes A's entries."""
+        """Try line cycles again if the operator has changed; `restrict` reads A."""
         if self._version != self._A.version:
             self._version, self._substitute = self._A.version, None
 
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
-        """Take another free set and shift, and coarsen."""
+        """Set another free set and shift, and coarsen."""
         self._note(free, shift)
         self.hierarchy.restrict(free, shift, self._weight)
 
     @property
     def program(self) -> Program:
-        """Precondition: z = one cycle on r."""
+        """The preconditioner: z = one cycle on r."""
         return self.hierarchy.cycle
 
     def apply(self) -> None:
-        """Precondition: run `program`."""
+        """Apply the preconditioner: run `program`."""
         self.program.run()

@@ -1,4 +1,8 @@
-"""A multigrid cycle for A made one for A + U W U': Woodbury's formula with the cycle in place of the inverse."""
+"""Woodbury preconditioner for a grid operator plus a term of low rank.
+
+A multigrid cycle for A becomes one for A + U W U': Woodbury's formula with the cycle in place of
+the inverse.
+"""
 
 from __future__ import annotations
 
@@ -19,17 +23,17 @@ from warp_lcp.rows.program import launch as launch_recorded
 from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import Reduction
 
-# added over own inertia, as estimated, from which a column is corrected for: others move
-# eigenvalues by a small factor
+# Ratio of added to own inertia, as estimated, from which a column is corrected: the other columns
+# move eigenvalues by a small factor.
 STRONG = 2.0
-# U_q' A^-1 U_q / (U_q' U_q) over rows^(1 / (dimension - 1)): of a disc and of a sphere
+# U_q' A^-1 U_q / (U_q' U_q) over rows^(1 / (dimension - 1)): of a disc and of a sphere.
 SPREAD = 0.115
-FELT = 0.3  # added over own inertia of a mode of the columns corrected for, from which it counts
-CHANGED = 2.0  # factor by which a column's square may change before its potential is renewed
-MOST_READ = 1024  # products that are read with other numbers
-SKEW = 0.3  # the most that potentials may be unsymmetric
+FELT = 0.3  # ratio of added to own inertia from which a mode of the corrected columns counts
+CHANGED = 2.0  # factor by which a column's square may change before its potential is recomputed
+MOST_READ = 1024  # largest number of products that are read together with other numbers
+SKEW = 0.3  # largest relative skew part of the potentials
 SPREADING, STRONGEST = wp.constant(wp.float64(SPREAD)), wp.constant(wp.float64(STRONG))
-# what the host computes again must not come out the other way
+# Safety factor: the host recomputes the decision and must not decide otherwise.
 SAFELY = wp.constant(wp.float64(1.0 + 1e-9))
 I32, F64 = wp.array(dtype=wp.int32), wp.array(dtype=wp.float64)
 
@@ -37,7 +41,10 @@ I32, F64 = wp.array(dtype=wp.int32), wp.array(dtype=wp.float64)
 @no_type_check
 @forward_kernel(module="warp_lcp.low_rank_correction")
 def split_kernel(S: F64, E: F64, columns: I32, sums: F64, m: int, force: F64, kept: F64):
-    """From Z'r: kept = E^-1 Z'r, and S'^-1 Z'r as factors of all columns; S and E are the inverses."""
+    """Split Z'r: e = E^-1 Z'r into `kept`, f = S'^-1 Z'r into `force`.
+
+    `force` has a factor for each column of U. S and E are the inverses, row by row.
+    """
     i = wp.tid()
     f = wp.float64(0.0)
     e = wp.float64(0.0)
@@ -51,7 +58,10 @@ def split_kernel(S: F64, E: F64, columns: I32, sums: F64, m: int, force: F64, ke
 @no_type_check
 @forward_kernel(module="warp_lcp.low_rank_correction")
 def join_kernel(S: F64, columns: I32, u: F64, m: int, kept: F64, t: F64):
-    """From U'z: t = S^-1 U'z less what `split_kernel` kept; S is the inverse."""
+    """Compute t = S^-1 U'z - kept, with `kept` of `split_kernel`.
+
+    S is the inverse, row by row.
+    """
     i = wp.tid()
     a = -kept[i]
     for j in range(m):
@@ -62,7 +72,10 @@ def join_kernel(S: F64, columns: I32, u: F64, m: int, kept: F64, t: F64):
 @no_type_check
 @forward_kernel(module="warp_lcp.low_rank_correction")
 def add_products_kernel(W: F64, uz: F64, up: F64, n: int, scalars: F64):
-    """Make z'Kz and z'Kp of K = A + U W U' from those of A."""
+    """Add z'(U W U')z to z'Az, and z'(U W U')p to z'Ap.
+
+    The sums are then those of K = A + U W U'. Arguments: uz = U'z, up = U'p.
+    """
     zz = wp.float64(0.0)
     zp = wp.float64(0.0)
     for i in range(n):
@@ -77,7 +90,11 @@ def add_products_kernel(W: F64, uz: F64, up: F64, n: int, scalars: F64):
 @no_type_check
 @forward_kernel(module="warp_lcp.low_rank_correction")
 def subtract_energy_kernel(u: F64, weighed: F64, n: int, scalars: F64, products: F64):
-    """From u = U'x and W u: x'(y + b + U W U' x) exceeds twice the energy by x'U W U' x; keep u as `products`."""
+    """Correct the energy by the term of low rank, from u = U'x and W u.
+
+    x'(y + b + U W U' x) exceeds twice the energy by x'U W U' x, which is subtracted. u is stored as
+    `products`.
+    """
     beyond = wp.float64(0.0)
     for i in range(n):
         beyond += u[i] * weighed[i]
@@ -103,7 +120,11 @@ def calm_kernel(
     power: wp.float64,
     calm: I32,
 ):
-    """Find whether no column is strong, with a margin; one thread."""
+    """Set `calm` to 1 if no column is strong, with a margin, else to 0; one thread.
+
+    A column is strong if W_qq SPREAD rows^power U_q'U_q >= STRONG, its estimated ratio of added to
+    own inertia.
+    """
     calm[0] = 1
     for q in range(rank):
         rows = squares[rank + q // width]
@@ -125,26 +146,26 @@ class LowRankCorrection:
 
         M = P B P' + Z E^-1 Z',   P = I - Z S^-1 U',
 
-    is the inverse of B^-1 + U W U' (Woodbury): what the cycle leaves of the condition number of A
-    it then leaves of that of A + U W U', whatever W is. Conjugate gradients without it meet an
-    eigenvalue 1 + W_qq U_q' A^-1 U_q a column: the mass of liquid that a body moves with it over
-    its own mass, 1000 for the lightest.
+    is the inverse of B^-1 + U W U' (Woodbury). The condition number of the preconditioned A + U W
+    U' is then that of the preconditioned A, for every W. Without it conjugate gradients meet an
+    eigenvalue 1 + W_qq U_q' A^-1 U_q for each column: the ratio of the mass of liquid that a body
+    moves with it to its own mass, 1000 for the lightest.
 
-    In this form M is symmetric and positive definite for any Z with an S like that: Z is made when
-    a solve begins, a cycle a column, and again only where the free set has changed much. Columns
-    with a small ratio are left alone, they cost nothing. Those corrected for may depend on each
-    other, where few cells touch a body: the inverses are those on the modes of W^(1/2) S W^(1/2)
-    that are felt. Nothing is kept from one solve to the next, so that results do not depend on what
-    was solved before.
+    In this form M is symmetric and positive definite for any Z with such an S. Z is computed when a
+    solve begins, a cycle for each column, and again only where the free set has changed much.
+    Columns with a small ratio are not corrected and cost nothing. The corrected columns may depend
+    on each other, where few cells touch a body: the inverses are those on the modes of W^(1/2) S
+    W^(1/2) with a ratio above FELT. Nothing is kept from one solve to the next, so that results do
+    not depend on earlier solves.
 
     Args:
         low: U W U'.
         hierarchy: of A on the free set.
 
     Attributes:
-        slots: columns corrected for.
-        noted: the sums that `renew` decides by.
-        calm: on a GPU, int32 of shape (1,): whether they ask for no column.
+        slots: number of corrected columns.
+        noted: the sums by which `renew` decides.
+        calm: on a GPU, int32 of shape (1,): whether they require no corrected column.
     """
 
     def __init__(self, low: LowRankOperator, hierarchy: Hierarchy) -> None:
@@ -160,13 +181,13 @@ class LowRankCorrection:
         self._power = wp.float64(
             1.0 / max(sum(n > 1 for n in hierarchy.finest.stencil.padding.counts) - 1, 1)
         )
-        # of the sums on a GPU, and the entries that it is for
+        # The reduction of the sums on a GPU, with the memory of its entries.
         self._adding: tuple[Any, Reduction] | None = None
         self._columns_of_slots = HostArray(n, wp.int32, device)
         self._of_slot = self._columns_of_slots.array
         self._size = hierarchy.finest.x.size
         self._Z = wp.zeros(0, dtype=hierarchy.real, device=device)
-        self._spare = self._Z  # in which potentials lie that get other slots
+        self._spare = self._Z  # memory for potentials that change slots
         self._bound: dict[int, tuple[Reduction, Any, Any]] = {}  # by the number of slots
         self._dots: Reduction | None = None
         self._slot_columns = list[int]()
@@ -191,37 +212,47 @@ class LowRankCorrection:
 
     @property
     def slots(self) -> int:
-        """Number of columns corrected for."""
+        """Number of corrected columns."""
         return len(self._slot_columns)
 
     @property
     def is_calm(self) -> bool:
-        """Whether no column is corrected for; a GPU then continues without the host while `calm` is 1."""
+        """Whether no column is corrected.
+
+        A GPU then continues without the host while `calm` is 1.
+        """
         return self.calm is not None and self.slots == 0
 
     @property
     def is_made_ahead(self) -> bool:
-        """Whether a GPU makes the potentials of the last solve's columns as the next solve begins."""
+        """Whether a GPU computes the potentials before the host's decision.
+
+        They are those of the last solve's columns, at the start of the next solve.
+        """
         return self.calm is not None and self.slots > 0
 
     @property
     def readings(self) -> tuple[Reading, ...]:
-        """What `note`, `note_products` and `make_potentials` write."""
+        """Arrays that `note`, `note_products` and `make_potentials` write."""
         return (self.noted,) if self._read_products is None else (self.noted, self._read_products)
 
     @property
     def key(self) -> tuple[int, ...]:
-        """What recorded launches depend on."""
+        """Key of recorded launches."""
         return self.slots, self._Z.ptr or 0
 
     def prepare(self) -> None:
-        """Make what `note` launches, for the memory that the entries are in."""
+        """Prepare the launches of `note` for the current memory of the entries."""
         found, key = self.noted.array, self._columns.rows.ptr
         if self.calm is not None and (self._adding is None or self._adding[0] != key):
             self._adding = key, self._columns.reduction(found, found.size)
 
     def note(self, launch: Launch) -> None:
-        """Launch the sums U_q' U_q over the free set, the rows that each body touches there and, on a GPU, whether that is `calm`."""
+        """Launch the sums by which `renew` decides.
+
+        U_q' U_q over the free set, the number of rows that each body touches there and, on a GPU,
+        `calm`.
+        """
         columns, low, d = self._columns, self._low, self._hierarchy.finest.stencil.d
         if self.calm is None:
             one = Rows.flat(1, low.device)
@@ -230,25 +261,27 @@ class LowRankCorrection:
             ).launch(launch)
             return
         assert self._adding is not None, "prepare comes first"
-        found, adding = self.noted.array, self._adding[1]
+        squares, adding = self.noted.array, self._adding[1]
         BY_TURNS.bind(
             columns.turns, columns.entry_fields, rank=low.rank, d=d, out=adding.partials
         ).launch(launch)
-        adding.add_up(0, columns=found.size, launch=launch)
-        inputs = [low.weights, found, low.rank, columns.width, self._power, self.calm]
+        adding.add_up(0, columns=squares.size, launch=launch)
+        inputs = [low.weights, squares, low.rank, columns.width, self._power, self.calm]
         launch(calm_kernel, 1, inputs, device=low.device)
 
     def renew(self, *, begins: bool, noted: bool = False, made: bool = False) -> bool:
-        """Take the free set as it is now: choose the columns to correct for, and make potentials, a cycle each.
+        """Choose the columns to correct for the current free set, and update potentials.
+
+        A potential Z_q = B U_q costs a cycle.
 
         Args:
             begins: whether a solve begins.
             noted: whether `note` has been launched for this free set, `note_products` too, and
                 their readings have changed since.
-            made: whether `make_potentials` has.
+            made: whether `make_potentials` has been launched.
 
         Returns:
-            Whether the finest right-hand side was lost.
+            Whether the finest right-hand side was overwritten.
         """
         low, W = self._low, self._low.host_weights
         if not noted:
@@ -258,6 +291,8 @@ class LowRankCorrection:
         found, width, across = self.noted.numpy().copy(), self._columns.width, low.layout.across
         found = found if across is None else across.sum(found)
         squares, rows = found[: low.rank], np.repeat(found[low.rank :], width)
+        # Ratio of added to own inertia of column q: W_qq U_q'A^-1 U_q, estimated from the rows that
+        # it touches.
         strong = np.flatnonzero(
             W.diagonal() * SPREAD * rows ** float(self._power.value) * squares >= STRONG
         ).tolist()
@@ -273,19 +308,22 @@ class LowRankCorrection:
             self._seen[stale] = squares[stale]
         else:
             self._fill(stale, squares)
-        lost, known = (
+        overwritten, products_known = (
             bool(stale),
             self._read_products is not None
             and (made or (noted and not begins and not chosen and not stale)),
         )
-        if strong and not self._invert(W, known=known) and len(stale) < len(strong):
+        if strong and not self._invert(W, known=products_known) and len(stale) < len(strong):
             self._fill([q for q in strong if q not in stale], squares)
             self._invert(W)
-            lost = True
-        return lost
+            overwritten = True
+        return overwritten
 
     def begin(self, *, launch: Launch = launch_now) -> None:
-        """Before a cycle: take U S'^-1 Z'r off the hierarchy's finest right-hand side r."""
+        """Subtract U S'^-1 Z'r from the finest right-hand side r, before a cycle.
+
+        That is r <- P'r; the factors stay in `force`.
+        """
         if self._dots is None:
             return
         low, m = self._low, self.slots
@@ -296,7 +334,10 @@ class LowRankCorrection:
         self._spread(-1.0, launch)
 
     def end(self, *, launch: Launch = launch_now) -> None:
-        """After the cycle: correct the finest x, and put back what `begin` took."""
+        """Correct the finest x after the cycle, and restore r.
+
+        x <- x - Z (S^-1 U'x - E^-1 Z'r), and the term that `begin` subtracted is added again.
+        """
         if self._dots is None:
             return
         low, finest, m = self._low, self._hierarchy.finest, self.slots
@@ -308,11 +349,14 @@ class LowRankCorrection:
         self._subtract.launch(launch)
 
     def _choose(self, strong: list[int]) -> None:
-        """Give these columns slots; those that have one keep their potentials, the others' must be made."""
+        """Assign slots to these columns.
+
+        Columns that have a slot keep their potentials; the others' must be computed.
+        """
         old, low, n = {q: slot for slot, q in enumerate(self._slot_columns)}, self._low, self._size
-        kept = [q for q in strong if q in old and self._seen[q] > 0.0]
+        with_potentials = [q for q in strong if q in old and self._seen[q] > 0.0]
         before = self._Z
-        if kept:
+        if with_potentials:
             if self._spare.size < before.size:
                 self._spare = wp.empty_like(before)
             wp.copy(self._spare, before, count=before.size)
@@ -330,14 +374,14 @@ class LowRankCorrection:
             if len(strong) not in self._bound:
                 self._bound[len(strong)] = self._bind(len(strong))
             self._dots, self._multiply, self._subtract = self._bound[len(strong)]
-        for q in kept:
+        for q in with_potentials:
             wp.copy(
                 self._Z, before, dest_offset=strong.index(q) * n, src_offset=old[q] * n, count=n
             )
-        self._seen[[q for q in range(low.rank) if q not in kept]] = 0.0
+        self._seen[[q for q in range(low.rank) if q not in with_potentials]] = 0.0
 
     def _bind(self, slots: int) -> tuple[Reduction, Any, Any]:
-        """Return the sums Z'r of so many slots, what multiplies them, and what subtracts Z t."""
+        """Return the launches for a number of slots: sums Z'r, products, z -= Z t."""
         finest, rows, n, across = (
             self._hierarchy.finest,
             self._hierarchy.finest.stencil.rows,
@@ -363,7 +407,7 @@ class LowRankCorrection:
         )
 
     def _fill(self, columns: list[int], squares: np.ndarray) -> None:
-        """Make the potentials B U_q of columns."""
+        """Compute the potentials B U_q of columns."""
         finest, n = self._hierarchy.finest, self._size
         if self.calm is not None and self._low.layout.across is None:
             for q in columns:
@@ -387,14 +431,18 @@ class LowRankCorrection:
         self.note_products()
 
     def note_products(self) -> None:
-        """Launch the products of the potentials on the free set, if `renew` can read them with others."""
+        """Launch the products of the potentials if `renew` can read them.
+
+        They are on the free set, and are read together with other numbers.
+        """
         if self._read_products is not None:
             self._launch_products(self._products)
 
     def _invert(self, W: np.ndarray, *, known: bool = False) -> bool:
-        """Write the inverses of S and E on the modes that are felt; return whether S is as symmetric as it should be.
+        """Write the inverses of S and E on the modes that count.
 
-        `known`: the products have been read.
+        With V the modes of W^(1/2) S W^(1/2) whose ratio exceeds FELT, an inverse is V (V'M V)^-1
+        V'. `known`: the products have been read. Returns whether S is sufficiently symmetric.
         """
         m = self.slots
         if self._products.size < m * self._low.rank:
@@ -404,13 +452,16 @@ class LowRankCorrection:
             if self._read_products is not None:
                 self._read_products.changed()
         products = self._products if self._read_products is None else self._read_products
+        # G = U'Z, of which S has the rows of the corrected columns; its symmetric and skew parts.
         G = np.ascontiguousarray(products.numpy()[: m * self._low.rank].reshape(m, -1).T)
         S = G[self._slot_columns]
         even, odd = 0.5 * (S + S.T), 0.5 * (S - S.T)
+        # W^(1/2) on the corrected columns, from the eigenvectors of W.
         values, vectors = np.linalg.eigh(W[np.ix_(self._slot_columns, self._slot_columns)])
         root = vectors * np.sqrt(np.maximum(values, 0.0))
         ratios, modes = np.linalg.eigh(root.T @ even @ root)
         felt = ratios > FELT
+        # V spans the modes with a ratio above FELT; V (V'M V)^-1 V' is the inverse of M on them.
         V = root @ modes[:, felt]
         scale = 1.0 / np.sqrt(ratios[felt])
         skew = np.abs(scale[:, None] * (V.T @ odd @ V) * scale).max(initial=0.0)
@@ -425,12 +476,12 @@ class LowRankCorrection:
         self.note(launch_recorded)
 
     def _launch_unit_force(self) -> None:
-        """Make U f the finest right-hand side."""
+        """Set the finest right-hand side to U f."""
         clear(self._hierarchy.finest.b)
         self._spread(1.0, launch_recorded)
 
     def _launch_potential(self, slot: int) -> None:
-        """Launch on a GPU the potential of a slot's column, a cycle."""
+        """Launch the potential of a slot's column on a GPU: one cycle."""
         launch_recorded(
             unit_kernel, self._low.rank, [self._of_slot, slot, self._force], device=self._low.device
         )
@@ -439,7 +490,7 @@ class LowRankCorrection:
         copy(self._Z[slot * self._size : (slot + 1) * self._size], self._hierarchy.finest.x)
 
     def _launch_products(self, products: wp.array[Any]) -> None:
-        """Launch U'Z, a slot after another; no force is left."""
+        """Launch U'Z, slot by slot; `force` is cleared."""
         clear(self._force)
         d, rank, n = self._hierarchy.finest.stencil.d, self._low.rank, self._size
         for s in range(self.slots):

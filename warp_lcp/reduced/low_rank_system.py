@@ -1,4 +1,7 @@
-"""Principal system of a grid plus a term of low rank, by the Woodbury formula: a liquid that carries rigid bodies."""
+"""Principal system of a grid plus a term of low rank (Woodbury).
+
+For example a liquid that carries rigid bodies.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,10 @@ from warp_lcp.rows.vectors import rows_of
 
 
 class CoupledGridSystem(KrylovSystem):
-    """Conjugate gradients on a grid operator plus one of low rank, preconditioned by the grid's multigrid, corrected for the columns."""
+    """Conjugate gradients on a grid operator plus a term of low rank.
+
+    The preconditioner is the grid's multigrid cycle, corrected for the columns.
+    """
 
     def __init__(
         self,
@@ -44,7 +50,7 @@ class CoupledGridSystem(KrylovSystem):
         self._free: wp.array[Any] | None = None
         self._weight = zeros_like(self.r) if shifted else None
         across = A.layout.across
-        # without ghost cells, which others sum
+        # Without ghost cells, which other ranks sum.
         rows = None if across is None else grid.stencil.rows
         self._iterate_by(
             ConjugateGradient(self._product, self, weight=self._weight, rows=rows, across=across),
@@ -55,13 +61,13 @@ class CoupledGridSystem(KrylovSystem):
         self._take_diagonal()
 
     def refresh(self) -> None:
-        """Take the grid's rows again if they changed."""
+        """Read the grid's rows again if they have changed."""
         self._grid.refresh()
         self._take_diagonal()
         self._begins = True
 
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
-        """Take another free set and shift."""
+        """Set another free set and shift."""
         self._free = free
         self._grid.restrict(free, shift)
         if self._weight is not None:
@@ -81,7 +87,7 @@ class CoupledGridSystem(KrylovSystem):
         self._begins = False
 
     def apply(self) -> None:
-        """Precondition: one cycle of the grid's multigrid, corrected."""
+        """Apply the preconditioner: one corrected cycle of the grid's multigrid."""
         self._correction.begin()
         self._grid.apply()
         self._correction.end()

@@ -1,4 +1,7 @@
-"""Projected multigrid ahead of its host: a GPU takes truncated steps, and begins a solve, as long as there is nothing to decide."""
+"""Device-resident iteration of projected multigrid.
+
+A GPU begins a solve and takes truncated steps as long as the host has nothing to decide.
+"""
 
 from __future__ import annotations
 
@@ -37,31 +40,33 @@ if TYPE_CHECKING:
     from warp_lcp.reduced.multigrid_workspace import MultigridWorkspace
 
 EPS = float(np.finfo(np.float64).eps)
-# the least residual that is taken for one: the squares of smaller ones vanish, which the loop looks
-# into
+# Least residual that counts as ordinary: the squares of smaller ones underflow, which the loop
+# examines.
 ORDINARY = 1e-100
-# of a guess's residual to b within which corrections in float32 neither overflow nor vanish
+# Range of the ratio of a guess's residual to b in which float32 corrections neither overflow nor
+# vanish.
 RATIOS = 1e-6, 1e6
-ROWS = 32  # at most
+ROWS = 32  # largest number of rows
 
 
-# A row that is kept of each evaluation: NORM ... ENERGY, then these.
+# A row is stored for each evaluation: NORM ... ENERGY, then these.
 ROW_STEP = wp.constant(4)
 ROW_SIZE = wp.constant(5)
 ROW = wp.constant(6)
-# Slots of what the device judges its steps by, as `descent.Descent` and the outer loop do.
-TAKEN = wp.constant(0)  # rows written
-MOST = wp.constant(1)  # rows that may be
+# Slots of the numbers by which the device judges its steps, as `descent.Descent` and the outer loop
+# do.
+TAKEN = wp.constant(0)  # number of rows written
+MOST = wp.constant(1)  # largest number of rows
 TOLERANCE = wp.constant(2)
 BEST = wp.constant(3)  # least norm
 LAST_NORM = wp.constant(4)
 LAST_ENERGY = wp.constant(5)
 LOWEST = wp.constant(6)  # energy
-FELL = wp.constant(7)  # by how much the last step lowered it
-NOISE = wp.constant(8)  # of the energy, relative
+FELL = wp.constant(7)  # last decrease of the energy
+NOISE = wp.constant(8)  # relative noise of the energy
 JUDGED = 9
 CREEPS, STALLS = wp.constant(wp.float64(CREEP)), wp.constant(wp.float64(STALL))
-# what the host computes again must not come out the other way
+# Safety factor: the host recomputes the decision and must not decide otherwise.
 SAFELY = wp.constant(wp.float64(1.0 + 1e-9))
 LEAST_RATIO, MOST_RATIO = wp.constant(wp.float64(1e-6)), wp.constant(wp.float64(1e6))
 
@@ -69,7 +74,7 @@ LEAST_RATIO, MOST_RATIO = wp.constant(wp.float64(1e-6)), wp.constant(wp.float64(
 @wp.func
 @no_type_check
 def keep_row(scalars: f64, rows: f64, n: int):
-    """Keep what an evaluation has found as row n."""
+    """Store the results of an evaluation as row n."""
     for c in range(4):
         rows[n * ROW + c] = scalars[c]
     rows[n * ROW + ROW_STEP] = scalars[STEP]
@@ -79,7 +84,7 @@ def keep_row(scalars: f64, rows: f64, n: int):
 @forward_kernel(module="warp_lcp.projected_multigrid.ahead")
 @no_type_check
 def take_unit_kernel(scalars: f64, square: f64):
-    """Take ||b|| as the unit of right-hand sides, 1 if it is 0; no step has been taken."""
+    """Use ||b|| as the unit of right-hand sides, 1 if it is 0; reset the step."""
     size = wp.sqrt(square[0])
     scalars[SIZE] = size
     if size == wp.float64(0.0):
@@ -91,14 +96,17 @@ def take_unit_kernel(scalars: f64, square: f64):
 @forward_kernel(module="warp_lcp.projected_multigrid.ahead")
 @no_type_check
 def keep_row_kernel(scalars: f64, rows: f64, n: int):
-    """Keep what an evaluation has found as row n."""
+    """Store the results of an evaluation as row n."""
     keep_row(scalars, rows, n)
 
 
 @forward_kernel(module="warp_lcp.projected_multigrid.ahead")
 @no_type_check
 def join_unusual_kernel(floating: wp.array(dtype=wp.int32), faults: f64, others: f64, unusual: f64):
-    """Put side by side what tells whether a solve begins as usual, so that ranks exchange it together."""
+    """Join the flags of an unusual start, so that ranks exchange them together.
+
+    Floating components, faults of the guess, and bounds of another code.
+    """
     unusual[0] = wp.float64(floating[0])
     unusual[1] = faults[0]
     unusual[2] = wp.float64(0.0)
@@ -122,10 +130,11 @@ def begin_kernel(
     noise: wp.float64,
     calm: wp.array(dtype=wp.int32),
 ):
-    """Begin with the guess that has been evaluated, if it misses the tolerance and is as large as b; row 0 has the reference.
+    """Begin with the evaluated guess, unless the host must decide.
 
-    The tolerance is absolute, or of the root mean square if unknowns are counted. `calm`: whether
-    the host need not prepare the steps.
+    Steps follow if the guess misses the tolerance and its residual is comparable to b. Row 0 has
+    the reference. The tolerance is absolute, or that of the root mean square if unknowns are
+    counted. `calm`: whether the host need not prepare the steps.
     """
     keep_row(scalars, rows, 1)
     norm = wp.sqrt(scalars[NORM])
@@ -174,7 +183,7 @@ def resume_kernel(
     fell: wp.float64,
     noise: wp.float64,
 ):
-    """Begin with a step, from where the host has judged."""
+    """Begin with a step, from the state that the host has judged."""
     judged[TAKEN] = wp.float64(0.0)
     judged[MOST] = wp.float64(most)
     judged[TOLERANCE] = tolerance
@@ -200,11 +209,11 @@ def judge_kernel(
     bounded: bool,
     calm: wp.array(dtype=wp.int32),
 ):
-    """Keep what a truncated step has led to; go on if the host would take another one without a thought.
+    """Store the result of a truncated step; decide whether the device goes on.
 
-    That is where the residual and, with bounds, the energy are the least yet, the tolerance is
-    missed, and the free set does not creep; nor changes, unless the device rebuilds what depends on
-    it: `calm`, whether that is all.
+    It goes on if the residual and, with bounds, the energy are the least so far, the tolerance is
+    missed, and the free set does not creep. The free set must not change either, unless the device
+    rebuilds what depends on it; `calm`: whether that is sufficient.
     """
     zero = wp.float64(0.0)
     n = int(judged[TAKEN])
@@ -215,7 +224,7 @@ def judge_kernel(
     margin = judged[NOISE] * (wp.abs(judged[LAST_ENERGY]) + wp.abs(energy))
     go = n + 1 < int(judged[MOST]) and wp.isfinite(scalars[STEP])
     go = go and norm > judged[TOLERANCE] * SAFELY and norm < judged[BEST]
-    if bounded:  # without bounds there is no energy
+    if bounded:  # without bounds the energy is not used
         go = go and judged[LOWEST] - energy > margin * SAFELY
     if scalars[MOVED] > zero:
         go = (
@@ -237,20 +246,20 @@ def judge_kernel(
 
 
 class RunAhead:
-    """What the device does without its host, and what the host has not looked at of it yet.
+    """Steps that the device takes without the host, and their unread results.
 
-    A step follows a step where residual and energy are the least so far, the tolerance is missed
-    and the free set does not creep: then the host, which judges all of that again when it comes,
-    would have taken the same one. Everything else is left to it. On the CPU the team works through
-    the beginning of a solve as one table, and through the steps as a table that it repeats.
+    Another step follows while residual and energy are the least so far, the tolerance is missed and
+    the free set does not creep. There the host, which repeats all these decisions later, would have
+    taken the same step. All other cases are left to the host. On the CPU the threads execute the
+    beginning of a solve as one table of launches, and the steps as a table that is repeated.
 
     Args:
-        work: whose steps they are; its operator is a grid's, in one process.
-        rebuilds: whether the device follows the free set, too; else steps end where that changes,
-            and the host rebuilds.
+        work: the workspace of the steps; its operator is a grid's, in one process.
+        rebuilds: whether the device also updates the hierarchy for the free set; else steps end
+            where that changes, and the host rebuilds.
 
     Attributes:
-        rows: evaluations that the host has not looked at, see `keep_row`.
+        rows: evaluations that the host has not read, see `keep_row`.
     """
 
     def __init__(self, work: MultigridWorkspace, *, rebuilds: bool = True) -> None:
@@ -259,25 +268,30 @@ class RunAhead:
         self.rows = deque[np.ndarray]()
         self._found, self._judged = Reading(device, ROWS * int(ROW)), Reading(device, JUDGED)
         self._going, self._stale = (zeros(1, wp.int32, device) for _ in range(2))
-        # of the kernel that begins: stale, most, both tolerances, noise
+        # Arguments of the kernel that begins: stale, most, both tolerances, noise.
         self._numbers = [Scalar() for _ in range(5)]
         self._standing = [Scalar() for _ in range(9)]  # of the kernel that resumes
-        # by the step's program, and whether the device rebuilds
+        # By the step's program, and whether the device rebuilds.
         self._loops: dict[tuple[int, bool], Program] = {}
         self._resuming = LaunchGraph(device, self._launch_resumption)
         self._beginning: Beginning | None = None
 
     @staticmethod
     def suits(work: MultigridWorkspace) -> bool:
-        """Return whether the device can do without its host: where loops run on it, on a grid. Ranks begin a solve so, on the CPU."""
+        """Return whether the device can work without its host.
+
+        Loops must run on the device, on a grid. On ranks only the beginning of a solve does, on the
+        CPU.
+        """
         plain = type(work.hierarchy) is Hierarchy and isinstance(work.A, GridPoisson)
         alone = work.problem.layout.across is None
         return plain and loops_on_device(work.A.device) and (alone or work.A.device.is_cpu)
 
     def steps(self, tolerance: float, left: int) -> bool:
-        """Take a step and what follows it, at most `left`; return False, with nothing done, where kernels have yet to be loaded.
+        """Take a step and those that follow it, at most `left`.
 
-        Ranks, which wait for each other in every step, take none.
+        Returns False, with nothing done, where kernels have yet to be loaded. Ranks, which wait for
+        each other in every step, take none.
         """
         work = self._work
         if self._shared:
@@ -287,14 +301,14 @@ class RunAhead:
         loop = self._loop(rebuilds=self._may_rebuild())
         if loop is None:
             return False
-        given = [
+        arguments = [
             int(work.stale),
             min(left, ROWS),
             tolerance,
             *work.descent.standing,
             work.descent.noise,
         ]
-        for number, value in zip(self._standing, given, strict=True):
+        for number, value in zip(self._standing, arguments, strict=True):
             number.value = value
         self._resuming.run(loop, variant=work.program_key())
         if not work.A.device.is_cuda:
@@ -304,26 +318,30 @@ class RunAhead:
 
     @property
     def _calm(self) -> wp.array[Any] | None:
-        """On a GPU, whether bodies ask for no correction of the cycle; None: there are none."""
+        """On a GPU, whether bodies need no correction of the cycle.
+
+        None if there are no bodies.
+        """
         correction = self._work.correction
         return None if correction is None else correction.calm
 
     def _may_rebuild(self) -> bool:
-        """Return whether the device follows the free set now."""
+        """Return whether the device updates the hierarchy now."""
         correction = self._work.correction
         return self._rebuilds or (correction is not None and correction.is_calm)
 
     def begin(
         self, guess: wp.array[Any], criteria: StoppingCriteria | MeanCriteria, left: int
     ) -> float | None:
-        """Begin a solve from a guess, and take steps; return the residual at clip(0, l, u), None where the loop has to begin again.
+        """Begin a solve from a guess, and take steps.
 
-        Without unknowns that count, nothing is done, and the residual is 0.
+        Returns the residual at clip(0, l, u), None where the loop has to begin again. Without
+        unknowns that count, nothing is done, and the residual is 0.
 
         Args:
             guess: stored field that is not the iterate.
             criteria: when steps are done.
-            left: steps at most.
+            left: largest number of steps.
         """
         work, r = self._work, self._work.residual
         loop = self._loop(rebuilds=True) if self._may_rebuild() and not self._shared else None
@@ -353,7 +371,7 @@ class RunAhead:
             if loop is not None:
                 loop.run_while(self._going)
         self._take_rows()
-        # no unknown counts: there is nothing to solve
+        # No unknown counts: there is nothing to solve.
         if isinstance(criteria, MeanCriteria) and criteria.count() == 0:
             self.rows.clear()
             work.distrust_hierarchy()  # the free set is unknown
@@ -368,20 +386,20 @@ class RunAhead:
         )
         if not (usual and reference > ORDINARY and RATIOS[0] * size < first < RATIOS[1] * size):
             self.rows.clear()
-            work.distrust_hierarchy()  # it may be of any free set now
+            work.distrust_hierarchy()  # the hierarchy may be of any free set now
             return None
         for classified in (False, True):
             r.take(self.rows.popleft(), size, classified=classified)
         return reference
 
     def forget_guess(self) -> None:
-        """Keep no guess alive: the launches that begin a solve from one are made again."""
+        """Release the guess: the launches that begin from one are created again."""
         self._beginning = None
         self.rows.clear()
 
     def _judge_first(self, counted: wp.array[Any] | None, launch: Launch) -> None:
         """Record the kernel that decides whether the guess is good enough."""
-        *given, noise = self._numbers
+        *arguments, noise = self._numbers
         memory = [
             self._work.residual.scalars,
             self._found.array,
@@ -392,7 +410,7 @@ class RunAhead:
         launch(
             begin_kernel,
             1,
-            [*memory, *given, counted, noise, self._calm],
+            [*memory, *arguments, counted, noise, self._calm],
             device=self._work.A.device,
         )
 
@@ -408,7 +426,7 @@ class RunAhead:
                     correction.note_products()
 
     def _take_rows(self) -> None:
-        """Take over the rows that a loop has left; waits for the device."""
+        """Read the rows of a loop; waits for the device."""
         for reading in (self._found, self._judged, *self._work.readings):
             reading.changed()
         count = int(self._judged.numpy()[int(TAKEN)])
@@ -416,7 +434,11 @@ class RunAhead:
         self.rows.extend(self._found.numpy()[: count * int(ROW)].reshape(count, -1).copy())
 
     def _loop(self, *, rebuilds: bool) -> Program | None:
-        """Return the program of a step among others, None while parts of it have not run."""
+        """Return the program of a step, None while parts of it have not run.
+
+        A step is a rebuild of the hierarchy if the free set is stale, the truncated cycle, and the
+        decision whether another step follows.
+        """
         work = self._work
         step, rebuild = work.step_program(), work.hierarchy.rebuilding
         if not (step.has_run and rebuild.has_run):
@@ -426,7 +448,7 @@ class RunAhead:
             loop = self._loops[key] = Program(work.A.device)
             if rebuilds:
                 loop.record(Conditional(self._stale, rebuild))
-            # rounding cannot be taken back: x, the best iterate, is stored before each step
+            # Rounding cannot be undone: x, the best iterate, is stored before each step.
             if work.precision is Precision.SINGLE:
                 CONVERT.bind(Rows.of_fields(work.problem.layout), a=work.x, b=work.best()).launch(
                     loop.launch
@@ -450,14 +472,16 @@ class RunAhead:
 
 
 class Beginning:
-    """The launches that begin a solve from a guess: residuals at clip(0, l, u) and at the guess, and what is unusual about the data.
+    """The launches that begin a solve from a guess.
+
+    They evaluate the residuals at clip(0, l, u) and at the guess, and test for unusual data.
 
     Args:
         work: of the solve.
         guess: stored field, read each time.
         counted: of the criteria, see `MeanCriteria`.
         found: receives the first evaluation, see `keep_row`.
-        judge: launches or records what decides whether the guess is good enough.
+        judge: launches or records the kernel that decides whether the guess is good enough.
     """
 
     def __init__(
@@ -475,9 +499,12 @@ class Beginning:
             found,
             work.A.device,
         )
-        self._key, self._finder = work.program_key(), work.A.component_finder  # type: ignore[attr-defined]  # of a GridPoisson
+        self._key, self._finder = (
+            work.program_key(),
+            work.A.component_finder,  # type: ignore[attr-defined]  # of a GridPoisson
+        )
         self._judge, self._graph = judge, LaunchGraph(device, self._launch)  # on CUDA
-        self._unusual = Reading(device, 3)  # of ranks
+        self._unusual = Reading(device, 3)  # flags of ranks
         self._program = None if device.is_cuda else Program(device)
         if self._program is not None:
             self._searches, search = zeros(1, wp.int32, device), Program(device)
@@ -486,7 +513,7 @@ class Beginning:
             judge(counted, self._program.launch)
 
     def fits(self, guess: wp.array[Any], counted: wp.array[Any] | None) -> bool:
-        """Return whether the launches are of this guess and count, and of the bounds as they are."""
+        """Return whether the launches are for this guess, count and bounds."""
         return (
             self._guess.ptr == guess.ptr
             and self._counted is counted
@@ -515,7 +542,10 @@ class Beginning:
     def _launch(
         self, loop: Program | None, going: wp.array[Any], renewed: bool, searches: bool
     ) -> None:
-        """Launch or record everything, with arguments as of `run_with`; `searches`: for floating components."""
+        """Launch or record everything, with the arguments of `run_with`.
+
+        `searches`: whether to search for floating components.
+        """
         if renewed:
             self._work.hierarchy.refresh()
         self._record(launch, self._finder.search if searches else None)
@@ -527,7 +557,10 @@ class Beginning:
             correction.make_potentials()
 
     def is_plain(self) -> bool:
-        """Return whether no component floats, the guess is finite and bounds are coded as before; waits for the device."""
+        """Return whether the data are as usual; waits for the device.
+
+        No component floats, the guess is finite, and bounds are coded as before.
+        """
         bounds = self._work.problem.bounds
         if self._work.problem.layout.across is not None:
             floating, faults, others = self._unusual.numpy()
@@ -539,8 +572,8 @@ class Beginning:
 
         Args:
             launch: launches or records.
-            search: of floating components: on the CPU a part of the program, on CUDA what launches
-                it; None: it is not due.
+            search: of floating components: on the CPU a part of the program, on CUDA a function
+                that launches it; None: it is not due.
         """
         work, r, x = self._work, self._work.residual, self._work.x
         p, device = work.problem, work.A.device

@@ -1,4 +1,7 @@
-"""Projected multigrid on a grid operator plus one of low rank: a liquid that carries rigid bodies."""
+"""Projected multigrid on a grid operator plus a term of low rank.
+
+For example a liquid that carries rigid bodies.
+"""
 
 from __future__ import annotations
 
@@ -28,9 +31,10 @@ if TYPE_CHECKING:
 
 
 class CoupledResidual(AssessedResidual):
-    """The natural residual of y = A x + (b + U W U' x): the term in brackets changes on U's rows only and takes b's place.
+    """Natural residual of y = A x + (b + U W U' x).
 
-    Its d_i are the diagonal of A alone, which is no larger.
+    The term in brackets changes on U's rows only and replaces b. Its d_i are the diagonal of A
+    alone, which is no larger.
     """
 
     def __init__(
@@ -44,22 +48,25 @@ class CoupledResidual(AssessedResidual):
     ) -> None:
         super().__init__(problem, A, hierarchy, rounded=rounded)
         self.diagonal, self.unit, self._diagonal_of = A.stencil.d, float(A.stencil.unit), None
-        self._low, self._b = low, wp.zeros_like(problem.b)  # in the place of the problem's
+        self._low, self._b = low, wp.zeros_like(problem.b)  # replaces the problem's b
         self._low_version = -1
 
     def renew(self) -> None:
-        """Take operator and bodies again if they have changed."""
+        """Read operator and bodies again if they have changed."""
         super().renew()
         if self._low_version != self._low.version:
             self._low_version, self.free_set = self._low.version, self.free_set + 1
 
     def project(self, x: wp.array[Any], *, keep: bool, launch: Launch = launch_now) -> None:
-        """Launch the projection of x, or of 0, onto the bounds; take b, off U's rows."""
+        """Launch the projection of x, or of 0, onto the bounds; copy b.
+
+        The copy is exact off U's rows.
+        """
         CONVERT.bind(rows_of(self._b), a=self.problem.b, b=self._b).launch(launch)
         super().project(x, keep=keep, launch=launch)
 
     def assess(self, x: wp.array[Any], *, classify: bool, launch: Launch = launch_now) -> None:
-        """Launch the evaluation, of b + U W U' x first, and correct the energy for that."""
+        """Launch the evaluation with b + U W U' x, and correct the energy for it."""
         low = self._low
         low.add(x, self.problem.b, self._b, launch=launch)
         super().assess(x, classify=classify, launch=launch)
@@ -67,7 +74,7 @@ class CoupledResidual(AssessedResidual):
         launch(coupling.subtract_energy_kernel, 1, inputs, device=low.device)
 
     def read(self, *, classified: bool) -> float:
-        """Read what the evaluation found, U'x too."""
+        """Read the results of the evaluation, and U'x."""
         self._low.products.changed()
         return super().read(classified=classified)
 
@@ -79,18 +86,18 @@ class CoupledResidual(AssessedResidual):
         classify: bool,
         launch: Launch = launch_now,
     ) -> None:
-        """Launch the step and the evaluation where it ends; U'x is needed between them."""
+        """Launch the step and the evaluation at its end; U'x is needed between them."""
         self.update(x, direction, launch=launch)
         self.assess(x, classify=classify, launch=launch)
 
 
 class CoupledWorkspace(MultigridWorkspace):
-    """Memory of the method for one problem of a grid and bodies."""
+    """Workspace of the method for one problem of a grid and bodies."""
 
     residual: CoupledResidual
     correction: LowRankCorrection
-    # What a projection does to the force on a body that weighs next to nothing is a leap each time,
-    # and the energy of grid and bodies lets projected cycles of the grid hardly move.
+    # The projection changes the force on a very light body by a large factor each time, and the
+    # projected cycles of the grid hardly reduce the energy of grid and bodies.
     most_runs = 3
 
     def __init__(
@@ -111,13 +118,13 @@ class CoupledWorkspace(MultigridWorkspace):
         self._along = wp.zeros(low.rank, dtype=wp.float64, device=problem.device)  # U'p
         self._fresh = True  # whether the correction is still that of the last solve
         self.readings = (low.products, *self.correction.readings)
-        self._prepared = False  # whether potentials have been made as the solve began
+        self._prepared = False  # whether potentials have been computed as the solve began
         low.products_of = self.x if problem.layout.across is None else None
 
     def start(
         self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
     ) -> None:
-        """Forget the search direction; operator and bodies may have changed."""
+        """Reset the search direction; operator and bodies may have changed."""
         super().start(warm=warm, tolerance=tolerance, floating=floating)
         self._fresh = True
 
@@ -132,7 +139,10 @@ class CoupledWorkspace(MultigridWorkspace):
         return reference
 
     def begin_cycles(self, count: int) -> None:
-        """Let projected cycles come next: all unknowns are in their right-hand side."""
+        """Schedule projected cycles.
+
+        Their right-hand side contains all unknowns.
+        """
         self.cycles_left = count
         self.forget_direction()
         self.free_set_noted = False
@@ -143,7 +153,7 @@ class CoupledWorkspace(MultigridWorkspace):
         if not self.exact:
             super()._move_monotonely(safe, classify, launch)
             return
-        # made now, not among recorded launches
+        # Recorded now, not among other launches.
         assert self.hierarchy.projected_sweep if safe else self.hierarchy.monotone_cycle
         self._monotone.run(safe, classify, variant=self.problem_key())
 
@@ -160,15 +170,15 @@ class CoupledWorkspace(MultigridWorkspace):
         )
 
     def rebuild(self, *, classify: bool) -> None:
-        """Follow the free set, with the correction too."""
+        """Update the hierarchy and the correction for the free set."""
         stale = self.stale
         super().rebuild(classify=classify)
         if not (stale or self._fresh) or self.cycles_left > 0:
             return
         begins, self._fresh = self._fresh, False
         noted, self.free_set_noted = self.free_set_noted, False
-        made, self._prepared = self._prepared, False  # which has overwritten the right-hand side
-        # so has this
+        made, self._prepared = self._prepared, False  # this has overwritten the right-hand side
+        # `renew` may have overwritten it too.
         if self.correction.renew(begins=begins, noted=noted, made=noted and made) or made:
             self._evaluation.run(self.x, classify, variant=self.problem_key())
             if self.floating is not None:
@@ -178,32 +188,35 @@ class CoupledWorkspace(MultigridWorkspace):
         self.residual.assess(x, classify=classify, launch=launch_recorded)
 
     def _cycle(self) -> None:
-        """Run a cycle on the residual."""
+        """Run a corrected cycle on the residual."""
         self.correction.begin()
         super()._cycle()
 
     def problem_key(self) -> tuple[Any, ...]:
-        """Return what launches depend on of the problem's data; where the columns' entries lie, too."""
+        """Return the key of launches that depend on the problem's data.
+
+        It includes the memory of the columns' entries.
+        """
         return (*super().problem_key(), self._low.columns.rows.ptr)
 
     def program_key(self) -> tuple[Any, ...]:
-        """Return what the launches of a truncated cycle depend on; the correction's too."""
+        """Return the key of the launches of a truncated cycle, with the correction's."""
         return (*super().program_key(), *self.correction.key)
 
     def _correct(self, program: Program) -> None:
-        """Record a cycle, its correction, the measuring and the plan of the step."""
+        """Record a cycle, its correction, its products and the choice of the step."""
         self.correction.begin(launch=program.launch)
         program.extend(self.hierarchy.cycle)
         self._measure(launch=program.launch)
 
     def _measure(self, *, launch: Launch = launch_now) -> None:
-        """Correct the cycle's z for the bodies, measure it and plan the step."""
+        """Correct the cycle's z for the bodies, sum its products, choose the step."""
         self.correction.end(launch=launch)
         self._sum_products(launch=launch)
         launch(kernels.plan_step_kernel, 1, [self.residual.scalars], device=self.A.device)
 
     def _sum_products(self, *, launch: Launch = launch_now) -> None:
-        """Sum the products that beta and the step need, with A + U W U'."""
+        """Sum the products for beta and the step, with A + U W U'."""
         residual, finest, device, columns = (
             self.residual,
             self.hierarchy.finest,

@@ -1,4 +1,4 @@
-"""Natural residual of a grid problem, with the free set there and the right-hand side on it."""
+"""Natural residual of a grid problem, with free set and right-hand side."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from warp_lcp.rows.vectors import Reduction
 
 
 class AssessedResidual(NaturalResidual):
-    """The natural residual, evaluated together with the free set and the right-hand side on it.
+    """Natural residual, free set and right-hand side on it, in one pass.
 
     Attributes:
         classified: whether the last evaluation let unknowns at a bound leave the free set; after
             `start`, whether the next one will.
         free_set: version of the free set and of the operator: it grows when one of them changes.
-        active: unknowns held.
+        active: number of held unknowns.
         energy: x'Ax/2 + b'x.
     """
 
@@ -62,10 +62,13 @@ class AssessedResidual(NaturalResidual):
             0.0,
             0.0,
         )
-        self.size = 1.0  # what the right-hand side is divided by
+        self.size = 1.0  # divisor of the right-hand side
 
     def start(self, x: wp.array[Any], *, keep: bool) -> None:
-        """Set x to clip(x, l, u) or clip(0, l, u); a guess is classified, a cold start is not."""
+        """Set x to clip(x, l, u) or clip(0, l, u).
+
+        A guess is classified, a cold start is not.
+        """
         self.renew()
         with as_one_table(x.device, self.problem.layout.across):
             super().start(x, keep=keep)
@@ -79,19 +82,25 @@ class AssessedResidual(NaturalResidual):
             self.set(kernels.STEP, 0.0)
 
     def share_bounds(self, launch: Launch = launch_now) -> None:
-        """Fill the bounds' ghost cells: x's will move as the cells do that they stand for."""
+        """Fill the ghost cells of the bounds.
+
+        The ghost cells of x then move in the same way as the cells that they represent.
+        """
         ghosts, (lower, _, upper, _, code) = self._A.stencil.ghosts, self.problem.bounds.operands
         for bound in (lower, upper, code):
             if ghosts is not None and bound.size:
                 ghosts.filling(bound).launch(launch)
 
     def renew(self) -> None:
-        """Take the operator again if it has changed."""
+        """Read the operator again if it has changed."""
         if self.has_new_operator():
             self._hierarchy.refresh()
 
     def has_new_operator(self) -> bool:
-        """Return whether the operator has changed; the caller then refreshes the hierarchy."""
+        """Return whether the operator has changed.
+
+        The caller then refreshes the hierarchy.
+        """
         if self._version == self._A.version:
             return False
         self._version, self.free_set = self._A.version, self.free_set + 1
@@ -102,7 +111,7 @@ class AssessedResidual(NaturalResidual):
         return self._norm_of_b
 
     def evaluate(self, x: wp.array[Any], classify: bool | None = None) -> float:
-        """Compute the norm of the natural residual at x, the free set and the right-hand side.
+        """Compute the norm of the natural residual, free set and right-hand side at x.
 
         Args:
             x: stored field.
@@ -110,13 +119,13 @@ class AssessedResidual(NaturalResidual):
                 evaluation.
         """
         classify = self.classified if classify is None else classify
-        plain = type(self).assess is AssessedResidual.assess  # others may launch by Warp alone
+        plain = type(self).assess is AssessedResidual.assess  # subclasses may launch by Warp alone
         with as_one_table(x.device, self.problem.layout.across) if plain else nullcontext():
             self.assess(x, classify=classify)
         return self.read(classified=classify)
 
     def assess(self, x: wp.array[Any], *, classify: bool, launch: Launch = launch_now) -> None:
-        """Launch the evaluation at x; `read` has what it finds."""
+        """Launch the evaluation at x; `read` returns its results."""
         self._A.stencil.wrap(x, launch=launch)
         kernels.ADVANCE.launch(None, self._assessing(x, classify), launch=launch)
         self.sums.add_up(int(kernels.NORM), columns=4, launch=launch)
@@ -124,7 +133,7 @@ class AssessedResidual(NaturalResidual):
     def update(
         self, x: wp.array[Any], direction: wp.array[Any], *, launch: Launch = launch_now
     ) -> None:
-        """Launch the step from x along the direction that the cycle's correction gives."""
+        """Launch the step from x along the new conjugate direction."""
         self._updating(self._A.stencil.rows, x, direction).launch(launch)
 
     def advance(
@@ -135,10 +144,11 @@ class AssessedResidual(NaturalResidual):
         classify: bool,
         launch: Launch = launch_now,
     ) -> None:
-        """Launch the step and the evaluation where it ends: one launch on the CPU, unless periodic ghost cells must be filled between.
+        """Launch the step and the evaluation at its end.
 
-        Ghost cells that stand for cells of others take the step by themselves; x's and the
-        correction's are filled.
+        One launch on the CPU, unless periodic ghost cells must be filled between. Ghost cells that
+        represent cells of other ranks take the step by themselves; those of x and of the correction
+        are filled.
         """
         p, s = self.problem, self._A.stencil
         if p.device.is_cuda or any(s.periodic):
@@ -159,6 +169,7 @@ class AssessedResidual(NaturalResidual):
         )
 
     def _assessing(self, x: wp.array[Any], classify: bool) -> Bound:
+        """Return the kernel that evaluates the residual at x, with its arguments."""
         p, finest = self.problem, self._finest
         return kernels.ASSESS.bind(
             self._A.stencil.rows,
@@ -179,7 +190,9 @@ class AssessedResidual(NaturalResidual):
         )
 
     def read(self, *, classified: bool) -> float:
-        """Read what the evaluation found; a step that is not finite was not taken, and its residual is no number.
+        """Read the results of an evaluation; return the norm.
+
+        A step that is not finite was not taken, and its norm is NaN.
 
         Args:
             classified: the evaluation's `classify`.
@@ -194,7 +207,10 @@ class AssessedResidual(NaturalResidual):
     def take(
         self, row: Iterable[float], norm_of_b: float | None = None, *, classified: bool
     ) -> float:
-        """Take what an evaluation has found, see `multigrid_ahead.keep_row`; return the norm."""
+        """Store the results of an evaluation, see `multigrid_ahead.keep_row`.
+
+        Returns the norm.
+        """
         self.classified = classified
         square, moved, active, twice, step, size = map(float, row)
         self.energy, self.size = 0.5 * twice, size

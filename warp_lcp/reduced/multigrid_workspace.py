@@ -1,4 +1,7 @@
-"""Projected and truncated multigrid cycles at work on a grid problem: the iterate, its residual with a free set, and a direction."""
+"""Workspace of projected and truncated multigrid cycles on a grid problem.
+
+It has the iterate, its residual with a free set, and a search direction.
+"""
 
 from __future__ import annotations
 
@@ -30,36 +33,37 @@ from warp_lcp.rows.readings import Reading
 if TYPE_CHECKING:
     from warp_lcp.reduced.low_rank_correction import LowRankCorrection
 
-AHEAD = 20  # steps that the device may take without the host: then their pace is looked at
+AHEAD = 20  # steps that the device may take without the host, which then examines their pace
 
 
 class MultigridWorkspace(IterateMemory):
-    """Memory of `ProjectedMultigrid` for one problem; its cycles also serve other methods on grids.
+    """Workspace of `ProjectedMultigrid`; its cycles also serve other grid methods.
 
     x is moved in place. The best iterate is not stored while it is x, nor when x is one step past
-    it, for a step can be taken back; it is when the residual has risen and goes on from there.
+    it, because a step can be undone. It is stored when the residual has risen and another step
+    follows.
 
     Args:
         problem: the problem.
         A: its operator.
         settings: of the method, with `precision`, `monotone_cycles` and `cycle`.
-        residual: makes the residual of the problem, the operator and the hierarchy.
+        residual: creates the residual of the problem, the operator and the hierarchy.
         shifted: whether the finest diagonal takes shifts.
         ahead: whether the device may take steps without the host.
 
     Attributes:
-        cycles_left: projected cycles that come next.
+        cycles_left: number of projected cycles that come next.
         cycles_against_creeping: whether a projected cycle follows a step in which the free set
             creeps.
     """
 
     residual: AssessedResidual
-    readings: tuple[Reading, ...] = ()  # that evaluations leave besides the residual's
+    readings: tuple[Reading, ...] = ()  # written by evaluations besides the residual's
     correction: LowRankCorrection | None = None  # of the cycle, for bodies
-    # of projected cycles that were due: after those, the free set goes round in circles
+    # Limit of runs of projected cycles: after those, the free set is considered to cycle.
     most_runs: float = math.inf
     cycles_against_creeping = True
-    # whether `LowRankCorrection.note` has been launched for the free set as it is
+    # Whether `LowRankCorrection.note` has been launched for the current free set.
     free_set_noted = False
 
     def __init__(
@@ -80,8 +84,8 @@ class MultigridWorkspace(IterateMemory):
             problem.bounded,
         )
         self._p = problem.layout.zeros(real)
-        # a projected cycle forgets the search direction, so its lower bounds may lie in that
-        # memory: finite numbers, and 0 off the unknowns
+        # A projected cycle resets the search direction, so its lower bounds may use that memory:
+        # finite numbers, and 0 off the unknowns.
         upper = (
             problem.layout.zeros(real) if problem.bounds.may_bind[1] else nothing(real, A.device)
         )
@@ -101,14 +105,14 @@ class MultigridWorkspace(IterateMemory):
         self._programs: dict[tuple[Any, ...], Program] = {}  # truncated cycles
         self._mask: wp.array[Any] | None = None
         self.scratch = self._scratch() if real is wp.float32 else None
-        # steps since the best iterate; whether it is in memory of its own
+        # Steps since the best iterate; whether it has memory of its own.
         self._past, self._stored = 0, False
         self.cycles_left, self.descent = 0, Descent(self.precision.epsilon)
         self._tolerance, self._taken = 0.0, 0  # steps of this solve
         self._ahead = RunAhead(self) if ahead and RunAhead.suits(self) else None
-        self._one_table = self._ahead is not None  # whether nothing is read on the way of a step
-        self._built = 0  # the version of the free set that the hierarchy has
-        # steps that the device may take without the host; whether it has begun the solve
+        self._one_table = self._ahead is not None  # whether nothing is read back within a step
+        self._built = 0  # the version of the free set that the hierarchy was built for
+        # Steps that the device may take without the host; whether it has begun the solve.
         self._budget, self._begun = 0, False
 
     @property
@@ -117,11 +121,14 @@ class MultigridWorkspace(IterateMemory):
         return self._built != self.residual.free_set
 
     def distrust_hierarchy(self) -> None:
-        """Have the hierarchy built again before the next cycle."""
+        """Mark the hierarchy for a rebuild before the next cycle."""
         self._built = 0
 
     def forget_solve(self) -> None:
-        """Free what only the last solve needed, and the search direction, which no step must see again."""
+        """Release the data of the last solve, and clear the search direction.
+
+        No later step may read that direction.
+        """
         self.floating = None
         self._p.zero_()
         if self._ahead is not None:
@@ -130,12 +137,14 @@ class MultigridWorkspace(IterateMemory):
     def begin_ahead(
         self, guess: wp.array[Any] | None, criteria: StoppingCriteria | MeanCriteria, steps: int
     ) -> float | None:
-        """Begin a solve, and take steps, without the host; return the residual at clip(0, l, u), None where nothing has begun.
+        """Begin a solve, and take steps, without the host.
+
+        Returns the residual at clip(0, l, u), None where nothing has begun.
 
         Args:
             guess: stored field; None: the host begins.
             criteria: of the solve.
-            steps: that may be taken without the host in this solve.
+            steps: largest number of steps without the host in this solve.
         """
         self._budget = steps
         if self._ahead is None or guess is None or guess.ptr == self.x.ptr or steps <= 0:
@@ -152,20 +161,23 @@ class MultigridWorkspace(IterateMemory):
 
     @property
     def exact(self) -> bool:
-        """Whether x is no more than a step from where it was before one."""
+        """Whether a step changes x by no more than the step itself.
+
+        No constant of a floating component is added then, and x is not rounded.
+        """
         return self.floating is None and self._rounded is None
 
     def _scratch(self) -> tuple[wp.array[Any], wp.array[Any]]:
-        """Return what is free between cycles, as fields of four bytes and of one byte a cell."""
+        """Return memory that is free between cycles, with four bytes and one byte a cell."""
         x, t = self.hierarchy.finest.x, self.hierarchy.finest.t
         return t, wp.array(ptr=x.ptr, dtype=wp.uint8, shape=x.shape, device=x.device)
 
     def keep(self) -> None:
-        """Remember x as the best iterate."""
+        """Mark x as the best iterate."""
         self._past, self._stored = 0, False
 
     def restore(self) -> None:
-        """Make x the best iterate again."""
+        """Set x to the best iterate."""
         if self._stored:
             self.problem.layout.copy(self.x, self._best)
         elif self._past == 1:
@@ -174,21 +186,27 @@ class MultigridWorkspace(IterateMemory):
         self.keep()
 
     def _leave(self) -> None:
-        """Store the best iterate before x leaves it behind: it was x, or one step ago."""
+        """Store the best iterate before x moves on.
+
+        It was x, or the x of one step ago.
+        """
         if not self._stored and self._past == (1 if self.exact else 0):
             if self._ahead is not None and self._ahead.rows and not self.exact:
-                self._stored = True  # the device has stored it, and x has gone on
+                self._stored = True  # the device has stored it, and x has moved on
             else:
                 self._keep_stored(by_undoing=self.exact)
         self._past += 1
 
     def store_best(self) -> None:
-        """Keep the best iterate in memory of its own: x is about to change by more than can be taken back."""
+        """Store the best iterate in memory of its own.
+
+        Before x changes by more than can be undone.
+        """
         if not self._stored and self._past <= (1 if self.exact else 0):
             self._keep_stored(by_undoing=self._past == 1)
 
     def _keep_stored(self, *, by_undoing: bool) -> None:
-        """Store x, or where its last step began."""
+        """Store x, or the start of its last step."""
         if by_undoing:
             self._undo(self.best())
         else:
@@ -196,13 +214,13 @@ class MultigridWorkspace(IterateMemory):
         self._stored = True
 
     def best(self) -> wp.array[Any]:
-        """Return the memory of the best iterate, made at the first call."""
+        """Return the memory of the best iterate, allocated at the first call."""
         if self._best is None:
             self._best = self.problem.layout.zeros(wp.float64)
         return self._best
 
     def _undo(self, out: wp.array[Any]) -> None:
-        """Write where the last step began."""
+        """Write the start of the last step."""
         p, scalars = self.problem, self.residual.scalars
         kernels.UNDO.bind(
             self.flat,
@@ -230,7 +248,7 @@ class MultigridWorkspace(IterateMemory):
     def start(
         self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
     ) -> None:
-        """Forget the search direction; the operator may have changed."""
+        """Reset the search direction; the operator may have changed."""
         self.floating = floating
         self.cycles_left = self.settings.monotone_cycles if self.bounded and not warm else 0
         self.descent.start(self.residual.energy, self.residual.norm)
@@ -241,11 +259,11 @@ class MultigridWorkspace(IterateMemory):
         self.forget_direction()
         if self.scratch is not None:
             CLEAR.bind(self.flat, x=self.scratch[1]).launch()
-        # corrections in float32 would overflow, or vanish
+        # Corrections in float32 would overflow, or vanish.
         rescale = not 1e-6 < self.residual.norm / self.residual.size < 1e6
         if rescale:
             self.residual.set(kernels.SIZE, self.residual.norm)
-        # unknowns at their bounds leave the free set unless a projected cycle comes next
+        # Unknowns at their bounds leave the free set unless a projected cycle comes next.
         classify = self.cycles_left == 0
         if self.floating is not None:
             self.residual.evaluate(self.x, classify)
@@ -255,30 +273,36 @@ class MultigridWorkspace(IterateMemory):
 
     @property
     def goes_in_circles(self) -> bool:
-        """Whether the free set keeps coming again, in a problem where that has no end."""
+        """Whether the free set keeps recurring, in a problem in which that may not end."""
         return self.descent.runs >= self.most_runs
 
     @property
     def is_ahead(self) -> bool:
-        """Whether the device has taken steps that the host does not know of yet."""
+        """Whether the device has taken steps that the host has not read yet."""
         return self._ahead is not None and bool(self._ahead.rows)
 
     def wants_monotone_cycle(self) -> bool:
         """Return whether the next step is a projected cycle."""
         if self.cycles_left == 0 and self.bounded:
-            due = self.descent.due(self.settings.patience)  # an active set can go round in a circle
+            due = self.descent.due(self.settings.patience)  # an active set can cycle
             if due:
                 self.begin_cycles(due)
         return self.cycles_left > 0
 
     def begin_cycles(self, count: int) -> None:
-        """Let projected cycles come next: all unknowns are in their right-hand side."""
+        """Schedule projected cycles.
+
+        Their right-hand side contains all unknowns.
+        """
         self.cycles_left = count
         self.forget_direction()
         self.residual.evaluate(self.x, classify=False)
 
     def monotone_step(self) -> Step:
-        """Projected cycle on all unknowns; a projected sweep where cycles have been seen to raise the energy."""
+        """Take a projected cycle on all unknowns.
+
+        A projected sweep replaces it once cycles have raised the energy.
+        """
         descent = self.descent
         self._leave()
         self._budget -= 1
@@ -299,7 +323,10 @@ class MultigridWorkspace(IterateMemory):
         return Step("monotone cycle", 1, None, interim=descent.sinks)
 
     def _move_monotonely(self, safe: bool, classify: bool, launch: Launch) -> None:
-        """Launch a projected cycle, or a sweep if `safe`, its step, and the evaluation where that ends."""
+        """Launch a projected cycle, its step, and the evaluation at its end.
+
+        A sweep if `safe`.
+        """
         p, finest = self.problem, self.hierarchy.finest
         lo, hi, bounds, scalars = (
             finest.lower,
@@ -315,7 +342,7 @@ class MultigridWorkspace(IterateMemory):
         self._advance(classify=classify, launch=launch)
 
     def _plan_monotone_step(self, launch: Launch) -> None:
-        """Take the projected cycle's correction as it is."""
+        """Take the projected cycle's correction unchanged."""
         finest = self.hierarchy.finest
         finest.stencil.wrap(finest.x, launch=launch)
         launch(
@@ -326,7 +353,10 @@ class MultigridWorkspace(IterateMemory):
         )
 
     def truncated_step(self) -> Step:
-        """One linear cycle on the free unknowns, made conjugate to the last direction, projected."""
+        """Take a truncated step: a linear cycle on the free unknowns.
+
+        Its correction is made conjugate to the last direction, and the step is projected.
+        """
         active = self.residual.active
         self._leave()
         self._budget -= 1
@@ -349,11 +379,14 @@ class MultigridWorkspace(IterateMemory):
         return Step("truncated cycle", 1, active, interim=self.descent.sinks)
 
     def _has_run_ahead(self) -> bool:
-        """Let the device take a step, and those that follow it; return whether it has, and take over what came of one."""
+        """Let the device take a step, and those that follow it.
+
+        Returns whether it has; the results of one step are then read.
+        """
         ahead, left = self._ahead, min(self._budget + 1, AHEAD - self._taken)
         if ahead is None or self.floating is not None:
             return False
-        # from the best iterate, where steps cannot be taken back
+        # From the best iterate, where steps cannot be undone.
         starts = left > 0 and (self._rounded is None or self._past == 1)
         if not (ahead.rows or (starts and ahead.steps(self._tolerance, left))):
             return False
@@ -366,7 +399,7 @@ class MultigridWorkspace(IterateMemory):
         return self.descent.creeps(self.judge(), moved=self.bounded and self.stale)
 
     def judge(self) -> float:
-        """Let the energy judge the step that has been evaluated; return by how much it has lowered it."""
+        """Judge the evaluated step by the energy; return the energy's decrease."""
         return self.descent.record(self.residual.energy, self.residual.norm)
 
     def _cycle(self) -> None:
@@ -374,7 +407,10 @@ class MultigridWorkspace(IterateMemory):
         self.hierarchy.cycle.run()
 
     def step_program(self) -> Program:
-        """Return the launches of a truncated cycle; bounds in place may be coded now and not in the next solve."""
+        """Return the launches of a truncated cycle.
+
+        They are stored by key: bounds in place may be coded now and not in the next solve.
+        """
         key = self.program_key()
         program = self._programs.get(key)
         if program is None:
@@ -384,16 +420,19 @@ class MultigridWorkspace(IterateMemory):
         return program
 
     def problem_key(self) -> tuple[Any, ...]:
-        """Return what launches depend on of the problem's data."""
+        """Return the key of launches that depend on the problem's data."""
         lower, least, upper, most, code = self.problem.bounds.operands
         return lower.ptr, float(least), upper.ptr, float(most), code.ptr
 
     def program_key(self) -> tuple[Any, ...]:
-        """Return what the launches of a truncated cycle depend on."""
+        """Return the key of the launches of a truncated cycle."""
         return self.problem_key()
 
     def _correct(self, program: Program) -> None:
-        """Record a cycle, the measuring of its correction and the plan of the step; on the CPU the cycle's last leg measures."""
+        """Record a cycle, the products of its correction and the choice of the step.
+
+        On the CPU the last part of the cycle sums the products.
+        """
         hierarchy = self.hierarchy
         if not hierarchy.ends_in_wave:
             program.extend(hierarchy.cycle)
@@ -405,7 +444,10 @@ class MultigridWorkspace(IterateMemory):
         self._plan(program.launch)
 
     def _measure_beside_cuts(self, launch: Launch) -> None:
-        """Measure the correction again beside cells of other processes, whose part of it has come since."""
+        """Sum the correction's products again beside cells of other processes.
+
+        Their part of the correction has arrived since.
+        """
         finest, sums = self.hierarchy.finest, self.residual.sums.partials
         s = finest.stencil
         if s.ghosts is not None:
@@ -427,19 +469,19 @@ class MultigridWorkspace(IterateMemory):
             ).launch(launch)
 
     def _measure(self, *, launch: Launch = launch_now) -> None:
-        """Measure the cycle's correction and plan the step."""
+        """Sum the products of the cycle's correction, and choose the step."""
         finest = self.hierarchy.finest
         finest.stencil.wrap(finest.x, launch=launch)
         kernels.measuring(finest, self._p, self.residual.sums.partials).launch(launch)
         self._plan(launch)
 
     def _plan(self, launch: Launch) -> None:
-        """Add up what has been measured, and plan the step."""
+        """Add up the products, and choose the step."""
         self.residual.sums.add_up(int(kernels.ZAZ), columns=4, launch=launch)
         launch(kernels.plan_step_kernel, 1, [self.residual.scalars], device=self.A.device)
 
     def _advance(self, *, classify: bool, launch: Launch = launch_now) -> None:
-        """Take the planned step and evaluate the residual there."""
+        """Take the chosen step and evaluate the residual there."""
         if self.exact:
             self.residual.advance(self.x, self._p, classify=classify, launch=launch)
             return
@@ -448,10 +490,10 @@ class MultigridWorkspace(IterateMemory):
         self.residual.assess(self.x, classify=classify, launch=launch)
 
     def rebuild(self, *, classify: bool) -> None:
-        """Let the hierarchy follow the free set, if that has changed.
+        """Rebuild the hierarchy for the free set, if that has changed.
 
         Args:
-            classify: as of the residual's `evaluate`, where the right-hand side has to be made
+            classify: as of the residual's `evaluate`, where the right-hand side has to be computed
                 again.
         """
         if self.stale:
@@ -459,11 +501,11 @@ class MultigridWorkspace(IterateMemory):
             self._built = self.residual.free_set
 
     def forget_direction(self) -> None:
-        """Let the next step begin without a search direction."""
+        """Reset the search direction for the next step."""
         self.residual.set(kernels.CARRY, 0.0)
 
     def _project(self) -> None:
-        """Keep the right-hand side compatible on singular components."""
+        """Make the right-hand side compatible on singular components."""
         free = self.hierarchy.finest.stencil.d
         if self._mask is None:
             self._mask = self.problem.layout.zeros(wp.uint8)
@@ -472,10 +514,10 @@ class MultigridWorkspace(IterateMemory):
 
 
 class ColdStart(MultigridWorkspace):
-    """Memory of the cycles, whose iterate, residual and hierarchy the method shares.
+    """Workspace of the cycles of a cold start.
 
-    The finest diagonal of the hierarchy takes the method's shifts, and the method keeps the best
-    iterate.
+    The method shares its iterate, residual and hierarchy. The finest diagonal of the hierarchy
+    takes the method's shifts, and the method stores the best iterate.
 
     Args:
         problem: the problem.
@@ -485,12 +527,15 @@ class ColdStart(MultigridWorkspace):
 
     def __init__(self, problem: LCP, A: HasStencil, settings: Any) -> None:
         super().__init__(problem, A, settings, shifted=True, ahead=False)
-        self._stored = True  # elsewhere
+        self._stored = True  # by the method
 
     def start(
         self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
     ) -> None:
-        """Begin; the method may have written the finest diagonal since it was coarsened."""
+        """Begin a solve.
+
+        The method may have written the finest diagonal since the last coarsening.
+        """
         self.hierarchy.finest.changed.fill_(1)
         self.distrust_hierarchy()
         super().start(warm=warm, tolerance=tolerance, floating=floating)

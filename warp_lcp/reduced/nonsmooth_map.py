@@ -1,10 +1,11 @@
-"""An LCP as a system of nonsmooth equations f(x) = 0 on the device: the maps that Newton-type and gradient methods descend on.
+"""An LCP as a system of nonsmooth equations f(x) = 0, on the device.
 
-With a = d (x - l), c = d (u - x) and psi(a, b) = a + b - sqrt(a^2 + b^2): h = -psi(-y, c) stands
-for y where there is an upper bound, and f = psi(a, h) where there is a lower one, else f = h;
-penalized: f <- lambda f + (1 - lambda) (a+ y+ - c+ (-y)+) / scale. A generalized Jacobian is diag(p
-d) + diag(q) A with p, q >= 0. FUSED passes go over the rows of a grid, whose system is condensed
-where the step ends, in the type of corrections, the others over flat fields.
+The maps of Newton-type and gradient methods. With a = d (x - l), c = d (u - x) and psi(a, b) = a +
+b - sqrt(a^2 + b^2): h = -psi(-y, c) replaces y where there is an upper bound, and f = psi(a, h)
+where there is a lower one, else f = h; penalized: f <- lambda f + (1 - lambda) (a+ y+ - c+ (-y)+) /
+scale. A generalized Jacobian is diag(p d) + diag(q) A with p, q >= 0. FUSED passes go over the rows
+of a grid, whose system is condensed at the end of the step, in the type of corrections, the others
+over flat fields.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ from warp_lcp.rows.host_kernel import HostKernel
 from warp_lcp.rows.program import Launch, launch_now
 from warp_lcp.rows.vectors import Sums, convert, rows_of
 
-# of q where it divides: measured; less makes D needlessly large, more slows convergence
+# Least q as a divisor: measured; a smaller one makes D needlessly large, a larger one slows
+# convergence.
 LEAST_Q = 1e-6
 
 f64 = wp.float64
@@ -46,11 +48,11 @@ ADVANCE = KERNELS["nonsmooth_map.advance"]
 MOVE = KERNELS["nonsmooth_map.move"]
 CONDENSE_AT_ROWS = KERNELS["nonsmooth_map.condense_at_rows"]
 HOST = HostKernel(KERNELS["nonsmooth_map.host"])
-# a plane is condensed when the one above it has moved
+# A plane is condensed when the one above it has moved.
 STEP = Wave("nonsmooth_map.step", (MOVE, 0), (CONDENSE_AT_ROWS, 1))
 DIFFERENCE = KERNELS["finite_difference.difference"]
 SCALE = KERNELS["finite_difference.scale"]
-# distance of two points of a difference, relative to ||x|| / ||p||: half the digits of float64
+# Distance of the two points of a difference, relative to ||x|| / ||p||: half the digits of float64.
 APART = 1e-7
 
 
@@ -58,7 +60,10 @@ KINK = 1e-14  # times the size of b: a point this near to both sides of a kink i
 
 
 class MapForm(StrEnum):
-    """Which map ([Book] 1.1.2-3): the minimum map, Fischer and Burmeister's, or Chen, Chen and Kanzow's penalized one."""
+    """The map f ([Book] 1.1.2-3).
+
+    The minimum map, Fischer and Burmeister's, or Chen, Chen and Kanzow's penalized one.
+    """
 
     NATURAL = "natural"
     FISCHER = "fischer"
@@ -66,12 +71,12 @@ class MapForm(StrEnum):
 
 
 class Kink(StrEnum):
-    """What stands for the derivative at a kink ([Book] 2.4.2).
+    """Choice of the derivative at a kink ([Book] 2.4.2).
 
-    There any (p, q) = (1 - alpha, 1 - beta) with alpha^2 + beta^2 <= 1 is one: a random one; (0,
-    1), that of a point moved a little off the bound; or the unknown does not move in this step
-    (zero). With an approximation it does not either, and the products with the Jacobian are finite
-    differences of the map.
+    There any (p, q) = (1 - alpha, 1 - beta) with alpha^2 + beta^2 <= 1 is a derivative. "random": a
+    random one. "perturbation": (0, 1), that of a point moved slightly off the bound. "zero": the
+    unknown does not move in this step. "approximation": it does not move either, and the products
+    with the Jacobian are finite differences of the map.
     """
 
     RANDOM = "random"
@@ -86,7 +91,7 @@ KinkName = Literal[tuple(map(str, Kink))]
 
 @dataclass(frozen=True, slots=True)
 class MapFields:
-    """Stored fields that the values f of a map are computed from.
+    """Stored fields from which the values f of a map are computed.
 
     Attributes:
         x: iterate.
@@ -105,11 +110,11 @@ class MapFields:
 
 @dataclass(frozen=True, slots=True)
 class MapNumbers:
-    """Numbers of a map.
+    """Parameters of a map.
 
     Attributes:
-        share: of the Fischer-Burmeister function in the penalized one.
-        over: one over the size of b an unknown.
+        share: weight of the Fischer-Burmeister function in the penalized map.
+        over: reciprocal of the root mean square of b.
         kinks: distance to a kink below which an element of its subdifferential is chosen.
         seed: of random elements.
     """
@@ -155,20 +160,21 @@ class MapWeights:
 
 
 class NonsmoothMap:
-    """f, the merit f.f / 2 and its gradient, at the point where a residual was evaluated last.
+    """f, the merit f.f / 2 and its gradient at the point of the last residual.
 
     With the natural residual's d, a = d (x - l), c = d (u - x) and psi(a, b) = a + b - sqrt(a^2 +
-    b^2), the Fischer map of a boxed row is psi(a, -psi(-y, c)) ([Book] eq. 1.48, signs turned so
-    that f > 0 where y > 0), of one without upper bound psi(a, y), of an equation y; penalized:
-    lambda times that plus (1 - lambda) (a+ y+ - c+ (-y)+) / scale with `scale` the root mean square
-    of b. The factor d makes f's units those of y, so that a change of x's units changes nothing.
+    b^2), the Fischer map of a boxed row is psi(a, -psi(-y, c)) ([Book] eq. 1.48, with the signs
+    changed so that f > 0 where y > 0). It is psi(a, y) in a row without upper bound, and y in an
+    equation. The penalized map is lambda times that plus (1 - lambda) (a+ y+ - c+ (-y)+) / scale
+    with `scale` the root mean square of b. The factor d gives f the units of y, so that f does not
+    depend on x's units.
 
     Args:
         problem: the problem.
-        residual: whose y is used.
+        residual: its y is used.
         map: which of the three.
         share: lambda of the penalized map.
-        kink: what stands for the derivative at a kink.
+        kink: choice of the derivative at a kink.
         scaled: False: d = 1.
 
     Attributes:
@@ -201,14 +207,15 @@ class NonsmoothMap:
         )
         self._draws = self._random and not natural
         self._sums, self.norm = Sums(Rows.flat(layout.size, problem.device), 2), 0.0
-        # made when first asked for, as is this one and the last gradient, the product, the weights
+        # Created at the first use, as are the current and the last gradient, the product and the
+        # weights.
         self._by_rows: Sums | None = None
         self._gradients: list[wp.array[Any]] = []
         self._drops = kink in (Kink.ZERO, Kink.APPROXIMATION)
         self.begin()
 
     def begin(self) -> None:
-        """Take the scale of b as it is now."""
+        """Read the current scale of b."""
         count = max(int(np.count_nonzero(self.problem.unknown.numpy() == 1)), 1)
         scale = self.residual.norm_of_b() / np.sqrt(count) or 1.0
         self._numbers = MapNumbers(self._share, float(1 / scale), float(KINK * scale), 0)
@@ -240,7 +247,9 @@ class NonsmoothMap:
         scale: float,
         turn: int,
     ) -> float:
-        """Write Newton's system divided by q: (A + D) dx = -f / q with D = d p / q, q at least 1e-6; return the merit.
+        """Write Newton's system divided by q; return the merit.
+
+        (A + D) dx = -f / q with D = d p / q, q at least 1e-6.
 
         Args:
             x: the iterate.
@@ -273,13 +282,15 @@ class NonsmoothMap:
         scale: float,
         turn: int,
     ) -> float:
-        """Move x by length e, set the residual's norm, and condense the next system there, for one CPU thread and no periodic axes.
+        """Move x by length e, and condense the next system there.
+
+        The pass also sets the residual's norm. For one CPU thread and grids without periodic axes.
 
         Args:
             x: the iterate, stored.
             e: the direction, stored.
-            length: how far; 0: only condense.
-            finest: level with a shift; receives the system, D on top of A's diagonal.
+            length: of the move; 0: only condense.
+            finest: level with a shift; receives the system, D added to A's diagonal.
             scale: of the right-hand side.
             turn: number of the step.
 
@@ -320,7 +331,7 @@ class NonsmoothMap:
         """Write the gradient J'f, scaled by d^-2, to `direction`.
 
         Returns:
-            ||d^-1 J'f||^2, and the inner product of d^-1 J'f with what it was the last time.
+            ||d^-1 J'f||^2, and the inner product of d^-1 J'f with that of the last call.
         """
         p = self.problem
         if not self._gradients:
@@ -328,7 +339,7 @@ class NonsmoothMap:
         last, new, product, weights = self._gradients
         self._gradients = [new, last, product, weights]
         self._half_sum(WEIGHTED, x, MapWeights(new, weights))
-        # grids take stored fields flat
+        # Grids take stored fields flat.
         shape = (p.layout.size,) if isinstance(p.layout, PaddedLayout) else p.layout.stored_shape
         p.A.apply_transpose(weights.reshape(shape), product.reshape(shape))
         square, inner = self._sums.of(
@@ -348,11 +359,14 @@ class NonsmoothMap:
         return self._gradients[0]
 
     def slope(self, x: wp.array[Any], e: wp.array[Any]) -> float:
-        """Return the derivative of the merit at x along e, f'J e = (p d f)'e + (q f)'A e: one product, none with A'."""
+        """Return the derivative of the merit at x along e.
+
+        f'J e = (p d f)'e + (q f)'A e: one product with A, none with A'.
+        """
         p, layout = self.problem, self.problem.layout
         along, product, by_x, by_y = (layout.zeros(wp.float64) for _ in range(4))
         convert(e, along)
-        # grids take stored fields flat
+        # Grids take stored fields flat.
         shape = (layout.size,) if isinstance(layout, PaddedLayout) else layout.stored_shape
         p.A.apply(along.reshape(shape), product.reshape(shape))
         self._half_sum(WEIGHTED, x, MapWeights(by_x, by_y))
@@ -361,9 +375,9 @@ class NonsmoothMap:
         return float(self._sums.scalars.numpy()[:2].sum())
 
     def is_stationary(self, x: wp.array[Any], share: float) -> bool:
-        """Return whether no direction within the bounds lowers the merit at x to first order.
+        """Return whether x is a stationary point of the merit within the bounds.
 
-        That is the projected gradient d (x - clip(x - d^-2 J'f)), of at most `share` times ||f||.
+        The norm of the projected gradient d (x - clip(x - d^-2 J'f)) must be at most `share` ||f||.
 
         Raises:
             NoTranspose: A has no products with A'.
@@ -387,7 +401,10 @@ class NonsmoothMap:
         *,
         projected: bool,
     ) -> None:
-        """Set x = base + scale e, projected onto the bounds or not; base and x may be one field."""
+        """Set x = base + scale e, projected onto the bounds or not.
+
+        base and x may be one field.
+        """
         p = self.problem
         rows, bounds = self._sums.rows, p.bounds.operands
         ADVANCE.bind(
@@ -404,6 +421,7 @@ class NonsmoothMap:
     def _half_sum(
         self, declared: RowPass, x: wp.array[Any], *more: MapSystem | MapWeights
     ) -> float:
+        """Run a kernel of the map at x; return half of its first sum."""
         sums = self._sums.of(
             declared,
             self._numbers,
@@ -422,9 +440,10 @@ class NonsmoothMap:
 
 
 class FiniteDifferenceSystem(KrylovSystem):
-    """Solve J e = -f by GMRES with J p = (f(x + h p) - f(x)) / h, preconditioned by the diagonal of A.
+    """Solve J e = -f by GMRES with finite differences.
 
-    `linearize` takes the point; `r` and `e` are as in a principal system.
+    J p = (f(x + h p) - f(x)) / h, preconditioned by the diagonal of A. `linearize` sets the point;
+    `r` and `e` are as in a principal system.
 
     Args:
         problem: the problem.
@@ -450,13 +469,16 @@ class FiniteDifferenceSystem(KrylovSystem):
         self.refresh()
 
     def refresh(self) -> None:
-        """Take the diagonal and b's scale again."""
+        """Read the diagonal and the scale of b again."""
         self._map.begin()
         d = self._residual.diagonal.numpy().astype(np.float64) * self._residual.unit
         self._diagonal = wp.array(d, dtype=wp.float64, device=self._problem.device)
 
     def linearize(self, x: wp.array[Any], free: wp.array[Any], size: float) -> None:
-        """Take the point x, where the residual was evaluated, and make -f / size on the free unknowns the right-hand side."""
+        """Set the point x, where the residual was evaluated.
+
+        The right-hand side becomes -f / size on the free unknowns.
+        """
         self._x, self._free, self._size = x, free, size
         self._map.values(x, self._f)
         self._length = 1 + self.norm(x)
@@ -464,10 +486,11 @@ class FiniteDifferenceSystem(KrylovSystem):
         DIFFERENCE.bind(rows_of(self.r), free=free, f=self._f, over=1 / size, q=self.r).launch()
 
     def apply(self) -> None:
-        """Precondition: z = r / d."""
+        """Apply the preconditioner: z = r / |d|."""
         SCALE.bind(rows_of(self.r), r=self.r, d=self._diagonal, z=self.z).launch()
 
     def _product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = launch_now) -> None:
+        """Compute q = J p by a difference of the map, on the free unknowns."""
         norm = self.norm(p)
         if norm == 0:
             q.zero_()
@@ -480,12 +503,14 @@ class FiniteDifferenceSystem(KrylovSystem):
 
 
 class HostMap:
-    """f and a generalized Jacobian diag(p d) + diag(q) A of a dense problem on the host, by the formulas of `NonsmoothMap`.
+    """f and a generalized Jacobian of a dense problem on the host.
+
+    The Jacobian is diag(p d) + diag(q) A; the formulas are those of `NonsmoothMap`.
 
     Args:
         data: the problem.
         share: lambda.
-        kink: what stands at kinks.
+        kink: choice at kinks.
         rng: of random elements.
         scaled: False: d = 1.
     """
@@ -507,13 +532,19 @@ class HostMap:
         self._element = np.zeros(n), np.ones(n)
 
     def value(self, x: np.ndarray, y: np.ndarray, smoothing: float = 0.0) -> np.ndarray:
-        """Return f; smoothing mu > 0: of the smoothed map, with psi(a, b) = a + b - sqrt(a^2 + b^2 + 2 mu), without penalty."""
+        """Return f, or the smoothed map's f for smoothing mu > 0.
+
+        The smoothed map has psi(a, b) = a + b - sqrt(a^2 + b^2 + 2 mu), without penalty.
+        """
         return self._rows(x, y, smoothing)[0].copy()
 
     def linearized(
         self, x: np.ndarray, y: np.ndarray | None = None, smoothing: float = 0.0
     ) -> tuple[np.ndarray, ...]:
-        """Return f, p and q of an element of the generalized Jacobian, and which rows are at a kink; y = A x + b unless given."""
+        """Return f, p and q of a generalized Jacobian, and the rows at a kink.
+
+        y = A x + b if None.
+        """
         if self.kink is Kink.RANDOM:
             self._element = tuple(1 - np.sqrt(0.5) * self._rng.random(len(x)) for _ in range(2))
         f, p, q, kinks = (
@@ -527,7 +558,7 @@ class HostMap:
         return np.diag(p * self.d) + q[:, None] * self.data.A
 
     def _rows(self, x: np.ndarray, y: np.ndarray, smoothing: float) -> list[np.ndarray]:
-        """Return f, p, q and kinks: memory that the next call overwrites."""
+        """Return f, p, q and kinks, in memory that the next call overwrites."""
         n, data = len(x), self.data
         reals = (x, y, self.d, data.lower, data.upper, *self._element)
         return HOST.run(

@@ -1,9 +1,10 @@
-"""The system on the free unknowns that Newton-type methods share: (P A P + P D P) e = r with a free set P and a shift D >= 0.
+"""Linear system on the free unknowns: (P A P + P D P) e = r.
 
-Grids take multigrid-preconditioned conjugate gradients, dense and narrow matrices a factorization,
-other sparse ones algebraic multigrid or incomplete factors, other operators Krylov methods
-preconditioned by the diagonal: conjugate gradients where A is symmetric, else GMRES. Where a
-problem brings a preconditioner, that is taken instead. Each kind of system is a file.
+Newton-type methods share it; P is the free set and D >= 0 a shift. Grids take
+multigrid-preconditioned conjugate gradients, dense and narrow matrices a factorization, other
+sparse ones algebraic multigrid or incomplete factors, other operators Krylov methods preconditioned
+by the diagonal: conjugate gradients where A is symmetric, else GMRES. A preconditioner of the
+problem replaces these. Each kind of system is a file.
 """
 
 from __future__ import annotations
@@ -31,11 +32,11 @@ from warp_lcp.reduced.sparse_system import SparseSystem
 
 
 class PrincipalSystem(Protocol):
-    """The system on a free set.
+    """Linear system on a free set.
 
-    A system made with `shifted=True` measures residuals as ||d^(-1/2) r||, d the diagonal of A + D,
-    in `norm` and in `solve`: rows that a large D makes stiff would else decide when to stop.
-    Without it they are ||r||. Dense systems, solved directly, always take ||r||.
+    A system created with `shifted=True` measures residuals as ||d^(-1/2) r||, d the diagonal of A +
+    D, in `norm` and in `solve`: otherwise rows that a large D makes stiff would decide when to
+    stop. Without it they are ||r||. Dense systems, solved directly, always use ||r||.
 
     Attributes:
         r: stored field; the right-hand side, zero off the free set, overwritten by `solve`.
@@ -46,16 +47,24 @@ class PrincipalSystem(Protocol):
     e: wp.array[Any]
 
     def refresh(self) -> None:
-        """Take A's entries again after they changed in place; `restrict` must follow."""
+        """Read A's entries after they changed in place; `restrict` must follow."""
 
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
-        """Take another free set (stored uint8 field) and shift (stored float64 field, >= 0; needs `shifted=True`; None: 0)."""
+        """Set another free set and shift.
+
+        Args:
+            free: stored uint8 field.
+            shift: stored float64 field, >= 0; needs `shifted=True`; None: 0.
+        """
 
     def norm(self) -> float:
         """Return the norm of r, as `solve` measures it."""
 
     def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
-        """Solve until the residual's norm is at most `tolerance`; return iterations and the norm reached."""
+        """Solve until the residual's norm is at most `tolerance`.
+
+        Returns the number of iterations and the norm reached.
+        """
 
 
 def principal_system(
@@ -72,9 +81,9 @@ def principal_system(
     Args:
         problem: the problem.
         real: type of the corrections, where the operator leaves a choice.
-        bounded: whether projected cycles are wanted on grids.
+        bounded: whether projected cycles are needed on grids.
         settings: how a grid's cycles go.
-        shifted: whether `restrict` gets a shift; see `PrincipalSystem` for what it does to norms.
+        shifted: whether `restrict` gets a shift; it changes norms, see `PrincipalSystem`.
         hierarchy: of a grid's stencil, where another method has made one.
     """
     A = problem.A
@@ -94,5 +103,11 @@ def principal_system(
         return SparseSystem(A, real, shifted=shifted)
     terms = grid_and_low_rank(A)
     if terms is not None:
-        return CoupledGridSystem(A, *terms, real, settings=settings, shifted=shifted)  # type: ignore[arg-type]
+        return CoupledGridSystem(
+            A,  # type: ignore[arg-type]
+            *terms,
+            real,
+            settings=settings,
+            shifted=shifted,
+        )
     return DiagonalSystem(problem, shifted=shifted)

@@ -1,4 +1,4 @@
-"""Protocol of the systems that Newton's method on the minimum map solves, and the choice between them."""
+"""Reduced systems of Newton's method on the minimum map: protocol and choice."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ from warp_lcp.reduced.host_system import HostSystem
 
 
 class ReducedSystem(Protocol):
-    """Newton's equations at the iterate, reduced to the unknowns that the minimum map calls free: A_FF e_F = -y_F.
+    """Newton's equations on the free unknowns: A_FF e_F = -y_F.
 
-    A step is `classify`, `restrict`, `solve`, `move`, then `accept` or `fall_back`.
+    Free are the unknowns that the minimum map selects at the iterate. A step is `classify`,
+    `restrict`, `solve`, `move`, then `accept` or `fall_back`.
 
     Attributes:
-        whole: whether the step that `solve` has found is taken whole, whatever the residual does.
+        whole: whether the step of `solve` is taken whole, even if the residual rises.
     """
 
     whole: bool
@@ -32,34 +33,52 @@ class ReducedSystem(Protocol):
     def start(
         self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
     ) -> None:
-        """Forget the last solve; the operator may have changed."""
+        """Reset the state of the last solve; the operator may have changed."""
 
     def monotone_cycle(self) -> Step | None:
-        """Take a projected multigrid cycle if the start is still cold; return None, with nothing done, if it is not."""
+        """Take a projected multigrid cycle after a cold start.
+
+        Returns None, with nothing done, if none is due.
+        """
 
     def classify(self) -> Step | None:
-        """Find the free set F at x; return a step that has been taken instead of Newton's, such as one on coarse unknowns."""
+        """Find the free set F at x.
+
+        Returns a step that has been taken instead of Newton's, such as one on coarse unknowns, else
+        None.
+        """
 
     def restrict(self) -> bool:
-        """Move held unknowns onto their bounds, and set up the equations on F; return whether their right-hand side is not 0."""
+        """Move held unknowns onto their bounds, and set up the equations on F.
+
+        Returns whether their right-hand side is nonzero.
+        """
 
     def solve(self) -> int | None:
-        """Solve them as accurately as the settings ask; return linear iterations, None where no step leads on from here."""
+        """Solve the equations to the accuracy of the settings.
+
+        Returns the number of linear iterations, None if there is no step from here.
+        """
 
     def move(self, length: float) -> float:
-        """Set x = clip(x + length e, l, u) from where the step began, at first with length 1; return the residual's norm there."""
+        """Set x = clip(x + length e, l, u) from the start of the step.
+
+        The first length is 1. Returns the residual's norm there.
+        """
 
     def accept(self, iterations: int) -> Step:
-        """Return the step that ends at x, with the linear iterations that it took."""
+        """Return the step that ends at x, with its number of linear iterations."""
 
     def fall_back(
         self, iterations: int, norms: deque[float], best: float, length: float
     ) -> Step | ReducedSystem:
-        """Go on where `solve` finds no step, or the search no length; return the step taken, or a system that takes over.
+        """Continue where `solve` finds no step, or the search no length.
+
+        Returns the step taken, or a system that takes over.
 
         Args:
             iterations: linear iterations so far.
-            norms: last residual norms, whose maximum no length has kept to; to be cleared if no
+            norms: last residual norms, whose maximum all lengths have exceeded; to be cleared if no
                 later step may undo this one.
             best: the smallest residual norm of the search, inf if there was none.
             length: where it was.

@@ -11,7 +11,7 @@ from warp_lcp.settings import Count, CountOrZero, Settings, Share
 
 @dataclass(frozen=True, kw_only=True)
 class NewtonSettings(Settings):
-    """Settings of methods that solve a linear system in each step: its accuracy, and what comes before and within.
+    """Settings of methods that solve a linear system in each step.
 
     A method that needs other defaults declares the field again.
 

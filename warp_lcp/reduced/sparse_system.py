@@ -1,4 +1,7 @@
-"""Principal systems of sparse matrices, and systems whose preconditioner may fail, so that better factors take over."""
+"""Principal systems of sparse matrices.
+
+Systems whose preconditioner may fail are guarded: better factors then take over.
+"""
 
 from __future__ import annotations
 
@@ -24,28 +27,29 @@ from warp_lcp.problem.protocol import FLUID, HasStencil
 from warp_lcp.rows.fields import zeros, zeros_like
 from warp_lcp.rows.program import Launch, launch_now
 
-# symmetric matrices far from M-matrices: on plates of 60^2 and 120^2 0.55 times the iterations of
-# the usual settings, .8 on elastic blocks
+# For symmetric matrices far from M-matrices: on plates of 60^2 and 120^2 0.55 times the iterations
+# of the usual settings, .8 on elastic blocks.
 FAR_FROM_M = partial(AlgebraicSettings, strength=0.08, interval=(0.05, 1.0))
-# share of a column below which entries of the factors go, and the most of them in units of A's
+# Share of a column below which entries of the factors are dropped, and the largest number of
+# entries in units of A's.
 DROP, FILL = 1e-4, 10.0
-# share of a row's largest entry; its multiples modulo 1 are all different
+# Share of a row's largest entry; its multiples modulo 1 are all different.
 NUDGE, GOLDEN = 1e-14, (math.sqrt(5) - 1) / 2
-# unknowns up to which factors are complete: that costs less than the iterations it saves
+# Up to so many unknowns factors are complete: that costs less than the iterations it saves.
 DIRECT = 2000
-# unknowns of a grid up to which factors are complete where cycles fail: a second or two
+# Unknowns of a grid up to which factors are complete where cycles fail: a second or two.
 FACTORED_IN_PLANE, FACTORED_IN_SPACE = 1 << 17, 1 << 14
-RAISED = 1e-13  # share by which diagonals are raised then
-# of a right-hand side: what any preconditioner worth its name comes to, whatever rounding leaves
+RAISED = 1e-13  # relative increase of the diagonals of complete factors
+# Of a right-hand side: any useful preconditioner reaches it, whatever rounding leaves.
 REDUCED = 1e-2
-ENOUGH = 60  # iterations by which it should
+ENOUGH = 60  # iterations within which it should reach that
 
 
 class Substitute(Protocol):
-    """A system that takes over: the same matrix, fields of its own."""
+    """A system that takes over: the same matrix, with its own fields."""
 
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None) -> None:
-        """Take another free set and shift."""
+        """Set another free set and shift."""
 
     def solve_for(
         self, r: wp.array[Any], e: wp.array[Any], tolerance: float, max_iterations: int
@@ -54,29 +58,32 @@ class Substitute(Protocol):
 
 
 class GuardedSystem(KrylovSystem):
-    """A Krylov method with a preconditioner, and where that fails by another system.
+    """Krylov method whose preconditioner is replaced by another system if it fails.
 
     A preconditioner fails if its solve stalls, or is cut off after `ENOUGH` iterations, before the
-    residual is at the tolerance or `REDUCED`. What takes over stays until the operator changes.
+    residual reaches the tolerance or `REDUCED`. The substitute stays until the operator changes.
     """
 
     _substitute: Substitute | None = None
-    _make_substitute: Callable[[], Substitute] | None = None  # None: nothing takes over
-    # the free set and the shift there are
+    _make_substitute: Callable[[], Substitute] | None = None  # none: no substitute
+    # The current free set and shift.
     _restriction: tuple[wp.array[Any], wp.array[Any] | None] | None = None
 
     def _guard(self, substitute: Callable[[], Substitute]) -> None:
-        """Take over where needed, from now on, by a system that is made then."""
+        """Set the function that creates the substitute when it is needed."""
         self._saved, self._make_substitute = zeros_like(self.r), substitute
 
     def _note(self, free: wp.array[Any], shift: wp.array[Any] | None) -> None:
-        """Remember the free set and the shift."""
+        """Store the free set and the shift."""
         self._restriction = free, shift
         if self._substitute is not None:
             self._substitute.restrict(free, shift)
 
     def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
-        """Iterate from e = 0 until the norm is at most the tolerance; return iterations and the norm reached."""
+        """Iterate from e = 0 until the norm is at most the tolerance.
+
+        Returns the number of iterations and the norm reached.
+        """
         if self._make_substitute is None or self._restriction is None:
             return super().solve(tolerance, max_iterations)
         done, start = 0, self.norm()
@@ -98,29 +105,29 @@ class SparsePreconditioner(Preconditioner, Protocol):
     weight: wp.array[Any]
 
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
-        """Take a free set and a shift."""
+        """Set a free set and a shift."""
 
     def product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = launch_now) -> None:
-        """q = M p, on the device."""
+        """Compute q = M p on the device."""
 
 
 class SparseSystem(GuardedSystem):
-    """(P A P + P D P) e = r with a sparse A.
+    """Principal system (P A P + P D P) e = r of a sparse A.
 
-    Symmetric matrices whose diagonal is not negative take conjugate gradients with algebraic
-    multigrid, which falls back on sweeps where nothing aggregates. Others take GMRES: with
-    algebraic multigrid if most rows are diagonally dominant and nearly all off-diagonal entries
-    negative (convection-diffusion), else with incomplete factors that SciPy makes anew and applies,
-    on the host for any device. On directed cycles, I - S with S nearly a permutation, multigrid
-    fails, and factors take over.
+    Symmetric matrices whose diagonal is not negative are solved by conjugate gradients with
+    algebraic multigrid, which falls back on sweeps where nothing aggregates. Others are solved by
+    GMRES. Its preconditioner is algebraic multigrid if most rows are diagonally dominant and nearly
+    all off-diagonal entries are negative (convection-diffusion). Otherwise it is incomplete
+    factors, which SciPy computes and applies on the host for each free set, for any device. On
+    directed cycles, I - S with S nearly a permutation, multigrid fails, and factors take over.
 
     Args:
         A: the matrix.
         real: type of the corrections.
         shifted: as of `PrincipalSystem`.
         settings: of the hierarchy.
-        substitute: makes what takes over where the hierarchy fails; None: factors, if A is not
-            symmetric.
+        substitute: creates the system that takes over where the hierarchy fails; None: factors, if
+            A is not symmetric.
 
     Attributes:
         cycled: whether the preconditioner is algebraic multigrid: A is symmetric, or nearly an
@@ -157,7 +164,9 @@ class SparseSystem(GuardedSystem):
             self._guard(substitute)
 
     def refresh(self) -> None:
-        """Choose again where an update of A has changed whether it is symmetric; `restrict` takes the entries.
+        """Reset the choice of the preconditioner if A has changed.
+
+        `restrict` reads the entries.
 
         Raises:
             ValueError: A was symmetric and is not any more: this system's fields serve conjugate
@@ -171,14 +180,16 @@ class SparseSystem(GuardedSystem):
                 )
 
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
-        """Take another free set and shift, and compute the preconditioner anew."""
+        """Set another free set and shift, and recompute the preconditioner."""
         if self._substitute is None:
             self.preconditioner.restrict(free, shift)
         self._note(free, shift)
 
 
 class IncompleteFactors:
-    """L U factors of the free block by SciPy, on the host; incomplete ones of more than `DIRECT` unknowns.
+    """LU factors of the free block by SciPy, on the host.
+
+    Incomplete factors for more than `DIRECT` unknowns.
 
     Args:
         A: the matrix.
@@ -200,7 +211,7 @@ class IncompleteFactors:
         mask = scipy.sparse.diags_array((free.numpy() != 0).astype(np.float64))
         self._M = (mask @ matrix @ mask).tocsr()
         diagonal = np.abs(self._M.diagonal())
-        # of a tiny entry in float32: the method sees that its iterate is not finite
+        # A tiny entry in float32 overflows: the method detects that its iterate is not finite.
         with np.errstate(over="ignore"):
             self.weight.assign(
                 np.where(free.numpy() != 0, 1 / np.where(diagonal > 0, diagonal, 1.0), 0.0)
@@ -210,19 +221,22 @@ class IncompleteFactors:
         )
 
     def product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = launch_now) -> None:
-        """q = M p, on the host."""
+        """Compute q = M p on the host."""
         q.assign(self._M @ p.numpy())
 
     def apply(self) -> None:
-        """Precondition on the host: z = the factors' inverse times r."""
+        """Apply the preconditioner on the host: z = the factors' inverse times r."""
         z = np.zeros(self._A.unknowns)
         if self._solve is not None:
             z[self._free] = self._solve(self.r.numpy()[self._free].astype(np.float64))
-        with np.errstate(over="ignore"):  # the method sees that its iterate is not finite
+        with np.errstate(over="ignore"):  # the method detects that its iterate is not finite
             self.z.assign(z)
 
     def _factor(self, block: Any) -> Any:
-        """Return what applies the factors' inverse; nothing is done where they cannot be had."""
+        """Return a function that applies the factors' inverse.
+
+        It is the identity where the factors are singular.
+        """
         try:
             if block.shape[0] <= DIRECT:
                 return scipy.sparse.linalg.splu(nudged(block, NUDGE)).solve
@@ -234,11 +248,11 @@ class IncompleteFactors:
 
 
 def nudged(block: Any, share: float, *, small: float = 0.0) -> Any:
-    """Return a block without exactly singular factors: SuperLU, given those, writes to stderr, and may crash the process.
+    """Return a block without exactly singular factors.
 
-    A strictly diagonally dominant block is regular and stays as it is. Of others the diagonal grows
-    by a share of each row's largest entry, another one in each row, so that no two rows become
-    alike.
+    SuperLU, given those, writes to stderr, and may crash the process. A strictly diagonally
+    dominant block is regular and stays unchanged. The diagonal of others grows by a share of each
+    row's largest entry, a different one in each row, so that no two rows become equal.
 
     Args:
         block: square, in compressed columns.
@@ -261,7 +275,10 @@ def nudged(block: Any, share: float, *, small: float = 0.0) -> Any:
 
 
 class CompleteFactors(IncompleteFactors):
-    """Complete factors of matrices that others fail on; of slightly raised diagonals, for a component may be singular."""
+    """Complete factors of matrices on which other preconditioners fail.
+
+    Diagonals are slightly raised, because a component may be singular.
+    """
 
     def _factor(self, block: Any) -> Any:
         try:
@@ -286,12 +303,15 @@ class FactoredSystem(KrylovSystem):
 
     @staticmethod
     def of(A: SparseOperator, *, weighted: bool, complete: int = 0) -> FactoredSystem:
-        """Return the system of a matrix, with complete factors of no more than so many unknowns."""
+        """Return the system of a matrix.
+
+        Factors are complete for at most `complete` unknowns.
+        """
         kind = CompleteFactors if A.unknowns <= complete else IncompleteFactors
         return FactoredSystem(kind(A, wp.float64), weighted=weighted)
 
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None) -> None:
-        """Take another free set and shift, and factor."""
+        """Set another free set and shift, and factor."""
         self._factors.restrict(free, shift)
 
     def solve_for(
@@ -305,7 +325,9 @@ class FactoredSystem(KrylovSystem):
 
 
 class MatrixSystem:
-    """The systems of a grid operator's matrix, in double precision: by algebraic multigrid, then by factors.
+    """Systems of a grid operator's matrix, in double precision.
+
+    Solved by algebraic multigrid, then by factors.
 
     Args:
         A: the operator.
@@ -322,7 +344,7 @@ class MatrixSystem:
         )
 
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None) -> None:
-        """Take another free set and shift, stored fields of the grid."""
+        """Set another free set and shift, stored fields of the grid."""
         device = self._operator.device
         of_rows = (
             None
@@ -336,7 +358,7 @@ class MatrixSystem:
     def solve_for(
         self, r: wp.array[Any], e: wp.array[Any], tolerance: float, max_iterations: int
     ) -> tuple[int, float]:
-        """Solve for e; fields of the grid."""
+        """Solve for e; r and e are fields of the grid."""
         self._system.r.assign(r.numpy()[self._rows].astype(np.float64))
         iterations, norm = self._system.solve(tolerance, max_iterations)
         stored = np.zeros(e.size, dtype=wp.dtype_to_numpy(e.dtype))

@@ -1,1 +1,1 @@
-"""Methods, one a file; `registry.METHODS` has them by name."""
+"""Solvers, one file for each; `registry.METHODS` has them by name."""

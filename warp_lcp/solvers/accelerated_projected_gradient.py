@@ -1,4 +1,4 @@
-"""Accelerated projected gradients: the proximal-map form of the problem, with Nesterov's momentum."""
+"""Accelerated projected gradient method (proximal map, Nesterov's momentum)."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from warp_lcp.sweeps.spectrum import positive_diagonal, scaled_spectrum
 KERNELS = KernelFile(Path(__file__).parent / "headers/gradient_projection.h")
 PROGRESS = KERNELS["accelerated.progress"]
 EXTRAPOLATE = KERNELS["accelerated.extrapolate"]
-MARGIN = 1.05  # Lanczos' estimate is from below
-FAR = 1.5  # times L: a step of more curvature is taken back
+MARGIN = 1.05  # Lanczos' method estimates L from below
+FAR = 1.5  # times L: a step of larger curvature is rejected
 NOISE = 1e-20  # relative (squared) length of a step below which its curvature is rounding
 
 
@@ -32,15 +32,16 @@ class AcceleratedProjectedGradient(Settings):
     It iterates the proximal map x = prox_K(x - r (A x + b)) of the box K ([Book] 1.1.4).
 
     With the diagonal D of A as metric and L = lambda_max(D^-1/2 A D^-1/2): x+ = clip(z - D^-1 (A z
-    + b) / L, l, u), where z = x + beta (x - x before) with Nesterov's beta. The momentum is reset
-    where (z - x+)' D (x+ - x) > 0. L comes from Lanczos' method and grows where a step's curvature
-    exceeds it; where by far, the step is taken back. One product a step, since A z + b is
-    extrapolated as z is. Converges for symmetric positive semidefinite A; the error of the energy
-    falls as 1/k^2, faster in the end.
+    + b) / L, l, u), where z = x + beta (x - x_old) with Nesterov's beta. The momentum is reset
+    where (z - x+)' D (x+ - x) > 0. L comes from Lanczos' method and is raised where the curvature
+    of a step exceeds it; where the curvature exceeds 1.5 L, the step is rejected. A step needs one
+    product with A, since A z + b is extrapolated in the same way as z. The method converges for
+    symmetric positive semidefinite A; the error of the energy falls as 1/k^2, and faster near the
+    solution.
 
     Args:
         lipschitz: L > 0 in the metric D; estimated if None.
-        estimate_steps: products that the estimate takes.
+        estimate_steps: number of products with A for the estimate.
         precision: "mixed" or "double" keep the iterate in float64, "single" rounds it to float32.
     """
 
@@ -71,7 +72,7 @@ class AcceleratedProjectedGradient(Settings):
 
 @dataclass(frozen=True, slots=True)
 class MomentumFields:
-    """Stored fields that both kernels of a step take.
+    """Stored fields that both kernels of a step use.
 
     Attributes:
         x: iterate.
@@ -93,10 +94,10 @@ class MomentumFields:
 
 
 class AcceleratedWorkspace(IterateMemory):
-    """Memory of the method.
+    """Workspace of the accelerated projected gradient method.
 
     Attributes:
-        lipschitz: L as it is now.
+        lipschitz: the current L.
     """
 
     def __init__(self, problem: LCP, settings: AcceleratedProjectedGradient) -> None:
@@ -109,7 +110,7 @@ class AcceleratedWorkspace(IterateMemory):
         self._sums = Sums(rows_of(self.x), len(PROGRESS.sums))
 
     def start(self, *, warm: bool, tolerance: float) -> None:
-        """Forget the momentum; look at the operator again if it has changed."""
+        """Reset the momentum; estimate L again if the operator has changed."""
         self._momentum = 0.0  # Nesterov's t; 0 before the first step, when there is no z
         version = version_of(self.problem.A)
         if version != self._version:
@@ -118,10 +119,15 @@ class AcceleratedWorkspace(IterateMemory):
                 greatest = scaled_spectrum(self.problem, self.settings.estimate_steps)[1]
                 # any L will do for a zero matrix
                 self.lipschitz = MARGIN * greatest if greatest > 0 else 1.0
-            self._version = version  # last: time may be up before
+            self._version = version  # last: the time limit may end the estimate before
 
     def advance(self, x: wp.array[Any]) -> None:
-        """Take the step; the residual's y is that of x."""
+        """Take one step; `residual.y` is A x + b at x.
+
+        With beta of the last step: z = x + beta (x - x_old), y_z = y + beta (y - y_old), and then x
+        <- clip(z - D^-1 y_z / L, l, u). The kernel stores the x and y before the step, to which a
+        rejected step returns.
+        """
         p, beta = self.problem, self._beta(x) if self._momentum > 0 else 0.0
         if self._momentum == 0:
             self._momentum = 1.0
@@ -136,7 +142,13 @@ class AcceleratedWorkspace(IterateMemory):
         self.round_iterate()
 
     def _beta(self, x: wp.array[Any]) -> float:
-        """Look at the last step, correct L, return the share of it that goes on."""
+        """Return Nesterov's beta for the next step; correct L by the last one.
+
+        With s = x - z of the last step, its curvature is s'A s = s'(y - y_z), to be compared with L
+        s'D s. A larger curvature raises L, and by far larger rejects the step. Both cases, and (z -
+        x)' D (x - x_old) > 0, reset the momentum: beta = 0. Else t+ = (1 + sqrt(1 + 4 t^2)) / 2 and
+        beta = (t - 1) / t+.
+        """
         curvature, metric, turned, size = self._sums.of(PROGRESS, self._momenta(x))
         exceeded = metric > NOISE * size and curvature > self.lipschitz * metric
         if exceeded:
@@ -153,7 +165,7 @@ class AcceleratedWorkspace(IterateMemory):
         return (t - 1) / self._momentum
 
     def _momenta(self, x: wp.array[Any]) -> MomentumFields:
-        """Return what both kernels take."""
+        """Return the fields that both kernels read."""
         return MomentumFields(
             x, self._x_old, self.residual.y, self._z, self._y_z, self._d, self.problem.unknown
         )

@@ -1,4 +1,4 @@
-"""A method for matrices at work on the assembled matrix of a grid."""
+"""Run a method for sparse matrices on the assembled matrix of a grid."""
 
 from __future__ import annotations
 
@@ -21,11 +21,12 @@ from warp_lcp.settings import Settings
 class AssembledMatrix(Settings):
     """Another method, on the assembled float64 matrix of a grid.
 
-    For domains on which aggregates of whole blocks fail: channels and walls a cell wide, spirals
-    and mazes share blocks that are not joined inside; so do cells whose coefficients are random
-    over many decades. Cycles of a geometric hierarchy are slow there, without bounds too, while
-    algebraic aggregates follow the coefficients (Vanek, Mandel and Brezina). The unknowns are the
-    fluid cells, in their order. Steps are those of `inner`, with its cold start.
+    For domains on which geometric aggregates of whole blocks fail. In channels and walls one cell
+    wide, spirals and mazes, a block contains cells that are not connected within it. Coefficients
+    that are random over many decades are another case. There the cycles of a geometric hierarchy
+    converge slowly, even without bounds, while algebraic aggregates follow the coefficients (Vanek,
+    Mandel and Brezina). The unknowns are the fluid cells, in their order. Steps are those of
+    `inner`, with its cold start.
 
     Args:
         inner: a method that takes sparse matrices.
@@ -57,7 +58,7 @@ class AssembledMatrix(Settings):
 
 
 class AssembledWorkspace(IterateMemory):
-    """Memory of the method for one problem; the matrix is assembled when a solve begins."""
+    """Workspace for one problem; each solve assembles the matrix at its start."""
 
     def __init__(self, problem: LCP, method: Solver) -> None:
         if not has(problem.A, HasStencil) or problem.A.stencil.ghosts is not None:
@@ -66,7 +67,7 @@ class AssembledWorkspace(IterateMemory):
         self._method, self._A = method, problem.A
 
     def start(self, *, warm: bool, tolerance: float) -> None:
-        """Assemble the problem as it is now, and begin at x."""
+        """Assemble the problem in its current state, and begin at x."""
         p = self.problem
         self._rows = np.flatnonzero(p.unknown.numpy() == 1)
         b, lower, upper, x = (

@@ -1,4 +1,7 @@
-"""Blocked Gauss-Seidel: blocks of unknowns in turn, each solved exactly or by any method."""
+"""Blocked Gauss-Seidel: solve blocks of unknowns in turn.
+
+A block is solved exactly by a kernel, or by any method.
+"""
 
 from __future__ import annotations
 
@@ -30,9 +33,9 @@ from warp_lcp.sweeps.block_kernels import BlockLists, block_sweep_kernel
 from warp_lcp.sweeps.sweep import bound_operands, check_colors
 from warp_lcp.sweeps.sweep_kernels import KERNELS
 
-CONSECUTIVE = 3  # unknowns of a block unless given: a contact in space
-MOST = 6  # unknowns of a block that a thread solves by active sets
-CHANGES = 60  # of a line's set; few are needed, and what is left is projected
+CONSECUTIVE = 3  # default number of unknowns of a block: a contact in space
+MOST = 6  # largest number of unknowns of a block that a thread solves by active sets
+CHANGES = 60  # limit of changes of a line's active set; the rest is projected, few are needed
 
 f64 = wp.float64
 SOLVE_LINE = KERNELS["grid_lines.solve"]
@@ -41,7 +44,7 @@ SOLVE_LINE = KERNELS["grid_lines.solve"]
 class GridLines(Enum):
     """Blocks of cells along one axis of a grid, for `BlockedGaussSeidel`.
 
-    The axis of the strongest coefficients is the one that pays.
+    Lines along the axis of the largest coefficients converge fastest.
     """
 
     X = 0
@@ -53,21 +56,22 @@ class GridLines(Enum):
 class BlockedGaussSeidel(Settings):
     """Blocked Gauss-Seidel: solve blocks of unknowns in turn ([Book] 2.2.3).
 
-    With blocks of one unknown it is projected Gauss-Seidel, with one block its solver. Strong
-    coupling within a block, as of a contact's normal and tangential forces, then costs no sweeps.
-    Converges for symmetric positive definite A. Blocks of at most 6 unknowns are solved exactly by
-    a kernel: active sets changed until none is wrong, all sets if that does not end; bounds affine
-    in x, also in unknowns of the block, are part of that system. On CUDA blocks that are not
-    coupled are solved at once. Larger blocks, and all if `sub_solver` is given, are problems of
-    their own, solved one by one from the host.
+    With blocks of one unknown it is projected Gauss-Seidel, with one block it is the solver of that
+    block. Strong coupling within a block, such as between a contact's normal and tangential forces,
+    does not slow the sweeps down. The method converges for symmetric positive definite A. A kernel
+    solves blocks of at most 6 unknowns exactly: it changes the active set until no condition is
+    violated, and tries all sets if that does not end. Bounds that are affine in x, also in unknowns
+    of the block, are part of that system. On CUDA, blocks that are not coupled are solved in
+    parallel. Larger blocks, and all blocks if `sub_solver` is given, are solved one after the other
+    from the host, each as a problem of its own.
 
-    On grids blocks are lines of cells, in two colors: lines along an axis whose coefficients are
-    many times the others' make sweeps as good as if all were equal. Or give blocks as lists and a
-    `sub_solver`; each block then costs passes over the whole grid, so that a few large blocks only
-    make sense.
+    On grids the default blocks are lines of cells, in two colors. Lines along an axis whose
+    coefficients are many times the others' make sweeps converge as if all coefficients were equal.
+    Blocks may also be lists with a `sub_solver`; each block then costs passes over the whole grid,
+    so that only a few large blocks are practical.
 
     Args:
-        blocks: unknowns of a block, consecutive ones; or `GridLines`; or for each block flat
+        blocks: number of consecutive unknowns of a block; or `GridLines`; or for each block flat
             indices into a field of the problem's shape, together all unknowns, each once. If None,
             3 unknowns, on grids lines along x.
         sub_solver: a method for the blocks; None: the kernel for blocks of at most 6 unknowns,
@@ -103,25 +107,26 @@ class BlockedGaussSeidel(Settings):
                 method does not take its blocks.
         """
         check_taken(self, problem.A)
-        A, given, kind = problem.A, self.blocks, type(problem.A).__name__
+        A, blocks_setting, kind = problem.A, self.blocks, type(problem.A).__name__
         rows = A.rows() if has(A, HasRows) else None
-        if given is None:
-            given = GridLines.X if has(A, HasStencil) else CONSECUTIVE
-        if isinstance(given, GridLines):
+        if blocks_setting is None:
+            blocks_setting = GridLines.X if has(A, HasStencil) else CONSECUTIVE
+        if isinstance(blocks_setting, GridLines):
             if not has(A, HasStencil) or self.sub_solver is not None:
                 raise ValueError(
-                    f"blocks = {given}: only for GridPoisson without a sub_solver; A is a {kind}"
+                    f"blocks = {blocks_setting}: only for GridPoisson without a sub_solver; A is a "
+                    f"{kind}"
                 )
-            return LineWorkspace(problem, given, self)
-        if rows is None and (isinstance(given, int) or self.sub_solver is None):
+            return LineWorkspace(problem, blocks_setting, self)
+        if rows is None and (isinstance(blocks_setting, int) or self.sub_solver is None):
             raise ValueError(
                 f"{kind} gives no access to rows: give BlockedGaussSeidel GridLines, or lists as "
                 "blocks and a sub_solver"
             )
         blocks = (
-            blocks_of_size(problem, given)
-            if isinstance(given, int)
-            else given_blocks(problem, given)
+            blocks_of_size(problem, blocks_setting)
+            if isinstance(blocks_setting, int)
+            else given_blocks(problem, blocks_setting)
         )
         if rows is not None and self.sub_solver is None and max(map(len, blocks)) <= MOST:
             return BlockWorkspace(problem, rows, blocks, self)
@@ -153,7 +158,7 @@ class BlockedGaussSeidel(Settings):
 
 
 class BlockWorkspace(SweepWorkspace):
-    """Memory of sweeps over small blocks."""
+    """Workspace of sweeps over small blocks."""
 
     def __init__(
         self,
@@ -175,7 +180,11 @@ class BlockWorkspace(SweepWorkspace):
             and problem.bounds.affine is None
         )
         if self._parallel:
-            colors = color_blocks(problem.A.matrix(), owner, len(blocks))  # type: ignore[attr-defined]
+            colors = color_blocks(
+                problem.A.matrix(),  # type: ignore[attr-defined]
+                owner,
+                len(blocks),
+            )
         self._starts = [0, *np.cumsum([len(color) for color in colors]).tolist()]
         arrays = [
             np.concatenate([[0], np.cumsum(sizes)]),
@@ -185,7 +194,7 @@ class BlockWorkspace(SweepWorkspace):
             np.concatenate(colors),
         ]
         names = ("first", "rows", "owner", "place", "order")
-        given = put(
+        block_lists = put(
             BlockLists(),
             {
                 name: wp.array(v, dtype=wp.int32, device=device)
@@ -197,12 +206,12 @@ class BlockWorkspace(SweepWorkspace):
             problem.b,
             *bound_operands(problem),
             wp.float64(settings.omega),
-            given,
+            block_lists,
         ]
         self._kernel = block_sweep_kernel(rows.values.dtype, max(sizes))
 
     def run(self, x: wp.array[Any], *, forward: bool) -> None:
-        """Solve each block once: by one thread, or color by color."""
+        """Solve each block once: by one thread, or color by color in parallel."""
         colors = range(len(self._starts) - 1)
         for c in colors if forward else reversed(colors):
             count = self._starts[c + 1] - self._starts[c]
@@ -217,17 +226,17 @@ class BlockWorkspace(SweepWorkspace):
 
 @dataclass(frozen=True, slots=True)
 class LineMemory:
-    """Memory and sizes of solves of lines of cells.
+    """Fields and sizes for the solves of lines of cells.
 
     Attributes:
-        c: multiples of the elimination, a stored field.
+        c: multiples of the elimination (Thomas algorithm), a stored field.
         q: its right-hand side.
         z: solution of a line's system.
         s: states of the unknowns, uint8.
-        s1: elements from plane to plane.
-        s2: elements from row to row.
-        cells: of a line.
-        most: changes of a line's active set.
+        s1: stride from plane to plane, in elements.
+        s2: stride from row to row, in elements.
+        cells: number of cells of a line.
+        most: limit of changes of a line's active set.
         omega: relaxation factor.
     """
 
@@ -243,10 +252,11 @@ class LineMemory:
 
 
 class LineWorkspace(SweepWorkspace):
-    """Memory of sweeps over a grid's lines, those of one color of a checkerboard after those of the other.
+    """Workspace of sweeps over the lines of a grid, in checkerboard colors.
 
-    A line is a tridiagonal M-matrix with bounds; its active set is changed until none is wrong,
-    each change a tridiagonal solve.
+    The lines of one color are solved before those of the other. A line is a tridiagonal M-matrix
+    with bounds. Its active set is changed until no condition is violated; each change is a
+    tridiagonal solve.
 
     Args:
         problem: on a grid.

@@ -1,4 +1,4 @@
-"""Direct enumeration of the active sets of tiny problems, one at a time or in batches."""
+"""Direct enumeration of the active sets of tiny problems, singly or in batches."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from warp_lcp.reduced.dense_problem import DenseProblem, DenseWorkspace, check_s
 from warp_lcp.reduced.enumeration_kernels import enumeration_kernels
 from warp_lcp.rows.fields import Array, checked_device, real_array
 
-MOST = 4  # unknowns: 3^4 = 81 sets
-# measure of a solution: natural residual over the terms of y, of cond(A) < 1e5
+MOST = 4  # largest number of unknowns: 3^4 = 81 sets
+# Largest measure of a solution: natural residual over the terms of y, for cond(A) < 1e5.
 ACCEPTED = {wp.float64: 1e-10, wp.float32: 3e-5}
-# measure of all sets above which there surely is no solution: rounding in systems of cond(A) = 1e12
-# makes less
+# If the measure of all sets is larger, there is surely no solution: rounding in systems of cond(A)
+# = 1e12 causes less.
 CLEAR = 1e-3
-SAME = 1e-9  # relative difference below which two solutions are one
+SAME = 1e-9  # relative difference below which two solutions count as one
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,10 +32,10 @@ class DirectEnumeration:
     [Book] 2.1.1, eqs. 2.10-2.12, algorithm 1.
 
     Each unknown is at l, at u or free with y = 0, which makes 2^n complementarity cones for the LCP
-    and 3^n for a box; the set that solves the problem most exactly wins. A may be anything:
-    unsymmetric, indefinite, singular. A free block that is singular contributes its basic solution.
-    Where no set solves the problem, by far or as multipliers prove, there is no solution:
-    INFEASIBLE. x0 is not used; `linear_iterations` counts sets.
+    and 3^n for a box. The result is the set with the smallest residual. A may be unsymmetric,
+    indefinite or singular. For a singular free block the basic solution is taken. The status is
+    INFEASIBLE where no set comes near a solution, or where multipliers prove that there is none. x0
+    is not used; `linear_iterations` counts sets.
 
     For many problems at once see `enumerate_batch`.
     """
@@ -81,21 +81,23 @@ class DirectEnumeration:
 
         Example:
             >>> import numpy as np, warp_lcp as wl
-            >>> A = wl.DenseOperator(np.array([[1.0, 2.0], [2.0, 1.0]]), device="cpu")  # the book's figure 2.1: not a P-matrix
-            >>> print(np.round(DirectEnumeration().solutions(wl.LCP(A, np.array([-1.0, -1.0]))), 3))
+            >>> # The book's figure 2.1: not a P-matrix.
+            >>> A = wl.DenseOperator(np.array([[1.0, 2.0], [2.0, 1.0]]), device="cpu")
+            >>> problem = wl.LCP(A, np.array([-1.0, -1.0]))
+            >>> print(np.round(DirectEnumeration().solutions(problem), 3))
             [[1.    0.   ]
              [0.    1.   ]
              [0.333 0.333]]
         """
         n = check_size(problem, "DirectEnumeration", self.most_unknowns)
         candidates, measures = _candidates(DenseProblem.read(problem))
-        found: list[np.ndarray] = []
+        solutions: list[np.ndarray] = []
         for x in candidates[measures <= ACCEPTED[wp.float64]]:
             if not any(
-                np.abs(x - other).max() <= SAME * max(1.0, np.abs(x).max()) for other in found
+                np.abs(x - other).max() <= SAME * max(1.0, np.abs(x).max()) for other in solutions
             ):
-                found.append(x)
-        return np.array(found).reshape(-1, n)
+                solutions.append(x)
+        return np.array(solutions).reshape(-1, n)
 
 
 @dataclass(frozen=True)
@@ -126,9 +128,9 @@ def enumerate_batch(
 
     [Book] 2.1.1.
 
-    Rows may be in units of their own: each problem is equilibrated symmetrically first, exactly, by
-    powers of 2. Device arrays of one type are used without a copy, and nothing is allocated if
-    `out` is given besides.
+    The rows may have different units: each problem is first equilibrated symmetrically by powers of
+    2, which is exact. Device arrays of one type are used without a copy, and if `out` is given as
+    well, nothing is allocated.
 
     Args:
         A: matrices, shape (m, n, n), n <= 4; numpy or wp.array, float64 unless a wp.array of
@@ -147,7 +149,9 @@ def enumerate_batch(
             device arrays are not read back).
 
     Example:
-        >>> result = enumerate_batch(np.array([[[2.0, 1.0], [1.0, 2.0]]] * 2), np.array([[-3.0, -3.0], [-2.0, 5.0]]), device="cpu")
+        >>> A = np.array([[[2.0, 1.0], [1.0, 2.0]]] * 2)
+        >>> b = np.array([[-3.0, -3.0], [-2.0, 5.0]])
+        >>> result = enumerate_batch(A, b, device="cpu")
         >>> print(result.x.numpy(), result.sets.numpy())
         [[1. 1.]
          [1. 0.]] [4 1]
@@ -207,9 +211,10 @@ def enumerate_batch(
 
 
 def _candidates(data: DenseProblem) -> tuple[np.ndarray, np.ndarray]:
-    """Return the x of every set, shape (3^n, n), and its measure: 2 where the set has none, at most 1 elsewhere.
+    """Return the x of each active set and its measure.
 
-    The sets are tried in units in which A is equilibrated: what counts as a zero pivot does not
+    x has shape (3^n, n). The measure has shape (3^n,): at most 1, or 2 where the set has no x. The
+    sets are tried in units in which A is equilibrated, so that the test for a zero pivot does not
     depend on the units of the rows.
     """
     n, (scaled, units) = len(data.b), data.scaled()
@@ -222,7 +227,7 @@ def _candidates(data: DenseProblem) -> tuple[np.ndarray, np.ndarray]:
         wp.empty(3**n, dtype=wp.float64, device="cpu"),
     )
     wp.launch(enumeration_kernels(n, wp.float64).each, 3**n, [*inputs, x, measures], device="cpu")
-    with np.errstate(over="ignore"):  # of sets that hold an unknown at a bound beyond all numbers
+    with np.errstate(over="ignore"):  # in sets with an unknown at a huge bound
         return x.numpy() * units, measures.numpy()
 
 
@@ -243,7 +248,7 @@ def _on_device(
 
 
 def _bounds(value: Any, m: int, n: int, dtype: Any, device: wp.Device, name: str) -> wp.array[Any]:
-    """Return a bound as an array of one row for all problems, or of a row each."""
+    """Return a bound as an array with one row for all problems, or a row for each."""
     if isinstance(value, wp.array):
         if (
             tuple(value.shape) not in ((n,), (1, n), (m, n))

@@ -1,4 +1,4 @@
-"""Fallback: methods in order, each with the condition under which it takes over from the one before."""
+"""Fallback: methods in order, each with a condition under which it takes over."""
 
 from __future__ import annotations
 
@@ -33,26 +33,26 @@ FIRST = 20  # steps before which `crawls` is False: residuals of conjugate gradi
 MOST = 30  # steps that a solve may still need at that pace: assembly and set-up cost about as much
 STALLED = 10  # steps without a smaller residual after which a method stalls
 PROGRESS = 0.999  # a residual above this part of the smallest so far is no progress
-WEAK = 30  # iterations of a linear solve that tell of a weak preconditioner
+WEAK = 30  # iterations of a linear solve that show a weak preconditioner
 GRACE = StoppingCriteria.patience  # steps after a hand-over in which the residual need not fall
 BATCH = 0.1  # factor by which a batch of steps reduces the residual
-# attributes of a workspace that stay, and that the outer loop asks for
+# Attributes of a workspace that do not change, and that the outer loop reads.
 LASTING = ("begin_ahead", "scratch", "solution")
-# failures that no other method mends
+# Failures that no other method can repair.
 PROVED = (SolveStatus.INFEASIBLE, SolveStatus.NEGATIVE_CURVATURE)
 
 
 class Progress:
-    """Residuals and steps of the method at work, as a condition sees them.
+    """Residuals and steps of the current method, as its conditions see them.
 
     Attributes:
         problem: the problem.
-        tolerance: residual norm that is asked for.
+        tolerance: required residual norm.
         least: smallest residual norm so far, at the start of each step.
         norms: residual norms there.
         step: the last step; None before the first.
-        waited: steps in succession, none of them interim, that have left the smallest residual
-            where it was.
+        waited: number of consecutive steps, none of them interim, that have not reduced the
+            smallest residual.
     """
 
     def __init__(self, problem: Any, tolerance: float) -> None:
@@ -60,14 +60,14 @@ class Progress:
         self.begin()
 
     def begin(self) -> None:
-        """Forget the method before."""
+        """Reset for a new method."""
         self.least: list[float] = []
         self.norms: list[float] = []
         self.step: Step | None = None
         self.waited, self._smallest = 0, math.inf
 
     def record(self, norm: float) -> None:
-        """Take note of the residual at the start of a step."""
+        """Record the residual norm at the start of a step."""
         least, interim = self.least, self.step is not None and self.step.interim
         self.norms.append(norm)
         least.append(norm if not least or norm < least[-1] else least[-1])
@@ -99,8 +99,8 @@ def stalls(progress: Progress) -> bool:
 def crawls(progress: Progress) -> bool:
     """Return whether the tolerance is more than 30 steps away at the present pace.
 
-    By the last 10 steps, and not before 20. A tolerance below float64's rounding of the first
-    residual counts as that.
+    The pace is that of the last 10 steps; it is not judged before 20 steps. The tolerance counts as
+    at least float64's rounding of the first residual.
     """
     if len(progress.least) <= FIRST:
         return False
@@ -120,7 +120,10 @@ def slow_linear_solves(progress: Progress) -> bool:
 
 @runtime_checkable
 class StartsAfter(Protocol):
-    """A method that reuses what the method before has made for the same problem, such as a hierarchy."""
+    """A method that can reuse the workspace of the method before it.
+
+    For example its multigrid hierarchy.
+    """
 
     def init_after(self, problem: Any, before: Any) -> Any:
         """Return a workspace, as `init` does.
@@ -133,11 +136,11 @@ class StartsAfter(Protocol):
 
 @dataclass(frozen=True)
 class FallbackEntry:
-    """A method of a chain.
+    """A method of a chain, with the condition under which it takes over.
 
     Args:
         method: with its settings.
-        when: condition under which it takes over; not asked of the first one.
+        when: condition under which it takes over; not used for the first one.
         restart: begin at clip(0, l, u) instead of where the method before has ended.
         batch: steps of the method, at most, that count as one step of the chain, which ends earlier
             where the residual has fallen to a tenth. For methods whose steps are cheap.
@@ -152,13 +155,14 @@ class FallbackEntry:
 class Fallback:
     """Chain of methods, each of which takes over as soon as its condition holds.
 
-    Before each step the condition of the next method that takes the problem is asked; others, and
-    one equal to the method at work, are skipped. If it holds, the next method gets the iterate (the
-    best one if the last step has failed; the one that a restarted method was given, after that
-    method), the tolerance, floating components, and what its `init_after` takes from the workspace
-    before. Nothing is handed over where the residual is what rounding leaves (FLOOR), but by a
-    restarted method, or where the last step has proved that there is no solution. The residual of
-    the first workspace judges all iterates. Each `Record` names the method that made it.
+    Before each step the condition of the next method that takes the problem is evaluated. Methods
+    that do not take the problem, and one equal to the current method, are skipped. If the condition
+    holds, the next method gets the iterate: the best one if the last step has failed; after a
+    restarted method, the one that the restarted method was given. It also gets the tolerance, the
+    floating components, and what its `init_after` reuses of the workspace before. There is no
+    hand-over where the residual is at its rounding floor (FLOOR), except by a restarted method, or
+    where the last step has proved that there is no solution. The residual of the first workspace
+    judges all iterates. Each `Record` names its method.
 
     Args:
         entries: a method, then pairs (method, condition) or `FallbackEntry` objects. Conditions:
@@ -170,7 +174,8 @@ class Fallback:
     Example:
         >>> import numpy as np, warp_lcp as wl
         >>> chain = wl.Fallback(wl.ProjectedSOR(), (wl.Lemke(), wl.stalls))
-        >>> problem = wl.LCP(np.array([[0.0, 1.0], [-1.0, 0.0]]) + 0.01 * np.eye(2), np.array([-1.0, 1.0]))
+        >>> A = np.array([[0.0, 1.0], [-1.0, 0.0]]) + 0.01 * np.eye(2)
+        >>> problem = wl.LCP(A, np.array([-1.0, 1.0]))
         >>> print(wl.solve(problem, chain).method)
         lemke
     """
@@ -194,7 +199,8 @@ class Fallback:
         return hash(self.entries)
 
     def __repr__(self) -> str:
-        return f"Fallback({', '.join(_described(entry, first=k == 0) for k, entry in enumerate(self.entries))})"
+        entries = (_described(entry, first=k == 0) for k, entry in enumerate(self.entries))
+        return f"Fallback({', '.join(entries)})"
 
     def __str__(self) -> str:
         """Return the methods in order, each with its condition."""
@@ -210,7 +216,7 @@ class Fallback:
         return Fallback, self.entries
 
     def __getattr__(self, name: str) -> Any:
-        """Return an attribute of the first method: `supports`, `distributed`, `precision`, ..."""
+        """Return an attribute of the first method: `supports`, `precision`, ..."""
         if name.startswith("__") or name == "entries":
             raise AttributeError(name)
         return getattr(self.entries[0].method, name)
@@ -226,7 +232,7 @@ class Fallback:
         return tuple(method_name(entry.method) for entry in self.entries)
 
     def init(self, problem: Any) -> FallbackWorkspace:
-        """Return a workspace; later methods make theirs when they take over.
+        """Return a workspace; later methods create theirs when they take over.
 
         Raises:
             ValueError: the first method does not take the problem.
@@ -244,7 +250,7 @@ class Fallback:
         )
 
     def step(self, problem: Any, work: FallbackWorkspace, x: wp.array[Any]) -> Step:
-        """Take a step of the method at work, after a hand-over where one is due."""
+        """Take a step of the current method, after a hand-over if one is due."""
         return work.step()
 
 
@@ -266,11 +272,11 @@ class SpareChain:
 
 
 class FallbackWorkspace:
-    """Memory of a chain for one problem.
+    """Workspace of a chain for one problem.
 
-    Attributes that are not its own are those of the first method's workspace. As long as that
-    method is at work, a step costs little more than its own: residuals are noted, and conditions
-    asked.
+    Attributes that are not its own are those of the first method's workspace. While that method is
+    the current one, a step costs little more than its own: residuals are recorded, and conditions
+    evaluated.
 
     Attributes:
         x: the iterate, a stored field.
@@ -292,19 +298,19 @@ class FallbackWorkspace:
             if isinstance(first.precision, Precision)
             else Precision(first.precision)
         )
-        # whether its device may take steps without the host
+        # Whether the first method's device may take steps without the host.
         self._may_be_ahead = hasattr(first, "is_ahead")
-        # by place in the chain; None: the method does not take the problem
+        # Workspaces by position in the chain; None: the method does not take the problem.
         self._works: dict[int, Any] = {0: first}
-        # by place: whether a method takes such a problem, before it has a workspace
+        # By position: whether a method takes such a problem, before it has a workspace.
         self._suited: dict[int, bool] = {}
         self._best: wp.array[Any] | None = None
         self._place = 0
-        # the iterate that the restarted method at work was given
+        # The iterate that the current method was given, if it is a restarted one.
         self._begun: wp.array[Any] | None = None
-        # whether only the rounding floor keeps the method at work from handing over
+        # Whether only the rounding floor prevents a hand-over.
         self._floored = False
-        # whether the best iterate is kept here and no longer by the first workspace
+        # Whether the best iterate is stored here and no longer by the first workspace.
         self._left_first = False
         self._at_best, self._best_norm = False, math.inf
 
@@ -320,7 +326,10 @@ class FallbackWorkspace:
     def start(
         self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
     ) -> bool | None:
-        """Begin with the first method, at an iterate that `keep` has been told of; the operator may have changed."""
+        """Begin with the first method, at an iterate that `keep` has stored.
+
+        The operator may have changed.
+        """
         self._place, self._since, self._floating = 0, 0, floating
         if self._left_first:
             self._left_first = False
@@ -330,7 +339,7 @@ class FallbackWorkspace:
         return self._first.start(warm=warm, tolerance=tolerance, **given)
 
     def keep(self) -> None:
-        """Remember x as the best iterate."""
+        """Store x as the best iterate."""
         self._at_best, self._best_norm = True, self.residual.norm
         if not self._left_first:
             self._first.keep()
@@ -341,7 +350,7 @@ class FallbackWorkspace:
             work.keep()
 
     def restore(self) -> None:
-        """Make x the best iterate again."""
+        """Set x to the best iterate."""
         if not self._left_first:
             self._first.restore()
         elif self._best is not None:
@@ -349,10 +358,14 @@ class FallbackWorkspace:
         self._at_best = True
 
     def step(self) -> Step:
-        """Hand over if that is due, then take a step."""
+        """Hand over if a condition holds, then take a step.
+
+        A failure with which a condition holds is replaced by an interim step: the next step then
+        hands over.
+        """
         progress, first, at_first = self._progress, self._first, self._place == 0
         progress.record(self.residual.norm)
-        # nothing is handed over: the device has taken the step
+        # No hand-over while the device has already taken the step.
         ahead = at_first and self._may_be_ahead and first.is_ahead
         if not ahead and (place := self._due()) is not None:
             self._hand_over(place)
@@ -377,21 +390,21 @@ class FallbackWorkspace:
         return done
 
     def _due(self) -> int | None:
-        """Return the place of the method that takes over now, None if none does."""
+        """Return the position of the method that takes over now, None if none does."""
         self._floored = False
         for entry in self._entries[self._place + 1 :]:
             if entry.when(self._progress):
                 break
         else:
-            return None  # conditions cost less than what follows
+            return None  # conditions cost less than the tests below
         for place in range(self._place + 1, len(self._entries)):
             entry = self._entries[place]
             if entry.method == self._entries[self._place].method or not self._may_take(place):
                 continue
             if not entry.when(self._progress):
                 return None
-            # a path joined far from the start reaches large x, where rounding leaves much: the
-            # method before it was not at its floor
+            # A path that is joined far from the start reaches large x, where rounding errors are
+            # large: the method before it was not at its rounding floor.
             if not self._entries[self._place].restart and self._at_floor():
                 self._floored = True
                 return None
@@ -400,7 +413,7 @@ class FallbackWorkspace:
         return None
 
     def _may_take(self, place: int) -> bool:
-        """Return whether a method takes the problem, as far as that is known without its workspace."""
+        """Return whether a method takes the problem, without creating its workspace."""
         if place in self._works:
             return self._workspace(place) is not None
         if place not in self._suited:
@@ -410,7 +423,10 @@ class FallbackWorkspace:
         return self._suited[place]
 
     def _at_floor(self) -> bool:
-        """Return whether the residual, here or of the best iterate, is what rounding leaves."""
+        """Return whether the residual, here or of the best iterate, is at its floor.
+
+        The rounding floor is the residual that rounding errors leave.
+        """
         floor = FLOOR_MARGIN * self.residual.rounding_floor(self.x, self.precision.epsilon)
         return min(self.residual.norm, self._best_norm) <= floor
 
@@ -426,6 +442,10 @@ class FallbackWorkspace:
         )
 
     def _made(self, method: Solver) -> Any:
+        """Return a workspace of a method, None if it does not take the problem.
+
+        An equal method of the chain shares its workspace.
+        """
         same = next(
             (
                 k
@@ -447,7 +467,10 @@ class FallbackWorkspace:
             return None
 
     def _hand_over(self, place: int) -> None:
-        """Start the method at a place of the chain, from the iterate or from clip(0, l, u)."""
+        """Start the method at a position of the chain.
+
+        It begins at the iterate or at clip(0, l, u).
+        """
         entry, before, work = (
             self._entries[place],
             self._entries[self._place],
@@ -467,7 +490,10 @@ class FallbackWorkspace:
         self._begin(work, restart=entry.restart)
 
     def _leave_first(self) -> None:
-        """Store the best iterate here: what others do to x the first workspace cannot undo."""
+        """Store the best iterate here.
+
+        The first workspace cannot restore it once other methods change x.
+        """
         first = self._first
         if self._at_best:
             self._store_best()
@@ -514,7 +540,7 @@ class FallbackWorkspace:
         return done
 
     def _take(self, work: Any) -> None:
-        """Write the iterate of the method at work to x."""
+        """Copy the iterate of the current method to x."""
         wp.copy(self.x, work.x)
         self._first.round_iterate()
         self.residual.current = False
@@ -527,7 +553,10 @@ class FallbackWorkspace:
         return done
 
     def _batch(self, entry: FallbackEntry, work: Any) -> Step:
-        """Take steps until the residual has fallen to a tenth; STAGNATED where it does not fall for some."""
+        """Take steps until the residual has fallen to a tenth.
+
+        The step fails with STAGNATED if the residual does not fall for GRACE steps.
+        """
         residual, linear, idle, sank = work.residual, 0, 0, False
         least, target = residual.norm, max(self._progress.tolerance, BATCH * residual.norm)
         done = Step("none", 0)
@@ -545,7 +574,7 @@ class FallbackWorkspace:
 
 
 def _entry(given: Any, *, first: bool) -> FallbackEntry:
-    """Return what was given as an entry."""
+    """Return an argument of `Fallback` as an entry."""
     if isinstance(given, FallbackEntry):
         entry = given
     elif isinstance(given, tuple) and len(given) == 2:
@@ -571,7 +600,7 @@ def _entry(given: Any, *, first: bool) -> FallbackEntry:
 
 
 def _described(entry: FallbackEntry, *, first: bool) -> str:
-    """Return an entry in words."""
+    """Describe an entry in words."""
     return (
         method_name(entry.method)
         if first
@@ -580,7 +609,7 @@ def _described(entry: FallbackEntry, *, first: bool) -> str:
 
 
 def _named(method: Any) -> str:
-    """Return a method's name, and the form of A that it works on, if that is another one."""
+    """Return a method's name, with the form of A that it works on if that differs."""
     return method_name(method) + getattr(method, "form", "")
 
 

@@ -1,4 +1,7 @@
-"""Newton's method on the Fischer-Burmeister map: shifted principal systems matrix-free, factors of the Jacobian where A is dense."""
+"""Newton's method on the Fischer-Burmeister map.
+
+Shifted principal systems are solved matrix-free; dense Jacobians are factored on the host.
+"""
 
 from __future__ import annotations
 
@@ -37,15 +40,14 @@ from warp_lcp.settings import Count, CountOrZero, ShareOrAll, renamed
 from warp_lcp.solvers.gradient_descent import DescentWorkspace, GradientDescent
 
 SHARE = 0.95  # lambda of the penalized map for dense problems: measured on frictional contacts
-FIRST_STEPS = 30  # of the regularized stage: those that succeed need 5 to 27
-# nu is this times min(1, ||f||), A's entries being near 1: J'J + nu I has a factorization whatever
-# J is
+FIRST_STEPS = 30  # limit of the regularized stage: the solves that succeed need 5 to 27 steps
+# nu is this times min(1, ||f||), A's entries being near 1: J'J + nu I can be factored for every J.
 REGULARIZATION = 1e-6
-# start of x (None: as the solve began), first mu, its factor, steps
+# Start of x (None: as the solve began), first mu, its factor, and number of steps.
 HOMOTOPIES = ((None, 1.0, 0.3, 40), (10.0, 1.0, 0.5, 60))
-# projected gradient, in parts of ||f||, up to which a point where a search has failed is
-# stationary: the shortest steps, 1e-8, leave up to that of a local minimum's gradient; where
-# searches fail on contacts for other reasons it is 1 to 4
+# A point where a search has failed is stationary if its projected gradient is at most this part of
+# ||f||. The shortest steps, 1e-8, leave up to that at a local minimum; where searches fail on
+# contacts for other reasons the gradient is 1 to 4.
 STATIONARY = 1e-4
 DESCENT = 1e-10  # a direction whose slope is less than this times ||dx||^2.1 is no descent
 
@@ -66,10 +68,11 @@ class FischerNewton(NewtonSettings):
 
     Dense problems (frictional contact, semi-definite A) are solved with factors of J on the host,
     in units in which A is equilibrated symmetrically and b is near 1, and the result is within the
-    bounds. `safeguard` makes them a chain: at most 30 steps (J'J + nu I)^-1 J'f with nu = 1e-6
-    min(1, ||f||) on the penalized map, searched nonmonotonically, the gradient where that is no
-    descent; then two homotopies on the smoothed map x + y - sqrt(x^2 + y^2 + 2 mu), mu -> 0. There
-    is no pivoting method inside.
+    bounds. With `safeguard` such a solve is a sequence of methods. First come at most 30 steps (J'J
+    + nu I)^-1 J'f with nu = 1e-6 min(1, ||f||) on the penalized map, with a nonmonotone line
+    search, or steps along the gradient where that direction is no descent direction. Then two
+    homotopies follow, on the smoothed map x + y - sqrt(x^2 + y^2 + 2 mu), mu -> 0. No pivoting
+    method is part of the sequence.
 
     `linear_iterations` counts preconditioned iterations on the finest grid, factorizations where A
     is dense.
@@ -92,7 +95,7 @@ class FischerNewton(NewtonSettings):
         monotone_cycles: projected multigrid cycles of a cold start on a grid.
         eta: each linear solve reduces its residual by this factor.
         max_linear_iterations: maximum number of iterations of one linear solve.
-        memory: merits that a safeguarded search remembers.
+        memory: number of merits that a safeguarded search stores.
         cycle: settings of multigrid cycles.
 
     Example:
@@ -125,6 +128,8 @@ class FischerNewton(NewtonSettings):
     def descent(self, problem: LCP) -> GradientDescent:
         """Return the gradient descent on this method's map for a problem.
 
+        As a warm start, only this gradient descent is consistent with the method.
+
         No other gradient descent is consistent with the method as a warm start.
         """
         weight = (
@@ -144,6 +149,8 @@ class FischerNewton(NewtonSettings):
         """Return a workspace, on the host for dense matrices.
 
         With kink="approximation" it is on the device for all matrices.
+
+        With kink="approximation" it is on the device for all matrices.
         """
         if isinstance(problem.A, DenseOperator) and Kink(self.kink) is not Kink.APPROXIMATION:
             return FischerDenseWorkspace(problem, self)
@@ -151,6 +158,8 @@ class FischerNewton(NewtonSettings):
 
     def step(self, problem: LCP, work: Any, x: wp.array[Any]) -> Step:
         """Take a monotone cycle, a gradient step or a Newton step.
+
+        Cycles and gradient steps come first, after a cold start.
 
         Cycles and gradient steps come first, while the start is cold.
         """
@@ -164,7 +173,7 @@ class FischerNewton(NewtonSettings):
 
 
 class FischerWorkspace(IterateMemory):
-    """Memory of the method for one problem, on the device."""
+    """Workspace of the method for one problem, on the device."""
 
     def __init__(self, problem: LCP, settings: FischerNewton) -> None:
         self.settings, self.kink, layout = settings, Kink(settings.kink), problem.layout
@@ -207,7 +216,7 @@ class FischerWorkspace(IterateMemory):
     def start(
         self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
     ) -> None:
-        """Forget the last solve; the operator may have changed."""
+        """Reset the state of the last solve; the operator may have changed."""
         self.floating = floating
         s = self.settings
         self.cycles_left = (
@@ -222,29 +231,38 @@ class FischerWorkspace(IterateMemory):
         self.system.refresh()
         if self.cold_start is not None:
             self.cold_start.start(warm=warm, tolerance=tolerance, floating=floating)
-        # what is singular: components none of whose unknowns is bounded
+        # The singular part: components none of whose unknowns has a bound.
         if self.floating is not None:
             p = self.problem
             free = (p.unknown.numpy() == 1) & np.isinf(p.lower.numpy()) & np.isinf(p.upper.numpy())
             self._without_bounds = wp.array(free.astype(np.uint8), device=p.device)
 
     def monotone_step(self) -> Step:
-        """Projected multigrid cycle on all unknowns."""
+        """Take a projected multigrid cycle on all unknowns."""
         assert self.cold_start is not None
         return self.cold_start.monotone_step()
 
     @property
     def _fused(self) -> bool:
-        """Whether a step is one pass over memory, where the problem allows that."""
+        """Whether a step is one pass over memory; the problem must allow it."""
         return self._fusable and self.floating is None
 
     def newton_step(self, x: wp.array[Any]) -> Step:
-        """Solve for the direction, and search along it."""
+        """Solve for Newton's direction, and search along it.
+
+        The system is (A + D) e = r with D = d p / q and r = -f / (q size), in units of the
+        residual's norm, `size`: the step is dx = size e. A full step that lowers the merit f'f / 2
+        enough is taken without a search. The trial at a new x already condenses the system of the
+        next step. If the search fails, x returns to the start of the step, and a gradient step
+        follows.
+        """
         s, fused = self.settings, self._fused
         if self._scale == 0:
             if not fused and self.cold_start is not None:
                 self.residual.affine(x)
             self._condense(x)
+        # From here on all is in units of the residual's norm, `size`: r is -f / (q size), and the
+        # step is size e.
         size, merit = 1 / self._scale, self._merit
         self._scale = 0.0
         if isinstance(self.system, FiniteDifferenceSystem):
@@ -271,29 +289,44 @@ class FischerWorkspace(IterateMemory):
         return self._fall_back(x, iterations)
 
     def _take_full_step(self, x: wp.array[Any], size: float, merit: float) -> bool:
-        """Move by size e; return whether the merit falls by the share that a search asks of an exact direction, whose slope is -f'f."""
+        """Move by size e; return whether the merit falls as for an exact direction.
+
+        The slope of an exact Newton direction is -f'f.
+        """
         return self._trial(x, size) <= self._search.limit - 2 * DECREASE * merit
 
     def _searched(self, x: wp.array[Any], size: float) -> bool:
-        """Go back and search along e by the merit's own slope, which is another one where e is inexact; return whether it helps."""
+        """Return to the start and search along e by the merit's own slope.
+
+        That differs from -f'f where e is inexact. Returns whether the search succeeds.
+        """
         self._go(x, 0.0)
         self._evaluate(x)
         slope = size * self.map.slope(x, self.system.e)
         return slope < 0 and self._search.search(lambda t: self._trial(x, t * size), slope)[0] > 0.0
 
     def _project(self, x: wp.array[Any]) -> None:
-        """Move x onto its bounds, which it may miss by what the criteria allow; the solve goes on if they are not met there."""
+        """Move x onto its bounds, which it may violate by what the criteria allow.
+
+        The solve goes on if the criteria are not met there.
+        """
         self.residual.start(x, keep=True)
         self._round(x)
         self._evaluate(x)
         self._scale = 0.0
 
     def _evaluate(self, x: wp.array[Any]) -> float:
-        """Return the norm of the natural residual, and write y, which the grid's own evaluation leaves out."""
+        """Return the norm of the natural residual, and write y.
+
+        The grid's own evaluation does not store y.
+        """
         return NaturalResidual.evaluate(self.residual, x)
 
     def _condense(self, x: wp.array[Any], move: float = 0.0) -> float:
-        """Write the system of the next step, and return the merit; move x first, where that is one pass."""
+        """Write the system of the next step; return the merit f'f / 2.
+
+        If passes are fused, the same pass moves x by `move` e first.
+        """
         self.steps += 1
         self._scale = 1 / max(self.residual.norm, 1e-300)
         if self._fused:
@@ -307,7 +340,7 @@ class FischerWorkspace(IterateMemory):
         return self._merit
 
     def _fall_back(self, x: wp.array[Any], iterations: int) -> Step:
-        """Go down the gradient where Newton's direction is of no use, or say so."""
+        """Take a gradient step where Newton's direction fails, or return the failure."""
         try:
             if not self.settings.safeguard:
                 stationary = self.map.is_stationary(x, STATIONARY)
@@ -318,12 +351,12 @@ class FischerWorkspace(IterateMemory):
                     SolveStatus.LOCAL_MINIMUM if stationary else SolveStatus.NON_DESCENT,
                 )
             step = self.descend(x)
-        except NoTranspose:  # of an operator that has products only
+        except NoTranspose:  # an operator that has products only
             return Step("fischer", iterations, None, SolveStatus.NON_DESCENT)
         return Step("gradient", iterations + step.linear_iterations, None, step.failure)
 
     def descend(self, x: wp.array[Any]) -> Step:
-        """Go down the gradient of the same map once."""
+        """Take one gradient step on the same map."""
         shared = self.cold_start is None  # a grid's own residual does not keep y
         if self._gradient is None:
             self._gradient = DescentWorkspace(
@@ -340,7 +373,10 @@ class FischerWorkspace(IterateMemory):
         return step
 
     def _trial(self, x: wp.array[Any], scale: float) -> float:
-        """Move, and return the merit; the system is that of the next step then, for a full step is nearly always taken."""
+        """Move x, and return the merit.
+
+        The system is then that of the next step, because a full step is nearly always taken.
+        """
         if self._fused:
             move, self._gone = scale - self._gone, scale
             return self._condense(x, move) if math.isfinite(move) else math.inf
@@ -349,7 +385,10 @@ class FischerWorkspace(IterateMemory):
         return self._condense(x) if math.isfinite(self._evaluate(x)) else math.inf
 
     def _go(self, x: wp.array[Any], scale: float) -> None:
-        """Move to x + scale e from where the step began; without bounds in the way the last move is taken back, which saves a copy."""
+        """Move to x + scale e from the start of the step.
+
+        Without bounds the last move is undone by a negative one, which saves a copy of x.
+        """
         if self.settings.safeguard:
             self.map.advance(x, self.system.e, scale - self._gone, x, projected=False)
         else:
@@ -358,10 +397,10 @@ class FischerWorkspace(IterateMemory):
 
 
 class FischerDenseWorkspace(DenseWorkspace):
-    """Memory of the method for one dense problem.
+    """Workspace of the method for one dense problem.
 
     Steps are taken in units in which A is equilibrated, and may leave the bounds; x is the
-    projection of where they are.
+    projection of the iterate onto them.
 
     Attributes:
         stage: 0 while steps are Newton's on the map itself, k in the k-th homotopy.
@@ -384,7 +423,7 @@ class FischerDenseWorkspace(DenseWorkspace):
         data, self.units = self.data, np.ones(len(self.data.b), dtype=np.float64)
         if s.scaled:
             data, self.units = self.data.scaled()
-        # squares of what is larger overflow
+        # Squares of larger numbers overflow.
         lower, upper = without_far(data.lower, data.upper, INFINITY)
         data = replace(data, lower=lower, upper=upper)
         self.map = HostMap(
@@ -401,7 +440,7 @@ class FischerDenseWorkspace(DenseWorkspace):
         self._iterate = self._begun = self.read_iterate() / self.units
 
     def descend(self, x: Any) -> Step:
-        """Go down the gradient of the same map once."""
+        """Take one gradient step on the same map."""
         if self._gradient is None:
             self._gradient = DescentWorkspace(self.problem, self._descent, self.residual)
             self._gradient.start(warm=True, tolerance=self.target)
@@ -410,7 +449,7 @@ class FischerDenseWorkspace(DenseWorkspace):
         return Step("gradient", step.linear_iterations)
 
     def newton_step(self, x: Any) -> Step:
-        """Take a step of the stage that is due."""
+        """Take a step of the current stage."""
         self.steps += 1
         if self.stage == 0:
             failure = self._regularized() if self.settings.safeguard else self._plain()
@@ -425,17 +464,23 @@ class FischerDenseWorkspace(DenseWorkspace):
         return Step(name, 1, None, failure, interim=self.settings.safeguard and failure is None)
 
     def _plain(self) -> SolveStatus | None:
-        """Take a step of the book's method: algorithm 12."""
+        """Take a step of the book's method: algorithm 12.
+
+        It solves J dx = -f with J = diag(p) + diag(q) A, in the units of the map, and searches
+        along the projected path. Kink "zero" leaves unknowns at a kink where they are.
+        """
         x, map_ = self._iterate, self.map
         f, p, q, kinks = map_.linearized(x)
         move = ~kinks if map_.kink is Kink.ZERO else np.ones(len(x), dtype=bool)
         J = map_.jacobian(p, q)
         dx = np.zeros(len(x))
         dx[move] = _solve(J[np.ix_(move, move)], -f[move])
+        # A stationary point of f'f / 2 that is no solution.
         gradient = J.T @ f
         if np.linalg.norm(gradient / map_.d) <= 1e-12 * np.linalg.norm(f):
             return SolveStatus.LOCAL_MINIMUM
         failure = self._searched(x, dx, float(gradient @ dx), 0.5 * float(f @ f), projected=True)
+        # Projected gradient of the merit.
         inside = map_.d * (x - np.clip(x - gradient / map_.d**2, map_.data.lower, map_.data.upper))
         return (
             SolveStatus.LOCAL_MINIMUM
@@ -444,9 +489,13 @@ class FischerDenseWorkspace(DenseWorkspace):
         )
 
     def _regularized(self) -> SolveStatus | None:
-        """Take a step of the safeguarded method, along the gradient if that of Newton's is no descent."""
+        """Take a regularized step: dx = -(J'J + nu I)^-1 J'f.
+
+        If it is no descent direction of f'f / 2, the negative gradient -J'f replaces it.
+        """
         x, map_ = self._iterate, self.map
         f, p, q, kinks = map_.linearized(x)
+        # At a kink the row of J is d e_i'.
         if map_.kink is Kink.ZERO:
             p, q = np.where(kinks, 1.0, p), np.where(kinks, 0.0, q)
         J = map_.jacobian(p, q)
@@ -460,28 +509,31 @@ class FischerDenseWorkspace(DenseWorkspace):
     def _searched(
         self, x: np.ndarray, dx: np.ndarray, slope: float, merit: float, *, projected: bool
     ) -> SolveStatus | None:
-        """Move along a direction; return how that fails."""
+        """Search along a direction; return the failure, None if the merit falls."""
         if not (np.isfinite(slope) and slope < 0):
             return SolveStatus.NON_DESCENT
-        data, found = self.map.data, x
+        data, moved = self.map.data, x
 
         def trial(length: float) -> float:
-            nonlocal found
-            found = x + length * dx
+            nonlocal moved
+            moved = x + length * dx
             if projected:
-                found = np.clip(found, data.lower, data.upper)
-            f = self.map.value(found, data.affine(found))
+                moved = np.clip(moved, data.lower, data.upper)
+            f = self.map.value(moved, data.affine(moved))
             return 0.5 * float(f @ f)
 
         self._search.remember(merit)
         length, _ = self._search.search(trial, slope)
         if length == 0.0:
             return SolveStatus.NON_DESCENT
-        self._iterate = found
+        self._iterate = moved
         return None
 
     def _next_stage(self) -> None:
-        """Begin the next homotopy: y independent of x, and not below 1 at first."""
+        """Begin the next homotopy.
+
+        y is independent of x, and at least 1 at first for one-sided bounds.
+        """
         start, self._mu, self._factor, self._steps_left = HOMOTOPIES[self.stage]
         self.stage += 1
         data = self.map.data
@@ -495,7 +547,12 @@ class FischerDenseWorkspace(DenseWorkspace):
         self._iterate, self._y = x, np.where(one_sided, np.maximum(y, 1.0), y)
 
     def _homotopy(self) -> SolveStatus | None:
-        """Take a Newton step for A x + b = y and the smoothed map of (x, y), and lower mu."""
+        """Take a Newton step for A x + b = y and the smoothed map, then lower mu.
+
+        The unknowns are (x, y). With the gap g = A x + b - y, which a step of length t reduces to
+        (1 - t) g, dx solves (diag(p) + diag(q) A) dx = -f - q g and dy = A dx + g. The length is
+        halved until hypot(||g||, ||f||) falls.
+        """
         x, y, map_, A = self._iterate, self._y, self.map, self.map.data.A
         gap, (f, p, q, _) = map_.data.affine(x) - y, map_.linearized(x, y, self._mu)
         dx = _solve(map_.jacobian(p, q), -f - q * gap)
@@ -506,6 +563,7 @@ class FischerDenseWorkspace(DenseWorkspace):
             float(np.hypot(np.linalg.norm(gap), np.linalg.norm(f))),
             1.0,
         )
+        # Armijo's condition on hypot(||gap||, ||f||); the gap is linear in the step length.
         while length > 1e-6:
             after = map_.value(x + length * dx, y + length * dy, self._mu)
             if (
@@ -526,7 +584,10 @@ class FischerDenseWorkspace(DenseWorkspace):
 
 
 def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Solve a linear system; the least-squares solution of least norm where the matrix is singular to rounding."""
+    """Solve a linear system.
+
+    Returns the least-squares solution of least norm where the matrix is singular to rounding.
+    """
     if not right.size:
         return right
     factors, pivots, info = scipy.linalg.lapack.dgetrf(matrix)

@@ -1,4 +1,7 @@
-"""Nonsmooth gradient descent: slow, but every product it needs is one with A or A'; a start for Newton methods."""
+"""Nonsmooth gradient descent, a start for Newton methods.
+
+It is slow, but needs only products with A and A'.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +20,8 @@ from warp_lcp.reduced.descent import NonmonotoneSearch
 from warp_lcp.reduced.nonsmooth_map import MapForm, MapName, NonsmoothMap
 from warp_lcp.settings import Count, NonNegative, Settings, ShareOrAll, renamed
 
-LEAST = 1e-12  # relative decrease of the merit without which a step is none
-LONGEST = 1e6  # length tried
+LEAST = 1e-12  # a smaller relative decrease of the merit counts as no step
+LONGEST = 1e6  # longest length that is tried
 
 
 @renamed(share="fischer_weight")
@@ -31,14 +34,14 @@ class GradientDescent(Settings):
     x <- clip(x - t d^-2 J'f, l, u) with an element J = diag(p d) + diag(q) A of the generalized
     Jacobian and the natural residual's d, which makes the direction independent of x's units. t
     comes from a backtracking search along the projected path that starts at Barzilai and Borwein's
-    length; the merit may not exceed the largest of the last ones. Needs products with A' as well,
-    and nothing else of A: it is slow, with a rate that the square of A's condition decides.
+    length; the merit may not exceed the largest of the last ones. The method needs only products
+    with A and with A'. It is slow: its rate depends on the square of A's condition number.
 
-    The book's tests end it: the absolute one is the criteria of every method (CONVERGED); the
-    relative one (eq. 2.202), a merit that changes by less than `relative` of itself, and the
+    It ends by the book's tests. The absolute test is the criteria of every method (CONVERGED). The
+    relative test (eq. 2.202), a merit that changes by less than `relative` of itself, and the
     stagnation test (eq. 2.203), an x that changes by less than `stagnation` of its largest entry,
-    give STAGNATED; a gradient below `gradient` ||f|| gives LOCAL_MINIMUM; a search without success
-    gives NON_DESCENT.
+    give STAGNATED. A gradient below `gradient` ||f|| gives LOCAL_MINIMUM, and a search without
+    success NON_DESCENT.
 
     Args:
         map: "natural", "fischer" or "penalized".
@@ -47,7 +50,7 @@ class GradientDescent(Settings):
         relative: of the relative test, >= 0.
         stagnation: of the stagnation test, >= 0.
         gradient: of the test for a local minimum, >= 0.
-        memory: merits that the search remembers, >= 1; 1 is the book's monotone search.
+        memory: number of stored merits of the search, >= 1; 1 is the book's monotone search.
         precision: "mixed" and "double" are the same here; "single" rounds x to float32.
         scaled: False: d = 1 in the map and in the step, as in the book.
     """
@@ -73,12 +76,14 @@ class GradientDescent(Settings):
 
 
 class DescentWorkspace(IterateMemory):
-    """Memory of the method for one problem; another method's where it shares that one's residual.
+    """Workspace of the method for one problem.
+
+    It belongs to another method if it shares that method's residual.
 
     Args:
         problem: the problem.
         settings: the method.
-        residual: shared with the method that this one serves; its own if None.
+        residual: of the method that uses this one; its own if None.
     """
 
     def __init__(
@@ -99,24 +104,29 @@ class DescentWorkspace(IterateMemory):
         self.length, self._square = 1.0, 0.0
 
     def start(self, *, warm: bool, tolerance: float) -> None:
-        """Forget the last length and merits; b may have changed."""
+        """Reset the last length and merits; b may have changed."""
         self.length, self._square = 1.0, 0.0
         self._search.forget()
         self._map.begin()
 
     def descend(self, x: wp.array[Any]) -> Step:
-        """Go down once; `residual.y` is current at x before and after."""
+        """Take one step; `residual.y` is current at x before and after.
+
+        The direction is d^-2 J'f. The first length is Barzilai and Borwein's: with the inner
+        product of the last direction and this one over the square of the last one, t / (1 - inner /
+        square).
+        """
         s, map_ = self.settings, self._map
         merit = map_.merit(x)
         square, inner = map_.descend(x)
         if math.sqrt(square) <= s.gradient * math.sqrt(2 * merit):
             return Step("gradient", 1, None, SolveStatus.LOCAL_MINIMUM)
-        if self._square > 0:  # Barzilai and Borwein's length, of a step that no bound cut short
+        if self._square > 0:  # Barzilai and Borwein's length of a step without bounds
             change = 1 - inner / self._square
             self.length = self.length / change if change > 1e-6 else 10 * self.length
         self._square = square
         wp.copy(self._from, x)
-        # a projected step promises less than Armijo asks of a free one
+        # A projected step decreases the merit less than Armijo's condition for a free one requires.
         self._search.remember(merit * (1 - LEAST))
         length, reached = self._search.search(
             lambda t: self._trial(x, t), 0.0, first=min(self.length, LONGEST)
@@ -129,14 +139,17 @@ class DescentWorkspace(IterateMemory):
         return Step("gradient", 2, None, self._tested(x, merit, reached))
 
     def _trial(self, x: wp.array[Any], length: float) -> float:
-        """Move along the projected path, and return the merit."""
+        """Move along the projected path; return the merit."""
         self._map.advance(self._from, self._map.direction, -length, x, projected=True)
         self._round(x)
         self.residual.evaluate(x)
         return self._map.merit(x)
 
     def _tested(self, x: wp.array[Any], before: float, after: float) -> SolveStatus | None:
-        """Return how the relative and the stagnation test end the solve, None if they do not."""
+        """Return STAGNATED if the relative or the stagnation test ends the solve.
+
+        Returns None if neither does.
+        """
         s = self.settings
         if abs(before - after) <= s.relative * before:
             return SolveStatus.STAGNATED

@@ -1,4 +1,7 @@
-"""Incremental pivoting after Baraff: one row after the other is made to hold, and none is let go again."""
+"""Incremental pivoting after Baraff, for dense symmetric matrices.
+
+The conditions of the rows are fulfilled one after the other, and are kept.
+"""
 
 from __future__ import annotations
 
@@ -25,16 +28,17 @@ from warp_lcp.reduced.dense_problem import (
 )
 from warp_lcp.settings import Count, Settings
 
-# a rate below this part of the terms that it is a sum of is rounding: nothing changes there
+# A rate below this part of the terms of its sum is rounding: nothing changes there.
 ZERO = 1e-11
-# of the largest sum that a row's terms can make: a y beyond it is no rounding, whatever x has gone
-# through
+# Relative to the largest sum that a row's terms can make: a larger y is no rounding error, whatever
+# the history of x.
 CLEAR = 1e-8
-CORRECTED = 32  # rows driven after which y is computed afresh
-RESTARTS = 3  # times that the last check may send rows back that rounding has undone
-OPEN, FREE, LOW, HIGH = 0, 1, 2, 3  # not held yet; y = 0; x = l and y >= 0; x = u and y <= 0
+CORRECTED = 32  # number of driven rows after which y is recomputed
+RESTARTS = 3  # times that the last check may reopen rows that rounding has violated
+# Not fulfilled yet; y = 0; x = l and y >= 0; x = u and y <= 0.
+OPEN, FREE, LOW, HIGH = 0, 1, 2, 3
 CLOSE = 1e-12  # backward error, relative to the right-hand side, from which a direction is refined
-ACCEPTED = 1e-10  # the same, with which a direction is used; a singular block's stays near 1
+ACCEPTED = 1e-10  # the largest one of a direction that is used; a singular block's stays near 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,16 +47,16 @@ class IncrementalPivoting(Settings):
 
     [Book] 2.1.2, algorithm 2; eqs. 2.20-2.27.
 
-    The most violated row j is driven to y_j = 0 or to its bound while all rows that hold keep
-    holding: dx_F = -A_FF^-1 A_Fj, dy = A dx, and the longest step is taken that keeps x_F within
-    its bounds and the signs of y at bounds; what blocks it changes sides. Each change of F updates
+    The most violated row j is driven to y_j = 0 or to its bound while all fulfilled rows stay
+    fulfilled: dx_F = -A_FF^-1 A_Fj, dy = A dx. The step is the longest that keeps x_F within its
+    bounds and the signs of y at bounds; the blocking row changes sides. Each change of F updates
     the inverse of A_FF in O(n^2). Boxed bounds and equations are driven from either side. A
-    positive semi-definite A needs no care: whatever joins F leaves A_FF regular; where y_j cannot
-    change and nothing blocks, no solution exists: INFEASIBLE if multipliers prove it beyond
-    rounding (`certifies`), else STAGNATED.
+    positive semi-definite A needs no special treatment: every row that joins F leaves A_FF regular.
+    If y_j cannot change and no row blocks, no solution exists: INFEASIBLE if multipliers prove it
+    beyond rounding (`certifies`), else STAGNATED.
 
     A warm start begins with the rows of x0 that are violated. The last step solves A_FF x_F = -(b +
-    A x_bound)_F afresh. A step is a block of pivots; `linear_iterations` counts pivots.
+    A x_bound)_F again. A step is a block of pivots; `linear_iterations` counts pivots.
 
     Args:
         pivots_per_step: pivots in a step of the solve loop, which checks, records and counts steps;
@@ -90,10 +94,10 @@ class IncrementalPivoting(Settings):
 
 
 class PivotingWorkspace(DenseWorkspace):
-    """The sets and the row that is being driven."""
+    """Workspace of the method: the sets of rows and the driven row."""
 
     def start(self, *, warm: bool, tolerance: float) -> None:
-        """Begin with no row held."""
+        """Begin with all rows open."""
         super().start(warm=warm, tolerance=tolerance)
         n = len(self.data.b)
         self.values = np.clip(self.read_iterate(), self.data.lower, self.data.upper)
@@ -109,7 +113,7 @@ class PivotingWorkspace(DenseWorkspace):
         return int(np.count_nonzero(self.kind >= LOW))
 
     def pivot(self, count: int) -> int:
-        """Make at most `count` pivots; returns how many were made."""
+        """Make at most `count` pivots; return their number."""
         done = 0
         while done < count and self.ended is None and not time_is_up():
             if self.driven < 0 and not self._choose():
@@ -121,8 +125,12 @@ class PivotingWorkspace(DenseWorkspace):
         return done
 
     def _violation(self, *, surely: bool = False) -> np.ndarray:
-        """Return |y| of the rows that do not hold, 0 of the others, whatever their kind; `surely`: beyond doubt, at no product's cost."""
+        """Return |y| of the rows that are violated, 0 of the others, of every kind.
+
+        `surely`: only violations beyond every rounding error, without the cost of a product.
+        """
         x, y, data = self.values, self.y, self.data
+        # A negative y must be raised, or x must be at its upper bound, and vice versa.
         wrong = np.where(y < 0, x < data.upper, x > data.lower)
         if surely:
             noise = CLEAR * (self.sizes * np.abs(x).sum() + np.abs(data.b))
@@ -131,7 +139,7 @@ class PivotingWorkspace(DenseWorkspace):
         return np.where(wrong & (np.abs(y) > noise), np.abs(y), 0.0)
 
     def _choose(self) -> bool:
-        """Take the worst open row as the one to drive; False if all hold."""
+        """Choose the most violated open row as the driven one; False if none is violated."""
         self._chosen += 1
         violation = np.where(self.kind == OPEN, self._violation(surely=True), 0.0)
         if self._chosen % CORRECTED == 0 or not violation.any():
@@ -144,7 +152,10 @@ class PivotingWorkspace(DenseWorkspace):
         return True
 
     def _correct(self) -> None:
-        """Compute y afresh and let a Newton step on F take out what rounding has left of y_F."""
+        """Recompute y, and remove the rounding error of y_F by a Newton step on F.
+
+        x_F <- clip(x_F - A_FF^-1 y_F, l_F, u_F); then y_F = 0.
+        """
         F, data = self.inverse.members, self.data
         if len(F):
             self.y = data.affine(self.values)
@@ -154,22 +165,29 @@ class PivotingWorkspace(DenseWorkspace):
         self.y[F] = 0.0
 
     def _advance(self) -> None:
-        """Move along the direction of the driven row to the first thing that blocks, and let that change sides."""
+        """Move along the direction of the driven row up to the first blocking row.
+
+        dx_F = -A_FF^-1 A_Fj dx_j with dx_j = 1 or -1, and dy = A dx. The blocking row then changes
+        sides. A negative rate of y_j shows negative curvature. If no row blocks, dx is a direction
+        with A z = 0 and b'z < 0.
+        """
         j, F, data = self.driven, self.inverse.members, self.data
         dx = np.zeros(len(data.b))
+        # dx_F = -A_FF^-1 A_Fj and dy = A dx, in the direction that reduces |y_j|.
         z, dy = self.inverse.direction(j)
         dx[F], dx[j], dy = self.sign * z, self.sign, self.sign * dy
         dy[F] = 0.0
         noise = self._noise(dx, dy)
         rate = self.sign * dy[j]
         if rate < -1e3 * noise[j]:
-            # negative curvature: A, changed since init, is not positive semi-definite
+            # Negative curvature: A has changed since `init` and is not positive semi-definite.
             self.ended = SolveStatus.NON_DESCENT
             return
+        # The longest step that keeps all fulfilled conditions.
         steps = self._steps(dx, dy, noise)
         length = steps.min()
         if not np.isfinite(length):
-            # A z = 0 and b'z < 0: a proof, if no rounding has made it
+            # A z = 0 and b'z < 0 prove infeasibility, unless rounding has caused them.
             z = np.where(np.abs(dx) > ZERO * np.abs(dx).max(), dx, 0.0)
             proved = certifies(data, z) or inconsistent(data)
             self.ended = SolveStatus.INFEASIBLE if proved else SolveStatus.STAGNATED
@@ -177,8 +195,8 @@ class PivotingWorkspace(DenseWorkspace):
         self.idle = self.idle + 1 if length <= EPS * np.abs(self.values).max() else 0
         ties = np.flatnonzero(steps <= length * (1 + 4 * EPS))
         strength = np.where(self.kind[ties] == FREE, np.abs(dx[ties]), np.abs(dy[ties]))
-        # the strongest of equals is the most accurate pivot; after many steps of length 0 the least
-        # index ends a cycle (Bland)
+        # The strongest of equal rows is the most accurate pivot. After many steps of length 0 the
+        # least index ends a cycle (Bland).
         q = int(ties[strength.argmax()] if self.idle < len(steps) else ties[0])
         self.values += length * dx
         self.y += length * dy
@@ -186,7 +204,10 @@ class PivotingWorkspace(DenseWorkspace):
         self._exchange(q, dx[q])
 
     def _noise(self, dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
-        """Return below which part of the terms that it is a sum of a rate is rounding; larger where the rate is beyond any doubt."""
+        """Return the bound of each rate below which it is rounding.
+
+        The bound is ZERO times the terms of the sum; it is larger where the rate is beyond doubt.
+        """
         size = np.abs(dx)
         noise = ZERO * self.sizes * size.sum()  # no sum of its terms is larger
         doubtful = ((self.kind == LOW) & (dy < 0)) | ((self.kind == HIGH) & (dy > 0))
@@ -197,25 +218,28 @@ class PivotingWorkspace(DenseWorkspace):
         return noise
 
     def _steps(self, dx: np.ndarray, dy: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """Return how far each row lets the driven one go ([Book] eqs. 2.26-2.27)."""
+        """Return the step length at which each row blocks ([Book] eqs. 2.26-2.27)."""
         x, y, kind, data, j = self.values, self.y, self.kind, self.data, self.driven
         steps = np.full(len(x), np.inf)
+        # Free rows: x reaches a bound.
         free = (kind == FREE) & (np.abs(dx) > ZERO * np.abs(dx).max())
         free[j] = True
         room = np.where(dx > 0, data.upper - x, x - data.lower)
-        with np.errstate(over="ignore"):  # a bound that is as good as infinite
+        with np.errstate(over="ignore"):  # a bound that is practically infinite
             steps[free] = np.maximum(room[free], 0.0) / np.abs(dx[free])
+        # Rows at a bound: y reaches 0 from its sign.
         leaving = ((kind == LOW) & (dy < -noise)) | ((kind == HIGH) & (dy > noise))
         leaving &= data.lower < data.upper
         slack = np.where(kind == LOW, y, -y)
         steps[leaving] = np.maximum(slack[leaving], 0.0) / np.abs(dy[leaving])
+        # The driven row: y_j reaches 0.
         to_zero = abs(y[j]) / abs(dy[j]) if self.sign * dy[j] > noise[j] else np.inf
         self._vanishes = to_zero <= steps[j]  # y_j reaches 0 before x_j reaches its bound
         steps[j] = min(steps[j], to_zero)
         return steps
 
     def _exchange(self, q: int, rate: float) -> None:
-        """Let the blocking row change sides."""
+        """Move the blocking row to its other side."""
         x, data = self.values, self.data
         if q == self.driven:
             self.driven = -1
@@ -236,7 +260,10 @@ class PivotingWorkspace(DenseWorkspace):
         self.inverse.insert(q)
 
     def _finish(self) -> None:
-        """Solve for x_F afresh; rows that rounding has undone are open again, a few times."""
+        """Solve for x_F again; reopen rows that rounding has violated.
+
+        At most RESTARTS times.
+        """
         if len(self.inverse.members):
             self.inverse.refresh()
         self._correct()
@@ -252,18 +279,19 @@ class PivotingWorkspace(DenseWorkspace):
 
 
 class PrincipalInverse:
-    """Solves A_FF z = r for a growing and shrinking set F of a symmetric positive semi-definite A.
+    """Solver of A_FF z = r for a changing index set F.
 
-    The inverse is bordered when an index joins and deflated when one leaves. A is kept with the
-    rows and columns of F first, in the order of `members`, so that a product with A's columns F
-    tells the solution's residual too. An inverse that has lost its accuracy is computed afresh;
-    where the block itself is singular the minimum-norm least-squares solution takes over.
+    A is symmetric positive semi-definite. The inverse is bordered when an index joins F and
+    deflated when one leaves. A is stored with the rows and columns of F first, in the order of
+    `members`, so that a product with A's columns F also gives the residual of a solution. An
+    inverse that has lost its accuracy is recomputed; where the block itself is singular the
+    minimum-norm least-squares solution replaces it.
 
     Args:
         A: symmetric, shape (n, n).
 
     Attributes:
-        refactorizations: fresh inverses made so far.
+        refactorizations: number of recomputed inverses so far.
         singular: whether A_FF is numerically singular now.
     """
 
@@ -272,7 +300,7 @@ class PrincipalInverse:
         self.count, self.refactorizations, self.singular = 0, 0, False
         self._order, self._place, self._permuted = np.arange(n), np.arange(n), A.copy()
         self._inverse, self._padded = np.zeros((n, n), order="F"), np.zeros(n)
-        # index and solution of the last direction, while F has not changed
+        # Index and solution of the last direction, while F has not changed.
         self._last: tuple[int, np.ndarray] | None = None
 
     @property
@@ -286,8 +314,12 @@ class PrincipalInverse:
         return self._permuted[: self.count, : self.count]
 
     def direction(self, j: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return z with A_FF z = -A_Fj, shape (k,), and the rate of y = A x where x_F moves by z and x_j by 1, shape (n,)."""
+        """Return z with A_FF z = -A_Fj, and the rate of y.
+
+        z has shape (k,). The rate of y = A x, shape (n,), is that for x_F moving by z and x_j by 1.
+        """
         k, row = self.count, self._permuted[self._place[j]]
+        # z = -A_FF^-1 A_Fj by the inverse; refined if the residual in the rows F is too large.
         z = np.zeros(k) if self.singular else -(self._inverse[:k, :k] @ row[:k])
         rate = self._permuted[:, :k] @ z + row
         if k and (self.singular or not np.abs(rate[:k]).max() <= CLOSE * np.abs(row[:k]).max()):
@@ -299,7 +331,11 @@ class PrincipalInverse:
         return z, dy
 
     def insert(self, j: int) -> None:
-        """Add an index to F."""
+        """Add an index j to F.
+
+        With u = A_FF^-1 A_Fj and the Schur complement s = A_jj - A_Fj'u, the bordered inverse is
+        [[H + u u' / s, -u / s], [-u' / s, 1 / s]].
+        """
         k, last = self.count, self._last
         column = self._permuted[self._place[j], :k].copy()
         u = last[1] if last is not None and last[0] == j else self.solve(column)
@@ -315,7 +351,11 @@ class PrincipalInverse:
         H[k, k] = 1 / schur
 
     def remove(self, j: int) -> None:
-        """Take an index out of F."""
+        """Remove an index from F.
+
+        With the inverse partitioned as [[H, h], [h', p]], the index last, the deflated inverse is H
+        - h h' / p.
+        """
         last, at = self.count - 1, int(self._place[j])
         _exchange(self._inverse[: last + 1, : last + 1], at, last)
         self._swap(at, last)
@@ -327,7 +367,10 @@ class PrincipalInverse:
         self._add_outer(self._inverse[:last, last].copy(), -1 / pivot, last)
 
     def solve(self, r: np.ndarray) -> np.ndarray:
-        """Return z with A_FF z = r, refined; the least-squares solution where A_FF is singular."""
+        """Return z with A_FF z = r, refined once.
+
+        Returns the least-squares solution where A_FF is singular.
+        """
         if self.count == 0:
             return np.zeros(0)
         for fresh in (False, True):
@@ -340,7 +383,7 @@ class PrincipalInverse:
         return np.linalg.lstsq(self.block, r, rcond=RANK)[0]
 
     def refresh(self) -> None:
-        """Compute the inverse afresh, O(k^3)."""
+        """Recompute the inverse, O(k^3)."""
         k = self.count
         self.refactorizations += 1
         try:
@@ -359,7 +402,7 @@ class PrincipalInverse:
         return bool(error <= ACCEPTED * np.abs(r).max())
 
     def _swap(self, at: int, other: int) -> None:
-        """Let two indices change places."""
+        """Exchange the places of two indices."""
         self._last = None
         _exchange(self._permuted, at, other)
         self._order[[at, other]] = self._order[[other, at]]
@@ -368,12 +411,12 @@ class PrincipalInverse:
     def _add_outer(self, v: np.ndarray, factor: float, k: int) -> None:
         """Add factor v v' to the leading k x k part of the inverse."""
         self._padded[:k], self._padded[k:] = v, 0.0
-        if k:  # of whole columns, which BLAS updates in place
+        if k:  # whole columns, which BLAS updates in place
             dger(factor, self._padded, v, a=self._inverse[:, :k], overwrite_a=True)
 
 
 def _exchange(matrix: np.ndarray, i: int, j: int) -> None:
-    """Exchange two rows and the same columns."""
+    """Exchange two rows and the same two columns."""
     if i != j:
         for view in (matrix, matrix.T):
             view[[i, j]] = view[[j, i]]

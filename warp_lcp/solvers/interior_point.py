@@ -1,10 +1,12 @@
-"""The interior-point method: Newton's method on the Kojima map, with Mehrotra's predictor and corrector.
+"""Interior-point method: Newton's method on the Kojima map.
+
+By default with Mehrotra's predictor and corrector.
 
 w = x - l and v = u - x, infinite where there is no bound; s and t are their multipliers, 0 there.
 With dx known, ds = (tau - w s - second dx_a ds_a) / w - (s / w) dx and dt = (tau - v t + second
 dx_a dt_a) / v + (t / v) dx, where dx_a is the predictor's step; `joined` is 1 where the correction
-e comes on top of that. FUSED passes go over the rows of a grid whose system is condensed where the
-step ends, the others over flat fields.
+e is added to it. FUSED passes go over the rows of a grid whose system is condensed at the end of
+the step, the others over flat fields.
 """
 
 from __future__ import annotations
@@ -32,7 +34,7 @@ from warp_lcp.rows.fields import zeros_like
 from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, Positive, Share
 
-LARGEST_START = 1e6  # of the residual's norm: ||b|| up to which it gives the start's size
+LARGEST_START = 1e6  # times the residual's norm: largest ||b|| that sets the size of the start
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/interior_point.h")
 INSIDE = KERNELS["interior_point.inside"]
@@ -41,12 +43,12 @@ CONDENSE = KERNELS["interior_point.condense"]
 MOVE = KERNELS["interior_point.move"]
 RATIOS = KERNELS["interior_point.ratios"]
 CENTER = KERNELS["interior_point.center"]
-# a plane is condensed when the one above it has moved
+# A plane is condensed when the one above it has moved.
 ADVANCE = Wave("interior_point.advance", (MOVE, 0), (CONDENSE, 1))
 
 
-# a near start has w A_ii and s at least this multiple of the residual's root mean square; 3 to 50
-# measured
+# A near start has w A_ii and s at least this multiple of the residual's root mean square; 3 to 50
+# were measured.
 NEAR = 10.0
 
 
@@ -58,20 +60,20 @@ class InteriorPoint(NewtonSettings):
 
     With w = x - l, v = u - x and multipliers s, t >= 0, the solution has A x + b = s - t, W s = 0,
     V t = 0. A step is Newton's for W s = V t = tau: (A + D) dx = -(A x + b) + tau / w - tau / v
-    with D = s / w + t / v, so that dx, ds and dt keep all of w, v, s and t positive; equations have
-    D = 0, unknowns with l = u are held. Mehrotra's rule solves with tau = 0 first (the predictor),
-    takes sigma = (mu_after / mu)^3 and solves again with tau = sigma mu and the predictor's
-    second-order terms. The book's rule solves once with tau = mu / k and goes the share k / (N + 1)
-    of the way to the boundary in step k. All variables take one common step, without which the
-    method does not converge for LCPs that are no quadratic programs.
+    with D = s / w + t / v, and it is shortened so that w, v, s and t all stay positive. Equations
+    have D = 0, unknowns with l = u are held. Mehrotra's rule solves with tau = 0 first (the
+    predictor), sets sigma = (mu_after / mu)^3 and solves again with tau = sigma mu and the
+    predictor's second-order terms. The book's rule solves once with tau = mu / k and goes the share
+    k / (N + 1) of the way to the boundary in step k. All variables take one common step, without
+    which the method does not converge for LCPs that are no quadratic programs.
 
     A must be positive semi-definite (x'Ax >= 0; it need not be symmetric), else steps may become
-    arbitrarily short. Dense and sparse problems are solved in units in which rows are alike; where
-    there is no solution, iterates leave for infinity: then, if A has at most 40,000 entries, a
-    linear program is asked, and INFEASIBLE is proved. A float32 correction carries D up to 1e30:
-    nothing is clamped. On grids the shifted systems are solved by conjugate gradients with
-    multigrid, stopped on the norm of d^(-1/2) r, d the diagonal of A + D. `linear_iterations`
-    counts their iterations.
+    arbitrarily short. Dense and sparse problems are solved in units in which all rows have similar
+    sizes. Where there is no solution, the iterates diverge. If A then has at most 40,000 entries, a
+    linear program decides whether INFEASIBLE is proved. float32 can represent D up to 1e30, so D is
+    not limited. On grids the shifted systems are solved by conjugate gradients with multigrid,
+    stopped on the norm of d^(-1/2) r, d the diagonal of A + D. `linear_iterations` counts their
+    iterations.
 
     Args:
         precision: "mixed": iterate and multipliers float64, corrections float32 on grids; "double";
@@ -115,7 +117,7 @@ class InteriorPoint(NewtonSettings):
         return InteriorPointWorkspace(problem, self)
 
     def step(self, problem: LCP, work: Any, x: wp.array[Any]) -> Step:
-        """Take a monotone cycle while the start is cold, else a path-following step."""
+        """Take a monotone cycle after a cold start, then path-following steps."""
         if isinstance(work, EquilibratedWorkspace):
             return work.step(self.step)
         if work.cycles_left > 0:
@@ -128,7 +130,9 @@ class InteriorPoint(NewtonSettings):
 
 @dataclass(frozen=True, slots=True)
 class ComplementaryPairs:
-    """Distances of x to its bounds and their multipliers, stored float64 fields: w s = v t = mu on the central path.
+    """Distances of x to its bounds and their multipliers.
+
+    Stored float64 fields; w s = v t = mu on the central path.
 
     Attributes:
         w: x - l; infinite without a lower bound.
@@ -145,7 +149,7 @@ class ComplementaryPairs:
 
 @dataclass(frozen=True, slots=True)
 class PathDirection:
-    """A direction along the central path: ds and dt follow from that of x.
+    """A direction along the central path: ds and dt follow from dx.
 
     Attributes:
         a: the predictor's direction of x.
@@ -190,7 +194,7 @@ class PathSystem:
 
 
 class InteriorPointWorkspace(IterateMemory):
-    """Memory of the method for one problem.
+    """Workspace of the method for one problem.
 
     Attributes:
         mu: mean of the products w s and v t, units of x y.
@@ -222,7 +226,7 @@ class InteriorPointWorkspace(IterateMemory):
         )
         self._D, self.free = layout.zeros(wp.float64), layout.zeros(wp.uint8)
         self._predicted = zeros_like(self.system.e)
-        # conjugate gradients leave the residual in r
+        # Conjugate gradients leave the residual in r.
         self._carries = isinstance(self.system, GridSystem) and problem.A.symmetric
         fused = isinstance(self.system, GridSystem) and self.system.fused
         self._upper, self._fusable = (
@@ -233,7 +237,11 @@ class InteriorPointWorkspace(IterateMemory):
             Sums(rows_of(self.x), 3),
             wp.zeros(1, dtype=wp.float64, device=problem.device),
         )
-        self._grid_sums = Sums(problem.A.stencil.rows, 3) if self._fusable else self._sums  # type: ignore[attr-defined]
+        self._grid_sums = (
+            Sums(problem.A.stencil.rows, 3)  # type: ignore[attr-defined]
+            if self._fusable
+            else self._sums
+        )
         self.cycles_left = self.steps = self.count = 0
         self.near = self.begun = False
         self.mu = self.target = self.size = 0.0
@@ -241,7 +249,7 @@ class InteriorPointWorkspace(IterateMemory):
     def start(
         self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
     ) -> None:
-        """Forget the path; the operator may have changed."""
+        """Reset the path; the operator may have changed."""
         self.floating = floating
         s = self.settings
         cold_grid = self.problem.bounded and self._carries and not warm
@@ -254,32 +262,40 @@ class InteriorPointWorkspace(IterateMemory):
             self.cold_start.start(warm=not cold_grid, tolerance=tolerance, floating=floating)
 
     def monotone_step(self, x: wp.array[Any]) -> Step:
-        """Projected multigrid cycle on all unknowns."""
+        """Take a projected multigrid cycle on all unknowns."""
         assert self.cold_start is not None
         return self.cold_start.monotone_step()
 
     @property
     def is_grid(self) -> bool:
-        """Whether the residual is a grid's own, which does not keep y."""
+        """Whether the residual is a grid's own, which does not store y."""
         return self.cold_start is not None
 
     @property
     def _fused(self) -> bool:
-        """Whether what moves is evaluated and condensed in the same pass over memory: by one CPU thread, without periodic axes."""
+        """Whether the pass that moves x also evaluates and condenses there.
+
+        Used by one CPU thread, without periodic axes.
+        """
         return self._fusable and self.floating is None and self.count > 0
 
     def begin(self, x: wp.array[Any]) -> None:
-        """Move x inside its bounds, and choose multipliers: by b and the residual far from the path, by the residual near it."""
+        """Move x inside its bounds, and choose the multipliers.
+
+        Far from the path their size follows from b and the residual, near it from the residual
+        alone: s and t are at least `least`, and so are w A_ii and v A_ii.
+        """
         p = self.problem
         self._inside(x, 0.0)
         self.count = int(self._multipliers(0.0)[1])
         if self.count:
             if self.near:
                 least = NEAR * self.residual.norm / math.sqrt(self.count)
+            # A far start: the size of b, or of the residual if that is larger.
             else:
                 unknowns = max(int(np.count_nonzero(p.unknown.numpy() == 1)), 1)
-                # b may be 0 where bounds are not, and have a row that is held, which says nothing
-                # of the others
+                # b may be 0 where the bounds are not, and one held row of b may be far larger than
+                # the others.
                 size = max(
                     min(self.residual.norm_of_b(), LARGEST_START * self.residual.norm),
                     self.residual.norm,
@@ -291,7 +307,7 @@ class InteriorPointWorkspace(IterateMemory):
         elif self.is_grid:
             self.residual.affine(x)
         self.begun, self.condensed = True, False
-        # what is singular: components none of whose unknowns is bounded
+        # The singular part: components none of whose unknowns has a bound.
         if self.floating is not None:
             free, w, v = self.free.numpy() != 0, self._w.numpy(), self._v.numpy()
             self._without_bounds = wp.array(
@@ -299,13 +315,21 @@ class InteriorPointWorkspace(IterateMemory):
             )
 
     def path_step(self, x: wp.array[Any]) -> Step:
-        """Solve for the direction, and go nearly as far along it as w, v, s and t stay positive."""
+        """Solve for the direction; move nearly as far as w, v, s and t stay positive.
+
+        The predictor solves (A + D) dx = -(A x + b) with tau = 0, D = s / w + t / v. Mehrotra's
+        corrector solves again with tau = sigma mu and the second-order terms. The book's rule
+        solves once with tau = mu / k. The step is `share` of the longest one; all variables take
+        the same length. The system is scaled by 1 / size, the norm of the residual, so that float32
+        can hold it.
+        """
         s, self.steps = self.settings, self.steps + 1
         if self._fused:
             return self._fused_step(x)
         self.size = max(self.residual.norm, 1e-300)
         tau = 0.0 if s.mehrotra else self.mu / self.steps
         second = 0.0
+        # D = s / w + t / v and r = -(A x + b) + tau / w - tau / v, over `size`.
         self._sums.of(
             CONDENSE,
             self._pairs,
@@ -320,11 +344,13 @@ class InteriorPointWorkspace(IterateMemory):
         iterations = self._solve(s.predictor_eta if s.mehrotra and self.count else s.eta)
         longest, products = self._ratios(second, tau)
         if s.mehrotra and self.count:
+            # Mehrotra's corrector, from the predictor's ratios.
             tau, second = self._center(longest, products), 1.0
             self._correct(tau, y=self.residual.y, D=None)
             self._project()
             iterations += self._solve(s.eta)
             longest, _ = self._ratios(second, tau)
+        # The same length for x, w, v, s and t.
         share = s.backoff if s.mehrotra else min(s.backoff, self.steps / (s.horizon + 1))
         length = min(1.0, share / longest) if longest > 0 else 1.0
         self._move(x, second, tau, length)
@@ -334,7 +360,10 @@ class InteriorPointWorkspace(IterateMemory):
         return Step(name, iterations, None, interim=not s.mehrotra and self.steps <= s.horizon)
 
     def _fused_step(self, x: wp.array[Any]) -> Step:
-        """Do what `path_step` does by Mehrotra's rule in four passes over memory."""
+        """Take Mehrotra's step of `path_step` in four passes over memory.
+
+        The pass that moves x also condenses the system of the next step.
+        """
         s, finest = self.settings, self.system.hierarchy.finest
         if not self.condensed:
             self.condensed = True
@@ -349,8 +378,12 @@ class InteriorPointWorkspace(IterateMemory):
         return Step("predictor-corrector", iterations, None)
 
     def _center(self, longest: float, products: float) -> float:
-        """Return Mehrotra's tau: mu times the cube of what the predictor would leave of it."""
-        # products that vanish: rounding, or coefficients beyond what corrections hold
+        """Return Mehrotra's tau = sigma mu with sigma = (mu_after / mu)^3.
+
+        mu_after is that of the longest predictor step of length a: (1 - a) mu + a^2 (dw ds + dv dt)
+        / count.
+        """
+        # The products vanish by rounding, or by coefficients that corrections cannot represent.
         if not self.mu > 0:
             return 0.0
         length = min(1.0, 1 / longest) if longest > 0 else 1.0
@@ -363,7 +396,7 @@ class InteriorPointWorkspace(IterateMemory):
 
     @property
     def _pass_sums(self) -> Sums:
-        """Sums of the kernels that run over a grid's rows where passes are fused."""
+        """Sums of the kernels: over a grid's rows where passes are fused."""
         return self._grid_sums if self._fused else self._sums
 
     def _direction(self, second: float, tau: float) -> PathDirection:
@@ -373,14 +406,21 @@ class InteriorPointWorkspace(IterateMemory):
     @property
     def _stencil(self) -> Any:
         r = self.residual
-        return self.problem.A.stencil if self._fused else Known(r.diagonal, r.unit, r.y)  # type: ignore[attr-defined]
+        return (
+            self.problem.A.stencil  # type: ignore[attr-defined]
+            if self._fused
+            else Known(r.diagonal, r.unit, r.y)
+        )
 
     def _condensing(self, x: wp.array[Any], D: wp.array[Any], tau: float) -> PathSystem:
         p = self.problem
         return PathSystem(x, p.b, p.unknown, self.free, D, self.system.r, 1 / self.size, tau)
 
     def _advance(self, x: wp.array[Any], tau: float, length: float) -> None:
-        """Move, unless the length is 0, and set the residual's norm and the next system there."""
+        """Move, unless the length is 0, and condense the next system there.
+
+        The same pass sums the square of the residual's norm at the new x.
+        """
         sums, rows, bounds, upper = (
             self._grid_sums,
             self._grid_sums.rows,
@@ -423,9 +463,13 @@ class InteriorPointWorkspace(IterateMemory):
         return float(np.sqrt(self._grid_sums.scalars.numpy()[slot]))
 
     def _ratios(self, second: float, tau: float) -> tuple[float, float]:
-        """Return the reciprocal of the longest step, 0 if there is none, and the sum of dw ds + dv dt."""
+        """Return the reciprocal of the longest step, and sum(dw ds + dv dt).
+
+        The reciprocal is 0 if the step is not limited. It is the largest of -dw / w, -dv / v, -ds /
+        s and -dt / t.
+        """
         self._longest.zero_()
-        found = self._pass_sums.of(
+        sums = self._pass_sums.of(
             RATIOS,
             self._pairs,
             self._direction(second, tau),
@@ -433,7 +477,7 @@ class InteriorPointWorkspace(IterateMemory):
             UPPER=self._upper,
             FUSED=self._fused,
         )
-        products = float(found[0])
+        products = float(sums[0])
         return float(self._longest.numpy()[0]), products
 
     def _correct(self, tau: float, *, y: wp.array[Any] | None, D: wp.array[Any] | None) -> None:
@@ -455,8 +499,8 @@ class InteriorPointWorkspace(IterateMemory):
         )
 
     def _move(self, x: wp.array[Any], second: float, tau: float, length: float) -> None:
-        """Take the step, and remember mu."""
-        found = self._sums.of(
+        """Take the step, and store mu."""
+        sums = self._sums.of(
             MOVE,
             self._pairs,
             self._direction(second, tau),
@@ -466,7 +510,7 @@ class InteriorPointWorkspace(IterateMemory):
             UPPER=self._upper,
             FUSED=False,
         )
-        self.mu = float(found[0]) / max(self.count, 1)
+        self.mu = float(sums[0]) / max(self.count, 1)
         self._finish_move(x)
 
     def _inside(self, x: wp.array[Any], width: float) -> None:
@@ -487,7 +531,10 @@ class InteriorPointWorkspace(IterateMemory):
         ).launch()
 
     def _multipliers(self, least: float) -> tuple[float, float]:
-        """Set s and t to y's sides, at least `least`; return the sum of products and how many bounds are finite."""
+        """Set s and t to the parts of y of each sign, at least `least`.
+
+        Returns the sum of the products w s and v t, and the number of finite bounds.
+        """
         total, count = self._sums.of(
             MULTIPLIERS, self._pairs, y=self.residual.y, least=least, UPPER=self._upper, FUSED=False
         )
@@ -503,6 +550,6 @@ class InteriorPointWorkspace(IterateMemory):
         ]
 
     def _project(self) -> None:
-        """Take off what a singular component without bounds cannot meet."""
+        """Remove the part that a singular component without bounds cannot meet."""
         if self.floating is not None:
             self.floating.project(self.system.r, self._without_bounds)

@@ -1,4 +1,7 @@
-"""Lemke's complementary pivoting, which starts as Lemke and Howson's on bimatrix games: any dense matrix."""
+"""Lemke's complementary pivoting, for any dense matrix.
+
+On bimatrix games it starts as Lemke and Howson's method.
+"""
 
 from __future__ import annotations
 
@@ -32,9 +35,11 @@ REGULAR = 1e-10  # reciprocal condition number above which the equations' block 
 
 @dataclass(frozen=True)
 class LemkeForm:
-    """M, q and the affine map from z back to x ([Book] 1.2.2 and table 3.4 state the reformulations).
+    """M, q and the affine map from z back to x.
 
-    - l = u: x is known; its row asks nothing.
+    [Book] 1.2.2 and table 3.4 state the reformulations.
+
+    - l = u: x is known; its row sets no condition.
     - a finite l: x = l + z; only u finite: x = u - z, and the row changes its sign.
     - both finite: one more pair, s = u - l - z >= 0 with v >= 0 and y = w - v: M = [[A, I], [-I,
       0]], positive semi-definite if A is.
@@ -58,22 +63,28 @@ class LemkeForm:
 
     @classmethod
     def of(cls, data: DenseProblem) -> LemkeForm:
-        """Return the form of a boxed problem; of a sparse one whose rows all have a finite bound, too."""
+        """Return the form of a boxed problem.
+
+        A sparse problem must have a finite bound in each row.
+        """
         if scipy.sparse.issparse(data.A):
             return cls._of_narrow(data)
         A, lower, upper, n = data.A, data.lower, data.upper, len(data.b)
+        # x = base + columns z: `sign` is 1 for x = l + z and -1 for x = u - z.
         fixed = lower == upper
         below, above = np.isfinite(lower) & ~fixed, np.isfinite(upper) & ~fixed
         equations = np.flatnonzero(~below & ~above & ~fixed)
         sided = np.flatnonzero(below | above)
         base = np.where(np.isfinite(lower), lower, np.where(np.isfinite(upper), upper, 0.0))
         sign = np.where(below, 1.0, -1.0)[sided]
-        # columns: what z does to x; the rows of y are combined likewise
+        # Columns: the change of x with z; the rows of y are combined in the same way.
         columns = np.zeros((n, len(sided)))
         columns[sided, np.arange(len(sided))] = sign
         if len(sided) == n:
             M, q = sign[:, None] * A * sign, sign * (A @ base + data.b)
         elif len(equations):
+            # Eliminate the equations: x_E = -A_EE^-1 (b_E + A_EI x_I), which changes base and
+            # columns.
             block = A[np.ix_(equations, equations)]
             if 1 / np.linalg.cond(block) > REGULAR:
                 base[equations] = 0.0
@@ -82,6 +93,7 @@ class LemkeForm:
                 tests = columns[sided].T
                 M, q = tests @ (A @ columns)[sided], tests @ (A @ base + data.b)[sided]
             else:
+                # The block is singular: x_E = x+ - x- with both parts >= 0.
                 split = np.zeros((n, 2 * len(equations)))
                 split[np.r_[equations, equations], np.arange(2 * len(equations))] = np.repeat(
                     [1.0, -1.0], len(equations)
@@ -91,6 +103,7 @@ class LemkeForm:
         else:  # a choice of rows and columns with signs, no product of matrices
             M, q = sign[:, None] * A[np.ix_(sided, sided)] * sign, sign * (A @ base + data.b)[sided]
         both, m = np.flatnonzero((below & above)[sided]), len(q)
+        # Boxes: one more pair s = u - l - z >= 0.
         if len(both):
             k = len(both)
             pick = np.zeros((k, m))
@@ -104,8 +117,8 @@ class LemkeForm:
     def _of_narrow(cls, data: DenseProblem) -> LemkeForm:
         """Reformulate a sparse problem all of whose rows have a finite bound.
 
-        The row s = u - l - z follows that of its z at once, so that a matrix of bandwidth k becomes
-        one of 2 k + 1 at most.
+        The row s = u - l - z follows directly after that of its z, so that a matrix of bandwidth k
+        becomes one of bandwidth at most 2 k + 1.
         """
         below, n = np.isfinite(data.lower), len(data.b)
         both = np.flatnonzero(below & np.isfinite(data.upper))
@@ -134,12 +147,16 @@ class LemkeForm:
         return self.base + self.map @ z
 
 
-# bandwidth that is called narrow, and unknowns up to which a dense inverse costs no more
+# Largest bandwidth that counts as narrow, and number of unknowns up to which a dense inverse costs
+# no more.
 WIDEST, FEW = 3, 30
 
 
 def narrow_problem(problem: LCP) -> DenseProblem | None:
-    """Return a sparse problem of small bandwidth whose rows all have a finite bound and none has l = u, None if it is another one."""
+    """Return a narrow sparse problem, None if the problem is of another kind.
+
+    Its matrix has a small bandwidth, its rows have at least one finite bound, and l < u in all.
+    """
     A = problem.A
     if not isinstance(A, SparseOperator) or A.unknowns <= FEW or A.bandwidth > WIDEST:
         return None
@@ -148,21 +165,21 @@ def narrow_problem(problem: LCP) -> DenseProblem | None:
     return data if sided.all() else None
 
 
-# entries of the entering column below this part of its largest are no pivots (methods.md: 200 of
-# 200 with it)
+# Entries of the entering column below this part of its largest are no pivots (200 of 200 problems
+# are solved with it).
 PIVOT = 1e-10
-# relative difference of ratios that counts as a tie, which the lexicographic rule breaks
+# Relative difference of ratios that counts as a tie, which the lexicographic rule breaks.
 TIE = 1e-12
-# residual, relative to that of clip(0, l, u), beyond which an end of the path is no solution
+# Residual, relative to that of clip(0, l, u), beyond which an end of the path is no solution.
 NOISE = 1e-6
-# pivots, or an eighth of the rows if that is more, after which the inverse is computed afresh;
-# columns are refined between
+# Pivots, or an eighth of the rows if that is more, after which the inverse is recomputed; between,
+# columns are refined.
 PERIOD = 20
-# bounds of this size, in units in which A and b are near 1, are left out at first: beside them
-# ratios that differ tie
+# Bounds of this size, in units in which A and b are near 1, are omitted at first: beside them
+# ratios that differ tie.
 FAR = 1e8
-BEYOND = 1e100  # those of this size always are: products overflow
-# relative error of the entering column after refinement with which the inverse stays in use
+BEYOND = 1e100  # bounds of this size are always omitted: products overflow
+# Relative error of the entering column after refinement up to which the inverse stays in use.
 ACCEPTED = 1e-9
 
 
@@ -172,25 +189,24 @@ class Lemke(Settings):
 
     [Book] 2.1, appendix C; LCP of w - M z - d z0 = q.
 
-    z0 and the covering vector d > 0 make the start feasible; complements enter until z0 leaves. It
-    processes every problem with a copositive-plus matrix, positive semi-definite ones among them,
-    symmetric or not, and every P-matrix; for others it may end in a ray. A ray is believed only
-    when further covering vectors, random in [.5, 1.5], end in one too; the status is then
-    INFEASIBLE if multipliers prove that no x meets the inequalities (`certifies`), which they do
-    where A is positive semi-definite, else STAGNATED. On a bimatrix game, M = [[0, E], [F', 0]]
-    with E, F > 0 and q < 0, where every such d ends in a ray, it begins as Lemke and Howson's
-    method does.
+    z0 and the covering vector d > 0 make the start feasible; complements enter until z0 leaves. The
+    method solves every problem with a P-matrix or a copositive-plus matrix, such as a positive
+    semi-definite one, symmetric or not. For others it may end in a ray. A ray ends the solve only
+    if further covering vectors, random in [.5, 1.5], also end in one. The status is then INFEASIBLE
+    if multipliers prove that no x meets the inequalities (`certifies`), which they do where A is
+    positive semi-definite, else STAGNATED. On a bimatrix game, M = [[0, E], [F', 0]] with E, F > 0
+    and q < 0, every such d ends in a ray; there the start is that of Lemke and Howson's method.
 
-    Where all bounds are finite, there is a solution whatever A is, and after a ray d = 0 in the
-    rows s = u - l - z leads to one: on another ray (z', s', z0') those rows ask for z' = -s' = 0,
-    so that w' = v' + d z0'; where w' > 0, z = 0, so that s = u - l and v' = 0, which leaves w' = d
-    z0', the start's ray alone.
+    Where all bounds are finite, there is a solution for every A, and after a ray d = 0 in the rows
+    s = u - l - z leads to one. On another ray (z', s', z0') those rows require z' = -s' = 0, so
+    that w' = v' + d z0'. Where w' > 0, z = 0, so that s = u - l and v' = 0, which leaves w' = d
+    z0', the ray of the start alone.
 
-    Bounds far beyond the sizes of A and b count as infinite at first, and as they are if that leads
-    nowhere. Boxes add a pair of variables, equations are eliminated or, where their block is
-    singular, split (see LemkeForm). x0 is not used. A pivot costs O(m^2), m <= 2n, O(m) with a
-    matrix of bandwidth <= 3 whose rows all have a finite bound. A step is a
-    block of pivots; `linear_iterations` counts pivots.
+    Bounds that are very large compared with A and b are treated as infinite at first, and with
+    their values if that fails. Boxes add a pair of variables; equations are eliminated or, where
+    their block is singular, split (see LemkeForm). x0 is not used. A pivot costs O(m^2), m <= 2n,
+    or O(m) with a matrix of bandwidth <= 3 whose rows all have a finite bound. A step is a block of
+    pivots; `linear_iterations` counts pivots.
 
     Args:
         pivots_per_step: pivots in a step of the solve loop, which checks, records and counts steps;
@@ -199,7 +215,7 @@ class Lemke(Settings):
     """
 
     needs: ClassVar[str] = "n <= 4096; terminates for copositive-plus and P-matrices"
-    # the basis and its inverse take 134 MB each, four times that with boxes everywhere
+    # The basis and its inverse take 134 MB each, and four times that if all rows are boxes.
     most_unknowns: ClassVar[int] = 4096
 
     pivots_per_step: Count | None = None
@@ -221,9 +237,10 @@ class Lemke(Settings):
 
 
 class Basis:
-    """A complementary basis of w - M z - d z0 = q but for z0's pair, and its inverse.
+    """A complementary basis of w - M z - d z0 = q, and its inverse.
 
-    Variables are numbered w: 0 ... m-1, z: m ... 2m-1, z0: 2m.
+    Complementary except for the pair whose place z0 takes. Variables are numbered w: 0 ... m-1, z:
+    m ... 2m-1, z0: 2m.
 
     Args:
         M: shape (m, m).
@@ -239,19 +256,22 @@ class Basis:
         self.age = 0
 
     def _start(self, M: Any, q: np.ndarray, d: np.ndarray) -> None:
-        """Take the data; w is basic."""
+        """Set M, q and d; w is basic."""
         m = len(q)
         self.M, self.q, self.d, self.m = M, q, d, m
         self.variables, self.values = np.arange(m), q.copy()
-        # the lexicographic minimum of (q_i, e_i) / d_i leaves: of equal ratios the last, whose row
-        # has the later 1
+        # The row with the lexicographic minimum of (q_i, e_i) / d_i leaves: of equal ratios the
+        # last, whose row has the later 1.
         ratios = np.divide(q, d, out=np.full(m, np.inf), where=d > 0)
         self.row = int(np.flatnonzero(ratios <= ratios.min() + TIE * abs(ratios.min()))[-1])
-        # variables with which the path ends when they leave
+        # The path ends when one of these variables leaves.
         self.entering, self.ends = 2 * m, (2 * m, 2 * m)
 
     def pivot(self) -> bool | None:
-        """Let the entering variable in; True when z0 has left, False on a ray, None to go on."""
+        """Pivot on the entering variable.
+
+        True when the path has ended, False on a ray, None to go on.
+        """
         if self.entering < 0:  # the start is the solution
             return True
         first = self.entering == 2 * self.m
@@ -269,7 +289,7 @@ class Basis:
         return None
 
     def exchange(self, row: int, entering: int) -> None:
-        """Let a variable in at a row."""
+        """Pivot a variable into the basis at a row."""
         self.row, self.entering = row, entering
         self._replace(self._direction())
 
@@ -280,7 +300,7 @@ class Basis:
         return values[self.m : 2 * self.m]
 
     def refresh(self) -> None:
-        """Compute the inverse afresh, O(m^3)."""
+        """Recompute the inverse, O(m^3)."""
         self.age = 0
         try:
             self.inverse = np.asfortranarray(np.linalg.inv(self.matrix))
@@ -292,7 +312,7 @@ class Basis:
         return self.inverse[rows]
 
     def _column(self) -> np.ndarray:
-        """Return the entering variable's column."""
+        """Return the column of the entering variable."""
         if self.entering == 2 * self.m:
             return -self.d
         column = np.zeros(self.m)
@@ -306,6 +326,10 @@ class Basis:
         return z + self.inverse @ (r - self.matrix @ z)
 
     def _direction(self) -> np.ndarray:
+        """Return the entering column in the current basis, B^-1 c.
+
+        The inverse is recomputed if it is old, or if the residual of the result is too large.
+        """
         column = self._column()
         direction = self._solve(column)
         if (
@@ -317,15 +341,20 @@ class Basis:
         return direction
 
     def _leaving(self, direction: np.ndarray) -> int | None:
-        """Return the row of the lexicographic minimum ratio; z0 leaves whenever it may; None on a ray."""
+        """Return the row of the lexicographic minimum ratio, None on a ray.
+
+        z0 leaves whenever it may.
+        """
         rows = np.flatnonzero(direction > PIVOT * np.abs(direction).max())
         if not len(rows):
             return None
+        # Minimum ratio test with a tolerance for ties.
         ratios = np.maximum(self.values[rows], 0.0) / direction[rows]
         rows = rows[ratios <= ratios.min() + TIE * max(ratios.min(), np.abs(self.q).max())]
         ends = (self.variables[rows] == self.ends[0]) | (self.variables[rows] == self.ends[1])
         if ends.any():
             return int(rows[ends][0])
+        # Lexicographic rule: of tied rows those with the least B^-1 row, column by column.
         inverse = self._rows_of_inverse(rows) if len(rows) > 1 else None
         for column in range(self.m):
             if inverse is None or len(rows) == 1:
@@ -336,7 +365,11 @@ class Basis:
         return int(rows[direction[rows].argmax()])
 
     def _replace(self, direction: np.ndarray) -> None:
-        """Put the entering column into the leaving row's place."""
+        """Put the entering column in the place of the leaving row's.
+
+        A rank-1 update of the inverse: the leaving row is divided by the pivot, and its multiples
+        are subtracted from the others.
+        """
         row, others = self.row, direction.copy()
         self.matrix[:, row] = self._column()
         self.inverse[row] /= direction[row]
@@ -348,16 +381,19 @@ class Basis:
 
 
 class BandedBasis(Basis):
-    """The same basis of a sparse M of small bandwidth, its variables in the order of their pairs, factored at each pivot."""
+    """Basis of a sparse M of small bandwidth, factored at each pivot.
+
+    The variables are in the order of their pairs.
+    """
 
     def __init__(self, M: Any, q: np.ndarray, d: np.ndarray) -> None:
         self._start(M, q, d)
         self.factors = BandedFactors(M, d)
-        # the pair both of whose variables are out, once z0 is in
+        # The pair both of whose variables are nonbasic, once z0 is basic.
         self.missing, self.regular = -1, True
 
     def refresh(self) -> None:
-        """Nothing to do: factors are made at each pivot."""
+        """Do nothing: factors are computed at each pivot."""
 
     def _rows_of_inverse(self, rows: np.ndarray) -> np.ndarray:
         return self.factors.rows(rows) if self.missing >= 0 else np.eye(self.m)[rows]
@@ -370,7 +406,7 @@ class BandedBasis(Basis):
         return self._column() if self.missing < 0 else self.factors.solve(self._column())
 
     def _replace(self, direction: np.ndarray) -> None:
-        """Let the entering variable stand at its own pair, z0 at the pair of the leaving one."""
+        """Place the entering variable at its own pair, z0 at the leaving one's pair."""
         ended = self.variables[self.row] == 2 * self.m
         if self.missing >= 0:
             self.variables[self.missing] = self.entering
@@ -386,7 +422,9 @@ class BandedBasis(Basis):
 
 
 def strategies(M: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the unknowns of two players, None if this is no game.
+    """Return the unknowns of two players, None if the problem is no game.
+
+    A bimatrix game of costs has M = [[0, E], [F', 0]], E > 0, F > 0 and q < 0, in some order.
 
     A bimatrix game of costs has M = [[0, E], [F', 0]], E > 0, F > 0 and q < 0, in some order.
     """
@@ -408,12 +446,12 @@ def strategies(M: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray] | 
 def start_game(basis: Basis) -> bool:
     """Begin with the first player's first strategy; return False if this is no game.
 
-    w = q + M z. Lemke's z0, with d > 0, makes all w >= 0; the first complement that enters then
-    meets no row, as its block of M is 0: a ray. Lemke and Howson begin with z_k alone, as large as
-    makes w >= 0 for the other player, w_s = 0 there; then z_s, as large as makes w >= 0 for the
-    first one, w_r = 0 there. That is a feasible basis, complementary but for pair k: the solution
-    if r = k. Else z_r enters, and the path ends where a variable of pair k leaves; as E, F > 0, it
-    meets no ray.
+    w = q + M z. Lemke's z0, with d > 0, makes all w >= 0. No row blocks the first complement that
+    then enters, as its block of M is 0: a ray. Lemke and Howson's method begins with z_k alone, so
+    large that w >= 0 for the other player, w_s = 0 there; then z_s, so large that w >= 0 for the
+    first one, w_r = 0 there. That is a feasible basis, complementary except for pair k: the
+    solution if r = k. Else z_r enters, and the path ends where a variable of pair k leaves; as E, F
+    > 0, it does not end in a ray.
     """
     players = strategies(basis.M, basis.q)
     if players is None:
@@ -422,7 +460,7 @@ def start_game(basis: Basis) -> bool:
     entering = pair
     for rows in reversed(players):
         sizes = -basis.q[rows] / basis.M[rows, entering]
-        # of ties the last: the rows of the others stay lexicographically positive
+        # The last of equal sizes: the rows of the others stay lexicographically positive.
         row = int(rows[np.flatnonzero(sizes >= sizes.max())[-1]])
         basis.exchange(row, m + entering)
         entering = row
@@ -432,7 +470,7 @@ def start_game(basis: Basis) -> bool:
 
 
 class LemkeWorkspace(DenseWorkspace):
-    """The basis, the covering vectors tried and what they showed."""
+    """Workspace of the method: basis, covering vectors tried, rays met."""
 
     def __init__(self, problem: LCP, covering_vectors: int) -> None:
         super().__init__(problem)
@@ -449,7 +487,10 @@ class LemkeWorkspace(DenseWorkspace):
         return narrow_problem(self.problem) or super().read()
 
     def _widen(self) -> None:
-        """Begin again with a dense inverse: the banded factors are singular, which the basis need not be."""
+        """Begin again with a dense inverse.
+
+        The banded factors are singular, which the basis need not be.
+        """
         self.data = super().read()
         self._take()
 
@@ -462,7 +503,7 @@ class LemkeWorkspace(DenseWorkspace):
             (np.isfinite(one) & np.isinf(other)).any()
             for one, other in zip(given, (lower, upper), strict=True)
         )
-        # which a narrow form needs
+        # A narrow form needs a finite bound in each row.
         if scipy.sparse.issparse(scaled.A) and not (np.isfinite(lower) | np.isfinite(upper)).all():
             if self._keeps_far:
                 self._widen()
@@ -480,7 +521,7 @@ class LemkeWorkspace(DenseWorkspace):
         self._cover(np.ones(m))
 
     def pivot(self, count: int) -> int:
-        """Make at most `count` pivots; returns how many were made."""
+        """Make at most `count` pivots; return their number."""
         done = 0
         while done < count and self.ended is None and not time_is_up():
             if self.basis is None:
@@ -504,7 +545,10 @@ class LemkeWorkspace(DenseWorkspace):
         return self.basis.z() * (self._sizes[1] / self._sizes[0])
 
     def _cover(self, d: np.ndarray) -> None:
-        """Start with a covering vector, M and q scaled to 1; no basis is needed where z = 0 is the solution."""
+        """Start with a covering vector, M and q scaled to 1.
+
+        No basis is needed where z = 0 is the solution.
+        """
         M, q = self.form.M / self._sizes[0], self.form.q / self._sizes[1]
         made = BandedBasis if scipy.sparse.issparse(M) else Basis
         self.basis: Basis | None = made(M, q, d) if (q < 0).any() else None
@@ -512,11 +556,14 @@ class LemkeWorkspace(DenseWorkspace):
             start_game(self.basis)
 
     def _finish(self, z: np.ndarray) -> None:
-        """Write the solution, polished where x is between its bounds; one that is none is a ray in truth: a pivot was noise."""
+        """Write the solution, polished where x is between its bounds.
+
+        If x is no solution, a pivot was noise: the path counts as a ray.
+        """
         data = self.data
         x = np.clip(self.units * self.form.solution(z), data.lower, data.upper)
         size = 16 * EPS * self.units * np.abs(x / self.units).max()
-        if self._keeps_far or not isinstance(self.basis, BandedBasis):  # whose factors are fresh
+        if self._keeps_far or not isinstance(self.basis, BandedBasis):  # banded factors are fresh
             x = data.polished(x, (x - data.lower > size) & (data.upper - x > size))
         if self.basis is not None and not data.residual(x) <= NOISE * data.residual(
             np.clip(0.0, data.lower, data.upper)
@@ -527,7 +574,7 @@ class LemkeWorkspace(DenseWorkspace):
         self.ended = SolveStatus.STAGNATED
 
     def _ray(self) -> None:
-        """Try another covering vector, or say what the rays mean."""
+        """Try another covering vector, or set the status after the last."""
         if self.rays < self.covering_vectors:
             self.rays += 1
             d, pairs = self._random.uniform(0.5, 1.5, len(self.form.q)), self.form.pairs
@@ -535,7 +582,7 @@ class LemkeWorkspace(DenseWorkspace):
                 d[pairs] = 0.0
             self._cover(d)
             return
-        if self._has_far and not self._keeps_far:  # a solution may lie out there
+        if self._has_far and not self._keeps_far:  # a solution may lie beyond the omitted bounds
             self.rays, self._keeps_far = 0, True
             self._take()
             return

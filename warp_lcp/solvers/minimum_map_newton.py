@@ -1,4 +1,7 @@
-"""Newton's method on the minimum map: an active set, a linear solve on the free unknowns, a safeguard."""
+"""Newton's method on the minimum map.
+
+A step finds the active set, solves a linear system on the free unknowns, and is safeguarded.
+"""
 
 from __future__ import annotations
 
@@ -27,18 +30,20 @@ class MinimumMapNewton(NewtonSettings):
     at their bounds ([Book] 2.4.1).
 
     Unknown i is held where x_i - y_i / d_i, with the natural residual's d, is outside [l_i, u_i].
-    Cold, the first steps on a grid are projected multigrid cycles, which find the active set to
-    within a few cells; a Newton step alone moves its boundary by about a layer a step. Each Newton
-    correction is solved inexactly in the corrections' precision, and the step is shortened along
-    its projection onto the bounds if the residual would exceed the largest of the last `memory`
-    ones (Grippo, Lampariello, Lucidi 1986). On a large sparse matrix, an active set that creeps all
-    the same is moved by a problem on coarse points (Brandt and Cryer 1983) if A is nearly a
-    diagonally dominant M-matrix. Converges on a grid in a few steps; on other matrices A should be
-    a P-matrix. Where it is not, free blocks may be singular and steps fail: dense problems try
+    After a cold start on a grid, the first steps are projected multigrid cycles, which find the
+    active set to within a few cells; a Newton step alone moves its boundary by about one layer.
+    Each Newton correction is solved inexactly in the corrections' precision, and the step is
+    shortened along its projection onto the bounds if the residual would exceed the largest of the
+    last `memory` ones (Grippo, Lampariello, Lucidi 1986). If the active set of a large sparse
+    matrix still moves slowly and A is nearly a diagonally dominant M-matrix, a problem on coarse
+    points moves it (Brandt and Cryer 1983).
+
+    On a grid the method converges in a few steps; on other matrices A should be a P-matrix. Where
+    it is not, free blocks may be singular and steps may fail. Dense problems then try
     Levenberg-Marquardt steps of the minimum map and end with STAGNATED after 10 steps without
-    progress, others end with NON_DESCENT, or STAGNATED where steps repeat themselves; INFEASIBLE if
-    equations have no solution. `wl.solve` without a method goes on by other methods
-    (`wl.default_chain`).
+    progress. Others end with NON_DESCENT, or with STAGNATED where steps repeat themselves. The
+    status is INFEASIBLE if equations have no solution. `wl.solve` without a method continues with
+    other methods (`wl.default_chain`).
 
     Args:
         precision: "mixed": iterate float64, corrections float32; "double"; or "single": the iterate
@@ -54,8 +59,8 @@ class MinimumMapNewton(NewtonSettings):
         memory: number of last residuals whose maximum a step may not exceed (nonmonotone search).
         cycle: settings of multigrid cycles.
         direct: begin with whole steps that LAPACK solves on the host, for matrices of at most 200
-            unknowns or a bandwidth up to 3: what `default_method` chooses there. The steps above
-            take over where these lead nowhere.
+            unknowns or a bandwidth up to 3: chosen by `default_method` there. The steps above
+            take over where these fail.
         safeguard: True: as described above. False: the book's method alone, its Newton steps with
             Armijo's monotone search from the first to the last, and NON_DESCENT where no share of a
             step lowers the residual, as on some contacts ([Book] fig. C.2b).
@@ -90,12 +95,14 @@ class MinimumMapNewton(NewtonSettings):
         return NewtonWorkspace(problem, self, reduced_system(problem, self))
 
     def step(self, problem: LCP, work: NewtonWorkspace, x: wp.array[Any]) -> Step:
-        """Take a monotone cycle while the start is cold, else a Newton step."""
+        """Take a monotone cycle after a cold start, then Newton steps."""
         return work.step()
 
 
 class NewtonWorkspace:
-    """Memory of the method for one problem: the reduced system, and residuals of the last steps.
+    """Workspace of the method for one problem.
+
+    It holds the reduced system, and the residuals of the last steps.
 
     Args:
         problem: the problem.
@@ -103,9 +110,9 @@ class NewtonWorkspace:
         system: Newton's equations on the free unknowns.
 
     Attributes:
-        system: the reduced system at work; another one takes over where it leads nowhere.
-        iterate: x, its residual, and the best x so far, for all of them.
-        norms: residual norms where the last steps began; no step may exceed the largest.
+        system: the current reduced system; another one takes over where it fails.
+        iterate: x, its residual, and the best x so far, shared by all systems.
+        norms: residual norms at the start of the last steps; no step may exceed the largest.
     """
 
     def __init__(self, problem: LCP, settings: MinimumMapNewton, system: ReducedSystem) -> None:
@@ -115,27 +122,31 @@ class NewtonWorkspace:
         self.scratch = getattr(iterate, "scratch", None)
         self.keep, self.restore = iterate.keep, iterate.restore
         self.round_iterate, self.solution = iterate.round_iterate, iterate.solution
-        # 1 is Armijo's monotone search
+        # A memory of 1 is Armijo's monotone search.
         self.norms = deque[float](maxlen=settings.memory if settings.safeguard else 1)
 
     def start(
         self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
     ) -> None:
-        """Forget the last solve; the operator may have changed."""
+        """Reset the state of the last solve; the operator may have changed."""
         self.system = self._first
         self.norms.clear()
         self.system.start(warm=warm, tolerance=tolerance, floating=floating)
 
     def step(self) -> Step:
-        """Take a monotone cycle while the start is cold, else a Newton step."""
+        """Take a monotone cycle after a cold start, then Newton steps."""
         cycle = self.system.monotone_cycle()
         return self.newton_step() if cycle is None else cycle
 
     def newton_step(self) -> Step:
-        """Classify, restrict, solve on the free set, move with a safeguard."""
+        """Take a Newton step: classify, restrict, solve on the free set, move.
+
+        With F the free set, it solves A_FF e_F = -y_F after the held unknowns have moved onto their
+        bounds.
+        """
         system = self.system
         self.norms.append(self.residual.norm)
-        # unknown i is held where x_i - y_i / d_i is outside [l_i, u_i]; F are the others
+        # Unknown i is held where x_i - y_i / d_i is outside [l_i, u_i]; F is the set of the others.
         other = system.classify()
         if other is not None:
             self.norms.clear()
@@ -146,7 +157,10 @@ class NewtonWorkspace:
         return self.fall_back(0, math.inf, 1.0) if iterations is None else self.move(iterations)
 
     def move(self, iterations: int) -> Step:
-        """Go x + t e, projected, with t = 1, 1/2, ... until the residual is less than the largest of the last ones."""
+        """Move to clip(x + t e, l, u) with t = 1, 1/2, ... until the residual falls.
+
+        It must fall below the largest of the last norms, by DECREASE t of it.
+        """
         system, limit = self.system, max(self.norms)
         length, best, best_length = 1.0, math.inf, 1.0
         for _ in range(self.settings.backtracks + 1):
@@ -159,7 +173,10 @@ class NewtonWorkspace:
         return self.fall_back(iterations, best, best_length)
 
     def fall_back(self, iterations: int, best: float, best_length: float) -> Step:
-        """Go on where no step is found, or no length of it will do: by a step of another kind, or by another system."""
+        """Continue where there is no direction, or no length of it is accepted.
+
+        By a step of another kind, or by another system.
+        """
         found = self.system.fall_back(iterations, self.norms, best, best_length)
         if isinstance(found, Step):
             return found

@@ -1,4 +1,4 @@
-"""MPRGP with a preconditioner on the free set: conjugate gradients that know the bounds."""
+"""MPRGP: projected conjugate gradients with a preconditioner on the free set."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ SPLIT = KERNELS["mprgp.split"]
 SPLIT_KNOWN = KERNELS["mprgp.split_known"]
 RELEASE = KERNELS["mprgp.release"]
 GAIN = KERNELS["mprgp.gain"]
-SINGLE_SLACK = 1.2e-7  # a bound that float32 rounds is met within this part of it
-ENERGY_ROUNDING = 1e-12  # rises of the energy within this part of it are rounding
-# of the energy: falls of less, over as many steps as patience lasts, are what rounding its sum may
-# pretend
+SINGLE_SLACK = 1.2e-7  # relative distance within which a bound counts as met in float32
+ENERGY_ROUNDING = 1e-12  # relative rises of the energy up to this are rounding
+# Relative fall of the energy below which rounding of its sum may pretend a fall over as many steps
+# as the patience.
 NOISE = 1e-14
 
 
@@ -53,20 +53,21 @@ class MPRGP(Settings):
 
     It minimizes 1/2 x'Ax + b'x within the bounds (Dostal; Takahashi and Batty 2023).
 
-    Unknowns at a bound are held. While the part of the residual on them, the chopped gradient, is
-    small against the free part (||beta||^2 <= Gamma^2 phi~'phi), a step of conjugate gradients on
-    the free set, preconditioned there by one multigrid cycle, is projected: x = clip(x - alpha p).
-    If that meets no bound it was plain conjugate gradients and the direction is carried on; else
-    the preconditioner is rebuilt for the new set and the direction is reset. When the chopped
-    gradient is large, a step along it releases unknowns. Dostal's expansion by a half step and a
-    fixed step is replaced by the projected step: it needed over 8 times the work of a linear solve,
-    this one 1.5. Cold, the first steps on a grid are projected multigrid cycles.
+    Unknowns at a bound are held. The chopped gradient is the part of the residual on them. While it
+    is small compared with the free part (||beta||^2 <= Gamma^2 phi~'phi), a step is one of
+    conjugate gradients on the free set, preconditioned there by one multigrid cycle, and then
+    projected: x = clip(x - alpha p). If the projection meets no bound, the direction is kept for
+    the next step; otherwise the preconditioner is rebuilt for the new set and the direction is
+    reset. When the chopped gradient is large, a step along it releases unknowns. The projected step
+    replaces Dostal's expansion by a half step and a fixed step, which needed over 8 times the work
+    of a linear solve; the projected step needs 1.5 times. After a cold start on a grid, the first
+    steps are projected multigrid cycles.
 
-    On grids a projected cycle follows a step that its projection has spoiled, and `patience` steps
-    without a new least energy, as in `ProjectedMultigrid`; elsewhere a projected step that raises
-    the energy is halved. While steps lower the energy the stopping criteria's own patience does not
-    run out. `linear_iterations` counts monotone cycles and products with A: one a step, two if it
-    releases unknowns.
+    On grids a projected cycle follows a step that its projection has made worse, and also
+    `patience` steps without a new least energy, as in `ProjectedMultigrid`; elsewhere a projected
+    step that raises the energy is halved. While steps lower the energy, the patience of the
+    stopping criteria does not run out. `linear_iterations` counts monotone cycles and products with
+    A: one for each step, two if the step releases unknowns.
 
     Args:
         precision: "mixed": iterate float64, corrections float32; "double"; or "single": the iterate
@@ -80,7 +81,7 @@ class MPRGP(Settings):
     needs: ClassVar[str] = "A symmetric, positive semi-definite"
 
     precision: PrecisionName = "mixed"
-    monotone_cycles: CountOrZero = 1  # two cost as much as they save on splashes of 64^3 and 128^3
+    monotone_cycles: CountOrZero = 1  # on splashes of 64^3 and 128^3 two save no time
     gamma: Positive = 1.0
     patience: Count = 3
     cycle: CycleSettings = field(default_factory=CycleSettings)
@@ -96,12 +97,13 @@ class MPRGP(Settings):
     def init_after(self, problem: LCP, before: Any) -> MPRGPWorkspace:
         """Return a workspace with the preconditioner of the method before.
 
-        If that is a sparse matrix's. Raises as `init`.
+        Only a sparse matrix's is reused. Raises as `init`.
         """
         system = getattr(before, "system", None)
         return self._checked(problem, system if isinstance(system, SparseSystem) else None)
 
     def _checked(self, problem: LCP, system: SparseSystem | None) -> MPRGPWorkspace:
+        """Return a workspace if A is symmetric without negative diagonal entries."""
         if not problem.A.symmetric:
             raise ValueError(
                 "A is not symmetric: MPRGP minimizes an energy that exists only for a symmetric A; "
@@ -118,6 +120,9 @@ class MPRGP(Settings):
 
     def step(self, problem: LCP, work: MPRGPWorkspace, x: wp.array[Any]) -> Step:
         """Take a monotone cycle or a projected conjugate-gradient step.
+
+        Cycles come first, after a cold start. A proportioning step precedes the gradient step where
+        it is needed.
 
         Cycles come first, while the start is cold. A proportioning step precedes the gradient step
         where it is needed.
@@ -137,13 +142,15 @@ class MPRGP(Settings):
 
 
 class SplitResidual(NaturalResidual):
-    """The natural residual, with what decides on the next step: its parts, the free set, the right-hand side there, the chopped step.
+    """Natural residual with the data that choose the next step.
+
+    The norms of its parts, the free set, the right-hand side there, and the chopped step.
 
     Args:
         problem: the problem.
         r: stored field, receives the right-hand side -y / size on the free set.
         chopped_step: stored field like r, receives -residual / (A_ii size) on the held unknowns.
-        slack: an unknown within this part of a bound is at it.
+        slack: an unknown within this relative distance of a bound is at it.
 
     Attributes:
         free: stored uint8 field, 1 where an unknown is off its bounds.
@@ -189,11 +196,15 @@ class SplitResidual(NaturalResidual):
             self.size, self.norm = self._norm_of_b or 1.0, 0.0
 
     def norm_of_b(self) -> float:
-        """Return ||b|| over the unknowns, as it was when the solve began."""
+        """Return ||b|| over the unknowns, as it was at the start of the solve."""
         return self._norm_of_b
 
     def evaluate(self, x: wp.array[Any]) -> float:
-        """Compute the norm of the natural residual at x and what the attributes hold; on grids y is not stored."""
+        """Compute the norm of the natural residual at x, and all attributes.
+
+        One pass evaluates y = A x + b, the residual and its parts, the free set, g = -y / size on
+        it and the chopped step. On grids y is not stored.
+        """
         p = self.problem
         if 0 < self.norm < math.inf:
             self.size = self.norm
@@ -204,7 +215,7 @@ class SplitResidual(NaturalResidual):
             self.affine(x)
         else:
             self._stencil.wrap(x)
-        found = self._split.of(
+        sums = self._split.of(
             kernel,
             stencil=stencil,
             bounds=p.bounds.operands,
@@ -218,7 +229,7 @@ class SplitResidual(NaturalResidual):
             slack=self._slack,
         )
         square, self.chopped, self.reduced, self.release, moved, active, self.energy = (
-            float(v) for v in found
+            float(v) for v in sums
         )
         self.norm, self.current, self.active, self.moved = (
             float(np.sqrt(square)),
@@ -229,7 +240,10 @@ class SplitResidual(NaturalResidual):
         return self.norm
 
     def measure(self, finest: StencilLevel, p: wp.array[Any]) -> list[float]:
-        """Return z'Az, z'Ap, r'z and r'p, on a grid's finest level with its x = z and b = r."""
+        """Return z'Az, z'Ap, r'z and r'p on a grid's finest level.
+
+        The level's x is z, its b is r.
+        """
         engine.measuring(finest, p, self._split.partials).launch(wp.launch)
         self._split.add_up(0, columns=4)
         return [float(v) for v in self._split.scalars.numpy()[:4]]
@@ -241,7 +255,7 @@ class SplitResidual(NaturalResidual):
 
 
 class MPRGPWorkspace(IterateMemory):
-    """Memory of the method for one problem.
+    """Workspace of the method for one problem.
 
     Args:
         problem: the problem.
@@ -261,7 +275,7 @@ class MPRGPWorkspace(IterateMemory):
         self._fields = [problem.layout.zeros(wp.float64) for _ in range(2 if self.is_grid else 3)]
         self._best: wp.array[Any] = self._fields[0]
         self._p, self._q = zeros_like(z), zeros_like(z)
-        # a multigrid cycle leaves nothing of what was in z
+        # A multigrid cycle overwrites z completely.
         self._chopped = z if self.is_grid else zeros_like(z)
         slack = SINGLE_SLACK if precision is Precision.SINGLE else 0.0
         residual = SplitResidual(problem, self.preconditioner.r, self._chopped, slack=slack)
@@ -278,7 +292,7 @@ class MPRGPWorkspace(IterateMemory):
     def start(
         self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
     ) -> None:
-        """Forget the direction; the operator may have changed."""
+        """Reset the direction; the operator may have changed."""
         self.floating = floating
         self._cycles_left = (
             self.settings.monotone_cycles if self.is_grid and self.bounded and not warm else 0
@@ -294,7 +308,10 @@ class MPRGPWorkspace(IterateMemory):
         self.system.refresh()
 
     def sinks(self) -> bool:
-        """Return whether the energy has fallen beyond rounding since this was last so; on grids, whether the step before has lowered it."""
+        """Return whether the energy has fallen beyond rounding.
+
+        Since the last time that it had; on grids, whether the step before has lowered it.
+        """
         if self.is_grid:
             return self._descent.sinks
         sinks = self.residual.energy < self._lowest - NOISE * abs(self._lowest)
@@ -317,7 +334,7 @@ class MPRGPWorkspace(IterateMemory):
         return self._cycled
 
     def monotone_step(self, x: wp.array[Any]) -> Step:
-        """Projected cycle on all unknowns."""
+        """Take a projected cycle on all unknowns."""
         residual = self.residual
         self._cycles_left -= 1
         residual.moved, self._carry = True, False
@@ -329,13 +346,21 @@ class MPRGPWorkspace(IterateMemory):
         return Step("monotone cycle", 1, None)
 
     def proportion(self) -> bool:
-        """Step along the chopped gradient as far as the energy falls: it releases unknowns. False: it falls without end."""
+        """Step along the chopped gradient to the minimum of the energy.
+
+        The step releases unknowns. With the direction p = -residual / A_ii on the held unknowns its
+        length is -y'p / p'Ap, and on grids the right-hand side is updated by the same product A p.
+
+        Returns:
+            False: the energy is unbounded below along the direction.
+        """
         residual, direction = self.residual, self._chopped
         self._carry, self._released = False, True
         self._product(direction)
         curvature = residual.dot(direction, self._q)
         if not (self.is_grid and curvature > 0):
-            # where a step ends the residual writes another chopped step, and it may be taken again
+            # The residual at the end of a step writes another chopped step, and this one may be
+            # repeated.
             wp.copy(self._p, direction)
             return self._projected_step(self._p, residual.release, curvature)
         factor, target, p = residual.release / curvature, self._target(), self.problem
@@ -358,10 +383,13 @@ class MPRGPWorkspace(IterateMemory):
         return True
 
     def conjugate(self) -> bool:
-        """Precondition on the free set, make the direction conjugate to the last one if the set is the same, take the projected step.
+        """Take the projected step along a preconditioned conjugate direction.
+
+        The right-hand side is preconditioned on the free set. The direction is made conjugate to
+        the last one if the set is the same.
 
         Returns:
-            False: the energy falls without end along it.
+            False: the energy is unbounded below along the direction.
         """
         residual, M = self.residual, self.preconditioner
         if residual.moved:
@@ -373,7 +401,10 @@ class MPRGPWorkspace(IterateMemory):
         return self._grid_step() if self.is_grid else self._general_step()
 
     def _general_step(self) -> bool:
-        """Keep q = A p from step to step."""
+        """Take the step of any operator, with q = A p kept from step to step.
+
+        beta = -z'q / p'q of the last direction p, then p <- z + beta p.
+        """
         residual, M, beta = self.residual, self.preconditioner, 0.0
         if self._carry:
             beta = -residual.dot(M.z, self._q) / self._curvature
@@ -387,7 +418,10 @@ class MPRGPWorkspace(IterateMemory):
         return self._projected_step(self._p, gain, curvature)
 
     def _grid_step(self) -> bool:
-        """Sum the products of z and p in one pass over the grid, then make p and move x in another."""
+        """Take the step of a grid in two passes.
+
+        The first sums the products of z and p, the second computes p and moves x.
+        """
         residual, finest = self.residual, self.system.hierarchy.finest
         finest.stencil.wrap(finest.x)
         zaz, zap, gz, gp = residual.measure(finest, self._p)
@@ -413,11 +447,14 @@ class MPRGPWorkspace(IterateMemory):
         return True
 
     def _projected_step(self, direction: wp.array[Any], gain: float, curvature: float) -> bool:
-        """Move x along a direction to the minimum of the energy, projected; shorter where the projection makes the energy rise."""
+        """Move x to the energy's minimum along a direction, projected.
+
+        The step is halved where the projection raises the energy.
+        """
         residual = self.residual
         if curvature > 0:
             length = gain / curvature * residual.size
-        else:  # the energy falls without end: to the first bound
+        else:  # the energy is unbounded below: move to the first bound
             length = self._first_bound(direction) if gain > 0 else 0.0
             if not math.isfinite(length):
                 return False
@@ -433,13 +470,16 @@ class MPRGPWorkspace(IterateMemory):
         return True
 
     def _move(self, direction: wp.array[Any], length: float) -> wp.array[Any]:
-        """Step along a direction; returns where x was before."""
+        """Step along a direction; return the memory of the x before."""
         origin = self.x
         self._advance(origin, direction, length, self._target())
         return origin
 
     def _target(self) -> wp.array[Any]:
-        """Return memory for the next x: not the best iterate's, and not x's either where a step may be taken again."""
+        """Return memory for the next x, other than the best iterate's.
+
+        It is not x's own either where a step may be repeated.
+        """
         if self.is_grid and self.x is not self._best:
             return self.x
         return next(f for f in self._fields if f is not self._best and f is not self.x)
@@ -447,28 +487,31 @@ class MPRGPWorkspace(IterateMemory):
     def _advance(
         self, origin: wp.array[Any], direction: wp.array[Any], length: float, target: wp.array[Any]
     ) -> None:
-        """x = clip(origin + length direction, l, u)."""
+        """Compute x = clip(origin + length direction, l, u)."""
         projected_move(
             self.residual.rows, self.problem.bounds.operands, origin, direction, length, target
         )
         self._settle(target)
 
     def _settle(self, target: wp.array[Any]) -> None:
-        """Take what a step wrote as x."""
+        """Make the result of a step the current x."""
         self.x = target
         self._finish_move(self.x)
         self.residual.current = False
 
     def keep(self) -> None:
-        """Remember x as the best iterate: the next step goes to other memory."""
+        """Store x as the best iterate: the next step is written to other memory."""
         self._best = self.x
 
     def restore(self) -> None:
-        """Make the best iterate x again."""
+        """Set x to the best iterate."""
         self.x = self._best
 
     def _first_bound(self, direction: wp.array[Any]) -> float:
-        """Return how far the first bound is, on the host; inf if there is none. Semi-definite matrices ask for it now and then."""
+        """Return the distance to the first bound along a direction; inf without one.
+
+        Computed on the host. Semi-definite matrices need it occasionally.
+        """
         p, at = direction.numpy().astype(np.float64), self.x.numpy()
         lower, upper = self.problem.lower.numpy(), self.problem.upper.numpy()
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -476,7 +519,7 @@ class MPRGPWorkspace(IterateMemory):
         return float(gaps.min())
 
     def _product(self, direction: wp.array[Any]) -> None:
-        """q = A times a direction."""
+        """Compute q = A times a direction."""
         A, shape = self.problem.A, self.problem.layout.stored_shape
         if self.is_grid:
             A.stencil.product(direction, self._q)  # type: ignore[attr-defined]
@@ -485,12 +528,12 @@ class MPRGPWorkspace(IterateMemory):
 
 
 def _preconditioner(problem: LCP, real: Any, cycle: CycleSettings, system: Any) -> tuple[Any, Any]:
-    """Return the principal system and what preconditions it."""
-    # its own system is solved directly: that would be an active-set method
+    """Return the principal system and its preconditioner."""
+    # A dense matrix's own system is solved directly, which would be an active-set method.
     if system is None and isinstance(problem.A, DenseOperator):
         system = DiagonalSystem(problem)
     elif system is None and isinstance(problem.A, SparseOperator):
-        # narrow ones too, for the same reason
+        # Narrow matrices too, for the same reason.
         system = SparseSystem(problem.A, real)
     elif system is None:
         system = principal_system(problem, real, bounded=problem.bounded, settings=cycle)

@@ -1,4 +1,7 @@
-"""The nonsmooth nonlinear conjugate gradient method: Fletcher-Reeves on what projected Gauss-Seidel takes away."""
+"""Nonsmooth nonlinear conjugate gradient method (NNCG).
+
+Fletcher-Reeves directions from the changes of projected Gauss-Seidel sweeps.
+"""
 
 from __future__ import annotations
 
@@ -30,15 +33,15 @@ class NNCG(Settings):
 
     [Book] 2.2.6, algorithm 8; Silcowitz-Hansen et al. 2010.
 
-    The change of a sweep is taken for the negative gradient, g = x - PGS(x), of a function whose
-    minimum is the sweep's fixed point. With beta = |g|^2 / |g before|^2: x <- PGS(x) + beta p and p
-    <- beta p - g without a line search; where beta > 1, p <- 0 and x <- PGS(x). Unlike algorithm 8,
-    x is projected onto the bounds after the move along p, so that iterates stay feasible; where
-    bounds are affine in x, the unknowns that they depend on first: friction held at its limit by
-    bounds before the move costs most of the acceleration (a box on others a thousand times lighter,
-    5,000 sweeps: 3e-3 of the first residual in place of 4e-11). No proof of convergence. On 64^3
-    cells to 1e-6 it took 250 sweeps where omega = 1 took 3,900, and the best omega, 1.9, 150 to
-    200.
+    The change of a sweep is the negative gradient, g = x - PGS(x), of a function whose minimum is
+    the sweep's fixed point. With beta = |g|^2 / |g_old|^2: x <- PGS(x) + beta p and p <- beta p - g
+    without a line search; where beta > 1, p <- 0 and x <- PGS(x). Unlike algorithm 8, x is
+    projected onto the bounds after the move along p, so that iterates stay feasible. Where bounds
+    are affine in x, the unknowns that they depend on are projected first: if friction kept the
+    bounds from before the move, most of the acceleration would be lost (a box on others a thousand
+    times lighter, 5,000 sweeps: 3e-3 of the first residual instead of 4e-11). There is no proof of
+    convergence. On 64^3 cells to 1e-6 it took 250 sweeps; projected Gauss-Seidel took 3,900 with
+    omega = 1, and 150 to 200 with the best omega, 1.9.
 
     Args:
         direction: of its sweeps, "forward", "backward" or "symmetric".
@@ -67,7 +70,7 @@ class NNCG(Settings):
         return work
 
     def step(self, problem: LCP, work: NNCGWorkspace, x: wp.array[Any]) -> Step:
-        """Sweep and move on along the last direction."""
+        """Sweep, then move along the last direction."""
         wp.copy(work.g, x)
         for forward in DIRECTIONS[self.direction]:
             work.sweep.run(x, forward=forward)
@@ -76,7 +79,7 @@ class NNCG(Settings):
 
 
 class NNCGWorkspace(SweepWorkspace):
-    """Memory of the method.
+    """Workspace of the method.
 
     Attributes:
         g: stored field, x before the sweep, then the gradient.
@@ -94,13 +97,17 @@ class NNCGWorkspace(SweepWorkspace):
         self._sums = Sums(rows_of(self.x), slots=2)
 
     def start(self, *, warm: bool, tolerance: float) -> None:
-        """Forget the direction; the operator may have changed."""
+        """Reset the direction; the operator may have changed."""
         super().start(warm=warm, tolerance=tolerance)
         self._sums.scalars.zero_()
         self.p.zero_()
 
     def advance(self, x: wp.array[Any]) -> None:
-        """Move x, which a sweep has just moved, along p, and turn p."""
+        """Move x after a sweep along p, and update p.
+
+        g = x_before - x; beta = |g|^2 / |g_old|^2; x <- clip(x + beta p), p <- beta p - g, or both
+        restart where beta > 1. Both squares stay on the device.
+        """
         p, sums, unknown = self.problem, self._sums, self.problem.unknown
         sums.of(TAKEN, x=x, g=self.g, unknown=unknown)
         bounds = p.bounds.operands if p.bounds.affine is None else self._constant

@@ -1,4 +1,7 @@
-"""The penalty method: unknowns beyond a bound are pushed back by a stiff spring; Newton's method on that is policy iteration."""
+"""Penalty method: stiff springs replace the bounds.
+
+Newton's method on the penalized equations is policy iteration.
+"""
 
 from __future__ import annotations
 
@@ -25,14 +28,14 @@ from warp_lcp.settings import Positive, Share
 KERNELS = KernelFile(Path(__file__).parent / "headers/penalty.h")
 MOVE = KERNELS["penalty.move"]
 SORT = KERNELS["penalty.sort"]
-# residual over the springs' error from which on something else is to be mended; |A D^-1| <= 2 on
-# grids
+# Ratio of the residual to the springs' error from which other errors dominate; |A D^-1| <= 2 on
+# grids.
 DOMINANT = 4.0
 SHARE = 0.1  # of the tolerance that the penalty's own error may take
-LEAST_RAISE = 10.0  # factor by which rho grows at least
-# rho, beyond which float64 does not see the violation of an unknown of its bound's size
+LEAST_RAISE = 10.0  # least factor by which rho grows
+# Largest rho: beyond it float64 cannot represent the violation of an unknown of its bound's size.
 LARGEST = 1e12
-EARLY = 10  # steps in which the set may wander while the residual rises
+EARLY = 10  # steps in which the set may change while the residual rises
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,19 +45,19 @@ class Penalty(NewtonSettings):
     It replaces the bounds by springs and solves the piecewise linear equations.
 
     The equations are A z + b + rho D (min(z - l, 0) + max(z - u, 0)) = 0, D the diagonal of the
-    natural residual's d. With V the unknowns beyond a bound, a step is Newton's: (A + rho D_V) z+ =
-    -b + rho D_V g, g the bound that is passed. It depends on V alone, so it starts from x = clip(z,
-    l, u), where its right-hand side is -(A x + b): nothing cancels however large rho is. On grids
-    it is solved by conjugate gradients with a multigrid cycle on A + rho D_V. With an M-matrix and
+    natural residual's d. With V the unknowns that violate a bound, a step is Newton's: (A + rho
+    D_V) z+ = -b + rho D_V g, g the violated bound. It depends on V alone, so it starts from x =
+    clip(z, l, u), where its right-hand side is -(A x + b): no terms cancel for any rho. On grids it
+    is solved by conjugate gradients with a multigrid cycle on A + rho D_V. With an M-matrix and
     bounds on one side the equations are concave or convex: from the second step on z moves off the
     bounds, V shrinks, and is found after finitely many steps. Elsewhere V may cycle, and the solve
     ends with STAGNATED or MAX_ITERATIONS.
 
-    The error: where y > 0, z is below its bound by y / (rho d), and neighbors solve their equations
-    with that z. What is returned is x = clip(z, l, u), whose natural residual is O(1 / rho): about
-    |A D^-1 y_V| / rho. The solve is judged by it. Where V stays, or that error is most of the
-    residual, and it is more than a tenth of the tolerance, rho grows in proportion, once as a rule,
-    up to 1e12.
+    The error of the method: where y > 0, z is below its bound by y / (rho d), and neighbors solve
+    their equations with that z. The result is x = clip(z, l, u), and the criteria are checked on
+    its natural residual, which is O(1 / rho): about |A D^-1 y_V| / rho. rho is raised in
+    proportion, as a rule once, up to 1e12, where V stays or that error is most of the residual, and
+    the error is more than a tenth of the tolerance.
 
     `linear_iterations` counts iterations on the finest grid, factorizations where A is dense.
 
@@ -96,12 +99,12 @@ class Penalty(NewtonSettings):
 
 
 class PenaltyWorkspace(IterateMemory):
-    """Memory of the method for one problem.
+    """Workspace of the method for one problem.
 
     Attributes:
-        rho: stiffness as it is now, in units of d.
-        side: stored int8 field; the bound that each unknown is beyond, -1 the lower and 1 the upper
-            one, else 0.
+        rho: current stiffness, in units of d.
+        side: stored int8 field; the bound that each unknown is beyond: -1 the lower, 1 the upper,
+            else 0.
     """
 
     def __init__(self, problem: LCP, settings: Penalty) -> None:
@@ -132,7 +135,7 @@ class PenaltyWorkspace(IterateMemory):
     def start(
         self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
     ) -> None:
-        """Forget the set and the last stiffness; the operator may have changed."""
+        """Reset the set and the last stiffness; the operator may have changed."""
         self.floating = floating
         s = self.settings
         self.cycles_left = (
@@ -148,43 +151,54 @@ class PenaltyWorkspace(IterateMemory):
             self.cold_start.start(warm=warm, tolerance=tolerance, floating=floating)
 
     def monotone_step(self) -> Step:
-        """Projected multigrid cycle on all unknowns."""
+        """Take a projected multigrid cycle on all unknowns."""
         assert self.cold_start is not None
         return self.cold_start.monotone_step()
 
     def policy_step(self, x: wp.array[Any]) -> Step:
-        """Solve with a penalty on the unknowns beyond their bounds, then update that set."""
+        """Solve with a penalty on the unknowns beyond their bounds; update that set.
+
+        With V that set, (A + rho D_V) e = -(A x + b) / size from x = clip(z, l, u), and z = x +
+        size e. Springs are then updated at z, and z is projected onto the bounds.
+        """
         s, p = self.settings, self.problem
         first = self.steps == 0
         if first:
             self.residual.affine(x)
         if first or self._raise():
+            # The first step finds the springs at x; a larger rho keeps them.
             self._sort(x, first=first, keep=not first)
             self.residual.affine(x)  # unknowns within y / (rho d) of a bound are on it now
             self._stale = True
         self.steps += 1
         if self._stale:
             self.system.restrict(self._free, self._shift)
+        # (A + rho D_V) e = -(A x + b) / size; the solve is more accurate once V has stayed.
         settled, size = self._moved == 0, max(self.residual.norm, 1e-300)
         self._sums.of(ON_FREE, y=self.residual.y, free=self._free, g=self.system.r, scale=1 / size)
-        if self.floating is not None:  # what is singular: components without springs
+        if self.floating is not None:  # the singular part: components without springs
             self.floating.project(self.system.r, self._inside)
         factor = max(s.eta**2 if settled else s.eta, 0.3 * SHARE * self.target / size)
         norm = self.system.norm()
         iterations = self.system.solve(factor * norm, s.max_linear_iterations)[0] if norm > 0 else 0
+        # z = x + size e; then y at z, the springs of the next step, and x = clip(z, l, u).
         MOVE.bind(
             self._sums.rows, x=x, e=self.system.e, unknown=p.unknown, side=self.side, size=size
         ).launch()
         self.residual.affine(x)
         active = self._sort(x)
         self._finish_move(x)
-        # which writes y; the grid's own evaluation leaves it out
+        # This writes y, which the grid's own evaluation does not store.
         NaturalResidual.evaluate(self.residual, x)
         self._stale = self._moved > 0
         return Step("policy", iterations, active, interim=self._stale and self.steps <= EARLY)
 
     def _raise(self) -> bool:
-        """Stiffen the springs where their error is most of the residual and beyond its share of the tolerance; return whether they are."""
+        """Stiffen the springs where their error dominates; return whether it did.
+
+        Their error must be most of the residual and more than its share of the tolerance. rho grows
+        by the ratio of the two.
+        """
         allowed = SHARE * self.target
         settled = self._moved == 0 or self.residual.norm <= DOMINANT * self._excess
         if not settled or not self._excess > allowed > 0 or self.rho >= LARGEST:
@@ -193,11 +207,11 @@ class PenaltyWorkspace(IterateMemory):
         return True
 
     def _sort(self, x: wp.array[Any], *, first: bool = False, keep: bool = False) -> int:
-        """Find the springs of the next step at z, project it onto the bounds, and return how many springs there are.
+        """Update the springs at z, project z onto the bounds; return their number.
 
         A spring stays if z is still beyond its bound. Its row of the step says z - g = -y / (rho
-        d), so that y has the sign that matters; the solution of the linear solve has not, which
-        knows no sizes below its tolerance.
+        d), so that the sign of y decides. The solution of the linear solve has no reliable sign
+        there, because it is smaller than the tolerance of the solve.
         """
         p, r = self.problem, self.residual
         moved, active, square = self._sums.of(

@@ -1,4 +1,7 @@
-"""The primal-dual active set method: Newton's method on the minimum map with full steps, watched for cycles."""
+"""Primal-dual active set method with detection of cycles.
+
+It is Newton's method on the minimum map with full steps.
+"""
 
 from __future__ import annotations
 
@@ -24,12 +27,12 @@ from warp_lcp.reduced.settings import NewtonSettings
 from warp_lcp.settings import Share
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
 
-LOWER, FREE, UPPER = -1, 0, 1  # where least-index pivoting has an unknown
-STUCK = 2  # steps on one set that leave the residual where it is: its free block is singular
-PIVOTS = 50  # least-index pivots, in units of the unknowns, after which A is taken for no P-matrix
-# growth of the residual beyond what whole steps on regular blocks cause (5e5 on a grid of 1000^2)
+LOWER, FREE, UPPER = -1, 0, 1  # places of an unknown in least-index pivoting
+STUCK = 2  # steps on one set that do not reduce the residual: its free block is singular
+PIVOTS = 50  # least-index pivots per unknown after which A counts as no P-matrix
+# Growth of the residual beyond that of whole steps on regular blocks (5e5 on a grid of 1000^2).
 BLOWN = 1e7
-SLACK = 1e-12  # of the largest magnitudes of x and y: violations below it are rounding
+SLACK = 1e-12  # relative to the largest |x| and |y|: smaller violations are rounding
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,14 +42,17 @@ class PrimalDualActiveSet(NewtonSettings):
     It guesses the active set from x and y, solves for the rest, and repeats until the guess stays.
 
     With the natural residual's d, unknown i is held at l_i if x_i - y_i / d_i < l_i, at u_i if it
-    is above, else free: y_i = 0 there. This is MinimumMapNewton's step without search or
-    projection, and shares its implementation. Started anywhere it ends after finitely many steps if
-    A is an M-matrix; on other P-matrices it may cycle. If a set recurs without a smaller residual,
-    dense problems continue by least-index principal pivoting (Murty 1974; with bounds Judice and
-    Pires), which is finite for every P-matrix but may be slow; others end with STAGNATED. So does a
-    solve that meets a singular free block (never in a P-matrix): its set stays while the residual
-    does not fall, the residual grows by 1e7, or the block's condition number exceeds 1e12. Cold,
-    the first steps on a grid are projected multigrid cycles.
+    is above u_i, else it is free: y_i = 0. This is MinimumMapNewton's step without search or
+    projection, and shares its implementation. If A is an M-matrix, the method ends after finitely
+    many steps from any start; on other P-matrices it may cycle. If a set recurs without a smaller
+    residual, dense problems continue by least-index principal pivoting (Murty 1974; with bounds
+    Judice and Pires), which is finite for every P-matrix but may be slow; others end with
+    STAGNATED.
+
+    A solve also ends with STAGNATED where a free block is singular, which never occurs in a
+    P-matrix: the set stays while the residual does not fall, the residual grows by 1e7, or the
+    block's condition number exceeds 1e12. After a cold start on a grid, the first steps are
+    projected multigrid cycles.
 
     `linear_iterations` counts as in MinimumMapNewton; a least-index pivot counts one.
 
@@ -60,7 +66,7 @@ class PrimalDualActiveSet(NewtonSettings):
         max_linear_iterations: maximum number of conjugate-gradient iterations of one step.
         cycle: settings of multigrid cycles.
         stop_if_singular: end with STAGNATED where a free block is singular; False: pivot on by
-            least squares, for matrices that are regular but for rounding.
+            least squares, for matrices that only rounding makes singular.
     """
 
     needs: ClassVar[str] = "M-matrix, or P-matrix where dense"
@@ -85,20 +91,20 @@ class PrimalDualActiveSet(NewtonSettings):
         return ActiveSetWorkspace(problem, self.as_newton(), stop_if_singular=self.stop_if_singular)
 
     def step(self, problem: LCP, work: ActiveSetWorkspace, x: wp.array[Any]) -> Step:
-        """Take a monotone cycle while the start is cold, else a full step.
+        """Take a monotone cycle after a cold start, then full steps.
 
-        Least-index pivots after a recurring set.
+        Least-index pivots follow a recurring set.
         """
         return work.step()
 
 
 class ActiveSetWorkspace(NewtonWorkspace):
-    """Memory of the method for one problem.
+    """Workspace of the method for one problem.
 
     Attributes:
-        places: where least-index pivoting has each unknown (LOWER, FREE, UPPER); None before a
-            cycle is met.
-        cycled: whether a set has come again.
+        places: LOWER, FREE or UPPER of each unknown in least-index pivoting; None before the first
+            cycle.
+        cycled: whether a set has recurred.
         first: the residual's norm before the first step.
     """
 
@@ -115,26 +121,32 @@ class ActiveSetWorkspace(NewtonWorkspace):
     def start(
         self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
     ) -> None:
-        """Forget the sets; the operator may have changed."""
+        """Reset the sets; the operator may have changed."""
         super().start(warm=warm, tolerance=tolerance, floating=floating)
         self._target = tolerance
-        self._seen: dict[bytes, float] = {}  # residuals at the sets met
+        self._seen: dict[bytes, float] = {}  # residual norms by fingerprint of the active set
         self._last, self._moved, self._stuck, self._pivots = b"", True, 0, 0
         self.cycled, self.places, self.first = False, None, 0.0
         self._unbounded = Bounds(self.problem.layout, *INFINITE).operands
 
     def newton_step(self) -> Step:
-        """Classify, solve on the free set, take the whole step; a least-index one after a cycle."""
+        """Classify, solve on the free set, take the whole step.
+
+        After a cycle: least-index pivots.
+        """
         if self.places is not None:
             return self.least_index_step(self.x)
         step = super().newton_step()
-        held = step.linear_iterations == 0 and step.failure is None  # every unknown is
+        held = step.linear_iterations == 0 and step.failure is None  # all unknowns are held
         if held and self._cycles(self.x) and isinstance(self.problem.A, DenseOperator):
             return self.least_index_step(self.x)
         return step
 
     def move(self, iterations: int) -> Step:
-        """Take the whole step, without a search: the base class has classified, and solved on the free set."""
+        """Take the whole step, without a search.
+
+        The base class has classified the unknowns and solved on the free set.
+        """
         p, x, system = self.problem, self.x, self.system
         cycles, step = self._cycles(x), replace(system.accept(iterations), name="active set")
         if self._stops and self._stuck >= STUCK:
@@ -145,24 +157,27 @@ class ActiveSetWorkspace(NewtonWorkspace):
             return replace(step, failure=SolveStatus.STAGNATED)
         if self._watched:
             wp.copy(system.start_of_step, x)
-        # within rounding of the bounds at the end
+        # At the end x is within rounding of the bounds.
         bounds = self._unbounded if self._moved else p.bounds.operands
         projected_move(system.sums.rows, bounds, x, system.principal.e, system.size, x)
         system.settle()
         self.round_iterate()
         norm = self.residual.evaluate(x)
-        if self._watched and not norm <= BLOWN * self.first:  # the free block is all but singular
+        if self._watched and not norm <= BLOWN * self.first:  # the free block is nearly singular
             wp.copy(x, system.start_of_step)
             self.residual.evaluate(x)
             return replace(step, failure=SolveStatus.STAGNATED)
-        if norm <= self._target:  # x may miss its bounds by what the criteria allow
+        if norm <= self._target:  # x may violate its bounds by what the criteria allow
             self.residual.start(x, keep=True)
             self.round_iterate()
-        # whole steps may first take the residual up
+        # Whole steps may first raise the residual.
         return replace(step, interim=step.interim or (self._watched and self._moved))
 
     def _cycles(self, x: wp.array[Any]) -> bool:
-        """Return whether the set has come again, now or before, without a residual much smaller than then."""
+        """Return whether the active set has recurred, now or before.
+
+        A recurrence counts unless the residual has fallen by half since.
+        """
         key, norm = self._fingerprint(x), self.norms[-1]
         self.first = self.first or norm
         self._moved, self._last = key != self._last, key
@@ -174,7 +189,7 @@ class ActiveSetWorkspace(NewtonWorkspace):
         return self.cycled
 
     def _fingerprint(self, x: wp.array[Any]) -> bytes:
-        """Return what tells a set, with its bounds, from others."""
+        """Return a hash that identifies an active set."""
         free = self.system.free.numpy() != 0
         at_upper = ~free & (x.numpy() == self.problem.upper.numpy())
         return hashlib.blake2b(
@@ -182,12 +197,15 @@ class ActiveSetWorkspace(NewtonWorkspace):
         ).digest()
 
     def least_index_step(self, x: wp.array[Any]) -> Step:
-        """Some pivots of the first unknown that violates its condition; interim until none does."""
-        own = DenseProblem.read(self.problem)
-        data, units = own.scaled()
+        """Take least-index pivots: the first violating unknown changes its place.
+
+        The step is interim until no condition is violated.
+        """
+        problem = DenseProblem.read(self.problem)
+        data, units = problem.scaled()
         if self.places is None:
-            free, at = self.system.free.numpy()[own.rows] != 0, x.numpy()[own.rows]
-            self.places = np.where(free, FREE, np.where(at == own.upper, UPPER, LOWER))
+            free, at = self.system.free.numpy()[problem.rows] != 0, x.numpy()[problem.rows]
+            self.places = np.where(free, FREE, np.where(at == problem.upper, UPPER, LOWER))
         pivots, most = 0, pivots_of(None, len(data.b)) * 8
         values, violated, singular = _basic_solution(data, self.places)
         while (
@@ -201,10 +219,10 @@ class ActiveSetWorkspace(NewtonWorkspace):
         if not np.isfinite(values).all() or (lost and violated.size):  # A is no P-matrix
             return Step("least index", pivots, None, SolveStatus.STAGNATED)
         stored = x.numpy().copy()
-        stored[own.rows] = units * np.clip(values, data.lower, data.upper)
+        stored[problem.rows] = units * np.clip(values, data.lower, data.upper)
         x.assign(stored)
         self.round_iterate()
-        # counts only if the criteria are not met by rounding
+        # Counts only if rounding keeps the criteria from being met.
         failure = None if violated.size else SolveStatus.STAGNATED
         return Step(
             "least index",
@@ -216,7 +234,11 @@ class ActiveSetWorkspace(NewtonWorkspace):
 
 
 def _basic_solution(data: DenseProblem, places: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Return x with y = 0 on the free unknowns and the others at their bounds, what violates its condition, and if x is not unique."""
+    """Return the basic solution of the places, its violations, and singularity.
+
+    x has y = 0 on the free unknowns and its bounds on the others. The violations are indices of the
+    unknowns whose conditions do not hold. The last value says whether x is not unique.
+    """
     singular = False
     x = np.where(places == LOWER, data.lower, np.where(places == UPPER, data.upper, 0.0))
     free = np.flatnonzero(places == FREE)
@@ -239,7 +261,7 @@ def _basic_solution(data: DenseProblem, places: np.ndarray) -> tuple[np.ndarray,
 
 
 def _other_place(data: DenseProblem, places: np.ndarray, x: np.ndarray, i: int) -> int:
-    """Return where a violating unknown goes."""
+    """Return the new place of a violating unknown."""
     if places[i] != FREE:
         return FREE
     return LOWER if x[i] < data.lower[i] else UPPER

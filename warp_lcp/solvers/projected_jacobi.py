@@ -1,4 +1,4 @@
-"""Projected Jacobi: all unknowns at once, from the same iterate."""
+"""Projected Jacobi method: update all unknowns from the same iterate."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from warp_lcp.sweeps.spectrum import scaled_spectrum
 from warp_lcp.sweeps.sweep_kernels import jacobi_kernel
 
 STEPS = 20  # of Lanczos' method
-# of the 2 / lambda_max at which Jacobi's method stops converging; Lanczos sees lambda_max from
-# below
+# Part of 2 / lambda_max, the limit of convergence of Jacobi's method; Lanczos' method estimates
+# lambda_max from below.
 SHARE = 1.8
 
 
@@ -27,16 +27,16 @@ class ProjectedJacobi(Settings):
 
     [Book] 2.2.1, table 2.1 and eq. 2.63 with M = D / omega.
 
-    x <- clip(x - omega D^-1 (A x + b), l, u). Converges for symmetric positive definite A and 0 <
-    omega < 2 / lambda_max(D^-1 A), which the book's omega = 1 exceeds for many matrices; the test
-    of algorithm 4 then says DIVERGED (see `Contraction`). About half as fast as projected
-    Gauss-Seidel, but the same in every order, and no slower on a GPU. Zero and negative diagonals
-    as in ProjectedSOR. Works with any operator, and with bounds affine in x, which are those at the
-    last x.
+    x <- clip(x - omega D^-1 (A x + b), l, u). The method converges for symmetric positive definite
+    A and 0 < omega < 2 / lambda_max(D^-1 A). The book's omega = 1 is too large for many matrices;
+    the test of algorithm 4 then returns DIVERGED (see `Contraction`). It is about half as fast as
+    projected Gauss-Seidel, but its result does not depend on the order of the unknowns, so that it
+    is no slower on a GPU. Zero and negative diagonals are treated as in ProjectedSOR. It works with
+    any operator, and with bounds affine in x, which are evaluated at the last x.
 
     Args:
         omega: damping > 0; min(1, 1.8 / lambda_max), estimated, if None. Without symmetry,
-            lambda_max is that of A's symmetric part, which promises nothing; with a negative
+            lambda_max is that of A's symmetric part, which guarantees nothing; with a negative
             diagonal entry, 1.
         precision: "mixed" or "double" keep the iterate in float64, "single" rounds it to float32.
     """
@@ -61,7 +61,7 @@ class ProjectedJacobi(Settings):
         return work
 
     def step(self, problem: LCP, work: JacobiWorkspace, x: wp.array[Any]) -> Step:
-        """Pass once over the unknowns; y is that of the residual."""
+        """Update all unknowns once; y is that of the residual."""
         r = work.residual
         inputs = [work.d, r.unit, r.y, problem.lower, problem.upper, problem.unknown, work.omega, x]
         wp.launch(jacobi_kernel(work.d.dtype), x.size, inputs, device=problem.device)
@@ -70,7 +70,7 @@ class ProjectedJacobi(Settings):
 
 
 class JacobiWorkspace(SweepWorkspace):
-    """Memory of the method.
+    """Workspace of the method.
 
     Attributes:
         omega: the damping in use.
@@ -85,11 +85,11 @@ class JacobiWorkspace(SweepWorkspace):
         self.omega = settings.omega or 1.0
 
     def start(self, *, warm: bool, tolerance: float) -> None:
-        """Estimate the damping where the operator is new."""
+        """Estimate the damping if the operator is new."""
         self.d, version = self.diagonal.field(), version_of(self.problem.A)
         if self._given is None and version != self._version:
             self.omega = self._estimate()
-            self._version = version  # last: time may be up before
+            self._version = version  # last: the time limit may end the estimate before
         self.contraction.start(self.x)
 
     def _estimate(self) -> float:

@@ -1,4 +1,7 @@
-"""Multigrid for grid LCPs at the price of a linear solve: monotone cycles, then truncated cycles with a carried CG direction."""
+"""Projected multigrid for the LCP of a grid, at the cost of a linear solve.
+
+Monotone cycles, then truncated cycles with a carried conjugate-gradient direction.
+"""
 
 from __future__ import annotations
 
@@ -25,18 +28,20 @@ class ProjectedMultigrid(Settings):
 
     It takes about as many cycles as multigrid for the linear system.
 
-    Cold, the first step is a projected (monotone) cycle, which moves whole aggregates on and off
-    their bounds. Then each step evaluates y = A x + b in float64, takes the unknowns that sit at a
-    bound with y of the right sign out of the hierarchy (they are *truncated*), preconditions -y by
-    one linear cycle on the rest, makes the correction conjugate to the remainder of the last
-    direction, and projects the step onto the bounds. There are no inner tolerances: without bounds
-    this is preconditioned conjugate gradients with a true residual, and the same code is the linear
-    solver. Steps are judged by the energy x'Ax/2 + b'x (`descent.Descent`): where it falls evenly
-    while the free set moves, a contact's boundary creeps by a layer of cells a step, and a monotone
-    cycle follows; where `patience` steps set no new least energy, monotone cycles follow, twice as
-    many each time; beside rigid bodies the third run of them ends the solve with STAGNATED. Cycles
-    are slow in channels a cell wide and where coefficients are random over decades: `wl.solve`
-    without a method then goes on by `MinimumMapNewton` on the assembled matrix
+    After a cold start, the first step is a projected (monotone) cycle, which moves whole aggregates
+    on and off their bounds. Each later step evaluates y = A x + b in float64 and removes the
+    unknowns that are at a bound with y of the right sign from the hierarchy (they are *truncated*).
+    It preconditions -y by one linear cycle on the others, makes the correction conjugate to what is
+    left of the last direction, and projects the step onto the bounds. There are no inner
+    tolerances: without bounds this is the method of preconditioned conjugate gradients with a true
+    residual, and the same code is the linear solver.
+
+    Steps are judged by the energy x'Ax/2 + b'x (`descent.Descent`). If it falls evenly while the
+    free set changes, a contact's boundary moves by only one layer of cells per step, and a monotone
+    cycle follows. If `patience` steps reach no new least energy, monotone cycles follow, twice as
+    many each time; with rigid bodies the third run of them ends the solve with STAGNATED. Cycles
+    are slow in channels one cell wide and where coefficients are random over decades: `wl.solve`
+    without a method then continues with `MinimumMapNewton` on the assembled matrix
     (`wl.default_chain`).
 
     Args:
@@ -52,8 +57,8 @@ class ProjectedMultigrid(Settings):
     distributed: ClassVar[bool] = True
 
     precision: PrecisionName = "mixed"
-    # without one the set creeps; nested iteration from the coarsest level saves a step of ten, and
-    # takes as long
+    # Without one the active set advances slowly. Nested iteration from the coarsest level saves one
+    # step in ten, and takes as long.
     monotone_cycles: CountOrZero = 1
     patience: Count = 3
     cycle: CycleSettings = field(default_factory=CycleSettings)
@@ -81,18 +86,18 @@ class ProjectedMultigrid(Settings):
         return CoupledWorkspace(problem, *terms, self)
 
     def spare(self, problem: LCP) -> SpareWorkspace | None:
-        """Return the workspace of an earlier solve with a problem's data.
+        """Return a kept workspace of an earlier solve with the problem's data.
 
-        None if `init` has to make one. From the second solve of a form in succession on one
-        workspace is kept, see `wl.release_workspace`.
+        Returns None if `init` has to create one. From the second consecutive solve of a form on,
+        one workspace is kept, see `wl.release_workspace`.
         """
         return lend(problem, self) if type(self) is ProjectedMultigrid else None
 
     def step(self, problem: LCP, work: MultigridWorkspace, x: wp.array[Any]) -> Step:
         """Take a monotone cycle or a truncated one.
 
-        Monotone cycles come while the start is cold and where steps do not lower the energy;
-        truncated ones otherwise.
+        Monotone cycles come after a cold start and where steps do not lower the energy; truncated
+        ones otherwise.
         """
         if work.goes_in_circles:
             work.residual.current = True

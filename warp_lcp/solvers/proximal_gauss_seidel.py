@@ -1,4 +1,7 @@
-"""Proximal Gauss-Seidel sweeps over contacts with the circular friction cone, all contacts of a color at once."""
+"""Proximal Gauss-Seidel sweeps over contacts with circular friction cones.
+
+All contacts of a color are updated in parallel.
+"""
 
 from __future__ import annotations
 
@@ -20,9 +23,9 @@ from warp_lcp.settings import Count, Settings, Share
 
 f64, i32 = wp.float64, wp.int32
 KERNELS = KernelFile(Path(__file__).parent / "headers/proximal_gauss_seidel.h")
-# contacts of a task on the CPU, and how many cells of a usual pass one costs as much as
+# Contacts of a task on the CPU, and the number of cells of a usual pass that cost as much as one.
 GRAIN, COST = 32, 128
-# of the state: two squared changes, what multiplies all r-factors, the squared residual
+# Of the state: two squared changes, the factor of all r-factors, the squared residual.
 FACTOR, LEFT, STATE = 2, 3, 4
 BETTER = 0.9  # of the least residual: progress
 LEAST = 0.05  # of the first r-factors
@@ -30,7 +33,7 @@ LEAST = 0.05  # of the first r-factors
 
 @cache
 def passes(dim: int, q: int) -> SimpleNamespace:
-    """Return the passes over contacts of `dim` rows between bodies of q velocities."""
+    """Return the kernels for contacts of `dim` rows and bodies of q velocities."""
     module, constants = (
         f"warp_lcp.proximal_gauss_seidel_{dim}_{q}",
         {"DIM": dim, "Q": q, "FACTOR": FACTOR},
@@ -56,28 +59,28 @@ class ProximalGaussSeidel(Settings):
 
     [Book] 1.1.4, 1.3.5; Erleben 2017.
 
-    A sweep takes each contact once, at the velocities that those before it have left:
+    A sweep updates each contact once, with the velocities after the updates before it:
 
-        r_n <- max(0, r_n - rho_n u_n), then r_t <- the nearest point of |r_t| <= mu r_n to r_t -
-        rho_t u_t
+        r_n <- max(0, r_n - rho_n u_n),
+        r_t <- the nearest point of |r_t| <= mu r_n to r_t - rho_t u_t,
 
     with r-factors rho_n = 1 / B_nn and rho_t = 1 / (the largest eigenvalue of B_tt) of the
-    contact's own block of B = J J' + diag(e); for spheres that solves it exactly. B is not made:
-    bodies keep w = J'r, and a contact touches those of its two. Contacts that share no body have
-    one color and are swept at once, by all threads or a GPU; their order, and every bit, depends on
-    the contacts alone.
+    contact's own block of B = J J' + diag(e); for spheres that solves it exactly. B is not
+    assembled: bodies store w = J'r, and a contact changes that of its two bodies. Contacts that
+    share no body have one color and are updated in parallel, by all threads or a GPU; their order,
+    and every bit of the result, depends on the contacts alone.
 
-    Sweeps are accelerated as `NNCG` accelerates them, by g = r - sweep(r), beta = |g|^2 / |g
-    before|^2, r <- r + beta p, p <- beta p - g, and p <- 0 where beta > 1
-    [Silcowitz-Hansen et al. 2010]; the residual is that after a sweep, where r is in its cones.
-    Where it has stayed above 0.9 of its least for `wait` sweeps, as sweeps that go round in circles
-    do, all r-factors shrink, down to a twentieth. No theorem promises convergence for mu > 0. The
-    residual, recomputed in float64 from r alone, is that of `FrictionalContact.residual`.
+    Sweeps are accelerated as `NNCG` accelerates them, by g = r - sweep(r), beta = |g|^2 /
+    |g_old|^2, r <- r + beta p, p <- beta p - g, and p <- 0 where beta > 1 [Silcowitz-Hansen et al.
+    2010]; the residual is that after a sweep, where r is in its cones. Where it has stayed above
+    0.9 of its least for `wait` sweeps, as in a cycle of sweeps, all r-factors shrink, down to a
+    twentieth. There is no proof of convergence for mu > 0. The residual, recomputed in float64 from
+    r alone, is that of `FrictionalContact.residual`.
 
     Args:
         accelerate: whether sweeps are accelerated; plain ones took more than three times as many
             for 1,000 spheres in a box.
-        check_every: sweeps from one look at the residual to the next; a step of the method, so that
+        check_every: sweeps between evaluations of the residual; a step of the method, so that
             limits are met in multiples of it.
         wait: sweeps without progress after which r-factors shrink.
         shrink: factor by which they shrink.
@@ -129,17 +132,19 @@ class ContactFields:
 
 
 class ContactWorkspace:
-    """Impulses and what bodies make of them, with contacts in the order of their colors.
+    """Workspace of the method: impulses and body velocities.
+
+    Contacts are stored in the order of their colors.
 
     Args:
         problem: the contacts.
         method: the method.
 
     Attributes:
-        x: impulses as the problem numbers contacts, shape (k, dim).
+        x: impulses in the problem's numbering, shape (k, dim).
         order: contacts color by color.
         starts: where each color begins, and the end.
-        norm, current: of the residual, as `wl.solve` asks for.
+        norm, current: of the residual, as `wl.solve` reads them.
     """
 
     precision = Precision.DOUBLE
@@ -167,7 +172,7 @@ class ContactWorkspace:
         self._look(self._program.launch)
 
     def _contacts(self) -> ContactFields:
-        """Return the contacts as kernels see them, color by color."""
+        """Return the contacts in the layout of the kernels, color by color."""
         p, order = self.problem, self.order
         k, dim, _ = p.one.shape
         J, diagonal = np.concatenate([p.one[order], p.other[order]], axis=2), p.diagonal[order]
@@ -187,7 +192,7 @@ class ContactWorkspace:
         return ContactFields(rows, b, e, laws_, contact, one, other, self._w, self.x.flatten())
 
     def _gathering(self) -> Any:
-        """Return the pass that finds w = J'r body by body."""
+        """Return the kernel that computes w = J'r body by body."""
         p, fields = self.problem, self._fields
         both = np.stack([p.first[self.order], p.second[self.order]], axis=1).ravel()
         sides = np.argsort(both, kind="stable")[: np.count_nonzero(both < p.bodies)]
@@ -204,7 +209,10 @@ class ContactWorkspace:
         return replace(made, weight=COST)
 
     def _record(self, now: int) -> None:
-        """Record a sweep, after a move along the last direction; `now` and 1 - now: which squared change is the last and which before."""
+        """Record a sweep, after a move along the last direction.
+
+        `now` and 1 - now are the slots of the last squared change and of the one before.
+        """
         launch, fields, state = self._program.launch, self._fields, self._state
         if self.method.accelerate:
             CARRY.bind(
@@ -227,7 +235,7 @@ class ContactWorkspace:
             self._changes.dot(self._g, self._g, 1 - now, launch=launch)
 
     def _look(self, launch: Launch = launch_now) -> None:
-        """Find w from the impulses alone, and the squared residual."""
+        """Compute w and the squared residual from the impulses alone."""
         self._gather.launch(launch)
         self._left.launch(launch)
         self._squares.add_up(LEFT, launch=launch)
@@ -237,20 +245,20 @@ class ContactWorkspace:
         return self.norm
 
     def start(self, *, warm: bool, tolerance: float) -> None:
-        """Forget directions and r-factors of the last solve."""
+        """Reset the directions and r-factors of the last solve."""
         self._factor, self._least, self._idle = 1.0, self.norm, 0
         self._set_off()
 
     def _set_off(self) -> None:
-        """Take the r-factors as they are, and no direction."""
+        """Write the r-factors to the device, and reset the direction."""
         self._state.assign([0.0, 0.0, self._factor, 0.0])
         for field in (self._g, self._way, self._turn):
             field.zero_()
         wp.copy(self._before, self._w)
 
     def sweep(self) -> None:
-        """Sweep, look at the residual, and shrink r-factors where it makes no progress."""
-        # the program takes the last squared change from the same place
+        """Sweep, read the residual, and shrink r-factors where it makes no progress."""
+        # The program reads the last squared change from the same slot.
         if self.method.accelerate and self.method.check_every % 2:
             self._swap()
         self._program.run()
@@ -272,36 +280,37 @@ class ContactWorkspace:
         return self._read()
 
     def rounding_floor(self, x: wp.array[Any], epsilon: float) -> float:
-        """Return what rounding may leave of the residual: epsilon (|J| |J|' |r| + |b|)."""
+        """Return the rounding floor of the residual: epsilon (|J| |J|' |r| + |b|)."""
         J, r = abs(self.problem.jacobian), np.abs(x.numpy()).ravel()
         return float(epsilon * np.linalg.norm(J @ (J.T @ r) + np.abs(self.problem.b.ravel())))
 
     def keep(self) -> None:
-        """Remember the impulses as the best ones."""
+        """Store the impulses as the best ones."""
         wp.copy(self._best, self.x)
 
     def restore(self) -> None:
-        """Take the best impulses back."""
+        """Set the impulses to the best ones."""
         wp.copy(self.x, self._best)
 
 
 def colors(first: np.ndarray, second: np.ndarray, bodies: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return contacts color by color and where each color begins, and the end: each has the first color that its bodies do not have yet.
+    """Return contacts color by color, and where each color begins.
 
-    So there are fewer colors than twice the most contacts of a body.
+    The starts include the end. Each contact has the first color that its two bodies do not have
+    yet, so that there are fewer colors than twice the largest number of contacts of a body.
 
     Args:
         first: body of each contact, shape (k,).
-        second: the other one, `bodies` where it is none.
+        second: the other body, `bodies` if there is none.
         bodies: their number.
     """
-    taken, color = [0] * (bodies + 1), np.empty(len(first), dtype=np.int64)
+    colors_of_body, color = [0] * (bodies + 1), np.empty(len(first), dtype=np.int64)
     for k, (i, j) in enumerate(zip(first.tolist(), second.tolist(), strict=True)):
-        both = taken[i] | taken[j]
+        both = colors_of_body[i] | colors_of_body[j]
         free = ~both & (both + 1)  # the lowest bit that neither has
         color[k] = free.bit_length() - 1
-        taken[i] |= free
+        colors_of_body[i] |= free
         if j < bodies:
-            taken[j] |= free
+            colors_of_body[j] |= free
     order = np.argsort(color, kind="stable")
     return order, np.searchsorted(color[order], np.arange(color.max(initial=-1) + 2))

@@ -1,4 +1,4 @@
-"""The proximal-point method: regularized problems around centers that move to the solution."""
+"""Proximal-point method: regularized problems around moving centers."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from warp_lcp.solvers.fallback import Fallback, fails
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.primal_dual_active_set import PrimalDualActiveSet
 
-# eps of the first center, its factor from center to center, and the smallest
+# eps of the first center, its factor from center to center, and the smallest eps.
 CENTER, FACTOR, LEAST = 1e-4, 0.1, 1e-10
-# factor of eps where a regularized problem is not solved, and the largest eps: larger ones are
-# easier
+# Factor of eps where a regularized problem is not solved, and the largest eps; problems with larger
+# eps are easier.
 RAISED, LARGEST = 100.0, 1.0
-# of a center's residual: what the regularized problem's may be when the next center is taken
+# Part of a center's residual that the regularized problem's must reach before the next center.
 NEAR = 1e-3
 TRIED, FEWER = 30, 15  # steps for one center, before and after eps had to be raised
-# unknowns up to which a sparse matrix is taken as a dense one, for which least-index pivoting is
-# there
+# Unknowns up to which a sparse matrix is treated as dense, so that least-index pivoting can be
+# used.
 SMALL = 1000
 FALL = 0.9  # a center whose residual is above this part of the smallest so far is no progress
 IDLE = 4  # centers without progress before the end
@@ -40,22 +40,25 @@ IDLE = 4  # centers without progress before the end
 class ProximalPoint(Settings):
     """Proximal-point method: solve regularized problems around moving centers.
 
-    (Martinet 1970, Rockafellar 1976.) Solve A x + b + eps D (x - c) = y with the same bounds, take
-    clip(x, l, u) for the center c, lower eps, repeat. D is the natural residual's d. A + eps D is a
-    P-matrix wherever A is a P0-matrix (positive semi-definite ones, skew ones), so that free blocks
-    are regular and least-index pivoting is finite. Its solutions tend to one of the problem's own
-    if A is monotone and there is one. Each regularized problem is solved to 1e-3 of its center's
-    residual, by an inner method; where that fails, eps is raised, and does not fall below that
-    again. Failure with eps = 1 ends the solve with NON_DESCENT, centers without progress with
-    STAGNATED, a proof by a linear program (at most 40,000 entries) with INFEASIBLE. A step is one
-    of the inner method; `linear_iterations` counts as there.
+    (Martinet 1970, Rockafellar 1976.) Solve A x + b + eps D (x - c) = y with the same bounds, use
+    clip(x, l, u) as the next center c, lower eps, repeat. D is the natural residual's d. A + eps D
+    is a P-matrix wherever A is a P0-matrix (for example a positive semi-definite or a skew one), so
+    that free blocks are regular and least-index pivoting is finite. The solutions tend to one of
+    the problem if A is monotone and a solution exists.
 
-    Made for a singular block here and there. Linear programs (A skew) of more than some dozens of
-    unknowns come to residuals of 1e-2 or end with NON_DESCENT: they are InteriorPoint's.
+    An inner method solves each regularized problem to 1e-3 of the residual at its center. If it
+    fails, eps is raised, and does not fall below that value again. The solve ends with NON_DESCENT
+    if it fails at eps = 1, with STAGNATED if the centers make no progress, and with INFEASIBLE if a
+    linear program (at most 40,000 entries) proves it. A step is one of the inner method;
+    `linear_iterations` counts as there.
+
+    The method is meant for problems with a few singular blocks. Linear programs (A skew) of more
+    than some dozens of unknowns reach residuals of 1e-2 or end with NON_DESCENT: use InteriorPoint
+    for them.
 
     Args:
         inner: method for regularized problems; None: PrimalDualActiveSet; on sparse matrices of
-            more than 1000 unknowns then MinimumMapNewton, where a set recurs.
+            more than 1000 unknowns MinimumMapNewton follows where a set recurs.
 
     Example:
         >>> import numpy as np, warp_lcp as wl
@@ -86,14 +89,14 @@ class ProximalPoint(Settings):
 
 
 class ProximalWorkspace(IterateMemory):
-    """Memory of the method for one problem; A is read when a solve begins."""
+    """Workspace of the method for one problem; A is read when a solve begins."""
 
     def __init__(self, problem: LCP, inner: Solver | None) -> None:
         super().__init__(problem)
         self._given = inner
 
     def start(self, *, warm: bool, tolerance: float) -> None:
-        """Take A, b and the bounds as they are now."""
+        """Read the current A, b and bounds."""
         p, self._tolerance, self._eps = self.problem, tolerance, CENTER
         A: Any = p.A
         self._matrix, self._b = A.rows().matrix(), p.b.numpy().copy()
@@ -152,7 +155,10 @@ class ProximalWorkspace(IterateMemory):
         work.start(warm=True, tolerance=self._near)
 
     def _assess(self, x: wp.array[Any], *, solved: bool) -> SolveStatus | None:
-        """Prepare for the next center; return how the solve ends if it has come no nearer to a solution for some."""
+        """Prepare for the next center; return the status if the solve ends.
+
+        It ends if IDLE centers have made no progress, or eps cannot be raised further.
+        """
         self._steps = 0
         x.assign(np.clip(x.numpy(), self._lower, self._upper))
         norm = self.residual.evaluate(x)
@@ -179,7 +185,8 @@ class ProximalWorkspace(IterateMemory):
             return self._matrix + np.diag(self._eps * self._D)
         entries, i = self._matrix.tocoo(), np.arange(len(self._D))
         places = np.r_[entries.row, i], np.r_[entries.col, i]
-        # duplicates are summed and sums of 0 stay entries: the pattern is the same for all eps
+        # Duplicates are summed and sums of 0 stay entries, so that the pattern is the same for all
+        # eps.
         return scipy.sparse.csr_array(
             (np.r_[entries.data, self._eps * self._D], places), shape=self._matrix.shape
         )
@@ -187,6 +194,9 @@ class ProximalWorkspace(IterateMemory):
 
 @cache
 def _inner_method(sparse: bool) -> Solver:
-    """Return the method for regularized problems, whose matrices are P-matrices wherever A is a P0-matrix."""
+    """Return the default method for regularized problems.
+
+    Their matrices are P-matrices wherever A is a P0-matrix.
+    """
     pivoting = PrimalDualActiveSet(precision="double", stop_if_singular=False)
     return Fallback(pivoting, (MinimumMapNewton(precision="double"), fails)) if sparse else pivoting

@@ -1,4 +1,4 @@
-"""Projected successive over-relaxation; projected Gauss-Seidel is omega = 1."""
+"""Projected successive over-relaxation; omega = 1 is projected Gauss-Seidel."""
 
 from __future__ import annotations
 
@@ -27,22 +27,22 @@ class ProjectedSOR(Settings):
 
     [Book] 2.2.1, eq. 2.52.
 
-    x_i <- clip(x_i - omega (A x + b)_i / A_ii, l_i, u_i), red-black order on grids, row order
-    otherwise. Converges for symmetric positive definite A and 0 < omega < 2 ([Book] 2.2.2). The
-    iteration count grows with the grid: on 64^3 cells to 1e-3 and 1e-6 about 1,750 and 4,000 sweeps
-    with omega = 1, 110 and 200 with the best omega, 1.9, where ProjectedMultigrid takes 5 and 8
-    cycles; a splash of 20^3 and 32^3 cells takes 210 and 497 with 1.4, 73 and 102 with
-    `advised_omega`, the default on grids. A time step of an American put, 2,000 nodes on a line,
-    takes 2,031 sweeps with omega = 1, 851 with 1.4, 124 with `advised_omega`: more than the 100
-    that StoppingCriteria allows unless told otherwise.
+    x_i <- clip(x_i - omega (A x + b)_i / A_ii, l_i, u_i), in red-black order on grids, in row order
+    otherwise. The method converges for symmetric positive definite A and 0 < omega < 2 ([Book]
+    2.2.2). The number of sweeps grows with the grid. 64^3 cells take about 1,750 sweeps to 1e-3 and
+    4,000 to 1e-6 with omega = 1, 110 and 200 with the best omega, 1.9; ProjectedMultigrid takes 5
+    and 8 cycles. A splash of 20^3 and 32^3 cells takes 210 and 497 sweeps with omega = 1.4, 73 and
+    102 with `advised_omega`, the default on grids. A time step of an American put, 2,000 nodes on a
+    line, takes 2,031 sweeps with omega = 1, 851 with 1.4, 124 with `advised_omega`: more than the
+    100 that StoppingCriteria allows by default.
 
-    Where A_ii = 0, x_i goes to the bound that the sign of y_i asks for, and stays where y_i = 0 or
-    there is no such bound; where A_ii < 0 it goes to the bound that solves the scalar problem, of
-    two the one of lesser energy ([Book] 2.2.2, fig. 2.4). Bounds may be affine in x: they follow
-    each change of x in dense and sparse matrices, each sweep on grids.
+    Where A_ii = 0, x_i goes to the bound that the sign of y_i selects, and stays where y_i = 0 or
+    there is no such bound. Where A_ii < 0, it goes to the bound that solves the scalar problem; if
+    both do, to the one of lesser energy ([Book] 2.2.2, fig. 2.4). Bounds may be affine in x: in
+    dense and sparse matrices they are updated after each change of x, on grids after each sweep.
 
-    Each sweep is tested for contraction ([Book] algorithm 4, see `Contraction`): DIVERGED, or
-    NON_DESCENT where a sweep changes nothing.
+    After each sweep the contraction is tested ([Book] algorithm 4, see `Contraction`); the status
+    is DIVERGED if the test fails, or NON_DESCENT if a sweep changes nothing.
 
     The orders of the book's figure 2.3, in matrices: "impulse" is order = "magnitude", "greedy" is
     "greedy", "coordinate" and "staggered" are permutations that the caller makes, by height, or
@@ -52,7 +52,7 @@ class ProjectedSOR(Settings):
 
     Args:
         omega: relaxation factor in (0, 2); 1 is projected Gauss-Seidel. None: `advised_omega` on
-            grids with a symmetric stencil and constant bounds, at the price of 60 products whenever
+            grids with a symmetric stencil and constant bounds, at the cost of 60 products whenever
             the operator has changed; 1.4 elsewhere, the best of the book's parameter study.
         direction: "forward", "backward", or "symmetric", which follows every forward sweep with a
             backward one.
@@ -106,11 +106,11 @@ class ProjectedSOR(Settings):
 
 
 class SweepWorkspace(IterateMemory):
-    """Memory of a method that sweeps.
+    """Workspace of a method that sweeps.
 
     Attributes:
-        sweep: how.
-        diagonal: A's.
+        sweep: the sweep over the unknowns.
+        diagonal: of A.
         contraction: the test of its sweeps.
     """
 
@@ -122,13 +122,16 @@ class SweepWorkspace(IterateMemory):
         self.contraction = Contraction(problem)
 
     def start(self, *, warm: bool, tolerance: float) -> None:
-        """Look at the operator again; nothing else is carried from solve to solve."""
+        """Read the operator again; nothing else is carried from solve to solve."""
         self.sweep.start()
         self.contraction.start(self.x)
 
 
 class SORWorkspace(SweepWorkspace):
-    """Memory of the method; on grids it finds omega when a solve begins, unless that is given."""
+    """Workspace of the method; on grids a solve estimates omega at its start.
+
+    If the settings have an omega, that is used.
+    """
 
     def __init__(self, problem: LCP, settings: ProjectedSOR) -> None:
         super().__init__(problem, settings.precision)
@@ -139,11 +142,11 @@ class SORWorkspace(SweepWorkspace):
     def start(
         self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
     ) -> None:
-        """Look at the operator again; of a grid that has changed find omega."""
+        """Read the operator again; estimate omega for a grid that has changed."""
         version = version_of(self.problem.A)
         if self._advised and self._version != version:
             self._relax_by(grid_omega(self.problem, singular=floating is not None))
-            self._version = version  # last: time may be up before
+            self._version = version  # last: the time limit may end the estimate before
         super().start(warm=warm, tolerance=tolerance)
 
     def _relax_by(self, omega: float) -> None:
@@ -161,31 +164,32 @@ def has_advised_omega(problem: LCP) -> bool:
 def grid_omega(problem: LCP, *, singular: bool) -> float:
     """Return the advised relaxation factor of a grid.
 
-    On a singular grid lambda_min = 0 would advise 2: at most what a quarter of a wave along its
-    longest side asks for. There lambda_min = 1 - cos(pi / (2 (n + 1))), so that Young's formula is
-    2 / (1 + sin(pi / (2 (n + 1)))).
+    On a singular grid lambda_min = 0 would advise omega = 2. There omega is at most that for a
+    quarter of a wave along the longest side, lambda_min = 1 - cos(pi / (2 (n + 1))), so that
+    Young's formula is 2 / (1 + sin(pi / (2 (n + 1)))).
     """
     most = 2 / (1 + math.sin(math.pi / (2 * (max(problem.layout.shape) + 1)))) if singular else 2.0
     try:
         return min(advised_omega(problem), most)
-    except ValueError:  # a negative diagonal, as a negative shift makes it
+    except ValueError:  # a negative diagonal, for example by a negative shift
         return BOOK
 
 
 def advised_omega(problem: LCP, steps: int = 60, free: Any = None) -> float:
-    """Return an estimate of the best relaxation factor omega (Young).
+    """Estimate the best relaxation factor omega (Young).
 
-    2 / (1 + sqrt(1 - rho^2)).
+    omega = 2 / (1 + sqrt(1 - rho^2)).
 
     rho = 1 - lambda_min(D^-1 A) is the spectral radius of Jacobi's method, estimated by Lanczos'
-    method. The formula is exact for equations in two colors (grids), and a guide elsewhere. Only
-    the free unknowns count in the end: where many are held at bounds, the whole matrix advises too
-    much, and a second look with the free set of an earlier solution pays.
+    method. The formula is exact for equations in two colors (grids), and a guide elsewhere. Near
+    the solution only the free unknowns matter. Where many unknowns are held at bounds, the value
+    for the whole matrix is too large, and a second estimate with the free set of an earlier
+    solution is better.
 
     Args:
         problem: with a symmetric A and a positive diagonal.
         steps: products with A.
-        free: field of the problem's shape, non-zero where x is thought to be off its bounds;
+        free: field of the problem's shape, non-zero where x is expected to be off its bounds;
             everywhere if None.
 
     Raises:

@@ -1,4 +1,4 @@
-"""The quadratic program of a symmetric problem, solved by PIQP."""
+"""Solve the quadratic program of a symmetric problem by PIQP."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ class QuadraticProgram(Settings):
     It minimizes x'Ax / 2 + b'x over l <= x <= u ([Book] 2.2.2, eq. 2.56; extra `peers`).
 
     The minimizers are the solutions of the problem, because A is symmetric and positive
-    semi-definite and the gradient is y = A x + b. Sparse operators stay sparse; others are taken as
-    dense matrices. x0 is not used; one step solves, and `linear_iterations` counts PIQP's
-    iterations, a factorization each. What PIQP's multipliers hold is then set on its bound, and y =
-    0 solved for in the others, if that is better. An objective that is unbounded below is
-    INFEASIBLE: no x solves the problem.
+    semi-definite and the gradient is y = A x + b. Sparse operators stay sparse; others are
+    converted to dense matrices. x0 is not used. There is one step, and `linear_iterations` counts
+    PIQP's iterations, a factorization each. Afterwards unknowns that PIQP's multipliers hold are
+    set to their bounds, and y = 0 is solved for the others; that result is used if it is better. An
+    objective that is unbounded below is INFEASIBLE: no x solves the problem.
 
     Args:
         tolerance: PIQP's absolute and relative tolerance, on the equilibrated problem; > 0. The
-            loop's criteria are checked on the natural residual whatever PIQP says.
+            loop's criteria are checked on the natural residual, independent of PIQP's status.
         max_iterations: maximum number of iterations of PIQP, >= 1.
     """
 
@@ -82,7 +82,7 @@ class QuadraticProgram(Settings):
 
 
 class QuadraticProgramWorkspace(DenseWorkspace):
-    """The problem as PIQP takes it."""
+    """Workspace of the method: the problem in PIQP's form."""
 
     def read(self) -> DenseProblem:
         """Read the problem; a sparse A stays sparse."""
@@ -101,14 +101,19 @@ class QuadraticProgramWorkspace(DenseWorkspace):
             )
 
     def minimize(self, tolerance: float, max_iterations: int) -> int:
-        """Run PIQP; returns its iterations."""
+        """Run PIQP; return its number of iterations.
+
+        It solves the equilibrated problem. Where the distance to a bound is less than its
+        multiplier, x is set on the bound, and y = 0 is solved for in the other rows; the better of
+        both x is the iterate.
+        """
         import piqp  # an extra
 
         data, (scaled, units) = self.data, self.data.scaled()
         sparse = scipy.sparse.issparse(data.A)
         solver = piqp.SparseSolver() if sparse else piqp.DenseSolver()
         solver.settings.eps_abs = solver.settings.eps_rel = tolerance
-        # bounds hold to its root
+        # Bounds hold to the square root of the gap's tolerance.
         solver.settings.eps_duality_gap_abs = solver.settings.eps_duality_gap_rel = tolerance**1.1
         solver.settings.max_iter = max_iterations
         A = scipy.sparse.csc_matrix(scaled.A) if sparse else np.asfortranarray(scaled.A)
@@ -116,8 +121,8 @@ class QuadraticProgramWorkspace(DenseWorkspace):
         status = solver.solve()
         iterations, x = int(solver.result.info.iter), np.asarray(solver.result.x)
         solved = status == piqp.PIQP_SOLVED
-        # PIQP often runs along an unbounded direction to its iteration limit without saying so: a
-        # linear program decides
+        # PIQP often follows an unbounded direction to its iteration limit without reporting it: a
+        # linear program decides.
         if not solved and len(data.b) <= QuadraticProgram.most_unknowns and inconsistent(data):
             self.ended = SolveStatus.INFEASIBLE
             return iterations
@@ -140,7 +145,11 @@ class QuadraticProgramWorkspace(DenseWorkspace):
 
 
 def is_convex(A: Any) -> bool:
-    """Return whether a symmetric matrix with entries near 1, dense or sparse, is positive semi-definite: factors of it, shifted, say so."""
+    """Return whether a symmetric matrix is positive semi-definite.
+
+    Its entries are near 1; it may be dense or sparse. The factors of the slightly shifted matrix
+    decide.
+    """
     if not scipy.sparse.issparse(A):
         return semidefinite(A)
     shifted = (A + SEMIDEFINITE * scipy.sparse.eye_array(A.shape[0])).tocsc()

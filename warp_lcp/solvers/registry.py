@@ -1,12 +1,13 @@
-"""The methods by name: the one table that scenes, the command line, the tests and the documentation read.
+"""Table of the methods by name.
 
-A new method is one file and one line here. Each class says in `supports` which capabilities it asks
-of an operator, any one of them (see `warp_lcp.problem.protocol`; nothing where every operator will
-do), and in `needs` what must hold of A ("symmetric", ...). A class that takes small problems only
-has `most_unknowns`; one whose problems are no `LCP` names their class as `problems` and takes no
-operators, so that `families` of it are none; one that takes no upper bounds and no equations has
-`boxed = False`; one that ends with NEGATIVE_CURVATURE where A is surely no P- and no semi-definite
-matrix has `definite = True`.
+Scenes, the command line, the tests and the documentation read it. A new method is one file and one
+line here. Each class lists in `supports` the capabilities of an operator of which it needs at least
+one (see `warp_lcp.problem.protocol`; no attribute if every operator will do), and says in `needs`
+what must hold of A ("symmetric", ...). A class for small problems only has `most_unknowns`. A class
+whose problems are no `LCP` names their class as `problems`; it takes no operators, so that its
+`families` are empty. A class that takes no upper bounds and no equations has `boxed = False`. A
+class that ends with NEGATIVE_CURVATURE where A is surely no P- and no semi-definite matrix has
+`definite = True`.
 """
 
 from __future__ import annotations
@@ -49,21 +50,24 @@ ALSO = {
 
 
 class Methods(dict[str, type[Any]]):
-    """Methods by their names; an unknown one's KeyError says which is meant, or which there are."""
+    """Methods by their names; the KeyError of an unknown name lists near ones."""
 
     def __missing__(self, name: str) -> type[Any]:
-        """Refuse a name that no method has."""
+        """Raise a KeyError for a name that no method has."""
         raise KeyError(f"no such method: {name!r}; {self.nearest(name)}")
 
     def nearest(self, name: object) -> str:
-        """Return `did you mean ...?` for initials, class names and synonyms, else `settings.nearest`."""
+        """Return `did you mean ...?` for initials, class names and synonyms.
+
+        For other names the result is that of `settings.nearest`.
+        """
         word = str(name).lower().replace("_", "-").replace(" ", "-")
-        for known, kind in self.items():
-            initials = "".join(part[0] for part in known.split("-"))
-            if ALSO.get(word, known) == known and (
+        for name_of_method, kind in self.items():
+            initials = "".join(part[0] for part in name_of_method.split("-"))
+            if ALSO.get(word, name_of_method) == name_of_method and (
                 word in ALSO or word in (initials, kind.__name__.lower())
             ):
-                return f"did you mean {known!r}?"
+                return f"did you mean {name_of_method!r}?"
         return nearest(word, self)
 
 
@@ -95,7 +99,9 @@ METHODS = Methods(
 
 
 def method_of(method: Any, name: str = "method") -> Any:
-    """Return the method that a name in METHODS stands for, with its default settings, or the method given.
+    """Return the method of a name in METHODS, with its default settings.
+
+    A method instance is returned unchanged.
 
     Args:
         method: a name, or a method with its settings.
@@ -116,7 +122,10 @@ def method_of(method: Any, name: str = "method") -> Any:
 
 
 def grid_methods() -> tuple[str, ...]:
-    """Return the names of the methods that take a grid of any size and a precision: what a scene may name."""
+    """Return the names of the methods that a scene may name.
+
+    They take a grid of any size and a precision.
+    """
     grids = [
         (name, method)
         for name, method in METHODS.items()

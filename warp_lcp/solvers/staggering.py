@@ -1,4 +1,7 @@
-"""Staggering: a problem in a few blocks, each solved by its own method in turn ([Book] 2.2.4)."""
+"""Staggering: solve a few blocks of a problem in turn ([Book] 2.2.4).
+
+Each block has its own method.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,7 @@ from warp_lcp.settings import Count, Settings, Share
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.sweeps.sweep import Contraction
 
-SHARE = 0.3  # of the whole tolerance, which a block need not be solved beyond
+SHARE = 0.3  # of the whole tolerance, beyond which a block need not be solved
 Blocks = Annotated[Sequence[Any] | np.ndarray, "for each block a list of indices"]
 KERNELS = KernelFile(Path(__file__).parent / "headers/gradient_projection.h")
 SELECT = KERNELS["partition.select"]
@@ -38,10 +41,10 @@ class Staggering(Settings):
 
     The other blocks are held fixed ([Book] 2.2.4).
 
-    Block k solves A_kk x_k + (b_k + sum_{j != k} A_kj x_j) within its bounds: a block Gauss-Seidel
-    method, which converges for symmetric positive definite A. Bounds affine in x are constants of
-    the block while it is solved, so that any method may solve it: normal forces and friction in
-    turn.
+    Block k solves A_kk x_k + (b_k + sum_{j != k} A_kj x_j) within its bounds: this is a block
+    Gauss-Seidel method, which converges for symmetric positive definite A. Bounds affine in x are
+    constants of the block while it is solved, so that any method may solve it, for example the
+    normal forces and the friction in turn.
 
     Args:
         blocks: for each block flat indices into a field of the problem's shape, together all
@@ -85,18 +88,18 @@ class Staggering(Settings):
         )
 
     def step(self, problem: LCP, work: StaggeringWorkspace, x: wp.array[Any]) -> Step:
-        """Solve each block once, the others held."""
+        """Solve each block once, with the others held fixed."""
         linear = work.rounds.run(work.target)
         return Step("round", linear, failure=work.contraction.test(x))
 
 
 class StaggeringWorkspace(IterateMemory):
-    """Memory of a problem in blocks that are solved in turn.
+    """Workspace of a problem in blocks that are solved in turn.
 
     Attributes:
         rounds: the blocks with their methods.
         contraction: the test of rounds for contraction.
-        target: the residual that is asked for.
+        target: the required residual.
     """
 
     def __init__(
@@ -115,7 +118,7 @@ class StaggeringWorkspace(IterateMemory):
         self.target = 0.0
 
     def start(self, *, warm: bool, tolerance: float) -> None:
-        """Take A again where it has changed."""
+        """Read A again where it has changed."""
         self.target = tolerance
         for block in self.blocks:
             block.refresh()
@@ -158,12 +161,15 @@ class StaggeredRound:
     def run(self, target: float, *, forward: bool = True) -> int:
         """Solve each block once, forward or backward; return linear iterations.
 
+        `target` is the residual required of all blocks together.
+
         `target` is the residual asked for of all blocks.
         """
         count, linear = len(self.blocks), 0
         for k in range(count) if forward else reversed(range(count)):
             check_time()
             norm = self._residual(k)
+            # A block is solved to eta times its residual, or to its share of the tolerance.
             goal = max(self._eta * norm, SHARE * target / math.sqrt(count))
             if not math.isfinite(norm) or norm <= goal:
                 continue
@@ -191,7 +197,10 @@ class StaggeredRound:
 
 
 def blocks_of_size(problem: LCP, size: int) -> list[np.ndarray]:
-    """Return stored indices of the unknowns, `size` consecutive ones a block; the last block may be smaller."""
+    """Return stored indices of the unknowns, in blocks of `size` consecutive ones.
+
+    The last block may be smaller.
+    """
     unknowns = np.flatnonzero(problem.unknown.numpy() == 1)
     return [unknowns[i : i + size] for i in range(0, len(unknowns), size)]
 
@@ -200,7 +209,7 @@ def given_blocks(problem: LCP, blocks: Blocks) -> list[np.ndarray]:
     """Return stored indices of each block.
 
     Args:
-        problem: whose unknowns they are.
+        problem: the problem.
         blocks: for each block flat indices into a field of the problem's shape; together all
             unknowns, each once.
 
@@ -215,7 +224,7 @@ def given_blocks(problem: LCP, blocks: Blocks) -> list[np.ndarray]:
         )
     layout = problem.layout
     place = layout.places()
-    found = []
+    stored_blocks = []
     for k, block in enumerate(blocks):
         index = np.asarray(block, dtype=np.int64).ravel()
         if index.size == 0:
@@ -225,10 +234,10 @@ def given_blocks(problem: LCP, blocks: Blocks) -> list[np.ndarray]:
                 f"blocks[{k}] has indices from {index.min()} to {index.max()}: expected 0 ... "
                 f"{len(place) - 1}"
             )
-        found.append(place[index])
+        stored_blocks.append(place[index])
     count = (
-        np.bincount(np.concatenate(found), minlength=layout.size)
-        if found
+        np.bincount(np.concatenate(stored_blocks), minlength=layout.size)
+        if stored_blocks
         else np.zeros(layout.size, dtype=int)
     )
     wrong = count != (problem.unknown.numpy() == 1)
@@ -238,11 +247,13 @@ def given_blocks(problem: LCP, blocks: Blocks) -> list[np.ndarray]:
             f"blocks hold index {at} {count[place[at]]} times, expected "
             f"{int(problem.unknown.numpy()[place[at]] == 1)}"
         )
-    return found
+    return stored_blocks
 
 
 def color_blocks(matrix: scipy.sparse.csr_array, owner: np.ndarray, count: int) -> list[np.ndarray]:
-    """Return the blocks of each color, in order: no row of a block has an entry in a column of another block of its color.
+    """Return the blocks of each color, in order.
+
+    No row of a block has an entry in a column of another block of its color.
 
     Args:
         matrix: A.
@@ -255,15 +266,18 @@ def color_blocks(matrix: scipy.sparse.csr_array, owner: np.ndarray, count: int) 
     pattern = scipy.sparse.csr_array(
         (np.ones(matrix.nnz), matrix.indices, matrix.indptr), shape=matrix.shape
     )
+    # The graph of blocks: two are neighbors if A has an entry between them.
     color = greedy_colors((members.T @ pattern @ members).tocsr())
     return [np.flatnonzero(color == c) for c in range(int(color.max()) + 1)]
 
 
 class MatrixBlock:
-    """A block of a dense or sparse problem: A_BB x_B + (b_B + A_BC x_C), C the other unknowns. Products with A_BC are made on the host.
+    """A block of a dense or sparse problem: A_BB x_B + (b_B + A_BC x_C).
+
+    C are the other unknowns. Products with A_BC are computed on the host.
 
     Attributes:
-        problem: the block's own; b and bounds are written by `couple`.
+        problem: the block's own; `couple` writes b and bounds.
     """
 
     def __init__(self, whole: LCP, x: wp.array[Any], rows: np.ndarray) -> None:
@@ -276,7 +290,7 @@ class MatrixBlock:
         self._version = version_of(whole.A)
 
     def refresh(self) -> None:
-        """Take A's entries again where they have changed."""
+        """Read A's entries again where they have changed."""
         A, version = cast(Any, self.problem.A), version_of(self._whole.A)
         if isinstance(A, SparseOperator) and version == self._version:
             return
@@ -297,13 +311,13 @@ class MatrixBlock:
         return wp.array(self._x.numpy()[self._rows], dtype=wp.float64, device=self._whole.device)
 
     def accept(self, result: SolveResult) -> None:
-        """Write a block's x_B to the common iterate."""
+        """Write the block's x_B to the common iterate."""
         values = self._x.numpy()
         values[self._rows] = result.x.numpy()
         self._x.assign(values)
 
     def _entries(self) -> tuple[Any, Any]:
-        """Return A_BB, and the block's rows of A with 0 in place of it."""
+        """Return A_BB, and the block's rows of A with 0 in its place."""
         A, rows = self._whole.A, self._rows
         assert has(A, HasRows)
         slab = A.rows().matrix()[rows]
@@ -318,7 +332,9 @@ class MatrixBlock:
 
 
 class GridBlock:
-    """A block of a grid problem: the same grid with AIR, x = 0, in place of the other unknowns, whose part is in b.
+    """A block of a grid problem, on the same grid.
+
+    The other unknowns are AIR, x = 0; their contribution is in b.
 
     Attributes:
         problem: the block's own, in the layout of the whole; bounds are shared with it.
@@ -341,18 +357,24 @@ class GridBlock:
         self._version = A.version
 
     def refresh(self) -> None:
-        """Take A's coefficients again; cells that are no longer FLUID leave the block, new ones belong to none."""
+        """Read A's coefficients again.
+
+        Cells that are no longer FLUID leave the block; new ones belong to no block.
+        """
         A = self._whole.A
         assert has(A, HasBlocks)
         if A.version != self._version:
             self._version = A.version
             cells = self._cells().reshape(self._whole.layout.stored_shape)
-            self.problem.A.update(wp.array(cells, dtype=wp.int8, device=self._whole.device))  # type: ignore[attr-defined]
+            self.problem.A.update(  # type: ignore[attr-defined]
+                wp.array(cells, dtype=wp.int8, device=self._whole.device)
+            )
 
     def couple(self) -> None:
-        """Write what A x + b leaves of b when the block's own part is taken out."""
+        """Write the block's b: A x + b without the block's own part of A x."""
         whole, member = self._whole, self._member
         whole.bounds.follow(self._x)
+        # b_B = A x + b - A_BB x_B on the block's cells.
         whole.apply_plus(self._x, whole.b, self._y)
         SELECT.bind(
             rows_of(self._x), x=self._x, less=None, target=self._guess, member=member, kept=False
@@ -363,11 +385,11 @@ class GridBlock:
         ).launch()
 
     def guess(self) -> wp.array[Any]:
-        """Return x_B as `couple` found it."""
+        """Return x_B as `couple` wrote it."""
         return self._guess
 
     def accept(self, result: SolveResult) -> None:
-        """Write a block's x_B to the common iterate."""
+        """Write the block's x_B to the common iterate."""
         SELECT.bind(
             rows_of(self._x),
             x=result.x.flatten(),
@@ -379,7 +401,10 @@ class GridBlock:
 
     def _cells(self) -> np.ndarray:
         """Return the padded cell types with AIR in place of the other unknowns."""
-        cells, member = self._whole.A.cells.numpy().ravel(), self._member.numpy()  # type: ignore[attr-defined]
+        cells, member = (
+            self._whole.A.cells.numpy().ravel(),  # type: ignore[attr-defined]
+            self._member.numpy(),
+        )
         return np.where((cells == FLUID) & (member == 0), AIR, cells).astype(np.int8)
 
 

@@ -1,4 +1,7 @@
-"""Projected Gauss-Seidel subspace minimization: sweeps find the free set, a linear solve finds x on it."""
+"""Subspace minimization after projected Gauss-Seidel sweeps.
+
+Sweeps find the free set, a linear solve finds x on it.
+"""
 
 from __future__ import annotations
 
@@ -26,27 +29,28 @@ from warp_lcp.sweeps.sweep import sweep_for
 KERNELS = KernelFile(Path(__file__).parent / "headers/gradient_projection.h")
 BETWEEN = KERNELS["subspace.between"]
 FOLLOW = KERNELS["subspace.follow"]
-ROUNDING = 1e-14  # relative change of the energy that is none
+ROUNDING = 1e-14  # a smaller relative change of the energy counts as none
 
 
 @dataclass(frozen=True, kw_only=True)
 class SubspaceMinimization(Settings):
     """Subspace minimization after projected Gauss-Seidel sweeps.
 
-    It sweeps, then solves A_FF x_F = -(b_F + A_FH x_H) on the unknowns off their bounds and
+    It does sweeps, then solves A_FF x_F = -(b_F + A_FH x_H) for the unknowns off their bounds, and
     projects ([Book] 2.2.5, algorithm 7, eq. 2.95).
 
-    A step is `sweeps` projected Gauss-Seidel sweeps and up to `solves` such solves, until the free
-    set stays ([Book] eq. 2.98). Each solve is inexact, as far as the whole one still needs. Its
-    projected correction is halved until the energy x'A x / 2 + b'x or the residual falls, up to
-    `backtracks` times; if neither falls, x is left as after the sweeps. The book takes full steps,
-    whose "jaggyness" (fig. 2.10) this avoids; `backtracks = -1` takes full steps as the book does.
+    A step consists of `sweeps` projected Gauss-Seidel sweeps and up to `solves` such solves, until
+    the free set stays ([Book] eq. 2.98). Each solve is inexact: it is as accurate as the whole
+    solve still needs. Its projected correction is halved until the energy x'A x / 2 + b'x or the
+    residual falls, up to `backtracks` times; if neither falls, x is left as after the sweeps. The
+    book takes full steps, whose "jaggyness" (fig. 2.10) this avoids; `backtracks = -1` takes full
+    steps as the book does.
 
-    Bounds may be affine in x: they are constants of each linear solve; held unknowns then move with
+    Bounds may be affine in x: they are constants of each linear solve. Held unknowns then move with
     their bounds, and only the residual judges the step, as there is no energy. With friction the
     residual may have to rise first: `backtracks = -1` solves a stack of 10 boxes to 1e-13 in 13
-    steps where 200 safeguarded ones end at 5e-4 (`benchmarks.contacts`), and diverges in the time
-    steps of a brick wall.
+    steps, where 200 safeguarded steps end at 5e-4 (`benchmarks.contacts`), but it diverges in the
+    time steps of a brick wall.
 
     `linear_iterations` counts sweeps and preconditioned iterations.
 
@@ -57,7 +61,7 @@ class SubspaceMinimization(Settings):
         eta: each linear solve reduces its residual by this factor, or to the accuracy that the
             whole solve still needs.
         max_linear_iterations: maximum number of iterations of one linear solve.
-        backtracks: halvings of a correction; -1 takes all corrections as they come.
+        backtracks: halvings of a correction; -1 takes each correction in full.
         precision: "mixed": iterate float64, corrections float32; "double"; or "single": the iterate
             rounded to float32 as well.
         cycle: settings of multigrid cycles.
@@ -106,7 +110,7 @@ class SubspaceMinimization(Settings):
 
 
 class SubspaceWorkspace(SweepWorkspace):
-    """Memory of the method for one problem."""
+    """Workspace of the method for one problem."""
 
     def __init__(self, problem: LCP, settings: SubspaceMinimization) -> None:
         super().__init__(problem, settings.precision)
@@ -124,14 +128,17 @@ class SubspaceWorkspace(SweepWorkspace):
     def start(
         self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
     ) -> None:
-        """Forget the free set; the operator may have changed."""
+        """Reset the free set; the operator may have changed."""
         super().start(warm=warm, tolerance=tolerance)
         self.floating = floating
         self._stale, self._target = True, tolerance
         self.system.refresh()
 
     def classify(self, x: wp.array[Any]) -> tuple[int, int]:
-        """Find the free set; return how many unknowns entered or left it, and how many are held."""
+        """Find the free set; return how many unknowns changed sides and are held.
+
+        An unknown is free where l < x < u ([Book] eq. 2.92).
+        """
         p = self.problem
         p.bounds.follow(x)
         found = self._sums.of(
@@ -144,7 +151,11 @@ class SubspaceWorkspace(SweepWorkspace):
         return moved, held
 
     def minimize(self, x: wp.array[Any]) -> int:
-        """Solve on the free set and move x along the projected correction; returns linear iterations."""
+        """Solve on the free set and move x along the projected correction.
+
+        It solves A_FF e_F = -y_F / size, then x <- clip(x + size e, l, u) with the correction
+        halved until the residual or the energy falls. Returns the number of linear iterations.
+        """
         s, residual = self.settings, self.residual
         norm, energy = residual.evaluate(x), self._energy(x)
         size = self._right_side(1.0)
@@ -172,6 +183,10 @@ class SubspaceWorkspace(SweepWorkspace):
         return iterations
 
     def _correct(self, x: wp.array[Any], scale: float) -> None:
+        """Set x = clip(x0 + scale e, l, u) from the x0 before the correction.
+
+        Held unknowns then follow bounds that are affine in x.
+        """
         p = self.problem
         p.bounds.follow(self._before)
         projected_move(
@@ -192,7 +207,10 @@ class SubspaceWorkspace(SweepWorkspace):
         self._finish_move(x)
 
     def _energy(self, x: wp.array[Any]) -> float:
-        """Return x'A x / 2 + b'x = x'(y + b) / 2, y being that of x; infinite where there is none: A not symmetric, bounds affine."""
+        """Return the energy x'A x / 2 + b'x = x'(y + b) / 2, y being that of x.
+
+        Infinite where it does not exist: A is not symmetric, or bounds are affine.
+        """
         if not self.problem.A.symmetric or self._old_bounds:
             return np.inf
         for slot, other in enumerate((self.residual.y, self.problem.b)):
@@ -200,7 +218,7 @@ class SubspaceWorkspace(SweepWorkspace):
         return 0.5 * float(self._sums.scalars.numpy().sum())
 
     def _right_side(self, scale: float) -> float:
-        """Set the system's right-hand side to -scale y on the free set; return y's norm there."""
+        """Set the right-hand side to -scale y on the free set; return y's norm there."""
         return float(
             np.sqrt(
                 self._sums.of(

@@ -1,1 +1,1 @@
-"""Sweeps of relaxation methods: rows and small blocks one after the other, their order, and the spectrum of the scaled matrix."""
+"""Sweeps of relaxation methods: rows, small blocks, orders, spectrum."""

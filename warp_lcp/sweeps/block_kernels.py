@@ -1,5 +1,8 @@
 # mypy: ignore-errors
-"""Kernels of blocked Gauss-Seidel: small boxed problems, solved exactly by active sets, one block after the other."""
+"""Kernels of blocked Gauss-Seidel: small boxed problems solved by active sets.
+
+The blocks are solved exactly, one after the other.
+"""
 
 import functools
 from typing import Any
@@ -13,14 +16,18 @@ from warp_lcp.sweeps.sweep_kernels import INFINITE, ZERO, scalar_solution
 
 f64, i32 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int32)
 AT_LOWER, FREE, AT_UPPER = wp.constant(0), wp.constant(1), wp.constant(2)
-# of the terms of y and of |x|: what elimination in a small block leaves
+# Relative to the terms of y and to |x|: rounding error of the elimination in a small block.
 ROUNDING = wp.constant(wp.float64(1e-12))
-SINGULAR = wp.constant(wp.float64(1e-13))  # of the largest entry
+SINGULAR = wp.constant(wp.float64(1e-13))  # relative to the largest entry
 
 
 @wp.struct
 class BlockLists:
-    """Blocks: where each begins in `rows`, those, of which block each row is and where in it, and the order of the blocks."""
+    """Lists of the blocks.
+
+    Where each block begins in `rows`, the rows of the blocks, the block of each row and its place
+    there, and the order of the blocks.
+    """
 
     first: i32
     rows: i32
@@ -31,7 +38,11 @@ class BlockLists:
 
 @functools.cache
 def block_sweep_kernel(a_type: Any, m: int) -> Any:
-    """Return the kernel for entries of type a_type and blocks of at most m unknowns."""
+    """Return the kernel for entries of type a_type and blocks of at most m unknowns.
+
+    A block is the boxed problem of A_BB and c = b_B + A_BC x_C; its unknowns have the states
+    AT_LOWER, FREE and AT_UPPER.
+    """
     name = f"warp_lcp.blocked_gauss_seidel.{a_type.__name__}_{m}"
     Rows = matrix_rows(a_type)
     vector = wp.types.vector(length=m, dtype=wp.float64)
@@ -41,7 +52,10 @@ def block_sweep_kernel(a_type: Any, m: int) -> Any:
 
     @wp.struct
     class BlockSide:
-        """Lower or upper bounds of a block's unknowns; within it they may be affine in another unknown, `at` >= 0."""
+        """Lower or upper bounds of a block's unknowns.
+
+        Within the block they may be affine in another unknown, `at` >= 0.
+        """
 
         constant: vector
         slope: vector
@@ -49,7 +63,7 @@ def block_sweep_kernel(a_type: Any, m: int) -> Any:
 
     @wp.func
     def side_at(side: BlockSide, x: vector, p: int):
-        """The bound of unknown p at x."""
+        """Return the bound of unknown p at x."""
         value = side.constant[p]
         q = side.at[p]
         if q >= 0:
@@ -58,22 +72,30 @@ def block_sweep_kernel(a_type: Any, m: int) -> Any:
 
     @wp.func
     def set_side(side: BlockSide, p: int, S: AffineSide, B: BlockLists, x: f64, i: int, block: int):
-        """The side with the bound of unknown i as its p-th one: affine in an unknown of the block, or constant while that is solved."""
-        made = side
-        made.constant[p] = bound_at(S, x, i)
-        made.at[p] = -1
+        """Return the side with the bound of unknown i as its p-th one.
+
+        The bound is affine in an unknown of the block, or constant while the block is solved.
+        """
+        updated = side
+        updated.constant[p] = bound_at(S, x, i)
+        updated.at[p] = -1
         if S.index.shape[0] > 0:
             j = S.index[i]
             if j >= 0:
                 if B.owner[j] == block:
-                    made.constant[p] = S.constant[i]
-                    made.slope[p] = S.coefficient[i]
-                    made.at[p] = B.place[j]
-        return made
+                    updated.constant[p] = S.constant[i]
+                    updated.slope[p] = S.coefficient[i]
+                    updated.at[p] = B.place[j]
+        return updated
 
     @wp.func
     def solve_set(a: table, low: BlockSide, high: BlockSide, state: places, n: int):
-        """Solve rows of A x = -c where free, x = bound elsewhere; the last component is 1, or 0 where the set is singular."""
+        """Solve A x = -c in the free rows, x = bound in the others.
+
+        `a` holds [A, c]. Gaussian elimination with partial pivoting; rows of affine bounds couple x
+        to the unknown that they depend on. The last component of the result is 1, or 0 where the
+        set is singular.
+        """
         t = a
         largest = ZERO
         for p in range(n):
@@ -127,7 +149,11 @@ def block_sweep_kernel(a_type: Any, m: int) -> Any:
 
     @wp.func
     def wanted(a: table, low: BlockSide, high: BlockSide, x: vector, state: places, n: int):
-        """The set that x asks for: states that are wrong, changed."""
+        """Return the active set that x selects: violated states are changed.
+
+        A free unknown outside its bounds goes to the bound; one at its lower bound with y < 0, or
+        at its upper bound with y > 0, becomes free. Violations within rounding do not count.
+        """
         new = state
         size = ZERO
         for p in range(n):
@@ -155,7 +181,12 @@ def block_sweep_kernel(a_type: Any, m: int) -> Any:
 
     @wp.func
     def solve_block(a: table, low: BlockSide, high: BlockSide, x: vector, n: int):
-        """Solve the block: change wrong states, all at first, then the one of least index; else try all sets; else scalar problems."""
+        """Solve the block by changes of its active set.
+
+        All violated states are changed at first, later the one of least index. If that does not
+        end, all sets are tried; if none solves the block, its unknowns are solved as scalar
+        problems.
+        """
         state = places()
         for p in range(n):
             state[p] = FREE
@@ -168,8 +199,8 @@ def block_sweep_kernel(a_type: Any, m: int) -> Any:
         sets = int(1)
         for _ in range(n):
             sets = sets * 3
-        # of the set; below 0: the one that the last asked for. One place solves, or CUDA keeps what
-        # it takes twice
+        # Code of the set; below 0: the one that the last set selected. A single place calls the
+        # solve, because CUDA would keep registers for two.
         code = int(-1)
         count = int(0)
         while code < sets:
@@ -234,7 +265,11 @@ def block_sweep_kernel(a_type: Any, m: int) -> Any:
         forward: bool,
         x: f64,
     ):
-        """Solve `each` blocks a thread, from place begin of their order."""
+        """Solve `each` blocks per thread, from place `begin` of their order.
+
+        For each block: c = b_B + A_BC x_C with the other unknowns C, then the boxed problem of A_BB
+        and c, relaxed by omega and projected onto its bounds.
+        """
         thread = wp.tid()
         for step in range(each):
             at = begin + thread * each + step
@@ -268,8 +303,8 @@ def block_sweep_kernel(a_type: Any, m: int) -> Any:
             new = solve_block(a, low, high, old, n)
             for p in range(n):
                 new[p] = old[p] + omega * (new[p] - old[p])
-            # unknowns that others' bounds depend on have constant ones, so that their order does
-            # not matter
+            # Unknowns on which other bounds depend have constant bounds: they are projected first,
+            # so that the order within the block does not matter.
             for p in range(n):
                 if low.at[p] < 0 and high.at[p] < 0:
                     new[p] = wp.clamp(new[p], low.constant[p], high.constant[p])

@@ -1,4 +1,7 @@
-"""Extreme eigenvalues of the scaled matrix D^-1/2 A D^-1/2, by Lanczos' method: what step lengths and relaxation factors come from."""
+"""Extreme eigenvalues of the scaled matrix D^-1/2 A D^-1/2, by Lanczos' method.
+
+Step lengths and relaxation factors follow from them.
+"""
 
 from __future__ import annotations
 
@@ -15,12 +18,11 @@ SEED = 20151
 
 
 def scaled_spectrum(problem: LCP, steps: int, free: Any = None) -> tuple[float, float]:
-    """Return estimates of the least and the greatest eigenvalue of D^-1/2 A D^-1/2, D the diagonal of A.
+    """Estimate the least and the greatest eigenvalue of D^-1/2 A D^-1/2.
 
-    Where A is not symmetric, of its symmetric part.
-
-    The greatest is estimated from below, mostly to a percent in 20 steps; the least from above, and
-    slowly. The vectors are on the host.
+    D is the diagonal of A. Where A is not symmetric, the values are those of its symmetric part.
+    The greatest is estimated from below, usually to a percent in 20 steps; the least from above,
+    with slow convergence. The vectors are on the host.
 
     Args:
         problem: its bounds and b do not matter.
@@ -30,7 +32,7 @@ def scaled_spectrum(problem: LCP, steps: int, free: Any = None) -> tuple[float, 
 
     Raises:
         ValueError: a diagonal entry of an unknown is negative, or `free` is empty. Zero entries are
-            taken as 1.
+            replaced by 1.
     """
     layout, A = problem.layout, problem.A
     scale = 1 / np.sqrt(positive_diagonal(problem))
@@ -42,6 +44,7 @@ def scaled_spectrum(problem: LCP, steps: int, free: Any = None) -> tuple[float, 
     field, image, nothing = (layout.zeros(wp.float64) for _ in range(3))
 
     def product(v: np.ndarray) -> np.ndarray:
+        """Return D^-1/2 A D^-1/2 v, or that of the symmetric part of A."""
         field.assign(scale * v)
         problem.apply_plus(field, nothing, image)
         if not A.symmetric:
@@ -75,18 +78,25 @@ def positive_diagonal(problem: LCP) -> np.ndarray:
 
 
 def _lanczos(product: Any, v: np.ndarray, steps: int) -> tuple[float, float]:
-    """Return the extreme Ritz values of a symmetric map; plain three-term recurrence, whose ghosts do no harm to them."""
+    """Return the extreme Ritz values of a symmetric map after some Lanczos steps.
+
+    Plain three-term recurrence without reorthogonalization: ghost eigenvalues do not change the
+    extreme ones. It stops where the Krylov space is exhausted.
+    """
     alpha: list[float] = []
     beta: list[float] = []
     old = np.zeros_like(v)
     for _ in range(steps):
         check_time()
+        # w = A v - beta v_old - alpha v; alpha and beta are the tridiagonal matrix of the Ritz
+        # values.
         w = product(v)
         if beta:
             w -= beta[-1] * old
         alpha.append(float(v @ w))
         w -= alpha[-1] * v
         size = float(np.linalg.norm(w))
+        # The Krylov space is exhausted.
         if size <= 1e-10 * max(map(abs, alpha)):
             break
         beta.append(size)

@@ -1,4 +1,7 @@
-"""How the unknowns of a problem are swept: by the operator itself, or row by row where rows are at hand; and whether sweeps contract."""
+"""Sweeps over the unknowns of a problem, and the test whether they contract.
+
+By the operator itself, or row by row where it gives access to rows.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,7 @@ from warp_lcp.sweeps.sweep_kernels import CHANGE, row_kernels
 
 
 class SweepOrder(StrEnum):
-    """In which order the unknowns of a sweep are visited ([Book] 2.2.1 and fig. 2.3)."""
+    """Order in which a sweep visits the unknowns ([Book] 2.2.1 and fig. 2.3)."""
 
     NATURAL = "natural"
     MULTICOLOR = "multicolor"
@@ -32,17 +35,21 @@ OrderName = Literal[tuple(map(str, SweepOrder))]
 
 
 class Sweep:
-    """Sweeps a problem's iterate, in an order of its own."""
+    """Base of the sweeps over a problem's iterate."""
 
     def start(self) -> None:
-        """A solve begins: take again of A what is not shared with it."""
+        """Begin a solve: read again those data of A that are copies."""
 
     def run(self, x: wp.array[Any], *, forward: bool) -> None:
         """Sweep x (stored, float64) once."""
 
 
 class OperatorSweep(Sweep):
-    """The operator's own sweep: red-black on grids, by rows or by colors on sparse matrices. Affine bounds are evaluated once a sweep."""
+    """The operator's own sweep.
+
+    Red-black on grids, by rows or by colors on sparse matrices. Affine bounds are evaluated once a
+    sweep.
+    """
 
     def __init__(
         self, problem: LCP, A: Relaxes, omega: float, *, colored: bool | None = None
@@ -58,20 +65,22 @@ class OperatorSweep(Sweep):
 
 
 def bound_operands(problem: LCP) -> list[Any]:
-    """Return the lower and the upper bounds, as kernels take them that follow x."""
+    """Return the lower and the upper bounds for kernels that evaluate them at x."""
     affine = problem.bounds.affine
     return affine.operands if affine else [affine_side(problem.lower), affine_side(problem.upper)]
 
 
 class RowSweep(Sweep):
-    """Rows one after the other by one thread, in any order; bounds affine in x and zero or negative diagonals are minded row by row.
+    """Sweep row by row by one thread, in any order.
+
+    Bounds that are affine in x and zero or negative diagonals are treated row by row.
 
     Args:
         problem: the problem.
         rows: its operator's rows.
         omega: relaxation factor.
-        order: NATURAL, MAGNITUDE (largest |x| first, sorted anew before each sweep) or GREEDY
-            (always the row that would change most).
+        order: NATURAL, MAGNITUDE (largest |x| first, sorted before each sweep) or GREEDY (always
+            the row that would change most).
         permutation: rows in the order of a sweep; all of them by number if None.
     """
 
@@ -86,19 +95,19 @@ class RowSweep(Sweep):
         self.problem, self._rows, self._omega, self._order = problem, rows, wp.float64(omega), order
         n = problem.layout.size
         self._n = n if permutation is None else len(permutation)
-        given = (
+        places = (
             np.zeros(n if order is SweepOrder.MAGNITUDE else 0)
             if permutation is None
             else permutation
         )
-        self._places = wp.array(given, dtype=wp.int32, device=problem.device)
+        self._places = wp.array(places, dtype=wp.int32, device=problem.device)
         self._matrix = rows.operand
         self._bounds = bound_operands(problem)
         self._kernels = row_kernels(rows.values.dtype)
         self._y = problem.layout.zeros(wp.float64) if order is SweepOrder.GREEDY else None
 
     def run(self, x: wp.array[Any], *, forward: bool) -> None:
-        """Sweep by one thread, the order chosen now where it depends on x."""
+        """Sweep by one thread; an order that depends on x is computed first."""
         p = self.problem
         if self._y is not None:
             p.A.apply(x, self._y)
@@ -113,24 +122,24 @@ class RowSweep(Sweep):
 
 
 class DiagonalSweep(Sweep):
-    """The operator's own sweep while the diagonal is positive, row by row where an entry of it is not."""
+    """The operator's own sweep if the diagonal is positive, else a row sweep."""
 
     def __init__(self, own: Sweep, by_rows: Sweep | None, diagonal: Diagonal) -> None:
         self._own, self._by_rows, self._diagonal, self._current = own, by_rows, diagonal, own
 
     def start(self) -> None:
-        """Look at the diagonal, which decides how to sweep."""
+        """Choose the sweep by the current diagonal."""
         self._current = (
             self._own if self._by_rows is None or self._diagonal.positive() else self._by_rows
         )
 
     def run(self, x: wp.array[Any], *, forward: bool) -> None:
-        """Sweep in the way that the diagonal allows."""
+        """Sweep by the chosen sweep."""
         self._current.run(x, forward=forward)
 
 
 class Diagonal:
-    """A problem's diagonal, and what a scalar problem can make of it."""
+    """A problem's diagonal, and the test of its scalar problems."""
 
     def __init__(self, problem: LCP, residual: NaturalResidual) -> None:
         self.problem, self._residual = problem, residual
@@ -140,20 +149,23 @@ class Diagonal:
         return self.field().numpy().astype(np.float64) * self._residual.unit
 
     def field(self) -> wp.array[Any]:
-        """Return the diagonal / unit, a stored field; of grids and sparse matrices their own memory."""
+        """Return the diagonal / unit, a stored field.
+
+        For grids and sparse matrices it is their own memory.
+        """
         p, r = self.problem, self._residual
         return r.diagonal if has(p.A, HasStencil) else p.layout.load(p.A.diagonal(), p.A.dtype)
 
     def positive(self) -> bool:
-        """Return whether every unknown's entry is positive."""
+        """Return whether the entries of all unknowns are positive."""
         return bool((self.values()[self.problem.unknown.numpy() == 1] > 0).all())
 
     def check(self) -> None:
         """Refuse rows without a minimizer in their own direction ([Book] 2.2.2, fig. 2.4).
 
         Raises:
-            ValueError: A_ii = 0 with a b_i that asks for a move without a bound in its way, or A_ii
-                < 0 where no bound solves the row.
+            ValueError: A_ii = 0 and b_i requires a move that no bound limits, or A_ii < 0 where no
+                bound solves the row.
         """
         p, d = self.problem, self.values()
         b, lower, upper, inside = (
@@ -163,9 +175,9 @@ class Diagonal:
             p.unknown.numpy() == 1,
         )
         with np.errstate(invalid="ignore", over="ignore"):
-            # neither the lower bound solves the scalar problem with the others at 0,
+            # The lower bound does not solve the scalar problem with the others at 0.
             below = np.isinf(lower) | (b + d * lower < 0)
-            above = np.isinf(upper) | (b + d * upper > 0)  # nor the upper one
+            above = np.isinf(upper) | (b + d * upper > 0)  # the upper one does not either
         concave = inside & (d < 0) & below & above
         if concave.any():
             row = int(np.flatnonzero(concave)[0])
@@ -175,7 +187,8 @@ class Diagonal:
                 f"b = {b[row]}): no sweep can solve them"
             )
         if has(p.A, NamesComponents):
-            # a grid's zero diagonals are isolated cells, which the loop settles or calls INFEASIBLE
+            # A grid's zero diagonals are isolated cells, which the loop settles or calls
+            # INFEASIBLE.
             return
         stuck = inside & (d == 0) & (((b < 0) & np.isinf(upper)) | ((b > 0) & np.isinf(lower)))
         if stuck.any():
@@ -237,7 +250,7 @@ def sweep_for(
 
 
 def check_colors(problem: LCP) -> None:
-    """Refuse grids that two colors do not suffice for.
+    """Refuse grids that need more than two colors.
 
     Raises:
         ValueError: a periodic side has an odd number of cells.
@@ -256,11 +269,11 @@ class Contraction:
     """Tests sweeps for contraction and divergence ([Book] 2.2.1, algorithm 4).
 
     The book compares max |x_i| of successive sweeps, and calls any growth divergence. From x = 0
-    that stops every solve at its second sweep, so the change delta = max |x_i - x_i before| is
-    compared, which a contraction shrinks: divergence is a delta that has grown in RISES sweeps in a
-    row and is GROWTH times the least one. Bounds can hide divergence: iterates then jump between
-    bounds, delta stays as it is, and the solve ends as stagnated. A delta of 0 is a sweep that
-    changes nothing.
+    that stops every solve at its second sweep. Here the change delta = max |x_i - x_i,old| is
+    compared, which a contraction reduces. A solve diverges if delta has grown in RISES successive
+    sweeps and is GROWTH times the least one. Bounds can hide divergence: iterates then jump between
+    bounds, delta stays constant, and the solve ends as stagnated. If delta = 0, the sweep has
+    changed nothing.
 
     Attributes:
         factor: delta over the one before; estimates the rate of convergence once it has settled.
@@ -275,12 +288,15 @@ class Contraction:
         self.factor = np.nan
 
     def start(self, x: wp.array[Any]) -> None:
-        """Begin with x as the iterate before the first sweep."""
+        """Store x as the iterate before the first sweep."""
         wp.copy(self._old, x)
         self._last, self._least, self._rises, self.factor = np.nan, np.inf, 0, np.nan
 
     def test(self, x: wp.array[Any]) -> SolveStatus | None:
-        """Compare x with the x of the last call; return DIVERGED, NON_DESCENT where nothing changed, or None."""
+        """Compare x with the x of the last call.
+
+        Returns DIVERGED, NON_DESCENT where nothing has changed, or None.
+        """
         self._out.zero_()
         CHANGE.bind(rows_of(x), x=x, old=self._old, out_of=self._out).launch()
         delta = float(self._out.numpy()[0])

@@ -1,5 +1,8 @@
 # mypy: ignore-errors
-"""Kernels of sweeps: the scalar problem of one unknown, rows one after the other in any order, Jacobi's pass, the size of a change."""
+"""Kernels of sweeps.
+
+The scalar problem of one unknown, rows in any order, Jacobi's method, and the size of a change.
+"""
 
 import functools
 from pathlib import Path
@@ -15,12 +18,16 @@ from warp_lcp.rows.compiler import forward_kernel
 
 f64, i32, i8 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int32), wp.array(dtype=wp.int8)
 ZERO = wp.constant(wp.float64(0.0))
-INFINITE = wp.constant(wp.float64(1.0e300))  # bounds beyond are none
+INFINITE = wp.constant(wp.float64(1.0e300))  # larger bounds are infinite
 
 
 @wp.func
 def bound_for_concave(x: wp.float64, y: wp.float64, d: wp.float64, l: wp.float64, u: wp.float64):
-    """Where d < 0: the bound at which y has the sign it should have; of two, the one with the lesser d t^2 / 2 + y t."""
+    """Return the bound that solves a scalar problem with d < 0.
+
+    There y has the right sign: y >= 0 at l, y <= 0 at u. Of two such bounds it is the one with the
+    lesser energy d t^2 / 2 + y t, t the change of x.
+    """
     has_l = l > -INFINITE
     has_u = u < INFINITE
     v = x
@@ -45,7 +52,11 @@ def bound_for_concave(x: wp.float64, y: wp.float64, d: wp.float64, l: wp.float64
 def scalar_solution(
     x: wp.float64, y: wp.float64, d: wp.float64, l: wp.float64, u: wp.float64, omega: wp.float64
 ):
-    """What x becomes, case by case on the sign of the diagonal d ([Book] 2.2.2, fig. 2.4)."""
+    """Return the relaxed solution of the scalar problem of one unknown.
+
+    By the sign of the diagonal d ([Book] 2.2.2, fig. 2.4): clip(x - omega y / d, l, u) for d > 0;
+    the bound that the sign of y selects for d = 0; the bound of least energy for d < 0.
+    """
     v = x
     if d > ZERO:
         v = wp.clamp(x - omega * y / d, l, u)
@@ -55,7 +66,7 @@ def scalar_solution(
         if y < ZERO:
             v = u
         if wp.abs(v) > INFINITE:
-            v = x  # no minimizer in this direction: x waits for the others
+            v = x  # no minimizer in this direction: x does not change
         v = wp.clamp(v, l, u)
     else:
         v = bound_for_concave(x, y, d, l, u)
@@ -64,7 +75,10 @@ def scalar_solution(
 
 @functools.cache
 def row_kernels(a_type: Any) -> SimpleNamespace:
-    """Return the kernels for entries of type a_type: `sweep` in a given order, `greedy` by the largest residual."""
+    """Return the kernels of row sweeps for entries of type a_type.
+
+    `sweep` uses a given order, `greedy` the largest residual.
+    """
     name = f"warp_lcp.sweep.{a_type.__name__}"
     entries, Rows = wp.array(dtype=a_type), matrix_rows(a_type)
 
@@ -80,7 +94,10 @@ def row_kernels(a_type: Any) -> SimpleNamespace:
         n: int,
         x: f64,
     ):
-        """Relax the rows of `order` (empty: all, by number) one after the other, by one thread."""
+        """Relax the rows of `order` one after the other, by one thread.
+
+        An empty `order` means all rows, by number.
+        """
         for place in range(n):
             r = place
             if not forward:
@@ -114,7 +131,10 @@ def row_kernels(a_type: Any) -> SimpleNamespace:
         y: f64,
         x: f64,
     ):
-        """Relax n times the row whose x would change most, measured by |d| |change|; A is symmetric, so that its column is its row."""
+        """Relax n times the row whose x would change most, measured by |d| |change|.
+
+        y = A x + b is updated by the row's column, which equals the row: A is symmetric.
+        """
         for _ in range(n):
             chosen = int(-1)
             most = ZERO
@@ -150,7 +170,7 @@ def row_kernels(a_type: Any) -> SimpleNamespace:
 
 @functools.cache
 def jacobi_kernel(d_type: Any) -> Any:
-    """Return the kernel of Jacobi's pass for a diagonal of type d_type."""
+    """Return the kernel of Jacobi's method for a diagonal of type d_type."""
 
     @forward_kernel(module=f"warp_lcp.jacobi.{d_type.__name__}")
     def jacobi(
@@ -163,7 +183,7 @@ def jacobi_kernel(d_type: Any) -> Any:
         omega: wp.float64,
         x: f64,
     ):
-        """Solve each scalar problem from the same x."""
+        """Solve the scalar problem of each unknown at the same x."""
         i = wp.tid()
         if unknown[i] == wp.int8(1):
             x[i] = scalar_solution(x[i], y[i], unit * wp.float64(d[i]), lower[i], upper[i], omega)
