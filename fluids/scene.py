@@ -18,17 +18,17 @@ from warp_lcp.settings import Positive
 
 # Measured at 96^3 as the growth of a process on the CPU, first step included; bytes a cell.
 PRESSURE_BYTES = 92  # fields of the pressure solve
-BOUND_BYTES = 9  # of them, those of walls that separate
-LEVEL_SET_BYTES = 19  # more for a surface between cells, or slivers
+BOUND_BYTES = 9  # of them, bounds of separating walls
+LEVEL_SET_BYTES = 19  # added for a surface between cells, or slivers
 SMOOTHING_BYTES = 12
 TENSION_BYTES = 21
 UNILATERAL_BYTES = 1
-# its fields, those of coarse levels, and the velocity before the pressure
+# Its fields, those of coarse levels, and the velocity before the pressure solve.
 VISCOUS_BYTES = {2: 140, 3: 220}
-# Courant numbers below it: liquid over a mesh gained energy without bound at 1/4 on 40 cells, at
-# 1/8 on 20
+# Courant numbers below this are short steps: liquid poured over a mesh gained energy without bound
+# at 1/4 on 40 cells, at 1/8 on 20.
 SHORT_STEPS = 0.5
-# of a right-hand side that bodies change, and a motion of a body, if it is light
+# Added for a right-hand side that bodies change, and for each motion of a light body.
 BODY_BYTES, POTENTIAL_BYTES = 8, 4
 VISCOSITY = Usual(
     1e-4,
@@ -41,7 +41,7 @@ VISCOSITY = Usual(
 TENSION = Usual(1e-4, 3.0, "N/m", "0.02 to 0.5, 0.072 for water,", "mN/m", 1e-3)
 DRAG = Usual(0.0, 1.0, "", "about 0.005")
 LIQUID_CFL = Usual(0.0, 10.0, "", "1 to 4")
-# for A + U W U', see `fluids.coupling`
+# Methods for A + U W U', see `fluids.coupling`.
 COUPLED_METHODS = ("projected-multigrid", "minimum-map-newton", "primal-dual-active-set")
 
 
@@ -94,7 +94,7 @@ class LiquidScene(ParticleScene):
 
     solve_bytes: ClassVar[int] = PRESSURE_BYTES
     carried_by_grid: ClassVar[bool] = True
-    # splashed liquid lies in more cells, and solves take more iterations
+    # Factor on cells and iterations: splashed liquid occupies more cells.
     stirred: ClassVar[float] = 1.2
 
     pressure: Pressure = Field(default_factory=Pressure)
@@ -188,7 +188,7 @@ class LiquidScene(ParticleScene):
         return found
 
     def _viscosity_complaints(self) -> list[Complaint]:
-        """Return what needs viscosity, and what viscosity does not go with."""
+        """Return errors of settings that need viscosity or exclude it."""
         if self.viscosity is not None and self.endless:
             return [Complaint(("viscosity",), None, "cannot be combined with periodic axes")]
         own = [
@@ -227,7 +227,7 @@ class LiquidScene(ParticleScene):
     def kept(
         self, materials: Sequence[MaterialProperties | SourceProperties]
     ) -> list[float] | None:
-        """Return viscosities relative to `viscosity.value`; None: one viscosity."""
+        """Return viscosities relative to `viscosity.value`; None if all are equal."""
         if self.viscosity is None or all(
             shape.viscosity is None for shape in (*self.liquid, *self.source)
         ):
@@ -311,7 +311,7 @@ class LiquidScene(ParticleScene):
 
     @property
     def drags(self) -> list[float] | None:
-        """Return c_f of the domain's walls and of each solid; None: no wall drag.
+        """Return c_f of the domain's walls and of each solid; None without wall drag.
 
         See `fluids.wall_drag`.
         """
@@ -324,16 +324,16 @@ class LiquidScene(ParticleScene):
     def keeps_volume(self) -> bool:
         """Return whether voids inside the liquid are closed.
 
-        Not with the unilateral model, where liquid may separate, nor with a narrow band, whose
-        interior is known to a tenth.
+        False with the unilateral model, where liquid may separate, and with a narrow band, whose
+        interior density is known only to a tenth.
         """
         return self.pressure.model == "incompressible" and self.particles.narrow_band is None
 
     @property
     def settles(self) -> bool:
-        """Return whether overfull cells settle to the density at rest.
+        """Return whether overfull cells relax to the density at rest.
 
-        The unilateral model settles them with gravity, see `fluids.unilateral`.
+        False with the unilateral model, where gravity does this, see `fluids.unilateral`.
         """
         return self.pressure.model == "unilateral" and any(self.physics.gravity)
 
@@ -393,12 +393,13 @@ class LiquidScene(ParticleScene):
     def short_steps(self) -> bool:
         """Return whether steps are short enough to need support of spray.
 
-        Spray must then not take the velocity of the liquid beside it in each step.
+        In short steps spray must not take the velocity of the liquid beside it, see
+        `fluids.pressure`.
         """
         return self.time.cfl < SHORT_STEPS and self.pressure.model == "incompressible"
 
     def own_memory_parts(self) -> dict[str, int]:
-        """Return the most memory of pressure and surface on the device [bytes]."""
+        """Return the peak memory of pressure and surface on the device [bytes]."""
         cells, level_set = self.counted_cells, self.pressure.surface == "ghost-fluid"
         bounded = self.lets_go or self.pressure.model == "unilateral"
         motions = sum(solid.is_body for solid in self.solid) * (3 if self.dimension == 2 else 6)
