@@ -37,8 +37,8 @@ from warp_lcp.settings import (
     renamed_names,
 )
 
-# (1 - momentum) times the cells along a side, in cold solves. Below 2 sqrt(pressure_step / 4) pi / 2
-# = 1.4 the longest wave, a quarter of which fits into a column's depth, oscillates, and walls hold
+# (1 - momentum) times the cells along a side, in cold solves. Below 1.4 = 2 sqrt(pressure_step / 4)
+# pi / 2 the longest wave, a quarter of which fits into a column's depth, oscillates, and walls hold
 # back what has risen. Friction needs a larger value.
 SWING = 1.9
 # Distance of the cells of one color along each axis. Two threads then change no common velocity,

@@ -1,4 +1,4 @@
-"""Scenes of rigid bodies alone: walls, solids that stand or are moved, and bodies that gravity and contacts move."""
+"""Scene tables of rigid bodies without a material: walls, solids, joints, targets."""
 
 from __future__ import annotations
 
@@ -59,7 +59,10 @@ class ContactOutput(Output):
 
 
 class JointTable(Table):
-    """[[joint]]: connects two bodies at a point, or a body with space. Bodies of a joint do not collide."""
+    """[[joint]]: connects two bodies at a point, or a body with space.
+
+    Bodies of a joint do not collide.
+    """
 
     kind: JointKind = Field(
         description="ball: turns about the anchor; hinge: about an axis; fixed: not"
@@ -86,7 +89,7 @@ class JointTable(Table):
     )
 
     def complaints(self, dimension: int, solids: Sequence[Any]) -> list[Complaint]:
-        """Return what is wrong with the joint among these solids in a scene of 2 or 3 dimensions."""
+        """Return errors of the joint among these solids in 2 or 3 dimensions."""
         found, hinge = [], self.kind == "hinge"
         for number in self.solids:
             if not 0 <= number < len(solids):
@@ -149,7 +152,11 @@ class JointTable(Table):
         return found
 
     def to_joint(self, bodies: Sequence[int]) -> Joint:
-        """Return the joint; `bodies` has the number among the bodies of each solid, WORLD of what stands."""
+        """Return the joint.
+
+        `bodies` maps each solid to its number among the bodies, or to WORLD for a solid that is no
+        body.
+        """
         first, second = [
             bodies[number] for number in [*self.solids, *([-1] if len(self.solids) == 1 else [])]
         ]
@@ -162,9 +169,10 @@ class JointTable(Table):
 
 
 class TargetTable(Table):
-    """[[target]]: path of a point of a body. Inverse kinematics moves the bodies, without forces and contacts.
+    """[[target]]: path of a point of a body, for inverse kinematics.
 
-    Each body must be the first body of a hinge; hinges form trees.
+    Inverse kinematics moves the bodies, without forces and contacts. Each body must be the first
+    body of a hinge; hinges form trees.
     """
 
     solid: int = Field(ge=0, description="number of the body among the [[solid]] tables, from 0")
@@ -175,7 +183,7 @@ class TargetTable(Table):
     )
 
     def complaints(self, dimension: int, solids: Sequence[Any]) -> list[Complaint]:
-        """Return what is wrong with the target among these solids in a scene of 2 or 3 dimensions."""
+        """Return errors of the target among these solids in 2 or 3 dimensions."""
         found = []
         if self.solid >= len(solids) or not solids[self.solid].is_body:
             found.append(Complaint(("solid",), self.solid, "must be the number of a rigid body"))
@@ -199,7 +207,7 @@ class TargetTable(Table):
 
 
 class ContactScene(Scene):
-    """A scene of rigid bodies without a material."""
+    """Scene of rigid bodies without a material."""
 
     elsewhere: ClassVar = dict.fromkeys(
         ("sand", "material", "friction"), "granular"
@@ -213,21 +221,24 @@ class ContactScene(Scene):
     @model_validator(mode="before")
     @classmethod
     def _method_for_joints(cls, data: Any) -> Any:
-        """Fill in the method of scenes with joints where none is given."""
+        """Set the default method of scenes with joints."""
         solver = data.get("solver", {}) if isinstance(data, dict) else None
         if isinstance(solver, dict) and data.get("joint"):
             return {**data, "solver": {"method": JOINTED, **solver}}
         return data
 
     def body_numbers(self) -> list[int]:
-        """Return the number among the bodies of each solid, WORLD of what stands, and WORLD once more at the end."""
+        """Return the number among the bodies of each solid, and a final WORLD.
+
+        WORLD for a solid that is no body.
+        """
         moving = [solid.is_body for solid in self.solid]
         return [
             int(sum(moving[:index])) if body else WORLD for index, body in enumerate(moving)
         ] + [WORLD]
 
     def joints(self) -> list[Joint]:
-        """Return the joints, between bodies by their numbers among the bodies."""
+        """Return the joints, with the numbers of their bodies."""
         return [table.to_joint(self.body_numbers()) for table in self.joint]
 
     def targets(self) -> list[Target]:
@@ -242,7 +253,7 @@ class ContactScene(Scene):
         ]
 
     def complaints(self) -> list[Complaint]:
-        """Return what is wrong across keys."""
+        """Return errors that involve several keys."""
         found = super().complaints()
         if not any(solid.is_body for solid in self.solid):
             found.append(
@@ -298,7 +309,7 @@ class ContactScene(Scene):
         )
 
     def _target_complaints(self) -> list[Complaint]:
-        """Return what is wrong with targets, and with what they move."""
+        """Return errors of targets and of the bodies that they move."""
         found = [
             Complaint(("target", index, *c.place), c.value, c.message)
             for index, table in enumerate(self.target)
@@ -324,7 +335,7 @@ class ContactScene(Scene):
         return found
 
     def _joint_complaints(self) -> list[Complaint]:
-        """Return what is wrong with joints, and what does not go with them."""
+        """Return errors of joints, and of keys that exclude joints."""
         found = [
             Complaint(("joint", index, *c.place), c.value, c.message)
             for index, table in enumerate(self.joint)
@@ -354,7 +365,7 @@ class ContactScene(Scene):
         return found
 
     def plan(self) -> list[tuple[str, str]]:
-        """Return what a run would do."""
+        """Return a summary of the run."""
         kept = {"preset", "open", "moving", "bodies", "time", "frames"}
         solver, moving = self.solver, sum(solid.is_body for solid in self.solid)
         model = "the circular cone" if solver.method in CONE else "boxes"
@@ -386,7 +397,7 @@ class ContactScene(Scene):
         ]
 
     def _joint_line(self) -> str:
-        """Return what joints there are, for the plan."""
+        """Return the line of the plan about joints."""
         counts = {
             kind: sum(table.kind == kind for table in self.joint) for kind in get_args(JointKind)
         }
@@ -401,7 +412,10 @@ class ContactScene(Scene):
         return ", ".join(line for line, count in named.items() if count)
 
     def _grid_complaints(self) -> list[Complaint]:
-        """Return what is wrong with the domain; its sides need not be whole numbers of cells."""
+        """Return errors of the domain.
+
+        Its sides need not be whole numbers of cells.
+        """
         found = self.domain.spacing_complaints()
         if self.domain.periodic is not None and len(self.domain.periodic) != self.dimension:
             found.append(

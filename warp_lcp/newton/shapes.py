@@ -22,7 +22,7 @@ from warp_lcp.grid.solids import (
 )
 from warp_lcp.grid.triangle_mesh import close_surface
 
-SEGMENTS = 64  # around what is round and made of triangles: its volume is 0.2 % too small
+SEGMENTS = 64  # segments of round shapes made of triangles: the volume is 0.2 % too small
 
 
 def rotation_of(quaternion: np.ndarray) -> np.ndarray:
@@ -34,19 +34,19 @@ def rotation_of(quaternion: np.ndarray) -> np.ndarray:
 
 
 def pose_of(transform: np.ndarray) -> Pose:
-    """Return the change of place that a transform is: position [m] and quaternion, shape (7,)."""
+    """Return the pose of a transform: position [m] and quaternion, shape (7,)."""
     return Pose(rotation_of(transform[3:]), np.asarray(transform[:3], dtype=np.float64))
 
 
 def geometries(model: Any, origin: np.ndarray) -> dict[int, list[Geometry]]:
-    """Return the shapes of each body, -1 the world's, where the model places them: those that collide with shapes.
+    """Return the colliding shapes of each body as placed in the model; -1: the world.
 
     Args:
-        model: of newton.
-        origin: what is the origin in the liquid's coordinates [m], shape (3,).
+        model: the newton model.
+        origin: origin of the liquid's coordinates in the world [m], shape (3,).
 
     Raises:
-        ValueError: a shape has no inside, or none that a liquid can tell.
+        ValueError: a shape has no inside, or none that a liquid can use.
     """
     arrays = {
         name: getattr(model, f"shape_{name}").numpy()
@@ -70,12 +70,15 @@ def geometries(model: Any, origin: np.ndarray) -> dict[int, list[Geometry]]:
 
 
 def united(shapes: list[Geometry]) -> Geometry:
-    """Return all shapes of a body as one."""
+    """Return all shapes of a body as one shape."""
     return shapes[0] if len(shapes) == 1 else Union(parts=tuple(shapes))
 
 
 def reaches_into(geometry: Geometry, size: np.ndarray) -> bool:
-    """Tell whether a standing shape reaches into a domain from the origin to `size` [m], or may: a floor that only bears it does not."""
+    """Return whether a shape at rest reaches, or may reach, into the domain.
+
+    The domain is a box from the origin to `size` [m]. A floor below the domain does not count.
+    """
     slack = 1e-6 * float(size.max())
     bounds = geometry.bounds()
     if bounds is not None:
