@@ -1,4 +1,4 @@
-"""The motions of a scene file: how a solid moves, from where its shape is placed."""
+"""Motions of a scene file: movement of a solid relative to its placement."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class PrescribedMotion(Table):
         return found
 
     def _size_complaints(self, dimension: int) -> list[Complaint]:
-        """Return what is wrong with the number of entries, and with keys that are missing or too many."""
+        """Return errors of the number of entries, and missing or superfluous keys."""
         return [
             Complaint((name,), value, f"must have {dimension} entries in {dimension}-D")
             for name, value in self
@@ -67,7 +67,7 @@ class TranslationMotion(PrescribedMotion):
     stop: float | None = Field(default=None, description="end time [s]; default: never")
 
     def to_motion(self, dimension: int) -> motion.Motion:
-        """Return the shift over time."""
+        """Return the translation over time."""
         from warp_lcp.grid import motion
 
         return motion.Translation(
@@ -86,7 +86,7 @@ class RotationMotion(PrescribedMotion):
     stop: float | None = Field(default=None, description="end time [s]; default: never")
 
     def to_motion(self, dimension: int) -> motion.Motion:
-        """Return the turn over time."""
+        """Return the rotation over time."""
         from warp_lcp.grid import motion
 
         return motion.Rotation(
@@ -117,7 +117,7 @@ class SinusoidMotion(PrescribedMotion):
     axis: Axis | None = Field(default=None, description=AXIS)
 
     def to_motion(self, dimension: int) -> motion.Motion:
-        """Return shift and turn over time."""
+        """Return translation and rotation over time."""
         from warp_lcp.grid import motion
 
         zeros = [0.0] * dimension
@@ -163,7 +163,7 @@ class KeyframesMotion(PrescribedMotion):
     )
 
     def to_motion(self, dimension: int) -> motion.Motion:
-        """Return shift and turn over time."""
+        """Return translation and rotation over time."""
         from warp_lcp.grid import motion
 
         rotate = (

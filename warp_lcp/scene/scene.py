@@ -58,7 +58,10 @@ GridMethod = Literal[grid_methods()]
 
 
 def _tolerance(value: Any) -> Any:
-    """Return a number in (0, 1) or "auto"; a wrong one is refused as any other number is, without a word of the alternative's type."""
+    """Return a number in (0, 1) or "auto", with an error as for any other number.
+
+    The error does not mention the type of the alternative.
+    """
     return value if value == "auto" else adapter(Share).validate_python(value)
 
 
@@ -69,17 +72,17 @@ Tolerance = Annotated[
 
 PRESET_KEY = "set of defaults by accuracy"
 
-LONGEST_NAME = 60  # characters; file systems take 255 bytes, and a letter has up to four
+LONGEST_NAME = 60  # characters; file systems allow 255 bytes, and a letter has up to four
 NAME_RULE = (
     f'must be a name of at most {LONGEST_NAME} letters, digits, "-", "_", "." and spaces, '
     "without a dot or space at its ends"
 )
 
-WHOLE_CELLS = 1e-6  # how far a side may be from a whole number of cells, relative
+WHOLE_CELLS = 1e-6  # largest relative distance of a side from a whole number of cells
 
 
 def _name(text: str) -> str:
-    """Return a name that may be a folder's, whatever stands before it; "" is none."""
+    """Return a valid name of a folder, also with a prefix; "" for no name."""
     if len(text) > LONGEST_NAME or text != text.strip(". ") or set(text) - set(file_name(text)):
         raise PydanticCustomError("name", NAME_RULE)
     return text
@@ -120,7 +123,7 @@ class Time(Table):
     def frame_time(self, frame: int) -> float:
         """Return the time [s] of a frame.
 
-        The last one is the end of the run, whether or not that is a multiple of the frame interval.
+        The last one is the end of the run, even if that is no multiple of the frame interval.
         """
         return min(frame / self.frames_per_second, self.duration)
 
@@ -166,7 +169,7 @@ class Domain(Table):
     @model_validator(mode="before")
     @classmethod
     def _without_ends(cls, data: Any) -> Any:
-        """Give a domain of a spacing sides that are farther than anything gets."""
+        """Set the sides of a domain with `spacing` to an unreachable distance."""
         if (
             not isinstance(data, dict)
             or not isinstance(data.get("spacing"), int | float)
@@ -186,7 +189,7 @@ class Domain(Table):
 
     @property
     def boundless(self) -> bool:
-        """Return whether there are no far ends."""
+        """Return whether the domain is unbounded."""
         return self.spacing is not None
 
     def spacing_complaints(self) -> list[Complaint]:
@@ -289,7 +292,7 @@ class Scene(Table):
     """
 
     elsewhere: ClassVar = dict.fromkeys(("sand", "material", "friction", "gauge"), "granular")
-    palette: ClassVar[Literal["water", "sand"]] = "water"  # of its images
+    palette: ClassVar[Literal["water", "sand"]] = "water"  # color scheme of its images
     scene: About
     time: Time
     domain: Domain
@@ -302,7 +305,7 @@ class Scene(Table):
     @model_validator(mode="before")
     @classmethod
     def _gravity_is_down(cls, data: Any) -> Any:
-        """Fill in gravity, whose default needs the number of dimensions."""
+        """Set gravity, whose default depends on the number of dimensions."""
         domain, physics = (
             (data.get("domain"), data.get("physics", {}))
             if isinstance(data, dict)
@@ -327,7 +330,7 @@ class Scene(Table):
     @model_validator(mode="before")
     @classmethod
     def _preset_fills_in(cls, data: Any) -> Any:
-        """Take from `solver.preset` what the scene does not say."""
+        """Apply the defaults of `solver.preset`."""
         return fill_in(cls, data) if isinstance(data, dict) else data
 
     @model_validator(mode="after")
@@ -349,7 +352,7 @@ class Scene(Table):
     def seen(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the low and high corner [m] of the region in pictures, shape (3,).
 
-        The domain; if unbounded, the region of the shapes.
+        It is the domain or, if that is unbounded, the region of the shapes.
         """
         size = np.array([*self.domain.size, 0.0][:3])
         boxes = (
@@ -374,13 +377,13 @@ class Scene(Table):
 
     @property
     def endless(self) -> tuple[int, ...]:
-        """Return the axes without an end: what leaves at one side comes in at the other."""
+        """Return the periodic axes."""
         return ()
 
     def materials(self) -> tuple[str, Sequence[MaterialProperties]]:
         """Return the key of the material's shapes, such as `liquid`, and the shapes.
 
-        Empty for bodies alone.
+        Empty for scenes without a material.
         """
         return "material", ()
 
@@ -392,7 +395,7 @@ class Scene(Table):
         return ()
 
     def body_frictions(self) -> list[float]:
-        """Return Coulomb's coefficient of each solid's surface against bodies and walls."""
+        """Return the friction coefficient of each solid against bodies and walls."""
         given = [
             BODY_FRICTION if solid.friction is None else solid.friction for solid in self.solid
         ]
@@ -440,7 +443,7 @@ class Scene(Table):
         Args:
             key: the array's name in the file, such as `liquid`.
             shapes: its entries.
-            inside: also refuse an entry that lies wholly outside the domain.
+            inside: also refuse entries that lie wholly outside the domain.
         """
         found = []
         for index, shape in enumerate(shapes):
@@ -506,7 +509,7 @@ class Scene(Table):
     def memory_estimate(self) -> int:
         """Return the estimated peak memory of a run [bytes]; 0: unknown.
 
-        Without the program itself.
+        It does not include the program itself.
         """
         return sum(self.memory_parts().values())
 
@@ -578,7 +581,10 @@ class Scene(Table):
         return found
 
     def _outside_complaints(self) -> list[Complaint]:
-        """Return which rigid bodies lie wholly outside the domain, as far as their keys tell."""
+        """Return errors of rigid bodies that lie wholly outside the domain.
+
+        As far as their keys tell, without mesh files.
+        """
         return [
             Complaint(
                 ("solid", index),
@@ -603,7 +609,7 @@ class Scene(Table):
         ]
 
     def _body_line(self, index: int, solid: Solid) -> str:
-        """Return what a rigid body is, for the plan."""
+        """Return a description of a rigid body, for the plan."""
         unit = "kg" if self.dimension == 3 else "kg/m"
         return f"solid {index} {solid.shape} of " + (
             f"{solid.mass:g} {unit}" if solid.mass is not None else f"{solid.density:g} kg/m^3"
