@@ -20,7 +20,7 @@ from warp_lcp.operators.grid_poisson import FLUID
 from warp_lcp.problem.stopping import StoppingCriteria
 
 PETSC, CUTEST, P4PDES = "PETSc", "CUTEst", "p4pdes"
-SPG = "CSPG.jl"  # its table of CUTEst's problems, by the spectral projected gradient method
+SPG = "CSPG.jl"  # its table of CUTEst's problems, with the spectral projected gradient method
 
 
 @dataclass(frozen=True)
@@ -28,14 +28,14 @@ class Published:
     """Published figure and the function that recomputes it.
 
     Attributes:
-        problem: whose it is, a heading of docs/problems.md.
-        case: which size and data, and which number.
-        printed: the number; zeros that only fill a column are left out.
-        source: who printed it.
-        measure: computes it.
-        within: where ours is another one, what it differs by at most, for a reason that
-            docs/problems.md gives; 0: all digits are met.
-        slow: whether that takes more than a few seconds.
+        problem: name of the problem, a heading of docs/problems.md.
+        case: size, data, and the quantity.
+        printed: the number, without zeros that only fill a column.
+        source: its source.
+        measure: function that recomputes it.
+        within: allowed difference if our value differs, for a reason in docs/problems.md; 0 if all
+            digits agree.
+        slow: whether it takes more than a few seconds.
     """
 
     problem: str
@@ -51,7 +51,7 @@ class Published:
         """Half a unit of the last printed digit, or `within`."""
         exponent = Decimal(self.printed).as_tuple().exponent
         assert isinstance(exponent, int)
-        # rounded half up, and binary fractions
+        # Rounded half up, and for binary fractions.
         return self.within or 0.5 * 10.0**exponent * (1 + 1e-6)
 
 
@@ -59,7 +59,7 @@ def solution(problem: Problem) -> np.ndarray:
     """Return the solution of a gallery problem to 12 digits, on the host.
 
     Raises:
-        RuntimeError: it was not found; the message has the status.
+        RuntimeError: the solve failed; the message has the status.
     """
     result = solve(problem.lcp(), stopping=StoppingCriteria(rtol=1e-12))
     if not result:
@@ -123,7 +123,7 @@ def _bearings() -> list[Published]:
     return found
 
 
-# (name, load, border): {Q: (printed, within)}
+# (name, load, border): {Q: (printed, within)}.
 TORSIONS: dict[tuple[str, float, float], dict[int, tuple[str, float]]] = {
     ("TORSION1", 5.0, 0.5): {
         2: ("-5.1851852e-1", 0),
@@ -271,11 +271,11 @@ def _dam(nx: int) -> np.ndarray:
 def seepage_height(w: np.ndarray, *, high: float = 24.0, low: float = 4.0) -> float:
     """Return the height of the seepage face of a dam above the water behind it.
 
-    Of the highest wet node beside the face, as in p4pdes/dam.c.
+    It is that of the highest wet node beside the face, as in p4pdes/dam.c.
 
     Args:
         w: solution of `dam`, shape (ny, nx).
-        high: of the dam, in any unit of length.
+        high: height of the dam, in any unit of length.
         low: depth of the water behind it.
     """
     y = np.linspace(0, high, len(w))
