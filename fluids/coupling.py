@@ -119,7 +119,7 @@ class BodyCoupling:
             self._low.update(self._weights(), symmetric=True)
 
     def grow_entries(self) -> bool:
-        """Write the entries again that exceeded the buffer of a GPU in the last `take`.
+        """Write the entries of U again if they exceeded the buffer of a GPU.
 
         Returns:
             Whether entries were missing, so that the solve must be repeated.

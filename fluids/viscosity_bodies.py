@@ -137,7 +137,9 @@ class WallPull:
     def pulled(
         self, velocity: Sequence[wp.array], points: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return C'u and D of each solid, shapes (solids, width) and (solids, width, width).
+        """Return C'u and D of each solid.
+
+        Shapes (solids, width) and (solids, width, width).
 
         Args:
             velocity: u of each component [m/s].

@@ -41,7 +41,9 @@ WALL = 0.5
 
 @dataclass(frozen=True, slots=True)
 class ViscousRows:
-    """Equations of the faces of one component, float32 fields but for `span` and `axis`.
+    """Equations of the faces of one component.
+
+    Float32 fields except `span` and `axis`.
 
     Attributes:
         axis: axis of the component.
@@ -81,7 +83,9 @@ class LevelShift:
 
 
 class ViscosityLevel:
-    """Viscous equations on a grid, see `CycleLevel`; on a rank, on its part of the grid.
+    """Viscous equations on a grid, see `CycleLevel`.
+
+    On a rank, on its part of the grid.
 
     Args:
         grid: grid of the level.

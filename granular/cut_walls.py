@@ -1,4 +1,4 @@
-"""Solids that cut cells of sand: open fractions, and Coulomb friction on their true surface.
+"""Solids that cut cells of sand: open fractions, and friction on their surface.
 
 The discrete power of the stresses includes only the open part: pressure on the open part of a face,
 a deviator on the open part of its cell or edge. Strain rates are differences between faces that can

@@ -279,7 +279,7 @@ class SandScene(ParticleScene):
     @model_validator(mode="before")
     @classmethod
     def _density_of_material(cls, data: Any) -> Any:
-        """Take the density from the material unless [physics] says otherwise."""
+        """Set the default density to that of the material."""
         if not isinstance(data, dict):
             return data
         material, physics = data.get("material", {}), data.get("physics", {})

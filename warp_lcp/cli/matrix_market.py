@@ -65,7 +65,7 @@ def read_shape(path: Path, fits: Fits, expected: str) -> tuple[int, int]:
 
 
 def read_market(path: Path, fits: Fits, expected: str) -> Any:
-    """Read a matrix: scipy.sparse (CSR) or numpy as the file says, float64.
+    """Read a matrix: scipy.sparse (CSR) or numpy, as in the file, float64.
 
     Args:
         path: the file; .gz and .bz2 are unpacked.

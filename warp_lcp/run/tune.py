@@ -49,7 +49,7 @@ class Candidate:
     seconds: float
 
     def words(self) -> str:
-        """Return the settings as the command line takes them."""
+        """Return the settings in the format of the command line."""
         return " ".join(f"{key}={value:g}" for key, value in self.settings.items())
 
 

@@ -105,7 +105,10 @@ def _rename(
 
 
 def _table_classes(annotation: Any) -> Iterator[type[Table]]:
-    """Yield the classes of tables in an annotation, such as those of a list or a union."""
+    """Yield the classes of tables in an annotation.
+
+    Such as those of a list or a union.
+    """
     if isinstance(annotation, type) and issubclass(annotation, Table):
         yield annotation
     for part in get_args(annotation):

@@ -199,7 +199,10 @@ def clipped_convex(
 
 
 def _inner_ball(rows: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return center and radius of the largest ball in halfspaces: max r, n x + r <= -d."""
+    """Return center and radius of the largest ball in halfspaces.
+
+    max r, n x + r <= -d.
+    """
     found = linprog(
         [0.0, 0.0, 0.0, -1.0],
         A_ub=np.column_stack([rows[:, :3], np.ones(len(rows))]),
