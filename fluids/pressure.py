@@ -98,6 +98,7 @@ class Projection:
         result: result of the solve; `result.x` is kick_dt p / (rho dx) [m/s]. None without liquid
             cells.
         unknowns: number of FLUID cells.
+        found: returns `released` and `max_outflow`, and waits for the device.
     """
 
     result: wl.SolveResult | None

@@ -99,8 +99,8 @@ class ViscosityLevel:
             walls, see `fluids.viscosity`.
         edges: weights of links across, by pairs of axes.
         volume, drag, diagonal, hold, norm, there: fields of the faces of each component: mass
-        weights; contribution of walls to the diagonal; their sum; flags of faces that a wall holds;
-        normalization of the interpolation; flags of unknowns.
+            weights; contribution of walls to the diagonal; their sum; flags of faces that a wall
+            holds; normalization of the interpolation; flags of unknowns.
         r: the residual; scratch memory of sweeps.
         span: first and one past the last unknown of each row, and its core, a run of cells with
             equal equations.

@@ -120,7 +120,8 @@ class SandBodies:
     def place(self, index: np.ndarray, centers: np.ndarray, walls: Walls) -> None:
         """Find the faces, cells and edges where bodies meet sand.
 
-        index: int, -1 in open cells, the wall number elsewhere; shape of the grid's fields.
+        Args:
+            index: int, -1 in open cells, the wall number elsewhere; shape of the grid's fields.
             centers: centers of mass [m], shape (bodies, 3).
             walls: faces between sand and solids; the same object while `index` is unchanged.
         """

@@ -143,6 +143,21 @@ class Stress(wl.VariationalInequality):
     by the methods of `granular.coupled`. Gradient, projection and momentum of a cell are fused in
     one kernel (`granular.stress.step` in `headers/stress.h`), so that there are no separate
     functions for y and P.
+
+    Args:
+        packing: the packing of the step.
+        walls: faces between sand and solids.
+        box: bound each part of the friction separately, as Narain et al. do; else the cone.
+        rate: friction grows with the shear rate, see `YieldSet`.
+        bodies: rigid bodies that the stresses move, if any.
+
+    Attributes:
+        now: the stresses, see `granular.yield_set`, float32.
+        kick_dt: time that forces acted in the step of these stresses [s]; 0 before the first step.
+        cold: whether forces act for much longer in the current step than in the last one, as in the
+            first two steps.
+        checked: velocity under the stresses, in float64, from the last `residual`.
+        last_residual: residual of pressure and friction [m/s].
     """
 
     def __init__(

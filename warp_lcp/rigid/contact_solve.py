@@ -201,6 +201,13 @@ class ContactSolve:
         / 2 - t). The positions still have the motion before the impact until t, and that after it
         later, see `detour`.
 
+        Args:
+            contacts: the contacts of the step.
+            approach: normal velocities before gravity acted [m/s], shape (k,).
+            dt: time step [s].
+            kick_dt: time that gravity has acted [s].
+            gravity: [m/s^2], shape (3,).
+
         Returns:
             Impulses of the other contacts before the impacts [N s], shape (k, dimension).
         """

@@ -39,8 +39,8 @@ def fix_text(text: str, model: type[Table], source: str) -> tuple[str, list[str]
 
     The rest of the text is unchanged.
 
-    text: text of a valid TOML file.
-        text: of a valid TOML file.
+    Args:
+        text: text of a valid TOML file.
         model: the class of the scene.
         source: the file, for messages.
 
