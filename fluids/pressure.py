@@ -357,6 +357,11 @@ class PressureProjection:
         self._kick, self._ratio = kick_dt, kick_dt / self._last if self._last > 0.0 else 0.0
 
     def _make_problem(self) -> None:
+        """Create the LCP on the boxes of this rank, and the solver's workspace.
+
+        In one process the problem uses the fields of the grid directly. On ranks it has copies,
+        without ghost layers.
+        """
         part, least, opened = self.grid.part, self._least, self.boundary.open
         fields = [self._unknown, least if isinstance(least, wp.array) else None, self._shift]
         kind, lower, shift = boxes = [

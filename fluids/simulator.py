@@ -190,7 +190,13 @@ class LiquidSimulation(ParticleSimulation):
             return self._step(dt)
 
     def _step(self, dt: float) -> Row:
-        """Advance by dt [s]."""
+        """Advance by dt [s]; see `step`.
+
+        Order of a step: particles to grid, with gravity; free surface and surface tension; user
+        models; viscosity; pressure and projection; wall impulses and wall drag; extrapolation of
+        the velocity; grid to particles; motion of particles and solids. Rigid bodies get their
+        impulses from viscosity and pressure, and contacts are solved after both.
+        """
         before = self.begin_step(dt)
         if self.forces is not None:
             self.forces.begin(self.time)
@@ -477,7 +483,12 @@ class LiquidSimulation(ParticleSimulation):
         ]
 
     def _project(self, window: Window, dt: float, speed: float) -> Projection:
-        """Solve for the pressure and project the velocity."""
+        """Solve for the pressure and project the velocity.
+
+        The bodies get the impulses of the pressure first, so that closed faces have the bodies' new
+        velocities in the projection. Without unknowns, all liquid is spray and only the sources'
+        faces are set.
+        """
         projection, watch = self.projection, self.watch
         with watch.stage("pressure set-up", *self.velocity, *projection.fields()):
             self.boundary.begin_step(self.time, dt)

@@ -89,6 +89,9 @@ class TimeErrorTolerance:
     ) -> None:
         """Estimate the time discretization error from a solution.
 
+        It computes e'A e for e = x - x0, the squared norm of the velocity change; `time_error`
+        reads the sum later, without a wait here.
+
         Args:
             A: the operator.
             result: the solve's result.

@@ -221,6 +221,10 @@ class Viscosity:
     ) -> ViscousResult:
         """Apply viscosity to a velocity for one step, and store its change.
 
+        Conjugate gradients in float32 compute a correction, and the residual is recomputed in
+        float64 (iterative refinement), until it is below the tolerance or its rounding. In stiff
+        steps the criterion of the first correction is its estimated error.
+
         Args:
             velocity: u1 of each component [m/s] (updated), extrapolated into the air by one face.
             window: cells that hold all liquid, with a margin of two.
@@ -399,7 +403,12 @@ class Viscosity:
             self.grid.everywhere.run(self._passes.sum, u=u, kept=kept, more=more)
 
     def _set_up(self, kind: wp.array, contact: wp.array) -> None:
-        """Set up the equations of a step, with a change of 0."""
+        """Set up the equations of a step, with a change of 0.
+
+        The order is: distances of faces from walls, which change only with moving walls; weights of
+        the links, from the liquid fractions of cells and edges, tau and the viscosities; diagonals,
+        with the drag of walls; coarse levels.
+        """
         clear(self._change)
         fine, boundary, passes, planes = self._fine, self.boundary, self._passes, self.grid.planes
         slip, distance = self._slip, self._distance

@@ -84,6 +84,9 @@ class WallPull:
     ) -> None:
         """Compute `rows`, `blocks` and `values`.
 
+        Each entry is a link of a liquid face to a face or wall of a solid. The kernel counts the
+        entries of each component, and then writes them.
+
         Args:
             window: cells with all faces beside the solids; None without any.
             level: the equations of the step.
@@ -238,6 +241,9 @@ class BodyDrag:
         self, level: ViscosityLevel, walls: ViscousWalls, velocity: Sequence[wp.array]
     ) -> None:
         """Compute the coefficients of a step, and the bodies' response to the liquid.
+
+        With m = rho dx^d M^-1 it computes W = (1 + m D)^-1 m for each body, symmetrized against
+        rounding, and the force C'u - D V of the current velocities.
 
         Arguments as of `WallPull.take`.
         """

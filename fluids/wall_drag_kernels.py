@@ -77,7 +77,11 @@ def mean_of(field: F32, known: I8, axis: int, component: int, k: int, j: int, i:
 
 @wp.func
 def velocity_on(D: Drag, axis: int, k: int, j: int, i: int):
-    """Return the velocity vector on a face [m/s]."""
+    """Return the velocity vector on a face [m/s].
+
+    The component of the face's own axis is stored there; the others are means over the surrounding
+    faces.
+    """
     q = wp.vec3()
     if axis == 0:
         q[0] = D.u[k, j, i]
@@ -188,6 +192,10 @@ def drag_kernel(
     losses: wp.array(dtype=wp.float64),
 ):
     """Apply the drag to the projected faces of a row beside walls.
+
+    With the sums over all pieces of wall, the new velocity is u' = u - sum of rate lost / (1 + sum
+    of rate), the implicit step of `fluids.wall_drag`. The sum has to be known before any piece's
+    share of the impulse, so that pieces are visited twice if impulses are written.
 
     Only walls that hold the liquid count. With `values` null the pieces of wall are counted, else
     their impulses are written. Velocities change only if `apply` is set. `mass` is that of a full

@@ -177,6 +177,10 @@ class SandBodies:
     ) -> None:
         """Start a time step.
 
+        The start velocity is that of the body together with its layer of sand, of mass m and
+        momentum p in units of full faces. With w = rho dx^d M^-1 it is (1 + w m)^-1 (V* + w p), and
+        the response to impulses is (1 + w m)^-1 w.
+
         Args:
             packing: the packing of the step.
             sand: velocity u* of each component [m/s], including gravity, also on the bodies' faces.
@@ -240,6 +244,10 @@ class SandBodies:
         self, packing: Packing, numbers: wp.array, *, pressure_step: float, shear_step: float
     ) -> None:
         """Compute the correction of a trial step per velocity mismatch.
+
+        The correction is (1 + W G)^-1, where G = R D^-1 R' bounds the change of the force with the
+        velocity: a sum over cells of the steps of pressure and deviator, and over edges of those of
+        shear.
 
         Args:
             packing: the packing of the step.
@@ -319,7 +327,11 @@ class SandBodies:
     def respond(
         self, packing: Packing, stress: wp.array, launch: Launch, *, implicit: bool
     ) -> None:
-        """Compute the bodies' velocity under the stresses, or a step toward it."""
+        """Compute the bodies' velocity under the stresses, or a step toward it.
+
+        A first kernel sums the forces over runs of cells and edges; a second one sums the runs of
+        each body and updates its velocity, see `bodies_kernels.respond_kernel`.
+        """
         device = self.grid.device
         inputs = [
             self._shape,

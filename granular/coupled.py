@@ -311,6 +311,7 @@ class InterleavedSweeps(Settings):
         )
 
     def _round(self, stress: Stress) -> None:
+        """Launch a round of sweeps: pressure, friction in cells, friction on walls."""
         p, walls, device = stress.packing, stress.walls, stress.packing.grid.device
         passes = interleaved_passes(p.grid.dimension, stress.box, stress.rate, device.is_cuda)
         structs, now, numbers, omega = (

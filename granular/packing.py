@@ -172,7 +172,11 @@ class Packing:
     def _launch(
         self, density: wp.array, velocity: Sequence[wp.array], solid: Sequence[wp.array]
     ) -> None:
-        """Launch an update."""
+        """Launch an update.
+
+        Each kernel needs the result of the one before: fractions of cells; kinds, flags and free
+        volumes; masses of faces; weights of edges; stiffness of cells; spans of the rows.
+        """
         grid, dimension = self.grid, self.grid.dimension
         domain, nodes = grid.domain, self.nodes
         domain.launch(kernels.fraction_kernel, [self.base, self._capacity, density, self.fraction])

@@ -57,6 +57,7 @@ class SandReport:
         )
 
     def _launch_taking(self, velocity: Sequence[wp.array]) -> None:
+        """Launch the copy of velocities, and the contact of cells beside walls."""
         stress, packing = self.stress, self.stress.packing
         for axis, field in enumerate(velocity):
             fields = [
@@ -94,6 +95,7 @@ class SandReport:
         }
 
     def _launch_report(self) -> None:
+        """Launch the sums of the log values over all cells."""
         stress, p = self.stress, self.stress.packing
         self._report.take(
             p.counted,

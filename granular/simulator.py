@@ -160,6 +160,7 @@ class SandSimulation(ParticleSimulation):
             self._completion.run(window, variant=window.near is None)
 
     def _launch_completion(self, window: Window) -> None:
+        """Launch the velocity of faces that have mass, but no particle weight."""
         if self.sides is not None:
             self.sides.average(self.velocity, self.weights, self._saved or ())
         # Faces farther out have mass but no particle weight.
@@ -195,7 +196,12 @@ class SandSimulation(ParticleSimulation):
             return self._step(dt)
 
     def _step(self, dt: float) -> Row:
-        """Advance by dt [s]."""
+        """Advance by dt [s]; see `step`.
+
+        Order of a step: particles to grid, with gravity; packing; stress solve and its velocity;
+        contacts of bodies; extrapolation; grid to particles; motion of particles and solids. If a
+        later part fails, the stresses are rolled back.
+        """
         before = self.begin_step(dt)
         window = self.window(before)
         self.particles_to_grid(window)
@@ -396,7 +402,12 @@ class SandSimulation(ParticleSimulation):
         return wl.solve(self.stress, self.method, stopping=stopping, workspace=self._work)
 
     def _solve(self, window: Window, dt: float) -> Row:
-        """Solve for the stresses, and read their velocity; return log values."""
+        """Solve for the stresses, and read their velocity; return log values.
+
+        Order: density and packing, with the current velocities of solids and sources; rigid bodies;
+        stress solve; acceptance, see `step`; projected velocity; contacts. The yield set is in
+        units of impulses over rho dx [m/s].
+        """
         packing, stress, solids, scene = self.packing, self.stress, self.solids, self.scene
         with self.watch.stage("packing", self.density, packing.fraction, *self.velocity):
             self._density_to_grid.run(
@@ -615,6 +626,7 @@ class GranularSimulator:
         warnings: list[str] = []
 
         def make_parts(grid: StaggeredGrid) -> Parts:
+            """Build walls, solids and sources on a grid."""
             boundary, notes = make_boundary(scene, grid, folder, solids=placed)
             solids = SandSolids(
                 grid,

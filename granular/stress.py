@@ -240,6 +240,10 @@ class Stress(wl.VariationalInequality):
     def begin(self, bound: YieldSet, gravity: np.ndarray, dt: float, kick_dt: float) -> None:
         """Start from the last stresses, in cells that allow them in the new packing.
 
+        The stresses of the last step are scaled by the ratio of the times that forces act, damped
+        in the checkerboard pattern, and set to 0 in cells that cannot have stress in the new
+        packing.
+
         Args:
             bound: yield set of the sand.
             gravity: [m/s^2], three entries.
@@ -426,6 +430,11 @@ class Stress(wl.VariationalInequality):
         return self.last_residual
 
     def _project(self, velocity: Velocity, launch: Launch) -> None:
+        """Launch projected steps of cells and wall faces, or their natural residual.
+
+        With `self.velocity` in float32 it is a step; with `self.checked` in float64 the distance
+        that a step would move the stresses.
+        """
         p, walls, passes = self.packing, self.walls, velocity.passes
         structs = (p.fields, velocity.fields, self._fields)
         p.counted.run(passes.step, *structs, launch=launch, partials=self._cell_sums.partials)

@@ -218,7 +218,11 @@ class KinematicSimulation:
         return np.array([target.place(time) for target in self.targets])[:, : self.bodies.dimension]
 
     def _place(self, dt: float) -> None:
-        """Place the bodies at the current angles, with the mean velocities of the step."""
+        """Place the bodies at the current angles, with the mean velocities of the step.
+
+        Poses follow from the root of each tree to its ends. Velocities are differences of poses
+        over dt.
+        """
         turns: list[np.ndarray] = []
         anchors: list[np.ndarray] = []
         figure = self.figure
@@ -273,6 +277,7 @@ class KinematicSimulation:
         )
 
     def _row(self, pose: ReachedPose, goals: np.ndarray) -> dict[str, float | int | str | None]:
+        """Return a row of the log."""
         off = np.linalg.norm(self.figure.positions(self.theta) - goals, axis=1)
         own: dict[str, float | int | str | None] = {
             "target_error": float(off.max()),

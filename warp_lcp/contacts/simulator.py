@@ -128,6 +128,7 @@ class ContactSimulation:
         ]
 
     def _row(self, dt: float, status: str) -> dict[str, float | int | str | None]:
+        """Return a row of the log."""
         bodies, solved = self.bodies, self.bodies.contacts > 0 or bool(self.bodies.joints)
         momentum = bodies.bodies.momentum.sum(axis=0)
         # Potential energy half a step earlier.

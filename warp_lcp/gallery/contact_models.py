@@ -259,7 +259,11 @@ class StewartTrinkleModel:
         return scipy.sparse.csr_array(scipy.sparse.block_diag(blocks))
 
     def problem(self, system: ContactSystem) -> Problem:
-        """Return the LCP; it is mixed if joints have equations."""
+        """Return the LCP; it is mixed if joints have equations.
+
+        A = T B T' plus the entries of the cones: 1 in the rows of x_t and -1 in the row of beta,
+        and mu in the row of beta at x_n.
+        """
         k, m, T = system.contacts, len(system.lower), self.unfold(system)
         K = len(self.spread(system.dim)) - 1
         beta = np.zeros((2 + K, 2 + K))

@@ -110,7 +110,11 @@ class ContactStepper:
         self._joints: np.ndarray | None = None
 
     def step(self) -> StepReport:
-        """Advance the world by dt and return the report of the solve."""
+        """Advance the world by dt and return the report of the solve.
+
+        Order of a step: contacts and their problem; impulses; velocities; position correction;
+        motion.
+        """
         world, dt = self.world, self.dt
         assembly = world.assemble(dt, rate=self.rate if self.stabilization == "baumgarte" else 0.0)
         system = assembly.system

@@ -76,6 +76,7 @@ def _energy(make: Callable[..., Problem], *sizes: Any, **options: Any) -> Callab
 
 
 def _bearings() -> list[Published]:
+    """Return the published figures of journal bearings."""
     rows = [(8, 12, 0.1, "-.183437"), (10, 16, 0.9, "-15.607"), (50, 50, 0.99, "-60.1509")]
     found = [
         Published(
@@ -179,6 +180,7 @@ TORSIONS_SPG = [
 
 
 def _torsions() -> list[Published]:
+    """Return the published figures of torsion problems."""
     rows = [
         (*key, Q, *value, CUTEST) for key, values in TORSIONS.items() for Q, value in values.items()
     ]
@@ -200,6 +202,7 @@ def _torsions() -> list[Published]:
 
 
 def _sines() -> list[Published]:
+    """Return the published figures of membranes over obstacles."""
     hill = {
         4: "0.753659753",
         10: "1.397897560",
@@ -242,6 +245,7 @@ def _ball_errors(n: int) -> np.ndarray:
 
 
 def _balls() -> list[Published]:
+    """Return the published figures of the ball obstacle problem."""
     known = {
         5: ("4.531e-02", "1.635e-01"),
         9: ("3.076e-03", "1.334e-02"),
@@ -291,6 +295,7 @@ def _height(nx: int) -> float:
 
 
 def _dams() -> list[Published]:
+    """Return the published figures of dams."""
     rows = {
         5: ("2.53716015237691",),
         4: ("18.148640609503", "6.78414305345868"),
@@ -327,6 +332,7 @@ def _price(k: int) -> float:
 
 
 def _puts() -> list[Published]:
+    """Return the published figures of puts in Heston's model."""
     four, six = (
         ("2.0000", "1.1076", "0.5200", "0.2137", "0.0820"),
         ("2.00000", "1.10763", "0.520038", "0.213681", "0.082046"),
@@ -350,6 +356,7 @@ def _ice_errors(nodes: int, regularization: float) -> np.ndarray:
 
 
 def _domes() -> list[Published]:
+    """Return the published figures of ice domes."""
     rows = [
         (1e-3, "largest", np.max, "938.275"),
         (1e-3, "average", np.mean, "147.420"),

@@ -192,7 +192,11 @@ class IceDome:
             share = max(share / 10 ** (1 / 3), self.regularization)
 
     def _newton(self, H: np.ndarray, share: float, device: Any) -> np.ndarray:
-        """Return the solution for a share of the constant diffusivity from a guess."""
+        """Return the solution for a share of the constant diffusivity from a guess.
+
+        Each step solves the LCP of the linearization, F(H_k) - m + J (H - H_k) complementary to H
+        >= 0, on the inner nodes.
+        """
         inner = np.flatnonzero(np.pad(np.ones((self.nodes - 2,) * 2, dtype=bool), 1))
         falls = (self.balance() * (self.side / (self.nodes - 1)) ** 2).ravel()[inner]
         for _ in range(STEPS):

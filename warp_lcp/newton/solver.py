@@ -317,6 +317,11 @@ class SolverLiquid(SolverBase, CouplingInterface):
         return True
 
     def _advance(self, dt: float) -> None:
+        """Run steps of the liquid over dt [s], with shorter steps after a failure.
+
+        Steps are equal in length, at most the stable one and twice the last one. A failed step is
+        halved up to RETRIES times.
+        """
         simulation, end, least = self.simulation, self.simulation.time + dt, dt / 2**RETRIES
         step = math.inf
         while (remaining := end - simulation.time) > WHOLE * dt:

@@ -110,6 +110,7 @@ class Viewer:
                 self.go(newest)
 
     def _add_controls(self) -> None:
+        """Add keys, a slider and a timer to the plotter."""
         last = max(len(self.recording.numbers) - 1, 1)
         self.plotter.add_text(
             KEYS, position="upper_right", font_size=9, color=EDGE, name="keys", render=False

@@ -165,6 +165,10 @@ class RigidBodies:
     def solve_contacts(self) -> None:
         """Solve the contacts with the impulses of the material.
 
+        The momenta are reset to those without contacts, plus the impulses of the material, and
+        contacts are solved again, starting from the impulses of `begin_step`. Without impulses of
+        the material, those of `begin_step` are kept.
+
         Raises:
             RuntimeError: there was no `begin_step`.
         """

@@ -312,7 +312,11 @@ class BodyStates(Sequence[RigidBody]):
         return np.concatenate([self.momentum / self.mass[:, None], spin], axis=1)
 
     def inverse_masses(self, dimension: int) -> np.ndarray:
-        """Return `RigidBody.inverse_mass` of all, shape (n, k, k)."""
+        """Return `RigidBody.inverse_mass` of all, shape (n, k, k).
+
+        It is block diag(1/m, R I^-1 R') times the matrix `hold` of supported bodies, symmetrized
+        against rounding.
+        """
         if dimension == 2:
             # The last row of R I^-1 R', of which a plane needs only zz.
             across = self.rotation[:, 2:]

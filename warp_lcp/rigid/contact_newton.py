@@ -153,6 +153,11 @@ class ContactNewton:
     def _interior_point(self, rtol: float, start: float) -> None:
         """Mehrotra's predictor-corrector method from one start.
 
+        Each step solves the linearized equations twice with one matrix: a predictor toward the
+        bounds, whose success chooses the centering (reached / mean)^3, and a corrector with the
+        second-order terms. The first iterate has all pairs positive, with velocities `start` times
+        the largest of b.
+
         The equations are x_n u_n = 0, low (mu x_n + x_t) = 0 and up (mu x_n - x_t) = 0, with u_t =
         low - up.
 
@@ -229,6 +234,9 @@ class ContactNewton:
         self, weights: np.ndarray, diagonal: np.ndarray, coupling: np.ndarray, right: np.ndarray
     ) -> np.ndarray | None:
         """Return x of [I, -J'; W J, C] [w; x] = [0; right]; None if singular.
+
+        Eliminating w gives (W J J' + C) x = right. The system is scaled by `self._scale` on both
+        sides.
 
         Args:
             weights: the diagonal of W, shape (k rows,).

@@ -172,6 +172,10 @@ class ContactShape:
 
 
 def _box(shape: Box, dimension: int) -> ContactShape:
+    """Return a placed box as a shape.
+
+    In space its points are corners and points along the edges; in 2-D corners only.
+    """
     place = shape.placement
     lower, upper = (np.array([*corner, 0.0][:3]) for corner in (shape.lower, shape.upper))
     center, half = (
@@ -238,7 +242,10 @@ def _capsule(shape: Capsule) -> ContactShape:
 
 
 def _around(start: np.ndarray, end: np.ndarray, along: np.ndarray, radius: float) -> ContactShape:
-    """Return the shape of all points within a radius of a segment."""
+    """Return the shape of all points within a radius of a segment.
+
+    Points are along the segment, at shares `along` of its length.
+    """
     axis = (end - start)[0]
     square = float(axis @ axis)
     other = (
@@ -275,7 +282,11 @@ def _around(start: np.ndarray, end: np.ndarray, along: np.ndarray, radius: float
 
 
 def _polygon(shape: TriangleMesh) -> ContactShape:
-    """Return the cut of a mesh by z = 0 as a shape of the plane."""
+    """Return the cut of a mesh by z = 0 as a shape of the plane.
+
+    The distance is that to the nearest segment; it is negative where the outline winds around the
+    point.
+    """
     segments = mesh_outline(shape)
     if not len(segments):
         raise ValueError("the mesh does not meet the plane z = 0")
@@ -316,6 +327,10 @@ def _polygon(shape: TriangleMesh) -> ContactShape:
 
 
 def _surface(shape: TriangleMesh) -> ContactShape:
+    """Return a placed mesh as a shape.
+
+    The gradient of the distance is by central differences.
+    """
     vertices, triangles = shape.placement.apply(shape.surface.vertices), shape.surface.triangles
     size = 0.5 * float(np.ptp(vertices, axis=0).max())
     step = DIFFERENCE * size

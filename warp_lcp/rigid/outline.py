@@ -116,6 +116,7 @@ def body_surface(geometry: Geometry, dimension: int) -> BodySurface:
 
 
 def _box(box: Box, dimension: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return points and corners of a box; in 2-D of its cut by z = 0."""
     lower, upper = (np.array([*corner, 0.0][:3]) for corner in (box.lower, box.upper))
     if dimension == 2:
         unit = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])

@@ -169,6 +169,7 @@ class CheckpointFolder:
         return file
 
     def _write(self, checkpoint: Checkpoint) -> Path:
+        """Write the file of this rank's state; return it."""
         pickled = [name for name, array in checkpoint.state.items() if array.dtype.hasobject]
         if pickled:
             raise ValueError(

@@ -195,6 +195,7 @@ class Run:
         frames: int | None,
         on_step: Callable[[Run], object] | None,
     ) -> None:
+        """Check the arguments and initialize the run."""
         if frames is not None and (
             not isinstance(frames, int) or isinstance(frames, bool) or frames < 0
         ):

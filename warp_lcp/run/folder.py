@@ -247,6 +247,7 @@ class RunFolder:
 
     @on_root
     def _start(self, record: RunRecord) -> None:
+        """Delete files of an earlier run, and write scene and record."""
         own, _ = self._contents()
         # Checkpoints first, so that a half-deleted run is not continued.
         own.sort(key=lambda file: file.parent.name != CHECKPOINTS)
@@ -293,6 +294,7 @@ class RunFolder:
 
     @on_root
     def _continuation(self) -> Continuation:
+        """Return the checkpoint to continue from, and remarks, on the root rank."""
         self._check_run()
         self._check_same_scene()
         checkpoint, refused = self.checkpoints.newest()
@@ -475,6 +477,7 @@ class RunFolder:
                 self.collective.watchdog.post_in(self.path)
 
     def _check_run(self) -> None:
+        """Raise an error if the folder has no run, or foreign entries in its place."""
         if not holds_run(self.path):
             raise OutputError(f"{self.path}: there is no run to resume")
         wrong = [

@@ -56,6 +56,7 @@ class Log:
 
     @on_root
     def _open(self, path: Path, columns: tuple[str, ...], after_step: int | None) -> None:
+        """Open the file for appending, after its header or the rows to keep."""
         header = ",".join(columns)
         lines = [header] if after_step is None else rows_until(path, header, after_step)
         write_text(path, "".join(f"{line}\n" for line in lines))

@@ -359,6 +359,7 @@ class RunLoop:
         return self.record
 
     def _check_space(self, last: int, frame: list[Part]) -> None:
+        """Raise an error if the output of the remaining frames does not fit."""
         if not self.folder.keeps:
             return
         frames = max(0, last - self._frames_done() + 1)

@@ -211,6 +211,10 @@ class Profile:
 def _figures(
     seconds: float, moved: int, steps: int, total: float
 ) -> tuple[str, str, str, str, str]:
+    """Return the figures of a stage as texts.
+
+    Time [s], share, time per step [ms], traffic per step [MB], speed [GB/s].
+    """
     each = max(steps, 1)
     speed = f"{moved / seconds / 1e9:.2f}" if moved and seconds > 0.0 else ""
     share = f"{seconds / total:.1%}" if total > 0.0 else ""

@@ -213,6 +213,7 @@ class _Trial:
         self.seconds += clock_of() - begun
 
     def _look(self) -> Look:
+        """Return mass distribution, energy and front at the current time."""
         row, points = self.rows[-1], self._points()
         energy = float(row.get("kinetic_energy") or 0.0) + float(row.get("potential_energy") or 0.0)
         front = float(np.percentile(points[:, 0], FRONT)) if len(points) else 0.0
@@ -225,6 +226,7 @@ class _Trial:
         )
 
     def _points(self) -> np.ndarray:
+        """Return the particles of the current frame."""
         points = next(
             (part.points for part in self.simulation.frame() if isinstance(part, Points)), None
         )

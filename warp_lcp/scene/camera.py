@@ -79,6 +79,7 @@ class Camera(Table):
         return self._window_complaints(size) if dimension == 2 else self._room_complaints(size)
 
     def _window_complaints(self, size: list[float]) -> list[Complaint]:
+        """Return errors of the window of a 2-D domain."""
         low, high = self.low or [0.0, 0.0], self.high or size
         if all(a < b for a, b in zip(low, high, strict=True)):
             return []
@@ -91,6 +92,7 @@ class Camera(Table):
         ]
 
     def _room_complaints(self, size: list[float]) -> list[Complaint]:
+        """Return errors of the view of a 3-D domain."""
         if self.position is None:
             given = [key for key in ("look_at", "up") if getattr(self, key) is not None]
             return [Complaint((key,), getattr(self, key), "needs camera.position") for key in given]

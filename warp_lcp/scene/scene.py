@@ -566,6 +566,7 @@ class Scene(Table):
         ]
 
     def _side_complaints(self) -> list[Complaint]:
+        """Return errors of the domain's open sides."""
         found = []
         for index, side in enumerate(self.domain.open):
             if side in self.domain.open[:index]:
@@ -598,6 +599,7 @@ class Scene(Table):
         ]
 
     def _motion_complaints(self) -> list[Complaint]:
+        """Return errors of moving solids that fill whole cells."""
         if self.domain.solids == "cut-cell":
             return []
         message = 'needs domain.solids = "cut-cell": solids that fill whole cells cannot move'
@@ -616,6 +618,7 @@ class Scene(Table):
         )
 
     def _grid_complaints(self) -> list[Complaint]:
+        """Return errors of the grid: whole cells along each side, periodic axes."""
         found = self.domain.spacing_complaints()
         for axis, side in enumerate(self.domain.size if not found else ()):
             cells = side / self.spacing

@@ -230,6 +230,7 @@ def _leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _find(text: str) -> Path | Traversable:
+    """Return the file of a scene by name or path."""
     path = Path(text)
     scenes = built_in_scenes()
     if text in scenes:
@@ -277,6 +278,7 @@ def _near_file(path: Path, others: Iterable[str]) -> str:
 
 
 def _parse(file: Path | Traversable, source: str) -> dict[str, Any]:
+    """Return the tables of a TOML file."""
     try:
         return tomllib.loads(file.read_bytes().decode("utf-8-sig").replace("\r\n", "\n"))
     except OSError as error:

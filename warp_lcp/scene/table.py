@@ -166,6 +166,7 @@ class _Place:
 
 
 def _locate(model: type[Table], location: tuple[str | int, ...]) -> _Place:
+    """Return the location of an error from pydantic's path."""
     place = _Place(path="", below=(model,))
     for part in location:
         if isinstance(part, int):
@@ -182,6 +183,10 @@ def _locate(model: type[Table], location: tuple[str | int, ...]) -> _Place:
 
 
 def _problem(model: type[Table], error: ErrorDetails) -> KeyFault:
+    """Return the error of a key from pydantic's error.
+
+    Keys of later versions and of other simulators have messages of their own.
+    """
     kind, context = error["type"], error.get("ctx", {})
     place = _locate(model, error["loc"])
     later = place.owner.later if place.owner else {}
