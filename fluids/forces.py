@@ -228,7 +228,7 @@ class SolidForces:
         if self._bodies is None:
             bodies = [False, *(isinstance(s.motion, BodyMotion) for s in self._solids)]
             self._bodies = wp.array(bodies, dtype=wp.uint8, device=sums.grid.device)
-        given = [
+        kernel_args = [
             self._bodies,
             simulation.boundary.touch,
             projection.pressure,
@@ -238,7 +238,7 @@ class SolidForces:
             number.value = float(change)
         self.add(
             sums.take(
-                kernels.pressure_kernel, window, self.references, [*given, *self._kick, scale]
+                kernels.pressure_kernel, window, self.references, [*kernel_args, *self._kick, scale]
             )
         )
 

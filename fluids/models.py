@@ -94,15 +94,15 @@ def make_tension(
     scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, surface: FreeSurface
 ) -> SurfaceTension | None:
     """Return the surface tension of a scene, or None without tension or surface."""
-    given = scene.surface_tension
-    if given is None or surface.phi is None:
+    settings = scene.surface_tension
+    if settings is None or surface.phi is None:
         return None
-    angle, density = given.contact_angle, scene.physics.density
+    angle, density = settings.contact_angle, scene.physics.density
     return SurfaceTension(
         grid,
         boundary,
         surface.phi,
-        coefficient=given.coefficient,
+        coefficient=settings.coefficient,
         contact_angle=angle,
         density=density,
     )
@@ -172,14 +172,14 @@ def make_viscosity(
     if scene.viscosity is None:
         return None
     tolerance = scene.solver.tolerance if scene.solver.tolerance != "auto" else VISCOUS_TOLERANCE
-    kept = scene.kept([*scene.liquid, *scene.source])
+    relative = scene.kept([*scene.liquid, *scene.source])
     return Viscosity(
         grid,
         boundary,
         viscosity=scene.viscosity.value,
         density=scene.physics.density,
         slip_lengths=scene.slip_lengths,
-        thickest=None if kept is None else max(*kept, 1.0),
+        thickest=None if relative is None else max(*relative, 1.0),
         phi=surface.phi,
         tolerance=tolerance,
         sources=bool(scene.source),

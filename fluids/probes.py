@@ -117,7 +117,7 @@ def probe_kernel(
         for n in range(1, 4):
             values[t, n] = wp.float64(wp.nan)
     if wet:
-        found = wp.float64(0.0)
+        pressure = wp.float64(0.0)
         total = float(0.0)
         for n in range(4 * planes):
             at, share = corner(c, n, planes, shape)
@@ -126,10 +126,10 @@ def probe_kernel(
                 rise = float(0.0)
                 for axis in range(planes + 1):
                     rise += kick[axis] * off[axis]
-                found += wp.float64(share) * (x[at[2], at[1], at[0]] + wp.float64(rise))
+                pressure += wp.float64(share) * (x[at[2], at[1], at[0]] + wp.float64(rise))
                 total += share
         if total > 0.0:
-            values[t, 0] = found / wp.float64(total)
+            values[t, 0] = pressure / wp.float64(total)
         values[t, 1] = wp.float64(interpolated(u, planes, p[0], c[1], c[2]))
         values[t, 2] = wp.float64(interpolated(v, planes, c[0], p[1], c[2]))
         if planes == 2:
@@ -257,14 +257,14 @@ class Probes:
         cells = np.floor(grid.to_grid(self._points)).astype(np.int64) - 1
         owner = grid.part.owners(np.clip(cells, 0, np.array(grid.domain_counts) - 1))
         everyone = grid.part.ranks.gather(np.concatenate([mine, reach], axis=1))
-        found = np.asarray(everyone[owner, np.arange(len(owner)), : mine.shape[1]])
-        for probe, values in enumerate(found):
+        combined = np.asarray(everyone[owner, np.arange(len(owner)), : mine.shape[1]])
+        for probe, values in enumerate(combined):
             ways = [rank for rank in everyone[:, probe] if rank[-1] > rank[-2]]
             for rank in sorted(ways, key=lambda rank: float(rank[-2])):
                 values[4] = rank[4]
                 if rank[5] == 0.0:  # the search has ended at the surface or a solid
                     break
-        return found
+        return combined
 
     def _measure(self, simulation: "LiquidSimulation") -> np.ndarray:
         """Return x [m/s], velocity [m/s] and level [cells] of each probe."""

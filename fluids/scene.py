@@ -110,15 +110,15 @@ class LiquidScene(ParticleScene):
 
     def complaints(self) -> list[Complaint]:
         """Return errors that involve several keys."""
-        found = super().complaints()
+        complaints = super().complaints()
         if self.solver.method not in COUPLED_METHODS and any(solid.is_body for solid in self.solid):
             message = (
                 "cannot be combined with rigid bodies (their part of the matrix has only "
                 f"products); use {', '.join(COUPLED_METHODS)}"
             )
-            found.append(Complaint(("solver", "method"), self.solver.method, message))
+            complaints.append(Complaint(("solver", "method"), self.solver.method, message))
         if self.pressure.model == "unilateral" and self.pressure.surface == "voxel":
-            found.append(
+            complaints.append(
                 Complaint(
                     ("pressure", "surface"),
                     "voxel",
@@ -131,28 +131,28 @@ class LiquidScene(ParticleScene):
                 'cannot be combined with pressure.model = "unilateral", whose liquid may '
                 "separate anywhere inside"
             )
-            found.append(Complaint(("particles", "narrow_band"), None, message))
+            complaints.append(Complaint(("particles", "narrow_band"), None, message))
         elif self.pressure.surface == "voxel" and self.particles.narrow_band is not None:
             message = 'needs pressure.surface = "ghost-fluid", which computes how full cells are'
-            found.append(Complaint(("particles", "narrow_band"), None, message))
+            complaints.append(Complaint(("particles", "narrow_band"), None, message))
         if self.surface_tension is not None and self.pressure.surface == "voxel":
             message = 'needs pressure.surface = "ghost-fluid", whose surface has a curvature'
-            found.append(Complaint(("surface_tension",), None, message))
+            complaints.append(Complaint(("surface_tension",), None, message))
         if self.surface_tension is not None and self.pressure.model == "unilateral":
             message = (
                 'needs pressure.model = "incompressible": surface tension needs a pressure '
                 "that may be negative"
             )
-            found.append(Complaint(("surface_tension",), None, message))
+            complaints.append(Complaint(("surface_tension",), None, message))
         return [
-            *found,
+            *complaints,
             *self._viscosity_complaints(),
             *probe_complaints(self.probe, self.domain.size, self.physics.gravity),
         ]
 
     def notes(self) -> list[str]:
         """Return suspicious settings."""
-        found, tension = (
+        notes, tension = (
             [*super().notes(), *LIQUID_DENSITY.notes("physics.density", self.physics.density)],
             self.surface_tension,
         )
@@ -162,13 +162,13 @@ class LiquidScene(ParticleScene):
             for place, shape in self.shapes()
         ]
         for place, value in given:
-            found += VISCOSITY.notes(place, value)
-        found += LIQUID_CFL.notes("time.cfl", self.time.cfl)
+            notes += VISCOSITY.notes(place, value)
+        notes += LIQUID_CFL.notes("time.cfl", self.time.cfl)
         if tension is not None:
-            found += TENSION.notes("surface_tension.coefficient", tension.coefficient)
+            notes += TENSION.notes("surface_tension.coefficient", tension.coefficient)
             if 0.0 < tension.contact_angle <= math.pi + 0.01:
                 degrees = math.degrees(tension.contact_angle)
-                found.append(
+                notes.append(
                     f"surface_tension.contact_angle = {tension.contact_angle:g} is in degrees; if "
                     f"radians were meant, it is {degrees:.3g}"
                 )
@@ -184,8 +184,8 @@ class LiquidScene(ParticleScene):
             *drags,
             *((f"solid[{n}].drag", solid.drag) for n, solid in enumerate(self.solid)),
         ]:
-            found += DRAG.notes(place, value)
-        return found
+            notes += DRAG.notes(place, value)
+        return notes
 
     def _viscosity_complaints(self) -> list[Complaint]:
         """Return errors of settings that need viscosity or exclude it."""
@@ -209,17 +209,17 @@ class LiquidScene(ParticleScene):
             (("domain", "wall"), self.domain.wall),
             *((("solid", n, "wall"), solid.wall) for n, solid in enumerate(self.solid)),
         ]
-        found = [Complaint(place, wall, message) for place, wall in walls if wall == "sticky"]
+        complaints = [Complaint(place, wall, message) for place, wall in walls if wall == "sticky"]
         slips = [
             (n, solid.slip_length)
             for n, solid in enumerate(self.solid)
             if solid.slip_length is not None
         ]
-        found += [
+        complaints += [
             Complaint((key, n, "viscosity"), value, "needs the table [viscosity]")
             for key, n, value in own
         ]
-        return found + [
+        return complaints + [
             Complaint(("solid", n, "slip_length"), slip, "needs the table [viscosity]")
             for n, slip in slips
         ]
@@ -256,18 +256,18 @@ class LiquidScene(ParticleScene):
         """Return the models that the scene turns on, and those that have no effect."""
         full, ghost = self.stays_full, self.pressure.surface == "ghost-fluid"
         closed = "liquid fills a closed box: there is no free surface"
-        found = []
+        models = []
         if self.pressure.model == "unilateral":
-            found.append(Model("unilateral pressure", 'pressure.model = "unilateral"'))
+            models.append(Model("unilateral pressure", 'pressure.model = "unilateral"'))
         elif self.lets_go:
-            found.append(
+            models.append(
                 Model(
                     "separating walls",
                     "liquid may separate from domain.wall or a solid: bounds on the pressure",
                 )
             )
         elif self.domain.wall == "separating":
-            found.append(
+            models.append(
                 Model(
                     "separating walls",
                     "the domain has no wall: equations without bounds",
@@ -275,7 +275,7 @@ class LiquidScene(ParticleScene):
                 )
             )
         if ghost:
-            found.append(
+            models.append(
                 Model(
                     "ghost-fluid surface",
                     closed if full else 'pressure.surface = "ghost-fluid"',
@@ -283,31 +283,31 @@ class LiquidScene(ParticleScene):
                 )
             )
         if self.pressure.smoothing and ghost:
-            found.append(
+            models.append(
                 Model("smoothing", closed if full else "pressure.smoothing", built=not full)
             )
         if self.viscosity is not None:
-            found.append(Model("viscosity", "viscosity.value"))
+            models.append(Model("viscosity", "viscosity.value"))
         if self.surface_tension is not None:
-            found.append(
+            models.append(
                 Model("surface tension", closed if full else "[surface_tension]", built=not full)
             )
         if self.short_steps:
-            found.append(Model("support of spray", f"time.cfl is below {SHORT_STEPS}"))
+            models.append(Model("support of spray", f"time.cfl is below {SHORT_STEPS}"))
         if self.solver.tolerance == "auto":
-            found.append(Model("automatic tolerance", 'solver.tolerance = "auto"'))
+            models.append(Model("automatic tolerance", 'solver.tolerance = "auto"'))
         if self.probe:
-            found.append(Model("probes", "[[probe]]"))
+            models.append(Model("probes", "[[probe]]"))
         if self.output.forces:
-            found.append(Model("forces on solids", "output.forces"))
+            models.append(Model("forces on solids", "output.forces"))
         if self.drags is not None:
-            found.append(
+            models.append(
                 Model(
                     "drag along walls",
                     "[wall_drag]" if self.wall_drag is not None else "drag of a solid",
                 )
             )
-        return [*found, *super().models()]
+        return [*models, *super().models()]
 
     @property
     def drags(self) -> list[float] | None:

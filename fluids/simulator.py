@@ -426,7 +426,7 @@ class LiquidSimulation(ParticleSimulation):
                 viscosity.keep_change()
                 momenta = self._move_on(viscosity, momenta, dt)
             with self.watch.stage("viscosity", *self.velocity, projection.kind, projection.contact):
-                given = (
+                arguments = (
                     self.velocity,
                     window,
                     projection.kind,
@@ -434,16 +434,16 @@ class LiquidSimulation(ParticleSimulation):
                     self.kick_dt / parts,
                     speed,
                 )
-                found = viscosity.solve(*given, last=part + 1 == parts)
-            if not found.converged:
+                result = viscosity.solve(*arguments, last=part + 1 == parts)
+            if not result.converged:
                 residual = (
-                    f"relative residual of {found.relative_residual:.2e} (tolerance "
+                    f"relative residual of {result.relative_residual:.2e} (tolerance "
                     f"{viscosity.tolerance})"
                 )
                 raise missed_by_far(
                     "viscous",
-                    found.status,
-                    found.iterations,
+                    result.status,
+                    result.iterations,
                     residual,
                     "a shorter step is less stiff",
                 )
@@ -453,7 +453,7 @@ class LiquidSimulation(ParticleSimulation):
                         self.velocity, projection.kind, projection.contact, self.forces.references
                     )
                 )
-            total = found if total is None else found.after(total)
+            total = result if total is None else result.after(total)
         assert total is not None
         viscosity.undo(self.velocity)
         for body, values in zip(

@@ -40,14 +40,14 @@ def push_pass(cut: bool) -> SimpleNamespace:
     `push` acts on the velocity; `energy` sums the surface's energy. `cut` is True if faces have
     open fractions.
     """
-    made = functools.partial(
+    kernel = functools.partial(
         KERNELS.kernel,
         module=MODULE + "_cut" * cut,
         constants={"CUT": cut, "MOVING": False, "GHOST": True},
     )
     return SimpleNamespace(
-        push=made("fluids.surface_tension.push"),
-        energy=made("fluids.surface_tension.surface_energy"),
+        push=kernel("fluids.surface_tension.push"),
+        energy=kernel("fluids.surface_tension.surface_energy"),
     )
 
 
@@ -118,13 +118,13 @@ def share_kernel(k, j, i, phi: FIELD, blocked: MARKS, capacity: FIELD, cosine: f
 
     With `capacity`, the open fractions beside walls, phi belongs to the open part only.
     """
-    found = float(0.0)
+    value = float(0.0)
     if blocked[k, j, i] == wp.int8(0):
-        found = filled(-phi[k, j, i])
+        value = filled(-phi[k, j, i])
         if capacity:
-            if capacity[k, j, i] < 0.999 and found > TAIL and found < 1.0 - TAIL:
-                found = whole_share(found, capacity[k, j, i], cosine)
-    share[k, j, i] = found
+            if capacity[k, j, i] < 0.999 and value > TAIL and value < 1.0 - TAIL:
+                value = whole_share(value, capacity[k, j, i], cosine)
+    share[k, j, i] = value
 
 
 @wp.func

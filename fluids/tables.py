@@ -57,17 +57,17 @@ def probe_complaints(
     probes: Sequence[Probe], size: Sequence[float], gravity: Sequence[float]
 ) -> list[Complaint]:
     """Return errors of the probes in a domain of given sides [m] and gravity [m/s^2]."""
-    found = []
+    complaints = []
     for index, probe in enumerate(probes):
         place = ("probe", index, "position")
         if len(probe.position) != len(size):
-            found.append(
+            complaints.append(
                 Complaint(
                     place, probe.position, f"must have {len(size)} entries, as domain.size has"
                 )
             )
         elif not all(0.0 <= x <= side for x, side in zip(probe.position, size, strict=True)):
-            found.append(
+            complaints.append(
                 Complaint(
                     place,
                     probe.position,
@@ -81,13 +81,13 @@ def probe_complaints(
                 f"is also the name of another probe of the {probe.quantity}: log columns "
                 "must differ"
             )
-            found.append(Complaint(("probe", index, "name"), probe.name, message))
+            complaints.append(Complaint(("probe", index, "name"), probe.name, message))
         if probe.quantity == "level" and not any(gravity):
-            found.append(
+            complaints.append(
                 Complaint(
                     ("probe", index, "quantity"),
                     "level",
                     "needs gravity, along which it is measured",
                 )
             )
-    return found
+    return complaints

@@ -243,14 +243,14 @@ class Viscosity:
         self._begin(box, inner, tau)
         self._graphs["_set_up"].run(kind, contact, variant=self._placed)
         self._placed = True
-        given = {"u": velocity, "kind": kind, "contact": contact}
+        fields = {"u": velocity, "kind": kind, "contact": contact}
         if self._bodies is not None:
             self._bodies.take(
                 self._fine, ViscousWalls(self._distance, self._slip, kind, contact), velocity
             )
             if self._bodies.moved:  # the recorded iteration has the old column addresses
                 self._solver = self._krylov()
-        first, lost, driven, stiff = self._force(given, changed=False)
+        first, lost, driven, stiff = self._force(fields, changed=False)
         norm, least, iterations = first, max(self.tolerance * first, ROUNDING * speed * stiff), 0
         while norm > least and iterations < self.max_iterations:
             before = norm
@@ -261,7 +261,7 @@ class Viscosity:
             )
             self._solver.start(max_iterations=self.max_iterations - iterations, **goal)
             self._graphs["_take_solution"].run(velocity, self._solver.x, variant=self._solver.x.ptr)
-            norm, lost, driven, _ = self._force(given, changed=True)
+            norm, lost, driven, _ = self._force(fields, changed=True)
             iterations += self._solver.found()[0]  # read together with the force
             if not norm < 0.5 * before:  # the limit of float32
                 break
@@ -495,21 +495,21 @@ class Viscosity:
         diagonal.
         """
         self._graphs["_residual"].run(given, changed, variant=changed)
-        found = np.zeros(4)
+        totals = np.zeros(4)
         for sums in self._sums:
             sums.changed()
         for sums in self._sums:
-            found += sums.read()
+            totals += sums.read()
         if self._bodies is not None:
             self._bodies.answer(self.multigrid.r, self._change)
-            found[0] = float(np.square(self.multigrid.r.numpy(), dtype=np.float64).sum())
+            totals[0] = float(np.square(self.multigrid.r.numpy(), dtype=np.float64).sum())
         if self._across is not None:
-            found = self._across.sum(found)
+            totals = self._across.sum(totals)
         return [
-            float(np.sqrt(found[0])),
-            float(found[1]),
-            float(found[2]),
-            float(np.sqrt(found[3])),
+            float(np.sqrt(totals[0])),
+            float(totals[1]),
+            float(totals[2]),
+            float(np.sqrt(totals[3])),
         ]
 
     def _residual(self, given: dict[str, Any], changed: bool) -> None:

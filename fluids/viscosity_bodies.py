@@ -101,7 +101,7 @@ class WallPull:
         )
         index = self.boundary.solids.index if isinstance(self.boundary, WholeCells) else None
         center = wp.array(points.ravel(), dtype=wp.float64, device=grid.device)
-        found = [
+        entries = [
             (np.zeros(0, dtype=np.int32), np.zeros(0, dtype=np.int32), np.zeros((0, self.width)))
         ]
         for axis in range(grid.dimension if window is not None else 0):
@@ -132,9 +132,9 @@ class WallPull:
                 wall_c=wall_c,
                 from_=axis * grid.size,
             )
-            found.append(self._entries(links))
+            entries.append(self._entries(links))
         self.rows, self.blocks, self.values = (
-            np.concatenate(parts) for parts in zip(*found, strict=True)
+            np.concatenate(parts) for parts in zip(*entries, strict=True)
         )
 
     def pulled(

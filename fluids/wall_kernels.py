@@ -131,7 +131,7 @@ def standing_of(S: Walls, k: int, j: int, i: int):
 
     0, the domain, if none does.
     """
-    found = int(0)
+    owner = int(0)
     most = float(0.0)
     for n in range(2 * (S.planes + 1)):
         axis = n >> 1
@@ -145,8 +145,8 @@ def standing_of(S: Walls, k: int, j: int, i: int):
         )
         if wall > 0 and 1.0 - free > most and not moves(S, wall):
             most = 1.0 - free
-            found = wall
-    return found
+            owner = wall
+    return owner
 
 
 @wp.func
