@@ -126,29 +126,29 @@ class SandBodies:
             walls: faces between sand and solids; the same object while `index` is unchanged.
         """
         grid, device = self.grid, self.grid.device
-        found = find_body_faces(grid, index, self.numbers, centers, self._counted)
+        faces = find_body_faces(grid, index, self.numbers, centers, self._counted)
         # With the same cells, recorded launches stay valid.
         if self.faces is not None and walls is self._walls:
-            self.faces = found
+            self.faces = faces
             for places, rows in (
-                (self._faces, found.face.row),
-                (self._cells, found.cell.row),
-                (self._edges, found.edge.row),
+                (self._faces, faces.face.row),
+                (self._cells, faces.cell.row),
+                (self._edges, faces.edge.row),
             ):
                 places.row.assign(rows)  # type: ignore[attr-defined]  # an array of the struct
             return
-        self.faces = found
+        self.faces = faces
         self._walls, wall_cells = walls, walls.host_cells
-        self._entries, cells = entries_near(grid, found, wall_cells, walls.host_sides)
+        self._entries, cells = entries_near(grid, faces, wall_cells, walls.host_sides)
         self._entry_cells = wall_cells[self._entries].copy()
 
         def put(values: np.ndarray, dtype: type) -> wp.array:
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
 
         for places, part in (
-            (self._faces, found.face),
-            (self._cells, found.cell),
-            (self._edges, found.edge),
+            (self._faces, faces.face),
+            (self._cells, faces.cell),
+            (self._edges, faces.edge),
         ):
             places.at, places.axis, places.body = (
                 put(part.at, I32),
@@ -156,12 +156,12 @@ class SandBodies:
                 put(part.body, I32),
             )
             places.row = put(part.row, F64)
-        self._edges.copies = put(own_copies(grid, found.edge, self._counted), U8)
-        copies, homes = unowned_copies(grid, index, found)
+        self._edges.copies = put(own_copies(grid, faces.edge, self._counted), U8)
+        copies, homes = unowned_copies(grid, index, faces)
         self._unowned = put((FIRST[grid.dimension] + copies) * grid.size + homes, I32)
         self._trial = put(cells, I32)
         self._active = wp.zeros(1 + len(self._entries), dtype=wp.int32, device=device)
-        spans, parts = self._parts(found)
+        spans, parts = self._parts(faces)
         self._spans, self._owned = put(spans, I32), put(parts, I32)
         self._partial = wp.zeros((len(spans), self.freedoms), dtype=wp.float64, device=device)
 

@@ -245,7 +245,7 @@ def stiffness_kernel(
     """
     n = wp.tid()
     at = cells.at[n]
-    found = wp.vec2d()
+    steps = wp.vec2d()
     if (int(flags[at]) & HOLDS) != 0:
         full = wp.clamp(1.0 - drive[at] * numbers[STEP_OF_CELL] / NEARLY, 0.0, 1.0)
         diagonal = float(0.0)
@@ -255,10 +255,10 @@ def stiffness_kernel(
                 m = entry(mass, axis, o)
                 diagonal += (m + full * (1.0 - m)) * entry(inverse, axis, o)
         if diagonal > 0.0:
-            found[0] = wp.float64(1.0) / wp.float64(diagonal)
+            steps[0] = wp.float64(1.0) / wp.float64(diagonal)
     if (int(flags[at]) & SHEARS_HERE) != 0 and stiff[at] > 0.0:
-        found[1] = wp.float64(1.0) / wp.float64(stiff[at])
-    out[n] = found
+        steps[1] = wp.float64(1.0) / wp.float64(stiff[at])
+    out[n] = steps
 
 
 @forward_kernel(**options)

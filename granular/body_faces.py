@@ -248,7 +248,7 @@ def _edges(grid: StaggeredGrid, face: Incidence) -> Incidence:
     The shear rate of an edge is u_a - u_a(one cell back along b) + u_b - u_b(one cell back along
     a).
     """
-    strides, found = _strides(grid), []
+    strides, edge_parts = _strides(grid), []
     for d, (alpha, beta) in enumerate(SHEARS[grid.dimension]):
         parts = []
         for axis, other in ((alpha, beta), (beta, alpha)):
@@ -257,11 +257,11 @@ def _edges(grid: StaggeredGrid, face: Incidence) -> Incidence:
                 (face.at[own], face.body[own], face.row[own]),
                 (face.at[own] + strides[other], face.body[own], -face.row[own]),
             ]
-        found.append(_summed(grid, parts, d))
-    order = np.argsort(np.concatenate([part.body for part in found]), kind="stable")
+        edge_parts.append(_summed(grid, parts, d))
+    order = np.argsort(np.concatenate([part.body for part in edge_parts]), kind="stable")
     return Incidence(
         *(
-            np.concatenate([getattr(part, name) for part in found])[order]
+            np.concatenate([getattr(part, name) for part in edge_parts])[order]
             for name in Incidence.__dataclass_fields__
         )
     )

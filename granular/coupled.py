@@ -358,14 +358,14 @@ def interleaved_passes(
     `listed`: over a list of cells.
     """
     module = f"granular.interleaved_{dimension}d{'_box' * box}{'_rate' * rate}{'_listed' * listed}"
-    made = functools.partial(
+    kernel = functools.partial(
         KERNELS.kernel, module=module, constants={"DIM": dimension, "BOX": box, "RATE": rate}
     )
     area = "granular.interleaved" + "_listed" * listed
     return SimpleNamespace(
-        pressure=made(f"{area}.sweep_pressure"),
-        friction=made(f"{area}.sweep_friction"),
-        wall=made("granular.interleaved.sweep_walls"),
+        pressure=kernel(f"{area}.sweep_pressure"),
+        friction=kernel(f"{area}.sweep_friction"),
+        wall=kernel("granular.interleaved.sweep_walls"),
     )
 
 

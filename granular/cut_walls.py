@@ -204,14 +204,14 @@ def _octants(distance: np.ndarray, dimension: int) -> np.ndarray:
     flat = corners.reshape(*(2,) * dimension, -1)
     least, most = (f(flat.reshape(2**dimension, -1), axis=0) for f in (np.min, np.max))
     mixed = np.flatnonzero((least < 0.0) & (most > 0.0))
-    found = np.zeros((2,) * dimension + (flat.shape[-1],))
-    found[..., least >= 0.0] = 1.0
+    parts = np.zeros((2,) * dimension + (flat.shape[-1],))
+    parts[..., least >= 0.0] = 1.0
     for halves in itertools.product((0, 1), repeat=dimension):  # with the last axis first
         low = [0.5 * half for half in reversed(halves)]
-        found[halves][mixed] = _open_part(
+        parts[halves][mixed] = _open_part(
             flat[..., mixed], low, [a + 0.5 for a in low], SAMPLES[dimension]
         )
-    return found.reshape((2,) * dimension + distance.shape)
+    return parts.reshape((2,) * dimension + distance.shape)
 
 
 def _open_faces(
@@ -222,17 +222,17 @@ def _open_faces(
     Faces on the domain's sides are included, although its walls close them.
     """
     for axis, face in enumerate(faces):
-        others = [other for other in range(grid.dimension) if other != axis]
-        corners = _corners(distance, others)
+        plane_axes = [other for other in range(grid.dimension) if other != axis]
+        corners = _corners(distance, plane_axes)
         for layer in (1, grid.counts[axis] + 1):
             at = [slice(1, -1)] * 3
             at[2 - axis] = slice(layer, layer + 1)
-            part = corners[:, :, *at] if len(others) == 2 else corners[:, *at]
-            flat = part.reshape(*(2,) * len(others), -1)
+            part = corners[:, :, *at] if len(plane_axes) == 2 else corners[:, *at]
+            flat = part.reshape(*(2,) * len(plane_axes), -1)
             found = _open_part(
-                flat, [0.0] * len(others), [1.0] * len(others), 2 * SAMPLES[grid.dimension]
+                flat, [0.0] * len(plane_axes), [1.0] * len(plane_axes), 2 * SAMPLES[grid.dimension]
             )
-            face[tuple(at)] = found.reshape(part.shape[len(others) :])
+            face[tuple(at)] = found.reshape(part.shape[len(plane_axes) :])
     return faces
 
 

@@ -377,7 +377,7 @@ class SandScene(ParticleScene):
 
     def complaints(self) -> list[Complaint]:
         """Return errors that involve several keys."""
-        found = super().complaints()
+        complaints = super().complaints()
         for key, first in (("friction_angle", self.friction_angle), ("cohesion", self.cohesion)):
             for number, sand in enumerate(self.sand):
                 value = getattr(sand, key)
@@ -385,9 +385,9 @@ class SandScene(ParticleScene):
                     message = (
                         f"must be {first:g} as in the other [[sand]]: a scene has one material"
                     )
-                    found.append(Complaint(("sand", number, key), value, message))
+                    complaints.append(Complaint(("sand", number, key), value, message))
         return (
-            found
+            complaints
             + self._strength_complaints()
             + self._rate_complaints()
             + self._domain_complaints()
@@ -395,7 +395,7 @@ class SandScene(ParticleScene):
 
     def notes(self) -> list[str]:
         """Return suspicious settings."""
-        found = [
+        notes = [
             *super().notes(),
             *GRAIN_DENSITY.notes("physics.density", self.physics.density),
             *SAND_CFL.notes("time.cfl", self.time.cfl),
@@ -409,7 +409,7 @@ class SandScene(ParticleScene):
             for number, sand in enumerate(self.sand)
         ]
         for place, angle in angles:
-            found += FRICTION_ANGLE.notes(place, angle)
+            notes += FRICTION_ANGLE.notes(place, angle)
         cohesions = [("material.cohesion", self.material.cohesion)]
         cohesions += [
             (f"sand[{number}].cohesion", sand.cohesion)
@@ -417,14 +417,14 @@ class SandScene(ParticleScene):
             if sand.cohesion is not None
         ]
         for place, cohesion in cohesions:
-            found += COHESION.notes(place, cohesion)
+            notes += COHESION.notes(place, cohesion)
         grains = self.friction.grain_size
         if grains is not None and grains > self.spacing:
-            found.append(
+            notes.append(
                 f"friction.grain_size = {grains:g} m is larger than a cell, {self.spacing:.4g} m; "
                 f"if mm were meant, it is {1e-3 * grains:g}"
             )
-        return found
+        return notes
 
     def _strength_complaints(self) -> list[Complaint]:
         material, most = self.material, self.cohesion / math.tan(math.radians(self.friction_angle))

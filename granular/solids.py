@@ -223,7 +223,7 @@ class SandSolids:
             for solid in self._placed
         ]
         starts = self._cells is None
-        found = voxelize(
+        voxels = voxelize(
             grid,
             now,
             wall_separating=True,
@@ -232,8 +232,8 @@ class SandSolids:
             counts=starts,
         )
         if starts:
-            self._covered = found.covered
-        wp.copy(self.index, found.index)
+            self._covered = voxels.covered
+        wp.copy(self.index, voxels.index)
         if grid.barriers is not None:
             grid.barriers.enter(self.index)
         if self._boundary.sides is not None:
@@ -326,7 +326,7 @@ def wall_faces(
         For each face its open cell's flat index (int32), 2 axis + side (uint8) and its wall number
         (int32).
     """
-    found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    faces: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     inner = np.zeros(index.shape, dtype=bool)
     inner[
         (slice(1, -1),) * 3 if counted is None else tuple(map(slice, counted.low, counted.high))
@@ -339,8 +339,8 @@ def wall_faces(
             beyond = open_ + (stride if side else -stride)
             wall = flat[beyond]
             at = wall >= 0
-            found.append((open_[at], np.full(int(at.sum()), 2 * axis + side), wall[at]))
-    cells, sides, walls = (np.concatenate(parts) for parts in zip(*found, strict=True))
+            faces.append((open_[at], np.full(int(at.sum()), 2 * axis + side), wall[at]))
+    cells, sides, walls = (np.concatenate(parts) for parts in zip(*faces, strict=True))
     order = np.argsort(cells, kind="stable")
     return (
         cells[order].astype(np.int32),

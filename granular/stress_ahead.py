@@ -113,7 +113,7 @@ class StressAhead:
         pressure_step, shear_step, lookahead = self._method.steps(s)
         s.check().run()
         fields = [s.total, s.counts, s.numbers, s.momentum, self._decisions.array, self._going]
-        given = [
+        arguments = [
             pressure_step,
             shear_step,
             lookahead,
@@ -121,7 +121,7 @@ class StressAhead:
             MOST_MOMENTUM,
             *self._given,
         ]
-        launch(kernels.begin_steps_kernel, 1, [*fields, *given], device=device)
+        launch(kernels.begin_steps_kernel, 1, [*fields, *arguments], device=device)
         s.start_from_now()
         if device.is_cuda:
             self._launch_steps()

@@ -84,14 +84,14 @@ def stress_passes(
         "TRIAL": 0,
     }
     names = ("edge_stress", "face_velocity", "edge_strain", "step", "traction", "admit", "damp")
-    made = {
+    cell_kernels = {
         name: KERNELS.kernel(
             f"granular.stress.{name}", module=module, compute=real, constants=words
         )
         for name in names
     }
     wall = KERNELS.kernel("granular.stress.wall_step", module=module, compute=real, constants=words)
-    return SimpleNamespace(**made, wall=wall)
+    return SimpleNamespace(**cell_kernels, wall=wall)
 
 
 @forward_kernel(module="granular.momentum")
