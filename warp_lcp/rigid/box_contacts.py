@@ -127,7 +127,7 @@ def _cut(polygon: list[np.ndarray], normal: np.ndarray, offset: float) -> list[n
 
     A corner on the plane counts as inside.
     """
-    kept = []
+    corners = []
     heights = [float(normal @ p) - offset for p in polygon]
     tiny = 1e-12 * (1 + abs(offset))
     for n, p in enumerate(polygon):
@@ -137,7 +137,7 @@ def _cut(polygon: list[np.ndarray], normal: np.ndarray, offset: float) -> list[n
             heights[(n + 1) % len(polygon)],
         )
         if h <= tiny:
-            kept.append(p)
+            corners.append(p)
         if (h > tiny and next_height < -tiny) or (h < -tiny and next_height > tiny):
-            kept.append(p + h / (h - next_height) * (q - p))
-    return kept
+            corners.append(p + h / (h - next_height) * (q - p))
+    return corners

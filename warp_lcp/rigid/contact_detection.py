@@ -137,21 +137,21 @@ def between(
             ]
         )
     single = [len(shape.points) == 1 for shape in (one, other)]  # one point: the center of a ball
-    found = []
+    candidates = []
     if not single[1] or single[0]:
-        found.append(_points_of(one, at, other, there, margin, one.points))
+        candidates.append(_points_of(one, at, other, there, margin, one.points))
     if not single[0] and len(other.points):
-        found.append(_points_of(other, there, one, at, margin, other.points).turned())
+        candidates.append(_points_of(other, there, one, at, margin, other.points).turned())
     if dimension == 3:
-        found.append(
+        candidates.append(
             _points_of(one, at, other, there, margin, _nearest_of(one, at, other, there, margin))
         )
-        found.append(
+        candidates.append(
             _points_of(
                 other, there, one, at, margin, _nearest_of(other, there, one, at, margin)
             ).turned()
         )
-    return ContactPoints.joined(found)
+    return ContactPoints.joined(candidates)
 
 
 def _nearest_of(
@@ -261,7 +261,7 @@ def close_pairs(middle: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.nd
         half: half their sides [m], shape (n, 3).
     """
     low, high = middle - half, middle + half
-    first, *others = np.argsort(-np.ptp(middle, axis=0), kind="stable").tolist()
+    first, *shorter_axes = np.argsort(-np.ptp(middle, axis=0), kind="stable").tolist()
     order = np.argsort(low[:, first], kind="stable")
     # Later boxes that begin before the end of this one.
     ends = np.searchsorted(low[order, first], high[order, first], side="right")
@@ -269,7 +269,7 @@ def close_pairs(middle: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.nd
     one = np.repeat(np.arange(len(order)), after)
     other = one + 1 + np.arange(len(one)) - np.repeat(np.cumsum(after) - after, after)
     one, other = order[one], order[other]
-    for axis in others:  # each axis removes most of the pairs
+    for axis in shorter_axes:  # each axis removes most of the pairs
         begin, end = np.ascontiguousarray(low[:, axis]), np.ascontiguousarray(high[:, axis])
         both = (begin[one] <= end[other]) & (begin[other] <= end[one])
         one, other = one[both], other[both]
@@ -329,14 +329,16 @@ class FoundContacts:
     @classmethod
     def joined(cls, several: Sequence[FoundContacts]) -> FoundContacts:
         """Return several objects as one."""
-        some = [found for found in several if len(found.first)]
+        some = [contacts for contacts in several if len(contacts.first)]
         if len(some) < 2:
             return some[0] if some else several[0]
         first, second, obstacle = (
             np.concatenate([getattr(f, name) for f in some])
             for name in ("first", "second", "obstacle")
         )
-        return cls(first, second, obstacle, ContactPoints.joined([found.points for found in some]))
+        return cls(
+            first, second, obstacle, ContactPoints.joined([contacts.points for contacts in some])
+        )
 
 
 class ContactDetection:
@@ -388,7 +390,7 @@ class ContactDetection:
         poses = [Place(turn, shift) for turn, shift in zip(turns, shifts, strict=True)]
         middle = (turns @ self._middle[:, :, None])[:, :, 0] + shifts
         half = (np.abs(turns) @ self._half[:, :, None])[:, :, 0] + self._radius[:, None]
-        found = [
+        contacts = [
             self._with_obstacle(number, obstacle.pose(time), poses, middle, half, ways + more)
             for number, (obstacle, more) in enumerate(zip(self.obstacles, brought, strict=True))
         ]
@@ -411,7 +413,7 @@ class ContactDetection:
                 [touching, FoundContacts.of(first, second, NONE, points)]
             )
             touching = touching.where(np.lexsort((touching.second, touching.first)))
-        return FoundContacts.joined([*found, touching])
+        return FoundContacts.joined([*contacts, touching])
 
     def _balls(
         self, i: np.ndarray, j: np.ndarray, centers: np.ndarray, margins: np.ndarray
@@ -484,9 +486,9 @@ class ContactDetection:
         touch = ContactPoints(
             middle[ball] - (self._radius[ball] + 0.5 * gap)[:, None] * normal, normal, gap
         )
-        found = FoundContacts(ball, np.full(len(ball), n), np.full(len(ball), number), touch)
+        contacts = FoundContacts(ball, np.full(len(ball), n), np.full(len(ball), number), touch)
         if balls.all():
-            return found
+            return contacts
         i, m = i[~balls], m[~balls]
         each = [
             self._kept(
@@ -495,5 +497,7 @@ class ContactDetection:
             )
             for a, b in zip(i.tolist(), m.tolist(), strict=True)
         ]
-        found = FoundContacts.joined([found, FoundContacts.of(i, np.full(len(i), n), number, each)])
-        return found.where(np.argsort(found.first, kind="stable"))
+        contacts = FoundContacts.joined(
+            [contacts, FoundContacts.of(i, np.full(len(i), n), number, each)]
+        )
+        return contacts.where(np.argsort(contacts.first, kind="stable"))

@@ -127,7 +127,7 @@ class ContactNewton:
             free = ~(at_low | at_up)
             # Free rows: J w + (yields + SHIFT d) x = -b + SHIFT d x_before. Rows at a bound: d (x
             # -+ mu x_n) = 0.
-            found = self._solved(
+            solution = self._solved(
                 free.astype(float),
                 np.where(free, SHIFT * d + self._yields, d),
                 d[self._tangents]
@@ -135,9 +135,9 @@ class ContactNewton:
                 * (at_low[self._tangents].astype(float) - at_up[self._tangents]),
                 np.where(free, SHIFT * d * x - self._b, 0.0),
             )
-            if found is None:
+            if solution is None:
                 return
-            x = found
+            x = solution
             self.take(x)
 
     def interior_point(self, rtol: float) -> None:
@@ -258,17 +258,17 @@ class ContactNewton:
         try:
             if self._small is not None:
                 K = np.block([[np.eye(bodies), -J.T], [weights[:, None] * J, C.toarray()]])
-                found = scale * np.linalg.solve(scale[:, None] * K * scale, sides)
+                solution = scale * np.linalg.solve(scale[:, None] * K * scale, sides)
             else:
                 blocks = [[sparse.eye_array(bodies), -J.T], [sparse.diags_array(weights) @ J, C]]
                 scaling = sparse.diags_array(scale)
-                found = scale * splu(
+                solution = scale * splu(
                     (scaling @ sparse.block_array(blocks) @ scaling).tocsc()
                 ).solve(sides)
         # SuperLU raises RuntimeError for singular matrices, LAPACK LinAlgError.
         except (RuntimeError, np.linalg.LinAlgError):
             return None
-        return found[bodies:] if np.isfinite(found).all() else None
+        return solution[bodies:] if np.isfinite(solution).all() else None
 
     def _y(self, x: np.ndarray) -> np.ndarray:
         return np.asarray(self._J @ (self._J.T @ x) + self._yields * x + self._b)
@@ -283,10 +283,10 @@ class ContactNewton:
         """Return the relative residual of x within its bounds; store x if it is best."""
         x = np.clip(x, *self._bounds(x))
         d = self._diagonal
-        found = (
+        residual = (
             float(np.linalg.norm(d * (x - np.clip(x - self._y(x) / d, *self._bounds(x)))))
             / self._reference
         )
-        if found < self.residual:
-            self.x, self.residual = x, found
-        return found
+        if residual < self.residual:
+            self.x, self.residual = x, residual
+        return residual

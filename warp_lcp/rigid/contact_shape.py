@@ -114,14 +114,14 @@ class ContactShape:
             which, each = distances.argmin(axis=0), np.arange(len(points))
             return distances[which, each], directions[which, each]
 
-        made = tuple(box for part in parts for box in part.boxes)
-        corners = np.concatenate([box.corners() for box in made])
+        merged = tuple(box for part in parts for box in part.boxes)
+        corners = np.concatenate([box.corners() for box in merged])
         return cls(
             points=corners,
             radius=0.0,
             distance=nearest,
             size=max(part.size for part in parts),
-            boxes=made,
+            boxes=merged,
         )
 
     @cached_property

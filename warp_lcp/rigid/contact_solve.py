@@ -119,16 +119,22 @@ class ContactSolve:
             ValueError: names the bodies that overlap.
         """
         nothing = np.zeros(len(self.bodies))
-        found = self._apart(
+        contacts = self._apart(
             self.detection.find(time, nothing, np.zeros(len(self.detection.obstacles)))
         )
-        overlapping = -found.points.gap > START_OVERLAP * self._size[found.first]
+        overlapping = -contacts.points.gap > START_OVERLAP * self._size[contacts.first]
         if not overlapping.any():
             return
         k = int(overlapping.argmax())
-        number, other, which = int(found.first[k]), int(found.second[k]), int(found.obstacle[k])
-        of_pair = (found.first == number) & (found.second == other) & (found.obstacle == which)
-        name, deep = self.bodies[number].name, -float(found.points.gap[of_pair].min())
+        number, other, which = (
+            int(contacts.first[k]),
+            int(contacts.second[k]),
+            int(contacts.obstacle[k]),
+        )
+        of_pair = (
+            (contacts.first == number) & (contacts.second == other) & (contacts.obstacle == which)
+        )
+        name, deep = self.bodies[number].name, -float(contacts.points.gap[of_pair].min())
         if which != NONE:
             raise ValueError(
                 f"{name} reaches {deep:.3g} m into {self.detection.obstacles[which].name} at the "
@@ -161,20 +167,20 @@ class ContactSolve:
             planar is not None
             and (touching := planar.find(time, dt, falls, near, brought)) is not None
         ):
-            found, contacts = touching
+            detected, contacts = touching
             return (
                 contacts
                 if planar.still and not self._joined
-                else self.assembled(self._apart(found), time, dt, gravity)
+                else self.assembled(self._apart(detected), time, dt, gravity)
             )
         six = self.bodies.velocities()
         speeds, spins = lengths(six[:, :3]), lengths(six[:, 3:])
         ways = AHEAD * dt * (speeds + spins * self.reach + falls)
-        found = self._apart(self.detection.find(time, ways, near + np.array(brought), near))
+        detected = self._apart(self.detection.find(time, ways, near + np.array(brought), near))
         if gone is not None and not everywhere:
             out = np.append(gone, False)
-            found = found.where(~(out[found.first] | out[found.second]))
-        return self.assembled(found, time, dt, gravity)
+            detected = detected.where(~(out[detected.first] | out[detected.second]))
+        return self.assembled(detected, time, dt, gravity)
 
     def approach(self, contacts: Contacts) -> np.ndarray:
         """Return normal velocities at contacts [m/s], shape (k,), for `bounce`.
@@ -225,13 +231,13 @@ class ContactSolve:
         b = contacts.velocities(self._velocities())
         free = b[:, 0].copy()
         b[:, 0] -= contacts.target
-        problem, others, V = (
+        problem, resting, V = (
             self._problem(contacts, b, contacts.friction),
             np.flatnonzero(~may),
             self._velocities(),
         )
-        if len(others):  # supported bodies do not fall
-            before[others] = problem.part(others).solve(EXACT).impulses
+        if len(resting):  # supported bodies do not fall
+            before[resting] = problem.part(resting).solve(EXACT).impulses
             V = V + self._answer(contacts.on_bodies(before, len(self.bodies)))
             free = contacts.velocities(V)[:, 0]
         a = np.clip((free - approach) / kick_dt, -FALL * g, FALL * g)
@@ -383,10 +389,10 @@ class ContactSolve:
         bias, free = rows.bias(dt), J @ V.ravel()
         x = np.concatenate([start.ravel(), self.joint_impulses])
         for _ in range(ROUNDS):
-            found = self._solver(
+            result = self._solver(
                 replace(problem, joints=JointPart(self._weighted(rows), free + bias)), x
             )
-            x = found.impulses
+            x = result.impulses
             impulses, held = x[: start.size].reshape(start.shape), x[start.size :]
             pushes = contacts.on_bodies(impulses, n) + (J.T @ held).reshape(n, q)
             after = (
@@ -396,7 +402,7 @@ class ContactSolve:
             after[motors] = bias[motors]
             off = dt * float(np.abs(after - bias).max())
             bias = after
-            self.residual, self.iterations = found.residual, self.iterations + found.iterations
+            self.residual, self.iterations = result.residual, self.iterations + result.iterations
             if off <= JOINED * min(1.0, float(self._size.min())):
                 break
         self.joint_rows, self.joint_impulses = rows, held
@@ -407,7 +413,7 @@ class ContactSolve:
 
         0 before the first step.
         """
-        found, rows = dict.fromkeys(range(len(self.joints)), 0.0), self.joint_rows
+        torques, rows = dict.fromkeys(range(len(self.joints)), 0.0), self.joint_rows
         if rows is not None:
             owners = np.repeat(
                 np.arange(len(self.joints)),
@@ -415,10 +421,10 @@ class ContactSolve:
             )
             for row in np.flatnonzero(rows.motors).tolist():
                 joint = int(owners[row])
-                found[joint] = self.joints[joint].motor_torque * float(
+                torques[joint] = self.joints[joint].motor_torque * float(
                     self.joint_impulses[row] / rows.upper[row]
                 )
-        return found
+        return torques
 
     def _moved(self, pushes: np.ndarray, dt: float) -> BodyStates:
         """Return the bodies after impulses, shape (n, q), and a motion of dt [s]."""
@@ -570,7 +576,7 @@ class ContactSolve:
             if obstacle.motion is not None and (here := found.obstacle == number).any():
                 moved[here] = _carried(obstacle.motion, point[here], time, dt)
         at = np.concatenate([self.bodies.position, np.zeros((1, 3))])
-        mine, others = point - at[first], point - at[second]
+        mine, second_arms = point - at[first], point - at[second]
         ways: tuple[tuple[np.ndarray, float], ...] = ()
         if gravity is not None and dim == 3:  # in a plane there is one tangent
             six = np.concatenate([self.bodies.velocities(), np.zeros((1, 6))])
@@ -578,7 +584,7 @@ class ContactSolve:
                 six[first, :3]
                 + cross(six[first, 3:], mine)
                 - six[second, :3]
-                - cross(six[second, 3:], others)
+                - cross(six[second, 3:], second_arms)
                 - moved
             )
             ways = (
@@ -586,7 +592,7 @@ class ContactSolve:
                 (slip, ALONG_SLIP * falls),
             )
         frames = contact_frames(normal, dim, ways)
-        one, other = _rows(mine, frames, dim), -_rows(others, frames, dim)
+        one, other = _rows(mine, frames, dim), -_rows(second_arms, frames, dim)
         standing = second == n
         other[standing] = 0.0
         wall = -(frames @ moved[:, :, None])[:, :, 0]

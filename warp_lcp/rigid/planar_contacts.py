@@ -196,13 +196,13 @@ class PlanarContacts:
             self._placed(o, time) if of is None else of
             for o, of in zip(self.obstacles, self._standing, strict=True)
         ]
-        found = np.concatenate(
+        rows = np.concatenate(
             [part for margin, of in zip(margins, placed, strict=True) for part in ((margin,), of)]
             or [np.zeros(0)]
         )
         if self.still and len(margins):
-            self._around = margins[0], found
-        return found
+            self._around = margins[0], rows
+        return rows
 
     def find(
         self, time: float, dt: float, falls: float, near: float, brought: Sequence[float]
@@ -221,7 +221,7 @@ class PlanarContacts:
         """
         n, capacity = len(self.bodies), self._capacity
         obstacles = self._obstacles(time, [near + way for way in brought])
-        given = (self.bodies.values, self._fixed, obstacles)
+        state = (self.bodies.values, self._fixed, obstacles)
         sizes = {
             "count": n,
             "obstacles": len(self.obstacles),
@@ -229,7 +229,7 @@ class PlanarContacts:
             "capacity": capacity,
         }
         reals, (total,) = FIND.run(
-            given,
+            state,
             (self._planes,),
             work=10 * n + sum(WIDTHS) * capacity,
             dt=dt,
