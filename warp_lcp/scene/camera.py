@@ -54,12 +54,12 @@ class Camera(Table):
     def complaints(self, dimension: int, size: list[float]) -> list[Complaint]:
         """Return errors of the camera in a domain of two or three sides [m]."""
         wrong, right = (ROOM_KEYS, WINDOW_KEYS) if dimension == 2 else (WINDOW_KEYS, ROOM_KEYS)
-        found = []
+        complaints = []
         for key in wrong:
             if getattr(self, key) is not None:
                 allowed = ", ".join(type(self).model_fields[name].alias or name for name in right)
                 message = f"cannot be used in {dimension}-D; allowed are {allowed}"
-                found.append(
+                complaints.append(
                     Complaint(
                         (type(self).model_fields[key].alias or key,), getattr(self, key), message
                     )
@@ -67,15 +67,15 @@ class Camera(Table):
         for key in right:
             value = getattr(self, key)
             if isinstance(value, list) and len(value) != dimension:
-                found.append(
+                complaints.append(
                     Complaint(
                         (type(self).model_fields[key].alias or key,),
                         value,
                         f"must have {dimension} entries",
                     )
                 )
-        if found:
-            return found
+        if complaints:
+            return complaints
         return self._window_complaints(size) if dimension == 2 else self._room_complaints(size)
 
     def _window_complaints(self, size: list[float]) -> list[Complaint]:

@@ -56,17 +56,17 @@ class Prices:
 def price_table() -> Mapping[str, Prices]:
     """Return the entries of `presets.toml` by simulator."""
     read = tomllib.loads((files("warp_lcp.scene") / TABLE).read_text(encoding="utf-8"))
-    found = {}
+    entries = {}
     for simulator, part in read.items():
         presets: dict[str, Preset] = {
             name: Preset(part[name]["distance"], part[name]["volume"], _flat(part[name]))
             for name in PRESETS
         }
         steps = tuple((cfl, dt_max) for cfl, dt_max in part["steps"])
-        found[simulator] = Prices(
+        entries[simulator] = Prices(
             presets, _flat(part["reference"]), steps, tuple(part["tolerances"])
         )
-    return found
+    return entries
 
 
 def fill_in(model: type[Scene], data: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -110,13 +110,13 @@ def preset_line(scene: Scene) -> str | None:
     prices = price_table().get(scene.scene.simulator)
     if name is None or prices is None:
         return None
-    given = {
+    own_values = {
         key: (value, value_of(scene, key)) for key, value in prices.presets[name].settings.items()
     }
-    taken = [f"{key} {value:g}" for key, (value, is_now) in given.items() if is_now == value]
+    taken = [f"{key} {value:g}" for key, (value, is_now) in own_values.items() if is_now == value]
     own = [
         f"{key} {is_now:g}" if isinstance(is_now, float | int) else f"{key} {is_now}"
-        for key, (value, is_now) in given.items()
+        for key, (value, is_now) in own_values.items()
         if is_now not in (value, None)
     ]
     return f"{name}: " + "; ".join(

@@ -406,34 +406,34 @@ class Scene(Table):
 
         Subclasses add theirs to `super().complaints()`.
         """
-        found = self._grid_complaints()
+        complaints = self._grid_complaints()
         if len(self.physics.gravity) != self.dimension:
             message = f"must have {self.dimension} entries, as domain.size has"
-            found.append(Complaint(("physics", "gravity"), self.physics.gravity, message))
+            complaints.append(Complaint(("physics", "gravity"), self.physics.gravity, message))
         if self.time.dt_min > self.time.dt_max:
-            found.append(
+            complaints.append(
                 Complaint(
                     ("time", "dt_min"),
                     self.time.dt_min,
                     f"must not exceed time.dt_max = {self.time.dt_max}",
                 )
             )
-        found += [
+        complaints += [
             Complaint(("camera", *c.place), c.value, c.message)
             for c in self.camera.complaints(self.dimension, self.domain.size)
         ]
         if self.output.volume and self.dimension == 2:
-            found.append(
+            complaints.append(
                 Complaint(
                     ("output", "volume"), True, "needs a 3-D domain; domain.size has 2 entries"
                 )
             )
-        found += (
+        complaints += (
             self.shape_complaints("solid", self.solid)
             + self._motion_complaints()
             + self._side_complaints()
         )
-        return found + self._outside_complaints()
+        return complaints + self._outside_complaints()
 
     def shape_complaints(
         self, key: str, shapes: Sequence[Shape], *, inside: bool = False
@@ -445,7 +445,7 @@ class Scene(Table):
             shapes: its entries.
             inside: also refuse entries that lie wholly outside the domain.
         """
-        found = []
+        complaints = []
         for index, shape in enumerate(shapes):
             own = shape.complaints(self.dimension)
             if inside and not own and self.enclosed_volume(shape) == 0.0:
@@ -457,11 +457,11 @@ class Scene(Table):
                         f"{self.domain.size} m",
                     )
                 ]
-            found += [
+            complaints += [
                 Complaint((key, index, *complaint.place), complaint.value, complaint.message)
                 for complaint in own
             ]
-        return found
+        return complaints
 
     def enclosed_volume(self, shape: Shape) -> float:
         """Return an upper bound of a shape's volume in the domain [m^3; m^2 in 2-D].
@@ -487,17 +487,17 @@ class Scene(Table):
 
         Subclasses add those of their tables.
         """
-        found = []
+        notes = []
         for place, shape in self.shapes():
             turned = shape.turned_out(self.domain.size)
             if turned is not None and turned[0] > STRAY * self.spacing:
                 center = [float(f"{coordinate:.6g}") for coordinate in turned[1]]
-                found.append(
+                notes.append(
                     f"{place} ({shape.shape}): rotate about the origin moves it {turned[0]:.4g} m "
                     "out of the domain; to rotate it "
                     f"about its center, set about = {center}"
                 )
-        return [*found, *scene_notes(self)]
+        return [*notes, *scene_notes(self)]
 
     def memory_parts(self) -> dict[str, int]:
         """Return the estimated memory of each part of a run on its device [bytes].
@@ -567,19 +567,19 @@ class Scene(Table):
 
     def _side_complaints(self) -> list[Complaint]:
         """Return errors of the domain's open sides."""
-        found = []
+        complaints = []
         for index, side in enumerate(self.domain.open):
             if side in self.domain.open[:index]:
-                found.append(Complaint(("domain", "open", index), side, "is named twice"))
+                complaints.append(Complaint(("domain", "open", index), side, "is named twice"))
             if side in SIDES[2 * self.dimension :]:
-                found.append(
+                complaints.append(
                     Complaint(
                         ("domain", "open", index),
                         side,
                         "is a side of a 3-D domain; domain.size has 2 entries",
                     )
                 )
-        return found
+        return complaints
 
     def _outside_complaints(self) -> list[Complaint]:
         """Return errors of rigid bodies that lie wholly outside the domain.
@@ -619,8 +619,8 @@ class Scene(Table):
 
     def _grid_complaints(self) -> list[Complaint]:
         """Return errors of the grid: whole cells along each side, periodic axes."""
-        found = self.domain.spacing_complaints()
-        for axis, side in enumerate(self.domain.size if not found else ()):
+        complaints = self.domain.spacing_complaints()
+        for axis, side in enumerate(self.domain.size if not complaints else ()):
             cells = side / self.spacing
             if round(cells) < 1 or abs(cells - round(cells)) > WHOLE_CELLS * cells:
                 sides = [
@@ -632,16 +632,16 @@ class Scene(Table):
                     f"must be a whole number of cells of {self.spacing:.6g} m; the nearest: "
                     f"{' and '.join(sides)}"
                 )
-                found.append(Complaint(("domain", "size", axis), side, message))
+                complaints.append(Complaint(("domain", "size", axis), side, message))
         if self.domain.periodic is not None and len(self.domain.periodic) != self.dimension:
-            found.append(
+            complaints.append(
                 Complaint(
                     ("domain", "periodic"),
                     self.domain.periodic,
                     f"must have {self.dimension} entries",
                 )
             )
-        return found
+        return complaints
 
 
 def _shown(tolerance: float | str) -> str:

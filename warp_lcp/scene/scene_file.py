@@ -154,7 +154,7 @@ def single_tables(source: SceneSource) -> dict[str, set[str]]:
         SceneError: the file cannot be read, or names no simulator.
     """
     data, label, _, _ = _raw(source)
-    found = {}
+    tables = {}
     for name, field in _scene_model(data, label).model_fields.items():
         kinds = [
             kind
@@ -162,8 +162,8 @@ def single_tables(source: SceneSource) -> dict[str, set[str]]:
             if isinstance(kind, type) and issubclass(kind, Table)
         ]
         if kinds and get_origin(field.annotation) is not list:
-            found[name] = {inner.alias or key for key, inner in kinds[0].model_fields.items()}
-    return found
+            tables[name] = {inner.alias or key for key, inner in kinds[0].model_fields.items()}
+    return tables
 
 
 def fix_file(source: str) -> list[str]:

@@ -174,14 +174,16 @@ class BoxTable(Shape):
 
     def complaints(self, dimension: int) -> list[Complaint]:
         """Return errors of the box in a scene of 2 or 3 dimensions."""
-        found = super().complaints(dimension)
-        if not found and any(low >= high for low, high in zip(self.min, self.max, strict=True)):
-            found.append(
+        complaints = super().complaints(dimension)
+        if not complaints and any(
+            low >= high for low, high in zip(self.min, self.max, strict=True)
+        ):
+            complaints.append(
                 Complaint(
                     ("max",), self.max, f"must be greater than min = {self.min} along every axis"
                 )
             )
-        return found
+        return complaints
 
 
 class SphereTable(Shape):
@@ -342,15 +344,15 @@ class SolidProperties(Shape):
     def _body_complaints(self) -> list[Complaint]:
         """Return errors of a rigid body."""
         key = "mass" if self.mass is not None else "density"
-        found = []
+        complaints = []
         if self.mass is not None and self.density is not None:
-            found.append(
+            complaints.append(
                 Complaint(
                     ("density",), self.density, "cannot be combined with mass: give one of them"
                 )
             )
         if self.motion is not None:
-            found.append(
+            complaints.append(
                 Complaint(
                     ("motion",),
                     None,
@@ -358,7 +360,7 @@ class SolidProperties(Shape):
                 )
             )
         if self.invert:
-            found.append(
+            complaints.append(
                 Complaint(
                     ("invert",),
                     True,
@@ -366,29 +368,31 @@ class SolidProperties(Shape):
                 )
             )
         if self.shape == "plane":
-            found.append(
+            complaints.append(
                 Complaint((key,), getattr(self, key), "not for a plane: a half space has no mass")
             )
-        return found
+        return complaints
 
     def _still_complaints(self) -> list[Complaint]:
         """Return errors of keys that need a rigid body."""
-        given: dict[str, object] = {
+        body_keys: dict[str, object] = {
             "velocity": self.velocity,
             "angular_velocity": self.angular_velocity,
             "restitution": self.restitution or None,
         }
         message = "needs mass or density, which make the solid a rigid body"
-        found = [
-            Complaint((name,), value, message) for name, value in given.items() if value is not None
+        complaints = [
+            Complaint((name,), value, message)
+            for name, value in body_keys.items()
+            if value is not None
         ]
         if self.friction is not None and not self.rubs:
-            found.append(
+            complaints.append(
                 Complaint(
                     ("friction",), self.friction, f"{message}: a liquid has no friction with solids"
                 )
             )
-        return found
+        return complaints
 
 
 class MaterialProperties(Shape):

@@ -59,11 +59,11 @@ def plug_ins(group: str, kind: type[Any], what: str) -> dict[str, Any]:
     Raises:
         TypeError: an object is not of this kind, which `what` names.
     """
-    found = {}
+    loaded = {}
     for entry in entry_points(group=group):
-        found[entry.name] = entry.load()
-        if not isinstance(found[entry.name], kind):
+        loaded[entry.name] = entry.load()
+        if not isinstance(loaded[entry.name], kind):
             raise TypeError(
-                f"entry point {entry.name!r} of {group} is not {what}: {found[entry.name]!r}"
+                f"entry point {entry.name!r} of {group} is not {what}: {loaded[entry.name]!r}"
             )
-    return found
+    return loaded
