@@ -134,28 +134,29 @@ def check_output(scene: Scene) -> list[str]:
         "surface": (output.surface, Surface, scene.dimension),
         "the surfaces of bodies": (has_bodies, Surface, scene.dimension),
     }
-    found = {
+    support = {
         name: holds(output.format, kind, dimension)
         for name, (wanted, kind, dimension) in kinds.items()
         if wanted
     }
-    refused = {name: held.why for name, held in found.items() if held.dress is None}
+    refused = {name: held.why for name, held in support.items() if held.dress is None}
     if refused:
         what = f"cannot store {' and '.join(refused)}"
         why = next((f" ({one_line(why.strip())})" for why in refused.values() if why.strip()), "")
         off = [f"output.{name} = false" for name in refused if name in type(output).model_fields]
-        others = " or ".join(name for name in EVERYTHING if name != output.format)
+        alternatives = " or ".join(name for name in EVERYTHING if name != output.format)
         raise SceneError(
             scene.scene.name,
             [
                 KeyFault(
                     "output.format",
-                    f"{what}{why}; " + ", ".join([*off, f"or choose {others}, which hold all"]),
+                    f"{what}{why}; "
+                    + ", ".join([*off, f"or choose {alternatives}, which hold all"]),
                     written(output.format),
                 )
             ],
         )
-    bare = [name for name, held in found.items() if held.dress is Dress.BARE]
+    bare = [name for name, held in support.items() if held.dress is Dress.BARE]
     return (
         [
             f'output.format = "{output.format}" writes the geometry of {" and ".join(bare)}, '

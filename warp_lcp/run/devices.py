@@ -53,13 +53,13 @@ def choose_device(name: str | None) -> str:
     Raises:
         DeviceError: there is no such device.
     """
-    there = devices()
+    available = devices()
     if name is None:
-        return next(iter(there))
+        return next(iter(available))
     alias = "cuda:0" if name == "cuda" else name
-    if alias not in there:
+    if alias not in available:
         raise DeviceError(
-            f"--device {name}: there is no such device; choose from {', '.join(there)}"
+            f"--device {name}: there is no such device; choose from {', '.join(available)}"
         )
     return alias
 

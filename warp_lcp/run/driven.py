@@ -330,17 +330,17 @@ class Run:
             RunError: there is no such body, or a vector is not finite or of another dimension.
         """
         bodies = _of_particles(self.simulation).bodies
-        there = bodies.bodies if bodies is not None else []
-        if not isinstance(body, (int, np.integer)) or not 0 <= body < len(there):
+        rigid_bodies = bodies.bodies if bodies is not None else []
+        if not isinstance(body, (int, np.integer)) or not 0 <= body < len(rigid_bodies):
             raise RunError(
                 f"body = {body!r}: "
                 + (
-                    f"must be from 0 to {len(there) - 1}"
-                    if there
+                    f"must be from 0 to {len(rigid_bodies) - 1}"
+                    if rigid_bodies
                     else "the scene has no rigid bodies"
                 )
             )
-        pushed, given = there[body], self._vector("impulse", impulse)
+        pushed, given = rigid_bodies[body], self._vector("impulse", impulse)
         arm = np.zeros(3) if at is None else self._vector("at", at) - pushed.position
         pushed.push(np.concatenate([given, np.cross(arm, given)]))
 
@@ -435,7 +435,7 @@ def _overrides(
     The tables of those in `keys` are looked up.
     """
     tables = single_tables(scene) if keys else {}
-    given = dict(overrides or {})
+    values = dict(overrides or {})
     for key, value in keys.items():
         owners = [table for table, names in tables.items() if key in names]
         if len(owners) != 1:
@@ -446,8 +446,8 @@ def _overrides(
                 else f"no such key; {nearest(key, known)}"
             )
             raise SceneError("Run", [KeyFault(key, which)])
-        given[f"{owners[0]}.{key}"] = value
-    return [f"{key}={_written(key, value)}" for key, value in given.items()]
+        values[f"{owners[0]}.{key}"] = value
+    return [f"{key}={_written(key, value)}" for key, value in values.items()]
 
 
 def _written(key: str, value: Any) -> str:

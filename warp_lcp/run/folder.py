@@ -269,17 +269,21 @@ class RunFolder:
             OutputError: there is no run, its scene is another one, or no checkpoint is valid.
         """
         while True:
-            found = self._continuation()
+            continuation = self._continuation()
             if not self._shared:
-                return found
+                return continuation
             whole: Mapping[str, np.ndarray] = {}
             # The states are too large for a message.
-            if found and found.checkpoint and PIECES not in found.checkpoint.state:
-                whole, found = (
-                    found.checkpoint.state,
-                    replace(found, checkpoint=replace(found.checkpoint, state={})),
+            if (
+                continuation
+                and continuation.checkpoint
+                and PIECES not in continuation.checkpoint.state
+            ):
+                whole, continuation = (
+                    continuation.checkpoint.state,
+                    replace(continuation, checkpoint=replace(continuation.checkpoint, state={})),
                 )
-            continued: Continuation = self.collective.share(found)
+            continued: Continuation = self.collective.share(continuation)
             checkpoint = continued.checkpoint
             if checkpoint is None or (checkpoint.state and self.checkpoints.complete(checkpoint)):
                 return continued

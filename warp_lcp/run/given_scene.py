@@ -68,23 +68,23 @@ def scene_to_resume(folder: Path, source: str | None, overrides: Sequence[str]) 
     """
     if not holds_run(folder):
         raise OutputError(f"{folder}: there is no run to resume")
-    own, asked = folder / SCENE, [override_key(override) for override in overrides]
-    before = [entry for entry in _recorded(folder) if override_key(entry["set"]) not in asked]
+    own, new_keys = folder / SCENE, [override_key(override) for override in overrides]
+    before = [entry for entry in _recorded(folder) if override_key(entry["set"]) not in new_keys]
     if source is None or (own.is_file() and Path(source).is_file() and own.samefile(source)):
         return GivenScene(
             load_scene(own, overrides), [*before, *({"set": override} for override in overrides)]
         )
 
-    kept = [entry["set"] for entry in before if not _edited(entry, source)]
-    scene = load_scene(source, [*kept, *overrides])
+    earlier = [entry["set"] for entry in before if not _edited(entry, source)]
+    scene = load_scene(source, [*earlier, *overrides])
     ran, now = (recorded_keys(own) or {}).get(RESOLUTION), keys(scene)[RESOLUTION]
-    if ran not in (None, now) and RESOLUTION not in asked:
+    if ran not in (None, now) and RESOLUTION not in new_keys:
         raise OutputError(
             f"{folder}: {RESOLUTION} is {ran}, but {now} in {source}: use --set {RESOLUTION}={now} "
             "to resample to the other grid, "
             f"or --set {RESOLUTION}={ran} to keep the grid"
         )
-    return GivenScene(scene, _noted(source, [*kept, *overrides]), kept)
+    return GivenScene(scene, _noted(source, [*earlier, *overrides]), earlier)
 
 
 def _edited(entry: Mapping[str, str], source: str) -> bool:

@@ -119,7 +119,7 @@ def rows_until(path: Path, header: str, step: int) -> list[str]:
     found, *rows = text.split("\n")[:-1] or [""]  # a line without a line break was truncated
     if found != header and (rows or not header.startswith(found)):
         raise OutputError(f"{path}: its columns are {found!r}, this run's are {header!r}")
-    kept, last = [header], 0
+    lines, last = [header], 0
     for row in rows:
         number = row.split(",", 1)[0]
         if (
@@ -127,6 +127,6 @@ def rows_until(path: Path, header: str, step: int) -> list[str]:
             and number.isdecimal()
             and last < int(number) <= step
         ):
-            kept.append(row)
+            lines.append(row)
             last = int(number)
-    return kept
+    return lines

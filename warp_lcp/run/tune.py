@@ -91,21 +91,21 @@ class Tuning:
 
     def verdict(self, accuracy: str) -> list[str]:
         """Return the result in words: settings, accuracy, missed bounds and a remedy."""
-        best, asked, volume = (
+        best, limits, volume = (
             self.chosen,
             self.preset,
             self.chosen.trial.volume_error(self.reference),
         )
         words = f"{best.words()}: {best.seconds:.3g} s"
-        found = (
-            f"distance {best.distance:.4f} (at most {asked.distance:g}), volume or packing "
-            f"{volume:.3f} (at most {asked.volume:g})"
+        accuracy_line = (
+            f"distance {best.distance:.4f} (at most {limits.distance:g}), volume or packing "
+            f"{volume:.3f} (at most {limits.volume:g})"
         )
         if self.noise is None:
-            return [f"{accuracy}: {words}", found]
+            return [f"{accuracy}: {words}", accuracy_line]
         differences = (
-            ("distance", best.distance, asked.distance),
-            ("volume or packing", volume, asked.volume),
+            ("distance", best.distance, limits.distance),
+            ("volume or packing", volume, limits.volume),
         )
         missed = ", ".join(
             f"{name} by a factor of {own / most:.2g}"
@@ -119,14 +119,14 @@ class Tuning:
         if self.met:
             return [
                 f"within the noise of the reference, but not {accuracy}: {words}",
-                found,
+                accuracy_line,
                 f"bounds missed: {missed}; but {unsure}: smaller errors cannot be measured",
                 "runs diverge this far with any settings in these frames: use fewer --frames to "
                 "compare earlier times",
             ]
         return [
             f"nearest of the settings tried, but not {accuracy}: {words}",
-            found,
+            accuracy_line,
             f"bounds missed: {missed}; {unsure}",
             self._remedy(),
         ]
