@@ -219,7 +219,7 @@ def run(
     overrides: SetOption = None,
 ) -> None:
     """Simulate a scene; ParaView opens the frames in the run folder."""
-    given = {
+    options = {
         "--out": out,
         "--device": device,
         "--frames": frames,
@@ -234,7 +234,7 @@ def run(
                 "--resume and --force exclude each other: --resume continues a run, --force "
                 "deletes it"
             )
-        loaded = launcher.load(scene, overrides or (), given)
+        loaded = launcher.load(scene, overrides or (), options)
         chosen, console = launcher.choose_device(device), launcher.console
         folder, name = out or default_folder(loaded.scene), loaded.scene.scene.name
         say(console, f"{name} on {launcher.place(chosen)}, into {folder}")
@@ -584,7 +584,7 @@ def bench(
         if compare is not None:
             tell(installed[suite].compare(*compare))
             return
-        asked: dict[str, Any] = ({"scene": scene} if scene else {}) | (
+        options: dict[str, Any] = ({"scene": scene} if scene else {}) | (
             {} if seed is None else {"seed": seed}
         )
         if not shared:  # called on every rank
@@ -596,7 +596,7 @@ def bench(
             repeat=repeat,
             shared=shared,
             threads=threads,
-            **asked,
+            **options,
         )
     except ValueError as error:
         end(str(error), WRONG_INPUT)

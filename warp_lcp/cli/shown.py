@@ -156,7 +156,7 @@ def render(
             f"{'' if look is RenderLook.PHOTO else ' on one core'}",
         )
 
-    with wrong_input(), Count(console, "drawing", "images") as told:
+    with wrong_input(), Count(console, "drawing", "images") as counter:
         frame = [
             *(frame or ()),
             *(frame_range(frames, Recording(folder, color, show).numbers) if frames else ()),
@@ -177,7 +177,7 @@ def render(
                 if film
                 else photograph_run
             )
-            report: Any = {"told": told, "estimated": estimated, "noted": partial(say, console)}
+            report: Any = {"told": counter, "estimated": estimated, "noted": partial(say, console)}
             images = list(draw(folder, frames=frame, settings=settings, out=out, **report))
             tell(f"{film}: {len(images)} frames" if film else _listed(images))
             return
@@ -201,7 +201,7 @@ def render(
                         film,
                         looks=looks,
                         rate=check_rate(fps),
-                        told=told,
+                        told=counter,
                         estimated=estimated,
                     )
                 )
@@ -217,7 +217,7 @@ def render(
                 looks=looks,
                 out=out,
                 sheet=sheet,
-                told=told,
+                told=counter,
                 estimated=estimated,
             )
         )
