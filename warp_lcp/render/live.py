@@ -225,18 +225,18 @@ class Answers(BaseHTTPRequestHandler):
             OSError: a file cannot be read.
         """
         try:
-            asked = urlsplit(self.path)
-            words = parse_qs(asked.query)
+            url = urlsplit(self.path)
+            words = parse_qs(url.query)
         except ValueError as error:
             raise QueryError(f"invalid address: {error}") from error
         live = self.server.live
-        if asked.path == "/":
+        if url.path == "/":
             return self.server.page, "text/html; charset=utf-8"
-        if asked.path == "/run":
+        if url.path == "/run":
             return json.dumps(live.state()).encode(), "application/json"
-        if asked.path == "/frame":
+        if url.path == "/frame":
             return live.frame(_number(words, "number")), "application/octet-stream"
-        if asked.path == "/log":
+        if url.path == "/log":
             return live.log(_number(words, "from")), "text/csv; charset=utf-8"
         raise RenderError("no such page")
 

@@ -200,7 +200,7 @@ class Recording:
         Raises:
             RenderError: there is no such frame.
         """
-        found = set()
+        selected = set()
         for frame in frames:
             number = self.numbers[frame] if -len(self.numbers) <= frame < 0 else frame
             if number not in self.numbers:
@@ -208,8 +208,8 @@ class Recording:
                     f"--frame {frame}: there is no such frame; the run has {self.numbers[0]} to "
                     f"{self.numbers[-1]}"
                 )
-            found.add(number)
-        return sorted(found) or self.numbers
+            selected.add(number)
+        return sorted(selected) or self.numbers
 
     def frame(self, number: int) -> Frame:
         """Return the data of an image of a frame.
@@ -353,8 +353,8 @@ class Recording:
             RenderError: there is none.
         """
         parts = ("surface", "particles") if self.show is Show.BOTH else (PARTS[self.show],)
-        found = {part: self._numbers(part) for part in parts}
-        for part, numbers in found.items():
+        part_numbers = {part: self._numbers(part) for part in parts}
+        for part, numbers in part_numbers.items():
             if not numbers:
                 output = self.scene.output
                 why = "" if getattr(output, part, True) else f"; the scene's output.{part} is false"
@@ -367,7 +367,7 @@ class Recording:
                     f"{self.folder}: holds no frames of "
                     f"{'a surface' if part == 'surface' else part}{why}"
                 )
-        numbers = sorted(set.intersection(*map(set, found.values())))
+        numbers = sorted(set.intersection(*map(set, part_numbers.values())))
         if not numbers:
             raise RenderError(f"{self.folder}: holds no frame of both {' and '.join(parts)}")
         self.numbers = numbers

@@ -68,13 +68,13 @@ def export_run(
         if (first is None or first <= number) and (last is None or number <= last)
     ]
     if not numbers:
-        asked = " ".join(
+        requested = " ".join(
             f"--{name} {number}"
             for name, number in (("first", first), ("last", last))
             if number is not None
         )
         raise RenderError(
-            f"{asked}: there are no such frames; the run has {recording.numbers[0]} to "
+            f"{requested}: there are no such frames; the run has {recording.numbers[0]} to "
             f"{recording.numbers[-1]}"
         )
     try:

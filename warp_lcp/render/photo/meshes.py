@@ -203,13 +203,13 @@ def _inner_ball(rows: np.ndarray) -> tuple[np.ndarray, float]:
 
     max r, n x + r <= -d.
     """
-    found = linprog(
+    solution = linprog(
         [0.0, 0.0, 0.0, -1.0],
         A_ub=np.column_stack([rows[:, :3], np.ones(len(rows))]),
         b_ub=-rows[:, 3],
         bounds=[(None, None)] * 4,
     )
-    return (found.x[:3], float(found.x[3])) if found.success else (np.zeros(3), 0.0)
+    return (solution.x[:3], float(solution.x[3])) if solution.success else (np.zeros(3), 0.0)
 
 
 def grain_prototypes(rounds: int) -> tuple[np.ndarray, np.ndarray]:

@@ -119,13 +119,13 @@ def find_llvm() -> str | None:
 
     None if there is none.
     """
-    found = {}
+    libraries = {}
     for folder in LLVM_FOLDERS:
         for file in glob(f"{folder}/libLLVM*"):
             version = LLVM_FILE.fullmatch(os.path.basename(file))
             if version and version[1] and int(version[1]) >= OLDEST_LLVM:
-                found[int(version[1])] = file
-    return found[max(found)] if found else None
+                libraries[int(version[1])] = file
+    return libraries[max(libraries)] if libraries else None
 
 
 def render_radiance(
@@ -270,7 +270,7 @@ def mesh_plugin(mitsuba: Any, mesh: PhotoMesh) -> Any:
         )
     if mesh.normals is None:
         properties["face_normals"] = True
-    made = mitsuba.Mesh(
+    plugin = mitsuba.Mesh(
         mesh.name,
         len(mesh.points),
         len(mesh.corners),
@@ -278,16 +278,16 @@ def mesh_plugin(mitsuba: Any, mesh: PhotoMesh) -> Any:
         has_vertex_normals=mesh.normals is not None,
     )
     if colored:
-        made.add_attribute(
+        plugin.add_attribute(
             "vertex_color", 3, np.ascontiguousarray(mesh.color, dtype=np.float32).ravel()
         )
-    data = mitsuba.traverse(made)
+    data = mitsuba.traverse(plugin)
     data["vertex_positions"] = np.ascontiguousarray(mesh.points, dtype=np.float32).ravel()
     data["faces"] = np.ascontiguousarray(mesh.corners, dtype=np.uint32).ravel()
     if mesh.normals is not None:
         data["vertex_normals"] = np.ascontiguousarray(mesh.normals, dtype=np.float32).ravel()
     data.update()
-    return made
+    return plugin
 
 
 def surface_plugin(mesh: PhotoMesh, colored: bool) -> dict[str, Any]:
