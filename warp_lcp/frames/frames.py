@@ -169,7 +169,7 @@ class FrameFolder:
         Raises:
             OSError: a file cannot be read.
         """
-        found, name, is_beside = set(), kind.removesuffix(".ply"), kind.endswith(".ply")
+        present, name, is_beside = set(), kind.removesuffix(".ply"), kind.endswith(".ply")
         for file in self.frames.iterdir() if self.frames.is_dir() else ():
             match = FRAME_FILE.fullmatch(file.name)
             if match is None or match["name"] != name:
@@ -177,8 +177,8 @@ class FrameFolder:
             # A file beside the frame's own.
             is_ply = match["format"] == "ply" and self.frame_format != "ply"
             if is_ply == is_beside and _is_whole(file):
-                found.add(int(match["index"]))
-        return sorted({*range(count)} - found)
+                present.add(int(match["index"]))
+        return sorted({*range(count)} - present)
 
     def write_part(self, path: Path, part: Part) -> Path:
         """Write a part to a path with the suffix of its format; return the file.

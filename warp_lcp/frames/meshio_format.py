@@ -268,7 +268,7 @@ def holds(name: str, kind: type, dimension: int) -> Holds:
         _sample(kind, dimension, round(SAMPLE ** (1.0 / dimension))),
         _sample(kind, dimension, 0),
     )
-    found, why, said = None, "", io.StringIO()
+    support, why, said = None, "", io.StringIO()
     with (
         tempfile.TemporaryDirectory() as folder,
         contextlib.redirect_stderr(said),
@@ -276,7 +276,7 @@ def holds(name: str, kind: type, dimension: int) -> Holds:
     ):
         path = Path(folder) / f"sample.{SUFFIXES[name]}"
         for dress in Dress:
-            if found and dress is Dress.BARE:
+            if support and dress is Dress.BARE:
                 break
             said.truncate(said.seek(0))
             try:
@@ -292,10 +292,10 @@ def holds(name: str, kind: type, dimension: int) -> Holds:
             empty = False
             with contextlib.suppress(*_faults()):
                 empty = _comes_back(path, none, name, dress)
-            found = found or Holds(dress, empty, size)
+            support = support or Holds(dress, empty, size)
             if not warns:  # else meshio would warn at every frame; another conversion is tried
                 return Holds(dress, empty, size)
-    return found or Holds(None, why=why)
+    return support or Holds(None, why=why)
 
 
 def _comes_back(path: Path, part: Points | Cells | Surface, name: str, dress: Dress) -> bool:
@@ -305,21 +305,21 @@ def _comes_back(path: Path, part: Points | Cells | Surface, name: str, dress: Dr
     """
     expected = mesh_of(part)
     _write(path, _dressed(expected, dress), name)
-    found = from_meshio(_module(name).read(str(path)))
-    points = np.asarray(found.points, dtype=np.float64)
+    copy = from_meshio(_module(name).read(str(path)))
+    points = np.asarray(copy.points, dtype=np.float64)
     if expected.points.shape != points.shape or not np.allclose(
         points, expected.points, rtol=1e-6, atol=1e-7
     ):
         return False
-    if expected.corners.size and not np.array_equal(found.corners, expected.corners):
+    if expected.corners.size and not np.array_equal(copy.corners, expected.corners):
         return False
     return (
         dress is Dress.BARE
         or not len(points)
         or all(
-            key in found.fields
-            and found.fields[key].shape == values.shape
-            and np.allclose(found.fields[key], values, rtol=1e-6)
+            key in copy.fields
+            and copy.fields[key].shape == values.shape
+            and np.allclose(copy.fields[key], values, rtol=1e-6)
             for key, values in expected.fields.items()
         )
     )
@@ -350,15 +350,15 @@ def _dressed(mesh: Mesh, dress: Dress) -> Mesh:
 
 def _joined(fields: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return fields with `velocity_x`, `_y` and `_z` joined to vectors."""
-    found: dict[str, np.ndarray] = {}
+    joined: dict[str, np.ndarray] = {}
     for key, values in fields.items():
         match = AXES.fullmatch(key)
         names = [f"{match['name']}_{axis}" for axis in "xyz"] if match else []
         if not match or not all(name in fields and fields[name].ndim == 1 for name in names):
-            found[key] = values
+            joined[key] = values
         elif match["axis"] == "x":
-            found[match["name"]] = np.stack([fields[name] for name in names], axis=-1)
-    return found
+            joined[match["name"]] = np.stack([fields[name] for name in names], axis=-1)
+    return joined
 
 
 def meshio_of(mesh: Mesh) -> Any:

@@ -237,8 +237,8 @@ def _nodes(
     )
     nx, ny, nz = counts
     kinds = kinds.reshape(nx, LOWER, ny, LOWER, nz, LOWER).transpose(0, 2, 4, 1, 3, 5)
-    found = kinds.any(axis=(3, 4, 5))
-    kinds = kinds[found].reshape(-1, LOWER**3)
+    nonempty = kinds.any(axis=(3, 4, 5))
+    kinds = kinds[nonempty].reshape(-1, LOWER**3)
     lower, upper = np.zeros(len(kinds), dtype=LOWER_NODE), np.zeros(1, dtype=UPPER_NODE)
     lower["table"]["value"] = np.where(kinds < 0, -background, background)
     lower["children"] = np.packbits(kinds > 0, axis=1, bitorder="little")
@@ -246,7 +246,7 @@ def _nodes(
     begin = (len(lower) - node) * LOWER_NODE.itemsize  # offset of the leaves from the node
     lower["table"]["child"][node, entry] = begin + (kinds[node, entry] - 1) * LEAF_NODE.itemsize
     upper["table"]["value"] = background
-    x, y, z = np.argwhere(found).T
+    x, y, z = np.argwhere(nonempty).T
     place = (x * UPPER + y) * UPPER + z
     upper["table"]["child"][0, place] = upper.nbytes + np.arange(len(lower)) * LOWER_NODE.itemsize
     children = np.zeros(UPPER**3, dtype=bool)

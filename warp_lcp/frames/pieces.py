@@ -107,8 +107,8 @@ def piece_files(path: Path) -> list[Path]:
         pieces = root(
             read_whole(path), f"P{'ImageData' if kind == 'vti' else 'UnstructuredGrid'}"
         ).iter("Piece")
-        found = [Path(str(piece.get("Source"))) for piece in pieces]
-        for file in found:
+        sources = [Path(str(piece.get("Source"))) for piece in pieces]
+        for file in sources:
             own = (
                 len(file.parts) == 2
                 and RANK_FOLDER.fullmatch(file.parts[0])
@@ -119,9 +119,9 @@ def piece_files(path: Path) -> list[Path]:
                     f"names {str(file)!r}: a piece is rank_0000/{path.stem}.{kind} in its own "
                     "folder"
                 )
-        if len(set(found)) != len(found):
+        if len(set(sources)) != len(sources):
             raise ValueError("names a piece twice")
-        return [path.parent / file for file in found]
+        return [path.parent / file for file in sources]
 
 
 def one_mesh(meshes: Sequence[Mesh]) -> Mesh:
@@ -205,13 +205,13 @@ def _sewn(mesh: Mesh) -> Mesh:
         np.ascontiguousarray(mesh.points).view(np.dtype((np.void, mesh.points.strides[0]))).ravel()
     )
     _, first, place = np.unique(places, return_index=True, return_inverse=True)
-    kept, number = np.unique(first, return_inverse=True)
+    first_points, number = np.unique(first, return_inverse=True)
     fields = (
         mesh.fields
         if mesh.on_cells
-        else {name: values[kept] for name, values in mesh.fields.items()}
+        else {name: values[first_points] for name, values in mesh.fields.items()}
     )
-    return Mesh(mesh.points[kept], number[place][mesh.corners], fields, mesh.on_cells)
+    return Mesh(mesh.points[first_points], number[place][mesh.corners], fields, mesh.on_cells)
 
 
 def _mesh(pieces: Sequence[tuple[str, Piece]], first: Piece) -> Iterator[str]:
