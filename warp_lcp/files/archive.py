@@ -145,22 +145,22 @@ class Archive:
         if header is None or not header.shape or header.fastest_first:
             whole = self.read([name])[name]
             return np.ascontiguousarray(whole[box]) if whole.ndim else whole
-        rows, *others = box
+        rows, *other_axes = box
         plane = prod(header.shape[1:]) * header.dtype.itemsize
         shape = [part.stop - part.start for part in box]
         with _faults_named(name), self._file.open(self._members[name]) as stream:
             check_claim(
                 f"{'x'.join(map(str, shape))} values", prod(shape) * header.dtype.itemsize + plane
             )
-            found = np.empty(shape, dtype=header.dtype)
+            values = np.empty(shape, dtype=header.dtype)
             _exactly(stream, header.length)
             for row in range(rows.stop):
                 read = _exactly(stream, plane)
                 if row >= rows.start:
-                    found[row - rows.start] = np.frombuffer(read, dtype=header.dtype).reshape(
+                    values[row - rows.start] = np.frombuffer(read, dtype=header.dtype).reshape(
                         header.shape[1:]
-                    )[tuple(others)]
-        return found
+                    )[tuple(other_axes)]
+        return values
 
     def close(self) -> None:
         """Close the file and its stream."""

@@ -73,22 +73,22 @@ def free_host_memory() -> int | None:
 
     The free memory of the machine, within the limit of the process; None if unknown.
     """
-    found: list[int] = []
+    limits: list[int] = []
     if MEMORY.exists() and (
         available := re.search(r"MemAvailable:\s+(\d+) kB", MEMORY.read_text(encoding="ascii"))
     ):
-        found.append(1024 * int(available[1]))
+        limits.append(1024 * int(available[1]))
     if resource is not None and OWN_SIZE.exists():
         limit = resource.getrlimit(resource.RLIMIT_AS)[0]
         if limit != resource.RLIM_INFINITY:
-            found.append(
+            limits.append(
                 max(
                     0,
                     limit
                     - resource.getpagesize() * int(OWN_SIZE.read_text(encoding="ascii").split()[0]),
                 )
             )
-    return min(found, default=None)
+    return min(limits, default=None)
 
 
 def _bytes(count: int) -> str:
