@@ -193,22 +193,22 @@ def _dataset(group: Any, name: str, path: Path) -> Any:
     """Return a dataset of this file, with a size that its stored bytes allow."""
     import h5py
 
-    found = group
+    member = group
     for part in name.split("/"):
-        found = _inside(found, part, path)
-    if not isinstance(found, h5py.Dataset) or found.is_virtual or found.external:
+        member = _inside(member, part, path)
+    if not isinstance(member, h5py.Dataset) or member.is_virtual or member.external:
         raise ValueError(f"{path}: {group.name}/{name} is not a dataset of this file")
-    size, stored = int(found.nbytes), int(found.id.get_storage_size())
+    size, stored = int(member.nbytes), int(member.id.get_storage_size())
     # The fill value is 0: FCLIB creates datasets without writing to them.
-    if stored == 0 and size <= UNWRITTEN and not found.chunks:
-        return found
+    if stored == 0 and size <= UNWRITTEN and not member.chunks:
+        return member
     check_claim(
         f"{name} of {size} bytes",
         size,
-        stored=-(-size // DEFLATED) if found.chunks else size,
+        stored=-(-size // DEFLATED) if member.chunks else size,
         held=stored,
     )
-    return found
+    return member
 
 
 def _inside(group: Any, name: str, path: Path) -> Any:

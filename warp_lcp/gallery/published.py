@@ -78,7 +78,7 @@ def _energy(make: Callable[..., Problem], *sizes: Any, **options: Any) -> Callab
 def _bearings() -> list[Published]:
     """Return the published figures of journal bearings."""
     rows = [(8, 12, 0.1, "-.183437"), (10, 16, 0.9, "-15.607"), (50, 50, 0.99, "-60.1509")]
-    found = [
+    figures = [
         Published(
             "Journal bearing",
             f"jbearing2, {nx} x {ny}, e = {e}",
@@ -98,7 +98,7 @@ def _bearings() -> list[Published]:
         125: "-0.18058",
     }
     for n, printed in known.items():
-        found.append(
+        figures.append(
             Published(
                 "Journal bearing",
                 f"JNLBRNG1, {n} x {n}",
@@ -111,7 +111,7 @@ def _bearings() -> list[Published]:
         ("JNLBRNG1", 0.1, "-1.80573195e-01", 1e-7),
         ("JNLBRNG2", 0.5, "-4.14865279e+00", 4e-8),
     ):
-        found.append(
+        figures.append(
             Published(
                 "Journal bearing",
                 f"{name}, 100 x 100",
@@ -121,7 +121,7 @@ def _bearings() -> list[Published]:
                 within,
             )
         )
-    return found
+    return figures
 
 
 # (name, load, border): {Q: (printed, within)}.
@@ -303,7 +303,7 @@ def _dams() -> list[Published]:
         2: ("89.9564647149903", "53.982307919772", "22.6601332428759"),
         1: ("146.570291707977", "94.3247021169195", "44.7462088399388"),
     }
-    found = [
+    figures = [
         Published("Dam", f"5 x 7, w at ({i}, {j})", printed, P4PDES, partial(_entry, j, i), 2e-11)
         for j, values in rows.items()
         for i, printed in enumerate(values, 1)
@@ -318,8 +318,10 @@ def _dams() -> list[Published]:
     }
     for nx, printed in heights.items():
         case = f"{nx} x {(nx - 1) * 3 // 2 + 1}, height of the seepage face"
-        found.append(Published("Dam", case, printed, P4PDES, partial(_height, nx), slow=nx > 1025))
-    return found
+        figures.append(
+            Published("Dam", case, printed, P4PDES, partial(_height, nx), slow=nx > 1025)
+        )
+    return figures
 
 
 @cache

@@ -91,25 +91,25 @@ def arrays(problem: LCP, x0: wp.array[Any]) -> dict[str, np.ndarray]:
         raise ValueError("only problems of a GridPoisson without periodic axes can be recorded")
     cells = _inner(A.cells, A)
     fluid = cells == FLUID
-    kept: dict[str, np.ndarray] = {"format": np.array(FORMAT), "cells": cells}
+    saved: dict[str, np.ndarray] = {"format": np.array(FORMAT), "cells": cells}
     for name, field in (("b", problem.b), ("x0", x0)):
-        kept[name] = np.where(fluid, _inner(field, A), 0.0)
+        saved[name] = np.where(fluid, _inner(field, A), 0.0)
     for name, bound, none in (("lower", problem.lower, -np.inf), ("upper", problem.upper, np.inf)):
         host = _inner(bound, A)
         first = host[fluid][0]
-        kept[name] = (
+        saved[name] = (
             np.array(first) if (host[fluid] == first).all() else np.where(fluid, host, none)
         )
     for axis in range(len(A.shape)):
         if A.faces[axis].size:
-            kept[f"face_{AXES[axis]}"] = _inner(A.faces[axis], A, axis)
+            saved[f"face_{AXES[axis]}"] = _inner(A.faces[axis], A, axis)
         elif A.uniform[axis] != 1.0:
             faces = [n + (a == len(A.shape) - 1 - axis) for a, n in enumerate(A.shape)]
-            kept[f"face_{AXES[axis]}"] = np.full(faces, A.uniform[axis])
+            saved[f"face_{AXES[axis]}"] = np.full(faces, A.uniform[axis])
     if A.shift.size:
         host = _inner(A.shift, A)
-        kept["shift"] = np.where(fluid, host, host.dtype.type(0))
-    return kept
+        saved["shift"] = np.where(fluid, host, host.dtype.type(0))
+    return saved
 
 
 def _inner(field: wp.array[Any], A: GridPoisson, axis: int | None = None) -> np.ndarray:
@@ -147,18 +147,18 @@ def load(path: Path, *, device: Any = None, dtype: Any = wp.float32) -> Recorded
             message names it.
     """
     with opened(path) as archive:
-        kept = archive.read(sorted(KNOWN & archive.headers.keys()))
+        saved = archive.read(sorted(KNOWN & archive.headers.keys()))
         coefficients: dict[str, Any] = {
-            name: kept[name] for name in ("face_x", "face_y", "face_z", "shift") if name in kept
+            name: saved[name] for name in ("face_x", "face_y", "face_z", "shift") if name in saved
         }
-        A = GridPoisson(kept["cells"], device=device, dtype=dtype, **coefficients)
+        A = GridPoisson(saved["cells"], device=device, dtype=dtype, **coefficients)
         b, lower, upper, x0 = (
-            np.broadcast_to(kept[name], A.shape).astype(np.float64)
+            np.broadcast_to(saved[name], A.shape).astype(np.float64)
             for name in ("b", "lower", "upper", "x0")
         )
-        numbers: dict[str, Any] = {name: kept[name].item() for name in NUMBERS}
+        numbers: dict[str, Any] = {name: saved[name].item() for name in NUMBERS}
         facts = {"symmetric", "semidefinite"} | (
-            {"mixed"} if np.isneginf(lower[kept["cells"] == FLUID]).any() else set()
+            {"mixed"} if np.isneginf(lower[saved["cells"] == FLUID]).any() else set()
         )
         return RecordedProblem(
             Path(path).stem, A, b, lower, upper, None, frozenset(facts), x0, **numbers

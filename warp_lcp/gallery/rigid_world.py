@@ -79,21 +79,21 @@ class World:
         if not len(self.solids):
             raise ValueError("solids is empty: expected at least one body")
         self.fixed = np.isposinf(self.mass)
-        made = [
+        parts = [
             _made(solid, 1.0 if m == FIXED else m)
             for solid, m in zip(self.solids, self.mass, strict=True)
         ]
         self.bodies = BodyStates(
             [
                 RigidBody(p, name=f"body {i}", friction=self.friction)
-                for i, (p, _) in enumerate(made)
+                for i, (p, _) in enumerate(parts)
             ]
         )
-        shapes = [shape for _, shape in made]
+        shapes = [shape for _, shape in parts]
         self.contact_solve = ContactSolve(
             ContactDetection(self.bodies, shapes, self.obstacles, 3, every=True)
         )
-        self.size = min(shape.reach(properties.center) for properties, shape in made)
+        self.size = min(shape.reach(properties.center) for properties, shape in parts)
 
     def velocities(self) -> np.ndarray:
         """Return velocities, linear and angular, of the bodies [m/s, rad/s], shape (n, 6)."""
@@ -115,13 +115,15 @@ class World:
         near, way = (near, dt * fastest) if margin is None else (margin, 0.0)
         n, ignored = len(self.bodies), self.ignored | {hinge.pair for hinge in self.hinges}
         still = np.append(self.fixed, True)
-        found = self.contact_solve.detection.find(
+        detected = self.contact_solve.detection.find(
             0.0, np.full(n, way), np.full(len(self.obstacles), near + way), near
         )
-        found = found.without(ignored)
-        found = found.where(~(still[found.first] & still[found.second]))
-        found = found.where(np.lexsort((found.first, found.second, found.obstacle == NONE)))
-        return self.contact_solve.assembled(found, 0.0, 1.0, None)
+        detected = detected.without(ignored)
+        detected = detected.where(~(still[detected.first] & still[detected.second]))
+        detected = detected.where(
+            np.lexsort((detected.first, detected.second, detected.obstacle == NONE))
+        )
+        return self.contact_solve.assembled(detected, 0.0, 1.0, None)
 
     def assemble(self, dt: float, *, rate: float = 0.2) -> Assembly:
         """Return the velocity problem of a step.
