@@ -187,14 +187,14 @@ class WorldBodies(RigidBodies):
             getattr(model, f"body_{name}").numpy()[self.indices]
             for name in ("mass", "com", "inertia")
         )
-        found = []
+        properties = []
         for index, R, q, mass, com, inertia in zip(
             self.indices, self._turned, self._placed, masses, centers, inertias, strict=True
         ):
             own = inertia.astype(np.float64) if mass > 0.0 else np.eye(3)
             turned = R @ (0.5 * (own + own.T)) @ R.T
             center = q[:3] + R @ com - self._origin
-            found.append(
+            properties.append(
                 (
                     int(index),
                     MassProperties(
@@ -202,7 +202,7 @@ class WorldBodies(RigidBodies):
                     ),
                 )
             )
-        return found
+        return properties
 
 
 SAME = 1e-6  # [m, and of a rotation's entries]: float32 accuracy of a pose

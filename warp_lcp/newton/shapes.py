@@ -53,7 +53,7 @@ def geometries(model: Any, origin: np.ndarray) -> dict[int, list[Geometry]]:
         for name in ("body", "flags", "type", "scale", "transform")
     }
     placed = model.body_q.numpy() if model.body_count else np.zeros((0, 7))
-    found: dict[int, list[Geometry]] = {}
+    geometries_of: dict[int, list[Geometry]] = {}
     for shape in range(model.shape_count):
         row = {name: array[shape] for name, array in arrays.items()}
         if not row["flags"] & newton.ShapeFlags.COLLIDE_SHAPES:
@@ -63,10 +63,10 @@ def geometries(model: Any, origin: np.ndarray) -> dict[int, list[Geometry]]:
         if body >= 0:
             pose = pose_of(placed[body]).after(pose)
         geometry = _geometry(row, model.shape_source[shape], model.shape_label[shape])
-        found.setdefault(body, []).append(
+        geometries_of.setdefault(body, []).append(
             geometry.moved(Pose(pose.rotation, pose.translation - origin))
         )
-    return found
+    return geometries_of
 
 
 def united(shapes: list[Geometry]) -> Geometry:
@@ -106,22 +106,23 @@ def _geometry(row: Mapping[str, Any], source: Any, name: str) -> Geometry:
         return Sphere(center=[0.0, 0.0, 0.0], radius=x)
     if kind == kinds.PLANE and not (x or y):
         return Plane(point=[0.0, 0.0, 0.0], normal=[0.0, 0.0, 1.0])
-    made = {"compute_normals": False, "compute_uvs": False, "compute_inertia": False}
+    mesh_options = {"compute_normals": False, "compute_uvs": False, "compute_inertia": False}
     if kind == kinds.ELLIPSOID:
         return _mesh(
             newton.Mesh.create_ellipsoid(
-                x, y, z, num_latitudes=SEGMENTS // 2, num_longitudes=SEGMENTS, **made
+                x, y, z, num_latitudes=SEGMENTS // 2, num_longitudes=SEGMENTS, **mesh_options
             ),
             name,
         )
     if kind == kinds.CYLINDER:
         mesh = newton.Mesh.create_cylinder(
-            x, y, up_axis=newton.Axis.Z, barrel_radius=z, segments=SEGMENTS, **made
+            x, y, up_axis=newton.Axis.Z, barrel_radius=z, segments=SEGMENTS, **mesh_options
         )
         return _mesh(mesh, name)
     if kind == kinds.CONE:
         return _mesh(
-            newton.Mesh.create_cone(x, y, up_axis=newton.Axis.Z, segments=SEGMENTS, **made), name
+            newton.Mesh.create_cone(x, y, up_axis=newton.Axis.Z, segments=SEGMENTS, **mesh_options),
+            name,
         )
     if kind == kinds.MESH:
         return _mesh(source, name, row["scale"])
