@@ -39,7 +39,7 @@ class BodyCoupling:
         grid: the grid.
         boundary: its solids, with the bodies among them.
         bodies: the bodies.
-        density: of the liquid [kg/m^3].
+        density: density of the liquid [kg/m^3].
         share: factor on U V in the outflow, for a problem in terms of mass, see
             `fluids.unilateral`.
     """
@@ -196,7 +196,8 @@ class BodyCoupling:
         Below a body that rests on a floor only gravity would act on them.
 
         Args:
-            velocity: of each component [m/s] (updated on closed faces away from the liquid).
+            velocity: velocity of each component [m/s] (updated on closed faces away from the
+                liquid).
             known: int8, > 0 where the velocity has been extrapolated.
         """
         block = self.boundary.cut.moving_block()

@@ -123,7 +123,7 @@ def make_pressure(
         grid: its grid.
         boundary: its solids.
         surface: the free surface.
-        weights: of the particles on the faces of each component.
+        weights: particle weights on the faces of each component.
         bodies: rigid bodies among the solids; None without any.
     """
     solver, coupling = (

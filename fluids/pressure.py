@@ -299,7 +299,7 @@ class PressureProjection:
         Args:
             velocity: u* of each component [m/s].
             dt: time step [s].
-            kick_dt: how long forces have acted on u* [s].
+            kick_dt: time that forces have acted on u* [s].
             window: cells that hold all FLUID cells; None: all cells.
         """
         self._look(window)
@@ -509,8 +509,8 @@ class PressureProjection:
             velocity: u* of each component [m/s] (updated on open faces of FLUID cells, and on faces
                 with particle weight beside them).
             window: cells that hold all FLUID cells, with one to spare on each side.
-            result: of `solve`.
-            criteria: of `solve`.
+            result: the result of `solve`.
+            criteria: the criteria of `solve`.
         """
         unknowns = self.counted()
         reference = (

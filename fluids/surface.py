@@ -61,8 +61,8 @@ class FreeSurface(Protocol):
     Attributes:
         phi: float32 distance to the surface at cell centers [cells], < 0 in liquid; None if the
             surface lies on the cells' faces.
-        density: of the particles at the last `mark`, relative to that at rest, float32; None if not
-            computed.
+        density: density of the particles at the last `mark`, relative to that at rest, float32;
+            None if not computed.
     """
 
     phi: wp.array | None

@@ -89,7 +89,7 @@ class SurfaceTension:
         phi: distance to the surface [cells], < 0 in liquid, from a `GhostFluidSurface`.
         coefficient: sigma [N/m].
         contact_angle: angle in the liquid [degrees].
-        density: of the liquid [kg/m^3].
+        density: density of the liquid [kg/m^3].
 
     Attributes:
         jump: kick_dt sigma kappa / (rho dx) [m/s] in cells beside the surface, float32.
@@ -157,7 +157,7 @@ class SurfaceTension:
             velocity: u* of each component [m/s] (updated).
             window: cells that hold all FLUID cells, with a margin on each side.
             kind: int8 of AIR, FLUID, SOLID, as `phi` marks them.
-            kick_dt: how long forces act [s].
+            kick_dt: time that forces act [s].
         """
         if self.boundary.moves:
             self._find_walls()
@@ -369,7 +369,8 @@ def wall_cells(
     Args:
         grid: the grid.
         base: int8, SOLID or AIR, in the stored shape.
-        distance: to solids at the cells' low corners [cells]; None: solids are whole cells.
+        distance: distance to solids at the cells' low corners [cells]; None: solids are whole
+            cells.
 
     Returns:
         `blocked`, int8 in the stored shape; the flat indices of the cells, int32, shape (n,); their

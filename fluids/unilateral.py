@@ -74,12 +74,12 @@ class UnilateralPressure(PressureProjection):
         level_set: level set of the liquid's surface, whose density is used.
         weights: particle weights on the faces of each component; faces without weight have no
             momentum.
-        tolerance: as of `PressureProjection`.
+        tolerance: see `PressureProjection`.
         max_iterations: likewise.
         coupling: likewise.
         gravity: likewise; without gravity nothing settles.
 
-    Attributes: as of `PressureProjection`; `kind` marks the cells inside the level set.
+    Attributes: see `PressureProjection`; `kind` marks the cells inside the level set.
     """
 
     def __init__(

@@ -120,7 +120,8 @@ class Viscosity:
         boundary: solids and walls.
         viscosity: mu [Pa s].
         density: [kg/m^3].
-        slip_lengths: of the domain's wall and each solid [m], shape (1 + solids,); inf: free slip.
+        slip_lengths: slip length of the domain's wall and each solid [m], shape (1 + solids,); inf:
+            free slip.
         phi: float32 distance to the free surface at cell centers [cells], < 0 in liquid; None if it
             lies on the cells' faces.
         tolerance: relative residual at which a solve ends.
@@ -338,8 +339,8 @@ class Viscosity:
 
         Args:
             velocity: the velocity after the step [m/s].
-            kind: as of `solve`.
-            contact: as of `solve`.
+            kind: see `solve`.
+            contact: see `solve`.
             points: reference points of the moments [m], shape (1 + solids, 3).
         """
         if self._pull is None:

@@ -146,7 +146,7 @@ class WallPull:
 
         Args:
             velocity: u of each component [m/s].
-            points: as of `take`.
+            points: see `take`.
         """
         grid, dimension = self.grid, self.grid.dimension
         axes, cells = np.divmod(self.rows, grid.size)
@@ -206,7 +206,7 @@ class BodyDrag:
         grid: the grid.
         boundary: its solids, with the bodies among them.
         bodies: the bodies.
-        density: of the liquid [kg/m^3].
+        density: density of the liquid [kg/m^3].
         passes: kernels of the viscous solve.
         solved: cells whose faces are unknowns.
         across: communicator; all methods are then collective. None if serial.

@@ -30,7 +30,7 @@ class ViscosityMultigrid:
 
     Attributes:
         r, z: flat float32 fields, one component after the other.
-        levels: from the finest on.
+        levels: the levels, the finest one first.
         program: launches of one cycle.
     """
 

@@ -40,7 +40,7 @@ class WallDrag:
         grid: the grid.
         boundary: its solids.
         coefficients: c_f of the domain's walls and of each solid, shape (1 + solids,).
-        density: of the liquid [kg/m^3].
+        density: density of the liquid [kg/m^3].
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class WallDrag:
         Args:
             sums: sums of impulses.
             window: cells that hold all liquid.
-            velocity: of each component [m/s] (updated where it is projected).
+            velocity: velocity of each component [m/s] (updated where it is projected).
             projection: the projection of the step.
             phi: distance to the free surface, see `FreeSurface.phi`.
             dt: time that the drag acts [s].

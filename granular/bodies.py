@@ -188,7 +188,7 @@ class SandBodies:
                 `sand`.
             velocity: V* of each body, shape (bodies, k) [m/s, 1/s].
             inverse_mass: M^-1 of each, shape (bodies, k, k).
-            density: of sand at its densest packing [kg/m^3].
+            density: density of sand at its densest packing [kg/m^3].
         """
         assert self.faces is not None
         self._scale, rows, owner = (

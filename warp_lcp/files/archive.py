@@ -60,7 +60,7 @@ class Header:
     """Header of an array in an archive.
 
     Args:
-        shape: of the array.
+        shape: shape of the array.
         dtype: its type.
         fastest_first: Fortran order: the first axis varies fastest.
         length: bytes of its member before the first value.

@@ -90,7 +90,7 @@ def read_vti(path: Path) -> Cells:
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: it is no such file, or cut short.
+        ValueError: it is no such file, or truncated.
     """
     with read_back(path):
         text, mark, data = read_whole(path).partition(APPENDED)

@@ -94,7 +94,8 @@ class WorldBodies(RigidBodies):
 
         Args:
             poses: poses of all bodies of the model, shape (bodies, 7).
-            velocities: of their centers of mass [m/s] and angular [rad/s], shape (bodies, 6).
+            velocities: velocities of their centers of mass [m/s] and angular [rad/s], shape
+                (bodies, 6).
             forces: forces on them [N, N m], shape (bodies, 6).
             time: time of the liquid [s].
         """

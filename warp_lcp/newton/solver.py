@@ -104,8 +104,8 @@ class SolverLiquid(SolverBase, CouplingInterface):
         Args:
             model: the newton model, whose bodies with shapes are in the liquid.
             rigid: creates the rigid-body solver for a view of the model, such as `SolverXPBD`.
-            scene: as of the class.
-            origin: as of the class.
+            scene: see the class.
+            origin: see the class.
             iterations: number of alternating steps. In the first one the rigid-body solver only
                 estimates the liquid's impulses. 1 is cheaper, but bodies much lighter than the
                 liquid then oscillate for some steps after a jolt.

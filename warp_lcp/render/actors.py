@@ -139,7 +139,7 @@ def body_meshes(
     """Return rigid bodies at their positions, each in a color of its own.
 
     Args:
-        bodies: with the field `body`; None without bodies.
+        bodies: surfaces with the field `body`; None without bodies.
         at_first: the bodies in the run's first frame, which defines the octants of balls.
         line_width: width of the outlines of bodies in 2-D [pixels].
         front: distance of bodies in 2-D in front of the particles [m].

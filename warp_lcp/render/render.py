@@ -156,7 +156,7 @@ def expected_seconds(recording: Recording, numbers: Sequence[int], looks: Looks)
     It is based on the content of the middle frame.
 
     Raises:
-        RenderError: that frame cannot be read.
+        RenderError: the frame cannot be read.
     """
     frame = recording.frame(numbers[len(numbers) // 2])
     points = len(frame.points) + (0 if frame.surface is None else len(frame.surface.points))

@@ -21,8 +21,8 @@ class Firm:
 
     Args:
         held: rows with a load; along tangents, rows that do not slip.
-        first: those whose second side does not move, so that they support their first body.
-        second: those that support their second body.
+        first: rows whose second side does not move, so that they support their first body.
+        second: rows that support their second body.
         bodies: number of bodies.
     """
 

@@ -82,7 +82,7 @@ class PlanarImpulses:
 
     Args:
         contacts: contacts of the step.
-        impulses: of the contacts [N s], shape (k, 2).
+        impulses: impulses of the contacts [N s], shape (k, 2).
         residual: the largest residual of an island, relative to that of no impulses.
         iterations: the most iterations of an island.
         dt: length of the step [s].

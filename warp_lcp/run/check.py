@@ -27,8 +27,8 @@ def check_scene(
     The summary has pairs of a word and a line.
 
     Args:
-        path_or_name: as of `load_scene`.
-        overrides: as of `load_scene`.
+        path_or_name: see `load_scene`.
+        overrides: see `load_scene`.
 
     Raises:
         SceneError: listing everything that is wrong.

@@ -96,7 +96,7 @@ class CheckpointFolder:
     Args:
         folder: the folder, created with the first checkpoint.
         fingerprint: digest of the scene without keys that may change when the run continues.
-        keys: of the scene, with their values, written with each checkpoint.
+        keys: keys of the scene, with their values, written with each checkpoint.
         collective: collective operations of the ranks that share the run, whose checkpoints are in
             parts; `write`, `complete` and `prune` are then collective.
 

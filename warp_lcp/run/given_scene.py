@@ -29,7 +29,7 @@ class GivenScene:
     Args:
         scene: the scene.
         overrides: overrides for run.json, which a resumed run applies again.
-        kept: those of them from earlier parts of the run.
+        kept: overrides from earlier parts of the run.
     """
 
     scene: Scene
@@ -41,8 +41,8 @@ def given_scene(source: SceneSource, overrides: Sequence[str]) -> GivenScene:
     """Return the scene of a new run.
 
     Args:
-        source: as of `load_scene`.
-        overrides: as of `load_scene`.
+        source: see `load_scene`.
+        overrides: see `load_scene`.
 
     Raises:
         SceneError: lists all errors.
@@ -59,8 +59,8 @@ def scene_to_resume(folder: Path, source: str | None, overrides: Sequence[str]) 
 
     Args:
         folder: folder of the run.
-        source: as of `load_scene`; None: the folder's own scene.
-        overrides: as of `load_scene`.
+        source: see `load_scene`; None: the folder's own scene.
+        overrides: see `load_scene`.
 
     Raises:
         OutputError: there is no run, or its grid would change without an explicit request.

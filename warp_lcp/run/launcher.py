@@ -51,8 +51,8 @@ class Launcher:
         """Return the scene of a new or resumed run.
 
         Args:
-            scene: as of `load_scene`; None: that of the folder.
-            overrides: as of `load_scene`.
+            scene: see `load_scene`; None: that of the folder.
+            overrides: see `load_scene`.
             options: options of the command, by name.
 
         Raises:

@@ -59,7 +59,7 @@ class Tuning:
 
     Attributes:
         scene: the scene with the chosen settings.
-        chosen: those settings and their results.
+        chosen: the chosen settings and their results.
         preset: the preset whose bounds define the accuracy.
         bounds: bounds of the differences: those of the preset or, with an uncertain reference,
             combined with its noise.

@@ -262,7 +262,7 @@ def grain_mesh(
     Args:
         centers: [m], shape (n, 3).
         radius: mean radius [m].
-        seeds: of the grains, shape (n,).
+        seeds: seeds of the grains, shape (n,).
         rounds: 0 for 20 triangles per grain, 1 for 80.
     """
     shapes, corners = grain_prototypes(rounds)

@@ -67,7 +67,7 @@ class PhotoMesh:
     Args:
         name: name of the mesh.
         points: [m], shape (n, 3).
-        corners: of the triangles, shape (m, 3), counterclockwise seen from outside.
+        corners: point indices of the triangles, shape (m, 3), counterclockwise seen from outside.
         finish: finish of the surface.
         color: reflectance, or absorption of a liquid [1/m]; linear Rec. 709, shape (3,), or
             reflectances at the points, shape (n, 3).
