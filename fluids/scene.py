@@ -94,7 +94,8 @@ class LiquidScene(ParticleScene):
 
     solve_bytes: ClassVar[int] = PRESSURE_BYTES
     carried_by_grid: ClassVar[bool] = True
-    # Factor on cells and iterations: splashed liquid occupies more cells.
+    # Factor on the estimated time of a step: splashed liquid occupies more cells, and solves take
+    # more iterations.
     stirred: ClassVar[float] = 1.2
 
     pressure: Pressure = Field(default_factory=Pressure)

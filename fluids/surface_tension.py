@@ -43,7 +43,7 @@ SAFETY = 3.0  # safety factor on the square of the longest step: particles add n
 class SurfaceShares:
     """Smoothed liquid fractions of cells, and series of the distance to the surface.
 
-    The distance [cells] is linear w + cubic w^3, with w = 2 once - twice - 1/2.
+    The distance [cells] is linear w + cubic w^3, with w = 1/2 - (2 once - twice).
 
     Attributes:
         once: fractions after the passes of the step, float32.
@@ -352,7 +352,7 @@ class SurfaceTension:
 
 
 def _profile(passes: int) -> tuple[float, float]:
-    """Return the series of the distance to a plane [cells] in 2 once - twice - 1/2."""
+    """Return the coefficients of the distance to a plane, see `SurfaceShares`."""
     narrow, wide = (math.sqrt(0.25 + 0.5 * count) for count in (passes, 2 * passes))
     first, third = ((2.0 / narrow**n - 1.0 / wide**n) / math.sqrt(2.0 * math.pi) for n in (1, 3))
     return 1.0 / first, third / (6.0 * first**4)

@@ -34,8 +34,8 @@ SWEEPS = 4  # sweeps of the coarsest level, each forward and backward
 # Factor on the finer level's `mixed`: twice that is at most `cell`, so that the squares of a cell
 # outweigh its products also in 3-D.
 MIXED = 0.5
-# Factor on the finer level's wall drag, relative to its links: half of the neighbors are in the
-# same row.
+# Factor on the finer level's wall drag, relative to its links: half of the faces near a wall lie in
+# the row beside it.
 WALL = 0.5
 
 

@@ -24,8 +24,7 @@ class SandReport:
 
     Attributes:
         ratio: ratio of each cell's friction to its bound, float32.
-        contact: uint8: HELD in cells beside walls with pressure, RELEASED without pressure, 0
-            elsewhere.
+        contact: uint8: HELD in cells of sand with pressure, RELEASED without pressure, 0 elsewhere.
         known: int8, 1 on each component's faces that the stresses act on, -1 inside solids, 0
             elsewhere.
     """
@@ -57,7 +56,7 @@ class SandReport:
         )
 
     def _launch_taking(self, velocity: Sequence[wp.array]) -> None:
-        """Launch the copy of velocities, and the contact of cells beside walls."""
+        """Launch the copy of velocities, and the contact of cells with sand."""
         stress, packing = self.stress, self.stress.packing
         for axis, field in enumerate(velocity):
             fields = [

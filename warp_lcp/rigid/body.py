@@ -86,8 +86,8 @@ class RigidBody:
         time: time of the state [s].
         hold: matrix that maps an impulse to the part that contacts do not absorb, shape (k, k);
             None for the identity. See `RigidBodies.begin_step`.
-        given: sum of the impulses since `hold` was set, before it is applied, shape (6,): force and
-            torque.
+        given: sum of the impulses since `hold` was set, including the parts that contacts absorb,
+            shape (6,): [N s, N m s].
 
     Raises:
         ValueError: friction or restitution is out of range.
