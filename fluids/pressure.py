@@ -300,7 +300,7 @@ class PressureProjection:
             velocity: u* of each component [m/s].
             dt: time step [s].
             kick_dt: time that forces have acted on u* [s].
-            window: cells that hold all FLUID cells; None: all cells.
+            window: cells that hold all FLUID cells; None for all cells.
         """
         self._look(window)
         self._everyone = None

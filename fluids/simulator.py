@@ -74,8 +74,8 @@ class LiquidSimulation(ParticleSimulation):
 
     Attributes:
         surface: the free surface.
-        forces: force output of each solid; None: off.
-        tension: surface tension; None: off.
+        forces: force output of each solid; None if off.
+        tension: surface tension; None if off.
         projection: the pressure solve and its fields.
         record: callback that gets the problem of each step before its solve; optional.
     """
@@ -596,7 +596,7 @@ class FluidsSimulator:
             ranks: MPI ranks that share the simulation, with the same scene on each; None for one
                 process.
             wall_velocity: velocity [m/s] of the domain's wall and of each solid, shape (1 + solids,
-                3), constant; the solids' cells stay fixed. None: all are at rest.
+                3), constant; the solids' cells stay fixed. None if all are at rest.
             models: user models, see `warp_lcp.fluids.models.LiquidModel`.
 
         Raises:

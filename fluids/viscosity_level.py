@@ -91,7 +91,7 @@ class ViscosityLevel:
         grid: grid of the level.
         x: its solution.
         b: its right-hand side.
-        finer: grid of the finer level; None: this one is the finest.
+        finer: grid of the finer level; None for the finest level.
 
     Attributes:
         cell: weights of links along a component's own axis.

@@ -156,8 +156,6 @@ def closed_on(S: Walls, axis: int, k: int, j: int, i: int):
     In this order: an owner and its share of a face, the share of the standing solid of the cell
     (`standing_of`), a moving solid and its share. Of a face of the domain's sides, solids have the
     part that they cover.
-
-    Of a domain's face solids have the part that they cover.
     """
     owner = int(-1)
     own = float(0.0)

@@ -166,9 +166,7 @@ def within(
 ) -> np.ndarray:
     """Return the mask of flat indices in a window, grown by some layers.
 
-    If the window is None, all.
-
-    None: all.
+    All indices if the window is None.
     """
     if window is None:
         return np.ones(len(flat), dtype=bool)

@@ -187,7 +187,7 @@ class MomentumWorkspace(StressWorkspace):
         Returns None if the host decides on the steps.
 
         Args:
-            guess: must be None: the solve starts from the current stresses.
+            guess: must be None, since the solve starts from the current stresses.
             criteria: stopping criteria; the device decides only with an absolute tolerance.
             steps: most steps of this solve without the host.
         """

@@ -133,7 +133,7 @@ def solve_files(
         right_side: b, a vector of either form.
         lower: a number, or the file of a vector; magnitudes of 1e20 and more are infinite.
         upper: likewise.
-        method: a name in `METHODS`; None: `wl.solve` chooses.
+        method: a name in `METHODS`; `wl.solve` chooses if None.
         tolerance: residual, relative to the one at clip(0, lower, upper).
         max_iterations: limit of steps.
         max_seconds: limit of the wall time.

@@ -40,7 +40,7 @@ class GridOutcome(Outcome):
     Attributes:
         shape: shape of the whole grid's cells, (nz, ny, nx) or (ny, nx).
         unknowns: number of unknowns of the whole grid.
-        decomposition: decomposition if the result has x of a rank's box; None: of the whole grid.
+        decomposition: decomposition if the result has x of a rank's box; None for the whole grid.
     """
 
     shape: tuple[int, ...]

@@ -53,8 +53,6 @@ class BodySurface:
 
     As `warp_lcp.simulation.Surface`, without a name.
 
-    As `warp_lcp.simulation.Surface`, without a name.
-
     Args:
         points: [m], shape (n, 3).
         corners: point indices of triangles, shape (m, 3), counterclockwise seen from outside, or of

@@ -114,7 +114,7 @@ class Run:
 
     Args:
         scene: a scene file, the name of a built-in scene, its tables as a dict, or a Scene.
-        folder: folder for log, frames and checkpoints; None: no files are written.
+        folder: folder for log, frames and checkpoints; no files are written if None.
         device: a Warp device; default: a GPU, if there is one.
         frames: stop after this frame; default: the last one of the scene.
         force: delete an existing run in the folder.

@@ -38,7 +38,7 @@ def foretold(
     Args:
         scene: the scene.
         simulation: the simulation at its start.
-        seconds: measured time of a step; None: from the cost table.
+        seconds: measured time of a step; that of the cost table if None.
     """
     where = "as measured"
     if isinstance(scene, ParticleScene) and isinstance(simulation, ParticleSimulation):

@@ -59,7 +59,7 @@ def scene_to_resume(folder: Path, source: str | None, overrides: Sequence[str]) 
 
     Args:
         folder: folder of the run.
-        source: see `load_scene`; None: the folder's own scene.
+        source: see `load_scene`; the folder's own scene if None.
         overrides: see `load_scene`.
 
     Raises:

@@ -51,7 +51,7 @@ class Launcher:
         """Return the scene of a new or resumed run.
 
         Args:
-            scene: see `load_scene`; None: that of the folder.
+            scene: see `load_scene`; that of the folder if None.
             overrides: see `load_scene`.
             options: options of the command, by name.
 

@@ -58,7 +58,7 @@ class RunRequest:
 
     Args:
         scene: the scene, the same on all ranks.
-        out: the run's folder, visible to all ranks; None: no files are written.
+        out: the run's folder, visible to all ranks; no files are written if None.
         device: Warp device of this rank, such as `cuda:0`.
         overrides: differences of the scene from its file, for run.json, see
             `warp_lcp.run.given_scene`.
