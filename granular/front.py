@@ -3,9 +3,9 @@
 
 They are selected on the device, without an extra readback.
 
-The n-th smallest of float32 numbers is found digit by digit (radix selection): of the numbers that
-begin with the digits found, count those with each next digit; the one in which n falls is found.
-Counts are integers, so that the result is exact.
+The n-th smallest of float32 numbers is found digit by digit (radix selection). For each digit, the
+numbers that begin with the digits found so far are counted by their next digit; the digit in whose
+count the n-th number falls is the next one. Counts are integers, so that the result is exact.
 """
 
 from typing import no_type_check
