@@ -1,4 +1,4 @@
-"""Liquids on a staggered grid that let go of their walls: the plug-in `fluids` of warp_lcp."""
+"""Liquids on a staggered grid with separating walls: the plug-in `fluids`."""
 
 from warp_lcp.fluids.pressure import PressureProjection, Projection
 from warp_lcp.fluids.scene import LiquidScene

@@ -18,31 +18,29 @@ from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rows.host_array import HostArray
 from warp_lcp.rows.program import LaunchGraph, call, clear, launch
 
-LEAST = 4096  # entries that a GPU has room for at least, which counts them while it solves
-SPARE = 1.5  # room for entries, times those there are when there is none left
+LEAST = 4096  # least capacity for entries on a GPU, which counts them during the solve
+SPARE = 1.5  # factor on the number of entries when the buffer is enlarged
 
 
 class BodyCoupling:
     """Coupling of rigid bodies and liquid by one pressure.
 
-    After [Batty, Bertails & Bridson 2007].
+    The method is that of [Batty, Bertails & Bridson 2007]. A body's velocity after the pressure's
+    impulse I = rho dx^d U'x is V* + M^-1 I, with x in m/s. The outflow of a cell gains U V. The
+    entry U_iq is the sum over the faces of cell i of s_f (1 - a_f) times the velocity of unit
+    motion q at the face's center, with s_f = +-1 outward. With b from V* the outflow is
 
-    A body's velocity is V* + M^-1 I after the pressure's impulse I = rho dx^d U'x of its x [m/s],
-    and the outflow of a cell gains U V: U_iq is the sum over the faces of cell i of s_f (1 - a_f)
-    times the velocity of unit motion q at the face's center, s_f = +-1 outward. So with b from V*
-    the outflow is
+        y = b + (A + rho dx^d U M^-1 U') x.
 
-        y = b + (A + rho dx^d U M^-1 U') x,
-
-    symmetric and positive semi-definite like A. Liquid and body exchange opposite impulses on the
-    same faces: momentum is conserved exactly, and energy up to the residual y.
+    The operator is symmetric and positive semi-definite like A. Liquid and body exchange opposite
+    impulses on the same faces: momentum is conserved exactly, and energy up to the residual y.
 
     Args:
         grid: the grid.
         boundary: its solids, with the bodies among them.
         bodies: the bodies.
-        density: of the liquid [kg/m^3].
-        share: factor on U V in the outflow, where the problem is one of masses, see
+        density: density of the liquid [kg/m^3].
+        share: factor on U V in the outflow, for a problem in terms of mass, see
             `fluids.unilateral`.
     """
 
@@ -83,8 +81,8 @@ class BodyCoupling:
             wp.zeros(rows, dtype=wp.int32, device=grid.device) for _ in range(2)
         )
         self._low: wl.LowRankOperator | None = None
-        self._flat: wp.array | None = None  # of the last solution
-        # cells of a `take` whose entries have not been counted by the host
+        self._flat: wp.array | None = None  # flat values of the last solution
+        # Field of cell kinds whose entries the host has not counted yet, see `grow_entries`.
         self._pending: wp.array | None = None
         self._beside, self._enclosing = ActiveWindow(grid.domain), ActiveWindow(grid.domain)
         self._counting = LaunchGraph(grid.device, self._launch_count)
@@ -121,10 +119,10 @@ class BodyCoupling:
             self._low.update(self._weights(), symmetric=True)
 
     def grow_entries(self) -> bool:
-        """Enter again what a GPU had no room for in the last `take`.
+        """Write the entries of U again if they exceeded the buffer of a GPU.
 
         Returns:
-            Whether there was some, so that a solve must be repeated.
+            Whether entries were missing, so that the solve must be repeated.
         """
         kind, self._pending = self._pending, None
         if kind is None or self.columns.wanted() <= self.columns.capacity:
@@ -135,7 +133,10 @@ class BodyCoupling:
         return True
 
     def _enter(self, kind: wp.array) -> None:
-        """Write the entries of U for the cells of the window; a GPU does not wait for their number, see `grow_entries`."""
+        """Write the entries of U for the cells of the window.
+
+        A GPU does not wait for their number, see `grow_entries`.
+        """
         columns = self.columns
         self._counting.run(kind, variant=columns.capacity)
         columns.counting()
@@ -145,7 +146,7 @@ class BodyCoupling:
             self._enter_all(kind)
 
     def _enter_all(self, kind: wp.array) -> None:
-        """Write the entries of U, as many as have been counted."""
+        """Write all counted entries of U."""
         columns, total = self.columns, self.columns.wanted()
         if total > columns.capacity:
             columns.reserve(round(SPARE * total))
@@ -154,12 +155,12 @@ class BodyCoupling:
             self._entering.run(kind, variant=columns.rows.ptr)
 
     def _launch_count(self, kind: wp.array) -> None:
-        """Count the entries of each row of cells, and add them up."""
+        """Count the entries of each row of cells, and compute their offsets."""
         clear(self._counts)
         self._beside.launch_rows(
             kernels.enter_kernel, [self._solids, kind, self._counts, None, None, None, None]
         )
-        first, device = 0, self.grid.device  # whose offset is 0
+        first, device = 0, self.grid.device  # the first row, whose offset is 0
         if device.is_cuda:
             call(partial(wp.utils.array_scan, self._counts, self._offsets, inclusive=False))
             first = len(self._counts) - 1
@@ -177,7 +178,7 @@ class BodyCoupling:
         )
 
     def push(self, x: wp.array) -> None:
-        """Apply to the bodies the impulses of x = kick_dt p / (rho dx) [m/s]."""
+        """Apply the impulses of x = kick_dt p / (rho dx) [m/s] to the bodies."""
         products = self._low.products_at(x) if self._low is not None else None
         if products is None:
             if self._flat is None or self._flat.ptr != x.ptr:
@@ -190,19 +191,21 @@ class BodyCoupling:
         self.columns.gather(x, launch=launch)
 
     def hold(self, velocity: Sequence[wp.array], known: Sequence[wp.array]) -> None:
-        """Move particles buried by a body with it; collective.
+        """Move particles that a body has buried along with it; collective.
 
-        Below a body that rests on a floor, gravity alone would act on them.
+        Below a body that rests on a floor only gravity would act on them.
 
         Args:
-            velocity: of each component [m/s] (updated on closed faces that no liquid is near).
-            known: int8, > 0 where the velocity has been continued to.
+            velocity: velocity of each component [m/s] (updated on closed faces away from the
+                liquid).
+            known: int8, > 0 where the velocity has been extrapolated.
         """
         block = self.boundary.cut.moving_block()
         if block is not None:
             self._enclosing.move_to(self.grid.window(*block, grow=1))
             self._holding.run(velocity, known)
-        self.grid.part.fill(*velocity)  # those know what is continued there whose cells they are
+        # Ranks get the extrapolated values from the owners of the cells.
+        self.grid.part.fill(*velocity)
 
     def _launch_enclosed(self, velocity: Sequence[wp.array], known: Sequence[wp.array]) -> None:
         for fields in zip(self.boundary.open, self.boundary.velocity, known, velocity, strict=True):

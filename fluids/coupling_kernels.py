@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Kernels that find how the motions of rigid bodies displace the liquid of the cells beside them."""
+"""Kernels for the coupling matrix U of rigid bodies and liquid cells."""
 
 import warp as wp
 
@@ -15,20 +15,20 @@ _F64 = wp.array(dtype=wp.float64)
 
 @wp.struct
 class Solids:
-    """The bodies among the solids."""
+    """Indices and centers of mass of the rigid bodies, and the layout of the fields."""
 
     walls: Walls
     bodies: int
-    body: _I32  # of a wall's number; -1: it is none
+    body: _I32  # body of each wall number; -1 for a wall that is no body
     center: wp.array(dtype=wp.vec3d)  # of mass of each body [m]
-    low: wp.vec3i  # first (k, j, i) of what is stored of the problem's fields
-    rows: int  # of a plane of those
-    row: int  # their length
+    low: wp.vec3i  # first (k, j, i) of the stored fields of the problem
+    rows: int  # rows per plane of these fields
+    row: int  # length of a row of these fields
 
 
 @wp.func
 def body_on_face(S: Solids, axis: int, k: int, j: int, i: int):
-    """Return the body that covers a face, -1 if none does, and the share of the face that it covers."""
+    """Return the body that covers a face, -1 without one, and the covered share."""
     free, solid, part = moving_on(S.walls, axis, k, j, i)
     share = (wp.float64(1.0) - wp.float64(free)) * wp.float64(part)
     body = S.body[solid]
@@ -39,7 +39,7 @@ def body_on_face(S: Solids, axis: int, k: int, j: int, i: int):
 
 @wp.func
 def beside_a_wall(S: Solids, k: int, j: int, i: int):
-    """Return whether a face of a cell is not open."""
+    """Return whether a face of a cell is not fully open."""
     a = wp.min(
         wp.min(S.walls.open_x[k, j, i], S.walls.open_x[k, j, i + 1]),
         wp.min(S.walls.open_y[k, j, i], S.walls.open_y[k, j + 1, i]),
@@ -65,7 +65,10 @@ def side(S: Solids, n: int, k: int, j: int, i: int):
 
 @wp.func
 def next_body(S: Solids, last: int, k: int, j: int, i: int):
-    """Return the least body after `last` beside a cell; the number of bodies if there is none."""
+    """Return the next body number after `last` beside a cell.
+
+    Returns the number of bodies if there is no further one.
+    """
     least = int(S.bodies)
     for n in range(2 * (S.walls.planes + 1)):
         body, _share = side(S, n, k, j, i)
@@ -88,10 +91,11 @@ def enter_kernel(
     block: _I32,
     values: _F64,
 ):
-    """Count the pairs of a FLUID cell and a body beside it in a row, or with `values` write their entries.
+    """Count the entries of U in a row of cells, or write them if `values` is given.
 
-    An entry is what a cell's outflow gains by unit motions of a body, (vx, vy, wz) or (vx, vy, vz,
-    wx, wy, wz).
+    An entry belongs to a FLUID cell and a body beside it: the outflow of the cell due to unit
+    motions of the body, (vx, vy, wz) in 2-D or (vx, vy, vz, wx, wy, wz) in 3-D, see
+    `fluids.coupling`.
     """
     row = k * kind.shape[1] + j
     begin = int(0)
@@ -143,7 +147,11 @@ def enter_kernel(
 
 @forward_kernel(module="fluids.coupling")
 def offsets_kernel(first: int, counts: _I32, offsets: _I32, capacity: int, total: _I32):
-    """Add up counts exclusively from row `first` on, whose offset is known; `total`: what there is room for, and all; one thread."""
+    """Compute exclusive prefix sums of counts, from row `first` on.
+
+    The offset of row `first` is known. `total` gets the number of entries, limited by the capacity,
+    and the unlimited number. One thread.
+    """
     before = offsets[first]
     for row in range(first, counts.shape[0]):
         offsets[row] = before
@@ -154,6 +162,6 @@ def offsets_kernel(first: int, counts: _I32, offsets: _I32, capacity: int, total
 
 @cell_kernel("fluids.coupling")
 def enclosed_kernel(k, j, i, open: F32, solid: F32, known: I8, velocity: F32):
-    """Give closed faces that nothing has reached the velocity of the solid there [m/s]."""
+    """Set closed faces without extrapolated velocity to the solid's velocity [m/s]."""
     if known[k, j, i] <= wp.int8(0) and open[k, j, i] == 0.0:
         velocity[k, j, i] = solid[k, j, i]

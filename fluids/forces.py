@@ -1,4 +1,7 @@
-"""What a liquid does to each solid and to the domain's walls: forces and torques, a row a step of `forces.csv`."""
+"""Forces and torques of the liquid on solids and walls, one row per step.
+
+They are written to `forces.csv`.
+"""
 
 from __future__ import annotations
 
@@ -24,11 +27,11 @@ from warp_lcp.rows.program import LaunchGraph, clear
 if TYPE_CHECKING:
     from warp_lcp.fluids.simulator import LiquidSimulation
 
-SPARE = 1.5  # room for entries, times those there are when there is none left
+SPARE = 1.5  # factor on the number of entries when the buffer is enlarged
 
 
 def walls_of(grid: StaggeredGrid, boundary: Boundary) -> Any:
-    """Return the solids of a boundary as kernels take them, `wall_kernels.Walls`."""
+    """Return the solids of a boundary as the kernel struct `wall_kernels.Walls`."""
     S = Walls()
     S.planes, S.spacing, S.origin = grid.planes, grid.spacing, wp.vec3i(*grid.origin)
     if isinstance(boundary, CutBoundary):
@@ -52,16 +55,17 @@ def walls_of(grid: StaggeredGrid, boundary: Boundary) -> Any:
 
 
 class WallSums:
-    """Add up what kernels find on closed parts of faces, by solid; the same on every run, whatever the threads.
+    """Sum impulses on closed parts of faces by solid, in a deterministic order.
 
-    A kernel is launched twice, with a thread a row: to count its entries, and to write them. It
-    takes, behind the cells, `walls`, reference points, counts, offsets, owners and values (the last
-    three null when it counts) and what else is given.
+    The sums do not depend on the number of threads. A kernel is launched twice, with one thread per
+    row: to count its entries, and to write them. After the cells its arguments are `walls`,
+    reference points, counts, offsets, owners and values (the last three are null while it counts),
+    then further arguments.
 
     Args:
         grid: the grid.
         boundary: its solids.
-        solids: how many, the domain's walls among them.
+        solids: their number, including the domain's walls.
     """
 
     def __init__(self, grid: StaggeredGrid, boundary: Boundary, solids: int) -> None:
@@ -79,11 +83,14 @@ class WallSums:
     def take(
         self, kernel: wp.Kernel, window: Window, references: np.ndarray, given: Sequence[Any]
     ) -> np.ndarray:
-        """Return the sums of a kernel's entries, shape (solids, 6): impulses [N s] and, about `references`, their moments [N m s].
+        """Return the sums of a kernel's entries, shape (solids, 6).
+
+        The first three columns are impulses [N s], the others their moments about `references` [N m
+        s].
 
         Args:
-            kernel: what finds them.
-            window: cells that it visits.
+            kernel: the kernel that finds the entries.
+            window: cells that the kernel visits.
             references: a point of each solid [m], shape (solids, 3).
             given: further arguments.
         """
@@ -102,7 +109,7 @@ class WallSums:
         )
 
     def _count(self, kernel: wp.Kernel, window: Window, given: list[Any]) -> None:
-        """Launch the count of a kernel's entries, and find where those of each row begin."""
+        """Launch a kernel that counts entries, and compute the offsets of the rows."""
         clear(self._counts)
         window.launch_rows(
             kernel, [self.walls, self._about, self._counts, None, None, None, *given]
@@ -110,7 +117,7 @@ class WallSums:
         scan(self._counts, self._offsets, inclusive=False)
 
     def _write(self, kernel: wp.Kernel, window: Window, given: list[Any]) -> None:
-        """Launch what writes a kernel's entries."""
+        """Launch a kernel that writes its entries."""
         window.launch_rows(
             kernel,
             [
@@ -125,7 +132,7 @@ class WallSums:
         )
 
     def launch(self, kernel: wp.Kernel, window: Window, given: Sequence[Any]) -> None:
-        """Launch a kernel for what else it does; its entries are counted only."""
+        """Launch a kernel for its other effects; its entries are only counted."""
         window.launch_rows(kernel, [self.walls, None, self._counts, None, None, None, *given])
 
     def _reserve(self, count: int) -> None:
@@ -135,32 +142,34 @@ class WallSums:
 
 
 class SolidForces:
-    """Collect a step's impulses on each solid, whatever model finds them, and tell forces and torques.
+    """Sum each solid's impulses in a step, and return forces and torques.
 
-    The pressure of a cell acts on the parts of its faces that are closed, whose sum over a cell is
-    the vector area of the wall in it: what it pushes off the wall there is what it pushes the
-    liquid with, without loss, whether walls cut cells or fill them. It is continued from the cell's
-    center to the wall. Half a cell from a wall of whole cells, or the domain's, it takes what stops
-    the liquid in between: 1/2 rho dx^d (u* - u_s) on a closed face, of which u* is the velocity
-    before the projection, and a pool's floor so bears all of it. To solids that cut cells it goes
-    on by the pressure at rest's gradient; rigid bodies are told what the coupling gives them,
-    without that.
+    The pressure of a cell acts on the closed parts of its faces. Their sum over a cell is the
+    vector area of the wall in it, for cut and for whole cells, so that liquid and wall receive
+    exactly opposite impulses.
 
-    Divided by the time that forces act in a step impulses are forces at its beginning: what the
-    trapezoidal rule makes of a table's forces is the impulse. Where two solids touch within a cell
-    either may have what is buried between them; their sum is right.
+    The pressure is extrapolated from the cell's center to the wall. On walls of whole cells and of
+    the domain, half a cell away, it gains the impulse that stops the liquid in between: 1/2 rho
+    dx^d (u* - u_s) on a closed face, with u* the velocity before the projection. The floor of a
+    pool so carries the full weight. On solids that cut cells it is extrapolated with the
+    hydrostatic gradient. Rigid bodies get the impulses of the coupling, without this extrapolation.
 
-    A torque is about the solid's own point: a rigid body's center of mass; of another solid the
-    center of the box around it as the scene places it, which its motion takes along; the origin for
-    the domain, for half spaces, and for what is all but a shape.
+    Divided by the time that forces act in a step, impulses are forces at the beginning of the step:
+    the trapezoidal rule over the forces of a table gives the impulse. Where two solids touch within
+    a cell, either may have the part that is buried between them; their sum is right.
+
+    Torques are about a point of the solid: the center of mass of a rigid body; for another solid
+    the center of the box around it in the scene, moved with the solid; the origin for the domain,
+    for half spaces and for inverted shapes.
 
     Args:
-        solids: in the order of their numbers, 1 + s; the domain is number 0.
+        solids: in the order of their numbers, 1 + s; number 0 is the domain.
         dimension: 2 or 3.
 
     Attributes:
-        impulses: in the step so far [N s, N m s], shape (1 + solids, 6); in 2-D per meter of depth.
-        references: the solids' own points [m], shape (1 + solids, 3).
+        impulses: sums of the step so far [N s, N m s], shape (1 + solids, 6); in 2-D per meter of
+            depth.
+        references: reference points of the torques [m], shape (1 + solids, 3).
     """
 
     def __init__(self, solids: Sequence[PlacedSolid], dimension: int) -> None:
@@ -170,11 +179,15 @@ class SolidForces:
         )
         self.impulses, self.references = np.zeros((1 + len(solids), 6)), self._centers
         self._kick = [Scalar() for _ in range(3)]
-        # whether each solid is a rigid body, once the device is known
+        # Flags of rigid bodies among the solids; allocated when the device is known.
         self._bodies: wp.array | None = None
 
     def columns(self) -> tuple[str, ...]:
-        """Return `domain_fx`, `solid0_fx` and so on, [N], and `domain_tx` and so on, [N m]; 2-D: _fx, _fy [N/m], _torque [N]."""
+        """Return the column names of forces [N] and torques [N m].
+
+        In 3-D `domain_fx`, `solid0_fx` and so on [N], and `domain_tx` and so on [N m]; in 2-D _fx
+        and _fy [N/m] and _torque [N].
+        """
         parts = (
             ("fx", "fy", "torque") if self._dimension == 2 else ("fx", "fy", "fz", "tx", "ty", "tz")
         )
@@ -185,7 +198,7 @@ class SolidForces:
         )
 
     def begin(self, time: float) -> None:
-        """Begin a step at a time [s], before models add to it and solids move."""
+        """Begin a step at a time [s], before models add impulses and solids move."""
         self.impulses, self.references = np.zeros_like(self.impulses), self._centers.copy()
         for number, solid in enumerate(self._solids, start=1):
             if isinstance(solid.motion, BodyMotion):
@@ -196,11 +209,17 @@ class SolidForces:
                 )[0]
 
     def add(self, impulses: np.ndarray) -> None:
-        """Add what a model's traction has given each solid in the step, [N s, N m s] about `references`, shape (1 + solids, 6)."""
+        """Add the impulses of a model's traction on each solid in the step.
+
+        Shape (1 + solids, 6), [N s] and [N m s] about `references`.
+        """
         self.impulses += impulses
 
     def add_pressure(self, sums: WallSums, window: Window, simulation: LiquidSimulation) -> None:
-        """Add what a step's pressure has given; the velocity of closed faces must be that before the projection still."""
+        """Add the impulses of a step's pressure.
+
+        Closed faces must still have their velocity before the projection.
+        """
         velocity, projection, scale = (
             simulation.velocity,
             simulation.projection,
@@ -209,7 +228,7 @@ class SolidForces:
         if self._bodies is None:
             bodies = [False, *(isinstance(s.motion, BodyMotion) for s in self._solids)]
             self._bodies = wp.array(bodies, dtype=wp.uint8, device=sums.grid.device)
-        given = [
+        kernel_args = [
             self._bodies,
             simulation.boundary.touch,
             projection.pressure,
@@ -219,24 +238,30 @@ class SolidForces:
             number.value = float(change)
         self.add(
             sums.take(
-                kernels.pressure_kernel, window, self.references, [*given, *self._kick, scale]
+                kernels.pressure_kernel, window, self.references, [*kernel_args, *self._kick, scale]
             )
         )
 
     @staticmethod
     def push(bodies: RigidBodies, impulses: np.ndarray) -> None:
-        """Give rigid bodies impulses that they have not got otherwise, of the shape of `impulses`."""
+        """Apply impulses to the rigid bodies that no other model applies.
+
+        The shape is that of `impulses`.
+        """
         six = impulses[bodies.numbers]
         bodies.bodies.apply_impulses(six if bodies.dimension == 3 else six[:, PLANAR])
 
     def row(self, kick_dt: float) -> Row:
-        """Return forces and torques of the step, in which forces acted for `kick_dt` [s]."""
+        """Return forces and torques of a step in which forces acted for `kick_dt` [s]."""
         shown = self.impulses if self._dimension == 3 else self.impulses[:, PLANAR]
         return dict(zip(self.columns(), (shown / kick_dt).ravel().tolist(), strict=True))
 
 
 def _center(geometry: Geometry, dimension: int) -> np.ndarray:
-    """Return the center of the box around a shape [m], the origin if there is none, shape (3,)."""
+    """Return the center of the box around a shape [m], shape (3,).
+
+    The origin if the shape has no finite box.
+    """
     bounds, center = geometry.bounds(), np.zeros(3)
     if bounds is not None and np.isfinite(bounds[:, :dimension]).all():
         center[:dimension] = bounds[:, :dimension].mean(axis=0)

@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Kernels that find what the pressure does to solids."""
+"""Kernel for the impulses of the pressure on solids."""
 
 import warp as wp
 
@@ -39,10 +39,11 @@ def pressure_kernel(
     kick_z: float,
     scale: wp.float64,
 ):
-    """Count the closed parts of faces that pressure acts on in a row, or with `values` write its impulses on them: `scale` x a share.
+    """Count the closed face parts of a row under pressure, or write the impulses.
 
-    x is continued from a cell's center to the wall, see `warp_lcp.fluids.forces`; the kick [m/s] is
-    what gravity adds to velocities.
+    Impulses are written if `values` is given. An impulse is `scale` times the share of the face
+    times x, extrapolated from the cell's center to the wall, see `fluids.forces`. The kick [m/s] is
+    the velocity change by gravity.
     """
     row = k * x.shape[1] + j
     begin = int(0)
@@ -80,7 +81,8 @@ def pressure_kernel(
                             if S.number_x:
                                 share *= reach_across(S, axis, k, j, i)
                                 crossed, below, above = crossing_on(S, axis, c, b, a)
-                                if crossed > 0:  # at rest's gradient to where the solid is
+                                # Extrapolate with the hydrostatic gradient to the solid.
+                                if crossed > 0:
                                     gap = wp.where(high == 1, below, above)
                                     more = float(side) * gap * wp.vec3(kick_x, kick_y, kick_z)[axis]
                             force = wp.vec3d()

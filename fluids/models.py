@@ -1,4 +1,4 @@
-"""Models of a liquid: surface, pressure, surface tension, viscosity, your own."""
+"""Models of a liquid: surface, pressure, surface tension, viscosity, user models."""
 
 from __future__ import annotations
 
@@ -26,43 +26,45 @@ if TYPE_CHECKING:
 
 
 class LiquidModel(Protocol):
-    """A model of your own in the step of a liquid, such as a force.
+    """User-defined model in the step of a liquid, such as a force.
 
-    `LiquidSimulation` takes it among its `models`.
+    It is passed to `LiquidSimulation` in `models`. It acts on all of the liquid: with such models,
+    the momentum corrections of airborne material are off, which assume gravity alone.
 
-    It acts on all of the liquid: with such models the corrections of bodies in flight, which know
-    of gravity alone, are off.
-
-    Written once, it runs in one process and on ranks: `liquid.grid.part` says which cells are this
-    process's, fills ghost cells and adds up over all. Every rank enters `act` in every step.
+    The same code runs in one process and on MPI ranks: `liquid.grid.part` tells which cells belong
+    to this process, fills ghost cells and sums over all ranks. Every rank calls `act` in every
+    step.
 
     Attributes:
-        columns: of the log, that `act` fills.
+        columns: log columns that `act` fills.
     """
 
     columns: tuple[str, ...]
 
     def allocate(self, liquid: LiquidSimulation) -> None:
-        """Allocate arrays on `liquid.grid`; again when the grid has changed."""
+        """Allocate arrays on `liquid.grid`.
+
+        Called again whenever the grid has changed.
+        """
 
     def act(self, liquid: LiquidSimulation, window: Window, dt: float) -> Row:
         """Change `liquid.velocity`, after gravity, before viscosity; collective.
 
         Args:
-            liquid: whose faces in liquid are known, `liquid.projection.known`; forces act for
-                `liquid.kick_dt` [s].
+            liquid: the simulation. Faces in liquid are marked in `liquid.projection.known`; forces
+                act for `liquid.kick_dt` [s].
             window: cells that the liquid can touch in the step.
             dt: time step [s].
 
         Returns:
-            What the log has in `columns`, the same on all ranks.
+            The values of `columns`, the same on all ranks.
 
         Raises:
             StepFailed: a smaller dt may be tried; on all ranks.
         """
 
 
-VISCOUS_TOLERANCE = 1e-4  # where the pressure's comes from the time step
+VISCOUS_TOLERANCE = 1e-4  # used where the pressure's tolerance is derived from the time step
 
 
 def make_surface(
@@ -76,7 +78,8 @@ def make_surface(
         boundary: its solids.
         fill: adds the density of liquid without particles, such as below a narrow band.
     """
-    if scene.stays_full and not boundary.velocity:  # walls that a caller moves might make room
+    # Walls that a caller moves could make room.
+    if scene.stays_full and not boundary.velocity:
         return NoSurface(grid, boundary)
     count = scene.particles.per_axis**grid.dimension
     if scene.pressure.surface == "ghost-fluid":
@@ -91,15 +94,15 @@ def make_tension(
     scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, surface: FreeSurface
 ) -> SurfaceTension | None:
     """Return the surface tension of a scene, or None without tension or surface."""
-    given = scene.surface_tension
-    if given is None or surface.phi is None:
+    settings = scene.surface_tension
+    if settings is None or surface.phi is None:
         return None
-    angle, density = given.contact_angle, scene.physics.density
+    angle, density = settings.contact_angle, scene.physics.density
     return SurfaceTension(
         grid,
         boundary,
         surface.phi,
-        coefficient=given.coefficient,
+        coefficient=settings.coefficient,
         contact_angle=angle,
         density=density,
     )
@@ -120,8 +123,8 @@ def make_pressure(
         grid: its grid.
         boundary: its solids.
         surface: the free surface.
-        weights: of the particles on the faces of each component.
-        bodies: rigid bodies among the solids; None: there are none.
+        weights: particle weights on the faces of each component.
+        bodies: rigid bodies among the solids; None without any.
     """
     solver, coupling = (
         wl.default_chain(wl.METHODS[scene.solver.method](precision=scene.solver.precision)),
@@ -169,14 +172,14 @@ def make_viscosity(
     if scene.viscosity is None:
         return None
     tolerance = scene.solver.tolerance if scene.solver.tolerance != "auto" else VISCOUS_TOLERANCE
-    kept = scene.kept([*scene.liquid, *scene.source])
+    relative = scene.kept([*scene.liquid, *scene.source])
     return Viscosity(
         grid,
         boundary,
         viscosity=scene.viscosity.value,
         density=scene.physics.density,
         slip_lengths=scene.slip_lengths,
-        thickest=None if kept is None else max(*kept, 1.0),
+        thickest=None if relative is None else max(*relative, 1.0),
         phi=surface.phi,
         tolerance=tolerance,
         sources=bool(scene.source),

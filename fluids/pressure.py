@@ -43,7 +43,7 @@ CONSTANTS = {
     "RELEASED": RELEASED,
     "HELD": HELD,
 }
-THETA_MIN = 1e-3  # the nearest that air comes to a FLUID cell's center, in cells
+THETA_MIN = 1e-3  # least distance of the air from the center of a FLUID cell [cells]
 KERNELS = KernelFile(Path(__file__).parent / "headers/pressure.h", CONSTANTS)
 COUNT = KERNELS["fluids.pressure.count_fluid"]
 
@@ -82,11 +82,11 @@ def pressure_passes(cut: bool, moving: bool, ghost: bool, bounded: bool = True) 
     )
 
 
-FACES = "face_x", "face_y", "face_z"  # of an operator
-# of an outflow, relative to the speeds it is the difference of (float32 faces)
+FACES = "face_x", "face_y", "face_z"  # names of the operator's face fields
+# Rounding error of an outflow, relative to the speeds that it is the difference of (float32).
 ROUNDING = 4 * float(np.finfo(np.float32).eps)
-# a wall cell lets go if its outflow exceeds this multiple of the accepted residual: resting
-# ceilings are degenerate
+# A wall cell is RELEASED if its outflow exceeds this multiple of the accepted residual. Resting
+# liquid at a ceiling is degenerate: x and y are both close to 0.
 RELEASE_FACTOR = 10.0
 
 
@@ -95,8 +95,9 @@ class Projection:
     """Result of a pressure projection.
 
     Attributes:
-        result: of the solve; `result.x` is kick_dt p / (rho dx) [m/s]. None: no cell holds liquid.
-        unknowns: FLUID cells.
+        result: result of the solve; `result.x` is kick_dt p / (rho dx) [m/s]. None without liquid
+            cells.
+        unknowns: number of FLUID cells.
         found: returns `released` and `max_outflow`, and waits for the device.
     """
 
@@ -124,17 +125,17 @@ class Projection:
 
 @dataclass(frozen=True, slots=True)
 class LiquidBoundary:
-    """Cells of the liquid, its surface and the walls, for the pressure's kernels.
+    """Cell kinds, free surface and walls, as a struct for the pressure kernels.
 
     Attributes:
         kind: int8 of AIR, FLUID, SOLID.
-        phi: level set of the surface [cells], float32; None: the surface lies at the faces of FLUID
-            cells.
-        planes: nodes along z that a tent function spans: 1 in 2-D, 2 in 3-D.
-        open_x: open fractions of the faces along x, float32; None: walls are whole cells.
+        phi: level set of the surface [cells], float32; None if the surface lies at the faces of
+            FLUID cells.
+        planes: nodes along z within the support of a tent function: 1 in 2-D, 2 in 3-D.
+        open_x: open fractions of the faces along x, float32; None if walls are whole cells.
         open_y: likewise along y.
         open_z: likewise along z; None in 2-D.
-        solid_x: velocity of solids along x on the faces [m/s], float32; None: they rest.
+        solid_x: velocity of solids along x on the faces [m/s], float32; None if they rest.
         solid_y: likewise along y.
         solid_z: likewise along z; None in 2-D.
     """
@@ -153,54 +154,58 @@ class LiquidBoundary:
 class PressureProjection:
     """Pressure solve and projection of the velocity.
 
-    With x = kick_dt p / (rho dx) [m/s] on FLUID cells, s_f = +-1 outward, a_f the open fraction of
-    a face, u_s the solid's velocity and theta_f the distance to the free surface in cells where air
-    is beyond the face, else 1 [Batty, Bertails & Bridson 2007],
+    The unknowns are x = kick_dt p / (rho dx) [m/s] on FLUID cells. Let s_f = +-1 outward, a_f the
+    open fraction of a face, u_s the solid's velocity, and theta_f the distance to the free surface
+    in cells if air is beyond the face, else 1. Then [Batty, Bertails & Bridson 2007]
 
-        y_i = b_i + sum over faces of (a_f / theta_f) (x_i - x_neighbor),   b_i = sum of s_f [a_f u*_f + (1 - a_f) u_s,f],   x = 0 in AIR,
+        y_i = b_i + sum over faces of (a_f / theta_f) (x_i - x_neighbor),
+        b_i = sum of s_f [a_f u*_f + (1 - a_f) u_s,f],   x = 0 in AIR,
 
     is the net outflow after u = u* - (x_right - x_left) / theta. FLUID cells with a face that is
-    not open on a separating wall have 0 <= x complementary to y >= 0, the others y = 0. Liquid that
-    wets the wall has -kick_dt `adhesion` in the place of 0, and its `jump` beside a surface with a
-    stronger pull: air then cannot enter between liquid and wall. Whole cells have a = 0 or 1, a
-    surface on the cells' faces theta = 1: without solids that cut cells the matrix keeps unit
-    weights, and the surface adds a_f (1 / theta_f - 1) to the diagonal. Beyond an open side of the
-    domain lies AIR outside of the operator: its faces add a_f / theta_f.
+    not fully open on a separating wall have 0 <= x complementary to y >= 0, the others y = 0. For
+    liquid that wets the wall the bound is -kick_dt `adhesion` instead of 0, or its `jump` beside a
+    surface with a stronger pull: then air cannot enter between liquid and wall.
 
-    Material in AIR cells has no pressure; where the velocity is continued into air, it takes that
-    of liquid beside it. With `weights`, for short steps, it rests on the surface instead: a face
-    there that particles gave weight takes the mean change of the projected faces around it, but no
-    more than gravity gave it, nor than brings it to their mean velocity. To take that velocity
-    itself, in every step however short, would drag spray along with whatever passes it: at CFL 1/8
-    that raised the energy of liquid poured over a mesh without bound, and so did changes beyond
-    gravity's at CFL 1/16.
+    Whole cells have a = 0 or 1; a surface on the cells' faces has theta = 1. Without solids that
+    cut cells the matrix has unit weights, and the surface adds a_f (1 / theta_f - 1) to the
+    diagonal. Beyond an open side of the domain lies AIR outside of the operator: its faces add a_f
+    / theta_f.
+
+    Material in AIR cells has no pressure. Where the velocity is extrapolated into air, it takes
+    that of the liquid beside it. With `weights`, for short steps, it rests on the surface instead:
+    a face there with particle weight takes the mean change of the projected faces around it, but at
+    most the change by gravity, and at most the change to their mean velocity.
+
+    The mean velocity itself, taken in every step however short, would let spray be dragged along by
+    liquid that passes it: at CFL 1/8 this increased the energy of liquid poured over a mesh without
+    bound. Changes beyond that by gravity did the same at CFL 1/16.
 
     Args:
         grid: the grid.
         boundary: solids and walls.
         solver: settings of the method, for example `wl.MinimumMapNewton()`.
-        tolerance: relative residual at which a solve is done; "auto": see `fluids.tolerance`.
-        max_iterations: of the method a solve may take.
+        tolerance: relative residual at which a solve ends; "auto": see `fluids.tolerance`.
+        max_iterations: limit of the method's iterations in a solve.
         phi: float32 distance to the free surface at cell centers [cells], < 0 exactly in FLUID
-            cells; None: it lies on the cells' faces.
-        coupling: coupling with rigid bodies, whose term is added to A; None: there are none.
+            cells; None if it lies on the cells' faces.
+        coupling: coupling with rigid bodies, whose term is added to A; None without bodies.
         lets_go: whether a wall is separating; else y = 0 on all cells, and no bounds are stored.
-        weights: of the particles on the faces of each component; None: no support of spray by the
-            surface.
+        weights: particle weights on the faces of each component; None without support of spray by
+            the surface.
         gravity: magnitude of gravity [m/s^2], the limit of that support.
 
     Attributes:
-        kind: int8 of AIR, FLUID, SOLID, which the caller marks.
-        cells: `kind` of the last projection, which pressure and contact belong to; as first marked
-            before it.
+        kind: int8 of AIR, FLUID, SOLID, marked by the caller.
+        cells: `kind` of the last projection, to which pressure and contact belong; before the first
+            projection, as first marked.
         pressure: last accepted x [m/s], float64.
         contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED.
         known: int8, one field per component: faces that the last projection made valid, see
             `warp_lcp.grid.extrapolate`.
-        jump: of the pressure across the surface [m/s] in cells beside it, float32, set by the
-            surface tension; None: there is none.
-        adhesion: pressure below that of the air at which liquid detaches from a wall, over rho dx
-            [m/s^2].
+        jump: jump of the pressure across the surface [m/s] in cells beside it, float32, set by the
+            surface tension; None without surface tension.
+        adhesion: suction (pressure below that of the air) at which liquid detaches from a wall,
+            divided by rho dx [m/s^2].
         automatic: automatic tolerance, or None.
     """
 
@@ -240,7 +245,7 @@ class PressureProjection:
         self.pressure, self.known = grid.field(wp.float64), grid.faces(wp.int8)
         wp.copy(self.kind, boundary.base)
         self.show()
-        self._unknown = self.kind  # FLUID where there is an unknown
+        self._unknown = self.kind  # FLUID at unknowns
         self._b, self._start = (grid.field(wp.float64) for _ in range(2))
         self._lower = (
             wp.full(grid.shape, -np.inf, dtype=wp.float64, device=grid.device) if lets_go else None
@@ -253,7 +258,7 @@ class PressureProjection:
             WindowTally(COUNT, grid),
             WindowTally(self._passes.contact, grid),
         )
-        # those that are solved for
+        # Cells of the unknowns.
         self._trail, self._cells = DirtyRegion(grid.domain), ActiveWindow(grid.domain)
         self._cells.move_to(part.owned)
         self._rhs, self._guess = part.box_like(self._b), part.box_like(self._start).flatten()
@@ -272,11 +277,11 @@ class PressureProjection:
         launches = self._launch_projection, self._copy_cells, self._copy_faces
         graphs = (LaunchGraph(grid.device, f, at_once=part.at_once) for f in launches)
         self._projection, self._copying, self._copying_faces = graphs
-        # unknowns of all processes in this step, once they are asked for
+        # Number of unknowns on all ranks in this step; None until `counted` is called.
         self._everyone: int | None = None
-        # built when there is liquid: an empty problem is refused
+        # Built when there is liquid, since an LCP cannot be empty.
         self._problem: wl.LCP | None = None
-        # how long forces acted in the last projection and act in this one [s]; by that
+        # Times that forces acted in the last projection and act in this one [s], and their ratio.
         self._last = self._kick = self._ratio = 0.0
 
     def show(self) -> None:
@@ -286,17 +291,16 @@ class PressureProjection:
     def prepare(
         self, velocity: Sequence[wp.array], dt: float, kick_dt: float, window: Window | None = None
     ) -> bool:
-        """Set up the problem of the marked cells; return whether there is one.
+        """Set up the problem of the marked cells; return whether it has cells.
 
-        The first guess is the last pressure.
-
-        It may have no unknowns: `counted` returns their number and waits for the device.
+        The first guess is the last pressure. The problem may have no unknowns: `counted` returns
+        their number and waits for the device.
 
         Args:
             velocity: u* of each component [m/s].
             dt: time step [s].
-            kick_dt: how long forces have acted on u* [s].
-            window: cells that hold all FLUID cells; None: all cells.
+            kick_dt: time that forces have acted on u* [s].
+            window: cells that hold all FLUID cells; None for all cells.
         """
         self._look(window)
         self._everyone = None
@@ -313,7 +317,7 @@ class PressureProjection:
         return True
 
     def _launch_preparation(self, velocity: Sequence[wp.array]) -> None:
-        """Launch the set-up of b, the lower bound, the first guess and the shift of the diagonal."""
+        """Launch the set-up of b, lower bound, first guess and shift of the diagonal."""
         self._cells.run(
             self._passes.prepare,
             self._faces,
@@ -330,7 +334,10 @@ class PressureProjection:
         )
 
     def _look(self, window: Window | None) -> None:
-        """Solve for the cells of a window, and undo what is left of the last one; ranks solve for all of their cells."""
+        """Restrict the problem to the cells of a window, and clear those of the last one.
+
+        On ranks the problem has all cells.
+        """
         part = self.grid.part
         self._cells.move_to(part.owned if part.shared else self._trail.through(window))
 
@@ -343,10 +350,18 @@ class PressureProjection:
         return Projection(None, 0, lambda: (0.0, 0.0))
 
     def _begin(self, kick_dt: float) -> None:
-        """Note how long forces act: what pressures were as impulses in the last projection they are now by the ratio of these times."""
+        """Store the time that forces act, and its ratio to that of the last projection.
+
+        The ratio converts pressures stored as impulses of the last projection.
+        """
         self._kick, self._ratio = kick_dt, kick_dt / self._last if self._last > 0.0 else 0.0
 
     def _make_problem(self) -> None:
+        """Create the LCP on the boxes of this rank, and the solver's workspace.
+
+        In one process the problem uses the fields of the grid directly. On ranks it has copies,
+        without ghost layers.
+        """
         part, least, opened = self.grid.part, self._least, self.boundary.open
         fields = [self._unknown, least if isinstance(least, wp.array) else None, self._shift]
         kind, lower, shift = boxes = [
@@ -377,7 +392,7 @@ class PressureProjection:
         return self._operator if self.coupling is None else self.coupling.join(self._operator)
 
     def _update(self) -> None:
-        """Take the cells, and where bodies meet them."""
+        """Update cells and coupling entries."""
         self._copying.run()
         if self.boundary.moves:
             self._copying_faces.run()
@@ -397,12 +412,12 @@ class PressureProjection:
         )
 
     def _copy_cells(self) -> None:
-        """Give a rank's problem what the fields of its part hold."""
+        """Copy the part's fields into the problem of a rank."""
         for field, box in self._copied:
             self.grid.part.copy_to_box(field, box)
 
     def _copy_faces(self) -> None:
-        """Give it the faces' open fractions."""
+        """Copy the open fractions of the faces into the problem of a rank."""
         for field, box in self._copied_faces:
             self.grid.part.copy_to_box(field, box)
 
@@ -413,7 +428,7 @@ class PressureProjection:
             speed: scale of u* [m/s].
 
         Returns:
-            The result and the criteria it was held to.
+            The result and its stopping criteria.
         """
         mean = self._criteria(speed)
         assert self._problem is not None, "prepare comes first"
@@ -432,15 +447,15 @@ class PressureProjection:
         return result, criteria
 
     def push_bodies(self, result: wl.SolveResult) -> None:
-        """Apply the impulses of a pressure solution to the bodies, if there are any."""
+        """Apply the impulses of a pressure solution to the bodies, if any."""
         if self.coupling is not None:
             self.coupling.push(result.x)
 
     def _criteria(self, speed: float) -> MeanCriteria:
-        """Return when a solve is done.
+        """Return the stopping criteria of a solve.
 
-        The absolute tolerance is the rounding noise of b, so that a liquid at rest or in free fall
-        is not iterated on it.
+        The absolute tolerance is the rounding noise of b, so that no iterations are spent on it for
+        a liquid at rest or in free fall.
 
         Args:
             speed: scale of u* [m/s].
@@ -491,17 +506,17 @@ class PressureProjection:
         """Apply a solution: subtract the gradient, mark valid faces and released cells.
 
         Args:
-            velocity: u* of each component [m/s] (updated on open faces that touch FLUID, and on
-                those with weight beside them).
+            velocity: u* of each component [m/s] (updated on open faces of FLUID cells, and on faces
+                with particle weight beside them).
             window: cells that hold all FLUID cells, with one to spare on each side.
-            result: of `solve`.
-            criteria: of `solve`.
+            result: the result of `solve`.
+            criteria: the criteria of `solve`.
         """
         unknowns = self.counted()
         reference = (
             result.residual / result.relative_residual if result.relative_residual > 0.0 else 0.0
         )
-        # the criteria bound a 2-norm; what a cell may carry of it is the root mean square
+        # The criteria bound a 2-norm; the share of one cell is the root mean square.
         threshold = RELEASE_FACTOR * criteria.tolerance(reference) / max(unknowns, 1) ** 0.5
         self._threshold.value = threshold
         self._last = self._kick
@@ -512,7 +527,7 @@ class PressureProjection:
         return Projection(result, unknowns, self._found)
 
     def _launch_projection(self, velocity: Sequence[wp.array], window: Window, x: wp.array) -> None:
-        """Launch the projection: the gradient, the support of spray, the contact of wall cells."""
+        """Launch the projection: gradient, support of spray, contact of wall cells."""
         self._accept(x)
         for axis, field in enumerate(velocity):
             window.clear(self.known[axis])
@@ -593,7 +608,10 @@ class PressureProjection:
         return self.pressure.numpy() * scale
 
     def _support(self, velocity: Sequence[wp.array], window: Window) -> None:
-        """Let the pressure act on what rests on the surface; its faces become known after the projected ones, also those of others."""
+        """Apply the pressure to material that rests on the surface.
+
+        Its faces become known after the projected ones, on all ranks.
+        """
         self.grid.part.fill(*velocity, *self.known)
         for axis, (field, weight, known) in enumerate(
             zip(velocity, self._weights, self.known, strict=False)
@@ -611,20 +629,23 @@ class PressureProjection:
             )
 
     def _accept(self, x: wp.array) -> None:
-        """Take the solution of the problem, and show its cells."""
+        """Store the solution of the problem, and show its cells in frames."""
         self._take(x)
         copy(self.cells, self.kind)
 
     def _take(self, x: wp.array) -> None:
-        """Take the solution of the problem as the pressure."""
+        """Store the solution of the problem as the pressure."""
         self.grid.part.store(x, self.pressure, self._guess)
 
     def _found(self) -> tuple[float, float]:
-        """Return how many cells the last projection released, and the largest outflow of the others; collective."""
+        """Return the number of released cells and the largest outflow of the others.
+
+        They belong to the last projection; collective.
+        """
         every = self.grid.part.ranks.gather(np.array(self._found_here()))
         return float(every[:, 0].sum()), float(every[:, 1].max())
 
     def _found_here(self) -> tuple[float, float]:
-        """Return the same of this process's cells."""
+        """Return the result of `_found` for the cells of this process."""
         released, worst = self._contacts.read()
         return released, worst

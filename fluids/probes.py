@@ -1,4 +1,7 @@
-"""Probes: pressure, velocity and the surface's height at points of the scene, a row a step of `probes.csv`."""
+"""Probes: pressure, velocity and surface height at points, one row per step.
+
+They are written to `probes.csv`.
+"""
 
 import math
 import typing
@@ -20,11 +23,11 @@ if typing.TYPE_CHECKING:
     from warp_lcp.fluids.simulator import LiquidSimulation
 
 _FLUID, _SOLID = wp.constant(wp.int8(FLUID)), wp.constant(wp.int8(SOLID))
-STEP = wp.constant(0.25)  # cells between two looks for the surface
-# of a probe: pressure over density, velocity, level, and whether that is where the search ended, in
-# liquid
+STEP = wp.constant(0.25)  # step of the search for the surface [cells]
+# Values per probe: pressure over density, velocity (3), level, and whether the search has ended in
+# liquid.
 VALUES = 6
-FAR = 1e9  # cells: farther than any grid
+FAR = 1e9  # larger than any grid [cells]
 
 options: dict[str, typing.Any] = {"module": "fluids.probes"}
 
@@ -32,7 +35,10 @@ options: dict[str, typing.Any] = {"module": "fluids.probes"}
 @wp.func
 @typing.no_type_check
 def corner(x: wp.vec3, n: int, planes: int, shape: wp.vec3i):
-    """Return corner n of the cube of cell centers around array coordinates, and its share in trilinear interpolation."""
+    """Return corner n of the cube of cell centers around a point, and its weight.
+
+    The point is in array coordinates; the weight is that of trilinear interpolation.
+    """
     high = wp.vec3i(n & 1, (n >> 1) & 1, n >> 2)
     at = wp.vec3i(0, 0, 1)
     share = float(1.0)
@@ -47,7 +53,11 @@ def corner(x: wp.vec3, n: int, planes: int, shape: wp.vec3i):
 @wp.func
 @typing.no_type_check
 def depth_of(x: wp.vec3, planes: int, shape: wp.vec3i, kind: I8, phi: F32):
-    """Return how deep array coordinates lie below the free surface, by cells that are not SOLID, and the share of those."""
+    """Return the depth of a point below the free surface, and the open weight.
+
+    The depth is interpolated from the cells that are not SOLID. The second value is the sum of
+    their interpolation weights.
+    """
     deep = float(0.0)
     total = float(0.0)
     for n in range(4 * planes):
@@ -81,11 +91,12 @@ def probe_kernel(
     reach: wp.array(dtype=wp.vec2),
     values: wp.array2d(dtype=wp.float64),
 ):
-    """Find x [m/s], velocity [m/s] and level [cells] at points in array coordinates, in which cell i reaches from i to i + 1.
+    """Find x [m/s], velocity [m/s] and level [cells] at points.
 
-    The kick [m/s] is what gravity adds to x from a cell to the next along each axis, `up` points
-    against it and has length 1. The surface is looked for between two distances from the point,
-    `reach` [cells].
+    Points are in array coordinates, in which cell i reaches from i to i + 1. The kick [m/s] is the
+    change of x by gravity from a cell to the next along each axis. `up` is the unit vector against
+    gravity. The search for the surface covers distances between the two values of `reach` [cells]
+    from the point.
     """
     t = wp.tid()
     kick = wp.vec3(kick_x, kick_y, kick_z)
@@ -106,7 +117,7 @@ def probe_kernel(
         for n in range(1, 4):
             values[t, n] = wp.float64(wp.nan)
     if wet:
-        found = wp.float64(0.0)
+        pressure = wp.float64(0.0)
         total = float(0.0)
         for n in range(4 * planes):
             at, share = corner(c, n, planes, shape)
@@ -115,16 +126,16 @@ def probe_kernel(
                 rise = float(0.0)
                 for axis in range(planes + 1):
                     rise += kick[axis] * off[axis]
-                found += wp.float64(share) * (x[at[2], at[1], at[0]] + wp.float64(rise))
+                pressure += wp.float64(share) * (x[at[2], at[1], at[0]] + wp.float64(rise))
                 total += share
         if total > 0.0:
-            values[t, 0] = found / wp.float64(total)
+            values[t, 0] = pressure / wp.float64(total)
         values[t, 1] = wp.float64(interpolated(u, planes, p[0], c[1], c[2]))
         values[t, 2] = wp.float64(interpolated(v, planes, c[0], p[1], c[2]))
         if planes == 2:
             values[t, 3] = wp.float64(interpolated(w, planes, c[0], c[1], p[2]))
     if reach[t][0] < reach[t][1]:
-        room = reach[t][1]  # or to the grid's end
+        room = reach[t][1]  # limited by the grid's end below
         for axis in range(planes + 1):
             if up[axis] != 0.0:
                 end = wp.where(up[axis] > 0.0, float(counts[axis]) + 1.0, 1.0)
@@ -149,35 +160,39 @@ def probe_kernel(
 
 
 class Probes:
-    """Measure at points that stay where they are; `row` is collective.
+    """Measure pressure, velocity and level at fixed points; `row` is collective.
 
-    Pressure is interpolated trilinearly from the liquid's cells; air and solids among the eight
-    around a point are left out, and what the others have is continued to the point by the pressure
-    at rest's gradient rho g. Velocity is trilinear on each component's faces. Where the point's
-    cell holds no liquid pressure is 0 and velocity has no value. The level is the way from the
-    point against gravity to the first surface above it, or to the solid or the domain's end that
-    comes before; 0 if the point is not in liquid.
+    Pressure is interpolated trilinearly from the liquid's cells. Of the eight cells around a point,
+    air and solids are left out, and the pressure of the others is extrapolated to the point with
+    the hydrostatic gradient rho g. Velocity is interpolated trilinearly from the faces of each
+    component. Where the point's cell holds no liquid, pressure is 0 and velocity is empty.
+
+    The level is the distance from the point against gravity to the first surface above it, or to a
+    solid or the domain's end before that; 0 if the point is not in liquid.
 
     Args:
-        probes: of the scene.
+        probes: the probes of the scene.
         gravity: [m/s^2], shape (3,).
         grid: the grid.
     """
 
     def __init__(self, probes: Sequence[Probe], gravity: np.ndarray, grid: StaggeredGrid) -> None:
         self.probes, self.gravity, self.dimension = tuple(probes), gravity, grid.dimension
-        size = math.hypot(*gravity)  # not 0 where the squares are
+        size = math.hypot(*gravity)  # hypot does not underflow where the squares do
         self._up = -gravity / size if size > 0.0 else np.zeros(3)
         self._points = np.array([[*probe.position, 0.0][:3] for probe in probes])
-        self._grid: StaggeredGrid | None = None  # that has been measured on
+        self._grid: StaggeredGrid | None = None  # grid of the last measurement
         self._kick = [Scalar() for _ in range(3)]
 
     def columns(self) -> tuple[str, ...]:
-        """Return the names of the columns: NAME_pressure [Pa], NAME_level [m], NAME_vx, NAME_vy and in 3-D NAME_vz [m/s]."""
+        """Return the column names of all probes.
+
+        NAME_pressure [Pa], NAME_level [m], NAME_vx, NAME_vy and in 3-D NAME_vz [m/s].
+        """
         return tuple(column for probe in self.probes for column in probe.columns(self.dimension))
 
     def row(self, simulation: "LiquidSimulation") -> Row:
-        """Return what a step has found, before anything moves."""
+        """Return the values of a step, before anything moves."""
         found, scale = (
             self._measure(simulation),
             simulation.scene.physics.density * simulation.grid.spacing / simulation.kick_dt,
@@ -195,8 +210,11 @@ class Probes:
         return row
 
     def _reach(self, grid: StaggeredGrid) -> np.ndarray:
-        """Return between which distances from each probe the surface is looked for [cells], shape (probes, 2); 0 and 0: nowhere."""
-        # no direction is up, and no probe asks for a level: nothing would end the search
+        """Return the distances between which the surface is searched, shape (probes, 2).
+
+        In cells; 0 and 0 if there is no search.
+        """
+        # Without gravity no direction is up and no probe has a level: the search would not end.
         if not self._up.any():
             return np.zeros((len(self.probes), 2))
         if grid.part.shared:
@@ -210,7 +228,10 @@ class Probes:
         return np.where(inside, [0.0, FAR], 0.0)
 
     def _ways_through(self, grid: StaggeredGrid) -> np.ndarray:
-        """Return between which distances the way up from each probe leads through this rank's box, by whole steps of the search."""
+        """Return the distances at which the search passes through this rank's box.
+
+        Shape (probes, 2), in whole steps of the search [cells].
+        """
         axes = slice(grid.dimension)
         start, up = grid.to_grid(self._points)[:, axes], self._up[axes]
         first_cell, window = np.array(grid.part.first)[axes], grid.part.owned
@@ -228,18 +249,22 @@ class Probes:
         )
 
     def _joined(self, mine: np.ndarray, reach: np.ndarray, grid: StaggeredGrid) -> np.ndarray:
-        """Return what all ranks have found: at a point the one whose box has it, of a level those over whose boxes the way up leads."""
+        """Return the values of all probes, combined from all ranks.
+
+        The rank whose box has the point gives pressure and velocity. The ranks along the search
+        upward give the level.
+        """
         cells = np.floor(grid.to_grid(self._points)).astype(np.int64) - 1
         owner = grid.part.owners(np.clip(cells, 0, np.array(grid.domain_counts) - 1))
         everyone = grid.part.ranks.gather(np.concatenate([mine, reach], axis=1))
-        found = np.asarray(everyone[owner, np.arange(len(owner)), : mine.shape[1]])
-        for probe, values in enumerate(found):
+        combined = np.asarray(everyone[owner, np.arange(len(owner)), : mine.shape[1]])
+        for probe, values in enumerate(combined):
             ways = [rank for rank in everyone[:, probe] if rank[-1] > rank[-2]]
             for rank in sorted(ways, key=lambda rank: float(rank[-2])):
                 values[4] = rank[4]
-                if rank[5] == 0.0:  # the surface, or a solid
+                if rank[5] == 0.0:  # the search has ended at the surface or a solid
                     break
-        return found
+        return combined
 
     def _measure(self, simulation: "LiquidSimulation") -> np.ndarray:
         """Return x [m/s], velocity [m/s] and level [cells] of each probe."""
@@ -268,7 +293,7 @@ class Probes:
         return self._joined(mine, self._reached, grid) if grid.part.shared else mine
 
     def _launch(self, fields: list[wp.array | None]) -> None:
-        """Launch the search at all points."""
+        """Launch the kernel at all points."""
         assert self._grid is not None, "the grid is known"
         counts, up = wp.vec3i(*self._grid.counts), wp.vec3(*self._up)
         inputs = [

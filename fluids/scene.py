@@ -18,17 +18,17 @@ from warp_lcp.settings import Positive
 
 # Measured at 96^3 as the growth of a process on the CPU, first step included; bytes a cell.
 PRESSURE_BYTES = 92  # fields of the pressure solve
-BOUND_BYTES = 9  # of them, those of walls that separate
-LEVEL_SET_BYTES = 19  # more for a surface between cells, or slivers
+BOUND_BYTES = 9  # of them, bounds of separating walls
+LEVEL_SET_BYTES = 19  # added for a surface between cells, or slivers
 SMOOTHING_BYTES = 12
 TENSION_BYTES = 21
 UNILATERAL_BYTES = 1
-# its fields, those of coarse levels, and the velocity before the pressure
+# Its fields, those of coarse levels, and the velocity before the pressure solve.
 VISCOUS_BYTES = {2: 140, 3: 220}
-# Courant numbers below it: liquid over a mesh gained energy without bound at 1/4 on 40 cells, at
-# 1/8 on 20
+# Courant numbers below this are short steps: liquid poured over a mesh gained energy without bound
+# at 1/4 on 40 cells, at 1/8 on 20.
 SHORT_STEPS = 0.5
-# of a right-hand side that bodies change, and a motion of a body, if it is light
+# Added for a right-hand side that bodies change, and for each motion of a light body.
 BODY_BYTES, POTENTIAL_BYTES = 8, 4
 VISCOSITY = Usual(
     1e-4,
@@ -41,7 +41,7 @@ VISCOSITY = Usual(
 TENSION = Usual(1e-4, 3.0, "N/m", "0.02 to 0.5, 0.072 for water,", "mN/m", 1e-3)
 DRAG = Usual(0.0, 1.0, "", "about 0.005")
 LIQUID_CFL = Usual(0.0, 10.0, "", "1 to 4")
-# for A + U W U', see `fluids.coupling`
+# Methods for A + U W U', see `fluids.coupling`.
 COUPLED_METHODS = ("projected-multigrid", "minimum-map-newton", "primal-dual-active-set")
 
 
@@ -94,7 +94,8 @@ class LiquidScene(ParticleScene):
 
     solve_bytes: ClassVar[int] = PRESSURE_BYTES
     carried_by_grid: ClassVar[bool] = True
-    # splashed liquid lies in more cells, and solves take more iterations
+    # Factor on the estimated time of a step: splashed liquid occupies more cells, and solves take
+    # more iterations.
     stirred: ClassVar[float] = 1.2
 
     pressure: Pressure = Field(default_factory=Pressure)
@@ -110,15 +111,15 @@ class LiquidScene(ParticleScene):
 
     def complaints(self) -> list[Complaint]:
         """Return errors that involve several keys."""
-        found = super().complaints()
+        complaints = super().complaints()
         if self.solver.method not in COUPLED_METHODS and any(solid.is_body for solid in self.solid):
             message = (
                 "cannot be combined with rigid bodies (their part of the matrix has only "
                 f"products); use {', '.join(COUPLED_METHODS)}"
             )
-            found.append(Complaint(("solver", "method"), self.solver.method, message))
+            complaints.append(Complaint(("solver", "method"), self.solver.method, message))
         if self.pressure.model == "unilateral" and self.pressure.surface == "voxel":
-            found.append(
+            complaints.append(
                 Complaint(
                     ("pressure", "surface"),
                     "voxel",
@@ -131,28 +132,28 @@ class LiquidScene(ParticleScene):
                 'cannot be combined with pressure.model = "unilateral", whose liquid may '
                 "separate anywhere inside"
             )
-            found.append(Complaint(("particles", "narrow_band"), None, message))
+            complaints.append(Complaint(("particles", "narrow_band"), None, message))
         elif self.pressure.surface == "voxel" and self.particles.narrow_band is not None:
             message = 'needs pressure.surface = "ghost-fluid", which computes how full cells are'
-            found.append(Complaint(("particles", "narrow_band"), None, message))
+            complaints.append(Complaint(("particles", "narrow_band"), None, message))
         if self.surface_tension is not None and self.pressure.surface == "voxel":
             message = 'needs pressure.surface = "ghost-fluid", whose surface has a curvature'
-            found.append(Complaint(("surface_tension",), None, message))
+            complaints.append(Complaint(("surface_tension",), None, message))
         if self.surface_tension is not None and self.pressure.model == "unilateral":
             message = (
                 'needs pressure.model = "incompressible": surface tension needs a pressure '
                 "that may be negative"
             )
-            found.append(Complaint(("surface_tension",), None, message))
+            complaints.append(Complaint(("surface_tension",), None, message))
         return [
-            *found,
+            *complaints,
             *self._viscosity_complaints(),
             *probe_complaints(self.probe, self.domain.size, self.physics.gravity),
         ]
 
     def notes(self) -> list[str]:
         """Return suspicious settings."""
-        found, tension = (
+        notes, tension = (
             [*super().notes(), *LIQUID_DENSITY.notes("physics.density", self.physics.density)],
             self.surface_tension,
         )
@@ -162,13 +163,13 @@ class LiquidScene(ParticleScene):
             for place, shape in self.shapes()
         ]
         for place, value in given:
-            found += VISCOSITY.notes(place, value)
-        found += LIQUID_CFL.notes("time.cfl", self.time.cfl)
+            notes += VISCOSITY.notes(place, value)
+        notes += LIQUID_CFL.notes("time.cfl", self.time.cfl)
         if tension is not None:
-            found += TENSION.notes("surface_tension.coefficient", tension.coefficient)
+            notes += TENSION.notes("surface_tension.coefficient", tension.coefficient)
             if 0.0 < tension.contact_angle <= math.pi + 0.01:
                 degrees = math.degrees(tension.contact_angle)
-                found.append(
+                notes.append(
                     f"surface_tension.contact_angle = {tension.contact_angle:g} is in degrees; if "
                     f"radians were meant, it is {degrees:.3g}"
                 )
@@ -184,11 +185,11 @@ class LiquidScene(ParticleScene):
             *drags,
             *((f"solid[{n}].drag", solid.drag) for n, solid in enumerate(self.solid)),
         ]:
-            found += DRAG.notes(place, value)
-        return found
+            notes += DRAG.notes(place, value)
+        return notes
 
     def _viscosity_complaints(self) -> list[Complaint]:
-        """Return what needs viscosity, and what viscosity does not go with."""
+        """Return errors of settings that need viscosity or exclude it."""
         if self.viscosity is not None and self.endless:
             return [Complaint(("viscosity",), None, "cannot be combined with periodic axes")]
         own = [
@@ -209,17 +210,17 @@ class LiquidScene(ParticleScene):
             (("domain", "wall"), self.domain.wall),
             *((("solid", n, "wall"), solid.wall) for n, solid in enumerate(self.solid)),
         ]
-        found = [Complaint(place, wall, message) for place, wall in walls if wall == "sticky"]
+        complaints = [Complaint(place, wall, message) for place, wall in walls if wall == "sticky"]
         slips = [
             (n, solid.slip_length)
             for n, solid in enumerate(self.solid)
             if solid.slip_length is not None
         ]
-        found += [
+        complaints += [
             Complaint((key, n, "viscosity"), value, "needs the table [viscosity]")
             for key, n, value in own
         ]
-        return found + [
+        return complaints + [
             Complaint(("solid", n, "slip_length"), slip, "needs the table [viscosity]")
             for n, slip in slips
         ]
@@ -227,7 +228,7 @@ class LiquidScene(ParticleScene):
     def kept(
         self, materials: Sequence[MaterialProperties | SourceProperties]
     ) -> list[float] | None:
-        """Return viscosities relative to `viscosity.value`; None: one viscosity."""
+        """Return viscosities relative to `viscosity.value`; None if all are equal."""
         if self.viscosity is None or all(
             shape.viscosity is None for shape in (*self.liquid, *self.source)
         ):
@@ -256,18 +257,18 @@ class LiquidScene(ParticleScene):
         """Return the models that the scene turns on, and those that have no effect."""
         full, ghost = self.stays_full, self.pressure.surface == "ghost-fluid"
         closed = "liquid fills a closed box: there is no free surface"
-        found = []
+        models = []
         if self.pressure.model == "unilateral":
-            found.append(Model("unilateral pressure", 'pressure.model = "unilateral"'))
+            models.append(Model("unilateral pressure", 'pressure.model = "unilateral"'))
         elif self.lets_go:
-            found.append(
+            models.append(
                 Model(
                     "separating walls",
                     "liquid may separate from domain.wall or a solid: bounds on the pressure",
                 )
             )
         elif self.domain.wall == "separating":
-            found.append(
+            models.append(
                 Model(
                     "separating walls",
                     "the domain has no wall: equations without bounds",
@@ -275,7 +276,7 @@ class LiquidScene(ParticleScene):
                 )
             )
         if ghost:
-            found.append(
+            models.append(
                 Model(
                     "ghost-fluid surface",
                     closed if full else 'pressure.surface = "ghost-fluid"',
@@ -283,35 +284,35 @@ class LiquidScene(ParticleScene):
                 )
             )
         if self.pressure.smoothing and ghost:
-            found.append(
+            models.append(
                 Model("smoothing", closed if full else "pressure.smoothing", built=not full)
             )
         if self.viscosity is not None:
-            found.append(Model("viscosity", "viscosity.value"))
+            models.append(Model("viscosity", "viscosity.value"))
         if self.surface_tension is not None:
-            found.append(
+            models.append(
                 Model("surface tension", closed if full else "[surface_tension]", built=not full)
             )
         if self.short_steps:
-            found.append(Model("support of spray", f"time.cfl is below {SHORT_STEPS}"))
+            models.append(Model("support of spray", f"time.cfl is below {SHORT_STEPS}"))
         if self.solver.tolerance == "auto":
-            found.append(Model("automatic tolerance", 'solver.tolerance = "auto"'))
+            models.append(Model("automatic tolerance", 'solver.tolerance = "auto"'))
         if self.probe:
-            found.append(Model("probes", "[[probe]]"))
+            models.append(Model("probes", "[[probe]]"))
         if self.output.forces:
-            found.append(Model("forces on solids", "output.forces"))
+            models.append(Model("forces on solids", "output.forces"))
         if self.drags is not None:
-            found.append(
+            models.append(
                 Model(
                     "drag along walls",
                     "[wall_drag]" if self.wall_drag is not None else "drag of a solid",
                 )
             )
-        return [*found, *super().models()]
+        return [*models, *super().models()]
 
     @property
     def drags(self) -> list[float] | None:
-        """Return c_f of the domain's walls and of each solid; None: no wall drag.
+        """Return c_f of the domain's walls and of each solid; None without wall drag.
 
         See `fluids.wall_drag`.
         """
@@ -324,16 +325,16 @@ class LiquidScene(ParticleScene):
     def keeps_volume(self) -> bool:
         """Return whether voids inside the liquid are closed.
 
-        Not with the unilateral model, where liquid may separate, nor with a narrow band, whose
-        interior is known to a tenth.
+        False with the unilateral model, where liquid may separate, and with a narrow band, whose
+        interior density is known only to a tenth.
         """
         return self.pressure.model == "incompressible" and self.particles.narrow_band is None
 
     @property
     def settles(self) -> bool:
-        """Return whether overfull cells settle to the density at rest.
+        """Return whether overfull cells relax to the density at rest.
 
-        The unilateral model settles them with gravity, see `fluids.unilateral`.
+        False with the unilateral model, where gravity does this, see `fluids.unilateral`.
         """
         return self.pressure.model == "unilateral" and any(self.physics.gravity)
 
@@ -393,12 +394,13 @@ class LiquidScene(ParticleScene):
     def short_steps(self) -> bool:
         """Return whether steps are short enough to need support of spray.
 
-        Spray must then not take the velocity of the liquid beside it in each step.
+        In short steps spray must not take the velocity of the liquid beside it, see
+        `fluids.pressure`.
         """
         return self.time.cfl < SHORT_STEPS and self.pressure.model == "incompressible"
 
     def own_memory_parts(self) -> dict[str, int]:
-        """Return the most memory of pressure and surface on the device [bytes]."""
+        """Return the peak memory of pressure and surface on the device [bytes]."""
         cells, level_set = self.counted_cells, self.pressure.surface == "ghost-fluid"
         bounded = self.lets_go or self.pressure.model == "unilateral"
         motions = sum(solid.is_body for solid in self.solid) * (3 if self.dimension == 2 else 6)

@@ -55,9 +55,9 @@ if TYPE_CHECKING:
     from warp_lcp.distributed.ranks import Ranks
 
 
-# that solve problems of several ranks
+# Methods that solve on several ranks.
 METHODS_ON_RANKS = ("projected-multigrid", "minimum-map-newton")
-MOST_PARTS = 8  # of the viscous solve in a step that is much shorter than the last one
+MOST_PARTS = 8  # most viscous solves in a step that is much shorter than the last one
 
 
 class LiquidSimulation(ParticleSimulation):
@@ -65,19 +65,19 @@ class LiquidSimulation(ParticleSimulation):
 
     Args:
         scene: the scene.
-        grid: the one that it starts on.
+        grid: the initial grid.
         parts: the fields and models on that grid.
-        particles: the liquid at the start.
-        solids: of the scene, if the output needs the forces on them.
-        models: of your own, see `warp_lcp.fluids.models.LiquidModel`.
-        more: as of `ParticleSimulation`.
+        particles: the initial liquid.
+        solids: the solids of the scene, if forces on them are output.
+        models: user models, see `warp_lcp.fluids.models.LiquidModel`.
+        more: arguments of `ParticleSimulation`.
 
     Attributes:
         surface: the free surface.
-        forces: force output of each solid; None: off.
-        tension: surface tension; None: off.
-        projection: the pressure's fields.
-        record: takes the problem of each step before it is solved, if it is set.
+        forces: force output of each solid; None if off.
+        tension: surface tension; None if off.
+        projection: the pressure solve and its fields.
+        record: callback that gets the problem of each step before its solve; optional.
     """
 
     scene: LiquidScene
@@ -131,7 +131,8 @@ class LiquidSimulation(ParticleSimulation):
             WallDrag(grid, self.boundary, drags, physics.density) if drags is not None else None
         )
         self.viscosity = make_viscosity(self.scene, grid, self.boundary, self.surface, self.bodies)
-        if self.models:  # flights and spray know of gravity alone
+        # Airborne momentum and spray corrections assume gravity alone.
+        if self.models:
             self.flights = None
         for model in self.models:
             model.allocate(self)
@@ -145,7 +146,7 @@ class LiquidSimulation(ParticleSimulation):
         """Transfer velocity (and viscosity) of particles to the faces; apply gravity."""
         super().particles_to_grid(window)
         if self.viscosity is not None and self.viscosity.relative:
-            # which stay what they are
+            # The particles' viscosities do not change.
             p, fields = self.particles, (self.viscosity.relative, self.weights)
             particles_to_faces(
                 self.grid,
@@ -157,7 +158,8 @@ class LiquidSimulation(ParticleSimulation):
                 offsets=p.offsets,
                 runs=p.runs,
             )
-            # ghost particles' own ghosts would have a share
+            # Ghost particles near the outer edge lack neighbors, so ghost values come from their
+            # owners.
             self.grid.part.fill(*self.viscosity.relative, *self.weights)
 
     def stable_dt(self) -> float:
@@ -176,7 +178,7 @@ class LiquidSimulation(ParticleSimulation):
         """Advance by dt [s].
 
         The pressure is solved before any particle moves, so that a failed solve changes at most the
-        particles' order.
+        order of the particles.
 
         Raises:
             StepFailed: a solve missed its criteria; a smaller dt may be tried.
@@ -188,7 +190,13 @@ class LiquidSimulation(ParticleSimulation):
             return self._step(dt)
 
     def _step(self, dt: float) -> Row:
-        """Advance by dt [s]."""
+        """Advance by dt [s]; see `step`.
+
+        Order of a step: particles to grid, with gravity; free surface and surface tension; user
+        models; viscosity; pressure and projection; wall impulses and wall drag; extrapolation of
+        the velocity; grid to particles; motion of particles and solids. Rigid bodies get their
+        impulses from viscosity and pressure, and contacts are solved after both.
+        """
         before = self.begin_step(dt)
         if self.forces is not None:
             self.forces.begin(self.time)
@@ -198,7 +206,8 @@ class LiquidSimulation(ParticleSimulation):
         self._find_surface(window)
         own = self._act(window, dt)
         if self.grid.device.is_cuda and self.surface.density is not None:
-            self.monitor_density(window, self.surface.density)  # so that it is read with the solve
+            # Counted here, to be read back together with the solve.
+            self.monitor_density(window, self.surface.density)
         viscous = self._rub(self.viscosity, window, dt, speed) if self.viscosity is not None else {}
         projected = self._project(window, dt, speed)
         if self.scene.output.diagnostics:
@@ -240,10 +249,8 @@ class LiquidSimulation(ParticleSimulation):
     def tables(self) -> dict[str, tuple[str, ...]]:
         """Return the columns of the tables besides the log.
 
-        `measured` has the last row of each.
-
-        `time` is that of pressures, levels and forces: the step's beginning; velocities are those
-        of its middle.
+        `measured` has the last row of each table. `time` is that of pressures, levels and forces:
+        the beginning of the step. Velocities are those of its middle.
         """
         measured = {
             "probes": self.probes,
@@ -256,7 +263,7 @@ class LiquidSimulation(ParticleSimulation):
         }
 
     def _measure(self) -> None:
-        """Fill the rows of the tables, if there are any."""
+        """Fill the rows of the tables, if any."""
         clock: Row = {"step": self.step_count + 1, "time": self.time}
         if self.probes is not None:
             with self.watch.stage("probes", *self.velocity, self.projection.pressure):
@@ -266,10 +273,12 @@ class LiquidSimulation(ParticleSimulation):
             self.measured["forces"] = clock | self.forces.row(self.kick_dt)
 
     def _meet_walls(self, window: Window, dt: float) -> Row:
-        """Collect what the projection has done to solids, before closed faces take other velocities, and let walls drag.
+        """Collect the pressure impulses on solids, and apply wall drag.
+
+        This comes before closed faces get other velocities.
 
         Returns:
-            What the log says of it.
+            The log values of the wall drag.
         """
         sums, forces, part = self.wall_sums, self.forces, self.grid.part
         window, row = part.faces(window), Row()
@@ -290,20 +299,21 @@ class LiquidSimulation(ParticleSimulation):
                     forces.add(dragged)
                 if self.bodies is not None and dragged is not None:
                     SolidForces.push(self.bodies, np.asarray(part.ranks.sum(dragged)))
-                    self.boundary.begin_step(self.time, dt)  # their velocities are others now
+                    # The velocities of the bodies have changed.
+                    self.boundary.begin_step(self.time, dt)
                 part.fill(*self.velocity)
         return {name: float(part.ranks.sum(value)) for name, value in row.items()}
 
     def own_columns(self) -> tuple[str, ...]:
         """Return the log columns of pressure and volume.
 
-        active: wall cells that let go; max_divergence [1/s]: of the other FLUID cells after the
-        projection; volume [m^3; m^2 in 2-D]: counts FLUID cells, or lies inside the surface where
-        that is finer than cells. With an automatic tolerance: tolerance, the relative residual that
-        the step was held to, and time_error [m/s], the error in the velocity that its length makes.
-        With viscosity what its solve took and reached, the energy that became heat in the step, and
-        the work of moving walls on it [J; J/m in 2-D]. With drag along walls: drag_work [J; J/m in
-        2-D], the energy that it takes from the liquid in the step.
+        active: wall cells that separate; max_divergence [1/s]: of the other FLUID cells after the
+        projection; volume [m^3; m^2 in 2-D]: of the FLUID cells, or inside the surface if this is
+        finer than cells. With an automatic tolerance: tolerance, the relative residual used as the
+        criterion, and time_error [m/s], the velocity error due to the length of the step. With
+        viscosity: iterations and residual of its solve, the energy dissipated in the step, and the
+        work of moving walls on the liquid [J; J/m in 2-D]. With wall drag: drag_work, the energy
+        that it takes from the liquid in the step [J; J/m in 2-D].
         """
         own = tuple(name for model in self.models for name in model.columns)
         drags = ("drag_work",) if self.scene.drags is not None else ()
@@ -321,10 +331,9 @@ class LiquidSimulation(ParticleSimulation):
     def frame(self) -> list[Part]:
         """Return the parts of a frame: particles, liquid cells, surface and volume.
 
-        Cells are those of the last solve; surface and volume are optional.
-
-        Particles have velocity, speed and, where it differs, viscosity [Pa s]; cells pressure [Pa],
-        wall and released flags.
+        Cells are those of the last solve; surface and volume are optional. Particles have velocity,
+        speed and, where it differs, viscosity [Pa s]. Cells have pressure [Pa], wall and released
+        flags.
         """
         cells, grid = self.projection.fluid_cells(), self.grid
         at = tuple(cells.T)
@@ -364,7 +373,7 @@ class LiquidSimulation(ParticleSimulation):
         self.projection.restore(dict(state))
 
     def _find_surface(self, window: Window) -> None:
-        """Mark the liquid's cells, give velocity to their faces, and let the surface's tension push them."""
+        """Mark liquid cells, set their face velocities, and apply surface tension."""
         projection = self.projection
         with self.watch.stage("surface", self.particles.key, projection.kind):
             self.surface.begin(window)
@@ -376,7 +385,7 @@ class LiquidSimulation(ParticleSimulation):
                 self.tension.act(self.velocity, window, projection.kind, self.kick_dt)
 
     def _act(self, window: Window, dt: float) -> Row:
-        """Let the caller's models act; return what the log says of them."""
+        """Apply the user models; return their log values."""
         row = Row()
         for model in self.models:
             with self.watch.stage(type(model).__name__, *self.velocity):
@@ -384,23 +393,24 @@ class LiquidSimulation(ParticleSimulation):
         return row
 
     def _mark_cells(self, window: Window) -> None:
-        """Mark the liquid's cells, ghost cells as other processes do."""
+        """Mark liquid cells; ghost cells get the marks of their owners."""
         self.surface.mark(self.particles, window, self.projection.kind)
         self.grid.part.fill(
             self.projection.kind, *([] if self.surface.phi is None else [self.surface.phi])
         )
 
     def _launch_surface(self, window: Window) -> None:
-        """Launch the marking of the liquid's cells, and the velocity of their faces."""
+        """Launch the marking of liquid cells, and the velocities of their faces."""
         self._mark_cells(window)
         self.surface.complete(window, self.velocity, self.weights, self.projection.known)
 
     def _rub(self, viscosity: Viscosity, window: Window, dt: float, speed: float) -> Row:
-        """Change the velocity before the pressure by what viscosity does to that after it; return what the log says of it.
+        """Apply viscosity before the pressure solve; return its log values.
 
-        The pressure first finds which walls hold: viscosity acts on the velocity that it leaves.
-        Then all of it acts anew, together with what viscosity has changed, so that it balances
-        viscous stresses too and the walls that let go do so by the sum of both.
+        A first pressure solve finds which walls hold the liquid: viscosity acts on the projected
+        velocity. Its change is then added to the velocity before that projection, and the pressure
+        is solved again. So the pressure balances viscous stresses too, and walls separate according
+        to the sum of both.
         """
         projection = self.projection
         viscosity.keep(self.velocity)
@@ -408,15 +418,15 @@ class LiquidSimulation(ParticleSimulation):
         if self._project(window, dt, speed).result is None:
             return {}
         self.extrapolate_velocity(window, projection.known, projection.kind, projection.contact)
-        # A step much shorter than the last one, as a retry is, still has half of that to make up
-        # for: equations no stiffer than its own length asks for are solved several times.
+        # A step much shorter than the last one, such as a retry, still has to make up for half of
+        # that step: several solves, none stiffer than this step's own length requires.
         parts, total = min(max(1, int(self.kick_dt / dt)), MOST_PARTS), None
         for part in range(parts):
             if part:
                 viscosity.keep_change()
                 momenta = self._move_on(viscosity, momenta, dt)
             with self.watch.stage("viscosity", *self.velocity, projection.kind, projection.contact):
-                given = (
+                arguments = (
                     self.velocity,
                     window,
                     projection.kind,
@@ -424,16 +434,16 @@ class LiquidSimulation(ParticleSimulation):
                     self.kick_dt / parts,
                     speed,
                 )
-                found = viscosity.solve(*given, last=part + 1 == parts)
-            if not found.converged:
+                result = viscosity.solve(*arguments, last=part + 1 == parts)
+            if not result.converged:
                 residual = (
-                    f"relative residual of {found.relative_residual:.2e} (tolerance "
+                    f"relative residual of {result.relative_residual:.2e} (tolerance "
                     f"{viscosity.tolerance})"
                 )
                 raise missed_by_far(
                     "viscous",
-                    found.status,
-                    found.iterations,
+                    result.status,
+                    result.iterations,
                     residual,
                     "a shorter step is less stiff",
                 )
@@ -443,7 +453,7 @@ class LiquidSimulation(ParticleSimulation):
                         self.velocity, projection.kind, projection.contact, self.forces.references
                     )
                 )
-            total = found if total is None else found.after(total)
+            total = result if total is None else result.after(total)
         assert total is not None
         viscosity.undo(self.velocity)
         for body, values in zip(
@@ -456,20 +466,29 @@ class LiquidSimulation(ParticleSimulation):
     def _move_on(
         self, viscosity: Viscosity, momenta: Sequence[tuple[np.ndarray, ...]], dt: float
     ) -> list[tuple[np.ndarray, ...]]:
-        """Give the bodies the impulses of one of several viscous solves of a step; return their momenta before all, with these added."""
+        """Apply the impulses of one of several viscous solves of a step to the bodies.
+
+        Returns their momenta before the first solve with these impulses added.
+        """
         if self.bodies is None:
             return []
         bodies = self.bodies.bodies
         before = [body.momenta() for body in bodies]
         viscosity.push_bodies()
-        self.boundary.begin_step(self.time, dt)  # their velocities are others now
+        # The velocities of the bodies have changed.
+        self.boundary.begin_step(self.time, dt)
         changes = zip(momenta, before, (body.momenta() for body in bodies), strict=True)
         return [
             tuple(kept + now - then for kept, then, now in zip(*of, strict=True)) for of in changes
         ]
 
     def _project(self, window: Window, dt: float, speed: float) -> Projection:
-        """Solve for the pressure and project the velocity."""
+        """Solve for the pressure and project the velocity.
+
+        The bodies get the impulses of the pressure first, so that closed faces have the bodies' new
+        velocities in the projection. Without unknowns, all liquid is spray and only the sources'
+        faces are set.
+        """
         projection, watch = self.projection, self.watch
         with watch.stage("pressure set-up", *self.velocity, *projection.fields()):
             self.boundary.begin_step(self.time, dt)
@@ -491,14 +510,16 @@ class LiquidSimulation(ParticleSimulation):
                 self.record(projection.recorded(speed) | clock)
         with watch.stage("pressure solve", *projection.fields()):
             result, criteria = projection.solve(speed)
-        if projection.counted() == 0:  # which a GPU has not waited for
+        # A GPU has not waited for the number of unknowns.
+        if projection.counted() == 0:
             return self._held(projection.leave())
         if not result:
             self._explain(result)
         if self.bodies is not None:
             with watch.stage("bodies"):
                 projection.push_bodies(result)
-                self.boundary.begin_step(self.time, dt)  # their velocities are others now
+                # The velocities of the bodies have changed.
+                self.boundary.begin_step(self.time, dt)
         with watch.stage(
             "projection",
             *self.velocity,
@@ -510,13 +531,13 @@ class LiquidSimulation(ParticleSimulation):
             return self._held(projection.project(self.velocity, window, result, criteria))
 
     def _held(self, projected: Projection) -> Projection:
-        """Give the sources' faces their velocity back, and show their cells as liquid."""
+        """Reset the velocities of the sources' faces, and show their cells as liquid."""
         if self.sources is not None:
             self.sources.hold(self.velocity, self.projection.known, self.projection.cells)
         return projected
 
     def _explain(self, result: wl.SolveResult) -> NoReturn:
-        """Say why a solve has failed.
+        """Raise the error that explains a failed solve.
 
         Raises:
             StepFailed: a smaller dt may be tried.
@@ -533,7 +554,7 @@ class LiquidSimulation(ParticleSimulation):
                 f"step {self.step_count}: the velocity on the faces of cell (x, y, z) = {where} is "
                 f"not finite ({len(cells)} cells)"
             )
-        # no dt helps
+        # No smaller dt helps.
         if result.status is wl.SolveStatus.INFEASIBLE and (self.boundary.velocity or self.sources):
             raise SimulationFailed(
                 f"step {self.step_count}: liquid fills a closed space whose volume changes, by "
@@ -569,13 +590,14 @@ class FluidsSimulator:
         """Build the simulation of a scene; on ranks, this rank's part (collective).
 
         Args:
-            scene: a LiquidScene.
+            scene: the scene, a LiquidScene.
             device: a Warp device's name.
             folder: folder of the files that the scene names.
-            ranks: that share it, for which the scene is the same; None: one process.
+            ranks: MPI ranks that share the simulation, with the same scene on each; None for one
+                process.
             wall_velocity: velocity [m/s] of the domain's wall and of each solid, shape (1 + solids,
-                3), constant; the solids' cells stay fixed. None: all are at rest.
-            models: of your own, see `warp_lcp.fluids.models.LiquidModel`.
+                3), constant; the solids' cells stay fixed. None if all are at rest.
+            models: user models, see `warp_lcp.fluids.models.LiquidModel`.
 
         Raises:
             ValueError: the scene cannot be simulated, or not on ranks; the message names the key
@@ -602,9 +624,8 @@ class FluidsSimulator:
     ) -> LiquidSimulation:
         """Build the simulation of a scene from placed solids and bodies.
 
-        `bodies` are those that the liquid moves; other arguments as in `create`.
-
-        `scene.solid`, in the same order, has the boundary condition of each solid.
+        `bodies` are those that the liquid moves; other arguments as in `create`. `scene.solid`, in
+        the same order, has the boundary condition of each solid.
         """
         warnings: list[str] = []
 
@@ -619,7 +640,8 @@ class FluidsSimulator:
         if ranks is None:
             coverage, grid = start_of(scene, device)
         else:
-            from warp_lcp.distributed.particle_assembly import part_of  # what it needs is an extra
+            # Imported here, since it needs an optional package.
+            from warp_lcp.distributed.particle_assembly import part_of
 
             coverage, grid = (
                 None,

@@ -24,7 +24,7 @@ _FLUID = wp.constant(wp.int8(FLUID))
 @list_kernel("fluids.surface")
 @typing.no_type_check
 def mark_particles_kernel(i, key: wp.array(dtype=wp.int32), kind: wp.array(dtype=wp.int8)):
-    """A cell that holds a particle is FLUID."""
+    """Mark the cells of particles as FLUID."""
     cell = key[i]
     if kind[cell] == _AIR:
         kind[cell] = _FLUID
@@ -33,7 +33,10 @@ def mark_particles_kernel(i, key: wp.array(dtype=wp.int32), kind: wp.array(dtype
 @cell_kernel("fluids.surface")
 @typing.no_type_check
 def mark_inside_kernel(k, j, first, end, phi: F32, capacity: F32, most: float, kind: I8):
-    """An open cell of the domain below the free surface is FLUID, if the share of its kernel that is open is no more than `most`."""
+    """Mark open cells below the free surface as FLUID.
+
+    Only cells whose open share of the kernel is at most `most`.
+    """
     for i in range(wp.max(first, 1), wp.min(end, kind.shape[2] - 1)):
         if (
             kind[k, j, i] == _AIR
@@ -46,34 +49,34 @@ def mark_inside_kernel(k, j, first, end, phi: F32, capacity: F32, most: float, k
                 kind[k, j, i] = _FLUID
 
 
-# a cell whose open share is smaller may hold no particle though liquid fills it: the level set
-# decides
+# A cell whose open share is smaller may hold no particle though liquid fills it: the level set
+# decides.
 SLIVER = 0.35
-SAMPLES = 8  # points along the edge of a cut cell, of a volume that is found once
+SAMPLES = 8  # sample points along the edge of a cut cell, for its open volume
 
 
 class FreeSurface(Protocol):
     """Free surface of a liquid.
 
     Attributes:
-        phi: float32 distance to the surface at cell centers [cells], < 0 in liquid; None: the
+        phi: float32 distance to the surface at cell centers [cells], < 0 in liquid; None if the
             surface lies on the cells' faces.
-        density: of the particles when it was last marked, in units of that at rest, float32; None:
-            nothing needed it.
+        density: density of the particles at the last `mark`, relative to that at rest, float32;
+            None if not computed.
     """
 
     phi: wp.array | None
     density: wp.array | None
 
     def begin(self, window: Window) -> None:
-        """Begin a step in a window: clear what the last one has left elsewhere."""
+        """Begin a step in a window: clear values of the last step outside of it."""
 
     def mark(self, particles: Particles, window: Window, kind: wp.array) -> None:
         """Mark the kind of each cell, after `begin`.
 
         Args:
-            particles: the liquid; `key` holds its cells.
-            window: cells that it can touch.
+            particles: the liquid; `key` holds the cell of each particle.
+            window: cells that the liquid can touch.
             kind: int8 of AIR, FLUID, SOLID (written).
         """
 
@@ -93,9 +96,9 @@ class FreeSurface(Protocol):
         """Compute the liquid's volume, which `volume` returns."""
 
     def volume(self, cells: int) -> float:
-        """Return the liquid's volume when last marked or measured [m^3; m^2 in 2-D].
+        """Return the volume of liquid at the last `mark` or `measure` [m^3; m^2 in 2-D].
 
-        Takes the number of FLUID cells.
+        The argument is the number of FLUID cells.
         """
 
 
@@ -103,7 +106,7 @@ class WholeCellSurface:
     """Free surface on cell faces: cells that hold a particle are liquid.
 
     In cells that a solid cuts down to a sliver there may be no particle though the liquid fills
-    them; a level set decides there.
+    them; there a level set decides.
     """
 
     phi = None
@@ -116,7 +119,10 @@ class WholeCellSurface:
         particles_a_cell: int,
         fill: Fill | None = None,
     ) -> None:
-        """Make a level set if cells are cut; `fill` adds to its density what no particle stands for."""
+        """Create a level set if cells are cut.
+
+        `fill` adds the density of liquid without particles.
+        """
         self.grid, self.boundary, self._fill = grid, boundary, fill
         self._level_set = (
             LevelSet(grid, particles_a_cell=particles_a_cell) if boundary.open else None
@@ -124,7 +130,7 @@ class WholeCellSurface:
         self.density = self._level_set.density if self._level_set is not None else None
 
     def begin(self, window: Window) -> None:
-        """Clear what the last step has left elsewhere."""
+        """Clear values of the last step outside of the window."""
         if self._level_set is not None:
             self._level_set.leave(window)
 
@@ -171,7 +177,7 @@ class NoSurface:
     phi = density = None
 
     def __init__(self, grid: StaggeredGrid, boundary: Boundary) -> None:
-        """Find the cells, and the volume of this process's."""
+        """Find the open cells, and the volume of those of this process."""
         kind = boundary.base.numpy().copy()
         kind[kind == wl.AIR] = wl.FLUID
         self.grid = grid
@@ -214,13 +220,13 @@ class NoSurface:
 class GhostFluidSurface:
     """Ghost-fluid surface: zero of a level set of the particles' density.
 
-    The air begins between cell centers [Gibou et al. 2002].
+    It lies between cell centers [Gibou et al. 2002].
 
     Args:
         grid: the grid.
         boundary: solids and walls.
-        particles_a_cell: of liquid at rest.
-        smoothing: binomial passes over the density: quieter, and less accurate in thin sheets.
+        particles_a_cell: particles per cell of liquid at rest.
+        smoothing: binomial passes over the density: less noise, less accuracy in thin sheets.
         fill: adds the density of liquid without particles.
     """
 
@@ -240,7 +246,7 @@ class GhostFluidSurface:
         self._window, self._measured = grid.everywhere, False
 
     def begin(self, window: Window) -> None:
-        """Clear what the last step has left elsewhere."""
+        """Clear values of the last step outside of the window."""
         self._window, self._measured = window.now, False
         self.level_set.leave(window)
 
@@ -275,7 +281,10 @@ class GhostFluidSurface:
 
 
 def _open_shares(grid: StaggeredGrid, boundary: Boundary) -> np.ndarray:
-    """Return which share of each cell no solid takes, shape (nz, ny, nx), from the distance to solids at the cells' corners."""
+    """Return the open share of each cell, shape (nz, ny, nx).
+
+    It is computed from the distance to solids at the cells' corners.
+    """
     nx, ny, nz = grid.counts
     if boundary.distance is None:
         return np.ones((nz, ny, nx))
@@ -287,7 +296,7 @@ def _open_shares(grid: StaggeredGrid, boundary: Boundary) -> np.ndarray:
     cut = (corners.min(axis=0) < 0.0) & (corners.max(axis=0) > 0.0)
     values = corners[:, cut].reshape(*(2 for _ in axes), -1)
     low = (np.arange(SAMPLES) + 0.5) / SAMPLES
-    # from corners to points inside, one axis after the other; the one in turn goes last
+    # Interpolate from corners to sample points, one axis after the other.
     for _ in axes:
         values = np.moveaxis(np.tensordot(np.stack([1.0 - low, low]), values, axes=(0, 0)), 0, -2)
     shares[cut] = (values > 0.0).mean(axis=tuple(range(values.ndim - 1)))

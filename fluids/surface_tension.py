@@ -1,4 +1,4 @@
-"""Surface tension: the jump of the pressure across a ghost-fluid surface, and the angle at which it meets walls."""
+"""Surface tension and contact angles: pressure jump of a ghost-fluid surface."""
 
 from __future__ import annotations
 
@@ -22,32 +22,34 @@ from warp_lcp.operators.grid_poisson import SOLID
 from warp_lcp.rows.memory import Scalar
 from warp_lcp.rows.program import LaunchGraph, clear
 
-# binomial passes of a filter: particles' noise asks for the fewest, the cost and thin liquid for
-# the most
+# Binomial passes of the filter: the minimum follows from the noise of the particles, the maximum
+# from the cost and from thin liquid.
 PASSES, MOST_PASSES = 8, 16
-# of the grid's capillary rate, at which gradients of the velocity near the surface decay
+# Damping rate of velocity gradients near the surface, relative to the grid's capillary rate.
 CALM = 0.2
-# the largest z^3 (2 exp(-z^2/2) - exp(-z^2)): of a filtered capillary wave, omega^2 s^3 rho dx^3 /
-# sigma
+# The largest z^3 (2 exp(-z^2/2) - exp(-z^2)): of a filtered capillary wave, omega^2 s^3 rho dx^3 /
+# sigma.
 STIFFEST = 2.08
-# quarters of a cell from the mirror of a cell in a solid to where all cells around are open, at
-# most
+# Most steps of a quarter cell from the mirror image of a wall's cell to a point with open cells
+# around it.
 FARTHER = 9
-# cells around particles that are smoothed: two of the widest filter's spreads, with what `window`
-# spares
+# Width of the smoothed region around particles [cells]: two standard deviations of the widest
+# filter, less the margin of `window`.
 REACH = 6
-SAFETY = 3.0  # in the square of the longest step: particles add noise
+SAFETY = 3.0  # safety factor on the square of the longest step: particles add noise
 
 
 @dataclass(frozen=True, slots=True)
 class SurfaceShares:
-    """Smoothed shares of liquid in cells, and the series of the distance to the surface [cells] in them.
+    """Smoothed liquid fractions of cells, and series of the distance to the surface.
+
+    The distance [cells] is linear w + cubic w^3, with w = 1/2 - (2 once - twice).
 
     Attributes:
-        once: shares after the passes of the step, float32.
-        twice: after twice as many.
-        linear: first coefficient of the distance in 2 once - twice less 1/2.
-        cubic: third coefficient.
+        once: fractions after the passes of the step, float32.
+        twice: fractions after twice as many passes.
+        linear: first coefficient of the distance.
+        cubic: third coefficient of the distance.
     """
 
     once: wp.array
@@ -57,41 +59,42 @@ class SurfaceShares:
 
 
 class SurfaceTension:
-    """Push liquid by the pressure p = sigma kappa that its surface asks for.
+    """Apply the capillary pressure p = sigma kappa to the liquid at its surface.
 
     The jump of a ghost-fluid surface [Gibou et al. 2002] between a FLUID cell i and an AIR cell n
     at theta, with X = kick_dt sigma kappa / (rho dx) there, changes u = u* - (x_right - x_left) /
-    theta by X / theta alone. It is added to u* before the projection, so that the pressure's
-    problem stays as it is: x is the liquid's whole pressure over that of the air, and 0 <= x on
-    separating walls means what it meant.
+    theta by X / theta. It is added to u* before the projection, so that the pressure problem is
+    unchanged: x is the liquid's whole pressure above that of the air, and 0 <= x on separating
+    walls keeps its meaning.
 
-    The curvature kappa = div n, n = -grad f / |grad f|, is that of f = (2 S - S^2) f0, where f0 is
-    the share of a cell's kernel that lies below the surface, and S are m binomial passes (1, 2,
-    1)/4 along each axis, nearly a Gaussian of the variance s^2 = m/2. Of a ripple of wavenumber q
-    on a plane f keeps 2 e^-a - e^-2a, a = (q s)^2 / 2, so that capillary waves are slower by (q
-    s)^4 / 8. For m >= `PASSES`; more where the step asks for it: explicit leapfrog steps are stable
-    while omega dt < 2, and no ripple then has omega^2 > STIFFEST sigma / (rho (s dx)^3). So waves
-    that a step cannot follow are pushed less instead of making it shorter.
+    The curvature kappa = div n, n = -grad f / |grad f|, is that of f = (2 S - S^2) f0. Here f0 is
+    the share of a cell's kernel below the surface, and S is m binomial passes (1, 2, 1)/4 along
+    each axis, nearly a Gaussian of variance s^2 = m/2. Of a ripple of wavenumber q on a plane f
+    keeps 2 e^-a - e^-2a, a = (q s)^2 / 2, so that capillary waves are slower by (q s)^4 / 8. Each
+    step has m >= `PASSES`. Explicit leapfrog steps are stable while omega dt < 2, and no ripple
+    then has omega^2 > STIFFEST sigma / (rho (s dx)^3). Longer steps use more passes: waves that a
+    step cannot resolve are filtered out instead of limiting the step.
 
-    In cells of walls, f goes on so that the surface meets the wall at the contact angle: the
-    distance to it falls along the wall's normal by the angle's cosine there, and by (1 - kappa d)
-    of that on the wall at a distance d from it, where parallel surfaces meet the wall. With the
-    cosine alone the curvature beside the wall would be 0.6 of what it is at an angle of 30 degrees,
-    on any grid. So kappa is found twice in a step, first without itself. Beside walls particles
-    tell of the open part of a cell's kernel alone, see `whole_share`.
+    In cells of walls, f is extended so that the surface meets the wall at the contact angle. Along
+    the wall's normal the distance to the surface falls by the cosine of the angle, and by (1 -
+    kappa d) times the cosine on the wall at a distance d from the surface, where parallel surfaces
+    meet the wall. With the cosine alone the curvature beside the wall would be 0.6 of the right
+    value at an angle of 30 degrees, on any grid. So kappa is computed twice in a step, first
+    without this term. Beside walls particles represent only the open part of a cell's kernel, see
+    `whole_share`.
 
     Args:
         grid: the grid.
         boundary: solids and walls.
-        phi: distance to the surface [cells], < 0 in liquid, of a `GhostFluidSurface`.
+        phi: distance to the surface [cells], < 0 in liquid, from a `GhostFluidSurface`.
         coefficient: sigma [N/m].
-        contact_angle: in the liquid [degrees].
-        density: of the liquid [kg/m^3].
+        contact_angle: angle in the liquid [degrees].
+        density: density of the liquid [kg/m^3].
 
     Attributes:
         jump: kick_dt sigma kappa / (rho dx) [m/s] in cells beside the surface, float32.
-        adhesion: sigma cos(angle) kappa / (rho dx) [m/s^2] of the most curved surface, by which
-            liquid that wets a wall keeps air from it.
+        adhesion: sigma cos(angle) kappa / (rho dx) [m/s^2] of the most curved surface, the suction
+            with which liquid that wets a wall adheres to it.
     """
 
     def __init__(
@@ -107,7 +110,7 @@ class SurfaceTension:
         self.grid, self.boundary, self._phi = grid, boundary, phi
         self.coefficient, self.density = coefficient, density
         self._cosine = math.cos(math.radians(contact_angle)) if contact_angle != 90.0 else 0.0
-        self._most = float(grid.dimension - 1)  # curvature, of a radius of one cell [1/dx]
+        self._most = float(grid.dimension - 1)  # largest curvature: a radius of one cell [1/dx]
         self.adhesion = (
             max(self._cosine, 0.0) * self._most * coefficient / (density * grid.spacing**2)
         )
@@ -116,13 +119,13 @@ class SurfaceTension:
         self._energy = WindowTally(self._passes.energy, grid)
         self._blocked = grid.field(wp.int8)
         self._capacity, self._lean = boundary.capacity, grid.field()
-        # kick_dt sigma / (rho dx^2); by which gradients are multiplied
+        # kick_dt sigma / (rho dx^2), and the factor on velocity gradients.
         self._scale, self._factor = Scalar(), Scalar()
-        # cells whose energy has been measured; None: none have liquid
+        # Cells of the last energy measurement; None without liquid.
         self._measured: ActiveWindow | None = None
         self._cells = ActiveWindow(grid.domain)
-        shared = grid.part.shared  # then ranks exchange halos, and their particles are others
-        # the lists of wall cells are rebuilt
+        shared = grid.part.shared  # then ranks exchange halos, and their particles change
+        # Moving solids change the lists of wall cells.
         self._pushing = LaunchGraph(grid.device, self._push, at_once=shared or boundary.moves)
         self._calming = LaunchGraph(grid.device, self._calm, at_once=shared)
         self._measuring = LaunchGraph(
@@ -132,7 +135,7 @@ class SurfaceTension:
         self._find_walls()
 
     def longest_step(self) -> float:
-        """Return the longest step [s] that is stable with the most passes."""
+        """Return the longest step [s] that is stable with the largest number of passes."""
         return self._step_of(MOST_PASSES)
 
     def _step_of(self, passes: int) -> float:
@@ -140,7 +143,7 @@ class SurfaceTension:
         return math.sqrt(4.0 * self.density * spread**3 / (SAFETY * STIFFEST * self.coefficient))
 
     def _passes_for(self, kick_dt: float) -> int:
-        """Return how many passes a step takes."""
+        """Return the number of filter passes of a step."""
         return next(
             (m for m in range(PASSES, MOST_PASSES) if self._step_of(m) >= kick_dt), MOST_PASSES
         )
@@ -148,13 +151,13 @@ class SurfaceTension:
     def act(
         self, velocity: Sequence[wp.array], window: Window, kind: wp.array, kick_dt: float
     ) -> None:
-        """Push the faces that the surface crosses.
+        """Apply the pressure jump to the faces that the surface crosses.
 
         Args:
             velocity: u* of each component [m/s] (updated).
-            window: cells that hold all FLUID cells, with some to spare on each side.
+            window: cells that hold all FLUID cells, with a margin on each side.
             kind: int8 of AIR, FLUID, SOLID, as `phi` marks them.
-            kick_dt: how long forces act [s].
+            kick_dt: time that forces act [s].
         """
         if self.boundary.moves:
             self._find_walls()
@@ -162,12 +165,15 @@ class SurfaceTension:
         self._once, self._twice, self._bend = self._roles(passes)
         self._shares = SurfaceShares(self._once, self._twice, *_profile(passes))
         self._scale.value = kick_dt * self.coefficient / (self.density * self.grid.spacing**2)
-        if self._cosine != 0.0:  # the last step has left those of its surface
+        if self._cosine != 0.0:  # clear the jump of the last step's surface
             self._lean.fill_(self._cosine)
         self._pushing.run(velocity, window, kind, passes, variant=(passes, window.near is None))
 
     def _roles(self, passes: int) -> tuple[wp.array, wp.array, wp.array]:
-        """Return the fields of the shares after so many passes and after twice as many, and that of the curvature."""
+        """Return the fields of both filtered fractions and of the curvature.
+
+        The fractions are those after the given number of passes and after twice as many.
+        """
         once = self._fields[1:][passes % 2]
         twice = [field for field in self._fields if field is not once][passes % 2]
         (bend,) = (field for field in self._fields if field is not once and field is not twice)
@@ -176,10 +182,10 @@ class SurfaceTension:
     def _push(
         self, velocity: Sequence[wp.array], window: Window, kind: wp.array, passes: int
     ) -> None:
-        """Launch what `act` does."""
+        """Launch the kernels of `act`."""
         grid, planes, bend = self.grid, self.grid.planes, self._bend
         self._find_curvature(window, passes)
-        if self._cosine != 0.0:  # how the surface goes on into walls depends on its curvature
+        if self._cosine != 0.0:  # the extension into walls depends on the curvature
             s, bending = self._shares, 1.0 / (grid.dimension - 1)
             shares = [s.linear, s.cubic, s.once, s.twice]
             inputs = [
@@ -209,9 +215,12 @@ class SurfaceTension:
             window.run(self._passes.push, self._faces(kind), jump=self.jump, field=field, axis=axis)
 
     def _find_curvature(self, window: Window, passes: int) -> None:
-        """Find the curvature [1/cells] in cells near the surface, and continued into walls: its nearest point may lie in one."""
+        """Compute the curvature [1/cells] near the surface, and extend it into walls.
+
+        The nearest point of the surface may lie in a wall.
+        """
         first, *free = self._fields
-        # passes look beyond the window, where an earlier step may have left something
+        # The passes read cells outside of the window, where an earlier step may have left values.
         clear(*self._fields)
         capacity = self._capacity if self._cosine != 0.0 else None
         window.launch(
@@ -232,14 +241,14 @@ class SurfaceTension:
         self._continue(self._bend, 0, 0.0)
 
     def calm(self, particles: Particles, dt: float) -> None:
-        """Take from particles near the surface what ripples shorter than the filter leave in their gradients: nothing pulls these back.
+        """Damp velocity gradients shorter than the filter on particles near the surface.
 
-        Without it they grow from the particles' noise, for APIC damps next to nothing, and take the
-        surface apart.
+        Ripples shorter than the filter have no restoring force. Without damping they grow from the
+        noise of the particles, since APIC has nearly no dissipation, and destroy the surface.
 
         Args:
-            particles: the liquid (updated: gradients, and their numbers, as a narrow band may have
-                added and taken some).
+            particles: the liquid (updated: gradients; also their numbers, as a narrow band may have
+                added and removed particles).
             dt: time step [s].
         """
         self._factor.value = math.exp(
@@ -248,7 +257,7 @@ class SurfaceTension:
         self._calming.run(particles)
 
     def _calm(self, particles: Particles) -> None:
-        """Launch what `calm` does."""
+        """Launch the kernels of `calm`."""
         particles.number()
         for gradient in particles.affine:
             listed = [
@@ -261,7 +270,7 @@ class SurfaceTension:
             launch_list(kernels.calm_kernel, particles.count, listed, device=self.grid.device)
 
     def measure(self, window: Window, kind: wp.array) -> None:
-        """Find the energy, for `energy` to tell."""
+        """Compute the surface energy, which `energy` returns."""
         box = window.common(self.grid.part.owned)
         self._measured = None if box is None else self._cells
         if box is not None:
@@ -270,7 +279,10 @@ class SurfaceTension:
             self._energy.changed()
 
     def energy(self) -> float:
-        """Return the energy of surface and wet walls when it was last measured [J; J/m in 2-D]: sigma (area - cos(angle) wet area)."""
+        """Return the last measured energy of surface and wet walls [J; J/m in 2-D].
+
+        It is sigma (area - cos(angle) wet area).
+        """
         mine = self._energy.read() if self._measured is not None else [0.0, 0.0]
         area, wetted = self.grid.part.ranks.sum(np.array(mine)).tolist()
         return (
@@ -280,7 +292,7 @@ class SurfaceTension:
         )
 
     def _faces(self, kind: wp.array) -> LiquidBoundary:
-        """Return the cells, the surface and the walls, which rest."""
+        """Return cells, surface and walls as a kernel struct, with walls at rest."""
         return LiquidBoundary(
             kind,
             self._phi,
@@ -292,15 +304,18 @@ class SurfaceTension:
     def _smoothed(
         self, window: Window, source: wp.array, free: Sequence[wp.array], passes: int, before: int
     ) -> wp.array:
-        """Return the source after binomial passes, in one of two free fields; so many passes are `before` them."""
+        """Return the source after binomial passes, in one of two free fields.
+
+        `before` passes have been applied to the source already.
+        """
         self._continue(source, before, self._cosine)
-        # `begin_kernel` looks farther than others' cells are known
+        # `begin_kernel` reads more layers of ghost cells than are filled.
         if before == 0 and self._cosine != 0.0:
             self.grid.part.fill(source)
         for done in range(1, passes + 1):
             out = free[done % 2]
             window.run(BINOMIAL, planes=self.grid.planes, source=source, out=out)
-            # a pass looks a cell far, and what goes on into walls three
+            # A pass reads one layer of ghost cells, the extension into walls three.
             if done % 2 == 0 or done == passes:
                 self.grid.part.fill(out)
             self._continue(out, before + done, self._cosine)
@@ -308,20 +323,23 @@ class SurfaceTension:
         return source
 
     def _continue(self, field: wp.array, passes: int, cosine: float) -> None:
-        """Continue a share into walls, after so many passes; with a cosine of 0 whatever a field has."""
+        """Extend a smoothed fraction into walls after the given number of passes.
+
+        With a cosine of 0 any field is extended by mirroring.
+        """
         walls, fields = (
             [*self._walls, self._lean.flatten(), cosine],
             [self.grid.planes, self._blocked, field, field.flatten()],
         )
         kernel, spread = kernels.continue_kernel, [math.sqrt(0.25 + 0.5 * passes)]
-        if passes == 0 and cosine != 0.0:  # a cell's kernel has no tails
+        if passes == 0 and cosine != 0.0:  # a cell's kernel has compact support
             kernel, spread = kernels.begin_kernel, []
         launch_list(
             kernel, len(self._walls[0]), [*walls, *spread, *fields], device=self.grid.device
         )
 
     def _find_walls(self) -> None:
-        """Find the cells of walls that passes read, and where what they get comes from."""
+        """Find the wall cells that passes read, and the source points of their values."""
         distance, device = self.boundary.distance, self.grid.device
         blocked, *lists = wall_cells(
             self.grid, self.boundary.base.numpy(), None if distance is None else distance.numpy()
@@ -334,7 +352,7 @@ class SurfaceTension:
 
 
 def _profile(passes: int) -> tuple[float, float]:
-    """Return the series of the distance [cells] in the share 2 once - twice less 1/2, across a plane."""
+    """Return the coefficients of the distance to a plane, see `SurfaceShares`."""
     narrow, wide = (math.sqrt(0.25 + 0.5 * count) for count in (passes, 2 * passes))
     first, third = ((2.0 / narrow**n - 1.0 / wide**n) / math.sqrt(2.0 * math.pi) for n in (1, 3))
     return 1.0 / first, third / (6.0 * first**4)
@@ -343,20 +361,22 @@ def _profile(passes: int) -> tuple[float, float]:
 def wall_cells(
     grid: StaggeredGrid, base: np.ndarray, distance: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return which cells are walls, and of those beside open ones: flat index, the point before the wall that each reads, and how far.
+    """Return the wall cells beside open ones, and the points that they mirror.
 
-    A cell whose center lies in a solid is a wall, mirrored along the solid's normal; so is each of
-    the ring or, without a distance, of a solid's whole cells, mirrored along the axes.
+    A cell whose center lies in a solid is a wall cell, mirrored along the solid's normal. Cells of
+    the ring and, without a distance, those of a solid's whole cells are mirrored along the axes.
 
     Args:
         grid: the grid.
         base: int8, SOLID or AIR, in the stored shape.
-        distance: to solids at the cells' low corners [cells]; None: solids are whole cells.
+        distance: distance to solids at the cells' low corners [cells]; None: solids are whole
+            cells.
 
     Returns:
-        `blocked`, int8 in the stored shape; the cells, int32, shape (n,); the points (i, j, k) in
-        cells' numbers, shape (n, 3); the ways [cells], and how far in the open the middle of each
-        lies, 0 of a mirror, shape (n,); float32.
+        `blocked`, int8 in the stored shape; the flat indices of the cells, int32, shape (n,); their
+        mirror points (i, j, k) in units of cells, shape (n, 3); the distances from cell to point
+        [cells], and the distance of their middle from the wall, 0 for a mirror image, shape (n,);
+        float32.
     """
     flat, ends = grid.dimension == 2, np.array(base.shape) - 1
     inner = np.zeros(base.shape, dtype=bool)
@@ -371,17 +391,17 @@ def wall_cells(
     steps = [
         np.array(s) - 1 for s in np.ndindex(3, 3, 3) if s != (1, 1, 1) and not (flat and s[0] != 1)
     ]
-    # and cells that have part of their face open ask for one layer more
+    # Cells with a partly open face need one more layer.
     near = _beside(~blocked, steps)
     cells = np.argwhere(blocked & (near | (_beside(near, steps) & (center < 0.0) & inner)))
     first, sides, least = np.zeros_like(cells), np.zeros_like(cells), np.full(len(cells), 4)
-    # faces, then edges, then corners
+    # Neighbors across faces, then edges, then corners.
     for step in sorted(steps, key=lambda s: int(np.abs(s).sum())):
         there, size = padded[tuple((cells + 1 + step).T)], int(np.abs(step).sum())
         first[there & (least == 4)] = step
         least[there & (least == 4)] = size
         sides[there & (least == size)] += step
-    # between two open neighbors lies the cell that mirrors both walls, if it is open
+    # The cell between two open neighbors mirrors both walls, if it is open.
     sides = np.sign(sides)
     both = padded[tuple((cells + 1 + sides).T)]
     toward = np.where(both[:, None], sides, first)
@@ -394,7 +414,7 @@ def wall_cells(
     solid = np.flatnonzero((center[at] < 0.0) & inner[at])
     depth, along = -2.0 * center[at][solid], normal.reshape(3, -1)[:, flat_index[solid]].T
     corners = [np.array(corner) for corner in np.ndindex(1 if flat else 2, 2, 2)]
-    for _ in range(FARTHER):  # until no cell of a wall is among those around the point
+    for _ in range(FARTHER):  # until no wall cell is among those around the point
         mirrored = np.clip(cells[solid] + depth[:, None] * along, 1, ends - 1)
         around = [np.minimum(np.floor(mirrored).astype(int) + corner, ends) for corner in corners]
         depth += 0.25 * np.logical_or.reduce([blocked[tuple(cell.T)] != 0 for cell in around])
@@ -403,7 +423,7 @@ def wall_cells(
 
 
 def _beside(marked: np.ndarray, steps: list[np.ndarray]) -> np.ndarray:
-    """Return which cells have a marked one at one of the steps from them."""
+    """Return the cells that have a marked cell at one of the given steps."""
     padded = np.pad(marked, 1)
     return np.logical_or.reduce(
         [
@@ -414,7 +434,10 @@ def _beside(marked: np.ndarray, steps: list[np.ndarray]) -> np.ndarray:
 
 
 def _at_centers(nodes: np.ndarray, flat: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean of the values at each cell's corners, and the unit vector (k, j, i) along which they grow; `flat`: in 2-D."""
+    """Return the mean over each cell's corners, and the unit gradient (k, j, i).
+
+    `flat` is True in 2-D.
+    """
     axes = (1, 2) if flat else (0, 1, 2)
     center, slopes = nodes.astype(np.float64), np.zeros((3, *nodes.shape))
     for axis in axes:
@@ -427,7 +450,7 @@ def _at_centers(nodes: np.ndarray, flat: bool) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _next(field: np.ndarray, axis: int) -> np.ndarray:
-    """Return each element's successor along an axis, the last one's own."""
+    """Return each element's successor along an axis; the last one is repeated."""
     return np.concatenate(
         [field.take(range(1, field.shape[axis]), axis), field.take([-1], axis)], axis
     )

@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Kernels of surface tension: the smoothed share of liquid beside walls, its curvature, the push on the surface, its energy."""
+"""Kernels of surface tension: extension into walls, curvature, push, energy."""
 
 import functools
 from pathlib import Path
@@ -15,16 +15,16 @@ from warp_lcp.rows import KernelFile
 
 MODULE = "fluids.surface_tension"
 FLOATS = wp.array(dtype=wp.float32)
-TAIL = wp.constant(1e-6)  # shares nearer to 0 or 1 have no place on the profile
-# cells; no kernel within reach of a wall's cell is cut by a surface that is farther from it
+TAIL = wp.constant(1e-6)  # Fractions nearer to 0 or 1 than this have no distance in the profile.
+# A surface farther from a wall's cell than this cuts no kernel that the extension reads [cells].
 FARAWAY = wp.constant(4.0)
-# cells, from beside a wall and along it, to where the surface's curvature is asked for
+# Offsets from the wall, and largest distance along it, at which the curvature is read [cells].
 FURTHER, MOST = wp.constant(2.0), wp.constant(3.0)
-# cells from the surface, beyond which parallel surfaces meet a wall as they do there
+# Distance from the surface beyond which parallel surfaces meet a wall at the same angle [cells].
 NEAR = wp.constant(2.0)
-BAND = 0.02  # cells whose share is nearer to 0 or 1 are too far from the surface to matter
-HALF = 0.3  # the part of the shares on either side of the surface that its area is found from
-FARTHEST = 1.5  # cells from one beside the surface to the smooth surface
+BAND = 0.02  # fractions nearer to 0 or 1 than this are too far from the surface
+HALF = 0.3  # range of the fraction on either side of 1/2 within which the area is integrated
+FARTHEST = 1.5  # largest distance of a cell beside the surface from the smooth surface [cells]
 KERNELS = KernelFile(
     Path(__file__).parent / "headers/surface_tension.h",
     CONSTANTS | {"BAND": BAND, "FARTHEST": FARTHEST, "THETA_MIN": THETA_MIN, "HALF": HALF},
@@ -35,21 +35,28 @@ JUMP = KERNELS["fluids.surface_tension.jump"]
 
 @functools.cache
 def push_pass(cut: bool) -> SimpleNamespace:
-    """Return `push`, which acts on the velocity, and `energy`, which sums the surface up; `cut`: whether faces have open fractions."""
-    made = functools.partial(
+    """Return the kernels `push` and `energy`, with or without open fractions.
+
+    `push` acts on the velocity; `energy` sums the surface's energy. `cut` is True if faces have
+    open fractions.
+    """
+    kernel = functools.partial(
         KERNELS.kernel,
         module=MODULE + "_cut" * cut,
         constants={"CUT": cut, "MOVING": False, "GHOST": True},
     )
     return SimpleNamespace(
-        push=made("fluids.surface_tension.push"),
-        energy=made("fluids.surface_tension.surface_energy"),
+        push=kernel("fluids.surface_tension.push"),
+        energy=kernel("fluids.surface_tension.surface_energy"),
     )
 
 
 @wp.func
 def filled(s: float):
-    """Return the share of a cell's kernel that a half space filled up to s cells from its center holds, see `warp_lcp.grid.level_set`."""
+    """Return the fraction of a cell's kernel within a half space.
+
+    The half space ends s cells from the cell's center, see `warp_lcp.grid.level_set`.
+    """
     t = wp.min(1.5 - wp.abs(s), 1.0)
     share = t * t * t / 6.0
     if wp.abs(s) < 0.5:
@@ -60,17 +67,17 @@ def filled(s: float):
 
 @wp.func
 def walled(part: float):
-    """Return how far into a wall the mean place of a part of a cell's kernel lies [cells], and its variance, of the part that a wall takes.
+    """Return mean distance and variance of the part of a kernel that a wall takes.
 
-    It is what lies c or more from the center: the kernel is (3/2 - t)^2 / 2 there, and 3/4 - t^2 up
-    to t = 1/2.
+    The part of a cell's kernel in the wall is everything c or more from the center [cells], since
+    the kernel is (3/2 - t)^2 / 2 there, and 3/4 - t^2 up to t = 1/2.
     """
     u = wp.pow(wp.min(6.0 * part, 1.0), 1.0 / 3.0)  # 3/2 - c
     place = 1.5 - 0.75 * u
     variance = 0.0375 * u * u
     if part > 1.0 / 6.0:
         c = float(0.0)
-        for _step in range(4):  # Newton's, for 1/2 - 3/4 c + c^3 / 3 = part
+        for _step in range(4):  # Newton's method for 1/2 - 3/4 c + c^3 / 3 = part
             c -= (0.5 - 0.75 * c + c * c * c / 3.0 - part) / (c * c - 0.75)
         c = wp.max(c, 0.0)
         place = (0.203125 - 0.375 * c * c + 0.25 * c * c * c * c) / part
@@ -82,13 +89,13 @@ def walled(part: float):
 
 @wp.func
 def whole_share(open_share: float, capacity: float, cosine: float):
-    """Return the share of a whole kernel of which a wall takes a part, of what liquid fills of the open part.
+    """Return the filled fraction of a whole kernel, from that of its open part.
 
-    Particles know of the open part alone, whose mean place lies off the center: a surface that is
-    inclined to the wall seems to lie lower there, by 0.15 cells times the cosine beside a whole
-    cell's wall. In the wall the surface goes on as in `continue_kernel`. With d its distance from
-    the center the whole share is G(-d), the wall's part of it a normal distribution's, and the
-    difference what is open.
+    Particles represent only the open part, whose centroid is off the cell's center. A surface
+    inclined to the wall therefore seems to lie lower there, by 0.15 cells times the cosine beside a
+    whole cell's wall. Inside the wall the surface is extended as in `continue_kernel`. With d its
+    distance from the center the whole fraction is G(-d). The wall's part is that of a normal
+    distribution, and the difference is the open part. The distance d is found by bisection.
     """
     part = wp.min(1.0 - capacity, 0.5)
     beyond = walled(part)
@@ -107,14 +114,17 @@ def whole_share(open_share: float, capacity: float, cosine: float):
 
 @cell_kernel(MODULE)
 def share_kernel(k, j, i, phi: FIELD, blocked: MARKS, capacity: FIELD, cosine: float, share: FIELD):
-    """Say how full the kernel of each open cell is; with a `capacity` of those of which walls take a part, phi is of the rest alone."""
-    found = float(0.0)
+    """Compute the filled fraction of the kernel of each open cell.
+
+    With `capacity`, the open fractions beside walls, phi belongs to the open part only.
+    """
+    value = float(0.0)
     if blocked[k, j, i] == wp.int8(0):
-        found = filled(-phi[k, j, i])
+        value = filled(-phi[k, j, i])
         if capacity:
-            if capacity[k, j, i] < 0.999 and found > TAIL and found < 1.0 - TAIL:
-                found = whole_share(found, capacity[k, j, i], cosine)
-    share[k, j, i] = found
+            if capacity[k, j, i] < 0.999 and value > TAIL and value < 1.0 - TAIL:
+                value = whole_share(value, capacity[k, j, i], cosine)
+    share[k, j, i] = value
 
 
 @wp.func
@@ -126,7 +136,10 @@ def distance_of(k: int, j: int, i: int, once: FIELD, twice: FIELD, linear: float
 
 @wp.func
 def away_from(cell: int, ny: int, nx: int, p: wp.vec3):
-    """Return the direction from the center of a cell, by its flat index on a grid of ny rows of nx cells, to a point [cells]."""
+    """Return the direction from a cell's center to a point [cells].
+
+    The cell is a flat index on a grid of ny rows of nx cells.
+    """
     k = cell // (ny * nx)
     j = (cell - k * ny * nx) // nx
     away = p - wp.vec3(float(cell - k * ny * nx - j * nx), float(j), float(k))
@@ -150,17 +163,18 @@ def lean_kernel(
     bend: FIELD,
     lean: FLOATS,
 ):
-    """Find by how much the distance d to the surface falls into a wall's cell, each cell of the way, so that the two meet at their angle.
+    """Compute the slope of the distance to the surface along the way into a wall.
 
-    Where the surface meets the wall that is the cosine. At d from there, on the wall, parallel
-    surfaces meet it at other angles, of cosine (1 - kappa d), kappa the surface's curvature
-    [1/cells] across the line where they meet: `part` of the whole one. It is taken where the
-    surface is nearest, two cells further from the wall, beside which it is not right before this is
-    known.
+    The slope is the fall of the distance d per cell of the way from the point to the wall's cell,
+    such that the surface meets the wall at the contact angle. Where the surface meets the wall the
+    slope is the cosine of that angle. At d from there, on the wall, parallel surfaces meet it at
+    other angles, of cosine (1 - kappa d). Here kappa is the surface's curvature [1/cells] across
+    the contact line: `part` of the whole curvature. It is read at the nearest point of the surface,
+    two cells away from the wall: beside the wall it is not accurate before the slope is known.
 
-    The way's middle lies `raised` cells before a wall that cuts cells, where its ends were moved
-    into the open. Of a circle of radius 1/kappa whose center is cosine / kappa behind the wall,
-    that is raised + cosine / kappa from the middle, which takes the cosine's place.
+    The middle of the way lies `raised` cells in front of a wall that cuts cells, if its ends were
+    moved into the open. From the middle, the center of a circle of radius 1/kappa, cosine / kappa
+    behind the wall, is at a distance of raised + cosine / kappa. This sum replaces the cosine.
     """
     p = points[i]
     away = away_from(cells[i], bend.shape[1], bend.shape[2], p)
@@ -186,7 +200,7 @@ def lean_kernel(
     steep = wp.max(wp.dot(slope, slope), 0.1)
     q = FURTHER * away - slope * (d / steep)
     cell = wp.vec3(float(a), float(b), float(c))
-    # at the point itself, which lies between cells where the wall's cell is cut
+    # Correct to the point itself, which lies between cells if the wall's cell is cut.
     d += wp.dot(slope, p - cell)
     q = cell + q * wp.min(MOST / wp.max(wp.length(q), 1e-6), 1.0)
     a = wp.clamp(int(wp.floor(q[0])), 1, bend.shape[2] - 2)
@@ -216,7 +230,7 @@ def lean_kernel(
 
 @wp.func
 def distance_for(share: float):
-    """Return the distance [cells] at which `filled` gives this share of a cell's kernel, by bisection."""
+    """Return the distance [cells] at which `filled` equals a fraction, by bisection."""
     low = float(-1.5)
     high = float(1.5)
     for _step in range(16):
@@ -230,7 +244,10 @@ def distance_for(share: float):
 
 @wp.func
 def open_mean(p: wp.vec3, planes: int, blocked: MARKS, share: FIELD):
-    """Return the share interpolated at a point from the open cells around it, and the weight of these cells, 0 if there are none."""
+    """Interpolate the fraction from the open cells around a point.
+
+    Also returns the sum of the weights of these cells, 0 without open cells.
+    """
     a = int(wp.floor(p[0]))
     b = int(wp.floor(p[1]))
     c = int(wp.floor(p[2]))
@@ -265,12 +282,13 @@ def begin_kernel(
     share: FIELD,
     flat: FLOATS,
 ):
-    """Continue the share of cells' kernels into a wall's cell, as `continue_kernel` does with smoothed shares.
+    """Extend the fraction of cells' kernels into a wall's cell.
 
-    A kernel is 3 cells wide. Before a wetted wall it may hold no liquid where that of the wall's
-    cell, which the surface reaches first, does. There the distance to the surface follows from
-    cells around: it grows by the angle's cosine away from the wall and by its sine along it. The
-    same holds for air at a wall that liquid does not wet.
+    A kernel is 3 cells wide. In front of a wetted wall the kernel may hold no liquid where that of
+    the wall's cell does, which the surface reaches first. There the distance to the surface follows
+    from the surrounding cells: it grows by the angle's cosine away from the wall and by its sine
+    along the wall. The same holds for air at a wall that the liquid does not wet. Elsewhere this is
+    the extension of `continue_kernel`.
     """
     p = points[i]
     away = away_from(cells[i], share.shape[1], share.shape[2], p)
@@ -283,7 +301,7 @@ def begin_kernel(
         if value > TAIL and value < 1.0 - TAIL:
             value = filled(fall - distance_for(value))
         else:
-            # empty before a wall that liquid wets, or full before one that it does not
+            # Empty in front of a wetted wall, or full in front of one that is not wetted.
             if (value - 0.5) * cosine < 0.0:
                 sign = wp.where(cosine > 0.0, 1.0, -1.0)
                 sine = wp.sqrt(wp.max(1.0 - cosine * cosine, 0.0))
@@ -321,11 +339,13 @@ def continue_kernel(
     share: FIELD,
     flat: FLOATS,
 ):
-    """Continue the share into a wall's cell from the open cells around a point before the wall, `way` cells nearer to the open.
+    """Extend the smoothed fraction into a wall's cell from a mirror point.
 
-    Along it the distance to the surface falls by `lean`, if the cosine is not 0; a profile of the
-    normal distribution with the spread [cells] turns shares into distances and back. A cell reads
-    open cells and writes none.
+    The point lies `way` cells away in the open, and the fraction is interpolated from the open
+    cells around it. Along the way the distance to the surface falls by `lean` per cell, if the
+    cosine is not 0. The profile, a normal distribution of standard deviation `spread` [cells],
+    converts fractions to distances and back. Each thread reads open cells and writes a wall cell:
+    there are no races.
     """
     p = points[i]
     value, weight = open_mean(p, planes, blocked, share)
@@ -338,6 +358,6 @@ def continue_kernel(
 
 @list_kernel(MODULE)
 def calm_kernel(i, factor: float, deepest: float, key: INTS, phi: FLOATS, gradient: POINTS):
-    """Weaken a velocity's gradient in particles whose cell is near the surface."""
+    """Scale the velocity gradients of particles in cells near the surface."""
     if phi[key[i]] > deepest:
         gradient[i] = factor * gradient[i]

@@ -1,4 +1,4 @@
-"""Tables of a liquid's scene: what is measured in it, and how walls slow it down."""
+"""Scene tables of a liquid: wall drag and probes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,10 @@ from warp_lcp.settings import NonNegative
 
 
 class WallDragSettings(Table):
-    """[wall_drag]: drag of walls with an unresolved boundary layer; off without the table and `drag` of a solid."""
+    """[wall_drag]: drag of walls with an unresolved boundary layer.
+
+    Off without the table and without `drag` of a solid.
+    """
 
     coefficient: NonNegative = Field(
         default=0.0,
@@ -25,7 +28,7 @@ class WallDragSettings(Table):
 
 
 def _column_name(text: str) -> str:
-    """Return a name that columns may begin with."""
+    """Return a valid prefix of column names."""
     if not (text.isascii() and text.isidentifier()):
         raise PydanticCustomError(
             "name", 'must consist of letters, digits and "_", and not begin with a digit'
@@ -45,7 +48,7 @@ class Probe(Table):
     )
 
     def columns(self, dimension: int) -> tuple[str, ...]:
-        """Return the names of its columns."""
+        """Return the column names of the probe."""
         parts = ("vx", "vy", "vz")[:dimension] if self.quantity == "velocity" else (self.quantity,)
         return tuple(f"{self.name}_{part}" for part in parts)
 
@@ -53,18 +56,18 @@ class Probe(Table):
 def probe_complaints(
     probes: Sequence[Probe], size: Sequence[float], gravity: Sequence[float]
 ) -> list[Complaint]:
-    """Return what is wrong with the probes of a domain of these sides [m], in such a gravity [m/s^2]."""
-    found = []
+    """Return errors of the probes in a domain of given sides [m] and gravity [m/s^2]."""
+    complaints = []
     for index, probe in enumerate(probes):
         place = ("probe", index, "position")
         if len(probe.position) != len(size):
-            found.append(
+            complaints.append(
                 Complaint(
                     place, probe.position, f"must have {len(size)} entries, as domain.size has"
                 )
             )
         elif not all(0.0 <= x <= side for x, side in zip(probe.position, size, strict=True)):
-            found.append(
+            complaints.append(
                 Complaint(
                     place,
                     probe.position,
@@ -78,13 +81,13 @@ def probe_complaints(
                 f"is also the name of another probe of the {probe.quantity}: log columns "
                 "must differ"
             )
-            found.append(Complaint(("probe", index, "name"), probe.name, message))
+            complaints.append(Complaint(("probe", index, "name"), probe.name, message))
         if probe.quantity == "level" and not any(gravity):
-            found.append(
+            complaints.append(
                 Complaint(
                     ("probe", index, "quantity"),
                     "level",
                     "needs gravity, along which it is measured",
                 )
             )
-    return found
+    return complaints

@@ -15,14 +15,13 @@ from warp_lcp.rows.vectors import Across, Reduction, convert, rows_of
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/pressure.h")
 CHANGE = KERNELS["tolerance.change"]
-FRACTION = 0.1  # of the time step's error that the solve may leave
-# relative residual of the first steps, before which there is no change to measure: a liquid that is
-# at rest shall stay so
+FRACTION = 0.1  # share of the time step's error that the solve may add
+# Relative residual of the first steps, when no change has been measured. A liquid at rest must stay
+# at rest.
 FIRST = 1e-4
-# relative residual than which none is asked to be smaller: rounding on the faces is what is left
-# then
+# Smallest relative residual: below it the rounding of the faces dominates.
 LEAST = 1e-6
-# relative residual that is always asked for: what follows a collision must not be taken as it is
+# Largest relative residual: the step after a collision must not be solved too loosely.
 MOST = 0.1
 
 
@@ -31,35 +30,35 @@ class TimeErrorTolerance:
 
     A step assumes a constant acceleration by the pressure. To first order its velocity error is
     half of the change of this acceleration from one step to the next. The first guess of a solve is
-    just the last step's pressure, x0 = x_last kick_dt / kick_dt_last:
+    the last step's pressure, x0 = x_last kick_dt / kick_dt_last, so that
 
         time error = 1/2 ||G (x - x0)||,   ||G e||^2 = e'A e,
 
-    with G the gradient: in the energy norm of A an error in x is one in the velocity. It is
-    measured once x is known, and used for the next step, times (kick_dt / kick_dt_last)^2 where
-    that is shorter.
+    with G the gradient: in the energy norm of A, the error in x is the error in the velocity. It is
+    measured after the solve, and used for the next step, scaled by (kick_dt / kick_dt_last)^2 if
+    that step is shorter.
 
-    What a solve leaves is e with residual r = A e. Multigrid cycles leave errors that are as short
-    as the cells, on which A is of order one: looked at in forty steps of dam-break-2d,
+    The remaining error e of a solve has the residual r = A e. Multigrid cycles leave errors of
+    wavelengths near the cell size, for which A is of order one: in forty steps of dam-break-2d,
     splash-in-circle, mesh-obstacle and wave-maker, ||G e|| = 0.12 to 1.0 ||r|| after one to six
-    cycles. So a solve is done when ||r|| <= FRACTION time error, which costs nothing to test.
+    cycles. So a solve ends when ||r|| <= FRACTION time error, a test without extra cost.
 
     Liquid at rest and in free fall has residuals of rounding noise, which the absolute tolerance
     covers.
 
     Args:
-        size: elements of a stored field.
-        device: where they live.
+        size: number of elements of a stored field.
+        device: their device.
         across: communicator; None if serial.
 
     Attributes:
-        used: relative residual that the last solve was held to.
+        used: relative residual that was the criterion of the last solve.
     """
 
     def __init__(self, size: int, device: wp.Device, across: Across | None = None) -> None:
         self.used = FIRST
         self._error: float | None = None
-        # whether a step came before; whether `_sum` has an error that has not been asked for
+        # Whether there was a previous step, and whether `_sum` has an error that was not read yet.
         self._warm = self._change = False
         self._unknowns = 1
         self._reference = 0.0  # residual of the last step at x = 0, root mean square [m/s]
@@ -71,7 +70,7 @@ class TimeErrorTolerance:
 
         Args:
             ratio: kick_dt / kick_dt_last; 0 without a last step.
-            atol: for rounding, root mean square [m/s].
+            atol: rounding error, root mean square [m/s].
         """
         self._warm = ratio > 0.0
         if not self._warm or self.time_error is None:
@@ -90,12 +89,15 @@ class TimeErrorTolerance:
     ) -> None:
         """Estimate the time discretization error from a solution.
 
+        It computes e'A e for e = x - x0, the squared norm of the velocity change; `time_error`
+        reads the sum later, without a wait here.
+
         Args:
             A: the operator.
-            result: of the solve.
-            criteria: of the solve.
+            result: the solve's result.
+            criteria: its stopping criteria.
             fields: its first guess and another stored float64 field (both overwritten).
-            unknowns: of the problem.
+            unknowns: their number.
         """
         reference = (
             result.residual / result.relative_residual if result.relative_residual > 0.0 else 0.0
@@ -103,12 +105,12 @@ class TimeErrorTolerance:
         self.used = criteria.tolerance(reference) / reference if reference > 0.0 else 0.0
         self._reference = reference / max(unknowns, 1) ** 0.5
         self._unknowns, self._change = max(unknowns, 1), self._warm
-        if not self._warm:  # from rest to motion is no change of an acceleration
+        if not self._warm:  # the start of motion is no change of an acceleration
             self._error = None
             return
         change, product = (field.flatten() for field in fields)
         x = result.x.flatten()
-        if x.dtype is not wp.float64:  # of a method in single precision
+        if x.dtype is not wp.float64:  # methods in single precision
             convert(x, product)
             x = product
         CHANGE.bind(rows_of(x), x=x, guess=change).launch()

@@ -1,4 +1,4 @@
-"""Unilateral pressure: it only prevents over-filled cells, without suction."""
+"""Unilateral pressure: it prevents overfull cells and has no suction."""
 
 from __future__ import annotations
 
@@ -26,60 +26,60 @@ from warp_lcp.rows.readings import Reading
 class UnilateralPressure(PressureProjection):
     """Unilateral pressure: 0 <= p complementary to the free volume of a cell >= 0.
 
-    The problem has all cells that are not SOLID.
+    The model follows Narain et al. (2010) and Gerszewski and Bargteil (2013), as reported in [Book]
+    1.3; the discrete law is derived here. All cells that are not SOLID are unknowns.
 
-    After Narain et al. (2010) and Gerszewski and Bargteil (2013), as reported in [Book] 1.3; the
-    discrete law is derived here.
-
-    rho_i is the density of the particles in units of that at rest, capacity_i what fits beside
-    walls, a_f the open fraction of a face, s_f = +-1 outward. A cell is filled to f_i = min(rho_i /
-    (FULL capacity_i), 1), f_f is that of a face. The pressure accelerates it:
+    rho_i is the density of the particles relative to that at rest, capacity_i the part of the
+    kernel that walls leave open, a_f the open fraction of a face, and s_f = +-1 outward. The filled
+    fraction of a cell is f_i = min(rho_i / (FULL capacity_i), 1), and f_f is that of a face. The
+    pressure changes the momentum of a face:
 
         f_f u_f = f_f u*_f - (x_right - x_left),   x = kick_dt p / (rho_0 dx) [m/s].
 
-    With what passes a face, q_f = a_f f_f u*_f + (1 - a_f) u_s,f (a solid that comes in takes room:
-    the second term),
+    The flux through a face is q_f = a_f f_f u*_f + (1 - a_f) u_s,f; its second term is the volume
+    that a moving solid takes. Then
 
-        y_i = room_i + settling_i + sum of s_f q_f + sum of a_f (x_i - x_neighbor),   0 <= x complementary to y >= 0,
-        room_i = max(dx / dt, what flows in) max(capacity_i - rho_i / FULL, 0),
-        settling_i = c (capacity_i - rho_i), within +-(1 - FULL) c,
+        y_i = room_i + settling_i + sum of s_f q_f + sum of a_f (x_i - x_neighbor),
+        0 <= x complementary to y >= 0,
+        room_i = max(dx / dt, inflow) max(capacity_i - rho_i / FULL, 0),
+        settling_i = c (capacity_i - rho_i), within +-(1 - FULL) c.
 
-    whose matrix is symmetric and has no density in it, since it is the momentum f_f u_f and not the
-    velocity that the pressure's gradient changes. Where a cell has room for what flows in, x = 0:
-    nothing holds liquid together, and walls let go as air does.
+    The matrix is symmetric and does not depend on the density, since the pressure gradient changes
+    the momentum f_f u_f and not the velocity. Where a cell has room for the inflow, x = 0: nothing
+    holds the liquid together, and it separates from walls as from air.
 
-    A full cell has no room, whatever it holds and however long the step is, so that its pressure
-    acts in the shortest one. That it comes to the density at rest takes a time of its own: c =
-    sqrt(g dx), the speed of waves on a layer of cells, or dx / dt if that is less. At dx / dt, as
-    room is taken, a short step would throw out what is too much at any speed, and lose the pressure
-    where a little is missing. Too much and too little count alike: where the one acts slowly and
-    the other at once, the uppermost cells fall into the room that was made by pushing, and a pool
-    boils.
+    A full cell has no room, whatever its density and however long the step, so that its pressure
+    acts also in very short steps. It relaxes to the density at rest at a speed of its own: c =
+    sqrt(g dx), the speed of waves on a layer of cells, or dx / dt if that is less. If it relaxed at
+    dx / dt, like room, a short step would eject the excess at any speed, and would have no pressure
+    where a little is missing. Excess and deficit relax at the same speed: otherwise the uppermost
+    cells fall into room that was made by pushing, and a pool boils.
 
-    In q the share f_f is that of the cell that the flow comes from, and room grows with what flows
-    in, which in a step of many cells is more than fits: a cell that is filled and empties at once
-    has room for all of it. With f_f the mean of both cells, or without that, the front of a block
-    in free flight seems to over-fill the cells ahead and is blown off. What the gradient
-    accelerates is the mean of both.
+    In q the fraction f_f is that of the upwind cell. Room grows with the inflow, which is more than
+    fits in a step of many cells: a cell that is filled and emptied at once has room for all of it.
+    With the mean f_f of both cells, or without the inflow, the front of a block in free flight
+    seems to overfill the cells ahead and is blown off. The gradient accelerates the mean of both
+    cells.
 
-    Cells that are open to less than a quarter hold too few particles to tell a density: they take
-    what fits, and do not settle.
+    Cells that are less than a quarter open hold too few particles for a density: they accept what
+    fits, and do not settle.
 
-    The density is that of a kernel three cells wide, so that the two layers of cells beneath a
-    surface are not full and carry no pressure until they have been compressed a little.
+    The density uses a kernel three cells wide, so that the two layers of cells beneath a surface
+    are not full and have no pressure until they are slightly compressed.
 
     Args:
         grid: the grid.
         boundary: solids and walls.
         solver: settings of the method.
-        level_set: of the liquid's surface, whose density is used.
-        weights: of the particles on each component's faces: faces without keep nothing.
-        tolerance: as of `PressureProjection`.
+        level_set: level set of the liquid's surface, whose density is used.
+        weights: particle weights on the faces of each component; faces without weight have no
+            momentum.
+        tolerance: see `PressureProjection`.
         max_iterations: likewise.
         coupling: likewise.
         gravity: likewise; without gravity nothing settles.
 
-    Attributes: as of `PressureProjection`; `kind` says where the level set lies in the liquid.
+    Attributes: see `PressureProjection`; `kind` marks the cells inside the level set.
     """
 
     def __init__(
@@ -106,10 +106,11 @@ class UnilateralPressure(PressureProjection):
         )
         self._weights = list(weights)
         self._sums = wp.zeros((*grid.shape[:2], 2), dtype=wp.float64, device=grid.device)
-        self._totals = Reading(grid.device, 2) if grid.device.is_cuda else None  # of `_sums`
+        # Totals of `_sums` on a GPU.
+        self._totals = Reading(grid.device, 2) if grid.device.is_cuda else None
         self._unknown, self._least = grid.field(wp.int8), 0.0
-        wp.copy(self._unknown, boundary.base)  # the ring stays as it is
-        if boundary.open and self._shift is None:  # pockets between solids that are too full
+        wp.copy(self._unknown, boundary.base)  # the ring does not change
+        if boundary.open and self._shift is None:  # pockets between solids that are overfull
             self._shift = grid.field()
         setting = kernels.UnilateralSetting()
         setting.planes = grid.planes
@@ -168,7 +169,7 @@ class UnilateralPressure(PressureProjection):
         return Projection(result, self.counted(), self._found)
 
     def _launch_projection(self, velocity: Sequence[wp.array], window: Window, x: wp.array) -> None:
-        """Launch the projection, and what finds the contact of wall cells."""
+        """Launch the projection and the contact of wall cells."""
         self._accept(x)
         for axis, field in enumerate(velocity):
             clear(self.known[axis])
@@ -207,16 +208,16 @@ class UnilateralPressure(PressureProjection):
         return float(rows[..., 0].sum()), float(rows[..., 1].max())
 
     def fluid_cells(self) -> np.ndarray:
-        """Return the cells with liquid or pressure in the last projection.
+        """Return this process's cells with liquid or pressure in the last projection.
 
-        Those of this process, shape (n, 3), as indices (k, j, i) in the stored shape.
+        Shape (n, 3), indices (k, j, i) in the stored shape.
         """
         part = self.grid.part
         cells, pressure = (part.box_of(field.numpy()) for field in (self.cells, self.pressure))
         return np.argwhere((cells == FLUID) | (pressure > 0.0)) + np.array(part.owned.low)
 
     def _at(self, velocity: Sequence[wp.array]) -> Any:
-        """Return the setting with velocities, open fractions and solids' velocities as they are."""
+        """Return the kernel struct with current velocities and open fractions."""
         s = self._setting
         s.u, s.v, s.w = three_components(velocity)
         s.open_x, s.open_y, s.open_z = three_components(self.boundary.open)

@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Kernels of the pressure that only keeps cells from over-filling."""
+"""Kernels of the unilateral pressure, which prevents overfull cells."""
 
 import warp as wp
 
@@ -8,13 +8,13 @@ from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.material.boundary_kernels import HELD, LETS_GO, RELEASED, TOUCHES
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
 
-# density, of that at rest, from which a cell counts as full: less than 1 by more than what the
-# sampling makes of it
+# Density, relative to that at rest, from which a cell counts as full: less than 1 by more than the
+# sampling noise.
 FULL = 0.8
-# of a cell's kernel: where less is open, as in `warp_lcp.grid.level_set`, a particle more or less
-# is not to tell
+# Open share of a cell's kernel below which it has no density: single particles would dominate, as
+# in `warp_lcp.grid.level_set`.
 LEAST_SHARE = 0.25
-# of a face: less mass would be thrown about by the pressure of a full cell beside it
+# Least density of a face: the pressure of a full cell beside it would throw less mass about.
 LEAST_DENSITY = 0.1
 
 _AIR = wp.constant(wp.int8(AIR))
@@ -24,27 +24,30 @@ _SOLID = wp.constant(wp.int8(SOLID))
 
 @wp.struct
 class UnilateralSetting:
-    """What is the same for all cells of a step, and the fields that say where liquid is."""
+    """Fields of a step: liquid, walls and velocities, the same for all cells."""
 
     planes: int
     density: F32
     capacity: F32
-    cells: I8  # FLUID: an unknown
+    cells: I8  # FLUID at unknowns
     base: I8
     u: F32  # u* of each component [m/s]
     v: F32
     w: F32
-    open_x: F32  # fractions of faces
+    open_x: F32  # open fractions of faces
     open_y: F32
     open_z: F32
-    solid_x: F32  # what solids let pass [m/s]
+    solid_x: F32  # flux due to solids [m/s]
     solid_y: F32
     solid_z: F32
 
 
 @wp.func
 def open_part(s: UnilateralSetting, open: F32, k: int, j: int, i: int, c: int, b: int, a: int):
-    """Return the open fraction of the lower face of cell (k, j, i), beyond which cell (c, b, a) lies."""
+    """Return the open fraction of the lower face of cell (k, j, i).
+
+    Beyond the face lies cell (c, b, a).
+    """
     part = float(1.0)
     if open:
         part = open[k, j, i]
@@ -55,13 +58,13 @@ def open_part(s: UnilateralSetting, open: F32, k: int, j: int, i: int, c: int, b
 
 @wp.func
 def filled(s: UnilateralSetting, k: int, j: int, i: int):
-    """Return which share of a cell is filled: never more than all of it, whatever it holds."""
+    """Return the filled fraction of a cell, at most 1."""
     return wp.min(s.density[k, j, i] / (FULL * wp.max(s.capacity[k, j, i], LEAST_SHARE)), 1.0)
 
 
 @wp.func
 def face_density(s: UnilateralSetting, k: int, j: int, i: int, c: int, b: int, a: int):
-    """Return the density on the face between two cells, of a full cell's."""
+    """Return the density on the face between two cells, relative to a full cell."""
     total = float(0.0)
     count = float(0.0)
     if s.base[k, j, i] != _SOLID:
@@ -86,7 +89,11 @@ def passing(
     b: int,
     a: int,
 ):
-    """Return what passes the lower face of cell (k, j, i) [m/s], in units of what full cells let pass; solids take their place."""
+    """Return the flux q through the lower face of cell (k, j, i) [m/s].
+
+    See `fluids.unilateral`: relative to the flux of full cells, including the volume that solids
+    take.
+    """
     part = open_part(s, open, k, j, i, c, b, a)
     flow = part * u[k, j, i]
     if flow > 0.0:
@@ -100,10 +107,10 @@ def passing(
 
 @wp.func
 def slack(s: UnilateralSetting, rate: wp.float64, settling: float, k: int, j: int, i: int):
-    """Return y of a cell: what it may still take, what it is off the density at rest, and what flows out of it [m/s].
+    """Return y of a cell without the pressure: room, settling and net outflow [m/s].
 
-    The rate is dx / dt [m/s], and settling the speed at which a full cell comes to the density at
-    rest [m/s], of what it is off by.
+    The equation is that of `fluids.unilateral`. The rate is dx / dt [m/s]. Settling is the speed c
+    at which a full cell relaxes to the density at rest [m/s].
     """
     left = passing(s, s.u, s.open_x, s.solid_x, k, j, i, k, j, i - 1)
     right = passing(s, s.u, s.open_x, s.solid_x, k, j, i + 1, k, j, i)
@@ -140,7 +147,10 @@ def prepare_kernel(
     start: F64,
     shift: F32,
 ):
-    """Mark the unknowns; fill right-hand side, first guess and what the open sides add to the diagonal."""
+    """Mark the unknowns; set right-hand side, first guess and diagonal shift.
+
+    The shift is that of the open sides of the domain.
+    """
     unknown = s.base[k, j, i] != _SOLID and kind[k, j, i] != _SOLID
     value = wp.float64(0.0)
     guess = wp.float64(0.0)
@@ -172,17 +182,20 @@ def prepare_kernel(
 def push_kernel(
     k, j, i, s: UnilateralSetting, axis: int, x: F64, open: F32, weight: F32, field: F32, known: I8
 ):
-    """Let the pressure act on the open faces that particles gave weight, and mark them 1; others 0, or -1 inside solids of whole cells."""
+    """Apply the pressure gradient to open faces with particle weight.
+
+    These faces are marked 1 in `known`, others 0, or -1 inside solids of whole cells.
+    """
     c = k - wp.where(axis == 2, 1, 0)
     b = j - wp.where(axis == 1, 1, 0)
     a = i - wp.where(axis == 0, 1, 0)
     mark = int(0)
-    if a < 0 or b < 0 or c < 0:  # the ring's own lower faces lie in the wall
+    if a < 0 or b < 0 or c < 0:  # the lower faces of the ring lie in the wall
         mark = -1
     elif open_part(s, open, k, j, i, c, b, a) > 0.0:
         if weight[k, j, i] > TINY_WEIGHT:
             mark = 1
-            # a source's cells are no unknowns, and their faces' velocities are given
+            # A source's cells are no unknowns, and the velocities of their faces are prescribed.
             if s.cells[k, j, i] != _SOLID and s.cells[c, b, a] != _SOLID:
                 change = x[k, j, i] - x[c, b, a]
                 field[k, j, i] -= wp.float32(change) / face_density(s, k, j, i, c, b, a)
@@ -208,9 +221,10 @@ def contact_kernel(
     sums: F64,
     found: wp.array(dtype=wp.float64),
 ):
-    """Set the contact of wall cells; sum up those of a row that release liquid, and find its largest |y| of full cells.
+    """Set the contact of wall cells; sum released cells, and find the largest |y|.
 
-    `found`, if there is one, has the sum of the first and the largest of the second of all rows.
+    The sums are those of a row: its cells that release liquid, and the largest |y| of its full
+    cells. If `found` is given, it gets the total and the maximum over all rows.
     """
     released = int(0)
     worst = wp.float64(0.0)

@@ -1,29 +1,32 @@
-"""Viscosity: an implicit step in a variational form, with free surfaces that bear no traction and walls that hold or let go.
+"""Viscosity: implicit variational step with traction-free surfaces.
 
-With the rate of strain e of a velocity u, the step from u1 makes [Batty & Bridson 2008]
+Walls hold the liquid or separate from it. With the rate of strain e of a velocity u, the step from
+u1 minimizes [Batty & Bridson 2008]
 
-    1/2 sum_f V_f |u_f - u1_f|^2 + tau sum_s V_s e_s : e_s,   tau = nu dt / dx^2,
+   1/2 sum_f V_f |u_f - u1_f|^2 + tau sum_s V_s e_s : e_s,   tau = nu dt / dx^2.
 
-least: u on faces, e_aa at cells, e_ab on edges, differences in units of 1/dx, V the shares of their
-cubes that liquid fills, but 0 of faces between two cells of air: their u1 is the neighbors', and
-with a mass it would hold the surface back by a shear of mu d_t u_n, u_n the normal velocity and t
-along the surface, in steps of nu dt / dx^2 < 1. So faces have
+u lies on faces, e_aa at cells, e_ab on edges; differences are in units of 1/dx. V are the liquid
+fractions of the cubes around faces, cells and edges. V = 0 on faces between two cells of air: their
+u1 is extrapolated from the neighbors, and a mass there would hold the surface back by a shear of
+mu d_t u_n in steps of nu dt / dx^2 < 1, with u_n the normal velocity and t along the surface. So
+faces have
 
-    V u + tau K u = V u1,   K symmetric and positive semi-definite,
+   V u + tau K u = V u1,   K symmetric and positive semi-definite,
 
-with K u = 0 for all rigid motions of what floats freely: linear and angular momentum stay. Faces in
-air that touch a filled cell or edge are unknowns too, so that the surface bears no traction.
+with K u = 0 for all rigid motions of liquid that floats freely: linear and angular momentum are
+conserved. Faces in air that touch a filled cell or edge are unknowns too, so that the surface is
+free of traction.
 
-In terms of gradients, with the determinants of pairs of axes apart,
+In terms of gradients, with the determinants of pairs of axes separated,
 
-    e : e = |grad u|^2 / 2 + (div u)^2 / 2 + sum_{a<b} (d_b u_a d_a u_b - d_a u_a d_b u_b),
+   e : e = |grad u|^2 / 2 + (div u)^2 / 2 + sum_{a<b} (d_b u_a d_a u_b - d_a u_a d_b u_b).
 
-and in the discrete sums too the last term adds up to nothing in the middle of the liquid. Beside a
-wall where the liquid sticks it is left out with div u, which the pressure has made 0: what remains
-is |grad u|^2 / 2, whose links that cross the wall end at it, at theta of their length, with the
-wall's velocity there [Gibou et al. 2002], second order on walls that cut cells. A slip length puts
-the end that far behind the wall (Navier). Links to walls that the pressure's complementarity has
-let go of are cut: there is no traction.
+The last term sums to zero in the interior of the liquid, also in the discrete sums. Beside a wall
+where the liquid sticks, it is omitted together with div u, which the pressure has made 0. The rest
+is |grad u|^2 / 2. Its links that cross the wall end at the wall, at theta of their length, with the
+wall's velocity there [Gibou et al. 2002]: second order on walls that cut cells. A slip length moves
+the end that far behind the wall (Navier). Links to walls that the liquid has left, by the
+pressure's complementarity, are cut: there is no traction.
 """
 
 from __future__ import annotations
@@ -57,10 +60,10 @@ from warp_lcp.rows.fields import zeros
 from warp_lcp.rows.memory import Scalar
 from warp_lcp.rows.program import Launch, LaunchGraph, clear, copy, launch_now
 
-# of a force, relative to the diagonal times the speed
+# Rounding error of a force, relative to the diagonal times the speed.
 ROUNDING = 4 * float(np.finfo(np.float32).eps)
-# of nu dt / dx^2: where it is less, faces without mass, which nobody reads, would decide by their
-# error when a solve ends
+# The error criterion of a solve needs nu dt / dx^2 above this. Below it, faces without mass would
+# dominate the error, although their velocity is not used.
 STIFF = 1.0
 
 VISCOUS_COLUMNS = ("viscous_iterations", "viscous_residual", "dissipated", "wall_work")
@@ -68,14 +71,15 @@ VISCOUS_COLUMNS = ("viscous_iterations", "viscous_residual", "dissipated", "wall
 
 @dataclass(frozen=True)
 class ViscousResult:
-    """What a viscous step has done.
+    """Result of a viscous step.
 
     Attributes:
-        iterations: of conjugate gradients.
+        iterations: number of conjugate gradient iterations.
         relative_residual: ||r|| over that of the start, recomputed from the velocities in float64.
-        status: CONVERGED: it is at most the tolerance, or at the rounding of the velocities.
-        dissipated: energy that became heat [J; J/m in 2-D].
-        given_by_walls: work that moving walls did [J; J/m in 2-D].
+        status: CONVERGED if the residual is at most the tolerance, or at the rounding of the
+            velocities.
+        dissipated: energy converted to heat [J; J/m in 2-D].
+        given_by_walls: work of moving walls on the liquid [J; J/m in 2-D].
     """
 
     iterations: int
@@ -86,7 +90,7 @@ class ViscousResult:
 
     @property
     def converged(self) -> bool:
-        """Whether the step may be taken."""
+        """Whether the step may be used."""
         return self.status is SolveStatus.CONVERGED
 
     def row(self) -> tuple[int, float, float, float]:
@@ -94,7 +98,7 @@ class ViscousResult:
         return self.iterations, self.relative_residual, self.dissipated, self.given_by_walls
 
     def after(self, before: ViscousResult) -> ViscousResult:
-        """Return what this solve and one before it in the same step have done together."""
+        """Return the combined result of this solve and an earlier one of the same step."""
         return ViscousResult(
             before.iterations + self.iterations,
             max(before.relative_residual, self.relative_residual),
@@ -105,31 +109,33 @@ class ViscousResult:
 
 
 class Viscosity:
-    """Take implicit steps of viscosity; `solve` and `push_bodies` are collective.
+    """Implicit viscous steps; `solve` and `push_bodies` are collective.
 
-    Velocity, kinds of cells, contacts, surface and the liquid's own viscosities must be right in
-    ghost cells; velocity and change then are. `impulses` are those of this process's faces.
+    Velocity, cell kinds, contacts, surface and the liquid's own viscosities must be correct in
+    ghost cells. Velocity and change are then correct there too. `impulses` covers the faces of this
+    process.
 
     Args:
         grid: the grid.
         boundary: solids and walls.
         viscosity: mu [Pa s].
         density: [kg/m^3].
-        slip_lengths: of the domain's wall and each solid [m], shape (1 + solids,); inf: free slip.
-        phi: float32 distance to the free surface at cell centers [cells], < 0 in liquid; None: it
+        slip_lengths: slip length of the domain's wall and each solid [m], shape (1 + solids,); inf:
+            free slip.
+        phi: float32 distance to the free surface at cell centers [cells], < 0 in liquid; None if it
             lies on the cells' faces.
-        tolerance: relative residual at which a solve is done.
-        thickest: the largest viscosity, in units of `viscosity`; None: there is only one.
-        max_iterations: of conjugate gradients in a step; 200 unless given, 1000 where viscosities
-            differ.
-        bodies: those that the liquid moves, among the solids; None: there are none.
-        sources: whether cells may turn SOLID, as those of sources do.
+        tolerance: relative residual at which a solve ends.
+        thickest: the largest viscosity, in units of `viscosity`; None if all are equal.
+        max_iterations: limit of conjugate gradient iterations in a step. Default: 200, or 1000 if
+            viscosities differ.
+        bodies: rigid bodies among the solids that the liquid moves; None without any.
+        sources: whether cells can turn SOLID, as those of sources do.
 
     Attributes:
-        change: what the last step changed of each component [m/s].
-        before: of a velocity that a caller keeps, see `undo`.
-        relative: viscosity on the faces of each component, in units of `viscosity`, 0 where there
-            is no liquid; empty: there is only one.
+        change: change of each component in the last step [m/s].
+        before: saved velocity, see `keep` and `undo`.
+        relative: viscosity on the faces of each component, in units of `viscosity`, 0 without
+            liquid; empty if all viscosities are equal.
     """
 
     def __init__(
@@ -174,7 +180,7 @@ class Viscosity:
         self._distance, self._slip, self.before = grid.faces(), grid.faces(), grid.faces()
         self.relative = [] if thickest is None else grid.faces()
         self.change = self.multigrid.components(self._change)
-        self._pull: WallPull | None = None  # made when it is first asked for
+        self._pull: WallPull | None = None  # built at the first use
         self._bodies: BodyDrag | None = None
         if bodies is not None:
             assert isinstance(boundary, CutBoundary), "a scene with bodies has cut cells"
@@ -197,7 +203,7 @@ class Viscosity:
             self._keep_change,
             self._undo,
         )
-        shared = grid.part.shared  # then ranks exchange halos in some
+        shared = grid.part.shared  # then ranks exchange halos between launches
         self._graphs = {
             function.__name__: LaunchGraph(grid.device, function, at_once=shared)
             for function in launches
@@ -214,17 +220,21 @@ class Viscosity:
         *,
         last: bool = True,
     ) -> ViscousResult:
-        """Find the change of a velocity in a step; the velocity itself becomes what it was changed to.
+        """Apply viscosity to a velocity for one step, and store its change.
+
+        Conjugate gradients in float32 compute a correction, and the residual is recomputed in
+        float64 (iterative refinement), until it is below the tolerance or its rounding. In stiff
+        steps the criterion of the first correction is its estimated error.
 
         Args:
-            velocity: u1 of each component [m/s] (updated), continued into the air by a face.
-            window: cells that hold all liquid, with two to spare.
+            velocity: u1 of each component [m/s] (updated), extrapolated into the air by one face.
+            window: cells that hold all liquid, with a margin of two.
             kind: int8 of AIR, FLUID, SOLID.
             contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED.
-            dt: how long viscosity acts [s].
+            dt: time that viscosity acts [s].
             speed: scale of the velocities [m/s].
-            last: whether no other solve of the step follows; faces in walls take their velocity in
-                the last one.
+            last: whether this is the last solve of the step, in which faces in walls take the
+                velocity of the wall.
         """
         box, inner = self._boxes(window)
         if inner is None:
@@ -234,14 +244,14 @@ class Viscosity:
         self._begin(box, inner, tau)
         self._graphs["_set_up"].run(kind, contact, variant=self._placed)
         self._placed = True
-        given = {"u": velocity, "kind": kind, "contact": contact}
+        fields = {"u": velocity, "kind": kind, "contact": contact}
         if self._bodies is not None:
             self._bodies.take(
                 self._fine, ViscousWalls(self._distance, self._slip, kind, contact), velocity
             )
-            if self._bodies.moved:  # a recorded iteration knows where they lay
+            if self._bodies.moved:  # the recorded iteration has the old column addresses
                 self._solver = self._krylov()
-        first, lost, driven, stiff = self._force(given, changed=False)
+        first, lost, driven, stiff = self._force(fields, changed=False)
         norm, least, iterations = first, max(self.tolerance * first, ROUNDING * speed * stiff), 0
         while norm > least and iterations < self.max_iterations:
             before = norm
@@ -252,9 +262,9 @@ class Viscosity:
             )
             self._solver.start(max_iterations=self.max_iterations - iterations, **goal)
             self._graphs["_take_solution"].run(velocity, self._solver.x, variant=self._solver.x.ptr)
-            norm, lost, driven, _ = self._force(given, changed=True)
-            iterations += self._solver.found()[0]  # read with the force
-            if not norm < 0.5 * before:  # what float32 can tell
+            norm, lost, driven, _ = self._force(fields, changed=True)
+            iterations += self._solver.found()[0]  # read together with the force
+            if not norm < 0.5 * before:  # the limit of float32
                 break
         if last:
             self._graphs["_cover"].run(velocity, kind)
@@ -276,11 +286,11 @@ class Viscosity:
         )
 
     def _begin(self, box: Window, inner: Window, tau: float) -> None:
-        """Have launches work in a box, and on the unknowns of its `inner` cells."""
+        """Move the launches to a box, and the solve to the unknowns of its `inner` cells."""
         self._tau.value = tau
         self._box.move_to(box)
-        # edges and faces on the upper ends of the domain, too; below the first cell there is
-        # nothing
+        # The windows of edges and faces include the upper ends of the domain; cells below the first
+        # one have none.
         self._above.move_to(Window.of([max(low, 1) for low in box.low], box.high, box.device))
         self._unknowns.move_to(inner)
         self.multigrid.move_to(box)
@@ -292,7 +302,7 @@ class Viscosity:
         self.grid.part.fill(*velocity)
 
     def _cover(self, velocity: Sequence[wp.array], kind: wp.array) -> None:
-        """Give faces in walls their velocity."""
+        """Set faces in walls to the wall's velocity."""
         for axis, (total, u, own) in enumerate(
             zip(self.change, velocity, self._solids, strict=True)
         ):
@@ -312,7 +322,10 @@ class Viscosity:
         return ConjugateGradient(self._product, self.multigrid, across=self._across)
 
     def _boxes(self, window: Window) -> tuple[Window, Window | None]:
-        """Return where something may differ from what the last step left, and which cells of these have unknowns; None: none has."""
+        """Return the box where fields may change, and its cells with unknowns.
+
+        The box includes cells changed by the last step. The second window is None without unknowns.
+        """
         part = self.grid.part
         box = part.whole(replace(self._trail.through(window), near=None))
         return box, box.common(part.owned)
@@ -320,13 +333,15 @@ class Viscosity:
     def impulses(
         self, velocity: Sequence[wp.array], kind: wp.array, contact: wp.array, points: np.ndarray
     ) -> np.ndarray:
-        """Return what viscous stresses of the last step give the domain and each solid, shape (1 + solids, 6): N s, N m s.
+        """Return the impulses of the last step's viscous stresses, shape (1 + solids, 6).
+
+        On the domain and each solid [N s], and their moments [N m s].
 
         Args:
-            velocity: that the step has made [m/s].
-            kind: as of `solve`.
-            contact: as of `solve`.
-            points: about which moments are taken [m], shape (1 + solids, 3).
+            velocity: the velocity after the step [m/s].
+            kind: see `solve`.
+            contact: see `solve`.
+            points: reference points of the moments [m], shape (1 + solids, 3).
         """
         if self._pull is None:
             self._pull = WallPull(
@@ -341,7 +356,7 @@ class Viscosity:
             spins = np.stack((turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]), axis=-1)
             six = np.concatenate((np.einsum("sij,sj->si", turn, points) + shift, spins), axis=1)
             motions = six if self.grid.dimension == 3 else six[:, PLANAR]
-            if self._bodies is not None:  # which are unknowns of the step, too
+            if self._bodies is not None:  # the bodies are unknowns of the step
                 motions[self._bodies.bodies.numbers] = self._bodies.velocities()
             pulled -= np.einsum("sij,sj->si", drags, motions)
         impulses = np.zeros((len(points), 6))
@@ -351,12 +366,12 @@ class Viscosity:
         return impulses
 
     def push_bodies(self) -> None:
-        """Give the bodies the impulses of the last step, if there are bodies."""
+        """Apply the impulses of the last step to the bodies, if any."""
         if self._bodies is not None:
             self._bodies.push(self._change)
 
     def _product(self, p: wp.array, q: wp.array, *, launch: Launch = launch_now) -> None:
-        """Write q = A p, the bodies' answer included."""
+        """Write q = A p, including the response of the bodies."""
         self.multigrid.product(p, q, launch=launch)
         if self._bodies is not None:
             self._bodies.subtract(p, q, launch)
@@ -366,11 +381,14 @@ class Viscosity:
         self._graphs["_keep"].run(velocity)
 
     def keep_change(self) -> None:
-        """Add the last solve's change to `before`: another solve of the same step follows, from the velocity that this one has made."""
+        """Add the last solve's change to `before`.
+
+        Another solve of the same step follows, which starts from the velocity of this one.
+        """
         self._graphs["_keep_change"].run()
 
     def undo(self, velocity: Sequence[wp.array]) -> None:
-        """Make a velocity what `before` keeps, but for the last step's change."""
+        """Restore a velocity from `before`, plus the last step's change."""
         self._graphs["_undo"].run(velocity)
 
     def _keep(self, velocity: Sequence[wp.array]) -> None:
@@ -386,7 +404,12 @@ class Viscosity:
             self.grid.everywhere.run(self._passes.sum, u=u, kept=kept, more=more)
 
     def _set_up(self, kind: wp.array, contact: wp.array) -> None:
-        """Find the equations of a step, whose change is 0 yet."""
+        """Set up the equations of a step, with a change of 0.
+
+        The order is: distances of faces from walls, which change only with moving walls; weights of
+        the links, from the liquid fractions of cells and edges, tau and the viscosities; diagonals,
+        with the drag of walls; coarse levels.
+        """
         clear(self._change)
         fine, boundary, passes, planes = self._fine, self.boundary, self._passes, self.grid.planes
         slip, distance = self._slip, self._distance
@@ -452,7 +475,10 @@ class Viscosity:
         self.multigrid.set_up()
 
     def _motion(self, axis: int) -> tuple[wp.array | None, wp.array | None, wp.array | None]:
-        """Return whose a component's faces are where solids cut cells and move, and how these turn and shift; else None."""
+        """Return the solids of a component's faces, with their rotations and shifts.
+
+        None if no solid both cuts cells and moves.
+        """
         if not (isinstance(self.boundary, CutBoundary) and self.boundary.moves):
             return None, None, None
         cut = self.boundary.cut
@@ -464,27 +490,31 @@ class Viscosity:
         return [*self.boundary.velocity] or [None] * self.grid.dimension
 
     def _force(self, given: dict[str, Any], *, changed: bool) -> list[float]:
-        """Write the residual; return its norm, the energy lost by the force, what walls give, and the diagonal's norm."""
+        """Write the residual; return its norm and the energies of the step.
+
+        In this order: the norm, the energy lost by the force, the work of walls, the norm of the
+        diagonal.
+        """
         self._graphs["_residual"].run(given, changed, variant=changed)
-        found = np.zeros(4)
+        totals = np.zeros(4)
         for sums in self._sums:
             sums.changed()
         for sums in self._sums:
-            found += sums.read()
+            totals += sums.read()
         if self._bodies is not None:
             self._bodies.answer(self.multigrid.r, self._change)
-            found[0] = float(np.square(self.multigrid.r.numpy(), dtype=np.float64).sum())
+            totals[0] = float(np.square(self.multigrid.r.numpy(), dtype=np.float64).sum())
         if self._across is not None:
-            found = self._across.sum(found)
+            totals = self._across.sum(totals)
         return [
-            float(np.sqrt(found[0])),
-            float(found[1]),
-            float(found[2]),
-            float(np.sqrt(found[3])),
+            float(np.sqrt(totals[0])),
+            float(totals[1]),
+            float(totals[2]),
+            float(np.sqrt(totals[3])),
         ]
 
     def _residual(self, given: dict[str, Any], changed: bool) -> None:
-        """Launch the passes that write the residual, and what they sum."""
+        """Launch the kernels that write the residual and its sums."""
         fine, solids = self._fine, self._solids
         residual, velocity, distance = (
             self.multigrid.components(self.multigrid.r),
@@ -521,7 +551,7 @@ class Viscosity:
 
 
 def _numbers(array: wp.array) -> wp.array:
-    """Return vectors or matrices as the numbers that they lie in memory as."""
+    """Return an array of vectors or matrices as a view of its scalars."""
     size = array.size * array.strides[0] // 4
     return wp.array(
         ptr=array.ptr, dtype=wp.float32, shape=(size,), device=array.device, capacity=4 * size

@@ -1,4 +1,7 @@
-"""Solids that a thick liquid drags along, and that drag it; the velocities of rigid bodies are unknowns of the viscous step."""
+"""Two-way viscous coupling of the liquid with moving solids and rigid bodies.
+
+The velocities of rigid bodies are unknowns of the viscous step.
+"""
 
 from __future__ import annotations
 
@@ -19,18 +22,18 @@ from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rows.program import Launch
 from warp_lcp.rows.vectors import Across
 
-SPARE = 1.5  # room for links, times those there are when there is none left
+SPARE = 1.5  # factor on the number of links when the buffer is enlarged
 
 
 @dataclass(frozen=True, slots=True)
 class ViscousWalls:
-    """Walls as viscous forces see them.
+    """Fields of walls and cells that the viscous coupling reads.
 
     Attributes:
-        distance: of each component's faces from walls [cells].
-        slip: the slip length of those [cells].
-        kind: of cells.
-        contact: of cells.
+        distance: distance of each component's faces from walls [cells].
+        slip: slip length of those walls [cells].
+        kind: cell kinds.
+        contact: wall contact of cells.
     """
 
     distance: Sequence[wp.array]
@@ -40,23 +43,24 @@ class ViscousWalls:
 
 
 class WallPull:
-    """Find what pulls the liquid's faces towards some solids.
+    """Viscous coupling coefficients between liquid faces and moving solids.
 
-    What pulls a face towards a solid's velocity V, of its motions (vx, vy, wz) or (vx, vy, vz, wx,
-    wy, wz) about a point, does so by c'V: of a link that meets its wall, the weight times the
-    velocities of the unit motions there; of a product with a face in the solid, those at that face.
-    The solid is pulled back by C'u - D V, C of rows c. All this is an energy's, which rigid motions
-    of liquid and solid together leave 0, so D is what makes C'u = D V for those.
+    The viscous force on a face due to a solid's velocity V is c'V. The motions of a solid are (vx,
+    vy, wz) in 2-D and (vx, vy, vz, wx, wy, wz) in 3-D, about a point. For a link that meets its
+    wall, c is the weight times the velocities of the unit motions there. For a product with a face
+    in the solid, c has those at that face. The reaction on the solid is C'u - D V, with rows c of
+    C. Both are derivatives of an energy that is 0 for rigid motions of liquid and solid together,
+    so that D satisfies C'u = D V for them.
 
     Args:
         grid: the grid.
         boundary: its solids.
-        numbers: those of the solids, 0 for the domain.
-        passes: of the viscous solve.
+        numbers: numbers of the solids, 0 for the domain.
+        passes: kernels of the viscous solve.
 
     Attributes:
-        rows: the face of each c, in the flat field of all components.
-        blocks: its solid.
+        rows: face of each c, in the flat field of all components.
+        blocks: solid of each c.
         values: c, shape (n, 3) or (n, 6).
     """
 
@@ -78,13 +82,16 @@ class WallPull:
     def take(
         self, window: Window | None, level: ViscosityLevel, walls: ViscousWalls, points: np.ndarray
     ) -> None:
-        """Find `rows`, `blocks` and `values`.
+        """Compute `rows`, `blocks` and `values`.
+
+        Each entry is a link of a liquid face to a face or wall of a solid. The kernel counts the
+        entries of each component, and then writes them.
 
         Args:
-            window: cells with all faces beside the solids; None: there are none.
+            window: cells with all faces beside the solids; None without any.
             level: the equations of the step.
-            walls: around the liquid.
-            points: about which the solids turn [m], shape (solids, 3).
+            walls: walls around the liquid.
+            points: reference points of the solids' rotations [m], shape (solids, 3).
         """
         grid, distance = self.grid, walls.distance
         owners: list[Any] = (
@@ -94,7 +101,7 @@ class WallPull:
         )
         index = self.boundary.solids.index if isinstance(self.boundary, WholeCells) else None
         center = wp.array(points.ravel(), dtype=wp.float64, device=grid.device)
-        found = [
+        entries = [
             (np.zeros(0, dtype=np.int32), np.zeros(0, dtype=np.int32), np.zeros((0, self.width)))
         ]
         for axis in range(grid.dimension if window is not None else 0):
@@ -125,19 +132,21 @@ class WallPull:
                 wall_c=wall_c,
                 from_=axis * grid.size,
             )
-            found.append(self._entries(links))
+            entries.append(self._entries(links))
         self.rows, self.blocks, self.values = (
-            np.concatenate(parts) for parts in zip(*found, strict=True)
+            np.concatenate(parts) for parts in zip(*entries, strict=True)
         )
 
     def pulled(
         self, velocity: Sequence[wp.array], points: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return C'u and D of each solid, shapes (solids, width) and (solids, width, width).
+        """Return C'u and D of each solid.
+
+        Shapes (solids, width) and (solids, width, width).
 
         Args:
             velocity: u of each component [m/s].
-            points: as of `take`.
+            points: see `take`.
         """
         grid, dimension = self.grid, self.grid.dimension
         axes, cells = np.divmod(self.rows, grid.size)
@@ -155,7 +164,7 @@ class WallPull:
             own = self.blocks == n
             arms = places[own] - points[n]
             arms[:, dimension:] = 0.0
-            # by the axis of the turn
+            # Velocities of unit rotations about each axis.
             turns = np.cross(np.eye(3)[None], arms[:, None])[np.arange(len(arms)), :, axes[own]]
             motions = np.concatenate(
                 (np.eye(3)[axes[own]][:, :dimension], turns[:, 2:] if dimension == 2 else turns),
@@ -166,7 +175,10 @@ class WallPull:
         return sums, drags
 
     def _entries(self, links: Callable[..., None]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return rows, solids and values of a component's entries, which `links` counts and then writes."""
+        """Return rows, solids and values of a component's entries.
+
+        `links` counts them, and then writes them.
+        """
         device = self.grid.device
         self._counts.zero_()
         links(offsets=None, entry_rows=None, blocks=None, values=None)
@@ -181,27 +193,27 @@ class WallPull:
 
 
 class BodyDrag:
-    """Solve for liquid and bodies together, see `WallPull`.
+    """Implicit coupling of liquid and rigid bodies by viscosity, see `WallPull`.
 
     With m = rho dx^d M^-1 a body's velocity is V = V1 + m (C'u - D V), so that a change of the
     liquid's velocity changes it by
 
         dV = W C'du,   W = (1 + m D)^-1 m,
 
-    and the liquid's equations lose C W C', symmetric like the rest.
+    and C W C' is subtracted from the matrix of the liquid, which stays symmetric.
 
     Args:
         grid: the grid.
         boundary: its solids, with the bodies among them.
         bodies: the bodies.
-        density: of the liquid [kg/m^3].
-        passes: of the viscous solve.
-        solved: cells whose faces the equations are of.
-        across: who has other faces, for whom all methods are collective then; None: nobody.
+        density: density of the liquid [kg/m^3].
+        passes: kernels of the viscous solve.
+        solved: cells whose faces are unknowns.
+        across: communicator; all methods are then collective. None if serial.
 
     Attributes:
-        moved: whether the columns lie elsewhere since the last step.
-        change: of the bodies' velocities in the step so far.
+        moved: whether the arrays of the columns were reallocated since the last step.
+        change: change of the bodies' velocities in the step so far.
     """
 
     def __init__(
@@ -228,7 +240,13 @@ class BodyDrag:
     def take(
         self, level: ViscosityLevel, walls: ViscousWalls, velocity: Sequence[wp.array]
     ) -> None:
-        """Find what pulls the bodies in a step, and how they answer to the liquid's velocity as it is; arguments as of `WallPull`."""
+        """Compute the coefficients of a step, and the bodies' response to the liquid.
+
+        With m = rho dx^d M^-1 it computes W = (1 + m D)^-1 m for each body, symmetrized against
+        rounding, and the force C'u - D V of the current velocities.
+
+        Arguments as of `WallPull.take`.
+        """
         block, bodies, dimension = (
             self.boundary.cut.moving_block(),
             self.bodies.bodies,
@@ -259,13 +277,13 @@ class BodyDrag:
         self._response.assign(self._weights)
 
     def answer(self, residual: wp.array, change: wp.array) -> None:
-        """Add to a residual what bodies do that move as the liquid's velocity, changed by so much, asks."""
+        """Add the bodies' response to a change of the liquid's velocity to a residual."""
         self.change = self._weights @ (self._pulled.ravel() + self.columns.gather(change).numpy())
         self._factors.assign(self.change)
         self.columns.scatter(self._factors, residual, residual)
 
     def subtract(self, p: wp.array, q: wp.array, launch: Launch) -> None:
-        """q -= C W C'p."""
+        """Subtract C W C'p from q."""
         self.columns.gather(p, launch=launch)
         launch(
             weigh_kernel,
@@ -276,12 +294,15 @@ class BodyDrag:
         self.columns.scatter(self._factors, q, q, sign=-1.0, launch=launch)
 
     def velocities(self) -> np.ndarray:
-        """Return the bodies' velocities that the step has found, before the bodies get them, shape (bodies, width) [m/s, 1/s]."""
+        """Return the bodies' velocities after the step [m/s, 1/s].
+
+        Shape (bodies, width). The bodies themselves have them only after `push`.
+        """
         before = np.array([body.velocities(self.grid.dimension) for body in self.bodies.bodies])
         return before + self.change.reshape(before.shape)
 
     def push(self, change: wp.array) -> None:
-        """Give the bodies the impulses of a step that changed the liquid's velocity by so much."""
+        """Apply the impulses of a step to the bodies, given the change of the liquid."""
         moved = self.change.reshape(self._pulled.shape)
         pulled = (
             self._pulled

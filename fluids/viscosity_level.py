@@ -1,14 +1,15 @@
-"""Levels of the viscous equations on faces: sweeps, transfers, and what ranks exchange between them.
+"""Multigrid levels of the viscous equations on faces: sweeps and transfers.
 
-Coarse levels have equations of the same form with the means of what the finer one weighs; unknowns
-are carried linearly, beside air by those there are. A coarse level is a sum of squares, too: an
-unknown is drawn to faces in walls by no less than its links to them weigh. Gauss-Seidel takes one
-component after the other, two colors of rows each, and back.
+The equations of coarse levels have the same form, with averages of the finer level's weights.
+Interpolation is linear; beside air it uses the unknowns that exist. A coarse level is a sum of
+squares, too: an unknown is coupled to faces in walls by at least the weight of its links to them.
+Gauss-Seidel sweeps take one component after the other, each in two colors of rows, and then in
+reverse order.
 
-On ranks each face belongs to the one whose box has the cell above it. A sweep takes the faces of
-one process in its order: ghost cells in so many layers as the second color needs are computed
-twice; then the component's ghost cells come from their ranks. So the cycle is that of one process,
-on any number of ranks; where rows are not cut it has its bits.
+On ranks each face belongs to the rank whose box has the cell above it. A sweep has the order of one
+process: as many layers of ghost cells as the second color needs are computed twice, and then the
+component's ghost cells are exchanged. So the cycle is that of one process, on any number of ranks.
+Where rows are not cut it is equal in bits.
 """
 
 from __future__ import annotations
@@ -26,32 +27,35 @@ from warp_lcp.grid.staggered import CLEAR, StaggeredGrid, Window, three_componen
 from warp_lcp.multigrid.cycle import CycleStage, Launches
 from warp_lcp.rows.program import Launch, perform
 
-# layers of ghost cells that sweeps need: rows of the second color look at those of the first, where
-# odd cells look at even ones
+# Layers of ghost cells that sweeps need: rows of the second color read those of the first, in which
+# odd cells read even ones.
 KNOWN = 3
-SWEEPS = 4  # of the coarsest level, each forth and back
-# of the finer level's: twice that is at most `cell`, so that cells' squares outweigh their products
-# in 3-D, too
+SWEEPS = 4  # sweeps of the coarsest level, each forward and backward
+# Factor on the finer level's `mixed`: twice that is at most `cell`, so that the squares of a cell
+# outweigh its products also in 3-D.
 MIXED = 0.5
-# of the finer level's drag by walls, in units of its own links: half of what is near one lies in
-# its row
+# Factor on the finer level's wall drag, relative to its links: half of the faces near a wall lie in
+# the row beside it.
 WALL = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class ViscousRows:
-    """Equations of the faces of one component, float32 fields but for `span` and `axis`.
+    """Equations of the faces of one component.
+
+    Float32 fields except `span` and `axis`.
 
     Attributes:
-        axis: of the component.
+        axis: axis of the component.
         cell: weights of links along the axis.
-        mixed: of those, what is left out of the products of different components where walls are.
-        xb: weights of links across, towards the first of the other axes.
-        xc: likewise towards the second; None in 2-D.
-        volume: what weighs on the faces.
-        drag: what walls add to the diagonal.
+        mixed: the part of `cell` that is omitted from the products of different components beside
+            walls.
+        xb: weights of links across, along the first of the other axes.
+        xc: likewise along the second; None in 2-D.
+        volume: mass weights of the faces.
+        drag: contribution of walls to the diagonal.
         diagonal: the sum, 0 where there is no unknown.
-        span: where each row's unknowns begin and end, and its core, int32.
+        span: first and one past the last unknown of each row, and its core, int32.
     """
 
     axis: int
@@ -67,7 +71,11 @@ class ViscousRows:
 
 @dataclass(frozen=True, slots=True)
 class LevelShift:
-    """Cells from cell 2n - 1 to the first cell of the finer level that is in cell n of a coarse one: not 0 in parts of grids."""
+    """Offset between the cells of a level and the finer one.
+
+    Number of cells from cell 2n - 1 to the first cell of the finer level in cell n of a coarse one.
+    It is not 0 in parts of grids.
+    """
 
     shift_x: int = 0
     shift_y: int = 0
@@ -75,31 +83,32 @@ class LevelShift:
 
 
 class ViscosityLevel:
-    """Viscous equations on a grid, see `CycleLevel`; on a rank, on its part of the grid.
+    """Viscous equations on a grid, see `CycleLevel`.
+
+    On a rank, on its part of the grid.
 
     Args:
-        grid: the level's.
+        grid: grid of the level.
         x: its solution.
         b: its right-hand side.
-        finer: grid of the finer level; None: this one is the finest.
+        finer: grid of the finer level; None for the finest level.
 
     Attributes:
         cell: weights of links along a component's own axis.
-        mixed: of those, what is left out of the products of different components where walls are,
-            see `fluids.viscosity`.
+        mixed: the part of `cell` that is omitted from the products of different components beside
+            walls, see `fluids.viscosity`.
         edges: weights of links across, by pairs of axes.
-        volume, drag, diagonal, hold, norm, there: of the faces of each component: what weighs, what
-            walls add, the sum; whether a wall holds it; the interpolation's normalization; and what
-            that is to find.
-        r: the residual, and what a sweep keeps.
-        span: where a row's unknowns begin and end, and its core, a run of cells with the equations
-            of those around them.
-        shift: from the finer level's cells to this one's.
-        odd_row, odd_cell: whether row and cell 0 have the colors of row and cell 1 of the whole
-            grid.
+        volume, drag, diagonal, hold, norm, there: fields of the faces of each component: mass
+            weights; contribution of walls to the diagonal; their sum; flags of faces that a wall
+            holds; normalization of the interpolation; flags of unknowns.
+        r: the residual; scratch memory of sweeps.
+        span: first and one past the last unknown of each row, and its core, a run of cells with
+            equal equations.
+        shift: offset between the finer level's cells and this one's.
+        odd_row, odd_cell: 1 if row or cell 0 is odd in the whole grid, as for parts of grids.
     """
 
-    visits = 1  # V-cycles
+    visits = 1  # a V-cycle
 
     def __init__(
         self,
@@ -136,11 +145,11 @@ class ViscosityLevel:
         self.span = wp.zeros(4 * grid.shape[0] * grid.shape[1], dtype=wp.int32, device=grid.device)
 
     def others(self, axis: int) -> list[int | None]:
-        """Return the two other axes; None: there is none."""
+        """Return the two other axes; None for a missing one."""
         return [*(a for a in range(self.dimension) if a != axis), None][:2]
 
     def of_others(self, axis: int, fields: Sequence[Any]) -> list[Any]:
-        """Return what other components have of fields, a field a component."""
+        """Return the entries of the other components in a list with one per component."""
         return [None if other is None else fields[other] for other in self.others(axis)]
 
     def rows(self, axis: int) -> ViscousRows:
@@ -154,12 +163,12 @@ class ViscosityLevel:
 
     @property
     def equations(self) -> list[wp.array]:
-        """The fields that say what the equations are."""
+        """The fields of the equations."""
         fields = (self.edges.values(), self.volume, self.drag, self.hold, self.diagonal)
         return [self.cell, self.mixed, *(field for each in fields for field in each)]
 
     def around(self, width: int) -> Window:
-        """Return the cells in which something is to be found: those of this part of a grid and so many around it."""
+        """Return the window of this part's cells and `width` layers around it."""
         return self._windows[width]
 
     @staticmethod
@@ -173,7 +182,10 @@ class ViscosityLevel:
         )
 
     def share(self, fields: Sequence[wp.array], launch: Launch | None = None) -> None:
-        """Fill ghost cells from other ranks: all of them, of equations; while a cycle is launched or recorded, `KNOWN` layers."""
+        """Fill ghost cells from other ranks.
+
+        All layers of equations; only `KNOWN` layers while a cycle is launched or recorded.
+        """
         if self.shared and launch is not None:
             memory = fields if self.grid.device.is_cuda else [field.numpy() for field in fields]
             perform(partial(self.grid.part.fill, *memory, width=KNOWN), launch)
@@ -181,7 +193,10 @@ class ViscosityLevel:
             self.grid.part.fill(*fields)
 
     def halved(self, window: Window) -> Window:
-        """Return the cells of this level that take something from a window of the finer one; on ranks all that this one is to know."""
+        """Return the cells of this level that average a window of the finer one.
+
+        On ranks, all cells that this rank needs.
+        """
         if self.shared:
             return self.grid.part.stored
         low = [n // 2 for n in window.low]
@@ -191,7 +206,7 @@ class ViscosityLevel:
         return Window.of(low, high, self.grid.device)
 
     def find_spans(self, window: Window) -> None:
-        """Find where the rows' unknowns lie."""
+        """Find the first and the last unknown of each row."""
         dx, dy, dz = three_components(self.diagonal)
         window = self.grid.domain if self.shared else window
         window.run(self.passes.span, whole=True, dx=dx, dy=dy, dz=dz, span=self.span, ends=None)
@@ -201,39 +216,46 @@ class ViscosityLevel:
     def descend(
         self, coarse: ViscosityLevel, *, projected: bool, from_zero: bool
     ) -> Iterator[CycleStage]:
-        """Yield steps 1 and 2 of a cycle: sweeps, and the residual on the next level."""
+        """Yield steps 1 and 2 of a cycle: sweeps, and restriction of the residual."""
         assert from_zero and not projected, "a V-cycle without bounds"
         yield from self._beginning()
         for step in (partial(self.smooth, True), self.residual, partial(self.restrict, coarse)):
             yield Launches(step)
 
     def coarsen_bounds(self, coarse: ViscosityLevel) -> tuple[()]:
-        """Return nothing: there are no bounds."""
+        """Return an empty tuple, since there are no bounds."""
         return ()
 
     def ascend(self, coarse: ViscosityLevel, *, projected: bool) -> Iterator[CycleStage]:
-        """Yield steps 5 and 6."""
+        """Yield steps 5 and 6 of a cycle: prolongation and sweeps."""
         for step in (partial(self.prolong, coarse), partial(self.smooth, False)):
             yield Launches(step)
 
     def solve(self, visits: int, *, projected: bool, from_zero: bool) -> Iterator[CycleStage]:
-        """Yield the stages of a `CoarsestSolver`: sweeps forth, as many back."""
+        """Yield the stages of a `CoarsestSolver`: forward, then backward sweeps."""
         yield from self._beginning()
         for forth in (True,) * SWEEPS + (False,) * SWEEPS:
             yield Launches(partial(self.sweep, forth))
 
     def _beginning(self) -> Iterator[CycleStage]:
-        """Yield ghost cells of b, and x = 0."""
+        """Yield the exchange of b's ghost cells, and x = 0."""
         yield Launches(partial(self.share, self.b))
         yield Launches(self.clear)
 
     def smooth(self, forth: bool, launch: Launch) -> None:
-        """Relax all, and what lies before and behind the rows' cores, where errors last, before and after."""
+        """Relax the band of each row, then all unknowns, then the band again.
+
+        The band are the unknowns outside of the rows' cores, at surfaces and walls, where errors
+        decay slowly.
+        """
         for band in (True, False, True):
             self.sweep(forth, launch, band=band)
 
     def sweep(self, forth: bool, launch: Launch, *, band: bool = False) -> None:
-        """Relax all components, the last one first if not forth; in a band at surfaces and walls alone if asked."""
+        """Relax all components, in reverse order if not `forth`.
+
+        With `band`, only the unknowns outside of the rows' cores, at surfaces and walls.
+        """
         for axis in range(self.dimension) if forth else reversed(range(self.dimension)):
             rows, (y, z) = self.rows(axis), self.of_others(axis, self.x)
             for left, color in (1, 0), (0, 1):
@@ -258,7 +280,7 @@ class ViscosityLevel:
             self.share([self.x[axis]], launch)
 
     def residual(self, launch: Launch) -> None:
-        """Find r = b - A x."""
+        """Compute r = b - A x."""
         for axis in range(self.dimension):
             y, z = self.of_others(axis, self.x)
             self.around(1).run(
@@ -273,7 +295,7 @@ class ViscosityLevel:
             )
 
     def product(self, x: list[wp.array], out: list[wp.array], launch: Launch) -> None:
-        """Find A x."""
+        """Compute A x."""
         for axis in range(self.dimension):
             y, z = self.of_others(axis, x)
             self.around(0).run(
@@ -293,12 +315,12 @@ class ViscosityLevel:
             self.grid.domain.run(CLEAR[wp.float32], launch=launch, field=field)
 
     def average(self, fine: ViscosityLevel, window: Window, inner: Window) -> None:
-        """Take the means of a finer level.
+        """Set the weights to averages of a finer level.
 
         Args:
             fine: the finer level.
-            window: cells of this one that take something of it.
-            inner: those of the domain among them.
+            window: cells of this level with contributions of the finer one.
+            inner: those of them in the domain.
         """
         planes, axes = self.grid.planes, range(self.dimension)
 
@@ -341,7 +363,7 @@ class ViscosityLevel:
         self.find_spans(inner)
 
     def normalize(self, coarse: ViscosityLevel, window: Window) -> None:
-        """Find the normalization of the interpolation from a coarser level, where it is made."""
+        """Compute the normalization of the interpolation from a coarser level."""
         window = self.around(KNOWN) if self.shared else window
         for axis in range(self.dimension):
             window.run(
@@ -355,7 +377,7 @@ class ViscosityLevel:
             )
 
     def restrict(self, coarse: ViscosityLevel, launch: Launch) -> None:
-        """Make the residual the coarser level's right-hand side."""
+        """Restrict the residual to the coarser level's right-hand side."""
         for axis in range(self.dimension):
             coarse.around(0).run(
                 self.passes.restrict,
@@ -369,7 +391,7 @@ class ViscosityLevel:
             )
 
     def prolong(self, coarse: ViscosityLevel, launch: Launch) -> None:
-        """Add the coarser level's solution."""
+        """Add the interpolated solution of the coarser level."""
         for axis in range(self.dimension):
             self.around(3).run(
                 self.passes.prolong,
@@ -385,7 +407,7 @@ class ViscosityLevel:
 
 
 def join_cores(level: ViscosityLevel) -> None:
-    """Find the cores of rows that are cut: they may reach over the boxes of several ranks."""
+    """Find the cores of rows that are cut into boxes of several ranks."""
     grid, ranks, owned = level.grid, level.grid.part.row_ranks, level.grid.part.owned
     if ranks is None:
         return

@@ -1,4 +1,4 @@
-"""Multigrid for the viscous equations: one symmetric cycle, the preconditioner of conjugate gradients."""
+"""Multigrid preconditioner of the viscous equations: one symmetric V-cycle."""
 
 from __future__ import annotations
 
@@ -15,22 +15,23 @@ from warp_lcp.multigrid.halo_levels import GATHERED
 from warp_lcp.rows.fields import zeros
 from warp_lcp.rows.program import Launch, launch_now, perform
 
-LEAST = 8  # cells of the longest side at which there is no coarser level
+LEAST = 8  # cells of the longest side of the coarsest level
 
 
 class ViscosityMultigrid:
-    """Approximate the inverse of the viscous equations on faces: z = M r, symmetric and positive definite.
+    """Multigrid preconditioner z = M r, symmetric and positive definite.
 
-    On ranks `set_up` and `apply` are collective: r is read, and z written, of this rank's own
-    faces; of the others within `KNOWN` layers z is what their ranks find.
+    M approximates the inverse of the viscous equations on faces. On ranks `set_up` and `apply` are
+    collective: r is read, and z written, on this rank's own faces; within `KNOWN` layers of ghost
+    faces z has the values of their owners.
 
     Args:
         grid: the finest grid.
 
     Attributes:
         r, z: flat float32 fields, one component after the other.
-        levels: from the finest on.
-        program: one cycle.
+        levels: the levels, the finest one first.
+        program: launches of one cycle.
     """
 
     def __init__(self, grid: StaggeredGrid) -> None:
@@ -42,15 +43,15 @@ class ViscosityMultigrid:
         self.r, self.z = (
             zeros(size, wp.float32, grid.device, small_pages=grid.sparse) for _ in range(2)
         )
-        # its ghost cells are filled
+        # A copy of r with ghost cells.
         self._b = zeros(size, wp.float32, grid.device) if self._shared else self.r
         self.levels = self._levels()
         self._gathered = self._whole() if self._shared else None
-        # of the cells whose equations are made
+        # Cells whose equations are computed.
         self._boxes = [ActiveWindow(level.grid.everywhere) for level in self.levels]
-        # those of the domain among them
+        # Those of them in the domain.
         self._inner = [ActiveWindow(level.grid.domain) for level in self.levels]
-        self._window: Window | None = None  # of the last `move_to`
+        self._window: Window | None = None  # window of the last `move_to`
         begin = [Launches(partial(perform, self._take_right_side))] if self._shared else []
         self.program = recorded(grid.device, [*begin, *self.cycle.stages()])
 
@@ -68,7 +69,10 @@ class ViscosityMultigrid:
         return levels
 
     def _is_coarsest(self, grid: StaggeredGrid) -> bool:
-        """Whether sweeps solve on a grid; on ranks, whether it is gathered."""
+        """Whether a grid is the coarsest level.
+
+        It is solved by sweeps; on ranks it is gathered.
+        """
         return max(grid.domain_counts) <= LEAST or (
             self._shared and math.prod(grid.domain_counts) <= GATHERED
         )
@@ -98,7 +102,7 @@ class ViscosityMultigrid:
         )
 
     def components(self, field: wp.array) -> list[wp.array]:
-        """Return a flat field as one field a component."""
+        """Return views of a flat field, one per component."""
         n = self.grid.size
         return [
             field[axis * n : (axis + 1) * n].reshape(self.grid.shape)
@@ -106,15 +110,18 @@ class ViscosityMultigrid:
         ]
 
     def apply(self) -> None:
-        """Write z = M r."""
+        """Compute z = M r."""
         self.program.run()
 
     def product(self, p: wp.array, q: wp.array, *, launch: Launch = launch_now) -> None:
-        """Write q = A p."""
+        """Compute q = A p."""
         self.levels[0].product(self.components(p), self.components(q), launch)
 
     def move_to(self, window: Window) -> None:
-        """Have `set_up` make the equations of a window, which has cells of the domain: elsewhere they are what they were."""
+        """Restrict `set_up` to the cells of a window in the domain.
+
+        Equations elsewhere are not changed.
+        """
         if window == self._window:
             return
         self._window = window
@@ -126,7 +133,10 @@ class ViscosityMultigrid:
             self._inner[number].move_to(inner)
 
     def set_up(self) -> None:
-        """Make the coarse levels from the finest, in the cells of `move_to`; on ranks, in all cells."""
+        """Compute the coarse levels from the finest one, in the cells of `move_to`.
+
+        On ranks, in all cells.
+        """
         fine = self.levels[0]
         fine.share(fine.equations)
         fine.find_spans(self._inner[0])
@@ -143,7 +153,7 @@ class ViscosityMultigrid:
 
 
 def _take_part(level: ViscosityLevel, whole: ViscosityLevel) -> None:
-    """Write this rank's part of the whole grid's solution, ghost cells too."""
+    """Copy this rank's part of the whole grid's solution, with ghost cells."""
     part: Any = level.grid.part
     for x, of_whole in zip(level.x, whole.x, strict=True):
         part.take(of_whole, x)

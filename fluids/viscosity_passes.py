@@ -1,4 +1,4 @@
-"""Passes of the viscous solve, see `fluids.viscosity`."""
+"""Kernels of the viscous solve, see `fluids.viscosity`."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from warp_lcp.material.boundary_kernels import RELEASED
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
 from warp_lcp.rows import KernelFile, RowPass
 
-CLOSE = 1e-3  # cells: a face within it of a wall, or behind it, has the wall's velocity
+CLOSE = 1e-3  # cells: a face this near to a wall, or behind it, has the wall's velocity
 THETA = 0.02  # cells: the shortest link to a wall
-ALIKE = 1.001  # viscosities at most as far apart are one
-CORE = 1e-3  # diagonals that differ by less of theirs are alike
-# of a cell that the distance changes by from face to face: the wall lies across the axis
+ALIKE = 1.001  # viscosities within this ratio count as equal
+CORE = 1e-3  # relative difference below which diagonals count as equal
+# Change of the distance from face to face [cells] above which the wall is perpendicular to the
+# axis.
 ALONG = 0.95
 KINDS = {"AIR": AIR, "FLUID": FLUID, "SOLID": SOLID, "RELEASED": RELEASED}
 LIMITS = {"CLOSE": CLOSE, "THETA": THETA, "ALONG": ALONG, "ALIKE": ALIKE}
@@ -30,7 +31,9 @@ def viscous_passes(
     moving: bool = False,
     varies: bool = False,
 ) -> SimpleNamespace:
-    """Return the passes of a dimension; those that look at walls differ by these.
+    """Return the kernels of the viscous solve for a dimension.
+
+    The other arguments select variants of the kernels that read walls and surface.
 
     Args:
         dimension: 2 or 3.

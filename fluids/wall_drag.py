@@ -1,4 +1,4 @@
-"""Drag along walls, for liquids whose boundary layer no grid resolves: a quadratic law beside walls that hold the liquid."""
+"""Quadratic wall drag of liquids whose boundary layer the grid does not resolve."""
 
 from __future__ import annotations
 
@@ -18,28 +18,29 @@ from warp_lcp.rows.program import LaunchGraph, clear, copy
 
 
 class WallDrag:
-    """Slow down the liquid beside walls: a shear stress c_f / 2 rho |u| u, with u the velocity along the wall relative to it.
+    """Wall drag: a shear stress c_f / 2 rho |u| u on the liquid beside walls.
 
-    Beside a wall lie FLUID cells with a closed part of a face, unless they are RELEASED. A cell
-    hands each piece of wall in it, of area A, to its two faces of a component in proportion to what
-    they leave open, and a face with the liquid's volume V between its two cells has
+    The velocity u is that along the wall relative to it. Cells beside a wall are FLUID cells with a
+    closed part of a face, unless they are RELEASED. Each piece of wall in a cell, of area A, is
+    distributed to the cell's two faces of a component in proportion to their open fractions. With
+    the liquid's volume V between the two cells of a face
 
-        du/dt = -k |u| u,   k = (sum of c_f / 2 times its shares of A) / V,
+        du/dt = -k |u| u,   k = (sum of c_f / 2 times its shares of A) / V.
 
-    solved at once, u / (1 + dt k |u|): exact for one wall, and never faster than before, however
-    long the step. What faces lose walls get. Where solids cut a cell all of them are one plane,
-    with the vector area of what they close and the normal along it: beside corners too, and not in
-    gaps of one cell, where it cancels.
+    This is solved implicitly, u / (1 + dt k |u|): exact for one wall, and never an acceleration,
+    however long the step. The momentum that faces lose is applied to the walls. Where solids cut a
+    cell, all of them are one plane, with the vector area of what they close and the normal along
+    it. This also holds beside corners, but not in gaps of one cell, where the vector area cancels.
 
-    V is that of the liquid in the face's cells as the surface lies, so that a sheet of thickness h
-    slows down as u0 / (1 + c_f/2 u0 t / h) whether it fills its cells or not, if h is at most a
-    cell. Of a deeper flow the cells beside the wall alone slow down, and u is theirs.
+    V follows from the free surface, so that a sheet of thickness h slows down as u0 / (1 + c_f/2 u0
+    t / h) whether it fills its cells or not, if h is at most a cell. In a deeper flow only the
+    cells beside the wall are decelerated, and u is their velocity.
 
     Args:
         grid: the grid.
         boundary: its solids.
         coefficients: c_f of the domain's walls and of each solid, shape (1 + solids,).
-        density: of the liquid [kg/m^3].
+        density: density of the liquid [kg/m^3].
     """
 
     def __init__(
@@ -82,17 +83,18 @@ class WallDrag:
         """Slow down the projected faces.
 
         Args:
-            sums: adds up impulses.
+            sums: sums of impulses.
             window: cells that hold all liquid.
-            velocity: of each component [m/s] (updated where it is projected).
-            projection: that has just been made.
-            phi: as of the free surface.
-            dt: how long the drag acts [s].
-            references: the solids' points, see `SolidForces`; None: nobody asks for impulses.
+            velocity: velocity of each component [m/s] (updated where it is projected).
+            projection: the projection of the step.
+            phi: distance to the free surface, see `FreeSurface.phi`.
+            dt: time that the drag acts [s].
+            references: reference points of the solids, see `SolidForces`; None if force output is
+                off.
 
         Returns:
-            The energy that faces lose [J; J/m in 2-D], and the impulses on each solid, as of
-            `WallSums.take`; None: nobody asks.
+            The energy that faces lose [J; J/m in 2-D], and the impulses on each solid, see
+            `WallSums.take`; None if force output is off.
         """
         self._dt.value = dt
         if references is None:
@@ -118,7 +120,7 @@ class WallDrag:
             sums.launch(drag_kernel, window, given)
 
     def _keep(self, velocity: Sequence[wp.array]) -> None:
-        """Launch copies of the velocity as it was, and begin with no losses."""
+        """Launch copies of the velocity, and reset the losses."""
         for before, field in zip(self._before, velocity, strict=True):
             copy(before, field)
         clear(self._losses)
@@ -132,7 +134,7 @@ class WallDrag:
         *,
         apply: bool,
     ) -> list[list[Any]]:
-        """Return what the kernel takes for each component."""
+        """Return the kernel's arguments for each component."""
         D = self._drag
         D.walls, D.kind, D.contact, D.phi = sums.walls, projection.kind, projection.contact, phi
         D.u, D.v, D.w = three_components(self._before)

@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Kernels of the drag along walls."""
+"""Kernels of the wall drag, see `fluids.wall_drag`."""
 
 import warp as wp
 
@@ -14,12 +14,12 @@ HALF = wp.constant(0.5)
 
 @wp.struct
 class Drag:
-    """What the drag is made of; velocities are those after the projection, float32 on faces."""
+    """Fields that the wall drag reads; velocities are those after the projection."""
 
     walls: Walls
     kind: I8
     contact: U8
-    # distance to the free surface at cell centers [cells]; null: it lies on the cells' faces
+    # Distance to the free surface at cell centers [cells]; null if it lies on the cells' faces.
     phi: F32
     u: F32
     v: F32
@@ -27,9 +27,9 @@ class Drag:
     known_u: I8
     known_v: I8
     known_w: I8
-    # of the domain and each solid: shear stress over rho u^2
+    # Shear stress over rho u^2 of the domain and of each solid.
     coefficient: wp.array(dtype=wp.float32)
-    turn: wp.array(dtype=wp.mat33)  # a wall's point x moves at turn x + shift
+    turn: wp.array(dtype=wp.mat33)  # the velocity of a wall's point x is turn x + shift
     shift: wp.array(dtype=wp.vec3)
 
 
@@ -47,7 +47,7 @@ def open_share(S: Walls, axis: int, k: int, j: int, i: int):
 
 @wp.func
 def fill(D: Drag, k: int, j: int, i: int):
-    """Return how full of liquid a cell is, as its surface lies."""
+    """Return the liquid fraction of a cell, from the free surface."""
     full = wp.where(D.kind[k, j, i] == _FLUID, 1.0, 0.0)
     if D.phi:
         full = wp.clamp(HALF - D.phi[k, j, i], 0.0, 1.0)
@@ -57,12 +57,15 @@ def fill(D: Drag, k: int, j: int, i: int):
 
 @wp.func
 def mean_of(field: F32, known: I8, axis: int, component: int, k: int, j: int, i: int):
-    """Return a component's mean over the projected ones of its four faces around a face of another axis [m/s]; 0 without any."""
+    """Return the mean of a component on a face of another axis [m/s].
+
+    It is the mean over the projected ones of its four faces around this face; 0 without any.
+    """
     total = float(0.0)
     count = float(0.0)
     for n in range(4):
-        a = n & 1  # the cell below the face, or the face's
-        b = n >> 1  # its lower or upper face
+        a = n & 1  # 0: the cell of the face; 1: the cell below
+        b = n >> 1  # 0: its lower face; 1: its upper face
         z = k - wp.where(axis == 2, a, 0) + wp.where(component == 2, b, 0)
         y = j - wp.where(axis == 1, a, 0) + wp.where(component == 1, b, 0)
         x = i - wp.where(axis == 0, a, 0) + wp.where(component == 0, b, 0)
@@ -74,7 +77,11 @@ def mean_of(field: F32, known: I8, axis: int, component: int, k: int, j: int, i:
 
 @wp.func
 def velocity_on(D: Drag, axis: int, k: int, j: int, i: int):
-    """Return the velocity on a face [m/s]."""
+    """Return the velocity vector on a face [m/s].
+
+    The component of the face's own axis is stored there; the others are means over the surrounding
+    faces.
+    """
     q = wp.vec3()
     if axis == 0:
         q[0] = D.u[k, j, i]
@@ -94,11 +101,11 @@ def velocity_on(D: Drag, axis: int, k: int, j: int, i: int):
 
 @wp.func
 def piece_of(S: Walls, n: int, along: int, k: int, j: int, i: int):
-    """Return the area of a piece of wall in a cell [faces] that drags along an axis, its normal, and whose it is.
+    """Return area [faces], normal and solid of a piece of wall in a cell.
 
-    The first 2 d pieces are what whole cells, or the domain, close of each face; the last one is
-    what solids that cut the cell close: a plane with the vector area of all their parts, which
-    cancel in a gap of one cell.
+    The area is the one that drags along an axis. The first 2 d pieces are the parts of each face
+    that whole cells, or the domain, close. The last piece is that of solids that cut the cell: a
+    plane with the vector area of all their parts, which cancel in a gap of one cell.
     """
     faces = 2 * (S.planes + 1)
     area = float(0.0)
@@ -150,11 +157,15 @@ def piece_of(S: Walls, n: int, along: int, k: int, j: int, i: int):
 
 @wp.func
 def pull(D: Drag, axis: int, q: wp.vec3, x: wp.vec3, area: float, normal: wp.vec3, solid: int):
-    """Return how fast a piece of wall pulls a face's velocity, area x coefficient x speed, and what that loses until it rests [m/s]."""
+    """Return the pull of a piece of wall on a face, and the speed that it removes.
+
+    The pull is area x coefficient x speed. The second value is the velocity change until the face
+    rests relative to the wall [m/s].
+    """
     relative = q - (D.turn[solid] * x + D.shift[solid])
     along = relative - wp.dot(relative, normal) * normal
     own = relative[axis]
-    # no more than all of it, nor a gain
+    # At most all of the velocity, and no gain.
     lost = wp.clamp(along[axis], wp.min(own, 0.0), wp.max(own, 0.0))
     return wp.where(lost == 0.0, 0.0, area * D.coefficient[solid] * wp.length(along)), lost
 
@@ -180,10 +191,15 @@ def drag_kernel(
     known: I8,
     losses: wp.array(dtype=wp.float64),
 ):
-    """Slow down the projected faces of a row beside walls that hold the liquid; count pieces of wall, or with `values` write impulses.
+    """Apply the drag to the projected faces of a row beside walls.
 
-    Nothing changes unless `apply` or `values` is given. `mass` is that of a full cell [kg];
-    `losses` gains the energy of each row [J].
+    With the sums over all pieces of wall, the new velocity is u' = u - sum of rate lost / (1 + sum
+    of rate), the implicit step of `fluids.wall_drag`. The sum has to be known before any piece's
+    share of the impulse, so that pieces are visited twice if impulses are written.
+
+    Only walls that hold the liquid count. With `values` null the pieces of wall are counted, else
+    their impulses are written. Velocities change only if `apply` is set. `mass` is that of a full
+    cell [kg]; `losses` gains the energy of each row [J].
     """
     row = k * field.shape[1] + j
     begin = int(0)
@@ -209,14 +225,14 @@ def drag_kernel(
             pulls = float(0.0)
             now = float(0.0)
             last = int(e)
-            # what all pieces do, and then what of it is each one's
+            # First the sum over all pieces, then the share of each one.
             for turn in range(wp.where(values, 2, 1)):
                 for side in range(2):
                     z = wp.where(side == 0, k, c)
                     y = wp.where(side == 0, j, b)
                     s = wp.where(side == 0, i, a)
                     if (side == 0 and here) or (side == 1 and below):
-                        # the cell's other face: its upper or its lower one
+                        # The cell's other face: its upper or its lower one.
                         o = wp.where(side == 0, 1, 0)
                         other = open_share(
                             S,
@@ -237,7 +253,7 @@ def drag_kernel(
                                     pulls += rate * lost
                                     e += 1
                                 else:
-                                    e -= 1  # from the last one
+                                    e -= 1  # backward from the last one
                                     force = wp.vec3d()
                                     force[axis] = mass * wp.float64(
                                         part * rate * (now - q[axis] + lost)

@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Which solid closes how much of a face: what rigid bodies' coupling, forces on solids and drag along walls ask alike."""
+"""Open fraction of a face, and the solid that closes the rest."""
 
 import warp as wp
 
@@ -9,24 +9,28 @@ from warp_lcp.grid.cut_cells_kernels import Moving, moving_part, open_face
 
 @wp.struct
 class Walls:
-    """What solids leave open, see `warp_lcp.grid.cut_cells`; of whole cells `index` says it, see `warp_lcp.grid.voxelize`."""
+    """Open fractions and numbers of the solids on faces and cells.
+
+    See `warp_lcp.grid.cut_cells`; for whole cells `index` has the solids, see
+    `warp_lcp.grid.voxelize`.
+    """
 
     planes: int
     spacing: wp.float64
-    origin: wp.vec3i  # cells of a larger grid before the first one of this
-    index: I32  # without cut cells
-    distance: F32  # of nodes from the solids [cells], with cut cells
-    moving: Moving  # where a solid moves
+    origin: wp.vec3i  # offset of this grid's first cell in a larger grid
+    index: I32  # null with cut cells
+    distance: F32  # of nodes from the solids [cells]; only with cut cells
+    moving: Moving  # share and number of moving solids
     open_x: F32
     open_y: F32
     open_z: F32
     wall_x: I16
     wall_y: I16
     wall_z: I16
-    number_x: I16  # of thin solids that cross faces, with barriers, see `warp_lcp.grid.barriers`
+    number_x: I16  # thin solids that cross faces, see `warp_lcp.grid.barriers`
     number_y: I16
     number_z: I16
-    # and how far they are from the centers of the cells below and above a face [cells]
+    # Their distances from the cells below and above a face [cells].
     below_x: F32
     below_y: F32
     below_z: F32
@@ -37,7 +41,7 @@ class Walls:
 
 @wp.func
 def fields_on(S: Walls, axis: int, k: int, j: int, i: int):
-    """Return the open fraction of a face among cut cells, and the number of the solid that closes it."""
+    """Return the open fraction of a face of cut cells, and the closing solid."""
     free = S.open_x[k, j, i]
     wall = S.wall_x[k, j, i]
     if axis == 1:
@@ -51,7 +55,10 @@ def fields_on(S: Walls, axis: int, k: int, j: int, i: int):
 
 @wp.func
 def crossing_on(S: Walls, axis: int, k: int, j: int, i: int):
-    """Return the thin solid that crosses a face, 0 if none does, and its distance from the cells below and above [cells]."""
+    """Return the thin solid that crosses a face, and its distances.
+
+    0 without one. The distances are those from the cells below and above [cells].
+    """
     number = S.number_x[k, j, i]
     below = S.below_x[k, j, i]
     above = S.above_x[k, j, i]
@@ -68,7 +75,10 @@ def crossing_on(S: Walls, axis: int, k: int, j: int, i: int):
 
 @wp.func
 def reach_across(S: Walls, axis: int, k: int, j: int, i: int):
-    """Return the area of a cell's side of thin solids, across an axis, in faces: what they cut off another cell is its."""
+    """Return the area of a thin solid's side toward a cell, across an axis [faces].
+
+    The part of a neighbor that the thin solid cuts off belongs to the cell.
+    """
     area = float(1.0)
     for d in range(S.planes + 1):
         if d != axis:
@@ -87,7 +97,10 @@ def reach_across(S: Walls, axis: int, k: int, j: int, i: int):
 
 @wp.func
 def moving_on(S: Walls, axis: int, k: int, j: int, i: int):
-    """Return the open fraction of a face, the moving solid that covers it, 0 if none does, and its part of what is not open."""
+    """Return open fraction, moving solid and its share of a face.
+
+    The solid is 0 if no moving one covers the face; the share is that of the closed part.
+    """
     free = float(1.0)
     solid = int(0)
     part = float(0.0)
@@ -114,8 +127,11 @@ def moves(S: Walls, solid: int):
 
 @wp.func
 def standing_of(S: Walls, k: int, j: int, i: int):
-    """Return the solid that stands still and closes the most of a face of a cut cell; 0, the domain, if none does."""
-    found = int(0)
+    """Return the standing solid with the largest closed part of a face of a cell.
+
+    0, the domain, if none does.
+    """
+    owner = int(0)
     most = float(0.0)
     for n in range(2 * (S.planes + 1)):
         axis = n >> 1
@@ -129,15 +145,17 @@ def standing_of(S: Walls, k: int, j: int, i: int):
         )
         if wall > 0 and 1.0 - free > most and not moves(S, wall):
             most = 1.0 - free
-            found = wall
-    return found
+            owner = wall
+    return owner
 
 
 @wp.func
 def closed_on(S: Walls, axis: int, k: int, j: int, i: int):
-    """Return an owner and its share of a face, the share of what stands in the cell (`standing_of`), and a solid that moves and its share.
+    """Return the owner of a face, and the shares of the solids that close it.
 
-    Of a domain's face solids have the part that they cover.
+    In this order: an owner and its share of a face, the share of the standing solid of the cell
+    (`standing_of`), a moving solid and its share. Of a face of the domain's sides, solids have the
+    part that they cover.
     """
     owner = int(-1)
     own = float(0.0)
@@ -172,7 +190,7 @@ def closed_on(S: Walls, axis: int, k: int, j: int, i: int):
 
 @wp.func
 def wall_way(S: Walls, k: int, j: int, i: int):
-    """Return the way from a cut cell's center to the nearest point of the solids' surface [cells]."""
+    """Return the vector from a cut cell's center to the solids' nearest point [cells]."""
     mean = float(0.0)
     slope = wp.vec3()
     corners = 4 * S.planes
@@ -189,7 +207,7 @@ def wall_way(S: Walls, k: int, j: int, i: int):
 
 @wp.func
 def face_center(S: Walls, axis: int, k: int, j: int, i: int):
-    """Return the center of a lower face [m], z = 0 in 2-D."""
+    """Return the center of a cell's lower face [m], with z = 0 in 2-D."""
     o = S.origin
     half = wp.float64(0.5)
     x = wp.vec3d(
@@ -211,7 +229,10 @@ def put(
     owners: wp.array(dtype=wp.int32),
     values: wp.array2d(dtype=wp.float64),
 ):
-    """Write entry e: an impulse on a solid, and its moment with a lever."""
+    """Write entry e: an impulse on a solid, and its moment about a reference point.
+
+    `lever` is the vector from the reference point.
+    """
     turn = wp.cross(lever, force)
     owners[e] = solid
     for n in range(3):

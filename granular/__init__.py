@@ -1,4 +1,4 @@
-"""Sand that flows, piles up and comes to rest: a plug-in of warp_lcp."""
+"""Dry sand that flows, piles up and comes to rest: the plug-in `granular`."""
 
 from warp_lcp.granular.simulator import GranularSimulator
 

@@ -43,55 +43,56 @@ from warp_lcp.rows.vectors import add_across
 if typing.TYPE_CHECKING:
     from warp_lcp.granular.stress import Velocity, Walls
 
-# trial steps before a step: one is exact while all stresses around a body are free; a second took a
-# sixth of the steps less
+# Trial steps before a step. One is exact while all stresses around a body are free; a second one
+# saved a sixth of the steps.
 ROUNDS = 2
-# cells or edges whose forces a thread adds up, on the CPU and on CUDA
+# Cells or edges whose forces a thread sums, on the CPU and on CUDA.
 GRAIN = {False: 1024, True: 64}
 NUMBERS = {2: 3, 3: 6}  # degrees of freedom of a body
-FIRST = {2: 2, 3: 4}  # layer of the first copy of a shear
+FIRST = {2: 2, 3: 4}  # layer of the first copy of the first shear
 
 
 class SandBodies:
-    """Rigid bodies in the stress solve.
+    """Implicit coupling of rigid bodies with the stresses of sand.
 
-    `begin`, `prepare`, `respond` and `search` are collective. A rank adds up what the stresses of
-    its cells do to the bodies, their copies on edges at cuts included, and sums over ranks are the
-    force: all ranks give a body the same velocity, and so all faces of their parts.
+    `begin`, `prepare`, `respond` and `search` are collective. A rank sums the forces of the
+    stresses of its cells on the bodies, including their copies on edges at cuts. The force is the
+    sum over the ranks, so that a body has the same velocity on all ranks.
 
-    With F = - sum of rows times stresses, see `granular.body_faces`, a body leaves the solve with V
-    = V* + rho dx^d M^-1 F. That adds R M^-1 R' to the matrix of the stresses: a light body's part
-    of it is far larger than sand's own. So a step of the stresses takes it implicitly: it is the
-    projected step whose own stresses give the bodies the velocity that it was taken with, a step in
-    the metric D + R M^-1 R' instead of D. That velocity is the root of a monotone equation in k
-    numbers a body, found by a few trial steps of the cells and wall faces beside bodies, each
-    followed by V <- V - (1 + W G)^-1 (V - V* - W F), W = rho dx^d M^-1 and G = R D^-1 R' the most
-    that F can fall with V. So the number of steps does not depend on the bodies' mass.
+    With F = - sum of rows times stresses, see `granular.body_faces`, the velocity of a body after
+    the solve is V = V* + rho dx^d M^-1 F. This adds R M^-1 R' to the matrix of the stresses. For a
+    light body this term is far larger than the sand's own, so a step of the stresses treats it
+    implicitly: it is a projected step in the metric D + R M^-1 R' instead of D, taken with the
+    velocity that its own stresses give the bodies.
 
-    The sand between a body's face and the centers of the cells before it has the face's velocity:
-    its mass, half a cell's, is added to the body's, and what gravity and its own motion bring along
-    to V*. Without it a body would neither bear nor drag along that layer.
+    This velocity is the root of a monotone equation with k unknowns per body. It is found by a few
+    trial steps of the cells and wall faces beside bodies, each followed by V <- V - (1 + W G)^-1 (V
+    - V* - W F), with W = rho dx^d M^-1 and G = R D^-1 R', a bound of -dF/dV. So the number of steps
+    does not depend on the mass of the bodies.
+
+    The sand between a body's face and the centers of the cells in front of it moves with the face:
+    its mass, half of a cell's, is added to the body's, and its momentum, including gravity, to V*.
+    Otherwise a body would neither carry nor drag this layer.
 
     Args:
         grid: the grid.
-        numbers: the wall's number of each body, 1 + index of its solid.
+        numbers: wall number of each body, 1 + index of its solid.
 
     Attributes:
         freedoms: k, degrees of freedom of a body.
-        velocity: V of each, float64, shape (bodies, k) [m/s, 1/s]; after `Stress.residual` that
-            which the stresses leave.
+        velocity: V of each body, float64, shape (bodies, k) [m/s, 1/s]; after `Stress.residual` the
+            one that results from the stresses.
     """
 
     def __init__(self, grid: StaggeredGrid, numbers: Sequence[int]) -> None:
-        """Allocate what does not depend on where the bodies are."""
-        # the cells whose stresses act on the bodies here, and of their faces and edges those that
-        # no one else has
+        """Allocate the arrays that do not depend on the positions of the bodies."""
+        # The cells whose stresses this rank sums, and the faces and edges that only this rank has.
         part = grid.part
         self._counted: Window | None = part.owned if part.shared else None
         self._own: Window | None = part.faces(grid.everywhere) if part.shared else None
         self.grid, self.numbers, self.freedoms = grid, tuple(numbers), NUMBERS[grid.dimension]
         count, k, device = len(self.numbers), self.freedoms, grid.device
-        # velocity and force, as the stresses leave them
+        # Velocity and force that result from the stresses.
         self._left = [Reading(device, count * k) for _ in range(2)]
         self.velocity, self._force = (reading.array.reshape((count, k)) for reading in self._left)
         self._error = wp.zeros((count, k), dtype=wp.float64, device=device)
@@ -107,10 +108,10 @@ class SandBodies:
             wp.vec3i(1, columns, columns * rows),
         )
         self._beginning = LaunchGraph(device, lambda: copy(self.velocity, self._start.array))
-        self._total = wp.zeros_like(self._force)  # of all ranks
-        # its entries, as `_owned` has runs
+        self._total = wp.zeros_like(self._force)  # sum over all ranks
+        # Run indices per entry, in the format of `_owned`.
         self._each = wp.array(np.arange(count)[:, None] + [0, 1], dtype=wp.int32, device=device)
-        # 1: sand is beside a body on some rank; else no force is asked for
+        # 1 if sand is beside a body on some rank; else no force is computed.
         self._met = wp.zeros(1, dtype=wp.int32, device=device)
         self.faces: BodyFaces | None = None
         self._walls: Walls
@@ -120,35 +121,34 @@ class SandBodies:
         """Find the faces, cells and edges where bodies meet sand.
 
         Args:
-            index: int, -1 in open cells, the wall's number elsewhere; shape of the grid's fields.
-            centers: of mass [m], shape (bodies, 3).
-            walls: the faces between sand and solids, the same object as long as `index` is the
-                same.
+            index: int, -1 in open cells, the wall number elsewhere; shape of the grid's fields.
+            centers: centers of mass [m], shape (bodies, 3).
+            walls: faces between sand and solids; the same object while `index` is unchanged.
         """
         grid, device = self.grid, self.grid.device
-        found = find_body_faces(grid, index, self.numbers, centers, self._counted)
-        # the same cells: what is recorded stays valid
+        faces = find_body_faces(grid, index, self.numbers, centers, self._counted)
+        # With the same cells, recorded launches stay valid.
         if self.faces is not None and walls is self._walls:
-            self.faces = found
+            self.faces = faces
             for places, rows in (
-                (self._faces, found.face.row),
-                (self._cells, found.cell.row),
-                (self._edges, found.edge.row),
+                (self._faces, faces.face.row),
+                (self._cells, faces.cell.row),
+                (self._edges, faces.edge.row),
             ):
                 places.row.assign(rows)  # type: ignore[attr-defined]  # an array of the struct
             return
-        self.faces = found
+        self.faces = faces
         self._walls, wall_cells = walls, walls.host_cells
-        self._entries, cells = entries_near(grid, found, wall_cells, walls.host_sides)
+        self._entries, cells = entries_near(grid, faces, wall_cells, walls.host_sides)
         self._entry_cells = wall_cells[self._entries].copy()
 
         def put(values: np.ndarray, dtype: type) -> wp.array:
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
 
         for places, part in (
-            (self._faces, found.face),
-            (self._cells, found.cell),
-            (self._edges, found.edge),
+            (self._faces, faces.face),
+            (self._cells, faces.cell),
+            (self._edges, faces.edge),
         ):
             places.at, places.axis, places.body = (
                 put(part.at, I32),
@@ -156,12 +156,12 @@ class SandBodies:
                 put(part.body, I32),
             )
             places.row = put(part.row, F64)
-        self._edges.copies = put(own_copies(grid, found.edge, self._counted), U8)
-        copies, homes = unowned_copies(grid, index, found)
+        self._edges.copies = put(own_copies(grid, faces.edge, self._counted), U8)
+        copies, homes = unowned_copies(grid, index, faces)
         self._unowned = put((FIRST[grid.dimension] + copies) * grid.size + homes, I32)
         self._trial = put(cells, I32)
         self._active = wp.zeros(1 + len(self._entries), dtype=wp.int32, device=device)
-        spans, parts = self._parts(found)
+        spans, parts = self._parts(faces)
         self._spans, self._owned = put(spans, I32), put(parts, I32)
         self._partial = wp.zeros((len(spans), self.freedoms), dtype=wp.float64, device=device)
 
@@ -177,14 +177,18 @@ class SandBodies:
     ) -> None:
         """Start a time step.
 
+        The start velocity is that of the body together with its layer of sand, of mass m and
+        momentum p in units of full faces. With w = rho dx^d M^-1 it is (1 + w m)^-1 (V* + w p), and
+        the response to impulses is (1 + w m)^-1 w.
+
         Args:
-            packing: where sand is.
-            sand: velocity u* of each component [m/s], gravity included, on the bodies' faces as
-                well.
-            weights: of the particles on each component's faces; where they are 0, so is `sand`.
+            packing: the packing of the step.
+            sand: velocity u* of each component [m/s], including gravity, also on the bodies' faces.
+            weights: particle weights on the faces of each component; where they are 0, so is
+                `sand`.
             velocity: V* of each body, shape (bodies, k) [m/s, 1/s].
             inverse_mass: M^-1 of each, shape (bodies, k, k).
-            density: of sand at its densest [kg/m^3].
+            density: density of sand at its densest packing [kg/m^3].
         """
         assert self.faces is not None
         self._scale, rows, owner = (
@@ -205,7 +209,7 @@ class SandBodies:
         mass = mass * within(self.grid, self.faces.face.at, self._own)
         count = len(self.numbers)
         self._layer_mass = self._sum(_products(mass, rows, owner, count))
-        # integers where there is no face
+        # bincount returns integers if there are no faces.
         momentum = [np.bincount(owner, mass * speed * row, count) for row in rows[:, 0].T]
         self._layer_momentum = self._sum(np.stack(momentum, axis=1).astype(float))
         alone = inverse_mass * self._scale
@@ -229,7 +233,7 @@ class SandBodies:
             )
 
     def forget(self, stress: StressFields) -> None:
-        """Remove stresses where only the edge of a body is near."""
+        """Set stresses to 0 in cells that touch a body only with an edge."""
         if len(self._unowned):
             fields = [field.flatten() for field in (stress.now, stress.before, stress.point)]
             launch(
@@ -241,16 +245,20 @@ class SandBodies:
     ) -> None:
         """Compute the correction of a trial step per velocity mismatch.
 
+        The correction is (1 + W G)^-1, where G = R D^-1 R' bounds the change of the force with the
+        velocity: a sum over cells of the steps of pressure and deviator, and over edges of those of
+        shear.
+
         Args:
-            packing: where sand is.
-            numbers: of the stresses, see `granular.yield_set`.
-            pressure_step: of the projected gradient, relative to the diagonal.
-            shear_step: likewise, of the shear stresses.
+            packing: the packing of the step.
+            numbers: parameters of the stresses, see `granular.yield_set`.
+            pressure_step: length of the projected gradient step, relative to the diagonal.
+            shear_step: likewise for the shear stresses.
         """
         found, device, dimension = self.faces, self.grid.device, self.grid.dimension
         assert found is not None
         inverse, cell, edge = flat_vector(packing.inverse), found.cell, found.edge
-        room = 2 * len(cell.at)  # both in one memory, which is read by one copy
+        room = 2 * len(cell.at)  # both are in one buffer, so that one copy reads them
         memory = wp.zeros(room + len(edge.at), dtype=wp.float64, device=device)
         cells = wp.array(ptr=memory.ptr or 0, dtype=wp.vec2d, shape=len(cell.at), device=device)
         inputs = [
@@ -293,17 +301,15 @@ class SandBodies:
     def impulses(self) -> np.ndarray:
         """Return the impulse of the sand on each body since V*, shape (bodies, k).
 
-        [kg m/s, kg m^2/s; 2-D: per m].
-
-        That is of the stresses of the last `Stress.residual`, and of the layer of sand that moves
-        with the body.
+        [kg m/s, kg m^2/s; 2-D: per m]. It includes the stresses of the last `Stress.residual` and
+        the layer of sand that moves with the body.
         """
         velocity, force = (reading.numpy().reshape(self.velocity.shape) for reading in self._left)
         layer = self._layer_momentum - np.einsum("bqr,br->bq", self._layer_mass, velocity)
         return np.asarray((force + layer) * self._scale)
 
     def changed(self) -> None:
-        """Say that a solve has been launched, which changes `impulses`."""
+        """Mark `impulses` as changed, after a solve has been launched."""
         for reading in self._left:
             reading.changed()
 
@@ -321,7 +327,11 @@ class SandBodies:
     def respond(
         self, packing: Packing, stress: wp.array, launch: Launch, *, implicit: bool
     ) -> None:
-        """Compute the bodies' velocity under the stresses, or a step towards it."""
+        """Compute the bodies' velocity under the stresses, or a step toward it.
+
+        A first kernel sums the forces over runs of cells and edges; a second one sums the runs of
+        each body and updates its velocity, see `bodies_kernels.respond_kernel`.
+        """
         device = self.grid.device
         inputs = [
             self._shape,
@@ -356,10 +366,11 @@ class SandBodies:
         Faces and edges beside the bodies are set to it.
 
         Args:
-            packing: where sand is.
-            velocity: what a step is taken with, at the bodies' last velocity.
-            stress: the stresses, of which `point` is overwritten beside bodies.
-            launch: records.
+            packing: the packing of the step.
+            velocity: velocity of the sand, which the steps start from, with the bodies' last
+                velocity.
+            stress: the stresses; their `point` is overwritten beside bodies.
+            launch: records the launches.
         """
         p, device, walls = packing, self.grid.device, self._walls
         kernels = body_kernels(self.grid.dimension, velocity.real, velocity.box, velocity.rate)
@@ -380,11 +391,14 @@ class SandBodies:
                 launch(kernels.strain, len(self._edges.at), edges, device=device)
 
     def _sum(self, found: np.ndarray) -> np.ndarray:
-        """Return sums over all processes."""
+        """Return the sums over all ranks."""
         return np.asarray(self.grid.part.ranks.sum(found))
 
     def _forces(self, launch: Launch) -> tuple[wp.array, wp.array]:
-        """Return the runs of each body, first and last, and what stresses do to the body in these; of ranks, the sums over all."""
+        """Return the runs of each body, first and last, and the forces on it in them.
+
+        On ranks, the sums over all.
+        """
         across, device = self.grid.part.across, self.grid.device
         if across is None:
             return self._owned, self._partial
@@ -398,7 +412,10 @@ class SandBodies:
         return self._each, self._total
 
     def _parts(self, found: BodyFaces) -> tuple[np.ndarray, np.ndarray]:
-        """Return runs of the lists of cells and edges that a thread adds up, first and last of both, and each body's runs."""
+        """Split the lists of cells and edges into runs, one per thread.
+
+        Returns the first and last entry of both lists for each run, and the runs of each body.
+        """
         grain = GRAIN[self.grid.device.is_cuda]
         spans: list[list[int]] = []
         parts: list[list[int]] = []
@@ -415,13 +432,15 @@ class SandBodies:
 
 
 def _products(weight: np.ndarray, rows: np.ndarray, owner: np.ndarray, count: int) -> np.ndarray:
-    """Return the sums of weight row' row over the rows of each owner, shape (count, k, k).
+    """Return the sums of weight row' row over the rows of each owner.
+
+    Shape (count, k, k).
 
     Args:
         weight: shape (n,).
-        rows: shape (n, several, k).
-        owner: of each, ascending, shape (n,).
-        count: of owners.
+        rows: shape (n, rows per entry, k).
+        owner: owner of each entry, ascending, shape (n,).
+        count: number of owners.
     """
     ends = np.searchsorted(owner, np.arange(count + 1))
     found = np.zeros((count, rows.shape[2], rows.shape[2]))

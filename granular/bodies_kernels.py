@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Kernels of rigid bodies in sand: what the stresses do to them, the velocity they get, and trial steps of the stresses around them."""
+"""Kernels of rigid bodies in sand: forces, velocities and trial steps."""
 
 import functools
 from collections.abc import Sequence
@@ -29,12 +29,12 @@ options = {"module": "granular.bodies"}
 
 @functools.cache
 def vector_struct(real: Any) -> Any:
-    """Return the struct of a vector's components, flat."""
+    """Return the struct of a vector field's components as flat arrays."""
     return make_struct(f"Vector_{real.__name__}", dict.fromkeys("xyz", wp.array(dtype=real)))
 
 
 def flat_vector(fields: Sequence[wp.array]) -> Any:
-    """Return the components of a vector as kernels take them: flat, none where there are fewer."""
+    """Return the components of a vector field as flat arrays; missing ones are null."""
     return put(
         vector_struct(fields[0].dtype)(),
         dict(zip("xyz", [field.flatten() for field in fields], strict=False)),
@@ -49,24 +49,24 @@ class FieldShape:
     """Shape of the grid's fields."""
 
     dimension: int
-    layer: int  # elements of a field
-    strides: wp.vec3i  # elements from cell to cell along x, y, z
+    layer: int  # elements per layer of a field
+    strides: wp.vec3i  # offset in elements to the next cell along x, y, z
 
 
 @wp.struct
 class Places:
-    """Faces, cells or edges beside bodies, see `granular.body_faces.Incidence`."""
+    """Faces, cells or edges beside bodies, see `body_faces.Incidence`."""
 
     at: _INTS
     axis: _BYTES
     body: _INTS
     row: _MATS
-    copies: _BYTES  # of an edge, a bit each: which of its cells' stresses act on the body here
+    copies: _BYTES  # bit mask of an edge's copies that act on the body on this rank
 
 
 @wp.func
 def entry(v: Any, axis: int, n: int):
-    """Element n of the component along an axis."""
+    """Return element n of the component along an axis."""
     if axis == 0:
         return v.x[n]
     if axis == 1:
@@ -87,13 +87,13 @@ def set_entry(v: Any, axis: int, n: int, value: Any):
 
 @wp.func
 def axes_of(shear: int):
-    """The axes of a shear."""
+    """Return the two axes of a shear."""
     return wp.where(shear == 2, 1, 0), wp.where(shear == 0, 1, 2)
 
 
 @wp.func
 def stress_part(stress: _SINGLE, layer: int, cell: int, axis: int, dimension: int):
-    """The normal stress of a cell along an axis, compression negative."""
+    """Return the normal stress of a cell along an axis, compression negative."""
     x = wp.float64(stress[cell])
     if dimension == 3:
         return wp.float64(stress[(1 + axis) * layer + cell]) - x
@@ -103,13 +103,13 @@ def stress_part(stress: _SINGLE, layer: int, cell: int, axis: int, dimension: in
 
 @wp.func
 def copy_of(stress: _SINGLE, n: int, copies: int, q: int):
-    """The stress of an edge's copy, 0 where it acts on the body elsewhere."""
+    """Return the stress of an edge's copy, 0 if it acts on the body on another rank."""
     return wp.where((copies >> q) & 1 == 1, wp.float64(stress[n]), wp.float64(0.0))
 
 
 @forward_kernel(**options)
 def forget_kernel(slot: _INTS, now: _SINGLE, before: _SINGLE, point: _SINGLE):
-    """No stress at the slots."""
+    """Set the stresses at the given slots to 0."""
     n = slot[wp.tid()]
     now[n] = 0.0
     before[n] = 0.0
@@ -126,7 +126,11 @@ def force_kernel(
     share: Vector,
     out: _ROW,
 ):
-    """What a part of the cells and edges beside a body does to it: minus their rows times their stresses."""
+    """Compute the force of some cells and edges on a body.
+
+    F = - sum of rows times stresses, see `granular.body_faces`. Each thread sums a run of cells and
+    edges in order, so that the result does not depend on the number of threads.
+    """
     part = wp.tid()
     freedoms = out.shape[1]
     for q in range(freedoms):
@@ -157,7 +161,10 @@ def force_kernel(
 
 @forward_kernel(**options)
 def add_runs_kernel(parts: _SPANS, partial: _ROW, met: _INTS, total: _ROW):
-    """Sums of each body's runs on this rank, 0 where no force is asked for; a thread an entry."""
+    """Sum the runs of each body on this rank, with a thread per entry.
+
+    0 if no force is computed.
+    """
     body, q = wp.tid()
     value = wp.float64(0.0)
     if met[0] != 0:
@@ -178,7 +185,11 @@ def respond_kernel(
     error: _ROW,
     velocity: _ROW,
 ):
-    """The force on a body and the velocity that it leaves; implicit: a step towards the velocity whose stresses leave it."""
+    """Compute the force on a body, and the velocity that results from it.
+
+    If `implicit` is set, the velocity is moved by one Newton-like step, V - (1 + W G)^-1 (V - V* -
+    W F), toward the velocity whose stresses result in itself.
+    """
     body = wp.tid()
     freedoms = velocity.shape[1]
     for q in range(freedoms):
@@ -202,7 +213,10 @@ def respond_kernel(
 
 @forward_kernel(**options)
 def layer_kernel(faces: Places, mass: Vector, u: Vector, weight: Vector, out: _PAIRS):
-    """Mass of the sand that moves with a body's face, half a cell, and the velocity that it had."""
+    """Compute mass and velocity of the sand that moves with a body's face.
+
+    It is half of the cell in front of the face.
+    """
     n = wp.tid()
     a = int(faces.axis[n])
     at = faces.at[n]
@@ -225,10 +239,13 @@ def stiffness_kernel(
     numbers: _SINGLE,
     out: _PAIRS,
 ):
-    """Inverses of what the steps of pressure and friction in a cell are scaled by; 0 where it has none."""
+    """Compute the inverse step scales of pressure and friction in a cell.
+
+    0 where a cell has none.
+    """
     n = wp.tid()
     at = cells.at[n]
-    found = wp.vec2d()
+    steps = wp.vec2d()
     if (int(flags[at]) & HOLDS) != 0:
         full = wp.clamp(1.0 - drive[at] * numbers[STEP_OF_CELL] / NEARLY, 0.0, 1.0)
         diagonal = float(0.0)
@@ -238,15 +255,18 @@ def stiffness_kernel(
                 m = entry(mass, axis, o)
                 diagonal += (m + full * (1.0 - m)) * entry(inverse, axis, o)
         if diagonal > 0.0:
-            found[0] = wp.float64(1.0) / wp.float64(diagonal)
+            steps[0] = wp.float64(1.0) / wp.float64(diagonal)
     if (int(flags[at]) & SHEARS_HERE) != 0 and stiff[at] > 0.0:
-        found[1] = wp.float64(1.0) / wp.float64(stiff[at])
-    out[n] = found
+        steps[1] = wp.float64(1.0) / wp.float64(stiff[at])
+    out[n] = steps
 
 
 @forward_kernel(**options)
 def lightness_kernel(grid: FieldShape, edges: Places, share: Vector, inverse: Vector, out: _REALS):
-    """1 / sum of the inverse masses around an edge; 0 where it has no shear."""
+    """Compute 1 / sum of the inverse masses around an edge.
+
+    0 where it has no shear.
+    """
     n = wp.tid()
     at = edges.at[n]
     d = int(edges.axis[n])
@@ -264,13 +284,13 @@ def lightness_kernel(grid: FieldShape, edges: Places, share: Vector, inverse: Ve
 
 @functools.cache
 def body_kernels(dimension: int, real: Any, box: bool, rate: bool = False) -> SimpleNamespace:
-    """Return kernels and passes for 2 or 3 dimensions and velocities of `real`."""
+    """Return the kernels for 2 or 3 dimensions, with velocities of type `real`."""
     name = f"bodies_{dimension}d_{real.__name__}{'_box' * box}{'_rate' * rate}"
     module, Velocity = f"granular.{name}", vector_struct(real)
 
     @forward_kernel(module=module)
     def move(faces: Places, velocity: _ROW, moved: Velocity):
-        """Give the bodies' faces the velocity that they have."""
+        """Set the velocity of the bodies' faces."""
         n = wp.tid()
         b = faces.body[n]
         u = wp.float64(0.0)
@@ -280,7 +300,7 @@ def body_kernels(dimension: int, real: Any, box: bool, rate: bool = False) -> Si
 
     @forward_kernel(module=module)
     def strain(grid: FieldShape, edges: Places, u: Velocity, rates: Velocity):
-        """Twice the shear rate of the edges beside bodies, times dx."""
+        """Compute twice the shear rate of the edges beside bodies, times dx."""
         n = wp.tid()
         i = edges.at[n]
         d = int(edges.axis[n])

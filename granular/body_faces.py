@@ -1,12 +1,12 @@
 """Faces between bodies and sand, and the strain rates that bodies cause.
 
-A body of k degrees of freedom V (2-D: vx, vy, wz; 3-D: vx, vy, vz, wx, wy, wz; about its center of
-mass) has the velocity J_f V on face f, J_f the velocity of unit motions at the face's center along
-its axis. It changes the differences of velocity across an open cell, and the rates of shear of an
-edge, by rows times V; what the stresses do to the body is minus the same rows times the stresses.
-So sand and bodies exchange momentum and angular momentum without loss: the sum of the forces on all
-faces of sand and of a body is zero, and so is that of their torques, since the rates of strain of a
-rigid motion are.
+The velocity of a body has k components V, about its center of mass: vx, vy, wz in 2-D; vx, vy, vz,
+wx, wy, wz in 3-D. Its velocity on face f is J_f V, where J_f are the velocities of unit motions at
+the face's center along the face's axis. V changes the velocity differences across an open cell, and
+the shear rates of an edge, by rows times V. The force of the stresses on the body is minus the same
+rows times the stresses. So sand and bodies exchange momentum and angular momentum without loss: the
+forces on all faces of sand and of a body add up to zero, and so do their torques, since the strain
+rates of a rigid motion are zero.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ class Incidence:
     """Places beside bodies (faces, cells or edges) with their body, sorted by body.
 
     Attributes:
-        at: flat index of the place, shape (n,).
-        body: of each, shape (n,).
-        row: what a unit of V makes there, shape (n, m, k): the face's velocity, [1] and [m], the
-            differences of velocity along each axis across the cell, high less low, or the rate of
-            shear of the edge.
-        axis: the axis of a face, the shear of an edge, 0 of a cell.
-        share: bodies beside the place.
+        at: flat index of each place, shape (n,).
+        body: body of each place, shape (n,).
+        row: coefficients of V, shape (n, m, k): for a face its velocity (m = 1); for a cell the
+            velocity differences across it along each axis, high less low; for an edge its shear
+            rate.
+        axis: axis of a face, shear of an edge, 0 for a cell.
+        share: number of bodies beside the place.
     """
 
     at: np.ndarray
@@ -48,7 +48,7 @@ class Incidence:
 
 @dataclass(frozen=True)
 class BodyFaces:
-    """Faces of bodies near open cells, and the adjacent cells and edges."""
+    """Faces of bodies beside open cells, and the cells and edges beside them."""
 
     face: Incidence
     cell: Incidence
@@ -64,15 +64,15 @@ def find_body_faces(
 ) -> BodyFaces:
     """Return the faces between bodies and open cells.
 
-    A face between two solids belongs to that of the higher number.
+    A face between two solids belongs to the solid with the higher number.
 
     Args:
         grid: the grid.
-        index: int, -1 in open cells, the wall's number elsewhere; shape of the grid's fields.
-        numbers: the wall's number of each body.
-        centers: of mass of each body [m], shape (bodies, 3).
-        counted: cells that are asked for, with their edges and all faces that strain these; None:
-            all.
+        index: int, -1 in open cells, the wall number elsewhere; shape of the grid's fields.
+        numbers: wall number of each body.
+        centers: center of mass of each body [m], shape (bodies, 3).
+        counted: cells whose entries are needed, with their edges and all faces in their strain
+            rates; None for all cells.
     """
     faces = [
         _faces(grid, index, axis, np.asarray(numbers, dtype=int)) for axis in range(grid.dimension)
@@ -103,15 +103,16 @@ def find_body_faces(
 def entries_near(
     grid: StaggeredGrid, faces: BodyFaces, cells: np.ndarray, sides: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return wall faces and cells that a body's velocity reaches.
+    """Return the wall faces and cells that depend on a body's velocity.
 
-    Wall faces with an edge beside a body, and all cells whose stresses it changes.
+    These are the wall faces with an edge beside a body, and all cells whose stresses the body
+    changes.
 
     Args:
         grid: the grid.
-        faces: of the bodies.
+        faces: faces of the bodies.
         cells: flat index of the open cell of each wall face.
-        sides: 2 axis + side of each.
+        sides: 2 axis + side of each wall face.
     """
     strides, near = _strides(grid), np.zeros(len(cells), dtype=bool)
     for d, (alpha, beta) in enumerate(SHEARS[grid.dimension]):
@@ -130,10 +131,9 @@ def unowned_copies(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return shear copies on edges beside bodies that belong to no wall face.
 
-    As (shear, 4) in one number, and the cell.
-
-    A cell that touches a solid with its edge alone may have left a stress there before a body came
-    that near. Nothing bounds it now.
+    The first array has (shear, 4) combined in one number, the second one the cell. A cell that
+    touches a solid only with an edge may have a stress there from before the body came near. No
+    yield condition bounds this stress any more.
     """
     strides, solid = _strides(grid), index.ravel() >= 0
     copies, cells = [], []
@@ -150,9 +150,9 @@ def unowned_copies(
 
 
 def own_copies(grid: StaggeredGrid, edge: Incidence, counted: Window | None) -> np.ndarray:
-    """Return which of an edge's four copies are in counted cells.
+    """Return the copies of each edge that lie in counted cells, as a bit mask.
 
-    One bit each, uint8, shape (n,); `counted` None: all.
+    One bit per copy, uint8, shape (n,). If `counted` is None, all.
     """
     strides, axes = np.array(_strides(grid)), np.array(SHEARS[grid.dimension])[edge.axis]
     cells = [
@@ -164,9 +164,9 @@ def own_copies(grid: StaggeredGrid, edge: Incidence, counted: Window | None) -> 
 def within(
     grid: StaggeredGrid, flat: np.ndarray, window: Window | None, *, below: int = 0, above: int = 0
 ) -> np.ndarray:
-    """Return which flat indices lie in a window grown by some layers.
+    """Return the mask of flat indices in a window, grown by some layers.
 
-    None: all.
+    All indices if the window is None.
     """
     if window is None:
         return np.ones(len(flat), dtype=bool)
@@ -184,13 +184,16 @@ def _strides(grid: StaggeredGrid) -> tuple[int, int, int]:
 def _faces(
     grid: StaggeredGrid, index: np.ndarray, axis: int, numbers: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the flat indices of the bodies' faces of one axis that an open cell is near, and their bodies."""
+    """Return the bodies' faces of an axis beside open cells, and their bodies.
+
+    Faces are flat indices.
+    """
     owner = np.full(int(max(index.max(initial=0), numbers.max(initial=0))) + 2, -1)
     owner[numbers + 1] = np.arange(len(numbers))
     held = owner[index + 1] >= 0
     if not held.any():
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
-    # the box around all bodies, so that the rest of the grid costs nothing
+    # Only the box around all bodies is searched.
     found = ndimage.find_objects(held.astype(np.int8))[0]
     box = [
         slice(max(along.start - 2, 0), min(along.stop + 3, size))
@@ -211,7 +214,7 @@ def _faces(
 
 
 def _face_rows(grid: StaggeredGrid, flat: np.ndarray, axis: int, centers: np.ndarray) -> np.ndarray:
-    """Return J of faces of one axis."""
+    """Return the rows J of faces of an axis."""
     k, j, i = np.unravel_index(flat, grid.shape)
     place = np.stack([i, j, k], axis=1) + np.array(grid.origin) - 0.5
     place[:, axis] -= 0.5
@@ -228,7 +231,7 @@ def _cells(grid: StaggeredGrid, index: np.ndarray, face: Incidence) -> Incidence
     inner[1:-1, 1:-1, 1:-1] = index[1:-1, 1:-1, 1:-1] < 0
     open_, step = inner.ravel(), np.array(_strides(grid))[face.axis]
     parts = []
-    # a face is the low one of a cell and the high one of that before
+    # A face is the lower one of its cell and the upper one of the cell before.
     for cell, sign in ((face.at, -1.0), (face.at - step, 1.0)):
         at = np.flatnonzero(open_[cell])
         rows = np.zeros((len(at), grid.dimension, face.row.shape[2]))
@@ -240,10 +243,10 @@ def _cells(grid: StaggeredGrid, index: np.ndarray, face: Incidence) -> Incidence
 def _edges(grid: StaggeredGrid, face: Incidence) -> Incidence:
     """Return the edges beside bodies.
 
-    The rate of shear of an edge is u_a - u_a(one cell back along b) + u_b - u_b(one cell back along
+    The shear rate of an edge is u_a - u_a(one cell back along b) + u_b - u_b(one cell back along
     a).
     """
-    strides, found = _strides(grid), []
+    strides, edge_parts = _strides(grid), []
     for d, (alpha, beta) in enumerate(SHEARS[grid.dimension]):
         parts = []
         for axis, other in ((alpha, beta), (beta, alpha)):
@@ -252,11 +255,11 @@ def _edges(grid: StaggeredGrid, face: Incidence) -> Incidence:
                 (face.at[own], face.body[own], face.row[own]),
                 (face.at[own] + strides[other], face.body[own], -face.row[own]),
             ]
-        found.append(_summed(grid, parts, d))
-    order = np.argsort(np.concatenate([part.body for part in found]), kind="stable")
+        edge_parts.append(_summed(grid, parts, d))
+    order = np.argsort(np.concatenate([part.body for part in edge_parts]), kind="stable")
     return Incidence(
         *(
-            np.concatenate([getattr(part, name) for part in found])[order]
+            np.concatenate([getattr(part, name) for part in edge_parts])[order]
             for name in Incidence.__dataclass_fields__
         )
     )
@@ -265,7 +268,7 @@ def _edges(grid: StaggeredGrid, face: Incidence) -> Incidence:
 def _summed(
     grid: StaggeredGrid, parts: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], axis: int
 ) -> Incidence:
-    """Return the places that parts name, by body, each once, with the sums of their rows."""
+    """Merge parts into unique places, sorted by body, and sum their rows."""
     place, body, rows = (np.concatenate(part) for part in zip(*parts, strict=True))
     pairs, which = np.unique(body * grid.size + place, return_inverse=True)
     total = np.zeros((len(pairs), *rows.shape[1:]))

@@ -1,4 +1,4 @@
-"""Coupled pressure and friction of sand: accelerated projection, sweeps."""
+"""Methods for pressure and friction of sand: heavy-ball steps and sweeps."""
 
 from __future__ import annotations
 
@@ -37,23 +37,22 @@ from warp_lcp.settings import (
     renamed_names,
 )
 
-# 1 - momentum, times the cells of a side, of cold solves: with less than 2 sqrt(pressure_step / 4)
-# pi / 2 = 1.4 the longest
+# (1 - momentum) times the cells along a side, in cold solves. Below 1.4 = 2 sqrt(pressure_step / 4)
+# pi / 2 the longest wave, a quarter of which fits into a column's depth, oscillates, and walls hold
+# back what has risen. Friction needs a larger value.
 SWING = 1.9
-# wave, a quarter of which fits into a column's depth, swings back, and walls hold down what they
-# have let rise; friction asks for more
-# cells along an axis, so that two threads change no velocity in common: what a cell changes reaches
-# two cells far
+# Distance of the cells of one color along each axis. Two threads then change no common velocity,
+# since an update reaches two cells far.
 APART = 3
 KERNELS = KernelFile(Path(__file__).parent / "headers/sweeps.h", CONSTANTS)
 
 
 class StressWorkspace:
-    """Workspace of a stress solve; the iterate is the problem's field, in place.
+    """Workspace of a stress solve; it iterates on the problem's own field.
 
-    The last stresses are the result, even if the solve fails; `HeavyBallProjectedGradient.least`
-    explains why. Earlier stresses and the momentum are memory of the problem, whose `begin` uses it
-    between solves.
+    The last stresses are the result, even if the solve fails; see
+    `HeavyBallProjectedGradient.least` for the reason. The problem stores earlier stresses and the
+    momentum, which its `begin` uses between solves.
     """
 
     precision = wl.Precision.SINGLE
@@ -75,7 +74,7 @@ class StressWorkspace:
         return 0.0
 
     def keep(self) -> None:
-        """Keep the last stresses as the result."""
+        """Do nothing: the last stresses are the result."""
 
     restore = keep
 
@@ -85,39 +84,40 @@ class HeavyBallProjectedGradient(Settings):
     """Heavy-ball projected gradient method for pressure and friction together.
 
     Each step moves all stresses against their gradient, scaled by the problem's diagonal, and
-    projects: x onto x >= 0, the friction onto the yield set of the new x. Pressure and friction
-    have momenta of their own, which grow where steps go on in one direction and fall where they
-    flutter: the friction's bound depends on the pressure but not the other way round, so that the
-    problem has no energy to descend and too much momentum makes it oscillate where sand is nearly
-    rigid. Where the residual no longer falls, the momentum is limited further. No theorem promises
-    convergence, and in deep sand that yields there is a floor, see docs/methods.md: the residual
-    that is reported is that of the stresses, recomputed in float64.
+    projects: x onto x >= 0, then the friction onto the yield set at the new x. Pressure and
+    friction have separate momenta, which grow while steps continue in one direction and fall while
+    they oscillate. The friction's bound depends on the pressure but not the other way round, so
+    that the problem has no energy that decreases, and too much momentum causes oscillations where
+    sand is nearly rigid. Where the residual no longer falls, the momentum is limited further.
 
-    With diagonals D_x and D_s of a full packing, steps are stable while c_x a_x + c_s a_s < 2 (1 +
-    beta) / (1 + 2 lookahead beta), where a are the steps and c = 2, 2 in 2-D, 2, 4 in 3-D (the
-    largest eigenvalue on a periodic grid); the defaults take four fifths of that.
+    Convergence is not proven, and in deep yielding sand the residual has a floor, see
+    docs/methods.md. The reported residual is that of the final stresses, recomputed in float64.
+
+    With the diagonals D_x and D_s of a full packing, steps are stable while c_x a_x + c_s a_s < 2
+    (1 + beta) / (1 + 2 lookahead beta). Here a are the steps, and c = 2, 2 in 2-D and 2, 4 in 3-D,
+    the largest eigenvalues on a periodic grid. The defaults use four fifths of this limit.
 
     Args:
-        pressure_step: relative to the diagonal.
-        shear_step: relative to the diagonal; in 3-D it is halved.
-        lookahead: the gradient is taken at x + lookahead beta (x - x_before), steps start from x +
+        pressure_step: step of the pressure, relative to the diagonal.
+        shear_step: step of the shear stresses, relative to the diagonal; in 3-D it is halved.
+        lookahead: the gradient is taken at x + lookahead beta (x - x_before); steps start from x +
             beta (x - x_before).
         momentum: beta at the start of a solve.
-        check_every: periods of steps between two looks at the estimate of the residual.
+        check_every: periods of steps between two checks of the residual estimate.
         patience: steps without a better estimate, after which the next estimate near the best is
             accepted.
         wait: steps without a better estimate after which the momentum is limited, unless the
             estimate is within the tolerance.
-        calm: limits of the momentum, one after the other: beyond .87 deep sand that yields
-            flutters, which doubles its residual; waves of pressure as long as the sand is deep want
-            .95 and more, so that solves start without a limit.
-        least: steps that a solve takes, whatever its residual, unless that is next to nothing.
-            Smooth errors hardly show in the residual and add up from one time step to the next:
-            without these steps, packed sand at rest creeps two to four times as far.
-        cold: the same of a solve that starts from much less than its forces make, unless the
-            residual is next to nothing before. What it leaves is the distance that sand initially
-            at rest falls, with a rebound at walls: in a silo 126 cells deep it is 2e-4 of the
-            height, and friction points down in the uppermost rows.
+        calm: successive limits of the momentum. Above 0.87 deep yielding sand oscillates, which
+            doubles its residual; pressure waves as long as the depth of the sand need 0.95 and
+            more, so that solves start without a limit.
+        least: minimum number of steps of a solve, unless its residual is nearly zero. Smooth errors
+            hardly show in the residual and accumulate from one time step to the next: without these
+            steps, packed sand at rest creeps two to four times as far.
+        cold: minimum number for a solve that starts from much smaller stresses than its forces
+            cause, unless the residual is nearly zero before. The remaining error is the distance
+            that sand initially at rest falls, with a rebound at walls: in a silo 126 cells deep it
+            is 2e-4 of the height, and friction points down in the uppermost rows.
     """
 
     problems: ClassVar = Stress
@@ -138,9 +138,9 @@ class HeavyBallProjectedGradient(Settings):
         return MomentumWorkspace(problem, self)
 
     def step(self, problem: Stress, work: MomentumWorkspace, x: wp.array) -> wl.Step:
-        """Take `check_every` periods of steps, or more without the host.
+        """Run `check_every` periods of steps, or more without the host.
 
-        The residual is evaluated when it is due.
+        The residual is evaluated when a decision requires it.
         """
         taken, due, stagnates = work.take_steps()
         failure = wl.SolveStatus.STAGNATED if stagnates else None
@@ -176,20 +176,20 @@ class MomentumWorkspace(StressWorkspace):
         super().__init__(stress)
         self.method = method
         self._ahead = StressAhead(stress, method) if StressAhead.suits(stress) else None
-        self._leads = False  # whether the device has begun the solve, and takes its steps
-        # where the decisions have the residual of the stresses as they are; None: it is not known
+        self._leads = False  # whether the device started the solve and decides on its steps
+        # Slot of the decisions with the residual of the current stresses; None if it is unknown.
         self._news: int | None = None
-        self._taken = 0  # of the steps done, those that the outer loop knows of
+        self._taken = 0  # steps that the outer loop has counted
 
     def begin_ahead(self, guess: None, criteria: wl.StoppingCriteria, steps: int) -> float | None:
         """Begin a solve on the device; return the residual at its start.
 
-        None: the host leads.
+        Returns None if the host decides on the steps.
 
         Args:
-            guess: None: the solve begins with the stresses as they are.
-            criteria: when steps are done; the device leads where the tolerance is absolute.
-            steps: of this solve that may be taken without the host.
+            guess: must be None, since the solve starts from the current stresses.
+            criteria: stopping criteria; the device decides only with an absolute tolerance.
+            steps: most steps of this solve without the host.
         """
         self._leads, self._news = (
             self._ahead is not None and steps > 0 and criteria.rtol == 0.0,
@@ -204,7 +204,7 @@ class MomentumWorkspace(StressWorkspace):
         return reference
 
     def _take(self, place: int) -> float:
-        """Take a residual over that the device has found; return its norm."""
+        """Read a residual that the device has computed; return its norm."""
         assert self._ahead is not None
         sums = self._ahead.decisions()[place : place + 2]
         self.norm, self.current = math.hypot(*self.problem.take_residual(*map(float, sums))), True
@@ -215,9 +215,9 @@ class MomentumWorkspace(StressWorkspace):
         return super().evaluate(x) if self._news is None else self._take(self._news)
 
     def take_steps(self) -> tuple[int, bool, bool]:
-        """Take steps; return their number, and two decisions.
+        """Run steps; return their number, and two decisions.
 
-        Whether to evaluate the residual, and whether progress has ended.
+        The decisions are: evaluate the residual, and progress has ended.
         """
         if self._ahead is None or not self._leads:
             taken = self.method.check_every * PERIOD
@@ -229,7 +229,7 @@ class MomentumWorkspace(StressWorkspace):
         return taken, bool(found[kernels.DUE]), bool(found[kernels.STAGNATES])
 
     def start(self, *, warm: bool, tolerance: float) -> bool:
-        """Begin a sequence of steps; return whether a minimum number is required.
+        """Start a sequence of steps; return whether a minimum number is required.
 
         The minimum holds for any residual.
         """
@@ -244,7 +244,7 @@ class MomentumWorkspace(StressWorkspace):
             momentum=method.momentum,
         )
         self._aim, self._best, self._limits = tolerance, math.inf, list(method.calm)
-        # steps: taken, when the estimate was best, when it or the momentum last changed
+        # Counts of steps: done, at the best estimate, at the last change of estimate or momentum.
         self._done, self._best_at, self._moved = 0, 0, 0
         self._least, self._still = method.least, 0.0
         if stress.cold:
@@ -255,7 +255,7 @@ class MomentumWorkspace(StressWorkspace):
         return self._least > 0
 
     def judge(self, estimate: float, taken: int) -> tuple[bool, bool]:
-        """Return whether to evaluate the residual, and whether progress has ended.
+        """Return two decisions: evaluate the residual, and progress has ended.
 
         Also limits the momentum.
         """
@@ -283,15 +283,13 @@ class MomentumWorkspace(StressWorkspace):
 class InterleavedSweeps(Settings):
     """Alternating Gauss-Seidel sweeps over pressure and friction.
 
-    [Book] 2.2.4: staggering with one sweep per block.
-
-    Solving either to the end before the other converges far slower: both carry the same load, and
-    each sweep must be able to hand it over.
+    [Book] 2.2.4: staggering with one sweep per block. To converge either block before the other is
+    far slower: both carry the same load, which each sweep must be able to shift.
 
     Args:
-        pressure_relaxation: of the sweeps for the pressure.
-        friction_relaxation: of the sweeps for the friction, which 1.3 or more stalls.
-        check_every: rounds between two looks at the residual.
+        pressure_relaxation: relaxation factor of the pressure sweeps.
+        friction_relaxation: relaxation factor of the friction sweeps; 1.3 or more stalls.
+        check_every: rounds between two evaluations of the residual.
     """
 
     problems: ClassVar = Stress
@@ -313,6 +311,7 @@ class InterleavedSweeps(Settings):
         )
 
     def _round(self, stress: Stress) -> None:
+        """Launch a round of sweeps: pressure, friction in cells, friction on walls."""
         p, walls, device = stress.packing, stress.walls, stress.packing.grid.device
         passes = interleaved_passes(p.grid.dimension, stress.box, stress.rate, device.is_cuda)
         structs, now, numbers, omega = (
@@ -331,10 +330,10 @@ class InterleavedSweeps(Settings):
 
 
 class StressSweepWorkspace(StressWorkspace):
-    """Workspace of sweeps, which keep the velocity up to date."""
+    """Workspace of sweeps, which update the velocity incrementally."""
 
     def start(self, *, warm: bool, tolerance: float) -> None:
-        """Compute the velocity that the sweeps then keep up to date."""
+        """Compute the velocity that the sweeps then update."""
         self.problem.velocity.find(self.problem.now)
 
 
@@ -354,16 +353,19 @@ def _sweep(stress: Stress, passed: RowPass, omega: float) -> None:
 def interleaved_passes(
     dimension: int, box: bool = False, rate: bool = False, listed: bool = False
 ) -> SimpleNamespace:
-    """Return the sweep kernels in 2-D or 3-D; `listed`: over a list of cells."""
+    """Return the sweep kernels in 2-D or 3-D.
+
+    `listed`: over a list of cells.
+    """
     module = f"granular.interleaved_{dimension}d{'_box' * box}{'_rate' * rate}{'_listed' * listed}"
-    made = functools.partial(
+    kernel = functools.partial(
         KERNELS.kernel, module=module, constants={"DIM": dimension, "BOX": box, "RATE": rate}
     )
     area = "granular.interleaved" + "_listed" * listed
     return SimpleNamespace(
-        pressure=made(f"{area}.sweep_pressure"),
-        friction=made(f"{area}.sweep_friction"),
-        wall=made("granular.interleaved.sweep_walls"),
+        pressure=kernel(f"{area}.sweep_pressure"),
+        friction=kernel(f"{area}.sweep_friction"),
+        wall=kernel("granular.interleaved.sweep_walls"),
     )
 
 
@@ -373,7 +375,7 @@ def colors(
 ) -> list[wp.array]:
     """Return the flat indices of a box's cells by color.
 
-    Cells low <= (k, j, i) < high; cells of a color are `APART` along each axis.
+    Cells low <= (k, j, i) < high. The cells of a color are `APART` cells apart along each axis.
     """
     cells = np.arange(np.prod(shape), dtype=np.int32).reshape(shape)[tuple(map(slice, low, high))]
     starts = np.ndindex(*(min(APART, n) for n in cells.shape))

@@ -1,10 +1,10 @@
-"""Solids that cut cells as the stresses of sand meet them: what they leave open, and friction on their true surface.
+"""Solids that cut cells of sand: open fractions, and friction on their surface.
 
-The discrete power of the stresses is that of what is open: pressure on the open part of a face, a
-deviator on the open part of its cell or edge. Rates of strain are differences between faces that
-can move, so that sliding along a wall strains nothing, and forces are their adjoint, so that
-stresses exchange momentum without loss. No deviator acts on a wall: in the cells that it cuts the
-pressure is the whole load, and its friction is a traction of its own.
+The discrete power of the stresses includes only the open part: pressure on the open part of a face,
+a deviator on the open part of its cell or edge. Strain rates are differences between faces that can
+move, so that sliding along a wall causes no strain. Forces are the adjoint of strain rates, so that
+stresses exchange momentum without loss. No deviator acts on a wall: in cells that it cuts the
+pressure is the whole load, and wall friction is a separate traction.
 """
 
 from __future__ import annotations
@@ -28,30 +28,30 @@ from warp_lcp.rows.program import Launch
 if TYPE_CHECKING:
     from warp_lcp.granular.stress import Velocity
 
-SAMPLES = {2: 8, 3: 4}  # of a half cell along each axis, for its volume
-LEAST_WALL = 1e-4  # of a cell's face, below which there is no wall
-WALL_FACE = 16  # cells of a usual pass that a wall face costs
+SAMPLES = {2: 8, 3: 4}  # sample points of a half cell along each axis, for its volume
+LEAST_WALL = 1e-4  # least area of a wall in a cell, in units of a face
+WALL_FACE = 16  # cost of a wall face, in cells of a usual kernel
 
 
 class CutWalls:
-    """Solids that stand still and cut cells.
+    """Solids at rest that cut cells of sand.
 
     Args:
         grid: the grid.
         cut: the solids.
         friction: Coulomb's coefficient of the domain's walls and of each solid, >= 0; inf sticks.
-        solved: the cells whose walls are asked for; None: all.
+        solved: the cells whose walls are needed; None for all.
 
     Attributes:
-        openings: float32: what solids leave open of the lower faces of each axis, then what of each
-            cell the differences of velocity along each axis stand for: its volume where solids
-            leave both faces open in part, else 0; shape (2 dimension, *grid.shape).
+        openings: float32, shape (2 dimension, *grid.shape). First the open fractions of the lower
+            faces of each axis; then the part of each cell that the velocity difference along each
+            axis represents: its open volume where solids leave both faces partly open, else 0.
         volume: float32 open part of each cell.
-        around: float32 open part of what surrounds the edges of each shear.
-        count: cells with a wall.
-        cells: int32, their flat index.
-        normal: unit, out of the sand, shape (count, 3), on the host.
-        area: of each, in units of a cell's face, on the host.
+        around: float32 open fractions of the cubes around the edges of each shear.
+        count: number of cells with a wall.
+        cells: their flat indices, int32.
+        normal: unit normals out of the sand, shape (count, 3), on the host.
+        area: area of each wall, in units of a cell's face, on the host.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class CutWalls:
         friction: Sequence[float],
         solved: Window | None = None,
     ) -> None:
-        """Find volumes, areas and normals."""
+        """Compute volumes, areas and normals."""
         self.grid, device, dimension = grid, grid.device, grid.dimension
         distance, solid = cut.distance.numpy().astype(np.float64), cut.base.numpy() == SOLID
         octants = _octants(distance, dimension)
@@ -98,7 +98,7 @@ class CutWalls:
         high: list[np.ndarray],
         volume: np.ndarray,
     ) -> None:
-        """Find the cells with a wall, and what their kernel reads."""
+        """Find the cells with a wall, and the arrays of their kernel."""
         walls = np.array([a - b for a, b in zip(faces, high, strict=True)])
         size = np.sqrt((walls**2).sum(axis=0))
         at = np.flatnonzero(open_ & (size > LEAST_WALL))
@@ -130,14 +130,14 @@ class CutWalls:
         grain: int,
         launch: Launch,
     ) -> None:
-        """Take a projected step of the tractions, or find what the natural residual would move.
+        """Run a projected step of the tractions, or compute its natural residual.
 
         Args:
-            packing: where sand is.
-            velocity: that the stresses leave.
+            packing: the packing of the step.
+            velocity: velocity under the stresses.
             stress: the stresses.
-            partials: of sums; the last of each column are these.
-            grain: cells a thread takes.
+            partials: partial sums; the last ones of each column are written.
+            grain: cells per thread.
             launch: launches or records.
         """
         rows = Rows.entries(self.count, self.grid.device, grain, weight=WALL_FACE)
@@ -158,7 +158,10 @@ class CutWalls:
 
 
 def _corners(distance: np.ndarray, axes: Sequence[int]) -> np.ndarray:
-    """Return the distances at the corners of each cell along some axes, shape (2, ..., 2, *grid.shape), the last axis first."""
+    """Return the distances at the corners of each cell along some axes.
+
+    Shape (2, ..., 2, *grid.shape), with the last axis first.
+    """
     found = distance
     for axis in axes:
         found = np.stack([found, np.roll(found, -1, axis=-1 - axis)])
@@ -168,13 +171,16 @@ def _corners(distance: np.ndarray, axes: Sequence[int]) -> np.ndarray:
 def _open_part(
     corners: np.ndarray, low: Sequence[float], high: Sequence[float], samples: int
 ) -> np.ndarray:
-    """Return the part of boxes where the distance, linear between its values at the corners of a unit cube, is positive.
+    """Return the open fraction of boxes in unit cubes.
+
+    It is the part where the distance, interpolated linearly between the corners of the cube, is
+    positive.
 
     Args:
         corners: shape (2, ..., 2, n), the last axis of the cube first.
-        low: of the box along each axis.
-        high: likewise.
-        samples: along each axis of the box.
+        low: low end of the box along each axis.
+        high: high end of the box along each axis.
+        samples: sample points along each axis of the box.
     """
     total = np.zeros(corners.shape[-1])
     places = [
@@ -190,51 +196,61 @@ def _open_part(
 
 
 def _octants(distance: np.ndarray, dimension: int) -> np.ndarray:
-    """Return the open part of each half of each cell along all axes, shape (2, ..., 2, *grid.shape), the last axis first."""
+    """Return the open fraction of each octant of each cell.
+
+    Octants are the halves along all axes; shape (2, ..., 2, *grid.shape), with the last axis first.
+    """
     corners = _corners(distance, range(dimension))
     flat = corners.reshape(*(2,) * dimension, -1)
     least, most = (f(flat.reshape(2**dimension, -1), axis=0) for f in (np.min, np.max))
     mixed = np.flatnonzero((least < 0.0) & (most > 0.0))
-    found = np.zeros((2,) * dimension + (flat.shape[-1],))
-    found[..., least >= 0.0] = 1.0
-    for halves in itertools.product((0, 1), repeat=dimension):  # of the last axis first
+    parts = np.zeros((2,) * dimension + (flat.shape[-1],))
+    parts[..., least >= 0.0] = 1.0
+    for halves in itertools.product((0, 1), repeat=dimension):  # with the last axis first
         low = [0.5 * half for half in reversed(halves)]
-        found[halves][mixed] = _open_part(
+        parts[halves][mixed] = _open_part(
             flat[..., mixed], low, [a + 0.5 for a in low], SAMPLES[dimension]
         )
-    return found.reshape((2,) * dimension + distance.shape)
+    return parts.reshape((2,) * dimension + distance.shape)
 
 
 def _open_faces(
     grid: StaggeredGrid, faces: list[np.ndarray], distance: np.ndarray
 ) -> list[np.ndarray]:
-    """Return what solids leave open of faces, those of the domain's sides too, which its walls close."""
+    """Return the open fractions of faces, as solids leave them.
+
+    Faces on the domain's sides are included, although its walls close them.
+    """
     for axis, face in enumerate(faces):
-        others = [other for other in range(grid.dimension) if other != axis]
-        corners = _corners(distance, others)
+        plane_axes = [other for other in range(grid.dimension) if other != axis]
+        corners = _corners(distance, plane_axes)
         for layer in (1, grid.counts[axis] + 1):
             at = [slice(1, -1)] * 3
             at[2 - axis] = slice(layer, layer + 1)
-            part = corners[:, :, *at] if len(others) == 2 else corners[:, *at]
-            flat = part.reshape(*(2,) * len(others), -1)
+            part = corners[:, :, *at] if len(plane_axes) == 2 else corners[:, *at]
+            flat = part.reshape(*(2,) * len(plane_axes), -1)
             found = _open_part(
-                flat, [0.0] * len(others), [1.0] * len(others), 2 * SAMPLES[grid.dimension]
+                flat, [0.0] * len(plane_axes), [1.0] * len(plane_axes), 2 * SAMPLES[grid.dimension]
             )
-            face[tuple(at)] = found.reshape(part.shape[len(others) :])
+            face[tuple(at)] = found.reshape(part.shape[len(plane_axes) :])
     return faces
 
 
 def _around(
     octants: np.ndarray, inner: np.ndarray, solid: np.ndarray, alpha: int, beta: int
 ) -> np.ndarray:
-    """Return the open part of what surrounds the edges of a shear; 0 beside cells that solids fill but on the domain's walls."""
+    """Return the open fractions of the cubes around the edges of a shear.
+
+    0 beside cells that solids fill, except on the domain's walls.
+    """
     dimension = octants.ndim - 3
     total, count, filled = (
         np.zeros(inner.shape),
         np.zeros(inner.shape),
         np.zeros(inner.shape, dtype=bool),
     )
-    for a, b in itertools.product((0, 1), repeat=2):  # the cells one back along alpha, along beta
+    # Offsets of the cells, back along alpha and along beta.
+    for a, b in itertools.product((0, 1), repeat=2):
         at: list[slice | int] = [slice(None)] * dimension
         at[dimension - 1 - alpha], at[dimension - 1 - beta] = 1 if a else 0, 1 if b else 0
         part = octants[tuple(at)].reshape(-1, *inner.shape).mean(axis=0)

@@ -1,4 +1,7 @@
-"""Structs of fields that the kernels of stresses take; components along z, and the second and third shear, are None in 2-D."""
+"""Structs of fields for the stress kernels.
+
+Components along z, and the second and third shear, are None in 2-D.
+"""
 
 from dataclasses import dataclass
 
@@ -7,24 +10,24 @@ import warp as wp
 
 @dataclass(frozen=True, slots=True)
 class SandFields:
-    """Where sand is, see `Packing`.
+    """Packing of sand, see `granular.packing.Packing`.
 
     Attributes:
-        flags: uint8 bits of a cell, 0 without sand.
-        drive: what of a cell is free [m/s], float32.
+        flags: uint8 bits of each cell, 0 without sand.
+        drive: free volume of each cell as a velocity [m/s], float32.
         stiff: bound of the friction's diagonal in a cell, float32.
-        fraction: share of a cell that grains fill, float32.
+        fraction: volume fraction of grains in each cell, float32.
         spans: first and one past the last cell of each row that stresses reach, int32.
         share_x: weight of a cell's copy on the edges of the first shear, float32.
         share_y: likewise of the second.
         share_z: likewise of the third.
-        mass_x: of the faces along x, in units of a full face's, float32.
+        mass_x: mass of the faces along x, in units of a full face, float32.
         mass_y: likewise along y.
         mass_z: likewise along z.
-        inverse_x: 1 / mass_x, 0 where nothing can be moved, float32.
+        inverse_x: 1 / mass_x, 0 on faces that cannot move, float32.
         inverse_y: likewise along y.
         inverse_z: likewise along z.
-        start_x: velocity along x that the stresses act on [m/s], float32.
+        start_x: velocity along x before the stresses [m/s], float32.
         start_y: likewise along y.
         start_z: likewise along z.
     """
@@ -50,16 +53,16 @@ class SandFields:
 
 @dataclass(frozen=True, slots=True)
 class VelocityFields:
-    """A velocity of sand and what its shears are, see `Velocity`; float32 or float64.
+    """Velocity of sand and its shears, see `stress.Velocity`; float32 or float64.
 
     Attributes:
         u_x: velocity along x on faces [m/s].
         u_y: likewise along y.
         u_z: likewise along z.
-        edge_x: of the first shear on edges: its stress, then twice its rate times dx [m/s].
+        edge_x: values of the first shear on edges: its stress, then twice its rate times dx [m/s].
         edge_y: likewise of the second.
         edge_z: likewise of the third.
-        openings: of cells that solids cut, float32; None: none does.
+        openings: open fractions of cells that solids cut, float32; None without such cells.
     """
 
     u_x: wp.array
@@ -73,14 +76,14 @@ class VelocityFields:
 
 @dataclass(frozen=True, slots=True)
 class StressFields:
-    """Stresses of a solve, float32, and the numbers of its steps.
+    """Stresses of a solve, float32, and the parameters of its steps.
 
     Attributes:
-        now: the stresses.
-        before: those before the last step.
-        point: where the next gradient is taken.
-        momentum: of the next steps, float64.
-        numbers: float32, see `granular.yield_set`.
+        now: the current stresses.
+        before: the stresses before the last step.
+        point: the point at which the next gradient is taken.
+        momentum: momentum of the next steps, float64.
+        numbers: parameters, float32, see `granular.yield_set`.
     """
 
     now: wp.array
@@ -95,10 +98,10 @@ class WallFaces:
     """Faces of cells on solids.
 
     Attributes:
-        cells: flat index of each face's cell, int32.
-        sides: of that cell on which the face is, uint8.
-        walls: number of the wall, int32.
-        friction: of each wall, float32.
+        cells: flat index of the cell of each face, int32.
+        sides: side of the cell on which the face lies, uint8.
+        walls: wall number, int32.
+        friction: friction coefficient of each wall, float32.
     """
 
     cells: wp.array

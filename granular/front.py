@@ -1,9 +1,11 @@
 # mypy: ignore-errors
-"""Percentile of the particles' x and y, selected on the device: runout and height of the sand without a readback of its own.
+"""Runout and height of sand: percentiles of the particles' x and y.
 
-The n-th smallest of float32 numbers is found digit by digit (radix selection): of the numbers that
-begin with the digits found, count those with each next digit; the one in which n falls is found.
-Counts are integers, so that the result is exact.
+They are selected on the device, without an extra readback.
+
+The n-th smallest of float32 numbers is found digit by digit (radix selection). For each digit, the
+numbers that begin with the digits found so far are counted by their next digit; the digit in whose
+count the n-th number falls is the next one. Counts are integers, so that the result is exact.
 """
 
 from typing import no_type_check
@@ -24,7 +26,7 @@ WORDS = wp.array(dtype=wp.uint32)
 
 @wp.func
 def ordered_bits(x: float):
-    """Return bits that compare, unsigned, as the numbers do."""
+    """Return an unsigned integer with the same order as the float32 numbers."""
     bits = wp.cast(x, wp.uint32)
     return wp.where(bits < SIGN, bits ^ SIGN, ~bits)
 
@@ -34,7 +36,7 @@ def ordered_bits(x: float):
 def count_kernel(
     i, position: POINTS, found: WORDS, counts: INTS, mask: wp.uint32, shift: wp.uint32
 ):
-    """Count the digits behind `mask` of the coordinates that begin with what is found."""
+    """Count the next digits of the coordinates that begin with the digits found."""
     for axis in range(AXES):
         bits = ordered_bits(position[i][axis])
         if (bits & mask) == (found[axis] & mask):
@@ -52,7 +54,10 @@ def select_kernel(
     shift: wp.uint32,
     out: wp.array(dtype=wp.float32),
 ):
-    """Find the digit in which the number at a rank falls, and its rank among those; a thread an axis."""
+    """Select the next digit of the number at a rank, and the rank among the rest.
+
+    With one thread per axis.
+    """
     axis = wp.tid()
     left = rank[axis]
     bits = found[axis] & mask
@@ -77,7 +82,7 @@ class Front:
     """Percentile of the particles' x and y [m].
 
     Args:
-        device: where the particles are.
+        device: device of the particles.
     """
 
     def __init__(self, device: wp.Device) -> None:
@@ -92,8 +97,8 @@ class Front:
         """Launch the selection; `read` then returns the result.
 
         Args:
-            particles: at finite positions.
-            place: of the number among the particles' sorted ones, counted from 0.
+            particles: the particles; their positions must be finite.
+            place: index in the sorted numbers, counted from 0.
         """
         self._count, self._place.value = particles.count, place
         if self._count:

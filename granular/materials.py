@@ -1,11 +1,11 @@
 """Named granular materials, with the sources of their parameters.
 
-The angles are between loose and dense packing as soil mechanics measures them, near the loose one,
+Friction angles lie between those of loose and dense packing in soil mechanics, near the loose one,
 which is that of a heap: uniform sand of round grains 27.5 to 34 degrees, sandy gravel 35 to 50
-[Terzaghi & Peck 1967, table 17.1]; the densities are between both too, dry uniform sand 1430 to
+[Terzaghi & Peck 1967, table 17.1]. Densities lie between both as well: dry uniform sand 1430 to
 1750 kg/m^3 [table 6.3]. Sugar: angle of repose and bulk density of dry granulated sugar [Beakawi
 Al-Hashemi & Al-Amoudi 2018, a review]. Friction against walls is that of smooth solid walls, about
-two thirds of the angle's tangent. Every number may be set in a scene instead.
+two thirds of the angle's tangent. A scene can override every number.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ class Material:
     """Granular material.
 
     Attributes:
-        friction_angle: at which it stops on a slope of itself [degrees].
-        density: of the material at its densest [kg/m^3], air included.
-        max_fraction: of space that grains fill at their densest.
+        friction_angle: angle of a slope at which the material stops [degrees].
+        density: bulk density at the densest packing, with air [kg/m^3].
+        max_fraction: volume fraction of grains at the densest packing.
         wall_friction: Coulomb's coefficient against solids.
     """
 
@@ -46,15 +46,15 @@ def slope(angle: float, test: FrictionAngleTest, dimension: int) -> float:
 
     The angle [degrees] is that of the given test.
 
-    Repose: layers stop at it, k = tan. What slides along a slope shears alone, under equal normal
-    stresses: its shear stress over its pressure is the slope's tangent. Sand that rests and has
-    pushed against itself along the slope holds up to asin(k), 35.3 degrees where k = tan(30
-    degrees): heaps that are poured slowly lie between both.
+    Repose: layers stop at this angle, k = tan. Material that slides along a slope is in simple
+    shear, under equal normal stresses: its shear stress over its pressure is the slope's tangent.
+    Sand at rest that was compressed along the slope stays up to asin(k), 35.3 degrees for k =
+    tan(30 degrees): heaps that are poured slowly lie between both.
 
-    Plane strain: Mohr and Coulomb's, k = sin. In 3-D that cone is flatter where a sample is
-    compressed along one axis: 30 degrees become 22.2. So triaxial compression has k = 2 sqrt(3) sin
-    / (3 - sin), from |s|_F = sqrt(2/3) q and q = 6 sin / (3 - sin) p, where q is the difference of
-    the principal stresses. In 2-D there is no other compression than plane strain's.
+    Plane strain: the criterion of Mohr and Coulomb, k = sin. In 3-D its cone has a smaller angle
+    under compression along one axis: 30 degrees become 22.2. So triaxial compression has k = 2
+    sqrt(3) sin / (3 - sin), from |s|_F = sqrt(2/3) q and q = 6 sin / (3 - sin) p, where q is the
+    difference of the principal stresses. In 2-D the only compression is plane strain.
 
     >>> alike = (26.565, "repose"), (30.0, "plane-strain"), (22.23, "triaxial-compression")
     >>> print(*(f"{slope(angle, test, 3):.3f}" for angle, test in alike))

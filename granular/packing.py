@@ -21,50 +21,50 @@ from warp_lcp.rows.readings import Reading
 if TYPE_CHECKING:
     from warp_lcp.granular.cut_walls import CutWalls
 
-REACH = 2  # cells from those of a process whose stresses the velocities around these feel
+REACH = 2  # layers of ghost cells whose stresses act on velocities in the box
 SHEARS = {2: ((0, 1),), 3: ((0, 1), (0, 2), (1, 2))}  # the axes of each shear
 
 
 class Packing:
-    """Packing of sand in a step, and where stresses act.
+    """Packing of sand in a step, and the cells in which stresses act.
 
-    phi is the share of a cell that grains fill, in units of the densest packing. Sand may be denser
-    than 1 by what the particles' sampling makes of it, which the stresses leave as it is; from FULL
-    on a cell is full. A face has the mean of its cells as mass; those with less than 0.02 are
-    empty, those with less than 0.1 count as 0.1. A cell with phi > 0.3 beside air counts as full in
-    the pressure's problem, so that a surface of partly filled cells carries a pressure, and thus
-    friction; its mass is its own.
+    phi is the volume fraction of grains in a cell, relative to the densest packing. Sampling noise
+    of the particles can make phi exceed 1, which the stresses do not correct. From FULL on a cell
+    counts as full. The mass of a face is the mean of its cells; faces with less than 0.02 are
+    empty, those with less than 0.1 count as 0.1. In the pressure problem a cell with phi > 0.3
+    beside air counts as full, so that a surface of partly filled cells has pressure, and thus
+    friction; its mass is still phi.
 
-    On ranks it is right in the box and `REACH` layers around it where the density is in all ghost
-    layers.
+    On ranks the result is correct in the box and `REACH` layers around it if the density is correct
+    in all ghost layers.
 
     Args:
         grid: the grid.
         base: int8, SOLID or AIR.
-        capacity: float32, share of a cell's kernel that is open.
-        sides: of axes without an end, if there are any.
-        cut: solids that cut cells, if there are any; `base` has those cells alone that they leave
-            nothing of.
+        capacity: float32, open share of a cell's kernel.
+        sides: exchange across periodic axes, if any.
+        cut: solids that cut cells, if any; only the cells that they fill completely are SOLID in
+            `base`.
 
     Attributes:
-        base: that of the arguments.
+        base: the argument of the same name.
         fraction: phi, float32.
         kind: int8 FLUID where a cell holds sand (phi > 0.02), AIR, SOLID.
         flags: uint8 bits of a cell, see `granular.yield_set`.
-        drive: what of a cell is free, at most FULL - phi and what is free around it, times dx / dt
-            [m/s], float32.
-        mass, inverse: of each component's faces, in units of a full face's, float32; inverse is 0
-            where nothing can be moved.
-        start: velocity of each component that the stresses act on [m/s], float32.
+        drive: free volume of a cell as a velocity: at most FULL - phi, and at most the mean free
+            fraction around it, times dx / dt [m/s], float32.
+        mass, inverse: mass of each component's faces, in units of a full face, float32; inverse is
+            0 on faces that cannot move.
+        start: velocity of each component before the stresses [m/s], float32.
         share: weight of a cell's copy on the edges of each shear, float32, see
             `granular.yield_set`.
         stiff: bound of the friction's diagonal in a cell, float32.
         spans: int32, first and one past the last cell of each row that stresses reach, shape
             (*grid.shape[:2], 2).
-        nodes: the window of lower faces and edges of all cells and the domain's upper side.
-        strained: of it, edges whose rates of strain counted cells take.
-        moved: faces whose velocities these and counted cells take.
-        stressed: edges whose stresses those take.
+        nodes: window of the lower faces and edges of all cells, including the domain's upper side.
+        strained: window of edges whose strain rates enter the counted cells.
+        moved: window of faces whose velocities enter these edges and the counted cells.
+        stressed: window of edges whose stresses act on these faces.
     """
 
     def __init__(
@@ -99,7 +99,8 @@ class Packing:
         more = 1 if grid.dimension == 3 else 0
         self.nodes = Window(low, (high[0] + more, high[1] + 1, high[2] + 1), grid.device)
         self.counted = grid.part.owned
-        # of this step's sand, on ranks; the same object in all steps, which recorded exchanges read
+        # Exchange of this step's cells on ranks; always the same object, since recorded exchanges
+        # read it.
         self._forest: Any = None
         self.strained, self.moved, self.stressed = (
             self._around(0, 1),
@@ -107,12 +108,12 @@ class Packing:
             self._around(1, 2),
         )
         self._known = grid.part.stored
-        # count, largest fraction of each row
+        # Number of sand cells and largest fraction of each row.
         self._rows = wp.zeros((2, *grid.shape[:2]), dtype=wp.float64, device=grid.device)
         self._found = Reading(grid.device, 2)
         self._rate = Scalar()  # dx / dt [m/s]
         self._update = LaunchGraph(grid.device, self._launch)
-        if sides is not None:  # what a row's neighbors hold may lie at the other end of it
+        if sides is not None:  # the neighbors of a row may be at its other end
             self.spans.assign(np.full((*grid.shape[:2], 2), (low[2], high[2] + 1), dtype=np.int32))
 
     def update(
@@ -125,10 +126,11 @@ class Packing:
         """Update the packing from the particles' density and velocity.
 
         Args:
-            density: of the particles, in units of the densest packing, float32.
-            velocity: u* of each component [m/s], gravity included.
+            density: density of the particles, relative to the densest packing, float32.
+            velocity: u* of each component [m/s], including gravity.
             dt: time step [s].
-            solid: velocity of the solids on each component's faces [m/s]; empty: they stand still.
+            solid: velocity of the solids on each component's faces [m/s]; empty if they are at
+                rest.
         """
         self._rate.value = self.grid.spacing / dt
         self._update.run(
@@ -140,10 +142,10 @@ class Packing:
         self._found.changed()
 
     def find_ghosts(self, layers: int) -> None:
-        """Find the ghost cells with sand, which `join` fills; collective.
+        """Find the ghost cells with sand, for `join`; collective.
 
         Args:
-            layers: of a field of stresses.
+            layers: layers of a stress field.
         """
         if self.grid.part.across is not None:
             sand = self.flags.numpy() != 0
@@ -156,21 +158,25 @@ class Packing:
 
     @property
     def counts(self) -> wp.array:
-        """Return `sand_cells` and `densest` where kernels find them, float64, shape (2,)."""
+        """Return `sand_cells` and `densest` as a device array, float64, shape (2,)."""
         return self._found.array
 
     @property
     def densest(self) -> float:
-        """Largest fraction of a cell, in units of the densest packing.
+        """Largest fraction of a cell, relative to the densest packing.
 
-        Of cells whose capacity is more than a half.
+        Only cells with more than half of their kernel open count.
         """
         return float(self._found.numpy()[1])
 
     def _launch(
         self, density: wp.array, velocity: Sequence[wp.array], solid: Sequence[wp.array]
     ) -> None:
-        """Launch an update."""
+        """Launch an update.
+
+        Each kernel needs the result of the one before: fractions of cells; kinds, flags and free
+        volumes; masses of faces; weights of edges; stiffness of cells; spans of the rows.
+        """
         grid, dimension = self.grid, self.grid.dimension
         domain, nodes = grid.domain, self.nodes
         domain.launch(kernels.fraction_kernel, [self.base, self._capacity, density, self.fraction])
@@ -236,7 +242,7 @@ class Packing:
         nodes.launch_rows(kernels.widen_kernel, [self._own, self.spans])
 
     def _launch_counts(self, density: wp.array) -> None:
-        """Launch what finds `sand_cells` and `densest`."""
+        """Launch the computation of `sand_cells` and `densest`."""
         self.counted.launch_rows(kernels.count_kernel, [self.flags, self._rows])
         self._known.launch_rows(
             kernels.most_kernel, [self.base, self._capacity, density, self._rows]
@@ -252,16 +258,19 @@ class Packing:
         )
 
     def _around(self, below: int, above: int) -> Window:
-        """Return the counted cells and so many layers of nodes on their lower and upper sides, as far as there are nodes."""
+        """Return the window of counted cells, grown by layers of nodes.
+
+        `below` and `above` layers on the lower and upper sides, within the grid.
+        """
         low, high = [n - below for n in self.counted.low], [n + above for n in self.counted.high]
         window = Window.of(low, high, self.grid.device)
         return window.common(self.nodes) or self.nodes
 
     def join(self, stress: wp.array, *, launch: Launch = launch) -> None:
-        """Fill `REACH` layers of ghost cells of a field of stresses; collective.
+        """Fill `REACH` layers of ghost cells of a stress field; collective.
 
-        After `find_ghosts`. Also the cells beyond periodic sides. Cells without sand have stresses
-        of 0 on all ranks.
+        Called after `find_ghosts`. Cells beyond periodic sides are filled, too. Cells without sand
+        have stresses of 0 on all ranks.
         """
         if self._forest is not None:
             self.grid.part.filling(stress, forest=self._forest).launch(launch)
@@ -270,7 +279,7 @@ class Packing:
 
     @property
     def fields(self) -> SandFields:
-        """Return the fields as kernels take them."""
+        """Return the fields as a kernel struct."""
         components = [
             c
             for f in (self.share, self.mass, self.inverse, self.start)

@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Kernels of the packing: masses of faces, shares of edges, what a cell may carry."""
+"""Kernels of the packing: face masses, edge weights, free volume, stiffness."""
 
 import warp as wp
 
@@ -12,31 +12,34 @@ _FLUID = wp.constant(wp.int8(FLUID))
 _AIR = wp.constant(wp.int8(AIR))
 _SOLID = wp.constant(wp.int8(SOLID))
 
-LEAST_FRACTION = 0.02  # of a cell or face, below which it is empty
-LEAST_MASS = 0.1  # of a face, in units of a full one: lighter ones would make the problem stiff
-DENSE = 0.5  # the fraction from which a cell carries shear
-# the fraction from which a cell beside air counts as full: a partly filled one has no pressure, and
-# so no friction
+LEAST_FRACTION = 0.02  # of a cell or face, below which it counts as empty
+LEAST_MASS = 0.1  # least mass of a face, relative to a full one: less would make the problem stiff
+DENSE = 0.5  # fraction from which a cell has shear stress
+# Fraction from which a cell beside air counts as full: other partly filled cells have no pressure,
+# and so no friction.
 SURFACE = 0.3
-# the fraction from which a cell counts as full: less than 1 by the sampling's noise, whose gaps
-# would close as falls
+# Fraction from which a cell counts as full: less than 1 by the sampling noise, since gaps due to
+# noise would close as if sand fell.
 FULL = 0.95
-# by which it is less where a wall takes nearly all of a cell: half the distance of two particles
+# Reduction of FULL where a wall takes nearly all of a cell: half the distance of two particles.
 WALL_NOISE = 0.25
-FIRM_FRACTION = 0.9  # from which cohesion holds a cell together
-# of a cell, below which it bears nothing: its faces are slits, through which only huge pressures
-# would move sand
+FIRM_FRACTION = 0.9  # fraction from which a cell has cohesion
+# Open fraction of a cell below which it has no stress: its faces are slits, and only huge pressures
+# could move sand through them.
 LEAST_OPEN = 5e-4
-LANES = 16  # cells of a vector
-ROUNDING = 1e-6  # by which a fraction may differ from 1 and count as 1
+LANES = 16  # cells per SIMD vector
+ROUNDING = 1e-6  # a fraction that differs from 1 by less counts as 1
 
 _F32X = wp.array4d(dtype=wp.float32)
-Faces = make_struct("Faces", dict.fromkeys("xyz", F32))  # the components of a vector, or shears
+Faces = make_struct("Faces", dict.fromkeys("xyz", F32))  # components of a vector, or shears
 
 
 @cell_kernel("granular.packing")
 def fraction_kernel(k, j, i, base: I8, capacity: F32, splatted: F32, fraction: F32):
-    """Fraction of a cell from the particles' density. More than 1 is mass, but never a velocity, see `contents_kernel`."""
+    """Compute the fraction of a cell from the particles' density.
+
+    A value above 1 is mass, but never causes a velocity, see `contents_kernel`.
+    """
     phi = float(0.0)
     if base[k, j, i] != _SOLID:
         phi = splatted[k, j, i] / wp.max(capacity[k, j, i], 0.1)
@@ -60,15 +63,15 @@ def contents_kernel(
     flags: U8,
     drive: F32,
 ):
-    """Which cells hold sand, and what of them is still free: drive = max(FULL - saturation, 0) dx / dt [m/s].
+    """Mark cells with sand, and compute their free volume.
 
-    What is free in a cell must be free around it as well: a gap that its neighbors' surplus fills
-    is the particles' sampling, no room.
+    drive = max(FULL - saturation, 0) dx / dt [m/s]. The free fraction of a cell is limited by the
+    mean around it: a gap beside a surplus in the neighbors is sampling noise, not room.
 
-    Never negative: what is too dense is a matter of positions, which the density correction moves
-    apart. Pushed out by the stresses it would be a velocity, which friction works against (a silo's
-    walls would pull its sand down), and the larger the shorter the step. Where solids cut cells,
-    `volume` is what they leave open of each.
+    The drive is never negative: excess density is corrected by moving particles apart (density
+    correction). A correction by the stresses would be a velocity, which friction opposes (the walls
+    of a silo would pull its sand down), and which grows as the time step shrinks. Where solids cut
+    cells, `volume` is the open part of each cell.
     """
     solid = base[k, j, i] == _SOLID
     phi = fraction[k, j, i]
@@ -121,7 +124,10 @@ def contents_kernel(
 
 @wp.func
 def _free_around(base: I8, capacity: F32, fraction: F32, planes: int, k: int, j: int, i: int):
-    """What of a cell would be free if all that is free around it, weighed by (1, 2, 1)/4 along each axis, were in it."""
+    """Return the free volume fraction after a 1-2-1 filter.
+
+    The weights are (1, 2, 1)/4 along each axis.
+    """
     free = float(0.0)
     for c in range(1 - planes, planes):
         for b in range(-1, 2):
@@ -149,15 +155,17 @@ def face_kernel(
     mass: F32,
     inverse: F32,
 ):
-    """Mass of a face in units of a full one, its inverse, and the velocity that the stress acts on.
+    """Compute the mass of a face, its inverse, and the velocity before the stresses.
 
-    A face beside a solid cannot be moved: inverse 0. Its mass is the fraction of the open cell
-    where the solid moves (it sweeps sand along), and its velocity the solid's. A face of no mass
-    stays out of it: 0 in all three. A cell that is filled less than the surface has no pressure: a
-    face between it and one that has bears all of it, not half. Else half of it would weigh on
-    nothing, the pressure and thus the friction below would be too small by what lies in it, and the
-    uppermost row would slide off slopes that it should rest on. Of a face that a solid cuts the
-    open part has mass, at least a least one.
+    Masses are in units of a full face. A face beside a solid cannot move: its inverse is 0. Its
+    mass is the fraction of the open cell if the solid moves (it sweeps sand along), and its
+    velocity the solid's. A face without mass has 0 in all three.
+
+    A cell that is filled less than the surface has no pressure. A face between it and one with
+    pressure gets the whole load, not half. Otherwise half of the load would be lost: the pressure
+    and thus the friction below would be too small by the weight of that cell, and the uppermost row
+    would slide off slopes on which it should rest. Of a face that a solid cuts the open part has
+    mass, with a lower limit.
     """
     c, b, a = cell_below(axis, k, j, i)
     m = float(0.0)
@@ -166,7 +174,7 @@ def face_kernel(
     if base[k, j, i] == _SOLID or base[c, b, a] == _SOLID:
         if solid:
             u = solid[k, j, i]
-            m = fraction[k, j, i] + fraction[c, b, a]  # one is 0, or both
+            m = fraction[k, j, i] + fraction[c, b, a]  # one of them is 0, or both
     else:
         mean = 0.5 * (fraction[k, j, i] + fraction[c, b, a])
         less = wp.min(fraction[k, j, i], fraction[c, b, a])
@@ -203,9 +211,10 @@ def edge_kernel(
     around: F32,
     share: F32,
 ):
-    """The weight of a copy on an edge: 1 / dense cells around it, or -1 / cells with a wall face that ends there, or 0.
+    """Compute the weight of a copy on an edge.
 
-    Where solids cut cells, times what is open around it.
+    It is 1 / dense cells around the edge, or -1 / cells with a wall face that ends there, or 0.
+    Where solids cut cells, it is multiplied by the open fraction around the edge.
     """
     ka = wp.where(alpha == 2, 1, 0)
     ja = wp.where(alpha == 1, 1, 0)
@@ -217,12 +226,12 @@ def edge_kernel(
         f1 = inverse_alpha[k - kb, j - jb, i]
         g0 = inverse_beta[k, j, i]
         g1 = inverse_beta[k - ka, j - ja, i - ia]
-        if f0 + f1 + g0 + g1 == 0.0:  # most edges: nothing to move
+        if f0 + f1 + g0 + g1 == 0.0:  # most edges: no face can move
             share[k, j, i] = 0.0
             continue
         solids, dense, held = int(0), int(0), int(0)
         for q in range(4):
-            a, b = q & 1, q >> 1  # the cells around the edge: one back along alpha, along beta
+            a, b = q & 1, q >> 1  # the cells around the edge: back along alpha, along beta
             flag = int(flags[k - a * ka - b * kb, j - a * ja - b * jb, i - a * ia])
             dense += flag & SHEARS_HERE
             if base[k - a * ka - b * kb, j - a * ja - b * jb, i - a * ia] == _SOLID:
@@ -252,7 +261,11 @@ def edge_kernel(
 def stiffness_kernel(
     k, j, i, dimension: int, flags: U8, inverse: Faces, share: Faces, openings: _F32X, stiff: F32
 ):
-    """What bounds the friction's part of a step in a cell: the largest diagonal in the metric of its yield set. 0: it carries no shear."""
+    """Compute the bound of the friction's step scale in a cell.
+
+    It is the largest diagonal entry in the metric of the cell's yield set; 0 in cells without shear
+    stress.
+    """
     most = float(0.0)
     if int(flags[k, j, i]) & SHEARS_HERE:
         x = inverse.x[k, j, i] + inverse.x[k, j, i + 1]
@@ -302,7 +315,10 @@ def _edge(
     aj: int,
     ai: int,
 ):
-    """4 share times the sum of the inverse masses around an edge between cells; 0 on walls."""
+    """Return 4 share times the sum of the inverse masses around an edge.
+
+    0 on walls.
+    """
     around = (
         first[k, j, i]
         + first[k - bk, j - bj, i - bi]
@@ -314,7 +330,7 @@ def _edge(
 
 @cell_kernel("granular.packing")
 def span_kernel(k, j, first, end, flags: U8, own: I32):
-    """First and one past the last cell of a row that holds sand."""
+    """Find the first and one past the last cell with sand in a row."""
     low = int(end)
     high = int(0)
     for i in range(first, end):
@@ -327,7 +343,7 @@ def span_kernel(k, j, first, end, flags: U8, own: I32):
 
 @cell_kernel("granular.packing")
 def count_kernel(k, j, first, end, flags: U8, rows: F64):
-    """How many cells of a row hold sand."""
+    """Count the cells with sand in a row."""
     count = int(0)
     for i in range(first, end):
         if flags[k, j, i] != wp.uint8(0):
@@ -337,7 +353,10 @@ def count_kernel(k, j, first, end, flags: U8, rows: F64):
 
 @cell_kernel("granular.packing")
 def most_kernel(k, j, first, end, base: I8, capacity: F32, density: F32, rows: F64):
-    """Largest fraction of a row's cells whose kernel is open for more than a half."""
+    """Find the largest fraction of a row's cells.
+
+    Only cells with more than half of their kernel open count.
+    """
     most = float(0.0)
     for i in range(first, end):
         if base[k, j, i] != _SOLID and capacity[k, j, i] > 0.5:
@@ -347,7 +366,10 @@ def most_kernel(k, j, first, end, base: I8, capacity: F32, density: F32, rows: F
 
 @list_kernel("granular.packing")
 def fold_kernel(i, rows: F64, found: wp.array(dtype=wp.float64)):
-    """Add up the rows' cells and find the largest of their fractions: both are exact in any order."""
+    """Sum the rows' counts, and find the largest of their fractions.
+
+    Both are exact in any order.
+    """
     k = i // rows.shape[2]
     j = i - k * rows.shape[2]
     wp.atomic_add(found, 0, rows[0, k, j])
@@ -356,7 +378,10 @@ def fold_kernel(i, rows: F64, found: wp.array(dtype=wp.float64)):
 
 @cell_kernel("granular.packing")
 def widen_kernel(k, j, first, end, own: I32, wide: I32):
-    """The span of a row and the rows around it, a cell wider on both sides, rounded up to whole vectors, within the range."""
+    """Widen the span of a row to the rows around it and one cell on both sides.
+
+    The width is rounded up to whole SIMD vectors, within the range.
+    """
     low = int(end)
     high = int(0)
     for c in range(wp.max(k - 1, 0), wp.min(k + 2, own.shape[0])):
@@ -370,8 +395,8 @@ def widen_kernel(k, j, first, end, own: I32, wide: I32):
     else:
         low = wp.max(low - 1, first)
         high = wp.min(high + 1, end)
-        # whole vectors of cells, which may lie on either side; what is left of a row takes as long
-        # as a vector
+        # Whole vectors of cells, which may extend to either side: the rest of a row costs as much
+        # as a vector.
         more = (high - low + LANES - 1) / LANES * LANES - (high - low)
         right = wp.min(more, wp.max(end - 1 - high, 0))
         wide[k, j, 0] = wp.max(low - (more - right), first)

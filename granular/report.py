@@ -1,4 +1,4 @@
-"""What a solve of the stresses leaves: the velocity, what holds sand to walls, and figures for the log."""
+"""Results of a stress solve: velocity, wall contact and log values."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from warp_lcp.rows.program import LaunchGraph
 
 
 class SandReport:
-    """Takes over what `Stress.checked` holds after a solve.
+    """Velocity, wall contact and log values after a stress solve.
 
     Args:
         stress: the stresses.
 
     Attributes:
-        ratio: of each cell's friction to its bound, float32.
-        contact: uint8 of HELD where sand has pressure, RELEASED where it has none, 0 elsewhere.
+        ratio: ratio of each cell's friction to its bound, float32.
+        contact: uint8: HELD in cells of sand with pressure, RELEASED without pressure, 0 elsewhere.
         known: int8, 1 on each component's faces that the stresses act on, -1 inside solids, 0
             elsewhere.
     """
@@ -44,11 +44,11 @@ class SandReport:
             LaunchGraph(grid.device, record)
             for record in (self._launch_taking, self._launch_report)
         )
-        # no face inside a solid that cuts cells is left unknown
+        # With solids that cut cells, no face inside a solid is left unknown.
         self._base = stress.packing.base if cut is None else grid.field(wp.int8)
 
     def take(self, velocity: Sequence[wp.array]) -> None:
-        """Give the faces that stresses act on the velocity that they leave [m/s], and find `known` and `contact`; collective."""
+        """Write the velocity after the stresses [m/s], `known` and `contact`; collective."""
         self._taking.run(velocity, variant=tuple(field.ptr for field in velocity))
         packing = self.stress.packing
         packing.grid.part.fill(
@@ -56,6 +56,7 @@ class SandReport:
         )
 
     def _launch_taking(self, velocity: Sequence[wp.array]) -> None:
+        """Launch the copy of velocities, and the contact of cells with sand."""
         stress, packing = self.stress, self.stress.packing
         for axis, field in enumerate(velocity):
             fields = [
@@ -70,19 +71,20 @@ class SandReport:
         packing.grid.domain.launch(contact_kernel, inputs)
 
     def measure(self) -> None:
-        """Launch what finds the figures of the last solve, which `report` returns."""
+        """Launch the computation of the log values, which `report` returns."""
         self._reporting.run()
         self._report.changed()
 
     def report(self, mass: float) -> Row:
-        """Return figures of the last solve, after `measure`; collective.
+        """Return log values of the last solve, after `measure`; collective.
 
-        yielded: share of the cells that carry shear whose friction is at its bound; dissipation:
-        what friction takes, never negative but for the solve's residual [J; J/m in 2-D];
-        predicted_excess: by how much a cell's fraction would exceed 1 after the step, at most.
+        yielded: fraction of the cells with shear stress whose friction is at its bound;
+        dissipation: energy dissipated by friction, never negative except for the solve's residual
+        [J; J/m in 2-D]; predicted_excess: largest amount by which a cell's fraction would exceed 1
+        after the step.
 
         Args:
-            mass: of a full cell [kg; kg/m in 2-D].
+            mass: mass of a full cell [kg; kg/m in 2-D].
         """
         cells, yielded, taken, most = self._found()
         return {
@@ -92,6 +94,7 @@ class SandReport:
         }
 
     def _launch_report(self) -> None:
+        """Launch the sums of the log values over all cells."""
         stress, p = self.stress, self.stress.packing
         self._report.take(
             p.counted,
@@ -103,7 +106,10 @@ class SandReport:
         )
 
     def _found(self) -> list[float]:
-        """Return how many cells carry shear, how many have yielded, what friction takes and the largest excess."""
+        """Return the cells with shear, those yielding, the dissipation, the excess.
+
+        The first two are counts; the excess is the largest one.
+        """
         part = self.stress.packing.grid.part
         part.fill(self.ratio)
         every = part.ranks.gather(np.array(self._report.read()))

@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Kernels of what is told of a step: how near each cell is to yielding, what friction takes, and what holds sand to walls."""
+"""Kernels for log values of sand: yield ratio, dissipation, wall contact."""
 
 import functools
 from pathlib import Path
@@ -12,7 +12,7 @@ from warp_lcp.grid.extrapolate import BLOCKED
 from warp_lcp.operators.grid_poisson import SOLID
 from warp_lcp.rows import KernelFile, RowPass
 
-RATIO_YIELDS = 0.99  # of the bound, from which a cell counts as yielded
+RATIO_YIELDS = 0.99  # ratio to the bound from which a cell counts as yielding
 KERNELS = KernelFile(
     Path(__file__).parent / "headers/stress.h", CONSTANTS | {"RATIO_YIELDS": RATIO_YIELDS}
 )
@@ -20,7 +20,10 @@ KERNELS = KernelFile(
 
 @functools.cache
 def report_pass(dimension: int, rate: bool = False, cut: bool = False) -> RowPass:
-    """Return the pass for 2 or 3 dimensions; friction grows with the rate of shear; solids cut cells."""
+    """Return the kernel for 2 or 3 dimensions.
+
+    `rate`: friction depends on the shear rate. `cut`: solids cut cells.
+    """
     module = f"granular.report_{dimension}d{'_rate' * rate}{'_cut' * cut}"
     return KERNELS.kernel(
         "granular.report.report",
@@ -31,7 +34,7 @@ def report_pass(dimension: int, rate: bool = False, cut: bool = False) -> RowPas
 
 @cell_kernel("granular.report")
 def take_kernel(k, j, i, axis: int, base: I8, inverse: F32, found: F64, velocity: F32, known: I8):
-    """Give a face that stresses act on the velocity that they leave, and find what is known of it."""
+    """Set the velocity of a face that stresses act on, and mark it as known."""
     c, b, a = cell_below(axis, k, j, i)
     mark = wp.int8(0)
     if inverse[k, j, i] > 0.0:

@@ -32,16 +32,16 @@ from warp_lcp.scene.shapes import (
 from warp_lcp.scene.unusual import GRAIN_DENSITY, Usual
 from warp_lcp.settings import NonNegative, Positive, Share
 
-STRESS_BYTES = {2: 160, 3: 330}  # a cell: the coupled solve's fields
-CUT_STRESS_BYTES = {2: 48, 3: 76}  # and where solids cut cells
-# slope of a cone from which on it holds stresses with tension
+STRESS_BYTES = {2: 160, 3: 330}  # bytes per cell: the coupled solve's fields
+CUT_STRESS_BYTES = {2: 48, 3: 76}  # added where solids cut cells
+# Slope k from which on the yield cone contains tensile stresses.
 STEEPEST = {2: 1.0, 3: math.sqrt(0.75)}
 STEEPEST_ANGLE = {"repose": {2: 45.0, 3: 40.8}, "triaxial-compression": {3: 36.8}}  # degrees
 FRICTION_ANGLE = Usual(6.0, 60.0, "degrees", "25 to 45", "radians", math.degrees(1.0))
 COHESION = Usual(0.0, 1e6, "Pa", "100 to 5,000 (damp sand), 1e4 to 1e5 (clay)")
 SAND_CFL = Usual(0.0, 4.0, "", "0.5 to 1")
-# inertial number at which half of the growth of glass beads' friction is there
-# [Jop, Forterre & Pouliquen 2006]
+# Inertial number at which friction of glass beads has reached half of its growth
+# [Jop, Forterre & Pouliquen 2006].
 GLASS = 0.279
 
 Angle = Annotated[float, Field(gt=0, lt=60)]
@@ -148,7 +148,7 @@ class Gauge(Table):
 
 
 def _not_automatic(value: Any) -> Any:
-    """Refuse "auto", which liquids have."""
+    """Refuse "auto", which is for liquids."""
     if value == "auto":
         message = (
             "is for liquids only: the tolerance of sand is relative to rho g dx, the weight "
@@ -243,7 +243,10 @@ Solid = Annotated[
 
 
 def _found(rules: Iterable[tuple[object, str, object, str]]) -> list[Complaint]:
-    """Return the complaints whose case there is: each a case, the key that it is about, its value and the message."""
+    """Return the complaints whose condition is true.
+
+    Each rule has a condition, the key, its value and the message.
+    """
     return [
         Complaint(tuple(key.split(".")), value, message)
         for case, key, value, message in rules
@@ -257,11 +260,11 @@ class SandScene(ParticleScene):
     elsewhere: ClassVar = {"liquid": "fluids", "pressure": "fluids"}
     palette: ClassVar = "sand"
     solve_bytes: ClassVar[int] = STRESS_BYTES[3]
-    # sand at rest has 1e-5, and what crowds is not pushed apart by its pressure
+    # Sand at rest has 1e-5; its pressure does not push overlapping particles apart.
     crowded: ClassVar[float] = 4e-4
-    # leaves at most 1.1 of the densest nearly everywhere; 1 leaves 1.27
+    # Limits the density to 1.1 of the densest packing nearly everywhere; 1 would give 1.27.
     correction_gain: ClassVar[float] = 4.0
-    # friction holds back: .25 of columns, .4 to .8 of what runs and pours
+    # Friction slows sand down: 0.25 for columns, 0.4 to 0.8 for flows.
     fall_speed: ClassVar[float] = 0.5
 
     time: SandTime
@@ -276,7 +279,7 @@ class SandScene(ParticleScene):
     @model_validator(mode="before")
     @classmethod
     def _density_of_material(cls, data: Any) -> Any:
-        """Take the density from the material unless [physics] says otherwise."""
+        """Set the default density to that of the material."""
         if not isinstance(data, dict):
             return data
         material, physics = data.get("material", {}), data.get("physics", {})
@@ -314,7 +317,7 @@ class SandScene(ParticleScene):
 
     @property
     def cohesion(self) -> float:
-        """Return the cohesion of the sand, its own or the material's [Pa]."""
+        """Return the cohesion [Pa], from the scene or the material."""
         own = next((sand.cohesion for sand in self.sand if sand.cohesion is not None), None)
         return self.material.cohesion if own is None else own
 
@@ -334,12 +337,12 @@ class SandScene(ParticleScene):
     def growth(self, spacing: float, kick_dt: float) -> dict[str, float]:
         """Return `gain` and `halfway` of the yield set; empty without mu(I).
 
-        I = |rate of shear| d sqrt(rho_s / p) [Jop, Forterre & Pouliquen 2006], rho_s = rho /
-        max_fraction that of a grain.
+        I = |shear rate| d sqrt(rho_s / p) [Jop, Forterre & Pouliquen 2006], with the grain density
+        rho_s = rho / max_fraction.
 
         Args:
-            spacing: of the cells [m].
-            kick_dt: how long forces act [s].
+            spacing: cell size [m].
+            kick_dt: time that forces act [s].
         """
         dynamic, grain = self.friction.dynamic_angle, self.friction.grain_size
         if dynamic is None or grain is None:
@@ -374,7 +377,7 @@ class SandScene(ParticleScene):
 
     def complaints(self) -> list[Complaint]:
         """Return errors that involve several keys."""
-        found = super().complaints()
+        complaints = super().complaints()
         for key, first in (("friction_angle", self.friction_angle), ("cohesion", self.cohesion)):
             for number, sand in enumerate(self.sand):
                 value = getattr(sand, key)
@@ -382,9 +385,9 @@ class SandScene(ParticleScene):
                     message = (
                         f"must be {first:g} as in the other [[sand]]: a scene has one material"
                     )
-                    found.append(Complaint(("sand", number, key), value, message))
+                    complaints.append(Complaint(("sand", number, key), value, message))
         return (
-            found
+            complaints
             + self._strength_complaints()
             + self._rate_complaints()
             + self._domain_complaints()
@@ -392,7 +395,7 @@ class SandScene(ParticleScene):
 
     def notes(self) -> list[str]:
         """Return suspicious settings."""
-        found = [
+        notes = [
             *super().notes(),
             *GRAIN_DENSITY.notes("physics.density", self.physics.density),
             *SAND_CFL.notes("time.cfl", self.time.cfl),
@@ -406,7 +409,7 @@ class SandScene(ParticleScene):
             for number, sand in enumerate(self.sand)
         ]
         for place, angle in angles:
-            found += FRICTION_ANGLE.notes(place, angle)
+            notes += FRICTION_ANGLE.notes(place, angle)
         cohesions = [("material.cohesion", self.material.cohesion)]
         cohesions += [
             (f"sand[{number}].cohesion", sand.cohesion)
@@ -414,14 +417,14 @@ class SandScene(ParticleScene):
             if sand.cohesion is not None
         ]
         for place, cohesion in cohesions:
-            found += COHESION.notes(place, cohesion)
+            notes += COHESION.notes(place, cohesion)
         grains = self.friction.grain_size
         if grains is not None and grains > self.spacing:
-            found.append(
+            notes.append(
                 f"friction.grain_size = {grains:g} m is larger than a cell, {self.spacing:.4g} m; "
                 f"if mm were meant, it is {1e-3 * grains:g}"
             )
-        return found
+        return notes
 
     def _strength_complaints(self) -> list[Complaint]:
         material, most = self.material, self.cohesion / math.tan(math.radians(self.friction_angle))
@@ -438,7 +441,7 @@ class SandScene(ParticleScene):
         return []
 
     def _too_steep(self) -> Complaint:
-        """Return the complaint about a friction angle, at the key that gives it."""
+        """Return the complaint about a friction angle, at the key that sets it."""
         angle, message = self.friction_angle, self._at_most()
         number = next(
             (number for number, sand in enumerate(self.sand) if sand.friction_angle is not None),
@@ -459,7 +462,7 @@ class SandScene(ParticleScene):
         )
 
     def _at_most(self) -> str:
-        """Return what is said of an angle that is too steep."""
+        """Return the allowed range of an angle that is too steep, in words."""
         test, most = (
             self.material.friction_angle_test,
             STEEPEST_ANGLE[self.material.friction_angle_test][self.dimension],
@@ -470,7 +473,7 @@ class SandScene(ParticleScene):
         )
 
     def _rate_complaints(self) -> list[Complaint]:
-        """Return what is wrong with friction that grows with the rate of shear."""
+        """Return errors of friction that grows with the shear rate."""
         table, dynamic = self.friction, self.friction.dynamic_angle
         if dynamic is None:
             given = {"grain_size": table.grain_size, "inertial_number": table.inertial_number}
@@ -508,7 +511,7 @@ class SandScene(ParticleScene):
         )
 
     def _domain_complaints(self) -> list[Complaint]:
-        """Return what does not go with an axis without an end, with rigid bodies, or with sand at all."""
+        """Return errors of periodic axes, rigid bodies and keys that sand lacks."""
         domain, method, closed, periodic = (
             self.domain,
             self.solver.method,
@@ -596,6 +599,6 @@ class SandScene(ParticleScene):
         ]
 
     def own_memory_parts(self) -> dict[str, int]:
-        """Return the most memory of the stresses on the device [bytes]."""
+        """Return the peak memory of the stresses on the device [bytes]."""
         cut = CUT_STRESS_BYTES[self.dimension] if self.cuts_cells else 0
         return {"stresses": self.counted_cells * (STRESS_BYTES[self.dimension] + cut)}

@@ -50,18 +50,19 @@ from warp_lcp.simulation import Cells, Part, SimulationFailed, StepFailed, misse
 if TYPE_CHECKING:
     from warp_lcp.distributed.ranks import Ranks
 
-METHODS_ON_RANKS = ("accelerated-projection",)  # that solve problems of several ranks
-# cells full of sand whose work is that which a step takes however little there is of it
+METHODS_ON_RANKS = ("accelerated-projection",)  # methods that solve on several ranks
+# Fixed cost of a step, in cells full of sand.
 STEP_WORK = 1 << 9
-FRONT = 99.0  # percentile of the particles that runout and height are of
-# rho g dx: cells are left with a velocity that is off by as much as gravity makes in the step
+FRONT = 99.0  # percentile of the particles that defines runout and height
+# Largest accepted residual, in units of rho g dx: velocities are then wrong by as much as gravity
+# adds in a step.
 FAR = 1.0
 JAMMED = (
     "solids or a source may enclose sand: move them less or slower; deep sand may need more "
     "solver.max_iterations"
 )
-STANDING = 0.05  # of sqrt(g dx): a scale for the residual where there is no gravity
-DIAGNOSTICS = ("yielded", "dissipation", "predicted_excess")  # columns that nothing else needs
+STANDING = 0.05  # of sqrt(g dx): velocity scale of the residual without gravity
+DIAGNOSTICS = ("yielded", "dissipation", "predicted_excess")  # columns for the log only
 COLUMNS = (
     "coupled_residual",
     "staggering_iterations",
@@ -80,16 +81,16 @@ class SandSimulation(ParticleSimulation):
 
     Args:
         scene: the scene.
-        grid: the one that it starts on.
+        grid: the initial grid.
         parts: the fields and models on that grid; `solids`: walls with contact and friction.
-        particles: the sand at the start.
-        more: as of `ParticleSimulation`.
+        particles: the initial sand.
+        more: arguments of `ParticleSimulation`.
 
     Attributes:
         packing: density of the sand.
         stress: stresses of the sand.
-        carried: rigid bodies in the stress solve; None: there are none.
-        outcome: of the last solve.
+        carried: rigid bodies in the stress solve; None without any.
+        outcome: result of the last solve.
     """
 
     scene: SandScene
@@ -97,7 +98,7 @@ class SandSimulation(ParticleSimulation):
     def __init__(
         self, scene: SandScene, grid: StaggeredGrid, parts: Parts, particles: Particles, **more: Any
     ) -> None:
-        """Allocate the fields and find the sand's cells."""
+        """Allocate the fields and find the cells with sand."""
         self.method = METHODS[scene.solver.method]()
         self._at_rest = scene.particles.per_axis**grid.dimension
         self._percentiles = (
@@ -128,7 +129,7 @@ class SandSimulation(ParticleSimulation):
             self.packing, self.solids.walls, box=box, rate=rate, bodies=self.carried
         )
         self.outcome = SandReport(self.stress)
-        self._work: Any = None  # of the method that made it
+        self._work: Any = None  # workspace of the current method
         self._made_by: Any = None
         inner = (slice(1, -1),) * 3
         wp.copy(self.packing.kind[inner], self.solids.base[inner])
@@ -159,9 +160,10 @@ class SandSimulation(ParticleSimulation):
             self._completion.run(window, variant=window.near is None)
 
     def _launch_completion(self, window: Window) -> None:
+        """Launch the velocity of faces that have mass, but no particle weight."""
         if self.sides is not None:
             self.sides.average(self.velocity, self.weights, self._saved or ())
-        # faces have mass farther out than weight
+        # Faces farther out have mass but no particle weight.
         complete(
             window,
             self.velocity,
@@ -182,8 +184,8 @@ class SandSimulation(ParticleSimulation):
 
         Stresses that miss their tolerance are accepted (the log's coupled_residual has their
         residual), unless the residual exceeds `FAR` and they would add energy to the sand. They are
-        solved for before any particle moves, so that a failed solve leaves the state unchanged,
-        except for the particles' order.
+        computed before any particle moves, so that a failed solve leaves the state unchanged,
+        except for the order of the particles.
 
         Raises:
             StepFailed: the stresses are far from balance; a smaller dt may be tried.
@@ -194,7 +196,12 @@ class SandSimulation(ParticleSimulation):
             return self._step(dt)
 
     def _step(self, dt: float) -> Row:
-        """Advance by dt [s]."""
+        """Advance by dt [s]; see `step`.
+
+        Order of a step: particles to grid, with gravity; packing; stress solve and its velocity;
+        contacts of bodies; extrapolation; grid to particles; motion of particles and solids. If a
+        later part fails, the stresses are rolled back.
+        """
         before = self.begin_step(dt)
         window = self.window(before)
         self.particles_to_grid(window)
@@ -227,13 +234,13 @@ class SandSimulation(ParticleSimulation):
         )
 
     def _measure_stresses(self) -> None:
-        """Launch what the log alone wants to know of the stresses."""
+        """Launch the computation of stress values that only the log needs."""
         if self.scene.output.diagnostics:
             with self.watch.stage("diagnostics", self.packing.flags, self.stress.now):
                 self.outcome.measure()
 
     def _measured(self) -> Row:
-        """Return what the log alone wants to know of the stresses."""
+        """Return stress values that only the log needs."""
         if not self.scene.output.diagnostics:
             return {}
         return self.outcome.report(self.scene.physics.density * self.grid.cell_volume)
@@ -248,11 +255,11 @@ class SandSimulation(ParticleSimulation):
 
         coupled_residual: natural residual of pressure and friction together, root mean square over
         the cells with sand, in units of rho g dx; solve_residual: relative to that at the start of
-        the solve; staggering_iterations: of the coupled method; yielded, dissipation,
-        predicted_excess: see `SandReport.report`; max_fraction: of a cell at the start of the step,
-        in units of the densest packing; runout [m]: 99th percentile of x less that at the start;
-        height [m]: 99th percentile of y; flow_rate [kg/s; kg/(s m) in 2-D]: mass below the gauge,
-        or without a gauge the mass that left through drains and open sides.
+        the solve; staggering_iterations: iterations of the coupled method; yielded, dissipation,
+        predicted_excess: see `SandReport.report`; max_fraction: largest fraction of a cell at the
+        start of the step, relative to the densest packing; runout [m]: 99th percentile of x less
+        that at the start; height [m]: 99th percentile of y; flow_rate [kg/s; kg/(s m) in 2-D]: mass
+        below the gauge, or without a gauge the mass that left through drains and open sides.
         """
         columns = tuple(
             name for name in COLUMNS if self.scene.output.diagnostics or name not in DIAGNOSTICS
@@ -298,7 +305,10 @@ class SandSimulation(ParticleSimulation):
         ]
 
     def _sand_cells(self) -> np.ndarray:
-        """Return where this process's sand is that a frame shows, as (k, j, i) in the stored shape, shape (n, 3)."""
+        """Return this process's cells with sand in frames, shape (n, 3).
+
+        Indices (k, j, i) in the stored shape.
+        """
         part = self.grid.part
         return np.argwhere(part.box_of(self.packing.kind.numpy()) == FLUID) + np.array(
             part.owned.low
@@ -307,7 +317,7 @@ class SandSimulation(ParticleSimulation):
     def pressures(self) -> np.ndarray:
         """Return the pressure p = rho dx x / dt [Pa] of the last solve.
 
-        Stored shape; zero before the first step.
+        In the stored shape; zero before the first step.
         """
         scale = (
             self.scene.physics.density * self.grid.spacing / self.stress.kick_dt
@@ -340,12 +350,12 @@ class SandSimulation(ParticleSimulation):
         self._start = float(state["front_at_start"])
 
     def _take_clock(self, state: Mapping[str, np.ndarray]) -> None:
-        """Go on at the time of a state, with its bodies, and solids where they are then."""
+        """Continue at the time of a state, with its bodies and moving solids."""
         super()._take_clock(state)
         self._place_solids()
 
     def _place_solids(self) -> None:
-        """Put the solids that move where they are now."""
+        """Place the moving solids at their current positions."""
         if self.solids.moves:
             self.solids.place(self.time)
             if self.solids.walls is not self.stress.walls:
@@ -355,10 +365,11 @@ class SandSimulation(ParticleSimulation):
                 self.carried.place(self.solids.host_index, centers, self.solids.walls)
 
     def _gains(self, scale: float) -> bool:
-        """Return whether the stresses leave sand faster than it, solids, sources and bodies were and gravity makes it (`scale`, m/s).
+        """Return whether the stresses accelerate sand beyond all of its sources of speed.
 
-        Walls turn velocities: a component may become as large as the magnitude of the velocity was,
-        here that of the largest components before the step.
+        These are the speeds of sand, solids, sources and bodies before the step, and that due to
+        gravity (`scale`, m/s). Walls redirect velocities: a component may become as large as the
+        magnitude of the velocity before, here that of the largest components.
         """
         packing, own = self.packing, self._own
         moving = [own(inverse) > 0.0 for inverse in packing.inverse]
@@ -379,19 +390,24 @@ class SandSimulation(ParticleSimulation):
     def solve_stress(self, scale: float) -> wl.SolveResult:
         """Solve for the stresses to the tolerance of the scene.
 
-        In units of `scale` [m/s]: g dt is a pressure of rho g dx.
+        It is relative to `scale` [m/s]: g dt corresponds to a pressure of rho g dx.
         """
         solver = self.scene.solver
         stopping = wl.StoppingCriteria(
             rtol=0.0, atol=solver.tolerance * scale, max_iterations=solver.max_iterations
         )
-        # the first solve on a grid, or another method since the last one
+        # The first solve on a grid, or the method has changed.
         if self._made_by is not self.method:
             self._work, self._made_by = self.method.init(self.stress), self.method
         return wl.solve(self.stress, self.method, stopping=stopping, workspace=self._work)
 
     def _solve(self, window: Window, dt: float) -> Row:
-        """Solve for the stresses and take over the velocity that they leave; return what the log wants to know of the solve."""
+        """Solve for the stresses, and read their velocity; return log values.
+
+        Order: density and packing, with the current velocities of solids and sources; rigid bodies;
+        stress solve; acceptance, see `step`; projected velocity; contacts. The yield set is in
+        units of impulses over rho dx [m/s].
+        """
         packing, stress, solids, scene = self.packing, self.stress, self.solids, self.scene
         with self.watch.stage("packing", self.density, packing.fraction, *self.velocity):
             self._density_to_grid.run(
@@ -409,7 +425,7 @@ class SandSimulation(ParticleSimulation):
             and self.sources is None
             and not self.grid.part.shared
         ):
-            # whose number comes with what the solve has to tell
+            # The number of airborne parts is read together with the solve's results.
             with self.watch.stage("bodies in flight", packing.kind):
                 self.flights.find(window, self.weights, packing.kind)
         impulse = self.kick_dt / (scene.physics.density * self.grid.spacing)  # of a stress of 1 Pa
@@ -461,7 +477,7 @@ class SandSimulation(ParticleSimulation):
         }
 
     def _begin_bodies(self) -> None:
-        """Tell the stresses how the bodies move and how easily."""
+        """Pass velocity and inverse mass of the bodies to the stress solve."""
         if self.carried is None or self.bodies is None:
             return
         dimension, bodies = self.grid.dimension, self.bodies.bodies
@@ -475,7 +491,7 @@ class SandSimulation(ParticleSimulation):
         )
 
     def _push_bodies(self, dt: float) -> None:
-        """Give the bodies what the sand has done to them, and the faces beside them the velocity that this leaves."""
+        """Apply the impulses of the sand to the bodies, and update their faces."""
         if self.carried is None or self.bodies is None:
             return
         self.bodies.bodies.apply_impulses(self.carried.impulses())
@@ -488,7 +504,7 @@ class SandSimulation(ParticleSimulation):
         copy(self._base, self.solids.base)
 
     def _find_density(self, window: Window) -> None:
-        """Find the particles' density in the cells of a window."""
+        """Compute the particles' density in the cells of a window."""
         particle_density(self.grid, self.particles, window, self._at_rest, self.density)
         if self.sides is not None:
             self.sides.add(self.density)
@@ -502,7 +518,7 @@ class SandSimulation(ParticleSimulation):
         contact: wp.array,
         join: Join | None,
     ) -> None:
-        """Continue the velocity among walls as the stresses meet them."""
+        """Extrapolate the velocity beside walls according to the stresses' contact."""
         s = self.solids
         if s.cut is not None:
             super()._continue(window, known, kind, contact, join)
@@ -535,7 +551,10 @@ class SandSimulation(ParticleSimulation):
         )
 
     def _front_of_all(self) -> tuple[float, float]:
-        """Return the same of all ranks' particles, of which each tells those that may lie beyond it."""
+        """Return the percentiles of all ranks' particles.
+
+        Each rank contributes the values that may lie beyond the percentile.
+        """
         position, ranks = self.particles.position.numpy()[:, :2], self.grid.part.ranks
         count = int(ranks.sum(len(position)))
         beyond = count - percentile_place(count)
@@ -559,20 +578,20 @@ class SandSimulation(ParticleSimulation):
         return (self._mass_below() - below + left) / dt
 
     def _most(self) -> float:
-        """Return the largest fraction of a cell, in units of the densest packing."""
+        """Return the largest fraction of a cell, relative to the densest packing."""
         return self._largest([self.packing.densest])[0]
 
     def _own(self, field: wp.array) -> np.ndarray:
-        """Return what of a field no other process has."""
+        """Return the part of a field that only this process has."""
         return np.asarray(self.grid.part.known_of(field.numpy()))
 
     def _largest(self, values: list[float]) -> list[float]:
-        """Return the largest of what all processes have, number by number."""
+        """Return the elementwise maximum over all processes."""
         return [float(value) for value in self.grid.part.ranks.max(np.array(values))]
 
 
 def percentile_place(count: int) -> int:
-    """Return the index of the percentile of runout and height in sorted numbers."""
+    """Return the index in sorted numbers of the percentile of runout and height."""
     return min(int(count * FRONT / 100.0), count - 1)
 
 
@@ -589,10 +608,11 @@ class GranularSimulator:
         """Build the simulation of a scene; on ranks, this rank's part (collective).
 
         Args:
-            scene: a SandScene.
+            scene: the scene, a SandScene.
             device: a Warp device's name.
             folder: folder of the files that the scene names.
-            ranks: that share it, for which the scene is the same; None: one process.
+            ranks: MPI ranks that share the simulation, with the same scene on each; None for one
+                process.
 
         Raises:
             ValueError: the scene cannot be simulated, or not on ranks; the message names the key
@@ -606,6 +626,7 @@ class GranularSimulator:
         warnings: list[str] = []
 
         def make_parts(grid: StaggeredGrid) -> Parts:
+            """Build walls, solids and sources on a grid."""
             boundary, notes = make_boundary(scene, grid, folder, solids=placed)
             solids = SandSolids(
                 grid,
@@ -621,13 +642,14 @@ class GranularSimulator:
         if ranks is None:
             coverage, grid = start_of(scene, device)
         else:
-            from warp_lcp.distributed.balance import Balance  # what it needs is an extra
+            # Imported here, since it needs an optional package.
+            from warp_lcp.distributed.balance import Balance
             from warp_lcp.distributed.particle_assembly import part_of
 
             shown = [
                 key for key in ("surface", "volume") if scene.endless and getattr(scene.output, key)
             ]
-            # they end at sides that ranks do not have
+            # Surface and volume would end at sides that ranks do not have.
             refused = [f"output.{key} where an axis is periodic" for key in shown]
             balance = Balance(fixed=STEP_WORK)
             coverage, grid = (

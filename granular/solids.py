@@ -1,4 +1,7 @@
-"""Solids as sand meets them: whole cells that push and rub, or what `granular.cut_walls` makes of those that cut cells."""
+"""Solids in sand: whole cells with contact and friction, or cut cells.
+
+See `granular.cut_walls` for solids that cut cells.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,7 @@ from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.program import LaunchGraph, clear, launch
 
 INTS, BYTES = wp.array(dtype=wp.int32), wp.array(dtype=wp.uint8)
-CUDA_LISTS = 1024  # parts of the list of faces, a thread of a GPU each
+CUDA_LISTS = 1024  # parts of the list of faces, one per thread on a GPU
 
 
 @wp.func
@@ -33,20 +36,20 @@ class Walls:
 
     Args:
         grid: the grid.
-        index: int, -1 in open cells, the wall's number elsewhere, shape of the grid's fields.
+        index: int, -1 in open cells, the wall number elsewhere, shape of the grid's fields.
         friction: Coulomb's coefficient of each wall, >= 0; inf sticks.
-        rubbing_only: leave out the faces of walls without friction. Their stresses are 0 from the
-            start as long as no wall moves; what moves may come where other cells of sand had
-            theirs, which its faces then take away.
-        counted: cells whose faces these are; None: all.
+        rubbing_only: omit the faces of walls without friction. Their stresses are 0 as long as no
+            wall moves. A moving wall can reach cells with stresses, which its faces must then
+            remove.
+        counted: cells whose faces are included; None for all.
 
     Attributes:
-        count: faces.
+        count: number of faces.
         cells: int32, flat index of each face's open cell.
         sides: uint8, 2 axis + side.
-        walls: int32, the wall's number.
-        friction: float32, of each wall.
-        active: int32: how many faces sand touches, and which.
+        walls: int32, wall number of each face.
+        friction: float32, friction coefficient of each wall.
+        active: int32: number of faces beside sand, followed by their entries.
     """
 
     def __init__(
@@ -73,10 +76,12 @@ class Walls:
         self.active = wp.zeros(1 + self.count, dtype=wp.int32, device=device)
 
     def activate(self, flags: wp.array) -> None:
-        """Find the faces whose cells hold sand: their number and their entries, ascending, go to `active`.
+        """List the faces whose cells hold sand.
+
+        Their number and their entries, ascending, are written to `active`.
 
         Args:
-            flags: uint8 of the cells, 0 where they hold none.
+            flags: uint8 flags of the cells, 0 without sand.
         """
         device, fields = flags.device, [self.cells, flags.flatten(), self.active]
         if not device.is_cuda:
@@ -89,7 +94,7 @@ class Walls:
 @forward_kernel(module="granular.walls")
 @no_type_check
 def activate_kernel(cells: INTS, flags: BYTES, active: INTS):
-    """List the entries whose cells hold sand, in order, behind their number."""
+    """List the entries whose cells hold sand, in order, after their number."""
     count = int(0)
     for face in range(cells.shape[0]):
         if flags[cells[face]] != wp.uint8(0):
@@ -101,7 +106,10 @@ def activate_kernel(cells: INTS, flags: BYTES, active: INTS):
 @forward_kernel(module="granular.walls_cuda")
 @no_type_check
 def count_active_kernel(cells: INTS, flags: BYTES, active: INTS, counts: INTS):
-    """Count the entries of one of equal parts of the list whose cells hold sand; a thread a part."""
+    """Count the entries with sand in one of equal parts of the list.
+
+    With one thread per part.
+    """
     t, n, count = wp.tid(), cells.shape[0], int(0)
     for face in range(part_begin(t, n, counts.shape[0]), part_begin(t + 1, n, counts.shape[0])):
         if flags[cells[face]] != wp.uint8(0):
@@ -112,7 +120,10 @@ def count_active_kernel(cells: INTS, flags: BYTES, active: INTS, counts: INTS):
 @forward_kernel(module="granular.walls_cuda")
 @no_type_check
 def list_active_kernel(cells: INTS, flags: BYTES, active: INTS, counts: INTS):
-    """List them in order, behind their number: each part's after those of the parts before it."""
+    """List the entries with sand of one part of the list.
+
+    They follow those of the parts before it, so that the order is that of the list.
+    """
     t, n, count = wp.tid(), cells.shape[0], int(0)
     for before in range(t):
         count += counts[before]
@@ -125,27 +136,28 @@ def list_active_kernel(cells: INTS, flags: BYTES, active: INTS, counts: INTS):
 
 
 class SandSolids:
-    """Solids and the domain's walls, as whole cells with friction. Making it, `place` and `begin_step` are collective.
+    """Solids and the domain's walls, as whole cells with friction.
 
-    A cell belongs to a solid if its center lies inside. Particles move among the surfaces of
-    `boundary`, which may cut cells.
+    The constructor, `place` and `begin_step` are collective. A cell belongs to a solid if its
+    center lies inside. Particles move between the surfaces of `boundary`, which may cut cells.
 
     Args:
         grid: the grid.
         placed: the solids.
-        boundary: where particles may go.
+        boundary: surfaces for the motion of particles.
         friction: Coulomb's coefficient of the domain's walls and of each solid.
-        prescribed: keep velocities on faces even if nothing moves: sources prescribe some.
-        cuts: let solids that stand still cut cells for the stresses too, if `boundary` has them so.
+        prescribed: allocate velocities on faces even if no solid moves, since sources prescribe
+            some.
+        cuts: let solids at rest cut cells for the stresses too, if they do so in `boundary`.
 
     Attributes:
-        cut: what they leave open and where they rub; None: they are whole cells.
-        index: int32, -1 in open cells, the wall's number elsewhere.
+        cut: open fractions and walls of cut cells; None if solids are whole cells.
+        index: int32, -1 in open cells, the wall number elsewhere.
         base: int8, SOLID or AIR.
-        velocity: of the solids on each component's faces [m/s]; empty if they stand still.
+        velocity: velocity of the solids on each component's faces [m/s]; empty if they are at rest.
         separating: uint8 of each wall: all ones.
-        walls: the faces between open cells and solids; another object where cells have changed.
-        notes: warnings worth a line at the start of a run.
+        walls: faces between open cells and solids; a new object whenever cells have changed.
+        notes: warnings for the start of a run.
     """
 
     def __init__(
@@ -158,7 +170,7 @@ class SandSolids:
         prescribed: bool = False,
         cuts: bool = False,
     ) -> None:
-        # cells whose walls these are; None: all
+        # Cells whose walls are included; None for all.
         self._counted = grid.part.owned if grid.part.shared else None
         self.grid, self._placed, self._boundary, self._friction = (
             grid,
@@ -170,7 +182,7 @@ class SandSolids:
         self.separating = wp.full(1 + len(placed), 1, dtype=wp.uint8, device=grid.device)
         self.velocity: Faces = grid.faces() if boundary.moves or prescribed else []
         self._setting = LaunchGraph(grid.device, self._launch_velocity)
-        self._cells: np.ndarray | None = None  # `index` as `walls` know it
+        self._cells: np.ndarray | None = None  # `index` for which `walls` was built
         fits = (
             cuts
             and isinstance(boundary, CutBoundary)
@@ -188,7 +200,7 @@ class SandSolids:
 
     @property
     def host_index(self) -> np.ndarray:
-        """`index` on the host, not to be written to, if solids move."""
+        """`index` on the host, read-only, if solids move."""
         assert self._cells is not None
         return self._cells
 
@@ -198,7 +210,7 @@ class SandSolids:
         return self._boundary.moves
 
     def place(self, time: float) -> None:
-        """Put the solids where they are at `time` [s]."""
+        """Place the solids at their positions at `time` [s]."""
         grid = self.grid
         now = [
             solid
@@ -211,7 +223,7 @@ class SandSolids:
             for solid in self._placed
         ]
         starts = self._cells is None
-        found = voxelize(
+        voxels = voxelize(
             grid,
             now,
             wall_separating=True,
@@ -220,8 +232,8 @@ class SandSolids:
             counts=starts,
         )
         if starts:
-            self._covered = found.covered
-        wp.copy(self.index, found.index)
+            self._covered = voxels.covered
+        wp.copy(self.index, voxels.index)
         if grid.barriers is not None:
             grid.barriers.enter(self.index)
         if self._boundary.sides is not None:
@@ -229,11 +241,11 @@ class SandSolids:
         grid.part.fill(self.index)
         grid.everywhere.launch(kernels.base_kernel, [self.index, self.base])
         cells = self.index.numpy()
-        if self.cut is not None:  # the domain's walls alone are whole cells
+        if self.cut is not None:  # only the domain's walls are whole cells
             wp.copy(self.base, self._boundary.base)
             cells = cells.copy()
             grid.interior(cells)[...] = -1
-        # else what is recorded for these walls stays valid
+        # Otherwise recorded launches for these walls stay valid.
         if self._cells is None or not np.array_equal(cells, self._cells):
             rubbing = not self.moves
             self._cells, self.walls = (
@@ -242,8 +254,8 @@ class SandSolids:
             )
 
     def _thin_notes(self) -> tuple[str, ...]:
-        """Return a warning for each solid that stands still and that no stress feels."""
-        # cells' centers that each solid holds
+        """Return a warning for each solid at rest that is too thin for the stresses."""
+        # Number of cell centers in each solid.
         covered = self.grid.part.ranks.sum(np.array([*self._covered, 0]))[:-1]
         held = self.grid.barriers.walls.numbers if self.grid.barriers is not None else ()
         return tuple(
@@ -256,7 +268,7 @@ class SandSolids:
         )
 
     def _whole_note(self, cuts: bool) -> str:
-        """Return why solids that cut cells do not do so for the stresses."""
+        """Return the reason why solids that cut cells are whole cells for the stresses."""
         reason = (
             "some solids move"
             if self.moves
@@ -271,16 +283,16 @@ class SandSolids:
         )
 
     def begin_step(self, time: float, dt: float) -> None:
-        """Find how fast the solids move in the step that starts at `time` [s] and lasts `dt` [s]."""
+        """Compute the solids' velocities in the step from `time` [s] of length `dt` [s]."""
         self._boundary.begin_step(time, dt)
         if self.velocity:
             self._setting.run()
             if self.moves and self.grid.part.joined:
-                # where an axis without an end has led them around
+                # Periodic axes: the values come from the opposite side.
                 self.grid.part.fill(*self.velocity)
 
     def _launch_velocity(self) -> None:
-        """Launch what sets the velocity of the solids' faces."""
+        """Launch the update of the velocity of the solids' faces."""
         boundary, grid = self._boundary, self.grid
         if self.moves and isinstance(boundary, CutBoundary):
             cut = boundary.cut
@@ -297,7 +309,7 @@ class SandSolids:
                 ]
                 grid.everywhere.launch(kernels.wall_velocity_kernel, inputs)
         else:
-            clear(*self.velocity)  # a source that has stopped has left its own
+            clear(*self.velocity)  # clear the values of sources that have stopped
 
 
 def wall_faces(
@@ -306,15 +318,15 @@ def wall_faces(
     """Return the faces between open cells and solids, by cell.
 
     Args:
-        index: int, -1 in open cells, the wall's number elsewhere; shape of the grid's fields.
+        index: int, -1 in open cells, the wall number elsewhere; shape of the grid's fields.
         dimension: 2 or 3.
-        counted: cells whose faces are asked for; None: all.
+        counted: cells whose faces are included; None for all.
 
     Returns:
-        For each face its open cell's flat index (int32), 2 axis + side (uint8) and its wall's
-        number (int32).
+        For each face its open cell's flat index (int32), 2 axis + side (uint8) and its wall number
+        (int32).
     """
-    found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    faces: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     inner = np.zeros(index.shape, dtype=bool)
     inner[
         (slice(1, -1),) * 3 if counted is None else tuple(map(slice, counted.low, counted.high))
@@ -327,8 +339,8 @@ def wall_faces(
             beyond = open_ + (stride if side else -stride)
             wall = flat[beyond]
             at = wall >= 0
-            found.append((open_[at], np.full(int(at.sum()), 2 * axis + side), wall[at]))
-    cells, sides, walls = (np.concatenate(parts) for parts in zip(*found, strict=True))
+            faces.append((open_[at], np.full(int(at.sum()), 2 * axis + side), wall[at]))
+    cells, sides, walls = (np.concatenate(parts) for parts in zip(*faces, strict=True))
     order = np.argsort(cells, kind="stable")
     return (
         cells[order].astype(np.int32),

@@ -36,25 +36,24 @@ from warp_lcp.rows.program import Launch, LaunchGraph, Program, copy, launch, la
 from warp_lcp.rows.vectors import Reduction, add_across
 from warp_lcp.settings import renamed_method
 
-WALL_GRAIN = 256  # wall faces a CPU thread takes
-MOST_MOMENTUM = 0.985  # unless a method wants less
-GROWN = 1.5  # of the time for which forces act in a step: its stresses are no guess to trust
+WALL_GRAIN = 256  # wall faces per CPU thread
+MOST_MOMENTUM = 0.985  # default limit of the momentum
+GROWN = 1.5  # if forces act longer than this times the last step, old stresses are no good guess
 
 
 @dataclass(frozen=True)
 class YieldSet:
     """Yield set of sand: |s|_F / sqrt(2) <= k x + cohesion, x >= -tension.
 
-    Stresses are impulses over rho dx [m/s].
-
-    With `gain` friction grows with the rate of shear: k becomes k + gain e / (e + halfway sqrt(x)),
-    e = |rate of shear| dx [m/s], which is mu(I) [Jop, Forterre & Pouliquen 2006].
+    Stresses are impulses over rho dx [m/s]. With `gain`, friction grows with the shear rate: k
+    becomes k + gain e / (e + halfway sqrt(x)), e = |shear rate| dx [m/s], which is mu(I)
+    [Jop, Forterre & Pouliquen 2006].
 
     Attributes:
         k: tangent of the angle of repose.
-        cohesion: of cells that carry shear.
-        tension: of cells that are nearly full.
-        gain: what k gains at most; counts where the stresses are made for it.
+        cohesion: cohesion of cells that have shear stress.
+        tension: tensile strength of cells that are nearly full.
+        gain: largest increase of k; used only if the stresses were created with `rate`.
         halfway: e / sqrt(x) [sqrt(m/s)] at which half of that is gained.
     """
 
@@ -66,12 +65,12 @@ class YieldSet:
 
 
 class Velocity:
-    """Velocity under a stress, in one precision, and the rates of strain.
+    """Velocity and strain rates under a stress, in one precision.
 
     Attributes:
-        u: of each component [m/s].
-        edge: of each shear: first the shear stress of the edges, then twice their rate of shear
-            times dx [m/s].
+        u: velocity of each component [m/s].
+        edge: values of each shear on edges: first the shear stress, then twice the shear rate times
+            dx [m/s].
     """
 
     def __init__(self, packing: Packing, real: type, *, box: bool, rate: bool) -> None:
@@ -86,7 +85,7 @@ class Velocity:
 
     @property
     def fields(self) -> VelocityFields:
-        """Return the fields as kernels take them."""
+        """Return the fields as a kernel struct."""
         return VelocityFields(
             *[*three_components(self.u), *three_components(self.edge), self.openings]
         )
@@ -104,8 +103,8 @@ class Velocity:
         Args:
             stress: the stresses.
             launch: launches or records.
-            bodies: whose faces get the velocity that they have.
-            respond: first give the bodies the velocity that the stresses leave.
+            bodies: bodies whose velocity is set on their faces.
+            respond: first update the bodies' velocity from the stresses.
         """
         p, passes, sand, fields = self.packing, self.passes, self.packing.fields, self.fields
         p.join(stress, launch=launch)
@@ -123,42 +122,42 @@ class Velocity:
 class Stress(wl.VariationalInequality):
     """Variational inequality of pressure and friction of sand for a given packing.
 
-    With x = kick_dt p / (rho dx) and s alike, u = u* + (1/m) (-grad x + div s) on faces of mass m,
-    the stress is the solution of
+    With x = kick_dt p / (rho dx), s scaled in the same way, and u = u* + (1/m) (-grad x + div s) on
+    faces of mass m, the stress is the solution of
 
-        0 <= x  complementary to  w = drive + div(m' u) >= 0, drive of `granular.packing.Packing`,
-        s = the nearest point of the yield set of x to s + r E u,
+        0 <= x  complementary to  w = drive + div(m' u) >= 0,
+        s = the nearest point of the yield set at x to s + r E u,
 
-    for any r > 0, m' = m in loose cells and 1 in full ones [Narain, Golas & Lin 2010; Daviet &
-    Bertails-Descoubes 2016]: sand is never denser than 1, and friction takes as much energy as it
-    can. In a cell |n|^2 / 2 + sum over shears of max_q b_q^2 <= (k x + cohesion)^2. On a face of a
-    solid the shear stress is within mu times the normal load (Coulomb), and within what the sand
-    beside it bears there: a rougher wall makes the sand fail (snippet `wall_bound` of
-    `headers/sand.h`).
+    for any r > 0, with drive of `granular.packing.Packing`, and m' = m in loose cells and 1 in full
+    ones [Narain, Golas & Lin 2010; Daviet & Bertails-Descoubes 2016]. So the density of sand never
+    exceeds 1, and friction dissipates as much energy as it can. In a cell |n|^2 / 2 + sum over
+    shears of max_q b_q^2 <= (k x + cohesion)^2. On a face of a solid the shear stress is within mu
+    times the normal load (Coulomb), and within the strength of the sand beside it: against a
+    rougher wall the sand itself fails (snippet `wall_bound` of `headers/sand.h`).
 
-    So it is a quasi-variational inequality, over the product of x >= 0 and of the slices of the
-    cones that hold each cell's s at its x; its natural residual is how far (x, s) - P((x, s) - y/d)
-    lies from 0, y = (w, -E u), P onto x >= 0 first and then onto the slice at that x. It is not the
-    projection onto the cones themselves, which would let sand push itself apart as it shears (an
-    associated flow rule, whose normal velocity is k times the slip). `wl.solve` solves it, by the
-    methods of `granular.coupled`. Gradient, projection and momentum of a cell are one pass over
-    memory (`granular.stress.step` in `headers/stress.h`): that is why neither y nor P stand here
-    alone.
+    This is a quasi-variational inequality, over the product of x >= 0 and the slices of the cones
+    that contain each cell's s at its x. Its natural residual is the norm of (x, s) - P((x, s) -
+    y/d), with y = (w, -E u), where P projects onto x >= 0 first and then onto the slice at that x.
+    P is not the projection onto the cones themselves, which would make sand dilate as it shears (an
+    associated flow rule, whose normal velocity is k times the slip). `wl.solve` solves the problem
+    by the methods of `granular.coupled`. Gradient, projection and momentum of a cell are fused in
+    one kernel (`granular.stress.step` in `headers/stress.h`), so that there are no separate
+    functions for y and P.
 
     Args:
-        packing: where sand is.
-        walls: its faces with solids.
-        box: bound each part of the friction by itself, as Narain et al. do; else the cone.
-        rate: friction grows with the rate of shear, as the yield set says.
-        bodies: those that the stresses move, if there are any.
+        packing: the packing of the step.
+        walls: faces between sand and solids.
+        box: bound each part of the friction separately, as Narain et al. do; else the cone.
+        rate: friction grows with the shear rate, see `YieldSet`.
+        bodies: rigid bodies that the stresses move, if any.
 
     Attributes:
         now: the stresses, see `granular.yield_set`, float32.
-        kick_dt: how long forces acted in the step that they belong to [s]; 0 before the first.
-        cold: whether forces act for much longer in the step that has begun than in the last, as in
-            the first two steps.
-        checked: the velocity that they leave, in float64, since the last `residual`.
-        last_residual: that of pressure and friction [m/s].
+        kick_dt: time that forces acted in the step of these stresses [s]; 0 before the first step.
+        cold: whether forces act for much longer in the current step than in the last one, as in the
+            first two steps.
+        checked: velocity under the stresses, in float64, from the last `residual`.
+        last_residual: residual of pressure and friction [m/s].
     """
 
     def __init__(
@@ -191,30 +190,30 @@ class Stress(wl.VariationalInequality):
         self.numbers = wp.zeros(NUMBERS, dtype=wp.float32, device=grid.device)
         self.momentum = wp.zeros(STATE, dtype=wp.float64, device=grid.device)
         self._sums = wp.zeros(2 * COLUMNS, dtype=wp.float64, device=grid.device)
-        # of all processes
+        # Sums over all ranks.
         self.total = self._sums if self._across is None else wp.zeros_like(self._sums)
-        # `cells`, for kernels
+        # `cells` for kernels.
         self.counts = (
             wp.zeros(1, dtype=wp.float64, device=grid.device) if self.shared else packing.counts
         )
         self._nothing = wp.zeros_like(self._sums)
-        # by the steps of a period
+        # Sums by the steps of a period.
         self._found = wp.zeros((PERIOD, 2 * COLUMNS), dtype=wp.float64, device=grid.device)
         threads = int(np.prod(packing.grid.shape[:2])) * packing.counted.cells.chunks
         self._cell_sums = Reduction(
             grid.size, grid.device, self._sums, columns=COLUMNS, threads=threads
         )
         self._wall_sums: Reduction | None = None
-        # on the CPU the memory of both
+        # On the CPU these are views of the device arrays.
         self._host, self._host_momentum = self.numbers.numpy(), self.momentum.numpy()
-        self._program: Program | None = None  # of an accelerated step
-        self._check: Program | None = None  # of the residual
-        self._cells: int | None = 1  # None: nobody has asked since `begin`
-        self._yields = [Scalar() for _ in range(NUMBERS - 3)]  # of `numbers_kernel`
+        self._program: Program | None = None  # a period of steps with momentum
+        self._check: Program | None = None  # evaluation of the residual
+        self._cells: int | None = 1  # None until it is read after `begin`
+        self._yields = [Scalar() for _ in range(NUMBERS - 3)]  # arguments of `numbers_kernel`
         self.last_residual = 0.0, 0.0
         self.kick_dt, self.cold = 0.0, True
-        self._last, self._last_kick = wp.zeros_like(self.now), 0.0  # as before `begin`
-        self._ratio = Scalar()  # of the time for which forces act to that in the last step
+        self._last, self._last_kick = wp.zeros_like(self.now), 0.0  # before `begin`
+        self._ratio = Scalar()  # ratio of this step's `kick_dt` to the last one
         self._admitting, self._restarting = (
             LaunchGraph(grid.device, record, at_once=grid.part.at_once)
             for record in (self._launch_admission, self.start_from_now)
@@ -222,7 +221,7 @@ class Stress(wl.VariationalInequality):
         self.set_walls(walls)
 
     def set_walls(self, walls: Walls) -> None:
-        """Set other walls, after solids have moved."""
+        """Replace the walls after solids have moved."""
         device = self.packing.grid.device
         self.walls, self._program, self._check = walls, None, None
         self._admitting.forget()
@@ -239,13 +238,17 @@ class Stress(wl.VariationalInequality):
         )
 
     def begin(self, bound: YieldSet, gravity: np.ndarray, dt: float, kick_dt: float) -> None:
-        """Start from the last stresses, where they exist in the new packing.
+        """Start from the last stresses, in cells that allow them in the new packing.
+
+        The stresses of the last step are scaled by the ratio of the times that forces act, damped
+        in the checkerboard pattern, and set to 0 in cells that cannot have stress in the new
+        packing.
 
         Args:
             bound: yield set of the sand.
             gravity: [m/s^2], three entries.
             dt: time step [s].
-            kick_dt: time for which forces act in it [s]; stresses are impulses and are rescaled
+            kick_dt: time that forces act in the step [s]; stresses are impulses and are rescaled
                 from the last step's pressure.
         """
         self._last_kick = self.kick_dt
@@ -263,13 +266,16 @@ class Stress(wl.VariationalInequality):
         self._ratio.value = kick_dt / self.kick_dt if self.kick_dt > 0.0 else 1.0
         self._admitting.run()
         self.kick_dt = kick_dt
-        # of which cells without sand have lost theirs in ghost layers, too
+        # Ghost cells without sand have lost their stresses, too.
         self.packing.grid.part.fill(self.now, width=REACH)
 
     def _launch_admission(self) -> None:
-        """Launch what makes the last stresses those of the new packing: rescaled, 0 where it admits none, without the checkerboard."""
+        """Launch the transfer of the last stresses to the new packing.
+
+        They are rescaled, set to 0 where the packing allows none, and damped in the checkerboard.
+        """
         p, sand, stresses = self.packing, self.packing.fields, self._fields
-        if p.grid.device.is_cuda:  # on the CPU they are the host's memory
+        if p.grid.device.is_cuda:  # on the CPU the arrays share the host's memory
             launch(numbers_kernel, 1, [self.numbers, *self._yields], device=p.grid.device)
         copy(self._last, self.now)
         self.walls.activate(p.flags)
@@ -280,23 +286,23 @@ class Stress(wl.VariationalInequality):
         p.counted.run(self.velocity.passes.damp, sand, stresses, source=self._point)
 
     def _count(self) -> int:
-        """Return how many cells of all processes hold sand."""
+        """Return the number of cells with sand on all ranks."""
         return int(self.packing.grid.part.ranks.sum(self.packing.sand_cells))
 
     @property
     def cells(self) -> int:
-        """Number of cells that hold sand, at least 1; may wait for the device."""
+        """Number of cells with sand, at least 1; may wait for the device."""
         if self._cells is None:
             self._cells = max(self._count(), 1)
         return self._cells
 
     def _upload(self, array: wp.array, host: np.ndarray) -> None:
-        """Copy the host's numbers to an array; on the CPU they are its memory."""
+        """Copy host values to a device array; on the CPU they share memory."""
         if self.packing.grid.device.is_cuda:
             array.assign(host)
 
     def roll_back(self) -> None:
-        """Restore the stresses before `begin`; the step is not taken."""
+        """Restore the stresses before `begin`, for a step that is rejected."""
         wp.copy(self.now, self._last)
         self.kick_dt = self._last_kick
 
@@ -306,10 +312,10 @@ class Stress(wl.VariationalInequality):
         """Restart the steps with momentum.
 
         Args:
-            pressure_step: of the projected gradient, relative to the diagonal.
-            shear_step: likewise, of the shear stresses.
-            lookahead: where the gradient is taken, in units of the momentum's displacement.
-            momentum: the most of the last step that is repeated, at first.
+            pressure_step: length of the projected gradient step, relative to the diagonal.
+            shear_step: likewise for the shear stresses.
+            lookahead: point of the gradient, in units of the momentum's displacement.
+            momentum: initial limit of the momentum, the fraction of the last step that is repeated.
         """
         self.set_steps(pressure_step, shear_step, lookahead)
         self._upload(self.numbers, self._host)
@@ -333,7 +339,7 @@ class Stress(wl.VariationalInequality):
             )
 
     def start_from_now(self) -> None:
-        """Start the momentum from the present stresses; launches or records."""
+        """Reset the momentum to the current stresses; launches or records."""
         for stress in (self._point, self._before):
             copy(stress, self.now)
 
@@ -349,7 +355,7 @@ class Stress(wl.VariationalInequality):
     calm = renamed_method("calm", limit_momentum)
 
     def advance(self, periods: int) -> float:
-        """Take several periods of steps; return an estimate of the residual [m/s].
+        """Run several periods of steps; return an estimate of the residual [m/s].
 
         See `PERIOD`; the steps have momentum.
         """
@@ -366,7 +372,7 @@ class Stress(wl.VariationalInequality):
         )
 
     def period(self) -> Program:
-        """Return the program of `PERIOD` steps with momentum, of the walls as they are."""
+        """Return the program of `PERIOD` steps with momentum, for the current walls."""
         if self._program is None:
             self._program = Program(self.packing.grid.device)
             for step in range(PERIOD):
@@ -381,9 +387,10 @@ class Stress(wl.VariationalInequality):
         self._end_step(step, launch)
 
     def _end_step(self, step: int, launch: Launch) -> None:
-        """Add up what a step of a period has found, and choose the momentum of the next but one.
+        """Sum the results of a step of a period, and update the momentum.
 
-        The momentum changes by the sums once a period alone, and so ranks share them once a period.
+        The momentum changes by these sums only once per period, so ranks exchange them once per
+        period.
         """
         self._add_up_here(launch)
         if self._across is None:
@@ -409,7 +416,7 @@ class Stress(wl.VariationalInequality):
         return self.take_residual(sums[0], sums[1] + sums[COLUMNS])
 
     def check(self) -> Program:
-        """Return the program that leaves the sums of the residual in `total`."""
+        """Return the program that writes the sums of the residual to `total`."""
         if self._check is None:
             self._check = Program(self.packing.grid.device)
             self.checked.find(self.now, launch=self._check.launch, bodies=self.bodies, respond=True)
@@ -418,11 +425,16 @@ class Stress(wl.VariationalInequality):
         return self._check
 
     def take_residual(self, pressure: float, friction: float) -> tuple[float, float]:
-        """Return the residual whose sums of squares a device has found [m/s]."""
+        """Return the residual [m/s] from sums of squares of the device."""
         self.last_residual = math.sqrt(pressure / self.cells), math.sqrt(friction / self.cells)
         return self.last_residual
 
     def _project(self, velocity: Velocity, launch: Launch) -> None:
+        """Launch projected steps of cells and wall faces, or their natural residual.
+
+        With `self.velocity` in float32 it is a step; with `self.checked` in float64 the distance
+        that a step would move the stresses.
+        """
         p, walls, passes = self.packing, self.walls, velocity.passes
         structs = (p.fields, velocity.fields, self._fields)
         p.counted.run(passes.step, *structs, launch=launch, partials=self._cell_sums.partials)
@@ -441,7 +453,7 @@ class Stress(wl.VariationalInequality):
         return StressFields(self.now, self._before, self._point, self.momentum, self.numbers)
 
     def _add_up(self, launch: Launch) -> None:
-        """Launch the sums over cells and walls of all processes."""
+        """Launch the sums over cells and walls of all ranks."""
         self._add_up_here(launch)
         if self._across is not None:
             launch(

@@ -1,4 +1,4 @@
-"""Heavy-ball steps of sand's stresses ahead of the host: the device takes them until the residual is due."""
+"""Heavy-ball steps of a stress solve that run on the device without the host."""
 
 from __future__ import annotations
 
@@ -19,14 +19,15 @@ if TYPE_CHECKING:
 
 
 class StressAhead:
-    """Steps of a solve that the device takes and judges, as `coupled.MomentumWorkspace` would on the host.
+    """Steps of a solve with all decisions on the device.
 
-    On CUDA a solve is one graph: the residual at the start, a loop of periods of steps until the
-    residual is due, that residual; the host reads once. On the CPU a thread team works through the
-    loop as one table.
+    The decisions are those of `coupled.MomentumWorkspace`. On CUDA a solve is one graph: the
+    residual at the start, a loop of periods of steps until a residual is due, and that residual;
+    the host reads once. On the CPU a thread pool executes the loop as one table.
 
     Args:
-        stress: the problem; on ranks, which decide alike by sums over all, on the CPU.
+        stress: the problem; on ranks only on the CPU, with equal decisions from sums over all
+            ranks.
         method: settings of the steps.
     """
 
@@ -35,26 +36,29 @@ class StressAhead:
         self._decisions = Reading(device, kernels.DECISIONS)
         self._going = wp.zeros(1, dtype=wp.int32, device=device)
         self._limits = wp.array(method.calm, dtype=wp.float64, device=device)
-        self._given = [Scalar() for _ in range(5)]  # of `begin_steps_kernel`, from `limit_` on
+        self._given = [Scalar() for _ in range(5)]  # arguments of the kernel from `limit_` on
         self._beginning, self._resuming = (
             LaunchGraph(device, record)
             for record in (self._launch_beginning, self._launch_resumption)
         )
-        self._period: Program | None = None  # that the loop is made of
+        self._period: Program | None = None  # period of which the loop is made
         self._loop = Program(device)
 
     @staticmethod
     def suits(stress: Stress) -> bool:
-        """Return whether the device can take steps without the host: where loops run on it; of ranks, on the CPU."""
+        """Return whether the device can run steps without the host.
+
+        The device must support loops; on ranks, only the CPU does.
+        """
         grid = stress.packing.grid
         return loops_on_device(grid.device) and not (stress.shared and grid.device.is_cuda)
 
     def begin(self, tolerance: float, most: int) -> None:
-        """Evaluate the residual of the stresses as they are, and take steps until it is due again.
+        """Evaluate the residual of the current stresses, and run steps until it is due.
 
         Args:
-            tolerance: of the residual [m/s].
-            most: steps of the solve.
+            tolerance: tolerance of the residual [m/s].
+            most: most steps of the solve.
         """
         stress, method = self._stress, self._method
         stress.set_steps(*method.steps(stress))
@@ -68,17 +72,17 @@ class StressAhead:
         self._repeat()
 
     def resume(self) -> None:
-        """Take more steps, after a residual that misses the tolerance."""
+        """Run more steps, after a residual that misses the tolerance."""
         self._make_loop()
         self._resuming.run()
         self._repeat()
 
     def decisions(self) -> np.ndarray:
-        """Return what the device has decided, by the slots of `stress_kernels`; waits for it."""
+        """Return the device's decisions, by the slots of `stress_kernels`; waits for it."""
         return self._decisions.numpy()
 
     def _repeat(self) -> None:
-        """Take the steps on the CPU; on CUDA they have been launched."""
+        """Run the steps on the CPU; on CUDA they have been launched."""
         if not self._stress.packing.grid.device.is_cuda:
             self._loop.run_while(self._going)
         self._decisions.changed()
@@ -86,11 +90,11 @@ class StressAhead:
             self._stress.bodies.changed()
 
     def _make_loop(self) -> None:
-        """Make the loop of the walls as they are: a period of steps, and what decides whether another one follows."""
+        """Build the loop for the current walls: a period of steps and the decisions."""
         period, device = self._stress.period(), self._stress.packing.grid.device
         if self._period is period:
             return
-        self._stress.check()  # not made while others are recorded
+        self._stress.check()  # must not be built while launches are recorded
         self._period, self._loop = period, Program(device)
         self._loop.extend(period)
         s, method = self._stress, self._method
@@ -104,12 +108,12 @@ class StressAhead:
         self._resuming.forget()
 
     def _launch_beginning(self) -> None:
-        """Launch what begins a solve, and on CUDA its steps."""
+        """Launch the start of a solve, and on CUDA its steps."""
         s, device = self._stress, self._stress.packing.grid.device
         pressure_step, shear_step, lookahead = self._method.steps(s)
         s.check().run()
         fields = [s.total, s.counts, s.numbers, s.momentum, self._decisions.array, self._going]
-        given = [
+        arguments = [
             pressure_step,
             shear_step,
             lookahead,
@@ -117,20 +121,20 @@ class StressAhead:
             MOST_MOMENTUM,
             *self._given,
         ]
-        launch(kernels.begin_steps_kernel, 1, [*fields, *given], device=device)
+        launch(kernels.begin_steps_kernel, 1, [*fields, *arguments], device=device)
         s.start_from_now()
         if device.is_cuda:
             self._launch_steps()
 
     def _launch_resumption(self) -> None:
-        """Launch what goes on with a solve, and on CUDA its steps."""
+        """Launch the continuation of a solve, and on CUDA its steps."""
         device = self._stress.packing.grid.device
         launch(kernels.resume_steps_kernel, 1, [self._decisions.array, self._going], device=device)
         if device.is_cuda:
             self._launch_steps()
 
     def _launch_steps(self) -> None:
-        """Launch the loop, and the residual that it leaves, on CUDA."""
+        """Launch the loop and the final residual on CUDA."""
         s = self._stress
         self._loop.run_while(self._going)
         s.check().run()

@@ -1,15 +1,16 @@
 # mypy: ignore-errors
-"""Passes of the coupled pressure and friction of sand: projected steps on the stresses of `granular.yield_set`, 2-D and 3-D.
+"""Kernels of the coupled pressure and friction of sand, in 2-D and 3-D.
 
-And the momentum of these steps, and the decisions by which a device takes them without its host,
-see `granular.stress_ahead`.
+They run projected steps on the stresses of `granular.yield_set`, update the momentum of these
+steps, and make the decisions with which a device runs them without the host, see
+`granular.stress_ahead`.
 
-And what damps the pattern that exerts no force: a checkerboard in the pressure and one in the shear
-balance each other on every face. Noise in the fraction feeds it and no equation takes it away.
-Where p = (-1)^(i + j), the shear stress with -p at a cell's low-low corner, +p at the two mixed
-ones and -p at high-high cancels grad p; in 3-D half of that on the edges of each shear does. So a
-part of what alternates of the pressure in all directions, (-1, 2, -1)/4 along each axis, can be
-taken from p and added to the copies with those signs, and no velocity changes. Only cells deep in
+They also damp a pattern that exerts no force: a checkerboard in the pressure and one in the shear
+balance each other on every face. Noise in the fraction excites it, and no equation damps it. With
+p = (-1)^(i + j), the shear stress with -p at a cell's low-low corner, +p at the two mixed ones and
+-p at high-high cancels grad p; in 3-D half of that on the edges of each shear does. So a part of
+the pressure that alternates along all directions, (-1, 2, -1)/4 along each axis, can be subtracted
+from p and added to the copies with those signs, without a change of velocity. Only cells deep in
 dense sand take part, away from solids that cut cells.
 """
 
@@ -38,9 +39,9 @@ from warp_lcp.granular.yield_set import (
 from warp_lcp.rows import KernelFile
 from warp_lcp.rows.compiler import forward_kernel
 
-# The momentum's state: steps done; the most of it for pressure and friction; that of this step;
-# that of the next; estimates of the natural residuals over the last PERIOD steps; sums over these;
-# 1 less the most that the momentum may grow to.
+# Slots of the momentum's state: number of steps; limits for pressure and friction; momenta of this
+# step and of the next one; estimates of the natural residuals over the last PERIOD steps; sums over
+# these steps; 1 less the limit up to which the momentum may grow.
 COUNT, BETA_X, NOW_X, NOW_S, NEXT_X, NEXT_S, RESIDUAL_X, SUMS, REST, STATE = (
     0,
     1,
@@ -54,7 +55,7 @@ COUNT, BETA_X, NOW_X, NOW_S, NEXT_X, NEXT_S, RESIDUAL_X, SUMS, REST, STATE = (
     18,
 )
 PERIOD = 5
-DAMPED = 0.15  # of the checkerboard, in a step
+DAMPED = 0.15  # part of the checkerboard that is removed in a step
 HIGH, LOW = 0.85, 0.5  # cosines above and below which the momentum grows and falls
 
 MOMENTUM: dict[str, Any] = {"NOW_X": NOW_X, "NOW_S": NOW_S, "NEXT_X": NEXT_X, "NEXT_S": NEXT_S}
@@ -67,7 +68,10 @@ KERNELS = KernelFile(
 def stress_passes(
     dimension: int, real: Any, *, box: bool = False, rate: bool = False, cut: bool = False
 ) -> SimpleNamespace:
-    """Return the passes for 2 or 3 dimensions: with velocities of float32 of a step, of float64 of what the natural residual would move."""
+    """Return the kernels for 2 or 3 dimensions.
+
+    Steps have velocities in float32, the natural residual in float64.
+    """
     residual = real is F64
     kind = ("residual" if residual else "step") + "_box" * box + "_rate" * rate + "_cut" * cut
     module = f"granular.stress_{dimension}d_{real.__name__}_{kind}"
@@ -80,22 +84,23 @@ def stress_passes(
         "TRIAL": 0,
     }
     names = ("edge_stress", "face_velocity", "edge_strain", "step", "traction", "admit", "damp")
-    made = {
+    cell_kernels = {
         name: KERNELS.kernel(
             f"granular.stress.{name}", module=module, compute=real, constants=words
         )
         for name in names
     }
     wall = KERNELS.kernel("granular.stress.wall_step", module=module, compute=real, constants=words)
-    return SimpleNamespace(**made, wall=wall)
+    return SimpleNamespace(**cell_kernels, wall=wall)
 
 
 @forward_kernel(module="granular.momentum")
 def momentum_kernel(sums: wp.array(dtype=wp.float64), state: wp.array(dtype=wp.float64)):
-    """Momentum of the next step but one; every few steps more or less of it, by the angle between the projection's error and the step.
+    """Update the momentum of the next step but one.
 
-    cos = <e, s> / sqrt(<e, e> <s, s>) is near 1 where more momentum would help and small where the
-    iterates flutter.
+    Every few steps it is increased or decreased, by the angle between the projection's error e and
+    the step s: cos = <e, s> / sqrt(<e, e> <s, s>) is near 1 where more momentum would help, and
+    small where the iterates oscillate.
     """
     for c in range(COLUMNS):
         value = sums[c] + sums[COLUMNS + c]
@@ -131,16 +136,17 @@ def momentum_kernel(sums: wp.array(dtype=wp.float64), state: wp.array(dtype=wp.f
 def keep_step_kernel(
     sums: wp.array(dtype=wp.float64), found: wp.array2d(dtype=wp.float64), step: int
 ):
-    """Keep the sums of a step of a period on this rank; a thread a column."""
+    """Store the sums of a step of a period on this rank; a thread per column."""
     c = wp.tid()
     found[step, c] = sums[c]
 
 
 @forward_kernel(module="granular.momentum")
 def period_kernel(found: wp.array2d(dtype=wp.float64), total: wp.array(dtype=wp.float64)):
-    """Sums of a period of which the momentum makes those of its steps on all ranks, cells and walls; a thread a column.
+    """Combine the sums of a period over cells, walls and ranks; a thread per column.
 
-    The momentum adds up roots of columns 6 and 7, and takes the root of what it is given.
+    `momentum_kernel` expects one set of sums per step. It adds roots of columns 6 and 7, and takes
+    the root of its argument.
     """
     c = wp.tid()
     value = wp.float64(0.0)
@@ -155,23 +161,23 @@ def period_kernel(found: wp.array2d(dtype=wp.float64), total: wp.array(dtype=wp.
     total[COLUMNS + c] = wp.float64(0.0)
 
 
-# Decisions of a solve. Steps: taken, when the estimate was best, when it or the momentum last
-# changed, to be taken at least, at most.
+# Slots of the decisions of a solve. Counts of steps: done, at the best estimate, at the last change
+# of estimate or momentum, minimum, maximum.
 DONE, BEST_AT, CHANGED, LEAST, MOST = 0, 1, 2, 3, 4
-# [m/s]: least estimate, what it is to fall below, below which `LEAST` does not count
+# In m/s: best estimate, target, and the value below which `LEAST` does not count.
 BEST, AIM, STILL = 5, 6, 7
-# limits of the momentum used; whether the residual is due; whether progress has ended
+# Number of momentum limits used; whether the residual is due; whether progress has ended.
 LIMITS, DUE, STAGNATES = 8, 9, 10
-# sums of squares of pressure's and friction's residual: at the start, after the last steps
+# Sums of squares of the residuals of pressure and friction: at the start, after the last steps.
 FIRST, LAST, DECISIONS = 11, 13, 15
-# of the best estimate: progress, and where a solve that stagnates may end
+# Factors on the best estimate: less is progress; a stagnating solve ends within the second one.
 BETTER, NEAR_BEST = 0.95, 1.2
-NOTHING = 1e-3  # of the tolerance: nothing to solve, as in free fall
-STILL_SHARE = 1e-2  # of the tolerance, which leaves sand at rest
-TIGHTER = 0.8  # the aim after a residual was due, should the estimate have been too good
-# by which a step of the friction, over its length, exceeds the natural residual: measured
+NOTHING = 1e-3  # relative to the tolerance: nothing to solve, as in free fall
+STILL_SHARE = 1e-2  # relative to the tolerance: sand stays at rest
+TIGHTER = 0.8  # factor on the target at each residual, since the estimate may be too low
+# Factor from a step of the friction over its length to its natural residual: measured.
 SHARE = 0.7**0.5
-SAFELY = 1.0 + 1e-9  # the host computes the norm again
+SAFELY = 1.0 + 1e-9  # the host recomputes the norm
 f32s, f64s, i32s = wp.array(dtype=wp.float32), wp.array(dtype=wp.float64), wp.array(dtype=wp.int32)
 
 
@@ -188,7 +194,10 @@ def numbers_kernel(
     gain: float,
     halfway: float,
 ):
-    """Write what the kernels of a time step read, before a method sets its steps; see `granular.yield_set`."""
+    """Write the parameters of a time step, see `granular.yield_set`.
+
+    The steps of a method are set afterwards.
+    """
     numbers[FRICTION] = k
     numbers[COHESION] = cohesion
     numbers[TENSION] = tension
@@ -213,7 +222,7 @@ def limit(state: f64s, momentum: wp.float64):
 
 @forward_kernel(module="granular.momentum")
 def keep_sums_kernel(sums: f64s, decisions: f64s, place: int):
-    """Keep the sums of a residual: of pressure, of friction in cells and on walls."""
+    """Store the sums of a residual: of pressure, of friction in cells and on walls."""
     decisions[place] = sums[0]
     decisions[place + 1] = sums[1] + sums[COLUMNS]
 
@@ -237,7 +246,10 @@ def begin_steps_kernel(
     still: wp.float64,
     most: wp.float64,
 ):
-    """Begin the steps of a solve whose residual at the start is known, as `coupled.MomentumWorkspace.start` does."""
+    """Start the steps of a solve, as `coupled.MomentumWorkspace.start` does.
+
+    The residual at the start must be known.
+    """
     numbers[PRESSURE_STEP] = pressure_step
     numbers[SHEAR_STEP] = shear_step
     numbers[LOOKAHEAD] = lookahead
@@ -272,7 +284,7 @@ def begin_steps_kernel(
 
 @forward_kernel(module="granular.momentum")
 def resume_steps_kernel(decisions: f64s, going: i32s):
-    """Go on after a residual that has missed the tolerance."""
+    """Continue after a residual that has missed the tolerance."""
     decisions[DUE] = wp.float64(0.0)
     decisions[STAGNATES] = wp.float64(0.0)
     going[0] = 1
@@ -290,7 +302,10 @@ def decide_kernel(
     patience: int,
     wait: int,
 ):
-    """Decide after a period of steps whether the host is to look at the residual, as `coupled.MomentumWorkspace.judge` does."""
+    """Decide after a period whether the residual is due.
+
+    The rules are those of `coupled.MomentumWorkspace.judge`.
+    """
     done = decisions[DONE] + wp.float64(PERIOD)
     decisions[DONE] = done
     if done % wp.float64(check) != wp.float64(0.0):

@@ -1,25 +1,27 @@
 """Yield set of sand: layout of the stress fields, parameters, kernels.
 
-All stresses are impulses over rho dx [m/s]: x = kick_dt p / (rho dx) and the like, so that spacing
-and time step appear nowhere. A field of stresses has layers of the grid's shape: x, the normal
-parts of the deviator (2-D: a = s_xx = -s_yy; 3-D: s_xx, s_yy, s_zz), and for each shear four
-*copies*, which belong to the cell: copy q of the shear of axes (alpha, beta) lies on the cell's
-edge at the low (0) or high (1) side along alpha, q & 1, and along beta, q >> 1. Shears are ordered
-xy, xz, yz. An edge, stored at the cell whose low side it is, has the mean of the copies of the
-cells that take part in it; `share` holds the weight of a copy there: > 0 between cells, < 0 (and
-its absolute value the weight) on a wall, 0 where there is no shear. Where solids cut cells DIM
-layers follow: the traction of the wall in a cell, see `granular.cut_walls`.
+All stresses are impulses over rho dx [m/s]: x = kick_dt p / (rho dx), and the shear stresses alike,
+so that equations contain neither spacing nor time step. A field of stresses has layers of the
+grid's shape: x; the normal parts of the deviator (2-D: a = s_xx = -s_yy; 3-D: s_xx, s_yy, s_zz);
+and for each shear four *copies* in each cell. Copy q of the shear of axes (alpha, beta) lies on the
+cell's edge at the low (0) or high (1) side along alpha, q & 1, and along beta, q >> 1. Shears are
+ordered xy, xz, yz. An edge is stored at the cell whose low side it is. Its stress is the mean of
+the copies of the cells that take part in it. `share` has the weight of a copy: > 0 between cells;
+< 0 on a wall, with the weight as its absolute value; 0 where there is no shear. Where solids cut
+cells DIM more layers have the traction of the wall in a cell, see `granular.cut_walls`.
 """
 
 import warp as wp
 
-# iterations for the multiplier of a yielding cell: 3 are exact to 2e-6 of the bound, 4 to rounding
+# Newton iterations for the multiplier of a yielding cell: 3 are exact to 2e-6 of the bound, 4 to
+# rounding.
 NEWTON = 4
-COLUMNS = 8  # of a row's sums, see `granular.stress_kernels`
+COLUMNS = 8  # columns of the sums of a row, see `granular.stress_kernels`
 
-# what kernels read: the yield set, dt g [m/s] (three entries), the steps of a method relative to
-# the diagonal, how far beyond the stresses, in units of the momentum's displacement, it takes its
-# gradient, dt / dx [s/m], what friction gains with the rate (snippet `rate_bound` of `sand.h`)
+# Slots of the kernels' parameters: yield set; dt g [m/s] (three entries); steps of the method
+# relative to the diagonal; point of the gradient beyond the stresses, in units of the momentum's
+# displacement; dt / dx [s/m]; growth of friction with the shear rate (snippet `rate_bound` of
+# `sand.h`).
 FRICTION, COHESION, TENSION, WEIGHT, PRESSURE_STEP, SHEAR_STEP, LOOKAHEAD, STEP_OF_CELL = (
     0,
     1,
@@ -32,14 +34,14 @@ FRICTION, COHESION, TENSION, WEIGHT, PRESSURE_STEP, SHEAR_STEP, LOOKAHEAD, STEP_
 )
 GAIN, HALFWAY, NUMBERS = 10, 11, 12
 
-HOLDS = 1  # bits of a cell: it holds sand, and so a pressure,
-SHEARS_HERE = 2  # enough of it to carry shear,
-FIRM = 4  # so much that cohesion may hold it together,
-PARTLY = 8  # and a solid cuts it, or a cell beside it
-# of a cell free, below which what passes its faces counts as volume, whatever its neighbors hold,
-# see `sand.h`
+HOLDS = 1  # bits of a cell: it holds sand, and so has a pressure,
+SHEARS_HERE = 2  # it holds enough sand for shear stress,
+FIRM = 4  # it is dense enough for cohesion,
+PARTLY = 8  # a solid cuts it, or a cell beside it
+# Free fraction of a cell below which the flux through its faces counts as volume, whatever the
+# neighbors hold, see `sand.h`.
 NEARLY = 0.05
-LEAST_RADIUS = 1e-30  # [m/s], of a yield set that holds only zero
+LEAST_RADIUS = 1e-30  # radius [m/s] of a yield set that contains only zero
 
 CONSTANTS = {
     "NEWTON": NEWTON,

@@ -1,4 +1,4 @@
-"""The command line: `warp-lcp run | render | view | serve | export | check | tune | scenes | schema | solve | bench | info`."""
+"""Command line: the program `warp-lcp` and its commands."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from warp_lcp.simulation import InputError, SimulationFailed, StepFailed
 from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
 from warp_lcp.solvers.registry import METHODS
 
-RANKED_SUITE = "scaling"  # what `bench --engine petsc` measures
+RANKED_SUITE = "scaling"  # suite of `bench --engine petsc`
 
 app = typer.Typer(
     name="warp-lcp",
@@ -62,7 +62,7 @@ def _begin_alike(word: str, names: Iterable[str]) -> list[str]:
 
 
 def _scenes_alike(incomplete: str) -> list[str]:
-    """Return the built-in scenes, scene files and folders that begin with a word, for shell completion."""
+    """Return completions of a scene: built-in scenes, scene files and folders."""
     near = (
         sorted(Path().glob(f"{glob.escape(incomplete)}*"))
         if not Path(incomplete).is_absolute()
@@ -148,7 +148,7 @@ def options(
         ),
     ] = False,
 ) -> None:
-    """Define the options that belong to no command."""
+    """Define the options of the program itself."""
 
 
 def main() -> None:
@@ -219,7 +219,7 @@ def run(
     overrides: SetOption = None,
 ) -> None:
     """Simulate a scene; ParaView opens the frames in the run folder."""
-    given = {
+    options = {
         "--out": out,
         "--device": device,
         "--frames": frames,
@@ -234,7 +234,7 @@ def run(
                 "--resume and --force exclude each other: --resume continues a run, --force "
                 "deletes it"
             )
-        loaded = launcher.load(scene, overrides or (), given)
+        loaded = launcher.load(scene, overrides or (), options)
         chosen, console = launcher.choose_device(device), launcher.console
         folder, name = out or default_folder(loaded.scene), loaded.scene.scene.name
         say(console, f"{name} on {launcher.place(chosen)}, into {folder}")
@@ -272,7 +272,7 @@ def run(
     _report(record, folder)
 
 
-for command in (render, view, serve, export):  # after `run`, in the list of commands
+for command in (render, view, serve, export):  # after `run` in the list of commands
     app.command()(command)
 
 
@@ -293,7 +293,7 @@ def check(
     force_memory: ForceMemory = False,
     overrides: SetOption = None,
 ) -> None:
-    """Validate a scene; estimate memory, steps, run time and disk use; list suspicious settings."""
+    """Validate a scene; estimate memory and run time; list suspicious settings."""
     with wrong_input():
         chosen = choose_device(device)
         if fix:
@@ -342,7 +342,7 @@ def tune_scene(
     ] = None,
     overrides: SetOption = None,
 ) -> None:
-    """Find the fastest settings of a scene for an accuracy, by trial runs of its first frames."""
+    """Find the fastest settings of a scene for an accuracy, by short trial runs."""
     with wrong_input():
         chosen = choose_device(device)
         loaded = load_scene(scene, overrides or ())
@@ -458,7 +458,7 @@ def solve(
     engine: EngineOption = Engine.SINGLE,
     rank_timeout: RankTimeout = LIMIT,
 ) -> None:
-    """Solve the complementarity problem y = A x + b, lower <= x <= upper, from files or as recorded by a run."""
+    """Solve y = A x + b, lower <= x <= upper, from files or a recorded problem."""
     options: dict[str, Any] = {
         "method": method,
         "tolerance": tolerance,
@@ -561,13 +561,16 @@ def bench(
     ] = None,
     threads: ThreadsOption = None,
 ) -> None:
-    """Run benchmarks, or compare two results. First prints the expected time on two cores and the packages needed."""
+    """Run benchmarks, or compare two results.
+
+    First prints the expected time on two cores and the packages needed.
+    """
     installed = benchmarks()
     if suite not in installed:
         end(f"{suite}: no such suite; {nearest(suite, installed)}", WRONG_INPUT)
     with wrong_input():
         _use_threads(threads)
-        # ranks choose for themselves
+        # Ranks choose their devices themselves.
         chosen = device if engine is Engine.PETSC else choose_device(device)
         if scene:
             load_scene(scene)
@@ -581,10 +584,10 @@ def bench(
         if compare is not None:
             tell(installed[suite].compare(*compare))
             return
-        asked: dict[str, Any] = ({"scene": scene} if scene else {}) | (
+        options: dict[str, Any] = ({"scene": scene} if scene else {}) | (
             {} if seed is None else {"seed": seed}
         )
-        if not shared:  # every rank is here
+        if not shared:  # called on every rank
             tell(f"{suite}: takes about {installed[suite].takes}", error=True)
         files = installed[suite].run(
             device=chosen,
@@ -593,7 +596,7 @@ def bench(
             repeat=repeat,
             shared=shared,
             threads=threads,
-            **asked,
+            **options,
         )
     except ValueError as error:
         end(str(error), WRONG_INPUT)
@@ -631,7 +634,7 @@ def _use_threads(count: int | None) -> None:
 
 
 def _print_tuning(tuning: Tuning, accuracy: str, device: str) -> None:
-    """Print what was measured and the fastest settings."""
+    """Print the measurements and the fastest settings."""
     rows = tuning.rows()
     tell(table_lines(rows[0], rows[1:], left=range(len(rows[0]))))
     tell(
@@ -648,7 +651,7 @@ def _print_pairs(pairs: list[tuple[str, str]]) -> None:
 
 
 def _report(record: RunRecord, folder: Path) -> None:
-    """Print how a run ended."""
+    """Print the exit status of a run."""
     taken = f"{record.steps} steps, {record.time:.6g} s simulated in {record.seconds:.1f} s"
     if record.status == "finished" and record.steps and record.resumed_from_step == record.steps:
         tell(

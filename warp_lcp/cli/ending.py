@@ -50,7 +50,7 @@ def _show_renamed_keys(
     file: TextIO | None = None,
     line: str | None = None,
 ) -> None:
-    """Print a warning about a renamed key as one line; all others as Python does."""
+    """Print a warning about a renamed key as one line; others as Python does."""
     if issubclass(category, RenamedKeyWarning):
         tell(str(message), error=True)
     else:

@@ -1,6 +1,6 @@
 """Safe reader of real Matrix Market files.
 
-SciPy's reader (1.17) ends the process where a number is cut short.
+SciPy's reader (1.17) ends the process if a number is truncated.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ HEADER = re.compile(
     rb"(?P<size>[ \t]*\d{1,18}(?:[ \t]+\d{1,18}){1,2})[ \t]*+(?:\r?\n|\Z)",
     re.IGNORECASE,
 )
-COPIES = 5  # of the text: the shortest number takes 2 bytes of it, and 8 as it is read
+COPIES = 5  # copies of the text in memory: the shortest number has 2 bytes, and 8 after conversion
 NUMBER = 8  # bytes
-HEAD = 1 << 16  # bytes in which a header is looked for before all of a file is read
-Fits = Callable[[int, int], bool]  # whether a matrix of so many rows and columns is allowed
+HEAD = 1 << 16  # bytes that are searched for a header before the whole file is read
+Fits = Callable[[int, int], bool]  # whether a matrix of these sizes is allowed
 
 
 class MarketError(ValueError):
-    """A file that is not of this format; the message says why, not which file."""
+    """Error of the file format; the message does not include the file's name."""
 
 
 def read_shape(path: Path, fits: Fits, expected: str) -> tuple[int, int]:
-    """Return rows and columns as the header of a matrix has them, without reading more.
+    """Return rows and columns from the header of a matrix.
 
     Args:
         path: the file; .gz and .bz2 are unpacked.
         fits: whether a shape is allowed.
-        expected: what the message says of a shape that is not.
+        expected: description of allowed shapes for the message.
 
     Raises:
         OSError: the file cannot be read.
@@ -52,7 +52,7 @@ def read_shape(path: Path, fits: Fits, expected: str) -> tuple[int, int]:
     """
     text = _text(path, HEAD)
     header = HEADER.match(text)
-    # a long comment, or a size cut short
+    # A long comment, or a truncated size.
     if len(text) == HEAD and (header is None or header.end() == HEAD):
         header = HEADER.match(_text(path))
     rows, columns, more = _size(header, fits, expected)
@@ -65,18 +65,18 @@ def read_shape(path: Path, fits: Fits, expected: str) -> tuple[int, int]:
 
 
 def read_market(path: Path, fits: Fits, expected: str) -> Any:
-    """Read a matrix: scipy.sparse (CSR) or numpy as the file says, float64.
+    """Read a matrix: scipy.sparse (CSR) or numpy, as in the file, float64.
 
     Args:
         path: the file; .gz and .bz2 are unpacked.
-        fits: whether a shape is allowed, asked before the matrix is read.
-        expected: what the message says of a shape that is not.
+        fits: whether a shape is allowed; called before the matrix is read.
+        expected: description of allowed shapes for the message.
 
     Raises:
         OSError: the file cannot be read.
-        MarketError: it is not of this format.
+        MarketError: the file is not of this format.
         ValueError: its numbers are complex, or its shape does not fit.
-        ClaimError: it claims more than it has, or than there is memory for.
+        ClaimError: its sizes exceed the file or the free memory.
     """
     text = _text(path)
     header = HEADER.match(text)
@@ -90,7 +90,10 @@ def read_market(path: Path, fits: Fits, expected: str) -> Any:
 
 
 def _size(header: re.Match[bytes] | None, fits: Fits, expected: str) -> tuple[int, int, list[int]]:
-    """Check a header; return rows, columns and, of a sparse matrix, its number of entries."""
+    """Check a header; return rows, columns and the number of entries.
+
+    The last one only for sparse matrices.
+    """
     if header is None:
         raise MarketError(
             "it must begin with %%MatrixMarket matrix FORM FIELD SYMMETRY and a line with its size"
@@ -109,7 +112,10 @@ def _size(header: re.Match[bytes] | None, fits: Fits, expected: str) -> tuple[in
 
 
 def _dense(body: bytes, rows: int, columns: int, symmetry: bytes) -> np.ndarray:
-    """Return an array: all of it by columns, or its lower triangle, without the diagonal if that is 0."""
+    """Return a dense matrix, stored by columns.
+
+    Of a symmetric matrix, the file has the lower triangle, without the diagonal if that is 0.
+    """
     skew = symmetry == b"skew-symmetric"
     count = (
         rows * columns if symmetry == b"general" else rows * (rows - 1 if skew else rows + 1) // 2
@@ -127,14 +133,14 @@ def _dense(body: bytes, rows: int, columns: int, symmetry: bytes) -> np.ndarray:
 def _sparse(
     body: bytes, rows: int, columns: int, entries: int, symmetry: bytes, *, pattern: bool
 ) -> scipy.sparse.csr_array:
-    """Return a matrix of entries (row, column, value), counted from 1."""
+    """Return a sparse matrix from entries (row, column, value), counted from 1."""
     width = 2 if pattern else 3
     what = _entries(rows, columns, entries)
     table = _numbers(
         body, width * entries, what, NUMBER * (rows + columns + 2 * width * entries)
     ).reshape(entries, width)
     kind: Any = np.int32 if max(rows, columns) <= np.iinfo(np.int32).max else np.int64
-    with np.errstate(invalid="ignore"):  # a place that is no such number differs from what was read
+    with np.errstate(invalid="ignore"):  # conversion changes an index that is no whole number
         row, column = (table[:, axis].astype(kind) - 1 for axis in range(2))
     inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
     if not (inside & (row + 1.0 == table[:, 0]) & (column + 1.0 == table[:, 1])).all():
@@ -149,18 +155,18 @@ def _sparse(
 
 
 def _numbers(body: bytes, count: int, what: str, needed: int) -> np.ndarray:
-    """Return so many numbers of a text, and no others.
+    """Return exactly `count` numbers of a text.
 
     Args:
         body: the text.
-        count: how many it must hold.
-        what: names them.
-        needed: memory that they take [bytes].
+        count: expected number.
+        what: name of the numbers in messages.
+        needed: memory of the result [bytes].
     """
     _check_stored(what, count, len(body), needed)
     try:
         with warnings.catch_warnings():
-            # so NumPy says that something is no number
+            # NumPy then reports invalid numbers.
             warnings.simplefilter("error", DeprecationWarning)
             found = np.fromstring(body, dtype=np.float64, sep=" ") if body.strip() else np.zeros(0)
     except (DeprecationWarning, ValueError) as error:
@@ -175,12 +181,12 @@ def _entries(rows: int, columns: int, entries: int) -> str:
 
 
 def _check_stored(what: str, count: int, held: int, needed: int = 0) -> None:
-    """Refuse a count of numbers beyond what a file holds or free memory allows."""
+    """Raise an error if a count of numbers exceeds the file or free memory."""
     check_claim(what, needed, stored=len("1\n") * count - 1, held=held)
 
 
 def _text(path: Path, most: int | None = None) -> bytes:
-    """Return what is in a file, unpacked if it is packed, or the first bytes of it."""
+    """Return the content of a file, or its first bytes; .gz and .bz2 are unpacked."""
     unpack = PACKED.get(path.suffix)
     if unpack is None and most is not None and path.is_file():
         with path.open("rb") as stream:

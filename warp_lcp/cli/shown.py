@@ -61,7 +61,7 @@ CameraOption = Annotated[
 
 
 class RenderLook(StrEnum):
-    """How images are drawn."""
+    """Renderer of images."""
 
     QUICK = "quick"
     PHOTO = "photo"
@@ -140,8 +140,11 @@ def render(
     ] = None,
     overrides: CameraOption = None,
 ) -> None:
-    """Draw the frames of a run as PNG images or as a film (needs the extra `render` or `photo`)."""
-    # starts Warp, which draws surfaces and samples 2-D solids, without its native messages
+    """Draw the frames of a run as PNG images or a film.
+
+    Needs the extra `render` or `photo`.
+    """
+    # Starts Warp, which draws surfaces and samples 2-D solids, without its native messages.
     devices()
     console = Terminal(stderr=True)
 
@@ -149,10 +152,11 @@ def render(
         say(
             console,
             "drawing takes about "
-            f"{timedelta(seconds=math.ceil(seconds))}{'' if look is RenderLook.PHOTO else ' on one core'}",
+            f"{timedelta(seconds=math.ceil(seconds))}"
+            f"{'' if look is RenderLook.PHOTO else ' on one core'}",
         )
 
-    with wrong_input(), Count(console, "drawing", "images") as told:
+    with wrong_input(), Count(console, "drawing", "images") as counter:
         frame = [
             *(frame or ()),
             *(frame_range(frames, Recording(folder, color, show).numbers) if frames else ()),
@@ -173,7 +177,7 @@ def render(
                 if film
                 else photograph_run
             )
-            report: Any = {"told": told, "estimated": estimated, "noted": partial(say, console)}
+            report: Any = {"told": counter, "estimated": estimated, "noted": partial(say, console)}
             images = list(draw(folder, frames=frame, settings=settings, out=out, **report))
             tell(f"{film}: {len(images)} frames" if film else _listed(images))
             return
@@ -197,7 +201,7 @@ def render(
                         film,
                         looks=looks,
                         rate=check_rate(fps),
-                        told=told,
+                        told=counter,
                         estimated=estimated,
                     )
                 )
@@ -213,7 +217,7 @@ def render(
                 looks=looks,
                 out=out,
                 sheet=sheet,
-                told=told,
+                told=counter,
                 estimated=estimated,
             )
         )
@@ -221,10 +225,10 @@ def render(
 
 
 def refuse_quick_options(**given: bool) -> None:
-    """Refuse options that only `--look quick` has.
+    """Raise an error for options that only `--look quick` has.
 
     Raises:
-        RenderError: one of them is given.
+        RenderError: one of them is set.
     """
     for name, there in given.items():
         if there:
@@ -232,7 +236,7 @@ def refuse_quick_options(**given: bool) -> None:
 
 
 def _listed(images: list[Path]) -> str:
-    """Return one line that names the images."""
+    """Return one line with the names of the images."""
     return (
         f"{images[0]}"
         if len(images) == 1
@@ -246,7 +250,10 @@ def view(
     color: ColorOption = None,
     overrides: CameraOption = None,
 ) -> None:
-    """Show a run in a window, also while it is in progress (needs a display and the extra `render`)."""
+    """Show a run in a window, also while it is in progress.
+
+    Needs a display and the extra `render`.
+    """
     devices()
     with wrong_input():
         view_run(folder, Looks(color=color, show=show, overrides=overrides or ()))
@@ -262,7 +269,7 @@ def serve(
     ] = PORT,
     show: ShowOption = None,
 ) -> None:
-    """Show frames and log of a run on a web page, also while it is in progress; Ctrl-C ends it."""
+    """Show a run on a web page, also while it is in progress; Ctrl-C ends it."""
     devices()
     with wrong_input():
         if not folder.is_dir():
@@ -298,7 +305,10 @@ def export(
         ),
     ] = None,
 ) -> None:
-    """Write the frames of a run to one USD file, for Blender, Houdini and Maya (needs the extra `usd`)."""
+    """Write a run to one USD file, for Blender, Houdini and Maya.
+
+    Needs the extra `usd`.
+    """
     devices()
     with wrong_input(), Count(Terminal(stderr=True), "writing", "frames") as told:
         count = len(list(export_run(folder, out, show=show, first=first, last=last, told=told)))
@@ -322,7 +332,10 @@ class _Begun:
 
 @contextmanager
 def looked_on(observer: Observer, folder: Path, *, page: bool, window: bool) -> Iterator[Observer]:
-    """Serve a web page of a run, or open a window in another process, once the run folder exists; the window stays open."""
+    """Show a web page or a window of a run once its folder exists.
+
+    The window runs in another process, and stays open.
+    """
     with ExitStack() as stack:
 
         def begin() -> None:

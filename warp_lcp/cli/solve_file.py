@@ -1,4 +1,4 @@
-"""A problem from Matrix Market files, solved: `warp-lcp solve`."""
+"""Solve a problem from Matrix Market files: `warp-lcp solve`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from warp_lcp.run.problem_folder import ProblemError
 from warp_lcp.settings import SettingError
 from warp_lcp.solvers.registry import METHODS
 
-MOST_ROWS = 40  # of the table of iterations: a longer history shows its first and last ones
+MOST_ROWS = 40  # rows of the table of iterations: a longer history shows its first and last ones
 SQUARE: tuple[Fits, str] = (lambda rows, columns: rows == columns > 0, "A must be square")
 FORMAT = "a Matrix Market file (https://math.nist.gov/MatrixMarket/formats.html)"
 
@@ -37,8 +37,8 @@ class Outcome:
 
     Attributes:
         problem: the problem.
-        solver: the method, None where `wl.solve` has chosen it.
-        name: in `METHODS`, of the method that found x.
+        solver: the method; None if `wl.solve` has chosen it.
+        name: name in `METHODS` of the method that found x.
         result: the result.
     """
 
@@ -48,7 +48,7 @@ class Outcome:
     result: SolveResult
 
     def heading(self) -> str:
-        """Return a line that says what was solved."""
+        """Return a line about the problem."""
         A = self.problem.A
         kind = f"{A.nnz} entries, " if isinstance(A, SparseOperator) else "dense, "
         symmetry = "symmetric" if A.symmetric else "unsymmetric"
@@ -100,7 +100,7 @@ class Outcome:
         return table
 
     def ending(self) -> str:
-        """Return a line that says how it ended."""
+        """Return a line about the result."""
         r = self.result
         size = f"residual {r.residual:.3e}, relative {r.relative_residual:.3e}"
         return f"{r.status.name}: {r.status.value}; {r.iterations} iterations, {size}"
@@ -131,19 +131,19 @@ def solve_files(
     Args:
         matrix: A, sparse (coordinate) or dense (array).
         right_side: b, a vector of either form.
-        lower: a number or the file of a vector; magnitudes of 1e20 and more are infinite.
+        lower: a number, or the file of a vector; magnitudes of 1e20 and more are infinite.
         upper: likewise.
-        method: a name in `METHODS`; what `wl.solve` chooses if None.
-        tolerance: of the residual, relative to the one at clip(0, lower, upper).
-        max_iterations: maximum number of steps.
-        max_seconds: the most wall time of the solve.
+        method: a name in `METHODS`; `wl.solve` chooses if None.
+        tolerance: residual, relative to the one at clip(0, lower, upper).
+        max_iterations: limit of steps.
+        max_seconds: limit of the wall time.
         device: a Warp device.
 
     Raises:
-        ProblemError: a file or an option is wrong.
+        ProblemError: a file or an option is invalid.
     """
     stopping = criteria(tolerance, max_iterations, max_seconds)
-    n = _checked(matrix, *SQUARE)[0]  # sizes first: a file may claim rows that take minutes
+    n = _checked(matrix, *SQUARE)[0]  # sizes first: a file may have a huge number of rows
     for path in (
         right_side,
         *(Path(side) for side in (lower, upper) if _number(side) is None and Path(side).exists()),
@@ -168,7 +168,7 @@ def solve_files(
 
 
 def criteria(tolerance: float, max_iterations: int, max_seconds: float) -> StoppingCriteria:
-    """Return the criteria that options ask for.
+    """Return the stopping criteria from options.
 
     Raises:
         ProblemError: an option is outside its range; the message names it.
@@ -183,19 +183,21 @@ def criteria(tolerance: float, max_iterations: int, max_seconds: float) -> Stopp
 
 
 def read_matrix(path: Path) -> Any:
-    """Return a square matrix, scipy.sparse or numpy as the file says.
+    """Return a square matrix, scipy.sparse or numpy, as stored in the file.
 
     Raises:
-        ProblemError: the file cannot be read, or holds no finite real square matrix.
+        ProblemError: the file cannot be read, or is no finite real square matrix.
     """
     return _read(path, *SQUARE)
 
 
 def read_vector(path: Path, n: int, *, infinite: bool = False) -> np.ndarray:
-    """Return a vector of n finite numbers, or also infinite ones, from a file of shape n x 1 or 1 x n.
+    """Return a vector of n finite numbers from a file of shape n x 1 or 1 x n.
+
+    Or also infinite ones, if `infinite` is set.
 
     Raises:
-        ProblemError: the file cannot be read, or holds something else.
+        ProblemError: the file cannot be read, or is no such vector.
     """
     matrix = _read(path, *_vector_of(n), infinite=infinite)
     return (matrix.toarray() if scipy.sparse.issparse(matrix) else matrix).ravel()
@@ -215,7 +217,7 @@ def write_vector(path: Path, x: np.ndarray) -> None:
 
 
 def _vector_of(n: int) -> tuple[Fits, str]:
-    """Return which shapes a vector may have, and what a message says of others."""
+    """Return the test for shapes of a vector, and their description."""
     return (
         lambda rows, columns: (rows, columns) in ((n, 1), (1, n)),
         f"expected {n} x 1, a number for each row of A",
@@ -223,14 +225,14 @@ def _vector_of(n: int) -> tuple[Fits, str]:
 
 
 def _checked(path: Path, fits: Fits, expected: str) -> tuple[int, int]:
-    """Return the shape that a file's header claims, which fits."""
+    """Return the shape in a file's header after a check."""
     with _told(path):
         return read_shape(path, fits, expected)
 
 
 @contextmanager
 def _told(path: Path) -> Iterator[None]:
-    """Say which file is meant where one cannot be read."""
+    """Add the file's name to errors of reading."""
     try:
         yield
     except FileNotFoundError as error:
@@ -244,7 +246,10 @@ def _told(path: Path) -> Iterator[None]:
 
 
 def _read(path: Path, fits: Fits, expected: str, *, infinite: bool = False) -> Any:
-    """Return what a file of a shape that fits holds: finite real numbers, or also infinite ones."""
+    """Return the matrix in a file of an allowed shape, with finite real numbers.
+
+    Or also infinite ones, if `infinite` is set.
+    """
     with _told(path):
         matrix = read_market(path, fits, expected)
     values = matrix.data if scipy.sparse.issparse(matrix) else matrix
@@ -258,7 +263,7 @@ def _read(path: Path, fits: Fits, expected: str, *, infinite: bool = False) -> A
 
 
 def _number(value: str) -> float | None:
-    """Return a number, None if the text is none."""
+    """Return a number; None if the text is no number."""
     try:
         return float(value)
     except ValueError:
@@ -266,7 +271,7 @@ def _number(value: str) -> float | None:
 
 
 def _bound(value: str, n: int, option: str) -> float | np.ndarray:
-    """Return a bound: a number, or the vector in a file, with infinity for 1e20 and more."""
+    """Return a bound: a number, or the vector in a file; 1e20 and more is infinite."""
     number = _number(value)
     if number is None and not Path(value).exists():
         raise ProblemError(f"{option} {value}: neither a number nor a file")
@@ -282,7 +287,10 @@ def _bound(value: str, n: int, option: str) -> float | np.ndarray:
 
 
 def method_named(name: str, family: str, *, shared: bool = False) -> Any:
-    """Return a method by its name, for a family of operators, perhaps on several ranks."""
+    """Return a method by its name, for a family of operators.
+
+    With `shared`, for several ranks.
+    """
     if name not in METHODS:
         raise ProblemError(f"--method {name}: no such method; {METHODS.nearest(name)}")
     fits = [

@@ -1,6 +1,6 @@
 """Solve a recorded grid problem: `warp-lcp solve FILE.npz`.
 
-The file is written by `run --record-problems`; this process or ranks solve it.
+The file is written by `run --record-problems`; one process or several ranks solve it.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from warp_lcp.distributed.decomposition import Decomposition
     from warp_lcp.distributed.ranks import Ranks
 
-SUFFIX = ".npz"  # of recorded problems
-FIELD = ".npy"  # of their solutions
+SUFFIX = ".npz"  # suffix of recorded problems
+FIELD = ".npy"  # suffix of their solutions
 
 
 @dataclass(frozen=True)
@@ -38,9 +38,9 @@ class GridOutcome(Outcome):
     """Result of a solve and the grid problem solved.
 
     Attributes:
-        shape: of the whole grid's cells, (nz, ny, nx) or (ny, nx).
-        unknowns: of the whole grid.
-        decomposition: whose box of x the result has; None: all of it.
+        shape: shape of the whole grid's cells, (nz, ny, nx) or (ny, nx).
+        unknowns: number of unknowns of the whole grid.
+        decomposition: decomposition if the result has x of a rank's box; None for the whole grid.
     """
 
     shape: tuple[int, ...]
@@ -48,7 +48,7 @@ class GridOutcome(Outcome):
     decomposition: Decomposition | None
 
     def heading(self) -> str:
-        """Return a line that says what was solved."""
+        """Return a line about the problem."""
         cells = " x ".join(map(str, reversed(self.shape)))
         line = (
             f"{self.unknowns} unknowns, {cells} cells, by {self.methods} on {self.problem.device}"
@@ -61,7 +61,7 @@ class GridOutcome(Outcome):
     def write(self, path: Path) -> None:
         """Write x as a NumPy array of the shape of the cells; collective.
 
-        The first rank writes the parts of all.
+        The first rank writes the parts of all ranks.
 
         Raises:
             ProblemError: the file cannot be written.
@@ -92,15 +92,15 @@ def solve_recorded(
     Args:
         path: the file.
         method: a name in `METHODS`; the default method for grids if None.
-        tolerance: of the residual, relative to the one at clip(0, lower, upper).
-        max_iterations: maximum number of steps.
-        max_seconds: the most wall time of the solve.
+        tolerance: residual, relative to the one at clip(0, lower, upper).
+        max_iterations: limit of steps.
+        max_seconds: limit of the wall time.
         device: a Warp device.
-        ranks: who solve it together, each of them its own box of cells; collective. None: this
-            process alone.
+        ranks: ranks that solve it together, each with its own box of cells; collective. None for
+            one process.
 
     Raises:
-        ProblemError: the file or an option is wrong.
+        ProblemError: the file or an option is invalid.
     """
     stopping = criteria(tolerance, max_iterations, max_seconds)
     solver = default_chain(ProjectedMultigrid())
@@ -127,7 +127,7 @@ def solve_recorded(
 def check_recorded(
     path: Path, *, right_side: Path | None, lower: str | None, upper: str | None, out: Path | None
 ) -> None:
-    """Refuse options that are of matrices.
+    """Raise an error for options that are only for matrices.
 
     Raises:
         ProblemError: one was given; the message names it.
@@ -155,7 +155,7 @@ def file_digest(path: Path) -> str | None:
 
 
 def _decomposition(shape: tuple[int, ...], ranks: Ranks) -> Decomposition:
-    """Return the boxes of a grid's cells."""
+    """Return the decomposition of a grid into boxes of cells."""
     from warp_lcp.distributed.decomposition import Decomposition
 
     nx, ny, nz = (*reversed(shape), 1)[:3]
@@ -177,7 +177,7 @@ def _problem(
     )
     kept = load_part(path, part)
     cells, b, lower, upper = (kept.pop(name) for name in ("cells", "b", "lower", "upper"))
-    # less than float32 tells asks for the file's own numbers
+    # Tolerances below the accuracy of float32 need the file's own precision.
     kind = wp.float64 if tolerance < FLOAT32_ROUNDING else wp.float32
     coefficients: dict[str, Any] = {**kept, "device": device, "dtype": kind}
     return LCP(
@@ -189,14 +189,17 @@ def _problem(
 
 
 def _bound(values: np.ndarray) -> float | np.ndarray:
-    """Return a bound as an LCP takes it: a number, or a field."""
+    """Return a bound as a number if it is constant, else as a field."""
     return values if values.ndim else float(values)
 
 
 def _write_boxes(
     path: Path, x: np.ndarray, shape: tuple[int, ...], decomposition: Decomposition
 ) -> None:
-    """Write the ranks' boxes of x into one array, of which the root rank holds one box at a time."""
+    """Gather the ranks' boxes of x in one file.
+
+    The root rank holds one box at a time in memory.
+    """
     from warp_lcp.distributed.waiting import waiting
 
     comm, boxes = decomposition.ranks.comm, decomposition.boxes

@@ -1,4 +1,7 @@
-"""Interface of benchmark suites, found by the entry-point group `warp_lcp.benchmarks`."""
+"""Interface of benchmark suites, with the entry-point group of plug-ins.
+
+The group is `warp_lcp.benchmarks`.
+"""
 
 from __future__ import annotations
 
@@ -30,17 +33,19 @@ class Benchmark(Protocol):
         shared: bool = False,
         threads: int | None = None,
     ) -> list[Path]:
-        """Run the benchmark and return the files written to `out`: NAME.json, NAME.md and plots.
+        """Run the benchmark and return the files written to `out`.
+
+        NAME.json, NAME.md and plots.
 
         Args:
             device: Warp device.
             out: folder of the files.
-            sizes: cells along a side; the suite's own without any.
+            sizes: cells along a side; default: those of the suite.
             repeat: samples of each timing.
-            scene: the only one to measure, of a suite that runs scenes; a name or a file.
-            seed: first one of the random problems, of a suite that draws them; new ones without.
-            shared: measure on several ranks, of a suite that can.
-            threads: of the CPU; one without, and of the suite threads all.
+            scene: the only one to measure, for a suite that runs scenes; a name or a file.
+            seed: first one of the random problems, for a suite that draws them; default: new ones.
+            shared: measure on several ranks, if the suite supports it.
+            threads: threads of the CPU; default: one, and all for the suite threads.
 
         Raises:
             ValueError: an option is out of range.

@@ -1,4 +1,4 @@
-"""Rigid bodies that touch, without a material around them: a plug-in of warp_lcp."""
+"""Rigid bodies in contact, without a material: the plug-in `contacts`."""
 
 from warp_lcp.contacts.simulator import ContactSimulator
 

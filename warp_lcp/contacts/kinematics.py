@@ -1,4 +1,7 @@
-"""Bodies that inverse kinematics moves: angles of hinges that bring points of bodies to targets, within the hinges' limits."""
+"""Simulation of bodies that inverse kinematics moves.
+
+The angles of hinges move points of bodies to targets, within the limits of the hinges.
+"""
 
 from __future__ import annotations
 
@@ -15,19 +18,19 @@ from warp_lcp.rigid.joints import WORLD, Joint
 from warp_lcp.rigid.outline import BodySurface
 from warp_lcp.simulation import NoStopwatch, Part, SimulationFailed, Stopwatch, Surface
 
-MARK = 0.03  # of the figure's reach: half the size of what shows a target
+MARK = 0.03  # relative to the figure's reach: half the size of a target's marker
 COLUMNS = ("target_error", "solver", "solve_status", "solve_iterations", "solve_residual")
 
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """Where a point of a body is to be over time.
+    """Target path of a point of a body.
 
     Args:
-        body: its number.
-        point: of it, as placed [m], shape (3,).
+        body: number of the body.
+        point: point of the body, as placed [m], shape (3,).
         times: increasing [s], shape (m,).
-        places: at those times, on straight ways between them [m], shape (m, 3).
+        places: positions at those times, with linear interpolation [m], shape (m, 3).
     """
 
     body: int
@@ -36,16 +39,16 @@ class Target:
     places: np.ndarray
 
     def place(self, time: float) -> np.ndarray:
-        """Return where the point is to be at a time [s], shape (3,)."""
+        """Return the target position at a time [s], shape (3,)."""
         return np.array([np.interp(time, self.times, along) for along in self.places.T])
 
 
 def tree_of(joints: Sequence[Joint], bodies: int) -> list[int]:
-    """Return the joints' numbers in an order in which each follows the one that carries it.
+    """Return the joints' numbers, each after that of the body that carries it.
 
     Raises:
-        ValueError: a body has no hinge of its own, or several; a joint is no hinge; or bodies form
-            a ring.
+        ValueError: a body has no hinge as its first body, or several; a joint is no hinge; or
+            bodies form a ring.
     """
     own = {joint.first: number for number, joint in enumerate(joints)}
     if sorted(joint.first for joint in joints) != list(range(bodies)) or any(
@@ -74,7 +77,7 @@ def tree_of(joints: Sequence[Joint], bodies: int) -> list[int]:
 def figure_of(
     joints: Sequence[Joint], order: Sequence[int], targets: Sequence[Target], dimension: int
 ) -> ArticulatedFigure:
-    """Return the figure that hinges and targets make, hinges in an order of `tree_of`."""
+    """Return the articulated figure of hinges and targets, in the order of `tree_of`."""
     place = {joints[number].first: index for index, number in enumerate(order)}
     hinges = [joints[number] for number in order]
     parents = tuple(place.get(hinge.second, -1) for hinge in hinges)
@@ -95,18 +98,20 @@ def figure_of(
 
 
 class KinematicSimulation:
-    """Bodies on hinges whose angles inverse kinematics finds in each step, from those of the step before ([Book] 1.3.4).
+    """Simulation of bodies on hinges by inverse kinematics ([Book] 1.3.4).
+
+    Each step computes the angles of the hinges from those of the step before.
 
     Args:
-        bodies: of the scene, with its joints.
-        targets: one at least.
-        solver: of the angles.
+        bodies: bodies of the scene, with its joints.
+        targets: at least one.
+        solver: solver for the angles.
         method: its name in the log.
         dt: the longest step [s].
 
     Attributes:
-        time: of the state [s].
-        step_count: steps taken.
+        time: time of the state [s].
+        step_count: number of steps.
         watch: measures the stages of a step.
         theta: angles of the hinges, in the order of `tree_of` [rad], shape (n,).
     """
@@ -133,14 +138,14 @@ class KinematicSimulation:
         self.watch: Stopwatch = NoStopwatch()
 
     def stable_dt(self) -> float:
-        """Return the longest step [s]: angles have no other."""
+        """Return the longest step [s], a constant."""
         return self._dt
 
     def step(self, dt: float) -> dict[str, float | int | str | None]:
         """Advance by dt [s] and return a row of the log.
 
         Raises:
-            SimulationFailed: an angle is not finite any more.
+            SimulationFailed: an angle is not finite.
         """
         with self.watch.stage("angles"):
             goals = self._goals(self.time + dt)
@@ -155,15 +160,18 @@ class KinematicSimulation:
     def columns(self) -> tuple[str, ...]:
         """Return the names of the log's columns.
 
-        target_error: the largest distance of a target from what is to be there [m].
-        solve_iterations: problems solved, one for each change of the angles; solve_residual: the
-        projected gradient [rad] of half the squared distances. The bodies' are those of
+        target_error: the largest distance of a point from its target [m]. solve_iterations: number
+        of problems solved, one for each update of the angles; solve_residual: the projected
+        gradient [rad] of half the squared distances. For the bodies' columns see
         `RigidBodies.columns`.
         """
         return (*COLUMNS, *self.bodies.columns())
 
     def frame(self) -> list[Part]:
-        """Return the surfaces of the bodies, and octahedra (squares in 2-D) where targets are: `body` goes on counting with them."""
+        """Return the surfaces of the bodies, and markers of the targets.
+
+        Markers are octahedra (squares in 2-D), numbered in `body` after the bodies.
+        """
         own, marks = (
             self.bodies.surfaces(),
             [self._mark(number) for number in range(len(self.targets))],
@@ -185,7 +193,7 @@ class KinematicSimulation:
         """Continue from `state`.
 
         Raises:
-            ValueError: it is of other bodies.
+            ValueError: the state belongs to other bodies.
         """
         angles = np.asarray(state.get("angles", []), dtype=np.float64)
         if angles.shape != self.theta.shape:
@@ -210,7 +218,11 @@ class KinematicSimulation:
         return np.array([target.place(time) for target in self.targets])[:, : self.bodies.dimension]
 
     def _place(self, dt: float) -> None:
-        """Put the bodies where the angles want them, with the mean velocities of the step."""
+        """Place the bodies at the current angles, with the mean velocities of the step.
+
+        Poses follow from the root of each tree to its ends. Velocities are differences of poses
+        over dt.
+        """
         turns: list[np.ndarray] = []
         anchors: list[np.ndarray] = []
         figure = self.figure
@@ -235,7 +247,7 @@ class KinematicSimulation:
             )
 
     def _mark(self, number: int) -> BodySurface:
-        """Return what shows a target."""
+        """Return the marker of a target."""
         size, dimension = MARK * self.figure.reach, self.bodies.dimension
         ends = np.concatenate([np.eye(3), -np.eye(3)])[:, :] * size
         if dimension == 2:
@@ -265,6 +277,7 @@ class KinematicSimulation:
         )
 
     def _row(self, pose: ReachedPose, goals: np.ndarray) -> dict[str, float | int | str | None]:
+        """Return a row of the log."""
         off = np.linalg.norm(self.figure.positions(self.theta) - goals, axis=1)
         own: dict[str, float | int | str | None] = {
             "target_error": float(off.max()),

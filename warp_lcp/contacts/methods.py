@@ -1,4 +1,4 @@
-"""The methods that solve for the impulses of contacts, and the model of friction that each of them takes."""
+"""Methods for contact impulses, and the friction model of each."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from warp_lcp.rigid.contact_problem import ContactImpulses, ContactProblem
 from warp_lcp.rigid.contacts import jacobian
 from warp_lcp.solvers.registry import METHODS
 
-# of `warp_lcp.rigid.contact_problem`: what bodies in liquids and in sand are solved by
+# The solver of `warp_lcp.rigid.contact_problem`, which bodies in liquids and in sand use.
 DEFAULT = "sweeps-and-newton"
-# in its place where there are joints, which are equations: sweeps are slow at them, pivots exact
+# Default with joints, which are equations: sweeps converge slowly, pivoting is exact.
 JOINTED = "lemke"
-# of the normal and the friction problem of a staggered iteration, solved by pivoting
+# Tolerance of the normal and the friction problem of a staggered iteration, solved by pivoting.
 PIVOTING = 1e-8
 
-# |r_t| <= mu r_n along each tangent: bounds that are affine in x
+# |r_t| <= mu r_n along each tangent: bounds that are affine in x.
 BOXED: dict[str, Callable[[ContactSystem], Any]] = {
     "nncg": lambda s: wl.NNCG(),
     "psor": lambda s: wl.ProjectedSOR(omega=1.0),
@@ -38,8 +38,8 @@ BOXED: dict[str, Callable[[ContactSystem], Any]] = {
         blocks=s.staggered(), solvers=wl.IncrementalPivoting(), eta=PIVOTING
     ),
 }
-# a cone of several sides and the slip as one more unknown: an unsymmetric linear complementarity
-# problem
+# A polygonal cone with the slip as an additional unknown: an unsymmetric linear complementarity
+# problem.
 STEWART_TRINKLE: dict[str, Callable[[ContactSystem], Any]] = {
     "lemke": lambda s: wl.Lemke(),
     "fischer-newton": lambda s: wl.FischerNewton(),
@@ -47,9 +47,9 @@ STEWART_TRINKLE: dict[str, Callable[[ContactSystem], Any]] = {
     "interior-point": lambda s: wl.InteriorPoint(precision="double"),
     "primal-dual-active-set": lambda s: wl.PrimalDualActiveSet(),
 }
-# the circular cone itself, bodies instead of a matrix
+# The circular cone, without an assembled matrix.
 CONE: dict[str, Callable[[], Any]] = {"proximal-gauss-seidel": wl.ProximalGaussSeidel}
-# of inverse kinematics, whose problems have small dense matrices and no blocks
+# Methods for inverse kinematics, whose problems have small dense matrices and no blocks.
 KINEMATIC = (
     "lemke",
     "fischer-newton",
@@ -63,18 +63,20 @@ assert {*BOXED, *STEWART_TRINKLE, *CONE} <= METHODS.keys()
 
 
 class MethodOfChoice:
-    """Solve the problem of a step's contacts by a method of `wl.METHODS`; an `ImpulseSolver`.
+    """Solve the contact problem of a step by a method of `wl.METHODS`.
+
+    It implements `ImpulseSolver`.
 
     Args:
-        name: of the method; DEFAULT for none of them.
+        name: name of the method; DEFAULT for the solver of `warp_lcp.rigid`.
         directions: sides of the friction cone of Stewart and Trinkle, for the methods of that
             model.
         tolerance: residual to reach, relative to that of no impulses.
-        most: iterations.
+        most: limit of iterations.
         device: Warp device's name.
 
     Attributes:
-        status: of the last solve.
+        status: status of the last solve.
     """
 
     def __init__(
@@ -88,14 +90,17 @@ class MethodOfChoice:
         self._device, self.status = device, wl.SolveStatus.CONVERGED
 
     def __call__(self, problem: ContactProblem, start: np.ndarray) -> ContactImpulses:
-        """Return the impulses; those of the least residual where the method does not converge, as `status` says."""
+        """Return the impulses.
+
+        If the method does not converge, see `status`, they are those of the least residual.
+        """
         self.status = wl.SolveStatus.CONVERGED
         if self._method is None and self._cone is None:
             found = problem.solve(self._stopping, start, self._stopping.rtol)
             if found.residual > self._stopping.rtol:
                 self.status = wl.SolveStatus.MAX_ITERATIONS
             return found
-        # nothing approaches: impulses are 0
+        # No contact approaches: impulses are 0.
         if problem.joints is None and not (problem.b[:, 0] < 0.0).any():
             return ContactImpulses(np.zeros_like(start), 0.0, 0)
         if self._method is None:
@@ -111,11 +116,12 @@ class MethodOfChoice:
         return ContactImpulses(impulses, float(result.relative_residual), result.iterations)
 
     def _in_cones(self, problem: ContactProblem, start: np.ndarray) -> ContactImpulses:
-        """Return the impulses in the circular cones; tolerances are relative to no impulses, as those of the other models.
+        """Return impulses within the circular cones.
 
-        Contacts do not yield here. Where they are redundant (J'z = 0), as in jammed packings, e > 0
-        makes the impulses unique, but a sweep changes their part along z by e / B only: the
-        residual |e r| would take 1 / YIELDS sweeps. Sweeps without e need no unique impulses.
+        Tolerances are relative to no impulses, as for the other models. The contacts have no
+        compliance e here. If they are redundant (J'z = 0), as in jammed packings, e > 0 makes the
+        impulses unique, but a sweep changes their component along z only by e / B: the residual |e
+        r| would take 1 / YIELDS sweeps. Sweeps without e do not need unique impulses.
         """
         p = problem
         cones = wl.FrictionalContact(
@@ -131,7 +137,10 @@ class MethodOfChoice:
 
 
 def contact_system(problem: ContactProblem) -> ContactSystem:
-    """Return u = B r + b with B = J J' + diag(yields) as a matrix, shape (rows of all contacts, then of joints, the same)."""
+    """Return u = B r + b with B = J J' + diag(yields) as a matrix.
+
+    The rows are those of all contacts, then of joints.
+    """
     dim, joints, n = problem.one.shape[1], problem.joints, problem.bodies
     parts = (
         [jacobian(problem.first, problem.second, problem.one, problem.other, n)]

@@ -1,4 +1,4 @@
-"""Scenes of rigid bodies alone: walls, solids that stand or are moved, and bodies that gravity and contacts move."""
+"""Scene tables of rigid bodies without a material: walls, solids, joints, targets."""
 
 from __future__ import annotations
 
@@ -59,7 +59,10 @@ class ContactOutput(Output):
 
 
 class JointTable(Table):
-    """[[joint]]: connects two bodies at a point, or a body with space. Bodies of a joint do not collide."""
+    """[[joint]]: connects two bodies at a point, or a body with space.
+
+    Bodies of a joint do not collide.
+    """
 
     kind: JointKind = Field(
         description="ball: turns about the anchor; hinge: about an axis; fixed: not"
@@ -86,11 +89,11 @@ class JointTable(Table):
     )
 
     def complaints(self, dimension: int, solids: Sequence[Any]) -> list[Complaint]:
-        """Return what is wrong with the joint among these solids in a scene of 2 or 3 dimensions."""
-        found, hinge = [], self.kind == "hinge"
+        """Return errors of the joint among these solids in 2 or 3 dimensions."""
+        complaints, hinge = [], self.kind == "hinge"
         for number in self.solids:
             if not 0 <= number < len(solids):
-                found.append(
+                complaints.append(
                     Complaint(
                         ("solids",),
                         self.solids,
@@ -98,15 +101,15 @@ class JointTable(Table):
                     )
                 )
             elif solids[number].motion is not None:
-                found.append(
+                complaints.append(
                     Complaint(
                         ("solids",),
                         self.solids,
                         f"solid[{number}] has a motion: bodies can be joined only to a fixed solid",
                     )
                 )
-        if not found and not solids[self.solids[0]].is_body:
-            found.append(
+        if not complaints and not solids[self.solids[0]].is_body:
+            complaints.append(
                 Complaint(
                     ("solids",),
                     self.solids,
@@ -114,42 +117,48 @@ class JointTable(Table):
                 )
             )
         if len(set(self.solids)) < len(self.solids):
-            found.append(Complaint(("solids",), self.solids, "must differ"))
+            complaints.append(Complaint(("solids",), self.solids, "must differ"))
         for key in ("anchor", "axis"):
             value = getattr(self, key)
             if value is not None and len(value) != dimension:
-                found.append(
+                complaints.append(
                     Complaint((key,), value, f"must {counted(dimension)} in {dimension}-D")
                 )
         for key in ("axis", "limits", "motor_speed", "motor_torque"):
             if not hinge and getattr(self, key) is not None:
-                found.append(
+                complaints.append(
                     Complaint(
                         (key,), getattr(self, key), f"is only for hinges: this joint is {self.kind}"
                     )
                 )
         if (self.motor_speed is None) != (self.motor_torque is None):
-            found.append(
+            complaints.append(
                 Complaint(
                     ("motor_torque",), self.motor_torque, "must be given together with motor_speed"
                 )
             )
         if hinge and dimension == 3 and (self.axis is None or not any(self.axis)):
-            found.append(
+            complaints.append(
                 Complaint(("axis",), self.axis, "must be given for a hinge in 3-D, and not be zero")
             )
         if hinge and dimension == 2 and self.axis is not None:
-            found.append(Complaint(("axis",), self.axis, "must be left out in 2-D, where it is z"))
+            complaints.append(
+                Complaint(("axis",), self.axis, "must be left out in 2-D, where it is z")
+            )
         if self.kind == "ball" and dimension == 2:
-            found.append(Complaint(("kind",), self.kind, "must be hinge in 2-D"))
+            complaints.append(Complaint(("kind",), self.kind, "must be hinge in 2-D"))
         if self.limits is not None and not -180.0 <= self.limits[0] <= self.limits[1] <= 180.0:
-            found.append(
+            complaints.append(
                 Complaint(("limits",), self.limits, "must be in order and within 180 degrees")
             )
-        return found
+        return complaints
 
     def to_joint(self, bodies: Sequence[int]) -> Joint:
-        """Return the joint; `bodies` has the number among the bodies of each solid, WORLD of what stands."""
+        """Return the joint.
+
+        `bodies` maps each solid to its number among the bodies, or to WORLD for a solid that is no
+        body.
+        """
         first, second = [
             bodies[number] for number in [*self.solids, *([-1] if len(self.solids) == 1 else [])]
         ]
@@ -162,9 +171,10 @@ class JointTable(Table):
 
 
 class TargetTable(Table):
-    """[[target]]: path of a point of a body. Inverse kinematics moves the bodies, without forces and contacts.
+    """[[target]]: path of a point of a body, for inverse kinematics.
 
-    Each body must be the first body of a hinge; hinges form trees.
+    Inverse kinematics moves the bodies, without forces and contacts. Each body must be the first
+    body of a hinge; hinges form trees.
     """
 
     solid: int = Field(ge=0, description="number of the body among the [[solid]] tables, from 0")
@@ -175,31 +185,35 @@ class TargetTable(Table):
     )
 
     def complaints(self, dimension: int, solids: Sequence[Any]) -> list[Complaint]:
-        """Return what is wrong with the target among these solids in a scene of 2 or 3 dimensions."""
-        found = []
+        """Return errors of the target among these solids in 2 or 3 dimensions."""
+        complaints = []
         if self.solid >= len(solids) or not solids[self.solid].is_body:
-            found.append(Complaint(("solid",), self.solid, "must be the number of a rigid body"))
+            complaints.append(
+                Complaint(("solid",), self.solid, "must be the number of a rigid body")
+            )
         for place, value in [
             (("point",), self.point),
             *((("places", index), row) for index, row in enumerate(self.places)),
         ]:
             if len(value) != dimension:
-                found.append(Complaint(place, value, f"must {counted(dimension)} in {dimension}-D"))
+                complaints.append(
+                    Complaint(place, value, f"must {counted(dimension)} in {dimension}-D")
+                )
         if not (np.diff(self.times) > 0.0).all():
-            found.append(Complaint(("times",), self.times, "must increase"))
+            complaints.append(Complaint(("times",), self.times, "must increase"))
         if len(self.places) != len(self.times):
-            found.append(
+            complaints.append(
                 Complaint(
                     ("places",),
                     self.places,
                     f"must have {len(self.times)} entries, one for each time",
                 )
             )
-        return found
+        return complaints
 
 
 class ContactScene(Scene):
-    """A scene of rigid bodies without a material."""
+    """Scene of rigid bodies without a material."""
 
     elsewhere: ClassVar = dict.fromkeys(
         ("sand", "material", "friction"), "granular"
@@ -213,21 +227,24 @@ class ContactScene(Scene):
     @model_validator(mode="before")
     @classmethod
     def _method_for_joints(cls, data: Any) -> Any:
-        """Fill in the method of scenes with joints where none is given."""
+        """Set the default method of scenes with joints."""
         solver = data.get("solver", {}) if isinstance(data, dict) else None
         if isinstance(solver, dict) and data.get("joint"):
             return {**data, "solver": {"method": JOINTED, **solver}}
         return data
 
     def body_numbers(self) -> list[int]:
-        """Return the number among the bodies of each solid, WORLD of what stands, and WORLD once more at the end."""
+        """Return the number among the bodies of each solid, and a final WORLD.
+
+        WORLD for a solid that is no body.
+        """
         moving = [solid.is_body for solid in self.solid]
         return [
             int(sum(moving[:index])) if body else WORLD for index, body in enumerate(moving)
         ] + [WORLD]
 
     def joints(self) -> list[Joint]:
-        """Return the joints, between bodies by their numbers among the bodies."""
+        """Return the joints, with the numbers of their bodies."""
         return [table.to_joint(self.body_numbers()) for table in self.joint]
 
     def targets(self) -> list[Target]:
@@ -242,17 +259,17 @@ class ContactScene(Scene):
         ]
 
     def complaints(self) -> list[Complaint]:
-        """Return what is wrong across keys."""
-        found = super().complaints()
+        """Return errors that involve several keys."""
+        complaints = super().complaints()
         if not any(solid.is_body for solid in self.solid):
-            found.append(
+            complaints.append(
                 Complaint(("solid",), None, "has no rigid body: give one a density or a mass")
             )
         for key in ("particles", "grid", "surface", "volume", "forces"):
             if getattr(self.output, key):
-                found.append(Complaint(("output", key), True, f"must be false: {NO_MATERIAL}"))
+                complaints.append(Complaint(("output", key), True, f"must be false: {NO_MATERIAL}"))
         if self.physics.density != type(self.physics).model_fields["density"].default:
-            found.append(
+            complaints.append(
                 Complaint(
                     ("physics", "density"),
                     self.physics.density,
@@ -261,7 +278,7 @@ class ContactScene(Scene):
             )
         for key, usual in (("wall", "separating"), ("solids", "cut-cell"), ("follow", True)):
             if getattr(self.domain, key) != usual:
-                found.append(
+                complaints.append(
                     Complaint(
                         ("domain", key),
                         getattr(self.domain, key),
@@ -269,7 +286,7 @@ class ContactScene(Scene):
                     )
                 )
         if self.solver.preset is not None:
-            found.append(
+            complaints.append(
                 Complaint(
                     ("solver", "preset"),
                     self.solver.preset,
@@ -277,55 +294,55 @@ class ContactScene(Scene):
                 )
             )
         if self.solver.precision != "double":
-            found.append(
+            complaints.append(
                 Complaint(("solver", "precision"), self.solver.precision, "must be double")
             )
         if self.solver.directions != 4 and self.solver.method not in STEWART_TRINKLE:
-            others = (
+            incompatible = (
                 "uses the circular cone"
                 if self.solver.method in CONE
                 else "uses the boxed friction model"
             )
             message = (
                 f"is only for the methods {', '.join(STEWART_TRINKLE)}; {self.solver.method} "
-                f"{others}"
+                f"{incompatible}"
             )
-            found.append(Complaint(("solver", "directions"), self.solver.directions, message))
+            complaints.append(Complaint(("solver", "directions"), self.solver.directions, message))
         return (
-            found
+            complaints
             + (self._joint_complaints() if self.joint else [])
             + (self._target_complaints() if self.target else [])
         )
 
     def _target_complaints(self) -> list[Complaint]:
-        """Return what is wrong with targets, and with what they move."""
-        found = [
+        """Return errors of targets and of the bodies that they move."""
+        complaints = [
             Complaint(("target", index, *c.place), c.value, c.message)
             for index, table in enumerate(self.target)
             for c in table.complaints(self.dimension, self.solid)
         ]
         if self.solver.method not in KINEMATIC:
             message = f"cannot be used for inverse kinematics; choose from {', '.join(KINEMATIC)}"
-            found.append(Complaint(("solver", "method"), self.solver.method, message))
+            complaints.append(Complaint(("solver", "method"), self.solver.method, message))
         for index, table in enumerate(self.joint):
             if table.motor_torque is not None:
-                found.append(
+                complaints.append(
                     Complaint(
                         ("joint", index, "motor_torque"),
                         table.motor_torque,
                         "must be left out: targets move the bodies",
                     )
                 )
-        if not found and not self._joint_complaints():
+        if not complaints and not self._joint_complaints():
             try:
                 tree_of(self.joints(), sum(solid.is_body for solid in self.solid))
             except ValueError as error:
-                found.append(Complaint(("target",), None, str(error)))
-        return found
+                complaints.append(Complaint(("target",), None, str(error)))
+        return complaints
 
     def _joint_complaints(self) -> list[Complaint]:
-        """Return what is wrong with joints, and what does not go with them."""
-        found = [
+        """Return errors of joints, and of keys that exclude joints."""
+        complaints = [
             Complaint(("joint", index, *c.place), c.value, c.message)
             for index, table in enumerate(self.joint)
             for c in table.complaints(self.dimension, self.solid)
@@ -335,27 +352,27 @@ class ContactScene(Scene):
                 "cannot solve joints, which are equations; choose from "
                 f"{', '.join((*BOXED, *STEWART_TRINKLE))}"
             )
-            found.append(Complaint(("solver", "method"), self.solver.method, message))
+            complaints.append(Complaint(("solver", "method"), self.solver.method, message))
         if self.domain.open:
-            found.append(
+            complaints.append(
                 Complaint(
                     ("domain", "open"), self.domain.open, "must be left out in a scene with joints"
                 )
             )
         for index, solid in enumerate(self.solid):
             if solid.restitution:
-                found.append(
+                complaints.append(
                     Complaint(
                         ("solid", index, "restitution"),
                         solid.restitution,
                         "must be 0 where there are joints",
                     )
                 )
-        return found
+        return complaints
 
     def plan(self) -> list[tuple[str, str]]:
-        """Return what a run would do."""
-        kept = {"preset", "open", "moving", "bodies", "time", "frames"}
+        """Return a summary of the run."""
+        shown_keys = {"preset", "open", "moving", "bodies", "time", "frames"}
         solver, moving = self.solver, sum(solid.is_body for solid in self.solid)
         model = "the circular cone" if solver.method in CONE else "boxes"
         model = (
@@ -367,7 +384,7 @@ class ContactScene(Scene):
             *(
                 (word, line)
                 for word, line in super().plan()
-                if word in kept and (word != "bodies" or moving <= 8)
+                if word in shown_keys and (word != "bodies" or moving <= 8)
             ),
             *([("bodies", f"{moving} of {len(self.solid)} solids")] if moving > 8 else []),
             *([("joints", self._joint_line())] if self.joint else []),
@@ -386,7 +403,7 @@ class ContactScene(Scene):
         ]
 
     def _joint_line(self) -> str:
-        """Return what joints there are, for the plan."""
+        """Return the line of the plan about joints."""
         counts = {
             kind: sum(table.kind == kind for table in self.joint) for kind in get_args(JointKind)
         }
@@ -401,14 +418,17 @@ class ContactScene(Scene):
         return ", ".join(line for line, count in named.items() if count)
 
     def _grid_complaints(self) -> list[Complaint]:
-        """Return what is wrong with the domain; its sides need not be whole numbers of cells."""
-        found = self.domain.spacing_complaints()
+        """Return errors of the domain.
+
+        Its sides need not be whole numbers of cells.
+        """
+        complaints = self.domain.spacing_complaints()
         if self.domain.periodic is not None and len(self.domain.periodic) != self.dimension:
-            found.append(
+            complaints.append(
                 Complaint(
                     ("domain", "periodic"),
                     self.domain.periodic,
                     f"must have {self.dimension} entries",
                 )
             )
-        return found
+        return complaints

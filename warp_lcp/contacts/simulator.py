@@ -1,4 +1,4 @@
-"""The simulation of rigid bodies alone: gravity, contacts, motion."""
+"""Simulation of rigid bodies without a material: gravity, contacts, motion."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ COLUMNS = (
 
 
 class ContactSimulation:
-    """Rigid bodies on their way, as `RigidBodies` moves them.
+    """Simulation of rigid bodies, moved by `RigidBodies`.
 
     Velocities are those of the middle of the last step: v' = v + g (dt + dt_before) / 2 + M^-1 J'
     r, x' = x + dt v'.
 
     Args:
-        scene: what is simulated.
-        bodies: the scene's.
-        method: solves for the impulses of their contacts.
+        scene: the scene.
+        bodies: the bodies of the scene.
+        method: solver for the impulses of their contacts.
 
     Attributes:
-        time: of the state [s].
-        step_count: steps taken.
+        time: time of the state [s].
+        step_count: number of steps.
         watch: measures the stages of a step.
     """
 
@@ -54,7 +54,10 @@ class ContactSimulation:
         self.watch: Stopwatch = NoStopwatch()
 
     def stable_dt(self) -> float:
-        """Return the step [s] in which the fastest body goes by `time.cfl` sizes of the smallest one."""
+        """Return the longest step [s] by the CFL number.
+
+        In it the fastest body moves by `time.cfl` sizes of the smallest one.
+        """
         speed = self.bodies.top_speed(self.scene.time.dt_max, float(np.linalg.norm(self.gravity)))
         size = min(shape.size for shape in self.bodies.shapes)
         return self.scene.time.cfl * size / speed if speed > 0.0 else np.inf
@@ -63,12 +66,12 @@ class ContactSimulation:
         """Advance by dt [s] and return a row of the log.
 
         Raises:
-            SimulationFailed: a body is not finite any more.
+            SimulationFailed: a body is not finite.
         """
         with self.watch.stage("contacts"):
             self.bodies.begin_step(self.time, dt, self.gravity, 0.5 * (self._last_dt + dt))
             self.bodies.solve_contacts()
-            status = self._method.status.name  # before overlaps are solved for
+            status = self._method.status.name  # before the solve for overlaps
         with self.watch.stage("motion"):
             self.bodies.end_step(dt)
         if trouble := self.bodies.trouble(self.scene.domain.size, self.scene.endless):
@@ -80,11 +83,11 @@ class ContactSimulation:
     def columns(self) -> tuple[str, ...]:
         """Return the names of the log's columns.
 
-        Energies [J; J/m in 2-D] are those of the step's middle, of which the velocities are;
-        potential_energy is 0 at the origin. max_speed: of a point of a body [m/s]. solve_residual:
-        of the problem of the contacts' impulses as the method takes it, relative to that of no
-        impulses; empty, as what stands before it, where nothing touches. The bodies' are those of
-        `RigidBodies.columns`.
+        Energies [J; J/m in 2-D] are those of the middle of the step, like the velocities;
+        potential_energy is 0 at the origin. max_speed: largest speed of a point of a body [m/s].
+        solve_residual: residual of the contact problem as the method solves it, relative to that of
+        no impulses; empty, like the columns before it, without contacts. For the bodies' columns
+        see `RigidBodies.columns`.
         """
         return (*COLUMNS, *self.bodies.columns())
 
@@ -102,7 +105,7 @@ class ContactSimulation:
         """Continue from `state`.
 
         Raises:
-            ValueError: it is of other bodies.
+            ValueError: the state belongs to other bodies.
         """
         missing = {"clock", "step_count", "bodies"} - set(state)
         if missing:
@@ -125,9 +128,10 @@ class ContactSimulation:
         ]
 
     def _row(self, dt: float, status: str) -> dict[str, float | int | str | None]:
+        """Return a row of the log."""
         bodies, solved = self.bodies, self.bodies.contacts > 0 or bool(self.bodies.joints)
         momentum = bodies.bodies.momentum.sum(axis=0)
-        # back by half a step
+        # Potential energy half a step earlier.
         energy = bodies.potential_energy(self.gravity) + 0.5 * dt * float(momentum @ self.gravity)
         own: dict[str, float | int | str | None] = {
             "kinetic_energy": bodies.kinetic_energy(),
@@ -142,7 +146,7 @@ class ContactSimulation:
 
 
 class ContactSimulator:
-    """The plug-in for rigid bodies that touch."""
+    """Simulator plug-in for rigid bodies without a material."""
 
     name = "contacts"
     summary = "rigid bodies that stack, slide, topple and bounce"
@@ -155,9 +159,9 @@ class ContactSimulator:
 
         Args:
             scene: a ContactScene.
-            device: a Warp device's name; of the methods but the default one, which works on the
+            device: a Warp device's name, for methods other than the default one, which runs on the
                 CPU.
-            folder: where the files are that the scene names.
+            folder: folder of the files that the scene names.
 
         Raises:
             ValueError: the scene cannot be simulated; the message names the key and what is
@@ -176,7 +180,7 @@ class ContactSimulator:
         bodies = make_bodies(
             scene, placed_solids(scene, folder), partial(RigidBodies, solver=method)
         )
-        assert bodies is not None  # of which the scene has one
+        assert bodies is not None  # a scene has at least one body
         if scene.target:
             solve = InverseKinematics(
                 method=METHODS[solver.method](),

@@ -1,1 +1,1 @@
-"""Files of any program: written whole or not at all, read without believing what they claim, told without obeying what they say."""
+"""Atomic file writes, and safe reading of untrusted files."""

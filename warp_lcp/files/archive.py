@@ -1,4 +1,8 @@
-"""Arrays of .npz files: types and sizes are checked against the file and the memory before an array is read; nothing is unpickled."""
+"""Safe reader of .npz files of plain arrays.
+
+Types and sizes are checked against the file and the memory before an array is read; nothing is
+unpickled.
+"""
 
 from __future__ import annotations
 
@@ -19,16 +23,16 @@ import numpy as np
 
 from warp_lcp.files.claims import ClaimError, check_claim
 
-SUFFIX = ".npy"  # of an archive's members
-HEADER = re.compile(  # as NumPy writes it; its own reader evaluates whatever stands there
+SUFFIX = ".npy"  # suffix of an archive's members
+HEADER = re.compile(  # as NumPy writes it; NumPy's reader evaluates the text
     rb"\{'descr': '(?P<type>[<>|=][?bBiufcSUO]\d*)', 'fortran_order': (?P<order>True|False), "
     rb"'shape': \((?P<shape>(?:\d{1,19}, ?)*(?:\d{1,19})?)\),? ?\}\s*"
 )
-# of a header's length, by the version of the format
+# Bytes of a header's length, by the version of the format.
 LENGTH_BYTES = {(1, 0): 2, (2, 0): 4, (3, 0): 4}
 LONGEST = 10_000  # characters of a header, NumPy's own limit
-DEFLATED = 1032  # a byte that deflate wrote never becomes more (zlib.net/zlib_tech.html)
-FAULTS = (  # what zipfile, zlib and NumPy raise for files that are no archives
+DEFLATED = 1032  # largest expansion of a byte by deflate (zlib.net/zlib_tech.html)
+FAULTS = (  # errors of zipfile, zlib and NumPy for invalid archives
     OSError,
     ValueError,
     TypeError,
@@ -45,17 +49,20 @@ FAULTS = (  # what zipfile, zlib and NumPy raise for files that are no archives
 
 
 class ArchiveError(ValueError):
-    """A file that is no archive of plain arrays, or a damaged one; the message says why, not which file."""
+    """Error of an archive: not of plain arrays, or damaged.
+
+    The message does not include the file's name.
+    """
 
 
 @dataclass(frozen=True)
 class Header:
-    """What an archive says of one of its arrays.
+    """Header of an array in an archive.
 
     Args:
-        shape: of the array.
+        shape: shape of the array.
         dtype: its type.
-        fastest_first: its first axis is the one whose neighbors are side by side.
+        fastest_first: Fortran order: the first axis varies fastest.
         length: bytes of its member before the first value.
     """
 
@@ -66,35 +73,36 @@ class Header:
 
     @property
     def nbytes(self) -> int:
-        """Memory that the array takes [bytes]."""
+        """Memory of the array [bytes]."""
         return prod(self.shape) * self.dtype.itemsize
 
     def __str__(self) -> str:
-        """Return type and shape as messages have them."""
+        """Return type and shape for messages."""
         return f"{self.dtype} of shape {self.shape}"
 
 
 class Archive:
-    """An open .npz file. Use it in a `with` block.
+    """Open .npz file; use it in a `with` block.
 
     Args:
         path: the file.
 
     Attributes:
-        headers: of all arrays, by name.
+        headers: headers of all arrays, by name.
 
     Raises:
-        ArchiveError: the file cannot be read, is no archive, or says of an array what cannot be.
+        ArchiveError: the file cannot be read, is no archive, or has impossible headers.
     """
 
     headers: dict[str, Header]
 
     def __init__(self, path: Path) -> None:
-        """Open a file and read what it says of its arrays."""
+        """Open a file and read the headers of its arrays."""
         with _faults_named():
-            if path.exists() and not path.is_file():  # a pipe would be waited for
+            if path.exists() and not path.is_file():  # opening a pipe would block
                 raise ArchiveError("it is not a file")
-            self._stream = open(path, "rb")  # noqa: SIM115 - `close` closes it; zipfile leaves a broken file open
+            # `close` closes it; zipfile would leave a broken file open.
+            self._stream = open(path, "rb")  # noqa: SIM115
         try:
             with _faults_named():
                 self._file = zipfile.ZipFile(self._stream)
@@ -122,11 +130,13 @@ class Archive:
         return found
 
     def read_box(self, name: str, box: tuple[slice, ...]) -> np.ndarray:
-        """Read a part of an array, all of one without axes; from the file's start to the part's end, a plane or row at a time.
+        """Read a part of an array, or all of an array without axes.
+
+        The file is read from its start to the end of the part, one plane or row at a time.
 
         Args:
-            name: of the array.
-            box: a slice with start and stop of each axis, within the array.
+            name: name of the array.
+            box: a slice with start and stop for each axis, within the array.
 
         Raises:
             ArchiveError: there is no such array, it is damaged, or does not fit the free memory.
@@ -135,22 +145,22 @@ class Archive:
         if header is None or not header.shape or header.fastest_first:
             whole = self.read([name])[name]
             return np.ascontiguousarray(whole[box]) if whole.ndim else whole
-        rows, *others = box
+        rows, *other_axes = box
         plane = prod(header.shape[1:]) * header.dtype.itemsize
         shape = [part.stop - part.start for part in box]
         with _faults_named(name), self._file.open(self._members[name]) as stream:
             check_claim(
                 f"{'x'.join(map(str, shape))} values", prod(shape) * header.dtype.itemsize + plane
             )
-            found = np.empty(shape, dtype=header.dtype)
+            values = np.empty(shape, dtype=header.dtype)
             _exactly(stream, header.length)
             for row in range(rows.stop):
                 read = _exactly(stream, plane)
                 if row >= rows.start:
-                    found[row - rows.start] = np.frombuffer(read, dtype=header.dtype).reshape(
+                    values[row - rows.start] = np.frombuffer(read, dtype=header.dtype).reshape(
                         header.shape[1:]
-                    )[tuple(others)]
-        return found
+                    )[tuple(other_axes)]
+        return values
 
     def close(self) -> None:
         """Close the file and its stream."""
@@ -171,7 +181,7 @@ class Archive:
         self.close()
 
     def _check_members(self, size: int) -> None:
-        """Refuse members of which one says what another denies, or more than the file has."""
+        """Raise an error for members with contradictory or impossible sizes."""
         infos = self._file.infolist()
         if len(self._members) != len(infos):
             raise ArchiveError("two arrays have the same name")
@@ -190,7 +200,7 @@ class Archive:
             check_claim(f"{name!r} of {info.file_size} bytes", 0, stored=info.file_size, held=most)
 
     def _header(self, info: zipfile.ZipInfo) -> Header:
-        """Read what an archive says of an array, and compare it with the room that this takes."""
+        """Read the header of an array, and compare it with the member's size."""
         with _faults_named(info.filename.removesuffix(SUFFIX)), self._file.open(info) as stream:
             version = np.lib.format.read_magic(stream)
             if version not in LENGTH_BYTES:
@@ -216,7 +226,7 @@ class Archive:
             return header
 
     def _check_memory(self, names: Collection[str]) -> None:
-        """Refuse arrays that are not there, or for which there is no room."""
+        """Raise an error for missing arrays, or if memory is insufficient."""
         missing = sorted(set(names) - self.headers.keys())
         if missing:
             raise ArchiveError(f"it lacks {', '.join(missing)}")
@@ -228,9 +238,9 @@ class Archive:
 
 @contextmanager
 def _faults_named(name: str = "") -> Iterator[None]:
-    """Turn what can go wrong while an archive is read into one error, which names the array."""
+    """Convert errors while an archive is read into one that names the array."""
     try:
-        # of NumPy, on headers that Python 2 wrote
+        # NumPy warns about headers that Python 2 wrote.
         with warnings.catch_warnings(action="ignore", category=UserWarning):
             yield
     except FAULTS as error:
@@ -245,7 +255,7 @@ def _faults_named(name: str = "") -> Iterator[None]:
 
 
 def _exactly(stream: IO[bytes], count: int) -> bytes:
-    """Return so many bytes.
+    """Return exactly `count` bytes.
 
     Raises:
         ArchiveError: there are fewer.

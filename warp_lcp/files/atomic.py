@@ -1,4 +1,4 @@
-"""Write files whole or not at all, and never through a link."""
+"""Atomic file writes, never through a link."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-SPARE = ".spare"  # of room that is kept
-SUFFIX = ".part"  # of the temporary files, which a killed run may leave behind
+SPARE = ".spare"  # suffix of a reserved file
+SUFFIX = ".part"  # suffix of temporary files, which a killed run may leave
 LINK = "is a link and is not followed"
-# those of older versions have no random part
+# Those of older versions have no random part.
 TEMPORARY = re.compile(rf"\.(?P<name>.+?)(?:\.[0-9a-f]{{16}})?{re.escape(SUFFIX)}")
 NO_LINKS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
 BY_DESCRIPTOR = {os.open, os.rename, os.unlink} <= os.supports_dir_fd  # not on Windows
@@ -24,11 +24,13 @@ BY_DESCRIPTOR = {os.open, os.rename, os.unlink} <= os.supports_dir_fd  # not on 
 
 @dataclass(frozen=True)
 class _Folder:
-    """A folder in which files are opened, renamed and deleted by name, whatever its path leads to meanwhile.
+    """Folder for opening, renaming and deleting files by name.
+
+    With a descriptor, later changes of the folder's path have no effect.
 
     Args:
-        path: of the folder.
-        descriptor: of the folder; None where the platform takes paths alone.
+        path: path of the folder.
+        descriptor: descriptor of the folder; None if the platform only supports paths.
     """
 
     path: Path
@@ -69,10 +71,12 @@ class _Folder:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
-    """Give a new file in the same folder to write; it takes `path`'s place at the end, unless something was raised.
+    """Yield a new file in the same folder, which replaces `path` at the end.
+
+    After an error, `path` is not replaced.
 
     Raises:
-        OSError: the file cannot be written; `path` is as before.
+        OSError: the file cannot be written; `path` is unchanged.
     """
     with _temporary(path) as (folder, name):
         with open(folder.open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL), "wb") as file:
@@ -85,10 +89,12 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
 
 @contextmanager
 def replacing_by_name(path: Path) -> Iterator[Path]:
-    """Give the path of a new, empty file, for an encoder that opens it itself; the rest is as in `replacing`.
+    """Yield the path of a new, empty file, for an encoder that opens it itself.
+
+    Otherwise as `replacing`.
 
     Raises:
-        OSError: the file cannot be written; `path` is as before.
+        OSError: the file cannot be written; `path` is unchanged.
     """
     with _temporary(path) as (folder, name):
         os.close(folder.open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL))
@@ -104,7 +110,10 @@ def replacing_by_name(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def _temporary(path: Path) -> Iterator[tuple[_Folder, str]]:
-    """Yield the folder and a random temporary name beside a file; delete the temporary file at the end."""
+    """Yield the folder and a random temporary name beside a file.
+
+    The temporary file is deleted at the end.
+    """
     name = f".{path.name.removeprefix('.').removesuffix(SUFFIX)}.{secrets.token_hex(8)}{SUFFIX}"
     with _Folder.opened(path.parent) as folder:
         try:
@@ -115,19 +124,21 @@ def _temporary(path: Path) -> Iterator[tuple[_Folder, str]]:
 
 
 def open_in_place(path: Path, flags: int, mode: int = 0o666) -> int:
-    """Return the descriptor of a file that is written where it is: a plain one of this name alone.
+    """Return the descriptor of a file for writing in place.
+
+    It must be a regular file with one name.
 
     Args:
         path: the file.
-        flags: of `os.open`.
-        mode: of a file that is made.
+        flags: flags of `os.open`.
+        mode: mode of a new file.
 
     Raises:
-        OSError: it cannot be opened, or is a link, has other names too, or is a pipe, a device or a
-            folder.
+        OSError: the file cannot be opened, or is a link, has other names too, or is a pipe, a
+            device or a folder.
     """
     try:
-        # a pipe would be waited for
+        # Without O_NONBLOCK, opening a pipe would block.
         descriptor = os.open(path, flags | NO_LINKS | getattr(os, "O_NONBLOCK", 0), mode)
     except OSError as error:
         if error.errno in (errno.ELOOP, errno.EMLINK):
@@ -142,7 +153,9 @@ def open_in_place(path: Path, flags: int, mode: int = 0o666) -> int:
 
 
 def sync_folder(folder: Path) -> None:
-    """Bring a folder's names to the disk, so that after a power failure no file is older than one that was written before it.
+    """Write a folder's directory entries to the disk.
+
+    After a power failure no file is then older than one that was written before it.
 
     Raises:
         OSError: the folder cannot be read.
@@ -157,15 +170,15 @@ def sync_folder(folder: Path) -> None:
 
 
 def make_folder(folder: Path, *, within: Path | None = None) -> None:
-    """Make a folder and those above it, unless they are there, so that a power failure does not take them away with what is in them.
+    """Create a folder and its missing parents, durable across a power failure.
 
     Args:
         folder: the folder.
-        within: a folder; if it is above, none in between may be a link: what is written there stays
-            there.
+        within: a folder above; no folder in between may be a link, so that files are written inside
+            it.
 
     Raises:
-        OSError: it cannot be made, or leads elsewhere.
+        OSError: it cannot be created, or leads elsewhere.
     """
     if within is not None and within in folder.parents:
         if folder.is_symlink():
@@ -175,7 +188,7 @@ def make_folder(folder: Path, *, within: Path | None = None) -> None:
         return
     make_folder(folder.parent)
     folder.mkdir(exist_ok=True)
-    with suppress(PermissionError):  # one that may be written into, but not read
+    with suppress(PermissionError):  # the folder may be writable but not readable
         sync_folder(folder.parent)
 
 
@@ -184,11 +197,11 @@ def write_text(path: Path, text: str, *, spare: bool = False) -> None:
 
     Args:
         path: the file.
-        text: what it is to hold.
-        spare: take the room that `reserve` has kept, if there is some.
+        text: the content.
+        spare: use the room that `reserve` has reserved, if any.
 
     Raises:
-        OSError: the file cannot be written; `path` is as before.
+        OSError: the file cannot be written; `path` is unchanged.
     """
     with ExitStack() as stack:
         if not (spare and _write_over(_spare(path), text.encode(), path)):
@@ -196,17 +209,22 @@ def write_text(path: Path, text: str, *, spare: bool = False) -> None:
 
 
 def reserve(path: Path, size: int) -> None:
-    """Keep room on the disk for a text of up to `size` bytes, which can be written even once the disk is full.
+    """Reserve disk space for a text of up to `size` bytes.
+
+    The text can then be written even on a full disk.
 
     Raises:
-        OSError: there is no such room.
+        OSError: there is not enough space.
     """
     with replacing(_spare(path)) as file:
         file.write(bytes(size))
 
 
 def _write_over(spare: Path, data: bytes, path: Path) -> bool:
-    """Write over a file, on a full disk into the room that it has, and give it the name `path`; return whether there was one."""
+    """Overwrite a reserved file and rename it to `path`; return if there was one.
+
+    On a full disk the data fit into its space.
+    """
     with _temporary(path) as (folder, name):
         try:
             descriptor = open_in_place(spare, os.O_RDWR)

@@ -1,4 +1,4 @@
-"""What others wrote: sizes that nobody believes before they fit the file and the memory, and text that is shown and not obeyed."""
+"""Check sizes in files against file and memory; escape text for display."""
 
 from __future__ import annotations
 
@@ -11,28 +11,33 @@ except ImportError:  # not on Windows
     resource = None  # type: ignore[assignment]
 
 MEMORY = Path("/proc/meminfo")
-LAYOUT = "\n\t"  # what a text of several lines may hold
-OWN_SIZE = Path("/proc/self/statm")  # pages, those of the address space first
+LAYOUT = "\n\t"  # control characters allowed in a text of several lines
+OWN_SIZE = Path("/proc/self/statm")  # in pages; the address space comes first
 
 
 class ClaimError(ValueError):
-    """A file claims more than it has or than there is room for; the message says how much, not which file."""
+    """A size in a file exceeds the file or the free memory.
+
+    The message gives the amount, but not the file's name.
+    """
 
 
 def check_claim(
     what: str, needed: int, *, stored: int | None = None, held: int | None = None
 ) -> None:
-    """Refuse what a file claims before anything is allocated for it. Call it with counts as they were read, of any size or sign.
+    """Raise an error if a size exceeds the file or the free memory.
+
+    Call it before the allocation, with counts as they were read, of any size or sign.
 
     Args:
-        what: the claim, as the message begins, such as `1000000000000 vertices`.
-        needed: memory that reading it takes [bytes].
-        stored: the least that it takes in the file [bytes]; None: a file may leave it out, as a
-            sparse matrix does its zeros.
-        held: what the file has for it [bytes].
+        what: beginning of the message, such as `1000000000000 vertices`.
+        needed: memory for reading it [bytes].
+        stored: its least size in the file [bytes]; None if a file may omit it, as the zeros of a
+            sparse matrix.
+        held: bytes of the file available for it.
 
     Raises:
-        ClaimError: it is negative, more than the file has, or more than is free.
+        ClaimError: the size is negative, larger than the file, or larger than the free memory.
     """
     if needed < 0:
         raise ClaimError(f"{what}: a size must be >= 0")
@@ -46,11 +51,11 @@ def check_claim(
 
 
 def read_whole(path: Path, *, copies: int = 2) -> bytes:
-    """Return what is in a file, which must be one: a device or a pipe has no end.
+    """Return the content of a regular file; devices and pipes have no end.
 
     Args:
         path: the file.
-        copies: of its bytes that its reader makes in memory, at least.
+        copies: copies of its bytes that the reader makes in memory, at least.
 
     Raises:
         OSError: it cannot be read.
@@ -64,28 +69,31 @@ def read_whole(path: Path, *, copies: int = 2) -> bytes:
 
 
 def free_host_memory() -> int | None:
-    """Return the memory that this process may still take [bytes]: what the machine has free and its own limit allows; None: not known."""
-    found: list[int] = []
+    """Return the memory that this process can still allocate [bytes].
+
+    The free memory of the machine, within the limit of the process; None if unknown.
+    """
+    limits: list[int] = []
     if MEMORY.exists() and (
         available := re.search(r"MemAvailable:\s+(\d+) kB", MEMORY.read_text(encoding="ascii"))
     ):
-        found.append(1024 * int(available[1]))
+        limits.append(1024 * int(available[1]))
     if resource is not None and OWN_SIZE.exists():
         limit = resource.getrlimit(resource.RLIMIT_AS)[0]
         if limit != resource.RLIM_INFINITY:
-            found.append(
+            limits.append(
                 max(
                     0,
                     limit
                     - resource.getpagesize() * int(OWN_SIZE.read_text(encoding="ascii").split()[0]),
                 )
             )
-    return min(found, default=None)
+    return min(limits, default=None)
 
 
 def _bytes(count: int) -> str:
-    """Return a number of bytes as a reader grasps it."""
-    count = min(count, 10**24)  # beyond what a float holds nobody counts
+    """Return a number of bytes in words."""
+    count = min(count, 10**24)  # beyond any practical size
     return (
         f"{count} bytes"
         if count < 10_000
@@ -96,7 +104,9 @@ def _bytes(count: int) -> str:
 
 
 def visible(text: str) -> str:
-    r"""Return a text with an escape in place of each character that does not print: controls, writing directions, half of a pair.
+    r"""Return a text with escapes for characters that do not print.
+
+    Such as control characters, writing directions and unpaired surrogates.
 
     >>> visible("\x1b]0;title\x07\n\u202e\udcff")
     '\\x1b]0;title\\x07\n\\u202e\\udcff'
@@ -109,7 +119,9 @@ def visible(text: str) -> str:
 
 
 def one_line(text: str) -> str:
-    r"""Return a text that stands within a line, where a break would let it pretend to be another message.
+    r"""Return a text in one line, with escapes for line breaks.
+
+    A line break could imitate another message.
 
     >>> one_line("pool\nfinished: frame 4 of 4")
     'pool\\nfinished: frame 4 of 4'

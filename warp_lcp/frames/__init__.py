@@ -1,1 +1,1 @@
-"""Frames as ParaView, renderers and modelers open them."""
+"""Frames in the formats of ParaView, renderers and modelers."""

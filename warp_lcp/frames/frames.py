@@ -1,7 +1,7 @@
-"""Frames as ParaView opens them: VTU or VTI files, and PVD collections that give each its time; volumes as NanoVDB, surfaces as PLY too.
+"""Frames of a run: VTU, VTI, NanoVDB and PLY files, and PVD collections.
 
-Or in a format of meshio's, in which no collection is written: ParaView takes numbered files as a
-series.
+PVD collections list files with their times, for ParaView. Formats of meshio have no collection:
+ParaView opens numbered files as a series.
 """
 
 from __future__ import annotations
@@ -32,14 +32,15 @@ from warp_lcp.frames.vtu import vtu_bytes, write_vtu
 from warp_lcp.simulation import Cells, NoStopwatch, Part, Points, Stopwatch, Surface, Volume
 
 FRAME_FILE = re.compile(
-    rf"(?P<name>[a-z][a-z_]*)_(?P<index>\d{{6,}})\.(?P<format>p?vtu|p?vti|nvdb|{'|'.join(SUFFIXES.values())})"
+    rf"(?P<name>[a-z][a-z_]*)_(?P<index>\d{{6,}})"
+    rf"\.(?P<format>p?vtu|p?vti|nvdb|{'|'.join(SUFFIXES.values())})"
 )
-COLLECTED = ("vtu", "vti", "pvtu", "pvti")  # what ParaView opens as a series
-WAITING = 2  # frames in memory, the one being written included
-END = b"</VTKFile>\n"  # of those that are whole
+COLLECTED = ("vtu", "vti", "pvtu", "pvti")  # formats that ParaView opens as a series
+WAITING = 2  # frames in memory, including the one being written
+END = b"</VTKFile>\n"  # end of complete files
 
 GridFormat = Literal["vtu", "vti"]
-# what writes a part, how many bytes that takes
+# Writer and file size of a part, by format.
 OWN_FORMATS: dict[str, tuple[Callable[[Path, Any], None], Callable[[Any], int]]] = {
     "vtu": (write_vtu, vtu_bytes),
     "vti": (write_vti, vti_bytes),
@@ -48,14 +49,16 @@ OWN_FORMATS: dict[str, tuple[Callable[[Path, Any], None], Callable[[Any], int]]]
 
 
 class FrameFolder:
-    """The frames of one run: `frames/<name>_<index>.vtu` (or .vti, .nvdb) and, but for volumes, `<name>.pvd` beside the folder.
+    """Frames of one run: `frames/<name>_<index>.vtu` (or .vti, .nvdb).
+
+    Except for volumes, `<name>.pvd` beside the folder lists them.
 
     Args:
-        folder: of the run.
-        grid_format: of the cells; "vtu": as the rest.
+        folder: folder of the run.
+        grid_format: format of the cells; "vtu": as the other parts.
         surface_ply: write surfaces as PLY files too.
-        frame_format: of particles, surfaces and bodies; one without points, where the format does
-            not hold that, is a VTU file.
+        frame_format: format of particles, surfaces and bodies; a part without points is a VTU file
+            if the format cannot store it.
     """
 
     def __init__(
@@ -66,7 +69,7 @@ class FrameFolder:
         surface_ply: bool = False,
         frame_format: FrameFormat = "vtu",
     ) -> None:
-        """Look at a run's folder; nothing is written before the first frame."""
+        """Inspect a run's folder; nothing is written before the first frame."""
         self.folder = folder
         self.grid_format, self.surface_ply, self.frame_format = (
             grid_format,
@@ -81,8 +84,8 @@ class FrameFolder:
 
         Args:
             index: the frame's number.
-            time: of the frame [s].
-            frame: what it shows.
+            time: time of the frame [s].
+            frame: its parts.
 
         Returns:
             Its files.
@@ -103,7 +106,10 @@ class FrameFolder:
         return files
 
     def has_collection(self, part: Part) -> bool:
-        """Return whether the frames of a part are in a PVD collection, which names files of VTK's XML formats alone."""
+        """Return whether a part has a PVD collection.
+
+        Collections list only files of VTK's XML formats.
+        """
         if isinstance(part, Volume):
             return False
         return self.frame_format == "vtu" or (isinstance(part, Cells) and self.grid_format == "vti")
@@ -119,10 +125,12 @@ class FrameFolder:
         write_text(self.folder / f"{name}.pvd", collection(times))
 
     def resume(self, times: list[float]) -> None:
-        """Continue after the frames of `times`: later files are deleted, the collections are those of the frames that are there.
+        """Continue after the frames of `times`; delete later files.
+
+        The collections then list the remaining frames.
 
         Args:
-            times: of the frames that stay, beginning with frame 0 [s].
+            times: times of the remaining frames, beginning with frame 0 [s].
 
         Raises:
             OSError: a file cannot be deleted or written.
@@ -141,34 +149,39 @@ class FrameFolder:
                 )
         for name, entries in self._times.items():
             if self.frame_format != "vtu" and not (self.folder / f"{name}.pvd").is_file():
-                continue  # of a format without collections, in which those are empty frames
+                continue  # of a format without collections, whose VTU files are empty frames
             write_text(self.folder / f"{name}.pvd", collection(entries))
 
     def kinds(self, frame: Sequence[Part]) -> list[str]:
-        """Return what `missing` looks for in a frame: the names of its parts, with `.ply` where a part has such a file too."""
+        """Return the kinds of files of a frame, for `missing`.
+
+        The names of its parts, and those with `.ply` for parts with such a file.
+        """
         return [part.name for part in frame] + [
             f"{part.name}.ply" for part in frame if self.surface_ply and isinstance(part, Surface)
         ]
 
     def missing(self, kind: str, count: int) -> list[int]:
-        """Return which of the first `count` frames have no file of a kind, or not all pieces of one that ranks wrote.
+        """Return the frames before `count` without a complete file of a kind.
+
+        A file of ranks is complete if all of its parts exist.
 
         Raises:
             OSError: a file cannot be read.
         """
-        found, name, is_beside = set(), kind.removesuffix(".ply"), kind.endswith(".ply")
+        present, name, is_beside = set(), kind.removesuffix(".ply"), kind.endswith(".ply")
         for file in self.frames.iterdir() if self.frames.is_dir() else ():
             match = FRAME_FILE.fullmatch(file.name)
             if match is None or match["name"] != name:
                 continue
-            # a file beside the frame's own
+            # A file beside the frame's own.
             is_ply = match["format"] == "ply" and self.frame_format != "ply"
             if is_ply == is_beside and _is_whole(file):
-                found.add(int(match["index"]))
-        return sorted({*range(count)} - found)
+                present.add(int(match["index"]))
+        return sorted({*range(count)} - present)
 
     def write_part(self, path: Path, part: Part) -> Path:
-        """Write a part to a path that gets the suffix of its format; return the file.
+        """Write a part to a path with the suffix of its format; return the file.
 
         Raises:
             OSError: the file cannot be written.
@@ -183,22 +196,22 @@ class FrameFolder:
 
 
 class Frames(Protocol):
-    """What takes a run's frames."""
+    """Interface of frame folders."""
 
     def write(self, index: int, time: float, frame: list[Part]) -> list[Path]:
         """Write frame `index` of a time [s]; return its files."""
 
 
 class FrameWriter:
-    """Write frames, and what comes after them, on a thread of its own while the simulation goes on; at most WAITING are in memory.
+    """Write frames on a thread of its own while the simulation continues.
 
-    What goes wrong there is raised by every later call of `put`, `then`, `check` or `flush`, and
-    nothing later is written. Leaving the `with` block waits for what was put, whatever ended the
-    block, and raises only if nothing else did.
+    At most WAITING frames are in memory. Errors are raised by every later call of `put`, `then`,
+    `check` or `flush`, and nothing is written after an error. The end of the `with` block waits for
+    queued frames, whatever ended the block, and raises only if nothing else did.
     """
 
     def __init__(self, folder: Frames, watch: Stopwatch | None = None) -> None:
-        self.newest: int | None = None  # the number of the newest frame that is on disk
+        self.newest: int | None = None  # number of the newest frame on disk
         self._folder = folder
         self._watch = watch or NoStopwatch()
         self._pending: deque[Future[None]] = deque()
@@ -206,7 +219,7 @@ class FrameWriter:
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="frames")
 
     def put(self, index: int, time: float, frame: list[Part]) -> None:
-        """Hand over a frame, whose arrays nobody changes any more; wait if there are too many already.
+        """Queue a frame, whose arrays must not change; wait if the queue is full.
 
         Raises:
             OSError: an earlier frame could not be written.
@@ -220,21 +233,23 @@ class FrameWriter:
         self.then("frames, written", write)
 
     def then(self, name: str, write: Callable[[], list[Path]]) -> None:
-        """Call a function, which returns its files, when all that was put is on disk; wait if there is too much already.
+        """Queue a function that returns its files; wait if the queue is full.
+
+        It is called after all earlier items are on disk.
 
         Args:
-            name: of what it writes, for the profile.
+            name: name of the written data in the profile.
             write: the function.
 
         Raises:
-            OSError: something earlier could not be written.
+            OSError: an earlier item could not be written.
         """
         while len(self._pending) >= WAITING:
             self._finish()
         self._pending.append(self._thread.submit(self._write, name, write))
 
     def check(self) -> None:
-        """Raise what went wrong so far, without waiting.
+        """Raise earlier errors, without waiting.
 
         Raises:
             OSError: a frame could not be written.
@@ -252,7 +267,7 @@ class FrameWriter:
             self._finish()
 
     def end(self) -> None:
-        """Wait for the frames that were put, and take no more."""
+        """Wait for the queued frames, and accept no more."""
         self._thread.shutdown()
 
     def __enter__(self) -> Self:
@@ -269,12 +284,12 @@ class FrameWriter:
             self.flush()
 
     def _finish(self) -> None:
-        """Wait for the oldest frame; one that failed stays the oldest, so that it is raised again."""
+        """Wait for the oldest item; a failed one stays, to be raised again."""
         self._pending[0].result()
         self._pending.popleft()
 
     def _write(self, name: str, write: Callable[[], list[Path]]) -> None:
-        if self._failed:  # a run that ends here must not leave anything later
+        if self._failed:  # after an error nothing later may be written
             return
         self._failed = True
         with self._watch.beside(name):
@@ -290,13 +305,13 @@ def frame_bytes(
     surface_ply: bool = False,
     frame_format: FrameFormat = "vtu",
 ) -> int:
-    """Return about how many bytes the files of a frame take; rather more than less.
+    """Return the estimated size of the files of a frame [bytes]; an upper estimate.
 
     Args:
-        frame: what it shows.
-        grid_format: of the cells.
+        frame: its parts.
+        grid_format: format of the cells.
         surface_ply: count the PLY files of surfaces.
-        frame_format: of the rest.
+        frame_format: format of the other parts.
     """
     total = sum(ply_bytes(part) for part in frame if surface_ply and isinstance(part, Surface))
     for part in frame:
@@ -310,7 +325,7 @@ def frame_bytes(
 
 
 def part_format(part: Part, grid_format: GridFormat, frame_format: FrameFormat = "vtu") -> str:
-    """Return the format of a part's file; surfaces may have a PLY file besides."""
+    """Return the format of a part's file; surfaces may also have a PLY file."""
     if isinstance(part, Volume):
         return "nvdb"
     if isinstance(part, Cells) and grid_format == "vti":
@@ -324,7 +339,7 @@ def part_format(part: Part, grid_format: GridFormat, frame_format: FrameFormat =
 
 
 def _is_whole(file: Path) -> bool:
-    """Return whether a frame's file has an end, and so have all that one with the pieces of ranks names."""
+    """Return whether a frame's file, and all parts that it lists, are complete."""
     try:
         return _has_end(file) and (
             file.suffix[1:] not in WHOLE.values() or all(map(_has_end, piece_files(file)))
@@ -334,7 +349,7 @@ def _is_whole(file: Path) -> bool:
 
 
 def _has_end(file: Path) -> bool:
-    """Return whether a file is there and was not cut."""
+    """Return whether a file exists and is not truncated."""
     if not file.is_file():
         return False
     with open(file, "rb") as stream:

@@ -1,4 +1,4 @@
-"""Frames as meshio has them: its meshes, and every file format that it writes and reads back."""
+"""Frames as meshio meshes, and in all file formats that it reads and writes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from warp_lcp.files.atomic import replacing_by_name
 from warp_lcp.frames.vtu import Mesh, mesh_of, vtu_bytes
 from warp_lcp.simulation import Cells, Points, Surface, Volume
 
-FrameFormat = Literal[  # those that meshio reads back as they were
+FrameFormat = Literal[  # formats that meshio reads back unchanged
     "vtu",
     "xdmf",
     "vtk",
@@ -45,7 +45,7 @@ FrameFormat = Literal[  # those that meshio reads back as they were
     "su2",
     "tecplot",
 ]
-SUFFIXES = {  # of meshio's formats, by its names; of several the first without compression
+SUFFIXES = {  # suffixes of meshio's formats, by name; the first uncompressed one of several
     "xdmf": "xdmf",
     "vtk": "vtk",
     "gmsh": "msh",
@@ -68,19 +68,19 @@ SUFFIXES = {  # of meshio's formats, by its names; of several the first without 
     "su2": "su2",
     "tecplot": "dat",
 }
-WRITTEN_ONLY = {"mdpa", "tecplot"}  # meshio's readers of these do not end where a file was cut
+WRITTEN_ONLY = {"mdpa", "tecplot"}  # meshio's readers of these accept truncated files
 FORMAT_OF = {suffix: name for name, suffix in SUFFIXES.items()}
-MODULES = {"dolfin-xml": "dolfin"}  # of meshio, where they have other names than the format
+MODULES = {"dolfin-xml": "dolfin"}  # modules of meshio whose names differ from the format's
 OPTIONS: dict[str, dict[str, Any]] = {
     "xdmf": {"data_format": "XML"},  # one file; HDF would be a second one, which needs h5py
     "stl": {"binary": True},
 }
-CELL_KINDS = {1: "vertex", 2: "line", 3: "triangle", 4: "quad", 8: "hexahedron"}  # by their corners
+CELL_KINDS = {1: "vertex", 2: "line", 3: "triangle", 4: "quad", 8: "hexahedron"}  # by corners
 CORNERS = {kind: corners for corners, kind in CELL_KINDS.items()}
-ADDED = re.compile(":|^GLOBAL_ID$")  # in names that meshio's readers add, such as gmsh:dim_tags
+ADDED = re.compile(":|^GLOBAL_ID$")  # names that meshio's readers add, such as gmsh:dim_tags
 AXES = re.compile(r"(?P<name>.+)_(?P<axis>[xyz])")
-SAMPLE = 1000  # about as many cells has what a format is tried with
-# what meshio's readers and writers raise where a format does not hold a mesh, or a file is damaged
+SAMPLE = 1000  # approximate number of cells of the sample for a format
+# Errors of meshio's readers and writers for unsupported meshes and damaged files.
 FAULTS = (
     OSError,
     ValueError,
@@ -102,23 +102,23 @@ FAULTS = (
 
 
 class Dress(IntEnum):
-    """What is done to a mesh so that a format holds it, from nothing to much."""
+    """Conversion of a mesh that a format needs, from none to most."""
 
     AS_IS = 0
-    PLAIN_NUMBERS = 1  # points float64, whole numbers int32
-    SCALARS = 2  # vectors as three fields besides, named for the axes
-    BARE = 3  # without fields
+    PLAIN_NUMBERS = 1  # points in float64, integers in int32
+    SCALARS = 2  # also vectors as three fields, named by axis
+    BARE = 3  # also without fields
 
 
 @dataclass(frozen=True)
 class Holds:
-    """How a format holds the parts of a kind.
+    """Support of a format for a kind of parts.
 
     Args:
-        dress: the least that is done to them; None: it does not hold them.
-        empty: whether it holds one without points.
-        size: of a file, in those of a VTU file.
-        why: it does not.
+        dress: the least conversion needed; None if it cannot store them.
+        empty: whether it can store one without points.
+        size: size of a file, relative to a VTU file.
+        why: reason if it cannot.
     """
 
     dress: Dress | None
@@ -128,11 +128,12 @@ class Holds:
 
 
 def to_meshio(part: Points | Cells | Surface | Volume) -> Any:
-    """Return a part of a frame as a `meshio.Mesh`: points [m], cells, and its fields as point data or cell data.
+    """Return a part of a frame as a `meshio.Mesh`.
 
-    Points become vertices, surfaces triangles or lines, cells quadrilaterals or hexahedra that
-    share their corners. Of a volume the voxels become hexahedra that a NanoVDB file would hold as
-    active: those nearer to the surface than its band, or where the density is not 0.
+    Points [m], cells, and its fields as point data or cell data. Points become vertices, surfaces
+    triangles or lines, cells quadrilaterals or hexahedra that share their corners. The voxels of a
+    volume that are active in a NanoVDB file become hexahedra: those nearer to the surface than its
+    band, or with a density other than 0.
 
     >>> import numpy as np
     >>> from warp_lcp.simulation import Points
@@ -144,10 +145,12 @@ def to_meshio(part: Points | Cells | Surface | Volume) -> Any:
 
 
 def from_meshio(mesh: Any) -> Mesh:
-    """Return what a `meshio.Mesh` of one kind of cells holds; vectors that were taken apart are put together again.
+    """Return the content of a `meshio.Mesh` with one kind of cells.
+
+    Vectors that were stored as three fields are joined again.
 
     Raises:
-        ValueError: it has cells of several kinds, or of others than frames have.
+        ValueError: it has cells of several kinds, or of kinds that frames do not have.
     """
     points = np.asarray(mesh.points)
     points = (
@@ -189,16 +192,18 @@ def from_meshio(mesh: Any) -> Mesh:
 
 
 def write_meshio(path: Path, part: Points | Cells | Surface, name: str) -> None:
-    """Write a part of a frame in a format of meshio's, atomically. One without points that the format does not hold is refused.
+    """Write a part of a frame in a format of meshio, atomically.
+
+    A part without points is refused if the format cannot store it.
 
     Args:
         path: the file.
-        part: that the format holds, see `holds`.
-        name: of the format.
+        part: a part that the format can store, see `holds`.
+        name: name of the format.
 
     Raises:
         OSError: the file cannot be written.
-        ValueError: the format does not hold it.
+        ValueError: the format cannot store it.
     """
     dress = holds(name, *kind_of(part)).dress
     if dress is None:
@@ -216,13 +221,13 @@ def write_meshio(path: Path, part: Points | Cells | Surface, name: str) -> None:
 
 
 def read_meshio(path: Path, name: str) -> Mesh:
-    """Return what a file of `write_meshio` holds.
+    """Return the content of a file of `write_meshio`.
 
     Raises:
         OSError: the file cannot be read.
         ValueError: it is damaged, or of another format.
     """
-    path.stat()  # whose error is the system's
+    path.stat()  # raises the system's error
     if name in WRITTEN_ONLY:
         raise ValueError(
             f"{path}: is not a readable frame: {name} files are written for other programs and "
@@ -237,12 +242,12 @@ def read_meshio(path: Path, name: str) -> Mesh:
 
 
 def meshio_bytes(part: Points | Cells | Surface, name: str) -> int:
-    """Return about how many bytes the file of a part takes, as a sample's did."""
+    """Return the estimated size of the file of a part [bytes], from a sample."""
     return int(vtu_bytes(part) * holds(name, *kind_of(part)).size)
 
 
 def kind_of(part: Points | Cells | Surface) -> tuple[type, int]:
-    """Return the type of a part and how many dimensions its cells have."""
+    """Return the type of a part and the dimension of its cells."""
     if isinstance(part, Points):
         return Points, 3
     return type(part), part.dimension if isinstance(part, Cells) else part.corners.shape[1]
@@ -250,18 +255,20 @@ def kind_of(part: Points | Cells | Surface) -> tuple[type, int]:
 
 @cache
 def holds(name: str, kind: type, dimension: int) -> Holds:
-    """Return how a format holds the parts of a kind: a sample is written, read back and compared.
+    """Return how a format supports the parts of a kind.
+
+    A sample is written, read back and compared.
 
     Args:
-        name: of the format.
-        kind: of the parts.
-        dimension: of their cells.
+        name: name of the format.
+        kind: type of the parts.
+        dimension: dimension of their cells.
     """
     sample, none = (
         _sample(kind, dimension, round(SAMPLE ** (1.0 / dimension))),
         _sample(kind, dimension, 0),
     )
-    found, why, said = None, "", io.StringIO()
+    support, why, said = None, "", io.StringIO()
     with (
         tempfile.TemporaryDirectory() as folder,
         contextlib.redirect_stderr(said),
@@ -269,7 +276,7 @@ def holds(name: str, kind: type, dimension: int) -> Holds:
     ):
         path = Path(folder) / f"sample.{SUFFIXES[name]}"
         for dress in Dress:
-            if found and dress is Dress.BARE:
+            if support and dress is Dress.BARE:
                 break
             said.truncate(said.seek(0))
             try:
@@ -285,38 +292,41 @@ def holds(name: str, kind: type, dimension: int) -> Holds:
             empty = False
             with contextlib.suppress(*_faults()):
                 empty = _comes_back(path, none, name, dress)
-            found = found or Holds(dress, empty, size)
-            if not warns:  # else meshio would warn at every frame, if there is another way
+            support = support or Holds(dress, empty, size)
+            if not warns:  # else meshio would warn at every frame; another conversion is tried
                 return Holds(dress, empty, size)
-    return found or Holds(None, why=why)
+    return support or Holds(None, why=why)
 
 
 def _comes_back(path: Path, part: Points | Cells | Surface, name: str, dress: Dress) -> bool:
-    """Return whether a part that is written in a format is read back: its points to float32, its cells, and its fields unless bare."""
+    """Return whether a part is unchanged after writing and reading.
+
+    That is, its points to float32, its cells, and its fields unless bare.
+    """
     expected = mesh_of(part)
     _write(path, _dressed(expected, dress), name)
-    found = from_meshio(_module(name).read(str(path)))
-    points = np.asarray(found.points, dtype=np.float64)
+    copy = from_meshio(_module(name).read(str(path)))
+    points = np.asarray(copy.points, dtype=np.float64)
     if expected.points.shape != points.shape or not np.allclose(
         points, expected.points, rtol=1e-6, atol=1e-7
     ):
         return False
-    if expected.corners.size and not np.array_equal(found.corners, expected.corners):
+    if expected.corners.size and not np.array_equal(copy.corners, expected.corners):
         return False
     return (
         dress is Dress.BARE
         or not len(points)
         or all(
-            key in found.fields
-            and found.fields[key].shape == values.shape
-            and np.allclose(found.fields[key], values, rtol=1e-6)
+            key in copy.fields
+            and copy.fields[key].shape == values.shape
+            and np.allclose(copy.fields[key], values, rtol=1e-6)
             for key, values in expected.fields.items()
         )
     )
 
 
 def _dressed(mesh: Mesh, dress: Dress) -> Mesh:
-    """Return a mesh as a format takes it."""
+    """Return a mesh after a conversion."""
     if dress is Dress.AS_IS:
         return mesh
     fields = {} if dress is Dress.BARE else mesh.fields
@@ -339,16 +349,16 @@ def _dressed(mesh: Mesh, dress: Dress) -> Mesh:
 
 
 def _joined(fields: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return fields in which `velocity_x`, `_y` and `_z` are one again."""
-    found: dict[str, np.ndarray] = {}
+    """Return fields with `velocity_x`, `_y` and `_z` joined to vectors."""
+    joined: dict[str, np.ndarray] = {}
     for key, values in fields.items():
         match = AXES.fullmatch(key)
         names = [f"{match['name']}_{axis}" for axis in "xyz"] if match else []
         if not match or not all(name in fields and fields[name].ndim == 1 for name in names):
-            found[key] = values
+            joined[key] = values
         elif match["axis"] == "x":
-            found[match["name"]] = np.stack([fields[name] for name in names], axis=-1)
-    return found
+            joined[match["name"]] = np.stack([fields[name] for name in names], axis=-1)
+    return joined
 
 
 def meshio_of(mesh: Mesh) -> Any:
@@ -366,12 +376,15 @@ def meshio_of(mesh: Mesh) -> Any:
 
 
 def _write(path: Path, mesh: Mesh, name: str) -> None:
-    with np.errstate(divide="ignore", invalid="ignore"):  # normals of triangles without an area
+    with np.errstate(divide="ignore", invalid="ignore"):  # normals of triangles without area
         _module(name).write(str(path), meshio_of(mesh), **OPTIONS.get(name, {}))
 
 
 def _module(name: str) -> Any:
-    """Return meshio's module of a format; its own `read` ends the process where a file is damaged."""
+    """Return meshio's module of a format.
+
+    meshio's own `read` ends the process for a damaged file.
+    """
     import meshio
 
     return getattr(meshio, MODULES.get(name, name))
@@ -384,7 +397,7 @@ def _faults() -> tuple[type[Exception], ...]:
 
 
 def _active(volume: Volume) -> Cells:
-    """Return the voxels of a volume that a NanoVDB file holds as active."""
+    """Return the voxels of a volume that are active in a NanoVDB file."""
     active = (
         np.abs(volume.values) < volume.band if volume.band is not None else volume.values != 0.0
     )
@@ -393,10 +406,10 @@ def _active(volume: Volume) -> Cells:
 
 
 def _sample(kind: type, dimension: int, side: int) -> Points | Cells | Surface:
-    """Return a part with the kinds of fields that frames have, of a lattice of points or cells."""
+    """Return a sample part on a lattice, with all kinds of fields of frames."""
     counts = [side] * dimension + [1] * (3 - dimension)
     index = np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1).reshape(-1, 3)
-    index[:, :dimension] -= 2  # numbers below 0, too, and with exponents
+    index[:, :dimension] -= 2  # includes negative numbers, and ones with exponents
     count = len(index)
     numbers = np.linspace(-1.7, 3.1, count)
     fields: dict[str, np.ndarray] = {

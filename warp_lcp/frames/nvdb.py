@@ -1,13 +1,14 @@
-"""NanoVDB files of volumes: sparse voxels as renderers and Warp read them, written by NumPy, so that no other thread is disturbed.
+"""NanoVDB files of volumes: sparse voxels for renderers and Warp.
 
-The places are those of the format's version 32, for trees of 5, 4 and 3 bits an axis (Warp's
-`native/nanovdb/NanoVDB.h` describes them): a grid's header, the tree's, a root with one entry, one
-upper node of 32^3 entries, lower nodes of 16^3 and leaves of 8^3 voxels. An entry is a value, or
-how far after its own node the child begins.
+NumPy writes them, so that no other thread is blocked. The layout is that of version 32 of the
+format, for trees of 5, 4 and 3 bits per axis (Warp's `native/nanovdb/NanoVDB.h` describes it): the
+header of the grid, that of the tree, a root with one entry, one upper node of 32^3 entries, lower
+nodes of 16^3 entries and leaves of 8^3 voxels. An entry is a value, or the offset of the child from
+its own node.
 
-Warp's own (1.19: `Volume.allocate_by_tiles`, `save_to_nvdb`) is as fast, but its files have neither
-a name nor a class nor a box nor a number of active voxels (all 0), and what is deep inside a level
-set reads as outside: readers that ask for "level_set" find nothing.
+Warp's own writer (1.19: `Volume.allocate_by_tiles`, `save_to_nvdb`) is as fast, but its files have
+no name, class, box and number of active voxels (all 0), and the deep inside of a level set reads as
+outside: readers that search for "level_set" find nothing.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from warp_lcp.frames.vtk_xml import raw
 from warp_lcp.simulation import Volume
 
 LEAF, LOWER, UPPER = 8, 16, 32  # entries along an edge of a node
-LARGEST = LEAF * LOWER * UPPER  # voxels along an edge of what one upper node holds
+LARGEST = LEAF * LOWER * UPPER  # voxels along an edge of an upper node
 VERSION = 32 << 21 | 3 << 10 | 3
 LEVEL_SET, FOG_VOLUME = 1, 2  # classes of grids
 FLOAT = 1  # type of values
@@ -55,7 +56,7 @@ GRID = np.dtype(
     ]
 )
 BOX = [("low", "<i4", 3), ("high", "<i4", 3)]  # of active voxels
-# leaves, lower, upper, root
+# Leaves, lower, upper, root.
 TREE = np.dtype(
     [("offsets", "<i8", 4), ("nodes", "<u4", 3), ("tiles", "<u4", 3), ("voxels", "<u8")]
 )
@@ -66,7 +67,7 @@ ROOT = np.dtype(
         ("background", "<f4"),
         ("statistics", "<f4", 4),
         ("padding", "V16"),
-        # its only entry
+        # Its only entry.
         ("key", "<u8"),
         ("child", "<i8"),
         ("state", "<u4"),
@@ -74,7 +75,7 @@ ROOT = np.dtype(
         ("more", "V8"),
     ]
 )
-# an entry of a node
+# An entry of a node.
 VALUE = np.dtype(
     {"names": ["value", "child"], "formats": ["<f4", "<i8"], "offsets": [0, 0], "itemsize": 8}
 )
@@ -128,9 +129,9 @@ META = np.dtype(
 def write_nvdb(path: Path, volume: Volume) -> None:
     """Write a volume as a NanoVDB file, uncompressed, atomically.
 
-    Index (i, j, k) is the center of that cell. A level set has its band's width where it is not
-    known: + outside and - inside, neither of which takes room. Voxels are active within the band;
-    those of a density are where it is not 0.
+    Index (i, j, k) is the center of that cell. Where a level set is unknown it has the width of its
+    band: + outside and - inside, neither of which is stored. Voxels are active within the band;
+    those of a density where it is not 0.
 
     Args:
         path: the file.
@@ -138,7 +139,7 @@ def write_nvdb(path: Path, volume: Volume) -> None:
 
     Raises:
         OSError: the file cannot be written.
-        ValueError: the values are not of a 3-D grid, not finite, or more than 4096 along an axis.
+        ValueError: the values are not on a 3-D grid, not finite, or more than 4096 along an axis.
     """
     if (
         volume.values.ndim != 3
@@ -157,7 +158,7 @@ def write_nvdb(path: Path, volume: Volume) -> None:
 
 
 def nvdb_bytes(volume: Volume) -> int:
-    """Return how many bytes the file of a volume takes at most."""
+    """Return an upper bound of the size of the file of a volume [bytes]."""
     leaves, lower = (
         int(np.prod([-(-count // edge) for count in volume.values.shape]))
         for edge in (LEAF, LEAF * LOWER)
@@ -171,7 +172,7 @@ def nvdb_bytes(volume: Volume) -> int:
 
 
 def name_key(name: bytes) -> int:
-    """Return the number by which readers look a grid's name up."""
+    """Return the hash by which readers search for a grid's name."""
     key = 0
     for letter in name:
         key = (key * 67 + letter + (key >> 56)) % 2**64
@@ -179,7 +180,7 @@ def name_key(name: bytes) -> int:
 
 
 def _grid(volume: Volume) -> tuple[list[np.ndarray], bytes]:
-    """Return a grid as a file has it, part by part, and what stands before it."""
+    """Return the parts of a grid in a file, and the file's header."""
     background = np.float32(0.0 if volume.band is None else volume.band)
     tiles = _tiles(volume.values, background)
     high, low = tiles.max(axis=(3, 4, 5)), tiles.min(axis=(3, 4, 5))
@@ -189,7 +190,7 @@ def _grid(volume: Volume) -> tuple[list[np.ndarray], bytes]:
     lower, upper = _nodes(used, inside, background)
     root, tree, grid = np.zeros(1, dtype=ROOT), np.zeros(1, dtype=TREE), np.zeros(1, dtype=GRID)
     parts = [grid, tree, root, upper, lower, leaves]
-    # of the next part, from the tree's beginning
+    # Offset of the next part from the tree's beginning.
     begins = np.cumsum([part.nbytes for part in parts]) - grid.nbytes
     tree["offsets"], tree["nodes"] = begins[[4, 3, 2, 1]], [len(leaves), len(lower), 1]
     tree["voxels"] = np.unpackbits(leaves["active"]).sum(dtype=np.int64)
@@ -202,7 +203,10 @@ def _grid(volume: Volume) -> tuple[list[np.ndarray], bytes]:
 
 
 def _tiles(values: np.ndarray, background: np.float32) -> np.ndarray:
-    """Return the values of each tile, shape (nx, ny, nz, 8, 8, 8) with nx, ny and nz tiles; a view."""
+    """Return a view of the values by tile, shape (nx, ny, nz, 8, 8, 8).
+
+    With nx, ny and nz tiles.
+    """
     nz, ny, nx = counts = [-(-count // LEAF) for count in values.shape]
     padded = np.full([LEAF * count for count in counts], background, dtype=np.float32)
     padded[tuple(slice(count) for count in values.shape)] = values
@@ -210,7 +214,7 @@ def _tiles(values: np.ndarray, background: np.float32) -> np.ndarray:
 
 
 def _leaves(tiles: np.ndarray, used: np.ndarray, band: float | None) -> np.ndarray:
-    """Return the leaves, in the order of their places."""
+    """Return the leaves, in the order of their positions."""
     values = tiles[used].reshape(-1, LEAF**3)
     leaves = np.zeros(len(values), dtype=LEAF_NODE)
     if band is not None:
@@ -224,25 +228,25 @@ def _leaves(tiles: np.ndarray, used: np.ndarray, band: float | None) -> np.ndarr
 def _nodes(
     used: np.ndarray, inside: np.ndarray, background: np.float32
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lower nodes, in the order of their places, and the upper one."""
+    """Return the lower nodes, in the order of their positions, and the upper one."""
     counts = [-(-count // LOWER) for count in used.shape]
-    # 0: outside, -1: inside, else the number of a leaf, from 1
+    # 0: outside, -1: inside, else the number of a leaf, from 1.
     kinds = np.zeros([LOWER * count for count in counts], dtype=np.int64)
     kinds[tuple(slice(count) for count in used.shape)] = np.where(
         used, np.cumsum(used).reshape(used.shape), -1 * inside
     )
     nx, ny, nz = counts
     kinds = kinds.reshape(nx, LOWER, ny, LOWER, nz, LOWER).transpose(0, 2, 4, 1, 3, 5)
-    found = kinds.any(axis=(3, 4, 5))
-    kinds = kinds[found].reshape(-1, LOWER**3)
+    nonempty = kinds.any(axis=(3, 4, 5))
+    kinds = kinds[nonempty].reshape(-1, LOWER**3)
     lower, upper = np.zeros(len(kinds), dtype=LOWER_NODE), np.zeros(1, dtype=UPPER_NODE)
     lower["table"]["value"] = np.where(kinds < 0, -background, background)
     lower["children"] = np.packbits(kinds > 0, axis=1, bitorder="little")
     node, entry = np.nonzero(kinds > 0)
-    begin = (len(lower) - node) * LOWER_NODE.itemsize  # of the leaves, from the node
+    begin = (len(lower) - node) * LOWER_NODE.itemsize  # offset of the leaves from the node
     lower["table"]["child"][node, entry] = begin + (kinds[node, entry] - 1) * LEAF_NODE.itemsize
     upper["table"]["value"] = background
-    x, y, z = np.argwhere(found).T
+    x, y, z = np.argwhere(nonempty).T
     place = (x * UPPER + y) * UPPER + z
     upper["table"]["child"][0, place] = upper.nbytes + np.arange(len(lower)) * LOWER_NODE.itemsize
     children = np.zeros(UPPER**3, dtype=bool)
@@ -252,7 +256,10 @@ def _nodes(
 
 
 def _box(leaves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first and the last active voxel along each axis; an empty box if there is none."""
+    """Return the first and the last active voxel along each axis.
+
+    An empty box without active voxels.
+    """
     active = (
         np.unpackbits(leaves["active"], axis=1, bitorder="little")
         .astype(bool)
@@ -266,9 +273,9 @@ def _box(leaves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _describe(grid: np.ndarray, root: np.ndarray, volume: Volume, size: int) -> None:
-    """Write what the grid is, and where."""
+    """Write the metadata of the grid."""
     spacing = float(volume.spacing)
-    low = (np.array(volume.origin) + 0.5) * spacing  # of the first cell's center
+    low = (np.array(volume.origin) + 0.5) * spacing  # center of the first cell
     grid["magic"], grid["checksum"], grid["version"], grid["flags"] = (
         b"NanoVDB1",
         NO_CHECKSUM,
@@ -292,7 +299,7 @@ def _describe(grid: np.ndarray, root: np.ndarray, volume: Volume, size: int) -> 
 
 
 def _header(grid: np.ndarray, tree: np.ndarray, root: np.ndarray) -> bytes:
-    """Return what stands before a grid in a file, by which readers find it."""
+    """Return the file header, by which readers find the grid."""
     name = bytes(grid["name"][0])
     file, meta = np.zeros(1, dtype=FILE), np.zeros(1, dtype=META)
     file["magic"], file["version"], file["grids"] = b"NanoVDB0", VERSION, 1

@@ -1,4 +1,7 @@
-"""Frames in pieces, each in the folder of a rank: PVTU and PVTI files, which make one of them for ParaView, and reading them back."""
+"""Frames in parts, one per rank: PVTU and PVTI files, and reading them back.
+
+Each part is in the folder of its rank. PVTU and PVTI files list the parts, for ParaView.
+"""
 
 from __future__ import annotations
 
@@ -17,10 +20,11 @@ from warp_lcp.frames.vtk_xml import attributes, opening, read_back, root, writab
 from warp_lcp.frames.vtu import Mesh
 from warp_lcp.simulation import Cells, Points, Surface
 
-# where each process keeps its pieces of frames and checkpoints
+# Folder of a rank's parts of frames and checkpoints.
 RANK_FOLDER = re.compile(r"rank_\d{4,}")
-SURFACES = (2, 3)  # corners of segments and triangles
-WHOLE = {"vtu": "pvtu", "vti": "pvti"}  # the suffix of the file that names the pieces, by theirs
+SURFACES = (2, 3)  # numbers of corners of segments and triangles
+# Suffix of the file that lists the parts, by the parts' suffix.
+WHOLE = {"vtu": "pvtu", "vti": "pvti"}
 
 Kind = Literal["vtu", "vti"]
 Image = tuple[tuple[int, int, int], tuple[int, int, int]]
@@ -28,16 +32,16 @@ Image = tuple[tuple[int, int, int], tuple[int, int, int]]
 
 @dataclass(frozen=True)
 class Piece:
-    """What the file of a whole frame says of one of its pieces.
+    """Metadata of a part in the file of a whole frame.
 
     Args:
-        kind: the suffix of its file.
-        size: how many points or cells it has.
+        kind: suffix of its file.
+        size: number of points or cells.
         fields: attributes of their data arrays.
         points: attributes of the array of points; "" for an image.
-        on_cells: the fields are those of cells.
+        on_cells: whether the fields belong to cells.
         image: first and last corner of an image [cells].
-        spacing: of an image's cells [m].
+        spacing: cell size of an image [m].
     """
 
     kind: Kind
@@ -50,7 +54,7 @@ class Piece:
 
 
 def describe(part: Points | Cells | Surface, kind: Kind) -> Piece:
-    """Return what is to be said of a part that becomes a file of a kind."""
+    """Return the metadata of a part in a file of a kind."""
     cells = isinstance(part, Cells)
     size, written = writable_fields(part)
     fields = tuple(attributes(name, values) for name, values in written.items())
@@ -66,12 +70,12 @@ def describe(part: Points | Cells | Surface, kind: Kind) -> Piece:
 
 
 def write_whole(path: Path, pieces: Sequence[tuple[str, Piece]]) -> None:
-    """Write the file that makes one frame of pieces, atomically.
+    """Write the file that lists the parts of a frame, atomically.
 
     Args:
-        path: the file, whose suffix is that of `WHOLE`.
-        pieces: of one kind: their files, relative to `path`, and what is in them; empty ones count
-            only if all are.
+        path: the file, with a suffix of `WHOLE`.
+        pieces: parts of one kind: their files, relative to `path`, and their metadata; empty ones
+            are omitted unless all are empty.
 
     Raises:
         OSError: the file cannot be written.
@@ -90,19 +94,21 @@ def write_whole(path: Path, pieces: Sequence[tuple[str, Piece]]) -> None:
 
 
 def piece_files(path: Path) -> list[Path]:
-    """Return the files of the pieces that a file of `write_whole` names: of its own name, each in a rank's folder beside it.
+    """Return the files of the parts in a file of `write_whole`.
+
+    They have its own name, each in a rank's folder beside it.
 
     Raises:
         OSError: it cannot be read.
-        ValueError: it is no such file, or names others, or one twice.
+        ValueError: it is no such file, or lists other files, or one twice.
     """
     with read_back(path):
         kind = path.suffix.removeprefix(".p")
         pieces = root(
             read_whole(path), f"P{'ImageData' if kind == 'vti' else 'UnstructuredGrid'}"
         ).iter("Piece")
-        found = [Path(str(piece.get("Source"))) for piece in pieces]
-        for file in found:
+        sources = [Path(str(piece.get("Source"))) for piece in pieces]
+        for file in sources:
             own = (
                 len(file.parts) == 2
                 and RANK_FOLDER.fullmatch(file.parts[0])
@@ -113,16 +119,16 @@ def piece_files(path: Path) -> list[Path]:
                     f"names {str(file)!r}: a piece is rank_0000/{path.stem}.{kind} in its own "
                     "folder"
                 )
-        if len(set(found)) != len(found):
+        if len(set(sources)) != len(sources):
             raise ValueError("names a piece twice")
-        return [path.parent / file for file in found]
+        return [path.parent / file for file in sources]
 
 
 def one_mesh(meshes: Sequence[Mesh]) -> Mesh:
-    """Return the mesh of all pieces, of which there is at least one; empty ones need not have the kind of cells of the others.
+    """Return one mesh from those of all parts, at least one.
 
-    Pieces of a surface have the points on cuts twice, in the same place to the last bit: it comes
-    back with each once.
+    Empty parts may have another kind of cells. Parts of a surface have the points on cuts twice,
+    with equal bits; in the result each occurs once.
 
     Raises:
         ValueError: they have other fields or cells than each other.
@@ -147,7 +153,7 @@ def one_mesh(meshes: Sequence[Mesh]) -> Mesh:
 
 
 def one_grid(parts: Sequence[Cells]) -> Cells:
-    """Return the cells of all pieces, of which there is at least one, as one part.
+    """Return the cells of all parts, at least one, as one object.
 
     Raises:
         ValueError: they have other fields than each other.
@@ -171,7 +177,10 @@ def rank_folder(rank: int) -> str:
 
 
 def in_ranks(folder: Path) -> Iterator[Path]:
-    """Yield what is in a folder, and in the folders of ranks there; nothing if there is no such folder."""
+    """Yield the entries of a folder, and of the ranks' folders in it.
+
+    Nothing if there is no such folder.
+    """
     for path in folder.iterdir() if folder.is_dir() else ():
         if _is_rank(path):
             yield from path.iterdir()
@@ -180,7 +189,7 @@ def in_ranks(folder: Path) -> Iterator[Path]:
 
 
 def remove_empty_ranks(folder: Path) -> None:
-    """Delete the folders of ranks in a folder that hold nothing.
+    """Delete the empty folders of ranks in a folder.
 
     Raises:
         OSError: one cannot be deleted.
@@ -191,18 +200,18 @@ def remove_empty_ranks(folder: Path) -> None:
 
 
 def _sewn(mesh: Mesh) -> Mesh:
-    """Return a mesh with the points of one place as one point, the first of them."""
+    """Return a mesh with points at one position merged into the first of them."""
     places = (
         np.ascontiguousarray(mesh.points).view(np.dtype((np.void, mesh.points.strides[0]))).ravel()
     )
     _, first, place = np.unique(places, return_index=True, return_inverse=True)
-    kept, number = np.unique(first, return_inverse=True)
+    first_points, number = np.unique(first, return_inverse=True)
     fields = (
         mesh.fields
         if mesh.on_cells
-        else {name: values[kept] for name, values in mesh.fields.items()}
+        else {name: values[first_points] for name, values in mesh.fields.items()}
     )
-    return Mesh(mesh.points[kept], number[place][mesh.corners], fields, mesh.on_cells)
+    return Mesh(mesh.points[first_points], number[place][mesh.corners], fields, mesh.on_cells)
 
 
 def _mesh(pieces: Sequence[tuple[str, Piece]], first: Piece) -> Iterator[str]:
@@ -215,7 +224,10 @@ def _mesh(pieces: Sequence[tuple[str, Piece]], first: Piece) -> Iterator[str]:
 
 
 def _image(pieces: Sequence[tuple[str, Piece]], first: Piece) -> Iterator[str]:
-    """Yield a PVTI file; the pieces' boxes fill the image, so that even those without a shown cell count."""
+    """Yield a PVTI file.
+
+    The boxes of the parts must fill the image, so that parts without shown cells are included.
+    """
     corners = np.array([piece.image for _, piece in pieces])
     yield opening("PImageData").decode()
     whole = extent_of(corners[:, 0].min(axis=0), corners[:, 1].max(axis=0))

@@ -1,7 +1,7 @@
-"""PLY files of surfaces, which modelers such as Blender read.
+"""PLY files of surfaces, for modelers such as Blender.
 
-meshio writes such files too, but with the time of day in them, so that no two runs make the same
-bytes, and segments as faces of two corners.
+meshio writes such files too, but with the time of day in them, so that files of two runs differ in
+bytes, and with segments as faces of two corners.
 """
 
 from __future__ import annotations
@@ -28,12 +28,14 @@ HEADER_BYTES = 1000
 
 
 def write_ply(path: Path, surface: Surface) -> None:
-    """Write a surface as a binary PLY file, atomically: triangles as `face`, segments as `edge`.
+    """Write a surface as a binary PLY file, atomically.
+
+    Triangles are elements `face`, segments `edge`.
 
     Args:
         path: the file.
-        surface: its fields become properties of the vertices; vectors have one named for each axis,
-            such as `velocity_x`.
+        surface: its fields become properties of the vertices; vectors have one per axis, such as
+            `velocity_x`.
 
     Raises:
         OSError: the file cannot be written.
@@ -66,7 +68,7 @@ def write_ply(path: Path, surface: Surface) -> None:
 
 
 def ply_bytes(surface: Surface) -> int:
-    """Return about how many bytes the file of a surface takes."""
+    """Return the estimated size of the file of a surface [bytes]."""
     fields = sum(values.nbytes for values in surface.fields.values())
     return (
         HEADER_BYTES

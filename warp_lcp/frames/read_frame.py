@@ -1,4 +1,4 @@
-"""Read a frame of a run back, whatever its format, in one piece or in those of ranks."""
+"""Read a frame of a run, in any format, whole or in parts of ranks."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ READERS: dict[str, tuple[Callable[[Path], Any], Callable[[list[Any]], Any]]] = {
     "vti": (read_vti, one_grid),
 }
 MESHIO_READS = (suffix for suffix, name in FORMAT_OF.items() if name not in WRITTEN_ONLY)
-# suffixes of a part's file, the one that counts first
+# Suffixes of a part's file, in order of priority.
 READABLE = ("vti", "pvti", "pvtu", "vtu", *MESHIO_READS)
 
 
 def read_part(file: Path) -> Mesh | Cells:
-    """Return what is in a frame's file, or in the pieces that it names.
+    """Return the content of a frame's file, or of the parts that it lists.
 
     Raises:
         OSError: a file cannot be read.
@@ -51,7 +51,7 @@ def read_frame(file: str | PathLike[str]) -> Any:
     """Read a file of a run's `frames` as a `meshio.Mesh`.
 
     meshio itself reads neither VTU files without cells, as frames before the first drop are, nor
-    VTI files, nor files that name the pieces of ranks; all of these are read here, and other
+    VTI files, nor files that list parts of ranks. This function reads all of these, and other
     formats of `output.format`. Volumes are not meshes: see `wp.Volume.load_from_nvdb`.
 
     Args:

@@ -1,4 +1,4 @@
-"""VTI files: cells as an image, in which those that are not shown are hidden."""
+"""VTI files: cells as an image with hidden cells."""
 
 from __future__ import annotations
 
@@ -24,17 +24,19 @@ from warp_lcp.frames.vtk_xml import (
 from warp_lcp.simulation import Cells
 
 HIDDEN = 32  # vtkDataSetAttributes::HIDDENCELL
-GHOSTS = "vtkGhostType"  # the array by whose name VTK knows which cells are hidden
+GHOSTS = "vtkGhostType"  # name of VTK's array of hidden cells
 APPENDED = b'<AppendedData encoding="raw">\n_'
 XML_BYTES = 1000
 
 
 def write_vti(path: Path, cells: Cells) -> None:
-    """Write cells as a VTI file: fields over the whole grid (0 in hidden cells), raw bytes behind the text, atomically.
+    """Write cells as a VTI file, atomically.
+
+    Fields cover the whole grid (0 in hidden cells), as raw bytes after the text.
 
     Args:
         path: the file.
-        cells: the cells that are shown; without `counts` the image is the box around them.
+        cells: the shown cells; without `counts` the image is the box around them.
 
     Raises:
         OSError: the file cannot be written.
@@ -58,17 +60,20 @@ def write_vti(path: Path, cells: Cells) -> None:
 
 
 def image_end(low: np.ndarray, counts: np.ndarray, dimension: int) -> np.ndarray:
-    """Return the last corner of an image [cells] that begins at the corner `low`; one of pixels has no extent along z."""
+    """Return the last corner of an image [cells] from its first corner `low`.
+
+    An image of pixels has no extent along z.
+    """
     return low + np.where(np.arange(3) < dimension, counts, 0)
 
 
 def extent_of(low: np.ndarray, end: np.ndarray) -> str:
-    """Return an image's first and last corner as VTK writes them."""
+    """Return an image's first and last corner in VTK's format."""
     return " ".join(f"{a} {b}" for a, b in zip(low, end, strict=True))
 
 
 def vti_bytes(cells: Cells) -> int:
-    """Return how many bytes the file of cells takes, or a little more."""
+    """Return an upper estimate of the size of the file of cells [bytes]."""
     each = sum(
         values.itemsize * values[:1].size if len(values) else 8 for values in cells.fields.values()
     )
@@ -76,14 +81,16 @@ def vti_bytes(cells: Cells) -> int:
 
 
 def read_vti(path: Path) -> Cells:
-    """Return the cells that a file of `write_vti` shows; without `counts`, which it does not tell from the box around the cells.
+    """Return the shown cells of a file of `write_vti`, without `counts`.
+
+    The file does not tell `counts` from the box around the cells.
 
     Args:
-        path: the file; its name up to the last _ is the cells'.
+        path: the file; its name up to the last _ is that of the cells.
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: it is no such file, or cut short.
+        ValueError: it is no such file, or truncated.
     """
     with read_back(path):
         text, mark, data = read_whole(path).partition(APPENDED)
@@ -114,7 +121,7 @@ def read_vti(path: Path) -> Cells:
 
 
 def image_box(cells: Cells) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first cell of the image of cells, and its numbers of cells along x, y and z."""
+    """Return the first cell of the image, and its cells along x, y and z."""
     if cells.box is not None:
         low, high = np.array(cells.box)
         return low, high - low
@@ -134,15 +141,15 @@ def _vti(
     flat: np.ndarray,
     size: int,
 ) -> Iterator[bytes | memoryview]:
-    """Yield the parts of a VTI file; one field at a time is in memory as all cells of the image have it.
+    """Yield the parts of a VTI file, with one field at a time in memory.
 
     Args:
         low: first corner of the image [cells].
         end: its last corner.
-        spacing: of the cells [m].
-        fields: of the cells that are shown.
-        flat: their numbers in the image.
-        size: cells of the image.
+        spacing: cell size [m].
+        fields: values in the shown cells.
+        flat: flat indices of the shown cells in the image.
+        size: number of cells of the image.
     """
     hidden = np.zeros(1, dtype=np.uint8)
     extent = extent_of(low, end)

@@ -1,4 +1,4 @@
-"""Arrays as VTK's XML files hold them: their types, and their bytes as base64 text; and the same read back, whatever a file holds."""
+"""Arrays in VTK's XML files: types, base64 text, and safe reading."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ import numpy as np
 
 from warp_lcp.simulation import Cells, Points, Surface
 
-# bytes encoded at a time, a multiple of 3: memory stays small, and other threads go on in between
+# Bytes encoded at a time, a multiple of 3: memory stays small, and other threads run in between.
 ENCODED = 3 * 2**18
 TYPE = re.compile(r"(?P<kind>Float|Int|UInt)(?P<bits>8|16|32|64)")
-LENGTH_BYTES = 8  # before each array, as header_type says
+LENGTH_BYTES = 8  # before each array, see header_type
 
 
 def opening(kind: str) -> bytes:
-    """Return what a VTK file begins with.
+    """Return the beginning of a VTK file.
 
     Args:
-        kind: of the data set, such as `ImageData`.
+        kind: type of the data set, such as `ImageData`.
     """
     return (
         f'<?xml version="1.0"?>\n<VTKFile type="{kind}" version="1.0" byte_order="LittleEndian" '
@@ -32,12 +32,14 @@ def opening(kind: str) -> bytes:
 
 
 def writable(name: str, values: np.ndarray, size: int) -> np.ndarray:
-    """Return a field in a type that VTK has (there are no booleans and no half floats), little-endian and contiguous.
+    """Return a field in a type of VTK, little-endian and contiguous.
+
+    VTK has neither booleans nor half floats.
 
     Args:
-        name: of the field.
+        name: name of the field.
         values: shape (size,) or (size, 3).
-        size: points or cells.
+        size: number of points or cells.
 
     Raises:
         ValueError: the field has another length.
@@ -52,13 +54,13 @@ def writable(name: str, values: np.ndarray, size: int) -> np.ndarray:
 
 
 def writable_fields(part: Points | Cells | Surface) -> tuple[int, dict[str, np.ndarray]]:
-    """Return how many points or cells a part has, and its fields as `writable` makes them."""
+    """Return the number of points or cells of a part, and its writable fields."""
     size = len(part.index if isinstance(part, Cells) else part.points)
     return size, {name: writable(name, values, size) for name, values in part.fields.items()}
 
 
 def attributes(name: str, values: np.ndarray) -> str:
-    """Return the attributes of a data array that do not depend on where its bytes are."""
+    """Return the attributes of a data array, except its offset."""
     kind = {"f": "Float", "i": "Int", "u": "UInt"}[values.dtype.kind] + str(
         8 * values.dtype.itemsize
     )
@@ -67,25 +69,27 @@ def attributes(name: str, values: np.ndarray) -> str:
 
 
 def length(values: np.ndarray) -> bytes:
-    """Return what stands before an array's bytes: how many they are."""
+    """Return the length prefix of an array's bytes."""
     return values.nbytes.to_bytes(LENGTH_BYTES, "little")
 
 
 def raw(values: np.ndarray) -> memoryview:
-    """Return the bytes of an array that is contiguous, without copying them."""
+    """Return the bytes of a contiguous array, without a copy."""
     return values.reshape(-1).view(np.uint8).data
 
 
 def inline(name: str, values: np.ndarray) -> Iterator[bytes]:
-    """Yield a data array whose bytes stand in it as base64 text: what every reader of VTK's files understands, meshio among them.
+    """Yield a data array with base64 text inside.
+
+    Every reader of VTK's files supports it, including meshio.
 
     Args:
-        name: of the array.
+        name: name of the array.
         values: little-endian and contiguous, shape (n,) or (n, components).
     """
     data = raw(values)
     yield f'<DataArray {attributes(name, values)} format="binary">'.encode()
-    head = -LENGTH_BYTES % 3  # with so many bytes of the array the length fills whole groups of 3
+    head = -LENGTH_BYTES % 3  # bytes of the array that complete the length to groups of 3
     yield base64.b64encode(length(values) + bytes(data[:head]))
     for begin in range(head, len(data), ENCODED):
         yield base64.b64encode(data[begin : begin + ENCODED])
@@ -94,11 +98,11 @@ def inline(name: str, values: np.ndarray) -> Iterator[bytes]:
 
 @contextmanager
 def read_back(path: Path) -> Iterator[None]:
-    """Turn what is wrong in a file, while it is read, into one error that names it.
+    """Convert errors while a file is read into one that names it.
 
     Raises:
         OSError: it cannot be read.
-        ValueError: it is not what a run writes.
+        ValueError: it is not a file of a run.
     """
     try:
         yield
@@ -117,11 +121,11 @@ def read_back(path: Path) -> Iterator[None]:
 
 
 def root(text: bytes, kind: str) -> ElementTree.Element:
-    """Return the data set of a file that `opening` began.
+    """Return the data set of a file that starts with `opening`.
 
     Raises:
-        ValueError: it is another one, or declares entities, of which a few bytes may become any
-            number.
+        ValueError: it is another type, or declares entities, which can expand a few bytes without
+            limit.
         ParseError: it is not XML.
     """
     if b"<!" in text:
@@ -155,15 +159,15 @@ def data_type(array: ElementTree.Element) -> np.dtype:
 
 
 def array_values(array: ElementTree.Element, data: bytes, at: int = 0) -> np.ndarray:
-    """Return a data array, shape (n,) or (n, components), from bytes that begin with its length.
+    """Return a data array, shape (n,) or (n, components), from length and bytes.
 
     Args:
         array: its attributes.
         data: the bytes.
-        at: where they begin.
+        at: offset of the length in the bytes.
 
     Raises:
-        ValueError: they are fewer than their length says, or do not make whole rows.
+        ValueError: there are fewer bytes than the length says, or no whole rows.
     """
     dtype, components = data_type(array), int(array.get("NumberOfComponents", "1"))
     size = int.from_bytes(data[at : at + LENGTH_BYTES], "little")
@@ -178,10 +182,10 @@ def array_values(array: ElementTree.Element, data: bytes, at: int = 0) -> np.nda
 
 
 def inline_values(array: ElementTree.Element) -> np.ndarray:
-    """Return a data array that `inline` wrote.
+    """Return a data array written by `inline`.
 
     Raises:
-        ValueError: it is none.
+        ValueError: it is no such array.
     """
     if array.get("format") != "binary":
         raise ValueError(f"{array.get('Name')!r} is not base64 text")

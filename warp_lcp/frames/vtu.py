@@ -1,4 +1,7 @@
-"""VTU files: particles as vertices, surfaces as triangles or segments, cells as quadrilaterals or hexahedra."""
+"""VTU files of particles, surfaces and cells.
+
+Particles are vertices, surfaces triangles or segments, cells quadrilaterals or hexahedra.
+"""
 
 from __future__ import annotations
 
@@ -25,23 +28,23 @@ from warp_lcp.simulation import Cells, Points, Surface
 CORNERS = np.array(
     [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]]
 )
-# vertex, line, triangle, quadrilateral and hexahedron by their corners
+# Vertex, line, triangle, quadrilateral and hexahedron by number of corners.
 VTK_TYPES = {1: 1, 2: 3, 3: 5, 4: 9, 8: 12}
 VTK_CORNERS = {kind: corners for corners, kind in VTK_TYPES.items()}
-BASE64 = 4 / 3  # what the encoding adds to the bytes
-XML_BYTES = 2000  # of the text around the arrays
+BASE64 = 4 / 3  # size of the encoding relative to the bytes
+XML_BYTES = 2000  # text around the arrays
 OFFSET_BYTES, TYPE_BYTES, POINT_BYTES = 4, 1, 12
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """What a VTU file holds.
+    """Content of a VTU file.
 
     Args:
         points: [m], shape (n, 3).
-        corners: of the cells among them, shape (m, corners of a cell).
-        fields: at the points, or in the cells, of shape (n,) or (n, 3).
-        on_cells: the fields are those of cells.
+        corners: point indices of the cells, shape (m, corners of a cell).
+        fields: values at the points, or in the cells, of shape (n,) or (n, 3).
+        on_cells: whether the fields belong to cells.
     """
 
     points: np.ndarray
@@ -51,10 +54,11 @@ class Mesh:
 
 
 def write_vtu(path: Path, part: Points | Cells | Surface) -> None:
-    """Write a part of a frame as a VTU file: binary, uncompressed (compression takes three times as long as writing), atomically.
+    """Write a part of a frame as a VTU file, atomically.
 
-    The arrays are base64 text. Appended raw bytes would take 3/4 of the room and 0.6 to 0.8 of the
-    time, but meshio cannot read them.
+    Binary and uncompressed: compression takes three times as long as writing. The arrays are base64
+    text. Appended raw bytes would have 3/4 of the size and take 0.6 to 0.8 of the time, but meshio
+    cannot read them.
 
     Args:
         path: the file.
@@ -75,7 +79,9 @@ def write_vtu(path: Path, part: Points | Cells | Surface) -> None:
 
 
 def mesh_of(part: Points | Cells | Surface) -> Mesh:
-    """Return the mesh of a part, its fields in types that VTK has: points are vertices, cells share their corners.
+    """Return the mesh of a part, its fields in types of VTK.
+
+    Points are vertices; cells share their corners.
 
     Raises:
         ValueError: a field has another length than the points or cells.
@@ -97,11 +103,11 @@ def mesh_of(part: Points | Cells | Surface) -> Mesh:
 
 
 def read_vtu(path: Path) -> Mesh:
-    """Return what a file of `write_vtu` holds.
+    """Return the content of a file of `write_vtu`.
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: it is no such file, or cut short.
+        ValueError: it is no such file, or truncated.
     """
     with read_back(path):
         piece = root(read_whole(path, copies=3), "UnstructuredGrid").find("Piece")
@@ -130,20 +136,26 @@ def read_vtu(path: Path) -> Mesh:
 
 
 def vtu_bytes(part: Points | Cells | Surface) -> int:
-    """Return about how many bytes the file of a part takes; no less for points, a little more for cells that share corners."""
+    """Return the estimated size of the file of a part [bytes].
+
+    It is exact for points, an upper estimate for cells that share corners.
+    """
     total = XML_BYTES + sum(values.nbytes for values in part.fields.values())
     if isinstance(part, Points):
         points, cells, each = part.points.nbytes, len(part.points), 1
     elif isinstance(part, Surface):
         points, (cells, each) = part.points.nbytes, part.corners.shape
     else:
-        # about two corner points a cell
+        # About two corner points per cell.
         points, cells, each = len(part.index) * 2 * POINT_BYTES, len(part.index), 2**part.dimension
     return int(BASE64 * (total + points + cells * (4 * each + OFFSET_BYTES + TYPE_BYTES)))
 
 
 def _corners(cells: Cells) -> tuple[np.ndarray, np.ndarray]:
-    """Return the corner points [m] (float32, shape (m, 3)) and each cell's corners among them, shape (n, 4) or (n, 8)."""
+    """Return corner points and each cell's corner indices.
+
+    Points [m] in float32, shape (m, 3); indices of shape (n, 4) or (n, 8).
+    """
     each = 2**cells.dimension
     if len(cells.index) == 0:
         return np.zeros((0, 3), dtype="<f4"), np.zeros((0, each), dtype="<i4")
@@ -152,7 +164,7 @@ def _corners(cells: Cells) -> tuple[np.ndarray, np.ndarray]:
     strides = np.array([shape[1] * shape[2], shape[2], 1])
     x, y, z = (cells.index - low).T
     flat = ((x * shape[1] + y) * shape[2] + z)[:, None] + CORNERS[:each] @ strides
-    # a table over the bounding box: much faster than sorting the corners
+    # A table over the bounding box: much faster than sorting the corners.
     used = np.zeros(shape.prod(), dtype=bool)
     used[flat] = True
     number = np.cumsum(used, dtype="<i4")
@@ -166,7 +178,10 @@ def _corners(cells: Cells) -> tuple[np.ndarray, np.ndarray]:
 def _vtu(
     points: np.ndarray, corners: np.ndarray, fields: dict[str, np.ndarray], where: str
 ) -> Iterator[bytes]:
-    """Yield the parts of a VTU file. One without points still names its fields, so that a viewer finds them in every frame."""
+    """Yield the parts of a VTU file.
+
+    A file without points also lists its fields, so that a viewer finds them in every frame.
+    """
     count, each = corners.shape
     yield opening("UnstructuredGrid")
     yield (

@@ -1,4 +1,4 @@
-"""Problems to try methods on, each deterministic by its seed; most with a known solution."""
+"""Test problems for methods, deterministic by seed; most with a known solution."""
 
 from warp_lcp.gallery.contact_models import (
     BoxedModel,

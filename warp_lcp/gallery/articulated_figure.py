@@ -17,24 +17,24 @@ Z = (0.0, 0.0, 1.0)
 class ArticulatedFigure:
     """Tree of hinges ([Book] 1.3.4).
 
-    Each hinge turns its link about an axis fixed in its parent's link.
-
-    With R_j = R_parent Rot(axis_j, theta_j) and p_j = p_parent + R_parent offset_j, an end effector
-    on link j is at p_j + R_j tip.
+    Each hinge rotates its link about an axis fixed in its parent's link. With R_j = R_parent
+    Rot(axis_j, theta_j) and p_j = p_parent + R_parent offset_j, an end effector on link j is at p_j
+    + R_j tip.
 
     Args:
-        parents: of each hinge, the hinge before it on the way to the root; -1 for a hinge on the
-            fixed root; parents come first.
+        parents: parent of each hinge, the previous one from the root; -1 for a hinge on the fixed
+            root; parents come first.
         axes: unit vectors in the parent's frame, shape (n, 3).
-        offsets: places of the hinges in the parent's frame [m], shape (n, 3).
-        effectors: the hinges whose links carry end effectors.
-        tips: places of the end effectors in their links' frames [m], shape (e, 3).
+        offsets: positions of the hinges in the parent's frame [m], shape (n, 3).
+        effectors: the hinges whose links have end effectors.
+        tips: positions of the end effectors in their links' frames [m], shape (e, 3).
         lower: least angles [rad], shape (n,), may be -inf.
         upper: largest angles [rad], shape (n,), may be inf.
-        dimension: 3, or 2: figures in the x-y plane, all of whose axes are z.
+        dimension: 3, or 2 for figures in the x-y plane, in which all axes are z.
 
     Raises:
-        ValueError: a shape, a parent, an axis or a limit is wrong; the message names the argument.
+        ValueError: a shape, a parent, an axis or a limit is invalid; the message names the
+            argument.
 
     Example:
         >>> figure = planar_chain([2.0, 1.0])
@@ -108,20 +108,23 @@ class ArticulatedFigure:
     def reach(self) -> float:
         """Length of the longest path from the first hinge to an end effector [m].
 
-        The length scale of errors and angles.
+        It is the length scale of errors and angles.
         """
         links = np.linalg.norm(self.offsets, axis=1) * (np.array(self.parents) >= 0)
         return float((self.ancestors @ links + np.linalg.norm(self.tips, axis=1)).max())
 
     def _frames(self, theta: Vector) -> tuple[Vector, Vector, Vector]:
-        """Return the hinges' places (n, 3), their axes (n, 3) and the end effectors (e, 3), in the world."""
+        """Return positions (n, 3) and axes (n, 3) of hinges, and end effectors (e, 3).
+
+        In world coordinates.
+        """
         own = Rotation.from_rotvec(theta[:, None] * self.axes).as_matrix()
         places, turns = self.offsets.copy(), own.copy()
         for j, parent in enumerate(self.parents):
             if parent >= 0:
                 places[j] = places[parent] + turns[parent] @ self.offsets[j]
                 turns[j] = turns[parent] @ own[j]
-        axes = np.einsum("nij,nj->ni", turns, self.axes)  # a hinge does not turn its own axis
+        axes = np.einsum("nij,nj->ni", turns, self.axes)  # a hinge does not rotate its own axis
         carriers = list(self.effectors)
         return places, axes, places[carriers] + np.einsum("eij,ej->ei", turns[carriers], self.tips)
 
@@ -132,7 +135,7 @@ class ArticulatedFigure:
     def jacobian(self, theta: Vector) -> Vector:
         """Return the Jacobian df/dtheta [m], shape (e dimension, n).
 
-        a_j x (f_i - p_j) where hinge j moves effector i, else 0.
+        It is a_j x (f_i - p_j) if hinge j moves effector i, else 0.
         """
         places, axes, ends = self._frames(theta)
         arms = np.cross(axes[None], ends[:, None] - places[None]) * self.ancestors[..., None]
@@ -141,8 +144,8 @@ class ArticulatedFigure:
     def curvature(self, theta: Vector, weights: Vector) -> Vector:
         """Return sum_k w_k d^2 f_k / dtheta^2 [m^2], shape (n, n), symmetric.
 
-        d^2 f_i / dtheta_j dtheta_k = a_j x (a_k x (f_i - p_k)), j on k's way to the root or k
-        itself, and k on effector i's.
+        d^2 f_i / dtheta_j dtheta_k = a_j x (a_k x (f_i - p_k)), with j on the path from k to the
+        root, or k itself, and k on the path of effector i.
 
         Args:
             theta: angles [rad], shape (n,).
@@ -154,7 +157,8 @@ class ArticulatedFigure:
         arms = np.cross(axes[None], ends[:, None] - places[None]) * self.ancestors[..., None]
         # w . (a_j x arm_k) = (w x a_j) . arm_k
         second = np.einsum("ekc,ejc->jk", arms, np.cross(w[:, None], axes[None]))
-        above = np.zeros((self.hinges, self.hinges), dtype=bool)  # j is k or on its way to the root
+        # J is k or on its path to the root.
+        above = np.zeros((self.hinges, self.hinges), dtype=bool)
         for k, parent in enumerate(self.parents):
             above[:, k] = above[:, parent] if parent >= 0 else False
             above[k, k] = True
@@ -168,8 +172,8 @@ def planar_chain(
     """Return a chain in the x-y plane that lies along x at theta = 0.
 
     Args:
-        lengths: of the links [m].
-        lower: least angles [rad], a number or one a link.
+        lengths: lengths of the links [m].
+        lower: least angles [rad], a number or one per link.
         upper: largest angles [rad], likewise.
     """
     n = len(lengths)
@@ -196,8 +200,8 @@ def spatial_chain(
     The axes of its hinges are z, y, x, z, y, x and so on.
 
     Args:
-        lengths: of the links [m].
-        lower: least angles [rad], a number or one a link.
+        lengths: lengths of the links [m].
+        lower: least angles [rad], a number or one per link.
         upper: largest angles [rad], likewise.
     """
     flat = planar_chain(lengths, lower=lower, upper=upper)
@@ -210,10 +214,9 @@ def spatial_chain(
 def branching_figure() -> ArticulatedFigure:
     """Return the upper half of a body with three end effectors.
 
-    A spine of 3 hinges, two arms of 5 and a head of 2.
-
-    y is up at theta = 0, with the arms hanging out sideways; 1 m from hip to shoulders and to a
-    hand; limits are a person's, roughly.
+    A spine of 3 hinges, two arms of 5 and a head of 2. At theta = 0, y is up and the arms point
+    sideways; the distance from hip to shoulders, and from shoulder to hand, is 1 m; limits are
+    roughly those of a person.
     """
     x, y, z = np.eye(3)
     joints: list[tuple[int, Vector, Vector, float, float]] = [  # parent, axis, offset, limits

@@ -1,9 +1,7 @@
 """Models of Coulomb friction: polyhedral-cone LCP, boxed problem, proximal map.
 
-See [Book] 1.3.5.
-
-All start from a `ContactSystem`: relative velocities at the contacts after impulses r, u = B r + q,
-whatever made them.
+See [Book] 1.3.5. All models start from a `ContactSystem`: relative velocities at the contacts after
+impulses r, u = B r + q, of any origin.
 """
 
 from __future__ import annotations
@@ -27,17 +25,17 @@ class ContactSystem:
     contacts.
 
     Args:
-        name: of the scene.
+        name: name of the scene.
         B: J M^-1 J', symmetric positive semi-definite [1/kg], scipy.sparse, shape (dim k + m, dim k
             + m).
         q: velocities without impulses, plus position correction [m/s], shape (dim k + m,).
         friction: coefficient mu >= 0 of each contact, shape (k,).
-        lower: least impulse of each joint row [N s], shape (m,); none where -inf.
-        upper: the largest one.
+        lower: least impulse of each joint row [N s], shape (m,); -inf without a bound.
+        upper: largest impulse.
         dim: 3 in space, 2 in the plane.
 
     Raises:
-        ValueError: shapes do not fit, or a coefficient is negative.
+        ValueError: shapes do not match, or a coefficient is negative.
     """
 
     name: str
@@ -83,8 +81,8 @@ class ContactSystem:
     def blocks(self, most: int = 5) -> list[np.ndarray]:
         """Return the rows of each contact, then blocks of the joints' rows.
 
-        Equations that follow each other share a block of at most `most` rows; bounded rows stand
-        alone.
+        Consecutive equations share a block of at most `most` rows; bounded rows have blocks of
+        their own.
         """
         blocks = list(np.arange(self.dim * self.contacts).reshape(self.contacts, self.dim))
         free = np.isinf(self.lower) & np.isinf(self.upper)
@@ -100,21 +98,19 @@ class ContactSystem:
     def staggered(self) -> list[np.ndarray]:
         """Return two blocks of rows: normal impulses with joints, and friction.
 
-        There is one block if there is no contact.
+        Only the first block if there is no contact.
         """
         blocks = [np.concatenate([self.normals, self.joints]), self.tangents.ravel()]
         return [block for block in blocks if block.size]
 
     def residual(self, r: np.ndarray) -> float:
-        """Return the norm of the proximal map's defect at r, in m/s.
+        """Return the residual norm of the proximal map at r [m/s].
 
-        The map projects onto the circular cone.
-
-        With u = B r + q and d a contact's mean diagonal of B: d (r_n - max(0, r_n - u_n / d)), and
-        for friction the same with the projection onto |r_t| <= mu r_n ([Book] 1.1.4, 1.3.5; the
-        disk of the true normal impulse). 0 exactly where Coulomb's law holds: r_n >= 0, u_n >= 0,
-        r_n u_n = 0, and r_t is in the disk and opposite to u_t where that is not 0. Joint rows are
-        clipped.
+        The map projects onto the circular cone. With u = B r + q and d a contact's mean diagonal of
+        B, the residual is d (r_n - max(0, r_n - u_n / d)), and for friction the same with the
+        projection onto |r_t| <= mu r_n ([Book] 1.1.4, 1.3.5; the disk of the true normal impulse).
+        It is 0 exactly if Coulomb's law holds: r_n >= 0, u_n >= 0, r_n u_n = 0, and r_t is in the
+        disk, and opposite to u_t if u_t is not 0. Joint rows are clipped.
         """
         u, d = self.B @ r + self.q, np.abs(self.B.diagonal())
         d = np.where(d > 0, d, 1.0)
@@ -155,13 +151,12 @@ class ContactModel(Protocol):
 
 @dataclass(frozen=True)
 class BoxedModel:
-    """Boxed friction model: |r_t| <= mu r_n for each tangent alone.
+    """Boxed friction model: |r_t| <= mu r_n for each tangent separately.
 
-    Bounds are affine in r_n ([Book] 1.3.5).
-
-    The cone has four sides and its friction up to sqrt(2) mu along diagonals, and friction does not
-    oppose the slip exactly. The problem is symmetric positive semi-definite, with n = dim k + m
-    unknowns, and for methods that take affine bounds.
+    Bounds are affine in r_n ([Book] 1.3.5). The cone has four sides and allows friction up to
+    sqrt(2) mu along diagonals, and friction is not exactly opposite to the slip. The problem is
+    symmetric positive semi-definite, with n = dim k + m unknowns, for methods that support affine
+    bounds.
     """
 
     def problem(self, system: ContactSystem) -> Problem:
@@ -197,10 +192,10 @@ class BoxedModel:
 class FrozenBoxModel(BoxedModel):
     """Boxed friction model with given normal impulses s: |r_t| <= mu s.
 
-    Bounds are constants, so any method for boxed problems may solve it.
+    Bounds are constants, so any method for boxed problems can solve it.
 
     Args:
-        normal: s of each contact [N s], shape (k,).
+        normal: impulse s of each contact [N s], shape (k,).
     """
 
     normal: np.ndarray = field(default_factory=lambda: np.zeros(0))
@@ -218,20 +213,20 @@ class FrozenBoxModel(BoxedModel):
 
 @dataclass(frozen=True)
 class StewartTrinkleModel:
-    """The LCP of Stewart and Trinkle with a cone of K sides.
+    """LCP of Stewart and Trinkle with a friction cone of K sides.
 
-    [Book] 1.3.5, eqs. 1.146-1.147.
+    [Book] 1.3.5, eqs. 1.146-1.147. Friction is a sum of non-negative impulses along K unit vectors,
+    evenly spaced around the normal. With the slip speed beta, a contact has the rows y_n = u_n, y_t
+    = u_t + beta, y_beta = mu x_n - sum of x_t, each complementary to its x >= 0. With the sign of
+    the last row the matrix is [B_nn, B_nt, 0; B_tn, B_tt, e; mu, -e', 0]. It is not symmetric, the
+    diagonal of beta is 0, and it is copositive: a problem for Lemke's method and Newton-type
+    methods, with (2 + K) k + m unknowns.
 
-    Friction is a sum of non-negative impulses along K unit vectors evenly around the normal; with
-    beta, the slip speed, a contact has the rows y_n = u_n, y_t = u_t + beta, y_beta = mu x_n - sum
-    of x_t, each complementary to its x >= 0. The last sign makes it
-    [B_nn, B_nt, 0; B_tn, B_tt, e; mu, -e', 0]. Not symmetric, beta's diagonal is 0, copositive:
-    Lemke's method and Newton-type methods. Unknowns: (2 + K) k + m. The cone lies inside the
-    circular one and touches it along the K vectors; its sides recede by the factor cos(pi / K). In
-    the plane the vectors are +-t, K = 2, whatever `directions` is.
+    The cone lies inside the circular one and touches it along the K vectors; its sides are nearer
+    by the factor cos(pi / K). In the plane the vectors are +-t, K = 2, whatever `directions` is.
 
     Args:
-        directions: K, even; 2 are opposite, and friction acts along one tangent alone.
+        directions: K, even; with 2 opposite ones, friction acts along one tangent only.
 
     Raises:
         ValueError: K is odd, or less than 2.
@@ -240,7 +235,7 @@ class StewartTrinkleModel:
     directions: int = 4
 
     def __post_init__(self) -> None:
-        """Check that K is even and there are two at least."""
+        """Check that K is even and at least 2."""
         if self.directions < 2 or self.directions % 2:
             raise ValueError(f"directions = {self.directions}: must be an even number >= 2")
 
@@ -254,7 +249,7 @@ class StewartTrinkleModel:
     def unfold(self, system: ContactSystem) -> scipy.sparse.csr_array:
         """Return the matrix T of r = T'x; shape (unknowns, rows of B).
 
-        Impulses are r = T'x of the unknowns x, velocities along the vectors T u.
+        Impulses are r = T'x for the unknowns x, velocities along the vectors T u.
         """
         each = np.vstack([self.spread(system.dim), np.zeros(system.dim)])
         blocks = [
@@ -264,7 +259,11 @@ class StewartTrinkleModel:
         return scipy.sparse.csr_array(scipy.sparse.block_diag(blocks))
 
     def problem(self, system: ContactSystem) -> Problem:
-        """Return the LCP; it is mixed if joints have equations."""
+        """Return the LCP; it is mixed if joints have equations.
+
+        A = T B T' plus the entries of the cones: 1 in the rows of x_t and -1 in the row of beta,
+        and mu in the row of beta at x_n.
+        """
         k, m, T = system.contacts, len(system.lower), self.unfold(system)
         K = len(self.spread(system.dim)) - 1
         beta = np.zeros((2 + K, 2 + K))
@@ -299,7 +298,7 @@ class StewartTrinkleModel:
     def guess(self, system: ContactSystem, r: np.ndarray) -> np.ndarray:
         """Return a first guess whose impulses are near r.
 
-        Friction is split onto the two nearest vectors; beta comes from the slip at r.
+        Friction is split onto the two nearest vectors; beta is the slip speed at r.
         """
         k, dim, spread = system.contacts, system.dim, self.spread(system.dim)
         rows, own = dim * k, r[: dim * k].reshape(k, dim)
@@ -332,18 +331,17 @@ def proximal_sweeps(
 ) -> tuple[np.ndarray, float, int]:
     """Solve the proximal form with the circular cone by Gauss-Seidel sweeps.
 
-    Over contacts, on the host ([Book] 1.1.4, 1.3.5).
-
-    r_n <- max(0, r_n - u_n / B_nn), then r_t <- proj(r_t - u_t / rho) onto |r_t| <= mu r_n with rho
-    the largest eigenvalue of the contact's B_tt; joint rows <- clip(r - u / B_ii). No proof of
-    convergence for mu > 0; the reference for the polyhedral cones here, in systems of up to some
-    hundred contacts.
+    The sweeps are over contacts, on the host ([Book] 1.1.4, 1.3.5): r_n <- max(0, r_n - u_n /
+    B_nn), then r_t <- proj(r_t - u_t / rho) onto |r_t| <= mu r_n, with rho the largest eigenvalue
+    of the contact's B_tt; joint rows <- clip(r - u / B_ii). Convergence is not proven for mu > 0.
+    The result is the reference for the polyhedral cones here, in systems of up to some hundred
+    contacts.
 
     Args:
         system: the contact system.
-        tolerance: of `system.residual`, relative to that at r = 0.
-        most: sweeps.
-        r0: first impulses; 0 if None.
+        tolerance: limit of `system.residual`, relative to that at r = 0.
+        most: limit of sweeps.
+        r0: initial impulses; 0 if None.
 
     Returns:
         r, the residual at r [m/s], and the number of sweeps.

@@ -1,9 +1,8 @@
 """Contact scenes of the book's figures 2.9 and 2.11.
 
-Stacks, walls, heavy on light bodies, chains of hinges, inclines, gears, motors.
-
-Each makes a `World`, deterministic by its seed, in meters and kilograms; `contact_scene` makes a
-problem of one by its name.
+Stacks, walls, heavy on light bodies, chains of hinges, inclines, gears, motors. Each function
+returns a `World`, deterministic by its seed, in meters and kilograms; `contact_scene` returns the
+problem of a scene by name.
 """
 
 from __future__ import annotations
@@ -32,13 +31,13 @@ from warp_lcp.solvers.nncg import NNCG
 
 DENSITY = 1000.0  # [kg/m^3]
 Y_AXIS = np.array([0.0, 1.0, 0.0])
-BARS = 3  # of a gear, which has twice as many teeth
-LINK = (0.2, 0.12, 0.08)  # half sides of a snake's [m]
+BARS = 3  # bars of a gear, which has twice as many teeth
+LINK = (0.2, 0.12, 0.08)  # half sides of a snake's links [m]
 Vector = Sequence[float] | np.ndarray
 
 
 def box(center: Vector, half: Vector, turn: Rotation | None = None) -> Box:
-    """Return a box by its center and half sides [m], turned about the center."""
+    """Return a box by its center and half sides [m], rotated about the center."""
     place = Placement(
         rotation=(turn or Rotation.identity()).as_matrix(), translation=np.array(center)
     )
@@ -48,7 +47,7 @@ def box(center: Vector, half: Vector, turn: Rotation | None = None) -> Box:
 def gear(center: Vector, half: Vector, phase: float) -> list[Box]:
     """Return a gear of crossed bars in the xz plane.
 
-    BARS bars of half sides [m], the first at an angle [rad].
+    It has BARS bars of given half sides [m], the first at an angle [rad].
     """
     return [
         box(
@@ -109,8 +108,7 @@ def box_stack(count: int = 10, *, seed: int = 2015) -> World:
 def wall(rows: int = 4, *, columns: int = 4, seed: int = 2015) -> World:
     """Return a wall of bricks in running bond.
 
-    Bricks are 1:0.5:0.5, every second row has half bricks at its ends, densities are within a
-    tenth.
+    Bricks are 1:0.5:0.5, every second row has half bricks at its ends, densities vary by a tenth.
 
     Raises:
         ValueError: rows or columns are missing.
@@ -168,10 +166,13 @@ def heavy_on_light(layers: int = 2, *, ratio: float = 1000.0, seed: int = 2015) 
 
 
 def _arch(links: int) -> tuple[list[Box], list[np.ndarray], np.ndarray]:
-    """Return half a regular polygon of links that stands on z = 0, the points between them, and the center of the one on top."""
+    """Return half a regular polygon of links standing on z = 0.
+
+    Also the points between the links, and the center of the top link.
+    """
     step = np.pi / links
     radius = LINK[0] / np.tan(step / 2)
-    # the first link leans by step / 2: its lowest corner is that far below its end
+    # The first link is tilted by step / 2: its lowest corner is that far below its end.
     up = np.array([0.0, 0.0, LINK[2] * np.sin(step / 2)])
 
     def at(distance: float, angle: float) -> np.ndarray:
@@ -184,27 +185,28 @@ def _arch(links: int) -> tuple[list[Box], list[np.ndarray], np.ndarray]:
 
 
 def _chain(points: Sequence[Vector], limits: np.ndarray) -> tuple[Joint, ...]:
-    """Return hinges between bodies that follow each other, which turn by up to a limit [rad] each either way."""
+    """Return hinges between consecutive bodies, with limits of +- some angle [rad]."""
     pairs = enumerate(zip(points, limits.tolist(), strict=True))
     return tuple(Joint(i + 1, i, np.array(at), Y_AXIS, (-limit, limit)) for i, (at, limit) in pairs)
 
 
 def _next_but_one(links: int) -> frozenset[tuple[int, int]]:
-    """Return the pairs of a chain's links with one between them, which hinges keep apart."""
+    """Return the pairs of a chain's links with one link between them.
+
+    Their hinges keep them apart.
+    """
     return frozenset((i, i + 2) for i in range(links - 2))
 
 
 def arched_snake(links: int = 9, *, heavy: float = 0.0, seed: int = 2015) -> World:
     """Return an arch of boxes joined by hinges with limits (fig. 2.9a, b; 2.11g).
 
-    A body lies on top if `heavy` > 0.
-
-    Hinges turn by up to 0.02 to 0.04 rad either way.
+    A box lies on top if `heavy` > 0. Hinges rotate by up to 0.02 to 0.04 rad either way.
 
     Args:
-        links: boxes, an odd number >= 3.
+        links: number of boxes, odd, at least 3.
         heavy: mass of the box on top over that of a link; 0 for none.
-        seed: of the limits.
+        seed: seed of the limits.
 
     Raises:
         ValueError: links or heavy is out of range.
@@ -231,10 +233,10 @@ def arched_snake(links: int = 9, *, heavy: float = 0.0, seed: int = 2015) -> Wor
 def hanging_snake(links: int = 8, *, seed: int = 2015) -> World:
     """Return a hanging chain of hinged boxes, the first one fixed (fig. 2.11i).
 
-    The limits of the hinges hold it.
+    The limits of the hinges support it.
 
     Raises:
-        ValueError: there are less than two links.
+        ValueError: there are fewer than two links.
     """
     _check("links", links, 2)
     boxes, mass = (
@@ -253,16 +255,15 @@ def incline(
 ) -> World:
     """Return boxes in a row on a slope (fig. 2.9e, 2.11a).
 
-    Each rests below atan(mu) and slides with g (sin - mu cos) above.
-
-    The plane goes through the origin and rises toward -x; boxes are 1:1:0.5, so that they do not
-    topple, with masses within a tenth.
+    Each box rests below atan(mu) and slides with g (sin - mu cos) above. The plane goes through the
+    origin and rises toward -x; boxes are 1:1:0.5, so that they do not topple, with masses that vary
+    by a tenth.
 
     Args:
-        count: boxes.
-        angle: of the slope [rad], in [0, pi / 2).
+        count: number of boxes.
+        angle: angle of the slope [rad], in [0, pi / 2).
         friction: mu.
-        seed: of the masses.
+        seed: seed of the masses.
 
     Raises:
         ValueError: count or angle is out of range.
@@ -304,10 +305,8 @@ def leaning_wall(
 def gear_pyramid(rows: int = 3, *, seed: int = 2015) -> World:
     """Return a pyramid of six-toothed gears (fig. 2.9f, g; 2.11d, e).
 
-    The gears lean on each other, the lowest row between posts.
-
-    Gears of a row are a tooth's width apart, those above are let in from a little height: it needs
-    some steps to settle.
+    The gears lean on each other, the lowest row between posts. Gears of a row are a tooth's width
+    apart; those above start at a small height and need some steps to settle.
 
     Raises:
         ValueError: there is no row.
@@ -333,10 +332,8 @@ def gear_pyramid(rows: int = 3, *, seed: int = 2015) -> World:
 def motor_arm(links: int = 4, *, torque: float = 400.0, seed: int = 2015) -> World:
     """Return an arm of boxes on a fixed base with motors in its hinges.
 
-    Speeds up to 0.5 rad/s, torques limited [N m].
-
-    Motors near the base carry more; their limits grow with the square of the links they carry,
-    times `torque` / links^2.
+    Speeds up to 0.5 rad/s, torques limited [N m]. Motors near the base carry more: their limits
+    grow with the square of the number of links that they carry, times `torque` / links^2.
 
     Raises:
         ValueError: links or torque is out of range.
@@ -399,18 +396,17 @@ def contact(
 ) -> Problem:
     """Return the impulse problem of random bodies in contact.
 
-    In the model of Stewart and Trinkle ([Book] 1.3.5).
-
-    Bodies are balls of radius 1 with velocities v; each contact joins one to another or to the
-    ground at a random point of its surface, the tangents turned at random. Whatever v is there is a
-    solution (Anitescu, Potra), which Lemke's method finds; impulses need not be unique.
+    It uses the model of Stewart and Trinkle ([Book] 1.3.5). Bodies are balls of radius 1 with
+    velocities v; each contact connects one to another or to the ground at a random point of its
+    surface, with randomly rotated tangents. For any v there is a solution (Anitescu, Potra), which
+    Lemke's method finds; impulses need not be unique.
 
     Args:
-        contacts: how many; a problem has (2 + directions) contacts unknowns.
+        contacts: number of contacts; a problem has (2 + directions) contacts unknowns.
         directions: tangents of a contact, an even number >= 2.
-        bodies: how many; half as many as contacts if None.
+        bodies: number of bodies; half as many as contacts if None.
         friction: coefficient mu >= 0.
-        seed: of all choices.
+        seed: seed of all random numbers.
 
     Raises:
         ValueError: an argument is out of range.
@@ -421,7 +417,7 @@ def contact(
             f"contacts = {contacts}, friction = {friction}: at least one contact, friction >= 0"
         )
     bodies = bodies or max(1, contacts // 2)
-    # every body has a contact
+    # Every body has a contact.
     rng, first = np.random.default_rng(seed), np.arange(contacts) % bodies
     second, one, other = (
         np.full(contacts, bodies),
@@ -438,7 +434,7 @@ def contact(
             second[k], other[k] = j, -np.hstack([frame, np.cross(-arm, frame)])
     J = jacobian(first, second, one, other, bodies)
     mass = rng.uniform(0.5, 2.0, bodies)
-    # a solid sphere's inertia is 2/5 m r^2
+    # The inertia of a solid sphere is 2/5 m r^2.
     inverse_mass = np.repeat(1 / mass, 6) * np.tile([1.0, 1.0, 1.0, 2.5, 2.5, 2.5], bodies)
     B = csr_array(J @ (inverse_mass[:, None] * J.toarray().T))
     system = ContactSystem("", B, J @ rng.standard_normal(6 * bodies), np.full(contacts, friction))
@@ -465,7 +461,7 @@ SCENES: dict[str, Callable[..., World]] = {
     "driven-gears": driven_gears,
 }
 
-# steps after which these scenes have their contacts or limits
+# Steps after which these scenes have contacts or reached limits.
 SETTLING = {"gear-pyramid": 60, "hanging-snake": 60, "driven-gears": 40}
 
 
@@ -482,15 +478,15 @@ def contact_scene(
 
     Args:
         name: one of SCENES.
-        size: bodies, rows or links, what the scene counts; its own if None.
-        model: how friction becomes a problem; BoxedModel() if None.
+        size: number of bodies, rows or links; default of the scene if None.
+        model: friction model; BoxedModel() if None.
         dt: time step [s].
-        steps: made before the problem is taken, each by 500 iterations of NNCG at most; where a
-            scene has to settle, see SETTLING.
-        seed: of the scene.
+        steps: steps before the problem, each with at most 500 iterations of NNCG; for scenes that
+            have to settle, see SETTLING.
+        seed: seed of the scene.
 
     Raises:
-        ValueError: there is no such scene, an argument is out of range, or nothing touches.
+        ValueError: there is no such scene, an argument is out of range, or there are no contacts.
 
     Example:
         >>> problem = contact_scene("box-stack", 2)

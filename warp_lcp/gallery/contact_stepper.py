@@ -1,6 +1,6 @@
 """Velocity-level time stepper of rigid bodies: semi-implicit Euler, any method.
 
-For experiments with contact methods; not a general engine: one coefficient of friction, no
+For experiments with contact methods. It is no general engine: one coefficient of friction, no
 restitution.
 """
 
@@ -29,12 +29,12 @@ class StepReport:
     """Report of a contact step.
 
     Args:
-        time: at its end [s].
-        contacts: how many there were.
-        iterations: of the method.
-        residual: of the model's problem, relative to that of x = clip(0, l, u).
-        status: of the solve.
-        impulses: r of the contacts and joints [N s].
+        time: time at its end [s].
+        contacts: number of contacts.
+        iterations: iterations of the method.
+        residual: residual of the model's problem, relative to that of x = clip(0, l, u).
+        status: status of the solve.
+        impulses: impulses r of the contacts and joints [N s].
     """
 
     time: float
@@ -48,24 +48,25 @@ class StepReport:
 class ContactStepper:
     """Time stepper of rigid bodies with contacts.
 
-    A step detects contacts, solves for impulses, changes velocities, and moves the bodies.
+    A step detects contacts, solves for impulses, changes velocities, and moves the bodies: v' = v +
+    dt g + M^-1 J'r, x' = x + dt v'.
 
-    v' = v + dt g + M^-1 J'r, x' = x + dt v'. Overlaps are removed by position correction:
-    "baumgarte" adds a part of the overlap over dt in the problem itself, which bodies keep as
-    velocity; "split" moves bodies by a second, frictionless problem's velocities, which are
-    forgotten (50 sweeps of projected Gauss-Seidel); "none" leaves them. Impulses start from those
-    of the step before at the same contacts, as `ContactMemory` knows them.
+    Overlaps are removed by position correction. "baumgarte" adds a part of the overlap over dt to
+    the problem itself, which remains as velocity. "split" moves bodies by the velocities of a
+    second, frictionless problem, which are discarded (50 sweeps of projected Gauss-Seidel). "none"
+    does not correct overlaps. Impulses start from those of the previous step at the same contacts,
+    see `ContactMemory`.
 
     Args:
         world: the world; its state is updated.
-        method: a method of `wl.METHODS` that takes the model's problem, or a function that returns
-            one for a system, as blocks depend on it; projected Gauss-Seidel if None.
-        model: how friction becomes a problem.
+        method: a method of `wl.METHODS` for the model's problem, or a function that returns one for
+            a system, since blocks depend on it; projected Gauss-Seidel if None.
+        model: friction model.
         dt: time step [s].
         stabilization: "baumgarte", "split" or "none".
-        rate: part of an overlap or a joint's error that is removed in a step, in [0, 1].
-        stopping: when a solve is done; 1e-6 and 500 iterations if None.
-        warm: whether impulses start from those of the step before.
+        rate: fraction of an overlap or a joint's error that is removed in a step, in [0, 1].
+        stopping: stopping criteria; 1e-6 and 500 iterations if None.
+        warm: whether impulses start from those of the previous step.
         device: Warp device; the CPU if None.
 
     Raises:
@@ -105,11 +106,15 @@ class ContactStepper:
         self.stabilization, self.device = stabilization, device or "cpu"
         self.stopping = stopping or StoppingCriteria(rtol=1e-6, max_iterations=500, patience=500)
         self.time = 0.0
-        # impulses of the last step; those of contacts are in the world's memory
+        # Joint impulses of the last step; those of contacts are in the world's memory.
         self._joints: np.ndarray | None = None
 
     def step(self) -> StepReport:
-        """Advance the world by dt and return the report of the solve."""
+        """Advance the world by dt and return the report of the solve.
+
+        Order of a step: contacts and their problem; impulses; velocities; position correction;
+        motion.
+        """
         world, dt = self.world, self.dt
         assembly = world.assemble(dt, rate=self.rate if self.stabilization == "baumgarte" else 0.0)
         system = assembly.system
@@ -134,7 +139,7 @@ class ContactStepper:
         return StepReport(self.time, system.contacts, iterations, residual, status, r)
 
     def _solve(self, assembly: Assembly) -> tuple[np.ndarray, int, float, SolveStatus]:
-        """Return the impulses of the model's problem, the iterations they took, the relative residual and the status."""
+        """Return impulses, iterations, relative residual and status of the problem."""
         system = assembly.system
         method: Any = self.method
         if not hasattr(method, "step"):
@@ -154,7 +159,7 @@ class ContactStepper:
         )
 
     def _guess(self, assembly: Assembly) -> np.ndarray:
-        """Return impulses of the step before where they are known, 0 elsewhere."""
+        """Return impulses of the previous step where they exist, 0 elsewhere."""
         joints = assembly.system.joints
         known = (
             self._joints
@@ -171,7 +176,10 @@ class ContactStepper:
         )
 
     def _separation(self) -> np.ndarray:
-        """Return velocities that remove overlaps and errors of joints, of a frictionless problem of bodies at rest, shape (n, 6)."""
+        """Return velocities that remove overlaps and errors of joints, shape (n, 6).
+
+        They solve a frictionless problem of bodies at rest.
+        """
         assembly = self.world.assemble(self.dt, rate=self.rate)
         system = assembly.system
         keep = np.concatenate([system.normals, system.joints])

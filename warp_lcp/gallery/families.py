@@ -1,4 +1,4 @@
-"""Families of small random problems: a name and a function of the seed each."""
+"""Families of small random problems: names, and functions of the seed."""
 
 from __future__ import annotations
 
@@ -15,7 +15,10 @@ from warp_lcp.gallery.problem import Problem
 
 
 def _some(seed: int) -> Any:
-    """Return random numbers that choose a problem's size and shares, independent of those that fill it."""
+    """Return a random generator for a problem's size and settings.
+
+    It is independent of the one for the problem's numbers.
+    """
     return np.random.default_rng([seed, 20150205])
 
 

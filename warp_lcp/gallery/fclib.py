@@ -1,14 +1,15 @@
 """Frictional contact problems of the FCLIB collection, HDF5 files (needs h5py).
 
-Extra `contact`.
+It needs the extra `contact`. The layout is that of FCLIB's own writer
+(github.com/FrictionalContactLibrary/fclib, src/fclib.h and src/fclib.c):
 
-Layout, as FCLIB's own writer makes it (github.com/FrictionalContactLibrary/fclib, src/fclib.h and
-src/fclib.c): /fclib_local holds spacedim, matrices W and, together, V and R, and vectors/{q, mu,
-s}: u = W r + V l + q, V'r + R l + s = 0; /fclib_global holds spacedim, M, H and perhaps G, and
-vectors/{f, w, mu, b}: M v = H r + G l + f, u = H'v + w, G'v + b = 0. A matrix is a group of m, n,
-nz, nzmax, p, i, x: triplets (rows p, columns i) where nz >= 0, compressed columns where nz = -1,
-compressed rows where nz = -2. Rows of a contact are normal, then tangents. /solution/{r, l} may
-hold a solution.
+- /fclib_local has spacedim, matrices W and, together, V and R, and vectors/{q, mu, s}:
+  u = W r + V l + q, V'r + R l + s = 0.
+- /fclib_global has spacedim, M, H and possibly G, and vectors/{f, w, mu, b}:
+  M v = H r + G l + f, u = H'v + w, G'v + b = 0.
+- A matrix is a group of m, n, nz, nzmax, p, i, x: triplets (rows p, columns i) if nz >= 0,
+  compressed columns if nz = -1, compressed rows if nz = -2.
+- Rows of a contact are normal, then tangents. /solution/{r, l} can have a solution.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from warp_lcp.files.archive import DEFLATED
 from warp_lcp.files.claims import ClaimError, check_claim
 from warp_lcp.gallery.contact_models import ContactSystem
 
-UNWRITTEN = 2**24  # bytes of a dataset that was never written, up to which it is read as zeros
+UNWRITTEN = 2**24  # most bytes of a dataset that was never written, which is read as zeros
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,10 +34,10 @@ class FclibProblem:
     """Content of an FCLib file.
 
     Args:
-        system: velocities at contacts for impulses; equations of l are its joint rows.
-        solution: impulses (r, l) that the file gives [N s], a vector like `system.q`; None without
-            any.
-        title: of the problem; empty without any.
+        system: velocities at contacts for impulses; the equations of l are its joint rows.
+        solution: impulses (r, l) in the file [N s], a vector like `system.q`; None without a
+            solution.
+        title: title of the problem; empty without one.
     """
 
     system: ContactSystem
@@ -97,7 +98,7 @@ def _read(file: Any, path: Path) -> FclibProblem:
 
 
 def _local(group: Any, path: Path) -> tuple[scipy.sparse.csr_array, np.ndarray, int]:
-    """Return B = [W, V; V', R], (q, s) and how many rows are joints'."""
+    """Return B = [W, V; V', R], (q, s) and the number of joint rows."""
     q = _values(group, "vectors/q", path)
     W = _matrix(group, "W", (len(q), len(q)), path)
     if "V" not in group:
@@ -112,7 +113,10 @@ def _local(group: Any, path: Path) -> tuple[scipy.sparse.csr_array, np.ndarray, 
 
 
 def _global(group: Any, path: Path) -> tuple[scipy.sparse.csr_array, np.ndarray, int]:
-    """Return B = C'M^-1 C and C'M^-1 f + (w, b) with C = (H, G), and how many rows are joints'."""
+    """Return B = C'M^-1 C, C'M^-1 f + (w, b) and the number of joint rows.
+
+    C = (H, G).
+    """
     joints = 0
     f, q = _values(group, "vectors/f", path), _values(group, "vectors/w", path)
     M, C = _matrix(group, "M", (len(f), len(f)), path), _matrix(group, "H", (len(f), len(q)), path)
@@ -134,7 +138,7 @@ def _global(group: Any, path: Path) -> tuple[scipy.sparse.csr_array, np.ndarray,
 
 
 def _matrix(group: Any, name: str, shape: tuple[int, int], path: Path) -> scipy.sparse.csr_array:
-    """Return a matrix of a shape that is stored in one of FCLIB's three ways."""
+    """Return a matrix of a given shape, in one of FCLIB's three formats."""
     if name not in group:
         raise ValueError(f"{path}: {group.name} has no matrix {name}")
     m, n, nz = (_number(group, f"{name}/{key}", path) for key in ("m", "n", "nz"))
@@ -153,14 +157,14 @@ def _matrix(group: Any, name: str, shape: tuple[int, int], path: Path) -> scipy.
         if made is None:
             raise ValueError(f"nz = {nz}: must be >= 0, -1 or -2")
         stored = made((x[:used], i[:used], p), shape=(m, n))
-        stored.check_format(full_check=True)  # an index beyond the shape would be written to
+        stored.check_format(full_check=True)  # an index beyond the shape would write out of bounds
         return scipy.sparse.csr_array(stored)
     except (ValueError, IndexError) as error:
         raise ValueError(f"{path}: {group.name}/{name} is not a sparse matrix: {error}") from error
 
 
 def _symmetric(B: Any, path: Path) -> scipy.sparse.csr_array:
-    """Return B without what rounding has made unsymmetric."""
+    """Return B without the asymmetry due to rounding."""
     B = scipy.sparse.csr_array(B)
     if 0 in B.shape or not np.isfinite(B.data).all():
         raise ValueError(f"{path}: the matrix of the contacts is empty or not finite")
@@ -170,7 +174,7 @@ def _symmetric(B: Any, path: Path) -> scipy.sparse.csr_array:
 
 
 def _values(group: Any, name: str, path: Path, kinds: str = "iuf") -> np.ndarray:
-    """Return a dataset of numbers of some kinds as a vector."""
+    """Return a dataset of numbers of given kinds as a vector."""
     found = np.asarray(_dataset(group, name, path)[()])
     if found.dtype.kind not in kinds or not np.isfinite(found).all():
         raise ValueError(f"{path}: {group.name}/{name} is {found.dtype}: must be finite numbers")
@@ -178,7 +182,7 @@ def _values(group: Any, name: str, path: Path, kinds: str = "iuf") -> np.ndarray
 
 
 def _number(group: Any, name: str, path: Path) -> int:
-    """Return a dataset of one whole number."""
+    """Return a dataset of one integer."""
     values = _values(group, name, path, "iu")
     if len(values) != 1:
         raise ValueError(f"{path}: {group.name}/{name} has {len(values)} values: expected one")
@@ -186,29 +190,29 @@ def _number(group: Any, name: str, path: Path) -> int:
 
 
 def _dataset(group: Any, name: str, path: Path) -> Any:
-    """Return a dataset that is in this file, and whose size what is stored there can make."""
+    """Return a dataset of this file, with a size that its stored bytes allow."""
     import h5py
 
-    found = group
+    member = group
     for part in name.split("/"):
-        found = _inside(found, part, path)
-    if not isinstance(found, h5py.Dataset) or found.is_virtual or found.external:
+        member = _inside(member, part, path)
+    if not isinstance(member, h5py.Dataset) or member.is_virtual or member.external:
         raise ValueError(f"{path}: {group.name}/{name} is not a dataset of this file")
-    size, stored = int(found.nbytes), int(found.id.get_storage_size())
-    # its fill value, which is 0: FCLIB makes datasets that it writes nothing to
-    if stored == 0 and size <= UNWRITTEN and not found.chunks:
-        return found
+    size, stored = int(member.nbytes), int(member.id.get_storage_size())
+    # The fill value is 0: FCLIB creates datasets without writing to them.
+    if stored == 0 and size <= UNWRITTEN and not member.chunks:
+        return member
     check_claim(
         f"{name} of {size} bytes",
         size,
-        stored=-(-size // DEFLATED) if found.chunks else size,
+        stored=-(-size // DEFLATED) if member.chunks else size,
         held=stored,
     )
-    return found
+    return member
 
 
 def _inside(group: Any, name: str, path: Path) -> Any:
-    """Return what is in a group, if it is in the same file."""
+    """Return the member of a group, if it is in the same file."""
     import h5py
 
     if not isinstance(group, h5py.Group) or name not in group:
@@ -219,7 +223,7 @@ def _inside(group: Any, name: str, path: Path) -> Any:
 
 
 def _text(group: Any, name: str, path: Path) -> str:
-    """Return a string that a file may hold."""
+    """Return an optional string of a file."""
     if name not in group:
         return ""
     value = _dataset(group, name, path)[()]

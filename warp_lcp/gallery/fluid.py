@@ -21,14 +21,14 @@ SOLID_CENTER, SOLID_RADIUS = (0.55, 0.5, 0.3), 0.15
 
 @dataclass(frozen=True)
 class Splash:
-    """A pressure problem on n^3 cells.
+    """Pressure problem on n^3 cells.
 
     Args:
         n: cells along a side.
         cells: AIR, FLUID, SOLID, shape (n, n, n).
         b: net outflow of each FLUID cell, same shape, float64.
-        wall: which FLUID cells touch a solid.
-        faces: coefficients `face_x`, `face_y`, `face_z` as `GridPoisson` takes them.
+        wall: mask of the FLUID cells that touch a solid.
+        faces: coefficients `face_x`, `face_y`, `face_z` for `GridPoisson`.
     """
 
     n: int
@@ -50,8 +50,8 @@ class Splash:
         """Return the problem for a solver, with float32 coefficients.
 
         Args:
-            bounds: one of BOUNDS; "walls" lets the liquid separate from walls, "everywhere" from
-                all.
+            bounds: one of BOUNDS; "walls" lets the liquid separate from walls, "everywhere" at all
+                cells.
             device: Warp device of the operator; the default device if None.
             b: net outflow of each FLUID cell, shape (n, n, n); that of the splash if None.
         """
@@ -75,7 +75,7 @@ class Splash:
         Args:
             bounds: one of BOUNDS.
             device: Warp device of the operator.
-            dtype: its storage.
+            dtype: storage type of the operator.
         """
         A = GridPoisson(self.cells, device=device, dtype=dtype, **self.faces)
         lower = np.broadcast_to(
@@ -98,10 +98,10 @@ class SplashPart:
     """Cells of a part of a splash.
 
     Args:
-        cells: their types with those of the cells around, SOLID beyond the box of the liquid: two
-            more along each axis than `b`.
+        cells: their types including those of adjacent cells, SOLID beyond the box of the liquid:
+            two more along each axis than `b`.
         b: net outflow of each FLUID cell, float64.
-        wall: which FLUID cells touch a solid, of the shape of `b`.
+        wall: mask of the FLUID cells that touch a solid, of the shape of `b`.
     """
 
     cells: np.ndarray
@@ -116,7 +116,7 @@ def splash(n: int, *, phase: float = 0.0) -> Splash:
 
     Args:
         n: cells along a side.
-        phase: shifts the velocity field that b is the net outflow of.
+        phase: phase of the velocity field, whose net outflow is b.
 
     Raises:
         ValueError: n < 1.
@@ -132,7 +132,7 @@ def splash_part(n: int, part: tuple[slice, ...], *, phase: float = 0.0) -> Splas
 
     Args:
         n: cells along a side of the whole.
-        part: their indices along each axis, as those of arrays of all cells.
+        part: index range along each axis, as for arrays of all cells.
         phase: as in `splash`.
     """
     numbers = [np.arange(s.start - 1, s.stop + 1) for s in part]
@@ -174,7 +174,7 @@ def splash_part(n: int, part: tuple[slice, ...], *, phase: float = 0.0) -> Splas
 def basin(n: int) -> Splash:
     """Return a closed box of liquid below a layer of AIR, with random b.
 
-    Every row of the grid is in use.
+    Every row of the grid has unknowns.
     """
     cells = np.full((n, n, n), FLUID, dtype=np.int8)
     cells[-1] = AIR

@@ -23,8 +23,8 @@ from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 
 Coefficients = dict[tuple[int, int], np.ndarray]
-IMPLICIT = 2  # steps of implicit Euler before those of Crank and Nicolson: the payoff has a kink
-DENSE = 0.2  # of K: within it nodes of S are as dense as can be
+IMPLICIT = 2  # steps of implicit Euler before Crank-Nicolson, since the payoff has a kink
+DENSE = 0.2  # relative to K: range in which nodes of S are densest
 
 
 def differences(
@@ -32,11 +32,11 @@ def differences(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return difference weights of diffusion u'' + drift u' at nodes x.
 
-    Weights below and above the diagonal: central differences, upwind where a central weight would
+    Weights below and above the diagonal: central differences, or upwind if a central weight would
     be negative.
 
     Args:
-        x: nodes, rising, shape (n,); the last one has the spacing of the one before.
+        x: nodes, increasing, shape (n,); the last one has the spacing of the one before.
         diffusion: >= 0, shape (..., n).
         drift: likewise, any sign.
     """
@@ -59,13 +59,13 @@ class Heston:
     dS = r S dt + sqrt(v) S dW1, dv = kappa (theta - v) dt + sigma sqrt(v) dW2, with correlated dW1
     and dW2.
 
-    Its price u(S, v) at time t before expiry obeys u_t + L u >= 0, u >= max(K - S, 0), one of them
-    with equality, where L u = -(v S^2 u_SS / 2 + rho sigma v S u_Sv + sigma^2 v u_vv / 2 + r S u_S
-    + kappa (theta - v) u_v - r u). The defaults are the test of Ikonen and Toivanen (2005).
+    The price u(S, v) at time t before expiry satisfies u_t + L u >= 0, u >= max(K - S, 0), one of
+    them with equality, where L u = -(v S^2 u_SS / 2 + rho sigma v S u_Sv + sigma^2 v u_vv / 2 + r S
+    u_S + kappa (theta - v) u_v - r u). The defaults are the test of Ikonen and Toivanen (2005).
 
     Args:
         strike: K > 0.
-        expiry: of the option > 0 [years].
+        expiry: time to expiry > 0 [years].
         rate: r >= 0 [1/year], without dividends.
         reversion: kappa > 0 [1/year].
         mean: theta > 0 [1/year].
@@ -114,15 +114,14 @@ class Heston:
     def coefficients(self, S: np.ndarray, v: np.ndarray) -> Coefficients:
         """Return the differential operator as a stencil of 7 points.
 
-        {(dv, dS): array of shape (v, S)}, of second order on smooth grids but where v is next to 0.
-
-        The mixed derivative is the mean of those of the two squares in whose direction it is
-        positive, which keeps A an M-matrix where the ratio of spacings lets it. Above the last v
-        the price does not change, beyond the last S it is 0.
+        {(dv, dS): array of shape (v, S)}, of second order on smooth grids except for v near 0. The
+        mixed derivative is the mean of those of the two squares in whose direction it is positive,
+        which keeps A an M-matrix if the ratio of spacings allows it. Above the last v the price is
+        constant, beyond the last S it is 0.
 
         Args:
-            S: nodes, rising from 0.
-            v: nodes, rising from 0.
+            S: nodes, increasing from 0.
+            v: nodes, increasing from 0.
         """
         X, V = np.meshgrid(S, v)
         west, east = differences(S, V * X**2 / 2, self.rate * X)
@@ -157,17 +156,16 @@ class Heston:
     ) -> Prices:
         """Return the prices of the put at time 0.
 
-        Each time step is a complementarity problem, which starts from the last one's solution.
-
-        Time steps grow like their number, since the price is smooth later on and its free boundary
-        moves slower.
+        Each time step is a complementarity problem, which starts from the last one's solution. Time
+        steps grow linearly, since the price is smoother later and its free boundary moves more
+        slowly.
 
         Args:
             ns: intervals of S, >= 8.
             nv: intervals of v, >= 4.
-            steps: of time, > 2, of which the first 2 are implicit Euler's, others Crank and
-                Nicolson's.
-            american: whether it may be exercised at any time; else there are no bounds.
+            steps: number of time steps > 2; the first 2 are implicit Euler, the others
+                Crank-Nicolson.
+            american: whether it can be exercised at any time; else there are no bounds.
             device: Warp device of the operator.
 
         Raises:
@@ -179,10 +177,10 @@ class Heston:
                 raise ValueError(f"{name} = {value}: must be >= {least}")
         S, v = self.nodes(ns, nv)
         cells = np.full((nv + 1, ns + 1), FLUID)
-        cells[:, -1] = AIR  # the price is 0 there; beyond the other sides it does not change
+        cells[:, -1] = AIR  # the price is 0 there; at the other sides it is constant beyond
         shift = wp.zeros((3, nv + 3, ns + 3), dtype=wp.float64, device=device)
         A = Stencil(cells, self.coefficients(S, v), shift=shift, device=device, dtype=wp.float64)
-        L = grid_matrix(A)  # no shift so far
+        L = grid_matrix(A)  # without shift so far
         payoff = np.broadcast_to(np.maximum(self.strike - S, 0) * (S[-1] > S), cells.shape)
         u, times = payoff.copy(), self.expiry * (np.arange(steps + 1) / steps) ** 2
         b = A.layout.load(u, wp.float64).reshape(A.layout.stored_shape)
@@ -191,7 +189,7 @@ class Heston:
         work = method.init(problem)
         for step, (before, after) in enumerate(pairwise(times)):
             share = 1.0 if step < IMPLICIT else 0.5
-            # of y, so that only the shift changes from step to step
+            # Scale of y, chosen such that only the shift changes from step to step.
             unit = 1 / (share * (after - before))
             shift.fill_(unit)
             A.update(A.cells)
@@ -211,15 +209,15 @@ class Heston:
     ) -> np.ndarray:
         """Return Richardson-extrapolated prices from this grid and one twice as fine.
 
-        4/3 of the fine grid's prices less 1/3 of this grid's.
+        4/3 of the fine grid's prices minus 1/3 of this grid's.
 
         Args:
             spot: S, a number or an array.
             variance: v.
             ns: intervals of S of the coarse grid.
             nv: intervals of v.
-            steps: of time.
-            options: of `put`.
+            steps: number of time steps.
+            options: options of `put`.
         """
         coarse, fine = (
             self.put(k * ns, k * nv, k * steps, **options).at(spot, variance) for k in (1, 2)

@@ -18,11 +18,12 @@ from warp_lcp.settings import CountOrZero, NonNegative, Positive, Settings
 from warp_lcp.solvers.incremental_pivoting import IncrementalPivoting
 
 Vector = np.ndarray
-# shares of the model's decrease from which on the trust region grows, and below which it shrinks
+# Ratios of actual to predicted decrease above which the trust region grows, and below which it
+# shrinks.
 AGREES, DISAGREES = 0.75, 0.25
 LEAST_RADIUS = 1e-13  # [rad]: smaller steps are rounding
 INNER = StoppingCriteria(rtol=1e-10, max_iterations=500)  # of each LCP
-# of reach^2: the least eigenvalue that a model with curvature is shifted to, where its own is less
+# Relative to reach^2: smallest eigenvalue of a model with curvature, after a shift.
 DEFINITE = 1e-6
 
 
@@ -51,14 +52,12 @@ class StepProblem:
     def multipliers(self, *, device: Any = None) -> LCP:
         """Return the book's LCP in the 2n multipliers of the limits.
 
-        [Book] eq. 1.143-1.144; all limits must be finite.
-
-        With B = [I; -I]: H d + c = B'x, so that 0 <= x is complementary to B H^-1 B' x + (-l; u) -
-        B H^-1 c >= 0. The matrix is positive semi-definite of rank n: a limit's two rows are each
-        other's negatives.
+        [Book] eq. 1.143-1.144; all limits must be finite. With B = [I; -I]: H d + c = B'x, so that
+        0 <= x is complementary to B H^-1 B' x + (-l; u) - B H^-1 c >= 0. The matrix is positive
+        semi-definite of rank n: the two rows of a limit are negatives of each other.
 
         Raises:
-            ValueError: H is singular: without damping it is wherever there are more hinges than
+            ValueError: H is singular, which it is without damping if there are more hinges than
                 goals; or a bound is infinite.
         """
         if not np.isfinite([self.lower, self.upper]).all():
@@ -91,14 +90,13 @@ class ReachedPose:
     Args:
         theta: angles [rad], shape (n,), within the limits.
         objective: 1/2 |g - f(theta)|^2 [m^2].
-        projected_gradient: the measure of convergence [rad].
+        projected_gradient: measure of convergence [rad].
         status: CONVERGED; MAX_ITERATIONS; or STAGNATED: no step above rounding lowers the
             objective.
-        iterations: LCPs solved, one an iteration.
-        rejected: how many of their steps did not lower the objective.
-        unsolved: how many of the LCPs did not converge.
-        overshoot: the most by which a solution of an LCP left its bounds [rad] before it was
-            clipped to them.
+        iterations: number of LCPs, one per iteration.
+        rejected: number of steps that did not lower the objective.
+        unsolved: number of LCPs that did not converge.
+        overshoot: largest distance of an LCP's solution from its bounds [rad], before clipping.
         history: objective at the start and after each iteration [m^2]; it never grows.
     """
 
@@ -121,27 +119,25 @@ class ReachedPose:
 class InverseKinematics(Settings):
     """Inverse kinematics within joint limits: one boxed LCP per step.
 
-    Minimizes 1/2 |g - f(theta)|^2 ([Book] 1.3.4, eqs. 1.130-1.144).
-
-    The Gauss-Newton model at theta, (J'J + mu I) d - J'(g - f) = y with max(l - theta, -radius) <=
-    d <= min(u - theta, radius), is solved by any method. The book takes its steps as they are; here
-    a step is taken only if the objective falls, and the box's radius follows how well the model
-    predicts it. Converged: |theta - clip(theta - grad / reach^2, l, u)| <= tolerance in the largest
-    angle.
+    It minimizes 1/2 |g - f(theta)|^2 ([Book] 1.3.4, eqs. 1.130-1.144). The Gauss-Newton model at
+    theta, (J'J + mu I) d - J'(g - f) = y with max(l - theta, -radius) <= d <= min(u - theta,
+    radius), is solved by any method. The book accepts all steps; here a step is accepted only if
+    the objective falls, and the radius of the box follows the agreement with the model. Converged:
+    |theta - clip(theta - grad / reach^2, l, u)| <= tolerance for the largest angle.
 
     The damping mu keeps H definite, which most methods need, and shortens steps where J is nearly
-    singular, at a price in iterations: see docs/theory.md for measurements. A goal out of reach
-    leaves a residual, whose curvature the Gauss-Newton model lacks: `curvature` adds -sum_k (g -
-    f)_k f_k'' and shifts the sum to be definite.
+    singular, at the cost of iterations: see docs/theory.md for measurements. A goal out of reach
+    has a residual, whose curvature the Gauss-Newton model lacks: `curvature` adds -sum_k (g - f)_k
+    f_k'' and shifts the sum to be definite.
 
     Args:
-        method: of the LCPs, with its default chain; the default takes any damping; with
-            `multipliers` it must be one for semi-definite A.
+        method: method of the LCPs, with its default chain; the default supports any damping; with
+            `multipliers` it must support semi-definite A.
         damping: mu in units of reach^2, >= 0.
-        radius: first largest change of an angle in a step [rad], > 0.
-        tolerance: of the projected gradient [rad], > 0.
-        max_iterations: maximum number of LCPs, >= 0.
-        curvature: model the objective's second derivative wholly.
+        radius: initial limit of the change of an angle in a step [rad], > 0.
+        tolerance: tolerance of the projected gradient [rad], > 0.
+        max_iterations: limit of LCPs, >= 0.
+        curvature: use the complete second derivative of the objective.
         multipliers: solve the book's LCP in the multipliers of the limits instead of the boxed one
             in the step.
         device: Warp device of the LCPs; the default device if None.
@@ -151,9 +147,12 @@ class InverseKinematics(Settings):
 
     Example:
         >>> from warp_lcp.gallery.articulated_figure import planar_chain
-        >>> arm = planar_chain([1.0, 1.0], lower=np.array([-3.0, 0.0]), upper=np.array([3.0, 2.5]))  # an elbow that bends one way
-        >>> pose = InverseKinematics(device="cpu").solve(arm, np.array([[1.0, 1.0]]), start=np.array([0.3, 0.3]))
-        >>> print(pose.status.name, arm.positions(pose.theta).round(6), (pose.theta >= arm.lower).all())
+        >>> lower, upper = np.array([-3.0, 0.0]), np.array([3.0, 2.5])  # the elbow bends one way
+        >>> arm = planar_chain([1.0, 1.0], lower=lower, upper=upper)
+        >>> solver = InverseKinematics(device="cpu")
+        >>> pose = solver.solve(arm, np.array([[1.0, 1.0]]), start=np.array([0.3, 0.3]))
+        >>> within = (pose.theta >= arm.lower).all()
+        >>> print(pose.status.name, arm.positions(pose.theta).round(6), within)
         CONVERGED [[1. 1.]] True
     """
 
@@ -171,15 +170,15 @@ class InverseKinematics(Settings):
     ) -> ReachedPose:
         """Return the pose whose end effectors are closest to their goals.
 
-        A local minimum near the start.
+        It is a local minimum near the start.
 
         Args:
             figure: the articulated figure.
             goals: g [m], shape (e, dimension).
-            start: angles [rad], shape (n,), clipped to the limits; 0 clipped to them if None.
+            start: angles [rad], shape (n,), clipped to the limits; 0 if None.
 
         Raises:
-            ValueError: goals or start has a wrong shape or holds values that are not finite.
+            ValueError: goals or start has a wrong shape or values that are not finite.
         """
         lower, upper, scale = figure.lower, figure.upper, figure.reach**2
         theta = np.clip(
@@ -232,7 +231,7 @@ class InverseKinematics(Settings):
         )
 
     def _status(self, measure: float, radius: float, iterations: int) -> SolveStatus | None:
-        """Return how the iteration ends now, None if it goes on."""
+        """Return the status with which the iteration ends; None if it continues."""
         if measure <= self.tolerance:
             return SolveStatus.CONVERGED
         if iterations >= self.max_iterations:
@@ -257,7 +256,7 @@ class InverseKinematics(Settings):
         )
 
     def _step(self, model: StepProblem) -> tuple[Vector, bool, float]:
-        """Return a step within its bounds, whether its LCP converged, and by how much its solution left the bounds."""
+        """Return a clipped step, whether its LCP converged, and the distance clipped."""
         problem = (
             model.multipliers(device=self.device)
             if self.multipliers
@@ -270,7 +269,11 @@ class InverseKinematics(Settings):
         return inside, bool(result), float(np.abs(d - inside).max())
 
     def _radius(self, radius: float, fall: float, foretold: float, length: float) -> float:
-        """Return the next radius: half of the step where the model was wrong, twice the radius where it was right and short."""
+        """Return the next radius of the trust region.
+
+        Half of the step if the model was wrong, twice the radius if it was right and the step was
+        short.
+        """
         if foretold <= 0 or fall < DISAGREES * foretold:
             return 0.5 * min(radius, max(length, LEAST_RADIUS))
         if fall > AGREES * foretold and length > 0.9 * radius:
@@ -279,7 +282,7 @@ class InverseKinematics(Settings):
 
 
 def _checked(values: Any, shape: tuple[int, ...], name: str) -> Vector:
-    """Return finite numbers of a shape."""
+    """Return an array after checks of its shape and of finite numbers."""
     values = np.asarray(values, dtype=np.float64)
     if values.shape != shape:
         raise ValueError(f"{name} has shape {values.shape}: expected {shape}")

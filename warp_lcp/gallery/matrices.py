@@ -27,11 +27,11 @@ def definite(
     """Return a planted problem with a dense symmetric positive definite matrix.
 
     Args:
-        n: unknowns.
-        condition: largest over smallest eigenvalue, >= 1; they are spaced evenly in their
-            logarithm, the largest is 1.
-        plant: how the solution is chosen.
-        seed: of all choices.
+        n: number of unknowns.
+        condition: largest over smallest eigenvalue, >= 1; they are spaced evenly on a logarithmic
+            scale, the largest is 1.
+        plant: settings of the solution.
+        seed: seed of all random numbers.
 
     Raises:
         ValueError: n < 1 or condition < 1.
@@ -54,15 +54,14 @@ def semidefinite(
 ) -> Problem:
     """Return a planted problem with a dense semidefinite matrix.
 
-    B B' of rank n - zeros n, symmetric; planted, hence solvable.
-
-    y is the same for all its solutions, x need not be.
+    B B' of rank n - zeros n, symmetric; planted, hence solvable. y is the same for all solutions, x
+    need not be.
 
     Args:
-        n: unknowns.
+        n: number of unknowns.
         zeros: share of zero eigenvalues, in [0, 1).
-        plant: how the solution is chosen.
-        seed: of all choices.
+        plant: settings of the solution.
+        seed: seed of all random numbers.
 
     Raises:
         ValueError: zeros is outside [0, 1).
@@ -90,10 +89,10 @@ def skewed(n: int, *, skew: float = 1.0, plant: Plant | None = None, seed: int =
     A P-matrix B B' + I/2 + skew (C - C').
 
     Args:
-        n: unknowns.
+        n: number of unknowns.
         skew: size of the skew part's entries relative to 1 / sqrt(n).
-        plant: how the solution is chosen.
-        seed: of all choices.
+        plant: settings of the solution.
+        seed: seed of all random numbers.
     """
     rng = np.random.default_rng(seed)
     B, C = (rng.standard_normal((n, n)) / np.sqrt(n) for _ in range(2))
@@ -112,16 +111,14 @@ def period_three(
 ) -> Problem:
     """Return P-matrices on which the minimum-map Newton method cycles.
 
-    Size 3; from some starts the period is 3 (Ben Gharbia, Gilbert).
-
-    Each block is [[1, 0, a], [a, 1, 0], [0, a, 1]], whose principal minors are 1, 1 and 1 + a^3.
-    Without a plant b = -1.
+    Size 3; from some starts the period is 3 (Ben Gharbia, Gilbert). Each block is [[1, 0, a], [a,
+    1, 0], [0, a, 1]], whose principal minors are 1, 1 and 1 + a^3. Without a plant b = -1.
 
     Args:
-        blocks: how many, each with its own a in [1.5, 4.5], their rows and columns scaled by
-            positive numbers; with seed=None one block with a = 4, unscaled.
-        plant: how the solution is chosen; b = -1 if None.
-        seed: of all choices.
+        blocks: number of blocks, each with its own a in [1.5, 4.5], and with rows and columns
+            scaled by positive numbers; with seed=None one block with a = 4, unscaled.
+        plant: settings of the solution; b = -1 if None.
+        seed: seed of all random numbers.
 
     Raises:
         ValueError: blocks < 1.
@@ -171,10 +168,10 @@ def banded(n: int, *, bands: int = 3, plant: Plant | None = None, seed: int = 20
     A symmetric positive definite M-matrix.
 
     Args:
-        n: unknowns.
+        n: number of unknowns.
         bands: off-diagonals on each side, < n.
-        plant: how the solution is chosen.
-        seed: of all choices.
+        plant: settings of the solution.
+        seed: seed of all random numbers.
 
     Raises:
         ValueError: n or bands is out of range.

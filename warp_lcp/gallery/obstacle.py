@@ -11,7 +11,8 @@ from warp_lcp.gallery.problem import M_MATRIX, Problem
 from warp_lcp.operators.grid_poisson import AIR, FLUID, GridPoisson
 
 RADIUS = 0.697965148223374  # a, where the membrane leaves the ball: a^2 (log 2 - log a) = 1 - a^2
-# beyond it the ball is continued by its tangent cone, so that psi is defined on the square
+# Radius beyond which the ball is extended by its tangent cone, so that psi is defined on the
+# square.
 EDGE = 0.9
 UNIQUE = M_MATRIX | {"unique", "solvable"}
 SLOPE = RADIUS**2 / np.sqrt(1 - RADIUS**2)  # of the membrane against -log r
@@ -28,7 +29,7 @@ def ball_height(r: np.ndarray) -> np.ndarray:
 def membrane_height(r: np.ndarray) -> np.ndarray:
     """Return the exact solution of the ball obstacle problem.
 
-    psi for r <= a, SLOPE log(2 / r) beyond: harmonic, with psi's value and slope at a.
+    psi for r <= a, SLOPE log(2 / r) beyond: harmonic, with the value and slope of psi at a.
     """
     return np.where(r <= RADIUS, ball_height(r), SLOPE * np.log(2 / np.maximum(r, RADIUS)))
 
@@ -36,16 +37,15 @@ def membrane_height(r: np.ndarray) -> np.ndarray:
 def ball_obstacle(n: int, *, device: Any = None, dtype: Any = wp.float32) -> Problem:
     """Return Bueler's ball obstacle problem on [-2, 2]^2.
 
-    -Laplace u >= 0, u >= psi, with the exact solution's values on the border.
-
-    The operator is h^2 times the 5-point one, h = 4 / (n - 1); border nodes are AIR and their
-    values part of b. `solution` is the exact one at the nodes, not that of the discrete problem:
-    the difference is the discretization's error, O(h^2) away from the free boundary r = RADIUS.
+    -Laplace u >= 0, u >= psi, with the exact solution's values on the border. The operator is h^2
+    times the 5-point one, h = 4 / (n - 1); border nodes are AIR and their values part of b.
+    `solution` is the exact one at the nodes, not that of the discrete problem: the difference is
+    the discretization error, O(h^2) away from the free boundary r = RADIUS.
 
     Args:
-        n: nodes a side, the border included; odd numbers have a node at the origin.
+        n: nodes per side, including the border; odd numbers have a node at the origin.
         device: Warp device of the operator.
-        dtype: its storage.
+        dtype: storage type of the operator.
 
     Raises:
         ValueError: there is no inner node.
@@ -78,20 +78,19 @@ def torsion(
 ) -> Problem:
     """Return the elastic-plastic torsion of a square bar.
 
-    -Laplace u = load where |u| is less than the distance to the border.
-
-    The unit square has n nodes a side, the border not included; u is Prandtl's stress function,
-    whose slope is 1 at most. Where |u| is the distance, the bar has yielded: along the diagonals it
-    never does. With n = 2 Q - 2 it is CUTEst's TORSIONA to F, that of MINPACK-2, and with border =
-    0.5 TORSION1 to 6, for loads of 5, 10 and 20.
+    -Laplace u = load where |u| is less than the distance to the border. The unit square has n nodes
+    per side, without the border; u is Prandtl's stress function, whose slope is at most 1. Where
+    |u| is the distance, the bar has yielded; along the diagonals it never does. With n = 2 Q - 2 it
+    is CUTEst's TORSIONA to F, that of MINPACK-2, and with border = 0.5 TORSION1 to 6, for loads of
+    5, 10 and 20.
 
     Args:
-        n: inner nodes a side.
+        n: inner nodes per side.
         load: twice the shear modulus times the twist, in units of the yield stress.
-        border: weight of differences to the border in the energy, > 0; 0.5: each inner node has a
-            quarter of the squares of all its four.
+        border: weight of differences to the border in the energy, > 0; with 0.5 each inner node has
+            a quarter of the squares of all four differences.
         device: Warp device of the operator.
-        dtype: its storage.
+        dtype: storage type of the operator.
 
     Raises:
         ValueError: there is no inner node, or the border has no weight.
@@ -107,7 +106,10 @@ def torsion(
 
 
 def _faces(cells: np.ndarray, x: float, y: float, border: float) -> dict[str, Any]:
-    """Return face coefficients x and y, those on a border one cell wide times `border`: numbers where that is 1."""
+    """Return face coefficients x and y, with those on a border times `border`.
+
+    The border is one cell wide. They are numbers if `border` is 1.
+    """
     if not 0 < border < np.inf:
         raise ValueError(f"border = {border}: must be > 0 and finite")
     if border == 1:
@@ -124,18 +126,16 @@ def sine_obstacle(
 ) -> Problem:
     """Return the membrane of Dembo and Tulowitzki: -Laplace u >= 1 over an obstacle.
 
-    Above a hill, or between four hills and holes; CUTEst's OBSTCLA and OBSTCLB.
-
-    u >= sin(3.2 y) sin(3.3 x), or s^3 <= u <= s^2 + 0.02 with s = sin(9.2 y) sin(9.3 x), on the
-    unit square; u = 0 on the border, whose differences have half the weight of others in the
-    energy, as in CUTEst.
+    Above a hill, or between four hills and holes; CUTEst's OBSTCLA and OBSTCLB. u >= sin(3.2 y)
+    sin(3.3 x), or s^3 <= u <= s^2 + 0.02 with s = sin(9.2 y) sin(9.3 x), on the unit square; u = 0
+    on the border, whose differences have half the weight of others in the energy, as in CUTEst.
 
     Args:
-        nx: nodes along x, the border included.
-        ny: nodes along y, the border included.
+        nx: nodes along x, including the border.
+        ny: nodes along y, including the border.
         between: whether there are two obstacles.
         device: Warp device of the operator.
-        dtype: its storage.
+        dtype: storage type of the operator.
 
     Raises:
         ValueError: there is no inner node.
@@ -175,21 +175,20 @@ def journal_bearing(
 ) -> Problem:
     """Return the pressure u >= 0 of the film in a journal bearing.
 
-    Reynolds' equation; the film cavitates where u = 0.
-
-    u minimizes the integral of h^3 |grad u|^2 / 2 - e sin(x) u over [0, 2 pi] x [0, 2 half_width],
-    with the film's thickness h = 1 + e cos x and u = 0 on the border, by linear elements on right
-    triangles whose h^3 is the mean of their corners'. It is problem DPJB of MINPACK-2, PETSc's
-    jbearing2.c and, with two nodes less, CUTEst's JNLBRNG1 (e = 0.1) and 2 (e = 0.5). Lengths
-    around the shaft in radii, pressures in 6 viscosity speed radius / clearance^2.
+    Reynolds' equation; the film cavitates where u = 0. u minimizes the integral of h^3 |grad u|^2 /
+    2 - e sin(x) u over [0, 2 pi] x [0, 2 half_width], with the film's thickness h = 1 + e cos x and
+    u = 0 on the border, by linear elements on right triangles, whose h^3 is the mean over their
+    corners. It is problem DPJB of MINPACK-2, PETSc's jbearing2.c and, with two nodes less, CUTEst's
+    JNLBRNG1 (e = 0.1) and 2 (e = 0.5). Lengths around the shaft are in radii, pressures in 6
+    viscosity speed radius / clearance^2.
 
     Args:
-        nx: inner nodes around.
+        nx: inner nodes around the shaft.
         ny: inner nodes across.
-        eccentricity: e of the shaft, in [0, 1) clearances.
-        half_width: of the bearing, > 0 [radii].
+        eccentricity: eccentricity e of the shaft, in [0, 1) clearances.
+        half_width: half width of the bearing, > 0 [radii].
         device: Warp device of the operator.
-        dtype: its storage.
+        dtype: storage type of the operator.
 
     Raises:
         ValueError: there is no inner node, or a number is out of range.
@@ -227,20 +226,19 @@ def dam(
 ) -> Problem:
     """Return the problem of water seepage through a dam.
 
-    From a full reservoir to water of depth `low`.
-
-    By Baiocchi's transform, w(x, y) is the integral of the pressure's head from y up: w >= 0,
-    -Laplace w + 1 >= 0, and w has its values on the border. Where w > 0 the dam is wet. `b` holds
-    hx hy and the border's values, which are AIR.
+    From a full reservoir to water of depth `low`. By Baiocchi's transform, w(x, y) is the integral
+    of the pressure head from y up: w >= 0, -Laplace w + 1 >= 0, with given values of w on the
+    border. The dam is wet where w > 0. `b` includes hx hy and the values on the border, which is
+    AIR.
 
     Args:
-        nx: nodes along x, the border included.
-        ny: nodes along y, the border included.
-        width: of the dam, in any unit of length.
-        high: its height, and the reservoir's depth.
+        nx: nodes along x, including the border.
+        ny: nodes along y, including the border.
+        width: width of the dam, in any unit of length.
+        high: height of the dam, and depth of the reservoir.
         low: depth of the water behind it.
         device: Warp device of the operator.
-        dtype: its storage.
+        dtype: storage type of the operator.
 
     Raises:
         ValueError: there is no inner node.

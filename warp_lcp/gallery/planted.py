@@ -20,12 +20,12 @@ class Plant(Settings):
     """Settings of a planted solution.
 
     Args:
-        active: share of the unknowns with a bound that sit at it.
-        weak: share of those where y = 0 as well, so that strict complementarity fails.
-        boxed: finite upper bounds too; active unknowns sit at either with equal chance.
+        active: share of the bounded unknowns that are at their bound.
+        weak: share of those with y = 0 as well, so that strict complementarity fails.
+        boxed: finite upper bounds too; active unknowns are at either bound with equal chance.
         mixed: share of the rows that are equations.
-        size: x and y off their zeros are uniform in [0.1, 1] times this; y also times A's mean
-            diagonal.
+        size: nonzero x and y are uniform in [0.1, 1] times this; y also times the mean diagonal of
+            A.
 
     Raises:
         ValueError: a share is outside [0, 1], or the size is not positive.
@@ -44,14 +44,14 @@ def planted(
     """Return a problem with a given matrix and a planted solution.
 
     l <= x <= u, y >= 0 where x = l, y <= 0 where x = u, y = 0 elsewhere and on equations; the lower
-    bounds are 0, or in [-1, 0] times `plant.size` where there are upper ones.
+    bounds are 0, or in [-1, 0] times `plant.size` if there are upper ones.
 
     Args:
         A: numpy or scipy.sparse matrix, shape (n, n).
-        rng: where the choices come from.
-        plant: how.
-        name: of the problem.
-        facts: what holds for A; the plant's own are added.
+        rng: random generator.
+        plant: settings of the solution.
+        name: name of the problem.
+        facts: properties of A; those of the plant are added.
 
     Raises:
         ValueError: A is empty or not square.
@@ -129,19 +129,19 @@ def poisson(
     """Return a planted problem with the 5- or 7-point operator of a grid.
 
     Args:
-        shape: cells (ny, nx) or (nz, ny, nx), a ring of AIR not counted.
-        plant: how the solution is chosen; a share of 0.3 active, strictly complementary, if None.
+        shape: cells (ny, nx) or (nz, ny, nx), without a ring of AIR.
+        plant: settings of the solution; a share of 0.3 active, strictly complementary, if None.
         air: share of AIR cells among them.
         solid: share of SOLID cells.
         ring: surround them by AIR: x = 0 on the border, as in 'the 7-point matrix of 10^3
             unknowns'.
         coefficients: "uniform" (1) or "random" (in [0.2, 1], exact in float32).
-        seed: of all choices.
+        seed: seed of all random numbers.
         device: Warp device of the operator.
-        dtype: its storage.
+        dtype: storage type of the operator.
 
     Raises:
-        ValueError: coefficients is neither.
+        ValueError: coefficients is invalid.
     """
     if coefficients not in ("uniform", "random"):
         raise ValueError(f"coefficients = {coefficients!r}: must be 'uniform' or 'random'")

@@ -19,7 +19,7 @@ from warp_lcp.problem.lcp import LCP
 FACTS = frozenset(
     {
         "symmetric",
-        "positive-definite",  # x'Ax > 0, also of an A that is not symmetric
+        "positive-definite",  # x'Ax > 0, also for unsymmetric A
         "semidefinite",  # x'Ax >= 0
         "p-matrix",  # every principal minor is positive: one solution for every b
         "m-matrix",  # a P-matrix without positive entries off the diagonal
@@ -30,10 +30,10 @@ FACTS = frozenset(
         "mixed",  # there are rows without bounds
         "strict",  # the known solution is strictly complementary
         "unique",  # there is one solution
-        "solvable",  # there is one at least
+        "solvable",  # there is at least one solution
     }
 )
-# facts of Laplacians
+# Facts of Laplacians.
 M_MATRIX = frozenset(
     {"symmetric", "positive-definite", "p-matrix", "m-matrix", "positive-diagonal"}
 )
@@ -44,13 +44,13 @@ class Problem:
     """Test problem: y = A x + b, lower <= x <= upper.
 
     Args:
-        name: what it is, with its parameters.
+        name: name, with its parameters.
         A: a GridPoisson, a scipy.sparse matrix or a numpy array.
         b: field of A's shape; 0 where a grid has no unknown.
         lower: l, a field like b, or AffineBounds.
         upper: u, likewise.
-        solution: a solution, a field like b; None if none is known.
-        facts: what holds, members of FACTS.
+        solution: a solution, a field like b; None if unknown.
+        facts: properties, members of FACTS.
 
     Raises:
         ValueError: a fact is no member of FACTS.
@@ -65,7 +65,7 @@ class Problem:
     facts: frozenset[str]
 
     def __post_init__(self) -> None:
-        """Check that all facts are known ones."""
+        """Check that all facts are members of FACTS."""
         unknown = sorted(self.facts - FACTS)
         if unknown:
             raise ValueError(f"facts holds {unknown}: allowed are {sorted(FACTS)}")
@@ -80,11 +80,11 @@ class Problem:
     def lcp(self, *, device: Any = None, dtype: Any = wp.float64) -> LCP:
         """Return the problem as an LCP for a solver.
 
-        The operator of a grid has its device and type already.
+        The operator of a grid already has its device and type.
 
         Args:
             device: Warp device of a matrix; the default device if None.
-            dtype: storage of a matrix.
+            dtype: storage type of a matrix.
         """
         make = {
             "grid": lambda: self.A,
@@ -109,7 +109,7 @@ class Problem:
     def sparse(self) -> Problem:
         """Return the problem with a scipy.sparse matrix of the grid's FLUID cells.
 
-        Rows have the cells' order; a problem that is no grid's is returned as it is.
+        Rows have the order of the cells; a problem without a grid is returned unchanged.
         """
         if not isinstance(self.A, GridPoisson):
             return self
@@ -131,7 +131,7 @@ class Problem:
 
 
 def _number_or_field(bound: Any) -> Any:
-    """Return a bound that is the same everywhere as a number: methods are faster with it."""
+    """Return a constant bound as a number, for which methods are faster."""
     if isinstance(bound, AffineBounds):
         return bound
     first = float(bound.flat[0])

@@ -20,7 +20,7 @@ from warp_lcp.operators.grid_poisson import FLUID
 from warp_lcp.problem.stopping import StoppingCriteria
 
 PETSC, CUTEST, P4PDES = "PETSc", "CUTEst", "p4pdes"
-SPG = "CSPG.jl"  # its table of CUTEst's problems, by the spectral projected gradient method
+SPG = "CSPG.jl"  # its table of CUTEst's problems, with the spectral projected gradient method
 
 
 @dataclass(frozen=True)
@@ -28,14 +28,14 @@ class Published:
     """Published figure and the function that recomputes it.
 
     Attributes:
-        problem: whose it is, a heading of docs/problems.md.
-        case: which size and data, and which number.
-        printed: the number; zeros that only fill a column are left out.
-        source: who printed it.
-        measure: computes it.
-        within: where ours is another one, what it differs by at most, for a reason that
-            docs/problems.md gives; 0: all digits are met.
-        slow: whether that takes more than a few seconds.
+        problem: name of the problem, a heading of docs/problems.md.
+        case: size, data, and the quantity.
+        printed: the number, without zeros that only fill a column.
+        source: its source.
+        measure: function that recomputes it.
+        within: allowed difference if our value differs, for a reason in docs/problems.md; 0 if all
+            digits agree.
+        slow: whether it takes more than a few seconds.
     """
 
     problem: str
@@ -51,7 +51,7 @@ class Published:
         """Half a unit of the last printed digit, or `within`."""
         exponent = Decimal(self.printed).as_tuple().exponent
         assert isinstance(exponent, int)
-        # rounded half up, and binary fractions
+        # Rounded half up, and for binary fractions.
         return self.within or 0.5 * 10.0**exponent * (1 + 1e-6)
 
 
@@ -59,7 +59,7 @@ def solution(problem: Problem) -> np.ndarray:
     """Return the solution of a gallery problem to 12 digits, on the host.
 
     Raises:
-        RuntimeError: it was not found; the message has the status.
+        RuntimeError: the solve failed; the message has the status.
     """
     result = solve(problem.lcp(), stopping=StoppingCriteria(rtol=1e-12))
     if not result:
@@ -76,8 +76,9 @@ def _energy(make: Callable[..., Problem], *sizes: Any, **options: Any) -> Callab
 
 
 def _bearings() -> list[Published]:
+    """Return the published figures of journal bearings."""
     rows = [(8, 12, 0.1, "-.183437"), (10, 16, 0.9, "-15.607"), (50, 50, 0.99, "-60.1509")]
-    found = [
+    figures = [
         Published(
             "Journal bearing",
             f"jbearing2, {nx} x {ny}, e = {e}",
@@ -97,7 +98,7 @@ def _bearings() -> list[Published]:
         125: "-0.18058",
     }
     for n, printed in known.items():
-        found.append(
+        figures.append(
             Published(
                 "Journal bearing",
                 f"JNLBRNG1, {n} x {n}",
@@ -110,7 +111,7 @@ def _bearings() -> list[Published]:
         ("JNLBRNG1", 0.1, "-1.80573195e-01", 1e-7),
         ("JNLBRNG2", 0.5, "-4.14865279e+00", 4e-8),
     ):
-        found.append(
+        figures.append(
             Published(
                 "Journal bearing",
                 f"{name}, 100 x 100",
@@ -120,10 +121,10 @@ def _bearings() -> list[Published]:
                 within,
             )
         )
-    return found
+    return figures
 
 
-# (name, load, border): {Q: (printed, within)}
+# (name, load, border): {Q: (printed, within)}.
 TORSIONS: dict[tuple[str, float, float], dict[int, tuple[str, float]]] = {
     ("TORSION1", 5.0, 0.5): {
         2: ("-5.1851852e-1", 0),
@@ -179,6 +180,7 @@ TORSIONS_SPG = [
 
 
 def _torsions() -> list[Published]:
+    """Return the published figures of torsion problems."""
     rows = [
         (*key, Q, *value, CUTEST) for key, values in TORSIONS.items() for Q, value in values.items()
     ]
@@ -200,6 +202,7 @@ def _torsions() -> list[Published]:
 
 
 def _sines() -> list[Published]:
+    """Return the published figures of membranes over obstacles."""
     hill = {
         4: "0.753659753",
         10: "1.397897560",
@@ -242,6 +245,7 @@ def _ball_errors(n: int) -> np.ndarray:
 
 
 def _balls() -> list[Published]:
+    """Return the published figures of the ball obstacle problem."""
     known = {
         5: ("4.531e-02", "1.635e-01"),
         9: ("3.076e-03", "1.334e-02"),
@@ -271,11 +275,11 @@ def _dam(nx: int) -> np.ndarray:
 def seepage_height(w: np.ndarray, *, high: float = 24.0, low: float = 4.0) -> float:
     """Return the height of the seepage face of a dam above the water behind it.
 
-    Of the highest wet node beside the face, as in p4pdes/dam.c.
+    It is that of the highest wet node beside the face, as in p4pdes/dam.c.
 
     Args:
         w: solution of `dam`, shape (ny, nx).
-        high: of the dam, in any unit of length.
+        high: height of the dam, in any unit of length.
         low: depth of the water behind it.
     """
     y = np.linspace(0, high, len(w))
@@ -291,6 +295,7 @@ def _height(nx: int) -> float:
 
 
 def _dams() -> list[Published]:
+    """Return the published figures of dams."""
     rows = {
         5: ("2.53716015237691",),
         4: ("18.148640609503", "6.78414305345868"),
@@ -298,7 +303,7 @@ def _dams() -> list[Published]:
         2: ("89.9564647149903", "53.982307919772", "22.6601332428759"),
         1: ("146.570291707977", "94.3247021169195", "44.7462088399388"),
     }
-    found = [
+    figures = [
         Published("Dam", f"5 x 7, w at ({i}, {j})", printed, P4PDES, partial(_entry, j, i), 2e-11)
         for j, values in rows.items()
         for i, printed in enumerate(values, 1)
@@ -313,8 +318,10 @@ def _dams() -> list[Published]:
     }
     for nx, printed in heights.items():
         case = f"{nx} x {(nx - 1) * 3 // 2 + 1}, height of the seepage face"
-        found.append(Published("Dam", case, printed, P4PDES, partial(_height, nx), slow=nx > 1025))
-    return found
+        figures.append(
+            Published("Dam", case, printed, P4PDES, partial(_height, nx), slow=nx > 1025)
+        )
+    return figures
 
 
 @cache
@@ -327,6 +334,7 @@ def _price(k: int) -> float:
 
 
 def _puts() -> list[Published]:
+    """Return the published figures of puts in Heston's model."""
     four, six = (
         ("2.0000", "1.1076", "0.5200", "0.2137", "0.0820"),
         ("2.00000", "1.10763", "0.520038", "0.213681", "0.082046"),
@@ -350,6 +358,7 @@ def _ice_errors(nodes: int, regularization: float) -> np.ndarray:
 
 
 def _domes() -> list[Published]:
+    """Return the published figures of ice domes."""
     rows = [
         (1e-3, "largest", np.max, "938.275"),
         (1e-3, "average", np.mean, "147.420"),

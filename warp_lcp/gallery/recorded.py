@@ -25,7 +25,7 @@ NUMBERS = ("step", "time", "dt", "spacing", "tolerance", "absolute_tolerance")
 REQUIRED = frozenset({"format", "cells", "b", "lower", "upper", "x0", *NUMBERS})
 FIELDS = frozenset({"cells", "b", "lower", "upper", "x0", "face_x", "face_y", "face_z", "shift"})
 PLACED = ("cells", "b", "lower", "upper", "shift")  # of the shape of `cells`, or a number
-KNOWN = REQUIRED | FIELDS  # of a file that holds more the rest is not read
+KNOWN = REQUIRED | FIELDS  # further arrays of a file are ignored
 DESCRIPTION = """\
 # Complementarity problems of a simulation
 
@@ -56,13 +56,13 @@ class RecordedProblem(Problem):
     """Problem recorded by a simulation.
 
     Args:
-        x0: where the simulation started, a field like b.
-        step: steps done before.
-        time: reached by them [s].
+        x0: first guess of the simulation, a field like b.
+        step: number of steps before.
+        time: time after them [s].
         dt: length of the step [s].
-        spacing: edge of a cell [m].
-        tolerance: relative residual that the simulation asked for.
-        absolute_tolerance: residual that it took for 0, in the units of y.
+        spacing: cell size [m].
+        tolerance: relative residual that the simulation required.
+        absolute_tolerance: residual that it counted as 0, in the units of y.
     """
 
     x0: np.ndarray
@@ -80,7 +80,7 @@ def arrays(problem: LCP, x0: wp.array[Any]) -> dict[str, np.ndarray]:
     The caller adds `NUMBERS`.
 
     Args:
-        problem: whose operator is a GridPoisson.
+        problem: the problem, whose operator is a GridPoisson.
         x0: first guess, float64 in the padded layout.
 
     Raises:
@@ -91,29 +91,32 @@ def arrays(problem: LCP, x0: wp.array[Any]) -> dict[str, np.ndarray]:
         raise ValueError("only problems of a GridPoisson without periodic axes can be recorded")
     cells = _inner(A.cells, A)
     fluid = cells == FLUID
-    kept: dict[str, np.ndarray] = {"format": np.array(FORMAT), "cells": cells}
+    saved: dict[str, np.ndarray] = {"format": np.array(FORMAT), "cells": cells}
     for name, field in (("b", problem.b), ("x0", x0)):
-        kept[name] = np.where(fluid, _inner(field, A), 0.0)
+        saved[name] = np.where(fluid, _inner(field, A), 0.0)
     for name, bound, none in (("lower", problem.lower, -np.inf), ("upper", problem.upper, np.inf)):
         host = _inner(bound, A)
         first = host[fluid][0]
-        kept[name] = (
+        saved[name] = (
             np.array(first) if (host[fluid] == first).all() else np.where(fluid, host, none)
         )
     for axis in range(len(A.shape)):
         if A.faces[axis].size:
-            kept[f"face_{AXES[axis]}"] = _inner(A.faces[axis], A, axis)
+            saved[f"face_{AXES[axis]}"] = _inner(A.faces[axis], A, axis)
         elif A.uniform[axis] != 1.0:
             faces = [n + (a == len(A.shape) - 1 - axis) for a, n in enumerate(A.shape)]
-            kept[f"face_{AXES[axis]}"] = np.full(faces, A.uniform[axis])
+            saved[f"face_{AXES[axis]}"] = np.full(faces, A.uniform[axis])
     if A.shift.size:
         host = _inner(A.shift, A)
-        kept["shift"] = np.where(fluid, host, host.dtype.type(0))
-    return kept
+        saved["shift"] = np.where(fluid, host, host.dtype.type(0))
+    return saved
 
 
 def _inner(field: wp.array[Any], A: GridPoisson, axis: int | None = None) -> np.ndarray:
-    """Return a stored field without its ring; of faces the upper ones of the last cells too."""
+    """Return a stored field without its ring.
+
+    A field of faces includes the upper faces of the last cells.
+    """
     host = field.numpy().reshape(A.layout.stored_shape)
     inner = host[
         tuple(slice(1, None if axis is not None and a == 2 - axis else -1) for a in range(3))
@@ -137,25 +140,25 @@ def load(path: Path, *, device: Any = None, dtype: Any = wp.float32) -> Recorded
     Args:
         path: the file.
         device: Warp device of its operator; the default device if None.
-        dtype: of the operator's coefficients.
+        dtype: storage type of the operator's coefficients.
 
     Raises:
-        ValueError: the file is none of a problem, or is damaged or of a later version; the message
-            names it.
+        ValueError: the file is not a recorded problem, or is damaged or of a later version; the
+            message names it.
     """
     with opened(path) as archive:
-        kept = archive.read(sorted(KNOWN & archive.headers.keys()))
+        saved = archive.read(sorted(KNOWN & archive.headers.keys()))
         coefficients: dict[str, Any] = {
-            name: kept[name] for name in ("face_x", "face_y", "face_z", "shift") if name in kept
+            name: saved[name] for name in ("face_x", "face_y", "face_z", "shift") if name in saved
         }
-        A = GridPoisson(kept["cells"], device=device, dtype=dtype, **coefficients)
+        A = GridPoisson(saved["cells"], device=device, dtype=dtype, **coefficients)
         b, lower, upper, x0 = (
-            np.broadcast_to(kept[name], A.shape).astype(np.float64)
+            np.broadcast_to(saved[name], A.shape).astype(np.float64)
             for name in ("b", "lower", "upper", "x0")
         )
-        numbers: dict[str, Any] = {name: kept[name].item() for name in NUMBERS}
+        numbers: dict[str, Any] = {name: saved[name].item() for name in NUMBERS}
         facts = {"symmetric", "semidefinite"} | (
-            {"mixed"} if np.isneginf(lower[kept["cells"] == FLUID]).any() else set()
+            {"mixed"} if np.isneginf(lower[saved["cells"] == FLUID]).any() else set()
         )
         return RecordedProblem(
             Path(path).stem, A, b, lower, upper, None, frozenset(facts), x0, **numbers
@@ -166,7 +169,7 @@ def check(path: Path) -> None:
     """Check that a file holds a recorded problem, without reading its fields.
 
     Raises:
-        ValueError: it is not, or is cut short or of a later version; the message names it.
+        ValueError: it does not, or is truncated or of a later version; the message names it.
     """
     with opened(path):
         pass
@@ -177,9 +180,9 @@ def opened(path: Path) -> Iterator[Archive]:
     """Open a recorded problem and check it, without reading its fields.
 
     Raises:
-        ValueError: it is not, is damaged, of a later version, or larger than the free memory; the
-            message names it. Errors of the block about the content of the file are reported in the
-            same way.
+        ValueError: it is not one, is damaged, of a later version, or larger than the free memory;
+            the message names it. Errors of the block about the content of the file are reported in
+            the same way.
     """
     try:
         with Archive(Path(path)) as archive:
@@ -190,7 +193,7 @@ def opened(path: Path) -> Iterator[Archive]:
 
 
 def _check(archive: Archive) -> None:
-    """Refuse an archive whose arrays are not those of a problem."""
+    """Raise an error if the arrays of an archive are not those of a problem."""
     headers = archive.headers
     if (
         "format" in headers
@@ -227,8 +230,8 @@ def cell_counts(path: Path) -> tuple[int, ...]:
     """Return the shape of a recorded problem's cells, (nz, ny, nx) or (ny, nx).
 
     Raises:
-        ValueError: the file is none of a problem, or is damaged or of a later version; the message
-            names it.
+        ValueError: the file is not a recorded problem, or is damaged or of a later version; the
+            message names it.
     """
     with opened(path) as archive:
         return archive.headers["cells"].shape
@@ -237,17 +240,16 @@ def cell_counts(path: Path) -> tuple[int, ...]:
 def load_part(path: Path, part: tuple[slice, ...]) -> dict[str, np.ndarray]:
     """Return the arrays of a recorded problem in a box of cells.
 
-    `cells`, `b`, bounds, face coefficients (upper faces included) and shift.
-
-    The file is read from its start to the box's end, one plane of cells (in 2-D one row) at a time.
+    `cells`, `b`, bounds, face coefficients (upper faces included) and shift. The file is read from
+    its start to the end of the box, one plane of cells (in 2-D one row) at a time.
 
     Args:
         path: the file.
-        part: which cells, a slice of each axis of `cells`.
+        part: the cells, a slice for each axis of `cells`.
 
     Raises:
-        ValueError: the file is none of a problem, or is damaged or of a later version; the message
-            names it.
+        ValueError: the file is not a recorded problem, or is damaged or of a later version; the
+            message names it.
     """
     faces = {f"face_{AXES[axis]}": len(part) - 1 - axis for axis in range(len(part))}
     with opened(path) as archive:

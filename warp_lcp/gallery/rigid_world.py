@@ -19,16 +19,17 @@ from warp_lcp.rigid.joints import Joint, JointRows
 from warp_lcp.rigid.mass_properties import MassProperties, mass_properties
 from warp_lcp.rigid.obstacles import Obstacle
 
-Parts = Sphere | Box | Sequence[Box]  # a ball, a box, or boxes that share their center
+Parts = Sphere | Box | Sequence[Box]  # a ball, a box, or boxes with a common center
 
 FIXED = np.inf  # mass [kg] of a body that does not move
 GROUND = Obstacle(name="ground", points=np.zeros((1, 3)), normals=np.array([[0.0, 0.0, 1.0]]))
 GRAVITY = (0.0, 0.0, -9.81)  # [m/s^2]
-# of the smallest body's reach: gaps up to it are contacts, besides those that the fastest bodies
-# may close in a step
+# Relative to the smallest body's reach: gaps up to this are contacts, besides those that the
+# fastest bodies can close in a step.
 MARGIN = 0.02
-NEAR_LIMIT = 0.2  # [rad]: a limit that is farther away has no row
-# of the smallest body's reach: overlap that is left alone, so that resting contacts stay
+NEAR_LIMIT = 0.2  # [rad]: limits farther away have no row
+# Relative to the smallest body's reach: overlap that is not corrected, so that resting contacts
+# persist.
 SLOP = 0.002
 
 
@@ -37,19 +38,19 @@ class World:
     """State of a contact scene: bodies, shapes, joints, gravity.
 
     Args:
-        name: the scene, with its parameters.
-        solids: the shape of each body, as it is placed: a ball, a box, or boxes that share their
-            center and the body's mass evenly.
-        mass: of each [kg]; FIXED for one that does not move.
+        name: name of the scene, with its parameters.
+        solids: the placed shape of each body: a ball, a box, or boxes with a common center and
+            equal shares of the mass.
+        mass: mass of each body [kg]; FIXED for one that does not move.
         obstacles: the ground.
-        hinges: joints; the bodies of one do not collide.
+        hinges: joints; bodies of a joint do not collide.
         friction: coefficient mu >= 0 of all contacts.
         gravity: [m/s^2].
         ignored: further pairs of bodies that do not collide, the smaller index first.
 
     Attributes:
-        bodies: their state; steps write it.
-        fixed: which do not move, shape (n,).
+        bodies: the bodies' state, updated by steps.
+        fixed: mask of the fixed bodies, shape (n,).
         contact_solve: finds contacts and stores their impulses.
         size: reach of the smallest body [m].
 
@@ -72,27 +73,27 @@ class World:
     size: float = field(init=False)
 
     def __post_init__(self) -> None:
-        """Check gravity, and make the bodies, which check the rest."""
+        """Check gravity, and create the bodies, which check the other values."""
         if not np.isfinite(self.gravity).all():
             raise ValueError(f"gravity = {self.gravity}: must be finite, in m/s^2")
         if not len(self.solids):
             raise ValueError("solids is empty: expected at least one body")
         self.fixed = np.isposinf(self.mass)
-        made = [
+        parts = [
             _made(solid, 1.0 if m == FIXED else m)
             for solid, m in zip(self.solids, self.mass, strict=True)
         ]
         self.bodies = BodyStates(
             [
                 RigidBody(p, name=f"body {i}", friction=self.friction)
-                for i, (p, _) in enumerate(made)
+                for i, (p, _) in enumerate(parts)
             ]
         )
-        shapes = [shape for _, shape in made]
+        shapes = [shape for _, shape in parts]
         self.contact_solve = ContactSolve(
             ContactDetection(self.bodies, shapes, self.obstacles, 3, every=True)
         )
-        self.size = min(shape.reach(properties.center) for properties, shape in made)
+        self.size = min(shape.reach(properties.center) for properties, shape in parts)
 
     def velocities(self) -> np.ndarray:
         """Return velocities, linear and angular, of the bodies [m/s, rad/s], shape (n, 6)."""
@@ -101,12 +102,11 @@ class World:
     def contacts(self, dt: float = 0.0, *, margin: float | None = None) -> Contacts:
         """Return the current contacts, or those possible within dt [s].
 
-        dt assumes that two bodies meet at the largest speed of all.
+        With dt, every body can move at the largest speed of all.
 
         Args:
             dt: time step [s].
-            margin: gap [m] up to which there is a contact; what bodies and their speeds ask for if
-                None.
+            margin: gap [m] up to which there is a contact; None: from the bodies' sizes and speeds.
         """
         fastest, near = (
             float(np.linalg.norm(self.velocities()[:, :3], axis=1).max()),
@@ -115,24 +115,26 @@ class World:
         near, way = (near, dt * fastest) if margin is None else (margin, 0.0)
         n, ignored = len(self.bodies), self.ignored | {hinge.pair for hinge in self.hinges}
         still = np.append(self.fixed, True)
-        found = self.contact_solve.detection.find(
+        detected = self.contact_solve.detection.find(
             0.0, np.full(n, way), np.full(len(self.obstacles), near + way), near
         )
-        found = found.without(ignored)
-        found = found.where(~(still[found.first] & still[found.second]))
-        found = found.where(np.lexsort((found.first, found.second, found.obstacle == NONE)))
-        return self.contact_solve.assembled(found, 0.0, 1.0, None)
+        detected = detected.without(ignored)
+        detected = detected.where(~(still[detected.first] & still[detected.second]))
+        detected = detected.where(
+            np.lexsort((detected.first, detected.second, detected.obstacle == NONE))
+        )
+        return self.contact_solve.assembled(detected, 0.0, 1.0, None)
 
     def assemble(self, dt: float, *, rate: float = 0.2) -> Assembly:
         """Return the velocity problem of a step.
 
-        u = J v' + c with v' = v + dt g + M^-1 J'r. For a contact's normal row c = gap / dt where
-        there is a gap, so that what approaches arrives in the step, and rate min(gap + slop, 0) /
-        dt where bodies overlap (Baumgarte); joints see `JointRows.bias`.
+        u = J v' + c with v' = v + dt g + M^-1 J'r. For a contact's normal row c = gap / dt if there
+        is a gap, so that an approaching body arrives within the step, and rate min(gap + slop, 0) /
+        dt if bodies overlap (Baumgarte); for joints see `JointRows.bias`.
 
         Args:
             dt: time step [s].
-            rate: part of an overlap or of a joint's error that the step removes, in [0, 1].
+            rate: fraction of an overlap or of a joint's error that the step removes, in [0, 1].
 
         Raises:
             ValueError: dt or rate is out of range.
@@ -190,11 +192,11 @@ class Assembly:
 
     Args:
         system: B, q, friction, bounds of joints.
-        contacts: the points of its contacts.
-        J: velocities at contacts and joints from those of the bodies, shape (rows, 6n).
-        response: M^-1 J', velocities of the bodies from impulses, shape (6n, rows).
+        contacts: its contacts.
+        J: maps velocities of the bodies to those at contacts and joints, shape (rows, 6n).
+        response: M^-1 J', maps impulses to velocities of the bodies, shape (6n, rows).
         falling: velocities of the bodies without impulses, shape (n, 6).
-        bias: c, the part of q that removes errors of position [m/s], shape (rows,).
+        bias: c, the part of q that removes position errors [m/s], shape (rows,).
     """
 
     system: ContactSystem
@@ -210,7 +212,10 @@ class Assembly:
 
 
 def _made(solid: Parts, mass: float) -> tuple[MassProperties, ContactShape]:
-    """Return mass properties and surface of a body; bars and boxes share the mass evenly."""
+    """Return mass properties and surface of a body.
+
+    Several boxes share the mass evenly.
+    """
     if isinstance(solid, Sphere):
         return mass_properties(solid, 3, mass=mass), ContactShape.of(solid, 3)
     boxes = [solid] if isinstance(solid, Box) else solid
@@ -222,5 +227,5 @@ def _made(solid: Parts, mass: float) -> tuple[MassProperties, ContactShape]:
 
 
 def _near(rows: JointRows) -> JointRows:
-    """Return the rows without those of limits that are far away."""
+    """Return the rows without those of distant limits."""
     return rows.where(rows.equations | rows.motors | (rows.error <= NEAR_LIMIT))

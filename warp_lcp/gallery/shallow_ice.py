@@ -17,10 +17,10 @@ from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.stopping import StoppingCriteria
 
-STEPS = 60  # of Newton's method, which took 7 at the most
+STEPS = 60  # limit of Newton steps; at most 7 were needed
 TIGHT = StoppingCriteria(rtol=1e-10, max_iterations=200)
-# Where a cell's fluxes are taken, in its own coordinates; along which axis; and the corners (x, y)
-# that each leaves and enters.
+# Points of a cell's fluxes, in its own coordinates; axis of each flux; and the corners (x, y) that
+# it leaves and enters.
 POINTS = (
     ((0.5, 0.25), 0, (0, 0), (1, 0)),
     ((0.5, 0.75), 0, (0, 1), (1, 1)),
@@ -34,21 +34,21 @@ CORNERS = ((0, 0), (1, 0), (1, 1), (0, 1))
 class IceDome:
     """Radial dome of ice on a flat bed with a known thickness H.
 
-    div q = m where H > 0, q = -Gamma H^(n+2) |grad H|^(n-1) grad H.
+    div q = m where H > 0, q = -Gamma H^(n+2) |grad H|^(n-1) grad H. The surface mass balance m
+    keeps the dome steady; outside, more ice melts than flows in.
 
-    The surface mass balance m is what keeps the dome as it is; outside, more melts than flows in.
-    Discretized by the control volumes of Bueler (2016) on bilinear elements with two fluxes a side,
-    as his program p4pdes/ice.c does: F(H) >= 0, H >= 0, H'F(H) = 0, F the outflow of each volume
-    less what falls on it, and D = (1 - regularization) Gamma H^(n+2) (|grad H|^2 +
-    slope^2)^((n-1)/2) + regularization * 1 m^2/s for the diffusivity. H = 0 on the border.
+    The discretization is that of Bueler (2016), control volumes on bilinear elements with two
+    fluxes per side, as in his program p4pdes/ice.c: F(H) >= 0, H >= 0, H'F(H) = 0. F is the outflow
+    of each volume less its mass balance, with the diffusivity D = (1 - regularization) Gamma
+    H^(n+2) (|grad H|^2 + slope^2)^((n-1)/2) + regularization * 1 m^2/s. H = 0 on the border.
 
     Args:
-        nodes: a side of the square, the border included, >= 3.
-        side: of the square [m].
-        radius: of the dome [m].
-        height: of its center [m].
+        nodes: nodes per side of the square, including the border, >= 3.
+        side: side of the square [m].
+        radius: radius of the dome [m].
+        height: height of its center [m].
         exponent: n > 1 of Glen's law.
-        softness: A [1/(Pa^n s)] of the ice.
+        softness: ice softness A [1/(Pa^n s)].
         regularization: share of a constant diffusivity, in (0, 1].
         slope: least slope, > 0.
 
@@ -104,7 +104,7 @@ class IceDome:
     def balance(self) -> np.ndarray:
         """Return the mass balance m at the nodes [m/s], shape (nodes, nodes).
 
-        m is not finite at center and margin; its value 1 cm beside stands there.
+        m is not finite at center and margin; there its value 1 cm beside is used.
         """
         n = self.exponent
         s = np.clip(self.distance, 0.01 / self.radius, 1 - 0.01 / self.radius)
@@ -120,7 +120,7 @@ class IceDome:
 
         Args:
             H: thickness at the nodes [m], shape (nodes, nodes).
-            share: of the constant diffusivity.
+            share: share of the constant diffusivity.
         """
         h, n, N = self.side / (self.nodes - 1), self.exponent, self.nodes
         corners = np.stack([H[y : N - 1 + y, x : N - 1 + x] for x, y in CORNERS])
@@ -173,17 +173,16 @@ class IceDome:
     def solve(self, *, device: Any = None) -> np.ndarray:
         """Return the discrete H at the nodes [m] by Newton's method.
 
-        Shape (nodes, nodes). Each step is a linear complementarity problem, H >= 0.
-
-        The share of the constant diffusivity falls from 1, where the problem is linear, by a third
-        of a decade each time, to `regularization`.
+        Shape (nodes, nodes). Each step is a linear complementarity problem, H >= 0. The share of
+        the constant diffusivity falls from 1, where the problem is linear, by a third of a decade
+        each time, to `regularization`.
 
         Args:
             device: Warp device of the operators.
 
         Raises:
             RuntimeError: a linear problem was not solved, or Newton's method did not converge; the
-                message says which.
+                message names the cause.
         """
         H, share = np.zeros((self.nodes,) * 2), 1.0
         while True:
@@ -193,7 +192,11 @@ class IceDome:
             share = max(share / 10 ** (1 / 3), self.regularization)
 
     def _newton(self, H: np.ndarray, share: float, device: Any) -> np.ndarray:
-        """Return the solution for a share of the constant diffusivity from a guess."""
+        """Return the solution for a share of the constant diffusivity from a guess.
+
+        Each step solves the LCP of the linearization, F(H_k) - m + J (H - H_k) complementary to H
+        >= 0, on the inner nodes.
+        """
         inner = np.flatnonzero(np.pad(np.ones((self.nodes - 2,) * 2, dtype=bool), 1))
         falls = (self.balance() * (self.side / (self.nodes - 1)) ** 2).ravel()[inner]
         for _ in range(STEPS):

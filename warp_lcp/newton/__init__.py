@@ -1,1 +1,4 @@
-"""Liquid in the worlds of newton (newton-physics.org): `warp_lcp.newton.solver`, which needs the extra `newton`."""
+"""Liquid in worlds of newton: `warp_lcp.newton.solver`.
+
+It needs the extra `newton` (newton-physics.org).
+"""

@@ -1,4 +1,7 @@
-"""Bodies of a newton world as a liquid pushes them; contacts and joints are that world's."""
+"""Bodies of a newton model in a liquid.
+
+The newton world handles their contacts and joints.
+"""
 
 from __future__ import annotations
 
@@ -16,19 +19,20 @@ from warp_lcp.rigid.mass_properties import MassProperties
 
 
 class WorldBodies(RigidBodies):
-    """The bodies of a newton model that a liquid holds, in the place of `RigidBodies`; a step has no contacts.
+    """Bodies of a newton model in a liquid, with the interface of `RigidBodies`.
+
+    A step has no contacts.
 
     Args:
-        model: of newton.
-        origin: what is the origin in the liquid's coordinates [m], shape (3,).
-        shapes: of each body by its number in the model.
-        first: wall number of the first of them; the others follow.
+        model: the newton model.
+        origin: origin of the liquid's coordinates in the world [m], shape (3,).
+        shapes: shapes of each body by its number in the model.
+        first: wall number of the first body; the others follow.
 
     Attributes:
-        indices: their numbers in the model.
-        force: what acts on them besides gravity and liquid [N, N m], about their centers of mass,
-            shape (n, 6).
-        impulses: what the liquid has given them since this was zeroed [N s, N m s], shape (n, 6).
+        indices: numbers of the bodies in the model.
+        force: forces besides gravity and liquid [N, N m], about the centers of mass, shape (n, 6).
+        impulses: impulses of the liquid since this was set to zero [N s, N m s], shape (n, 6).
     """
 
     def __init__(
@@ -45,24 +49,30 @@ class WorldBodies(RigidBodies):
         self.motions = [BodyMotion(body) for body in self.bodies]
         self.refresh(model)
         self.contacts, self.contact_residual, self._surfaces = 0, 0.0, None
-        self.joints = ()  # the world has them
-        self.exits = ((), 0)  # the world decides where they go
+        self.joints = ()  # joints are part of the newton world
+        self.exits = ((), 0)  # the newton world removes bodies
         self._before: np.ndarray | None = None
         self.force, self.impulses = (np.zeros((len(self.bodies), 6)) for _ in range(2))
 
     def refresh(self, model: Any) -> None:
-        """Take masses and inertias from the model; what has none, or is kinematic, answers to no impulse."""
+        """Update masses and inertias from the model.
+
+        Bodies without mass, and kinematic ones, do not respond to impulses.
+        """
         kinematic = model.body_flags.numpy()[self.indices] & newton.BodyFlags.KINEMATIC != 0
         self.prescribed = kinematic | (model.body_inv_mass.numpy()[self.indices] == 0.0)
         for body, (_, properties) in zip(self.bodies, self._properties(model), strict=True):
             body.properties = properties
-        self.bodies = BodyStates(self.bodies)  # with the masses
+        self.bodies = BodyStates(self.bodies)  # with the new masses
         self._com = model.body_com.numpy()[self.indices].astype(np.float64)
 
     def asked(
         self, poses: np.ndarray, velocities: np.ndarray, forces: np.ndarray | None, dt: float
     ) -> np.ndarray:
-        """Return what a step of dt [s] depends on: poses, and velocities with what the forces give; arguments as of `take`."""
+        """Return the inputs of a step of dt [s]: poses, and velocities after forces.
+
+        Arguments as of `take`.
+        """
         placed, moved = (array[self.indices].astype(np.float64) for array in (poses, velocities))
         given = (
             np.zeros_like(moved) if forces is None else dt * forces[self.indices].astype(np.float64)
@@ -78,13 +88,16 @@ class WorldBodies(RigidBodies):
     def take(
         self, poses: np.ndarray, velocities: np.ndarray, forces: np.ndarray | None, time: float
     ) -> bool:
-        """Take the state of the world; return whether a body lies elsewhere than the last step left it.
+        """Set the state of the world; return whether a body was moved from outside.
+
+        That is, whether its pose differs from the one after the last step.
 
         Args:
-            poses: of all bodies of the model, shape (bodies, 7).
-            velocities: of their centers of mass [m/s] and angular [rad/s], shape (bodies, 6).
-            forces: on them [N, N m], shape (bodies, 6).
-            time: of the liquid [s].
+            poses: poses of all bodies of the model, shape (bodies, 7).
+            velocities: velocities of their centers of mass [m/s] and angular [rad/s], shape
+                (bodies, 6).
+            forces: forces on them [N, N m], shape (bodies, 6).
+            time: time of the liquid [s].
         """
         moved = False
         self.force = (
@@ -110,7 +123,7 @@ class WorldBodies(RigidBodies):
         return moved
 
     def give(self, poses: np.ndarray, velocities: np.ndarray) -> None:
-        """Enter the state of the bodies that are free to move into arrays as of `take` (updated)."""
+        """Write the state of the free bodies into arrays as of `take` (updated)."""
         for number, index in enumerate(self.indices):
             if not self.prescribed[number]:
                 body = self.bodies[number]
@@ -120,7 +133,7 @@ class WorldBodies(RigidBodies):
                 velocities[index, :3], velocities[index, 3:] = body.velocity, body.angular_velocity
 
     def begin_step(self, time: float, dt: float, gravity: np.ndarray, kick_dt: float) -> None:
-        """Let gravity and the world's forces act for `kick_dt` [s]."""
+        """Apply gravity and the world's forces for `kick_dt` [s]."""
         self.restore_step()
         self._before = self._states()
         for body, force, prescribed in zip(self.bodies, self.force, self.prescribed, strict=True):
@@ -133,10 +146,10 @@ class WorldBodies(RigidBodies):
                 body.push(kick_dt * force)
 
     def solve_contacts(self) -> None:
-        """Do nothing: contacts are the world's."""
+        """Do nothing: the newton world handles contacts."""
 
     def end_step(self, dt: float) -> None:
-        """Move and turn the bodies."""
+        """Move and rotate the bodies."""
         self._before = None
         for body, impulse in zip(self.bodies, self.impulses, strict=True):
             impulse += body.given
@@ -150,12 +163,15 @@ class WorldBodies(RigidBodies):
             self._before = None
 
     def trouble(self, size: Sequence[float], endless: Sequence[int]) -> str | None:
-        """Return what makes it impossible to go on, if something does: a body that is not finite."""
+        """Return the reason why the simulation cannot continue, if any.
+
+        A body is not finite.
+        """
         wrong = [body.name for body in self.bodies if not np.isfinite(body.state()).all()]
         return f"{wrong[0]} has a velocity that is not finite" if wrong else None
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return what `restore` needs."""
+        """Return the state for `restore`."""
         return {"bodies": self._states()}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
@@ -164,19 +180,22 @@ class WorldBodies(RigidBodies):
         self.bodies.restore(np.asarray(state["bodies"]))
 
     def _properties(self, model: Any) -> list[tuple[int, MassProperties]]:
-        """Return mass, center and inertia of each body as the model places it, those of a unit ball where it has none."""
+        """Return mass, center and inertia of each body as placed in the model.
+
+        Those of a unit ball for bodies without mass.
+        """
         masses, centers, inertias = (
             getattr(model, f"body_{name}").numpy()[self.indices]
             for name in ("mass", "com", "inertia")
         )
-        found = []
+        properties = []
         for index, R, q, mass, com, inertia in zip(
             self.indices, self._turned, self._placed, masses, centers, inertias, strict=True
         ):
             own = inertia.astype(np.float64) if mass > 0.0 else np.eye(3)
             turned = R @ (0.5 * (own + own.T)) @ R.T
             center = q[:3] + R @ com - self._origin
-            found.append(
+            properties.append(
                 (
                     int(index),
                     MassProperties(
@@ -184,14 +203,17 @@ class WorldBodies(RigidBodies):
                     ),
                 )
             )
-        return found
+        return properties
 
 
-SAME = 1e-6  # [m, and of a rotation's entries]: what float32 leaves of a pose
+SAME = 1e-6  # [m, and of a rotation's entries]: float32 accuracy of a pose
 
 
 def quaternion_of(R: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Return the quaternion (x, y, z, w) of a rotation, of the two the one nearer to another."""
+    """Return the quaternion (x, y, z, w) of a rotation.
+
+    Of the two, the one nearer to another quaternion.
+    """
     from scipy.spatial.transform import Rotation
 
     q = Rotation.from_matrix(R).as_quat()

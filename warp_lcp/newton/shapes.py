@@ -22,7 +22,7 @@ from warp_lcp.grid.solids import (
 )
 from warp_lcp.grid.triangle_mesh import close_surface
 
-SEGMENTS = 64  # around what is round and made of triangles: its volume is 0.2 % too small
+SEGMENTS = 64  # segments of round shapes made of triangles: the volume is 0.2 % too small
 
 
 def rotation_of(quaternion: np.ndarray) -> np.ndarray:
@@ -34,26 +34,26 @@ def rotation_of(quaternion: np.ndarray) -> np.ndarray:
 
 
 def pose_of(transform: np.ndarray) -> Pose:
-    """Return the change of place that a transform is: position [m] and quaternion, shape (7,)."""
+    """Return the pose of a transform: position [m] and quaternion, shape (7,)."""
     return Pose(rotation_of(transform[3:]), np.asarray(transform[:3], dtype=np.float64))
 
 
 def geometries(model: Any, origin: np.ndarray) -> dict[int, list[Geometry]]:
-    """Return the shapes of each body, -1 the world's, where the model places them: those that collide with shapes.
+    """Return the colliding shapes of each body as placed in the model; -1: the world.
 
     Args:
-        model: of newton.
-        origin: what is the origin in the liquid's coordinates [m], shape (3,).
+        model: the newton model.
+        origin: origin of the liquid's coordinates in the world [m], shape (3,).
 
     Raises:
-        ValueError: a shape has no inside, or none that a liquid can tell.
+        ValueError: a shape has no inside, or none that a liquid can use.
     """
     arrays = {
         name: getattr(model, f"shape_{name}").numpy()
         for name in ("body", "flags", "type", "scale", "transform")
     }
     placed = model.body_q.numpy() if model.body_count else np.zeros((0, 7))
-    found: dict[int, list[Geometry]] = {}
+    geometries_of: dict[int, list[Geometry]] = {}
     for shape in range(model.shape_count):
         row = {name: array[shape] for name, array in arrays.items()}
         if not row["flags"] & newton.ShapeFlags.COLLIDE_SHAPES:
@@ -63,19 +63,22 @@ def geometries(model: Any, origin: np.ndarray) -> dict[int, list[Geometry]]:
         if body >= 0:
             pose = pose_of(placed[body]).after(pose)
         geometry = _geometry(row, model.shape_source[shape], model.shape_label[shape])
-        found.setdefault(body, []).append(
+        geometries_of.setdefault(body, []).append(
             geometry.moved(Pose(pose.rotation, pose.translation - origin))
         )
-    return found
+    return geometries_of
 
 
 def united(shapes: list[Geometry]) -> Geometry:
-    """Return all shapes of a body as one."""
+    """Return all shapes of a body as one shape."""
     return shapes[0] if len(shapes) == 1 else Union(parts=tuple(shapes))
 
 
 def reaches_into(geometry: Geometry, size: np.ndarray) -> bool:
-    """Tell whether a standing shape reaches into a domain from the origin to `size` [m], or may: a floor that only bears it does not."""
+    """Return whether a shape at rest reaches, or may reach, into the domain.
+
+    The domain is a box from the origin to `size` [m]. A floor below the domain does not count.
+    """
     slack = 1e-6 * float(size.max())
     bounds = geometry.bounds()
     if bounds is not None:
@@ -103,22 +106,23 @@ def _geometry(row: Mapping[str, Any], source: Any, name: str) -> Geometry:
         return Sphere(center=[0.0, 0.0, 0.0], radius=x)
     if kind == kinds.PLANE and not (x or y):
         return Plane(point=[0.0, 0.0, 0.0], normal=[0.0, 0.0, 1.0])
-    made = {"compute_normals": False, "compute_uvs": False, "compute_inertia": False}
+    mesh_options = {"compute_normals": False, "compute_uvs": False, "compute_inertia": False}
     if kind == kinds.ELLIPSOID:
         return _mesh(
             newton.Mesh.create_ellipsoid(
-                x, y, z, num_latitudes=SEGMENTS // 2, num_longitudes=SEGMENTS, **made
+                x, y, z, num_latitudes=SEGMENTS // 2, num_longitudes=SEGMENTS, **mesh_options
             ),
             name,
         )
     if kind == kinds.CYLINDER:
         mesh = newton.Mesh.create_cylinder(
-            x, y, up_axis=newton.Axis.Z, barrel_radius=z, segments=SEGMENTS, **made
+            x, y, up_axis=newton.Axis.Z, barrel_radius=z, segments=SEGMENTS, **mesh_options
         )
         return _mesh(mesh, name)
     if kind == kinds.CONE:
         return _mesh(
-            newton.Mesh.create_cone(x, y, up_axis=newton.Axis.Z, segments=SEGMENTS, **made), name
+            newton.Mesh.create_cone(x, y, up_axis=newton.Axis.Z, segments=SEGMENTS, **mesh_options),
+            name,
         )
     if kind == kinds.MESH:
         return _mesh(source, name, row["scale"])

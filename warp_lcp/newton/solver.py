@@ -1,4 +1,4 @@
-"""A solver of newton for liquid that lets go of walls, in which the bodies of a model float and sink."""
+"""Newton solver for a liquid, in which the bodies of a model float and sink."""
 
 from __future__ import annotations
 
@@ -24,12 +24,13 @@ from warp_lcp.scene.scene_file import SceneSource, load_scene
 from warp_lcp.scene.shapes import SolidSphere
 from warp_lcp.simulation import StepFailed
 
-RETRIES = 6  # halvings of a step that fails
+RETRIES = 6  # halvings of the time step after a failure
 DEFAULTS: dict[str, Any] = {"scene": {"simulator": "fluids"}, "time": {"duration": 1.0}}
-WHOLE = 1e-9  # of a step: what rounding leaves of it
-# of cells and radians, and of what gravity gives in a step: bodies that differ by less move alike
+WHOLE = 1e-9  # relative to a step: rounding
+# Relative to cells, radians, and the velocity that gravity adds in a step: smaller differences of
+# the bodies' states do not matter.
 ALIKE = 1e-2
-# [m/s, rad/s]: what float32 leaves of a velocity from which impulses have been taken back
+# [m/s, rad/s]: float32 accuracy of a velocity after impulses were subtracted.
 ROUNDING = 1e-5
 MOVES, POSED = (
     ("body_q", "body_qd", "particle_q", "particle_qd", "joint_q", "joint_qd"),
@@ -38,30 +39,30 @@ MOVES, POSED = (
 
 
 class SolverLiquid(SolverBase, CouplingInterface):
-    """Liquid in a box of a newton world; its bodies displace it, and its pressure moves them.
+    """Liquid in a box of a newton world, coupled with the bodies of the model.
 
-    Pressure and bodies are one problem, see `warp_lcp.fluids.coupling`: it knows the bodies'
-    masses, so that added mass makes nothing unstable. Alone, `step` lets bodies move by gravity,
-    `body_f` and the liquid, without contacts and joints. `coupled` returns newton's
-    `SolverCoupledProxy` of it and of a solver for these: the liquid starts from the velocities that
-    contacts and joints leave.
+    Bodies displace the liquid, and its pressure moves them. Pressure and bodies are one problem,
+    see `warp_lcp.fluids.coupling`: it includes the bodies' masses, so that added mass does not
+    cause instabilities. Used alone, `step` moves bodies by gravity, `body_f` and the liquid,
+    without contacts and joints. `coupled` returns newton's `SolverCoupledProxy` of this solver and
+    one for contacts and joints: the liquid starts from the velocities after contacts and joints.
 
     Args:
-        model: of newton. Shapes that collide with shapes displace the liquid: those of bodies, and
-            what stands in the box.
+        model: the newton model. Shapes that collide with shapes displace the liquid: those of
+            bodies, and static ones in the box.
         scene: the liquid, as tables, a file or a name: its domain from 0 to `domain.size` in 3-D,
-            `[[liquid]]`, and whatever else a scene may have but rigid bodies. Gravity is the
-            model's; `scene` and `time` may be left out of tables.
-        origin: where in the world the domain's low corner is [m].
-        bodies: numbers of those that the liquid holds; all that have shapes unless given.
+            `[[liquid]]`, and all other tables except rigid bodies. Gravity is the model's; `scene`
+            and `time` can be omitted from tables.
+        origin: position of the domain's low corner in the world [m].
+        bodies: numbers of the bodies in the liquid. Default: all that have shapes.
 
     Attributes:
         simulation: the liquid, in coordinates of its domain.
-        bodies: those that it holds.
-        row: the last step's row of the log.
+        bodies: the bodies in the liquid.
+        row: log row of the last step.
 
     Raises:
-        ValueError: the scene or a shape is not for this.
+        ValueError: the scene or a shape is not supported.
     """
 
     def __init__(
@@ -82,7 +83,7 @@ class SolverLiquid(SolverBase, CouplingInterface):
         self._origin, self._chosen = np.asarray(origin, dtype=np.float64), bodies
         self.row: Row = {}
         self._coupled = self._restarts = self._again = False
-        # whether the next step is the first since the coupler has set the bodies' poses
+        # Whether the next step is the first since the coupler has set the bodies' poses.
         self._begins = True
         self._kept: dict[str, np.ndarray] = {}
         self._asked: np.ndarray | None = None
@@ -98,16 +99,16 @@ class SolverLiquid(SolverBase, CouplingInterface):
         origin: Sequence[float] = (0.0, 0.0, 0.0),
         iterations: int = 2,
     ) -> SolverCoupledProxy:
-        """Return a solver of a world with liquid: `rigid` moves the bodies, the liquid pushes them.
+        """Return a solver of a world with liquid, coupled with a rigid-body solver.
 
         Args:
-            model: of newton, whose bodies with shapes the liquid holds.
-            rigid: makes the bodies' solver of a view of the model, say `SolverXPBD`.
-            scene: as of the class, like the rest.
-            origin: likewise.
-            iterations: how often both take a step; the first time the bodies' solver only guesses
-                what the liquid gives. 1 is cheaper, and bodies far lighter than the liquid then
-                swing for some steps after a jolt.
+            model: the newton model, whose bodies with shapes are in the liquid.
+            rigid: creates the rigid-body solver for a view of the model, such as `SolverXPBD`.
+            scene: see the class.
+            origin: see the class.
+            iterations: number of alternating steps. In the first one the rigid-body solver only
+                estimates the liquid's impulses. 1 is cheaper, but bodies much lighter than the
+                liquid then oscillate for some steps after a jolt.
         """
         bodies, joints, particles = (
             list(range(count))
@@ -133,15 +134,15 @@ class SolverLiquid(SolverBase, CouplingInterface):
         *,
         observables: Any = None,
     ) -> None:
-        """Advance liquid and bodies by dt [s], in as many steps of the liquid as its CFL number asks for.
+        """Advance liquid and bodies by dt [s], in as many substeps as CFL requires.
 
-        `state_in.body_f` acts besides gravity; `control` and `contacts` are of no meaning.
-        Kinematic bodies move as their velocities say, and keep their poses. The liquid's own state
-        is this solver's, not `state_in`'s.
+        `state_in.body_f` acts besides gravity; `control` and `contacts` are ignored. Kinematic
+        bodies have their given velocities, and keep their poses. The liquid's own state is stored
+        in this solver, not in `state_in`.
 
         Raises:
             RuntimeError: a graph is being captured.
-            StepFailed: the pressure's solve failed, with shorter steps too.
+            StepFailed: the pressure solve failed, also with shorter steps.
             SimulationFailed: something is not finite, or has left the domain.
         """
         if not (math.isfinite(dt) and dt > 0.0):
@@ -173,12 +174,15 @@ class SolverLiquid(SolverBase, CouplingInterface):
         state_out.body_qd.assign(velocities)
 
     def particles(self) -> wp.array:
-        """Return where the liquid's particles are in the world [m], wp.vec3, for a viewer's `log_points`."""
+        """Return the positions of the liquid's particles in the world [m], wp.vec3.
+
+        For a viewer's `log_points`.
+        """
         points = self.simulation.points().points.astype(np.float64) + self._origin
         return wp.array(points.astype(np.float32), dtype=wp.vec3, device=self.model.device)
 
     def notify_model_changed(self, flags: int) -> None:
-        """Take other masses or gravity from the model; shapes stay what they were."""
+        """Update masses or gravity from the model; shapes are not updated."""
         changes = newton.ModelFlags
         if self.bodies is not None and flags & (
             changes.BODY_INERTIAL_PROPERTIES | changes.BODY_PROPERTIES
@@ -188,20 +192,23 @@ class SolverLiquid(SolverBase, CouplingInterface):
             self.simulation.gravity[:] = self._gravity()
 
     def reset(self, state: Any, world_mask: Any = None, flags: Any = None) -> None:
-        """Put the liquid back to where it was at the start, unless no world is reset; bodies are where the next state has them."""
+        """Reset the liquid to its initial state, unless no world is reset.
+
+        The next state sets the bodies.
+        """
         super().reset(state, world_mask, flags)
         if world_mask is None or world_mask.numpy().any():
             self.simulation, self.bodies = self._create()
             self.simulation.gravity[:] = self._gravity()
 
     def coupling_notify_iteration_restarts(self, enabled: bool) -> None:
-        """Learn that a coupler steps this solver, and whether it repeats steps."""
+        """Set whether a coupler drives this solver and repeats steps."""
         self._coupled, self._restarts = True, enabled
 
     def coupling_notify_input_state_update(
         self, state: Any, flags: Any, *, iteration_restart: bool = False, dt: float = 0.0
     ) -> None:
-        """Learn that bodies have new poses, and whether the coupler repeats the step."""
+        """Note that bodies have new poses, and whether the coupler repeats the step."""
         self._begins |= bool(int(flags) & POSED)
         self._again |= iteration_restart and dt > 0.0
 
@@ -216,7 +223,10 @@ class SolverLiquid(SolverBase, CouplingInterface):
         contacts: Any,
         dt: float,
     ) -> None:
-        """Return the liquid's impulses of the step as forces: what it gave is what the bodies' own solver takes."""
+        """Return the liquid's impulses of the step as forces.
+
+        The rigid-body solver gets exactly these impulses.
+        """
         if self.bodies is None:
             return
         forces, proxies = (
@@ -263,7 +273,7 @@ class SolverLiquid(SolverBase, CouplingInterface):
                 PlacedSolid(geometry=shape, separating=separating, name=body.name, motion=motion)
                 for body, shape, motion in movers
             ]
-        # their walls matter
+        # Placeholders in the list of solids, of which only the wall conditions matter.
         stand, move = (
             SolidSphere(shape="sphere", center=[0.0] * 3, radius=1.0, mass=mass)
             for mass in (None, 1.0)
@@ -275,11 +285,14 @@ class SolverLiquid(SolverBase, CouplingInterface):
         ), bodies
 
     def _begin(self, asked: np.ndarray | None, dt: float) -> bool:
-        """Be where the step begins; return whether it is to be taken, not repeated with bodies that move as they did, contacts or not.
+        """Restore the state at the beginning of the step; return whether to run it.
+
+        It is not run if the coupler repeats it and the bodies move as before, with or without
+        contacts.
 
         Args:
-            asked: of `WorldBodies.asked`.
-            dt: [s].
+            asked: the result of `WorldBodies.asked`.
+            dt: time step [s].
         """
         if self._begins or not self._coupled:
             if self._again:
@@ -299,18 +312,23 @@ class SolverLiquid(SolverBase, CouplingInterface):
             if self.bodies is not None:
                 self.bodies.impulses[:] = 0.0
         else:
-            self._asked = None  # one of several steps
+            self._asked = None  # one of several substeps
         self._begins = False
         return True
 
     def _advance(self, dt: float) -> None:
+        """Run steps of the liquid over dt [s], with shorter steps after a failure.
+
+        Steps are equal in length, at most the stable one and twice the last one. A failed step is
+        halved up to RETRIES times.
+        """
         simulation, end, least = self.simulation, self.simulation.time + dt, dt / 2**RETRIES
         step = math.inf
         while (remaining := end - simulation.time) > WHOLE * dt:
             step = min(simulation.stable_dt(), self.scene.time.dt_max, 2.0 * step)
             count = math.ceil(remaining / step * (1.0 - WHOLE))
             while True:
-                # forces act for as long as bodies move, as newton has it
+                # In newton, forces act for the whole motion of the bodies.
                 simulation.last_dt = remaining / count
                 try:
                     self.row = simulation.step(remaining / count)

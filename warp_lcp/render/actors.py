@@ -1,4 +1,7 @@
-"""What comes and goes in a run's images: particles, the surface of the material and rigid bodies. Needs the extra `render`."""
+"""Actors of a run's images: particles, surfaces and rigid bodies.
+
+Needs the extra `render`.
+"""
 
 from __future__ import annotations
 
@@ -25,9 +28,9 @@ BODY_COLORS = [
     "#6f7f95",
 ]
 BODY_EDGE = "#4a3b33"
-LIGHTER = 0.5  # of the way to white: every other eighth of a ball
+LIGHTER = 0.5  # fraction of the way to white, for every other octant of a ball
 BOX_POINTS = 8
-ROUND = 1e-3  # how much the distances from the middle of what is round may differ, relative
+ROUND = 1e-3  # largest relative difference of the distances from the center of a round body
 SURFACES: dict[str, dict[str, Any]] = {  # in 3-D, by `Scene.palette`
     "water": {
         "color": "#4aa9ee",
@@ -39,33 +42,34 @@ SURFACES: dict[str, dict[str, Any]] = {  # in 3-D, by `Scene.palette`
     },
     "sand": {"color": "#c9a15f", "specular": 0.0, "ambient": 0.4},
 }
-# in 2-D, at the domain's bottom and at its top
+# In 2-D, at the domain's bottom and at its top.
 FILLS = {"water": ["#1254a2", "#78c4ee"], "sand": ["#aa7c46", "#deb87a"]}
 OUTLINES = {"water": "#0c3e80", "sand": "#78522a"}
 
-# shadows of water are blue, of sand brown
+# Shadows are blue for water, brown for sand.
 SHADES = {"water": np.array([1.4, 1.0, 0.7]), "sand": np.array([1.1, 1.3, 1.5])}
-SHEENS = {"water": 0.35, "sand": 0.0}  # how bright the lamp's mirror image is: sand has none
-# the normal that mirrors the light into the camera
+SHEENS = {"water": 0.35, "sand": 0.0}  # brightness of the lamp's specular reflection; 0 for sand
+# The normal that reflects the light into the camera.
 GLINT = (LIGHT + THREE_QUARTERS) / np.linalg.norm(LIGHT + THREE_QUARTERS)
-# of the density in particles a cell: flatter and denser is deeper inside than two cells
+# Slope and density, in particles per cell: flatter and denser is deeper inside than two cells.
 HIDDEN_SLOPE, HIDDEN_DENSITY = 0.6, 6.0
-SHADING_CELLS = 4e6  # of the density that shades a liquid, to bound its memory
+SHADING_CELLS = 4e6  # cells of the density that shades a liquid, to limit its memory
 
-FLUSH = 1e-5  # of the domain's longest side: how far from a side a point on it may lie
+# Distance from a side of the domain up to which a point is on it, relative to the longest side.
+FLUSH = 1e-5
 
-Drawn = tuple[Any, dict[str, Any]]  # a mesh of pyvista's, and how its plotter is to draw it
+Drawn = tuple[Any, dict[str, Any]]  # a pyvista mesh, and the options of its plotter
 
 
 class Actors:
-    """What stands on a plotter of pyvista's, in groups that are exchanged as a whole."""
+    """Actors of a plotter, in groups that are replaced as a whole."""
 
     def __init__(self, plotter: Any) -> None:
         self.plotter = plotter
         self._counts: dict[str, int] = defaultdict(int)
 
     def exchange(self, group: str, meshes: Sequence[Drawn]) -> list[Any]:
-        """Draw meshes in place of those that the group had; return the actors of those that have points."""
+        """Replace the meshes of a group; return the actors of those with points."""
         for number in range(self._counts[group]):
             self.plotter.remove_actor(f"{group} {number}", render=False)
         drawn = [(mesh, looks) for mesh, looks in meshes if mesh.n_points]
@@ -86,15 +90,16 @@ class Actors:
 def surface_meshes(
     surface: Surface, palette: str, size: Sequence[float], line_width: float
 ) -> list[Drawn]:
-    """Return the surface of a material, the part on each of the domain's sides by itself.
+    """Return the surface of a material, separated by the domain's sides.
 
-    In 2-D it is the inside, deeper in color toward the bottom, and the outline, behind the solids.
+    In 2-D it consists of the inside, deeper in color toward the bottom, and the outline, behind the
+    solids.
 
     Args:
         surface: triangles, or closed chains of segments.
-        palette: of the material.
-        size: of the domain [m].
-        line_width: of the outline [pixels].
+        palette: palette of the material.
+        size: size of the domain [m].
+        line_width: width of the outline [pixels].
     """
     if not len(surface.corners):
         return []
@@ -102,7 +107,7 @@ def surface_meshes(
         ends = np.abs(surface.points - np.stack([np.zeros(3), size])[:, None]) < FLUSH * max(size)
         on_side = ends[:, surface.corners].all(axis=2).transpose(1, 0, 2).reshape(-1, 6)
         side = np.where(on_side.any(axis=1), on_side.argmax(axis=1), 6)
-        # each with its own normals: their edges are sharp
+        # Each part has normals of its own, for sharp edges.
         parts = [surface.corners[side == number] for number in np.unique(side)]
         return [
             (poly_data(surface.points, part), {"smooth_shading": True, **SURFACES[palette]})
@@ -131,13 +136,13 @@ def surface_meshes(
 def body_meshes(
     bodies: Surface | None, at_first: Surface | None, line_width: float, front: float
 ) -> list[Drawn]:
-    """Return rigid bodies where they are, each in a color of its own.
+    """Return rigid bodies at their positions, each in a color of its own.
 
     Args:
-        bodies: with the field `body`; None: there are none.
-        at_first: the bodies in the run's first frame, which tells the eighths of balls.
-        line_width: of the outlines of bodies in 2-D [pixels].
-        front: how far bodies in 2-D stand before the particles [m].
+        bodies: surfaces with the field `body`; None without bodies.
+        at_first: the bodies in the run's first frame, which defines the octants of balls.
+        line_width: width of the outlines of bodies in 2-D [pixels].
+        front: distance of bodies in 2-D in front of the particles [m].
     """
     if bodies is None:
         return []
@@ -155,7 +160,7 @@ def body_meshes(
 def _solid_body(
     points: np.ndarray, corners: np.ndarray, color: str, at_first: Surface | None
 ) -> Drawn:
-    """Return a body; a ball in eighths of two shades, which show how it turns."""
+    """Return a body; a ball has octants of two shades, which show its rotation."""
     from matplotlib.colors import to_hex, to_rgb
 
     mesh = poly_data(points, corners)
@@ -168,7 +173,7 @@ def _solid_body(
     if at_first is None or len(at_first.points) != len(points) or not is_round(points, corners):
         return mesh, {"color": color, "split_sharp_edges": True, **looks}
     own = at_first.points[np.unique(corners)]
-    # changes its sign between eighths
+    # The sign alternates between octants.
     side = np.prod(own - 0.5 * (own.min(axis=0) + own.max(axis=0)), axis=1)
     pale = to_hex(LIGHTER + (1.0 - LIGHTER) * np.array(to_rgb(color)))
     return mesh, {
@@ -183,10 +188,10 @@ def _solid_body(
 def _flat_body(
     points: np.ndarray, corners: np.ndarray, color: str, line_width: float, front: float
 ) -> list[Drawn]:
-    """Return the inside and the outline of a body, a little before the particles and the walls."""
+    """Return inside and outline of a body, in front of particles and walls."""
     outline = poly_data(points, corners).clean()
     inside = outline.triangulate_contours().translate((0.0, 0.0, front))
-    if is_round(points, corners):  # a radius, which shows how the disc turns
+    if is_round(points, corners):  # a radius, which shows the rotation of the disc
         outline = outline.merge(
             poly_data(
                 np.stack([points[corners[:, 0]].mean(axis=0), points[corners[0, 0]]]),
@@ -201,7 +206,7 @@ def _flat_body(
 
 
 def poly_data(points: np.ndarray, corners: np.ndarray) -> Any:
-    """Return what has these corners, triangles or segments, as pyvista's PolyData of the points that they use."""
+    """Return triangles or segments as PolyData, with only the points in use."""
     import pyvista
 
     used, own = np.unique(corners, return_inverse=True)
@@ -214,7 +219,10 @@ def poly_data(points: np.ndarray, corners: np.ndarray) -> Any:
 
 
 def is_round(points: np.ndarray, corners: np.ndarray) -> bool:
-    """Return whether a body is a disc or a ball: its points [m], more than a box has, lie at one distance from their middle."""
+    """Return whether a body is a disc or a ball.
+
+    Its points [m], more than those of a box, have one distance from their center.
+    """
     own = points[np.unique(corners)]
     distance = np.linalg.norm(own - 0.5 * (own.min(axis=0) + own.max(axis=0)), axis=1)
     return len(own) > BOX_POINTS and bool(np.ptp(distance) < ROUND * distance.max())
@@ -223,23 +231,23 @@ def is_round(points: np.ndarray, corners: np.ndarray) -> bool:
 def shaded(
     points: np.ndarray, colors: np.ndarray, spacing: float, palette: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Light particles as the smooth surface of the liquid that they make up, whose normals point down the gradient of their density.
+    """Shade particles like a smooth surface of the liquid.
 
-    Particles inside the liquid, and single drops, keep their color.
+    The normals are opposite to the gradient of the particles' density. Particles inside the liquid,
+    and single drops, keep their color.
 
     Args:
         points: [m], shape (n, 3).
         colors: 0 to 255, shape (n, 3).
-        spacing: over which the density is averaged [m].
-        palette: of the material, a key of SHADES.
+        spacing: length over which the density is averaged [m].
+        palette: palette of the material, a key of SHADES.
 
     Returns:
-        Colors as `colors`, and which particles are not hidden deep inside by the others, shape
-        (n,).
+        Colors as `colors`, and a mask of the particles that are not hidden deep inside, shape (n,).
     """
     low, extent = points.min(axis=0), np.ptp(points, axis=0)
     spacing = max(spacing, (float(np.prod(extent + 6 * spacing)) / SHADING_CELLS) ** (1 / 3))
-    # a lattice of two particles a cell then lies well inside the bins
+    # A lattice of two particles per cell then lies well inside the bins.
     at = (points - low) / spacing + 3.25
     density, _ = np.histogramdd(
         at, bins=[range(math.ceil(side) + 1) for side in at.max(axis=0) + 3.0]

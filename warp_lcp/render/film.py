@@ -1,4 +1,7 @@
-"""Films: images that FFmpeg, which the package imageio-ffmpeg brings, encodes one after the other, so that one at a time is in memory."""
+"""Films, encoded by FFmpeg image by image.
+
+FFmpeg comes with the package imageio-ffmpeg. One image at a time is in memory.
+"""
 
 from __future__ import annotations
 
@@ -15,12 +18,12 @@ from warp_lcp.files.atomic import replacing_by_name
 from warp_lcp.render.recording import RenderError
 
 INSTALL_ENCODER = "pip install 'imageio-ffmpeg>=0.6'"
-SLOWEST, FASTEST = 0.1, 240.0  # frames a second of a film
-GIF_FASTEST = 50.0  # frames a second: viewers slow down what changes every hundredth of a second
-QUALITY = "18"  # of x264, from 0 (no loss) to 51: flat colors and thin lines stay clean
-# for each image of a GIF
+SLOWEST, FASTEST = 0.1, 240.0  # frames per second of a film
+GIF_FASTEST = 50.0  # frames per second: viewers slow down faster animations
+QUALITY = "18"  # of x264, from 0 (lossless) to 51: flat colors and thin lines stay clean
+# A palette for each image of a GIF.
 OWN_COLORS = "split[a][b];[a]palettegen=stats_mode=single[p];[b][p]paletteuse=new=1:dither=none"
-ENCODERS: dict[str, dict[str, Any]] = {  # H.264 in MP4; a GIF repeats for ever
+ENCODERS: dict[str, dict[str, Any]] = {  # H.264 in MP4; a GIF repeats forever
     ".mp4": {
         "codec": "libx264",
         "pix_fmt_out": "yuv420p",
@@ -35,13 +38,15 @@ ENCODERS: dict[str, dict[str, Any]] = {  # H.264 in MP4; a GIF repeats for ever
 
 
 class Film:
-    """A film in the making; its file appears when the `with` block ends without an error.
+    """Film under construction; its file is created when the `with` block ends.
+
+    No file is created if the block raises an error.
 
     Args:
-        file: of the film, `.mp4` or `.gif`; a GIF leaves images out whose rate is above what
-            viewers play.
+        file: file of the film, `.mp4` or `.gif`; a GIF omits images whose rate is above the limit
+            of viewers.
         size: width and height of its images [pixels].
-        rate: frames a second [1/s].
+        rate: frames per second [1/s].
 
     Raises:
         RenderError: the encoder is missing, or the file cannot be written.
@@ -55,7 +60,9 @@ class Film:
         self._rate, self._offered = rate / self._every, 0
 
     def add(self, draw: Callable[[], np.ndarray]) -> None:
-        """Add an image, red, green and blue from 0 to 255; one that the film's kind has no time for is not even drawn.
+        """Add an image, red, green and blue from 0 to 255.
+
+        An image that exceeds the rate of a GIF is not drawn.
 
         Raises:
             RenderError: the file cannot be written.
@@ -95,14 +102,14 @@ class Film:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Bring the film to disk, or leave nothing of it."""
+        """Write the film to disk; delete it after an error."""
         try:
             self._stack.__exit__(kind, error, trace)
         except OSError as failure:
             raise self._failure(failure) from failure
 
     def _encoder(self, temporary: Path) -> Generator[None, Any, None]:
-        """Return what takes the images."""
+        """Return the encoder, which receives the images."""
         try:
             import imageio_ffmpeg
         except ImportError as error:
@@ -130,10 +137,10 @@ class Film:
 
 
 def film_suffix(file: Path) -> str:
-    """Return the suffix of a film, which says how it is encoded.
+    """Return the suffix of a film, which selects the encoder.
 
     Raises:
-        RenderError: nothing encodes such films.
+        RenderError: there is no encoder for such films.
     """
     suffix = file.suffix.lower()
     if suffix not in ENCODERS:
@@ -144,10 +151,10 @@ def film_suffix(file: Path) -> str:
 
 
 def check_rate(rate: float | None) -> float | None:
-    """Return frames a second as they were given.
+    """Return a valid number of frames per second.
 
     Raises:
-        RenderError: no film can have so many or so few.
+        RenderError: the rate is out of range.
     """
     if rate is not None and not SLOWEST <= rate <= FASTEST:
         raise RenderError(f"--fps {rate:g}: must be {SLOWEST:g} to {FASTEST:g} frames a second")

@@ -1,4 +1,4 @@
-"""Sand as grains: each particle, which stands for many, is drawn as a few, none like the other."""
+"""Sand as grains: each particle is drawn as a few different grains."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-GRAINS = 250_000  # in an image, at the most about
-A_PARTICLE = 6  # grains, where there are not that many particles
-# radius of one alone in its particle's room, over the distance of particles: nothing shows through
+GRAINS = 250_000  # in an image, approximate limit
+A_PARTICLE = 6  # most grains per particle
+# Radius of a single grain per particle, relative to the particles' distance: no gaps remain.
 SIZES = {2: 1.2, 3: 0.62}
-APART = 0.7  # from its particle, over the distance of particles, along each axis at the most
-VARIETY = 0.16  # of a grain's brightness, either way
+APART = 0.7  # largest offset from the particle along each axis, relative to the particles' distance
+VARIETY = 0.16  # variation of a grain's brightness
 PATTERNS = 4096
 PATTERN = np.random.default_rng(2281).uniform(-1.0, 1.0, (PATTERNS, A_PARTICLE, 4))
 
@@ -22,10 +22,10 @@ def grains(
     """Return grains in place of particles.
 
     Args:
-        points: of the particles [m], shape (n, 3).
+        points: positions of the particles [m], shape (n, 3).
         colors: 0 to 255, shape (n, 3).
         spacing: distance of neighboring particles [m].
-        size: of the domain [m], which grains do not leave.
+        size: size of the domain [m], which limits the positions of grains.
 
     Returns:
         Points [m], colors as `colors`, and the radius of a grain [m].
@@ -38,15 +38,16 @@ def grains(
 def placed_grains(
     points: np.ndarray, spacing: float, size: Sequence[float]
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the grains of particles: points [m], shape (n, k, 3), numbers in `PATTERN`, shape (n, k), and radius [m].
+    """Return positions, pattern numbers and radius of the grains of particles.
 
-    The offsets of grains depend on the position of the particle, not on its number. Runs reorder
+    Positions [m], shape (n, k, 3), indices into `PATTERN`, shape (n, k), and radius [m]. The
+    offsets of grains depend on the position of the particle, not on its number: runs reorder
     particles, and sand at rest must not flicker.
 
     Args:
-        points: of the particles [m], shape (n, 3).
+        points: positions of the particles [m], shape (n, 3).
         spacing: distance of neighboring particles [m].
-        size: of the domain [m], which grains do not leave.
+        size: size of the domain [m], which limits the positions of grains.
     """
     count = int(np.clip(GRAINS // max(len(points), 1), 1, A_PARTICLE))
     dimension = len(size)

@@ -1,4 +1,7 @@
-"""A page on the loopback address that shows a run's frames as they come, with plots of its log. Needs nothing beside the core."""
+"""Web page of a running simulation, on the loopback address.
+
+It shows frames as they are written, and plots of the log. It needs only the core dependencies.
+"""
 
 from __future__ import annotations
 
@@ -31,17 +34,17 @@ from warp_lcp.scene.camera import viewpoint
 from warp_lcp.simulation import InputError
 
 LOOPBACK = "127.0.0.1"
-PORT = 8765  # unless told
-# that a browser may have asked for, at a port that may be forwarded here:
+PORT = 8765  # default
+# Host names accepted in requests, with any port, which may be forwarded. Others that resolve to
+# this machine are refused (DNS rebinding).
 HOST = re.compile(r"(?:127\.0\.0\.1|localhost)(?::\d{1,5})?")
-# refuse other host names that resolve to this machine (DNS rebinding)
 PATIENCE = 10.0  # seconds without a byte after which a connection is closed
-MOST_CONNECTIONS = 16  # of which the oldest gives way to a new one, and
-# requests at a time, those of connections that are gone included; more are turned away
+MOST_CONNECTIONS = 16  # most connections; a new one then replaces the oldest
+# Most requests at a time, including those of closed connections; more are refused.
 MOST_ANSWERED = 64
 SHORTAGE = 0.2  # seconds
-MOST_POINTS = 300_000  # of a frame's particles; of more every second, third ... goes to the page
-# along the longest side of the lattice whose points near a solid's surface are drawn
+MOST_POINTS = 300_000  # particles of a frame; of more, every second, third ... is sent
+# Lattice points along the longest side, of which those near a solid's surface are drawn.
 SOLID_POINTS = {2: 512, 3: 96}
 SAFE = (
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; connect-src "
@@ -50,34 +53,37 @@ SAFE = (
 
 
 class QueryError(ValueError):
-    """A number that a request needs is none."""
+    """Invalid number in a request."""
 
 
 @dataclass
 class Live:
-    """What a page asks of a run, which may still be at work or not have begun.
+    """Data of a run for the page; the run may be running or not yet started.
 
     Args:
-        folder: of the run.
-        show: what of the material is shown; see `Recording`.
+        folder: folder of the run.
+        show: part of the material to show; see `Recording`.
     """
 
     folder: Path
     show: Show | None = None
 
     def __post_init__(self) -> None:
-        self._lock = Lock()  # requests come on threads of their own
+        self._lock = Lock()  # requests run on threads of their own
 
     @cached_property
     def _recording(self) -> Recording:
         recording = Recording(self.folder, show=self.show)
         output, liquid = recording.scene.output, recording.scene.palette != "sand"
-        # a frame's surface comes after its particles
+        # The surface of a frame is written after its particles.
         late = self.show is None and liquid and getattr(output, "surface", False)
         return Recording(self.folder, show=Show.SURFACE) if late else recording
 
     def state(self) -> dict[str, Any]:
-        """Return what there is: the numbers of the frames and, once there is one, what the page needs to draw them."""
+        """Return the numbers of the frames, and the data needed to draw them.
+
+        The data exist once there is a frame.
+        """
         record = read_record(self.folder)
         state: dict[str, Any] = {
             "status": record.get("status", "not begun"),
@@ -108,7 +114,10 @@ class Live:
         }
 
     def frame(self, number: int) -> bytes:
-        """Return a frame: a line of JSON, filled up with spaces to whole words, then its arrays, 32 bits a value, in the line's order.
+        """Return a frame as a line of JSON, followed by its arrays.
+
+        The line is padded with spaces to whole words. The arrays are in the line's order, with 32
+        bits per value.
 
         Raises:
             RenderError: there is no such frame, or it cannot be read.
@@ -139,10 +148,10 @@ class Live:
         return head + b"".join(array.tobytes() for array in flat.values())
 
     def log(self, begin: int) -> bytes:
-        """Return what the log holds from a byte on, whole lines; nothing beyond its end.
+        """Return the whole lines of the log from a byte on; empty at its end.
 
         Raises:
-            OSError: it cannot be read, or is a link to another file.
+            OSError: the log cannot be read, or is a link to another file.
         """
         file = self.folder / "log.csv"
         if not file.is_file():
@@ -184,7 +193,10 @@ class Live:
 
 
 class Answers(BaseHTTPRequestHandler):
-    """Answers a page: itself, `/run`, `/frame?number=N` and `/log?from=BYTE`; nothing else of the machine can be asked for."""
+    """Request handler of the page, `/run`, `/frame?number=N` and `/log?from=BYTE`.
+
+    No other paths are served.
+    """
 
     server: LiveServer
     timeout = PATIENCE
@@ -205,26 +217,26 @@ class Answers(BaseHTTPRequestHandler):
         return self._tell(HTTPStatus.OK, answer, kind)
 
     def _answer(self) -> tuple[bytes, str]:
-        """Return what is asked for, and its kind.
+        """Return the content of a request, and its type.
 
         Raises:
-            QueryError: a number is none.
-            InputError: there is no such thing.
+            QueryError: a number is invalid.
+            InputError: there is no such content.
             OSError: a file cannot be read.
         """
         try:
-            asked = urlsplit(self.path)
-            words = parse_qs(asked.query)
+            url = urlsplit(self.path)
+            words = parse_qs(url.query)
         except ValueError as error:
             raise QueryError(f"invalid address: {error}") from error
         live = self.server.live
-        if asked.path == "/":
+        if url.path == "/":
             return self.server.page, "text/html; charset=utf-8"
-        if asked.path == "/run":
+        if url.path == "/run":
             return json.dumps(live.state()).encode(), "application/json"
-        if asked.path == "/frame":
+        if url.path == "/frame":
             return live.frame(_number(words, "number")), "application/octet-stream"
-        if asked.path == "/log":
+        if url.path == "/log":
             return live.log(_number(words, "from")), "text/csv; charset=utf-8"
         raise RenderError("no such page")
 
@@ -244,30 +256,36 @@ class Answers(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, format: str, *args: object) -> None:
-        """Say nothing of requests on the terminal, which is the run's."""
+        """Print nothing, since the terminal belongs to the run."""
 
 
 class LiveServer(ThreadingHTTPServer):
-    """Serves the page of a run on the loopback address, by few threads and descriptors whatever comes: the run needs its own."""
+    """Web server of a run's page on the loopback address.
+
+    Numbers of threads and descriptors are limited, since the run needs its own.
+    """
 
     daemon_threads = True
-    request_queue_size = 64  # wait in the system: a busy run takes them late
+    request_queue_size = 64  # waiting connections, which a busy run accepts late
 
     def __init__(self, live: Live, port: int) -> None:
         self.live = live
         self._open: dict[socket.socket, None] = {}  # connections, the oldest first
-        self._answered = 0  # requests that a thread is at
+        self._answered = 0  # requests in progress
         self._counting = Lock()
         self.page = files("warp_lcp.render").joinpath("live.html").read_bytes()
         super().__init__((LOOPBACK, port), Answers)
 
     @property
     def address(self) -> str:
-        """Return what to open in a browser."""
+        """Return the address for a browser."""
         return f"http://{LOOPBACK}:{self.server_port}/"
 
     def get_request(self) -> tuple[socket.socket, Any]:
-        """Take a connection; without a descriptor for it, wait a little, as the loop around this would try again at once."""
+        """Accept a connection; without a free descriptor, wait before the error.
+
+        The server's loop would try again at once.
+        """
         try:
             return super().get_request()
         except OSError:
@@ -283,21 +301,21 @@ class LiveServer(ThreadingHTTPServer):
                 oldest = next(iter(self._open))
                 del self._open[oldest]
                 with suppress(OSError):
-                    oldest.shutdown(socket.SHUT_RDWR)  # its thread sees the end and closes it
+                    oldest.shutdown(socket.SHUT_RDWR)  # its thread gets an error and closes it
             self._open[request] = None
         if full:
             return self.shutdown_request(request)
         return super().process_request(request, client_address)
 
     def shutdown_request(self, request: Any) -> None:
-        """Close a connection that was answered, or is not."""
+        """Close a connection, answered or not."""
         with self._counting:
             self._open.pop(request, None)
             self._answered -= 1
         super().shutdown_request(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Say nothing of a browser that has gone away."""
+        """Ignore errors of closed browsers."""
 
 
 def live_server(folder: Path, *, port: int = PORT, show: Show | None = None) -> LiveServer:
@@ -316,7 +334,10 @@ def live_server(folder: Path, *, port: int = PORT, show: Show | None = None) -> 
 
 @contextmanager
 def served(folder: Path) -> Iterator[str]:
-    """Serve a run's page beside it, on the usual port if that is free; the block gets the address, or why there is none."""
+    """Serve a run's page during a block, on the default port if it is free.
+
+    The block gets the address, or the reason why there is none.
+    """
     try:
         server = live_server(folder)
     except RenderError:

@@ -1,4 +1,4 @@
-"""The layout of an image of a run: a line with the time and a legend, below it one picture or several."""
+"""Layout of an image: a line with time and legend, and one or more pictures."""
 
 from __future__ import annotations
 
@@ -18,23 +18,25 @@ DOTS_AN_INCH, POINTS_AN_INCH = 100, 72
 
 
 class Painter(Protocol):
-    """What draws the pictures on a page."""
+    """Renderer of the pictures on a page."""
 
     def draw(self, frame: Frame) -> np.ndarray:
         """Return a picture of a frame."""
 
     def close(self) -> None:
-        """Free windows and the like; nothing is drawn afterward."""
+        """Free windows and other resources; no drawing afterward."""
 
 
 class Page:
-    """The layout of an image: a line with time or name and the legend, below it one picture or several with a line each.
+    """Layout of an image: a line with time and legend, below it the pictures.
+
+    Several pictures have a line each.
 
     Args:
-        recording: what is drawn.
+        recording: the frames of the run.
         size: width and height [pixels].
-        pictures: how many.
-        painter: makes what draws the pictures, given the recording and their width and height
+        pictures: number of pictures.
+        painter: creates the renderer of the pictures, from the recording and their width and height
             [pixels].
 
     Raises:
@@ -52,7 +54,7 @@ class Page:
         self.line = max(20, round(0.065 * min(size)))  # heights [pixels]
         self.caption = round(0.8 * self.line) if pictures > 1 else 0
         sides = recording.scene.domain.size
-        # of a picture; a room is seen at an angle
+        # Aspect of a picture; 3-D domains are seen at an angle.
         aspect = sides[0] / sides[1] if len(sides) == 2 else 1.5
         tiles = {columns: self._tile(columns, pictures) for columns in range(1, pictures + 1)}
         self.columns, (width, height) = max(
@@ -101,14 +103,14 @@ class Page:
         self._draw_legend(figure)
         canvas.draw()
         image = np.array(canvas.buffer_rgba())[..., :3]
-        # Matplotlib would take as long as drawing them does
+        # Copied here, since Matplotlib would take as long as drawing them.
         for number, (left, top) in zip(numbers, corners, strict=True):
             picture = image[top + self.caption : top + self.caption + height, left : left + width]
             picture[:] = self.painter.draw(self.recording.frame(number))
         return image
 
     def _tile(self, columns: int, pictures: int) -> tuple[int, int]:
-        """Return the width and height of a picture when so many stand side by side."""
+        """Return the width and height of a picture in a given number of columns."""
         return self.size[0] // columns, (self.size[1] - self.line) // -(
             -pictures // columns
         ) - self.caption
@@ -134,7 +136,7 @@ class Page:
         self._write(figure, f"{scale.high:g}", left + width + gap, middle, "left")
 
     def _write(self, figure: Figure, text: str, x: float, y: float, anchor: str) -> None:
-        """Write beside a point, x and y down from the upper left corner [pixels]."""
+        """Write a text at a point, x and y from the upper left corner [pixels]."""
         size = 0.45 * self.line * POINTS_AN_INCH / DOTS_AN_INCH
         figure.text(
             x / self.size[0],

@@ -1,4 +1,7 @@
-"""Pictures of a run's frames: domain, solids and material, drawn by pyvista without a screen. Needs the extra `render`."""
+"""Pictures of a run's frames, drawn by pyvista without a screen.
+
+They show domain, solids and material. Needs the extra `render`.
+"""
 
 from __future__ import annotations
 
@@ -16,14 +19,14 @@ from warp_lcp.render.solid_meshes import FlatSolids, RoomSolids, apart, prescrib
 from warp_lcp.render.sunlight import LIGHT, SHADE, Sunlight, scattered
 from warp_lcp.scene.camera import Viewpoint, viewpoint
 
-# per pixel and direction: images are drawn larger and averaged down, since splats have no other
-# anti-aliasing
+# Samples per pixel and direction: images are drawn larger and averaged down, since splats have no
+# other antialiasing.
 SAMPLES = 2
-# how far walls stand before 2-D particles, over the longest side, and over a disc's radius: discs
-# face the camera
+# Distance of walls in front of 2-D particles, relative to the longest side, and to a disc's radius:
+# discs face the camera.
 FRONT, TILT = 1e-3, 0.3
-SMALL = 0.25  # radius of particles that a surface is shown around, over their spacing
-# of rooms at the bottom, fading into white, which would hide water
+SMALL = 0.25  # radius of particles inside a surface, relative to their spacing
+# Background of 3-D domains at the bottom, fading into white, which would hide water.
 BACKDROPS = {"water": "#c9d5df", "other": "#e3e2df"}
 
 DISC = """//VTK::Color::Impl
@@ -35,7 +38,7 @@ BALL = (
     + "ambientColor *= 0.8 + 0.2 * sqrt(1.0 - distance2);\ndiffuseColor *= 0.8 + 0.2 * sqrt(1.0 - "
     "distance2);\n"
 )
-# lit from above and before: where the lamp is, seen as cameras look unless told otherwise
+# Lit from above and in front: the lamp in the coordinates of the default camera.
 GRAIN = (
     DISC
     + """vec3 normal = vec3(offsetVCVSOutput.xy, sqrt(1.0 - distance2));
@@ -47,12 +50,12 @@ diffuseColor *= light;
 
 
 class Picture:
-    """A plotter on which domain and solids stand or move, and particles, surfaces and bodies come and go.
+    """Plotter of a run's frames, with fixed and changing actors.
 
     Args:
-        recording: of the run.
+        recording: frames of the run.
         size: width and height of an image [pixels].
-        plotter: pyvista's, to draw into instead; it is shown on a screen, at its own size.
+        plotter: a pyvista plotter to draw into; it is shown on a screen, at its own size.
     """
 
     def __init__(self, recording: Recording, size: tuple[int, int], plotter: Any = None) -> None:
@@ -73,7 +76,7 @@ class Picture:
         self.plotter = plotter or pyvista.Plotter(
             off_screen=True, window_size=[SAMPLES * side for side in size], lighting="none"
         )
-        # 0 is three times as fast in software; SAMPLES smooths too
+        # 0 is three times as fast in software; SAMPLES smooths too.
         self.plotter.render_window.SetMultiSamples(0 if plotter is None else 8)
         water = recording.show in WITH_SURFACE and scene.palette == "water"
         self.plotter.set_background(
@@ -109,7 +112,7 @@ class Picture:
         camera.view_angle = view.angle
 
     def place(self, frame: Frame) -> None:
-        """Exchange what is not there any more for what is there in a frame."""
+        """Replace the actors of the last frame with those of a frame."""
         moving = [(solid, motion.pose(frame.time)) for solid, motion in self._moving]
         size, width = self.scene.domain.size, self.samples
         solids = self._solids.meshes(moving)
@@ -145,7 +148,7 @@ class Picture:
         self.place(frame)
         self.plotter.renderer.reset_camera_clipping_range()
         pixels = self._pixels()
-        # balls that reach beyond the domain's walls would make its edges a row of beads
+        # Balls that extend beyond the domain's walls would cover its edges.
         if self._blank is not None:
             outside, background = self._blank
             pixels[outside] = background
@@ -156,12 +159,15 @@ class Picture:
         self.plotter.close()
 
     def _pixels(self) -> np.ndarray:
-        """Render, and return the pixels, SAMPLES of them per pixel of an image along each axis."""
+        """Render, and return the pixels, with SAMPLES per pixel along each axis."""
         self.plotter.render()
         return np.array(self.plotter.screenshot(return_img=True))
 
     def _outside(self, view: Viewpoint, size: tuple[int, int]) -> np.ndarray | None:
-        """Return which pixels lie outside the outline of a 3-D domain; None: the scene is 2-D, or a corner is behind the camera."""
+        """Return the pixels outside the outline of a 3-D domain.
+
+        None if the scene is 2-D, or a corner is behind the camera.
+        """
         from scipy.spatial import ConvexHull
 
         if self.flat:
@@ -173,17 +179,17 @@ class Picture:
         if depth.min() <= 0.0:
             return None
         width, height = (self.samples * side for side in size)
-        focal = 0.5 * height / math.tan(math.radians(view.angle / 2.0))  # of a pinhole [pixels]
+        focal = 0.5 * height / math.tan(math.radians(view.angle / 2.0))  # focal length [pixels]
         hull = ConvexHull(
             np.stack([0.5 * width + focal * x / depth, 0.5 * height - focal * y / depth], axis=-1)
         )
         column, row = np.arange(width) + 0.5, np.arange(height)[:, None] + 0.5
-        # the lines of the box are drawn on its outline
+        # The lines of the box are drawn on its outline.
         beyond = [a * column + b * row + c > self.samples for a, b, c in hull.equations]
         return np.any(beyond, axis=0)
 
     def _place_standing(self) -> None:
-        """Draw the domain and the solids that stand, and prepare those that move."""
+        """Draw the domain and the solids at rest, and prepare the moving ones."""
         solids = prescribed_solids(self.scene)
         sides, width = self.scene.domain.size, 2 * self.samples
         drawer: Any = (
@@ -212,7 +218,10 @@ class Picture:
         ]
 
     def _casters(self, meshes: list[Drawn]) -> np.ndarray:
-        """Return points [m] on what casts shadows: not on lines, and not on containers, through which one sees."""
+        """Return points [m] on objects that cast shadows.
+
+        Lines, and containers, which are transparent, cast none.
+        """
         return np.concatenate(
             [
                 np.zeros((0, 3)),
@@ -225,7 +234,7 @@ class Picture:
         )
 
     def _particles(self, frame: Frame, sun: Sunlight | None) -> tuple[list[Drawn], float]:
-        """Return particles as discs or balls, sand as grains, lit as the surface that they make up, and their radius [m]."""
+        """Return particles as discs, balls or grains, shaded, and their radius [m]."""
         import pyvista
 
         points, radius = frame.points, self.radius

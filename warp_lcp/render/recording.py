@@ -1,4 +1,4 @@
-"""The frames of a run, read back for its images, and the color scale that they share."""
+"""Frames of a run, read back for images, and their common color scale."""
 
 from __future__ import annotations
 
@@ -18,21 +18,24 @@ from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import check_shapes, load_scene
 from warp_lcp.simulation import Cells, InputError, Points, Surface
 
-SCALE_FRAMES = 16  # evenly spaced frames that fix the color scale of a run
-SCALE_VALUES = 50_000  # about how many values of each
+SCALE_FRAMES = 16  # evenly spaced frames that define the color scale of a run
+SCALE_VALUES = 50_000  # approximate number of values of each
 ROUND_NUMBERS = np.array([1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0])
-PALETTES = {  # of speeds, by `Scene.palette`
+PALETTES = {  # for speeds, by `Scene.palette`
     "water": ("#0e3e8a", "#166abe", "#3aa0e0", "#82d0f0", "#cef0fa"),
     "sand": ("#a8743e", "#bd8a50", "#d2a468", "#e4be82", "#f2d8a4"),
 }
 
 
 class RenderError(InputError):
-    """Nothing can be drawn; the message says why and what to do."""
+    """An image cannot be drawn.
+
+    The message says why and what to do.
+    """
 
 
 class Color(StrEnum):
-    """What the color of a particle means."""
+    """Quantity of the particles' colors."""
 
     SPEED = "speed"
     PRESSURE = "pressure"
@@ -42,35 +45,34 @@ class Color(StrEnum):
 
 
 class Show(StrEnum):
-    """What of the material images show."""
+    """Part of the material in images."""
 
     PARTICLES = "particles"
     SURFACE = "surface"
     BOTH = "both"
-    BODIES = "bodies"  # nothing of it
+    BODIES = "bodies"  # no material
 
 
 WITH_PARTICLES, WITH_SURFACE = (Show.PARTICLES, Show.BOTH), (Show.SURFACE, Show.BOTH)
 
 
-# that frames must have
+# Parts that frames must have.
 PARTS = {Show.PARTICLES: "particles", Show.SURFACE: "surface", Show.BODIES: "bodies"}
-# what sand's particles know besides
+# Further quantities of sand's particles.
 LABELS = {Color.FRACTION: "fraction of grains", Color.YIELD_RATIO: "yield ratio"}
 
 
 @dataclass(frozen=True)
 class Frame:
-    """What an image of a frame shows.
+    """Data of an image of a frame.
 
     Args:
         time: [s].
-        points: of the particles [m], shape (n, 3).
-        values: that color them, shape (n,).
-        surface: of the material; None: not shown.
-        bodies: the surfaces of rigid bodies where they are, with the field `body`; None: the scene
-            has none.
-        cells: with what fills them; None: not shown.
+        points: positions of the particles [m], shape (n, 3).
+        values: values for their colors, shape (n,).
+        surface: surface of the material; None if not shown.
+        bodies: current surfaces of rigid bodies, with the field `body`; None if the scene has none.
+        cells: cells with their fields; None if not shown.
     """
 
     time: float
@@ -83,13 +85,15 @@ class Frame:
 
 @dataclass(frozen=True)
 class Scale:
-    """Colors from `low` to `high`, the same in every image of a run; a scale without a label has no legend.
+    """Color scale from `low` to `high`, the same in every image of a run.
+
+    A scale without a label has no legend.
 
     Args:
         label: quantity and unit.
         low: the value of the first color.
         high: the value of the last color.
-        palette: evenly spaced colors; Matplotlib's viridis unless given.
+        palette: evenly spaced colors. Default: Matplotlib's viridis.
     """
 
     label: str
@@ -99,7 +103,7 @@ class Scale:
 
     @cached_property
     def mappable(self) -> Any:
-        """The scale as Matplotlib takes it."""
+        """The scale as a Matplotlib mappable."""
         from matplotlib.cm import ScalarMappable
         from matplotlib.colors import LinearSegmentedColormap, Normalize
 
@@ -116,19 +120,19 @@ class Scale:
 
 
 class Recording:
-    """The frames that a run wrote, to be read back.
+    """Frames of a run, for reading.
 
     Args:
-        folder: of the run.
-        color: what is to be read besides the positions; speed unless given.
-        show: what is to be read; particles if a color is given, of sand, or where there is no
-            surface, else the surface; bodies where the run writes nothing but them.
-        overrides: of the scene's table [camera], such as `camera.position=[1, 2, 3]`.
-        cells: read the cells too, where the run wrote them; then their pressure is the color unless
-            another is given, or the surface is all that there is of the material.
+        folder: folder of the run.
+        color: quantity to read besides the positions. Default: speed.
+        show: part of the material to read. Default: particles if a color is set, for sand, or if
+            there is no surface; else the surface; bodies if the run writes nothing else.
+        overrides: overrides of the scene's table [camera], such as `camera.position=[1, 2, 3]`.
+        cells: read the cells too, if the run wrote them; then their pressure is the color unless
+            another is set, or only the surface is shown.
 
     Raises:
-        RenderError: the folder is no run's, or has no such frames.
+        RenderError: the folder is not that of a run, or has no such frames.
         SceneError: its scene cannot be read.
     """
 
@@ -141,7 +145,7 @@ class Recording:
         *,
         cells: bool = False,
     ) -> None:
-        """Look which frames there are."""
+        """Find the frames in the folder."""
         if not (folder / "scene.toml").is_file():
             why = "it has no scene.toml" if folder.is_dir() else "there is no such folder"
             raise RenderError(f"{folder}: is not the folder of a run: {why}")
@@ -164,7 +168,7 @@ class Recording:
             and self._numbers("particles")
         ):
             color = Color.PRESSURE if self._numbers("grid") else Color.SPEED
-        # a heap's surface is lace where it is thin, else clay
+        # The surface of a heap has holes where it is thin, and looks like clay elsewhere.
         grains = self.scene.palette == "sand" and bool(self._numbers("particles"))
         smooth = color is None and not grains and bool(self._numbers("surface"))
         bodies_alone = (
@@ -189,12 +193,14 @@ class Recording:
             )
 
     def chosen(self, frames: Sequence[int]) -> list[int]:
-        """Return the numbers of the frames asked for, each once, in order; all if none is asked for. Negative ones count from the end.
+        """Return the numbers of requested frames, each once, in order.
+
+        All if none is requested. Negative ones count from the end.
 
         Raises:
             RenderError: there is no such frame.
         """
-        found = set()
+        selected = set()
         for frame in frames:
             number = self.numbers[frame] if -len(self.numbers) <= frame < 0 else frame
             if number not in self.numbers:
@@ -202,11 +208,11 @@ class Recording:
                     f"--frame {frame}: there is no such frame; the run has {self.numbers[0]} to "
                     f"{self.numbers[-1]}"
                 )
-            found.add(number)
-        return sorted(found) or self.numbers
+            selected.add(number)
+        return sorted(selected) or self.numbers
 
     def frame(self, number: int) -> Frame:
-        """Return what an image of a frame shows.
+        """Return the data of an image of a frame.
 
         Raises:
             RenderError: a file cannot be read, or lacks a field.
@@ -233,7 +239,7 @@ class Recording:
         return self._surface("surface", number)
 
     def particles(self, number: int) -> Points:
-        """Return the particles of a frame, those at finite positions, with their fields.
+        """Return the particles of a frame with finite positions, and their fields.
 
         Raises:
             RenderError: the file cannot be read.
@@ -254,9 +260,11 @@ class Recording:
         """
         return self._surface("bodies", number) if self._file("bodies", number).is_file() else None
 
-    @np.errstate(invalid="ignore")  # what is no number is left out
+    @np.errstate(invalid="ignore")  # values that are no numbers are omitted
     def read(self, number: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the particles of a frame, those with finite numbers: positions [m], shape (n, 3), and what colors them, shape (n,).
+        """Return positions [m], shape (n, 3), and color values, shape (n,), of a frame.
+
+        Only particles with finite numbers.
 
         Raises:
             RenderError: a file cannot be read, or lacks the field that colors the particles.
@@ -276,7 +284,11 @@ class Recording:
 
     @cached_property
     def scale(self) -> Scale:
-        """Return the colors for the whole run: up to what 98 of 100 particles stay below, rounded up; the few above take the last color."""
+        """Return the color scale of the whole run.
+
+        It ends at the 98th percentile of the particles, rounded up; larger values have the last
+        color.
+        """
         if self.color is Color.PLAIN or not self._numbers("particles"):
             return Scale("", -1.0, 1.0, PALETTES[self.scene.palette])
         samples = [self.read(number)[1] for number in spread(self.numbers, SCALE_FRAMES)]
@@ -287,14 +299,17 @@ class Recording:
             [2.0, 98.0],
         )
         high = _round_up(high)
-        # liquid that a wall holds has pressure below 0
+        # Liquid that a wall holds has negative pressure.
         low = -_round_up(-low) if low < -0.01 * high else 0.0
         if self.color is Color.SPEED:
             return Scale("speed [m/s]", low, high, PALETTES[self.scene.palette])
         return Scale(LABELS.get(self.color, "pressure [Pa]"), low, high)
 
     def particle_spacing(self) -> float:
-        """Return how far apart neighbors are at the start [m], from the number of particles in the cells that hold some."""
+        """Return the initial distance of neighboring particles [m].
+
+        It follows from the number of particles in the cells with particles.
+        """
         points = (
             self.particles(self.numbers[0]).points
             if self.show in WITH_PARTICLES
@@ -321,20 +336,25 @@ class Recording:
 
     @cached_property
     def _readable(self) -> list[str]:
-        """Return the suffixes of a part's file; a PLY file of a surface, beside one of another format, is not the run's frame."""
+        """Return the suffixes of a part's file.
+
+        A PLY file of a surface, beside one of another format, is not the run's frame.
+        """
         return [
             suffix for suffix in READABLE if suffix != "ply" or self.scene.output.format == "ply"
         ]
 
     def look_again(self) -> list[int]:
-        """Look which frames there are by now, and return the numbers of those that have all that is shown.
+        """Search for new frames; return the numbers of the complete ones.
+
+        Complete frames have all parts that are shown.
 
         Raises:
             RenderError: there is none.
         """
         parts = ("surface", "particles") if self.show is Show.BOTH else (PARTS[self.show],)
-        found = {part: self._numbers(part) for part in parts}
-        for part, numbers in found.items():
+        part_numbers = {part: self._numbers(part) for part in parts}
+        for part, numbers in part_numbers.items():
             if not numbers:
                 output = self.scene.output
                 why = "" if getattr(output, part, True) else f"; the scene's output.{part} is false"
@@ -347,15 +367,15 @@ class Recording:
                     f"{self.folder}: holds no frames of "
                     f"{'a surface' if part == 'surface' else part}{why}"
                 )
-        numbers = sorted(set.intersection(*map(set, found.values())))
+        numbers = sorted(set.intersection(*map(set, part_numbers.values())))
         if not numbers:
             raise RenderError(f"{self.folder}: holds no frame of both {' and '.join(parts)}")
         self.numbers = numbers
         return numbers
 
-    @np.errstate(invalid="ignore")  # what is no number is left out
+    @np.errstate(invalid="ignore")  # values that are no numbers are omitted
     def _surface(self, name: str, number: int) -> Surface:
-        """Return a surface, those of its triangles or segments whose points are finite."""
+        """Return the triangles or segments of a surface with finite points."""
         file = self._file(name, number)
         mesh = _read(file)
         corners = (
@@ -396,7 +416,7 @@ class Recording:
         return cells
 
     def files(self, number: int) -> list[Path]:
-        """Return the files that tell what a frame shows: of particles or surface, and of bodies."""
+        """Return the files of a frame's particles or surface, and bodies."""
         parts = {
             Show.PARTICLES: ["particles"],
             Show.SURFACE: ["surface"],
@@ -404,7 +424,7 @@ class Recording:
             Show.BODIES: [],
         }
         files = [self._file(part, number) for part in [*parts[self.show], "bodies"]]
-        # of ranks
+        # Files of ranks.
         pieces = [
             piece for file in files for piece in sorted(file.parent.glob(f"rank_*/{file.stem}.*"))
         ]
@@ -424,7 +444,7 @@ class Recording:
         return np.asarray(fields[name], dtype=np.float64)
 
     def _pressure(self, number: int, points: np.ndarray) -> np.ndarray:
-        """Return the pressure of each particle's cell [Pa], 0 where the frame has no such cell."""
+        """Return the pressure of each particle's cell [Pa]; 0 without such a cell."""
         cells = self._cells(number)
         counts = np.array(self.scene.cell_counts)
         table = np.zeros(counts)
@@ -437,13 +457,16 @@ class Recording:
 
 
 def spread(numbers: Sequence[int], count: int) -> list[int]:
-    """Return at most `count` of the numbers, evenly spaced, with the first and the last."""
+    """Return at most `count` of the numbers, evenly spaced.
+
+    The first and the last are included.
+    """
     places = np.linspace(0, len(numbers) - 1, min(count, len(numbers)))
     return [numbers[round(place)] for place in places]
 
 
 def _read(file: Path) -> Any:
-    """Return the Mesh or the Cells of a frame's file, or of the pieces that it names.
+    """Return the Mesh or the Cells of a frame's file, or of the parts in its list.
 
     Raises:
         RenderError: a file cannot be read.

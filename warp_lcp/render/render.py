@@ -1,4 +1,7 @@
-"""Images and films of a run, with the time and a legend, alone or side by side. Needs the extra `render`."""
+"""Images and films of a run, with time and legend, alone or side by side.
+
+Needs the extra `render`.
+"""
 
 from __future__ import annotations
 
@@ -21,24 +24,25 @@ INSTALL = "pip install 'pyvista>=0.45'"
 INSTALL_MATPLOTLIB = "pip install 'matplotlib>=3.9'"
 SMALLEST, LARGEST = 240, 4096  # pixels along a side of an image
 SHEET_FRAMES = 6
-# Seconds of a core that an image takes, a megapixel and a million points of particles and surface:
-# 2-D, 3-D, a section. Measured on 3,000 to 650,000 particles at 640 x 360 and 1280 x 720; within a
-# factor of 2.
+# Seconds of a core per image, megapixel and million points of particles and surface: 2-D, 3-D, a
+# section. Measured for 3,000 to 650,000 particles at 640 x 360 and 1280 x 720; within a factor of
+# 2.
 FLAT_SECONDS, ROOM_SECONDS, SECTION_SECONDS = (0.03, 0.15, 2.0), (0.1, 0.65, 2.0), (0.08, 0.03, 2.0)
-PACKING = 1  # of PNGs, from 1 to 9: a quarter of what PIL's own, 6, takes, and files a third larger
+# Compression of PNGs, 1 to 9: a quarter of the time of PIL's default, 6, with files a third larger.
+PACKING = 1
 
 
 @dataclass(frozen=True, kw_only=True)
 class Looks:
-    """How images of a run look.
+    """Appearance of a run's images.
 
     Args:
         size: width and height of an image [pixels].
-        color: what the color of a particle means; speed unless given.
-        show: what of the material is shown; see `Recording`.
+        color: quantity of the particles' colors. Default: speed.
+        show: part of the material to show; see `Recording`.
         cut: draw a section with Matplotlib, which needs no pyvista.
-        at: where the section of a 3-D run cuts its z axis [m]; in the middle unless given.
-        overrides: of the scene's table [camera], such as `camera.position=[1, 2, 3]`.
+        at: z of the section through a 3-D run [m]. Default: the middle.
+        overrides: overrides of the scene's table [camera], such as `camera.position=[1, 2, 3]`.
     """
 
     size: tuple[int, int] = (1280, 720)
@@ -59,21 +63,23 @@ def render_run(
     told: Callable[[int, int], None] = lambda done, of: None,
     estimated: Callable[[float], None] = lambda seconds: None,
 ) -> Iterator[Path]:
-    """Draw frames of a run, in SI units on a color scale that fits the whole run; yield each file when it is written.
+    """Draw frames of a run; yield each finished file.
+
+    In SI units, on a color scale for the whole run.
 
     Args:
-        folder: of the run.
-        frames: numbers of frames, negative ones counted from the end; all (for a sheet, some evenly
-            spaced) unless given.
-        looks: how the images look.
-        out: where the images go; `folder / "images"` unless given.
+        folder: folder of the run.
+        frames: numbers of frames, negative ones counted from the end. Default: all (for a sheet,
+            some evenly spaced ones).
+        looks: appearance of the images.
+        out: folder of the images. Default: `folder / "images"`.
         sheet: draw the frames side by side into one image, `sheet.png`.
-        told: is called with how many images are drawn, and how many there will be.
-        estimated: is called with about how many seconds of a core drawing will take, before it
-            begins, where there are several frames.
+        told: called with the number of finished images, and the total number.
+        estimated: called with the estimated time of one core [s], before drawing begins, if there
+            are several frames.
 
     Raises:
-        RenderError: what draws is missing, there are no such frames, or an image cannot be written.
+        RenderError: a package is missing, there are no such frames, or an image cannot be written.
         SceneError: the run's scene cannot be read.
     """
     looks = looks or Looks()
@@ -110,21 +116,19 @@ def film_run(
     told: Callable[[int, int], None] = lambda done, of: None,
     estimated: Callable[[float], None] = lambda seconds: None,
 ) -> Iterator[int]:
-    """Draw all frames of a run into a film, one after the other; yield the number of each when it is drawn.
+    """Draw all frames of a run into a film; yield the number of each drawn frame.
 
     Args:
-        folder: of the run.
+        folder: folder of the run.
         film: the file; `.mp4` or `.gif`.
-        looks: how the images look.
-        rate: frames a second of the film; those of the scene, so that time goes by as it does,
-            unless given [1/s].
-        told: is called with how many images are drawn, and how many there will be.
-        estimated: is called with about how many seconds of a core drawing will take, before it
-            begins, where there are several frames.
+        looks: appearance of the images.
+        rate: frames per second of the film [1/s]. Default: that of the scene, for real time.
+        told: called with the number of finished images, and the total number.
+        estimated: called with the estimated time of one core [s], before drawing begins, if there
+            are several frames.
 
     Raises:
-        RenderError: what draws or encodes is missing, there are no frames, or the film cannot be
-            written.
+        RenderError: a package is missing, there are no frames, or the film cannot be written.
         SceneError: the run's scene cannot be read.
     """
     looks = looks or Looks()
@@ -147,10 +151,12 @@ def film_run(
 
 
 def expected_seconds(recording: Recording, numbers: Sequence[int], looks: Looks) -> float:
-    """Return about how many seconds of a core it takes to draw frames, by what the one in their middle holds.
+    """Return the estimated time of drawing frames on one core [s].
+
+    It is based on the content of the middle frame.
 
     Raises:
-        RenderError: that frame cannot be read.
+        RenderError: the frame cannot be read.
     """
     frame = recording.frame(numbers[len(numbers) // 2])
     points = len(frame.points) + (0 if frame.surface is None else len(frame.surface.points))
@@ -165,10 +171,10 @@ def expected_seconds(recording: Recording, numbers: Sequence[int], looks: Looks)
 
 
 def _painter(looks: Looks, stack: ExitStack) -> Callable[[Recording, tuple[int, int]], Painter]:
-    """Return what draws the pictures of a page.
+    """Return the constructor of the renderer of a page's pictures.
 
     Raises:
-        RenderError: it is not installed, or is not asked for what it can.
+        RenderError: a package is missing, or an option is not supported.
     """
     if looks.cut:
         try:
@@ -191,7 +197,7 @@ def _painter(looks: Looks, stack: ExitStack) -> Callable[[Recording, tuple[int, 
         ) from error
     from warp_lcp.render.picture import Picture
 
-    # VTK warns where there is no display, and draws all the same
+    # VTK warns without a display, but draws anyway.
     stack.enter_context(pyvista.vtk_verbosity("off"))
     return Picture
 
@@ -200,7 +206,7 @@ def parse_size(text: str) -> tuple[int, int]:
     """Return width and height [pixels] of text such as `1280x720`.
 
     Raises:
-        RenderError: it reads otherwise, or an image cannot be that small or large.
+        RenderError: the text has another format, or the size is out of range.
     """
     match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
     width, height = (int(match[1]), int(match[2])) if match else (0, 0)
@@ -213,7 +219,7 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def _save(pixels: np.ndarray, file: Path, folder: Path) -> None:
-    """Write an image; below a run's folder no link is written through."""
+    """Write an image, in a run's folder never through a link."""
     from PIL import Image
 
     try:

@@ -1,4 +1,7 @@
-"""Sections through a run, drawn by Matplotlib alone: cells and their pressure, particles nearby, the outlines of solids and surfaces."""
+"""Sections through a run, drawn by Matplotlib alone.
+
+They show cells and their pressure, particles nearby, the outlines of solids and surfaces.
+"""
 
 from __future__ import annotations
 
@@ -16,18 +19,18 @@ from warp_lcp.render.solid_meshes import EDGE, nearest_distance, prescribed_soli
 from warp_lcp.simulation import Surface
 
 DOTS_AN_INCH = 100
-OUTLINE_POINTS = 400  # along the longest side, where solids are sampled
+OUTLINE_POINTS = 400  # sample points of solids along the longest side
 CELL, DOT, SOLID, LINE = "#e6eaee", "#1c3f63", "#c3c7cc", "#0c3e80"
 SMALLEST_DOT, LARGEST_DOT = 2.0, 5.0  # points
 
 
 class Section:
-    """What lies in the x-y plane: all of a 2-D run, or a cut through a 3-D one.
+    """Picture of the x-y plane: a 2-D run, or a cut through a 3-D one.
 
     Args:
-        recording: of the run.
+        recording: frames of the run.
         size: width and height of an image [pixels].
-        at: z of the cut [m]; in the middle of a 3-D domain unless given.
+        at: z of the cut [m]. Default: the middle of a 3-D domain.
 
     Raises:
         RenderError: the cut is not in the domain.
@@ -89,7 +92,7 @@ class Section:
         """Do nothing: pictures do not share a figure."""
 
     def _draw_cells(self, axes: Any, frame: Frame) -> None:
-        """Fill the cut cells, with the colors of their pressure if that is what colors mean."""
+        """Fill the cut cells, with the colors of their pressure if requested."""
         from matplotlib.colors import ListedColormap
 
         if frame.cells is None:
@@ -121,7 +124,7 @@ class Section:
         )
 
     def _draw_solids(self, axes: Any, time: float) -> None:
-        """Fill where the distance to the nearest solid is negative."""
+        """Fill the region of negative distance to the nearest solid."""
         if not self._solids:
             return
         x, y = (
@@ -154,7 +157,10 @@ class Section:
         )
 
     def _fill_bodies(self, axes: Any, bodies: Surface) -> None:
-        """Fill the outlines of the bodies in the plane: triangles from the origin to each segment, which wind about what is inside."""
+        """Fill the outlines of the bodies in the plane.
+
+        Triangles from the origin to each segment wind around points inside.
+        """
         from matplotlib.patches import PathPatch
         from matplotlib.path import Path
 
@@ -168,16 +174,19 @@ class Section:
         self._draw_lines(axes, bodies, BODY_EDGE)
 
     def _segments(self, surface: Surface) -> np.ndarray:
-        """Return the outline of a surface in the plane, ends [m], shape (m, 2, 2)."""
+        """Return the segments of a surface in the plane [m], shape (m, 2, 2)."""
         ends = surface.points[surface.corners]
         return ends[..., :2] if self.at is None else cut(ends, self.at)
 
     def _draw_particles(self, axes: Any, frame: Frame) -> None:
-        """Draw the particles within half a cell of the plane, in the color of what they are or as dots over the cells' pressure."""
+        """Draw the particles within half a cell of the plane.
+
+        In their color, or as dots over the cells' pressure.
+        """
         h = self.scene.spacing
         near = slice(None) if self.at is None else np.abs(frame.points[:, 2] - self.at) < 0.5 * h
         points, values = frame.points[near], frame.values[near]
-        # an upper bound of those that a meter takes
+        # Upper bound of the inches per meter.
         inches = self.size[0] / DOTS_AN_INCH / self.scene.domain.size[0]
         marker = min(
             max(SMALLEST_DOT, 0.35 * self.recording.particle_spacing() * 72.0 * inches), LARGEST_DOT
@@ -204,19 +213,19 @@ class Section:
 
 
 def cut(triangles: np.ndarray, z: float) -> np.ndarray:
-    """Return where triangles cross a plane z = const as segments.
+    """Return the segments in which triangles cross a plane z = const.
 
     Args:
         triangles: corners [m], shape (n, 3, 3).
-        z: of the plane [m].
+        z: z of the plane [m].
 
     Returns:
-        Ends, x and y [m], shape (m, 2, 2).
+        Ends of the segments, x and y [m], shape (m, 2, 2).
     """
     above = triangles[..., 2] >= z
     crossing = above.any(axis=1) & ~above.all(axis=1)
     triangles, above = triangles[crossing], above[crossing]
-    # the corner on a side of its own
+    # The corner on the other side of the plane than the two others.
     alone = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), (~above).argmax(axis=1))
     own = np.arange(len(triangles))
     tip = triangles[own, alone]
@@ -227,5 +236,5 @@ def cut(triangles: np.ndarray, z: float) -> np.ndarray:
         ends.append((tip + share * (corner - tip))[:, :2])
     segments = np.stack(ends, axis=1)
     under = ~above[own, alone]
-    segments[under] = segments[under][:, ::-1]  # all with what they enclose on the same side
+    segments[under] = segments[under][:, ::-1]  # all segments have their inside on the same side
     return segments

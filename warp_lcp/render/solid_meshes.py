@@ -1,4 +1,7 @@
-"""The domain and the solids of a run's images, where they are at a frame's time. Needs the extra `render`."""
+"""Domain and solids of a run's images, at the time of a frame.
+
+Needs the extra `render`.
+"""
 
 from __future__ import annotations
 
@@ -18,27 +21,27 @@ from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.shapes import BoxTable, CapsuleTable, MeshTable, PlaneTable, Shape, SphereTable
 from warp_lcp.simulation import Surface
 
-OUTLINE_POINTS = 1500  # along the longest side, where 2-D solids are sampled: about a drawn pixel
+OUTLINE_POINTS = 1500  # sample points of 2-D solids along the longest side: about a pixel
 TOUCHING = 0.75
-# of the longest side: how far the white reaches; of `front`: where lines stand
+# Extent of the white frame, relative to the longest side; position of lines, relative to `front`.
 AROUND, LINE_FRONT = 20.0, 1.2
 FLAT_SOLID, SOLID, EDGE = "#bfc3c8", "#cdd1d5", "#6b7075"
 
 
 class FlatSolids:
-    """A rectangle with white around it; solids are filled where the signed distance to them is negative.
+    """Domain and solids in 2-D: a white frame, and filled solids.
 
-    Both stand before the particles and hide what of their discs reaches across a wall, which would
-    look like a saw.
+    Solids fill the region of negative signed distance. Both lie in front of the particles and hide
+    the parts of their discs beyond a wall, which would look like a saw.
 
     Args:
-        size: of the domain [m].
-        line_width: of the domain's edges [pixels].
-        front: how far walls stand before the particles [m].
+        size: size of the domain [m].
+        line_width: width of the domain's edges [pixels].
+        front: distance of walls in front of the particles [m].
     """
 
     def __init__(self, size: Sequence[float], line_width: float, front: float) -> None:
-        """Choose where distances are sampled."""
+        """Choose the sample points of distances."""
         import pyvista
 
         self.size, self.line_width, self.front = size, line_width, front
@@ -49,7 +52,7 @@ class FlatSolids:
         self._points = wp.array(self._plane.points, dtype=wp.vec3, device="cpu")
 
     def domain(self) -> list[Drawn]:
-        """Return what hides everything around the domain, and its edges."""
+        """Return the frame around the domain, and its edges."""
         import pyvista
 
         (right, top), far, z = self.size, AROUND * max(self.size), self.front
@@ -73,11 +76,11 @@ class FlatSolids:
         ]
 
     def prepared(self, solid: Shape) -> Geometry:
-        """Return what is needed to draw a solid."""
+        """Return the geometry of a solid."""
         return solid.to_geometry(Path(), 2)
 
     def meshes(self, solids: Sequence[tuple[Geometry, Pose]]) -> list[Drawn]:
-        """Return where the distance to the nearest of solids is negative, and a line around it."""
+        """Return the region of negative distance to the nearest solid, and its outline."""
         nearest = nearest_distance(solids, self._points)
         if nearest.min() >= 0.0:
             return []
@@ -93,11 +96,13 @@ class FlatSolids:
 
 
 class RoomSolids:
-    """The edges of a box; solids are surfaces, containers (inverted shapes) their translucent far sides.
+    """Domain and solids in 3-D: edges of a box, and surfaces of solids.
+
+    Containers (inverted shapes) have translucent far sides.
 
     Args:
-        size: of the domain [m].
-        line_width: of the domain's edges [pixels].
+        size: size of the domain [m].
+        line_width: width of the domain's edges [pixels].
     """
 
     def __init__(self, size: Sequence[float], line_width: float) -> None:
@@ -113,7 +118,7 @@ class RoomSolids:
         return [(edges, line)]
 
     def prepared(self, solid: Shape) -> Outline:
-        """Return what is needed to draw a solid."""
+        """Return the surface of a solid, in its own coordinates."""
         return Outline(solid)
 
     def meshes(self, solids: Sequence[tuple[Outline, Pose]]) -> list[Drawn]:
@@ -123,7 +128,7 @@ class RoomSolids:
             mesh = outline.inside(self.size, pose)
             looks = {"color": SOLID, "smooth_shading": True, "split_sharp_edges": True}
             if outline.shape.invert and not isinstance(outline.shape, PlaneTable):
-                # beyond the walls of the domain there is nothing to contain
+                # Containers end at the walls of the domain.
                 mesh = _clipped(mesh, self.size, closed=False)
                 line = {"color": EDGE, "line_width": 0.5 * self.line_width, "lighting": False}
                 meshes += [
@@ -136,17 +141,19 @@ class RoomSolids:
 
 
 class Outline:
-    """The surface of a 3-D shape, as pyvista's PolyData. Inverted shapes have the surface of what they leave out.
+    """Surface of a 3-D shape, as pyvista's PolyData.
+
+    Inverted shapes have the surface of their complement.
 
     Args:
-        shape: in 3-D.
+        shape: the shape, in 3-D.
 
     Raises:
-        TypeError: there is no drawing of such a shape.
+        TypeError: shapes of this kind cannot be drawn.
     """
 
     def __init__(self, shape: Shape) -> None:
-        """Make the surface in the shape's own coordinates."""
+        """Build the surface in the shape's own coordinates."""
         import pyvista
 
         self.shape = shape
@@ -176,11 +183,11 @@ class Outline:
         self.mesh = mesh.triangulate().clean() if mesh.n_points else mesh
 
     def inside(self, size: np.ndarray, pose: Pose) -> Any:
-        """Return the surface where the shape is, cut at the domain's walls unless it is inverted.
+        """Return the placed surface, cut at the domain's walls unless inverted.
 
         Args:
-            size: of the domain [m], shape (3,).
-            pose: relative to where the shape is placed.
+            size: size of the domain [m], shape (3,).
+            pose: pose relative to the shape's placement.
         """
         import pyvista
 
@@ -201,12 +208,18 @@ class Outline:
 
 
 def prescribed_solids(scene: Scene) -> list[Any]:
-    """Return the solids whose places the scene tells; where the others, rigid bodies, are only frames know."""
+    """Return the solids with prescribed motion, without rigid bodies.
+
+    Positions of rigid bodies are only in frames.
+    """
     return [solid for solid in scene.solid if not solid.is_body]
 
 
 def nearest_distance(solids: Sequence[tuple[Geometry, Pose]], points: wp.array) -> np.ndarray:
-    """Return the signed distance from points [m] on the CPU to the nearest of solids [m], infinite without any."""
+    """Return the signed distance from points [m] to the nearest solid [m].
+
+    On the CPU; infinite without solids.
+    """
     nearest = np.full(len(points), np.inf, dtype=np.float32)
     distance = wp.empty(len(points), dtype=wp.float32, device="cpu")
     for solid, pose in solids:
@@ -216,13 +229,14 @@ def nearest_distance(solids: Sequence[tuple[Geometry, Pose]], points: wp.array) 
 
 
 def apart(surface: Surface, solids: Sequence[tuple[Geometry, Pose]], spacing: float) -> Surface:
-    """Return a liquid's surface without what touches solids, which would show their sides once more through the liquid.
+    """Return a liquid's surface without the parts that touch solids.
+
+    The sides of solids would be visible twice through the liquid.
 
     Args:
         surface: closed triangles, whose normals point out of the liquid.
-        solids: and where they are.
-        spacing: a cell's edge [m]; the surface lies within `TOUCHING` of it at the solids that it
-            touches.
+        solids: the solids and their poses.
+        spacing: cell size [m]; a surface within `TOUCHING` cells of a solid touches it.
     """
     corners = surface.points[surface.corners]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -239,7 +253,7 @@ def apart(surface: Surface, solids: Sequence[tuple[Geometry, Pose]], spacing: fl
 
 
 def _clipped(mesh: Any, size: np.ndarray, *, closed: bool = True) -> Any:
-    """Cut a surface at the domain's walls, where it reaches beyond; a closed one is closed again there."""
+    """Cut a surface at the domain's walls; a closed one is closed again there."""
     for axis in range(3):
         for end, sign in ((0.0, 1.0), (size[axis], -1.0)):
             if mesh.n_points and (sign * (mesh.points[:, axis] - end)).min() < -1e-6 * size[axis]:

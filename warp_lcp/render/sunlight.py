@@ -1,4 +1,8 @@
-"""Where the lamp of a room's images does not reach: a map of what lies nearest to it, as in shadow mapping, of points instead of pixels."""
+"""Shadows of the lamp in 3-D images, by a shadow map of points.
+
+The map has the point nearest to the lamp in each direction, as in shadow mapping, but from points
+instead of pixels.
+"""
 
 from __future__ import annotations
 
@@ -8,24 +12,24 @@ from typing import Any, cast
 import numpy as np
 from scipy.ndimage import gaussian_filter, maximum_filter
 
-# from the domain to the lamp
+# Direction from the domain to the lamp.
 LIGHT = np.array([0.25, 0.9, 0.45]) / np.linalg.norm([0.25, 0.9, 0.45])
-ACROSS = np.linalg.svd(LIGHT[None])[2][1:]  # two directions at right angles to it
-# widths of the map that something lies behind what shades it: less would be its own roughness
+ACROSS = np.linalg.svd(LIGHT[None])[2][1:]  # two directions perpendicular to it
+# Bias of the map in widths: a smaller one would shade rough surfaces by themselves.
 BEHIND = 5.0
-POINTS = 300_000  # of the map, at the most
-SOFT = 1.5  # widths, of the edge of a shadow on the floor
-# the floor's color, and how much darker a shadow is
+POINTS = 300_000  # most points of the map
+SOFT = 1.5  # widths of the edge of a shadow on the floor
+# Color of the floor, and darkness of a shadow.
 FLOOR, SHADE = np.array([240.0, 240.0, 240.0]), 0.35
 FLOOR_POINTS = 160  # along its longest side
 
 
 class Sunlight:
-    """What the lamp reaches.
+    """Shadow map of the lamp.
 
     Args:
-        casters: points [m] of what casts shadows, each of shape (n, 3), about `width` apart.
-        width: of what the map tells apart [m].
+        casters: points [m] on objects that cast shadows, each of shape (n, 3), about `width` apart.
+        width: resolution of the map [m].
     """
 
     def __init__(self, casters: Sequence[np.ndarray], width: float) -> None:
@@ -35,7 +39,7 @@ class Sunlight:
             max(width, float(np.sqrt(np.ptp(place, axis=0).prod() / POINTS))),
             place.min(axis=0),
         )
-        # of two at one place the higher comes last, and stays
+        # Of two points in one cell the higher one comes last and is kept.
         order = np.argsort(height := points @ LIGHT)[1:]
         place = self._places(points[order])
         nearest = np.full(place.max(axis=0, initial=0) + 1, -np.inf)
@@ -43,7 +47,7 @@ class Sunlight:
         self._nearest = np.pad(maximum_filter(nearest, 3), 1, constant_values=-np.inf)
 
     def reaches(self, points: np.ndarray) -> np.ndarray:
-        """Return how much of the light comes to points [m], from 0 to 1, shape (n,)."""
+        """Return the lit fraction at points [m], from 0 to 1, shape (n,)."""
         place, height = self._places(points) + 1, points @ LIGHT + BEHIND * self._width
         last, free = np.array(self._nearest.shape) - 1, np.zeros(len(points))
         for shift in np.ndindex(3, 3):
@@ -53,7 +57,7 @@ class Sunlight:
         return cast(np.ndarray, free / 9.0)
 
     def floor(self, size: Sequence[float]) -> tuple[Any, dict[str, Any]]:
-        """Return the floor of a domain [m] with the shadows on it, and how it is drawn."""
+        """Return the floor of a domain [m] with the shadows on it, and its options."""
         import pyvista
 
         step = max(size[0], size[2]) / FLOOR_POINTS
@@ -71,7 +75,10 @@ class Sunlight:
 
 
 def scattered(mesh: Any, width: float) -> np.ndarray:
-    """Return points [m] on the triangles of one of pyvista's meshes, as many as squares of a width [m] have its area, shape (n, 3)."""
+    """Return points [m] scattered on the triangles of a pyvista mesh, shape (n, 3).
+
+    One point per square of a given width [m].
+    """
     if not mesh.n_cells:
         return np.zeros((0, 3))
     corners = np.asarray(mesh.points, dtype=float)[mesh.triangulate().regular_faces]

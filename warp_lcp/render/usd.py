@@ -1,4 +1,7 @@
-"""A run's frames as one USD file, which Blender, Houdini and Maya read. Needs the extra `usd`."""
+"""Export a run's frames as one USD file, for Blender, Houdini and Maya.
+
+Needs the extra `usd`.
+"""
 
 from __future__ import annotations
 
@@ -34,18 +37,18 @@ def export_run(
     last: int | None = None,
     told: Callable[[int, int], None] = lambda done, of: None,
 ) -> Iterator[int]:
-    """Write frames of a run into a USD file, one after the other; yield the number of each when it is written.
+    """Write frames of a run into a USD file; yield the number of each written frame.
 
     A time code is the number of a frame; y is up, lengths are in meters, velocities in meters per
-    second. The file appears when whole.
+    second. The file is created when it is complete.
 
     Args:
-        folder: of the run.
+        folder: folder of the run.
         file: `.usdc` and `.usd` are binary, `.usda` is text.
-        show: what of the material is written; see `Recording`.
-        first: the number of the first frame; that of the run's unless given.
-        last: the number of the last frame.
-        told: is called with how many frames are written, and how many there will be.
+        show: part of the material to write; see `Recording`.
+        first: number of the first frame. Default: that of the run.
+        last: number of the last frame.
+        told: called with the number of written frames, and the total number.
 
     Raises:
         RenderError: USD is missing, there are no such frames, or the file cannot be written.
@@ -65,13 +68,13 @@ def export_run(
         if (first is None or first <= number) and (last is None or number <= last)
     ]
     if not numbers:
-        asked = " ".join(
+        requested = " ".join(
             f"--{name} {number}"
             for name, number in (("first", first), ("last", last))
             if number is not None
         )
         raise RenderError(
-            f"{asked}: there are no such frames; the run has {recording.numbers[0]} to "
+            f"{requested}: there are no such frames; the run has {recording.numbers[0]} to "
             f"{recording.numbers[-1]}"
         )
     try:
@@ -87,7 +90,7 @@ def export_run(
             with replacing_by_name(file) as temporary:
                 whole.replace(temporary)
     except (OSError, Tf.ErrorException) as error:
-        # of the first thing that went wrong
+        # Of the first error.
         why = error.strerror if isinstance(error, OSError) else error.args[0].commentary
         raise RenderError(f"{file}: cannot be written: {why}") from error
 
@@ -96,7 +99,7 @@ def usd_suffix(file: Path) -> str:
     """Return the suffix of a USD file.
 
     Raises:
-        RenderError: it is none of USD's, or the file is a folder.
+        RenderError: it is not a suffix of USD, or the file is a folder.
     """
     suffix = file.suffix.lower()
     if suffix not in SUFFIXES:
@@ -107,16 +110,18 @@ def usd_suffix(file: Path) -> str:
 
 
 class Stage:
-    """A stage that grows by frames; what has been added is on the disk, so that one frame at a time is in memory.
+    """USD stage that grows by frames, with one frame at a time in memory.
+
+    Frames that have been added are on the disk.
 
     Args:
-        crate: the file, `.usdc`, which is not there yet.
-        recording: of the run.
-        numbers: of the frames that are to be added.
+        crate: the new file, `.usdc`.
+        recording: frames of the run.
+        numbers: numbers of the frames to add.
     """
 
     def __init__(self, crate: Path, recording: Recording, numbers: Sequence[int]) -> None:
-        """Write what all frames share."""
+        """Write the data that all frames share."""
         from pxr import Tf, Usd, UsdGeom
 
         scene = recording.scene
@@ -149,7 +154,7 @@ class Stage:
         """Add a frame.
 
         Raises:
-            RenderError: it cannot be read.
+            RenderError: the frame cannot be read.
         """
         code = self._code(number)
         if self._surface is not None:
@@ -176,7 +181,10 @@ class Stage:
         self._stage.Save()
 
     def saved_as(self, suffix: str) -> Path:
-        """Close the stage; return its file, another one with text if the suffix is that of text."""
+        """Close the stage; return its file.
+
+        If the suffix is that of text, the file is converted.
+        """
         file = self._crate
         if suffix == TEXT:
             file = file.with_suffix(suffix)
@@ -185,26 +193,29 @@ class Stage:
         return file
 
     def _code(self, number: int) -> float:
-        """Return the time code of a frame: its number, a little less at the end of a run that ends between two frames."""
+        """Return the time code of a frame.
+
+        It is its number, or slightly less for the last frame of a run that ends between two frames.
+        """
         return round(self._time.frame_time(number) * self._rate, 6)
 
     def _solids(self) -> list[tuple[Any, Any]]:
-        """Write the solids whose places the scene tells; return the motions of those that move, with what places them."""
+        """Write the prescribed solids; return motions and transforms of moving ones."""
         moving = []
         for number, solid in enumerate(prescribed_solids(self._recording.scene)):
-            if isinstance(solid, PlaneTable):  # has no surface that ends
+            if isinstance(solid, PlaneTable):  # is unbounded
                 continue
             outline = body_surface(solid.to_geometry(Path(), self._dimension), self._dimension)
             shape = self._shape(f"solid_{number}", SOLID)
             self._set_shape(shape, outline.points, outline.corners, self._always)
-            if solid.invert:  # a container is seen from within
+            if solid.invert:  # a container is seen from inside
                 shape.CreateOrientationAttr("leftHanded")
             if solid.motion:
                 moving.append((solid.motion.to_motion(self._dimension), shape.AddTransformOp()))
         return moving
 
     def _set_bodies(self, bodies: Surface, code: float) -> None:
-        """Place rigid bodies, each of which has its shape once, about its middle."""
+        """Place rigid bodies; each shape is stored once, relative to its center."""
         of_point = np.asarray(bodies.fields["body"]).ravel()
         for body in np.unique(of_point):
             own = of_point == body
@@ -221,7 +232,7 @@ class Stage:
             )
 
     def _shape(self, name: str, color: str) -> Any:
-        """Define what has triangles, in 2-D segments, each a curve."""
+        """Define a mesh of triangles, in 2-D curves of one segment each."""
         from pxr import UsdGeom
 
         path = f"{self._root}/{name}"
@@ -264,7 +275,10 @@ class Stage:
 
 
 def vertex_normals(surface: Surface) -> np.ndarray:
-    """Return unit normals of a surface of triangles at its points, shape (n, 3): means of those around, weighed by area."""
+    """Return unit normals at the points of a triangle surface, shape (n, 3).
+
+    Area-weighted means over the adjacent triangles.
+    """
     a, b, c = np.moveaxis(surface.points[surface.corners], 1, 0)
     twice_area = np.repeat(np.cross(b - a, c - a), 3, axis=0)
     sums = [
@@ -280,7 +294,7 @@ def vertex_normals(surface: Surface) -> np.ndarray:
 def _set_points(
     prim: Any, points: np.ndarray, when: Any, velocity: np.ndarray | None, width: float
 ) -> None:
-    """Give a prim its points [m], their velocities [m/s] and the box around them, at a time code."""
+    """Set points [m], velocities [m/s] and extent of a prim at a time code."""
     prim.GetPointsAttr().Set(_vectors(points), when)
     if velocity is not None:
         prim.GetVelocitiesAttr().Set(_vectors(velocity), when)
@@ -293,7 +307,7 @@ def _set_points(
 
 
 def _set_width(prim: Any, width: float) -> None:
-    """Give all points of curves or of a cloud one width [m]."""
+    """Set one width [m] for all points of curves or of a point cloud."""
     from pxr import UsdGeom
 
     prim.CreateWidthsAttr([width])
@@ -313,7 +327,7 @@ def _integers(values: np.ndarray) -> Any:
 
 
 def _matrix(rotation: np.ndarray, translation: np.ndarray) -> Any:
-    """Return a change of place as USD has it, for rows."""
+    """Return a transform as a USD matrix, for row vectors."""
     from pxr import Gf
 
     matrix = np.eye(4)
@@ -322,6 +336,6 @@ def _matrix(rotation: np.ndarray, translation: np.ndarray) -> Any:
 
 
 def _color(code: str) -> Any:
-    """Return a color such as #4aa9ee as USD has it."""
+    """Return a color such as #4aa9ee as a USD color."""
     parts = [int(code[place : place + 2], 16) / 255 for place in (1, 3, 5)]
     return _vectors(np.array([parts]) ** DISPLAY_GAMMA)

@@ -1,4 +1,7 @@
-"""A window in which a run's frames go by. Needs a display and the extra `render`."""
+"""Window that shows a run's frames.
+
+Needs a display and the extra `render`.
+"""
 
 from __future__ import annotations
 
@@ -16,21 +19,22 @@ from warp_lcp.render.render import INSTALL, Looks
 from warp_lcp.render.solid_meshes import EDGE
 from warp_lcp.run.folder import read_record
 
-WINDOW = 1280, 720  # pixels at the start
-WITHOUT_SCREEN = ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow")  # what VTK falls back to
-TICK = 20  # milliseconds between two looks at the clock
-LOOK = 1.0  # seconds between two looks at the folder of a run at work
+WINDOW = 1280, 720  # initial size in pixels
+# Fallbacks of VTK without a display.
+WITHOUT_SCREEN = ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow")
+TICK = 20  # milliseconds between two checks of the clock
+LOOK = 1.0  # seconds between two checks of a running run's folder
 KEYS = "Space: play   Left, Right: step   Home, End   q: quit"
 FOREVER = 2**31 - 1
 
 
 class Viewer:
-    """The frames of a run in a plotter, one at a time.
+    """Frames of a run in a plotter, one at a time.
 
     Args:
-        recording: of the run.
-        plotter: pyvista's.
-        clock: tells seconds, for playing.
+        recording: frames of the run.
+        plotter: plotter of pyvista.
+        clock: returns seconds, for playing.
     """
 
     def __init__(
@@ -40,15 +44,16 @@ class Viewer:
 
         self.recording, self.plotter, self.clock = recording, plotter, clock
         self.picture = Picture(recording, plotter.window_size, plotter)
-        self.place = 0  # among the recording's frames
-        self.playing_since: tuple[float, int] | None = None  # the clock's time and the place then
+        self.place = 0  # index in the recording's frames
+        # Time and index at the start of playing.
+        self.playing_since: tuple[float, int] | None = None
         self._looked = clock()
         self._slider: Any = None
         self._add_controls()
         self.go(0)
 
     def go(self, place: int) -> None:
-        """Show the frame at a place, the nearest if there is none."""
+        """Show the frame at an index, limited to the existing ones."""
         self.place = min(max(place, 0), len(self.recording.numbers) - 1)
         frame = self.recording.frame(self.recording.numbers[self.place])
         self.picture.place(frame)
@@ -65,12 +70,12 @@ class Viewer:
         self.plotter.render()
 
     def step(self, by: int) -> None:
-        """Stop playing and go on or back by some frames."""
+        """Stop playing and move forward or back by some frames."""
         self.playing_since = None
         self.go(self.place + by)
 
     def play(self) -> None:
-        """Begin to play from here, at the end from the start; or stop."""
+        """Start or stop playing; at the end, start from the beginning."""
         if self.playing_since is not None:
             self.playing_since = None
             return
@@ -79,7 +84,7 @@ class Viewer:
         self.playing_since = (self.clock(), self.place)
 
     def tick(self, _: int = 0) -> None:
-        """Show the frame that it is time for; frames that the machine is too slow for are left out."""
+        """Show the frame of the current time; omit frames if drawing is too slow."""
         if self.clock() - self._looked >= LOOK:
             self._look_again()
         if self.playing_since is None:
@@ -92,7 +97,10 @@ class Viewer:
             self.go(place)
 
     def _look_again(self) -> None:
-        """Take the frames that a run at work has written since, and show the newest if the one before is shown."""
+        """Add new frames of a running run.
+
+        If the last frame is shown, the newest one is shown next.
+        """
         last, self._looked = len(self.recording.numbers) - 1, self.clock()
         newest = len(self.recording.look_again()) - 1
         if newest > last:
@@ -102,6 +110,7 @@ class Viewer:
                 self.go(newest)
 
     def _add_controls(self) -> None:
+        """Add keys, a slider and a timer to the plotter."""
         last = max(len(self.recording.numbers) - 1, 1)
         self.plotter.add_text(
             KEYS, position="upper_right", font_size=9, color=EDGE, name="keys", render=False
@@ -134,7 +143,7 @@ class Viewer:
 
 
 def check_window(folder: Path) -> None:
-    """Refuse where no window can be opened.
+    """Raise an error if no window can be opened.
 
     Raises:
         RenderError: pyvista or a display is missing.
@@ -150,7 +159,9 @@ def check_window(folder: Path) -> None:
 
 
 def view_run(folder: Path, looks: Looks | None = None) -> None:
-    """Show a run's frames in a window until it is closed, those too that come meanwhile; of a run at work it waits for the first.
+    """Show a run's frames in a window until it is closed.
+
+    New frames of a running run are added; without frames it waits for the first.
 
     Raises:
         RenderError: pyvista or a display is missing, or there are no frames.

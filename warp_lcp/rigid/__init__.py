@@ -1,1 +1,1 @@
-"""Rigid bodies among the material: mass and inertia of a scene's shapes, their motion, and contacts between them and with walls."""
+"""Rigid bodies: mass properties, motion, joints, contacts with friction."""

@@ -18,24 +18,25 @@ from warp_lcp.rigid.joints import Joint
 from warp_lcp.rigid.obstacles import Obstacle
 from warp_lcp.rigid.outline import BodySurface, body_surface
 
-OUTSIDE = 3.0  # times a body's reach: where its center lies when it has left
+OUTSIDE = 3.0  # distance of a removed body's center from the domain, times its reach
 IN_PLANE = ("x", "y", "vx", "vy", "angle", "spin")
 IN_SPACE = ("x", "y", "z", "vx", "vy", "vz", "wx", "wy", "wz")
 
 
 @dataclass(frozen=True)
 class _Begun:
-    """What `begin_step` leaves for the rest of a step.
+    """Values of `begin_step` that the rest of the step needs.
 
     Args:
-        states: of the bodies before it.
+        states: states of the bodies before the step.
         free: momenta without contacts, shape (n, 6).
-        contacts: where bodies touch.
-        impulses: of the contacts if no material pushes; once `settled` with what it gave.
-        detour: of the bodies in the step, where they bounce.
-        dt: of the step [s].
-        kick_dt: how long gravity acts [s].
-        settled: whether contacts have been solved for with what the material gave.
+        contacts: contacts of the bodies.
+        impulses: impulses of the contacts without the material; once `settled` is set, including
+            it.
+        detour: displacement errors of the bodies in the step due to impacts.
+        dt: length of the step [s].
+        kick_dt: time that gravity acts [s].
+        settled: whether contacts have been solved with the impulses of the material.
     """
 
     states: np.ndarray
@@ -49,43 +50,42 @@ class _Begun:
 
 
 class RigidBodies:
-    """Rigid bodies of a scene, pushed by material, walls and each other.
+    """Rigid bodies of a scene, moved by material, walls and each other.
 
-    A step is `begin_step`, the material's solve with `RigidBody.apply_impulse`, and `end_step`;
-    `restore_step` in its place if the solve fails. `begin_step` leaves the velocities V* that
-    contacts allow before the material pushes. `end_step` starts again from gravity and the
-    material's impulses and solves for the contacts once more, since the loads on walls have
-    changed.
+    A step is `begin_step`, the material's solve with `RigidBody.apply_impulse`, and `end_step`, or
+    `restore_step` if the solve fails. `begin_step` computes the velocities V* that contacts allow
+    without the material. `end_step` starts again from gravity and the material's impulses and
+    solves for the contacts once more, since the loads on walls have changed.
 
     Args:
         bodies: in the order of their solids.
-        geometries: the shape of each as the scene places it.
-        numbers: the wall number of each, 1 + the index of its solid.
-        obstacles: walls and solids that they may touch.
+        geometries: the shape of each body as placed in the scene.
+        numbers: the wall number of each body, 1 + the index of its solid.
+        obstacles: walls and solids in contact with bodies.
         dimension: 2 or 3.
-        solver: solves for the impulses of contacts and joints; the default handles only contacts.
+        solver: solver for the impulses of contacts and joints; the default handles only contacts.
         joints: between the bodies, numbered as in `bodies`; restitution must be 0 with them.
-        ranks: processes that share the bodies, see `warp_lcp.distributed.ranks.Ranks`. Each has all
-            of them and takes the same steps from the same numbers; `begin_step`, `solve_contacts`
-            and `end_step` are collective.
+        ranks: processes that share the bodies, see `warp_lcp.distributed.ranks.Ranks`. Each one has
+            all bodies and computes the same steps; `begin_step`, `solve_contacts` and `end_step`
+            are collective.
 
     Attributes:
-        motions: a `BodyMotion` of each, for the solids.
-        time: of the state [s].
-        contacts: points where bodies touched in the last step.
-        contact_residual: of the last problem of contacts, relative to that of no impulses.
-        contact_iterations: of its solve.
-        exits: sides of the domain that bodies leave by: its size [m], and bits of
-            `warp_lcp.grid.sides.side_bits`. A body whose center of mass has crossed one is out of
-            the simulation for good: at rest outside, touched by nothing, in no frame.
-        material: whether a material may push the bodies; else contacts that hold them are not
+        motions: a `BodyMotion` of each body, for the solids.
+        time: time of the state [s].
+        contacts: number of contact points in the last step.
+        contact_residual: residual of the last contact problem, relative to that of no impulses.
+        contact_iterations: iterations of its solve.
+        exits: open sides of the domain for bodies: its size [m], and bits of
+            `warp_lcp.grid.sides.side_bits`. A body whose center of mass has crossed one is removed
+            for good: at rest outside, without contacts, in no frame.
+        material: whether a material can move the bodies; else contacts that support them are not
             tracked.
 
     Raises:
         ValueError: a body is not wholly inside the domain, or overlaps another body or a solid.
     """
 
-    _columns: tuple[str, ...] | None = None  # of the log, once they are asked for
+    _columns: tuple[str, ...] | None = None  # log columns, built at the first use
 
     def __init__(
         self,
@@ -121,19 +121,18 @@ class RigidBodies:
         return self.bodies[0].time
 
     def begin_step(self, time: float, dt: float, gravity: np.ndarray, kick_dt: float) -> None:
-        """Apply gravity and contacts; hold bodies that rest against walls and solids.
+        """Apply gravity and contacts; fix supported bodies against walls and solids.
 
-        Against the domain's walls, moving solids and fixed solids.
-
-        Held directions answer to no impulse of the material (see `RigidBody.inverse_mass`): it
-        meets a body on the floor as it meets the floor. `solve_contacts` updates which contacts
-        bear.
+        These are the domain's walls, moving solids and fixed solids. Along supported directions a
+        body does not respond to impulses of the material (see `RigidBody.inverse_mass`): for the
+        material, a body on the floor is like the floor. `solve_contacts` updates which contacts
+        support bodies.
 
         Args:
-            time: of the state [s].
+            time: time of the state [s].
             dt: time step [s], > 0.
             gravity: [m/s^2], shape (3,).
-            kick_dt: how long gravity acts [s].
+            kick_dt: time that gravity acts [s].
         """
         self.restore_step()
         gravity = np.asarray(gravity, dtype=np.float64)
@@ -165,6 +164,10 @@ class RigidBodies:
 
     def solve_contacts(self) -> None:
         """Solve the contacts with the impulses of the material.
+
+        The momenta are reset to those without contacts, plus the impulses of the material, and
+        contacts are solved again, starting from the impulses of `begin_step`. Without impulses of
+        the material, those of `begin_step` are kept.
 
         Raises:
             RuntimeError: there was no `begin_step`.
@@ -202,7 +205,7 @@ class RigidBodies:
         """Move the bodies; calls `solve_contacts` if it has not been called.
 
         Args:
-            dt: of `begin_step` [s].
+            dt: the argument of `begin_step` [s].
 
         Raises:
             RuntimeError: there was no `begin_step`.
@@ -223,10 +226,10 @@ class RigidBodies:
         self._agree()
 
     def _agree(self) -> None:
-        """Take the bodies, what holds them and the memory of contacts from the root rank.
+        """Broadcast bodies, supports and contact memory from the root rank.
 
-        Processors of another kind may round otherwise, and ranks that disagree by a bit would in
-        time disagree on a contact.
+        Different processors may round differently, and a difference of a bit between ranks would in
+        time become a different contact.
         """
         if self._ranks.size == 1:
             return
@@ -271,13 +274,13 @@ class RigidBodies:
             self._begun = None
 
     def trouble(self, size: Sequence[float], endless: Sequence[int]) -> str | None:
-        """Return why the simulation cannot continue, or "".
+        """Return the reason why the simulation cannot continue, or "".
 
-        A body is not finite, or meets its own periodic image.
+        A body is not finite, or touches its own periodic image.
 
         Args:
-            size: of the domain [m].
-            endless: axes without an end, at whose sides solids must be alike.
+            size: size of the domain [m].
+            endless: periodic axes, at whose two sides solids must be equal.
         """
         finite = np.isfinite(self.bodies.values[:, :STATE]).all(axis=1)
         if not finite.all():
@@ -302,7 +305,7 @@ class RigidBodies:
 
         Args:
             span: time to look ahead [s].
-            gravity: its size [m/s^2].
+            gravity: its magnitude [m/s^2].
         """
         six, there = self.bodies.velocities(), ~self.gone()
         speeds = lengths(six[:, :3]) + lengths(six[:, 3:]) * self._solve.reach
@@ -329,7 +332,7 @@ class RigidBodies:
         """Restore `state`.
 
         Raises:
-            ValueError: it is of other bodies.
+            ValueError: the state belongs to other bodies.
         """
         states = np.asarray(state["bodies"], dtype=np.float64)
         if states.shape != (len(self.bodies), STATE):
@@ -350,12 +353,12 @@ class RigidBodies:
     def columns(self) -> tuple[str, ...]:
         """Return the log columns: position, velocity and rotation of each body.
 
-        x, y, z: the center of mass [m]; vx, vy, vz: its velocity [m/s]; 2-D: angle and spin, how
-        far it has turned [degrees] and how fast it turns [degrees/s]; 3-D: wx, wy, wz, the angular
-        velocity [degrees/s]. contacts: points where bodies touch or nearly do; contact_residual:
-        how well the problem of their impulses was solved, relative to that of no impulses. With
-        open sides: bodies_gone, how many bodies have left by them. With joints: joint_error, the
-        largest distance of anchors [m] or angle between what is held [rad]; of each hinge, numbered
+        x, y, z: center of mass [m]; vx, vy, vz: its velocity [m/s]; 2-D: angle and spin, the
+        rotation [degrees] and its speed [degrees/s]; 3-D: wx, wy, wz, the angular velocity
+        [degrees/s]. contacts: number of points where bodies touch or nearly touch;
+        contact_residual: residual of the contact problem, relative to that of no impulses. With
+        open sides: bodies_gone, the number of removed bodies. With joints: joint_error, the largest
+        distance of anchors [m] or angle between fixed directions [rad]; for each hinge, numbered
         among the joints, joint0_angle [degrees], and joint0_torque of its motor [N m].
         """
         names = IN_PLANE if self.dimension == 2 else IN_SPACE
@@ -375,7 +378,7 @@ class RigidBodies:
         )
 
     def _joint_columns(self) -> list[tuple[int, str]]:
-        """Return what the log has of each joint."""
+        """Return joint number and column name of each joint column."""
         hinges = [
             (number, joint) for number, joint in enumerate(self.joints) if joint.kind == "hinge"
         ]

@@ -16,15 +16,15 @@ from warp_lcp.rows import KernelFile
 from warp_lcp.rows.host_kernel import HostKernel
 from warp_lcp.settings import NonNegative, Part, checked
 
-# of the fixed point; a step turns a body by far less than a radian, and each round by a factor of
-# that less
+# Limit of the fixed-point iteration. A step rotates a body by far less than a radian, and each
+# round reduces the error by that angle.
 MOST_ROUNDS = 60
-STATE, VALUES = 20, 26  # numbers of a body's state, and with the impulses given
-# where in the state
+STATE, VALUES = 20, 26  # numbers of a body's state, and with the impulses received
+# Columns of the state.
 POSITION, ROTATION, MOMENTUM, SPINNING = slice(0, 3), slice(3, 12), slice(12, 15), slice(15, 18)
 ANGLE, TIME, GIVEN = 18, 19, slice(20, 26)
 UNIT, EPSILON = np.eye(3), float(np.finfo(np.float64).eps)
-# v @ CROSS: entries of the matrix of v x
+# v @ CROSS are the entries of the matrix of v x.
 CROSS = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(0, 2, 1).reshape(3, 9)
 NO_TIMES = np.zeros(0)
 AXES = [0, 1, 2]
@@ -36,7 +36,10 @@ ADVANCE, POSES = (
 
 
 def _part(columns: slice, shape: tuple[int, ...] = (-1,)) -> property:
-    """Return the property of a vector or matrix in a body's values: read as a copy, written by assignment."""
+    """Return the property of a vector or matrix in a body's values.
+
+    It is read as a copy, and written by assignment.
+    """
 
     def read(body: RigidBody) -> np.ndarray:
         part = body.values[columns].reshape(shape).copy()
@@ -64,27 +67,27 @@ class RigidBody:
     Velocities follow from the momenta, which only impulses change.
 
     Args:
-        properties: mass, center and inertia as the scene places the body.
-        name: what messages call it.
+        properties: mass, center and inertia of the body as placed in the scene.
+        name: name in messages.
         friction: Coulomb's coefficient, >= 0.
-        restitution: the part of the speed of an impact that comes back, in [0, 1].
-        velocity: of the center of mass at the start [m/s], shape (3,).
-        angular_velocity: at the start [rad/s], shape (3,).
+        restitution: ratio of the speeds after and before an impact, in [0, 1].
+        velocity: initial velocity of the center of mass [m/s], shape (3,).
+        angular_velocity: initial angular velocity [rad/s], shape (3,).
 
     Attributes:
-        values: everything that changes but `hold`, shape (26,); a row of `BodyStates` for a body of
-            several. What the attributes below return is a copy, not to be written to; assign a new
+        values: all variables except `hold`, shape (26,); a row of `BodyStates` if the body belongs
+            to one. The attributes below return copies, which must not be modified; assign a new
             value.
-        position: of the center of mass [m], shape (3,).
-        rotation: from where the scene placed it, shape (3, 3).
+        position: position of the center of mass [m], shape (3,).
+        rotation: rotation relative to the scene's placement, shape (3, 3).
         momentum: [kg m/s], shape (3,).
         angular_momentum: about the center of mass, in the world's axes [kg m^2/s], shape (3,).
-        angle: by how much it has turned about z [rad], as many turns as they are; of meaning in
-            2-D.
-        time: of the state [s].
-        hold: matrix from an impulse to the part left by contacts, shape (k, k); None: identity. See
-            `RigidBodies.begin_step`.
-        given: impulses since `hold` was set, as they were given, shape (6,): force and torque.
+        angle: rotation angle about z [rad], including full turns; meaningful in 2-D.
+        time: time of the state [s].
+        hold: matrix that maps an impulse to the part that contacts do not absorb, shape (k, k);
+            None for the identity. See `RigidBodies.begin_step`.
+        given: sum of the impulses since `hold` was set, including the parts that contacts absorb,
+            shape (6,): [N s, N m s].
 
     Raises:
         ValueError: friction or restitution is out of range.
@@ -100,14 +103,14 @@ class RigidBody:
         velocity: np.ndarray | None = None,
         angular_velocity: np.ndarray | None = None,
     ) -> None:
-        """Place the body where the scene does."""
+        """Place the body as in the scene."""
         self.friction, self.restitution = (
             checked("friction", friction, NonNegative),
             checked("restitution", restitution, Part),
         )
         self.properties, self.name = properties, name
         self.values = np.zeros(VALUES)
-        self.states: BodyStates | None = None  # that `values` are a row of
+        self.states: BodyStates | None = None  # the `BodyStates` of which `values` is a row
         self.position, self.rotation = properties.center, np.eye(3)
         self.momentum = properties.mass * _three(velocity)
         self.angular_momentum = properties.inertia @ _three(angular_velocity)
@@ -165,13 +168,11 @@ class RigidBody:
         return result if dimension == 3 else result[PLANAR][:, PLANAR]
 
     def inverse_mass(self, dimension: int) -> np.ndarray:
-        """Return the velocity per impulse, shape (k, k), positive semi-definite.
+        """Return the velocity per impulse, shape (k, k).
 
-        Symmetric.
-
-        That is block diag(1/m, I^-1), less what contacts with walls take while they hold the body
-        (between `RigidBodies.begin_step` and `end_step`): 0 along directions in which it cannot
-        move.
+        Symmetric and positive semi-definite: block diag(1/m, I^-1), without the directions that
+        contacts with walls block while they support the body (between `RigidBodies.begin_step` and
+        `end_step`). It is 0 along directions in which the body cannot move.
         """
         free = self.free_inverse_mass(dimension)
         if self.hold is None:
@@ -191,7 +192,7 @@ class RigidBody:
         )
 
     def apply_impulse(self, impulse: np.ndarray) -> None:
-        """Apply an impulse and an angular impulse, less the part that walls take.
+        """Apply an impulse and an angular impulse, without the part that walls absorb.
 
         Shape (k,) [N s, N m s].
         """
@@ -200,7 +201,7 @@ class RigidBody:
         self.push(impulse if self.hold is None else self.hold @ impulse)
 
     def push(self, impulse: np.ndarray) -> None:
-        """Apply an impulse and an angular impulse without regard to contacts.
+        """Apply an impulse and an angular impulse regardless of contacts.
 
         Shape (k,) [N s, N m s].
         """
@@ -230,7 +231,7 @@ class RigidBody:
         return self.values[:STATE].copy()
 
     def restore(self, state: np.ndarray) -> None:
-        """Restore `state`; no contact holds the body."""
+        """Restore `state`, without contacts that support the body."""
         self.values[:STATE] = state
         self.release()
 
@@ -243,23 +244,23 @@ class RigidBody:
         self.momentum, self.angular_momentum, self.given = kept
 
     def release(self) -> None:
-        """Reset contacts that hold the body and the impulses received."""
+        """Remove the supports of the body, and reset the impulses received."""
         self.hold, self.given = None, np.zeros(6)
 
 
 class BodyStates(Sequence[RigidBody]):
-    """Several bodies with their states in one array.
+    """States of several bodies in one array.
 
     Args:
-        bodies: whose states become rows of the array, so that a body belongs to one `BodyStates`,
-            the last one made of it.
+        bodies: the bodies, whose states become rows of the array. A body belongs to one
+            `BodyStates` at a time, the last one created.
 
     Attributes:
-        values: of all bodies, shape (n, 26); the views of it below have shapes (n, 3), (n, 3, 3),
+        values: values of all bodies, shape (n, 26); its views below have shapes (n, 3), (n, 3, 3),
             (n,) and (n, 6).
-        mass: [kg], shape (n,), as the bodies have it when this is made.
-        center: centers of mass as the scene places them [m], shape (n, 3).
-        inverse_inertia: as the scene places them [1/(kg m^2)], shape (n, 3, 3).
+        mass: masses at the creation of the object [kg], shape (n,).
+        center: centers of mass as placed in the scene [m], shape (n, 3).
+        inverse_inertia: inverse inertias as placed in the scene [1/(kg m^2)], shape (n, 3, 3).
     """
 
     def __init__(self, bodies: Sequence[RigidBody]) -> None:
@@ -284,7 +285,7 @@ class BodyStates(Sequence[RigidBody]):
 
     @classmethod
     def of(cls, bodies: Sequence[RigidBody]) -> BodyStates:
-        """Return bodies with their states in one array: themselves if they have one."""
+        """Return bodies with their states in one array; no copy if they already are."""
         return bodies if isinstance(bodies, cls) else cls(bodies)
 
     def __len__(self) -> int:
@@ -302,7 +303,7 @@ class BodyStates(Sequence[RigidBody]):
         return self._bodies[number]
 
     def copied(self) -> BodyStates:
-        """Return copies of the bodies, to try a motion."""
+        """Return copies of the bodies, for trial motions."""
         return BodyStates([copy(body) for body in self])
 
     def velocities(self) -> np.ndarray:
@@ -311,9 +312,13 @@ class BodyStates(Sequence[RigidBody]):
         return np.concatenate([self.momentum / self.mass[:, None], spin], axis=1)
 
     def inverse_masses(self, dimension: int) -> np.ndarray:
-        """Return `RigidBody.inverse_mass` of all, shape (n, k, k)."""
+        """Return `RigidBody.inverse_mass` of all, shape (n, k, k).
+
+        It is block diag(1/m, R I^-1 R') times the matrix `hold` of supported bodies, symmetrized
+        against rounding.
+        """
         if dimension == 2:
-            # the last row of R I^-1 R', as far as it counts in the plane
+            # The last row of R I^-1 R', of which a plane needs only zz.
             across = self.rotation[:, 2:]
             result = np.zeros((len(self), 3, 3))
             result[:, 0, 0] = result[:, 1, 1] = 1.0 / self.mass
@@ -330,9 +335,9 @@ class BodyStates(Sequence[RigidBody]):
         return result
 
     def apply_impulses(self, impulses: np.ndarray) -> None:
-        """Apply impulses, less the parts that walls take.
+        """Apply impulses, without the parts that walls absorb.
 
-        Shape (n, k) [N s, N m s]; as `RigidBody.apply_impulse` of each.
+        Shape (n, k) [N s, N m s]; as `RigidBody.apply_impulse` of each body.
         """
         self.given += in_space(impulses)
         if all(body.hold is None for body in self._bodies):
@@ -355,16 +360,16 @@ class BodyStates(Sequence[RigidBody]):
         advance_states(self.values, self.mass, self.inverse_inertia, dt)
 
     def shift(self, ways: np.ndarray) -> None:
-        """Move bodies by small ways (m, rad), shape (n, k), without a velocity."""
+        """Move bodies by small displacements (m, rad), shape (n, k), without velocity."""
         shift_states(self.values, in_space(ways))
 
     def restore(self, states: np.ndarray) -> None:
-        """Continue from states, shape (n, 20), held by nothing."""
+        """Restore states, shape (n, 20), without supports."""
         self.values[:, :STATE] = states
         self.release()
 
     def release(self) -> None:
-        """Forget what holds the bodies and what they were given."""
+        """Remove the supports of all bodies, and reset the impulses received."""
         self.given[:] = 0.0
         for body in self:
             body.hold = None
@@ -374,7 +379,7 @@ class BodyMotion:
     """Motion of a body's solid; implements `warp_lcp.grid.motion.Motion`.
 
     Args:
-        body: which.
+        body: the body.
     """
 
     def __init__(self, body: RigidBody) -> None:
@@ -383,7 +388,8 @@ class BodyMotion:
     def pose(self, time: float) -> Pose:
         """Return the pose at a time [s].
 
-        At the time of the body's state its pose, later the one after the present velocities.
+        At the time of the body's state it is the current pose; later it is the one at the current
+        velocities.
         """
         body = self.body
         position, rotation = (
@@ -407,9 +413,9 @@ class BodyMotion:
 
     @staticmethod
     def velocity_fields_of(motions: Sequence[BodyMotion]) -> tuple[np.ndarray, np.ndarray]:
-        """Return turns, shape (n, 3, 3) [1/s], and shifts, shape (n, 3) [m/s].
+        """Return the velocity fields: rotation (n, 3, 3) [1/s], shift (n, 3) [m/s].
 
-        A body's point x moves at turn x + shift now.
+        The current velocity of a body's point x is rotation x + shift.
         """
         n = len(motions)
         reals = _moved(motions, NO_TIMES)
@@ -419,7 +425,10 @@ class BodyMotion:
 
 
 def _moved(motions: Sequence[BodyMotion], times: np.ndarray) -> np.ndarray:
-    """Return memory of the kernel `poses`: rotations and translations at m times are from 39 n + m on, turns and shifts after them."""
+    """Run the kernel `poses`, and return its memory.
+
+    Rotations and translations at m times start at 39 n + m, followed by rotation rates and shifts.
+    """
     n, m = len(motions), len(times)
     reals, _ = POSES.run(
         (*_held(motions), times), (), tasks=n, work=12 * n * (m + 1), count=n, times=m
@@ -440,7 +449,7 @@ def _held(motions: Sequence[BodyMotion]) -> tuple[np.ndarray, ...]:
 
 
 def in_space(values: np.ndarray) -> np.ndarray:
-    """Return vectors of three (2-D) or six entries, shape (..., k), as ones of six."""
+    """Return vectors of 3 (2-D) or 6 entries as vectors of 6, shape (..., k)."""
     values = np.asarray(values, dtype=np.float64)
     if values.shape[-1] == 6:
         return values
@@ -461,10 +470,11 @@ def advance_states(
 ) -> None:
     """Move bodies along their velocities for dt [s]; `values` are updated.
 
-    A turn is about the angular velocity in the middle of the step, whose inertia is that of half
-    the turn (the implicit midpoint rule on rotations): angular momentum is kept exactly, and the
-    energy of a free rotation does not drift, as the rule is its own inverse backwards in time. With
-    w = R I^-1 R' L it is the fixed point of h <- dt/2 w(exp(h) R), found for each body by itself.
+    The rotation is about the angular velocity in the middle of the step, with the inertia after
+    half of the rotation (the implicit midpoint rule on rotations). Angular momentum is conserved
+    exactly, and the energy of a free rotation does not drift, since the rule is symmetric in time.
+    With w = R I^-1 R' L it is the fixed point of h <- dt/2 w(exp(h) R), iterated for each body
+    separately.
 
     Args:
         values: rows of `RigidBody.values`, shape (n, 26).
@@ -495,9 +505,8 @@ def shift_states(values: np.ndarray, ways: np.ndarray) -> None:
 def rotation_by(vector: np.ndarray) -> np.ndarray:
     """Return matrices of rotations by |v| [rad] about vectors v, shape (..., 3).
 
-    They equal SciPy's `Rotation.from_rotvec` to rounding.
-
-    With K x = v x x that is 1 + sin(a) / a K + (sin(a/2) / (a/2))^2 K^2 / 2, a = |v|.
+    With K x = v x x the matrix is 1 + sin(a) / a K + (sin(a/2) / (a/2))^2 K^2 / 2, a = |v|. It
+    equals SciPy's `Rotation.from_rotvec` to rounding.
     """
     angle = np.sqrt(np.square(vector).sum(axis=-1))[..., None, None] / np.pi
     K = cross_matrix(vector)
@@ -505,7 +514,10 @@ def rotation_by(vector: np.ndarray) -> np.ndarray:
 
 
 def _sinc(x: np.ndarray) -> np.ndarray:
-    """Return sin(pi x) / (pi x), as `np.sinc`, whose look at the type takes as long as the sine."""
+    """Return sin(pi x) / (pi x).
+
+    As `np.sinc`, whose type checks take as long as the sine.
+    """
     y = np.pi * x
     y = np.where(y, y, EPSILON)
     return np.asarray(np.sin(y) / y)

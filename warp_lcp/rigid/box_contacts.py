@@ -1,6 +1,6 @@
-"""Contact points of two boxes by the axis of least overlap.
+"""Contact points of two boxes by the separating axis test.
 
-Points of a face or of a pair of edges.
+The points lie on a face, or between a pair of edges.
 """
 
 from __future__ import annotations
@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-# of a half side: an edge axis must separate by so much more than the faces, as faces give more
-# points
+# Relative to a half side: an edge axis must separate more than faces by this much, as faces give
+# more points.
 FACE_FIRST = 1e-2
-PARALLEL = 1e-6  # squared sine of two edges below which their cross product is no axis
+PARALLEL = 1e-6  # squared sine of two edges below which their cross product is not used as an axis
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,10 +42,10 @@ def box_box(
 
     Points [m], shape (k, 3); normal from b to a; gaps [m], shape (k,), negative where they overlap.
 
-    Of 15 axes (3 face normals of each, 9 cross products of edges) the one along which the boxes are
-    farthest apart, or overlap least, is the normal. For a face, the face of the other box that
-    looks at it is clipped against its sides (Sutherland and Hodgman), and points within the margin
-    are kept; for edges there is one point, halfway between them.
+    Of 15 axes (3 face normals of each box, 9 cross products of edges) the one with the largest gap,
+    or the least overlap, is the normal. For a face, the opposite face of the other box is clipped
+    against its sides (Sutherland and Hodgman), and points within the margin are contacts. For edges
+    there is one point, halfway between them.
 
     Args:
         a: one box.
@@ -83,7 +83,11 @@ def box_box(
 def _edges(
     a: OrientedBox, b: OrientedBox, first: int, second: int, normal: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Return the point halfway between the supporting edges of a (axis `first`) and b, and the gap along the normal."""
+    """Return the point between supporting edges of a and b, and their gap.
+
+    The point is halfway between them; the edge of a is along axis `first`; the gap is along the
+    normal [m].
+    """
     ends = []
     for box, axis, toward in ((a, first, -normal), (b, second, normal)):
         side = np.where(box.rotation.T @ toward >= 0, 1.0, -1.0)
@@ -100,7 +104,10 @@ def _edges(
 def _clip(
     reference: OrientedBox, incident: OrientedBox, axis: int, outward: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the corners of the incident face clipped by the sides of the reference face, and their heights above it [m]."""
+    """Return the clipped corners of the incident face, and their heights.
+
+    They are clipped by the sides of the reference face; heights are above it [m].
+    """
     facing = incident.rotation.T @ outward
     k = int(np.abs(facing).argmax())
     center = incident.center - np.sign(facing[k]) * incident.half[k] * incident.rotation[:, k]
@@ -116,8 +123,11 @@ def _clip(
 
 
 def _cut(polygon: list[np.ndarray], normal: np.ndarray, offset: float) -> list[np.ndarray]:
-    """Return the part of a convex polygon where normal.x <= offset; a corner on the plane counts as inside."""
-    kept = []
+    """Return the part of a convex polygon where normal.x <= offset.
+
+    A corner on the plane counts as inside.
+    """
+    corners = []
     heights = [float(normal @ p) - offset for p in polygon]
     tiny = 1e-12 * (1 + abs(offset))
     for n, p in enumerate(polygon):
@@ -127,7 +137,7 @@ def _cut(polygon: list[np.ndarray], normal: np.ndarray, offset: float) -> list[n
             heights[(n + 1) % len(polygon)],
         )
         if h <= tiny:
-            kept.append(p)
+            corners.append(p)
         if (h > tiny and next_height < -tiny) or (h < -tiny and next_height > tiny):
-            kept.append(p + h / (h - next_height) * (q - p))
-    return kept
+            corners.append(p + h / (h - next_height) * (q - p))
+    return corners

@@ -14,18 +14,18 @@ from warp_lcp.rigid.box_contacts import OrientedBox, box_box
 from warp_lcp.rigid.contact_shape import ON_SURFACE, ContactShape
 from warp_lcp.rigid.obstacles import Obstacle
 
-FLAT = {2: 2, 3: 4}  # contacts of a pair with about one normal: a flat rest needs no more
-MOST = {2: 4, 3: 8}  # contacts of a pair
-OTHER_SIDE = 0.1  # of normals' difference: contacts of sides that differ by less count as of one
-SAME = 1e-6  # of a shape's size: points of contact this close are one
-# so many times the gap must a point be farther from the others to count more than one with less
+FLAT = {2: 2, 3: 4}  # contacts of a pair with about one normal: enough for a flat support
+MOST = {2: 4, 3: 8}  # most contacts of a pair
+OTHER_SIDE = 0.1  # difference of normals below which contacts count as of one side
+SAME = 1e-6  # relative to a shape's size: contact points this close are merged
+# Penalty of the gap above the deepest point, relative to the distance from the chosen points.
 LOWER = 20.0
-# for those that come on top where others lie lower: what a round rim rests on is not what it may
-# tip over
+# The same for additional points, which lie lower than some chosen ones: a round rim rests on other
+# points than those over which it may tip.
 MUCH_LOWER = 200.0
-MORE = 2  # of these, at most
-NONE = -1  # in the place of an obstacle: it is a body
-LEVEL = 1e-4  # of the smaller shape's size: gaps that differ by less are of one height
+MORE = 2  # most additional points of this kind
+NONE = -1  # obstacle number of contacts between bodies
+LEVEL = 1e-4  # relative to the smaller shape's size: gaps that differ by less are equal
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +33,8 @@ class ContactPoints:
     """Contact points of a pair.
 
     Args:
-        point: halfway between the surfaces [m], shape (k, 3).
-        normal: unit vectors from the other to the one, shape (k, 3).
+        point: points halfway between the surfaces [m], shape (k, 3).
+        normal: unit vectors from the second shape to the first, shape (k, 3).
         gap: [m], negative where they overlap, shape (k,).
     """
 
@@ -47,7 +47,7 @@ class ContactPoints:
         return len(self.gap)
 
     def turned(self) -> ContactPoints:
-        """Return the same points with first and second exchanged."""
+        """Return the same points with first and second shape exchanged."""
         return ContactPoints(self.point, -self.normal, self.gap)
 
     def where(self, chosen: np.ndarray) -> ContactPoints:
@@ -56,7 +56,7 @@ class ContactPoints:
 
     @classmethod
     def joined(cls, several: Sequence[ContactPoints]) -> ContactPoints:
-        """Return the points of several pairs as one."""
+        """Return the points of several pairs as one object."""
         some = [points for points in several if len(points.gap)]
         if len(some) < 2:
             point, normal, gap = (
@@ -93,9 +93,9 @@ def on_plane(
     """Return the contact points of a shape with a plane.
 
     Args:
-        shape: of the body, as placed.
-        pose: of the body.
-        point: of the plane [m], shape (3,).
+        shape: shape of the body, as placed.
+        pose: pose of the body.
+        point: a point of the plane [m], shape (3,).
         normal: unit vector into the open, shape (3,).
         margin: gap [m] up to which there is a contact.
     """
@@ -116,13 +116,14 @@ def between(
 ) -> ContactPoints:
     """Return the contact points of two shapes; normals point to the first.
 
-    Boxes by the axis along which they overlap least; others by points of either surface, and in
-    space those of either's edges that are nearest to the other, and the distance to the other one.
+    For boxes, see `box_contacts`. For other shapes, the points of either surface are tested with
+    the distance to the other shape. In space, so are the points of either's edges that are nearest
+    to the other.
 
     Args:
         one: a shape, as placed.
         at: its pose.
-        other: the other one.
+        other: the other shape.
         there: its pose.
         margin: gap [m] up to which there is a contact.
         dimension: 2 or 3.
@@ -135,28 +136,31 @@ def between(
                 for b in other.boxes
             ]
         )
-    single = [len(shape.points) == 1 for shape in (one, other)]  # the center of a ball says all
-    found = []
+    single = [len(shape.points) == 1 for shape in (one, other)]  # one point: the center of a ball
+    candidates = []
     if not single[1] or single[0]:
-        found.append(_points_of(one, at, other, there, margin, one.points))
+        candidates.append(_points_of(one, at, other, there, margin, one.points))
     if not single[0] and len(other.points):
-        found.append(_points_of(other, there, one, at, margin, other.points).turned())
+        candidates.append(_points_of(other, there, one, at, margin, other.points).turned())
     if dimension == 3:
-        found.append(
+        candidates.append(
             _points_of(one, at, other, there, margin, _nearest_of(one, at, other, there, margin))
         )
-        found.append(
+        candidates.append(
             _points_of(
                 other, there, one, at, margin, _nearest_of(other, there, one, at, margin)
             ).turned()
         )
-    return ContactPoints.joined(found)
+    return ContactPoints.joined(candidates)
 
 
 def _nearest_of(
     one: ContactShape, at: Pose | Place, other: ContactShape, there: Pose | Place, margin: float
 ) -> np.ndarray:
-    """Return the points of one shape's edges that are nearest to the other, where that has a surface between its own points."""
+    """Return the points of one shape's edges that are nearest to the other.
+
+    Only if the other shape has a surface between its own points.
+    """
     if not len(one.edges) or len(other.points) == 1:
         return np.zeros((0, 3))
     ends = (at.apply(one.edges.reshape(-1, 3)) - there.translation) @ there.rotation
@@ -172,7 +176,10 @@ def _points_of(
     margin: float,
     points: np.ndarray,
 ) -> ContactPoints:
-    """Return which of some points of one shape, in the axes in which it is placed, are near the other."""
+    """Return the contacts of some points of one shape with the other.
+
+    Points are in the axes in which the shape is placed.
+    """
     centers = at.apply(points)
     local = (centers - there.translation) @ there.rotation
     if other.closed and len(local) > 1:  # most points are far away
@@ -195,7 +202,10 @@ def _moved(box: OrientedBox, pose: Pose | Place) -> OrientedBox:
 
 
 def _boxes(a: OrientedBox, b: OrientedBox, margin: float, dimension: int) -> ContactPoints:
-    """Return where two boxes touch; in 2-D they are thick, and of their contacts those of one face count."""
+    """Return the contacts of two boxes.
+
+    In 2-D they are thick, and only the contacts of one face count.
+    """
     if dimension == 2:
         deep = max(a.half[2], b.half[2])
         a, b = (
@@ -212,14 +222,14 @@ def _boxes(a: OrientedBox, b: OrientedBox, margin: float, dimension: int) -> Con
 
 
 def spread(points: ContactPoints, size: float, dimension: int) -> ContactPoints:
-    """Return the deepest point and others far from it, enough to support a body.
+    """Return the deepest point and points far from it, enough to support a body.
 
-    Where all have about one normal that is two points in 2-D and four in 3-D, and up to two more if
+    If all have about one normal these are two points in 2-D and four in 3-D, and up to two more if
     some of these are higher than others.
 
     Args:
         points: the points.
-        size: of the smaller shape [m].
+        size: size of the smaller shape [m].
         dimension: 2 or 3.
     """
     if len(points) < 2:
@@ -244,22 +254,22 @@ def spread(points: ContactPoints, size: float, dimension: int) -> ContactPoints:
 def close_pairs(middle: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the pairs i > j of overlapping axis-aligned boxes, in order.
 
-    Sorted by their neighborhood along the longest axis.
+    Candidates are found by sorting along the longest axis (sweep and prune).
 
     Args:
-        middle: of the boxes [m], shape (n, 3).
+        middle: centers of the boxes [m], shape (n, 3).
         half: half their sides [m], shape (n, 3).
     """
     low, high = middle - half, middle + half
-    first, *others = np.argsort(-np.ptp(middle, axis=0), kind="stable").tolist()
+    first, *shorter_axes = np.argsort(-np.ptp(middle, axis=0), kind="stable").tolist()
     order = np.argsort(low[:, first], kind="stable")
-    # who begins before a box ends, after itself
+    # Later boxes that begin before the end of this one.
     ends = np.searchsorted(low[order, first], high[order, first], side="right")
     after = ends - np.arange(len(order)) - 1
     one = np.repeat(np.arange(len(order)), after)
     other = one + 1 + np.arange(len(one)) - np.repeat(np.cumsum(after) - after, after)
     one, other = order[one], order[other]
-    for axis in others:  # each leaves few of the pairs for the next
+    for axis in shorter_axes:  # each axis removes most of the pairs
         begin, end = np.ascontiguousarray(low[:, axis]), np.ascontiguousarray(high[:, axis])
         both = (begin[one] <= end[other]) & (begin[other] <= end[one])
         one, other = one[both], other[both]
@@ -273,10 +283,10 @@ class FoundContacts:
     """Contact points of bodies, k of them.
 
     Args:
-        first: body that normals point into, shape (k,).
-        second: body that they come from; the number of bodies where that is none, shape (k,).
-        obstacle: number of the obstacle that they come from; NONE where that is a body, shape (k,).
-        points: where.
+        first: body that the normal points into, shape (k,).
+        second: body that the normal comes from; the number of bodies for an obstacle, shape (k,).
+        obstacle: number of the obstacle; NONE for contacts between bodies, shape (k,).
+        points: the contact points.
     """
 
     first: np.ndarray
@@ -289,7 +299,7 @@ class FoundContacts:
         return len(self.first)
 
     def where(self, chosen: np.ndarray) -> FoundContacts:
-        """Return the contacts that are chosen, by a mask or their places."""
+        """Return selected contacts, by a mask or indices."""
         return FoundContacts(
             self.first[chosen],
             self.second[chosen],
@@ -298,7 +308,7 @@ class FoundContacts:
         )
 
     def without(self, pairs: Collection[tuple[int, int]]) -> FoundContacts:
-        """Return the contacts of other pairs than these, the smaller number first."""
+        """Return the contacts without those of some pairs, smaller number first."""
         if not pairs:
             return self
         count = 1 + max(int(self.second.max(initial=0)), *(high for _, high in pairs))
@@ -318,26 +328,28 @@ class FoundContacts:
 
     @classmethod
     def joined(cls, several: Sequence[FoundContacts]) -> FoundContacts:
-        """Return several as one."""
-        some = [found for found in several if len(found.first)]
+        """Return several objects as one."""
+        some = [contacts for contacts in several if len(contacts.first)]
         if len(some) < 2:
             return some[0] if some else several[0]
         first, second, obstacle = (
             np.concatenate([getattr(f, name) for f in some])
             for name in ("first", "second", "obstacle")
         )
-        return cls(first, second, obstacle, ContactPoints.joined([found.points for found in some]))
+        return cls(
+            first, second, obstacle, ContactPoints.joined([contacts.points for contacts in some])
+        )
 
 
 class ContactDetection:
     """Detection of contacts of bodies with each other and with obstacles.
 
     Args:
-        bodies: all.
-        shapes: of the bodies as placed.
+        bodies: all bodies.
+        shapes: shapes of the bodies as placed.
         obstacles: walls and solids.
         dimension: 2 or 3.
-        every: keep every point of a pair, not a few that hold a body.
+        every: keep every point of a pair, not only the few that support a body.
     """
 
     def __init__(
@@ -365,20 +377,20 @@ class ContactDetection:
     def find(
         self, time: float, ways: np.ndarray, brought: np.ndarray, near: float = 0.0
     ) -> FoundContacts:
-        """Return the contacts: obstacle by obstacle, then between bodies, pairs in order.
+        """Return the contacts: obstacle by obstacle, then pairs of bodies, in order.
 
         Args:
-            time: of the state [s].
-            ways: how far each body may come [m], shape (n,).
-            brought: gap up to which a body that rests touches each obstacle [m].
-            near: gap up to which bodies that rest touch each other [m].
+            time: time of the state [s].
+            ways: largest displacement of each body [m], shape (n,).
+            brought: gap up to which a body at rest touches each obstacle [m].
+            near: gap up to which bodies at rest touch each other [m].
         """
         turns, at = self.bodies.rotation, self.bodies.position
         shifts = at - (turns @ self.bodies.center[:, :, None])[:, :, 0]
         poses = [Place(turn, shift) for turn, shift in zip(turns, shifts, strict=True)]
         middle = (turns @ self._middle[:, :, None])[:, :, 0] + shifts
         half = (np.abs(turns) @ self._half[:, :, None])[:, :, 0] + self._radius[:, None]
-        found = [
+        contacts = [
             self._with_obstacle(number, obstacle.pose(time), poses, middle, half, ways + more)
             for number, (obstacle, more) in enumerate(zip(self.obstacles, brought, strict=True))
         ]
@@ -401,12 +413,15 @@ class ContactDetection:
                 [touching, FoundContacts.of(first, second, NONE, points)]
             )
             touching = touching.where(np.lexsort((touching.second, touching.first)))
-        return FoundContacts.joined([*found, touching])
+        return FoundContacts.joined([*contacts, touching])
 
     def _balls(
         self, i: np.ndarray, j: np.ndarray, centers: np.ndarray, margins: np.ndarray
     ) -> FoundContacts:
-        """Return the contacts of balls i with balls j: the points between them on the lines of their centers."""
+        """Return the contacts of balls i with balls j.
+
+        Each is the point between the balls on the line of their centers.
+        """
         way = centers[i] - centers[j]
         length = lengths(way)
         gap = length - self._radius[j] - self._radius[i]
@@ -428,7 +443,7 @@ class ContactDetection:
         half: np.ndarray,
         margins: np.ndarray,
     ) -> FoundContacts:
-        """Return where bodies touch an obstacle."""
+        """Return the contacts of bodies with an obstacle."""
         shape, n = self.obstacles[number].shape, len(poses)
         if shape is None:
             return self._with_planes(number, there, poses, middle, half, margins)
@@ -456,7 +471,10 @@ class ContactDetection:
         half: np.ndarray,
         margins: np.ndarray,
     ) -> FoundContacts:
-        """Return where bodies touch the planes of an obstacle: balls, each at one point, all at once."""
+        """Return the contacts of bodies with the planes of an obstacle.
+
+        All balls, with one point each, are tested at once.
+        """
         obstacle, n = self.obstacles[number], len(poses)
         points, normals = there.apply(obstacle.points), obstacle.normals @ there.rotation.T
         heights = middle @ normals.T - (points * normals).sum(axis=1)
@@ -468,9 +486,9 @@ class ContactDetection:
         touch = ContactPoints(
             middle[ball] - (self._radius[ball] + 0.5 * gap)[:, None] * normal, normal, gap
         )
-        found = FoundContacts(ball, np.full(len(ball), n), np.full(len(ball), number), touch)
+        contacts = FoundContacts(ball, np.full(len(ball), n), np.full(len(ball), number), touch)
         if balls.all():
-            return found
+            return contacts
         i, m = i[~balls], m[~balls]
         each = [
             self._kept(
@@ -479,5 +497,7 @@ class ContactDetection:
             )
             for a, b in zip(i.tolist(), m.tolist(), strict=True)
         ]
-        found = FoundContacts.joined([found, FoundContacts.of(i, np.full(len(i), n), number, each)])
-        return found.where(np.argsort(found.first, kind="stable"))
+        contacts = FoundContacts.joined(
+            [contacts, FoundContacts.of(i, np.full(len(i), n), number, each)]
+        )
+        return contacts.where(np.argsort(contacts.first, kind="stable"))

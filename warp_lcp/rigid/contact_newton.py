@@ -1,9 +1,10 @@
-"""Newton's methods for contacts that sweeps leave unsolved: few costly steps, whatever the ratio of masses and the height of a stack.
+"""Newton's methods for contact problems that sweeps do not solve.
 
-Both solve systems of bodies and contacts together, [I, -J'; W J, C], which are sparse and well
-scaled where B = J J' is full and is not: a light body between two heavy ones makes eigenvalues of B
-as far apart as the masses. The package's `PrimalDualActiveSet` and `InteriorPoint` take neither
-bounds that depend on x nor J.
+They take few costly steps, whatever the ratio of masses and the height of a stack. Both methods
+solve sparse systems of bodies and contacts together, [I, -J'; W J, C]. These are well scaled,
+while B = J J' is full and badly scaled: a light body between two heavy ones makes eigenvalues of B
+as different as the masses. The package's `PrimalDualActiveSet` and `InteriorPoint` support neither
+bounds that depend on x nor the factor J.
 """
 
 from __future__ import annotations
@@ -20,30 +21,32 @@ from warp_lcp.rigid.contacts import jacobian
 if TYPE_CHECKING:
     from warp_lcp.rigid.contact_problem import ContactProblem
 
-# of B's diagonal, added in a step's matrix: four corners of a box bear its weight in many ways, and
-# B is singular
+# Shift of B's diagonal, relative to it: four corners of a box can share its weight in many ways, so
+# that B is singular.
 SHIFT = 1e-11
-# times the largest velocity: where the interior point starts, and again where it jams, as friction
-# is not monotone
+# Initial velocities of the interior point, times the largest velocity. The second is used where the
+# first stalls, as friction is not monotone.
 STARTS = (1e4, 1e2)
-MOST_SETS = 20  # steps of the active set: near its solution it needs 1 to 10
-MOST_STEPS = 80  # of the interior point: it needs 10 to 60
-JAMMED = 20  # steps without a smaller residual
-SMALL = 150  # rows of a system that LAPACK solves sooner than SuperLU
-TO_BOUNDARY = 0.995  # part of the way to the first bound that a step goes
+MOST_SETS = 20  # steps of the active set method; near its solution it needs 1 to 10
+MOST_STEPS = 80  # steps of the interior point method; it needs 10 to 60
+JAMMED = 20  # steps without a smaller residual before a method is stopped
+SMALL = 150  # rows of a system up to which LAPACK is faster than SuperLU
+TO_BOUNDARY = 0.995  # fraction of the step to the first bound
 
 
 @dataclass(eq=False)
 class _Pairs:
-    """The complementary pairs of the interior point, all > 0; unknowns as of `ContactNewton`.
+    """Complementary pairs of the interior point method, all > 0.
+
+    The unknowns are those of `ContactNewton`.
 
     Args:
-        x: impulses, whose normal ones are the first of pairs with `normal`.
+        x: impulses; the normal ones are paired with `normal`.
         normal: velocities along normals.
-        low: parts of slip against which x is at its lower bound.
-        up: at its upper one.
-        below: how far x is above its lower bound, mu x_n + x_t.
-        above: below its upper one, mu x_n - x_t.
+        low: parts of the slip at the lower bound of x.
+        up: parts of the slip at the upper bound.
+        below: distance of x from its lower bound, mu x_n + x_t.
+        above: distance from its upper bound, mu x_n - x_t.
     """
 
     x: np.ndarray
@@ -54,7 +57,7 @@ class _Pairs:
     above: np.ndarray
 
     def moved(self, step: _Pairs, length: float) -> _Pairs:
-        """Return the pairs after a part of a step."""
+        """Return the pairs after a step of a given length."""
         return _Pairs(*(getattr(self, name) + length * getattr(step, name) for name in vars(self)))
 
     def products(self, normals: np.ndarray) -> list[np.ndarray]:
@@ -62,7 +65,7 @@ class _Pairs:
         return [self.x[normals] * self.normal, self.low * self.below, self.up * self.above]
 
     def length(self, step: _Pairs, normals: np.ndarray) -> float:
-        """Return the part of a step, at most 1, after which something is 0."""
+        """Return the largest length of a step, at most 1, without negative values."""
         mine = np.concatenate(
             [self.x[normals], self.normal, self.low, self.up, self.below, self.above]
         )
@@ -74,16 +77,16 @@ class _Pairs:
 
 
 class ContactNewton:
-    """Solve a `ContactProblem` to its last digits.
+    """Newton's methods for a `ContactProblem`, to rounding accuracy.
 
     Args:
-        problem: with a contact that approaches.
-        x: impulses to start from, shape (k, rows).
+        problem: a problem with at least one approaching contact.
+        x: initial impulses, shape (k, rows).
 
     Attributes:
-        x: impulses of the least residual so far, shape (k rows,).
-        residual: theirs, relative to that of no impulses.
-        steps: linear systems solved.
+        x: impulses with the least residual so far, shape (k rows,).
+        residual: their residual, relative to that of no impulses.
+        steps: number of linear systems solved.
     """
 
     def __init__(self, problem: ContactProblem, x: np.ndarray) -> None:
@@ -99,14 +102,17 @@ class ContactNewton:
         )
         self._normals = rows * np.arange(k)
         self._tangents = (self._normals[:, None] + np.arange(1, rows)).ravel()
-        self._own = np.repeat(self._normals, rows - 1)  # the normal of each tangent
+        self._own = np.repeat(self._normals, rows - 1)  # normal row of each tangent
         self._friction = np.repeat(problem.friction, rows - 1)
         self._scale = np.concatenate([np.ones(self._J.shape[1]), 1.0 / np.sqrt(self._diagonal)])
         self.x, self.residual, self.steps = x.ravel(), np.inf, 0
         self.take(self.x)
 
     def active_set(self, rtol: float) -> None:
-        """Newton's method on the natural residual from x: solve y = 0 on the free unknowns, x = bound on the others, until these stay.
+        """Primal-dual active set method, starting from x.
+
+        Each step solves y = 0 for the free unknowns, with x = bound for the others, until the sets
+        no longer change.
 
         Args:
             rtol: residual to reach, relative to that of no impulses.
@@ -119,9 +125,9 @@ class ContactNewton:
             wanted = x - self._y(x) / d
             at_low, at_up = wanted <= low, wanted >= up
             free = ~(at_low | at_up)
-            # free: J w + (yields + SHIFT d) x = -b + SHIFT d x_before; at a bound: d (x -+ mu x_n)
-            # = 0
-            found = self._solved(
+            # Free rows: J w + (yields + SHIFT d) x = -b + SHIFT d x_before. Rows at a bound: d (x
+            # -+ mu x_n) = 0.
+            solution = self._solved(
                 free.astype(float),
                 np.where(free, SHIFT * d + self._yields, d),
                 d[self._tangents]
@@ -129,13 +135,13 @@ class ContactNewton:
                 * (at_low[self._tangents].astype(float) - at_up[self._tangents]),
                 np.where(free, SHIFT * d * x - self._b, 0.0),
             )
-            if found is None:
+            if solution is None:
                 return
-            x = found
+            x = solution
             self.take(x)
 
     def interior_point(self, rtol: float) -> None:
-        """Follow the central path from several starts, until a residual is reached.
+        """Interior point method from several starts, until a residual is reached.
 
         Args:
             rtol: residual to reach, relative to that of no impulses.
@@ -145,11 +151,19 @@ class ContactNewton:
                 self._interior_point(rtol, start)
 
     def _interior_point(self, rtol: float, start: float) -> None:
-        """Mehrotra's predictor and corrector on x_n u_n = 0, low (mu x_n + x_t) = 0, up (mu x_n - x_t) = 0 with u_t = low - up.
+        """Mehrotra's predictor-corrector method from one start.
+
+        Each step solves the linearized equations twice with one matrix: a predictor toward the
+        bounds, whose success chooses the centering (reached / mean)^3, and a corrector with the
+        second-order terms. The first iterate has all pairs positive, with velocities `start` times
+        the largest of b.
+
+        The equations are x_n u_n = 0, low (mu x_n + x_t) = 0 and up (mu x_n - x_t) = 0, with u_t =
+        low - up.
 
         Args:
             rtol: residual to reach.
-            start: size of the velocities to start from, times the largest of b.
+            start: size of the initial velocities, relative to the largest of b.
         """
         least, since = np.inf, 0
         speed = start * max(float(np.abs(self._b).max()), np.finfo(float).tiny)
@@ -164,7 +178,7 @@ class ContactNewton:
             if self.residual <= rtol or since == JAMMED:
                 return
             products = now.products(self._normals)
-            # predictor: to the bounds
+            # Predictor: a step to the bounds.
             step = self._direction(now, [-product for product in products])
             if step is None:
                 return
@@ -180,7 +194,10 @@ class ContactNewton:
             now = now.moved(step, TO_BOUNDARY * now.length(step, self._normals))
 
     def _direction(self, now: _Pairs, targets: list[np.ndarray]) -> _Pairs | None:
-        """Return the step that changes the products of pairs by targets to first order, and closes the gaps of the equations."""
+        """Return the Newton step for given changes of the pairs' products.
+
+        It also closes the residuals of the linear equations.
+        """
         normals, tangents, own, mu = self._normals, self._tangents, self._own, self._friction
         to_normal, to_low, to_up = targets
         y = self._y(now.x)
@@ -216,13 +233,16 @@ class ContactNewton:
     def _solved(
         self, weights: np.ndarray, diagonal: np.ndarray, coupling: np.ndarray, right: np.ndarray
     ) -> np.ndarray | None:
-        """Return x of [I, -J'; W J, C] [w; x] = [0; right]; None where the matrix is singular.
+        """Return x of [I, -J'; W J, C] [w; x] = [0; right]; None if singular.
+
+        Eliminating w gives (W J J' + C) x = right. The system is scaled by `self._scale` on both
+        sides.
 
         Args:
             weights: the diagonal of W, shape (k rows,).
-            diagonal: that of C.
+            diagonal: diagonal of C.
             coupling: entries of C in the rows of tangents, at their normals.
-            right: of the equation.
+            right: right-hand side.
         """
         self.steps += 1
         bodies, n, scale = self._J.shape[1], len(diagonal), self._scale
@@ -238,16 +258,17 @@ class ContactNewton:
         try:
             if self._small is not None:
                 K = np.block([[np.eye(bodies), -J.T], [weights[:, None] * J, C.toarray()]])
-                found = scale * np.linalg.solve(scale[:, None] * K * scale, sides)
+                solution = scale * np.linalg.solve(scale[:, None] * K * scale, sides)
             else:
                 blocks = [[sparse.eye_array(bodies), -J.T], [sparse.diags_array(weights) @ J, C]]
                 scaling = sparse.diags_array(scale)
-                found = scale * splu(
+                solution = scale * splu(
                     (scaling @ sparse.block_array(blocks) @ scaling).tocsc()
                 ).solve(sides)
-        except (RuntimeError, np.linalg.LinAlgError):  # SuperLU: exactly singular; LAPACK
+        # SuperLU raises RuntimeError for singular matrices, LAPACK LinAlgError.
+        except (RuntimeError, np.linalg.LinAlgError):
             return None
-        return found[bodies:] if np.isfinite(found).all() else None
+        return solution[bodies:] if np.isfinite(solution).all() else None
 
     def _y(self, x: np.ndarray) -> np.ndarray:
         return np.asarray(self._J @ (self._J.T @ x) + self._yields * x + self._b)
@@ -259,13 +280,13 @@ class ContactNewton:
         return low, up
 
     def take(self, x: np.ndarray) -> float:
-        """Return the relative residual of x within its bounds, and keep x if it is the least."""
+        """Return the relative residual of x within its bounds; store x if it is best."""
         x = np.clip(x, *self._bounds(x))
         d = self._diagonal
-        found = (
+        residual = (
             float(np.linalg.norm(d * (x - np.clip(x - self._y(x) / d, *self._bounds(x)))))
             / self._reference
         )
-        if found < self.residual:
-            self.x, self.residual = x, found
-        return found
+        if residual < self.residual:
+            self.x, self.residual = x, residual
+        return residual

@@ -2,14 +2,14 @@
 
 The bounds are affine in the normal impulses.
 
-It is solved by the method of `warp_lcp.solvers.nncg` on B = J J' + diag(e), in a loop of its own
-(`headers/contact_nncg.h`), which shares the formula of beta (`snippets.h`). It differs in three
+The problem is solved by the method of `warp_lcp.solvers.nncg` on B = J J' + diag(e), in a separate
+loop (`headers/contact_nncg.h`) with the same formula of beta (`snippets.h`). It differs in three
 ways: rows are products with J at bodies, so that a sweep costs the entries of J, not those of B;
 contacts are swept in their order, not by colors; and an island of bodies is solved by one thread in
-one launch, which looks at the residual each 8 sweeps. `wl.NNCG` on the assembled B takes 390, 510
-and 890 us an iteration with 20, 200 and 1,000 contacts, this loop 2.6, 26 and 110 us. Sweeps need
-about as many iterations as the ratio of masses that touch, times the square of a stack's height;
-the rest is solved by sparse systems in `contact_newton`.
+one launch, which evaluates the residual every 8 sweeps. `wl.NNCG` on the assembled B takes 390, 510
+and 890 us an iteration with 20, 200 and 1,000 contacts, this loop 2.6, 26 and 110 us. The number of
+sweeps is about the ratio of masses in contact, times the square of a stack's height; harder
+problems are solved by sparse systems in `contact_newton`.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from warp_lcp.rows.host_kernel import HostKernel
 if TYPE_CHECKING:
     from warp_lcp.rigid.joints import JointRows
 
-# of B, along tangents: how friction is shared between contacts then is unique, and rest creeps by
-# 1e-7 m/s at most
+# Relative to the diagonal of B, along tangents: makes the distribution of friction over contacts
+# unique. Bodies at rest creep by 1e-7 m/s at most.
 YIELDS = 1e-6
-MANY = 20_000  # sweeps, where nothing else helps
+MANY = 20_000  # sweeps, if no other method converges
 KERNELS = KernelFile(Path(__file__).parent / "headers/contact_nncg.h")
 NNCG = KERNELS["warp_lcp.rigid.contacts.nncg"]
 
@@ -41,10 +41,10 @@ class ContactImpulses(NamedTuple):
     """Result of a contact solve.
 
     Attributes:
-        impulses: [N s], shape (k, rows); where there are joints, these flat and then those of
+        impulses: [N s], shape (k, rows); with joints a flat array that ends with those of the
             joints [N s, N m s], shape (k rows + m,).
-        residual: the largest of an island, relative to that of no impulses.
-        iterations: the most of an island: sweeps, and steps of Newton's methods.
+        residual: the largest residual of an island, relative to that of no impulses.
+        iterations: the most iterations of an island: sweeps, and steps of Newton's methods.
     """
 
     impulses: np.ndarray
@@ -57,7 +57,7 @@ class JointPart:
     """Joint rows of a contact problem: y = B x + b, lower <= x <= upper.
 
     Args:
-        rows: as those of contacts, times a factor of the inverse masses.
+        rows: in the format of contact rows: J times a factor of the inverse masses.
         b: velocities without impulses, plus position correction [m/s, rad/s], shape (m,).
     """
 
@@ -69,20 +69,19 @@ class JointPart:
 class ContactProblem:
     """Contact problem y = B x + b with x_n >= 0 and |x_t| <= mu x_n.
 
-    The rows of each of the k contacts are its normal and its tangents.
-
-    B = J J' + YIELDS diag(J J') along tangents, J = what velocities of bodies make at contacts,
-    times a factor of the inverse masses.
+    The rows of each of the k contacts are its normal and its tangents. B = J J' + YIELDS diag(J J')
+    along tangents. J maps the bodies' velocities to those at contacts, and is multiplied by a
+    factor of the inverse masses.
 
     Args:
         first: body of each contact, shape (k,).
-        second: the other one, `bodies` where it is none, shape (k,).
+        second: the other body, or `bodies` for an obstacle, shape (k,).
         one: rows of J for the first body, shape (k, rows, q).
-        other: for the second, shape (k, rows, q).
-        b: velocities without impulses, less those that are the least [m/s], shape (k, rows).
+        other: rows of J for the second body, shape (k, rows, q).
+        b: velocities without impulses, less the smallest allowed ones [m/s], shape (k, rows).
         friction: Coulomb's coefficient, shape (k,).
-        bodies: their number.
-        joints: further rows, which `solve` does not take; None: there are none.
+        bodies: number of bodies.
+        joints: rows of joints, which `solve` does not support; None without joints.
     """
 
     first: np.ndarray
@@ -97,7 +96,7 @@ class ContactProblem:
     def at(self, b: np.ndarray) -> ContactProblem:
         """Return the problem of the same contacts with other velocities b.
 
-        The sorted rows are taken over.
+        The sorted rows are shared.
         """
         other = replace(self, b=b)
         other.__dict__["sorted_rows"] = self.sorted_rows
@@ -108,7 +107,7 @@ class ContactProblem:
         """Rows of the contacts, sorted by islands.
 
         Order and starts as of `islands`; in that order J of both bodies, the diagonal of B besides
-        J J', that of B, and the friction.
+        J J', the diagonal of B, and the friction.
         """
         k, rows, _ = self.one.shape
         order, starts = self.islands()
@@ -133,7 +132,7 @@ class ContactProblem:
             )[group]
         order = np.argsort(group, kind="stable")
         group = group[order]
-        # where a group begins
+        # First contact of each group.
         starts = np.flatnonzero(np.concatenate([group[:1] >= 0, group[1:] != group[:-1]]))
         return order, np.append(starts, len(order))
 
@@ -156,15 +155,16 @@ class ContactProblem:
     ) -> ContactImpulses:
         """Return impulses, residual and number of iterations.
 
-        An island that does not reach the tolerance is taken at its least residual, which says so.
+        For an island that misses the tolerance, the impulses with the least residual are returned,
+        and the residual tells.
 
         Args:
-            stopping: of NNCG, of which `rtol` and `max_iterations` count.
-            start: impulses to start from, shape (k, rows); none if None.
-            unsolved: residual of an island above which Newton's methods go on, to `rtol`.
+            stopping: criteria of NNCG; only `rtol` and `max_iterations` are used.
+            start: initial impulses, shape (k, rows); 0 if None.
+            unsolved: residual of an island above which Newton's methods continue, to `rtol`.
 
         Raises:
-            ValueError: there are joints.
+            ValueError: the problem has joints.
         """
         if self.joints is not None:
             raise ValueError(
@@ -198,11 +198,11 @@ class ContactProblem:
         )
 
     def _go_on(self, rtol: float, x: np.ndarray) -> ContactImpulses:
-        """Return better impulses than those that sweeps have found, their residual, and the iterations that they took.
+        """Improve the impulses of the sweeps by Newton's methods.
 
-        Active sets solve what rests, from what sweeps have left, in a few steps, interior points
-        what they start too far from. Where a column topples and bodies hit each other these jam,
-        and many sweeps come near enough for active sets.
+        Active sets solve contacts at rest in a few steps, starting from the sweeps. Interior points
+        solve problems with a distant start. Both stall where a column topples and bodies hit each
+        other; then many sweeps come close enough for active sets.
         """
         newton = ContactNewton(self, x)
         newton.active_set(rtol)
@@ -222,7 +222,10 @@ SWEEPS = HostKernel(NNCG)
 
 
 def _components(first: list[int], second: list[int], bodies: int) -> np.ndarray:
-    """Return for each body the least one that links to it through pairs of bodies, shape (bodies,)."""
+    """Return the least body of each body's component, shape (bodies,).
+
+    Components are those of the graph of pairs.
+    """
     least = list(range(bodies))
     for pair in zip(first, second, strict=True):
         low, high = sorted(_root(least, body) for body in pair)
@@ -231,7 +234,7 @@ def _components(first: list[int], second: list[int], bodies: int) -> np.ndarray:
 
 
 def _root(least: list[int], body: int) -> int:
-    """Follow links to smaller bodies to their end, and shorten them."""
+    """Return the root of a body, with path compression (union-find)."""
     end = body
     while least[end] != end:
         end = least[end]

@@ -15,16 +15,16 @@ from warp_lcp.rigid.body import lengths
 from warp_lcp.rigid.box_contacts import OrientedBox
 from warp_lcp.rigid.outline import mesh_outline
 
-# of points [m], shape (n, 3): distances [m] and directions outward
+# Maps points [m], shape (n, 3), to distances [m] and outward directions.
 Distance = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 ALONG = np.linspace(0.0, 1.0, 9)  # points along an edge of a box or the axis of a capsule
-MOST_POINTS = 1500  # of a mesh
-LONG = 0.1  # of a mesh's size: shorter edges have corners close enough
-ROUNDS = 12  # of the search along an edge, each of which leaves a quarter of it
-DIFFERENCE = 2e-3  # of a mesh's size: for its direction; its distance is a float32
-ON_SURFACE = 1e-9  # of a shape's size, within which the way to the nearest point has no direction
-THICK = 1.0  # half the thickness of a 2-D box in the plane's contacts, of its sides
+MOST_POINTS = 1500  # most points of a mesh
+LONG = 0.1  # relative to a mesh's size: the corners of shorter edges are close enough
+ROUNDS = 12  # rounds of the search along an edge; each reduces the interval to a quarter
+DIFFERENCE = 2e-3  # relative to a mesh's size: step of its gradient, since its distance is float32
+ON_SURFACE = 1e-9  # relative to a shape's size: distance from the surface without a direction
+THICK = 1.0  # half thickness of a 2-D box in contacts of a plane, relative to its sides
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -32,19 +32,20 @@ class ContactShape:
     """Shape for contacts, as placed by the scene.
 
     Args:
-        points: the surface is `radius` away from them: shape (n, 3) [m].
+        points: points at a distance of `radius` from the surface: shape (n, 3) [m].
         radius: [m].
         distance: signed distance and its gradient.
         boxes: boxes of the shape if it consists of boxes; in 2-D a thick one.
         size: about half its extent [m].
-        closed: whether the inside has an end; contacts with others than such need points of theirs.
-        signed: the signed distance alone, where that takes less time.
+        closed: whether the inside is bounded; contacts with unbounded shapes need points of the
+            other.
+        signed: the signed distance alone, if that is faster.
         edges: in space, segments that may be nearer to another surface between their ends than at
             `points`: shape (m, 2, 3) [m].
-        own: of discs, capsules and boxes of a plane, what `distance` knows; see `numbers`.
+        own: parameters of discs, capsules and boxes of a plane; see `numbers`.
 
     Attributes:
-        low, high: bounds of the closed ones [m], shape (3,).
+        low, high: bounds of closed shapes [m], shape (3,).
     """
 
     points: np.ndarray
@@ -60,7 +61,7 @@ class ContactShape:
     high: np.ndarray = field(init=False)
 
     def __post_init__(self) -> None:
-        """Find the bounds of what is within the radius of the points."""
+        """Compute the bounds of the points and their radius."""
         points = self.points if len(self.points) else np.zeros((1, 3))
         object.__setattr__(self, "low", points.min(axis=0) - self.radius)
         object.__setattr__(self, "high", points.max(axis=0) + self.radius)
@@ -72,7 +73,7 @@ class ContactShape:
         Inverted shapes have no points.
 
         Raises:
-            ValueError: it is none of these.
+            ValueError: the shape is of another kind.
         """
         if isinstance(geometry, Box):
             shape = _box(geometry, dimension)
@@ -113,21 +114,21 @@ class ContactShape:
             which, each = distances.argmin(axis=0), np.arange(len(points))
             return distances[which, each], directions[which, each]
 
-        made = tuple(box for part in parts for box in part.boxes)
-        corners = np.concatenate([box.corners() for box in made])
+        merged = tuple(box for part in parts for box in part.boxes)
+        corners = np.concatenate([box.corners() for box in merged])
         return cls(
             points=corners,
             radius=0.0,
             distance=nearest,
             size=max(part.size for part in parts),
-            boxes=made,
+            boxes=merged,
         )
 
     @cached_property
     def numbers(self) -> np.ndarray | None:
         """Numbers of a disc, capsule or box for `headers/planar_contacts.h`.
 
-        Shape (55,); None: it is another shape.
+        Shape (55,); None for other shapes.
         """
         if self.own is None or len(self.points) > len(ALONG):
             return None
@@ -142,10 +143,9 @@ class ContactShape:
     def nearest_on(self, edges: np.ndarray, margin: float) -> np.ndarray:
         """Return the point of each edge nearest to this shape, shape (n, 3).
 
-        Or deepest in it; only those that may be within a margin.
-
-        The distance to a convex shape has one minimum along a segment; near others it is the one
-        beside the nearest of nine points.
+        Or the deepest point in the shape. Edges that cannot be within the margin are omitted. The
+        distance to a convex shape has one minimum along a segment; for other shapes it is the
+        minimum beside the nearest of nine points.
 
         Args:
             edges: in the axes in which this shape is placed, shape (m, 2, 3) [m].
@@ -172,6 +172,10 @@ class ContactShape:
 
 
 def _box(shape: Box, dimension: int) -> ContactShape:
+    """Return a placed box as a shape.
+
+    In space its points are corners and points along the edges; in 2-D corners only.
+    """
     place = shape.placement
     lower, upper = (np.array([*corner, 0.0][:3]) for corner in (shape.lower, shape.upper))
     center, half = (
@@ -238,7 +242,10 @@ def _capsule(shape: Capsule) -> ContactShape:
 
 
 def _around(start: np.ndarray, end: np.ndarray, along: np.ndarray, radius: float) -> ContactShape:
-    """Return all points within a radius of a segment."""
+    """Return the shape of all points within a radius of a segment.
+
+    Points are along the segment, at shares `along` of its length.
+    """
     axis = (end - start)[0]
     square = float(axis @ axis)
     other = (
@@ -275,7 +282,11 @@ def _around(start: np.ndarray, end: np.ndarray, along: np.ndarray, radius: float
 
 
 def _polygon(shape: TriangleMesh) -> ContactShape:
-    """Return the cut of a mesh by z = 0, whose distance is that in the plane."""
+    """Return the cut of a mesh by z = 0 as a shape of the plane.
+
+    The distance is that to the nearest segment; it is negative where the outline winds around the
+    point.
+    """
     segments = mesh_outline(shape)
     if not len(segments):
         raise ValueError("the mesh does not meet the plane z = 0")
@@ -292,7 +303,7 @@ def _polygon(shape: TriangleMesh) -> ContactShape:
         ways = from_start - share[..., None] * way
         away = np.linalg.norm(ways, axis=2)
         each, nearest = np.arange(len(points)), away.argmin(axis=1)
-        a, b = from_start, from_start - way  # the outline winds around the points inside by 2 pi
+        a, b = from_start, from_start - way  # the outline winds around interior points by 2 pi
         turns = np.arctan2(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0], (a * b).sum(axis=2)).sum(
             axis=1
         )
@@ -316,6 +327,10 @@ def _polygon(shape: TriangleMesh) -> ContactShape:
 
 
 def _surface(shape: TriangleMesh) -> ContactShape:
+    """Return a placed mesh as a shape.
+
+    The gradient of the distance is by central differences.
+    """
     vertices, triangles = shape.placement.apply(shape.surface.vertices), shape.surface.triangles
     size = 0.5 * float(np.ptp(vertices, axis=0).max())
     step = DIFFERENCE * size
@@ -352,13 +367,16 @@ def _surface(shape: TriangleMesh) -> ContactShape:
 
 
 def _edges_of(triangles: np.ndarray) -> np.ndarray:
-    """Return the corners of the edges of triangles, once each, shape (m, 2)."""
+    """Return the corner pairs of the unique edges of triangles, shape (m, 2)."""
     sides = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
     return np.asarray(np.unique(np.sort(sides, axis=1), axis=0))
 
 
 def _spread(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Return at most `MOST_POINTS` points of a surface: the corners of its hull first, then others, and middles of long edges."""
+    """Return at most `MOST_POINTS` points of a surface.
+
+    The corners of its convex hull first, then other corners, and middles of long edges.
+    """
     hull = ConvexHull(vertices).vertices
     rest = np.setdiff1d(np.arange(len(vertices)), hull)
     points = np.concatenate([vertices[hull], vertices[rest]])

@@ -1,4 +1,4 @@
-"""Velocity-level contact impulses: which bodies touch, and their response."""
+"""Velocity-level contact impulses: detection, solve, supported bodies."""
 
 from __future__ import annotations
 
@@ -19,33 +19,34 @@ from warp_lcp.rigid.firm import SINGULAR, Firm
 from warp_lcp.rigid.joints import Joint, JointRows, joined_pairs
 from warp_lcp.rigid.planar_contacts import AHEAD, RATE, ROUGH, SLOP, PlanarContacts, PlanarImpulses
 
-# of the smallest body's size: gaps up to it are contacts, besides those that speeds may close in a
-# step
+# Relative to the smallest body's size: gaps up to this are contacts, besides those that velocities
+# may close in a step.
 NEAR = 1e-2
-START_OVERLAP = 1e-3  # of a body's size, with which it may start: files round their numbers
-# of gravity's speed in a step: slower impacts do not bounce, so that bodies come to rest
+START_OVERLAP = 1e-3  # relative to a body's size: overlap allowed at the start, due to rounding
+# Relative to the speed that gravity adds in a step: slower impacts do not bounce, so that bodies
+# come to rest.
 BOUNCE = 2.0
-# times gravity: what falls beside what rests is not faster, and more is another impact's
+# Relative to gravity: limit of the acceleration at a contact; more is due to another impact.
 FALL = 1.5
-# a stack then drifts by 1e-7 of its size in a second
+# A stack then drifts by 1e-7 of its size in a second.
 EXACT = StoppingCriteria(rtol=1e-7, max_iterations=600)
-UNSOLVED = 1e-5  # residual of sweeps from which on Newton's methods are worth their time
-TINY = 1e-6  # of a step: what is left of it after an impact at its end
-ALONG_SLIP = 1e-6  # of gravity's speed in a step: a slower slip has no direction
-SIDEWAYS = 1e-6  # of gravity, along a contact's plane
-# of the smallest body's size, and in rad: errors of joints at the end of a step that are none
+UNSOLVED = 1e-5  # residual of sweeps above which Newton's methods are used
+TINY = 1e-6  # relative to a step: least time after an impact
+ALONG_SLIP = 1e-6  # relative to the speed of gravity in a step: a slower slip has no direction
+SIDEWAYS = 1e-6  # relative to gravity, along a contact's plane
+# Relative to the smallest body's size, and in rad: tolerance of joint errors at the end of a step.
 JOINED = 1e-9
-ROUNDS = 8  # solves of a step, at most, until its joints are where they ought to be at its end
+ROUNDS = 8  # most solves of a step until its joints hold at its end
 
 
-# of a problem and the impulses to start from
+# Takes a problem and the initial impulses.
 ImpulseSolver = Callable[[ContactProblem, np.ndarray], ContactImpulses]
 
 
 def sweeps_and_newton(problem: ContactProblem, start: np.ndarray) -> ContactImpulses:
     """Solve by nonlinear conjugate gradients on sweeps, then by Newton's methods.
 
-    Newton's methods run only where sweeps do not reach the tolerance.
+    Newton's methods run only if sweeps do not reach the tolerance.
     """
     return problem.solve(EXACT, start, UNSOLVED)
 
@@ -54,20 +55,20 @@ class ContactSolve:
     """Contact detection and solve for impulses.
 
     Args:
-        detection: of the bodies.
-        solver: solves for the impulses of a step; overlaps, and what rests while others bounce,
-            have their own.
-        joints: between the bodies; the bodies of one do not collide, nor do those that fixed ones
-            make one piece of.
+        detection: detection of the bodies' contacts.
+        solver: solver for the impulses of a step; overlaps, and resting contacts during a bounce,
+            have solvers of their own.
+        joints: joints between the bodies; bodies of a joint do not collide, nor do bodies rigidly
+            connected by fixed joints.
 
     Attributes:
-        residual: of the last problem, relative to that of no impulses; 0 without contacts and
-            joints.
-        iterations: of the last step; 0 without contacts and joints.
+        residual: residual of the last problem, relative to that of no impulses; 0 without contacts
+            and joints.
+        iterations: iterations of the last step; 0 without contacts and joints.
         memory: impulses of the last step.
-        joint_rows: of the last step; None: there are no joints, or there was no step.
-        joint_impulses: of these rows [N s, N m s], shape (m,).
-        reach: of each body's points from its center of mass [m], shape (n,).
+        joint_rows: joint rows of the last step; None without joints, or before the first step.
+        joint_impulses: impulses of these rows [N s, N m s], shape (m,).
+        reach: largest distance of each body's points from its center of mass [m], shape (n,).
     """
 
     def __init__(
@@ -101,33 +102,39 @@ class ContactSolve:
         self._near = NEAR * float(self._size.min(initial=np.inf))
         self._friction = np.array([body.friction for body in bodies])
         self._bounce = np.array([body.restitution for body in bodies])
-        # and the rotations that they are of
+        # The roots, and the rotations that they belong to.
         self._found_roots: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
-        # contacts, roots and problem of `push_apart`
+        # Contacts, roots and problem of `push_apart`.
         self._last: tuple[Contacts, np.ndarray, ContactProblem] | None = None
-        self._pushed: PlanarImpulses | None = None  # by the last `push_apart`
+        self._pushed: PlanarImpulses | None = None  # result of the last `push_apart`
         self._planar = (
             PlanarContacts(detection, self.reach) if PlanarContacts.holds(detection) else None
         )
         self._roots_of_inertias = np.linalg.cholesky(bodies.inverse_inertia)
 
     def check_start(self, time: float) -> None:
-        """Refuse bodies that overlap at the start.
+        """Raise an error if bodies overlap at the start.
 
         Raises:
-            ValueError: which, and with what.
+            ValueError: names the bodies that overlap.
         """
         nothing = np.zeros(len(self.bodies))
-        found = self._apart(
+        contacts = self._apart(
             self.detection.find(time, nothing, np.zeros(len(self.detection.obstacles)))
         )
-        overlapping = -found.points.gap > START_OVERLAP * self._size[found.first]
+        overlapping = -contacts.points.gap > START_OVERLAP * self._size[contacts.first]
         if not overlapping.any():
             return
         k = int(overlapping.argmax())
-        number, other, which = int(found.first[k]), int(found.second[k]), int(found.obstacle[k])
-        of_pair = (found.first == number) & (found.second == other) & (found.obstacle == which)
-        name, deep = self.bodies[number].name, -float(found.points.gap[of_pair].min())
+        number, other, which = (
+            int(contacts.first[k]),
+            int(contacts.second[k]),
+            int(contacts.obstacle[k]),
+        )
+        of_pair = (
+            (contacts.first == number) & (contacts.second == other) & (contacts.obstacle == which)
+        )
+        name, deep = self.bodies[number].name, -float(contacts.points.gap[of_pair].min())
         if which != NONE:
             raise ValueError(
                 f"{name} reaches {deep:.3g} m into {self.detection.obstacles[which].name} at the "
@@ -144,10 +151,10 @@ class ContactSolve:
         """Return current contacts and those possible within the step.
 
         Args:
-            time: of the state [s].
+            time: time of the state [s].
             dt: time step [s].
             gravity: [m/s^2], shape (3,); the bodies' velocities are those before it acts.
-            gone: bodies that touch nothing, shape (n,); None: there are none.
+            gone: removed bodies, which have no contacts, shape (n,); None without any.
         """
         falls, near = math.sqrt(gravity @ gravity) * dt, self._near
         brought = [
@@ -160,27 +167,27 @@ class ContactSolve:
             planar is not None
             and (touching := planar.find(time, dt, falls, near, brought)) is not None
         ):
-            found, contacts = touching
+            detected, contacts = touching
             return (
                 contacts
                 if planar.still and not self._joined
-                else self.assembled(self._apart(found), time, dt, gravity)
+                else self.assembled(self._apart(detected), time, dt, gravity)
             )
         six = self.bodies.velocities()
         speeds, spins = lengths(six[:, :3]), lengths(six[:, 3:])
         ways = AHEAD * dt * (speeds + spins * self.reach + falls)
-        found = self._apart(self.detection.find(time, ways, near + np.array(brought), near))
+        detected = self._apart(self.detection.find(time, ways, near + np.array(brought), near))
         if gone is not None and not everywhere:
             out = np.append(gone, False)
-            found = found.where(~(out[found.first] | out[found.second]))
-        return self.assembled(found, time, dt, gravity)
+            detected = detected.where(~(out[detected.first] | out[detected.second]))
+        return self.assembled(detected, time, dt, gravity)
 
     def approach(self, contacts: Contacts) -> np.ndarray:
         """Return normal velocities at contacts [m/s], shape (k,), for `bounce`.
 
-        Negative: approaching; 0 where nothing bounces.
+        Negative: approaching; 0 if nothing bounces.
         """
-        bounces = contacts.restitution.any()  # else `bounce` does nothing
+        bounces = contacts.restitution.any()  # otherwise `bounce` does nothing
         return contacts.velocities(self._velocities())[:, 0] if bounces else np.zeros(len(contacts))
 
     def bounce(
@@ -193,18 +200,18 @@ class ContactSolve:
     ) -> np.ndarray:
         """Set the rebound velocity and time of impacts (updates the contacts).
 
-        The bodies' velocities are those after gravity has acted on them for `kick_dt`, which are of
-        the middle of the step. A gap closes by v t + a t^2 / 2 with v at the step's beginning;
-        where it is 0, at t = `when`, the speed v_i = v + a t becomes -e v_i. At the end of the step
-        it is -e v_i + a (dt - t), so in the middle of a step without an impact -e v_i + a (dt / 2 -
-        t): the target. Bodies have gone by then as before the impact until t, and as after it
+        The bodies' velocities are those after gravity has acted on them for `kick_dt`, in the
+        middle of the step. A gap closes by v t + a t^2 / 2 with v at the step's beginning. Where it
+        is 0, at t = `when`, the speed v_i = v + a t becomes -e v_i. At the end of the step it is -e
+        v_i + a (dt - t), so the target in the middle of a step without an impact is -e v_i + a (dt
+        / 2 - t). The positions still have the motion before the impact until t, and that after it
         later, see `detour`.
 
         Args:
-            contacts: those of the step.
+            contacts: the contacts of the step.
             approach: normal velocities before gravity acted [m/s], shape (k,).
             dt: time step [s].
-            kick_dt: how long gravity has acted [s].
+            kick_dt: time that gravity has acted [s].
             gravity: [m/s^2], shape (3,).
 
         Returns:
@@ -224,19 +231,19 @@ class ContactSolve:
         b = contacts.velocities(self._velocities())
         free = b[:, 0].copy()
         b[:, 0] -= contacts.target
-        problem, others, V = (
+        problem, resting, V = (
             self._problem(contacts, b, contacts.friction),
             np.flatnonzero(~may),
             self._velocities(),
         )
-        if len(others):  # what rests on them does not fall
-            before[others] = problem.part(others).solve(EXACT).impulses
+        if len(resting):  # supported bodies do not fall
+            before[resting] = problem.part(resting).solve(EXACT).impulses
             V = V + self._answer(contacts.on_bodies(before, len(self.bodies)))
             free = contacts.velocities(V)[:, 0]
         a = np.clip((free - approach) / kick_dt, -FALL * g, FALL * g)
         v = approach + a * (kick_dt - 0.5 * dt)
         gap = np.maximum(gap, 0.0)
-        with np.errstate(divide="ignore", invalid="ignore"):  # of those that do not meet
+        with np.errstate(divide="ignore", invalid="ignore"):  # for contacts that do not meet
             t = 2.0 * gap / (np.sqrt(np.maximum(v**2 - 2.0 * a * gap, 0.0)) - v)
         met = may & (t >= 0.0) & (t <= dt)
         t = np.where(met, t, 0.0)
@@ -244,29 +251,31 @@ class ContactSolve:
             self._meet(contacts, k, float(t[k]), V)
         free[met] = contacts.velocities(V)[met, 0]
         after, rest = -e * (free + a * (t - 0.5 * dt)), dt - t
-        # and apart at the end of the step: smaller bounces are none
+        # Smaller bounces, not apart at the end of the step, are ignored.
         met &= (after > 0.0) & (after + 0.5 * a * rest >= 0.0)
         contacts.target[met] = (after + a * (0.5 * dt - t))[met]
         order, starts = problem.islands()
-        for begin, end in pairwise(starts):  # what bears an impact does so when it happens
+        # Contacts of an island with an impact act at its time.
+        for begin, end in pairwise(starts):
             mine = order[begin:end]
             if met[mine].any():
                 contacts.when[mine] = np.where(met[mine], t[mine], t[mine][met[mine]].mean())
-        # what an impact elsewhere moves: gaps close from then on
+        # Contacts moved by an impact elsewhere: gaps close from that time on.
         along = ~met & (contacts.when > 0.0)
         left = np.maximum(contacts.gap + contacts.when * free, 0.0)[along] / np.maximum(
             dt - contacts.when[along], TINY * dt
         )
-        # and what parts before does not part less after, or r (u before + u after) / 2 would be
-        # energy gained
+        # Contacts that separate before must not separate less after, or r (u before + u after) / 2
+        # would add energy.
         contacts.target[along] = np.where(free[along] > 0.0, np.minimum(-left, -free[along]), -left)
         return before
 
     def _meet(self, contacts: Contacts, k: int, t: float, V: np.ndarray) -> None:
-        """Let contact k of two bodies act where they meet at time t of the step, at velocities V, shape (n, q) (updates its rows).
+        """Move contact k of two bodies to their positions at time t of the step.
 
-        Both get the impulse at one point, so that angular momentum is kept: points of either that
-        meet then are apart now.
+        V are the velocities, shape (n, q); the rows of the contact are updated. Both bodies get the
+        impulse at one point, so that angular momentum is conserved: the points of the bodies that
+        meet at t are still apart.
         """
         pair = [int(contacts.first[k]), int(contacts.second[k])]
         bodies, shapes = (
@@ -299,17 +308,15 @@ class ContactSolve:
     ) -> np.ndarray | None:
         """Return displacement errors of bodies due to impacts within the step.
 
-        The difference to where velocities after impacts would move them (m, rad), shape (n, q);
-        None: zero.
-
-        An impact at time t of the step has changed velocities by M^-1 J' r, and bodies have gone
-        without it until then. With the target of `bounce` that is exact for what flies along
-        parabolas before and after.
+        The difference to the motion with the velocities after impacts (m, rad), shape (n, q); None
+        for zero. An impact at time t of the step has changed velocities by M^-1 J' r, and bodies
+        have moved without it until then. With the target of `bounce` this is exact for parabolas
+        before and after.
 
         Args:
-            contacts: those of the step.
+            contacts: the contacts of the step.
             before: impulses without the impacts, see `bounce` [N s], shape (k, dimension).
-            impulses: with them.
+            impulses: impulses with the impacts.
         """
         if not contacts.when.any():
             return None
@@ -331,9 +338,9 @@ class ContactSolve:
 
         Args:
             contacts: the contacts.
-            start: impulses to start from; those of the last step if None.
-            dt: time step [s], at whose end joints are to hold; they need it.
-            kick_dt: how long torques of motors have acted [s].
+            start: initial impulses; those of the last step if None.
+            dt: time step [s], at whose end joints must hold; required with joints.
+            kick_dt: time that torques of motors have acted [s].
         """
         self.residual, self.iterations = 0.0, 0
         if not len(contacts) and not self.joints:
@@ -366,12 +373,13 @@ class ContactSolve:
         dt: float,
         kick_dt: float,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the impulses of contacts, and what these and those of joints add up to at each body, shape (n, q).
+        """Return the impulses of contacts, and the total impulses on each body.
 
-        Impulses of joints act along the rows J of the step's beginning, and are such that errors e
-        are 0 at its end (the SHAKE method: second order, energy does not drift). e is not linear in
-        velocities: the problem is solved again with c = e / dt - J v' of the v' that it gave, where
-        y = J v' + c; limits likewise with what is left up to them.
+        The totals include those of joints, shape (n, q). Impulses of joints act along the rows J of
+        the step's beginning, such that errors e are 0 at its end (the SHAKE method: second order,
+        energy does not drift). e is not linear in velocities: the problem is solved again with c =
+        e / dt - J v' for the last v', where y = J v' + c. Limits are treated likewise with the
+        distance to them.
         """
         n, q = len(self.bodies), self._roots().shape[1]
         rows = JointRows.joined(
@@ -381,10 +389,10 @@ class ContactSolve:
         bias, free = rows.bias(dt), J @ V.ravel()
         x = np.concatenate([start.ravel(), self.joint_impulses])
         for _ in range(ROUNDS):
-            found = self._solver(
+            result = self._solver(
                 replace(problem, joints=JointPart(self._weighted(rows), free + bias)), x
             )
-            x = found.impulses
+            x = result.impulses
             impulses, held = x[: start.size].reshape(start.shape), x[start.size :]
             pushes = contacts.on_bodies(impulses, n) + (J.T @ held).reshape(n, q)
             after = (
@@ -394,7 +402,7 @@ class ContactSolve:
             after[motors] = bias[motors]
             off = dt * float(np.abs(after - bias).max())
             bias = after
-            self.residual, self.iterations = found.residual, self.iterations + found.iterations
+            self.residual, self.iterations = result.residual, self.iterations + result.iterations
             if off <= JOINED * min(1.0, float(self._size.min())):
                 break
         self.joint_rows, self.joint_impulses = rows, held
@@ -405,7 +413,7 @@ class ContactSolve:
 
         0 before the first step.
         """
-        found, rows = dict.fromkeys(range(len(self.joints)), 0.0), self.joint_rows
+        torques, rows = dict.fromkeys(range(len(self.joints)), 0.0), self.joint_rows
         if rows is not None:
             owners = np.repeat(
                 np.arange(len(self.joints)),
@@ -413,20 +421,20 @@ class ContactSolve:
             )
             for row in np.flatnonzero(rows.motors).tolist():
                 joint = int(owners[row])
-                found[joint] = self.joints[joint].motor_torque * float(
+                torques[joint] = self.joints[joint].motor_torque * float(
                     self.joint_impulses[row] / rows.upper[row]
                 )
-        return found
+        return torques
 
     def _moved(self, pushes: np.ndarray, dt: float) -> BodyStates:
-        """Return the bodies where impulses, shape (n, q), let them be after dt [s]."""
+        """Return the bodies after impulses, shape (n, q), and a motion of dt [s]."""
         moved = self.bodies.copied()
         moved.push(pushes)
         moved.advance(dt)
         return moved
 
     def remember(self, contacts: Contacts, impulses: np.ndarray) -> None:
-        """Keep impulses, shape (k, dimension), to start the next step from."""
+        """Store impulses, shape (k, dimension), as the start of the next step."""
         if self._pushed is not None and self._pushed.impulses is impulses:
             self.memory.take(self._pushed.memory)
         else:
@@ -437,15 +445,14 @@ class ContactSolve:
     ) -> np.ndarray | None:
         """Return the smallest displacements that reduce overlaps at the end of a step.
 
-        (m, rad), in the metric of the bodies' masses.
-
-        They give no velocity, so no energy of motion; a frictionless problem like that of the
-        impulses. Shape (n, q); None: no ways.
+        (m, rad), in the metric of the bodies' masses. They add no velocity, and thus no kinetic
+        energy. The problem is frictionless, and otherwise that of the impulses. Shape (n, q); None
+        for no displacements.
 
         Args:
-            contacts: those of the step.
+            contacts: the contacts of the step.
             dt: time step [s].
-            detour: of the bodies in the step.
+            detour: displacement errors of the bodies in the step, see `detour`.
         """
         pushed, bodies = self._pushed, self.bodies
         if not len(contacts):
@@ -456,7 +463,7 @@ class ContactSolve:
             and pushed.dt == dt
             and detour is None
         ):
-            if np.array_equal(pushed.values, bodies.values):  # nothing has pushed them since
+            if np.array_equal(pushed.values, bodies.values):  # no impulse since `push_apart`
                 return pushed.ways
         velocities = self._velocities() if detour is None else self._velocities() + detour / dt
         gap = contacts.gap + dt * contacts.velocities(velocities)[:, 0]
@@ -470,7 +477,10 @@ class ContactSolve:
         return self._answer(contacts.on_bodies(problem.solve(ROUGH).impulses, len(self.bodies)))
 
     def _joined_separation(self, contacts: Contacts, b: np.ndarray, dt: float) -> np.ndarray:
-        """Return the ways of `separation` that leave joints together, of gaps b to reach [m], shape (k,)."""
+        """Return the displacements of `separation` that keep joints together.
+
+        `b` are the gaps to reach [m], shape (k,).
+        """
         moved = self._moved(np.zeros_like(self._velocities()), dt)
         rows = JointRows.joined([joint.rows(moved, dt, self.dimension) for joint in self.joints])
         rows = rows.where(rows.equations)
@@ -486,10 +496,8 @@ class ContactSolve:
     def hold(self, contacts: Contacts, impulses: np.ndarray) -> None:
         """Let contacts with walls and solids absorb impulses into them.
 
-        For each body by itself.
-
-        A body that is held holds what bears against it where it cannot move itself: a stack on the
-        floor is held up to its top.
+        Each body is treated separately. A supported body supports the bodies in contact with it
+        along directions in which it cannot move: a stack on the floor is supported up to its top.
         """
         pushed = self._pushed
         if pushed is not None and pushed.impulses is impulses and pushed.squares is not None:
@@ -505,7 +513,7 @@ class ContactSolve:
                 number = waiting.pop(0)
                 body, G = self.bodies[number], roots[number]
                 squares, V = np.linalg.eigh(firm.square(contacts, number, G))
-                # what contacts take, in the metric of the mass
+                # Directions that contacts support, in the metric of the mass.
                 V = V[:, squares > SINGULAR * squares.max()]
                 body.hold = np.eye(len(G)) - np.linalg.inv(G).T @ V @ V.T @ G.T
                 reached = firm.spread(contacts, number, G, G - G @ V @ V.T)
@@ -516,7 +524,10 @@ class ContactSolve:
                 ]
 
     def _problem_of_step(self, contacts: Contacts, b: np.ndarray) -> ContactProblem:
-        """Return the problem of the contacts of a step, which is solved twice: before and after the material's impulses."""
+        """Return the problem of the contacts of a step.
+
+        It is solved twice: before and after the material's impulses.
+        """
         roots = self._roots()
         if self._last is None or self._last[0] is not contacts or self._last[1] is not roots:
             self._last = contacts, roots, self._problem(contacts, b, contacts.friction)
@@ -524,7 +535,10 @@ class ContactSolve:
         return self._last[2].at(b)
 
     def _problem(self, contacts: Contacts, b: np.ndarray, friction: np.ndarray) -> ContactProblem:
-        """Return the problem of the first rows of each contact, as many as b has, shape (k, rows)."""
+        """Return the problem of the first rows of each contact.
+
+        As many rows as b has, shape (k, rows).
+        """
         one, other = (rows[:, : b.shape[1]] for rows in (contacts.one, contacts.other))
         first, second = contacts.first, contacts.second
         roots = self._all_roots()[1]
@@ -533,14 +547,14 @@ class ContactSolve:
         )
 
     def _weighted(self, rows: JointRows) -> JointRows:
-        """Return joints' rows as those of a problem."""
+        """Return joints' rows times the roots of the inverse masses."""
         roots = self._all_roots()[1]
         return replace(
             rows, one=rows.one @ roots[rows.first], other=rows.other @ roots[rows.second]
         )
 
     def _apart(self, found: FoundContacts) -> FoundContacts:
-        """Return the contacts of pairs that no joint holds together."""
+        """Return the contacts of pairs that are not connected by joints."""
         return found.without(self._joined)
 
     def assembled(
@@ -548,7 +562,7 @@ class ContactSolve:
     ) -> Contacts:
         """Return the contacts with their rows.
 
-        Tangents are along the slip, or along gravity if that is given.
+        Tangents are along the slip, or along gravity if it is given.
         """
         falls, n, dim = (
             0.0 if gravity is None else float(np.linalg.norm(gravity)) * dt,
@@ -562,15 +576,15 @@ class ContactSolve:
             if obstacle.motion is not None and (here := found.obstacle == number).any():
                 moved[here] = _carried(obstacle.motion, point[here], time, dt)
         at = np.concatenate([self.bodies.position, np.zeros((1, 3))])
-        mine, others = point - at[first], point - at[second]
+        mine, second_arms = point - at[first], point - at[second]
         ways: tuple[tuple[np.ndarray, float], ...] = ()
-        if gravity is not None and dim == 3:  # there is one tangent in a plane
+        if gravity is not None and dim == 3:  # in a plane there is one tangent
             six = np.concatenate([self.bodies.velocities(), np.zeros((1, 6))])
             slip = (
                 six[first, :3]
                 + cross(six[first, 3:], mine)
                 - six[second, :3]
-                - cross(six[second, 3:], others)
+                - cross(six[second, 3:], second_arms)
                 - moved
             )
             ways = (
@@ -578,7 +592,7 @@ class ContactSolve:
                 (slip, ALONG_SLIP * falls),
             )
         frames = contact_frames(normal, dim, ways)
-        one, other = _rows(mine, frames, dim), -_rows(others, frames, dim)
+        one, other = _rows(mine, frames, dim), -_rows(second_arms, frames, dim)
         standing = second == n
         other[standing] = 0.0
         wall = -(frames @ moved[:, :, None])[:, :, 0]
@@ -606,13 +620,13 @@ class ContactSolve:
         )
 
     def _obstacle_way(self, motion: Motion | None, time: float, dt: float) -> float:
-        """Return how far points near the bodies go with an obstacle in a step [m]."""
+        """Return the displacement of an obstacle near the bodies in a step [m]."""
         if motion is None:
             return 0.0
         return dt * float(lengths(_carried(motion, self.bodies.position, time, dt)).max())
 
     def _answer(self, pushes: np.ndarray) -> np.ndarray:
-        """Return M^-1 times what acts on the bodies, shape (n, q) both."""
+        """Return M^-1 times impulses, shape (n, q) both."""
         roots = self._roots()
         return np.asarray((roots @ (roots.swapaxes(1, 2) @ pushes[:, :, None]))[:, :, 0])
 
@@ -621,7 +635,10 @@ class ContactSolve:
         return self._all_roots()[0]
 
     def _all_roots(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return `_roots`, and these with 0 in the place of what is no body, shape (n + 1, q, q)."""
+        """Return `_roots`, and the same with a zero matrix for obstacles.
+
+        Shape (n + 1, q, q).
+        """
         rotation = self.bodies.rotation
         if self._found_roots is None or not np.array_equal(self._found_roots[0], rotation):
             roots = np.zeros((len(self.bodies), 6, 6))
@@ -641,12 +658,18 @@ class ContactSolve:
 
 
 def _rows(arms: np.ndarray, frames: np.ndarray, dimension: int) -> np.ndarray:
-    """Return the velocities along frames of points `arms` from a body's center, of its velocities, shape (k, dimension, q)."""
+    """Return rows that map a body's velocities to those of points along frames.
+
+    `arms` lead from the body's center to the points; shape (k, dimension, q).
+    """
     both = np.concatenate([frames, cross(arms[:, None], frames)], axis=2)
     return both if dimension == 3 else both[:, :, PLANAR]
 
 
 def _carried(motion: Motion, points: np.ndarray, time: float, dt: float) -> np.ndarray:
-    """Return the mean velocities of points that a solid takes along in a step [m/s], shape (k, 3)."""
+    """Return the mean velocities of points fixed to a solid in a step.
+
+    [m/s], shape (k, 3).
+    """
     way = motion.pose(time + dt).after(motion.pose(time).inverse())
     return np.asarray((way.apply(points) - points) / dt)

@@ -10,9 +10,9 @@ from scipy.sparse import bsr_array, csr_array
 
 from warp_lcp.rigid.body import BodyStates, cross, lengths
 
-# of a body's size: a contact this close to one of the last step starts from its impulse
+# Relative to a body's size: a contact this close to one of the last step starts from its impulse.
 SAME_PLACE = 0.05
-KEPT = 32  # contacts remembered for each body, at most
+KEPT = 32  # most contacts remembered for each body
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,20 +23,20 @@ class Contacts:
 
     Args:
         first: body that the normal points into, shape (k,).
-        second: body that it comes from, the number of bodies where that is none, shape (k,).
-        point: in the world [m], shape (k, 3).
+        second: body that the normal comes from, the number of bodies for an obstacle, shape (k,).
+        point: points in the world [m], shape (k, 3).
         frames: normal and tangents, shape (k, dimension, 3).
         gap: [m], shape (k,).
-        size: of the smaller body [m], shape (k,).
+        size: size of the smaller body [m], shape (k,).
         friction: Coulomb's coefficient, shape (k,).
-        one: relative velocities of the first body's velocities, shape (k, dimension, q).
-        other: of the second's, 0 where that is none.
+        one: rows for the velocities of the first body, shape (k, dimension, q).
+        other: rows for the second body, 0 for an obstacle.
         wall: velocity of moving obstacles [m/s], shape (k, dimension).
         target: smallest allowed normal velocity [m/s], which closes the gap or rebounds, shape
             (k,).
-        restitution: the part of the speed of an impact that comes back, shape (k,).
-        when: time from the step's beginning to the impact that bounces, there or elsewhere among
-            bodies that touch [s], shape (k,); 0: none does.
+        restitution: ratio of the speeds after and before an impact, shape (k,).
+        when: time from the step's beginning to the impact that bounces, at this contact or
+            elsewhere among connected bodies [s], shape (k,); 0 without an impact.
     """
 
     first: np.ndarray
@@ -88,8 +88,8 @@ class ContactMemory:
     """Impulses of the last step's contacts, to start the next solve from.
 
     Attributes:
-        values: first and second body, place in the first body's own axes [m], impulse in the
-            world's [N s]; shape (k, 8).
+        values: first and second body, position in the first body's axes [m], impulse in the world's
+            axes [N s]; shape (k, 8).
     """
 
     def __init__(self, bodies: int) -> None:
@@ -100,25 +100,25 @@ class ContactMemory:
         return np.concatenate([self.values, np.full((self._most - len(self.values), 8), -1.0)])
 
     def restore(self, state: np.ndarray) -> None:
-        """Restore `state`; empty: no memory."""
+        """Restore `state`; an empty array clears the memory."""
         values = np.array(state, dtype=np.float64).reshape(-1, 8)
         self.values = values[values[:, 0] >= 0.0]
 
     def keep(self, contacts: Contacts, impulses: np.ndarray, bodies: BodyStates) -> None:
-        """Remember impulses, shape (k, dimension)."""
+        """Store impulses, shape (k, dimension)."""
         world = (impulses[:, None] @ contacts.frames)[:, 0]
         self.take(
             np.column_stack([contacts.first, contacts.second, _places(contacts, bodies), world])
         )
 
     def take(self, values: np.ndarray) -> None:
-        """Take values, shape (k, 8), as many as are kept."""
+        """Store values, shape (k, 8), up to the capacity."""
         self.values = values[: self._most]
 
     def recall(self, contacts: Contacts, bodies: BodyStates) -> np.ndarray:
-        """Return impulses to start from, shape (k, dimension).
+        """Return initial impulses, shape (k, dimension).
 
-        Those of the nearest contact of the same pair, each used once.
+        They are those of the nearest stored contact of the same pair, each used once.
         """
         start, old = np.zeros(contacts.wall.shape), self.values
         if not len(old) or not len(contacts):
@@ -130,7 +130,7 @@ class ContactMemory:
         )
         order = np.argsort(before, kind="stable")
         low, high = (np.searchsorted(before[order], keys, side=side) for side in ("left", "right"))
-        # each contact beside each old one of the same two
+        # All pairs of a new and an old contact of the same two bodies.
         fresh = np.repeat(np.arange(len(keys)), high - low)
         known = order[np.arange(len(fresh)) - np.repeat(np.cumsum(high - low) - high, high - low)]
         way = lengths(places[fresh] - old[known, 2:5])
@@ -144,13 +144,16 @@ class ContactMemory:
 
 
 def _least(group: np.ndarray, other: np.ndarray, way: np.ndarray) -> np.ndarray:
-    """Return the entry of each group with the shortest way, of those alike the one with the least `other`."""
+    """Return the entry of each group with the shortest distance.
+
+    Of equal ones, the one with the least `other`.
+    """
     order = np.lexsort((other, way, group))
     return order[np.diff(group[order], prepend=-1) > 0]
 
 
 def _places(contacts: Contacts, bodies: BodyStates) -> np.ndarray:
-    """Return contacts in the axes of their first bodies [m], shape (k, 3)."""
+    """Return contact points in the axes of their first bodies [m], shape (k, 3)."""
     arms = contacts.point - bodies.position[contacts.first]
     return np.asarray((arms[:, None] @ bodies.rotation[contacts.first])[:, 0])
 
@@ -161,11 +164,11 @@ def jacobian(
     """Return the Jacobian J of pairs, shape (k rows, q bodies).
 
     Args:
-        first: of each pair, shape (k,).
-        second: the other one, `bodies` where it is none.
+        first: first body of each pair, shape (k,).
+        second: the other body, `bodies` for an obstacle.
         one: rows for the first body, shape (k, rows, q).
-        other: for the second.
-        bodies: their number.
+        other: rows for the second body.
+        bodies: number of bodies.
     """
     k, rows, q = one.shape
     blocks, places = (
@@ -184,10 +187,8 @@ def contact_frames(
 ) -> np.ndarray:
     """Return normal and tangents of contacts, shape (k, dimension, 3).
 
-    Right-handed in space.
-
-    There the first tangent is along the last of some ways that is longer than its least: boxes of
-    friction then are as wide as the cone where it counts.
+    Right-handed in space. There the first tangent is along the last of `ways` that is longer than
+    its least length: the friction box is then as wide as the cone in that direction.
     """
     if dimension == 2:
         return np.stack(

@@ -1,4 +1,4 @@
-"""Which contacts stand firm, so that bodies on them are held: walls, and bodies that are held themselves."""
+"""Contacts that support bodies: with walls, and with supported bodies."""
 
 from __future__ import annotations
 
@@ -8,20 +8,22 @@ import numpy as np
 
 from warp_lcp.rigid.contacts import Contacts
 
-BEARS = 1e-6  # of the largest impulse of a body: contacts with less do not hold it
-STILL = 1e-6  # of how a free body yields: what yields less does not
-SINGULAR = 1e-9  # of the largest: what several contacts say of the same direction
+BEARS = 1e-6  # relative to the largest impulse of a body: smaller ones do not support it
+STILL = 1e-6  # relative to a free body's response: smaller responses count as none
+SINGULAR = 1e-9  # relative to the largest singular value: redundant contacts
 
 
 @dataclass(frozen=True, eq=False)
 class Firm:
-    """Rows of contacts, shape (k, dimension) each.
+    """Contact rows that support a body: which rows support which body.
+
+    Masks of contact rows, shape (k, dimension) each.
 
     Args:
-        held: that bear; along tangents: that do not slip.
-        first: of those, whose other side does not move, so that they hold their first body.
-        second: that hold their second one.
-        bodies: their number.
+        held: rows with a load; along tangents, rows that do not slip.
+        first: rows whose second side does not move, so that they support their first body.
+        second: rows that support their second body.
+        bodies: number of bodies.
     """
 
     held: np.ndarray
@@ -31,7 +33,7 @@ class Firm:
 
     @classmethod
     def of(cls, contacts: Contacts, impulses: np.ndarray, bodies: int) -> Firm:
-        """Return what walls and other solids hold, by impulses of shape (k, dimension)."""
+        """Return the supports by walls and solids, from impulses (k, dimension)."""
         normal = impulses[:, 0]
         largest = np.zeros(bodies + 1)
         np.maximum.at(largest, contacts.first, normal)
@@ -43,7 +45,10 @@ class Firm:
         return cls(held, held & (contacts.second == bodies)[:, None], np.zeros_like(held), bodies)
 
     def square(self, contacts: Contacts, number: int, root: np.ndarray) -> np.ndarray:
-        """Return G' J' J G of the rows J that hold a body, shape (q, q); G: `root` of its inverse mass, shape (q, q)."""
+        """Return G' J' J G of the rows J that support a body, shape (q, q).
+
+        G is `root`, the root of its inverse mass, shape (q, q).
+        """
         one, other = contacts.first == number, contacts.second == number
         J = (
             np.concatenate(
@@ -56,13 +61,13 @@ class Firm:
     def spread(
         self, contacts: Contacts, number: int, free: np.ndarray, left: np.ndarray
     ) -> list[int]:
-        """Let a body that is held hold others; return which.
+        """Let a supported body support others; return their numbers.
 
         Args:
             contacts: the contacts.
-            number: of the body.
+            number: number of the body.
             free: root of its inverse mass, shape (q, q).
-            left: of what is left of that.
+            left: root of the inverse mass that remains with supports, shape (q, q).
         """
         reached: list[int] = []
         sides = (

@@ -14,7 +14,7 @@ from warp_lcp.rigid.body import PLANAR, RigidBody
 from warp_lcp.rigid.contacts import contact_frames, jacobian
 
 JointKind = Literal["ball", "hinge", "fixed"]
-WORLD = -1  # in the place of a body: the joint is fixed in space
+WORLD = -1  # body number of space, for joints fixed in space
 MOST_ANGLE = np.pi  # [rad]: angles are known up to a whole turn
 
 
@@ -24,15 +24,15 @@ class Joint:
 
     A ball joint allows rotation about the point, a hinge about an axis, a fixed joint none. A
     hinge's angle is that of `first` relative to `second`, 0 in the initial pose. In the plane the
-    axis is z, and a hinge takes the place of a ball joint.
+    axis is z, and a hinge is used as a ball joint.
 
     Args:
         first: a body.
-        second: another one, or WORLD.
-        anchor: the point as the scene places it [m], shape (3,).
-        axis: of a hinge, of any length, shape (3,).
-        limits: of a hinge, least and largest angle [rad]; infinite for none, else within half a
-            turn.
+        second: another body, or WORLD.
+        anchor: the point as placed in the scene [m], shape (3,).
+        axis: axis of a hinge, of any length, shape (3,).
+        limits: least and largest angle of a hinge [rad]; infinite without limits, else within half
+            a turn.
         motor_speed: target angular velocity of a hinge's motor [rad/s].
         motor_torque: largest torque of the motor [N m]; 0: no motor.
         kind: "ball", "hinge" or "fixed".
@@ -52,7 +52,7 @@ class Joint:
     kind: JointKind = "hinge"
 
     def __post_init__(self) -> None:
-        """Check, and give the axis unit length."""
+        """Check the values, and normalize the axis."""
         if self.first == self.second or self.first < 0:
             raise ValueError(
                 f"first = {self.first}, second = {self.second}: must be two bodies, or a body and "
@@ -100,7 +100,7 @@ class Joint:
     def side(
         self, bodies: Sequence[RigidBody], number: int
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the joint on a body or WORLD: arm [m], anchor [m] and rotation."""
+        """Return arm [m], anchor [m] and rotation of the joint on a body or WORLD."""
         if number == WORLD:
             return self.anchor, self.anchor, np.eye(3)
         body = bodies[number]
@@ -108,12 +108,12 @@ class Joint:
         return arm, body.position + arm, body.rotation
 
     def angle(self, bodies: Sequence[RigidBody]) -> float:
-        """Return the angle of the first body relative to the second [rad], (-pi, pi].
+        """Return the hinge angle of the first body relative to the second [rad].
 
-        About the axis of the hinge.
+        In (-pi, pi], about the axis of the hinge.
         """
         R, S = (self.side(bodies, number)[2] for number in (self.first, self.second))
-        # a direction across the axis that is the same for both at angle 0
+        # A direction perpendicular to the axis, equal for both bodies at angle 0.
         zero = contact_frames(np.asarray(self.axis)[None], 3)[0, 1]
         mine, other = R @ zero, S @ zero
         return float(np.arctan2(np.cross(other, mine) @ (R @ self.axis), other @ mine))
@@ -133,14 +133,14 @@ class Joint:
         Errors of equations, distances to limits, 0 for a motor.
 
         Args:
-            bodies: all, as they are.
-            held: directions of `held` that stay, from when the rows were made.
+            bodies: all bodies in their current state.
+            held: directions of `held`, from when the rows were built.
             dimension: 2 or 3.
         """
         (_, anchor, R), (_, other_anchor, S) = (
             self.side(bodies, number) for number in (self.first, self.second)
         )
-        if self.kind == "fixed":  # R S' = 1 + [e]x for a small relative turn e
+        if self.kind == "fixed":  # R S' = 1 + [e]x for a small relative rotation e
             T = R @ S.T
             turned = held @ (
                 0.5 * np.array([T[2, 1] - T[1, 2], T[0, 2] - T[2, 0], T[1, 0] - T[0, 1]])
@@ -165,15 +165,16 @@ class Joint:
     def rows(self, bodies: Sequence[RigidBody], dt: float, dimension: int = 3) -> JointRows:
         """Return the rows for the impulses over a time [s].
 
-        y = J v' + c: the anchors' relative velocity and the angular velocity about `held` directions are equations (y = 0, x free); the
-        angle's rate plus its distance to a limit over the step is >= 0 where x > 0; the motor's y is the rate less the wanted one,
-        |x| <= torque dt.
+        With y = J v' + c: the anchors' relative velocity and the angular velocity about `held`
+        directions are equations (y = 0, x free). For a limit, the angle's rate plus its distance to
+        the limit over the step is >= 0, complementary to x >= 0. For a motor, y is the rate less
+        the target rate, with |x| <= torque dt.
         """
         (arm, anchor, R), (other_arm, other_anchor, _) = (
             self.side(bodies, number) for number in (self.first, self.second)
         )
         apart, held, axis = anchor - other_anchor, self.held(bodies, dimension), R @ self.axis
-        # one point for both impulses: they keep the angular momentum
+        # Both impulses act at one point, which conserves angular momentum.
         arm, other_arm = arm - 0.5 * apart, other_arm + 0.5 * apart
         linear = [
             np.concatenate([e, np.cross(arm, e), -e, -np.cross(other_arm, e)])
@@ -215,13 +216,13 @@ class JointRows:
     Args:
         sources: the joints, each with the directions of its `Joint.held`.
         first: body of each row, shape (m,).
-        second: the other one, the number of bodies where it is none.
-        one: relative velocities of the first body's velocities, shape (m, 1, q).
-        other: of the second's.
-        error: of `Joint.errors`, shape (m,).
-        wanted: speed of a motor [rad/s], 0 elsewhere.
+        second: the other body, the number of bodies for WORLD.
+        one: rows for the first body, shape (m, 1, q).
+        other: rows for the second body.
+        error: error as of `Joint.errors`, shape (m,).
+        wanted: target speed of a motor [rad/s], 0 for other rows.
         lower: least impulse [N s, N m s], -inf for equations, 0 for limits, finite for motors.
-        upper: the largest one.
+        upper: largest impulse.
     """
 
     sources: tuple[tuple[Joint, np.ndarray], ...]
@@ -240,7 +241,7 @@ class JointRows:
 
     @classmethod
     def joined(cls, several: Sequence[JointRows]) -> JointRows:
-        """Return the rows of several joints (at least one) as one."""
+        """Return the rows of several joints (at least one) as one object."""
         names = ("first", "second", "one", "other", "error", "wanted", "lower", "upper")
         arrays = {name: np.concatenate([getattr(rows, name) for rows in several]) for name in names}
         return cls(sources=tuple(source for rows in several for source in rows.sources), **arrays)
@@ -267,11 +268,11 @@ class JointRows:
     def bias(self, dt: float, rate: float = 1.0) -> np.ndarray:
         """Return c for a step of dt [s], shape (m,).
 
-        Error to remove, distance to limits, less the speed of a motor.
+        Error to remove, distance to limits, minus the speed of a motor.
 
         Args:
             dt: time step [s].
-            rate: part of an error that the step removes, in [0, 1].
+            rate: fraction of an error that the step removes, in [0, 1].
         """
         part = np.where(~self.equations & (self.error > 0.0), 1.0, rate)
         return part * self.error / dt - self.wanted
@@ -286,14 +287,13 @@ class JointRows:
 def joined_pairs(joints: Sequence[Joint], bodies: int) -> frozenset[tuple[int, int]]:
     """Return the pairs of bodies that do not collide, the smaller index first.
 
-    Bodies of a joint, and bodies rigidly connected by fixed joints.
-
-    A piece is what fixed joints hold together; fixed in space, or joined to a body of a piece, says
-    nothing about the others of it.
+    These are bodies of a joint, and bodies of a group that fixed joints connect rigidly. Joints to
+    WORLD, and other joints to a body of a group, do not exclude collisions with the rest of the
+    group.
 
     Args:
-        joints: all.
-        bodies: their number.
+        joints: all joints.
+        bodies: number of bodies.
     """
     firm = [joint.pair for joint in joints if joint.kind == "fixed" and joint.second != WORLD]
     links = coo_array(

@@ -11,8 +11,8 @@ import numpy as np
 from warp_lcp.grid.solids import Box, Capsule, Geometry, Placement, Sphere, TriangleMesh
 from warp_lcp.rigid.outline import mesh_outline
 
-ROUND = 1e-9  # relative: an inertia that is less symmetric is none
-# of a mesh's surface, from which what lies inside the mesh itself would weigh too much
+ROUND = 1e-9  # relative asymmetry up to which an inertia counts as symmetric
+# Fraction of a mesh's surface inside the mesh itself, above which overlaps would weigh too much.
 TWICE = 0.01
 
 
@@ -22,9 +22,9 @@ class MassProperties:
 
     Args:
         mass: [kg]; 2-D: [kg/m], per meter of depth.
-        center: of mass [m], shape (3,), z = 0 in 2-D.
-        inertia: about the center [kg m^2], shape (3, 3), symmetric positive definite; 2-D: [kg m],
-            and only its zz counts.
+        center: center of mass [m], shape (3,), z = 0 in 2-D.
+        inertia: inertia about the center [kg m^2], shape (3, 3), symmetric positive definite; 2-D:
+            [kg m], of which only zz is used.
 
     Raises:
         ValueError: a value is not finite, the mass is not positive or the inertia is not symmetric
@@ -67,9 +67,9 @@ def mass_properties(
 ) -> MassProperties:
     """Return the mass properties of a placed shape of uniform density.
 
-    Boxes, spheres and capsules by their closed forms; meshes by the integrals of 1, x and x x' over
-    the tetrahedra between the origin and their triangles, in 2-D over the triangles between the
-    origin and the segments of their cut by z = 0, which are exact.
+    Boxes, spheres and capsules have closed forms. For meshes the integrals of 1, x and x x' are
+    exact sums over the tetrahedra between the origin and their triangles, in 2-D over the triangles
+    between the origin and the segments of their cut by z = 0.
 
     Args:
         geometry: a box, sphere, capsule or mesh, not inverted.
@@ -124,14 +124,14 @@ def _closed_form(
     start, end = (np.array([*point, 0.0][:3]) for point in (shape.start, shape.end))
     length, r, center = float(np.linalg.norm(end - start)), shape.radius, 0.5 * (start + end)
     h = 0.5 * length
-    # a rectangle and two half discs, whose centers of mass are 4 r / (3 pi) from their diameters
+    # A rectangle and two half discs, whose centers of mass are 4 r / (3 pi) from their diameters.
     if dimension == 2:
         middle, caps = 2.0 * r * length, math.pi * r**2
         about = middle * (length**2 + 4.0 * r**2) / 12.0 + caps * (
             0.5 * r**2 + h**2 + 8.0 * h * r / (3.0 * math.pi)
         )
         return middle + caps, center, about * np.eye(3)
-    # half balls: 3 r / 8 from the plane that cuts them
+    # Half balls: 3 r / 8 from the plane of the cut.
     middle, caps = math.pi * r**2 * length, 4.0 / 3.0 * math.pi * r**3
     along = 0.5 * middle * r**2 + 0.4 * caps * r**2
     across = middle * (length**2 / 12.0 + 0.25 * r**2) + caps * (0.4 * r**2 + h**2 + 0.75 * h * r)
@@ -152,7 +152,10 @@ def _placed(
 
 
 def _mesh(mesh: TriangleMesh, dimension: int) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return volume, center and inertia at density 1 of a mesh as placed, or of its cut by z = 0."""
+    """Return volume, center and inertia at density 1 of a placed mesh.
+
+    In 2-D, of its cut by z = 0.
+    """
     if mesh.surface.crossings.doubled > TWICE:
         raise ValueError(
             f"{mesh.surface.name}: about {mesh.surface.crossings.doubled:.0%} of its surface lies "
@@ -167,7 +170,7 @@ def _mesh(mesh: TriangleMesh, dimension: int) -> tuple[float, np.ndarray, np.nda
         corners = segments
     else:
         corners = vertices[mesh.surface.triangles]
-    # near the shape: far from it the terms would cancel
+    # Near the shape: terms would cancel for a distant origin.
     origin = corners.reshape(-1, 3).mean(axis=0)
     corners = corners - origin
     total = corners.sum(axis=1)
@@ -180,8 +183,8 @@ def _mesh(mesh: TriangleMesh, dimension: int) -> tuple[float, np.ndarray, np.nda
     if not volume > 0.0:
         return 0.0, origin, np.eye(3)
     center = parts @ total / ((dimension + 1) * volume)
-    # of a simplex with a corner at the origin: its volume times (sum of v v' + (sum of v)(sum of
-    # v)') over (d + 1)(d + 2)
+    # For a simplex with a corner at the origin: its volume times (sum of v v' + (sum of v)(sum of
+    # v)') over (d + 1)(d + 2).
     squares = np.einsum("i,ikj,ikl->jl", parts, corners, corners) + np.einsum(
         "i,ij,il->jl", parts, total, total
     )

@@ -12,19 +12,19 @@ from warp_lcp.grid.solids import Box, Plane
 from warp_lcp.grid.voxelize import PlacedSolid
 from warp_lcp.rigid.contact_shape import ContactShape
 
-PLACED = Pose.identity()  # of what stands where the scene places it
+PLACED = Pose.identity()  # pose of solids at rest
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Obstacle:
-    """Solid that no impulse moves.
+    """Solid that impulses do not move.
 
     Args:
-        name: what messages call it.
-        shape: its surface as placed; None: it consists of planes.
-        points: of the planes that bound it [m], shape (m, 3).
-        normals: of those planes, into the open, shape (m, 3).
-        motion: where it is over time; None: it stands.
+        name: name in messages.
+        shape: its surface as placed; None if it consists of planes.
+        points: a point of each plane that bounds it [m], shape (m, 3).
+        normals: normals of those planes, into the open, shape (m, 3).
+        motion: its motion; None at rest.
     """
 
     name: str
@@ -44,9 +44,9 @@ def domain_walls(
     """Return the walls of the domain, a box from the origin to `size` [m].
 
     Args:
-        size: of the domain.
-        open_sides: of `warp_lcp.grid.sides.side_bits`: there is no wall.
-        endless: axes without an end: no walls either.
+        size: size of the domain.
+        open_sides: bits of `warp_lcp.grid.sides.side_bits`: sides without a wall.
+        endless: periodic axes, also without walls.
     """
     points, normals = [], []
     for axis, length in enumerate(size):
@@ -68,7 +68,7 @@ def domain_walls(
 def obstacle(solid: PlacedSolid, dimension: int) -> Obstacle:
     """Return a solid of a scene as an obstacle.
 
-    Half spaces and inverted boxes by their planes, other shapes by their distance.
+    Half spaces and inverted boxes are represented by planes, other shapes by their distance.
     """
     shape = solid.geometry
     if isinstance(shape, Plane):

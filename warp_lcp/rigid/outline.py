@@ -9,17 +9,15 @@ import numpy as np
 
 from warp_lcp.grid.solids import Box, Capsule, Geometry, Sphere, TriangleMesh, Union
 
-NO_LENGTH = 1e-9  # of a mesh's size
+NO_LENGTH = 1e-9  # relative to a mesh's size
 AROUND = 48  # points around a disc or ball; even
 
 
 def mesh_outline(mesh: TriangleMesh) -> np.ndarray:
     """Return the segments of a placed mesh in the plane z = 0 [m], shape (m, 2, 3).
 
-    The inside is on the left.
-
-    Corners on the plane count as above it, so that each triangle that reaches below gives one
-    segment or none.
+    The inside is on the left. Corners on the plane count as above it, so that each triangle gives
+    at most one segment.
     """
     corners = mesh.placement.apply(mesh.surface.vertices)[mesh.surface.triangles]
     above = corners[..., 2] >= 0.0
@@ -28,7 +26,7 @@ def mesh_outline(mesh: TriangleMesh) -> np.ndarray:
     corners, above, count = corners[crossing], above[crossing], count[crossing]
     if not len(corners):
         return np.zeros((0, 2, 3))
-    # the corner on the other side than the two others
+    # The corner on the other side of the plane than the two others.
     alone = np.where(count == 1, above.argmax(axis=1), above.argmin(axis=1))
     order = (alone[:, None] + np.arange(3)) % 3
     a, b, c = np.moveaxis(np.take_along_axis(corners, order[..., None], axis=1), 1, 0)
@@ -40,12 +38,12 @@ def mesh_outline(mesh: TriangleMesh) -> np.ndarray:
         return point
 
     ends = np.stack([cut(a, b), cut(a, c)], axis=1)
-    # seen from outside a triangle is counterclockwise: with one corner above, the way from its left
-    # side to its right one leaves the inside on the left
+    # A triangle is counterclockwise seen from outside: with one corner above, the path from its
+    # left side to its right one has the inside on its left.
     swap = count == 2
     ends[swap] = ends[swap][:, ::-1]
     length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
-    # a triangle that only touches the plane gives a point
+    # A triangle that only touches the plane gives a point.
     return ends[length > NO_LENGTH * mesh.placement.scale * mesh.surface.size]
 
 
@@ -57,9 +55,9 @@ class BodySurface:
 
     Args:
         points: [m], shape (n, 3).
-        corners: of triangles, shape (m, 3), counterclockwise seen from outside, or of segments,
-            shape (m, 2), the inside on the left.
-        fields: at the points.
+        corners: point indices of triangles, shape (m, 3), counterclockwise seen from outside, or of
+            segments, shape (m, 2), with the inside on the left.
+        fields: values at the points.
     """
 
     points: np.ndarray
@@ -88,7 +86,7 @@ def body_surface(geometry: Geometry, dimension: int) -> BodySurface:
     """Return the surface of a placed box, sphere, capsule, mesh or union of these.
 
     Raises:
-        ValueError: it is none of these.
+        ValueError: the shape is of another kind.
     """
     if isinstance(geometry, Union):
         return BodySurface.joined([body_surface(part, dimension) for part in geometry.parts])
@@ -116,6 +114,7 @@ def body_surface(geometry: Geometry, dimension: int) -> BodySurface:
 
 
 def _box(box: Box, dimension: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return points and corners of a box; in 2-D of its cut by z = 0."""
     lower, upper = (np.array([*corner, 0.0][:3]) for corner in (box.lower, box.upper))
     if dimension == 2:
         unit = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
@@ -132,7 +131,7 @@ def _box(box: Box, dimension: int) -> tuple[np.ndarray, np.ndarray]:
 def _round(
     start: np.ndarray, end: np.ndarray, radius: float, dimension: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return a stadium or capsule, a disc or ball where the ends coincide."""
+    """Return a stadium or capsule; a disc or ball if the ends coincide."""
     axis = end - start
     length = float(np.linalg.norm(axis))
     axis = axis / length if length else np.array([1.0, 0.0, 0.0])
@@ -145,7 +144,7 @@ def _round(
     u = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
     u /= np.linalg.norm(u)
     v = np.cross(axis, u)
-    # from the tip at the end to that at the start
+    # From the tip at the end to the tip at the start.
     down = np.pi * (np.arange(AROUND // 2) + 0.5) / (AROUND // 2)
     angle = 2.0 * np.pi * np.arange(AROUND) / AROUND
     ring = np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * v

@@ -1,4 +1,7 @@
-"""Contacts of a few bodies in a plane by one native call, with the bits of `ContactDetection` and `ContactSolve.assembled`."""
+"""Native contact search and solve for a few bodies in a plane.
+
+The results are those of `ContactDetection` and `ContactSolve.assembled`, equal in bits.
+"""
 
 from __future__ import annotations
 
@@ -33,10 +36,10 @@ from warp_lcp.rigid.obstacles import Obstacle
 from warp_lcp.rows import KernelFile
 from warp_lcp.rows.host_kernel import HostKernel
 
-# of the way that speeds and gravity make in a step: what a material gives a body is not known
-# before it is solved for
+# Factor on the displacement by velocities and gravity in a step, since the impulses of a material
+# are not known before its solve.
 AHEAD = 2.0
-FEW = 64  # bodies: with more, pairs are sorted
+FEW = 64  # bodies: with more, pairs are found by sorting
 WIDTHS = (1, 1, 1, 3, 3, 1, 6, 6, 6, 2, 1, 1, 1, 1)  # numbers of a contact, field by field
 FIND = HostKernel(
     KernelFile(Path(__file__).parent / "headers/planar_contacts.h")[
@@ -55,9 +58,9 @@ FIND = HostKernel(
     MORE=MORE,
     MOST_OF_PAIR=MOST[2],
 )
-SLOP = 1e-5  # of a body's size: overlap that is left alone
-RATE = 0.3  # part of a larger overlap that a step removes
-# for overlaps, which take several steps anyway
+SLOP = 1e-5  # relative to a body's size: overlap that is not corrected
+RATE = 0.3  # fraction of a larger overlap that a step removes
+# Criteria for overlaps, which take several steps anyway.
 ROUGH = StoppingCriteria(rtol=1e-2, max_iterations=30)
 PUSH = HostKernel(
     KernelFile(Path(__file__).parent / "headers/planar_impulses.h")[
@@ -75,20 +78,20 @@ PUSH = HostKernel(
 
 @dataclass(frozen=True, eq=False)
 class PlanarImpulses:
-    """Result of a push, with what the rest of a step asks for.
+    """Result of a push, with the values that the rest of a step needs.
 
     Args:
-        contacts: of the step.
-        impulses: of the contacts [N s], shape (k, 2).
-        residual: the largest of an island, relative to that of no impulses.
-        iterations: the most of an island.
-        dt: of the step [s].
-        values: of the bodies after it.
-        ways: displacements that reduce overlaps at the end of the step (m, rad), shape (n, 3);
-            None: no contact will overlap by more than `SLOP`.
-        memory: what a `ContactMemory` keeps of the contacts, shape (k, 8).
-        squares: G'J'JG of the rows J that hold a body against walls and solids, and the diagonal of
-            the root G of its inverse mass, by body; None: bodies that are held touch others.
+        contacts: contacts of the step.
+        impulses: impulses of the contacts [N s], shape (k, 2).
+        residual: the largest residual of an island, relative to that of no impulses.
+        iterations: the most iterations of an island.
+        dt: length of the step [s].
+        values: values of the bodies after the push.
+        ways: displacements that reduce overlaps at the end of the step (m, rad), shape (n, 3); None
+            if no contact will overlap by more than `SLOP`.
+        memory: rows for a `ContactMemory`, shape (k, 8).
+        squares: G'J'JG of the rows J that support a body against walls and solids, and the diagonal
+            of the root G of its inverse mass, by body; None if supported bodies touch others.
     """
 
     contacts: Contacts
@@ -103,11 +106,11 @@ class PlanarImpulses:
 
 
 class PlanarContacts:
-    """Search for the contacts of a few boxes, discs and capsules in a plane.
+    """Contact search for a few boxes, discs and capsules in a plane.
 
     Args:
-        detection: of the bodies, of which `holds` is true.
-        reach: of each body's points from its center of mass [m], shape (n,).
+        detection: detection of the bodies' contacts, for which `holds` is true.
+        reach: largest distance of each body's points from its center of mass [m], shape (n,).
     """
 
     def __init__(self, detection: ContactDetection, reach: np.ndarray) -> None:
@@ -137,7 +140,7 @@ class PlanarContacts:
             self._placed(obstacle, 0.0) if obstacle.motion is None else None
             for obstacle in self.obstacles
         ]
-        # obstacles that all stand, and the margin around them
+        # The obstacles if all are at rest, and the margin around them.
         self._around: tuple[float, np.ndarray] | None = None
         self._capacity = 8 * (len(shapes) + 8)  # contacts
         self._masses = np.concatenate(
@@ -153,7 +156,7 @@ class PlanarContacts:
 
     @staticmethod
     def holds(detection: ContactDetection) -> bool:
-        """Return whether it finds the contacts of these bodies and obstacles."""
+        """Return whether these bodies and obstacles are supported."""
         shapes = (
             *detection.shapes,
             *(obstacle.shape for obstacle in detection.obstacles if obstacle.shape is not None),
@@ -167,7 +170,7 @@ class PlanarContacts:
 
     @staticmethod
     def _placed(obstacle: Obstacle, time: float) -> np.ndarray:
-        """Return what the kernel has of an obstacle, but for its margin."""
+        """Return the kernel's numbers of an obstacle, without its margin."""
         pose, shape = obstacle.pose(time), obstacle.shape
         if shape is None:
             return np.concatenate(
@@ -183,39 +186,42 @@ class PlanarContacts:
         return np.concatenate([shape.numbers, *of_pose])
 
     def _obstacles(self, time: float, margins: Sequence[float]) -> np.ndarray:
-        """Return the kernel's obstacles, each with the gap up to which a body that rests touches it [m]."""
+        """Return the kernel's numbers of all obstacles.
+
+        Each with the gap up to which a body at rest touches it [m].
+        """
         if self.still and self._around is not None and self._around[0] == margins[0]:
             return self._around[1]
         placed = [
             self._placed(o, time) if of is None else of
             for o, of in zip(self.obstacles, self._standing, strict=True)
         ]
-        found = np.concatenate(
+        rows = np.concatenate(
             [part for margin, of in zip(margins, placed, strict=True) for part in ((margin,), of)]
             or [np.zeros(0)]
         )
         if self.still and len(margins):
-            self._around = margins[0], found
-        return found
+            self._around = margins[0], rows
+        return rows
 
     def find(
         self, time: float, dt: float, falls: float, near: float, brought: Sequence[float]
     ) -> tuple[FoundContacts, Contacts] | None:
-        """Return the contacts, and these with rows for obstacles that stand.
+        """Return the contacts, and the same with rows for obstacles at rest.
 
         Args:
-            time: of the state [s].
+            time: time of the state [s].
             dt: time step [s].
-            falls: speed that gravity gives in a step [m/s].
-            near: gap up to which bodies that rest touch each other [m].
-            brought: how far each obstacle may come [m].
+            falls: speed that gravity adds in a step [m/s].
+            near: gap up to which bodies at rest touch each other [m].
+            brought: largest displacement of each obstacle [m].
 
         Returns:
-            None: this loop does not find them.
+            The contacts; None if this search does not support them.
         """
         n, capacity = len(self.bodies), self._capacity
         obstacles = self._obstacles(time, [near + way for way in brought])
-        given = (self.bodies.values, self._fixed, obstacles)
+        state = (self.bodies.values, self._fixed, obstacles)
         sizes = {
             "count": n,
             "obstacles": len(self.obstacles),
@@ -223,7 +229,7 @@ class PlanarContacts:
             "capacity": capacity,
         }
         reals, (total,) = FIND.run(
-            given,
+            state,
             (self._planes,),
             work=10 * n + sum(WIDTHS) * capacity,
             dt=dt,
@@ -241,8 +247,8 @@ class PlanarContacts:
         first, second, which = (field.astype(np.int64) for field in fields[:3])
         point, normal, gap = fields[3].reshape(k, 3), fields[4].reshape(k, 3), fields[5]
         frames = fields[6].reshape(k, 2, 3)
-        # in the order in which `ContactSolve.assembled` leaves them, by which BLAS chooses how it
-        # adds up
+        # In the memory order of `ContactSolve.assembled`, on which the summation order of BLAS
+        # depends.
         one, other = (
             np.ascontiguousarray(rows.reshape(k, 2, 3).transpose(2, 0, 1)).transpose(1, 2, 0)
             for rows in fields[7:9]
@@ -277,16 +283,16 @@ class PlanarContacts:
         """Push the bodies apart by nonlinear conjugate gradients on sweeps.
 
         Args:
-            contacts: of the step.
-            before: impulses to start from [N s], shape (k, 2), if `resumed`; else those of a
+            contacts: contacts of the step.
+            before: initial impulses [N s], shape (k, 2), if `resumed`; else those of a
                 `ContactMemory`, shape (m, 8).
             resumed: see `before`.
-            stopping: of NNCG.
-            unsolved: largest residual with which the bodies are pushed.
-            dt: of the step [s].
+            stopping: criteria of NNCG.
+            unsolved: largest residual for which the impulses are applied.
+            dt: length of the step [s].
 
         Returns:
-            None: they are not solved for, and the bodies are as before.
+            The result; None if the residual is larger, and then the bodies are unchanged.
         """
         c, n, k = contacts, len(self.bodies), len(contacts)
         of_contacts = (

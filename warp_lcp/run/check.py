@@ -16,7 +16,7 @@ from warp_lcp.scene.simulator import runs_on_ranks, simulators
 from warp_lcp.scene.table import KeyFault, SceneError, written
 from warp_lcp.simulation import Cells, Points, Simulation, Surface
 
-EVERYTHING = ("vtu", "xdmf", "vtk", "gmsh")  # formats that hold all parts with their fields
+EVERYTHING = ("vtu", "xdmf", "vtk", "gmsh")  # formats that store all parts with their fields
 
 
 def check_scene(
@@ -27,8 +27,8 @@ def check_scene(
     The summary has pairs of a word and a line.
 
     Args:
-        path_or_name: as of `load_scene`.
-        overrides: as of `load_scene`.
+        path_or_name: see `load_scene`.
+        overrides: see `load_scene`.
 
     Raises:
         SceneError: listing everything that is wrong.
@@ -41,16 +41,16 @@ def check_scene(
 
 
 def check_memory(scene: Scene, device: str, *, share: float = 1.0) -> None:
-    """Refuse a scene that takes more memory than a device has free.
+    """Raise an error if a scene needs more memory than a device has free.
 
     Args:
-        scene: what would run.
-        device: a Warp device's name; on a GPU, the making of the particles, on the host, does not
-            count.
-        share: of the run that is on this device.
+        scene: the scene.
+        device: a Warp device's name; on a GPU, the host memory for the creation of the particles is
+            not counted.
+        share: fraction of the run on this device.
 
     Raises:
-        SceneError: naming both amounts.
+        SceneError: names both amounts.
     """
     needed = int(
         share * (scene.memory_estimate() if device == "cpu" else sum(scene.memory_parts().values()))
@@ -71,10 +71,10 @@ def check_memory(scene: Scene, device: str, *, share: float = 1.0) -> None:
 
 
 def check_ranks(scene: Scene) -> None:
-    """Refuse a scene that cannot run on ranks, or whose output cannot be in pieces.
+    """Raise an error if a scene cannot run on ranks, or lacks a parallel format.
 
     Raises:
-        SceneError: listing what stands against it.
+        SceneError: lists all reasons.
     """
     name = scene.scene.simulator
     problems = []
@@ -105,12 +105,12 @@ def check_ranks(scene: Scene) -> None:
 
 
 def check_output(scene: Scene) -> list[str]:
-    """Refuse a format that cannot store the scene's output; return notes.
+    """Check that each format can store the scene's output; return notes.
 
     A note names the parts whose fields the format does not store.
 
     Raises:
-        SceneError: naming the parts, why, and what the format holds.
+        SceneError: names the parts, the reason, and what the format can store.
     """
     output = scene.output
     if output.format == "vtu":
@@ -134,28 +134,29 @@ def check_output(scene: Scene) -> list[str]:
         "surface": (output.surface, Surface, scene.dimension),
         "the surfaces of bodies": (has_bodies, Surface, scene.dimension),
     }
-    found = {
+    support = {
         name: holds(output.format, kind, dimension)
         for name, (wanted, kind, dimension) in kinds.items()
         if wanted
     }
-    refused = {name: held.why for name, held in found.items() if held.dress is None}
+    refused = {name: held.why for name, held in support.items() if held.dress is None}
     if refused:
         what = f"cannot store {' and '.join(refused)}"
         why = next((f" ({one_line(why.strip())})" for why in refused.values() if why.strip()), "")
         off = [f"output.{name} = false" for name in refused if name in type(output).model_fields]
-        others = " or ".join(name for name in EVERYTHING if name != output.format)
+        alternatives = " or ".join(name for name in EVERYTHING if name != output.format)
         raise SceneError(
             scene.scene.name,
             [
                 KeyFault(
                     "output.format",
-                    f"{what}{why}; " + ", ".join([*off, f"or choose {others}, which hold all"]),
+                    f"{what}{why}; "
+                    + ", ".join([*off, f"or choose {alternatives}, which hold all"]),
                     written(output.format),
                 )
             ],
         )
-    bare = [name for name, held in found.items() if held.dress is Dress.BARE]
+    bare = [name for name, held in support.items() if held.dress is Dress.BARE]
     return (
         [
             f'output.format = "{output.format}" writes the geometry of {" and ".join(bare)}, '
@@ -169,12 +170,12 @@ def check_output(scene: Scene) -> list[str]:
 def start(scene: Scene, device: str, ranks: Ranks | None = None) -> Simulation:
     """Return the simulation of a scene at its start.
 
-    Errors that a run would raise before its first step are raised.
+    Raises the errors that a run would raise before its first step.
 
     Args:
-        scene: what would run.
+        scene: the scene.
         device: a Warp device's name.
-        ranks: that share it, for this rank's part.
+        ranks: MPI ranks that share it; the result is this rank's part.
 
     Raises:
         SceneError: the scene cannot be simulated.
@@ -186,12 +187,12 @@ def start(scene: Scene, device: str, ranks: Ranks | None = None) -> Simulation:
         )
         return simulator.create(scene, device=device, folder=Path.cwd(), **shared)
     except ValueError as error:
-        check_shapes(scene, scene.scene.name)  # whose message names the shape
+        check_shapes(scene, scene.scene.name)  # its error names the shape
         raise SceneError(scene.scene.name, [KeyFault("", str(error))]) from error
 
 
 def _check_bodies(scene: Scene, source: str) -> None:
-    """Refuse rigid bodies that overlap each other, walls or other solids."""
+    """Raise an error if rigid bodies overlap each other, walls or other solids."""
     if not any(solid.is_body for solid in scene.solid):
         return
     from warp_lcp.material.particle_assembly import make_bodies, placed_solids

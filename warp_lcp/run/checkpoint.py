@@ -1,4 +1,4 @@
-"""Checkpoints: everything a run continues from, as plain arrays in an .npz file."""
+"""Checkpoints: the complete state of a run, as plain arrays in an .npz file."""
 
 from __future__ import annotations
 
@@ -21,27 +21,30 @@ from warp_lcp.frames.pieces import in_ranks, rank_folder
 
 FORMAT = 2
 CHECKPOINT_FILE = re.compile(r"step_(?P<step>[0-9]{6,})\.npz")
-# set aside when a run continued from an earlier one
+# Checkpoints that were renamed when a run continued from an earlier one.
 REFUSED_FILE = re.compile(r"refused_[0-9]{6,}\.npz")
 STATE = "state/"
 META = "meta"
-# the only array of a checkpoint whose state is in the files of ranks: a checksum of each
+# The only array of a checkpoint with its state in the files of ranks: their checksums.
 PIECES = "pieces_of_ranks"
 
 
 class CheckpointError(ValueError):
-    """A file that a run cannot continue from. The message names it and says why."""
+    """A file that a run cannot continue from.
+
+    The message names it and says why.
+    """
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """The state of a run after a step.
+    """State of a run after a step.
 
     Args:
-        step: the number of steps taken.
-        time: reached by them [s].
+        step: number of steps since the start.
+        time: time after them [s].
         state: the simulation's arrays.
-        keys: of the scene that led there, with their values; not needed to write one.
+        keys: keys of the run's scene, with their values; not needed to write a checkpoint.
     """
 
     step: int
@@ -56,10 +59,10 @@ class Checkpoint:
 
 
 class StoredPiece(Mapping[str, np.ndarray]):
-    """A rank's piece of a state in its file; an array is read when it is asked for.
+    """A rank's part of a state in its file; arrays are read on access.
 
     Args:
-        path: of the file, which has been verified.
+        path: path of the file, which has been verified.
     """
 
     def __init__(self, path: Path) -> None:
@@ -85,21 +88,21 @@ class StoredPiece(Mapping[str, np.ndarray]):
 
 
 class CheckpointFolder:
-    """The checkpoints of one run, `step_<number>.npz`.
+    """Checkpoints of one run, `step_<number>.npz`.
 
-    Those of a run on several ranks have their states in pieces, `rank_0003/step_<number>.npz`;
+    On several ranks the states are stored in parts, `rank_0003/step_<number>.npz`;
     `step_<number>.npz` has their checksums.
 
     Args:
-        folder: made when the first checkpoint is written.
-        fingerprint: tells the run's scene from others, whatever may change when it goes on.
-        keys: of the scene, with their values, written with each checkpoint.
-        collective: of the ranks that share the run, whose checkpoints are in pieces; `write`,
-            `complete` and `prune` are collective then.
+        folder: the folder, created with the first checkpoint.
+        fingerprint: digest of the scene without keys that may change when the run continues.
+        keys: keys of the scene, with their values, written with each checkpoint.
+        collective: collective operations of the ranks that share the run, whose checkpoints are in
+            parts; `write`, `complete` and `prune` are then collective.
 
     Attributes:
-        spared: steps whose checkpoints `prune` leaves, as something that is missing can be made
-            again from them.
+        spared: steps whose checkpoints `prune` keeps, since missing output can be recomputed from
+            them.
     """
 
     def __init__(
@@ -114,9 +117,9 @@ class CheckpointFolder:
             collective or Collective.of_one(),
             collective is not None,
         )
-        # why the pieces of a step cannot be used, as its ranks have found
+        # Reasons why the parts of a step cannot be used, as found by its ranks.
         self._refused: dict[int, str] = {}
-        # the step that ranks go on from, whose pieces are not to be replaced
+        # Step from which ranks continue, whose parts must not be replaced.
         self._continued: int | None = None
         self.fingerprint = fingerprint
         self.keys = dict(keys or {})
@@ -127,7 +130,7 @@ class CheckpointFolder:
         return self.folder / f"step_{step:06d}.npz"
 
     def steps(self) -> list[int]:
-        """Return the steps that there are files of, newest first."""
+        """Return the steps with files, newest first."""
         files = self.folder.iterdir() if self.folder.is_dir() else ()
         return sorted(
             (
@@ -141,7 +144,7 @@ class CheckpointFolder:
     def write(self, checkpoint: Checkpoint) -> Path:
         """Write a checkpoint atomically.
 
-        On ranks each writes its piece, then the root rank the file that completes them.
+        On ranks, each one writes its part, then the root rank the file that completes them.
 
         Returns:
             The file of this rank's state.
@@ -166,6 +169,7 @@ class CheckpointFolder:
         return file
 
     def _write(self, checkpoint: Checkpoint) -> Path:
+        """Write the file of this rank's state; return it."""
         pickled = [name for name, array in checkpoint.state.items() if array.dtype.hasobject]
         if pickled:
             raise ValueError(
@@ -190,7 +194,7 @@ class CheckpointFolder:
     def prune(self, kept: int) -> None:
         """Delete all but the newest `kept` checkpoints and the spared ones.
 
-        Pieces of no checkpoint are deleted, too.
+        Parts without a checkpoint are deleted, too.
 
         Raises:
             OSError: a file cannot be deleted.
@@ -224,7 +228,7 @@ class CheckpointFolder:
         """Read and verify a checkpoint.
 
         Raises:
-            CheckpointError: the file is cut short or damaged, of another version or of another
+            CheckpointError: the file is truncated or damaged, of another version or of another
                 scene.
         """
         path = self.path(step)
@@ -259,12 +263,12 @@ class CheckpointFolder:
         return checkpoint
 
     def verify(self, checkpoint: Checkpoint) -> None:
-        """Read and verify the pieces of a checkpoint, if it is in pieces.
+        """Read and verify the parts of a checkpoint, if it has parts.
 
-        Ranks have done so in `complete`.
+        Ranks have done this in `complete`.
 
         Raises:
-            CheckpointError: one of them cannot be used.
+            CheckpointError: a part cannot be used.
         """
         if checkpoint.step in self._refused:
             raise CheckpointError(self._refused[checkpoint.step])
@@ -275,9 +279,9 @@ class CheckpointFolder:
                 raise CheckpointError(problem)
 
     def complete(self, checkpoint: Checkpoint) -> bool:
-        """Verify the pieces of a checkpoint, each on one rank.
+        """Verify the parts of a checkpoint, each on one rank.
 
-        Without a valid piece `newest` refuses the checkpoint from now on.
+        If a part is invalid, `newest` rejects the checkpoint from then on.
         """
         self._continued = checkpoint.step
         ranks = self.collective.ranks
@@ -290,7 +294,7 @@ class CheckpointFolder:
         return not found
 
     def problem(self, checkpoint: Checkpoint, rank: int) -> str:
-        """Return why a rank's piece of a checkpoint cannot be used, "" if it can."""
+        """Return why a rank's part of a checkpoint cannot be used; "" if it can."""
         folder = self.of_rank(rank)
         try:
             if folder.read(checkpoint.step).checksum == checkpoint.state[PIECES][rank]:
@@ -300,7 +304,7 @@ class CheckpointFolder:
         return f"{folder.path(checkpoint.step)}: belongs to another checkpoint"
 
     def pieces(self, checkpoint: Checkpoint) -> list[StoredPiece]:
-        """Return the pieces of a checkpoint, which have been verified.
+        """Return the parts of a checkpoint, which have been verified.
 
         Raises:
             OSError: a file cannot be read.
@@ -311,11 +315,11 @@ class CheckpointFolder:
         ]
 
     def of_rank(self, rank: int) -> CheckpointFolder:
-        """Return the folder of a rank's pieces."""
+        """Return the folder of a rank's parts."""
         return CheckpointFolder(self.folder / rank_folder(rank), self.fingerprint)
 
     def _all_pieces(self) -> list[tuple[int, Path]]:
-        """Return the pieces of all ranks with their steps."""
+        """Return the parts of all ranks with their steps."""
         matches = [
             (CHECKPOINT_FILE.fullmatch(file.name), file)
             for file in in_ranks(self.folder)
@@ -337,10 +341,10 @@ class CheckpointFolder:
 
 
 def _meta(archive: Archive) -> dict[str, Any]:
-    """Return what a checkpoint says of its state: of format 2, all of the right type.
+    """Return the metadata of a checkpoint: of format 2, with valid types.
 
     Raises:
-        ArchiveError: it says nothing, or something else.
+        ArchiveError: the metadata is missing or invalid.
     """
     try:
         meta: Any = json.loads(str(archive.read([META])[META]))

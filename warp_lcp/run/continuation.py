@@ -72,12 +72,12 @@ def mesh_digests(scene: Scene) -> dict[str, str]:
 
 
 def fingerprint(scene: Scene, digests: Mapping[str, str] | None = None) -> str:
-    """Return a digest of everything that must not change between the parts of a run.
+    """Return a digest of all keys that must not change when a run continues.
 
     Args:
         scene: the scene.
-        digests: of its mesh files, which count by what is in them and not by where they are; None:
-            read them.
+        digests: digests of its mesh files, which are compared by content and not by path; None:
+            compute them.
     """
     files = mesh_digests(scene) if digests is None else digests
     fixed = {

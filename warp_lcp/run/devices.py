@@ -15,25 +15,28 @@ from warp_lcp.simulation import InputError
 
 
 class EngineError(InputError):
-    """An engine cannot be used here. The message says why and what to do."""
+    """An engine cannot be used here.
+
+    The message says why and what to do.
+    """
 
 
 class Engine(StrEnum):
     """Engine of a computation: this process, or MPI ranks started by `mpiexec`."""
 
     SINGLE = "single"  # one process with one device
-    PETSC = "petsc"  # the ranks of MPI, whose grids PETSc cuts and exchanges
+    PETSC = "petsc"  # MPI ranks, with grids distributed by PETSc
 
 
 class DeviceError(InputError):
-    """There is no such device; the message lists those there are."""
+    """There is no such device; the message lists the available ones."""
 
 
 def devices() -> dict[str, str]:
     """Return the devices of this machine and their descriptions, preferred one first.
 
     Raises:
-        KernelCacheError: there is no place for compiled kernels.
+        KernelCacheError: the cache of compiled kernels cannot be used.
     """
     try:
         start_warp()
@@ -50,13 +53,13 @@ def choose_device(name: str | None) -> str:
     Raises:
         DeviceError: there is no such device.
     """
-    there = devices()
+    available = devices()
     if name is None:
-        return next(iter(there))
+        return next(iter(available))
     alias = "cuda:0" if name == "cuda" else name
-    if alias not in there:
+    if alias not in available:
         raise DeviceError(
-            f"--device {name}: there is no such device; choose from {', '.join(there)}"
+            f"--device {name}: there is no such device; choose from {', '.join(available)}"
         )
     return alias
 
@@ -70,7 +73,7 @@ def free_memory(name: str) -> int | None:
 
 
 def cuda_driver() -> str:
-    """Return the version of the CUDA driver, or that there is none."""
+    """Return the version of the CUDA driver, or a text if there is none."""
     devices()
     version = wp.get_cuda_driver_version()
     return "none found" if version is None else ".".join(map(str, version))
@@ -86,7 +89,7 @@ def _describe(device: wp.Device) -> str:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of what decides a run's numbers."""
+    """Return the versions of all software that affects the results."""
     found = {name: _version(name) for name in ("warp-lcp", "warp-lang", "numpy")}
     return {**found, "python": platform.python_version(), "platform": platform.platform()}
 

@@ -1,4 +1,4 @@
-"""A run that a Python program drives: frame by frame, with a hand in every step."""
+"""Python API: step a run frame by frame, with callbacks."""
 
 from __future__ import annotations
 
@@ -48,9 +48,9 @@ class Frame:
 
     Args:
         index: number of the frame, 0 at the start.
-        time: of the simulation [s].
-        row: the last step's row of the log, by column; empty before the first step.
-        simulation: itself.
+        time: time of the simulation [s].
+        row: the last step's log row, by column; empty before the first step.
+        simulation: the simulation.
     """
 
     index: int
@@ -79,9 +79,8 @@ class Frame:
     def fields(self) -> dict[str, wp.array]:
         """Velocity on the faces of the grid, `velocity_x` to `velocity_z` [m/s].
 
-        Shape (nz + 2, ny + 2, nx + 2), with a ring of cells around the domain.
-
-        Entry [k, j, i] is of the lower face of cell (i - 1, j - 1, k - 1) along the axis.
+        Shape (nz + 2, ny + 2, nx + 2), with a ring of cells around the domain. Entry [k, j, i]
+        belongs to the lower face of cell (i - 1, j - 1, k - 1) along the axis.
         """
         faces = _of_particles(self.simulation).velocity
         return {f"velocity_{axis}": field for axis, field in zip("xyz", faces, strict=False)}
@@ -89,18 +88,17 @@ class Frame:
     def to_meshio(self) -> dict[str, Any]:
         """Return a `meshio.Mesh` for each part of the frame, by name.
 
-        Points [m], cells, and the fields as point data or cell data.
-
-        The parts are `particles`, `grid` (its cells are quadrilaterals or hexahedra), and
-        `surface`, `bodies`, `level_set` and `density` where the scene has them. Of volumes the
-        cells are those within the level set's band, and where the density is not 0.
+        Points [m], cells, and the fields as point data or cell data. The parts are `particles`,
+        `grid` (its cells are quadrilaterals or hexahedra), and `surface`, `bodies`, `level_set` and
+        `density` if the scene has them. Of volumes only the cells within the level set's band, or
+        with a density other than 0, are included.
         """
         return {part.name: to_meshio(part) for part in self.parts()}
 
     def parts(self) -> list[Part]:
         """Return copies of the parts that a frame's files contain.
 
-        Points, cells with pressure, and surfaces and volumes if the scene wants them.
+        Points, cells with pressure, and surfaces and volumes if the scene requests them.
         """
         return self.simulation.frame()
 
@@ -108,21 +106,20 @@ class Frame:
 class Run:
     """A run of a scene, stepped from Python.
 
-    `for frame in run` takes the steps from one frame to the next.
-
-    The steps are those of `warp-lcp run`, and with a `folder` so are log, frames and checkpoints,
-    bit for bit. Once the loop is left, with `break`, by an error in it or by Ctrl-C, the run is
-    stopped with a checkpoint, from which `Run.resume` continues. Ctrl-C waits for the end of the
-    current step and is then raised as usual; a second one does not wait.
+    `for frame in run` runs the steps from one frame to the next. They are the same as those of
+    `warp-lcp run`, and with a `folder` so are log, frames and checkpoints, bit for bit. When the
+    loop ends early, with `break`, by an error in it or by Ctrl-C, the run is stopped with a
+    checkpoint, from which `Run.resume` continues. Ctrl-C waits for the end of the current step and
+    is then raised as usual; a second Ctrl-C does not wait.
 
     Args:
         scene: a scene file, the name of a built-in scene, its tables as a dict, or a Scene.
-        folder: folder for log, frames and checkpoints; None: nothing is written.
+        folder: folder for log, frames and checkpoints; no files are written if None.
         device: a Warp device; default: a GPU, if there is one.
         frames: stop after this frame; default: the last one of the scene.
-        force: delete the run that is in the folder.
+        force: delete an existing run in the folder.
         on_step: called after each step, as by `on_step`.
-        overrides: keys of the scene with other values, such as {"domain.resolution": 96,
+        overrides: keys of the scene with new values, such as {"domain.resolution": 96,
             "liquid.0.max": [1, 1]}.
         keys: the same, without the name of the table, for keys that only one table has:
             `resolution=96`.
@@ -132,7 +129,7 @@ class Run:
         record: record of the run, as in run.json.
 
     Raises:
-        SceneError: the scene is wrong; the message lists everything that is.
+        SceneError: the scene is invalid; the message lists all errors.
         RunError: an argument is wrong.
         DeviceError: there is no such device.
     """
@@ -149,7 +146,7 @@ class Run:
         overrides: Mapping[str, Any] | None = None,
         **keys: Any,
     ) -> None:
-        """Load the scene; nothing is built and nothing written before the first frame is asked for."""
+        """Load the scene; build and write nothing before the first frame."""
         given = given_scene(scene, _overrides(scene, overrides, keys))
         self._set_up(
             given,
@@ -172,9 +169,8 @@ class Run:
     ) -> Self:
         """Return the run of a folder, continued from its newest checkpoint.
 
-        The next frame is the first one without a file; arguments as of `Run`.
-
-        Changes made by callbacks are in the checkpoint, except gravity, which is that of the scene.
+        The next frame is the first one without a file; arguments as of `Run`. Changes made by
+        callbacks are in the checkpoint, except gravity, which is that of the scene.
 
         Raises:
             OutputError: there is no run in the folder.
@@ -199,6 +195,7 @@ class Run:
         frames: int | None,
         on_step: Callable[[Run], object] | None,
     ) -> None:
+        """Check the arguments and initialize the run."""
         if frames is not None and (
             not isinstance(frames, int) or isinstance(frames, bool) or frames < 0
         ):
@@ -220,15 +217,15 @@ class Run:
     def on_step(self, callback: Callable[[Run], object]) -> Callable[[Run], object]:
         """Register a callback that is called with the run after each step.
 
-        It is called before the frame and the checkpoint of that time are written. It may be used as
+        It is called before the frame and the checkpoint of that time are written. It can be used as
         a decorator.
 
-        It may read `run.row`, `run.time` and `run.simulation`, `push` a body, change `gravity`,
-        `add` material and `stop` the run. An error that it raises ends the run with a checkpoint of
-        the step; `Run.resume` continues, first with the frame if the step ends one.
+        The callback may read `run.row`, `run.time` and `run.simulation`, `push` a body, change
+        `gravity`, `add` material and `stop` the run. An error that it raises ends the run with a
+        checkpoint of the step; `Run.resume` continues, first with the frame if the step ends one.
 
         Raises:
-            RunError: it cannot be called.
+            RunError: it is not callable.
         """
         if not callable(callback):
             raise RunError(f"on_step: must be a function of the run, not {type(callback).__name__}")
@@ -239,7 +236,7 @@ class Run:
         """Simulate, and yield each frame when its time is reached.
 
         Raises:
-            OutputError: the folder cannot take the run.
+            OutputError: the folder cannot be used for the run.
             SceneError: the scene cannot be simulated.
             SimulationFailed: the run has failed; the message is the reason in run.json.
             KeyboardInterrupt: Ctrl-C was pressed; the run has been stopped, with a checkpoint.
@@ -267,11 +264,14 @@ class Run:
             raise SimulationFailed(self.record.reason)
 
     def _goes_on(self, running: Iterator[RunLoop], interruption: Interruption) -> bool:
-        """Take the steps to the next frame; return whether there is one. In the main thread Ctrl-C waits for the step's end."""
+        """Run the steps to the next frame; return whether there is one.
+
+        In the main thread Ctrl-C waits for the end of the step.
+        """
         is_main = threading.current_thread() is threading.main_thread()
         with interruption if is_main else nullcontext():
             goes_on = next(running, None) is not None
-            # the step ended a frame, too; the loop asks whether to stop behind that
+            # The step has ended a frame; the loop reads the stop request after it.
             while goes_on and interruption.name:
                 goes_on = next(running, None) is not None
             return goes_on
@@ -307,10 +307,8 @@ class Run:
     def gravity(self) -> np.ndarray:
         """Gravity [m/s^2], a copy, shape (3,).
 
-        Set it with as many numbers as the scene has dimensions.
-
-        Limits that the pressure of liquids derives from gravity are still computed from the scene's
-        gravity.
+        Set it with as many numbers as the scene has dimensions. Limits that the pressure of liquids
+        derives from gravity are still computed from the scene's gravity.
         """
         return _of_particles(self.simulation).gravity.copy()
 
@@ -326,37 +324,37 @@ class Run:
         Args:
             body: its number, counted from 0 in the order of the scene's solids.
             impulse: [N s; N s/m in 2-D].
-            at: the point that it acts on [m]; default: the center of mass.
+            at: point of application [m]; default: the center of mass.
 
         Raises:
             RunError: there is no such body, or a vector is not finite or of another dimension.
         """
         bodies = _of_particles(self.simulation).bodies
-        there = bodies.bodies if bodies is not None else []
-        if not isinstance(body, (int, np.integer)) or not 0 <= body < len(there):
+        rigid_bodies = bodies.bodies if bodies is not None else []
+        if not isinstance(body, (int, np.integer)) or not 0 <= body < len(rigid_bodies):
             raise RunError(
                 f"body = {body!r}: "
                 + (
-                    f"must be from 0 to {len(there) - 1}"
-                    if there
+                    f"must be from 0 to {len(rigid_bodies) - 1}"
+                    if rigid_bodies
                     else "the scene has no rigid bodies"
                 )
             )
-        pushed, given = there[body], self._vector("impulse", impulse)
+        pushed, given = rigid_bodies[body], self._vector("impulse", impulse)
         arm = np.zeros(3) if at is None else self._vector("at", at) - pushed.position
         pushed.push(np.concatenate([given, np.cross(arm, given)]))
 
     def add(self, **shape: Any) -> int:
         """Add material, at rest or with a `velocity`, outside material and solids.
 
-        Return the number of new particles.
+        Returns the number of new particles.
 
         Args:
             shape: the keys of an entry of the scene's `[[liquid]]` or `[[sand]]`, such as
                 shape="box", min=[0, 1], max=[1, 2].
 
         Raises:
-            SceneError: a key is wrong.
+            SceneError: a key is invalid.
             RunError: there is no room.
         """
         simulation = _of_particles(self.simulation)
@@ -376,7 +374,7 @@ class Run:
         self._stopped = "its program"
 
     def _vector(self, name: str, value: Sequence[float]) -> np.ndarray:
-        """Return a vector of the scene's dimension [as given], shape (3,)."""
+        """Return a vector of the scene's dimension, in the unit of its values, shape (3,)."""
         try:
             given = np.asarray(value, dtype=np.float64)
         except (TypeError, ValueError):
@@ -387,30 +385,30 @@ class Run:
 
 
 class _Ears:
-    """The observer of a driven run.
+    """Observer of a run that is driven from Python.
 
     Args:
-        run: that hears of its steps.
+        run: the run, whose callbacks are called.
     """
 
     def __init__(self, run: Run) -> None:
         self._run = run
 
     def note(self, text: str) -> None:
-        """Keep a remark."""
+        """Store a remark."""
         self._run.notes.append(text)
 
     def start(self, time: float, end: float) -> None:
         """Do nothing."""
 
     def step(self, row: Mapping[str, Value]) -> None:
-        """Hand the step on to the callbacks."""
+        """Pass the step to the callbacks."""
         self._run.row = row
         for callback in self._run._callbacks:
             callback(self._run)
 
     def frame(self, index: int, last: int) -> None:
-        """Remember the number of the frame that is due."""
+        """Store the number of the current frame."""
         self._run._index = index
 
 
@@ -432,9 +430,12 @@ def _folder(folder: str | PathLike[str] | None) -> Path | None:
 def _overrides(
     scene: SceneSource, overrides: Mapping[str, Any] | None, keys: Mapping[str, Any]
 ) -> list[str]:
-    """Return overrides as `load_scene` has them, those of `keys` with their tables found."""
+    """Return overrides in the format of `load_scene`.
+
+    The tables of those in `keys` are looked up.
+    """
     tables = single_tables(scene) if keys else {}
-    given = dict(overrides or {})
+    values = dict(overrides or {})
     for key, value in keys.items():
         owners = [table for table, names in tables.items() if key in names]
         if len(owners) != 1:
@@ -445,8 +446,8 @@ def _overrides(
                 else f"no such key; {nearest(key, known)}"
             )
             raise SceneError("Run", [KeyFault(key, which)])
-        given[f"{owners[0]}.{key}"] = value
-    return [f"{key}={_written(key, value)}" for key, value in given.items()]
+        values[f"{owners[0]}.{key}"] = value
+    return [f"{key}={_written(key, value)}" for key, value in values.items()]
 
 
 def _written(key: str, value: Any) -> str:

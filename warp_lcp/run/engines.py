@@ -11,11 +11,11 @@ from warp_lcp.run.launcher import Launcher
 
 @contextmanager
 def launcher_of(engine: Engine, *, rank_timeout: float) -> Iterator[Launcher]:
-    """Give the launcher of a command.
+    """Yield the launcher of a command.
 
     Args:
-        engine: what carries it.
-        rank_timeout: seconds that one of several ranks may keep the others waiting; 0: any.
+        engine: engine that runs the command.
+        rank_timeout: longest time that ranks wait for one of them [s]; 0: no limit.
 
     Raises:
         EngineError: the engine cannot be used here.

@@ -1,4 +1,4 @@
-"""The folder of a run: what is in it, who may write there, and how the run ended."""
+"""Run folder: its files, write access, and the run's record."""
 
 from __future__ import annotations
 
@@ -62,10 +62,11 @@ RECORD = "run.json"
 SCENE = "scene.toml"
 ROUNDING = 1e-9
 BEFORE = "during the first step"
-# bytes that run.json may grow by until the run ends, with the reason and warnings
+# Room for the growth of run.json until the run ends, with the reason and warnings [bytes].
 LAST_WORDS = 8192
 OWN_FILES = re.compile(
-    rf"scene\.toml|run\.json(?:{re.escape(SPARE)})?|profile\.json|(?:log|probes|forces)\.csv|[a-z][a-z_]*\.pvd|{POST}"
+    rf"scene\.toml|run\.json(?:{re.escape(SPARE)})?|profile\.json|(?:log|probes|forces)\.csv"
+    rf"|[a-z][a-z_]*\.pvd|{POST}"
 )
 IMAGE_FILE = re.compile(r"(?:(?:frame|slice)_\d{6,}|sheet)\.png")
 CHECKPOINTS = "checkpoints"
@@ -78,27 +79,27 @@ class RunRecord:
     """Record of a run, as in run.json.
 
     Args:
-        scene: the scene's name.
-        simulator: what simulates it.
-        device: where.
-        engine: what carried it, see `warp_lcp.run.devices`.
-        ranks: processes that shared it.
-        status: how it ended, or that it has not.
-        reason: why it ended.
-        steps: taken since the scene's start.
-        time: reached [s].
-        frames: the number of the newest frame.
-        resumed_from_step: the checkpoint that this part of the run continued, if it did; 0 if there
-            was none and it began anew.
-        changed: the scene's keys that have other values than in the part before, with both.
-        resampled_from_resolution: domain.resolution of the checkpoint, if the state was brought to
-            another grid.
-        mesh_files: a digest of what is in each mesh file, by its key.
-        overrides: what `--set` was given for this run, with the values of the scene's file, see
+        scene: name of the scene.
+        simulator: name of the simulator.
+        device: name of the device.
+        engine: engine that ran it, see `warp_lcp.run.devices`.
+        ranks: number of processes.
+        status: exit status, or that the run has not ended.
+        reason: reason for the end.
+        steps: number of steps since the scene's start.
+        time: time reached [s].
+        frames: number of the newest frame.
+        resumed_from_step: step of the checkpoint from which this part of the run continued; 0 if
+            there was none and it started from the beginning.
+        changed: keys of the scene that have changed since the part before, with both values.
+        resampled_from_resolution: domain.resolution of the checkpoint, if the state was resampled
+            to another grid.
+        mesh_files: digest of the content of each mesh file, by its key.
+        overrides: `--set` options of this run, with the values of the scene's file, see
             `warp_lcp.run.given_scene`.
-        seconds: that this part of the run took.
-        warnings: what the user should know about the results.
-        versions: of the software.
+        seconds: wall time of this part of the run.
+        warnings: warnings about the results.
+        versions: versions of the software.
     """
 
     scene: str
@@ -126,10 +127,9 @@ class Continuation:
     """State from which a run continues.
 
     Args:
-        checkpoint: to continue from; None: nothing was computed yet.
-        remarks: what the user should know, such as newer checkpoints that cannot be used.
-        changed: a line for each key of the scene that has another value than when the checkpoint
-            was written.
+        checkpoint: the checkpoint; None if nothing was computed yet.
+        remarks: remarks for the user, such as newer checkpoints that cannot be used.
+        changed: a line for each key of the scene that has changed since the checkpoint was written.
         resampled_from: domain.resolution of the checkpoint, if the scene has another one.
     """
 
@@ -140,24 +140,24 @@ class Continuation:
 
 
 class RunFolder:
-    """scene.toml, run.json, log.csv, frames and checkpoints of one run.
+    """Files of one run: scene.toml, run.json, log.csv, frames and checkpoints.
 
-    Of several ranks the root rank owns the folder and each adds its pieces; methods are collective,
-    but for `write_record`, and raise on all ranks what fails on any.
+    On several ranks the root rank owns the folder and each rank adds its parts. Methods are
+    collective, except `write_record`: an error on any rank is raised on all.
 
     Args:
-        path: of the folder, which all ranks see.
-        scene: what runs.
-        collective: of the ranks that share the run; None: this process has it alone.
+        path: path of the folder, visible to all ranks.
+        scene: the scene of the run.
+        collective: collective operations of the ranks that share the run; None for one process.
 
     Raises:
         SceneError: a mesh file of the scene cannot be read.
     """
 
-    keeps = True  # what a run shows
+    keeps = True  # whether files are written
 
     def __init__(self, path: Path, scene: Scene, collective: Collective | None = None) -> None:
-        """Look at a folder, there or not; nothing is written yet."""
+        """Inspect a folder, which need not exist; nothing is written yet."""
         self.path, self.scene, self.log = path, scene, path / "log.csv"
         self.collective, self._shared = collective or Collective.of_one(), collective is not None
         with self.collective.together():
@@ -173,21 +173,21 @@ class RunFolder:
 
     @contextmanager
     def held(self, *, resume: bool) -> Iterator[list[str]]:
-        """Hold the lock of the folder, created if a new run needs it; yields remarks.
+        """Hold the lock of the folder, which is created if needed; yield remarks.
 
         Args:
-            resume: there must be a run.
+            resume: a run must exist.
 
         Raises:
-            OutputError: the folder cannot be made or written, another process runs there, or there
-                is no run to resume.
+            OutputError: the folder cannot be created or written, another process runs there, or
+                there is no run to resume.
         """
         with ExitStack() as stack:
             yield self._lock(stack, resume) or []
 
     @on_root
     def _lock(self, stack: ExitStack, resume: bool) -> list[str]:
-        """Keep other processes out until a stack ends; return remarks."""
+        """Lock the folder until a stack is closed; return remarks."""
         if self.path.exists() and not self.path.is_dir():
             raise OutputError(f"{self.path}: is not a folder")
         if resume:
@@ -204,19 +204,21 @@ class RunFolder:
 
     @on_root
     def check_new(self, *, force: bool) -> None:
-        """Refuse what a new run may not overwrite, and folders that cannot be written.
+        """Raise an error if a new run would overwrite files, or cannot write.
+
+        Only files of an earlier run may be overwritten.
 
         Args:
-            force: an earlier run may go.
+            force: an earlier run may be overwritten.
 
         Raises:
-            OutputError: there is something in the folder, or it cannot be made or written.
+            OutputError: the folder is not empty, or it cannot be created or written.
         """
         if self.path.exists() and not self.path.is_dir():
             raise OutputError(f"{self.path}: is not a folder")
         _probe(self.path)
         own, foreign = self._contents()
-        # nothing, or killed with its first files
+        # Empty, or a run that was killed while it wrote its first files.
         if not foreign and all(path.name.startswith(f".{RECORD}") for path in own):
             return
         if foreign or not holds_run(self.path):
@@ -245,15 +247,16 @@ class RunFolder:
 
     @on_root
     def _start(self, record: RunRecord) -> None:
+        """Delete files of an earlier run, and write scene and record."""
         own, _ = self._contents()
-        # first, so that a half-deleted run is not continued
+        # Checkpoints first, so that a half-deleted run is not continued.
         own.sort(key=lambda file: file.parent.name != CHECKPOINTS)
         for file in own:
-            if file.name != RECORD:  # replaced below: at every moment the folder is a run's
+            if file.name != RECORD:  # replaced below: the folder always has a record
                 file.unlink()
         for name in OWN_FOLDERS:
             if (self.path / name).is_dir():
-                # before there is a run that could take what was in it for its own
+                # Before there is a run to which the old files could seem to belong.
                 sync_folder(self.path / name)
             remove_empty_ranks(self.path / name)
         self.write_record(record)
@@ -266,17 +269,21 @@ class RunFolder:
             OutputError: there is no run, its scene is another one, or no checkpoint is valid.
         """
         while True:
-            found = self._continuation()
+            continuation = self._continuation()
             if not self._shared:
-                return found
+                return continuation
             whole: Mapping[str, np.ndarray] = {}
-            # too much for a message
-            if found and found.checkpoint and PIECES not in found.checkpoint.state:
-                whole, found = (
-                    found.checkpoint.state,
-                    replace(found, checkpoint=replace(found.checkpoint, state={})),
+            # The states are too large for a message.
+            if (
+                continuation
+                and continuation.checkpoint
+                and PIECES not in continuation.checkpoint.state
+            ):
+                whole, continuation = (
+                    continuation.checkpoint.state,
+                    replace(continuation, checkpoint=replace(continuation.checkpoint, state={})),
                 )
-            continued: Continuation = self.collective.share(found)
+            continued: Continuation = self.collective.share(continuation)
             checkpoint = continued.checkpoint
             if checkpoint is None or (checkpoint.state and self.checkpoints.complete(checkpoint)):
                 return continued
@@ -291,6 +298,7 @@ class RunFolder:
 
     @on_root
     def _continuation(self) -> Continuation:
+        """Return the checkpoint to continue from, and remarks, on the root rank."""
         self._check_run()
         self._check_same_scene()
         checkpoint, refused = self.checkpoints.newest()
@@ -354,7 +362,7 @@ class RunFolder:
         times: list[float],
         frame: list[Part],
     ) -> list[str]:
-        """Return a line for each gap in the files up to a step; see `warp_lcp.run.gaps`.
+        """Return a line for each gap in the files up to a step; see `run.gaps`.
 
         Raises:
             OSError: a file cannot be read.
@@ -409,13 +417,13 @@ class RunFolder:
     def open_log(
         self, columns: tuple[str, ...], *, after_step: int | None = None, table: str = "log"
     ) -> Log:
-        """Begin the log or continue it, see `Log`; or another table."""
+        """Open the log, or another table, at its start or after a step, see `Log`."""
         return Log(
             self.log.with_stem(table), columns, after_step=after_step, collective=self.collective
         )
 
     def frame_writer(self, watch: Stopwatch) -> FrameWriter | RankFrameWriter:
-        """Return the frame writer, which works while the simulation continues."""
+        """Return the frame writer, which writes while the simulation continues."""
         return (
             RankFrameWriter(self.frames, watch)
             if isinstance(self.frames, RankFrames)
@@ -440,13 +448,13 @@ class RunFolder:
         write_text(self.path / RECORD, text, spare=not begins)
 
     def check_space(self, needed: int) -> None:
-        """Refuse a run whose output does not fit.
+        """Raise an error if the output of a run does not fit on the disk.
 
         Args:
-            needed: an estimate of what this rank writes [bytes].
+            needed: estimated output of this rank [bytes].
 
         Raises:
-            OutputError: there is less free.
+            OutputError: less is free.
         """
         self._check_space(sum(self.collective.exchange(needed)))
 
@@ -462,7 +470,7 @@ class RunFolder:
             )
 
     def _check_shared(self) -> None:
-        """Refuse a folder that the root rank has begun to write and that others do not see."""
+        """Raise an error if ranks do not see the folder of the root rank."""
         with self.collective.together():
             if not (self.path / RECORD).is_file():
                 raise OutputError(
@@ -473,6 +481,7 @@ class RunFolder:
                 self.collective.watchdog.post_in(self.path)
 
     def _check_run(self) -> None:
+        """Raise an error if the folder has no run, or foreign entries in its place."""
         if not holds_run(self.path):
             raise OutputError(f"{self.path}: there is no run to resume")
         wrong = [
@@ -501,14 +510,14 @@ class RunFolder:
             )
 
     def _check_same_scene(self) -> None:
-        """Refuse other values of keys that must not change, and mesh files that hold something else."""
+        """Raise an error if fixed keys, or the content of mesh files, have changed."""
         before, now = recorded_keys(self.path / SCENE), keys(self.scene)
         files = read_record(self.path).get("mesh_files", {})
-        if before is None:  # killed before it was written: the checkpoints tell whose they are
+        if before is None:  # killed before it was written: the checkpoints have the fingerprint
             before = now
         for key, digest in self.mesh_files.items():
             if files.get(key) == digest:
-                before[key] = now[key]  # the same mesh in another place
+                before[key] = now[key]  # the same mesh at another path
             elif key in files and before.get(key) == now[key]:
                 raise OutputError(
                     f"{self.path}: {key} = {now[key]!r}: the content of the file has changed since "
@@ -521,7 +530,7 @@ class RunFolder:
             raise OutputError("\n  ".join([head, *changes, f"may change: {MAY_CHANGE}"]))
 
     def _has_steps(self) -> bool:
-        """Return whether the log has a row, or a frame or the record tells of a step."""
+        """Return whether the log, a frame or the record shows a step."""
         rows = self.log.read_bytes().count(b"\n") if self.log.is_file() else 0
         later = any(
             match and int(match["index"])
@@ -532,9 +541,12 @@ class RunFolder:
         return rows > 1 or later or bool(read_record(self.path).get("steps"))
 
     def _other_versions(self) -> list[str]:
-        """Return a remark if the run began with other software, which need not give the same bits."""
+        """Return a remark if the run began with other software versions.
+
+        Results may then differ in bits.
+        """
         before, now = read_record(self.path).get("versions", {}), versions()
-        now.pop("platform", None)  # its name tells the kernel, not the processor
+        now.pop("platform", None)  # it has the version of the kernel, not the processor
         other = [
             f"{name} {before[name]}, now {now[name]}"
             for name in sorted(before.keys() & now.keys())
@@ -550,7 +562,7 @@ class RunFolder:
         )
 
     def _contents(self) -> tuple[list[Path], list[Path]]:
-        """Return the files that a run makes, and everything else."""
+        """Return the files of runs, and all other files."""
         own: list[Path] = []
         foreign: list[Path] = []
         for path, pattern in _walk(self.path):
@@ -571,7 +583,7 @@ def holds_run(folder: Path) -> bool:
 
 
 def mark_ended(folder: Path, status: Status, reason: str) -> None:
-    """Write the end of a run into run.json, if it still says that the run goes on."""
+    """Write the end of a run into run.json, if it says that the run is running."""
     with suppress(OSError):
         record = read_record(folder)
         if record.get("status") == "running":
@@ -596,16 +608,16 @@ def read_record(folder: Path) -> dict[str, Any]:
 
 @cache
 def _record_types() -> dict[str, TypeAdapter[Any]]:
-    """Return what validates each value of a record."""
+    """Return the validators of the values of a record."""
     return {key: TypeAdapter(hint) for key, hint in get_type_hints(RunRecord).items()}
 
 
 def recorded_keys(path: Path) -> dict[str, Any] | None:
-    """Return the keys of the scene as run; None without a valid file."""
+    """Return the keys of the scene of a run; None without a valid file."""
     try:
         return keys(load_scene(path))
     except SceneError:
-        pass  # a mesh has been moved, perhaps; what the file says still counts
+        pass  # a mesh may have been moved; the file itself is still valid
     try:
         found = table_keys(tomllib.loads(path.read_text(encoding="utf-8")))
         return found if "scene.simulator" in found else None
@@ -614,7 +626,7 @@ def recorded_keys(path: Path) -> dict[str, Any] | None:
 
 
 def _walk(folder: Path) -> Iterator[tuple[Path, re.Pattern[str]]]:
-    """Yield what is in a run's folder with the pattern of the names that a run writes there."""
+    """Yield the files of a run's folder, with the pattern of valid names."""
     for path in folder.iterdir():
         if path.name in OWN_FOLDERS and path.is_dir() and not path.is_symlink():
             for file in in_ranks(path):
@@ -624,7 +636,10 @@ def _walk(folder: Path) -> Iterator[tuple[Path, re.Pattern[str]]]:
 
 
 def _is_of_run(path: Path, folder: Path, pattern: re.Pattern[str]) -> bool:
-    """Return whether a run would write or read what lies in its folder: every file in the folders of its own, known names beside them."""
+    """Return whether a file in a run's folder belongs to the run.
+
+    In the run's own subfolders all files do, beside them only known names.
+    """
     return (
         path.parent != folder
         or path.name in OWN_FOLDERS
@@ -633,13 +648,13 @@ def _is_of_run(path: Path, folder: Path, pattern: re.Pattern[str]) -> bool:
 
 
 def _written_as(name: str) -> str:
-    """Return the name that a temporary file was to get, others as they are."""
+    """Return the final name of a temporary file; other names are unchanged."""
     temporary = TEMPORARY.fullmatch(name)
     return temporary["name"] if temporary else name
 
 
 def _probe(folder: Path) -> None:
-    """Make the folder if it is not there, and see whether files can be written in it."""
+    """Create the folder if needed, and check that it is writable."""
     try:
         make_folder(folder)
         with tempfile.TemporaryFile(dir=folder) as file:

@@ -25,25 +25,28 @@ BUSY = (errno.EWOULDBLOCK, errno.EACCES)
 
 
 class FolderBusyError(RuntimeError):
-    """Another process runs in the folder. The message names it."""
+    """Another process runs in the folder.
+
+    The message names it.
+    """
 
 
 @contextmanager
 def locked(folder: Path) -> Iterator[list[str]]:
-    """Hold a folder; others are refused until the block, or the process, ends.
+    """Lock a folder until the block, or the process, ends.
 
-    The system's lock on the file run.lock counts, not the file: one that a killed process left is
-    taken over. The file tells people who holds the folder.
+    The operating system's lock on the file run.lock is decisive, not the file: a file that a killed
+    process left is reused. Its content names the process for people.
 
     Args:
-        folder: must exist.
+        folder: an existing folder.
 
     Yields:
-        Remarks: a lock that was taken over, or a file system without locks, where two runs are not
-        kept apart.
+        Remarks: a lock file that was reused, or a file system without locks, on which two runs are
+            not kept apart.
 
     Raises:
-        FolderBusyError: another process holds it.
+        FolderBusyError: another process holds the lock.
         OSError: the file cannot be written, or is a link.
     """
     if fcntl is None:
@@ -66,14 +69,14 @@ def locked(folder: Path) -> Iterator[list[str]]:
         os.pwrite(descriptor, json.dumps(holder).encode(), 0)
         yield remarks
     finally:
-        with suppress(OSError):  # already gone, or a disk that has become read-only
-            # while it is still locked: whoever opened it before sees that it is not there any more
+        with suppress(OSError):  # already deleted, or a disk that has become read-only
+            # Deleted while locked: a process that opened it before sees that it is gone.
             path.unlink()
         os.close(descriptor)
 
 
 def _acquire(path: Path) -> tuple[int, list[str]]:
-    """Return a locked descriptor of the file that is at `path` now."""
+    """Return a locked descriptor of the current file at `path`."""
     while True:
         descriptor = open_in_place(path, os.O_RDWR | os.O_CREAT, 0o644)
         try:
@@ -93,7 +96,7 @@ def _acquire(path: Path) -> tuple[int, list[str]]:
             ]
         if _is_at(descriptor, path):
             return descriptor, []
-        os.close(descriptor)  # its holder ended, and removed it, between the two calls
+        os.close(descriptor)  # its owner ended, and deleted it, between the two calls
 
 
 def _is_at(descriptor: int, path: Path) -> bool:
@@ -104,7 +107,7 @@ def _is_at(descriptor: int, path: Path) -> bool:
 
 
 def _describe(text: bytes) -> str:
-    """Return who wrote a lock file."""
+    """Return the process that wrote a lock file, in words."""
     try:
         holder: Any = json.loads(text)
         return one_line(

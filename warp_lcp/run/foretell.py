@@ -21,24 +21,24 @@ from warp_lcp.scene.scene import Scene
 from warp_lcp.simulation import Cells, Part, Points, Simulation
 
 MANY_FRAMES = 10_000
-PIECE = 0.5  # of a step that a frame cuts off
-FULL = 0.98  # of the cells: what solids fill is a mistake, most often an inverted shape
-BURIED = 0.5  # of a material's points: less than that is how one fills a vessel
-LOG_BYTES = 14  # an entry
-FRAME_SECONDS = 3e-3  # of a core, of a frame however small
-BYTE_SECONDS = 2.5e-9  # of a core
-ROW_SECONDS = 0.8e-3  # beside a step: how long it may be, its row of the log
+PIECE = 0.5  # mean part of a step that the end of a frame cuts off
+FULL = 0.98  # fraction of cells in solids that is suspicious, most often an inverted shape
+BURIED = 0.5  # fraction of a material's points in solids; less is normal for material in a vessel
+LOG_BYTES = 14  # per entry
+FRAME_SECONDS = 3e-3  # per frame, on one core
+BYTE_SECONDS = 2.5e-9  # per byte, on one core
+ROW_SECONDS = 0.8e-3  # per step, besides the simulation: time step and log row
 
 
 def foretold(
     scene: Scene, simulation: Simulation, seconds: float | None = None
 ) -> list[tuple[str, str]]:
-    """Return estimates of steps, run time and disk use, as pairs of a word and a line.
+    """Return estimates of steps, run time and disk use, as pairs of word and line.
 
     Args:
-        scene: what would run.
-        simulation: where it begins.
-        seconds: a step, as measured; None: by the list of prices.
+        scene: the scene.
+        simulation: the simulation at its start.
+        seconds: measured time of a step; that of the cost table if None.
     """
     where = "as measured"
     if isinstance(scene, ParticleScene) and isinstance(simulation, ParticleSimulation):
@@ -62,7 +62,7 @@ def foretold(
 
 
 def in_words(size: float) -> str:
-    """Return a number of bytes in the largest unit of which there is one."""
+    """Return a number of bytes in the largest suitable unit."""
     unit = next((n for n in range(4, 2, -1) if size >= 1000.0**n), 2)
     return f"{size / 1000.0**unit:.3g} {('MB', 'GB', 'TB')[unit - 2]}"
 
@@ -73,7 +73,7 @@ def expected_step(scene: ParticleScene, simulation: ParticleSimulation) -> float
     For the mean amount of material in the run.
     """
     growth = expected_growth(scene)
-    # a grid that follows grows, too
+    # The grid window grows with the material.
     cells = min(round(math.prod(simulation.grid.counts) * growth), math.prod(scene.cell_counts))
     listed, particles = (
         prices(scene.scene.simulator, scene.dimension),
@@ -85,7 +85,7 @@ def expected_step(scene: ParticleScene, simulation: ParticleSimulation) -> float
 def expected_growth(scene: ParticleScene) -> float:
     """Return the mean amount of material in a run relative to the start.
 
-    Inflow is taken as even; half of it may leave.
+    Inflow is assumed to be uniform, and half of it to leave.
     """
     leaves = bool(scene.drain or scene.domain.open)
     most, first = scene.particle_estimate(), max(scene.particle_estimate(later=False), 1)
@@ -95,12 +95,12 @@ def expected_growth(scene: ParticleScene) -> float:
 def expected_speed(scene: ParticleScene, simulation: ParticleSimulation) -> float:
     """Return the speed that limits the steps of a run [m/s].
 
-    Of the material at the start, sources, solids, and a fall under gravity.
+    The largest of the initial material, sources, solids, and a fall under gravity.
     """
     totals, g = simulation.particles.totals(), float(np.linalg.norm(simulation.gravity))
     parts, end = (simulation.boundary, simulation.sources), scene.time.duration
     solids, sources = (0.0 if part is None else part.top_speed(0.0, end) for part in parts)
-    # to the floor
+    # To the floor.
     falls = [
         float(bounds[0][1])
         for source in scene.source
@@ -114,7 +114,10 @@ def expected_speed(scene: ParticleScene, simulation: ParticleSimulation) -> floa
 
 
 def _fall(scene: ParticleScene, simulation: ParticleSimulation) -> float:
-    """Return the work of gravity on the material's top until all lies level on the floor, and along other axes until the wall [J/kg]."""
+    """Return the work of gravity on the material's top [J/kg].
+
+    Along y until all material lies level on the floor, along other axes until the wall.
+    """
     totals, gravity, size = simulation.particles.totals(), simulation.gravity, scene.domain.size
     if totals.count == 0:
         return 0.0
@@ -130,19 +133,19 @@ def _fall(scene: ParticleScene, simulation: ParticleSimulation) -> float:
 
 
 def expected_steps(scene: ParticleScene, simulation: ParticleSimulation) -> int:
-    """Return about how many steps a run will take."""
+    """Return the estimated number of steps of a run."""
     time, dx, g = scene.time, simulation.grid.spacing, float(np.linalg.norm(simulation.gravity))
     speed = expected_speed(scene, simulation) + math.sqrt(time.cfl * g * dx)
-    # which surface tension may bound
+    # Surface tension may limit the step.
     stable = min(time.cfl * dx / speed if speed > 0.0 else math.inf, simulation.stable_dt())
     longest = min(max(stable, time.dt_min), time.dt_max)
-    # whole steps: at one speed the next number, over a run's speeds half a step more
+    # Steps per frame are rounded up: by half a step on average over a run's speeds.
     a_frame = time.duration / time.frame_count / longest
     return round(time.frame_count * max(a_frame + PIECE * min(a_frame, 1.0), 1.0))
 
 
 def longest_steps(scene: Scene, simulation: Simulation) -> int:
-    """Return the number of steps if all are as long as the first may be."""
+    """Return the number of steps if all are as long as the first one."""
     dt = min(max(simulation.stable_dt(), scene.time.dt_min), scene.time.dt_max)
     count = scene.time.frame_count
     return count * math.ceil(scene.time.duration / count / dt * (1.0 - 1e-9))
@@ -162,7 +165,7 @@ def expected_bytes(scene: Scene, simulation: Simulation, steps: int) -> int:
 
 
 def _grown(part: Part, factor: float) -> Part:
-    """Return points or cells of so many times as much material; other parts as they are."""
+    """Return points or cells scaled to more material; other parts unchanged."""
     if not isinstance(part, (Points, Cells)) or factor == 1.0:
         return part
     count = len(part.points) if isinstance(part, Points) else len(part.index)

@@ -24,15 +24,15 @@ def gaps(
 ) -> list[str]:
     """Return a line for each kind of files with gaps, with a remedy.
 
-    Checkpoints that the remedy needs are spared.
+    Checkpoints that the remedy needs are kept.
 
     Args:
-        logs: the columns of log.csv and of the tables beside it.
+        logs: columns of log.csv and of the tables beside it.
         frames: the run's frames.
         checkpoints: the run's checkpoints.
-        step: that the run goes on from.
-        times: of the frames up to there, beginning with frame 0 [s].
-        frame: as the run would write it now.
+        step: step from which the run continues.
+        times: times of the frames up to there, beginning with frame 0 [s].
+        frame: the parts of a frame of this run.
 
     Raises:
         OutputError: the log has other columns.
@@ -84,7 +84,10 @@ def _precedes(first: int, step: int, time: float) -> bool:
 
 
 def _again(checkpoints: CheckpointFolder, is_before: Callable[[int, float], bool]) -> str:
-    """Return how to have again what is missing, given what tells whether a checkpoint's step and time are before it."""
+    """Return how to recompute missing output.
+
+    `is_before` tells whether a checkpoint's step and time are before it.
+    """
     steps = checkpoints.steps()
     for newer, step in pairwise(steps):
         try:

@@ -18,18 +18,18 @@ from warp_lcp.scene.scene_file import (
     scene_value,
 )
 
-# `set`: what was given, `file`: the value that the scene's file had, if that was looked at
+# `set`: the override, `file`: the value in the scene's file, if it was read.
 Overrides = list[dict[str, str]]
 
 
 @dataclass(frozen=True)
 class GivenScene:
-    """A scene and where it differs from its file.
+    """Scene and its differences from its file.
 
     Args:
-        scene: what to run.
-        overrides: for run.json, so that a run that goes on keeps them.
-        kept: those of them that earlier parts of the run were given.
+        scene: the scene.
+        overrides: overrides for run.json, which a resumed run applies again.
+        kept: overrides from earlier parts of the run.
     """
 
     scene: Scene
@@ -41,54 +41,57 @@ def given_scene(source: SceneSource, overrides: Sequence[str]) -> GivenScene:
     """Return the scene of a new run.
 
     Args:
-        source: as of `load_scene`.
-        overrides: as of `load_scene`.
+        source: see `load_scene`.
+        overrides: see `load_scene`.
 
     Raises:
-        SceneError: listing everything that is wrong.
+        SceneError: lists all errors.
     """
     return GivenScene(load_scene(source, overrides), _noted(source, overrides))
 
 
 def scene_to_resume(folder: Path, source: str | None, overrides: Sequence[str]) -> GivenScene:
-    """Return the scene of a run that goes on.
+    """Return the scene of a resumed run.
 
-    It is the folder's own one, or `source` as it is now with what `--set` has changed since the run
-    began; where the file has a value that it did not have then, somebody has edited it, and that
-    counts. `overrides` count last.
+    It is the folder's own scene, or the current `source` with the overrides since the run began. If
+    a value in the file has changed since then, it was edited, and the edited value is used.
+    `overrides` are applied last.
 
     Args:
-        folder: of the run.
-        source: as of `load_scene`; None: the folder's own scene.
-        overrides: as of `load_scene`.
+        folder: folder of the run.
+        source: see `load_scene`; the folder's own scene if None.
+        overrides: see `load_scene`.
 
     Raises:
-        OutputError: there is no run, or its grid would become another one without being asked for.
-        SceneError: listing everything that is wrong.
+        OutputError: there is no run, or its grid would change without an explicit request.
+        SceneError: lists all errors.
     """
     if not holds_run(folder):
         raise OutputError(f"{folder}: there is no run to resume")
-    own, asked = folder / SCENE, [override_key(override) for override in overrides]
-    before = [entry for entry in _recorded(folder) if override_key(entry["set"]) not in asked]
+    own, new_keys = folder / SCENE, [override_key(override) for override in overrides]
+    before = [entry for entry in _recorded(folder) if override_key(entry["set"]) not in new_keys]
     if source is None or (own.is_file() and Path(source).is_file() and own.samefile(source)):
         return GivenScene(
             load_scene(own, overrides), [*before, *({"set": override} for override in overrides)]
         )
 
-    kept = [entry["set"] for entry in before if not _edited(entry, source)]
-    scene = load_scene(source, [*kept, *overrides])
+    earlier = [entry["set"] for entry in before if not _edited(entry, source)]
+    scene = load_scene(source, [*earlier, *overrides])
     ran, now = (recorded_keys(own) or {}).get(RESOLUTION), keys(scene)[RESOLUTION]
-    if ran not in (None, now) and RESOLUTION not in asked:
+    if ran not in (None, now) and RESOLUTION not in new_keys:
         raise OutputError(
             f"{folder}: {RESOLUTION} is {ran}, but {now} in {source}: use --set {RESOLUTION}={now} "
             "to resample to the other grid, "
             f"or --set {RESOLUTION}={ran} to keep the grid"
         )
-    return GivenScene(scene, _noted(source, [*kept, *overrides]), kept)
+    return GivenScene(scene, _noted(source, [*earlier, *overrides]), earlier)
 
 
 def _edited(entry: Mapping[str, str], source: str) -> bool:
-    """Return whether the scene's file has another value than when it was overridden, and not the one that it was overridden by."""
+    """Return whether the file's value was edited since it was overridden.
+
+    A value equal to the override does not count.
+    """
     return "file" in entry and scene_value(source, entry["set"]) not in (
         entry["file"],
         override_value(entry["set"]),
@@ -100,5 +103,5 @@ def _noted(source: SceneSource, overrides: Sequence[str]) -> Overrides:
 
 
 def _recorded(folder: Path) -> Overrides:
-    """Return what run.json says of the overrides; nothing if it cannot be read."""
+    """Return the overrides in run.json; empty if it cannot be read."""
     return [entry for entry in read_record(folder).get("overrides", []) if "set" in entry]

@@ -12,38 +12,38 @@ from collections.abc import Callable, Sequence
 from types import FrameType, TracebackType
 from typing import Any, Self
 
-# batch systems send those of the user's, too
+# Batch systems also send the user signals.
 ENDING = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGUSR1", "SIGUSR2", "SIGXCPU")
 SIGNALS = tuple(number for number in signal.Signals if number.name in ENDING)
 OVER = b"\0"
-GRACE = 1.0  # seconds that native code may take before a process that has nothing to lose is ended
+GRACE = 1.0  # seconds for native code to return before a process without results is ended
 FAILED = 1
 
 
 class Interrupted(KeyboardInterrupt):
-    """A signal came before the first step had ended; the text is its name."""
+    """A signal arrived before the end of the first step; the text is its name."""
 
 
 class Interruption:
     """Context in which signals stop a run.
 
-    Called after each step, it returns the name of the signal, "" if none.
+    Called after each step, it returns the name of the signal, "" without one.
 
-    Until it is called first there is nothing to lose, and much to wait for, as kernels are
-    compiled: there a signal raises `Interrupted`. Python hands a signal on only once the compiler
-    is back, which may take many seconds, so a thread of its own says at once that it has come, and
-    ends the process, if asked to, when it is not handed on soon. What ignores a signal, as nohup
-    does SIGHUP, goes on ignoring it. A second Ctrl-C does not wait for the step's end.
+    Before the first call no result can be lost, and the compilation of kernels may take long: there
+    a signal raises `Interrupted`. Python handles a signal only after the compiler has returned,
+    which may take many seconds. A separate thread therefore reports the signal at once and, if
+    `last` is given, ends the process when Python does not handle it soon. Ignored signals, such as
+    SIGHUP under nohup, stay ignored. A second Ctrl-C does not wait for the end of the step.
 
     Args:
-        say: takes a line for the user.
-        at_once: raise before the first step has ended; ranks, which wait for each other, do not.
-        last: called with the signal's name before a process that compiles is ended; None: it is not
-            ended.
-        signals: which of them.
+        say: gets a line for the user.
+        at_once: raise before the end of the first step; not on ranks, which wait for each other.
+        last: called with the signal's name before a process in a compiler is ended; None: the
+            process is not ended.
+        signals: names of the signals.
     """
 
-    name: str  # of the signal that came first; "" if none
+    name: str  # name of the first signal; "" without one
 
     def __init__(
         self,
@@ -59,7 +59,7 @@ class Interruption:
         self._previous: dict[signal.Signals, Any] = {}
 
     def __call__(self) -> str:
-        """Return the name of the signal that came first."""
+        """Return the name of the first signal."""
         self._early = False
         return self.name
 
@@ -71,7 +71,7 @@ class Interruption:
         self._thread = threading.Thread(target=self._announce, name="signals", daemon=True)
         self._thread.start()
         for number in self._signals:
-            # None: a handler that Python has not installed and cannot restore
+            # None is a handler that Python has not installed and cannot restore.
             if signal.getsignal(number) not in (signal.SIG_IGN, None):
                 self._previous[number] = signal.signal(number, self._take)
         return self
@@ -92,7 +92,7 @@ class Interruption:
 
     def _take(self, given: int, frame: FrameType | None) -> None:
         number = signal.Signals(given)
-        # SIGTERM may come several times, to the process and to its group
+        # SIGTERM may arrive several times, for the process and for its group.
         if number == signal.SIGINT:
             signal.signal(number, self._previous[number])
         self._taken.set()
@@ -102,7 +102,7 @@ class Interruption:
                 raise Interrupted(number.name)
 
     def _announce(self) -> None:
-        """Say which signal has come, once."""
+        """Report the signal, once."""
         while (given := os.read(self._read, 1)) != OVER:
             number = signal.Signals(given[0])
             if number not in self._previous:
@@ -115,8 +115,7 @@ class Interruption:
             )
             if early and self._last is not None and not self._taken.wait(GRACE):
                 self._last(number.name)
-                # nothing less ends a compiler; no step is lost, and no file that counts is
-                # half-written
+                # Nothing else ends a compiler; no step is lost, and no result file is half-written.
                 os._exit(FAILED)
             while os.read(self._read, 1) != OVER:
                 pass

@@ -23,7 +23,7 @@ class KernelCacheError(OSError):
 def watch_loads() -> None:
     """Check the files of a kernel module before Warp first loads it.
 
-    Warp loads damaged files and then fails.
+    Warp would load damaged files and fail.
     """
     load = wp.Module.load
     if hasattr(load, "__wrapped__") or not hasattr(wp.Module, "get_module_identifier"):
@@ -33,7 +33,7 @@ def watch_loads() -> None:
     def checked(
         module: wp.Module, device: Any, block_dim: int | None = None, *more: Any, **options: Any
     ) -> Any:
-        if module.execs:  # as at every launch but the first
+        if module.execs:  # as in all launches after the first
             return load(module, device, block_dim, *more, **options)
         try:
             mend(
@@ -78,7 +78,10 @@ def mend(folder: Path) -> bool:
 
 
 def _damaged(file: Path) -> bool:
-    """Return whether a file is cut short, empty or of zeros; what is wrong within is not seen."""
+    """Return whether a file is truncated, empty or zero.
+
+    Other damage is not detected.
+    """
     if file.suffix not in (*BINARIES, ".meta"):
         return False
     if not file.is_file():
@@ -97,7 +100,7 @@ def _damaged(file: Path) -> bool:
 
 
 def _cut(data: bytes) -> bool:
-    """Return whether the table of sections, which is at the end of ELF files of 64 bits, is not there."""
+    """Return whether an ELF file (64 bits) lacks its section table at the end."""
     if len(data) < 64:
         return True
     (begin,) = struct.unpack_from("<Q", data, 0x28)

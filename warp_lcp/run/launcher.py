@@ -22,22 +22,22 @@ if TYPE_CHECKING:
 
 
 class Launcher:
-    """Carries out a command in this process alone.
+    """Launcher that runs a command in this process alone.
 
     Attributes:
-        console: takes messages; those of the root rank.
-        collective: of the ranks that share the work; None if this process has it alone.
+        console: console for messages; on ranks, for those of the root rank.
+        collective: collective operations of the ranks that share the work; None for one process.
     """
 
     collective: Collective | None = None
 
     def __init__(self, console: Terminal | None = None) -> None:
-        """Write messages to the error stream."""
+        """Create a launcher; without a console, messages go to the error stream."""
         self.console = console or Terminal(stderr=True)
 
     @property
     def is_root(self) -> bool:
-        """Whether this process tells the user what happens."""
+        """Whether this process prints messages."""
         return self.collective is None or self.collective.ranks.is_root
 
     @property
@@ -48,16 +48,16 @@ class Launcher:
     def load(
         self, scene: str | None, overrides: Sequence[str], options: Mapping[str, Any]
     ) -> GivenScene:
-        """Return the scene of a run, or of one that goes on.
+        """Return the scene of a new or resumed run.
 
         Args:
-            scene: as of `load_scene`; None: that of the folder.
-            overrides: as of `load_scene`.
-            options: of the command, by their names.
+            scene: see `load_scene`; that of the folder if None.
+            overrides: see `load_scene`.
+            options: options of the command, by name.
 
         Raises:
-            OutputError: there is no run to go on with.
-            SceneError: listing everything that is wrong.
+            OutputError: there is no run to resume.
+            SceneError: lists all errors.
         """
         out = options.get("--out")
         if not options.get("--resume"):
@@ -74,10 +74,10 @@ class Launcher:
         )
 
     def agree(self, given: Mapping[str, Any]) -> None:
-        """Check that all were given the same values, by their names.
+        """Check that all ranks have the same values, by name.
 
         Raises:
-            OutputError: they were not; the message names what differs.
+            OutputError: they differ; the message names the difference.
         """
 
     def choose_device(self, name: str | None) -> str:
@@ -89,10 +89,10 @@ class Launcher:
         return choose_device(name)
 
     def place(self, device: str) -> str:
-        """Return where the work is done, in words.
+        """Return the device in words.
 
         Args:
-            device: of this process.
+            device: device of this process.
         """
         return device
 
@@ -107,7 +107,7 @@ class Launcher:
         """Simulate a scene that `load` returned, as `run_scene` does.
 
         Raises:
-            OutputError: the folder cannot take the run.
+            OutputError: the folder cannot be used for the run.
             SceneError: the scene cannot be simulated.
         """
         return run_scene(
@@ -116,5 +116,5 @@ class Launcher:
 
 
 def default_folder(scene: Scene) -> Path:
-    """Return the folder of a scene's run where none is given."""
+    """Return the default folder of a scene's run."""
     return Path("out") / scene.scene.name

@@ -1,4 +1,4 @@
-"""log.csv: a row a time step."""
+"""Log of a run, log.csv: a row per time step."""
 
 from __future__ import annotations
 
@@ -17,15 +17,17 @@ Value = float | int | str | None
 
 
 class OutputError(InputError):
-    """The output folder cannot take the run. The message says why and what to do."""
+    """The output folder cannot be used for the run.
+
+    The message says why and what to do.
+    """
 
 
 class Log:
     """CSV file with a row per step.
 
-    A missing value is empty, never nan; every row is flushed at once.
-
-    The root rank writes it; methods are collective, so that a full disk ends all ranks.
+    A missing value is empty, never nan; every row is flushed at once. The root rank writes the
+    file; methods are collective, so that a full disk ends all ranks.
     """
 
     def __init__(
@@ -36,14 +38,14 @@ class Log:
         after_step: int | None = None,
         collective: Collective | None = None,
     ) -> None:
-        """Begin a log, or continue one.
+        """Create a log, or continue one.
 
         Args:
             path: the file.
             columns: all of its columns; the first is `step`.
-            after_step: continue an existing file behind this step; later rows, and a last row cut
-                short, are dropped.
-            collective: of the ranks that share the run.
+            after_step: continue an existing file after this step; later rows, and a truncated last
+                row, are dropped.
+            collective: collective operations of the ranks that share the run.
 
         Raises:
             OSError: the file cannot be written.
@@ -54,16 +56,20 @@ class Log:
 
     @on_root
     def _open(self, path: Path, columns: tuple[str, ...], after_step: int | None) -> None:
+        """Open the file for appending, after its header or the rows to keep."""
         header = ",".join(columns)
         lines = [header] if after_step is None else rows_until(path, header, after_step)
         write_text(path, "".join(f"{line}\n" for line in lines))
         opened = open_in_place(path, os.O_WRONLY | os.O_APPEND)
-        self._file: TextIO = open(opened, "a", buffering=1, encoding="utf-8", newline="")  # noqa: SIM115 - `close` closes it
+        # `close` closes the file.
+        self._file: TextIO = open(  # noqa: SIM115
+            opened, "a", buffering=1, encoding="utf-8", newline=""
+        )
         self._writer = csv.DictWriter(self._file, columns, lineterminator="\n")
 
     @on_root
     def append(self, row: Mapping[str, Value]) -> None:
-        """Write a row; columns that it lacks are empty.
+        """Write a row; missing columns are empty.
 
         Raises:
             OSError: the disk is full.
@@ -91,7 +97,7 @@ def _cell(value: Value) -> Value:
     if isinstance(value, bool):
         return int(value)
     if isinstance(value, float):
-        # float(): NumPy's scalars write themselves otherwise
+        # NumPy scalars would be formatted differently.
         return float(value) if math.isfinite(value) else None
     return value
 
@@ -99,21 +105,21 @@ def _cell(value: Value) -> Value:
 def rows_until(path: Path, header: str, step: int) -> list[str]:
     """Return the header of a log and its rows up to a step, in order.
 
-    Incomplete rows are left out.
+    Incomplete rows are omitted.
 
     Args:
-        path: the file; there may be none.
-        header: that it must have, unless it was cut even there.
-        step: the last one.
+        path: the file, which may be missing.
+        header: expected header; a truncated one is accepted.
+        step: the last step.
 
     Raises:
         OutputError: the file has other columns.
     """
     text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else f"{header}\n"
-    found, *rows = text.split("\n")[:-1] or [""]  # what no line break ends was cut
+    found, *rows = text.split("\n")[:-1] or [""]  # a line without a line break was truncated
     if found != header and (rows or not header.startswith(found)):
         raise OutputError(f"{path}: its columns are {found!r}, this run's are {header!r}")
-    kept, last = [header], 0
+    lines, last = [header], 0
     for row in rows:
         number = row.split(",", 1)[0]
         if (
@@ -121,6 +127,6 @@ def rows_until(path: Path, header: str, step: int) -> list[str]:
             and number.isdecimal()
             and last < int(number) <= step
         ):
-            kept.append(row)
+            lines.append(row)
             last = int(number)
-    return kept
+    return lines

@@ -47,7 +47,7 @@ from warp_lcp.simulation import (
     Volume,
 )
 
-# of a frame's interval: what rounding leaves between a step's end and the frame it was cut for
+# Relative to the interval of frames: rounding of the time at the end of a frame.
 SAME_TIME = 1e-9
 SPACE_MARGIN = 1.1
 
@@ -57,17 +57,17 @@ class RunRequest:
     """Options of a run, as of `warp-lcp run`.
 
     Args:
-        scene: what to simulate, the same on all ranks.
-        out: the run's folder, which all ranks see; None: nothing is written.
-        device: a Warp device, such as `cuda:0`; of this rank.
-        overrides: by which the scene differs from its file, for run.json, see
+        scene: the scene, the same on all ranks.
+        out: the run's folder, visible to all ranks; no files are written if None.
+        device: Warp device of this rank, such as `cuda:0`.
+        overrides: differences of the scene from its file, for run.json, see
             `warp_lcp.run.given_scene`.
-        last_frame: end after this frame; the scene's last one without it.
-        resume: continue the run in the folder, which may have had another number of ranks.
+        last_frame: frame after which the run ends; default: the scene's last one.
+        resume: continue the run in the folder, from any number of ranks.
         force: delete the run in the folder.
-        force_memory: run even what will not fit into the device's free memory.
-        record_problems: folder that takes the problem of each step, see
-            `warp_lcp.gallery.recorded`; not on ranks.
+        force_memory: run even if the estimated memory exceeds the device's free memory.
+        record_problems: folder for the problem of each step, see `warp_lcp.gallery.recorded`; not
+            on ranks.
     """
 
     scene: Scene
@@ -89,9 +89,9 @@ def run_scene(
     profile: Profile | None = None,
     collective: Collective | None = None,
 ) -> RunRecord:
-    """Simulate a scene into a folder; collective where ranks share the run.
+    """Simulate a scene into a folder; collective if ranks share the run.
 
-    Arguments, what it returns and what it raises are those of `running_scene`.
+    Arguments, return value and errors are those of `running_scene`.
     """
     running = running_scene(
         request, observer=observer, stop=stop, profile=profile, collective=collective
@@ -113,26 +113,26 @@ def running_scene(
 ) -> Generator[RunLoop, None, RunRecord]:
     """Simulate a scene as far as frames are requested; collective on ranks.
 
-    Between frames the caller may change the simulation. Once the generator is closed, the run ends
-    as one that was stopped.
+    Between frames the caller may change the simulation. When the generator is closed, the run ends
+    as a stopped run.
 
     Args:
-        request: what is asked for.
-        observer: learns of every step.
-        stop: asked after every step; True, or what it is interrupted by, ends the run with a
-            checkpoint, on any rank.
+        request: options of the run.
+        observer: observer of every step.
+        stop: called after every step; True, or the name of a signal, on any rank ends the run with
+            a checkpoint.
         profile: measures the run's stages; written to profile.json at the end.
-        collective: of the ranks that share the run; None: this process has it alone.
+        collective: collective operations of the ranks that share the run; None for one process.
 
     Yields:
-        The loop before it begins, and again at each frame of this run, with the simulation as the
-        frame shows it.
+        The loop before the first step, and again at each frame of this run, with the simulation in
+        the state of the frame.
 
     Returns:
-        How the run ended, as in run.json.
+        The record of the run, as in run.json.
 
     Raises:
-        OutputError: the folder cannot take the run; on all ranks, as everything here.
+        OutputError: the folder cannot be used for the run; on all ranks, like all errors here.
         SceneError: the scene cannot be simulated, or not on ranks.
     """
     scene, everyone = request.scene, collective or Collective.of_one()
@@ -192,7 +192,10 @@ def _simulation(
     collective: Collective | None,
     continued: Continuation | None,
 ) -> tuple[Simulation, list[str]]:
-    """Return the simulation where the run begins or goes on, or this rank's part of it, and what it has to say."""
+    """Return the simulation at the start of the run, and its remarks.
+
+    On ranks, this rank's part; a resumed run starts from its checkpoint.
+    """
     scene, notes = request.scene, list[str]()
     simulation = start(scene, request.device, collective.ranks if collective else None)
     try:
@@ -211,10 +214,10 @@ def _simulation(
 def _go_on(
     simulation: Simulation, folder: RunFolder, continued: Continuation, *, on_ranks: bool
 ) -> list[str]:
-    """Continue from a checkpoint; return what the user should know of it.
+    """Continue from a checkpoint; return remarks for the user.
 
     Raises:
-        ValueError: the simulation cannot.
+        ValueError: the simulation cannot continue from it.
     """
     assert continued.checkpoint is not None
     state, name, other_grid = (
@@ -245,7 +248,7 @@ def _go_on(
 
 
 def _record_problems(simulation: Simulation, scene: Scene, folder: Path, *, more: bool) -> None:
-    """Have a simulation write the problem of each step into a folder."""
+    """Let a simulation write the problem of each step into a folder."""
     if not isinstance(simulation, Recorded):
         raise OutputError(
             f"--record-problems: the simulator {scene.scene.simulator} has no problems to record"
@@ -259,14 +262,14 @@ def _record_problems(simulation: Simulation, scene: Scene, folder: Path, *, more
 
 
 class RunLoop:
-    """A simulation on its way through its frames.
+    """Time loop of a simulation over its frames.
 
     Args:
-        simulation: where it begins or goes on.
-        folder: takes the output, and knows the scene.
-        record: says how the run ends.
-        observer: learns of every step.
-        profile: measures the stages.
+        simulation: the simulation at the start of the run.
+        folder: folder for the output, with the scene.
+        record: record of the run.
+        observer: observer of every step.
+        profile: timer of the stages.
     """
 
     def __init__(
@@ -277,7 +280,7 @@ class RunLoop:
         observer: Observer,
         profile: Profile | None,
     ) -> None:
-        """Take over a simulation; nothing is written yet."""
+        """Store the simulation and the settings; nothing is written yet."""
         scene = folder.scene
         self.time = scene.time
         self.output = scene.output
@@ -290,20 +293,20 @@ class RunLoop:
         if isinstance(simulation, Profiled):
             simulation.watch = self.watch
         self.writer = folder.frame_writer(self.watch)
-        # what only this process knows holds for the run if it does on some rank
+        # Facts that one process knows hold for the run if they do on any rank.
         self._somewhere = folder.collective.ranks.any
-        # whose surfaces are part of every frame
+        # Surfaces of bodies are part of every frame.
         self._has_bodies = any(solid.is_body for solid in scene.solid)
         self._begun = clock.perf_counter()
         self._first_step = 0
         self._below_dt_min = False
-        # the frame of the time that a resumed run goes on from, which is not there
+        # Whether the frame at the time of the checkpoint is missing.
         self._owes = False
-        # what solves left that missed their tolerance, and in which step
+        # Residuals of solves that missed their tolerance, and their steps.
         self._missed: list[tuple[float, int]] = []
         self._tolerance = scene.solver.tolerance
-        self._tables: dict[str, Log] = {}  # beside the log
-        self._checkpointed: int | None = None  # the newest checkpoint's step
+        self._tables: dict[str, Log] = {}  # tables besides the log
+        self._checkpointed: int | None = None  # step of the newest checkpoint
         self._checkpoint_time = clock.monotonic()
 
     def execute(
@@ -315,7 +318,7 @@ class RunLoop:
         start = self._frame()
         self._check_space(last, start)
         try:
-            # what is caught here was raised on all ranks
+            # Errors caught here were raised on all ranks.
             with self.folder.collective.together(), ExitStack() as stack:
                 stack.enter_context(self.writer)
                 log = stack.enter_context(
@@ -326,22 +329,22 @@ class RunLoop:
                 try:
                     stopped = yield from self._advance(log, last, stop, resumed=resumed)
                 except GeneratorExit:
-                    # nobody asks for more frames; the state is that of the last one
+                    # No more frames are requested; the state is that of the last one.
                     stopped = f"stopped by the program after frame {self._frames_done()}"
                 self._write_checkpoint(log)
             self.record.status = "stopped" if stopped else "finished"
             self.record.reason = stopped or f"frame {last} of {count} reached"
-        except Interrupted as error:  # the checkpoint before the first step is there
+        except Interrupted as error:  # the checkpoint before the first step exists
             self.record.status, self.record.reason = "stopped", f"interrupted by {error} {BEFORE}"
         except (StepFailed, SimulationFailed) as error:
             self._fail(str(error))
             self._try_to(self.writer.flush)
-            if isinstance(error, StepFailed):  # the state is as before the step
+            if isinstance(error, StepFailed):  # the state is that before the step
                 self._try_to(self._write_checkpoint)
         except OSError as error:
             full = "the disk is full: " if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
             self._fail(f"{full}{error}; files written before are intact")
-        except Exception as error:  # it is raised again
+        except Exception as error:  # raised again below
             self._fail(
                 str(error) if isinstance(error, RankFailed) else f"{type(error).__name__}: {error}"
             )
@@ -356,11 +359,12 @@ class RunLoop:
         return self.record
 
     def _check_space(self, last: int, frame: list[Part]) -> None:
+        """Raise an error if the output of the remaining frames does not fit."""
         if not self.folder.keeps:
             return
         frames = max(0, last - self._frames_done() + 1)
         state = sum(array.nbytes for array in self.simulation.state().values())
-        states = self.output.checkpoints_kept + 1  # the one being written too
+        states = self.output.checkpoints_kept + 1  # with the one that is being written
         output = self.output
         each = frame_bytes(
             frame, output.grid_format, surface_ply=output.surface_ply, frame_format=output.format
@@ -368,20 +372,20 @@ class RunLoop:
         self.folder.check_space(int(SPACE_MARGIN * (each * frames + states * state)))
 
     def _start(self, last: int, frame: list[Part]) -> Log:
-        """Write what there is before the first step."""
+        """Write the output before the first step."""
         self.folder.start(self.record)
         with ExitStack() as stack:
             log = stack.enter_context(closing(self.folder.open_log(self._columns())))
             self._write_frame(0, last, frame)
-            self._write_checkpoint(log)  # so that a run can be continued from its first moment on
+            self._write_checkpoint(log)  # so that a run can always be continued
             stack.pop_all()
         return log
 
     def _resume(self, last: int, frame: list[Part]) -> Log:
-        """Take back what an interrupted run wrote after its checkpoint, and tell what is missing of what it wrote before.
+        """Remove output after the checkpoint, and report missing output before it.
 
-        A run that failed between a step and the frame at its end, in a callback for instance, still
-        owes that frame: the checkpoint is of its time, so it is written now.
+        A run that failed between a step and the frame at its end, for instance in a callback, lacks
+        that frame: the checkpoint has its time, so it is written now.
         """
         self.record.frames = done = self._frames_done()
         self._first_step = self.simulation.step_count
@@ -406,7 +410,7 @@ class RunLoop:
         return log
 
     def _open_tables(self, stack: ExitStack, after_step: int | None) -> None:
-        """Begin or continue the tables beside the log, to be closed by a stack."""
+        """Open the tables beside the log; a stack closes them."""
         for name, columns in self._table_columns().items():
             self._tables[name] = stack.enter_context(
                 closing(self.folder.open_log(columns, after_step=after_step, table=name))
@@ -421,7 +425,10 @@ class RunLoop:
     def _advance(
         self, log: Log, last: int, stop: Callable[[], bool | str], *, resumed: bool
     ) -> Generator[RunLoop, None, str]:
-        """Step until the last frame is written; return why the run stopped before, "" if it did not."""
+        """Step until the last frame is written; return the reason of an early stop.
+
+        "" if the run did not stop early.
+        """
         frame = self._frames_done() + 1
         if not resumed or self._owes:
             yield self
@@ -450,11 +457,14 @@ class RunLoop:
 
     @contextmanager
     def _keeping_step(self, log: Log) -> Iterator[None]:
-        """Give the time after a step: what goes wrong there, on any rank, leaves a checkpoint of it where the disk allows."""
+        """Context after a step: on an error on any rank, write a checkpoint.
+
+        It is written if the disk allows.
+        """
         try:
             with self.folder.collective.together():
                 yield
-        except (Exception, KeyboardInterrupt) as error:  # it is raised again
+        except (Exception, KeyboardInterrupt) as error:  # raised again below
             self._try_to(partial(self._write_checkpoint, log))
             if isinstance(error, KeyboardInterrupt):
                 self.record.status, self.record.reason = (
@@ -464,7 +474,7 @@ class RunLoop:
             raise
 
     def _interrupted(self, asked: bool | str) -> str:
-        """Return by what some rank was asked to stop."""
+        """Return the stop request of any rank."""
         names = [
             name if isinstance(name, str) else "" for name in self.folder.collective.exchange(asked)
         ]
@@ -476,11 +486,11 @@ class RunLoop:
         )
 
     def _step(self, end: float) -> dict[str, Value]:
-        """Take a step towards a time [s] and return its row of the log."""
+        """Run a step toward a time [s] and return its log row."""
         begun = clock.perf_counter()
         stable, number = stable_dt(self.simulation), self.simulation.step_count + 1
         if stable < self.time.dt_min and not self._below_dt_min:
-            self._below_dt_min = True  # once is enough: the log's column cfl has the rest
+            self._below_dt_min = True  # one warning is enough: the log column cfl has the rest
             self._warn(
                 f"step {number}: the longest stable step is {stable:.3g} s, less than time.dt_min; "
                 "steps may be unstable"
@@ -497,14 +507,17 @@ class RunLoop:
         }
 
     def _is_frame_time(self, index: int) -> bool:
-        """Return whether the simulation is at the time of a frame, so that it shows what the frame does."""
+        """Return whether the simulation is at the time of a frame."""
         return (
             abs(self.simulation.time - self.time.frame_time(index))
             <= SAME_TIME / self.time.frames_per_second
         )
 
     def _frames_done(self) -> int:
-        """Return the number of the newest frame whose time is reached; it follows from the time alone."""
+        """Return the number of the newest frame whose time is reached.
+
+        It depends on the time only.
+        """
         interval = 1.0 / self.time.frames_per_second
         reached = self.simulation.time + SAME_TIME * interval
         frame = min(int(reached / interval), self.time.frame_count)
@@ -515,7 +528,7 @@ class RunLoop:
         return frame
 
     def _frame(self) -> list[Part]:
-        """Return what the scene wants to see of the simulation now."""
+        """Return the parts of a frame that the scene requests."""
         output = self.output
         if not self.folder.keeps or not (
             output.particles or output.grid or output.surface or output.volume or self._has_bodies
@@ -539,11 +552,13 @@ class RunLoop:
         )
 
     def _write_checkpoint(self, log: Log | None = None, *, beside: bool = False) -> None:
-        """Write a checkpoint unless there is one of this step; what a run that continues from it expects is on the disk before.
+        """Write a checkpoint unless there is one of this step.
+
+        All output that a resumed run expects is written to disk before.
 
         Args:
-            log: of the run.
-            beside: the run goes on meanwhile.
+            log: log of the run.
+            beside: write while the run continues.
         """
         step = self.simulation.step_count
         if self._checkpointed == step or not self.folder.keeps:
@@ -577,7 +592,7 @@ class RunLoop:
         )
 
     def _count(self) -> None:
-        """Bring the record up to date."""
+        """Update the record."""
         if self.writer.newest is not None:
             self.record.frames = self.writer.newest
         self.record.steps, self.record.time = self.simulation.step_count, self.simulation.time
@@ -588,7 +603,7 @@ class RunLoop:
         self.folder.write_record(self.record)
 
     def _tell_missed(self) -> None:
-        """Say how many steps of this run's went on from a solve that had missed its tolerance."""
+        """Warn about steps of this run whose solve missed its tolerance."""
         if self._missed:
             (worst, step), steps = max(self._missed), self.simulation.step_count - self._first_step
             left = f": the worst, step {step}, left a residual of {worst:.1e}" * (worst > 0.0)
@@ -602,7 +617,7 @@ class RunLoop:
         self.record.reason = reason
 
     def _try_to(self, write: Callable[[], None]) -> None:
-        """Write after a failure; a disk that refuses that too is worth a warning, not another error."""
+        """Write a file after a failure; a further failure becomes a warning."""
         try:
             write()
         except OSError as error:

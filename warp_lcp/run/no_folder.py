@@ -1,4 +1,4 @@
-"""The folder of a run that writes nothing."""
+"""Run folder that writes nothing."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from warp_lcp.simulation import Part, Stopwatch
 
 
 class NoLog(Log):
-    """A log that keeps no row."""
+    """Log that discards its rows."""
 
     def __init__(self, columns: tuple[str, ...]) -> None:
         self.columns = columns
@@ -31,7 +31,7 @@ class NoLog(Log):
 
 
 class NoFrames:
-    """Frames that go nowhere."""
+    """Frame folder that discards its frames."""
 
     def write(self, index: int, time: float, frame: list[Part]) -> list[Path]:
         """Do nothing."""
@@ -39,10 +39,10 @@ class NoFrames:
 
 
 class NoFolder(RunFolder):
-    """The place of a run that writes nothing: of one process, and never resumed.
+    """Run folder that writes nothing; for one process, never resumed.
 
     Args:
-        scene: what runs.
+        scene: the scene of the run.
     """
 
     keeps = False

@@ -1,4 +1,4 @@
-"""The folder that a run records its pressure problems in."""
+"""Folder of the recorded pressure problems of a run."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ class ProblemError(InputError):
 
 
 class ProblemFolder:
-    """Files `problem_<step>.npz` and a README.md that says what they hold.
+    """Files `problem_<step>.npz`, and a README.md about their content.
 
     Args:
-        folder: where; made if it is not there.
-        more: whether there may be problems already, of a run that goes on.
+        folder: the folder, created if needed.
+        more: whether there may be problems already, of a resumed run.
 
     Raises:
-        OutputError: the folder cannot be written to, or holds another run's problems.
+        OutputError: the folder cannot be written, or holds another run's problems.
     """
 
     def __init__(self, folder: Path, *, more: bool = False) -> None:
-        """Make the folder and describe what will be in it."""
+        """Create the folder and its README.md."""
         self.folder = folder
         if not more and files(folder):
             raise OutputError(

@@ -17,8 +17,8 @@ from warp_lcp.rows.team import get_threads, shared_seconds
 from warp_lcp.run.terminal import table_lines
 
 PROFILE = "profile.json"
-KERNELS = "kernels, loaded"  # the stage of modules that Warp compiles, or finds compiled
-LOADED = re.compile(r"Module .* took ([0-9.]+) ms")  # what Warp says of each
+KERNELS = "kernels, loaded"  # stage of modules that Warp compiles or loads
+LOADED = re.compile(r"Module .* took ([0-9.]+) ms")  # message of Warp for each module
 
 
 @dataclass
@@ -26,13 +26,12 @@ class Stage:
     """Time and memory traffic of a stage.
 
     Args:
-        beside: it ran on a thread of its own.
-        calls: how often it was entered.
-        seconds: in all.
-        first_seconds: of the first call, which may allocate.
-        bytes: what it had to read or write at least: its arrays, each counted once a call, or its
-            files.
-        shared: seconds of it that all CPU threads worked on.
+        beside: whether it ran on another thread.
+        calls: number of calls.
+        seconds: total time.
+        first_seconds: time of the first call, which may allocate.
+        bytes: least memory traffic: its arrays, each counted once per call, or its files.
+        shared: part of `seconds` with all CPU threads at work.
     """
 
     beside: bool = False
@@ -43,19 +42,19 @@ class Stage:
     shared: float = 0.0
 
     def add(self, seconds: float) -> None:
-        """Count a call of so many seconds."""
+        """Add a call of some seconds."""
         self.first_seconds = self.first_seconds if self.calls else seconds
         self.calls += 1
         self.seconds += seconds
 
 
 class LoadedKernels:
-    """Warp logger that adds up compile and load times of kernels.
+    """Warp logger that sums compile and load times of kernels.
 
-    Other messages are passed on.
+    All messages are forwarded.
 
     Attributes:
-        loads: of modules.
+        loads: number of module loads.
     """
 
     def __init__(self) -> None:
@@ -63,12 +62,12 @@ class LoadedKernels:
         self._logger, self._level = wp.get_logger(), wp.config.log_level
 
     def debug(self, message: str) -> None:
-        """Pass a message on to the logger that was there before."""
+        """Forward a message to the previous logger."""
         if self._level <= wp.LOG_DEBUG:
             self._logger.debug(message)
 
     def info(self, message: str) -> None:
-        """Pass a message on, and count it if it tells of a module."""
+        """Forward a message, and count it if it reports a module."""
         if found := LOADED.search(message):
             self.loads.add(float(found[1]) * 1e-3)
         if self._level <= wp.LOG_INFO:
@@ -77,12 +76,12 @@ class LoadedKernels:
     def warning(
         self, message: str, category: type[Warning] | None = None, stacklevel: int = 1
     ) -> None:
-        """Pass a message on to the logger that was there before."""
+        """Forward a message to the previous logger."""
         if self._level <= wp.LOG_WARNING:
             self._logger.warning(message, category, stacklevel=stacklevel + 1)
 
     def error(self, message: str) -> None:
-        """Pass a message on to the logger that was there before."""
+        """Forward a message to the previous logger."""
         self._logger.error(message)
 
 
@@ -93,7 +92,7 @@ class Profile:
         device: a Warp device, such as `cuda:0`.
 
     Attributes:
-        stages: by name, in the order of their first calls.
+        stages: stages by name, in the order of their first calls.
     """
 
     def __init__(self, device: str) -> None:
@@ -103,7 +102,7 @@ class Profile:
 
     @contextmanager
     def kernels_apart(self) -> Iterator[None]:
-        """Count compile and load times of kernels as a stage of their own."""
+        """Count compile and load times of kernels as a separate stage."""
         kernels = LoadedKernels()
         self.stages[KERNELS] = self._loads = kernels.loads
         with wp.ScopedLogger(kernels), wp.ScopedLogLevel(min(wp.config.log_level, wp.LOG_INFO)):
@@ -129,7 +128,7 @@ class Profile:
 
     @contextmanager
     def beside(self, name: str) -> Iterator[None]:
-        """Measure what another thread does meanwhile."""
+        """Measure a stage on another thread."""
         begun = time.perf_counter()
         try:
             yield
@@ -137,17 +136,17 @@ class Profile:
             self.stages.setdefault(name, Stage(beside=True)).add(time.perf_counter() - begun)
 
     def wrote(self, name: str, *files: Path) -> None:
-        """Add the sizes of files to a stage; a file that is missing by now counts as 0."""
+        """Add the sizes of files to a stage; a missing file counts as 0."""
         for file in files:
             with suppress(FileNotFoundError):
                 self.stages[name].bytes += file.stat().st_size
 
     def table(self, steps: int, seconds: float) -> str:
-        """Return a table of the stages, and of what no stage accounts for.
+        """Return a table of the stages, and of the remaining time.
 
         Args:
-            steps: that the run took.
-            seconds: that it took.
+            steps: number of steps of the run.
+            seconds: time of the run.
         """
         rows = []
         for name, stage in self.stages.items():
@@ -187,9 +186,9 @@ class Profile:
         """Write profile.json.
 
         Args:
-            folder: of the run.
-            steps: that the run took.
-            seconds: that it took.
+            folder: folder of the run.
+            steps: number of steps of the run.
+            seconds: time of the run.
 
         Raises:
             OSError: the file cannot be written.
@@ -212,6 +211,10 @@ class Profile:
 def _figures(
     seconds: float, moved: int, steps: int, total: float
 ) -> tuple[str, str, str, str, str]:
+    """Return the figures of a stage as texts.
+
+    Time [s], share, time per step [ms], traffic per step [MB], speed [GB/s].
+    """
     each = max(steps, 1)
     speed = f"{moved / seconds / 1e9:.2f}" if moved and seconds > 0.0 else ""
     share = f"{seconds / total:.1%}" if total > 0.0 else ""

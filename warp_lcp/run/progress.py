@@ -18,27 +18,27 @@ from warp_lcp.problem.result import SolveStatus
 from warp_lcp.run.log import Value
 from warp_lcp.run.terminal import say
 
-# the first that a log has is the one that the scene's tolerance is of
+# The first of these columns in a log is the one that the scene's tolerance bounds.
 RESIDUALS = "coupled_residual", "solve_residual"
 CONVERGED = SolveStatus.CONVERGED.name
 LINE_EVERY = 5.0  # seconds between two lines of a count
-WINDOW = 20.0  # seconds of the recent past that the time left is judged by
+WINDOW = 20.0  # seconds of the recent past that the estimate uses
 
 
 class Observer(Protocol):
-    """Someone who watches a run."""
+    """Observer of a run."""
 
     def note(self, text: str) -> None:
-        """Take a remark that the user should see."""
+        """Receive a remark for the user."""
 
     def start(self, time: float, end: float) -> None:
-        """Learn the time [s] that the run begins and ends at."""
+        """Receive the start and end time [s] of the run."""
 
     def step(self, row: Mapping[str, Value]) -> None:
-        """Take a step's row of the log."""
+        """Receive a step's log row."""
 
     def frame(self, index: int, last: int) -> None:
-        """Learn that a frame is taken; its files follow."""
+        """Receive the number of a frame, before its files are written."""
 
 
 def time_left(progress: Progress) -> str:
@@ -51,11 +51,11 @@ def time_left(progress: Progress) -> str:
 
 
 class Lines:
-    """A plain line for each frame."""
+    """Progress as plain lines, one per frame."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
-        self._progress = Progress(console=console, speed_estimate_period=WINDOW)  # never shown
+        self._progress = Progress(console=console, speed_estimate_period=WINDOW)  # never displayed
         self._task = self._progress.add_task("", total=None)
         self._row: Mapping[str, Value] = {}
 
@@ -71,20 +71,20 @@ class Lines:
         """Do nothing."""
 
     def note(self, text: str) -> None:
-        """Write a remark on a line of its own."""
+        """Print a remark on a line of its own."""
         self._write(one_line(text))
 
     def start(self, time: float, end: float) -> None:
-        """Learn the time [s] that the run begins and ends at."""
+        """Store the start and end time [s] of the run."""
         _begin(self._progress, time, end)
 
     def step(self, row: Mapping[str, Value]) -> None:
-        """Remember a step's row of the log."""
+        """Store a step's log row."""
         self._row = row
         self._progress.update(self._task, completed=_number(row, "time"))
 
     def frame(self, index: int, last: int) -> None:
-        """Write a line with the frame, its time and the last step's numbers."""
+        """Print a line with the frame, its time and the last step's numbers."""
         self._write(
             f"frame {index}/{last}  t {_number(self._row, 'time'):.4g} s  {describe(self._row)}  "
             f"{time_left(self._progress)}"
@@ -97,11 +97,11 @@ class Lines:
 
 
 class Bar:
-    """A bar of simulated time, the last step's numbers and the time left."""
+    """Progress bar of simulated time, with the last step's numbers and time left."""
 
     def __init__(self, console: Console) -> None:
         text = TextColumn("{task.description}", table_column=Column(no_wrap=True))
-        # what the text leaves of the line
+        # The rest of the line.
         bar = BarColumn(bar_width=None, table_column=Column(ratio=1))
         percent = TaskProgressColumn(table_column=Column(no_wrap=True, width=4))
         self._console = console
@@ -130,11 +130,11 @@ class Bar:
         self._progress.stop()
 
     def note(self, text: str) -> None:
-        """Write a remark above the bar."""
+        """Print a remark above the bar."""
         say(self._console, one_line(text))
 
     def start(self, time: float, end: float) -> None:
-        """Learn the time [s] that the run begins and ends at."""
+        """Store the start and end time [s] of the run."""
         _begin(self._progress, time, end)
 
     def step(self, row: Mapping[str, Value]) -> None:
@@ -151,13 +151,13 @@ class Bar:
 class Count:
     """Counter of finished items: a changing line on a terminal, else plain lines.
 
-    Plain lines come every few seconds.
+    Plain lines are printed every few seconds.
 
     Args:
-        console: where it is told.
-        doing: what is done, `drawing`.
-        things: what there are so many of, `images`.
-        clock: tells seconds.
+        console: console for the lines.
+        doing: name of the work, such as `drawing`.
+        things: name of the items, such as `images`.
+        clock: returns seconds.
     """
 
     def __init__(
@@ -165,7 +165,7 @@ class Count:
     ) -> None:
         self._console, self._doing, self._things, self._clock = console, doing, things, clock
         self._status = console.status(doing)
-        # never shown
+        # Never displayed.
         self._progress = Progress(console=console, get_time=clock, speed_estimate_period=WINDOW)
         self._task = self._progress.add_task("", total=None)
 
@@ -180,11 +180,11 @@ class Count:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Leave nothing of the line that changes."""
+        """Clear the changing line."""
         self._status.stop()
 
     def __call__(self, done: int, of: int) -> None:
-        """Learn how many are done; the first call, with none, begins."""
+        """Update the number of finished items; the first call, with 0, starts."""
         if not done:
             _begin(self._progress, 0.0, of)
             self._told = self._clock()
@@ -199,12 +199,12 @@ class Count:
 
 
 def _begin(progress: Progress, time: float, end: float) -> None:
-    """Begin at a simulated time [s] that is to reach `end`."""
+    """Start the progress at a simulated time [s], up to `end`."""
     progress.reset(TaskID(0), total=end, completed=time)  # type: ignore[arg-type]
 
 
 def describe(row: Mapping[str, Value]) -> str:
-    """Return a step's numbers as a line; what the simulation does not log is left out."""
+    """Return a step's numbers as a line, without missing columns."""
     parts = [f"step {row['step']}", f"dt {_number(row, 'dt'):.2g} s"]
     if isinstance(row.get("solve_iterations"), int):
         parts.append(f"{row['solve_iterations']} iterations")
@@ -223,7 +223,7 @@ def residual_of(row: Mapping[str, Value]) -> float | None:
 
 
 def missed(row: Mapping[str, Value]) -> bool:
-    """Return whether a step's solve ended short of its tolerance."""
+    """Return whether a step's solve missed its tolerance."""
     return (row.get("solve_status") or CONVERGED) != CONVERGED
 
 

@@ -1,4 +1,4 @@
-"""Frames of several ranks: a piece per rank, and files that name all pieces."""
+"""Frames of several ranks: one part per rank, and files that list all parts."""
 
 from __future__ import annotations
 
@@ -13,34 +13,33 @@ from warp_lcp.frames.frames import FrameFolder, FrameWriter
 from warp_lcp.frames.pieces import WHOLE, Kind, Piece, describe, rank_folder, write_whole
 from warp_lcp.simulation import Cells, Part, Stopwatch, Volume
 
-Pieces = dict[str, Piece]  # of a rank, by their parts' names
+Pieces = dict[str, Piece]  # metadata of a rank's parts, by name
 
 
 class RankFrames:
     """Frames of a run on several ranks.
 
     `frames/rank_0003/<name>_<index>.vtu` (or .vti), and `frames/<name>_<index>.pvtu` (.pvti).
-
-    Volumes are whole, on one rank, and stand beside those.
+    Volumes are gathered on one rank, and stored beside those.
 
     Args:
-        whole: the folder of the run's frames.
-        collective: of the ranks.
+        whole: folder of the run's frames.
+        collective: collective operations of the ranks.
     """
 
     def __init__(self, whole: FrameFolder, collective: Collective) -> None:
-        """Look at a run's folder; nothing is written before the first frame."""
+        """Inspect a run's folder; nothing is written before the first frame."""
         self.whole, self.collective = whole, collective
         self.frames = whole.frames
         self.pieces = self.frames / rank_folder(collective.ranks.rank)
 
     def write(self, index: int, time: float, frame: list[Part]) -> list[Path]:
-        """Write the rank's pieces of a frame.
+        """Write this rank's parts of a frame.
 
         Args:
             index: the frame's number.
-            time: of the frame [s].
-            frame: what the rank has of it.
+            time: time of the frame [s].
+            frame: this rank's parts.
 
         Returns:
             Their files.
@@ -61,7 +60,7 @@ class RankFrames:
         self.whole.resume(times)
 
     def describe(self, frame: list[Part]) -> Pieces:
-        """Return the metadata of the rank's pieces.
+        """Return the metadata of this rank's parts.
 
         Raises:
             ValueError: a field has another length than its points or cells.
@@ -75,12 +74,12 @@ class RankFrames:
 
     @on_root
     def publish(self, index: int, time: float, pieces: list[Pieces]) -> None:
-        """Write the files of a whole frame, and add it to the collections; collective.
+        """Write the index files of a frame, and add it to the collections; collective.
 
         Args:
             index: the frame's number.
-            time: of the frame [s].
-            pieces: of every rank, whose files are there.
+            time: time of the frame [s].
+            pieces: metadata of every rank's parts, whose files exist.
 
         Raises:
             OSError: a file cannot be written.
@@ -102,16 +101,15 @@ class RankFrames:
 class RankFrameWriter:
     """Frame writer on each rank; errors of any rank are raised on all.
 
-    Its methods are collective.
-
-    A frame is published, as a whole and in order, when all ranks have written their pieces.
+    Its methods are collective. A frame is published, in order, when all ranks have written their
+    parts.
 
     Args:
-        frames: of the run.
-        watch: measures what this rank writes.
+        frames: frames of the run.
+        watch: measures the writes of this rank.
 
     Attributes:
-        newest: the number of the newest frame that is there as a whole.
+        newest: number of the newest published frame.
     """
 
     def __init__(self, frames: RankFrames, watch: Stopwatch) -> None:
@@ -124,7 +122,7 @@ class RankFrameWriter:
         self._waiting: deque[tuple[int, float, list[Pieces]]] = deque()
 
     def put(self, index: int, time: float, frame: list[Part]) -> None:
-        """Hand over a frame, as to `FrameWriter.put`; on all ranks.
+        """Queue a frame, see `FrameWriter.put`; collective.
 
         Raises:
             OSError: an earlier frame could not be written on some rank.
@@ -136,12 +134,12 @@ class RankFrameWriter:
         self._publish()
 
     def check(self) -> None:
-        """Raise what went wrong so far on any rank, without waiting for frames.
+        """Raise earlier errors of any rank, without waiting for frames.
 
         Raises:
             OSError: a frame could not be written.
         """
-        if self._waiting:  # as on every rank
+        if self._waiting:  # equal on all ranks
             with self._collective.together():
                 self._mine.check()
             self._publish()

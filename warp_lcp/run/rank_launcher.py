@@ -33,24 +33,23 @@ from warp_lcp.scene.table import written
 from warp_lcp.simulation import InputError, SimulationFailed, StepFailed
 
 PLANNED = (OSError, InputError, StepFailed, SimulationFailed)
-# how many processes mpiexec or srun has started, as it tells them
+# Environment variables of mpiexec or srun with the number of processes.
 SIZES = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "SLURM_STEP_NUM_TASKS")
-SHOWN = 4  # differences in one message
-# seconds in which a process that has done its part ends, while PETSc and MPI meet the others for
-# the last time
+SHOWN = 4  # differences shown in a message
+# Seconds for a process to exit at the end, while PETSc and MPI synchronize for the last time.
 PARTING = 60
 
 
 class RankLauncher(Launcher):
-    """Carries out a command on one of the ranks; every method is collective.
+    """Launcher that runs a command on all ranks; every method is collective.
 
     Args:
-        ranks: all of them.
-        rank_timeout: seconds that one of them may keep the others waiting; 0: any.
+        ranks: all ranks.
+        rank_timeout: longest time that ranks wait for one of them [s]; 0: no limit.
     """
 
     def __init__(self, ranks: Ranks, rank_timeout: float) -> None:
-        """Have messages of the root rank alone."""
+        """Create a launcher; only the root rank prints messages."""
         super().__init__(Terminal(stderr=True, quiet=not ranks.is_root))
         if not ranks.is_root:
             wp.config.log_level = wp.LOG_ERROR
@@ -66,9 +65,9 @@ class RankLauncher(Launcher):
         """Return a scene that is the same on all ranks.
 
         Raises:
-            SceneError: listing everything that is wrong.
-            OutputError: ranks were started with different scenes or options; the message names what
-                differs.
+            SceneError: lists all errors.
+            OutputError: ranks were started with different scenes or options; the message names the
+                difference.
         """
         with self.collective.together():
             given = super().load(scene, overrides, options)
@@ -89,13 +88,13 @@ class RankLauncher(Launcher):
             try:
                 return device_of_rank(self.collective.ranks, name)
             except ValueError as error:
-                # the collective names it
+                # The collective operation names the rank.
                 raise DeviceError(
                     str(error).removesuffix(f" (rank {self.collective.ranks.rank})")
                 ) from error
 
     def place(self, device: str) -> str:
-        """Return where the ranks work, in words."""
+        """Return the devices of the ranks in words."""
         size = self.collective.ranks.size
         return f"{size} rank{'s' if size > 1 else ''} ({device})"
 
@@ -115,10 +114,10 @@ class RankLauncher(Launcher):
         return super().run(request, observer=observer, stop=stop, profile=profile)
 
     def agree(self, given: Mapping[str, Any]) -> None:
-        """Check that all ranks were given the same values, by their names.
+        """Check that all ranks have the same values, by name.
 
         Raises:
-            OutputError: they were not; the message names what differs.
+            OutputError: they differ; the message names the difference.
         """
         digests = self.collective.exchange(
             hashlib.blake2b(pickle.dumps(sorted(given.items(), key=lambda item: item[0]))).digest()
@@ -150,7 +149,10 @@ class RankLauncher(Launcher):
         )
 
     def _last_words(self, text: str) -> None:
-        """Say why all processes end now, and write it into run.json, which the root rank cannot do from inside MPI."""
+        """Print why all processes end now, and write it into run.json.
+
+        The root rank cannot do this inside an MPI call.
+        """
         tell(text, error=True)
         if self._folder is not None:
             lines = text.splitlines()
@@ -166,14 +168,14 @@ class RankLauncher(Launcher):
 def ranks_together(rank_timeout: float) -> Iterator[RankLauncher]:
     """Run this process's part of a collective command.
 
-    All but the root rank end silently, with its exit code.
+    All ranks but the root exit silently, with the root's exit code.
 
     Args:
-        rank_timeout: seconds that one of them may keep the others waiting; 0: any.
+        rank_timeout: longest time that ranks wait for one of them [s]; 0: no limit.
 
     Raises:
-        EngineError: MPI or PETSc is missing, or of another kind than mpiexec.
-        typer.Exit: the ranks have failed, and this one has nothing to say of it.
+        EngineError: MPI or PETSc is missing, or does not match mpiexec.
+        typer.Exit: the command has failed; the root rank prints the error.
     """
     try:
         ranks = Ranks.world()
@@ -189,7 +191,7 @@ def ranks_together(rank_timeout: float) -> Iterator[RankLauncher]:
             "of the MPI that mpi4py was built with, or the matching --mpi option of srun"
         )
     if ranks.size > 1:
-        # Python's threads have ended by then: the system's own clock ends what does not
+        # Python's threads have ended by then: an alarm of the system ends a process that hangs.
         atexit.register(signal.alarm, PARTING)
     try:
         launcher = RankLauncher(ranks, rank_timeout)

@@ -30,12 +30,12 @@ class RankSimulation:
     """A rank's part of a simulation: an error on one rank is raised on all.
 
     Args:
-        simulation: of this rank, where the run begins or goes on.
-        collective: of the ranks.
+        simulation: simulation of this rank at the start of the run.
+        collective: collective operations of the ranks.
 
     Attributes:
-        time: the simulation's [s].
-        step_count: steps done.
+        time: time of the simulation [s].
+        step_count: number of steps.
     """
 
     def __init__(self, simulation: Joined, collective: Collective) -> None:
@@ -70,7 +70,7 @@ class RankSimulation:
         return float(self._collective.share(mine))
 
     def events(self, until: float) -> list[float]:
-        """Return when something starts or stops, up to `until` [s]; all ranks know it."""
+        """Return the times of starts and stops, up to `until` [s]; equal on all ranks."""
         return self._simulation.events(until) if isinstance(self._simulation, Scheduled) else []
 
     def step(self, dt: float) -> dict[str, Value]:
@@ -78,7 +78,7 @@ class RankSimulation:
 
         Raises:
             StepFailed: the solve missed its criteria on all ranks.
-            SimulationFailed: the run cannot go on.
+            SimulationFailed: the run cannot continue.
         """
         try:
             with self._collective.together():
@@ -86,7 +86,7 @@ class RankSimulation:
         except RankFailed as error:
             raise self._collective.told_as(SimulationFailed(str(error))) from error
         except StepFailed as error:
-            # the others have gone on: there is no state to try again from
+            # The other ranks have continued: there is no state to retry from.
             if len(self._collective.failed) < self._collective.ranks.size:
                 raise SimulationFailed(f"{error} (but not on all ranks)") from error
             raise
@@ -98,7 +98,7 @@ class RankSimulation:
         return self._simulation.columns()
 
     def frame(self) -> list[Part]:
-        """Return this rank's pieces of a frame, with their place in the grid."""
+        """Return this rank's parts of a frame, with their position in the grid."""
         with self._collective.together():
             return [
                 replace(part, box=part.box or self._box) if isinstance(part, Cells) else part
@@ -106,12 +106,12 @@ class RankSimulation:
             ]
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return this rank's piece of the state."""
+        """Return this rank's part of the state."""
         with self._collective.together():
             return self._simulation.state()
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Continue from the only piece of a state."""
+        """Continue from a state, given as its only part."""
         self._simulation.restore_pieces([state])
         self.time, self.step_count = self._simulation.time, self._simulation.step_count
 
@@ -121,6 +121,6 @@ class RankSimulation:
 
     @cached_property
     def _box(self) -> Corners:
-        """The box of a simulation that keeps it; parts of another one tell theirs."""
+        """The box of the simulation's grid; distributed parts have boxes of their own."""
         (x0, y0, z0), (x1, y1, z1) = self._simulation.state()["box"].tolist()
         return (x0, y0, z0), (x1, y1, z1)

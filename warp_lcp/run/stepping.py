@@ -1,4 +1,4 @@
-"""A step of a simulation: how long it may be, and what is tried where it fails."""
+"""Choose the time step; repeat a failed step with half its length."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from warp_lcp.run.log import Value
 from warp_lcp.scene.scene import Time
 from warp_lcp.simulation import Scheduled, Simulation, SimulationFailed, StepFailed
 
-# halvings of dt: a step 64 times shorter that still fails has another cause than its length
+# Halvings of dt: if a step 64 times shorter fails, its length is not the reason.
 RETRIES = 6
-# of a step: what starts or stops closer to a step's end than that makes no step of its own
+# Relative to a step: an event closer than this to a step's end is not given a step of its own.
 SHARE = 0.25
 
 
@@ -19,7 +19,7 @@ def stable_dt(simulation: Simulation) -> float:
     """Return the longest next step [s] that the CFL number allows.
 
     Raises:
-        SimulationFailed: it is not a number.
+        SimulationFailed: it is not finite.
     """
     stable = simulation.stable_dt()
     if math.isnan(stable):
@@ -32,18 +32,17 @@ def stable_dt(simulation: Simulation) -> float:
 def plan_dt(stable: float, remaining: float, time: Time, events: Sequence[float] = ()) -> float:
     """Return the next time step [s], within the scene's bounds.
 
-    It ends on the frame's time and never leaves a sliver before it.
-
-    It depends on nothing but the state, so a run that was interrupted takes the same steps. The
-    last two steps before a frame or an event are equal; they may be shorter than dt_min. Steps run
-    across events that are closer than SHARE dt to now or to the frame, and of several within dt
-    across all but the last.
+    It ends exactly at the frame's time and never leaves a short remainder before it. It depends
+    only on the state, so that an interrupted run has the same steps. The last two steps before a
+    frame or an event are equal; they may be shorter than dt_min. Steps do not end at events that
+    are closer than SHARE dt to the current time or to the frame. Of several events within dt, a
+    step ends only at the last one.
 
     Args:
-        stable: what the CFL number allows [s].
-        remaining: the time to the next frame [s].
+        stable: limit by the CFL number [s].
+        remaining: time to the next frame [s].
         time: the scene's bounds.
-        events: the times from now [s] to those at which steps should end.
+        events: times from now [s] at which steps should end.
     """
     dt = min(max(stable, time.dt_min), time.dt_max)
     later = [event for event in events if SHARE * dt <= event <= remaining - SHARE * dt]
@@ -56,19 +55,19 @@ def plan_dt(stable: float, remaining: float, time: Time, events: Sequence[float]
 def take_step(
     simulation: Simulation, stable: float, end: float, time: Time
 ) -> tuple[float, int, dict[str, Value]]:
-    """Take a step, with half its length if it fails.
+    """Run a step, with half its length if it fails.
 
     Returns its length [s], the number of halvings and the log columns.
 
     Args:
-        simulation: that takes it.
-        stable: what the CFL number allows [s].
-        end: the next frame's time [s].
+        simulation: the simulation.
+        stable: limit by the CFL number [s].
+        end: time of the next frame [s].
         time: the scene's bounds.
 
     Raises:
         StepFailed: the shortest step failed too.
-        SimulationFailed: the run cannot go on.
+        SimulationFailed: the run cannot continue.
     """
     now, retries = simulation.time, 0
     events = simulation.events(end) if isinstance(simulation, Scheduled) else []

@@ -18,7 +18,7 @@ from warp_lcp.files.claims import one_line, visible
 from warp_lcp.run.kernel_cache import KernelCacheError
 
 FREE_TEXT = "--set"  # its values may be arrays of several lines
-# click's ClickException, which new versions of typer have inside them
+# click's ClickException, which new versions of typer include.
 Refusal: Any = typer.BadParameter.__mro__[2]
 
 
@@ -30,15 +30,15 @@ class Terminal(Console):
         self.push_render_hook(_Harmless())
 
     def on_broken_pipe(self) -> None:
-        """Be quiet from now on: whoever read has ended, which ends no run."""
+        """Print no more after the reader has closed the pipe; the run continues."""
         self.quiet = True
 
 
 class Commands(TyperGroup):
-    """The commands; wrong usage is told as everything else is."""
+    """Command group with the same error messages for wrong usage."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Refuse control characters in arguments."""
+        """Raise an error for control characters in arguments."""
         for before, argument in zip(["", *args], args, strict=False):
             if (
                 before != FREE_TEXT
@@ -51,14 +51,14 @@ class Commands(TyperGroup):
         return super().parse_args(ctx, args)
 
     def main(self, *arguments: Any, **options: Any) -> Any:
-        """Run a command; what the output's encoding lacks is escaped."""
+        """Run a command; escape characters that the output's encoding lacks."""
         for stream in (sys.stdout, sys.stderr):
             if hasattr(stream, "reconfigure"):
                 stream.reconfigure(errors="backslashreplace")
         return super().main(*arguments, **options)
 
     def make_context(self, *arguments: Any, **options: Any) -> Any:
-        """Begin a command; what refuses its words shows them harmless."""
+        """Create a command's context; escape arguments in its errors."""
         try:
             return super().make_context(*arguments, **options)
         except Refusal as error:
@@ -66,7 +66,7 @@ class Commands(TyperGroup):
             raise
 
     def invoke(self, ctx: Any) -> Any:
-        """Run a command; interruptions and an unusable cache end with exit code 1."""
+        """Run a command; interruptions and cache errors end with exit code 1."""
         try:
             return super().invoke(ctx)
         except Refusal as error:
@@ -94,7 +94,7 @@ def tell(text: object, *, error: bool = False) -> None:
 def table_lines(
     header: Iterable[str], rows: Iterable[Iterable[str]], *, left: Iterable[int] = (0,)
 ) -> str:
-    """Return a table as text with aligned columns; those of `left` are left-aligned."""
+    """Return a table as text with aligned columns; `left` ones are left-aligned."""
     table = Table(
         *(Column(name, justify="left" if i in left else "right") for i, name in enumerate(header)),
         box=None,
@@ -108,7 +108,7 @@ def table_lines(
 
 
 class _Harmless(RenderHook):
-    """Wraps what a console prints."""
+    """Render hook that escapes the text of a console."""
 
     def process_renderables(self, renderables: list[ConsoleRenderable]) -> list[ConsoleRenderable]:
         """Return renderables whose text is visible."""
@@ -116,13 +116,13 @@ class _Harmless(RenderHook):
 
 
 class _Visible:
-    """A renderable whose text is visible."""
+    """Renderable with escaped text."""
 
     def __init__(self, renderable: ConsoleRenderable) -> None:
         self._renderable = renderable
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Render, without what the text says to the terminal."""
+        """Render with escaped control characters."""
         segments: Iterable[Segment] = console.render(self._renderable, options)
         for segment in segments:
             yield segment if segment.control else Segment(visible(segment.text), segment.style)

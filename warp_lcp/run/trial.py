@@ -19,12 +19,12 @@ from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.table import KeyFault, SceneError
 from warp_lcp.simulation import Points, Simulation
 
-FRONT = 99.0  # percentile of the particles that the front is of
-LEAST, MOST = 3, 30  # steps that `step_seconds` measures
-ENOUGH = 2.0  # seconds of them, LEAST apart
-LOOKS = 6  # at the most: frames that are compared
-# cells: the edge of the boxes that densities are compared in, so that particles' own noise averages
-# out
+FRONT = 99.0  # percentile of the particles that defines the front
+LEAST, MOST = 3, 30  # numbers of steps that `step_seconds` measures
+ENOUGH = 2.0  # seconds of measurement that are enough after LEAST steps
+LOOKS = 6  # most frames that are compared
+# Edge of the boxes in which densities are compared [cells]; large enough to average out sampling
+# noise.
 BIN = 2.0
 
 
@@ -34,9 +34,10 @@ class Look:
 
     Attributes:
         time: [s].
-        mass: of the material in each box of a coarse grid [kg; 2-D: kg/m], one axis a dimension.
-        energy: kinetic and potential, of the origin's height [J; 2-D: J/m].
-        front: the x that 99 % of the particles have not reached [m].
+        mass: mass of the material in each box of a coarse grid [kg; 2-D: kg/m], one axis per
+            dimension.
+        energy: kinetic and potential energy, 0 at the origin's height [J; 2-D: J/m].
+        front: the 99th percentile of the particles' x [m].
     """
 
     time: float
@@ -50,19 +51,18 @@ class Trial:
     """Time and results of the first frames of a run.
 
     Attributes:
-        seconds: of the steps, frames not counted. On the CPU those of the process, which other
+        seconds: time of the steps without frames. On the CPU it is that of the process, which other
             programs disturb least.
-        steps: taken.
-        iterations: of the method, in all steps.
-        linear_iterations: on the finest grid, in all steps.
-        looks: at the start and then at equal distances in time.
-        residual: the largest relative residual of a step, coupled residual of sand.
-        volume: at the start of the first step and of the last [m^3; 2-D: m^2]; None: the log has no
-            volume.
-        packing: the most of a cell at the start of a step, in units of the densest packing; None:
-            the log does not say.
-        penetration: share of the particles that have ended inside solids or walls; None: the
-            simulation does not tell.
+        steps: number of steps.
+        iterations: iterations of the method, in all steps.
+        linear_iterations: linear iterations on the finest grid, in all steps.
+        looks: values at the start and then at equal intervals of time.
+        residual: the largest relative residual of a step; for sand, the coupled residual.
+        volume: volume at the start of the first step and of the last [m^3; 2-D: m^2]; None if it is
+            not in the log.
+        packing: largest fraction of a cell at the start of a step, relative to the densest packing;
+            None if it is not in the log.
+        penetration: fraction of the particles that end inside solids or walls; None if unknown.
     """
 
     seconds: float
@@ -77,7 +77,7 @@ class Trial:
 
     @property
     def volume_drift(self) -> float | None:
-        """Return by how much the volume has grown, relative; None: it is not known."""
+        """Return the relative growth of the volume; None if unknown."""
         return (
             None
             if self.volume is None or self.volume[0] == 0.0
@@ -87,10 +87,10 @@ class Trial:
     def distance(self, reference: Trial) -> float:
         """Return the displaced fraction of the mass relative to a reference run.
 
-        The mean over the looks: 0 equal, 1 all of it.
+        The mean over the compared times, from 0 (equal) to 1 (all mass is displaced).
 
         Raises:
-            ValueError: the two were not looked at alike.
+            ValueError: the two runs have values at different times.
         """
         shares = []
         for own, other in zip(self.looks[1:], reference.looks[1:], strict=True):
@@ -113,7 +113,10 @@ class Trial:
         return max(differences) / scale if scale > 0.0 else 0.0
 
     def volume_error(self, reference: Trial) -> float:
-        """Return the difference of volume growth or packing to a reference; 0: unknown."""
+        """Return the difference of volume growth or packing to a reference.
+
+        0 if unknown.
+        """
         for own, other in (
             (self.volume_drift, reference.volume_drift),
             (self.packing, reference.packing),
@@ -145,16 +148,16 @@ def trial(
     """Run a scene's first frames.
 
     Args:
-        scene: what to simulate.
+        scene: the scene.
         device: a Warp device.
-        frames: how many.
-        box: edge of the boxes that mass is summed in [m]; two cells unless given.
-        inspect: is shown the simulation at the end.
+        frames: number of frames.
+        box: edge of the boxes for the mass distribution [m]. Default: two cells.
+        inspect: called with the simulation at the end.
 
     Raises:
-        SceneError: the scene cannot be simulated, or shows no particles.
-        StepFailed: a step missed its criteria, with shorter steps too.
-        SimulationFailed: the run cannot go on.
+        SceneError: the scene cannot be simulated, or has no particles in frames.
+        StepFailed: a step missed its criteria, also with shorter steps.
+        SimulationFailed: the run cannot continue.
     """
     simulation = start(scene, device)
     ran = _Trial(scene, simulation, device, box or BIN * scene.spacing)
@@ -165,7 +168,7 @@ def trial(
 
 
 class _Trial:
-    """A simulation that is timed and looked at."""
+    """Timed simulation of the first frames."""
 
     def __init__(self, scene: Scene, simulation: Simulation, device: str, box: float) -> None:
         self.scene, self.simulation, self.device, self.box = scene, simulation, device, box
@@ -173,14 +176,14 @@ class _Trial:
         self.seconds = 0.0
 
     def run(self, times: Sequence[float], frames: int) -> Trial:
-        """Step to the last frame and look at `times` [s]."""
+        """Step to the last frame and record the values at `times` [s]."""
         looks: list[Look] = []
         for frame in range(1, frames + 1):
             end = self.scene.time.frame_time(frame)
             while end - self.simulation.time > SAME_TIME / self.scene.time.frames_per_second:
                 self._step(end)
                 if not looks:
-                    looks.append(self._look())  # the first step tells energy and mass
+                    looks.append(self._look())  # then energy and mass are known
             if any(abs(end - time) < SAME_TIME for time in times):
                 looks.append(self._look())
         volumes = self._known("volume")
@@ -200,7 +203,7 @@ class _Trial:
         )
 
     def _step(self, end: float) -> None:
-        """Take a step towards a time [s], as a run does."""
+        """Run a step toward a time [s], as a run does."""
         clock_of = clock.perf_counter if wp.get_device(self.device).is_cuda else clock.process_time
         begun = clock_of()
         self.rows.append(
@@ -210,6 +213,7 @@ class _Trial:
         self.seconds += clock_of() - begun
 
     def _look(self) -> Look:
+        """Return mass distribution, energy and front at the current time."""
         row, points = self.rows[-1], self._points()
         energy = float(row.get("kinetic_energy") or 0.0) + float(row.get("potential_energy") or 0.0)
         front = float(np.percentile(points[:, 0], FRONT)) if len(points) else 0.0
@@ -222,6 +226,7 @@ class _Trial:
         )
 
     def _points(self) -> np.ndarray:
+        """Return the particles of the current frame."""
         points = next(
             (part.points for part in self.simulation.frame() if isinstance(part, Points)), None
         )
@@ -259,7 +264,7 @@ class _Trial:
 def spread(points: np.ndarray, size: Sequence[float], box: float) -> np.ndarray:
     """Return the fraction of the points in each box of a grid, by tent weights.
 
-    The tents are as wide as two boxes.
+    Each tent is as wide as two boxes.
 
     Args:
         points: [m], shape (n, dimension).
@@ -289,11 +294,11 @@ def spread(points: np.ndarray, size: Sequence[float], box: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Differences:
-    """The largest differences from a reference run.
+    """Largest differences from a reference run.
 
     Args:
-        distance: share of the mass that is elsewhere.
-        volume: in the growth of a liquid's volume, or in how densely sand is packed.
+        distance: displaced fraction of the mass.
+        volume: difference in the growth of a liquid's volume, or in the packing of sand.
     """
 
     distance: float
@@ -308,10 +313,8 @@ class Differences:
     def beside(self, noise: Differences) -> Differences:
         """Return the bounds for a difference plus an independent noise.
 
-        Both add in quadrature.
-
-        Their squares do: a run that lies a bound from the mean of runs as good as the reference
-        lies so far from one of them.
+        Both add in quadrature: the squared distance from one run of the reference's accuracy is
+        that from the mean of such runs plus the noise squared.
         """
         return Differences(
             math.hypot(self.distance, noise.distance), math.hypot(self.volume, noise.volume)
@@ -321,7 +324,7 @@ class Differences:
 def spread_of(references: Sequence[Trial]) -> Differences:
     """Return the largest differences between equally accurate runs; 0 for one run.
 
-    Nothing can be shown to be nearer to one of them.
+    Smaller differences cannot be resolved.
     """
     pairs = list(itertools.combinations(references, 2))
     distance, volume = (
@@ -334,17 +337,16 @@ def spread_of(references: Sequence[Trial]) -> Differences:
 def step_seconds(scene: Scene, *, device: str) -> tuple[float, int]:
     """Return the median time of a step [s] and the number of steps.
 
-    Of the first steps except the very first.
-
-    They are those of a run: a step that fails is tried again with a shorter dt, and none follows
-    the last frame's but the second. Later steps depend on where the liquid goes. Measured on a CPU
-    for dam-break-2d, dam-break, mesh-obstacle and splash-in-circle: 9 % above to 16 % below the
-    mean of all steps of a run, 10 to 24 % below its time a step with frames and checkpoints.
+    Of the first steps except the very first, as in a run: a failed step is repeated with a shorter
+    dt, and no step follows the last frame except the second. Later steps depend on the motion of
+    the liquid. Measured on a CPU for dam-break-2d, dam-break, mesh-obstacle and splash-in-circle: 9
+    % above to 16 % below the mean of all steps of a run, 10 to 24 % below its time per step with
+    frames and checkpoints.
 
     Raises:
         SceneError: the scene cannot be simulated.
-        StepFailed: a step missed its criteria, with shorter steps too.
-        SimulationFailed: the simulation cannot go on.
+        StepFailed: a step missed its criteria, also with shorter steps.
+        SimulationFailed: the simulation cannot continue.
     """
     simulation, time, frame = start(scene, device), scene.time, 1
     seconds: list[float] = []  # the first step compiles kernels and allocates

@@ -1,6 +1,6 @@
 """Find the fastest settings for an accuracy by trial runs of the first frames.
 
-On the device that will run the scene.
+The trials run on the device that will run the scene.
 """
 
 from __future__ import annotations
@@ -18,28 +18,28 @@ from warp_lcp.scene.scene_file import HEADER, dump_scene
 from warp_lcp.scene.table import KeyFault, SceneError
 from warp_lcp.simulation import SimulationFailed, StepFailed
 
-# of the calibration, unless asked for otherwise: that many `warp-lcp bench tradeoff` compares
+# Default number of frames of a trial, as in `warp-lcp bench tradeoff`.
 FRAMES = 18
-CLOSE = 1.25  # settings that take at most so many times the shortest time are timed again, in turns
-# times the shortest, or the nearest: noise of what was measured; among such times the nearer to the
-# reference is taken
+CLOSE = 1.25  # settings within this ratio of the shortest time are timed again, interleaved
+# Ratio of times, or of distances, within the noise of the measurement; among such settings the one
+# nearer to the reference is chosen.
 SAME = 1.05
-ROUNDS = 2  # more timings of those
-# times the steps of the reference: runs as good as it, whose distances from each other say how sure
-# it is
+ROUNDS = 2  # further timings of those
+# Factors on the steps of the reference: runs of equal accuracy, whose distances measure its
+# uncertainty.
 TWINS = (0.9, 0.8)
-TWICE = 1.7  # times the steps, about: the steps of a frame are whole numbers
-CORRECTED_EVERY = (4, 2, 1)  # steps between two density corrections, where the scene has them
+TWICE = 1.7  # approximate factor on the number of steps, since a frame has whole steps
+CORRECTED_EVERY = (4, 2, 1)  # steps between two density corrections, if the scene has them
 
 
 @dataclass
 class Candidate:
-    """Settings that were tried.
+    """Settings of a trial, and its results.
 
     Attributes:
-        settings: by `section.key`.
-        trial: what they took and showed; its seconds are those of the first timing.
-        distance: share of the mass that is elsewhere than in the reference run.
+        settings: settings by `section.key`.
+        trial: the trial run; its seconds are those of the first timing.
+        distance: displaced fraction of the mass relative to the reference run.
         seconds: the shortest of all timings.
     """
 
@@ -49,7 +49,7 @@ class Candidate:
     seconds: float
 
     def words(self) -> str:
-        """Return the settings as the command line takes them."""
+        """Return the settings in the format of the command line."""
         return " ".join(f"{key}={value:g}" for key, value in self.settings.items())
 
 
@@ -58,19 +58,19 @@ class Tuning:
     """Result of a tuning.
 
     Attributes:
-        scene: with the settings chosen.
-        chosen: those settings and what they take.
-        preset: whose bounds the accuracy is.
-        bounds: what runs were held to: those of the preset, or, with an unsure reference, of what
-            is measured beside its noise.
-        limit: how many times those a run may differ: 1, or, where nothing tried is within them,
-            hardly more than the nearest does.
-        noise: what runs as good as the reference differ by; None: it was not asked, for some
-            settings are within the preset's own bounds.
-        reference: the run that the others were compared with.
+        scene: the scene with the chosen settings.
+        chosen: the chosen settings and their results.
+        preset: the preset whose bounds define the accuracy.
+        bounds: bounds of the differences: those of the preset or, with an uncertain reference,
+            combined with its noise.
+        limit: factor on those bounds up to which a run is accepted: 1 or, if no trial is within
+            them, slightly more than that of the nearest trial.
+        noise: differences between runs of the reference's accuracy; None if not measured, since
+            some settings are within the preset's own bounds.
+        reference: the reference run.
         tried: all settings that ran, in the order of the trials.
-        failed: settings whose run ended, and why.
-        frames: of each trial.
+        failed: settings whose run failed, and why.
+        frames: number of frames of each trial.
     """
 
     scene: Scene
@@ -91,21 +91,21 @@ class Tuning:
 
     def verdict(self, accuracy: str) -> list[str]:
         """Return the result in words: settings, accuracy, missed bounds and a remedy."""
-        best, asked, volume = (
+        best, limits, volume = (
             self.chosen,
             self.preset,
             self.chosen.trial.volume_error(self.reference),
         )
         words = f"{best.words()}: {best.seconds:.3g} s"
-        found = (
-            f"distance {best.distance:.4f} (at most {asked.distance:g}), volume or packing "
-            f"{volume:.3f} (at most {asked.volume:g})"
+        accuracy_line = (
+            f"distance {best.distance:.4f} (at most {limits.distance:g}), volume or packing "
+            f"{volume:.3f} (at most {limits.volume:g})"
         )
         if self.noise is None:
-            return [f"{accuracy}: {words}", found]
+            return [f"{accuracy}: {words}", accuracy_line]
         differences = (
-            ("distance", best.distance, asked.distance),
-            ("volume or packing", volume, asked.volume),
+            ("distance", best.distance, limits.distance),
+            ("volume or packing", volume, limits.volume),
         )
         missed = ", ".join(
             f"{name} by a factor of {own / most:.2g}"
@@ -119,20 +119,20 @@ class Tuning:
         if self.met:
             return [
                 f"within the noise of the reference, but not {accuracy}: {words}",
-                found,
+                accuracy_line,
                 f"bounds missed: {missed}; but {unsure}: smaller errors cannot be measured",
                 "runs diverge this far with any settings in these frames: use fewer --frames to "
                 "compare earlier times",
             ]
         return [
             f"nearest of the settings tried, but not {accuracy}: {words}",
-            found,
+            accuracy_line,
             f"bounds missed: {missed}; {unsure}",
             self._remedy(),
         ]
 
     def _remedy(self) -> str:
-        """Return what would help, by what shorter steps brought at the fine end of those tried."""
+        """Return a remedy, from the effect of shorter steps among those tried."""
         finest = max(self.tried, key=lambda c: c.trial.steps)
         coarser = [c for c in self.tried if TWICE * c.trial.steps <= finest.trial.steps]
         if not coarser:
@@ -151,10 +151,10 @@ class Tuning:
         )
 
     def rows(self) -> list[tuple[str, ...]]:
-        """Return a table of what was tried: settings, seconds, steps and distance.
+        """Return a table of all trials: settings, seconds, steps and distance.
 
-        Also the differences of energy (relative) and front from the reference, the growth of the
-        volume, or how densely sand was packed.
+        Further columns are the differences of energy (relative) and front from the reference, and
+        the growth of the volume or the packing of sand.
         """
         packed = self.reference.packing is not None
         rows: list[tuple[str, ...]] = [
@@ -198,26 +198,26 @@ def tune(
     frames: int = FRAMES,
     say: Callable[[str], object] = lambda text: None,
 ) -> Tuning:
-    """Measure which settings take the least time for an accuracy.
+    """Find the settings with the shortest run time for an accuracy.
 
-    An accuracy bounds the distance from a reference run at the same resolution, and the volume's
-    difference from it: those of the preset of its name, see `warp_lcp.scene.presets`. Longer time
-    steps take less time and lie further away, so the longest that meets the bounds is found by
-    bisection, with the preset's tolerance; then the loosest tolerance, and the rarest density
-    correction, that keep them. The fastest few are timed again in turns.
+    An accuracy bounds the distance from a reference run at the same resolution, and the difference
+    of the volume: the bounds are those of the preset of its name, see `warp_lcp.scene.presets`.
+    Longer time steps take less time and have larger distances, so the longest one that meets the
+    bounds is found by bisection, with the preset's tolerance. Then follow the loosest tolerance and
+    the least frequent density correction that keep the bounds. The fastest few settings are timed
+    again, interleaved.
 
-    Where none of the steps meets the bounds, runs as good as the reference, of slightly shorter
-    steps, say how far the reference itself can be trusted: at a coarse resolution a splash
-    amplifies whatever it is given. Nothing can be shown to be nearer than they are to each other,
-    so the bounds then count beside that noise. What does not meet them even so ends with the
-    fastest of the nearest settings.
+    If no step meets the bounds, runs of the reference's accuracy, with slightly shorter steps,
+    measure the uncertainty of the reference: at a coarse resolution a splash amplifies any
+    difference. Distances below this noise cannot be resolved, so the bounds are combined with it.
+    If no settings meet these bounds either, the result is the fastest of the nearest settings.
 
     Args:
-        scene: whose first frames are run, with everything that it says but for those settings.
+        scene: the scene, whose other settings are kept.
         accuracy: name of a preset.
         device: a Warp device.
-        frames: how many.
-        say: takes a line about each trial.
+        frames: number of frames.
+        say: gets a line about each trial.
 
     Raises:
         SceneError: the scene cannot be tuned or simulated.
@@ -233,7 +233,7 @@ def tune(
 
 
 def write_tuned(path: Path, tuning: Tuning, accuracy: str, device: str) -> None:
-    """Write the tuned scene, with what was measured in comments above it.
+    """Write the tuned scene, with the measurements in comments above it.
 
     Raises:
         OSError: the file cannot be written.
@@ -249,7 +249,7 @@ def write_tuned(path: Path, tuning: Tuning, accuracy: str, device: str) -> None:
 
 @dataclass
 class _Search:
-    """The trials of a tuning."""
+    """Search for the fastest settings."""
 
     scene: Scene
     prices: Prices
@@ -262,7 +262,7 @@ class _Search:
     _known: dict[tuple[tuple[str, Any], ...], Candidate | None] = field(default_factory=dict)
 
     def run(self) -> Tuning:
-        """Find the fastest settings within the bounds, or, where there are none, the fastest of the nearest."""
+        """Find the fastest settings within the bounds, or the fastest of the nearest."""
         self.reference = self._reference_run()
         self.say(f"reference: {self.reference.seconds:.3g} s, {self.reference.steps} steps")
         self.bounds, self.limit, noise = (
@@ -306,7 +306,7 @@ class _Search:
         )
 
     def _fastest(self, near: list[Candidate]) -> Candidate:
-        """Return the fastest, once those close to it were timed again in turns."""
+        """Return the fastest settings, after interleaved timings of the close ones."""
         shortest = min(c.seconds for c in near)
         close = [c for c in near if c.seconds <= CLOSE * shortest]
         for _ in range(ROUNDS if len(close) > 1 else 0):
@@ -319,13 +319,13 @@ class _Search:
         return min((c for c in close if c.seconds <= SAME * shortest), key=lambda c: c.distance)
 
     def _reference_run(self, part: float = 1.0) -> Trial:
-        """Run the reference, or one with a part of its steps."""
+        """Run the reference, or one with a fraction of its steps."""
         settings = dict(self.prices.reference)
         settings |= {key: part * settings[key] for key in ("time.cfl", "time.dt_max")}
         return trial(changed(self.scene, settings), device=self.device, frames=self.frames)
 
     def _noise(self) -> Differences:
-        """Return what runs as good as the reference differ by."""
+        """Return the differences between runs of the reference's accuracy."""
         self.say("no settings are within the bounds; measuring how accurate the reference is")
         references = [self.reference]
         for part in TWINS:
@@ -348,9 +348,12 @@ class _Search:
         return getattr(self.scene, key.partition(".")[0]) is not None
 
     def _longest_step(self, settings: dict[str, Any]) -> int | None:
-        """Return which of the steps is the longest that meets the bound; None: none does. Shorter ones than it do, by bisection."""
+        """Return the index of the longest step that meets the bounds, by bisection.
+
+        None if none does. Steps shorter than one that meets the bounds meet them too.
+        """
         steps = self.prices.steps
-        low, high = 0, len(steps)  # the answer lies in low..high; high: none
+        low, high = 0, len(steps)  # the result is in low..high; high means none
         while low < high:
             middle = (low + high) // 2
             if self._meets({**settings, **_step_settings(steps[middle])}):
@@ -362,7 +365,10 @@ class _Search:
     def _loosest(
         self, settings: dict[str, Any], key: str, values: tuple[float, ...]
     ) -> dict[str, Any]:
-        """Return the settings with the loosest of the values, loose ones first, that meets the bounds; as they are where none does."""
+        """Return the settings with the loosest value that meets the bounds.
+
+        Values are tried from the loosest on; the settings are unchanged if none does.
+        """
         for value in values:
             if not self._has(key) or value == settings.get(key):
                 break
@@ -378,7 +384,7 @@ class _Search:
         return found is not None and self._miss(found) <= self.limit
 
     def _try(self, settings: dict[str, Any]) -> Candidate | None:
-        """Run the first frames with some settings; None: that failed."""
+        """Run the first frames with some settings; return None if that fails."""
         words = " ".join(f"{key}={value:g}" for key, value in settings.items())
         try:
             ran = trial(changed(self.scene, settings), device=self.device, frames=self.frames)

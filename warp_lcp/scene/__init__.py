@@ -1,1 +1,1 @@
-"""Scene files: tables, shapes, motions, presets, the prices of models."""
+"""Scene files: tables, shapes, motions, presets, costs of models."""

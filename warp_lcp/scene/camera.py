@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from warp_lcp.scene.scene import Scene
 
 VIEW_ANGLE = 25.0  # degrees, over the height of an image
-MARGIN = 1.08  # of the image, over what is shown
-# from the domain to the camera
+MARGIN = 1.08  # size of the image relative to its content
+# Direction from the domain to the camera.
 THREE_QUARTERS = np.array([0.55, 0.5, 1.0]) / np.linalg.norm([0.55, 0.5, 1.0])
 Y_AXIS, Z_AXIS = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
 ROOM_KEYS, WINDOW_KEYS = ("position", "look_at", "up", "field_of_view"), ("low", "high")
@@ -54,12 +54,12 @@ class Camera(Table):
     def complaints(self, dimension: int, size: list[float]) -> list[Complaint]:
         """Return errors of the camera in a domain of two or three sides [m]."""
         wrong, right = (ROOM_KEYS, WINDOW_KEYS) if dimension == 2 else (WINDOW_KEYS, ROOM_KEYS)
-        found = []
+        complaints = []
         for key in wrong:
             if getattr(self, key) is not None:
                 allowed = ", ".join(type(self).model_fields[name].alias or name for name in right)
                 message = f"cannot be used in {dimension}-D; allowed are {allowed}"
-                found.append(
+                complaints.append(
                     Complaint(
                         (type(self).model_fields[key].alias or key,), getattr(self, key), message
                     )
@@ -67,18 +67,19 @@ class Camera(Table):
         for key in right:
             value = getattr(self, key)
             if isinstance(value, list) and len(value) != dimension:
-                found.append(
+                complaints.append(
                     Complaint(
                         (type(self).model_fields[key].alias or key,),
                         value,
                         f"must have {dimension} entries",
                     )
                 )
-        if found:
-            return found
+        if complaints:
+            return complaints
         return self._window_complaints(size) if dimension == 2 else self._room_complaints(size)
 
     def _window_complaints(self, size: list[float]) -> list[Complaint]:
+        """Return errors of the window of a 2-D domain."""
         low, high = self.low or [0.0, 0.0], self.high or size
         if all(a < b for a, b in zip(low, high, strict=True)):
             return []
@@ -91,6 +92,7 @@ class Camera(Table):
         ]
 
     def _room_complaints(self, size: list[float]) -> list[Complaint]:
+        """Return errors of the view of a 3-D domain."""
         if self.position is None:
             given = [key for key in ("look_at", "up") if getattr(self, key) is not None]
             return [Complaint((key,), getattr(self, key), "needs camera.position") for key in given]
@@ -118,14 +120,14 @@ class Camera(Table):
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """A pinhole camera.
+    """Pinhole camera.
 
     Args:
         position: [m], shape (3,).
-        focus: the point in the middle of the image [m], shape (3,).
-        up: of the image, a unit vector, shape (3,).
-        angle: over the height of the image [degrees].
-        aspect: the image's width over its height.
+        focus: point at the center of the image [m], shape (3,).
+        up: upward direction of the image, a unit vector, shape (3,).
+        angle: view angle over the height of the image [degrees].
+        aspect: width of the image over its height.
     """
 
     position: np.ndarray
@@ -136,10 +138,7 @@ class Viewpoint:
 
     @property
     def axes(self) -> np.ndarray:
-        """Return the image's unit vectors (right, up, into the scene), shape (3, 3).
-
-        As rows.
-        """
+        """Return the image's unit vectors (right, up, forward) as rows, shape (3, 3)."""
         forward = (self.focus - self.position) / np.linalg.norm(self.focus - self.position)
         right = np.cross(forward, self.up)
         right /= np.linalg.norm(right)
@@ -149,7 +148,7 @@ class Viewpoint:
 def viewpoint(scene: Scene, aspect: float) -> Viewpoint:
     """Return the viewpoint of images with a given aspect.
 
-    Of the scene's [camera], else the nearest one that shows the whole domain.
+    It is that of the scene's [camera], else the nearest one that shows the whole domain.
     """
     camera = scene.camera
     low, high = scene.seen
@@ -185,10 +184,10 @@ def view_of_points(
     """Return the nearest viewpoint in a direction that shows all points.
 
     Args:
-        points: in the picture [m], shape (n, 3).
-        toward: from the points to the camera, of unit length.
-        angle: over the height of the image [degrees].
-        aspect: the image's width over its height.
+        points: points that must be visible [m], shape (n, 3).
+        toward: unit vector from the points to the camera.
+        angle: view angle over the height of the image [degrees].
+        aspect: width of the image over its height.
     """
     right = np.cross(Y_AXIS, toward)
     right /= np.linalg.norm(right)
@@ -196,7 +195,7 @@ def view_of_points(
     corners = points @ axes.T
     focus = corners.mean(axis=0)
     slope = math.tan(math.radians(angle / 2)) / MARGIN
-    # what is near looks larger, so the middle of the image is not that of the points
+    # Near points look larger, so the center of the image is not that of the points.
     for _ in range(5):
         x, y, z = (corners - focus).T
         distance = max((z + np.abs(x) / (slope * aspect)).max(), (z + np.abs(y) / slope).max())

@@ -13,13 +13,13 @@ TABLE = "models.toml"
 
 @dataclass(frozen=True)
 class Model:
-    """A part of a simulation that a scene turns on.
+    """Part of a simulation that a scene turns on.
 
     Args:
-        name: as in the list of prices.
-        why: the key or what else of the scene asks for it.
-        built: False: it was asked for, but the scene cannot need it; `why` then says so.
-        count: how many the scene has, each of which takes what the list says, such as rigid bodies.
+        name: name in the cost table.
+        why: key of the scene, or other reason, that requires it.
+        built: False if it was requested, but has no effect; `why` then gives the reason.
+        count: number of instances in the scene, such as rigid bodies; the cost is that of one.
     """
 
     name: str
@@ -33,11 +33,11 @@ class Price:
     """Cost of a model, measured on one processor core.
 
     Args:
-        fixed_seconds: of a step, however small the scene [s]: launches and what the host does.
-        cell_seconds: of a step, a cell of the domain [s].
-        particle_seconds: of a step, a particle [s].
-        cell_bytes: of memory, a cell.
-        particle_bytes: of memory, a particle.
+        fixed_seconds: per step, independent of the size [s]: launches and work of the host.
+        cell_seconds: per step and cell of the domain [s].
+        particle_seconds: per step and particle [s].
+        cell_bytes: memory per cell.
+        particle_bytes: memory per particle.
     """
 
     fixed_seconds: float = 0.0
@@ -57,7 +57,7 @@ class Price:
 
 @cache
 def prices(simulator: str, dimension: int) -> Mapping[str, Price]:
-    """Return the costs of models by name; `base`: what every scene has.
+    """Return the costs of models by name; `base`: the cost of every scene.
 
     Empty if nothing was measured.
     """
@@ -98,13 +98,13 @@ def model_lines(
     As pairs of a word and a line.
 
     Args:
-        models: of a scene.
-        listed: of `prices`.
-        cells: of the domain.
-        particles: at most.
-        memory: of the whole run [bytes].
-        measured: how long a step takes here [s], which scales the list; None: as where it was
-            measured.
+        models: models of a scene.
+        listed: costs from `prices`.
+        cells: number of cells of the domain.
+        particles: largest number of particles.
+        memory: memory of the whole run [bytes].
+        measured: measured time of a step on this machine [s], which scales the table; None: times
+            of the table.
     """
     predicted = predicted_seconds(models, listed, cells, particles)
     scale = measured / predicted if measured is not None and predicted > 0.0 else 1.0

@@ -1,4 +1,4 @@
-"""The motions of a scene file: how a solid moves, from where its shape is placed."""
+"""Motions of a scene file: movement of a solid relative to its placement."""
 
 from __future__ import annotations
 
@@ -38,17 +38,17 @@ class PrescribedMotion(Table):
 
     def complaints(self, dimension: int) -> list[Complaint]:
         """Return errors of the motion in a scene of 2 or 3 dimensions."""
-        found = self._size_complaints(dimension)
-        if found:
-            return found
+        complaints = self._size_complaints(dimension)
+        if complaints:
+            return complaints
         try:
             self.to_motion(dimension)
         except ValueError as error:
-            found.append(Complaint((), None, str(error)))
-        return found
+            complaints.append(Complaint((), None, str(error)))
+        return complaints
 
     def _size_complaints(self, dimension: int) -> list[Complaint]:
-        """Return what is wrong with the number of entries, and with keys that are missing or too many."""
+        """Return errors of the number of entries, and missing or superfluous keys."""
         return [
             Complaint((name,), value, f"must have {dimension} entries in {dimension}-D")
             for name, value in self
@@ -67,7 +67,7 @@ class TranslationMotion(PrescribedMotion):
     stop: float | None = Field(default=None, description="end time [s]; default: never")
 
     def to_motion(self, dimension: int) -> motion.Motion:
-        """Return the shift over time."""
+        """Return the translation over time."""
         from warp_lcp.grid import motion
 
         return motion.Translation(
@@ -86,7 +86,7 @@ class RotationMotion(PrescribedMotion):
     stop: float | None = Field(default=None, description="end time [s]; default: never")
 
     def to_motion(self, dimension: int) -> motion.Motion:
-        """Return the turn over time."""
+        """Return the rotation over time."""
         from warp_lcp.grid import motion
 
         return motion.Rotation(
@@ -117,7 +117,7 @@ class SinusoidMotion(PrescribedMotion):
     axis: Axis | None = Field(default=None, description=AXIS)
 
     def to_motion(self, dimension: int) -> motion.Motion:
-        """Return shift and turn over time."""
+        """Return translation and rotation over time."""
         from warp_lcp.grid import motion
 
         zeros = [0.0] * dimension
@@ -131,20 +131,20 @@ class SinusoidMotion(PrescribedMotion):
         )
 
     def _size_complaints(self, dimension: int) -> list[Complaint]:
-        found = super()._size_complaints(dimension)
+        complaints = super()._size_complaints(dimension)
         if self.angle is not None:
-            found += _center_complaints(self.center, "angle") + _axis_complaints(
+            complaints += _center_complaints(self.center, "angle") + _axis_complaints(
                 self.axis, dimension
             )
         elif self.amplitude is None:
-            found.append(Complaint((), None, "a sinusoid needs amplitude, angle or both"))
+            complaints.append(Complaint((), None, "a sinusoid needs amplitude, angle or both"))
         else:
-            found += [
+            complaints += [
                 Complaint((name,), value, "has no effect without angle")
                 for name, value in (("center", self.center), ("axis", self.axis))
                 if value is not None
             ]
-        return found
+        return complaints
 
 
 class KeyframesMotion(PrescribedMotion):
@@ -163,7 +163,7 @@ class KeyframesMotion(PrescribedMotion):
     )
 
     def to_motion(self, dimension: int) -> motion.Motion:
-        """Return shift and turn over time."""
+        """Return translation and rotation over time."""
         from warp_lcp.grid import motion
 
         rotate = (
@@ -182,31 +182,31 @@ class KeyframesMotion(PrescribedMotion):
         )
 
     def _size_complaints(self, dimension: int) -> list[Complaint]:
-        found = super()._size_complaints(dimension)
+        complaints = super()._size_complaints(dimension)
         if not (np.diff(self.times) > 0.0).all():
-            found.append(Complaint(("times",), self.times, "must increase"))
+            complaints.append(Complaint(("times",), self.times, "must increase"))
         if self.translate is None and self.rotate is None:
-            found.append(Complaint((), None, "keyframes need translate, rotate or both"))
+            complaints.append(Complaint((), None, "keyframes need translate, rotate or both"))
         if self.rotate is not None:
-            found += _center_complaints(self.center, "rotate")
+            complaints += _center_complaints(self.center, "rotate")
         elif self.center is not None:
-            found.append(Complaint(("center",), self.center, "has no effect without rotate"))
+            complaints.append(Complaint(("center",), self.center, "has no effect without rotate"))
         for name, rows, width in (
             ("translate", self.translate, dimension),
             ("rotate", self.rotate, 1 if dimension == 2 else 3),
         ):
             if rows is not None and len(rows) != len(self.times):
-                found.append(
+                complaints.append(
                     Complaint(
                         (name,), rows, f"must have {len(self.times)} entries, one for each time"
                     )
                 )
-            found += [
+            complaints += [
                 Complaint((name, index), row, f"must {counted(width)} in {dimension}-D")
                 for index, row in enumerate(rows or ())
                 if len(row) != width
             ]
-        return found
+        return complaints
 
 
 Motion = Annotated[

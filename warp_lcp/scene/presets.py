@@ -16,7 +16,7 @@ SceneT = TypeVar("SceneT", bound="Scene")
 PresetName = Literal["preview", "standard", "final"]
 PRESETS: tuple[PresetName, ...] = ("preview", "standard", "final")
 TABLE = "presets.toml"
-Settings = Mapping[str, Any]  # by "section.key", such as time.cfl
+Settings = Mapping[str, Any]  # values by "section.key", such as time.cfl
 
 
 @dataclass(frozen=True)
@@ -24,11 +24,10 @@ class Preset:
     """Accuracy and settings of a preset.
 
     Attributes:
-        distance: the largest share of the mass that may be elsewhere than in the simulator's
-            reference run.
-        volume: the largest difference from that run in the growth of a liquid's volume, or in how
-            densely sand is packed.
-        settings: the scene's keys that it gives values to, by `section.key`.
+        distance: largest displaced fraction of the mass relative to the simulator's reference run.
+        volume: largest difference from that run in the growth of a liquid's volume, or in the
+            packing of sand.
+        settings: values of the scene's keys, by `section.key`.
     """
 
     distance: float
@@ -38,13 +37,13 @@ class Preset:
 
 @dataclass(frozen=True)
 class Prices:
-    """A simulator's part of the table.
+    """Presets and trial settings of one simulator.
 
     Attributes:
-        presets: by name.
-        reference: settings of the run that others are compared with.
+        presets: presets by name.
+        reference: settings of the reference run.
         steps: lengths of a time step to try, (time.cfl, time.dt_max [s]), the longest first.
-        tolerances: of the solver, the loosest first.
+        tolerances: tolerances of the solver to try, the loosest first.
     """
 
     presets: Mapping[str, Preset]
@@ -55,29 +54,29 @@ class Prices:
 
 @cache
 def price_table() -> Mapping[str, Prices]:
-    """Return the table's parts by simulator."""
+    """Return the entries of `presets.toml` by simulator."""
     read = tomllib.loads((files("warp_lcp.scene") / TABLE).read_text(encoding="utf-8"))
-    found = {}
+    entries = {}
     for simulator, part in read.items():
         presets: dict[str, Preset] = {
             name: Preset(part[name]["distance"], part[name]["volume"], _flat(part[name]))
             for name in PRESETS
         }
         steps = tuple((cfl, dt_max) for cfl, dt_max in part["steps"])
-        found[simulator] = Prices(
+        entries[simulator] = Prices(
             presets, _flat(part["reference"]), steps, tuple(part["tolerances"])
         )
-    return found
+    return entries
 
 
 def fill_in(model: type[Scene], data: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return a scene's raw data with the defaults of its preset.
 
-    Keys in the data are kept; wrong data are left to the validation.
+    Keys in the data are kept; invalid data are left to the validation.
 
     Args:
-        model: the scene's class, which knows which tables turn a model on.
-        data: as the file has it.
+        model: the scene's class, which knows the tables that turn a model on.
+        data: the data of the file.
     """
     about, solver = data.get("scene"), data.get("solver")
     simulator = about.get("simulator") if isinstance(about, Mapping) else None
@@ -111,13 +110,13 @@ def preset_line(scene: Scene) -> str | None:
     prices = price_table().get(scene.scene.simulator)
     if name is None or prices is None:
         return None
-    given = {
+    own_values = {
         key: (value, value_of(scene, key)) for key, value in prices.presets[name].settings.items()
     }
-    taken = [f"{key} {value:g}" for key, (value, is_now) in given.items() if is_now == value]
+    taken = [f"{key} {value:g}" for key, (value, is_now) in own_values.items() if is_now == value]
     own = [
         f"{key} {is_now:g}" if isinstance(is_now, float | int) else f"{key} {is_now}"
-        for key, (value, is_now) in given.items()
+        for key, (value, is_now) in own_values.items()
         if is_now not in (value, None)
     ]
     return f"{name}: " + "; ".join(
@@ -138,10 +137,10 @@ def value_of(scene: Scene, key: str) -> Any:
 def changed(scene: SceneT, settings: Settings) -> SceneT:
     """Return a scene with other values at `section.key`.
 
-    Those of models that are off are left out.
+    Those of models that are off are omitted.
 
     Raises:
-        pydantic.ValidationError: the scene does not take them.
+        pydantic.ValidationError: a value is invalid in the scene.
     """
     data = scene.model_dump(by_alias=True, exclude_none=True)
     for key, value in settings.items():

@@ -20,7 +20,7 @@ def rename_keys(tables: MutableMapping[str, Any], model: type[Table], source: st
     """Rename old keys in the tables of a scene, in place, and warn about each.
 
     Args:
-        tables: the scene as its file has it.
+        tables: the tables of a scene file.
         model: the class of the scene; `Table.renamed` of its tables holds the old names.
         source: the scene's file or name, for messages.
 
@@ -40,18 +40,18 @@ def fix_text(text: str, model: type[Table], source: str) -> tuple[str, list[str]
     The rest of the text is unchanged.
 
     Args:
-        text: of a valid TOML file.
+        text: text of a valid TOML file.
         model: the class of the scene.
         source: the file, for messages.
 
     Raises:
-        SceneError: a table has a key by both names, or an old name stands in other text too, such
+        SceneError: a table has a key by both names, or an old name also occurs in other text, such
             as a description.
     """
     expected = tomllib.loads(text)
     renamed = list(_rename(expected, model, source))
     for old, new in {(old, new) for _, old, new in renamed}:
-        # `old = value`, also quoted, dotted or in an inline table
+        # Replaces `old = value`, also quoted, dotted or in an inline table.
         text = re.sub(rf"(?<![\w-]){old}(?=[\"']?\s*=)", new, text)
     if tomllib.loads(text) != expected:
         raise SceneError(
@@ -70,7 +70,10 @@ def fix_text(text: str, model: type[Table], source: str) -> tuple[str, list[str]
 def _rename(
     tables: Any, model: type[Table], source: str, place: str = ""
 ) -> Iterator[tuple[str, str, str]]:
-    """Rename keys of a table and the tables in it; yield the table's place, the old and the new name."""
+    """Rename keys of a table and the tables in it.
+
+    Yields the place of each table, the old and the new name.
+    """
     for old, new in model.renamed.items():
         if old not in tables:
             continue
@@ -84,7 +87,7 @@ def _rename(
                     )
                 ],
             )
-        # in their order
+        # The order of keys is kept.
         entries = {new if key == old else key: value for key, value in tables.items()}
         tables.clear()
         tables.update(entries)
@@ -102,7 +105,10 @@ def _rename(
 
 
 def _table_classes(annotation: Any) -> Iterator[type[Table]]:
-    """Yield the classes of tables in an annotation, such as those of a list or a union."""
+    """Yield the classes of tables in an annotation.
+
+    Such as those of a list or a union.
+    """
     if isinstance(annotation, type) and issubclass(annotation, Table):
         yield annotation
     for part in get_args(annotation):

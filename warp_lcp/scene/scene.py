@@ -58,7 +58,10 @@ GridMethod = Literal[grid_methods()]
 
 
 def _tolerance(value: Any) -> Any:
-    """Return a number in (0, 1) or "auto"; a wrong one is refused as any other number is, without a word of the alternative's type."""
+    """Return a number in (0, 1) or "auto", with an error as for any other number.
+
+    The error does not mention the type of the alternative.
+    """
     return value if value == "auto" else adapter(Share).validate_python(value)
 
 
@@ -69,17 +72,17 @@ Tolerance = Annotated[
 
 PRESET_KEY = "set of defaults by accuracy"
 
-LONGEST_NAME = 60  # characters; file systems take 255 bytes, and a letter has up to four
+LONGEST_NAME = 60  # characters; file systems allow 255 bytes, and a letter has up to four
 NAME_RULE = (
     f'must be a name of at most {LONGEST_NAME} letters, digits, "-", "_", "." and spaces, '
     "without a dot or space at its ends"
 )
 
-WHOLE_CELLS = 1e-6  # how far a side may be from a whole number of cells, relative
+WHOLE_CELLS = 1e-6  # largest relative distance of a side from a whole number of cells
 
 
 def _name(text: str) -> str:
-    """Return a name that may be a folder's, whatever stands before it; "" is none."""
+    """Return a valid name of a folder, also with a prefix; "" for no name."""
     if len(text) > LONGEST_NAME or text != text.strip(". ") or set(text) - set(file_name(text)):
         raise PydanticCustomError("name", NAME_RULE)
     return text
@@ -120,7 +123,7 @@ class Time(Table):
     def frame_time(self, frame: int) -> float:
         """Return the time [s] of a frame.
 
-        The last one is the end of the run, whether or not that is a multiple of the frame interval.
+        The last one is the end of the run, even if that is no multiple of the frame interval.
         """
         return min(frame / self.frames_per_second, self.duration)
 
@@ -166,7 +169,7 @@ class Domain(Table):
     @model_validator(mode="before")
     @classmethod
     def _without_ends(cls, data: Any) -> Any:
-        """Give a domain of a spacing sides that are farther than anything gets."""
+        """Set the sides of a domain with `spacing` to an unreachable distance."""
         if (
             not isinstance(data, dict)
             or not isinstance(data.get("spacing"), int | float)
@@ -186,7 +189,7 @@ class Domain(Table):
 
     @property
     def boundless(self) -> bool:
-        """Return whether there are no far ends."""
+        """Return whether the domain is unbounded."""
         return self.spacing is not None
 
     def spacing_complaints(self) -> list[Complaint]:
@@ -289,7 +292,7 @@ class Scene(Table):
     """
 
     elsewhere: ClassVar = dict.fromkeys(("sand", "material", "friction", "gauge"), "granular")
-    palette: ClassVar[Literal["water", "sand"]] = "water"  # of its images
+    palette: ClassVar[Literal["water", "sand"]] = "water"  # color scheme of its images
     scene: About
     time: Time
     domain: Domain
@@ -302,7 +305,7 @@ class Scene(Table):
     @model_validator(mode="before")
     @classmethod
     def _gravity_is_down(cls, data: Any) -> Any:
-        """Fill in gravity, whose default needs the number of dimensions."""
+        """Set gravity, whose default depends on the number of dimensions."""
         domain, physics = (
             (data.get("domain"), data.get("physics", {}))
             if isinstance(data, dict)
@@ -327,7 +330,7 @@ class Scene(Table):
     @model_validator(mode="before")
     @classmethod
     def _preset_fills_in(cls, data: Any) -> Any:
-        """Take from `solver.preset` what the scene does not say."""
+        """Apply the defaults of `solver.preset`."""
         return fill_in(cls, data) if isinstance(data, dict) else data
 
     @model_validator(mode="after")
@@ -349,7 +352,7 @@ class Scene(Table):
     def seen(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the low and high corner [m] of the region in pictures, shape (3,).
 
-        The domain; if unbounded, the region of the shapes.
+        It is the domain or, if that is unbounded, the region of the shapes.
         """
         size = np.array([*self.domain.size, 0.0][:3])
         boxes = (
@@ -374,13 +377,13 @@ class Scene(Table):
 
     @property
     def endless(self) -> tuple[int, ...]:
-        """Return the axes without an end: what leaves at one side comes in at the other."""
+        """Return the periodic axes."""
         return ()
 
     def materials(self) -> tuple[str, Sequence[MaterialProperties]]:
         """Return the key of the material's shapes, such as `liquid`, and the shapes.
 
-        Empty for bodies alone.
+        Empty for scenes without a material.
         """
         return "material", ()
 
@@ -392,7 +395,7 @@ class Scene(Table):
         return ()
 
     def body_frictions(self) -> list[float]:
-        """Return Coulomb's coefficient of each solid's surface against bodies and walls."""
+        """Return the friction coefficient of each solid against bodies and walls."""
         given = [
             BODY_FRICTION if solid.friction is None else solid.friction for solid in self.solid
         ]
@@ -403,34 +406,34 @@ class Scene(Table):
 
         Subclasses add theirs to `super().complaints()`.
         """
-        found = self._grid_complaints()
+        complaints = self._grid_complaints()
         if len(self.physics.gravity) != self.dimension:
             message = f"must have {self.dimension} entries, as domain.size has"
-            found.append(Complaint(("physics", "gravity"), self.physics.gravity, message))
+            complaints.append(Complaint(("physics", "gravity"), self.physics.gravity, message))
         if self.time.dt_min > self.time.dt_max:
-            found.append(
+            complaints.append(
                 Complaint(
                     ("time", "dt_min"),
                     self.time.dt_min,
                     f"must not exceed time.dt_max = {self.time.dt_max}",
                 )
             )
-        found += [
+        complaints += [
             Complaint(("camera", *c.place), c.value, c.message)
             for c in self.camera.complaints(self.dimension, self.domain.size)
         ]
         if self.output.volume and self.dimension == 2:
-            found.append(
+            complaints.append(
                 Complaint(
                     ("output", "volume"), True, "needs a 3-D domain; domain.size has 2 entries"
                 )
             )
-        found += (
+        complaints += (
             self.shape_complaints("solid", self.solid)
             + self._motion_complaints()
             + self._side_complaints()
         )
-        return found + self._outside_complaints()
+        return complaints + self._outside_complaints()
 
     def shape_complaints(
         self, key: str, shapes: Sequence[Shape], *, inside: bool = False
@@ -440,9 +443,9 @@ class Scene(Table):
         Args:
             key: the array's name in the file, such as `liquid`.
             shapes: its entries.
-            inside: also refuse an entry that lies wholly outside the domain.
+            inside: also refuse entries that lie wholly outside the domain.
         """
-        found = []
+        complaints = []
         for index, shape in enumerate(shapes):
             own = shape.complaints(self.dimension)
             if inside and not own and self.enclosed_volume(shape) == 0.0:
@@ -454,11 +457,11 @@ class Scene(Table):
                         f"{self.domain.size} m",
                     )
                 ]
-            found += [
+            complaints += [
                 Complaint((key, index, *complaint.place), complaint.value, complaint.message)
                 for complaint in own
             ]
-        return found
+        return complaints
 
     def enclosed_volume(self, shape: Shape) -> float:
         """Return an upper bound of a shape's volume in the domain [m^3; m^2 in 2-D].
@@ -484,17 +487,17 @@ class Scene(Table):
 
         Subclasses add those of their tables.
         """
-        found = []
+        notes = []
         for place, shape in self.shapes():
             turned = shape.turned_out(self.domain.size)
             if turned is not None and turned[0] > STRAY * self.spacing:
                 center = [float(f"{coordinate:.6g}") for coordinate in turned[1]]
-                found.append(
+                notes.append(
                     f"{place} ({shape.shape}): rotate about the origin moves it {turned[0]:.4g} m "
                     "out of the domain; to rotate it "
                     f"about its center, set about = {center}"
                 )
-        return [*found, *scene_notes(self)]
+        return [*notes, *scene_notes(self)]
 
     def memory_parts(self) -> dict[str, int]:
         """Return the estimated memory of each part of a run on its device [bytes].
@@ -506,7 +509,7 @@ class Scene(Table):
     def memory_estimate(self) -> int:
         """Return the estimated peak memory of a run [bytes]; 0: unknown.
 
-        Without the program itself.
+        It does not include the program itself.
         """
         return sum(self.memory_parts().values())
 
@@ -563,22 +566,26 @@ class Scene(Table):
         ]
 
     def _side_complaints(self) -> list[Complaint]:
-        found = []
+        """Return errors of the domain's open sides."""
+        complaints = []
         for index, side in enumerate(self.domain.open):
             if side in self.domain.open[:index]:
-                found.append(Complaint(("domain", "open", index), side, "is named twice"))
+                complaints.append(Complaint(("domain", "open", index), side, "is named twice"))
             if side in SIDES[2 * self.dimension :]:
-                found.append(
+                complaints.append(
                     Complaint(
                         ("domain", "open", index),
                         side,
                         "is a side of a 3-D domain; domain.size has 2 entries",
                     )
                 )
-        return found
+        return complaints
 
     def _outside_complaints(self) -> list[Complaint]:
-        """Return which rigid bodies lie wholly outside the domain, as far as their keys tell."""
+        """Return errors of rigid bodies that lie wholly outside the domain.
+
+        As far as their keys tell, without mesh files.
+        """
         return [
             Complaint(
                 ("solid", index),
@@ -592,6 +599,7 @@ class Scene(Table):
         ]
 
     def _motion_complaints(self) -> list[Complaint]:
+        """Return errors of moving solids that fill whole cells."""
         if self.domain.solids == "cut-cell":
             return []
         message = 'needs domain.solids = "cut-cell": solids that fill whole cells cannot move'
@@ -603,15 +611,16 @@ class Scene(Table):
         ]
 
     def _body_line(self, index: int, solid: Solid) -> str:
-        """Return what a rigid body is, for the plan."""
+        """Return a description of a rigid body, for the plan."""
         unit = "kg" if self.dimension == 3 else "kg/m"
         return f"solid {index} {solid.shape} of " + (
             f"{solid.mass:g} {unit}" if solid.mass is not None else f"{solid.density:g} kg/m^3"
         )
 
     def _grid_complaints(self) -> list[Complaint]:
-        found = self.domain.spacing_complaints()
-        for axis, side in enumerate(self.domain.size if not found else ()):
+        """Return errors of the grid: whole cells along each side, periodic axes."""
+        complaints = self.domain.spacing_complaints()
+        for axis, side in enumerate(self.domain.size if not complaints else ()):
             cells = side / self.spacing
             if round(cells) < 1 or abs(cells - round(cells)) > WHOLE_CELLS * cells:
                 sides = [
@@ -623,16 +632,16 @@ class Scene(Table):
                     f"must be a whole number of cells of {self.spacing:.6g} m; the nearest: "
                     f"{' and '.join(sides)}"
                 )
-                found.append(Complaint(("domain", "size", axis), side, message))
+                complaints.append(Complaint(("domain", "size", axis), side, message))
         if self.domain.periodic is not None and len(self.domain.periodic) != self.dimension:
-            found.append(
+            complaints.append(
                 Complaint(
                     ("domain", "periodic"),
                     self.domain.periodic,
                     f"must have {self.dimension} entries",
                 )
             )
-        return found
+        return complaints
 
 
 def _shown(tolerance: float | str) -> str:

@@ -22,20 +22,20 @@ from warp_lcp.scene.simulator import Simulator, simulators
 from warp_lcp.scene.table import KeyFault, SceneError, Table, validate, written
 from warp_lcp.settings import nearest
 
-DEEPEST = 16  # tables and arrays in each other; a scene needs six
-# in an array of them, such as [[liquid]]: each is a shape whose distances are taken by itself
+DEEPEST = 16  # nesting limit of tables and arrays; a scene needs six
+# Limit for an array of tables, such as [[liquid]]: each is a shape with a distance of its own.
 MOST_TABLES = 10_000
-GIVEN = "the scene given"  # to Python as tables
-LARGEST = 1e18  # of a number: its square is a float32, and sums of cubes are float64
+GIVEN = "the scene given"  # name in messages for tables given in Python
+LARGEST = 1e18  # largest magnitude: its square fits into float32, sums of cubes into float64
 
-# a file, the name of a built-in scene, the tables of a file, a scene
+# A file, the name of a built-in scene, the tables of a file, or a scene.
 SceneSource = str | Path | Mapping[str, Any] | Scene
 
 HEADER = "# The scene as it ran: defaults filled in, overrides applied, paths absolute.\n"
 
 
 def built_in_scenes() -> dict[str, Traversable]:
-    """Return the scenes that come with the package, by name."""
+    """Return the built-in scenes by name."""
     found = {
         entry.name.removesuffix(".toml"): entry
         for entry in files("warp_lcp.scene.scenes").iterdir()
@@ -48,8 +48,8 @@ def installed_simulators() -> dict[str, Simulator]:
     """Return the simulators by name.
 
     Raises:
-        SceneError: one of them cannot be loaded, perhaps because another distribution installed a
-            package of its name.
+        SceneError: one of them cannot be loaded, perhaps because another distribution has installed
+            a package of its name.
     """
     try:
         return simulators()
@@ -68,13 +68,12 @@ def load_scene(source: SceneSource, overrides: Sequence[str] = ()) -> Scene:
     Its class is the `scene_model` of its simulator.
 
     Args:
-        source: a TOML file, the name of a built-in scene, tables as such a file has them, or a
-            scene.
+        source: a TOML file, the name of a built-in scene, the tables of such a file, or a scene.
         overrides: `section.key=value` with values as in TOML (bare words are text);
             `liquid.0.max=[1, 1]` reaches into an array of tables.
 
     Raises:
-        SceneError: listing everything that is wrong.
+        SceneError: lists all errors.
     """
     data, label, folder, name = _raw(source)
     for override in overrides:
@@ -91,7 +90,10 @@ def load_scene(source: SceneSource, overrides: Sequence[str] = ()) -> Scene:
 
 
 def _raw(source: SceneSource) -> tuple[dict[str, Any], str, Path, str]:
-    """Return a scene's tables, what messages call it, the folder that its files are relative to, and its name where it has none."""
+    """Return a scene's tables, name in messages, folder and default name.
+
+    Paths in the tables are relative to the folder.
+    """
     if isinstance(source, Scene):
         source = source.model_dump(by_alias=True, exclude_none=True)
     if isinstance(source, Mapping):
@@ -108,7 +110,7 @@ def _raw(source: SceneSource) -> tuple[dict[str, Any], str, Path, str]:
 
 
 def _plain(value: Any) -> Any:
-    """Return tables and arrays as a TOML file would give them, so that no caller's object is changed."""
+    """Return a deep copy of tables and arrays, in the types of a TOML file."""
     if isinstance(value, Mapping):
         return {str(key): _plain(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):
@@ -152,7 +154,7 @@ def single_tables(source: SceneSource) -> dict[str, set[str]]:
         SceneError: the file cannot be read, or names no simulator.
     """
     data, label, _, _ = _raw(source)
-    found = {}
+    tables = {}
     for name, field in _scene_model(data, label).model_fields.items():
         kinds = [
             kind
@@ -160,8 +162,8 @@ def single_tables(source: SceneSource) -> dict[str, set[str]]:
             if isinstance(kind, type) and issubclass(kind, Table)
         ]
         if kinds and get_origin(field.annotation) is not list:
-            found[name] = {inner.alias or key for key, inner in kinds[0].model_fields.items()}
-    return found
+            tables[name] = {inner.alias or key for key, inner in kinds[0].model_fields.items()}
+    return tables
 
 
 def fix_file(source: str) -> list[str]:
@@ -211,12 +213,12 @@ def keys(scene: Scene) -> dict[str, Any]:
 
 
 def table_keys(table: Mapping[str, Any]) -> dict[str, Any]:
-    """Return every key of a table of tables with its value, as `keys` does."""
+    """Return all keys of nested tables with values, as `keys` does."""
     return dict(_leaves(dict(table)))
 
 
 def _leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Walk tables and arrays of tables; lists of numbers are leaves."""
+    """Yield the values in tables and arrays of tables; lists of numbers are values."""
     if isinstance(value, dict):
         for key, entry in value.items():
             yield from _leaves(entry, f"{path}.{key}" if path else key)
@@ -228,6 +230,7 @@ def _leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _find(text: str) -> Path | Traversable:
+    """Return the file of a scene by name or path."""
     path = Path(text)
     scenes = built_in_scenes()
     if text in scenes:
@@ -251,7 +254,10 @@ def _find(text: str) -> Path | Traversable:
 
 
 def _near_file(path: Path, others: Iterable[str]) -> str:
-    """Return `did you mean ...?` for a scene file that is not there but nearly, unless another name is nearer; "" where there is none."""
+    """Return `did you mean ...?` for a scene file with a similar name, or "".
+
+    "" also if the name of a built-in scene is more similar.
+    """
     try:
         files = {
             file.stem: str(path.parent / file.name)
@@ -272,6 +278,7 @@ def _near_file(path: Path, others: Iterable[str]) -> str:
 
 
 def _parse(file: Path | Traversable, source: str) -> dict[str, Any]:
+    """Return the tables of a TOML file."""
     try:
         return tomllib.loads(file.read_bytes().decode("utf-8-sig").replace("\r\n", "\n"))
     except OSError as error:
@@ -291,7 +298,10 @@ def _parse(file: Path | Traversable, source: str) -> dict[str, Any]:
 
 
 def _refuse_extremes(data: dict[str, Any], source: str) -> None:
-    """Refuse what no scene needs and no arithmetic survives; nan and inf are for the validation, which knows the keys."""
+    """Raise an error for extreme numbers, lengths and nesting.
+
+    nan and inf are left to the validation, which knows the keys.
+    """
     problems = []
     waiting: list[tuple[str, Any, int]] = [(key, value, 1) for key, value in data.items()]
     while waiting:  # not recursive: dotted keys nest without limit
@@ -317,7 +327,10 @@ def _refuse_extremes(data: dict[str, Any], source: str) -> None:
 
 
 def _override(data: dict[str, Any], override: str, source: str) -> None:
-    """Set one key of the raw data; whether the key exists and the value suits it is for the validation to say."""
+    """Set one key of the raw data.
+
+    The validation checks whether the key exists and the value is allowed.
+    """
     name, equals, text = override.partition("=")
     keys = name.strip().split(".")
     if not equals or len(keys) < 2 or not all(keys):
@@ -338,7 +351,7 @@ def _override(data: dict[str, Any], override: str, source: str) -> None:
 
 
 def _place(table: object, keys: list[str], depth: int, source: str) -> str | int:
-    """Return keys[depth] as what it is in `table`: a table's key or an index into an array."""
+    """Return keys[depth] as a key of `table`, or as an index into an array."""
     key, parent, path = keys[depth], ".".join(keys[:depth]), ".".join(keys[: depth + 1])
     if isinstance(table, dict):
         return key
@@ -362,7 +375,7 @@ def _value(text: str) -> Any:
 
 
 def _resolve_paths(data: dict[str, Any], folder: Path) -> None:
-    """Make the files that shapes name absolute, so that the scene means the same from anywhere."""
+    """Make the paths of files that shapes name absolute."""
     for entries in data.values():
         for entry in entries if isinstance(entries, list) else ():
             file = entry.get("file") if isinstance(entry, dict) else None
@@ -371,7 +384,10 @@ def _resolve_paths(data: dict[str, Any], folder: Path) -> None:
 
 
 def _scene_model(data: dict[str, Any], source: str) -> type[Scene]:
-    """Return the class of the simulator that the scene names; without it, no other key can be judged."""
+    """Return the scene class of the simulator that the scene names.
+
+    Without a simulator, no other key can be validated.
+    """
     about = data.get("scene")
     name = about.get("simulator") if isinstance(about, dict) else None
     installed = installed_simulators()
@@ -399,7 +415,7 @@ def _scene_model(data: dict[str, Any], source: str) -> type[Scene]:
 
 
 def _find_meshes(scene: Scene, source: str) -> None:
-    """Refuse meshes whose file is not there, before anything is built."""
+    """Raise an error for missing mesh files, before anything is built."""
     problems = [
         KeyFault(path, "there is no such file", written(file))
         for path, file in _leaves(scene.model_dump())

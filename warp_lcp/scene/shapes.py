@@ -1,4 +1,4 @@
-"""The shapes of a scene file: where solids stand and where material starts."""
+"""Shapes of a scene file: solids, initial material, sources and drains."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from warp_lcp.settings import NonNegative, Part, Positive
 if TYPE_CHECKING:
     from warp_lcp.grid.solids import Geometry, Placement
 
-BUILTIN = "builtin:"  # how the name of a mesh that the project generates begins
+BUILTIN = "builtin:"  # prefix of the names of meshes that the project generates
 
 Wall = Literal["separating", "free-slip", "sticky"]
 
 
 def _wall_friction(value: Any, handler: ValidatorFunctionWrapHandler) -> float | str:
-    """Return a number from 0 to 10 or "stick"; a wrong one is refused once, and not by each alternative."""
+    """Return a number from 0 to 10 or "stick", with one error for both alternatives."""
     try:
         friction: float | str = handler(value)
     except ValidationError as error:
@@ -39,14 +39,16 @@ WallFriction = Annotated[
     WrapValidator(_wall_friction, json_schema_input_type=float | Literal["stick"]),
 ]
 FRICTIONS = "0 (free slip) to 10, or stick"
-# Coulomb's coefficient of a wall that holds what presses against it: sand, as far as that holds
-# itself
+# Coulomb's coefficient of a sticky wall: sand at the wall slides only where the sand itself yields.
 STICKS = 1e6
-BODY_FRICTION = 0.5  # of a rigid body unless its scene says otherwise
+BODY_FRICTION = 0.5  # default of a rigid body
 
 
 class _Boxes:
-    """The boxes around a shape that were asked for, by dimension: equal to no others, so that shapes compare by their keys alone."""
+    """Cache of a shape's bounding boxes by dimension.
+
+    Caches compare by identity; shapes are compared by their keys only.
+    """
 
     def __init__(self) -> None:
         self.known: dict[int, np.ndarray | None] = {}
@@ -55,14 +57,12 @@ class _Boxes:
 class Shape(Table):
     """Region of space: p = about + rotation (scale (q - about)) + translation.
 
-    `about` is the origin by default.
-
-    `rotate` is in degrees: one angle in 2-D, angles about the fixed axes x, y, z (in that order) in
-    3-D. `invert` swaps inside and outside.
+    `about` is the origin by default. `rotate` is in degrees: one angle in 2-D, angles about the
+    fixed axes x, y, z (in that order) in 3-D. `invert` swaps inside and outside.
     """
 
     if TYPE_CHECKING:
-        shape: str  # of the file's key; each kind of shape has a value of its own
+        shape: str  # value of the file's key, unique for each kind of shape
     translate: Vector | None = Field(default=None, description="translation [m]")
     rotate: Angles | None = Field(
         default=None, description="rotation [degrees]: a number in 2-D, [x, y, z] in 3-D"
@@ -78,7 +78,7 @@ class Shape(Table):
         """Return the shape as a signed distance.
 
         Args:
-            folder: where the files are that the shape names.
+            folder: folder of the files that the shape names.
             dimension: 2 or 3.
 
         Raises:
@@ -101,9 +101,8 @@ class Shape(Table):
     def turned_out(self, domain: list[float]) -> tuple[float, list[float]] | None:
         """Return the distance by which `rotate` moves the shape out of a domain.
 
-        And its center before [m]; None: it does not.
-
-        Of a shape that turns about the origin, which may not have been meant.
+        And its center before [m]; None if it does not. Only for shapes that are rotated about the
+        origin, which may be a mistake.
         """
         if self.about is not None or not any(self.rotate or []) or self.invert:
             return None
@@ -120,7 +119,7 @@ class Shape(Table):
     def bounds(self, dimension: int) -> np.ndarray | None:
         """Return the low and high corner [m] of a box around the shape, shape (2, 3).
 
-        None when the shape has no limits, or only its file knows them.
+        None if the shape is unbounded, or only its file has its size.
         """
         known = self._boxes.known
         if dimension not in known:
@@ -159,7 +158,7 @@ class Shape(Table):
 
 
 class BoxTable(Shape):
-    """A box between two corners."""
+    """Box between two corners."""
 
     shape: Literal["box"] = "box"
     min: Vector = Field(description="lower corner [m]")
@@ -175,18 +174,20 @@ class BoxTable(Shape):
 
     def complaints(self, dimension: int) -> list[Complaint]:
         """Return errors of the box in a scene of 2 or 3 dimensions."""
-        found = super().complaints(dimension)
-        if not found and any(low >= high for low, high in zip(self.min, self.max, strict=True)):
-            found.append(
+        complaints = super().complaints(dimension)
+        if not complaints and any(
+            low >= high for low, high in zip(self.min, self.max, strict=True)
+        ):
+            complaints.append(
                 Complaint(
                     ("max",), self.max, f"must be greater than min = {self.min} along every axis"
                 )
             )
-        return found
+        return complaints
 
 
 class SphereTable(Shape):
-    """A ball; a disc in 2-D."""
+    """Ball; a disc in 2-D."""
 
     shape: Literal["sphere"] = "sphere"
     center: Vector = Field(description="center [m]")
@@ -235,14 +236,14 @@ class CapsuleTable(Shape):
 
 
 class PlaneTable(Shape):
-    """The half space on the side of a plane that its normal points away from."""
+    """Half space on the side of a plane opposite to its normal."""
 
     shape: Literal["plane"] = "plane"
     point: Vector = Field(description="point of the plane [m]")
     normal: Vector = Field(description="outward normal of any length")
 
     def to_geometry(self, folder: Path, dimension: int) -> Geometry:
-        """Return the half space that the normal points away from."""
+        """Return the half space on the side opposite to the normal."""
         from warp_lcp.grid import solids
 
         return solids.Plane(
@@ -277,17 +278,17 @@ class MeshTable(Shape):
         )
 
     def bounds(self, dimension: int) -> np.ndarray | None:
-        """Return None: only the file knows."""
+        """Return None: the size is only in the file."""
         return None
 
 
 class SolidProperties(Shape):
     """Properties of a solid besides its shape.
 
-    Where solids have more, their classes derive from SolidBox, SolidSphere and so on.
+    Solids with more properties have classes derived from SolidBox, SolidSphere and so on.
     """
 
-    rubs: ClassVar[bool] = False  # whether the material rubs against solids that stand
+    rubs: ClassVar[bool] = False  # whether the material has friction with solids at rest
     wall: Wall | None = Field(default=None, description="boundary condition; default: domain.wall")
     slip_length: float | None = Field(
         default=None,
@@ -327,7 +328,7 @@ class SolidProperties(Shape):
 
     @property
     def moves(self) -> bool:
-        """Return whether it does not stand still."""
+        """Return whether it moves."""
         return self.is_body or self.motion is not None
 
     def complaints(self, dimension: int) -> list[Complaint]:
@@ -341,17 +342,17 @@ class SolidProperties(Shape):
         return found + (self._body_complaints() if self.is_body else self._still_complaints())
 
     def _body_complaints(self) -> list[Complaint]:
-        """Return what is wrong with a rigid body."""
+        """Return errors of a rigid body."""
         key = "mass" if self.mass is not None else "density"
-        found = []
+        complaints = []
         if self.mass is not None and self.density is not None:
-            found.append(
+            complaints.append(
                 Complaint(
                     ("density",), self.density, "cannot be combined with mass: give one of them"
                 )
             )
         if self.motion is not None:
-            found.append(
+            complaints.append(
                 Complaint(
                     ("motion",),
                     None,
@@ -359,7 +360,7 @@ class SolidProperties(Shape):
                 )
             )
         if self.invert:
-            found.append(
+            complaints.append(
                 Complaint(
                     ("invert",),
                     True,
@@ -367,29 +368,31 @@ class SolidProperties(Shape):
                 )
             )
         if self.shape == "plane":
-            found.append(
+            complaints.append(
                 Complaint((key,), getattr(self, key), "not for a plane: a half space has no mass")
             )
-        return found
+        return complaints
 
     def _still_complaints(self) -> list[Complaint]:
-        """Return which keys need a rigid body."""
-        given: dict[str, object] = {
+        """Return errors of keys that need a rigid body."""
+        body_keys: dict[str, object] = {
             "velocity": self.velocity,
             "angular_velocity": self.angular_velocity,
             "restitution": self.restitution or None,
         }
         message = "needs mass or density, which make the solid a rigid body"
-        found = [
-            Complaint((name,), value, message) for name, value in given.items() if value is not None
+        complaints = [
+            Complaint((name,), value, message)
+            for name, value in body_keys.items()
+            if value is not None
         ]
         if self.friction is not None and not self.rubs:
-            found.append(
+            complaints.append(
                 Complaint(
                     ("friction",), self.friction, f"{message}: a liquid has no friction with solids"
                 )
             )
-        return found
+        return complaints
 
 
 class MaterialProperties(Shape):
@@ -411,43 +414,43 @@ class LiquidProperties(MaterialProperties):
 
 
 class SolidBox(SolidProperties, BoxTable):
-    """A solid box."""
+    """Solid box."""
 
 
 class SolidSphere(SolidProperties, SphereTable):
-    """A solid ball."""
+    """Solid ball."""
 
 
 class SolidCapsule(SolidProperties, CapsuleTable):
-    """A solid capsule."""
+    """Solid capsule."""
 
 
 class SolidPlane(SolidProperties, PlaneTable):
-    """A solid half space."""
+    """Solid half space."""
 
 
 class SolidMesh(SolidProperties, MeshTable):
-    """A solid inside a surface of triangles."""
+    """Solid inside a triangle mesh."""
 
 
 class LiquidBox(LiquidProperties, BoxTable):
-    """A box of liquid."""
+    """Box of liquid."""
 
 
 class LiquidSphere(LiquidProperties, SphereTable):
-    """A ball of liquid."""
+    """Ball of liquid."""
 
 
 class LiquidCapsule(LiquidProperties, CapsuleTable):
-    """A capsule of liquid."""
+    """Capsule of liquid."""
 
 
 class LiquidPlane(LiquidProperties, PlaneTable):
-    """A half space of liquid."""
+    """Half space of liquid."""
 
 
 class LiquidMesh(LiquidProperties, MeshTable):
-    """Liquid inside a surface of triangles."""
+    """Liquid inside a triangle mesh."""
 
 
 class Schedule(Table):
@@ -494,43 +497,43 @@ class DrainProperties(Schedule, Shape):
 
 
 class SourceBox(SourceProperties, BoxTable):
-    """A box that material comes out of."""
+    """Source in a box."""
 
 
 class SourceSphere(SourceProperties, SphereTable):
-    """A ball that material comes out of."""
+    """Source in a ball."""
 
 
 class SourceCapsule(SourceProperties, CapsuleTable):
-    """A capsule that material comes out of."""
+    """Source in a capsule."""
 
 
 class SourcePlane(SourceProperties, PlaneTable):
-    """A half space that material comes out of."""
+    """Source in a half space."""
 
 
 class SourceMesh(SourceProperties, MeshTable):
-    """A surface of triangles that material comes out of."""
+    """Source inside a triangle mesh."""
 
 
 class DrainBox(DrainProperties, BoxTable):
-    """A box that swallows material."""
+    """Drain in a box."""
 
 
 class DrainSphere(DrainProperties, SphereTable):
-    """A ball that swallows material."""
+    """Drain in a ball."""
 
 
 class DrainCapsule(DrainProperties, CapsuleTable):
-    """A capsule that swallows material."""
+    """Drain in a capsule."""
 
 
 class DrainPlane(DrainProperties, PlaneTable):
-    """A half space that swallows material."""
+    """Drain in a half space."""
 
 
 class DrainMesh(DrainProperties, MeshTable):
-    """A surface of triangles that swallows material."""
+    """Drain inside a triangle mesh."""
 
 
 Solid = Annotated[

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @runtime_checkable
 class Simulator(Protocol):
-    """A plug-in: a kind of material and the scenes that describe it."""
+    """Simulator plug-in: a kind of material and the scenes that describe it."""
 
     name: str
     summary: str
@@ -36,17 +36,15 @@ class Simulator(Protocol):
 def runs_on_ranks(simulator: Simulator) -> bool:
     """Return whether a plug-in's simulations run on several MPI ranks.
 
-    Then its `create` takes `ranks`.
-
-    They are then `warp_lcp.simulation.Joined`. `create` is collective, with the same scene on all
-    ranks, and returns this rank's part.
+    Its `create` then has an argument `ranks`, is collective with the same scene on all ranks, and
+    returns this rank's part, a `warp_lcp.simulation.Joined`.
     """
     return "ranks" in inspect.signature(simulator.create).parameters
 
 
 @functools.cache
 def entry_points(group: str) -> metadata.EntryPoints:
-    """Return the entry points of a group; packages are searched once a process."""
+    """Return the entry points of a group; packages are searched once per process."""
     return metadata.entry_points(group=group)
 
 
@@ -59,13 +57,13 @@ def plug_ins(group: str, kind: type[Any], what: str) -> dict[str, Any]:
     """Return the objects loaded by the entry points of a group, by name.
 
     Raises:
-        TypeError: something is not of a kind, which `what` says in words.
+        TypeError: an object is not of this kind, which `what` names.
     """
-    found = {}
+    loaded = {}
     for entry in entry_points(group=group):
-        found[entry.name] = entry.load()
-        if not isinstance(found[entry.name], kind):
+        loaded[entry.name] = entry.load()
+        if not isinstance(loaded[entry.name], kind):
             raise TypeError(
-                f"entry point {entry.name!r} of {group} is not {what}: {found[entry.name]!r}"
+                f"entry point {entry.name!r} of {group} is not {what}: {loaded[entry.name]!r}"
             )
-    return found
+    return loaded

@@ -17,7 +17,7 @@ from warp_lcp.simulation import InputError
 
 ModelT = TypeVar("ModelT", bound="Table")
 
-# pydantic's error types in the words of someone who writes a scene.
+# Messages for pydantic's error types, in the terms of scene files.
 MESSAGES = {
     "missing": "is missing",
     "greater_than": "must be greater than {gt:g}",
@@ -42,7 +42,7 @@ MESSAGES = {
 }
 NOT_YET = "not available yet in this version"
 ANY_VALUE: frozenset[object] = frozenset()
-VARIANT_KEYS = ("shape", "kind")  # of tables that come in several forms, each with keys of its own
+VARIANT_KEYS = ("shape", "kind")  # keys that select the form of a table
 
 
 def _as_list(value: object) -> object:
@@ -60,18 +60,19 @@ Angles = Annotated[
 class Table(BaseModel):
     """Table of a scene file.
 
-    Unknown keys, wrong types, nan and inf are refused; a table is immutable.
-
-    A field's description, with its unit, is quoted when its value is refused.
+    Unknown keys, wrong types, nan and inf are refused; a table is immutable. A field's description,
+    with its unit, is quoted when its value is refused.
     """
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
-    #: keys of models that later versions bring, each with the values that are refused until then (`ANY_VALUE`: the key itself).
+    #: Keys of models in later versions, each with the values that are refused until then
+    #: (`ANY_VALUE`: the key itself).
     later: ClassVar[Mapping[str, frozenset[object]]] = {}
-    #: those among them that other simulators have already, with the simulator's name; and more keys that only those have.
+    #: Those of them, and further keys, that other simulators have, with the simulator's name.
     elsewhere: ClassVar[Mapping[str, str]] = {}
-    #: old names of keys, each with today's name; scene files may still have them (see `warp_lcp.scene.renamed_keys`).
+    #: Old names of keys, each with its current name; scene files may still have them (see
+    #: `warp_lcp.scene.renamed_keys`).
     renamed: ClassVar[Mapping[str, str]] = {}
 
 
@@ -90,10 +91,10 @@ class KeyFault:
 
 
 class SceneError(InputError):
-    """A scene that cannot be used; `problems` lists everything that is wrong with it."""
+    """Error of an invalid scene; `problems` lists all errors."""
 
     def __init__(self, source: str, problems: Iterable[KeyFault]) -> None:
-        """Compose the text from the file's name and its problems."""
+        """Compose the message from the file's name and its problems."""
         self.source = source
         self.problems = tuple(problems)
         if len(self.problems) == 1:
@@ -109,7 +110,7 @@ class SceneError(InputError):
 class Complaint:
     """Error of a check across keys: key, value, and what is allowed.
 
-    The value is given if it helps.
+    The value is included if it helps.
     """
 
     place: tuple[str | int, ...]
@@ -140,11 +141,11 @@ def validate(model: type[ModelT], data: Mapping[str, Any], source: str) -> Model
 
     Args:
         model: the class of the scene.
-        data: what the TOML says.
-        source: the name to complain under, usually the file's.
+        data: the content of the TOML file.
+        source: name in messages, usually that of the file.
 
     Raises:
-        SceneError: with every problem that was found.
+        SceneError: lists all errors.
     """
     try:
         return model.model_validate(data)
@@ -155,7 +156,7 @@ def validate(model: type[ModelT], data: Mapping[str, Any], source: str) -> Model
 
 @dataclass
 class _Place:
-    """Where an error's location leads: the path as written in the file, the table that owns the last key, and the key's field."""
+    """Location of an error: path in the file, table of the last key, and field."""
 
     path: str
     key: str = ""
@@ -165,11 +166,13 @@ class _Place:
 
 
 def _locate(model: type[Table], location: tuple[str | int, ...]) -> _Place:
+    """Return the location of an error from pydantic's path."""
     place = _Place(path="", below=(model,))
     for part in location:
         if isinstance(part, int):
             place.path += f"[{part}]"
-        elif part in _variants(place.below):  # pydantic names the shape it chose; the file does not
+        elif part in _variants(place.below):
+            # The file has no entry for the shape that pydantic adds to the location.
             place.below = (_variants(place.below)[part],)
         else:
             owner = place.below[0] if len(place.below) == 1 else None
@@ -180,6 +183,10 @@ def _locate(model: type[Table], location: tuple[str | int, ...]) -> _Place:
 
 
 def _problem(model: type[Table], error: ErrorDetails) -> KeyFault:
+    """Return the error of a key from pydantic's error.
+
+    Keys of later versions and of other simulators have messages of their own.
+    """
     kind, context = error["type"], error.get("ctx", {})
     place = _locate(model, error["loc"])
     later = place.owner.later if place.owner else {}
@@ -217,19 +224,25 @@ def _unknown_variant(place: _Place, key: str, tag: object) -> KeyFault:
 
 
 def _keys(table: type[Table]) -> dict[str, FieldInfo]:
-    """Return a table's fields under the names that the file uses."""
+    """Return a table's fields by their names in the file."""
     return {info.alias or name: info for name, info in table.model_fields.items()}
 
 
 def _tables(annotation: object) -> tuple[type[Table], ...]:
-    """Return the table classes inside a field's annotation (`list[Annotated[A | B, ...]]` gives A and B)."""
+    """Return the table classes in a field's annotation.
+
+    `list[Annotated[A | B, ...]]` gives A and B.
+    """
     if isinstance(annotation, type) and issubclass(annotation, Table):
         return (annotation,)
     return tuple(table for argument in get_args(annotation) for table in _tables(argument))
 
 
 def _variants(tables: tuple[type[Table], ...]) -> dict[str, type[Table]]:
-    """Return the tables that one key, such as `shape`, chooses from, by its value; none when there is nothing to choose."""
+    """Return the tables that a key such as `shape` selects, by its value.
+
+    Empty if there is only one table.
+    """
     if len(tables) < 2:
         return {}
     return {
@@ -246,6 +259,6 @@ def counted(count: int) -> str:
 
 
 def written(value: object) -> str:
-    """Return a value as a scene file would show it, cut to a line."""
+    """Return a value as written in a scene file, cut to a line."""
     text = json.dumps(value, default=str, ensure_ascii=False)
     return text if len(text) <= 200 else f"{text[:197]}..."  # long enough for paths

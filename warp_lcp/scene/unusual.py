@@ -1,6 +1,6 @@
 """Suspicious settings: wrong units, gravity upward, material beyond the domain.
 
-They are allowed, and told at the start of a run and by `check`, with the value, what is usual, and
+They are allowed. A run and `check` report them at the start, with the value, the usual range, and
 the unit.
 """
 
@@ -17,12 +17,12 @@ if TYPE_CHECKING:
     from warp_lcp.scene.scene import Scene
     from warp_lcp.scene.shapes import MaterialProperties, Solid
 
-FRACTION = 0.25 * math.pi  # of which angles in radians are often multiples
-DIGITS = 1e-3  # to how much, relative
+FRACTION = 0.25 * math.pi  # angles in radians are often multiples of this
+DIGITS = 1e-3  # relative accuracy of that test
 STRONG = 50.0  # gravity [m/s^2]: twice that of Jupiter
-# of a velocity [m/s]: sound in air, beyond which no liquid or sand is incompressible for long
+# Speed [m/s] of sound in air, beyond which no liquid or sand is incompressible for long.
 FAST = 340.0
-MOVED = 0.5  # cells: a motion shorter than this by the end of a run is not visible
+MOVED = 0.5  # cells: a shorter motion by the end of a run is not visible
 
 
 @dataclass(frozen=True)
@@ -30,12 +30,12 @@ class Usual:
     """Usual range of a key.
 
     Args:
-        low: least value that is not told of.
-        high: greatest such value.
-        unit: of the key; "" of numbers without one.
-        known: what is usual, in words.
-        other: unit that the number may have been meant in.
-        factor: one of the other unit in the key's.
+        low: least value without a warning.
+        high: greatest value without a warning.
+        unit: unit of the key; "" for numbers without one.
+        known: the usual range in words.
+        other: another unit in which the number may have been given.
+        factor: one of the other unit in the key's unit.
     """
 
     low: float
@@ -79,7 +79,7 @@ def radians_meant(
 
 
 def scene_notes(scene: Scene) -> Iterator[str]:
-    """Yield what looks like a mistake in the tables of every scene."""
+    """Yield suspicious settings in the tables of every scene."""
     gravity, time = scene.physics.gravity, scene.time
     strength = math.hypot(*gravity)
     if gravity[1] > 0.0:
@@ -111,7 +111,7 @@ def scene_notes(scene: Scene) -> Iterator[str]:
 
 
 def _solid_notes(scene: Scene, place: str, solid: Solid) -> Iterator[str]:
-    """Yield what looks like a mistake in a solid's motion, mass or density."""
+    """Yield suspicious settings of a solid's motion, mass or density."""
     for key in ("phase", "angle"):
         yield from radians_meant(f"{place}.motion.{key}", getattr(solid.motion, key, None))
     yield from radians_meant(
@@ -121,7 +121,7 @@ def _solid_notes(scene: Scene, place: str, solid: Solid) -> Iterator[str]:
     yield from BODY_DENSITY.notes(f"{place}.density", solid.density)
     if solid.mass is not None:
         volume, unit = scene.enclosed_volume(solid), "kg" if scene.dimension == 3 else "kg/m"
-        # the box around the shape is larger than the shape
+        # The box around the shape is larger than the shape.
         least = solid.mass / volume if volume > 0.0 else 0.0
         if least > BODY_DENSITY.high:
             yield (
@@ -134,7 +134,7 @@ def _solid_notes(scene: Scene, place: str, solid: Solid) -> Iterator[str]:
 def material_notes(
     scene: Scene, key: str, materials: Sequence[MaterialProperties]
 ) -> Iterator[str]:
-    """Yield material that extends far out of the domain, and scenes without motion."""
+    """Yield warnings about material outside the domain, and scenes without motion."""
     size = np.array(scene.domain.size)
     for number, shape in enumerate(materials):
         box = None if shape.invert else shape.bounds(scene.dimension)
@@ -142,7 +142,7 @@ def material_notes(
             continue
         low, high = (corner[: scene.dimension] for corner in box)
         beyond, middle = float(np.maximum(-low, high - size).max()), 0.5 * (low + high)
-        # a drop may stand at a wall, and be cut in half by it
+        # A drop may be centered on a wall, which cuts it in half.
         outside = bool(((middle < 0.0) | (middle > size)).any())
         if beyond > scene.spacing and (outside or (shape.shape == "box" and shape.rotate is None)):
             yield (

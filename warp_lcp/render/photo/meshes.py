@@ -1,4 +1,7 @@
-"""Triangle meshes of a picture: normals with creases, a liquid closed against walls and solids, grains of sand, convex solids."""
+"""Triangle meshes of path-traced pictures.
+
+Normals with creases, a liquid closed against walls and solids, grains of sand, convex solids.
+"""
 
 from __future__ import annotations
 
@@ -11,18 +14,18 @@ from scipy.spatial.transform import Rotation
 
 from warp_lcp.simulation import Surface
 
-CREASE = 40.0  # degrees between two triangles that do not share a normal
-OVERLAP = 0.1  # of a liquid with the solids that it touches [cells]
-TOUCHING = 0.6  # distance of a liquid's points that touch a solid [cells]
-PROTOTYPES = 64  # of grains
-FINE_GRAINS = 60_000  # up to so many have 80 triangles, more have 20
+CREASE = 40.0  # largest angle [degrees] between triangles that share a normal
+OVERLAP = 0.1  # overlap of a liquid with the solids that it touches [cells]
+TOUCHING = 0.6  # distance from a solid up to which a liquid's points touch it [cells]
+PROTOTYPES = 64  # number of different grains
+FINE_GRAINS = 60_000  # up to this number grains have 80 triangles, otherwise 20
 
-# signed distance [m] of points [m], negative inside solids
+# Signed distance [m] at points [m], negative inside solids.
 Distance = Callable[[np.ndarray], np.ndarray]
 
 
 def face_normals(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Return the normals of triangles, their lengths twice the areas [m^2]."""
+    """Return the normals of triangles, with lengths of twice the areas [m^2]."""
     a, b, c = np.moveaxis(points[corners], 1, 0)
     return np.cross(b - a, c - a)
 
@@ -30,10 +33,11 @@ def face_normals(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
 def creased(
     points: np.ndarray, corners: np.ndarray, angle: float = CREASE
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return points, corners and unit normals of a mesh that is smooth except at edges sharper than an angle [degrees].
+    """Return points, corners and unit normals of a mesh with creases.
 
-    Each corner of a triangle averages the triangles around its point whose normals are within the
-    angle of its own.
+    The mesh is smooth except at edges sharper than an angle [degrees]. The normal at each corner of
+    a triangle is the average over the triangles around its point whose normals are within the angle
+    of its own.
     """
     normal = face_normals(points, corners)
     unit = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
@@ -54,7 +58,7 @@ def creased(
 
 
 def smooth_normals(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Return unit normals at the points, averages over the triangles around them by area."""
+    """Return unit normals at the points, area-weighted over adjacent triangles."""
     normal = face_normals(points, corners)
     sums = np.zeros((len(points), 3))
     for axis in range(3):
@@ -65,18 +69,20 @@ def smooth_normals(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
 def closed_liquid(
     surface: Surface, size: Sequence[float], spacing: float, distance: Distance | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return points, corners, normals and velocities of a liquid's surface, closed against the domain's walls and solids.
+    """Return a liquid's surface, closed against the domain's walls and solids.
+
+    As points, corners, normals and velocities.
 
     - Triangles in a wall are flat, with points of their own, so that the free surface meets them at
       a sharp edge.
-    - The liquid reaches below the floor y = 0 and into solids by `OVERLAP`: no film of air remains
-      between them, which would reflect.
+    - The liquid reaches below the floor y = 0 and into solids by `OVERLAP`, so that no film of air
+      remains between them, which would reflect.
 
     Args:
-        surface: closed triangles, with the field `velocity` or without.
-        size: of the domain [m].
-        spacing: a cell's edge [m].
-        distance: to the solids; None: there are none.
+        surface: closed triangles, with or without the field `velocity`.
+        size: size of the domain [m].
+        spacing: cell size [m].
+        distance: distance to the solids; None without solids.
     """
     points, corners = np.array(surface.points, dtype=np.float64), surface.corners
     velocity = np.array(surface.fields.get("velocity", np.zeros_like(points)), dtype=np.float64)
@@ -110,10 +116,10 @@ def closed_liquid(
 def pressed_against(
     points: np.ndarray, corners: np.ndarray, distance: Distance, spacing: float
 ) -> np.ndarray:
-    """Return points of a surface, those that touch a solid and face it moved to `OVERLAP` inside it.
+    """Return a surface's points, with those at a solid moved `OVERLAP` into it.
 
-    A point at signed distance d moves by (d + overlap) against the distance's gradient, which
-    points out of the solid.
+    Only points whose normals face the solid are moved. A point at signed distance d moves by (d +
+    overlap) against the distance's gradient, which points out of the solid.
     """
     points, overlap = points.copy(), OVERLAP * spacing
     normal = np.zeros_like(points)
@@ -122,7 +128,7 @@ def pressed_against(
     near = np.flatnonzero(np.abs(distance(points)) < TOUCHING * spacing)
     if not len(near):
         return points
-    for _ in range(2):  # the gradient turns near edges
+    for _ in range(2):  # the gradient changes near edges
         at = points[near]
         step = 1e-2 * spacing
         shifts = step * np.eye(3)
@@ -138,7 +144,10 @@ def pressed_against(
 
 
 def icosphere(rounds: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points and triangles of a unit icosahedron, each triangle cut into four so many times."""
+    """Return points and triangles of a unit icosahedron, subdivided `rounds` times.
+
+    Each round cuts a triangle into four.
+    """
     golden = 0.5 * (1.0 + 5.0**0.5)
     pairs = [(0.0, a, b * golden) for a in (-1.0, 1.0) for b in (-1.0, 1.0)]
     points = np.array([np.roll(pair, turn) for turn in range(3) for pair in pairs])
@@ -157,7 +166,10 @@ def icosphere(rounds: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def outward_hull(points: np.ndarray) -> np.ndarray:
-    """Return the triangles of the convex hull of points, counterclockwise seen from outside."""
+    """Return the triangles of the convex hull of points.
+
+    Counterclockwise seen from outside.
+    """
     hull = ConvexHull(points)
     corners = np.array(hull.simplices)
     inward = np.einsum("ij,ij->i", face_normals(points, corners), hull.equations[:, :3]) < 0.0
@@ -168,7 +180,9 @@ def outward_hull(points: np.ndarray) -> np.ndarray:
 def clipped_convex(
     halfspaces: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the triangles of the convex solid n x + d <= 0 inside a box, or None if they have no common inside.
+    """Return the triangles of a convex solid n x + d <= 0 inside a box.
+
+    None if they do not intersect.
 
     Args:
         halfspaces: rows (n, d), shape (k, 4), n of unit length.
@@ -185,18 +199,24 @@ def clipped_convex(
 
 
 def _inner_ball(rows: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return center and radius of the largest ball in halfspaces: max r, n x + r <= -d."""
-    found = linprog(
+    """Return center and radius of the largest ball in halfspaces.
+
+    max r, n x + r <= -d.
+    """
+    solution = linprog(
         [0.0, 0.0, 0.0, -1.0],
         A_ub=np.column_stack([rows[:, :3], np.ones(len(rows))]),
         b_ub=-rows[:, 3],
         bounds=[(None, None)] * 4,
     )
-    return (found.x[:3], float(found.x[3])) if found.success else (np.zeros(3), 0.0)
+    return (solution.x[:3], float(solution.x[3])) if solution.success else (np.zeros(3), 0.0)
 
 
 def grain_prototypes(rounds: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return irregular grains of about unit radius: points, shape (PROTOTYPES, n, 3), and triangles that they share."""
+    """Return irregular grains of about unit radius.
+
+    Points, shape (PROTOTYPES, n, 3), and their common triangles.
+    """
     rng = np.random.default_rng(5077)
     points, corners = icosphere(rounds)
     shapes = []
@@ -209,7 +229,9 @@ def grain_prototypes(rounds: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def grain_poses(seeds: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return for each grain, by its seed alone: prototype, rotation matrix, scale of its radius, and tone in [0, 1).
+    """Return prototype, rotation, scale and tone of each grain, by its seed.
+
+    The rotation is a matrix, the scale a factor on the radius, the tone in [0, 1).
 
     Args:
         seeds: integers, shape (n,); equal ones give equal grains.
@@ -233,19 +255,21 @@ def grain_poses(seeds: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, 
 def grain_mesh(
     centers: np.ndarray, radius: float, seeds: np.ndarray, rounds: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return one mesh of all grains, in float32: points, triangles, and the grain's index of each point.
+    """Return one mesh of all grains, in float32.
+
+    Points, triangles, and the grain's index of each point.
 
     Args:
         centers: [m], shape (n, 3).
         radius: mean radius [m].
-        seeds: of the grains, shape (n,).
-        rounds: 0 makes 20 triangles a grain, 1 makes 80.
+        seeds: seeds of the grains, shape (n,).
+        rounds: 0 for 20 triangles per grain, 1 for 80.
     """
     shapes, corners = grain_prototypes(rounds)
     prototype, rotation, scale, _ = grain_poses(seeds)
     each = shapes.shape[1]
     points = np.empty((len(centers), each, 3), dtype=np.float32)
-    for start in range(0, len(centers), 100_000):  # bounds the memory
+    for start in range(0, len(centers), 100_000):  # limits the memory
         own = slice(start, start + 100_000)
         turned = np.einsum("nij,nkj->nki", rotation[own], shapes.astype(np.float32)[prototype[own]])
         points[own] = centers[own, None] + (radius * scale[own])[:, None, None] * turned

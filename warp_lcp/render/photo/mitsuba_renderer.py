@@ -1,4 +1,7 @@
-"""Path tracing of a `PhotoScene` by Mitsuba 3, denoised by Open Image Denoise. Needs the extra `photo`."""
+"""Path tracing of a `PhotoScene` by Mitsuba 3, with a denoiser.
+
+The denoiser is Open Image Denoise. Needs the extra `photo`.
+"""
 
 from __future__ import annotations
 
@@ -19,9 +22,9 @@ from warp_lcp.render.recording import RenderError
 from warp_lcp.scene.camera import Viewpoint
 
 INSTALL = "pip install 'warp-lcp[photo]'"
-# compiled ahead of time; twice as fast, compiled at run time by LLVM
+# The first is compiled ahead of time; the second is twice as fast, compiled at run time by LLVM.
 SCALAR, LLVM = "scalar_rgb", "llvm_ad_rgb"
-OLDEST_LLVM = 16  # Dr.Jit 1.5 crashes on 14 and 15
+OLDEST_LLVM = 16  # Dr.Jit 1.5 crashes with 14 and 15
 LLVM_FOLDERS = [
     "/usr/lib/*-linux-gnu",
     "/usr/lib64",
@@ -37,12 +40,13 @@ mitsuba.set_variant("llvm_ad_rgb")
 scene = {"type": "scene", "integrator": {"type": "volpath"}, "sensor": {"type": "perspective"}, "sky": {"type": "constant"}}
 mitsuba.render(mitsuba.load_dict(scene), spp=1).numpy()
 """
-VERSION = 1  # of how pictures look; pictures of another one are rendered again
-DEPTH, ROULETTE = 20, 10  # bounces; from where on paths end by chance
-SUBFRAMES = 8  # instants of a shutter interval, where something moves
-PASS_PATHS = 4_000_000  # of a pass, at the most
-LARGEST_SAMPLE = 30.0  # radiance of a pixel's mean over a pass: rare bright paths would leave spots
-GROUND_REACH = 60.0  # of the ground, in sizes of the domain
+VERSION = 1  # version of the pictures' appearance; pictures of another version are rendered again
+DEPTH, ROULETTE = 20, 10  # most bounces; bounce from which paths end at random
+SUBFRAMES = 8  # instants of a shutter interval, with motion
+PASS_PATHS = 4_000_000  # most paths of a pass
+# Limit of a pixel's mean radiance in a pass: rare bright paths would leave spots.
+LARGEST_SAMPLE = 30.0
+GROUND_REACH = 60.0  # size of the ground, relative to the domain
 GROUND = [0.62, 0.61, 0.595]  # reflectance
 SKY_ROWS = 256
 WATER_INDEX, ROUGHNESS = 1.33, 0.35
@@ -50,12 +54,12 @@ WATER_INDEX, ROUGHNESS = 1.33, 0.35
 
 @dataclass(frozen=True)
 class Quality:
-    """How a picture is rendered.
+    """Quality of a picture.
 
     Args:
         size: width and height [pixels].
-        samples: paths through a pixel.
-        shutter: duration of the exposure [s]; 0: an instant.
+        samples: paths per pixel.
+        shutter: duration of the exposure [s]; 0 for an instant.
     """
 
     size: tuple[int, int]
@@ -67,10 +71,10 @@ def load_renderer(variant: str = SCALAR) -> Any:
     """Return the module `mitsuba`, ready to render.
 
     Args:
-        variant: of Mitsuba; the one for LLVM needs `choose_variant` before.
+        variant: variant of Mitsuba; the one for LLVM needs `choose_variant` before.
 
     Raises:
-        RenderError: it or Open Image Denoise is not installed.
+        RenderError: Mitsuba or Open Image Denoise is not installed.
     """
     try:
         import mitsuba
@@ -86,7 +90,10 @@ def load_renderer(variant: str = SCALAR) -> Any:
 
 @cache
 def choose_variant() -> str:
-    """Return the variant for LLVM if there is one that renders, tried in a process of its own since some crash, else the scalar one."""
+    """Return the LLVM variant if it renders, else the scalar one.
+
+    It is tried in another process, since some versions crash.
+    """
     path = os.environ.get("DRJIT_LIBLLVM_PATH") or find_llvm()
     if path is None:
         return SCALAR
@@ -108,29 +115,32 @@ def choose_variant() -> str:
 
 
 def find_llvm() -> str | None:
-    """Return the file of the newest LLVM library from `OLDEST_LLVM` on, by its name; None: there is none."""
-    found = {}
+    """Return the file name of the newest LLVM library from `OLDEST_LLVM` on.
+
+    None if there is none.
+    """
+    libraries = {}
     for folder in LLVM_FOLDERS:
         for file in glob(f"{folder}/libLLVM*"):
             version = LLVM_FILE.fullmatch(os.path.basename(file))
             if version and version[1] and int(version[1]) >= OLDEST_LLVM:
-                found[int(version[1])] = file
-    return found[max(found)] if found else None
+                libraries[int(version[1])] = file
+    return libraries[max(libraries)] if libraries else None
 
 
 def render_radiance(
     scene: PhotoScene, quality: Quality, seed: int, variant: str = SCALAR
 ) -> np.ndarray:
-    """Return the denoised scene-linear radiance of a picture, shape (height, width, 3).
+    """Return the denoised scene-linear radiance of a picture, (height, width, 3).
 
     Motion blur is the mean over instants of the shutter interval, each rendered with its share of
     the samples.
 
     Args:
-        scene: what it shows.
+        scene: content of the picture.
         quality: size, samples and shutter.
-        seed: of the random numbers; equal seeds give equal pictures.
-        variant: of Mitsuba; pictures of two variants differ in their noise.
+        seed: seed of the random numbers; equal seeds give equal pictures.
+        variant: variant of Mitsuba; pictures of two variants differ in their noise.
     """
     mitsuba = load_renderer(variant)
     moves = quality.shutter > 0.0 and any(mesh.velocity is not None for mesh in scene.meshes)
@@ -154,14 +164,20 @@ def render_radiance(
 
 
 def pass_samples(quality: Quality, instants: int) -> list[int]:
-    """Return the samples of each pass of an instant; a pass has at most `PASS_PATHS` paths, which bounds the memory."""
+    """Return the samples of each pass of an instant.
+
+    A pass has at most `PASS_PATHS` paths, which limits the memory.
+    """
     each = max(1, round(quality.samples / instants))
     passes = min(each, math.ceil(each * math.prod(quality.size) / PASS_PATHS))
     return [each // passes + (number < each % passes) for number in range(passes)]
 
 
 def denoised(layers: np.ndarray) -> np.ndarray:
-    """Return radiance without noise, of layers (radiance, albedo, normal), shape (height, width, 9)."""
+    """Return denoised radiance, from layers of shape (height, width, 9).
+
+    The layers are radiance, albedo and normal.
+    """
     import pyoidn
 
     radiance, albedo, normal = (
@@ -176,7 +192,7 @@ def denoised(layers: np.ndarray) -> np.ndarray:
 
 
 def displaced(scene: PhotoScene, time: float) -> PhotoScene:
-    """Return a scene in which all that moves has moved on by a time [s] at its velocity."""
+    """Return a scene with all moving points displaced by their velocity over time [s]."""
     if not time:
         return scene
     meshes = [
@@ -187,7 +203,10 @@ def displaced(scene: PhotoScene, time: float) -> PhotoScene:
 
 
 def scene_plugins(mitsuba: Any, scene: PhotoScene, size: tuple[int, int]) -> dict[str, Any]:
-    """Return a scene as `mitsuba.load_dict` takes it: integrator, sensor, sky, ground and meshes."""
+    """Return a scene as a dict for `mitsuba.load_dict`.
+
+    With integrator, sensor, sky, ground and meshes.
+    """
     transform = mitsuba.ScalarTransform4f
     reach = GROUND_REACH * float(scene.size.max())
     middle = 0.5 * scene.size
@@ -216,7 +235,7 @@ def scene_plugins(mitsuba: Any, scene: PhotoScene, size: tuple[int, int]) -> dic
 
 
 def sensor_plugin(transform: Any, view: Viewpoint, size: tuple[int, int]) -> dict[str, Any]:
-    """Return the camera."""
+    """Return the plugin of the camera."""
     return {
         "type": "perspective",
         "fov": view.angle,
@@ -233,17 +252,17 @@ def sensor_plugin(transform: Any, view: Viewpoint, size: tuple[int, int]) -> dic
             "rfilter": {"type": "box"},
             "pixel_format": "rgb",
         },
-        "sampler": {"type": "independent"},  # patterns of stratified ones survive the denoiser
+        "sampler": {"type": "independent"},  # patterns of stratified samplers survive the denoiser
     }
 
 
 def mesh_plugin(mitsuba: Any, mesh: PhotoMesh) -> Any:
-    """Return a mesh with its material; one that absorbs has a medium inside."""
+    """Return a mesh with its material; an absorbing one contains a medium."""
     properties = mitsuba.Properties()
     colored = mesh.color.ndim == 2
     properties["surface"] = mitsuba.load_dict(surface_plugin(mesh, colored))
     if mesh.finish is Finish.LIQUID:
-        # colors of plugins are at most 1, `scale` is free
+        # Colors of plugins are at most 1, `scale` is unlimited.
         most = max(float(mesh.color.max()), 1e-9)
         color = {"type": "rgb", "value": (mesh.color / most).tolist()}
         properties["interior"] = mitsuba.load_dict(
@@ -251,7 +270,7 @@ def mesh_plugin(mitsuba: Any, mesh: PhotoMesh) -> Any:
         )
     if mesh.normals is None:
         properties["face_normals"] = True
-    made = mitsuba.Mesh(
+    plugin = mitsuba.Mesh(
         mesh.name,
         len(mesh.points),
         len(mesh.corners),
@@ -259,20 +278,20 @@ def mesh_plugin(mitsuba: Any, mesh: PhotoMesh) -> Any:
         has_vertex_normals=mesh.normals is not None,
     )
     if colored:
-        made.add_attribute(
+        plugin.add_attribute(
             "vertex_color", 3, np.ascontiguousarray(mesh.color, dtype=np.float32).ravel()
         )
-    data = mitsuba.traverse(made)
+    data = mitsuba.traverse(plugin)
     data["vertex_positions"] = np.ascontiguousarray(mesh.points, dtype=np.float32).ravel()
     data["faces"] = np.ascontiguousarray(mesh.corners, dtype=np.uint32).ravel()
     if mesh.normals is not None:
         data["vertex_normals"] = np.ascontiguousarray(mesh.normals, dtype=np.float32).ravel()
     data.update()
-    return made
+    return plugin
 
 
 def surface_plugin(mesh: PhotoMesh, colored: bool) -> dict[str, Any]:
-    """Return what scatters light at a surface."""
+    """Return the scattering model of a surface."""
     if mesh.finish is Finish.LIQUID:
         return {"type": "dielectric", "int_ior": WATER_INDEX, "ext_ior": 1.0}
     color = (
@@ -294,20 +313,23 @@ def surface_plugin(mesh: PhotoMesh, colored: bool) -> dict[str, Any]:
 
 
 def sky() -> np.ndarray:
-    """Return the radiance of a studio's sky by direction: a gradient, a large key light, a fill; shape (rows, 2 rows, 3), y up."""
+    """Return the radiance of a studio's sky by direction, shape (rows, 2 rows, 3).
+
+    A gradient, a large key light, and a rim light; y is up.
+    """
     polar = (np.arange(SKY_ROWS) + 0.5) / SKY_ROWS * math.pi
     around = (np.arange(2 * SKY_ROWS) + 0.5) / SKY_ROWS * math.pi
     polar, around = np.meshgrid(polar, around, indexing="ij")
-    # Mitsuba's map: d = (sin phi sin theta, cos theta, -cos phi sin theta)
+    # Mitsuba's environment map: d = (sin phi sin theta, cos theta, -cos phi sin theta).
     direction = np.stack(
         [np.sin(around) * np.sin(polar), np.cos(polar), -np.cos(around) * np.sin(polar)], axis=-1
     )
     height = np.clip(direction[..., 1:2], 0.0, 1.0) ** 0.6
     radiance = (1.0 - height) * np.array([0.80, 0.84, 0.90]) + height * np.array([0.14, 0.24, 0.46])
     radiance = np.where(direction[..., 1:2] < 0.0, np.array([0.30, 0.30, 0.31]), radiance)
-    # key, from the left
+    # Key light, from the left.
     radiance += _lamp(direction, [-0.75, 1.0, -0.1], 13.0, 3.0, [28.0, 25.8, 22.5])
-    # rim, from behind on the right
+    # Rim light, from behind on the right.
     radiance += _lamp(direction, [1.0, 0.45, -0.9], 18.0, 8.0, [2.0, 2.3, 2.8])
     return radiance.astype(np.float32)
 

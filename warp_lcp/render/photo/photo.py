@@ -1,4 +1,7 @@
-"""Path-traced pictures and films of a run, one file a frame: what is there with the same settings is kept."""
+"""Path-traced pictures and films of a run, one file per frame.
+
+Pictures that exist with the same settings are kept.
+"""
 
 from __future__ import annotations
 
@@ -27,30 +30,30 @@ from warp_lcp.render.photo.photo_scene import PhotoScenes
 from warp_lcp.render.photo.view_transform import agx
 from warp_lcp.render.recording import Recording, RenderError, Show
 
-EXPOSURE = 1.55  # of radiance, before AgX
-CONTRAST, SATURATION = 1.6, 1.35  # the look, after AgX's sigmoid
-# CPU seconds of a million paths through liquid, and through grains, bodies and sky; of a frame's
-# geometry. Measured on an Intel Xeon; within a factor of 2.
+EXPOSURE = 1.55  # factor on radiance, before AgX
+CONTRAST, SATURATION = 1.6, 1.35  # applied after AgX's sigmoid
+# CPU seconds of a million paths through liquid, and through grains, bodies and sky; and of a
+# frame's geometry. Measured on an Intel Xeon; within a factor of 2.
 LIQUID_SECONDS, OPAQUE_SECONDS = (
     {"scalar_rgb": 9.0, "llvm_ad_rgb": 4.6},
     {"scalar_rgb": 9.0, "llvm_ad_rgb": 4.2},
 )
 GEOMETRY_SECONDS = 8.0
-SETTINGS_KEY = "warp-lcp photo"  # of a PNG's text chunk
-SAMPLES, MOST_SAMPLES = 64, 65536  # paths through a pixel
+SETTINGS_KEY = "warp-lcp photo"  # key of a PNG's text chunk
+SAMPLES, MOST_SAMPLES = 64, 65536  # paths per pixel
 SHUTTER = 0.25  # exposure in frame intervals
 
 
 @dataclass(frozen=True, kw_only=True)
 class PhotoSettings:
-    """How pictures are made.
+    """Settings of the pictures.
 
     Args:
         size: width and height [pixels].
-        samples: paths through a pixel.
-        shutter: how long the exposure is, in frame intervals; 0: no motion blur.
-        show: what of the material is shown; see `Recording`.
-        overrides: of the scene's table [camera], such as `camera.position=[1, 2, 3]`.
+        samples: paths per pixel.
+        shutter: duration of the exposure, in frame intervals; 0 for no motion blur.
+        show: part of the material to show; see `Recording`.
+        overrides: overrides of the scene's table [camera], such as `camera.position=[1, 2, 3]`.
 
     Raises:
         RenderError: a value is out of range.
@@ -80,20 +83,20 @@ def photograph_run(
     estimated: Callable[[float], None] = lambda seconds: None,
     noted: Callable[[str], None] = lambda text: None,
 ) -> Iterator[Path]:
-    """Render frames of a 3-D run as PNG images; yield each file when it is there.
+    """Render frames of a 3-D run as PNG images; yield each finished file.
 
-    A picture holds its settings. One that is there with the same settings is kept; one with others
-    is rendered again.
+    A picture contains its settings. An existing picture with the same settings is kept; one with
+    other settings is rendered again.
 
     Args:
-        folder: of the run.
-        frames: numbers of frames, negative ones counted from the end; all unless given.
-        settings: how pictures are made.
-        out: where they go; `folder / "photo"` unless given.
-        told: is called with how many pictures are there, and how many there will be.
-        estimated: is called with about how many seconds rendering will take on this machine's
-            cores, before it begins.
-        noted: is called with what was kept and what is rendered again.
+        folder: folder of the run.
+        frames: numbers of frames, negative ones counted from the end. Default: all.
+        settings: settings of the pictures.
+        out: folder of the pictures. Default: `folder / "photo"`.
+        told: called with the number of finished pictures, and the total number.
+        estimated: called with the estimated time on this machine's cores [s], before rendering
+            begins.
+        noted: called with notes on kept and repeated pictures.
 
     Raises:
         RenderError: the extra `photo` is missing, the run is 2-D, there are no such frames, or a
@@ -133,13 +136,15 @@ def photograph_run(
 def photograph_film(
     folder: Path, film: Path, *, rate: float | None = None, **given: Any
 ) -> Iterator[Path]:
-    """Render frames as `photograph_run` does, then encode them into a film; yield each picture when it is there.
+    """Render frames as `photograph_run` does, then encode them into a film.
+
+    Yields each finished picture.
 
     Args:
-        folder: of the run.
+        folder: folder of the run.
         film: the file; `.mp4` or `.gif`.
-        rate: frames a second of the film; the scene's unless given [1/s].
-        given: as of `photograph_run`.
+        rate: frames per second of the film [1/s]. Default: that of the scene.
+        given: arguments of `photograph_run`.
 
     Raises:
         RenderError: as in `photograph_run`, or the film cannot be written.
@@ -158,10 +163,12 @@ def photograph_film(
 
 
 def frame_range(text: str, numbers: Sequence[int]) -> list[int]:
-    """Return the frames from A to B, both included, of text `A:B`; either may be missing, negative ones count from the end.
+    """Return the frames from A to B, both included, of text `A:B`.
+
+    Either number may be missing; negative ones count from the end.
 
     Raises:
-        RenderError: it reads otherwise, or there is no such frame.
+        RenderError: the text has another format, or there is no such frame.
     """
     try:
         ends = [int(part) if part.strip() else None for part in text.split(":")]
@@ -187,11 +194,11 @@ def frame_range(text: str, numbers: Sequence[int]) -> list[int]:
 
 
 def expected_seconds(settings: PhotoSettings, variant: str, *, liquid: bool) -> float:
-    """Return about how many seconds a picture takes on this machine's cores.
+    """Return the estimated time of a picture on this machine's cores [s].
 
     Args:
-        settings: how it is made.
-        variant: of Mitsuba.
+        settings: settings of the picture.
+        variant: variant of Mitsuba.
         liquid: whether light passes through liquid.
     """
     rate = (LIQUID_SECONDS if liquid else OPAQUE_SECONDS)[variant]
@@ -201,7 +208,7 @@ def expected_seconds(settings: PhotoSettings, variant: str, *, liquid: bool) -> 
 
 
 def core_count() -> int:
-    """Return how many cores this process may use."""
+    """Return the number of cores available to this process."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -213,7 +220,10 @@ def developed(radiance: np.ndarray) -> np.ndarray:
 
 
 def picture_settings(scenes: PhotoScenes, number: int, settings: PhotoSettings) -> dict[str, Any]:
-    """Return all that a picture depends on: the renderer's version, settings, camera, and checksums of the frame's files."""
+    """Return everything that determines a picture.
+
+    The renderer's version, settings, camera, and checksums of the frame's files.
+    """
     view = scenes.view
     camera = [*view.position, *view.focus, *view.up, view.angle]
     checksums = {
@@ -231,14 +241,17 @@ def picture_settings(scenes: PhotoScenes, number: int, settings: PhotoSettings) 
 
 
 def read_settings(file: Path) -> dict[str, Any] | None:
-    """Return the settings that a picture was made with; None: there is no whole picture, or it holds none."""
+    """Return the settings stored in a picture.
+
+    None if there is no complete picture, or it has no settings.
+    """
     from PIL import Image
 
     try:
         with Image.open(file) as image:
             image.load()
             held = json.loads(image.info.get(SETTINGS_KEY, "null"))
-    except (OSError, ValueError, SyntaxError):  # Pillow's for damaged files
+    except (OSError, ValueError, SyntaxError):  # raised by Pillow for damaged files
         return None
     return held if isinstance(held, dict) else None
 
@@ -249,7 +262,7 @@ def _report(
     wanted: dict[int, Any],
     missing: Sequence[int],
 ) -> None:
-    """Tell which pictures are kept, and which are rendered again because of which settings."""
+    """Report which pictures are kept, and which are repeated and why."""
     if kept := len(wanted) - len(missing):
         noted(f"{kept} of {len(wanted)} pictures are there with these settings and are kept")
     again = [number for number in missing if held[number] is not None]
@@ -266,7 +279,7 @@ def _report(
 
 
 def _save(pixels: np.ndarray, settings: dict[str, Any], file: Path, folder: Path) -> None:
-    """Write a picture with its settings; below a run's folder no link is written through."""
+    """Write a picture with its settings, in a run's folder never through a link."""
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo
 

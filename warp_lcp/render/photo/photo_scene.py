@@ -1,4 +1,4 @@
-"""Plain description of a picture, made of a run's frame: meshes with materials, camera and ground. It does not depend on a renderer."""
+"""Renderer-independent description of a picture: meshes, camera and ground."""
 
 from __future__ import annotations
 
@@ -35,25 +35,25 @@ from warp_lcp.scene.camera import VIEW_ANGLE, Viewpoint, view_of_points, viewpoi
 from warp_lcp.scene.shapes import BoxTable, PlaneTable
 from warp_lcp.simulation import Points, Surface
 
-FRAMING_FRAMES = 8  # evenly spaced frames that tell where the material goes
-FRAMING_SHARE = 0.5  # percent of a frame's points that may leave the picture at each side
-FRAMING_POINTS = 4000  # of a frame, about
-TOWARD = np.array([0.5, 0.42, 1.0]) / np.linalg.norm([0.5, 0.42, 1.0])  # to the camera
+FRAMING_FRAMES = 8  # evenly spaced frames that determine the view
+FRAMING_SHARE = 0.5  # percent of a frame's points that may lie outside the picture at each side
+FRAMING_POINTS = 4000  # approximate limit for a frame
+TOWARD = np.array([0.5, 0.42, 1.0]) / np.linalg.norm([0.5, 0.42, 1.0])  # direction to the camera
 
-# Absorption over the domain's longest side, for red, green and blue: exp(-a) of the light is left.
-# The real one, 0.35/m and less, would leave a tank of one meter without color.
+# Absorption over the domain's longest side, for red, green and blue: the transmittance is exp(-a).
+# The real value, 0.35/m and less, would leave a tank of one meter without color.
 ABSORPTION = {"water": np.array([2.6, 0.75, 0.42]), "syrup": np.array([2.0, 12.0, 60.0])}
 SYRUP = 1.0  # viscosity [Pa s] from which a liquid has the color of honey
-# reflectances of grains
+# Reflectances of grains.
 SANDS = np.array([[0.62, 0.45, 0.27], [0.72, 0.58, 0.40], [0.45, 0.31, 0.19], [0.80, 0.72, 0.60]])
 SAND_SHARES = np.array([0.45, 0.30, 0.15, 0.10])
 SOLID = np.array([0.36, 0.38, 0.41])
-PALE = np.array([0.82, 0.80, 0.76])  # wedges of balls
+PALE = np.array([0.82, 0.80, 0.76])  # reflectance of every other wedge of balls
 WEDGES = 6
 
 
 class Finish(StrEnum):
-    """How a surface reflects and transmits light."""
+    """Surface finish: reflection and transmission of light."""
 
     LIQUID = "liquid"  # smooth dielectric, index of refraction 1.33, absorbing inside
     MATTE = "matte"  # diffuse
@@ -65,14 +65,14 @@ class PhotoMesh:
     """Triangles of one material.
 
     Args:
-        name: of the mesh.
+        name: name of the mesh.
         points: [m], shape (n, 3).
-        corners: of the triangles, shape (m, 3), counterclockwise seen from outside.
-        finish: of the surface.
-        color: reflectance, of a liquid its absorption [1/m]; linear Rec. 709, shape (3,), or
+        corners: point indices of the triangles, shape (m, 3), counterclockwise seen from outside.
+        finish: finish of the surface.
+        color: reflectance, or absorption of a liquid [1/m]; linear Rec. 709, shape (3,), or
             reflectances at the points, shape (n, 3).
-        normals: at the points, of unit length, shape (n, 3); None: flat triangles.
-        velocity: at the points [m/s], shape (n, 3); None: at rest.
+        normals: unit normals at the points, shape (n, 3); None for flat triangles.
+        velocity: velocities of the points [m/s], shape (n, 3); None at rest.
     """
 
     name: str
@@ -86,13 +86,13 @@ class PhotoMesh:
 
 @dataclass(frozen=True, eq=False)
 class PhotoScene:
-    """What a picture shows.
+    """Content of a picture.
 
     Args:
-        meshes: of material, bodies and solids.
+        meshes: meshes of material, bodies and solids.
         view: the camera.
         ground: height of the ground [m].
-        size: of the domain [m].
+        size: size of the domain [m].
     """
 
     meshes: Sequence[PhotoMesh]
@@ -102,19 +102,19 @@ class PhotoScene:
 
 
 class PhotoScenes:
-    """The picture's description of each frame of a run.
+    """Contents of the pictures of a run, by frame.
 
-    A liquid whose frames have particles alone gets a surface around them, unless particles are
-    asked for.
+    If the frames of a liquid have only particles, a surface is built around them, unless particles
+    are requested.
 
     Args:
-        recording: of a 3-D run.
+        recording: frames of a 3-D run.
         aspect: width over height of the picture.
-        beads: show a liquid's particles as beads where the frames have no surface.
+        beads: show a liquid's particles as beads if the frames have no surface.
 
     Raises:
-        RenderError: the run is 2-D, or has no frame that can be read; or its particles are only
-            near a surface that is not there.
+        RenderError: the run is 2-D, or has no frame that can be read; or its particles exist only
+            near a surface that is not in the frames.
     """
 
     def __init__(self, recording: Recording, aspect: float, *, beads: bool = False) -> None:
@@ -124,7 +124,7 @@ class PhotoScenes:
                 "--look photo: draws 3-D runs; this one is 2-D, which --look quick draws"
             )
         self.recording, self._scene = recording, scene
-        particles = getattr(scene, "particles", None)  # settings of what the particles stand for
+        particles = getattr(scene, "particles", None)  # settings of the material
         self._wrapped = scene.palette == "water" and particles is not None and not beads
         if (
             self._wrapped
@@ -148,7 +148,7 @@ class PhotoScenes:
         self._bodies = [solid.to_geometry(Path(), 3) for solid in scene.solid if solid.is_body]
 
     def frame(self, number: int) -> PhotoScene:
-        """Return the description of a frame.
+        """Return the content of the picture of a frame.
 
         Raises:
             RenderError: the frame cannot be read.
@@ -172,7 +172,7 @@ class PhotoScenes:
         return PhotoScene(meshes, self.view, 0.0, np.array(self._scene.domain.size))
 
     def _material(self, surface: Surface, distance: Distance | None) -> list[PhotoMesh]:
-        """Return a liquid's surface, closed against walls and solids, or a smooth surface of sand."""
+        """Return a liquid's surface, closed against walls and solids, or sand's surface."""
         if not len(surface.corners):
             return []
         if self._scene.palette == "sand":
@@ -205,7 +205,7 @@ class PhotoScenes:
         ]
 
     def _grains(self, number: int) -> list[PhotoMesh]:
-        """Return particles as grains, one mesh of all."""
+        """Return particles as grains, in one mesh."""
         particles = self.recording.particles(number)
         if not len(particles.points):
             return []
@@ -224,7 +224,7 @@ class PhotoScenes:
         return [PhotoMesh("grains", points, corners, Finish.MATTE, color, normals, moved)]
 
     def _solid_meshes(self, time: float) -> list[PhotoMesh]:
-        """Return the solids whose places the scene tells, cut at the domain; containers are invisible."""
+        """Return the prescribed solids, cut at the domain; containers are invisible."""
         meshes = []
         margin = 1e-2 * self._scene.spacing
         low, high = np.full(3, -margin), np.array(self._scene.domain.size) + margin
@@ -248,7 +248,10 @@ class PhotoScenes:
         return meshes
 
     def _distance(self, time: float, bodies: Surface | None) -> Distance | None:
-        """Return the signed distance to solids and bodies that a liquid may touch; None: there are none."""
+        """Return the signed distance to solids and bodies that a liquid may touch.
+
+        None without any.
+        """
         placed = [
             (geometry, motion.pose(time) if motion else Pose.identity())
             for _, geometry, motion in self._prescribed
@@ -267,7 +270,10 @@ class PhotoScenes:
 
 
 def particle_surface(scene: Any, particles: Points) -> Surface:
-    """Return the surface around a liquid's particles, as `output.surface` writes it, with the velocity of the nearest particle."""
+    """Return the surface around a liquid's particles, as with `output.surface`.
+
+    With the velocity of the nearest particle.
+    """
     grid = StaggeredGrid(scene.cell_counts, scene.spacing, 3, "cpu")
     at = np.asarray(particles.points, dtype=np.float64)
     at = at[((at >= 0.0) & (at <= scene.domain.size)).all(axis=1)]
@@ -288,7 +294,10 @@ def particle_surface(scene: Any, particles: Points) -> Surface:
 
 
 def framed(recording: Recording, aspect: float) -> Viewpoint:
-    """Return the camera: the scene's, or one that sees where material and bodies go over the run, from as near as shows all of it."""
+    """Return the scene's camera, or the nearest one that shows the whole run.
+
+    The run's part is that of material and bodies in all frames.
+    """
     scene = recording.scene
     if scene.camera.position is not None:
         return viewpoint(scene, aspect)
@@ -310,18 +319,20 @@ def framed(recording: Recording, aspect: float) -> Viewpoint:
 
 
 def main_part(points: np.ndarray) -> np.ndarray:
-    """Return some of the points of a frame, without the few that are far from the others: single drops and grains."""
+    """Return a sample of a frame's points, without single drops and grains."""
     low, high = np.percentile(points, [FRAMING_SHARE, 100.0 - FRAMING_SHARE], axis=0)
     inside = points[((points >= low) & (points <= high)).all(axis=1)]
     return inside[:: len(inside) // FRAMING_POINTS + 1] if len(inside) else points[:1]
 
 
 def body_meshes(bodies: Surface, at_first: Sequence[np.ndarray]) -> list[PhotoMesh]:
-    """Return rigid bodies, each in a color of its own; balls have wedges of two colors, which show how they turn.
+    """Return rigid bodies, each in a color of its own.
+
+    Balls have wedges of two colors, which show their rotation.
 
     Args:
-        bodies: with the field `body` and, perhaps, `velocity`.
-        at_first: points of each body where the scene places it.
+        bodies: surfaces with the field `body` and possibly `velocity`.
+        at_first: points of each body as placed in the scene.
     """
     of_point, velocity = np.asarray(bodies.fields["body"]).ravel(), bodies.fields.get("velocity")
     meshes = []
@@ -351,14 +362,20 @@ def body_meshes(bodies: Surface, at_first: Sequence[np.ndarray]) -> list[PhotoMe
 
 
 def rigid_pose(first: np.ndarray, now: np.ndarray) -> Pose:
-    """Return the rotation and translation that take points [m] to where they are now, by least squares (Kabsch)."""
+    """Return the rigid motion between two sets of points [m], by least squares.
+
+    Rotation and translation from the first to the current points (Kabsch).
+    """
     middle, there = first.mean(axis=0), now.mean(axis=0)
     turn = Rotation.align_vectors(now - there, first - middle)[0].as_matrix()
     return Pose.about(middle, turn, there - middle)
 
 
 def grain_colors(seeds: np.ndarray) -> np.ndarray:
-    """Return reflectances of grains by their seeds: four tones of sand, lighter and darker, shape (n, 3)."""
+    """Return reflectances of grains by their seeds, shape (n, 3).
+
+    Four tones of sand, lighter and darker.
+    """
     tone = grain_poses(seeds)[3]
     kind = np.minimum(np.searchsorted(np.cumsum(SAND_SHARES), tone, side="right"), len(SANDS) - 1)
     shade = 0.8 + 0.35 * (37.0 * tone % 1.0)
@@ -366,14 +383,14 @@ def grain_colors(seeds: np.ndarray) -> np.ndarray:
 
 
 def liquid_absorption(scene: Any) -> np.ndarray:
-    """Return a liquid's absorption [1/m], by its viscosity that of water or of syrup."""
+    """Return a liquid's absorption [1/m]: that of water, or of syrup if viscous."""
     viscosity = getattr(scene, "viscosity", None)
     kind = "syrup" if viscosity is not None and viscosity.value >= SYRUP else "water"
     return ABSORPTION[kind] / max(scene.domain.size)
 
 
 def liquid_beads(scene: Any) -> np.ndarray:
-    """Return the reflectance of a liquid's particles that are drawn as beads."""
+    """Return the reflectance of a liquid's particles drawn as beads."""
     return np.exp(-liquid_absorption(scene) * max(scene.domain.size))
 
 
@@ -384,7 +401,10 @@ def linear_color(text: str) -> np.ndarray:
 
 
 def _halfspaces(solid: Any, pose: Pose) -> np.ndarray | None:
-    """Return a box or a half-space as rows (n, d) of n x + d <= 0; None: the solid is another shape."""
+    """Return a box or a half-space as rows (n, d) of n x + d <= 0.
+
+    None for other shapes.
+    """
     placement = solid.placement(3).moved(pose)
     if isinstance(solid, PlaneTable):
         normal = (

@@ -1,9 +1,9 @@
-"""AgX: from scene-linear radiance to display code values, with a log2 encoding and a sigmoid per channel.
+"""AgX view transform: scene-linear radiance to display code values.
 
-Sobotka's AgX (2022) in the constants of Wrensch, "Minimal AgX implementation" (2023). Rec. 709
+Sobotka's AgX (2022) with the constants of Wrensch, "Minimal AgX implementation" (2023). Rec. 709
 colors are mixed by an inset matrix, so that bright saturated light turns white instead of clipping
-to a primary; encoded as log2 over 16.5 stops around middle grey 0.18; and bent by a sigmoid, linear
-about middle grey, with a power toe and a power shoulder.
+to a primary. They are encoded as log2 over 16.5 stops around middle grey 0.18, and mapped by a
+sigmoid per channel, linear about middle grey, with a power toe and a power shoulder.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import numpy as np
 MIDDLE_GREY = 0.18  # scene-linear
 STOPS = -10.0, 6.5  # below and above middle grey
 PIVOT_OUTPUT = 0.5  # code value of middle grey
-SLOPE = 2.0  # of the sigmoid at middle grey
-TOE, SHOULDER = 3.0, 3.25  # powers: greater ones bend later and harder
+SLOPE = 2.0  # slope of the sigmoid at middle grey
+TOE, SHOULDER = 3.0, 3.25  # powers: greater ones bend later and more sharply
 INSET = np.array(
     [
         [0.842479062253094, 0.0784335999999992, 0.0792237451477643],
@@ -30,21 +30,24 @@ def agx(radiance: np.ndarray, *, contrast: float = 1.0, saturation: float = 1.0)
 
     Args:
         radiance: shape (..., 3); negative values count as 0.
-        contrast: power of the code values after the sigmoid, the look: c^contrast.
-        saturation: distance of the colors from their luma, after the sigmoid.
+        contrast: power of the code values after the sigmoid: c^contrast.
+        saturation: factor on the distance of the colors from their luma, after the sigmoid.
     """
     mixed = np.maximum(radiance, 0.0) @ INSET.T
     low, high = STOPS
     stops = np.log2(np.maximum(mixed, 1e-30) / MIDDLE_GREY)
     code = sigmoid((np.clip(stops, low, high) - low) / (high - low))
-    code = np.clip(code, 0.0, 1.0) ** contrast  # rounding leaves black a little below 0
+    code = np.clip(code, 0.0, 1.0) ** contrast  # rounding leaves black slightly below 0
     luma = (code @ LUMA)[..., None]
     code = luma + saturation * (code - luma)
     return np.clip(code @ np.linalg.inv(INSET).T, 0.0, 1.0)
 
 
 def sigmoid(x: np.ndarray) -> np.ndarray:
-    """Return the tone curve of log-encoded values in [0, 1]: f(0) = 0, f(pivot) = 1/2 with slope `SLOPE`, f(1) = 1."""
+    """Return the tone curve of log-encoded values in [0, 1].
+
+    f(0) = 0, f(pivot) = 1/2 with slope `SLOPE`, f(1) = 1.
+    """
     low, high = STOPS
     pivot = -low / (high - low)
     toe = _branch(pivot - x, pivot, PIVOT_OUTPUT, TOE)
@@ -53,7 +56,10 @@ def sigmoid(x: np.ndarray) -> np.ndarray:
 
 
 def _branch(distance: np.ndarray, reach: float, rise: float, power: float) -> np.ndarray:
-    """Return s u / (1 + u^p)^(1/p), u = SLOPE distance / s, where s makes the value at `reach` equal to `rise`."""
+    """Return s u / (1 + u^p)^(1/p), u = SLOPE distance / s.
+
+    The scale s is such that the value at `reach` equals `rise`.
+    """
     scale = SLOPE * reach * ((SLOPE * reach / rise) ** power - 1.0) ** (-1.0 / power)
     u = SLOPE * np.maximum(distance, 0.0) / scale
     return scale * u / (1.0 + u**power) ** (1.0 / power)
