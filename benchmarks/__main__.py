@@ -1,4 +1,7 @@
-"""The process that measures: `python -m warp_lcp.benchmarks SUITE --device cpu --out DIR`; `warp-lcp bench` starts it."""
+"""Benchmark process: measure one suite and write its files.
+
+`python -m warp_lcp.benchmarks SUITE --device cpu --out DIR`; `warp-lcp bench` starts it.
+"""
 
 from __future__ import annotations
 
@@ -60,8 +63,8 @@ def main() -> None:
     )
     given.out.mkdir(parents=True, exist_ok=True)
     gc.collect()
-    # searches for arrays (`machine.array_bytes`) pass over the hundreds of thousands of objects
-    # that imports have made
+    # Imports create hundreds of thousands of objects. Frozen, they are skipped by searches for
+    # arrays (`machine.array_bytes`).
     gc.freeze()
     try:
         results = suite.measure(options, given.out)

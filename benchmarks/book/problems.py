@@ -1,4 +1,4 @@
-"""The problems of [Book] appendix C twice: by the recipes of its code, Num4LCP, and with a solution that is one."""
+"""Problems of [Book] appendix C, by Num4LCP's recipes and with true solutions."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from warp_lcp.gallery.matrices import banded_matrix, spectrum_matrix
 BLOCK = 6  # unknowns of a contact: normal, four tangents, slip speed
 ZEROS = 0.25  # share of zeros in x in all experiments of Num4LCP
 SEED = 2015
-SMALL = 32  # cells along a side of the largest grid below which all experiments are small
+SMALL = 32  # cells along the longest side; all experiments are small if no grid has more
 
 
 @dataclass(frozen=True)
 class Scale:
-    """How large the experiments are.
+    """Sizes of the experiments.
 
     Args:
         problems: number of random problems of each kind.
@@ -43,7 +43,7 @@ class Scale:
 
     @staticmethod
     def of(options: Options) -> Scale:
-        """Return the book's numbers, or small ones where only small grids are asked for."""
+        """Return the book's sizes, or small ones if only small grids are requested."""
         grids = options.sizes or (16, 32, 64)
         if max(grids) < SMALL:
             return Scale(2 * options.repeat, 4, 3, 12, grids, (2, 4), 40)
@@ -64,7 +64,10 @@ def recipe(A: Any, rng: np.random.Generator, name: str) -> Problem:
 
 
 def complementary(A: Any, rng: np.random.Generator, name: str) -> Problem:
-    """Return a problem with a complementary solution: a quarter of x at zero with y > 0 there, b = y - A x."""
+    """Return a problem with a complementary solution: b = y - A x.
+
+    A quarter of x is 0, with y > 0 there.
+    """
     return planted(A, rng, Plant(active=ZEROS), name=name, facts=frozenset())
 
 
@@ -75,7 +78,11 @@ RULES: dict[str, Callable[[Any, np.random.Generator, str], Problem]] = {
 
 
 def contact_matrix(contacts: int, rng: np.random.Generator, tangents: int = 4) -> np.ndarray:
-    """Return Num4LCP's contact matrix, which no contact of bodies has.
+    """Return the contact matrix of Num4LCP.
+
+    No contact of rigid bodies has such a matrix. It consists of random symmetric 6 x 6 blocks, half
+    of them zero, shifted to be positive definite. The pattern of Stewart and Trinkle is written
+    over the nonzero blocks.
 
     Random symmetric 6 x 6 blocks, half of them zero, shifted to positive definite, with the pattern
     of Stewart and Trinkle written over those that are left.
@@ -105,7 +112,10 @@ def contact_matrix(contacts: int, rng: np.random.Generator, tangents: int = 4) -
 
 
 def dense(rule: str, scale: Scale, number: int, zeros: float = 0.0) -> Problem:
-    """Return a dense positive semi-definite problem: eigenvalues 1/n, 2/n, ... 1, the smallest share `zeros` of them set to 0."""
+    """Return a dense positive semi-definite problem with zero eigenvalues.
+
+    The eigenvalues are 1/n, 2/n, ... 1; the smallest ones, a share `zeros`, are set to 0.
+    """
     n, rng = scale.dense, np.random.default_rng([SEED + 2, number, int(1000 * zeros)])
     eigenvalues = np.arange(1, n + 1) / n
     eigenvalues[: int(n * zeros)] = 0
@@ -113,7 +123,7 @@ def dense(rule: str, scale: Scale, number: int, zeros: float = 0.0) -> Problem:
 
 
 def kinds(scale: Scale) -> dict[str, Callable[[int], Problem]]:
-    """Return what makes the fluid and the contact problems, by kind, each a function of the problem's number."""
+    """Return functions that make fluid and contact problems from a number, by kind."""
     n = scale.side**3
 
     def fluid(rule: str) -> Callable[[int], Problem]:
