@@ -1,4 +1,9 @@
-"""Seepage through a dam against PETSc's SNESVI, in turns on one core: `python -m benchmarks.dam`, in the source tree.
+"""Seepage through a dam: comparison with PETSc's SNESVI, in turns on one core.
+
+`python -m benchmarks.dam`, in the source tree. Both solvers start cold: the time includes problem,
+operator and multigrid. PETSc uses grid sequencing, each grid with half the spacing of the last. On
+each it takes Newton steps on the free set (`vinewtonrsls`), solved by conjugate gradients with its
+geometric multigrid.
 
 Both are cold: problem, operator and multigrid are made on the way. PETSc iterates from grid to
 grid, each with doubled spaces between nodes, takes Newton's steps on the free set (`vinewtonrsls`)
@@ -35,7 +40,7 @@ def ours(nx: int, ny: int) -> tuple[float, str, int, float]:
 
 
 def theirs(python: str, levels: int) -> dict[str, object]:
-    """Return PETSc's answer on its finest grid; the norm is that of the inner nodes."""
+    """Return PETSc's answer on its finest grid, with the norm of the inner nodes."""
     request = {"coarsest": COARSEST, "levels": levels, "rtol": RTOL, "sizes": SIZES}
     command = [
         python,
@@ -53,7 +58,7 @@ def theirs(python: str, levels: int) -> dict[str, object]:
 
 
 def main() -> None:
-    """Print a line a turn."""
+    """Print a line for each turn."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument(
         "--levels",
@@ -64,7 +69,7 @@ def main() -> None:
     parser.add_argument("--repeat", type=int, default=REPEAT)
     given, python = parser.parse_args(), interpreter()
     nx, ny = ((n - 1) * 2 ** (given.levels - 1) + 1 for n in COARSEST)
-    ours(65, 97)  # loads kernels
+    ours(65, 97)  # loads the kernels
     for _ in range(given.repeat):
         seconds, status, steps, norm = ours(nx, ny)
         line = (

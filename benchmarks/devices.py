@@ -1,4 +1,7 @@
-"""CPU beside GPU: the same work on each machine, one file of figures for each, which `--compare` puts side by side."""
+"""CPU and GPU: the same work on each machine, and a comparison of the results.
+
+A run writes one file of figures; `--compare` puts two files side by side.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,7 @@ from warp_lcp.scene.simulator import simulators
 TITLE = "One machine: solvers, contacts, steps, kernels"
 SIZES = (64, 128)
 STOPPING = wl.StoppingCriteria(rtol=1e-6)
-SWEEPS = 20  # of PGS: its time is given for one; to 1e-6 it needs thousands on these grids
+SWEEPS = 20  # sweeps of PGS; the time of one is reported, since 1e-6 needs thousands on these grids
 METHODS: dict[str, Callable[[], Any]] = {
     "ProjectedMultigrid": wl.ProjectedMultigrid,
     "MinimumMapNewton": wl.MinimumMapNewton,
@@ -32,10 +35,11 @@ METHODS: dict[str, Callable[[], Any]] = {
     "FischerNewton": wl.FischerNewton,
     "InteriorPoint": wl.InteriorPoint,
 }
-CONTACTS, CONTACT_SWEEPS = "wall", 200  # scene of the gallery, and sweeps in a sample
+CONTACTS, CONTACT_SWEEPS = "wall", 200  # scene of the gallery, and sweeps of a sample
 STEPS = ("dam-break", "column-collapse")  # built-in scenes whose steps are timed: a liquid, sand
-LARGEST_STEP = 128  # cells along the longest side: of sand in 256 a step takes minutes on two cores
-BEFORE, TIMED = 10, 20  # steps until the material moves, and those that are timed
+# cells along the longest side: a step of sand with 256 takes minutes on two cores
+LARGEST_STEP = 128
+BEFORE, TIMED = 10, 20  # steps until the material moves, and timed steps
 
 
 def measure(options: Options, out: Path) -> Results:

@@ -1,4 +1,4 @@
-"""The same liquid in larger domains: what a step and its memory cost, and what laying grids around the liquid takes of a run."""
+"""The same liquid in larger domains: cost of steps, memory and grid rebuilds."""
 
 from __future__ import annotations
 
@@ -20,16 +20,19 @@ from warp_lcp.fluids import SIMULATOR, LiquidScene
 from warp_lcp.simulation import NoStopwatch
 
 TITLE = "The same liquid in larger domains"
-SIDE = 48  # cells of the cube of liquid, and of the smallest domain
+SIDE = 48  # cells along a side of the cube of liquid, and of the smallest domain
 LARGER = (48, 96, 192, 384, 768)
-STEPS, LONGEST = 4, 0.005  # before a step is measured; the longest one [s]
-FLIGHT = 0.8  # [s] that a ball flies through a domain without far ends, and falls onto a floor
-# MB; % of a step
+STEPS, LONGEST = 4, 0.005  # steps before the measured one; the longest step [s]
+FLIGHT = 0.8  # [s] time of flight of a ball through an unbounded domain, onto a floor
+# Time ratios by domain size, growth of the state, memory [MB], grid rebuilds [% of a step].
 TIME_LIMITS, GROWTH_LIMIT, MEMORY_LIMIT, LAYING_LIMIT = {192: 1.2, 768: 1.5}, 1.15, 200.0, 8.0
 
 
 def measure(options: Options, out: Path) -> Results:
-    """Step the liquid in each domain, in turns; then memory, a process each; then the flight."""
+    """Step the liquid in each domain, in turns; then measure memory and the flight.
+
+    Memory is measured in one process per domain.
+    """
     if wp.get_device(options.device).is_cuda:
         raise ValueError(f"--device {options.device}: the suite domains measures the CPU")
     sizes = options.sizes or LARGER
@@ -91,7 +94,7 @@ def _stepping(n: int) -> Any:
     start = simulation.state()
 
     def step() -> None:
-        if simulation.step_count > STEPS + 40:  # it must not reach the floor
+        if simulation.step_count > STEPS + 40:  # the liquid must not reach the floor
             simulation.restore(start)
         simulation.step(min(simulation.stable_dt(), LONGEST))
 
@@ -101,7 +104,10 @@ def _stepping(n: int) -> Any:
 
 
 def memory_of(n: int) -> tuple[int, float, float]:
-    """Return the cells that the grid covers, what the process grew by in some steps, and the size of a state [MB].
+    """Return the cells of the grid, the growth of the process and the size of a state.
+
+    Sizes are in MB. The same steps in the smallest domain come first, so that what they load and
+    keep is not counted.
 
     The same steps in the smallest domain come before: what they load and keep is not the domain's.
     """
@@ -120,21 +126,24 @@ def memory_of(n: int) -> tuple[int, float, float]:
 
 
 class Shares(NoStopwatch):
-    """Seconds of each stage."""
+    """Stopwatch that adds up the seconds of each stage."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = defaultdict(float)
 
     @contextmanager
     def stage(self, name: str, *arrays: Any) -> Iterator[None]:
-        """Add the seconds of what happens to a stage."""
+        """Add the seconds of the enclosed code to a stage."""
         begun = time.perf_counter()
         yield
         self.seconds[name] += time.perf_counter() - begun
 
 
 def _flight() -> Record:
-    """Return what laying grids takes of a ball's flight over a solid, in a domain without far ends."""
+    """Return the cost of grid rebuilds during a ball's flight.
+
+    The ball flies over a solid in an unbounded domain.
+    """
     scene = LiquidScene.model_validate(
         {
             "scene": {"simulator": "fluids"},
