@@ -5,12 +5,6 @@ included, to the same relative residual. The methods of a problem take turns. A 
 three figures: the share of its problems that its method solves, the method's time over that of the
 best method, and the problems that only its alternatives solve. `docs/generate/choice_figures.py`
 writes the table of docs/choosing-a-method.md from the stored results.
-
-Each method solves each problem cold, set-up included, to the same relative residual. The methods of
-a problem take turns. A rule is judged by the share of its problems that its method solves, by that
-method's time over the best method's, and by what its alternatives add.
-`docs/generate/choice_figures.py` writes the table of docs/choosing-a-method.md from the kept
-results.
 """
 
 from __future__ import annotations

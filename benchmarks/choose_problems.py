@@ -1,9 +1,6 @@
 """Random problems by kind and seed, to measure and test rules of `wl.recommend`.
 
 Sizes are log-uniform. The seed also chooses shares, condition numbers, bounds and the accuracy.
-
-Sizes are spread evenly in their logarithm. The seed chooses shares, conditions, bounds and the
-accuracy, too.
 """
 
 from __future__ import annotations

@@ -4,10 +4,6 @@
 operator and multigrid. PETSc uses grid sequencing, each grid with half the spacing of the last. On
 each it takes Newton steps on the free set (`vinewtonrsls`), solved by conjugate gradients with its
 geometric multigrid.
-
-Both are cold: problem, operator and multigrid are made on the way. PETSc iterates from grid to
-grid, each with doubled spaces between nodes, takes Newton's steps on the free set (`vinewtonrsls`)
-and solves them by conjugate gradients and its geometric multigrid.
 """
 
 import argparse

@@ -108,8 +108,6 @@ def memory_of(n: int) -> tuple[int, float, float]:
 
     Sizes are in MB. The same steps in the smallest domain come first, so that what they load and
     keep is not counted.
-
-    The same steps in the smallest domain come before: what they load and keep is not the domain's.
     """
     _stepping(SIDE)()
     forget_peak()

@@ -84,9 +84,6 @@ def contact_matrix(contacts: int, rng: np.random.Generator, tangents: int = 4) -
     of them zero, shifted to be positive definite. The pattern of Stewart and Trinkle is written
     over the nonzero blocks.
 
-    Random symmetric 6 x 6 blocks, half of them zero, shifted to positive definite, with the pattern
-    of Stewart and Trinkle written over those that are left.
-
     Args:
         contacts: number of contacts, six unknowns each.
         rng: random numbers.

@@ -1,4 +1,6 @@
-"""Random problems of many kinds, by kind and seed: what no method was tuned on. `problem(kind, seed)` is the same for ever.
+"""Random problems by kind and seed, on which no method was tuned.
+
+`problem(kind, seed)` always returns the same problem.
 
 Seeds 0 to 9,999 are for tests and for development, 10,000 to 19,999 are kept unseen for acceptance,
 a run draws from 20,000 on.
@@ -12,7 +14,7 @@ from warp_lcp.benchmarks.extremes.problem import GridProblem, Problem, solvable
 from warp_lcp.benchmarks.extremes.unseen import grids, matrices
 from warp_lcp.benchmarks.extremes.unseen.draw import Draw, Unseen, changed
 
-RESERVED = range(10_000, 20_000)  # seeds for acceptance
+RESERVED = range(10_000, 20_000)  # seeds reserved for acceptance
 FRESH = range(20_000, 1 << 31)  # seeds that a run draws from
 
 Make = Callable[[Draw], Problem]
@@ -29,7 +31,7 @@ GRIDS, SURE_MATRICES, HARD_MATRICES = (
 )
 KINDS = {**GRIDS, **SURE_MATRICES, **HARD_MATRICES}
 ALLOWANCE = {"lognormal": 1.5}
-WARM_EVERY = 3  # of how many seeds one is solved once more with b changed by 1 %
+WARM_EVERY = 3  # every third seed is solved again with b changed by 1 %
 
 
 def problem(kind: str, seed: int, *, small: bool = False) -> Unseen:
