@@ -1,6 +1,7 @@
-"""Solve and judge hostile inputs: `python -m warp_lcp.benchmarks.hostile --seed N --count N [--kinds ...] [--out DIR]`.
+"""Command that solves and judges hostile inputs.
 
-Each kind has a worker process, whose death or CPU time beyond the limit costs one case only.
+`python -m warp_lcp.benchmarks.hostile --seed N --count N [--kinds ...] [--out DIR]`. Each kind has
+a worker process. If it dies or exceeds the CPU time limit, only one case is lost.
 """
 
 from __future__ import annotations
@@ -19,9 +20,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-LIMIT = 60.0  # [s] of CPU time that a solve without max_seconds may take
-GRACE = 15.0  # [s] until the worker is ended
-WALL = 600.0  # [s] of wall time, on a machine that is busy
+LIMIT = 60.0  # [s] limit of CPU time for a solve without max_seconds
+GRACE = 15.0  # [s] from the limit until the worker is ended
+WALL = 600.0  # [s] limit of wall time, for a busy machine
 FAULTS = ("FALSE CONVERGED", "FALSE INFEASIBLE", "CRASH", "TIMEOUT", "EXCEPTION")
 REMARKS = ("row hidden", "suspicious", "infeasible unproved", "not solved", "refused")
 COLUMNS = ("solves", "converged", "infeasible right", "honest", "other method", *FAULTS, *REMARKS)
@@ -29,7 +30,7 @@ COLUMNS = ("solves", "converged", "infeasible right", "honest", "other method", 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one case: pairs of category and reason, CPU seconds of its solve."""
+    """Outcome of one case: pairs of category and reason, CPU seconds of its solve."""
 
     kind: str
     index: int
@@ -39,7 +40,7 @@ class Outcome:
 
 
 def main() -> None:
-    """Run the kinds asked for, print a table and the faults."""
+    """Run the requested kinds; print a table and the faults."""
     parser = argparse.ArgumentParser(
         prog="python -m warp_lcp.benchmarks.hostile", description=__doc__
     )
@@ -66,7 +67,7 @@ def main() -> None:
         start = time.perf_counter()
         outcomes += supervise(kind, given.seed, given.count)
         _say(f"{kind}: {time.perf_counter() - start:.0f} s")
-        if given.out:  # after each kind, as a run may be interrupted
+        if given.out:  # written after each kind, since a run may be interrupted
             given.out.mkdir(parents=True, exist_ok=True)
             (given.out / "hostile.md").write_text(report(outcomes, given.seed))
             (given.out / "hostile.json").write_text(
@@ -82,20 +83,20 @@ def _say(text: str) -> None:
 
 
 def _work(kind: str, seed: int, indices: range) -> None:
-    """Solve cases in this process, a line of JSON before and after each."""
+    """Solve cases in this process; print a line of JSON before and after each."""
     warnings.simplefilter("ignore")
     import warp
 
     warp.config.quiet = True
     from warp_lcp.benchmarks.hostile import attempt, draw_case, judge
 
-    signal.signal(signal.SIGPROF, signal.SIG_DFL)  # ends the process, in whatever library it is
+    signal.signal(signal.SIGPROF, signal.SIG_DFL)  # ends the process in any library
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     for index in indices:
         case = draw_case(kind, seed, index)
         _write({"begin": index, "name": case.name})
         signal.setitimer(signal.ITIMER_PROF, LIMIT + GRACE)
-        signal.setitimer(signal.ITIMER_REAL, WALL)  # a solve that waits takes no CPU time
+        signal.setitimer(signal.ITIMER_REAL, WALL)  # a solve that waits uses no CPU time
         start = time.process_time()
         answer = attempt(case)
         seconds = time.process_time() - start
@@ -202,7 +203,7 @@ def _tell(outcome: Outcome, seed: int) -> None:
 
 
 def fault_lines(outcomes: list[Outcome], seed: int, categories: tuple[str, ...]) -> list[str]:
-    """Return a line for each verdict of the categories, with what repeats it."""
+    """Return a line for each verdict of the categories, with the command to repeat it."""
     return [
         f"{category}: --kinds {o.kind} --seed {seed} --index {o.index}: {o.name} ({o.seconds:.1f} "
         f"s): {' '.join(why.split())}"
@@ -213,7 +214,7 @@ def fault_lines(outcomes: list[Outcome], seed: int, categories: tuple[str, ...])
 
 
 def report(outcomes: list[Outcome], seed: int) -> str:
-    """Return a page: a row a kind, then the faults and remarks."""
+    """Return a page: a row for each kind, then the faults and remarks."""
     kinds = list(dict.fromkeys(o.kind for o in outcomes))
     lines = [
         f"# Hostile inputs, seed {seed}",

@@ -1,4 +1,4 @@
-"""Cases of the hostile benchmark: an input, how it is solved, and what is known of its answer."""
+"""Cases of the hostile benchmark: input, solve, and known facts of the answer."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from warp_lcp.problem.protocol import families
 
 Bounds = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 CONVERGED, INFEASIBLE, REFUSED, EXCEPTION = "CONVERGED", "INFEASIBLE", "REFUSED", "EXCEPTION"
-# Methods that take any matrix, or refuse it in a ValueError, which is no fault.
+# Methods that take any matrix or refuse it with a ValueError, which is no fault.
 NAMED = tuple(
     sorted(
         name
@@ -32,7 +32,7 @@ GRID_METHODS = ("projected-multigrid", "minimum-map-newton", "mprgp", "psor", "i
 
 @dataclass(frozen=True)
 class Answer:
-    """What a solve returned, on the host.
+    """Result of a solve, on the host.
 
     Args:
         status: name of a `wl.SolveStatus`, or REFUSED (a ValueError) or EXCEPTION (any other).
@@ -49,7 +49,7 @@ class Answer:
 
 @dataclass(frozen=True, kw_only=True)
 class Box:
-    """The problem y = A x + b, l <= x <= u as plain arrays, and what is known of its answer.
+    """Problem y = A x + b, l <= x <= u as plain arrays, with its known facts.
 
     Args:
         A: matrix (n, n), dense or scipy.sparse, float64.
@@ -90,7 +90,7 @@ class Box:
 
 @dataclass(frozen=True, kw_only=True)
 class Program:
-    """A quadratic program as given to qpsolvers, and a well-scaled form of it with the same x.
+    """Quadratic program for qpsolvers, and a well-scaled form with the same x.
 
     Args:
         scaled: qpsolvers.Problem as given to the solver.
@@ -107,7 +107,7 @@ class Program:
 
 @dataclass(frozen=True)
 class Values:
-    """Arrays that the answer must have, to a tolerance relative to the largest entry of each."""
+    """Expected arrays, to a tolerance relative to the largest entry of each."""
 
     expected: dict[str, np.ndarray]
     tolerance: float
@@ -115,14 +115,17 @@ class Values:
 
 @dataclass(frozen=True)
 class Refusal:
-    """Malformed input: a ValueError, or a solve that ends in a status other than CONVERGED."""
+    """Malformed input, which must be refused.
+
+    Expected is a ValueError, or a solve that ends in a status other than CONVERGED.
+    """
 
     why: str
 
 
 @dataclass(frozen=True)
 class Case:
-    """One solve.
+    """One solve, with the truth about its answer.
 
     Args:
         name: what was drawn, in a line.
@@ -151,7 +154,9 @@ def box_case(
     entries: bool = True,
     x0: np.ndarray | None = None,
 ) -> Case:
-    """Return a case that solves a box by the default, a named method or another entry point.
+    """Return a case that solves a box problem.
+
+    By the default method, a named method or another entry point.
 
     Args:
         rng: random numbers.
@@ -263,7 +268,10 @@ def command_line(
 
 
 def _environment() -> dict[str, str]:
-    """Return the environment of a child process that imports this package, whatever its folder."""
+    """Return the environment of a child process that can import this package.
+
+    It works in any folder.
+    """
     import os
 
     root = str(Path(wl.__file__).parents[1])

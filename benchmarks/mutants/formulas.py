@@ -1,4 +1,7 @@
-"""Mutants of the formulas that make an algorithm: signs, constants, index sets, conditions; each with the test file that must notice it."""
+"""Mutants of the formulas of the algorithms.
+
+Signs, constants, index sets and conditions, each with the test file that must fail.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Which tests are run for a change of a module: those that bear its name, then those that name what it defines, then those of its users."""
+"""Choice of the tests for a change of a module.
+
+First the tests that bear its name, then those that name its definitions, then those of its users.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +10,8 @@ from collections import defaultdict
 from functools import cache
 from pathlib import Path
 
-# minutes each, or about other things: compilation for CUDA, pages and notebooks, ranks, runs that
-# are killed
+# Tests of minutes, or of other subjects: compilation for CUDA, pages and notebooks, ranks, killed
+# runs.
 NEVER = re.compile(
     r"_slow|cuda_compiles|test_docs|notebook|readme|tutorial|gallery_page|on_ranks|tests/(distributed|benchmarks|fuzz)|killed_run|crash_points"
 )
@@ -24,7 +27,10 @@ def _tests(root: Path) -> dict[str, set[str]]:
 
 @cache
 def _users(root: Path) -> dict[str, set[str]]:
-    """Return the modules that import each module, by its last name and its package's, and who names each header."""
+    """Return the modules that import each module, and the users of each header.
+
+    Modules are keyed by their last name and that of their package.
+    """
     users = defaultdict(set)
     for package in ("warp_lcp", "fluids", "granular"):
         for file in (root / package).rglob("*"):
@@ -52,13 +58,13 @@ def tests_of(root: Path, module: str) -> list[str]:
     """Return test files, the likeliest to notice a change of a module first."""
     score: dict[str, float] = defaultdict(float)
     front, weight, seen = {module}, 1.0, set[str]()
-    for _ in range(3):  # headers in headers
+    for _ in range(3):  # headers may include headers
         front = {
             user
             for file in front
             for user in (_users(root).get(file, ()) if file.endswith(".h") else (file,))
         }
-    if not front:  # its name is put together
+    if not front:  # its name is composed at run time
         front = {
             str(file.relative_to(root)) for file in (root / module).parents[1].glob("*_kernels.py")
         }
