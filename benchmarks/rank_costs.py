@@ -1,9 +1,11 @@
-"""What a liquid costs a rank: `mpiexec -n N python -m warp_lcp.benchmarks.rank_costs SCENE [KEY=VALUE...]`, for docs/planning.md.
+"""Cost of a liquid on each rank: seconds, memory and received bytes.
 
-Prints the figures of the rank that has most of each. Seconds are the processor's, so that neighbors
-on the machine count less; a rank that waits for others in MPI takes them, too. Memory is the most
-that the process held, less what it held with Python, libraries and kernels. Bytes are those that a
-rank receives, by who sends them and why.
+`mpiexec -n N python -m warp_lcp.benchmarks.rank_costs SCENE [KEY=VALUE...]`, for docs/planning.md.
+
+Each printed figure is that of the rank with the largest value. Seconds are CPU seconds, so that
+other programs on the machine count less; waiting in MPI uses CPU time too. Memory is the peak of
+the process, less its memory after Python, libraries and kernels were loaded. Bytes are those that a
+rank receives, by sender and reason.
 """
 
 from __future__ import annotations
@@ -28,18 +30,22 @@ from warp_lcp.fluids.simulator import FluidsSimulator
 from warp_lcp.rows.program import LaunchGraph, Program
 from warp_lcp.scene.scene_file import load_scene
 
-SKIPPED, STEPS = 10, 10  # liquid moves when it is measured
+SKIPPED, STEPS = 10, 10  # the liquid moves when it is measured
 SMALL = "domain.resolution=32"  # loads the kernels
 MEGA = 1 << 20
 
 
 class Traffic:
-    """What a rank receives: bytes and occasions, by their kind; those of a recorded program at each of its runs."""
+    """Counter of the bytes and messages that a rank receives, by kind.
+
+    Exchanges of a recorded program count at each of its runs.
+    """
 
     def __init__(self) -> None:
-        """Count from here on, in this process."""
+        """Start to count, in this process."""
         self.bytes, self.times = Counter[str](), Counter[str]()
-        self._recorded: list[tuple[str, int]] | None = None  # by the program that is being recorded
+        # calls of the program that is being recorded
+        self._recorded: list[tuple[str, int]] | None = None
         self._listen(
             Subdomain,
             "fill",
@@ -59,7 +65,7 @@ class Traffic:
         self._listen(
             Ranks, "gather", lambda ranks, values: (ranks.size - 1) * np.asarray(values).nbytes
         )
-        # sent; as much comes
+        # Sent bytes; as many are received.
         self._listen(
             MpiMailbox,
             "swap",
@@ -77,7 +83,7 @@ class Traffic:
         setattr(kind, name, counted)
 
     def _listen_to_programs(self) -> None:
-        """Count what is recorded when it runs, not when it is recorded."""
+        """Count recorded exchanges when they run, not when they are recorded."""
         record, run, recorded = (
             LaunchGraph._recorded,
             Program.run,
@@ -108,7 +114,7 @@ class Traffic:
 
 @cache
 def _ghosts(owner: Subdomain | Halo, width: int | None = None) -> int:
-    """Return how many ghost cells are filled."""
+    """Return the number of ghost cells that are filled."""
     forest = (
         owner._forest
         if isinstance(owner, Halo)
@@ -124,7 +130,7 @@ def _item(field: wp.array | np.ndarray) -> int:
 
 
 def main() -> None:
-    """Measure on the ranks there are."""
+    """Measure on all ranks."""
     wp.config.log_level = wp.LOG_ERROR
     ranks, (name, *overrides) = Ranks.world(), sys.argv[1:]
     traffic, make = (

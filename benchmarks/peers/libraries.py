@@ -1,4 +1,7 @@
-"""Peers in this process, on the assembled matrix: solvers of A x = -b, and of quadratic programs, x'A x / 2 + b'x over x >= lower."""
+"""Peers in this process, on the assembled matrix.
+
+Solvers of A x = -b, and of quadratic programs, x'A x / 2 + b'x over x >= lower.
+"""
 
 from __future__ import annotations
 
@@ -17,13 +20,13 @@ CG_PATIENCE, OSQP_PATIENCE = 20_000, 100_000  # iterations
 def pyamg(
     question: Question, tolerance: float, *, build: str = "smoothed_aggregation_solver"
 ) -> Answer:
-    """One of PyAMG's hierarchies before CG, all defaults."""
+    """Solve by CG with one of PyAMG's hierarchies, all defaults."""
     import pyamg as library
 
     A, residuals = sp.csr_matrix(question.matrix), list[float]()
     begun = time.perf_counter()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # its own, of its use of SciPy
+        warnings.simplefilter("ignore")  # PyAMG warns about its own use of SciPy
         hierarchy = getattr(library, build)(A)
         middle = time.perf_counter()
         x = hierarchy.solve(-question.b, tol=tolerance, accel="cg", residuals=residuals)
@@ -31,7 +34,7 @@ def pyamg(
 
 
 def scipy_cg(question: Question, tolerance: float) -> Answer:
-    """Plain conjugate gradients."""
+    """Solve by plain conjugate gradients."""
     A, b, count = question.matrix, -question.b, list[int]()
     begun = time.perf_counter()
     x, _ = scipy.sparse.linalg.cg(
@@ -41,7 +44,10 @@ def scipy_cg(question: Question, tolerance: float) -> Answer:
 
 
 def amgcl(question: Question, tolerance: float) -> Answer:
-    """AMGCL's smoothed aggregation with one sweep of its ILU(0) before CG, the fastest of its smoothers here."""
+    """Solve by CG with AMGCL's smoothed aggregation.
+
+    One sweep of its ILU(0) smooths; it is the fastest of its smoothers here.
+    """
     import pyamgcl
 
     A, b = sp.csr_matrix(question.matrix), -question.b
@@ -56,7 +62,10 @@ def amgcl(question: Question, tolerance: float) -> Answer:
 
 
 def warp_cg(question: Question, tolerance: float, *, device: str) -> Answer:
-    """Warp's own conjugate gradients with a diagonal preconditioner on a Warp BSR matrix, float64."""
+    """Solve by Warp's conjugate gradients with a diagonal preconditioner.
+
+    On a Warp BSR matrix in float64.
+    """
     import warp as wp
     import warp.optim.linear
     import warp.sparse
@@ -80,7 +89,7 @@ def warp_cg(question: Question, tolerance: float, *, device: str) -> Answer:
 
 
 def cupy_cg(question: Question, tolerance: float) -> Answer:
-    """Plain conjugate gradients of CuPy, on its current CUDA device."""
+    """Solve by CuPy's plain conjugate gradients on its current CUDA device."""
     import cupy
     import cupyx.scipy.sparse
     import cupyx.scipy.sparse.linalg
@@ -100,7 +109,10 @@ def cupy_cg(question: Question, tolerance: float) -> Answer:
 
 
 def osqp(question: Question, tolerance: float) -> Answer:
-    """Operator splitting with one factorization; tolerances are absolute, in units of b."""
+    """Solve by OSQP: operator splitting with one factorization.
+
+    Its tolerances are absolute, in units of b.
+    """
     import osqp as library
 
     P, A = sp.triu(question.matrix, format="csc"), sp.eye_array(len(question.b), format="csc")
@@ -127,7 +139,7 @@ def osqp(question: Question, tolerance: float) -> Answer:
 
 
 def piqp(question: Question, tolerance: float) -> Answer:
-    """Proximal interior point with sparse factorizations."""
+    """Solve by PIQP: a proximal interior-point method, sparse factorizations."""
     import piqp as library
 
     P = sp.csc_matrix(question.matrix)
@@ -148,7 +160,10 @@ def piqp(question: Question, tolerance: float) -> Answer:
 
 
 def clarabel(question: Question, tolerance: float) -> Answer:
-    """Interior point on a homogeneous embedding, with sparse factorizations."""
+    """Solve by Clarabel: an interior-point method on a homogeneous embedding.
+
+    With sparse factorizations.
+    """
     import clarabel as library
 
     P = sp.csc_matrix(sp.triu(question.matrix, format="csc"))
