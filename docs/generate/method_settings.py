@@ -1,4 +1,7 @@
-"""Writes docs/api/settings.md from the annotations of methods: `python docs/generate/method_settings.py`."""
+"""Write docs/api/settings.md from the annotations of methods.
+
+`python docs/generate/method_settings.py`.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,7 @@ import warp_lcp as wl
 from warp_lcp.settings import ranges, rule
 
 PAGE = Path(__file__).parents[1] / "api" / "settings.md"
-COMMON = 3  # from this number of methods on, a setting that they share is in the common list
+COMMON = 3  # least number of methods that share a setting in the common list
 HEAD = """# Settings of methods
 
 <!-- Written by docs/generate/method_settings.py from the classes; do not edit. -->
@@ -40,7 +43,7 @@ def rows(kind: type[Any]) -> dict[str, str]:
 
 
 def section(title: str, lines: list[str], also: list[str]) -> str:
-    """Return a list, and the names of settings that are in the common one."""
+    """Return a list, and the names of its settings that are in the common list."""
     names = ", ".join(f"`{name}`" for name in also)
     items = [*lines, *([ALSO + names] if also else [])]
     return "\n".join(["", f"## {title}", "", *items, ""]) if items else ""
@@ -52,7 +55,7 @@ def page() -> str:
     count = Counter(line for found in methods.values() for line in found.values())
     common = [line for line, times in count.items() if times >= COMMON]
     names = Counter(line.split("`")[1] for line in common)
-    # a name has one default here
+    # A name has one default here.
     common = [line for line in common if names[line.split("`")[1]] == 1]
     parts = [
         section(kind.__name__, list(rows(kind).values()), [])
