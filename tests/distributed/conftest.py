@@ -1,4 +1,7 @@
-"""Programs on ranks: tests here start them by mpiexec, and are skipped where MPI or PETSc is missing."""
+"""Fixtures that start programs on ranks by mpiexec.
+
+Tests are skipped where MPI or PETSc is missing.
+"""
 
 import subprocess
 import textwrap
@@ -7,14 +10,16 @@ import pytest
 
 from warp_lcp.distributed import launch
 
-SECONDS = 240.0  # a run that takes longer hangs; the first one compiles kernels
+SECONDS = 240.0  # limit of a run that may hang; the first one compiles kernels
 
 launch.find_petsc()
 
 
 @pytest.fixture
 def mpi(tmp_path):
-    """Run this interpreter on n ranks: `mpi(2, "-m", "module", "--option")`, or `mpi(2, TEXT, *arguments)` with a program's text.
+    """Run this interpreter on n ranks.
+
+    `mpi(2, "-m", "module", "--option")`, or `mpi(2, TEXT, *arguments)` with the text of a program.
 
     Text is what has a line break in it; it is written into a file in `tmp_path`, which is the
     working folder of all runs.
@@ -53,7 +58,7 @@ def mpi(tmp_path):
         try:
             out, errors = process.communicate(timeout=seconds)
         except subprocess.TimeoutExpired:
-            process.terminate()  # mpiexec ends its ranks then
+            process.terminate()  # mpiexec then ends its ranks
             try:
                 out, errors = process.communicate(timeout=10.0)
             except subprocess.TimeoutExpired:
