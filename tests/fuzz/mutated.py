@@ -1,4 +1,7 @@
-"""Bytes that were once a good file: flipped bits, cuts, doubled and foreign pieces, and numbers that promise too much."""
+"""Mutated bytes of valid files.
+
+Flipped bits, cuts, doubled and foreign parts, and numbers that claim too much.
+"""
 
 from __future__ import annotations
 
