@@ -14,7 +14,7 @@ DEVICE = wp.get_device("cpu")
 
 
 class Others:
-    """Layout with three times as much of everything."""
+    """Communicator whose other ranks have three times this rank's values."""
 
     def sum(self, values):
         return 4.0 * np.asarray(values)
