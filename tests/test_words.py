@@ -61,7 +61,10 @@ def parsed(file: Path) -> ast.Module:
 
 
 def documented() -> dict[str, str]:
-    """Return the summary line of everything that docs/api shows or that `run` and `scene` have: modules, classes, functions."""
+    """Return the summary line of everything in docs/api, `run` and `scene`.
+
+    Modules, classes and functions.
+    """
     found: dict[str, str] = {}
     for reference in re.findall(
         r"^::: (\S+)",
@@ -103,7 +106,10 @@ def _add_summaries(found: dict[str, str], name: str, node: ast.AST) -> None:
 
 
 def messages(phrases: re.Pattern[str]) -> Iterator[str]:
-    """Yield the place and the text of each string of the packages that has one of the phrases, except docstrings."""
+    """Yield place and text of each string with one of the phrases.
+
+    Docstrings are left out.
+    """
     for file in (
         file
         for package in ("warp_lcp", "fluids", "granular")
