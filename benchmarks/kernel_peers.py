@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Peers of the 7-point product: a plain Warp kernel with one thread a cell, and Numba."""
+"""Peers of the 7-point product: a plain Warp kernel and Numba."""
 
 from collections.abc import Callable
 from typing import Any

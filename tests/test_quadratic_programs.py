@@ -14,7 +14,10 @@ OTHERS = [name for name in ("clarabel", "piqp") if name in qpsolvers.available_s
 
 
 def check(seed, **options):
-    """Compare verdict, objective and minimizer with the construction, and test optimality."""
+    """Compare verdict, objective and minimizer with the construction.
+
+    Optimality is tested too.
+    """
     drawn = draw(seed, **options)
     found = qp.solve_problem(qpsolvers.Problem(**drawn.scaled))
     message = (seed, drawn.verdict, found.extras["result"].message)

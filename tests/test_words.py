@@ -1,4 +1,4 @@
-"""Plain words: summary lines of the public API, help texts, messages, phrases of the documentation, the glossary."""
+"""Plain words in docstrings, help texts, messages and documentation."""
 
 import ast
 import inspect

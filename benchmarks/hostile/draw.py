@@ -58,7 +58,7 @@ def plane_laplacian(
 
 
 def definite(rng: np.random.Generator, n: int) -> tuple[str, Any]:
-    """Return a symmetric positive definite matrix of condition up to 1e4, dense or sparse."""
+    """Return an SPD matrix of condition number up to 1e4, dense or sparse."""
     kind = str(rng.choice(["dense", "chain", "plane", "graph"]))
     if kind == "dense" or n < 4:
         Q = np.linalg.qr(rng.standard_normal((n, n)))[0]

@@ -54,10 +54,10 @@ def period(time: np.ndarray, signal: np.ndarray) -> float:
 
 
 def mode(x: np.ndarray, wavenumber: float, area: float, length: float) -> float:
-    """Return the amplitude [m] of cos(k x) in a liquid's elevation, from equal particles that fill it.
+    """Return the amplitude [m] of cos(k x) in a liquid's elevation.
 
-    The integral of cos(k x) over a liquid of depth h + eta(x) is that of eta cos(k x), where k is a
-    multiple of pi / length.
+    Equal particles fill the liquid. The integral of cos(k x) over a liquid of depth h + eta(x) is
+    that of eta cos(k x), where k is a multiple of pi / length.
 
     Args:
         x: of the particles [m], shape (n,).
@@ -196,7 +196,7 @@ def filled_fraction(cells: np.ndarray, counts: tuple[int, int], volume: float) -
 
 
 def enclosed_cells(cells: np.ndarray, counts: tuple[int, int], volume: float) -> float:
-    """Return the volume inside the surface, in cells; arguments as of `filled_fraction`."""
+    """Return the volume inside the surface [cells]; arguments as `filled_fraction`."""
     nx, ny = counts
     fraction = np.clip(filled_fraction(cells, counts, volume), 0.0, 1.0)
     distance = np.pad(-np.interp(fraction, cumulative(KNOTS), KNOTS), 1, mode="edge")

@@ -48,7 +48,7 @@ def small(name: str) -> str:
 
 
 def every_command(scene: object, tmp_path: Path, *overrides: str) -> None:
-    """Run every command on a scene and on its run folder, except those that open a window."""
+    """Run every command without a window on a scene and on its run folder."""
     out, problems = tmp_path / "out", tmp_path / "problems"
     sets = [word for override in overrides for word in ("--set", override)]
     loaded = load_scene(str(scene))

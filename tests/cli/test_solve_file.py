@@ -1,4 +1,4 @@
-"""`warp-lcp solve`: Matrix Market files in, a table and x out, exit codes and messages."""
+"""`warp-lcp solve` on Matrix Market files: output, exit codes and messages."""
 
 from pathlib import Path
 

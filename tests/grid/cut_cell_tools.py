@@ -70,7 +70,10 @@ def tilted(dimension, direction):
 
 
 def clip(polygon, normal, offset):
-    """Return the part of a polygon, shape (m, 3), where normal.x > offset (Sutherland & Hodgman)."""
+    """Return the part of a polygon where normal.x > offset, shape (m, 3).
+
+    By Sutherland & Hodgman's algorithm.
+    """
     result = []
     side = polygon @ normal - offset
     for a, b, da, db in zip(

@@ -110,7 +110,7 @@ def test_no_solution_is_proved(b, kind, precision):
 
 @pytest.mark.parametrize("seed", range(6))
 def test_what_is_no_solution_is_not_called_infeasible_where_there_is_one(seed):
-    """No INFEASIBLE for solvable problems.
+    """False INFEASIBLE is excluded for solvable problems.
 
     Indefinite matrices, for which the method gives no guarantee; enumeration decides.
     """

@@ -1,4 +1,4 @@
-"""Lemke's method: any matrix, contacts with friction, boxes by reformulation, rays."""
+"""Lemke's method: any matrix, frictional contacts, boxes by reformulation, rays."""
 
 import numpy as np
 import pytest
