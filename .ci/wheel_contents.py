@@ -1,10 +1,9 @@
 """Build the wheel in three ways and check its contents.
 
-The three ways: from a checkout, from the source distribution, and from a checkout without symbolic
-links, as git makes it on Windows.
-
-All three must hold the sources, headers and tables of `warp_lcp`, and nothing else. Run in the
-repository by a Python with setuptools: `python .ci/wheel_contents.py FOLDER`; the wheel goes there.
+The wheel is built from a checkout, from the source distribution, and from a checkout without
+symbolic links, as git makes it on Windows. All three wheels must hold the sources, headers and
+tables of `warp_lcp`, and nothing else. Run this program in the repository by a Python with
+setuptools: `python .ci/wheel_contents.py FOLDER`; the wheel goes into FOLDER.
 """
 
 import shutil

@@ -1,6 +1,6 @@
 """Benchmark process: measure one suite and write its files.
 
-`python -m warp_lcp.benchmarks SUITE --device cpu --out DIR`; `warp-lcp bench` starts it.
+Run it as `python -m warp_lcp.benchmarks SUITE --device cpu --out DIR`; `warp-lcp bench` starts it.
 """
 
 from __future__ import annotations

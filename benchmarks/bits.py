@@ -1,9 +1,8 @@
 """Digests of solver results on grids, for bit-by-bit comparison.
 
-`python -m warp_lcp.benchmarks.bits --out before.txt`, then `diff` with the file of another version.
-
-One line per solve: the problem, the method, its status, steps, a digest of x and one of the
-residuals of all iterates; or the message of a refusal.
+Run `python -m warp_lcp.benchmarks.bits --out before.txt`, and `diff` the file with that of another
+version. There is one line per solve: the problem, the method, its status, steps, a digest of x and
+one of the residuals of all iterates; or the message of a refusal.
 """
 
 from __future__ import annotations

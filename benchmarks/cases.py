@@ -130,7 +130,7 @@ class Case:
     def memory(self) -> None:
         """Count the bytes of operator, problem and workspace, b and the bounds included.
 
-        Counted during a solve in place, and after it.
+        They are counted during a solve in place, and after it.
         """
         forget_peak()
         before, resident, most = array_bytes(), resident_bytes(), list[int]()

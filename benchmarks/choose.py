@@ -201,8 +201,8 @@ def is_right(record: Record, name: str) -> bool:
 def rule_row(number: int, records: Sequence[Record]) -> list[str]:
     """Return the table row of a rule.
 
-    Columns: problems, solved, time over the best, the best methods, the gain of the alternatives,
-    and the default.
+    The columns are problems, solved, time over the best, the best methods, the gain of the
+    alternatives, and the default.
     """
     own = [r for r in records if r.facts["rule"] == number]
     method = RULES[number - 1].method

@@ -40,7 +40,8 @@ def between(rng: np.random.Generator, low: float, high: float) -> int:
 def plant(rng: np.random.Generator) -> Plant:
     """Return options for a planted solution.
 
-    A share of active unknowns, sometimes boxes, weakly active unknowns, equations.
+    They choose a share of active unknowns and, sometimes, boxes, weakly active unknowns and
+    equations.
     """
     boxed = bool(rng.random() < 0.3)
     weak, mixed = (float(rng.random() < 0.2) * float(rng.uniform(0, 0.5)) for _ in range(2))

@@ -159,7 +159,7 @@ def _scene(
 def _equal(options: Options) -> list[Record]:
     """Compare PGS and NNCG after equal sweeps.
 
-    On the stacks, and on the heavy box at all mass ratios.
+    They run on the stacks, and on the heavy box at all mass ratios.
     """
     systems = {
         name: next_step(name, options.device).system for name in STACKS if name != "heavy-on-light"

@@ -1,9 +1,9 @@
 """Seepage through a dam: comparison with PETSc's SNESVI, in turns on one core.
 
-`python -m benchmarks.dam`, in the source tree. Both solvers start cold: the time includes problem,
-operator and multigrid. PETSc uses grid sequencing, each grid with half the spacing of the last. On
-each it takes Newton steps on the free set (`vinewtonrsls`), solved by conjugate gradients with its
-geometric multigrid.
+Run `python -m benchmarks.dam` in the source tree. Both solvers start cold: the time includes
+problem, operator and multigrid. PETSc uses grid sequencing, each grid with half the spacing of the
+last. On each it takes Newton steps on the free set (`vinewtonrsls`), solved by conjugate gradients
+with its geometric multigrid.
 """
 
 import argparse

@@ -1,6 +1,6 @@
 """Cost of driving a run from Python.
 
-`python -m benchmarks.driven [SCENE ...]`, in the source tree. Three runs of the same scene take
+Run `python -m benchmarks.driven [SCENE ...]` in the source tree. Three runs of the same scene take
 turns: by `run_scene`, as on the command line; by `for frame in wl.Run(...)`, with a callback in
 each step and access to the particles in each frame; and by `run_scene` again, which shows the noise
 of the clock. All write log, frames and checkpoints. Times are CPU seconds, so that other programs

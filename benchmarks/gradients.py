@@ -1,6 +1,6 @@
 """Cost of gradients through a solution.
 
-`python -m benchmarks.gradients`, in the source tree. CPU seconds, measured in turns.
+Run `python -m benchmarks.gradients` in the source tree. It measures CPU seconds, in turns.
 
 `wl.vjp` is compared with the solve itself and with the linear solve that it contains, on a membrane
 over a ball. In that linear solve the active unknowns are AIR, the tolerance is the same, and the
@@ -92,7 +92,7 @@ def measure(shape: tuple[int, ...], faces: bool, rtol: float) -> None:
 def remember(shape: tuple[int, ...]) -> None:
     """Print the additional memory of `wl.vjp` and of a linear solve.
 
-    After solves of few and of many steps.
+    They are measured after solves of few and of many steps.
     """
     A, _, load, obstacle, _ = membrane(shape, False)
     problem = wl.LCP(A, load, lower=obstacle)

@@ -1,10 +1,9 @@
 """Host time of a simulation step by stage, and of the native work in it.
 
-`python -m warp_lcp.benchmarks.host`.
-
-A step is Python that prepares operations, and native calls that execute tables of them
-(`warp_lcp.rows.team.Team.run`). The *floor* of a stage is the time of its native calls alone: each
-is repeated from the same memory, without Python in between, and the fastest one counts.
+Run `python -m warp_lcp.benchmarks.host`. A step consists of Python, which prepares operations, and
+of native calls, which execute tables of them (`warp_lcp.rows.team.Team.run`). The *floor* of a
+stage is the time of its native calls alone: each call is repeated from the same memory, without
+Python in between, and the fastest one counts.
 """
 
 from __future__ import annotations
@@ -77,7 +76,7 @@ class StageTimer:
     Nested stages are excluded from the enclosing one.
 
     Attributes:
-        seconds: by stage, in the order of their first begin; `OUTSIDE` between `begin` and `end`.
+        seconds: CPU seconds by stage, in order of first begin; `OUTSIDE` for the rest of a step.
     """
 
     def __init__(self) -> None:
@@ -118,15 +117,15 @@ class StageTimer:
 class StepRecorder:
     """Counter of calls by stage, which also replays native calls.
 
-    It works while it is entered.
+    It counts as long as its `with` block runs.
 
     Args:
-        timer: says which stage is running.
-        replays: of each native call; 0: only count.
+        timer: stopwatch with the running stage.
+        replays: number of replays of each native call; 0 to count only.
 
     Attributes:
-        counts: by stage, of `COUNTS`.
-        native: seconds of the native calls by stage, the fastest replay of each.
+        counts: numbers of calls by stage and kind, see `COUNTS`.
+        native: seconds of the native calls by stage, with the fastest replay of each.
     """
 
     def __init__(self, timer: StageTimer, replays: int = REPLAYS) -> None:
@@ -249,11 +248,11 @@ def scene_records(name: str, resolution: int, device: str, steps: int, rounds: i
     """Return the records of a scene: of its whole step, and of each stage.
 
     Args:
-        name: of a scene, or its file.
+        name: name or file of a scene.
         resolution: cells along the longest side.
-        device: of the CPU.
-        steps: of a round, whose mean is a sample.
-        rounds: samples.
+        device: the CPU.
+        steps: steps of a round; their mean is a sample.
+        rounds: number of samples.
 
     Raises:
         ValueError: the device is not the CPU, a number is not positive, or the simulation has no

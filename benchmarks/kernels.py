@@ -1,9 +1,8 @@
 """Rates of all passes over the finest grid, against the copy bandwidth.
 
-In cells and bytes per second.
-
-The passes are those that solves of a full basin bind, so that the list follows the code. The bytes
-are those of the fields that a pass declares to read and to write, each counted once.
+Rates are in cells and bytes per second. The passes are those that solves of a full basin bind, so
+that the list follows the code. The bytes are those of the fields that a pass declares to read and
+to write, each counted once.
 """
 
 from __future__ import annotations
@@ -215,7 +214,7 @@ def _synchronized(run: Callable[[], None], device: str) -> Callable[[], None]:
 def _hear(scene: Splash, device: str) -> tuple[dict[str, Heard], Heard]:
     """Return the passes over the finest grid that solves of the scene bind.
 
-    By a unique label, with the float32 product among them.
+    Each pass has a unique label. The float32 product among them is returned as well.
     """
     heard: list[Heard] = []
     bind = RowPass.bind
@@ -296,7 +295,7 @@ def _figures(
 ) -> dict[str, Figure]:
     """Return rates of a kernel that moves `per_cell` bytes.
 
-    Also the share of the copy bandwidth in the same rounds.
+    The share of the copy bandwidth in the same rounds is included.
     """
     figures = {
         "cells": Figure(n**3),

@@ -1,8 +1,7 @@
 """Cost of each model of a scene, in time per step and memory.
 
-`warp-lcp check` estimates runs from this price list.
-
-python -m warp_lcp.benchmarks.models          # also writes warp_lcp/scene/models.toml and docs/models.md, in a checkout
+`warp-lcp check` estimates runs from this price list. Run `python -m warp_lcp.benchmarks.models`. In
+a checkout it also writes warp_lcp/scene/models.toml and docs/models.md.
 """
 
 from __future__ import annotations
@@ -167,7 +166,7 @@ def run_seconds(simulation: Any, time: Time) -> np.ndarray:
 def step_seconds_of(simulation: Any, dt: float) -> tuple[float, dict[str, Any]]:
     """Return the seconds of a step and its row.
 
-    CPU seconds on a CPU, which other programs do not affect.
+    On a CPU they are CPU seconds, which other programs do not affect.
     """
     device = simulation.grid.device
     read = clock(str(device))
@@ -250,7 +249,8 @@ def split(seconds: float, half: float, dimension: int) -> tuple[float, float]:
 def split_base(base: Sample, half: Sample, thin: Sample) -> tuple[float, float, float]:
     """Return the seconds of a step: fixed, per cell and per particle.
 
-    Fitted by nonnegative least squares to three scenes of other sizes and amounts of material.
+    They are fitted by nonnegative least squares to three scenes of other sizes and amounts of
+    material.
     """
     scenes = [(base, counts(base.scene)), (half, counts(half.scene)), (thin, counts(thin.scene))]
     rows = np.array([[1.0, *count] for _, count in scenes]) / np.array(
@@ -349,7 +349,7 @@ def table_of(simulator: str, dimension: int, records: list[Record]) -> Table:
 def price_list(records: list[Record]) -> Mapping[str, Any]:
     """Return the contents of `warp_lcp/scene/models.toml`.
 
-    By simulator, dimension and model, the fields of `warp_lcp.scene.models.Price`.
+    It holds the fields of `warp_lcp.scene.models.Price` by simulator, dimension and model.
     """
     listed: dict[str, Any] = {}
     for record in records:
@@ -369,7 +369,7 @@ def price_list(records: list[Record]) -> Mapping[str, Any]:
 def overview(records: Sequence[Record]) -> Table:
     """Return the prices of all models in 3-D.
 
-    Time per step as a share of `base`, and memory.
+    The columns are time per step as a share of `base`, and memory.
     """
     columns = {"fluids 3d": "liquid", "granular 3d": "sand"}
     priced = {record.name: record for record in records if ": " in record.name}

@@ -1,9 +1,8 @@
 """Published methods for the pressure LCP on the splash: iterations and seconds.
 
-Methods of 2011 to 2023, to the same residual.
-
-Each runs as published as far as that is known (`docs/published-methods.md` says what was read and
-what is reconstructed), cold from p = 0, and then with what this library adds. All share kernels,
+The methods are of 2011 to 2023 and solve to the same residual. Each runs as published, as far as
+that is known: `docs/published-methods.md` says what was read and what is reconstructed. Each starts
+cold from p = 0, and then runs again with the additions of this library. All share kernels,
 precision, multigrid cycles and stopping criteria, so that methods are compared and not
 implementations. `docs/generate/published_figures.py` puts the figures into that page.
 """
@@ -68,11 +67,10 @@ class ProductsOnly(wl.Operator):
 class TruncatedMultigrid(wl.ProjectedMultigrid):
     """Multigrid iterations whose coarse levels leave out the active set.
 
-    Without conjugate directions and without projected cycles.
-
-    From x, unknowns at a bound with y = A x + b of the right sign are held; a linear cycle on the
-    others, whose Galerkin coarse levels and interpolation leave the held ones out, gives a
-    correction z; x + t z is projected onto the bounds, t the minimizer of the energy along z.
+    The method has neither conjugate directions nor projected cycles. From x, unknowns at a bound
+    with y = A x + b of the right sign are active. A linear cycle on the other unknowns gives a
+    correction z; its Galerkin coarse levels and its interpolation leave the active ones out. Then x
+    + t z is projected onto the bounds, where t minimizes the energy along z.
     """
 
     def init(self, problem: wl.LCP) -> TruncatedWorkspace:
@@ -142,7 +140,7 @@ ENTRIES = (
 def measure(options: Options, out: Path) -> Results:
     """Measure every method at every size in 3-D and 2-D.
 
-    With bounds at walls and everywhere.
+    The bounds are at walls and everywhere.
     """
     sizes = options.sizes or SIZES
     where = machine(
@@ -167,9 +165,9 @@ def _measure_scene(
     """Measure one sample of every method in each round.
 
     Args:
-        scene: what to solve.
+        scene: the scene to solve.
         options: device and number of rounds.
-        slow: methods with their bounds that are left out; those above PATIENCE are added.
+        slow: pairs of method and bounds that are left out; those above PATIENCE are added.
         load: whether a first round without samples loads the kernels.
     """
     linear = Case(

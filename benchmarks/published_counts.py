@@ -1,9 +1,7 @@
 """Published iteration counts, and the counts of the methods here.
 
-The problems can be rebuilt exactly.
-
-Each runs with the settings, the start and the stopping rule of its source, in double precision; see
-`docs/published-methods.md`.
+The problems can be rebuilt exactly. Each method runs with the settings, the start and the stopping
+rule of its source, in double precision; see `docs/published-methods.md`.
 """
 
 from __future__ import annotations
@@ -56,10 +54,10 @@ class Count:
         method: name in `wl.METHODS`.
         problem: problem, grids and start.
         printed: the published numbers.
-        source: where they were read.
-        measure: counts iterations here, a number for each printed one.
-        reason: why a number here differs by more than WITHIN; empty: none does.
-        slow: whether that takes seconds.
+        source: source of the numbers.
+        measure: function that counts iterations here, a number for each printed one.
+        reason: why a number here differs by more than WITHIN; empty if none does.
+        slow: whether the count takes seconds.
     """
 
     method: str
@@ -96,7 +94,7 @@ def steps_until(
     The tolerance is absolute, or relative to the first value.
 
     Raises:
-        RuntimeError: the method ends before.
+        RuntimeError: the method ends earlier.
     """
     work, norms = method.init(problem), list[float]()
     unknown, b = (problem.layout.unload(stored).numpy() for stored in (problem.unknown, problem.b))
@@ -192,7 +190,8 @@ def _refined(u: np.ndarray) -> np.ndarray:
 def stairs_problem() -> tuple[wl.LCP, np.ndarray]:
     """Return the problem of deal.II's step-41 and its obstacle.
 
-    Bilinear elements on 128^2 cells of [-1, 1]^2, load -10, u >= a stair of four steps.
+    It has bilinear elements on 128^2 cells of [-1, 1]^2, the load -10, and u >= a stair of four
+    steps.
     """
     n = 129
     x = np.linspace(-1, 1, n)
@@ -233,7 +232,7 @@ def stairs() -> tuple[float, ...]:
 def string_problem() -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Return A, b, obstacle and tolerance of PERMON's ex1.c.
 
-    A string above a sine, 100 nodes.
+    The problem is a string above a sine with 100 nodes.
     """
     n = 100
     h, i = 1 / (n - 1), np.arange(1, n - 1)
@@ -244,7 +243,7 @@ def string_problem() -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
 def bearing_problem(nx: int, ny: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Return A, b, bound and tolerance of PERMON's jbearing2.c.
 
-    A journal bearing of eccentricity 0.1.
+    The problem is a journal bearing of eccentricity 0.1.
     """
     problem = journal_bearing(nx, ny, device="cpu").dense()
     return problem.A, problem.b, np.asarray(problem.lower), 1e-6
@@ -275,8 +274,8 @@ def bearings(*sizes: tuple[int, int]) -> tuple[float, ...]:
 def put_problem() -> tuple[np.ndarray, np.ndarray, Callable[[np.ndarray], np.ndarray]]:
     """Return A, the payoff and b(V) of PETSc's blackscholes.c.
 
-    A time step of an American put by Crank and Nicolson's scheme. Values 10 at S = 0 and 0 at S =
-    100 are known, so that A has 149 unknowns; V has the 151 values of the step before.
+    The problem is a time step of an American put by Crank and Nicolson's scheme. Values 10 at S = 0
+    and 0 at S = 100 are known, so that A has 149 unknowns; V has the 151 values of the step before.
     """
     strike, rate, dividend, volatility, step = 10.0, 0.04, 0.01, 0.4, 0.1
     S = np.linspace(0, 100, 151)
@@ -299,8 +298,8 @@ def put_problem() -> tuple[np.ndarray, np.ndarray, Callable[[np.ndarray], np.nda
 def fischer_gradient(A: np.ndarray, lower: np.ndarray, x: np.ndarray, y: np.ndarray) -> float:
     """Return the gradient norm of the Fischer-Burmeister merit function.
 
-    As in TAO's semismooth methods: the norm of J'f, J = diag(p) + diag(q) A. At kinks, p and q are
-    those of a point moved along z, which is 1 at kinks and 0 elsewhere.
+    As in TAO's semismooth methods, it is the norm of J'f, J = diag(p) + diag(q) A. At kinks, p and
+    q are those of a point moved along z, which is 1 at kinks and 0 elsewhere.
     """
     a = x - lower
     rho = np.hypot(a, y)
@@ -331,7 +330,7 @@ def put() -> tuple[float, ...]:
 def gap_norm(x: np.ndarray, y: np.ndarray) -> float:
     """Return the optimality measure of TAO's bqpip, for x >= 0.
 
-    The root of the complementarity gap plus the dual infeasibility.
+    It is the root of the complementarity gap plus the dual infeasibility.
     """
     return float(
         np.sqrt(np.maximum(x, 0.0) @ np.maximum(y, 0.0) + np.abs(np.minimum(y, 0.0)).sum())
@@ -366,8 +365,8 @@ def pivots(*sizes: int) -> tuple[float, ...]:
 def slowest_mode(n: int, *, by_rows: bool) -> tuple[np.ndarray, float]:
     """Return the error that sweeps reduce least, shape (n, n), and its factor.
 
-    On the 5-point operator of n^2 nodes. The factor of Jacobi is cos(pi h) with h = 1 / (n + 1);
-    that of Gauss-Seidel, row by row, is its square (Young 1971).
+    The operator is the 5-point one on n^2 nodes. The factor of Jacobi is cos(pi h) with h = 1 / (n
+    + 1); that of Gauss-Seidel, row by row, is its square (Young 1971).
     """
     k, factor = np.arange(1, n + 1), float(np.cos(np.pi / (n + 1)))
     wave = np.sin(np.pi * k / (n + 1)) * (factor**k if by_rows else 1.0)

@@ -1,6 +1,7 @@
 """Cost of a liquid on each rank: seconds, memory and received bytes.
 
-`mpiexec -n N python -m warp_lcp.benchmarks.rank_costs SCENE [KEY=VALUE...]`, for docs/planning.md.
+Run `mpiexec -n N python -m warp_lcp.benchmarks.rank_costs SCENE [KEY=VALUE...]`, for
+docs/planning.md.
 
 Each printed figure is that of the rank with the largest value. Seconds are CPU seconds, so that
 other programs on the machine count less; waiting in MPI uses CPU time too. Memory is the peak of

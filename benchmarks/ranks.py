@@ -1,9 +1,8 @@
 """Suite `ranks`: solves of the suite `scaling` on several ranks of PETSc.
 
-Strong scaling, memory of a rank, and the overhead of the distribution.
-
-Started by `mpiexec`, it measures on the ranks there are, each of which makes its own box of the
-grid only. Otherwise it starts 1, 2 and 4 ranks itself, one after the other.
+It measures strong scaling, the memory of a rank, and the overhead of the distribution. Started by
+`mpiexec`, it measures on the running ranks; each rank makes only its own box of the grid. Otherwise
+it starts 1, 2 and 4 ranks itself, one after the other.
 """
 
 from __future__ import annotations
@@ -132,7 +131,7 @@ class Shared:
     def residual(self, x: np.ndarray) -> float:
         """Return the relative natural residual of x, this rank's part of the solution.
 
-        Computed by NumPy in float64, independent of the solver.
+        It is computed by NumPy in float64, independently of the solver.
         """
         inner = (slice(1, -1),) * 3
         cells, b = self.part.cells, np.pad(self.part.b, 1)
@@ -148,10 +147,10 @@ class Shared:
     def memory(self, before: int) -> None:
         """Measure the memory of the ranks in a solve.
 
-        Bytes of arrays per cell, the peak of a process, and the peak less `before`.
+        The figures are bytes of arrays per cell, the peak of a process, and the peak less `before`.
 
         Args:
-            before: bytes that this process held when it had loaded its kernels, and not this scene.
+            before: bytes of this process with its kernels, before the scene was made.
         """
         forget_peak()
         arrays, most = array_bytes(), list[int]()
@@ -207,7 +206,7 @@ def measure(options: Options, out: Path) -> Results:
     """Measure on the running ranks, or on each number of ranks in a run of its own.
 
     Raises:
-        SystemExit: on all ranks but the first, and on all with an exit code that is not 0 where one
+        SystemExit: on all ranks except the first; on all ranks, with a nonzero exit code, if one
             has failed.
     """
     sizes = sorted(options.sizes or SIZES)
@@ -293,10 +292,8 @@ def on_ranks(
 ) -> list[Record]:
     """Measure the sizes that fit on all ranks, one sample of each in every round.
 
-    Collective.
-
-    The first rank also solves each problem alone, on one thread and on as many as there are ranks,
-    in the same rounds, as far as it fits on its machine.
+    This call is collective. The first rank also solves each problem alone, on one thread and on as
+    many as there are ranks, in the same rounds, as far as it fits on its machine.
 
     Raises:
         MemoryError: no size fits.

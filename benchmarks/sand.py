@@ -88,7 +88,7 @@ def collapse(size: int, **tables: Any) -> SandScene:
 def _large() -> dict[str, SandScene]:
     """Return scenes whose steps are timed.
 
-    65,000 particles on 128^2 cells, and 500,000 on 64^3.
+    They have 65,000 particles on 128^2 cells, and 500,000 on 64^3.
     """
     flat = {"size": [1.28, 1.28], "resolution": 128, "friction": 0.577}
     deep = {"size": [0.64, 0.64, 0.64], "resolution": 64, "friction": 0.577}
@@ -155,7 +155,7 @@ def _methods(
 ) -> tuple[list[Record], dict[str, tuple[list[float], list[float]]]]:
     """Return each method's iterations and seconds from each state.
 
-    Also return the curves of the methods from the state in mid-flow.
+    The curves of the methods from the state in mid-flow are returned too.
     """
     records, curves = [], dict[str, tuple[list[float], list[float]]]()
     simulation = _simulation(collapse(size), options.device)

@@ -1,7 +1,7 @@
 """Cost of a solve against grid size, with its growth exponent.
 
-Set-up, iterations, seconds to three tolerances, bytes per cell. A second part measures the
-attainable accuracy: solves in each precision with a tolerance of 0 end at their floor.
+The figures are set-up, iterations, seconds to three tolerances, and bytes per cell. A second part
+measures the attainable accuracy: solves in each precision with a tolerance of 0 end at their floor.
 """
 
 from __future__ import annotations
@@ -216,7 +216,7 @@ def fitting(asked: Sequence[int], device: str) -> tuple[list[int], dict[int, str
 def exponent(unknowns: Sequence[float], seconds: Sequence[float]) -> float:
     """Return the growth exponent of seconds over unknowns.
 
-    By least squares of the logarithms.
+    The fit is by least squares of the logarithms.
     """
     return float(np.polyfit(np.log(unknowns), np.log(seconds), 1)[0])
 

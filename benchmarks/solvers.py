@@ -1,9 +1,7 @@
 """Linear and LCP solves of the splash: time, iterations and memory.
 
-In turns with PyAMG and SciPy in the same process.
-
-Every method of the library then solves a problem of each kind that [Book] appendix C compares
-methods on, made small.
+The solves take turns with those of PyAMG and SciPy in the same process. Then every method of the
+library solves a small problem of each kind on which [Book] appendix C compares methods.
 """
 
 from __future__ import annotations
@@ -114,8 +112,8 @@ def _measure_size(n: int, options: Options) -> tuple[list[Case], dict[str, list[
 def _cases(n: int, device: str) -> list[Case]:
     """Return the cases of a size.
 
-    Unit coefficients for ProjectedMultigrid and other methods; harder scenes for
-    ProjectedMultigrid.
+    ProjectedMultigrid and other methods run on unit coefficients. Only ProjectedMultigrid runs on
+    harder scenes.
     """
     scene, engine = splash(n), wl.ProjectedMultigrid()
     if n > LARGE:
@@ -271,7 +269,7 @@ def _book(
 ) -> tuple[list[Record], dict[str, dict[str, tuple[list[float], list[float]]]]]:
     """Solve each small problem by every applicable method.
 
-    Return records, and residuals over iterations by problem and method.
+    The result is records, and residuals over iterations by problem and method.
     """
     records, curves = list[Record](), dict[str, dict[str, tuple[list[float], list[float]]]]()
     for what, make in BOOK.items():

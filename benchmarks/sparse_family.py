@@ -78,7 +78,7 @@ def triangles(n: int, rng: np.random.Generator) -> SparseProblem:
 def convection(n: int, rng: np.random.Generator) -> SparseProblem:
     """Return convection-diffusion with rotating wind: an unsymmetric M-matrix.
 
-    Five points, upwind differences.
+    The stencil has five points and upwind differences.
     """
     plain = five_points(n, rng)
     m = round(n**0.5)
@@ -96,7 +96,7 @@ def convection(n: int, rng: np.random.Generator) -> SparseProblem:
 def elastic(n: int, rng: np.random.Generator) -> SparseProblem:
     """Return an elastic block, held at one side, that sinks onto a wavy ground.
 
-    Plane strain, bilinear elements.
+    The elements are bilinear, in plane strain.
     """
     m = round((n / 2) ** 0.5)
     g = 3**-0.5

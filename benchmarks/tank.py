@@ -55,7 +55,7 @@ MCADAMS = (
 class Tank:
     """Closed tank of liquid with a wavy surface, a sphere and a pillar.
 
-    Axes z, y, x; y is up.
+    The axes are z, y, x, and y is up.
 
     Args:
         n: cells along a side.
@@ -130,7 +130,7 @@ class Tank:
     def residuals(self, x: np.ndarray) -> tuple[float, float]:
         """Return the norms of the natural residual at x and at 0.
 
-        Computed by NumPy, without code of the solvers.
+        They are computed by NumPy, without code of the solvers.
         """
         squares = np.zeros(2)
         for first, last, parts in self._slabs():

@@ -1,6 +1,6 @@
 """Suite `threads`: kernels, cycles, solves and steps on 1, 2, ... threads.
 
-In turns, with a comparison of independent copies as the machine's own limit.
+Numbers of threads take turns. Independent copies on all cores show the machine's own limit.
 """
 
 from __future__ import annotations

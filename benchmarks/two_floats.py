@@ -1,7 +1,7 @@
 # mypy: ignore-errors
 """Residuals in pairs of float32: accuracy, and estimated time on an RTX 4090.
 
-`python -m benchmarks.two_floats`, in the source tree.
+Run `python -m benchmarks.two_floats` in the source tree.
 
 Consumer GPUs compute in float64 at 1/64 of the rate of float32. Here the natural residual of a
 splash at solutions by projected multigrid is evaluated on the CPU in genuine float32. x and b are
@@ -137,7 +137,7 @@ def check_pairs() -> None:
 def evaluation(way: str) -> tuple[wp.Kernel, type]:
     """Return a kernel that evaluates the natural residual, and its argument struct.
 
-    One thread per cell.
+    The kernel has one thread per cell.
     """
     how, real = WAYS[way]
     types = (

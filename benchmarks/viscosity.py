@@ -1,11 +1,11 @@
 """Cost of a viscous solve relative to a pressure solve of the same cells.
 
-`python -m benchmarks.viscosity [CELLS ...]`, in the source tree.
+Run `python -m benchmarks.viscosity [CELLS ...]` in the source tree.
 
-The tank is filled to three fifths; its surface is wavy and its velocity is a few smooth waves.
-Measured are the viscous step at several viscosities, and the pressure of that velocity, cold, with
-closed walls and with separating walls. All solve to 1e-4, in turns; the result is medians of CPU
-times.
+The tank is filled to three fifths; its surface is wavy and its velocity is a few smooth waves. The
+benchmark measures the viscous step at several viscosities, and the pressure of that velocity, cold,
+with closed walls and with separating walls. All solve to 1e-4, in turns; the results are medians of
+CPU times.
 """
 
 import sys

@@ -1,7 +1,7 @@
 """[Book] figures C.1 to C.4, tables C.1 and C.2.
 
-Sparsity patterns, convergence, final states, kinks of the Fischer map, and the factors lambda and
-omega.
+The experiments cover sparsity patterns, convergence, final states, kinks of the Fischer map, and
+the factors lambda and omega.
 """
 
 from __future__ import annotations
@@ -255,7 +255,7 @@ def _kinks(results: Results, problems: dict[str, list[Problem]], options: Option
 def _lambda(results: Results, problems: dict[str, list[Problem]], options: Options) -> None:
     """Vary lambda of the penalized Fischer map.
 
-    With the book's loop, and with the safeguards of this library.
+    The method runs with the book's loop, and with the safeguards of this library.
     """
     rows = list[list[str]]()
     solved, steps = (

@@ -1,6 +1,6 @@
 """[Book] figures 2.3, 2.10 and 2.12, on the scenes of figures 2.9 and 2.11.
 
-Sweep orders of PGS, subspace minimization and NNCG.
+The methods are sweep orders of PGS, subspace minimization and NNCG.
 """
 
 from __future__ import annotations

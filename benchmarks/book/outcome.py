@@ -23,7 +23,8 @@ DEEP = 1e-12  # tolerance of the solves, small enough to show the final converge
 class Merit(Enum):
     """Merit function that Num4LCP tests.
 
-    Half the squared norm of the Fischer-Burmeister map or of the minimum map, or the product x'|y|.
+    It is half the squared norm of the Fischer-Burmeister map or of the minimum map, or the product
+    x'|y|.
     """
 
     FISCHER = "Fischer"
@@ -52,9 +53,9 @@ class Trace:
     """Iterates of a solve: merits and natural residuals.
 
     Args:
-        merits: the merit of each iterate, the start's first.
-        residuals: the natural residual of each over the first one's.
-        status: how the solve ended.
+        merits: merit of each iterate, that of the start first.
+        residuals: natural residual of each iterate over that of the first.
+        status: end status of the solve.
     """
 
     merits: Sequence[float]
@@ -69,8 +70,8 @@ class Trace:
     def verdict(self, merit: Merit, limits: Limits) -> tuple[str, int, float]:
         """Return state, iterations and relative residual at Num4LCP's stopping point.
 
-        Sweeps are tested after each one; Newton methods before each step, whose first test is
-        iteration 1.
+        Sweeps are tested after each step. Newton methods are tested before each step, the first
+        time as iteration 1.
         """
         first = 1 if merit is Merit.PRODUCT else 0
         before = np.inf
@@ -165,8 +166,8 @@ class Outcome:
     def row(self) -> list[str]:
         """Return a table row: the book's verdicts, then problems solved to RTOL.
 
-        Columns: final states, iterations and largest residual by the book's tests; problems solved
-        to RTOL and their steps.
+        The columns are final states, iterations and largest residual by the book's tests, and then
+        the problems solved to RTOL and their steps.
         """
         worst = max(residual for _, _, residual in self.verdicts)
         return [

@@ -53,9 +53,9 @@ class Scale:
 def recipe(A: Any, rng: np.random.Generator, name: str) -> Problem:
     """Return the problem that Num4LCP's `make_lcp` makes of a matrix.
 
-    Its `solution` is the x that it plants, uniform in (0, 1) with a quarter set to 0, b = -A x
-    where x > 0 and 0 elsewhere. That x is no solution where (A x)_i < 0 at a zero: with an M-matrix
-    everywhere.
+    Its `solution` is the planted x, uniform in (0, 1) with a quarter set to 0. b is -A x where x >
+    0, and 0 elsewhere. The planted x is no solution where (A x)_i < 0 at a zero. With an M-matrix
+    that holds at every zero.
     """
     x = rng.random(A.shape[0])
     x[x < ZEROS] = 0
@@ -87,8 +87,8 @@ def contact_matrix(contacts: int, rng: np.random.Generator, tangents: int = 4) -
     Args:
         contacts: number of contacts, six unknowns each.
         rng: random numbers.
-        tangents: how many of a contact's tangents have the pattern: all 4 in Num4LCP's Matlab code,
-            3 in its Python code.
+        tangents: number of a contact's tangents with the pattern: all 4 in Num4LCP's Matlab
+            code, 3 in its Python code.
     """
     n = BLOCK * contacts
     R = rng.random((n, n))

@@ -1,6 +1,6 @@
 """[Book] figures C.5 and C.6, and problems with zero eigenvalues.
 
-Cost against size, warm starts, semi-definite problems.
+The studies are cost against size, warm starts and semi-definite problems.
 """
 
 from __future__ import annotations
@@ -142,7 +142,7 @@ def _timed(problem: wl.LCP, solver: Any, most: int, repeat: int) -> tuple[wl.Sol
 def exponent(sizes: np.ndarray, seconds: Sequence[float], least: int) -> float:
     """Return p of seconds = c sizes^p, a least-squares fit of the logarithms.
 
-    NaN if there are fewer than two sizes or a problem is unsolved.
+    The result is NaN if there are fewer than two sizes or a problem is unsolved.
     """
     kept = sizes >= least if (sizes >= least).sum() > 1 else sizes > 0
     if np.isnan(seconds).any() or kept.sum() < 2:

@@ -55,7 +55,7 @@ def cases(seed: int) -> Iterator[Case]:
     """Yield all cases, family by family.
 
     Args:
-        seed: first one of the random problems.
+        seed: first seed of the random problems.
 
     Raises:
         ValueError: two cases share a name.
@@ -177,8 +177,8 @@ def table(verdicts: Sequence[Verdict]) -> Table:
 
     A row has status, relative residual and seconds in each precision.
 
-    Noteworthy: a verdict is wrong, a solve stops before its tolerance, or it takes a second or
-    more. Random problems are listed only if a verdict is wrong.
+    A case is noteworthy if a verdict is wrong, a solve stops before its tolerance, or it takes a
+    second or more. Random problems are listed only if a verdict is wrong.
     """
     by_case = defaultdict[tuple[str, str], list[Verdict]](list)
     for v in (v for v in verdicts if v.wrong or v.case.family not in judging.FAMILIES):

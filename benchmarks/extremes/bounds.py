@@ -1,6 +1,7 @@
 """Hostile right-hand sides and bounds.
 
-Families: scales, degenerate solutions, all or no unknowns at a bound, tolerances below rounding.
+The families are scales, degenerate solutions, active sets of all or no unknowns, and tolerances
+below rounding.
 """
 
 from __future__ import annotations
@@ -74,7 +75,7 @@ def given_pool(
 def degenerate() -> Iterator[Case]:
     """Yield degenerate solutions, and active sets of all or no unknowns.
 
-    Degenerate: x_i = l_i and y_i = 0 on many cells.
+    A degenerate solution has x_i = l_i and y_i = 0 on many cells.
     """
     family = "active sets"
     case = partial(given_pool, family)

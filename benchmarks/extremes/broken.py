@@ -73,7 +73,7 @@ def sooner(
 ) -> wl.SolveResult:
     """Return an unconverged iterate and call it converged.
 
-    Either the start without a step, or the result for a tenth of the tolerance's digits.
+    The iterate is the start without a step, or the result for a tenth of the tolerance's digits.
     """
     weak = (
         replace(stopping, max_iterations=0) if start else replace(stopping, rtol=stopping.rtol**0.1)

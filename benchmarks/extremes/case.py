@@ -95,8 +95,8 @@ class Attempt:
     def spent(self) -> float:
         """Seconds that count against a budget.
 
-        CPU time where it is known, since other programs on the machine lengthen the wall time
-        alone.
+        The CPU time counts where it is known, since other programs on the machine lengthen the wall
+        time alone.
         """
         return min(self.seconds, self.processor)
 

@@ -1,11 +1,12 @@
 """Independent A x + b and natural residual of hostile problems, in float64.
 
-Everything is assembled without code of the library.
+Everything is assembled without code of the library. The natural residual is
 
-r_i = d_i (x_i - clip(x_i - y_i / d_i, l_i, u_i)) with d_i = 1 / (r_i c_i), diag(r) A diag(c)
-equilibrated: |A_ii| where no transversal of A has a larger product than the diagonal, else that of
-columns scaled to 1, then rows; 1 for empty rows and columns. Norms are scaled by their largest
-entry, so that squares neither overflow nor vanish.
+    r_i = d_i (x_i - clip(x_i - y_i / d_i, l_i, u_i)),   d_i = 1 / (s_i c_i),
+
+where diag(s) A diag(c) is equilibrated. d_i is |A_ii| if no transversal of A has a larger product
+than the diagonal; otherwise it is that of columns scaled to 1, then rows. d_i is 1 for empty rows
+and columns. Norms are scaled by their largest entry, so that squares neither overflow nor vanish.
 """
 
 from __future__ import annotations
@@ -133,15 +134,14 @@ def stencil(
 ) -> tuple[scipy.sparse.csr_array, np.ndarray]:
     """Return the matrix of the FLUID cells, and which cells these are, flat.
 
-    It is assembled face by face from the definition.
-
-    A face has the coefficient c, adds c to the diagonal of each FLUID cell beside it and -c between
-    two; SOLID on a side closes it, and so does the array's end unless the axis is periodic.
+    It is assembled face by face from the definition. A face with the coefficient c adds c to the
+    diagonal of each FLUID cell beside it, and -c between two of them. A SOLID cell on one side
+    closes the face. The end of the array closes it too, unless the axis is periodic.
 
     Args:
         cells: AIR, FLUID, SOLID, shape (nz, ny, nx) or (ny, nx).
         faces: `face_x`, `face_y`, `face_z`: numbers or arrays with one face more along their axis;
-            1 where there is none.
+            1 by default.
         shift: added to the diagonal, a number or shape of `cells`.
         periodic: whether x, y, z wrap around.
     """

@@ -1,7 +1,7 @@
 """Hostile matrices.
 
-Families: zero eigenvalues, empty rows, P-matrices on which Newton's method cycles, and matrices on
-which pivoting methods take 2^n steps.
+The families are zero eigenvalues, empty rows, P-matrices on which Newton's method cycles, and
+matrices on which pivoting methods take 2^n steps.
 """
 
 from __future__ import annotations

@@ -114,7 +114,7 @@ def independent(
 ) -> tuple[float | None, list[str]]:
     """Return the relative residual of the last pressure, and its faults.
 
-    Computed from the recorded arrays alone.
+    They are computed from the recorded arrays alone.
     """
     faces = {name: kept[name] for name in ("face_x", "face_y", "face_z") if name in kept}
     problem = GridProblem(
@@ -189,8 +189,8 @@ def made(kind: Material, **tables: Any) -> Callable[[str, str], ParticleSimulati
 def steps_and_forces() -> Iterator[Case]:
     """Yield extreme time steps, CFL numbers, gravity and speeds.
 
-    Time steps from 1e-9 to 10 s, CFL numbers from 0.01 to 50, gravity from 0 to 1e6 m/s^2, speeds
-    to 1e6 m/s.
+    Time steps are from 1e-9 to 10 s, CFL numbers from 0.01 to 50, gravity from 0 to 1e6 m/s^2,
+    speeds up to 1e6 m/s.
     """
     for kind in (liquid, sand):
 

@@ -119,7 +119,7 @@ def array_bytes() -> int:
 def resident_bytes(*, peak: bool = False) -> int:
     """Return the resident memory of the process, or its peak since `forget_peak`.
 
-    0 if the system does not report it.
+    The result is 0 if the system does not report it.
     """
     if not STATUS.exists():
         return 0

@@ -139,8 +139,8 @@ def timed(
     """Time every call of functions that callers look up in a module or a class.
 
     Args:
-        device: synchronized around each call.
-        functions: where each is looked up, by label.
+        device: device to synchronize around each call.
+        functions: module or class and name of each function, by label.
 
     Yields:
         Seconds of the calls so far, by label.

@@ -1,7 +1,7 @@
 """Command that solves and judges hostile inputs.
 
-`python -m warp_lcp.benchmarks.hostile --seed N --count N [--kinds ...] [--out DIR]`. Each kind has
-a worker process. If it dies or exceeds the CPU time limit, only one case is lost.
+Run `python -m warp_lcp.benchmarks.hostile --seed N --count N [--kinds ...] [--out DIR]`. Each kind
+has a worker process. If it dies or exceeds the CPU time limit, only one case is lost.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ class Answer:
         status: name of a `wl.SolveStatus`, or REFUSED (a ValueError) or EXCEPTION (any other).
         x: the solution, shape (n,).
         note: message of an exception, or further facts.
-        values: other arrays by name, as gradients.
+        values: other arrays by name, for example gradients.
     """
 
     status: str
@@ -58,13 +58,13 @@ class Box:
         upper: u, shape (n,).
         rtol: relative tolerance of the solve.
         solution: a solution known by construction.
-        unique: whether it is the only one.
-        solvable: whether a solution exists, by construction; None: an oracle is asked.
-        definite: A is symmetric positive semi-definite, by construction.
-        monotone: x'Ax >= 0 for all x, by construction; implied by `definite`.
-        grid: the problem was posed on a grid, where d_i = A_ii.
+        unique: whether that solution is the only one.
+        solvable: whether a solution exists, by construction; None if an oracle decides.
+        definite: whether A is symmetric positive semi-definite, by construction.
+        monotone: whether x'Ax >= 0 for all x, by construction; implied by `definite`.
+        grid: whether the problem was posed on a grid, where d_i = A_ii.
         storage: relative rounding of coefficients that the operator documents (float32 storage).
-        affine: bounds at x, where they are affine in x.
+        affine: function of x that returns the bounds, if they are affine in x.
         largest: a bound on |x| beyond which an answer is suspicious.
     """
 
@@ -128,10 +128,10 @@ class Case:
     """One solve, with the truth about its answer.
 
     Args:
-        name: what was drawn, in a line.
-        solve: makes the solve; what it raises is recorded.
-        truth: what is known of the answer.
-        method: the method named; None: the default.
+        name: description of the drawn case, in one line.
+        solve: function that solves; its exceptions are recorded.
+        truth: known facts of the answer.
+        method: name of the method; None for the default.
     """
 
     name: str
@@ -156,18 +156,18 @@ def box_case(
 ) -> Case:
     """Return a case that solves a box problem.
 
-    By the default method, a named method or another entry point.
+    The case solves it by the default method, a named method or another entry point.
 
     Args:
         rng: random numbers.
-        name: what was drawn.
+        name: description of the drawn case.
         box: the problem.
-        operator: makes A as it is given to the library; None: `box.A` itself.
-        shape: of the fields of a grid; then `unknowns` are the flat indices of FLUID cells.
-        unknowns: see `shape`.
+        operator: makes A in the form for the library; None for `box.A` itself.
+        shape: shape of the fields of a grid; None for matrices.
+        unknowns: flat indices of the FLUID cells of a grid.
         named: methods to draw from.
         share: probability that a method is named.
-        bounds: bounds as they are given to the library; None: those of the box.
+        bounds: bounds in the form for the library; None for those of the box.
         entries: whether other entry points may be drawn.
         x0: start, shape (n,).
     """

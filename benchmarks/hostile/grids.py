@@ -62,7 +62,7 @@ def _coefficients(
 def solid(rng: Rng) -> Case:
     """Draw a stencil with arrays beside SOLID, AIR and outer sides.
 
-    Compare its parts, or solve with it.
+    The case compares its parts, or solves with it.
     """
     cells, symmetric = _cells(rng), bool(rng.random() < 0.6)
     periodic = tuple(bool(p) for p in rng.random(3) < 0.15)
@@ -158,8 +158,8 @@ def solid(rng: Rng) -> Case:
 def periodic(rng: Rng) -> Case:
     """Draw periodic stencils and grids.
 
-    Singular stencils, compatible or not, unsymmetric dominant M-matrices, and grids with face
-    coefficients.
+    They are singular stencils, compatible or not, unsymmetric dominant M-matrices, and grids with
+    face coefficients.
     """
     kind = str(rng.choice(["singular", "dominant", "faces"], p=[0.45, 0.35, 0.2]))
     if kind == "faces":
@@ -322,7 +322,7 @@ def _faces(rng: Rng) -> Case:
 def gradients(rng: Rng) -> Case:
     """Draw a well-conditioned problem and a cotangent.
 
-    Compare `wl.vjp` with dense implicit differentiation.
+    The case compares `wl.vjp` with dense implicit differentiation.
     """
     kind = str(rng.choice(["dense", "sparse", "stencil", "stencil", "operator"]))
     if kind == "stencil":

@@ -1,6 +1,6 @@
 """Independent judgement of answers by NumPy, SciPy's HiGHS and Clarabel.
 
-In the caller's units. No solver of the library is used.
+The judgement is in the caller's units and uses no solver of the library.
 """
 
 from __future__ import annotations
@@ -77,7 +77,8 @@ def _values(truth: Values, answer: Answer) -> Verdicts:
 def scales(box: Box) -> np.ndarray:
     """Return d of the natural residual.
 
-    A_ii for positive semi-definite A and grids, otherwise by Ruiz's equilibration.
+    It is A_ii for positive semi-definite A and grids, and otherwise follows from Ruiz's
+    equilibration.
     """
     diagonal = np.asarray(box.A.diagonal(), dtype=float)
     if (box.grid or box.definite) and (diagonal > 0).all():

@@ -1,6 +1,6 @@
 """Kinds 1, 6, 7, 8, 10, 11 and 13 of the hostile benchmark.
 
-Matrices, contacts and user-defined operators.
+These kinds are matrices, contacts and user-defined operators.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def rows(rng: Rng) -> Case:
 def singular(rng: Rng) -> Case:
     """Draw a singular system or LCP: compatible up to rounding, or incompatible.
 
-    Incompatible by a margin.
+    An incompatible one is incompatible by a margin.
     """
     n = draw.size(rng, 2, 800)
     kind = str(
@@ -244,7 +244,7 @@ def sign(rng: Rng) -> Case:
 def friction(rng: Rng) -> Case:
     """Draw contacts with friction.
 
-    Scenes of the gallery as boxes, random boxes, and pyramids as LCPs.
+    They are scenes of the gallery as boxes, random boxes, and pyramids as LCPs.
     """
     from warp_lcp.gallery.contact_models import BoxedModel, StewartTrinkleModel
     from warp_lcp.gallery.contact_scenes import SCENES
@@ -341,7 +341,7 @@ def _side(side: Any, x: np.ndarray) -> np.ndarray:
 def malformed(rng: Rng) -> Case:
     """Draw malformed sparse matrices, singular blocks, or unusual but valid types.
 
-    Malformed: the arrays contradict each other.
+    In a malformed matrix the arrays contradict each other.
     """
     n = draw.size(rng, 3, 600)
     M = (sp.random_array((n, n), density=min(1.0, 5 / n), rng=rng) + 10 * sp.eye_array(n)).tocsr()
@@ -459,7 +459,7 @@ def _form(M: Any, form: str) -> Any:
 def _singular_block(rng: Rng, n: int) -> Case:
     """Draw a matrix with exactly singular blocks, and a planted solution.
 
-    Equal rows, empty rows or columns, zero diagonals.
+    The blocks have equal rows, empty rows or columns, or zero diagonals.
     """
     symmetric = rng.random() < 0.5
     M = sp.random_array((n, n), density=min(1.0, 3 / n), rng=rng).tocsr()
@@ -487,7 +487,7 @@ def _singular_block(rng: Rng, n: int) -> Case:
 def odd(rng: Rng) -> Case:
     """Draw further inputs of users.
 
-    Buffers, functions, empty rows, stacks of masses, cycles, SciPy's lists of pairs.
+    They are buffers, functions, empty rows, stacks of masses, cycles and SciPy's lists of pairs.
     """
     way = str(
         rng.choice(["buffer", "operator", "empty row", "stack", "cycle", "pairs", "read-only"])

@@ -1,6 +1,6 @@
 """Kinds 2, 3 and 9 of the hostile benchmark: quadratic programs, low rank.
 
-Also bounds with infinity written as a number.
+There are also bounds with infinity written as a number.
 """
 
 from __future__ import annotations
@@ -186,7 +186,8 @@ def solve_program(problem: Any) -> Answer:
 def low_rank(rng: Rng) -> Case:
     """Draw a box problem of low rank.
 
-    A factored matrix, a support vector machine, a ridge, a portfolio, a game or a linear program.
+    It is a factored matrix, a support vector machine, a ridge, a portfolio, a game or a linear
+    program.
     """
     kind = str(
         rng.choice(

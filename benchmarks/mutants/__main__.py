@@ -1,6 +1,6 @@
 """Draw mutants, run the tests of each and report the survivors.
 
-`python -m warp_lcp.benchmarks.mutants --count 50 --seed 7`.
+Run `python -m warp_lcp.benchmarks.mutants --count 50 --seed 7`.
 """
 
 from __future__ import annotations
@@ -94,12 +94,11 @@ def tests(arguments: list[str], *, brief: bool = False) -> tuple[str, str, float
     """Run pytest on this worker's tree in a process of its own.
 
     Args:
-        arguments: for pytest.
+        arguments: arguments of pytest.
         brief: whether to run each test with one of its parameters.
 
     Returns:
-        "passed", "failed", "crashed" or "timeout", the end of what it printed, and its processor
-        time [s].
+        "passed", "failed", "crashed" or "timeout", the end of its output, and its CPU time [s].
     """
     log, limit = TREE / "mutant.log", int(SECONDS * len(arguments) + HANGS)
     child = os.fork()

@@ -1,7 +1,7 @@
 """Mutation operators.
 
-Operators of cosmic-ray that leave plausible code, omitted calls, operators in C++ headers, and
-formulas.
+They are operators of cosmic-ray that leave plausible code, omitted calls, changed operators in C++
+headers, and changed formulas.
 """
 
 from __future__ import annotations
@@ -151,9 +151,9 @@ def draw(root: Path, count: int, seed: int) -> list[Mutant]:
     Each has an operator that applies at its line or near it.
 
     Args:
-        root: folder of the packages.
-        count: how many.
-        seed: of the first line and of the operators.
+        root: folder that contains the packages.
+        count: number of mutants.
+        seed: seed of the first line and of the operators.
     """
     rng = random.Random(seed)
     files = sorted(

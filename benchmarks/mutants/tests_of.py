@@ -1,6 +1,7 @@
 """Choice of the tests for a change of a module.
 
-First the tests that bear its name, then those that name its definitions, then those of its users.
+First come the tests that bear its name, then those that name its definitions, then those of its
+users.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The dam by PETSc's SNESVI; `dam.py` runs this program.
 
-Grid sequencing on doubled grids, Newton steps on the free set, geometric multigrid.
+It uses grid sequencing on doubled grids, Newton steps on the free set, and geometric multigrid.
 """
 
 import gc
@@ -19,7 +19,7 @@ from petsc4py import PETSc  # noqa: E402
 def problem(nx, ny, width, high, low):
     """Return matrix and right-hand side of the dam, A w = c.
 
-    By rows, border nodes included, for -Laplace w + 1 >= 0 times hx hy.
+    Rows include border nodes. The problem is -Laplace w + 1 >= 0 times hx hy.
     """
     x, y = np.linspace(0, width, nx), np.linspace(0, high, ny)
     w = np.zeros((ny, nx))

@@ -1,6 +1,6 @@
 """Peers in this process, on the assembled matrix.
 
-Solvers of A x = -b, and of quadratic programs, x'A x / 2 + b'x over x >= lower.
+They are solvers of A x = -b, and of quadratic programs, x'A x / 2 + b'x over x >= lower.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def amgcl(question: Question, tolerance: float) -> Answer:
 def warp_cg(question: Question, tolerance: float, *, device: str) -> Answer:
     """Solve by Warp's conjugate gradients with a diagonal preconditioner.
 
-    On a Warp BSR matrix in float64.
+    The matrix is a Warp BSR matrix in float64.
     """
     import warp as wp
     import warp.optim.linear
@@ -162,7 +162,7 @@ def piqp(question: Question, tolerance: float) -> Answer:
 def clarabel(question: Question, tolerance: float) -> Answer:
     """Solve by Clarabel: an interior-point method on a homogeneous embedding.
 
-    With sparse factorizations.
+    Its factorizations are sparse.
     """
     import clarabel as library
 

@@ -88,14 +88,14 @@ class Peer:
     """Another solver of the same problem.
 
     Args:
-        name: what tables call it.
-        library: distribution it is of.
-        solve: solves to its own idea of a tolerance; the harness tightens that until
-            `Question.residual` agrees.
-        bounds: which problems it solves.
-        most: cells a side beyond which it is not asked.
-        settings: what was set.
-        precision: of its vectors.
+        name: name in tables.
+        library: name of its distribution.
+        solve: solves to the peer's own tolerance; the harness tightens it until
+            `Question.residual` is small enough.
+        bounds: kinds of bounds that it solves.
+        most: most cells along a side that are measured.
+        settings: non-default settings.
+        precision: precision of its vectors.
     """
 
     name: str

@@ -79,7 +79,7 @@ def missing() -> str:
 def environment() -> dict[str, str]:
     """Return the environment of PETSc's interpreter.
 
-    One thread, and Debian's PETSc if PETSC_DIR names none.
+    It sets one thread, and Debian's PETSc if PETSC_DIR names none.
     """
     found = sorted(glob.glob(DEBIAN_PETSC))
     return {
@@ -95,7 +95,7 @@ def peers(folder: Path) -> Iterator[tuple[list[Peer], str]]:
     """Start PETSc if it is installed; yield its peers and its version.
 
     Args:
-        folder: of the files of the exchange.
+        folder: folder for the exchanged files.
     """
     python = interpreter()
     if python is None:
@@ -120,14 +120,14 @@ class Worker:
     """Running process of a peer.
 
     Args:
-        name: of the peer.
-        command: that starts it: an interpreter and a script that serves, see `petsc_worker`.
+        name: name of the peer.
+        command: interpreter and script of the peer, see `petsc_worker`.
 
     Attributes:
-        version: of the peer.
+        version: version of the peer.
 
     Raises:
-        PeerFailed: it does not start.
+        PeerFailed: the peer does not start.
     """
 
     def __init__(self, name: str, command: Sequence[str]) -> None:
@@ -145,7 +145,7 @@ class Worker:
         """Return the answer to a request.
 
         Raises:
-            PeerFailed: it says that it failed, or it has ended.
+            PeerFailed: the peer reports a failure, or has ended.
         """
         assert self.process.stdin is not None
         try:
@@ -186,7 +186,7 @@ def asked(
     The problem's file of a scene is written at its first question.
 
     Raises:
-        PeerFailed: it gave no answer.
+        PeerFailed: the peer gives no answer.
     """
     path, answer, A = folder / f"{question.scene.n}.npz", folder / "x.npy", question.matrix
     if not path.exists():

@@ -1,8 +1,8 @@
 """PETSc's multigrid CG and its active-set solver, for PETSc's own interpreter.
 
 The matrix is converted and the transfers of the geometric hierarchy are built before the clock
-starts: neither is PETSc's work. A line of JSON asks, a line of JSON answers; arrays travel in .npz
-files. It imports nothing of this project.
+starts, since neither is PETSc's work. A request is a line of JSON, and so is an answer; arrays are
+exchanged in .npz files. The program imports nothing of this project.
 """
 
 from __future__ import annotations
@@ -183,7 +183,7 @@ class ReducedMultigrid:
 def inequality(request: Request) -> Reply:
     """Solve the LCP by SNESVI's reduced-space active-set Newton method with CG.
 
-    With geometric multigrid if no options are given.
+    It uses geometric multigrid if no options are given.
     """
     problem = problem_of(request["problem"])
     lower = problem.lower[request["bounds"]]
@@ -254,10 +254,10 @@ def serve(
     The first line that is sent is the peer's version.
 
     Args:
-        version: of the peer.
-        methods: what can be asked for, by the request's `method`.
-        failures: what methods raise where they fail; the answer is then {"error": text}. Anything
-            else ends the program.
+        version: version of the peer.
+        methods: functions by the `method` of a request.
+        failures: exceptions of failed methods; the answer is then {"error": text}. Other
+            exceptions end the program.
     """
     replies = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
     # Output of the peer must not mix with the answers.

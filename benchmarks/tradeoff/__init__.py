@@ -1,6 +1,6 @@
 """Suite `tradeoff`: cost of accuracy.
 
-Seconds, iterations and bytes against residuals, errors and the visible results of a run.
+It compares seconds, iterations and bytes with residuals, errors and the visible results of a run.
 """
 
 from __future__ import annotations

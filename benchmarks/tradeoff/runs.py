@@ -38,9 +38,9 @@ class Runs:
 
     Args:
         name: the scene's name or file.
-        resolution: cells along its longest side, what settings scale.
-        frames: of a run.
-        options: device and repeats.
+        resolution: cells along its longest side; settings scale it.
+        frames: number of frames of a run.
+        options: device and number of repeats.
     """
 
     def __init__(self, name: str, resolution: int, frames: int, options: Options) -> None:
@@ -146,7 +146,7 @@ class Runs:
 def front_of(points: Sequence[tuple[float, float]]) -> list[int]:
     """Return the Pareto front: points that no other one beats in both coordinates.
 
-    By increasing first coordinate.
+    They are in order of the first coordinate.
     """
     best, found = float("inf"), []
     for index in sorted(range(len(points)), key=lambda i: points[i]):

@@ -40,7 +40,7 @@ def settings_of(simulator: str) -> list[Setting]:
     """Return the settings to measure.
 
     Raises:
-        ValueError: there are none for the simulator.
+        ValueError: the simulator has no settings here.
     """
     lists: dict[str, Callable[[], Iterator[Setting]]] = {"fluids": _liquid, "granular": _sand}
     if simulator not in lists:

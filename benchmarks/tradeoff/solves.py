@@ -187,7 +187,7 @@ class Pressures(Probe):
     They are solved from the initial guess of the run.
 
     Raises:
-        ValueError: the scene's simulator shows none.
+        ValueError: the scene's simulator does not record pressure problems.
     """
 
     kind, warm, tolerances = "solve", 1, (1e-1, 1e-2, 1e-3, 1e-4, 1e-6, 1e-8)

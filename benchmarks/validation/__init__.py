@@ -85,7 +85,7 @@ def measure(options: Options, out: Path) -> Results:
 def summary(trials: Mapping[str, Sequence[Trial]]) -> Table:
     """Return a row for each check.
 
-    Columns: figures within their bounds, and controls that fail theirs.
+    The columns are figures within their bounds, and controls that fail theirs.
     """
     rows, sums = list[list[str]](), np.zeros(4, dtype=int)
     for name, own in trials.items():

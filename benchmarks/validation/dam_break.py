@@ -145,8 +145,8 @@ def slope(time: np.ndarray, place: np.ndarray) -> float:
 def plate_friction() -> float:
     """Return the friction coefficient c_f of a smooth plate, 0.074 Re^(-1/5).
 
-    By Prandtl's law for turbulent flow, for a plate of length 10 a at the speed of the experiment's
-    front.
+    Prandtl's law for turbulent flow is used, for a plate of length 10 a at the speed of the
+    experiment's front.
     """
     speed = slope(FAR_T, FAR_Z) * math.sqrt(N2 * GRAVITY * A)
     return 0.074 * (speed * 10.0 * A / VISCOSITY) ** -0.2

@@ -19,12 +19,11 @@ class Step:
     """Energies [J; J/m in 2-D] of a step.
 
     Attributes:
-        before: kinetic and potential energy at its start, bodies included.
-        after: at its end.
-        given: what came in from outside: with particles that sources add and outlets remove, by
-            walls that the scene moves, and where an endless axis takes particles back to its
-            beginning.
-        displaced: what the density correction's displacements lifted; part of `after`.
+        before: kinetic and potential energy at its begin, bodies included.
+        after: the same at its end.
+        given: energy from outside: of particles that sources add and outlets remove, of walls
+            that the scene moves, and of particles that pass a periodic side.
+        displaced: potential energy added by the density correction; part of `after`.
     """
 
     before: float
@@ -48,7 +47,7 @@ class Ledger:
     spray that they hit is not in `given`.
 
     Args:
-        simulation: of particles; a ledger stays with it, as it watches its parts.
+        simulation: particle simulation; it stays wrapped, since its parts are observed.
     """
 
     def __init__(self, simulation: Any) -> None:
@@ -118,8 +117,8 @@ class Ledger:
         """Reset the simulation to a state.
 
         Args:
-            state: of the simulation.
-            energy: that `now` was then.
+            state: state of the simulation.
+            energy: value of `now` at that state.
         """
         self.simulation.restore(state)
         self._dt, self.now = self.simulation.last_dt, energy
@@ -248,8 +247,8 @@ class Ledger:
 def wall_outflow(simulation: Any) -> np.ndarray:
     """Return the outflow of each cell [m/s] into moving walls and sources.
 
-    In the stored shape; bodies do not count. On a face of the open fraction a_f it is s_f (1 - a_f)
-    u_s,f, s_f = +-1 outward. A source's cells are SOLID and their faces closed.
+    It is in the stored shape, and bodies do not count. On a face of the open fraction a_f it is s_f
+    (1 - a_f) u_s,f, s_f = +-1 outward. A source's cells are SOLID and their faces closed.
     """
     boundary, kind = simulation.boundary, simulation.projection.kind.numpy()
     bodies = simulation.bodies.numbers if simulation.bodies is not None else []

@@ -156,8 +156,8 @@ def check_at(check: str, resolution: str) -> Callable[[Callable[..., None]], Cal
     """Make a function that adds findings into one that returns a trial.
 
     Args:
-        check: its name.
-        resolution: in words, with the function's arguments in braces.
+        check: name of the check.
+        resolution: resolution as text, with the function's arguments in braces.
     """
 
     def decorated(run: Callable[..., None]) -> Callable[..., Trial]:
@@ -180,9 +180,9 @@ def attempt(check: str, resolution: str, run: Callable[[Findings], None]) -> Tri
     """Run a check; a simulation that ends early fails the check, not the suite.
 
     Args:
-        check: its name.
-        resolution: in words.
-        run: adds findings to what it is given.
+        check: name of the check.
+        resolution: resolution as text.
+        run: function that adds findings to its argument.
     """
     found, begun, error = Findings(), time.perf_counter(), ""
     try:
@@ -241,10 +241,10 @@ def curves_of(
     """Return the curves of trials by resolution and label.
 
     Args:
-        trials: whose curves.
-        labels: what a label begins with; any without.
-        check: whose trials only.
-        but: the label that is left out.
+        trials: trials of the curves.
+        labels: beginnings of the labels; all labels by default.
+        check: only trials of this check.
+        but: label that is left out.
     """
     chosen = [t for t in trials if check in ("", t.check)]
     return {

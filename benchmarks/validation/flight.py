@@ -72,13 +72,13 @@ def thrown(found: Findings, cells: int) -> None:
 def off_its_parabola(what: str, cells: int, cfl: float, *, whole_kicks: bool = False) -> float:
     """Return the distance of a center of mass from its parabola, over its way.
 
-    After `DURATION`.
+    The distance is taken after `DURATION`.
 
     Args:
         what: a key of `THROWN`.
-        cells: along the domain.
+        cells: cells along the domain.
         cfl: the Courant number.
-        whole_kicks: let gravity act for the whole step that it moves things by, as symplectic Euler
+        whole_kicks: let gravity act for the whole step before the motion, as symplectic Euler
             does.
     """
     simulation = THROWN[what](cells, time={"duration": 100.0, "cfl": cfl, "dt_max": 1.0})
@@ -134,11 +134,11 @@ def drop(
     """Return a spinning drop in a room of two meters, far from its walls.
 
     Args:
-        n: cells a meter.
-        transfer: of particles and grid.
-        thrown: give it the velocity LAUNCH and let gravity act.
+        n: cells per meter.
+        transfer: transfer between particles and grid.
+        thrown: whether it has the velocity LAUNCH and gravity acts.
         cfl: Courant number.
-        keeps: whether bodies in flight keep their momenta; False: the control.
+        keeps: whether airborne material conserves its momenta; False for the control.
     """
     tables: Row = {
         "particles": {"transfer": transfer},
@@ -162,7 +162,7 @@ def drop(
 def turning(simulation: LiquidSimulation) -> float:
     """Return the angular momentum about the center of mass [m^2/s].
 
-    Of unit masses; that of the affine part is included.
+    The masses are 1; the part of the affine velocities is included.
     """
     particles = simulation.particles
     x, v = positions(simulation), particles.velocity.numpy().astype(np.float64)

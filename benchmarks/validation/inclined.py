@@ -1,20 +1,19 @@
 """Sand on slopes: periodic layers, and blocks and hoppers on inclined walls.
 
-The walls are inclined to the grid.
+The walls are inclined to the grid. A layer rests, or runs with the acceleration of gravity less
+that of friction.
 
-A layer rests, or runs with the acceleration that friction leaves of gravity's.
+On a rough floor the friction is the sand's own, k = tan(friction angle) times the normal load. On a
+smooth floor stiff sand slides with the friction of the wall. Above the friction angle running sand
+keeps running. Sand that has settled rests up to the angle whose sine is k, because it has pushed
+against itself along the slope. Checks of running sand therefore start with a velocity. A rough
+floor bears the stress of sand in simple shear, k times the load: a running layer slides on it, and
+its lowest row is as fast as the others.
 
-On a rough floor the friction is the sand's own, k = tan(friction angle) of the normal load; stiff
-sand slides on a smooth one with the wall's. Above the friction angle sand that runs goes on
-running; sand that has settled holds up to the angle whose sine is k, because it has pushed against
-itself along the slope. So the checks of running sand start it moving. A rough floor bears what sand
-beside it bears in simple shear, k times the load: a layer that runs slides on it, the lowest row as
-fast as the others.
-
-Where friction grows with the rate of shear, mu(I) [Jop, Forterre & Pouliquen 2006], a layer runs at
-a steady speed. Pressure and shear stress grow with the depth alike, so that I is the same
-everywhere, mu(I) = tan(slope). |Rate of shear| = I sqrt(p / rho_s) / d with p = rho g (H - y)
-cos(slope), rho = max_fraction rho_s, then integrates to Bagnold's profile, u = 2/3 I / d
+Where friction grows with the rate of shear, mu(I) [Jop, Forterre & Pouliquen 2006], a layer reaches
+a steady speed. Pressure and shear stress grow equally with the depth, so that I is the same
+everywhere: mu(I) = tan(slope). The rate of shear is I sqrt(p / rho_s) / d with p = rho g (H - y)
+cos(slope) and rho = max_fraction rho_s. Its integral is Bagnold's profile, u = 2/3 I / d
 sqrt(max_fraction g cos(slope)) (H^1.5 - (H - y)^1.5).
 """
 
@@ -189,7 +188,7 @@ def accelerates(angle: float) -> float:
 def runs(cells: int, angle: float, *, speed: float = START, **tables: Any) -> float:
     """Return the acceleration of running sand on a slope [m/s^2].
 
-    Measured in the second half of the run; the slope is in degrees.
+    It is measured in the second half of the run; the slope is in degrees.
     """
     simulation = _create(cells, angle, speed, **tables)
     time, mean = _watch(simulation, cells, RUNS)
@@ -200,7 +199,7 @@ def runs(cells: int, angle: float, *, speed: float = START, **tables: Any) -> fl
 def rests(cells: int, angle: float, **tables: Any) -> tuple[float, float]:
     """Return the acceleration [g] of sand that settled level and is then tilted.
 
-    In all of RESTS, and in its second half; the slope is in degrees.
+    The results are over all of RESTS, and over its second half; the slope is in degrees.
     """
     simulation = _create(cells, 0.0, 0.0, **tables)
     _watch(simulation, cells, SETTLES)
@@ -242,7 +241,7 @@ def _watch(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Step for a time; return times [s] and mean velocities along the slope [m/s].
 
-    One entry for each step.
+    There is one entry for each step.
     """
     dt = DT * RESOLUTIONS[0] / cells
     mean = []
@@ -340,11 +339,11 @@ def acceleration(
     """Return the acceleration of a stiff block down a plane [m/s^2].
 
     Args:
-        angle: of the plane [degrees].
-        friction: of the plane.
-        cells: of the block's height.
-        whole: solids are whole cells for the stresses.
-        shift: of the plane [cells].
+        angle: slope of the plane [degrees].
+        friction: friction of the plane.
+        cells: cells of the block's height.
+        whole: whether solids are whole cells for the stresses.
+        shift: shift of the plane in the grid [cells].
     """
     t, dx = math.radians(angle), BLOCK_HEIGHT / cells
     down, up = np.array([math.cos(t), -math.sin(t)]), np.array([math.sin(t), math.cos(t)])
@@ -367,9 +366,9 @@ def discharge(shift: float, cells: int, *, whole: bool = False) -> list[float]:
     """Return the discharge rates of a hopper in parts of the time, over sqrt(g D^3).
 
     Args:
-        shift: of the hopper [cells].
-        cells: of its width.
-        whole: solids are whole cells for the stresses.
+        shift: shift of the hopper in the grid [cells].
+        cells: cells of its width.
+        whole: whether solids are whole cells for the stresses.
     """
     dx, t, parts = WIDTH / cells, math.radians(STEEP), np.linspace(FROM, TO, PARTS + 1)
     middle, foot = 0.5 * WIDTH + shift * dx, 0.2 + 0.61 * shift * dx

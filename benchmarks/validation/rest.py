@@ -199,7 +199,7 @@ def _bias(
 ) -> tuple[float, tuple[np.ndarray, np.ndarray]]:
     """Return the mean of p - rho g (h - y), and the mean pressures of the rows.
 
-    Cells count that lie a cell or more below the surface.
+    Only cells count that lie a cell or more below the surface.
     """
     y = (np.arange(len(pressure)) + 0.5) * dx
     wet = pressure > 0.0

@@ -102,10 +102,10 @@ def runouts(
     The controls have half of the friction, and the largest friction of a cone.
 
     Args:
-        found: takes the figures.
-        cells: of a column's width.
-        aspects: height over width; those of the check without any.
-        controls: run the negative controls too.
+        found: collector of the figures.
+        cells: cells of a column's width.
+        aspects: ratios of height to width; those of the check by default.
+        controls: whether the negative controls run too.
     """
     chosen, ways = aspects or CASES[cells], []
     for aspect in chosen:
@@ -149,9 +149,9 @@ def collapse(aspect: float, cells: int, *, length: float = 0.0, **tables: Any) -
 
     Args:
         aspect: height over width.
-        cells: of the width.
-        length: of the domain [widths]; by the experiments without one.
-        tables: of the scene.
+        cells: cells of the width.
+        length: length of the domain [widths]; by default from the experiments.
+        tables: further tables of the scene.
     """
     more = {"solver": {"max_iterations": MOST}} if aspect * cells >= HIGH else {}
     simulation = column(
@@ -421,7 +421,7 @@ def resting(found: Findings, cells: int, watches: int = WATCHES) -> None:
 def rest(cells: int, watches: int, **tables: Any) -> list[tuple[float, float]]:
     """Return the drift of all and of the inside of a pile, in each observation.
 
-    In heights / s.
+    Drifts are in heights / s.
     """
     simulation = column(ASPECT, cells, length=LENGTH, **tables)
     for _ in steps(simulation, STOPPED * FALL + AFTER):

@@ -1,9 +1,9 @@
 """Heaps of slowly poured sand: slope, shape and rest; rest of flatter wedges.
 
-In sand whose yield set has the slope k a layer that runs stops at atan k: what slides along a slope
-shears alone, under equal normal stresses. Sand that rests has pushed against itself along the
-slope, and so holds up to asin k: by 1, 5 and 17 degrees more at 20, 30 and 40. A heap lies between,
-and the check says by how much it is off the angle at which layers stop.
+If the slope of the yield set is k, a running layer stops at atan k: a layer that slides along a
+slope is in simple shear, with equal normal stresses. Resting sand has pushed against itself along
+the slope, and so rests up to asin k: by 1, 5 and 17 degrees more at 20, 30 and 40. The slope of a
+heap lies between the two. The check measures its difference from the angle at which layers stop.
 """
 
 from __future__ import annotations
@@ -94,10 +94,10 @@ def pour(cells: int, angle: float, *, lasts: float = LASTS, **tables: Any) -> He
     """Pour a heap and observe it.
 
     Args:
-        cells: of the domain's length.
-        angle: at which a layer stops [degrees].
-        lasts: how long after the pouring the last look is [s].
-        tables: of the scene.
+        cells: cells of the domain's length.
+        angle: slope at which a layer stops [degrees].
+        lasts: time from the end of the pouring to the last observation [s].
+        tables: further tables of the scene.
     """
     middle, stop = 0.5 * LENGTH, AREA / (SPEED * MOUTH)
     seed = box([middle - 0.5 * SEED_WIDTH, 0.0], [middle + 0.5 * SEED_WIDTH, SEED_HEIGHT])
@@ -174,7 +174,8 @@ def dome(across: np.ndarray) -> np.ndarray:
 def fit(line: Outline, shape: Callable[[np.ndarray], np.ndarray]) -> tuple[float, float, float]:
     """Return angle [degrees], error [m], height [m] of a shape fitted to an outline.
 
-    By least squares over all columns, so that the density of single columns has little effect.
+    The fit is by least squares over all columns, so that the density of single columns has little
+    effect.
     """
     x, y = line
     middle = float(np.average(x, weights=y))

@@ -1,10 +1,8 @@
 """Discharge of sand through a slot: constant in time, and its law of the width.
 
 The rate does not depend on the fill and grows as (D - delta)^(3/2) with the slot D. The discharge
-of a liquid falls with the square root of its height.
-
-The bin's floor is rough: its friction is the sand's own. delta is a property of grains, which a
-continuum has not: it is near 0.
+of a liquid falls with the square root of its height. The bin's floor is rough: its friction is the
+sand's own. delta is a property of grains; in a continuum it is near 0.
 """
 
 from __future__ import annotations
@@ -179,7 +177,7 @@ def _bin(
 ) -> tuple[list[float], list[dict[str, Any]], dict[str, Any], dict[str, Any]]:
     """Return the scene of a bin.
 
-    The size of the domain, the halves of the floor, the fill, and a drain below.
+    It has the size of the domain, the halves of the floor, the fill, and a drain below.
     """
     top = BELOW + PLATE * SPACING
     size = [WIDTH, top + depth + 4.0 * SPACING]

@@ -1,14 +1,14 @@
 """Sand at rest between walls: Janssen's law of the load on the ground.
 
-Deep sand rests on the walls:
+The walls bear the weight of deep sand. The vertical stress at the depth z is
 
     sigma(z) / (rho g W) = (1 - exp(-c mu K z / W)) / (c mu K),
 
-c = 2 between two walls, 4 in a square of four [Janssen 1895]. K, how much of the vertical stress
-presses on the walls, lies between 1/3, where sand of a sine of 1/2 gives way sideways, and 1:
-bounds are a tenth beyond either. The vertical stress is the pressure less the deviator's part,
-averaged over a cross-section; depth is the mass above it over rho W, which holds wherever the
-surface may be.
+with c = 2 between two walls, and 4 in a square of four [Janssen 1895]. K is the ratio of the stress
+on the walls to the vertical stress. It lies between 1/3, where sand of a sine of 1/2 yields
+sideways, and 1; the bounds of the check are a tenth beyond either. The vertical stress is the
+pressure less the deviator's part, averaged over a cross-section. The depth is the mass above it
+over rho W, which does not depend on the surface.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class Silo(NamedTuple):
 def janssen(depth: float, friction: float, ratio: float, walls: int = 2) -> float:
     """Return Janssen's vertical stress [rho g W] at a depth [widths].
 
-    For K = ratio, between `walls` walls.
+    K is `ratio`, and the number of walls is `walls`.
     """
     rate = walls * friction * ratio
     return depth if rate == 0.0 else (1.0 - math.exp(-rate * depth)) / rate
@@ -76,7 +76,7 @@ def trial(
 ) -> None:
     """Compare the loads of a silo with Janssen's law.
 
-    As it is, with short steps, under a lid, and between walls without friction.
+    The silo runs as it is, with short steps, under a lid, and between walls without friction.
     """
     more: dict[str, Any] = {"deep": deep or DEEP[dimension], "square": dimension == 3}
     depths = range(1, math.ceil(more["deep"]))
@@ -128,7 +128,8 @@ def slot(found: Findings, cells: int) -> None:
 def controls(found: Findings, cells: int) -> None:
     """Run the negative controls, which must all miss the law.
 
-    Sand pushed up, which reverses the walls' friction, and former rules of packing and warm starts.
+    The controls are sand pushed up, which reverses the walls' friction, and former rules of packing
+    and warm starts.
     """
     depths = range(1, 6)
     plain = rest(fill(cells, 0.5))
@@ -212,14 +213,14 @@ def fill(
     """Return a filled silo at rest.
 
     Args:
-        cells: of its width.
-        friction: of its walls.
+        cells: cells of its width.
+        friction: friction of its walls.
         deep: height of the sand [widths].
-        deeper: cells along z; 1: two dimensions.
-        lid: what lies on the sand [rho g W].
-        square: whether z has walls as x has; else it has no end.
+        deeper: cells along z; 1 in 2-D.
+        lid: load of a lid on the sand [rho g W].
+        square: whether z has walls as x has; otherwise z is periodic.
         rise: speed of the floor [m/s], in 2-D.
-        tables: of the scene.
+        tables: further tables of the scene.
     """
     dx, high = WIDTH / cells, round(deep * cells)
     more = [cells * dx] if square else [deeper * dx] if deeper > 1 else []
@@ -255,9 +256,9 @@ def rest(
     """Let sand rest and measure the loads.
 
     Args:
-        simulation: of `fill`.
-        duration: [s].
-        tiny: length of a short step after `PERIOD` others [s]; 0: there are none.
+        simulation: a simulation of `fill`.
+        duration: simulated time [s].
+        tiny: length of a short step after `PERIOD` others [s]; 0 for none.
         each: called before each step with its length [s].
     """
     heights: list[Any] = []

@@ -64,12 +64,12 @@ def create_liquid(
     """Return a simulation of a liquid.
 
     Args:
-        numerics: of solids and surface.
-        size: of the domain [m].
+        numerics: representation of solids and surface.
+        size: size of the domain [m].
         resolution: cells along its longest side.
-        liquid: shapes.
-        folder: where the files are that shapes name.
-        tables: of the scene; `wall` and `cfl` are short for domain.wall and time.cfl.
+        liquid: tables of its shapes.
+        folder: folder of the files that shapes name.
+        tables: further tables; `wall` and `cfl` are short for domain.wall and time.cfl.
     """
     data: Row = {
         "scene": {"simulator": "fluids"},
@@ -121,11 +121,11 @@ def column(
 
     Args:
         aspect: height over width.
-        cells: of the width.
-        length: of the domain [widths].
-        angle: of friction [degrees].
-        floor: its friction.
-        tables: of the scene.
+        cells: cells of the width.
+        length: length of the domain [widths].
+        angle: friction angle [degrees].
+        floor: friction of the floor.
+        tables: further tables of the scene.
     """
     dx = WIDTH / cells
     nx, ny = round(length * cells), round(aspect * cells) + FLOOR + HEADROOM
@@ -176,7 +176,7 @@ def fill(simulation: LiquidSimulation) -> np.ndarray:
 def particles_in_cells(simulation: LiquidSimulation) -> tuple[np.ndarray, tuple[int, int], float]:
     """Return the arguments of `signals.filled_fraction`.
 
-    Positions [cells], cells along x and y, and a particle's volume [cells].
+    They are positions [cells], cells along x and y, and a particle's volume [cells].
     """
     nx, ny, _ = simulation.grid.counts
     return positions(simulation) / simulation.grid.spacing, (nx, ny), 1.0 / PER_AXIS**2
@@ -200,7 +200,7 @@ def runout(simulation: SandSimulation) -> float:
 def profile(simulation: SandSimulation) -> np.ndarray:
     """Return the highest cell of the pile in each column, shape (nx + 2,).
 
-    0 if a column has no sand.
+    It is 0 if a column has no sand.
     """
     full = simulation.packing.fraction.numpy()[1] > FULL
     rows = np.arange(full.shape[0])[:, None]
@@ -220,7 +220,7 @@ def height(simulation: SandSimulation) -> float:
 def depth(simulation: SandSimulation) -> np.ndarray:
     """Return the depth of each particle below the surface [cells], shape (n,).
 
-    Negative above the surface.
+    It is negative above the surface.
     """
     cells = np.floor(positions(simulation) / simulation.grid.spacing).astype(int) + 1
     return np.asarray(profile(simulation)[cells[:, 0]] - cells[:, 1])
@@ -235,13 +235,13 @@ def drift(
     sorted now and then; they are tracked through steps in which they move less than their distance.
 
     Args:
-        simulation: to step.
-        duration: [s].
+        simulation: the simulation to step.
+        duration: simulated time [s].
         height: unit of length [m].
-        deep: cells below the surface.
+        deep: least depth below the surface [cells].
 
     Returns:
-        The mean over all, and over those that lie `deep`.
+        The mean over all particles, and over those at least `deep` below the surface.
     """
     start, low = positions(simulation), depth(simulation)
     at, origin = start, np.arange(len(start))

@@ -25,7 +25,7 @@ SAMPLES = 6  # samples of a cell along each axis, for the volume
 def crossings(time: np.ndarray, signal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the times of upward and of downward zero crossings of a signal.
 
-    Linear between samples.
+    The signal is linear between samples.
     """
     time, signal = np.asarray(time, dtype=float), np.asarray(signal, dtype=float)
     below, above = signal[:-1], signal[1:]
@@ -41,10 +41,10 @@ def crossings(time: np.ndarray, signal: np.ndarray) -> tuple[np.ndarray, np.ndar
 def period(time: np.ndarray, signal: np.ndarray) -> float:
     """Return the period of a signal.
 
-    From crossings in one direction, so that its mean need not be 0 and it may decay.
+    Only crossings in one direction count, so that the signal's mean need not be 0 and it may decay.
 
     Raises:
-        ValueError: neither direction is crossed twice.
+        ValueError: there are no two crossings in one direction.
     """
     rising, falling = crossings(time, signal)
     spans = [(len(at) - 1, at[-1] - at[0]) for at in (rising, falling) if len(at) > 1]
@@ -60,10 +60,10 @@ def mode(x: np.ndarray, wavenumber: float, area: float, length: float) -> float:
     that of eta cos(k x), where k is a multiple of pi / length.
 
     Args:
-        x: of the particles [m], shape (n,).
-        wavenumber: k [1/m].
-        area: of one particle [m^2].
-        length: of the tank [m].
+        x: positions of the particles [m], shape (n,).
+        wavenumber: wave number k [1/m].
+        area: area of one particle [m^2].
+        length: length of the tank [m].
     """
     return float(2.0 / length * area * np.cos(wavenumber * np.asarray(x)).sum())
 
@@ -73,7 +73,7 @@ def relative_rms(
 ) -> float:
     """Return the root mean square of values(at + shift) / expected - 1.
 
-    Linear between samples.
+    The curve is linear between samples.
     """
     found = np.interp(np.asarray(at) + shift, time, values)
     return float(np.sqrt(np.mean((found / np.asarray(expected) - 1.0) ** 2)))
@@ -113,7 +113,7 @@ def best_pace(
 def front(fill: np.ndarray) -> int:
     """Return the right edge [cells] of the farthest floor cell that is half full.
 
-    0 if there is none.
+    The result is 0 if there is none.
 
     Args:
         fill: fraction of each cell that is liquid, shape (ny, nx), the floor first.
@@ -125,8 +125,8 @@ def front(fill: np.ndarray) -> int:
 def stays(time: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the middle times of an advancing front's stays, and its places.
 
-    The last stay has no end and is left out. A front that is known to a cell follows a staircase.
-    It is on average at its places, and known best in the middle of a tread.
+    The last stay has no end and is left out. A front that is resolved to a cell follows a
+    staircase. It is on average at its places, and known best in the middle of a tread.
     """
     time, place = np.asarray(time, dtype=float), np.asarray(place, dtype=float)
     farthest = np.maximum.accumulate(place)
@@ -169,7 +169,7 @@ def cumulative(s: np.ndarray) -> np.ndarray:
 def weights(f: np.ndarray) -> list[np.ndarray]:
     """Return the quadratic B-spline at the cell of a point and its neighbors.
 
-    f: distance from the cell's center [cells].
+    f is the distance from the cell's center [cells].
     """
     return [0.5 * (0.5 - f) ** 2, 0.75 - f * f, 0.5 * (0.5 + f) ** 2]
 
@@ -179,8 +179,8 @@ def filled_fraction(cells: np.ndarray, counts: tuple[int, int], volume: float) -
 
     Args:
         cells: x and y of the particles in cells from the domain's corner, shape (n, 2).
-        counts: cells (nx, ny).
-        volume: of a particle [cells].
+        counts: numbers of cells (nx, ny).
+        volume: volume of a particle [cells].
     """
     nx, ny = counts
     rho = np.zeros((ny + 2, nx + 2))

@@ -82,14 +82,13 @@ def collapse(
 
     Args:
         what: a key of `LONGEST`.
-        cells: along the domain.
+        cells: cells along the domain.
         dt: length of the steps [s].
-        change: makes the simulation a control.
-        moments: at which the energy is wanted [s].
+        change: function that makes the simulation a control.
+        moments: times at which the energy is returned [s].
 
     Returns:
-        The energy at the moments over that at the start, and the most that a step added to it, over
-        it.
+        The energy at the moments, and the largest gain of a step, both over the initial energy.
     """
     simulation: Any
     if what == "sand":
@@ -114,7 +113,7 @@ def collapse(
 def _push_sand_apart(simulation: Any) -> None:
     """Push out a fifth of the excess density within a step, as a velocity.
 
-    However short the step is.
+    The fraction does not depend on the length of the step.
     """
     packing = simulation.packing
     update = packing.update
@@ -133,7 +132,7 @@ def _push_sand_apart(simulation: Any) -> None:
 def _push_liquid_apart(simulation: Any) -> None:
     """Push out all excess density within a step, as a velocity.
 
-    However short the step is.
+    The amount does not depend on the length of the step.
     """
     projection = simulation.projection
     prepare = projection.prepare

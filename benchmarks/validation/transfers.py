@@ -57,7 +57,8 @@ class Cloud:
     def angular_momentum(self) -> float:
         """Return the angular momentum about the origin.
 
-        Includes the affine part in the tent functions around a particle: f (1 - f) dx^2 dv/dx.
+        The affine part is included: in the tent functions around a particle it is f (1 - f) dx^2
+        dv/dx.
         """
         gradients = [g.numpy() for g in self.affine]
         return angular_momentum(
@@ -73,9 +74,9 @@ def angular_momentum(
     The affine part is included.
 
     Args:
-        position: [m], shape (n, 2 or 3).
-        velocity: [m/s], same shape.
-        gradients: of each component [1/s]; empty without an affine part.
+        position: positions [m], shape (n, 2 or 3).
+        velocity: velocities [m/s], same shape.
+        gradients: velocity gradient of each component [1/s]; empty without an affine part.
         dx: the grid's spacing [m].
     """
     x, v = np.asarray(position, dtype=np.float64), np.asarray(velocity, dtype=np.float64)
@@ -133,7 +134,7 @@ def round_trip(found: Findings, n: int) -> None:
 def changes(c: Cloud) -> tuple[float, float]:
     """Return the relative changes of momentum and angular momentum in a round trip.
 
-    Relative to the sums of the particles' |v| and |x| |v|.
+    The changes are relative to the sums of the particles' |v| and |x| |v|.
     """
     speed, arm = (np.linalg.norm(a.numpy(), axis=1) for a in (c.velocity, c.position))
     linear, angular = c.momentum(), c.angular_momentum()
@@ -151,7 +152,7 @@ def changes(c: Cloud) -> tuple[float, float]:
 def orders(found: Findings) -> None:
     """Find the order of the advection in time and in space.
 
-    In time on Zalesak's disk, in space in a vortex.
+    The order in time is found on Zalesak's disk, that in space in a vortex.
     """
     turns = [zalesak_error(steps) for steps in TURN_STEPS]
     found.add("Zalesak's disk, one turn: order in time", order(turns), low=2.7, high=3.3)
@@ -189,7 +190,7 @@ def zalesak_error(steps: int, n: int = 64) -> float:
 def euler_error(steps: int) -> float:
     """Return the largest error [m] of the disk after a turn of Euler steps.
 
-    That of its farthest point.
+    It is the error of the disk's farthest point.
     """
     growth = abs(1.0 + 2.0j * math.pi / steps) ** steps
     turned = steps * math.atan(2.0 * math.pi / steps)
@@ -202,8 +203,8 @@ def vortex_error(n: int, *, off: float = 0.0) -> float:
     The angular velocity falls with the radius.
 
     Args:
-        n: cells a side.
-        off: cells by which the fields are sampled off their faces, along both axes.
+        n: cells along a side.
+        off: distance of the samples from their faces, along both axes [cells].
     """
     angle = np.linspace(0.0, 2.0 * math.pi, 97)[:-1]
     start = CENTER + np.stack([0.15 * np.cos(angle), 0.15 * np.sin(angle), 0.0 * angle], axis=1)

@@ -93,15 +93,15 @@ def drop(
 ) -> Fall:
     """Let a block fall.
 
-    Particles are told apart by their order from the floor up, which a rigid fall keeps and a
-    straggler can only lose places in.
+    Particles are matched by their order from the floor up. A rigid fall keeps it, and a straggler
+    can only lose places in it.
 
     Args:
         resolution: cells of the domain's height.
-        numerics: of solids and surface.
+        numerics: representation of solids and surface.
         ceiling: a key of CEILINGS.
         wall: separating or free-slip.
-        release: whether faces of cells that let go may take the liquid's velocity.
+        release: whether faces of separated cells may take the liquid's velocity.
     """
     simulation = create_liquid(
         numerics, SIZE, resolution, [box([0.0, LOW], SIZE)], solid=CEILINGS[ceiling], wall=wall
@@ -170,8 +170,8 @@ def slide(cells: int, numerics: Numerics, wall: str) -> tuple[float, float, floa
     `wall` is separating or free-slip.
 
     Returns:
-        The loss of momentum along the wall over that at the start, and the mean ways off the wall
-        and along it [cells].
+        The loss of momentum along the wall over that at the start, and the mean displacements off
+        the wall and along it [cells].
     """
     angle = math.radians(ANGLE)
     tangent, normal = (

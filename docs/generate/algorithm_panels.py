@@ -1,8 +1,7 @@
 """Draw `docs/algorithms.png`: algorithms and figures of the book.
 
-One panel for each that has no picture elsewhere.
-
-Every panel shows a run of the library: `python docs/generate/algorithm_panels.py`.
+Each has a panel if it has no picture elsewhere. Every panel shows a run of the library. Run
+`python docs/generate/algorithm_panels.py`.
 """
 
 from __future__ import annotations
@@ -164,7 +163,7 @@ def contraction_panel(axes: Any) -> None:
 def diagonal_panel(axes: Any) -> None:
     """Draw the energy of one unknown in [0, 1] and the sweep's result.
 
-    For each sign of a.
+    There is one energy for each sign of a.
     """
     x = np.linspace(0, 1, 50)
     for a in (2.0, 0.0, -2.0):

@@ -1,6 +1,6 @@
 """Write the measured section of `docs/choosing-a-method.md`.
 
-From the stored results of the suite `choose`.
+The figures are the stored results of the suite `choose`.
 """
 
 from __future__ import annotations

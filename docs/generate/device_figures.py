@@ -1,6 +1,6 @@
 """Write the table of machines in `docs/gpu.md`.
 
-From the result files of the suite `devices`, one for each machine.
+The figures are the result files of the suite `devices`, one for each machine.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def files() -> dict[str, Path]:
 def table() -> str:
     """Return the table of milliseconds and iterations.
 
-    A row for each piece of work of at least two machines, a column for each machine.
+    Each piece of work that at least two machines have done has a row; each machine has a column.
     """
     machines: dict[str, dict[str, Any]] = {}
     for name, path in files().items():

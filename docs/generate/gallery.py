@@ -1,7 +1,7 @@
 """Run the built-in scenes, draw each and write docs/gallery.md.
 
-`python docs/generate/gallery.py [--scene NAME]... [--work DIR]`. Other scenes keep their picture
-and their figures, which are stored in docs/gallery/figures.json.
+Run `python docs/generate/gallery.py [--scene NAME]... [--work DIR]`. Other scenes keep their
+picture and their figures, which are stored in docs/gallery/figures.json.
 """
 
 from __future__ import annotations

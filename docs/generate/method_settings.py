@@ -1,6 +1,6 @@
 """Write docs/api/settings.md from the annotations of methods.
 
-`python docs/generate/method_settings.py`.
+Run `python docs/generate/method_settings.py`.
 """
 
 from __future__ import annotations

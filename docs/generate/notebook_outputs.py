@@ -1,6 +1,6 @@
 """Run the cells of notebooks, without Jupyter, and store their output.
 
-`python docs/generate/notebook_outputs.py [NAME]...`.
+Run `python docs/generate/notebook_outputs.py [NAME]...`.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ def printed(notebook: dict[str, Any], pictures: list[list[bytes]] | None = None)
     """Run the code cells in one name space; return the printed text of each.
 
     Args:
-        notebook: as read from its file.
-        pictures: gets the PNG files of each cell's Matplotlib figures, if given.
+        notebook: contents of the notebook's file.
+        pictures: list to which the PNG files of each cell's figures are appended.
     """
     names: dict[str, Any] = {}
     texts = []

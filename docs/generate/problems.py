@@ -1,6 +1,6 @@
 """Draw the pictures of docs/problems.md and compute its tables.
 
-`python docs/generate/problems.py [--tables]`.
+Run `python docs/generate/problems.py [--tables]`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Write the table of `docs/published-methods.md`.
 
-From the stored results of the suite `published`.
+The figures are the stored results of the suite `published`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ LINEAR = "linear solve"
 def table() -> str:
     """Return the table, and the date of the measurement.
 
-    A row for each method, a column for each kind of bounds and size.
+    Each method has a row; each kind of bounds and size has a column.
     """
     machine, *records = json.loads(RESULTS.read_text())
     kept = {(r["method"], r["bounds"], r["size"]): r for r in records}

@@ -1,6 +1,6 @@
 """Write docs/scenes.md from the schemas of scene files.
 
-`python docs/generate/scene_keys.py`.
+Run `python docs/generate/scene_keys.py`.
 """
 
 from __future__ import annotations
@@ -142,7 +142,7 @@ LIMITS = """## Limits
 def reference(prop: Definition) -> str | None:
     """Return the name of the definition that a property refers to.
 
-    The property itself, or one of its alternatives.
+    The reference is that of the property itself, or of one of its alternatives.
     """
     for part in (prop, *prop.get("anyOf", ())):
         if "$ref" in part:
@@ -226,9 +226,9 @@ def row(
     """Return a key's row of a table.
 
     Args:
-        name: of the key.
-        prop: of the schema.
-        required: whether it must be given.
+        name: name of the key.
+        prop: property of the schema.
+        required: whether the key is required.
         others: the key's properties in scenes of other materials, by their names.
     """
     meaning, default = meaning_of(prop), default_of(name, prop, required)
@@ -253,8 +253,8 @@ def table(
     """Return the keys of a definition as a Markdown table, empty if it has none.
 
     Args:
-        definition: of the schema.
-        leave_out: keys that other tables have.
+        definition: definition of the schema.
+        leave_out: keys that are in other tables.
         others: the same table in scenes of other materials, by their names.
     """
     required, rows = definition.get("required", ()), []
@@ -284,9 +284,9 @@ def variant_table(
     """Return the keys of tables of several kinds as one Markdown table.
 
     Args:
-        kinds: the definitions by kind.
-        column: head of the column of kinds.
-        leave_out: keys that other tables have.
+        kinds: definitions by kind.
+        column: heading of the column of kinds.
+        leave_out: keys that are in other tables.
         defaults: whether there is a column of defaults.
     """
     rows: dict[tuple[str, str, str], list[str]] = {}

@@ -1,9 +1,8 @@
 """Random problems by kind and seed, on which no method was tuned.
 
-`problem(kind, seed)` always returns the same problem.
-
-Seeds 0 to 9,999 are for tests and for development, 10,000 to 19,999 are kept unseen for acceptance,
-a run draws from 20,000 on.
+`problem(kind, seed)` always returns the same problem. Seeds 0 to 9,999 are for tests and
+development. Seeds 10,000 to 19,999 are kept unseen for acceptance. A run draws seeds from 20,000
+on.
 """
 
 from __future__ import annotations
@@ -38,9 +37,9 @@ def problem(kind: str, seed: int, *, small: bool = False) -> Unseen:
     """Return the problem of a kind and a seed.
 
     Args:
-        kind: of `KINDS`.
-        seed: >= 0.
-        small: of a size that every method can take; another problem than the large one.
+        kind: a name of `KINDS`.
+        seed: a number >= 0.
+        small: return a problem small enough for every method; it differs from the large one.
 
     Raises:
         ValueError: there is no such kind.

@@ -35,9 +35,9 @@ class Draw:
     """Random generator of a kind and a seed, with common choices.
 
     Args:
-        kind: of problem.
-        seed: of it.
-        small: draw sizes that every method can take.
+        kind: kind of the problem.
+        seed: seed of the problem.
+        small: draw sizes small enough for every method.
     """
 
     def __init__(self, kind: str, seed: int, *, small: bool = False) -> None:

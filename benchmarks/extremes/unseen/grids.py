@@ -129,7 +129,7 @@ def handful(draw: Draw) -> GridProblem:
 def section(draw: Draw, n: int) -> np.ndarray:
     """Return a cross-section of a bar.
 
-    A square, a rectangle, an ellipse, an L, a triangle or a square with a hole.
+    It is a square, a rectangle, an ellipse, an L, a triangle or a square with a hole.
     """
     kind = draw.of("square", "square", "rectangle", "ellipse", "L", "triangle", "hole")
     X, Y = np.meshgrid(*(np.linspace(0, 1, n),) * 2)
@@ -221,7 +221,7 @@ def bearing(draw: Draw) -> GridProblem:
 def rows(draw: Draw) -> GridProblem:
     """Return rows of all kinds side by side, with random shares.
 
-    Equations, one bound, two bounds, fixed values.
+    The kinds are equations, one bound, two bounds and fixed values.
     """
     shape = draw.shape(draw.of(2, 3))
     cells = framed(np.ones(shape))
@@ -315,7 +315,7 @@ def cut_cells(draw: Draw) -> GridProblem:
 def shifted(draw: Draw) -> GridProblem:
     """Return a time step of diffusion: a shift of 10^-5 to 100.
 
-    On all cells or some, with or without AIR.
+    The shift is on all cells or some, with or without AIR.
     """
     shape = draw.shape(draw.of(2, 3))
     cells = np.full(shape, FLUID)

@@ -1,6 +1,6 @@
 """Random matrices: plates, elastic contact, meshes, options, linear programs.
 
-Also skew matrices with small diagonals.
+There are also skew matrices with small diagonals.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def assembled(of_elements: np.ndarray, at: np.ndarray, n: int) -> scipy.sparse.c
 def stiffness(poisson: float) -> np.ndarray:
     """Return the stiffness matrix of a bilinear unit square in plane strain, E = 1.
 
-    Nodes (0,0), (1,0), (0,1), (1,1), x before y.
+    The nodes are (0,0), (1,0), (0,1), (1,1), x before y.
     """
     D = np.array([[1 - poisson, poisson, 0], [poisson, 1 - poisson, 0], [0, 0, 0.5 - poisson]]) / (
         (1 + poisson) * (1 - 2 * poisson)
