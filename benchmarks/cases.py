@@ -31,12 +31,12 @@ class Case:
 
     form: str  # coefficients: `unit`, `faces`, `cells 1:100`, `arrays 1:100`
     scene: Splash  # the scene
-    bounds: str  # which unknowns have p >= 0
+    bounds: str  # unknowns with p >= 0: a name of BOUNDS
     solver: Any  # settings of the method
     device: str  # Warp device
     full: bool = True  # whether reuse, warm starts and time to tolerances are measured too
     label: str = ""  # display name of the method; its class name if empty
-    # makes the operator from cells, a device and face coefficients
+    # Makes the operator from cells, a device and face coefficients.
     operator: Callable[..., Any] = wl.GridPoisson
     samples: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     counts: dict[str, float] = field(default_factory=dict)

@@ -460,7 +460,7 @@ def large_game(rng: np.random.Generator) -> wl.LCP:
     return wl.LCP(A, np.concatenate([-np.ones(n), np.ones(n)]))
 
 
-# for rules that no kind above meets; problems of sign errors may have no solution
+# For rules that no kind above meets; problems of sign errors may have no solution.
 RARE: dict[str, Make] = {
     "sign error": lambda r, s: sign_error(r, 10, 500),
     "large sign error": lambda r, s: sign_error(r, 1001, 3000),

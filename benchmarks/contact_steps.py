@@ -21,7 +21,7 @@ from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rigid.contact_problem import ContactImpulses, ContactProblem
 from warp_lcp.scene.scene_file import load_scene
 
-SPHERES, SIDE = 1000, 10  # and spheres along a side of the box
+SPHERES, SIDE = 1000, 10  # number of spheres, and spheres along a side of the box
 # Steps until the spheres have fallen onto each other, measured steps, and their length [s].
 SETTLING, STEPS, DT = 40, 5, 0.005
 RADIUS, APART = 0.05, 0.115  # [m] largest radius, and initial distance of centers

@@ -37,7 +37,7 @@ METHODS: dict[str, Callable[[], Any]] = {
 }
 CONTACTS, CONTACT_SWEEPS = "wall", 200  # scene of the gallery, and sweeps of a sample
 STEPS = ("dam-break", "column-collapse")  # built-in scenes whose steps are timed: a liquid, sand
-# cells along the longest side: a step of sand with 256 takes minutes on two cores
+# Cells along the longest side: a step of sand with 256 takes minutes on two cores.
 LARGEST_STEP = 128
 BEFORE, TIMED = 10, 20  # steps until the material moves, and timed steps
 

@@ -41,7 +41,7 @@ COMPARE, CELLS = os.environ.get("COMPARE") == "1", os.environ.get("CELLS") == "1
 PACKAGE = "warp_lcp"
 # These modules query CUDA itself, or another process.
 REAL = ("warp_lcp.distributed.", "warp_lcp.run.devices", "warp_lcp.benchmarks.")
-ADDRESS = 0x6F0000000000  # where compiled kernels read the order of threads
+ADDRESS = 0x6F0000000000  # address at which compiled kernels read the order of threads
 # Kernels (module:name) whose results depend on the order of threads, and why they may.
 ORDER_MATTERS = {
     "warp_lcp.components.unite.*:unite": "trees differ, their roots do not",

@@ -227,7 +227,7 @@ def measure_all(simulator: str, dimension: int, size: int, options: Options) -> 
     samples: dict[str, Sample] = {}
     for text, tables in wanted.items():
         scene = reference(simulator, dimension, tables, size)
-        # loads kernels and data that are no part of a scene's cost
+        # Loads kernels and data that are no part of a scene's cost.
         create(scene, options.device).step(1e-3)
         samples[text] = first_run(scene, options.device)
     for _ in range(options.repeat - 1):

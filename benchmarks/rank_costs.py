@@ -45,7 +45,7 @@ class Traffic:
     def __init__(self) -> None:
         """Start to count, in this process."""
         self.bytes, self.times = Counter[str](), Counter[str]()
-        # calls of the program that is being recorded
+        # Calls of the program that is being recorded.
         self._recorded: list[tuple[str, int]] | None = None
         self._listen(
             Subdomain,

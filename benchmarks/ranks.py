@@ -68,7 +68,7 @@ Found = Mapping[tuple[int, str, int], Record]  # by cells a side, bounds, ranks
 class Shared:
     """One kind of bounds at one size, on all ranks."""
 
-    decomposition: Decomposition  # of the n^3 cells
+    decomposition: Decomposition  # decomposition of the n^3 cells
     part: SplashPart  # this rank's cells
     bounds: str  # `linear`, `walls`, `everywhere`
     device: str  # Warp device of this rank

@@ -24,7 +24,7 @@ from warp_lcp.granular.simulator import SandSimulation
 TITLE = "Sand: pressure and friction together"
 # [s] into the collapse.
 STATES = {"falling": 0.1, "mid-flow": 0.25, "spreading": 0.4, "coming to rest": 0.8}
-TOLERANCE = 1e-3  # of the stresses, in units of rho g dx
+TOLERANCE = 1e-3  # tolerance of the stresses, in units of rho g dx
 MOST = 4000  # limit of the iterations of a method
 COLLAPSE_END = 1.2  # [s]
 STEPS = 20  # timed steps of the large scenes

@@ -26,7 +26,7 @@ from warp_lcp.benchmarks.sparse_family import FAMILY, SparseProblem, numbered_at
 TITLE = "Sparse matrices numbered at random: with bounds, against PyAMG without"
 # Roots of the numbers of unknowns; first seed of problems on which nothing was tuned.
 SIZES, SEED = (316, 1000), 30001
-RTOL, TARGET = 1e-6, 1.5  # of the residual; of our seconds over PyAMG's
+RTOL, TARGET = 1e-6, 1.5  # relative residual; target of our seconds over PyAMG's
 ITERATIONS = 100  # limit after which PyAMG's solve counts as failed
 BUILDS = ("smoothed_aggregation_solver", "ruge_stuben_solver", "rootnode_solver")
 

@@ -32,7 +32,7 @@ class Suite:
     """Set of measurements."""
 
     name: str  # name on the command line; the files are NAME.json, NAME.md and NAME-*.png
-    summary: str  # what it measures, for the help text
+    summary: str  # description for the help text
     # Minutes on two cores with compiled kernels, and the optional extras.
     takes: str
     resizable: bool = True  # whether other sizes can be requested

@@ -23,7 +23,7 @@ from warp_lcp.gallery.contact_models import BoxedModel, ContactSystem
 ORDERED = ("wall", "box-stack", "leaning-wall", "gear-pyramid")
 ROUNDS = 100  # sweeps shown in figure 2.3
 LEVELS = (1e-3, 1e-6, 1e-10)
-# method, and the least number of sweeps that one of its steps costs
+# Method, and the least number of sweeps that one of its steps costs.
 METHODS: dict[str, tuple[Any, int]] = {
     "PGS": (wl.ProjectedSOR(omega=1.0), 1),
     "NNCG": (wl.NNCG(), 1),

@@ -80,11 +80,11 @@ def refusal(names: str) -> Promise:
 class Attempt:
     """Actual outcome of a case."""
 
-    status: str  # of the result, or `refused`, or the message of a simulation
+    status: str  # status of the result, `refused`, or the message of a simulation
     residual: float | None = None  # independent and relative; None if there is none
     seconds: float = 0.0  # wall time [s]
     message: str = ""  # message of a refusal or a failed step
-    # faults that do not depend on the expected outcome
+    # Faults that do not depend on the expected outcome.
     faults: list[str] = field(default_factory=list)
     met: bool = False  # whether the independent residual meets the tolerance
     facts: dict[str, Any] = field(default_factory=dict)  # further entries of the record
@@ -113,8 +113,8 @@ class Case(ABC):
     family: str  # the cases that share an expectation
     name: str  # unique in its family
     _: KW_ONLY
-    expected: Promise = SOLVED  # the expected outcome,
-    # except in these precisions.
+    expected: Promise = SOLVED  # expected outcome
+    # Other expected outcomes, by precision.
     promises: Mapping[str, Promise] = field(default_factory=dict)
     budget: float = BUDGET  # CPU seconds that a precision may take
     precisions: tuple[str, ...] = PRECISIONS  # precisions in which the case runs

@@ -15,7 +15,7 @@ from warp_lcp.benchmarks.extremes.shapes import AIR, FLUID, SOLID, chance, full,
 
 SHAPES = ((48, 53), (17, 18, 19))
 Y, X = np.indices((48, 50))
-# limited by the matrix's own rounding: neighboring entries differ by 12 decades
+# Limited by the matrix's own rounding: neighboring entries differ by 12 decades.
 ROUGH = {"rtol": 1e-6}
 SINGLE_MAY_STOP = {"single": EITHER}
 MIXED_MAY_STOP = {"single": EITHER, "mixed": EITHER}
@@ -194,9 +194,9 @@ def bodies() -> Iterator[Case]:
             **may_stop(inverse, LIGHTEST),
         )
     yield from case("heavy bodies, 3-D", lambda: swimming_3d([1e-8, 1e-8]))
-    # the term of a body in air
+    # The term of a body in air.
     yield from case("a column that touches nothing", lambda: with_column(swimming([1.0]), 0.0, 1e8))
-    # the term of a body counted twice
+    # The term of a body counted twice.
     yield from case("two equal columns", lambda: with_column(swimming([10.0]), 1.0, 3.0))
     yield from case("a piston closes a chamber", piston)
 

@@ -112,7 +112,7 @@ def _least_cost(
 
     `alone`: rows and columns that are matched with themselves at no cost.
     """
-    # the other entries are practically forbidden
+    # The other entries are practically forbidden.
     table = np.full((n, n), 4.0 * n * (float(np.abs(cost).max()) + 1.0))
     table[row, column], table[alone, alone] = cost, 0.0
     return float(table[linear_sum_assignment(table)].sum())

@@ -42,10 +42,10 @@ def ended_with(names: str) -> Promise:
 class RunCase(Case):
     """Simulation of a few steps."""
 
-    # makes the simulation for a precision and a device
+    # Makes the simulation for a precision and a device.
     make: Callable[[str, str], ParticleSimulation]
     _: KW_ONLY
-    dt: float | None = None  # of every step [s]; by the CFL number if None
+    dt: float | None = None  # length of every step [s]; by the CFL number if None
     steps: int = STEPS  # number of steps
     # Changes the simulation before the first step.
     prepare: Callable[[ParticleSimulation], object] = lambda simulation: None

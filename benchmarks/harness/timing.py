@@ -38,7 +38,7 @@ class Figure:
     """Measured or counted number."""
 
     value: float  # the median
-    unit: str = ""  # of value, low and high; empty for counts and ratios
+    unit: str = ""  # unit of value, low and high; empty for counts and ratios
     low: float | None = None  # smallest sample
     high: float | None = None  # largest sample
     samples: int = 1  # number of samples

@@ -46,7 +46,7 @@ class Contest:
 
     peer: Peer  # the solver
     question: Question  # the problem
-    # tolerance given to the peer, such that its residual is the required one
+    # Tolerance given to the peer, such that its residual is the required one.
     tolerance: float = RTOL
     answers: list[Answer] = field(default_factory=list)  # one for each round
     residual: float = float("nan")  # residual of the last answer

@@ -32,7 +32,7 @@ MULTIGRID = {
     "mg_levels_ksp_max_it": 1,
     "mg_levels_pc_type": "sor",
 }
-# tolerance of a Newton step; tighter ones take fewer steps and more time
+# Tolerance of a Newton step; tighter ones take fewer steps and more time.
 LOOSE = {"ksp_rtol": 1e-2}
 
 

@@ -27,7 +27,7 @@ from warp_lcp.scene.simulator import simulators
 from warp_lcp.simulation import Recorded, Simulation
 from warp_lcp.solvers.registry import grid_methods
 
-# numbers of problems of a run of liquid and of states of sand, at equal distances
+# Numbers of problems of a run of liquid and of states of sand, at equal distances.
 PROBLEMS, STATES = 4, 3
 EXACT = wl.StoppingCriteria(rtol=1e-13, max_iterations=500)
 EXACT_STEP = {

@@ -42,7 +42,7 @@ LENGTH, HEIGHT = 6.0, 2.5  # size of the tank, in units of a: the front meets no
 END = 3.7  # end of the run, in T
 MAX_SHIFT = 0.3  # limit of the shift in T, since the time origin of the experiment is uncertain
 FIRST, LAST = 0.84, 3.33  # range of T of the compared data
-WRONG_GRAVITY = (0.5, 0.8, 1.25, 2.0)  # of the controls, as factors of the true one
+WRONG_GRAVITY = (0.5, 0.8, 1.25, 2.0)  # gravity in the controls, as factors of the true one
 TAU_LAST = 2.45
 
 SIZE, COLUMN = [1.6, 0.8], 0.4  # [m] domain with two columns, and the side of each
@@ -72,9 +72,9 @@ H = np.array(
 # range in which its slope is compared.
 FAR_T = np.array([3.345, 4.034, 4.418, 5.091, 5.685, 6.306, 6.822, 7.439, 8.031, 8.633, 9.237])
 FAR_Z = np.array([4.134, 4.944, 5.881, 6.980, 7.945, 8.966, 9.986, 10.963, 11.977, 13.005, 13.970])
-# range of Z; length of the tank in units of a; end of the run in T
+# Range of Z; length of the tank in units of a; end of the run in T.
 FAR, FAR_LENGTH, FAR_END = (4.0, 14.0), 16.0, 11.0
-VISCOSITY = 1e-6  # of water [m^2/s]
+VISCOSITY = 1e-6  # kinematic viscosity of water [m^2/s]
 
 
 class Collapse(NamedTuple):

@@ -34,7 +34,7 @@ class Finding:
     value: float  # measured value; NaN if it could not be measured
     low: float = -math.inf  # the bound from below
     high: float = math.inf  # the bound from above
-    unit: str = ""  # of value and bounds
+    unit: str = ""  # unit of value and bounds
     # Whether it is a negative control: its set-up is wrong on purpose and must break the bound.
     control: bool = False
 
@@ -77,7 +77,7 @@ class Trial:
 
     check: str  # name of the check
     resolution: str  # resolution as text
-    findings: Sequence[Finding]  # what was found
+    findings: Sequence[Finding]  # measured figures
     seconds: float = 0.0  # wall time [s]
     error: str = ""  # why the trial did not finish; empty if it did
     curves: dict[str, Curve] = field(default_factory=dict)
@@ -127,7 +127,7 @@ class Trial:
 class Check:
     """Check: what must hold, its trials and charts."""
 
-    about: str  # what must hold
+    about: str  # what the check tests
     # Functions with their cases; a case is an argument, or a tuple of several.
     trials: Sequence[tuple[Callable[..., Trial], Sequence[Any]]]
     # A comparison of the trials: its description and its function.

@@ -26,7 +26,7 @@ from warp_lcp.benchmarks.validation.scenes import (
 from warp_lcp.benchmarks.validation.transfers import angular_momentum
 from warp_lcp.fluids import LiquidSimulation
 
-# cells along the domain of thrown material, cells per meter for a spinning drop
+# Cells along the domain of thrown material, cells per meter for a spinning drop.
 RESOLUTIONS = (32, 64)
 SIZE = [2.0, 2.0]  # [m]; no wall is met
 MOST = 1e-4  # largest distance from the parabola, as a share of the way

@@ -69,7 +69,7 @@ AFTER, UNTIL = 0.03, 0.12  # [s] range in which the block's acceleration is meas
 HOPPER = 40  # cells of the hopper's width
 # Sizes of the hopper [m, degrees], and its friction.
 WIDTH, SLOT, STEEP, LIP, SLICK = 0.4, 0.1, 60.0, 0.025, 0.2
-SHIFTS = (0.0, 0.25, 0.5)  # of the grid [cells]
+SHIFTS = (0.0, 0.25, 0.5)  # shifts of the grid [cells]
 FROM, TO, PARTS = 0.25, 0.6, 3  # [s] range in which the hopper's rate is measured, and its parts
 
 

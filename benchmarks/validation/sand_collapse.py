@@ -31,9 +31,9 @@ CONTROLLED = 2.0  # aspect ratio of the negative controls
 WIDENED = 0.2  # tolerance around the range of the experiments
 HEIGHT = 0.1  # tolerance of the experiments' heights
 STEEPEST = 45.0  # degrees, of a control: no cone is steeper
-# Cells and aspect ratios of columns whose friction grows with the rate of shear,
+# Cells and aspect ratios of columns whose friction grows with the rate of shear.
 GROWTH = 20, (1.0, 2.0, 4.0)
-# by as much as that of glass beads.
+# It grows by as much as that of glass beads.
 GAIN = math.tan(math.radians(32.76)) - math.tan(math.radians(20.9))
 DYNAMIC = math.degrees(math.atan(WALL_FRICTION + GAIN))
 GRAIN = 5.3e-4  # [m] grain size of glass beads [Jop, Forterre & Pouliquen 2006]
@@ -48,7 +48,7 @@ CUBE = 48  # cells along the domain in 3-D
 CUBE_DOMAIN, CUBE_WIDTH = 0.96, 0.28  # [m] domain in 3-D, and the cube that collapses there
 
 RESOLUTIONS = (20, 40)  # cells of the width of a column whose steps or rest are observed
-# of that column: aspect ratio, domain [widths], duration [s]
+# Of that column: aspect ratio, domain [widths], duration [s].
 ASPECT, LENGTH, DURATION = 2.0, 7.0, 1.2
 FALL = math.sqrt(ASPECT * WIDTH / GRAVITY)  # [s]
 FEW = 10  # iteration limit of a control
@@ -208,7 +208,7 @@ def cube(found: Findings, cells: int = CUBE) -> None:
     found.add("steps with stresses to 1e-3", share_solved(rows), low=95.0, unit="%")
     found.add("|mean of exp(4 i angle)| of the 5 % farthest", _squareness(x), high=0.5)
     found.must_break("before it falls: |mean of exp(4 i angle)|", _squareness(start), high=0.5)
-    radius = CUBE_WIDTH / math.sqrt(math.pi)  # of a round column of equal area
+    radius = CUBE_WIDTH / math.sqrt(math.pi)  # radius of a round column of equal area
     aspect = CUBE_WIDTH / radius
     # [Lube2004], [Lajeunesse2004].
     low, high = (1.0 - WIDENED) * 1.6 * math.sqrt(aspect), (1.0 + WIDENED) * 2.0 * math.sqrt(aspect)

@@ -39,7 +39,7 @@ Outline = tuple[np.ndarray, np.ndarray]  # x and y [m]
 class Heap(NamedTuple):
     """Result of pouring a heap."""
 
-    angle: float  # of the best-fitting wedge [degrees], some time after the end of the pouring
+    angle: float  # slope of the best-fitting wedge [degrees], some time after the pouring
     creep: float  # decrease of the angle from then on [degrees/s]
     wedge: float  # distance of the outline from that wedge, root mean square, over its height
     solved: float  # share of the steps whose stresses meet the tolerance [%]

@@ -36,7 +36,7 @@ HEADROOM = 4  # cells above the sand
 RESTS = 0.3  # [s]
 TINY, PERIOD = 1e-5, 20  # [s] of a short step, and number of other steps between them
 LOAD, LID = 2.0, 0.25  # [rho g W] of a lid; its height [widths]
-CLEAR = 1e-3  # of a cell, gap between a lid and the walls
+CLEAR = 1e-3  # gap between a lid and the walls [cells]
 # [widths] Rows nearer to the surface lack walls in part of their cells' kernels.
 NEAR = 0.25
 RISE = 0.01  # [m/s] speed of the floor
@@ -275,7 +275,7 @@ def rest(
     )
     x = simulation.stress.now.numpy()[(slice(None), *inner)].astype(np.float64)
     flat, across, cells = grid.dimension == 2, (0, 2), x.shape[3]
-    unit = GRAVITY * simulation.stress.kick_dt * cells  # of rho g W
+    unit = GRAVITY * simulation.stress.kick_dt * cells  # load unit rho g W
     load = (x[0] + x[1] if flat else x[0] - x[2]).mean(axis=across) / unit
     # The wall load of a row is the mean of its copies, see `granular.yield_set`.
     xy = x[2:6] if flat else x[4:8]

@@ -29,7 +29,7 @@ WALL_FRICTION = math.tan(math.radians(FRICTION_ANGLE))
 WIDTH = 0.2  # [m] width of a column of sand
 FLOOR, HEADROOM = 2, 4  # cells of the solid below columns, and cells above a column
 CORRECTED: dict[str, Any] = {"density_correction": {}}
-TOLERANCE = 1e-3  # of the stresses [rho g dx]
+TOLERANCE = 1e-3  # tolerance of the stresses [rho g dx]
 FRONT = 99.0  # percentile of the particles that defines the front
 FULL = 0.5  # least fraction of a cell that is part of a pile
 

@@ -31,7 +31,7 @@ SIZE, LOW = [0.4, 0.8], 0.55  # [m] domain with a ceiling, and bottom of the blo
 SLANTED = math.radians(5.0)
 CEILINGS: dict[str, list[scenes.Row]] = {
     "flat": [],
-    # cuts cells
+    # Cuts cells.
     "slanted": [
         {"shape": "plane", "point": [0.2, 0.76], "normal": [math.sin(SLANTED), -math.cos(SLANTED)]}
     ],

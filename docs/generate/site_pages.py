@@ -15,7 +15,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 NOTEBOOK = re.compile(r"\]\(((?:\.\./)?[\w-]+)\.ipynb\)")  # link to a notebook
-FONT = "STIXTwoMath-Regular.ttf"  # of ziamath; docs/site.css names it
+FONT = "STIXTwoMath-Regular.ttf"  # font of ziamath; docs/site.css names it
 # Script that the plug-in `offline` loads for the search, and our copy.
 SHIM, OWN_SHIM = "https://unpkg.com/iframe-worker/shim", "iframe-worker.js"
 # Link from a page directly under docs to a file of the repository.

@@ -39,7 +39,7 @@ def test_counts_are_the_published_ones(count):
     here = count.measure()
     off = [abs(a - b) for a, b in zip(here, count.printed, strict=True)]
     assert all(n > counts.WITHIN for n in off) if count.reason else max(off) <= counts.WITHIN, here
-    # rounding may change the last step
+    # Rounding may change the last step.
     assert np.allclose(here, documented(count), rtol=0, atol=1.0)
     assert count.method in wl.METHODS
 

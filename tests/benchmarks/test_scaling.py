@@ -31,7 +31,7 @@ def test_sizes_stop_where_memory_ends(monkeypatch):
     free |= {"cuda:0": 1 << 50, "cpu": 100 * 64**3}
     # The scene is made in host memory.
     assert scaling.fitting([32, 64, 128], "cuda:0")[0] == [32, 64]
-    # on the CPU its memory holds scene and solve
+    # On the CPU its memory holds scene and solve.
     assert scaling.fitting([32, 64], "cpu")[0] == [32]
     monkeypatch.setattr(scaling, "free_memory", lambda device: None)
     assert scaling.fitting([1024], "cpu") == ([1024], {})

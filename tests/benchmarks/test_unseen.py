@@ -115,7 +115,7 @@ def test_no_problem_is_lost_and_none_is_changed_without_need():
     assert moved.b[0, :2].sum() == pytest.approx(0.01 * 4)
     np.testing.assert_array_equal(moved.b[0, 2:], [0, -5, -7, 0])
     outflow = replace(made, b=-made.b)
-    # the bound x >= 0 balances it
+    # The bound x >= 0 balances it.
     np.testing.assert_array_equal(solvable(outflow).b[0, :2], [1, 3])
     assert solvable(replace(outflow, lower=-np.inf)).b[0, :2].sum() == pytest.approx(0.0, abs=1e-14)
     assert solvable(replace(made, lower=-np.inf, upper=2.0)).b[0, :2].sum() == -4

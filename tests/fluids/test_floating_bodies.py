@@ -180,7 +180,7 @@ def test_momentum_is_exchanged_without_loss_and_energy_without_gain(dimension, r
         total[n] += mass * v[:3]
         energy[n] += 0.5 * mass * v[:3] @ v[:3] + 0.5 * v[3:] @ inertia @ v[3:]
     np.testing.assert_allclose(total[1], total[0], atol=2e-6 * np.abs(total[0]).max())
-    # some momentum was exchanged
+    # Some momentum was exchanged.
     assert np.abs(mass * (W[0] - V[0])[0]) > 1e-3 * np.abs(total[0]).max()
     assert W[0][0] > 0.0
     assert energy[1] < energy[0]

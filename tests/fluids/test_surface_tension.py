@@ -18,7 +18,7 @@ from warp_lcp.fluids import surface_tension_kernels as kernels
 from warp_lcp.fluids.surface_tension import MOST_PASSES, SurfaceTension, wall_cells
 
 SIGMA, RHO, RADIUS = 0.072, 1000.0, 0.01  # of water [N/m, kg/m^3], and of drops [m]
-# units of a drop
+# Units of a drop.
 SPEED, TIME = math.sqrt(SIGMA / (RHO * RADIUS)), math.sqrt(RHO * RADIUS**3 / SIGMA)
 WATER: dict[str, Any] = {"coefficient": SIGMA}
 

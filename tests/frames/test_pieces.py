@@ -16,7 +16,7 @@ from warp_lcp.scene.scene_file import dump_scene, load_scene
 from warp_lcp.simulation import Cells, Part, Points, Surface
 
 COUNTS = (6, 4, 2)
-# boxes of three ranks
+# Boxes of three ranks.
 BOXES = (((0, 0, 0), (2, 4, 2)), ((2, 0, 0), (5, 4, 2)), ((5, 0, 0), (6, 4, 2)))
 
 

@@ -34,7 +34,7 @@ def test_spheres():
     contacts = world_of(ball([0, 0, 0], 1.0), ball([0, 0, 1.4], 0.5)).contacts(margin=0.1)
     assert len(contacts) == 1
     assert contacts.gap[0] == pytest.approx(-0.1)
-    # into the first body, which is above
+    # Into the first body, which is above.
     np.testing.assert_allclose(contacts.frames[0, 0], [0, 0, 1])
     assert (contacts.first[0], contacts.second[0]) == (1, 0)
     np.testing.assert_allclose(contacts.point[0], [0, 0, 0.95])  # halfway between 1.0 and 0.9

@@ -178,7 +178,7 @@ def test_grids_are_laid_where_the_material_leaves_them() -> None:
     )
     assert laid.around([50, 40, 20], [51, 41, 21], first).size < first.size / module.LOOSE
     assert laid.around([0, 0, 0], [150, 90, 60]) is DOMAIN  # more than half of the domain
-    # beyond the domain
+    # Beyond the domain.
     assert laid.around([-50, 200, 0], [-40, 300, 9]).domain_counts == DOMAIN.counts
     assert Coverage(DOMAIN, follows=False).around([40, 40, 20], [41, 41, 21]) is DOMAIN
     always = Coverage(DOMAIN, always=(([90, 90, 60], [91, 91, 61]),), endless=[2])

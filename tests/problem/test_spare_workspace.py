@@ -127,7 +127,7 @@ def test_a_kept_workspace_has_the_bits_of_a_new_one(seed, monkeypatch):
     for problem in [*problems, *problems[::-1], *problems]:
         kept, new = both(problem, method, x0=x0, stopping=stopping)
         assert kept == new
-    # all except the first two, and those after a solve that does not converge
+    # All except the first two, and those after a solve that does not converge.
     assert len(taken) >= 5
 
 

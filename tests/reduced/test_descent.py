@@ -29,7 +29,7 @@ def test_pressure_far_from_air_is_that_of_the_linear_system(name):
     cells[(..., -1) if "strip" in name else (0,) * cells.ndim] = 0
     A, b = wl.GridPoisson(cells, device="cpu"), np.where(cells == 1, -1.0, 0.0)
     result, linear = wl.solve(wl.LCP(A, b)), wl.solve(wl.LCP(A, b, -np.inf))
-    # no unknown is active, and the residual rises thirtyfold on the way
+    # No unknown is active, and the residual rises thirtyfold on the way.
     assert result, result.status
     assert linear
     assert result.iterations <= 2 * linear.iterations + 6

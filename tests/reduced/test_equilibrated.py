@@ -59,7 +59,7 @@ def test_extreme_rows(kind, method):
         scaled = problem(D[:, None] * A * D, D * b, kind)
         result = wl.solve(scaled, wl.default_chain(method, scaled))
         assert result, (seed, result.status)
-        # the criterion is in units of y: it distinguishes these rows from 0
+        # The criterion is in units of y: it distinguishes these rows from 0.
         largest = D.max() / 100 < D
         np.testing.assert_array_equal(
             (result.x.numpy() * D)[largest] < 1e-3, lemke(A, b)[largest] < 1e-3

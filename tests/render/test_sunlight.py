@@ -24,7 +24,7 @@ def test_what_lies_behind_something_is_in_its_shadow():
     x, z = RNG.uniform(0.0, 1.0, (2, 4000))
     floor = np.stack([x, np.zeros(4000), z], axis=-1)
     light = sun.reaches(floor)
-    # intersection of the ray to the lamp with the plate's plane
+    # Intersection of the ray to the lamp with the plate's plane.
     through = floor + 0.5 / LIGHT[1] * LIGHT
     depth = (0.2 - np.abs(through[:, [0, 2]] - 0.5)).min(axis=1)
     assert (light[depth > 4 * WIDTH] == 0.0).all()

@@ -328,7 +328,7 @@ def test_a_plane_and_an_inverted_box_are_walls():
 
 
 def test_open_sides_have_no_wall():
-    # the bottom is open
+    # The bottom is open.
     bodies = bodies_of([Sphere(center=[0.5, 0.5], radius=0.1)], 2, open_sides=0b0100)
     run(bodies, 1.0)
     assert bodies.bodies[0].position[1] == pytest.approx(0.5 - 0.5 * G * 1.01, rel=1e-9)

@@ -302,7 +302,7 @@ def test_rotations_off_by_rounding_become_the_nearest_ones():
     off = Rotation.random(50, rng=rng).as_matrix() + 1e-9 * rng.normal(size=(50, 3, 3))
     u, _, vt = np.linalg.svd(off)
     near = orthonormal(off)
-    # it has rounding errors of its own
+    # It has rounding errors of its own.
     np.testing.assert_allclose(near, u @ vt, rtol=0.0, atol=1e-14)
     np.testing.assert_allclose(
         near @ near.swapaxes(1, 2), np.broadcast_to(np.eye(3), near.shape), rtol=0.0, atol=2e-15

@@ -208,7 +208,7 @@ def test_links_that_come_while_it_runs(scene, whole, tmp_path):
         def step(self, row: Any) -> None:
             super().step(row)
             for number, name in enumerate(names(whole) if row["step"] == 1 else ()):
-                # newer ones, which count as checkpoints
+                # Newer ones, which count as checkpoints.
                 checkpoint = name.startswith("checkpoints/step")
                 if not checkpoint and not (out / name).exists() and not (out / name).is_symlink():
                     lay(out / name, elsewhere / f"{number}")

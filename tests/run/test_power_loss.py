@@ -86,7 +86,7 @@ class Disk:
     files: dict[int, bytes] = field(default_factory=dict)
     durable: dict[int, Names] = field(default_factory=dict)
     promised: int = -1
-    # keeps files open, so that no inode number is reused
+    # Keeps files open, so that no inode number is reused.
     _held: list[int] = field(default_factory=list)
     _lock: Any = field(default_factory=threading.RLock)
     _busy: bool = False

@@ -215,7 +215,7 @@ def test_the_correction_is_symmetric_positive_definite_and_inverts_light_modes(d
         correction.begin()
         work.hierarchy.cycle.run()
         correction.end()
-        # the effect of `begin` is reverted
+        # The effect of `begin` is reverted.
         np.testing.assert_allclose(finest.b.numpy(), side, atol=1e-12)
         z.append(finest.x.numpy().copy())
     assert z[0] @ r[1] == pytest.approx(z[1] @ r[0], rel=1e-8)

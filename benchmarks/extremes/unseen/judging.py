@@ -36,15 +36,15 @@ from warp_lcp.problem.protocol import families
 FAMILY, METHODS_FAMILY = FAMILIES = ("unseen", "unseen, every method")
 # More iterations than the default, so that the count is known.
 CRITERIA: dict[str, Any] = {"rtol": 1e-6, "max_iterations": 400}
-OFTEN = (2.0, 6)  # at most 2 e + 6 iterations, where e is the count for the equations,
-OFTEN_SHARE = 0.95  # on this share of the grids,
-ALWAYS = (3.0, 6)  # and never more than 3 e + 6
+OFTEN = (2.0, 6)  # at most 2 e + 6 iterations, where e is the count for the equations
+OFTEN_SHARE = 0.95  # share of the grids on which that must hold
+ALWAYS = (3.0, 6)  # at most 3 e + 6 iterations on all grids
 WITHOUT_EQUATIONS = 100  # iterations where the equations have no solution: the default limit
 # Largest excess of a warm start's iterations on the finest grid over a cold start's c, on
 # OFTEN_SHARE of the grids; it is never more than 2 c + 6. Steps are no measure: a cold start that
 # continues with Newton's method on the grid's matrix takes fewer and longer ones.
 WARM_MORE = 1
-# statuses that no method may return for a solvable small problem
+# Statuses that no method may return for a solvable small problem.
 NO_END = (case.OUT_OF_TIME, "INFEASIBLE", "NON_FINITE")
 GAVE_UP = Promise(Expected.EITHER, HONEST | {"LOCAL_MINIMUM", "DIVERGED"})
 GRIDS_A_KIND, MATRICES_A_KIND = 18, 10
