@@ -71,14 +71,14 @@ def main(folder: Path) -> None:
     for kind, tree in trees.items():
         wheel = built(tree, "wheel", folder / f"wheel-{kind}")
         with ZipFile(wheel) as archive:
-            found = {name for name in archive.namelist() if ".dist-info/" not in name}
-        if found != expected:
+            contents = {name for name in archive.namelist() if ".dist-info/" not in name}
+        if contents != expected:
             sys.exit(
-                f"the wheel of the {kind} lacks {sorted(expected - found)} and has "
-                f"{sorted(found - expected)} besides"
+                f"the wheel of the {kind} lacks {sorted(expected - contents)} and has "
+                f"{sorted(contents - expected)} besides"
             )
     print(
-        f"{wheel.name}: {len(found)} files, all of warp_lcp; the same of a source distribution and "
+        f"{wheel.name}: {len(contents)} files, all of warp_lcp; the same of a source distribution and "
         "without symbolic links"
     )
 

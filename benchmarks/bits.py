@@ -122,7 +122,7 @@ def small_solves() -> Iterator[tuple[str, wl.LCP, Any, Any]]:
                 periodic=periodic,
                 **({} if form == "arrays" else faces),
             )
-            for made in (
+            for solver in (
                 wl.ProjectedMultigrid(),
                 wl.MinimumMapNewton(),
                 wl.MinimumMapNewton(precision="single"),
@@ -130,7 +130,7 @@ def small_solves() -> Iterator[tuple[str, wl.LCP, Any, Any]]:
                 yield (
                     f"{name} {form} {real.__name__} periodic {periodic}",
                     wl.LCP(A, b, *bounds["coded twice"]),
-                    made,
+                    solver,
                     None,
                 )
 
@@ -149,14 +149,14 @@ def other_solves() -> Iterator[tuple[str, wl.LCP, Any, Any]]:
             wl.InteriorPoint,
             wl.FischerNewton,
         ):
-            made = method(precision=precision)
+            solver = method(precision=precision)
             for kind in ("walls", "everywhere", "linear"):
-                yield f"splash 32 {kind}", splash(32).lcp(kind, device="cpu"), made, None
-            yield "cut splash 32", cut_cells(splash(32)).lcp("walls", device="cpu"), made, None
+                yield f"splash 32 {kind}", splash(32).lcp(kind, device="cpu"), solver, None
+            yield "cut splash 32", cut_cells(splash(32)).lcp("walls", device="cpu"), solver, None
             yield (
                 "closed box",
                 wl.LCP(wl.GridPoisson(box, device="cpu"), b - b.mean(), 0.0),
-                made,
+                solver,
                 None,
             )
         low = wl.LowRankOperator(columns, [100.0, 100.0], device="cpu")

@@ -112,7 +112,7 @@ class Case:
         start, turn = wp.zeros_like(b), 0
         while True:
             for warm in (False, True):
-                begun = time.perf_counter()
+                start_time = time.perf_counter()
                 result = wl.solve(
                     problem,
                     self.solver,
@@ -121,7 +121,7 @@ class Case:
                     workspace=work,
                 )
                 wp.synchronize_device(self.device)
-                yield time.perf_counter() - begun, result.iterations
+                yield time.perf_counter() - start_time, result.iterations
                 if not warm:
                     wp.copy(start, result.x)
                     turn += 1

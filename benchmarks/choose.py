@@ -156,7 +156,7 @@ def budget_choices(problem: wl.LCP, advice: Recommendation) -> dict[str, str]:
     """Return the method for each step budget, and for the memory of sweeps."""
     if advice.traits.affine:  # the method does not depend on the budget
         return {}
-    found = {
+    recommended = {
         f"{steps} steps": wl.recommend(
             problem, accuracy=RTOL, budget=wl.Budget(iterations=steps)
         ).name
@@ -164,7 +164,7 @@ def budget_choices(problem: wl.LCP, advice: Recommendation) -> dict[str, str]:
     }
     lean = memory_of("psor", advice.traits)
     return {
-        **found,
+        **recommended,
         "memory of a sweep": wl.recommend(
             problem, accuracy=RTOL, budget=wl.Budget(bytes=lean)
         ).name,

@@ -338,15 +338,15 @@ def stack(rng: np.random.Generator, seed: int) -> wl.LCP:
 def products(rng: np.random.Generator, seed: int) -> wl.LCP:
     """Return a problem whose operator offers matrix products only."""
     n = between(rng, 20, 400)
-    made = gallery.definite(
+    problem = gallery.definite(
         n, condition=10.0 ** float(rng.uniform(0, 3)), plant=plant(rng), seed=seed
     )
-    A = np.asarray(made.A)
+    A = np.asarray(problem.A)
     return wl.LCP(
         wl.LinearOperator(lambda x: A @ x, shape=(n,), symmetric=True),
-        made.b,
-        made.lower,
-        made.upper,
+        problem.b,
+        problem.lower,
+        problem.upper,
     )
 
 

@@ -86,22 +86,22 @@ def steps_of_spheres(options: Options) -> tuple[list[Record], Table]:
 
     All methods take the same step from the same state. The result of the last method is kept.
     """
-    made, timed = {}, {}
+    simulations, timed = {}, {}
     for method in METHODS:
         options.say(f"{SPHERES} spheres in a box: {method}")
-        made[method] = SIMULATOR.create(
+        simulations[method] = SIMULATOR.create(
             load_scene(spheres(method)), device=options.device, folder=Path()
         )
-        solve = made[method].bodies._solve
+        solve = simulations[method].bodies._solve
         solve._solver = timed[method] = _Timed(solve._solver)
-    last = made[METHODS[-1]]
+    last = simulations[METHODS[-1]]
     for _ in range(SETTLING):
         last.step(DT)
-    found: dict[str, dict[str, list[float]]] = {method: defaultdict(list) for method in METHODS}
+    samples: dict[str, dict[str, list[float]]] = {method: defaultdict(list) for method in METHODS}
     for number in range(-1, STEPS):  # the first step loads kernels
         state = last.state()
         for method in METHODS:
-            simulation, timed[method].seconds = made[method], 0.0
+            simulation, timed[method].seconds = simulations[method], 0.0
             simulation.restore(state)
             begun = time.perf_counter()
             row = simulation.step(DT)
@@ -117,8 +117,8 @@ def steps_of_spheres(options: Options) -> tuple[list[Record], Table]:
             }
             figures |= {"contacts": float(row["contacts"] or 0)}
             for name, value in figures.items() if number >= 0 else ():
-                found[method][name].append(value)
-    return _reported(found)
+                samples[method][name].append(value)
+    return _reported(samples)
 
 
 def _reported(found: dict[str, dict[str, list[float]]]) -> tuple[list[Record], Table]:

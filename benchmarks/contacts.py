@@ -115,10 +115,10 @@ def _scene(
         (StewartTrinkleModel(4), "LCP", LCP),
     ]
     for model, kind, methods in models:
-        given = model.problem(system)
-        if kind == "LCP" and len(given.b) > LARGEST_LCP:
+        formulation = model.problem(system)
+        if kind == "LCP" and len(formulation.b) > LARGEST_LCP:
             continue
-        problem = (given.dense() if kind == "LCP" else given).lcp(device=options.device)
+        problem = (formulation.dense() if kind == "LCP" else formulation).lcp(device=options.device)
         for label, make in methods.items():
             method, most = make(system)
             facts = {"model": kind, "scene": name, "method": label}
@@ -141,7 +141,7 @@ def _scene(
                 "linear_iterations": Figure(result.linear_iterations),
                 "seconds": Figure(result.history[-1].seconds, "s"),
                 "cone_residual": Figure(cone, "m/s"),
-                "unknowns": Figure(len(given.b)),
+                "unknowns": Figure(len(formulation.b)),
             }
             for level in (1e-3, 1e-6, 1e-10):
                 reached = next(((n, t) for n, r, t in history if r <= level), None)

@@ -63,10 +63,10 @@ def main() -> None:
         help="grids of PETSc, 5 x 7 nodes the coarsest: 11 are 4097 x 6145",
     )
     parser.add_argument("--repeat", type=int, default=REPEAT)
-    given, python = parser.parse_args(), interpreter()
-    nx, ny = ((n - 1) * 2 ** (given.levels - 1) + 1 for n in COARSEST)
+    arguments, python = parser.parse_args(), interpreter()
+    nx, ny = ((n - 1) * 2 ** (arguments.levels - 1) + 1 for n in COARSEST)
     ours(65, 97)  # loads the kernels
-    for _ in range(given.repeat):
+    for _ in range(arguments.repeat):
         seconds, status, steps, norm = ours(nx, ny)
         line = (
             f"{nx} x {ny} nodes to {RTOL:g}: ours {seconds:.2f} s, {status}, {steps} steps, |w| "
@@ -74,7 +74,7 @@ def main() -> None:
         )
         if python is None:
             sys.exit(f"{line}; {missing()}")
-        peer = theirs(python, given.levels)
+        peer = theirs(python, arguments.levels)
         last = peer["steps"][-1][2:4]  # type: ignore[index]
         line += f"; PETSc {peer['version']} {peer['seconds']:.2f} s, {last}, |w| {peer['norm']:.9g}"
         sys.stdout.write(f"{line}; ratio {peer['seconds'] / seconds:.1f}\n")  # type: ignore[operator]

@@ -196,7 +196,7 @@ def _flight_table(record: Record) -> Table:
 def _targets(records: list[Record]) -> Table:
     by_name = {record.name: record for record in records}
     times = {n: by_name[f"{n}^3"].figures["ratio"] for n in TIME_LIMITS if f"{n}^3" in by_name}
-    found = [
+    targets = [
         Target(f"{n}^3 over {SIDE}^3, a step", TIME_LIMITS[n], ratio, " x")
         for n, ratio in times.items()
     ]
@@ -204,12 +204,12 @@ def _targets(records: list[Record]) -> Table:
         growth = (
             by_name["192^3"].figures["memory"].value / by_name[f"{SIDE}^3"].figures["memory"].value
         )
-        found.append(Target(f"192^3 over {SIDE}^3, memory", GROWTH_LIMIT, Figure(growth), " x"))
+        targets.append(Target(f"192^3 over {SIDE}^3, memory", GROWTH_LIMIT, Figure(growth), " x"))
     if "768^3" in by_name:
-        found.append(
+        targets.append(
             Target("768^3, memory", MEMORY_LIMIT, by_name["768^3"].figures["memory"], " MB")
         )
-    found.append(
+    targets.append(
         Target("laying grids, share of a step", LAYING_LIMIT, records[-1].figures["laying"], " %")
     )
-    return table_of_targets("of large domains", found)
+    return table_of_targets("of large domains", targets)

@@ -53,13 +53,13 @@ def measure(scene: str, duration: float) -> None:
     """Print the ratios of a scene's runs."""
     work, seconds = (by_command, by_program, by_command), []
     for _ in range(TURNS + 1):
-        taken = []
+        turn_seconds = []
         for run in work:
             with tempfile.TemporaryDirectory() as folder:
                 begun = time.process_time()
                 run(scene, Path(folder) / "run", duration)
-                taken.append(time.process_time() - begun)
-        seconds.append(taken)
+                turn_seconds.append(time.process_time() - begun)
+        seconds.append(turn_seconds)
     first, driven, again = np.transpose(seconds[1:])  # the first turn loads kernels
     sys.stdout.write(
         f"{scene}, {duration:g} s, {first.mean():.2f} s of the processor, {TURNS} turns:\n"

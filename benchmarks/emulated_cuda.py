@@ -267,17 +267,17 @@ def compared(invoke):
     """
 
     def launch(kernel, hooks, params, adjoint):
-        found = {}
+        arrays = {}
         for argument, value in zip(kernel.adj.args, params[1:], strict=False):
-            arrays_of(value, argument.type, found)
-        before = {address: ctypes.string_at(address, size) for address, (size, _) in found.items()}
+            arrays_of(value, argument.type, arrays)
+        before = {address: ctypes.string_at(address, size) for address, (size, _) in arrays.items()}
         after = []
         for order.value in (*({0, 1, 2} - {ORDER}), ORDER):
             for address, data in before.items():
                 ctypes.memmove(address, data, len(data))
             invoke(kernel, hooks, params, adjoint)
             after.append(
-                {address: ctypes.string_at(address, size) for address, (size, _) in found.items()}
+                {address: ctypes.string_at(address, size) for address, (size, _) in arrays.items()}
             )
         # The hash of a module with arguments in memory is no part of the name.
         name = f"{kernel.module.name.partition('.memory.')[0]}:{kernel.key}"
@@ -317,12 +317,17 @@ def checked_by_cells(invoke):
             invoke(kernel, hooks, params, adjoint)
             return
         counts = meter.copy()
-        found, (_, rows, given), columns, twin = {}, params, form.declared.found, form.by_cells
-        arrays_of(given, kernel.adj.args[1].type, found)
-        for address in {given.out.data} if columns else ():
-            found.pop(address, None)  # the two forms have different places of sums
+        arrays, (_, rows, kernel_args), columns, twin = (
+            {},
+            params,
+            form.declared.found,
+            form.by_cells,
+        )
+        arrays_of(kernel_args, kernel.adj.args[1].type, arrays)
+        for address in {kernel_args.out.data} if columns else ():
+            arrays.pop(address, None)  # the two forms have different places of sums
         native, cells = (
-            twin.native.from_buffer_copy(bytes(given)),
+            twin.native.from_buffer_copy(bytes(kernel_args)),
             type(rows).from_buffer_copy(rows),
         )
         cells.grain, cells.chunks = 1, cells.nx
@@ -332,10 +337,10 @@ def checked_by_cells(invoke):
             native.out = out.__ctype__()
         by_cells, arguments = layout.copy_of(layout.BLANK), object.__new__(twin._struct)
         vars(by_cells)["_ctype"], vars(arguments)["_ctype"] = cells, native
-        before = {address: ctypes.string_at(address, size) for address, (size, _) in found.items()}
+        before = {address: ctypes.string_at(address, size) for address, (size, _) in arrays.items()}
         wp.launch(twin.kernel, dims, [by_cells, arguments], device="cpu", block_dim=1)
         expected = {
-            address: ctypes.string_at(address, size) for address, (size, _) in found.items()
+            address: ctypes.string_at(address, size) for address, (size, _) in arrays.items()
         }
         for address, data in before.items():
             ctypes.memmove(address, data, len(data))
@@ -346,12 +351,12 @@ def checked_by_cells(invoke):
         name = " ".join([form.declared.name, *form.words])
         launched_by_cells[name] += 1
         otherwise[name] += not all(
-            equal_bits(ctypes.string_at(a, len(data)), data, found[a][1])
+            equal_bits(ctypes.string_at(a, len(data)), data, arrays[a][1])
             for a, data in expected.items()
         )
         if columns:
             count = len(columns) * math.prod(layout.threads(rows))
-            sums = np.frombuffer(ctypes.string_at(given.out.data, 8 * count)).reshape(
+            sums = np.frombuffer(ctypes.string_at(kernel_args.out.data, 8 * count)).reshape(
                 len(columns), -1
             )
             for column, one, other in zip(

@@ -30,24 +30,24 @@ def membrane(
     square = sum(
         ((q - n / 2) / (0.3 * n)) ** 2 for q, n in zip(np.indices(shape), shape, strict=True)
     )
-    given: dict[str, Any] = {}
+    coefficients: dict[str, Any] = {}
     for axis in range(len(shape) if faces else 0):
         face = list(shape)
         face[-1 - axis] += 1
-        given[f"face_{'xyz'[axis]}"] = rng.uniform(0.5, 2.0, face)
+        coefficients[f"face_{'xyz'[axis]}"] = rng.uniform(0.5, 2.0, face)
     obstacle = np.where(square < 1, 0.5 * np.sqrt(np.maximum(1 - square, 0.0)), -1.0)
     return (
-        wl.GridPoisson(cells, device="cpu", **given),
+        wl.GridPoisson(cells, device="cpu", **coefficients),
         cells,
         np.full(shape, 20.0 / shape[0] ** 2),
         obstacle,
-        given,
+        coefficients,
     )
 
 
 def measure(shape: tuple[int, ...], faces: bool, rtol: float) -> None:
     """Print median times of a linear solve and of `wl.vjp`, and their median ratio."""
-    A, cells, load, obstacle, given = membrane(shape, faces)
+    A, cells, load, obstacle, coefficients = membrane(shape, faces)
     problem, tight, stopping = (
         wl.LCP(A, load, lower=obstacle),
         wl.StoppingCriteria(rtol=1e-10),
@@ -62,7 +62,7 @@ def measure(shape: tuple[int, ...], faces: bool, rtol: float) -> None:
     right = np.where(open_cells == wl.FLUID, g, 0.0)
 
     def linear() -> np.ndarray:
-        block = wl.GridPoisson(open_cells, device="cpu", **given)
+        block = wl.GridPoisson(open_cells, device="cpu", **coefficients)
         return wl.solve(wl.LCP(block, right, -np.inf), stopping=stopping).x.numpy()
 
     work = {

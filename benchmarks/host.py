@@ -234,14 +234,14 @@ class StepRecorder:
 def measure(options: Options, out: Path) -> Results:
     """Measure steps of each scene."""
     scenes = [options.scene] if options.scene else SCENES
-    found: dict[str, list[Record]] = {}
+    by_scene: dict[str, list[Record]] = {}
     for name in scenes:
         for size in options.sizes or (RESOLUTION,):
             options.say(f"{name}, {size} cells")
-            found[f"{name}, {size} cells"] = scene_records(
+            by_scene[f"{name}, {size} cells"] = scene_records(
                 name, size, options.device, STEPS, options.repeat
             )
-    return results(found, machine(options.device, elements=1 << 22, repeat=options.repeat))
+    return results(by_scene, machine(options.device, elements=1 << 22, repeat=options.repeat))
 
 
 def scene_records(name: str, resolution: int, device: str, steps: int, rounds: int) -> list[Record]:
@@ -377,28 +377,30 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--out", type=Path, help="folder of host.json, host.md and host-stages.png")
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     wp.config.log_level = wp.LOG_ERROR
-    found = {}
+    by_scene = {}
     try:
-        wl.set_threads(given.threads)
-        for name in given.scene or SCENES:
-            label = f"{name}, {given.resolution} cells"
-            found[label] = scene_records(name, given.resolution, "cpu", given.steps, given.rounds)
+        wl.set_threads(arguments.threads)
+        for name in arguments.scene or SCENES:
+            label = f"{name}, {arguments.resolution} cells"
+            by_scene[label] = scene_records(
+                name, arguments.resolution, "cpu", arguments.steps, arguments.rounds
+            )
             for line in [
                 f"## {label}",
                 "",
-                *markdown(results({label: found[label]}).tables[0]),
+                *markdown(results({label: by_scene[label]}).tables[0]),
                 "",
             ]:
                 sys.stdout.write(f"{line}\n")
             sys.stdout.flush()
     except ValueError as error:
         parser.error(str(error))
-    if given.out:
-        given.out.mkdir(parents=True, exist_ok=True)
+    if arguments.out:
+        arguments.out.mkdir(parents=True, exist_ok=True)
         for line in write(
-            "host", TITLE, results(found, machine("cpu", elements=1 << 22)), given.out
+            "host", TITLE, results(by_scene, machine("cpu", elements=1 << 22)), arguments.out
         ):
             sys.stdout.write(f"{line}\n")
 

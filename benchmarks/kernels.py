@@ -137,9 +137,9 @@ def _measure_form(n: int, form: str, options: Options) -> list[Record]:
     Copies and the peers take part in the rounds.
     """
     device = options.device
-    heard, product = _hear(_basin(n, form), device)
+    passes, product = _hear(_basin(n, form), device)
     a, b = (wp.full(min(COPIED, 64 * n**3), 1.0, dtype=wp.float32, device=device) for _ in range(2))
-    kernels = [(name, _synchronized(one.bound.launch, device)) for name, one in heard.items()]
+    kernels = [(name, _synchronized(one.bound.launch, device)) for name, one in passes.items()]
     peers = _peers(product, n, device) if form == "unit" else {}
     work: dict[str, Callable[[], None]] = {}
     for third in range(COPIES):  # spread over a round, which takes seconds at 256^3
@@ -163,7 +163,7 @@ def _measure_form(n: int, form: str, options: Options) -> list[Record]:
         for taken in zip(*(times[f"copy {third}"] for third in range(COPIES)), strict=True)
     ]
     records = []
-    for key, one in heard.items():
+    for key, one in passes.items():
         role = "set-up" if key.startswith(SET_UP) else "serial" if key.startswith(SERIAL) else "hot"
         with_peers = one is product and bool(peers)
         taken, copied = (apart["product"], own) if with_peers else (times[key], copying)
@@ -216,7 +216,7 @@ def _hear(scene: Splash, device: str) -> tuple[dict[str, Heard], Heard]:
 
     Each pass has a unique label. The float32 product among them is returned as well.
     """
-    heard: list[Heard] = []
+    recorded: list[Heard] = []
     bind = RowPass.bind
 
     def listening(
@@ -239,7 +239,7 @@ def _hear(scene: Splash, device: str) -> tuple[dict[str, Heard], Heard]:
             for name, value in zip(("lower", "", "upper", "", "code"), bounds or (), strict=False)
             if name
         }
-        heard.append(Heard(bound, fields))
+        recorded.append(Heard(bound, fields))
         return bound
 
     with mock.patch.object(RowPass, "bind", listening):
@@ -260,7 +260,7 @@ def _hear(scene: Splash, device: str) -> tuple[dict[str, Heard], Heard]:
         x = wp.array(np.random.default_rng(7).random(A.layout.size, np.float32), device=device)
         A.stencil.product(x, wp.zeros_like(x))
     kinds: dict[str, Heard] = {}
-    for one in heard:
+    for one in recorded:
         declared = one.bound.form.declared
         alone = not declared.name.startswith(
             "components."
@@ -275,7 +275,7 @@ def _hear(scene: Splash, device: str) -> tuple[dict[str, Heard], Heard]:
             and not declared.listed
         ):
             kinds.setdefault(one.name, one)
-    return kinds, kinds[heard[-1].name]
+    return kinds, kinds[recorded[-1].name]
 
 
 def _peers(product: Heard, n: int, device: str) -> dict[str, Callable[[], None]]:

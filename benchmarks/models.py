@@ -285,7 +285,7 @@ def records_of(simulator: str, dimension: int, options: Options) -> list[Record]
         "cell_bytes": Figure(base.bytes / cells, "B"),
     }
     facts = {"cells": cells, "particles": particles}
-    found = [Record(f"{simulator} {dimension}d: base", figures, facts)]
+    records = [Record(f"{simulator} {dimension}d: base", figures, facts)]
     for name, offer in offers(simulator, dimension).items():
         on, off, many = str(offer.on), str(offer.off), {"cell": cells, "particle": particles}
         added, added_half = (
@@ -301,10 +301,10 @@ def records_of(simulator: str, dimension: int, options: Options) -> list[Record]
                 (samples[on].bytes - samples[off].bytes) / many[offer.unit] / offer.count, "B"
             ),
         }
-        found.append(
+        records.append(
             Record(f"{simulator} {dimension}d: {name}", figures, facts | {"frames": offer.frames})
         )
-    return found
+    return records
 
 
 def measure(options: Options, out: Path) -> Results:
@@ -417,8 +417,10 @@ def main() -> None:
     parser.add_argument("--repeat", type=int, default=5)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--page", type=Path, default=Path("docs/models.md"))
-    given = parser.parse_args()
-    options = Options(given.device, (), given.repeat, lambda text: sys.stderr.write(f"{text}\n"))
+    arguments = parser.parse_args()
+    options = Options(
+        arguments.device, (), arguments.repeat, lambda text: sys.stderr.write(f"{text}\n")
+    )
     results = measure(options, Path())
     head = (
         "# What models add to a step and to memory, by simulator and dimension; written by "
@@ -427,7 +429,7 @@ def main() -> None:
     Path(str(files("warp_lcp.scene") / TABLE)).write_text(
         head + tomli_w.dumps(price_list(results.records)), "utf-8"
     )
-    write_page(given.page, results)
+    write_page(arguments.page, results)
 
 
 if __name__ == "__main__":

@@ -149,7 +149,7 @@ def main() -> None:
         simulation.step(simulation.stable_dt())
     traffic.bytes.clear()
     traffic.times.clear()
-    begun = time.process_time()
+    start_time = time.process_time()
     rows = [simulation.step(simulation.stable_dt()) for _ in range(STEPS)]
     part: Any = simulation.grid.part
     box = part.box.counts
@@ -159,8 +159,8 @@ def main() -> None:
         for side in range(2)
         if part.cuts >> 2 * axis + side & 1
     )
-    seconds = (time.process_time() - begun) / STEPS
-    found = {
+    seconds = (time.process_time() - start_time) / STEPS
+    figures = {
         "cells of the box": part.box.cells,
         "cells stored": part.grid.size,
         "particles": simulation.particles.count,
@@ -171,7 +171,7 @@ def main() -> None:
         **{f"{kind}: bytes a step": size / STEPS for kind, size in sorted(traffic.bytes.items())},
         **{f"{kind}: times a step": count / STEPS for kind, count in sorted(traffic.times.items())},
     }
-    most = ranks.max(np.array([*found.values()], dtype=float))
+    most = ranks.max(np.array([*figures.values()], dtype=float))
     if ranks.is_root:
         counts = [key for key in ("solve_iterations", "density_iterations") if key in rows[0]]
         solves = [f"{np.mean([row[key] or 0 for row in rows]):.1f} {key}" for key in counts]
@@ -179,7 +179,7 @@ def main() -> None:
             f"{name} {' '.join(overrides)}, {ranks.size} ranks, {cpu_model()}; a step: "
             f"{', '.join(solves)}"
         )
-        for key, value in zip(found, most, strict=True):
+        for key, value in zip(figures, most, strict=True):
             print(f"{value:14,.1f}  {key}")
 
 

@@ -217,7 +217,7 @@ def measure(options: Options, out: Path) -> Results:
         raise SystemExit(WRONG_INPUT)
     else:
         records = [record for count in RANKS for record in _started(count, sizes, options)]
-    found = {
+    by_case = {
         (r.facts["n"], r.facts["bounds"], r.facts["ranks"]): r
         for r in records
         if "boxes" in r.facts
@@ -227,16 +227,19 @@ def measure(options: Options, out: Path) -> Results:
         elements=1 << 22,
         repeat=options.repeat,
     )
-    charts = [] if launch.rank_here() is not None else [_chart(found, sizes)]
+    charts = [] if launch.rank_here() is not None else [_chart(by_case, sizes)]
     return Results(
-        [where, *records], [targets(found, sizes), _table(found)], list(charts), _failures(records)
+        [where, *records],
+        [targets(by_case, sizes), _table(by_case)],
+        list(charts),
+        _failures(records),
     )
 
 
 def _started(count: int, sizes: Sequence[int], options: Options) -> list[Record]:
     """Start so many ranks and measure on them."""
     with tempfile.TemporaryDirectory() as folder:
-        asked = [
+        suite_options = [
             *(part for n in sizes for part in ("--size", str(n))),
             "--repeat",
             str(options.repeat),
@@ -247,7 +250,7 @@ def _started(count: int, sizes: Sequence[int], options: Options) -> list[Record]
             "-m",
             "warp_lcp.benchmarks",
             "ranks",
-            *asked,
+            *suite_options,
             "--repeat",
             str(options.repeat),
             "--device",

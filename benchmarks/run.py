@@ -235,14 +235,14 @@ def _particles(size: int, options: Options) -> Record:
     with timed(options.device, STAGES) as seconds:
         for _ in range(PARTICLE_STEPS + 1):
             simulation.step(min(simulation.stable_dt(), scene.time.dt_max))
-    there, back = seconds["to grid"][1:], seconds["to particles"][1:]
+    to_grid, back = seconds["to grid"][1:], seconds["to particles"][1:]
     figures = {"particles": Figure(count)}
     figures |= {
         label: Figure.of([1e9 * t / count for t in times], "ns")
-        for label, times in (("to_grid", there), ("to_particles", back))
+        for label, times in (("to_grid", to_grid), ("to_particles", back))
     }
     figures["round_trip"] = Figure.of(
-        [1e9 * (a + b) / count for a, b in zip(there, back, strict=True)], "ns"
+        [1e9 * (a + b) / count for a, b in zip(to_grid, back, strict=True)], "ns"
     )
     figures["advection"] = Figure.of([1e9 * t / count for t in seconds["advection"][1:]], "ns")
     return Record("particles, 3-D", figures)

@@ -165,25 +165,25 @@ def _methods(
             _step(simulation)
         state = simulation.state()
         seconds: dict[str, list[float]] = {name: [] for name in METHODS}
-        found: dict[str, _Taken] = {}
+        solves: dict[str, _Taken] = {}
         for turn in range(options.repeat + 1):  # the first turn loads kernels
             for name in METHODS:
-                taken = _solve(simulation, state, name, TOLERANCE, MOST)
-                found[name] = taken
+                solve = _solve(simulation, state, name, TOLERANCE, MOST)
+                solves[name] = solve
                 if turn > 0:
-                    seconds[name].append(taken.seconds)
+                    seconds[name].append(solve.seconds)
         base = seconds["interleaved-sweeps"]
-        for name, taken in found.items():
-            assert taken.outcome is not None
+        for name, solve in solves.items():
+            assert solve.outcome is not None
             ratios = [a / b for a, b in zip(seconds[name], base, strict=True)]
             figures = {
                 "seconds": Figure.of(seconds[name], "s"),
                 "ratio": Figure.of(ratios),
-                "iterations": Figure(taken.outcome.iterations),
-                "residual": Figure(taken.residual),
+                "iterations": Figure(solve.outcome.iterations),
+                "residual": Figure(solve.residual),
             }
             records.append(
-                Record(f"{label}: {name}", figures, {"status": taken.outcome.status.name})
+                Record(f"{label}: {name}", figures, {"status": solve.outcome.status.name})
             )
             if label == "mid-flow":
                 curves[name] = _curve(simulation, state, name)

@@ -97,17 +97,19 @@ class Growing:
         n = self.scene.n
         case = Case("unit", self.scene, self.bounds, wl.ProjectedMultigrid(), self.device)
         case.memory()
-        figures = {name: Figure.of(taken, "s") for name, taken in self.samples.items() if taken}
+        figures = {
+            name: Figure.of(samples, "s") for name, samples in self.samples.items() if samples
+        }
         figures |= {name: Figure(value) for name, value in self.counts.items()}
         figures |= {
             "unknowns": Figure(self.unknowns),
             "bytes_per_cell": Figure(case.counts["bytes_per_cell"], "B"),
         }
-        taken = self.samples["to_1e-06"]
-        if taken:
-            figures["per_cell"] = Figure.of([1e9 * t / n**3 for t in taken], "ns")
+        samples = self.samples["to_1e-06"]
+        if samples:
+            figures["per_cell"] = Figure.of([1e9 * t / n**3 for t in samples], "ns")
             figures["in_copies"] = Figure.of(
-                [t * copying * 1e9 / (FIELD_BYTES * n**3) for t in taken]
+                [t * copying * 1e9 / (FIELD_BYTES * n**3) for t in samples]
             )
         return Record(f"{n}^3 {self.bounds}", figures, {"n": n, "bounds": self.bounds})
 
@@ -331,13 +333,13 @@ def _failures(floors: Sequence[Record]) -> list[str]:
     """Return failures of mixed precision, and solves with a wrong reported residual."""
     lines = []
     for r in floors:
-        own, told = r.figures["floor"].value, r.figures["told"].value
+        own, reported = r.figures["floor"].value, r.figures["told"].value
         if r.facts["precision"] == "mixed" and own > REACHED:
             lines.append(f"{r.name}: ends at {own:.2e}")
         # At the floor x has few significant digits: rounding errors of two orders of summation
         # differ by a share of the floor itself.
-        if not math.isclose(own, told, rel_tol=0.5):
-            lines.append(f"{r.name}: the solve tells {told:.2e}, x has {own:.2e}")
+        if not math.isclose(own, reported, rel_tol=0.5):
+            lines.append(f"{r.name}: the solve tells {reported:.2e}, x has {own:.2e}")
     return lines
 
 

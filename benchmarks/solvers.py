@@ -176,14 +176,14 @@ def _records(
                 {"form": case.form, "bounds": case.bounds, "method": method, "n": n},
             )
         )
-    for name, given in answers.items():
+    for name, solutions in answers.items():
         figures = {
-            part: Figure.of([getattr(a, part) for a in given], "s")
+            part: Figure.of([getattr(a, part) for a in solutions], "s")
             for part in ("setup", "solve", "total")
         }
         figures |= {
-            "iterations": Figure(given[-1].iterations),
-            "residual": Figure(question.residual(given[-1].x)),
+            "iterations": Figure(solutions[-1].iterations),
+            "residual": Figure(question.residual(solutions[-1].x)),
         }
         records.append(
             Record(

@@ -53,13 +53,13 @@ def measure(options: Options, out: Path) -> Results:
 
 def ours(problem: SparseProblem, device: str) -> tuple[float, wl.SolveResult]:
     """Return the seconds of a cold solve, operator and LCP included, and its result."""
-    begun = time.perf_counter()
+    start_time = time.perf_counter()
     A = wl.SparseOperator(problem.A, device=device, near_null_space=problem.near_null_space)
     result = wl.solve(
         wl.LCP(A, problem.b, problem.lower),
         stopping=wl.StoppingCriteria(rtol=RTOL, max_iterations=300),
     )
-    return time.perf_counter() - begun, result
+    return time.perf_counter() - start_time, result
 
 
 def pyamg_solvers(problem: SparseProblem) -> dict[str, Callable[[], float]]:
@@ -67,15 +67,15 @@ def pyamg_solvers(problem: SparseProblem) -> dict[str, Callable[[], float]]:
 
     Each returns the seconds of set-up and solve, inf if it fails.
     """
-    found: dict[str, Callable[[], float]] = {}
+    solvers: dict[str, Callable[[], float]] = {}
     for build in BUILDS:
         for accel in ("cg",) if problem.symmetric else ("gmres", "bicgstab"):
             # Ruge-Stuben divides by zero on elastic blocks.
             if problem.near_null_space is None or build != "ruge_stuben_solver":
-                found[f"{build.removesuffix('_solver')} {accel}"] = partial(
+                solvers[f"{build.removesuffix('_solver')} {accel}"] = partial(
                     _pyamg, problem, build, accel
                 )
-    return found
+    return solvers
 
 
 def _pyamg(problem: SparseProblem, build: str, accel: str) -> float:
@@ -87,13 +87,13 @@ def _pyamg(problem: SparseProblem, build: str, accel: str) -> float:
     )
     if problem.near_null_space is not None:
         A, settings = A.tobsr((2, 2)), {"B": problem.near_null_space}
-    begun = time.perf_counter()
+    start_time = time.perf_counter()
     with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
         warnings.simplefilter("ignore")
         solver = getattr(pyamg, build)(A, **settings)
         # GMRES tests the preconditioned residual and so ends early, to PyAMG's advantage.
         x = solver.solve(-problem.b, tol=RTOL, accel=accel, maxiter=ITERATIONS)
-    seconds = time.perf_counter() - begun
+    seconds = time.perf_counter() - start_time
     return (
         seconds
         if np.linalg.norm(A @ x + problem.b) <= 1e3 * RTOL * np.linalg.norm(problem.b)

@@ -156,11 +156,11 @@ def numbered_at_random(kind: str, n: int, seed: int) -> SparseProblem:
     The unknowns of an elastic node stay together.
     """
     rng = np.random.default_rng(seed)
-    made, block = FAMILY[kind](n, rng), 2 if kind == "elastic" else 1
-    order = (block * rng.permutation(len(made.b) // block)[:, None] + np.arange(block)).ravel()
-    A = made.A[order][:, order].tocsr()
+    problem, block = FAMILY[kind](n, rng), 2 if kind == "elastic" else 1
+    order = (block * rng.permutation(len(problem.b) // block)[:, None] + np.arange(block)).ravel()
+    A = problem.A[order][:, order].tocsr()
     A.sort_indices()
     # PyAMG does not combine other index types with its own.
     A.indptr, A.indices = A.indptr.astype(np.int32), A.indices.astype(np.int32)
-    B = None if made.near_null_space is None else made.near_null_space[order]
-    return SparseProblem(A, made.b[order], made.lower[order], B, made.symmetric)
+    B = None if problem.near_null_space is None else problem.near_null_space[order]
+    return SparseProblem(A, problem.b[order], problem.lower[order], B, problem.symmetric)

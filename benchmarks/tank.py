@@ -119,13 +119,13 @@ class Tank:
 
         Only the lowest rows are written.
         """
-        made = tuple(
+        fields = tuple(
             np.zeros((self.n,) * 3, dtype=kind) for kind in (np.int8, np.float64, np.float64)
         )
         for k in range(self.n):
-            for whole, part in zip(made, self.plane(k), strict=True):
+            for whole, part in zip(fields, self.plane(k), strict=True):
                 whole[k, : self.rows] = part
-        return made[0], made[1], made[2]
+        return fields[0], fields[1], fields[2]
 
     def residuals(self, x: np.ndarray) -> tuple[float, float]:
         """Return the norms of the natural residual at x and at 0.
@@ -215,9 +215,9 @@ def _solve(tank: Tank, samples: dict[str, list[float]], counts: dict[str, float]
     The arrays are freed when the problem is made.
     """
     forget_peak()
-    begun = resident_bytes()
+    start_time = resident_bytes()
     cells, b, lower = tank.arrays()
-    given = resident_bytes() - begun
+    input_bytes = resident_bytes() - start_time
     times = [time.perf_counter()]
     A = wl.GridPoisson(cells, device="cpu")
     times.append(time.perf_counter())
@@ -229,9 +229,9 @@ def _solve(tank: Tank, samples: dict[str, list[float]], counts: dict[str, float]
     result = wl.solve(problem, wl.ProjectedMultigrid(), stopping=STOPPING, workspace=work)
     times.append(time.perf_counter())
     for name, size in (
-        ("given", given),
-        ("peak", resident_bytes(peak=True) - begun),
-        ("kept", resident_bytes() - begun),
+        ("given", input_bytes),
+        ("peak", resident_bytes(peak=True) - start_time),
+        ("kept", resident_bytes() - start_time),
     ):
         samples[name].append(1e-9 * size)
     for part, (start, end) in zip(

@@ -61,12 +61,12 @@ def measure(options: Options, out: Path) -> Results:
         for label, group in _groups(options.sizes or SIZES):
             options.say(label)
             made = {count: group(count) for count in counts}
-            others = [made[1], *(group(1) for _ in range(counts[-1] - 1))]
+            copies = [made[1], *(group(1) for _ in range(counts[-1] - 1))]
             for name in made[1]:
                 work = {str(count): _on(count, made[count][name]) for count in counts}
                 if name in TURNS:
                     work["apart"] = _on(
-                        1, partial(_at_once, [other[name] for other in others], TURNS[name])
+                        1, partial(_at_once, [other[name] for other in copies], TURNS[name])
                     )
                 times = in_turns(work, options.repeat)
                 figures = {
@@ -74,7 +74,7 @@ def measure(options: Options, out: Path) -> Results:
                 }
                 if "apart" in times:
                     figures["apart"] = ratios(
-                        [len(others) * TURNS[name] * t for t in times["1"]], times["apart"]
+                        [len(copies) * TURNS[name] * t for t in times["1"]], times["apart"]
                     )
                 records.append(
                     Record(
@@ -153,9 +153,9 @@ class _Grid:
     def work(self, count: int) -> Work:
         """Return the measured functions by name."""
         wl.set_threads(count)
-        kept: Any = wl.ProjectedMultigrid().init(self.problem)
-        wl.solve(self.problem, wl.ProjectedMultigrid(), stopping=STOPPING, workspace=kept)
-        hierarchy: Hierarchy = kept.hierarchy
+        workspace: Any = wl.ProjectedMultigrid().init(self.problem)
+        wl.solve(self.problem, wl.ProjectedMultigrid(), stopping=STOPPING, workspace=workspace)
+        hierarchy: Hierarchy = workspace.hierarchy
         fine, coarse = hierarchy.levels[:2]
         sweep = fine.sweeping(fine.t, fine.x, 0.5, projected=False)
         return {
@@ -169,7 +169,7 @@ class _Grid:
             "restriction": _program(fine.restricting(coarse).launch),
             "cycle": hierarchy.cycle.run,
             "steps of a solve": lambda: wl.solve(
-                self.problem, wl.ProjectedMultigrid(), stopping=STOPPING, workspace=kept
+                self.problem, wl.ProjectedMultigrid(), stopping=STOPPING, workspace=workspace
             ),
             "solve, cold": lambda: wl.solve(
                 self.problem, wl.ProjectedMultigrid(), stopping=STOPPING

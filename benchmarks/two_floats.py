@@ -191,22 +191,27 @@ def evaluated(problem: wl.LCP, way: str, x: np.ndarray) -> np.ndarray:
         for v in (layout.load(x, F64).numpy(), problem.b.numpy())
     ]
     parts = [wp.array(part, dtype=real, device="cpu") for pair in pairs for part in pair]
-    given = {
+    kernel_args = {
         "row": stencil.padding.row,
         "plane": stencil.padding.plane,
         "d": stencil.d,
         "code": problem.bounds.code,
     }
-    given |= dict(
+    kernel_args |= dict(
         zip(
             (*FIELDS, *NUMBERS),
             (*parts, stencil.unit, *stencil.coefficients, *problem.bounds.values),
             strict=True,
         )
     )
-    given |= {"unknown": problem.unknown, "r": wp.zeros_like(parts[0])}
-    wp.launch(kernel, x.shape, [put(Given(), given)], device="cpu")
-    return given["r"].numpy().reshape(layout.stored_shape)[1:-1, 1:-1, 1:-1].astype(np.longdouble)
+    kernel_args |= {"unknown": problem.unknown, "r": wp.zeros_like(parts[0])}
+    wp.launch(kernel, x.shape, [put(Given(), kernel_args)], device="cpu")
+    return (
+        kernel_args["r"]
+        .numpy()
+        .reshape(layout.stored_shape)[1:-1, 1:-1, 1:-1]
+        .astype(np.longdouble)
+    )
 
 
 def exact_residual(scene: Splash, x: np.ndarray) -> np.ndarray:
@@ -240,12 +245,12 @@ def compare() -> None:
         scene = splash(n)
         problem = scene.lcp("walls", device="cpu")
         for rtol in TOLERANCES:
-            found = wl.solve(
+            result = wl.solve(
                 problem, wl.ProjectedMultigrid(), stopping=wl.StoppingCriteria(rtol=rtol)
             )
             x, norm = (
-                found.x.numpy(),
-                lambda r, unit=found.history[0].residual: float(np.linalg.norm(r.ravel()) / unit),
+                result.x.numpy(),
+                lambda r, unit=result.history[0].residual: float(np.linalg.norm(r.ravel()) / unit),
             )
             residuals, exact = (
                 [evaluated(problem, way, x) for way in WAYS],
@@ -255,8 +260,8 @@ def compare() -> None:
                 [
                     f"{n}^3",
                     f"{rtol:.0e}",
-                    found.status.name,
-                    found.iterations,
+                    result.status.name,
+                    result.iterations,
                     *map(norm, residuals),
                     norm(exact),
                 ]

@@ -58,9 +58,9 @@ def viscous(simulation: LiquidSimulation) -> tuple[float, int]:
     wave(simulation)
     projection = simulation.projection
     projection.contact.fill_(1)
-    begun = time.process_time()
+    start_time = time.process_time()
     assert simulation.viscosity is not None
-    found = simulation.viscosity.solve(
+    result = simulation.viscosity.solve(
         simulation.velocity,
         simulation.grid.everywhere,
         projection.kind,
@@ -68,8 +68,8 @@ def viscous(simulation: LiquidSimulation) -> tuple[float, int]:
         DT,
         1.0,
     )
-    assert found.converged, "the viscous solve must reach its tolerance"
-    return time.process_time() - begun, found.iterations
+    assert result.converged, "the viscous solve must reach its tolerance"
+    return time.process_time() - start_time, result.iterations
 
 
 def pressure(simulation: LiquidSimulation) -> tuple[float, int]:

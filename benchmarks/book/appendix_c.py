@@ -270,19 +270,19 @@ def _lambda(results: Results, problems: dict[str, list[Problem]], options: Optio
             options.say(f"book: lambda, {kind}, {label}")
             row, name = [kind, label], f"{kind}, {label}"
             for share in SHARES:
-                found = outcome(
+                solves = outcome(
                     f"lambda: {name}: {share:g}",
                     few,
                     replace(solver, fischer_weight=share),
                     Merit.FISCHER,
                     options.device,
                 )
-                results.records.append(found.record())
-                row.append(found.share)
-                solved.setdefault(name, (SHARES, []))[1].append(100 * len(found.solved) / len(few))
-                if found.solved:
+                results.records.append(solves.record())
+                row.append(solves.share)
+                solved.setdefault(name, (SHARES, []))[1].append(100 * len(solves.solved) / len(few))
+                if solves.solved:
                     steps.setdefault(name, ([], []))[0].append(share)
-                    steps[name][1].append(statistics.fmean(found.solved))
+                    steps[name][1].append(statistics.fmean(solves.solved))
             rows.append(row)
     remark = (
         f"Problems solved to {RTOL:g} within 100 steps, and the mean of their steps. 1 is the "

@@ -80,13 +80,17 @@ def measure(results: Results, scale: Scale, options: Options) -> None:
             height = np.concatenate(
                 [np.repeat(assembly.contacts.point[:, 2], 3), np.full(len(system.lower), np.inf)]
             )
-            found = {
+            residual_curves = {
                 label: _order(problem, make(system, height), options)
                 for label, make in ORDERS.items()
             }
-            ordered.append(Lines(name, system.name, "sweeps or rounds", UNIT, found, log="y"))
-            order_rows.append([name, *(f"{min(r, default=0.0):.1e}" for _, r in found.values())])
-            last = {label: Figure(min(r, default=0.0)) for label, (_, r) in found.items()}
+            ordered.append(
+                Lines(name, system.name, "sweeps or rounds", UNIT, residual_curves, log="y")
+            )
+            order_rows.append(
+                [name, *(f"{min(r, default=0.0):.1e}" for _, r in residual_curves.values())]
+            )
+            last = {label: Figure(min(r, default=0.0)) for label, (_, r) in residual_curves.items()}
             results.records.append(Record(f"orders: {name}", last))
     remark = (
         f"At most {scale.sweeps} sweeps; least: the smallest residual met. Boxed friction, "

@@ -171,7 +171,7 @@ def _warm(results: Results, scale: Scale, options: Options) -> None:
         }.items():
             for start, starts in (("from 0", None), (f"from {SWEPT} sweeps", swept)):
                 name = f"{method} {start}"
-                found = outcome(
+                solves = outcome(
                     f"warm: {rule}: {name}",
                     problems,
                     solver,
@@ -180,14 +180,14 @@ def _warm(results: Results, scale: Scale, options: Options) -> None:
                     limits=limits,
                     starts=starts,
                 )
-                results.records.append(found.record())
+                results.records.append(solves.record())
                 rows.append(
-                    [rule, method, start, found.states, spread(found.accepted), found.share]
+                    [rule, method, start, solves.states, spread(solves.accepted), solves.share]
                 )
                 shown = range(1, 8)
                 curves[name] = (
                     [float(k) for k in shown],
-                    [float(found.accepted.count(k)) for k in shown],
+                    [float(solves.accepted.count(k)) for k in shown],
                 )
         panels.append(Lines(rule, rule, "iterations", "problems", curves, log=""))
     remark = (
@@ -234,7 +234,7 @@ def _zeros(results: Results, scale: Scale, options: Options) -> None:
             )
             shares = {"solvable": able}
             for method, (solver, merit) in SEMIDEFINITE.items():
-                found = outcome(
+                solves = outcome(
                     f"zeros: {rule}: {zeros:.0%}: {method}",
                     problems,
                     solver,
@@ -242,10 +242,10 @@ def _zeros(results: Results, scale: Scale, options: Options) -> None:
                     options.device,
                     limits=limits,
                 )
-                results.records.append(found.record())
+                results.records.append(solves.record())
                 ends = results.records[-1].facts["statuses"]
-                rows.append([rule, f"{zeros:.0%}", f"{able} of {few}", method, *found.row(), ends])
-                shares[method] = len(found.solved)
+                rows.append([rule, f"{zeros:.0%}", f"{able} of {few}", method, *solves.row(), ends])
+                shares[method] = len(solves.solved)
             for name, count in shares.items():
                 curves[name][0].append(100 * zeros)
                 curves[name][1].append(100 * count / few)

@@ -82,16 +82,16 @@ def measure(options: Options, out: Path) -> Results:
             verdicts.append(judge(case, precision, options.device))
             if verdicts[-1].wrong:
                 options.say(f"{verdicts[-1].name}: {verdicts[-1].outcome}")
-    found = by_family(verdicts)
+    family_records = by_family(verdicts)
     unseen, beyond = judging.summary(verdicts, seed)
     wrong = [v for v in verdicts if v.wrong]
     records = [
         machine(options.device, elements=1 << 22, repeat=options.repeat),
-        *found,
+        *family_records,
         *map(record, wrong),
     ]
     failures = [f"{v.name}: {v.outcome} (expected: {v.promise})" for v in wrong] + beyond
-    return Results(records, [families(found), unseen, table(verdicts)], failures=failures)
+    return Results(records, [families(family_records), unseen, table(verdicts)], failures=failures)
 
 
 def record(verdict: Verdict) -> Record:

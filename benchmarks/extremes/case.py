@@ -128,16 +128,16 @@ class Case(ABC):
 
         A ValueError is a refusal. Other errors give a status with their names.
         """
-        begun = time.perf_counter()
+        start_time = time.perf_counter()
         try:
             attempt = self.tried(precision, device)
-            attempt.seconds = attempt.seconds or time.perf_counter() - begun
+            attempt.seconds = attempt.seconds or time.perf_counter() - start_time
             return attempt
         except (ValueError, *BROKEN) as error:
             broken = isinstance(error, BROKEN)
             return Attempt(
                 type(error).__name__ if broken else REFUSED,
-                seconds=time.perf_counter() - begun,
+                seconds=time.perf_counter() - start_time,
                 message=str(error),
             )
 
@@ -200,13 +200,13 @@ class SolveCase(Case):
             **self.stopping,
         }
         problem, method = self.problem(), wl.METHODS[self.method]
-        begun = time.perf_counter()
+        start_time = time.perf_counter()
         solver = method(precision=precision) if self.precisions == PRECISIONS else method()
         lcp = problem.lcp(device, wp.float32 if precision == "single" else wp.float64)
         solver = solver if self.alone else wl.default_chain(solver, lcp)
         result = self.solve(lcp, solver, stopping=wl.StoppingCriteria(**criteria), x0=self.x0)
         wp.synchronize_device(device)
-        return checked(problem, result, criteria, time.perf_counter() - begun, precision)
+        return checked(problem, result, criteria, time.perf_counter() - start_time, precision)
 
 
 def checked(
@@ -229,11 +229,11 @@ def checked(
     rounding = 32 * np.finfo(np.float64).eps * sizes
     if problem.rounded(wp.float32 if single else wp.float64):
         rounding += 4 * EPS * sizes
-    wanted = max(criteria["rtol"] * reference, criteria.get("atol", 0.0))
-    met = own <= wanted * (1 + 1e-6) + rounding
+    required = max(criteria["rtol"] * reference, criteria.get("atol", 0.0))
+    met = own <= required * (1 + 1e-6) + rounding
     faults = []
     if result and not met:
-        faults.append(f"CONVERGED at a residual of {own:.1e}, asked for {wanted:.1e}")
+        faults.append(f"CONVERGED at a residual of {own:.1e}, asked for {required:.1e}")
     # A result in single precision is rounded once more where it sits at a bound that is no float32
     # number.
     returned = 0.5 * EPS * sizes if single else 0.0
@@ -251,7 +251,7 @@ def checked(
     beyond = np.maximum(exact.lower - x, x - exact.upper) - (EPS * np.abs(x) if single else 0.0)
     if result and (beyond > 0).any():
         faults.append(f"x is {beyond.max():.1e} outside its bounds")
-    if not result and own < 0.99 * wanted - rounding:
+    if not result and own < 0.99 * required - rounding:
         faults.append(f"{result.status.name} at a solution")
     return Attempt(
         result.status.name,
@@ -316,7 +316,7 @@ def judge(case: Case, precision: str, device: str) -> Verdict:
 
 def in_time(case: Case, precision: str, device: str) -> Attempt:
     """Run a case; interrupt it far beyond its budget."""
-    begun, processor = time.perf_counter(), time.process_time()
+    start_time, processor = time.perf_counter(), time.process_time()
     try:
         with interrupted_after(LAST_CALL * case.budget + 60.0):  # one minute more for compilers
             attempt = case.attempt(precision, device)
@@ -324,7 +324,7 @@ def in_time(case: Case, precision: str, device: str) -> Attempt:
             attempt.processor = time.process_time() - processor
         return attempt
     except OverBudgetError:
-        return Attempt(OUT_OF_TIME, seconds=time.perf_counter() - begun)
+        return Attempt(OUT_OF_TIME, seconds=time.perf_counter() - start_time)
 
 
 def violations(promise: Promise, attempt: Attempt) -> list[str]:

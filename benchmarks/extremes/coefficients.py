@@ -119,9 +119,9 @@ def contrasts() -> Iterator[Case]:
             ("layers", (Y // 6) % 2 == 1),
             ("bubbles", np.hypot(Y % 16 - 7.5, X % 16 - 7.5) < 5),
         ):
-            made = partial(pool, Y.shape, faces=harmonic(np.where(light, 1.0, 1 / ratio)))
+            make_problem = partial(pool, Y.shape, faces=harmonic(np.where(light, 1.0, 1 / ratio)))
             yield from case(
-                f"{name} of density 1:{ratio:g}", made, **may_stop(ratio, LARGEST_CONTRAST)
+                f"{name} of density 1:{ratio:g}", make_problem, **may_stop(ratio, LARGEST_CONTRAST)
             )
     for shape in SHAPES:
         for decades, expected in ((4, SOLVED), (12, EITHER)):
@@ -137,9 +137,12 @@ def contrasts() -> Iterator[Case]:
                     partial(pool, shape, faces={f"face_{axis}": ratio}),
                 )
     for low, high in ((-6, 6), (0, 12), (-12, 0)):
-        made = partial(full, (40, 44), shift=10 ** chance(10).uniform(low, high, (40, 44)))
+        make_problem = partial(full, (40, 44), shift=10 ** chance(10).uniform(low, high, (40, 44)))
         yield from case(
-            f"shift from 1e{low} to 1e{high}", made, promises=SINGLE_MAY_STOP, stopping=ROUGH
+            f"shift from 1e{low} to 1e{high}",
+            make_problem,
+            promises=SINGLE_MAY_STOP,
+            stopping=ROUGH,
         )
     for scale in (1e-12, 1e12, 1e-30, 1e30):
         yield from case(

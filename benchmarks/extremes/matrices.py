@@ -27,14 +27,14 @@ def singular() -> Iterator[Case]:
     """Yield singular symmetric positive semi-definite matrices, and tiny matrices."""
     case = partial(given, "zero eigenvalues")
     for rank in (1, N // 2, N - 1):
-        made = partial(MatrixProblem.of, semidefinite(N, zeros=1 - rank / N))
+        make_problem = partial(MatrixProblem.of, semidefinite(N, zeros=1 - rank / N))
         methods, expected = (
             (*NEWTON, "mprgp", "interior-point", *PIVOTING, *LEMKE),
             EITHER if rank == 1 else SOLVED,
         )
         yield from case(
             f"dense of rank {rank}, b in its range",
-            made,
+            make_problem,
             methods,
             expected=expected,
             promises=MAY_STOP,

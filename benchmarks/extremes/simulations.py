@@ -63,7 +63,7 @@ class RunCase(Case):
         # A record cannot hold the term of the bodies.
         if isinstance(simulation, LiquidSimulation) and simulation.bodies is None:
             simulation.record = recorded.append
-        status, message, begun = "done", "", time.perf_counter()
+        status, message, start_time = "done", "", time.perf_counter()
         try:
             for _ in range(self.steps):
                 simulation.step(usual_dt(simulation) if self.dt is None else self.dt)
@@ -74,7 +74,7 @@ class RunCase(Case):
                 str(error),
             )
         wp.synchronize_device(device)
-        attempt = Attempt(status, None, time.perf_counter() - begun, message)
+        attempt = Attempt(status, None, time.perf_counter() - start_time, message)
         if status == "done":
             attempt.faults += [
                 *lost(simulation, before, leaves=self.leaves),

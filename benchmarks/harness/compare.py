@@ -36,16 +36,16 @@ def losses(
 
     It has fallen whichever samples of the two are compared.
     """
-    found = []
+    lines = []
     for name in (n for n in old if n in new):
         for label in (f for f in TO_PEERS if f in old[name].figures and f in new[name].figures):
             before, after = old[name].figures[label], new[name].figures[label]
             low, high = bounds(before, after)
             if high < 1 - allowed:
-                found.append(
+                lines.append(
                     f"{name}: {label} {before} fell to {after}, to [{low:.2f}, {high:.2f}] of it"
                 )
-    return found
+    return lines
 
 
 def comparison(old: Path, new: Path) -> str:

@@ -52,28 +52,30 @@ def main() -> None:
     parser.add_argument("--index", type=int, help="solve only this case, in this process")
     parser.add_argument("--out", type=Path, help="folder for hostile.json and hostile.md")
     parser.add_argument("--worker", type=int, help=argparse.SUPPRESS)  # index of the first case
-    given = parser.parse_args()
-    if given.worker is not None:
-        return _work(given.kinds[0], given.seed, range(given.worker, given.count))
+    arguments = parser.parse_args()
+    if arguments.worker is not None:
+        return _work(arguments.kinds[0], arguments.seed, range(arguments.worker, arguments.count))
     from warp_lcp.benchmarks.hostile import KINDS
 
-    unknown = sorted(set(given.kinds) - set(KINDS))
+    unknown = sorted(set(arguments.kinds) - set(KINDS))
     if unknown:
         parser.error(f"--kinds {' '.join(unknown)}: known are {', '.join(KINDS)}")
-    if given.index is not None:
-        return _work(given.kinds[0], given.seed, range(given.index, given.index + 1))
+    if arguments.index is not None:
+        return _work(
+            arguments.kinds[0], arguments.seed, range(arguments.index, arguments.index + 1)
+        )
     outcomes: list[Outcome] = []
-    for kind in given.kinds or KINDS:
+    for kind in arguments.kinds or KINDS:
         start = time.perf_counter()
-        outcomes += supervise(kind, given.seed, given.count)
+        outcomes += supervise(kind, arguments.seed, arguments.count)
         _say(f"{kind}: {time.perf_counter() - start:.0f} s")
-        if given.out:  # written after each kind, since a run may be interrupted
-            given.out.mkdir(parents=True, exist_ok=True)
-            (given.out / "hostile.md").write_text(report(outcomes, given.seed))
-            (given.out / "hostile.json").write_text(
+        if arguments.out:  # written after each kind, since a run may be interrupted
+            arguments.out.mkdir(parents=True, exist_ok=True)
+            (arguments.out / "hostile.md").write_text(report(outcomes, arguments.seed))
+            (arguments.out / "hostile.json").write_text(
                 json.dumps([asdict(o) for o in outcomes], indent=1)
             )
-    sys.stdout.write(report(outcomes, given.seed))
+    sys.stdout.write(report(outcomes, arguments.seed))
     sys.exit(1 if any(c in FAULTS for o in outcomes for c, _ in o.verdicts) else 0)
 
 
@@ -141,7 +143,7 @@ def supervise(kind: str, seed: int, count: int) -> list[Outcome]:
             "--count",
             str(count),
         ]
-        begun = ""
+        start_time = ""
         with (
             tempfile.TemporaryFile("w+") as messages,
             subprocess.Popen(
@@ -158,14 +160,14 @@ def supervise(kind: str, seed: int, count: int) -> list[Outcome]:
                     continue
                 record = json.loads(line[1:])
                 if "begin" in record:
-                    begun = record["name"]
+                    start_time = record["name"]
                     continue
                 outcomes.append(
                     Outcome(kind, record["end"], record["name"], _late(record), record["seconds"])
                 )
                 _tell(outcomes[-1], seed)
             messages.seek(0)
-            told = messages.read()
+            error_output = messages.read()
         if len(outcomes) < count:  # the worker has died
             category = (
                 "TIMEOUT" if -worker.returncode in (signal.SIGPROF, signal.SIGALRM) else "CRASH"
@@ -173,13 +175,13 @@ def supervise(kind: str, seed: int, count: int) -> list[Outcome]:
             why = (
                 f"more than {LIMIT + GRACE:g} s"
                 if category == "TIMEOUT"
-                else f"exit {worker.returncode}: {told.strip()[-150:]}"
+                else f"exit {worker.returncode}: {error_output.strip()[-150:]}"
             )
             outcomes.append(
                 Outcome(
                     kind,
                     len(outcomes),
-                    begun,
+                    start_time,
                     [[category, why]],
                     LIMIT + GRACE if category == "TIMEOUT" else 0.0,
                 )

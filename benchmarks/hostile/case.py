@@ -252,19 +252,19 @@ def command_line(
             text=True,
             check=False,
         )
-        told = f"{run.stdout}\n{run.stderr}".strip()
+        output = f"{run.stdout}\n{run.stderr}".strip()
         if run.returncode == 0 and (folder / "x.mtx").exists():
             return Answer(
-                CONVERGED, np.asarray(scipy.io.mmread(folder / "x.mtx")).ravel(), told[-200:]
+                CONVERGED, np.asarray(scipy.io.mmread(folder / "x.mtx")).ravel(), output[-200:]
             )
         if run.returncode == 2:
-            return Answer(REFUSED, None, told[-200:])
-        if run.returncode != 1 or "Traceback" in told:
-            return Answer(EXCEPTION, None, f"exit code {run.returncode}: {told[-200:]}")
+            return Answer(REFUSED, None, output[-200:])
+        if run.returncode != 1 or "Traceback" in output:
+            return Answer(EXCEPTION, None, f"exit code {run.returncode}: {output[-200:]}")
         status = next(
-            (s.name for s in wl.SolveStatus if s.name in told and s.name != CONVERGED), "FAILED"
+            (s.name for s in wl.SolveStatus if s.name in output and s.name != CONVERGED), "FAILED"
         )
-        return Answer(status, None, told[-200:])
+        return Answer(status, None, output[-200:])
 
 
 def _environment() -> dict[str, str]:

@@ -165,13 +165,13 @@ def stencil_matrix(
         if shift is not None:
             entries.append((i, i, float(np.broadcast_to(shift, cells.shape)[cell])))
         for offset, a in coefficients.items():
-            value, there = (
+            value, neighbor_cell = (
                 float(a[cell] if np.ndim(a) else a),
                 neighbor(cell, offset, cells.shape, periodic),
             )
-            kind = outside if there is None else cells[there]
-            if kind == FLUID and there is not None:
-                entries.append((i, int(index[there]), value))
+            kind = outside if neighbor_cell is None else cells[neighbor_cell]
+            if kind == FLUID and neighbor_cell is not None:
+                entries.append((i, int(index[neighbor_cell]), value))
             elif kind == SOLID:
                 entries.append((i, i, value))
     heads, tails, values = (np.array(column) for column in zip(*entries, strict=True))
@@ -210,15 +210,15 @@ def neighbor(
     cell: Any, offset: tuple[int, ...], shape: tuple[int, ...], periodic: tuple[bool, ...]
 ) -> tuple[int, ...] | None:
     """Return cell + offset, wrapped on periodic axes (given as x, y, z); None outside."""
-    there = []
+    indices = []
     for axis, (c, o, count) in enumerate(zip(cell, offset, shape, strict=True)):
         k = int(c) + o
         if not 0 <= k < count:
             if not periodic[len(shape) - 1 - axis]:
                 return None
             k %= count
-        there.append(k)
-    return tuple(there)
+        indices.append(k)
+    return tuple(indices)
 
 
 def offsets(dimensions: int, *, axes: bool) -> list[tuple[int, ...]]:

@@ -115,17 +115,17 @@ def solid(rng: Rng) -> Case:
 
         def parts() -> Answer:
             A = operator()
-            found = {
+            fields = {
                 "A x": A.apply(wp.array(x * fluid, dtype=wp.float64, device="cpu")),
                 "diagonal": A.diagonal(),
             }
-            found["boundary term"] = A.boundary_term(border)
+            fields["boundary term"] = A.boundary_term(border)
             assert border[inside].shape == cells.shape
             return Answer(
                 "CONVERGED",
                 None,
                 "",
-                {k: v.numpy().ravel()[F].astype(float) for k, v in found.items()},
+                {k: v.numpy().ravel()[F].astype(float) for k, v in fields.items()},
             )
 
         return Case(f"{name}, its parts", parts, Values(expected, 1e-12))
@@ -387,16 +387,18 @@ def gradients(rng: Rng) -> Case:
         if not result:
             return Answer(result.status.name, None, "the problem's own solve")
         try:
-            found = wl.vjp(result, field_of(g), stopping=wl.StoppingCriteria(rtol=1e-10))
+            gradient = wl.vjp(result, field_of(g), stopping=wl.StoppingCriteria(rtol=1e-10))
         except ArithmeticError as error:
             return Answer("NO GRADIENT", None, str(error)[:100])
-        values = {name: getattr(found, name).numpy().ravel()[F] for name in ("b", "lower", "upper")}
+        values = {
+            name: getattr(gradient, name).numpy().ravel()[F] for name in ("b", "lower", "upper")
+        }
         if kind == "dense":
-            values["matrix"] = found.coefficients["matrix"].numpy().ravel()
+            values["matrix"] = gradient.coefficients["matrix"].numpy().ravel()
         if kind == "stencil":
             values |= {
                 f"coefficient {o}": v.numpy().ravel()[F]
-                for o, v in found.coefficients["coefficients"].items()
+                for o, v in gradient.coefficients["coefficients"].items()
             }
         return Answer("CONVERGED", result.x.numpy().ravel()[F], "", values)
 
@@ -411,7 +413,7 @@ def _by_offset(
     fields = np.zeros((2, cells.size))
     fields[:, F] = mu, x
     m, v = fields.reshape(2, *cells.shape)
-    found = {}
+    by_offset = {}
     for o in a:
         part = np.zeros(cells.shape)
         for cell in zip(*np.nonzero(cells == draw.FLUID), strict=True):
@@ -420,5 +422,5 @@ def _by_offset(
             part[cell] = m[cell] * (
                 v[cell] if kind == draw.SOLID else v[there] if kind == draw.FLUID else 0.0
             )
-        found[f"coefficient {o}"] = part.ravel()[F]
-    return found
+        by_offset[f"coefficient {o}"] = part.ravel()[F]
+    return by_offset

@@ -239,19 +239,19 @@ def _linear_program(box: Box) -> bool | None:
     limits = np.column_stack((box.lower, box.upper))
     rows_of = sp.vstack([-A[above], A[below]]) if above.any() or below.any() else None
     sides = np.r_[b[above], -b[below]]
-    found = linprog(
+    optimum = linprog(
         np.zeros(n),
         A_ub=rows_of,
         b_ub=sides if rows_of is not None else None,
         bounds=limits,
         options={"time_limit": 20.0},
     )
-    if found.status == 0 and rows_of is not None:
-        excess = (rows_of @ found.x - sides) / (
-            np.abs(sides) + abs(rows_of) @ np.abs(found.x) + 1e-300
+    if optimum.status == 0 and rows_of is not None:
+        excess = (rows_of @ optimum.x - sides) / (
+            np.abs(sides) + abs(rows_of) @ np.abs(optimum.x) + 1e-300
         )
         return True if excess.max(initial=0.0) < 1e-9 else None
-    return {0: True, 2: False}.get(found.status)
+    return {0: True, 2: False}.get(optimum.status)
 
 
 def _enumerate(box: Box) -> bool | None:

@@ -289,13 +289,13 @@ def friction(rng: Rng) -> Case:
         model = (
             BoxedModel() if rng.random() < 0.75 or len(system.q) > 300 else StewartTrinkleModel(4)
         )
-        given = model.problem(system)
+        boxed = model.problem(system)
         name, system_A, system_b, low, high = (
-            f"{given.name}",
-            given.A,
-            np.asarray(given.b),
-            given.lower,
-            given.upper,
+            f"{boxed.name}",
+            boxed.A,
+            np.asarray(boxed.b),
+            boxed.lower,
+            boxed.upper,
         )
     n = len(system_b)
     if not isinstance(low, wl.AffineBounds) and not isinstance(high, wl.AffineBounds):

@@ -27,7 +27,7 @@ def infinity(rng: Rng) -> Case:
     kind, low, high = draw.bounds(rng, n)
     x, b = draw.plant(rng, A, low, high)
     written = rng.choice(INFINITIES, size=2, p=[0.35, 0.35, 0.1, 0.1, 0.1])
-    given = (
+    bound_arrays = (
         np.where(np.isfinite(low), low, -written[0]),
         np.where(np.isfinite(high), high, written[1]),
     )
@@ -56,7 +56,7 @@ def infinity(rng: Rng) -> Case:
         rng,
         f"{what}, {kind} bounds, infinity {written[0]:g}, {written[1]:g}",
         box,
-        bounds=given,
+        bounds=bound_arrays,
         named=named,
         share=0.5,
     )

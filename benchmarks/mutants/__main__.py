@@ -272,36 +272,42 @@ def _drawn(formulas: bool, count: int | None, seed: int) -> list[Mutant]:
 
 def main() -> None:
     """Run the command line."""
-    given = options()
-    given.out.mkdir(parents=True, exist_ok=True)
-    kernels, usual, kept = (
-        given.out.parent / "kernels-of-mutants",
+    arguments = options()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    kernels, usual, results_file = (
+        arguments.out.parent / "kernels-of-mutants",
         Path("~/.cache/warp").expanduser(),
-        given.out / "mutants.json",
+        arguments.out / "mutants.json",
     )
     if usual.exists() and not kernels.exists():
         shutil.copytree(usual, kernels)
     os.environ["WARP_CACHE_PATH"] = str(kernels)
-    if given.again:
+    if arguments.again:
         drawn = [
             Mutant(*(r[name] for name in Mutant._fields))
-            for r in json.loads(given.again.read_text())
+            for r in json.loads(arguments.again.read_text())
             if r["verdict"] != "killed"
         ]
     else:
-        drawn = _drawn(given.formulas, given.count, given.seed)
-    results = json.loads(kept.read_text()) if kept.exists() else []
+        drawn = _drawn(arguments.formulas, arguments.count, arguments.seed)
+    results = json.loads(results_file.read_text()) if results_file.exists() else []
     done = {tuple(r[name] for name in Mutant._fields[:4]) for r in results}
     todo = [mutant for mutant in drawn if mutant[:4] not in done]
-    random.Random(given.seed).shuffle(todo)  # a run that is stopped has then covered all packages
-    started = (given.jobs, prepare, (folder := tempfile.mkdtemp(), given.files, given.seconds))
+    random.Random(arguments.seed).shuffle(
+        todo
+    )  # a run that is stopped has then covered all packages
+    started = (
+        arguments.jobs,
+        prepare,
+        (folder := tempfile.mkdtemp(), arguments.files, arguments.seconds),
+    )
     with multiprocessing.get_context("fork").Pool(*started) as pool:
         for result in pool.imap_unordered(judge, todo):
             results.append(result)
             print("{verdict:8}{seconds:6} s {module}:{line} {after}".format(**result), flush=True)
-            kept.write_text(json.dumps(results, indent=1))
+            results_file.write_text(json.dumps(results, indent=1))
     shutil.rmtree(folder)
-    report(results, given.out, given.seed)
+    report(results, arguments.out, arguments.seed)
 
 
 if __name__ == "__main__":

@@ -129,10 +129,10 @@ def mutated(source: str, name: str, occurrence: int) -> str:
 
 def of_formulas(root: Path) -> list[Mutant]:
     """Return the mutants of FORMULAS."""
-    found = []
+    mutants = []
     for number, (module, before, after, _) in enumerate(FORMULAS):
         source = (root / module).read_text()
-        found.append(
+        mutants.append(
             Mutant(
                 module,
                 source.count("\n", 0, source.index(before)) + 1,
@@ -142,7 +142,7 @@ def of_formulas(root: Path) -> list[Mutant]:
                 after.strip(),
             )
         )
-    return found
+    return mutants
 
 
 def draw(root: Path, count: int, seed: int) -> list[Mutant]:
@@ -173,7 +173,7 @@ def draw(root: Path, count: int, seed: int) -> list[Mutant]:
     wanted = [lines[int((start + i) * len(lines) / count)] for i in range(count)]
     sources = {module: (root / module).read_text() for module in {module for module, _ in wanted}}
     places = {module: _places(module, source) for module, source in sources.items()}
-    found = []
+    mutants = []
     for module, line in wanted:
         if places[module]:
             nearest = min(abs(at - line) for at, *_ in places[module])
@@ -184,10 +184,10 @@ def draw(root: Path, count: int, seed: int) -> list[Mutant]:
                 text.splitlines()
                 for text in (sources[module], mutated(sources[module], name, occurrence))
             )
-            found.append(
+            mutants.append(
                 Mutant(module, at, name, occurrence, old[at - 1].strip(), new[at - 1].strip())
             )
-    return found
+    return mutants
 
 
 def _places(module: str, source: str) -> list[tuple[int, str, int]]:

@@ -38,13 +38,13 @@ def _users(root: Path) -> dict[str, set[str]]:
             if file.suffix in (".py", ".h"):
                 places = [file.parent, file.parent / "headers", root / "warp_lcp/rows/headers"]
                 for header in re.findall(r"[\"/](\w+)\.h(?::[\w.]+)?\"", file.read_text()):
-                    found = [
+                    included = [
                         place / f"{header}.h"
                         for place in places
                         if (place / f"{header}.h").exists()
                     ]
-                    if found and found[0] != file:
-                        users[str(found[0].relative_to(root))].add(str(file.relative_to(root)))
+                    if included and included[0] != file:
+                        users[str(included[0].relative_to(root))].add(str(file.relative_to(root)))
         for file in (root / package).rglob("*.py"):
             for whole, names in re.findall(
                 r"^\s*from ([\w.]+) import (.+)$", file.read_text(), re.MULTILINE
@@ -58,7 +58,7 @@ def _users(root: Path) -> dict[str, set[str]]:
 def tests_of(root: Path, module: str) -> list[str]:
     """Return test files, the likeliest to notice a change of a module first."""
     score: dict[str, float] = defaultdict(float)
-    front, weight, seen = {module}, 1.0, set[str]()
+    front, weight, visited = {module}, 1.0, set[str]()
     for _ in range(3):  # headers may include headers
         front = {
             user
@@ -90,7 +90,7 @@ def tests_of(root: Path, module: str) -> list[str]:
                     * (8 * same + len(words & there) ** 0.5 * (2 if place else 1))
                     / len(front) ** 0.5
                 )
-        seen |= front
-        front = {user for file in front for user in _users(root).get(file, ())} - seen
+        visited |= front
+        front = {user for file in front for user in _users(root).get(file, ())} - visited
         weight /= 4
     return [test for test in sorted(score, key=lambda t: (-score[t], t)) if score[test] > 0]

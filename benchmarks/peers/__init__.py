@@ -57,7 +57,7 @@ class Contest:
 
         The answer before it counts as a warm-up.
         """
-        begun = time.perf_counter()
+        start_time = time.perf_counter()
         for factor in TIGHTER:
             self.tolerance = factor * RTOL
             try:
@@ -70,7 +70,7 @@ class Contest:
                 if answer.total > BUDGET / 3:  # too slow for another round
                     self.answers.append(answer)
                 return
-            if time.perf_counter() - begun > BUDGET:
+            if time.perf_counter() - start_time > BUDGET:
                 break
         self.remark = f"residual {self.residual:.1e} at the least"
 
@@ -119,13 +119,13 @@ def measure(options: Options, out: Path) -> Results:
         options.device, elements=min(COPIED, 64 * max(sizes) ** 3), repeat=options.repeat
     )
     records, seconds = [where], dict[tuple[str, str], tuple[int, float]]()
-    with roster(options.device) as there:
-        where.facts["peers"] = there.versions
-        for name, text in there.versions.items():
+    with roster(options.device) as available:
+        where.facts["peers"] = available.versions
+        for name, text in available.versions.items():
             if not text[:1].isdigit():
                 options.say(f"{name}: {text}")
         for n in sizes:
-            found = _measure_size(n, there, seconds, options)
+            found = _measure_size(n, available, seconds, options)
             records += found
             seconds |= {
                 (r.facts["method"], r.facts["bounds"]): (n, t)
@@ -136,7 +136,7 @@ def measure(options: Options, out: Path) -> Results:
     asked = Table(
         "Who was asked",
         ["library", "version"],
-        [[name, text] for name, text in there.versions.items()],
+        [[name, text] for name, text in available.versions.items()],
     )
     tables = [_targets(records, n), asked, *(_table(m, records) for m in sizes)]
     return Results(records, tables, [_bars(bounds, records) for bounds in BOUNDS])

@@ -72,7 +72,7 @@ def main():
     """Print seconds, iterations and the answer at a node as JSON."""
     request = json.loads(sys.argv[1])
     sizes, rtol = request["sizes"], request["rtol"]
-    begun = time.perf_counter()
+    start_time = time.perf_counter()
     nx, ny, levels = request["coarsest"][0], request["coarsest"][1], request["levels"]
     dm = PETSc.DMDA().create([nx, ny], dof=1, stencil_width=1)
     snes: Any = None
@@ -101,7 +101,7 @@ def main():
         )
     w = x.getArray().reshape(ny, nx)
     answer = {
-        "seconds": time.perf_counter() - begun,
+        "seconds": time.perf_counter() - start_time,
         "steps": steps,
         "wet": int((w > 0).sum()),
         "norm": float(np.linalg.norm(w[1:-1, 1:-1])),

@@ -24,13 +24,13 @@ def pyamg(
     import pyamg as library
 
     A, residuals = sp.csr_matrix(question.matrix), list[float]()
-    begun = time.perf_counter()
+    start_time = time.perf_counter()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # PyAMG warns about its own use of SciPy
         hierarchy = getattr(library, build)(A)
         middle = time.perf_counter()
         x = hierarchy.solve(-question.b, tol=tolerance, accel="cg", residuals=residuals)
-    return Answer(x, middle - begun, time.perf_counter() - middle, len(residuals) - 1)
+    return Answer(x, middle - start_time, time.perf_counter() - middle, len(residuals) - 1)
 
 
 def scipy_cg(question: Question, tolerance: float) -> Answer:
@@ -51,14 +51,14 @@ def amgcl(question: Question, tolerance: float) -> Answer:
     import pyamgcl
 
     A, b = sp.csr_matrix(question.matrix), -question.b
-    begun = time.perf_counter()
+    start_time = time.perf_counter()
     preconditioner = pyamgcl.amg(
         A, {"coarsening.type": "smoothed_aggregation", "relax.type": "ilu0"}
     )
     solver = pyamgcl.solver(preconditioner, {"type": "cg", "tol": tolerance, "maxiter": 1000})
     middle = time.perf_counter()
     x = solver(b)
-    return Answer(x, middle - begun, time.perf_counter() - middle, int(solver.iters))
+    return Answer(x, middle - start_time, time.perf_counter() - middle, int(solver.iters))
 
 
 def warp_cg(question: Question, tolerance: float, *, device: str) -> Answer:
@@ -117,7 +117,7 @@ def osqp(question: Question, tolerance: float) -> Answer:
 
     P, A = sp.triu(question.matrix, format="csc"), sp.eye_array(len(question.b), format="csc")
     scale = tolerance * float(np.abs(question.b).max())
-    begun = time.perf_counter()
+    start_time = time.perf_counter()
     solver = library.OSQP()
     solver.setup(
         sp.csc_matrix(P),
@@ -134,7 +134,7 @@ def osqp(question: Question, tolerance: float) -> Answer:
     middle = time.perf_counter()
     result = solver.solve(raise_error=False)
     return Answer(
-        np.array(result.x), middle - begun, time.perf_counter() - middle, int(result.info.iter)
+        np.array(result.x), middle - start_time, time.perf_counter() - middle, int(result.info.iter)
     )
 
 
@@ -143,7 +143,7 @@ def piqp(question: Question, tolerance: float) -> Answer:
     import piqp as library
 
     P = sp.csc_matrix(question.matrix)
-    begun = time.perf_counter()
+    start_time = time.perf_counter()
     solver = library.SparseSolver()
     solver.settings.eps_abs = tolerance * float(np.abs(question.b).max())
     solver.settings.eps_rel = 0.0
@@ -153,7 +153,7 @@ def piqp(question: Question, tolerance: float) -> Answer:
     solver.solve()
     return Answer(
         np.array(solver.result.x),
-        middle - begun,
+        middle - start_time,
         time.perf_counter() - middle,
         int(solver.result.info.iter),
     )
@@ -175,7 +175,7 @@ def clarabel(question: Question, tolerance: float) -> Answer:
     settings = library.DefaultSettings()
     settings.verbose, settings.max_threads = False, 1
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
-    begun = time.perf_counter()
+    start_time = time.perf_counter()
     solver = library.DefaultSolver(
         P,
         question.b,
@@ -187,5 +187,8 @@ def clarabel(question: Question, tolerance: float) -> Answer:
     middle = time.perf_counter()
     solution = solver.solve()
     return Answer(
-        np.array(solution.x), middle - begun, time.perf_counter() - middle, int(solution.iterations)
+        np.array(solution.x),
+        middle - start_time,
+        time.perf_counter() - middle,
+        int(solution.iterations),
     )

@@ -47,18 +47,20 @@ class Problem:
     """
 
     def __init__(self, path: str) -> None:
-        with np.load(path) as kept:
+        with np.load(path) as archive:
             self.b, self.where, self.shape = (
-                kept["b"],
-                kept["where"],
-                tuple(int(s) for s in kept["shape"]),
+                archive["b"],
+                archive["where"],
+                tuple(int(s) for s in archive["shape"]),
             )
             rows, columns, values = (
-                kept["indptr"].astype(np.int32),
-                kept["indices"].astype(np.int32),
-                kept["data"],
+                archive["indptr"].astype(np.int32),
+                archive["indices"].astype(np.int32),
+                archive["data"],
             )
-            self.lower = {name[6:]: kept[name] for name in kept.files if name.startswith("lower_")}
+            self.lower = {
+                name[6:]: archive[name] for name in archive.files if name.startswith("lower_")
+            }
         self.A = PETSc.Mat().createAIJWithArrays((len(self.b),) * 2, (rows, columns, values))
         self.A.setOption(PETSc.Mat.Option.SPD, True)
 
@@ -84,7 +86,7 @@ def aggregates(where: np.ndarray, shape: tuple[int, ...]) -> list[Any]:
     They are constant on each aggregate. Trilinear ones need fewer iterations and three times the
     time, since their Galerkin products have 27 points.
     """
-    found = []
+    prolongations = []
     while len(where) > COARSEST and min(shape) > 2:
         coarse = tuple((s + 1) // 2 for s in shape)
         parents = np.ravel_multi_index(
@@ -95,12 +97,12 @@ def aggregates(where: np.ndarray, shape: tuple[int, ...]) -> list[Any]:
         columns = (np.cumsum(kept) - 1)[parents].astype(np.int32)
         rows = np.arange(len(where) + 1, dtype=np.int32)
         where, shape = np.flatnonzero(kept), coarse
-        found.append(
+        prolongations.append(
             PETSc.Mat().createAIJWithArrays(
                 (len(rows) - 1, len(where)), (rows, columns, np.ones(len(columns)))
             )
         )
-    return found
+    return prolongations
 
 
 def give(pc: Any, prolongations: list[Any]) -> None:
@@ -121,7 +123,7 @@ def linear(request: Request) -> Reply:
     x = right.duplicate()
     transfers = [] if own else aggregates(problem.where, problem.shape)
     with options(own or MULTIGRID):
-        begun = time.perf_counter()
+        start_time = time.perf_counter()
         ksp = PETSc.KSP().create()
         ksp.setOperators(problem.A)
         ksp.setType("cg")
@@ -137,7 +139,7 @@ def linear(request: Request) -> Reply:
     return _answer(
         request,
         x,
-        middle - begun,
+        middle - start_time,
         end - middle,
         ksp.getIterationNumber(),
         ksp.getConvergedReason(),
@@ -197,7 +199,7 @@ def inequality(request: Request) -> Reply:
         y.axpy(1.0, b)
 
     with options(LOOSE | request["options"]):
-        begun = time.perf_counter()
+        start_time = time.perf_counter()
         snes = PETSc.SNES().create()
         snes.setType("vinewtonrsls")
         snes.setFunction(function, residual)
@@ -218,7 +220,7 @@ def inequality(request: Request) -> Reply:
     return _answer(
         request,
         x,
-        middle - begun,
+        middle - start_time,
         seconds,
         snes.getIterationNumber(),
         snes.getConvergedReason(),

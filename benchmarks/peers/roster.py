@@ -80,7 +80,7 @@ def roster(device: str) -> Iterator[Roster]:
     """
     with (
         tempfile.TemporaryDirectory(prefix="peers-") as folder,
-        petsc.peers(Path(folder)) as (others, petsc_version),
+        petsc.peers(Path(folder)) as (petsc_peers, petsc_version),
     ):
         libraries = [
             "scipy",
@@ -102,7 +102,7 @@ def roster(device: str) -> Iterator[Roster]:
         yield Roster(
             tuple(
                 p
-                for p in (*_linear(device), *QUADRATIC, *others)
+                for p in (*_linear(device), *QUADRATIC, *petsc_peers)
                 if versions[p.library][:1].isdigit()
             ),
             versions,

@@ -170,13 +170,18 @@ def preset_table(scene: str, records: Sequence[Record]) -> Table:
     rows = []
     for r in presets:
         last = [figure for figure in ("volume_drift", "packing") if figure in r.figures][:1]
-        seen = (
+        visible = (
             shown(r, ["distance", "energy_error"], ".4f")
             + [*shown(r, ["front_error", *last], "+.4f"), "+0.0000"][:2]
         )
         times = [*shown(r, ["seconds"], ".3f"), f"{slowest / r.figures['seconds'].value:.1f}"]
         rows.append(
-            [str(r.facts["curve"]).removeprefix("preset "), str(r.facts["settings"]), *times, *seen]
+            [
+                str(r.facts["curve"]).removeprefix("preset "),
+                str(r.facts["settings"]),
+                *times,
+                *visible,
+            ]
         )
     columns = [
         "preset",

@@ -75,7 +75,7 @@ class Runs:
         if ran is None:
             return {}
         own, finest = self.reference(run.setting.scale), self.reference(REFERENCE)
-        found = {
+        values = {
             "seconds": Figure.least(run.seconds, "s"),
             "bytes": Figure(run.bytes, "B"),
             "distance": Figure(ran.distance(own)),
@@ -93,7 +93,7 @@ class Runs:
             "packing",
             "penetration",
         )
-        return found | {
+        return values | {
             name: Figure(value) for name in names if (value := getattr(ran, name)) is not None
         }
 

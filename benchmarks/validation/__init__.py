@@ -67,7 +67,7 @@ def measure(options: Options, out: Path) -> Results:
             f"{sum(t.seconds for t in trials[name]):.0f} s"
         )
         charts += [chart for chart in drawn if chart.curves]
-    found = [t for own in trials.values() for t in own]
+    all_trials = [t for own in trials.values() for t in own]
     where = machine(options.device, elements=1 << 22, repeat=options.repeat)
     tables = [
         summary(trials),
@@ -75,10 +75,10 @@ def measure(options: Options, out: Path) -> Results:
         *(table(name, CHECKS[name].about.strip(), own) for name, own in trials.items()),
     ]
     return Results(
-        [where, *(t.record() for t in found)],
+        [where, *(t.record() for t in all_trials)],
         tables,
         charts,
-        [line for t in found for line in t.failures()],
+        [line for t in all_trials for line in t.failures()],
     )
 
 

@@ -184,13 +184,13 @@ def attempt(check: str, resolution: str, run: Callable[[Findings], None]) -> Tri
         resolution: resolution as text.
         run: function that adds findings to its argument.
     """
-    found, begun, error = Findings(), time.perf_counter(), ""
+    found, start_time, error = Findings(), time.perf_counter(), ""
     try:
         run(found)
     except (StepFailed, SimulationFailed, ValueError) as reason:
         error = str(reason)
     return Trial(
-        check, resolution, found.findings, time.perf_counter() - begun, error, found.curves
+        check, resolution, found.findings, time.perf_counter() - start_time, error, found.curves
     )
 
 
@@ -270,7 +270,7 @@ def plot(
 
     `curves_of` chooses the latter; those in `marked` are points.
     """
-    given = {
+    curves = {
         label: (np.asarray(a).tolist(), np.asarray(b).tolist())
         for label, (a, b) in (exact or {}).items()
     }
@@ -281,7 +281,7 @@ def plot(
             title,
             x,
             y,
-            given | curves_of(trials, *labels, **chosen),
+            curves | curves_of(trials, *labels, **chosen),
             log=log,
             marked=frozenset(marked),
         )

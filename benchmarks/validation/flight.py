@@ -184,18 +184,18 @@ def spinning(found: Findings, n: int) -> None:
             (row["time"], turning(simulation) / start, row["kinetic_energy"])
             for row in steps(simulation, FLIGHT)
         ]
-        times, kept, energies = np.array(rows).T
-        found.curve(label, times, kept)
-        return float(kept[-1]), energies
+        times, shares, energies = np.array(rows).T
+        found.curve(label, times, shares)
+        return float(shares[-1]), energies
 
     for transfer in TRANSFERS:
         name, simulation = transfer.upper(), drop(n, transfer=transfer)
         middle = positions(simulation).mean(axis=0)
-        kept, energies = spun(f"{name}, {n} cells a meter", simulation)
+        shares, energies = spun(f"{name}, {n} cells a meter", simulation)
         way = float(np.linalg.norm(positions(simulation).mean(axis=0) - middle))
         found.add(
             f"{name}: angular momentum after {FLIGHT} s, of that at the start",
-            kept,
+            shares,
             low=KEPT[n],
             high=2.0 - KEPT[n],
         )
@@ -205,8 +205,8 @@ def spinning(found: Findings, n: int) -> None:
             np.diff(energies).max() / energies[0],
             high=1e-3,
         )
-    kept, _ = spun("APIC, control", drop(n, keeps=False))
-    found.must_break("APIC: angular momentum, bodies in flight left alone", kept, low=KEPT[n])
+    shares, _ = spun("APIC, control", drop(n, keeps=False))
+    found.must_break("APIC: angular momentum, bodies in flight left alone", shares, low=KEPT[n])
 
 
 @check_at("spin", "thrown spinning drop, {n} cells a meter")

@@ -29,13 +29,15 @@ def crossings(time: np.ndarray, signal: np.ndarray) -> tuple[np.ndarray, np.ndar
     """
     time, signal = np.asarray(time, dtype=float), np.asarray(signal, dtype=float)
     below, above = signal[:-1], signal[1:]
-    found = []
+    crossing_times = []
     for at in (
         np.flatnonzero((below < 0) & (above >= 0)),
         np.flatnonzero((below > 0) & (above <= 0)),
     ):
-        found.append(time[at] + (time[at + 1] - time[at]) * below[at] / (below[at] - above[at]))
-    return found[0], found[1]
+        crossing_times.append(
+            time[at] + (time[at + 1] - time[at]) * below[at] / (below[at] - above[at])
+        )
+    return crossing_times[0], crossing_times[1]
 
 
 def period(time: np.ndarray, signal: np.ndarray) -> float:

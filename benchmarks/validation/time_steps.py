@@ -138,7 +138,7 @@ def _push_liquid_apart(simulation: Any) -> None:
     prepare = projection.prepare
 
     def pushed(velocity: Any, dt: float, *given: Any) -> bool:
-        there: bool = prepare(velocity, dt, *given)
+        has_liquid: bool = prepare(velocity, dt, *given)
         excess = np.maximum(
             simulation.surface.level_set.density.numpy() - simulation.boundary.capacity.numpy(), 0.0
         )
@@ -146,7 +146,7 @@ def _push_liquid_apart(simulation: Any) -> None:
         projection._b.assign(
             projection._b.numpy() - np.where(inside, excess, 0.0) * simulation.grid.spacing / dt
         )
-        return there
+        return has_liquid
 
     projection.prepare = pushed
 

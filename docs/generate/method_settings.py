@@ -27,18 +27,18 @@ ALSO = "- [common](#common-settings): "
 
 def rows(kind: type[Any]) -> dict[str, str]:
     """Return the settings of a class as items of a list, by name."""
-    allowed, default, found = ranges(kind), kind(), {}
+    allowed, default, items = ranges(kind), kind(), {}
     for name in (field.name for field in dataclasses.fields(kind)):
         words = (
             rule(allowed[name])
             .replace("an integer", "integer")
             .replace("a finite number", "finite")
         )
-        found[name] = f"- `{name}` = `{getattr(default, name)!r}`, {words}"
+        items[name] = f"- `{name}` = `{getattr(default, name)!r}`, {words}"
     return (
-        found | {"cycle": "- `cycle`: [CycleSettings](#cyclesettings)"}
-        if "cycle" in found
-        else found
+        items | {"cycle": "- `cycle`: [CycleSettings](#cyclesettings)"}
+        if "cycle" in items
+        else items
     )
 
 
@@ -52,7 +52,7 @@ def section(title: str, lines: list[str], also: list[str]) -> str:
 def page() -> str:
     """Return the page."""
     methods = {kind.__name__: rows(kind) for kind in wl.METHODS.values()}
-    count = Counter(line for found in methods.values() for line in found.values())
+    count = Counter(line for items in methods.values() for line in items.values())
     common = [line for line, times in count.items() if times >= COMMON]
     names = Counter(line.split("`")[1] for line in common)
     # A name has one default here.
@@ -62,9 +62,9 @@ def page() -> str:
         for kind in (wl.StoppingCriteria, wl.CycleSettings)
     ]
     parts.append(section("Common settings", common, []))
-    for title, found in methods.items():
-        own = [line for line in found.values() if line not in common]
-        parts.append(section(title, own, [name for name, line in found.items() if line in common]))
+    for title, items in methods.items():
+        own = [line for line in items.values() if line not in common]
+        parts.append(section(title, own, [name for name, line in items.items() if line in common]))
     return HEAD + "".join(parts)
 
 

@@ -43,15 +43,15 @@ def printed(notebook: dict[str, Any], pictures: list[list[bytes]] | None = None)
 
 def drawn(plt: Any) -> list[bytes]:
     """Return the open figures as PNG files, and close them."""
-    found = []
+    pictures = []
     for figure in map(plt.figure, plt.get_fignums()):
         file = io.BytesIO()
         figure.savefig(
             file, format="png", dpi=DOTS, bbox_inches="tight", metadata={"Software": None}
         )
-        found.append(file.getvalue())
+        pictures.append(file.getvalue())
     plt.close("all")
-    return found
+    return pictures
 
 
 def kept(notebook: dict[str, Any]) -> list[str]:

@@ -326,14 +326,14 @@ def section(name: str, definition: Definition, others: dict[str, Definition] | N
 
 def tables_of(schema: Definition) -> dict[str, Definition]:
     """Return a simulator's tables by name, including nested tables."""
-    found = {}
+    tables = {}
     for name, prop in schema["properties"].items():
         if (target := reference(prop)) is not None:
-            found[name] = schema["$defs"][target]
-            for inner, part in found[name]["properties"].items():
+            tables[name] = schema["$defs"][target]
+            for inner, part in tables[name]["properties"].items():
                 if (deeper := reference(part)) is not None:
-                    found[f"{name}.{inner}"] = schema["$defs"][deeper]
-    return found
+                    tables[f"{name}.{inner}"] = schema["$defs"][deeper]
+    return tables
 
 
 def shapes_of(schema: Definition, name: str) -> dict[str, Definition]:

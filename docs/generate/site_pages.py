@@ -109,13 +109,13 @@ def formula(found: re.Match[str]) -> str:
     """Return a TeX formula as MathML."""
     from latex2mathml.converter import convert
 
-    made = convert(html.unescape(found[2]), display="block" if found[1] == "div" else "inline")
-    if "\\" in made:
+    mathml = convert(html.unescape(found[2]), display="block" if found[1] == "div" else "inline")
+    if "\\" in mathml:
         raise ValueError(f"not all of this is TeX that can be drawn: {found[2]}")
-    made = made.replace("<mo>&#x0221E;</mo>", "<mi>&#x0221E;</mi>").replace(
+    mathml = mathml.replace("<mo>&#x0221E;</mo>", "<mi>&#x0221E;</mi>").replace(
         "<mi>&#x027C2;</mi>", "<mo>&#x027C2;</mo>"
     )
-    return f'<div class="formula">{made}</div>' if found[1] == "div" else made
+    return f'<div class="formula">{mathml}</div>' if found[1] == "div" else mathml
 
 
 def typeset(text: str) -> str:

@@ -46,12 +46,12 @@ def problem(kind: str, seed: int, *, small: bool = False) -> Unseen:
     """
     if kind not in KINDS:
         raise ValueError(f"kind = {kind}: must be one of {', '.join(KINDS)}")
-    made = KINDS[kind](Draw(kind, seed, small=small))
-    if not isinstance(made, GridProblem):
-        return Unseen(made)
-    made = solvable(made)
+    drawn = KINDS[kind](Draw(kind, seed, small=small))
+    if not isinstance(drawn, GridProblem):
+        return Unseen(drawn)
+    drawn = solvable(drawn)
     return Unseen(
-        made,
-        changed(made, seed) if seed % WARM_EVERY == 0 and not small else None,
+        drawn,
+        changed(drawn, seed) if seed % WARM_EVERY == 0 and not small else None,
         ALLOWANCE.get(kind, 1.0),
     )

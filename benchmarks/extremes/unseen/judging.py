@@ -124,17 +124,19 @@ class UnseenCase(Drawn):
     def _warm(
         self, then: GridProblem, before: wl.SolveResult, attempt: Attempt, device: str
     ) -> None:
-        taken = {}
+        iterations = {}
         for how, guess in (("cold", {}), ("warm", {"x0": before.x})):
             result, found = solved(then, self.solve, device, **guess)
-            taken[how] = result.linear_iterations
+            iterations[how] = result.linear_iterations
             attempt.faults += [
                 f"changed, {how}: {fault}"
                 for fault in [*found.faults, *([] if result else [result.status.name])]
             ]
-        attempt.facts |= taken
-        if taken["warm"] > limit(taken["cold"], OFTEN, 1.0):
-            attempt.faults.append(f"{taken['warm']} iterations warm, {taken['cold']} cold")
+        attempt.facts |= iterations
+        if iterations["warm"] > limit(iterations["cold"], OFTEN, 1.0):
+            attempt.faults.append(
+                f"{iterations['warm']} iterations warm, {iterations['cold']} cold"
+            )
 
 
 def limit(equations: int | None, of: tuple[float, int], allowance: float) -> float:
@@ -165,7 +167,7 @@ class EveryMethodCase(Drawn):
 
     def tried(self, precision: str, device: str) -> Attempt:
         """Try all methods."""
-        problem, begun = (
+        problem, start_time = (
             unseen.problem(self.kind, self.seed, small=True).problem,
             time.perf_counter(),
         )
@@ -180,7 +182,7 @@ class EveryMethodCase(Drawn):
             "ends": ends,
             "converged": sum(end == "CONVERGED" for end in ends.values()),
         }
-        return Attempt("done", None, time.perf_counter() - begun, faults=faults, facts=facts)
+        return Attempt("done", None, time.perf_counter() - start_time, faults=faults, facts=facts)
 
 
 def by_method(
