@@ -78,7 +78,8 @@ def main(folder: Path) -> None:
                 f"{sorted(contents - expected)} besides"
             )
     print(
-        f"{wheel.name}: {len(contents)} files, all of warp_lcp; the same of a source distribution and "
+        f"{wheel.name}: {len(contents)} files, all of warp_lcp; the same of a source "
+        "distribution and "
         "without symbolic links"
     )
 

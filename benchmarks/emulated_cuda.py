@@ -89,9 +89,14 @@ struct emulated_order {
     size_t n, a; int order;
     emulated_order(size_t size) : n(size), a(1), order(*(volatile int*)ADDRESSull) {
         if (order != 2 || n < 3) return;
-        const auto divisor = [](size_t x, size_t y) { while (y) { const size_t t = x % y; x = y; y = t; } return x; };
+        const auto divisor = [](size_t x, size_t y) {
+            while (y) { const size_t t = x % y; x = y; y = t; }
+            return x;
+        };
         for (a = (size_t)(0.6180339887*(double)n) | 1; divisor(a, n) != 1;) ++a; }
-    size_t operator()(size_t t) const { return order == 0 ? t : order == 1 ? n - 1 - t : (t*a + n/3) % n; }
+    size_t operator()(size_t t) const {
+        return order == 0 ? t : order == 1 ? n - 1 - t : (t*a + n/3) % n;
+    }
 };
 """
 

@@ -49,35 +49,59 @@ PAIRS = """
 #pragma clang fp contract(off) reassociate(off)
 #endif
 struct Two { float hi, lo; };
-const auto sum = [](float a, float b) -> Two { const float s = a + b, t = s - a; return {s, (a - (s - t)) + (b - t)}; };
-const auto quick = [](float a, float b) -> Two { const float s = a + b; return {s, b - (s - a)}; };  // |a| >= |b|
-const auto product = [](float a, float b) -> Two { const float p = __fmul_rn(a, b); return {p, fmaf(a, b, -p)}; };
-const auto scaled = [&](float a, Two b) -> Two { const Two p = product(a, b.hi); return quick(p.hi, fmaf(a, b.lo, p.lo)); };
+const auto sum = [](float a, float b) -> Two {
+    const float s = a + b, t = s - a;
+    return {s, (a - (s - t)) + (b - t)};
+};
+const auto quick = [](float a, float b) -> Two {  // |a| >= |b|
+    const float s = a + b;
+    return {s, b - (s - a)};
+};
+const auto product = [](float a, float b) -> Two {
+    const float p = __fmul_rn(a, b);
+    return {p, fmaf(a, b, -p)};
+};
+const auto scaled = [&](float a, Two b) -> Two {
+    const Two p = product(a, b.hi);
+    return quick(p.hi, fmaf(a, b.lo, p.lo));
+};
 const auto add = [&](Two a, Two b) -> Two {
-    const Two s = sum(a.hi, b.hi), t = sum(a.lo, b.lo), u = quick(s.hi, s.lo + t.hi); return quick(u.hi, u.lo + t.lo); };
+    const Two s = sum(a.hi, b.hi), t = sum(a.lo, b.lo), u = quick(s.hi, s.lo + t.hi);
+    return quick(u.hi, u.lo + t.lo);
+};
 """
 # y = e x - sum of w x_neighbor + b, with weights and bounds in float32.
 PLAIN = """
 const auto gap = [&](F to) { return hi[c] - to; };
-const F y = e*hi[c] - (cx*(hi[c-1] + hi[c+1]) + cy*(hi[c-row] + hi[c+row]) + cz*(hi[c-plane] + hi[c+plane])) + b_hi[c];
+const F y = e*hi[c]
+    - (cx*(hi[c-1] + hi[c+1]) + cy*(hi[c-row] + hi[c+row]) + cz*(hi[c-plane] + hi[c+plane]))
+    + b_hi[c];
 """
 TWO = """
 const auto gap = [&](float to) { return (hi[c] - to) + lo[c]; };
 const auto x = [&](int at) -> Two { return {hi[at], lo[at]}; };
 const auto axis = [&](float w, int step) { return scaled(-w, add(x(c - step), x(c + step))); };
-const Two all = add(add(scaled(e, x(c)), add(add(axis(cx, 1), axis(cy, row)), axis(cz, plane))), Two{b_hi[c], b_lo[c]});
+const Two neighbors = add(add(axis(cx, 1), axis(cy, row)), axis(cz, plane));
+const Two all = add(add(scaled(e, x(c)), neighbors), Two{b_hi[c], b_lo[c]});
 const float y = all.hi + all.lo;
 """
 DIFFERENCES = """
 const auto gap = [&](float to) { return (hi[c] - to) + lo[c]; };
 float v = 0, rest = e;  // of e: faces to air
-const auto beside = [&](float open, int at) { v += open*((hi[c] - hi[at]) + (lo[c] - lo[at])); rest -= open; };
-const auto axis = [&](float w, int s) { beside(d[c-s] ? w : 0.0f, c - s); beside(d[c+s] ? w : 0.0f, c + s); };
+const auto beside = [&](float open, int at) {
+    v += open*((hi[c] - hi[at]) + (lo[c] - lo[at]));
+    rest -= open;
+};
+const auto axis = [&](float w, int s) {
+    beside(d[c-s] ? w : 0.0f, c - s);
+    beside(d[c+s] ? w : 0.0f, c + s);
+};
 axis(cx, 1); axis(cy, row); axis(cz, plane);
 const float y = ((v + rest*hi[c]) + b_hi[c]) + b_lo[c];
 """
 NATURAL = """
-const F f = e != 0 ? e : (F)1, l = code[c] & 1 ? g.least : -(F)INFINITY, u = code[c] & 2 ? g.most : (F)INFINITY;
+const F f = e != 0 ? e : (F)1;
+const F l = code[c] & 1 ? g.least : -(F)INFINITY, u = code[c] & 2 ? g.most : (F)INFINITY;
 const F below = f*gap(l), above = f*gap(u), low = below < y ? below : y;
 g.r.data[c] = g.unknown.data[c] == 1 ? (above > low ? above : low) : (F)0;
 """

@@ -14,7 +14,8 @@ from pathlib import Path
 # Tests of minutes, or of other subjects: compilation for CUDA, pages and notebooks, ranks, killed
 # runs.
 NEVER = re.compile(
-    r"_slow|cuda_compiles|test_docs|notebook|readme|tutorial|gallery_page|on_ranks|tests/(distributed|benchmarks|fuzz)|killed_run|crash_points"
+    r"_slow|cuda_compiles|test_docs|notebook|readme|tutorial|gallery_page|on_ranks|"
+    r"tests/(distributed|benchmarks|fuzz)|killed_run|crash_points"
 )
 WORD = re.compile(r"\w+")
 

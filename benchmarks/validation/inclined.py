@@ -416,9 +416,11 @@ def with_stairs(simulation: SandSimulation) -> SandSimulation:
 
 OBLIQUE = Check(
     about="""
-Sand on walls that lie askew to the grid: a stiff block slides as Coulomb says, and a smooth hopper runs evenly wherever the grid lies.
+Sand on walls that are inclined to the grid: a stiff block slides by Coulomb's law, and the rate of
+a smooth hopper does not depend on its place in the grid.
 
-The control are solids of whole cells, whose stairs hold the block, and whose hopper runs as its stairs happen to lie.
+The controls are solids of whole cells. Their stairs hold the block, and the rate of their hopper
+depends on the place of the stairs.
 """,
     trials=[(planes, (8, 16)), (hopper, [()])],
 )

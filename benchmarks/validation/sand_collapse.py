@@ -460,7 +460,8 @@ def models(found: Findings, cells: int) -> None:
 
 
 RESTING = Check(
-    about="""A pile that has collapsed comes to rest: its inside stands, and its surface moves less and less.
+    about="""
+A collapsed pile comes to rest: its inside does not move, and its surface moves less and less.
 
 The box of Narain et al. is compared with the cone on the same column.
 """,
