@@ -82,7 +82,7 @@ def overlap(bodies: RigidBodies) -> float:
 
 
 def steps_of_spheres(options: Options) -> tuple[list[Record], Table]:
-    """Return the cost of steps by each method, measured in turns.
+    """Return the cost of steps by each method, by interleaved timing.
 
     All methods take the same step from the same state. The result of the last method is kept.
     """

@@ -1,4 +1,4 @@
-"""Seepage through a dam: comparison with PETSc's SNESVI, in turns on one core.
+"""Seepage through a dam: interleaved comparison with PETSc's SNESVI, one core.
 
 Run `python -m benchmarks.dam` in the source tree. Both solvers start cold: the time includes
 problem, operator and multigrid. PETSc uses grid sequencing, each grid with half the spacing of the

@@ -29,7 +29,7 @@ TIME_LIMITS, GROWTH_LIMIT, MEMORY_LIMIT, LAYING_LIMIT = {192: 1.2, 768: 1.5}, 1.
 
 
 def measure(options: Options, out: Path) -> Results:
-    """Step the liquid in each domain, in turns; then measure memory and the flight.
+    """Step the liquid in each domain, interleaved; then measure memory and the flight.
 
     Memory is measured in one process per domain.
     """

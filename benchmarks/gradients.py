@@ -1,6 +1,6 @@
 """Cost of gradients through a solution.
 
-Run `python -m benchmarks.gradients` in the source tree. It measures CPU seconds, in turns.
+Run `python -m benchmarks.gradients` in the source tree. Its CPU times are interleaved.
 
 `wl.vjp` is compared with the solve itself and with the linear solve that it contains, on a membrane
 over a ball. In that linear solve the active unknowns are AIR, the tolerance is the same, and the

@@ -132,7 +132,7 @@ def measure(options: Options, out: Path) -> Results:
 
 
 def _measure_form(n: int, form: str, options: Options) -> list[Record]:
-    """Record the passes of one form of coefficients and time them in turns.
+    """Record the passes of one form of coefficients and time them, interleaved.
 
     Copies and the peers take part in the rounds.
     """

@@ -62,7 +62,7 @@ class Watch:
 
 
 def measure(options: Options, out: Path) -> Results:
-    """Run the scenes in turns, then compare walls and time the particles."""
+    """Run the scenes, interleaved; then compare walls and time the particles."""
     records = [machine(options.device, elements=1 << 22, repeat=options.repeat)]
     size = max(options.sizes, default=0)
     samples: dict[str, list[dict[str, float]]] = {name: [] for name in SCENES}

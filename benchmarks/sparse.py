@@ -1,6 +1,6 @@
 """Sparse matrices with random numbering: cold solves against PyAMG.
 
-A solve with bounds is compared with PyAMG's best linear solve of the same matrix, in turns.
+A solve with bounds is compared with PyAMG's best linear solve of the same matrix, interleaved.
 """
 
 from __future__ import annotations

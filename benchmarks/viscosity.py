@@ -4,8 +4,8 @@ Run `python -m benchmarks.viscosity [CELLS ...]` in the source tree.
 
 The tank is filled to three fifths; its surface is wavy and its velocity is a few smooth waves. The
 benchmark measures the viscous step at several viscosities, and the pressure of that velocity, cold,
-with closed walls and with separating walls. All solve to 1e-4, in turns; the results are medians of
-CPU times.
+with closed walls and with separating walls. All solve to 1e-4, interleaved; the results are medians
+of CPU times.
 """
 
 import sys

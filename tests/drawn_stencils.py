@@ -155,9 +155,9 @@ def drawn(seed, kind=None, *, thin=True):
     """Return a stencil of any shape, cells and boundaries with a dominant diagonal.
 
     Args:
-        seed: of the draw.
-        kind: of the coefficients, one of `KINDS`; drawn if None.
-        thin: whether axes of one and two cells are drawn, too.
+        seed: seed of the draw.
+        kind: kind of the coefficients, one of `KINDS`; random if None.
+        thin: whether axes may have one or two cells.
     """
     rng = np.random.default_rng(seed)
     n, kind = int(rng.integers(2, 4)), kind or rng.choice(KINDS)

@@ -81,9 +81,9 @@ def differences_by_step(scene: Scene, steps: int, every: int = 1) -> dict[int, l
     The compared step is the one after the step from which a fresh simulation has continued.
 
     Args:
-        scene: what to simulate.
-        steps: how many are taken without interruption.
-        every: continue behind each that this divides.
+        scene: scene to simulate.
+        steps: number of steps of the uninterrupted run.
+        every: interval of the steps after which a simulation is resumed.
     """
     whole, found = made(scene), {}
     for step in range(steps):

@@ -33,10 +33,10 @@ class Target:
     """Target of a figure, and its start.
 
     Args:
-        name: of the figure.
-        figure: what moves.
-        goals: g [m], shape (e, dimension).
-        start: angles [rad], shape (n,), strictly within the limits.
+        name: name of the figure.
+        figure: the articulated figure.
+        goals: goals g [m], shape (e, dimension).
+        start: initial angles [rad], shape (n,), strictly within the limits.
         reachable: whether some pose meets the goal.
     """
 
@@ -113,20 +113,20 @@ class Comparison:
     """Counts over targets.
 
     Args:
-        targets: how many.
-        converged: how many of our runs did.
-        same: how many objectives agree to SAME.
-        better: how many other optima of ours are lower than SciPy's.
-        worse: how many are higher.
-        both_stay: of the other optima, how many each code keeps when it starts from the other's
-            answer and ours from ours.
-        outside: the most by which a limit was passed [rad].
-        overshoot: the most by which a solution of an LCP left its bounds before it was clipped
-            [rad].
-        grew: steps after which the objective was higher.
-        iterations: of all our runs.
-        evaluations: of all of SciPy's.
-        worst: the largest difference where ours is higher, in units of reach^2.
+        targets: number of targets.
+        converged: number of our converged runs.
+        same: number of objectives that agree to SAME.
+        better: number of our other optima that are lower than SciPy's.
+        worse: number of our other optima that are higher.
+        both_stay: number of other optima that both codes keep, SciPy from our answer and ours
+            from its own.
+        outside: largest violation of a limit [rad].
+        overshoot: largest violation of the bounds by a solution of an LCP before it was
+            clipped [rad].
+        grew: number of steps that raised the objective.
+        iterations: iterations of all our runs.
+        evaluations: evaluations of all of SciPy's runs.
+        worst: largest difference if ours is higher, in units of reach^2.
     """
 
     targets: int = 0

@@ -63,7 +63,7 @@ class PlainMap:
     Args:
         form: "natural", "fischer" or "penalized".
         A, b, lower, upper: the problem.
-        share: of the penalized map.
+        share: share of the penalized map.
         kink: (p, q) at kinks.
     """
 

@@ -26,9 +26,9 @@ class Drawn:
         scaled: the same in other units, infinity as 1e20, 1e30 or inf.
         verdict: "solvable", "infeasible" or "unbounded".
         x: a minimizer in plain units, which are those of `scaled` times `units`.
-        unique: whether there is no other.
+        unique: whether x is the only minimizer.
         cost: factor of P and q.
-        units: what a unit of x in `scaled` is in plain units, shape (n,).
+        units: unit of x in `scaled`, in plain units, shape (n,).
     """
 
     plain: dict
@@ -44,10 +44,10 @@ def draw(seed, *, widest=8.0, columns=0.0, most=14):
     """Return a program.
 
     Args:
-        seed: of the draw.
-        widest: costs and rows are scaled by powers of 10 up to this.
-        columns: unknowns are, too.
-        most: unknowns.
+        seed: seed of the draw.
+        widest: largest exponent of the powers of 10 that scale costs and rows.
+        columns: whether unknowns are scaled, too.
+        most: largest number of unknowns.
     """
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, most + 1))

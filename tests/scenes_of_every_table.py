@@ -23,8 +23,8 @@ class Draw:
     Lengths are in units of the domain's longest side, times in those of a fall through it.
 
     Args:
-        seed: scenes of seeds that follow each other go through sides, dimensions, materials and
-            shapes in turn.
+        seed: seed of the scene; consecutive seeds cycle through sides, dimensions, materials
+            and shapes.
     """
 
     def __init__(self, seed: int) -> None:

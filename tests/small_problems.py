@@ -19,12 +19,12 @@ class SmallProblem:
     """Problem A x + b = y with bounds, and an initial guess.
 
     Args:
-        name: what it is.
+        name: description of the problem.
         A: numpy array or scipy.sparse matrix, shape (n, n).
         b: shape (n,), units of y.
         lower: l, shape (n,).
         upper: u, shape (n,).
-        start: a guess, shape (n,); None: a cold start.
+        start: initial guess, shape (n,); None for a cold start.
     """
 
     name: str
@@ -161,9 +161,9 @@ def plain_active_set(
     Solve on the free set until the set stays.
 
     Args:
-        problem: the problem; its matrix dense unless `bands` are given.
-        bands: of a tridiagonal A as `scipy.linalg.solve_banded` takes them.
-        limit: the most steps.
+        problem: the problem; its matrix is dense if `bands` is None.
+        bands: bands of a tridiagonal A in the form of `scipy.linalg.solve_banded`.
+        limit: largest number of steps.
     """
     A, b, lower, upper, x = problem.A, problem.b, problem.lower, problem.upper, problem.first
     d, y = A.diagonal(), A @ x + b

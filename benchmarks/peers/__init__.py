@@ -1,6 +1,6 @@
 """Suite `peers`: this library and other solvers on the same problems.
 
-All solve to the same residual, in turns, in one run.
+All solve to the same residual, interleaved in one run.
 """
 
 from __future__ import annotations

@@ -55,7 +55,7 @@ class Runs:
         )
 
     def measure(self, settings: Sequence[Setting]) -> list[Run]:
-        """Run all settings, in turns."""
+        """Run all settings, interleaved."""
         runs = [Run(setting) for setting in settings]
         for turn in range(self.options.repeat):
             for number, run in enumerate(runs):

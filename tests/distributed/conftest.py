@@ -21,14 +21,14 @@ def mpi(tmp_path):
 
     `mpi(2, "-m", "module", "--option")`, or `mpi(2, TEXT, *arguments)` with the text of a program.
 
-    Text is what has a line break in it; it is written into a file in `tmp_path`, which is the
+    A text has a line break. It is written into a file in `tmp_path`, which is the
     working folder of all runs.
 
     Args:
-        n: ranks.
-        arguments: of the interpreter, any type that `str` turns into text; or a program and its
-            arguments.
-        exit_code: what the run must end with; None for anything.
+        n: number of ranks.
+        arguments: arguments of the interpreter, of any type that `str` converts; or a program
+            and its arguments.
+        exit_code: required exit code; None for any.
         seconds: time limit.
         environment: variables to add.
 

@@ -49,8 +49,8 @@ class Fault:
     """Fault of this rank, which occurs once.
 
     Args:
-        kind: one of KINDS.
-        number: of the time at which it does.
+        kind: a name of KINDS.
+        number: visit of the place at which the fault occurs.
     """
 
     def __init__(self, kind: str, number: int) -> None:

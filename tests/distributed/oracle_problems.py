@@ -63,10 +63,10 @@ def small(name: str, bounds: str) -> Small:
     """Return liquid below air with a solid ball in it, in a closed box.
 
     Args:
-        name: cube (16^3, unit coefficients), brick (17 x 13 x 11 cells, a coefficient a face, a
-            shift) or plane (64^2, c_y = 1/2).
-        bounds: walls (x >= 0 beside solids), everywhere (x >= 0) or boxed (both bounds, other ones
-            in each cell).
+        name: cube (16^3, unit coefficients), brick (17 x 13 x 11 cells, a coefficient for each
+            face, a shift) or plane (64^2, c_y = 1/2).
+        bounds: walls (x >= 0 beside solids), everywhere (x >= 0) or boxed (both bounds,
+            different in each cell).
     """
     shape = {"cube": (16, 16, 16), "brick": (11, 13, 17), "plane": (64, 64)}[name]
     rng = np.random.default_rng(20261122 + len(name))

@@ -77,11 +77,11 @@ def measured(
     """Return the level set of evenly spread particles.
 
     Args:
-        simulation: of unit cells.
-        liquid: whether it is at each of `points` an axis and cell, two cells beyond the domain, in
-            the order of the stored cells.
-        open_: whether no solid is there.
-        points: how many.
+        simulation: simulation of unit cells.
+        liquid: whether liquid is at each sample; `points` samples per axis and cell, up to two
+            cells beyond the domain, in the order of the stored cells.
+        open_: whether a sample is outside of solids.
+        points: number of samples along each axis of a cell.
     """
     filled, room = (liquid & open_).astype(np.float64), open_.astype(np.float64)
     for axis, count in enumerate(simulation.grid.counts[::-1]):

@@ -24,10 +24,10 @@ def start(
 
     Args:
         solids: the tables [[solid]].
-        size: of the domain [m].
-        depth: of the bed [m].
+        size: size of the domain [m].
+        depth: depth of the bed [m].
         resolution: cells along the longest side.
-        tables: other tables of the scene.
+        tables: further tables of the scene.
     """
     flat = len(size) == 2
     bed = {"shape": "box", "min": [0.0] * len(size), "max": [size[0], depth, *size[2:]]}

@@ -76,10 +76,10 @@ def make(
         dimension: 2 or 3.
         counts: cells along x, y (and z).
         blocks: first and one past the last cell (x, y, z) of each, counted from 0.
-        ratio: of the blocks' density to sand's.
+        ratio: ratio of the blocks' density to sand's.
         depth: rows of sand.
-        sand: first and one past the last column that holds sand; None: all.
-        friction: of all walls.
+        sand: first and one past the last column with sand; None for all.
+        friction: friction of all walls.
     """
     grid = StaggeredGrid((*counts, 1)[:3], DX, dimension)
     index = np.zeros(grid.shape, dtype=np.int32)

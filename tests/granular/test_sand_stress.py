@@ -195,13 +195,12 @@ def nearest(
     m^2, and free entries shrink. SciPy's root finder gives each m, and mu.
 
     Args:
-        point: to project.
-        groups: entries whose largest magnitude counts.
-        free: weights of the squares of the entries that count by themselves; 0 for those in groups.
-        metric: weights of the squared distance; on the entries that count by themselves equal to
-            `free`.
-        radius: of the set.
-        grown: the radius by the multiplier instead.
+        point: the point to project.
+        groups: groups of entries of which the largest magnitude counts.
+        free: weights of the squares of the free entries; 0 for those in groups.
+        metric: weights of the squared distance; equal to `free` on the free entries.
+        radius: radius of the set.
+        grown: radius as a function of the multiplier, in place of `radius`.
     """
     if radius < 1e-12:
         return np.zeros_like(point)

@@ -30,7 +30,7 @@ class Twin:
     """Problem of random sand, and repeated solves from the same stresses.
 
     Args:
-        rng: draws grid, sand, walls and yield set.
+        rng: random generator of grid, sand, walls and yield set.
     """
 
     def __init__(self, rng: np.random.Generator) -> None:

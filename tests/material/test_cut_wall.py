@@ -41,10 +41,10 @@ class Slope:
 
     Args:
         grid: the grid.
-        normal: of the plane, into the open.
-        kind: of the open cells.
-        contact: of the open cells that the plane cuts.
-        shift: how far the plane lies from the domain's center along its normal, in cells.
+        normal: normal of the plane, into the open.
+        kind: kind of the open cells.
+        contact: contact state of the open cells that the plane cuts.
+        shift: distance of the plane from the domain's center along its normal [cells].
     """
 
     def __init__(

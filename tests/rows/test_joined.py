@@ -49,7 +49,7 @@ class Chain:
     """Stretches x = factor x + shift on the device, with the same on the host.
 
     Args:
-        factors: of each stretch.
+        factors: factor of each stretch.
     """
 
     def __init__(self, factors: list[float]) -> None:

@@ -28,10 +28,10 @@ class Disk:
     Files opened by `open` fail beyond the limit.
 
     Args:
-        folder: whose files count.
-        size: how much they may take [bytes].
-        code: of the error.
-        block: bytes that a file's size is rounded up to.
+        folder: folder of the counted files.
+        size: limit of their total size [bytes].
+        code: code of the error.
+        block: block size to which a file's size is rounded up [bytes].
     """
 
     def __init__(self, folder: Path, size: int, code: int = errno.ENOSPC, block: int = 1) -> None:

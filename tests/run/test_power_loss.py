@@ -35,11 +35,11 @@ class Moment:
     """Possible contents of a disk if the power fails now.
 
     Args:
-        names: of each folder, as they are.
-        durable: of each folder, as `fsync` has brought them to the disk.
-        files: what `fsync` has brought to the disk of each file.
-        promised: the newest step whose checkpoint had been written, for all that the run knew; -1
-            if none.
+        names: present names in each folder.
+        durable: names in each folder that `fsync` has flushed to the disk.
+        files: contents of each file that `fsync` has flushed to the disk.
+        promised: newest step whose checkpoint had been written, as known to the run; -1 if
+            none.
     """
 
     names: dict[int, Names]
@@ -56,10 +56,10 @@ class Moment:
         """Set a folder to its state after the failure.
 
         Args:
-            root: the number of the folder above.
-            out: the folder, which is not there.
-            ahead: names have reached the disk at once, before what is in the files; they may also
-                come as late as they can.
+            root: inode number of the folder above.
+            out: the folder, which does not exist yet.
+            ahead: whether names reach the disk at once, before the contents of the files;
+                otherwise as late as possible.
         """
         known = self.names if ahead else self.durable
         waiting = [(known.get(root, {}).get(out.name), out)]
@@ -77,7 +77,7 @@ class Disk:
     """Recorder of all operations on a folder, with the state at each moment.
 
     Args:
-        root: above the folder.
+        root: the folder above.
     """
 
     root: Path

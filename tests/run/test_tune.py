@@ -89,8 +89,8 @@ class Model:
     """Replacement of trials: distance and seconds by a formula of cfl and tolerance.
 
     Args:
-        distance: of a cfl of 1.
-        fails: from which cfl on runs fail.
+        distance: distance at a cfl of 1.
+        fails: least cfl at which runs fail.
     """
 
     def __init__(self, distance: float, fails: float = np.inf, drift: float = 0.0) -> None:
@@ -153,7 +153,7 @@ class Blurred(Model):
     their own.
 
     Args:
-        noise: that distance.
+        noise: distance of runs as good as the reference.
     """
 
     def __init__(self, distance: float, noise: float, drift: float = 0.0) -> None:
@@ -208,8 +208,8 @@ class Steps(Model):
     """Replacement of trials: 10 / cfl steps, and an irreducible part of the distance.
 
     Args:
-        stays: that part.
-        falls: what is beside it of a cfl of 1.
+        stays: irreducible part of the distance.
+        falls: remaining part of the distance at a cfl of 1.
     """
 
     def __init__(self, stays: float, falls: float) -> None:

@@ -134,10 +134,10 @@ class Case:
 
     Args:
         on, off: tables of the scene with the model, and of the nearest one without it.
-        modules: names, or their beginnings, of the kernel modules that are the model's own.
-        files: source files beneath which what it allocates is allocated.
-        columns: its own.
-        sand: whether the scene is one of sand.
+        modules: names, or their beginnings, of the model's own kernel modules.
+        files: source files on the stack of the model's allocations.
+        columns: log columns of the model.
+        sand: whether the scene has sand.
     """
 
     on: dict[str, Any]

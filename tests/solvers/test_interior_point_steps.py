@@ -24,10 +24,10 @@ class PlainPath:
 
     Args:
         A, b, lower, upper: the problem.
-        mehrotra: predictor and corrector, or the book's rule.
+        mehrotra: whether to use predictor and corrector, or the book's rule.
         horizon: N of the book's rule.
         backoff: share of the way to the boundary, at most.
-        start: multiple of the size of b from which w d and s begin.
+        start: initial w d and s, as a multiple of the size of b.
     """
 
     def __init__(

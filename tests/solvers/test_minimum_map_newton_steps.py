@@ -48,8 +48,8 @@ def plain_newton(A, b, lower, upper, x, steps, *, memory, backtracks=6):
     Active unknowns move onto their bounds, A_FF e = -y_F, and x = clip(x + t e) by Armijo's rule.
 
     Returns:
-        For each step x after it, how many are held, and t; t = 0 where the search fails, which
-        leaves x on its bounds.
+        For each step: x after it, the number of active unknowns, and t. t = 0 if the search
+        fails, which leaves x on its bounds.
     """
     d, norms, found = np.diag(A), [], []
     for _ in range(steps):

@@ -23,7 +23,7 @@ def plain_penalty(A, b, lower, upper, x, steps, rho):
     V is the unknowns where z is beyond a bound g; at first by x - y / (rho d).
 
     Returns:
-        For each step clip(z+, l, u), z+, and how many unknowns are beyond a bound.
+        For each step: clip(z+, l, u), z+, and the number of unknowns beyond a bound.
     """
     d, found = np.diag(A), []
     z = x - (A @ x + b) / (rho * d)
