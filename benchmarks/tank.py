@@ -215,9 +215,9 @@ def _solve(tank: Tank, samples: dict[str, list[float]], counts: dict[str, float]
     The arrays are freed when the problem is made.
     """
     forget_peak()
-    start_time = resident_bytes()
+    initial_bytes = resident_bytes()
     cells, b, lower = tank.arrays()
-    input_bytes = resident_bytes() - start_time
+    input_bytes = resident_bytes() - initial_bytes
     times = [time.perf_counter()]
     A = wl.GridPoisson(cells, device="cpu")
     times.append(time.perf_counter())
@@ -230,8 +230,8 @@ def _solve(tank: Tank, samples: dict[str, list[float]], counts: dict[str, float]
     times.append(time.perf_counter())
     for name, size in (
         ("given", input_bytes),
-        ("peak", resident_bytes(peak=True) - start_time),
-        ("kept", resident_bytes() - start_time),
+        ("peak", resident_bytes(peak=True) - initial_bytes),
+        ("kept", resident_bytes() - initial_bytes),
     ):
         samples[name].append(1e-9 * size)
     for part, (start, end) in zip(

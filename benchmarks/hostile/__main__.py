@@ -143,7 +143,7 @@ def supervise(kind: str, seed: int, count: int) -> list[Outcome]:
             "--count",
             str(count),
         ]
-        start_time = ""
+        running_case = ""
         with (
             tempfile.TemporaryFile("w+") as messages,
             subprocess.Popen(
@@ -160,7 +160,7 @@ def supervise(kind: str, seed: int, count: int) -> list[Outcome]:
                     continue
                 record = json.loads(line[1:])
                 if "begin" in record:
-                    start_time = record["name"]
+                    running_case = record["name"]
                     continue
                 outcomes.append(
                     Outcome(kind, record["end"], record["name"], _late(record), record["seconds"])
@@ -181,7 +181,7 @@ def supervise(kind: str, seed: int, count: int) -> list[Outcome]:
                 Outcome(
                     kind,
                     len(outcomes),
-                    start_time,
+                    running_case,
                     [[category, why]],
                     LIMIT + GRACE if category == "TIMEOUT" else 0.0,
                 )

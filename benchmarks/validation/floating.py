@@ -194,8 +194,8 @@ def exchange(dimension: int, ratio: float, *, together: bool = True) -> tuple[fl
     assert coupling is not None and bodies is not None
     if not together:
         coupling._share = 0.0
-    start_time = simulation.begin_step(0.01)
-    window: Window = simulation.window(start_time)
+    totals = simulation.begin_step(0.01)
+    window: Window = simulation.window(totals)
     simulation.particles_to_grid(window)
     simulation.surface.mark(simulation.particles, window, simulation.projection.kind)
     simulation.surface.complete(
@@ -204,7 +204,7 @@ def exchange(dimension: int, ratio: float, *, together: bool = True) -> tuple[fl
     before = [field.numpy().astype(np.float64) for field in simulation.velocity]
     start = bodies.bodies[0].momentum.copy()
     energy = bodies.bodies[0].kinetic_energy
-    simulation._project(window, 0.01, simulation.top_speed(start_time))
+    simulation._project(window, 0.01, simulation.top_speed(totals))
     wet = np.zeros(simulation.grid.shape, dtype=bool)
     wet[tuple(simulation.projection.fluid_cells().T)] = True
     scale, gained, energies = (
