@@ -274,8 +274,10 @@ def bearings(*sizes: tuple[int, int]) -> tuple[float, ...]:
 def put_problem() -> tuple[np.ndarray, np.ndarray, Callable[[np.ndarray], np.ndarray]]:
     """Return A, the payoff and b(V) of PETSc's blackscholes.c.
 
-    The problem is a time step of an American put by Crank and Nicolson's scheme. Values 10 at S = 0
-    and 0 at S = 100 are known, so that A has 149 unknowns; V has the 151 values of the step before.
+    The problem is a time step of an American put by Crank and Nicolson's scheme, for V_t = (rate -
+    dividend) S V_S + volatility^2 S^2 / 2 V_SS - rate V, t the time to expiry. The term rate V is
+    treated implicitly. Values 10 at S = 0 and 0 at S = 100 are known, so that A has 149 unknowns; V has
+    the 151 values of the step before.
     """
     strike, rate, dividend, volatility, step = 10.0, 0.04, 0.01, 0.4, 0.1
     S = np.linspace(0, 100, 151)

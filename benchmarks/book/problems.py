@@ -101,7 +101,8 @@ def contact_matrix(contacts: int, rng: np.random.Generator, tangents: int = 4) -
     blocks = A.reshape(contacts, BLOCK, contacts, BLOCK)
     i, j = np.nonzero(blocks[:, 0, :, 0])
     last, among = BLOCK - 1, slice(1, 1 + tangents)
-    blocks[i, last, j, 0] = 0.5  # mu
+    # Rows and columns of a block: normal impulse, four tangents, slip speed.
+    blocks[i, last, j, 0] = 0.5  # friction coefficient mu
     blocks[i, last, j, last] = blocks[i, 0, j, last] = 0.0
     blocks[i, last, j, among] = -1.0
     blocks[i, among, j, last] = 1.0

@@ -81,8 +81,11 @@ class Exact:
 def equilibrated_scale(matrix: Any) -> np.ndarray:
     """Return the scale d of a matrix's natural residual.
 
-    SciPy's matching is used where entries are larger than the diagonal entries of their rows and
-    columns.
+    The cost of an entry is log(sqrt(|a_ii a_jj|) / |a_ij|). The cost of the diagonal is 0, and a
+    transversal has a negative cost if its product is larger than that of the diagonal. A matching
+    is computed only if some cost is negative. Without a larger transversal d_i = |a_ii|. Otherwise
+    q_j is the largest entry of a column, t_i the largest of a row after the division by q, and d =
+    q t.
     """
     A = scipy.sparse.csr_array(matrix, dtype=np.float64)
     A.eliminate_zeros()
@@ -91,7 +94,6 @@ def equilibrated_scale(matrix: Any) -> np.ndarray:
     empty = (np.diff(A.indptr) == 0) & (np.bincount(column, minlength=len(d)) == 0)
     if (d[~empty] > 0).all():
         one = np.where(empty, 1.0, d)
-        # 0 for diagonal entries.
         cost = np.log(np.sqrt(one[row])) + np.log(np.sqrt(one[column])) - np.log(size)
         if (cost >= -1e-6).all() or _least_cost(
             cost, row, column, np.flatnonzero(empty), len(d)

@@ -179,6 +179,9 @@ def weights(f: np.ndarray) -> list[np.ndarray]:
 def filled_fraction(cells: np.ndarray, counts: tuple[int, int], volume: float) -> np.ndarray:
     """Return the density of particles over their density at rest, shape (ny, nx).
 
+    The density of a cell is the sum of the particles' volumes, weighted by its quadratic B-spline.
+    At rest it is the integral of the B-spline over the domain, which is below 1 beside walls.
+
     Args:
         cells: x and y of the particles in cells from the domain's corner, shape (n, 2).
         counts: numbers of cells (nx, ny).

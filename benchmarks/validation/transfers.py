@@ -71,7 +71,9 @@ def angular_momentum(
 ) -> float:
     """Return the angular momentum of equal particles of unit mass about the origin.
 
-    The affine part is included.
+    The first part is the sum of x v - y u. The affine part adds f (1 - f) dx^2 dv/dx and subtracts
+    f (1 - f) dx^2 du/dy, where f is the place between two nodes: a particle's tent function spreads
+    its velocity over both.
 
     Args:
         position: positions [m], shape (n, 2 or 3).

@@ -38,7 +38,8 @@ def assembled(of_elements: np.ndarray, at: np.ndarray, n: int) -> scipy.sparse.c
 def stiffness(poisson: float) -> np.ndarray:
     """Return the stiffness matrix of a bilinear unit square in plane strain, E = 1.
 
-    The nodes are (0,0), (1,0), (0,1), (1,1), x before y.
+    The nodes are (0,0), (1,0), (0,1), (1,1), x before y. K is the integral of B' D B by 2 x 2 Gauss
+    points of weight 1/4. B maps displacements to the strains (xx, yy, xy), D strains to stresses.
     """
     D = np.array([[1 - poisson, poisson, 0], [poisson, 1 - poisson, 0], [0, 0, 0.5 - poisson]]) / (
         (1 + poisson) * (1 - 2 * poisson)
@@ -58,8 +59,9 @@ def stiffness(poisson: float) -> np.ndarray:
 def elastic(draw: Draw) -> MatrixProblem:
     """Return an elastic block pressed on a foundation.
 
-    It consists of bilinear squares and is held at its top. Gaps bound the displacements of its
-    bottom.
+    It consists of bilinear squares, held at its top and pressed down there by a given displacement,
+    which enters b together with a vertical load. Gaps bound the vertical displacements of its
+    bottom from below.
     """
     nx, ny = draw.whole(6, 80), draw.whole(4, 50)
     node = np.arange((nx + 1) * (ny + 1)).reshape(ny + 1, nx + 1)
@@ -88,7 +90,11 @@ def elastic(draw: Draw) -> MatrixProblem:
 
 
 def triangles(draw: Draw) -> MatrixProblem:
-    """Return a membrane over an obstacle on an irregular mesh of linear triangles."""
+    """Return a membrane over an obstacle on an irregular mesh of linear triangles.
+
+    K_ij = e_i . e_j / (4 area) with the edges e_i opposite to the corners. The load is lumped: a
+    third of a triangle's area for each corner. Slivers are left out.
+    """
     n = draw.whole(12, 12000)
     points = np.vstack(
         [draw.rng.random((n, 2)) ** draw.of(1.0, 2.0), [[0, 0], [0, 1], [1, 0], [1, 1]]]
@@ -115,7 +121,9 @@ def triangles(draw: Draw) -> MatrixProblem:
 def option(draw: Draw) -> MatrixProblem:
     """Return an implicit step of an American put, tridiagonal and unsymmetric.
 
-    Early exercise is its lower bound.
+    It is Euler's implicit step dt of V_t = sigma^2 s^2 / 2 V_ss + rate s V_s - rate V, t the time
+    to expiry, at the prices s = 3 strike i / n, from the payoff. V = strike at s = 0. Early
+    exercise, the payoff, is the lower bound.
     """
     n, rate, sigma = draw.whole(20, 3000), draw.between(0.01, 0.1), draw.between(0.1, 0.6)
     dt, strike, i = draw.decades(1e-4, 1.0), 100.0, np.arange(1, n)
