@@ -1,6 +1,6 @@
 """Random contacts of rigid bodies, drawn by a seed.
 
-Spheres in a box, stacks of boxes, and bodies of any inertia with any contacts.
+They are spheres in a box, stacks of boxes, and bodies of any inertia with any contacts.
 """
 
 import numpy as np

@@ -1,6 +1,6 @@
 """Random stencils, and their matrices assembled by NumPy from the definition.
 
-The definition of `wl.Stencil`, cell by cell.
+The definition is that of `wl.Stencil`, cell by cell.
 """
 
 import itertools
@@ -129,7 +129,7 @@ def border_sums(drawn, padded):
 def mirrored(given, shape, cells, rng, *, broken):
     """Return arrays with a_o(i) = a_-o(i + o), on a torus.
 
-    If `broken`, between FLUID cells only.
+    If `broken`, that holds between FLUID cells only.
     """
     made = {}
     for offset, a in given.items():
@@ -214,7 +214,7 @@ SINGULAR = ("symmetric", "numbers", "rows", "columns", "circulant")
 def drawn_singular(seed, kind):
     """Return a stencil whose rows or columns sum to 0.
 
-    Between closed sides and periodic ones.
+    It lies between closed sides and periodic ones.
     """
     rng = np.random.default_rng([seed, 21])
     shape = (16 + seed % 3, 16) if rng.random() < 0.7 else (6, 7, 6)
@@ -255,7 +255,7 @@ def drawn_singular(seed, kind):
 def drawn_dominant(seed, side=40, side_in_space=10):
     """Return an M-matrix that need not be symmetric, and its data.
 
-    Random coefficients, winds or anisotropy over up to four decades.
+    It has random coefficients, winds or anisotropy over up to four decades.
     """
     rng = np.random.default_rng([seed, 31])
     shape = (side_in_space, side_in_space, side_in_space + 3) if seed % 3 == 2 else (side, side + 7)

@@ -22,7 +22,7 @@ def made(scene: Scene) -> Simulation:
 def told(simulation: Simulation, scene: Scene, index: int) -> Told:
     """Take a step as the run loop does, and return all its output.
 
-    Its row of the log, the state and a frame.
+    The output is its row of the log, the state and a frame.
     """
     interval = 1.0 / scene.time.frames_per_second
     end = (int(simulation.time / interval * (1.0 + 1e-9)) + 1) * interval

@@ -91,7 +91,7 @@ def targets(count: int, *, seed: int = 134) -> Iterator[Target]:
 def peer(target: Target, start: np.ndarray | None = None) -> scipy.optimize.OptimizeResult:
     """Return the answer of scipy.optimize.least_squares from the same start.
 
-    Its trust-region reflective method, with exact derivatives.
+    The method is its trust-region reflective one, with exact derivatives.
     """
     figure, inside = target.figure, 1e-10 * (target.figure.upper - target.figure.lower)
     return scipy.optimize.least_squares(

@@ -25,7 +25,7 @@ def assert_closed(corners: np.ndarray) -> None:
 def enclosed(points: np.ndarray, corners: np.ndarray) -> float:
     """Return the volume inside triangles, or the area inside an outline.
 
-    By the divergence theorem; > 0 if they face outward.
+    The result follows from the divergence theorem. It is positive if they face outward.
     """
     x = points.astype(np.float64)[corners]
     if corners.shape[1] == 2:

@@ -1,6 +1,6 @@
 """Boxed problems with narrow matrices by seed.
 
-Chains, convection, wide bands, beams, with bounds everywhere or in windows.
+They are chains, convection, wide bands and beams, with bounds everywhere or in windows.
 """
 
 import numpy as np

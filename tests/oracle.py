@@ -1,6 +1,6 @@
 """Independent answers for small problems, without code of the library.
 
-Dense assembly, Lemke's method, exhaustive search.
+They are dense assembly, Lemke's method and exhaustive search.
 """
 
 import itertools
@@ -43,7 +43,7 @@ def assemble(cells, faces=(1.0, 1.0, 1.0), shift=None, periodic=(False, False, F
 def lemke(M, q, limit=10_000):
     """Solve 0 <= z, w = M z + q >= 0, z'w = 0 by Lemke's method.
 
-    With the lexicographic rule; None on a ray.
+    The rule is lexicographic. The result is None on a ray.
     """
     n = len(q)
     if (q >= 0).all():

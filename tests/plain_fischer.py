@@ -1,6 +1,6 @@
 """Fischer-Burmeister map, its penalized form and the minimum map of a box.
 
-Row by row from their definitions, without the library.
+They are evaluated row by row from their definitions, without the library.
 """
 
 import math

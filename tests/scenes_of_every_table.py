@@ -1,6 +1,6 @@
 """Scenes by seed that together have every table, every shape and every motion.
 
-Thin and thick, from 1 mm to 1 km.
+They have thin and thick solids, and sides from 1 mm to 1 km.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Small and narrow problems by seed, and a plain active set in NumPy.
 
-In the forms of NumPy and SciPy.
+They are in the forms of NumPy and SciPy.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class SmallProblem:
 def option(seed: int, *, n: int | None = None, kind: str | None = None) -> SmallProblem:
     """Return a time step of an American put or call from its payoff; tridiagonal.
 
-    By Crank and Nicolson's or Euler's implicit method.
+    The method is Crank and Nicolson's or Euler's implicit one.
     """
     rng = np.random.default_rng(seed)
     n = n or int(rng.integers(3, 400))
@@ -96,7 +96,7 @@ def string(seed: int, *, n: int | None = None, between: bool = True) -> SmallPro
 def banded(seed: int, *, kind: str = "m-matrix") -> SmallProblem:
     """Return a random banded problem, bandwidth 1 to 3.
 
-    An M-matrix, another diagonally dominant P-matrix, or definite and unsymmetric.
+    It is an M-matrix, another diagonally dominant P-matrix, or definite and unsymmetric.
     """
     rng = np.random.default_rng(seed)
     width, n = int(rng.integers(1, 4)), int(rng.integers(5, 300))

@@ -54,7 +54,7 @@ def write_run(
 ) -> Path:
     """Write a run of the simulator `dots`.
 
-    10 cells along a side of 1 m, 20 frames per second.
+    It has 10 cells along a side of 1 m, and 20 frames per second.
     """
     folder.mkdir()
     source = folder / "source.toml"

@@ -46,7 +46,7 @@ def made(name: str, cells: int = 32, *changes: str) -> Any:
 def stepped(name: str) -> dict[str, list[float]]:
     """Return number, positions and velocities after some steps.
 
-    Of particles or bodies: their mean, and the spread around it.
+    They are the mean over particles or bodies, and the spread around it.
     """
     simulation = made(name)
     for _ in range(STEPS):

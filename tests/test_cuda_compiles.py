@@ -210,7 +210,7 @@ def drift(j: int, i: int):
 def use_stencil_kernels(reals):
     """Instantiate the kernels of compact stencils.
 
-    Of numbers, arrays and functions, of lines and aggregates, and of matrices.
+    They are those of numbers, arrays and functions, of lines and aggregates, and of matrices.
     """
     nine = np.array([[-1.0, -1.0, -1.0], [-1.0, 9.0, -1.0], [-1.0, -1.0, -1.0]])
     cells, wind = (
@@ -248,7 +248,7 @@ def use_stencil_kernels(reals):
 def use_kernels_of_gradients(reals):
     """Instantiate the kernels of vector-Jacobian products.
 
-    On every kind of bounds and diagonal.
+    They are instantiated for every kind of bounds and diagonal.
     """
     cells, T = (
         np.array([[0, 1, 1, 1]]),

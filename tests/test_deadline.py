@@ -40,7 +40,7 @@ def chain(n):
 def case(family, name):
     """Return a problem, its matrix and its b.
 
-    60 points of a membrane, a pool of 7 x 12 cells, 3 points for enumeration.
+    It has 60 points of a membrane, a pool of 7 x 12 cells, or 3 points for enumeration.
     """
     few, rng = name == "direct-enumeration", np.random.default_rng(7)
     if family == "grid":
@@ -223,7 +223,8 @@ def test_time_is_up_for_all_ranks_as_soon_as_it_is_for_one(monkeypatch):
 def test_lemke_on_an_american_put_ends_in_time():
     """Lemke on an American put: time limit in real time.
 
-    1,500 prices of the stock, the first step of a Crank-Nicolson scheme from the payoff.
+    It has 1,500 prices of the stock and is the first step of a Crank-Nicolson scheme from the
+    payoff.
     """
     n, rate, volatility, dt = 1500, 0.05, 0.3, 0.02
     price = np.linspace(0.0, 4.0, n + 2)[1:-1]

@@ -217,7 +217,7 @@ def test_generated_pages_are_up_to_date(name):
 def test_the_page_of_scene_files_has_every_key():
     """Every key on the page of scene files, from the schemas themselves.
 
-    Without the generator.
+    The generator is not used.
     """
     from warp_lcp.scene.scene_file import installed_simulators
 

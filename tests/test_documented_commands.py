@@ -21,7 +21,7 @@ FILE = re.compile(r"[./\\]|^[<$\"'*]")
 def shown(page):
     """Return the typed text of a page.
 
-    Lines of blocks, continued ones as one, and the text between backticks.
+    It is the lines of blocks, continued ones as one, and the text between backticks.
     """
     lines = [
         line for block in blocks(page, "sh") for line in block.replace("\\\n", " ").splitlines()

@@ -1,6 +1,6 @@
-"""wl.linear_complementarity with the conventions of SciPy.
+"""`wl.linear_complementarity` with the conventions of SciPy.
 
-Checked by SciPy's own solvers and by enumeration.
+The results are checked by SciPy's own solvers and by enumeration.
 """
 
 import numpy as np

@@ -211,7 +211,7 @@ def test_full_sweep():
 class FlippedRightSide(wl.MinimumMapNewton):
     """Wrong on purpose: solves y = A x - b and reports CONVERGED.
 
-    With the residual of that problem.
+    The residual is that of the other problem.
     """
 
     def init(self, problem):

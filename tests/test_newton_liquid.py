@@ -19,7 +19,8 @@ pytestmark = pytest.mark.filterwarnings("default")  # newton's own warnings
 def world(*bodies, ground=True, gravity=-GRAVITY):
     """Return a model of bodies.
 
-    (position, density, shape, its sizes, ...), each added to one body after the first.
+    A body is (position, density, shape, its sizes, ...); each one after the first is added to one
+    body.
     """
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, gravity))
     for position, density, *shapes in bodies:
@@ -107,7 +108,7 @@ def test_dense_bodies_sink_onto_the_world_s_floor_and_light_ones_rise():
 def test_a_sphere_sets_off_with_its_added_mass(ratio, alone):
     """Added mass of a sphere.
 
-    Half of its displacement, (1 + 2 q^3) / (1 - q^3) times as much in a round tank of 1/q
+    It is half of its displacement, (1 + 2 q^3) / (1 - q^3) times as much in a round tank of 1/q
     diameters.
     """
     q, dt = 0.25, 1e-3

@@ -1,6 +1,6 @@
 """Quadratic programs by qpsolvers.
 
-Against another of its solvers, and the conditions of Karush, Kuhn and Tucker.
+They are compared with another of its solvers, and with the conditions of Karush, Kuhn and Tucker.
 """
 
 import subprocess

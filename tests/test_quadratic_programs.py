@@ -231,7 +231,7 @@ def test_rows_that_contradict_each_other_by_little(gap):
 def test_figures_are_those_of_qpsolvers():
     """Figures of qpsolvers: its own three figures.
 
-    x_0 + x_1 = 1, x_0 - x_2 <= 0.2, -1 <= x <= 0.7: all kinds of multipliers.
+    The program x_0 + x_1 = 1, x_0 - x_2 <= 0.2, -1 <= x <= 0.7 has all kinds of multipliers.
     """
     P, q = np.diag([1.0, 2.0, 0.0]), np.array([-2.0, 0.5, 1.0])
     rows = {

@@ -28,7 +28,8 @@ NO_INDEFINITE = np.diag([1.0, 1.0, 1.0, 1.0, 1.0])
 def test_recommended_methods_converge(family):
     """Convergence of recommended methods.
 
-    60 problems in all, each to its required accuracy, within the step limit of the recommendation.
+    There are 60 problems, each with its required accuracy, within the step limit of the
+    recommendation.
     """
     for seed in SEEDS:
         name, lcp, accuracy = make(family, seed)

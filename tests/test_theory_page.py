@@ -1,6 +1,6 @@
 """Numbers of docs/theory.md, by enumeration of active sets.
 
-And its examples, pictures and links.
+Its examples, pictures and links are tested too.
 """
 
 import re

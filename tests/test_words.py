@@ -63,7 +63,7 @@ def parsed(file: Path) -> ast.Module:
 def documented() -> dict[str, str]:
     """Return the summary line of everything in docs/api, `run` and `scene`.
 
-    Modules, classes and functions.
+    It covers modules, classes and functions.
     """
     found: dict[str, str] = {}
     for reference in re.findall(

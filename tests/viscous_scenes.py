@@ -16,7 +16,7 @@ from warp_lcp.fluids import LiquidScene
 def viscous_scene(seed: int) -> LiquidScene:
     """Return the scene of a seed: a unit square or cube with a block or two.
 
-    Maybe with a source, and up to three solids in its middle.
+    It may have a source, and up to three solids in its middle.
     """
     rng = np.random.default_rng(seed)
     dimension = int(rng.choice([2, 3, 3]))

@@ -116,7 +116,7 @@ MOST = 1e-3  # share of the total that a step may add
 class Rise(NamedTuple):
     """Energy gained by a step of a length [s], and its part from density correction.
 
-    Both over the total energy.
+    Both are divided by the total energy.
     """
 
     length: float

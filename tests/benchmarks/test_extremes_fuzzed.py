@@ -22,7 +22,7 @@ TAME = 2  # decades of coefficients that every precision except single must solv
 def grid_problems(draw):
     """Draw a grid problem and the number of decades of its coefficients.
 
-    Random cells, coefficients, bounds and scale.
+    Cells, coefficients, bounds and scale are random.
     """
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     shape = tuple(draw(st.lists(st.integers(1, 12), min_size=2, max_size=3)))

@@ -72,7 +72,7 @@ def test_a_row_that_others_hide_is_told():
 def test_a_false_infeasible_is_seen():
     """Detection of a false INFEASIBLE.
 
-    By the planted solution, by a linear program for monotone A, and by enumeration.
+    It is detected by the planted solution, by a linear program for monotone A, and by enumeration.
     """
     claim = Answer("INFEASIBLE", np.zeros(2))
     assert categories(box([-1.0, 1.0], solvable=True), claim) == ["FALSE INFEASIBLE"]

@@ -51,7 +51,7 @@ def test_reasons_are_on_the_page():
 def test_active_sets_have_the_printed_sizes():
     """Sizes of the active sets in deal.II's output.
 
-    Those after its iterations 0, 1, 17 and 18, and two norms.
+    They are those after its iterations 0, 1, 17 and 18; two norms are compared too.
     """
     problem, _ = counts.stairs_problem()
     result = wl.solve(problem, counts.ACTIVE_SET, stopping=wl.StoppingCriteria(rtol=1e-9))
@@ -65,7 +65,7 @@ def test_active_sets_have_the_printed_sizes():
 def fischer_newton(A, b, lower, scale, tolerance):
     """Return the number of full Newton steps on the scaled Fischer-Burmeister map.
 
-    s (x - l) + y - sqrt(s^2 (x - l)^2 + y^2), with Armijo's search.
+    The map is s (x - l) + y - sqrt(s^2 (x - l)^2 + y^2), with Armijo's search.
     """
     x = np.maximum(0.0, lower)
 

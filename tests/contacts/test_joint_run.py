@@ -1,6 +1,6 @@
 """Scenes with joints and targets.
 
-Snakes, motors, gears, reaching arms; refusals; resuming; frames and images.
+The tests cover snakes, motors, gears and reaching arms, refusals, resuming, frames and images.
 """
 
 import csv

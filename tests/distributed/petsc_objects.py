@@ -21,7 +21,7 @@ from warp_lcp.multigrid.cycle_settings import CycleSettings
 def on_all_cells(problem, free):
     """Return the matrix on all cells from the definition.
 
-    A on the free cells, the identity on the others.
+    It is A on the free cells and the identity on the others.
     """
     A = problem.matrix().tocoo()
     cells, mask = np.flatnonzero(problem.fluid), free.ravel()
@@ -41,7 +41,7 @@ def random_vector(grid, boxes, shape, seed):
 def products():
     """Compare products and diagonals on all unknowns and on a free set.
 
-    With unit coefficients and others, in 3-D and 2-D.
+    They have unit coefficients and others, in 3-D and 2-D.
     """
     for name, dtype, accuracy in (
         ("brick", wp.float64, 1e-14),
@@ -200,7 +200,7 @@ def bounded_methods():
 class Sums:
     """Sums over aggregates of the next finer level's cells, by NumPy.
 
-    And the transpose times a factor.
+    The transpose, times a factor, is included.
     """
 
     def __init__(self, fine, coarse, factor):
@@ -233,7 +233,7 @@ def inner(stencil, field):
 def cycles_of_pcmg():
     """Compare a cycle with that of PETSc's PCMG, on one rank.
 
-    With Chebyshev smoothing on matrices assembled from the levels, W and V.
+    It has Chebyshev smoothing and matrices assembled from the levels, W and V.
     """
     problem, PETSc, options = small("brick", "walls"), petsc(), petsc().Options()
     for gamma in (2, 1):

@@ -39,7 +39,7 @@ WHERE = """
 def hosts(tmp_path):
     """Run this interpreter on ranks with a host each and return the output.
 
-    `hosts(3, *arguments)`, in `tmp_path`.
+    Call it as `hosts(3, *arguments)`; it runs in `tmp_path`.
     """
     if why := launch.missing():
         pytest.skip(why)

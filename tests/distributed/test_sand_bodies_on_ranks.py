@@ -24,7 +24,7 @@ def answers(
 ) -> list[np.ndarray]:
     """Return the coupling of random bodies with random stresses.
 
-    Sums of all kinds, and the resulting velocities.
+    It consists of sums of all kinds, and the resulting velocities.
     """
     grid, count, k = packing.grid, len(centers), bodies.freedoms
     walls = Walls(grid, index, [0.5] * (1 + count), counted=packing.counted)

@@ -52,7 +52,7 @@ def launch(
 def turning(simulation: LiquidSimulation, which: np.ndarray, *, gradients: bool = False) -> float:
     """Return the angular momentum of particles about their center [m^2/s].
 
-    Per particle; also with that of the gradients.
+    It is divided by the number of particles. The part of the gradients is optional.
     """
     dx, x = simulation.grid.spacing, simulation.particles.position.numpy().astype(np.float64)[which]
     v = simulation.particles.velocity.numpy().astype(np.float64)[which]

@@ -1,6 +1,6 @@
 """Bodies and liquid in one pressure problem.
 
-Its columns, exchange of momentum and energy, and the direction of motion of bodies.
+The tests cover its columns, exchange of momentum and energy, and the direction of motion of bodies.
 """
 
 import numpy as np
@@ -95,7 +95,7 @@ def test_the_columns_are_what_velocities_add_to_the_right_hand_side(dimension, m
 def projected(simulation, dt):
     """Project once; return velocities before and after.
 
-    Also those of the bodies (6 each).
+    The velocities of the bodies (6 each) are returned too.
     """
     before, taken = simulation.begin_step(dt), {}
     window = simulation.window(before)

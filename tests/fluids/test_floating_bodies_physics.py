@@ -57,7 +57,7 @@ def test_walls_that_let_go_of_liquid_do_not_change_how_a_disc_sets_off():
 def test_a_sphere_sets_off_with_its_added_mass(ratio):
     """Added mass of a sphere.
 
-    Half of its displacement, (1 + 2 q^3) / (1 - q^3) times as much in a round tank of 1/q
+    It is half of its displacement, (1 + 2 q^3) / (1 - q^3) times as much in a round tank of 1/q
     diameters.
     """
     q = 1.0 / WIDE
@@ -72,7 +72,7 @@ def test_a_sphere_sets_off_with_its_added_mass(ratio):
 def test_a_box_floats_at_its_displacement(dimension, cells):
     """Displacement of a floating box.
 
-    The mean over its bobbing, measured from the free surface around it.
+    It is the mean over its bobbing, measured from the free surface around it.
     """
     trial = displacement(dimension, cells, 0.6)
     assert trial.failures() == []

@@ -120,7 +120,7 @@ def record(out: Path) -> dict:
 def results(out: Path) -> dict[str, bytes]:
     """Return the bytes of every output file, and the log without seconds.
 
-    Files: frames, collections and checkpoints.
+    The files are frames, collections and checkpoints.
     """
     files = [*out.glob("frames/*"), *out.glob("*.pvd"), *out.glob("checkpoints/*")]
     found = {str(path.relative_to(out)): path.read_bytes() for path in files}
@@ -178,7 +178,7 @@ def kill_and_resume(
 ) -> list[int]:
     """Run, kill, resume and kill again, until `kills` processes died.
 
-    At random moments. Return the steps resumed from.
+    They die at random moments. Return the steps resumed from.
     """
     scene = folder / "scene.toml"
     scene.write_text(SCENE.replace("duration = 1.5", f"duration = {duration}"))

@@ -176,8 +176,8 @@ def test_particles_stay_out_of_a_cross_that_turns():
 def test_waves_of_a_flap_are_as_long_and_high_as_linear_theory_says():
     """Waves of a flap against linear theory.
 
-    Dean & Dalrymple's flap hinged at the bottom: H/S = 4 sinh(kh)/(kh) (kh sinh(kh) - cosh(kh) + 1)
-    / (sinh(2kh) + 2kh).
+    For Dean & Dalrymple's flap, hinged at the bottom, H/S = 4 sinh(kh)/(kh) (kh sinh(kh) - cosh(kh)
+    + 1) / (sinh(2kh) + 2kh).
     """
     depth, period, angle = 0.35, 1.2, 6.0
     omega = 2.0 * math.pi / period

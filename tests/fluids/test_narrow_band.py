@@ -90,7 +90,7 @@ def test_nothing_is_there_without_the_table():
 def test_the_depth_is_a_distance():
     """Depth as a distance.
 
-    Below a plane exact; below a corner of air within 8 %; through solids as through liquid.
+    It is exact below a plane, and within 8 % below a corner of air. Solids do not change it.
     """
     grid = StaggeredGrid((24, 24, 1), 1.0, 2, "cpu")
     simulation = tank(2, 24, 1.0, solid=[box([0.25, 0.25], [0.5, 0.5])], solids="voxel")
@@ -218,7 +218,7 @@ def test_a_body_dives_into_the_interior():
 def sloshing(particles: dict[str, Any], end: float) -> list[dict[str, Any]]:
     """Return the log of a standing wave.
 
-    Half a wavelength in a tank 1 m wide and 0.5 m deep.
+    The wave is half a wavelength in a tank 1 m wide and 0.5 m deep.
     """
     n = 64
     columns = [
@@ -234,7 +234,7 @@ def sloshing(particles: dict[str, Any], end: float) -> list[dict[str, Any]]:
 def wave(rows: list[dict[str, Any]]) -> tuple[float, float]:
     """Return a standing wave's period [s] and decay [1/s].
 
-    From the peaks of its kinetic energy.
+    They follow from the peaks of its kinetic energy.
     """
     time, energy = (
         np.cumsum([row["dt"] for row in rows]),

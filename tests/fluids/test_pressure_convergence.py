@@ -67,7 +67,7 @@ class Field:
 def cell_centers(n: int, dimension: int) -> np.ndarray:
     """Return the centers of n cells along each axis.
 
-    Shape (n, ..., n, dimension), coordinates x, y(, z).
+    The shape is (n, ..., n, dimension), with coordinates x, y(, z).
     """
     axis = (np.arange(n) + 0.5) / n
     return np.stack(np.meshgrid(*[axis] * dimension, indexing="ij")[::-1], axis=-1)
@@ -139,8 +139,8 @@ def test_a_disc_or_a_ball_of_liquid_in_air_converges_with_second_order(
 ) -> None:
     """Second-order convergence in a disc or ball of liquid in air.
 
-    In the largest error. With whole cells (theta = 1) the same solution converges with first order
-    only.
+    The order is that of the largest error. With whole cells (theta = 1) the same solution converges
+    with first order only.
     """
     assert order({n: dirichlet_error(n, dimension) for n in sizes}) >= SECOND_ORDER
     assert order({n: dirichlet_error(n, dimension, theta_min=1.0) for n in sizes}) < 1.4
@@ -222,8 +222,8 @@ def outward_flux(field: Field, n: int, wall: Disc, opening: Opening) -> np.ndarr
 def test_the_flux_through_open_faces_is_the_source_and_what_enters_through_the_wall() -> None:
     """Flux through open faces against source and inflow through the wall.
 
-    The right-hand side by another way: the source at many points of each cell, the wall's flux at
-    many points of the circle.
+    The right-hand side is computed in another way: from the source at many points of each cell, and
+    the wall's flux at many points of the circle.
     """
     n, m = 8, 300
     wall, field = Disc(CENTER[:2], 0.43), Field(np.array([0.62, 0.4]), 0.2, 1.0)

@@ -52,8 +52,8 @@ def test_a_tank_at_rest_has_pressures_and_levels_of_its_depth(
 ) -> None:
     """Pressures and levels of a tank at rest.
 
-    At walls, in corners, at cell centers and between. Whole cells put the surface half a cell too
-    high (`test_rest`).
+    The probes are at walls, in corners, at cell centers and between. Whole cells put the surface
+    half a cell too high (`test_rest`).
     """
     rng = np.random.default_rng(71)
     points = rng.uniform([0.0, 0.0, 0.0], [0.8, 0.4 - DX, 0.2], (20, 3))

@@ -34,7 +34,7 @@ def tank(dimension: int, **tables: Any) -> LiquidSimulation:
 def forces(simulation: LiquidSimulation, until: float) -> dict[str, np.ndarray]:
     """Step to a time; return the last force and torque on the domain and each solid.
 
-    Shape (3,) in 2-D, (6,) in 3-D.
+    The shape is (3,) in 2-D and (6,) in 3-D.
     """
     if until:
         advance(simulation, until)

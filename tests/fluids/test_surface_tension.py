@@ -489,7 +489,7 @@ def test_a_drop_oscillates_at_lambs_frequency(dimension: int) -> None:
 def wave(cells: int, times: float = 1.0) -> float:
     """Return the frequency of a standing capillary wave over the exact one.
 
-    sqrt(sigma k^3 tanh(k h) / rho).
+    The exact one is sqrt(sigma k^3 tanh(k h) / rho).
     """
     length = 2.0 * RADIUS
     k, depth, height = 2.0 * math.pi / length, length / 2, 0.02 * length
@@ -532,7 +532,7 @@ def test_capillary_waves_converge() -> None:
 def cap(angle: float, given: float) -> tuple[LiquidSimulation, float, float]:
     """Return a drop on the floor with a contact angle.
 
-    Also the height of its center of mass and the radius of its surface [m].
+    The height of its center of mass and the radius of its surface [m] are returned too.
     """
     a = math.radians(angle)
     radius = RADIUS * math.sqrt(0.5 * math.pi / (a - math.sin(a) * math.cos(a)))
@@ -681,8 +681,8 @@ def test_a_meniscus_rises_along_walls_that_let_go(width: float, angle: float) ->
 def test_liquid_rises_between_plates(angle: float) -> None:
     """Rise of liquid between plates.
 
-    By 2 sigma cos(angle) / (rho g width) over its pressure's level, 12 cells apart and 30, the mean
-    over the width.
+    The rise is 2 sigma cos(angle) / (rho g width) over its pressure's level, for widths of 12 and
+    30 cells, as the mean over the width.
     """
     plate, bath = box([0.004, 0.002], [0.006, 0.02]), [box([0.0, 0.0], [0.016, 0.006])]
     tables = {

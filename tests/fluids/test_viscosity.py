@@ -214,7 +214,7 @@ def test_iterations_do_not_grow_with_the_grid(viscosity: int, shape: str) -> Non
 def least_eigenvalue(level, steps: int = 60) -> float:
     """Return about the least eigenvalue of a level's equations, by Lanczos.
 
-    From a random vector, with the diagonal scaled to 1.
+    It starts from a random vector; the diagonal is scaled to 1.
     """
     shape, axes = level.grid.shape, range(level.dimension)
     diagonal = np.stack([field.numpy() for field in level.diagonal])
@@ -421,7 +421,8 @@ def test_couette_flow_between_cut_walls() -> None:
 def test_a_block_spreads_as_a_gravity_current(slip: float) -> None:
     """Front of a thin layer on a no-slip floor.
 
-    Huppert 1982: 1.411 (g q^3 t / (3 nu))^(1/5), q the area on each side of the middle.
+    It is at 1.411 (g q^3 t / (3 nu))^(1/5) (Huppert 1982), where q is the area on each side of the
+    middle.
     """
     given = {
         "viscosity": {"value": 1000.0, "slip_length": slip},

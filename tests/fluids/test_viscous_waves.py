@@ -1,6 +1,6 @@
 """Decay of standing waves on a viscous liquid, by Lamb's equation.
 
-At a finite depth and a finite viscosity.
+The depth and the viscosity are finite.
 """
 
 import cmath
@@ -103,7 +103,7 @@ def tank(wave: StandingWave, cells: int, viscosity: float, **tables: Any) -> Liq
 def decay(simulation: LiquidSimulation, wave: StandingWave, dt: float) -> complex:
     """Return -decay + i frequency [1/s] of the velocity beneath crest and trough.
 
-    In units of the parts of the wave's own rate.
+    Its parts are in units of those of the wave's own rate.
     """
     seen, n = [], wave.rate
     while simulation.time < VIEWED * 2.0 * math.pi / n.imag:
@@ -135,7 +135,7 @@ def wave_of(share: float) -> StandingWave:
 def test_the_root_is_known_where_viscosity_is_small() -> None:
     """Root of the equation for small viscosity.
 
-    2 nu k^2 (1 - sqrt(share / 2)) at first. The mode has no divergence, and no shear on the
+    It is 2 nu k^2 (1 - sqrt(share / 2)) at first. The mode has no divergence, and no shear on the
     surface.
     """
     for share in (1e-4, 1e-3):

@@ -411,7 +411,7 @@ def test_fields_that_a_format_does_not_hold_are_told(scene_file, tmp_path):
 def test_the_surface_of_a_liquid_as_stl(tmp_path):
     """Surface of a liquid as STL, for modelers and slicers.
 
-    No particles, no cells, triangles alone.
+    The file has no particles and no cells, but triangles alone.
     """
     scene = {
         "scene": {"simulator": "fluids"},

@@ -1,6 +1,6 @@
 """Surfaces in a run's folder: VTU series and PLY files.
 
-Of liquid and sand, in 2-D and 3-D; none unless the scene requests them.
+They are those of liquid and sand, in 2-D and 3-D. There is none unless the scene requests it.
 """
 
 import meshio

@@ -45,7 +45,7 @@ PARTS: list[Part] = [
 def write_run(folder: Path) -> None:
     """Write frames of one process and, with the number 1, of two ranks.
 
-    In both formats.
+    They are written in both formats.
     """
     folder.mkdir()
     (folder / "scene.toml").write_text(SCENE)

@@ -190,7 +190,7 @@ def test_a_folder_is_no_scene_and_no_mesh(tmp_path: Path) -> None:
 def fuzzed(chance: random.Random, original: bytes | None = None) -> bytes:
     """Return a scene with a few random changes of keys, values and sometimes bytes.
 
-    By default a built-in scene.
+    By default the scene is a built-in one.
     """
     text = (
         chance.choice(list(built_in_scenes().values())).read_bytes()

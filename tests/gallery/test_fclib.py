@@ -1,6 +1,6 @@
 """FCLIB files in the format of its own writer.
 
-Three kinds of matrices, local and global problems, solutions, wrong input.
+The tests cover three kinds of matrices, local and global problems, solutions, and wrong input.
 """
 
 import numpy as np
@@ -87,7 +87,7 @@ def test_unsymmetric_blocks_are_read_the_right_way_round(tmp_path, kind):
 def test_a_global_problem_has_the_velocities_of_its_bodies(tmp_path):
     """Velocities of the bodies of a global problem.
 
-    M v = H r + G l + f, u = H'v + w, G'v + b = 0, written out for random impulses.
+    The equations M v = H r + G l + f, u = H'v + w, G'v + b = 0 are written out for random impulses.
     """
     rng = np.random.default_rng(29)
     root = rng.standard_normal((7, 7))

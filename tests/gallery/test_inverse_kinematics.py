@@ -1,6 +1,6 @@
 """Inverse kinematics with joint limits.
 
-Forward kinematics, the LCPs' signs, limits, descent, SciPy's optimum.
+The tests cover forward kinematics, the LCPs' signs, limits, descent, and SciPy's optimum.
 """
 
 import dataclasses
@@ -101,8 +101,8 @@ def test_derivatives_are_differences(name):
 def test_the_two_forms_of_a_step_are_the_minimum_of_its_quadratic_program():
     """Two forms of a step, against the minimum of its quadratic program.
 
-    The boxed LCP and the book's LCP in the multipliers. A wrong sign of c or of B would leave the
-    box or ascend.
+    They are the boxed LCP and the book's LCP in the multipliers. A wrong sign of c or of B would
+    leave the box or ascend.
     """
     rng = np.random.default_rng(59)
     for _ in range(10):

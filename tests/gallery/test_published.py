@@ -233,8 +233,8 @@ def test_ice_balance_is_the_divergence_of_the_known_dome():
 def test_ice_dome_converges_to_the_known_one():
     """Convergence of the ice dome to the exact one.
 
-    Thickness at the center, mean error, radius. At the margin the slope is infinite, so that the
-    largest error stays large.
+    The measures are thickness at the center, mean error and radius. At the margin the slope is
+    infinite, so that the largest error stays large.
     """
     center, mean, radius = [], [], []
     for n in (17, 33, 65):

@@ -75,7 +75,7 @@ def test_what_is_fixed_stays_and_answers_to_no_impulse():
 def test_the_inverse_mass_is_that_of_the_energy():
     """Inverse mass against the kinetic energy.
 
-    v'M v / 2 with M^-1 of the velocity problem, along the effect of a contact.
+    The energy is v'M v / 2 with M^-1 of the velocity problem, along the effect of a contact.
     """
     world = World(
         "",

@@ -33,7 +33,7 @@ def directions(value):
 def differences(make, data, name, g):
     """Return the derivatives of L = g.x along the `directions` of data[name].
 
-    By central differences.
+    They are central differences.
     """
     value, found = np.array(data[name], dtype=float), []
     for way in directions(value):
@@ -58,7 +58,7 @@ def host(value):
 def check(make, data, seed, *, skip=()):
     """Compare the gradients of all data with differences; return the gradients.
 
-    Along each direction and length.
+    They are compared along each direction, and in length.
     """
     result = solved(make, data)
     g = np.random.default_rng(seed).standard_normal(result.x.shape)
@@ -347,7 +347,7 @@ def test_matrices(symmetric):
 def test_large_sparse_matrices_by_their_own_methods(symmetric):
     """Large sparse matrices by methods beyond the direct ones.
 
-    Compared with SciPy's solution on the same free set.
+    They are compared with SciPy's solution on the same free set.
     """
     A, rng = random_matrix(3000, 41, symmetric)
     b, lower, g = rng.standard_normal(3000), -0.1 * rng.random(3000), rng.standard_normal(3000)

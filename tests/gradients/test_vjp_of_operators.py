@@ -1,6 +1,6 @@
 """Gradients for every kind of operator against dense implicit differentiation.
 
-A_FF' mu_F = -g_F.
+The multipliers solve A_FF' mu_F = -g_F.
 """
 
 import numpy as np

@@ -1,6 +1,6 @@
 """Sweeps over pressure and friction.
 
-In colors, as on CUDA, and over listed cells.
+They run in colors, as on CUDA, and over listed cells.
 """
 
 import numpy as np

@@ -87,7 +87,7 @@ def test_the_ring_repeats_the_other_side() -> None:
 def folded(field: Any) -> np.ndarray:
     """Return a field in double, with the ring added to the cells that it repeats.
 
-    Along z and x.
+    That is done along z and x.
     """
     values = np.asarray(field, float).copy()
     for _ in range(2):

@@ -1,6 +1,6 @@
 """Dissipation of friction, and a pattern without dissipation.
 
-Compared with the forces on the faces.
+They are compared with the forces on the faces.
 """
 
 import numpy as np

@@ -156,8 +156,8 @@ def test_a_frame_after_restoring_is_that_before() -> None:
 def test_sand_goes_on_another_grid() -> None:
     """Sand resumed on another grid.
 
-    Twice the cells along an axis, as many particles per cell, the same mass within the sampling,
-    and solids at their current places.
+    It has twice the cells along an axis, as many particles per cell, the same mass within the
+    sampling, and solids at their current places.
     """
     tables = {"solid": [SLIDER], "solver": {"max_iterations": 60}}
     sand = [box([0.0, 0.0], [0.5, 0.25], velocity=[0.3, 0.0])]

@@ -172,9 +172,9 @@ def test_walls_and_solids_have_their_own_friction() -> None:
 def test_the_slope_of_the_yield_set() -> None:
     """Slope of the yield set.
 
-    k = tan 30 of repose, sin 30 in plane strain; in triaxial compression 2 sqrt(3) sin / (3 - sin),
-    the outer cone. 2-D is plane strain. Cohesion counts as such in the first, times cos 30 in the
-    others.
+    k is tan 30 of repose and sin 30 in plane strain. In triaxial compression it is 2 sqrt(3) sin /
+    (3 - sin), the outer cone. 2-D is plane strain. Cohesion counts as such in the first, times cos
+    30 in the others.
     """
     sand = [box([0.0, 0.0], [0.2, 0.2])]
     assert scene(size=[1.0, 0.5], resolution=16, sand=sand).slope == pytest.approx(

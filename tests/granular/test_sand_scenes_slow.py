@@ -78,8 +78,8 @@ def test_a_scene_from_beginning_to_end(name: str, tmp_path: Path) -> None:
 def test_the_planar_column_runs_as_far_as_experiments_say_and_rests(tmp_path: Path) -> None:
     """Runout and rest of the planar column, against experiments.
 
-    a = 2: 1.2 a to 1.8 a widths [Lube et al. 2005; Lajeunesse et al. 2005], widened by a fifth; in
-    the end almost nothing moves.
+    For a = 2 the runout is 1.2 a to 1.8 a widths [Lube et al. 2005; Lajeunesse et al. 2005],
+    widened by a fifth. In the end almost nothing moves.
     """
     log = run("column-collapse-2d", tmp_path / "run", "time.duration=2.5")
     assert 0.8 * 2.4 <= log["runout"][-1] / 0.25 <= 1.2 * 3.6

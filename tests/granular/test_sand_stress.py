@@ -1,6 +1,6 @@
 """Velocity, strain rates, projection and residual of sand's stresses.
 
-Against NumPy and SciPy, cell by cell from the equations.
+They are compared with NumPy and SciPy, cell by cell from the equations.
 """
 
 import itertools
@@ -338,7 +338,7 @@ def wall_move(
 ) -> float:
     """Return the squared natural residual of friction on a face of a solid.
 
-    Coulomb's, or the sand's own strength.
+    The friction is Coulomb's, or limited by the sand's own strength.
     """
     dimension, now, p = case.dimension, case.now, case.packing
     if p.flags.numpy()[cell] == 0:

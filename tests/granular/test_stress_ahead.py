@@ -1,6 +1,6 @@
 """Device-resident iterations of sand's stresses against those led by the host.
 
-Emulated, on CUDA too.
+They are emulated, and run on CUDA too.
 """
 
 import math

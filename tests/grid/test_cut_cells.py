@@ -271,7 +271,7 @@ def test_boxes_of_whole_cells_leave_whole_cells(name, dimension, size):
 def kernel_sums(open_cells, dimension):
     """Return the quadratic B-spline's integral over open cells.
 
-    1/6, 2/3, 1/6 along each axis.
+    Its weights are 1/6, 2/3, 1/6 along each axis.
     """
     result = open_cells.astype(np.float64)
     for axis in range(3 - dimension, 3):
@@ -282,7 +282,7 @@ def kernel_sums(open_cells, dimension):
 def line_distribution(normal, offset, points=240):
     """Return the open share {n.x > offset} of a kernel about the origin.
 
-    The exact integral along one axis, the midpoint rule across.
+    It is the exact integral along one axis and the midpoint rule across.
     """
     dimension, main = len(normal), int(np.argmax(np.abs(normal)))
     at = (np.arange(points) + 0.5) * (3.0 / points) - 1.5

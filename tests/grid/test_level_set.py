@@ -84,7 +84,7 @@ def centers(grid: StaggeredGrid, axis: int) -> np.ndarray:
 def share_below(s: np.ndarray) -> np.ndarray:
     """Return the share of the quadratic B-spline below s.
 
-    By numerical integration of its definition as a convolution of three boxes.
+    Its definition, a convolution of three boxes, is integrated numerically.
     """
     n = 400
     box = np.full(n, 1.0 / n)
@@ -138,8 +138,8 @@ def test_particles_as_a_liquid_has_them_put_the_surface_within_a_tenth_of_a_cell
 ) -> None:
     """Surface of a scene's particles, within a tenth of a cell.
 
-    The seeding of a scene: 2 along an axis, moved by a quarter of their spacing. Mean and scatter
-    of phi in cells beside the surface.
+    A scene has 2 particles along an axis of a cell, moved by a quarter of their spacing. The test
+    measures mean and scatter of phi in cells beside the surface.
     """
     points = (
         np.concatenate([lattice(grid, 2, 0.25, 515, plane) for plane in range(grid.counts[2])])
@@ -200,7 +200,8 @@ def test_the_density_is_the_sum_of_the_particles_kernels(
 ) -> None:
     """Density as the sum of the particles' kernels.
 
-    Against every pair of cell and particle in float64, each kernel evaluated from its distance.
+    The sum is over every pair of cell and particle in float64, each kernel evaluated from its
+    distance.
     """
     rng = np.random.default_rng(31415)
     points = rng.random((400, 3)) * np.array(grid.counts)
@@ -257,7 +258,7 @@ def test_a_lone_particle_is_spray(grid: StaggeredGrid) -> None:
 def test_nothing_stays_behind_when_the_window_moves(grid: StaggeredGrid) -> None:
     """Moved window without remains of the last one.
 
-    Equal bit for bit to a fresh level set, smoothed or not.
+    It is equal bit for bit to a fresh level set, smoothed or not.
     """
     base = on_device(box_of(grid))
     room = grid.field()

@@ -38,7 +38,7 @@ def cross_matrix(axis):
 def turn(axis, degrees):
     """Return the rotation matrix as the series of exp(angle [axis]x).
 
-    Independent of Rodrigues' formula and of quaternions.
+    It is independent of Rodrigues' formula and of quaternions.
     """
     generator = math.radians(degrees) * cross_matrix(np.asarray(axis) / np.linalg.norm(axis))
     term, total = np.eye(3), np.eye(3)
@@ -62,7 +62,7 @@ def any_pose(seed):
 def velocity(motion, time, points=POINTS):
     """Return the velocity of material points that are at `points` at `time`.
 
-    By central differences of the poses.
+    It follows from central differences of the poses.
     """
     back = motion.pose(time).inverse().apply(points)
     return (motion.pose(time + STEP).apply(back) - motion.pose(time - STEP).apply(back)) / (

@@ -12,7 +12,7 @@ from warp_lcp.grid.solids import Box, Plane, Sphere
 def open_volume(grid, normal, offset, cell):
     """Return the part of a cell, in 2-D of its area, where n.X > offset.
 
-    By sampling lines along x.
+    It is found by sampling lines along x.
     """
     i, j = cell
     y = j + (np.arange(2000) + 0.5) / 2000

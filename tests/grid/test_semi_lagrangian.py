@@ -13,7 +13,7 @@ CELLS = 32
 def coordinates(grid: StaggeredGrid, axis: int) -> list[np.ndarray]:
     """Return x, y, z [m] of a component's faces or of cell centers.
 
-    In the stored shape.
+    They are in the stored shape.
     """
     K, J, I = np.meshgrid(*(np.arange(n) - 1.0 for n in grid.shape), indexing="ij")
     return [(c + (0.0 if a == axis else 0.5)) * grid.spacing for a, c in enumerate((I, J, K))]

@@ -1,6 +1,6 @@
 """Surface around particles against shapes of known volume and place.
 
-With walls, solids, drops and sheets.
+The scenes have walls, solids, drops and sheets.
 """
 
 import itertools

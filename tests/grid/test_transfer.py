@@ -1,6 +1,6 @@
 """Transfers between particles and grid: consistency, conservation and losses.
 
-validation.md 6.
+The tests are those of validation.md 6.
 """
 
 from dataclasses import dataclass

@@ -28,7 +28,7 @@ CUBE_TRIANGLES = np.concatenate([QUADS[:, [0, 1, 2]], QUADS[:, [0, 2, 3]]])
 def icosphere(levels):
     """Return vertices on the unit sphere and outward triangles.
 
-    An icosahedron, each triangle divided into four `levels` times.
+    They are those of an icosahedron, each triangle divided into four `levels` times.
     """
     g = (1.0 + np.sqrt(5.0)) / 2.0
     vertices = np.array(
@@ -79,7 +79,7 @@ def distances(geometry, points):
 def parity_inside(points, surface, direction):
     """Return the number of triangles that a ray meets (Moeller and Trumbore).
 
-    For each point.
+    There is one number for each point.
     """
     a, b, c = (surface.vertices[surface.triangles[:, corner]] for corner in range(3))
     e1, e2 = b - a, c - a

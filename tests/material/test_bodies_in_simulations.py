@@ -1,6 +1,6 @@
 """Rigid bodies in simulations of liquid and sand.
 
-Steps, log, frames and checkpoints.
+The tests cover steps, log, frames and checkpoints.
 """
 
 from pathlib import Path

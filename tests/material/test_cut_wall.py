@@ -22,7 +22,7 @@ JUNK = 1e3  # on faces that are neither projected nor have weight
 def points(grid: StaggeredGrid, offset: Sequence[float]) -> np.ndarray:
     """Return the points (x, y, z) at an offset from the cells' low corners.
 
-    In cells from the domain's corner.
+    They are in cells from the domain's corner.
     """
     k, j, i = np.meshgrid(*(np.arange(n) - 1.0 for n in grid.shape), indexing="ij")
     return np.stack(
@@ -171,7 +171,7 @@ class Slope:
     def judged(self, axis: int) -> np.ndarray:
         """Return the closed faces in reach of a particle's tent function.
 
-        Away from the domain's walls.
+        Faces near the domain's walls are left out.
         """
         x = face_centers(self.grid, axis)
         away = np.all(

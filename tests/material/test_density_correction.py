@@ -190,7 +190,7 @@ def test_an_over_full_cell_pushes_its_neighbors_outward(dimension: int, indexed:
 def test_nobody_moves_more_than_half_a_cell_or_into_a_wall(solid: list[dict[str, Any]]) -> None:
     """Displacements of at most half a cell, and not into a wall.
 
-    Ten times too many particles on the floor and around a ball.
+    There are ten times too many particles on the floor and around a ball.
     """
     grid, boundary = tank(resolution=16, solid=solid)
     points = np.random.default_rng(5).uniform(0.001, 0.999, (9000, 3)) * [1.0, 0.3, 0.0]
@@ -340,7 +340,8 @@ def test_what_it_lifts_by_itself_is_in_proportion_to_the_step() -> None:
 def test_a_collapsed_column_has_the_volume_that_it_had(table: dict[str, Any]) -> None:
     """Volume of a collapsed column.
 
-    By an independent oracle from particles alone; without the correction it shrinks by a tenth.
+    The volume is that of an independent oracle, from particles alone. Without the correction it
+    shrinks by a tenth.
     """
     simulation = dam(**table)
     counts = tuple(simulation.grid.counts[:2])

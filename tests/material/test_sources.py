@@ -166,7 +166,7 @@ def lattice_points(
 ) -> np.ndarray:
     """Return jittered points of a source's lattice before it moves [m].
 
-    x fastest, shape (n, 3).
+    They are in the order x fastest, with shape (n, 3).
     """
     k, j, i = np.meshgrid(*(np.arange(n) for n in counts[::-1]), indexing="ij")
     lattice = np.stack([i.ravel(), j.ravel(), k.ravel()], axis=1) + low

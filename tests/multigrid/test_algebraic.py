@@ -56,7 +56,7 @@ def restrict(H, free, shift):
 def iterations(matrix, free, shift, device, real=wp.float64):
     """Return the conjugate-gradient iterations to 1e-6.
 
-    Checked by the true residual.
+    The true residual is checked.
     """
     H = hierarchy(matrix, free, shift, device, real)
     krylov = ConjugateGradient(H.product, H)

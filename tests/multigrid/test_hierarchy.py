@@ -1,6 +1,6 @@
 """Galerkin coarsening against dense triple products, and cycles.
 
-Symmetry, definiteness, bounds; conjugate gradients.
+The tests cover symmetry, definiteness, bounds and conjugate gradients.
 """
 
 import numpy as np
@@ -85,7 +85,7 @@ def test_coarse_levels_are_galerkin_products(shape, periodic, arrays, device):
 def test_two_sweeps_contract_an_interval_of_eigenvalues_as_no_other_two_do(interval):
     """Contraction of two sweeps on an interval of eigenvalues: optimal.
 
-    By 1/T2((b + a)/(b - a)), the minimum of polynomials of degree 2 with value 1 at 0.
+    The factor is 1/T2((b + a)/(b - a)), the minimum of polynomials of degree 2 with value 1 at 0.
     """
     (first, second), t = CycleSettings(interval=interval).weights, np.linspace(*interval, 1001)
     best = 1 / (2 * (sum(interval) / (interval[1] - interval[0])) ** 2 - 1)

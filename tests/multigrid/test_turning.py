@@ -1,6 +1,6 @@
 """Coefficients whose strong direction varies.
 
-Detection, iteration budgets, cycles, rebuild of the shared finest level.
+The tests cover detection, iteration budgets, cycles, and the rebuild of the shared finest level.
 """
 
 import numpy as np
@@ -142,8 +142,8 @@ def solved(shape, strengths, lower=-np.inf, upper=np.inf, solver=None):
 def test_the_default_solves_turning_anisotropy(strengths, n):
     """Default method on varying anisotropy of 1:1000.
 
-    Without the additional hierarchies 40 to 190 iterations at 256^2 and more with bounds, growing
-    with the grid.
+    Without the additional hierarchies it needs 40 to 190 iterations at 256^2. With bounds it needs
+    more, and they grow with the grid.
     """
     free, residual = solved((n, n), strengths(1e-3))
     assert free, free.status

@@ -122,7 +122,7 @@ def test_symmetry_is_known_of_operators_that_are_their_own_adjoint():
 def test_sizes_stand_for_a_diagonal_that_is_not_given():
     """Estimated diagonal: positive, as large as the largest entries of the rows.
 
-    And in its units.
+    It is in the units of A's entries.
     """
     n = 200
     D = scipy.sparse.diags_array(np.geomspace(1e-3, 1e3, n))

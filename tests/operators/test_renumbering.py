@@ -16,7 +16,7 @@ N = 260  # n^2 unknowns are enough for another order to pay
 def shuffled(n=N, *, block=1, wind=0.0, seed=30211):
     """Return an obstacle problem with randomly numbered nodes: A, b, l, numbers.
 
-    Per component, of `block` components.
+    Each node has `block` components.
     """
     second = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(n, n))
     convection = scipy.sparse.diags_array([-wind, wind], offsets=[-1, 0], shape=(n, n))

@@ -1,6 +1,6 @@
 """Restated problems: solutions, starts and bounds of the original one.
 
-By a residual from NumPy.
+The residual is computed by NumPy.
 """
 
 import numpy as np

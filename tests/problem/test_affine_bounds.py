@@ -1,6 +1,7 @@
 """Friction: bounds affine in x.
 
-Against enumeration of the states of planar contacts, and against Coulomb's law by hand.
+They are compared with an enumeration of the states of planar contacts, and with Coulomb's law by
+hand.
 """
 
 import itertools

@@ -69,7 +69,7 @@ def test_sweeps_converge_linearly_in_the_modified_merit():
 def test_in_a_box_distances_are_those_to_the_bound_that_y_asks_for():
     """Distances in a box: those to the bound that the sign of y implies.
 
-    y = x + b; x half above l where y > 0, half below u where y < 0, under u alone, and without a
+    y = x + b. x is half above l where y > 0, half below u where y < 0, under u alone, and without a
     bound.
     """
     problem = wl.LCP(

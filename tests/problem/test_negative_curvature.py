@@ -27,7 +27,7 @@ def laplacian(n):
 def drawn(seed):
     """Return a solvable matrix, sparse or dense.
 
-    Symmetric positive definite, or dominant and unsymmetric.
+    It is symmetric positive definite, or dominant and unsymmetric.
     """
     rng = np.random.default_rng(seed)
     kind, n = int(rng.integers(0, 4)), int(rng.integers(2, 40))

@@ -56,7 +56,7 @@ def operator(A, kind):
 def program(seed, m=20, n=20):
     """Return a linear program with its dual, as an LCP with eps I, and c, G, h.
 
-    min c'x, G x >= h, x >= 0, of 40 unknowns.
+    The program is min c'x, G x >= h, x >= 0, of 40 unknowns.
     """
     rng = np.random.default_rng([7919, seed])
     G, x, u = (
@@ -123,8 +123,8 @@ def test_linear_programs_have_their_optimum_or_are_not_solved(method, kind):
 def test_units_of_rows_and_columns_are_the_users(method):
     """Solutions in the user's units of rows and columns.
 
-    diag(R) M diag(C) with sixteen orders of magnitude among columns and eight among rows; judged in
-    units of M.
+    The matrix is diag(R) M diag(C) with sixteen orders of magnitude among columns and eight among
+    rows. It is judged in units of M.
     """
     for seed in range(4):
         M, b, *_ = program(seed)

@@ -94,7 +94,7 @@ def test_nor_on_grids(name, kind):
 def test_rounding_is_judged_row_by_row():
     """Rounding judged row by row, against NumPy.
 
-    r_i| <= 4 eps (|b_i| + sum_j |a_ij x_j|).
+    The tolerance of a row is |r_i| <= 4 eps (|b_i| + sum_j |a_ij x_j|).
     """
     rng = np.random.default_rng(6131)
     A = rng.standard_normal((5, 5)) + 6 * np.eye(5)

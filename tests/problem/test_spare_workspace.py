@@ -1,6 +1,6 @@
 """Spare workspace between cold solves.
 
-The bits of a new one, bounded memory, and no data of earlier problems.
+It has the bits of a new one, bounded memory, and no data of earlier problems.
 """
 
 import gc
@@ -58,7 +58,7 @@ def sides_of(rng, shape, kind):
 def drawn_problems(rng, shape, bounds, coefficients, count=3, **options):
     """Return problems that differ in cells, right-hand side and bounds.
 
-    And in the shift, where drawn.
+    They differ in the shift too, where it is drawn.
     """
     made = []
     for _ in range(count):
@@ -174,7 +174,7 @@ def test_problems_of_other_forms_have_workspaces_of_their_own():
 def test_problems_without_copies(monkeypatch):
     """Problems without copies: a new workspace for each solve.
 
-    Fields in place, operators of subclasses, masked ones, many cells.
+    They have fields in place, operators of subclasses, masked ones, or many cells.
     """
     cells, b = (
         np.full((6, 7, 9), wl.FLUID, np.int8),

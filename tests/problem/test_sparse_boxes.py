@@ -1,6 +1,6 @@
 """Boxes partly filled with liquid.
 
-The bits of a problem that visits the whole box, in memory of the size of the liquid.
+They have the bits of a problem that visits the whole box, in memory of the size of the liquid.
 """
 
 import subprocess
@@ -23,7 +23,7 @@ STOPPING = wl.StoppingCriteria(rtol=1e-6)
 def liquid(up, level):
     """Return cells that are FLUID up to a level along an axis.
 
-    With a wavy surface and a SOLID block.
+    They have a wavy surface and a SOLID block.
     """
     shape = SHAPES[up]
     k, j, i = np.indices(shape, sparse=True)
@@ -45,7 +45,7 @@ def stored(values):
 def solves(up, method, *, in_place):
     """Return results of solves in liquid that rises, falls and rises again.
 
-    Cold, and from the last x.
+    The solves start cold, and from the last x.
     """
     levels = [liquid(up, level) for level in (0.2, 0.5, 0.1, 0.3)]
     A = wl.GridPoisson(levels[0], device="cpu")

@@ -1,6 +1,6 @@
 """Energy as the criterion of steps, and grids with a misleading residual.
 
-Strips, vents, torsion, a dam, a moving obstacle.
+They are strips, vents, torsion, a dam, and a moving obstacle.
 """
 
 import numpy as np

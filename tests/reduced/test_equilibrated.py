@@ -50,8 +50,8 @@ def problem(A, b, kind, lower=0.0, upper=np.inf):
 def test_extreme_rows(kind, method):
     """Extreme rows.
 
-    Sixteen orders of magnitude between units, thirty-two between pivots: interior points once
-    diverged, and dense blocks seemed singular.
+    There are sixteen orders of magnitude between units, and thirty-two between pivots. Interior
+    points once diverged, and dense blocks seemed singular.
     """
     for seed in range(6):
         rng = np.random.default_rng(seed)

@@ -42,7 +42,7 @@ def relative_residual(p, x):
 def newton(A, b, lower, upper, x):
     """Return whole Newton steps on the minimum map, by dense NumPy.
 
-    Until the active set repeats.
+    They end when the active set repeats.
     """
     seen = []
     while True:

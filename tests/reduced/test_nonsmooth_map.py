@@ -87,7 +87,8 @@ def test_systems_on_the_device_are_those_of_the_definition(form, kink, device):
 def test_gradients_are_those_of_the_definition(form, device):
     """Gradients against the definition.
 
-    J'f over d^2, with the element (0, 1) at kinks, where f = 0 but not in other rows of the column.
+    They are J'f over d^2, with the element (0, 1) at kinks, where f = 0 but not in other rows of
+    the column.
     """
     A, b, lower, upper, x = at_kinks(4003)
     made, field, _ = device_map(A, b, lower, upper, x, form, 0.7, Kink.PERTURBATION, device)
@@ -169,7 +170,8 @@ def test_host_and_device_agree_step_by_step_at_the_kink(share, seed, device):
 def test_the_smoothed_map_is_that_of_the_definition(smoothing):
     """Smoothed map against the definition, with 60 digits.
 
-    psi = x + y - sqrt(x^2 + y^2 + 2 mu) without cancellation, and its rounded derivatives.
+    The map is psi = x + y - sqrt(x^2 + y^2 + 2 mu) without cancellation, with its rounded
+    derivatives.
     """
     rng = np.random.default_rng(4049)
     x, y = (rng.choice([-1.0, 1.0], 300) * 10.0 ** rng.uniform(-4, 4, 300) for _ in range(2))

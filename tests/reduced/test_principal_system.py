@@ -1,6 +1,6 @@
 """Principal systems (P A P + P D P) e = r on every family of operators.
 
-With masks and shifts, against dense matrices.
+They have masks and shifts, and are compared with dense matrices.
 """
 
 import numpy as np
@@ -214,7 +214,7 @@ def test_an_update_is_taken_and_lost_symmetry_is_told(device):
 def convection_diffusion(m, wind, upwind):
     """Return a 5-point stencil with a wind along both axes.
 
-    Centered differences, or upwind ones of any strength.
+    The differences are centered, or upwind with a wind of any strength.
     """
     T = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(m, m))
     C = scipy.sparse.diags_array(

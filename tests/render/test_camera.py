@@ -83,7 +83,7 @@ def test_wrong_cameras(scene, text, size, message):
 def project(view, points, size):
     """Return the images of points [m] in a pinhole camera, and their depths [m].
 
-    x to the right, y down from the upper left corner [pixels].
+    x points to the right and y down from the upper left corner [pixels].
     """
     width, height = size
     x, y, depth = ((points - view.position) @ view.axes.T).T

@@ -1,6 +1,6 @@
 """Meshes of path-traced pictures, and the view transform.
 
-Normals, liquid against walls and solids, grains, convex solids.
+The tests cover normals, liquid against walls and solids, grains, and convex solids.
 """
 
 import numpy as np

@@ -37,7 +37,7 @@ def pyvista():
 def make_run(dots, tmp_path):
     """Write the folder of a run by hand.
 
-    A list of frames, each the points [m] and velocities [m/s] of its particles.
+    It has a list of frames, each with the points [m] and velocities [m/s] of its particles.
     """
 
     def make(

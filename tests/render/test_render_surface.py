@@ -54,7 +54,7 @@ def is_orange(image):
 def middle(mask, folder, page_line=20):
     """Return the mean position of a 2-D image's pixels [m].
 
-    For a domain of 1 m whose height limits the image.
+    The domain has sides of 1 m; its height limits the image.
     """
     rows, columns = np.nonzero(mask)
     pixel = MARGIN / mask.shape[0]

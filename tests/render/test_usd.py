@@ -140,7 +140,7 @@ def test_velocities_are_those_of_a_fall(falls, tmp_path, dimension, name):
 def test_velocities_lead_to_the_next_frame(falls, tmp_path):
     """Velocities that lead to the next frame.
 
-    For the shutter of a renderer that interpolates points between frames.
+    They are for the shutter of a renderer that interpolates points between frames.
     """
     stage = exported(falls[3], tmp_path / "fall.usdc", show=Show.PARTICLES)
     particles = UsdGeom.PointBased(prim(stage, "particles"))

@@ -1,6 +1,6 @@
 """Motion of rigid bodies in NumPy, array by array.
 
-The same as the loop in `warp_lcp/rigid/headers/motion.h`.
+It is the same as the loop in `warp_lcp/rigid/headers/motion.h`.
 """
 
 import numpy as np

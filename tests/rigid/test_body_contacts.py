@@ -1,6 +1,6 @@
 """Contacts of bodies with walls, solids and each other, against mechanics.
 
-Rest, slope, stack and impact.
+The tests cover rest, slope, stack and impact.
 """
 
 import numpy as np

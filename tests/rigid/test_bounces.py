@@ -114,7 +114,7 @@ def test_elastic_bodies_that_rest_stay_at_rest(lengths):
 def test_a_column_of_balls_gains_no_energy(restitution, lengths, gain):
     """Energy of a column of balls.
 
-    Several impacts in a step, of bodies that hit others on both sides.
+    There are several impacts in a step, of bodies that hit others on both sides.
     """
     bodies = bodies_of(
         [Sphere(center=[0.5, 0.15 + 0.25 * k], radius=0.1) for k in range(3)],

@@ -1,6 +1,6 @@
 """Contact problem: the fused solve, its memory, and supported bodies.
 
-Compared with the package's own residual and methods.
+It is compared with the package's own residual and methods.
 """
 
 import numpy as np

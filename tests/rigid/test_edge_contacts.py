@@ -58,7 +58,7 @@ def test_the_gap_of_two_capsules_is_that_of_their_axes(seed):
 def test_the_gap_of_a_capsule_and_a_box_is_that_of_its_axis(seed):
     """Gap of a capsule and a box: that of its axis.
 
-    Beside a face, across an edge, at a corner, or with the axis inside.
+    The axis is beside a face, across an edge, at a corner, or inside.
     """
     rng = np.random.default_rng(seed)
     capsule, ends = capsule_of(rng, 0.02)

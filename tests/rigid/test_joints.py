@@ -1,6 +1,6 @@
 """Joints of rigid bodies against integrations and closed forms.
 
-Energy, period, momentum, limits, motors, drift.
+The tests cover energy, period, momentum, limits, motors and drift.
 """
 
 import numpy as np
@@ -75,7 +75,7 @@ def energy(bodies: RigidBodies, dt: float, gravity: np.ndarray = DOWN) -> float:
 def double_pendulum(duration: float, dimension: int) -> np.ndarray:
     """Return the angles of two bars that fall from the horizontal.
 
-    By Lagrange's equations and DOP853.
+    They follow from Lagrange's equations, integrated by DOP853.
     """
     m = 1000.0 * LENGTH * (2 * HALF) ** (dimension - 1)
     inertia = m * (LENGTH**2 + (2 * HALF) ** 2) / 12
@@ -127,7 +127,7 @@ def test_a_double_pendulum_goes_as_lagrange_says(dimension):
 def test_a_bar_swings_with_the_period_of_its_inertia():
     """Period of a bar: 2 pi sqrt(I / (m g c)) for small swings.
 
-    By the zeros of the angle.
+    It is measured by the zeros of the angle.
     """
     bodies, dt, tilt = system(chain(1), 1), 0.01, np.pi / 2 - 0.05
     turned = rotation_by(-tilt * Z)
@@ -255,7 +255,7 @@ def test_every_method_takes_the_equations_of_joints(method):
 def random_joints(rng: np.random.Generator) -> tuple[Joint, ...]:
     """Return a random tree of joints of all kinds between four bars.
 
-    With limits and motors.
+    They have limits and motors.
     """
     joints = []
     for first in range(4):

@@ -1,6 +1,6 @@
 """Fast paths of many bodies.
 
-Pairs by a sweep along an axis, balls all at once, impulses recalled by pairs.
+They are pairs by a sweep along an axis, balls all at once, and impulses recalled by pairs.
 """
 
 from types import SimpleNamespace

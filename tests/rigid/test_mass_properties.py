@@ -83,7 +83,7 @@ def test_mass_scales_the_inertia():
 def test_of_a_capsule_by_quadrature(dimension):
     """Mass properties of a capsule by quadrature.
 
-    Slices across the axis: segments or discs.
+    Slices across the axis are segments or discs.
     """
     r, length = 0.4, 1.1
     end = [0.3, 0.2, 0.9][:dimension]

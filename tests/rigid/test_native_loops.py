@@ -1,7 +1,7 @@
 """Native loops of rigid bodies against plain NumPy, step by step.
 
-Motion, planar contacts, impulses, supported bodies. The loops sum in the order of NumPy and
-OpenBLAS on processors with AVX2 and have their bits; elsewhere rounding may differ.
+The loops are motion, planar contacts, impulses and supported bodies. They sum in the order of NumPy
+and OpenBLAS on processors with AVX2 and have their bits; elsewhere rounding may differ.
 """
 
 import dataclasses
@@ -260,7 +260,7 @@ def test_overlaps_at_the_end_of_a_step_are_seen():
 def stepped(seed, loops, steps):
     """Return the history of a world.
 
-    Supported bodies, values, contacts, and remembered impulses.
+    It consists of supported bodies, values, contacts, and remembered impulses.
     """
     rng, bodies, shapes, obstacles = drawn_world(seed)
     world = object.__new__(RigidBodies)

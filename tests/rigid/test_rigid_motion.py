@@ -296,7 +296,7 @@ def test_bodies_of_one_array_move_as_each_does_alone():
 def test_rotations_off_by_rounding_become_the_nearest_ones():
     """Rotations with rounding errors: the nearest orthogonal matrices.
 
-    Against U V' of the singular value decomposition.
+    They are compared with U V' of the singular value decomposition.
     """
     rng = np.random.default_rng(6)
     off = Rotation.random(50, rng=rng).as_matrix() + 1e-9 * rng.normal(size=(50, 3, 3))

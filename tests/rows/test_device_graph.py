@@ -1,6 +1,6 @@
 """Launches with arguments patched in device memory, as in CUDA graphs.
 
-Here on the CPU, against NumPy.
+The launches run on the CPU here and are compared with NumPy.
 """
 
 from dataclasses import replace

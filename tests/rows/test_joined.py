@@ -1,6 +1,6 @@
 """Joined graphs of recorded stretches, in order with everything between them.
 
-Only with the plug-in `emulated_cuda`.
+The tests run with the plug-in `emulated_cuda` only.
 """
 
 import gc

@@ -230,7 +230,7 @@ def test_a_changed_recording_is_found(guarded):
 def pairwise(values: list[float]) -> float:
     """Return the sum as NumPy computes it.
 
-    8 accumulators over up to 128 values, halves beyond.
+    NumPy has 8 accumulators over up to 128 values, and adds halves beyond.
     """
     if len(values) < 8:
         total = -0.0

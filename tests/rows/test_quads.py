@@ -1,6 +1,6 @@
 """Quad passes, four cells of a row per thread, against single cells.
 
-As on CUDA; only with the plug-in `emulated_cuda`.
+They run as on CUDA, with the plug-in `emulated_cuda` only.
 """
 
 import os

@@ -1,6 +1,6 @@
 """Passes in one launch: each reads the results of those before it.
 
-For any number of threads that share the rows.
+Any number of threads may share the rows.
 """
 
 import numpy as np

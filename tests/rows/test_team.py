@@ -1,6 +1,6 @@
 """Thread pool: the bits of one thread, whatever interrupts, forks or leaves.
 
-And the same without a pool.
+The results without a pool are the same.
 """
 
 import math
@@ -399,7 +399,7 @@ def packing_kernel(
 def drawn_arguments(rng):
     """Return arguments of `packing_kernel`.
 
-    Arrays, some of them strided or empty, vectors, a struct, numbers.
+    They are arrays, some of them strided or empty, vectors, a struct, and numbers.
     """
     m, small, sizes = Mixed(), Small(), rng.integers(0, 6, 7)
     small.count, small.weight, small.place = (

@@ -39,7 +39,7 @@ def go(scene: Path, out: Path, *overrides: str, resume: bool = False, force: boo
 def contents(out: Path) -> dict[str, Any]:
     """Return the common contents of equal runs.
 
-    Frames, collections, the log without seconds, checkpoints, the scene.
+    They are frames, collections, the log without seconds, checkpoints, and the scene.
     """
     found: dict[str, Any] = {
         str(p.relative_to(out)): p.read_bytes() for p in [*out.glob("frames/*"), *out.glob("*.pvd")]

@@ -37,7 +37,7 @@ SHORT = {"duration": 0.1, "resolution": 32}
 def contents(folder: Path) -> dict:
     """Return the common contents of equal runs.
 
-    Frames, collections, the log without times, and checkpoints.
+    They are frames, collections, the log without times, and checkpoints.
     """
     found = {
         str(p.relative_to(folder)): p.read_bytes()

@@ -105,7 +105,7 @@ def begun(scene, tmp_path_factory) -> Path:
 def names(whole: Path) -> list[str]:
     """Return the names of all files and folders that a run writes.
 
-    With temporary files of the simplest kind.
+    Temporary files of the simplest kind are included.
     """
     found = sorted(str(path.relative_to(whole)) for path in whole.rglob("*"))
     return [

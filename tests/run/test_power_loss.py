@@ -299,7 +299,7 @@ WRITERS: dict[str, Callable[[Path], Any]] = {
 def test_the_order_of_calls(disk, name):
     """Order of calls, also for files on which no run depends.
 
-    Written, flushed, named, and the name flushed.
+    A file is written, flushed and named; then the name is flushed.
     """
     folder = disk.root / "files"
     folder.mkdir()

@@ -1,6 +1,6 @@
 """Runs resumed after every step: equal next step, row of the log and frame.
 
-Bit for bit.
+They are equal bit for bit.
 """
 
 import pytest

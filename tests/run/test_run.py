@@ -57,7 +57,7 @@ def record(out: Path) -> dict[str, Any]:
 def contents(out: Path) -> dict[str, Any]:
     """Return the common contents of two equal runs.
 
-    Every frame, collection and log row, and the last checkpoint.
+    They are every frame, collection and log row, and the last checkpoint.
     """
     found: dict[str, Any] = {
         str(p.relative_to(out)): p.read_bytes() for p in [*out.glob("frames/*"), *out.glob("*.pvd")]

@@ -1,6 +1,6 @@
 """Suspicious settings: reported by `check` and at the start of a run.
 
-With the value, the usual range, and the unit.
+The report has the value, the usual range, and the unit.
 """
 
 from __future__ import annotations

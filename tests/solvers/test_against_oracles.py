@@ -30,7 +30,7 @@ TIGHT = wl.StoppingCriteria(rtol=1e-10, max_iterations=20_000, patience=2000)
 def planted(A, rng, active=0.3):
     """Return a right-hand side with a known solution x >= 0, y >= 0, x'y = 0.
 
-    Strictly complementary.
+    It is strictly complementary.
     """
     held = rng.random(len(A)) < active
     x = np.where(held, 0.0, rng.uniform(0.1, 1.0, len(A)))

@@ -1,6 +1,6 @@
 """Blocked Gauss-Seidel and staggering, iterate by iterate against plain loops.
 
-Subproblems, friction within blocks and across them.
+The tests cover subproblems, and friction within blocks and across them.
 """
 
 import itertools
@@ -192,8 +192,8 @@ def test_rounds_over_subproblems_are_those_of_the_algorithm(method, direction, d
 def test_normal_and_tangential_forces_in_turn(device):
     """Normal and tangential forces in turn, [Book] 2.2.4.
 
-    Normal forces with friction fixed, then friction within the limits of these normal forces, in
-    each round.
+    Each round solves for normal forces with friction fixed, then for friction within the limits of
+    these normal forces.
     """
     normal = np.repeat(np.arange(0, 9, 3), 3)
     normal[::3] = -1

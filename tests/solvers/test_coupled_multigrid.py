@@ -62,7 +62,7 @@ def test_the_dense_oracle_agrees(solver, weights, scale, device):
 def tank(n, bodies, ratio, device):
     """Return a 3-D tank with boxes of some density ratio.
 
-    Unknowns, columns of their motions, and the operator.
+    The result is unknowns, columns of their motions, and the operator.
     """
     cells = np.ones((n, n, n), dtype=int)
     cells[:, -n // 5 :] = wl.AIR

@@ -1,6 +1,6 @@
 """Small and narrow problems: whole Newton steps on the host, fallbacks.
 
-And Lemke's banded basis.
+Lemke's banded basis is tested too.
 """
 
 import itertools
@@ -138,7 +138,7 @@ def test_entries_and_bounds_that_change_in_place_count(device):
 def test_banded_and_dense_factors_agree(width):
     """Agreement of banded and dense factors.
 
-    On a badly scaled unsymmetric matrix, so that pivots and fixed rows of other sizes matter.
+    The matrix is badly scaled and unsymmetric, so that pivots and fixed rows of other sizes matter.
     """
     rng = np.random.default_rng(5519 + width)
     n = 40
@@ -177,9 +177,9 @@ def test_cycles_are_handed_over():
 def test_other_matrices_end_as_by_the_safeguarded_steps(A, b, lower):
     """Other matrices: ends of the safeguarded steps.
 
-    Singular blocks with and without a solution, skew, negative, empty rows: the same status, dense
-    and sparse, with fallbacks. Where the method stops at a negative diagonal entry, the default's
-    pivots prove that there is no solution.
+    The matrices are singular blocks with and without a solution, skew ones, negative ones, and ones
+    with empty rows. Dense and sparse ones have the same status, with fallbacks. Where the method
+    stops at a negative diagonal entry, the default's pivots prove that there is no solution.
     """
     proved = wl.SolveStatus.NEGATIVE_CURVATURE, wl.SolveStatus.INFEASIBLE
     for form in (A, scipy.sparse.csr_array(A)):

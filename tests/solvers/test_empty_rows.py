@@ -1,6 +1,6 @@
 """Empty rows of a matrix: y = b there, so x is at the bound of b's sign.
 
-With every method.
+That holds for every method.
 """
 
 import numpy as np

@@ -46,7 +46,7 @@ def drawn(seed, symmetric):
 def check(name, seeds, sparse):
     """Check that there is no exception, false CONVERGED or INFEASIBLE.
 
-    And no warning.
+    Warnings are errors too.
     """
     method, converged = wl.METHODS[name], 0
     for seed in seeds:

@@ -1,6 +1,6 @@
 """NNCG and accelerated projected gradients.
 
-Against plain loops in NumPy, oracles, and iteration budgets.
+They are compared with plain loops in NumPy and oracles, within iteration budgets.
 """
 
 import numpy as np

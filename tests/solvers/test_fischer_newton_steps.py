@@ -256,7 +256,7 @@ def test_safeguarded_steps_on_the_host_are_those_of_the_algorithm():
 def smoothed_row(a, y, c, low, high, mu):
     """Return f of psi_mu(a, b), and its derivatives by x / d and by y.
 
-    psi_mu(a, b) = a + b - sqrt(a^2 + b^2 + 2 mu).
+    The map is psi_mu(a, b) = a + b - sqrt(a^2 + b^2 + 2 mu).
     """
 
     def psi(a, b):
@@ -389,7 +389,7 @@ def unit_rows(seed, share, n=7):
 def test_steps_on_a_grid_are_those_of_the_algorithm(kink, share, safeguard, scaled):
     """Steps on a grid against the algorithm.
 
-    The passes over rows: from x = 0 on walls, half of them with y = 0.
+    They are the passes over rows, from x = 0 on walls, half of them with y = 0.
     """
     rng = np.random.default_rng(4221)
     cells = rng.choice(3, (4, 5, 4), p=[0.1, 0.8, 0.1])

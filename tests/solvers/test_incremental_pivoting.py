@@ -1,6 +1,7 @@
 """Baraff's pivoting.
 
-Definite and semi-definite, boxes, equations, infeasible problems; O(n^2) per pivot.
+Problems are definite and semi-definite, with boxes, equations, and without a solution. A pivot
+costs O(n^2).
 """
 
 import numpy as np
@@ -173,7 +174,8 @@ def test_settings_and_sizes_are_checked(monkeypatch):
 def test_inverse_follows_changes_of_the_set():
     """Inverse after changes of the set.
 
-    Bordering and deflation against NumPy, without a fresh inverse on a well-conditioned block.
+    Bordering and deflation are compared with NumPy, without a fresh inverse on a well-conditioned
+    block.
     """
     rng = np.random.default_rng(743)
     A = semidefinite(rng, 30, 0.0) / 30 + np.eye(30)

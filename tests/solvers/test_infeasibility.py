@@ -222,7 +222,7 @@ def test_an_empty_row_stays():
 def equations(seed, largest):
     """Return a dense singular matrix and a vector w with A'w = 0.
 
-    Symmetric or not, scaled or not.
+    It is symmetric or not, scaled or not.
     """
     rng = np.random.default_rng([seed, 409])
     n = int(rng.integers(largest // 2, largest))

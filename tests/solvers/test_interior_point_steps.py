@@ -1,6 +1,6 @@
 """Interior-point method, iterate by iterate against a plain loop.
 
-Start, directions, centering, step lengths, by both rules.
+Start, directions, centering and step lengths are compared, by both rules.
 """
 
 import math
@@ -78,7 +78,7 @@ class PlainPath:
     def direction(self, tau, correction_w, correction_v):
         """Return Newton's dx, ds and dt.
 
-        For w s = tau - correction_w and v t = tau - correction_v.
+        They solve w s = tau - correction_w and v t = tau - correction_v.
         """
         n = len(self.b)
         right, D, ds, dt = -(self.A @ self.x + self.b), np.zeros(n), np.zeros(n), np.zeros(n)

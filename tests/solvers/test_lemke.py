@@ -25,7 +25,7 @@ def solve(A, b, lower=0.0, upper=np.inf, solver=None, stopping=TIGHT):
 def contacts(count, rng, friction=0.5):
     """Return the Stewart-Trinkle LCP of random bodies with random contacts.
 
-    Blocks of normal, four tangents and the sliding speed beta.
+    Its blocks are the normal, four tangents and the sliding speed beta.
     """
     bodies = max(2, count // 3)
     masses = rng.uniform(0.5, 2.0, bodies)

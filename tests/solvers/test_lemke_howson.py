@@ -28,7 +28,7 @@ def game(seed, *, integer):
 def problem(E, F):
     """Return the LCP of costs E, F.
 
-    E y >= 1, F'x >= 1, complementary to x, y >= 0.
+    E y >= 1 and F'x >= 1 are complementary to x, y >= 0.
     """
     A = np.zeros((sum(E.shape),) * 2)
     A[: len(E), len(E) :], A[len(E) :, : len(E)] = E, F.T

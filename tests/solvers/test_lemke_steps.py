@@ -1,6 +1,6 @@
 """Lemke's method, pivot by pivot against a tableau of fractions with exact ties.
 
-The lexicographic rule, z0 first, the first row.
+The rules are the lexicographic one, z0 first, and the first row.
 """
 
 from fractions import Fraction

@@ -1,6 +1,6 @@
 """Newton's method on the minimum map, iterates against a plain loop.
 
-Index sets at ties, and the method without any fallback.
+Index sets at ties are compared, and the method runs without any fallback.
 """
 
 import numpy as np
@@ -203,7 +203,7 @@ def test_index_sets_on_a_grid(bounds):
 def test_newton_alone_fails_on_contacts_and_says_so():
     """Newton alone on contacts: it fails and reports so.
 
-    [Book] fig. C.2b: non-descent after a few steps. No step is another method's.
+    In [Book] fig. C.2b it ends with non-descent after a few steps. No step is another method's.
     """
     outcomes = []
     for seed in range(8):

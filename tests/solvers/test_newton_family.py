@@ -1,6 +1,6 @@
 """Interior point, Fischer-Newton, gradient descent, minimum map's safeguard.
 
-Guarantees beyond the table of all methods.
+They have guarantees beyond the table of all methods.
 """
 
 import numpy as np

@@ -1,6 +1,6 @@
 """Penalty method: steps against a plain loop, answers against oracles.
 
-And the error of the springs.
+The error of the springs is tested too.
 """
 
 import numpy as np
@@ -114,7 +114,7 @@ def test_steps_are_those_of_the_method(kind, device):
 def test_bounds_that_are_equal_and_infinite_ones(device):
     """Equal and infinite bounds.
 
-    Both sides of every kind of row, against the oracle by enumeration.
+    Both sides of every kind of row are compared with the oracle by enumeration.
     """
     rng = np.random.default_rng(7127)
     for _ in range(6):
@@ -184,8 +184,8 @@ def test_a_soft_start_reaches_tight_tolerances_on_grids(shape, device):
 def test_iterations_do_not_grow_with_the_grid():
     """Iterations that do not grow with the grid.
 
-    Warm from projected cycles, at most two steps more from 65^2 to 257^2 on the ball, and from 16^3
-    to 48^3 on the splash.
+    Warm from projected cycles, it needs at most two steps more from 65^2 to 257^2 on the ball, and
+    from 16^3 to 48^3 on the splash.
     """
     counts = [
         wl.solve(ball_obstacle(n).lcp(device="cpu"), wl.Penalty()).iterations for n in (65, 257)

@@ -1,6 +1,6 @@
 """User-defined preconditioner: fewer iterations, equal solutions.
 
-No false success.
+There is no false success.
 """
 
 import numpy as np

@@ -1,6 +1,6 @@
 """Contacts with the circular cone.
 
-Sweeps against a plain loop, solutions against Coulomb's law and conic programs.
+Sweeps are compared with a plain loop, solutions with Coulomb's law and conic programs.
 """
 
 from itertools import pairwise
@@ -105,7 +105,7 @@ def test_solutions_are_coulombs_law(family, device):
 def cone_program(problem, lift):
     """Return the impulses of a conic program, by Clarabel.
 
-    Of least energy r'B r / 2 + (b + (lift, 0))'r in the cones.
+    They have the least energy r'B r / 2 + (b + (lift, 0))'r in the cones.
     """
     k, dim = problem.b.shape
     J = problem.jacobian

@@ -1,6 +1,6 @@
 """Problems with singular free blocks.
 
-By the proximal-point method, and by the fallbacks of active-set methods.
+They are solved by the proximal-point method, and by the fallbacks of active-set methods.
 """
 
 import numpy as np

@@ -1,6 +1,6 @@
 """Device-resident iterations: equal to those led by the host.
 
-On the CPU and, emulated, on CUDA.
+They run on the CPU and, emulated, as on CUDA.
 """
 
 import sys
@@ -379,7 +379,7 @@ def test_what_is_not_finite_is_found_by_both(wrong: float, both: Any) -> None:
 def liquid_below_air(least: float) -> tuple[wl.LCP, wp.array[Any]]:
     """Return a problem of cells with air above and one lower bound.
 
-    And its right-hand side.
+    Its right-hand side is returned too.
     """
     cells = np.full((14, 20), FLUID)
     cells[-1] = AIR

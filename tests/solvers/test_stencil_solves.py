@@ -21,7 +21,7 @@ NINE = np.array([[-1.0, -4.0, -1.0], [-4.0, 20.0, -4.0], [-1.0, -4.0, -1.0]]) / 
 def rotated(degrees, share=0.01):
     """Return bilinear elements of -div(K grad).
 
-    K = 1 along a direction and `share` across.
+    K is 1 along a direction and `share` across.
     """
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     xx, yy, xy = c * c + share * s * s, s * s + share * c * c, (1 - share) * c * s
@@ -32,7 +32,7 @@ def rotated(degrees, share=0.01):
 def convection(n, peclet, wind):
     """Return upwind differences of -Laplace u / peclet + v . grad u.
 
-    On the unit square.
+    The domain is the unit square.
     """
     h = 1 / (n + 1)
     Y, X = np.meshgrid(*(h * np.arange(1, n + 1),) * 2, indexing="ij")
@@ -96,7 +96,8 @@ def test_obstacles_cost_about_what_linear_solves_do(family):
 def drawn(seed):
     """Return a problem on random cells.
 
-    Numbers or arrays, symmetric, directed or anisotropic, full or star-shaped, in 2-D or 3-D.
+    Its coefficients are numbers or arrays, symmetric, directed or anisotropic, full or star-shaped,
+    in 2-D or 3-D.
     """
     rng = np.random.default_rng(seed)
     n = int(rng.integers(2, 4))
@@ -184,7 +185,8 @@ def test_methods_say_what_they_cannot():
 def test_coarse_matrices_are_products_of_the_transfers():
     """Coarse matrices as products of the transfers.
 
-    R A P e, by restricting A's product with a correction, for an unsymmetric stencil with holes.
+    The product is R A P e, by restricting A's product with a correction, for an unsymmetric stencil
+    with holes.
     """
     cells = np.where(np.random.default_rng(9).random((21, 30)) < 0.1, wl.AIR, wl.FLUID)
     a = {o: -(1.0 + o[0] + 0.3 * o[1]) for o in itertools.product((-1, 0, 1), repeat=2) if any(o)}

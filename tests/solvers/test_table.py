@@ -46,7 +46,7 @@ def cases():
 def operator(family, tiny, rng, device):
     """Return an operator, its dense matrix, and which field entries are unknowns.
 
-    Independent of the library.
+    It is independent of the library.
     """
     if family == "grid":
         cells = np.ones((1, 4) if tiny else (6, 7), dtype=int)
@@ -75,7 +75,7 @@ def operator(family, tiny, rng, device):
 def planted(A, bounds, rng):
     """Return b and bounds with a known, strictly complementary solution.
 
-    y > 0 at l, y < 0 at u, 0 in between.
+    There y > 0 at l, y < 0 at u, and y = 0 in between.
     """
     n = len(A)
     lower, upper = np.zeros(n), np.full(n, np.inf)

@@ -1,6 +1,7 @@
 """Sweeps against a plain loop.
 
-Orders, rows without a positive diagonal case by case, contraction, relaxation factors.
+The tests cover orders, rows without a positive diagonal case by case, contraction, and relaxation
+factors.
 """
 
 import numpy as np
